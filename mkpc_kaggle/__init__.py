@@ -1,0 +1,27 @@
+"""Offline two-stage image matching with Matching Key-Points Crop (MKPC).
+
+Importing this package is cheap and has no side effect: no torch, no network, no global switch. The names
+below are imported when they are first used.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from mkpc_kaggle.pipeline import PairMatch, TwoStageMatcher
+    from mkpc_kaggle.recipe import Recipe
+
+__version__ = "0.1.0"
+__all__ = ["PairMatch", "Recipe", "TwoStageMatcher", "__version__"]
+
+_HOME = {
+    "PairMatch": "mkpc_kaggle.pipeline",
+    "TwoStageMatcher": "mkpc_kaggle.pipeline",
+    "Recipe": "mkpc_kaggle.recipe",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(_HOME[name]), name)

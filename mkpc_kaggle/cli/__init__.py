@@ -1,0 +1,79 @@
+"""The command line: ``python -m mkpc_kaggle COMMAND`` and ``make_submission.py``."""
+
+import argparse
+import os
+import sys
+import time
+import warnings
+from collections.abc import Sequence
+from importlib import import_module
+from typing import TextIO
+
+from mkpc_kaggle import __version__
+from mkpc_kaggle.errors import UserError
+
+COMMANDS = ("submit", "match", "validate", "recipes", "check", "demo")
+EXIT_BAD_INPUT = 2
+
+_DESCRIPTION = """\
+Two-stage image matching with Matching Key-Points Crop, offline, inside a time budget.
+
+  submit    a test directory -> submission.csv
+  match     two images -> F, counts, a figure
+  validate  a directory with known poses -> mAA and pose AUC of a recipe
+  recipes   the recipes, their units, and the weights that each lacks
+  check     is this submission.csv what the competition takes?
+  demo      render a small test set with known poses
+
+COMMAND --help tells more.
+"""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command; the exit status: 0 done, 1 a check failed, 2 bad input, 130 / 143 ended by a signal."""
+    started = time.monotonic()
+    parser = argparse.ArgumentParser(
+        "mkpc_kaggle", description=_DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--version", action="version", version=__version__)
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    for name in COMMANDS:
+        command = import_module(f"mkpc_kaggle.cli.{name}")
+        sub = commands.add_parser(
+            name,
+            help=command.__doc__,
+            description=command.HELP,
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
+        command.add_arguments(sub)
+        sub.set_defaults(run=command.run)
+    parsed = parser.parse_args(arguments)
+    parsed.started = started
+    with warnings.catch_warnings():
+        warnings.showwarning = _show_warning
+        try:
+            return int(parsed.run(parsed))
+        except UserError as error:
+            print(f"error: {error}", file=sys.stderr)
+            return EXIT_BAD_INPUT
+
+
+def leave(status: int, *, at_rest: bool) -> int:
+    """Return ``status``; or leave at once where a thread cannot be stopped: all that matters is on disk."""
+    if at_rest:
+        return status
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(status)
+
+
+def _show_warning(
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    file: TextIO | None = None,
+    line: str | None = None,
+) -> None:
+    """A user wants the message, not the line of code it came from."""
+    print(f"warning: {message}", file=sys.stderr)

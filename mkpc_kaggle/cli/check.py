@@ -1,0 +1,28 @@
+"""is this submission.csv what the competition takes?"""
+
+import argparse
+from pathlib import Path
+
+HELP = """\
+Hold a submission against test.csv: header, ids and their order, nine finite numbers a row.
+Exit status: 0 it is good, 1 it is not (each problem on a line), 2 the test side cannot be read.
+"""
+MOST_LINES = 20
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("submission", type=Path)
+    parser.add_argument("--test-dir", type=Path, required=True, metavar="DIR")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    from mkpc_kaggle.competition import read_test_side, submission_problems
+
+    pairs = read_test_side(arguments.test_dir)
+    problems = submission_problems(arguments.submission, [pair.id for pair in pairs])
+    for problem in problems[:MOST_LINES]:
+        print(problem)
+    if len(problems) > MOST_LINES:
+        print(f"... and {len(problems) - MOST_LINES} more")
+    print(f"{arguments.submission}: {len(problems)} problems" if problems else f"good: {len(pairs)} rows")
+    return 1 if problems else 0

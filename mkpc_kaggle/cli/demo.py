@@ -1,0 +1,26 @@
+"""render a small test set with known poses"""
+
+import argparse
+from pathlib import Path
+
+HELP = """\
+Render scenes with known cameras, textured with scikit-learn's sample photographs, in the competition's layout:
+DIR/train with poses, DIR/test without, DIR/test_truth.csv to score a submission for the test side:
+
+  python -m mkpc_kaggle demo --out demo
+  python make_submission.py --test-dir demo/test
+  python -m mkpc_kaggle validate --train-dir demo/train --submission submission.csv --truth demo/test_truth.csv
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--out", type=Path, default=Path("demo"), metavar="DIR", help="default: demo")
+    parser.add_argument("--seed", type=int, default=0, help="another seed, other pictures")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    from mkpc_kaggle.demo import write_demo
+
+    demo = write_demo(arguments.out, seed=arguments.seed)
+    print(f"train side: {demo.train_dir}\ntest side: {demo.test_dir}\ntruth of the test side: {demo.truth_csv}")
+    return 0

@@ -1,0 +1,42 @@
+"""two images -> F, counts, a figure"""
+
+import argparse
+from pathlib import Path
+
+from mkpc_kaggle.cli import options
+
+HELP = """\
+Match two images and print the fundamental matrix (x1^T F x0 = 0, pixel centres at integers), how many matches
+each unit found, and the critical regions. --out draws the matches, the clusters and the critical regions.
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("image0", type=Path)
+    parser.add_argument("image1", type=Path)
+    parser.add_argument("--out", type=Path, metavar="FIG.png", help="draw the pair; the suffix says the format")
+    options.add_matching(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    from mkpc_kaggle import figures
+    from mkpc_kaggle.pipeline import TwoStageMatcher, to_image
+
+    images = to_image(arguments.image0), to_image(arguments.image1)
+    matcher = TwoStageMatcher(arguments.recipe, weights=arguments.weights, device=arguments.device)
+    match = matcher(*images)
+    print("\n".join(" ".join(f"{value: .9e}" for value in row) for row in match.estimate.matrix))
+    if match.estimate.failure:
+        print(f"this is the fallback: {match.estimate.failure}")
+    print(f"{len(match.matches)} matches, {match.estimate.inlier_count} inliers")
+    for result in match.results:
+        print(
+            f"  {result.unit.name:<30}{len(result.matches):>6} matches  {result.seconds:.2f} s  {result.failure}"
+        )
+    for name, region in zip(("image 0", "image 1"), match.regions or (), strict=False):
+        box = region.box
+        print(f"{name}: {region.reason}, x {box.left}..{box.right - 1}, y {box.top}..{box.bottom - 1}")
+    if arguments.out is not None:
+        figures.save(figures.draw_pair(*images, match, matcher.recipe.mkpc), arguments.out)
+        print(f"figure: {arguments.out}")
+    return 0

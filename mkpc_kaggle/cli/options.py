@@ -1,0 +1,43 @@
+"""Options that several commands share."""
+
+import argparse
+from pathlib import Path
+
+from mkpc_kaggle.run.budget import Budget, parse_duration
+
+
+def add_matching(parser: argparse.ArgumentParser) -> None:
+    """What decides how pairs are matched."""
+    parser.add_argument(
+        "--recipe",
+        default="auto",
+        metavar="NAME|FILE.toml",
+        help="what to run; `recipes` lists the names. auto (the default): the best that the weights allow",
+    )
+    parser.add_argument(
+        "--weights",
+        action="append",
+        default=[],
+        type=Path,
+        metavar="DIR",
+        help="where weight files lie; may be repeated. Also searched: $MKPC_WEIGHTS and /kaggle/input",
+    )
+    parser.add_argument(
+        "--device", default="auto", help="cpu, cuda, cuda:N, or auto (the default): a GPU if there is one"
+    )
+
+
+def add_time_limit(parser: argparse.ArgumentParser, default: str | None) -> None:
+    parser.add_argument(
+        "--time-limit",
+        default=default,
+        metavar="TIME",
+        help="such as 8h45m, 90m or 60s, counted from the start of the program; the run ends before it is over, "
+        f"and uses the time to run as many units as fit (default: {default or 'none'})",
+    )
+
+
+def budget_of(arguments: argparse.Namespace) -> Budget:
+    if arguments.time_limit is None:
+        return Budget(arguments.started)
+    return Budget(arguments.started, parse_duration(arguments.time_limit))

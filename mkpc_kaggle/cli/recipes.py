@@ -1,0 +1,30 @@
+"""the recipes, their units, and the weights that each lacks"""
+
+import argparse
+from pathlib import Path
+
+HELP = """\
+List the recipes: each unit's stage, matcher, long side and most matches, in order of importance, and which
+weight files are missing. A recipe of your own is a TOML file of the same form: --recipe FILE.toml.
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--weights", action="append", default=[], type=Path, metavar="DIR", help="may be repeated")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    from mkpc_kaggle.assembly import missing_slots, what_is_missing
+    from mkpc_kaggle.recipe import load_recipe, recipe_names
+    from mkpc_kaggle.weights import WeightStore
+
+    store = WeightStore(arguments.weights)
+    for name in recipe_names():
+        recipe = load_recipe(name)
+        print(f"{name}: {recipe.description}")
+        for unit in recipe.units:
+            extra = "  (extra: for weak pairs, if time is left)" if unit.extra else ""
+            print(f"    stage {unit.stage}  {unit.matcher}@{unit.long_side}  at most {unit.max_matches}{extra}")
+        missing = missing_slots(recipe, store)
+        print(f"    missing: {what_is_missing(missing, store)}" if missing else "    all weights are there")
+    return 0

@@ -1,0 +1,58 @@
+"""a test directory -> submission.csv"""
+
+import argparse
+from pathlib import Path
+
+from mkpc_kaggle.cli import leave, options
+
+HELP = """\
+Match every pair of test.csv and write one fundamental matrix a row.
+
+submission.csv is complete from the start: pairs that were not reached hold a fallback matrix, and every later
+version is better. Killed at any point, the same command goes on where it was (its journal lies in the work
+directory). Ctrl-C and SIGTERM end the run early with a valid file.
+
+Exit status: 0 done, or the time was up; 2 bad input; 130 or 143 ended by a signal (the file is valid).
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--test-dir",
+        type=Path,
+        required=True,
+        metavar="DIR",
+        help="holds test.csv and test_images/; or test_images",
+    )
+    parser.add_argument("--output", type=Path, default=Path("submission.csv"), help="default: submission.csv")
+    options.add_matching(parser)
+    options.add_time_limit(parser, default="8h45m")
+    parser.add_argument(
+        "--work-dir", type=Path, metavar="DIR", help="for the journal; default: beside the output, NAME.work"
+    )
+    parser.add_argument(
+        "--fresh", action="store_true", help="forget what an earlier run left in the work directory"
+    )
+
+
+def run(arguments: argparse.Namespace) -> int:
+    from mkpc_kaggle.assembly import assemble
+    from mkpc_kaggle.competition import read_test_side
+    from mkpc_kaggle.run.session import Session, interruptible
+    from mkpc_kaggle.run.summary import summary
+    from mkpc_kaggle.submit import submit
+
+    output: Path = arguments.output
+    with interruptible() as interrupt:
+        budget = options.budget_of(arguments)
+        pairs = read_test_side(arguments.test_dir)
+        assembly = assemble(arguments.recipe, weights=arguments.weights, device=arguments.device)
+        work_dir = arguments.work_dir or output.with_name(f"{output.stem}.work")
+        print(
+            f"{len(pairs)} pairs, recipe {assembly.recipe.name}, device {assembly.device}, journal in {work_dir}"
+        )
+        session = Session(work_dir, budget, interrupt, arguments.fresh)
+        report, at_rest = submit(pairs, assembly, session, output)
+        print(summary(pairs, report, assembly.left_out))
+        print(f"submission: {output}")
+        return leave(128 + interrupt.signal if interrupt.signal else 0, at_rest=at_rest)

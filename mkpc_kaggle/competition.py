@@ -1,0 +1,249 @@
+"""Files of the Image Matching Challenge 2022: the test side, the train side, submissions.
+
+Matrices and vectors in cells are separated by blanks, row by row. A test image is
+``test_images/<batch_id>/<image_id>.png``, a train image ``<scene>/images/<image_id>.jpg``; any of png, jpg and
+jpeg will do on both sides. F of a pair satisfies x2^T F x1 = 0, image 1 being the first.
+"""
+
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.geometry.metrics import Camera
+from mkpc_kaggle.geometry.robust import Matrix3
+
+TEST_COLUMNS = ("sample_id", "batch_id", "image_1_id", "image_2_id")
+SUBMISSION_COLUMNS = ("sample_id", "fundamental_matrix")
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two images to match: ``id`` is unique in a run, ``group`` the batch or scene they belong to."""
+
+    id: str
+    group: str
+    image0: Path
+    image1: Path
+
+    @property
+    def images(self) -> tuple[Path, Path]:
+        return self.image0, self.image1
+
+
+@dataclass(frozen=True, eq=False)
+class TruePair:
+    """A pair of the train side with its cameras."""
+
+    pair: Pair
+    camera0: Camera
+    camera1: Camera
+    covisibility: float
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A scene of the train side: its pairs, and the metres that one unit of its world is long."""
+
+    name: str
+    metres_per_unit: float
+    pairs: tuple[TruePair, ...]
+
+
+def read_test_side(directory: Path) -> tuple[Pair, ...]:
+    """The pairs of ``test.csv``, in its order.
+
+    ``directory`` holds ``test.csv`` and ``test_images/``, or is ``test_images`` itself with ``test.csv``
+    beside it. An image that is not there is no error here: its path is then one that does not exist. Raises
+    :class:`UserError` for a missing or unreadable table, missing columns, no rows, repeated sample ids, and
+    ids that are not plain names.
+    """
+    home = directory.parent if directory.name == "test_images" else directory
+    csv, images = home / "test.csv", home / "test_images"
+    table = read_table(csv, TEST_COLUMNS)
+    if not images.is_dir():
+        raise UserError(f"{images}: no such directory; --test-dir must hold test.csv and test_images/")
+    if table.empty:
+        raise UserError(f"{csv} has no rows: there is nothing to match")
+    repeated = table["sample_id"][table["sample_id"].duplicated()]
+    if not repeated.empty:
+        raise UserError(
+            f"{csv}: the sample_id {repeated.iloc[0]!r} stands there {1 + len(repeated)} times or more"
+        )
+    return tuple(
+        Pair(
+            str(sample),
+            str(batch),
+            image_path(images / plain_name(batch, csv), plain_name(first, csv)),
+            image_path(images / batch, plain_name(second, csv)),
+        )
+        for sample, batch, first, second in table[list(TEST_COLUMNS)].itertuples(index=False)
+    )
+
+
+def read_train_side(
+    directory: Path,
+    *,
+    scenes: Iterable[str] = (),
+    min_covisibility: float = 0.1,
+    pairs_per_scene: int | None = None,
+) -> tuple[Scene, ...]:
+    """The scenes of a train side (all, or those named), with the pairs of at least that covisibility.
+
+    ``pairs_per_scene`` takes that many of a scene's pairs, evenly spread over its table. Raises
+    :class:`UserError` for missing files, columns or scenes, and for cells that cannot be read.
+    """
+    factors = read_table(directory / "scaling_factors.csv", ("scene", "scaling_factor"))
+    metres = dict(zip(factors["scene"], factors["scaling_factor"], strict=True))
+    wanted = list(scenes) or sorted(name for name in metres if (directory / name).is_dir())
+    for name in wanted:
+        if name not in metres:
+            raise UserError(f"{directory}: unknown scene {name!r}; known: {', '.join(sorted(metres))}")
+    if not wanted:
+        raise UserError(f"{directory} has none of the scenes of its scaling_factors.csv")
+    return tuple(
+        _read_scene(
+            directory / plain_name(name, directory), float(metres[name]), min_covisibility, pairs_per_scene
+        )
+        for name in wanted
+    )
+
+
+def read_cameras(csv: Path) -> dict[str, Camera]:
+    """The cameras of a ``calibration.csv`` by image id."""
+    columns = ("image_id", "camera_intrinsics", "rotation_matrix", "translation_vector")
+    return {
+        image: Camera(_numbers(K, csv, 9).reshape(3, 3), _numbers(R, csv, 9).reshape(3, 3), _numbers(t, csv, 3))
+        for image, K, R, t in read_table(csv, columns)[list(columns)].itertuples(index=False)
+    }
+
+
+def write_submission(path: Path, rows: Mapping[str, Matrix3]) -> None:
+    """Write ``sample_id,fundamental_matrix`` in the order of ``rows``; the file is replaced at one stroke.
+
+    Raises ``OSError`` where it cannot be written; the former file is then untouched.
+    """
+    lines = [",".join(SUBMISSION_COLUMNS)]
+    lines += [f"{sample},{' '.join(f'{value:.12g}' for value in F.ravel())}" for sample, F in rows.items()]
+    part = path.with_name(f".{path.name}.part")
+    with part.open("w", encoding="utf-8", newline="\n") as stream:
+        stream.write("\n".join(lines) + "\n")
+        stream.flush()
+        os.fsync(stream.fileno())
+    part.replace(path)
+
+
+def read_submission(path: Path) -> dict[str, Matrix3]:
+    """F by sample id; raises :class:`UserError` for a file that is no submission."""
+    table = read_table(path, SUBMISSION_COLUMNS)
+    cells = zip(table["sample_id"], table["fundamental_matrix"], strict=True)
+    return {sample: _numbers(cell, path, 9).reshape(3, 3) for sample, cell in cells}
+
+
+def submission_problems(path: Path, sample_ids: Sequence[str]) -> list[str]:
+    """What is wrong with a submission, one sentence each; empty if the competition will take it."""
+    try:
+        table = read_table(path, SUBMISSION_COLUMNS)
+    except UserError as error:
+        return [str(error)]
+    problems = []
+    if tuple(table.columns) != SUBMISSION_COLUMNS:
+        problems.append(f"the header is {','.join(table.columns)}, not {','.join(SUBMISSION_COLUMNS)}")
+    found = list(table["sample_id"])
+    if found != list(sample_ids):
+        problems.append(_difference(found, sample_ids))
+    for sample, cell in zip(found, table["fundamental_matrix"], strict=True):
+        try:
+            F = _numbers(cell, path, 9)
+        except UserError as error:
+            problems.append(f"{sample}: {error}")
+            continue
+        if not np.isfinite(F).all():
+            problems.append(f"{sample}: a number is not finite")
+        elif not F.any():
+            problems.append(f"{sample}: the matrix is zero")
+    return problems
+
+
+def read_table(path: Path, columns: Sequence[str]) -> pd.DataFrame:
+    """A CSV file with all cells as text; raises :class:`UserError` unless it has these columns."""
+    try:
+        table = pd.read_csv(path, dtype=str, keep_default_na=False)
+    except FileNotFoundError as error:
+        raise UserError(f"{path}: no such file") from error
+    except pd.errors.EmptyDataError as error:
+        raise UserError(f"{path} is empty; expected the columns {', '.join(columns)}") from error
+    except (OSError, ValueError) as error:
+        raise UserError(f"{path} cannot be read as a table: {error}") from error
+    missing = [column for column in columns if column not in table.columns]
+    if missing:
+        raise UserError(f"{path} lacks the columns {', '.join(missing)}; it has {', '.join(table.columns)}")
+    return table
+
+
+def plain_name(name: str, where: Path) -> str:
+    """``name`` if it is the name of one file or directory; an id must not lead out of its directory."""
+    if name in ("", ".", "..") or any(mark in name for mark in ("/", "\\", "\0")):
+        raise UserError(f"{where}: the id {name!r} is not a plain name, so it cannot name a file here")
+    return name
+
+
+def image_path(directory: Path, image_id: str) -> Path:
+    """The image of that id in a directory; a png that does not exist where there is none."""
+    return _images_of(directory).get(image_id, directory / f"{image_id}.png")
+
+
+@cache
+def _images_of(directory: Path) -> dict[str, Path]:
+    if not directory.is_dir():
+        return {}
+    images = sorted(path for path in directory.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES)
+    return {path.stem: path for path in reversed(images)}
+
+
+def _read_scene(directory: Path, metres: float, min_covisibility: float, most: int | None) -> Scene:
+    cameras = read_cameras(directory / "calibration.csv")
+    csv = directory / "pair_covisibility.csv"
+    pairs = []
+    for key, covisibility in read_table(csv, ("pair", "covisibility"))[["pair", "covisibility"]].itertuples(
+        index=False
+    ):
+        first, dash, second = key.partition("-")
+        if not dash or first not in cameras or second not in cameras:
+            raise UserError(f"{csv}: the pair {key!r} is not two images of calibration.csv")
+        if float(covisibility) >= min_covisibility:
+            images = [image_path(directory / "images", plain_name(name, csv)) for name in (first, second)]
+            pair = Pair(f"{directory.name};{key}", directory.name, *images)
+            pairs.append(TruePair(pair, cameras[first], cameras[second], float(covisibility)))
+    if most is not None and most < len(pairs):
+        pairs = [pairs[index] for index in np.linspace(0, len(pairs) - 1, most).round().astype(int)]
+    return Scene(directory.name, metres, tuple(pairs))
+
+
+def _numbers(cell: str, where: Path, count: int) -> NDArray[np.float64]:
+    try:
+        numbers = np.array([float(part) for part in cell.split()])
+    except ValueError as error:
+        raise UserError(f"{where}: {cell!r} is not a list of numbers") from error
+    if numbers.size != count:
+        raise UserError(f"{where}: expected {count} numbers, found {numbers.size}: {cell!r}")
+    return numbers
+
+
+def _difference(found: Sequence[str], expected: Sequence[str]) -> str:
+    missing = [sample for sample in expected if sample not in set(found)]
+    surplus = [sample for sample in found if sample not in set(expected)]
+    if missing:
+        return f"{len(missing)} samples are missing, the first is {missing[0]}"
+    if surplus:
+        return f"{len(surplus)} samples are not in test.csv, the first is {surplus[0]}"
+    if len(found) != len(expected):
+        return "a sample stands there twice"
+    return "the samples are not in the order of test.csv"

@@ -1,0 +1,96 @@
+"""A pinhole camera and what follows from two of them.
+
+Pixel centres are at integer coordinates: (0, 0) is the centre of the top-left pixel, x to the right, y down.
+The world has z up; a camera looks along its +z. `X_cam = R X + t`.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """K, R: (3, 3) float64; t: (3,) float64 in world units; width, height in pixels."""
+
+    K: Floats
+    R: Floats
+    t: Floats
+    width: int
+    height: int
+
+    @property
+    def centre(self) -> Floats:
+        """The position in the world, (3,)."""
+        return np.asarray(-self.R.T @ self.t, dtype=np.float64)
+
+
+def look_at(
+    position: ArrayLike, target: ArrayLike, *, focal: float, width: int, height: int, roll: float = 0.0
+) -> Camera:
+    """A camera at `position` with `target` in the middle of its image.
+
+    `focal` is in pixels; `roll` turns the camera clockwise about its axis, in degrees. Position and target
+    are (3,) world points, not above one another.
+    """
+    centre = np.asarray(position, dtype=np.float64)
+    forward = _unit(np.asarray(target, dtype=np.float64) - centre)
+    right = _unit(np.cross(forward, (0.0, 0.0, 1.0)))
+    down = np.cross(forward, right)
+    cos, sin = np.cos(np.radians(roll)), np.sin(np.radians(roll))
+    R = np.stack([cos * right + sin * down, cos * down - sin * right, forward])
+    K = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]], dtype=np.float64)
+    return Camera(K, R, -R @ centre, width, height)
+
+
+def resized(camera: Camera, scale: float) -> Camera:
+    """The camera of the image made `scale` times as large: `x' = (x + 0.5) * scale - 0.5`.
+
+    Sides are rounded to whole pixels while K keeps the exact scale, so at most half a pixel is cut or added
+    on the right and at the bottom.
+    """
+    to_resized = np.array([[scale, 0, (scale - 1) / 2], [0, scale, (scale - 1) / 2], [0, 0, 1]])
+    return replace(
+        camera,
+        K=to_resized @ camera.K,
+        width=max(1, round(camera.width * scale)),
+        height=max(1, round(camera.height * scale)),
+    )
+
+
+def project(camera: Camera, points: Floats) -> tuple[Floats, Floats]:
+    """World points (N, 3) to pixels (N, 2) and depths (N,); pixels mean nothing where depth <= 0."""
+    image = (points @ camera.R.T + camera.t) @ camera.K.T
+    depth = image[:, 2]
+    return image[:, :2] / np.where(depth == 0, np.finfo(np.float64).tiny, depth)[:, None], depth
+
+
+def unproject(camera: Camera, pixels: Floats, depth: Floats) -> Floats:
+    """Pixels (N, 2) and their depths (N,), measured along the camera's axis, to world points (N, 3)."""
+    rays = np.column_stack([pixels, np.ones(len(pixels))]) @ np.linalg.inv(camera.K).T
+    return np.asarray((rays * depth[:, None] - camera.t) @ camera.R, dtype=np.float64)
+
+
+def relative_fundamental(first: Camera, second: Camera) -> Floats:
+    """F (3, 3) with `x2^T F x1 = 0` and unit Frobenius norm: `K2^-T [t]x R K1^-1`.
+
+    Raises ValueError when the two cameras stand at the same point: there is no F then.
+    """
+    R = second.R @ first.R.T
+    t = second.t - R @ first.t
+    F = np.linalg.inv(second.K).T @ _cross_matrix(t) @ R @ np.linalg.inv(first.K)
+    if np.linalg.norm(t) < 1e-9 * max(1.0, float(np.linalg.norm(first.t))):
+        raise ValueError("the two cameras have one centre: F is not defined")
+    return np.asarray(F / np.linalg.norm(F), dtype=np.float64)
+
+
+def _cross_matrix(t: Floats) -> Floats:
+    x, y, z = t
+    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+
+
+def _unit(vector: Floats) -> Floats:
+    return np.asarray(vector / np.linalg.norm(vector), dtype=np.float64)

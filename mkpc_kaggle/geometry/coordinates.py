@@ -1,0 +1,132 @@
+"""Boxes and views: the one place where pixels are converted.
+
+Pixel centres are at integers: the centre of the top-left pixel is (0, 0), x runs right, y runs down, and an
+image of width w covers [-0.5, w - 0.5). A resize by s maps ``x_view = (x + 0.5) * s - 0.5``, with one s for
+each axis from the *actual* sizes. A crop subtracts an integer offset. Padding goes to the right and the
+bottom, so it moves nothing. A flip mirrors the resized content: ``x_view = w - 1 - x``.
+"""
+
+from dataclasses import dataclass
+from math import ceil
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Points = NDArray[np.float32]
+Pixels = NDArray[np.uint8]
+
+
+class Size(NamedTuple):
+    """Width and height in pixels."""
+
+    width: int
+    height: int
+
+
+@dataclass(frozen=True)
+class Box:
+    """A half-open box of whole pixels: columns ``left <= x < right``, rows ``top <= y < bottom``."""
+
+    left: int
+    top: int
+    right: int
+    bottom: int
+
+    def __post_init__(self) -> None:
+        if self.left >= self.right or self.top >= self.bottom:
+            raise ValueError(f"an empty box: {self}")
+
+    @classmethod
+    def whole(cls, size: Size) -> "Box":
+        return cls(0, 0, size.width, size.height)
+
+    @property
+    def size(self) -> Size:
+        return Size(self.right - self.left, self.bottom - self.top)
+
+    @property
+    def area(self) -> int:
+        return self.size.width * self.size.height
+
+    def contains(self, points: NDArray[np.floating]) -> NDArray[np.bool_]:
+        """Which points, (N, 2) in image pixels, lie on the box's pixels; NaN lies nowhere."""
+        x, y = points[:, 0], points[:, 1]
+        return (x >= self.left - 0.5) & (x < self.right - 0.5) & (y >= self.top - 0.5) & (y < self.bottom - 0.5)
+
+
+@dataclass(frozen=True)
+class View:
+    """What a matcher is shown: a crop of an image, resized, perhaps mirrored, padded right and bottom.
+
+    ``crop`` is in image pixels, ``content`` the size of the resized crop, ``padded`` the size of the picture
+    with its padding.
+    """
+
+    crop: Box
+    content: Size
+    padded: Size
+    flip: bool = False
+
+    def __post_init__(self) -> None:
+        if min(self.content) < 1:
+            raise ValueError(f"a view without pixels: {self.content}")
+        if self.padded.width < self.content.width or self.padded.height < self.content.height:
+            raise ValueError(f"padding cannot shrink: content {self.content}, padded {self.padded}")
+
+    @classmethod
+    def fit(cls, crop: Box, *, long_side: int, multiple: int = 1, flip: bool = False) -> "View":
+        """The view of ``crop`` whose longer side is ``long_side`` pixels, its aspect kept to the nearest pixel.
+
+        Both sides are then padded up to a multiple of ``multiple``. Raises ``ValueError`` where a side is not
+        positive.
+        """
+        scale = long_side / max(crop.size)
+        width, height = (max(1, round(side * scale)) for side in crop.size)
+        padded = Size(*(ceil(side / multiple) * multiple for side in (width, height)))
+        return cls(crop, Size(width, height), padded, flip)
+
+    @property
+    def scale(self) -> tuple[float, float]:
+        """View pixels per image pixel, (s_x, s_y)."""
+        return self.content.width / self.crop.size.width, self.content.height / self.crop.size.height
+
+    def from_image(self, points: NDArray[np.floating]) -> NDArray[np.float64]:
+        """(N, 2) image pixels -> (N, 2) view pixels."""
+        offset = np.array([self.crop.left, self.crop.top])
+        resized = (np.asarray(points, np.float64) - offset + 0.5) * self.scale - 0.5
+        return self._mirror(np.asarray(resized, np.float64))
+
+    def to_image(self, points: NDArray[np.floating]) -> NDArray[np.float64]:
+        """(N, 2) view pixels -> (N, 2) image pixels: the inverse of :meth:`from_image`."""
+        offset = np.array([self.crop.left, self.crop.top])
+        resized = self._mirror(np.asarray(points, np.float64))
+        return np.asarray((resized + 0.5) / self.scale - 0.5 + offset, np.float64)
+
+    def holds(self, points: NDArray[np.floating]) -> NDArray[np.bool_]:
+        """Which (N, 2) view points lie on content rather than on padding or outside; NaN lies nowhere."""
+        return Box.whole(self.content).contains(points)
+
+    def render(self, image: Pixels) -> Pixels:
+        """The picture: (H, W) or (H, W, 3) uint8 image -> the same with ``padded`` height and width.
+
+        Padding is black. Shrinking averages areas, so that nothing aliases; enlarging is bilinear. Both use
+        the half-pixel convention of this module.
+        """
+        crop = self.crop
+        cut = image[crop.top : crop.bottom, crop.left : crop.right]
+        if cut.shape[1::-1] != crop.size:
+            raise ValueError(f"the crop {crop} leaves the image of {image.shape[1]} x {image.shape[0]} pixels")
+        shrinks = min(self.scale) < 1
+        picture = cv2.resize(cut, self.content, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
+        if self.flip:
+            picture = picture[:, ::-1]
+        right = self.padded.width - self.content.width
+        bottom = self.padded.height - self.content.height
+        return np.pad(picture, ((0, bottom), (0, right)) + ((0, 0),) * (image.ndim - 2))
+
+    def _mirror(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        if not self.flip:
+            return points
+        return np.column_stack([self.content.width - 1 - points[:, 0], points[:, 1]])

@@ -1,0 +1,127 @@
+"""The critical region of an image: Matching Key-Points Crop (the paper's Algorithm 1) and Crop Area Expansion.
+
+Each image is treated on its own: its matched points of stage 1, normalised by its width and height, are
+clustered; the big clusters are kept; their bounding box, scaled about its centre, is the critical region.
+Where that cannot be trusted the whole image stands in, and the region says why.
+"""
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mkpc_kaggle.geometry.clustering import dbscan
+from mkpc_kaggle.geometry.coordinates import Box, Points, Size
+
+
+class Ratio(StrEnum):
+    """What a cluster's size is compared with."""
+
+    LARGEST = "largest"
+    """the largest cluster: Algorithm 1"""
+    LAST_KEPT = "last-kept"
+    """the cluster kept before it: a reading found in published code"""
+
+
+@dataclass(frozen=True)
+class MkpcConfig:
+    """Settings of :func:`critical_region`.
+
+    ``eps`` is in units of the image's width and height, ``share`` is Algorithm 1's T, ``min_clustered`` the
+    least share of points that must lie in clusters, ``min_side`` the least side of a crop in pixels.
+    ``expand_x`` and ``expand_y`` are the paper's e_h and e_v.
+    """
+
+    eps: float = 0.05
+    min_samples: int = 5
+    share: float = 0.05
+    ratio: Ratio = Ratio.LARGEST
+    expand_x: float = 1.05
+    expand_y: float = 1.0
+    min_clustered: float = 0.2
+    min_side: int = 32
+
+
+class RegionReason(StrEnum):
+    """Why a region is what it is: the first is a crop, the others say why the whole image stands in."""
+
+    CROPPED = "cropped"
+    TOO_FEW_POINTS = "too few points"
+    NO_CLUSTER = "no cluster"
+    TOO_SCATTERED = "too few points in clusters"
+    TOO_SMALL = "box too small"
+
+
+@dataclass(frozen=True)
+class CriticalRegion:
+    """The box of one image that stage 2 looks at, in image pixels, and the reason for it.
+
+    ``clusters`` counts the clusters found, ``kept`` those whose points span the box.
+    """
+
+    box: Box
+    reason: RegionReason
+    clusters: int = 0
+    kept: int = 0
+
+    @property
+    def cropped(self) -> bool:
+        return self.reason is RegionReason.CROPPED
+
+
+def critical_region(points: Points, size: Size, config: MkpcConfig) -> CriticalRegion:
+    """The critical region of an image of ``size`` with matched ``points``, (N, 2) float32 in image pixels.
+
+    Points that are not finite or not on the image are ignored. Never raises on account of the points.
+    """
+    whole = Box.whole(size)
+    points = points[whole.contains(points)]
+    if len(points) < config.min_samples:
+        return CriticalRegion(whole, RegionReason.TOO_FEW_POINTS)
+    labels = cluster_points(points, size, config)
+    sizes = np.bincount(labels[labels >= 0])
+    if len(sizes) == 0:
+        return CriticalRegion(whole, RegionReason.NO_CLUSTER)
+    kept = keep_clusters(sizes, config.share, config.ratio)
+    if sizes.sum() < config.min_clustered * len(points):
+        return CriticalRegion(whole, RegionReason.TOO_SCATTERED, len(sizes), len(kept))
+    box = expand_box(points[np.isin(labels, kept)], size, config.expand_x, config.expand_y)
+    if min(box.size) < config.min_side:
+        return CriticalRegion(whole, RegionReason.TOO_SMALL, len(sizes), len(kept))
+    return CriticalRegion(box, RegionReason.CROPPED, len(sizes), len(kept))
+
+
+def cluster_points(points: Points, size: Size, config: MkpcConfig) -> NDArray[np.intp]:
+    """DBSCAN label of each point, (N,), -1 for noise; x is normalised by the width and y by the height."""
+    normalised = np.asarray(points, np.float64) / (size.width, size.height)
+    return dbscan(normalised, eps=config.eps, min_samples=config.min_samples)
+
+
+def keep_clusters(sizes: NDArray[np.intp], share: float, ratio: Ratio = Ratio.LARGEST) -> NDArray[np.intp]:
+    """Labels of the clusters to keep, largest first; ``sizes`` is (K,), the number of points by label.
+
+    The largest is kept, then the next while its size is at least ``share`` of the largest (or of the last
+    kept); the first that fails ends it. Clusters of one size keep their label order.
+    """
+    by_size = np.argsort(-sizes, kind="stable")
+    ranked = sizes[by_size]
+    against = ranked[0] if ratio is Ratio.LARGEST else ranked[:-1]
+    fails = ranked[1:] < share * against
+    stop = 1 + int(np.argmax(fails)) if fails.any() else len(ranked)
+    kept: NDArray[np.intp] = by_size[:stop]
+    return kept
+
+
+def expand_box(points: Points, size: Size, expand_x: float, expand_y: float) -> Box:
+    """Crop Area Expansion: the bounding box of ``points`` scaled about its centre, cut at the image's border.
+
+    The box is that of the points' pixels, [min, max + 1) in whole pixels, so nothing on the last row or
+    column is lost; scaled edges are rounded outwards.
+    """
+    low = np.floor(points.min(axis=0).astype(np.float64) + 0.5)
+    high = np.floor(points.max(axis=0).astype(np.float64) + 0.5) + 1
+    centre, half = (low + high) / 2, (high - low) / 2 * (expand_x, expand_y)
+    left, top = np.maximum(np.floor(centre - half), 0).astype(int)
+    right, bottom = np.minimum(np.ceil(centre + half), size).astype(int)
+    return Box(int(left), int(top), int(right), int(bottom))

@@ -1,0 +1,77 @@
+"""Corresponding points of one pair: always in full-image pixels outside a matcher; empty is a legal value."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mkpc_kaggle.geometry.coordinates import Box, Points, Size, View
+
+
+@dataclass(frozen=True, eq=False)
+class Matches:
+    """N corresponding points with scores; pixel centres at integers, (x, y).
+
+    ``points0`` and ``points1`` are (N, 2) float32, ``scores`` is (N,) float32, higher is surer. The order is
+    the matcher's own and is kept everywhere, because MAGSAC's result depends on it. Input of another dtype is
+    cast; shapes that disagree raise ``ValueError``.
+    """
+
+    points0: Points
+    points1: Points
+    scores: NDArray[np.float32]
+
+    def __post_init__(self) -> None:
+        for name, width in (("points0", (2,)), ("points1", (2,)), ("scores", ())):
+            array = np.ascontiguousarray(getattr(self, name), dtype=np.float32)
+            if array.shape != (len(self.scores), *width):
+                raise ValueError(f"{name} has shape {array.shape}, scores {np.shape(self.scores)}")
+            object.__setattr__(self, name, array)
+
+    @classmethod
+    def empty(cls) -> "Matches":
+        return cls(np.zeros((0, 2), np.float32), np.zeros((0, 2), np.float32), np.zeros(0, np.float32))
+
+    @classmethod
+    def concatenate(cls, parts: Iterable["Matches"]) -> "Matches":
+        """All parts, one after the other; nothing is merged or sorted."""
+        parts = list(parts)
+        if not parts:
+            return cls.empty()
+        return cls(
+            np.concatenate([part.points0 for part in parts]),
+            np.concatenate([part.points1 for part in parts]),
+            np.concatenate([part.scores for part in parts]),
+        )
+
+    def __len__(self) -> int:
+        return len(self.scores)
+
+    def __getitem__(self, index: NDArray[np.bool_] | NDArray[np.integer] | slice) -> "Matches":
+        """The matches that a mask, indices or a slice choose."""
+        return Matches(self.points0[index], self.points1[index], self.scores[index])
+
+    def best(self, most: int) -> "Matches":
+        """At most ``most`` matches, those of highest score, in their present order (ties: the earlier)."""
+        if len(self) <= most:
+            return self
+        chosen = np.argsort(-self.scores, kind="stable")[:most]
+        return self[np.sort(chosen)]
+
+    def inside(self, size0: Size, size1: Size) -> "Matches":
+        """Those with finite scores and both points on the pixels of images of these sizes."""
+        on_images = Box.whole(size0).contains(self.points0) & Box.whole(size1).contains(self.points1)
+        return self[on_images & np.isfinite(self.scores)]
+
+    def to_image(self, view0: View, view1: View) -> "Matches":
+        """Matches in view pixels -> image pixels, the way out of a matcher.
+
+        Dropped here: points that are not finite, points on padding or outside their view, non-finite scores.
+        """
+        kept = self[view0.holds(self.points0) & view1.holds(self.points1) & np.isfinite(self.scores)]
+        return Matches(
+            view0.to_image(kept.points0).astype(np.float32),
+            view1.to_image(kept.points1).astype(np.float32),
+            kept.scores,
+        )

@@ -1,0 +1,119 @@
+"""Scores: the mean average accuracy of the Image Matching Challenge 2022, and the pose AUC."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import inf
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.integrate import trapezoid
+
+from mkpc_kaggle.geometry.robust import Matrix3, poses_of_fundamental
+
+ROTATION_THRESHOLDS = np.linspace(1, 10, 10)
+"""Degrees; the i-th goes with the i-th of :data:`TRANSLATION_THRESHOLDS` (competition rules)."""
+TRANSLATION_THRESHOLDS = np.geomspace(0.2, 5, 10)
+"""Metres."""
+AUC_THRESHOLDS = (5.0, 10.0, 20.0)
+"""Degrees."""
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A calibrated camera: K (3, 3) in pixels; R (3, 3) and t (3,) take world to camera, X_cam = R X + t."""
+
+    K: Matrix3
+    R: Matrix3
+    t: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class PoseError:
+    """How far an F's pose is from the truth; infinite where there is no F.
+
+    ``rotation`` and ``translation_angle`` in degrees (the latter at most 90, as the sign is unknown),
+    ``translation`` in metres after scaling to the true length.
+    """
+
+    rotation: float
+    translation_angle: float
+    translation: float
+
+    @classmethod
+    def failed(cls) -> "PoseError":
+        return cls(inf, inf, inf)
+
+    @property
+    def angle(self) -> float:
+        """The larger of the two angular errors, in degrees: what the pose AUC counts."""
+        return max(self.rotation, self.translation_angle)
+
+
+def relative_pose(camera0: Camera, camera1: Camera) -> tuple[Matrix3, NDArray[np.float64]]:
+    """R (3, 3) and t (3,) with X_1 = R X_0 + t, in the cameras' world units."""
+    R = camera1.R @ camera0.R.T
+    return R, camera1.t - R @ camera0.t
+
+
+def fundamental_of_cameras(camera0: Camera, camera1: Camera) -> Matrix3:
+    """The true F with x1^T F x0 = 0, unit Frobenius norm: K1^-T [t]_x R K0^-1."""
+    R, t = relative_pose(camera0, camera1)
+    cross = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
+    F = np.linalg.inv(camera1.K).T @ cross @ R @ np.linalg.inv(camera0.K)
+    return np.asarray(F / np.linalg.norm(F))
+
+
+def pose_error(F: Matrix3, camera0: Camera, camera1: Camera, metres_per_unit: float) -> PoseError:
+    """The error of the pose that F stands for.
+
+    The competition is handed F alone, without points that could tell the two rotations of an F apart: the one
+    nearer to the truth counts, and the translation's sign is free.
+    """
+    R, t = relative_pose(camera0, camera1)
+    rotations, direction = poses_of_fundamental(F, camera0.K, camera1.K)
+    length = float(np.linalg.norm(t))
+    cosine = abs(float(direction @ t)) / max(length, np.finfo(float).tiny)
+    apart = min(float(np.linalg.norm(direction * length - t)), float(np.linalg.norm(direction * length + t)))
+    return PoseError(
+        rotation=min(rotation_angle(candidate @ R.T) for candidate in rotations),
+        translation_angle=float(np.degrees(np.arccos(min(cosine, 1.0)))),
+        translation=apart * metres_per_unit,
+    )
+
+
+def rotation_angle(R: Matrix3) -> float:
+    """The angle of a rotation matrix in degrees, 0 to 180; precise at both ends."""
+    skew = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+    return float(np.degrees(np.arctan2(np.linalg.norm(skew), np.trace(R) - 1)))
+
+
+def mean_average_accuracy(errors: Sequence[PoseError]) -> float:
+    """The mAA of one scene: the share of pairs within both thresholds, averaged over the ten threshold pairs.
+
+    NaN without pairs. Source: evaluation page of the Image Matching Challenge 2022.
+    """
+    if not errors:
+        return float("nan")
+    return float(np.mean([pair_accuracy(error) for error in errors]))
+
+
+def pair_accuracy(error: PoseError) -> float:
+    """The share of the ten threshold pairs that one pair's error meets: its part of the mAA."""
+    meets = (error.rotation < ROTATION_THRESHOLDS) & (error.translation < TRANSLATION_THRESHOLDS)
+    return float(np.mean(meets))
+
+
+def pose_auc(errors: Sequence[PoseError], threshold: float) -> float:
+    """Area under the recall curve of the angular error up to ``threshold`` degrees, 0 to 1; NaN without pairs.
+
+    The curve is the piecewise linear one through (error_i, i / n), sorted, as is usual since SuperGlue.
+    """
+    if not errors:
+        return float("nan")
+    angles = np.sort([error.angle for error in errors])
+    recall = np.arange(1, len(angles) + 1) / len(angles)
+    angles, recall = np.concatenate([[0.0], angles]), np.concatenate([[0.0], recall])
+    last = int(np.searchsorted(angles, threshold))
+    x = np.append(angles[:last], threshold)
+    y = np.append(recall[:last], recall[last - 1])
+    return float(trapezoid(y, x) / threshold)

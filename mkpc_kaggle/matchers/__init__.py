@@ -1,0 +1,1 @@
+"""The matchers: one contract, one registry, one file each."""

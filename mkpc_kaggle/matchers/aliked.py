@@ -1,0 +1,70 @@
+"""ALIKED keypoints (Zhao et al. 2023, kornia's network) with mutual nearest neighbours."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from kornia.feature import ALIKED
+
+from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.matchers.contract import MatcherSpec, Picture
+from mkpc_kaggle.matchers.neighbours import mutual_neighbours
+from mkpc_kaggle.matchers.sparse import Keypoints, image_batch, matches_of
+from mkpc_kaggle.weights import WeightStore
+
+SLOT = "aliked-n16"
+
+
+@dataclass(frozen=True)
+class AlikedOptions:
+    """``features``: the strongest kept in each picture. ``ratio`` of 1 leaves the mutual test alone."""
+
+    features: int = 2048
+    ratio: float = 1.0
+
+
+SPEC = MatcherSpec(
+    "aliked",
+    "ALIKED n16, mutual nearest neighbours",
+    AlikedOptions,
+    multiple=32,
+    licences=("BSD-3-Clause",),
+    slots=(SLOT,),
+)
+
+
+class AlikedMatcher:
+    """A match's score is the cosine of its descriptors."""
+
+    spec = SPEC
+
+    def __init__(self, network: ALIKED, options: AlikedOptions, device: str) -> None:
+        self.options = options
+        self.device = device
+        self._network = network.eval().to(device)
+
+    @torch.inference_mode()
+    def encode(self, pictures: Sequence[Picture]) -> list[Keypoints]:
+        found = self._network(image_batch(list(pictures), self.device))
+        return [
+            Keypoints.on_content(features.keypoints, features.descriptors, picture.content)
+            for features, picture in zip(found, pictures, strict=True)
+        ]
+
+    @torch.inference_mode()
+    def match(self, encodings0: Sequence[Keypoints], encodings1: Sequence[Keypoints]) -> list[Matches]:
+        return [self._match(*pair) for pair in zip(encodings0, encodings1, strict=True)]
+
+    def _match(self, keypoints0: Keypoints, keypoints1: Keypoints) -> Matches:
+        pairs = mutual_neighbours(keypoints0.descriptors, keypoints1.descriptors)
+        passed = pairs.ratio <= self.options.ratio
+        return matches_of(
+            keypoints0, keypoints1, pairs.index0[passed], pairs.index1[passed], pairs.similarity[passed]
+        )
+
+
+def load(weights: WeightStore, options: AlikedOptions, device: str) -> AlikedMatcher:
+    network = ALIKED(model_name="aliked-n16", max_num_keypoints=options.features, detection_threshold=0.0)
+    # The sampling grid is a computed buffer that checkpoints do not carry.
+    network.load_state_dict({"dkd.hw_grid": network.dkd.hw_grid, **weights.load(SLOT)})
+    return AlikedMatcher(network, options, device)

@@ -1,0 +1,102 @@
+"""What a matcher is: it looks at each picture alone, then at two of them together.
+
+One contract serves sparse, semi-dense and dense networks. ``encode`` does what depends on one picture
+(keypoints and descriptors, or a backbone's feature maps); its results are cached, because views of whole
+images come back in many pairs. ``match`` does the rest.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, is_dataclass
+from enum import StrEnum
+from typing import Any, Protocol, TypeVar
+
+from mkpc_kaggle.geometry.coordinates import Pixels, Size, View
+from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.weights import WeightStore
+
+
+class Colour(StrEnum):
+    """What a matcher's pictures hold: (H, W, 3) RGB or (H, W) gray."""
+
+    RGB = "rgb"
+    GRAY = "gray"
+
+
+@dataclass(frozen=True)
+class MatcherSpec:
+    """What can be said of a matcher before it is loaded.
+
+    ``multiple``: both sides of its pictures are padded to a multiple of it. ``same_size``: both pictures of a
+    pair must have one size. ``licences``: tags of its weights. ``slots``: what it needs of the manifest.
+    ``options``: a frozen dataclass of its settings, which a recipe's table ``[matchers.NAME]`` may change.
+    """
+
+    name: str
+    summary: str
+    options: type
+    colour: Colour = Colour.RGB
+    multiple: int = 1
+    same_size: bool = False
+    licences: tuple[str, ...] = ()
+    slots: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """What a matcher is shown: ``pixels`` uint8, (H, W, 3) RGB or (H, W) gray, and how it was cut.
+
+    Only the top-left ``content`` holds the image; the rest is padding, on which no point may lie.
+    """
+
+    pixels: Pixels
+    view: View
+
+    @property
+    def content(self) -> Size:
+        return self.view.content
+
+
+Encoding = TypeVar("Encoding")
+
+
+class Matcher(Protocol[Encoding]):
+    """A loaded matcher. Both calls answer item by item, in order."""
+
+    @property
+    def spec(self) -> MatcherSpec: ...
+
+    def encode(self, pictures: Sequence[Picture]) -> Sequence[Encoding]:
+        """Encodings of pictures that have one shape; dataclasses, so that their bytes can be counted."""
+        ...
+
+    def match(self, encodings0: Sequence[Encoding], encodings1: Sequence[Encoding]) -> Sequence[Matches]:
+        """The matches of each pair of encodings, in view pixels; empty is legal."""
+        ...
+
+
+class Loader(Protocol):
+    """Builds a matcher on a device ("cpu", "cuda:0") from its weights and its options."""
+
+    def __call__(self, weights: WeightStore, options: Any, device: str) -> Matcher[Any]: ...
+
+
+@dataclass(frozen=True)
+class MatcherEntry:
+    """A matcher that the registry knows."""
+
+    spec: MatcherSpec
+    load: Loader
+
+
+Registry = Mapping[str, MatcherEntry]
+
+
+def encoding_bytes(encoding: Any) -> int:
+    """The bytes of all arrays and tensors in an encoding, nested dataclasses and tuples included."""
+    if hasattr(encoding, "nbytes"):
+        return int(encoding.nbytes)
+    if is_dataclass(encoding):
+        return sum(encoding_bytes(getattr(encoding, field.name)) for field in fields(encoding))
+    if isinstance(encoding, tuple | list):
+        return sum(map(encoding_bytes, encoding))
+    return 0

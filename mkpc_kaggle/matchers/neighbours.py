@@ -1,0 +1,57 @@
+"""Mutual nearest neighbours of descriptors, in blocks, so that no N x M matrix is ever held."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+BLOCK_ROWS = 2048
+
+
+@dataclass(frozen=True)
+class Neighbours:
+    """M mutual pairs: ``index0`` and ``index1`` (M,) int64, ``similarity`` (M,) cosine in -1..1, and
+    ``ratio`` (M,), the distance to the nearest over that to the second nearest, the larger of both ways.
+    """
+
+    index0: Tensor
+    index1: Tensor
+    similarity: Tensor
+    ratio: Tensor
+
+
+def mutual_neighbours(descriptors0: Tensor, descriptors1: Tensor) -> Neighbours:
+    """Pairs of unit descriptors, (N, D) and (M, D), each other's nearest; in order of the first image.
+
+    Of equal neighbours the one of lower index counts. With fewer than two descriptors on a side there is no
+    second neighbour: the ratio is that of a second at the greatest distance.
+    """
+    if len(descriptors0) == 0 or len(descriptors1) == 0:
+        nothing = descriptors0.new_zeros(0)
+        return Neighbours(nothing.long(), nothing.long(), nothing, nothing)
+    best0, second0, nearest0 = _two_best(descriptors0, descriptors1)
+    best1, second1, nearest1 = _two_best(descriptors1, descriptors0)
+    index0 = torch.arange(len(descriptors0), device=descriptors0.device)
+    index0 = index0[nearest1[nearest0] == index0]
+    index1 = nearest0[index0]
+    ratio0, ratio1 = _distance_ratio(best0, second0)[index0], _distance_ratio(best1, second1)[index1]
+    return Neighbours(index0, index1, best0[index0], torch.maximum(ratio0, ratio1))
+
+
+def _two_best(queries: Tensor, keys: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Highest and second highest similarity of each query (N,), and the index of the highest (N,)."""
+    best, second, nearest = [], [], []
+    for start in range(0, len(queries), BLOCK_ROWS):
+        similarity = queries[start : start + BLOCK_ROWS] @ keys.T  # (rows, M)
+        top, index = similarity.max(dim=1)
+        best.append(top)
+        nearest.append(index)
+        similarity.scatter_(1, index[:, None], -1.0)
+        second.append(similarity.amax(dim=1))
+    return torch.cat(best), torch.cat(second), torch.cat(nearest)
+
+
+def _distance_ratio(best: Tensor, second: Tensor) -> Tensor:
+    """Euclidean distances of unit vectors are sqrt(2 - 2 s)."""
+    nearest, next_nearest = (1 - best).clamp(min=0), (1 - second).clamp(min=1e-12)
+    return (nearest / next_nearest).sqrt()

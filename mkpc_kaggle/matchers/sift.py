@@ -1,0 +1,74 @@
+"""RootSIFT with mutual nearest neighbours and the ratio test: classical, needs no weights.
+
+Sources: Lowe 2004 (SIFT, as in OpenCV); Arandjelovic and Zisserman 2012 (RootSIFT).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.matchers.contract import Colour, MatcherSpec, Picture
+from mkpc_kaggle.matchers.neighbours import mutual_neighbours
+from mkpc_kaggle.matchers.sparse import Keypoints, matches_of
+from mkpc_kaggle.weights import WeightStore
+
+
+@dataclass(frozen=True)
+class SiftOptions:
+    """``features``: the strongest kept in each picture. ``ratio``: matches must be below it both ways."""
+
+    features: int = 8000
+    ratio: float = 0.8
+    contrast_threshold: float = 0.04
+
+
+SPEC = MatcherSpec("sift", "RootSIFT, mutual nearest neighbours, ratio test", SiftOptions, Colour.GRAY)
+
+
+class SiftMatcher:
+    """OpenCV's SIFT; a match's score is one minus its distance ratio."""
+
+    spec = SPEC
+
+    def __init__(self, options: SiftOptions, device: str) -> None:
+        self.options = options
+        self.device = device
+        self._sift = cv2.SIFT_create(options.features, contrastThreshold=options.contrast_threshold)  # type: ignore[attr-defined,unused-ignore]
+
+    def encode(self, pictures: Sequence[Picture]) -> list[Keypoints]:
+        return [self._encode(picture) for picture in pictures]
+
+    def match(self, encodings0: Sequence[Keypoints], encodings1: Sequence[Keypoints]) -> list[Matches]:
+        return [self._match(*pair) for pair in zip(encodings0, encodings1, strict=True)]
+
+    def _encode(self, picture: Picture) -> Keypoints:
+        found, descriptors = self._sift.detectAndCompute(picture.pixels, None)
+        points = np.array([keypoint.pt for keypoint in found], np.float32).reshape(-1, 2)
+        descriptors = np.zeros((0, 128), np.float32) if descriptors is None else root_sift(descriptors)
+        return Keypoints.on_content(
+            torch.from_numpy(points).to(self.device),
+            torch.from_numpy(descriptors).to(self.device),
+            picture.content,
+        )
+
+    def _match(self, keypoints0: Keypoints, keypoints1: Keypoints) -> Matches:
+        pairs = mutual_neighbours(keypoints0.descriptors, keypoints1.descriptors)
+        passed = pairs.ratio < self.options.ratio
+        return matches_of(
+            keypoints0, keypoints1, pairs.index0[passed], pairs.index1[passed], 1 - pairs.ratio[passed]
+        )
+
+
+def root_sift(descriptors: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(K, 128) SIFT -> (K, 128) float32 unit vectors whose dot product is the Hellinger kernel."""
+    sums = np.maximum(descriptors.sum(axis=1, keepdims=True), np.finfo(np.float32).tiny)
+    return np.asarray(np.sqrt(descriptors / sums), np.float32)
+
+
+def load(weights: WeightStore, options: SiftOptions, device: str) -> SiftMatcher:
+    return SiftMatcher(options, device)

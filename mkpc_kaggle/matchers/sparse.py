@@ -1,0 +1,47 @@
+"""What keypoint matchers share: the encoding of a picture, and matches from pairs of indices."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mkpc_kaggle.geometry.coordinates import Size
+from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.matchers.contract import Picture
+
+
+@dataclass(frozen=True, eq=False)
+class Keypoints:
+    """K keypoints of one picture: ``points`` (K, 2) float32 in view pixels, unit ``descriptors`` (K, D)."""
+
+    points: Tensor
+    descriptors: Tensor
+    content: Size
+
+    @classmethod
+    def on_content(cls, points: Tensor, descriptors: Tensor, content: Size) -> "Keypoints":
+        """Those that lie on the picture's content rather than on its padding."""
+        upper = points.new_tensor(content) - 0.5
+        kept = ((points >= -0.5) & (points < upper)).all(dim=1)
+        return cls(points[kept], descriptors[kept], content)
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+def matches_of(
+    keypoints0: Keypoints, keypoints1: Keypoints, index0: Tensor, index1: Tensor, scores: Tensor
+) -> Matches:
+    """The matches that pair keypoint ``index0[i]`` of one picture with ``index1[i]`` of the other."""
+    return Matches(
+        keypoints0.points[index0].cpu().numpy(), keypoints1.points[index1].cpu().numpy(), scores.cpu().numpy()
+    )
+
+
+def image_batch(pictures: list[Picture], device: str) -> Tensor:
+    """Pictures of one shape as float32 in [0, 1]: (B, 3, H, W) from RGB, (B, 1, H, W) from gray."""
+    stacked = np.stack([picture.pixels for picture in pictures])
+    batch = torch.from_numpy(stacked).to(device)
+    batch = batch[:, None] if stacked.ndim == 3 else batch.permute(0, 3, 1, 2)
+    return batch.float() / 255

@@ -1,0 +1,114 @@
+"""XFeat keypoints matched by LighterGlue (Potje et al. 2024; kornia's networks)."""
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from kornia.feature import LightGlue, XFeat
+from torch import Tensor, nn
+
+from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.matchers.contract import MatcherSpec, Picture
+from mkpc_kaggle.matchers.sparse import Keypoints, image_batch, matches_of
+from mkpc_kaggle.weights import WeightStore
+
+XFEAT, LIGHTERGLUE = "xfeat", "xfeat-lighterglue"
+
+
+@dataclass(frozen=True)
+class XFeatLighterGlueOptions:
+    """``features``: the strongest kept in each picture. ``threshold``: matches must score above it."""
+
+    features: int = 2048
+    threshold: float = 0.1
+
+
+SPEC = MatcherSpec(
+    "xfeat_lighterglue",
+    "XFeat with LighterGlue: fast, learned",
+    XFeatLighterGlueOptions,
+    multiple=32,
+    licences=("Apache-2.0",),
+    slots=(XFEAT, LIGHTERGLUE),
+)
+
+
+class XFeatLighterGlueMatcher:
+    """A match's score is LighterGlue's."""
+
+    spec = SPEC
+
+    def __init__(self, xfeat: XFeat, glue: LightGlue, options: XFeatLighterGlueOptions, device: str) -> None:
+        self.options = options
+        self.device = device
+        self._xfeat = xfeat.eval().to(device)
+        self._glue = glue.eval().to(device)
+
+    @torch.inference_mode()
+    def encode(self, pictures: Sequence[Picture]) -> list[Keypoints]:
+        batch = image_batch(list(pictures), self.device)
+        found = self._xfeat.detectAndCompute(batch, top_k=self.options.features)
+        return [
+            Keypoints.on_content(features["keypoints"], features["descriptors"], picture.content)
+            for features, picture in zip(found, pictures, strict=True)
+        ]
+
+    @torch.inference_mode()
+    def match(self, encodings0: Sequence[Keypoints], encodings1: Sequence[Keypoints]) -> list[Matches]:
+        return [self._match(*pair) for pair in zip(encodings0, encodings1, strict=True)]
+
+    def _match(self, keypoints0: Keypoints, keypoints1: Keypoints) -> Matches:
+        if len(keypoints0) == 0 or len(keypoints1) == 0:
+            return Matches.empty()
+        found = self._glue({"image0": _glue_input(keypoints0), "image1": _glue_input(keypoints1)})
+        pairs, scores = found["matches"][0], found["scores"][0]  # (M, 2), (M,)
+        return matches_of(keypoints0, keypoints1, pairs[:, 0], pairs[:, 1], scores)
+
+
+def _glue_input(keypoints: Keypoints) -> dict[str, Tensor]:
+    return {
+        "keypoints": keypoints.points[None],
+        "descriptors": keypoints.descriptors[None],
+        "image_size": keypoints.points.new_tensor([keypoints.content]),
+    }
+
+
+def load(weights: WeightStore, options: XFeatLighterGlueOptions, device: str) -> XFeatLighterGlueMatcher:
+    xfeat = XFeat(top_k=options.features)
+    # Its fine matcher serves semi-dense matching only; some checkpoints are without it.
+    load_all_but(xfeat.net, weights.load(XFEAT), unused=r"fine_matcher\.", what=XFEAT)
+    tensors = {layer_name(name): tensor for name, tensor in weights.load(LIGHTERGLUE).items()}
+    layers = 1 + max(int(name.split(".")[1]) for name in tensors if name.startswith("transformers."))
+    glue = LightGlue(
+        None,  # type: ignore[arg-type]  # no download; kornia's annotation leaves it out
+        input_dim=64,
+        descriptor_dim=96,
+        n_layers=layers,
+        num_heads=1,
+        depth_confidence=-1,
+        width_confidence=-1,
+        filter_threshold=options.threshold,
+    )
+    # Without early stopping and pruning only the last layer's assignment is used.
+    early = rf"token_confidence\.|confidence_thresholds|log_assignment\.(?!{layers - 1}\.)"
+    load_all_but(glue, tensors, unused=early, what=LIGHTERGLUE)
+    return XFeatLighterGlueMatcher(xfeat, glue, options, device)
+
+
+def layer_name(name: str) -> str:
+    """LightGlue's present parameter name for that of an older checkpoint or of a training wrapper."""
+    return re.sub(r"^(self|cross)_attn\.(\d+)\.", r"transformers.\2.\1_attn.", name.removeprefix("matcher."))
+
+
+def load_all_but(network: nn.Module, tensors: Mapping[str, Tensor], *, unused: str, what: str) -> None:
+    """Load a checkpoint that may lack, or have besides, only entries whose names match ``unused``.
+
+    Raises :class:`UserError` for any other missing or surplus name.
+    """
+    own = network.state_dict()
+    odd = [name for name in own.keys() ^ tensors.keys() if not re.match(unused, name)]
+    if odd:
+        raise UserError(f"the weights for {what!r} do not fit the network: {', '.join(sorted(odd)[:5])}")
+    network.load_state_dict({**own, **{name: tensor for name, tensor in tensors.items() if name in own}})

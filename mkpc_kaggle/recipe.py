@@ -1,0 +1,158 @@
+"""Recipes: which matchers run on which views, in order of importance, and the settings of all that follows.
+
+A recipe is a TOML file: ``mkpc_kaggle/recipes/NAME.toml`` or one of the user's own.
+"""
+
+import tomllib
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field, replace
+from enum import StrEnum
+from pathlib import Path
+from typing import Any
+
+from mkpc_kaggle.config import check_keys, from_table
+from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.geometry.critical_region import MkpcConfig
+from mkpc_kaggle.geometry.robust import RobustConfig
+
+DIRECTORY = Path(__file__).resolve().parent / "recipes"
+
+
+class Mode(StrEnum):
+    """How a recipe's two stages are run; the last two are what the method is compared with."""
+
+    TWO_STAGE = "two-stage"
+    """as written: stage 2 looks at the critical regions"""
+    STAGE_1 = "stage-1"
+    """the units of stage 1 alone"""
+    WHOLE_IMAGES = "whole-images"
+    """every unit on whole images: the naive ensemble of equal inference count"""
+
+
+@dataclass(frozen=True)
+class Unit:
+    """One piece of work on one pair.
+
+    ``stage`` 1 looks at whole images, 2 at the critical regions; ``long_side`` is that of the resized view in
+    pixels; the ``max_matches`` surest matches are kept. ``flip`` mirrors both views. An ``extra`` unit is
+    left for the upgrade pass.
+    """
+
+    stage: int
+    matcher: str
+    long_side: int
+    max_matches: int = 4096
+    flip: bool = False
+    extra: bool = False
+
+    @property
+    def name(self) -> str:
+        """Such as ``2:sift@1280``: unique within a recipe."""
+        return f"{self.stage}:{self.matcher}@{self.long_side}{'~' if self.flip else ''}"
+
+
+@dataclass(frozen=True)
+class UpgradeConfig:
+    """Pairs with fewer inliers than ``below_inliers`` get the recipe's extra units when time is left."""
+
+    below_inliers: int = 100
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """Units in order of importance and the settings of MKPC, MAGSAC, the upgrade pass and the matchers.
+
+    The first unit is the sweep's: it has stage 1 and is not extra. Raises :class:`UserError` otherwise.
+    """
+
+    units: tuple[Unit, ...]
+    name: str = "unnamed"
+    description: str = ""
+    mkpc: MkpcConfig = field(default_factory=MkpcConfig)
+    magsac: RobustConfig = field(default_factory=RobustConfig)
+    upgrade: UpgradeConfig = field(default_factory=UpgradeConfig)
+    matchers: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        where = f"recipe {self.name!r}"
+        if not self.units:
+            raise UserError(f"{where} has no units")
+        if self.units[0].stage != 1 or self.units[0].extra:
+            raise UserError(f"{where}: the first unit sweeps all pairs, so it must have stage 1 and not be extra")
+        for unit in self.units:
+            if unit.stage not in (1, 2) or unit.long_side < 1 or unit.max_matches < 1:
+                raise UserError(f"{where}: stage must be 1 or 2, long_side and max_matches positive: {unit}")
+        names = [unit.name for unit in self.units]
+        for name in names:
+            if names.count(name) > 1:
+                raise UserError(f"{where} has the unit {name} twice")
+
+    @property
+    def regular(self) -> tuple[Unit, ...]:
+        """The units that every pair gets if time allows."""
+        return tuple(unit for unit in self.units if not unit.extra)
+
+    @property
+    def matcher_names(self) -> tuple[str, ...]:
+        """Each matcher once, in order of first use."""
+        return tuple(dict.fromkeys(unit.matcher for unit in self.units))
+
+    def only(self, wanted: Callable[[Unit], bool]) -> "Recipe":
+        """The same recipe with the units that ``wanted`` lets through."""
+        return replace(self, units=tuple(filter(wanted, self.units)))
+
+    def in_mode(self, mode: Mode) -> "Recipe":
+        """The recipe run another way, see :class:`Mode`."""
+        if mode is Mode.TWO_STAGE:
+            return self
+        name = f"{self.name} ({mode})"
+        if mode is Mode.STAGE_1:
+            return replace(self.only(lambda unit: unit.stage == 1), name=name)
+        whole = dict.fromkeys(replace(unit, stage=1) for unit in self.units)
+        return replace(self, name=name, units=tuple(whole))
+
+    def fingerprint(self) -> dict[str, Any]:
+        """All that decides what a run computes, as JSON-able values; name and description are no part of it."""
+        values = asdict(self)
+        del values["name"], values["description"]
+        return values
+
+
+def parse_recipe(text: str, name: str) -> Recipe:
+    """A recipe from TOML text; raises :class:`UserError` for what it cannot accept."""
+    where = f"recipe {name!r}"
+    try:
+        table = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise UserError(f"{where} is not valid TOML: {error}") from error
+    check_keys(table, ("description", "units", "mkpc", "magsac", "upgrade", "matchers"), where)
+    return Recipe(
+        units=tuple(
+            from_table(Unit, unit, f"{where}, unit {number}")
+            for number, unit in enumerate(table.get("units", []), start=1)
+        ),
+        name=name,
+        description=str(table.get("description", "")),
+        mkpc=from_table(MkpcConfig, table.get("mkpc", {}), f"{where}, table [mkpc]"),
+        magsac=from_table(RobustConfig, table.get("magsac", {}), f"{where}, table [magsac]"),
+        upgrade=from_table(UpgradeConfig, table.get("upgrade", {}), f"{where}, table [upgrade]"),
+        matchers=table.get("matchers", {}),
+    )
+
+
+def recipe_names() -> list[str]:
+    """The recipes that come with the package."""
+    return sorted(path.stem for path in DIRECTORY.glob("*.toml"))
+
+
+def load_recipe(name: str) -> Recipe:
+    """The recipe of that name, or in that ``.toml`` file; raises :class:`UserError` where there is none."""
+    path = Path(name) if name.endswith(".toml") else DIRECTORY / f"{name}.toml"
+    if not name.endswith(".toml") and name not in recipe_names():
+        raise UserError(
+            f"unknown recipe {name!r}; known: {', '.join(recipe_names())}, or a path that ends in .toml"
+        )
+    try:
+        return parse_recipe(path.read_text(encoding="utf-8"), path.stem)
+    except OSError as error:
+        raise UserError(f"recipe file {path} cannot be read: {error.strerror}") from error

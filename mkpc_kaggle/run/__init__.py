@@ -1,0 +1,1 @@
+"""The run engine: budget, journal, jobs and workers."""

@@ -1,0 +1,169 @@
+"""What the engine hands to a worker and what it gets back: plain values, so that they can cross processes."""
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+
+from mkpc_kaggle.competition import Pair
+from mkpc_kaggle.geometry.critical_region import CriticalRegion
+from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL, Matrix3
+from mkpc_kaggle.pipeline import PairMatch, UnitResult
+from mkpc_kaggle.recipe import Unit
+
+CHUNK = 8
+"""Pairs in a job: enough for a batch on a GPU, few enough to plan anew every some seconds."""
+
+
+NOT_REACHED = "not reached in time"
+
+
+class Phase(StrEnum):
+    """The passes of a run, in order."""
+
+    SWEEP = "sweep"
+    DEEPEN = "deepen"
+    UPGRADE = "upgrade"
+
+
+@dataclass(frozen=True)
+class Task:
+    """One pair of a job, with what earlier jobs found on it."""
+
+    index: int
+    pair: Pair
+    results: tuple[UnitResult, ...] = ()
+
+
+@dataclass(frozen=True)
+class Job:
+    """Run ``units`` on ``tasks``, those that a task has results of left out.
+
+    No unit is begun that is expected to end after ``deadline`` (seconds of the monotonic clock);
+    ``expected`` are the seconds that each unit is expected to take on a pair.
+    """
+
+    phase: Phase
+    tasks: tuple[Task, ...]
+    units: tuple[Unit, ...]
+    expected: tuple[float, ...]
+    deadline: float
+
+
+@dataclass(frozen=True)
+class UnitRecord:
+    """What the journal keeps of one unit on one pair."""
+
+    unit: str
+    stage: int
+    matches: int
+    inliers: int
+    encode_seconds: float
+    match_seconds: float
+    failure: str
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """What is known of one pair: its F and how it came about.
+
+    ``failure`` is empty, or says why ``F`` is the fallback. The seconds are those of the last job on the pair.
+    """
+
+    index: int
+    F: Matrix3
+    failure: str
+    units: tuple[UnitRecord, ...] = ()
+    regions: tuple[CriticalRegion, CriticalRegion] | None = None
+    decode_seconds: float = 0.0
+    cluster_seconds: float = 0.0
+    estimate_seconds: float = 0.0
+
+    @classmethod
+    def untouched(cls, index: int, reason: str = NOT_REACHED) -> "Record":
+        return cls(index, FALLBACK_FUNDAMENTAL.copy(), reason)
+
+    @property
+    def reached(self) -> bool:
+        return self.failure != NOT_REACHED
+
+    @property
+    def inliers(self) -> int:
+        return sum(unit.inliers for unit in self.units)
+
+    @property
+    def matches(self) -> int:
+        return sum(unit.matches for unit in self.units)
+
+    def has(self, unit: Unit) -> bool:
+        return any(record.unit == unit.name for record in self.units)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a job made of one task: the record to keep, and the results that later jobs may build on."""
+
+    record: Record
+    results: tuple[UnitResult, ...] = ()
+
+
+@dataclass(frozen=True)
+class JobResult:
+    """The outcomes of a job, one a task, in order."""
+
+    job: Job
+    outcomes: tuple[Outcome, ...]
+
+    def measured(self) -> list[tuple[str, float]]:
+        """Unit name and seconds of every unit that this job ran on a pair."""
+        return [
+            (result.unit.name, result.seconds)
+            for task, outcome in zip(self.job.tasks, self.outcomes, strict=True)
+            for result in outcome.results
+            if result.unit not in {before.unit for before in task.results}
+        ]
+
+
+def record_of(index: int, match: PairMatch, *, decode: float, cluster: float, estimate: float) -> Record:
+    """The record of a matched pair; the three are seconds."""
+    starts = np.cumsum([0] + [len(result.matches) for result in match.results])
+    return Record(
+        index,
+        match.estimate.matrix,
+        match.estimate.failure,
+        tuple(
+            UnitRecord(
+                result.unit.name,
+                result.unit.stage,
+                len(result.matches),
+                int(match.estimate.inliers[start : start + len(result.matches)].sum()),
+                result.encode_seconds,
+                result.match_seconds,
+                result.failure,
+            )
+            for result, start in zip(match.results, starts, strict=False)
+        ),
+        match.regions,
+        decode,
+        cluster,
+        estimate,
+    )
+
+
+def visiting_order(pairs: Sequence[Pair]) -> list[int]:
+    """Indices of pairs such that views of one image follow each other, and the encoding cache hits."""
+    return sorted(range(len(pairs)), key=lambda index: (pairs[index].group, *map(str, pairs[index].images)))
+
+
+def chunks(indices: Iterable[int]) -> Iterator[tuple[int, ...]]:
+    """One index alone, so that costs are known early, then :data:`CHUNK` at a time.
+
+    The same for every run of the same pairs, whatever was done before: a batch's composition can move the
+    last bits of a network's output.
+    """
+    indices = list(indices)
+    if indices:
+        yield (indices[0],)
+    for start in range(1, len(indices), CHUNK):
+        yield tuple(indices[start : start + CHUNK])

@@ -1,0 +1,190 @@
+"""Runs the engine on a train side and scores it as the competition does."""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import mean
+from typing import Any
+
+import numpy as np
+
+from mkpc_kaggle.assembly import Assembly
+from mkpc_kaggle.competition import Scene, TruePair, plain_name, read_submission, read_table
+from mkpc_kaggle.geometry.metrics import (
+    AUC_THRESHOLDS,
+    PoseError,
+    mean_average_accuracy,
+    pose_auc,
+    pose_error,
+)
+from mkpc_kaggle.geometry.robust import Matrix3
+from mkpc_kaggle.run.engine import RunReport
+from mkpc_kaggle.run.jobs import Record
+from mkpc_kaggle.run.session import Session, run_pairs
+
+
+@dataclass(frozen=True)
+class PairScore:
+    """One pair's error, infinite for a failed pair, and its record where the engine made one."""
+
+    id: str
+    covisibility: float
+    error: PoseError
+    record: Record | None = None
+
+
+@dataclass(frozen=True)
+class SceneScore:
+    """The scores of one scene's pairs."""
+
+    scene: str
+    pairs: tuple[PairScore, ...]
+
+    @property
+    def errors(self) -> list[PoseError]:
+        return [pair.error for pair in self.pairs]
+
+    @property
+    def maa(self) -> float:
+        return mean_average_accuracy(self.errors)
+
+    def auc(self, threshold: float) -> float:
+        return pose_auc(self.errors, threshold)
+
+
+@dataclass(frozen=True)
+class Validation:
+    """The scores of all scenes under one recipe; ``report`` is ``None`` for a submission scored from its file."""
+
+    recipe: str
+    scenes: tuple[SceneScore, ...]
+    report: RunReport | None = None
+
+    @property
+    def maa(self) -> float:
+        """The mean of the scenes' mAA: the competition's figure."""
+        return mean(scene.maa for scene in self.scenes)
+
+    def auc(self, threshold: float) -> float:
+        return mean(scene.auc(threshold) for scene in self.scenes)
+
+    @property
+    def records(self) -> list[Record]:
+        return [pair.record for scene in self.scenes for pair in scene.pairs if pair.record is not None]
+
+
+def validate(scenes: Sequence[Scene], assembly: Assembly, session: Session) -> tuple[Validation, bool]:
+    """Match all pairs of the scenes and score them; also whether every thread has come to rest."""
+    pairs = [true.pair for scene in scenes for true in scene.pairs]
+    report, at_rest = run_pairs(pairs, assembly, session)
+    records = iter(report.records)
+    scored = tuple(
+        SceneScore(scene.name, tuple(score_record(true, next(records), scene) for true in scene.pairs))
+        for scene in scenes
+    )
+    return Validation(assembly.recipe.name, scored, report), at_rest
+
+
+def score_record(true: TruePair, record: Record, scene: Scene) -> PairScore:
+    """The score of what the engine made of a pair; the fallback row counts as a failure."""
+    error = PoseError.failed() if record.failure else error_of(record.F, true, scene)
+    return PairScore(true.pair.id, true.covisibility, error, record)
+
+
+def error_of(F: Matrix3, true: TruePair, scene: Scene) -> PoseError:
+    return pose_error(F, true.camera0, true.camera1, scene.metres_per_unit)
+
+
+def score_submission(submission: Path, truth: Path, scenes: Sequence[Scene]) -> Validation:
+    """Score a submission whose samples are known pairs of a train side.
+
+    ``truth`` is a table ``sample_id,scene,image_1_id,image_2_id``, the images named as in the train side.
+    Samples that the table or the scenes lack are left out; raises
+    :class:`mkpc_kaggle.errors.UserError` for files that cannot be read.
+    """
+    found = read_submission(submission)
+    samples: dict[str, str] = {}
+    columns = ("sample_id", "scene", "image_1_id", "image_2_id")
+    for sample, scene, first, second in read_table(truth, columns)[list(columns)].itertuples(index=False):
+        samples[f"{plain_name(scene, truth)};{first}-{second}"] = sample
+    scored = []
+    for scene in scenes:
+        pairs = tuple(
+            PairScore(true.pair.id, true.covisibility, error_of(found[samples[true.pair.id]], true, scene))
+            for true in scene.pairs
+            if samples.get(true.pair.id) in found
+        )
+        if pairs:
+            scored.append(SceneScore(scene.name, pairs))
+    return Validation(submission.name, tuple(scored))
+
+
+def score_table(validation: Validation) -> list[str]:
+    """Lines: a row a scene and their mean, with mAA and pose AUC."""
+    heads = [f"AUC {threshold:.0f}" for threshold in AUC_THRESHOLDS]
+    lines = [f"{'scene':<20}{'pairs':>6}{'mAA':>9}" + "".join(f"{head:>9}" for head in heads)]
+    for scene in validation.scenes:
+        aucs = "".join(f"{scene.auc(threshold):>9.4f}" for threshold in AUC_THRESHOLDS)
+        lines.append(f"{scene.scene:<20}{len(scene.pairs):>6}{scene.maa:>9.4f}{aucs}")
+    aucs = "".join(f"{validation.auc(threshold):>9.4f}" for threshold in AUC_THRESHOLDS)
+    count = sum(len(scene.pairs) for scene in validation.scenes)
+    return [*lines, f"{'mean over scenes':<20}{count:>6}{validation.maa:>9.4f}{aucs}"]
+
+
+def to_json(validation: Validation) -> dict[str, Any]:
+    """All figures of a validation as JSON values: overall, per scene, per pair; infinite errors are null."""
+    records = validation.records
+    reasons = Counter(str(region.reason) for record in records for region in record.regions or ())
+    return {
+        "recipe": validation.recipe,
+        "mAA": validation.maa,
+        "AUC": {f"{threshold:g}": validation.auc(threshold) for threshold in AUC_THRESHOLDS},
+        "seconds": validation.report.seconds if validation.report else None,
+        "seconds_per_pair": validation.report.seconds / len(records) if validation.report else None,
+        "matches_by_stage": stage_means(records, "matches"),
+        "inliers_by_stage": stage_means(records, "inliers"),
+        "region_reasons": dict(reasons),
+        "scenes": [
+            {
+                "scene": scene.scene,
+                "mAA": scene.maa,
+                "AUC": {f"{threshold:g}": scene.auc(threshold) for threshold in AUC_THRESHOLDS},
+                "pairs": [_pair_json(pair) for pair in scene.pairs],
+            }
+            for scene in validation.scenes
+        ],
+    }
+
+
+def stage_means(records: Sequence[Record], what: str) -> Mapping[str, float]:
+    """Mean number of matches or inliers on a pair, by stage."""
+    return {
+        str(stage): float(
+            np.mean([sum(getattr(unit, what) for unit in r.units if unit.stage == stage) for r in records])
+        )
+        for stage in sorted({unit.stage for record in records for unit in record.units})
+    }
+
+
+def _pair_json(pair: PairScore) -> dict[str, Any]:
+    error, record = pair.error, pair.record
+    values: dict[str, Any] = {
+        "pair": pair.id,
+        "covisibility": pair.covisibility,
+        "rotation_error_degrees": _finite(error.rotation),
+        "translation_error_metres": _finite(error.translation),
+        "translation_error_degrees": _finite(error.translation_angle),
+    }
+    if record is not None:
+        values |= {
+            "failure": record.failure,
+            "inliers": record.inliers,
+            "matches": {unit.unit: unit.matches for unit in record.units},
+            "regions": [str(region.reason) for region in record.regions or ()],
+        }
+    return values
+
+
+def _finite(value: float) -> float | None:
+    return value if np.isfinite(value) else None

@@ -1,0 +1,252 @@
+"""`dbscan` against scikit-learn's, which is the definition, and against the clock."""
+
+import runpy
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_array_equal
+from sklearn.cluster import DBSCAN
+
+from mkpc_kaggle.geometry import clustering
+from mkpc_kaggle.geometry.clustering import dbscan
+
+DISTRIBUTIONS = runpy.run_path(str(Path(__file__).parents[1] / "benchmarks" / "clustering.py"))["DISTRIBUTIONS"]
+SIZE = 20_000
+MILLISECONDS = 250  # five times the promise: it must fail for what is quadratic, not for a busy machine
+
+
+def reference(points, *, eps, min_samples):
+    # The k-d tree always: the brute force that "auto" takes for a few points rounds |a|^2 - 2ab + |b|^2.
+    return DBSCAN(eps=eps, min_samples=min_samples, algorithm="kd_tree").fit_predict(points)
+
+
+def uniform(rng, n):
+    return rng.random((n, 2))
+
+
+def clumps(rng, n):
+    centre = rng.random((6, 2)) * 0.6
+    width = 10.0 ** rng.uniform(-4, -1, 6)
+    clump = rng.integers(6, size=n)
+    return centre[clump] + rng.normal(size=(n, 2)) * width[clump, None]
+
+
+def parallel_lines(rng, n):
+    angle = rng.uniform(0, np.pi)
+    along, across = rng.random(n), rng.integers(5, size=n) * 0.127
+    c, s = np.cos(angle), np.sin(angle)
+    return np.stack([c * along - s * across, s * along + c * across], axis=1)
+
+
+def exact_lattice(rng, n):
+    """Multiples of 1/8, many of them coincident: distances of exactly eps are everywhere."""
+    return rng.integers(-8, 8, (n, 2)) / 8
+
+
+def pythagorean_lattice(rng, n):
+    """Multiples of 1/80, which are rounded, and 3-4-5 triangles: eps 1/16 is five of them."""
+    return rng.integers(0, 60, (n, 2)) / 80
+
+
+def duplicated(rng, n):
+    distinct = rng.random((max(1, n // 20), 2))
+    return distinct[rng.integers(len(distinct), size=n)]
+
+
+def far_from_the_origin(rng, n):
+    return rng.random((n, 2)) - np.array([3e5, -7e6])
+
+
+FAMILIES = [uniform, clumps, parallel_lines, exact_lattice, pythagorean_lattice, duplicated, far_from_the_origin]
+SEEDS = st.integers(0, 2**32 - 1)
+EPS = st.sampled_from([0.01, 1 / 32, 0.05, 1 / 16, 0.1, 1 / 8, 0.17, 1 / 4, 0.5, 5.0])
+MIN_SAMPLES = st.one_of(st.integers(1, 12), st.integers(13, 100))
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+@given(seed=SEEDS, n=st.integers(1, 600), eps=EPS, min_samples=MIN_SAMPLES)
+@settings(max_examples=120, deadline=None)
+def test_labels_are_scikit_learns(family, seed, n, eps, min_samples):
+    points = family(np.random.default_rng(seed), n)
+    assert_array_equal(
+        dbscan(points, eps=eps, min_samples=min_samples), reference(points, eps=eps, min_samples=min_samples)
+    )
+
+
+@pytest.mark.parametrize(("chunk", "block", "heavy"), [(1 << 15, 1 << 12, 1), (7, 5, 4096), (1, 1, 20)])
+@pytest.mark.parametrize("family", [clumps, parallel_lines, exact_lattice])
+def test_small_inputs_take_the_paths_of_large_ones(family, chunk, block, heavy, monkeypatch):
+    monkeypatch.setattr(clustering, "_CHUNK", chunk)
+    monkeypatch.setattr(clustering, "_BLOCK", block)
+    monkeypatch.setattr(clustering, "_HEAVY_PAIR", heavy)
+    for seed in range(15):
+        rng = np.random.default_rng(seed)
+        points = family(rng, 200)
+        eps, min_samples = rng.choice([0.05, 0.125, 0.25]), int(rng.integers(1, 8))
+        assert_array_equal(
+            dbscan(points, eps=eps, min_samples=min_samples), reference(points, eps=eps, min_samples=min_samples)
+        )
+
+
+@pytest.mark.parametrize("heavy", [1, 4096])
+@pytest.mark.parametrize("family", [clumps, exact_lattice, pythagorean_lattice])
+def test_touching_cells_are_those_with_a_pair_within_eps(family, heavy, monkeypatch):
+    monkeypatch.setattr(clustering, "_HEAVY_PAIR", heavy)
+    cells = clustering._grid(family(np.random.default_rng(8), 300), 0.125)
+    a, b = cells.around(cells.keys)
+    members = [cells.xy[start : start + size] for start, size in zip(cells.start, cells.size, strict=True)]
+    expected = [cells.within(members[i][:, None] - members[j]).any() for i, j in zip(a, b, strict=True)]
+    assert 0 < np.count_nonzero(expected) < len(expected)
+    assert_array_equal(clustering._touching(cells, a, b), expected)
+
+
+@pytest.mark.parametrize(("eps", "touching"), [(0.625, True), (0.625 * (1 - 1e-12), False), (0.626, True)])
+def test_trees_leave_the_last_digits_to_exact_arithmetic(eps, touching, monkeypatch):
+    monkeypatch.setattr(clustering, "_HEAVY_PAIR", 1)
+    monkeypatch.setattr(clustering, "_facing", lambda p, q: (p, q))
+    cells = clustering._grid(np.array([[0.0, 0.0], [0.375, 0.5]]), eps)
+    assert len(cells.keys) == 2
+    assert_array_equal(clustering._touching(cells, np.array([0]), np.array([1])), [touching])
+
+
+@pytest.mark.parametrize("name", DISTRIBUTIONS)
+def test_labels_are_scikit_learns_on_the_named_distributions(name):
+    points = DISTRIBUTIONS[name](np.random.default_rng(1), 2000)
+    assert_array_equal(dbscan(points, eps=0.05, min_samples=5), reference(points, eps=0.05, min_samples=5))
+
+
+@pytest.mark.parametrize("name", DISTRIBUTIONS)
+def test_time_does_not_depend_on_the_distribution(name):
+    points = DISTRIBUTIONS[name](np.random.default_rng(2), SIZE)
+    best = np.inf
+    for _ in range(3):
+        begin = time.perf_counter()
+        dbscan(points, eps=0.05, min_samples=5)
+        best = min(best, time.perf_counter() - begin)
+    assert best * 1000 < MILLISECONDS
+
+
+@given(seed=SEEDS, n=st.integers(1, 300), min_samples=st.integers(1, 8))
+@settings(max_examples=60, deadline=None)
+def test_order_of_the_points_does_not_change_the_partition_of_core_points(seed, n, min_samples):
+    rng = np.random.default_rng(seed)
+    points = clumps(rng, n)
+    order = rng.permutation(n)
+    labels = dbscan(points, eps=0.05, min_samples=min_samples)[order]
+    shuffled = dbscan(points[order], eps=0.05, min_samples=min_samples)
+    squared = ((points[order][:, None] - points[order]) ** 2).sum(axis=-1)
+    core = (squared <= 0.05 * 0.05).sum(axis=1) >= min_samples
+    assert_array_equal(
+        labels[core][:, None] == labels[core], shuffled[core][:, None] == shuffled[core], err_msg="partition"
+    )
+    assert_array_equal(labels == -1, shuffled == -1, err_msg="noise")
+
+
+@given(seed=SEEDS, shift=st.tuples(*[st.integers(-(2**20), 2**20)] * 2), scale=st.integers(-60, 60))
+@settings(max_examples=60, deadline=None)
+def test_exact_translation_and_scale_do_not_change_labels(seed, shift, scale):
+    points = np.random.default_rng(seed).integers(0, 128, (250, 2)) / 128
+    labels = dbscan(points, eps=1 / 16, min_samples=4)
+    moved = (points + shift) * 2.0**scale
+    assert_array_equal(dbscan(moved, eps=2.0 ** (scale - 4), min_samples=4), labels)
+
+
+def test_runs_far_apart_are_clustered_as_each_would_be_near_the_origin():
+    rng = np.random.default_rng(3)
+    near = rng.integers(0, 64, (300, 2)) / 64
+    labels = dbscan(near, eps=1 / 16, min_samples=4)
+    far = np.concatenate([near, near - [0, 2.0**40], near - [2.0**40, 0], [[-1e300, 0], [1.7e308, -1.7e308]]])
+    clusters = labels.max() + 1
+    copies = [np.where(labels < 0, -1, labels + k * clusters) for k in range(3)]
+    assert clusters > 1
+    assert_array_equal(dbscan(far, eps=1 / 16, min_samples=4), np.concatenate([*copies, [-1, -1]]))
+
+
+@pytest.mark.parametrize("offset", [(0.5, 0.0), (0.0, -0.5), (0.375, 0.3125), (0.3, 0.4), (-0.4, 0.3)])
+def test_a_distance_of_exactly_eps_counts(offset):
+    eps = np.sqrt(offset[0] * offset[0] + offset[1] * offset[1])
+    eps = eps if eps * eps >= offset[0] * offset[0] + offset[1] * offset[1] else np.nextafter(eps, 1)
+    pair = np.array([(0.0, 0.0), offset])
+    assert_array_equal(dbscan(pair, eps=eps, min_samples=2), [0, 0])
+    assert_array_equal(dbscan(pair, eps=eps * (1 - 1e-12), min_samples=2), [-1, -1])
+    assert_array_equal(dbscan(pair, eps=eps * (1 - 1e-12), min_samples=1), [0, 1])
+
+
+@pytest.mark.parametrize("at", [2300, 2400, 2500, 2610])
+def test_one_touching_pair_joins_crowded_cells(at):
+    # Parallel lines 0.0503 apart: a cell has hundreds of their points, and the one that moves is no extreme of it.
+    x = np.linspace(0, 1, 5000)
+    points = np.concatenate([np.stack([x, 0.3 * x], axis=1), np.stack([x, 0.3 * x + 0.0525], axis=1)])
+    assert dbscan(points, eps=0.05, min_samples=5).max() == 1
+    points[at, 1] += 0.0002
+    assert dbscan(points, eps=0.05, min_samples=5).max() == 1
+    points[at, 1] += 0.0002
+    assert dbscan(points, eps=0.05, min_samples=5).max() == 0
+
+
+def test_a_border_point_takes_the_lowest_cluster_not_the_nearest():
+    # Two crosses of five points, arms of 1: their centres alone are core; (2, 0) ... is an arm of both.
+    arms = np.array([(0, 0), (0, 1), (0, -1), (-1, 0)], dtype=np.float64)
+    shared = np.array([[1.0, 0.0]])
+    near, far = arms * [-1, 1] + [1.75, 0], arms
+    for clusters in ([near, far], [far, near]):
+        points = np.concatenate([shared, *clusters])
+        labels = dbscan(points, eps=1.0, min_samples=5)
+        assert_array_equal(labels, [0] + [0] * 4 + [1] * 4)
+        assert_array_equal(labels, reference(points, eps=1.0, min_samples=5))
+
+
+def test_float32_is_taken_at_its_value():
+    points = np.random.default_rng(5).random((400, 2), dtype=np.float32)
+    labels = dbscan(points, eps=0.05, min_samples=4)
+    assert_array_equal(labels, reference(points.astype(np.float64), eps=0.05, min_samples=4))
+
+
+def test_degenerate_inputs():
+    empty = dbscan(np.empty((0, 2)), eps=0.05, min_samples=5)
+    assert empty.shape == (0,)
+    assert empty.dtype == np.intp
+    one = np.array([[0.2, 0.7]])
+    assert_array_equal(dbscan(one, eps=0.05, min_samples=1), [0])
+    assert_array_equal(dbscan(one, eps=0.05, min_samples=2), [-1])
+    same = np.repeat(one, 4, axis=0)
+    assert_array_equal(dbscan(same, eps=1e-9, min_samples=4), [0] * 4)
+    assert_array_equal(dbscan(same, eps=1e-9, min_samples=5), [-1] * 4)
+
+
+def test_the_input_is_left_alone():
+    points = np.random.default_rng(6).random((100, 2))
+    before = points.copy()
+    points.flags.writeable = False
+    dbscan(points, eps=0.1, min_samples=3)
+    assert_array_equal(points, before)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_points_must_be_finite(bad):
+    points = np.random.default_rng(7).random((10, 2))
+    points[3, 1] = bad
+    with pytest.raises(ValueError, match="finite"):
+        dbscan(points, eps=0.05, min_samples=5)
+
+
+@pytest.mark.parametrize("shape", [(4,), (4, 3), (2, 2, 2), (0,)])
+def test_points_must_be_in_the_plane(shape):
+    with pytest.raises(ValueError, match="shape"):
+        dbscan(np.zeros(shape), eps=0.05, min_samples=5)
+
+
+@pytest.mark.parametrize("eps", [0.0, -0.05, np.nan, np.inf, 1e-170, 1e200])
+def test_eps_must_be_positive_and_have_a_square(eps):
+    with pytest.raises(ValueError, match="eps"):
+        dbscan(np.zeros((3, 2)), eps=eps, min_samples=5)
+
+
+@pytest.mark.parametrize("min_samples", [0, -1])
+def test_min_samples_must_be_positive(min_samples):
+    with pytest.raises(ValueError, match="min_samples"):
+        dbscan(np.zeros((3, 2)), eps=0.05, min_samples=min_samples)
