@@ -16,7 +16,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.geometry.metrics import Camera
+from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.robust import Matrix3
 
 TEST_COLUMNS = ("sample_id", "batch_id", "image_1_id", "image_2_id")
@@ -195,6 +195,11 @@ def plain_name(name: str, where: Path) -> str:
     return name
 
 
+def pair_id(scene: str, first: str, second: str) -> str:
+    """The id under which a pair of the train side runs."""
+    return f"{scene};{first}-{second}"
+
+
 def image_path(directory: Path, image_id: str) -> Path:
     """The image of that id in a directory; a png that does not exist where there is none."""
     return _images_of(directory).get(image_id, directory / f"{image_id}.png")
@@ -220,7 +225,7 @@ def _read_scene(directory: Path, metres: float, min_covisibility: float, most: i
             raise UserError(f"{csv}: the pair {key!r} is not two images of calibration.csv")
         if float(covisibility) >= min_covisibility:
             images = [image_path(directory / "images", plain_name(name, csv)) for name in (first, second)]
-            pair = Pair(f"{directory.name};{key}", directory.name, *images)
+            pair = Pair(pair_id(directory.name, first, second), directory.name, *images)
             pairs.append(TruePair(pair, cameras[first], cameras[second], float(covisibility)))
     if most is not None and most < len(pairs):
         pairs = [pairs[index] for index in np.linspace(0, len(pairs) - 1, most).round().astype(int)]

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from mkpc_kaggle.assembly import Assembly
-from mkpc_kaggle.competition import Scene, TruePair, plain_name, read_submission, read_table
+from mkpc_kaggle.competition import Scene, TruePair, pair_id, read_submission, read_table
+from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.metrics import (
     AUC_THRESHOLDS,
     PoseError,
@@ -104,20 +105,27 @@ def score_submission(submission: Path, truth: Path, scenes: Sequence[Scene]) -> 
     :class:`mkpc_kaggle.errors.UserError` for files that cannot be read.
     """
     found = read_submission(submission)
-    samples: dict[str, str] = {}
     columns = ("sample_id", "scene", "image_1_id", "image_2_id")
+    known: dict[str, Matrix3] = {}  # F by the id that the pair has in the train side, in either order
     for sample, scene, first, second in read_table(truth, columns)[list(columns)].itertuples(index=False):
-        samples[f"{plain_name(scene, truth)};{first}-{second}"] = sample
-    scored = []
-    for scene in scenes:
-        pairs = tuple(
-            PairScore(true.pair.id, true.covisibility, error_of(found[samples[true.pair.id]], true, scene))
-            for true in scene.pairs
-            if samples.get(true.pair.id) in found
+        if sample in found:
+            known[pair_id(scene, first, second)] = found[sample]
+            known[pair_id(scene, second, first)] = found[sample].T
+    scores = [
+        SceneScore(
+            scene.name,
+            tuple(
+                PairScore(true.pair.id, true.covisibility, error_of(known[true.pair.id], true, scene))
+                for true in scene.pairs
+                if true.pair.id in known
+            ),
         )
-        if pairs:
-            scored.append(SceneScore(scene.name, pairs))
-    return Validation(submission.name, tuple(scored))
+        for scene in scenes
+    ]
+    scored = tuple(scene for scene in scores if scene.pairs)
+    if not scored:
+        raise UserError(f"{truth} names no pair of the scenes that {submission} has a row for")
+    return Validation(submission.name, scored)
 
 
 def score_table(validation: Validation) -> list[str]:

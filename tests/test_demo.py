@@ -21,7 +21,6 @@ from mkpc_kaggle.demo import (
     covisibility,
     look_at,
     project,
-    relative_fundamental,
     render,
     resized,
     unproject,
@@ -33,6 +32,7 @@ from mkpc_kaggle.demo.photographs import Photographs, load_photographs
 from mkpc_kaggle.demo.scene import in_units
 from mkpc_kaggle.demo.surface import box, slab, wall
 from mkpc_kaggle.demo.texture import mipmap, sample
+from mkpc_kaggle.geometry.cameras import fundamental_of_cameras
 
 SCALE = 0.2
 
@@ -134,7 +134,7 @@ def test_cameras_at_one_point_have_no_fundamental_matrix() -> None:
     a = look_at((1, 2, 3), (4, 9, 3), focal=500, width=640, height=480)
     b = look_at((1, 2, 3), (5, 9, 3), focal=700, width=640, height=480)
     with pytest.raises(ValueError, match="one centre"):
-        relative_fundamental(a, b)
+        fundamental_of_cameras(a, b)
 
 
 # Rendering

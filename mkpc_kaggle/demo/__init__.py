@@ -4,7 +4,7 @@ scikit-learn's two sample photographs and procedural materials cover planes and 
 Every view is rendered with a known camera and an exact depth map, so ground truth has no error of its own.
 """
 
-from mkpc_kaggle.demo.camera import Camera, look_at, project, relative_fundamental, resized, unproject
+from mkpc_kaggle.demo.camera import Camera, look_at, project, resized, unproject
 from mkpc_kaggle.demo.covisibility import covisibility, visible_share
 from mkpc_kaggle.demo.render import render
 from mkpc_kaggle.demo.scene import Scene, View
@@ -21,7 +21,6 @@ __all__ = [
     "covisibility",
     "look_at",
     "project",
-    "relative_fundamental",
     "render",
     "resized",
     "unproject",

@@ -1,4 +1,4 @@
-"""A pinhole camera and what follows from two of them.
+"""Pinhole cameras that look at things, and where the things come to lie.
 
 Pixel centres are at integer coordinates: (0, 0) is the centre of the top-left pixel, x to the right, y down.
 The world has z up; a camera looks along its +z. `X_cam = R X + t`.
@@ -9,16 +9,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mkpc_kaggle.geometry import cameras
+
 Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class Camera:
-    """K, R: (3, 3) float64; t: (3,) float64 in world units; width, height in pixels."""
+class Camera(cameras.Camera):
+    """A camera with the size of its image: width and height in pixels; t in world units."""
 
-    K: Floats
-    R: Floats
-    t: Floats
     width: int
     height: int
 
@@ -72,24 +71,6 @@ def unproject(camera: Camera, pixels: Floats, depth: Floats) -> Floats:
     """Pixels (N, 2) and their depths (N,), measured along the camera's axis, to world points (N, 3)."""
     rays = np.column_stack([pixels, np.ones(len(pixels))]) @ np.linalg.inv(camera.K).T
     return np.asarray((rays * depth[:, None] - camera.t) @ camera.R, dtype=np.float64)
-
-
-def relative_fundamental(first: Camera, second: Camera) -> Floats:
-    """F (3, 3) with `x2^T F x1 = 0` and unit Frobenius norm: `K2^-T [t]x R K1^-1`.
-
-    Raises ValueError when the two cameras stand at the same point: there is no F then.
-    """
-    R = second.R @ first.R.T
-    t = second.t - R @ first.t
-    F = np.linalg.inv(second.K).T @ _cross_matrix(t) @ R @ np.linalg.inv(first.K)
-    if np.linalg.norm(t) < 1e-9 * max(1.0, float(np.linalg.norm(first.t))):
-        raise ValueError("the two cameras have one centre: F is not defined")
-    return np.asarray(F / np.linalg.norm(F), dtype=np.float64)
-
-
-def _cross_matrix(t: Floats) -> Floats:
-    x, y, z = t
-    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
 
 
 def _unit(vector: Floats) -> Floats:

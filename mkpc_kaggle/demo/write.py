@@ -9,13 +9,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from mkpc_kaggle.demo.camera import Camera, Floats, relative_fundamental
+from mkpc_kaggle.demo.camera import Camera, Floats
 from mkpc_kaggle.demo.covisibility import covisibility
 from mkpc_kaggle.demo.photo import develop
 from mkpc_kaggle.demo.photographs import load_photographs
 from mkpc_kaggle.demo.scene import Scene
 from mkpc_kaggle.demo.scenes import SCENE_NAMES, build_scene
 from mkpc_kaggle.demo.texture import FloatImage, Picture
+from mkpc_kaggle.geometry.cameras import fundamental_of_cameras
 
 LEAST_COVISIBILITY = 0.1  # what the competition scores
 TEST_PAIRS = 8  # a scene
@@ -120,7 +121,7 @@ def _write_train(directory: Path, shown: Sequence[Shown], pairs: Sequence[Pair])
         "pair,covisibility,fundamental_matrix",
         (
             f"{p.first.image_id}-{p.second.image_id},{p.covisibility:.17g},"
-            f"{_numbers(relative_fundamental(p.first.camera, p.second.camera))}"
+            f"{_numbers(fundamental_of_cameras(p.first.camera, p.second.camera))}"
             for p in pairs
         ),
     )

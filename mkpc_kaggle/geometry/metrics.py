@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from math import inf
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.integrate import trapezoid
 
+from mkpc_kaggle.geometry.cameras import Camera, relative_pose
 from mkpc_kaggle.geometry.robust import Matrix3, poses_of_fundamental
 
 ROTATION_THRESHOLDS = np.linspace(1, 10, 10)
@@ -16,15 +16,6 @@ TRANSLATION_THRESHOLDS = np.geomspace(0.2, 5, 10)
 """Metres."""
 AUC_THRESHOLDS = (5.0, 10.0, 20.0)
 """Degrees."""
-
-
-@dataclass(frozen=True, eq=False)
-class Camera:
-    """A calibrated camera: K (3, 3) in pixels; R (3, 3) and t (3,) take world to camera, X_cam = R X + t."""
-
-    K: Matrix3
-    R: Matrix3
-    t: NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -47,20 +38,6 @@ class PoseError:
     def angle(self) -> float:
         """The larger of the two angular errors, in degrees: what the pose AUC counts."""
         return max(self.rotation, self.translation_angle)
-
-
-def relative_pose(camera0: Camera, camera1: Camera) -> tuple[Matrix3, NDArray[np.float64]]:
-    """R (3, 3) and t (3,) with X_1 = R X_0 + t, in the cameras' world units."""
-    R = camera1.R @ camera0.R.T
-    return R, camera1.t - R @ camera0.t
-
-
-def fundamental_of_cameras(camera0: Camera, camera1: Camera) -> Matrix3:
-    """The true F with x1^T F x0 = 0, unit Frobenius norm: K1^-T [t]_x R K0^-1."""
-    R, t = relative_pose(camera0, camera1)
-    cross = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
-    F = np.linalg.inv(camera1.K).T @ cross @ R @ np.linalg.inv(camera0.K)
-    return np.asarray(F / np.linalg.norm(F))
 
 
 def pose_error(F: Matrix3, camera0: Camera, camera1: Camera, metres_per_unit: float) -> PoseError:

@@ -150,13 +150,22 @@ class Engine:
         return regular[:count]
 
     def _hand_out(self, phase: Phase, indices: list[int], units: tuple[Unit, ...], bar: "tqdm[Any]") -> None:
-        deadline = self.budget.stop
-        unknown = [unit for unit in units if not self.costs.known(unit.name)]
+        lacking = {unit for index in indices for unit in self._lacking(self.records[index], units)}
+        unknown = [unit for unit in units if unit in lacking and not self.costs.known(unit.name)]
+        if not unknown:
+            self._submit(phase, indices, units, self.budget.stop)
+            return
+        # What has no known cost cannot be planned: try it on this chunk alone, within an allowance.
+        self._gather(bar, leave=0)
         allowance = EXPLORE_SHARE * self.budget.left()
-        if unknown:
-            # What has no known cost cannot be planned: try it on this chunk alone, within an allowance.
-            self._gather(bar, leave=0)
-            deadline = min(deadline, time.monotonic() + allowance)
+        deadline = time.monotonic() + allowance
+        self._submit(phase, indices, units, deadline)
+        self._gather(bar, leave=0)
+        if time.monotonic() >= deadline:
+            for unit in unknown:
+                self.costs.suppose(unit.name, allowance)
+
+    def _submit(self, phase: Phase, indices: list[int], units: tuple[Unit, ...], deadline: float) -> None:
         tasks = tuple(
             Task(index, self.pairs[index], self.journal.results(index, self._units)) for index in indices
         )
@@ -164,10 +173,6 @@ class Engine:
         if not self._in_flight:
             self._last_result = time.monotonic()
         self._in_flight.append(self.worker.submit(Job(phase, tasks, units, expected, deadline)))
-        if unknown:
-            self._gather(bar, leave=0)
-            for unit in unknown:
-                self.costs.suppose(unit.name, allowance)
 
     def _gather(self, bar: "tqdm[Any]", leave: int) -> None:
         """Wait for the oldest jobs until only ``leave`` are in flight."""
@@ -215,9 +220,8 @@ class Engine:
 
     def _gains(self, outcome: Outcome) -> bool:
         """Whether a job brought anything: a unit more, or the reason why there can be none."""
-        return bool(
-            len(outcome.record.units) > len(self.records[outcome.record.index].units) or not outcome.results
-        )
+        record, former = outcome.record, self.records[outcome.record.index]
+        return len(record.units) > len(former.units) or (record.reached and not former.reached)
 
     def _lacking(self, record: Record, units: Iterable[Unit]) -> list[Unit]:
         return [unit for unit in units if not record.has(unit)]

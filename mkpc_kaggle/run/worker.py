@@ -10,7 +10,7 @@ from typing import Protocol
 from mkpc_kaggle.images import ImageStore, Unreadable
 from mkpc_kaggle.pipeline import PairWork, Pipeline, finish
 from mkpc_kaggle.recipe import Recipe, Unit
-from mkpc_kaggle.run.jobs import Job, JobResult, Outcome, Record, Task, record_of
+from mkpc_kaggle.run.jobs import NOT_REACHED, Job, JobResult, Outcome, Record, Task, record_of
 
 
 class Worker(Protocol):
@@ -120,8 +120,8 @@ class InProcessWorker:
 
 def _outcome(task: Task, opened: Opened, recipe: Recipe) -> Outcome:
     work = opened.work
-    if work is None:
-        return Outcome(Record.untouched(task.index, opened.failure))
+    if work is None or not work.results:
+        return Outcome(Record.untouched(task.index, opened.failure or NOT_REACHED))
     start = time.perf_counter()
     match = finish(work, recipe)
     seconds = time.perf_counter() - start

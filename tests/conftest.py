@@ -1,0 +1,29 @@
+"""What tests share: a small rendered data set, and a matcher whose answers are known."""
+
+from pathlib import Path
+
+import pytest
+from mkpc_kaggle.demo import DemoSet, write_demo
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--slow", action="store_true", help="also run the tests that take minutes")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    if not config.getoption("--slow"):
+        for item in items:
+            if "slow" in item.keywords:
+                item.add_marker(pytest.mark.skip(reason="takes minutes; run with --slow"))
+
+
+@pytest.fixture(scope="session")
+def demo(tmp_path_factory: pytest.TempPathFactory) -> DemoSet:
+    """One scene of the demo at 40 % of its size: 7 images, 8 test pairs."""
+    return write_demo(tmp_path_factory.mktemp("demo"), scenes=["courtyard"], image_scale=0.4)
+
+
+@pytest.fixture
+def clean_environment(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.delenv("MKPC_WEIGHTS", raising=False)
+    monkeypatch.chdir(tmp_path)

@@ -1,0 +1,104 @@
+"""A matcher whose answers are known, and runs of the engine with it.
+
+It sees every pair as rectified: a point of image 1 is the point of image 0 moved along its row, so that F is
+[e_x]_x, and each match that it gives is an inlier.
+"""
+
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import cv2
+import numpy as np
+from mkpc_kaggle.assembly import assemble
+from mkpc_kaggle.competition import Pair
+from mkpc_kaggle.geometry.coordinates import View
+from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.matchers.contract import MatcherSpec, Picture
+from mkpc_kaggle.recipe import Recipe, Unit, UpgradeConfig
+from mkpc_kaggle.run.budget import Budget
+from mkpc_kaggle.run.engine import RunReport
+from mkpc_kaggle.run.jobs import Record
+from mkpc_kaggle.run.session import Interrupt, Session, run_pairs
+
+
+@dataclass(frozen=True)
+class Options:
+    pass
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    view: View
+    brightness: int
+
+
+@dataclass
+class RectifiedMatcher:
+    """``seconds`` for each pair; ``matches`` by the brightness of image 0; ``calls`` are (long side, brightness)."""
+
+    name: str = "rectified"
+    seconds: float = 0.0
+    matches: Callable[[int], int] = lambda _: 150
+    calls: list[tuple[int, int]] = field(default_factory=list)
+
+    @property
+    def spec(self) -> MatcherSpec:
+        return MatcherSpec(self.name, "a matcher for tests", Options)
+
+    def encode(self, pictures: Sequence[Picture]) -> list[Seen]:
+        return [Seen(picture.view, int(np.median(picture.pixels))) for picture in pictures]
+
+    def match(self, encodings0: Sequence[Seen], encodings1: Sequence[Seen]) -> list[Matches]:
+        return [self._match(*pair) for pair in zip(encodings0, encodings1, strict=True)]
+
+    def _match(self, seen0: Seen, seen1: Seen) -> Matches:
+        self.calls.append((max(seen0.view.content), seen0.brightness))
+        time.sleep(self.seconds)
+        count = self.matches(seen0.brightness)
+        rng = np.random.default_rng(seen0.brightness + 1000 * max(seen0.view.content))
+        points0 = rng.uniform(4, 60, (count, 2))
+        points1 = points0 + np.column_stack([rng.uniform(0, 15, count), np.zeros(count)])
+        return Matches(seen0.view.from_image(points0), seen1.view.from_image(points1), rng.uniform(size=count))
+
+
+SWEEP, SECOND, THIRD = Unit(1, "rectified", 96), Unit(2, "rectified", 128), Unit(1, "rectified", 160)
+EXTRA = Unit(1, "rectified", 192, extra=True)
+THREE_UNITS = Recipe((SWEEP, SECOND, THIRD), upgrade=UpgradeConfig(below_inliers=0))
+
+
+def write_pairs(directory: Path, count: int) -> list[Pair]:
+    """Pairs of flat 80 x 72 images, each with a brightness of its own: 10, 11, ..."""
+    pairs = []
+    directory.mkdir(parents=True, exist_ok=True)
+    for index in range(count):
+        paths = [directory / f"{index:03d}_{side}.png" for side in (0, 1)]
+        for path in paths:
+            cv2.imwrite(str(path), np.full((72, 80, 3), 10 + index, np.uint8))
+        pairs.append(Pair(f"set;{index:03d}", "set", *paths))
+    return pairs
+
+
+def run(
+    pairs: Sequence[Pair],
+    recipe: Recipe,
+    matcher: RectifiedMatcher,
+    work_dir: Path,
+    *,
+    limit: float = float("inf"),
+    interrupt: Interrupt | None = None,
+    publish: Callable[[Sequence[Record]], None] = lambda _: None,
+) -> RunReport:
+    assembly = assemble(recipe, matchers={matcher.name: matcher}, device="cpu")
+    budget = Budget(time.monotonic(), limit)
+    session = Session(work_dir, budget, interrupt or Interrupt(), progress=False)
+    report, _ = run_pairs(pairs, assembly, session, publish)
+    return report
+
+
+def interrupt_after(seconds: float) -> Interrupt:
+    interrupt = Interrupt()
+    threading.Timer(seconds, interrupt.set).start()
+    return interrupt

@@ -1,0 +1,117 @@
+import time
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.recipe import Unit
+from mkpc_kaggle.run.budget import WINDOW, Budget, Costs, format_duration, longest_prefix, parse_duration
+
+UNITS = (Unit(1, "a", 100), Unit(2, "b", 100), Unit(1, "c", 100))
+
+
+@pytest.mark.parametrize(
+    ("text", "seconds"),
+    [("8h45m", 31500), ("90m", 5400), ("60s", 60), ("60", 60), ("1h", 3600), ("1h2m3s", 3723), ("2.5s", 2.5)],
+)
+def test_durations_are_read(text: str, seconds: float) -> None:
+    assert parse_duration(text) == seconds
+
+
+@pytest.mark.parametrize("text", ["", "h", "8 hours", "-5s", "1m1h", "0", "0s", "nan", "9:00"])
+def test_what_is_no_duration_is_refused(text: str) -> None:
+    with pytest.raises(UserError):
+        parse_duration(text)
+
+
+def test_durations_are_shown_short() -> None:
+    assert [format_duration(s) for s in (4.24, 59.9, 61, 3599.9, 31500)] == [
+        "4.2s",
+        "59.9s",
+        "1m01s",
+        "1h00m",
+        "8h45m",
+    ]
+
+
+def test_a_budget_stops_before_it_ends_and_ends_before_its_limit() -> None:
+    for limit in (10.0, 60.0, 31500.0):
+        budget = Budget(time.monotonic(), limit)
+        assert budget.started < budget.stop < budget.end < budget.started + limit
+        assert budget.left() <= limit
+
+
+def test_a_spent_budget_has_nothing_left() -> None:
+    assert Budget(time.monotonic() - 100, 60).left() == 0
+
+
+def test_the_warm_up_counts_only_until_there_is_another_measurement() -> None:
+    costs = Costs()
+    assert not costs.known("a")
+    costs.observe("a", 10.0)
+    assert costs.known("a")
+    assert costs.of("a") == 10.0
+    costs.observe("a", 1.0)
+    costs.observe("a", 2.0)
+    assert costs.of("a") == 1.5
+
+
+def test_costs_follow_a_machine_that_slows_down() -> None:
+    costs = Costs()
+    for seconds in [1.0] * (WINDOW + 1) + [10.0] * WINDOW:
+        costs.observe("a", seconds)
+    assert costs.of("a") == 10.0
+
+
+def test_a_supposed_cost_holds_only_for_a_unit_that_was_never_measured() -> None:
+    costs = Costs()
+    costs.observe("a", 1.0)
+    costs.suppose("a", 99.0)
+    costs.suppose("b", 99.0)
+    assert costs.of("a") == 1.0
+    assert costs.of("b") == 99.0
+
+
+def known_costs(*seconds: float) -> Costs:
+    costs = Costs()
+    for unit, cost in zip(UNITS, seconds, strict=True):
+        costs.observe(unit.name, cost)
+    return costs
+
+
+def test_the_longest_prefix_that_fits_is_chosen() -> None:
+    costs = known_costs(1.0, 2.0, 4.0)
+    lacking = {unit.name: 10 for unit in UNITS}
+    assert [longest_prefix(UNITS, lacking, costs, s) for s in (5, 11, 32, 74)] == [0, 1, 2, 3]
+
+
+def test_units_that_pairs_have_already_cost_nothing() -> None:
+    costs = known_costs(1.0, 2.0, 4.0)
+    lacking = {UNITS[0].name: 0, UNITS[1].name: 10, UNITS[2].name: 1}
+    assert longest_prefix(UNITS, lacking, costs, 26) == 3
+
+
+def test_waiting_counts_against_the_time_too() -> None:
+    costs = known_costs(1.0, 2.0, 4.0)
+    lacking = {unit.name: 10 for unit in UNITS}
+    before = longest_prefix(UNITS, lacking, costs, 34)
+    costs.observe_overhead(1.0)
+    assert before == 2
+    assert longest_prefix(UNITS, lacking, costs, 34) == 1
+
+
+@given(
+    st.lists(st.floats(0, 100), min_size=3, max_size=3),
+    st.lists(st.integers(0, 1000), min_size=3, max_size=3),
+    st.floats(0, 1e6),
+    st.floats(1, 10),
+)
+def test_more_time_never_chooses_fewer_units(
+    seconds: list[float], pairs: list[int], time_left: float, factor: float
+) -> None:
+    costs = known_costs(*seconds)
+    lacking = {unit.name: count for unit, count in zip(UNITS, pairs, strict=True)}
+    count = longest_prefix(UNITS, lacking, costs, time_left)
+    assert count <= longest_prefix(UNITS, lacking, costs, time_left * factor)
+    needed = sum(costs.of(unit.name) * lacking[unit.name] for unit in UNITS[:count])
+    assert needed <= time_left

@@ -1,0 +1,331 @@
+"""Files of the competition: what is read, what is refused and in which words, what is written."""
+
+import os
+import re
+import time
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from shared import DATA, needs_data
+
+from mkpc_kaggle.competition import (
+    read_cameras,
+    read_submission,
+    read_test_side,
+    read_train_side,
+    submission_problems,
+    write_submission,
+)
+from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.geometry.cameras import fundamental_of_cameras
+
+HEADER = "sample_id,batch_id,image_1_id,image_2_id"
+EYE = np.eye(3)
+
+
+@pytest.fixture
+def side(tmp_path):
+    """A function that writes test.csv and empty image files; it returns the directory."""
+
+    def write(*rows, header=HEADER, images=()):
+        (tmp_path / "test_images").mkdir(exist_ok=True)
+        for name in images:
+            path = tmp_path / "test_images" / name
+            path.parent.mkdir(exist_ok=True)
+            path.touch()
+        (tmp_path / "test.csv").write_text("\n".join([header, *rows]) + "\n", encoding="utf-8")
+        return tmp_path
+
+    return write
+
+
+@pytest.fixture
+def train(tmp_path):
+    """A train side by hand: scene ``s`` with images a, b, c, d and six pairs."""
+    (tmp_path / "s" / "images").mkdir(parents=True)
+    (tmp_path / "s" / "images" / "a.JPG").touch()
+    cameras = [f"{name},2 0 1 0 2 1 0 0 1,1 0 0 0 1 0 0 0 1,{x} 0 0" for x, name in enumerate("abcd")]
+    lines = ["image_id,camera_intrinsics,rotation_matrix,translation_vector", *cameras]
+    (tmp_path / "s" / "calibration.csv").write_text("\n".join(lines) + "\n")
+    pairs = ["b-a,0.9", "c-a,0.1", "c-b,0.5", "d-a,0.09", "d-b,0.3", "d-c,0.7"]
+    (tmp_path / "s" / "pair_covisibility.csv").write_text("\n".join(["pair,covisibility", *pairs]) + "\n")
+    (tmp_path / "scaling_factors.csv").write_text("scene,scaling_factor\ns,2.5\nabsent,1\n")
+    return tmp_path
+
+
+def replace_in(path, old, new):
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new))
+
+
+def keys(scene):
+    return [true.pair.id.partition(";")[2] for true in scene.pairs]
+
+
+# the test side
+
+
+def test_pairs_come_in_the_order_of_the_table(side):
+    home = side("z,b,1,2", "a,b,2,1", "m,c,3,4")
+    assert [(pair.id, pair.group) for pair in read_test_side(home)] == [("z", "b"), ("a", "b"), ("m", "c")]
+
+
+def test_the_directory_and_test_images_itself_read_the_same(side):
+    home = side("s,b,1,2", images=["b/1.png", "b/2.png"])
+    assert read_test_side(home / "test_images") == read_test_side(home)
+
+
+@pytest.mark.parametrize("file", ["1.png", "1.jpg", "1.jpeg", "1.PNG", "1.Jpg", "1.JPEG"])
+def test_an_image_is_found_whatever_its_suffix(side, file):
+    (pair,) = read_test_side(side("s,b,1,2", images=[f"b/{file}", "b/10.png", "b/1.txt"]))
+    assert pair.image0.name == file
+    assert pair.image0.is_file()
+
+
+def test_a_missing_image_or_batch_is_a_path_that_does_not_exist(side):
+    pairs = read_test_side(side("s,b,1,2", "t,nowhere,1,2", images=["b/1.png"]))
+    assert [[image.is_file() for image in pair.images] for pair in pairs] == [[True, False], [False, False]]
+
+
+def test_ids_stay_the_text_that_they_are(side):
+    (pair,) = read_test_side(side("007,1e3,NA,0010", images=["1e3/NA.png", "1e3/0010.png"]))
+    assert (pair.id, pair.group) == ("007", "1e3")
+    assert [image.name for image in pair.images] == ["NA.png", "0010.png"]
+    assert all(image.is_file() for image in pair.images)
+
+
+def test_columns_may_come_in_any_order_and_with_others(side):
+    (pair,) = read_test_side(side("2,x,b,1,s", header="image_2_id,more,batch_id,image_1_id,sample_id"))
+    assert (pair.id, pair.group, pair.image0.stem, pair.image1.stem) == ("s", "b", "1", "2")
+
+
+def test_a_comma_at_the_end_of_each_row_does_not_shift_the_columns(side):
+    (pair,) = read_test_side(side("s,b,1,2,"))
+    assert (pair.id, pair.group, pair.image0.stem, pair.image1.stem) == ("s", "b", "1", "2")
+
+
+def test_no_table_is_named(tmp_path):
+    (tmp_path / "test_images").mkdir()
+    with pytest.raises(UserError, match=r"test\.csv: no such file"):
+        read_test_side(tmp_path)
+
+
+def test_no_test_images_is_named(side):
+    home = side("s,b,1,2")
+    (home / "test_images").rmdir()
+    with pytest.raises(UserError, match=r"test_images: no such directory"):
+        read_test_side(home)
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        (b"", "is empty"),
+        (b"\n\n", "is empty"),
+        (HEADER.encode() + b"\n", "has no rows"),
+        (b"sample_id,image_1_id\ns,1\n", "lacks the columns batch_id, image_2_id"),
+        (b"\x89PNG\r\n\x1a\n\xff\xfe\x00", "cannot be read as a table"),
+        (HEADER.encode() + b"\ns,b,1,2\nt,b,1,2,3,4\n", "cannot be read as a table"),
+        (HEADER.encode() + b"\ns,b,1\n", "''"),
+    ],
+    ids=["empty", "blank", "no rows", "columns", "binary", "ragged", "short"],
+)
+def test_a_table_that_cannot_be_used_is_refused_by_name(side, content, says):
+    home = side()
+    (home / "test.csv").write_bytes(content)
+    with pytest.raises(UserError, match=f"{re.escape(str(home / 'test.csv'))}.*{says}"):
+        read_test_side(home)
+
+
+def test_a_repeated_sample_id_is_refused_with_how_often_it_is_there(side):
+    home = side("s,b,1,2", "t,b,1,3", "s,b,2,3", "t,b,3,1")
+    with pytest.raises(UserError, match=r"test\.csv.*'s'.* 2 times"):
+        read_test_side(home)
+
+
+@pytest.mark.parametrize("row", ["s,{},1,2", "s,b,{},2", "s,b,1,{}"], ids=["batch", "image 1", "image 2"])
+@pytest.mark.parametrize("name", ["", ".", "..", "../x", "x/y", "/etc", "x\\y", "..\\x"])
+def test_an_id_that_is_no_plain_name_is_refused(side, row, name):
+    home = side("ok,b,1,2", row.format(name))
+    with pytest.raises(UserError, match=rf"test\.csv.*{re.escape(repr(name))} is not a plain name"):
+        read_test_side(home)
+
+
+@needs_data
+def test_every_image_of_the_shared_test_side_is_there():
+    pairs = read_test_side(DATA / "test")
+    assert len(pairs) == 29
+    assert all(image.is_file() for pair in pairs for image in pair.images)
+
+
+# the train side
+
+
+def test_a_train_side_by_hand_reads_as_written(train):
+    (scene,) = read_train_side(train)
+    assert (scene.name, scene.metres_per_unit) == ("s", 2.5)
+    first = scene.pairs[0]
+    assert (first.pair.id, first.pair.group, first.covisibility) == ("s;b-a", "s", 0.9)
+    assert [image.name for image in first.pair.images] == ["b.png", "a.JPG"]
+    assert_array_equal(first.camera0.K, [[2, 0, 1], [0, 2, 1], [0, 0, 1]])
+    assert_array_equal([first.camera0.t, first.camera1.t], [[1, 0, 0], [0, 0, 0]])
+
+
+def test_pairs_below_the_covisibility_are_left_out_and_those_at_it_are_not(train):
+    assert keys(*read_train_side(train)) == ["b-a", "c-a", "c-b", "d-b", "d-c"]
+    assert keys(*read_train_side(train, min_covisibility=0.5)) == ["b-a", "c-b", "d-c"]
+    assert len(keys(*read_train_side(train, min_covisibility=0))) == 6
+
+
+@pytest.mark.parametrize(
+    ("most", "chosen"),
+    [(1, ["b-a"]), (2, ["b-a", "d-c"]), (3, ["b-a", "c-b", "d-c"]), (99, ["b-a", "c-a", "c-b", "d-b", "d-c"])],
+)
+def test_pairs_per_scene_are_spread_over_the_table(train, most, chosen):
+    assert keys(*read_train_side(train, pairs_per_scene=most)) == chosen
+
+
+def test_an_unknown_scene_is_refused_with_the_known_ones(train):
+    with pytest.raises(UserError, match=r"unknown scene 'x'; known: absent, s"):
+        read_train_side(train, scenes=["s", "x"])
+
+
+def test_a_scene_that_is_asked_for_and_has_no_directory_is_named(train):
+    with pytest.raises(UserError, match=r"absent.*calibration\.csv: no such file"):
+        read_train_side(train, scenes=["absent"])
+
+
+def test_a_train_side_without_any_scene_is_refused(train):
+    replace_in(train / "scaling_factors.csv", "s,2.5\n", "")
+    with pytest.raises(UserError, match=r"has none of the scenes"):
+        read_train_side(train)
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new", "says"),
+    [
+        ("s/calibration.csv", "2 0 1 0 2 1 0 0 1", "2 0 1 0 2 1 0 0", "expected 9 numbers, found 8"),
+        ("s/calibration.csv", "2 0 1 0 2 1 0 0 1", "2 0 1 0 x 1 0 0 1", "not a list of numbers"),
+        ("s/calibration.csv", ",rotation_matrix", ",rotation", "lacks the columns rotation_matrix"),
+        ("s/pair_covisibility.csv", "c-b", "cb", "'cb'"),
+        ("s/pair_covisibility.csv", "c-b", "c-x", "'c-x'"),
+        ("s/pair_covisibility.csv", "c-b,0.5", "c-b,many", "many"),
+        ("s/pair_covisibility.csv", "c-b,0.5", "c-b,", "c-b"),
+        ("scaling_factors.csv", "2.5", "long", "long"),
+    ],
+)
+def test_a_cell_that_cannot_be_read_is_named_with_its_file(train, file, old, new, says):
+    replace_in(train / file, old, new)
+    with pytest.raises(UserError, match=f"{re.escape(file)}.*{re.escape(says)}"):
+        read_train_side(train)
+
+
+@needs_data
+def test_cameras_of_the_shared_train_side_give_its_fundamental_matrices():
+    csv = DATA / "train" / "fountain_p11" / "pair_covisibility.csv"
+    truth = dict(line.split(",")[::2] for line in csv.read_text().splitlines()[1:])
+    scenes = read_train_side(DATA / "train", scenes=["fountain_p11"], pairs_per_scene=5)
+    assert len(scenes[0].pairs) == 5
+    for true in scenes[0].pairs:
+        assert all(image.is_file() for image in true.pair.images)
+        F = fundamental_of_cameras(true.camera0, true.camera1)
+        expected = np.array(truth[true.pair.id.partition(";")[2]].split(), float).reshape(3, 3)
+        assert_allclose(F * np.sign(np.sum(F * expected)), expected, rtol=0, atol=1e-9)
+
+
+@needs_data
+def test_the_shared_train_side_has_five_scenes():
+    names = sorted(path.name for path in (DATA / "train").iterdir() if path.is_dir())
+    assert [scene.name for scene in read_train_side(DATA / "train", pairs_per_scene=1)] == names
+    assert len(read_cameras(DATA / "train" / "castle_p19" / "calibration.csv")) == 19
+
+
+# submissions
+
+
+def test_a_submission_keeps_its_numbers_and_their_order(tmp_path):
+    rng = np.random.default_rng(0)
+    rows = {f"s;{i}-x": rng.normal(size=(3, 3)) * 10.0 ** rng.integers(-12, 12, (3, 3)) for i in (5, 3, 9)}
+    write_submission(tmp_path / "submission.csv", rows)
+    read = read_submission(tmp_path / "submission.csv")
+    assert list(read) == list(rows)
+    for name, F in rows.items():
+        assert_allclose(read[name], F, rtol=1e-11, atol=0)
+    assert submission_problems(tmp_path / "submission.csv", list(rows)) == []
+
+
+def test_a_submission_is_plain_lines_under_the_header(tmp_path):
+    write_submission(tmp_path / "x.csv", {"b": EYE, "a": -EYE / 2})
+    expected = b"sample_id,fundamental_matrix\nb,1 0 0 0 1 0 0 0 1\na,-0.5 -0 -0 -0 -0.5 -0 -0 -0 -0.5\n"
+    assert (tmp_path / "x.csv").read_bytes() == expected
+
+
+@pytest.mark.parametrize("sample", ["a,b", 'a"b', "NA", "a b"])
+def test_a_sample_id_of_any_text_survives_the_submission(tmp_path, sample):
+    write_submission(tmp_path / "x.csv", {sample: EYE})
+    assert list(read_submission(tmp_path / "x.csv")) == [sample]
+    assert submission_problems(tmp_path / "x.csv", [sample]) == []
+
+
+def test_the_former_submission_stays_when_writing_fails(tmp_path, monkeypatch):
+    def full(descriptor):
+        raise OSError(28, "No space left on device")
+
+    path = tmp_path / "submission.csv"
+    write_submission(path, {"a": EYE})
+    before = path.read_bytes()
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="No space"):
+        write_submission(path, {"a": EYE, "b": EYE})
+    assert path.read_bytes() == before
+    monkeypatch.undo()
+    write_submission(path, {"b": EYE})
+    assert list(read_submission(path)) == ["b"]
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        ("id,F\na,1\n", "lacks the columns sample_id, fundamental_matrix"),
+        ("sample_id,fundamental_matrix,x\na,{F},1\nb,{F},1\n", "the header is"),
+        ("fundamental_matrix,sample_id\n{F},a\n{F},b\n", "the header is"),
+        ("sample_id,fundamental_matrix\na,{F}\n", "1 samples are missing, the first is b"),
+        ("sample_id,fundamental_matrix\na,{F}\nb,{F}\nc,{F}\n", "not in test.csv, the first is c"),
+        ("sample_id,fundamental_matrix\nb,{F}\na,{F}\n", "not in the order of test.csv"),
+        ("sample_id,fundamental_matrix\na,{F}\nb,{F}\nb,{F}\n", "twice"),
+        ("sample_id,fundamental_matrix\na,{F}\nb,1 2 3 4 5 6 7 8\n", "b: .*expected 9 numbers, found 8"),
+        ("sample_id,fundamental_matrix\na,{F}\nb,{F} 1\n", "b: .*expected 9 numbers, found 10"),
+        ("sample_id,fundamental_matrix\na,{F}\nb,\n", "b: .*expected 9 numbers, found 0"),
+        ("sample_id,fundamental_matrix\na,{F}\nb,1 2 3 4 5 6 7 8 x\n", "b: .*not a list of numbers"),
+        ("sample_id,fundamental_matrix\na,{F}\nb,1 2 3 4 5 6 7 8 nan\n", "b: a number is not finite"),
+        ("sample_id,fundamental_matrix\na,{F}\nb,1 2 3 4 5 6 7 8 -inf\n", "b: a number is not finite"),
+        ("sample_id,fundamental_matrix\na,{F}\nb,0 0 0 0 0 0 0 0 0\n", "b: the matrix is zero"),
+        ("", "is empty"),
+        ("\0\0\0", "columns|cannot be read"),
+    ],
+)
+def test_each_problem_of_a_submission_is_the_only_one_found(tmp_path, content, says):
+    (tmp_path / "x.csv").write_text(content.replace("{F}", "1 2 3 4 5 6 7 8 9"))
+    (problem,) = submission_problems(tmp_path / "x.csv", ["a", "b"])
+    assert re.search(says, problem)
+
+
+def test_all_problems_of_a_submission_are_told_at_once(tmp_path):
+    (tmp_path / "x.csv").write_text("sample_id,fundamental_matrix\nb,1\na,0 0 0 0 0 0 0 0 0\n")
+    assert len(submission_problems(tmp_path / "x.csv", ["a", "b"])) == 3
+
+
+def test_a_submission_that_is_not_there_is_a_problem(tmp_path):
+    (problem,) = submission_problems(tmp_path / "x.csv", ["a"])
+    assert "no such file" in problem
+
+
+def test_a_large_submission_in_the_wrong_order_is_checked_at_once(tmp_path):
+    ids = [f"s{number}" for number in range(10_000)]
+    write_submission(tmp_path / "x.csv", dict.fromkeys(reversed(ids), EYE))
+    start = time.perf_counter()
+    assert submission_problems(tmp_path / "x.csv", ids)
+    assert time.perf_counter() - start < 1

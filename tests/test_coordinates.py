@@ -1,0 +1,236 @@
+"""Boxes and views: the maps are each other's inverse, and the rendered pixels are where the maps say."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
+
+from mkpc_kaggle.geometry.coordinates import Box, Size, View
+
+SIDES = st.integers(1, 3000)
+
+
+@st.composite
+def boxes(draw):
+    left, top = draw(st.integers(-500, 3000)), draw(st.integers(-500, 3000))
+    return Box(left, top, left + draw(SIDES), top + draw(SIDES))
+
+
+@st.composite
+def views(draw):
+    content = Size(draw(SIDES), draw(SIDES))
+    padded = Size(content.width + draw(st.integers(0, 40)), content.height + draw(st.integers(0, 40)))
+    return View(draw(boxes()), content, padded, draw(st.booleans()))
+
+
+def spot(size, centre, sigma):
+    x, y = np.meshgrid(np.arange(size.width), np.arange(size.height))
+    squared = (x - centre[0]) ** 2 + (y - centre[1]) ** 2
+    return np.rint(255 * np.exp(-squared / (2 * sigma**2))).astype(np.uint8)
+
+
+def centroid(picture):
+    weight = picture.astype(np.float64)
+    y, x = np.indices(picture.shape)
+    return np.array([(weight * x).sum(), (weight * y).sum()]) / weight.sum()
+
+
+def ramp(size):
+    """One grey level for each pixel to the right, two for each down."""
+    x, y = np.meshgrid(np.arange(size.width), np.arange(size.height))
+    return (x + 2 * y).astype(np.uint8)
+
+
+def stripes(size):
+    return np.tile(np.array([[0], [255]] * (size.height // 2), np.uint8), (1, size.width))
+
+
+IMAGE = Size(107, 71)
+RENDERED = {
+    "enlarged": View.fit(Box.whole(IMAGE), long_side=250),
+    "enlarged and flipped": View.fit(Box.whole(IMAGE), long_side=250, flip=True),
+    "shrunk": View.fit(Box.whole(IMAGE), long_side=46),
+    "shrunk and flipped": View.fit(Box.whole(IMAGE), long_side=46, flip=True),
+    "of the same size": View.fit(Box.whole(IMAGE), long_side=107, flip=True),
+    "cropped and enlarged": View.fit(Box(13, 8, 90, 65), long_side=200, multiple=32),
+    "cropped, shrunk and flipped": View.fit(Box(13, 8, 90, 65), long_side=51, multiple=32, flip=True),
+    "with an axis that rounding changes": View(Box.whole(IMAGE), Size(80, 48), Size(80, 48), flip=True),
+    "enlarged along x, shrunk along y": View(Box.whole(IMAGE), Size(240, 40), Size(240, 40)),
+    "shrunk along x, enlarged along y": View(Box.whole(IMAGE), Size(60, 170), Size(64, 192), flip=True),
+}
+
+
+@given(view=views(), seed=st.integers(0, 2**32 - 1))
+@settings(max_examples=150, deadline=None)
+def test_there_and_back_is_the_identity(view, seed):
+    points = np.random.default_rng(seed).uniform(-4000, 4000, (20, 2))
+    assert_allclose(view.to_image(view.from_image(points)), points, rtol=0, atol=1e-7)
+    assert_allclose(view.from_image(view.to_image(points)), points, rtol=0, atol=1e-7)
+
+
+@given(view=views())
+@settings(max_examples=100, deadline=None)
+def test_the_edges_of_the_crop_are_the_edges_of_the_content(view):
+    edges = np.array([[view.crop.left, view.crop.top], [view.crop.right, view.crop.bottom]]) - 0.5
+    (x0, y0), (x1, y1) = view.from_image(edges)
+    left, right = (x1, x0) if view.flip else (x0, x1)
+    expected = [-0.5, -0.5, view.content.width - 0.5, view.content.height - 0.5]
+    assert_allclose([left, y0, right, y1], expected, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("flip", [False, True])
+def test_known_points_map_to_known_points(flip):
+    view = View(Box(10, 20, 14, 26), Size(8, 3), Size(16, 16), flip)
+    points = np.array([[10, 20], [13, 25], [11.5, 22.5]])
+    x = np.array([0.5, 6.5, 3.5])
+    expected = np.column_stack([7 - x if flip else x, [-0.25, 2.25, 1.0]])
+    assert_allclose(view.from_image(points), expected, rtol=0, atol=1e-12)
+    assert_allclose(view.to_image(expected), points, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("flip", [False, True])
+@pytest.mark.parametrize(
+    ("crop", "content"),
+    [
+        (Box(0, 0, 1, 1), Size(1, 1)),
+        (Box(0, 0, 1, 1), Size(640, 480)),
+        (Box(7, 9, 8, 10), Size(5, 5)),
+        (Box(0, 0, 30_000, 1), Size(100, 1)),
+        (Box(3, 0, 4, 30_000), Size(1, 100)),
+    ],
+)
+def test_views_of_one_pixel_and_very_long_ones_go_there_and_back(crop, content, flip):
+    view = View(crop, content, content, flip)
+    points = np.array([[crop.left, crop.top], [crop.right - 1, crop.bottom - 1], [3.3, 4.4]])
+    assert_allclose(view.to_image(view.from_image(points)), points, rtol=0, atol=1e-7)
+    assert view.to_image(np.zeros((0, 2))).shape == view.from_image(np.zeros((0, 2))).shape == (0, 2)
+
+
+@given(crop=boxes(), long_side=SIDES, multiple=st.sampled_from([1, 8, 14, 16, 32]), flip=st.booleans())
+@settings(max_examples=150, deadline=None)
+def test_a_fitted_view_keeps_the_aspect_to_the_nearest_pixel_and_pads_to_the_multiple(
+    crop, long_side, multiple, flip
+):
+    view = View.fit(crop, long_side=long_side, multiple=multiple, flip=flip)
+    assert max(view.content) == long_side
+    exact = min(crop.size) * long_side / max(crop.size)
+    assert abs(min(view.content) - max(1, exact)) <= 0.5
+    assert (view.crop, view.flip) == (crop, flip)
+    for side, padded in zip(view.content, view.padded, strict=True):
+        assert padded % multiple == 0
+        assert 0 <= padded - side < multiple
+
+
+@pytest.mark.parametrize("name", RENDERED)
+@pytest.mark.parametrize("centre", [(41.3, 30.8), (60.0, 40.5), (55.75, 44.25)])
+def test_a_spot_is_rendered_where_the_map_says(name, centre):
+    view = RENDERED[name]
+    picture = view.render(spot(IMAGE, centre, 4.0))
+    assert picture.shape == (view.padded.height, view.padded.width)
+    assert_allclose(centroid(picture), view.from_image(np.array([centre]))[0], rtol=0, atol=0.04)
+
+
+@pytest.mark.parametrize("name", RENDERED)
+def test_a_ramp_is_rendered_without_a_shift(name):
+    view = RENDERED[name]
+    picture = view.render(ramp(IMAGE))[: view.content.height, : view.content.width]
+    y, x = np.indices(picture.shape)
+    at = view.to_image(np.column_stack([x.ravel(), y.ravel()]))
+    low, high = (view.crop.left, view.crop.top), (view.crop.right - 1, view.crop.bottom - 1)
+    # Beyond the outermost centres there is nothing to interpolate.
+    inner = ((at >= low) & (at <= high)).all(axis=1)
+    difference = (picture.ravel() - at @ [1, 2])[inner]
+    assert inner.sum() > 500
+    assert abs(difference.mean()) < 0.2  # OpenCV rounds down a little: 0.13
+    assert abs(difference).max() < 1.5
+
+
+@pytest.mark.parametrize("content", [Size(64, 16), Size(64, 19), Size(32, 16), Size(90, 16)])
+def test_shrinking_averages_what_would_alias(content):
+    picture = View(Box.whole(Size(64, 64)), content, content).render(stripes(Size(64, 64)))
+    assert picture.min() > 127.5 - 30
+    assert picture.max() < 127.5 + 30
+
+
+@pytest.mark.parametrize("flip", [False, True])
+@pytest.mark.parametrize("shape", [(71, 107), (71, 107, 3)])
+def test_a_crop_that_is_not_resized_is_copied_and_padded_with_black_right_and_bottom(shape, flip):
+    image = np.random.default_rng(0).integers(1, 256, shape, dtype=np.uint8)
+    view = View.fit(Box(5, 7, 55, 37), long_side=50, multiple=32, flip=flip)
+    picture = view.render(image)
+    cut = image[7:37, 5:55]
+    assert picture.shape == (32, 64, *shape[2:])
+    assert picture.dtype == np.uint8
+    assert_array_equal(picture[:30, :50], cut[:, ::-1] if flip else cut)
+    assert not picture[30:].any()
+    assert not picture[:, 50:].any()
+
+
+@pytest.mark.parametrize("flip", [False, True])
+def test_padding_stays_black_and_moves_nothing_where_content_is_resized(flip):
+    image = np.random.default_rng(1).integers(1, 256, (71, 107, 3), dtype=np.uint8)
+    plain = View.fit(Box.whole(IMAGE), long_side=83, flip=flip)
+    padded = View.fit(Box.whole(IMAGE), long_side=83, multiple=32, flip=flip)
+    picture = padded.render(image)
+    assert picture.shape == (64, 96, 3)
+    assert_array_equal(picture[: plain.content.height, :83], plain.render(image))
+    assert picture.sum() == plain.render(image).sum()
+    corners = np.array([[0.0, 0], [106, 70]])
+    assert_array_equal(padded.from_image(corners), plain.from_image(corners))
+
+
+@pytest.mark.parametrize(
+    ("size", "long_side", "shape"), [((1, 1), 16, (16, 16)), ((900, 1), 90, (1, 90)), ((1, 3), 700, (700, 233))]
+)
+def test_images_one_pixel_wide_or_high_are_rendered(size, long_side, shape):
+    image = np.full(size[::-1], 200, np.uint8)
+    picture = View.fit(Box.whole(Size(*size)), long_side=long_side).render(image)
+    assert picture.shape == shape
+    assert (picture == 200).all()
+
+
+def test_a_box_holds_the_points_on_its_pixels_half_open_and_never_nan():
+    box = Box(2, 3, 10, 7)
+    inside = [(1.5, 2.5), (2, 3), (9, 6), (np.nextafter(9.5, 0), np.nextafter(6.5, 0))]
+    outside = [(np.nextafter(1.5, 0), 4), (4, np.nextafter(2.5, 0)), (9.5, 4), (4, 6.5)]
+    outside += [(np.nan, 4), (4, np.nan), (np.inf, 4), (4, -np.inf), (np.nan, np.nan)]
+    assert box.contains(np.array(inside)).all()
+    assert not box.contains(np.array(outside)).any()
+    assert box.contains(np.zeros((0, 2))).shape == (0,)
+    assert (box.size, box.area) == (Size(8, 4), 32)
+
+
+@pytest.mark.parametrize("flip", [False, True])
+def test_a_view_holds_points_on_content_but_not_on_padding(flip):
+    view = View(Box(100, 100, 140, 120), Size(20, 10), Size(32, 16), flip)
+    inside = [(-0.5, -0.5), (0, 0), (19, 9), (19.4, 9.4)]
+    outside = [(19.5, 5), (5, 9.5), (25, 5), (5, 14), (-0.6, 5), (5, -0.6), (np.nan, 5), (5, np.inf)]
+    assert view.holds(np.array(inside)).all()
+    assert not view.holds(np.array(outside)).any()
+
+
+@pytest.mark.parametrize("edges", [(0, 0, 0, 5), (0, 0, 5, 0), (3, 0, 2, 5), (0, 3, 5, 2)])
+def test_an_empty_box_is_an_error(edges):
+    with pytest.raises(ValueError, match="empty box"):
+        Box(*edges)
+
+
+@pytest.mark.parametrize(
+    ("content", "padded"), [((0, 4), (8, 8)), ((4, -1), (8, 8)), ((9, 4), (8, 8)), ((4, 9), (8, 8))]
+)
+def test_a_view_without_pixels_or_with_too_little_padding_is_an_error(content, padded):
+    with pytest.raises(ValueError, match=r"without pixels|cannot shrink"):
+        View(Box(0, 0, 4, 4), Size(*content), Size(*padded))
+
+
+@pytest.mark.parametrize("long_side", [0, -8])
+def test_fitting_to_a_side_that_is_not_positive_is_an_error(long_side):
+    with pytest.raises(ValueError):
+        View.fit(Box(0, 0, 40, 30), long_side=long_side)
+
+
+@pytest.mark.parametrize("crop", [Box(0, 0, 41, 30), Box(0, 0, 40, 31), Box(-1, 0, 20, 20), Box(-9, -9, -1, -1)])
+def test_rendering_a_crop_that_leaves_the_image_is_an_error(crop):
+    with pytest.raises(ValueError, match="leaves the image of 40 x 30"):
+        View.fit(crop, long_side=16).render(np.zeros((30, 40), np.uint8))

@@ -1,0 +1,223 @@
+"""The critical region: the paper's Algorithm 1 and Crop Area Expansion, to the letter."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_array_equal
+
+from mkpc_kaggle.geometry.coordinates import Box, Size
+from mkpc_kaggle.geometry.critical_region import (
+    MkpcConfig,
+    Ratio,
+    RegionReason,
+    cluster_points,
+    critical_region,
+    expand_box,
+    keep_clusters,
+)
+
+SQUARE = Size(1000, 1000)
+PAPER = MkpcConfig()
+BARE = MkpcConfig(expand_x=1.0, min_side=1)  # the plain bounding box, however small
+SEEDS = st.integers(0, 2**32 - 1)
+
+
+def block(left, top, right, bottom, n):
+    """n points that span a box from pixel to pixel: two of its corners, the others anywhere in it."""
+    inner = np.random.default_rng(n).uniform((left, top), (right, bottom), (n - 2, 2))
+    return np.concatenate([[(left, top), (right, bottom)], inner]).astype(np.float32)
+
+
+def lone(n):
+    """n points farther than eps apart, in the lower half of the square."""
+    return np.array([(20 + 60 * (i % 16), 440 + 60 * (i // 16)) for i in range(n)], np.float32)
+
+
+def region(*parts, size=SQUARE, config=BARE):
+    return critical_region(np.concatenate(parts), size, config)
+
+
+NOTHING = np.zeros((0, 2), np.float32)
+
+
+@pytest.mark.parametrize(
+    ("points", "reason", "clusters", "kept"),
+    [
+        (NOTHING, RegionReason.TOO_FEW_POINTS, 0, 0),
+        (block(100, 100, 101, 101, 4), RegionReason.TOO_FEW_POINTS, 0, 0),
+        (lone(30), RegionReason.NO_CLUSTER, 0, 0),
+        (np.concatenate([block(100, 100, 133, 133, 5), lone(21)]), RegionReason.TOO_SCATTERED, 1, 1),
+        (block(100, 100, 132, 130, 50), RegionReason.TOO_SMALL, 1, 1),
+        (block(100, 100, 132, 131, 50), RegionReason.CROPPED, 1, 1),
+        (np.concatenate([block(100, 100, 133, 133, 5), lone(20)]), RegionReason.CROPPED, 1, 1),
+    ],
+    ids=["empty", "few", "no cluster", "scattered", "one row too small", "of least side", "just clustered enough"],
+)
+def test_every_outcome_has_its_reason_and_only_one_is_a_crop(points, reason, clusters, kept):
+    got = critical_region(points, SQUARE, PAPER)
+    assert (got.reason, got.clusters, got.kept) == (reason, clusters, kept)
+    assert got.cropped == (reason is RegionReason.CROPPED) == (got.box != Box.whole(SQUARE))
+
+
+@pytest.mark.parametrize("clustered", range(5, 31))
+def test_a_fifth_of_the_points_in_clusters_is_enough_and_less_is_not(clustered):
+    one = block(100, 100, 130, 130, clustered)
+    assert region(one, lone(4 * clustered)).reason is RegionReason.CROPPED
+    assert region(one, lone(4 * clustered + 1)).reason is RegionReason.TOO_SCATTERED
+
+
+@pytest.mark.parametrize(("percent", "clustered"), [(7, 7), (14, 7), (28, 7), (55, 11), (56, 14)])
+def test_the_least_share_clustered_is_compared_to_the_letter(percent, clustered):
+    one, noise = block(100, 100, 130, 130, clustered), lone(clustered * 100 // percent - clustered)
+    got = region(one, noise, config=replace(BARE, min_clustered=percent / 100))
+    assert got.reason is RegionReason.CROPPED
+
+
+@pytest.mark.parametrize("k", [5, 7, 12])
+def test_a_cluster_of_exactly_the_share_is_kept_and_a_point_fewer_is_not(k):
+    large, small = block(100, 100, 130, 130, 20 * k), block(400, 300, 420, 320, k)
+    both, one = Box(100, 100, 421, 321), Box(100, 100, 131, 131)
+    kept = region(large, small)
+    assert (kept.box, kept.clusters, kept.kept) == (both, 2, 2)
+    over = block(100, 100, 130, 130, 20 * k + 1)
+    dropped = region(over, small)
+    assert (dropped.box, dropped.clusters, dropped.kept) == (one, 2, 1)
+
+
+@pytest.mark.parametrize("percent", range(1, 100))
+def test_the_share_is_compared_to_the_letter(percent):
+    share = percent / 100
+    for largest in (100, 700, 1100):
+        least = percent * largest // 100
+        assert least / largest >= share
+        assert_array_equal(keep_clusters(np.array([largest, least]), share), [0, 1])
+        assert_array_equal(keep_clusters(np.array([largest, least]), share, Ratio.LAST_KEPT), [0, 1])
+        assert_array_equal(keep_clusters(np.array([least - 1, largest]), share), [1])
+
+
+@pytest.mark.parametrize("k", [1, 3, 49, 333, 9973])
+def test_the_papers_share_is_compared_to_the_letter(k):
+    assert_array_equal(keep_clusters(np.array([k, 20 * k]), 0.05), [1, 0])
+    assert_array_equal(keep_clusters(np.array([k, 20 * k + 1]), 0.05), [1])
+
+
+def test_the_first_cluster_that_fails_ends_it():
+    sizes = np.array([4, 100, 6, 5, 3, 50])
+    assert_array_equal(keep_clusters(sizes, 0.05), [1, 5, 2, 3])
+    # Against the last kept, 100 -> 6 fails; a later 5 would pass against 6.
+    assert_array_equal(keep_clusters(np.array([100, 6, 5]), 0.1, Ratio.LAST_KEPT), [0])
+
+
+def test_comparing_with_the_last_kept_goes_on_where_the_largest_stops():
+    sizes = np.array([100, 20, 4, 1])
+    assert_array_equal(keep_clusters(sizes, 0.05, Ratio.LARGEST), [0, 1])
+    assert_array_equal(keep_clusters(sizes, 0.05, Ratio.LAST_KEPT), [0, 1, 2, 3])
+    parts = [block(100, 100, 130, 130, 400), block(300, 300, 330, 330, 40), block(700, 600, 730, 630, 6)]
+    largest = region(*parts)
+    last = region(*parts, config=replace(BARE, ratio=Ratio.LAST_KEPT))
+    assert (largest.box, largest.kept) == (Box(100, 100, 331, 331), 2)
+    assert (last.box, last.kept) == (Box(100, 100, 731, 631), 3)
+
+
+def test_clusters_of_one_size_keep_their_order_and_one_cluster_is_kept_whatever_the_share():
+    assert_array_equal(keep_clusters(np.array([7, 9, 7, 9]), 0.05), [1, 3, 0, 2])
+    assert_array_equal(keep_clusters(np.array([7]), 2.0), [0])
+
+
+def test_x_is_normalised_by_the_width_and_y_by_the_height():
+    size = Size(1000, 200)  # eps is 50 pixels along x and 10 along y
+    stack = np.repeat(np.array([[500, 100]], np.float32), 6, axis=0)
+    for shift, last_label in [((40, 0), 0), ((60, 0), 1), ((0, 9), 0), ((0, 20), 1)]:
+        points = np.concatenate([stack, stack + np.float32(shift)])
+        assert cluster_points(points, size, PAPER).max() == last_label
+        assert cluster_points(points[:, ::-1], Size(200, 1000), PAPER).max() == last_label
+
+
+def test_noise_does_not_widen_the_box():
+    clustered = block(100, 100, 130, 130, 40)
+    noise = np.array([(5, 5), (990, 10), (500, 900), (0, 999), (999, 999)], np.float32)
+    assert region(clustered, noise).box == region(clustered).box == Box(100, 100, 131, 131)
+
+
+def test_the_box_is_that_of_the_pixels_the_points_lie_on():
+    points = np.array([(99.5, 100.49), (130.49, 131.4)], np.float32)
+    assert expand_box(points, SQUARE, 1.0, 1.0) == Box(100, 100, 131, 132)
+
+
+def test_the_paper_expands_the_width_by_a_twentieth_about_the_centre_and_leaves_the_rows():
+    points = np.array([(200, 300), (399, 331)], np.float32)
+    assert (PAPER.expand_x, PAPER.expand_y) == (1.05, 1.0)
+    assert expand_box(points, SQUARE, 1.05, 1.0) == Box(195, 300, 405, 332)
+    assert expand_box(points[:, ::-1], SQUARE, 1.0, 1.05) == Box(300, 195, 332, 405)
+    # 101 columns grow by 2.525 on either side: edges are rounded outwards
+    assert expand_box(np.array([(200, 300), (300, 331)], np.float32), SQUARE, 1.05, 1.0) == Box(197, 300, 304, 332)
+    middle = np.concatenate([block(200 + 25 * i, 300, 225 + 25 * i, 331, 40) for i in range(8)])
+    assert critical_region(middle, SQUARE, PAPER).box == Box(194, 300, 407, 332)  # 201 columns
+
+
+def test_the_box_is_cut_at_the_border_and_loses_nothing_on_the_last_row_and_column():
+    size = Size(640, 480)
+    corners = np.array([(0, 0), (639, 479)], np.float32)
+    assert expand_box(corners, size, 1.05, 1.05) == Box(0, 0, 640, 480)
+    edge = np.nextafter(np.array([(639.5, 479.5)], np.float32), np.float32(0))
+    right = region(block(610, 450, 639, 479, 30), edge, size=size, config=replace(PAPER, min_side=1))
+    assert (right.box.right, right.box.bottom) == (640, 480)
+    assert right.box.left == 609  # 30 columns expanded by a twentieth about their centre, not about the cut box's
+    assert right.box.contains(edge).all()
+
+
+def test_points_that_are_not_finite_or_not_on_the_image_are_ignored():
+    clustered = block(100, 100, 130, 130, 10)
+    junk = np.array([(np.nan, 5), (5, np.inf), (-np.inf, np.nan), (1000, 5), (5, 999.5), (-0.75, 5)], np.float32)
+    assert region(clustered, np.repeat(junk, 30, axis=0)) == region(clustered)
+    assert region(np.repeat(junk, 30, axis=0)).reason is RegionReason.TOO_FEW_POINTS
+
+
+@given(
+    seed=SEEDS,
+    size=st.builds(Size, st.integers(1, 2000), st.integers(1, 2000)),
+    config=st.builds(
+        MkpcConfig,
+        share=st.sampled_from([0.0, 0.05, 0.5, 1.0]),
+        ratio=st.sampled_from(Ratio),
+        expand_x=st.floats(1, 3),
+        expand_y=st.floats(1, 3),
+        min_side=st.integers(1, 64),
+    ),
+)
+@settings(max_examples=150, deadline=None)
+def test_the_box_is_on_the_image_and_holds_every_kept_point(seed, size, config):
+    rng = np.random.default_rng(seed)
+    clumps = [rng.normal(rng.random(2), rng.choice([1e-3, 0.02]), (rng.integers(1, 60), 2)) for _ in range(4)]
+    points = (np.concatenate([*clumps, rng.uniform(-0.2, 1.2, (8, 2))]) * size).astype(np.float32)
+    got = critical_region(points, size, config)
+    box = got.box
+    assert 0 <= box.left < box.right <= size.width
+    assert 0 <= box.top < box.bottom <= size.height
+    assert got.kept <= got.clusters
+    if not got.cropped:
+        assert box == Box.whole(size)
+        return
+    on_image = points[Box.whole(size).contains(points)]
+    labels = cluster_points(on_image, size, config)
+    kept = keep_clusters(np.bincount(labels[labels >= 0]), config.share, config.ratio)
+    assert len(kept) == got.kept
+    assert box.contains(on_image[np.isin(labels, kept)]).all()
+    assert min(box.size) >= config.min_side
+
+
+@given(seed=SEEDS)
+@settings(max_examples=40, deadline=None)
+def test_the_order_of_the_points_does_not_matter(seed):
+    # Clumps more than two eps apart: no point is a border point of two of them, which DBSCAN gives to the first.
+    rng = np.random.default_rng(seed)
+    centres = np.array([(x, y) for x in (0.15, 0.45, 0.75) for y in (0.15, 0.45, 0.75)])[rng.permutation(9)[:4]]
+    clumps = [centre + rng.uniform(-0.02, 0.02, (rng.integers(2, 90), 2)) for centre in centres]
+    points = (np.concatenate([*clumps, rng.random((3, 2))]) * (640, 480)).astype(np.float32)
+    for ratio in Ratio:
+        config = replace(PAPER, ratio=ratio)
+        got = critical_region(points, Size(640, 480), config)
+        assert critical_region(rng.permutation(points), Size(640, 480), config) == got

@@ -1,0 +1,235 @@
+"""The engine with a matcher whose cost and answers are known."""
+
+import sqlite3
+import time
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mkpc_kaggle.assembly import Assembly
+from mkpc_kaggle.pipeline import Pipeline
+from mkpc_kaggle.recipe import UpgradeConfig
+from mkpc_kaggle.run.engine import Ending
+from mkpc_kaggle.run.jobs import NOT_REACHED, Record
+from mkpc_kaggle.run.journal import Journal
+
+from rectified import (
+    EXTRA,
+    SECOND,
+    SWEEP,
+    THIRD,
+    THREE_UNITS,
+    RectifiedMatcher,
+    interrupt_after,
+    run,
+    write_pairs,
+)
+
+
+def matrices(records: tuple[Record, ...]) -> bytes:
+    return b"".join(record.F.tobytes() for record in records)
+
+
+def units(record: Record) -> list[str]:
+    return [unit.unit for unit in record.units]
+
+
+def test_a_run_without_a_limit_gives_every_pair_every_unit(tmp_path: Path) -> None:
+    report = run(write_pairs(tmp_path, 11), THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
+    assert report.ending is Ending.COMPLETE
+    assert [record.index for record in report.records] == list(range(11))
+    for record in report.records:
+        assert units(record) == [SWEEP.name, SECOND.name, THIRD.name]
+        assert record.failure == ""
+        # Stage 2 sees the critical region only, so a few points at its border are lost.
+        assert 400 < record.inliers == record.matches <= 450
+        np.testing.assert_allclose(np.abs(record.F[1:, 1:]), [[0, 0.5**0.5], [0.5**0.5, 0]], atol=2e-3)
+        assert record.regions is not None
+
+
+def test_the_sweep_reaches_all_pairs_before_any_pair_is_deepened(tmp_path: Path) -> None:
+    matcher = RectifiedMatcher()
+    run(write_pairs(tmp_path, 9), THREE_UNITS, matcher, tmp_path / "work")
+    assert {side for side, _ in matcher.calls[:9]} == {SWEEP.long_side}
+    assert SWEEP.long_side not in {side for side, _ in matcher.calls[9:]}
+
+
+def test_every_published_version_is_whole_and_the_first_comes_before_any_work(tmp_path: Path) -> None:
+    matcher, published = RectifiedMatcher(), []
+
+    def publish(records: list[Record]) -> None:
+        published.append(([record.F.copy() for record in records], len(matcher.calls)))
+
+    run(write_pairs(tmp_path, 5), THREE_UNITS, matcher, tmp_path / "work", publish=publish)
+    assert published[0][1] == 0
+    assert len(published) >= 2
+    for version, _ in published:
+        assert len(version) == 5
+        assert all(np.isfinite(F).all() and F.any() for F in version)
+
+
+def test_units_that_do_not_fit_are_left_out_and_the_run_ends_in_time(tmp_path: Path) -> None:
+    # Sweep: 20 x 0.05 = 1 s. The other two units would need 2 s more; 0.7 s are left for them.
+    started = time.monotonic()
+    matcher = RectifiedMatcher(seconds=0.05)
+    report = run(write_pairs(tmp_path, 20), THREE_UNITS, matcher, tmp_path / "work", limit=3.2)
+    assert time.monotonic() - started < 3.2
+    assert report.ending is Ending.TIME_IS_UP
+    assert all(units(record)[0] == SWEEP.name for record in report.records)
+    assert 20 < len(matcher.calls) < 60
+
+
+def test_more_time_never_means_fewer_units(tmp_path: Path) -> None:
+    pairs = write_pairs(tmp_path, 12)
+    done = []
+    for limit in (2.4, 3.0, 6.0):
+        matcher = RectifiedMatcher(seconds=0.05)
+        run(pairs, THREE_UNITS, matcher, tmp_path / f"work{limit}", limit=limit)
+        done.append(len(matcher.calls))
+    assert done[0] < done[1] < done[2] == 36
+
+
+def test_a_limit_shorter_than_the_sweep_still_gives_every_row(tmp_path: Path) -> None:
+    report = run(write_pairs(tmp_path, 30), THREE_UNITS, RectifiedMatcher(seconds=0.2), tmp_path / "w", limit=2.5)
+    reached = [record for record in report.records if record.units]
+    assert 0 < len(reached) < 30
+    assert report.ending is Ending.TIME_IS_UP
+    assert {record.failure for record in report.records if not record.units} == {NOT_REACHED}
+    assert all(np.isfinite(record.F).all() and np.linalg.matrix_rank(record.F) == 2 for record in report.records)
+
+
+def test_time_left_goes_to_the_weakest_pairs_first(tmp_path: Path) -> None:
+    # The fewer matches, the brighter: the last pairs are the weakest.
+    matcher = RectifiedMatcher(matches=lambda brightness: 200 - 5 * brightness)
+    recipe = replace(THREE_UNITS, units=(SWEEP, EXTRA), upgrade=UpgradeConfig(below_inliers=120))
+    report = run(write_pairs(tmp_path, 12), recipe, matcher, tmp_path / "work")
+    extra = [brightness for side, brightness in matcher.calls if side == EXTRA.long_side]
+    assert extra == [21, 20, 19, 18, 17]
+    assert report.ending is Ending.COMPLETE
+    assert [len(record.units) for record in report.records] == [1] * 7 + [2] * 5
+
+
+def test_an_interrupted_run_goes_on_where_it_was_and_ends_with_the_same_bytes(tmp_path: Path) -> None:
+    pairs = write_pairs(tmp_path, 20)
+    undisturbed = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "undisturbed")
+    first = RectifiedMatcher(seconds=0.02)
+    cut = run(pairs, THREE_UNITS, first, tmp_path / "work", interrupt=interrupt_after(0.6))
+    assert cut.ending is Ending.INTERRUPTED
+    second = RectifiedMatcher()
+    resumed = run(pairs, THREE_UNITS, second, tmp_path / "work")
+    assert matrices(resumed.records) == matrices(undisturbed.records)
+    assert [units(record) for record in resumed.records] == [units(record) for record in undisturbed.records]
+    assert max(Counter(first.calls + second.calls).values()) == 1, "no unit runs twice on a pair"
+    assert first.calls
+    assert second.calls
+
+
+def test_a_finished_run_is_not_run_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pairs = write_pairs(tmp_path, 3)
+    once = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
+    monkeypatch.setattr(Pipeline, "load", lambda _: pytest.fail("nothing is left to do"))
+    twice = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
+    assert matrices(once.records) == matrices(twice.records)
+    assert twice.resumed == 3
+
+
+def test_an_unreadable_image_costs_its_pair_only(tmp_path: Path) -> None:
+    pairs = write_pairs(tmp_path, 4)
+    pairs[2].image1.write_bytes(b"")
+    report = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
+    assert "the file is empty" in report.records[2].failure
+    assert np.linalg.matrix_rank(report.records[2].F) == 2
+    assert [len(record.units) for record in report.records] == [3, 3, 0, 3]
+    assert report.ending is Ending.COMPLETE
+
+
+def test_a_matcher_that_raises_costs_its_pair_that_unit_only(tmp_path: Path) -> None:
+    def moody(brightness: int) -> int:
+        if brightness == 12:
+            raise RuntimeError("no mood")
+        return 150
+
+    report = run(write_pairs(tmp_path, 4), THREE_UNITS, RectifiedMatcher(matches=moody), tmp_path / "work")
+    assert [record.inliers > 400 for record in report.records] == [True, True, False, True]
+    assert {unit.failure for unit in report.records[2].units} == {"RuntimeError: no mood"}
+    assert "too few distinct matches" in report.records[2].failure
+
+
+def test_a_lost_job_is_a_fault_in_the_report_and_the_others_go_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = Pipeline.match
+
+    def lose_one(self: Pipeline, works: list, *rest: object) -> list:
+        if any(np.median(work.images[0].pixels) == 10 for work in works):
+            raise MemoryError("gone")
+        return whole(self, works, *rest)
+
+    monkeypatch.setattr(Pipeline, "match", lose_one)
+    report = run(write_pairs(tmp_path, 12), THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
+    assert report.faults == ("a job was lost: MemoryError: gone",)
+    assert [bool(record.units) for record in report.records] == [False] + [True] * 11
+
+
+def test_a_journal_that_cannot_be_written_does_not_stop_the_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise sqlite3.OperationalError("database or disk is full")
+
+    monkeypatch.setattr(Journal, "save", full)
+    report = run(write_pairs(tmp_path, 10), THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
+    assert all(record.inliers > 400 for record in report.records)
+    assert "disk is full" in report.faults[0]
+
+
+def test_a_submission_that_cannot_be_written_is_a_fault_not_the_end(tmp_path: Path) -> None:
+    def full(_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    report = run(write_pairs(tmp_path, 3), THREE_UNITS, RectifiedMatcher(), tmp_path / "work", publish=full)
+    assert all(record.inliers for record in report.records)
+    assert "No space left" in report.faults[0]
+
+
+def test_an_interrupt_ends_the_run_within_a_unit(tmp_path: Path) -> None:
+    started = time.monotonic()
+    matcher = RectifiedMatcher(seconds=0.1)
+    report = run(
+        write_pairs(tmp_path, 40), THREE_UNITS, matcher, tmp_path / "work", interrupt=interrupt_after(0.5)
+    )
+    assert report.ending is Ending.INTERRUPTED
+    assert time.monotonic() - started < 2.0
+    assert any(record.units for record in report.records), "what was found is kept"
+
+
+def test_a_unit_that_never_returns_does_not_hold_the_run_past_its_limit(tmp_path: Path) -> None:
+    def stuck(brightness: int) -> int:
+        if brightness == 13:
+            time.sleep(4)
+        return 150
+
+    started = time.monotonic()
+    report = run(
+        write_pairs(tmp_path, 12), THREE_UNITS, RectifiedMatcher(matches=stuck), tmp_path / "work", limit=3.0
+    )
+    assert time.monotonic() - started < 3.0
+    assert len(report.records) == 12
+    assert report.records[0].units
+
+
+def test_the_same_run_twice_gives_the_same_bytes(tmp_path: Path) -> None:
+    pairs = write_pairs(tmp_path, 9)
+    runs = [run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / f"work{n}") for n in range(2)]
+    assert matrices(runs[0].records) == matrices(runs[1].records)
+
+
+def test_an_assembly_is_a_value_that_builds_pipelines(tmp_path: Path) -> None:
+    from mkpc_kaggle.assembly import assemble
+
+    assembly = assemble(THREE_UNITS, matchers={"rectified": RectifiedMatcher()}, device="cpu")
+    assert isinstance(assembly, Assembly)
+    assert assembly.pipeline().batch == 1
+    assert assembly.fingerprint()["weights"] == {}

@@ -1,0 +1,283 @@
+"""Decoding: what is read, what is unreadable and why, and the store that does it once and ahead of need."""
+
+import os
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from numpy.testing import assert_array_equal
+
+from mkpc_kaggle import images
+from mkpc_kaggle.images import Image, ImageStore, Unreadable, read_image
+
+RED = (200, 30, 10)  # RGB
+
+
+def write(path, pixels, *options):
+    """RGB, gray or RGBA -> the file."""
+    order = {4: cv2.COLOR_RGBA2BGRA, 3: cv2.COLOR_RGB2BGR}.get(pixels.shape[2] if pixels.ndim == 3 else 1)
+    done, data = cv2.imencode(path.suffix, pixels if order is None else cv2.cvtColor(pixels, order), options)
+    assert done
+    path.write_bytes(data.tobytes())
+    return path
+
+
+def noise(*shape, kind=np.uint8):
+    return np.random.default_rng(0).integers(0, np.iinfo(kind).max, shape, dtype=kind, endpoint=True)
+
+
+def reason(path):
+    answer = read_image(path)
+    assert isinstance(answer, Unreadable)
+    assert answer.name == str(path)
+    assert str(answer) == f"{path}: {answer.reason}"
+    return answer.reason
+
+
+# one file
+
+
+def test_a_colour_png_is_read_as_it_is(tmp_path):
+    pixels = noise(5, 7, 3)
+    image = read_image(write(tmp_path / "a.png", pixels))
+    assert_array_equal(image.pixels, pixels)
+    assert (image.name, image.size, image.pixels.dtype) == (str(tmp_path / "a.png"), (7, 5), np.uint8)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".jpeg"])
+def test_red_comes_first(tmp_path, suffix):
+    image = read_image(write(tmp_path / f"a{suffix}", np.full((16, 24, 3), RED, np.uint8)))
+    assert np.abs(image.pixels.astype(int) - RED).max() <= 3
+
+
+def test_a_gray_file_has_three_equal_channels(tmp_path):
+    pixels = noise(5, 7)
+    image = read_image(write(tmp_path / "a.png", pixels))
+    assert_array_equal(image.pixels, np.stack([pixels] * 3, axis=2))
+    assert_array_equal(image.gray, pixels)
+
+
+@pytest.mark.parametrize("shape", [(16, 16), (16, 16, 3)])
+def test_sixteen_bits_are_divided_by_256(tmp_path, shape):
+    pixels = noise(*shape, kind=np.uint16)
+    image = read_image(write(tmp_path / "a.png", pixels))
+    assert_array_equal(image.pixels, np.broadcast_to((pixels // 256).reshape(16, 16, -1), (16, 16, 3)))
+
+
+def test_alpha_is_dropped_and_mixes_with_nothing(tmp_path):
+    pixels = noise(5, 7, 4)
+    assert_array_equal(read_image(write(tmp_path / "a.png", pixels)).pixels, pixels[..., :3])
+
+
+def test_an_exif_orientation_is_applied(tmp_path):
+    pixels = np.zeros((16, 32, 3), np.uint8)
+    pixels[:, :16] = RED  # turned clockwise by a quarter, the left half is on top
+    path = write(tmp_path / "a.jpg", pixels, cv2.IMWRITE_JPEG_QUALITY, 100)
+    tag = b"MM\0*\0\0\0\x08" + b"\0\x01" + b"\x01\x12\0\x03\0\0\0\x01\0\x06\0\0" + b"\0\0\0\0"
+    exif = b"Exif\0\0" + tag
+    data = path.read_bytes()
+    path.write_bytes(data[:2] + b"\xff\xe1" + (len(exif) + 2).to_bytes(2) + exif + data[2:])
+    image = read_image(path)
+    assert image.size == (16, 32)
+    assert image.pixels[:8, :, 0].mean() > 150 > 50 > image.pixels[-8:, :, 0].mean()
+
+
+def test_one_pixel_is_a_picture(tmp_path):
+    image = read_image(write(tmp_path / "a.png", np.full((1, 1, 3), RED, np.uint8)))
+    assert_array_equal(image.pixels, [[RED]])
+
+
+def test_thirty_megapixels_are_read(tmp_path):
+    pixels = np.zeros((5000, 6000), np.uint8)
+    pixels[4999, 5999] = 255
+    image = read_image(write(tmp_path / "a.png", pixels, cv2.IMWRITE_PNG_COMPRESSION, 1))
+    assert image.size == (6000, 5000)
+    assert image.pixels[-1, -1, 0] == 255
+
+
+def test_the_suffix_does_not_decide_the_format(tmp_path):
+    path = write(tmp_path / "a.jpg", noise(9, 9, 3)).rename(tmp_path / "a.png")
+    assert isinstance(read_image(path), Image)
+
+
+def test_an_empty_file_is_unreadable(tmp_path):
+    (tmp_path / "a.png").touch()
+    assert reason(tmp_path / "a.png") == "the file is empty"
+
+
+def test_text_is_unreadable(tmp_path):
+    (tmp_path / "a.png").write_text("no picture at all\n" * 100)
+    assert "not a picture" in reason(tmp_path / "a.png")
+
+
+def test_a_directory_and_a_missing_file_are_unreadable(tmp_path):
+    (tmp_path / "a.png").mkdir()
+    assert "cannot be read" in reason(tmp_path / "a.png")
+    assert reason(tmp_path / "b.png") == "no such file"
+
+
+@pytest.mark.skipif(os.name != "posix" or os.geteuid() == 0, reason="root may read everything")
+def test_a_file_without_permission_is_unreadable(tmp_path):
+    write(tmp_path / "a.png", noise(5, 5, 3)).chmod(0)
+    assert "ermission denied" in reason(tmp_path / "a.png")
+
+
+@pytest.mark.parametrize("share", [0.001, 0.1, 0.5, 0.99])
+def test_a_png_that_is_cut_off_is_unreadable(tmp_path, share):
+    path = write(tmp_path / "a.png", noise(64, 64, 3))
+    path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
+    assert "cut off" in reason(path)
+
+
+@pytest.mark.parametrize("share", [0.01, 0.1, 0.5, 0.99])
+def test_a_jpg_that_is_cut_off_is_read_as_far_as_it_goes_or_unreadable(tmp_path, share):
+    path = write(tmp_path / "a.jpg", noise(64, 64, 3))
+    path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
+    answer = read_image(path)
+    assert isinstance(answer, Unreadable) or answer.pixels.shape == (64, 64, 3)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg"])
+def test_damaged_bytes_never_raise(tmp_path, suffix):
+    whole = write(tmp_path / f"a{suffix}", noise(48, 48, 3)).read_bytes()
+    rng = np.random.default_rng(1)
+    for number in range(30):
+        data = bytearray(whole)
+        for place in rng.integers(len(data), size=1 + number):
+            data[place] = rng.integers(256)
+        (tmp_path / f"b{suffix}").write_bytes(data)
+        assert isinstance(read_image(tmp_path / f"b{suffix}"), Image | Unreadable)
+
+
+# arrays
+
+
+def test_an_array_is_named_by_its_content_and_its_shape():
+    pixels = noise(6, 4, 3)
+    assert Image.of_array(pixels).name == Image.of_array(pixels.copy()).name
+    assert Image.of_array(pixels).name != Image.of_array(pixels.reshape(4, 6, 3)).name
+    assert Image.of_array(pixels).name != Image.of_array(255 - pixels).name
+
+
+def test_a_gray_array_and_a_view_of_an_array_are_images():
+    gray = noise(6, 4)
+    assert_array_equal(Image.of_array(gray).pixels[..., 2], gray)
+    mirrored = noise(6, 4, 3)[:, ::-1]
+    assert_array_equal(Image.of_array(mirrored).pixels, mirrored)
+
+
+@pytest.mark.parametrize(
+    "array",
+    [
+        np.zeros((4, 4, 3), np.float32),
+        np.zeros((4, 4, 3), np.uint16),
+        np.zeros((4, 4, 4), np.uint8),
+        np.zeros((4, 4, 1), np.uint8),
+        np.zeros(4, np.uint8),
+        np.zeros((2, 4, 4, 3), np.uint8),
+        np.zeros((0, 4, 3), np.uint8),
+    ],
+    ids=lambda array: f"{array.dtype} {array.shape}",
+)
+def test_an_array_that_is_no_image_is_refused_by_type_and_shape(array):
+    with pytest.raises(ValueError, match=rf"not {array.dtype} \({array.shape[0]},"):
+        Image.of_array(array)
+
+
+# the store
+
+
+@pytest.fixture
+def decoded(monkeypatch):
+    """Paths in the order in which they were decoded; a file called ``bad`` is unreadable."""
+    seen: list[Path] = []
+
+    def fake(path):
+        seen.append(path)
+        time.sleep(0.01)
+        if path.name == "bad":
+            return Unreadable(str(path), "bad")
+        return Image(str(path), np.zeros((10, 10, 3), np.uint8))
+
+    monkeypatch.setattr(images, "read_image", fake)
+    return seen
+
+
+@pytest.fixture
+def store():
+    """Room for three of the images of ``decoded``."""
+    made = ImageStore(limit_bytes=900)
+    yield made
+    made.close()
+
+
+def test_what_is_announced_is_decoded_in_the_background(store, monkeypatch):
+    started, go = threading.Event(), threading.Event()
+
+    def slow(path):
+        started.set()
+        assert go.wait(10)
+        return Image(str(path), np.zeros((1, 1, 3), np.uint8))
+
+    monkeypatch.setattr(images, "read_image", slow)
+    store.announce([Path("a")])  # comes back although nothing can be decoded yet
+    assert started.wait(10)
+    go.set()
+    assert store.get(Path("a")).name == "a"
+
+
+def test_a_file_is_decoded_once_however_often_it_is_announced_and_asked_for(store, decoded):
+    paths = [Path("a"), Path("b")]
+    for _ in range(3):
+        store.announce([*paths, *paths])
+        assert [store.get(path).name for path in paths] == ["a", "b"]
+    assert decoded == paths
+
+
+def test_the_store_reads_real_files(store, tmp_path):
+    pixels = noise(5, 7, 3)
+    path = write(tmp_path / "a.png", pixels)
+    assert_array_equal(store.get(path).pixels, pixels)
+    assert store.get(tmp_path / "b.png") == Unreadable(str(tmp_path / "b.png"), "no such file")
+
+
+def test_the_image_used_longest_ago_makes_room(store, decoded):
+    for name in ("a", "b", "c", "a", "d", "a", "b"):
+        store.get(Path(name))
+    assert [path.name for path in decoded] == ["a", "b", "c", "d", "b"]
+
+
+def test_an_image_above_the_limit_is_handed_out_all_the_same(decoded):
+    small = ImageStore(limit_bytes=299)
+    assert [small.get(Path("a")).name for _ in range(2)] == ["a", "a"]
+    assert len(decoded) == 2
+    small.close()
+
+
+def test_an_unreadable_file_is_tried_again(store, decoded):
+    assert [store.get(Path("bad")).reason for _ in range(2)] == ["bad", "bad"]
+    assert len(decoded) == 2
+
+
+def test_threads_may_ask_for_the_same_file_at_once(store, decoded):
+    together = threading.Barrier(6)
+
+    def ask(_):
+        together.wait(10)
+        return store.get(Path("a")).name
+
+    with ThreadPoolExecutor(6) as pool:
+        assert list(pool.map(ask, range(6))) == ["a"] * 6
+    assert len(decoded) == 1
+
+
+def test_threads_that_press_on_a_small_store_get_what_they_ask_for(decoded):
+    store = ImageStore(limit_bytes=600, threads=2)
+    names = [str(number % 5) for number in range(60)]
+    with ThreadPoolExecutor(4) as pool:
+        assert list(pool.map(lambda name: store.get(Path(name)).name, names)) == names
+    store.close()

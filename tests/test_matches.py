@@ -1,0 +1,172 @@
+"""Matches: a value that keeps its order and drops what is not on the images."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
+
+from mkpc_kaggle.geometry.coordinates import Box, Size, View
+from mkpc_kaggle.geometry.matches import Matches
+
+NAN, INF = np.nan, np.inf
+
+
+def some(n, seed=0):
+    rng = np.random.default_rng(seed)
+    return Matches(rng.uniform(0, 90, (n, 2)), rng.uniform(0, 90, (n, 2)), rng.random(n))
+
+
+def scored(scores):
+    """The i-th match lies at (i, i): its place tells which one it was."""
+    at = np.repeat(np.arange(len(scores))[:, None], 2, axis=1)
+    return Matches(at, at, np.asarray(scores))
+
+
+def places(matches):
+    assert_array_equal(matches.points0, matches.points1)
+    return matches.points0[:, 0].astype(int).tolist()
+
+
+def assert_same(matches, other):
+    for name in ("points0", "points1", "scores"):
+        assert_array_equal(getattr(matches, name), getattr(other, name))
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float16, np.int64, np.uint8])
+def test_any_dtype_is_cast_to_contiguous_float32(dtype):
+    array = np.arange(12, dtype=dtype).reshape(2, 6)
+    matches = Matches(array[:, ::3], array.T[:2].T, array[:, 5])
+    for got in (matches.points0, matches.points1, matches.scores):
+        assert got.dtype == np.float32
+        assert got.flags.c_contiguous
+    assert_array_equal(matches.points0, [[0, 3], [6, 9]])
+    assert_array_equal(matches.scores, [5, 11])
+
+
+@pytest.mark.parametrize(
+    ("shape0", "shape1", "shape_scores"),
+    [
+        ((3, 2), (3, 2), (2,)),
+        ((2, 2), (3, 2), (3,)),
+        ((3, 2), (2, 2), (3,)),
+        ((3, 3), (3, 2), (3,)),
+        ((3, 2), (3, 2), (3, 1)),
+        ((3, 2), (6,), (3,)),
+        ((0,), (0, 2), (0,)),
+    ],
+)
+def test_shapes_that_disagree_are_an_error(shape0, shape1, shape_scores):
+    with pytest.raises(ValueError, match="shape"):
+        Matches(np.zeros(shape0), np.zeros(shape1), np.zeros(shape_scores))
+
+
+def test_empty_is_legal_everywhere():
+    empty = Matches.empty()
+    size, view = Size(40, 30), View.fit(Box(0, 0, 40, 30), long_side=64, flip=True)
+    results = [
+        empty,
+        Matches.concatenate([]),
+        Matches.concatenate([empty, empty]),
+        empty.best(0),
+        empty.best(5),
+        some(5).best(0),
+        empty.inside(size, size),
+        empty.to_image(view, view),
+        empty[:],
+        empty[np.zeros(0, bool)],
+    ]
+    for result in results:
+        assert len(result) == 0
+        assert result.points0.shape == result.points1.shape == (0, 2)
+        assert result.scores.shape == (0,)
+
+
+def test_concatenation_keeps_every_match_in_order_duplicates_too():
+    a, b = some(4, seed=1), some(3, seed=2)
+    together = Matches.concatenate(iter([a, Matches.empty(), b, a]))
+    assert len(together) == 11
+    assert_same(together[:4], a)
+    assert_same(together[4:7], b)
+    assert_same(together[7:], a)
+
+
+def test_a_mask_indices_and_a_slice_choose_matches():
+    matches = scored([5, 6, 7, 8])
+    assert places(matches[np.array([True, False, False, True])]) == [0, 3]
+    assert places(matches[np.array([2, 0])]) == [2, 0]
+    assert places(matches[1:3]) == [1, 2]
+
+
+@pytest.mark.parametrize(
+    ("scores", "most", "expected"),
+    [
+        ([0.1, 0.9, 0.5, 0.7], 2, [1, 3]),
+        ([0.9, 0.1, 0.7, 0.5], 3, [0, 2, 3]),
+        ([0.5, 0.5, 0.5, 0.5], 2, [0, 1]),
+        ([0.5, 0.9, 0.5, 0.5], 3, [0, 1, 2]),
+        ([-2.0, -1.0, -3.0], 1, [1]),
+        ([NAN, 0.2, NAN, 0.1], 2, [1, 3]),
+        ([0.1, 0.2], 2, [0, 1]),
+        ([0.1, 0.2], 100, [0, 1]),
+    ],
+)
+def test_the_best_are_those_of_highest_score_in_their_order_the_earlier_of_a_tie(scores, most, expected):
+    assert places(scored(scores).best(most)) == expected
+
+
+@given(scores=st.lists(st.integers(0, 5), max_size=40), most=st.integers(0, 45))
+@settings(max_examples=100, deadline=None)
+def test_the_best_are_those_of_a_stable_sort(scores, most):
+    by_score = sorted(range(len(scores)), key=lambda i: -scores[i])
+    assert places(scored(scores).best(most)) == sorted(by_score[:most])
+
+
+def test_inside_drops_what_is_off_either_image_or_not_finite():
+    good = [(0, 0), (-0.5, -0.5), (39.25, 29.25)]
+    bad = [(39.5, 3), (3, 29.5), (-0.75, 3), (NAN, 3), (3, INF)]
+    points = np.array([*good, *bad], np.float32)
+    zeros, ones = np.zeros_like(points), np.ones(len(points))
+    small, large = Size(40, 30), Size(1000, 1000)
+    first, second = Matches(points, zeros, ones), Matches(zeros, points, ones)
+    assert_same(first.inside(small, large), first[:3])
+    assert_same(second.inside(large, small), second[:3])
+    assert places(scored([1, NAN, 2, INF, -INF, 0]).inside(large, large)) == [0, 2, 5]
+
+
+def test_the_way_out_of_a_matcher_drops_padding_outside_and_not_finite_and_maps_the_rest():
+    view0 = View(Box(10, 20, 50, 40), Size(80, 40), Size(96, 64))
+    view1 = View(Box(0, 0, 60, 60), Size(30, 30), Size(32, 32), flip=True)
+    rows = [
+        ((0.5, 0.5), (29, 0), 0.9),  # kept
+        ((85, 10), (5, 5), 1),  # on the padding of view 0
+        ((10, 50), (5, 5), 1),
+        ((10, 10), (31, 5), 1),  # on the padding of view 1
+        ((79.25, 39.25), (0, 29), 0.1),  # kept
+        ((-0.75, 3), (5, 5), 1),  # outside
+        ((NAN, 3), (5, 5), 1),
+        ((3, 3), (5, INF), 1),
+        ((3, 3), (5, 5), NAN),
+        ((3, 3), (5, 5), INF),
+        ((40, 20), (15, 10), -3),  # kept: a low score is a score
+    ]
+    out = Matches(*(np.array(column, np.float32) for column in zip(*rows, strict=True))).to_image(view0, view1)
+    assert_allclose(out.points0, [(10, 20), (49.375, 39.375), (29.75, 29.75)], atol=1e-5)
+    assert_allclose(out.points1, [(0.5, 0.5), (58.5, 58.5), (28.5, 20.5)], atol=1e-5)
+    assert_array_equal(out.scores, np.array([0.9, 0.1, -3], np.float32))
+    assert out.points0.dtype == out.points1.dtype == np.float32
+
+
+@given(seed=st.integers(0, 2**32 - 1), long_side=st.integers(8, 900), flip=st.booleans())
+@settings(max_examples=50, deadline=None)
+def test_points_of_an_image_come_back_through_its_views(seed, long_side, flip):
+    rng = np.random.default_rng(seed)
+    crop0, crop1 = Box(30, 40, 330, 240), Box(0, 0, 100, 400)
+    view0 = View.fit(crop0, long_side=long_side, multiple=32, flip=flip)
+    view1 = View.fit(crop1, long_side=long_side, multiple=8)
+    points0 = rng.uniform((crop0.left, crop0.top), (crop0.right - 1, crop0.bottom - 1), (30, 2))
+    points1 = rng.uniform((crop1.left, crop1.top), (crop1.right - 1, crop1.bottom - 1), (30, 2))
+    out = Matches(view0.from_image(points0), view1.from_image(points1), rng.random(30)).to_image(view0, view1)
+    assert len(out) == 30
+    assert_allclose(out.points0, points0, rtol=0, atol=2e-3)
+    assert_allclose(out.points1, points1, rtol=0, atol=2e-3)

@@ -1,0 +1,215 @@
+"""The scores, against answers known by construction or by hand."""
+
+from math import inf, isnan, nan
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+
+from mkpc_kaggle.geometry.cameras import Camera, fundamental_of_cameras, relative_pose
+from mkpc_kaggle.geometry.metrics import (
+    AUC_THRESHOLDS,
+    ROTATION_THRESHOLDS,
+    TRANSLATION_THRESHOLDS,
+    PoseError,
+    mean_average_accuracy,
+    pair_accuracy,
+    pose_auc,
+    pose_error,
+    rotation_angle,
+)
+
+SEEDS = st.integers(0, 2**32 - 1)
+PERFECT = PoseError(0.0, 0.0, 0.0)
+
+
+def rotation(axis, degrees):
+    axis = np.asarray(axis, np.float64)
+    return cv2.Rodrigues(axis / np.linalg.norm(axis) * np.radians(degrees))[0]
+
+
+def random_camera(rng):
+    focal = rng.uniform(300, 3000)
+    K = np.array(
+        [[focal, 0, rng.uniform(200, 900)], [0, focal * rng.uniform(0.8, 1.25), rng.uniform(200, 900)], [0, 0, 1]]
+    )
+    return Camera(K, rotation(rng.normal(size=3), rng.uniform(0, 180)), rng.normal(size=3) * 3)
+
+
+def random_cameras(seed):
+    rng = np.random.default_rng(seed)
+    return random_camera(rng), random_camera(rng)
+
+
+def errors(*angles):
+    return [PoseError(angle, 0.0, 0.0) for angle in angles]
+
+
+def turned(camera, R):
+    return Camera(camera.K, R @ camera.R, R @ camera.t)
+
+
+def test_the_thresholds_are_those_of_the_competition():
+    assert_allclose(ROTATION_THRESHOLDS, [1, 2, 3, 4, 5, 6, 7, 8, 9, 10])
+    ratio = 25 ** (1 / 9)
+    assert_allclose(TRANSLATION_THRESHOLDS, [0.2 * ratio**i for i in range(10)])
+    assert AUC_THRESHOLDS == (5, 10, 20)
+
+
+@pytest.mark.parametrize(
+    ("rotation", "translation", "accuracy"),
+    [
+        (0, 0, 1.0),
+        (0.999, 0.1999, 1.0),
+        (1.0, 0, 0.9),  # on a threshold is not within it
+        (0, 0.2, 0.9),
+        (1.001, 0, 0.9),
+        (0, 0.2001, 0.9),
+        (9.999, 0, 0.1),
+        (10.001, 0, 0.0),
+        (0, 4.999, 0.1),
+        (0, 5.001, 0.0),
+        (4.5, 0.2 * 25 ** (6.5 / 9), 0.3),  # both of one threshold pair have to be met: the translation decides
+        (7.5, 0.5, 0.3),  # here the rotation
+        (inf, inf, 0.0),
+        (0, inf, 0.0),
+        (nan, nan, 0.0),
+    ],
+)
+def test_the_accuracy_of_a_pair_counts_the_threshold_pairs_that_it_meets(rotation, translation, accuracy):
+    assert pair_accuracy(PoseError(rotation, 0.0, translation)) == pytest.approx(accuracy, abs=1e-12)
+
+
+def test_the_mean_average_accuracy_is_the_mean_over_pairs_and_a_failed_pair_counts():
+    assert mean_average_accuracy([PERFECT]) == 1
+    assert mean_average_accuracy([PoseError.failed()]) == 0
+    assert mean_average_accuracy([PERFECT, PoseError.failed(), PERFECT, PoseError(5.5, 90, 0)]) == pytest.approx(
+        2.5 / 4
+    )
+    assert isnan(mean_average_accuracy([]))
+
+
+@pytest.mark.parametrize("degrees", [0, 1e-6, 1e-3, 1, 45, 90, 135, 179, 179.999, 180 - 1e-6, 180])
+@pytest.mark.parametrize("axis", [(1, 0, 0), (0, -1, 0), (1, 2, 3), (-1, 1, 0.1)])
+def test_the_rotation_angle_is_precise_at_both_ends(axis, degrees):
+    assert rotation_angle(rotation(axis, degrees)) == pytest.approx(degrees, rel=1e-6, abs=1e-13)
+
+
+@given(seed=SEEDS)
+@settings(max_examples=60, deadline=None)
+def test_the_fundamental_matrix_of_two_cameras_meets_the_epipolar_constraint(seed):
+    cameras = random_cameras(seed)
+    F = fundamental_of_cameras(*cameras)
+    X = np.random.default_rng(seed).normal(size=(50, 3)) * 10
+    x0, x1 = ((X @ camera.R.T + camera.t) @ camera.K.T for camera in cameras)
+    x0, x1 = (x / np.linalg.norm(x, axis=1, keepdims=True) for x in (x0, x1))
+    lines = x0 @ F.T
+    residual = np.abs(np.sum(x1 * lines, axis=1))
+    assert (residual < 1e-9 * np.linalg.norm(F)).all()
+    assert np.abs(np.sum(x1[::-1] * lines, axis=1)).max() > 1e-6 * np.linalg.norm(lines, axis=1).max()
+    assert np.linalg.norm(F) == pytest.approx(1, abs=1e-12)
+    assert np.linalg.svd(F, compute_uv=False)[2] < 1e-12
+
+
+@given(seed=SEEDS)
+@settings(max_examples=40, deadline=None)
+def test_the_relative_pose_takes_one_camera_to_the_other(seed):
+    first, second = random_cameras(seed)
+    R, t = relative_pose(first, second)
+    X = np.random.default_rng(seed).normal(size=(9, 3))
+    assert_allclose((X @ first.R.T + first.t) @ R.T + t, X @ second.R.T + second.t, atol=1e-9)
+
+
+@given(
+    seed=SEEDS, sign=st.sampled_from([1, -1]), metres=st.floats(0.01, 100), scale=st.sampled_from([1e-6, 1, 1e4])
+)
+@settings(max_examples=60, deadline=None)
+def test_the_true_matrix_has_no_error_whatever_its_sign_and_scale(seed, sign, metres, scale):
+    cameras = random_cameras(seed)
+    error = pose_error(sign * scale * fundamental_of_cameras(*cameras), *cameras, metres)
+    length = np.linalg.norm(relative_pose(*cameras)[1]) * metres
+    assert error.rotation < 1e-4
+    assert error.translation_angle < 1e-4
+    assert error.translation < 1e-6 * length
+    assert pair_accuracy(error) == 1 or length > 1e5
+
+
+@pytest.mark.parametrize("degrees", [0.5, 3.0, 20.0])
+@pytest.mark.parametrize("seed", range(4))
+def test_a_rotation_about_the_baseline_is_an_error_of_rotation_alone(seed, degrees):
+    # Camera 1 turns about the direction of t, so that t stays; F's other rotation is 180 - degrees off.
+    first, second = random_cameras(seed)
+    R, t = relative_pose(first, second)
+    wrong = Camera(second.K, rotation(t, degrees) @ R, t)
+    error = pose_error(fundamental_of_cameras(Camera(first.K, np.eye(3), np.zeros(3)), wrong), first, second, 1.0)
+    assert error.rotation == pytest.approx(degrees, rel=1e-5)
+    assert error.translation_angle < 1e-4
+    assert error.translation < 1e-5
+    assert error.angle == error.rotation
+
+
+@pytest.mark.parametrize(
+    ("degrees", "expected"), [(0.5, 0.5), (30.0, 30.0), (90.0, 90.0), (120.0, 60.0), (180.0, 0.0)]
+)
+@pytest.mark.parametrize("seed", range(3))
+def test_the_translation_is_scaled_to_metres_and_its_sign_is_free(seed, degrees, expected):
+    first, second = random_cameras(seed)
+    R, t = relative_pose(first, second)
+    across = np.cross(t, (1.0, 2.0, 3.0))
+    wrong = Camera(second.K, R, rotation(across, degrees) @ t * 7)  # its length is not known from F
+    error = pose_error(fundamental_of_cameras(Camera(first.K, np.eye(3), np.zeros(3)), wrong), first, second, 2.5)
+    assert error.translation_angle == pytest.approx(expected, rel=1e-5, abs=1e-4)
+    chord = 2 * np.linalg.norm(t) * np.sin(np.radians(expected) / 2)
+    assert error.translation == pytest.approx(2.5 * chord, rel=1e-5, abs=1e-5)
+    assert error.angle == max(error.rotation, error.translation_angle)
+
+
+def test_the_rotation_nearer_to_the_truth_counts():
+    camera = Camera(np.diag([500.0, 500, 1]), np.eye(3), np.zeros(3))
+    twisted = Camera(camera.K, rotation((1, 0, 0), 180), np.array([1.0, 0, 0]))
+    plain = Camera(camera.K, np.eye(3), np.array([1.0, 0, 0]))
+    F = fundamental_of_cameras(camera, plain)
+    for second in (plain, twisted):  # F is the same for both
+        assert pose_error(F, camera, second, 1.0).rotation < 1e-4
+
+
+def test_a_turn_of_the_world_changes_no_error():
+    first, second = random_cameras(11)
+    F = fundamental_of_cameras(first, turned(second, rotation((1, 2, 3), 4)))
+    error = pose_error(F, first, second, 1.0)
+    moved = [Camera(c.K, c.R @ rotation((3, 1, 1), 70).T, c.t + 0) for c in (first, second)]
+    again = pose_error(F, *moved, 1.0)
+    assert 0 < error.rotation < 5
+    assert_allclose([again.rotation, again.translation], [error.rotation, error.translation], rtol=1e-6)
+
+
+@pytest.mark.parametrize("threshold", AUC_THRESHOLDS)
+def test_the_pose_auc_has_its_extremes(threshold):
+    assert pose_auc(errors(0, 0, 0), threshold) == pytest.approx(1)
+    assert pose_auc(errors(threshold + 1, 60, inf), threshold) == 0
+    assert pose_auc([PoseError.failed()], threshold) == 0
+    assert isnan(pose_auc([], threshold))
+
+
+@pytest.mark.parametrize(
+    ("angles", "threshold", "area"),
+    [
+        ((5,), 10, 0.75),  # a triangle of 5 x 1 / 2 and a rectangle of 5 x 1
+        ((8, 2), 10, (0.5 + 4.5 + 2) / 10),  # 2 x .5 / 2, then 6 x (.5 + 1) / 2, then 2 x 1
+        ((2, 8, 30, inf), 10, (0.25 + 2.25 + 1) / 10),
+        ((4, 1, 4), 5, (1 / 6 + 3 * 0.5 + 1) / 5),  # two of one size: the curve steps to 2/3, then to 1
+        ((0, 10), 5, 0.5),
+        ((0, 3), 5, (3 * 0.75 + 2) / 5),
+    ],
+)
+def test_the_pose_auc_is_the_area_computed_by_hand(angles, threshold, area):
+    assert pose_auc(errors(*angles), threshold) == pytest.approx(area)
+
+
+def test_the_pose_auc_counts_the_larger_angle_of_a_pair():
+    assert (
+        pose_auc([PoseError(1.0, 5.0, 0.0)], 10) == pose_auc([PoseError(5.0, 1.0, 9.0)], 10) == pytest.approx(0.75)
+    )

@@ -1,0 +1,136 @@
+"""Mutual nearest neighbours against a brute force in numpy."""
+
+import numpy as np
+import pytest
+import torch
+from numpy.testing import assert_allclose, assert_array_equal
+
+from mkpc_kaggle.matchers import neighbours
+from mkpc_kaggle.matchers.neighbours import mutual_neighbours
+
+
+def unit(rng, n, dimension=16):
+    descriptors = rng.normal(size=(n, dimension))
+    return descriptors / np.linalg.norm(descriptors, axis=1, keepdims=True)
+
+
+def related(seed, n, m, dimension=16):
+    """Descriptors of two images, about half of them seen in both."""
+    rng = np.random.default_rng(seed)
+    first, second = unit(rng, n, dimension), unit(rng, m, dimension)
+    common = min(n, m) // 2
+    second[:common] = first[rng.permutation(n)[:common]] + 0.05 * rng.normal(size=(common, dimension))
+    return first, second / np.linalg.norm(second, axis=1, keepdims=True)
+
+
+def brute_force(first, second):
+    """index0, index1, similarity and ratio, from all distances."""
+    distance = np.linalg.norm(first[:, None] - second[None], axis=2)
+    to1, to0 = distance.argmin(axis=1), distance.argmin(axis=0)
+    index0 = np.array([i for i in range(len(first)) if to0[to1[i]] == i])
+    index1 = to1[index0]
+    ratios = []
+    for i, j in zip(index0, index1, strict=True):
+        second_of_row = min(np.delete(distance[i], j), default=2.0)
+        second_of_column = min(np.delete(distance[:, j], i), default=2.0)
+        ratios.append(distance[i, j] / min(second_of_row, second_of_column))
+    return index0, index1, (first @ second.T)[index0, index1], np.array(ratios)
+
+
+def found(first, second, dtype=torch.float64):
+    got = mutual_neighbours(torch.tensor(first, dtype=dtype), torch.tensor(second, dtype=dtype))
+    return tuple(tensor.numpy() for tensor in (got.index0, got.index1, got.similarity, got.ratio))
+
+
+def assert_equal_to_brute_force(first, second, dtype=torch.float64, tolerance=1e-9):
+    got, expected = found(first, second, dtype), brute_force(first, second)
+    for index, truth in zip(got[:2], expected[:2], strict=True):
+        assert index.dtype == np.int64
+        assert_array_equal(index, truth)
+    assert_allclose(got[2], expected[2], rtol=0, atol=tolerance)
+    assert_allclose(got[3], expected[3], rtol=0, atol=tolerance)
+
+
+@pytest.mark.parametrize(("n", "m"), [(1, 1), (1, 9), (9, 1), (2, 2), (40, 40), (150, 61), (61, 150)])
+@pytest.mark.parametrize("seed", range(3))
+def test_they_are_those_of_brute_force(n, m, seed):
+    assert_equal_to_brute_force(*related(seed, n, m))
+
+
+@pytest.mark.parametrize("rows", [1, 2, 7, 60, 61, 62])
+def test_blocks_change_nothing(rows, monkeypatch):
+    monkeypatch.setattr(neighbours, "BLOCK_ROWS", rows)
+    assert_equal_to_brute_force(*related(5, 61, 122))
+    assert_equal_to_brute_force(*related(6, 122, 61))
+
+
+def test_more_descriptors_than_a_block_in_float32_are_matched():
+    first, second = related(7, neighbours.BLOCK_ROWS + 300, 700, 64)
+    index0, index1, similarity, ratio = found(first, second, torch.float32)
+    cosine = first @ second.T
+    mutual = np.flatnonzero(cosine.argmax(axis=0)[cosine.argmax(axis=1)] == np.arange(len(first)))
+    assert mutual.max() >= neighbours.BLOCK_ROWS
+    assert_array_equal(index0, mutual)
+    assert_array_equal(index1, cosine.argmax(axis=1)[mutual])
+    assert_allclose(similarity, cosine[index0, index1], rtol=0, atol=1e-6)
+    assert (ratio[similarity > 0.9] < 0.75).all()
+    assert (ratio <= 1).all()
+
+
+def test_the_ratio_is_that_of_distances_and_the_larger_of_both_ways():
+    # Angles on a circle; a chord is 2 sin(angle / 2).
+    def circle(*degrees):
+        radians = np.radians(degrees)
+        return np.stack([np.cos(radians), np.sin(radians)], axis=1)
+
+    def chord(degrees):
+        return 2 * np.sin(np.radians(degrees) / 2)
+
+    index0, index1, similarity, ratio = found(circle(0, 25), circle(10, 100))
+    assert_array_equal(index0, [0])
+    assert_array_equal(index1, [0])
+    assert_allclose(similarity, [np.cos(np.radians(10))])
+    # One way the second is at 100 degrees, the other way at 15: the latter is the nearer rival.
+    assert_allclose(ratio, [chord(10) / chord(15)])
+    assert_allclose(found(circle(10, 100), circle(0, 25))[3], [chord(10) / chord(15)])
+
+
+def test_a_single_descriptor_has_its_second_at_the_greatest_distance():
+    angle = np.radians(60)
+    first, second = np.array([[1.0, 0]]), np.array([[np.cos(angle), np.sin(angle)]])
+    index0, index1, similarity, ratio = found(first, second)
+    assert (index0.tolist(), index1.tolist()) == ([0], [0])
+    assert_allclose(similarity, [0.5])
+    assert_allclose(ratio, [0.5])  # a chord of 1 over the diameter
+
+
+@pytest.mark.parametrize(("n", "m"), [(0, 0), (0, 5), (5, 0)])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_no_descriptors_give_no_pairs(n, m, dtype):
+    got = mutual_neighbours(torch.zeros((n, 8), dtype=dtype), torch.zeros((m, 8), dtype=dtype))
+    for index in (got.index0, got.index1):
+        assert (index.shape, index.dtype) == ((0,), torch.int64)
+    for value in (got.similarity, got.ratio):
+        assert (value.shape, value.dtype) == ((0,), dtype)
+
+
+def test_of_equal_neighbours_the_one_of_lower_index_counts():
+    x, y = [1.0, 0.0], [0.0, 1.0]
+    index0, index1, _, _ = found(np.array([x, y, x]), np.array([y, x, x, y]))
+    assert_array_equal(index0, [0, 1])
+    assert_array_equal(index1, [1, 0])
+
+
+def test_a_pair_with_an_equal_rival_is_ambiguous():
+    x, y = [1.0, 0.0], [0.0, 1.0]
+    assert_allclose(found(np.array([x, y]), np.array([x, x, y]))[3], [1, 0], atol=1e-5)
+    near = [np.cos(0.1), np.sin(0.1)]
+    assert_allclose(found(np.array([x]), np.array([near, near]))[3], [1])
+
+
+def test_the_descriptors_are_left_as_they_were():
+    first, second = (torch.tensor(array) for array in related(8, 30, 20))
+    copies = first.clone(), second.clone()
+    mutual_neighbours(first, second)
+    assert torch.equal(first, copies[0])
+    assert torch.equal(second, copies[1])

@@ -1,0 +1,308 @@
+"""Two-view estimates: the truth where there is one, else a value with its reason, and always the same bytes."""
+
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from numpy.testing import assert_allclose, assert_array_equal
+
+from mkpc_kaggle.geometry.cameras import Camera, fundamental_of_cameras, relative_pose
+from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.geometry.metrics import rotation_angle
+from mkpc_kaggle.geometry.robust import (
+    FALLBACK_FUNDAMENTAL,
+    Estimate,
+    Method,
+    Model,
+    RobustConfig,
+    calibrate,
+    epipolar_distances,
+    estimate,
+    poses_of_fundamental,
+)
+
+DEFAULT = RobustConfig()
+QUICK = RobustConfig(max_iterations=200)
+WIDTH, HEIGHT = 1024, 768
+SEEDS = [0, 1, 2]
+UNIT = pytest.approx(1, abs=1e-12)
+
+
+@cache
+def cameras(seed):
+    rng = np.random.default_rng(seed)
+    K0 = np.array([[820.0, 0, 500], [0, 840, 390], [0, 0, 1]])
+    K1 = np.array([[900.0, 0, 530], [0, 880, 370], [0, 0, 1]])
+    R0, R1 = (cv2.Rodrigues(rng.uniform(-0.15, 0.15, 3))[0] for _ in range(2))
+    t = np.array([1.0, rng.uniform(-0.5, 0.5), rng.uniform(-0.5, 0.5)])
+    return Camera(K0, R0, np.zeros(3)), Camera(K1, R1, t)
+
+
+def project(camera, X):
+    x = (X @ camera.R.T + camera.t) @ camera.K.T
+    return x[:, :2] / x[:, 2:]
+
+
+def seen(seed, n, *, plane=False):
+    """n noiseless matches of random points in general position, or on a plane askew."""
+    X = np.random.default_rng(seed + 100).uniform((-2, -2, 4), (2, 2, 9), (n, 3))
+    if plane:
+        X[:, 2] = 6 + 0.2 * X[:, 0] - 0.3 * X[:, 1]
+    first, second = cameras(seed)
+    return Matches(project(first, X), project(second, X), np.ones(n))
+
+
+def wild(seed, n):
+    rng = np.random.default_rng(seed + 200)
+    return Matches(*(rng.uniform(0, (WIDTH, HEIGHT), (n, 2)) for _ in range(2)), np.ones(n))
+
+
+@cache
+def scene(seed, plane=False):
+    """300 matches in random order, 40 % of them outliers, and which are true."""
+    order = np.random.default_rng(seed).permutation(300)
+    matches = Matches.concatenate([seen(seed, 180, plane=plane), wild(seed, 120)])
+    return matches[order], order < 180
+
+
+def intrinsics(seed):
+    return tuple(camera.K for camera in cameras(seed))
+
+
+def estimated(model, matches, config=DEFAULT, seed=0):
+    return estimate(matches, config, model, intrinsics(seed) if model is Model.E else None)
+
+
+def assert_agrees(result, truth):
+    assert result.ok
+    assert np.linalg.norm(result.matrix) == UNIT
+    assert (result.inliers & truth).sum() >= 0.97 * truth.sum()
+    assert (result.inliers & ~truth).sum() <= 0.05 * (~truth).sum()
+
+
+def assert_fallback(result, model, count):
+    assert not result.ok
+    assert result.failure
+    assert result.inliers.shape == (count,)
+    assert result.inlier_count == 0
+    expected = np.eye(3) / np.sqrt(3) if model is Model.H else FALLBACK_FUNDAMENTAL / np.sqrt(2)
+    assert_allclose(result.matrix, expected, atol=1e-15)
+
+
+def as_bytes(result):
+    return result.matrix.tobytes(), result.inliers.tobytes(), result.failure
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("method", Method)
+def test_the_fundamental_matrix_is_found_among_outliers(seed, method):
+    matches, truth = scene(seed)
+    result = estimate(matches, RobustConfig(method=method))
+    assert_agrees(result, truth)
+    assert np.linalg.svd(result.matrix, compute_uv=False)[2] < 1e-9
+    assert epipolar_distances(result.matrix, seen(seed + 10, 1)).max() > 1  # another scene's match
+    fresh = seen(seed, 500)[180:]
+    assert epipolar_distances(result.matrix, fresh).max() < 0.05
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_the_essential_matrix_is_found_among_outliers(seed):
+    matches, truth = scene(seed)
+    result = estimate(matches, DEFAULT, Model.E, intrinsics(seed))
+    assert_agrees(result, truth)
+    first, second = cameras(seed)
+    E = second.K.T @ fundamental_of_cameras(first, second) @ first.K
+    E /= np.linalg.norm(E)
+    assert min(np.linalg.norm(result.matrix - E), np.linalg.norm(result.matrix + E)) < 1e-3
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_the_homography_of_a_plane_is_found_among_outliers(seed):
+    matches, truth = scene(seed, plane=True)
+    result = estimate(matches, DEFAULT, Model.H)
+    assert_agrees(result, truth)
+    fresh = seen(seed, 500, plane=True)[180:]
+    moved = cv2.perspectiveTransform(fresh.points0[:, None], result.matrix)[:, 0]
+    assert np.hypot(*(moved - fresh.points1).T).max() < 0.05
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_the_pose_of_the_estimate_is_the_true_one(seed):
+    first, second = cameras(seed)
+    R, t = relative_pose(first, second)
+    for F, degrees in [
+        (fundamental_of_cameras(first, second), 1e-6),
+        (estimate(scene(seed)[0], DEFAULT).matrix, 0.05),
+    ]:
+        rotations, direction = poses_of_fundamental(F, first.K, second.K)
+        angles = [rotation_angle(rotation @ R.T) for rotation in rotations]
+        assert min(angles) < degrees
+        assert max(angles) > 30
+        assert np.linalg.norm(direction) == UNIT
+        assert np.degrees(np.linalg.norm(np.cross(direction, t / np.linalg.norm(t)))) < degrees
+        for rotation in rotations:
+            assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-9)
+            assert np.linalg.det(rotation) == UNIT
+
+
+def test_epipolar_distance_is_in_pixels_and_the_larger_of_the_two():
+    matches = Matches(np.array([(10, 20), (30, 40)]), np.array([(500, 20), (7, 43)]), np.ones(2))
+    assert_allclose(epipolar_distances(FALLBACK_FUNDAMENTAL, matches), [0, 3])
+    twice = FALLBACK_FUNDAMENTAL @ np.diag([1, 0.5, 1])  # the second image is half as high: y1 = y0 / 2
+    matches = Matches(np.array([(10, 20)]), np.array([(500, 13)]), np.ones(1))
+    assert_allclose(epipolar_distances(twice, matches), [6])
+    assert_allclose(epipolar_distances(1e-6 * twice.T, Matches(matches.points1, matches.points0, np.ones(1))), [6])
+    assert epipolar_distances(twice, Matches.empty()).shape == (0,)
+
+
+def test_calibration_undoes_the_camera_matrix():
+    K = np.array([[800.0, 2, 320], [0, 700, 240], [0, 0, 1]])
+    plane = np.array([[0.0, 0], [0.5, -0.25]])
+    pixels = np.column_stack([plane, np.ones(2)]) @ K.T
+    assert_allclose(calibrate(pixels[:, :2], K), plane, atol=1e-12)
+
+
+@pytest.mark.parametrize("count", range(8))
+@pytest.mark.parametrize("model", Model)
+def test_a_few_points_give_a_value(model, count):
+    result = estimated(model, seen(0, count))
+    if count < model.least_matches:
+        assert_fallback(result, model, count)
+        assert f"too few distinct matches for {model}: {count}" in result.failure
+    assert np.isfinite(result.matrix).all()
+    assert np.linalg.norm(result.matrix) == UNIT
+
+
+def test_eight_points_are_enough_for_a_fundamental_matrix():
+    result = estimate(seen(0, 8), DEFAULT)
+    assert result.ok
+    assert epipolar_distances(result.matrix, seen(0, 8)).max() < 0.2
+
+
+@pytest.mark.parametrize("model", Model)
+def test_points_that_say_nothing_give_the_fallback(model):
+    same = Matches(np.full((30, 2), 5.5), np.full((30, 2), 9.25), np.ones(30))
+    assert_fallback(estimated(model, same), model, 30)
+    nothing = Matches(np.full((30, 2), np.nan), seen(0, 30).points1, np.ones(30))
+    assert_fallback(estimated(model, nothing), model, 30)
+    repeated = seen(0, 4)[np.tile(np.arange(4), 25)]
+    assert_fallback(estimated(model, repeated), model, 100)
+    assert_fallback(estimated(model, Matches.empty()), model, 0)
+
+
+@pytest.mark.parametrize("model", Model)
+def test_collinear_points_give_a_value(model):
+    along = np.linspace(0, 700, 40)
+    line = Matches(np.column_stack([along, along]), np.column_stack([along, 2 * along]), np.ones(40))
+    result = estimated(model, line)
+    assert np.isfinite(result.matrix).all()
+    assert np.linalg.norm(result.matrix) == UNIT
+    assert result.inliers.shape == (40,)
+    assert result.ok == result.inliers.any()
+
+
+@pytest.mark.parametrize("model", Model)
+def test_the_fallback_is_finite_of_unit_norm_and_of_the_right_rank(model):
+    result = Estimate.failed(model, 3, "because")
+    assert result.failure == "because"
+    assert np.linalg.norm(result.matrix) == UNIT
+    assert np.linalg.matrix_rank(result.matrix) == (3 if model is Model.H else 2)
+    result.matrix[:] = 7  # each is its own
+    assert_fallback(Estimate.failed(model, 3, "because"), model, 3)
+
+
+@pytest.mark.parametrize("model", Model)
+def test_matches_that_are_not_finite_are_set_aside(model):
+    matches, truth = scene(0, plane=model is Model.H)
+    clean = estimated(model, matches)
+    bad = [Matches(np.full((50, 2), a), np.full((50, 2), b), np.ones(50)) for a, b in [(np.nan, 5), (5, np.inf)]]
+    order = np.argsort(np.random.default_rng(3).random(400), kind="stable")
+    order[np.flatnonzero(order < 300)] = np.arange(300)  # the good ones keep their order among themselves
+    mixed = estimated(model, Matches.concatenate([matches, *bad])[order])
+    assert_agrees(clean, truth)
+    assert_array_equal(mixed.matrix, clean.matrix)
+    assert_array_equal(mixed.inliers[order < 300], clean.inliers)
+    assert not mixed.inliers[order >= 300].any()
+
+
+@pytest.mark.parametrize("model", Model)
+def test_exact_repetitions_change_nothing_and_are_inliers_like_the_first(model):
+    matches, truth = scene(1, plane=model is Model.H)
+    clean = estimated(model, matches, seed=1)
+    assert_agrees(clean, truth)
+    again = np.random.default_rng(4).integers(0, 300, 900)
+    repeated = estimated(model, Matches.concatenate([matches, matches[again]]), seed=1)
+    assert_array_equal(repeated.matrix, clean.matrix)
+    assert_array_equal(repeated.inliers, np.concatenate([clean.inliers, clean.inliers[again]]))
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_the_mask_is_in_the_order_of_the_matches(seed):
+    matches = Matches.concatenate([wild(seed, 60), seen(seed, 100)])
+    result = estimate(matches[np.repeat(np.arange(160), 2)], DEFAULT)
+    assert_array_equal(result.inliers[::2], result.inliers[1::2])
+    assert_agrees(result, np.repeat(np.arange(160) >= 60, 2))
+
+
+@pytest.mark.parametrize("method", Method)
+@pytest.mark.parametrize("model", Model)
+def test_the_same_input_gives_the_same_bytes_whatever_else_goes_on(model, method):
+    plane, config = model is Model.H, RobustConfig(method=method, max_iterations=2000)
+    inputs = [scene(seed, plane)[0] for seed in SEEDS] * 4
+    alone = [as_bytes(estimated(model, matches, config)) for matches in inputs]
+    assert alone[:3] == alone[3:6] == alone[6:9]
+    assert len(set(alone)) == 3
+    for rng_seed in (0, 12345):
+        cv2.setRNGSeed(rng_seed)
+        assert [as_bytes(estimated(model, matches, config)) for matches in inputs[:3]] == alone[:3]
+    with ThreadPoolExecutor(4) as threads:
+        together = list(threads.map(lambda matches: as_bytes(estimated(model, matches, config)), inputs))
+    assert together == alone
+
+
+def test_an_essential_matrix_without_intrinsics_is_an_error_even_without_points():
+    for matches in (scene(0)[0], Matches.empty()):
+        with pytest.raises(ValueError, match="intrinsics"):
+            estimate(matches, DEFAULT, Model.E)
+
+
+def test_intrinsics_change_nothing_but_an_essential_matrix():
+    matches, _ = scene(0)
+    assert as_bytes(estimate(matches, DEFAULT, Model.F, intrinsics(0))) == as_bytes(estimate(matches, DEFAULT))
+
+
+ANY_FLOAT = st.floats(width=32)
+CORNERS = st.sampled_from([0.0, 1.0, -1.0, 2.0, 100.0, 1e-20, 1e20, 3e38])
+PIXELS = st.integers(0, 5).map(float)
+
+
+@given(data=st.data(), n=st.integers(0, 24), model=st.sampled_from(Model), method=st.sampled_from(Method))
+@settings(max_examples=150, deadline=None)
+def test_whatever_the_points_are_the_answer_is_an_estimate(data, n, model, method):
+    elements = data.draw(st.sampled_from([ANY_FLOAT, CORNERS, PIXELS]))
+    rows = data.draw(arrays(np.float32, (n, 4), elements=elements))
+    matches = Matches(rows[:, :2], rows[:, 2:], np.ones(n))
+    result = estimated(model, matches, RobustConfig(method=method, max_iterations=100))
+    assert result.matrix.shape == (3, 3)
+    assert np.isfinite(result.matrix).all()
+    assert np.linalg.norm(result.matrix) == UNIT
+    assert result.inliers.shape == (n,)
+    assert result.ok == result.inliers.any()
+    assert not result.inliers[~np.isfinite(rows).all(axis=1)].any()
+
+
+@pytest.mark.parametrize("model", Model)
+@pytest.mark.parametrize("exponent", [-30, -10, 10, 18, 30, 37])
+def test_points_of_any_magnitude_give_an_estimate(model, exponent):
+    rng = np.random.default_rng(5)
+    scale = 10.0**exponent
+    matches = Matches(rng.normal(size=(40, 2)) * scale, rng.normal(size=(40, 2)) * scale, np.ones(40))
+    for method in Method:
+        result = estimated(model, matches, RobustConfig(method=method, max_iterations=200))
+        assert np.isfinite(result.matrix).all()
+        assert np.linalg.norm(result.matrix) == UNIT
