@@ -12,6 +12,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+
 from mkpc_kaggle.assembly import assemble
 from mkpc_kaggle.competition import Pair
 from mkpc_kaggle.geometry.coordinates import View
@@ -37,7 +38,7 @@ class Seen:
 
 @dataclass
 class RectifiedMatcher:
-    """``seconds`` for each pair; ``matches`` by the brightness of image 0; ``calls`` are (long side, brightness)."""
+    """``seconds`` for each pair; ``matches`` by the brightness of image 0; ``calls``: (long side, brightness)."""
 
     name: str = "rectified"
     seconds: float = 0.0

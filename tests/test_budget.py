@@ -3,6 +3,7 @@ import time
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.recipe import Unit
 from mkpc_kaggle.run.budget import WINDOW, Budget, Costs, format_duration, longest_prefix, parse_duration

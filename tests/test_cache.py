@@ -79,10 +79,10 @@ def test_it_agrees_with_a_plain_list_in_order_of_use(limit, steps):
         entry = next((one for one in used if one[0] == key), None)
         if size is None:
             assert cache.get(key) == (entry[1] if entry else None)
-            size = entry[1] if entry else limit + 1
         else:
             cache.put(key, size, size)
-        used = [one for one in used if one[0] != key] + ([(key, size)] if size <= limit else [])
+            entry = (key, size) if size <= limit else None
+        used = [one for one in used if one[0] != key] + ([entry] if entry else [])
         while sum(size for _, size in used) > limit:
             used.pop(0)
         assert (len(cache), cache.bytes) == (len(used), sum(size for _, size in used))

@@ -1,6 +1,7 @@
 """The critical region: the paper's Algorithm 1 and Crop Area Expansion, to the letter."""
 
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -87,15 +88,13 @@ def test_a_cluster_of_exactly_the_share_is_kept_and_a_point_fewer_is_not(k):
     assert (dropped.box, dropped.clusters, dropped.kept) == (one, 2, 1)
 
 
-@pytest.mark.parametrize("percent", range(1, 100))
-def test_the_share_is_compared_to_the_letter(percent):
-    share = percent / 100
-    for largest in (100, 700, 1100):
-        least = percent * largest // 100
-        assert least / largest >= share
-        assert_array_equal(keep_clusters(np.array([largest, least]), share), [0, 1])
-        assert_array_equal(keep_clusters(np.array([largest, least]), share, Ratio.LAST_KEPT), [0, 1])
-        assert_array_equal(keep_clusters(np.array([least - 1, largest]), share), [1])
+@pytest.mark.parametrize("ratio", Ratio)
+def test_the_share_is_compared_to_the_letter(ratio):
+    for percent, hundreds in product(range(1, 100), (1, 7, 11)):
+        share, largest, least = percent / 100, 100 * hundreds, percent * hundreds
+        assert least / largest >= share  # Algorithm 1's own words
+        assert len(keep_clusters(np.array([largest, least]), share, ratio)) == 2, (least, largest)
+        assert len(keep_clusters(np.array([largest, least - 1]), share, ratio)) == 1, (least, largest)
 
 
 @pytest.mark.parametrize("k", [1, 3, 49, 333, 9973])

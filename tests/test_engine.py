@@ -8,13 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from mkpc_kaggle.assembly import Assembly
-from mkpc_kaggle.pipeline import Pipeline
-from mkpc_kaggle.recipe import UpgradeConfig
-from mkpc_kaggle.run.engine import Ending
-from mkpc_kaggle.run.jobs import NOT_REACHED, Record
-from mkpc_kaggle.run.journal import Journal
-
 from rectified import (
     EXTRA,
     SECOND,
@@ -26,6 +19,13 @@ from rectified import (
     run,
     write_pairs,
 )
+
+from mkpc_kaggle.assembly import Assembly
+from mkpc_kaggle.pipeline import Pipeline
+from mkpc_kaggle.recipe import UpgradeConfig
+from mkpc_kaggle.run.engine import Ending
+from mkpc_kaggle.run.jobs import NOT_REACHED, Record
+from mkpc_kaggle.run.journal import Journal
 
 
 def matrices(records: tuple[Record, ...]) -> bytes:

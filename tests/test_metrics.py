@@ -134,7 +134,6 @@ def test_the_true_matrix_has_no_error_whatever_its_sign_and_scale(seed, sign, me
     assert error.rotation < 1e-4
     assert error.translation_angle < 1e-4
     assert error.translation < 1e-6 * length
-    assert pair_accuracy(error) == 1 or length > 1e5
 
 
 @pytest.mark.parametrize("degrees", [0.5, 3.0, 20.0])

@@ -145,7 +145,7 @@ def test_an_unknown_matcher_lists_the_known_ones():
         (SIFT + '[magsac]\nmethod = "MAGSAC"\n', r"'MAGSAC' is none of 'magsac', 'ransac'"),
         (units('{ stage = 1, matcher = "sift", long_side = "640" }'), r"unit 1, key 'long_side': expected int"),
         (units('{ stage = true, matcher = "sift", long_side = 640 }'), r"key 'stage': expected int, got True"),
-        (units('{ stage = 1, matcher = 7, long_side = 640 }'), r"key 'matcher': expected str, got 7"),
+        (units("{ stage = 1, matcher = 7, long_side = 640 }"), r"key 'matcher': expected str, got 7"),
         (units('{ stage = 1, matcher = "sift", long_side = 640, flip = 1 }'), r"expected bool, got 1"),
         ("units = 3\n", "units"),
         ('units = "sift"\n', "units|unit 1"),

@@ -27,7 +27,6 @@ from mkpc_kaggle.geometry.robust import (
 )
 
 DEFAULT = RobustConfig()
-QUICK = RobustConfig(max_iterations=200)
 WIDTH, HEIGHT = 1024, 768
 SEEDS = [0, 1, 2]
 UNIT = pytest.approx(1, abs=1e-12)
@@ -107,7 +106,9 @@ def test_the_fundamental_matrix_is_found_among_outliers(seed, method):
     assert np.linalg.svd(result.matrix, compute_uv=False)[2] < 1e-9
     assert epipolar_distances(result.matrix, seen(seed + 10, 1)).max() > 1  # another scene's match
     fresh = seen(seed, 500)[180:]
-    assert epipolar_distances(result.matrix, fresh).max() < 0.05
+    distances = epipolar_distances(result.matrix, fresh)
+    assert np.median(distances) < 0.1  # MAGSAC++ is a weighted mean of near samples: RANSAC here is below 0.001
+    assert distances.max() < 0.5
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -137,7 +138,7 @@ def test_the_pose_of_the_estimate_is_the_true_one(seed):
     R, t = relative_pose(first, second)
     for F, degrees in [
         (fundamental_of_cameras(first, second), 1e-6),
-        (estimate(scene(seed)[0], DEFAULT).matrix, 0.05),
+        (estimate(scene(seed)[0], DEFAULT).matrix, 1.0),
     ]:
         rotations, direction = poses_of_fundamental(F, first.K, second.K)
         angles = [rotation_angle(rotation @ R.T) for rotation in rotations]
@@ -263,6 +264,17 @@ def test_the_same_input_gives_the_same_bytes_whatever_else_goes_on(model, method
     with ThreadPoolExecutor(4) as threads:
         together = list(threads.map(lambda matches: as_bytes(estimated(model, matches, config)), inputs))
     assert together == alone
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_opencv_is_handed_the_distinct_matches_in_their_order(seed):
+    matches, _ = scene(seed)
+    plain, mask = cv2.findFundamentalMat(
+        matches.points0, matches.points1, cv2.USAC_MAGSAC, DEFAULT.threshold, DEFAULT.confidence, 50_000
+    )
+    result = estimate(Matches.concatenate([matches, matches[::-1]]), DEFAULT)
+    assert_array_equal(result.matrix, plain / np.linalg.norm(plain))
+    assert_array_equal(result.inliers[:300], mask.ravel() > 0)
 
 
 def test_an_essential_matrix_without_intrinsics_is_an_error_even_without_points():

@@ -27,6 +27,16 @@ def add_matching(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_mode(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--mode",
+        choices=["two-stage", "stage-1", "whole-images"],
+        default="two-stage",
+        help="two-stage (the default): the recipe as written; stage-1: its units of stage 1 alone; whole-images: "
+        "all its units on whole images, the naive ensemble of equal inference count",
+    )
+
+
 def add_time_limit(parser: argparse.ArgumentParser, default: str | None) -> None:
     parser.add_argument(
         "--time-limit",

@@ -26,6 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--output", type=Path, default=Path("submission.csv"), help="default: submission.csv")
     options.add_matching(parser)
+    options.add_mode(parser)
     options.add_time_limit(parser, default="8h45m")
     parser.add_argument(
         "--work-dir", type=Path, metavar="DIR", help="for the journal; default: beside the output, NAME.work"
@@ -38,6 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     from mkpc_kaggle.assembly import assemble
     from mkpc_kaggle.competition import read_test_side
+    from mkpc_kaggle.recipe import Mode
     from mkpc_kaggle.run.session import Session, interruptible
     from mkpc_kaggle.run.summary import summary
     from mkpc_kaggle.submit import submit
@@ -46,7 +48,9 @@ def run(arguments: argparse.Namespace) -> int:
     with interruptible() as interrupt:
         budget = options.budget_of(arguments)
         pairs = read_test_side(arguments.test_dir)
-        assembly = assemble(arguments.recipe, weights=arguments.weights, device=arguments.device)
+        assembly = assemble(
+            arguments.recipe, weights=arguments.weights, device=arguments.device, mode=Mode(arguments.mode)
+        )
         work_dir = arguments.work_dir or output.with_name(f"{output.stem}.work")
         print(
             f"{len(pairs)} pairs, recipe {assembly.recipe.name}, device {assembly.device}, journal in {work_dir}"

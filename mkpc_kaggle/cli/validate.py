@@ -17,10 +17,7 @@ and images/ in each scene, scaling_factors.csv beside the scenes), and score it 
 over rotation errors of 1 to 10 degrees and translation errors of 0.2 to 5 metres, for each scene, then the
 mean of the scenes; beside it the AUC of the larger angular error up to 5, 10 and 20 degrees.
 
---mode compares: `two-stage` is the recipe as written, `stage-1` its units of stage 1 alone, `whole-images` all
-its units on whole images (the naive ensemble of equal inference count).
-
-With --submission and --truth nothing is matched: the file is scored.
+With --submission and --truth nothing is matched: the files are scored.
 """
 
 
@@ -29,14 +26,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--scenes", default="", metavar="A,B", help="default: all")
     parser.add_argument("--pairs-per-scene", type=int, metavar="N", help="evenly spread; default: all")
     parser.add_argument("--min-covisibility", type=float, default=0.1, help="default: 0.1, as in the competition")
-    parser.add_argument("--mode", choices=["two-stage", "stage-1", "whole-images"], default="two-stage")
     options.add_matching(parser)
+    options.add_mode(parser)
     options.add_time_limit(parser, default=None)
     parser.add_argument("--json", type=Path, metavar="FILE", help="write all figures, per pair too")
     parser.add_argument(
         "--work-dir", type=Path, metavar="DIR", help="keep the journal there; default: a temporary one"
     )
-    parser.add_argument("--submission", type=Path, metavar="CSV", help="score this file instead of matching")
+    parser.add_argument(
+        "--submission",
+        action="append",
+        type=Path,
+        metavar="CSV",
+        help="score it and match nothing; may be repeated",
+    )
     parser.add_argument("--truth", type=Path, metavar="CSV", help="which pairs its samples are (demo writes one)")
 
 
@@ -54,7 +57,9 @@ def run(arguments: argparse.Namespace) -> int:
         pairs_per_scene=arguments.pairs_per_scene,
     )
     if arguments.submission is not None:
-        print("\n".join(score_table(score_submission(arguments.submission, arguments.truth, scenes))))
+        for submission in arguments.submission:
+            print(submission)
+            print("\n".join(score_table(score_submission(submission, arguments.truth, scenes))))
         return 0
     with tempfile.TemporaryDirectory(prefix="mkpc-") as temporary:
         return _match_and_score(arguments, scenes, arguments.work_dir or Path(temporary))

@@ -82,6 +82,8 @@ class View:
         Both sides are then padded up to a multiple of ``multiple``. Raises ``ValueError`` where a side is not
         positive.
         """
+        if long_side < 1 or multiple < 1:
+            raise ValueError(f"long_side and multiple must be positive, not {long_side} and {multiple}")
         scale = long_side / max(crop.size)
         width, height = (max(1, round(side * scale)) for side in crop.size)
         padded = Size(*(ceil(side / multiple) * multiple for side in (width, height)))
@@ -116,10 +118,13 @@ class View:
         """
         crop = self.crop
         cut = image[crop.top : crop.bottom, crop.left : crop.right]
-        if cut.shape[1::-1] != crop.size:
-            raise ValueError(f"the crop {crop} leaves the image of {image.shape[1]} x {image.shape[0]} pixels")
-        shrinks = min(self.scale) < 1
-        picture = cv2.resize(cut, self.content, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
+        if min(crop.left, crop.top) < 0 or cut.shape[1::-1] != crop.size:
+            raise ValueError(f"{crop} leaves the image of {image.shape[1]} x {image.shape[0]} pixels")
+        # In two steps: INTER_AREA is itself only where neither axis grows.
+        shrunk = Size(*map(min, self.content, crop.size))
+        picture = cv2.resize(cut, shrunk, interpolation=cv2.INTER_AREA) if shrunk != crop.size else cut
+        if shrunk != self.content:
+            picture = cv2.resize(picture, self.content, interpolation=cv2.INTER_LINEAR)
         if self.flip:
             picture = picture[:, ::-1]
         right = self.padded.width - self.content.width

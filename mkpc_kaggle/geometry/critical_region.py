@@ -84,7 +84,7 @@ def critical_region(points: Points, size: Size, config: MkpcConfig) -> CriticalR
     if len(sizes) == 0:
         return CriticalRegion(whole, RegionReason.NO_CLUSTER)
     kept = keep_clusters(sizes, config.share, config.ratio)
-    if sizes.sum() < config.min_clustered * len(points):
+    if sizes.sum() / len(points) < config.min_clustered:
         return CriticalRegion(whole, RegionReason.TOO_SCATTERED, len(sizes), len(kept))
     box = expand_box(points[np.isin(labels, kept)], size, config.expand_x, config.expand_y)
     if min(box.size) < config.min_side:
@@ -107,7 +107,7 @@ def keep_clusters(sizes: NDArray[np.intp], share: float, ratio: Ratio = Ratio.LA
     by_size = np.argsort(-sizes, kind="stable")
     ranked = sizes[by_size]
     against = ranked[0] if ratio is Ratio.LARGEST else ranked[:-1]
-    fails = ranked[1:] < share * against
+    fails = ranked[1:] / against < share
     stop = 1 + int(np.argmax(fails)) if fails.any() else len(ranked)
     kept: NDArray[np.intp] = by_size[:stop]
     return kept

@@ -52,6 +52,6 @@ def _two_best(queries: Tensor, keys: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _distance_ratio(best: Tensor, second: Tensor) -> Tensor:
-    """Euclidean distances of unit vectors are sqrt(2 - 2 s)."""
-    nearest, next_nearest = (1 - best).clamp(min=0), (1 - second).clamp(min=1e-12)
+    """Euclidean distances of unit vectors are sqrt(2 - 2 s); two neighbours at no distance are ambiguous: 1."""
+    nearest, next_nearest = (1 - best).clamp(min=1e-12), (1 - second).clamp(min=1e-12)
     return (nearest / next_nearest).sqrt()

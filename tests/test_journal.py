@@ -1,0 +1,134 @@
+import sqlite3
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rectified import SECOND, SWEEP, THREE_UNITS
+
+from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.geometry.coordinates import Box
+from mkpc_kaggle.geometry.critical_region import CriticalRegion, RegionReason
+from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.geometry.robust import Estimate, Model
+from mkpc_kaggle.pipeline import PairMatch, UnitResult
+from mkpc_kaggle.run.jobs import Outcome, Record, record_of
+from mkpc_kaggle.run.journal import Journal
+
+OURS = {"recipe": {"a": 1}, "test set": "x"}
+UNITS = {unit.name: unit for unit in THREE_UNITS.units}
+
+
+def outcome(index: int = 7, seed: int = 0) -> Outcome:
+    rng = np.random.default_rng(seed)
+    results = tuple(
+        UnitResult(unit, Matches(rng.random((n, 2)), rng.random((n, 2)), rng.random(n)), 0.5, 0.25)
+        for unit, n in ((SWEEP, 30), (SECOND, 0))
+    )
+    regions = (
+        CriticalRegion(Box(1, 2, 30, 40), RegionReason.CROPPED, 3, 2),
+        CriticalRegion(Box(0, 0, 5, 6), RegionReason.TOO_SMALL),
+    )
+    match = PairMatch(results, regions, Estimate(Model.F, rng.random((3, 3)), rng.random(30) < 0.5))
+    return Outcome(record_of(index, match, decode=0.1, cluster=0.2, estimate=0.3), results)
+
+
+def assert_same(one: Record, other: Record) -> None:
+    assert one.F.tobytes() == other.F.tobytes()
+    assert one.units == other.units
+    assert one.regions == other.regions
+    assert (one.index, one.failure, one.decode_seconds) == (other.index, other.failure, other.decode_seconds)
+
+
+def test_what_is_saved_is_there_after_opening_again(tmp_path: Path) -> None:
+    saved = [outcome(3, seed=1), outcome(7, seed=2)]
+    journal = Journal(tmp_path, OURS)
+    journal.save([(one, False) for one in saved])
+    journal.close()
+    again = Journal(tmp_path, OURS)
+    records = again.records()
+    assert list(records) == [3, 7]
+    for one in saved:
+        assert_same(records[one.record.index], one.record)
+        for before, after in zip(one.results, again.results(one.record.index, UNITS), strict=True):
+            assert after.unit == before.unit
+            assert after.matches.points0.tobytes() == before.matches.points0.tobytes()
+            assert after.matches.scores.tobytes() == before.matches.scores.tobytes()
+    again.close()
+
+
+def test_a_later_outcome_replaces_the_former(tmp_path: Path) -> None:
+    journal = Journal(tmp_path, OURS)
+    journal.save([(outcome(seed=1), False)])
+    journal.save([(outcome(seed=2), False)])
+    assert_same(journal.records()[7], outcome(seed=2).record)
+    journal.close()
+
+
+def test_the_points_of_a_settled_pair_are_not_kept(tmp_path: Path) -> None:
+    journal = Journal(tmp_path, OURS)
+    journal.save([(outcome(), False)])
+    assert len(journal.results(7, UNITS)[0].matches) == 30
+    journal.save([(outcome(), True)])
+    assert len(journal.results(7, UNITS)[0].matches) == 0
+    assert journal.records()[7].units[0].matches == 30
+    journal.close()
+
+
+def test_a_job_is_saved_whole_or_not_at_all(tmp_path: Path) -> None:
+    journal = Journal(tmp_path, OURS)
+    broken = Outcome(Record(8, "no matrix", ""))  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="could not convert"):
+        journal.save([(outcome(3), False), (broken, False)])
+    assert journal.records() == {}
+    journal.save([(outcome(3), False)])
+    assert list(journal.records()) == [3]
+    journal.close()
+
+
+def test_a_journal_of_another_run_is_refused_and_says_what_differs(tmp_path: Path) -> None:
+    Journal(tmp_path, OURS).close()
+    with pytest.raises(UserError, match=r"another run: its recipe differ.*--fresh"):
+        Journal(tmp_path, {**OURS, "recipe": {"a": 2}})
+    Journal(tmp_path, OURS).close()
+
+
+def test_fresh_forgets_what_was_there(tmp_path: Path) -> None:
+    journal = Journal(tmp_path, OURS)
+    journal.save([(outcome(), False)])
+    journal.close()
+    journal = Journal(tmp_path, {**OURS, "recipe": {}}, fresh=True)
+    assert journal.records() == {}
+    journal.close()
+
+
+def test_two_runs_cannot_share_a_work_directory(tmp_path: Path) -> None:
+    first = Journal(tmp_path, OURS)
+    with pytest.raises(UserError, match="is another run at work there"):
+        Journal(tmp_path, OURS)
+    first.close()
+
+
+def test_a_damaged_journal_is_refused(tmp_path: Path) -> None:
+    Journal(tmp_path, OURS).close()
+    (tmp_path / "journal.sqlite").write_bytes(b"this is no database" * 100)
+    with pytest.raises(UserError, match=r"damaged.*--fresh"):
+        Journal(tmp_path, OURS)
+
+
+def test_a_work_directory_that_cannot_be_made_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(UserError, match="cannot be written"):
+        Journal(tmp_path / "file" / "work", OURS)
+
+
+def test_a_failed_save_leaves_the_journal_usable(tmp_path: Path) -> None:
+    journal = Journal(tmp_path, OURS)
+    journal._db.execute("PRAGMA max_page_count = 12")
+    with pytest.raises(sqlite3.OperationalError, match="full"):
+        for index in range(200):
+            journal.save([(outcome(index, seed=index), False)])
+    kept = journal.records()
+    journal._db.execute("PRAGMA max_page_count = 100000")
+    journal.save([(outcome(999), False)])
+    assert set(journal.records()) == {*kept, 999}
+    journal.close()

@@ -1,0 +1,222 @@
+"""``make_submission.py`` as a person runs it: a process, real pictures, files on disk."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pandas as pd
+import pytest
+
+from mkpc_kaggle.competition import read_submission, read_test_side, submission_problems
+from mkpc_kaggle.demo import DemoSet
+from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
+
+ROOT = Path(__file__).resolve().parents[1]
+RECIPE = """
+units = [
+    { stage = 1, matcher = "sift", long_side = 320 },
+    { stage = 2, matcher = "sift", long_side = 400 },
+    { stage = 1, matcher = "sift", long_side = 280, extra = true },
+]
+"""
+
+
+@pytest.fixture
+def recipe(tmp_path: Path) -> Path:
+    path = tmp_path / "small.toml"
+    path.write_text(RECIPE)
+    return path
+
+
+def command(test_dir: Path, output: Path, recipe: Path | str, *more: str) -> list[str]:
+    script = str(ROOT / "make_submission.py")
+    return [
+        sys.executable,
+        script,
+        "--test-dir",
+        str(test_dir),
+        "--output",
+        str(output),
+        "--recipe",
+        str(recipe),
+        *more,
+    ]
+
+
+def make(test_dir: Path, output: Path, recipe: Path | str, *more: str) -> subprocess.CompletedProcess[str]:
+    environment = {name: value for name, value in os.environ.items() if name != "MKPC_WEIGHTS"}
+    return subprocess.run(
+        command(test_dir, output, recipe, *more), capture_output=True, text=True, env=environment, check=False
+    )
+
+
+def assert_good(output: Path, test_dir: Path) -> None:
+    assert submission_problems(output, [pair.id for pair in read_test_side(test_dir)]) == []
+
+
+def test_a_submission_is_made_resumed_and_repeated_to_the_byte(
+    demo: DemoSet, recipe: Path, tmp_path: Path
+) -> None:
+    output = tmp_path / "submission.csv"
+    first = make(demo.test_dir, output, recipe)
+    assert first.returncode == 0, first.stderr
+    assert "complete after" in first.stdout
+    assert_good(output, demo.test_dir)
+    written = output.read_bytes()
+    second = make(demo.test_dir, output, recipe)
+    assert "8 of them from earlier runs" in second.stdout
+    assert output.read_bytes() == written
+    make(demo.test_dir, tmp_path / "again.csv", recipe)
+    assert (tmp_path / "again.csv").read_bytes() == written
+
+
+def test_a_killed_run_goes_on_and_ends_with_the_bytes_of_an_undisturbed_one(
+    demo: DemoSet, recipe: Path, tmp_path: Path
+) -> None:
+    undisturbed, output = tmp_path / "undisturbed.csv", tmp_path / "submission.csv"
+    make(demo.test_dir, undisturbed, recipe)
+    running = subprocess.Popen(command(demo.test_dir, output, recipe), stderr=subprocess.PIPE, text=True)
+    assert running.stderr is not None
+    for line in iter(lambda: running.stderr.read(1), ""):  # the progress bar: the first deepened pair
+        if line == "d":
+            break
+    running.send_signal(signal.SIGKILL)
+    running.wait()
+    running.stderr.close()
+    assert_good(output, demo.test_dir)
+    resumed = make(demo.test_dir, output, recipe)
+    assert resumed.returncode == 0, resumed.stderr
+    assert output.read_bytes() == undisturbed.read_bytes()
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_ends_the_run_with_a_valid_file(
+    demo: DemoSet, recipe: Path, tmp_path: Path, number: signal.Signals
+) -> None:
+    output = tmp_path / "submission.csv"
+    running = subprocess.Popen(
+        command(demo.test_dir, output, recipe), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    while not output.exists():
+        time.sleep(0.02)
+        assert running.poll() is None
+    running.send_signal(number)
+    out, _ = running.communicate(timeout=30)
+    assert running.returncode == 128 + number
+    assert "interrupted after" in out
+    assert_good(output, demo.test_dir)
+
+
+def test_a_run_ends_within_its_limit_with_every_row_there(demo: DemoSet, tmp_path: Path) -> None:
+    output = tmp_path / "submission.csv"
+    started = time.monotonic()
+    made = make(demo.test_dir, output, "classical", "--time-limit", "9s")
+    assert time.monotonic() - started < 9
+    assert made.returncode == 0, made.stderr
+    assert_good(output, demo.test_dir)
+
+
+def write_test_side(
+    directory: Path, pictures: dict[str, bytes | np.ndarray], pairs: list[tuple[str, str]]
+) -> Path:
+    folder = directory / "test_images" / "batch"
+    folder.mkdir(parents=True)
+    for name, picture in pictures.items():
+        if isinstance(picture, bytes):
+            (folder / name).write_bytes(picture)
+        else:
+            cv2.imwrite(str(folder / name), picture)
+    rows = [(f"set;batch;{a}-{b}", "batch", a, b) for a, b in pairs]
+    columns = ["sample_id", "batch_id", "image_1_id", "image_2_id"]
+    pd.DataFrame(rows, columns=columns).to_csv(directory / "test.csv", index=False)
+    return directory
+
+
+def test_odd_pictures_get_an_f_or_the_fallback_row_and_a_line_in_the_summary(
+    demo: DemoSet, recipe: Path, tmp_path: Path
+) -> None:
+    images = sorted((demo.train_dir / "courtyard" / "images").iterdir())
+    good, other = cv2.imread(str(images[0])), cv2.imread(str(images[1]))
+    png = cv2.imencode(".png", other)[1].tobytes()
+    pictures = {
+        "good.jpg": good,
+        "gray.png": cv2.cvtColor(other, cv2.COLOR_BGR2GRAY),
+        "rgba.png": cv2.cvtColor(other, cv2.COLOR_BGR2BGRA),
+        "deep.png": other.astype(np.uint16) * 256,
+        "huge.jpeg": cv2.resize(other, (6400, 4700)),
+        "empty.png": b"",
+        "cut.png": png[: len(png) // 2],
+        "dot.png": other[:1, :1],
+        "flat.png": np.full((200, 300, 3), 128, np.uint8),
+    }
+    usable, useless = ("gray", "rgba", "deep", "huge"), ("empty", "cut", "dot", "flat", "missing")
+    pairs = [("good", name) for name in (*usable, *useless)] + [("good", "good")]
+    test_dir = write_test_side(tmp_path / "odd", pictures, pairs)
+    made = make(test_dir, tmp_path / "submission.csv", recipe)
+    assert made.returncode == 0, made.stderr
+    assert "Traceback" not in made.stderr
+    assert_good(tmp_path / "submission.csv", test_dir)
+    rows = read_submission(tmp_path / "submission.csv")
+    fallback = FALLBACK_FUNDAMENTAL / np.linalg.norm(FALLBACK_FUNDAMENTAL)
+    for name in usable:
+        assert not np.allclose(rows[f"set;batch;good-{name}"], fallback, atol=1e-3), name
+    for name in useless:
+        assert f"set;batch;good-{name}: " in made.stdout, name
+        norm = np.linalg.norm(rows[f"set;batch;good-{name}"])
+        np.testing.assert_allclose(rows[f"set;batch;good-{name}"] / norm, fallback)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["--test-dir", "nowhere"], "test.csv: no such file"),
+        (["--recipe", "imaginary"], "unknown recipe 'imaginary'; known: "),
+        (["--recipe", "light"], "needs weights that were not found"),
+        (["--weights", "nowhere"], "--weights nowhere: no such directory"),
+        (["--time-limit", "soon"], "'soon' is no duration"),
+        (["--device", "abacus"], "unknown device 'abacus'"),
+        (["--output", "/dev/null/submission.csv"], "cannot be written"),
+        (["--work-dir", "/dev/null/work"], "cannot be written"),
+    ],
+)
+def test_bad_input_is_told_in_one_line_before_any_work(
+    demo: DemoSet, tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], told: str
+) -> None:
+    from mkpc_kaggle.cli import main
+
+    output = tmp_path / "submission.csv"
+    status = main(["submit", "--test-dir", str(demo.test_dir), "--output", str(output), *arguments])
+    captured = capsys.readouterr()
+    assert status == 2
+    assert captured.err.startswith("error: ")
+    assert told in captured.err
+    assert len(captured.err.splitlines()) == 1
+    assert not output.exists()
+
+
+def test_a_recipe_with_an_unknown_key_is_refused_with_the_known_ones(
+    demo: DemoSet, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from mkpc_kaggle.cli import main
+
+    recipe = tmp_path / "odd.toml"
+    recipe.write_text(RECIPE + "[magsac]\ntreshold = 0.2\n")
+    assert main(["submit", "--test-dir", str(demo.test_dir), "--recipe", str(recipe)]) == 2
+    assert "unknown key 'treshold'; known keys: method, threshold, confidence" in capsys.readouterr().err
+
+
+def test_another_recipe_in_the_same_work_directory_is_refused(demo: DemoSet, recipe: Path, tmp_path: Path) -> None:
+    output = tmp_path / "submission.csv"
+    make(demo.test_dir, output, recipe)
+    written = output.read_bytes()
+    recipe.write_text(RECIPE.replace("400", "401"))
+    refused = make(demo.test_dir, output, recipe)
+    assert refused.returncode == 2
+    assert "belongs to another run: its recipe differ" in refused.stderr
+    assert output.read_bytes() == written
+    assert make(demo.test_dir, output, recipe, "--fresh").returncode == 0
