@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import pytest
+
 from mkpc_kaggle.demo import DemoSet, write_demo
 
 

@@ -25,11 +25,6 @@ from mkpc_kaggle.run.jobs import Record
 from mkpc_kaggle.run.session import Interrupt, Session, run_pairs
 
 
-@dataclass(frozen=True)
-class Options:
-    pass
-
-
 @dataclass(frozen=True, eq=False)
 class Seen:
     view: View
@@ -47,7 +42,7 @@ class RectifiedMatcher:
 
     @property
     def spec(self) -> MatcherSpec:
-        return MatcherSpec(self.name, "a matcher for tests", Options)
+        return MatcherSpec(self.name, "a matcher for tests")
 
     def encode(self, pictures: Sequence[Picture]) -> list[Seen]:
         return [Seen(picture.view, int(np.median(picture.pixels))) for picture in pictures]

@@ -101,9 +101,10 @@ def test_columns_may_come_in_any_order_and_with_others(side):
     assert (pair.id, pair.group, pair.image0.stem, pair.image1.stem) == ("s", "b", "1", "2")
 
 
-def test_a_comma_at_the_end_of_each_row_does_not_shift_the_columns(side):
-    (pair,) = read_test_side(side("s,b,1,2,"))
-    assert (pair.id, pair.group, pair.image0.stem, pair.image1.stem) == ("s", "b", "1", "2")
+def test_rows_longer_than_the_header_are_refused_rather_than_shifted(side):
+    home = side("s,b,1,2,5", "t,c,1,2,5")
+    with pytest.raises(UserError, match=r"test\.csv"):
+        read_test_side(home)
 
 
 def test_no_table_is_named(tmp_path):

@@ -21,13 +21,22 @@ from mkpc_kaggle.matchers.xfeat_lighterglue import layer_name, load_all_but
 from mkpc_kaggle.recipe import Recipe, Unit
 from mkpc_kaggle.weights import WeightStore
 
-SIZE = Size(320, 224)
+SIZE = Size(256, 192)
 every_matcher = pytest.mark.parametrize(
     "name",
     ["sift", pytest.param("aliked", marks=needs_weights), pytest.param("xfeat_lighterglue", marks=needs_weights)],
 )
 # The median error in pixels that a matcher may have; XFeat's keypoints are whole pixels of its cells.
 WITHIN = {"sift": 0.4, "aliked": 1.0, "xfeat_lighterglue": 1.5}
+
+
+@pytest.fixture(autouse=True, scope="module")
+def one_thread():
+    """Small pictures gain nothing from more, and on a busy machine threads that wait for one another cost."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
 
 
 def affine(degrees, scale, x, y):
@@ -48,7 +57,7 @@ MAPS = {
 @cache
 def photograph():
     # Twice reduced, it is sharp at this size.
-    return cv2.resize(load_sample_image("china.jpg")[:, :610], SIZE, interpolation=cv2.INTER_AREA)
+    return cv2.resize(load_sample_image("china.jpg")[:, :569], SIZE, interpolation=cv2.INTER_AREA)
 
 
 @cache
@@ -116,7 +125,7 @@ def test_a_loaded_matcher_has_the_spec_of_the_registry(name):
 def test_matches_follow_the_known_map(name, kind):
     H = MAPS[kind]
     matches = match_photograph(name, cv2.warpPerspective(photograph(), H, SIZE, flags=cv2.INTER_AREA))
-    assert len(matches) >= 100
+    assert len(matches) >= 60
     errors = np.hypot(*offsets(matches, H).T)
     assert np.median(errors) < WITHIN[name]
     assert np.mean(errors < 4) > 0.75
@@ -173,7 +182,7 @@ def test_the_same_picture_twice_gives_the_same_bytes(name):
 @every_matcher
 def test_pictures_in_a_batch_are_encoded_as_they_are_alone(name):
     matcher = matcher_of(name)
-    pictures = [picture(np.ascontiguousarray(cut), matcher) for cut in (photograph()[:96], photograph()[96:192])]
+    pictures = [picture(np.ascontiguousarray(cut), matcher) for cut in (photograph()[:96], photograph()[96:])]
     for together, one in zip(matcher.encode(pictures), pictures, strict=True):
         (alone,) = matcher.encode([one])
         assert len(together) == len(alone) > 50
@@ -206,30 +215,29 @@ ODD = {
 
 @every_matcher
 @pytest.mark.parametrize("kind", ODD)
-@pytest.mark.parametrize("padding", [(0, 0), (40, 70)])
-def test_odd_pictures_give_legal_matches(name, kind, padding):
+def test_odd_pictures_give_legal_matches(name, kind):
     matcher = matcher_of(name)
-    odd = picture(ODD[kind], matcher, padding)
+    odd = picture(ODD[kind], matcher, padding=(0, 40))
     (encoding,) = matcher.encode([odd])
     full = photograph_encoding(name)
-    first, second, own = matcher.match([encoding, full, encoding], [full, encoding, encoding])
+    first, second = matcher.match([encoding, full], [full, encoding])
     content = Box.whole(odd.content)
-    for points in (first.points0, second.points1, own.points0, own.points1):
+    for points in (first.points0, second.points1):
         assert content.contains(points).all()
-    for matches in (first, second, own):
+    for matches in (first, second):
         assert np.isfinite(matches.scores).all()
 
 
 @every_matcher
 def test_no_match_lies_on_the_padding_and_padding_costs_no_good_match(name):
     matcher = matcher_of(name)
-    cut = np.ascontiguousarray(photograph()[:160, :200])
-    padded = picture(cut, matcher, padding=(120, 90))
-    assert padded.pixels.shape[:2] >= (250, 320)
+    cut = np.ascontiguousarray(photograph()[:140, :180])
+    padded = picture(cut, matcher, padding=(60, 50))
+    assert padded.pixels.shape[:2] >= (190, 240)
     matches = matcher.match(matcher.encode([padded]), [photograph_encoding(name)])[0]
     assert Box.whole(padded.content).contains(matches.points0).all()
     errors = np.hypot(*(matches.points1 - matches.points0).T)  # the cut's corner is the photograph's
-    assert np.sum(errors < 2) >= 80
+    assert np.sum(errors < 2) >= 60
 
 
 @every_matcher

@@ -53,7 +53,6 @@ def test_any_dtype_is_cast_to_contiguous_float32(dtype):
         ((3, 3), (3, 2), (3,)),
         ((3, 2), (3, 2), (3, 1)),
         ((3, 2), (6,), (3,)),
-        ((0,), (0, 2), (0,)),
     ],
 )
 def test_shapes_that_disagree_are_an_error(shape0, shape1, shape_scores):
@@ -170,3 +169,8 @@ def test_points_of_an_image_come_back_through_its_views(seed, long_side, flip):
     assert len(out) == 30
     assert_allclose(out.points0, points0, rtol=0, atol=2e-3)
     assert_allclose(out.points1, points1, rtol=0, atol=2e-3)
+
+
+def test_empty_lists_are_empty_matches() -> None:
+    assert len(Matches([], [], [])) == 0
+    assert Matches([], [], []).points0.shape == (0, 2)

@@ -25,6 +25,8 @@ class Matches:
     def __post_init__(self) -> None:
         for name, width in (("points0", (2,)), ("points1", (2,)), ("scores", ())):
             array = np.ascontiguousarray(getattr(self, name), dtype=np.float32)
+            if array.shape == (0,):  # an empty list is an empty list of points
+                array = array.reshape(0, *width)
             if array.shape != (len(self.scores), *width):
                 raise ValueError(f"{name} has shape {array.shape}, scores {np.shape(self.scores)}")
             object.__setattr__(self, name, array)

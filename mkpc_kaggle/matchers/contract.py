@@ -23,6 +23,11 @@ class Colour(StrEnum):
 
 
 @dataclass(frozen=True)
+class NoOptions:
+    """For a matcher that has nothing to set."""
+
+
+@dataclass(frozen=True)
 class MatcherSpec:
     """What can be said of a matcher before it is loaded.
 
@@ -33,7 +38,7 @@ class MatcherSpec:
 
     name: str
     summary: str
-    options: type
+    options: type = NoOptions
     colour: Colour = Colour.RGB
     multiple: int = 1
     same_size: bool = False

@@ -1,0 +1,108 @@
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from mkpc_kaggle.cli import COMMANDS, main
+from mkpc_kaggle.competition import read_test_side, write_submission
+from mkpc_kaggle.demo import DemoSet
+from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
+
+
+def test_importing_the_package_is_cheap_and_brings_no_torch() -> None:
+    code = "import sys, mkpc_kaggle; print([m for m in ('torch', 'cv2', 'pandas', 'numpy') if m in sys.modules])"
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert out.strip() == "[]"
+
+
+def test_geometry_imports_no_torch() -> None:
+    code = (
+        "import sys, pkgutil, importlib, mkpc_kaggle.geometry as g\n"
+        "[importlib.import_module(f'{g.__name__}.{m.name}') for m in pkgutil.iter_modules(g.__path__)]\n"
+        "print('torch' in sys.modules)"
+    )
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert out.strip() == "False"
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_has_a_help_that_teaches(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as left:
+        main([command, "--help"])
+    assert left.value.code == 0
+    assert len(capsys.readouterr().out.splitlines()) >= 8
+
+
+def test_recipes_are_listed_with_what_they_lack(
+    clean_environment: None, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["recipes"]) == 0
+    out = capsys.readouterr().out
+    light = out[out.index("light: ") :]
+    assert "missing: xfeat: xfeat.pt or xfeat_sparse_bnfolded.safetensors" in light
+    classical = out[out.index("classical: ") : out.index("light: ")]
+    assert "all weights are there" in classical
+
+
+def test_check_tells_good_from_bad(demo: DemoSet, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    ids = [pair.id for pair in read_test_side(demo.test_dir)]
+    path = tmp_path / "submission.csv"
+    write_submission(path, dict.fromkeys(ids, FALLBACK_FUNDAMENTAL))
+    assert main(["check", str(path), "--test-dir", str(demo.test_dir)]) == 0
+    assert "good: 8 rows" in capsys.readouterr().out
+    write_submission(path, dict.fromkeys(ids[1:], np.full((3, 3), np.nan)))
+    assert main(["check", str(path), "--test-dir", str(demo.test_dir)]) == 1
+    assert "1 samples are missing" in capsys.readouterr().out
+    assert main(["check", str(path), "--test-dir", str(tmp_path)]) == 2
+
+
+def test_match_prints_f_and_draws_the_pair(
+    demo: DemoSet, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recipe = tmp_path / "small.toml"
+    recipe.write_text(
+        'units = [{stage = 1, matcher = "sift", long_side = 320}, {stage = 2, matcher = "sift", long_side = 400}]'
+    )
+    images = sorted((demo.train_dir / "courtyard" / "images").iterdir())[:2]
+    figure = tmp_path / "new" / "pair.png"
+    assert main(["match", *map(str, images), "--recipe", str(recipe), "--out", str(figure)]) == 0
+    out = capsys.readouterr().out.splitlines()
+    F = np.array([[float(value) for value in line.split()] for line in out[:3]])
+    assert np.linalg.norm(F) == pytest.approx(1)
+    assert "1:sift@320" in "\n".join(out)
+    assert cv2.imread(str(figure)).shape[1] > 1000
+
+
+def test_match_draws_a_pair_that_has_nothing_in_common(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name in ("a.png", "b.png"):
+        cv2.imwrite(str(tmp_path / name), np.full((60, 90, 3), 127, np.uint8))
+    paths = [str(tmp_path / name) for name in ("a.png", "b.png")]
+    figure = tmp_path / "pair.png"
+    assert main(["match", *paths, "--recipe", "classical", "--out", str(figure)]) == 0
+    assert "this is the fallback: too few distinct matches" in capsys.readouterr().out
+    assert figure.exists()
+
+
+def test_a_figure_that_cannot_be_written_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    cv2.imwrite(str(tmp_path / "a.png"), np.full((60, 90, 3), 127, np.uint8))
+    paths = [str(tmp_path / "a.png")] * 2
+    assert main(["match", *paths, "--recipe", "classical", "--out", "/dev/null/pair.png"]) == 2
+    assert "cannot be written" in capsys.readouterr().err
+
+
+def test_match_tells_which_image_cannot_be_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["match", str(tmp_path / "a.png"), str(tmp_path / "b.png")]) == 2
+    assert "a.png: no such file" in capsys.readouterr().err
+
+
+def test_demo_writes_what_submit_and_validate_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from mkpc_kaggle import demo
+
+    monkeypatch.setattr(
+        demo, "write_demo", lambda out, seed, _write=demo.write_demo: _write(out, seed=seed, image_scale=0.1)
+    )
+    assert main(["demo", "--out", str(tmp_path)]) == 0
+    assert len(read_test_side(tmp_path / "test")) == 24

@@ -1,0 +1,151 @@
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from shared import DATA, needs_data
+
+from mkpc_kaggle.cli import main
+from mkpc_kaggle.competition import Pair, Scene, TruePair, read_test_side, read_train_side, write_submission
+from mkpc_kaggle.demo import DemoSet
+from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.geometry.cameras import Camera, fundamental_of_cameras
+from mkpc_kaggle.geometry.metrics import AUC_THRESHOLDS
+from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
+from mkpc_kaggle.run.jobs import Record
+from mkpc_kaggle.validate import score_record, score_submission, score_table
+
+RECIPE = """
+units = [{ stage = 1, matcher = "sift", long_side = 320 }, { stage = 2, matcher = "sift", long_side = 400 }]
+"""
+
+
+@pytest.fixture
+def recipe(tmp_path: Path) -> Path:
+    path = tmp_path / "small.toml"
+    path.write_text(RECIPE)
+    return path
+
+
+def true_matrices(demo: DemoSet) -> dict[str, np.ndarray]:
+    """The true F of the test side's samples, in the test side's order of images."""
+    cameras: dict[str, tuple[Camera, Camera]] = {}
+    for scene in read_train_side(demo.train_dir, min_covisibility=0):
+        for true in scene.pairs:
+            first, second = true.pair.image0.stem, true.pair.image1.stem
+            cameras[first, second] = true.camera0, true.camera1
+            cameras[second, first] = true.camera1, true.camera0
+    rows = (line.split(",") for line in demo.truth_csv.read_text().splitlines()[1:])
+    return {sample: fundamental_of_cameras(*cameras[first, second]) for sample, _, first, second in rows}
+
+
+def test_the_true_matrices_score_one_whatever_the_order_of_the_images(demo: DemoSet, tmp_path: Path) -> None:
+    truth = true_matrices(demo)
+    assert list(truth) == [pair.id for pair in read_test_side(demo.test_dir)]
+    write_submission(tmp_path / "true.csv", truth)
+    scored = score_submission(tmp_path / "true.csv", demo.truth_csv, read_train_side(demo.train_dir))
+    assert scored.maa == 1
+    assert [scored.auc(threshold) for threshold in AUC_THRESHOLDS] == pytest.approx([1, 1, 1], abs=1e-3)
+    assert sum(len(scene.pairs) for scene in scored.scenes) == 8
+
+
+def test_the_fallback_scores_next_to_nothing(demo: DemoSet, tmp_path: Path) -> None:
+    rows = dict.fromkeys(true_matrices(demo), FALLBACK_FUNDAMENTAL)
+    write_submission(tmp_path / "fallback.csv", rows)
+    scored = score_submission(tmp_path / "fallback.csv", demo.truth_csv, read_train_side(demo.train_dir))
+    assert scored.maa < 0.2
+
+
+def test_a_submission_for_another_set_is_refused(demo: DemoSet, tmp_path: Path) -> None:
+    write_submission(tmp_path / "other.csv", {"other;sample": FALLBACK_FUNDAMENTAL})
+    with pytest.raises(UserError, match="names no pair"):
+        score_submission(tmp_path / "other.csv", demo.truth_csv, read_train_side(demo.train_dir))
+
+
+def test_a_failed_pair_counts_as_failed_even_where_the_fallback_happens_to_be_right() -> None:
+    eye = np.eye(3)
+    camera0, camera1 = Camera(eye, eye, np.zeros(3)), Camera(eye, eye, np.array([1.0, 0, 0]))
+    true = TruePair(Pair("p", "s", Path("a"), Path("b")), camera0, camera1, 0.5)
+    scene = Scene("s", 1.0, (true,))
+    failed = score_record(true, Record(0, FALLBACK_FUNDAMENTAL.copy(), "too few matches"), scene)
+    right = score_record(true, Record(0, FALLBACK_FUNDAMENTAL.copy(), ""), scene)
+    assert failed.error.rotation == np.inf
+    assert right.error.angle < 1e-6
+
+
+def test_validate_scores_a_recipe_and_writes_all_figures(
+    demo: DemoSet, recipe: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "scores.json"
+    arguments = ["validate", "--train-dir", str(demo.train_dir), "--pairs-per-scene", "5"]
+    assert main([*arguments, "--recipe", str(recipe), "--json", str(out)]) == 0
+    printed = capsys.readouterr().out
+    scores = json.loads(out.read_text())
+    assert f"{'mean over scenes':<20}{5:>6}{scores['mAA']:>9.4f}" in printed
+    (scene,) = scores["scenes"]
+    assert scene["scene"] == "courtyard"
+    assert len(scene["pairs"]) == 5
+    assert 0.1 < scores["mAA"] == scene["mAA"] <= 1
+    assert scores["seconds_per_pair"] > 0
+    assert set(scores["inliers_by_stage"]) == {"1", "2"}
+    assert sum(scores["region_reasons"].values()) == 10
+    for pair in scene["pairs"]:
+        assert set(pair["matches"]) == {"1:sift@320", "2:sift@400"}
+
+
+@pytest.mark.parametrize(
+    ("mode", "stages"), [("stage-1", {"1"}), ("whole-images", {"1"}), ("two-stage", {"1", "2"})]
+)
+def test_modes_change_the_stages(demo: DemoSet, recipe: Path, tmp_path: Path, mode: str, stages: set[str]) -> None:
+    out = tmp_path / "scores.json"
+    arguments = ["validate", "--train-dir", str(demo.train_dir), "--pairs-per-scene", "1", "--mode", mode]
+    assert main([*arguments, "--recipe", str(recipe), "--json", str(out)]) == 0
+    assert set(json.loads(out.read_text())["inliers_by_stage"]) == stages
+
+
+def test_scoring_a_file_needs_to_know_its_pairs(demo: DemoSet, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["validate", "--train-dir", str(demo.train_dir), "--submission", "x.csv"]) == 2
+    assert "go together" in capsys.readouterr().err
+
+
+@needs_data
+def test_the_tables_of_real_scenes_agree_with_their_cameras() -> None:
+    scenes = read_train_side(DATA / "train", min_covisibility=0.1)
+    assert {scene.name: len(scene.pairs) for scene in scenes} == {
+        "castle_p19": 91,
+        "fountain_p11": 55,
+        "herz_jesus_p8": 28,
+        "reichstag_26": 304,
+        "scannet_samples": 15,
+    }
+    records = [
+        [Record(i, fundamental_of_cameras(true.camera0, true.camera1), "") for i, true in enumerate(scene.pairs)]
+        for scene in scenes
+    ]
+    for scene, found in zip(scenes, records, strict=True):
+        errors = [score_record(true, record, scene).error for true, record in zip(scene.pairs, found, strict=True)]
+        assert max(error.rotation for error in errors) < 1e-3
+        assert max(error.translation for error in errors) < 1e-2
+
+
+BASELINE = {"castle_p19": 0.4319, "fountain_p11": 0.9018, "herz_jesus_p8": 0.8857, "reichstag_26": 0.2313}
+
+
+@needs_data
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+def test_the_classical_recipe_reaches_plain_root_sift_scene_by_scene(tmp_path: Path) -> None:
+    out = tmp_path / "scores.json"
+    train = str(DATA / "train")
+    assert main(["validate", "--train-dir", train, "--recipe", "classical", "--json", str(out)]) == 0
+    scores = {scene["scene"]: scene["mAA"] for scene in json.loads(out.read_text())["scenes"]}
+    for scene, baseline in {**BASELINE, "scannet_samples": 0.04}.items():
+        assert scores[scene] >= baseline - 0.01, scene
+
+
+def test_the_table_has_a_row_a_scene_and_their_mean(demo: DemoSet, tmp_path: Path) -> None:
+    write_submission(tmp_path / "true.csv", true_matrices(demo))
+    scored = score_submission(tmp_path / "true.csv", demo.truth_csv, read_train_side(demo.train_dir))
+    lines = score_table(scored)
+    assert [line.split()[0] for line in lines] == ["scene", "courtyard", "mean"]
+    assert lines[1].split()[1:3] == ["8", "1.0000"]
