@@ -5,6 +5,7 @@ Matrices and vectors in cells are separated by blanks, row by row. A test image 
 jpeg will do on both sides. F of a pair satisfies x2^T F x1 = 0, image 1 being the first.
 """
 
+import csv
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -66,23 +67,22 @@ def read_test_side(directory: Path) -> tuple[Pair, ...]:
     ids that are not plain names.
     """
     home = directory.parent if directory.name == "test_images" else directory
-    csv, images = home / "test.csv", home / "test_images"
-    table = read_table(csv, TEST_COLUMNS)
+    path, images = home / "test.csv", home / "test_images"
+    table = read_table(path, TEST_COLUMNS)
     if not images.is_dir():
         raise UserError(f"{images}: no such directory; --test-dir must hold test.csv and test_images/")
     if table.empty:
-        raise UserError(f"{csv} has no rows: there is nothing to match")
+        raise UserError(f"{path} has no rows: there is nothing to match")
     repeated = table["sample_id"][table["sample_id"].duplicated()]
     if not repeated.empty:
-        raise UserError(
-            f"{csv}: the sample_id {repeated.iloc[0]!r} stands there {1 + len(repeated)} times or more"
-        )
+        times = int((table["sample_id"] == repeated.iloc[0]).sum())
+        raise UserError(f"{path}: the sample_id {repeated.iloc[0]!r} stands there {times} times")
     return tuple(
         Pair(
             str(sample),
             str(batch),
-            image_path(images / plain_name(batch, csv), plain_name(first, csv)),
-            image_path(images / batch, plain_name(second, csv)),
+            image_path(images / plain_name(batch, path), plain_name(first, path)),
+            image_path(images / batch, plain_name(second, path)),
         )
         for sample, batch, first, second in table[list(TEST_COLUMNS)].itertuples(index=False)
     )
@@ -101,7 +101,8 @@ def read_train_side(
     :class:`UserError` for missing files, columns or scenes, and for cells that cannot be read.
     """
     factors = read_table(directory / "scaling_factors.csv", ("scene", "scaling_factor"))
-    metres = dict(zip(factors["scene"], factors["scaling_factor"], strict=True))
+    cells = zip(factors["scene"], factors["scaling_factor"], strict=True)
+    metres = {scene: float(_numbers(cell, directory / "scaling_factors.csv", 1)[0]) for scene, cell in cells}
     wanted = list(scenes) or sorted(name for name in metres if (directory / name).is_dir())
     for name in wanted:
         if name not in metres:
@@ -109,19 +110,17 @@ def read_train_side(
     if not wanted:
         raise UserError(f"{directory} has none of the scenes of its scaling_factors.csv")
     return tuple(
-        _read_scene(
-            directory / plain_name(name, directory), float(metres[name]), min_covisibility, pairs_per_scene
-        )
+        _read_scene(directory / plain_name(name, directory), metres[name], min_covisibility, pairs_per_scene)
         for name in wanted
     )
 
 
-def read_cameras(csv: Path) -> dict[str, Camera]:
+def read_cameras(path: Path) -> dict[str, Camera]:
     """The cameras of a ``calibration.csv`` by image id."""
     columns = ("image_id", "camera_intrinsics", "rotation_matrix", "translation_vector")
     return {
-        image: Camera(_numbers(K, csv, 9).reshape(3, 3), _numbers(R, csv, 9).reshape(3, 3), _numbers(t, csv, 3))
-        for image, K, R, t in read_table(csv, columns)[list(columns)].itertuples(index=False)
+        image: Camera(_numbers(K, path, 9).reshape(3, 3), _numbers(R, path, 9).reshape(3, 3), _numbers(t, path, 3))
+        for image, K, R, t in read_table(path, columns)[list(columns)].itertuples(index=False)
     }
 
 
@@ -130,11 +129,11 @@ def write_submission(path: Path, rows: Mapping[str, Matrix3]) -> None:
 
     Raises ``OSError`` where it cannot be written; the former file is then untouched.
     """
-    lines = [",".join(SUBMISSION_COLUMNS)]
-    lines += [f"{sample},{' '.join(f'{value:.12g}' for value in F.ravel())}" for sample, F in rows.items()]
     part = path.with_name(f".{path.name}.part")
-    with part.open("w", encoding="utf-8", newline="\n") as stream:
-        stream.write("\n".join(lines) + "\n")
+    with part.open("w", encoding="utf-8", newline="") as stream:
+        table = csv.writer(stream, lineterminator="\n")
+        table.writerow(SUBMISSION_COLUMNS)
+        table.writerows([sample, " ".join(f"{value:.12g}" for value in F.ravel())] for sample, F in rows.items())
         stream.flush()
         os.fsync(stream.fileno())
     part.replace(path)
@@ -182,6 +181,8 @@ def read_table(path: Path, columns: Sequence[str]) -> pd.DataFrame:
         raise UserError(f"{path} is empty; expected the columns {', '.join(columns)}") from error
     except (OSError, ValueError) as error:
         raise UserError(f"{path} cannot be read as a table: {error}") from error
+    if not isinstance(table.index, pd.RangeIndex):  # pandas took the first column for an index
+        raise UserError(f"{path} has rows with more cells than its header: {', '.join(table.columns)}")
     missing = [column for column in columns if column not in table.columns]
     if missing:
         raise UserError(f"{path} lacks the columns {', '.join(missing)}; it has {', '.join(table.columns)}")
@@ -215,18 +216,17 @@ def _images_of(directory: Path) -> dict[str, Path]:
 
 def _read_scene(directory: Path, metres: float, min_covisibility: float, most: int | None) -> Scene:
     cameras = read_cameras(directory / "calibration.csv")
-    csv = directory / "pair_covisibility.csv"
+    path, columns = directory / "pair_covisibility.csv", ["pair", "covisibility"]
     pairs = []
-    for key, covisibility in read_table(csv, ("pair", "covisibility"))[["pair", "covisibility"]].itertuples(
-        index=False
-    ):
+    for key, cell in read_table(path, columns)[columns].itertuples(index=False):
+        covisibility = float(_numbers(cell, path, 1)[0])
         first, dash, second = key.partition("-")
         if not dash or first not in cameras or second not in cameras:
-            raise UserError(f"{csv}: the pair {key!r} is not two images of calibration.csv")
-        if float(covisibility) >= min_covisibility:
-            images = [image_path(directory / "images", plain_name(name, csv)) for name in (first, second)]
+            raise UserError(f"{path}: the pair {key!r} is not two images of calibration.csv")
+        if covisibility >= min_covisibility:
+            images = [image_path(directory / "images", plain_name(name, path)) for name in (first, second)]
             pair = Pair(pair_id(directory.name, first, second), directory.name, *images)
-            pairs.append(TruePair(pair, cameras[first], cameras[second], float(covisibility)))
+            pairs.append(TruePair(pair, cameras[first], cameras[second], covisibility))
     if most is not None and most < len(pairs):
         pairs = [pairs[index] for index in np.linspace(0, len(pairs) - 1, most).round().astype(int)]
     return Scene(directory.name, metres, tuple(pairs))
@@ -243,8 +243,9 @@ def _numbers(cell: str, where: Path, count: int) -> NDArray[np.float64]:
 
 
 def _difference(found: Sequence[str], expected: Sequence[str]) -> str:
-    missing = [sample for sample in expected if sample not in set(found)]
-    surplus = [sample for sample in found if sample not in set(expected)]
+    are, should_be = set(found), set(expected)
+    missing = [sample for sample in expected if sample not in are]
+    surplus = [sample for sample in found if sample not in should_be]
     if missing:
         return f"{len(missing)} samples are missing, the first is {missing[0]}"
     if surplus:

@@ -30,7 +30,9 @@ def from_table(cls: type[Config], table: Mapping[str, Any], where: str) -> Confi
 
 
 def check_keys(table: Mapping[str, Any], known: Iterable[str], where: str) -> None:
-    """Raise :class:`UserError` for the first key that is not among ``known``."""
+    """Raise :class:`UserError` for what is no table, and for the first key that is not among ``known``."""
+    if not isinstance(table, Mapping):
+        raise UserError(f"{where} must be a table, not {table!r}")
     known = list(known)
     for key in table:
         if key not in known:

@@ -60,8 +60,8 @@ class Unreadable:
 def read_image(path: Path) -> Image | Unreadable:
     """Decode one file (png, jpg; 8 or 16 bit; gray, colour, with alpha) to 8-bit RGB; never raises.
 
-    16-bit values are divided by 256, alpha is dropped, an EXIF orientation is applied. A damaged file counts
-    as readable as far as OpenCV decodes it: half a photograph still matches.
+    16-bit values are divided by 256, alpha is dropped, an EXIF orientation is applied. Whether a damaged file
+    is readable is OpenCV's to say: version 5 refuses one that was cut off.
     """
     name = str(path)
     try:
@@ -71,8 +71,8 @@ def read_image(path: Path) -> Image | Unreadable:
         bgr = cv2.imdecode(data, cv2.IMREAD_COLOR)
     except FileNotFoundError:
         return Unreadable(name, "no such file")
-    except OSError as error:
-        return Unreadable(name, f"cannot be read: {error.strerror}")
+    except (OSError, ValueError) as error:
+        return Unreadable(name, f"cannot be read: {error}")
     except (cv2.error, MemoryError) as error:
         return Unreadable(name, f"cannot be decoded: {error}")
     if bgr is None:
@@ -98,15 +98,18 @@ class ImageStore:
 
     def get(self, path: Path) -> Image | Unreadable:
         """The image, waiting for it if need be."""
-        known = self._images.get(path)
-        if known is not None:
-            return known
-        self.announce([path])
-        image = self._coming[path].result()
+        with self._lock:
+            known = self._images.get(path)
+            if known is not None:
+                return known
+            coming = self._coming.get(path) or self._decoders.submit(read_image, path)
+            self._coming[path] = coming
+        image = coming.result()
         with self._lock:
             if isinstance(image, Image):
                 self._images.put(path, image, image.pixels.nbytes)
-            del self._coming[path]
+            if self._coming.get(path) is coming:
+                del self._coming[path]
         return image
 
     def close(self) -> None:

@@ -150,7 +150,7 @@ class Pipeline:
             for work, pair in zip(works, views, strict=True)
             for image, view in zip(work.images, pair, strict=True)
         ]
-        encodings = self._encode(matcher, wanted)
+        encodings = self._encode(unit.matcher, wanted)
         encoded = time.perf_counter()
         found = matcher.match(encodings[::2], encodings[1::2])
         matched = time.perf_counter()
@@ -164,9 +164,10 @@ class Pipeline:
             for matches, pair in zip(found, views, strict=True)
         ]
 
-    def _encode(self, matcher: Matcher[Any], wanted: Sequence[tuple[Image, View]]) -> list[Any]:
-        """The encodings of views, from the cache or made now, views of one shape together."""
-        keys = [(matcher.spec.name, image.name, view) for image, view in wanted]
+    def _encode(self, name: str, wanted: Sequence[tuple[Image, View]]) -> list[Any]:
+        """The encodings of views by the matcher of that name, from the cache or made now, one shape together."""
+        matcher = self._matcher(name)
+        keys = [(name, image.name, view) for image, view in wanted]
         known = {key: self._encodings.get(key) for key in keys}
         missing = {key: item for key, item in zip(keys, wanted, strict=True) if known[key] is None}
         by_shape: dict[Size, list[tuple[str, str, View]]] = {}

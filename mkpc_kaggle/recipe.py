@@ -108,8 +108,10 @@ class Recipe:
         name = f"{self.name} ({mode})"
         if mode is Mode.STAGE_1:
             return replace(self.only(lambda unit: unit.stage == 1), name=name)
-        whole = dict.fromkeys(replace(unit, stage=1) for unit in self.units)
-        return replace(self, name=name, units=tuple(whole))
+        whole: dict[str, Unit] = {}
+        for unit in (replace(unit, stage=1) for unit in self.units):
+            whole.setdefault(unit.name, unit)
+        return replace(self, name=name, units=tuple(whole.values()))
 
     def fingerprint(self) -> dict[str, Any]:
         """All that decides what a run computes, as JSON-able values; name and description are no part of it."""
@@ -126,17 +128,21 @@ def parse_recipe(text: str, name: str) -> Recipe:
     except tomllib.TOMLDecodeError as error:
         raise UserError(f"{where} is not valid TOML: {error}") from error
     check_keys(table, ("description", "units", "mkpc", "magsac", "upgrade", "matchers"), where)
+    units, matchers = table.get("units", []), table.get("matchers", {})
+    if not isinstance(units, list):
+        raise UserError(f"{where}: units must be a list of tables, not {units!r}")
+    if not isinstance(matchers, dict):
+        raise UserError(f"{where}: matchers must be a table, not {matchers!r}")
     return Recipe(
         units=tuple(
-            from_table(Unit, unit, f"{where}, unit {number}")
-            for number, unit in enumerate(table.get("units", []), start=1)
+            from_table(Unit, unit, f"{where}, unit {number}") for number, unit in enumerate(units, start=1)
         ),
         name=name,
         description=str(table.get("description", "")),
         mkpc=from_table(MkpcConfig, table.get("mkpc", {}), f"{where}, table [mkpc]"),
         magsac=from_table(RobustConfig, table.get("magsac", {}), f"{where}, table [magsac]"),
         upgrade=from_table(UpgradeConfig, table.get("upgrade", {}), f"{where}, table [upgrade]"),
-        matchers=table.get("matchers", {}),
+        matchers=matchers,
     )
 
 
@@ -156,3 +162,5 @@ def load_recipe(name: str) -> Recipe:
         return parse_recipe(path.read_text(encoding="utf-8"), path.stem)
     except OSError as error:
         raise UserError(f"recipe file {path} cannot be read: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise UserError(f"recipe file {path} is not UTF-8 text") from error

@@ -10,8 +10,9 @@ asks for; lines of one slot are alternatives, the first that is found is taken.
 
 import hashlib
 import os
+import re
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -21,6 +22,7 @@ from mkpc_kaggle.errors import UserError
 
 if TYPE_CHECKING:
     import torch
+    from torch import nn
 
 KAGGLE_INPUT = Path("/kaggle/input")
 UNVERIFIED = "unverified"
@@ -122,7 +124,8 @@ class WeightStore:
             for directory in self.directories:
                 # The directory itself first: a walk through /kaggle/input costs seconds.
                 direct = directory / file.name
-                path = direct if direct.is_file() else next(directory.rglob(file.name), None)
+                deeper = (path for path in sorted(directory.rglob(file.name)) if path.is_file())
+                path = direct if direct.is_file() else next(deeper, None)
                 if path is not None:
                     return FoundWeights(file, path, verify(path, file))
         return None
@@ -161,3 +164,19 @@ def load_tensors(path: Path) -> "dict[str, torch.Tensor]":
         return dict(torch.load(path, map_location="cpu", weights_only=True))
     except Exception as error:
         raise UserError(f"{path} cannot be read as a checkpoint: {error}") from error
+
+
+def load_into(
+    network: "nn.Module", tensors: "Mapping[str, torch.Tensor]", *, what: str, unused: str = "$^"
+) -> None:
+    """Load a checkpoint into a network: every name and every shape must agree.
+
+    Only entries whose names match the pattern ``unused`` may be missing or surplus. Raises
+    :class:`UserError` naming some of those that do not fit.
+    """
+    own = network.state_dict()
+    odd = [name for name in own.keys() ^ tensors.keys() if not re.match(unused, name)]
+    odd += [name for name in own.keys() & tensors.keys() if own[name].shape != tensors[name].shape]
+    if odd:
+        raise UserError(f"the weights for {what!r} do not fit the network: {', '.join(sorted(odd)[:5])}")
+    network.load_state_dict({**own, **{name: tensor for name, tensor in tensors.items() if name in own}})

@@ -213,7 +213,7 @@ def test_a_train_side_without_any_scene_is_refused(train):
         ("s/pair_covisibility.csv", "c-b", "cb", "'cb'"),
         ("s/pair_covisibility.csv", "c-b", "c-x", "'c-x'"),
         ("s/pair_covisibility.csv", "c-b,0.5", "c-b,many", "many"),
-        ("s/pair_covisibility.csv", "c-b,0.5", "c-b,", "c-b"),
+        ("s/pair_covisibility.csv", "c-b,0.5", "c-b,", "found 0"),
         ("scaling_factors.csv", "2.5", "long", "long"),
     ],
 )

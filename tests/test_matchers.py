@@ -17,9 +17,9 @@ from mkpc_kaggle.geometry.coordinates import Box, Size, View
 from mkpc_kaggle.matchers.contract import Colour, Picture, encoding_bytes
 from mkpc_kaggle.matchers.neighbours import mutual_neighbours
 from mkpc_kaggle.matchers.registry import load_matcher, registry
-from mkpc_kaggle.matchers.xfeat_lighterglue import layer_name, load_all_but
+from mkpc_kaggle.matchers.xfeat_lighterglue import layer_name
 from mkpc_kaggle.recipe import Recipe, Unit
-from mkpc_kaggle.weights import WeightStore
+from mkpc_kaggle.weights import WeightStore, load_into
 
 SIZE = Size(256, 192)
 every_matcher = pytest.mark.parametrize(
@@ -293,18 +293,18 @@ def test_a_descriptor_that_is_there_twice_is_ambiguous():
 def test_a_checkpoint_with_a_surplus_or_a_missing_name_is_refused():
     network = nn.Sequential(nn.Linear(2, 2), nn.Linear(2, 2))
     whole = {name: torch.ones_like(tensor) for name, tensor in network.state_dict().items()}
-    load_all_but(network, whole, unused="nothing", what="w")
+    load_into(network, whole, unused="nothing", what="w")
     assert all((tensor == 1).all() for tensor in network.state_dict().values())
     for names in ({**whole, "2.bias": torch.ones(2)}, {k: v for k, v in whole.items() if k != "1.bias"}):
         with pytest.raises(UserError, match=r"'w' do not fit the network: [12]\.bias"):
-            load_all_but(network, names, unused=r"0\.", what="w")
+            load_into(network, names, unused=r"0\.", what="w")
 
 
 def test_a_checkpoint_may_lack_or_have_besides_what_is_not_used():
     network = nn.Sequential(nn.Linear(2, 2), nn.Linear(2, 2))
     before = network[1].bias.detach().clone()
     own = {name: torch.ones_like(tensor) for name, tensor in network.state_dict().items() if name != "1.bias"}
-    load_all_but(network, {**own, "2.x": torch.ones(9)}, unused=r"1\.bias|2\.", what="w")
+    load_into(network, {**own, "2.x": torch.ones(9)}, unused=r"1\.bias|2\.", what="w")
     assert torch.equal(network[1].bias, before)
     assert (network[0].weight == 1).all()
 
@@ -313,7 +313,7 @@ def test_a_tensor_of_another_shape_is_refused_by_its_name():
     network = nn.Sequential(nn.Linear(2, 2))
     wrong = {"0.weight": torch.ones(3, 2), "0.bias": torch.ones(2)}
     with pytest.raises(UserError, match=r"'w'.*0\.weight"):
-        load_all_but(network, wrong, unused="nothing", what="w")
+        load_into(network, wrong, unused="nothing", what="w")
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import MatcherSpec, Picture
 from mkpc_kaggle.matchers.neighbours import mutual_neighbours
 from mkpc_kaggle.matchers.sparse import Keypoints, image_batch, matches_of
-from mkpc_kaggle.weights import WeightStore
+from mkpc_kaggle.weights import WeightStore, load_into
 
 SLOT = "aliked-n16"
 
@@ -66,5 +66,5 @@ class AlikedMatcher:
 def load(weights: WeightStore, options: AlikedOptions, device: str) -> AlikedMatcher:
     network = ALIKED(model_name="aliked-n16", max_num_keypoints=options.features, detection_threshold=0.0)
     # The sampling grid is a computed buffer that checkpoints do not carry.
-    network.load_state_dict({"dkd.hw_grid": network.dkd.hw_grid, **weights.load(SLOT)})
+    load_into(network, weights.load(SLOT), what=SLOT, unused=r"dkd\.hw_grid")
     return AlikedMatcher(network, options, device)

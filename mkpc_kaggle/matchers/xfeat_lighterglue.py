@@ -1,18 +1,17 @@
 """XFeat keypoints matched by LighterGlue (Potje et al. 2024; kornia's networks)."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from kornia.feature import LightGlue, XFeat
-from torch import Tensor, nn
+from torch import Tensor
 
-from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import MatcherSpec, Picture
 from mkpc_kaggle.matchers.sparse import Keypoints, image_batch, matches_of
-from mkpc_kaggle.weights import WeightStore
+from mkpc_kaggle.weights import WeightStore, load_into
 
 XFEAT, LIGHTERGLUE = "xfeat", "xfeat-lighterglue"
 
@@ -78,7 +77,7 @@ def _glue_input(keypoints: Keypoints) -> dict[str, Tensor]:
 def load(weights: WeightStore, options: XFeatLighterGlueOptions, device: str) -> XFeatLighterGlueMatcher:
     xfeat = XFeat(top_k=options.features)
     # Its fine matcher serves semi-dense matching only; some checkpoints are without it.
-    load_all_but(xfeat.net, weights.load(XFEAT), unused=r"fine_matcher\.", what=XFEAT)
+    load_into(xfeat.net, weights.load(XFEAT), unused=r"fine_matcher\.", what=XFEAT)
     tensors = {layer_name(name): tensor for name, tensor in weights.load(LIGHTERGLUE).items()}
     layers = 1 + max(int(name.split(".")[1]) for name in tensors if name.startswith("transformers."))
     glue = LightGlue(
@@ -93,22 +92,10 @@ def load(weights: WeightStore, options: XFeatLighterGlueOptions, device: str) ->
     )
     # Without early stopping and pruning only the last layer's assignment is used.
     early = rf"token_confidence\.|confidence_thresholds|log_assignment\.(?!{layers - 1}\.)"
-    load_all_but(glue, tensors, unused=early, what=LIGHTERGLUE)
+    load_into(glue, tensors, unused=early, what=LIGHTERGLUE)
     return XFeatLighterGlueMatcher(xfeat, glue, options, device)
 
 
 def layer_name(name: str) -> str:
     """LightGlue's present parameter name for that of an older checkpoint or of a training wrapper."""
     return re.sub(r"^(self|cross)_attn\.(\d+)\.", r"transformers.\2.\1_attn.", name.removeprefix("matcher."))
-
-
-def load_all_but(network: nn.Module, tensors: Mapping[str, Tensor], *, unused: str, what: str) -> None:
-    """Load a checkpoint that may lack, or have besides, only entries whose names match ``unused``.
-
-    Raises :class:`UserError` for any other missing or surplus name.
-    """
-    own = network.state_dict()
-    odd = [name for name in own.keys() ^ tensors.keys() if not re.match(unused, name)]
-    if odd:
-        raise UserError(f"the weights for {what!r} do not fit the network: {', '.join(sorted(odd)[:5])}")
-    network.load_state_dict({**own, **{name: tensor for name, tensor in tensors.items() if name in own}})
