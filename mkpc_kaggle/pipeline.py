@@ -1,24 +1,20 @@
-"""The two-stage pipeline on a chunk of pairs, and :class:`TwoStageMatcher`, the library's face for one pair.
+"""The two-stage pipeline on a chunk of pairs.
 
 Stage 1 matches whole images, MKPC finds the critical region of each, stage 2 matches the crops; the points of
 both stages, in image pixels, are concatenated in the recipe's order, and MAGSAC does the rest.
 """
 
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from mkpc_kaggle.cache import ByteCache
-from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.geometry.coordinates import Box, Pixels, Size, View
+from mkpc_kaggle.geometry.coordinates import Box, Size, View
 from mkpc_kaggle.geometry.critical_region import CriticalRegion, critical_region
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import Estimate, Matrix3, Model, estimate
-from mkpc_kaggle.images import Image, Unreadable, read_image
+from mkpc_kaggle.images import Image
 from mkpc_kaggle.matchers.contract import Colour, Matcher, MatcherSpec, Picture, encoding_bytes
 from mkpc_kaggle.recipe import Recipe, Unit
 
@@ -229,58 +225,3 @@ def finish(
     results = tuple(sorted(work.results, key=lambda result: order[result.unit]))
     matches = Matches.concatenate(result.matches for result in results)
     return PairMatch(results, work.regions, estimate(matches, recipe.magsac, model, intrinsics))
-
-
-class TwoStageMatcher:
-    """Matches one pair at a time::
-
-        match = TwoStageMatcher("classical")("a.jpg", "b.jpg")
-        F, points0 = match.estimate.matrix, match.inliers.points0
-
-    ``recipe`` is a :class:`Recipe`, a recipe's name, or a path to a TOML file; ``weights`` are directories to
-    search. ``matchers`` are matchers of one's own, by the names under which the recipe's units call them.
-    Raises :class:`mkpc_kaggle.errors.UserError` for an unknown recipe, key or matcher, and for missing weights.
-    """
-
-    def __init__(
-        self,
-        recipe: Recipe | str = "auto",
-        *,
-        weights: Iterable[str | Path] = (),
-        device: str = "auto",
-        matchers: Mapping[str, Matcher[Any]] | None = None,
-    ) -> None:
-        from mkpc_kaggle.assembly import assemble
-
-        assembly = assemble(recipe, weights=map(Path, weights), device=device, matchers=matchers)
-        self.recipe = assembly.recipe
-        self._pipeline = assembly.pipeline()
-
-    def __call__(
-        self,
-        image0: str | Path | Pixels | Image,
-        image1: str | Path | Pixels | Image,
-        *,
-        model: Model | str = Model.F,
-        intrinsics: tuple[Matrix3, Matrix3] | None = None,
-    ) -> PairMatch:
-        """Match two images: paths, or arrays (H, W, 3) RGB or (H, W) gray, uint8.
-
-        ``model`` E needs ``intrinsics``, the camera matrices in pixels. Raises :class:`UserError` for an
-        image that cannot be read; a pair that cannot be matched is a result with ``estimate.failure``.
-        """
-        work = PairWork((to_image(image0), to_image(image1)))
-        (work,) = self._pipeline.match([work], self.recipe.units)
-        return finish(work, self.recipe, Model(model), intrinsics)
-
-
-def to_image(source: str | Path | Pixels | Image) -> Image:
-    """An image from a path or an array; raises :class:`UserError` where there is none."""
-    if isinstance(source, Image):
-        return source
-    if isinstance(source, np.ndarray):
-        return Image.of_array(source)
-    image = read_image(Path(source))
-    if isinstance(image, Unreadable):
-        raise UserError(str(image))
-    return image

@@ -21,8 +21,9 @@ from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL, Model
 from mkpc_kaggle.images import Image
 from mkpc_kaggle.matchers.contract import Colour, MatcherSpec
 from mkpc_kaggle.matchers.sift import SiftMatcher, SiftOptions
-from mkpc_kaggle.pipeline import PairWork, Pipeline, TwoStageMatcher, finish
+from mkpc_kaggle.pipeline import PairWork, Pipeline, finish
 from mkpc_kaggle.recipe import Mode, Recipe, Unit, load_recipe
+from mkpc_kaggle.two_stage import TwoStageMatcher
 
 SIZE = Size(480, 360)
 CORNER0, CORNER1, SCALE = (60, 130), (170, 50), 1.2

@@ -20,7 +20,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     from mkpc_kaggle import figures
-    from mkpc_kaggle.pipeline import TwoStageMatcher, to_image
+    from mkpc_kaggle.two_stage import TwoStageMatcher, to_image
 
     images = to_image(arguments.image0), to_image(arguments.image1)
     matcher = TwoStageMatcher(arguments.recipe, weights=arguments.weights, device=arguments.device)
