@@ -51,12 +51,17 @@ class Method(StrEnum):
 
 @dataclass(frozen=True)
 class RobustConfig:
-    """Settings of :func:`estimate`: the threshold in image pixels, the confidence, the iteration limit."""
+    """Settings of :func:`estimate`: the threshold in image pixels, the confidence, the iteration limit.
+
+    The estimator stops by chance before it has found the best model, and where depends on the order of the
+    matches: it is run on ``orders`` fixed permutations of them, and the model with most inliers is kept.
+    """
 
     method: Method = Method.MAGSAC
     threshold: float = 0.2
     confidence: float = 0.99999
     max_iterations: int = 50_000
+    orders: int = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,13 +118,13 @@ def estimate(
         points0, points1 = calibrate(points0, intrinsics[0]), calibrate(points1, intrinsics[1])
         threshold /= np.mean([intrinsics[i][j, j] for i in (0, 1) for j in (0, 1)])
     try:
-        matrix, mask = _solve(model, points0, points1, threshold, config)
+        matrix, mask = _best_of_orders(model, points0, points1, threshold, config)
     except cv2.error as error:
         return Estimate.failed(model, len(matches), f"OpenCV refused the points: {error.err}")
-    if matrix is None or matrix.shape != (3, 3) or not np.isfinite(matrix).all() or not matrix.any():
+    if matrix is None:
         return Estimate.failed(model, len(matches), f"no {model} fits {len(distinct)} distinct matches")
     inliers = np.zeros(len(matches), bool)
-    inliers[finite] = mask.ravel().astype(bool)[representative]
+    inliers[finite] = mask[representative]
     if not inliers.any():
         return Estimate.failed(model, len(matches), f"no {model} has inliers among {len(distinct)} matches")
     return Estimate(model, matrix / np.linalg.norm(matrix), inliers)
@@ -161,6 +166,25 @@ def _distinct(pairs: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[
     place = np.empty_like(order)
     place[order] = np.arange(len(order))
     return pairs[np.sort(first)], place[inverse.ravel()]
+
+
+def _best_of_orders(
+    model: Model,
+    points0: NDArray[np.float64],
+    points1: NDArray[np.float64],
+    threshold: float,
+    config: RobustConfig,
+) -> tuple[Matrix3 | None, NDArray[np.bool_]]:
+    """The model with most inliers over fixed permutations, the given order first, and its mask (N,)."""
+    best, best_mask = None, np.zeros(len(points0), bool)
+    for number in range(config.orders):
+        order = np.random.default_rng(number).permutation(len(points0)) if number else np.arange(len(points0))
+        matrix, mask = _solve(model, points0[order], points1[order], threshold, config)
+        if matrix is None or matrix.shape != (3, 3) or not np.isfinite(matrix).all() or not matrix.any():
+            continue
+        if best is None or np.count_nonzero(mask) > np.count_nonzero(best_mask):
+            best, best_mask[order] = matrix, mask.ravel().astype(bool)
+    return best, best_mask
 
 
 def _solve(
