@@ -26,7 +26,8 @@ class Mode(StrEnum):
     STAGE_1 = "stage-1"
     """the units of stage 1 alone"""
     WHOLE_IMAGES = "whole-images"
-    """every unit on whole images: the naive ensemble of equal inference count"""
+    """every unit on whole images, the naive ensemble of equal inference count; a unit that both stages have in
+    common runs once, since twice would find the same"""
 
 
 @dataclass(frozen=True)

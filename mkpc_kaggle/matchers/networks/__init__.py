@@ -1,0 +1,1 @@
+"""Networks written from their papers: plain PyTorch modules that load the public checkpoints unchanged."""

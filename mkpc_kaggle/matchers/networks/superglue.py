@@ -1,0 +1,264 @@
+"""SuperGlue (Sarlin et al. 2020, arXiv 1911.11763): matches of two sets of keypoints with descriptors.
+
+Parameter names are those of ``superglue_outdoor.pth`` and ``superglue_indoor.pth``, which load strictly; their
+terms (noncommercial research) bind whoever uses them. Inside, the keypoints of both images stand in one tensor
+(B, N0 + N1, 256), keypoints before channels: all maps act on the rows, and only attention tells the images apart.
+"""
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import cast
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from mkpc_kaggle.geometry.coordinates import Size
+
+CHANNELS = 256
+HEADS = 4
+LAYERS = 18
+"""Of the graph network: self, cross, self, cross, ..."""
+
+ABSORB_EVERY = 4
+"""Sinkhorn steps between two returns to the log domain; see ``log_optimal_transport``."""
+
+
+@dataclass(frozen=True)
+class SuperGlueConfig:
+    """``sinkhorn_iterations``: the published numbers have 20. ``match_threshold``: scores must be above it."""
+
+    sinkhorn_iterations: int = 100
+    match_threshold: float = 0.2
+
+    def __post_init__(self) -> None:
+        if self.sinkhorn_iterations < 1:
+            raise ValueError(f"the transport takes at least one iteration, not {self.sinkhorn_iterations}")
+
+
+@dataclass(frozen=True, eq=False)
+class ImageKeypoints:
+    """N keypoints of one image in each of B pairs, as SuperPoint finds them.
+
+    ``points`` (B, N, 2) float32, (x, y) in pixels of the image that the detector saw, whose size is ``size``;
+    ``scores`` (B, N) in 0..1; ``descriptors`` (B, N, 256), unit vectors.
+    """
+
+    points: Tensor
+    scores: Tensor
+    descriptors: Tensor
+    size: Size
+
+
+@dataclass(frozen=True, eq=False)
+class Assignment:
+    """``matches0`` (B, N0) int64: each keypoint's partner in image 1, or -1; ``matches1`` (B, N1) the inverse.
+
+    ``scores0`` (B, N0) and ``scores1`` (B, N1) float32: the transported share in 0..1 of every pair of mutual
+    best partners, also of those whose match the threshold refused; 0 for other keypoints.
+    """
+
+    matches0: Tensor
+    matches1: Tensor
+    scores0: Tensor
+    scores1: Tensor
+
+
+class Pointwise(nn.Conv1d):
+    """A linear map of channels, (..., in) to (..., out), whose weight is a convolution's, (out, in, 1)."""
+
+    def __init__(self, channels_in: int, channels_out: int) -> None:
+        super().__init__(channels_in, channels_out, kernel_size=1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return functional.linear(x, self.weight[:, :, 0], self.bias)
+
+
+def pointwise_network(*channels: int) -> nn.Sequential:
+    """Linear maps between these numbers of channels, batch norm and ReLU between them; acts on (rows, C)."""
+    steps: list[nn.Module] = []
+    for width_in, width_out in pairwise(channels[:-1]):
+        steps += [Pointwise(width_in, width_out), nn.BatchNorm1d(width_out), nn.ReLU(inplace=True)]
+    return nn.Sequential(*steps, Pointwise(*channels[-2:]))
+
+
+class KeypointEncoder(nn.Module):
+    """(B, N, 256) from where the keypoints lie, (B, N, 3): normalised x and y, score."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.encoder = pointwise_network(3, 32, 64, 128, 256, CHANNELS)
+
+    def forward(self, placed: Tensor) -> Tensor:
+        return _on_rows(self.encoder, placed)
+
+
+class Attention(nn.Module):
+    """Four heads of 64 channels. In the checkpoint channel c belongs to head ``c mod 4``."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.proj = nn.ModuleList(Pointwise(CHANNELS, CHANNELS) for _ in range(3))  # query, key, value
+        self.merge = Pointwise(CHANNELS, CHANNELS)
+
+    def forward(self, x: Tensor, n0: int, *, cross: bool) -> Tensor:
+        """Messages (B, N, 256) to the keypoints ``x`` (B, N, 256), of which the first ``n0`` are image 0's.
+
+        They come from the keypoints of the same image, or of the other one with ``cross``.
+        """
+        # Reordering the weights' channels by head costs less than reordering those of all keypoints.
+        maps = cast("Iterable[nn.Conv1d]", self.proj)
+        weight = torch.cat([_by_head(each.weight[:, :, 0]) for each in maps])  # (768, 256)
+        bias = torch.cat([_by_head(each.get_parameter("bias")) for each in maps])
+        projected = functional.linear(x, weight, bias)  # (B, N, 768)
+        heads = projected.view(*x.shape[:2], 3, HEADS, -1).permute(2, 0, 3, 1, 4)  # (3, B, 4, N, 64)
+        (query0, key0, value0), (query1, key1, value1) = heads[..., :n0, :], heads[..., n0:, :]
+        if cross:
+            key0, key1, value0, value1 = key1, key0, value1, value0
+        answer0 = functional.scaled_dot_product_attention(query0, key0, value0)  # (B, 4, N0, 64)
+        answer1 = functional.scaled_dot_product_attention(query1, key1, value1)  # (B, 4, N1, 64)
+        answer = torch.cat([answer0.transpose(1, 2), answer1.transpose(1, 2)], dim=1).flatten(2)  # (B, N, 256)
+        return functional.linear(answer, _by_head(self.merge.weight[:, :, 0].T).T, self.merge.bias)
+
+
+class Layer(nn.Module):
+    """One layer of the graph network: what a keypoint hears from the others changes its features."""
+
+    def __init__(self, *, cross: bool) -> None:
+        super().__init__()
+        self.cross = cross
+        self.attn = Attention()
+        self.mlp = pointwise_network(2 * CHANNELS, 2 * CHANNELS, CHANNELS)
+
+    def message(self, x: Tensor, n0: int) -> Tensor:
+        """The messages (B, N, 256) to the keypoints ``x`` (B, N, 256), the first ``n0`` of them image 0's."""
+        message: Tensor = self.attn(x, n0, cross=self.cross)
+        return message
+
+    def update(self, x: Tensor, message: Tensor) -> Tensor:
+        return x + _on_rows(self.mlp, torch.cat([x, message], dim=2))
+
+    def forward(self, x: Tensor, n0: int) -> Tensor:
+        return self.update(x, self.message(x, n0))
+
+
+class GraphNetwork(nn.Module):
+    """Layers that look alternately at the keypoints of the same and of the other image."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.layers = nn.ModuleList(Layer(cross=index % 2 == 1) for index in range(LAYERS))
+
+    def forward(self, x: Tensor, n0: int) -> Tensor:
+        for layer in self.layers:
+            x = layer(x, n0)
+        return x
+
+
+class SuperGlue(nn.Module):
+    """Keypoint encoder, graph network, optimal transport; for inference only, hence made in evaluation mode."""
+
+    def __init__(self, config: SuperGlueConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.kenc = KeypointEncoder()
+        self.gnn = GraphNetwork()
+        self.final_proj = Pointwise(CHANNELS, CHANNELS)
+        self.bin_score = nn.Parameter(torch.tensor(1.0))  # the score of having no partner
+        self.eval()
+
+    @torch.inference_mode()
+    def forward(self, image0: ImageKeypoints, image1: ImageKeypoints) -> Assignment:
+        """The matches of the keypoints of both images, in each of B pairs; no keypoints give no matches."""
+        n0, n1 = image0.points.shape[1], image1.points.shape[1]
+        if n0 == 0 or n1 == 0:
+            return no_assignment(image0.scores, image1.scores)
+        x = torch.cat([self.encoded(image0), self.encoded(image1)], dim=1)
+        scores = self.score_matrix(self.final_proj(self.gnn(x, n0)), n0)
+        log_plan = log_optimal_transport(scores, self.bin_score, self.config.sinkhorn_iterations)
+        return mutual_matches(log_plan, self.config.match_threshold)
+
+    def encoded(self, image: ImageKeypoints) -> Tensor:
+        """The features (B, N, 256) with which an image enters the graph: what it shows and where it is."""
+        return image.descriptors.to(self.final_proj.weight.dtype) + self.position(image)
+
+    def position(self, image: ImageKeypoints) -> Tensor:
+        """What the keypoint encoder says of an image's keypoints, (B, N, 256)."""
+        points = normalise_points(image.points, image.size)
+        placed = torch.cat([points, image.scores.float()[..., None]], dim=2)  # (B, N, 3)
+        encoded: Tensor = self.kenc(placed.to(self.final_proj.weight.dtype))
+        return encoded
+
+    @staticmethod
+    def score_matrix(projected: Tensor, n0: int) -> Tensor:
+        """Scaled inner products (B, N0, N1) float32 of projected features (B, N0 + N1, 256)."""
+        first, second = projected[:, :n0].float(), projected[:, n0:].float()
+        return (first @ second.mT) / math.sqrt(CHANNELS)
+
+
+def _by_head(rows: Tensor) -> Tensor:
+    """256 rows, those of one head together, from the checkpoint's order; a vector or a matrix."""
+    return rows.reshape(CHANNELS // HEADS, HEADS, -1).transpose(0, 1).reshape(rows.shape)
+
+
+def _on_rows(network: nn.Module, x: Tensor) -> Tensor:
+    """A network of (rows, C) on (B, N, C): there batch norm takes the last axis for the channels."""
+    rows: Tensor = network(x.flatten(0, 1))
+    return rows.view(*x.shape[:2], -1)
+
+
+def normalise_points(points: Tensor, size: Size) -> Tensor:
+    """Points in pixels relative to the image's middle, in units of 0.7 times its longer side; float32."""
+    middle = torch.tensor([size.width / 2, size.height / 2], device=points.device)
+    return (points.float() - middle) / (0.7 * max(size))
+
+
+def log_optimal_transport(scores: Tensor, bin_score: Tensor, iterations: int) -> Tensor:
+    """Sinkhorn's plan (B, m + 1, n + 1) float32 as logarithms, from scores (B, m, n); dustbins come last.
+
+    Each keypoint holds mass 1 and may give it to the other image's dustbin, which has room for all of them. An
+    iteration scales the rows, then the columns to their masses.
+
+    The first iteration is done in the log domain, after which no entry of the plan exceeds 1 and no row or
+    column sum is below (m + n)^-2. Iterations on the plan itself are then matrix-vector products. Every few of
+    them the scales go back into the potentials u and v and the plan is made anew, so that they cannot leave
+    float32's range, and an entry that underflows is one that a few scalings do not make count.
+    """
+    batch, m, n = scores.shape
+    couplings = bin_score.float().expand(batch, m + 1, n + 1).clone()
+    couplings[:, :m, :n] = scores
+    rows, columns = couplings.new_ones(m + 1), couplings.new_ones(n + 1)
+    rows[m], columns[n] = n, m
+    # The masses are divided by their sum here, and the plan is multiplied by it at the end.
+    rows, columns = rows / (m + n), columns / (m + n)
+    u = rows.log() - couplings.logsumexp(dim=2)  # (B, m + 1)
+    v = columns.log() - (couplings + u[:, :, None]).logsumexp(dim=1)  # (B, n + 1)
+    for done in range(1, iterations, ABSORB_EVERY):
+        plan = (couplings + u[:, :, None]).add_(v[:, None]).exp_()
+        column_scale = torch.ones_like(v)
+        for _ in range(min(ABSORB_EVERY, iterations - done)):
+            row_scale = rows / (plan @ column_scale[:, :, None])[:, :, 0]
+            column_scale = columns / (row_scale[:, None] @ plan)[:, 0]
+        u, v = u + row_scale.log(), v + column_scale.log()
+    return (couplings + u[:, :, None]).add_(v[:, None]).add_(math.log(m + n))
+
+
+def mutual_matches(log_plan: Tensor, threshold: float) -> Assignment:
+    """Pairs of keypoints that are each other's best in a plan (B, N0 + 1, N1 + 1), the dustbins left out."""
+    inner = log_plan[:, :-1, :-1]
+    (best0, partner0), partner1 = inner.max(dim=2), inner.argmax(dim=1)  # (B, N0), (B, N0), (B, N1)
+    mutual0 = partner1.gather(1, partner0) == torch.arange(inner.shape[1], device=inner.device)
+    mutual1 = partner0.gather(1, partner1) == torch.arange(inner.shape[2], device=inner.device)
+    scores0 = best0.exp().where(mutual0, 0)
+    scores1 = scores0.gather(1, partner1).where(mutual1, 0)
+    matches0 = partner0.where(mutual0 & (scores0 > threshold), -1)
+    matches1 = partner1.where(mutual1 & (scores1 > threshold), -1)
+    return Assignment(matches0, matches1, scores0, scores1)
+
+
+def no_assignment(scores0: Tensor, scores1: Tensor) -> Assignment:
+    """No matches between images of which at least one has no keypoints; takes shapes and device from scores."""
+    matches0, matches1 = (torch.full_like(scores, -1, dtype=torch.int64) for scores in (scores0, scores1))
+    return Assignment(matches0, matches1, torch.zeros_like(scores0).float(), torch.zeros_like(scores1).float())

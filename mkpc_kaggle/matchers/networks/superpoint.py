@@ -1,0 +1,184 @@
+"""SuperPoint (DeTone et al. 2018, arXiv 1712.07629): keypoints of a gray image and their descriptors.
+
+Parameter names are those of ``superpoint_v1.pth``, which loads strictly; its terms (noncommercial research)
+bind whoever uses it. The numbers are those with which SuperGlue's weights were published, a slip in the
+sampling of descriptors included. Pixel centres are at integers, as everywhere in the package.
+"""
+
+from dataclasses import dataclass
+from itertools import starmap
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+CELL = 8
+"""The stride of the features: a cell of the maps stands for 8 x 8 pixels."""
+
+SUPPRESSION_ROUNDS = 2
+"""How often points are looked for again among those that only a suppressed point outdid."""
+
+
+@dataclass(frozen=True)
+class SuperPointConfig:
+    """``nms_radius``: half the suppression window, in pixels. ``keypoint_threshold``: scores must be above it.
+
+    ``max_keypoints``: the strongest to keep, -1 for all. ``remove_borders``: the width in pixels of the strip
+    along the border without keypoints. SuperGlue's published numbers have 3, 0.005, 2048, 4 outdoors and
+    4, 0.005, 1024, 4 indoors.
+    """
+
+    nms_radius: int = 4
+    keypoint_threshold: float = 0.005
+    max_keypoints: int = -1
+    remove_borders: int = 4
+
+    def __post_init__(self) -> None:
+        if self.max_keypoints < -1 or self.max_keypoints == 0:
+            raise ValueError(f"max_keypoints is a positive number, or -1 for all; not {self.max_keypoints}")
+        if self.nms_radius < 0 or self.remove_borders < 0:
+            raise ValueError(f"neither nms_radius nor remove_borders may be negative: {self}")
+
+
+@dataclass(frozen=True, eq=False)
+class SuperPointKeypoints:
+    """K keypoints of one image, all float32: ``points`` (K, 2), whole pixels (x, y); ``scores`` (K,) in 0..1;
+    ``descriptors`` (K, 256), unit vectors, one a row.
+
+    By descending score if ``max_keypoints`` cut some off, else by row and column.
+    """
+
+    points: Tensor
+    scores: Tensor
+    descriptors: Tensor
+
+
+class SuperPoint(nn.Module):
+    """A shared trunk of eight convolutions, a detector head (Pa, Pb) and a descriptor head (Da, Db)."""
+
+    def __init__(self, config: SuperPointConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.conv1a = nn.Conv2d(1, 64, 3, padding=1)
+        self.conv1b = nn.Conv2d(64, 64, 3, padding=1)
+        self.conv2a = nn.Conv2d(64, 64, 3, padding=1)
+        self.conv2b = nn.Conv2d(64, 64, 3, padding=1)
+        self.conv3a = nn.Conv2d(64, 128, 3, padding=1)
+        self.conv3b = nn.Conv2d(128, 128, 3, padding=1)
+        self.conv4a = nn.Conv2d(128, 128, 3, padding=1)
+        self.conv4b = nn.Conv2d(128, 128, 3, padding=1)
+        self.convPa = nn.Conv2d(128, 256, 3, padding=1)
+        self.convPb = nn.Conv2d(256, CELL * CELL + 1, 1)
+        self.convDa = nn.Conv2d(128, 256, 3, padding=1)
+        self.convDb = nn.Conv2d(256, 256, 1)
+        # The layout of the weights decides that of the activations, the one-channel image's being ambiguous.
+        self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # missing in torch's stubs
+
+    @torch.inference_mode()
+    def forward(self, image: Tensor) -> list[SuperPointKeypoints]:
+        """The keypoints of each ``image`` of a batch (B, 1, H, W), gray in 0..1, with sides of at least 8.
+
+        Sides need not be multiples of 8; the at most 7 last rows and columns beyond carry no keypoint.
+        """
+        features = self.features(image)
+        scores = suppress_non_maxima(score_map(self.logits(features)), self.config.nms_radius)
+        return list(starmap(self._describe, zip(scores, self.descriptor_field(features), strict=True)))
+
+    def features(self, image: Tensor) -> Tensor:
+        """The trunk: (B, 128, h, w) from (B, 1, H, W), with h = floor(H / 8) and w = floor(W / 8)."""
+        if min(image.shape[-2:]) < CELL:
+            raise ValueError(f"an image has at least {CELL} pixels a side, not {tuple(image.shape[-2:])}")
+        x = image.to(self.conv1a.weight.dtype)
+        x = _relu_of_pool(self.conv1b(torch.relu_(self.conv1a(x))))
+        x = _relu_of_pool(self.conv2b(torch.relu_(self.conv2a(x))))
+        x = _relu_of_pool(self.conv3b(torch.relu_(self.conv3a(x))))
+        return torch.relu_(self.conv4b(torch.relu_(self.conv4a(x))))
+
+    def logits(self, features: Tensor) -> Tensor:
+        """The detector head: (B, 65, h, w), the 64 pixels of a cell row by row and "no keypoint"."""
+        logits: Tensor = self.convPb(torch.relu_(self.convPa(features)))
+        return logits
+
+    def descriptor_field(self, features: Tensor) -> Tensor:
+        """The descriptor head: (B, 256, h, w), one vector a cell, of any length."""
+        field: Tensor = self.convDb(torch.relu_(self.convDa(features)))
+        return field
+
+    def _describe(self, scores: Tensor, field: Tensor) -> SuperPointKeypoints:
+        """The keypoints of one image, from its suppressed score map (8h, 8w) and descriptor field (256, h, w)."""
+        points, kept = select_keypoints(scores, self.config)
+        return SuperPointKeypoints(points, kept, sample_descriptors(field, points))
+
+
+def _relu_of_pool(x: Tensor) -> Tensor:
+    """The same as pooling after the ReLU, on a quarter of the values."""
+    return torch.relu_(functional.max_pool2d(x, 2))
+
+
+def score_map(logits: Tensor) -> Tensor:
+    """The score of each pixel, (B, 8h, 8w) float32, from logits (B, 65, h, w)."""
+    batch, _, h, w = logits.shape
+    cells = logits.permute(0, 2, 3, 1).float().softmax(dim=3)[..., :-1]  # (B, h, w, 64)
+    rows = cells.reshape(batch, h, w, CELL, CELL).transpose(2, 3)  # (B, h, 8, w, 8)
+    return rows.reshape(batch, CELL * h, CELL * w)
+
+
+def suppress_non_maxima(scores: Tensor, radius: int) -> Tensor:
+    """``scores`` (B, H, W), at least 0, with those set to 0 that are no maximum of their square window.
+
+    Equal maxima in one window are all kept. A point that only suppressed points outdo is found again, but not
+    further down a chain than two rounds reach: neither greedy suppression nor its fixed point.
+    """
+    kept = scores == window_maximum(scores, radius)
+    for _ in range(SUPPRESSION_ROUNDS):
+        near = window_maximum(kept, radius)
+        rest = scores.masked_fill(near, 0)
+        kept |= (rest == window_maximum(rest, radius)) & ~near
+    return scores.masked_fill(~kept, 0)
+
+
+def window_maximum(values: Tensor, radius: int) -> Tensor:
+    """The maximum over (2 radius + 1)^2 pixels about each pixel of ``values`` (B, H, W), at least 0 or bool.
+
+    Axis by axis and by doubling, in a few vectorised passes where a pooling layer makes (2 radius + 1)^2
+    comparisons a pixel. The zeros beyond the border never win.
+    """
+    window = 2 * radius + 1
+    padded = functional.pad(values, (radius,) * 4)
+    for axis in (1, 2):
+        width = 1  # of the window whose maxima ``padded`` holds
+        while width < window:
+            step = min(width, window - width)
+            length = padded.shape[axis] - step
+            padded = torch.maximum(padded.narrow(axis, 0, length), padded.narrow(axis, step, length))
+            width += step
+    return padded
+
+
+def select_keypoints(scores: Tensor, config: SuperPointConfig) -> tuple[Tensor, Tensor]:
+    """Points (K, 2) float32, (x, y) in pixels, and scores (K,) of one suppressed score map (8h, 8w)."""
+    border, (height, width) = config.remove_borders, scores.shape
+    inner = scores[border : max(height - border, 0), border : max(width - border, 0)]
+    rows, columns = torch.nonzero(inner > config.keypoint_threshold, as_tuple=True)
+    kept = inner[rows, columns]
+    points = torch.stack([columns + border, rows + border], dim=1).float()
+    if 0 <= config.max_keypoints < len(kept):
+        kept, strongest = kept.topk(config.max_keypoints)
+        points = points[strongest]
+    return points, kept
+
+
+def sample_descriptors(field: Tensor, points: Tensor) -> Tensor:
+    """Unit descriptors (K, D) float32 at ``points`` (K, 2), from the vectors of the cells, ``field`` (D, h, w).
+
+    The centre of cell j lies at pixel 8 j + 3.5, yet the divisor below puts a point off by up to half a cell
+    (at the far border): so it was when SuperGlue was trained and published. Cells beyond the field are zero.
+    """
+    h, w = field.shape[1:]
+    extent = points.new_tensor([CELL * w - 4.5, CELL * h - 4.5])
+    grid = (points - 3.5) / extent * 2 - 1  # (K, 2); -1 is the first cell's centre, 1 the last one's
+    cells = functional.normalize(field.float(), dim=0)
+    sampled = functional.grid_sample(
+        cells[None], grid[None, None], mode="bilinear", align_corners=True
+    )  # (1, D, 1, K)
+    return functional.normalize(sampled[0, :, 0].T, dim=1)

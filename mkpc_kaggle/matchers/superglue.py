@@ -1,0 +1,97 @@
+"""SuperPoint keypoints matched by SuperGlue: the paper's matcher. Its weights are for noncommercial research."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+
+from mkpc_kaggle.geometry.coordinates import Size
+from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.matchers.contract import Colour, MatcherSpec, Picture
+from mkpc_kaggle.matchers.networks.superglue import ImageKeypoints, SuperGlue, SuperGlueConfig
+from mkpc_kaggle.matchers.networks.superpoint import SuperPoint, SuperPointConfig, SuperPointKeypoints
+from mkpc_kaggle.matchers.sparse import image_batch
+from mkpc_kaggle.weights import WeightStore, load_into
+
+SUPERPOINT, SUPERGLUE = "superpoint", "superglue-outdoor"
+
+
+@dataclass(frozen=True)
+class SuperGlueOptions:
+    """SuperPoint's and SuperGlue's settings of the published outdoor evaluation."""
+
+    max_keypoints: int = 2048
+    keypoint_threshold: float = 0.005
+    nms_radius: int = 3
+    sinkhorn_iterations: int = 20
+    match_threshold: float = 0.2
+
+
+# Sides need no multiple: SuperPoint itself leaves out the last rows and columns beyond one of 8.
+SPEC = MatcherSpec(
+    "superglue",
+    "SuperPoint with SuperGlue, outdoor weights",
+    SuperGlueOptions,
+    Colour.GRAY,
+    licences=("Magic-Leap-noncommercial",),
+    slots=(SUPERPOINT, SUPERGLUE),
+)
+LEAST_SIDE = 8
+"""Of a picture that SuperPoint can look at."""
+
+
+@dataclass(frozen=True, eq=False)
+class Encoded:
+    """The keypoints of one picture, and the size of the picture that they were found on."""
+
+    keypoints: SuperPointKeypoints
+    size: Size
+
+
+class SuperGlueMatcher:
+    """A match's score is the share of its keypoint that the optimal transport moves."""
+
+    spec = SPEC
+
+    def __init__(self, superpoint: SuperPoint, superglue: SuperGlue, device: str) -> None:
+        self.device = device
+        self._superpoint = superpoint.to(device)
+        self._superglue = superglue.to(device)
+
+    def encode(self, pictures: Sequence[Picture]) -> list[Encoded]:
+        if any(min(picture.content) < LEAST_SIDE for picture in pictures):
+            nothing = SuperPointKeypoints(torch.zeros(0, 2), torch.zeros(0), torch.zeros(0, 256))
+            return [Encoded(nothing, picture.content) for picture in pictures]
+        if not pictures:
+            return []
+        found = self._superpoint(image_batch(list(pictures), self.device))
+        return [Encoded(keypoints, picture.content) for keypoints, picture in zip(found, pictures, strict=True)]
+
+    def match(self, encodings0: Sequence[Encoded], encodings1: Sequence[Encoded]) -> list[Matches]:
+        return [self._match(*pair) for pair in zip(encodings0, encodings1, strict=True)]
+
+    def _match(self, encoded0: Encoded, encoded1: Encoded) -> Matches:
+        if len(encoded0.keypoints.points) == 0 or len(encoded1.keypoints.points) == 0:
+            return Matches.empty()
+        found = self._superglue(_as_pair(encoded0), _as_pair(encoded1))
+        index0 = torch.nonzero(found.matches0[0] >= 0)[:, 0]
+        points = encoded0.keypoints.points[index0], encoded1.keypoints.points[found.matches0[0, index0]]
+        return Matches(points[0].cpu().numpy(), points[1].cpu().numpy(), found.scores0[0, index0].cpu().numpy())
+
+
+def _as_pair(encoded: Encoded) -> ImageKeypoints:
+    """The keypoints as a batch of one."""
+    keypoints = encoded.keypoints
+    return ImageKeypoints(
+        keypoints.points[None], keypoints.scores[None], keypoints.descriptors[None], encoded.size
+    )
+
+
+def load(weights: WeightStore, options: SuperGlueOptions, device: str) -> SuperGlueMatcher:
+    superpoint = SuperPoint(
+        SuperPointConfig(options.nms_radius, options.keypoint_threshold, options.max_keypoints)
+    )
+    superglue = SuperGlue(SuperGlueConfig(options.sinkhorn_iterations, options.match_threshold))
+    load_into(superpoint, weights.load(SUPERPOINT), what=SUPERPOINT)
+    load_into(superglue, weights.load(SUPERGLUE), what=SUPERGLUE)
+    return SuperGlueMatcher(superpoint, superglue, device)

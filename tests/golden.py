@@ -1,0 +1,85 @@
+"""Golden vectors beside the repository, ``../shared/golden``; tests that need them are skipped without them."""
+
+import importlib.util
+import json
+import sys
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+import torch
+from shared import SHARED
+
+GOLDEN = SHARED / "golden"
+
+needs_golden = pytest.mark.skipif(not GOLDEN.is_dir(), reason=f"no golden vectors in {GOLDEN}")
+
+
+def golden_arrays(network, case):
+    """The arrays of one file by their names, as tensors where they hold numbers, else as text."""
+    with np.load(GOLDEN / network / f"{case}.npz") as file:
+        arrays = {name: file[name] for name in file}
+    return {
+        name: str(array) if array.dtype.kind == "U" else torch.from_numpy(array) for name, array in arrays.items()
+    }
+
+
+def standin_state(network):
+    """The stand-in checkpoint that the folder's ``standin.py`` makes, as tensors."""
+    path = list(sys.path)
+    try:  # the recipe puts its own folder on the path
+        spec = importlib.util.spec_from_file_location(f"standin_{network}", GOLDEN / network / "standin.py")
+        recipe = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(recipe)
+    finally:
+        sys.path[:] = path
+    return {name: torch.from_numpy(np.asarray(value)) for name, value in recipe.standin_state_dict().items()}
+
+
+def seeded_state(network):
+    """The stand-in checkpoint of a folder that has no recipe of its own, from its shapes and gains."""
+    spec = importlib.util.spec_from_file_location("seeded_weights", GOLDEN / "seeded_weights.py")
+    recipe = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(recipe)
+    shapes, gains = (json.loads((GOLDEN / network / f"{name}.json").read_text()) for name in ("shapes", "gains"))
+    return {
+        name: torch.from_numpy(np.asarray(recipe.seeded_tensor(name, shape, _gain(name, gains))))
+        for name, shape in shapes.items()
+    }
+
+
+def _gain(name, gains):
+    return next((gain for prefix, gain in gains["prefixes"].items() if name.startswith(prefix)), gains["default"])
+
+
+class Stage(NamedTuple):
+    """What a network computed at one stage, what it should be, and by how much they may differ at most."""
+
+    name: str
+    got: torch.Tensor
+    expected: torch.Tensor
+    tolerance: float = 0
+
+    @property
+    def difference(self):
+        """Infinite if shapes or kinds differ or a value is not finite."""
+        got, expected = self.got, self.expected
+        alike = got.shape == expected.shape and got.is_floating_point() == expected.is_floating_point()
+        if not alike or not got.isfinite().all():
+            return float("inf")
+        return (got.double() - expected.double()).abs().max().item() if got.numel() else 0.0
+
+
+def assert_stages(stages: Iterable[Stage]):
+    """All stages within their tolerances; the message starts with the first one that is off."""
+    off = [stage for stage in stages if stage.difference > stage.tolerance]
+    assert not off, "; ".join(f"{stage.name} is off by {stage.difference:.2g}" for stage in off)
+
+
+def print_table(network, stages_of_cases):
+    """A markdown table of ``(case, stages)``."""
+    print("| network | case | stage | largest difference | tolerance |\n|---|---|---|---|---|")
+    for case, stages in stages_of_cases:
+        for stage in stages:
+            print(f"| {network} | {case} | {stage.name} | {stage.difference:.1e} | {stage.tolerance:.0e} |")

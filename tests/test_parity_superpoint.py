@@ -1,0 +1,287 @@
+"""SuperPoint stage by stage against its golden vectors; what must hold of any weights; by hand on small maps.
+
+``python tests/test_parity_superpoint.py`` prints how far every stage of every case is off.
+"""
+
+import json
+from functools import cache
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from golden import Stage, assert_stages, golden_arrays, needs_golden, print_table, standin_state
+from hypothesis import given
+from hypothesis import strategies as st
+from torch.nn import functional
+
+from mkpc_kaggle.matchers.networks.superpoint import (
+    SuperPoint,
+    SuperPointConfig,
+    sample_descriptors,
+    score_map,
+    select_keypoints,
+    suppress_non_maxima,
+    window_maximum,
+)
+
+CASES = ["default_160x216", "outdoor_160x216", "odd_171x229", "noborder_64x72"]
+
+
+@cache
+def standin():
+    return standin_state("superpoint")
+
+
+def golden_network(config):
+    options = json.loads(config)
+    assert options.pop("descriptor_dim") == 256
+    network = SuperPoint(SuperPointConfig(**options))
+    network.load_state_dict(standin(), strict=True)
+    return network.eval()
+
+
+def image_of(pixels):
+    return pixels[None, None].float() / 255
+
+
+@torch.inference_mode()
+def network_stages(case):
+    golden = golden_arrays("superpoint", case)
+    network = golden_network(golden["config"])
+    image = image_of(golden["image"])
+    features = network.features(image)
+    logits, field = network.logits(features), network.descriptor_field(features)
+    scores = score_map(logits)
+    suppressed = suppress_non_maxima(scores, network.config.nms_radius)
+    (found,) = network(image)
+    got = {
+        "conv4b_relu": (features[0], 1e-4),
+        "logits": (logits[0], 1e-4),
+        "descriptor_raw": (field[0], 1e-4),
+        "dense_descriptors": (functional.normalize(field[0], dim=0), 1e-5),
+        "score_map": (scores[0], 2e-5),
+        "score_map_nms": (suppressed[0], 2e-5),
+        "keypoints": (found.points, 0),
+        "scores": (found.scores, 2e-5),
+        "descriptors": (found.descriptors.T, 1e-5),
+    }
+    yield from (Stage(name, *got[name][:1], golden[name], got[name][1]) for name in got if name in golden)
+    if "score_map_nms" in golden:
+        survivors, expected = (values > 0 for values in (suppressed[0], golden["score_map_nms"]))
+        yield Stage("surviving pixels", survivors.long(), expected.long())
+
+
+def nms_stages():
+    golden = golden_arrays("superpoint", "nms_cases")
+    for name in ("ties", "ramp", "random"):
+        for radius in range(5):
+            got = suppress_non_maxima(golden[name][None], radius)[0]
+            yield Stage(f"{name}, radius {radius}", got, golden[f"{name}_nms{radius}"])
+
+
+def sampling_stages():
+    golden = golden_arrays("superpoint", "descriptor_sampling")
+    got = sample_descriptors(golden["field"], golden["keypoints"])
+    yield Stage("descriptors", got.T, golden["descriptors"], 1e-5)
+
+
+def resized_by_opencv(source, size, *, rounded):
+    """As the reference prepares an image; the package itself resizes in views (see its coordinates)."""
+    pixels = cv2.resize(source.numpy() if rounded else source.numpy().astype(np.float32), size)
+    return torch.from_numpy(pixels).float()
+
+
+def resize_stages():
+    """The input's preparation: OpenCV's bilinear resize and the rule of sizes, as the specification has them."""
+    golden = golden_arrays("superpoint", "resize_cases")
+    for name, size in {"max50": (37, 50), "max120": (88, 120), "exact64x48": (64, 48)}.items():
+        for kind in ("float", "uint8"):
+            got = resized_by_opencv(golden["source"], size, rounded=kind == "uint8")
+            yield Stage(f"{name}_{kind}", got, golden[f"{name}_{kind}"], 1e-4 if kind == "float" else 1)
+    table = golden["size_table"]
+    sizes = [
+        [side if longest == -1 else round(side * (longest / max(width, height))) for side in (width, height)]
+        for width, height, longest in table[:, :3].tolist()
+    ]
+    yield Stage("size_table", torch.tensor(sizes), table[:, 3:])
+
+
+@needs_golden
+@pytest.mark.parametrize("case", CASES)
+def test_every_stage_of_the_network_is_the_golden_one(case):
+    assert_stages(network_stages(case))
+
+
+@needs_golden
+@pytest.mark.parametrize("stages", [nms_stages, sampling_stages, resize_stages])
+def test_steps_without_weights_are_the_golden_ones(stages):
+    assert_stages(stages())
+
+
+@needs_golden
+def test_a_batch_finds_what_its_images_give_alone():
+    golden = golden_arrays("superpoint", "default_160x216")
+    network = golden_network(golden["config"])
+    image = image_of(golden["image"])
+    batch = torch.cat([image, image.flip(3), torch.zeros_like(image)])
+    for found, one in zip(network(batch), batch, strict=True):
+        (alone,) = network(one[None])
+        assert torch.equal(found.points, alone.points)
+        torch.testing.assert_close(found.scores, alone.scores, rtol=0, atol=2e-5)
+        torch.testing.assert_close(found.descriptors, alone.descriptors, rtol=0, atol=1e-5)
+
+
+@needs_golden
+def test_half_precision_finds_mostly_the_same_points():
+    golden = golden_arrays("superpoint", "default_160x216")
+    (found,) = golden_network(golden["config"]).bfloat16()(image_of(golden["image"]))
+    assert (found.points.dtype, found.scores.dtype, found.descriptors.dtype) == (torch.float32,) * 3
+    expected = {tuple(point) for point in golden["keypoints"].tolist()}
+    assert len(expected & {tuple(point) for point in found.points.tolist()}) > 0.7 * len(expected)
+
+
+def network(**options):
+    """Random weights that respond to texture and find keypoints in noise."""
+    torch.manual_seed(0)
+    network = SuperPoint(SuperPointConfig(**options))
+    with torch.no_grad():
+        for name, weight in network.named_parameters():
+            if name.endswith("weight"):
+                torch.nn.init.kaiming_normal_(weight)
+                weight.sub_(weight.mean(dim=(1, 2, 3), keepdim=True))
+    return network.eval()
+
+
+def reference_suppression(scores, radius):
+    """The definition with loops over pixels; sets instead of maps."""
+    height, width = scores.shape
+
+    def window(y, x):
+        rows, columns = (range(max(at - radius, 0), at + radius + 1) for at in (y, x))
+        return [(i, j) for i in rows for j in columns if i < height and j < width]
+
+    pixels = list(np.ndindex(height, width))
+    kept = {p for p in pixels if scores[p] == max(scores[q] for q in window(*p))}
+    for _ in range(2):
+        near = {q for p in kept for q in window(*p)}
+        rest = {p: 0.0 if p in near else scores[p] for p in pixels}
+        kept |= {p for p in pixels if p not in near and rest[p] == max(rest[q] for q in window(*p))}
+    return np.array([[scores[y, x] if (y, x) in kept else 0 for x in range(width)] for y in range(height)])
+
+
+@pytest.mark.parametrize("radius", range(5))
+@pytest.mark.parametrize("seed", range(3))
+def test_suppression_is_its_definition(seed, radius):
+    rng = np.random.default_rng(seed)
+    maps = rng.integers(0, 12, (2, 13, 17)) / 8  # few values, many ties
+    got = suppress_non_maxima(torch.tensor(maps), radius).numpy()
+    np.testing.assert_array_equal(got, [reference_suppression(scores, radius) for scores in maps])
+
+
+def test_equal_maxima_and_plateaus_survive():
+    scores = torch.zeros(1, 7, 9)
+    scores[0, 3, 2:6] = 0.5
+    assert torch.equal(suppress_non_maxima(scores, 4), scores)
+
+
+def test_of_a_ramp_the_first_three_points_of_the_chain_survive():
+    scores = torch.arange(1, 31).float().flip(0)[None, None]  # descending along one row
+    found = suppress_non_maxima(scores, 2)[0, 0].nonzero()[:, 0].tolist()
+    assert found == [0, 3, 6]
+
+
+@given(st.integers(0, 9), st.integers(1, 12), st.integers(1, 12), st.integers(0, 2**32 - 1))
+def test_the_window_maximum_is_that_of_a_pooling_layer(radius, height, width, seed):
+    values = torch.from_numpy(np.random.default_rng(seed).random((2, height, width)))
+    pooled = functional.max_pool2d(values[:, None], 2 * radius + 1, stride=1, padding=radius)[:, 0]
+    assert torch.equal(window_maximum(values, radius), pooled)
+    assert torch.equal(window_maximum(values > 0.8, radius), pooled > 0.8)
+
+
+def test_a_point_of_the_border_suppresses_before_it_is_removed():
+    scores = torch.zeros(1, 24, 24)
+    scores[0, 10, 3], scores[0, 10, 5], scores[0, 16, 16] = 0.9, 0.5, 0.4
+    points, kept = select_keypoints(suppress_non_maxima(scores, 3)[0], SuperPointConfig(remove_borders=4))
+    assert points.tolist() == [[16, 16]]
+    assert kept.tolist() == pytest.approx([0.4])
+
+
+def test_the_threshold_is_strict_and_the_limit_keeps_the_strongest_in_order():
+    scores = torch.zeros(16, 24)
+    for (y, x), score in {
+        (4, 4): 0.25,
+        (4, 19): 0.5,
+        (11, 4): 0.75,
+        (11, 19): 0.125,
+        (12, 9): 1,
+        (9, 20): 1,
+    }.items():
+        scores[y, x] = score
+
+    def selected(**options):
+        points, kept = select_keypoints(scores, SuperPointConfig(keypoint_threshold=0.125, **options))
+        assert torch.equal(scores[points[:, 1].long(), points[:, 0].long()], kept)
+        return points.tolist()
+
+    in_rows = [[4, 4], [19, 4], [4, 11]]
+    assert selected() == selected(max_keypoints=3) == selected(max_keypoints=9) == in_rows
+    assert selected(max_keypoints=2) == [[4, 11], [19, 4]]
+    assert [20, 9] in selected(remove_borders=3)
+
+
+def test_a_cells_scores_are_its_pixels_row_by_row():
+    logits = torch.full((1, 65, 2, 3), -100.0)
+    logits[0, 13, 1, 2] = 100  # row 1, column 5 of the cell
+    logits[0, 64, 0, 0] = 100  # no keypoint
+    scores = score_map(logits)
+    assert scores.shape == (1, 16, 24)
+    assert scores[0, 9, 21] == 1
+    assert scores[0, :8, :8].sum() == 0
+
+
+def test_descriptors_are_unit_vectors_and_those_of_the_outermost_cells_at_the_ends():
+    torch.manual_seed(1)
+    field = torch.randn(5, 4, 6)
+    ends = torch.tensor([[3.5, 3.5], [47, 31]])  # the first cell's centre; what the slip takes for the last one's
+    got = sample_descriptors(field, ends)
+    torch.testing.assert_close(got, functional.normalize(torch.stack([field[:, 0, 0], field[:, 3, 5]]), dim=1))
+    inside = sample_descriptors(field, torch.rand(50, 2) * torch.tensor([47, 31]))
+    torch.testing.assert_close(inside.norm(dim=1), torch.ones(50))
+
+
+@pytest.mark.parametrize(("height", "width"), [(8, 8), (9, 15), (16, 16), (8, 200)])
+def test_small_images_have_no_keypoints_and_that_is_no_error(height, width):
+    (found,) = network(remove_borders=8)(torch.rand(1, 1, height, width))
+    assert (found.points.shape, found.scores.shape, found.descriptors.shape) == ((0, 2), (0,), (0, 256))
+    assert found.points.dtype == found.scores.dtype == found.descriptors.dtype == torch.float32
+
+
+def test_a_batch_equals_its_images_with_any_weights():
+    net = network(max_keypoints=20)
+    batch = torch.rand(3, 1, 45, 62)
+    for found, one in zip(net(batch), batch, strict=True):
+        (alone,) = net(one[None])
+        torch.testing.assert_close(found.scores, alone.scores, rtol=1e-4, atol=1e-7)
+        assert torch.equal(found.points, alone.points)
+        assert len(alone.points) == 20
+        assert (alone.scores.diff() <= 0).all()
+        assert ((alone.points >= 4) & (alone.points < torch.tensor([56 - 4, 40 - 4]))).all()
+    assert net(batch[:0]) == []
+
+
+def test_a_side_below_a_cell_is_refused():
+    with pytest.raises(ValueError, match="at least 8 pixels"):
+        network()(torch.rand(1, 1, 7, 64))
+
+
+@pytest.mark.parametrize("options", [{"max_keypoints": 0}, {"max_keypoints": -2}, {"nms_radius": -1}])
+def test_options_without_sense_are_refused(options):
+    with pytest.raises(ValueError, match=next(iter(options))):
+        SuperPointConfig(**options)
+
+
+if __name__ == "__main__":
+    steps = {"nms_cases": nms_stages, "descriptor_sampling": sampling_stages, "resize_cases": resize_stages}
+    tables = [(case, network_stages(case)) for case in CASES]
+    print_table("superpoint", tables + [(case, stages()) for case, stages in steps.items()])
