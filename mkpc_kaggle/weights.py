@@ -154,14 +154,18 @@ def verify(path: Path, file: WeightFile) -> str:
 
 
 def load_tensors(path: Path) -> "dict[str, torch.Tensor]":
-    """Tensors by name from a safetensors file or a torch checkpoint; nothing in the file is executed."""
+    """Tensors by name from a safetensors file or a torch checkpoint; nothing in the file is executed.
+
+    A training checkpoint keeps them under ``state_dict``.
+    """
     import torch
     from safetensors.torch import load_file
 
     try:
         if path.suffix == ".safetensors":
             return load_file(path)
-        return dict(torch.load(path, map_location="cpu", weights_only=True))
+        loaded = torch.load(path, map_location="cpu", weights_only=True)
+        return dict(loaded.get("state_dict", loaded))
     except Exception as error:
         raise UserError(f"{path} cannot be read as a checkpoint: {error}") from error
 

@@ -1,7 +1,6 @@
 """Golden vectors beside the repository, ``../shared/golden``; tests that need them are skipped without them."""
 
 import importlib.util
-import json
 import sys
 from collections.abc import Iterable
 from typing import NamedTuple
@@ -27,30 +26,24 @@ def golden_arrays(network, case):
 
 def standin_state(network):
     """The stand-in checkpoint that the folder's ``standin.py`` makes, as tensors."""
-    path = list(sys.path)
-    try:  # the recipe puts its own folder on the path
-        spec = importlib.util.spec_from_file_location(f"standin_{network}", GOLDEN / network / "standin.py")
-        recipe = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(recipe)
-    finally:
-        sys.path[:] = path
+    recipe = _module(GOLDEN / network / "standin.py")
     return {name: torch.from_numpy(np.asarray(value)) for name, value in recipe.standin_state_dict().items()}
 
 
-def seeded_state(network):
-    """The stand-in checkpoint of a folder that has no recipe of its own, from its shapes and gains."""
-    spec = importlib.util.spec_from_file_location("seeded_weights", GOLDEN / "seeded_weights.py")
-    recipe = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(recipe)
-    shapes, gains = (json.loads((GOLDEN / network / f"{name}.json").read_text()) for name in ("shapes", "gains"))
-    return {
-        name: torch.from_numpy(np.asarray(recipe.seeded_tensor(name, shape, _gain(name, gains))))
-        for name, shape in shapes.items()
-    }
+def seeded_tensor(name, shape, gain=1.0):
+    """The stand-in value of one parameter, for the folders without a ``standin.py``."""
+    return torch.from_numpy(_module(GOLDEN / "seeded_weights.py").seeded_tensor(name, shape, gain))
 
 
-def _gain(name, gains):
-    return next((gain for prefix, gain in gains["prefixes"].items() if name.startswith(prefix)), gains["default"])
+def _module(path):
+    before = list(sys.path)
+    try:  # a recipe puts its own folder on the path
+        spec = importlib.util.spec_from_file_location(f"golden_{path.parent.name}_{path.stem}", path)
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+    finally:
+        sys.path[:] = before
+    return module
 
 
 class Stage(NamedTuple):

@@ -1,0 +1,88 @@
+"""Refinement of coarse matches in 5x5 windows of the fine maps (Sun et al. 2021, section 3.4)."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from mkpc_kaggle.matchers.networks.coarse_matching import CoarseMatches
+from mkpc_kaggle.matchers.networks.grids import as_grid
+
+COARSE_STRIDE, FINE_STRIDE = 8, 2
+SIDE = 5  # of a window, in fine cells
+CENTRE = SIDE * SIDE // 2
+
+
+@dataclass(frozen=True, eq=False)
+class SemiDenseMatches:
+    """M matches of a batch of pairs, in order of (batch, coarse cell of image 0).
+
+    ``points0``, ``points1``: (M, 2) float32 (x, y) in pixels of the network's input, in a frame whose origin is
+    the corner of the image: the centre of the top-left pixel is (0.5, 0.5). Points of image 0 lie on the
+    grid of coarse cells; those of image 1 are refined by up to 4 pixels. ``expectation``: (M, 3) offset
+    (x, y) in -1..1 and its standard deviation.
+    """
+
+    coarse: CoarseMatches
+    points0: Tensor
+    points1: Tensor
+    expectation: Tensor
+
+
+class FinePreprocess(nn.Module):
+    """Adds the coarse features of a cell to each entry of its window."""
+
+    def __init__(self, coarse: int, fine: int) -> None:
+        super().__init__()
+        self.down_proj = nn.Linear(coarse, fine)
+        self.merge_feat = nn.Linear(2 * fine, fine)
+
+    def forward(self, windows: Tensor, context: Tensor) -> Tensor:
+        """Windows (M, 25, fine) and coarse features (M, coarse) -> (M, 25, fine)."""
+        of_window, of_context = self.merge_feat.weight.chunk(2, dim=1)
+        added = functional.linear(self.down_proj(context), of_context, self.merge_feat.bias)  # (M, fine)
+        return functional.linear(windows, of_window).add_(added[:, None])
+
+
+def cell_points(cells: Tensor, width: int) -> Tensor:
+    """(M,) cells of a coarse map of ``width`` columns -> (M, 2) float32 (x, y) in pixels."""
+    return torch.stack([cells % width, cells // width], dim=1).float() * COARSE_STRIDE
+
+
+def cut_windows(fine: Tensor, batch: Tensor, cells: Tensor) -> Tensor:
+    """Fine maps (N, C, Hf, Wf) and M coarse cells -> (M, 25, C): what lies around each, row by row.
+
+    A cell's window is centred on the fine cell at its top-left corner; zero outside the map.
+    """
+    grid = as_grid(fine)  # (N, Hf, Wf, C)
+    _, height, width, channels = grid.shape
+    step = COARSE_STRIDE // FINE_STRIDE
+    coarse_width = width // step
+    around = torch.arange(SIDE, device=fine.device) - SIDE // 2
+    rows = (cells // coarse_width * step)[:, None, None] + around[:, None]  # (M, 5, 1)
+    columns = (cells % coarse_width * step)[:, None, None] + around  # (M, 1, 5)
+    # Centres are at multiples of the step: windows reach beyond the top and the left only.
+    index = (batch[:, None, None] * height + rows.clamp(min=0)) * width + columns.clamp(min=0)  # (M, 5, 5)
+    windows = grid.reshape(-1, channels).index_select(0, index.flatten()).view(-1, SIDE * SIDE, channels)
+    return windows.masked_fill_(((rows < 0) | (columns < 0)).flatten(1)[..., None], 0.0)
+
+
+def expected_offset(windows0: Tensor, windows1: Tensor) -> Tensor:
+    """(M, 25, C) twice -> (M, 3) float32: mean offset (x, y) in -1..1, and its standard deviation.
+
+    The centre of window 0 is compared with all of window 1; the softmax is the distribution of the offset.
+    """
+    windows0, windows1 = windows0.float(), windows1.float()
+    logits = (windows1 @ windows0[:, CENTRE, :, None])[..., 0] / windows0.shape[2] ** 0.5  # (M, 25)
+    axis = torch.linspace(-1.0, 1.0, SIDE, device=logits.device)
+    offsets = torch.stack([axis.repeat(SIDE), axis.repeat_interleave(SIDE)], dim=1)  # (25, 2): (x, y)
+    heat = logits.softmax(dim=1)
+    mean = heat @ offsets  # (M, 2)
+    deviation = (heat @ offsets**2 - mean**2).clamp(min=1e-10).sqrt().sum(dim=1)
+    return torch.cat([mean, deviation[:, None]], dim=1)
+
+
+def refined_points(coarse1: Tensor, expectation: Tensor) -> Tensor:
+    """Coarse points of image 1 (M, 2) -> refined (M, 2): an offset of one is half a window, two fine cells."""
+    return coarse1 + expectation[:, :2] * (SIDE // 2 * FINE_STRIDE)

@@ -1,0 +1,83 @@
+"""What the matchers' transformers do with token grids, (..., h, w, C) with the channels last.
+
+A grid is a channels-last feature map seen the other way round, so neither view of it copies anything.
+"""
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+Layer = nn.Linear | nn.Conv1d | nn.Conv2d
+
+
+def as_map(grid: Tensor) -> Tensor:
+    """(N, h, w, C) -> (N, C, h, w), channels last in memory."""
+    return grid.permute(0, 3, 1, 2)
+
+
+def as_grid(feature_map: Tensor) -> Tensor:
+    """(N, C, h, w) -> (N, h, w, C); a view, and contiguous where the map was channels last."""
+    return feature_map.permute(0, 2, 3, 1)
+
+
+def mean_pool(grid: Tensor, factor: int | tuple[int, int]) -> Tensor:
+    """Means of ``factor`` (rows, columns) blocks; incomplete ones at the right and bottom are dropped."""
+    return grid if factor == 1 else as_grid(functional.avg_pool2d(as_map(grid), factor))
+
+
+def quads(grid: Tensor) -> Tensor:
+    """(..., h, w, E) -> (..., h/2 * w/2, 4, E): 2x2 cells row by row, and row by row within each."""
+    *lead, h, w, width = grid.shape
+    cells = grid.reshape(*lead, h // 2, 2, w // 2, 2, width).transpose(-4, -3)  # (..., h/2, w/2, 2, 2, E)
+    return cells.reshape(*lead, h * w // 4, 4, width)
+
+
+def unquads(cells: Tensor, h: int, w: int) -> Tensor:
+    """(..., h/2 * w/2, 4, E) -> (..., h, w, E): undoes :func:`quads`."""
+    *lead, _, _, width = cells.shape
+    rows = cells.reshape(*lead, h // 2, w // 2, 2, 2, width).transpose(-4, -3)  # (..., h/2, 2, w/2, 2, E)
+    return rows.reshape(*lead, h, w, width)
+
+
+def pointwise(layer: nn.Conv1d | nn.Conv2d, x: Tensor) -> Tensor:
+    """A convolution of kernel 1 on (..., C_in) -> (..., C_out)."""
+    return functional.linear(x, layer.weight.flatten(1), layer.bias)
+
+
+def linear_of_two(weight: Tensor, x: Tensor, y: Tensor) -> Tensor:
+    """``weight`` (out, C_x + C_y) on the concatenation of (..., C_x) and (..., C_y), never built."""
+    of_x, of_y = torch.split(weight, [x.shape[-1], y.shape[-1]], dim=1)
+    out = functional.linear(x, of_x)
+    out.view(-1, out.shape[-1]).addmm_(y.reshape(-1, y.shape[-1]), of_y.T)
+    return out
+
+
+class Perceptron(nn.Module):
+    """Two layers without biases and a ReLU between them, with their names in an ``nn.Sequential``.
+
+    The first is pointwise; so is the second, unless it is a 3x3 convolution of the grid.
+    """
+
+    def __init__(self, first: Layer, second: Layer) -> None:
+        super().__init__()
+        self.add_module("0", first)
+        self.add_module("2", second)
+
+    def forward(self, x: Tensor, y: Tensor | None = None) -> Tensor:
+        """(..., C), or two inputs (..., C_x) and (..., C_y) that stand for their concatenation -> (..., C_out)."""
+        first, second = self.get_parameter("0.weight"), self.get_parameter("2.weight")
+        weight = first.flatten(1)
+        hidden = functional.relu_(functional.linear(x, weight) if y is None else linear_of_two(weight, x, y))
+        if second.shape[2:] == (3, 3):
+            return as_grid(functional.conv2d(as_map(hidden), second, padding=1))
+        return functional.linear(hidden, second.flatten(1))
+
+
+def mask_valid(mask: Tensor, factor: int | tuple[int, int]) -> Tensor:
+    """(N, h, w) bool -> the same pooled: a block is valid only if all of its cells are."""
+    return functional.max_pool2d((~mask).float()[:, None], factor)[:, 0] == 0
+
+
+def softmax_attention(logits: Tensor, values: Tensor) -> Tensor:
+    """(..., L, S) and (..., S, D) -> (..., L, D)."""
+    return torch.softmax(logits, dim=-1) @ values

@@ -1,0 +1,76 @@
+"""The transformer with linear attention of LoFTR: its coarse one, and the fine one of its descendants too.
+
+Sources: Sun et al. 2021, section 3.2; Katharopoulos et al. 2020 (linear attention).
+"""
+
+from torch import Tensor, nn
+from torch.nn import functional
+
+from mkpc_kaggle.matchers.networks.grids import Perceptron
+
+Masks = tuple[Tensor, Tensor]
+
+
+def linear_attention(q: Tensor, k: Tensor, v: Tensor, heads: int, masks: Masks | None = None) -> Tensor:
+    """Queries (N, L, C), keys and values (N, S, C) -> (N, L, C); head h owns channels h C/heads and on.
+
+    ``masks``: of the queries (N, L) and of the keys (N, S), True at content. A masked query gets zero, a masked
+    key counts nothing. ``q`` and ``k`` are overwritten.
+    """
+    q, k = functional.elu(q, inplace=True).add_(1.0), functional.elu(k, inplace=True).add_(1.0)
+    if masks is not None:
+        q, k = q.mul_(masks[0][..., None]), k.mul_(masks[1][..., None])
+    width = q.shape[2] // heads
+    q, k, v = (x.view(*x.shape[:2], heads, width).transpose(1, 2) for x in (q, k, v))  # (N, heads, L or S, D)
+    total = k.sum(dim=2)[..., None]  # (N, heads, D, 1)
+    attended = (q @ (k.transpose(2, 3) @ v)).div_((q @ total).add_(1e-6))  # (N, heads, L, D)
+    return attended.transpose(1, 2).flatten(2)
+
+
+class EncoderLayer(nn.Module):
+    """Updates tokens from a source: attention, then a multi-layer perceptron on the tokens and what they got."""
+
+    def __init__(self, width: int, heads: int) -> None:
+        super().__init__()
+        self.heads = heads
+        self.q_proj = nn.Linear(width, width, bias=False)
+        self.k_proj = nn.Linear(width, width, bias=False)
+        self.v_proj = nn.Linear(width, width, bias=False)
+        self.merge = nn.Linear(width, width, bias=False)
+        self.mlp = Perceptron(nn.Linear(2 * width, 2 * width, bias=False), nn.Linear(2 * width, width, bias=False))
+        self.norm1 = nn.LayerNorm(width)
+        self.norm2 = nn.LayerNorm(width)
+
+    def forward(self, x: Tensor, source: Tensor, masks: Masks | None = None) -> Tensor:
+        """Tokens (N, L, C) and source (N, S, C), with their masks (N, L) and (N, S) -> (N, L, C)."""
+        message = linear_attention(
+            self.q_proj(x), self.k_proj(source), self.v_proj(source), self.heads, masks
+        )  # (N, L, C)
+        message = self.norm1(self.merge(message))
+        update: Tensor = self.norm2(self.mlp(x, message))
+        return update.add_(x)
+
+
+class LinearTransformer(nn.Module):
+    """``cycles`` times a layer of self and one of cross attention; each serves both images.
+
+    Cross attention runs in sequence: image 1 is updated from the image 0 that was updated just before.
+    """
+
+    def __init__(self, width: int, heads: int, cycles: int) -> None:
+        super().__init__()
+        self.layers = nn.ModuleList(EncoderLayer(width, heads) for _ in range(2 * cycles))
+
+    def forward(self, x0: Tensor, x1: Tensor, masks: Masks | None = None) -> tuple[Tensor, Tensor]:
+        """(N, L, C) and (N, S, C), with masks (N, L) and (N, S), True at content -> the same shapes."""
+        own0 = own1 = cross0 = cross1 = None
+        if masks is not None:
+            mask0, mask1 = masks
+            own0, own1, cross0, cross1 = (mask0, mask0), (mask1, mask1), (mask0, mask1), (mask1, mask0)
+        for index, layer in enumerate(self.layers):
+            if index % 2 == 0:
+                x0, x1 = layer(x0, x0, own0), layer(x1, x1, own1)
+            else:
+                x0 = layer(x0, x1, cross0)
+                x1 = layer(x1, x0, cross1)
+        return x0, x1

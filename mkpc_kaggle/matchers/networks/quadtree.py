@@ -1,0 +1,213 @@
+"""LoFTR with quadtree attention in its coarse transformer.
+
+Sources: Tang et al., "QuadTree Attention for Vision Transformers", 2022 (type B); Sun et al. 2021 (LoFTR).
+"""
+
+from dataclasses import dataclass
+from functools import partial
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from mkpc_kaggle.matchers.networks.grids import as_grid, as_map, mean_pool, pointwise, quads, unquads
+from mkpc_kaggle.matchers.networks.linear_attention import Masks
+from mkpc_kaggle.matchers.networks.position import FIXED_FALL, with_positions
+from mkpc_kaggle.matchers.networks.resnet_fpn import TOP
+from mkpc_kaggle.matchers.networks.semi_dense import HEADS, SemiDenseNetwork
+
+LEVELS = 3
+LAYERS = 8
+HIDDEN = 4 * TOP
+
+
+@dataclass(frozen=True)
+class QuadtreeConfig:
+    """As published for outdoors. ``topks``: how many key cells each level keeps for the next, coarsest first."""
+
+    threshold: float = 0.2
+    border: int = 2
+    temperature: float = 0.1
+    topks: tuple[int, int] = (16, 8)
+
+
+@dataclass(frozen=True, eq=False)
+class Attended:
+    """One level's answer for P query cells of G queries each: ``message`` (B, P, G, D), and ``kept`` (B, P, G, K)
+    int64, the key cells (row by row over the level's map) with the highest attention; None at the last level.
+    """
+
+    message: Tensor
+    kept: Tensor | None
+
+
+def attend(q: Tensor, k: Tensor, v: Tensor, keep: int | None) -> Attended:
+    """Queries (B, P, G, D), each group's keys and values (B, P, S, D); ``kept`` are indices into S."""
+    logits = (q * q.shape[-1] ** -0.5) @ k.transpose(-1, -2)  # (B, P, G, S)
+    kept = None if keep is None else logits.topk(min(keep, logits.shape[-1]), dim=-1, sorted=False).indices
+    return Attended(logits.softmax(dim=-1) @ v, kept)
+
+
+def attend_children(q: Tensor, k: Tensor, v: Tensor, parents: Tensor, keep: int | None) -> Attended:
+    """A finer level: maps (B, h, w, D) of queries, and (B, h_key, w_key, D) of keys and values.
+
+    ``parents``: (B, h w / 4, K) int64, for each 2x2 cell of queries the key cells of the level above whose
+    children it sees. Children of one parent lie together, so that they are gathered at one go.
+    """
+    w_key = k.shape[2]
+    candidates = partial(_children_of, parents=parents)
+    found = attend(quads(q), candidates(quads(k)), candidates(quads(v)), keep)
+    if found.kept is None:
+        return found
+    parent = parents[:, :, None].expand(-1, -1, 4, -1).gather(3, found.kept // 4)  # (B, P, 4, keep)
+    row = parent // (w_key // 2) * 2 + found.kept % 4 // 2
+    column = parent % (w_key // 2) * 2 + found.kept % 2
+    return Attended(found.message, row * w_key + column)
+
+
+def _children_of(cells: Tensor, parents: Tensor) -> Tensor:
+    """Cells (B, S, 4, D) gathered by ``parents`` (B, P, K) -> (B, P, 4 K, D), parent by parent."""
+    batch, count, four, width = cells.shape
+    offset = torch.arange(batch, device=cells.device)[:, None, None] * count
+    found = cells.reshape(-1, four * width).index_select(0, (parents + offset).flatten())
+    return found.view(batch, parents.shape[1], -1, width)
+
+
+def quadtree_attention(q: Tensor, k: Tensor, v: Tensor, shares: Tensor, topks: tuple[int, int]) -> Tensor:
+    """Queries (B, h, w, D), keys and values (B, h_key, w_key, D), one head each -> messages (B, h, w, D).
+
+    Sides are multiples of 4. The coarsest of three levels of mean pooling attends to all key cells; each next
+    one to the children of the ``topks`` best that its parent found. ``shares`` (3,): of the levels' messages.
+    """
+    (q0, k0, v0), (q1, k1, v1) = ([mean_pool(x, factor) for x in (q, k, v)] for factor in (4, 2))
+    batch, h0, w0, width = q0.shape
+    dense = attend(q0.reshape(batch, 1, -1, width), k0.flatten(1, 2)[:, None], v0.flatten(1, 2)[:, None], topks[0])
+    assert dense.kept is not None
+    middle = attend_children(q1, k1, v1, dense.kept[:, 0], topks[1])
+    assert middle.kept is not None
+    fine = attend_children(q, k, v, unquads(middle.kept, 2 * h0, 2 * w0).flatten(1, 2), None)
+    # A cell's children take its message over: in quads that is broadcasting.
+    coarse = dense.message[:, 0, :, None] * shares[0]  # (B, h0 w0, 1, D)
+    merged = unquads(coarse + middle.message * shares[1], 2 * h0, 2 * w0)  # (B, 2 h0, 2 w0, D)
+    return unquads(fine.message * shares[2] + merged.flatten(1, 2)[:, :, None], 4 * h0, 4 * w0)
+
+
+class LevelWeights(nn.Module):
+    """One learned scalar for each level, coarsest first; their softmax are the levels' shares."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.ones(LEVELS))
+
+
+class QuadtreeAttention(nn.Module):
+    """Quadtree attention of all heads, with its projections."""
+
+    def __init__(self, width: int, heads: int, topks: tuple[int, int]) -> None:
+        super().__init__()
+        self.heads = heads
+        self.topks = topks
+        self.q_proj = nn.Conv2d(width, width, 1, bias=False)
+        self.k_proj = nn.Conv2d(width, width, 1, bias=False)
+        self.v_proj = nn.Conv2d(width, width, 1, bias=False)
+        self.py_att = LevelWeights()
+        self.proj = nn.Linear(width, width)
+
+    def forward(self, x: Tensor, source: Tensor) -> Tensor:
+        """Grids (N, h, w, C) and (N, h_source, w_source, C) -> (N, h, w, C)."""
+        q, k, v = (
+            self._by_head(pointwise(layer, grid))
+            for layer, grid in ((self.q_proj, x), (self.k_proj, source), (self.v_proj, source))
+        )  # (N heads, h, w, D)
+        shares = self.py_att.weight.softmax(dim=0)
+        # One head at a time keeps the gathered keys in a CPU's cache; a GPU is fastest with all at once.
+        at_once = 1 if x.device.type == "cpu" else len(q)
+        parts = zip(*(torch.split(y, at_once) for y in (q, k, v)), strict=True)
+        message = torch.cat([quadtree_attention(q, k, v, shares, self.topks) for q, k, v in parts])
+        merged = message.view(-1, self.heads, *message.shape[1:]).permute(0, 2, 3, 1, 4).flatten(3)  # (N, h, w, C)
+        out: Tensor = self.proj(merged)
+        return out
+
+    def _by_head(self, grid: Tensor) -> Tensor:
+        """(N, h, w, C) -> (N heads, h, w, D), contiguous."""
+        return grid.view(*grid.shape[:3], self.heads, -1).permute(0, 3, 1, 2, 4).flatten(0, 1)
+
+
+class DepthwiseConvolution(nn.Module):
+    """3x3 over a grid (N, h, w, C), each channel on its own."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.dwconv = nn.Conv2d(width, width, 3, padding=1, groups=width)
+
+    def forward(self, grid: Tensor) -> Tensor:
+        return as_grid(self.dwconv(as_map(grid)))
+
+
+class ConvolutionalMlp(nn.Module):
+    """A multi-layer perceptron that sees the neighbours of a cell."""
+
+    def __init__(self, width: int, hidden: int) -> None:
+        super().__init__()
+        self.fc1 = nn.Linear(width, hidden)
+        self.dwconv = DepthwiseConvolution(hidden)
+        self.fc2 = nn.Linear(hidden, width)
+
+    def forward(self, grid: Tensor) -> Tensor:
+        """(N, h, w, C) -> (N, h, w, C)."""
+        neighbourhood = self.dwconv(functional.relu_(self.fc1(grid)))  # (N, h, w, hidden)
+        out: Tensor = self.fc2(functional.gelu(neighbourhood))
+        return out
+
+
+class QuadtreeLayer(nn.Module):
+    """Updates a grid from a source, both normalised beforehand."""
+
+    def __init__(self, width: int, heads: int, topks: tuple[int, int]) -> None:
+        super().__init__()
+        self.norm1 = nn.LayerNorm(width)
+        self.attn = QuadtreeAttention(width, heads, topks)
+        self.norm2 = nn.LayerNorm(width)
+        self.mlp = ConvolutionalMlp(width, HIDDEN)
+
+    def forward(self, x: Tensor, source: Tensor) -> Tensor:
+        """Grids (N, h, w, C) and (N, h_source, w_source, C) -> (N, h, w, C)."""
+        own = self.norm1(x)
+        attended = x + self.attn(own, own if source is x else self.norm1(source))
+        out: Tensor = attended + self.mlp(self.norm2(attended))
+        return out
+
+
+class QuadtreeTransformer(nn.Module):
+    """Self and cross attention in turn; a layer serves both images; cross attention updates both at once."""
+
+    def __init__(self, topks: tuple[int, int]) -> None:
+        super().__init__()
+        self.layers = nn.ModuleList(QuadtreeLayer(TOP, HEADS, topks) for _ in range(LAYERS))
+
+    def forward(self, x0: Tensor, x1: Tensor) -> tuple[Tensor, Tensor]:
+        for index, layer in enumerate(self.layers):
+            crossed = index % 2 == 1
+            x0, x1 = layer(x0, x1 if crossed else x0), layer(x1, x0 if crossed else x1)
+        return x0, x1
+
+
+class Quadtree(SemiDenseNetwork[QuadtreeTransformer]):
+    """Sides are multiples of 32. The published code asks for two images of one size; nothing learned does.
+
+    Masks act in the matching of coarse cells alone, as published: attention sees the padding.
+    """
+
+    multiple = 32
+
+    def __init__(self, config: QuadtreeConfig | None = None) -> None:
+        self.config = config or QuadtreeConfig()
+        super().__init__(QuadtreeTransformer(self.config.topks), self.config.threshold, self.config.border)
+
+    @property
+    def similarity_scale(self) -> float:
+        return 1 / (TOP * self.config.temperature)
+
+    def transform(self, coarse0: Tensor, coarse1: Tensor, masks: Masks | None = None) -> tuple[Tensor, Tensor]:
+        grid0, grid1 = self.loftr_coarse(with_positions(coarse0, FIXED_FALL), with_positions(coarse1, FIXED_FALL))
+        return grid0, grid1

@@ -1,0 +1,82 @@
+"""The ResNet with a feature pyramid of LoFTR and its descendants: maps at 1/8 and at 1/2 of the image.
+
+Source: Sun et al. 2021 (LoFTR), section 3.1; layer names as in the public checkpoints.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+STEM, MIDDLE, TOP, FINE = 128, 196, 256, 128  # channels at 1/2, 1/4 and 1/8, and of the fine output
+
+
+@dataclass(frozen=True, eq=False)
+class FeatureMaps:
+    """Of B images of H x W pixels, float32: ``coarse`` (B, 256, H/8, W/8) and ``fine`` (B, 128, H/2, W/2)."""
+
+    coarse: Tensor
+    fine: Tensor
+
+
+class ResidualBlock(nn.Module):
+    """Two 3x3 convolutions beside a shortcut, which is a strided 1x1 convolution where the size changes."""
+
+    def __init__(self, inputs: int, outputs: int, stride: int = 1) -> None:
+        super().__init__()
+        self.conv1 = nn.Conv2d(inputs, outputs, 3, stride, 1, bias=False)
+        self.bn1 = nn.BatchNorm2d(outputs)
+        self.conv2 = nn.Conv2d(outputs, outputs, 3, 1, 1, bias=False)
+        self.bn2 = nn.BatchNorm2d(outputs)
+        self.downsample = nn.Sequential()
+        if stride != 1:
+            self.downsample = nn.Sequential(
+                nn.Conv2d(inputs, outputs, 1, stride, bias=False), nn.BatchNorm2d(outputs)
+            )
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, inputs, h, w) -> (B, outputs, h / stride, w / stride)."""
+        y = functional.relu_(self.bn1(self.conv1(x)))
+        return functional.relu_(self.bn2(self.conv2(y)).add_(self.downsample(x)))
+
+
+def smoothing(inputs: int, outputs: int) -> nn.Sequential:
+    """What follows where two levels of the pyramid meet."""
+    return nn.Sequential(
+        nn.Conv2d(inputs, inputs, 3, padding=1, bias=False),
+        nn.BatchNorm2d(inputs),
+        nn.LeakyReLU(0.01, inplace=True),
+        nn.Conv2d(inputs, outputs, 3, padding=1, bias=False),
+    )
+
+
+class ResNetFpn(nn.Module):
+    """Gray images (B, 1, H, W), float32 in [0, 1], sides multiples of 8 -> :class:`FeatureMaps`."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.conv1 = nn.Conv2d(1, STEM, 7, 2, 3, bias=False)
+        self.bn1 = nn.BatchNorm2d(STEM)
+        self.layer1 = nn.Sequential(ResidualBlock(STEM, STEM), ResidualBlock(STEM, STEM))
+        self.layer2 = nn.Sequential(ResidualBlock(STEM, MIDDLE, 2), ResidualBlock(MIDDLE, MIDDLE))
+        self.layer3 = nn.Sequential(ResidualBlock(MIDDLE, TOP, 2), ResidualBlock(TOP, TOP))
+        self.layer3_outconv = nn.Conv2d(TOP, TOP, 1, bias=False)
+        self.layer2_outconv = nn.Conv2d(MIDDLE, TOP, 1, bias=False)
+        self.layer2_outconv2 = smoothing(TOP, MIDDLE)
+        self.layer1_outconv = nn.Conv2d(STEM, MIDDLE, 1, bias=False)
+        self.layer1_outconv2 = smoothing(MIDDLE, FINE)
+        # Weights that lie channels last make every map so; loading a checkpoint keeps it.
+        self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # missing in torch's stubs
+
+    def forward(self, image: Tensor) -> FeatureMaps:
+        half = self.layer1(functional.relu_(self.bn1(self.conv1(image))))  # (B, 128, H/2, W/2)
+        quarter = self.layer2(half)  # (B, 196, H/4, W/4)
+        coarse = self.layer3_outconv(self.layer3(quarter))  # (B, 256, H/8, W/8)
+        merged = self.layer2_outconv2(self.layer2_outconv(quarter).add_(_doubled(coarse)))  # (B, 196, H/4, W/4)
+        fine = self.layer1_outconv2(self.layer1_outconv(half).add_(_doubled(merged)))  # (B, 128, H/2, W/2)
+        return FeatureMaps(coarse, fine)
+
+
+def _doubled(x: Tensor) -> Tensor:
+    return functional.interpolate(x, scale_factor=2.0, mode="bilinear", align_corners=True)

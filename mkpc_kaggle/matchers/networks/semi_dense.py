@@ -1,0 +1,89 @@
+"""The frame that LoFTR, QuadTree and ASpanFormer fill: all but their coarse transformers is one network.
+
+Backbone, coarse transformer, dual softmax of all pairs of coarse cells, refinement in fine windows.
+"""
+
+from abc import ABC, abstractmethod
+from typing import Generic, TypeVar
+
+import torch
+from torch import Tensor, nn
+
+from mkpc_kaggle.matchers.networks.coarse_matching import CoarseMatches, coarse_matches
+from mkpc_kaggle.matchers.networks.fine_matching import (
+    FinePreprocess,
+    SemiDenseMatches,
+    cell_points,
+    cut_windows,
+    expected_offset,
+    refined_points,
+)
+from mkpc_kaggle.matchers.networks.linear_attention import LinearTransformer, Masks
+from mkpc_kaggle.matchers.networks.resnet_fpn import FINE, TOP, FeatureMaps, ResNetFpn
+
+HEADS = 8
+WINDOWS_AT_ONCE = 1024
+
+Transformer = TypeVar("Transformer", bound=nn.Module)
+
+
+class SemiDenseNetwork(nn.Module, ABC, Generic[Transformer]):
+    """For inference only: in evaluation mode, and no parameter asks for gradients.
+
+    ``multiple``: both sides of an image must be multiples of it. ``threshold``: a match's confidence is above it.
+    ``border``: coarse cells along the border of an image that get no match.
+    """
+
+    multiple: int
+
+    def __init__(self, loftr_coarse: Transformer, threshold: float, border: int) -> None:
+        super().__init__()
+        self.threshold = threshold
+        self.border = border
+        self.backbone = ResNetFpn()
+        self.loftr_coarse = loftr_coarse
+        self.fine_preprocess = FinePreprocess(TOP, FINE)
+        self.loftr_fine = LinearTransformer(FINE, HEADS, cycles=1)
+        self.eval().requires_grad_(False)
+
+    @property
+    @abstractmethod
+    def similarity_scale(self) -> float | Tensor:
+        """What the dot product of two coarse features is multiplied by before the dual softmax."""
+
+    @abstractmethod
+    def transform(self, coarse0: Tensor, coarse1: Tensor, masks: Masks | None = None) -> tuple[Tensor, Tensor]:
+        """The coarse transformer: maps (N, 256, h, w) of both images -> grids (N, h, w, 256)."""
+
+    def encode(self, image: Tensor) -> FeatureMaps:
+        """Gray images (B, 1, H, W), float32 in [0, 1]; ValueError where a side is no multiple of the network's."""
+        height, width = image.shape[2:]
+        if height % self.multiple or width % self.multiple or height * width == 0:
+            raise ValueError(f"sides of an image must be multiples of {self.multiple}, not {height} x {width}")
+        maps = self.backbone(image)
+        assert isinstance(maps, FeatureMaps)
+        return maps
+
+    def match(
+        self, features0: FeatureMaps, features1: FeatureMaps, masks: Masks | None = None
+    ) -> SemiDenseMatches:
+        """Matches of B pairs; ``masks``: (B, H/8, W/8) bool of each image, True at its content at the top left."""
+        grid0, grid1 = self.transform(features0.coarse, features1.coarse, masks)
+        coarse = coarse_matches(grid0, grid1, self.similarity_scale, self.threshold, self.border, masks)
+        expectation = self.refine(coarse, features0.fine, features1.fine, grid0, grid1)
+        points0, points1 = (
+            cell_points(cells, grid.shape[2]) for cells, grid in ((coarse.cell0, grid0), (coarse.cell1, grid1))
+        )
+        return SemiDenseMatches(coarse, points0, refined_points(points1, expectation), expectation)
+
+    def refine(self, coarse: CoarseMatches, fine0: Tensor, fine1: Tensor, grid0: Tensor, grid1: Tensor) -> Tensor:
+        """(M, 3): the offset of each match from the corner of its coarse cell in image 1, see fine_matching."""
+        indices = (coarse.batch, coarse.cell0, coarse.cell1)
+        found = []
+        for batch, cell0, cell1 in zip(*(torch.split(x, WINDOWS_AT_ONCE) for x in indices), strict=True):
+            windows0 = self.fine_preprocess(
+                cut_windows(fine0, batch, cell0), grid0.flatten(1, 2)[batch, cell0]
+            )  # (m, 25, 128)
+            windows1 = self.fine_preprocess(cut_windows(fine1, batch, cell1), grid1.flatten(1, 2)[batch, cell1])
+            found.append(expected_offset(*self.loftr_fine(windows0, windows1)))
+        return torch.cat(found)

@@ -1,0 +1,145 @@
+"""What the parity tests of LoFTR, QuadTree and ASpanFormer share."""
+
+from contextlib import contextmanager
+
+import torch
+from golden import Stage, golden_arrays
+
+from mkpc_kaggle.matchers.networks.coarse_matching import log_root_confidence, similarity
+from mkpc_kaggle.matchers.networks.fine_matching import cell_points
+from mkpc_kaggle.matchers.networks.resnet_fpn import FeatureMaps
+
+
+@contextmanager
+def recorded(network, names):
+    """Lists by module name, which fill with the inputs and the output of each call of these modules."""
+    calls = {name: [] for name in names}
+    hooks = [
+        network.get_submodule(name).register_forward_hook(
+            lambda _module, inputs, output, calls=calls[name]: calls.append((inputs, output))
+        )
+        for name in names
+    ]
+    yield calls
+    for hook in hooks:
+        hook.remove()
+
+
+def confidence_of(network, grid0, grid1, masks=None):
+    """The full confidence matrix (N, L, S)."""
+    return log_root_confidence(similarity(grid0, grid1, network.similarity_scale, masks)).mul(2).exp()
+
+
+def tolerance_of(name, tolerances):
+    """That of the entry's prefix; nothing, so that it must agree exactly, without one."""
+    return next((tolerance for prefix, tolerance in tolerances.items() if name.startswith(prefix)), 0.0)
+
+
+@torch.inference_mode()
+def loftr_stages(folder, case, network, tolerances):
+    """All entries of a golden file of LoFTR's kind, in the order of the computation."""
+    golden = golden_arrays(folder, case)
+    maps = [network.encode(golden[f"image{side}_u8"].float()[:, None] / 255) for side in (0, 1)]
+    masks = (golden["mask0"], golden["mask1"]) if "mask0" in golden else None
+    layers = [f"loftr_coarse.layers.{index}" for index in range(8)]
+    with recorded(network, [*layers, "loftr_coarse", "fine_preprocess", "loftr_fine"]) as calls:
+        matches = network.match(*maps, masks)
+
+    got = {}
+    coarse = matches.coarse
+    shapes = [features.coarse.shape[2:] for features in maps]
+    tokens = [output.reshape(len(output), -1, 256) for output in calls["loftr_coarse"][0][1]]
+    grids = [of_side.view(len(of_side), *shape, 256) for of_side, shape in zip(tokens, shapes, strict=True)]
+    for side in (0, 1):
+        got[f"feat_c{side}"] = maps[side].coarse[:, ::4]
+        got[f"feat_f{side}"] = maps[side].fine[:, ::8, ::2, ::2]
+        for index, name in enumerate(layers):
+            got[f"layer{index}_{side}"] = calls[name][side][1].reshape(tokens[side].shape)[..., ::16]
+        got[f"coarse{side}"] = tokens[side][..., :: 2 if case == "same_size" else 4]
+        got[f"win{side}"] = calls["fine_preprocess"][side][1][:6]
+        got[f"fine{side}"] = calls["loftr_fine"][0][1][side][:6]
+        scale = golden[f"scale{side}"][coarse.batch] if f"scale{side}" in golden else 1.0
+        got[f"mkpts{side}_c"] = cell_points((coarse.cell0, coarse.cell1)[side], shapes[side][1]) * scale
+        got[f"mkpts{side}_f"] = (matches.points0, matches.points1)[side] * scale
+    confidence = confidence_of(network, *grids, masks)
+    got |= {"conf": confidence, "conf_rows": confidence[:, ::7]}
+    got |= {"conf_rowmax": confidence.amax(2), "conf_colmax": confidence.amax(1)}
+    got |= {"b_ids": coarse.batch, "i_ids": coarse.cell0, "j_ids": coarse.cell1, "mconf": coarse.confidence}
+    got |= {"expec_f": matches.expectation}
+
+    order = ["feat_", *(f"layer{index}_" for index in range(8)), "coarse", "conf", "b_ids", "i_ids", "j_ids"]
+    order += ["mconf", "win", "fine", "expec_f", "mkpts0_c", "mkpts1_c", "mkpts0_f", "mkpts1_f"]
+    names = [name for prefix in order for name in golden if name.startswith(prefix)]
+    assert len(names) == sum(not name.startswith(("image", "mask", "scale")) for name in golden)
+    return [Stage(name, got[name], golden[name], tolerance_of(name, tolerances)) for name in names]
+
+
+def random_network(make, gain=3.0):
+    """The network with seeded random weights, whose features differ enough to be matched."""
+    torch.manual_seed(0)
+    network = make()
+    with torch.no_grad():
+        network.backbone.layer3_outconv.weight.mul_(gain)
+    return network
+
+
+def textured(*shape, seed=1):
+    return torch.rand(shape, generator=torch.Generator().manual_seed(seed))
+
+
+def items_of(matches, item):
+    """Cells, confidence and points of one item of the batch."""
+    of_item = matches.coarse.batch == item
+    coarse = matches.coarse
+    values = (coarse.cell0, coarse.cell1, coarse.confidence, matches.points0, matches.points1, matches.expectation)
+    return [value[of_item] for value in values]
+
+
+def assert_same_matches(first, second):
+    assert len(first[0]) > 0
+    for got, expected in zip(first, second, strict=True):
+        torch.testing.assert_close(got, expected, rtol=1e-4, atol=1e-3)
+
+
+def item_of(maps, item):
+    return FeatureMaps(maps.coarse[item : item + 1], maps.fine[item : item + 1])
+
+
+@torch.inference_mode()
+def check_batch_equals_single(network, size0, size1):
+    """Two pairs in a batch match as each does alone, masks included."""
+    images = textured(2, 1, *size0), textured(2, 1, *size1, seed=2)
+    maps = [network.encode(image) for image in images]
+    masks = [torch.ones(2, *(side // 8 for side in size), dtype=torch.bool) for size in (size0, size1)]
+    masks[0][1, :, -4:], masks[1][0, -4:] = False, False
+    both = network.match(*maps, tuple(masks))
+    for item in (0, 1):
+        alone = [network.encode(image[item : item + 1]) for image in images]
+        single = network.match(*alone, tuple(mask[item : item + 1] for mask in masks))
+        assert_same_matches(items_of(both, item), items_of(single, 0))
+
+
+@torch.inference_mode()
+def check_nothing_matches_padding(network, size):
+    """No point on padding, nor within the border of the content, even at threshold zero."""
+    maps = [network.encode(textured(1, 1, *size))] * 2
+    h, w = size[0] // 8, size[1] // 8
+    masks = [torch.zeros(1, h, w, dtype=torch.bool) for _ in maps]
+    masks[0][:, : h - 3, : w - 2], masks[1][:, : h - 1, : w - 4] = True, True
+    matches = network.match(*maps, tuple(masks))
+    assert len(matches.points0) > 0
+    for cells, mask in zip((matches.coarse.cell0, matches.coarse.cell1), masks, strict=True):
+        extent = mask[0].any(1).sum(), mask[0].any(0).sum()
+        for position, length in zip((cells // w, cells % w), extent, strict=True):
+            assert network.border <= position.min() and position.max() < length - network.border
+    empty = network.match(*maps, (masks[0], torch.zeros_like(masks[1])))
+    check_empty(empty)
+
+
+def check_empty(matches):
+    coarse = matches.coarse
+    for cells in (coarse.batch, coarse.cell0, coarse.cell1):
+        assert cells.shape == (0,) and cells.dtype == torch.int64
+    assert coarse.confidence.shape == (0,)
+    assert matches.points0.shape == matches.points1.shape == (0, 2)
+    assert matches.expectation.shape == (0, 3)

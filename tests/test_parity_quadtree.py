@@ -1,0 +1,130 @@
+"""QuadTree against the golden vectors of its reference; run as a script it prints the table of differences."""
+
+from functools import cache
+
+import pytest
+import torch
+from golden import Stage, assert_stages, golden_arrays, needs_golden, print_table, standin_state
+from semi_dense import (
+    check_batch_equals_single,
+    check_empty,
+    check_nothing_matches_padding,
+    loftr_stages,
+    random_network,
+    textured,
+)
+
+from mkpc_kaggle.matchers.networks.grids import mean_pool, quads, unquads
+from mkpc_kaggle.matchers.networks.quadtree import Quadtree, QuadtreeConfig, attend, quadtree_attention
+
+CASES = ("same_size", "diff_size_extension", "masked_batch")
+OPERATORS = ("attention_op", "attention_op_unequal")
+TOLERANCES = dict.fromkeys(("feat_", "layer", "coarse"), 1e-4)
+TOLERANCES |= {"conf": 2e-4, "mconf": 2e-4, "win": 2e-4, "fine": 2e-4, "expec_f": 5e-4, "mkpts1_f": 2e-3}
+HEADS = 2  # of the operator's golden vectors
+
+
+@cache
+def standin():
+    """With a backbone laid out as the reference's, whose maps then agree to the last bit here.
+
+    Which key cells are kept is discontinuous: in the masked case the rounding of the channels-last layout, well
+    within the tolerance of the maps, tips a near tie. LoFTR's vectors test that layout with the same weights.
+    """
+    network = Quadtree()
+    network.load_state_dict(standin_state("quadtree"))
+    network.backbone.to(memory_format=torch.contiguous_format)
+    return network
+
+
+def stages_of(case):
+    return loftr_stages("quadtree", case, standin(), TOLERANCES)
+
+
+def operator_stages(case):
+    golden = golden_arrays("quadtree", case)
+    q, k, v = (by_head(golden[name].permute(0, 2, 3, 1)) for name in "qkv")
+    topks = tuple(golden["topks"][:2].tolist())
+    pooled = [mean_pool(x, 4).flatten(1, 2)[:, None] for x in (q, k, v)]
+    kept = attend(*pooled, topks[0]).kept  # (2 HEADS, 1, cells, 6)
+    kept = kept[:, 0].unflatten(0, (-1, HEADS)).permute(0, 2, 3, 1)
+    # Which are kept counts, and not their order.
+    yield Stage("top_idx_level0", kept.sort(dim=2).values, golden["top_idx_level0"].long().sort(dim=2).values)
+    message = quadtree_attention(q, k, v, golden["level_weight"].softmax(0), topks)
+    message = message.flatten(1, 2).unflatten(0, (-1, HEADS)).transpose(1, 2)  # (2, h w, HEADS, D)
+    yield Stage("message", message, golden["message"], 1e-5)
+
+
+def by_head(grid):
+    """(N, h, w, HEADS D) -> (N HEADS, h, w, D)."""
+    return grid.unflatten(3, (HEADS, -1)).permute(0, 3, 1, 2, 4).flatten(0, 1)
+
+
+@needs_golden
+@pytest.mark.parametrize("case", CASES)
+def test_stages(case):
+    assert_stages(stages_of(case))
+
+
+@needs_golden
+@pytest.mark.parametrize("case", OPERATORS)
+def test_operator(case):
+    assert_stages(operator_stages(case))
+
+
+@needs_golden
+@torch.inference_mode()
+def test_no_match_at_threshold_one():
+    network = Quadtree(QuadtreeConfig(threshold=1.0))
+    network.load_state_dict(standin_state("quadtree"))
+    golden = golden_arrays("quadtree", "same_size")
+    check_empty(network.match(*(network.encode(golden[f"image{s}_u8"].float()[:, None] / 255) for s in (0, 1))))
+
+
+def network(**changes):
+    settings = {"threshold": 0.0, "temperature": 0.03, "topks": (3, 2)} | changes
+    return random_network(lambda: Quadtree(QuadtreeConfig(**settings)))
+
+
+def test_batch_equals_single():
+    check_batch_equals_single(network(border=0), (64, 96), (96, 64))
+
+
+def test_nothing_matches_padding():
+    check_nothing_matches_padding(network(border=1), (96, 64))
+
+
+@torch.inference_mode()
+def test_fewer_cells_than_are_kept():
+    small = network(topks=(16, 8))
+    check_empty(small.match(small.encode(textured(1, 1, 32, 32)), small.encode(textured(1, 1, 32, 64))))
+
+
+def test_sides_must_fit():
+    with pytest.raises(ValueError, match="multiples of 32"):
+        network().encode(torch.zeros(1, 1, 32, 40))
+
+
+def test_quads_and_back():
+    grid = torch.arange(2 * 4 * 6 * 3).view(2, 4, 6, 3)
+    cells = quads(grid)
+    assert cells[1, 4].tolist() == grid[1, 2:4, 2:4].flatten(0, 1).tolist()
+    assert torch.equal(unquads(cells, 4, 6), grid)
+
+
+def test_attention_with_all_cells_kept_is_that_of_each_level():
+    generator = torch.Generator().manual_seed(0)
+    q, k, v = (torch.randn(3, 8, width, 16, generator=generator) for width in (12, 4, 4))
+    shares = torch.tensor([0.2, 0.3, 0.5])
+    expected = torch.zeros(3, 8, 12, 16)
+    for share, factor in zip(shares, (4, 2, 1), strict=True):
+        pooled = [mean_pool(x, factor) for x in (q, k, v)]
+        flat = [x.flatten(1, 2) for x in pooled]
+        message = torch.nn.functional.scaled_dot_product_attention(*flat).view_as(pooled[0])
+        expected += share * message.repeat_interleave(factor, 1).repeat_interleave(factor, 2)
+    torch.testing.assert_close(quadtree_attention(q, k, v, shares, (99, 99)), expected)
+
+
+if __name__ == "__main__":
+    stages = [*((case, stages_of(case)) for case in CASES), *((case, operator_stages(case)) for case in OPERATORS)]
+    print_table("quadtree", stages)

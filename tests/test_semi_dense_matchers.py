@@ -1,0 +1,90 @@
+"""LoFTR and QuadTree as matchers, from checkpoints wrapped as the public ones are, with random weights."""
+
+from types import ModuleType
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from mkpc_kaggle.geometry.coordinates import Box, Size, View
+from mkpc_kaggle.matchers import loftr, quadtree
+from mkpc_kaggle.matchers.contract import Picture, encoding_bytes
+from mkpc_kaggle.matchers.networks.loftr import Loftr
+from mkpc_kaggle.matchers.networks.quadtree import Quadtree
+from mkpc_kaggle.matchers.semi_dense import PREFIX, SemiDenseMatcher, SemiDenseOptions, content_mask
+from mkpc_kaggle.recipe import Recipe, Unit
+from mkpc_kaggle.two_stage import TwoStageMatcher
+from mkpc_kaggle.weights import UNVERIFIED, WeightFile, WeightStore
+
+MODULES: list[tuple[ModuleType, type[nn.Module]]] = [(loftr, Loftr), (quadtree, Quadtree)]
+pytestmark = pytest.mark.filterwarnings("ignore:.*is not verified")
+
+
+@pytest.fixture(scope="module", params=MODULES, ids=["loftr", "quadtree"])
+def matcher(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> SemiDenseMatcher:
+    module, network = request.param
+    torch.manual_seed(0)
+    wrapped = {PREFIX + name: tensor for name, tensor in network().state_dict().items()}
+    path = tmp_path_factory.mktemp("weights") / "network.ckpt"
+    torch.save({"state_dict": wrapped, "epoch": 3}, path)
+    store = WeightStore([path.parent], [WeightFile(path.name, -1, UNVERIFIED, "none", module.SLOT, "made here")])
+    return module.load(store, SemiDenseOptions(threshold=0.0), "cpu")
+
+
+def textured(height: int, width: int, seed: int = 0) -> np.ndarray:
+    noise = np.random.default_rng(seed).integers(0, 255, (height // 4 + 1, width // 4 + 1), np.uint8)
+    return cv2.resize(noise, (width, height), interpolation=cv2.INTER_CUBIC)
+
+
+def picture(height: int, width: int, matcher: SemiDenseMatcher, seed: int = 0) -> Picture:
+    box = Box.whole(Size(width, height))
+    view = View.fit(box, long_side=max(width, height), multiple=matcher.spec.multiple)
+    return Picture(view.render(textured(height, width, seed)), view)
+
+
+@pytest.mark.parametrize("sizes", [((97, 131), (160, 88)), ((33, 47), (128, 96)), ((128, 128), (128, 128))])
+def test_matches_lie_on_the_content_whatever_the_sizes(
+    matcher: SemiDenseMatcher, sizes: tuple[tuple[int, int], tuple[int, int]]
+) -> None:
+    pictures = [picture(*size, matcher, seed) for seed, size in enumerate(sizes)]
+    first, second = (matcher.encode([one])[0] for one in pictures)
+    (matches,) = matcher.match([first], [second])
+    views = [one.view for one in pictures]
+    # Windows reach a few pixels over the edge; the cells themselves are content.
+    on_content = Box.whole(views[0].content).contains(matches.points0 + 1)
+    assert on_content.all()
+    assert len(matches.to_image(*views)) <= len(matches)
+    assert encoding_bytes(first) > 10_000
+
+
+def test_the_mask_is_true_where_a_cell_begins_on_content(matcher: SemiDenseMatcher) -> None:
+    (encoded,) = matcher.encode([picture(97, 131, matcher)])
+    mask = content_mask(encoded)
+    assert mask.shape[1:] == encoded.maps.coarse.shape[2:]
+    assert mask.sum() == 13 * 17
+
+
+def test_points_of_image_0_are_corners_of_cells_in_our_convention(matcher: SemiDenseMatcher) -> None:
+    (encoded,) = matcher.encode([picture(128, 160, matcher)])
+    (matches,) = matcher.match([encoded], [encoded])
+    assert len(matches) > 0
+    np.testing.assert_array_equal((matches.points0 + 0.5) % 8, 0)
+
+
+def test_encoding_in_a_batch_is_encoding_alone(matcher: SemiDenseMatcher) -> None:
+    pictures = [picture(96, 128, matcher, seed) for seed in range(2)]
+    together, alone = matcher.encode(pictures), [matcher.encode([one])[0] for one in pictures]
+    for one, other in zip(together, alone, strict=True):
+        torch.testing.assert_close(one.maps.coarse, other.maps.coarse, rtol=1e-3, atol=1e-4)
+
+
+def test_nothing_to_encode_and_flat_pictures_are_legal(matcher: SemiDenseMatcher) -> None:
+    assert matcher.encode([]) == []
+    recipe = Recipe((Unit(1, matcher.spec.name, 96), Unit(2, matcher.spec.name, 128)))
+    run = TwoStageMatcher(recipe, matchers={matcher.spec.name: matcher})
+    for pixels in (np.full((60, 80), 128, np.uint8), textured(47, 33)):
+        match = run(pixels, textured(80, 60))
+        assert [result.failure for result in match.results] == ["", ""]
+        assert np.isfinite(match.estimate.matrix).all()
