@@ -1,4 +1,4 @@
-"""LoFTR and QuadTree as matchers, from checkpoints wrapped as the public ones are, with random weights."""
+"""The semi-dense networks as matchers, from checkpoints wrapped as the public ones are, with random weights."""
 
 from types import ModuleType
 
@@ -9,8 +9,9 @@ import torch
 from torch import nn
 
 from mkpc_kaggle.geometry.coordinates import Box, Size, View
-from mkpc_kaggle.matchers import loftr, quadtree
+from mkpc_kaggle.matchers import aspanformer, loftr, quadtree
 from mkpc_kaggle.matchers.contract import Picture, encoding_bytes
+from mkpc_kaggle.matchers.networks.aspanformer import AspanFormer
 from mkpc_kaggle.matchers.networks.loftr import Loftr
 from mkpc_kaggle.matchers.networks.quadtree import Quadtree
 from mkpc_kaggle.matchers.semi_dense import PREFIX, SemiDenseMatcher, SemiDenseOptions, content_mask
@@ -18,11 +19,15 @@ from mkpc_kaggle.recipe import Recipe, Unit
 from mkpc_kaggle.two_stage import TwoStageMatcher
 from mkpc_kaggle.weights import UNVERIFIED, WeightFile, WeightStore
 
-MODULES: list[tuple[ModuleType, type[nn.Module]]] = [(loftr, Loftr), (quadtree, Quadtree)]
+MODULES: list[tuple[ModuleType, type[nn.Module]]] = [
+    (loftr, Loftr),
+    (quadtree, Quadtree),
+    (aspanformer, AspanFormer),
+]
 pytestmark = pytest.mark.filterwarnings("ignore:.*is not verified")
 
 
-@pytest.fixture(scope="module", params=MODULES, ids=["loftr", "quadtree"])
+@pytest.fixture(scope="module", params=MODULES, ids=["loftr", "quadtree", "aspanformer"])
 def matcher(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> SemiDenseMatcher:
     module, network = request.param
     torch.manual_seed(0)

@@ -1,4 +1,4 @@
-"""The adapter that LoFTR and QuadTree share: backbone maps once a picture, matches of cells for a pair."""
+"""The adapter of the semi-dense networks: backbone maps once a picture, matches of coarse cells for a pair."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -83,7 +83,10 @@ def to_matches(found: SemiDenseMatches) -> Matches:
     return Matches(points0, points1, found.coarse.confidence.float().cpu().numpy())
 
 
-def load_network(network: SemiDenseNetwork[Any], weights: WeightStore, slot: str) -> None:
-    """Fill a network from the published checkpoint, whose names have the training wrapper's prefix."""
+def load_network(network: SemiDenseNetwork[Any], weights: WeightStore, slot: str, *, unused: str = "$^") -> None:
+    """Fill a network from the published checkpoint, whose names have the training wrapper's prefix.
+
+    Position tables, which are computed, and names that match ``unused`` are set aside.
+    """
     tensors = {name.removeprefix(PREFIX): tensor for name, tensor in weights.load(slot).items()}
-    load_into(network, tensors, what=slot, unused=r"pos_encoding\.pe$")
+    load_into(network, tensors, what=slot, unused=rf".*pos_encoding\.pe$|{unused}")

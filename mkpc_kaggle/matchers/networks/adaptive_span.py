@@ -1,0 +1,121 @@
+"""Attention whose keys lie where a predicted flow points, as far apart as it is uncertain.
+
+Source: Chen et al., "ASpanFormer: Detector-Free Image Matching with Adaptive Span Transformer", 2022, section 3.
+Here "cells" are 2x2 blocks of queries that share their keys, 8 x 8 samples of the key map.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from mkpc_kaggle.matchers.networks.grids import mask_valid, mean_pool, quads, softmax_attention
+
+SIDE = 8  # samples on each axis
+SAMPLES = SIDE * SIDE
+CELLS_AT_ONCE = {"cpu": 256, "cuda": 8192}  # a cell's samples take 128 KiB; a CPU likes them in its cache
+MASKED = -1e8  # a logit; finite, so that where all are masked the attention is uniform
+
+
+@dataclass(frozen=True, eq=False)
+class Span:
+    """Of P cells of queries: ``centre`` and ``step`` (N, P, 2), (x, y) in cells of the level's key map.
+
+    A sample at (x, y) reads around index (x - 0.5, y - 0.5): the origin is the corner of the key map.
+    """
+
+    centre: Tensor
+    step: Tensor
+
+    def samples(self) -> Tensor:
+        """(N, P, 64, 2): x varies slowest."""
+        axis = torch.arange(SIDE, dtype=self.centre.dtype, device=self.centre.device) - (SIDE - 1) / 2
+        offsets = torch.cartesian_prod(axis, axis)  # (64, 2)
+        return self.centre[:, :, None] + offsets * self.step[:, :, None]
+
+
+def adaptive_span(flow: Tensor, radius: float, factor: int) -> Span:
+    """Flow (N, h, w, 4) -> the span of each cell at the level that pools by ``factor``.
+
+    The flow is the target (x, y) in coarse cells of the other image and its log-variances. The samples cover
+    two ``radius`` deviations, with a step of at least one. As published, centres are in units of the level but
+    steps are not.
+    """
+    deviation = torch.exp(flow[..., 2:] / 2) * radius
+    steps = (2 * deviation / SIDE).clamp(min=1.0)
+    pooled = mean_pool(torch.cat([flow[..., :2] / factor, steps], dim=-1), 2 * factor).flatten(1, 2)  # (N, P, 4)
+    return Span(*pooled.chunk(2, dim=-1))
+
+
+def sample_usable(samples: Tensor, mask: Tensor, key_size: tuple[int, int], factor: int) -> Tensor:
+    """(N, P, 64) bool: where the mask of the *query* image reads valid at the samples.
+
+    The mask should be the key image's, but it is with this oversight that the networks were published.
+    Coordinates are relative to the key map (h, w); ``mask`` is (N, h, w) at the coarse level.
+    """
+    valid = mask_valid(mask, factor).float()[:, None]
+    size = samples.new_tensor([key_size[1], key_size[0]])
+    read = functional.grid_sample(valid, samples / (size / 2) - 1, mode="nearest", align_corners=False)
+    return read[:, 0] == 1
+
+
+def span_attention(
+    q: Tensor, k: Tensor, v: Tensor, samples: Tensor, heads: int, usable: Tensor | None = None
+) -> Tensor:
+    """Queries (N, h, w, C), keys and values (N, h_key, w_key, C), samples (N, h w / 4, 64, 2) -> (N, h, w, C).
+
+    Samples outside the key map have a zero key and value, yet take part unless ``usable`` excludes them. The
+    messages stand cell after cell, four queries each, and are read as rows of the map as they stand: the
+    published networks were trained with this permutation within each two rows.
+    """
+    table = torch.cat([k, v], dim=-1)  # (N, h_key, w_key, 2 C)
+    index, weight = bilinear_taps(samples.flatten(0, 1), len(samples), table.shape[1], table.shape[2])
+    cells = quads(q).flatten(0, 1) * (q.shape[3] // heads) ** -0.5  # (N P, 4, C)
+    rows = table.flatten(0, 2)
+    messages = []
+    at_once = CELLS_AT_ONCE.get(q.device.type, 256)
+    for start in range(0, len(cells), at_once):
+        part = slice(start, start + at_once)
+        taps, shares = index[part].flatten(0, 1), weight[part].flatten(0, 1)
+        # A bag of four weighted rows is bilinear sampling, all channels of keys and values at one go.
+        read = functional.embedding_bag(taps, rows, per_sample_weights=shares, mode="sum")  # (p 64, 2 C)
+        out = None if usable is None else ~usable.flatten(0, 1)[part]
+        messages.append(_attend_cells(cells[part], read.view(-1, SAMPLES, read.shape[1]), heads, out))
+    return torch.cat(messages).view_as(q)
+
+
+def bilinear_taps(samples: Tensor, batch: int, height: int, width: int) -> tuple[Tensor, Tensor]:
+    """Samples (N P, 64, 2) of N maps -> the rows (N P, 64, 4) int64 of the flattened maps, and their weights.
+
+    Rows outside the map have no weight.
+    """
+    corner = (samples - 0.5).floor()
+    part = samples - 0.5 - corner  # (N P, 64, 2)
+    # Far outside, any index does; clamping keeps it in the range of integers.
+    left, top = corner[..., 0].clamp(-2, width).long(), corner[..., 1].clamp(-2, height).long()
+    weight_x, x = _axis_taps(left, part[..., 0], width)
+    weight_y, y = _axis_taps(top, part[..., 1], height)
+    first = torch.arange(batch, device=samples.device).repeat_interleave(len(samples) // batch) * (height * width)
+    index = first[:, None, None, None] + y[..., :, None] * width + x[..., None, :]  # (N P, 64, 2, 2)
+    return index.flatten(2), (weight_y[..., :, None] * weight_x[..., None, :]).flatten(2)
+
+
+def _axis_taps(low: Tensor, part: Tensor, length: int) -> tuple[Tensor, Tensor]:
+    """Weights and indices (..., 2) of the neighbours ``low`` and ``low + 1`` on an axis."""
+    index = torch.stack([low, low + 1], dim=-1)
+    weight = torch.stack([1 - part, part], dim=-1)
+    return weight * ((index >= 0) & (index < length)), index.clamp(0, length - 1)
+
+
+def _attend_cells(queries: Tensor, read: Tensor, heads: int, excluded: Tensor | None) -> Tensor:
+    """Scaled queries (p, 4, C), samples (p, 64, 2 C) of keys and values, ``excluded`` (p, 64) -> (p, 4, C)."""
+    keys, values = (half.chunk(heads, dim=-1) for half in read.chunk(2, dim=-1))
+    found = []
+    # Head by head: batched products of all heads would first copy the samples.
+    for query, key, value in zip(queries.chunk(heads, dim=-1), keys, values, strict=True):
+        logits = query @ key.transpose(1, 2)  # (p, 4, 64)
+        if excluded is not None:
+            logits.masked_fill_(excluded[:, None], MASKED)
+        found.append(softmax_attention(logits, value))
+    return torch.cat(found, dim=-1)

@@ -1,0 +1,173 @@
+"""DKM's warp refiners and the local correlation that they look at (Edstedt et al. 2023, section 3.3).
+
+Normalised coordinates: (x, y) in [-1, 1], where +-1 are the outer edges of an image; the centre of pixel
+(column j, row i) of w x h is ((2 j + 1) / w - 1, (2 i + 1) / h - 1). Resizing a map of them leaves its values.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from mkpc_kaggle.matchers.networks.grids import as_grid, as_map
+from mkpc_kaggle.matchers.networks.resnet50 import convolve_and_norm
+
+HIDDEN_BLOCKS = 8
+
+
+@dataclass(frozen=True)
+class RefinerShape:
+    """``features`` of either image, ``embedding`` of the displacement, correlation ``radius`` (None: none)."""
+
+    features: int
+    embedding: int
+    radius: int | None
+    hidden: int
+
+    @property
+    def inputs(self) -> int:
+        window = 0 if self.radius is None else (2 * self.radius + 1) ** 2
+        return 2 * self.features + self.embedding + window
+
+
+SHAPES = {  # by stride
+    16: RefinerShape(512, 128, 7, 1377),
+    8: RefinerShape(512, 64, 3, 1137),
+    4: RefinerShape(256, 32, 2, 569),
+    2: RefinerShape(64, 16, None, 144),
+    1: RefinerShape(3, 6, None, 24),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """``flow`` (B, 2, h, w): where each pixel lies in the other image, absolute and normalised, unclamped;
+    ``certainty`` (B, 1, h, w): logits. Both float32.
+    """
+
+    flow: Tensor
+    certainty: Tensor
+
+    def resized(self, size: torch.Size) -> "Estimate":
+        return Estimate(resize(self.flow, size), resize(self.certainty, size))
+
+
+class Refiner(nn.Module):
+    """Depthwise 5x5 and 1x1 convolutions by turns on what both images show where the flow puts them."""
+
+    def __init__(self, shape: RefinerShape) -> None:
+        super().__init__()
+        self.radius = shape.radius
+        self.block1 = block(shape.inputs, shape.hidden)
+        self.hidden_blocks = nn.Sequential(*(block(shape.hidden, shape.hidden) for _ in range(HIDDEN_BLOCKS)))
+        self.out_conv = nn.Conv2d(shape.hidden, 3, 1)
+        self.disp_emb = nn.Conv2d(2, shape.embedding, 1)
+
+    def forward(self, query: Tensor, support: Tensor, flow: Tensor) -> Tensor:
+        """Corrections (B, 3, h, w) of features (B, C, h, w) of both images and a flow (B, 2, h, w).
+
+        Channel 0 is added to the certainty's logit; 1 and 2 are x and y in eighths of a pixel of this scale.
+        """
+        x = self._look(query, support, flow)  # (B, inputs, h, w)
+        for depthwise, norm, _, mix in (self.block1, *self.hidden_blocks):
+            # One name for all: no more than two maps are alive at a time.
+            x = convolve_and_norm(depthwise, norm, x).relu_()
+            x = by_rows(mix, x)
+        corrections: Tensor = self.out_conv(x)
+        return corrections
+
+    def _look(self, query: Tensor, support: Tensor, flow: Tensor) -> Tensor:
+        seen = functional.grid_sample(
+            support, as_grid(flow), mode="bilinear", padding_mode="zeros", align_corners=False
+        )
+        parts = [query, seen, self.disp_emb(flow - identity_map(flow))]
+        if self.radius is not None:
+            parts.append(local_correlation(query, support, flow, self.radius))
+        return torch.cat(parts, dim=1).contiguous(memory_format=torch.channels_last)
+
+
+def block(inputs: int, outputs: int) -> nn.Sequential:
+    return nn.Sequential(
+        nn.Conv2d(inputs, outputs, 5, padding=2, groups=inputs),
+        nn.BatchNorm2d(outputs),
+        nn.ReLU(inplace=True),
+        nn.Conv2d(outputs, outputs, 1),
+    )
+
+
+def by_rows(pointwise: nn.Conv2d, x: Tensor) -> Tensor:
+    """A 1x1 convolution of (B, C, h, w), channels last: most of the network's work.
+
+    Rows go in as a batch, without a copy. A batch of one on one thread PyTorch leaves to MKL's matrix product
+    instead of oneDNN's convolution, which is twice as fast on AMD.
+    """
+    rows = as_grid(x).reshape(-1, 1, x.shape[3], x.shape[1])  # (B h, 1, w, C)
+    mixed: Tensor = pointwise(as_map(rows))  # (B h, C', 1, w)
+    return as_map(as_grid(mixed).reshape(len(x), x.shape[2], x.shape[3], -1))
+
+
+def refined(estimate: Estimate, corrections: Tensor, stride: int, full: torch.Size) -> Estimate:
+    """The estimate after a refiner's corrections; ``full`` (H, W): the size of stride 1 in the same pass."""
+    height, width = full
+    unit = corrections.new_tensor([stride / (4 * width), stride / (4 * height)])  # an eighth of a pixel
+    flow = estimate.flow + corrections[:, 1:] * unit[:, None, None]
+    return Estimate(flow, estimate.certainty + corrections[:, :1])
+
+
+def local_correlation(query: Tensor, support: Tensor, flow: Tensor, radius: int) -> Tensor:
+    """Dot products of each pixel's features with the support's around its target, over sqrt(C).
+
+    (B, C, h, w) both and (B, 2, h, w) -> (B, (2 radius + 1)^2, h, w), float32. The window moves in steps of one
+    pixel of the support, row by row; the support is zero outside, bilinear between pixels.
+
+    All samples of a pixel have one fraction: its products with the (2 radius + 2)^2 nearest pixels are blended.
+    """
+    batch, channels, height, width = support.shape
+    size = flow.new_tensor([width, height])
+    target = ((as_grid(flow) + 1) * size - 1) / 2  # (B, h, w, 2) pixels
+    corner = target.floor()
+    fraction_x, fraction_y = (target - corner).reshape(-1, 2, 1, 1).unbind(1)  # (P, 1, 1)
+
+    reach = torch.arange(-radius, radius + 2, device=flow.device)
+    columns, rows = (corner.reshape(-1, 2, 1).long() + reach).unbind(1)  # (P, 2 radius + 2)
+    outside = _beyond(rows, height)[:, :, None] | _beyond(columns, width)[:, None]  # (P, 2 r + 2, 2 r + 2)
+    image = torch.arange(batch, device=flow.device).repeat_interleave(height * width)[:, None] * height
+    index = ((image + rows.clamp(0, height - 1)) * width)[:, :, None] + columns.clamp(0, width - 1)[:, None]
+
+    products = _products(as_grid(query).flatten(0, 2), as_grid(support).flatten(0, 2), index.flatten(1))
+    products = products.view_as(index).masked_fill_(outside, 0)
+    products = torch.lerp(products[:, :-1], products[:, 1:], fraction_y)
+    products = torch.lerp(products[..., :-1], products[..., 1:], fraction_x)  # (P, 2 r + 1, 2 r + 1)
+    return as_map(products.mul_(channels**-0.5).view(batch, height, width, -1))
+
+
+def _beyond(index: Tensor, length: int) -> Tensor:
+    return (index < 0) | (index >= length)
+
+
+def _products(queries: Tensor, keys: Tensor, index: Tensor) -> Tensor:
+    """(P, K) dot products of queries (P, C) with their own keys each, (N, C) at ``index`` (P, K)."""
+    neighbours, channels = index.shape[1], keys.shape[1]
+    # The gathered keys of a block stay within a processor's cache; a GPU wants few large blocks.
+    floats = 2**26 if keys.is_cuda else 2**20
+    at_once = max(1, floats // (neighbours * channels))
+    products = queries.new_empty(index.shape)
+    blocks = zip(*(torch.split(x, at_once) for x in (queries, index, products)), strict=True)
+    for some, positions, out in blocks:
+        gathered = keys.index_select(0, positions.flatten()).view(-1, neighbours, channels)
+        # A row times a matrix: the other way round MKL takes ten times as long.
+        torch.bmm(some[:, None], gathered.transpose(1, 2), out=out[:, None])
+    return products
+
+
+def resize(x: Tensor, size: torch.Size) -> Tensor:
+    """(B, C, h, w) -> (B, C, *size), bilinear without antialiasing, larger or smaller."""
+    return functional.interpolate(x, tuple(size), mode="bilinear", align_corners=False)
+
+
+def identity_map(like: Tensor) -> Tensor:
+    """(1, 2, h, w): the normalised pixel centres of a map (..., h, w), channel 0 x and 1 y."""
+    height, width = like.shape[-2:]
+    x, y = (torch.linspace(1 / n - 1, 1 - 1 / n, n, device=like.device) for n in (width, height))
+    return torch.stack([x.expand(height, width), y[:, None].expand(height, width)])[None]

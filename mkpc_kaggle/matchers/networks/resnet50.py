@@ -1,0 +1,81 @@
+"""ResNet-50 as a pyramid of features: He et al., "Deep Residual Learning for Image Recognition", 2016.
+
+The stride of a bottleneck sits in its 3x3 convolution. Parameter names are the usual ones. For inference in
+evaluation mode only.
+"""
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+EXPANSION = 4
+
+
+class Bottleneck(nn.Module):
+    """1x1, 3x3 and 1x1 convolutions beside a shortcut, which is a 1x1 convolution where the shape changes."""
+
+    def __init__(self, inputs: int, width: int, stride: int = 1) -> None:
+        super().__init__()
+        outputs = EXPANSION * width
+        self.conv1 = nn.Conv2d(inputs, width, 1, bias=False)
+        self.bn1 = nn.BatchNorm2d(width)
+        self.conv2 = nn.Conv2d(width, width, 3, stride, 1, bias=False)
+        self.bn2 = nn.BatchNorm2d(width)
+        self.conv3 = nn.Conv2d(width, outputs, 1, bias=False)
+        self.bn3 = nn.BatchNorm2d(outputs)
+        self.downsample = nn.Sequential()
+        if inputs != outputs:
+            self.downsample = nn.Sequential(
+                nn.Conv2d(inputs, outputs, 1, stride, bias=False), nn.BatchNorm2d(outputs)
+            )
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, inputs, h, w) -> (B, 4 width, ceil(h / stride), ceil(w / stride))."""
+        y = convolve_and_norm(self.conv1, self.bn1, x).relu_()
+        y = convolve_and_norm(self.conv2, self.bn2, y).relu_()
+        y = convolve_and_norm(self.conv3, self.bn3, y)
+        return y.add_(self.downsample(x)).relu_()
+
+
+def stage(inputs: int, width: int, blocks: int, stride: int) -> nn.Sequential:
+    later = [Bottleneck(EXPANSION * width, width) for _ in range(blocks - 1)]
+    return nn.Sequential(Bottleneck(inputs, width, stride), *later)
+
+
+class ResNet50(nn.Module):
+    """The classifier is loaded because checkpoints carry it, and never used."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.conv1 = nn.Conv2d(3, 64, 7, 2, 3, bias=False)
+        self.bn1 = nn.BatchNorm2d(64)
+        self.layer1 = stage(64, 64, blocks=3, stride=1)
+        self.layer2 = stage(256, 128, blocks=4, stride=2)
+        self.layer3 = stage(512, 256, blocks=6, stride=2)
+        self.layer4 = stage(1024, 512, blocks=3, stride=2)
+        self.fc = nn.Linear(2048, 1000)
+
+    def forward(self, image: Tensor, coarsest: int = 32) -> tuple[Tensor, ...]:
+        """Features at strides 2, 4, 8, 16 and 32, as far as ``coarsest``, of images (B, 3, H, W) of any size.
+
+        (B, C, h, w) with C = 64, 256, 512, 1024, 2048; every halving of a side rounds up.
+        """
+        levels = [convolve_and_norm(self.conv1, self.bn1, image).relu_()]
+        x = functional.max_pool2d(levels[0], 3, stride=2, padding=1)
+        for stride, layer in zip(
+            (4, 8, 16, 32), (self.layer1, self.layer2, self.layer3, self.layer4), strict=True
+        ):
+            if stride <= coarsest:
+                x = layer(x)
+                levels.append(x)
+        return tuple(levels)
+
+
+def convolve_and_norm(conv: nn.Conv2d, norm: nn.BatchNorm2d, x: Tensor) -> Tensor:
+    """The batch norm of the convolution of ``x``; the norm goes into the weights, which are fewer than pixels."""
+    assert norm.running_mean is not None
+    assert norm.running_var is not None
+    scale = norm.weight * torch.rsqrt(norm.running_var + norm.eps)
+    mean = norm.running_mean if conv.bias is None else norm.running_mean - conv.bias
+    weight, bias = conv.weight * scale[:, None, None, None], norm.bias - mean * scale
+    return functional.conv2d(x, weight, bias, conv.stride, conv.padding, groups=conv.groups)
