@@ -142,7 +142,7 @@ def record_of(index: int, match: PairMatch, *, decode: float, cluster: float, es
                 result.match_seconds,
                 result.failure,
             )
-            for result, start in zip(match.results, starts, strict=False)
+            for result, start in zip(match.results, starts[:-1], strict=True)
         ),
         match.regions,
         decode,
