@@ -5,7 +5,7 @@ from contextlib import contextmanager
 import torch
 from golden import Stage, golden_arrays
 
-from mkpc_kaggle.matchers.networks.coarse_matching import log_root_confidence, similarity
+from mkpc_kaggle.matchers.networks.coarse_matching import Cells, levels
 from mkpc_kaggle.matchers.networks.fine_matching import cell_points
 from mkpc_kaggle.matchers.networks.resnet_fpn import FeatureMaps
 
@@ -27,7 +27,13 @@ def recorded(network, names):
 
 def confidence_of(network, grid0, grid1, masks=None):
     """The full confidence matrix (N, L, S)."""
-    return log_root_confidence(similarity(grid0, grid1, network.similarity_scale, masks)).mul(2).exp()
+    masks = masks or [torch.ones(grid.shape[:3], dtype=torch.bool) for grid in (grid0, grid1)]
+    pairs = zip(grid0 * network.similarity_scale, grid1, *masks, strict=True)
+    all_cells = [
+        Cells(first.flatten(0, 1), second.flatten(0, 1), mask0.flatten(), mask1.flatten())
+        for first, second, mask0, mask1 in pairs
+    ]
+    return torch.stack([torch.cat(list(levels(cells))) for cells in all_cells]).mul(2).exp()
 
 
 def tolerance_of(name, tolerances):

@@ -36,7 +36,7 @@ from mkpc_kaggle.matchers.networks.dkm import (
 )
 from mkpc_kaggle.matchers.networks.dkm_coarse import kernel, posterior_mean
 from mkpc_kaggle.matchers.networks.dkm_refiner import Estimate, identity_map, local_correlation, refined
-from mkpc_kaggle.matchers.networks.resnet50 import ResNet50, convolve_and_norm
+from mkpc_kaggle.matchers.networks.resnet50 import ResNet50
 
 MODES = {
     "threshold": (Weighting.THRESHOLD, False),
@@ -436,19 +436,6 @@ def test_images_of_two_sizes_are_refused():
         network().match(features(size=(32, 40)), features(size=(32, 41)))
     with pytest.raises(ValueError, match="one size"):
         network().match(features(), features(fine=(70, 83)))
-
-
-@torch.inference_mode()
-@pytest.mark.parametrize(("bias", "groups", "stride"), [(True, 6, 1), (False, 1, 2)])
-def test_the_norm_goes_into_the_weights(bias, groups, stride):
-    torch.manual_seed(1)
-    conv = torch.nn.Conv2d(6, 12, 3, stride, 1, groups=groups, bias=bias)
-    norm = torch.nn.BatchNorm2d(12).eval()
-    for tensor in (norm.weight, norm.bias, norm.running_mean):
-        tensor.normal_()
-    norm.running_var.uniform_(0.1, 2)
-    x = torch.randn(2, 6, 9, 8)
-    torch.testing.assert_close(convolve_and_norm(conv, norm, x), norm(conv(x)), rtol=1e-5, atol=1e-5)
 
 
 @torch.inference_mode()

@@ -1,16 +1,20 @@
 """Matches of coarse cells: dual softmax, mutual nearest neighbours, threshold and border.
 
-Source: Sun et al. 2021, section 3.3. Only one matrix of all pairs of cells is ever held.
+Source: Sun et al. 2021, section 3.3. The matrix of all pairs of cells is never held: some rows at a time are
+computed twice, once for the sums of the softmaxes and once for the best of each row and column. At 1600 x 1200
+pixels the whole matrix would take 3.6 GB.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from mkpc_kaggle.matchers.networks.layers import linear
 from mkpc_kaggle.matchers.networks.linear_attention import Masks
 
-ROWS_AT_ONCE = 512
+ROWS_AT_ONCE = {"cpu": 256, "cuda": 8192}
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,49 +38,95 @@ def coarse_matches(
     A match is above ``threshold`` and the best of its row and of its column, border cells included; then those
     with a cell within ``border`` of the border of its content go. ``masks``: (N, h, w) bool, True at content.
     """
-    level = log_root_confidence(similarity(grid0, grid1, scale, masks))  # (N, L, S)
-    best0, partner = level.max(dim=2)  # (N, L)
-    best1 = level.amax(dim=1)  # (N, S)
-    inner0 = inner_cells(grid0, border, masks and masks[0])  # (N, L)
-    inner1 = inner_cells(grid1, border, masks and masks[1])  # (N, S)
+    masks0, masks1 = masks or (grid0.new_ones(grid.shape[:3], dtype=torch.bool) for grid in (grid0, grid1))
+    found = [
+        _matches_of_pair(*pair, scale, threshold, border)
+        for pair in zip(grid0, grid1, masks0, masks1, strict=True)
+    ]
+    batch = torch.cat([torch.full_like(cells, item) for item, (cells, _, _) in enumerate(found)])
+    return CoarseMatches(batch, *(torch.cat(values) for values in zip(*found, strict=True)))
+
+
+def _matches_of_pair(
+    grid0: Tensor,
+    grid1: Tensor,
+    mask0: Tensor,
+    mask1: Tensor,
+    scale: float | Tensor,
+    threshold: float,
+    border: int,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """``cell0``, ``cell1`` and ``confidence`` of one pair; grids (h, w, C), masks (h, w)."""
+    cells = Cells(grid0.flatten(0, 1) * scale, grid1.flatten(0, 1), mask0.flatten(), mask1.flatten())
+    best0, partner, best1 = best_levels(cells)
+    inner0, inner1 = inner_cells(mask0, border), inner_cells(mask1, border)
     confidence = torch.exp(2 * best0)
-    kept = (confidence > threshold) & (best0 == best1.gather(1, partner)) & inner0 & inner1.gather(1, partner)
-    batch, cell0 = kept.nonzero(as_tuple=True)
-    return CoarseMatches(batch, cell0, partner[batch, cell0], confidence[batch, cell0])
+    kept = (confidence > threshold) & (best0 == best1[partner]) & inner0 & inner1[partner]
+    cell0 = kept.nonzero()[:, 0]
+    return cell0, partner[cell0], confidence[cell0]
 
 
-def similarity(grid0: Tensor, grid1: Tensor, scale: float | Tensor, masks: Masks | None) -> Tensor:
-    """(N, L, S) float32: scaled dot products, minus infinity where either cell is padding."""
-    tokens0, tokens1 = grid0.float().flatten(1, 2), grid1.float().flatten(1, 2)
-    matrix = (tokens0 * scale) @ tokens1.transpose(1, 2)
-    if masks is not None:
-        matrix.masked_fill_(~masks[0].flatten(1)[:, :, None], -torch.inf)
-        matrix.masked_fill_(~masks[1].flatten(1)[:, None, :], -torch.inf)
-    return matrix
+@dataclass(frozen=True, eq=False)
+class Cells:
+    """The L and S coarse cells of a pair: features (L, C) and (S, C), content (L,) and (S,) bool."""
+
+    features0: Tensor
+    features1: Tensor
+    content0: Tensor
+    content1: Tensor
+
+    def similarity(self) -> Iterator[Tensor]:
+        """Blocks of rows (l, S) float32: dot products, minus infinity where either cell is padding."""
+        rows = ROWS_AT_ONCE.get(self.features0.device.type, 256)
+        blocks = zip(torch.split(self.features0.float(), rows), torch.split(self.content0, rows), strict=True)
+        keys = self.features1.float()
+        for features, content in blocks:
+            products = linear(features, keys)
+            if not (content.all() and self.content1.all()):
+                products.masked_fill_(~(content[:, None] & self.content1), -torch.inf)
+            yield products
 
 
-def log_root_confidence(matrix: Tensor) -> Tensor:
-    """Similarity (N, L, S), overwritten -> half the logarithm of the confidence.
+def half_log_sums(cells: Cells) -> tuple[Tensor, Tensor]:
+    """(L,) and (S,): half the logarithm of the sums of exp(similarity) over each row and each column."""
+    over_rows = []
+    over_columns = cells.features1.new_full(cells.content1.shape, -torch.inf, dtype=torch.float32)
+    for block in cells.similarity():
+        over_rows.append(block.logsumexp(dim=1))
+        over_columns = torch.logaddexp(over_columns, block.logsumexp(dim=0))
+    # A row of padding alone sums to nothing; finite, it stays minus infinity when its sum is taken off.
+    finite = torch.finfo(torch.float32).min
+    return torch.cat(over_rows).clamp_(min=finite).div_(2), over_columns.clamp_(min=finite).div_(2)
+
+
+def levels(cells: Cells) -> Iterator[Tensor]:
+    """Blocks of rows (l, S): half the logarithm of the confidence.
 
     The confidence is the softmax over the rows times that over the columns, so its logarithm is
     2 s_ij - log sum_j exp s_ij - log sum_i exp s_ij.
     """
-    blocks = torch.split(matrix, ROWS_AT_ONCE, dim=1)  # a log-sum-exp makes a copy of what it is given
-    over_rows = torch.cat([block.logsumexp(dim=2) for block in blocks], dim=1)  # (N, L)
-    over_columns = torch.stack([block.logsumexp(dim=1) for block in blocks]).logsumexp(dim=0)  # (N, S)
-    finite = torch.finfo(matrix.dtype).min  # a row of padding alone sums to nothing; keep it at minus infinity
-    matrix.sub_(over_rows.clamp_(min=finite).div_(2)[:, :, None])
-    return matrix.sub_(over_columns.clamp_(min=finite).div_(2)[:, None, :])
+    over_rows, over_columns = half_log_sums(cells)
+    first = 0
+    for block in cells.similarity():
+        yield block.sub_(over_rows[first : first + len(block), None]).sub_(over_columns)
+        first += len(block)
 
 
-def inner_cells(grid: Tensor, border: int, mask: Tensor | None) -> Tensor:
-    """(N, h w) bool: content cells at least ``border`` away from the border of the content."""
-    batch, h, w = grid.shape[:3]
-    if mask is None:
-        mask = torch.ones((batch, h, w), dtype=torch.bool, device=grid.device)
-    bottom = mask.sum(dim=1).amax(dim=1)[:, None, None] - border  # (N, 1, 1)
-    right = mask.sum(dim=2).amax(dim=1)[:, None, None] - border
-    row = torch.arange(h, device=grid.device)[None, :, None]
-    column = torch.arange(w, device=grid.device)[None, None, :]
+def best_levels(cells: Cells) -> tuple[Tensor, Tensor, Tensor]:
+    """Of each row the best level (L,) and where it is (L,), and of each column the best (S,)."""
+    of_rows = []
+    of_columns = cells.features1.new_full(cells.content1.shape, -torch.inf, dtype=torch.float32)
+    for block in levels(cells):
+        of_rows.append(block.max(dim=1))
+        of_columns = torch.maximum(of_columns, block.amax(dim=0))
+    best, partner = (torch.cat(values) for values in zip(*of_rows, strict=True))
+    return best, partner, of_columns
+
+
+def inner_cells(mask: Tensor, border: int) -> Tensor:
+    """(h w,) bool: cells of the content (h, w) at least ``border`` away from its border."""
+    h, w = mask.shape
+    bottom, right = mask.sum(dim=0).amax() - border, mask.sum(dim=1).amax() - border
+    row, column = torch.arange(h, device=mask.device)[:, None], torch.arange(w, device=mask.device)
     inner = (row >= border) & (row < bottom) & (column >= border) & (column < right)
-    return (inner & mask).flatten(1)
+    return (inner & mask).flatten()

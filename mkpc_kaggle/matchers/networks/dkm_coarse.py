@@ -9,7 +9,6 @@ import torch
 from torch import Tensor, nn
 
 from mkpc_kaggle.matchers.networks.dkm_refiner import Estimate, identity_map
-from mkpc_kaggle.matchers.networks.resnet50 import convolve_and_norm
 
 STRIDES = (32, 16)
 FEATURES, POSTERIOR, WIDTH = 512, 256, 384  # channels
@@ -85,7 +84,7 @@ class ResidualRefinement(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """(B, inputs, h, w) -> (B, 384, h, w)."""
         x = self.conv1(x)
-        y = self.conv3(convolve_and_norm(self.conv2, self.bn, x).relu_())
+        y = self.conv3(torch.relu_(self.bn(self.conv2(x))))
         return torch.relu_(y.add_(x))
 
 

@@ -11,7 +11,6 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mkpc_kaggle.matchers.networks.grids import as_grid, as_map
-from mkpc_kaggle.matchers.networks.resnet50 import convolve_and_norm
 
 HIDDEN_BLOCKS = 8
 
@@ -72,8 +71,7 @@ class Refiner(nn.Module):
         x = self._look(query, support, flow)  # (B, inputs, h, w)
         for depthwise, norm, _, mix in (self.block1, *self.hidden_blocks):
             # One name for all: no more than two maps are alive at a time.
-            x = convolve_and_norm(depthwise, norm, x).relu_()
-            x = by_rows(mix, x)
+            x = by_rows(mix, torch.relu_(norm(depthwise(x))))
         corrections: Tensor = self.out_conv(x)
         return corrections
 

@@ -4,10 +4,10 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional
 
 from mkpc_kaggle.matchers.networks.coarse_matching import CoarseMatches
 from mkpc_kaggle.matchers.networks.grids import as_grid
+from mkpc_kaggle.matchers.networks.layers import Linear, linear
 
 COARSE_STRIDE, FINE_STRIDE = 8, 2
 SIDE = 5  # of a window, in fine cells
@@ -35,14 +35,14 @@ class FinePreprocess(nn.Module):
 
     def __init__(self, coarse: int, fine: int) -> None:
         super().__init__()
-        self.down_proj = nn.Linear(coarse, fine)
-        self.merge_feat = nn.Linear(2 * fine, fine)
+        self.down_proj = Linear(coarse, fine)
+        self.merge_feat = Linear(2 * fine, fine)
 
     def forward(self, windows: Tensor, context: Tensor) -> Tensor:
         """Windows (M, 25, fine) and coarse features (M, coarse) -> (M, 25, fine)."""
         of_window, of_context = self.merge_feat.weight.chunk(2, dim=1)
-        added = functional.linear(self.down_proj(context), of_context, self.merge_feat.bias)  # (M, fine)
-        return functional.linear(windows, of_window).add_(added[:, None])
+        added = linear(self.down_proj(context), of_context, self.merge_feat.bias)  # (M, fine)
+        return linear(windows, of_window).add_(added[:, None])
 
 
 def cell_points(cells: Tensor, width: int) -> Tensor:

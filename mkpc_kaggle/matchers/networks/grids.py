@@ -7,6 +7,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from mkpc_kaggle.matchers.networks.layers import linear
+
 Layer = nn.Linear | nn.Conv1d | nn.Conv2d
 
 
@@ -41,15 +43,13 @@ def unquads(cells: Tensor, h: int, w: int) -> Tensor:
 
 def pointwise(layer: nn.Conv1d | nn.Conv2d, x: Tensor) -> Tensor:
     """A convolution of kernel 1 on (..., C_in) -> (..., C_out)."""
-    return functional.linear(x, layer.weight.flatten(1), layer.bias)
+    return linear(x, layer.weight.flatten(1), layer.bias)
 
 
 def linear_of_two(weight: Tensor, x: Tensor, y: Tensor) -> Tensor:
     """``weight`` (out, C_x + C_y) on the concatenation of (..., C_x) and (..., C_y), never built."""
     of_x, of_y = torch.split(weight, [x.shape[-1], y.shape[-1]], dim=1)
-    out = functional.linear(x, of_x)
-    out.view(-1, out.shape[-1]).addmm_(y.reshape(-1, y.shape[-1]), of_y.T)
-    return out
+    return linear(x, of_x).add_(linear(y, of_y))
 
 
 class Perceptron(nn.Module):
@@ -66,11 +66,12 @@ class Perceptron(nn.Module):
     def forward(self, x: Tensor, y: Tensor | None = None) -> Tensor:
         """(..., C), or two inputs (..., C_x) and (..., C_y) that stand for their concatenation -> (..., C_out)."""
         first, second = self.get_parameter("0.weight"), self.get_parameter("2.weight")
-        weight = first.flatten(1)
-        hidden = functional.relu_(functional.linear(x, weight) if y is None else linear_of_two(weight, x, y))
+        weight, seen = first.flatten(1), x.to(first.dtype)
+        hidden = linear(seen, weight) if y is None else linear_of_two(weight, seen, y.to(first.dtype))
+        functional.relu_(hidden)
         if second.shape[2:] == (3, 3):
-            return as_grid(functional.conv2d(as_map(hidden), second, padding=1))
-        return functional.linear(hidden, second.flatten(1))
+            return as_grid(functional.conv2d(as_map(hidden), second, padding=1)).to(x.dtype)
+        return linear(hidden, second.flatten(1)).to(x.dtype)
 
 
 def mask_valid(mask: Tensor, factor: int | tuple[int, int]) -> Tensor:

@@ -3,10 +3,12 @@
 Sources: Sun et al. 2021, section 3.2; Katharopoulos et al. 2020 (linear attention).
 """
 
+import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
 from mkpc_kaggle.matchers.networks.grids import Perceptron
+from mkpc_kaggle.matchers.networks.layers import Linear
 
 Masks = tuple[Tensor, Tensor]
 
@@ -22,9 +24,11 @@ def linear_attention(q: Tensor, k: Tensor, v: Tensor, heads: int, masks: Masks |
         q, k = q.mul_(masks[0][..., None]), k.mul_(masks[1][..., None])
     width = q.shape[2] // heads
     q, k, v = (x.view(*x.shape[:2], heads, width).transpose(1, 2) for x in (q, k, v))  # (N, heads, L or S, D)
-    total = k.sum(dim=2)[..., None]  # (N, heads, D, 1)
-    attended = (q @ (k.transpose(2, 3) @ v)).div_((q @ total).add_(1e-6))  # (N, heads, L, D)
-    return attended.transpose(1, 2).flatten(2)
+    # The sum of the keys is one more column of values: alone it would take as long as all others.
+    both = torch.cat([k.transpose(2, 3) @ v, k.sum(dim=2)[..., None]], dim=3)  # (N, heads, D, D + 1)
+    attended, total = torch.split(q @ both, [width, 1], dim=3)  # (N, heads, L, D) and (N, heads, L, 1)
+    normed: Tensor = attended / (total + 1e-6)
+    return normed.transpose(1, 2).flatten(2)
 
 
 class EncoderLayer(nn.Module):
@@ -33,11 +37,11 @@ class EncoderLayer(nn.Module):
     def __init__(self, width: int, heads: int) -> None:
         super().__init__()
         self.heads = heads
-        self.q_proj = nn.Linear(width, width, bias=False)
-        self.k_proj = nn.Linear(width, width, bias=False)
-        self.v_proj = nn.Linear(width, width, bias=False)
-        self.merge = nn.Linear(width, width, bias=False)
-        self.mlp = Perceptron(nn.Linear(2 * width, 2 * width, bias=False), nn.Linear(2 * width, width, bias=False))
+        self.q_proj = Linear(width, width, bias=False)
+        self.k_proj = Linear(width, width, bias=False)
+        self.v_proj = Linear(width, width, bias=False)
+        self.merge = Linear(width, width, bias=False)
+        self.mlp = Perceptron(Linear(2 * width, 2 * width, bias=False), Linear(2 * width, width, bias=False))
         self.norm1 = nn.LayerNorm(width)
         self.norm2 = nn.LayerNorm(width)
 

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mkpc_kaggle.matchers.networks.grids import as_grid, as_map, mean_pool, pointwise, quads, unquads
+from mkpc_kaggle.matchers.networks.layers import Linear
 from mkpc_kaggle.matchers.networks.linear_attention import Masks
 from mkpc_kaggle.matchers.networks.position import FIXED_FALL, with_positions
 from mkpc_kaggle.matchers.networks.resnet_fpn import TOP
@@ -111,7 +112,7 @@ class QuadtreeAttention(nn.Module):
         self.k_proj = nn.Conv2d(width, width, 1, bias=False)
         self.v_proj = nn.Conv2d(width, width, 1, bias=False)
         self.py_att = LevelWeights()
-        self.proj = nn.Linear(width, width)
+        self.proj = Linear(width, width)
 
     def forward(self, x: Tensor, source: Tensor) -> Tensor:
         """Grids (N, h, w, C) and (N, h_source, w_source, C) -> (N, h, w, C)."""
@@ -149,15 +150,15 @@ class ConvolutionalMlp(nn.Module):
 
     def __init__(self, width: int, hidden: int) -> None:
         super().__init__()
-        self.fc1 = nn.Linear(width, hidden)
+        self.fc1 = Linear(width, hidden)
         self.dwconv = DepthwiseConvolution(hidden)
-        self.fc2 = nn.Linear(hidden, width)
+        self.fc2 = Linear(hidden, width)
 
     def forward(self, grid: Tensor) -> Tensor:
         """(N, h, w, C) -> (N, h, w, C)."""
-        neighbourhood = self.dwconv(functional.relu_(self.fc1(grid)))  # (N, h, w, hidden)
-        out: Tensor = self.fc2(functional.gelu(neighbourhood))
-        return out
+        hidden = functional.relu_(self.fc1(grid.to(self.fc1.weight.dtype)))  # (N, h, w, hidden)
+        out: Tensor = self.fc2(functional.gelu(self.dwconv(hidden)))
+        return out.to(grid.dtype)
 
 
 class QuadtreeLayer(nn.Module):

@@ -4,7 +4,6 @@ The stride of a bottleneck sits in its 3x3 convolution. Parameter names are the 
 evaluation mode only.
 """
 
-import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -31,10 +30,9 @@ class Bottleneck(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """(B, inputs, h, w) -> (B, 4 width, ceil(h / stride), ceil(w / stride))."""
-        y = convolve_and_norm(self.conv1, self.bn1, x).relu_()
-        y = convolve_and_norm(self.conv2, self.bn2, y).relu_()
-        y = convolve_and_norm(self.conv3, self.bn3, y)
-        return y.add_(self.downsample(x)).relu_()
+        y = functional.relu_(self.bn1(self.conv1(x)))
+        y = functional.relu_(self.bn2(self.conv2(y)))
+        return functional.relu_(self.bn3(self.conv3(y)).add_(self.downsample(x)))
 
 
 def stage(inputs: int, width: int, blocks: int, stride: int) -> nn.Sequential:
@@ -60,7 +58,7 @@ class ResNet50(nn.Module):
 
         (B, C, h, w) with C = 64, 256, 512, 1024, 2048; every halving of a side rounds up.
         """
-        levels = [convolve_and_norm(self.conv1, self.bn1, image).relu_()]
+        levels = [functional.relu_(self.bn1(self.conv1(image)))]
         x = functional.max_pool2d(levels[0], 3, stride=2, padding=1)
         for stride, layer in zip(
             (4, 8, 16, 32), (self.layer1, self.layer2, self.layer3, self.layer4), strict=True
@@ -69,13 +67,3 @@ class ResNet50(nn.Module):
                 x = layer(x)
                 levels.append(x)
         return tuple(levels)
-
-
-def convolve_and_norm(conv: nn.Conv2d, norm: nn.BatchNorm2d, x: Tensor) -> Tensor:
-    """The batch norm of the convolution of ``x``; the norm goes into the weights, which are fewer than pixels."""
-    assert norm.running_mean is not None
-    assert norm.running_var is not None
-    scale = norm.weight * torch.rsqrt(norm.running_var + norm.eps)
-    mean = norm.running_mean if conv.bias is None else norm.running_mean - conv.bias
-    weight, bias = conv.weight * scale[:, None, None, None], norm.bias - mean * scale
-    return functional.conv2d(x, weight, bias, conv.stride, conv.padding, groups=conv.groups)

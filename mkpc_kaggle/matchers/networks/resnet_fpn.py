@@ -14,7 +14,10 @@ STEM, MIDDLE, TOP, FINE = 128, 196, 256, 128  # channels at 1/2, 1/4 and 1/8, an
 
 @dataclass(frozen=True, eq=False)
 class FeatureMaps:
-    """Of B images of H x W pixels, float32: ``coarse`` (B, 256, H/8, W/8) and ``fine`` (B, 128, H/2, W/2)."""
+    """Of B images of H x W pixels: ``coarse`` (B, 256, H/8, W/8) and ``fine`` (B, 128, H/2, W/2).
+
+    In the precision of the backbone's weights.
+    """
 
     coarse: Tensor
     fine: Tensor
@@ -70,6 +73,7 @@ class ResNetFpn(nn.Module):
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # missing in torch's stubs
 
     def forward(self, image: Tensor) -> FeatureMaps:
+        image = image.to(self.conv1.weight.dtype)
         half = self.layer1(functional.relu_(self.bn1(self.conv1(image))))  # (B, 128, H/2, W/2)
         quarter = self.layer2(half)  # (B, 196, H/4, W/4)
         coarse = self.layer3_outconv(self.layer3(quarter))  # (B, 256, H/8, W/8)

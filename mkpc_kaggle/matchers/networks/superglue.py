@@ -13,9 +13,9 @@ from typing import cast
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional
 
 from mkpc_kaggle.geometry.coordinates import Size
+from mkpc_kaggle.matchers.networks.layers import attention, linear
 
 CHANNELS = 256
 HEADS = 4
@@ -73,7 +73,7 @@ class Pointwise(nn.Conv1d):
         super().__init__(channels_in, channels_out, kernel_size=1)
 
     def forward(self, x: Tensor) -> Tensor:
-        return functional.linear(x, self.weight[:, :, 0], self.bias)
+        return linear(x, self.weight[:, :, 0], self.bias)
 
 
 def pointwise_network(*channels: int) -> nn.Sequential:
@@ -112,15 +112,16 @@ class Attention(nn.Module):
         maps = cast("Iterable[nn.Conv1d]", self.proj)
         weight = torch.cat([_by_head(each.weight[:, :, 0]) for each in maps])  # (768, 256)
         bias = torch.cat([_by_head(each.get_parameter("bias")) for each in maps])
-        projected = functional.linear(x, weight, bias)  # (B, N, 768)
+        projected = linear(x, weight, bias)  # (B, N, 768)
         heads = projected.view(*x.shape[:2], 3, HEADS, -1).permute(2, 0, 3, 1, 4)  # (3, B, 4, N, 64)
         (query0, key0, value0), (query1, key1, value1) = heads[..., :n0, :], heads[..., n0:, :]
         if cross:
             key0, key1, value0, value1 = key1, key0, value1, value0
-        answer0 = functional.scaled_dot_product_attention(query0, key0, value0)  # (B, 4, N0, 64)
-        answer1 = functional.scaled_dot_product_attention(query1, key1, value1)  # (B, 4, N1, 64)
+        precision = self.merge.weight.dtype
+        answer0 = attention(query0, key0, value0, precision)  # (B, 4, N0, 64)
+        answer1 = attention(query1, key1, value1, precision)  # (B, 4, N1, 64)
         answer = torch.cat([answer0.transpose(1, 2), answer1.transpose(1, 2)], dim=1).flatten(2)  # (B, N, 256)
-        return functional.linear(answer, _by_head(self.merge.weight[:, :, 0].T).T, self.merge.bias)
+        return linear(answer, _by_head(self.merge.weight[:, :, 0].T).T, self.merge.bias)
 
 
 class Layer(nn.Module):
@@ -182,13 +183,13 @@ class SuperGlue(nn.Module):
 
     def encoded(self, image: ImageKeypoints) -> Tensor:
         """The features (B, N, 256) with which an image enters the graph: what it shows and where it is."""
-        return image.descriptors.to(self.final_proj.weight.dtype) + self.position(image)
+        return image.descriptors.float() + self.position(image)
 
     def position(self, image: ImageKeypoints) -> Tensor:
         """What the keypoint encoder says of an image's keypoints, (B, N, 256)."""
         points = normalise_points(image.points, image.size)
         placed = torch.cat([points, image.scores.float()[..., None]], dim=2)  # (B, N, 3)
-        encoded: Tensor = self.kenc(placed.to(self.final_proj.weight.dtype))
+        encoded: Tensor = self.kenc(placed)
         return encoded
 
     @staticmethod
@@ -205,8 +206,9 @@ def _by_head(rows: Tensor) -> Tensor:
 
 def _on_rows(network: nn.Module, x: Tensor) -> Tensor:
     """A network of (rows, C) on (B, N, C): there batch norm takes the last axis for the channels."""
-    rows: Tensor = network(x.flatten(0, 1))
-    return rows.view(*x.shape[:2], -1)
+    precision = next(network.parameters()).dtype
+    rows: Tensor = network(x.flatten(0, 1).to(precision))
+    return rows.to(x.dtype).view(*x.shape[:2], -1)
 
 
 def normalise_points(points: Tensor, size: Size) -> Tensor:

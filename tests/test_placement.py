@@ -1,0 +1,94 @@
+"""A network made ready to run: batch norms folded away, half precision where it is meant to be."""
+
+import pytest
+import torch
+from torch import nn
+
+from mkpc_kaggle.matchers.networks.layers import Linear, attention, linear
+from mkpc_kaggle.matchers.networks.placement import fold_norms, placed
+from mkpc_kaggle.matchers.networks.resnet_fpn import ResNetFpn
+from mkpc_kaggle.matchers.networks.superglue import pointwise_network
+
+
+def with_random_norms(network):
+    """In evaluation mode, with norms that do something."""
+    for module in network.modules():
+        if isinstance(module, nn.BatchNorm1d | nn.BatchNorm2d):
+            for tensor in (module.weight, module.bias, module.running_mean):
+                tensor.data.normal_()
+            module.running_var.uniform_(0.1, 2)
+    return network.eval().requires_grad_(False)
+
+
+@pytest.mark.parametrize("bias", [False, True])
+@torch.inference_mode()
+def test_a_norm_goes_into_the_convolution_before_it(bias):
+    torch.manual_seed(0)
+    network = with_random_norms(nn.Sequential(nn.Conv2d(3, 6, 3, 2, 1, bias=bias), nn.BatchNorm2d(6), nn.ReLU()))
+    x = torch.randn(2, 3, 9, 8)
+    expected = network(x)
+    fold_norms(network)
+    assert not any(isinstance(module, nn.BatchNorm2d) for module in network.modules())
+    torch.testing.assert_close(network(x), expected, rtol=1e-5, atol=1e-5)
+
+
+@torch.inference_mode()
+def test_a_norm_of_rows_goes_into_the_map_before_it():
+    torch.manual_seed(1)
+    network = with_random_norms(pointwise_network(3, 8, 5))
+    rows = torch.randn(7, 3)
+    expected = network(rows)
+    fold_norms(network)
+    assert [type(step) for step in network][1] is nn.Identity
+    torch.testing.assert_close(network(rows), expected, rtol=1e-5, atol=1e-5)
+
+
+@torch.inference_mode()
+def test_a_placed_backbone_gives_the_same_maps_channels_last():
+    torch.manual_seed(2)
+    network = with_random_norms(ResNetFpn())
+    image = torch.rand(1, 1, 32, 48)
+    expected = network(image)
+    found = placed(network)(image)
+    for got, map_ in ((found.coarse, expected.coarse), (found.fine, expected.fine)):
+        torch.testing.assert_close(got, map_, rtol=1e-4, atol=1e-4 * map_.abs().max().item())
+    assert found.fine.is_contiguous(memory_format=torch.channels_last)
+
+
+@torch.inference_mode()
+def test_half_precision_is_that_of_the_weights():
+    torch.manual_seed(3)
+    network = nn.Sequential(Linear(8, 8), nn.LayerNorm(8))
+    x = torch.randn(5, 8)
+    expected = network(x)
+    found = placed(network, precision=torch.bfloat16)(x)
+    assert network[0].weight.dtype == torch.bfloat16 and network[1].weight.dtype == torch.float32
+    assert found.dtype == torch.float32
+    assert 0 < (found - expected).abs().max() < 0.1
+
+
+@pytest.mark.parametrize("shape", [(4, 3), (32, 3), (2, 5, 3), (2, 8, 4, 3), (0, 3), (1, 3)])
+@pytest.mark.parametrize("threads", [1, 2])
+@torch.inference_mode()
+def test_a_linear_map_is_its_definition(shape, threads):
+    former = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        torch.manual_seed(4)
+        x, weight, bias = torch.randn(*shape), torch.randn(7, 3), torch.randn(7)
+        torch.testing.assert_close(linear(x, weight, bias), x @ weight.T + bias)
+        torch.testing.assert_close(linear(x.mT.contiguous().mT, weight), x @ weight.T)
+    finally:
+        torch.set_num_threads(former)
+
+
+@pytest.mark.parametrize("queries", [1, 300])
+@torch.inference_mode()
+def test_attention_is_its_definition(queries):
+    torch.manual_seed(5)
+    q, k, v = torch.randn(2, 3, queries, 16), torch.randn(2, 3, 40, 16), torch.randn(2, 3, 40, 16)
+    expected = (q @ k.mT / 4).softmax(dim=-1) @ v
+    torch.testing.assert_close(attention(q, k, v, torch.float32), expected)
+    half = attention(q, k, v, torch.bfloat16)
+    assert half.dtype == torch.float32
+    assert 0 < (half - expected).abs().max() < 0.05
