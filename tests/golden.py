@@ -3,6 +3,7 @@
 import importlib.util
 import sys
 from collections.abc import Iterable
+from contextlib import contextmanager
 from typing import NamedTuple
 
 import numpy as np
@@ -33,6 +34,23 @@ def standin_state(network):
 def seeded_tensor(name, shape, gain=1.0):
     """The stand-in value of one parameter, for the folders without a ``standin.py``."""
     return torch.from_numpy(_module(GOLDEN / "seeded_weights.py").seeded_tensor(name, shape, gain))
+
+
+@contextmanager
+def recorded(network, names):
+    """Lists by module name, which fill with the inputs and the output of each call of these modules."""
+    calls = {name: [] for name in names}
+    hooks = [
+        network.get_submodule(name).register_forward_hook(
+            lambda _module, inputs, output, calls=calls[name]: calls.append((inputs, output))
+        )
+        for name in names
+    ]
+    try:
+        yield calls
+    finally:
+        for hook in hooks:
+            hook.remove()
 
 
 def _module(path):
