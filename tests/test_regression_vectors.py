@@ -44,7 +44,8 @@ from mkpc_kaggle.matchers.networks.superpoint import SuperPoint, SuperPointConfi
 
 DATA = Path(__file__).with_name("data")
 SAMPLES, STEP = 200, 1_000_003  # a prime, so that samples lie in all channels, rows and columns
-TOLERANCE = 1e-3  # of a stage's largest value; the rounding of another processor takes a hundredth of it
+TOLERANCE = 1e-3  # of a stage's largest value; on the slowest and fastest code paths it takes a tenth of it
+EDGES = 3e-3  # instead, for DKM: refiners see a picture's edges where the flow points, which magnifies rounding
 LEEWAY = 20  # of so many keypoints or matches one may be another: a threshold or a tie within rounding
 
 
@@ -275,9 +276,10 @@ def stored_values(network, case):
 def stages_of(network, case):
     stored, got = stored_values(network, case), computed_values(network, case)
     assert list(got) == list(stored), "the stages are not those of the file"
+    tolerance = EDGES if network == "dkm" else TOLERANCE
     plain = (name for name in got if not name.endswith((", rows", ", values")))
     yield from (
-        Stage(name, got[name], stored[name], TOLERANCE * max(stored[name].abs().max().item(), 1e-6))
+        Stage(name, got[name], stored[name], tolerance * max(stored[name].abs().max().item(), 1e-6))
         for name in plain
     )
     for name in (name.removesuffix(", rows") for name in got if name.endswith(", rows")):
