@@ -3,12 +3,15 @@
 import importlib.util
 import sys
 from collections.abc import Iterable
+from contextlib import contextmanager
 from typing import NamedTuple
 
 import numpy as np
 import pytest
 import torch
 from shared import SHARED
+
+from mkpc_kaggle.matchers.networks.placement import placed
 
 GOLDEN = SHARED / "golden"
 
@@ -33,6 +36,29 @@ def standin_state(network):
 def seeded_tensor(name, shape, gain=1.0):
     """The stand-in value of one parameter, for the folders without a ``standin.py``."""
     return torch.from_numpy(_module(GOLDEN / "seeded_weights.py").seeded_tensor(name, shape, gain))
+
+
+@contextmanager
+def recorded(network, names):
+    """Lists by module name, which fill with the inputs and the output of each call of these modules."""
+    calls = {name: [] for name in names}
+    hooks = [
+        network.get_submodule(name).register_forward_hook(
+            lambda _module, inputs, output, calls=calls[name]: calls.append((inputs, output))
+        )
+        for name in names
+    ]
+    try:
+        yield calls
+    finally:
+        for hook in hooks:
+            hook.remove()
+
+
+def ready(network, state):
+    """The network with these weights as it runs, its batch norms folded."""
+    network.load_state_dict(state, strict=True)
+    return placed(network.eval())
 
 
 def _module(path):

@@ -1,28 +1,14 @@
 """What the parity tests of LoFTR, QuadTree and ASpanFormer share."""
 
-from contextlib import contextmanager
+from dataclasses import dataclass
 
 import torch
-from golden import Stage, golden_arrays
+from golden import Stage, golden_arrays, recorded
+from torch import Tensor
 
 from mkpc_kaggle.matchers.networks.coarse_matching import Cells, levels
-from mkpc_kaggle.matchers.networks.fine_matching import cell_points
+from mkpc_kaggle.matchers.networks.fine_matching import SemiDenseMatches, cell_points
 from mkpc_kaggle.matchers.networks.resnet_fpn import FeatureMaps
-
-
-@contextmanager
-def recorded(network, names):
-    """Lists by module name, which fill with the inputs and the output of each call of these modules."""
-    calls = {name: [] for name in names}
-    hooks = [
-        network.get_submodule(name).register_forward_hook(
-            lambda _module, inputs, output, calls=calls[name]: calls.append((inputs, output))
-        )
-        for name in names
-    ]
-    yield calls
-    for hook in hooks:
-        hook.remove()
 
 
 def confidence_of(network, grid0, grid1, masks=None):
@@ -41,33 +27,54 @@ def tolerance_of(name, tolerances):
     return next((tolerance for prefix, tolerance in tolerances.items() if name.startswith(prefix)), 0.0)
 
 
+@dataclass(frozen=True, eq=False)
+class Trace:
+    """What a network computed on the way to its matches; ``calls`` of its modules by name, see ``recorded``.
+
+    ``maps`` of both images, the transformer's ``grids`` (N, h, w, 256), and the full ``confidence`` (N, L, S).
+    """
+
+    maps: list[FeatureMaps]
+    calls: dict[str, list]
+    grids: list[Tensor]
+    confidence: Tensor
+    matches: SemiDenseMatches
+
+    def windows(self, side):
+        """Fine windows of the first matches (6, 25, 128), before and after the fine transformer."""
+        return self.calls["fine_preprocess"][side][1][:6], self.calls["loftr_fine"][0][1][side][:6]
+
+
 @torch.inference_mode()
+def traced(network, images, masks, names=()):
+    """Images (N, 1, H, W) matched, with the modules of these names recorded besides those that all have."""
+    maps = [network.encode(image) for image in images]
+    with recorded(network, [*names, "loftr_coarse", "fine_preprocess", "loftr_fine"]) as calls:
+        matches = network.match(*maps, masks)
+    transformed = zip(calls["loftr_coarse"][0][1], maps, strict=True)
+    grids = [tokens.reshape(len(tokens), *own.coarse.shape[2:], 256) for tokens, own in transformed]
+    return Trace(maps, calls, grids, confidence_of(network, *grids, masks), matches)
+
+
 def loftr_stages(folder, case, network, tolerances):
     """All entries of a golden file of LoFTR's kind, in the order of the computation."""
     golden = golden_arrays(folder, case)
-    maps = [network.encode(golden[f"image{side}_u8"].float()[:, None] / 255) for side in (0, 1)]
+    images = [golden[f"image{side}_u8"].float()[:, None] / 255 for side in (0, 1)]
     masks = (golden["mask0"], golden["mask1"]) if "mask0" in golden else None
     layers = [f"loftr_coarse.layers.{index}" for index in range(8)]
-    with recorded(network, [*layers, "loftr_coarse", "fine_preprocess", "loftr_fine"]) as calls:
-        matches = network.match(*maps, masks)
-
+    trace = traced(network, images, masks, layers)
+    matches, coarse, confidence = trace.matches, trace.matches.coarse, trace.confidence
     got = {}
-    coarse = matches.coarse
-    shapes = [features.coarse.shape[2:] for features in maps]
-    tokens = [output.reshape(len(output), -1, 256) for output in calls["loftr_coarse"][0][1]]
-    grids = [of_side.view(len(of_side), *shape, 256) for of_side, shape in zip(tokens, shapes, strict=True)]
-    for side in (0, 1):
-        got[f"feat_c{side}"] = maps[side].coarse[:, ::4]
-        got[f"feat_f{side}"] = maps[side].fine[:, ::8, ::2, ::2]
+    for side, (maps, grid) in enumerate(zip(trace.maps, trace.grids, strict=True)):
+        tokens = grid.flatten(1, 2)
+        got |= {f"feat_c{side}": maps.coarse[:, ::4], f"feat_f{side}": maps.fine[:, ::8, ::2, ::2]}
         for index, name in enumerate(layers):
-            got[f"layer{index}_{side}"] = calls[name][side][1].reshape(tokens[side].shape)[..., ::16]
-        got[f"coarse{side}"] = tokens[side][..., :: 2 if case == "same_size" else 4]
-        got[f"win{side}"] = calls["fine_preprocess"][side][1][:6]
-        got[f"fine{side}"] = calls["loftr_fine"][0][1][side][:6]
+            got[f"layer{index}_{side}"] = trace.calls[name][side][1].reshape(tokens.shape)[..., ::16]
+        got[f"coarse{side}"] = tokens[..., :: 2 if case == "same_size" else 4]
+        got[f"win{side}"], got[f"fine{side}"] = trace.windows(side)
         scale = golden[f"scale{side}"][coarse.batch] if f"scale{side}" in golden else 1.0
-        got[f"mkpts{side}_c"] = cell_points((coarse.cell0, coarse.cell1)[side], shapes[side][1]) * scale
+        got[f"mkpts{side}_c"] = cell_points((coarse.cell0, coarse.cell1)[side], grid.shape[2]) * scale
         got[f"mkpts{side}_f"] = (matches.points0, matches.points1)[side] * scale
-    confidence = confidence_of(network, *grids, masks)
     got |= {"conf": confidence, "conf_rows": confidence[:, ::7]}
     got |= {"conf_rowmax": confidence.amax(2), "conf_colmax": confidence.amax(1)}
     got |= {"b_ids": coarse.batch, "i_ids": coarse.cell0, "j_ids": coarse.cell1, "mconf": coarse.confidence}

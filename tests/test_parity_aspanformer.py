@@ -6,15 +6,14 @@ from functools import cache
 
 import pytest
 import torch
-from golden import GOLDEN, Stage, assert_stages, golden_arrays, needs_golden, print_table, seeded_tensor
+from golden import GOLDEN, Stage, assert_stages, golden_arrays, needs_golden, print_table, ready, seeded_tensor
 from semi_dense import (
     check_batch_equals_single,
     check_empty,
     check_nothing_matches_padding,
-    confidence_of,
     random_network,
-    recorded,
     textured,
+    traced,
 )
 
 from mkpc_kaggle.matchers.networks.adaptive_span import CELLS_AT_ONCE, adaptive_span, sample_usable, span_attention
@@ -43,15 +42,7 @@ EXACT = ("b_ids", "i_ids", "j_ids", "b0_q0_samplemask", "b0_q1_samplemask", "kpt
 INITIAL = [f"loftr_coarse.ini_layer.layers_coarse.{index}" for index in range(2)]
 BLOCKS = [f"loftr_coarse.layers.{index}" for index in range(4)]
 ATTENTION = "loftr_coarse.layers.0.attention"
-RECORDED = [
-    *INITIAL,
-    *BLOCKS,
-    ATTENTION,
-    "loftr_coarse",
-    "loftr_coarse.ini_layer",
-    "fine_preprocess",
-    "loftr_fine",
-]
+RECORDED = [*INITIAL, *BLOCKS, ATTENTION, "loftr_coarse.ini_layer"]
 ORDER = ["resized", "kpt_scale", "pos_scale", "backbone_", "pe", "pos", "ini_layer", "ini_feat", "ini_flow"]
 ORDER += [f"b{block}_{part}" for block in range(4) for part in ("flow\\d", "q", "feat", "flowfeat")]
 ORDER += ["coarse_final", "conf_", "[bij]_ids", "mconf", "fine_in", "fine_out", "expec_f", "mkpts"]
@@ -74,27 +65,22 @@ def standin():
     return {name: value for name, value in state.items() if "sample_offset" not in name}
 
 
-@torch.inference_mode()
 def stages_of(case):
     golden = golden_arrays("aspanformer", case)
-    network = AspanFormer(CASES[case])
-    network.load_state_dict(standin())
+    network = ready(AspanFormer(CASES[case]), standin())
     images = [resized_to_multiple(golden[f"image{side}"]) for side in (0, 1)]
-    maps = [network.encode(image) for image in images]
     masks = (golden["mask0"], golden["mask1"]) if "mask0" in golden else None
-    with recorded(network, RECORDED) as calls:
-        matches = network.match(*maps, masks)
-    coarse = matches.coarse
-    confidence = confidence_of(network, *calls["loftr_coarse"][0][1], masks)
+    trace = traced(network, images, masks, RECORDED)
+    matches, coarse, confidence = trace.matches, trace.matches.coarse, trace.confidence
     got = {"conf": confidence, "conf_row_max": confidence.amax(2), "conf_col_max": confidence.amax(1)}
     got |= {"b_ids": coarse.batch, "i_ids": coarse.cell0, "j_ids": coarse.cell1, "mconf": coarse.confidence}
     got |= {"expec_f": matches.expectation}
     for side in (0, 1):
-        got |= inputs_of(side, images[side], maps[side], network.config, golden)
-        got |= transformer_of(side, network.loftr_coarse, calls)
-        got |= levels_of(side, network.loftr_coarse.layers[0].attention, calls)
+        got |= inputs_of(side, images[side], trace.maps[side], network.config, golden)
+        got |= transformer_of(side, network.loftr_coarse, trace)
+        got |= levels_of(side, network.loftr_coarse.layers[0].attention, trace.calls)
         factor = golden[f"scale{side}"][coarse.batch] if masks else got[f"kpt_scale{side}"]
-        points = cell_points((coarse.cell0, coarse.cell1)[side], maps[side].coarse.shape[3])
+        points = cell_points((coarse.cell0, coarse.cell1)[side], trace.grids[side].shape[2])
         # In online mode coarse points are reported before the last rescaling.
         got[f"mkpts{side}_c"] = points * factor if masks else points
         got[f"mkpts{side}_f"] = (matches.points0, matches.points1)[side] * factor
@@ -124,10 +110,11 @@ def inputs_of(side, image, maps, config, golden):
     return got
 
 
-def transformer_of(side, transformer, calls):
+def transformer_of(side, transformer, trace):
     """Features and flows after each layer, and the fine windows."""
-    sides, grids = calls["loftr_coarse"][0]
-    got = {f"pos{side}": as_map(sides[side].positions), f"coarse_final{side}": as_map(grids[side]).flatten(2)}
+    calls = trace.calls
+    positions = calls["loftr_coarse"][0][0][side].positions
+    got = {f"pos{side}": as_map(positions), f"coarse_final{side}": as_map(trace.grids[side]).flatten(2)}
     for index, name in enumerate(INITIAL):
         got[f"ini_layer{index}_sub{side}"] = as_map(calls[name][side][1])
     initial = calls["loftr_coarse.ini_layer"][0][1][side]
@@ -137,8 +124,7 @@ def transformer_of(side, transformer, calls):
         got[f"b{index}_flow{side}"] = transformer.layers[index].decode_flow(own, other)
         got[f"b{index}_feat{side}"] = as_map(updated.visual)
         got[f"b{index}_flowfeat{side}"] = as_map(updated.flow)
-    got[f"fine_in{side}_m6"] = calls["fine_preprocess"][side][1][:6]
-    got[f"fine_out{side}_m6"] = calls["loftr_fine"][0][1][side][:6]
+    got[f"fine_in{side}_m6"], got[f"fine_out{side}_m6"] = trace.windows(side)
     return got
 
 

@@ -4,7 +4,7 @@ from functools import cache
 
 import pytest
 import torch
-from golden import Stage, assert_stages, golden_arrays, needs_golden, print_table, standin_state
+from golden import Stage, assert_stages, golden_arrays, needs_golden, print_table, ready, standin_state
 from semi_dense import (
     assert_same_matches,
     check_batch_equals_single,
@@ -29,9 +29,7 @@ TOLERANCES |= {"win": 2e-4, "fine": 2e-4, "mkpts1_f": 5e-4}
 
 @cache
 def standin():
-    network = Loftr()
-    network.load_state_dict(standin_state("loftr"))
-    return network
+    return ready(Loftr(), standin_state("loftr"))
 
 
 def stages_of(case):

@@ -4,7 +4,7 @@ from functools import cache
 
 import pytest
 import torch
-from golden import Stage, assert_stages, golden_arrays, needs_golden, print_table, standin_state
+from golden import Stage, assert_stages, golden_arrays, needs_golden, print_table, ready, standin_state
 from semi_dense import (
     check_batch_equals_single,
     check_empty,
@@ -31,8 +31,7 @@ def standin():
     Which key cells are kept is discontinuous: in the masked case the rounding of the channels-last layout, well
     within the tolerance of the maps, tips a near tie. LoFTR's vectors test that layout with the same weights.
     """
-    network = Quadtree()
-    network.load_state_dict(standin_state("quadtree"))
+    network = ready(Quadtree(), standin_state("quadtree"))
     network.backbone.to(memory_format=torch.contiguous_format)
     return network
 
@@ -75,8 +74,7 @@ def test_operator(case):
 @needs_golden
 @torch.inference_mode()
 def test_no_match_at_threshold_one():
-    network = Quadtree(QuadtreeConfig(threshold=1.0))
-    network.load_state_dict(standin_state("quadtree"))
+    network = ready(Quadtree(QuadtreeConfig(threshold=1.0)), standin_state("quadtree"))
     golden = golden_arrays("quadtree", "same_size")
     check_empty(network.match(*(network.encode(golden[f"image{s}_u8"].float()[:, None] / 255) for s in (0, 1))))
 

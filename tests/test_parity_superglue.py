@@ -9,7 +9,7 @@ from functools import cache
 
 import pytest
 import torch
-from golden import Stage, assert_stages, golden_arrays, needs_golden, print_table, standin_state
+from golden import Stage, assert_stages, golden_arrays, needs_golden, print_table, ready, standin_state
 from test_parity_superpoint import golden_network as golden_superpoint
 from test_parity_superpoint import image_of
 from torch.nn import functional
@@ -35,9 +35,7 @@ def standin():
 
 
 def golden_network(options):
-    network = SuperGlue(SuperGlueConfig(**options))
-    network.load_state_dict(standin(), strict=True)
-    return network
+    return ready(SuperGlue(SuperGlueConfig(**options)), standin())
 
 
 def golden_keypoints(golden, index):

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from golden import Stage, assert_stages, golden_arrays, needs_golden, print_table, standin_state
+from golden import Stage, assert_stages, golden_arrays, needs_golden, print_table, ready, standin_state
 from hypothesis import given
 from hypothesis import strategies as st
 from torch.nn import functional
@@ -36,9 +36,7 @@ def standin():
 def golden_network(config):
     options = json.loads(config)
     assert options.pop("descriptor_dim") == 256
-    network = SuperPoint(SuperPointConfig(**options))
-    network.load_state_dict(standin(), strict=True)
-    return network.eval()
+    return ready(SuperPoint(SuperPointConfig(**options)), standin())
 
 
 def image_of(pixels):

@@ -1,0 +1,91 @@
+"""Stand-in checkpoints of the paper's matchers in the public files' own formats, and a manifest that they fit."""
+
+import hashlib
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from standin import STAND_INS, standin_state
+from torch import Tensor, nn
+
+from mkpc_kaggle import assembly
+from mkpc_kaggle.matchers.networks.aspanformer import AspanFormer
+from mkpc_kaggle.matchers.networks.loftr import Loftr
+from mkpc_kaggle.matchers.networks.quadtree import Quadtree
+from mkpc_kaggle.matchers.networks.superglue import SuperGlue, SuperGlueConfig
+from mkpc_kaggle.matchers.networks.superpoint import SuperPoint, SuperPointConfig
+from mkpc_kaggle.weights import WeightFile, WeightStore
+
+
+def plain(state: dict[str, Tensor]) -> dict[str, Any]:
+    return state
+
+
+def wrapped(state: dict[str, Tensor]) -> dict[str, Any]:
+    """As a training run saves its network: under a prefix, beside what else it wants to remember."""
+    return {
+        "epoch": 29,
+        "global_step": 12345,
+        "state_dict": {f"matcher.{name}": tensor for name, tensor in state.items()},
+    }
+
+
+def wrapped_aspanformer(state: dict[str, Tensor]) -> dict[str, Any]:
+    """With the offsets that the published network keeps and does not read."""
+    offsets = {f"loftr_coarse.layers.{index}.attention.sample_offset": torch.ones(64, 2) for index in range(4)}
+    return wrapped(state | offsets)
+
+
+@dataclass(frozen=True)
+class PublicFile:
+    """One public checkpoint: its matcher, its slot of the manifest, the network that it fills, its layout."""
+
+    name: str
+    matcher: str
+    slot: str
+    standin: str
+    network: Callable[[], nn.Module]
+    layout: Callable[[dict[str, Tensor]], dict[str, Any]] = plain
+
+
+FILES = (
+    PublicFile(
+        "superpoint_v1.pth", "superglue", "superpoint", "superpoint", lambda: SuperPoint(SuperPointConfig())
+    ),
+    PublicFile(
+        "superglue_outdoor.pth",
+        "superglue",
+        "superglue-outdoor",
+        "superglue",
+        lambda: SuperGlue(SuperGlueConfig()),
+    ),
+    PublicFile("outdoor_ds.ckpt", "loftr", "loftr-outdoor", "loftr", Loftr, wrapped),
+    PublicFile("quadtree_outdoor.ckpt", "quadtree", "quadtree-outdoor", "quadtree", Quadtree, wrapped),
+    PublicFile(
+        "aspanformer_outdoor.ckpt",
+        "aspanformer",
+        "aspanformer-outdoor",
+        "aspanformer",
+        AspanFormer,
+        wrapped_aspanformer,
+    ),
+)
+
+
+def write_checkpoints(directory: Path, files: Iterable[PublicFile] = FILES) -> tuple[WeightFile, ...]:
+    """The files' lines of a manifest, sizes and digests included."""
+    lines = []
+    for file in files:
+        path = directory / file.name
+        torch.save(file.layout(standin_state(file.network(), STAND_INS[file.standin])), path)
+        digest = f"sha256:{hashlib.sha256(path.read_bytes()).hexdigest()}"
+        lines.append(WeightFile(file.name, path.stat().st_size, digest, "none", file.slot, "made by tests"))
+    return tuple(lines)
+
+
+def use_manifest(monkeypatch: pytest.MonkeyPatch, lines: tuple[WeightFile, ...]) -> None:
+    """Runs that are begun from now on hold their weights against these lines instead of the package's own."""
+    monkeypatch.setattr(assembly, "WeightStore", lambda directories: WeightStore(directories, lines))

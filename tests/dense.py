@@ -1,0 +1,138 @@
+"""What tests of DKM share: all intermediate values of a match, and pictures as the network wants them."""
+
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+import torch
+from golden import recorded
+
+from mkpc_kaggle.matchers.networks.dkm import MEAN, STD, Weighting
+from mkpc_kaggle.matchers.networks.dkm_coarse import kernel
+from mkpc_kaggle.matchers.networks.dkm_refiner import local_correlation
+
+MODES = {  # of sampling, by the golden files' names
+    "threshold": (Weighting.THRESHOLD, False),
+    "threshold_balanced": (Weighting.THRESHOLD, True),
+    "pow": (Weighting.CUBE_ROOT, False),
+    "pow_balanced": (Weighting.CUBE_ROOT, True),
+    "naive": (Weighting.UNIFORM, False),
+    "naive_balanced": (Weighting.UNIFORM, True),
+    "raw": (Weighting.PLAIN, False),
+    "balanced": (Weighting.PLAIN, True),
+}
+
+
+@contextmanager
+def one_thread():
+    """As the golden files were made. Their own rounding takes up to 0.7 of the tolerance at stride 1, and how work
+    is split among threads changes that of the network by as much again.
+    """
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+@contextmanager
+def recorded_refinement(decoder):
+    """What modules of the decoder got and gave, by name, and the estimate after each refiner."""
+    strides = decoder.conv_refiner.keys()
+    correct = decoder.correct
+    estimates = {f"estimate.{stride}": [] for stride in strides}
+
+    def recording(estimate, query, support, stride):
+        estimates[f"estimate.{stride}"].append(correct(estimate, query, support, stride))
+        return estimates[f"estimate.{stride}"][-1]
+
+    decoder.correct = recording
+    names = ["gps.32", "gps.16", "embedding_decoder", *(f"conv_refiner.{stride}" for stride in strides)]
+    try:
+        with recorded(decoder, names) as calls:
+            yield calls | estimates
+    finally:
+        del decoder.correct
+
+
+@one_thread()
+@torch.inference_mode()
+def computed(network, images, fine_images=(None, None)):
+    """All values on the way to a pair's match, in order: names of the golden files, "up_" in the second pass.
+
+    The directions are run one after the other; here they are one batch, as in the golden files.
+    """
+    features = [network.encode(*versions) for versions in zip(images, fine_images, strict=True)]
+    with recorded_refinement(network.decoder) as calls:
+        dense = network.match(*features)
+    values = encoded(network, images, 32) | coarse_values(network.decoder, calls)
+    passes = 1 if fine_images[0] is None else 2
+    values |= refiner_values(network.decoder, calls, 0, passes)
+    final = ""
+    if passes == 2:
+        final = "up_"
+        second = encoded(network, fine_images, 8) | refiner_values(network.decoder, calls, 1, passes)
+        values |= {f"up_{name}": value for name, value in second.items()}
+    return values | {f"{final}warp": dense.warp, f"{final}certainty": dense.certainty}
+
+
+def encoded(network, images, coarsest):
+    pyramids = [network.encoder(image, coarsest).levels for image in images]
+    return {f"enc{2**i}": torch.cat(levels) for i, levels in enumerate(zip(*pyramids, strict=True))}
+
+
+def coarse_values(decoder, calls):
+    """Projections, kernels, posteriors and first estimates at strides 32 and 16."""
+    values = {}
+    for s in (32, 16):
+        query, support = _joined(got for got, _ in calls[f"gps.{s}"])
+        flow, certainty, context = _joined(
+            (e.flow, e.certainty, z) for (at, *_), (e, z) in calls["embedding_decoder"] if at == s
+        )
+        x, y = query.flatten(2).mT, support.flatten(2).mT
+        values |= {f"proj{s}_q": query, f"proj{s}_s": support}
+        values |= {f"pos{s}": decoder.gps[str(s)].embed_coordinates(support)[:, ::8]}
+        values |= {f"K{s}_yy": kernel(y, y), f"K{s}_xy": kernel(x, y)}
+        values |= {f"gp{s}": torch.cat([gave for _, gave in calls[f"gps.{s}"]])}
+        values |= {f"dfn{s}_flow": flow, f"dfn{s}_cert": certainty, f"dfn{s}_ctx": context}
+        if s == 32:
+            values |= {"flow32": flow, "cert32": certainty}
+    return values
+
+
+def refiner_values(decoder, calls, number, passes):
+    """Correlations, corrections and estimates of one of the passes; the second has no stride 16."""
+    values = {}
+    for s, refiner in decoder.conv_refiner.items():
+        if number and s == "16":
+            continue
+        every = 1 if s == "16" else passes
+        calls_of_pass = calls[f"conv_refiner.{s}"][number::every]
+        if refiner.radius is not None:
+            seen = [local_correlation(*got, refiner.radius) for got, _ in calls_of_pass]
+            values[f"corr_r{refiner.radius}"] = torch.cat(seen)
+        corrections = torch.cat([gave for _, gave in calls_of_pass])
+        flow, certainty = _joined((e.flow, e.certainty) for e in calls[f"estimate.{s}"][number::every])
+        values |= {f"ref{s}_dcert": corrections[:, :1], f"ref{s}_disp": corrections[:, 1:]}
+        values |= {f"flow{s}": flow, f"cert{s}": certainty}
+    return values
+
+
+def _joined(calls):
+    return [torch.cat(parts) for parts in zip(*calls, strict=True)]
+
+
+def batch_of(pixels):
+    return pixels.permute(2, 0, 1)[None].contiguous()
+
+
+def resized_by_pil(pixels, size):
+    image = pytest.importorskip("PIL.Image", reason="the golden images were resized by PIL")
+    resized = image.fromarray(pixels.numpy()).resize(size[::-1], image.Resampling.BICUBIC)
+    return torch.from_numpy(np.array(resized))
+
+
+def grey_levels(image):
+    mean, std = (torch.tensor(values)[:, None, None] for values in (MEAN, STD))
+    return ((image * std + mean) * 255).round()

@@ -1,0 +1,118 @@
+"""Stand-in weights that come from code alone: of no use in earnest, but networks respond to texture and match.
+
+Every number is made of bytes of SHAKE-256 of a name, so that no generator of numpy's or torch's can change it.
+"""
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from fnmatch import fnmatchcase
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+
+@dataclass(frozen=True)
+class StandIn:
+    """How a network's stand-in weights depart from the rule of :func:`value_of`.
+
+    ``gain``: of all maps, beside their fan-in. ``scales``: factors of the parameters whose names match.
+    ``values``: set for those parameters, or for single entries, ``"convPb.bias[64]"``.
+    """
+
+    gain: float = 2.0
+    scales: Mapping[str, float] = field(default_factory=dict)
+    values: Mapping[str, float] = field(default_factory=dict)
+
+
+# Found by trial: with them a picture and its shifted copy have matches, and not everything matches.
+STAND_INS = {
+    "superpoint": StandIn(3.0, {"conv1a.weight": 2.0, "convPb.weight": 2.0}, {"convPb.bias[64]": 7.0}),
+    "superglue": StandIn(
+        1.0,
+        {
+            "kenc.encoder.12.weight": 0.3,
+            "kenc.encoder.12.bias": 0.1,
+            "gnn.layers.*.attn.proj.[01].weight": 16.0,
+            "gnn.layers.*.mlp.0.weight": 8.0,
+            "gnn.layers.*.mlp.3.weight": 0.1,
+            "gnn.layers.*.mlp.3.bias": 0.01,
+            "final_proj.weight": 5.0,
+        },
+        {"bin_score": 45.0},
+    ),
+    "loftr": StandIn(2.0, {"backbone.layer3_outconv.weight": 0.9}),
+    "quadtree": StandIn(
+        2.0, {"backbone.layer3_outconv.weight": 1.8, "loftr_coarse.layers.*.attn.py_att.weight": 4.0}
+    ),
+    "aspanformer": StandIn(
+        2.0,
+        {"backbone.layer3_outconv.weight": 2.0, "loftr_coarse.layers.*.flow_decoder.2.weight": 0.3},
+        {"coarse_matching.temperature": 6.0},
+    ),
+    "dkm": StandIn(
+        1.5,
+        {
+            "decoder.embedding_decoder.terminal_module.*.weight": 2.0,
+            "decoder.conv_refiner.*.out_conv.weight": 2.0,
+        },
+    ),
+}
+
+
+def uniform(name: str, shape: Sequence[int] = ()) -> np.ndarray:
+    """float64 in (-1, 1), 2^16 different values, as the name has it."""
+    count = int(np.prod(shape, dtype=int))
+    whole = np.frombuffer(hashlib.shake_256(name.encode()).digest(2 * count), "<u2").astype(np.float64)
+    return ((2 * whole + 1) / 2**16 - 1).reshape(shape)
+
+
+def value_of(name: str, shape: Sequence[int], gain: float) -> np.ndarray:
+    """The value of one parameter or buffer.
+
+    Maps have no mean, so that a flat input leaves them silent, and the variance ``gain`` / fan-in. Norms are
+    nearly neutral, with positive variances; biases are small.
+    """
+    numbers = uniform(name, shape)
+    if len(shape) > 1:
+        axes = tuple(range(1, len(shape)))
+        fan_in = np.prod(shape[1:])
+        mean = numbers.mean(axis=axes, keepdims=True) if fan_in > 1 else 0
+        return (numbers - mean) * np.sqrt(3 * gain / fan_in)
+    if name.endswith("running_var") or (shape and name.endswith(("weight", "affine"))):
+        return 1 + 0.2 * numbers
+    return 0.1 * numbers
+
+
+def standin_state(network: nn.Module, standin: StandIn) -> dict[str, Tensor]:
+    """A checkpoint of a network of ours: float32 tensors by name; integer buffers are 0."""
+    state = {}
+    for name, tensor in network.state_dict().items():
+        if not tensor.is_floating_point():
+            state[name] = torch.zeros_like(tensor)
+            continue
+        scale = np.prod([factor for pattern, factor in standin.scales.items() if fnmatchcase(name, pattern)])
+        state[name] = torch.from_numpy(
+            np.asarray(scale * value_of(name, tuple(tensor.shape), standin.gain), np.float32)
+        )
+    for name, value in standin.values.items():
+        key, _, entry = name.removesuffix("]").partition("[")
+        state[key].view(-1)[slice(None) if not entry else int(entry)] = value
+    return state
+
+
+def filled(network: nn.Module, name: str) -> nn.Module:
+    """The network with the stand-in weights of that name."""
+    network.load_state_dict(standin_state(network, STAND_INS[name]))
+    return network
+
+
+def scene(height: int, width: int, channels: int = 1, name: str = "scene") -> np.ndarray:
+    """A picture with texture at all scales, (height, width, channels) uint8; exact, for it is made of integers."""
+    total = np.zeros((height, width, channels), int)
+    for cell in (3, 8, 24):
+        rows, columns = -(-height // cell), -(-width // cell)
+        steps = uniform(f"{name}, {cell}", (rows, columns, channels)) * 128
+        total += np.kron(steps.astype(int), np.ones((cell, cell, 1), int))[:height, :width]
+    return (128 + total // 3).astype(np.uint8)

@@ -1,0 +1,310 @@
+"""DKM: what must hold of any weights, and by hand on small maps."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+from dense import MODES, batch_of, grey_levels, resized_by_pil
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch.nn import functional
+
+from mkpc_kaggle.geometry.coordinates import Size
+from mkpc_kaggle.matchers.networks.dkm import (
+    DKM,
+    DkmConfig,
+    SamplingConfig,
+    Weighting,
+    balancing_weights,
+    dense_warp,
+    density,
+    joined,
+    network_input,
+    pixel_points,
+    sample,
+)
+from mkpc_kaggle.matchers.networks.dkm_coarse import posterior_mean
+from mkpc_kaggle.matchers.networks.dkm_refiner import Estimate, identity_map, local_correlation, refined
+from mkpc_kaggle.matchers.networks.resnet50 import ResNet50
+
+
+@cache
+def network(*, symmetric=True):
+    """Random weights that keep activations, and so the flow, of order 1."""
+    torch.manual_seed(0)
+    network = DKM(DkmConfig(symmetric))
+    with torch.no_grad():
+        for parameter in network.parameters():
+            if parameter.ndim > 1:
+                parameter.normal_(std=parameter[0].numel() ** -0.5)
+    return network
+
+
+def images(count, height, width, seed=0):
+    """Normalised noise with some texture at all scales."""
+    generator = torch.Generator().manual_seed(seed)
+    layers = [
+        functional.interpolate(torch.randn(count, 3, n, n, generator=generator), (height, width), mode="bicubic")
+        for n in (2, 5, 17)
+    ]
+    return sum(layers)
+
+
+def features(count=1, size=(45, 61), fine=None, seed=0):
+    return network().encode(images(count, *size, seed), None if fine is None else images(count, *fine, seed))
+
+
+def test_the_parameters_are_those_of_the_checkpoint():
+    state = network().state_dict()
+    assert len(state) == 813
+    assert sum(parameter.numel() for parameter in network().parameters()) == 72_261_090
+
+
+@torch.inference_mode()
+@pytest.mark.parametrize("fine", [None, (70, 83)])
+def test_a_batch_finds_what_its_pairs_give_alone(fine):
+    query, support = features(2, fine=fine), features(2, fine=fine, seed=1)
+    found = network().match(query, support)
+    for i in range(2):
+        alone = [
+            network().encode(
+                images(2, 45, 61, seed)[i : i + 1], None if fine is None else images(2, *fine, seed)[i : i + 1]
+            )
+            for seed in (0, 1)
+        ]
+        expected = network().match(*alone)
+        torch.testing.assert_close(found.warp[i], expected.warp[0], rtol=0, atol=1e-3)
+        # A pixel within rounding of the border may count as outside in one of them.
+        off = (found.certainty[i] - expected.certainty[0]).abs() > 1e-3
+        assert off.float().mean() < 1e-3
+
+
+@torch.inference_mode()
+def test_a_symmetric_match_holds_both_one_way_matches():
+    query, support = features(), features(seed=1)
+    both = network().match(query, support)
+    there, back = (network(symmetric=False).match(*pair) for pair in ((query, support), (support, query)))
+    assert torch.equal(both.warp[:, :, :61], there.warp)
+    assert torch.equal(both.warp[:, :, 61:], back.warp[..., [2, 3, 0, 1]])
+    assert torch.equal(both.certainty, torch.cat([there.certainty, back.certainty], dim=2))
+
+
+@torch.inference_mode()
+def test_the_warp_is_in_range_and_its_query_side_the_identity():
+    found = network(symmetric=False).match(features(fine=(70, 83)), features(fine=(70, 83), seed=1))
+    assert found.warp.shape == (1, 70, 83, 4)
+    assert found.certainty.shape == (1, 70, 83)
+    assert found.warp.abs().max() <= 1
+    assert (found.certainty >= 0).all()
+    assert (found.certainty <= 1).all()
+    assert 0 < (found.certainty == 0).float().mean() < 1  # both kinds of target occur
+    assert found.warp[..., 2:].std() > 0.1
+    torch.testing.assert_close(found.warp[0, 3, 5, :2], torch.tensor([11 / 83 - 1, 7 / 70 - 1]))
+
+
+@torch.inference_mode()
+@pytest.mark.parametrize("size", [(1, 1), (2, 3), (5, 70), (33, 32)])
+def test_any_size_goes_through(size):
+    found = network().match(features(size=size), features(size=size, seed=1))
+    assert found.warp.shape == (1, size[0], 2 * size[1], 4)
+    assert found.warp.isfinite().all()
+    assert found.certainty.isfinite().all()
+
+
+@torch.inference_mode()
+def test_sides_are_halved_upwards_and_only_as_far_as_asked():
+    image = images(1, 45, 61)
+    levels = network().encoder(image).levels
+    sizes = [tuple(level.shape[1:]) for level in levels]
+    expected = [(3, 45, 61), (64, 23, 31), (256, 12, 16), (512, 6, 8), (1024, 3, 4), (2048, 2, 2)]
+    assert sizes == expected
+    fine = network().encoder(image, 8).levels
+    assert [level.shape for level in fine] == [level.shape for level in levels[:4]]
+    assert all(torch.equal(a, b) for a, b in zip(fine, levels, strict=False))
+
+
+def test_images_of_two_sizes_are_refused():
+    with pytest.raises(ValueError, match="one size"):
+        network().match(features(size=(32, 40)), features(size=(32, 41)))
+    with pytest.raises(ValueError, match="one size"):
+        network().match(features(), features(fine=(70, 83)))
+
+
+@torch.inference_mode()
+def test_a_bottleneck_is_its_definition():
+    torch.manual_seed(2)
+    block = ResNet50().eval().layer2[0]
+    x = torch.randn(1, 256, 7, 9)
+    y = functional.relu(block.bn1(block.conv1(x)))
+    y = functional.relu(block.bn2(block.conv2(y)))
+    expected = functional.relu(block.bn3(block.conv3(y)) + block.downsample(x))
+    torch.testing.assert_close(block(x), expected, rtol=1e-5, atol=1e-5)
+    assert block.conv2.stride == (2, 2)
+
+
+@given(
+    radius=st.integers(1, 4),
+    size=st.tuples(st.integers(1, 9), st.integers(1, 9)),
+    spread=st.sampled_from([0.5, 1.5, 20]),
+    seed=st.integers(0, 2**32 - 1),
+)
+@settings(max_examples=50, deadline=None)
+def test_local_correlation_is_its_definition(radius, size, spread, seed):
+    generator = torch.Generator().manual_seed(seed)
+    h, w = size
+    query, support = torch.randn(2, 2, 5, h, w, generator=generator)
+    flow = torch.randn(2, 2, h, w, generator=generator) * spread
+    offsets = [(a, b) for a in range(-radius, radius + 1) for b in range(-radius, radius + 1)]
+    expected = []
+    for a, b in offsets:
+        target = flow.permute(0, 2, 3, 1) + torch.tensor([2 * b / w, 2 * a / h])
+        expected.append((query * functional.grid_sample(support, target, align_corners=False)).sum(1) / 5**0.5)
+    got = local_correlation(query, support, flow, radius)
+    torch.testing.assert_close(got, torch.stack(expected, dim=1), rtol=1e-4, atol=2e-4)
+
+
+def test_local_correlation_is_the_same_in_several_blocks():
+    torch.manual_seed(3)
+    query, support = torch.randn(2, 1, 512, 12, 16)  # 32 pixels a block
+    flow = torch.randn(1, 2, 12, 16)
+    got = local_correlation(query, support, flow, 3)
+    pixel = got[0, :, 7, 11]
+    target = flow[0, :, 7, 11] * 1.0
+    window = torch.stack(
+        [target + torch.tensor([2 * b / 16, 2 * a / 12]) for a in range(-3, 4) for b in range(-3, 4)]
+    )
+    sampled = functional.grid_sample(support, window[None, None], align_corners=False)[0, :, 0]  # (512, 49)
+    torch.testing.assert_close(pixel, query[0, :, 7, 11] @ sampled / 512**0.5, rtol=1e-4, atol=1e-4)
+
+
+def test_the_posterior_is_that_of_the_textbook():
+    torch.manual_seed(4)
+    x, y, values = torch.randn(2, 7, 16), torch.randn(2, 11, 16), torch.randn(1, 11, 3)
+
+    def k(a, b):
+        a, b = a.double(), b.double()
+        return ((functional.normalize(a, dim=2) @ functional.normalize(b, dim=2).mT - 1) / 0.2).exp()
+
+    inverse = torch.linalg.inv(k(y, y) + 0.1 * torch.eye(11))
+    expected = k(x, y) @ inverse @ values.double()
+    torch.testing.assert_close(posterior_mean(x, y, values).double(), expected, rtol=1e-4, atol=1e-5)
+
+
+def test_a_unit_of_correction_is_an_eighth_of_a_pixel_of_its_stride():
+    estimate = Estimate(torch.zeros(1, 2, 5, 9), torch.ones(1, 1, 5, 9))
+    corrections = torch.tensor([3.0, 8.0, 16.0])[None, :, None, None].expand(1, 3, 5, 9)
+    found = refined(estimate, corrections, 4, torch.Size([20, 36]))
+    torch.testing.assert_close(found.flow[0, :, 0, 0], torch.tensor([2 / 9, 2 * 2 / 5]))
+    assert (found.certainty == 4).all()
+
+
+def test_targets_outside_have_no_certainty_and_coarse_doubts_count_half():
+    flow = torch.zeros(1, 2, 2, 2)
+    flow[0, 0, 0, 1], flow[0, 1, 1, 0], flow[0, :, 1, 1] = 1.001, -2, 1
+    found = dense_warp(Estimate(flow, torch.full((1, 1, 2, 2), -1.0)), torch.full((1, 1, 1, 1), -3.0))
+    raised = torch.tensor(0.5).sigmoid()
+    torch.testing.assert_close(found.certainty[0], raised * torch.tensor([[1, 0], [0, 1]]))
+    assert found.warp[0, ..., 2:].tolist() == [[[0, 0], [1, 0]], [[0, -1], [1, 1]]]
+    assert found.warp[0, ..., :2].tolist() == [[[-0.5, -0.5], [0.5, -0.5]], [[-0.5, 0.5], [0.5, 0.5]]]
+    sure = dense_warp(Estimate(flow, torch.full((1, 1, 2, 2), -1.0)), torch.full((1, 1, 1, 1), 3.0))
+    torch.testing.assert_close(sure.certainty[0, 0, 0], torch.tensor(-1.0).sigmoid())
+    both = joined(found, sure)
+    assert torch.equal(both.warp[0, 0, 3], torch.tensor([1, 0, 0.5, -0.5]))
+
+
+def test_pixel_centres():
+    assert identity_map(torch.zeros(1, 4))[0].tolist() == [[[-0.75, -0.25, 0.25, 0.75]], [[0, 0, 0, 0]]]
+    ends = torch.tensor([[-1.0, -1, 1, 1], [0, 0.5, 0, 0.5]])
+    points0, points1 = pixel_points(ends, Size(10, 20), Size(30, 40))
+    assert points0.tolist() == [[-0.5, -0.5], [4.5, 14.5]]
+    assert points1.tolist() == [[29.5, 39.5], [14.5, 29.5]]
+
+
+def warp_and_certainty(count=3000, seed=5):
+    generator = torch.Generator().manual_seed(seed)
+    return torch.rand(count, 4, generator=generator) * 2 - 1, torch.rand(count, generator=generator) ** 4
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_samples_repeat_with_a_seed_and_hold_no_match_twice(mode):
+    weighting, balanced = MODES[mode]
+    warp, certainty = warp_and_certainty()
+    config = SamplingConfig(400, weighting, balanced=balanced)
+    first, again, other = (
+        sample(warp, certainty, config, torch.Generator().manual_seed(seed)) for seed in (1, 1, 2)
+    )
+    assert torch.equal(first.matches, again.matches)
+    assert torch.equal(first.certainty, again.certainty)
+    assert not torch.equal(first.matches, other.matches)
+    assert len(first.matches.unique(dim=0)) == 400
+    folded = sample(warp.view(2, 30, 50, 4), certainty.view(2, 30, 50), config, torch.Generator().manual_seed(1))
+    assert torch.equal(folded.matches, first.matches)
+
+
+def test_without_balance_it_is_pytorchs_multinomial():
+    warp, certainty = warp_and_certainty()
+    drawn = torch.multinomial(certainty, 50, generator=torch.Generator().manual_seed(6))
+    config = SamplingConfig(50, Weighting.PLAIN, balanced=False)
+    found = sample(warp, certainty, config, torch.Generator().manual_seed(6))
+    assert torch.equal(found.matches, warp[drawn])
+    assert torch.equal(found.certainty, certainty[drawn])
+
+
+def test_balancing_spreads_the_matches():
+    generator = torch.Generator().manual_seed(7)
+    crowd = torch.rand(9000, 4, generator=generator) * 0.1
+    thin = torch.rand(1000, 4, generator=generator) * 0.1 - 0.9
+    warp, certainty = torch.cat([crowd, thin]), torch.ones(10000)
+    shares = [
+        (sample(warp, certainty, SamplingConfig(500, balanced=balanced), generator).matches[:, 0] < 0)
+        .float()
+        .mean()
+        .item()
+        for balanced in (False, True)
+    ]
+    assert shares[0] == pytest.approx(0.1, abs=0.06)
+    assert shares[1] > 0.3
+
+
+def test_what_has_no_weight_is_not_drawn():
+    warp, certainty = warp_and_certainty(100)
+    certainty[10:] = 0
+    found = sample(warp, certainty, SamplingConfig(50))
+    assert sorted(found.matches.tolist()) == sorted(warp[:10].tolist())
+    assert len(sample(warp, certainty * 0, SamplingConfig(50)).matches) == 0
+    assert len(sample(warp[:0], certainty[:0], SamplingConfig(50)).matches) == 0
+
+
+def test_sampling_refuses_what_makes_no_sense():
+    warp, certainty = warp_and_certainty(100)
+    with pytest.raises(ValueError, match="finite"):
+        sample(warp, certainty.index_fill(0, torch.tensor([3]), float("nan")), SamplingConfig(50))
+    with pytest.raises(ValueError, match="number"):
+        SamplingConfig(0)
+
+
+def test_density_is_its_definition_in_several_blocks():
+    points, _ = warp_and_certainty(3000)
+    exact = torch.exp(-torch.cdist(points.double(), points.double()).square() / 0.02).sum(dim=1)
+    torch.testing.assert_close(density(points).double(), exact, rtol=1e-4, atol=1e-4)
+    weights = balancing_weights(torch.tensor([1.0, 9.99, 10.0, 99.0]))
+    torch.testing.assert_close(weights, torch.tensor([1e-7, 1e-7, 1 / 11, 0.01]))
+
+
+def test_the_input_is_normalised_and_of_its_size():
+    pixels = torch.randint(0, 256, (2, 3, 8, 9), dtype=torch.uint8)
+    image = network_input(pixels, (8, 9))
+    expected = (pixels[1, 2, 3, 4] / 255 - 0.406) / 0.225
+    torch.testing.assert_close(image[1, 2, 3, 4], expected)
+    assert network_input(pixels, (20, 7)).shape == (2, 3, 20, 7)
+
+
+def test_the_input_is_resized_as_by_pil():
+    rng = np.random.default_rng(8)
+    pixels = torch.from_numpy(rng.integers(0, 256, (150, 210, 3), dtype=np.uint8))
+    for size in ((64, 80), (170, 333)):
+        got = grey_levels(network_input(batch_of(pixels), size))
+        off = (got - batch_of(resized_by_pil(pixels, size))).abs()
+        assert off.max() <= 1
+        assert off.mean() < 0.02
