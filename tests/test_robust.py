@@ -318,3 +318,31 @@ def test_points_of_any_magnitude_give_an_estimate(model, exponent):
         result = estimated(model, matches, RobustConfig(method=method, max_iterations=200))
         assert np.isfinite(result.matrix).all()
         assert np.linalg.norm(result.matrix) == UNIT
+
+
+def test_an_order_that_opencv_refuses_costs_that_order_alone(monkeypatch):
+    solve, calls = cv2.findFundamentalMat, []
+
+    def refusing_first(*arguments):
+        calls.append(arguments)
+        if len(calls) == 1:
+            raise cv2.error("sample_size <= points_size_")
+        return solve(*arguments)
+
+    monkeypatch.setattr(cv2, "findFundamentalMat", refusing_first)
+    points = np.random.default_rng(0).uniform(0, 500, (60, 2)).astype(np.float32)
+    found = estimate(Matches(points, points + np.float32([7, 3]), np.ones(60)), RobustConfig(orders=3))
+    assert len(calls) == 3
+    assert not found.failure and found.inlier_count == 60
+
+
+def test_points_that_opencv_refuses_in_every_order_have_its_reason(monkeypatch):
+    def refusing(*_):
+        error = cv2.error("no")
+        error.err = "sample_size <= points_size_"
+        raise error
+
+    monkeypatch.setattr(cv2, "findFundamentalMat", refusing)
+    points = np.random.default_rng(0).uniform(0, 500, (60, 2)).astype(np.float32)
+    found = estimate(Matches(points, points, np.ones(60)), RobustConfig())
+    assert "OpenCV refused the points: sample_size" in found.failure

@@ -175,15 +175,25 @@ def _best_of_orders(
     threshold: float,
     config: RobustConfig,
 ) -> tuple[Matrix3 | None, NDArray[np.bool_]]:
-    """The model with most inliers over fixed permutations, the given order first, and its mask (N,)."""
-    best, best_mask = None, np.zeros(len(points0), bool)
+    """The model with most inliers over fixed permutations, the given order first, and its mask (N,).
+
+    OpenCV now and then refuses points in one order and not in another; raises its error where it refused some
+    and the others gave nothing.
+    """
+    best, best_mask, refusal = None, np.zeros(len(points0), bool), None
     for number in range(config.orders):
         order = np.random.default_rng(number).permutation(len(points0)) if number else np.arange(len(points0))
-        matrix, mask = _solve(model, points0[order], points1[order], threshold, config)
+        try:
+            matrix, mask = _solve(model, points0[order], points1[order], threshold, config)
+        except cv2.error as error:
+            refusal = error
+            continue
         if matrix is None or matrix.shape != (3, 3) or not np.isfinite(matrix).all() or not matrix.any():
             continue
         if best is None or np.count_nonzero(mask) > np.count_nonzero(best_mask):
             best, best_mask[order] = matrix, mask.ravel().astype(bool)
+    if best is None and refusal is not None:
+        raise refusal
     return best, best_mask
 
 
