@@ -1,0 +1,198 @@
+"""Time, work and memory of every network beside kornia's LoFTR at 640 x 480, in one process, in turns.
+
+python -m benchmarks.matchers [--rounds 5] [--precision bfloat16] [--only loftr,dkm]
+
+Weights are the tests' stand-ins, the pictures a photograph and its shifted copy. The work is counted by PyTorch
+(matrix products and convolutions); the peak is what a large convolution reaches in the same process. The memory
+is the largest of a process that does nothing else, Python and PyTorch included.
+"""
+
+import argparse
+import resource
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from functools import cache, partial
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from sklearn.datasets import load_sample_images
+from torch import Tensor
+from torch.nn import functional
+from torch.utils.flop_counter import FlopCounterMode
+
+from mkpc_kaggle.geometry.coordinates import Size
+from mkpc_kaggle.matchers.networks.aspanformer import AspanFormer
+from mkpc_kaggle.matchers.networks.dkm import DKM, SamplingConfig, network_input, sample
+from mkpc_kaggle.matchers.networks.loftr import Loftr
+from mkpc_kaggle.matchers.networks.placement import placed
+from mkpc_kaggle.matchers.networks.quadtree import Quadtree
+from mkpc_kaggle.matchers.networks.superglue import ImageKeypoints, SuperGlue, SuperGlueConfig
+from mkpc_kaggle.matchers.networks.superpoint import SuperPoint, SuperPointConfig
+from tests.standin import filled
+
+Run = Callable[[], int]
+"""Does the work once; the number of matches or keypoints that it found."""
+
+VGA, DKM_SIZE = Size(640, 480), Size(720, 540)
+YARDSTICK = "kornia LoFTR"
+KILO, MEGA, GIGA = 1e3, 1e6, 1e9
+
+
+@cache
+def photographs(size: Size) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """Two views (H, W, 3) RGB, the second 16 pixels further right and 8 further down."""
+    photograph = load_sample_images().images[0]
+    resized = cv2.resize(photograph, size, interpolation=cv2.INTER_AREA)
+    return resized, np.roll(resized, (8, 16), axis=(0, 1))
+
+
+def gray_images(size: Size) -> list[Tensor]:
+    grays = (cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY) for picture in photographs(size))
+    return [torch.from_numpy(gray)[None, None].float() / 255 for gray in grays]
+
+
+def kornia_loftr(precision: torch.dtype) -> Run:
+    """Always in float32, with the weights of ours."""
+    from kornia.feature import LoFTR
+
+    network = LoFTR(pretrained=None).eval()
+    tensors = filled(Loftr(), "loftr").state_dict()
+    network.load_state_dict({**network.state_dict(), **tensors})
+    image0, image1 = gray_images(VGA)
+    return lambda: len(network({"image0": image0, "image1": image1})["keypoints0"])
+
+
+def semi_dense(make: Callable[[], Loftr | Quadtree | AspanFormer], name: str, size: Size) -> Callable[..., Run]:
+    def prepare(precision: torch.dtype) -> Run:
+        network = placed(filled(make(), name), precision=precision)
+        image0, image1 = gray_images(size)
+        return lambda: len(network.match(network.encode(image0), network.encode(image1)).points0)
+
+    return prepare
+
+
+def superpoint(precision: torch.dtype) -> Run:
+    network = placed(filled(SuperPoint(SuperPointConfig()), "superpoint").eval(), precision=precision)
+    image = gray_images(VGA)[0]
+    return lambda: len(network(image)[0].points)
+
+
+def superglue(number: int, precision: torch.dtype) -> Run:
+    network = placed(filled(SuperGlue(SuperGlueConfig(20)), "superglue"), precision=precision)
+    generator = torch.Generator().manual_seed(0)
+    points = torch.rand(1, number, 2, generator=generator) * torch.tensor(VGA)
+    scores = torch.rand(1, number, generator=generator)
+    descriptors = functional.normalize(torch.randn(1, number, 256, generator=generator), dim=2)
+    keypoints = ImageKeypoints(points, scores, descriptors, VGA)
+    return lambda: int((network(keypoints, keypoints).matches0 >= 0).sum())
+
+
+def dkm(precision: torch.dtype) -> Run:
+    network = placed(filled(DKM(), "dkm"), precision=precision)
+    pictures = [torch.from_numpy(view).permute(2, 0, 1)[None] for view in photographs(DKM_SIZE)]
+
+    def run() -> int:
+        inputs = [network_input(picture, DKM_SIZE[::-1]) for picture in pictures]
+        warps = network.match(*(network.encode(image) for image in inputs))
+        warp = torch.cat([one.warp.reshape(-1, 4) for one in warps])
+        certainty = torch.cat([one.certainty.flatten() for one in warps])
+        return len(sample(warp, certainty, SamplingConfig()).matches)
+
+    return run
+
+
+CASES: dict[str, Callable[[torch.dtype], Run]] = {
+    YARDSTICK: kornia_loftr,
+    "LoFTR": semi_dense(Loftr, "loftr", VGA),
+    "SuperPoint": superpoint,
+    "SuperGlue, 1024 keypoints": partial(superglue, 1024),
+    "SuperGlue, 2048 keypoints": partial(superglue, 2048),
+    "QuadTree": semi_dense(Quadtree, "quadtree", VGA),
+    "ASpanFormer": semi_dense(AspanFormer, "aspanformer", VGA),
+    "DKM 540x720, one pass": dkm,
+}
+LARGE = Size(1600, 1216)
+LARGE_CASES = {
+    f"{label}, {LARGE.width} x {LARGE.height}": semi_dense(make, name, LARGE)
+    for label, make, name in (
+        ("LoFTR", Loftr, "loftr"),
+        ("QuadTree", Quadtree, "quadtree"),
+        ("ASpanFormer", AspanFormer, "aspanformer"),
+    )
+}
+
+
+def seconds_of(run: Run) -> float:
+    start = time.perf_counter()
+    run()
+    return time.perf_counter() - start
+
+
+def work_of(run: Run) -> float:
+    """Floating-point operations of matrix products and convolutions, two for each multiplication."""
+    with FlopCounterMode(display=False) as counter:
+        run()
+    return float(counter.get_total_flops())
+
+
+def peak(precision: torch.dtype) -> float:
+    """Operations a second of a 3 x 3 convolution, channels last."""
+    x = torch.randn(1, 256, 120, 160, dtype=precision).contiguous(memory_format=torch.channels_last)
+    weight = torch.randn(256, 256, 3, 3, dtype=precision).contiguous(memory_format=torch.channels_last)
+    run = partial(functional.conv2d, x, weight, padding=1)
+    return 2 * weight[0].numel() * x.numel() / min(seconds_of(run) for _ in range(20))  # type: ignore[arg-type]
+
+
+def peak_memory(case: str, precision: str) -> float:
+    """Bytes of a process of its own."""
+    arguments = [sys.executable, "-m", "benchmarks.matchers", "--memory-of", case, "--precision", precision]
+    return float(subprocess.run(arguments, check=True, capture_output=True, text=True).stdout)
+
+
+@torch.inference_mode()
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--precision", choices=["float32", "bfloat16", "float16"], default="float32")
+    parser.add_argument("--only", default=",".join(CASES), help="parts of names of cases")
+    parser.add_argument("--memory-of", metavar="CASE", help="run this case once and print the process's peak")
+    arguments = parser.parse_args()
+    precision: torch.dtype = getattr(torch, arguments.precision)
+    if arguments.memory_of:
+        (CASES | LARGE_CASES)[arguments.memory_of](precision)()
+        print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024)
+        return
+    chosen = [case for case in CASES if any(part in case for part in arguments.only.split(",") if part)]
+    runs = {case: CASES[case](precision) for case in dict.fromkeys([YARDSTICK, *chosen])}
+    found, work = {case: run() for case, run in runs.items()}, {case: work_of(run) for case, run in runs.items()}
+    times: dict[str, list[float]] = {case: [] for case in runs}
+    for _ in range(arguments.rounds):
+        for case, run in runs.items():
+            times[case].append(seconds_of(run))
+    report(found, work, times, peak(precision), arguments.precision)
+
+
+def report(
+    found: dict[str, int], work: dict[str, float], times: dict[str, list[float]], most: float, precision: str
+) -> None:
+    """Medians of the rounds; shares of the yardstick's median."""
+    print(f"{torch.get_num_threads()} threads, {precision}; peak {most / GIGA:.0f} GFLOP/s\n")
+    print("| network | found | seconds | of kornia's | GFLOP | GFLOP/s | of peak | memory |")
+    print("|---|---|---|---|---|---|---|---|")
+    yardstick = statistics.median(times[YARDSTICK])
+    for case, seconds in times.items():
+        median = statistics.median(seconds)
+        print(
+            f"| {case} | {found[case]} | {median:.3f} | {median / yardstick:.2f} | {work[case] / GIGA:.0f} "
+            f"| {work[case] / median / GIGA:.0f} | {work[case] / median / most:.0%} "
+            f"| {peak_memory(case, precision) / GIGA:.2f} GB |"
+        )
+
+
+if __name__ == "__main__":
+    main()
