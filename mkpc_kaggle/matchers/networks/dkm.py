@@ -31,7 +31,8 @@ FINE_COARSEST = 8  # the coarsest stride that the second pass looks at
 OVERSAMPLING = 4  # before matches are balanced
 BANDWIDTH = 0.1  # of the density's kernel, in normalised coordinates
 MIN_DENSITY, LAST_RESORT = 10, 1e-7  # isolated matches are drawn only when no others are left
-BLOCK_FLOATS = 2**22
+BLOCK_FLOATS = 2**20
+LEAST_EXPONENT = -80  # e to less is denormal, which takes a processor ten times as long and adds nothing
 
 
 @dataclass(frozen=True)
@@ -282,7 +283,7 @@ def density(points: Tensor) -> Tensor:
     rows = max(1, BLOCK_FLOATS // max(1, len(points)))
     for some, out in zip(torch.split(points, rows), torch.split(density, rows), strict=True):
         exponents = torch.cdist(some, points).square_().div_(-2 * BANDWIDTH**2)
-        torch.sum(exponents.exp_(), dim=1, out=out)
+        torch.sum(exponents.clamp_(min=LEAST_EXPONENT).exp_(), dim=1, out=out)
     return density
 
 
