@@ -2,26 +2,36 @@
 
 from collections.abc import Container, Iterable, Mapping
 from dataclasses import dataclass, field
+from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.matchers.contract import Matcher
-from mkpc_kaggle.matchers.registry import load_matcher, options_of, slots_of
+from mkpc_kaggle.matchers.registry import load_matcher, options_of, registry, slots_of
 from mkpc_kaggle.pipeline import Pipeline
 from mkpc_kaggle.recipe import Mode, Recipe, Unit, load_recipe
 from mkpc_kaggle.weights import WeightStore
 
 AUTO = "auto"
 CUDA_BATCH = 8
+PERMISSIVE_TAGS = frozenset({"Apache-2.0", "BSD-3-Clause", "MIT"})
+
+
+class Licence(StrEnum):
+    """Which weights may be used, by their licence."""
+
+    ANY = "any"
+    PERMISSIVE = "permissive"
+    """those that may be used for any purpose: Apache-2.0, BSD-3-Clause, MIT"""
 
 
 @dataclass(frozen=True)
 class Assembly:
     """All that a worker needs to build its pipeline.
 
-    ``left_out`` are the units of recipe ``auto`` whose weights are missing; ``matchers`` are ready ones of
-    the user's own.
+    ``left_out`` are the units of recipe ``auto`` whose weights are missing or not permitted; ``matchers`` are
+    ready ones of the user's own.
     """
 
     recipe: Recipe
@@ -37,7 +47,7 @@ class Assembly:
 
     def fingerprint(self) -> dict[str, Any]:
         """What decides the numbers that come out: the recipe and the digests of its weights."""
-        slots = slots_of(name for name in self.recipe.matcher_names if name not in self.matchers)
+        slots = slots_of(self.recipe, not_own(self.recipe.matcher_names, self.matchers))
         found = {slot: self.weights.find(slot) for slot in slots}
         return {
             "recipe": self.recipe.fingerprint(),
@@ -54,11 +64,12 @@ def assemble(
     weights: Iterable[Path] = (),
     device: str = AUTO,
     mode: Mode = Mode.TWO_STAGE,
+    licence: Licence = Licence.ANY,
     matchers: Mapping[str, Matcher[Any]] | None = None,
 ) -> Assembly:
-    """Everything checked before any work: recipe, options, weights and their digests, device.
+    """Everything checked before any work: recipe, options, licences, weights and their digests, device.
 
-    Recipe ``auto`` drops the units whose weights are missing; for any other, missing weights raise
+    Recipe ``auto`` drops the units whose weights are missing or not permitted; for any other, such weights raise
     :class:`UserError`, as do unknown names and damaged files.
     """
     own = matchers or {}
@@ -66,20 +77,43 @@ def assemble(
     wanted = load_recipe(recipe) if isinstance(recipe, str) else recipe
     for name in {*wanted.matcher_names, *wanted.matchers} - own.keys():
         options_of(wanted, name)
+    refused = {name: licences_of(wanted, name, store, own) - PERMISSIVE_TAGS for name in wanted.matcher_names}
+    refused = {name: tags for name, tags in refused.items() if tags and licence is Licence.PERMISSIVE}
+    if refused and recipe != AUTO:
+        weights_of = ", ".join(f"{name} ({', '.join(sorted(tags))})" for name, tags in refused.items())
+        raise UserError(
+            f"--licence permissive refuses recipe {wanted.name!r} for the weights of {weights_of}. Take a recipe "
+            "without them, such as permissive, or --recipe auto, which leaves them out."
+        )
     missing = missing_slots(wanted, store, own)
     if missing and recipe != AUTO:
         raise UserError(
             f"recipe {wanted.name!r} needs weights that were not found ({what_is_missing(missing, store)}). "
             "Name their directory with --weights, or use --recipe auto, which does with what there is."
         )
-    chosen = wanted.only(lambda unit: unit.matcher in own or not set(slots_of([unit.matcher])) & set(missing))
+    lacking = {n for n in not_own(wanted.matcher_names, own) if not set(missing).isdisjoint(slots_of(wanted, [n]))}
+    chosen = wanted.only(lambda unit: unit.matcher not in lacking | refused.keys())
     left_out = tuple(unit for unit in wanted.units if unit not in chosen.units)
     return Assembly(chosen.in_mode(mode), store, resolve_device(device), left_out, own)
 
 
 def missing_slots(recipe: Recipe, store: WeightStore, own: Container[str] = ()) -> list[str]:
     """What the recipe's matchers need of the manifest and the store has not."""
-    return [slot for slot in slots_of(n for n in recipe.matcher_names if n not in own) if store.find(slot) is None]
+    slots = slots_of(recipe, not_own(recipe.matcher_names, own))
+    return [slot for slot in slots if store.find(slot) is None]
+
+
+def not_own(names: Iterable[str], own: Container[str]) -> list[str]:
+    """The names but those of the user's own matchers, which bring their weights along."""
+    return [name for name in names if name not in own]
+
+
+def licences_of(recipe: Recipe, name: str, store: WeightStore, own: Mapping[str, Matcher[Any]]) -> set[str]:
+    """What a matcher says of its weights, and what the manifest says of the files that were found for it."""
+    if name in own:
+        return set(own[name].spec.licences)
+    found = [store.find(slot) for slot in slots_of(recipe, [name])]
+    return {*registry()[name].spec.licences, *(weights.file.licence for weights in found if weights)}
 
 
 def what_is_missing(slots: Iterable[str], store: WeightStore) -> str:

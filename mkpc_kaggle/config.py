@@ -1,4 +1,4 @@
-"""Frozen dataclasses from TOML tables: every key is known, every value has its type."""
+"""Frozen dataclasses from TOML tables: every key is known, every value has its type and is in its range."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import MISSING, Field, fields
@@ -14,7 +14,7 @@ def from_table(cls: type[Config], table: Mapping[str, Any], where: str) -> Confi
     """Build the dataclass ``cls`` from a TOML table.
 
     ``where`` names the table in messages. Raises :class:`UserError` for an unknown key (listing the known
-    ones), a missing one, or a value of another type.
+    ones), a missing one, a value of another type, or one that the dataclass refuses with a ``ValueError``.
     """
     known: dict[str, Field[Any]] = {field.name: field for field in fields(cls)}  # type: ignore[arg-type]
     check_keys(table, known, where)
@@ -26,7 +26,11 @@ def from_table(cls: type[Config], table: Mapping[str, Any], where: str) -> Confi
     if missing:
         raise UserError(f"{where} lacks {', '.join(map(repr, missing))}")
     hints = get_type_hints(cls)
-    return cls(**{key: convert(value, hints[key], f"{where}, key {key!r}") for key, value in table.items()})
+    values = {key: convert(value, hints[key], f"{where}, key {key!r}") for key, value in table.items()}
+    try:
+        return cls(**values)
+    except ValueError as error:
+        raise UserError(f"{where}: {error}") from error
 
 
 def check_keys(table: Mapping[str, Any], known: Iterable[str], where: str) -> None:

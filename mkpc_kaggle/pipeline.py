@@ -192,9 +192,7 @@ def views_of(unit: Unit, spec: MatcherSpec, work: PairWork) -> tuple[View, View]
         boxes = [Box.whole(image.size) for image in work.images]
     else:
         boxes = [region.box for region in work.regions]
-    view0, view1 = (
-        View.fit(box, long_side=unit.long_side, multiple=spec.multiple, flip=unit.flip) for box in boxes
-    )
+    view0, view1 = (unit.view(box, spec.multiple) for box in boxes)
     if spec.same_size:
         common = Size(*map(max, view0.padded, view1.padded))
         view0, view1 = replace(view0, padded=common), replace(view1, padded=common)

@@ -3,6 +3,7 @@
 A recipe is a TOML file: ``mkpc_kaggle/recipes/NAME.toml`` or one of the user's own.
 """
 
+import re
 import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
@@ -12,10 +13,13 @@ from typing import Any
 
 from mkpc_kaggle.config import check_keys, from_table
 from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.geometry.coordinates import Box, Size, View
 from mkpc_kaggle.geometry.critical_region import MkpcConfig
 from mkpc_kaggle.geometry.robust import RobustConfig
+from mkpc_kaggle.ranges import AT_LEAST_0, AT_LEAST_1, Range, check_ranges
 
 DIRECTORY = Path(__file__).resolve().parent / "recipes"
+AREA = re.compile(r"[1-9]\d*x[1-9]\d*")
 
 
 class Mode(StrEnum):
@@ -34,22 +38,44 @@ class Mode(StrEnum):
 class Unit:
     """One piece of work on one pair.
 
-    ``stage`` 1 looks at whole images, 2 at the critical regions; ``long_side`` is that of the resized view in
-    pixels; the ``max_matches`` surest matches are kept. ``flip`` mirrors both views. An ``extra`` unit is
-    left for the upgrade pass.
+    ``stage`` 1 looks at whole images, 2 at the critical regions. A view's longer side gets ``long_side`` pixels,
+    or the view as many pixels as ``area`` has, height by width such as "540x720"; its aspect is kept either way,
+    but with ``stretch`` it gets just that height and width. The ``max_matches`` surest matches are kept. ``flip``
+    mirrors both views. An ``extra`` unit is left for the upgrade pass. ``ValueError`` for what makes no unit.
     """
 
     stage: int
     matcher: str
-    long_side: int
+    long_side: int = 0
     max_matches: int = 4096
     flip: bool = False
     extra: bool = False
+    area: str = ""
+    stretch: bool = False
+
+    def __post_init__(self) -> None:
+        check_ranges(self, stage=Range(1, 2), long_side=AT_LEAST_0, max_matches=AT_LEAST_1)
+        if bool(self.long_side) == bool(self.area):
+            raise ValueError("one of long_side and area must be given, and not both")
+        if self.area and not AREA.fullmatch(self.area):
+            raise ValueError(f'area must be height x width such as "540x720", not {self.area!r}')
+        if self.stretch and not self.area:
+            raise ValueError("stretch needs an area, the height and width to stretch views to")
 
     @property
     def name(self) -> str:
-        """Such as ``2:sift@1280``: unique within a recipe."""
-        return f"{self.stage}:{self.matcher}@{self.long_side}{'~' if self.flip else ''}"
+        """Such as ``2:sift@1280`` or ``1:dkm@540x720``; "!" says stretched, "~" mirrored. Unique in a recipe."""
+        marks = ("!" if self.stretch else "") + ("~" if self.flip else "")
+        return f"{self.stage}:{self.matcher}@{self.long_side or self.area}{marks}"
+
+    def view(self, crop: Box, multiple: int) -> View:
+        """What this unit shows of a crop, padded to a multiple."""
+        if not self.area:
+            return View.fit(crop, long_side=self.long_side, multiple=multiple, flip=self.flip)
+        height, width = map(int, self.area.split("x"))
+        if self.stretch:
+            return View.stretched(crop, size=Size(width, height), multiple=multiple, flip=self.flip)
+        return View.of_area(crop, area=width * height, multiple=multiple, flip=self.flip)
 
 
 @dataclass(frozen=True)
@@ -57,6 +83,9 @@ class UpgradeConfig:
     """Pairs with fewer inliers than ``below_inliers`` get the recipe's extra units when time is left."""
 
     below_inliers: int = 100
+
+    def __post_init__(self) -> None:
+        check_ranges(self, below_inliers=AT_LEAST_0)
 
 
 @dataclass(frozen=True)
@@ -80,9 +109,6 @@ class Recipe:
             raise UserError(f"{where} has no units")
         if self.units[0].stage != 1 or self.units[0].extra:
             raise UserError(f"{where}: the first unit sweeps all pairs, so it must have stage 1 and not be extra")
-        for unit in self.units:
-            if unit.stage not in (1, 2) or unit.long_side < 1 or unit.max_matches < 1:
-                raise UserError(f"{where}: stage must be 1 or 2, long_side and max_matches positive: {unit}")
         names = [unit.name for unit in self.units]
         for name in names:
             if names.count(name) > 1:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from mkpc_kaggle.assembly import assemble
+from mkpc_kaggle.assembly import Licence, assemble
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Pixels
 from mkpc_kaggle.geometry.robust import Matrix3, Model
@@ -23,7 +23,8 @@ class TwoStageMatcher:
         F, points0 = match.estimate.matrix, match.inliers.points0
 
     ``recipe`` is a :class:`Recipe`, a recipe's name, or a path to a TOML file; ``weights`` are directories to
-    search. ``matchers`` are matchers of one's own, by the names under which the recipe's units call them.
+    search; with ``licence`` "permissive" those that forbid some uses are refused. ``matchers`` are matchers of
+    one's own, by the names under which the recipe's units call them.
     Raises :class:`mkpc_kaggle.errors.UserError` for an unknown recipe, key or matcher, and for missing weights.
     """
 
@@ -33,9 +34,12 @@ class TwoStageMatcher:
         *,
         weights: Iterable[str | Path] = (),
         device: str = "auto",
+        licence: Licence | str = Licence.ANY,
         matchers: Mapping[str, Matcher[Any]] | None = None,
     ) -> None:
-        assembly = assemble(recipe, weights=map(Path, weights), device=device, matchers=matchers)
+        assembly = assemble(
+            recipe, weights=map(Path, weights), device=device, licence=Licence(licence), matchers=matchers
+        )
         self.recipe = assembly.recipe
         self._pipeline = assembly.pipeline()
 

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from mkpc_kaggle import assembly
 from mkpc_kaggle.matchers.networks.aspanformer import AspanFormer
+from mkpc_kaggle.matchers.networks.dkm import DKM
 from mkpc_kaggle.matchers.networks.loftr import Loftr
 from mkpc_kaggle.matchers.networks.quadtree import Quadtree
 from mkpc_kaggle.matchers.networks.superglue import SuperGlue, SuperGlueConfig
@@ -72,6 +73,7 @@ FILES = (
         AspanFormer,
         wrapped_aspanformer,
     ),
+    PublicFile("DKMv3_outdoor.pth", "dkm", "dkm-outdoor", "dkm", DKM),
 )
 
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 from golden import recorded
 
-from mkpc_kaggle.matchers.networks.dkm import MEAN, STD, Weighting
+from mkpc_kaggle.matchers.networks.dkm import MEAN, STD, Weighting, side_by_side
 from mkpc_kaggle.matchers.networks.dkm_coarse import kernel
 from mkpc_kaggle.matchers.networks.dkm_refiner import local_correlation
 
@@ -65,7 +65,7 @@ def computed(network, images, fine_images=(None, None)):
     """
     features = [network.encode(*versions) for versions in zip(images, fine_images, strict=True)]
     with recorded_refinement(network.decoder) as calls:
-        dense = network.match(*features)
+        dense = side_by_side(network.match(*features))
     values = encoded(network, images, 32) | coarse_values(network.decoder, calls)
     passes = 1 if fine_images[0] is None else 2
     values |= refiner_values(network.decoder, calls, 0, passes)

@@ -45,6 +45,7 @@ def test_recipes_are_listed_with_what_they_lack(
     assert "missing: xfeat: xfeat.pt or xfeat_sparse_bnfolded.safetensors" in light
     classical = out[out.index("classical: ") : out.index("light: ")]
     assert "all weights are there" in classical
+    assert "    2:dkm@630x840  at most 4096\n" in out
 
 
 def test_check_tells_good_from_bad(demo: DemoSet, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -91,6 +92,16 @@ def test_a_figure_that_cannot_be_written_is_told(tmp_path: Path, capsys: pytest.
     paths = [str(tmp_path / "a.png")] * 2
     assert main(["match", *paths, "--recipe", "classical", "--out", "/dev/null/pair.png"]) == 2
     assert "cannot be written" in capsys.readouterr().err
+
+
+def test_a_permissive_run_names_the_matcher_that_it_refuses(
+    clean_environment: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cv2.imwrite(str(tmp_path / "a.png"), np.full((60, 90, 3), 127, np.uint8))
+    paths = [str(tmp_path / "a.png")] * 2
+    assert main(["match", *paths, "--recipe", "yfcc", "--licence", "permissive"]) == 2
+    assert "superglue (Magic-Leap-noncommercial)" in capsys.readouterr().err
+    assert main(["match", *paths, "--licence", "permissive"]) == 0
 
 
 def test_match_tells_which_image_cannot_be_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
-from mkpc_kaggle.geometry.coordinates import Box, Size, View
+from mkpc_kaggle.geometry.coordinates import Box, Size, View, from_corner, from_normalised
 
 SIDES = st.integers(1, 3000)
 
@@ -122,6 +122,43 @@ def test_a_fitted_view_keeps_the_aspect_to_the_nearest_pixel_and_pads_to_the_mul
         assert 0 <= padded - side < multiple
 
 
+@given(crop=boxes(), area=st.integers(1, 2_000_000), multiple=st.sampled_from([1, 32]), flip=st.booleans())
+@settings(max_examples=150, deadline=None)
+def test_a_view_of_an_area_keeps_the_aspect_and_has_that_many_pixels(crop, area, multiple, flip):
+    view = View.of_area(crop, area=area, multiple=multiple, flip=flip)
+    width, height = (side * (area / crop.area) ** 0.5 for side in crop.size)
+    assert width * height == pytest.approx(area)
+    for side, exact in zip(view.content, (width, height), strict=True):
+        assert abs(side - max(1, exact)) <= 0.5 + 1e-9 * exact
+    assert (view.crop, view.flip) == (crop, flip)
+    assert all(
+        padded % multiple == 0 and 0 <= padded - side < multiple
+        for side, padded in zip(view.content, view.padded, strict=True)
+    )
+
+
+def test_views_of_known_areas():
+    area = 540 * 720
+    for size, content in (((640, 480), (720, 540)), ((480, 640), (540, 720)), ((47, 33), (744, 522))):
+        assert View.of_area(Box.whole(Size(*size)), area=area).content == content
+    assert View.of_area(Box.whole(Size(2000, 100)), area=area).content == (2789, 139)
+
+
+def test_a_stretched_view_has_the_size_whatever_the_crop_and_is_padded():
+    view = View.stretched(Box(3, 4, 103, 24), size=Size(72, 54), multiple=16, flip=True)
+    assert (view.content, view.padded, view.flip) == ((72, 54), (80, 64), True)
+    assert view.scale == (0.72, 2.7)
+
+
+def test_what_networks_count_otherwise_is_led_to_centres_at_integers():
+    corners = np.array([[0, 0], [0.5, 0.5], [30, 40]], np.float32)
+    assert from_corner(corners).tolist() == [[-0.5, -0.5], [0, 0], [29.5, 39.5]]
+    normalised = np.array([[-1, -1], [0, 0.5], [1, 1]], np.float32)
+    found = from_normalised(normalised, Size(10, 40))
+    assert found.tolist() == [[-0.5, -0.5], [4.5, 29.5], [9.5, 39.5]]
+    assert found.dtype == from_corner(corners).dtype == np.float32
+
+
 @pytest.mark.parametrize("name", RENDERED)
 @pytest.mark.parametrize("centre", [(41.3, 30.8), (60.0, 40.5), (55.75, 44.25)])
 def test_a_spot_is_rendered_where_the_map_says(name, centre):
@@ -226,8 +263,14 @@ def test_a_view_without_pixels_or_with_too_little_padding_is_an_error(content, p
 
 @pytest.mark.parametrize("long_side", [0, -8])
 def test_fitting_to_a_side_that_is_not_positive_is_an_error(long_side):
-    with pytest.raises(ValueError):
+    with pytest.raises(ValueError, match="positive"):
         View.fit(Box(0, 0, 40, 30), long_side=long_side)
+    with pytest.raises(ValueError, match="positive"):
+        View.of_area(Box(0, 0, 40, 30), area=long_side)
+    with pytest.raises(ValueError, match="without pixels"):
+        View.stretched(Box(0, 0, 40, 30), size=Size(9, long_side))
+    with pytest.raises(ValueError, match="multiple must be positive"):
+        View.fit(Box(0, 0, 40, 30), long_side=9, multiple=long_side)
 
 
 @pytest.mark.parametrize("crop", [Box(0, 0, 41, 30), Box(0, 0, 40, 31), Box(-1, 0, 20, 20), Box(-9, -9, -1, -1)])

@@ -10,7 +10,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.nn import functional
 
-from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.matchers.networks.dkm import (
     DKM,
     DkmConfig,
@@ -19,10 +18,10 @@ from mkpc_kaggle.matchers.networks.dkm import (
     balancing_weights,
     dense_warp,
     density,
-    joined,
     network_input,
-    pixel_points,
     sample,
+    side_by_side,
+    swapped,
 )
 from mkpc_kaggle.matchers.networks.dkm_coarse import posterior_mean
 from mkpc_kaggle.matchers.networks.dkm_refiner import Estimate, identity_map, local_correlation, refined
@@ -65,7 +64,7 @@ def test_the_parameters_are_those_of_the_checkpoint():
 @pytest.mark.parametrize("fine", [None, (70, 83)])
 def test_a_batch_finds_what_its_pairs_give_alone(fine):
     query, support = features(2, fine=fine), features(2, fine=fine, seed=1)
-    found = network().match(query, support)
+    found = side_by_side(network().match(query, support))
     for i in range(2):
         alone = [
             network().encode(
@@ -73,7 +72,7 @@ def test_a_batch_finds_what_its_pairs_give_alone(fine):
             )
             for seed in (0, 1)
         ]
-        expected = network().match(*alone)
+        expected = side_by_side(network().match(*alone))
         torch.testing.assert_close(found.warp[i], expected.warp[0], rtol=0, atol=1e-3)
         # A pixel within rounding of the border may count as outside in one of them.
         off = (found.certainty[i] - expected.certainty[0]).abs() > 1e-3
@@ -82,17 +81,19 @@ def test_a_batch_finds_what_its_pairs_give_alone(fine):
 
 @torch.inference_mode()
 def test_a_symmetric_match_holds_both_one_way_matches():
-    query, support = features(), features(seed=1)
-    both = network().match(query, support)
-    there, back = (network(symmetric=False).match(*pair) for pair in ((query, support), (support, query)))
-    assert torch.equal(both.warp[:, :, :61], there.warp)
-    assert torch.equal(both.warp[:, :, 61:], back.warp[..., [2, 3, 0, 1]])
-    assert torch.equal(both.certainty, torch.cat([there.certainty, back.certainty], dim=2))
+    first, second = features(), features(size=(38, 52), seed=1)
+    both = network().match(first, second)
+    ((there,), (back,)) = (network(symmetric=False).match(*pair) for pair in ((first, second), (second, first)))
+    assert len(both) == 2
+    assert torch.equal(both[0].warp, there.warp)
+    assert torch.equal(both[1].warp, back.warp[..., [2, 3, 0, 1]])
+    assert torch.equal(both[0].certainty, there.certainty)
+    assert torch.equal(both[1].certainty, back.certainty)
 
 
 @torch.inference_mode()
 def test_the_warp_is_in_range_and_its_query_side_the_identity():
-    found = network(symmetric=False).match(features(fine=(70, 83)), features(fine=(70, 83), seed=1))
+    (found,) = network(symmetric=False).match(features(fine=(70, 83)), features(fine=(70, 83), seed=1))
     assert found.warp.shape == (1, 70, 83, 4)
     assert found.certainty.shape == (1, 70, 83)
     assert found.warp.abs().max() <= 1
@@ -104,12 +105,18 @@ def test_the_warp_is_in_range_and_its_query_side_the_identity():
 
 
 @torch.inference_mode()
-@pytest.mark.parametrize("size", [(1, 1), (2, 3), (5, 70), (33, 32)])
-def test_any_size_goes_through(size):
-    found = network().match(features(size=size), features(size=size, seed=1))
-    assert found.warp.shape == (1, size[0], 2 * size[1], 4)
-    assert found.warp.isfinite().all()
-    assert found.certainty.isfinite().all()
+@pytest.mark.parametrize("fine", [False, True])
+@pytest.mark.parametrize("sizes", [((1, 1), (2, 3)), ((5, 70), (1, 1)), ((33, 32), (33, 32)), ((90, 4), (31, 40))])
+def test_any_two_sizes_go_through(sizes, fine):
+    larger = [(2 * h, w + 5) if fine else None for h, w in sizes]
+    pair = (
+        features(size=size, fine=full, seed=i) for i, (size, full) in enumerate(zip(sizes, larger, strict=True))
+    )
+    found = network().match(*pair)
+    expected = larger if fine else sizes
+    assert [dense.warp.shape for dense in found] == [(1, *size, 4) for size in expected]
+    assert [dense.certainty.shape for dense in found] == [(1, *size) for size in expected]
+    assert all(part.isfinite().all() for dense in found for part in (dense.warp, dense.certainty))
 
 
 @torch.inference_mode()
@@ -124,11 +131,43 @@ def test_sides_are_halved_upwards_and_only_as_far_as_asked():
     assert all(torch.equal(a, b) for a, b in zip(fine, levels, strict=False))
 
 
-def test_images_of_two_sizes_are_refused():
-    with pytest.raises(ValueError, match="one size"):
-        network().match(features(size=(32, 40)), features(size=(32, 41)))
-    with pytest.raises(ValueError, match="one size"):
+def test_a_second_pass_needs_both_images():
+    with pytest.raises(ValueError, match="either both images or neither"):
         network().match(features(), features(fine=(70, 83)))
+
+
+@torch.inference_mode()
+def test_what_the_support_shows_beside_the_query_moves_the_corrections_in_its_own_pixels():
+    """A refiner that sees the same things corrects by the same pixels, however large the support is."""
+    refiner = network().decoder.conv_refiner["8"]
+    generator = torch.Generator().manual_seed(5)
+    query, support = torch.randn(2, 1, 512, 6, 8, generator=generator)
+    larger = functional.pad(support, (0, 8, 0, 3))  # 9 x 16: as zero beside the support as outside it
+    in_pixels = torch.rand(1, 2, 6, 8, generator=generator) * 5
+    corrected, embedded = [], []
+    for seen in (support, larger):
+        height, width = seen.shape[2:]
+        size = torch.tensor([width, height])[:, None, None]
+        flow = (2 * in_pixels + 1) / size - 1
+        look = refiner._look(query, seen, flow)
+        embedded.append(torch.cat([look[:, : 2 * 512], look[:, 2 * 512 + 64 :]], dim=1))
+        estimate = Estimate(flow, torch.zeros(1, 1, 6, 8))
+        found = refined(estimate, torch.ones(1, 3, 6, 8), 8, torch.Size([8 * height, 8 * width]))
+        corrected.append((found.flow - flow) * size / 2)  # in the support's pixels at this stride
+    torch.testing.assert_close(embedded[0], embedded[1], rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(corrected[0], torch.full((1, 2, 6, 8), 1 / 8))
+    torch.testing.assert_close(corrected[1], corrected[0], rtol=1e-4, atol=1e-5)
+
+
+@torch.inference_mode()
+def test_the_posterior_knows_where_in_a_support_of_another_size_a_pixel_is():
+    gp = network().decoder.gps["16"]
+    support = torch.randn(1, 512, 5, 9, generator=torch.Generator().manual_seed(6))
+    query = support[:, :, 2:4, 3:6]  # a cut-out: each pixel is its own in the support
+    posterior, coordinates = gp(query, support), gp.embed_coordinates(support)
+    expected = coordinates[:, :, 2:4, 3:6]
+    assert posterior.shape == (1, 256, 2, 3)
+    assert functional.cosine_similarity(posterior, expected).min() > 0.99
 
 
 @torch.inference_mode()
@@ -146,15 +185,17 @@ def test_a_bottleneck_is_its_definition():
 @given(
     radius=st.integers(1, 4),
     size=st.tuples(st.integers(1, 9), st.integers(1, 9)),
+    support_size=st.tuples(st.integers(1, 9), st.integers(1, 9)),
     spread=st.sampled_from([0.5, 1.5, 20]),
     seed=st.integers(0, 2**32 - 1),
 )
 @settings(max_examples=50, deadline=None)
-def test_local_correlation_is_its_definition(radius, size, spread, seed):
+def test_local_correlation_is_its_definition(radius, size, support_size, spread, seed):
     generator = torch.Generator().manual_seed(seed)
-    h, w = size
-    query, support = torch.randn(2, 2, 5, h, w, generator=generator)
-    flow = torch.randn(2, 2, h, w, generator=generator) * spread
+    h, w = support_size
+    query = torch.randn(2, 5, *size, generator=generator)
+    support = torch.randn(2, 5, h, w, generator=generator)
+    flow = torch.randn(2, 2, *size, generator=generator) * spread
     offsets = [(a, b) for a in range(-radius, radius + 1) for b in range(-radius, radius + 1)]
     expected = []
     for a, b in offsets:
@@ -209,16 +250,12 @@ def test_targets_outside_have_no_certainty_and_coarse_doubts_count_half():
     assert found.warp[0, ..., :2].tolist() == [[[-0.5, -0.5], [0.5, -0.5]], [[-0.5, 0.5], [0.5, 0.5]]]
     sure = dense_warp(Estimate(flow, torch.full((1, 1, 2, 2), -1.0)), torch.full((1, 1, 1, 1), 3.0))
     torch.testing.assert_close(sure.certainty[0, 0, 0], torch.tensor(-1.0).sigmoid())
-    both = joined(found, sure)
+    both = side_by_side((found, swapped(sure)))
     assert torch.equal(both.warp[0, 0, 3], torch.tensor([1, 0, 0.5, -0.5]))
 
 
 def test_pixel_centres():
     assert identity_map(torch.zeros(1, 4))[0].tolist() == [[[-0.75, -0.25, 0.25, 0.75]], [[0, 0, 0, 0]]]
-    ends = torch.tensor([[-1.0, -1, 1, 1], [0, 0.5, 0, 0.5]])
-    points0, points1 = pixel_points(ends, Size(10, 20), Size(30, 40))
-    assert points0.tolist() == [[-0.5, -0.5], [4.5, 14.5]]
-    assert points1.tolist() == [[29.5, 39.5], [14.5, 29.5]]
 
 
 def warp_and_certainty(count=3000, seed=5):

@@ -14,7 +14,7 @@ from torch import nn
 
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Box, Size, View
-from mkpc_kaggle.matchers.contract import Colour, Picture, encoding_bytes
+from mkpc_kaggle.matchers.contract import Colour, Picture, Training, encoding_bytes
 from mkpc_kaggle.matchers.neighbours import mutual_neighbours
 from mkpc_kaggle.matchers.registry import load_matcher, registry
 from mkpc_kaggle.matchers.xfeat_lighterglue import layer_name
@@ -109,7 +109,7 @@ def test_every_spec_makes_sense():
         assert is_dataclass(spec.options)
         spec.options()  # every option has a default
         assert bool(spec.slots) == bool(spec.licences)
-        assert {field.type for field in fields(spec.options)} <= {int, float, bool, str, "int", "float"}
+        assert {field.type for field in fields(spec.options)} <= {int, float, bool, str, Training}
 
 
 @every_matcher

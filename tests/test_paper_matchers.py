@@ -51,6 +51,7 @@ TRIALS = {
     "loftr": SEMI_DENSE,
     "quadtree": SEMI_DENSE,
     "aspanformer": SEMI_DENSE,
+    "dkm": Trial(('area = "96x128"', 'area = "70x90"'), options="matches = 300"),
 }
 
 

@@ -12,7 +12,7 @@ import torch
 from dense import MODES, batch_of, computed, grey_levels, resized_by_pil
 from golden import GOLDEN, Stage, assert_stages, golden_arrays, needs_golden, print_table, ready, seeded_tensor
 
-from mkpc_kaggle.geometry.coordinates import Size
+from mkpc_kaggle.geometry.coordinates import Size, from_normalised
 from mkpc_kaggle.matchers.networks.dkm import (
     DKM,
     DkmConfig,
@@ -21,7 +21,6 @@ from mkpc_kaggle.matchers.networks.dkm import (
     density,
     draw,
     network_input,
-    pixel_points,
     sample,
 )
 
@@ -153,8 +152,10 @@ def sampling_stages():
     for key in ("kde_density", "kde_density_exact"):
         yield within(key, density(golden["kde_points"]), golden[key])
     height0, width0, height1, width1 = golden["pixel_sizes_HA_WA_HB_WB"].tolist()
-    points = pixel_points(golden["pixel_in"], Size(width0, height0), Size(width1, height1))
-    for name, got in zip(("pixel_A", "pixel_B"), points, strict=True):
+    sides = golden["pixel_in"].numpy().reshape(-1, 2, 2).swapaxes(0, 1)
+    sizes = Size(width0, height0), Size(width1, height1)
+    for name, points, size in zip(("pixel_A", "pixel_B"), sides, sizes, strict=True):
+        got = torch.from_numpy(from_normalised(points, size))
         yield within(name, got + 0.5, golden[name])  # theirs have pixel centres at halves
 
 

@@ -13,7 +13,7 @@ from shared import WEIGHTS, needs_weights
 from sklearn.datasets import load_sample_image
 
 from mkpc_kaggle import weights as weights_module
-from mkpc_kaggle.assembly import assemble
+from mkpc_kaggle.assembly import Licence, assemble
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Box, Size
 from mkpc_kaggle.geometry.matches import Matches
@@ -24,6 +24,7 @@ from mkpc_kaggle.matchers.sift import SiftMatcher, SiftOptions
 from mkpc_kaggle.pipeline import PairWork, Pipeline, finish
 from mkpc_kaggle.recipe import Mode, Recipe, Unit, load_recipe
 from mkpc_kaggle.two_stage import TwoStageMatcher
+from mkpc_kaggle.weights import WeightFile
 
 SIZE = Size(480, 360)
 CORNER0, CORNER1, SCALE = (60, 130), (170, 50), 1.2
@@ -438,8 +439,10 @@ def test_recipe_auto_leaves_out_the_units_whose_weights_are_missing():
 @needs_weights
 def test_recipe_auto_takes_all_whose_weights_are_there():
     assembly = assemble("auto", weights=[WEIGHTS])
-    assert assembly.recipe == load_recipe("auto")
-    assert assembly.left_out == ()
+    recipe, light = load_recipe("auto"), load_recipe("light")
+    assert set(assembly.recipe.matcher_names) == set(light.matcher_names)
+    assert assembly.recipe == recipe.only(lambda unit: unit.matcher in light.matcher_names)
+    assert assembly.left_out == tuple(unit for unit in recipe.units if unit not in assembly.recipe.units)
     assert all(digest.startswith("sha256:") for digest in assembly.fingerprint()["weights"].values())
     assert set(assembly.fingerprint()["weights"]) == {"xfeat", "xfeat-lighterglue", "aliked-n16"}
 
@@ -450,6 +453,72 @@ def test_a_named_recipe_without_its_weights_is_refused_with_the_file_names(recip
         UserError, match=r"needs weights.*xfeat\.pt or xfeat_sparse.*aliked-n16\.pth or .*--weights"
     ):
         assemble(recipe)
+
+
+def standins(directory, *names):
+    """A search directory with files of these names, and a manifest that knows them by slot and licence."""
+    for name, _, _ in names:
+        (directory / name).write_bytes(name.encode())
+    return [
+        WeightFile(name, -1, weights_module.UNVERIFIED, licence, slot, "here") for name, slot, licence in names
+    ]
+
+
+SUPERGLUE = (
+    ("sp.pth", "superpoint", "Magic-Leap-noncommercial"),
+    ("sg.pth", "superglue-outdoor", "Magic-Leap-noncommercial"),
+)
+PERMITTED = (("loftr.ckpt", "loftr-outdoor", "Apache-2.0"), ("dkm.pth", "dkm-outdoor", "MIT"))
+
+
+@pytest.fixture
+def known_files(monkeypatch, tmp_path):
+    """SuperGlue's, LoFTR's and DKM's weights are there, DKM's also for indoors, of unclear terms."""
+    files = standins(tmp_path, *SUPERGLUE, *PERMITTED, ("dkm_in.pth", "dkm-indoor", "unclear"))
+    others = [file for file in weights_module.manifest() if file.slot not in {known.slot for known in files}]
+    monkeypatch.setattr(weights_module, "manifest", lambda: (*files, *others))
+    return tmp_path
+
+
+@pytest.mark.filterwarnings("ignore:.*is not verified")
+def test_a_permissive_run_leaves_out_of_recipe_auto_what_is_licensed_otherwise(known_files):
+    every = assemble("auto", weights=[known_files])
+    assert every.recipe.matcher_names == ("superglue", "loftr", "sift", "dkm")
+    some = assemble("auto", weights=[known_files], licence=Licence.PERMISSIVE)
+    assert some.recipe.matcher_names == ("loftr", "sift", "dkm")
+    assert {unit.matcher for unit in some.left_out} >= {"superglue", "aspanformer"}
+    assert set(some.fingerprint()["weights"]) == {"loftr-outdoor", "dkm-outdoor"}
+
+
+@pytest.mark.parametrize("recipe", ["yfcc", "imc2022", load_recipe("scannet")])
+def test_a_permissive_run_refuses_a_recipe_by_matcher_and_licence_and_says_what_to_do(recipe):
+    says = r"permissive refuses recipe '\w+' .*superglue \(Magic-Leap-noncommercial\).*recipe auto"
+    with pytest.raises(UserError, match=says):
+        TwoStageMatcher(recipe, licence="permissive")
+
+
+@pytest.mark.filterwarnings("ignore:.*is not verified")
+def test_the_licence_of_the_file_counts_too(known_files):
+    recipe = Recipe((Unit(1, "dkm", area="90x120"),), matchers={"dkm": {"training": "outdoor"}})
+    assert assemble(recipe, weights=[known_files], licence=Licence.PERMISSIVE).left_out == ()
+    indoors = replace(recipe, matchers={"dkm": {"training": "indoor"}})
+    assert set(assemble(indoors, weights=[known_files]).fingerprint()["weights"]) == {"dkm-indoor"}
+    with pytest.raises(UserError, match=r"dkm \(unclear\)"):
+        assemble(indoors, weights=[known_files], licence=Licence.PERMISSIVE)
+
+
+def test_the_licence_of_a_matcher_of_ones_own_counts():
+    recipe = Recipe((Unit(1, "own", 480),))
+    for tags in ((), ("MIT",)):
+        matchers = {"own": Scripted(licences=tags)}
+        assert assemble(recipe, matchers=matchers, licence=Licence.PERMISSIVE).recipe == recipe
+    with pytest.raises(UserError, match=r"own \(GPL\)"):
+        assemble(recipe, matchers={"own": Scripted(licences=("GPL", "MIT"))}, licence=Licence.PERMISSIVE)
+
+
+def test_the_permissive_recipe_is_refused_for_nothing_but_missing_weights():
+    with pytest.raises(UserError, match="needs weights"):
+        assemble("permissive", licence=Licence.PERMISSIVE)
 
 
 def test_damaged_weights_are_refused_by_recipe_auto_too(tmp_path):

@@ -3,13 +3,17 @@
 import json
 import tomllib
 from dataclasses import replace
+from itertools import combinations
 
 import pytest
 
 from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.geometry.coordinates import Box, Size, View
 from mkpc_kaggle.geometry.critical_region import MkpcConfig, Ratio
 from mkpc_kaggle.geometry.robust import Method, RobustConfig
-from mkpc_kaggle.matchers.registry import options_of, registry
+from mkpc_kaggle.matchers.contract import Training
+from mkpc_kaggle.matchers.registry import options_of, registry, slots_of
+from mkpc_kaggle.ranges import Range
 from mkpc_kaggle.recipe import DIRECTORY, Mode, Recipe, Unit, load_recipe, parse_recipe, recipe_names
 
 SIFT = 'units = [{ stage = 1, matcher = "sift", long_side = 640 }]\n'
@@ -55,6 +59,38 @@ def test_every_recipe_of_the_package_says_all_it_has_in_toml():
         assert len(table["units"]) == len(load_recipe(name).units)
 
 
+def test_whatever_matchers_are_left_of_recipe_auto_the_first_unit_can_sweep():
+    recipe = load_recipe("auto")
+    names = recipe.matcher_names
+    assert set(registry()) == set(names)
+    for count in range(1, len(names) + 1):
+        for kept in combinations(names, count):
+            remaining = recipe.only(lambda unit, kept=kept: unit.matcher in kept)
+            assert set(remaining.matcher_names) == set(kept)
+            assert remaining.units[0].stage == 1
+
+
+@pytest.mark.parametrize("name", ["yfcc", "scannet"])
+def test_a_naive_recipe_is_the_whole_images_mode_of_the_other(name):
+    naive, whole = load_recipe(f"{name}_naive"), load_recipe(name).in_mode(Mode.WHOLE_IMAGES)
+    assert set(naive.units) == set(whole.units)
+    assert naive.matchers == whole.matchers
+
+
+def test_scannet_is_yfcc_with_indoor_weights_and_their_settings():
+    outdoor, indoor = load_recipe("yfcc"), load_recipe("scannet")
+    assert outdoor.units == indoor.units
+    options = options_of(indoor, "superglue")
+    assert (options.training, options.max_keypoints, options.nms_radius) == (Training.INDOOR, 1024, 4)
+    assert slots_of(indoor, ["superglue"]) == ("superpoint", "superglue-indoor")
+    assert slots_of(outdoor, ["superglue"]) == ("superpoint", "superglue-outdoor")
+
+
+def test_the_ensembles_have_the_matchers_that_they_are_said_to_have():
+    assert set(load_recipe("imc2022").matcher_names) == {"superglue", "loftr", "dkm", "quadtree", "aspanformer"}
+    assert set(load_recipe("permissive").matcher_names) == {"loftr", "quadtree", "dkm"}
+
+
 # reading
 
 
@@ -64,13 +100,18 @@ def test_a_recipe_reads_as_written():
         + units(
             '{ stage = 1, matcher = "sift", long_side = 640 }',
             '{ stage = 2, matcher = "x", long_side = 800, max_matches = 5, flip = true, extra = true }',
+            '{ stage = 2, matcher = "dkm", area = "540x720", stretch = true }',
         )
         + '[mkpc]\neps = 0.1\nmin_samples = 7\nratio = "last-kept"\nexpand_x = 2\n'
         + '[magsac]\nmethod = "ransac"\nthreshold = 1.5\n[upgrade]\nbelow_inliers = 9\n'
         + "[matchers.sift]\nfeatures = 10\n"
     )
-    assert recipe.units == (Unit(1, "sift", 640), Unit(2, "x", 800, 5, flip=True, extra=True))
-    assert recipe.regular == recipe.units[:1]
+    assert recipe.units == (
+        Unit(1, "sift", 640),
+        Unit(2, "x", 800, 5, flip=True, extra=True),
+        Unit(2, "dkm", area="540x720", stretch=True),
+    )
+    assert recipe.regular == (recipe.units[0], recipe.units[2])
     assert recipe.mkpc == MkpcConfig(eps=0.1, min_samples=7, ratio=Ratio.LAST_KEPT, expand_x=2.0)
     assert type(recipe.mkpc.expand_x) is float
     assert recipe.magsac == RobustConfig(Method.RANSAC, threshold=1.5)
@@ -95,6 +136,17 @@ def test_unit_names_tell_units_apart():
     assert len(names) == 4
     assert Unit(2, "sift", 1280).name == "2:sift@1280"
     assert Unit(1, "a", 640, flip=True).name != Unit(1, "a", 640).name
+    assert Unit(2, "dkm", area="540x720").name == "2:dkm@540x720"
+    assert Unit(2, "dkm", area="540x720", stretch=True, flip=True).name == "2:dkm@540x720!~"
+
+
+def test_a_unit_shows_a_crop_at_its_size():
+    crop = Box(10, 20, 110, 220)
+    assert Unit(1, "a", 640).view(crop, 32) == View.fit(crop, long_side=640, multiple=32)
+    assert Unit(1, "a", area="54x72", flip=True).view(crop, 8) == View.of_area(
+        crop, area=54 * 72, multiple=8, flip=True
+    )
+    assert Unit(1, "a", area="54x72", stretch=True).view(crop, 1).content == Size(72, 54)
 
 
 # refusing
@@ -176,12 +228,23 @@ def test_matcher_settings_that_are_no_table_are_refused(text):
             SIFT.replace("}]", '}, { stage = 1, matcher = "sift", long_side = 640, max_matches = 9 }]'),
             "1:sift@640 twice",
         ),
-        (SIFT.replace("}]", '}, { stage = 3, matcher = "sift", long_side = 640 }]'), "stage must be 1 or 2"),
-        (units('{ stage = 1, matcher = "sift", long_side = 0 }'), "long_side and max_matches positive"),
+        (
+            SIFT.replace("}]", '}, { stage = 3, matcher = "sift", long_side = 640 }]'),
+            r"unit 2: stage must be in \[1, 2\], not 3",
+        ),
+        (units('{ stage = 1, matcher = "sift", long_side = -9 }'), r"unit 1: long_side must be in \[0, inf\)"),
+        (units('{ stage = 1, matcher = "sift", long_side = 0 }'), "one of long_side and area must be given"),
+        (units('{ stage = 1, matcher = "sift" }'), "one of long_side and area must be given"),
+        (units('{ stage = 1, matcher = "sift", long_side = 9, area = "9x9" }'), "and not both"),
         (
             units('{ stage = 1, matcher = "sift", long_side = 9, max_matches = 0 }'),
-            "long_side and max_matches positive",
+            r"max_matches must be in \[1, inf\), not 0",
         ),
+        (units('{ stage = 1, matcher = "sift", area = "540" }'), "height x width such as \"540x720\", not '540'"),
+        (units('{ stage = 1, matcher = "sift", area = "540x0" }'), "area must be height x width"),
+        (units('{ stage = 1, matcher = "sift", area = "540 x 720" }'), "area must be height x width"),
+        (units('{ stage = 1, matcher = "sift", long_side = 9, stretch = true }'), "stretch needs an area"),
+        (units(*['{ stage = 1, matcher = "sift", area = "9x8" }'] * 2), "1:sift@9x8 twice"),
     ],
 )
 def test_units_that_make_no_run_are_refused(text, says):
@@ -189,8 +252,70 @@ def test_units_that_make_no_run_are_refused(text, says):
         parse(text)
 
 
+@pytest.mark.parametrize(
+    ("table", "line", "says"),
+    [
+        ("mkpc", "eps = -0.1", r"eps must be in \(0, inf\), not -0.1"),
+        ("mkpc", "eps = nan", r"eps must be in \(0, inf\), not nan"),
+        ("mkpc", "expand_x = inf", r"expand_x must be in \(0, inf\), not inf"),
+        ("mkpc", "share = 1.1", r"share must be in \[0, 1\], not 1.1"),
+        ("mkpc", "min_samples = 0", r"min_samples must be in \[1, inf\), not 0"),
+        ("mkpc", "min_side = 0", "min_side"),
+        ("magsac", "threshold = 0", r"threshold must be in \(0, inf\), not 0"),
+        ("magsac", "confidence = 1", r"confidence must be in \(0, 1\), not 1"),
+        ("magsac", "max_iterations = 3_000_000_000", r"max_iterations must be in \[1, 2.14748e\+09\]"),
+        ("magsac", "orders = 0", "orders"),
+        ("upgrade", "below_inliers = -1", r"below_inliers must be in \[0, inf\), not -1"),
+    ],
+)
+def test_a_number_out_of_its_range_is_refused_with_the_range(table, line, says):
+    with pytest.raises(UserError, match=rf"'mine', table \[{table}\]: .*{says}"):
+        parse(SIFT + f"[{table}]\n{line}\n")
+
+
+OUT_OF_RANGE = [
+    ("sift", "ratio = 2"),
+    ("aliked", "features = 0"),
+    ("xfeat_lighterglue", "threshold = -1"),
+    ("superglue", "max_keypoints = -1"),
+    ("superglue", "sinkhorn_iterations = 0"),
+    ("loftr", "threshold = 1.5"),
+    ("dkm", "passes = 3"),
+    ("dkm", "first_pass = 0"),
+    ("dkm", "matches = 0"),
+]
+
+
+@pytest.mark.parametrize(("matcher", "line"), OUT_OF_RANGE)
+def test_an_option_out_of_its_range_is_refused_with_the_range(matcher, line):
+    recipe = parse(SIFT + f"[matchers.{matcher}]\n{line}\n")
+    with pytest.raises(UserError, match=rf"'mine', table \[matchers.{matcher}\]: {line.split()[0]} must be in "):
+        options_of(recipe, matcher)
+
+
+def test_a_training_is_one_of_the_known_ones():
+    recipe = parse(SIFT + '[matchers.loftr]\ntraining = "underwater"\n')
+    with pytest.raises(UserError, match=r"'training'.*'underwater' is none of 'outdoor', 'indoor'"):
+        options_of(recipe, "loftr")
+
+
+@pytest.mark.parametrize(
+    ("bounds", "inside", "text"),
+    [
+        ("[]", [0, 0.5, 1], "[0, 1]"),
+        ("(]", [0.5, 1], "(0, 1]"),
+        ("[)", [0, 0.5], "[0, 1)"),
+        ("()", [0.5], "(0, 1)"),
+    ],
+)
+def test_a_range_says_which_ends_are_in_it(bounds, inside, text):
+    allowed = Range(0, 1, bounds)
+    assert [number for number in (-1, 0, 0.5, 1, 2) if number in allowed] == inside
+    assert str(allowed) == text
+
+
 def test_an_unknown_recipe_lists_the_known_ones():
-    with pytest.raises(UserError, match=r"'clasical'; known: auto, classical, light.*\.toml"):
+    with pytest.raises(UserError, match=r"'clasical'; known: auto, classical, imc2022, light.*\.toml"):
         load_recipe("clasical")
 
 

@@ -1,6 +1,8 @@
 """The semi-dense networks as matchers, from checkpoints wrapped as the public ones are, with random weights."""
 
+from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import cv2
 import numpy as np
@@ -10,10 +12,10 @@ from torch import nn
 
 from mkpc_kaggle.geometry.coordinates import Box, Size, View
 from mkpc_kaggle.matchers import aspanformer, loftr, quadtree
-from mkpc_kaggle.matchers.contract import Picture, encoding_bytes
-from mkpc_kaggle.matchers.networks.aspanformer import AspanFormer
-from mkpc_kaggle.matchers.networks.loftr import Loftr
-from mkpc_kaggle.matchers.networks.quadtree import Quadtree
+from mkpc_kaggle.matchers.contract import Picture, Training, encoding_bytes
+from mkpc_kaggle.matchers.networks.aspanformer import AspanFormer, AspanFormerConfig, pooling_factor
+from mkpc_kaggle.matchers.networks.loftr import Loftr, LoftrConfig
+from mkpc_kaggle.matchers.networks.quadtree import Quadtree, QuadtreeConfig
 from mkpc_kaggle.matchers.semi_dense import PREFIX, SemiDenseMatcher, SemiDenseOptions, content_mask
 from mkpc_kaggle.recipe import Recipe, Unit
 from mkpc_kaggle.two_stage import TwoStageMatcher
@@ -27,15 +29,21 @@ MODULES: list[tuple[ModuleType, type[nn.Module]]] = [
 pytestmark = pytest.mark.filterwarnings("ignore:.*is not verified")
 
 
-@pytest.fixture(scope="module", params=MODULES, ids=["loftr", "quadtree", "aspanformer"])
-def matcher(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> SemiDenseMatcher:
-    module, network = request.param
+def load_standin(module: ModuleType, network: type[nn.Module], directory: Path, training: Training) -> Any:
+    """The matcher with random weights, which are there for this training alone."""
     torch.manual_seed(0)
     wrapped = {PREFIX + name: tensor for name, tensor in network().state_dict().items()}
-    path = tmp_path_factory.mktemp("weights") / "network.ckpt"
-    torch.save({"state_dict": wrapped, "epoch": 3}, path)
-    store = WeightStore([path.parent], [WeightFile(path.name, -1, UNVERIFIED, "none", module.SLOT, "made here")])
-    return module.load(store, SemiDenseOptions(threshold=0.0), "cpu")
+    torch.save({"state_dict": wrapped, "epoch": 3}, directory / "network.ckpt")
+    slot = f"{module.SPEC.name}-{training}"
+    store = WeightStore([directory], [WeightFile("network.ckpt", -1, UNVERIFIED, "none", slot, "made here")])
+    return module.load(store, SemiDenseOptions(threshold=0.0, training=training), "cpu")
+
+
+@pytest.fixture(scope="module", params=MODULES, ids=["loftr", "quadtree", "aspanformer"])
+def matcher(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> SemiDenseMatcher:
+    matcher = load_standin(*request.param, tmp_path_factory.mktemp("weights"), Training.OUTDOOR)
+    assert isinstance(matcher, SemiDenseMatcher)
+    return matcher
 
 
 def textured(height: int, width: int, seed: int = 0) -> np.ndarray:
@@ -47,6 +55,31 @@ def picture(height: int, width: int, matcher: SemiDenseMatcher, seed: int = 0) -
     box = Box.whole(Size(width, height))
     view = View.fit(box, long_side=max(width, height), multiple=matcher.spec.multiple)
     return Picture(view.render(textured(height, width, seed)), view)
+
+
+INDOOR: list[tuple[ModuleType, type[nn.Module], Any]] = [
+    (loftr, Loftr, LoftrConfig(threshold=0.0, fixed_positions=True)),
+    (quadtree, Quadtree, QuadtreeConfig(threshold=0.0, topks=(32, 16))),
+    (aspanformer, AspanFormer, AspanFormerConfig(threshold=0.0, border=0, train_size=(480, 640))),
+]
+
+
+@pytest.mark.parametrize(("module", "network", "config"), INDOOR, ids=["loftr", "quadtree", "aspanformer"])
+def test_indoor_weights_come_with_their_settings_and_run_at_any_size(
+    module: ModuleType, network: type[nn.Module], config: Any, tmp_path: Path
+) -> None:
+    matcher = load_standin(module, network, tmp_path, Training.INDOOR)
+    assert matcher._network.config == config
+    encoded = [matcher.encode([picture(*size, matcher)])[0] for size in ((97, 131), (160, 88))]
+    (matches,) = matcher.match(encoded[:1], encoded[1:])
+    assert np.isfinite(matches.points1).all()
+
+
+def test_aspanformers_indoor_settings_are_the_published_ones_at_the_published_size() -> None:
+    config, rows, columns = INDOOR[2][2], 60, 80  # of 480 x 640
+    assert pooling_factor(rows, columns, None) == pooling_factor(rows, columns, (15, 20))
+    assert config.position_scale is None
+    assert config.train_size == (8 * rows, 8 * columns)  # so that positions are neither stretched nor shrunk
 
 
 @pytest.mark.parametrize("sizes", [((97, 131), (160, 88)), ((33, 47), (128, 96)), ((128, 128), (128, 128))])

@@ -10,7 +10,7 @@ import torch
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Box, Size, View
 from mkpc_kaggle.matchers import superglue
-from mkpc_kaggle.matchers.contract import Picture, encoding_bytes
+from mkpc_kaggle.matchers.contract import Picture, Training, encoding_bytes
 from mkpc_kaggle.matchers.networks.superglue import SuperGlue, SuperGlueConfig
 from mkpc_kaggle.matchers.networks.superpoint import SuperPoint, SuperPointConfig
 from mkpc_kaggle.recipe import Recipe, Unit
@@ -29,7 +29,11 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> WeightStore:
         torch.save(network.state_dict(), directory / name)
     files = [
         WeightFile(name, -1, UNVERIFIED, "none", slot, "made here")
-        for name, slot in (("sp.pth", superglue.SUPERPOINT), ("sg.pth", superglue.SUPERGLUE))
+        for name, slot in (
+            ("sp.pth", "superpoint"),
+            ("sg.pth", "superglue-outdoor"),
+            ("sg.pth", "superglue-indoor"),
+        )
     ]
     return WeightStore([directory], files)
 
@@ -75,6 +79,15 @@ def test_pictures_without_keypoints_have_no_matches(store: WeightStore, pixels: 
     encodings = picky.encode([picture(pixels)] * 2)
     assert [len(matches) for matches in picky.match(encodings[:1], encodings[1:])] == [0]
     assert picky.encode([]) == []
+
+
+def test_indoor_weights_are_another_slot(store: WeightStore) -> None:
+    indoor = superglue.SuperGlueOptions(training=Training.INDOOR)
+    assert superglue.SPEC.slots_for(indoor) == ("superpoint", "superglue-indoor")
+    outdoor_alone = WeightStore(store.directories, store.files[:2])
+    assert superglue.load(store, indoor, "cpu").spec is superglue.SPEC
+    with pytest.raises(KeyError, match="superglue-indoor"):
+        superglue.load(outdoor_alone, indoor, "cpu")
 
 
 def test_both_stages_run_with_it(matcher: superglue.SuperGlueMatcher) -> None:

@@ -4,6 +4,7 @@ import hashlib
 import os
 import pickle
 import warnings
+from dataclasses import replace
 
 import pytest
 import torch
@@ -12,6 +13,7 @@ from shared import WEIGHTS, needs_weights
 
 from mkpc_kaggle import weights
 from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.matchers.contract import Training
 from mkpc_kaggle.matchers.registry import registry
 from mkpc_kaggle.weights import UNVERIFIED, WeightFile, WeightStore, load_tensors, manifest, parse_manifest
 
@@ -50,8 +52,13 @@ def test_the_manifest_has_every_slot_of_every_matcher_with_its_licence():
         for slot in [file.slot]
     }
     for entry in registry().values():
-        for slot in entry.spec.slots:
+        options = entry.spec.options()
+        for slot in entry.spec.slots_for(options):
             assert licences[slot] & set(entry.spec.licences), slot
+        if hasattr(options, "training"):
+            indoor = entry.spec.slots_for(replace(options, training=Training.INDOOR))
+            assert indoor != entry.spec.slots_for(options)
+            assert all(licences[slot] for slot in indoor)
 
 
 def test_every_digest_of_the_manifest_is_whole_and_every_name_is_there_once():

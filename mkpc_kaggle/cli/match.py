@@ -23,7 +23,9 @@ def run(arguments: argparse.Namespace) -> int:
     from mkpc_kaggle.two_stage import TwoStageMatcher, to_image
 
     images = to_image(arguments.image0), to_image(arguments.image1)
-    matcher = TwoStageMatcher(arguments.recipe, weights=arguments.weights, device=arguments.device)
+    matcher = TwoStageMatcher(
+        arguments.recipe, weights=arguments.weights, device=arguments.device, licence=arguments.licence
+    )
     match = matcher(*images)
     print("\n".join(" ".join(f"{value: .9e}" for value in row) for row in match.estimate.matrix))
     if match.estimate.failure:

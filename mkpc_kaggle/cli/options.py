@@ -23,6 +23,13 @@ def add_matching(parser: argparse.ArgumentParser) -> None:
         help="where weight files lie; may be repeated. Also searched: $MKPC_WEIGHTS and /kaggle/input",
     )
     parser.add_argument(
+        "--licence",
+        choices=["any", "permissive"],
+        default="any",
+        help="permissive: use no weights but those under Apache-2.0, BSD-3-Clause or MIT; recipe auto then leaves "
+        "the others out, any other recipe that has them is refused (default: any)",
+    )
+    parser.add_argument(
         "--device", default="auto", help="cpu, cuda, cuda:N, or auto (the default): a GPU if there is one"
     )
 

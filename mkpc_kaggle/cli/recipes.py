@@ -4,8 +4,10 @@ import argparse
 from pathlib import Path
 
 HELP = """\
-List the recipes: each unit's stage, matcher, long side and most matches, in order of importance, and which
-weight files are missing. A recipe of your own is a TOML file of the same form: --recipe FILE.toml.
+List the recipes: their units in order of importance, and which weight files are missing. A unit reads
+stage:matcher@size, where the size is the view's long side, or the height x width whose area the view gets at
+its own aspect ("!": that height and width themselves; "~": mirrored), and the most matches that are kept.
+A recipe of your own is a TOML file of the form of those in the package: --recipe FILE.toml.
 """
 
 
@@ -24,7 +26,7 @@ def run(arguments: argparse.Namespace) -> int:
         print(f"{name}: {recipe.description}")
         for unit in recipe.units:
             extra = "  (extra: for weak pairs, if time is left)" if unit.extra else ""
-            print(f"    stage {unit.stage}  {unit.matcher}@{unit.long_side}  at most {unit.max_matches}{extra}")
+            print(f"    {unit.name}  at most {unit.max_matches}{extra}")
         missing = missing_slots(recipe, store)
         print(f"    missing: {what_is_missing(missing, store)}" if missing else "    all weights are there")
     return 0

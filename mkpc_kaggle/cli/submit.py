@@ -37,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    from mkpc_kaggle.assembly import assemble
+    from mkpc_kaggle.assembly import Licence, assemble
     from mkpc_kaggle.competition import read_test_side
     from mkpc_kaggle.recipe import Mode
     from mkpc_kaggle.run.session import Session, interruptible
@@ -49,7 +49,11 @@ def run(arguments: argparse.Namespace) -> int:
         budget = options.budget_of(arguments)
         pairs = read_test_side(arguments.test_dir)
         assembly = assemble(
-            arguments.recipe, weights=arguments.weights, device=arguments.device, mode=Mode(arguments.mode)
+            arguments.recipe,
+            weights=arguments.weights,
+            device=arguments.device,
+            mode=Mode(arguments.mode),
+            licence=Licence(arguments.licence),
         )
         work_dir = arguments.work_dir or output.with_name(f"{output.stem}.work")
         print(

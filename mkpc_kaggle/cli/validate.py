@@ -66,7 +66,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _match_and_score(arguments: argparse.Namespace, scenes: "tuple[Scene, ...]", work_dir: Path) -> int:
-    from mkpc_kaggle.assembly import assemble
+    from mkpc_kaggle.assembly import Licence, assemble
     from mkpc_kaggle.recipe import Mode
     from mkpc_kaggle.run.session import Session, interruptible
     from mkpc_kaggle.run.summary import summary
@@ -74,7 +74,11 @@ def _match_and_score(arguments: argparse.Namespace, scenes: "tuple[Scene, ...]",
 
     with interruptible() as interrupt:
         assembly = assemble(
-            arguments.recipe, weights=arguments.weights, device=arguments.device, mode=Mode(arguments.mode)
+            arguments.recipe,
+            weights=arguments.weights,
+            device=arguments.device,
+            mode=Mode(arguments.mode),
+            licence=Licence(arguments.licence),
         )
         session = Session(work_dir, options.budget_of(arguments), interrupt)
         validation, at_rest = validate(scenes, assembly, session)

@@ -4,10 +4,12 @@ Pixel centres are at integers: the centre of the top-left pixel is (0, 0), x run
 image of width w covers [-0.5, w - 0.5). A resize by s maps ``x_view = (x + 0.5) * s - 0.5``, with one s for
 each axis from the *actual* sizes. A crop subtracts an integer offset. Padding goes to the right and the
 bottom, so it moves nothing. A flip mirrors the resized content: ``x_view = w - 1 - x``.
+
+Networks have conventions of their own: :func:`from_corner` and :func:`from_normalised` lead to this one.
 """
 
 from dataclasses import dataclass
-from math import ceil
+from math import ceil, sqrt
 from typing import NamedTuple
 
 import cv2
@@ -79,15 +81,30 @@ class View:
     def fit(cls, crop: Box, *, long_side: int, multiple: int = 1, flip: bool = False) -> "View":
         """The view of ``crop`` whose longer side is ``long_side`` pixels, its aspect kept to the nearest pixel.
 
-        Both sides are then padded up to a multiple of ``multiple``. Raises ``ValueError`` where a side is not
-        positive.
+        As for all views made here, both sides are then padded up to a multiple of ``multiple``, and a size that
+        is not positive raises ``ValueError``.
         """
-        if long_side < 1 or multiple < 1:
-            raise ValueError(f"long_side and multiple must be positive, not {long_side} and {multiple}")
-        scale = long_side / max(crop.size)
+        return cls._scaled(crop, long_side / max(crop.size), multiple, flip)
+
+    @classmethod
+    def of_area(cls, crop: Box, *, area: int, multiple: int = 1, flip: bool = False) -> "View":
+        """The view of ``crop`` that has about ``area`` pixels, its aspect kept to the nearest pixel."""
+        return cls._scaled(crop, sqrt(max(0, area) / crop.area), multiple, flip)
+
+    @classmethod
+    def stretched(cls, crop: Box, *, size: Size, multiple: int = 1, flip: bool = False) -> "View":
+        """The view of ``crop`` resized to exactly ``size``, whatever its aspect."""
+        if multiple < 1:
+            raise ValueError(f"multiple must be positive, not {multiple}")
+        padded = Size(*(ceil(side / multiple) * multiple for side in size))
+        return cls(crop, size, padded, flip)
+
+    @classmethod
+    def _scaled(cls, crop: Box, scale: float, multiple: int, flip: bool) -> "View":
+        if scale <= 0:
+            raise ValueError(f"the size of a view must be positive: {crop.size} times {scale}")
         width, height = (max(1, round(side * scale)) for side in crop.size)
-        padded = Size(*(ceil(side / multiple) * multiple for side in (width, height)))
-        return cls(crop, Size(width, height), padded, flip)
+        return cls.stretched(crop, size=Size(width, height), multiple=multiple, flip=flip)
 
     @property
     def scale(self) -> tuple[float, float]:
@@ -135,3 +152,13 @@ class View:
         if not self.flip:
             return points
         return np.column_stack([self.content.width - 1 - points[:, 0], points[:, 1]])
+
+
+def from_corner(points: NDArray[np.floating]) -> NDArray[np.floating]:
+    """(N, 2) pixels counted from the image's top-left corner -> from the centre of its first pixel."""
+    return points - np.float32(0.5)
+
+
+def from_normalised(points: NDArray[np.floating], size: Size) -> NDArray[np.floating]:
+    """(N, 2) where +-1 are the outer edges of an image of ``size`` -> its pixels."""
+    return from_corner((points + 1) * np.array(size, points.dtype) / 2)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from mkpc_kaggle.geometry.clustering import dbscan
 from mkpc_kaggle.geometry.coordinates import Box, Points, Size
+from mkpc_kaggle.ranges import AT_LEAST_1, POSITIVE, SHARE, check_ranges
 
 
 class Ratio(StrEnum):
@@ -41,6 +42,10 @@ class MkpcConfig:
     expand_y: float = 1.0
     min_clustered: float = 0.2
     min_side: int = 32
+
+    def __post_init__(self) -> None:
+        check_ranges(self, eps=POSITIVE, min_samples=AT_LEAST_1, share=SHARE, expand_x=POSITIVE, expand_y=POSITIVE)
+        check_ranges(self, min_clustered=SHARE, min_side=AT_LEAST_1)
 
 
 class RegionReason(StrEnum):

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.ranges import AT_LEAST_1, POSITIVE, Range, check_ranges
 
 Matrix3 = NDArray[np.float64]
 
@@ -62,6 +63,10 @@ class RobustConfig:
     confidence: float = 0.99999
     max_iterations: int = 50_000
     orders: int = 8
+
+    def __post_init__(self) -> None:
+        check_ranges(self, threshold=POSITIVE, confidence=Range(0, 1, "()"), max_iterations=Range(1, 2**31 - 1))
+        check_ranges(self, orders=AT_LEAST_1)
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,6 +10,7 @@ from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import MatcherSpec, Picture
 from mkpc_kaggle.matchers.neighbours import mutual_neighbours
 from mkpc_kaggle.matchers.sparse import Keypoints, image_batch, matches_of
+from mkpc_kaggle.ranges import AT_LEAST_1, SHARE, check_ranges
 from mkpc_kaggle.weights import WeightStore, load_into
 
 SLOT = "aliked-n16"
@@ -21,6 +22,9 @@ class AlikedOptions:
 
     features: int = 2048
     ratio: float = 1.0
+
+    def __post_init__(self) -> None:
+        check_ranges(self, features=AT_LEAST_1, ratio=SHARE)
 
 
 SPEC = MatcherSpec(

@@ -1,25 +1,31 @@
-"""ASpanFormer (Chen et al. 2022), outdoor weights, which are for noncommercial use."""
+"""ASpanFormer (Chen et al. 2022). Its weights are for noncommercial use."""
 
-from mkpc_kaggle.matchers.contract import Colour, MatcherSpec
+from mkpc_kaggle.matchers.contract import Colour, MatcherSpec, Training
 from mkpc_kaggle.matchers.networks.aspanformer import AspanFormer, AspanFormerConfig
 from mkpc_kaggle.matchers.semi_dense import SemiDenseMatcher, SemiDenseOptions, load_network
 from mkpc_kaggle.weights import WeightStore
 
-SLOT = "aspanformer-outdoor"
-
 SPEC = MatcherSpec(
     "aspanformer",
-    "ASpanFormer, outdoor weights",
+    "ASpanFormer",
     SemiDenseOptions,
     Colour.GRAY,
     multiple=AspanFormer.multiple,
     licences=("Apple-noncommercial",),
-    slots=(SLOT,),
+    slots=("aspanformer-{training}",),
 )
 
 
 def load(weights: WeightStore, options: SemiDenseOptions, device: str) -> SemiDenseMatcher:
-    network = AspanFormer(AspanFormerConfig(threshold=options.threshold))
+    network = AspanFormer(config_of(options))
     # Checkpoints hold offsets besides that the published network never reads.
-    load_network(network, weights, SLOT, unused=r".*\.sample_offset$")
+    load_network(network, weights, *SPEC.slots_for(options), unused=r".*\.sample_offset$")
     return SemiDenseMatcher(network, SPEC, device)
+
+
+def config_of(options: SemiDenseOptions) -> AspanFormerConfig:
+    if options.training is Training.OUTDOOR:
+        return AspanFormerConfig(threshold=options.threshold)
+    # Published for 480 x 640 alone: positions as they are, the global level of 15 x 20 cells. At that size the
+    # positions stretched to the extent trained on and the pooling by four, which fit all sizes, are just these.
+    return AspanFormerConfig(threshold=options.threshold, border=0, train_size=(480, 640))

@@ -22,6 +22,13 @@ class Colour(StrEnum):
     GRAY = "gray"
 
 
+class Training(StrEnum):
+    """Which of a network's published weights: trained on MegaDepth's or on ScanNet's pictures."""
+
+    OUTDOOR = "outdoor"
+    INDOOR = "indoor"
+
+
 @dataclass(frozen=True)
 class NoOptions:
     """For a matcher that has nothing to set."""
@@ -32,8 +39,9 @@ class MatcherSpec:
     """What can be said of a matcher before it is loaded.
 
     ``multiple``: both sides of its pictures are padded to a multiple of it. ``same_size``: both pictures of a
-    pair must have one size. ``licences``: tags of its weights. ``slots``: what it needs of the manifest.
-    ``options``: a frozen dataclass of its settings, which a recipe's table ``[matchers.NAME]`` may change.
+    pair must have one size. ``licences``: tags of its weights. ``slots``: what it needs of the manifest, with an
+    option's value in place of its ``{name}``. ``options``: a frozen dataclass of its settings, which a recipe's
+    table ``[matchers.NAME]`` may change.
     """
 
     name: str
@@ -44,6 +52,10 @@ class MatcherSpec:
     same_size: bool = False
     licences: tuple[str, ...] = ()
     slots: tuple[str, ...] = ()
+
+    def slots_for(self, options: Any) -> tuple[str, ...]:
+        """The slots of the manifest that a matcher with these options is loaded from."""
+        return tuple(slot.format_map(vars(options)) for slot in self.slots)
 
 
 @dataclass(frozen=True, eq=False)

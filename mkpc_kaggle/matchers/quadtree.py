@@ -1,24 +1,23 @@
-"""LoFTR with QuadTree attention (Tang et al. 2022), outdoor weights."""
+"""LoFTR with QuadTree attention (Tang et al. 2022)."""
 
-from mkpc_kaggle.matchers.contract import Colour, MatcherSpec
+from mkpc_kaggle.matchers.contract import Colour, MatcherSpec, Training
 from mkpc_kaggle.matchers.networks.quadtree import Quadtree, QuadtreeConfig
 from mkpc_kaggle.matchers.semi_dense import SemiDenseMatcher, SemiDenseOptions, load_network
 from mkpc_kaggle.weights import WeightStore
 
-SLOT = "quadtree-outdoor"
-
 SPEC = MatcherSpec(
     "quadtree",
-    "LoFTR with QuadTree attention, outdoor weights",
+    "LoFTR with QuadTree attention",
     SemiDenseOptions,
     Colour.GRAY,
     multiple=Quadtree.multiple,
     licences=("Apache-2.0",),
-    slots=(SLOT,),
+    slots=("quadtree-{training}",),
 )
+TOPKS = {Training.OUTDOOR: (16, 8), Training.INDOOR: (32, 16)}  # as published
 
 
 def load(weights: WeightStore, options: SemiDenseOptions, device: str) -> SemiDenseMatcher:
-    network = Quadtree(QuadtreeConfig(threshold=options.threshold))
-    load_network(network, weights, SLOT)
+    network = Quadtree(QuadtreeConfig(threshold=options.threshold, topks=TOPKS[options.training]))
+    load_network(network, weights, *SPEC.slots_for(options))
     return SemiDenseMatcher(network, SPEC, device)

@@ -38,9 +38,10 @@ def options_of(recipe: Recipe, name: str) -> Any:
     return from_table(spec.options, table, f"recipe {recipe.name!r}, table [matchers.{name}]")
 
 
-def slots_of(names: Iterable[str]) -> tuple[str, ...]:
-    """What the registered matchers of these names need of the manifest, each slot once."""
-    return tuple(dict.fromkeys(slot for name in names for slot in registry()[name].spec.slots))
+def slots_of(recipe: Recipe, names: Iterable[str]) -> tuple[str, ...]:
+    """What these registered matchers need of the manifest with the recipe's options, each slot once."""
+    slots = (slot for name in names for slot in registry()[name].spec.slots_for(options_of(recipe, name)))
+    return tuple(dict.fromkeys(slots))
 
 
 def load_matcher(recipe: Recipe, name: str, weights: WeightStore, device: str) -> Matcher[Any]:

@@ -4,17 +4,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from mkpc_kaggle.geometry.coordinates import Size
+from mkpc_kaggle.geometry.coordinates import Size, from_corner
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.matchers.contract import MatcherSpec, Picture
+from mkpc_kaggle.matchers.contract import MatcherSpec, Picture, Training
 from mkpc_kaggle.matchers.networks.fine_matching import COARSE_STRIDE, SemiDenseMatches
 from mkpc_kaggle.matchers.networks.resnet_fpn import FeatureMaps
 from mkpc_kaggle.matchers.networks.semi_dense import SemiDenseNetwork
 from mkpc_kaggle.matchers.sparse import image_batch
+from mkpc_kaggle.ranges import SHARE, check_ranges
 from mkpc_kaggle.weights import WeightStore, load_into
 
 PREFIX = "matcher."
@@ -26,6 +26,10 @@ class SemiDenseOptions:
     """``threshold``: matches must be surer than this."""
 
     threshold: float = 0.2
+    training: Training = Training.OUTDOOR
+
+    def __post_init__(self) -> None:
+        check_ranges(self, threshold=SHARE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,10 +80,8 @@ def content_mask(encoded: Encoded) -> Tensor:
 
 
 def to_matches(found: SemiDenseMatches) -> Matches:
-    """Matches in view pixels; the network's origin is the image's corner, ours the centre of the first pixel."""
-    points0, points1 = (
-        points.float().cpu().numpy() - np.float32(0.5) for points in (found.points0, found.points1)
-    )
+    """Matches in view pixels."""
+    points0, points1 = (from_corner(points.float().cpu().numpy()) for points in (found.points0, found.points1))
     return Matches(points0, points1, found.coarse.confidence.float().cpu().numpy())
 
 

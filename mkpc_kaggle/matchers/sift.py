@@ -15,6 +15,7 @@ from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import Colour, MatcherSpec, Picture
 from mkpc_kaggle.matchers.neighbours import mutual_neighbours
 from mkpc_kaggle.matchers.sparse import Keypoints, matches_of
+from mkpc_kaggle.ranges import AT_LEAST_0, AT_LEAST_1, SHARE, check_ranges
 from mkpc_kaggle.weights import WeightStore
 
 
@@ -25,6 +26,9 @@ class SiftOptions:
     features: int = 8000
     ratio: float = 0.8
     contrast_threshold: float = 0.04
+
+    def __post_init__(self) -> None:
+        check_ranges(self, features=AT_LEAST_1, ratio=SHARE, contrast_threshold=AT_LEAST_0)
 
 
 SPEC = MatcherSpec("sift", "RootSIFT, mutual nearest neighbours, ratio test", SiftOptions, Colour.GRAY)

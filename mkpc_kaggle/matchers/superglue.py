@@ -7,34 +7,41 @@ import torch
 
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.matchers.contract import Colour, MatcherSpec, Picture
+from mkpc_kaggle.matchers.contract import Colour, MatcherSpec, Picture, Training
 from mkpc_kaggle.matchers.networks.superglue import ImageKeypoints, SuperGlue, SuperGlueConfig
 from mkpc_kaggle.matchers.networks.superpoint import SuperPoint, SuperPointConfig, SuperPointKeypoints
 from mkpc_kaggle.matchers.sparse import image_batch
+from mkpc_kaggle.ranges import AT_LEAST_0, AT_LEAST_1, SHARE, check_ranges
 from mkpc_kaggle.weights import WeightStore, load_into
-
-SUPERPOINT, SUPERGLUE = "superpoint", "superglue-outdoor"
 
 
 @dataclass(frozen=True)
 class SuperGlueOptions:
-    """SuperPoint's and SuperGlue's settings of the published outdoor evaluation."""
+    """SuperPoint's and SuperGlue's settings of the published outdoor evaluation.
+
+    With SuperGlue's indoor weights the published ones are ``max_keypoints`` 1024 and ``nms_radius`` 4.
+    """
 
     max_keypoints: int = 2048
     keypoint_threshold: float = 0.005
     nms_radius: int = 3
     sinkhorn_iterations: int = 20
     match_threshold: float = 0.2
+    training: Training = Training.OUTDOOR
+
+    def __post_init__(self) -> None:
+        check_ranges(self, max_keypoints=AT_LEAST_1, keypoint_threshold=SHARE, nms_radius=AT_LEAST_0)
+        check_ranges(self, sinkhorn_iterations=AT_LEAST_1, match_threshold=SHARE)
 
 
 # Sides need no multiple: SuperPoint itself leaves out the last rows and columns beyond one of 8.
 SPEC = MatcherSpec(
     "superglue",
-    "SuperPoint with SuperGlue, outdoor weights",
+    "SuperPoint with SuperGlue",
     SuperGlueOptions,
     Colour.GRAY,
     licences=("Magic-Leap-noncommercial",),
-    slots=(SUPERPOINT, SUPERGLUE),
+    slots=("superpoint", "superglue-{training}"),
 )
 LEAST_SIDE = 8
 """Of a picture that SuperPoint can look at."""
@@ -92,6 +99,6 @@ def load(weights: WeightStore, options: SuperGlueOptions, device: str) -> SuperG
         SuperPointConfig(options.nms_radius, options.keypoint_threshold, options.max_keypoints)
     )
     superglue = SuperGlue(SuperGlueConfig(options.sinkhorn_iterations, options.match_threshold))
-    load_into(superpoint, weights.load(SUPERPOINT), what=SUPERPOINT)
-    load_into(superglue, weights.load(SUPERGLUE), what=SUPERGLUE)
+    for network, slot in zip((superpoint, superglue), SPEC.slots_for(options), strict=True):
+        load_into(network, weights.load(slot), what=slot)
     return SuperGlueMatcher(superpoint, superglue, device)

@@ -11,6 +11,7 @@ from torch import Tensor
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import MatcherSpec, Picture
 from mkpc_kaggle.matchers.sparse import Keypoints, image_batch, matches_of
+from mkpc_kaggle.ranges import AT_LEAST_1, SHARE, check_ranges
 from mkpc_kaggle.weights import WeightStore, load_into
 
 XFEAT, LIGHTERGLUE = "xfeat", "xfeat-lighterglue"
@@ -22,6 +23,9 @@ class XFeatLighterGlueOptions:
 
     features: int = 2048
     threshold: float = 0.1
+
+    def __post_init__(self) -> None:
+        check_ranges(self, features=AT_LEAST_1, threshold=SHARE)
 
 
 SPEC = MatcherSpec(

@@ -29,7 +29,8 @@ def summary(pairs: Sequence[Pair], report: RunReport, left_out: Sequence[Unit] =
     lines += _counts("critical regions", (str(r.reason) for record in records for r in record.regions or ()))
     lines += _time_lines(records)
     if left_out:
-        lines.append(f"units left out, their weights are missing: {', '.join(unit.name for unit in left_out)}")
+        names = ", ".join(unit.name for unit in left_out)
+        lines.append(f"units left out, their weights are missing or not permitted: {names}")
     failed = [f"{pairs[record.index].id}: {record.failure}" for record in records if record.failure]
     lines += _list("pairs with the fallback row", failed)
     lines += _list("units that failed", _unit_failures(records))

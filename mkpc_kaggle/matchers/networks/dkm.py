@@ -1,10 +1,12 @@
 """DKM v3: Edstedt et al., "DKM: Dense Kernelized Feature Matching for Geometry Estimation", CVPR 2023.
 
-Two views of a pair are compared whole; every pixel of each gets a place in the other, and a certainty.
+Two views of a pair are compared whole; every pixel of each gets a place in the other, and a certainty. The views
+may have any sizes; the published code wants one size of both, where the results are the same.
 Coordinates are normalised: (x, y) in [-1, 1], where +-1 are the outer edges of an image (see dkm_refiner).
 Parameter names are those of the public checkpoints. For inference only.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -12,7 +14,6 @@ import torch
 from torch import Generator, Tensor, nn
 from torch.nn import functional
 
-from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.matchers.networks.dkm_coarse import FEATURES, STRIDES, WIDTH, EmbeddingDecoder, GaussianProcess
 from mkpc_kaggle.matchers.networks.dkm_refiner import (
     SHAPES,
@@ -30,8 +31,8 @@ FINE_COARSEST = 8  # the coarsest stride that the second pass looks at
 OVERSAMPLING = 4  # before matches are balanced
 BANDWIDTH = 0.1  # of the density's kernel, in normalised coordinates
 MIN_DENSITY, LAST_RESORT = 10, 1e-7  # isolated matches are drawn only when no others are left
-LEAST_EXPONENT = -80.0  # what is below counts nothing, and denormal numbers take ten times as long
-BLOCK_FLOATS = 2**22
+BLOCK_FLOATS = 2**20
+LEAST_EXPONENT = -80  # e to less is denormal, which takes a processor ten times as long and adds nothing
 
 
 @dataclass(frozen=True)
@@ -61,10 +62,8 @@ class DkmFeatures:
 
 @dataclass(frozen=True, eq=False)
 class DenseWarp:
-    """Of B pairs, float32: ``warp`` (B, H, W, 4), (x, y) in the query and (x, y) in the support, within [-1, 1];
-    ``certainty`` (B, H, W) in [0, 1], 0 where the target is outside.
-
-    A symmetric one is 2 W wide: the query's pixels on the left, the support's on the right.
+    """Of B pairs, float32: ``warp`` (B, H, W, 4), (x, y) in the first image and (x, y) in the second, in [-1, 1];
+    ``certainty`` (B, H, W) in [0, 1], 0 where the target is outside. The grid is that of one of the images.
     """
 
     warp: Tensor
@@ -100,23 +99,19 @@ class DKM(nn.Module):
         coarse = self.decoder.projected(self.encoder(image))
         return DkmFeatures(coarse, None if fine is None else self.encoder(fine, FINE_COARSEST))
 
-    def match(self, query: DkmFeatures, support: DkmFeatures) -> DenseWarp:
-        """B pairs, with a second pass where both have features for it; ValueError where sizes differ."""
-        if _sizes(query) != _sizes(support):
-            raise ValueError(
-                f"both images of a pair must have one size, not {_sizes(query)} and {_sizes(support)}"
-            )
-        forward = dense_warp(*self.decoder(query, support))
+    def match(self, first: DkmFeatures, second: DkmFeatures) -> tuple[DenseWarp, ...]:
+        """B pairs, whose images may differ in size: the warp on the first image's grid, then that on the second's.
+
+        One way there is the former alone. With a second pass where both images have features for it; ValueError
+        where only one has.
+        """
+        if (first.fine is None) != (second.fine is None):
+            raise ValueError("of a pair either both images or neither must have features for a second pass")
+        forward = dense_warp(*self.decoder(first, second))
         if not self.config.symmetric:
-            return forward
+            return (forward,)
         # One after the other: as one batch both directions would take twice the memory and no less time.
-        backward = dense_warp(*self.decoder(support, query))
-        return joined(forward, backward)
-
-
-def _sizes(features: DkmFeatures) -> list[tuple[int, ...]]:
-    pyramids = (features.coarse, features.fine)
-    return [tuple(pyramid.at(1).shape[2:]) for pyramid in pyramids if pyramid is not None]
+        return forward, swapped(dense_warp(*self.decoder(second, first)))
 
 
 class Encoder(nn.Module):
@@ -173,7 +168,7 @@ class Decoder(nn.Module):
 
     def correct(self, estimate: Estimate, query: Pyramid, support: Pyramid, stride: int) -> Estimate:
         corrections = self.conv_refiner[str(stride)](query.at(stride), support.at(stride), estimate.flow)
-        return refined(estimate, corrections, stride, _size(query, 1))
+        return refined(estimate, corrections, stride, _size(support, 1))
 
 
 def _size(pyramid: Pyramid, stride: int) -> torch.Size:
@@ -181,7 +176,7 @@ def _size(pyramid: Pyramid, stride: int) -> torch.Size:
 
 
 def dense_warp(estimate: Estimate, coarse_logits: Tensor) -> DenseWarp:
-    """The final values of one direction; ``coarse_logits`` (B, 1, h, w): those of stride 16, first pass."""
+    """One direction on the query's grid; ``coarse_logits`` (B, 1, h, w): those of stride 16, first pass."""
     flow, logits = estimate.flow, estimate.certainty
     # Half of the coarse evidence against a match is taken back.
     doubts = resize(coarse_logits, logits.shape[2:]).clamp(max=0)
@@ -192,11 +187,15 @@ def dense_warp(estimate: Estimate, coarse_logits: Tensor) -> DenseWarp:
     return DenseWarp(warp, certainty.masked_fill_(outside, 0))
 
 
-def joined(forward: DenseWarp, backward: DenseWarp) -> DenseWarp:
-    """Both directions side by side, the first image's coordinates first in either."""
-    swapped = torch.cat([backward.warp[..., 2:], backward.warp[..., :2]], dim=3)
+def swapped(dense: DenseWarp) -> DenseWarp:
+    """The same pairs of points, the other image's coordinates first."""
+    return DenseWarp(torch.cat([dense.warp[..., 2:], dense.warp[..., :2]], dim=3), dense.certainty)
+
+
+def side_by_side(warps: Sequence[DenseWarp]) -> DenseWarp:
+    """The published layout (B, H, 2 W, 4) of both directions, for images of one size."""
     return DenseWarp(
-        torch.cat([forward.warp, swapped], dim=2), torch.cat([forward.certainty, backward.certainty], dim=2)
+        torch.cat([dense.warp for dense in warps], dim=2), torch.cat([dense.certainty for dense in warps], dim=2)
     )
 
 
@@ -225,10 +224,13 @@ class SamplingConfig:
 
 @dataclass(frozen=True, eq=False)
 class SampledMatches:
-    """``matches`` (M, 4) float32, normalised (x, y) in either image; ``certainty`` (M,), as it was weighted."""
+    """``matches`` (M, 4) float32, normalised (x, y) in either image; ``certainty`` (M,), as it was weighted;
+    ``index`` (M,) int64, where they stand in the warp laid flat.
+    """
 
     matches: Tensor
     certainty: Tensor
+    index: Tensor
 
 
 def sample(
@@ -243,13 +245,11 @@ def sample(
     matches, weights = warp.reshape(-1, 4), weights_of(certainty.reshape(-1), config)
     if not weights.isfinite().all():
         raise ValueError("certainties must be finite")
-    drawn = draw(weights, noise_like(weights, generator), config.number * (OVERSAMPLING if config.balanced else 1))
-    matches, weights = matches[drawn], weights[drawn]
+    index = draw(weights, noise_like(weights, generator), config.number * (OVERSAMPLING if config.balanced else 1))
     if config.balanced:
-        evenness = balancing_weights(density(matches))
-        drawn = draw(evenness, noise_like(evenness, generator), config.number)
-        matches, weights = matches[drawn], weights[drawn]
-    return SampledMatches(matches, weights)
+        evenness = balancing_weights(density(matches[index]))
+        index = index[draw(evenness, noise_like(evenness, generator), config.number)]
+    return SampledMatches(matches[index], weights[index], index)
 
 
 def weights_of(certainty: Tensor, config: SamplingConfig) -> Tensor:
@@ -283,20 +283,10 @@ def density(points: Tensor) -> Tensor:
     rows = max(1, BLOCK_FLOATS // max(1, len(points)))
     for some, out in zip(torch.split(points, rows), torch.split(density, rows), strict=True):
         exponents = torch.cdist(some, points).square_().div_(-2 * BANDWIDTH**2)
-        exponents.clamp_(min=LEAST_EXPONENT)
-        torch.sum(exponents.exp_(), dim=1, out=out)
+        torch.sum(exponents.clamp_(min=LEAST_EXPONENT).exp_(), dim=1, out=out)
     return density
 
 
 def balancing_weights(density: Tensor) -> Tensor:
     """(N,) -> (N,): the denser, the less, yet next to nothing for isolated points."""
     return (1 / (density + 1)).masked_fill_(density < MIN_DENSITY, LAST_RESORT)
-
-
-def pixel_points(matches: Tensor, size0: Size, size1: Size) -> tuple[Tensor, Tensor]:
-    """(M, 4) normalised -> (M, 2) of each image in its pixels, their centres at integers."""
-    return _pixels(matches[:, :2], size0), _pixels(matches[:, 2:], size1)
-
-
-def _pixels(points: Tensor, size: Size) -> Tensor:
-    return (points + 1) * points.new_tensor(size) / 2 - 0.5

@@ -64,9 +64,10 @@ class Refiner(nn.Module):
         self.disp_emb = nn.Conv2d(2, shape.embedding, 1)
 
     def forward(self, query: Tensor, support: Tensor, flow: Tensor) -> Tensor:
-        """Corrections (B, 3, h, w) of features (B, C, h, w) of both images and a flow (B, 2, h, w).
+        """Corrections (B, 3, h, w) of features (B, C, h, w) and (B, C, h', w') and a flow (B, 2, h, w).
 
-        Channel 0 is added to the certainty's logit; 1 and 2 are x and y in eighths of a pixel of this scale.
+        Channel 0 is added to the certainty's logit; 1 and 2 are x and y in eighths of the support's pixel at this
+        scale.
         """
         x = self._look(query, support, flow)  # (B, inputs, h, w)
         for depthwise, norm, _, mix in (self.block1, *self.hidden_blocks):
@@ -106,7 +107,7 @@ def by_rows(pointwise: nn.Conv2d, x: Tensor) -> Tensor:
 
 
 def refined(estimate: Estimate, corrections: Tensor, stride: int, full: torch.Size) -> Estimate:
-    """The estimate after a refiner's corrections; ``full`` (H, W): the size of stride 1 in the same pass."""
+    """The estimate after a refiner's corrections; ``full`` (H, W): the support's size in the same pass."""
     height, width = full
     unit = corrections.new_tensor([stride / (4 * width), stride / (4 * height)])  # an eighth of a pixel
     flow = estimate.flow + corrections[:, 1:] * unit[:, None, None]
@@ -116,8 +117,8 @@ def refined(estimate: Estimate, corrections: Tensor, stride: int, full: torch.Si
 def local_correlation(query: Tensor, support: Tensor, flow: Tensor, radius: int) -> Tensor:
     """Dot products of each pixel's features with the support's around its target, over sqrt(C).
 
-    (B, C, h, w) both and (B, 2, h, w) -> (B, (2 radius + 1)^2, h, w), float32. The window moves in steps of one
-    pixel of the support, row by row; the support is zero outside, bilinear between pixels.
+    (B, C, h, w), (B, C, h', w') and (B, 2, h, w) -> (B, (2 radius + 1)^2, h, w), float32. The window moves in
+    steps of one pixel of the support, row by row; the support is zero outside, bilinear between pixels.
 
     All samples of a pixel have one fraction: its products with the (2 radius + 2)^2 nearest pixels are blended.
     """
@@ -130,14 +131,15 @@ def local_correlation(query: Tensor, support: Tensor, flow: Tensor, radius: int)
     reach = torch.arange(-radius, radius + 2, device=flow.device)
     columns, rows = (corner.reshape(-1, 2, 1).long() + reach).unbind(1)  # (P, 2 radius + 2)
     outside = _beyond(rows, height)[:, :, None] | _beyond(columns, width)[:, None]  # (P, 2 r + 2, 2 r + 2)
-    image = torch.arange(batch, device=flow.device).repeat_interleave(height * width)[:, None] * height
+    pixels = flow.shape[2] * flow.shape[3]  # of one query
+    image = torch.arange(batch, device=flow.device).repeat_interleave(pixels)[:, None] * height
     index = ((image + rows.clamp(0, height - 1)) * width)[:, :, None] + columns.clamp(0, width - 1)[:, None]
 
     products = _products(as_grid(query).flatten(0, 2), as_grid(support).flatten(0, 2), index.flatten(1))
     products = products.view_as(index).masked_fill_(outside, 0)
     products = torch.lerp(products[:, :-1], products[:, 1:], fraction_y)
     products = torch.lerp(products[..., :-1], products[..., 1:], fraction_x)  # (P, 2 r + 1, 2 r + 1)
-    return as_map(products.mul_(channels**-0.5).view(batch, height, width, -1))
+    return as_map(products.mul_(channels**-0.5).view(batch, *flow.shape[2:], -1))
 
 
 def _beyond(index: Tensor, length: int) -> Tensor:

@@ -1,0 +1,210 @@
+"""DKM as a matcher, from a checkpoint in the public file's own format, with random weights."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.geometry.coordinates import Box, Size, View
+from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.matchers import dkm
+from mkpc_kaggle.matchers.contract import Picture, Training, encoding_bytes
+from mkpc_kaggle.matchers.dkm import DkmMatcher, DkmOptions
+from mkpc_kaggle.matchers.networks.dkm import DKM, DenseWarp, DkmFeatures
+from mkpc_kaggle.matchers.networks.dkm_refiner import identity_map
+from mkpc_kaggle.matchers.networks.grids import as_grid
+from mkpc_kaggle.recipe import Recipe, Unit
+from mkpc_kaggle.two_stage import TwoStageMatcher
+from mkpc_kaggle.weights import UNVERIFIED, WeightFile, WeightStore
+
+pytestmark = pytest.mark.filterwarnings("ignore:.*is not verified")
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> WeightStore:
+    """Random weights that keep activations, and so the flow, of order 1; for outdoors alone."""
+    torch.manual_seed(0)
+    network = DKM()
+    for parameter in network.parameters():
+        if parameter.ndim > 1:
+            parameter.normal_(std=parameter[0].numel() ** -0.5)
+    directory = tmp_path_factory.mktemp("weights")
+    torch.save(network.state_dict(), directory / "DKMv3_outdoor.pth")
+    return WeightStore(
+        [directory], [WeightFile("DKMv3_outdoor.pth", -1, UNVERIFIED, "none", "dkm-outdoor", "made here")]
+    )
+
+
+@pytest.fixture(scope="module")
+def network(store: WeightStore) -> DKM:
+    return dkm.load(store, DkmOptions(), "cpu")._network
+
+
+@pytest.fixture
+def matcher(network: DKM) -> DkmMatcher:
+    return DkmMatcher(network, DkmOptions(matches=300), "cpu")
+
+
+def textured(height: int, width: int, seed: int = 0) -> np.ndarray:
+    noise = np.random.default_rng(seed).integers(0, 255, (height // 4 + 1, width // 4 + 1, 3), np.uint8)
+    return cv2.resize(noise, (width, height), interpolation=cv2.INTER_CUBIC)
+
+
+def picture(height: int, width: int, seed: int = 0, padding: int = 0) -> Picture:
+    content = Size(width, height)
+    view = View(Box.whole(content), content, Size(width + padding, height + 2 * padding))
+    return Picture(view.render(textured(height, width, seed)), view)
+
+
+def match_one(matcher: DkmMatcher, first: Picture, second: Picture) -> Matches:
+    (matches,) = matcher.match(matcher.encode([first]), matcher.encode([second]))
+    return matches
+
+
+def same(first: Matches, second: Matches) -> bool:
+    parts = ("points0", "points1", "scores")
+    return all(getattr(first, part).tobytes() == getattr(second, part).tobytes() for part in parts)
+
+
+SIZES = [((64, 96), (90, 50)), ((33, 47), (48, 64)), ((6, 120), (40, 40)), ((1, 1), (40, 50))]
+
+
+@pytest.mark.parametrize("sizes", SIZES)
+@pytest.mark.parametrize("passes", [1, 2])
+def test_matches_lie_on_the_pictures_whatever_their_sizes(
+    network: DKM, passes: int, sizes: tuple[tuple[int, int], tuple[int, int]]
+) -> None:
+    matcher = DkmMatcher(network, DkmOptions(passes, matches=300), "cpu")
+    pictures = [picture(*size, seed) for seed, size in enumerate(sizes)]
+    matches = match_one(matcher, *pictures)
+    assert 0 < len(matches) <= 300
+    assert len(matches.to_image(pictures[0].view, pictures[1].view)) == len(matches)
+    assert (matches.scores > 0).all()
+    assert (matches.scores <= 1).all()
+
+
+def test_the_same_pair_gives_the_same_bytes_whatever_ran_before_and_in_whatever_batch(matcher: DkmMatcher) -> None:
+    pictures = [picture(40, 56, seed) for seed in range(3)]
+    alone = match_one(matcher, *pictures[:2])
+    torch.rand(5)
+    one, two, three = matcher.encode(pictures)
+    other, again = matcher.match([three, one], [two, two])
+    assert same(again, alone)
+    assert not same(other, alone)
+    assert len(alone) == 300
+
+
+def test_which_matches_are_drawn_depends_on_both_pictures(matcher: DkmMatcher) -> None:
+    """Features of one pair, digests of others: the same warp is drawn from in other ways."""
+    first, second = matcher.encode([picture(40, 56, seed) for seed in (0, 1)])
+    drawn = [
+        matcher.match([dkm.Encoded(first.features, first.content, digest0)], [second])[0]
+        for digest0 in (first.digest, first.digest, 7)
+    ]
+    drawn += matcher.match([first], [dkm.Encoded(second.features, second.content, 7)])
+    assert [same(drawn[0], other) for other in drawn] == [True, True, False, False]
+
+
+def test_padding_changes_nothing(matcher: DkmMatcher) -> None:
+    plain = [picture(40, 56), picture(50, 36, 1)]
+    padded = [picture(40, 56, padding=13), picture(50, 36, 1, padding=8)]
+    assert padded[0].pixels.shape == (66, 69, 3)
+    assert same(match_one(matcher, *plain), match_one(matcher, *padded))
+
+
+def test_two_passes_look_at_the_picture_shrunk_and_whole(network: DKM) -> None:
+    matcher = DkmMatcher(network, DkmOptions(passes=2), "cpu")
+    (encoded,) = matcher.encode([picture(48, 80)])
+    assert encoded.features.coarse.at(1).shape == (1, 3, 30, 50)
+    assert encoded.features.fine is not None
+    assert encoded.features.fine.at(1).shape == (1, 3, 48, 80)
+    assert len(encoded.features.fine.levels) == 4
+
+
+def test_an_encoding_holds_what_matching_needs_and_its_bytes_are_counted(network: DKM) -> None:
+    for passes in (1, 2):
+        (encoded,) = DkmMatcher(network, DkmOptions(passes), "cpu").encode([picture(64, 96)])
+        fine = encoded.features.fine
+        levels = [*encoded.features.coarse.levels, *(fine.levels if fine else ())]
+        assert encoding_bytes(encoded) == 4 * sum(level.numel() for level in levels)
+        assert encoding_bytes(encoded) == sum(level.untyped_storage().nbytes() for level in levels)
+
+
+class Given:
+    """A network that answers with these warps."""
+
+    def __init__(self, *warps: DenseWarp) -> None:
+        self.warps = warps
+
+    def to(self, device: str) -> "Given":
+        return self
+
+    def encode(self, image: torch.Tensor) -> DkmFeatures:
+        return None  # type: ignore[return-value]
+
+    def match(self, first: DkmFeatures, second: DkmFeatures) -> tuple[DenseWarp, ...]:
+        return self.warps
+
+
+def identity_warp(height: int, width: int, certainty: float) -> DenseWarp:
+    grid = as_grid(identity_map(torch.zeros(height, width)))  # (1, h, w, 2)
+    return DenseWarp(torch.cat([grid, grid], dim=3), torch.full((1, height, width), certainty))
+
+
+def test_points_of_either_picture_are_in_its_own_pixels() -> None:
+    """Both show the same, at another size: places relative to the edges agree."""
+    warps = identity_warp(40, 60, 0.3), identity_warp(80, 30, 0.9)
+    matcher = DkmMatcher(Given(*warps), DkmOptions(matches=9999, balanced=False), "cpu")  # type: ignore[arg-type]
+    matches = match_one(matcher, picture(40, 60), picture(80, 30))
+    assert len(matches) == 40 * 60 + 80 * 30
+    expected = (matches.points0 + 0.5) * (30 / 60, 80 / 40) - 0.5
+    np.testing.assert_allclose(matches.points1, expected, atol=1e-4)
+    whole0 = np.abs(matches.points0 - np.rint(matches.points0)).max(axis=1) < 1e-4
+    whole1 = np.abs(matches.points1 - np.rint(matches.points1)).max(axis=1) < 1e-4
+    assert (whole0 | whole1).all()
+    np.testing.assert_array_equal(matches.scores == np.float32(0.3), whole0)
+    assert set(matches.scores.tolist()) == {float(np.float32(0.3)), float(np.float32(0.9))}
+
+
+def test_no_certainty_no_matches() -> None:
+    warps = identity_warp(9, 9, 0.0), identity_warp(9, 9, 0.0)
+    matcher = DkmMatcher(Given(*warps), DkmOptions(), "cpu")  # type: ignore[arg-type]
+    assert len(match_one(matcher, picture(9, 9), picture(9, 9))) == 0
+    assert matcher.encode([]) == []
+    assert matcher.match([], []) == []
+
+
+def test_one_way_is_from_the_first_to_the_second(store: WeightStore) -> None:
+    matcher = dkm.load(store, DkmOptions(symmetric=False, matches=200), "cpu")
+    matches = match_one(matcher, picture(40, 56), picture(50, 36, 1))
+    assert len(matches) == 200
+    np.testing.assert_allclose(matches.points0, np.rint(matches.points0), atol=1e-4)
+
+
+def test_the_training_says_which_weights(store: WeightStore) -> None:
+    with pytest.raises(KeyError, match="dkm-indoor"):
+        dkm.load(store, DkmOptions(training=Training.INDOOR), "cpu")
+
+
+def test_another_networks_checkpoint_is_refused(store: WeightStore, tmp_path: Path) -> None:
+    torch.save({"weight": torch.ones(3)}, tmp_path / "DKMv3_outdoor.pth")
+    with pytest.raises(UserError, match="'dkm-outdoor' do not fit the network"):
+        dkm.load(WeightStore([tmp_path], store.files), DkmOptions(), "cpu")
+
+
+UNITS = (Unit(1, "dkm", area="48x64"), Unit(2, "dkm", area="36x48"), Unit(2, "dkm", area="36x48", stretch=True))
+
+
+@pytest.mark.parametrize("shapes", [((90, 120), (120, 70)), ((33, 47), (20, 400)), ((60, 80), None)])
+def test_both_stages_run_with_it(network: DKM, shapes: tuple[tuple[int, int], tuple[int, int] | None]) -> None:
+    """Landscape and portrait, tiny and long, and a flat picture."""
+    matcher = DkmMatcher(network, DkmOptions(passes=2, matches=200), "cpu")
+    first = textured(*shapes[0])
+    second = np.full((60, 80, 3), 128, np.uint8) if shapes[1] is None else textured(*shapes[1], 1)
+    match = TwoStageMatcher(Recipe(UNITS), matchers={"dkm": matcher})(first, second)
+    assert [result.failure for result in match.results] == ["", "", ""]
+    assert all(0 < len(result.matches) <= 200 for result in match.results)
+    assert np.isfinite(match.estimate.matrix).all()
