@@ -26,6 +26,7 @@ from torch.nn import functional
 from torch.utils.flop_counter import FlopCounterMode
 
 from mkpc_kaggle.geometry.coordinates import Size
+from mkpc_kaggle.matchers.contract import Placement, Precision
 from mkpc_kaggle.matchers.networks.aspanformer import AspanFormer
 from mkpc_kaggle.matchers.networks.dkm import DKM, SamplingConfig, network_input, sample
 from mkpc_kaggle.matchers.networks.loftr import Loftr
@@ -56,7 +57,7 @@ def gray_images(size: Size) -> list[Tensor]:
     return [torch.from_numpy(gray)[None, None].float() / 255 for gray in grays]
 
 
-def kornia_loftr(precision: torch.dtype) -> Run:
+def kornia_loftr(precision: Precision) -> Run:
     """Always in float32, with the weights of ours."""
     from kornia.feature import LoFTR
 
@@ -68,22 +69,22 @@ def kornia_loftr(precision: torch.dtype) -> Run:
 
 
 def semi_dense(make: Callable[[], Loftr | Quadtree | AspanFormer], name: str, size: Size) -> Callable[..., Run]:
-    def prepare(precision: torch.dtype) -> Run:
-        network = placed(filled(make(), name), precision=precision)
+    def prepare(precision: Precision) -> Run:
+        network = placed(filled(make(), name), Placement(precision=precision))
         image0, image1 = gray_images(size)
         return lambda: len(network.match(network.encode(image0), network.encode(image1)).points0)
 
     return prepare
 
 
-def superpoint(precision: torch.dtype) -> Run:
-    network = placed(filled(SuperPoint(SuperPointConfig()), "superpoint").eval(), precision=precision)
+def superpoint(precision: Precision) -> Run:
+    network = placed(filled(SuperPoint(SuperPointConfig()), "superpoint").eval(), Placement(precision=precision))
     image = gray_images(VGA)[0]
     return lambda: len(network(image)[0].points)
 
 
-def superglue(number: int, precision: torch.dtype) -> Run:
-    network = placed(filled(SuperGlue(SuperGlueConfig(20)), "superglue"), precision=precision)
+def superglue(number: int, precision: Precision) -> Run:
+    network = placed(filled(SuperGlue(SuperGlueConfig(20)), "superglue"), Placement(precision=precision))
     generator = torch.Generator().manual_seed(0)
     points = torch.rand(1, number, 2, generator=generator) * torch.tensor(VGA)
     scores = torch.rand(1, number, generator=generator)
@@ -92,8 +93,8 @@ def superglue(number: int, precision: torch.dtype) -> Run:
     return lambda: int((network(keypoints, keypoints).matches0 >= 0).sum())
 
 
-def dkm(precision: torch.dtype) -> Run:
-    network = placed(filled(DKM(), "dkm"), precision=precision)
+def dkm(precision: Precision) -> Run:
+    network = placed(filled(DKM(), "dkm"), Placement(precision=precision))
     pictures = [torch.from_numpy(view).permute(2, 0, 1)[None] for view in photographs(DKM_SIZE)]
 
     def run() -> int:
@@ -106,7 +107,7 @@ def dkm(precision: torch.dtype) -> Run:
     return run
 
 
-CASES: dict[str, Callable[[torch.dtype], Run]] = {
+CASES: dict[str, Callable[[Precision], Run]] = {
     YARDSTICK: kornia_loftr,
     "LoFTR": semi_dense(Loftr, "loftr", VGA),
     "SuperPoint": superpoint,
@@ -158,11 +159,11 @@ def peak_memory(case: str, precision: str) -> float:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--precision", choices=["float32", "bfloat16", "float16"], default="float32")
+    parser.add_argument("--precision", choices=list(Precision), default=Precision.FLOAT32)
     parser.add_argument("--only", default=",".join(CASES), help="parts of names of cases")
     parser.add_argument("--memory-of", metavar="CASE", help="run this case once and print the process's peak")
     arguments = parser.parse_args()
-    precision: torch.dtype = getattr(torch, arguments.precision)
+    precision = Precision(arguments.precision)
     if arguments.memory_of:
         (CASES | LARGE_CASES)[arguments.memory_of](precision)()
         print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024)
@@ -174,7 +175,7 @@ def main() -> None:
     for _ in range(arguments.rounds):
         for case, run in runs.items():
             times[case].append(seconds_of(run))
-    report(found, work, times, peak(precision), arguments.precision)
+    report(found, work, times, peak(getattr(torch, precision)), precision)
 
 
 def report(

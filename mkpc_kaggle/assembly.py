@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.matchers.contract import Matcher
+from mkpc_kaggle.matchers.contract import Matcher, Placement, Precision
 from mkpc_kaggle.matchers.registry import load_matcher, options_of, registry, slots_of
 from mkpc_kaggle.pipeline import Pipeline
 from mkpc_kaggle.recipe import Mode, Recipe, Unit, load_recipe
@@ -36,26 +36,29 @@ class Assembly:
 
     recipe: Recipe
     weights: WeightStore
-    device: str
+    placement: Placement
     left_out: tuple[Unit, ...] = ()
     matchers: Mapping[str, Matcher[Any]] = field(default_factory=dict)
 
     def pipeline(self) -> Pipeline:
         """A pipeline whose matchers are loaded when they are first needed."""
         # Batches pay on a GPU; on a CPU they only cost memory.
-        return Pipeline(self.recipe, self._matcher, batch=CUDA_BATCH if self.device.startswith("cuda") else 1)
+        return Pipeline(
+            self.recipe, self._matcher, batch=CUDA_BATCH if self.placement.device.startswith("cuda") else 1
+        )
 
     def fingerprint(self) -> dict[str, Any]:
-        """What decides the numbers that come out: the recipe and the digests of its weights."""
+        """What decides the numbers that come out: the recipe, the precision and the digests of the weights."""
         slots = slots_of(self.recipe, not_own(self.recipe.matcher_names, self.matchers))
         found = {slot: self.weights.find(slot) for slot in slots}
         return {
             "recipe": self.recipe.fingerprint(),
+            "precision": self.placement.precision,
             "weights": {slot: file.digest for slot, file in found.items() if file is not None},
         }
 
     def _matcher(self, name: str) -> Matcher[Any]:
-        return self.matchers.get(name) or load_matcher(self.recipe, name, self.weights, self.device)
+        return self.matchers.get(name) or load_matcher(self.recipe, name, self.weights, self.placement)
 
 
 def assemble(
@@ -63,11 +66,12 @@ def assemble(
     *,
     weights: Iterable[Path] = (),
     device: str = AUTO,
+    precision: str = Precision.FLOAT32,
     mode: Mode = Mode.TWO_STAGE,
     licence: Licence = Licence.ANY,
     matchers: Mapping[str, Matcher[Any]] | None = None,
 ) -> Assembly:
-    """Everything checked before any work: recipe, options, licences, weights and their digests, device.
+    """Everything checked before any work: recipe, options, licences, weights and their digests, device, precision.
 
     Recipe ``auto`` drops the units whose weights are missing or not permitted; for any other, such weights raise
     :class:`UserError`, as do unknown names and damaged files.
@@ -94,7 +98,7 @@ def assemble(
     lacking = {n for n in not_own(wanted.matcher_names, own) if not set(missing).isdisjoint(slots_of(wanted, [n]))}
     chosen = wanted.only(lambda unit: unit.matcher not in lacking | refused.keys())
     left_out = tuple(unit for unit in wanted.units if unit not in chosen.units)
-    return Assembly(chosen.in_mode(mode), store, resolve_device(device), left_out, own)
+    return Assembly(chosen.in_mode(mode), store, resolve_placement(device, precision), left_out, own)
 
 
 def missing_slots(recipe: Recipe, store: WeightStore, own: Container[str] = ()) -> list[str]:
@@ -119,6 +123,28 @@ def licences_of(recipe: Recipe, name: str, store: WeightStore, own: Mapping[str,
 def what_is_missing(slots: Iterable[str], store: WeightStore) -> str:
     """The file names that would fill the slots."""
     return "; ".join(f"{slot}: {' or '.join(file.name for file in store.alternatives(slot))}" for slot in slots)
+
+
+def resolve_placement(device: str, precision: str) -> Placement:
+    """The placement that the user's words mean; :class:`UserError` for what is unknown or not there."""
+    where = resolve_device(device)
+    if precision == AUTO:
+        return Placement(where, fastest_precision(where))
+    if precision not in list(Precision):
+        raise UserError(f"unknown precision {precision!r}; known: auto, {', '.join(Precision)}")
+    return Placement(where, Precision(precision))
+
+
+def fastest_precision(device: str) -> Precision:
+    """Half precision where the device has units for it."""
+    import torch
+
+    if device.startswith("cuda"):
+        has_tensor_cores = torch.cuda.get_device_capability(device) >= (7, 0)
+        return Precision.FLOAT16 if has_tensor_cores else Precision.FLOAT32
+    # Older versions of PyTorch do not tell; then float32 is safe.
+    able: Mapping[str, Any] = getattr(torch.cpu, "get_capabilities", dict)()
+    return Precision.BFLOAT16 if able.get("avx512_bf16") or able.get("amx_bf16") else Precision.FLOAT32
 
 
 def resolve_device(device: str) -> str:

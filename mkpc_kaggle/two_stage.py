@@ -34,11 +34,17 @@ class TwoStageMatcher:
         *,
         weights: Iterable[str | Path] = (),
         device: str = "auto",
+        precision: str = "float32",
         licence: Licence | str = Licence.ANY,
         matchers: Mapping[str, Matcher[Any]] | None = None,
     ) -> None:
         assembly = assemble(
-            recipe, weights=map(Path, weights), device=device, licence=Licence(licence), matchers=matchers
+            recipe,
+            weights=map(Path, weights),
+            device=device,
+            precision=precision,
+            licence=Licence(licence),
+            matchers=matchers,
         )
         self.recipe = assembly.recipe
         self._pipeline = assembly.pipeline()

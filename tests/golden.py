@@ -11,6 +11,7 @@ import pytest
 import torch
 from shared import SHARED
 
+from mkpc_kaggle.matchers.contract import Placement
 from mkpc_kaggle.matchers.networks.placement import placed
 
 GOLDEN = SHARED / "golden"
@@ -58,7 +59,7 @@ def recorded(network, names):
 def ready(network, state):
     """The network with these weights as it runs, its batch norms folded."""
     network.load_state_dict(state, strict=True)
-    return placed(network.eval())
+    return placed(network.eval(), Placement())
 
 
 def _module(path):

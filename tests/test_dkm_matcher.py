@@ -11,7 +11,7 @@ from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Box, Size, View
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers import dkm
-from mkpc_kaggle.matchers.contract import Picture, Training, encoding_bytes
+from mkpc_kaggle.matchers.contract import Picture, Placement, Training, encoding_bytes
 from mkpc_kaggle.matchers.dkm import DkmMatcher, DkmOptions
 from mkpc_kaggle.matchers.networks.dkm import DKM, DenseWarp, DkmFeatures
 from mkpc_kaggle.matchers.networks.dkm_refiner import identity_map
@@ -40,7 +40,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> WeightStore:
 
 @pytest.fixture(scope="module")
 def network(store: WeightStore) -> DKM:
-    return dkm.load(store, DkmOptions(), "cpu")._network
+    return dkm.load(store, DkmOptions(), Placement())._network
 
 
 @pytest.fixture
@@ -178,7 +178,7 @@ def test_no_certainty_no_matches() -> None:
 
 
 def test_one_way_is_from_the_first_to_the_second(store: WeightStore) -> None:
-    matcher = dkm.load(store, DkmOptions(symmetric=False, matches=200), "cpu")
+    matcher = dkm.load(store, DkmOptions(symmetric=False, matches=200), Placement())
     matches = match_one(matcher, picture(40, 56), picture(50, 36, 1))
     assert len(matches) == 200
     np.testing.assert_allclose(matches.points0, np.rint(matches.points0), atol=1e-4)
@@ -186,13 +186,13 @@ def test_one_way_is_from_the_first_to_the_second(store: WeightStore) -> None:
 
 def test_the_training_says_which_weights(store: WeightStore) -> None:
     with pytest.raises(KeyError, match="dkm-indoor"):
-        dkm.load(store, DkmOptions(training=Training.INDOOR), "cpu")
+        dkm.load(store, DkmOptions(training=Training.INDOOR), Placement())
 
 
 def test_another_networks_checkpoint_is_refused(store: WeightStore, tmp_path: Path) -> None:
     torch.save({"weight": torch.ones(3)}, tmp_path / "DKMv3_outdoor.pth")
     with pytest.raises(UserError, match="'dkm-outdoor' do not fit the network"):
-        dkm.load(WeightStore([tmp_path], store.files), DkmOptions(), "cpu")
+        dkm.load(WeightStore([tmp_path], store.files), DkmOptions(), Placement())
 
 
 UNITS = (Unit(1, "dkm", area="48x64"), Unit(2, "dkm", area="36x48"), Unit(2, "dkm", area="36x48", stretch=True))

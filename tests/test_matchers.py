@@ -14,7 +14,7 @@ from torch import nn
 
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Box, Size, View
-from mkpc_kaggle.matchers.contract import Colour, Picture, Training, encoding_bytes
+from mkpc_kaggle.matchers.contract import Colour, Picture, Placement, Training, encoding_bytes
 from mkpc_kaggle.matchers.neighbours import mutual_neighbours
 from mkpc_kaggle.matchers.registry import load_matcher, registry
 from mkpc_kaggle.matchers.xfeat_lighterglue import layer_name
@@ -63,7 +63,7 @@ def photograph():
 @cache
 def matcher_of(name):
     recipe = Recipe((Unit(1, name, 320),), matchers={name: {"features": 1000}})
-    return load_matcher(recipe, name, WeightStore([WEIGHTS] if WEIGHTS.is_dir() else []), "cpu")
+    return load_matcher(recipe, name, WeightStore([WEIGHTS] if WEIGHTS.is_dir() else []), Placement())
 
 
 def picture(pixels, matcher, padding=(0, 0)):

@@ -12,7 +12,7 @@ from torch import nn
 
 from mkpc_kaggle.geometry.coordinates import Box, Size, View
 from mkpc_kaggle.matchers import aspanformer, loftr, quadtree
-from mkpc_kaggle.matchers.contract import Picture, Training, encoding_bytes
+from mkpc_kaggle.matchers.contract import Picture, Placement, Training, encoding_bytes
 from mkpc_kaggle.matchers.networks.aspanformer import AspanFormer, AspanFormerConfig, pooling_factor
 from mkpc_kaggle.matchers.networks.loftr import Loftr, LoftrConfig
 from mkpc_kaggle.matchers.networks.quadtree import Quadtree, QuadtreeConfig
@@ -36,7 +36,7 @@ def load_standin(module: ModuleType, network: type[nn.Module], directory: Path, 
     torch.save({"state_dict": wrapped, "epoch": 3}, directory / "network.ckpt")
     slot = f"{module.SPEC.name}-{training}"
     store = WeightStore([directory], [WeightFile("network.ckpt", -1, UNVERIFIED, "none", slot, "made here")])
-    return module.load(store, SemiDenseOptions(threshold=0.0, training=training), "cpu")
+    return module.load(store, SemiDenseOptions(threshold=0.0, training=training), Placement())
 
 
 @pytest.fixture(scope="module", params=MODULES, ids=["loftr", "quadtree", "aspanformer"])

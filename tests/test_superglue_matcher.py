@@ -10,7 +10,7 @@ import torch
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Box, Size, View
 from mkpc_kaggle.matchers import superglue
-from mkpc_kaggle.matchers.contract import Picture, Training, encoding_bytes
+from mkpc_kaggle.matchers.contract import Picture, Placement, Training, encoding_bytes
 from mkpc_kaggle.matchers.networks.superglue import SuperGlue, SuperGlueConfig
 from mkpc_kaggle.matchers.networks.superpoint import SuperPoint, SuperPointConfig
 from mkpc_kaggle.recipe import Recipe, Unit
@@ -40,7 +40,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> WeightStore:
 
 @pytest.fixture(scope="module")
 def matcher(store: WeightStore) -> superglue.SuperGlueMatcher:
-    return superglue.load(store, OPTIONS, "cpu")
+    return superglue.load(store, OPTIONS, Placement())
 
 
 def textured(height: int, width: int, seed: int = 0) -> np.ndarray:
@@ -75,7 +75,7 @@ def test_the_other_way_round_the_same_keypoints_are_paired(matcher: superglue.Su
 
 @pytest.mark.parametrize("pixels", [np.full((60, 80), 128, np.uint8), np.zeros((5, 300), np.uint8)])
 def test_pictures_without_keypoints_have_no_matches(store: WeightStore, pixels: np.ndarray) -> None:
-    picky = superglue.load(store, superglue.SuperGlueOptions(keypoint_threshold=0.9), "cpu")
+    picky = superglue.load(store, superglue.SuperGlueOptions(keypoint_threshold=0.9), Placement())
     encodings = picky.encode([picture(pixels)] * 2)
     assert [len(matches) for matches in picky.match(encodings[:1], encodings[1:])] == [0]
     assert picky.encode([]) == []
@@ -85,9 +85,9 @@ def test_indoor_weights_are_another_slot(store: WeightStore) -> None:
     indoor = superglue.SuperGlueOptions(training=Training.INDOOR)
     assert superglue.SPEC.slots_for(indoor) == ("superpoint", "superglue-indoor")
     outdoor_alone = WeightStore(store.directories, store.files[:2])
-    assert superglue.load(store, indoor, "cpu").spec is superglue.SPEC
+    assert superglue.load(store, indoor, Placement()).spec is superglue.SPEC
     with pytest.raises(KeyError, match="superglue-indoor"):
-        superglue.load(outdoor_alone, indoor, "cpu")
+        superglue.load(outdoor_alone, indoor, Placement())
 
 
 def test_both_stages_run_with_it(matcher: superglue.SuperGlueMatcher) -> None:
@@ -101,4 +101,4 @@ def test_another_networks_checkpoint_is_refused(store: WeightStore, tmp_path: Pa
     torch.save({"weight": torch.ones(3)}, tmp_path / "sp.pth")
     swapped = WeightStore([tmp_path, *store.directories], store.files)
     with pytest.raises(UserError, match="'superpoint' do not fit the network"):
-        superglue.load(swapped, OPTIONS, "cpu")
+        superglue.load(swapped, OPTIONS, Placement())

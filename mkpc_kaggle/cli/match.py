@@ -24,7 +24,11 @@ def run(arguments: argparse.Namespace) -> int:
 
     images = to_image(arguments.image0), to_image(arguments.image1)
     matcher = TwoStageMatcher(
-        arguments.recipe, weights=arguments.weights, device=arguments.device, licence=arguments.licence
+        arguments.recipe,
+        weights=arguments.weights,
+        device=arguments.device,
+        precision=arguments.precision,
+        licence=arguments.licence,
     )
     match = matcher(*images)
     print("\n".join(" ".join(f"{value: .9e}" for value in row) for row in match.estimate.matrix))

@@ -32,6 +32,12 @@ def add_matching(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--device", default="auto", help="cpu, cuda, cuda:N, or auto (the default): a GPU if there is one"
     )
+    parser.add_argument(
+        "--precision",
+        default="float32",
+        choices=["float32", "auto", "bfloat16", "float16"],
+        help="of the networks; auto: half precision where the device is faster in it (default: float32)",
+    )
 
 
 def add_mode(parser: argparse.ArgumentParser) -> None:

@@ -52,13 +52,12 @@ def run(arguments: argparse.Namespace) -> int:
             arguments.recipe,
             weights=arguments.weights,
             device=arguments.device,
+            precision=arguments.precision,
             mode=Mode(arguments.mode),
             licence=Licence(arguments.licence),
         )
         work_dir = arguments.work_dir or output.with_name(f"{output.stem}.work")
-        print(
-            f"{len(pairs)} pairs, recipe {assembly.recipe.name}, device {assembly.device}, journal in {work_dir}"
-        )
+        print(f"{len(pairs)} pairs, recipe {assembly.recipe.name}, {assembly.placement}, journal in {work_dir}")
         session = Session(work_dir, budget, interrupt, arguments.fresh)
         report, at_rest = submit(pairs, assembly, session, output)
         print(summary(pairs, report, assembly.left_out))

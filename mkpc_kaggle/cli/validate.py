@@ -77,6 +77,7 @@ def _match_and_score(arguments: argparse.Namespace, scenes: "tuple[Scene, ...]",
             arguments.recipe,
             weights=arguments.weights,
             device=arguments.device,
+            precision=arguments.precision,
             mode=Mode(arguments.mode),
             licence=Licence(arguments.licence),
         )

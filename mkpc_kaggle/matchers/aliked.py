@@ -7,7 +7,7 @@ import torch
 from kornia.feature import ALIKED
 
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.matchers.contract import MatcherSpec, Picture
+from mkpc_kaggle.matchers.contract import MatcherSpec, Picture, Placement
 from mkpc_kaggle.matchers.neighbours import mutual_neighbours
 from mkpc_kaggle.matchers.sparse import Keypoints, image_batch, matches_of
 from mkpc_kaggle.ranges import AT_LEAST_1, SHARE, check_ranges
@@ -38,7 +38,7 @@ SPEC = MatcherSpec(
 
 
 class AlikedMatcher:
-    """A match's score is the cosine of its descriptors."""
+    """A match's score is the cosine of its descriptors. Always in float32: kornia's network knows nothing else."""
 
     spec = SPEC
 
@@ -67,8 +67,8 @@ class AlikedMatcher:
         )
 
 
-def load(weights: WeightStore, options: AlikedOptions, device: str) -> AlikedMatcher:
+def load(weights: WeightStore, options: AlikedOptions, placement: Placement) -> AlikedMatcher:
     network = ALIKED(model_name="aliked-n16", max_num_keypoints=options.features, detection_threshold=0.0)
     # The sampling grid is a computed buffer that checkpoints do not carry.
     load_into(network, weights.load(SLOT), what=SLOT, unused=r"dkd\.hw_grid")
-    return AlikedMatcher(network, options, device)
+    return AlikedMatcher(network, options, placement.device)

@@ -1,7 +1,8 @@
 """ASpanFormer (Chen et al. 2022). Its weights are for noncommercial use."""
 
-from mkpc_kaggle.matchers.contract import Colour, MatcherSpec, Training
+from mkpc_kaggle.matchers.contract import Colour, MatcherSpec, Placement, Training
 from mkpc_kaggle.matchers.networks.aspanformer import AspanFormer, AspanFormerConfig
+from mkpc_kaggle.matchers.networks.placement import placed
 from mkpc_kaggle.matchers.semi_dense import SemiDenseMatcher, SemiDenseOptions, load_network
 from mkpc_kaggle.weights import WeightStore
 
@@ -16,11 +17,11 @@ SPEC = MatcherSpec(
 )
 
 
-def load(weights: WeightStore, options: SemiDenseOptions, device: str) -> SemiDenseMatcher:
+def load(weights: WeightStore, options: SemiDenseOptions, placement: Placement) -> SemiDenseMatcher:
     network = AspanFormer(config_of(options))
     # Checkpoints hold offsets besides that the published network never reads.
     load_network(network, weights, *SPEC.slots_for(options), unused=r".*\.sample_offset$")
-    return SemiDenseMatcher(network, SPEC, device)
+    return SemiDenseMatcher(placed(network, placement), SPEC, placement.device)
 
 
 def config_of(options: SemiDenseOptions) -> AspanFormerConfig:

@@ -22,6 +22,28 @@ class Colour(StrEnum):
     GRAY = "gray"
 
 
+class Precision(StrEnum):
+    """Of a network's convolutions and linear layers, by PyTorch's names."""
+
+    FLOAT32 = "float32"
+    BFLOAT16 = "bfloat16"
+    FLOAT16 = "float16"
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Where a matcher computes, "cpu" or "cuda:0", and in which precision.
+
+    Softmax, transport, least squares and coordinates are float32 in any.
+    """
+
+    device: str = "cpu"
+    precision: Precision = Precision.FLOAT32
+
+    def __str__(self) -> str:
+        return f"device {self.device} in {self.precision}"
+
+
 class Training(StrEnum):
     """Which of a network's published weights: trained on MegaDepth's or on ScanNet's pictures."""
 
@@ -92,9 +114,9 @@ class Matcher(Protocol[Encoding]):
 
 
 class Loader(Protocol):
-    """Builds a matcher on a device ("cpu", "cuda:0") from its weights and its options."""
+    """Builds a matcher from its weights and its options."""
 
-    def __call__(self, weights: WeightStore, options: Any, device: str) -> Matcher[Any]: ...
+    def __call__(self, weights: WeightStore, options: Any, placement: Placement) -> Matcher[Any]: ...
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,9 @@ import torch
 
 from mkpc_kaggle.geometry.coordinates import Size, from_normalised
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.matchers.contract import MatcherSpec, Picture, Training
+from mkpc_kaggle.matchers.contract import MatcherSpec, Picture, Placement, Training
 from mkpc_kaggle.matchers.networks.dkm import DKM, DkmConfig, DkmFeatures, SamplingConfig, network_input, sample
+from mkpc_kaggle.matchers.networks.placement import placed
 from mkpc_kaggle.ranges import AT_LEAST_1, SHARE, Range, check_ranges
 from mkpc_kaggle.weights import WeightStore, load_into
 
@@ -59,7 +60,7 @@ class DkmMatcher:
     def __init__(self, network: DKM, options: DkmOptions, device: str) -> None:
         self.options = options
         self.device = device
-        self._network = network.to(device)
+        self._network = network
         self._sampling = SamplingConfig(options.matches, threshold=options.threshold, balanced=options.balanced)
 
     @torch.inference_mode()
@@ -102,8 +103,8 @@ class DkmMatcher:
         )
 
 
-def load(weights: WeightStore, options: DkmOptions, device: str) -> DkmMatcher:
+def load(weights: WeightStore, options: DkmOptions, placement: Placement) -> DkmMatcher:
     network = DKM(DkmConfig(options.symmetric))
     (slot,) = SPEC.slots_for(options)
     load_into(network, weights.load(slot), what=slot)
-    return DkmMatcher(network, options, device)
+    return DkmMatcher(placed(network, placement), options, placement.device)

@@ -9,7 +9,7 @@ from typing import Any
 from mkpc_kaggle import matchers
 from mkpc_kaggle.config import from_table
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.matchers.contract import Matcher, MatcherEntry, MatcherSpec, Registry
+from mkpc_kaggle.matchers.contract import Matcher, MatcherEntry, MatcherSpec, Placement, Registry
 from mkpc_kaggle.recipe import Recipe
 from mkpc_kaggle.weights import WeightStore
 
@@ -44,6 +44,6 @@ def slots_of(recipe: Recipe, names: Iterable[str]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(slots))
 
 
-def load_matcher(recipe: Recipe, name: str, weights: WeightStore, device: str) -> Matcher[Any]:
+def load_matcher(recipe: Recipe, name: str, weights: WeightStore, placement: Placement) -> Matcher[Any]:
     """The matcher, ready to run; raises :class:`UserError` where its weights are missing or damaged."""
-    return registry()[name].load(weights, options_of(recipe, name), device)
+    return registry()[name].load(weights, options_of(recipe, name), placement)

@@ -46,7 +46,7 @@ class SemiDenseMatcher:
     def __init__(self, network: SemiDenseNetwork[Any], spec: MatcherSpec, device: str) -> None:
         self.spec = spec
         self.device = device
-        self._network = network.to(device)
+        self._network = network
 
     @torch.inference_mode()
     def encode(self, pictures: Sequence[Picture]) -> list[Encoded]:

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.matchers.contract import Colour, MatcherSpec, Picture
+from mkpc_kaggle.matchers.contract import Colour, MatcherSpec, Picture, Placement
 from mkpc_kaggle.matchers.neighbours import mutual_neighbours
 from mkpc_kaggle.matchers.sparse import Keypoints, matches_of
 from mkpc_kaggle.ranges import AT_LEAST_0, AT_LEAST_1, SHARE, check_ranges
@@ -77,5 +77,5 @@ def root_sift(descriptors: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.asarray(np.sqrt(descriptors / sums), np.float32)
 
 
-def load(weights: WeightStore, options: SiftOptions, device: str) -> SiftMatcher:
-    return SiftMatcher(options, device)
+def load(weights: WeightStore, options: SiftOptions, placement: Placement) -> SiftMatcher:
+    return SiftMatcher(options, placement.device)

@@ -7,7 +7,8 @@ import torch
 
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.matchers.contract import Colour, MatcherSpec, Picture, Training
+from mkpc_kaggle.matchers.contract import Colour, MatcherSpec, Picture, Placement, Training
+from mkpc_kaggle.matchers.networks.placement import placed
 from mkpc_kaggle.matchers.networks.superglue import ImageKeypoints, SuperGlue, SuperGlueConfig
 from mkpc_kaggle.matchers.networks.superpoint import SuperPoint, SuperPointConfig, SuperPointKeypoints
 from mkpc_kaggle.matchers.sparse import image_batch
@@ -62,8 +63,8 @@ class SuperGlueMatcher:
 
     def __init__(self, superpoint: SuperPoint, superglue: SuperGlue, device: str) -> None:
         self.device = device
-        self._superpoint = superpoint.to(device)
-        self._superglue = superglue.to(device)
+        self._superpoint = superpoint
+        self._superglue = superglue
 
     def encode(self, pictures: Sequence[Picture]) -> list[Encoded]:
         if any(min(picture.content) < LEAST_SIDE for picture in pictures):
@@ -94,11 +95,11 @@ def _as_pair(encoded: Encoded) -> ImageKeypoints:
     )
 
 
-def load(weights: WeightStore, options: SuperGlueOptions, device: str) -> SuperGlueMatcher:
+def load(weights: WeightStore, options: SuperGlueOptions, placement: Placement) -> SuperGlueMatcher:
     superpoint = SuperPoint(
         SuperPointConfig(options.nms_radius, options.keypoint_threshold, options.max_keypoints)
     )
     superglue = SuperGlue(SuperGlueConfig(options.sinkhorn_iterations, options.match_threshold))
     for network, slot in zip((superpoint, superglue), SPEC.slots_for(options), strict=True):
         load_into(network, weights.load(slot), what=slot)
-    return SuperGlueMatcher(superpoint, superglue, device)
+    return SuperGlueMatcher(placed(superpoint.eval(), placement), placed(superglue, placement), placement.device)

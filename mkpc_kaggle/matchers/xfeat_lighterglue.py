@@ -9,7 +9,8 @@ from kornia.feature import LightGlue, XFeat
 from torch import Tensor
 
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.matchers.contract import MatcherSpec, Picture
+from mkpc_kaggle.matchers.contract import MatcherSpec, Picture, Placement
+from mkpc_kaggle.matchers.networks.placement import autocast
 from mkpc_kaggle.matchers.sparse import Keypoints, image_batch, matches_of
 from mkpc_kaggle.ranges import AT_LEAST_1, SHARE, check_ranges
 from mkpc_kaggle.weights import WeightStore, load_into
@@ -43,16 +44,19 @@ class XFeatLighterGlueMatcher:
 
     spec = SPEC
 
-    def __init__(self, xfeat: XFeat, glue: LightGlue, options: XFeatLighterGlueOptions, device: str) -> None:
+    def __init__(
+        self, xfeat: XFeat, glue: LightGlue, options: XFeatLighterGlueOptions, placement: Placement
+    ) -> None:
         self.options = options
-        self.device = device
-        self._xfeat = xfeat.eval().to(device)
-        self._glue = glue.eval().to(device)
+        self.placement = placement
+        self._xfeat = xfeat.eval().to(placement.device)
+        self._glue = glue.eval().to(placement.device)
 
     @torch.inference_mode()
     def encode(self, pictures: Sequence[Picture]) -> list[Keypoints]:
-        batch = image_batch(list(pictures), self.device)
-        found = self._xfeat.detectAndCompute(batch, top_k=self.options.features)
+        batch = image_batch(list(pictures), self.placement.device)
+        with autocast(self.placement):
+            found = self._xfeat.detectAndCompute(batch, top_k=self.options.features)
         return [
             Keypoints.on_content(features["keypoints"], features["descriptors"], picture.content)
             for features, picture in zip(found, pictures, strict=True)
@@ -65,7 +69,8 @@ class XFeatLighterGlueMatcher:
     def _match(self, keypoints0: Keypoints, keypoints1: Keypoints) -> Matches:
         if len(keypoints0) == 0 or len(keypoints1) == 0:
             return Matches.empty()
-        found = self._glue({"image0": _glue_input(keypoints0), "image1": _glue_input(keypoints1)})
+        with autocast(self.placement):
+            found = self._glue({"image0": _glue_input(keypoints0), "image1": _glue_input(keypoints1)})
         pairs, scores = found["matches"][0], found["scores"][0]  # (M, 2), (M,)
         return matches_of(keypoints0, keypoints1, pairs[:, 0], pairs[:, 1], scores)
 
@@ -78,7 +83,7 @@ def _glue_input(keypoints: Keypoints) -> dict[str, Tensor]:
     }
 
 
-def load(weights: WeightStore, options: XFeatLighterGlueOptions, device: str) -> XFeatLighterGlueMatcher:
+def load(weights: WeightStore, options: XFeatLighterGlueOptions, placement: Placement) -> XFeatLighterGlueMatcher:
     xfeat = XFeat(top_k=options.features)
     # Its fine matcher serves semi-dense matching only; some checkpoints are without it.
     load_into(xfeat.net, weights.load(XFEAT), unused=r"fine_matcher\.", what=XFEAT)
@@ -97,7 +102,7 @@ def load(weights: WeightStore, options: XFeatLighterGlueOptions, device: str) ->
     # Without early stopping and pruning only the last layer's assignment is used.
     early = rf"token_confidence\.|confidence_thresholds|log_assignment\.(?!{layers - 1}\.)"
     load_into(glue, tensors, unused=early, what=LIGHTERGLUE)
-    return XFeatLighterGlueMatcher(xfeat, glue, options, device)
+    return XFeatLighterGlueMatcher(xfeat, glue, options, placement)
 
 
 def layer_name(name: str) -> str:

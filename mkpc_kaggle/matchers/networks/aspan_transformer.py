@@ -25,6 +25,7 @@ from mkpc_kaggle.matchers.networks.grids import (
     pointwise,
     softmax_attention,
 )
+from mkpc_kaggle.matchers.networks.layers import ExactConv1d
 from mkpc_kaggle.matchers.networks.resnet_fpn import TOP
 
 HEADS = 8
@@ -208,7 +209,7 @@ class Block(nn.Module):
         width = TOP if last else TOP + FLOW
         self.last = last
         self.flow_decoder = Perceptron(
-            nn.Conv1d(FLOW, FLOW // 2, 1, bias=False), nn.Conv1d(FLOW // 2, 4, 1, bias=False)
+            ExactConv1d(FLOW, FLOW // 2, 1, bias=False), ExactConv1d(FLOW // 2, 4, 1, bias=False)
         )
         self.attention = HierarchicalAttention(radius)
         self.q_proj = nn.Conv1d(TOP, TOP, 1, bias=False)

@@ -44,7 +44,7 @@ class DkmConfig:
 
 @dataclass(frozen=True, eq=False)
 class Pyramid:
-    """Features of B images, (B, C, h, w) float32 each, at strides 1, 2, 4, 8 and maybe 16 and 32."""
+    """Of B images, (B, C, h, w) each, in the network's precision: at strides 1, 2, 4, 8 and maybe 16 and 32."""
 
     levels: tuple[Tensor, ...]
 
@@ -122,7 +122,8 @@ class Encoder(nn.Module):
     def forward(self, image: Tensor, coarsest: int = 32) -> Pyramid:
         """The image (B, 3, H, W) itself and its features at strides 2 to ``coarsest``."""
         image = image.contiguous(memory_format=torch.channels_last)
-        return Pyramid((image, *self.net(image, coarsest)))
+        features = self.net(image.to(self.net.conv1.weight.dtype), coarsest)
+        return Pyramid((image, *features))
 
 
 class Decoder(nn.Module):

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from mkpc_kaggle.matchers.networks.dkm_refiner import Estimate, identity_map
+from mkpc_kaggle.matchers.networks.layers import ExactConv2d
 
 STRIDES = (32, 16)
 FEATURES, POSTERIOR, WIDTH = 512, 256, 384  # channels
@@ -20,11 +21,11 @@ class GaussianProcess(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.pos_conv = nn.Conv2d(2, POSTERIOR, 1)
+        self.pos_conv = ExactConv2d(2, POSTERIOR, 1)
 
     def forward(self, query: Tensor, support: Tensor) -> Tensor:
         """Posterior mean (B, 256, h, w) of features (B, 512, h, w) and (B, 512, h', w')."""
-        x, y = query.flatten(2).mT, support.flatten(2).mT  # (B, n, 512), (B, n', 512)
+        x, y = query.float().flatten(2).mT, support.float().flatten(2).mT  # (B, n, 512), (B, n', 512)
         coordinates = self.embed_coordinates(support).flatten(2).mT  # (1, n', 256)
         mean = posterior_mean(x, y, coordinates)  # (B, n, 256)
         return mean.mT.reshape(len(query), POSTERIOR, *query.shape[2:])
@@ -58,16 +59,17 @@ class EmbeddingDecoder(nn.Module):
         self.rrb_d = nn.ModuleDict({str(s): ResidualRefinement(256 + POSTERIOR) for s in STRIDES})
         self.cab = nn.ModuleDict({str(s): ChannelAttention() for s in STRIDES})
         self.rrb_u = nn.ModuleDict({str(s): ResidualRefinement(WIDTH) for s in STRIDES})
-        self.terminal_module = nn.ModuleDict({str(s): nn.Conv2d(WIDTH, 3, 1) for s in STRIDES})
+        self.terminal_module = nn.ModuleDict({str(s): ExactConv2d(WIDTH, 3, 1) for s in STRIDES})
 
     def forward(
         self, stride: int, posterior: Tensor, features: Tensor, context: Tensor
     ) -> tuple[Estimate, Tensor]:
         """Maps (B, 256, h, w), (B, 512, h, w) and (B, 384, h, w) -> the estimate and the next context."""
         at = str(stride)
-        embedded = torch.cat([self.feat_input_modules[at](features), posterior], dim=1)  # (B, 512, h, w)
+        own = self.feat_input_modules[at](features)
+        embedded = torch.cat([own, posterior.to(own.dtype)], dim=1)  # (B, 512, h, w)
         context = self.rrb_u[at](self.cab[at](context, self.rrb_d[at](embedded)))
-        found = self.terminal_module[at](context)  # (B, 3, h, w)
+        found = self.terminal_module[at](context.float())  # (B, 3, h, w)
         return Estimate(found[:, 1:], found[:, :1]), context
 
 

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mkpc_kaggle.matchers.networks.grids import as_grid, as_map
+from mkpc_kaggle.matchers.networks.layers import ExactConv2d
 
 HIDDEN_BLOCKS = 8
 
@@ -60,8 +61,8 @@ class Refiner(nn.Module):
         self.radius = shape.radius
         self.block1 = block(shape.inputs, shape.hidden)
         self.hidden_blocks = nn.Sequential(*(block(shape.hidden, shape.hidden) for _ in range(HIDDEN_BLOCKS)))
-        self.out_conv = nn.Conv2d(shape.hidden, 3, 1)
-        self.disp_emb = nn.Conv2d(2, shape.embedding, 1)
+        self.out_conv = ExactConv2d(shape.hidden, 3, 1)
+        self.disp_emb = ExactConv2d(2, shape.embedding, 1)
 
     def forward(self, query: Tensor, support: Tensor, flow: Tensor) -> Tensor:
         """Corrections (B, 3, h, w) of features (B, C, h, w) and (B, C, h', w') and a flow (B, 2, h, w).
@@ -73,17 +74,19 @@ class Refiner(nn.Module):
         for depthwise, norm, _, mix in (self.block1, *self.hidden_blocks):
             # One name for all: no more than two maps are alive at a time.
             x = by_rows(mix, torch.relu_(norm(depthwise(x))))
-        corrections: Tensor = self.out_conv(x)
+        corrections: Tensor = self.out_conv(x.float())
         return corrections
 
     def _look(self, query: Tensor, support: Tensor, flow: Tensor) -> Tensor:
         seen = functional.grid_sample(
-            support, as_grid(flow), mode="bilinear", padding_mode="zeros", align_corners=False
+            support.float(), as_grid(flow), mode="bilinear", padding_mode="zeros", align_corners=False
         )
         parts = [query, seen, self.disp_emb(flow - identity_map(flow))]
         if self.radius is not None:
             parts.append(local_correlation(query, support, flow, self.radius))
-        return torch.cat(parts, dim=1).contiguous(memory_format=torch.channels_last)
+        precision = self.block1.get_parameter("0.weight").dtype
+        looks = torch.cat([part.to(precision) for part in parts], dim=1)
+        return looks.contiguous(memory_format=torch.channels_last)
 
 
 def block(inputs: int, outputs: int) -> nn.Sequential:
@@ -135,7 +138,8 @@ def local_correlation(query: Tensor, support: Tensor, flow: Tensor, radius: int)
     image = torch.arange(batch, device=flow.device).repeat_interleave(pixels)[:, None] * height
     index = ((image + rows.clamp(0, height - 1)) * width)[:, :, None] + columns.clamp(0, width - 1)[:, None]
 
-    products = _products(as_grid(query).flatten(0, 2), as_grid(support).flatten(0, 2), index.flatten(1))
+    queries, keys = (as_grid(features.float()).flatten(0, 2) for features in (query, support))
+    products = _products(queries, keys, index.flatten(1))
     products = products.view_as(index).masked_fill_(outside, 0)
     products = torch.lerp(products[:, :-1], products[:, 1:], fraction_y)
     products = torch.lerp(products[..., :-1], products[..., 1:], fraction_x)  # (P, 2 r + 1, 2 r + 1)

@@ -33,6 +33,18 @@ class Linear(nn.Linear):
         return linear(x, self.weight, self.bias)
 
 
+class Exact:
+    """Marks layers whose results are coordinates: they stay in float32 whatever the network's precision."""
+
+
+class ExactConv1d(Exact, nn.Conv1d):
+    pass
+
+
+class ExactConv2d(Exact, nn.Conv2d):
+    pass
+
+
 def attention(q: Tensor, k: Tensor, v: Tensor, precision: torch.dtype) -> Tensor:
     """softmax(q k^T / sqrt(D)) v of (B, heads, L, D) and (B, heads, S, D) twice -> (B, heads, L, D), like ``q``.
 

@@ -7,23 +7,27 @@ import torch
 from torch import nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
+from mkpc_kaggle.matchers.contract import Placement, Precision
+from mkpc_kaggle.matchers.networks.layers import Exact
+
 Network = TypeVar("Network", bound=nn.Module)
 
 Norm = nn.BatchNorm1d | nn.BatchNorm2d
 Layer = nn.Linear | nn.Conv1d | nn.Conv2d
 
 
-def placed(network: Network, device: str = "cpu", precision: torch.dtype = torch.float32) -> Network:
-    """The network, changed in place. After it no checkpoint loads any more.
+def placed(network: Network, placement: Placement) -> Network:
+    """The network, changed in place: after it no checkpoint loads any more.
 
-    In half precision are the weights of convolutions and linear layers, and so the maps between convolutions; all
-    else (what transformers add up, softmax, transport, coordinates) stays float32.
+    The weights of convolutions and linear layers, :class:`Exact` ones apart, get the placement's precision, and
+    with them the maps between convolutions. All else stays float32: what transformers add up, softmax, transport,
+    coordinates.
     """
     fold_norms(network)
     for layer in network.modules():
-        if isinstance(layer, Layer):
-            layer.to(precision)
-    return network.to(device)
+        if isinstance(layer, Layer) and not isinstance(layer, Exact):
+            layer.to(dtype_of(placement))
+    return network.to(placement.device)
 
 
 def fold_norms(network: nn.Module) -> None:
@@ -35,3 +39,14 @@ def fold_norms(network: nn.Module) -> None:
                 precision = conv.weight.dtype
                 setattr(parent, conv_name, fuse_conv_bn_eval(conv.double(), norm.double()).to(precision))
                 setattr(parent, norm_name, nn.Identity())
+
+
+def autocast(placement: Placement) -> torch.autocast:
+    """For networks that are not ours: PyTorch decides what runs in half precision."""
+    enabled = placement.precision is not Precision.FLOAT32
+    return torch.autocast(torch.device(placement.device).type, dtype_of(placement), enabled)
+
+
+def dtype_of(placement: Placement) -> torch.dtype:
+    dtype: torch.dtype = getattr(torch, placement.precision)
+    return dtype
