@@ -81,8 +81,7 @@ def assemble(
     wanted = load_recipe(recipe) if isinstance(recipe, str) else recipe
     for name in {*wanted.matcher_names, *wanted.matchers} - own.keys():
         options_of(wanted, name)
-    refused = {name: licences_of(wanted, name, store, own) - PERMISSIVE_TAGS for name in wanted.matcher_names}
-    refused = {name: tags for name, tags in refused.items() if tags and licence is Licence.PERMISSIVE}
+    refused = restricted(wanted, store, own) if licence is Licence.PERMISSIVE else {}
     if refused and recipe != AUTO:
         weights_of = ", ".join(f"{name} ({', '.join(sorted(tags))})" for name, tags in refused.items())
         raise UserError(
@@ -110,6 +109,12 @@ def missing_slots(recipe: Recipe, store: WeightStore, own: Container[str] = ()) 
 def not_own(names: Iterable[str], own: Container[str]) -> list[str]:
     """The names but those of the user's own matchers, which bring their weights along."""
     return [name for name in names if name not in own]
+
+
+def restricted(recipe: Recipe, store: WeightStore, own: Mapping[str, Matcher[Any]]) -> dict[str, set[str]]:
+    """The recipe's matchers whose weights are not all permissively licensed, with the licences that are not."""
+    tags = {name: licences_of(recipe, name, store, own) - PERMISSIVE_TAGS for name in recipe.matcher_names}
+    return {name: others for name, others in tags.items() if others}
 
 
 def licences_of(recipe: Recipe, name: str, store: WeightStore, own: Mapping[str, Matcher[Any]]) -> set[str]:
