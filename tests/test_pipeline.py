@@ -12,7 +12,6 @@ from numpy.testing import assert_allclose
 from shared import WEIGHTS, needs_weights
 from sklearn.datasets import load_sample_image
 
-from mkpc_kaggle import weights as weights_module
 from mkpc_kaggle.assembly import assemble
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Box, Size
@@ -24,6 +23,7 @@ from mkpc_kaggle.matchers.sift import SiftMatcher, SiftOptions
 from mkpc_kaggle.pipeline import PairWork, Pipeline, finish
 from mkpc_kaggle.recipe import Mode, Recipe, Unit, load_recipe
 from mkpc_kaggle.two_stage import TwoStageMatcher
+from mkpc_kaggle.weights import store as weight_store
 
 SIZE = Size(480, 360)
 CORNER0, CORNER1, SCALE = (60, 130), (170, 50), 1.2
@@ -42,7 +42,7 @@ TWO_STAGES = Recipe((Unit(1, "sift", 480), Unit(2, "sift", 440)))
 def nowhere_else(monkeypatch, tmp_path):
     """Weights are searched only where a test says."""
     monkeypatch.delenv("MKPC_WEIGHTS", raising=False)
-    monkeypatch.setattr(weights_module, "KAGGLE_INPUT", tmp_path / "no kaggle")
+    monkeypatch.setattr(weight_store, "KAGGLE_INPUT", tmp_path / "no kaggle")
 
 
 @cache
