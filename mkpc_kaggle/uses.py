@@ -1,0 +1,36 @@
+"""What weight files are for: the matchers and recipes that use them, and the files that a name stands for."""
+
+from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.matchers.registry import registry, slots_of
+from mkpc_kaggle.recipe import load_recipe, recipe_names
+from mkpc_kaggle.weights import WeightFile, WeightStore
+
+
+def matchers_with(slot: str) -> list[str]:
+    """The matchers that take the slot's weights."""
+    return [name for name, entry in registry().items() if slot in entry.spec.slots]
+
+
+def recipes_with(slot: str) -> list[str]:
+    """The recipes that have a unit of such a matcher."""
+    matchers = set(matchers_with(slot))
+    return [name for name in recipe_names() if matchers & set(load_recipe(name).matcher_names)]
+
+
+def files_of(name: str, store: WeightStore) -> list[list[WeightFile]]:
+    """What a file's, a slot's or a recipe's name stands for: a list of files that will do for each slot.
+
+    Raises :class:`UserError` with the known names for an unknown one.
+    """
+    if any(file.name == name for file in store.files):
+        return [[file for file in store.files if file.name == name]]
+    slots = list(dict.fromkeys(file.slot for file in store.files))
+    if name in slots:
+        return [store.alternatives(name)]
+    if name in recipe_names() or name.endswith(".toml"):
+        recipe = load_recipe(name)
+        return [store.alternatives(slot) for slot in slots_of(recipe.matcher_names)]
+    raise UserError(
+        f"{name!r} is no file of the manifest (python -m mkpc_kaggle weights list names them), no slot "
+        f"({', '.join(slots)}) and no recipe ({', '.join(recipe_names())})"
+    )
