@@ -14,6 +14,8 @@ from typing import Any
 
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from safetensors.torch import save_file
 from torch import nn
 from weight_files import put
@@ -316,6 +318,23 @@ def test_a_tensor_lies_within_its_storage(tmp_path: Path) -> None:
     for wrong in ((6, 7, 1, 0), (6, 6, 1, 1), (6, 2, 1, -1), (6, 2, -1, 5), (7, 1, 1, 0), (1 << 30, 1, 1, 0)):
         with pytest.raises(UserError, match=r"x\.pt cannot be read as a checkpoint"):
             load_tensors(with_pickle(path, tensor_pickle(*wrong)))
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.lists(st.tuples(st.integers(0, 10_000), st.integers(0, 255)), min_size=1, max_size=3))
+def test_a_damaged_pickle_gives_tensors_or_a_refusal(
+    tmp_path_factory: pytest.TempPathFactory, changes: list[tuple[int, int]]
+) -> None:
+    data = bytearray(tensor_pickle(6, 2, 3, 1))
+    for place, byte in changes:
+        data[place % len(data)] = byte
+    path = with_pickle(tmp_path_factory.mktemp("fuzz") / "x.pt", bytes(data))
+    try:
+        loaded = load_tensors(path)
+    except UserError as refusal:
+        assert "x.pt cannot be read as a checkpoint" in str(refusal)
+    else:
+        assert all(isinstance(tensor, torch.Tensor) for tensor in loaded.values())
 
 
 def test_a_script_archive_is_refused(tmp_path: Path) -> None:

@@ -36,9 +36,9 @@ class WeightStore:
             if not directory.is_dir():
                 raise UserError(f"--weights {directory}: no such directory")
         environment = [Path(part) for part in os.environ.get("MKPC_WEIGHTS", "").split(os.pathsep) if part]
-        self.directories = given + [place for place in [*environment, KAGGLE_INPUT] if place.is_dir()]
+        self.directories = given + environment + ([KAGGLE_INPUT] if KAGGLE_INPUT.is_dir() else [])
         self.files = manifest() if files is None else tuple(files)
-        self._trees = [Tree(directory) for directory in dict.fromkeys(self.directories)]
+        self._trees = [Tree(place) for place in dict.fromkeys(self.directories) if place.is_dir()]
         self._searches: dict[tuple[WeightFile, ...], Search] = {}
 
     def alternatives(self, slot: str) -> list[WeightFile]:
