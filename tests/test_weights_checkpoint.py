@@ -85,6 +85,12 @@ def test_what_is_no_tensor_with_a_name_is_named(tmp_path: Path, save: Save) -> N
         load_tensors(tmp_path / "x.pt")
 
 
+@pytest.mark.parametrize("save", [save_zip, save_legacy])
+def test_parameters_come_as_plain_tensors(tmp_path: Path, save: Save) -> None:
+    save({"a": nn.Parameter(torch.ones(2)), "b": torch.ones(3, requires_grad=True)}, tmp_path / "x.pt")
+    assert_same(load_tensors(tmp_path / "x.pt"), {"a": torch.ones(2), "b": torch.ones(3)})
+
+
 # training checkpoints
 
 
@@ -175,6 +181,13 @@ def test_unknown_objects_among_the_tensors_are_named(tmp_path: Path, framework: 
         load_tensors(tmp_path / "x.ckpt")
 
 
+def test_a_tensor_that_is_not_as_it_is_stored_is_refused(tmp_path: Path, framework: types.ModuleType) -> None:
+    torch.save(training_checkpoint(framework, {"a": torch.tensor([1 + 2j]).conj()}), tmp_path / "x.ckpt")
+    sys.modules.pop("training_framework")
+    with pytest.raises(UserError, match=r"x\.ckpt .* a tensor of a kind that is not read here"):
+        load_tensors(tmp_path / "x.ckpt")
+
+
 def test_the_old_format_with_unknown_classes_is_refused(tmp_path: Path, framework: types.ModuleType) -> None:
     save_legacy(training_checkpoint(framework, TENSORS), tmp_path / "x.ckpt")
     sys.modules.pop("training_framework")
@@ -249,12 +262,12 @@ def test_the_bombs_of_these_tests_would_go_off(tmp_path: Path) -> None:
         sentinel.rmdir() if sentinel.is_dir() else sentinel.unlink()
 
 
-def with_pickle(path: Path, data: bytes) -> Path:
+def with_pickle(path: Path, data: bytes, compression: int = zipfile.ZIP_STORED) -> Path:
     """A checkpoint as torch writes it, its pickle replaced."""
     torch.save(TENSORS, path)
     with zipfile.ZipFile(path) as archive:
         records = {name: archive.read(name) for name in archive.namelist()}
-    with zipfile.ZipFile(path, "w") as archive:
+    with zipfile.ZipFile(path, "w", compression) as archive:
         for name, record in records.items():
             archive.writestr(name, data if name.endswith("/data.pkl") else record)
     return path
@@ -315,9 +328,23 @@ def test_a_tensor_lies_within_its_storage(tmp_path: Path) -> None:
     path = tmp_path / "x.pt"
     good = load_tensors(with_pickle(path, tensor_pickle(6, 2, 3, 1)))
     assert good["a"].tolist() == [1, 4]
-    for wrong in ((6, 7, 1, 0), (6, 6, 1, 1), (6, 2, 1, -1), (6, 2, -1, 5), (7, 1, 1, 0), (1 << 30, 1, 1, 0)):
+    for wrong in (
+        (6, 7, 1, 0),
+        (6, 6, 1, 1),
+        (6, 2, 1, -1),
+        (6, 2, -1, 5),
+        (7, 1, 1, 0),
+        (5, 1, 1, 0),
+        (1 << 30, 1, 1, 0),
+    ):
         with pytest.raises(UserError, match=r"x\.pt cannot be read as a checkpoint"):
             load_tensors(with_pickle(path, tensor_pickle(*wrong)))
+
+
+def test_compressed_records_are_refused(tmp_path: Path) -> None:
+    path = with_pickle(tmp_path / "x.pt", tensor_pickle(6, 2, 3, 1), zipfile.ZIP_DEFLATED)
+    with pytest.raises(UserError, match=r"x\.pt cannot be read .* record \w+ is compressed"):
+        load_tensors(path)
 
 
 @settings(max_examples=200, deadline=None)

@@ -200,6 +200,13 @@ def test_another_file_of_the_manifest_under_the_wrong_name_is_called_by_its_own(
     assert found_by(weights, "other").name == "a.bin"
 
 
+def test_an_alternative_under_the_name_of_another_is_taken_without_complaint(tmp_path: Path) -> None:
+    put(tmp_path, "a.bin", OTHER)
+    found = WeightStore([tmp_path], [line("a.bin"), line("b.bin", OTHER)]).find("slot")
+    assert found is not None
+    assert (found.file.name, found.path.name, found.state) == ("b.bin", "a.bin", State.RENAMED)
+
+
 @pytest.mark.parametrize("second", ["two/a.bin", "two/b.bin", "two/renamed.bin"])
 def test_after_a_bad_file_the_search_goes_on(tmp_path: Path, second: str) -> None:
     put(tmp_path / "one", "a.bin", DATA[:-1])

@@ -183,9 +183,7 @@ class _Reader:
             raise ValueError(f"record {record} has not the {size} bytes that it should have")
         flat = torch.empty(storage.items, dtype=dtype)
         with self._open(record) as stream:
-            count = stream.readinto(flat.view(torch.uint8).numpy())  # type: ignore[attr-defined]
-        if count != size:
-            raise ValueError(f"record {record} is cut off")
+            stream.readinto(flat.view(torch.uint8).numpy())  # type: ignore[attr-defined]
         return flat
 
     def _read(self, record: str) -> bytes:
@@ -193,6 +191,7 @@ class _Reader:
             return stream.read()
 
     def _open(self, record: str) -> IO[bytes]:
-        if self._archive.getinfo(self._root + record).compress_type != zipfile.ZIP_STORED:
+        info = self._archive.getinfo(self._root + record)
+        if info.compress_type != zipfile.ZIP_STORED or info.compress_size != info.file_size:
             raise ValueError(f"record {record} is compressed, which torch never does")
-        return self._archive.open(self._root + record)
+        return self._archive.open(info)

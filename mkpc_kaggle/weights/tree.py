@@ -42,8 +42,7 @@ class Tree:
     def files(self) -> tuple[Path, ...]:
         """All files in order of their paths, pictures apart: a competition's input has thousands of those."""
         found: list[Path] = []
-        for folder, folders, names in os.walk(self.root, onerror=_pass_over):
-            folders.sort()
+        for folder, _, names in os.walk(self.root, onerror=_pass_over):
             found += [Path(folder, name) for name in names if Path(name).suffix.lower() not in PICTURES]
         return tuple(sorted(found))
 
