@@ -12,19 +12,19 @@ from numpy.testing import assert_allclose
 from shared import WEIGHTS, needs_weights
 from sklearn.datasets import load_sample_image
 
-from mkpc_kaggle import weights as weights_module
 from mkpc_kaggle.assembly import Licence, assemble
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Box, Size
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL, Model
 from mkpc_kaggle.images import Image
-from mkpc_kaggle.matchers.contract import Colour, MatcherSpec
+from mkpc_kaggle.matchers.contract import Colour, MatcherSpec, Placement
 from mkpc_kaggle.matchers.sift import SiftMatcher, SiftOptions
 from mkpc_kaggle.pipeline import PairWork, Pipeline, finish
 from mkpc_kaggle.recipe import Mode, Recipe, Unit, load_recipe
 from mkpc_kaggle.two_stage import TwoStageMatcher
-from mkpc_kaggle.weights import WeightFile
+from mkpc_kaggle.weights import UNVERIFIED, WeightFile, manifest
+from mkpc_kaggle.weights import store as weight_store
 
 SIZE = Size(480, 360)
 CORNER0, CORNER1, SCALE = (60, 130), (170, 50), 1.2
@@ -43,7 +43,7 @@ TWO_STAGES = Recipe((Unit(1, "sift", 480), Unit(2, "sift", 440)))
 def nowhere_else(monkeypatch, tmp_path):
     """Weights are searched only where a test says."""
     monkeypatch.delenv("MKPC_WEIGHTS", raising=False)
-    monkeypatch.setattr(weights_module, "KAGGLE_INPUT", tmp_path / "no kaggle")
+    monkeypatch.setattr(weight_store, "KAGGLE_INPUT", tmp_path / "no kaggle")
 
 
 @cache
@@ -459,9 +459,7 @@ def standins(directory, *names):
     """A search directory with files of these names, and a manifest that knows them by slot and licence."""
     for name, _, _ in names:
         (directory / name).write_bytes(name.encode())
-    return [
-        WeightFile(name, -1, weights_module.UNVERIFIED, licence, slot, "here") for name, slot, licence in names
-    ]
+    return [WeightFile(name, -1, UNVERIFIED, licence, slot, "here") for name, slot, licence in names]
 
 
 SUPERGLUE = (
@@ -475,8 +473,8 @@ PERMITTED = (("loftr.ckpt", "loftr-outdoor", "Apache-2.0"), ("dkm.pth", "dkm-out
 def known_files(monkeypatch, tmp_path):
     """SuperGlue's, LoFTR's and DKM's weights are there, DKM's also for indoors, of unclear terms."""
     files = standins(tmp_path, *SUPERGLUE, *PERMITTED, ("dkm_in.pth", "dkm-indoor", "unclear"))
-    others = [file for file in weights_module.manifest() if file.slot not in {known.slot for known in files}]
-    monkeypatch.setattr(weights_module, "manifest", lambda: (*files, *others))
+    others = [file for file in manifest() if file.slot not in {known.slot for known in files}]
+    monkeypatch.setattr(weight_store, "manifest", lambda: (*files, *others))
     return tmp_path
 
 

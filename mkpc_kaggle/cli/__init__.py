@@ -12,7 +12,7 @@ from typing import TextIO
 from mkpc_kaggle import __version__
 from mkpc_kaggle.errors import UserError
 
-COMMANDS = ("submit", "match", "validate", "recipes", "check", "demo")
+COMMANDS = ("submit", "match", "validate", "recipes", "weights", "check", "demo")
 EXIT_BAD_INPUT = 2
 
 _DESCRIPTION = """\
@@ -22,6 +22,7 @@ Two-stage image matching with Matching Key-Points Crop, offline, inside a time b
   match     two images -> F, counts, a figure
   validate  a directory with known poses -> mAA and pose AUC of a recipe
   recipes   the recipes, their units, and the weights that each lacks
+  weights   the weight files: list, verify, locate, fetch, convert
   check     is this submission.csv what the competition takes?
   demo      render a small test set with known poses
 

@@ -79,6 +79,12 @@ class MatcherSpec:
         """The slots of the manifest that a matcher with these options is loaded from."""
         return tuple(slot.format_map(vars(options)) for slot in self.slots)
 
+    @property
+    def every_slot(self) -> tuple[str, ...]:
+        """The slots of all trainings."""
+        slots = (slot.format_map({"training": training}) for training in Training for slot in self.slots)
+        return tuple(dict.fromkeys(slots))
+
 
 @dataclass(frozen=True, eq=False)
 class Picture:

@@ -1,0 +1,21 @@
+"""Weight files: the manifest that lists them, finding, checking, loading, downloading and converting them.
+
+Importing this package imports no torch.
+"""
+
+from mkpc_kaggle.weights.checkpoint import load_into, load_tensors
+from mkpc_kaggle.weights.found import FoundFile, State
+from mkpc_kaggle.weights.manifest import UNVERIFIED, WeightFile, manifest, parse_manifest
+from mkpc_kaggle.weights.store import WeightStore
+
+__all__ = [
+    "UNVERIFIED",
+    "FoundFile",
+    "State",
+    "WeightFile",
+    "WeightStore",
+    "load_into",
+    "load_tensors",
+    "manifest",
+    "parse_manifest",
+]

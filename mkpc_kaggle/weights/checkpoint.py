@@ -1,0 +1,84 @@
+"""Tensors from a checkpoint file, none of whose code is run, and from there into a network."""
+
+import re
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.weights.inert import load_inert
+
+if TYPE_CHECKING:
+    import torch
+    from torch import nn
+
+
+def load_tensors(path: Path) -> "dict[str, torch.Tensor]":
+    """Tensors by name, on the CPU, from a safetensors file or a torch checkpoint; nothing in the file is executed.
+
+    A training checkpoint keeps them under ``state_dict``; what lies beside them there is left out. Raises
+    :class:`UserError` for a file that cannot be read, or whose table of tensors holds anything else.
+    """
+    import torch
+
+    try:
+        table = _load_table(path)
+    except Exception as error:
+        raise UserError(f"{path} cannot be read as a checkpoint: {error}") from error
+    odd = [
+        str(name)
+        for name, value in table.items()
+        if not isinstance(name, str) or not isinstance(value, torch.Tensor)
+    ]
+    if odd:
+        raise UserError(
+            f"{path} cannot be read as a checkpoint: not all of its entries are tensors with a name: "
+            f"{', '.join(odd[:5])}. Save the network's state_dict alone."
+        )
+    return {name: tensor.detach() for name, tensor in table.items()}
+
+
+def load_into(
+    network: "nn.Module", tensors: "Mapping[str, torch.Tensor]", *, what: str, unused: str = "$^"
+) -> None:
+    """Load a checkpoint into a network: every name and every shape must agree.
+
+    Only entries whose names match the pattern ``unused`` may be missing or surplus. Raises
+    :class:`UserError` naming some of those that do not fit.
+    """
+    own = network.state_dict()
+    odd = [name for name in own.keys() ^ tensors.keys() if not re.match(unused, name)]
+    odd += [name for name in own.keys() & tensors.keys() if own[name].shape != tensors[name].shape]
+    if odd:
+        raise UserError(f"the weights for {what!r} do not fit the network: {', '.join(sorted(odd)[:5])}")
+    network.load_state_dict({**own, **{name: tensor for name, tensor in tensors.items() if name in own}})
+
+
+def _load_table(path: Path) -> Mapping[Any, Any]:
+    if path.suffix == ".safetensors":
+        from safetensors.torch import load_file
+
+        return load_file(path)
+    import torch
+
+    try:
+        return _state_dict(torch.load(path, map_location="cpu", weights_only=True))
+    except OSError:
+        raise
+    except Exception as refusal:
+        if zipfile.is_zipfile(path):
+            return load_inert(path, _state_dict)
+        # torch's own words would advise to load it unsafely.
+        raise ValueError(
+            "it is none, or holds more than tensors in torch's old format; of that format only plain state dicts "
+            "are read"
+        ) from refusal
+
+
+def _state_dict(contents: object) -> Mapping[Any, Any]:
+    """The table of tensors in what a file holds."""
+    table = contents.get("state_dict", contents) if isinstance(contents, dict) else contents
+    if not isinstance(table, dict):
+        raise ValueError("it holds no table of tensors by name")
+    return table

@@ -1,0 +1,40 @@
+"""Any checkpoint that can be read, as safetensors with the same names."""
+
+from pathlib import Path
+
+from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.weights.checkpoint import load_tensors
+from mkpc_kaggle.weights.digests import file_digests
+from mkpc_kaggle.weights.manifest import UNVERIFIED, WeightFile, manifest
+
+
+def convert(source: Path, target: Path) -> WeightFile:
+    """Write the tensors of ``source`` into ``target``, each a contiguous copy; gives the manifest's line for it.
+
+    Raises :class:`UserError` for a source that cannot be read, and a target that cannot be written or whose name
+    does not end in ``.safetensors``.
+    """
+    if target.suffix != ".safetensors":
+        raise UserError(f"--out {target}: the name must end in .safetensors")
+    tensors = load_tensors(source)
+    from safetensors import SafetensorError
+    from safetensors.torch import save_file
+
+    partial = target.with_name(f"{target.name}.part")
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        # safetensors takes no views and no two tensors that share their bytes.
+        save_file({name: tensor.contiguous().clone() for name, tensor in tensors.items()}, partial)
+        partial.replace(target)
+    except (OSError, SafetensorError) as error:
+        raise UserError(f"{target} cannot be written: {error}") from error
+    return _line(source, target)
+
+
+def _line(source: Path, target: Path) -> WeightFile:
+    made, origin = file_digests(target), file_digests(source)
+    known = next((file for file in manifest() if origin.have(file.digest)), None) or next(
+        (file for file in manifest() if (file.name, file.digest) == (source.name, UNVERIFIED)), None
+    )
+    licence, slot, name = (known.licence, known.slot, known.name) if known else ("?", "?", source.name)
+    return WeightFile(target.name, made.size, made.sha256, licence, slot, f"{name} with the same tensor names")

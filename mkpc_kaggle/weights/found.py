@@ -1,0 +1,80 @@
+"""A file on this machine held against its line of the manifest."""
+
+import stat
+from collections.abc import Iterable
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+
+from mkpc_kaggle.weights.digests import Digests, file_digests
+from mkpc_kaggle.weights.manifest import UNVERIFIED, WeightFile
+from mkpc_kaggle.weights.notices import warn_once
+
+
+class State(StrEnum):
+    """What a file's bytes say of it."""
+
+    GOOD = "good"
+    RENAMED = "renamed"
+    """another name, but the bytes of a file of the manifest: as good"""
+    UNVERIFIED = "unverified"
+    """the manifest has no digest for it"""
+    TRUNCATED = "truncated"
+    SWAPPED = "another file"
+    """the right name, other bytes"""
+    UNREADABLE = "unreadable"
+
+    @property
+    def usable(self) -> bool:
+        return self in (State.GOOD, State.RENAMED, State.UNVERIFIED)
+
+
+@dataclass(frozen=True)
+class FoundFile:
+    """``digest`` is ``sha256:<hex>`` of the bytes, empty for an unreadable file; ``note`` explains the state."""
+
+    file: WeightFile
+    path: Path
+    state: State
+    digest: str
+    note: str = ""
+
+
+def examine(path: Path, file: WeightFile, files: Iterable[WeightFile]) -> FoundFile:
+    """What the file at ``path``, which bears the name of ``file``, really is; ``files`` are all that are known."""
+    try:
+        if not stat.S_ISREG(path.stat().st_mode):
+            return FoundFile(file, path, State.UNREADABLE, "", "no regular file")
+        digests = file_digests(path)
+    except OSError as error:
+        return FoundFile(file, path, State.UNREADABLE, "", f"cannot be read: {error.strerror}")
+    state, note = _judge(digests, file, files)
+    return FoundFile(file, path, state, digests.sha256, note)
+
+
+def recognise(path: Path, file: WeightFile) -> FoundFile | None:
+    """The file at ``path``, whatever its name, if it has the digest of ``file``."""
+    try:
+        digests = file_digests(path)
+    except OSError as error:
+        warn_once(f"{path} cannot be read, so it is not known what it is: {error.strerror}")
+        return None
+    if not digests.have(file.digest):
+        return None
+    state = State.GOOD if path.name == file.name else State.RENAMED
+    return FoundFile(file, path, state, digests.sha256, "" if state is State.GOOD else f"it is {file.name}")
+
+
+def _judge(digests: Digests, file: WeightFile, files: Iterable[WeightFile]) -> tuple[State, str]:
+    if digests.have(file.digest):
+        return State.GOOD, ""
+    for other in files:
+        if digests.have(other.digest):
+            return State.SWAPPED, f"its bytes are those of {other.name}"
+    if 0 <= file.size != digests.size:
+        state = State.TRUNCATED if digests.size < file.size else State.SWAPPED
+        return state, f"{digests.size} bytes, the manifest says {file.size}: truncated, or another file"
+    if file.digest == UNVERIFIED:
+        return State.UNVERIFIED, f"the manifest has no digest for it; this file's is {digests.sha256}"
+    own = digests.sha256 if file.digest.startswith("sha256:") else digests.git_blob
+    return State.SWAPPED, f"its digest is {own}, the manifest says {file.digest}: damaged, or another file"

@@ -1,0 +1,74 @@
+"""The weights manifest: every file that a matcher can use.
+
+``weights_manifest.txt`` has one line a file, columns split by blanks, ``#`` starts a comment::
+
+    name  bytes  digest  licence  slot  source
+
+``bytes`` is a number or ``?``. ``digest`` is ``sha256:<64 hex>``, or ``git-blob:<40 hex>`` (what ``git
+hash-object`` gives), or ``unverified``. A *slot* is what a matcher asks for; lines of one slot are alternatives,
+the first that is found is taken.
+"""
+
+import re
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+from mkpc_kaggle.errors import UserError
+
+UNVERIFIED = "unverified"
+DIGEST = re.compile(rf"sha256:[0-9a-f]{{64}}|git-blob:[0-9a-f]{{40}}|{UNVERIFIED}")
+
+
+@dataclass(frozen=True)
+class WeightFile:
+    """One line of the manifest; ``size`` in bytes, -1 where it is not known."""
+
+    name: str
+    size: int
+    digest: str
+    licence: str
+    slot: str
+    source: str
+
+    @property
+    def line(self) -> str:
+        """The line as the manifest has it."""
+        size = "?" if self.size < 0 else str(self.size)
+        return "  ".join((self.name, size, self.digest, self.licence, self.slot, self.source))
+
+
+def parse_manifest(text: str, where: str = "the weights manifest") -> tuple[WeightFile, ...]:
+    """All lines of a manifest; raises :class:`UserError` naming the line that cannot be read."""
+    files = []
+    for number, line in enumerate(text.splitlines(), start=1):
+        columns = line.partition("#")[0].split(maxsplit=5)
+        if columns:
+            files.append(_parse_line(columns, f"{where}, line {number}"))
+    return tuple(files)
+
+
+def _parse_line(columns: list[str], where: str) -> WeightFile:
+    if len(columns) != 6:
+        raise UserError(f"{where}: expected 6 columns, found {len(columns)}")
+    name, size, digest, licence, slot, source = columns
+    if Path(name).name != name or name.startswith("."):
+        raise UserError(f"{where}: {name!r} is not a plain file name")
+    if size != "?" and not (size.isascii() and size.isdigit()):
+        raise UserError(f"{where}: bytes must be a number or '?', not {size!r}")
+    if not DIGEST.fullmatch(digest):
+        raise UserError(
+            f"{where}: digest must be 'sha256:' with 64 hexadecimal digits, 'git-blob:' with 40, or "
+            f"'{UNVERIFIED}', not {digest!r}"
+        )
+    return WeightFile(name, -1 if size == "?" else int(size), digest, licence, slot, source.strip())
+
+
+@cache
+def manifest() -> tuple[WeightFile, ...]:
+    """The manifest that came with the package (in a wheel: inside it; in a checkout: beside it)."""
+    package = Path(__file__).resolve().parents[1]
+    for path in (package / "weights_manifest.txt", package.parent / "weights_manifest.txt"):
+        if path.is_file():
+            return parse_manifest(path.read_text(encoding="utf-8"), str(path))
+    raise UserError(f"weights_manifest.txt is missing from {package}: install the package again")

@@ -1,0 +1,81 @@
+"""A directory that is searched for weights: its files by name, and those that may be one under another name."""
+
+import os
+import stat
+from collections.abc import Iterator
+from functools import cached_property
+from pathlib import Path
+
+from mkpc_kaggle.weights.notices import warn_once
+
+PICTURES = frozenset({".jpg", ".jpeg", ".png"})
+CHECKPOINTS = frozenset({".pth", ".pt", ".ckpt", ".safetensors", ".bin", ".pkl", ""})
+LARGEST_OF_UNKNOWN_SIZE = 1 << 28
+"""Bytes. The files whose size nobody published have some 50 MB; bigger ones need not be read to tell."""
+
+
+class Tree:
+    """A directory and all below it, walked once, when that is first needed.
+
+    Links to files count, links to directories are not followed: they may lead back, or out. What cannot be
+    read is passed over with a warning.
+    """
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+
+    def named(self, name: str) -> Iterator[Path]:
+        """Files of this name: first in the directory itself, since a walk of /kaggle/input costs seconds."""
+        direct = self.root / name
+        if _is_entry(direct):
+            yield direct
+        yield from (path for path in self._by_name.get(name, ()) if path != direct)
+
+    def candidates(self, size: int) -> Iterator[Path]:
+        """Files that may be one of ``size`` bytes under another name; where that is -1, small checkpoints."""
+        for path, its_size in self._sizes.items():
+            likely = path.suffix.lower() in CHECKPOINTS and its_size <= LARGEST_OF_UNKNOWN_SIZE
+            if its_size == size or (size < 0 and likely):
+                yield path
+
+    @cached_property
+    def files(self) -> tuple[Path, ...]:
+        """All files in order of their paths, pictures apart: a competition's input has thousands of those."""
+        found: list[Path] = []
+        for folder, _, names in os.walk(self.root, onerror=_pass_over):
+            found += [Path(folder, name) for name in names if Path(name).suffix.lower() not in PICTURES]
+        return tuple(sorted(found))
+
+    @cached_property
+    def _by_name(self) -> dict[str, list[Path]]:
+        named: dict[str, list[Path]] = {}
+        for path in self.files:
+            named.setdefault(path.name, []).append(path)
+        return named
+
+    @cached_property
+    def _sizes(self) -> dict[Path, int]:
+        """Bytes of each file that is one: no pipe, no broken link."""
+        sizes = {}
+        for path in self.files:
+            try:
+                status = path.stat()
+            except OSError as error:
+                _pass_over(error)
+                continue
+            if stat.S_ISREG(status.st_mode):
+                sizes[path] = status.st_size
+        return sizes
+
+
+def _is_entry(path: Path) -> bool:
+    """Is there something that is no directory? Broken links count, so that they are told of."""
+    try:
+        path.lstat()
+        return not path.is_dir()
+    except OSError:
+        return False
+
+
+def _pass_over(error: OSError) -> None:
+    warn_once(f"{error.filename} cannot be read, so it is not searched for weights: {error.strerror}")

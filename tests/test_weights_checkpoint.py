@@ -1,0 +1,372 @@
+"""Tensors come out of every kind of checkpoint, and nothing in it runs."""
+
+import contextlib
+import operator
+import os
+import pickle
+import sys
+import types
+import zipfile
+from collections import OrderedDict
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from safetensors.torch import save_file
+from torch import nn
+from weight_files import put
+
+from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.weights import load_tensors
+
+TENSORS = {"a.weight": torch.arange(6.0).reshape(2, 3), "a.count": torch.tensor(7), "b": torch.zeros(0)}
+Save = Callable[[Any, Path], None]
+
+
+def save_zip(value: object, path: Path) -> None:
+    torch.save(value, path)
+
+
+def save_legacy(value: object, path: Path) -> None:
+    torch.save(value, path, _use_new_zipfile_serialization=False)
+
+
+def save_pickle(value: object, path: Path) -> None:
+    path.write_bytes(pickle.dumps(value, protocol=2))
+
+
+def assert_same(loaded: dict[str, torch.Tensor], wanted: dict[str, torch.Tensor]) -> None:
+    assert list(loaded) == list(wanted)
+    for name, tensor in wanted.items():
+        assert loaded[name].dtype == tensor.dtype
+        assert loaded[name].stride() == tensor.stride()
+        assert not loaded[name].requires_grad
+        assert torch.equal(loaded[name], tensor)
+
+
+# formats
+
+
+@pytest.mark.parametrize("save", [save_zip, save_legacy, save_file])
+@pytest.mark.parametrize("wrap", [False, True])
+def test_every_file_format_gives_the_same_tensors(tmp_path: Path, save: Save, wrap: bool) -> None:
+    safetensors = save is save_file
+    path = tmp_path / ("x.safetensors" if safetensors else "x.pt")
+    save({"state_dict": TENSORS, "epoch": 3} if wrap and not safetensors else TENSORS, path)
+    loaded = load_tensors(path)
+    assert loaded.keys() == TENSORS.keys()
+    assert_same({name: loaded[name] for name in TENSORS}, TENSORS)
+
+
+@pytest.mark.parametrize("name", ["x.pt", "x.safetensors"])
+@pytest.mark.parametrize("data", [b"", b"no checkpoint", b"\0" * 100])
+def test_a_file_that_is_no_checkpoint_is_refused_by_name(tmp_path: Path, name: str, data: bytes) -> None:
+    put(tmp_path, name, data)
+    with pytest.raises(UserError, match=rf"{name} cannot be read as a checkpoint"):
+        load_tensors(tmp_path / name)
+
+
+@pytest.mark.parametrize("save", [save_zip, save_legacy])
+@pytest.mark.parametrize("value", [torch.zeros(3), [torch.zeros(3)], {"state_dict": 3}])
+def test_a_checkpoint_without_a_table_of_tensors_is_refused(tmp_path: Path, value: object, save: Save) -> None:
+    save(value, tmp_path / "x.pt")
+    with pytest.raises(UserError, match=r"x\.pt cannot be read as a checkpoint: .*"):
+        load_tensors(tmp_path / "x.pt")
+
+
+@pytest.mark.parametrize("save", [save_zip, save_legacy])
+def test_what_is_no_tensor_with_a_name_is_named(tmp_path: Path, save: Save) -> None:
+    save({"a": torch.zeros(1), "epoch": 3, 7: torch.zeros(1)}, tmp_path / "x.pt")
+    with pytest.raises(UserError, match=r"not all of its entries are tensors with a name: epoch, 7\."):
+        load_tensors(tmp_path / "x.pt")
+
+
+@pytest.mark.parametrize("save", [save_zip, save_legacy])
+def test_parameters_come_as_plain_tensors(tmp_path: Path, save: Save) -> None:
+    save({"a": nn.Parameter(torch.ones(2)), "b": torch.ones(3, requires_grad=True)}, tmp_path / "x.pt")
+    assert_same(load_tensors(tmp_path / "x.pt"), {"a": torch.ones(2), "b": torch.ones(3)})
+
+
+# training checkpoints
+
+
+@pytest.fixture
+def framework() -> Iterator[types.ModuleType]:
+    """A training framework that is gone once the checkpoint is written."""
+    module = types.ModuleType("training_framework")
+    source = (
+        "class Config(dict):\n"
+        "    pass\n"
+        "class Stack(list):\n"
+        "    pass\n"
+        "class Checkpoint:\n"
+        "    def __init__(self):\n"
+        "        self.best, self.kind = {'score': 0.5}, Config(lr=Config(base=1e-3))\n"
+        "    def __setstate__(self, state):\n"
+        "        raise SystemError('this must not run')\n"
+        "class Slotted:\n"
+        "    __slots__ = ('x',)\n"
+        "    def __init__(self):\n"
+        "        self.x = 1\n"
+        "def schedule(epoch):\n"
+        "    return epoch\n"
+    )
+    exec(source, module.__dict__)
+    sys.modules["training_framework"] = module
+    yield module
+    sys.modules.pop("training_framework", None)
+
+
+def training_checkpoint(framework: types.ModuleType, state: dict[str, torch.Tensor]) -> dict[str, Any]:
+    return {
+        "epoch": 3,
+        "pytorch-lightning_version": "1.3.5",
+        "callbacks": {framework.Checkpoint: framework.Checkpoint(), "sizes": {1, 2}, "z": 1 + 2j, "b": b"x"},
+        "optimizer_states": [{"state": {0: {"step": 3, "mean": torch.ones(2)}}}],
+        "hyper_parameters": framework.Config(a=framework.Stack([1, 2]), b=framework.schedule),
+        "misc": [framework.Slotted(), torch.float32, torch.Size([2]), torch.device("cpu"), Path("/x")],
+        "state_dict": state,
+    }
+
+
+def test_a_training_checkpoint_with_unknown_classes_gives_its_tensors(
+    tmp_path: Path, framework: types.ModuleType
+) -> None:
+    torch.manual_seed(0)
+    base = torch.randn(4, 6)
+    network = nn.Sequential(nn.Linear(3, 2), nn.BatchNorm1d(2))
+    state: dict[str, torch.Tensor] = OrderedDict(
+        {f"matcher.{name}": tensor for name, tensor in network.state_dict().items()}
+    )
+    state |= {
+        "matcher.shared": base,
+        "matcher.rows": base[1:3],
+        "matcher.columns": base.t(),
+        "matcher.strided": base[::2, 1::3],
+        "matcher.parameter": nn.Parameter(torch.randn(3)),
+        "matcher.scalar": torch.tensor(3.5, dtype=torch.float64),
+        "matcher.empty": torch.zeros(0, 3),
+        "matcher.complex": torch.tensor([1 + 2j]),
+    }
+    for dtype in (torch.bfloat16, torch.float16, torch.int64, torch.int32, torch.uint8, torch.bool):
+        state[f"matcher.{dtype}"] = torch.tensor([[0, 1, 1], [1, 0, 0]]).to(dtype)
+    assert hasattr(network.state_dict(), "_metadata")
+    torch.save(training_checkpoint(framework, state), tmp_path / "x.ckpt")
+    sys.modules.pop("training_framework")
+    with pytest.raises(pickle.UnpicklingError):
+        torch.load(tmp_path / "x.ckpt", weights_only=True)
+    loaded = load_tensors(tmp_path / "x.ckpt")
+    assert_same(loaded, {name: tensor.detach() for name, tensor in state.items()})
+    assert loaded["matcher.shared"].untyped_storage().data_ptr() == (
+        loaded["matcher.columns"].untyped_storage().data_ptr()
+    )
+
+
+@pytest.mark.parametrize("protocol", [2, 3, 4, 5])
+def test_any_pickle_protocol_will_do(tmp_path: Path, framework: types.ModuleType, protocol: int) -> None:
+    torch.save(training_checkpoint(framework, TENSORS), tmp_path / "x.ckpt", pickle_protocol=protocol)
+    sys.modules.pop("training_framework")
+    assert_same(load_tensors(tmp_path / "x.ckpt"), TENSORS)
+
+
+def test_unknown_objects_among_the_tensors_are_named(tmp_path: Path, framework: types.ModuleType) -> None:
+    state = {"a": torch.zeros(1), "odd": framework.Slotted()}
+    torch.save(training_checkpoint(framework, state), tmp_path / "x.ckpt")
+    sys.modules.pop("training_framework")
+    with pytest.raises(UserError, match=r"x\.ckpt .* tensors with a name: odd\."):
+        load_tensors(tmp_path / "x.ckpt")
+
+
+def test_a_tensor_that_is_not_as_it_is_stored_is_refused(tmp_path: Path, framework: types.ModuleType) -> None:
+    torch.save(training_checkpoint(framework, {"a": torch.tensor([1 + 2j]).conj()}), tmp_path / "x.ckpt")
+    sys.modules.pop("training_framework")
+    with pytest.raises(UserError, match=r"x\.ckpt .* a tensor of a kind that is not read here"):
+        load_tensors(tmp_path / "x.ckpt")
+
+
+def test_the_old_format_with_unknown_classes_is_refused(tmp_path: Path, framework: types.ModuleType) -> None:
+    save_legacy(training_checkpoint(framework, TENSORS), tmp_path / "x.ckpt")
+    sys.modules.pop("training_framework")
+    with pytest.raises(UserError, match=r"x\.ckpt .* more than tensors in torch's old format"):
+        load_tensors(tmp_path / "x.ckpt")
+
+
+# malice
+
+
+class Call:
+    """Pickled, it is a call of any function."""
+
+    def __init__(self, function: Callable[..., Any], *arguments: Any, state: Any = None) -> None:
+        self.reduced = (function, arguments) if state is None else (function, arguments, state)
+
+    def __reduce__(self) -> Any:
+        return self.reduced
+
+
+def nasty(sentinel: Path) -> dict[str, object]:
+    """Calls that would make the sentinel file, by what they go through."""
+    command = f"touch {sentinel}"
+    python = f"__import__('pathlib').Path({str(sentinel)!r}).touch()"
+    hidden = sentinel.with_name("hidden.pt")
+    hidden.write_bytes(pickle.dumps(Call(os.system, command), protocol=2))
+    sentinel.with_name("hubconf.py").write_text(python)
+    return {
+        "os.system": Call(os.system, command),
+        "builtins.eval": Call(eval, python),
+        "builtins.exec": Call(exec, python),
+        "os.mkdir": Call(os.mkdir, str(sentinel)),
+        "builtins.getattr": Call(operator.call, Call(getattr, Call(__import__, "os"), "system"), command),
+        "torch.load": Call(torch.load, str(hidden), "cpu", Call(__import__, "pickle")),
+        "torch.hub": Call(torch.hub._load_local, str(sentinel.parent), "f"),
+        "torch.save": Call(torch.save, 1, str(sentinel)),
+        "pickle.loads": Call(pickle.loads, pickle.dumps(Call(os.system, command))),
+        "state": Call(types.SimpleNamespace, state={"x": Call(os.system, command)}),
+        "OrderedDict": Call(OrderedDict, [("x", Call(os.system, command))]),
+        "rebuild": Call(torch._utils._rebuild_parameter, Call(os.system, command), False, OrderedDict()),
+    }
+
+
+PLACES: dict[str, Callable[[object], object]] = {
+    "top": lambda bomb: bomb,
+    "state_dict": lambda bomb: {"state_dict": {**TENSORS, "bomb": bomb}},
+    "hyper_parameters": lambda bomb: {"state_dict": TENSORS, "hyper_parameters": {"x": [bomb]}},
+    "key": lambda bomb: {"state_dict": TENSORS, "callbacks": [{(1, 2): bomb}]},
+}
+
+
+@pytest.mark.parametrize("place", PLACES)
+@pytest.mark.parametrize("save", [save_zip, save_legacy, save_pickle])
+def test_a_malicious_pickle_runs_nothing(tmp_path: Path, place: str, save: Save) -> None:
+    sentinel = tmp_path / "sentinel"
+    for name, bomb in nasty(sentinel).items():
+        path = tmp_path / f"{name}.pt"
+        save(PLACES[place](bomb), path)
+        try:
+            assert_same(load_tensors(path), TENSORS)
+        except UserError as refusal:
+            assert path.name in str(refusal)
+        assert not sentinel.exists(), name
+
+
+def test_the_bombs_of_these_tests_would_go_off(tmp_path: Path) -> None:
+    sentinel = tmp_path / "sentinel"
+    for name, bomb in nasty(sentinel).items():
+        with contextlib.suppress(Exception):  # some fail after they have run
+            pickle.loads(pickle.dumps(bomb, protocol=2))
+        assert sentinel.exists(), name
+        sentinel.rmdir() if sentinel.is_dir() else sentinel.unlink()
+
+
+def with_pickle(path: Path, data: bytes, compression: int = zipfile.ZIP_STORED) -> Path:
+    """A checkpoint as torch writes it, its pickle replaced."""
+    torch.save(TENSORS, path)
+    with zipfile.ZipFile(path) as archive:
+        records = {name: archive.read(name) for name in archive.namelist()}
+    with zipfile.ZipFile(path, "w", compression) as archive:
+        for name, record in records.items():
+            archive.writestr(name, data if name.endswith("/data.pkl") else record)
+    return path
+
+
+BUILD_ON = {
+    "a function": b"ctorch._utils\n_rebuild_tensor_v2\n",
+    "a table's class": b"ccollections\nOrderedDict\n",
+    "a table": b"ccollections\nOrderedDict\n)R",
+    "a storage type": b"ctorch\nFloatStorage\n",
+    "an unknown class": b"cunknown\nThing\n",
+    "an unknown object": b"cunknown\nThing\n)R",
+}
+
+
+@pytest.mark.parametrize("target", BUILD_ON)
+@pytest.mark.parametrize("state", [b"}X\x01\0\0\0xK\x01s", b"N}X\x01\0\0\0xK\x01s\x86", b"}X\x04\0\0\0keysNs"])
+def test_a_pickle_cannot_change_what_it_is_given(tmp_path: Path, target: str, state: bytes) -> None:
+    from mkpc_kaggle.weights import inert
+
+    before = [repr(sorted(vars(one))) for one in (inert.Inert, inert.Table)]
+    path = with_pickle(tmp_path / "x.pt", b"\x80\x02}X\x01\0\0\0a" + BUILD_ON[target] + state + b"bs.")
+    with pytest.raises(UserError, match=r"x\.pt cannot be read as a checkpoint"):
+        load_tensors(path)
+    assert [repr(sorted(vars(one))) for one in (inert.Inert, inert.Table)] == before
+    assert not any(hasattr(value, "x") for value in inert.KNOWN.values())
+
+
+@pytest.mark.parametrize(
+    "data",
+    {
+        "getattr on what is given": b"\x80\x02cbuiltins\ngetattr\nctorch._utils\n_rebuild_tensor_v2\n"
+        b"X\x09\0\0\0__class__\x86R.",
+        "an old class": b"\x80\x02(X\x01\0\0\0xios\nsystem\n.",
+        "a dotted name": b"\x80\x04X\x05\0\0\0torchX\x12\0\0\0serialization.loadb\x93.",
+        "another persistent id": b"\x80\x02X\x06\0\0\0moduleQ.",
+        "a foreign storage": b"\x80\x02(X\x07\0\0\0storageX\x05\0\0\0floatX\x01\0\0\x000X\x03\0\0\0cpuK\x06tQ.",
+        "cut off": b"\x80\x02}X\x01\0\0\0a",
+        "nothing": b"",
+    }.values(),
+)
+def test_a_pickle_made_by_hand_is_refused(tmp_path: Path, data: bytes) -> None:
+    with pytest.raises(UserError, match=r"x\.pt cannot be read as a checkpoint"):
+        load_tensors(with_pickle(tmp_path / "x.pt", data))
+
+
+def tensor_pickle(items: int, shape: int, stride: int, offset: int) -> bytes:
+    """A state dict of one float32 tensor on the first storage, with an unknown object beside it."""
+    numbers = [b"J" + number.to_bytes(4, "little", signed=True) for number in (items, offset, shape, stride)]
+    return (
+        b"\x80\x02}(X\x0a\0\0\0state_dict}X\x01\0\0\0actorch._utils\n_rebuild_tensor_v2\n("
+        b"(X\x07\0\0\0storagectorch\nFloatStorage\nX\x01\0\0\x000X\x03\0\0\0cpu" + numbers[0] + b"tQ"
+        b"" + numbers[1] + numbers[2] + b"\x85" + numbers[3] + b"\x85\x89NtRsX\x01\0\0\0xcunknown\nThing\nu."
+    )
+
+
+def test_a_tensor_lies_within_its_storage(tmp_path: Path) -> None:
+    path = tmp_path / "x.pt"
+    good = load_tensors(with_pickle(path, tensor_pickle(6, 2, 3, 1)))
+    assert good["a"].tolist() == [1, 4]
+    for wrong in (
+        (6, 7, 1, 0),
+        (6, 6, 1, 1),
+        (6, 2, 1, -1),
+        (6, 2, -1, 5),
+        (7, 1, 1, 0),
+        (5, 1, 1, 0),
+        (1 << 30, 1, 1, 0),
+    ):
+        with pytest.raises(UserError, match=r"x\.pt cannot be read as a checkpoint"):
+            load_tensors(with_pickle(path, tensor_pickle(*wrong)))
+
+
+def test_compressed_records_are_refused(tmp_path: Path) -> None:
+    path = with_pickle(tmp_path / "x.pt", tensor_pickle(6, 2, 3, 1), zipfile.ZIP_DEFLATED)
+    with pytest.raises(UserError, match=r"x\.pt cannot be read .* record \w+ is compressed"):
+        load_tensors(path)
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.lists(st.tuples(st.integers(0, 10_000), st.integers(0, 255)), min_size=1, max_size=3))
+def test_a_damaged_pickle_gives_tensors_or_a_refusal(
+    tmp_path_factory: pytest.TempPathFactory, changes: list[tuple[int, int]]
+) -> None:
+    data = bytearray(tensor_pickle(6, 2, 3, 1))
+    for place, byte in changes:
+        data[place % len(data)] = byte
+    path = with_pickle(tmp_path_factory.mktemp("fuzz") / "x.pt", bytes(data))
+    try:
+        loaded = load_tensors(path)
+    except UserError as refusal:
+        assert "x.pt cannot be read as a checkpoint" in str(refusal)
+    else:
+        assert all(isinstance(tensor, torch.Tensor) for tensor in loaded.values())
+
+
+def test_a_script_archive_is_refused(tmp_path: Path) -> None:
+    path = with_pickle(tmp_path / "x.pt", pickle.dumps(3, protocol=2))
+    with zipfile.ZipFile(path, "a") as archive:
+        archive.writestr("x/constants.pkl", pickle.dumps((), protocol=2))
+    with pytest.raises(UserError, match=r"x\.pt cannot be read as a checkpoint"):
+        load_tensors(path)

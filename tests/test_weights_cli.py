@@ -1,0 +1,146 @@
+"""``python -m mkpc_kaggle weights``: what it prints and the status it ends with."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from shared import WEIGHTS, needs_weights
+from web import Site, serve
+from weight_files import DATA, OTHER, line, put, search_nowhere_else
+
+from mkpc_kaggle.cli import main
+from mkpc_kaggle.weights import UNVERIFIED, WeightFile, manifest, store
+
+FILES = (
+    line("sift.pt", slot="sift"),
+    line("a.pt", OTHER, slot="aliked-n16"),
+    line("b.pt", b"more", slot="aliked-n16", size=-1, digest=UNVERIFIED),
+    line("lost.pt", b"lost", slot="superpoint"),
+)
+
+
+@pytest.fixture(autouse=True)
+def own_manifest(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    search_nowhere_else(monkeypatch, tmp_path)
+    monkeypatch.setattr(store, "manifest", lambda: FILES)
+
+
+@pytest.fixture
+def weights(tmp_path: Path) -> Path:
+    return put(put(tmp_path / "weights", "sift.pt"), "renamed.pt", OTHER)
+
+
+def test_list_says_what_is_there_and_what_the_missing_would_enable(
+    weights: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["weights", "list", "--weights", str(weights)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[1].split() == ["sift.pt", "21", "MIT", "sift", "-", str(weights / "sift.pt")]
+    assert lines[2].split() == ["a.pt", "21", "MIT", "aliked-n16", "aliked", str(weights / "renamed.pt")]
+    assert lines[3].split() == ["b.pt", "?", "MIT", "aliked-n16", "aliked", "missing"]
+    assert lines[5].startswith("missing: superpoint (lost.pt), for matcher superglue")
+    assert "recipe yfcc" in lines[5]
+    assert len(lines) == 6
+
+
+def test_list_knows_every_file_of_the_real_manifest(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(store, "manifest", manifest)
+    assert main(["weights", "list"]) == 0
+    out = capsys.readouterr().out
+    assert all(file.name in out for file in manifest())
+
+
+def test_verify_is_content_with_renamed_and_unverified_files(
+    weights: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    put(weights, "b.pt")
+    (weights / "b.pt").write_bytes(b"what may be it")
+    assert main(["weights", "verify", "--weights", str(weights)]) == 0
+    out = capsys.readouterr().out
+    assert "3 files, 0 wrong" in out
+    assert "it is a.pt" in out
+    assert "unverified" in out
+
+
+def test_verify_finds_truncated_and_swapped_files(weights: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    put(weights, "lost.pt", b"los")
+    put(weights, "a.pt", DATA)
+    assert main(["weights", "verify", "--weights", str(weights)]) == 1
+    rows = {
+        row.split()[0]: row for row in capsys.readouterr().out.splitlines() if str(weights / row.split()[0]) in row
+    }
+    assert "truncated" in rows["lost.pt"]
+    assert rows["a.pt"].endswith("its bytes are those of sift.pt")
+
+
+def test_verify_of_nothing_says_where_it_looked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["weights", "verify", "--weights", str(tmp_path)]) == 0
+    assert capsys.readouterr().out == f"no weight files found (searched {tmp_path})\n"
+
+
+def test_locate_prints_the_path_alone(weights: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    put(weights, "a.pt", DATA)
+    for name in ("aliked-n16", "a.pt"):
+        assert main(["weights", "locate", name, "--weights", str(weights)]) == 0
+        captured = capsys.readouterr()
+        assert captured.out == f"{weights / 'renamed.pt'}\n"
+        assert "its bytes are those of sift.pt" in captured.err
+    assert main(["weights", "locate", "superpoint", "--weights", str(weights)]) == 1
+    captured = capsys.readouterr()
+    assert (captured.out, captured.err) == ("", f"superpoint: not found (searched {weights})\n")
+    assert main(["weights", "locate", "x", "--weights", str(weights)]) == 2
+    assert "slot (sift, aliked-n16, superpoint)" in capsys.readouterr().err
+
+
+def test_fetch_takes_files_slots_and_recipes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recipe = tmp_path / "own.toml"
+    recipe.write_text('units = [{stage = 1, matcher = "aliked", long_side = 320}]')
+    monkeypatch.setenv("no_proxy", "127.0.0.1")
+    with serve(Site(DATA)) as site:
+        web: tuple[WeightFile, ...] = (
+            replace(FILES[0], source=site.url),
+            replace(FILES[1], source="by hand"),
+            replace(FILES[2], source=site.url),
+        )
+        monkeypatch.setattr(store, "manifest", lambda: web)
+        assert main(["weights", "fetch", "sift.pt", "sift", str(recipe), "--out", str(tmp_path / "out")]) == 0
+        out = capsys.readouterr().out
+        assert len(site.asked) == 2
+        assert main(["weights", "fetch", "a.pt", "sift", "--out", str(tmp_path / "out")]) == 1
+        assert len(site.asked) == 2
+    assert f"sift.pt: licence MIT, from {site.url}\nsift.pt: fetched\n" in out
+    assert "b.pt: fetched: not verified" in out
+    again = capsys.readouterr().out
+    assert f"a.pt: by hand: get it from by hand and save it as {tmp_path / 'out' / 'a.pt'}" in again
+    assert "sift.pt: already there\n" in again
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["b.pt", "sift.pt"]
+
+
+def test_convert_prints_the_line_for_the_manifest(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    torch.save({"a": torch.zeros(2)}, tmp_path / "x.pt")
+    assert main(["weights", "convert", str(tmp_path / "x.pt"), "--out", str(tmp_path / "x.safetensors")]) == 0
+    size = (tmp_path / "x.safetensors").stat().st_size
+    assert capsys.readouterr().out.startswith(f"x.safetensors  {size}  sha256:")
+    assert main(["weights", "convert", str(tmp_path / "x.pt"), "--out", str(tmp_path / "x.pt")]) == 2
+
+
+@needs_weights
+def test_the_shared_checkpoints_are_good(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(store, "manifest", manifest)
+    assert main(["weights", "verify", "--weights", str(WEIGHTS)]) == 0
+    assert "3 files, 0 wrong" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("action", ["list", "verify", "locate", "fetch", "convert"])
+def test_every_action_has_a_help(action: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as left:
+        main(["weights", action, "--help"])
+    assert left.value.code == 0
+    assert len(capsys.readouterr().out.splitlines()) >= 6

@@ -1,0 +1,57 @@
+"""Checkpoints as safetensors."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from weight_files import digest_of
+
+from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.weights import convert as module
+from mkpc_kaggle.weights import load_tensors
+from mkpc_kaggle.weights.convert import convert
+from mkpc_kaggle.weights.manifest import UNVERIFIED, WeightFile
+
+
+def test_every_tensor_comes_through_whatever_it_shares(tmp_path: Path) -> None:
+    base = torch.arange(12.0).reshape(3, 4)
+    tensors = {
+        "net.base": base,
+        "net.turned": base.t(),
+        "net.same": base,
+        "net.half": torch.tensor(0.5, dtype=torch.bfloat16),
+        "net.count": torch.tensor([3]),
+    }
+    torch.save({"state_dict": tensors, "epoch": 3}, tmp_path / "x.ckpt")
+    line = convert(tmp_path / "x.ckpt", tmp_path / "new" / "x.safetensors")
+    data = (tmp_path / "new" / "x.safetensors").read_bytes()
+    assert (line.name, line.size, line.digest) == ("x.safetensors", len(data), digest_of(data))
+    assert (line.licence, line.slot, line.source) == ("?", "?", "x.ckpt with the same tensor names")
+    loaded = load_tensors(tmp_path / "new" / "x.safetensors")
+    assert loaded.keys() == tensors.keys()
+    assert all(torch.equal(loaded[name], tensor) for name, tensor in tensors.items())
+    assert [path.name for path in (tmp_path / "new").iterdir()] == ["x.safetensors"]
+
+
+def test_the_line_takes_over_what_the_manifest_knows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    torch.save({"a": torch.zeros(1)}, tmp_path / "x.pt")
+    digest = digest_of((tmp_path / "x.pt").read_bytes())
+    by_digest = WeightFile("known.pt", -1, digest, "MIT", "slot", "web")
+    by_name = WeightFile("x.pt", -1, UNVERIFIED, "BSD", "other", "web")
+    another = WeightFile("x.pt", -1, digest_of(b""), "BSD", "other", "web")
+    told = []
+    for files in ([by_name, by_digest], [by_name], [another]):
+        monkeypatch.setattr(module, "manifest", lambda files=files: files)
+        line = convert(tmp_path / "x.pt", tmp_path / "x.safetensors")
+        told.append((line.licence, line.slot, line.source.split()[0]))
+    assert told == [("MIT", "slot", "known.pt"), ("BSD", "other", "x.pt"), ("?", "?", "x.pt")]
+
+
+def test_what_cannot_be_converted_is_told(tmp_path: Path) -> None:
+    torch.save({"a": torch.zeros(1)}, tmp_path / "x.pt")
+    with pytest.raises(UserError, match=r"x\.bin: the name must end in \.safetensors"):
+        convert(tmp_path / "x.pt", tmp_path / "x.bin")
+    with pytest.raises(UserError, match=r"gone\.pt cannot be read"):
+        convert(tmp_path / "gone.pt", tmp_path / "x.safetensors")
+    with pytest.raises(UserError, match=r"x\.safetensors cannot be written"):
+        convert(tmp_path / "x.pt", tmp_path / "x.pt" / "x.safetensors")

@@ -1,0 +1,243 @@
+"""Downloads against a local server: whole, broken off, resumed, wrong, impossible."""
+
+import shutil
+from collections.abc import Iterator
+from dataclasses import replace
+from io import BytesIO
+from pathlib import Path
+from urllib.request import Request
+
+import pytest
+from web import Site, serve
+from weight_files import DATA, digest_of, line, put
+
+from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.weights import UNVERIFIED, WeightFile, fetch
+from mkpc_kaggle.weights.fetch import ATTEMPTS, BLOCK, Fetched, Outcome, choose, url_of
+
+BIG = bytes(range(256)) * 1000
+CUT = 100_000
+
+
+@pytest.fixture
+def site(monkeypatch: pytest.MonkeyPatch) -> Iterator[Site]:
+    monkeypatch.setenv("no_proxy", "127.0.0.1")
+    with serve(Site(BIG)) as site:
+        yield site
+
+
+class Pauses(list[float]):
+    """Takes the pauses between attempts and lets none pass."""
+
+    def __call__(self, seconds: float) -> None:
+        self.append(seconds)
+
+
+def get(site: Site, directory: Path, file: WeightFile | None = None, pauses: Pauses | None = None) -> Fetched:
+    wanted = replace(file or line(data=BIG), source=f"{site.url} (renamed)")
+    return fetch.fetch(wanted, directory, wait=Pauses() if pauses is None else pauses)
+
+
+def names_in(directory: Path) -> list[str]:
+    return sorted(path.name for path in directory.iterdir())
+
+
+def test_a_file_comes_whole_into_a_new_directory(site: Site, tmp_path: Path) -> None:
+    fetched = get(site, tmp_path / "new" / "weights")
+    assert (fetched.outcome, fetched.note) == (Outcome.FETCHED, "")
+    assert fetched.path.read_bytes() == BIG
+    assert names_in(fetched.path.parent) == ["a.bin"]
+
+
+def test_a_broken_connection_is_taken_up_where_it_broke(site: Site, tmp_path: Path) -> None:
+    site.breaks = [CUT, 5]
+    pauses = Pauses()
+    assert get(site, tmp_path, pauses=pauses).outcome is Outcome.FETCHED
+    assert (tmp_path / "a.bin").read_bytes() == BIG
+    assert site.asked == ["", f"bytes={CUT}-", f"bytes={CUT + 5}-"]
+    assert site.sent == len(BIG)
+    assert pauses == [1, 2]
+
+
+def test_another_call_goes_on_where_the_last_one_gave_up(site: Site, tmp_path: Path) -> None:
+    site.breaks = [CUT] + [0] * (ATTEMPTS - 1)
+    pauses = Pauses()
+    failed = get(site, tmp_path, pauses=pauses)
+    assert failed.outcome is Outcome.FAILED
+    assert f"failed {ATTEMPTS} times" in failed.note
+    assert f"{CUT} of {len(BIG)} bytes" in failed.note
+    assert (len(site.asked), pauses) == (ATTEMPTS, [1, 2, 4, 8])
+    assert names_in(tmp_path) == ["a.bin.part", "a.bin.part.mark"]
+    assert get(site, tmp_path).outcome is Outcome.FETCHED
+    assert (tmp_path / "a.bin").read_bytes() == BIG
+    assert site.sent == len(BIG)
+    assert names_in(tmp_path) == ["a.bin"]
+
+
+@pytest.mark.parametrize("digest", [UNVERIFIED, None])
+def test_a_file_that_changed_meanwhile_is_taken_anew(site: Site, tmp_path: Path, digest: str | None) -> None:
+    site.breaks = [CUT] + [0] * (ATTEMPTS - 1)
+    old = bytes(len(BIG))
+    site.data, site.tag = old, '"old"'
+    get(site, tmp_path, line(data=old, size=-1, digest=digest))
+    site.data, site.tag = BIG, '"new"'
+    assert get(site, tmp_path, line(data=BIG, size=-1, digest=digest)).outcome is Outcome.FETCHED
+    assert site.asked[-1] == f"bytes={CUT}-"
+    assert (tmp_path / "a.bin").read_bytes() == BIG
+
+
+def test_a_server_that_knows_no_ranges_sends_all_again(site: Site, tmp_path: Path) -> None:
+    site.ranges, site.breaks = False, [CUT]
+    assert get(site, tmp_path).outcome is Outcome.FETCHED
+    assert (tmp_path / "a.bin").read_bytes() == BIG
+    assert site.sent == CUT + len(BIG)
+
+
+def test_bytes_that_nobody_can_vouch_for_are_not_gone_on_with(site: Site, tmp_path: Path) -> None:
+    site.tag, site.breaks = "", [CUT]
+    assert get(site, tmp_path, line(data=BIG, digest=UNVERIFIED)).outcome is Outcome.FETCHED
+    assert site.asked == ["", ""]
+    assert (tmp_path / "a.bin").read_bytes() == BIG
+
+
+def test_another_part_than_was_asked_for_is_not_taken(site: Site, tmp_path: Path) -> None:
+    site.breaks, site.shift = [CUT], 7
+    assert get(site, tmp_path).outcome is Outcome.FETCHED
+    assert site.asked == ["", f"bytes={CUT}-", ""]
+    assert (tmp_path / "a.bin").read_bytes() == BIG
+
+
+@pytest.mark.parametrize("size", [-1, len(BIG)])
+def test_a_part_that_is_whole_only_lacks_its_name(site: Site, tmp_path: Path, size: int) -> None:
+    put(tmp_path, "a.bin.part", BIG)
+    assert get(site, tmp_path, line(data=BIG, size=size)).outcome is Outcome.FETCHED
+    assert (site.sent, names_in(tmp_path)) == (0, ["a.bin"])
+
+
+@pytest.mark.parametrize("size", [-1, len(BIG)])
+def test_a_part_that_is_too_long_is_dropped(site: Site, tmp_path: Path, size: int) -> None:
+    put(tmp_path, "a.bin.part", BIG + b"!")
+    assert get(site, tmp_path, line(data=BIG, size=size)).outcome is Outcome.FETCHED
+    assert (tmp_path / "a.bin").read_bytes() == BIG
+
+
+def test_a_wrong_digest_gives_no_name_and_leaves_nothing(site: Site, tmp_path: Path) -> None:
+    wanted = bytes(len(BIG))
+    failed = get(site, tmp_path, line(data=wanted))
+    assert failed.outcome is Outcome.FAILED
+    assert digest_of(BIG) in failed.note
+    assert digest_of(wanted) in failed.note
+    assert names_in(tmp_path) == []
+
+
+@pytest.mark.parametrize("length", [len(BIG) + 1, len(BIG) - 1])
+def test_a_server_that_has_another_size_is_refused_before_the_download(
+    site: Site, tmp_path: Path, length: int
+) -> None:
+    site.length = length
+    failed = get(site, tmp_path)
+    assert failed.outcome is Outcome.FAILED
+    assert f"has {length} bytes, the manifest says {len(BIG)}" in failed.note
+    assert (len(site.asked), names_in(tmp_path)) == (1, [])
+
+
+@pytest.mark.parametrize(("status", "requests"), [(404, 1), (403, 1), (503, 2), (429, 2)])
+def test_errors_that_pass_are_waited_for_and_others_are_told(
+    site: Site, tmp_path: Path, status: int, requests: int
+) -> None:
+    site.statuses = [status]
+    fetched = get(site, tmp_path)
+    assert len(site.asked) == requests
+    if requests == 1:
+        assert (fetched.outcome, names_in(tmp_path)) == (Outcome.FAILED, [])
+        assert f"the server says {status}" in fetched.note
+    else:
+        assert fetched.outcome is Outcome.FETCHED
+
+
+def test_a_server_that_is_not_there_is_told(site: Site, tmp_path: Path) -> None:
+    gone = replace(line(), source="http://127.0.0.1:9/a.bin")
+    pauses = Pauses()
+    failed = fetch.fetch(gone, tmp_path, wait=pauses)
+    assert (failed.outcome, len(pauses)) == (Outcome.FAILED, ATTEMPTS - 1)
+    assert "127.0.0.1:9" in failed.note
+
+
+@pytest.mark.parametrize("target", ["file:///etc/hostname", "ftp://127.0.0.1/a.bin", "data:,x"])
+def test_only_the_web_is_redirected_to(site: Site, tmp_path: Path, target: str) -> None:
+    site.redirect = target
+    failed = get(site, tmp_path, line(size=-1, digest=UNVERIFIED))
+    assert failed.outcome is Outcome.FAILED
+    assert target in failed.note
+    assert names_in(tmp_path) == []
+
+
+def test_no_redirection_leaves_https() -> None:
+    with pytest.raises(UserError, match="redirects to http://x/b, which is not followed"):
+        fetch._OnlyWeb().redirect_request(Request("https://x/a"), BytesIO(), 302, "", {}, "http://x/b")
+
+
+def test_a_redirection_keeps_the_part_that_is_asked_for(site: Site, tmp_path: Path) -> None:
+    site.breaks = [CUT] + [0] * (ATTEMPTS - 1)
+    get(site, tmp_path)
+    with serve(Site(b"", redirect=site.url)) as front:
+        assert get(front, tmp_path).outcome is Outcome.FETCHED
+    assert site.sent == len(BIG)
+
+
+def test_a_good_file_is_not_asked_for_and_a_bad_one_is_replaced(site: Site, tmp_path: Path) -> None:
+    put(tmp_path, data=BIG)
+    assert get(site, tmp_path).outcome is Outcome.ALREADY_THERE
+    assert site.asked == []
+    put(tmp_path, data=BIG[:-1])
+    assert get(site, tmp_path).outcome is Outcome.FETCHED
+    assert (tmp_path / "a.bin").read_bytes() == BIG
+
+
+def test_an_unverified_file_comes_with_its_digest(site: Site, tmp_path: Path) -> None:
+    fetched = get(site, tmp_path, line(size=-1, digest=UNVERIFIED))
+    assert fetched.outcome is Outcome.FETCHED
+    assert fetched.note.endswith(digest_of(BIG))
+
+
+def test_a_full_disk_is_told_before_the_download(
+    site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    usage = shutil.disk_usage(tmp_path)._replace(free=len(BIG) - 1)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage)
+    failed = get(site, tmp_path)
+    assert failed.outcome is Outcome.FAILED
+    assert f"only {len(BIG) - 1} bytes free" in failed.note
+    assert site.sent <= BLOCK
+
+
+def test_a_directory_that_cannot_be_made_is_told(site: Site, tmp_path: Path) -> None:
+    put(tmp_path, "file")
+    failed = get(site, tmp_path / "file" / "weights")
+    assert failed.outcome is Outcome.FAILED
+    assert "cannot be written" in failed.note
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "https://drive.google.com/file/d/1",
+        "weights/a.ckpt of a.tar, https://x.org/a.tar",
+        "ftp://x/a",
+        "file:///a",
+    ],
+)
+def test_what_cannot_be_downloaded_as_it_is_is_for_the_user(tmp_path: Path, source: str) -> None:
+    file = line(source=source)
+    assert url_of(file) is None
+    by_hand = fetch.fetch(file, tmp_path)
+    assert by_hand.outcome is Outcome.BY_HAND
+    assert by_hand.note == f"get it from {source} and save it as {tmp_path / 'a.bin'}"
+
+
+def test_of_alternatives_the_one_that_is_there_is_chosen_then_one_from_the_web(tmp_path: Path) -> None:
+    files = [line("a", source="by hand"), line("b", source="https://x.org/b"), line("c", source="by hand")]
+    assert choose(files, tmp_path).name == "b"
+    assert choose(files[::2], tmp_path).name == "a"
+    put(tmp_path, "c", DATA)
+    assert choose(files, tmp_path).name == "c"

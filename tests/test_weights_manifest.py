@@ -1,0 +1,65 @@
+"""The weights manifest: complete, readable, and refused by line where it is not."""
+
+import re
+
+import pytest
+
+from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.matchers.registry import registry
+from mkpc_kaggle.weights import UNVERIFIED, WeightFile, manifest, parse_manifest
+
+SHA256 = "sha256:" + "0f" * 32
+GIT_BLOB = "git-blob:" + "a1" * 20
+
+
+def test_the_manifest_has_every_slot_of_every_matcher_with_its_licence() -> None:
+    licences: dict[str, set[str]] = {}
+    for file in manifest():
+        licences.setdefault(file.slot, set()).add(file.licence)
+    for entry in registry().values():
+        for slot in entry.spec.every_slot:
+            # Nothing says under which terms DKM's indoor weights are.
+            assert licences[slot] & {*entry.spec.licences, "unclear"}, slot
+        for slot in entry.spec.slots_for(entry.spec.options()):
+            assert licences[slot] & set(entry.spec.licences), slot
+
+
+def test_every_name_of_the_manifest_is_there_once_and_its_slots_have_one_licence() -> None:
+    names = [file.name for file in manifest()]
+    assert len(set(names)) == len(names)
+    assert len({(file.slot, file.licence) for file in manifest()}) == len({file.slot for file in manifest()})
+
+
+def test_a_manifest_reads_as_written() -> None:
+    text = f"# head\n\na.pt 12 {SHA256} MIT one  https://x/a.pt (a copy)  # why\n  b.pt ? unverified BSD two y\n"
+    text += f"c.pt 3 {GIT_BLOB} MIT one z\n"
+    files = parse_manifest(text)
+    assert files == (
+        WeightFile("a.pt", 12, SHA256, "MIT", "one", "https://x/a.pt (a copy)"),
+        WeightFile("b.pt", -1, UNVERIFIED, "BSD", "two", "y"),
+        WeightFile("c.pt", 3, GIT_BLOB, "MIT", "one", "z"),
+    )
+    assert parse_manifest("\n".join(file.line for file in files)) == files
+
+
+@pytest.mark.parametrize(
+    ("wrong", "says"),
+    [
+        ("a.pt 12 unverified MIT one", "expected 6 columns, found 5"),
+        ("a.pt 12 unverified MIT one # x", "expected 6 columns, found 5"),
+        ("../a.pt 12 unverified MIT one x", "'../a.pt' is not a plain file name"),
+        ("d/a.pt 12 unverified MIT one x", "'d/a.pt' is not a plain file name"),
+        (".. 12 unverified MIT one x", "'..' is not a plain file name"),
+        ("a.pt 12kB unverified MIT one x", "bytes must be a number or '?', not '12kB'"),
+        ("a.pt -1 unverified MIT one x", "bytes must be a number or '?', not '-1'"),
+        ("a.pt 12 md5:00 MIT one x", "digest must be"),
+        ("a.pt 12 ? MIT one x", "digest must be"),
+        (f"a.pt 12 {SHA256[:-1]} MIT one x", "digest must be"),
+        (f"a.pt 12 {SHA256}0 MIT one x", "digest must be"),
+        (f"a.pt 12 {SHA256[:-1]}g MIT one x", "digest must be"),
+        (f"a.pt 12 {GIT_BLOB}{'00' * 12} MIT one x", "digest must be"),
+    ],
+)
+def test_a_line_that_cannot_be_read_is_named_by_its_number(wrong: str, says: str) -> None:
+    with pytest.raises(UserError, match=f"list.txt, line 3: {re.escape(says)}"):
+        parse_manifest(f"# head\nok.pt 12 unverified MIT one x\n{wrong}\n", "list.txt")

@@ -1,0 +1,296 @@
+"""Where weight files are searched, and that they are what they should be."""
+
+import os
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+
+import pytest
+import torch
+from shared import WEIGHTS, needs_weights
+from weight_files import DATA, OTHER, digest_of, line, put, search_nowhere_else
+
+from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.weights import UNVERIFIED, State, WeightStore, digests, store, tree
+
+
+@pytest.fixture(autouse=True)
+def nowhere_else(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    search_nowhere_else(monkeypatch, tmp_path)
+
+
+def found_by(weights: WeightStore, slot: str = "slot") -> Path:
+    found = weights.find(slot)
+    assert found is not None
+    return found.path
+
+
+def git_blob(path: Path) -> str:
+    run = subprocess.run(["git", "hash-object", str(path)], capture_output=True, text=True, check=True)
+    return "git-blob:" + run.stdout.strip()
+
+
+@needs_weights
+def test_the_shared_checkpoints_are_those_of_the_manifest() -> None:
+    weights = WeightStore([WEIGHTS])
+    for slot in ("aliked-n16", "xfeat", "xfeat-lighterglue"):
+        found = weights.find(slot)
+        assert found is not None
+        assert (found.state, found.digest) == (State.GOOD, found.file.digest)
+        assert all(tensor.isfinite().all() for tensor in weights.load(slot).values())
+
+
+def test_importing_the_package_brings_no_torch() -> None:
+    code = "import sys, mkpc_kaggle.weights; print('torch' in sys.modules)"
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert out.strip() == "False"
+
+
+# by name
+
+
+def test_a_file_is_found_in_the_directory_and_below_it(tmp_path: Path) -> None:
+    assert found_by(WeightStore([put(tmp_path / "a")], [line()])) == tmp_path / "a" / "a.bin"
+    put(tmp_path / "b" / "deep" / "deeper")
+    found = WeightStore([tmp_path / "b"], [line()]).find("slot")
+    assert found is not None
+    assert (found.path, found.digest) == (tmp_path / "b" / "deep" / "deeper" / "a.bin", digest_of(DATA))
+
+
+def test_a_directory_that_bears_the_name_of_the_file_is_looked_into(tmp_path: Path) -> None:
+    """Kaggle makes such directories of data sets of one file."""
+    put(tmp_path / "a.bin")
+    assert found_by(WeightStore([tmp_path], [line()])) == tmp_path / "a.bin" / "a.bin"
+
+
+def test_directories_are_searched_in_order_then_the_environment_then_kaggle(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    homes = [put(tmp_path / name) for name in ("one", "two", "three", "four", "kaggle")]
+    monkeypatch.setenv("MKPC_WEIGHTS", os.pathsep.join(map(str, [tmp_path / "gone", *homes[2:4]])))
+    monkeypatch.setattr(store, "KAGGLE_INPUT", homes[4])
+    for home in homes:
+        assert found_by(WeightStore(homes[:2], [line()])) == home / "a.bin"
+        (home / "a.bin").unlink()
+    assert WeightStore(homes[:2], [line()]).find("slot") is None
+
+
+def test_the_first_alternative_that_is_there_is_taken(tmp_path: Path) -> None:
+    files = [line("a.bin"), line("b.bin", OTHER), line("c.bin", slot="other")]
+    put(tmp_path, "b.bin", OTHER)
+    assert found_by(WeightStore([tmp_path], files)).name == "b.bin"
+    put(tmp_path, "a.bin")
+    assert found_by(WeightStore([tmp_path], files)).name == "a.bin"
+
+
+def test_a_directory_that_is_not_there_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=r"--weights .*gone: no such directory"):
+        WeightStore([tmp_path / "gone"])
+
+
+def test_missing_weights_are_named_with_all_alternatives_and_where_they_were_searched(tmp_path: Path) -> None:
+    weights = WeightStore([tmp_path], [line("a.bin"), line("b.bin")])
+    assert weights.find("slot") is None
+    with pytest.raises(UserError, match=rf"'slot': a\.bin or b\.bin not found \(searched {tmp_path}\)"):
+        weights.load("slot")
+    with pytest.raises(UserError, match=r"--weights"):
+        WeightStore([], [line()]).load("slot")
+
+
+def test_an_unknown_slot_is_a_mistake_in_the_code() -> None:
+    with pytest.raises(KeyError, match="'slto'"):
+        WeightStore([], [line()]).find("slto")
+
+
+# by digest
+
+
+@pytest.mark.parametrize("name", ["weights.dat", "model", "other.pth"])
+def test_a_renamed_file_is_found_by_its_size_and_digest(tmp_path: Path, name: str) -> None:
+    put(tmp_path / "data set" / "v1", name)
+    put(tmp_path, "same size.dat", OTHER)
+    found = WeightStore([tmp_path], [line()]).find("slot")
+    assert found is not None
+    assert (found.path.name, found.state, found.note) == (name, State.RENAMED, "it is a.bin")
+
+
+def test_without_a_size_only_small_checkpoints_are_read_for_their_digest(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tree, "LARGEST_OF_UNKNOWN_SIZE", len(DATA))
+    put(tmp_path, "table.csv")
+    put(tmp_path, "picture.png")
+    put(tmp_path, "big.pth", DATA * 2)
+    assert WeightStore([tmp_path], [line(size=-1), line(data=DATA * 2, size=-1)]).find("slot") is None
+    put(tmp_path, "renamed.ckpt")
+    assert found_by(WeightStore([tmp_path], [line(size=-1)])).name == "renamed.ckpt"
+
+
+def test_a_file_is_known_by_the_digest_that_git_gives(tmp_path: Path) -> None:
+    put(tmp_path, "renamed.pt")
+    file = line(digest=git_blob(tmp_path / "renamed.pt"))
+    found = WeightStore([tmp_path], [file]).find("slot")
+    assert found is not None
+    assert (found.state, found.digest) == (State.RENAMED, digest_of(DATA))
+
+
+def test_files_of_another_size_are_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    read: list[Path] = []
+    real = digests._digests
+    monkeypatch.setattr(digests, "_digests", lambda path, *rest: read.append(path) or real(path, *rest))
+    put(tmp_path, "long.pth", DATA + b"!")
+    put(tmp_path, "same.pth", OTHER)
+    assert WeightStore([tmp_path], [line()]).find("slot") is None
+    assert [path.name for path in read] == ["same.pth"]
+
+
+def test_a_file_is_read_once_until_it_changes(tmp_path: Path) -> None:
+    path = put(tmp_path) / "a.bin"
+    before = digests._digests.cache_info()
+    assert digests.file_digests(path) is digests.file_digests(path)
+    path.write_bytes(OTHER + b"longer")
+    assert digests.file_digests(path).sha256 == digest_of(OTHER + b"longer")
+    assert digests._digests.cache_info().misses - before.misses == 2
+
+
+def test_a_name_goes_before_a_digest(tmp_path: Path) -> None:
+    files = [line("a.bin"), line("b.bin", OTHER)]
+    put(tmp_path, "renamed.bin", DATA)
+    put(tmp_path, "b.bin", OTHER)
+    assert found_by(WeightStore([tmp_path], files)).name == "b.bin"
+
+
+def test_links_to_directories_are_not_followed(tmp_path: Path) -> None:
+    put(tmp_path / "outside", "b.pth")
+    inside = put(tmp_path / "inside" / "deep", "a.pth")
+    (inside / "loop").symlink_to(tmp_path / "inside")
+    (inside / "out").symlink_to(tmp_path / "outside")
+    (inside / "file.pth").symlink_to(tmp_path / "outside" / "b.pth")
+    assert [path.name for path in tree.Tree(tmp_path / "inside").files] == ["a.pth", "file.pth"]
+
+
+# what is not what it should be
+
+
+def test_a_truncated_file_is_refused_with_both_sizes(tmp_path: Path) -> None:
+    put(tmp_path, data=DATA[:-1])
+    with pytest.raises(UserError, match=r"a\.bin: 20 bytes, the manifest says 21: truncated.*weights fetch slot"):
+        WeightStore([tmp_path], [line()]).find("slot")
+
+
+def test_other_bytes_of_the_same_size_are_refused_with_both_digests(tmp_path: Path) -> None:
+    put(tmp_path, data=OTHER)
+    with pytest.raises(UserError, match=f"a.bin: .*{digest_of(OTHER)}.*{digest_of(DATA)}"):
+        WeightStore([tmp_path], [line()]).load("slot")
+
+
+def test_a_file_of_unknown_size_is_still_held_against_its_digest(tmp_path: Path) -> None:
+    file = line(size=-1)
+    assert WeightStore([put(tmp_path / "good")], [file]).find("slot") is not None
+    with pytest.raises(UserError, match="digest"):
+        WeightStore([put(tmp_path / "bad", data=OTHER)], [file]).find("slot")
+
+
+def test_another_file_of_the_manifest_under_the_wrong_name_is_called_by_its_own(tmp_path: Path) -> None:
+    put(tmp_path, "a.bin", OTHER)
+    weights = WeightStore([tmp_path], [line("a.bin", digest=UNVERIFIED), line("b.bin", OTHER, slot="other")])
+    with pytest.raises(UserError, match=r"a\.bin: its bytes are those of b\.bin"):
+        weights.find("slot")
+    assert found_by(weights, "other").name == "a.bin"
+
+
+def test_an_alternative_under_the_name_of_another_is_taken_without_complaint(tmp_path: Path) -> None:
+    put(tmp_path, "a.bin", OTHER)
+    found = WeightStore([tmp_path], [line("a.bin"), line("b.bin", OTHER)]).find("slot")
+    assert found is not None
+    assert (found.file.name, found.path.name, found.state) == ("b.bin", "a.bin", State.RENAMED)
+
+
+@pytest.mark.parametrize("second", ["two/a.bin", "two/b.bin", "two/renamed.bin"])
+def test_after_a_bad_file_the_search_goes_on(tmp_path: Path, second: str) -> None:
+    put(tmp_path / "one", "a.bin", DATA[:-1])
+    path = tmp_path / second
+    put(path.parent, path.name, OTHER if path.name == "b.bin" else DATA)
+    weights = WeightStore([tmp_path / "one", tmp_path / "two"], [line("a.bin"), line("b.bin", OTHER)])
+    with pytest.warns(UserWarning, match=r"passed over: .*one/a\.bin: 20 bytes, the manifest says 21"):
+        assert found_by(weights) == path
+    assert found_by(weights) == path  # told once
+
+
+def test_what_cannot_be_read_is_reported(tmp_path: Path) -> None:
+    (tmp_path / "a.bin").symlink_to(tmp_path / "nothing")
+    weights = WeightStore([tmp_path], [line()])
+    with (
+        pytest.warns(UserWarning, match=r"a\.bin cannot be read"),
+        pytest.raises(UserError, match=r"a\.bin: cannot be read: No such file"),
+    ):
+        weights.find("slot")
+
+
+def test_a_file_that_cannot_be_read_is_passed_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def read(path: Path, *rest: int) -> digests.Digests:
+        if path.name == "locked.bin":
+            raise PermissionError(13, "Permission denied", str(path))
+        return real(path, *rest)
+
+    real = digests._digests
+    monkeypatch.setattr(digests, "_digests", read)
+    put(tmp_path, "locked.bin")
+    put(tmp_path, "renamed.bin")
+    with pytest.warns(UserWarning, match=r"locked\.bin cannot be read.*Permission denied"):
+        assert found_by(WeightStore([tmp_path], [line()])).name == "renamed.bin"
+
+
+def test_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "a.bin")
+    with pytest.raises(UserError, match=r"a\.bin: no regular file"):
+        WeightStore([tmp_path], [line()]).find("slot")
+
+
+def test_an_unverified_file_warns_when_it_is_loaded_once_in_a_process(tmp_path: Path) -> None:
+    torch.save({"a": torch.zeros(1)}, tmp_path / "a.pt")
+    digest = digest_of((tmp_path / "a.pt").read_bytes())
+    file = line("a.pt", size=-1, digest=UNVERIFIED)
+    with pytest.warns(UserWarning, match=rf"a\.pt is not verified.*{digest}"):
+        WeightStore([tmp_path], [file]).load("slot")
+    with warnings.catch_warnings(record=True) as more:
+        warnings.simplefilter("always")
+        WeightStore([tmp_path], [file]).load("slot")
+    assert more == []
+
+
+# verifying all
+
+
+def test_verify_tells_good_truncated_swapped_renamed_and_unverified_files_apart(tmp_path: Path) -> None:
+    contents = {name: name.encode() * 9 for name in ("good", "cut", "swapped", "lost", "damaged", "free")}
+    files = [line(f"{name}.pt", data) for name, data in contents.items() if name != "free"]
+    files.append(line("free.pt", size=-1, digest=UNVERIFIED))
+    put(tmp_path, "good.pt", contents["good"])
+    put(tmp_path, "cut.pt", contents["cut"][:-1])
+    put(tmp_path, "swapped.pt", contents["good"])
+    put(tmp_path, "damaged.pt", contents["damaged"][:-1] + b"!")
+    put(tmp_path / "deep", "renamed.pt", contents["lost"])
+    put(tmp_path, "free.pt", contents["free"])
+    put(tmp_path, "none of ours.pt", b"?")
+    checked = {one.path.name: (one.state, one.note) for one in WeightStore([tmp_path], files).verify()}
+    assert {name: state for name, (state, _) in checked.items()} == {
+        "good.pt": State.GOOD,
+        "cut.pt": State.TRUNCATED,
+        "swapped.pt": State.SWAPPED,
+        "damaged.pt": State.SWAPPED,
+        "renamed.pt": State.RENAMED,
+        "free.pt": State.UNVERIFIED,
+    }
+    assert checked["swapped.pt"][1] == "its bytes are those of good.pt"
+    assert checked["renamed.pt"][1] == "it is lost.pt"
+    assert digest_of(contents["free"]) in checked["free.pt"][1]
+
+
+def test_verify_reports_what_cannot_be_read(tmp_path: Path) -> None:
+    (tmp_path / "a.bin").symlink_to(tmp_path / "a.bin")
+    with warnings.catch_warnings(record=True):
+        warnings.simplefilter("always")
+        (checked,) = WeightStore([tmp_path], [line()]).verify()
+    assert checked.state is State.UNREADABLE

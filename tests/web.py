@@ -1,0 +1,90 @@
+"""A local HTTP server that serves one file as a good server does, or as bad ones do."""
+
+import re
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+
+
+@dataclass
+class Site:
+    """What the server does; it may be changed between requests. ``asked`` gets each request's Range header."""
+
+    data: bytes
+    tag: str = '"one"'
+    ranges: bool = True
+    """honour Range"""
+    breaks: list[int] = field(default_factory=list)
+    """after how many bytes of the body the connection breaks, for each of the first requests"""
+    statuses: list[int] = field(default_factory=list)
+    """errors that the first requests get"""
+    length: int | None = None
+    """a Content-Length that is not true"""
+    shift: int = 0
+    """begins the part that was asked for so many bytes later"""
+    redirect: str = ""
+    asked: list[str] = field(default_factory=list)
+    sent: int = 0
+    """bytes of bodies"""
+    url: str = ""
+
+
+class _Handler(BaseHTTPRequestHandler):
+    site: Site
+
+    def do_GET(self) -> None:
+        site = self.site
+        site.asked.append(self.headers.get("Range", ""))
+        if site.redirect:
+            self.send_response(302)
+            self.send_header("Location", site.redirect)
+            self.end_headers()
+        elif site.statuses:
+            self.send_error(site.statuses.pop(0))
+        else:
+            self._send(site, self._start(site))
+
+    def _start(self, site: Site) -> int:
+        if not site.ranges or self.headers.get("If-Range", site.tag) != site.tag:
+            return 0
+        wanted = re.fullmatch(r"bytes=(\d+)-", self.headers.get("Range", ""))
+        return int(wanted[1]) + site.shift if wanted else 0
+
+    def _send(self, site: Site, start: int) -> None:
+        if start and start >= len(site.data):
+            self.send_response(416)
+            self.send_header("Content-Range", f"bytes */{len(site.data)}")
+            self.send_header("Content-Length", "0")
+            self.end_headers()
+            return
+        body = site.data[start:]
+        self.send_response(206 if start else 200)
+        if start:
+            self.send_header("Content-Range", f"bytes {start}-{len(site.data) - 1}/{len(site.data)}")
+        if site.tag:
+            self.send_header("ETag", site.tag)
+        self.send_header("Content-Length", str(site.length or len(body)))
+        self.end_headers()
+        body = body[: site.breaks.pop(0)] if site.breaks else body
+        self.wfile.write(body)
+        site.sent += len(body)
+
+    def log_message(self, *_: object) -> None:
+        pass
+
+
+@contextmanager
+def serve(site: Site) -> Iterator[Site]:
+    """Serve while the block runs, at ``site.url``."""
+    handler = type("Handler", (_Handler,), {"site": site})
+    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
+        thread.start()
+        site.url = f"http://127.0.0.1:{server.server_address[1]}/a.bin"
+        try:
+            yield site
+        finally:
+            server.shutdown()
+            thread.join()

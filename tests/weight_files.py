@@ -1,0 +1,39 @@
+"""What the tests of weights share: lines of a manifest, files that fit them, and no other place to search."""
+
+import hashlib
+from pathlib import Path
+
+import pytest
+
+from mkpc_kaggle.weights import WeightFile, store
+
+DATA = b"these are the weights"
+OTHER = b"those were the weights"[:21]
+
+
+def search_nowhere_else(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Only the directories that a test names are searched."""
+    monkeypatch.delenv("MKPC_WEIGHTS", raising=False)
+    monkeypatch.setattr(store, "KAGGLE_INPUT", tmp_path / "no kaggle")
+
+
+def digest_of(data: bytes) -> str:
+    return "sha256:" + hashlib.sha256(data).hexdigest()
+
+
+def line(
+    name: str = "a.bin",
+    data: bytes = DATA,
+    *,
+    size: int | None = None,
+    digest: str | None = None,
+    slot: str = "slot",
+    source: str = "somewhere",
+) -> WeightFile:
+    return WeightFile(name, len(data) if size is None else size, digest or digest_of(data), "MIT", slot, source)
+
+
+def put(directory: Path, name: str = "a.bin", data: bytes = DATA) -> Path:
+    directory.mkdir(parents=True, exist_ok=True)
+    (directory / name).write_bytes(data)
+    return directory
