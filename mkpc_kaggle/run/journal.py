@@ -178,7 +178,9 @@ class JournalReader(_Tables):
 
     def events(self) -> tuple[Event, ...]:
         """All events of all sessions of the run, in order."""
-        return tuple(Event(*row) for row in self._db.execute("SELECT kind, seconds, text FROM event ORDER BY place"))
+        return tuple(
+            Event(*row) for row in self._db.execute("SELECT kind, seconds, text FROM event ORDER BY place")
+        )
 
 
 class Journal(_Tables):

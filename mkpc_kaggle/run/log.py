@@ -93,7 +93,9 @@ def overview(log: RunLog) -> str:
 
 def tables(log: RunLog) -> dict[str, pd.DataFrame]:
     """Long tables by name: ``pairs``, ``units``, ``regions``, ``events``; ``pair`` is the row of the test set."""
-    return {name: pd.DataFrame(list(rows(log)), columns=list(columns)) for name, (columns, rows) in _TABLES.items()}
+    return {
+        name: pd.DataFrame(list(rows(log)), columns=list(columns)) for name, (columns, rows) in _TABLES.items()
+    }
 
 
 def write_csv(log: RunLog, directory: Path) -> list[Path]:
@@ -174,8 +176,11 @@ def _event_rows(log: RunLog) -> Iterator[Row]:
 
 _TABLES: dict[str, tuple[tuple[str, ...], Callable[[RunLog], Iterator[Row]]]] = {
     "pairs": (
-        ("pair", "id", "group", "image0", "image1", "failure", "matches", "inliers")
-        + ("decode_seconds", "encode_seconds", "match_seconds", "cluster_seconds", "estimate_seconds", *F_COLUMNS),
+        (
+            *("pair", "id", "group", "image0", "image1", "failure", "matches", "inliers"),
+            *("decode_seconds", "encode_seconds", "match_seconds", "cluster_seconds", "estimate_seconds"),
+            *F_COLUMNS,
+        ),
         _pair_rows,
     ),
     "units": (
