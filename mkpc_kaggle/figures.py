@@ -130,7 +130,7 @@ def draw_groups(groups: Mapping[str, Sequence[int]]) -> "Figure":
         axes.scatter(
             np.asarray(inliers)[some],
             row + np.asarray(spread)[some],
-            s=9,
+            s=16,
             color=CLUSTERS[0],
             alpha=0.7,
             linewidths=0,

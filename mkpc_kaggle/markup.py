@@ -20,6 +20,9 @@ body { margin: 0 auto; max-width: 72rem; padding: 1rem; color: var(--ink); backg
 h1 { font-size: 1.5rem; line-height: 1.25; margin: .5rem 0; }
 h2 { font-size: 1.15rem; margin: 2.2rem 0 .6rem; padding-top: .8rem; border-top: 1px solid var(--line); }
 p { margin: .4rem 0; max-width: 46rem; }
+.side { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 30rem), 1fr)); gap: .3rem 2rem;
+  align-items: start; }
+.side > p, .side > ul, .pictures { grid-column: 1 / -1; }
 .dim, figcaption { color: var(--dim); font-size: .9rem; }
 .bad { color: var(--bad); }
 .facts { display: grid; grid-template-columns: repeat(auto-fit, minmax(9rem, 1fr)); gap: .6rem; margin: 1rem 0; }
@@ -30,12 +33,13 @@ p { margin: .4rem 0; max-width: 46rem; }
 figure { margin: 0; break-inside: avoid; }
 figure svg, figure img { display: block; width: 100%; height: auto; }
 .plot { max-width: 40rem; margin-top: .6rem; }
-.wide { overflow-x: auto; margin: .6rem 0; }
+.wide { overflow-x: auto; margin: .6rem 0; min-width: 0; }
 table { border-collapse: collapse; font-size: .9rem; font-variant-numeric: tabular-nums; }
 th, td { text-align: left; padding: .25rem .7rem .25rem 0; border-bottom: 1px solid var(--line);
   vertical-align: top; }
-td { min-width: 4rem; }
-th { color: var(--dim); font-weight: 600; }
+td { min-width: 6rem; }
+td.n { min-width: 0; }
+th { color: var(--dim); font-weight: 600; white-space: nowrap; }
 td.n, th.n { text-align: right; white-space: nowrap; }
 tr { break-inside: avoid; }
 code { font-size: .9em; }

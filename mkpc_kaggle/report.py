@@ -18,10 +18,11 @@ import numpy as np
 from mkpc_kaggle import figures
 from mkpc_kaggle.competition import Pair
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.geometry.robust import Estimate, Model
+from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.geometry.robust import Estimate, Model, sampson_distances
 from mkpc_kaggle.images import Unreadable, read_image
 from mkpc_kaggle.markup import Markup, element, join, page, picture, table
-from mkpc_kaggle.pipeline import PairMatch, PairWork, finish
+from mkpc_kaggle.pipeline import PairMatch
 from mkpc_kaggle.run.budget import format_duration
 from mkpc_kaggle.run.journal import EventKind
 from mkpc_kaggle.run.log import RunLog, WeakPair, read_log
@@ -119,7 +120,7 @@ def report_page(log: RunLog, artist: Artist) -> Markup:
 
 
 def _section(title: str, content: Iterable[object]) -> Markup:
-    return element("section", element("h2", title), *content)
+    return element("section", element("h2", title), element("div", *content, class_="side"))
 
 
 def _headline(log: RunLog) -> Markup:
@@ -151,12 +152,9 @@ def _time(log: RunLog, artist: Artist) -> Iterator[object]:
     yield table(("part", "seconds", "a pair"), [(n, f"{s:.1f}", f"{s / count:.3f}") for n, s in parts.items()])
     means = unit_means(log.records)
     if means:
-        yield element(
-            "p", "Each unit, on the pairs that it ran on; matches, inliers and seconds are means of a pair."
-        )
+        heads = ("unit, means of its pairs", "pairs", "matches", "inliers", "seconds")
         yield table(
-            ("unit", "pairs", "matches", "inliers", "seconds"),
-            [(m.unit, m.pairs, f"{m.matches:.0f}", f"{m.inliers:.0f}", f"{m.seconds:.2f}") for m in means],
+            heads, [(m.unit, m.pairs, f"{m.matches:.0f}", f"{m.inliers:.0f}", f"{m.seconds:.2f}") for m in means]
         )
     if log.about.left_out:
         names = ", ".join(log.about.left_out)
@@ -258,17 +256,22 @@ def _draw_weak(log: RunLog, weak: WeakPair, source: Pair | None, artist: Artist)
         image0, image1 = map(read_image, source.images)
         if isinstance(image0, Unreadable) or isinstance(image1, Unreadable):
             return element("p", f"{caption}; an image cannot be read any more", class_="dim")
-        kept = sum(len(result.matches) for result in weak.results) == record.matches
-        nothing = PairMatch((), record.regions, Estimate(Model.F, record.F, np.zeros(0, bool)))
-        work = PairWork((image0, image1), weak.results, record.regions)
-        match = finish(work, log.recipe) if kept else nothing
-        told = caption if kept else f"{caption}; the journal no longer has the points"
+        match = match_of(weak, log.recipe.magsac.threshold)
+        told = caption if len(match.matches) == record.matches else f"{caption}; the points are no longer known"
         data = figures.to_jpeg(figures.draw_strip((image0, image1), match))
-        return picture(
-            data, "image/jpeg", told, f"the two images of {source.id} with matches and critical regions"
-        )
+        return picture(data, "image/jpeg", told, f"the images of {source.id}, matches and critical regions")
 
     return artist.draw(make)
+
+
+def match_of(weak: WeakPair, threshold: float) -> PairMatch:
+    """The pair as MAGSAC left it, without running it again; ``threshold`` in pixels tells the inliers."""
+    record = weak.record
+    matches = Matches.concatenate(result.matches for result in weak.results)
+    inliers = sampson_distances(record.F, matches) < threshold
+    if record.failure:
+        inliers = np.zeros(len(matches), bool)
+    return PairMatch(weak.results, record.regions, Estimate(Model.F, record.F, inliers, record.failure))
 
 
 def _failures(log: RunLog) -> Iterator[object]:
