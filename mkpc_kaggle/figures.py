@@ -126,7 +126,7 @@ def draw_groups(groups: Mapping[str, Sequence[int]]) -> "Figure":
     axes = _plain_axes(figure, "inliers of each pair, by batch; the line is the median")
     for row, inliers in enumerate(groups.values()):
         spread = np.linspace(-0.25, 0.25, len(inliers)) if len(inliers) > 1 else [0.0]
-        some = _sample(np.ones(len(inliers), bool), 400)
+        some = _sample(np.ones(len(inliers), bool), 120)
         axes.scatter(
             np.asarray(inliers)[some],
             row + np.asarray(spread)[some],
@@ -150,7 +150,7 @@ def draw_crops(sizes: Mapping[str, Sequence[tuple[int, int]]]) -> "Figure":
     total = sum(map(len, sizes.values()))
     axes = _plain_axes(figure, f"{total} critical regions: width and height in pixels, by reason")
     for colour, (reason, values) in zip(_CYCLE, sizes.items(), strict=False):
-        some = _sample(np.ones(len(values), bool), 1000)
+        some = _sample(np.ones(len(values), bool), 500)
         x, y = np.asarray(values)[some].T
         axes.scatter(x, y, s=12, color=colour, alpha=0.6, linewidths=0, label=f"{reason} ({len(values)})")
     axes.set_xlim(left=0)

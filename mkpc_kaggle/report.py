@@ -35,7 +35,7 @@ MOST_ROWS = 100
 MOST_GROUPS = 30
 DRAWING_SECONDS = 4.0
 """Time that must be left to begin to draw: matplotlib alone takes one or two to load."""
-WRITING_SECONDS, WRITING_SECONDS_PER_PAIR = 0.3, 0.0005
+WRITING_SECONDS, WRITING_SECONDS_PER_PAIR = 0.3, 0.0002
 """Time that must be left to write a report without figures."""
 LEAVING_SECONDS = 0.3
 """Time that a program needs to end."""
