@@ -152,7 +152,7 @@ def _time(log: RunLog, artist: Artist) -> Iterator[object]:
     yield table(("part", "seconds", "a pair"), [(n, f"{s:.1f}", f"{s / count:.3f}") for n, s in parts.items()])
     means = unit_means(log.records)
     if means:
-        heads = ("unit, means of its pairs", "pairs", "matches", "inliers", "seconds")
+        heads = ("unit (means)", "pairs", "matches", "inliers", "seconds")
         yield table(
             heads, [(m.unit, m.pairs, f"{m.matches:.0f}", f"{m.inliers:.0f}", f"{m.seconds:.2f}") for m in means]
         )
@@ -175,7 +175,7 @@ def _budget(log: RunLog, artist: Artist) -> Iterator[object]:
     }
     yield artist.plot(lambda: figures.draw_budget(ended, marks, log.about.limit))
     rows = [(phase, len(times), f"{min(times):.1f}", f"{max(times):.1f}") for phase, times in ended.items()]
-    yield table(("phase", "jobs", "first ended at (s)", "last ended at (s)"), rows)
+    yield table(("phase", "jobs", "first (s)", "last (s)"), rows)
 
 
 def _plan(log: RunLog) -> Iterator[object]:
@@ -202,7 +202,7 @@ def _groups(log: RunLog, artist: Artist) -> Iterator[object]:
     if len(groups) > MOST_GROUPS:
         yield element("p", f"Drawn are the {MOST_GROUPS} weakest of {len(groups)} batches.", class_="dim")
     rows = [(name, len(v), failed[name], f"{median(v):.0f}", min(v), max(v)) for name, v in groups.items()]
-    yield from _capped(("batch", "pairs", "without F", "median inliers", "least", "most"), rows)
+    yield from _capped(("batch", "pairs", "no F", "median", "least", "most"), rows)
 
 
 def _regions(log: RunLog, artist: Artist) -> Iterator[object]:
@@ -215,9 +215,9 @@ def _regions(log: RunLog, artist: Artist) -> Iterator[object]:
         return
     sizes = dict(sorted(sizes.items(), key=lambda item: -len(item[1])))
     yield artist.plot(lambda: figures.draw_crops(sizes))
-    yield element("p", "“cropped” is a crop; for any other reason the whole image stands in.", class_="dim")
     rows = [(reason, len(v), *(f"{side:.0f}" for side in np.median(v, axis=0))) for reason, v in sizes.items()]
-    yield table(("reason", "regions", "median width", "median height"), rows)
+    yield table(("reason", "regions", "width", "height"), rows)
+    yield element("p", "Width and height are medians. For any reason but “cropped” the whole image stands in.")
 
 
 def _weakest(log: RunLog, artist: Artist) -> Iterator[object]:
