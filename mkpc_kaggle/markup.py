@@ -9,11 +9,10 @@ from collections.abc import Iterable, Sequence
 
 _STYLE = """
 :root { color-scheme: light dark; --ink: #1b1d21; --dim: #5b616b; --line: #d5d8de; --paper: #ffffff;
-  --tint: #f3f5f8; --bad: #b3261e; }
+  --tint: #f3f5f8; }
 @media (prefers-color-scheme: dark) { :root { --ink: #e6e8ec; --dim: #a0a7b3; --line: #3a3f48; --paper: #16181c;
-  --tint: #20242a; --bad: #ff8a80; } }
-@media print { :root { color-scheme: light; --ink: #000; --dim: #444; --line: #bbb; --paper: #fff; --tint: #fff;
-  --bad: #900; } details > * { display: block; } }
+  --tint: #20242a; } }
+@media print { :root { color-scheme: light; --ink: #000; --dim: #444; --line: #bbb; --paper: #fff; --tint: #fff; } }
 * { box-sizing: border-box; }
 body { margin: 0 auto; max-width: 72rem; padding: 1rem; color: var(--ink); background: var(--paper);
   font: 1rem/1.5 system-ui, sans-serif; overflow-wrap: anywhere; }
@@ -24,7 +23,6 @@ p { margin: .4rem 0; max-width: 46rem; }
   align-items: start; }
 .side > p, .side > ul, .pictures { grid-column: 1 / -1; }
 .dim, figcaption { color: var(--dim); font-size: .9rem; }
-.bad { color: var(--bad); }
 .facts { display: grid; grid-template-columns: repeat(auto-fit, minmax(9rem, 1fr)); gap: .6rem; margin: 1rem 0; }
 .facts > div { background: var(--tint); border: 1px solid var(--line); border-radius: .4rem;
   padding: .5rem .7rem; }
