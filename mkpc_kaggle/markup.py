@@ -12,7 +12,8 @@ _STYLE = """
   --tint: #f3f5f8; }
 @media (prefers-color-scheme: dark) { :root { --ink: #e6e8ec; --dim: #a0a7b3; --line: #3a3f48; --paper: #16181c;
   --tint: #20242a; } }
-@media print { :root { color-scheme: light; --ink: #000; --dim: #444; --line: #bbb; --paper: #fff; --tint: #fff; } }
+@media print { :root { color-scheme: light; --ink: #000; --dim: #444; --line: #bbb; --paper: #fff;
+  --tint: #fff; } }
 * { box-sizing: border-box; }
 body { margin: 0 auto; max-width: 72rem; padding: 1rem; color: var(--ink); background: var(--paper);
   font: 1rem/1.5 system-ui, sans-serif; overflow-wrap: anywhere; }
