@@ -83,22 +83,22 @@ def known_costs(*seconds: float) -> Costs:
 def test_the_longest_prefix_that_fits_is_chosen() -> None:
     costs = known_costs(1.0, 2.0, 4.0)
     lacking = {unit.name: 10 for unit in UNITS}
-    assert [longest_prefix(UNITS, lacking, costs, s) for s in (5, 11, 32, 74)] == [0, 1, 2, 3]
+    assert [longest_prefix(UNITS, lacking, costs, s) for s in (13, 15, 43, 99)] == [0, 1, 2, 3]
 
 
 def test_units_that_pairs_have_already_cost_nothing() -> None:
     costs = known_costs(1.0, 2.0, 4.0)
     lacking = {UNITS[0].name: 0, UNITS[1].name: 10, UNITS[2].name: 1}
-    assert longest_prefix(UNITS, lacking, costs, 26) == 3
+    assert longest_prefix(UNITS, lacking, costs, 34) == 3
 
 
 def test_waiting_counts_against_the_time_too() -> None:
     costs = known_costs(1.0, 2.0, 4.0)
     lacking = {unit.name: 10 for unit in UNITS}
-    before = longest_prefix(UNITS, lacking, costs, 34)
+    before = longest_prefix(UNITS, lacking, costs, 45)
     costs.observe_overhead(1.0)
     assert before == 2
-    assert longest_prefix(UNITS, lacking, costs, 34) == 1
+    assert longest_prefix(UNITS, lacking, costs, 45) == 1
 
 
 @given(

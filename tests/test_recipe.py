@@ -162,7 +162,10 @@ def test_a_unit_shows_a_crop_at_its_size():
         ),
         (SIFT + "[mkpc]\nepsilon = 1\n", r"\[mkpc\].*'epsilon'.*eps, min_samples, share, ratio, expand_x"),
         (SIFT + "[magsac]\nmax_iters = 1\n", r"\[magsac\].*method, threshold, confidence, max_iterations"),
-        (SIFT + "[upgrade]\nbelow = 1\n", r"\[upgrade\].*'below'; known keys: below_inliers"),
+        (
+            SIFT + "[upgrade]\nbelow = 1\n",
+            r"\[upgrade\].*'below'; known keys: below_inliers, below_share, uncertain, least_gain",
+        ),
         (units('{ matcher = "sift", long_side = 640 }'), r"unit 1 lacks 'stage'"),
         ("", "no units"),
         ("units = [", "not valid TOML"),

@@ -1,12 +1,13 @@
 """The durable record of a run: an SQLite file that only the parent writes, one transaction a job.
 
-Tables: ``run`` (what the journal belongs to), ``pair`` (F, failure, seconds), ``unit`` (counts and seconds of
-each unit on each pair, and its points while a later pass may build on them), ``region`` (the critical
-regions).
+Tables: ``run`` (what the journal belongs to), ``pair`` (F, failure, seconds, inliers before an upgrade), ``unit``
+(counts and seconds of each unit on each pair, and its points while a later pass may build on them), ``region``
+(the critical regions), ``event`` (what happened when, in seconds since the start of the run that wrote it).
 """
 
 import json
 import sqlite3
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -21,21 +22,22 @@ from mkpc_kaggle.pipeline import UnitResult
 from mkpc_kaggle.recipe import Unit
 from mkpc_kaggle.run.jobs import Outcome, Record, UnitRecord
 
-FORMAT = 1
+FORMAT = 2
 FILE_NAME = "journal.sqlite"
 
 _SCHEMA = """
 CREATE TABLE IF NOT EXISTS run (key TEXT PRIMARY KEY, value TEXT NOT NULL);
 CREATE TABLE IF NOT EXISTS pair (
     pair INTEGER PRIMARY KEY, fundamental BLOB NOT NULL, failure TEXT NOT NULL,
-    decode_seconds REAL, cluster_seconds REAL, estimate_seconds REAL);
+    decode_seconds REAL, cluster_seconds REAL, estimate_seconds REAL, before INTEGER);
 CREATE TABLE IF NOT EXISTS unit (
     pair INTEGER, unit TEXT, stage INTEGER, matches INTEGER, inliers INTEGER,
-    encode_seconds REAL, match_seconds REAL, failure TEXT, points BLOB, place INTEGER,
+    encode_seconds REAL, match_seconds REAL, failure TEXT, place INTEGER, points BLOB,
     PRIMARY KEY (pair, unit));
 CREATE TABLE IF NOT EXISTS region (
     pair INTEGER, image INTEGER, "left" INTEGER, top INTEGER, "right" INTEGER, bottom INTEGER,
     reason TEXT, clusters INTEGER, kept INTEGER, PRIMARY KEY (pair, image));
+CREATE TABLE IF NOT EXISTS event (place INTEGER PRIMARY KEY, kind TEXT, seconds REAL, text TEXT);
 """
 
 
@@ -79,7 +81,7 @@ class Journal:
         ):
             region = CriticalRegion(Box(left, top, right, bottom), RegionReason(reason), *counts)
             regions.setdefault(pair, []).append(region)
-        columns = "pair, fundamental, failure, decode_seconds, cluster_seconds, estimate_seconds"
+        columns = "pair, fundamental, failure, decode_seconds, cluster_seconds, estimate_seconds, before"
         return {
             pair: Record(
                 pair,
@@ -102,8 +104,15 @@ class Journal:
             )
         )
 
+    def note(self, kind: str, seconds: float, text: str) -> None:
+        """Put down an event, ``seconds`` after the run's start."""
+        self._db.execute("INSERT INTO event (kind, seconds, text) VALUES (?, ?, ?)", [kind, seconds, text])
+
     def save(self, outcomes: list[tuple[Outcome, bool]]) -> None:
-        """Put down a job's outcomes, all or none; the points of those marked True are not needed again."""
+        """Put down a job's outcomes, all or none; the points of those marked True are not needed again.
+
+        An outcome's results may be the new ones alone: what was put down of others stays.
+        """
         with self._db:
             self._db.execute("BEGIN")
             for outcome, settled in outcomes:
@@ -115,7 +124,7 @@ class Journal:
     def _save(self, outcome: Outcome, settled: bool) -> None:
         record = outcome.record
         self._db.execute(
-            "REPLACE INTO pair VALUES (?, ?, ?, ?, ?, ?)",
+            "REPLACE INTO pair VALUES (?, ?, ?, ?, ?, ?, ?)",
             [
                 record.index,
                 np.ascontiguousarray(record.F, np.float64).tobytes(),
@@ -123,11 +132,17 @@ class Journal:
                 record.decode_seconds,
                 record.cluster_seconds,
                 record.estimate_seconds,
+                record.before,
             ],
         )
-        points = {result.unit.name: _blob(result.matches) for result in outcome.results}
+        points = {} if settled else {result.unit.name: _blob(result.matches) for result in outcome.results}
+        if settled:
+            self._db.execute("UPDATE unit SET points = NULL WHERE pair = ?", [record.index])
         self._db.executemany(
-            "REPLACE INTO unit VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+            "INSERT INTO unit VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?) ON CONFLICT DO UPDATE SET "
+            "matches = excluded.matches, inliers = excluded.inliers, encode_seconds = excluded.encode_seconds, "
+            "match_seconds = excluded.match_seconds, failure = excluded.failure, place = excluded.place, "
+            "points = coalesce(excluded.points, points)",
             [
                 [
                     record.index,
@@ -138,8 +153,8 @@ class Journal:
                     unit.encode_seconds,
                     unit.match_seconds,
                     unit.failure,
-                    None if settled else points[unit.unit],
                     place,
+                    points.get(unit.unit),
                 ]
                 for place, unit in enumerate(record.units)
             ],
@@ -181,9 +196,13 @@ class Journal:
 
 
 def _blob(matches: Matches) -> bytes:
-    return np.column_stack([matches.points0, matches.points1, matches.scores]).tobytes()
+    """All float32 values, column by column, first bytes first: those of like size are alike, and deflate well."""
+    table = np.column_stack([matches.points0, matches.points1, matches.scores])
+    columns = np.ascontiguousarray(table.T).view(np.uint8).reshape(-1, 4)
+    return zlib.compress(columns.T.tobytes(), level=1)
 
 
 def _matches(blob: bytes | None) -> Matches:
-    table = np.frombuffer(blob or b"", np.float32).reshape(-1, 5)
-    return Matches(table[:, :2], table[:, 2:4], table[:, 4])
+    planes = np.frombuffer(zlib.decompress(blob) if blob else b"", np.uint8).reshape(4, -1)
+    table = np.ascontiguousarray(planes.T).view(np.float32).reshape(5, -1)
+    return Matches(table[:2].T, table[2:4].T, table[4])

@@ -1,11 +1,13 @@
-"""One run from its parts: journal, worker and engine opened, used and let go of."""
+"""One run from its parts: journal, pool and engine opened, used and let go of."""
 
 import hashlib
+import os
 import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from math import isfinite
 from pathlib import Path
 from types import FrameType
 
@@ -13,9 +15,12 @@ from mkpc_kaggle.assembly import Assembly
 from mkpc_kaggle.competition import Pair
 from mkpc_kaggle.run.budget import Budget
 from mkpc_kaggle.run.engine import Engine, RunReport
+from mkpc_kaggle.run.in_process import InProcessPool
 from mkpc_kaggle.run.jobs import Record
 from mkpc_kaggle.run.journal import Journal
-from mkpc_kaggle.run.worker import InProcessWorker
+from mkpc_kaggle.run.plan import Patience
+from mkpc_kaggle.run.pool import Pool
+from mkpc_kaggle.run.processes import ProcessPool, Seat
 
 
 class Interrupt(threading.Event):
@@ -26,13 +31,20 @@ class Interrupt(threading.Event):
 
 @dataclass(frozen=True)
 class Session:
-    """What a run needs besides its pairs and its recipe."""
+    """What a run needs besides its pairs and its recipe.
+
+    ``workers`` is the number of worker processes; 0: none, the work is done in this one; ``None``: one a
+    device. ``guarded``: at the budget's last moment the process leaves, whatever hangs.
+    """
 
     work_dir: Path
     budget: Budget
     interrupt: Interrupt
     fresh: bool = False
     progress: bool = True
+    workers: int | None = 0
+    guarded: bool = False
+    patience: Patience | None = None
 
 
 def run_pairs(
@@ -48,23 +60,61 @@ def run_pairs(
     """
     belongs_to = {"test set": digest_of(pairs), **assembly.fingerprint()}
     journal = Journal(session.work_dir, belongs_to, fresh=session.fresh)
-    worker = InProcessWorker(assembly.pipeline)
-    try:
-        engine = Engine(
-            pairs,
-            assembly.recipe,
-            worker,
-            journal,
-            session.budget,
-            publish=publish,
-            interrupt=session.interrupt,
-            progress=session.progress,
-        )
-        report = engine.run()
-    finally:
-        at_rest = worker.close()
-        journal.close()
+    pool = pool_of(assembly, session.workers)
+    engine = Engine(
+        pairs,
+        assembly.recipe,
+        pool,
+        journal,
+        session.budget,
+        publish=publish,
+        interrupt=session.interrupt,
+        progress=session.progress,
+        patience=session.patience,
+    )
+    with watched(engine, session):
+        try:
+            report = engine.run()
+        finally:
+            at_rest = pool.close()
+            journal.close()
     return report, at_rest
+
+
+def pool_of(assembly: Assembly, workers: int | None) -> Pool:
+    """One process a device, or as many as are asked for, in turn on each device; or none."""
+    if workers == 0:
+        return InProcessPool(assembly.pipeline, assembly.recipe)
+    # On a CPU one process with all threads, unless more are asked for: two with half of them each were no faster.
+    devices = assembly.devices
+    places = [devices[number % len(devices)] for number in range(workers or len(devices))]
+    share = len(places) if devices == ("cpu",) else 1
+    seats = [Seat(f"{place} {number}", assembly.on(place).pipeline, share) for number, place in enumerate(places)]
+    return ProcessPool(seats, assembly.recipe)
+
+
+@contextmanager
+def watched(engine: Engine, session: Session) -> Iterator[None]:
+    """Leave the process at the budget's last moment, the submission written, if the run has not ended by then.
+
+    A thread does it, so that it helps wherever the others are stuck, short of holding the interpreter's lock:
+    that only a matcher in the engine's own process can do. Worker processes end with this one.
+    """
+    budget, over = session.budget, threading.Event()
+
+    def leave_in_the_end() -> None:
+        if not over.wait(budget.last - budget.clock()):
+            try:
+                engine.save_what_there_is(budget.reserve / 16)
+            finally:
+                os._exit(128 + session.interrupt.signal if session.interrupt.signal else 0)
+
+    if session.guarded and isfinite(budget.limit):
+        threading.Thread(target=leave_in_the_end, name="watchdog", daemon=True).start()
+    try:
+        yield
+    finally:
+        over.set()
 
 
 def digest_of(pairs: Sequence[Pair]) -> str:

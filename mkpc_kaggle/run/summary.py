@@ -28,6 +28,7 @@ def summary(pairs: Sequence[Pair], report: RunReport, left_out: Sequence[Unit] =
     lines += unit_table(records)
     lines += _counts("critical regions", (str(r.reason) for record in records for r in record.regions or ()))
     lines += _time_lines(records)
+    lines += _upgrade_lines(records)
     if left_out:
         names = ", ".join(unit.name for unit in left_out)
         lines.append(f"units left out, their weights are missing or not permitted: {names}")
@@ -64,6 +65,14 @@ def _time_lines(records: Sequence[Record]) -> list[str]:
     }
     count = max(1, len(records))
     return ["seconds a pair: " + ", ".join(f"{name} {value / count:.3f}" for name, value in parts.items())]
+
+
+def _upgrade_lines(records: Sequence[Record]) -> list[str]:
+    upgraded = [record for record in records if record.before is not None]
+    if not upgraded:
+        return []
+    before, after = sum(r.before or 0 for r in upgraded), sum(r.inliers for r in upgraded)
+    return [f"upgraded {len(upgraded)} pairs: {before} inliers before, {after} after"]
 
 
 def _counts(title: str, values: Iterable[str]) -> list[str]:
