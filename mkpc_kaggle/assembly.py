@@ -49,16 +49,18 @@ class Assembly:
 
         return tuple(f"cuda:{number}" for number in range(torch.cuda.device_count()))
 
+    @property
+    def batch(self) -> int:
+        """How many pairs a unit takes at a time: batches pay on a GPU; on a CPU they only cost memory."""
+        return CUDA_BATCH if self.placement.device.startswith("cuda") else 1
+
     def on(self, device: str) -> "Assembly":
         """The same on one device."""
         return replace(self, placement=replace(self.placement, device=device))
 
     def pipeline(self) -> Pipeline:
         """A pipeline whose matchers are loaded when they are first needed."""
-        # Batches pay on a GPU; on a CPU they only cost memory.
-        return Pipeline(
-            self.recipe, self._matcher, batch=CUDA_BATCH if self.placement.device.startswith("cuda") else 1
-        )
+        return Pipeline(self.recipe, self._matcher, batch=self.batch)
 
     def fingerprint(self) -> dict[str, Any]:
         """What decides the numbers that come out: the recipe, the precision and the digests of the weights."""

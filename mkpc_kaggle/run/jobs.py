@@ -32,8 +32,8 @@ class Plan:
     """What to do next: ``units`` on the pairs of ``indices``, those that a pair has had left out.
 
     ``expected`` are the seconds within which each unit most likely ends on a pair. No unit is begun that is
-    expected to end after ``deadline``, in seconds of the parent's clock. A worker that has been at it for
-    ``timeout`` seconds hangs. The views' sides are ``shrink`` times as long as the units say.
+    expected to end after ``deadline``, in seconds of the parent's clock. A worker that begins no unit and does not
+    answer for ``timeout`` seconds hangs. The views' sides are ``shrink`` times as long as the units say.
     """
 
     phase: Phase

@@ -6,7 +6,6 @@ It looks at a job's worth of pairs at a time, so that a hundred thousand pairs c
 from collections import Counter, deque
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from math import isfinite
 
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.pipeline import UnitResult
@@ -16,7 +15,7 @@ from mkpc_kaggle.run.jobs import Cause, Finished, Lost, Outcome, Phase, Plan, Re
 
 EXPLORE_SHARE = 0.25
 """The share of the time left that may be spent to learn what units cost that never ran."""
-JOB_SHARE = 0.5
+JOB_SHARE = 0.1
 """The share of the time left that a job may be expected to take: what a job found late comes too late."""
 SHRINK, LEAST_SHRINK = 0.7, 0.45
 """A unit that a worker fails at on one pair is tried on views whose sides are 0.7, then 0.49 times as long."""
@@ -30,14 +29,16 @@ ROUND = 4
 
 @dataclass(frozen=True)
 class Patience:
-    """When a worker is taken to hang: after ``floor`` seconds and ``factor`` times what its job should take.
+    """When a worker is taken to hang: silent for ``floor`` seconds and ``factor`` times what a unit should take.
 
-    ``unknown`` seconds are allowed for each pair where nobody knows what its units cost.
+    It is heard of before each unit on each ``batch`` of pairs. ``unknown`` seconds are allowed where nobody knows
+    what a unit costs. A machine that is ten times slower of a sudden does not hang.
     """
 
     floor: float = 60.0
     factor: float = 10.0
     unknown: float = 600.0
+    batch: int = 1
 
 
 @dataclass(frozen=True)
@@ -92,7 +93,6 @@ class Planner:
         self._again: deque[Stretch] = deque()
         self._flying: set[int] = set()
         self._jobs_out = 0
-        self._exploring = False
         self._allowance = 0.0
         self._last_event = budget.clock()
         self._pairs_of_phase = self._pairs_queued = 0
@@ -113,14 +113,14 @@ class Planner:
 
     def next(self, now: float) -> Plan | None:
         """The next plan; ``None`` where there is nothing to do, or nothing before a job comes back."""
-        if self._exploring or now >= self.budget.stop:
+        if now >= self.budget.stop:
             return None
         while (stretch := self._turn(now)) is not None:
             units = self._units(stretch, now)
             todo = [index for index in stretch.indices if self._can_gain(index, units)]
             lacking = list(dict.fromkeys(unit for index in todo for unit in self.records[index].lacking(units)))
             unknown = not all(self.costs.known(unit.name) for unit in lacking)
-            if unknown and self._jobs_out:  # what has no known cost cannot be planned: it is tried alone
+            if unknown and self._jobs_out >= self.workers:  # it would wait behind another, its allowance running
                 self._again.appendleft(stretch)
                 return None
             if todo:
@@ -152,17 +152,19 @@ class Planner:
         *,
         unknown: bool,
     ) -> Plan:
-        """A plan for the first of the pairs; those for which it gets late go back to the front of the queue."""
+        """A plan for the first of the pairs; the others go back to the front of the queue.
+
+        It is one pair where some unit's cost is unknown and cannot be planned, and few where it gets late.
+        """
         left = self.budget.stop - now
         seconds = self.costs.overhead + sum(self.costs.of(unit.name) for unit in lacking)
-        if isfinite(left) and len(todo) * seconds > JOB_SHARE * left:
-            most = max(1, int(JOB_SHARE * left / seconds))
-            if todo[most:]:
-                self._again.appendleft(replace(stretch, indices=tuple(todo[most:])))
-            todo = todo[:most]
+        most = len(todo) if len(todo) * seconds <= JOB_SHARE * left else max(1, int(JOB_SHARE * left / seconds))
+        most = 1 if unknown else most
+        if todo[most:]:
+            self._again.appendleft(replace(stretch, indices=tuple(todo[most:])))
+        todo = todo[:most]
         self._flying.update(todo)
         self._jobs_out += 1
-        self._exploring = unknown
         self._allowance = EXPLORE_SHARE * left
         if self._jobs_out == 1:
             self._last_event = now
@@ -178,9 +180,8 @@ class Planner:
         )
 
     def _timeout(self, lacking: Iterable[Unit], pairs: int, *, unknown: bool) -> float:
-        seconds = self.costs.overhead + sum(self.costs.most(unit.name) for unit in lacking)
-        allowed = self.patience.floor + self.patience.factor * seconds * pairs
-        return allowed + self.patience.unknown * pairs if unknown else allowed
+        seconds = max(self.costs.most(unit.name) for unit in lacking) * min(pairs, self.patience.batch)
+        return self.patience.floor + self.patience.factor * seconds + (self.patience.unknown if unknown else 0.0)
 
     def _can_gain(self, index: int, units: Iterable[Unit]) -> bool:
         return index not in self._aside and bool(self.records[index].lacking(units))
@@ -336,7 +337,6 @@ class Planner:
     def _back(self, plan: Plan) -> None:
         self._flying.difference_update(plan.indices)
         self._jobs_out -= 1
-        self._exploring = self._exploring and not plan.exploring
 
     # What was lost
 

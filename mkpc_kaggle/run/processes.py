@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
 from pathlib import Path
-from typing import TypeVar
+from typing import TypeVar, cast
 
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.pipeline import Pipeline
@@ -217,14 +217,13 @@ class Worker:
         return str(answer)
 
     def do(self, job: Job) -> Answer:
-        def ask() -> Answer:
-            self._jobs.send((job, job.plan.deadline - time.monotonic()))
-            answer: Answer = self._jobs.recv()
-            return answer
-
-        answer = self._within(job.plan.timeout, ask)
+        """Its answer, or what became of it."""
+        order = (job, job.plan.deadline - time.monotonic())
+        answer = self._within(job.plan.timeout, lambda: self._jobs.send(order))
+        while answer is None:  # an answer, or the sign that it lives
+            answer = self._within(job.plan.timeout, self._jobs.recv)
         if not isinstance(answer, Cause):
-            return answer
+            return cast(Answer, answer)
         told = f"nothing heard for {job.plan.timeout:.0f} s" if answer is Cause.HUNG else self._ended()
         return Lost(job, answer, told)
 
@@ -283,7 +282,7 @@ def serve(seat: Seat, jobs: Connection, words: Connection) -> None:
     while True:
         job, seconds = jobs.recv()
         try:
-            answer: Answer = bench.match(job, seconds)
+            answer: Answer = bench.match(job, seconds, alive=lambda: jobs.send(None))
         except Exception as error:
             answer = lost_by(job, error)
         jobs.send(answer)

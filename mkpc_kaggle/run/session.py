@@ -70,7 +70,7 @@ def run_pairs(
         publish=publish,
         interrupt=session.interrupt,
         progress=session.progress,
-        patience=session.patience,
+        patience=session.patience or Patience(batch=assembly.batch),
     )
     with watched(engine, session):
         try:

@@ -45,10 +45,10 @@ class Bench:
         """Decode these ahead, in the background."""
         self._images.announce(paths)
 
-    def match(self, job: Job, seconds: float) -> tuple[Matched, ...]:
+    def match(self, job: Job, seconds: float, alive: Callable[[], None] = lambda: None) -> tuple[Matched, ...]:
         """First half of a job: no unit is begun that is expected to end later than ``seconds`` from now.
 
-        Raises :class:`OutOfMemoryError`.
+        ``alive`` is called before each unit on each batch of pairs. Raises :class:`OutOfMemoryError`.
         """
         pipeline, plan = self.load(), job.plan
         deadline = time.monotonic() + seconds
@@ -56,6 +56,7 @@ class Bench:
         expected = dict(zip(units, plan.expected, strict=True))
 
         def keep_on(unit: Unit) -> bool:
+            alive()
             return not self._stopped.is_set() and time.monotonic() + expected[unit] < deadline
 
         opened = [self._open(task) for task in job.tasks]
