@@ -322,7 +322,7 @@ class Planner:
             return None
         self._proven.update(result.unit.name for result in outcome.results)
         before = inliers_before(former) if phase is Phase.UPGRADE else former.before
-        record = replace(record, before=before)
+        record = replace(record, before=before, regions=record.regions or former.regions)
         self._put(record)
         return Outcome(record, outcome.results)
 
