@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
 from pathlib import Path
-from typing import TypeVar, cast
+from typing import Any, TypeVar, cast
 
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.pipeline import Pipeline
@@ -209,7 +209,7 @@ class Worker:
 
     def load(self) -> str:
         """Wait until the matchers are loaded; empty, or why they are not. Raises the :class:`UserError` it met."""
-        answer = self._within(START_SECONDS, self._jobs.recv)
+        answer: object = self._within(START_SECONDS, self._jobs.recv)
         if isinstance(answer, UserError):
             raise answer
         if isinstance(answer, Cause):
@@ -219,7 +219,7 @@ class Worker:
     def do(self, job: Job) -> Answer:
         """Its answer, or what became of it."""
         order = (job, job.plan.deadline - time.monotonic())
-        answer = self._within(job.plan.timeout, lambda: self._jobs.send(order))
+        answer: Any = self._within(job.plan.timeout, lambda: self._jobs.send(order))
         while answer is None:  # an answer, or the sign that it lives
             answer = self._within(job.plan.timeout, self._jobs.recv)
         if not isinstance(answer, Cause):
