@@ -1,7 +1,7 @@
 """Puts a run's parts together: a recipe by name, the weights it finds, the device, the matchers."""
 
 from collections.abc import Container, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from pathlib import Path
 from typing import Any
@@ -40,12 +40,27 @@ class Assembly:
     left_out: tuple[Unit, ...] = ()
     matchers: Mapping[str, Matcher[Any]] = field(default_factory=dict)
 
+    @property
+    def devices(self) -> tuple[str, ...]:
+        """The devices to work on: every GPU where the placement names none of them."""
+        if self.placement.device != "cuda":
+            return (self.placement.device,)
+        import torch
+
+        return tuple(f"cuda:{number}" for number in range(torch.cuda.device_count()))
+
+    @property
+    def batch(self) -> int:
+        """How many pairs a unit takes at a time: batches pay on a GPU; on a CPU they only cost memory."""
+        return CUDA_BATCH if self.placement.device.startswith("cuda") else 1
+
+    def on(self, device: str) -> "Assembly":
+        """The same on one device."""
+        return replace(self, placement=replace(self.placement, device=device))
+
     def pipeline(self) -> Pipeline:
         """A pipeline whose matchers are loaded when they are first needed."""
-        # Batches pay on a GPU; on a CPU they only cost memory.
-        return Pipeline(
-            self.recipe, self._matcher, batch=CUDA_BATCH if self.placement.device.startswith("cuda") else 1
-        )
+        return Pipeline(self.recipe, self._matcher, batch=self.batch)
 
     def fingerprint(self) -> dict[str, Any]:
         """What decides the numbers that come out: the recipe, the precision and the digests of the weights."""
@@ -153,11 +168,11 @@ def fastest_precision(device: str) -> Precision:
 
 
 def resolve_device(device: str) -> str:
-    """``auto`` becomes the first GPU or the CPU; :class:`UserError` for a GPU that is not there."""
+    """``auto`` becomes the GPUs, "cuda", or the CPU; :class:`UserError` for a GPU that is not there."""
     import torch
 
     if device == AUTO:
-        return "cuda:0" if torch.cuda.is_available() else "cpu"
+        return "cuda" if torch.cuda.is_available() else "cpu"
     if device != "cpu" and not device.startswith("cuda"):
         raise UserError(f"unknown device {device!r}; known: auto, cpu, cuda, cuda:N")
     if device.startswith("cuda") and not torch.cuda.is_available():

@@ -27,7 +27,8 @@ Regions = tuple[CriticalRegion, CriticalRegion]
 class UnitResult:
     """What one unit found on one pair, in image pixels, and what it cost in seconds.
 
-    ``failure`` is empty, or says why there are no matches.
+    ``failure`` is empty, or says why there are no matches, or why the unit ran smaller than it is written;
+    ``exhausted`` that memory was short, so that the unit may do well on fewer pairs or smaller views.
     """
 
     unit: Unit
@@ -35,6 +36,7 @@ class UnitResult:
     encode_seconds: float = 0.0
     match_seconds: float = 0.0
     failure: str = ""
+    exhausted: bool = False
 
     @property
     def seconds(self) -> float:
@@ -142,8 +144,8 @@ class Pipeline:
         try:
             return self._match_batch(unit, works)
         except Exception as error:  # whatever a matcher raises costs these pairs this unit, not the run
-            reason = f"{type(error).__name__}: {error}"
-            return [UnitResult(unit, Matches.empty(), failure=reason) for _ in works]
+            lost = UnitResult(unit, Matches.empty(), failure=reason_of(error), exhausted=is_out_of_memory(error))
+            return [lost for _ in works]
 
     def _match_batch(self, unit: Unit, works: list[PairWork]) -> list[UnitResult]:
         matcher = self._matcher(unit.matcher)
@@ -194,6 +196,17 @@ class Pipeline:
         return self._matchers[name]
 
 
+def reason_of(error: BaseException) -> str:
+    return f"{type(error).__name__}: {error}"
+
+
+def is_out_of_memory(error: BaseException) -> bool:
+    """Whether an error of Python, of OpenCV or of PyTorch, on a CPU or a GPU, says that memory is short."""
+    # PyTorch has a type for GPUs alone; on a CPU it raises a RuntimeError, and OpenCV an error of its own.
+    told = ("OutOfMemory", "can't allocate memory", "out of memory", "Insufficient memory", "Failed to allocate")
+    return isinstance(error, MemoryError) or any(sign in reason_of(error) for sign in told)
+
+
 def views_of(unit: Unit, spec: MatcherSpec, work: PairWork) -> tuple[View, View]:
     """What a unit looks at: whole images in stage 1, critical regions in stage 2."""
     if unit.stage == 1 or work.regions is None:
@@ -226,8 +239,19 @@ def finish(
     model: Model = Model.F,
     intrinsics: tuple[Matrix3, Matrix3] | None = None,
 ) -> PairMatch:
-    """The pair's two-view model from all its matches, in the recipe's order: MAGSAC's result depends on it."""
+    """The pair's two-view model from all its matches, see :func:`conclude`."""
+    return conclude(work.results, work.regions, recipe, model, intrinsics)
+
+
+def conclude(
+    results: Iterable[UnitResult],
+    regions: Regions | None,
+    recipe: Recipe,
+    model: Model = Model.F,
+    intrinsics: tuple[Matrix3, Matrix3] | None = None,
+) -> PairMatch:
+    """The two-view model from all matches of a pair, in the recipe's order: MAGSAC's result depends on it."""
     order = {unit: number for number, unit in enumerate(recipe.units)}
-    results = tuple(sorted(work.results, key=lambda result: order[result.unit]))
-    matches = Matches.concatenate(result.matches for result in results)
-    return PairMatch(results, work.regions, estimate(matches, recipe.magsac, model, intrinsics))
+    ordered = tuple(sorted(results, key=lambda result: order[result.unit]))
+    matches = Matches.concatenate(result.matches for result in ordered)
+    return PairMatch(ordered, regions, estimate(matches, recipe.magsac, model, intrinsics))

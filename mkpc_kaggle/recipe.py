@@ -16,7 +16,7 @@ from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Box, Size, View
 from mkpc_kaggle.geometry.critical_region import MkpcConfig
 from mkpc_kaggle.geometry.robust import RobustConfig
-from mkpc_kaggle.ranges import AT_LEAST_0, AT_LEAST_1, Range, check_ranges
+from mkpc_kaggle.ranges import AT_LEAST_0, AT_LEAST_1, SHARE, Range, check_ranges
 
 DIRECTORY = Path(__file__).resolve().parent / "recipes"
 AREA = re.compile(r"[1-9]\d*x[1-9]\d*")
@@ -68,6 +68,14 @@ class Unit:
         marks = ("!" if self.stretch else "") + ("~" if self.flip else "")
         return f"{self.stage}:{self.matcher}@{self.long_side or self.area}{marks}"
 
+    def shrunk(self, factor: float) -> "Unit":
+        """The same unit on views whose sides are ``factor`` times as long."""
+        if not self.area:
+            return replace(self, long_side=max(1, round(factor * self.long_side)))
+        return replace(
+            self, area="x".join(str(max(1, round(factor * int(side)))) for side in self.area.split("x"))
+        )
+
     def view(self, crop: Box, multiple: int) -> View:
         """What this unit shows of a crop, padded to a multiple."""
         if not self.area:
@@ -80,12 +88,20 @@ class Unit:
 
 @dataclass(frozen=True)
 class UpgradeConfig:
-    """Pairs with fewer inliers than ``below_inliers`` get the recipe's extra units when time is left."""
+    """Which pairs are weak, and get the recipe's extra units when time is left.
+
+    Those with fewer inliers than ``below_inliers``, those whose inliers are a smaller share of the matches than
+    ``below_share``, and, with ``uncertain``, those with an image that no critical region could be found in. It
+    ends when the pairs of a round together gained less than ``least_gain`` of the inliers that they had.
+    """
 
     below_inliers: int = 100
+    below_share: float = 0.0
+    uncertain: bool = True
+    least_gain: float = 0.01
 
     def __post_init__(self) -> None:
-        check_ranges(self, below_inliers=AT_LEAST_0)
+        check_ranges(self, below_inliers=AT_LEAST_0, below_share=SHARE, least_gain=AT_LEAST_0)
 
 
 @dataclass(frozen=True)

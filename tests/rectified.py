@@ -22,6 +22,7 @@ from mkpc_kaggle.recipe import Recipe, Unit, UpgradeConfig
 from mkpc_kaggle.run.budget import Budget
 from mkpc_kaggle.run.engine import RunReport
 from mkpc_kaggle.run.jobs import Record
+from mkpc_kaggle.run.plan import Patience
 from mkpc_kaggle.run.session import Interrupt, Session, run_pairs
 
 
@@ -31,13 +32,17 @@ class Seen:
     brightness: int
 
 
+def plenty(_: int) -> int:
+    return 150
+
+
 @dataclass
 class RectifiedMatcher:
     """``seconds`` for each pair; ``matches`` by the brightness of image 0; ``calls``: (long side, brightness)."""
 
     name: str = "rectified"
     seconds: float = 0.0
-    matches: Callable[[int], int] = lambda _: 150
+    matches: Callable[[int], int] = plenty
     calls: list[tuple[int, int]] = field(default_factory=list)
 
     @property
@@ -86,10 +91,14 @@ def run(
     limit: float = float("inf"),
     interrupt: Interrupt | None = None,
     publish: Callable[[Sequence[Record]], None] = lambda _: None,
+    workers: int = 0,
+    patience: Patience | None = None,
 ) -> RunReport:
     assembly = assemble(recipe, matchers={matcher.name: matcher}, device="cpu")
     budget = Budget(time.monotonic(), limit)
-    session = Session(work_dir, budget, interrupt or Interrupt(), progress=False)
+    session = Session(
+        work_dir, budget, interrupt or Interrupt(), progress=False, workers=workers, patience=patience
+    )
     report, _ = run_pairs(pairs, assembly, session, publish)
     return report
 

@@ -169,8 +169,10 @@ def test_a_lost_job_is_a_fault_in_the_report_and_the_others_go_on(
 
     monkeypatch.setattr(Pipeline, "match", lose_one)
     report = run(write_pairs(tmp_path, 12), THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
-    assert report.faults == ("a job was lost: MemoryError: gone",)
-    assert [bool(record.units) for record in report.records] == [False] + [True] * 11
+    assert report.faults == ("a job was lost: out of memory: MemoryError: gone",)
+    assert report.records[0].failure == "given up: out of memory: MemoryError: gone"
+    assert all(record.inliers > 400 for record in report.records[1:])
+    assert report.ending is Ending.COMPLETE
 
 
 def test_a_journal_that_cannot_be_written_does_not_stop_the_run(

@@ -162,7 +162,10 @@ def test_a_unit_shows_a_crop_at_its_size():
         ),
         (SIFT + "[mkpc]\nepsilon = 1\n", r"\[mkpc\].*'epsilon'.*eps, min_samples, share, ratio, expand_x"),
         (SIFT + "[magsac]\nmax_iters = 1\n", r"\[magsac\].*method, threshold, confidence, max_iterations"),
-        (SIFT + "[upgrade]\nbelow = 1\n", r"\[upgrade\].*'below'; known keys: below_inliers"),
+        (
+            SIFT + "[upgrade]\nbelow = 1\n",
+            r"\[upgrade\].*'below'; known keys: below_inliers, below_share, uncertain, least_gain",
+        ),
         (units('{ matcher = "sift", long_side = 640 }'), r"unit 1 lacks 'stage'"),
         ("", "no units"),
         ("units = [", "not valid TOML"),
@@ -401,3 +404,8 @@ def test_the_fingerprint_leaves_out_name_and_description():
 )
 def test_the_fingerprint_changes_with_whatever_decides_the_numbers(other):
     assert json.dumps(other.fingerprint()) != json.dumps(ALL.fingerprint())
+
+
+def test_a_unit_can_be_shrunk() -> None:
+    assert Unit(1, "sift", 1000).shrunk(0.7) == Unit(1, "sift", 700)
+    assert Unit(2, "dkm", area="540x720", stretch=True).shrunk(0.5).name == "2:dkm@270x360!"

@@ -1,9 +1,10 @@
 """Options that several commands share."""
 
 import argparse
+from math import inf
 from pathlib import Path
 
-from mkpc_kaggle.run.budget import Budget, parse_duration
+from mkpc_kaggle.run.budget import Budget, monotonic_of, parse_duration
 
 
 def add_matching(parser: argparse.ArgumentParser) -> None:
@@ -30,7 +31,7 @@ def add_matching(parser: argparse.ArgumentParser) -> None:
         "the others out, any other recipe that has them is refused (default: any)",
     )
     parser.add_argument(
-        "--device", default="auto", help="cpu, cuda, cuda:N, or auto (the default): a GPU if there is one"
+        "--device", default="auto", help="cpu, cuda, cuda:N, or auto (the default): the GPUs if there are any"
     )
     parser.add_argument(
         "--precision",
@@ -50,6 +51,26 @@ def add_mode(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_engine(parser: argparse.ArgumentParser) -> None:
+    """How the engine works."""
+    parser.add_argument(
+        "--workers",
+        type=workers,
+        metavar="N",
+        help="worker processes; 0: none, all work is done in this one (default: one for each GPU, or one for "
+        "the CPU with all its threads)",
+    )
+    parser.add_argument("--explain", action="store_true", help="say at the end what was planned when, and why")
+
+
+def workers(text: str) -> int:
+    """A number of worker processes."""
+    count = int(text)
+    if count < 0:
+        raise argparse.ArgumentTypeError("must be 0 or more")
+    return count
+
+
 def add_time_limit(parser: argparse.ArgumentParser, default: str | None) -> None:
     parser.add_argument(
         "--time-limit",
@@ -58,9 +79,15 @@ def add_time_limit(parser: argparse.ArgumentParser, default: str | None) -> None
         help="such as 8h45m, 90m or 60s, counted from the start of the program; the run ends before it is over, "
         f"and uses the time to run as many units as fit (default: {default or 'none'})",
     )
+    parser.add_argument(
+        "--started-at",
+        type=float,
+        metavar="SECONDS",
+        help="count the limit from this moment instead, in seconds since 1970: a notebook that started before "
+        "gives the time.time() of its first cell, a script $(date +%%s)",
+    )
 
 
 def budget_of(arguments: argparse.Namespace) -> Budget:
-    if arguments.time_limit is None:
-        return Budget(arguments.started)
-    return Budget(arguments.started, parse_duration(arguments.time_limit))
+    started = arguments.started if arguments.started_at is None else monotonic_of(arguments.started_at)
+    return Budget(started, inf if arguments.time_limit is None else parse_duration(arguments.time_limit))

@@ -16,7 +16,8 @@ submission.csv is complete from the start: pairs that were not reached hold a fa
 version is better. Killed at any point, the same command goes on where it was (its journal lies in the work
 directory). Ctrl-C and SIGTERM end the run early with a valid file.
 
-Exit status: 0 done, or the time was up; 2 bad input; 130 or 143 ended by a signal (the file is valid).
+Exit status: 0 done, or the time was up; 1 the last version of the file could not be written (a full disk, say;
+an earlier one is there); 2 bad input; 130 or 143 ended by a signal (the file is valid).
 """
 
 
@@ -32,6 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     options.add_matching(parser)
     options.add_mode(parser)
     options.add_time_limit(parser, default="8h45m")
+    options.add_engine(parser)
     parser.add_argument(
         "--work-dir", type=Path, metavar="DIR", help="for the journal; default: beside the output, NAME.work"
     )
@@ -67,12 +69,17 @@ def run(arguments: argparse.Namespace) -> int:
         )
         work_dir = arguments.work_dir or output.with_name(f"{output.stem}.work")
         print(f"{len(pairs)} pairs, recipe {assembly.recipe.name}, {assembly.placement}, journal in {work_dir}")
-        session = Session(work_dir, budget, interrupt, arguments.fresh)
+        session = Session(work_dir, budget, interrupt, arguments.fresh, workers=arguments.workers, guarded=True)
         report, at_rest = submit(pairs, assembly, session, output)
+        if arguments.explain:
+            print("\n".join(["plan:", *map(str, report.explanations)]))
         print(summary(pairs, report, assembly.left_out))
-        print(f"submission: {output}")
+        print(
+            f"submission: {output}" + (f" is not the last version: {report.unwritten}" if report.unwritten else "")
+        )
         if not arguments.no_report:
             page = arguments.report or output.with_suffix(".html")
             ends = time.monotonic() + GRACE_SECONDS if interrupt.signal else budget.started + budget.limit
             print(report_run(work_dir, page, ends, pairs), flush=True)
-        return leave(128 + interrupt.signal if interrupt.signal else 0, at_rest=at_rest)
+        status = 128 + interrupt.signal if interrupt.signal else int(bool(report.unwritten))
+        return leave(status, at_rest=at_rest)

@@ -29,6 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     options.add_matching(parser)
     options.add_mode(parser)
     options.add_time_limit(parser, default=None)
+    options.add_engine(parser)
     parser.add_argument("--json", type=Path, metavar="FILE", help="write all figures, per pair too")
     parser.add_argument(
         "--work-dir", type=Path, metavar="DIR", help="keep the journal there; default: a temporary one"
@@ -81,10 +82,12 @@ def _match_and_score(arguments: argparse.Namespace, scenes: "tuple[Scene, ...]",
             mode=Mode(arguments.mode),
             licence=Licence(arguments.licence),
         )
-        session = Session(work_dir, options.budget_of(arguments), interrupt)
+        session = Session(work_dir, options.budget_of(arguments), interrupt, workers=arguments.workers)
         validation, at_rest = validate(scenes, assembly, session)
     pairs = [true.pair for scene in scenes for true in scene.pairs]
     assert validation.report is not None
+    if arguments.explain:
+        print("\n".join(["plan:", *map(str, validation.report.explanations)]))
     print(summary(pairs, validation.report, assembly.left_out))
     print(f"\nrecipe {validation.recipe}")
     print("\n".join(score_table(validation)))

@@ -1,30 +1,26 @@
-"""The engine: sweep, deepen, upgrade; every result is journalled, every version of the submission is whole."""
+"""The engine: plans, jobs and results, journalled as they come; every version of the submission is whole."""
 
 import sqlite3
 import threading
-import time
-from collections import Counter, deque
-from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import Future, wait
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from math import isfinite
-from typing import Any
+from typing import Any, Protocol
 
 from tqdm import tqdm
 
 from mkpc_kaggle.competition import Pair
+from mkpc_kaggle.pipeline import UnitResult
 from mkpc_kaggle.recipe import Recipe, Unit
-from mkpc_kaggle.run.budget import Budget, Costs, format_duration, longest_prefix
-from mkpc_kaggle.run.jobs import Job, JobResult, Outcome, Phase, Record, Task, chunks, visiting_order
-from mkpc_kaggle.run.journal import Journal
-from mkpc_kaggle.run.worker import Worker
+from mkpc_kaggle.run.budget import Budget, format_duration
+from mkpc_kaggle.run.jobs import Finished, Job, Lost, Outcome, Phase, Plan, Record, Task, visiting_order
+from mkpc_kaggle.run.plan import Explanation, Patience, Planner
+from mkpc_kaggle.run.pool import Pool
 
-IN_FLIGHT = 2
-"""Jobs a worker holds: one is matched while F is estimated for the other."""
 PUBLISH_SECONDS = 30.0
-EXPLORE_SHARE = 0.25
-"""The share of the time left that may be spent to learn what units cost that never ran."""
+LISTEN_SECONDS = 0.2
+"""How often an interrupt is looked for."""
 GRACE_SECONDS = 5.0
 """How long an interrupted run waits for the unit that is running."""
 
@@ -35,13 +31,15 @@ class Ending(StrEnum):
     COMPLETE = "complete"
     TIME_IS_UP = "time is up"
     INTERRUPTED = "interrupted"
+    NO_WORKER = "no worker left"
 
 
 @dataclass(frozen=True)
 class RunReport:
     """What a run leaves behind: a record for every pair, in their order, and how it went.
 
-    ``resumed`` pairs were done by earlier runs; ``faults`` are jobs that were lost, with their reasons.
+    ``resumed`` pairs were done by earlier runs; ``faults`` are jobs that were lost and files that could not be
+    written, with their reasons; ``unwritten`` says why the last version of the submission could not be.
     """
 
     records: tuple[Record, ...]
@@ -49,6 +47,20 @@ class RunReport:
     seconds: float
     resumed: int
     faults: tuple[str, ...]
+    explanations: tuple[Explanation, ...] = ()
+    unwritten: str = ""
+
+
+class Diary(Protocol):
+    """What the engine wants of a journal."""
+
+    def records(self) -> dict[int, Record]: ...
+
+    def results(self, pair: int, units: Mapping[str, Unit]) -> tuple[UnitResult, ...]: ...
+
+    def save(self, outcomes: list[tuple[Outcome, bool]]) -> None: ...
+
+    def note(self, kind: str, seconds: float, text: str) -> None: ...
 
 
 class Engine:
@@ -62,190 +74,172 @@ class Engine:
         self,
         pairs: Sequence[Pair],
         recipe: Recipe,
-        worker: Worker,
-        journal: Journal,
+        pool: Pool,
+        journal: Diary,
         budget: Budget,
         *,
         publish: Callable[[Sequence[Record]], None],
         interrupt: threading.Event,
         progress: bool = True,
+        patience: Patience | None = None,
     ) -> None:
         self.pairs = pairs
         self.recipe = recipe
-        self.worker = worker
+        self.pool = pool
         self.journal = journal
         self.budget = budget
         self.publish = publish
         self.interrupt = interrupt
-        self.progress = progress
-        self.costs = Costs()
-        self.records = [Record.untouched(index) for index in range(len(pairs))]
         self.faults: list[str] = []
+        self.unwritten = ""
         self._units = {unit.name: unit for unit in recipe.units}
-        self._in_flight: deque[Future[JobResult]] = deque()
-        self._published = time.monotonic()
-        self._last_result = time.monotonic()
+        self._unjournalled: dict[int, tuple[UnitResult, ...]] = {}
+        self._out = self._explained = 0
+        self._published = budget.clock()
         self._wait_until = budget.end
+        self._bar = Bar(budget) if progress else None
+        self._publishing = threading.Lock()
+        self.planner = self._planner(patience)
 
     def run(self) -> RunReport:
-        """Run until all is done, the time is up, or an interrupt; raises only what the worker's start raises."""
-        for index, record in self.journal.records().items():
-            self.records[index] = record
-        resumed = sum(not self._lacking(record, self.recipe.regular) for record in self.records)
+        """Run until all is done, the time is up, or an interrupt; raises only what the pool's start raises."""
+        records = self.planner.records
+        resumed = sum(not record.lacking(self.recipe.regular) for record in records)
         self._publish()
-        if any(self._wanted(record) for record in self.records):
-            self.worker.start()
-        for phase in (self._sweep, self._deepen, self._upgrade):
-            if self._may_go_on():
-                phase()
+        if any(self.planner.wanted(record) for record in records):
+            self.pool.start()
+            self._work()
+            self._wait()
+        if self._bar is not None:
+            self._bar.close()
         self._publish()
-        seconds = time.monotonic() - self.budget.started
-        return RunReport(tuple(self.records), self._ending(), seconds, resumed, tuple(self.faults))
-
-    def _sweep(self) -> None:
-        """The recipe's first unit on all pairs: an F for every pair, early."""
-        first = self.recipe.units[:1]
-        self._pass(Phase.SWEEP, chunks(visiting_order(self.pairs)), lambda _: first)
-
-    def _deepen(self) -> None:
-        """The other units, chunk by chunk: as many as let all remaining pairs have them."""
-        self._pass(Phase.DEEPEN, chunks(visiting_order(self.pairs)), self._units_that_fit)
-
-    def _upgrade(self) -> None:
-        """What was left out, the weakest pairs first, and for weak ones the extra units."""
-        weakest = sorted(self._touched(), key=lambda record: (record.inliers, record.index))
-        wanting = [record for record in weakest if self._wanted(record)]
-        weak = [record.index for record in wanting if self._weak(record)]
-        strong = [record.index for record in wanting if not self._weak(record)]
-        self._pass(Phase.UPGRADE, chunks(weak), lambda _: self.recipe.units)
-        self._pass(Phase.UPGRADE, chunks(strong), lambda _: self.recipe.regular)
-
-    def _pass(
-        self,
-        phase: Phase,
-        planned: Iterable[tuple[int, ...]],
-        choose: Callable[[tuple[int, ...]], tuple[Unit, ...]],
-    ) -> None:
-        """Hand out the planned chunks with the units that ``choose`` gives each, and gather the results."""
-        planned = list(planned)
-        total = sum(map(len, planned))
-        with tqdm(total=total, desc=phase, unit="pair", disable=not self.progress or total == 0) as bar:
-            for indices in planned:
-                self._gather(bar, leave=IN_FLIGHT - 1)
-                if not self._may_go_on():
-                    break
-                units = choose(indices)
-                todo = [index for index in indices if self._lacking(self.records[index], units)]
-                bar.update(len(indices) - len(todo))
-                if todo:
-                    self._hand_out(phase, todo, units, bar)
-            self._gather(bar, leave=0)
-
-    def _units_that_fit(self, indices: tuple[int, ...]) -> tuple[Unit, ...]:
-        regular = self.recipe.regular
-        lacking: Counter[str] = Counter()
-        for record in self._touched():
-            lacking.update(unit.name for unit in self._lacking(record, regular))
-        count = longest_prefix(regular, lacking, self.costs, self.budget.left())
-        return regular[:count]
-
-    def _hand_out(self, phase: Phase, indices: list[int], units: tuple[Unit, ...], bar: "tqdm[Any]") -> None:
-        lacking = {unit for index in indices for unit in self._lacking(self.records[index], units)}
-        unknown = [unit for unit in units if unit in lacking and not self.costs.known(unit.name)]
-        if not unknown:
-            self._submit(phase, indices, units, self.budget.stop)
-            return
-        # What has no known cost cannot be planned: try it on this chunk alone, within an allowance.
-        self._gather(bar, leave=0)
-        allowance = EXPLORE_SHARE * self.budget.left()
-        deadline = time.monotonic() + allowance
-        self._submit(phase, indices, units, deadline)
-        self._gather(bar, leave=0)
-        if time.monotonic() >= deadline:
-            for unit in unknown:
-                self.costs.suppose(unit.name, allowance)
-
-    def _submit(self, phase: Phase, indices: list[int], units: tuple[Unit, ...], deadline: float) -> None:
-        tasks = tuple(
-            Task(index, self.pairs[index], self.journal.results(index, self._units)) for index in indices
+        self._note_explanations()
+        return RunReport(
+            tuple(records),
+            self._ending(),
+            self.budget.spent(),
+            resumed,
+            tuple(self.faults),
+            tuple(self.planner.explanations),
+            self.unwritten,
         )
-        expected = tuple(self.costs.of(unit.name) for unit in units)
-        if not self._in_flight:
-            self._last_result = time.monotonic()
-        self._in_flight.append(self.worker.submit(Job(phase, tasks, units, expected, deadline)))
 
-    def _gather(self, bar: "tqdm[Any]", leave: int) -> None:
-        """Wait for the oldest jobs until only ``leave`` are in flight."""
-        while len(self._in_flight) > leave:
-            future = self._in_flight.popleft()
-            if not self._arrived(future):
-                self._in_flight.clear()
+    def save_what_there_is(self, seconds: float) -> None:
+        """Write the submission from another thread, unless the engine's own is at it for longer than that."""
+        if self._publishing.acquire(timeout=seconds):
+            self.publish(list(self.planner.records))
+
+    def _planner(self, patience: Patience | None) -> Planner:
+        records = [Record.untouched(index) for index in range(len(self.pairs))]
+        for index, record in self.journal.records().items():
+            records[index] = record
+        return Planner(visiting_order(self.pairs), self.recipe, records, self.budget, patience=patience)
+
+    def _work(self) -> None:
+        """Hand out what is planned as long as there is room, and gather what comes back."""
+        while not self.interrupt.is_set() and self.budget.left() > 0:
+            self.planner.workers = max(1, self.pool.workers)
+            while self._out < self.pool.capacity:
+                plan = self.planner.next(self.budget.clock())
+                if plan is None:
+                    break
+                self._hand_out(plan)
+            if self._out == 0:
                 return
-            error = future.exception()
-            if error is not None:
-                self._fault(f"a job was lost: {type(error).__name__}: {error}")
-                continue
-            self._take(future.result())
-            bar.update(len(future.result().outcomes))
-            if isfinite(self.budget.limit):
-                bar.set_postfix_str(f"budget left {format_duration(self.budget.left())}")
-            if time.monotonic() - self._published > PUBLISH_SECONDS:
-                self._publish()
+            self._gather()
 
-    def _arrived(self, future: "Future[JobResult]") -> bool:
-        """Wait for a job, until the time is up or an interrupt's grace has passed."""
-        while not future.done() and time.monotonic() < self._wait_until:
-            wait([future], timeout=0.2)
-            if self.interrupt.is_set():
-                self.worker.stop()
-                self._wait_until = min(self._wait_until, time.monotonic() + GRACE_SECONDS)
-        return future.done()
+    def _wait(self) -> None:
+        """Let what is under way end, until nothing is waited for any longer."""
+        while self._out > 0 and self.budget.clock() < self._wait_until:
+            if self.interrupt.is_set() and self._wait_until == self.budget.end:
+                self.pool.stop()
+                self._wait_until = min(self._wait_until, self.budget.clock() + GRACE_SECONDS)
+            self._gather()
 
-    def _take(self, result: JobResult) -> None:
-        gained = [outcome for outcome in result.outcomes if self._gains(outcome)]
+    def _hand_out(self, plan: Plan) -> None:
+        self._out += 1
+        self.pool.submit(
+            Job(plan, tuple(Task(index, self.pairs[index], self._results(index)) for index in plan.indices))
+        )
+
+    def _results(self, index: int) -> tuple[UnitResult, ...]:
+        """What earlier jobs found on a pair."""
+        if not self.planner.records[index].units:
+            return ()
+        if index in self._unjournalled:
+            return self._unjournalled[index]
         try:
-            self.journal.save([(outcome, not self._wanted(outcome.record)) for outcome in gained])
+            return self.journal.results(index, self._units)
+        except sqlite3.Error as error:  # without its former results a job gains nothing, and the F stays
+            self._fault(f"the journal cannot be read ({error})")
+            return ()
+
+    def _gather(self) -> None:
+        """Take one job back, if one comes."""
+        back = self.pool.next(min(self.budget.clock() + LISTEN_SECONDS, self._wait_until))
+        if back is None:
+            return
+        self._out -= 1
+        now = self.budget.clock()
+        if isinstance(back, Lost):
+            self._fault(f"a job was lost: {back}")
+            self._keep(self.planner.lose(back, now))
+        else:
+            self._keep(self.planner.take(back, now))
+            self._note_job(back)
+        self._note_explanations()
+        if self._bar is not None:
+            self._bar.show(*self.planner.progress)
+        if now - self._published > PUBLISH_SECONDS:
+            self._publish()
+
+    def _keep(self, outcomes: Sequence[Outcome]) -> None:
+        """Put outcomes into the journal; into memory those that it cannot take."""
+        if not outcomes:
+            return
+        settled = [not self.planner.wanted(outcome.record) for outcome in outcomes]
+        try:
+            former = [self._unjournalled.get(outcome.record.index, ()) for outcome in outcomes]
+            whole = [
+                Outcome(outcome.record, before + outcome.results)
+                for outcome, before in zip(outcomes, former, strict=True)
+            ]
+            self.journal.save(list(zip(whole, settled, strict=True)))
         except sqlite3.Error as error:
             self._fault(f"the journal cannot be written ({error}): an interrupted run would have to do this again")
-        for outcome in gained:
-            self.records[outcome.record.index] = outcome.record
-        measured = result.measured()
-        for unit, seconds in measured:
-            self.costs.observe(unit, seconds)
-        now = time.monotonic()
-        if measured:
-            waited = now - self._last_result - sum(seconds for _, seconds in measured)
-            self.costs.observe_overhead(waited / len(result.outcomes))
-        self._last_result = now
+            for outcome, done in zip(outcomes, settled, strict=True):
+                index = outcome.record.index
+                self._unjournalled[index] = () if done else self._results(index) + outcome.results
+            return
+        for outcome in outcomes:
+            self._unjournalled.pop(outcome.record.index, None)
 
-    def _gains(self, outcome: Outcome) -> bool:
-        """Whether a job brought anything: a unit more, or the reason why there can be none."""
-        record, former = outcome.record, self.records[outcome.record.index]
-        return len(record.units) > len(former.units) or (record.reached and not former.reached)
+    def _note_job(self, back: Finished) -> None:
+        plan = back.job.plan
+        seconds = sum(seconds for _, seconds in back.measured())
+        self._note("budget", plan.phase)
+        self._note("job", f"{plan.phase} {len(plan.indices)} pairs {seconds:.3f} s")
 
-    def _lacking(self, record: Record, units: Iterable[Unit]) -> list[Unit]:
-        return [unit for unit in units if not record.has(unit)]
+    def _note_explanations(self) -> None:
+        for one in self.planner.explanations[self._explained :]:
+            self._note("plan", one.text, one.seconds)
+        self._explained = len(self.planner.explanations)
 
-    def _wanted(self, record: Record) -> list[Unit]:
-        """The units that a pair shall have if there is time: the extra ones only where it is weak."""
-        return self._lacking(record, self.recipe.units if self._weak(record) else self.recipe.regular)
-
-    def _weak(self, record: Record) -> bool:
-        return record.inliers < self.recipe.upgrade.below_inliers
-
-    def _touched(self) -> list[Record]:
-        """The pairs that can be worked on: those whose images the sweep could read."""
-        return [record for record in self.records if record.units]
-
-    def _may_go_on(self) -> bool:
-        return not self.interrupt.is_set() and self.budget.left() > 0
+    def _note(self, kind: str, text: str, seconds: float | None = None) -> None:
+        try:
+            self.journal.note(kind, self.budget.spent() if seconds is None else seconds, text)
+        except sqlite3.Error as error:
+            self._fault(f"the journal cannot be written ({error}): an interrupted run would have to do this again")
 
     def _publish(self) -> None:
-        try:
-            self.publish(self.records)
-        except OSError as error:
-            self._fault(f"the submission cannot be written: {error}")
-        self._published = time.monotonic()
+        with self._publishing:
+            try:
+                self.publish(self.planner.records)
+                self.unwritten = ""
+            except OSError as error:
+                self.unwritten = f"the submission cannot be written: {error}"
+                self._fault(self.unwritten)
+        self._published = self.budget.clock()
 
     def _fault(self, what: str) -> None:
         if what not in self.faults:
@@ -254,5 +248,28 @@ class Engine:
     def _ending(self) -> Ending:
         if self.interrupt.is_set():
             return Ending.INTERRUPTED
-        finished = all(record.reached and not (record.units and self._wanted(record)) for record in self.records)
-        return Ending.COMPLETE if finished else Ending.TIME_IS_UP
+        if self.planner.complete:
+            return Ending.COMPLETE
+        return Ending.TIME_IS_UP if self.pool.workers else Ending.NO_WORKER
+
+
+class Bar:
+    """The progress of the present pass, on the terminal."""
+
+    def __init__(self, budget: Budget) -> None:
+        self._budget = budget
+        self._bar: tqdm[Any] | None = None
+        self._phase: Phase | None = None
+
+    def show(self, phase: Phase, done: int, total: int) -> None:
+        if phase is not self._phase:
+            self.close()
+            self._bar, self._phase = tqdm(total=total, desc=phase, unit="pair"), phase
+        assert self._bar is not None
+        if isfinite(self._budget.limit):
+            self._bar.set_postfix_str(f"budget left {format_duration(self._budget.left())}", refresh=False)
+        self._bar.update(done - self._bar.n)
+
+    def close(self) -> None:
+        if self._bar is not None:
+            self._bar.close()

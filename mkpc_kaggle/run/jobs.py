@@ -9,7 +9,7 @@ import numpy as np
 from mkpc_kaggle.competition import Pair
 from mkpc_kaggle.geometry.critical_region import CriticalRegion
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL, Matrix3
-from mkpc_kaggle.pipeline import PairMatch, UnitResult
+from mkpc_kaggle.pipeline import PairMatch, Regions, UnitResult
 from mkpc_kaggle.recipe import Unit
 
 CHUNK = 8
@@ -28,6 +28,30 @@ class Phase(StrEnum):
 
 
 @dataclass(frozen=True)
+class Plan:
+    """What to do next: ``units`` on the pairs of ``indices``, those that a pair has had left out.
+
+    ``expected`` are the seconds within which each unit most likely ends on a pair. No unit is begun that is
+    expected to end after ``deadline``, in seconds of the parent's clock. A worker that begins no unit and does not
+    answer for ``timeout`` seconds hangs. The views' sides are ``shrink`` times as long as the units say.
+    """
+
+    phase: Phase
+    indices: tuple[int, ...]
+    units: tuple[Unit, ...]
+    expected: tuple[float, ...]
+    deadline: float
+    timeout: float
+    shrink: float = 1.0
+    exploring: bool = False
+
+    @property
+    def note(self) -> str:
+        """What the units' records say of it; empty for units that run as they are written."""
+        return f"ran at {self.shrink:.2g} of its size, the worker failed at more" if self.shrink < 1 else ""
+
+
+@dataclass(frozen=True)
 class Task:
     """One pair of a job, with what earlier jobs found on it."""
 
@@ -38,17 +62,24 @@ class Task:
 
 @dataclass(frozen=True)
 class Job:
-    """Run ``units`` on ``tasks``, those that a task has results of left out.
+    """A plan with its pairs: all that a worker is told."""
 
-    No unit is begun that is expected to end after ``deadline`` (seconds of the monotonic clock);
-    ``expected`` are the seconds that each unit is expected to take on a pair.
+    plan: Plan
+    tasks: tuple[Task, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Matched:
+    """What a worker found on one task: the results of the units that it ran, without earlier ones.
+
+    ``failure`` is empty, or says which image cannot be read.
     """
 
-    phase: Phase
-    tasks: tuple[Task, ...]
-    units: tuple[Unit, ...]
-    expected: tuple[float, ...]
-    deadline: float
+    results: tuple[UnitResult, ...] = ()
+    regions: Regions | None = None
+    decode_seconds: float = 0.0
+    cluster_seconds: float = 0.0
+    failure: str = ""
 
 
 @dataclass(frozen=True)
@@ -69,6 +100,7 @@ class Record:
     """What is known of one pair: its F and how it came about.
 
     ``failure`` is empty, or says why ``F`` is the fallback. The seconds are those of the last job on the pair.
+    ``before`` is the number of inliers that it had when it was first upgraded; ``None`` if it never was.
     """
 
     index: int
@@ -79,6 +111,7 @@ class Record:
     decode_seconds: float = 0.0
     cluster_seconds: float = 0.0
     estimate_seconds: float = 0.0
+    before: int | None = None
 
     @classmethod
     def untouched(cls, index: int, reason: str = NOT_REACHED) -> "Record":
@@ -99,17 +132,22 @@ class Record:
     def has(self, unit: Unit) -> bool:
         return any(record.unit == unit.name for record in self.units)
 
+    def lacking(self, units: Iterable[Unit]) -> list[Unit]:
+        """Those of ``units`` that the pair has not had."""
+        had = {record.unit for record in self.units}
+        return [unit for unit in units if unit.name not in had]
+
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a job made of one task: the record to keep, and the results that later jobs may build on."""
+    """What became of one task: the record to keep, and the new results that later jobs may build on."""
 
     record: Record
     results: tuple[UnitResult, ...] = ()
 
 
 @dataclass(frozen=True)
-class JobResult:
+class Finished:
     """The outcomes of a job, one a task, in order."""
 
     job: Job
@@ -117,12 +155,29 @@ class JobResult:
 
     def measured(self) -> list[tuple[str, float]]:
         """Unit name and seconds of every unit that this job ran on a pair."""
-        return [
-            (result.unit.name, result.seconds)
-            for task, outcome in zip(self.job.tasks, self.outcomes, strict=True)
-            for result in outcome.results
-            if result.unit not in {before.unit for before in task.results}
-        ]
+        return [(result.unit.name, result.seconds) for outcome in self.outcomes for result in outcome.results]
+
+
+class Cause(StrEnum):
+    """Why a job was lost."""
+
+    DIED = "the worker died"
+    HUNG = "the worker hung"
+    OUT_OF_MEMORY = "out of memory"
+    RAISED = "the worker failed"
+    NO_WORKER = "no worker could be started"
+
+
+@dataclass(frozen=True)
+class Lost:
+    """A job that brought nothing, and why."""
+
+    job: Job
+    cause: Cause
+    text: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.cause}: {self.text}" if self.text else str(self.cause)
 
 
 def record_of(index: int, match: PairMatch, *, decode: float, cluster: float, estimate: float) -> Record:

@@ -1,13 +1,15 @@
 """The durable record of a run: an SQLite file that only the parent writes, one transaction a job.
 
 Tables: ``run`` (what the journal belongs to and who wrote it), ``sample`` (the ids of the pairs), ``pair`` (F,
-failure, seconds), ``unit`` (counts and seconds of each unit on each pair, and its points while a later pass may
-build on them or the report may draw them), ``region`` (the critical regions), ``event`` (what happened when).
+failure, seconds, inliers before an upgrade), ``unit`` (counts and seconds of each unit on each pair, and its
+points while a later pass may build on them or the report may draw them), ``region`` (the critical regions),
+``event`` (what happened when).
 """
 
 import json
 import os
 import sqlite3
+import zlib
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
@@ -39,10 +41,10 @@ CREATE TABLE IF NOT EXISTS sample (
     pair INTEGER PRIMARY KEY, id TEXT NOT NULL, "group" TEXT NOT NULL, image0 TEXT NOT NULL, image1 TEXT NOT NULL);
 CREATE TABLE IF NOT EXISTS pair (
     pair INTEGER PRIMARY KEY, fundamental BLOB NOT NULL, failure TEXT NOT NULL,
-    decode_seconds REAL, cluster_seconds REAL, estimate_seconds REAL);
+    decode_seconds REAL, cluster_seconds REAL, estimate_seconds REAL, before INTEGER);
 CREATE TABLE IF NOT EXISTS unit (
     pair INTEGER, unit TEXT, stage INTEGER, matches INTEGER, inliers INTEGER,
-    encode_seconds REAL, match_seconds REAL, failure TEXT, points BLOB, place INTEGER,
+    encode_seconds REAL, match_seconds REAL, failure TEXT, place INTEGER, points BLOB,
     PRIMARY KEY (pair, unit));
 CREATE TABLE IF NOT EXISTS region (
     pair INTEGER, image INTEGER, "left" INTEGER, top INTEGER, "right" INTEGER, bottom INTEGER,
@@ -109,7 +111,7 @@ class _Tables:
         ):
             region = CriticalRegion(Box(left, top, right, bottom), RegionReason(reason), *counts)
             regions.setdefault(pair, []).append(region)
-        columns = "pair, fundamental, failure, decode_seconds, cluster_seconds, estimate_seconds"
+        columns = "pair, fundamental, failure, decode_seconds, cluster_seconds, estimate_seconds, before"
         return {
             pair: Record(
                 pair,
@@ -221,7 +223,8 @@ class Journal(_Tables):
     def save(self, outcomes: list[tuple[Outcome, bool]]) -> None:
         """Put down a job's outcomes, all or none; the points of those marked True no later job needs.
 
-        Of these, the weakest keep them for the report: at most :data:`DRAWN` of one session.
+        Of these, the weakest keep them for the report: at most :data:`DRAWN` of one session. An outcome's results
+        may be the new ones alone: what was put down of others stays.
         """
         drawn = dict(self._drawn)
         with self._db:
@@ -259,7 +262,7 @@ class Journal(_Tables):
     def _save(self, outcome: Outcome, settled: bool) -> None:
         record = outcome.record
         self._db.execute(
-            "REPLACE INTO pair VALUES (?, ?, ?, ?, ?, ?)",
+            "REPLACE INTO pair VALUES (?, ?, ?, ?, ?, ?, ?)",
             [
                 record.index,
                 np.ascontiguousarray(record.F, np.float64).tobytes(),
@@ -267,11 +270,17 @@ class Journal(_Tables):
                 record.decode_seconds,
                 record.cluster_seconds,
                 record.estimate_seconds,
+                record.before,
             ],
         )
-        points = {result.unit.name: _blob(result.matches) for result in outcome.results}
+        points = {} if settled else {result.unit.name: _blob(result.matches) for result in outcome.results}
+        if settled:
+            self._db.execute("UPDATE unit SET points = NULL WHERE pair = ?", [record.index])
         self._db.executemany(
-            "REPLACE INTO unit VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+            "INSERT INTO unit VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?) ON CONFLICT DO UPDATE SET "
+            "matches = excluded.matches, inliers = excluded.inliers, encode_seconds = excluded.encode_seconds, "
+            "match_seconds = excluded.match_seconds, failure = excluded.failure, place = excluded.place, "
+            "points = coalesce(excluded.points, points)",
             [
                 [
                     record.index,
@@ -282,8 +291,8 @@ class Journal(_Tables):
                     unit.encode_seconds,
                     unit.match_seconds,
                     unit.failure,
-                    None if settled else points[unit.unit],
                     place,
+                    points.get(unit.unit),
                 ]
                 for place, unit in enumerate(record.units)
             ],
@@ -358,9 +367,13 @@ def _told(db: sqlite3.Connection) -> dict[str, Any]:
 
 
 def _blob(matches: Matches) -> bytes:
-    return np.column_stack([matches.points0, matches.points1, matches.scores]).tobytes()
+    """All float32 values, column by column, first bytes first: those of like size are alike, and deflate well."""
+    table = np.column_stack([matches.points0, matches.points1, matches.scores])
+    columns = np.ascontiguousarray(table.T).view(np.uint8).reshape(-1, 4)
+    return zlib.compress(columns.T.tobytes(), level=1)
 
 
 def _matches(blob: bytes | None) -> Matches:
-    table = np.frombuffer(blob or b"", np.float32).reshape(-1, 5)
-    return Matches(table[:, :2], table[:, 2:4], table[:, 4])
+    planes = np.frombuffer(zlib.decompress(blob) if blob else b"", np.uint8).reshape(4, -1)
+    table = np.ascontiguousarray(planes.T).view(np.float32).reshape(5, -1)
+    return Matches(table[:2].T, table[2:4].T, table[4])

@@ -1,11 +1,11 @@
-"""One run from its parts: journal, worker and engine opened, used and let go of."""
+"""One run from its parts: journal, pool and engine opened, used and let go of."""
 
 import hashlib
+import os
 import platform
 import signal
 import sqlite3
 import threading
-import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -22,9 +22,12 @@ from mkpc_kaggle.assembly import Assembly
 from mkpc_kaggle.competition import Pair
 from mkpc_kaggle.run.budget import Budget
 from mkpc_kaggle.run.engine import Engine, RunReport
+from mkpc_kaggle.run.in_process import InProcessPool
 from mkpc_kaggle.run.jobs import Record
 from mkpc_kaggle.run.journal import About, EventKind, Journal
-from mkpc_kaggle.run.worker import InProcessWorker
+from mkpc_kaggle.run.plan import Patience
+from mkpc_kaggle.run.pool import Pool
+from mkpc_kaggle.run.processes import ProcessPool, Seat
 
 
 class Interrupt(threading.Event):
@@ -35,13 +38,20 @@ class Interrupt(threading.Event):
 
 @dataclass(frozen=True)
 class Session:
-    """What a run needs besides its pairs and its recipe."""
+    """What a run needs besides its pairs and its recipe.
+
+    ``workers`` is the number of worker processes; 0: none, the work is done in this one; ``None``: one a
+    device. ``guarded``: at the budget's last moment the process leaves, whatever hangs.
+    """
 
     work_dir: Path
     budget: Budget
     interrupt: Interrupt
     fresh: bool = False
     progress: bool = True
+    workers: int | None = 0
+    guarded: bool = False
+    patience: Patience | None = None
 
 
 def run_pairs(
@@ -58,24 +68,26 @@ def run_pairs(
     belongs_to = {"test set": digest_of(pairs), **assembly.fingerprint()}
     about = about_run(assembly, session.budget)
     journal = Journal(session.work_dir, belongs_to, pairs=pairs, about=about, fresh=session.fresh)
-    journal.note(EventKind.START, time.monotonic() - session.budget.started, "")
-    worker = InProcessWorker(assembly.pipeline)
-    try:
-        engine = Engine(
-            pairs,
-            assembly.recipe,
-            worker,
-            journal,
-            session.budget,
-            publish=publish,
-            interrupt=session.interrupt,
-            progress=session.progress,
-        )
-        report = engine.run()
-        journal.note(EventKind.END, report.seconds, report.ending)
-    finally:
-        at_rest = worker.close()
-        journal.close()
+    journal.note(EventKind.START, session.budget.spent(), "")
+    pool = pool_of(assembly, session.workers)
+    engine = Engine(
+        pairs,
+        assembly.recipe,
+        pool,
+        journal,
+        session.budget,
+        publish=publish,
+        interrupt=session.interrupt,
+        progress=session.progress,
+        patience=session.patience or Patience(batch=assembly.batch),
+    )
+    with watched(engine, session):
+        try:
+            report = engine.run()
+            journal.note(EventKind.END, report.seconds, report.ending)
+        finally:
+            at_rest = pool.close()
+            journal.close()
     return report, at_rest
 
 
@@ -100,6 +112,42 @@ def versions() -> dict[str, str]:
         "NumPy": np.__version__,
         "SQLite": sqlite3.sqlite_version,
     }
+
+
+def pool_of(assembly: Assembly, workers: int | None) -> Pool:
+    """One process a device, or as many as are asked for, in turn on each device; or none."""
+    if workers == 0:
+        return InProcessPool(assembly.pipeline, assembly.recipe)
+    # On a CPU one process with all threads, unless more are asked for: two with half of them each were no faster.
+    devices = assembly.devices
+    places = [devices[number % len(devices)] for number in range(workers or len(devices))]
+    share = len(places) if devices == ("cpu",) else 1
+    seats = [Seat(f"{place} {number}", assembly.on(place).pipeline, share) for number, place in enumerate(places)]
+    return ProcessPool(seats, assembly.recipe)
+
+
+@contextmanager
+def watched(engine: Engine, session: Session) -> Iterator[None]:
+    """Leave the process at the budget's last moment, the submission written, if the run has not ended by then.
+
+    A thread does it, so that it helps wherever the others are stuck, short of holding the interpreter's lock:
+    that only a matcher in the engine's own process can do. Worker processes end with this one.
+    """
+    budget, over = session.budget, threading.Event()
+
+    def leave_in_the_end() -> None:
+        if not over.wait(budget.last - budget.clock()):
+            try:
+                engine.save_what_there_is(budget.reserve / 16)
+            finally:
+                os._exit(128 + session.interrupt.signal if session.interrupt.signal else 0)
+
+    if session.guarded and isfinite(budget.limit):
+        threading.Thread(target=leave_in_the_end, name="watchdog", daemon=True).start()
+    try:
+        yield
+    finally:
+        over.set()
 
 
 def digest_of(pairs: Sequence[Pair]) -> str:

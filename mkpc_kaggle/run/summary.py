@@ -39,6 +39,7 @@ def account(
     lines += unit_table(records)
     lines += _counts("critical regions", (str(r.reason) for record in records for r in record.regions or ()))
     lines += _time_lines(records)
+    lines += _upgrade_lines(records)
     if left_out:
         lines.append(f"units left out, their weights are missing or not permitted: {', '.join(left_out)}")
     failed = [f"{pairs[record.index].id}: {record.failure}" for record in records if record.failure]
@@ -102,6 +103,14 @@ def _time_lines(records: Sequence[Record]) -> list[str]:
     count = max(1, len(records))
     parts = seconds_by_part(records).items()
     return ["seconds a pair: " + ", ".join(f"{name} {value / count:.3f}" for name, value in parts)]
+
+
+def _upgrade_lines(records: Sequence[Record]) -> list[str]:
+    upgraded = [record for record in records if record.before is not None]
+    if not upgraded:
+        return []
+    before, after = sum(r.before or 0 for r in upgraded), sum(r.inliers for r in upgraded)
+    return [f"upgraded {len(upgraded)} pairs: {before} inliers before, {after} after"]
 
 
 def _counts(title: str, values: Iterable[str]) -> list[str]:

@@ -1,34 +1,19 @@
-"""Workers: where jobs are done. This one lives in the engine's own process, in threads of its own."""
+"""The two halves of a job: matching, where the device is, and the estimation of F, where the engine is."""
 
 import threading
 import time
-from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from typing import Protocol
+from pathlib import Path
 
 from mkpc_kaggle.images import ImageStore, Unreadable
-from mkpc_kaggle.pipeline import PairWork, Pipeline, finish
+from mkpc_kaggle.pipeline import PairWork, Pipeline, UnitResult, conclude
 from mkpc_kaggle.recipe import Recipe, Unit
-from mkpc_kaggle.run.jobs import NOT_REACHED, Job, JobResult, Outcome, Record, Task, record_of
+from mkpc_kaggle.run.jobs import NOT_REACHED, Finished, Job, Matched, Outcome, Plan, Record, Task, record_of
 
 
-class Worker(Protocol):
-    """Does jobs one after the other; several may wait for it."""
-
-    def start(self) -> None:
-        """Get ready to work; raises :class:`mkpc_kaggle.errors.UserError` where that cannot be."""
-        ...
-
-    def submit(self, job: Job) -> "Future[JobResult]": ...
-
-    def stop(self) -> None:
-        """Begin no further unit: jobs under way and those that wait end with what they have."""
-        ...
-
-    def close(self) -> bool:
-        """Let go of everything; false where something is still running and cannot be stopped."""
-        ...
+class OutOfMemoryError(Exception):
+    """A unit did not have memory enough."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,64 +25,58 @@ class Opened:
     failure: str = ""
 
 
-class InProcessWorker:
-    """Matching in one thread, F of the pairs matched before in another, decoding ahead in a third.
+class Bench:
+    """Where pairs are matched: a pipeline and the images at hand. Only :meth:`match` computes."""
 
-    OpenCV and torch release the interpreter's lock while they compute, so that the three overlap.
-    """
-
-    def __init__(self, make_pipeline: Callable[[], Pipeline], estimators: int = 1) -> None:
+    def __init__(self, make_pipeline: Callable[[], Pipeline]) -> None:
         self._make_pipeline = make_pipeline
         self._pipeline: Pipeline | None = None
         self._images = ImageStore()
-        self._matching = ThreadPoolExecutor(1, thread_name_prefix="match")
-        self._estimating = ThreadPoolExecutor(estimators, thread_name_prefix="estimate")
         self._stopped = threading.Event()
-        self._open_jobs: set[Future[JobResult]] = set()
 
-    def start(self) -> None:
-        self._matching.submit(self._load).result()
-
-    def submit(self, job: Job) -> "Future[JobResult]":
-        self._images.announce(path for task in job.tasks for path in task.pair.images)
-        done: Future[JobResult] = Future()
-        self._open_jobs.add(done)
-        done.add_done_callback(self._open_jobs.discard)
-        self._matching.submit(self._match, job, done)
-        return done
-
-    def stop(self) -> None:
-        self._stopped.set()
-
-    def close(self) -> bool:
-        self.stop()
-        self._images.close()
-        idle = not self._open_jobs
-        self._matching.shutdown(wait=idle)
-        self._estimating.shutdown(wait=idle)
-        return idle
-
-    def _load(self) -> Pipeline:
+    def load(self) -> Pipeline:
+        """Load all matchers; raises :class:`mkpc_kaggle.errors.UserError` where one cannot be."""
         if self._pipeline is None:
             self._pipeline = self._make_pipeline()
             self._pipeline.load()
         return self._pipeline
 
-    def _match(self, job: Job, done: "Future[JobResult]") -> None:
-        """First half of a job, in the matching thread."""
-        try:
-            pipeline = self._load()
-            expected = dict(zip(job.units, job.expected, strict=True))
+    def forget(self) -> None:
+        """Let go of the matchers and all that they remember; they are loaded again when they are needed."""
+        self._pipeline = None
 
-            def keep_on(unit: Unit) -> bool:
-                return not self._stopped.is_set() and time.monotonic() + expected[unit] < job.deadline
+    def announce(self, paths: Iterable[Path]) -> None:
+        """Decode these ahead, in the background."""
+        self._images.announce(paths)
 
-            opened = [self._open(task) for task in job.tasks]
-            matched = iter(pipeline.match([one.work for one in opened if one.work], job.units, keep_on))
-            opened = [replace(one, work=next(matched)) if one.work else one for one in opened]
-            self._estimating.submit(self._estimate, pipeline.recipe, job, opened, done)
-        except BaseException as error:
-            done.set_exception(error)
+    def match(self, job: Job, seconds: float, alive: Callable[[], None] = lambda: None) -> tuple[Matched, ...]:
+        """First half of a job: no unit is begun that is expected to end later than ``seconds`` from now.
+
+        ``alive`` is called before each unit on each batch of pairs. Raises :class:`OutOfMemoryError`.
+        """
+        pipeline, plan = self.load(), job.plan
+        deadline = time.monotonic() + seconds
+        units = {unit.shrunk(plan.shrink) if plan.shrink < 1 else unit: unit for unit in plan.units}
+        expected = dict(zip(units, plan.expected, strict=True))
+
+        def keep_on(unit: Unit) -> bool:
+            alive()
+            return not self._stopped.is_set() and time.monotonic() + expected[unit] < deadline
+
+        opened = [self._open(task) for task in job.tasks]
+        # A stand-in for a unit is no other unit: what a pair has had is left out here.
+        wanted = [unit for unit in units if not all(has(task, units[unit]) for task in job.tasks)]
+        matched = iter(pipeline.match([one.work for one in opened if one.work], wanted, keep_on))
+        done = [replace(one, work=next(matched)) if one.work else one for one in opened]
+        return tuple(_matched(task, one, units, plan) for task, one in zip(job.tasks, done, strict=True))
+
+    def stop(self) -> None:
+        """Begin no further unit."""
+        self._stopped.set()
+
+    def close(self) -> None:
+        self.stop()
+        self._images.close()
 
     def _open(self, task: Task) -> Opened:
         start = time.perf_counter()
@@ -109,21 +88,44 @@ class InProcessWorker:
             return Opened(None, seconds, str(image1))
         return Opened(PairWork((image0, image1), task.results), seconds)
 
-    def _estimate(self, recipe: Recipe, job: Job, opened: list[Opened], done: "Future[JobResult]") -> None:
-        """Second half of a job, in the estimating thread, while the next job is matched."""
-        try:
-            outcomes = [_outcome(task, one, recipe) for task, one in zip(job.tasks, opened, strict=True)]
-            done.set_result(JobResult(job, tuple(outcomes)))
-        except BaseException as error:
-            done.set_exception(error)
+
+def has(task: Task, unit: Unit) -> bool:
+    return any(result.unit == unit for result in task.results)
 
 
-def _outcome(task: Task, opened: Opened, recipe: Recipe) -> Outcome:
+def _matched(task: Task, opened: Opened, units: dict[Unit, Unit], plan: Plan) -> Matched:
     work = opened.work
-    if work is None or not work.results:
-        return Outcome(Record.untouched(task.index, opened.failure or NOT_REACHED))
+    if work is None:
+        return Matched(decode_seconds=opened.seconds, failure=opened.failure)
+    new = work.results[len(task.results) :]
+    short = next((result for result in new if result.exhausted), None)
+    if short is not None:
+        raise OutOfMemoryError(f"{units[short.unit].name}: {short.failure}")
+    results = tuple(as_written(result, units[result.unit], plan) for result in new)
+    return Matched(results, work.regions, opened.seconds, work.cluster_seconds)
+
+
+def as_written(result: UnitResult, unit: Unit, plan: Plan) -> UnitResult:
+    """The result under the name of the recipe's unit, with a note if the unit ran smaller than that."""
+    return replace(result, unit=unit, failure=result.failure or plan.note)
+
+
+def estimate(job: Job, matched: Iterable[Matched], recipe: Recipe) -> Finished:
+    """Second half of a job: F from all matches of each pair."""
+    return Finished(job, tuple(_outcome(task, one, recipe) for task, one in zip(job.tasks, matched, strict=True)))
+
+
+def _outcome(task: Task, matched: Matched, recipe: Recipe) -> Outcome:
+    if not matched.results:
+        return Outcome(Record.untouched(task.index, matched.failure or NOT_REACHED))
     start = time.perf_counter()
-    match = finish(work, recipe)
+    match = conclude(task.results + matched.results, matched.regions, recipe)
     seconds = time.perf_counter() - start
-    record = record_of(task.index, match, decode=opened.seconds, cluster=work.cluster_seconds, estimate=seconds)
-    return Outcome(record, match.results)
+    record = record_of(
+        task.index,
+        match,
+        decode=matched.decode_seconds,
+        cluster=matched.cluster_seconds,
+        estimate=seconds,
+    )
+    return Outcome(record, matched.results)

@@ -1,0 +1,429 @@
+"""The planner: what to do next, what a lost job means, and why; decisions on values, without threads or clocks.
+
+It looks at a job's worth of pairs at a time, so that a hundred thousand pairs cost no more to plan than ten.
+"""
+
+from collections import Counter, deque
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.pipeline import UnitResult
+from mkpc_kaggle.recipe import Recipe, Unit, UpgradeConfig
+from mkpc_kaggle.run.budget import Budget, Costs, format_duration, needs
+from mkpc_kaggle.run.jobs import Cause, Finished, Lost, Outcome, Phase, Plan, Record, UnitRecord, chunks
+
+EXPLORE_SHARE = 0.25
+"""The share of the time left that may be spent to learn what units cost that never ran."""
+JOB_SHARE = 0.1
+"""The share of the time left that a job may be expected to take: what a job found late comes too late."""
+SHRINK, LEAST_SHRINK = 0.7, 0.45
+"""A unit that a worker fails at on one pair is tried on views whose sides are 0.7, then 0.49 times as long."""
+MOST_LOSSES = 4
+"""A pair that cost that many jobs of its own is left alone."""
+HOPELESS = 3
+"""A unit that workers failed at on that many pairs and never ran is given up on all."""
+ROUND = 4
+"""Jobs of an upgrade whose gain is looked at together."""
+
+
+@dataclass(frozen=True)
+class Patience:
+    """When a worker is taken to hang: silent for ``floor`` seconds and ``factor`` times what a unit should take.
+
+    It is heard of before each unit on each ``batch`` of pairs. ``unknown`` seconds are allowed where nobody knows
+    what a unit costs. A machine that is ten times slower of a sudden does not hang.
+    """
+
+    floor: float = 60.0
+    factor: float = 10.0
+    unknown: float = 600.0
+    batch: int = 1
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """A decision, and why; ``seconds`` since the run's start."""
+
+    seconds: float
+    text: str
+
+    def __str__(self) -> str:
+        return f"{format_duration(self.seconds):>7}  {self.text}"
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """Pairs that will be worked on together, when their turn comes; ``units`` None: as many as fit then."""
+
+    phase: Phase
+    indices: tuple[int, ...]
+    units: tuple[Unit, ...] | None = None
+    shrink: float = 1.0
+    round: int = 0
+
+
+class Planner:
+    """Sweep, deepen, upgrade, over the pairs of ``order``.
+
+    ``records`` (one a pair, by index) are the state that it decides upon; it alone changes them. ``workers``
+    work at a time.
+    """
+
+    def __init__(
+        self,
+        order: Sequence[int],
+        recipe: Recipe,
+        records: list[Record],
+        budget: Budget,
+        workers: int = 1,
+        patience: Patience | None = None,
+    ) -> None:
+        self.recipe = recipe
+        self.records = records
+        self.budget = budget
+        self.workers = workers
+        self.patience = patience or Patience()
+        self.costs = Costs()
+        self.explanations: list[Explanation] = []
+        self.phase = Phase.SWEEP
+        self._order = order
+        self._phases = iter((self._sweep, self._deepen, self._upgrade))
+        self._queue: deque[Stretch] = deque()
+        self._again: deque[Stretch] = deque()
+        self._flying: set[int] = set()
+        self._jobs_out = 0
+        self._allowance = 0.0
+        self._last_event = budget.clock()
+        self._pairs_of_phase = self._pairs_queued = 0
+        self._fitting = -1
+        self._rounds: dict[int, list[int]] = {}
+        self._extras_help = True
+        self._aside: set[int] = set()
+        self._losses: Counter[int] = Counter()
+        self._blamed: dict[str, set[int]] = {}
+        self._proven: set[str] = set()
+        self._hopeless: set[str] = set()
+        self._lacking: Counter[str] = Counter()
+        for record in records:
+            if record.units:
+                self._lacking.update(unit.name for unit in record.lacking(recipe.regular))
+
+    # What to do next
+
+    def next(self, now: float) -> Plan | None:
+        """The next plan; ``None`` where there is nothing to do, or nothing before a job comes back."""
+        if now >= self.budget.stop:
+            return None
+        while (stretch := self._turn(now)) is not None:
+            units = self._units(stretch, now)
+            todo = [index for index in stretch.indices if self._can_gain(index, units)]
+            lacking = list(dict.fromkeys(unit for index in todo for unit in self.records[index].lacking(units)))
+            unknown = not all(self.costs.known(unit.name) for unit in lacking)
+            if unknown and self._jobs_out >= self.workers:  # it would wait behind another, its allowance running
+                self._again.appendleft(stretch)
+                return None
+            if todo:
+                return self._plan(stretch, todo, units, lacking, now, unknown=unknown)
+        return None
+
+    def _turn(self, now: float) -> Stretch | None:
+        """Take the next stretch out whose pairs are all back."""
+        for stretch in self._again:
+            if self._flying.isdisjoint(stretch.indices):
+                self._again.remove(stretch)
+                return stretch
+        while not self._queue:
+            if not self._open_phase(now):
+                return None
+        if not self._flying.isdisjoint(self._queue[0].indices) or not self._round_may_begin(self._queue[0], now):
+            return None
+        stretch = self._queue.popleft()
+        self._pairs_queued -= len(stretch.indices)
+        return stretch
+
+    def _plan(
+        self,
+        stretch: Stretch,
+        todo: list[int],
+        units: tuple[Unit, ...],
+        lacking: Sequence[Unit],
+        now: float,
+        *,
+        unknown: bool,
+    ) -> Plan:
+        """A plan for the first of the pairs; the others go back to the front of the queue.
+
+        It is one pair where some unit's cost is unknown and cannot be planned, and few where it gets late.
+        """
+        left = self.budget.stop - now
+        seconds = self.costs.overhead + sum(self.costs.of(unit.name) for unit in lacking)
+        most = len(todo) if len(todo) * seconds <= JOB_SHARE * left else max(1, int(JOB_SHARE * left / seconds))
+        most = 1 if unknown else most
+        if todo[most:]:
+            self._again.appendleft(replace(stretch, indices=tuple(todo[most:])))
+        todo = todo[:most]
+        self._flying.update(todo)
+        self._jobs_out += 1
+        self._allowance = EXPLORE_SHARE * left
+        if self._jobs_out == 1:
+            self._last_event = now
+        return Plan(
+            stretch.phase,
+            tuple(todo),
+            units,
+            tuple(self.costs.most(unit.name) for unit in units),
+            now + self._allowance if unknown else self.budget.stop,
+            self._timeout(lacking, len(todo), unknown=unknown),
+            stretch.shrink,
+            unknown,
+        )
+
+    def _timeout(self, lacking: Iterable[Unit], pairs: int, *, unknown: bool) -> float:
+        seconds = max(self.costs.most(unit.name) for unit in lacking) * min(pairs, self.patience.batch)
+        return self.patience.floor + self.patience.factor * seconds + (self.patience.unknown if unknown else 0.0)
+
+    def _can_gain(self, index: int, units: Iterable[Unit]) -> bool:
+        return index not in self._aside and bool(self.records[index].lacking(units))
+
+    def _units(self, stretch: Stretch, now: float) -> tuple[Unit, ...]:
+        """The units for a stretch whose turn has come."""
+        if stretch.units is None:
+            regular = self._possible(self.recipe.regular)
+            return regular[: self._fit(regular, now)]
+        units = self._possible(stretch.units)
+        if stretch.phase is Phase.SWEEP:
+            return units[:1]
+        # Towards the end, what still fits; a pass of all pairs is another matter.
+        return tuple(unit for unit in units if self.costs.most(unit.name) <= self.budget.stop - now)
+
+    def _possible(self, units: Iterable[Unit]) -> tuple[Unit, ...]:
+        return tuple(unit for unit in units if unit.name not in self._hopeless)
+
+    def _fit(self, units: tuple[Unit, ...], now: float) -> int:
+        """How many units all pairs can have in the time left; a change is explained."""
+        left = (self.budget.stop - now) * self.workers
+        count, short = len(units), 0.0
+        for number, needed in enumerate(needs(units, self._lacking, self.costs)):
+            if needed > left:
+                count, short = number, needed
+                break
+        if count != self._fitting:
+            if count < len(units):
+                self._explain(
+                    now,
+                    f"{count} of {len(units)} units fit: up to {units[count].name} all pairs would need "
+                    f"{format_duration(short / self.workers)}, {format_duration(left / self.workers)} are left",
+                )
+            elif self._fitting >= 0:
+                self._explain(now, f"all {count} units fit again")
+            self._fitting = count
+        return count
+
+    # The passes
+
+    def _open_phase(self, now: float) -> bool:
+        """Queue the next pass; false where it has to wait for jobs that are out, or there is none."""
+        if self.phase is not Phase.SWEEP and (self._flying or self._again):
+            return False  # who is weakest is known when all pairs are back
+        opened = next(self._phases, None)
+        if opened is None:
+            return False
+        self._queue.extend(opened(now))
+        self._pairs_of_phase = self._pairs_queued = sum(len(stretch.indices) for stretch in self._queue)
+        return True
+
+    def _sweep(self, _: float) -> list[Stretch]:
+        """The first unit on all pairs: an F for every pair, early."""
+        first = tuple(unit for unit in self.recipe.regular if unit.stage == 1)
+        return [Stretch(Phase.SWEEP, indices, first) for indices in chunks(self._order)]
+
+    def _deepen(self, now: float) -> list[Stretch]:
+        """The other units, chunk by chunk: as many as let all remaining pairs have them."""
+        self.phase = Phase.DEEPEN
+        self._explain(now, "the sweep is over; deepening begins")
+        return [Stretch(Phase.DEEPEN, indices) for indices in chunks(self._order)]
+
+    def _upgrade(self, now: float) -> list[Stretch]:
+        """What was left out, the weakest pairs first, and for weak ones the extra units."""
+        self.phase = Phase.UPGRADE
+        extras = [unit for unit in self.recipe.units if unit.extra]
+        touched = [record for record in self.records if record.units and record.index not in self._aside]
+        # By what they had before they were upgraded, so that a run that goes on decides as it did before.
+        touched.sort(key=lambda record: (inliers_before(record), record.index))
+        weak = [
+            one for one in touched if is_weak(one, self.recipe.upgrade) or len(one.lacking(extras)) < len(extras)
+        ]
+        chosen = {record.index for record in weak}
+        others = [one for one in touched if one.index not in chosen and one.lacking(self.recipe.regular)]
+        self._explain(now, f"upgrading begins: {len(weak)} weak pairs, {len(others)} others lack units")
+        stretches = [
+            Stretch(Phase.UPGRADE, indices, self.recipe.units, round=1 + number // ROUND if extras else 0)
+            for number, indices in enumerate(chunks(record.index for record in weak))
+        ]
+        for stretch in stretches:
+            self._rounds.setdefault(stretch.round, []).extend(stretch.indices)
+        regular = self.recipe.regular
+        return stretches + [
+            Stretch(Phase.UPGRADE, indices, regular) for indices in chunks(record.index for record in others)
+        ]
+
+    def _round_may_begin(self, stretch: Stretch, now: float) -> bool:
+        """False where the round before the last is not back yet; without gain there, the extra units end.
+
+        Not the last round, for which workers would have to wait, and not what happens to be back: the same
+        run has to end with the same bytes.
+        """
+        judged = self._rounds.get(stretch.round - 2, []) if stretch.round > 0 else []
+        if not judged or not self._extras_help:
+            return True
+        if not self._flying.isdisjoint(judged) or any(set(judged) & set(one.indices) for one in self._again):
+            return False
+        before = sum(inliers_before(self.records[index]) for index in judged)
+        after = sum(self.records[index].inliers for index in judged)
+        if after - before <= self.recipe.upgrade.least_gain * before:
+            self._extras_help = False
+            self._explain(
+                now, f"extra units end: the last {len(judged)} pairs went from {before} to {after} inliers"
+            )
+            regular = self.recipe.regular
+            self._queue = deque(replace(one, units=regular, round=0) for one in self._queue)
+        return True
+
+    # What came of it
+
+    def take(self, finished: Finished, now: float) -> list[Outcome]:
+        """Take note of a finished job; what it brought, to be kept."""
+        plan = finished.job.plan
+        measured = finished.measured()
+        self._measure(plan, measured, now, len(finished.outcomes))
+        self._back(plan)
+        if plan.exploring and now >= plan.deadline:
+            for unit in plan.units:
+                self.costs.suppose(unit.name, self._allowance)
+        return [kept for outcome in finished.outcomes if (kept := self._merge(outcome, plan.phase, now))]
+
+    def _measure(self, plan: Plan, measured: list[tuple[str, float]], now: float, pairs: int) -> None:
+        if measured and plan.shrink == 1:
+            for unit, seconds in measured:
+                self.costs.observe(unit, seconds)
+            elapsed = (now - self._last_event) * min(self.workers, self._jobs_out)
+            self.costs.observe_overhead((elapsed - sum(seconds for _, seconds in measured)) / pairs)
+        self._last_event = now
+
+    def _merge(self, outcome: Outcome, phase: Phase, now: float) -> Outcome | None:
+        """The outcome to keep, if the job brought anything: a unit more, or the reason why there can be none."""
+        record, former = outcome.record, self.records[outcome.record.index]
+        if not outcome.results and record.failure and record.reached:
+            self._aside.add(record.index)
+            if former.units:
+                self._explain(now, f"pair {record.index} keeps the F it has: {record.failure}")
+        if len(record.units) <= len(former.units) and (former.reached or not record.reached):
+            return None
+        self._proven.update(result.unit.name for result in outcome.results)
+        before = inliers_before(former) if phase is Phase.UPGRADE else former.before
+        record = replace(record, before=before, regions=record.regions or former.regions)
+        self._put(record)
+        return Outcome(record, outcome.results)
+
+    def _put(self, record: Record) -> None:
+        former = self.records[record.index]
+        had = {unit.name for unit in former.lacking(self.recipe.regular)} if former.units else set()
+        lacks = {unit.name for unit in record.lacking(self.recipe.regular)} if record.units else set()
+        self._lacking.subtract(had - lacks)
+        self._lacking.update(lacks - had)
+        self.records[record.index] = record
+
+    def _back(self, plan: Plan) -> None:
+        self._flying.difference_update(plan.indices)
+        self._jobs_out -= 1
+
+    # What was lost
+
+    def lose(self, lost: Lost, now: float) -> list[Outcome]:
+        """Take note of a lost job: halve it, take its units apart, shrink them, give them up; what to keep."""
+        plan = lost.job.plan
+        self._back(plan)
+        self._last_event = now
+        stretch = Stretch(plan.phase, plan.indices, plan.units, plan.shrink)
+        if lost.cause is Cause.NO_WORKER:
+            self._again.append(stretch)
+        elif len(plan.indices) > 1:
+            half = len(plan.indices) // 2
+            self._again.append(replace(stretch, indices=plan.indices[:half]))
+            self._again.append(replace(stretch, indices=plan.indices[half:]))
+        else:
+            return self._lose_pair(stretch, lost, now)
+        return []
+
+    def _lose_pair(self, stretch: Stretch, lost: Lost, now: float) -> list[Outcome]:
+        (index,) = stretch.indices
+        lacking = self.records[index].lacking(stretch.units or ())
+        if len(lacking) > 1:  # stage 1 first: the critical regions depend on it
+            for unit in sorted(lacking, key=lambda unit: unit.stage):
+                self._again.append(replace(stretch, units=(unit,)))
+            return []
+        (unit,) = lacking
+        self._losses[index] += 1
+        self._blamed.setdefault(unit.name, set()).add(index)
+        if len(self._blamed[unit.name]) >= HOPELESS and unit.name not in self._proven | self._hopeless:
+            self._hopeless.add(unit.name)
+            self._explain(now, f"{unit.name} is given up: workers failed at it on {HOPELESS} pairs ({lost})")
+        if self._losses[index] >= MOST_LOSSES:
+            self._again = deque(one for one in self._again if one.indices != (index,))
+            self._explain(now, f"pair {index} is left alone after {MOST_LOSSES} lost jobs ({lost})")
+            return [self._give_up(index, self.records[index].lacking(self.recipe.units), lost)]
+        if lost.cause is Cause.RAISED or stretch.shrink * SHRINK < LEAST_SHRINK:
+            self._explain(now, f"{unit.name} is given up on pair {index} ({lost})")
+            return [self._give_up(index, [unit], lost)]
+        self._again.append(replace(stretch, units=(unit,), shrink=stretch.shrink * SHRINK))
+        return []
+
+    def _give_up(self, index: int, units: Sequence[Unit], lost: Lost) -> Outcome:
+        """The pair keeps the F that it has; the units are marked as had, with the reason."""
+        record, reason = self.records[index], f"given up: {lost}"
+        empty = tuple(UnitRecord(unit.name, unit.stage, 0, 0, 0.0, 0.0, reason) for unit in units)
+        failure = record.failure if record.reached else reason
+        self._put(replace(record, units=record.units + empty, failure=failure))
+        return Outcome(
+            self.records[index], tuple(UnitResult(unit, Matches.empty(), failure=reason) for unit in units)
+        )
+
+    # What is left
+
+    def wanted(self, record: Record) -> list[Unit]:
+        """The units that a pair shall have if there is time: the extra ones only where it is weak."""
+        extras = self._extras_help and is_weak(record, self.recipe.upgrade)
+        return record.lacking(self._possible(self.recipe.units if extras else self.recipe.regular))
+
+    @property
+    def complete(self) -> bool:
+        """Whether every pair has been reached and nothing is wanted for those that can be worked on."""
+        return all(
+            record.reached and not (record.units and record.index not in self._aside and self.wanted(record))
+            for record in self.records
+        )
+
+    @property
+    def progress(self) -> tuple[Phase, int, int]:
+        """The present pass, how many of its pairs are behind, and how many there are."""
+        ahead = self._pairs_queued + len(self._flying) + sum(len(stretch.indices) for stretch in self._again)
+        return self.phase, max(0, self._pairs_of_phase - ahead), self._pairs_of_phase
+
+    def _explain(self, now: float, text: str) -> None:
+        self.explanations.append(Explanation(now - self.budget.started, text))
+
+
+def is_weak(record: Record, config: UpgradeConfig) -> bool:
+    """Whether more work may help: few inliers, a low share of them, or an uncertain critical region."""
+    unsure = record.regions is not None and not all(region.cropped for region in record.regions)
+    return (
+        record.inliers < config.below_inliers
+        or record.inliers < config.below_share * record.matches
+        or (config.uncertain and unsure)
+    )
+
+
+def inliers_before(record: Record) -> int:
+    """The inliers of a pair before it was upgraded."""
+    return record.inliers if record.before is None else record.before

@@ -1,0 +1,360 @@
+"""Faults injected into real runs, on real images, with worker processes."""
+
+import random
+import signal
+import sqlite3
+import subprocess
+import sys
+import time
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+from faulty import (
+    FaultyMatcher,
+    NonsenseMatcher,
+    SlowingMatcher,
+    VanishingMatcher,
+    die,
+    exhaust_gpu,
+    exhaust_memory,
+    hang,
+    pipeline_once,
+)
+from rectified import SECOND, SWEEP, THREE_UNITS, RectifiedMatcher, interrupt_after, run, write_pairs
+
+from mkpc_kaggle.assembly import Assembly
+from mkpc_kaggle.cli import main
+from mkpc_kaggle.competition import Pair, read_test_side, submission_problems
+from mkpc_kaggle.demo import DemoSet
+from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.pipeline import is_out_of_memory
+from mkpc_kaggle.run import session
+from mkpc_kaggle.run.engine import Ending, RunReport
+from mkpc_kaggle.run.jobs import NOT_REACHED, Record
+from mkpc_kaggle.run.journal import Journal
+from mkpc_kaggle.run.plan import Patience
+from mkpc_kaggle.run.processes import ProcessPool, Seat
+
+ROOT = Path(__file__).resolve().parents[1]
+COUNT = 12
+VICTIM = 3  # brightness 13
+QUICK = Patience(floor=0.7, factor=20, unknown=0.0)
+
+
+@pytest.fixture(scope="module")
+def pairs(tmp_path_factory: pytest.TempPathFactory) -> list[Pair]:
+    return write_pairs(tmp_path_factory.mktemp("pairs"), COUNT)
+
+
+@pytest.fixture(scope="module")
+def undisturbed(pairs: list[Pair], tmp_path_factory: pytest.TempPathFactory) -> RunReport:
+    return run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path_factory.mktemp("undisturbed"))
+
+
+def matrices(records: tuple[Record, ...] | list[Record]) -> list[bytes]:
+    return [record.F.tobytes() for record in records]
+
+
+def assert_others_as_good(report: RunReport, undisturbed: RunReport) -> None:
+    assert [record.index for record in report.records] == list(range(COUNT))
+    assert all(np.isfinite(record.F).all() and record.F.any() for record in report.records)
+    others = [matrix for index, matrix in enumerate(matrices(report.records)) if index != VICTIM]
+    assert others == [matrix for index, matrix in enumerate(matrices(undisturbed.records)) if index != VICTIM]
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_worker_processes_give_the_bytes_of_a_run_in_one_process(
+    pairs: list[Pair], undisturbed: RunReport, tmp_path: Path, workers: int
+) -> None:
+    report = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work", workers=workers)
+    assert report.ending is Ending.COMPLETE
+    assert report.faults == ()
+    assert matrices(report.records) == matrices(undisturbed.records)
+
+
+@pytest.mark.parametrize(
+    ("fault", "told"),
+    [
+        (die, "the worker died: signal SIGKILL"),
+        (hang, "the worker hung: nothing heard for"),
+        (exhaust_memory, "out of memory: 1:rectified@96: "),
+        (exhaust_gpu, "out of memory: 1:rectified@96: RuntimeError: CUDA out of memory"),
+    ],
+)
+def test_a_worker_lost_once_costs_time_alone(
+    pairs: list[Pair], undisturbed: RunReport, tmp_path: Path, fault: object, told: str
+) -> None:
+    matcher = FaultyMatcher(fault=fault, once=tmp_path / "once")  # type: ignore[arg-type]
+    report = run(pairs, THREE_UNITS, matcher, tmp_path / "work", workers=1, patience=QUICK)
+    assert report.ending is Ending.COMPLETE
+    assert len(report.faults) == 1
+    assert told in report.faults[0]
+    assert matrices(report.records) == matrices(undisturbed.records)
+
+
+def test_a_unit_too_big_for_the_memory_runs_smaller_on_that_pair_alone(
+    pairs: list[Pair], undisturbed: RunReport, tmp_path: Path
+) -> None:
+    matcher = FaultyMatcher(fault=exhaust_gpu, above=100)
+    report = run(pairs, THREE_UNITS, matcher, tmp_path / "work", workers=1)
+    assert_others_as_good(report, undisturbed)
+    sweep, *others = report.records[VICTIM].units
+    assert sweep.failure == ""
+    assert {unit.unit: unit.failure for unit in others} == {
+        SECOND.name: "ran at 0.7 of its size, the worker failed at more",
+        "1:rectified@160": "ran at 0.49 of its size, the worker failed at more",
+    }
+    assert report.records[VICTIM].inliers > 350
+    assert report.records[VICTIM].regions is not None
+    assert report.ending is Ending.COMPLETE
+
+
+def test_an_image_that_always_kills_the_worker_costs_its_pair_only_and_once(
+    pairs: list[Pair], undisturbed: RunReport, tmp_path: Path
+) -> None:
+    report = run(pairs, THREE_UNITS, FaultyMatcher(), tmp_path / "work", workers=1)
+    assert_others_as_good(report, undisturbed)
+    assert report.records[VICTIM].failure == "given up: the worker died: signal SIGKILL"
+    assert any("pair 3 is left alone after 4 lost jobs" in one.text for one in report.explanations)
+    assert report.ending is Ending.COMPLETE
+    again = run(pairs, THREE_UNITS, FaultyMatcher(), tmp_path / "work", workers=1)
+    assert again.faults == ()
+    assert matrices(again.records) == matrices(report.records)
+
+
+def test_a_pair_that_kills_workers_late_keeps_the_f_it_has(
+    pairs: list[Pair], undisturbed: RunReport, tmp_path: Path
+) -> None:
+    report = run(pairs, THREE_UNITS, FaultyMatcher(above=60), tmp_path / "work", workers=1)
+    assert_others_as_good(report, undisturbed)
+    victim = report.records[VICTIM]
+    assert victim.failure.startswith("given up") or victim.inliers > 100
+
+
+def test_nonsense_from_a_matcher_is_dropped(pairs: list[Pair], undisturbed: RunReport, tmp_path: Path) -> None:
+    report = run(pairs, THREE_UNITS, NonsenseMatcher(), tmp_path / "work", workers=1)
+    assert matrices(report.records[::2]) == matrices(undisturbed.records[::2])
+    assert all("too few" in record.failure for record in report.records[1::2])
+
+
+def test_an_image_that_vanishes_before_it_is_reached_costs_its_pair_only(tmp_path: Path) -> None:
+    pairs = write_pairs(tmp_path, 40)
+    matcher = VanishingMatcher(victim=pairs[39].image1)
+    report = run(pairs, THREE_UNITS, matcher, tmp_path / "work", workers=1)
+    assert "no such file" in report.records[39].failure
+    assert all(record.inliers > 400 for record in report.records[:39])
+
+
+def test_an_image_that_vanishes_after_the_sweep_leaves_its_pair_the_f_it_has(tmp_path: Path) -> None:
+    pairs = write_pairs(tmp_path, 4)
+    only_sweep = run(pairs, THREE_UNITS, RectifiedMatcher(seconds=0.1), tmp_path / "work", limit=2.2)
+    reached = [record.index for record in only_sweep.records if len(record.units) == 1]
+    assert reached, "the run was to end amid its work"
+    victim = reached[0]
+    pairs[victim].image1.unlink()
+    report = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
+    assert report.records[victim].F.tobytes() == only_sweep.records[victim].F.tobytes()
+    assert any(f"pair {victim} keeps the F it has" in one.text for one in report.explanations)
+    assert all(len(record.units) == 3 for record in report.records if record.index != victim)
+    assert report.ending is Ending.COMPLETE
+
+
+def test_a_run_whose_journal_is_full_keeps_its_results_in_memory(
+    pairs: list[Pair], undisturbed: RunReport, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    make = Journal.__init__
+
+    def small(self: Journal, *rest: object, **more: object) -> None:
+        make(self, *rest, **more)  # type: ignore[arg-type]
+        self._db.execute("PRAGMA max_page_count = 14")
+
+    monkeypatch.setattr(Journal, "__init__", small)
+    report = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
+    assert any("disk is full" in fault for fault in report.faults)
+    assert matrices(report.records) == matrices(undisturbed.records)
+    monkeypatch.undo()
+    resumed = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
+    assert resumed.ending is Ending.COMPLETE
+    assert matrices(resumed.records) == matrices(undisturbed.records)
+
+
+def test_a_submission_that_the_disk_does_not_take_is_told_and_the_exit_status_is_one(
+    demo: DemoSet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from mkpc_kaggle import submit
+
+    whole, versions = submit.write_submission, []
+
+    def full(path: Path, rows: dict[str, np.ndarray]) -> None:
+        versions.append(rows)
+        if len(versions) > 1:
+            raise OSError(28, "No space left on device")
+        whole(path, rows)
+
+    monkeypatch.setattr(submit, "write_submission", full)
+    recipe, output = tmp_path / "r.toml", tmp_path / "submission.csv"
+    recipe.write_text('units = [{ stage = 1, matcher = "sift", long_side = 200 }]')
+    told = ["submit", "--test-dir", str(demo.test_dir), "--output", str(output), "--recipe", str(recipe)]
+    assert main([*told, "--workers", "0"]) == 1
+    assert "is not the last version" in capsys.readouterr().out
+    assert submission_problems(output, [pair.id for pair in read_test_side(demo.test_dir)]) == []
+
+
+def test_a_wall_clock_that_jumps_moves_no_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    jumps = iter(range(0, 10**9, 10**5))
+    monkeypatch.setattr(time, "time", lambda: float(next(jumps)))
+    started = time.monotonic()
+    matcher = RectifiedMatcher(seconds=0.05)
+    report = run(write_pairs(tmp_path, 60), THREE_UNITS, matcher, tmp_path / "work", limit=3.0)
+    assert 1.2 < time.monotonic() - started < 3.0
+    assert report.ending is Ending.TIME_IS_UP
+    assert report.records[-1].failure != NOT_REACHED or report.records[0].units
+
+
+def test_a_worker_ten_times_slower_from_half_way_on_still_ends_in_time(tmp_path: Path) -> None:
+    started = time.monotonic()
+    matcher = SlowingMatcher(seconds=0.005, turn=90)
+    report = run(write_pairs(tmp_path, 60), THREE_UNITS, matcher, tmp_path / "work", limit=4.0)
+    assert time.monotonic() - started < 4.0
+    assert all(record.units for record in report.records)
+    assert any("units fit" in one.text for one in report.explanations)
+    assert time.monotonic() - started > 2.0, "the time is used"
+
+
+WATCHED = """
+import sys, time
+sys.path[:0] = {path!r}
+from pathlib import Path
+from rectified import THREE_UNITS, RectifiedMatcher, write_pairs
+from mkpc_kaggle.assembly import assemble
+from mkpc_kaggle.run.budget import Budget
+from mkpc_kaggle.run.session import Interrupt, Session, run_pairs
+from mkpc_kaggle.run.in_process import InProcessPool
+
+taken = InProcessPool.next
+def stuck(self, until):
+    back = taken(self, until + 5)
+    if time.monotonic() > started + 1:
+        time.sleep(1000)
+    return back
+InProcessPool.next = stuck
+home = Path(sys.argv[1])
+assembly = assemble(THREE_UNITS, matchers={{"rectified": RectifiedMatcher(seconds=0.05)}}, device="cpu")
+pairs = write_pairs(home / "pairs", 40)
+started = time.monotonic()
+session = Session(home / "work", Budget(started, 3.0), Interrupt(), progress=False, guarded=True)
+def publish(records):
+    (home / "out").write_text(str(sum(bool(record.units) for record in records)))
+run_pairs(pairs, assembly, session, publish)
+"""
+
+
+def test_the_watchdog_writes_and_leaves_where_the_engine_is_stuck(tmp_path: Path) -> None:
+    code = WATCHED.format(path=[str(ROOT), str(ROOT / "tests")])
+    started = time.monotonic()
+    made = subprocess.run([sys.executable, "-c", code, str(tmp_path)], timeout=30, check=False)
+    assert made.returncode == 0
+    assert time.monotonic() - started < 12  # imports, writing pictures, 3 s
+    assert int((tmp_path / "out").read_text()) > 5
+
+
+KILLED = """
+import sys, time
+sys.path[:0] = {path!r}
+from pathlib import Path
+from rectified import THREE_UNITS, RectifiedMatcher
+from mkpc_kaggle.assembly import assemble
+from mkpc_kaggle.competition import Pair
+from mkpc_kaggle.run.budget import Budget
+from mkpc_kaggle.run.session import Interrupt, Session
+from mkpc_kaggle.submit import submit
+
+if __name__ == "__main__":
+    home = Path(sys.argv[1])
+    images = sorted((home / "pairs").iterdir())
+    pairs = [Pair(f"set;{{n:03d}}", "set", *images[2 * n : 2 * n + 2]) for n in range(len(images) // 2)]
+    assembly = assemble(THREE_UNITS, matchers={{"rectified": RectifiedMatcher(seconds=0.02)}}, device="cpu")
+    session = Session(home / "work", Budget(time.monotonic()), Interrupt(), progress=False, workers=1)
+    submit(pairs, assembly, session, home / "submission.csv")
+"""
+
+
+def orphans(of: str) -> list[int]:
+    """Worker processes that were started by the process of that id, by what they were told at their start."""
+    found = []
+    for status in Path("/proc").glob("[0-9]*/cmdline"):
+        try:
+            line = status.read_bytes().decode(errors="replace")
+        except OSError:
+            continue
+        if "spawn_main" in line and f"parent_pid={of}," in line:
+            found.append(int(status.parent.name))
+    return found
+
+
+@pytest.mark.parametrize("moments", [3, pytest.param(20, marks=pytest.mark.slow)])
+def test_a_parent_killed_at_any_moment_leaves_a_whole_file_no_orphans_and_a_run_to_resume(
+    undisturbed: RunReport, tmp_path: Path, moments: int
+) -> None:
+    pairs = write_pairs(tmp_path / "pairs", COUNT)
+    script = tmp_path / "run.py"
+    script.write_text(KILLED.format(path=[str(ROOT), str(ROOT / "tests")]))
+    rng = random.Random(moments)
+    for _ in range(moments):
+        running = subprocess.Popen([sys.executable, str(script), str(tmp_path)])
+        time.sleep(rng.uniform(0.5, 5.0))
+        running.send_signal(signal.SIGKILL)
+        running.wait()
+        if (tmp_path / "submission.csv").exists():
+            assert submission_problems(tmp_path / "submission.csv", [pair.id for pair in pairs]) == []
+        deadline = time.monotonic() + 5
+        while orphans(str(running.pid)) and time.monotonic() < deadline:
+            time.sleep(0.05)
+        assert orphans(str(running.pid)) == []
+    assert subprocess.run([sys.executable, str(script), str(tmp_path)], check=False).returncode == 0
+    db = sqlite3.connect(tmp_path / "work" / "journal.sqlite")
+    stored = [row[0] for row in db.execute("SELECT fundamental FROM pair ORDER BY pair")]
+    db.close()
+    assert stored == matrices(undisturbed.records)
+
+
+def test_an_interrupt_reaches_workers_through_the_parent(pairs: list[Pair], tmp_path: Path) -> None:
+    started = time.monotonic()
+    matcher = RectifiedMatcher(seconds=0.3)
+    report = run(pairs, THREE_UNITS, matcher, tmp_path / "work", interrupt=interrupt_after(4.0), workers=1)
+    assert report.ending is Ending.INTERRUPTED
+    assert time.monotonic() - started < 9
+    assert any(record.has(SWEEP) for record in report.records)
+
+
+def test_a_worker_that_cannot_be_started_again_ends_the_run_with_every_row_there(
+    pairs: list[Pair], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def one_life(assembly: Assembly, _: object) -> ProcessPool:
+        return ProcessPool([Seat("cpu", partial(pipeline_once, assembly, tmp_path / "marker"))], assembly.recipe)
+
+    monkeypatch.setattr(session, "pool_of", one_life)
+    report = run(pairs, THREE_UNITS, FaultyMatcher(), tmp_path / "work", workers=1)
+    assert report.ending is Ending.NO_WORKER
+    assert any("no worker could be started" in fault for fault in report.faults)
+    assert report.records[0].has(SWEEP)
+    assert len(report.records) == COUNT
+
+
+def test_workers_that_die_while_they_load_are_bad_input() -> None:
+    pool = ProcessPool([Seat("cpu", die)], THREE_UNITS)  # type: ignore[arg-type]
+    with pytest.raises(UserError, match="no worker could be started: the worker died: signal SIGKILL"):
+        pool.start()
+    assert pool.close()
+
+
+def test_what_says_that_memory_is_short() -> None:
+    import torch
+
+    assert is_out_of_memory(MemoryError())
+    assert is_out_of_memory(torch.OutOfMemoryError("CUDA out of memory."))
+    told = "[enforce fail at alloc_cpu.cpp:117] err == 0. DefaultCPUAllocator: can't allocate memory: you tried"
+    assert is_out_of_memory(RuntimeError(told))
+    assert not is_out_of_memory(RuntimeError("shapes differ"))

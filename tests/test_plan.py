@@ -1,0 +1,174 @@
+"""The planner's decisions, and the engine on a virtual clock."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from statistics import median
+
+import numpy as np
+import pytest
+from rectified import EXTRA, SECOND, SWEEP, THREE_UNITS
+
+from benchmarks.simulation import RESTART_SECONDS, Scenario, random_scenario, simulate
+from mkpc_kaggle.geometry.coordinates import Box
+from mkpc_kaggle.geometry.critical_region import CriticalRegion, RegionReason
+from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
+from mkpc_kaggle.pipeline import UnitResult
+from mkpc_kaggle.recipe import Recipe, UpgradeConfig
+from mkpc_kaggle.run.budget import Budget
+from mkpc_kaggle.run.engine import Ending
+from mkpc_kaggle.run.jobs import Cause, Finished, Job, Lost, Outcome, Phase, Plan, Record, UnitRecord
+from mkpc_kaggle.run.plan import Planner, is_weak
+
+
+def planner(count: int = 40, recipe: Recipe = THREE_UNITS, workers: int = 1) -> Planner:
+    records = [Record.untouched(index) for index in range(count)]
+    return Planner(range(count), recipe, records, Budget(0.0, math.inf, lambda: 0.0), workers)
+
+
+def finished(plan: Plan, planner: Planner, inliers: int = 50) -> Finished:
+    """Every unit of a plan took a second and found some inliers."""
+    outcomes = []
+    for index in plan.indices:
+        former = planner.records[index]
+        new = former.lacking(plan.units)
+        units = former.units + tuple(UnitRecord(u.name, u.stage, 100, inliers, 0.0, 1.0, plan.note) for u in new)
+        results = tuple(UnitResult(unit, Matches.empty(), 0.0, 1.0) for unit in new)
+        outcomes.append(Outcome(Record(index, FALLBACK_FUNDAMENTAL, "", units), results))
+    return Finished(Job(plan, ()), tuple(outcomes))
+
+
+def plans(planner: Planner) -> Iterator[Plan]:
+    """All plans of a run in which each job comes back before the next is planned."""
+    while (plan := planner.next(0.0)) is not None:
+        yield plan
+        if planner.records[plan.indices[0]].lacking(plan.units):
+            planner.take(finished(plan, planner), 0.0)
+
+
+def test_the_passes_follow_each_other_and_every_pair_has_every_unit() -> None:
+    one = planner()
+    phases = [plan.phase for plan in plans(one)]
+    assert phases == sorted(phases, key=list(Phase).index)
+    assert one.complete
+    assert all(not record.lacking(THREE_UNITS.units) for record in one.records)
+
+
+def test_no_pair_is_in_two_jobs_at_a_time() -> None:
+    one = planner(9, workers=4)
+    first = one.next(0.0)
+    out = [first]
+    while (plan := one.next(0.0)) is not None:
+        out.append(plan)
+    indices = [index for plan in out for index in plan.indices]  # type: ignore[union-attr]
+    assert len(indices) == len(set(indices))
+    assert len(out) == 4, "every worker tries a unit whose cost is unknown, on one pair"
+
+
+def test_a_lost_job_is_halved_taken_apart_shrunk_and_given_up() -> None:
+    one = planner(9)
+    for plan in plans(one):
+        if plan.phase is Phase.DEEPEN and len(plan.indices) == 8:
+            break
+    seen = []
+    one.lose(Lost(Job(plan, ()), Cause.DIED), 0.0)
+    while (again := one.next(0.0)) is not None and again.phase is Phase.DEEPEN:
+        seen.append((again.indices, tuple(unit.name for unit in again.units), round(again.shrink, 2)))
+        if 1 in again.indices:
+            one.lose(Lost(Job(again, ()), Cause.DIED), 0.0)
+        else:
+            one.take(finished(again, one), 0.0)
+    mine = [(units, shrink) for indices, units, shrink in seen if indices == (1,)]
+    both, second, third = (SWEEP.name, SECOND.name, "1:rectified@160"), (SECOND.name,), ("1:rectified@160",)
+    assert mine == [(both, 1.0), (third, 1.0), (second, 1.0), (third, 0.7), (second, 0.7)]
+    assert [len(indices) for indices, _, _ in seen][:3] == [4, 4, 2]
+    assert one.records[1].units[-1].failure == "given up: the worker died"
+    assert not one.records[1].lacking(THREE_UNITS.units)
+    assert one.complete
+
+
+def test_a_unit_that_workers_always_fail_at_is_given_up_on_all_pairs() -> None:
+    one = planner(200)
+    lost = 0
+    while (plan := one.next(0.0)) is not None:
+        if any(unit == SECOND for unit in plan.units) and one.records[plan.indices[0]].lacking([SECOND]):
+            lost += 1
+            one.lose(Lost(Job(plan, ()), Cause.DIED), 0.0)
+        else:
+            one.take(finished(plan, one), 0.0)
+    assert lost < 40
+    assert one.complete
+    assert any(f"{SECOND.name} is given up: workers failed" in told.text for told in one.explanations)
+
+
+def test_a_job_that_no_worker_began_is_planned_again_as_it_was() -> None:
+    one = planner(9)
+    plan = one.next(0.0)
+    assert plan is not None
+    one.lose(Lost(Job(plan, ()), Cause.NO_WORKER), 0.0)
+    again = one.next(0.0)
+    assert again is not None
+    assert (again.indices, again.units, again.shrink) == (plan.indices, plan.units, 1.0)
+
+
+def test_pairs_are_weak_for_few_inliers_a_low_share_or_an_uncertain_region() -> None:
+    def record(matches: int, inliers: int, reason: RegionReason = RegionReason.CROPPED) -> Record:
+        region = CriticalRegion(Box(0, 0, 9, 9), reason)
+        unit = UnitRecord(SWEEP.name, 1, matches, inliers, 0.0, 0.0, "")
+        return Record(0, FALLBACK_FUNDAMENTAL, "", (unit,), (region, region))
+
+    config = UpgradeConfig(below_inliers=50, below_share=0.2)
+    assert is_weak(record(100, 49), config)
+    assert not is_weak(record(100, 50), config)
+    assert is_weak(record(1000, 199), config)
+    assert is_weak(record(100, 60, RegionReason.NO_CLUSTER), config)
+    assert not is_weak(record(100, 60, RegionReason.NO_CLUSTER), replace(config, uncertain=False))
+
+
+@pytest.mark.parametrize(("gain", "upgraded"), [(0, 57), (20, 300)])
+def test_extra_units_end_where_nothing_is_gained_and_a_resumed_run_decides_the_same(
+    gain: int, upgraded: int
+) -> None:
+    recipe = Recipe((SWEEP, EXTRA), upgrade=UpgradeConfig(below_inliers=100))
+    one = planner(300, recipe)
+    while (plan := one.next(0.0)) is not None:
+        one.take(finished(plan, one, 50 if plan.phase is Phase.SWEEP else gain), 0.0)
+    assert sum(record.has(EXTRA) for record in one.records) == upgraded
+    assert one.complete
+    again = Planner(range(300), recipe, list(one.records), one.budget)
+    assert again.next(0.0) is None
+    assert again.complete
+
+
+def test_costs_that_change_are_planned_for_and_explained() -> None:
+    ran = simulate(Scenario(400, (0.5, 1.0, 1.0), 0, 1, 1100.0, warm_up=1, misses=0, drift=10, turn=0.5))
+    assert ran.late == 0
+    assert ran.lost == 0
+    assert ran.report.ending is Ending.TIME_IS_UP
+    assert any("of 3 units fit" in one.text for one in ran.report.explanations)
+
+
+def test_random_runs_are_never_late_never_lose_a_row_and_use_their_time() -> None:
+    runs = [simulate(random_scenario(seed, pairs=300)) for seed in range(150)]
+    assert max(run.late for run in runs) == 0
+    assert sum(run.lost for run in runs) == 0
+    assert median(run.utilisation for run in runs if run.work_left) > 0.95
+
+
+def test_undisturbed_runs_use_all_their_time() -> None:
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        workers = int(rng.integers(1, 5))
+        costs = tuple(rng.uniform(0.2, 2, 5).tolist())
+        scenario = Scenario(600 * workers, costs, 1, workers, 2400.0, seed=seed)
+        ran = simulate(replace(scenario, limit=0.8 * scenario.work + 60))
+        assert ran.work_left
+        assert ran.utilisation > 0.97, scenario
+
+
+def test_planning_a_job_does_not_take_longer_for_many_pairs() -> None:
+    ran = simulate(Scenario(20_000, (0.1, 0.5, 0.5), 1, 2, 20_000.0))
+    assert ran.jobs > 2500
+    assert ran.planning < 1e-3
+    assert RESTART_SECONDS < ran.report.seconds < 20_000
