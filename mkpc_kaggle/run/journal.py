@@ -62,6 +62,8 @@ class EventKind(StrEnum):
     """units were given up or taken up again, and why"""
     BUDGET = "budget"
     """a job of the phase that the text names has ended"""
+    JOB = "job"
+    """what that job was"""
     FAULT = "fault"
     END = "end"
     """the run ended; the text says how"""
