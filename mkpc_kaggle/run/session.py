@@ -86,7 +86,7 @@ def pool_of(assembly: Assembly, workers: int | None) -> Pool:
     if workers == 0:
         return InProcessPool(assembly.pipeline, assembly.recipe)
     # On a CPU one process with all threads: two with half of them each do more (recipe light, two cores: the sweep
-    # in 18 s instead of 27), but need twice the memory, and a network's last bits change with its threads.
+    # over after 22 s instead of 31), but need twice the memory, and a network's last bits change with its threads.
     devices = assembly.devices
     places = [devices[number % len(devices)] for number in range(workers or len(devices))]
     share = len(places) if devices == ("cpu",) else 1
