@@ -8,7 +8,7 @@ jpeg will do on both sides. F of a pair satisfies x2^T F x1 = 0, image 1 being t
 import csv
 import os
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.cameras import Camera
-from mkpc_kaggle.geometry.robust import Matrix3
+from mkpc_kaggle.geometry.robust import Matrix3, Model
 
 TEST_COLUMNS = ("sample_id", "batch_id", "image_1_id", "image_2_id")
 SUBMISSION_COLUMNS = ("sample_id", "fundamental_matrix")
@@ -27,16 +27,29 @@ IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 
 @dataclass(frozen=True)
 class Pair:
-    """Two images to match: ``id`` is unique in a run, ``group`` the batch or scene they belong to."""
+    """Two images to match: ``id`` is unique in a run, ``group`` the batch or scene they belong to.
+
+    With ``intrinsics``, the camera matrices, E is estimated in F's stead.
+    """
 
     id: str
     group: str
     image0: Path
     image1: Path
+    intrinsics: tuple[Matrix3, Matrix3] | None = field(default=None, compare=False)
 
     @property
     def images(self) -> tuple[Path, Path]:
         return self.image0, self.image1
+
+    @property
+    def model(self) -> Model:
+        return Model.F if self.intrinsics is None else Model.E
+
+    @property
+    def key(self) -> str:
+        """What tells it from other pairs in a journal: the id, and the intrinsics that E depends on."""
+        return self.id if self.intrinsics is None else f"{self.id} {[K.tolist() for K in self.intrinsics]}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +64,7 @@ class TruePair:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A scene of the train side: its pairs, and the metres that one unit of its world is long."""
+    """Pairs with cameras, and the metres that one unit of their world is long, NaN where nobody knows."""
 
     name: str
     metres_per_unit: float

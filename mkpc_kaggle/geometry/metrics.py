@@ -23,7 +23,7 @@ class PoseError:
     """How far an F's pose is from the truth; infinite where there is no F.
 
     ``rotation`` and ``translation_angle`` in degrees (the latter at most 90, as the sign is unknown),
-    ``translation`` in metres after scaling to the true length.
+    ``translation`` in metres after scaling to the true length; NaN where the scale of the world is unknown.
     """
 
     rotation: float
@@ -67,7 +67,7 @@ def rotation_angle(R: Matrix3) -> float:
 def mean_average_accuracy(errors: Sequence[PoseError]) -> float:
     """The mAA of one scene: the share of pairs within both thresholds, averaged over the ten threshold pairs.
 
-    NaN without pairs. Source: evaluation page of the Image Matching Challenge 2022.
+    NaN without pairs, or without metres. Source: evaluation page of the Image Matching Challenge 2022.
     """
     if not errors:
         return float("nan")
@@ -75,7 +75,9 @@ def mean_average_accuracy(errors: Sequence[PoseError]) -> float:
 
 
 def pair_accuracy(error: PoseError) -> float:
-    """The share of the ten threshold pairs that one pair's error meets: its part of the mAA."""
+    """The share of the ten threshold pairs that one pair's error meets, its part of the mAA; NaN without metres."""
+    if np.isnan(error.translation):
+        return float("nan")
     meets = (error.rotation < ROTATION_THRESHOLDS) & (error.translation < TRANSLATION_THRESHOLDS)
     return float(np.mean(meets))
 

@@ -66,7 +66,7 @@ class UnitRecord:
 
 @dataclass(frozen=True, eq=False)
 class Record:
-    """What is known of one pair: its F and how it came about.
+    """What is known of one pair: its F (its E, where the pair has intrinsics) and how it came about.
 
     ``failure`` is empty, or says why ``F`` is the fallback. The seconds are those of the last job on the pair.
     """

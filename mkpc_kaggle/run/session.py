@@ -68,8 +68,8 @@ def run_pairs(
 
 
 def digest_of(pairs: Sequence[Pair]) -> str:
-    """Tells one test set from another: the ids of its pairs, in order."""
-    return hashlib.sha256("\n".join(pair.id for pair in pairs).encode()).hexdigest()
+    """Tells one test set from another: the keys of its pairs, in order."""
+    return hashlib.sha256("\n".join(pair.key for pair in pairs).encode()).hexdigest()
 
 
 @contextmanager

@@ -123,7 +123,7 @@ def _outcome(task: Task, opened: Opened, recipe: Recipe) -> Outcome:
     if work is None or not work.results:
         return Outcome(Record.untouched(task.index, opened.failure or NOT_REACHED))
     start = time.perf_counter()
-    match = finish(work, recipe)
+    match = finish(work, recipe, task.pair.model, task.pair.intrinsics)
     seconds = time.perf_counter() - start
     record = record_of(task.index, match, decode=opened.seconds, cluster=work.cluster_seconds, estimate=seconds)
     return Outcome(record, match.results)
