@@ -40,8 +40,9 @@ def paired_difference(scenes: Sequence[tuple[Values, Values]], *, seed: int = 0)
     """The mean over scenes of the mean gain on a pair, from the pairs' values under the first and second way.
 
     Both values of a pair stand at the same place. The interval is the percentile bootstrap's: the pairs of each
-    scene are drawn anew, with replacement, :data:`RESAMPLES` times; the scenes stay. ``ValueError`` without scenes,
-    for a scene without pairs, and where the two ways differ in pairs. The same input gives the same interval.
+    scene are drawn anew, with replacement, :data:`RESAMPLES` times; the scenes stay. It takes pairs for
+    independent, which those that share an image are not quite. The same input gives the same interval.
+    ``ValueError`` without scenes, for a scene without pairs, and where the two ways differ in pairs.
     Source: Efron and Tibshirani, An Introduction to the Bootstrap, 13.3.
     """
     if not scenes:
@@ -102,7 +103,7 @@ def _scene(validation: Validation, name: str) -> SceneScore:
 
 
 def seconds_of_work(record: Record) -> float:
-    """What matching a pair took: units, clusters and the last estimate; whichever run did them, side by side or not."""
+    """What a pair took: its units, clusters and last estimate, whichever run did them."""
     units = sum(unit.encode_seconds + unit.match_seconds for unit in record.units)
     return units + record.cluster_seconds + record.estimate_seconds
 
@@ -113,7 +114,7 @@ def seconds_per_pair(validation: Validation) -> float:
 
 
 def comparison_table(comparison: Comparison) -> list[str]:
-    """Lines: for each recipe its mAA and seconds a pair, then its gain over the first, in each scene and overall."""
+    """Lines: mAA and seconds a pair of each recipe, then its gain over the first, in each scene and overall."""
     first, *others = comparison.validations
     lines = [f"{'recipe':<40}{'mAA':>9}{'seconds a pair':>16}"]
     lines += [f"{one.recipe:<40}{one.maa:>9.4f}{seconds_per_pair(one):>16.3f}" for one in comparison.validations]

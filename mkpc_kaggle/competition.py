@@ -237,8 +237,8 @@ def _read_scene(directory: Path, metres: float, min_covisibility: float, most: i
         if not dash or first not in cameras or second not in cameras:
             raise UserError(f"{path}: the pair {key!r} is not two images of calibration.csv")
         if covisibility >= min_covisibility:
-            images = [image_path(directory / "images", plain_name(name, path)) for name in (first, second)]
-            pair = Pair(pair_id(directory.name, first, second), directory.name, *images)
+            image0, image1 = (image_path(directory / "images", plain_name(name, path)) for name in (first, second))
+            pair = Pair(pair_id(directory.name, first, second), directory.name, image0, image1)
             pairs.append(TruePair(pair, cameras[first], cameras[second], covisibility))
     if most is not None and most < len(pairs):
         pairs = [pairs[index] for index in np.linspace(0, len(pairs) - 1, most).round().astype(int)]

@@ -89,16 +89,6 @@ def parse_line(line: str, number: int, file: Path) -> Line:
     return Line(number, names, turns, (Camera(K0, np.eye(3), np.zeros(3)), Camera(K1, R, t)))
 
 
-def format_line(true: TruePair, image_root: Path, turns: tuple[int, int] = (0, 0)) -> str:
-    """The line of a pair whose images lie under ``image_root``; what :func:`parse_line` reads."""
-    pair, camera0, camera1 = true.pair, true.camera0, true.camera1
-    R = camera1.R @ camera0.R.T
-    T = np.vstack([np.column_stack([R, camera1.t - R @ camera0.t]), [0, 0, 0, 1]])
-    names = [image.relative_to(image_root).as_posix() for image in pair.images]
-    numbers = np.concatenate([camera0.K.ravel(), camera1.K.ravel(), T.ravel()])
-    return " ".join([*names, *map(str, turns), *(f"{number:.17g}" for number in numbers)])
-
-
 def confined(name: str, where: str) -> str:
     """``name`` if it is a relative path that cannot lead out of a directory."""
     # Windows' rules know drives and backslashes, and all that other systems call absolute.
@@ -125,7 +115,7 @@ class Upright:
 
 
 def turned_copy(image: Path, turns: int, copies: Path) -> Upright:
-    """Write the image turned by ``turns`` quarters to ``copies``; itself if there is nothing to turn or to read."""
+    """The image turned by ``turns`` quarters, in ``copies``; itself where there is nothing to turn or to read."""
     picture = read_image(image) if turns else None
     if picture is None or isinstance(picture, Unreadable):
         return Upright(image)

@@ -60,7 +60,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--work-dir",
         type=Path,
         metavar="DIR",
-        help="keep the journal there (with --compare one for each recipe), and go on from it; default: a temporary one",
+        help="keep the journal there (with --compare one a recipe) and go on from it; default: a temporary one",
     )
     parser.add_argument(
         "--submission",
@@ -143,9 +143,7 @@ def _compare(arguments: argparse.Namespace, scenes: "tuple[Scene, ...]", work_di
             _print_summary(validation, scenes, assembly)
             print("\n".join([*score_table(validation), ""]))
             if validation.report is None or validation.report.ending is not Ending.COMPLETE:
-                print(
-                    "nothing is compared before all have run on all pairs; with a --work-dir, the same command goes on"
-                )
+                print("nothing is compared before all is done; with a --work-dir, the same command goes on")
                 return leave(128 + interrupt.signal if interrupt.signal else 1, at_rest=at_rest)
             validations.append(validation)
     comparison = Comparison(tuple(validations))

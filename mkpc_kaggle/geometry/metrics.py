@@ -75,7 +75,7 @@ def mean_average_accuracy(errors: Sequence[PoseError]) -> float:
 
 
 def pair_accuracy(error: PoseError) -> float:
-    """The share of the ten threshold pairs that one pair's error meets, its part of the mAA; NaN without metres."""
+    """The share of the ten threshold pairs that an error meets, the pair's part of the mAA; NaN without metres."""
     if np.isnan(error.translation):
         return float("nan")
     meets = (error.rotation < ROTATION_THRESHOLDS) & (error.translation < TRANSLATION_THRESHOLDS)
