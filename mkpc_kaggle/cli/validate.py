@@ -41,6 +41,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     options.add_matching(parser)
     options.add_mode(parser)
     parser.add_argument(
+        "--units", metavar="A,B", help="only these of the recipe's units, such as 1:sift@1536; default: all"
+    )
+    parser.add_argument(
         "--compare",
         nargs="+",
         metavar="RECIPE[:MODE]",
@@ -82,6 +85,8 @@ def run(arguments: argparse.Namespace) -> int:
         raise UserError("--pairs and --image-root go together")
     if arguments.pairs is not None and (arguments.submission or arguments.compare):
         raise UserError("--submission and --compare need a --train-dir: they score in metres, which --pairs lacks")
+    if arguments.compare is not None and arguments.units is not None:
+        raise UserError("--units chooses from one recipe; --compare takes recipes as they are")
     if arguments.compare is not None and len(arguments.compare) < 2:
         raise UserError(f"--compare needs two recipes or more, not only {arguments.compare[0]}")
     with tempfile.TemporaryDirectory(prefix="mkpc-") as temporary:
@@ -174,7 +179,19 @@ def _assemble(arguments: argparse.Namespace, recipe: str, mode: str) -> "Assembl
         mode=Mode(mode),
         licence=Licence(arguments.licence),
     )
-    return replace(assembly, recipe=_with_estimator(assembly.recipe, arguments))
+    chosen = _with_units(assembly.recipe, arguments.units)
+    return replace(assembly, recipe=_with_estimator(chosen, arguments))
+
+
+def _with_units(recipe: "Recipe", wanted: str | None) -> "Recipe":
+    """The recipe with the units of these names alone; all of them where none are named."""
+    from mkpc_kaggle.errors import UserError
+
+    known, names = [unit.name for unit in recipe.units], wanted.split(",") if wanted is not None else []
+    for name in names:
+        if name not in known:
+            raise UserError(f"--units: recipe {recipe.name!r} has no unit {name!r}; it has {', '.join(known)}")
+    return recipe.only(lambda unit: unit.name in names) if names else recipe
 
 
 def _with_estimator(recipe: "Recipe", arguments: argparse.Namespace) -> "Recipe":
