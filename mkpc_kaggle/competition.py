@@ -11,6 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import pandas as pd
@@ -23,6 +24,8 @@ from mkpc_kaggle.geometry.robust import Matrix3, Model
 TEST_COLUMNS = ("sample_id", "batch_id", "image_1_id", "image_2_id")
 SUBMISSION_COLUMNS = ("sample_id", "fundamental_matrix")
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
+
+Item = TypeVar("Item")
 
 
 @dataclass(frozen=True)
@@ -214,6 +217,13 @@ def pair_id(scene: str, first: str, second: str) -> str:
     return f"{scene};{first}-{second}"
 
 
+def evenly_spread(items: Sequence[Item], most: int | None) -> list[Item]:
+    """At most that many of the items, the first and the last among them."""
+    if most is None or most >= len(items):
+        return list(items)
+    return [items[index] for index in np.linspace(0, len(items) - 1, most).round().astype(int)]
+
+
 def image_path(directory: Path, image_id: str) -> Path:
     """The image of that id in a directory; a png that does not exist where there is none."""
     return _images_of(directory).get(image_id, directory / f"{image_id}.png")
@@ -240,9 +250,7 @@ def _read_scene(directory: Path, metres: float, min_covisibility: float, most: i
             image0, image1 = (image_path(directory / "images", plain_name(name, path)) for name in (first, second))
             pair = Pair(pair_id(directory.name, first, second), directory.name, image0, image1)
             pairs.append(TruePair(pair, cameras[first], cameras[second], covisibility))
-    if most is not None and most < len(pairs):
-        pairs = [pairs[index] for index in np.linspace(0, len(pairs) - 1, most).round().astype(int)]
-    return Scene(directory.name, metres, tuple(pairs))
+    return Scene(directory.name, metres, tuple(evenly_spread(pairs, most)))
 
 
 def _numbers(cell: str, where: Path, count: int) -> NDArray[np.float64]:

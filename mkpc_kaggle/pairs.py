@@ -15,7 +15,7 @@ from pathlib import Path, PureWindowsPath
 import cv2
 import numpy as np
 
-from mkpc_kaggle.competition import Pair, Scene, TruePair
+from mkpc_kaggle.competition import Pair, Scene, TruePair, evenly_spread
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Size
@@ -38,12 +38,13 @@ class Line:
     cameras: tuple[Camera, Camera]
 
 
-def read_pairs(file: Path, image_root: Path, model: Model, copies: Path) -> Scene:
+def read_pairs(file: Path, image_root: Path, model: Model, *, copies: Path, most: int | None = None) -> Scene:
     """The pairs of a list as one scene of unknown scale, to estimate E or F on.
 
-    A turned copy of every image that has to be turned is written to the directory ``copies``, and the cameras are
-    those of the copies. An image that cannot be read is no error here: the run will say so. Raises
-    :class:`UserError` for a missing or empty file, a malformed line, and a name that leads out of ``image_root``.
+    ``most`` takes that many pairs, evenly spread over the list. A turned copy of every image that has to be turned
+    is written to the directory ``copies``, and the cameras are those of the copies. An image that cannot be read
+    is no error here: the run will say so. Raises :class:`UserError` for a missing or empty file, a malformed line,
+    and a name that leads out of ``image_root``.
     """
     if not image_root.is_dir():
         raise UserError(f"--image-root {image_root}: no such directory")
@@ -63,7 +64,8 @@ def read_pairs(file: Path, image_root: Path, model: Model, copies: Path) -> Scen
     def upright(name: str, turns: int) -> Upright:
         return turned_copy(image_root / name, turns, copies)
 
-    return Scene(file.stem, nan, tuple(_true_pair(line, upright, model, file.stem) for line in lines))
+    chosen = evenly_spread(lines, most)
+    return Scene(file.stem, nan, tuple(_true_pair(line, upright, model, file.stem) for line in chosen))
 
 
 def parse_line(line: str, number: int, file: Path) -> Line:

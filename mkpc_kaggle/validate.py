@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from math import isfinite, nan
 from pathlib import Path
 from statistics import mean
 from typing import Any
@@ -37,10 +38,11 @@ class PairScore:
 
 @dataclass(frozen=True)
 class SceneScore:
-    """The scores of one scene's pairs."""
+    """The scores of one scene's pairs; without metres there is no mAA."""
 
     scene: str
     pairs: tuple[PairScore, ...]
+    in_metres: bool = True
 
     @property
     def errors(self) -> list[PoseError]:
@@ -48,7 +50,7 @@ class SceneScore:
 
     @property
     def maa(self) -> float:
-        return mean_average_accuracy(self.errors)
+        return mean_average_accuracy(self.errors) if self.in_metres else nan
 
     def auc(self, threshold: float) -> float:
         return pose_auc(self.errors, threshold)
@@ -81,7 +83,11 @@ def validate(scenes: Sequence[Scene], assembly: Assembly, session: Session) -> t
     report, at_rest = run_pairs(pairs, assembly, session)
     records = iter(report.records)
     scored = tuple(
-        SceneScore(scene.name, tuple(score_record(true, next(records), scene) for true in scene.pairs))
+        SceneScore(
+            scene.name,
+            tuple(score_record(true, next(records), scene) for true in scene.pairs),
+            isfinite(scene.metres_per_unit),
+        )
         for scene in scenes
     )
     return Validation(assembly.recipe.name, scored, report), at_rest
@@ -145,7 +151,7 @@ def score_table(validation: Validation) -> list[str]:
 
 
 def _cell(value: float) -> str:
-    return f"{value:>9.4f}" if np.isfinite(value) else f"{'-':>9}"
+    return f"{value:>9.4f}" if isfinite(value) else f"{'-':>9}"
 
 
 def to_json(validation: Validation) -> dict[str, Any]:
@@ -203,4 +209,4 @@ def _pair_json(pair: PairScore) -> dict[str, Any]:
 
 
 def _finite(value: float) -> float | None:
-    return value if np.isfinite(value) else None
+    return value if isfinite(value) else None

@@ -108,14 +108,14 @@ def test_names_with_dots_in_them_are_fine() -> None:
 def test_a_list_without_pairs_is_refused(tmp_path: Path, content: bytes, told: str) -> None:
     (tmp_path / "list.txt").write_bytes(content)
     with pytest.raises(UserError, match=told):
-        read_pairs(tmp_path / "list.txt", tmp_path, Model.E, tmp_path)
+        read_pairs(tmp_path / "list.txt", tmp_path, Model.E, copies=tmp_path)
 
 
 def test_what_is_not_there_is_named(tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"none.txt cannot be read: No such file"):
-        read_pairs(tmp_path / "none.txt", tmp_path, Model.E, tmp_path)
+        read_pairs(tmp_path / "none.txt", tmp_path, Model.E, copies=tmp_path)
     with pytest.raises(UserError, match=r"--image-root .*: no such directory"):
-        read_pairs(tmp_path / "none.txt", tmp_path / "images", Model.E, tmp_path)
+        read_pairs(tmp_path / "none.txt", tmp_path / "images", Model.E, copies=tmp_path)
 
 
 @pytest.fixture
@@ -127,7 +127,11 @@ def scenes(demo: DemoSet) -> tuple[Scene, ...]:
 def test_the_true_matrix_has_no_error(
     demo: DemoSet, scenes: tuple[Scene, ...], tmp_path: Path, model: Model
 ) -> None:
-    read = read_pairs(write_list(tmp_path / "list.txt", scenes, demo.train_dir), demo.train_dir, model, tmp_path)
+    read = read_pairs(
+        write_list(tmp_path / "list.txt", scenes, demo.train_dir), demo.train_dir, model, copies=tmp_path
+    )
+    some = read_pairs(tmp_path / "list.txt", demo.train_dir, model, copies=tmp_path, most=2)
+    assert [true.pair.id for true in some.pairs] == [read.pairs[0].pair.id, read.pairs[2].pair.id]
     for true in read.pairs:
         assert true.pair.model is model
         cameras = true.camera0, true.camera1
@@ -153,7 +157,7 @@ def test_images_are_set_upright_and_their_cameras_with_them(
             cameras.append(camera.turned(-quarters, image.size))
         lines.append(line_of((names[0], names[1]), (cameras[0], cameras[1]), turns))
     (tmp_path / "list.txt").write_text("\n".join(lines))
-    read = read_pairs(tmp_path / "list.txt", tmp_path, Model.E, tmp_path / "copies")
+    read = read_pairs(tmp_path / "list.txt", tmp_path, Model.E, copies=tmp_path / "copies")
     for true, original in zip(read.pairs, originals, strict=True):
         for path, former in zip(true.pair.images, original.pair.images, strict=True):
             image, upright = read_image(path), read_image(former)
@@ -175,7 +179,7 @@ def test_a_journal_knows_what_was_estimated_and_with_which_cameras(
     path = write_list(tmp_path / "list.txt", scenes, demo.train_dir)
 
     def digest(model: Model) -> str:
-        return digest_of([true.pair for true in read_pairs(path, demo.train_dir, model, tmp_path).pairs])
+        return digest_of([true.pair for true in read_pairs(path, demo.train_dir, model, copies=tmp_path).pairs])
 
     before = digest(Model.E), digest(Model.F)
     assert before[0] != before[1]
@@ -207,7 +211,7 @@ def same_errors(train_dir: Path, scene: str, tmp_path: Path) -> None:
     np.testing.assert_allclose(errors_of(out), on_train_side, atol=1e-4)
 
     assert main(pairs) == 0
-    read = read_pairs(listed, train_dir, Model.E, tmp_path)
+    read = read_pairs(listed, train_dir, Model.E, copies=tmp_path)
     matcher = TwoStageMatcher(str(recipe))
     matches = [matcher(*true.pair.images, model=Model.E, intrinsics=true.pair.intrinsics) for true in read.pairs]
     errors = [error_of(match.estimate.matrix, true, read) for match, true in zip(matches, read.pairs, strict=True)]

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from mkpc_kaggle.assembly import Assembly
     from mkpc_kaggle.competition import Scene
     from mkpc_kaggle.recipe import Recipe
+    from mkpc_kaggle.run.session import Interrupt, Session
     from mkpc_kaggle.validate import Validation
 
 HELP = """\
@@ -35,9 +36,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     source.add_argument("--train-dir", type=Path, metavar="DIR")
     source.add_argument("--pairs", type=Path, metavar="FILE", help="a list of pairs with K and poses")
     parser.add_argument("--image-root", type=Path, metavar="DIR", help="where the images of --pairs lie")
-    parser.add_argument("--scenes", default="", metavar="A,B", help="default: all")
+    parser.add_argument("--scenes", default="", metavar="A,B", help="of --train-dir; default: all")
     parser.add_argument("--pairs-per-scene", type=int, metavar="N", help="evenly spread; default: all")
-    parser.add_argument("--min-covisibility", type=float, default=0.1, help="default: 0.1, as in the competition")
+    parser.add_argument(
+        "--min-covisibility", type=float, default=0.1, help="of --train-dir; default: 0.1, as in the competition"
+    )
     options.add_matching(parser)
     options.add_mode(parser)
     parser.add_argument(
@@ -108,8 +111,14 @@ def _read_scenes(arguments: argparse.Namespace, work_dir: Path) -> "tuple[Scene,
     from mkpc_kaggle.pairs import read_pairs
 
     if arguments.pairs is not None:
-        copies = work_dir / "turned"
-        return (read_pairs(arguments.pairs, arguments.image_root, Model(arguments.estimate), copies),)
+        scene = read_pairs(
+            arguments.pairs,
+            arguments.image_root,
+            Model(arguments.estimate),
+            copies=work_dir / "turned",
+            most=arguments.pairs_per_scene,
+        )
+        return (scene,)
     return read_train_side(
         arguments.train_dir,
         scenes=filter(None, arguments.scenes.split(",")),
@@ -119,13 +128,12 @@ def _read_scenes(arguments: argparse.Namespace, work_dir: Path) -> "tuple[Scene,
 
 
 def _match_and_score(arguments: argparse.Namespace, scenes: "tuple[Scene, ...]", work_dir: Path) -> int:
-    from mkpc_kaggle.run.session import Session, interruptible
+    from mkpc_kaggle.run.session import interruptible
     from mkpc_kaggle.validate import score_table, to_json, validate
 
     with interruptible() as interrupt:
         assembly = _assemble(arguments, arguments.recipe, arguments.mode)
-        session = Session(work_dir, options.budget_of(arguments), interrupt)
-        validation, at_rest = validate(scenes, assembly, session)
+        validation, at_rest = validate(scenes, assembly, _session(arguments, work_dir, interrupt))
     _print_summary(validation, scenes, assembly)
     print("\n".join(score_table(validation)))
     _write_json(arguments.json, to_json(validation))
@@ -135,7 +143,7 @@ def _match_and_score(arguments: argparse.Namespace, scenes: "tuple[Scene, ...]",
 def _compare(arguments: argparse.Namespace, scenes: "tuple[Scene, ...]", work_dir: Path) -> int:
     from mkpc_kaggle.compare import Comparison, comparison_json, comparison_table
     from mkpc_kaggle.run.engine import Ending
-    from mkpc_kaggle.run.session import Session, interruptible
+    from mkpc_kaggle.run.session import interruptible
     from mkpc_kaggle.validate import score_table, validate
 
     validations = []
@@ -143,8 +151,7 @@ def _compare(arguments: argparse.Namespace, scenes: "tuple[Scene, ...]", work_di
         assemblies = [_assemble(arguments, *_recipe_and_mode(choice)) for choice in arguments.compare]
         for choice, assembly in zip(arguments.compare, assemblies, strict=True):
             own_dir = work_dir / re.sub(r"[^\w.-]+", "_", choice)
-            session = Session(own_dir, options.budget_of(arguments), interrupt)
-            validation, at_rest = validate(scenes, assembly, session)
+            validation, at_rest = validate(scenes, assembly, _session(arguments, own_dir, interrupt))
             _print_summary(validation, scenes, assembly)
             print("\n".join([*score_table(validation), ""]))
             if validation.report is None or validation.report.ending is not Ending.COMPLETE:
@@ -155,6 +162,12 @@ def _compare(arguments: argparse.Namespace, scenes: "tuple[Scene, ...]", work_di
     print("\n".join(comparison_table(comparison)))
     _write_json(arguments.json, comparison_json(comparison))
     return leave(0, at_rest=at_rest)
+
+
+def _session(arguments: argparse.Namespace, work_dir: Path, interrupt: "Interrupt") -> "Session":
+    from mkpc_kaggle.run.session import Session
+
+    return Session(work_dir, options.budget_of(arguments), interrupt)
 
 
 def _recipe_and_mode(choice: str) -> tuple[str, str]:

@@ -67,7 +67,7 @@ def rotation_angle(R: Matrix3) -> float:
 def mean_average_accuracy(errors: Sequence[PoseError]) -> float:
     """The mAA of one scene: the share of pairs within both thresholds, averaged over the ten threshold pairs.
 
-    NaN without pairs, or without metres. Source: evaluation page of the Image Matching Challenge 2022.
+    NaN without pairs. Source: evaluation page of the Image Matching Challenge 2022.
     """
     if not errors:
         return float("nan")
@@ -75,9 +75,7 @@ def mean_average_accuracy(errors: Sequence[PoseError]) -> float:
 
 
 def pair_accuracy(error: PoseError) -> float:
-    """The share of the ten threshold pairs that an error meets, the pair's part of the mAA; NaN without metres."""
-    if np.isnan(error.translation):
-        return float("nan")
+    """The share of the ten threshold pairs that one pair's error meets: its part of the mAA."""
     meets = (error.rotation < ROTATION_THRESHOLDS) & (error.translation < TRANSLATION_THRESHOLDS)
     return float(np.mean(meets))
 
