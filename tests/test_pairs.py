@@ -1,4 +1,5 @@
 import json
+import re
 from pathlib import Path
 
 import cv2
@@ -19,6 +20,7 @@ from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.robust import Model
 from mkpc_kaggle.images import Image, read_image
 from mkpc_kaggle.pairs import parse_line, read_pairs
+from mkpc_kaggle.recipe import load_recipe
 from mkpc_kaggle.run.session import digest_of
 from mkpc_kaggle.validate import error_of
 
@@ -272,3 +274,12 @@ def test_options_that_do_not_go_together(
 def test_a_threshold_of_nothing_is_refused(demo: DemoSet, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["validate", "--train-dir", str(demo.train_dir), "--recipe", "classical", "--threshold", "0"]) == 2
     assert "threshold must be in" in capsys.readouterr().err
+
+
+def test_the_commands_of_the_docs_name_units_that_there_are() -> None:
+    text = (Path(__file__).resolve().parents[1] / "docs" / "benchmarks.md").read_text()
+    commands = re.findall(r"--recipe (\w+)(?: --units ([\w:@,]+))?", text)
+    assert {name for name, _ in commands} == {"yfcc", "yfcc_naive", "scannet", "scannet_naive"}
+    for name, units in commands:
+        known = {unit.name for unit in load_recipe(name).units}
+        assert set(filter(None, units.split(","))) <= known
