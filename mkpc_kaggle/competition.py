@@ -8,9 +8,10 @@ jpeg will do on both sides. F of a pair satisfies x2^T F x1 = 0, image 1 being t
 import csv
 import os
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import pandas as pd
@@ -18,25 +19,40 @@ from numpy.typing import NDArray
 
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.cameras import Camera
-from mkpc_kaggle.geometry.robust import Matrix3
+from mkpc_kaggle.geometry.robust import Matrix3, Model
 
 TEST_COLUMNS = ("sample_id", "batch_id", "image_1_id", "image_2_id")
 SUBMISSION_COLUMNS = ("sample_id", "fundamental_matrix")
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 
+Item = TypeVar("Item")
+
 
 @dataclass(frozen=True)
 class Pair:
-    """Two images to match: ``id`` is unique in a run, ``group`` the batch or scene they belong to."""
+    """Two images to match: ``id`` is unique in a run, ``group`` the batch or scene they belong to.
+
+    With ``intrinsics``, the camera matrices, E is estimated in F's stead.
+    """
 
     id: str
     group: str
     image0: Path
     image1: Path
+    intrinsics: tuple[Matrix3, Matrix3] | None = field(default=None, compare=False)
 
     @property
     def images(self) -> tuple[Path, Path]:
         return self.image0, self.image1
+
+    @property
+    def model(self) -> Model:
+        return Model.F if self.intrinsics is None else Model.E
+
+    @property
+    def key(self) -> str:
+        """What tells it from other pairs in a journal: the id, and the intrinsics that E depends on."""
+        return self.id if self.intrinsics is None else f"{self.id} {[K.tolist() for K in self.intrinsics]}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +67,7 @@ class TruePair:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A scene of the train side: its pairs, and the metres that one unit of its world is long."""
+    """Pairs with cameras, and the metres that one unit of their world is long, NaN where nobody knows."""
 
     name: str
     metres_per_unit: float
@@ -201,6 +217,13 @@ def pair_id(scene: str, first: str, second: str) -> str:
     return f"{scene};{first}-{second}"
 
 
+def evenly_spread(items: Sequence[Item], most: int | None) -> list[Item]:
+    """At most that many of the items, the first and the last among them."""
+    if most is None or most >= len(items):
+        return list(items)
+    return [items[index] for index in np.linspace(0, len(items) - 1, most).round().astype(int)]
+
+
 def image_path(directory: Path, image_id: str) -> Path:
     """The image of that id in a directory; a png that does not exist where there is none."""
     return _images_of(directory).get(image_id, directory / f"{image_id}.png")
@@ -224,12 +247,10 @@ def _read_scene(directory: Path, metres: float, min_covisibility: float, most: i
         if not dash or first not in cameras or second not in cameras:
             raise UserError(f"{path}: the pair {key!r} is not two images of calibration.csv")
         if covisibility >= min_covisibility:
-            images = [image_path(directory / "images", plain_name(name, path)) for name in (first, second)]
-            pair = Pair(pair_id(directory.name, first, second), directory.name, *images)
+            image0, image1 = (image_path(directory / "images", plain_name(name, path)) for name in (first, second))
+            pair = Pair(pair_id(directory.name, first, second), directory.name, image0, image1)
             pairs.append(TruePair(pair, cameras[first], cameras[second], covisibility))
-    if most is not None and most < len(pairs):
-        pairs = [pairs[index] for index in np.linspace(0, len(pairs) - 1, most).round().astype(int)]
-    return Scene(directory.name, metres, tuple(pairs))
+    return Scene(directory.name, metres, tuple(evenly_spread(pairs, most)))
 
 
 def _numbers(cell: str, where: Path, count: int) -> NDArray[np.float64]:

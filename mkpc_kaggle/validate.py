@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from math import isfinite, nan
 from pathlib import Path
 from statistics import mean
 from typing import Any
@@ -19,7 +20,7 @@ from mkpc_kaggle.geometry.metrics import (
     pose_auc,
     pose_error,
 )
-from mkpc_kaggle.geometry.robust import Matrix3
+from mkpc_kaggle.geometry.robust import Matrix3, Model
 from mkpc_kaggle.run.engine import RunReport
 from mkpc_kaggle.run.jobs import Record
 from mkpc_kaggle.run.session import Session, run_pairs
@@ -37,10 +38,11 @@ class PairScore:
 
 @dataclass(frozen=True)
 class SceneScore:
-    """The scores of one scene's pairs."""
+    """The scores of one scene's pairs; without metres there is no mAA."""
 
     scene: str
     pairs: tuple[PairScore, ...]
+    in_metres: bool = True
 
     @property
     def errors(self) -> list[PoseError]:
@@ -48,7 +50,7 @@ class SceneScore:
 
     @property
     def maa(self) -> float:
-        return mean_average_accuracy(self.errors)
+        return mean_average_accuracy(self.errors) if self.in_metres else nan
 
     def auc(self, threshold: float) -> float:
         return pose_auc(self.errors, threshold)
@@ -81,7 +83,11 @@ def validate(scenes: Sequence[Scene], assembly: Assembly, session: Session) -> t
     report, at_rest = run_pairs(pairs, assembly, session)
     records = iter(report.records)
     scored = tuple(
-        SceneScore(scene.name, tuple(score_record(true, next(records), scene) for true in scene.pairs))
+        SceneScore(
+            scene.name,
+            tuple(score_record(true, next(records), scene) for true in scene.pairs),
+            isfinite(scene.metres_per_unit),
+        )
         for scene in scenes
     )
     return Validation(assembly.recipe.name, scored, report), at_rest
@@ -93,8 +99,12 @@ def score_record(true: TruePair, record: Record, scene: Scene) -> PairScore:
     return PairScore(true.pair.id, true.covisibility, error, record)
 
 
-def error_of(F: Matrix3, true: TruePair, scene: Scene) -> PoseError:
-    return pose_error(F, true.camera0, true.camera1, scene.metres_per_unit)
+def error_of(matrix: Matrix3, true: TruePair, scene: Scene) -> PoseError:
+    """The error of a pair's F, or of its E if that is what was estimated."""
+    cameras = true.camera0, true.camera1
+    if true.pair.model is Model.E:
+        cameras = true.camera0.calibrated, true.camera1.calibrated
+    return pose_error(matrix, *cameras, scene.metres_per_unit)
 
 
 def score_submission(submission: Path, truth: Path, scenes: Sequence[Scene]) -> Validation:
@@ -129,24 +139,28 @@ def score_submission(submission: Path, truth: Path, scenes: Sequence[Scene]) -> 
 
 
 def score_table(validation: Validation) -> list[str]:
-    """Lines: a row a scene and their mean, with mAA and pose AUC."""
+    """Lines: a row a scene and their mean, with mAA and pose AUC; a dash for the mAA of unknown metres."""
     heads = [f"AUC {threshold:.0f}" for threshold in AUC_THRESHOLDS]
     lines = [f"{'scene':<20}{'pairs':>6}{'mAA':>9}" + "".join(f"{head:>9}" for head in heads)]
     for scene in validation.scenes:
         aucs = "".join(f"{scene.auc(threshold):>9.4f}" for threshold in AUC_THRESHOLDS)
-        lines.append(f"{scene.scene:<20}{len(scene.pairs):>6}{scene.maa:>9.4f}{aucs}")
+        lines.append(f"{scene.scene:<20}{len(scene.pairs):>6}{_cell(scene.maa)}{aucs}")
     aucs = "".join(f"{validation.auc(threshold):>9.4f}" for threshold in AUC_THRESHOLDS)
     count = sum(len(scene.pairs) for scene in validation.scenes)
-    return [*lines, f"{'mean over scenes':<20}{count:>6}{validation.maa:>9.4f}{aucs}"]
+    return [*lines, f"{'mean over scenes':<20}{count:>6}{_cell(validation.maa)}{aucs}"]
+
+
+def _cell(value: float) -> str:
+    return f"{value:>9.4f}" if isfinite(value) else f"{'-':>9}"
 
 
 def to_json(validation: Validation) -> dict[str, Any]:
-    """All figures of a validation as JSON values: overall, per scene, per pair; infinite errors are null."""
+    """All figures of a validation as JSON values: overall, per scene, per pair; what is not finite is null."""
     records = validation.records
     reasons = Counter(str(region.reason) for record in records for region in record.regions or ())
     return {
         "recipe": validation.recipe,
-        "mAA": validation.maa,
+        "mAA": _finite(validation.maa),
         "AUC": {f"{threshold:g}": validation.auc(threshold) for threshold in AUC_THRESHOLDS},
         "seconds": validation.report.seconds if validation.report else None,
         "seconds_per_pair": validation.report.seconds / len(records) if validation.report else None,
@@ -156,7 +170,7 @@ def to_json(validation: Validation) -> dict[str, Any]:
         "scenes": [
             {
                 "scene": scene.scene,
-                "mAA": scene.maa,
+                "mAA": _finite(scene.maa),
                 "AUC": {f"{threshold:g}": scene.auc(threshold) for threshold in AUC_THRESHOLDS},
                 "pairs": [_pair_json(pair) for pair in scene.pairs],
             }
@@ -179,7 +193,7 @@ def _pair_json(pair: PairScore) -> dict[str, Any]:
     error, record = pair.error, pair.record
     values: dict[str, Any] = {
         "pair": pair.id,
-        "covisibility": pair.covisibility,
+        "covisibility": _finite(pair.covisibility),
         "rotation_error_degrees": _finite(error.rotation),
         "translation_error_metres": _finite(error.translation),
         "translation_error_degrees": _finite(error.translation_angle),
@@ -195,4 +209,4 @@ def _pair_json(pair: PairScore) -> dict[str, Any]:
 
 
 def _finite(value: float) -> float | None:
-    return value if np.isfinite(value) else None
+    return value if isfinite(value) else None

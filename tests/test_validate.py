@@ -149,3 +149,18 @@ def test_the_table_has_a_row_a_scene_and_their_mean(demo: DemoSet, tmp_path: Pat
     lines = score_table(scored)
     assert [line.split()[0] for line in lines] == ["scene", "courtyard", "mean"]
     assert lines[1].split()[1:3] == ["8", "1.0000"]
+
+
+def test_some_of_a_recipes_units(demo: DemoSet, recipe: Path, tmp_path: Path) -> None:
+    out = tmp_path / "scores.json"
+    arguments = ["validate", "--train-dir", str(demo.train_dir), "--pairs-per-scene", "1", "--recipe", str(recipe)]
+    assert main([*arguments, "--units", "1:sift@320", "--json", str(out)]) == 0
+    (pair,) = json.loads(out.read_text())["scenes"][0]["pairs"]
+    assert set(pair["matches"]) == {"1:sift@320"}
+
+
+def test_an_unknown_unit_is_told_with_the_known_ones(
+    demo: DemoSet, recipe: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["validate", "--train-dir", str(demo.train_dir), "--recipe", str(recipe), "--units", "sift"]) == 2
+    assert "no unit 'sift'; it has 1:sift@320, 2:sift@400" in capsys.readouterr().err

@@ -2,14 +2,19 @@
 
 import argparse
 import json
+import re
 import tempfile
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from mkpc_kaggle.cli import leave, options
 
 if TYPE_CHECKING:
+    from mkpc_kaggle.assembly import Assembly
     from mkpc_kaggle.competition import Scene
+    from mkpc_kaggle.recipe import Recipe
+    from mkpc_kaggle.run.session import Interrupt, Session
+    from mkpc_kaggle.validate import Validation
 
 HELP = """\
 Run a recipe, with the engine that makes submissions, on a train side (calibration.csv, pair_covisibility.csv
@@ -17,22 +22,52 @@ and images/ in each scene, scaling_factors.csv beside the scenes), and score it 
 over rotation errors of 1 to 10 degrees and translation errors of 0.2 to 5 metres, for each scene, then the
 mean of the scenes; beside it the AUC of the larger angular error up to 5, 10 and 20 degrees.
 
+With --compare, several recipes run on the same pairs; each is compared with the first.
+
+With --pairs and --image-root the pairs come from a list in the format of SuperGlue's evaluation (a line a pair:
+name0 name1 turns0 turns1 K0 K1 T_0to1), E is estimated, and the AUC is what counts: see docs/benchmarks.md.
+
 With --submission and --truth nothing is matched: the files are scored.
 """
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--train-dir", type=Path, required=True, metavar="DIR")
-    parser.add_argument("--scenes", default="", metavar="A,B", help="default: all")
+    source = parser.add_mutually_exclusive_group(required=True)
+    source.add_argument("--train-dir", type=Path, metavar="DIR")
+    source.add_argument("--pairs", type=Path, metavar="FILE", help="a list of pairs with K and poses")
+    parser.add_argument("--image-root", type=Path, metavar="DIR", help="where the images of --pairs lie")
+    parser.add_argument("--scenes", default="", metavar="A,B", help="of --train-dir; default: all")
     parser.add_argument("--pairs-per-scene", type=int, metavar="N", help="evenly spread; default: all")
-    parser.add_argument("--min-covisibility", type=float, default=0.1, help="default: 0.1, as in the competition")
+    parser.add_argument(
+        "--min-covisibility", type=float, default=0.1, help="of --train-dir; default: 0.1, as in the competition"
+    )
     options.add_matching(parser)
     options.add_mode(parser)
+    parser.add_argument(
+        "--units", metavar="A,B", help="only these of the recipe's units, such as 1:sift@1536; default: all"
+    )
+    parser.add_argument(
+        "--compare",
+        nargs="+",
+        metavar="RECIPE[:MODE]",
+        help="run these in place of --recipe and --mode, and give the gain of each over the first with its 95 %% "
+        "interval; such as classical:whole-images classical",
+    )
+    parser.add_argument(
+        "--estimate", choices=["E", "F"], default="E", help="what to estimate on --pairs (default: E)"
+    )
+    parser.add_argument("--method", choices=["magsac", "ransac"], help="default: the recipe's")
+    parser.add_argument(
+        "--threshold", type=float, metavar="PIXELS", help="of the method; for E divided by the mean focal length"
+    )
     options.add_time_limit(parser, default=None)
     options.add_engine(parser)
     parser.add_argument("--json", type=Path, metavar="FILE", help="write all figures, per pair too")
     parser.add_argument(
-        "--work-dir", type=Path, metavar="DIR", help="keep the journal there; default: a temporary one"
+        "--work-dir",
+        type=Path,
+        metavar="DIR",
+        help="keep the journal there (with --compare one a recipe) and go on from it; default: a temporary one",
     )
     parser.add_argument(
         "--submission",
@@ -45,52 +80,165 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    from mkpc_kaggle.competition import read_train_side
     from mkpc_kaggle.errors import UserError
     from mkpc_kaggle.validate import score_submission, score_table
 
     if (arguments.submission is None) != (arguments.truth is None):
         raise UserError("--submission and --truth go together")
-    scenes = read_train_side(
+    if (arguments.pairs is None) != (arguments.image_root is None):
+        raise UserError("--pairs and --image-root go together")
+    if arguments.pairs is not None and (arguments.submission or arguments.compare):
+        raise UserError("--submission and --compare need a --train-dir: they score in metres, which --pairs lacks")
+    if arguments.compare is not None and arguments.units is not None:
+        raise UserError("--units chooses from one recipe; --compare takes recipes as they are")
+    if arguments.compare is not None and len(arguments.compare) < 2:
+        raise UserError(f"--compare needs two recipes or more, not only {arguments.compare[0]}")
+    with tempfile.TemporaryDirectory(prefix="mkpc-") as temporary:
+        work_dir = arguments.work_dir or Path(temporary)
+        scenes = _read_scenes(arguments, work_dir)
+        if arguments.submission is not None:
+            for submission in arguments.submission:
+                print(submission)
+                print("\n".join(score_table(score_submission(submission, arguments.truth, scenes))))
+            return 0
+        if arguments.compare is not None:
+            return _compare(arguments, scenes, work_dir)
+        return _match_and_score(arguments, scenes, work_dir)
+
+
+def _read_scenes(arguments: argparse.Namespace, work_dir: Path) -> "tuple[Scene, ...]":
+    from mkpc_kaggle.competition import read_train_side
+    from mkpc_kaggle.geometry.robust import Model
+    from mkpc_kaggle.pairs import read_pairs
+
+    if arguments.pairs is not None:
+        scene = read_pairs(
+            arguments.pairs,
+            arguments.image_root,
+            Model(arguments.estimate),
+            copies=work_dir / "turned",
+            most=arguments.pairs_per_scene,
+        )
+        return (scene,)
+    return read_train_side(
         arguments.train_dir,
         scenes=filter(None, arguments.scenes.split(",")),
         min_covisibility=arguments.min_covisibility,
         pairs_per_scene=arguments.pairs_per_scene,
     )
-    if arguments.submission is not None:
-        for submission in arguments.submission:
-            print(submission)
-            print("\n".join(score_table(score_submission(submission, arguments.truth, scenes))))
-        return 0
-    with tempfile.TemporaryDirectory(prefix="mkpc-") as temporary:
-        return _match_and_score(arguments, scenes, arguments.work_dir or Path(temporary))
 
 
 def _match_and_score(arguments: argparse.Namespace, scenes: "tuple[Scene, ...]", work_dir: Path) -> int:
-    from mkpc_kaggle.assembly import Licence, assemble
-    from mkpc_kaggle.recipe import Mode
-    from mkpc_kaggle.run.session import Session, interruptible
-    from mkpc_kaggle.run.summary import summary
+    from mkpc_kaggle.run.session import interruptible
     from mkpc_kaggle.validate import score_table, to_json, validate
 
     with interruptible() as interrupt:
-        assembly = assemble(
-            arguments.recipe,
-            weights=arguments.weights,
-            device=arguments.device,
-            precision=arguments.precision,
-            mode=Mode(arguments.mode),
-            licence=Licence(arguments.licence),
-        )
-        session = Session(work_dir, options.budget_of(arguments), interrupt, workers=arguments.workers)
-        validation, at_rest = validate(scenes, assembly, session)
+        assembly = _assemble(arguments, arguments.recipe, arguments.mode)
+        validation, at_rest = validate(scenes, assembly, _session(arguments, work_dir, interrupt))
+    _print_summary(arguments, validation, scenes, assembly)
+    print("\n".join(score_table(validation)))
+    _write_json(arguments.json, to_json(validation))
+    return leave(128 + interrupt.signal if interrupt.signal else 0, at_rest=at_rest)
+
+
+def _compare(arguments: argparse.Namespace, scenes: "tuple[Scene, ...]", work_dir: Path) -> int:
+    from mkpc_kaggle.compare import Comparison, comparison_json, comparison_table
+    from mkpc_kaggle.run.engine import Ending
+    from mkpc_kaggle.run.session import interruptible
+    from mkpc_kaggle.validate import score_table, validate
+
+    validations = []
+    with interruptible() as interrupt:
+        assemblies = [_assemble(arguments, *_recipe_and_mode(choice)) for choice in arguments.compare]
+        for choice, assembly in zip(arguments.compare, assemblies, strict=True):
+            own_dir = work_dir / re.sub(r"[^\w.-]+", "_", choice)
+            validation, at_rest = validate(scenes, assembly, _session(arguments, own_dir, interrupt))
+            _print_summary(arguments, validation, scenes, assembly)
+            print("\n".join([*score_table(validation), ""]))
+            if validation.report is None or validation.report.ending is not Ending.COMPLETE:
+                print("nothing is compared before all is done; with a --work-dir, the same command goes on")
+                return leave(128 + interrupt.signal if interrupt.signal else 1, at_rest=at_rest)
+            validations.append(validation)
+    comparison = Comparison(tuple(validations))
+    print("\n".join(comparison_table(comparison)))
+    _write_json(arguments.json, comparison_json(comparison))
+    return leave(0, at_rest=at_rest)
+
+
+def _session(arguments: argparse.Namespace, work_dir: Path, interrupt: "Interrupt") -> "Session":
+    from mkpc_kaggle.run.session import Session
+
+    return Session(work_dir, options.budget_of(arguments), interrupt, workers=arguments.workers)
+
+
+def _recipe_and_mode(choice: str) -> tuple[str, str]:
+    """``NAME:MODE`` -> both; without a mode, as the recipe is written."""
+    from mkpc_kaggle.recipe import Mode
+
+    name, _, mode = choice.rpartition(":")
+    return (name, mode) if name and mode in list(Mode) else (choice, Mode.TWO_STAGE)
+
+
+def _assemble(arguments: argparse.Namespace, recipe: str, mode: str) -> "Assembly":
+    from dataclasses import replace
+
+    from mkpc_kaggle.assembly import Licence, assemble
+    from mkpc_kaggle.recipe import Mode
+
+    assembly = assemble(
+        recipe,
+        weights=arguments.weights,
+        device=arguments.device,
+        precision=arguments.precision,
+        mode=Mode(mode),
+        licence=Licence(arguments.licence),
+    )
+    chosen = _with_units(assembly.recipe, arguments.units)
+    return replace(assembly, recipe=_with_estimator(chosen, arguments))
+
+
+def _with_units(recipe: "Recipe", wanted: str | None) -> "Recipe":
+    """The recipe with the units of these names alone; all of them where none are named."""
+    from mkpc_kaggle.errors import UserError
+
+    known, names = [unit.name for unit in recipe.units], wanted.split(",") if wanted is not None else []
+    for name in names:
+        if name not in known:
+            raise UserError(f"--units: recipe {recipe.name!r} has no unit {name!r}; it has {', '.join(known)}")
+    return recipe.only(lambda unit: unit.name in names) if names else recipe
+
+
+def _with_estimator(recipe: "Recipe", arguments: argparse.Namespace) -> "Recipe":
+    """The recipe with the robust method and threshold that the command names."""
+    from dataclasses import replace
+
+    from mkpc_kaggle.errors import UserError
+    from mkpc_kaggle.geometry.robust import Method
+
+    config = recipe.magsac
+    try:
+        if arguments.method is not None:
+            config = replace(config, method=Method(arguments.method))
+        if arguments.threshold is not None:
+            config = replace(config, threshold=arguments.threshold)
+    except ValueError as error:
+        raise UserError(f"--threshold: {error}") from error
+    return replace(recipe, magsac=config)
+
+
+def _print_summary(
+    arguments: argparse.Namespace, validation: "Validation", scenes: "tuple[Scene, ...]", assembly: "Assembly"
+) -> None:
+    from mkpc_kaggle.run.summary import summary
+
     pairs = [true.pair for scene in scenes for true in scene.pairs]
     assert validation.report is not None
     if arguments.explain:
         print("\n".join(["plan:", *map(str, validation.report.explanations)]))
     print(summary(pairs, validation.report, assembly.left_out))
     print(f"\nrecipe {validation.recipe}")
-    print("\n".join(score_table(validation)))
-    if arguments.json is not None:
-        arguments.json.write_text(json.dumps(to_json(validation), indent=1) + "\n", encoding="utf-8")
-    return leave(128 + interrupt.signal if interrupt.signal else 0, at_rest=at_rest)
+
+
+def _write_json(path: Path | None, values: dict[str, Any]) -> None:
+    if path is not None:
+        path.write_text(json.dumps(values, indent=1) + "\n", encoding="utf-8")

@@ -1,11 +1,16 @@
-"""Calibrated cameras, and the exact geometry of two of them."""
+"""Calibrated cameras, turned ones too, and the exact geometry of two of them."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.robust import Matrix3
+
+QUARTER: Matrix3 = np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])
+"""A quarter turn, counter-clockwise as one looks at the picture: (x, y) goes to (y, -x), y being down."""
+QUARTER.setflags(write=False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -15,6 +20,24 @@ class Camera:
     K: Matrix3
     R: Matrix3
     t: NDArray[np.float64]
+
+    @property
+    def calibrated(self) -> "Camera":
+        """The same camera with rays for pixels: the F of two such is the E of the two."""
+        return replace(self, K=np.eye(3))
+
+    def turned(self, quarters: int, size: Size) -> "Camera":
+        """The camera that takes ``np.rot90(picture, quarters)``, where this one takes a picture of ``size``.
+
+        A quarter turn moves the pixel (x, y) to (y, width - 1 - x). The camera turns about its axis by as much,
+        so that K stays what K is, with its focal lengths and its centre changing places.
+        """
+        camera, (width, height) = self, size
+        for _ in range(quarters % 4):
+            moved = np.array([[1.0, 0, 0], [0, 1, width - 1], [0, 0, 1]]) @ QUARTER
+            camera = Camera(moved @ camera.K @ QUARTER.T, QUARTER @ camera.R, QUARTER @ camera.t)
+            width, height = height, width
+        return camera
 
 
 def relative_pose(camera0: Camera, camera1: Camera) -> tuple[Matrix3, NDArray[np.float64]]:

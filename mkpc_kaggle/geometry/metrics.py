@@ -23,7 +23,7 @@ class PoseError:
     """How far an F's pose is from the truth; infinite where there is no F.
 
     ``rotation`` and ``translation_angle`` in degrees (the latter at most 90, as the sign is unknown),
-    ``translation`` in metres after scaling to the true length.
+    ``translation`` in metres after scaling to the true length; NaN where the scale of the world is unknown.
     """
 
     rotation: float

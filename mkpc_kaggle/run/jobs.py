@@ -97,7 +97,7 @@ class UnitRecord:
 
 @dataclass(frozen=True, eq=False)
 class Record:
-    """What is known of one pair: its F and how it came about.
+    """What is known of one pair: its F (its E, where the pair has intrinsics) and how it came about.
 
     ``failure`` is empty, or says why ``F`` is the fallback. The seconds are those of the last job on the pair.
     ``before`` is the number of inliers that it had when it was first upgraded; ``None`` if it never was.

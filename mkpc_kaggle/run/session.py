@@ -152,8 +152,8 @@ def watched(engine: Engine, session: Session) -> Iterator[None]:
 
 
 def digest_of(pairs: Sequence[Pair]) -> str:
-    """Tells one test set from another: the ids of its pairs, in order."""
-    return hashlib.sha256("\n".join(pair.id for pair in pairs).encode()).hexdigest()
+    """Tells one test set from another: the keys of its pairs, in order."""
+    return hashlib.sha256("\n".join(pair.key for pair in pairs).encode()).hexdigest()
 
 
 @contextmanager

@@ -119,7 +119,9 @@ def _outcome(task: Task, matched: Matched, recipe: Recipe) -> Outcome:
     if not matched.results:
         return Outcome(Record.untouched(task.index, matched.failure or NOT_REACHED))
     start = time.perf_counter()
-    match = conclude(task.results + matched.results, matched.regions, recipe)
+    match = conclude(
+        task.results + matched.results, matched.regions, recipe, task.pair.model, task.pair.intrinsics
+    )
     seconds = time.perf_counter() - start
     record = record_of(
         task.index,

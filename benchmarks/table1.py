@@ -1,0 +1,304 @@
+"""The paper's Table 1 at equal inference count: whole images against two stages; repeated points merged or not.
+
+python -m benchmarks.table1 --train-dir DIR --weights DIR --out DIR [--pairs-per-scene 6] [--matchers sift,aliked]
+
+All recipes see a pair together, so that a unit they share runs once. Each pair that is done is a line of
+OUT/pairs.jsonl: killed or stopped, the same command goes on there, with more pairs too. The tables in Markdown are
+printed at the end; ``--tables`` prints those of the pairs done so far.
+"""
+
+import argparse
+import json
+import os
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import combinations
+from pathlib import Path
+from statistics import mean
+
+from tqdm import tqdm
+
+from benchmarks.merging import merged
+from mkpc_kaggle.assembly import assemble
+from mkpc_kaggle.compare import Difference, paired_difference
+from mkpc_kaggle.competition import Scene, TruePair, read_train_side
+from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.geometry.metrics import PoseError, pair_accuracy, pose_auc
+from mkpc_kaggle.geometry.robust import RobustConfig, estimate
+from mkpc_kaggle.images import ImageStore, Unreadable
+from mkpc_kaggle.pipeline import PairWork, Pipeline, UnitResult
+from mkpc_kaggle.recipe import Recipe, Unit
+from mkpc_kaggle.run.jobs import visiting_order
+from mkpc_kaggle.validate import error_of
+
+LONG_SIDES = {
+    "sift": (1536, 1280, 1024, 1440, 1152, 1664),
+    "aliked": (1024, 832, 640, 928, 736, 1120),
+    "xfeat_lighterglue": (1024, 1280, 800, 1152, 896, 1408),
+}
+"""In the order in which recipes take them up: all differ, since to look twice at the same finds the same."""
+MOST_MATCHES = {"sift": 8000}
+OPTIONS: Mapping[str, Mapping[str, float]] = {"sift": {"features": 8000, "ratio": 0.8}}
+
+LAYOUTS = {
+    "one": (1, 0),
+    "two": (2, 0),
+    "three": (3, 0),
+    "one + two": (1, 2),
+    "two + one": (2, 1),
+    "six": (6, 0),
+    "three + three": (3, 3),
+}
+"""How many of a matcher's units look at whole images, and how many at the critical regions."""
+CONTRASTS = (("three", "one + two"), ("three", "two + one"), ("six", "three + three"))
+"""The same units, all on whole images and split over the stages."""
+ENSEMBLE_LAYOUTS = ("three", "two + one")
+MERGED_LAYOUTS = ("three", "two + one", "three + three")
+
+
+@dataclass(frozen=True)
+class Way:
+    """One way to match a pair: some matchers, the layout of each one's units, repeated points merged or not."""
+
+    matchers: tuple[str, ...]
+    layout: str
+    merged: bool = False
+
+    @property
+    def name(self) -> str:
+        return f"{' + '.join(self.matchers)}: {self.layout}{', merged' if self.merged else ''}"
+
+    @property
+    def units(self) -> tuple[Unit, ...]:
+        """Those of stage 1 first; a size of every matcher, then the next."""
+        whole, crops = LAYOUTS[self.layout]
+        return tuple(
+            Unit(1 if place < whole else 2, matcher, LONG_SIDES[matcher][place], MOST_MATCHES.get(matcher, 4096))
+            for place in range(whole + crops)
+            for matcher in self.matchers
+        )
+
+
+def ways_of(matchers: Sequence[str]) -> tuple[Way, ...]:
+    """Every layout of each matcher alone, some of every two and more together, and some with merging."""
+    alone = [Way((matcher,), layout) for matcher in matchers for layout in LAYOUTS]
+    together = [
+        Way(some, layout)
+        for count in range(2, len(matchers) + 1)
+        for some in combinations(matchers, count)
+        for layout in ENSEMBLE_LAYOUTS
+    ]
+    plain = [*alone, *together]
+    return (*plain, *(replace(way, merged=True) for way in plain if way.layout in MERGED_LAYOUTS))
+
+
+def union(ways: Iterable[Way]) -> Recipe:
+    """A recipe with the units of all ways, each once, those of stage 1 first."""
+    units = sorted({unit: None for way in ways for unit in way.units}, key=lambda unit: unit.stage)
+    names = {unit.matcher for unit in units}
+    return Recipe(tuple(units), "table1", matchers={name: OPTIONS[name] for name in OPTIONS if name in names})
+
+
+@dataclass(frozen=True)
+class Found:
+    """What one way made of one pair; ``matches`` are those that MAGSAC was given, ``seconds`` are of work."""
+
+    error: PoseError
+    matches: int
+    seconds: float
+
+
+def try_all(
+    ways: Sequence[Way], work: PairWork, true: TruePair, scene: Scene, pipeline: Pipeline, radius: float
+) -> dict[str, Found]:
+    """Every way on one pair: units of stage 1 once, those of stage 2 once for each plain way."""
+    (whole,) = pipeline.match([work], [unit for unit in pipeline.recipe.units if unit.stage == 1])
+    known = {result.unit: result for result in whole.results}
+    done: dict[tuple[Unit, ...], PairWork] = {}
+    for way in ways:
+        if way.units not in done:
+            stage1 = tuple(known[unit] for unit in way.units if unit.stage == 1)
+            stage2 = [unit for unit in way.units if unit.stage == 2]
+            done[way.units] = pipeline.match([replace(work, results=stage1)], stage2)[0]
+    config = pipeline.recipe.magsac
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        conclude = partial(_conclude, true=true, scene=scene, config=config, radius=radius)
+        found = pool.map(conclude, ways, [done[way.units] for way in ways])
+        return {way.name: one for way, one in zip(ways, found, strict=True)}
+
+
+def _conclude(
+    way: Way, work: PairWork, *, true: TruePair, scene: Scene, config: RobustConfig, radius: float
+) -> Found:
+    start = time.thread_time()  # several work at once
+    parts = [result.matches for result in work.results]
+    matches = merged(parts, radius) if way.merged else Matches.concatenate(parts)
+    result = estimate(matches, config)
+    seconds = time.thread_time() - start + work.cluster_seconds + _seconds(work.results)
+    error = error_of(result.matrix, true, scene) if result.ok else PoseError.failed()
+    return Found(error, len(matches), seconds)
+
+
+def _seconds(results: Iterable[UnitResult]) -> float:
+    return sum(result.seconds for result in results)
+
+
+class Diary:
+    """The pairs that are done, in a file of JSON lines; the first says what they were done with."""
+
+    def __init__(self, path: Path, settings: Mapping[str, object]) -> None:
+        self.path = path
+        self.found: dict[str, dict[str, Found]] = {}
+        told = json.dumps(settings, sort_keys=True)
+        text = path.read_text(encoding="utf-8") if path.exists() else ""
+        whole = text[: text.rfind("\n") + 1]  # a line that was cut off is done again
+        head, *lines = whole.splitlines() or [told]
+        if head != told:
+            raise UserError(f"{path} was made with other settings; name another --out")
+        for line in lines:
+            pair, found = json.loads(line)
+            self.found[pair] = {way: Found(PoseError(*error), *rest) for way, (error, *rest) in found.items()}
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(whole or told + "\n", encoding="utf-8")
+
+    def add(self, pair: str, found: Mapping[str, Found]) -> None:
+        values = {
+            way: [
+                [one.error.rotation, one.error.translation_angle, one.error.translation],
+                one.matches,
+                one.seconds,
+            ]
+            for way, one in found.items()
+        }
+        with self.path.open("a", encoding="utf-8") as stream:
+            stream.write(json.dumps([pair, values]) + "\n")
+        self.found[pair] = dict(found)
+
+
+def run_all(scenes: Sequence[Scene], ways: Sequence[Way], pipeline: Pipeline, diary: Diary, radius: float) -> None:
+    """Every way on every pair that the diary lacks; unreadable images are failures of every way."""
+    todo = [(scene, true) for scene in scenes for true in _in_order(scene) if true.pair.id not in diary.found]
+    images = ImageStore()
+    try:
+        for place, (scene, true) in enumerate(tqdm(todo, unit="pair", smoothing=0.05)):
+            images.announce(path for _, coming in todo[place : place + 2] for path in coming.pair.images)
+            image0, image1 = (images.get(path) for path in true.pair.images)
+            if isinstance(image0, Unreadable) or isinstance(image1, Unreadable):
+                diary.add(true.pair.id, {way.name: Found(PoseError.failed(), 0, 0.0) for way in ways})
+                continue
+            diary.add(true.pair.id, try_all(ways, PairWork((image0, image1)), true, scene, pipeline, radius))
+    finally:
+        images.close()
+
+
+def _in_order(scene: Scene) -> list[TruePair]:
+    return [scene.pairs[index] for index in visiting_order([true.pair for true in scene.pairs])]
+
+
+@dataclass(frozen=True)
+class Tables:
+    """What was found, by scene, on the pairs that are done."""
+
+    scenes: Mapping[str, Sequence[Mapping[str, Found]]]
+
+    @classmethod
+    def of(cls, scenes: Sequence[Scene], diary: Diary) -> "Tables":
+        done = {
+            scene.name: [diary.found[true.pair.id] for true in scene.pairs if true.pair.id in diary.found]
+            for scene in scenes
+        }
+        return cls({name: pairs for name, pairs in done.items() if pairs})
+
+    def markdown(self, ways: Sequence[Way]) -> Iterator[str]:
+        counts = ", ".join(f"{name} {len(pairs)}" for name, pairs in self.scenes.items())
+        yield f"Pairs: {counts}."
+        yield from ("", "### Accuracy", "", *self.accuracy([way for way in ways if not way.merged]))
+        yield from ("", "### The same units, split over the stages or all on whole images", "")
+        plain = {way.name: way for way in ways if not way.merged}
+        yield from self.gains(
+            (replace(way, layout=naive), way)
+            for naive, split in CONTRASTS
+            for way in plain.values()
+            if way.layout == split and replace(way, layout=naive).name in plain
+        )
+        yield from ("", "### Repeated points, merged or each counted", "")
+        yield from self.gains((replace(way, merged=False), way) for way in ways if way.merged)
+
+    def accuracy(self, ways: Sequence[Way]) -> Iterator[str]:
+        """A row a way: mAA by scene and their mean, AUC at 5 and 10 degrees, matches, seconds a pair."""
+        yield from _head(["way", *self.scenes, "mAA", "AUC 5", "AUC 10", "matches", "seconds"])
+        for way in ways:
+            found = {name: [pair[way.name] for pair in pairs] for name, pairs in self.scenes.items()}
+            errors = {name: [one.error for one in ones] for name, ones in found.items()}
+            maas = [mean(map(pair_accuracy, ones)) for ones in errors.values()]
+            aucs = [mean(pose_auc(ones, threshold) for ones in errors.values()) for threshold in (5, 10)]
+            every = [one for ones in found.values() for one in ones]
+            cells = [f"{value:.4f}" for value in (*maas, mean(maas), *aucs)]
+            cells += [f"{mean(one.matches for one in every):.0f}", f"{mean(one.seconds for one in every):.2f}"]
+            yield _row([way.name, *cells])
+
+    def gains(self, contrasts: Iterable[tuple[Way, Way]]) -> Iterator[str]:
+        """A row a contrast: what the second gains over the first in mAA, with intervals, by scene and overall."""
+        yield from _head(["way", "against", *self.scenes, "mean over scenes"])
+        for first, second in contrasts:
+            overall = self.difference(first, second, tuple(self.scenes))
+            by_scene = [str(self.difference(first, second, (name,))) for name in self.scenes]
+            yield _row([second.name, first.name, *by_scene, f"**{overall}**"])
+
+    def difference(self, first: Way, second: Way, scenes: Sequence[str]) -> Difference:
+        values = [
+            (
+                [pair_accuracy(pair[first.name].error) for pair in self.scenes[name]],
+                [pair_accuracy(pair[second.name].error) for pair in self.scenes[name]],
+            )
+            for name in scenes
+        ]
+        return paired_difference(values)
+
+
+def _head(cells: Sequence[str]) -> list[str]:
+    return [_row(cells), _row(["---"] * len(cells))]
+
+
+def _row(cells: Sequence[str]) -> str:
+    return f"| {' | '.join(cells)} |"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--train-dir", type=Path, required=True)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--weights", type=Path, action="append", default=[])
+    parser.add_argument("--device", default="auto")
+    parser.add_argument("--matchers", default=",".join(LONG_SIDES), help="default: %(default)s")
+    parser.add_argument("--scenes", default="", help="default: all")
+    parser.add_argument("--pairs-per-scene", type=int, help="evenly spread; default: all")
+    parser.add_argument("--min-covisibility", type=float, default=0.1)
+    parser.add_argument("--merge-radius", type=float, default=1.0, help="pixels; default: %(default)s")
+    parser.add_argument("--tables", action="store_true", help="match nothing, print what there is")
+    arguments = parser.parse_args()
+    scenes = read_train_side(
+        arguments.train_dir,
+        scenes=filter(None, arguments.scenes.split(",")),
+        min_covisibility=arguments.min_covisibility,
+        pairs_per_scene=arguments.pairs_per_scene,
+    )
+    ways = ways_of(arguments.matchers.split(","))
+    assembly = assemble(union(ways), weights=arguments.weights, device=arguments.device)
+    settings = {
+        **assembly.fingerprint(),
+        "merge radius": arguments.merge_radius,
+        "ways": [way.name for way in ways],
+    }
+    diary = Diary(arguments.out / "pairs.jsonl", settings)
+    if not arguments.tables:
+        run_all(scenes, ways, assembly.pipeline(), diary, arguments.merge_radius)
+    print("\n".join(Tables.of(scenes, diary).markdown(ways)))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,27 @@
+"""Writes pairs in the format that :mod:`mkpc_kaggle.pairs` reads."""
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+
+from mkpc_kaggle.competition import Scene, TruePair
+from mkpc_kaggle.geometry.cameras import Camera, relative_pose
+
+
+def line_of(names: tuple[str, str], cameras: tuple[Camera, Camera], turns: tuple[int, int] = (0, 0)) -> str:
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = relative_pose(*cameras)
+    numbers = np.concatenate([cameras[0].K.ravel(), cameras[1].K.ravel(), T.ravel()])
+    return " ".join([*names, *map(str, turns), *(f"{number:.17g}" for number in numbers)])
+
+
+def line_of_pair(true: TruePair, image_root: Path) -> str:
+    image0, image1 = (str(image.relative_to(image_root)) for image in true.pair.images)
+    return line_of((image0, image1), (true.camera0, true.camera1))
+
+
+def write_list(path: Path, scenes: Iterable[Scene], image_root: Path) -> Path:
+    lines = [line_of_pair(true, image_root) for scene in scenes for true in scene.pairs]
+    path.write_text("\n".join(lines) + "\n")
+    return path

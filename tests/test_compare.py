@@ -1,0 +1,134 @@
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mkpc_kaggle.cli import main
+from mkpc_kaggle.compare import Comparison, paired_difference
+from mkpc_kaggle.demo import DemoSet
+from mkpc_kaggle.geometry.metrics import PoseError
+from mkpc_kaggle.validate import PairScore, SceneScore, Validation
+
+tenths = st.lists(st.integers(0, 10).map(lambda count: count / 10), min_size=1, max_size=30)
+RECIPE = """
+units = [{ stage = 1, matcher = "sift", long_side = 320 }, { stage = 2, matcher = "sift", long_side = 400 }]
+"""
+
+
+def test_a_gain_that_all_pairs_have_leaves_nothing_to_chance() -> None:
+    difference = paired_difference([([0.1, 0.5, 0.7], [0.4, 0.8, 1.0])])
+    assert (difference.gain, difference.low, difference.high) == pytest.approx((0.3, 0.3, 0.3))
+    assert difference.told
+
+
+def test_scenes_count_alike_however_many_pairs_they_have() -> None:
+    difference = paired_difference([([0.0] * 9, [0.2] * 9), ([0.0], [0.4])])
+    assert (difference.gain, difference.low, difference.high) == pytest.approx((0.3, 0.3, 0.3))
+
+
+def test_one_pair_in_two_gives_the_interval_of_the_coin() -> None:
+    """Of 4 pairs 2 gain 1: the mean of a resample is binomial(4, 1/2) / 4, 0 and 1 with 6.25 % each."""
+    difference = paired_difference([([0, 0, 0, 0], [1, 0, 1, 0])])
+    assert (difference.gain, difference.low, difference.high) == (0.5, 0, 1)
+    assert not difference.told
+
+
+@settings(max_examples=30, deadline=None)
+@given(tenths)
+def test_the_same_twice_differs_by_nothing(values: list[float]) -> None:
+    difference = paired_difference([(values, values)])
+    assert (difference.gain, difference.low, difference.high) == (0, 0, 0)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.lists(tenths, min_size=1, max_size=3), st.randoms(use_true_random=False))
+def test_the_interval_holds_the_gain_and_turns_with_it(firsts: list[list[float]], random) -> None:
+    seconds = [random.sample(first, len(first)) for first in firsts]
+    scenes = list(zip(firsts, seconds, strict=True))
+    difference = paired_difference(scenes)
+    assert difference == paired_difference(scenes)
+    assert difference.low - 1e-9 <= difference.gain <= difference.high + 1e-9
+    other = paired_difference([(second, first) for first, second in scenes])
+    assert other.gain == pytest.approx(-difference.gain)
+    assert (other.low, other.high) == pytest.approx((-difference.high, -difference.low), abs=0.07)
+
+
+def test_nineteen_intervals_of_twenty_hold_the_truth() -> None:
+    """Two scenes; the second way is better by 0.08 and by 0 on average, with the pairs' own scatter on top."""
+    generator, held, trials = np.random.default_rng(7), 0, 200
+    for _ in range(trials):
+        scenes = []
+        for pairs, gain in ((80, 0.08), (40, 0.0)):
+            level = generator.integers(0, 8, pairs) / 10
+            moved = generator.choice([-0.2, 0.0, 0.2], size=pairs, p=[0.3 - gain / 0.4, 0.4, 0.3 + gain / 0.4])
+            scenes.append((level, level + moved))
+        difference = paired_difference(scenes)
+        held += difference.low <= 0.04 <= difference.high
+    assert 0.90 <= held / trials <= 0.985
+
+
+@pytest.mark.parametrize("scenes", [[], [([], [])], [([0.1], [0.1, 0.2])]])
+def test_what_cannot_be_compared_is_refused(scenes: list[tuple[list[float], list[float]]]) -> None:
+    with pytest.raises(ValueError, match=r"pairs|scenes"):
+        paired_difference(scenes)
+
+
+def validation(name: str, *ids: str) -> Validation:
+    scores = tuple(PairScore(pair, 0.5, PoseError(0, 0, 0)) for pair in ids)
+    return Validation(name, (SceneScore("s", scores),))
+
+
+def test_different_pairs_are_not_compared() -> None:
+    with pytest.raises(ValueError, match="different pairs"):
+        Comparison((validation("a", "p", "q"), validation("b", "q", "p")))
+
+
+def compare(demo: DemoSet, *more: str) -> int:
+    return main(["validate", "--train-dir", str(demo.train_dir), "--pairs-per-scene", "4", *more])
+
+
+def test_a_recipe_against_its_units_on_whole_images(
+    demo: DemoSet, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recipe, out = tmp_path / "small.toml", tmp_path / "scores.json"
+    recipe.write_text(RECIPE)
+    arguments = ["--compare", f"{recipe}:whole-images", str(recipe), "--work-dir", str(tmp_path / "work")]
+    assert compare(demo, *arguments, "--json", str(out)) == 0
+    table = capsys.readouterr().out.split("seconds a pair\n")[-1]
+    scores = json.loads(out.read_text())
+    assert [one["recipe"] for one in scores["recipes"]] == ["small (whole-images)", "small"]
+    (gain,) = scores["gains"]
+    naive, split = (one["mAA"] for one in scores["recipes"])
+    assert gain["mAA"] == pytest.approx(split - naive)
+    assert gain["low"] <= gain["mAA"] <= gain["high"]
+    assert f"{gain['mAA']:+.4f} [{gain['low']:+.4f}, {gain['high']:+.4f}]" in table
+    assert all(one["work_seconds_per_pair"] > 0 for one in scores["recipes"])
+
+    assert compare(demo, *arguments) == 0  # nothing is left to do: the journals tell the same
+    again = capsys.readouterr().out
+    assert again.count("4 of them from earlier runs") == 2
+    assert again.split("seconds a pair\n")[-1] == table
+
+
+def test_nothing_is_compared_before_all_is_done(
+    demo: DemoSet, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert compare(demo, "--compare", "classical", "classical:stage-1", "--time-limit", "1s") == 1
+    printed = capsys.readouterr().out
+    assert "nothing is compared" in printed
+    assert "gain of mAA" not in printed
+
+
+def test_one_recipe_is_no_comparison(demo: DemoSet, capsys: pytest.CaptureFixture[str]) -> None:
+    assert compare(demo, "--compare", "classical") == 2
+    assert "two recipes" in capsys.readouterr().err
+
+
+def test_an_unknown_recipe_is_told_before_any_work(demo: DemoSet, capsys: pytest.CaptureFixture[str]) -> None:
+    assert compare(demo, "--compare", "classical", "clasical:stage-1") == 2
+    captured = capsys.readouterr()
+    assert "unknown recipe 'clasical'" in captured.err
+    assert captured.out == ""

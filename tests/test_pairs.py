@@ -1,0 +1,285 @@
+import json
+import re
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pair_lists import line_of, line_of_pair, write_list
+from shared import DATA, needs_data
+
+from mkpc_kaggle import TwoStageMatcher
+from mkpc_kaggle.cli import main
+from mkpc_kaggle.competition import Scene, read_train_side
+from mkpc_kaggle.demo import DemoSet
+from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.geometry.cameras import Camera, fundamental_of_cameras
+from mkpc_kaggle.geometry.coordinates import Size
+from mkpc_kaggle.geometry.robust import Model
+from mkpc_kaggle.images import Image, read_image
+from mkpc_kaggle.pairs import parse_line, read_pairs
+from mkpc_kaggle.recipe import load_recipe
+from mkpc_kaggle.run.session import digest_of
+from mkpc_kaggle.validate import error_of
+
+FILE = Path("list.txt")
+EYE = " ".join(["1 0 0 0 1 0 0 0 1"] * 2 + ["1 0 0 1 0 1 0 0 0 0 1 0 0 0 0 1"])
+K = np.array([[500.0, 0, 31.5], [0, 450, 20.25], [0, 0, 1]])
+R = cv2.Rodrigues(np.array([0.1, -0.3, 0.2]))[0]
+CAMERA = Camera(K, R, np.array([0.2, -0.1, 0.5]))
+RECIPE = (
+    'units = [{ stage = 1, matcher = "sift", long_side = 480 }, { stage = 2, matcher = "sift", long_side = 400 }]'
+)
+
+
+@given(st.integers(0, 3), st.integers(0, 63), st.integers(0, 39), st.floats(0.5, 20))
+def test_a_turned_camera_sees_what_the_turned_picture_shows(turns: int, x: int, y: int, depth: float) -> None:
+    size = Size(64, 40)
+    picture = np.zeros((size.height, size.width))
+    picture[y, x] = 1
+    shown_y, shown_x = np.argwhere(np.rot90(picture, turns))[0]
+    point = R.T @ (depth * np.linalg.inv(K) @ [x, y, 1] - CAMERA.t)
+    turned = CAMERA.turned(turns, size)
+    projected = turned.K @ (turned.R @ point + turned.t)
+    assert projected[2] == pytest.approx(depth)
+    np.testing.assert_allclose(projected[:2] / projected[2], [shown_x, shown_y], atol=1e-9)
+
+
+@pytest.mark.parametrize("turns", range(4))
+def test_a_turned_camera_is_a_camera(turns: int) -> None:
+    turned = CAMERA.turned(turns, Size(64, 40))
+    np.testing.assert_allclose(turned.R @ turned.R.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(turned.R) == pytest.approx(1)
+    np.testing.assert_array_equal(turned.K[np.tril_indices(3, -1)], 0)
+    assert [turned.K[0, 0], turned.K[1, 1]] == ([500, 450] if turns % 2 == 0 else [450, 500])
+    back = turned.turned(-turns, Size(64, 40) if turns % 2 == 0 else Size(40, 64))
+    for one, other in ((back.K, K), (back.R, R), (back.t, CAMERA.t)):
+        np.testing.assert_allclose(one, other, atol=1e-12)
+
+
+def test_a_line_is_what_was_written() -> None:
+    first = Camera(K, R, np.array([1.0, 2, 3]))
+    line = parse_line(line_of(("a/b.jpg", "c.png"), (first, CAMERA), (3, 1)), 7, FILE)
+    assert (line.number, line.names, line.turns) == (7, ("a/b.jpg", "c.png"), (3, 1))
+    np.testing.assert_array_equal(line.cameras[0].K, K)
+    np.testing.assert_allclose(
+        fundamental_of_cameras(*line.cameras), fundamental_of_cameras(first, CAMERA), atol=1e-15
+    )
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        ("a b", "expected 38 fields, name0 name1 .* found 2"),
+        (f"a b 0 0 {EYE} 1", "expected 38 fields, .* found 39"),
+        (f"a b 0 4 {EYE}", "expected 0, 1, 2 or 3 quarter turns, found '4'"),
+        (f"a b -1 0 {EYE}", "quarter turns, found '-1'"),
+        (f"a b 0 0 {EYE}".replace("1 0 0 0 1", "1 0 x 0 1", 1), "expected numbers .*'x'"),
+        (f"a b 0 0 {EYE}".replace("1 0 0 0 1", "1 0 nan 0 1", 1), "expected finite numbers"),
+        (f"a b 0 0 {EYE}".replace("1 0 0 0 1", "-1 0 0 0 1", 1), "expected K0 = fx s cx"),
+        (f"a b 0 0 {EYE}".replace("0 0 0 1", "0 0 0 2").strip(), "expected T_0to1 = .*|expected K"),
+        (f"a b 0 0 {EYE}".replace("1 0 0 1 0 1 0 0", "1 0 0 1 0 2 0 0"), "with R a rotation"),
+        (f"a b 0 0 {EYE}".replace("1 0 0 1 0 1 0 0", "-1 0 0 1 0 1 0 0"), "with R a rotation"),
+    ],
+)
+def test_a_malformed_line_is_named_with_what_was_expected(line: str, expected: str) -> None:
+    with pytest.raises(UserError, match=rf"^list.txt, line 3: .*({expected})"):
+        parse_line(line, 3, FILE)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("/etc/passwd", "../a.jpg", "a/../../b.jpg", "..", "a/..", "//host/share/a"),
+        *("..\\a.jpg", "a\\..\\b.jpg", "\\a", "C:\\a", "C:a"),
+    ],
+)
+def test_no_name_leads_out_of_the_image_root(name: str) -> None:
+    for names in (f"{name} ok.jpg", f"ok.jpg {name}"):
+        with pytest.raises(UserError, match=r"list.txt, line 2: .* leads out of the image root"):
+            parse_line(f"{names} 0 0 {EYE}", 2, FILE)
+
+
+def test_names_with_dots_in_them_are_fine() -> None:
+    assert parse_line(f"a/b..c.jpg ./d.jpg 0 0 {EYE}", 1, FILE).names == ("a/b..c.jpg", "./d.jpg")
+
+
+@pytest.mark.parametrize(("content", "told"), [(b"\n \n", "has no pairs"), (b"\xff\xfe", "not UTF-8")])
+def test_a_list_without_pairs_is_refused(tmp_path: Path, content: bytes, told: str) -> None:
+    (tmp_path / "list.txt").write_bytes(content)
+    with pytest.raises(UserError, match=told):
+        read_pairs(tmp_path / "list.txt", tmp_path, Model.E, copies=tmp_path)
+
+
+def test_what_is_not_there_is_named(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=r"none.txt cannot be read: No such file"):
+        read_pairs(tmp_path / "none.txt", tmp_path, Model.E, copies=tmp_path)
+    with pytest.raises(UserError, match=r"--image-root .*: no such directory"):
+        read_pairs(tmp_path / "none.txt", tmp_path / "images", Model.E, copies=tmp_path)
+
+
+@pytest.fixture
+def scenes(demo: DemoSet) -> tuple[Scene, ...]:
+    return read_train_side(demo.train_dir, pairs_per_scene=3)
+
+
+@pytest.mark.parametrize("model", [Model.E, Model.F])
+def test_the_true_matrix_has_no_error(
+    demo: DemoSet, scenes: tuple[Scene, ...], tmp_path: Path, model: Model
+) -> None:
+    read = read_pairs(
+        write_list(tmp_path / "list.txt", scenes, demo.train_dir), demo.train_dir, model, copies=tmp_path
+    )
+    some = read_pairs(tmp_path / "list.txt", demo.train_dir, model, copies=tmp_path, most=2)
+    assert [true.pair.id for true in some.pairs] == [read.pairs[0].pair.id, read.pairs[2].pair.id]
+    for true in read.pairs:
+        assert true.pair.model is model
+        cameras = true.camera0, true.camera1
+        if model is Model.E:
+            cameras = true.camera0.calibrated, true.camera1.calibrated
+        assert error_of(fundamental_of_cameras(*cameras), true, read).angle < 1e-6
+        assert all(path.is_file() for path in true.pair.images)
+
+
+def test_images_are_set_upright_and_their_cameras_with_them(
+    demo: DemoSet, scenes: tuple[Scene, ...], tmp_path: Path
+) -> None:
+    """Images that lie on their sides, with cameras to match, come back as what they were."""
+    lines, originals = [], [true for scene in scenes for true in scene.pairs]
+    for number, true in enumerate(originals):
+        turns, names, cameras = (number + 1, 3 - number), [], []
+        for quarters, path, camera in zip(turns, true.pair.images, (true.camera0, true.camera1), strict=True):
+            image = read_image(path)
+            assert isinstance(image, Image)
+            names.append(f"{number}-{path.stem}.png")
+            lying = cv2.cvtColor(np.ascontiguousarray(np.rot90(image.pixels, -quarters)), cv2.COLOR_RGB2BGR)
+            cv2.imwrite(str(tmp_path / names[-1]), lying)
+            cameras.append(camera.turned(-quarters, image.size))
+        lines.append(line_of((names[0], names[1]), (cameras[0], cameras[1]), turns))
+    (tmp_path / "list.txt").write_text("\n".join(lines))
+    read = read_pairs(tmp_path / "list.txt", tmp_path, Model.E, copies=tmp_path / "copies")
+    for true, original in zip(read.pairs, originals, strict=True):
+        for path, former in zip(true.pair.images, original.pair.images, strict=True):
+            image, upright = read_image(path), read_image(former)
+            assert isinstance(image, Image)
+            assert isinstance(upright, Image)
+            np.testing.assert_array_equal(image.pixels, upright.pixels)
+        for camera, former_camera in ((true.camera0, original.camera0), (true.camera1, original.camera1)):
+            np.testing.assert_allclose(camera.K, former_camera.K, atol=1e-9)
+        np.testing.assert_allclose(
+            fundamental_of_cameras(true.camera0, true.camera1),
+            fundamental_of_cameras(original.camera0, original.camera1),
+            atol=1e-9,
+        )
+
+
+def test_a_journal_knows_what_was_estimated_and_with_which_cameras(
+    scenes: tuple[Scene, ...], demo: DemoSet, tmp_path: Path
+) -> None:
+    path = write_list(tmp_path / "list.txt", scenes, demo.train_dir)
+
+    def digest(model: Model) -> str:
+        return digest_of([true.pair for true in read_pairs(path, demo.train_dir, model, copies=tmp_path).pairs])
+
+    before = digest(Model.E), digest(Model.F)
+    assert before[0] != before[1]
+    first, *rest = path.read_text().splitlines()
+    K00, others = first.split()[4], first.split()[5:]
+    path.write_text("\n".join([" ".join([*first.split()[:4], str(float(K00) + 1), *others]), *rest]))
+    assert (digest(Model.E) == before[0], digest(Model.F) == before[1]) == (False, True)
+
+
+def errors_of(out: Path) -> list[tuple[float | None, float | None]]:
+    (scene,) = json.loads(out.read_text())["scenes"]
+    return [(pair["rotation_error_degrees"], pair["translation_error_degrees"]) for pair in scene["pairs"]]
+
+
+def same_errors(train_dir: Path, scene: str, tmp_path: Path) -> None:
+    """F on a list has the errors of F on the train side; E those of the library's E."""
+    recipe, out = tmp_path / "small.toml", tmp_path / "scores.json"
+    recipe.write_text(RECIPE)
+    scenes = read_train_side(train_dir, scenes=[scene], pairs_per_scene=2)
+    listed = write_list(tmp_path / "list.txt", scenes, train_dir)
+    common = ["--recipe", str(recipe), "--json", str(out)]
+    assert (
+        main(["validate", "--train-dir", str(train_dir), "--scenes", scene, "--pairs-per-scene", "2", *common])
+        == 0
+    )
+    on_train_side = errors_of(out)
+    pairs = ["validate", "--pairs", str(listed), "--image-root", str(train_dir), *common]
+    assert main([*pairs, "--estimate", "F"]) == 0
+    np.testing.assert_allclose(errors_of(out), on_train_side, atol=1e-4)
+
+    assert main(pairs) == 0
+    read = read_pairs(listed, train_dir, Model.E, copies=tmp_path)
+    matcher = TwoStageMatcher(str(recipe))
+    matches = [matcher(*true.pair.images, model=Model.E, intrinsics=true.pair.intrinsics) for true in read.pairs]
+    errors = [error_of(match.estimate.matrix, true, read) for match, true in zip(matches, read.pairs, strict=True)]
+    expected = [(error.rotation, error.translation_angle) for error in errors]
+    np.testing.assert_allclose(errors_of(out), expected, atol=1e-9)
+    assert min(error.angle for error in errors) < 5
+
+
+def test_a_list_scores_as_the_train_side_does(demo: DemoSet, tmp_path: Path) -> None:
+    same_errors(demo.train_dir, "courtyard", tmp_path)
+
+
+@needs_data
+def test_a_list_of_real_pairs_scores_as_the_train_side_does(tmp_path: Path) -> None:
+    same_errors(DATA / "train", "fountain_p11", tmp_path)
+
+
+def test_failures_count_as_such(
+    demo: DemoSet, scenes: tuple[Scene, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One pair of two cannot be read: half of what the other reaches is left."""
+    true = max(scenes[0].pairs, key=lambda true: true.covisibility)
+    out = tmp_path / "scores.json"
+    good = line_of_pair(true, demo.train_dir)
+    bad = line_of(("missing.jpg", "none.jpg"), (true.camera0, true.camera1), (1, 0))
+    (tmp_path / "list.txt").write_text(f"{good}\n\n{bad}\n")
+    arguments = ["validate", "--pairs", str(tmp_path / "list.txt"), "--image-root", str(demo.train_dir)]
+    arguments += ["--recipe", "classical", "--method", "ransac", "--threshold", "1", "--json", str(out)]
+    assert main(arguments) == 0
+    scores = json.loads(out.read_text())
+    assert scores["mAA"] is None
+    found, missing = scores["scenes"][0]["pairs"]
+    assert found["rotation_error_degrees"] < 5
+    assert (missing["rotation_error_degrees"], missing["pair"]) == (None, "3: missing.jpg turned 1 none.jpg")
+    assert "no such file" in missing["failure"]
+    error = max(found["rotation_error_degrees"], found["translation_error_degrees"])
+    curve = 0.5 * (20 - error / 2) / 20
+    assert scores["AUC"]["20"] == pytest.approx(curve)
+    row = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("mean over scenes"))
+    assert row.split()[3:5] == ["2", "-"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["--pairs", "a.txt"], "go together"),
+        (["--pairs", "a.txt", "--image-root", ".", "--compare", "a", "b"], "need a --train-dir"),
+        (["--train-dir", ".", "--image-root", "."], "go together"),
+    ],
+)
+def test_options_that_do_not_go_together(
+    arguments: list[str], told: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["validate", *arguments]) == 2
+    assert told in capsys.readouterr().err
+
+
+def test_a_threshold_of_nothing_is_refused(demo: DemoSet, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["validate", "--train-dir", str(demo.train_dir), "--recipe", "classical", "--threshold", "0"]) == 2
+    assert "threshold must be in" in capsys.readouterr().err
+
+
+def test_the_commands_of_the_docs_name_units_that_there_are() -> None:
+    text = (Path(__file__).resolve().parents[1] / "docs" / "benchmarks.md").read_text()
+    commands = re.findall(r"--recipe (\w+)(?: --units ([\w:@,]+))?", text)
+    assert {name for name, _ in commands} == {"yfcc", "yfcc_naive", "scannet", "scannet_naive"}
+    for name, units in commands:
+        known = {unit.name for unit in load_recipe(name).units}
+        assert set(filter(None, units.split(","))) <= known

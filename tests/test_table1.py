@@ -1,0 +1,110 @@
+"""The benchmark of the paper's Table 1: the same units whole and split, repeated points merged or not."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks import table1
+from benchmarks.merging import merged
+from benchmarks.table1 import CONTRASTS, Diary, Tables, Way, run_all, union, ways_of
+from mkpc_kaggle.assembly import assemble
+from mkpc_kaggle.competition import read_train_side
+from mkpc_kaggle.demo import DemoSet
+from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.recipe import Mode
+from mkpc_kaggle.run.budget import Budget
+from mkpc_kaggle.run.session import Interrupt, Session
+from mkpc_kaggle.validate import validate
+
+
+def matches(*points: tuple[float, float]) -> Matches:
+    """The point (x, y) in both images."""
+    return Matches(points, points, np.ones(len(points)))
+
+
+def test_what_another_part_finds_again_is_left_out() -> None:
+    together = merged([matches((0, 0), (0.5, 0), (9, 9)), matches((0.9, 0), (20, 20)), matches((20.5, 19.5))], 1)
+    np.testing.assert_array_equal(together.points0, [(0, 0), (0.5, 0), (9, 9), (20, 20)])
+
+
+def test_both_points_must_be_near() -> None:
+    first, second = Matches([(0, 0)], [(0, 0)], [1]), Matches([(0, 0)], [(0, 3)], [1])
+    assert len(merged([first, second], 1)) == 2
+    assert len(merged([first, second], 3)) == 1
+
+
+def test_a_chain_keeps_every_second() -> None:
+    """What was left out leaves nothing out itself."""
+    together = merged([matches((number, 0)) for number in range(5)], 1)
+    np.testing.assert_array_equal(together.points0[:, 0], [0, 2, 4])
+
+
+@pytest.mark.parametrize("parts", [[], [matches()], [matches((1, 1), (1, 1))]])
+def test_one_part_or_none_stays_as_it_is(parts: list[Matches]) -> None:
+    assert len(merged(parts, 1)) == len(Matches.concatenate(parts))
+
+
+@pytest.mark.parametrize(("naive", "split"), CONTRASTS)
+def test_contrasts_have_the_same_units_and_as_many(naive: str, split: str) -> None:
+    for matchers in (("sift",), ("aliked", "xfeat_lighterglue")):
+        whole, split_units = Way(matchers, naive).units, Way(matchers, split).units
+        assert {unit.stage for unit in split_units} == {1, 2}
+        assert {unit.stage for unit in whole} == {1}
+        recipe = union([Way(matchers, split)])
+        assert {unit.name for unit in recipe.in_mode(Mode.WHOLE_IMAGES).units} == {unit.name for unit in whole}
+        assert len(whole) == len(split_units)
+
+
+@pytest.fixture
+def small(monkeypatch: pytest.MonkeyPatch) -> tuple[Way, ...]:
+    monkeypatch.setattr(table1, "LONG_SIDES", {"sift": (320, 400, 480)})
+    layouts = {"one": (1, 0), "three": (3, 0), "one + two": (1, 2)}
+    monkeypatch.setattr(table1, "LAYOUTS", layouts)
+    return ways_of(["sift"])
+
+
+def test_it_gives_what_the_engine_gives_and_goes_on_where_it_was(
+    demo: DemoSet, small: tuple[Way, ...], tmp_path: Path
+) -> None:
+    (scene,) = read_train_side(demo.train_dir, pairs_per_scene=3)
+    assembly = assemble(union(small))
+    path = tmp_path / "out" / "pairs.jsonl"
+    run_all([scene], small, assembly.pipeline(), Diary(path, {"a": 1}), 1.0)
+    diary = Diary(path, {"a": 1})
+    assert set(diary.found) == {true.pair.id for true in scene.pairs}
+
+    way = next(way for way in small if way.name == "sift: one + two")
+    recipe = assemble(union([way]))
+    session = Session(tmp_path / "work", Budget(0.0), Interrupt(), progress=False)
+    validation, _ = validate([scene], recipe, session)
+    for score in validation.scenes[0].pairs:
+        assert score.record is not None
+        found = diary.found[score.id][way.name]
+        assert found.matches == score.record.matches
+        assert found.error == score.error
+        assert (
+            0 < diary.found[score.id]["sift: three, merged"].matches < diary.found[score.id]["sift: three"].matches
+        )
+
+    whole = path.read_bytes()
+    last = whole.splitlines(keepends=True)[-1]
+    path.write_bytes(whole[: -len(last) // 2])  # the last line was cut off
+    again = Diary(path, {"a": 1})
+    assert len(again.found) == len(scene.pairs) - 1
+    run_all([scene], small, assembly.pipeline(), again, 1.0)
+    assert Diary(path, {"a": 1}).found.keys() == diary.found.keys()
+    with pytest.raises(UserError, match="other settings"):
+        Diary(path, {"a": 2})
+
+    lines = list(Tables.of([scene], again).markdown(small))
+    assert lines[0] == "Pairs: courtyard 3."
+    rows = [line.split(" | ")[0] for line in lines if line.startswith("| sift")]
+    assert rows == [
+        "| sift: one",
+        "| sift: three",
+        "| sift: one + two",
+        "| sift: one + two",
+        "| sift: three, merged",
+    ]
