@@ -42,7 +42,7 @@ def wheels(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def request_(tmp_path: Path, wheels: Path) -> Request:
+def wanted(tmp_path: Path, wheels: Path) -> Request:
     weights = put(put(tmp_path / "weights", "another_name.pt"), "kept.pt", OTHER)
     return Request(tmp_path / "out", "someone", (weights,), (python_version(),), wheels)
 
@@ -51,9 +51,9 @@ def contents(directory: Path) -> dict[str, bytes]:
     return {str(path.relative_to(directory)): path.read_bytes() for path in directory.rglob("*") if path.is_file()}
 
 
-def test_the_dataset_holds_wheels_weights_and_their_licences(request_: Request) -> None:
-    package = make_package(request_)
-    dataset = request_.out / "dataset"
+def test_the_dataset_holds_wheels_weights_and_their_licences(wanted: Request) -> None:
+    package = make_package(wanted)
+    dataset = wanted.out / "dataset"
     names = {path.name for path in dataset.iterdir()}
     assert {"LICENSE", "MIT.txt", "weights_manifest.txt", "requirements.txt", "dataset-metadata.json"} <= names
     assert {name.partition("-")[0] for name in names if name.endswith(".whl")} == {
@@ -72,11 +72,11 @@ def test_the_dataset_holds_wheels_weights_and_their_licences(request_: Request) 
     )
 
 
-def test_the_kernel_runs_on_a_gpu_without_internet_on_the_competition_and_the_dataset(request_: Request) -> None:
-    make_package(request_)
-    kernel = request_.out / "kernel"
+def test_the_kernel_runs_on_a_gpu_without_internet_on_the_competition_and_the_dataset(wanted: Request) -> None:
+    make_package(wanted)
+    kernel = wanted.out / "kernel"
     metadata = json.loads((kernel / "kernel-metadata.json").read_text())
-    dataset = json.loads((request_.out / "dataset" / "dataset-metadata.json").read_text())
+    dataset = json.loads((wanted.out / "dataset" / "dataset-metadata.json").read_text())
     assert metadata["enable_gpu"] is True
     assert metadata["enable_internet"] is False
     assert metadata["competition_sources"] == ["image-matching-challenge-2022"]
@@ -85,59 +85,59 @@ def test_the_kernel_runs_on_a_gpu_without_internet_on_the_competition_and_the_da
     assert (kernel / metadata["code_file"]).read_bytes() == find_checkout().submission_notebook.read_bytes()
 
 
-def test_the_same_request_gives_the_same_bytes_and_leaves_files_alone(request_: Request, tmp_path: Path) -> None:
-    make_package(request_)
-    former = {path: path.stat().st_mtime_ns for path in request_.out.rglob("*")}
-    (request_.out / "dataset" / "free.pt").write_bytes(b"broken off")
-    make_package(request_)
+def test_the_same_request_gives_the_same_bytes_and_leaves_files_alone(wanted: Request, tmp_path: Path) -> None:
+    make_package(wanted)
+    former = {path: path.stat().st_mtime_ns for path in wanted.out.rglob("*")}
+    (wanted.out / "dataset" / "free.pt").write_bytes(b"broken off")
+    make_package(wanted)
     kept = [path for path, modified in former.items() if path.is_file() and path.stat().st_mtime_ns == modified]
     assert {path.name for path in former if path.is_file()} - {path.name for path in kept} == {"free.pt"}
-    make_package(replace(request_, out=tmp_path / "again"))
-    assert contents(tmp_path / "again") == contents(request_.out)
+    make_package(replace(wanted, out=tmp_path / "again"))
+    assert contents(tmp_path / "again") == contents(wanted.out)
 
 
 def test_a_private_package_has_all_weights_and_a_public_one_refuses_to_be_laid_over_it(
-    request_: Request, capsys: pytest.CaptureFixture[str]
+    wanted: Request, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert request_.wheels is not None
-    arguments = ["package", "--owner", "someone", "--out", str(request_.out), "--python", python_version()]
-    arguments += ["--wheels", str(request_.wheels), "--weights", str(request_.weights[0])]
+    assert wanted.wheels is not None
+    arguments = ["package", "--owner", "someone", "--out", str(wanted.out), "--python", python_version()]
+    arguments += ["--wheels", str(wanted.wheels), "--weights", str(wanted.weights[0])]
     assert main([*arguments, "--private"]) == 0
     out = " ".join(capsys.readouterr().out.split())
     assert "private on Kaggle and share it with nobody" in out
     assert "kept.pt (Magic-Leap-noncommercial)" in out
-    assert (request_.out / "dataset" / "kept.pt").read_bytes() == OTHER
+    assert (wanted.out / "dataset" / "kept.pt").read_bytes() == OTHER
     assert main(arguments) == 2
     assert "kept.pt. Remove it" in capsys.readouterr().err
-    (request_.out / "dataset" / "kept.pt").unlink()
+    (wanted.out / "dataset" / "kept.pt").unlink()
     assert main(arguments) == 0
     assert "Left out" in capsys.readouterr().out
 
 
-def test_bad_requests_are_refused_before_anything_is_written(request_: Request, tmp_path: Path) -> None:
+def test_bad_requests_are_refused_before_anything_is_written(wanted: Request, tmp_path: Path) -> None:
     empty = tmp_path / "empty"
     empty.mkdir()
     bad = {
-        "no Kaggle user name": replace(request_, owner="some one"),
-        "no such directory": replace(request_, wheels=tmp_path / "nowhere"),
-        f"for Python {python_version()}": replace(request_, wheels=empty),
-        "for Python 2.7": replace(request_, pythons=("2.7",)),
-        "truncated": replace(request_, weights=(put(tmp_path / "damaged", "free.pt", DATA[:-1]),)),
+        "no Kaggle user name": replace(wanted, owner="some one"),
+        "no such directory": replace(wanted, wheels=tmp_path / "nowhere"),
+        f"for Python {python_version()}": replace(wanted, wheels=empty),
+        "for Python 2.7": replace(wanted, pythons=("2.7",)),
+        "truncated": replace(wanted, weights=(put(tmp_path / "damaged", "free.pt", DATA[:-1]),)),
     }
     for told, request in bad.items():
         with pytest.raises(UserError, match=told):
             make_package(request)
-    assert not request_.out.exists()
+    assert not wanted.out.exists()
 
 
 def test_without_sources_it_says_that_a_checkout_is_needed(
-    request_: Request, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    wanted: Request, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     from mkpc_kaggle.package import checkout
 
     monkeypatch.setattr(checkout, "__file__", str(tmp_path / "site-packages/mkpc_kaggle/package/checkout.py"))
     with pytest.raises(UserError, match="clone the repository"):
-        make_package(request_)
+        make_package(wanted)
 
 
 def test_a_bundled_package_is_pinned_and_is_one_that_the_wheel_needs() -> None:
@@ -172,7 +172,7 @@ def test_the_wheel_holds_what_a_run_needs_and_not_the_tests(tmp_path: Path) -> N
 
 
 @pytest.mark.slow
-def test_wheels_come_from_the_index_for_other_pythons_too(request_: Request, tmp_path: Path) -> None:
+def test_wheels_come_from_the_index_for_other_pythons_too(wanted: Request, tmp_path: Path) -> None:
     pins = bundled_requirements(find_checkout())
     probe = [
         sys.executable,
@@ -187,7 +187,7 @@ def test_wheels_come_from_the_index_for_other_pythons_too(request_: Request, tmp
     ]
     if subprocess.run(probe, check=False, capture_output=True).returncode != 0:
         pytest.skip("pip reaches no index from here")
-    request = replace(request_, wheels=None, pythons=("3.11", "3.12"))
+    request = replace(wanted, wheels=None, pythons=("3.11", "3.12"))
     make_package(request)
     names = [path.name for path in (request.out / "dataset").glob("kornia_rs-*.whl")]
     assert sorted(name.split("-")[2] for name in names) == ["cp311", "cp312"]
