@@ -47,7 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     from mkpc_kaggle.package import Request, make_package
 
-    pythons = tuple(arguments.python.split(","))
+    pythons = tuple(version.strip() for version in arguments.python.split(","))
     weights = tuple(arguments.weights)
     out: Path = arguments.out
     package = make_package(Request(out, arguments.owner, weights, pythons, arguments.wheels, arguments.private))
