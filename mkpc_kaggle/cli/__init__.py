@@ -12,7 +12,7 @@ from typing import TextIO
 from mkpc_kaggle import __version__
 from mkpc_kaggle.errors import UserError
 
-COMMANDS = ("submit", "match", "validate", "recipes", "weights", "check", "journal", "demo")
+COMMANDS = ("submit", "match", "validate", "recipes", "weights", "check", "journal", "package", "demo")
 EXIT_BAD_INPUT = 2
 
 _DESCRIPTION = """\
@@ -25,6 +25,7 @@ Two-stage image matching with Matching Key-Points Crop, offline, inside a time b
   weights   the weight files: list, verify, locate, fetch, convert
   check     is this submission.csv what the competition takes?
   journal   what a run did: overview, tables for pandas, report.html
+  package   the folders that you upload to Kaggle
   demo      render a small test set with known poses
 
 COMMAND --help tells more.

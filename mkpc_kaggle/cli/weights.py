@@ -2,8 +2,9 @@
 
 import argparse
 import sys
-from collections.abc import Sequence
 from pathlib import Path
+
+from mkpc_kaggle.cli.tables import print_table
 
 HELP = """\
 The files that the matchers load their weights from; none comes with the package.
@@ -75,7 +76,7 @@ def _list(arguments: argparse.Namespace) -> int:
         size = "?" if file.size < 0 else str(file.size)
         matchers = ", ".join(matchers_with(file.slot)) or "-"
         rows.append((file.name, size, file.licence, file.slot, matchers, "; ".join(where) or "missing"))
-    _print_table(rows)
+    print_table(rows)
     for slot in dict.fromkeys(file.slot for file in store.files):
         alternatives = store.alternatives(slot)
         if store.search(alternatives).found is None:
@@ -95,7 +96,7 @@ def _verify(arguments: argparse.Namespace) -> int:
         print(f"no weight files found (searched {store.searched})")
         return 0
     rows = [(one.file.name, str(one.state), str(one.path), one.note) for one in found]
-    _print_table([("file", "state", "path", "note"), *rows])
+    print_table([("file", "state", "path", "note"), *rows])
     wrong = sum(not one.state.usable for one in found)
     print(f"{len(found)} files, {wrong} wrong")
     return 1 if wrong else 0
@@ -138,9 +139,3 @@ def _convert(arguments: argparse.Namespace) -> int:
 
     print(convert(arguments.file, arguments.out).line)
     return 0
-
-
-def _print_table(rows: Sequence[tuple[str, ...]]) -> None:
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    for row in rows:
-        print("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())

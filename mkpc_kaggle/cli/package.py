@@ -1,0 +1,79 @@
+"""the folders that you upload to Kaggle: a dataset and a notebook"""
+
+import argparse
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from mkpc_kaggle.cli.tables import print_table
+
+if TYPE_CHECKING:
+    from mkpc_kaggle.package import Item
+
+HELP = """\
+Write DIR/dataset (our wheel, the wheels that Kaggle's image may lack, weights with their licences) and DIR/kernel
+(the submission notebook), each with the metadata that the `kaggle` command reads. It runs in a checkout, on a
+machine with internet or with the wheels in a directory (--wheels). Run again, it keeps what is there already.
+
+Weights whose licences do not allow to pass them on are left out, unless --private is given.
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="where the two folders go")
+    parser.add_argument("--owner", required=True, metavar="NAME", help="your user name on Kaggle")
+    parser.add_argument(
+        "--weights",
+        action="append",
+        default=[],
+        type=Path,
+        metavar="DIR",
+        help="where weight files lie; may be repeated. Also searched: $MKPC_WEIGHTS",
+    )
+    parser.add_argument(
+        "--python",
+        default="3.11,3.12",
+        metavar="VERSIONS",
+        help="the Python versions that Kaggle's image may have (default: 3.11,3.12)",
+    )
+    parser.add_argument("--wheels", type=Path, metavar="DIR", help="take wheels from there and use no network")
+    parser.add_argument(
+        "--private",
+        action="store_true",
+        help="put weights in that must not be passed on: the dataset must stay private then",
+    )
+
+
+def run(arguments: argparse.Namespace) -> int:
+    from mkpc_kaggle.package import Request, make_package
+
+    pythons = tuple(version.strip() for version in arguments.python.split(","))
+    weights = tuple(arguments.weights)
+    out: Path = arguments.out
+    package = make_package(Request(out, arguments.owner, weights, pythons, arguments.wheels, arguments.private))
+    print(f"{out / 'dataset'}")
+    _print_files(package.dataset)
+    print(f"\n{out / 'kernel'}")
+    _print_files(package.kernel)
+    if package.restricted:
+        names = ", ".join(f"{item.name} ({item.licence})" for item in package.restricted)
+        print(f"\n{_PRIVATE if arguments.private else _LEFT_OUT}: {names}")
+    print(_NEXT.format(out=out))
+    return 0
+
+
+_LEFT_OUT = """\
+Left out, because their licences do not allow, or not clearly, to pass them on (--private puts them in)"""
+_PRIVATE = """\
+In this dataset, though their licences do not allow, or not clearly, to pass them on. Keep the dataset private on
+Kaggle and share it with nobody; mind, too, what the licences say of competitions. These are"""
+_NEXT = """
+Next, with the `kaggle` command (README, On Kaggle):
+  kaggle datasets create -p {out}/dataset
+  kaggle kernels push -p {out}/kernel"""
+
+
+def _print_files(items: "Iterable[Item]") -> None:
+    rows = [(item.name, str(item.size), item.licence or "-", item.note) for item in items]
+    total = sum(int(size) for _, size, _, _ in rows)
+    print_table([("file", "bytes", "licence", ""), *rows, (f"{len(rows)} files", str(total), "", "")])

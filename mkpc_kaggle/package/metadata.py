@@ -1,0 +1,61 @@
+"""The JSON files that the ``kaggle`` command reads (its docs/datasets_metadata.md and kernels_metadata.md)."""
+
+import json
+import re
+from collections.abc import Iterable
+
+from mkpc_kaggle.errors import UserError
+
+COMPETITION = "image-matching-challenge-2022"
+DATASET_SLUG = "mkpc-kaggle"
+KERNEL_TITLE = "MKPC submission"
+KERNEL_SLUG = KERNEL_TITLE.lower().replace(" ", "-")
+"""Kaggle makes the slug from the title in this way, and wants both to agree."""
+
+
+def check_owner(owner: str) -> None:
+    """Raise :class:`UserError` unless it can be the name of a Kaggle user."""
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9-]*", owner):
+        raise UserError(
+            f"--owner {owner!r} is no Kaggle user name: give the last part of your profile's address, "
+            "letters, digits and dashes"
+        )
+
+
+def dataset_metadata(owner: str, licences: Iterable[str]) -> str:
+    """``dataset-metadata.json``. Kaggle takes one licence a dataset; the description tells the others."""
+    return _json(
+        {
+            "id": f"{owner}/{DATASET_SLUG}",
+            "title": "MKPC Kaggle",
+            "subtitle": "Offline two-stage image matching: wheels and weights",
+            "description": "mkpc_kaggle (Apache-2.0), the wheels that it needs (each has its licence inside), and "
+            "weights of image matchers. weights_manifest.txt names the licence and the source of each file of "
+            f"weights. Licences of the weights here: {', '.join(sorted(set(licences))) or 'none, no weights'}.",
+            "licenses": [{"name": "other"}],
+        }
+    )
+
+
+def kernel_metadata(owner: str, notebook: str) -> str:
+    """``kernel-metadata.json``: GPU on, internet off, the competition and our dataset attached."""
+    return _json(
+        {
+            "id": f"{owner}/{KERNEL_SLUG}",
+            "title": KERNEL_TITLE,
+            "code_file": notebook,
+            "language": "python",
+            "kernel_type": "notebook",
+            "is_private": True,
+            "enable_gpu": True,
+            "enable_internet": False,
+            "competition_sources": [COMPETITION],
+            "dataset_sources": [f"{owner}/{DATASET_SLUG}"],
+            "kernel_sources": [],
+            "model_sources": [],
+        }
+    )
+
+
+def _json(table: dict[str, object]) -> str:
+    return json.dumps(table, indent=2) + "\n"

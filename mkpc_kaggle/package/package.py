@@ -1,0 +1,100 @@
+"""The dataset folder and the kernel folder, from a checkout, weights and an index of wheels."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.package.checkout import Checkout, find_checkout
+from mkpc_kaggle.package.folder import Item, fill, refuse_strangers
+from mkpc_kaggle.package.metadata import check_owner, dataset_metadata, kernel_metadata
+from mkpc_kaggle.package.weights import Chosen, choose_weights
+from mkpc_kaggle.package.wheels import build_wheel, bundled_requirements, collect_wheels, licence_of
+from mkpc_kaggle.weights import WeightStore
+
+
+@dataclass(frozen=True)
+class Request:
+    """``owner`` is a user of Kaggle; ``pythons`` are versions such as ``3.11``.
+
+    ``wheels`` is a directory to take wheels from, instead of pip's index. ``private`` puts weights in that must
+    not be passed on.
+    """
+
+    out: Path
+    owner: str
+    weights: tuple[Path, ...] = ()
+    pythons: tuple[str, ...] = ("3.11", "3.12")
+    wheels: Path | None = None
+    private: bool = False
+
+
+@dataclass(frozen=True)
+class Package:
+    """What was written: the files of both folders, and the weights whose licences do not allow to pass them on."""
+
+    dataset: tuple[Item, ...]
+    kernel: tuple[Item, ...]
+    restricted: tuple[Item, ...]
+
+
+def make_package(request: Request) -> Package:
+    """Write both folders; the same request gives the same bytes, and files that are there already are kept.
+
+    Raises :class:`UserError`, before anything is written, without a checkout, for files in the folders that do not
+    belong there, for damaged weights, and where wheels cannot be built or had.
+    """
+    check_owner(request.owner)
+    if request.wheels is not None and not request.wheels.is_dir():
+        raise UserError(f"--wheels {request.wheels}: no such directory")
+    checkout = find_checkout()
+    chosen = choose_weights(WeightStore(request.weights), checkout, private=request.private)
+    dataset, kernel = request.out / "dataset", request.out / "kernel"
+    with TemporaryDirectory(prefix="mkpc-") as temporary:
+        staging = Path(temporary)
+        dataset_items = _dataset_items(request, checkout, chosen, staging)
+        kernel_items = _kernel_items(request, checkout, staging)
+        refuse_strangers(dataset, dataset_items)
+        refuse_strangers(kernel, kernel_items)
+        fill(dataset, dataset_items)
+        fill(kernel, kernel_items)
+    return Package(_there(dataset, dataset_items), _there(kernel, kernel_items), chosen.restricted)
+
+
+def _dataset_items(request: Request, checkout: Checkout, chosen: Chosen, staging: Path) -> tuple[Item, ...]:
+    own, others = staging / "own", staging / "others"
+    requirements = bundled_requirements(checkout)
+    wheel = build_wheel(checkout, own)
+    wheels = collect_wheels(
+        requirements, request.pythons, others, kept=request.out / "dataset", wheels=request.wheels
+    )
+    own_version = wheel.name.split("-")[1]
+    lines = [f"mkpc-kaggle=={own_version}", *requirements]
+    licences = [item.licence for item in chosen.items]
+    return (
+        _text(staging, "dataset-metadata.json", dataset_metadata(request.owner, licences)),
+        *(Item(path.name, path, licence_of(path)) for path in (wheel, *wheels)),
+        _text(staging, "requirements.txt", "\n".join(lines) + "\n"),
+        Item("LICENSE", checkout.licence),
+        Item("weights_manifest.txt", checkout.weights_manifest),
+        *chosen.licence_texts,
+        *chosen.items,
+    )
+
+
+def _kernel_items(request: Request, checkout: Checkout, staging: Path) -> tuple[Item, ...]:
+    notebook = checkout.submission_notebook
+    return (
+        _text(staging, "kernel-metadata.json", kernel_metadata(request.owner, notebook.name)),
+        Item(notebook.name, notebook),
+    )
+
+
+def _text(staging: Path, name: str, text: str) -> Item:
+    path = staging / name
+    path.write_text(text, encoding="utf-8", newline="\n")
+    return Item(name, path)
+
+
+def _there(directory: Path, items: tuple[Item, ...]) -> tuple[Item, ...]:
+    return tuple(Item(item.name, directory / item.name, item.licence, item.note) for item in items)

@@ -1,0 +1,91 @@
+"""Wheels: our own, built from the checkout, and those of the dependencies that Kaggle's image may lack."""
+
+import re
+import subprocess
+import sys
+import zipfile
+from collections.abc import Iterable, Sequence
+from email.parser import Parser
+from importlib.util import find_spec
+from pathlib import Path
+
+from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.package.checkout import Checkout
+
+BUNDLED = ("kornia", "kornia-rs", "safetensors")
+"""What of our dependencies, and of theirs, Kaggle's image may lack or have in a version that nobody tested here.
+The others (torch, numpy, scipy, pandas, scikit-learn, OpenCV, matplotlib, tqdm) are the image's own."""
+PLATFORMS = ("manylinux_2_28_x86_64", "manylinux_2_17_x86_64", "manylinux2014_x86_64")
+
+
+def bundled_requirements(checkout: Checkout) -> tuple[str, ...]:
+    """``name==version`` of each bundled dependency, the version being the one that the tests run with."""
+    lines = checkout.pins.read_text(encoding="utf-8").splitlines()
+    pinned = dict(_pin(line) for line in lines if line and not line.startswith("#"))
+    return tuple(f"{name}=={pinned[name]}" for name in BUNDLED)
+
+
+def build_wheel(checkout: Checkout, directory: Path) -> Path:
+    """Build our wheel into the directory; the same sources give the same bytes. Raises :class:`UserError`."""
+    # Without hatchling here, pip gets it for the build, which needs a network.
+    isolation = ["--no-build-isolation"] if find_spec("hatchling") else []
+    failure = _pip("wheel", "--no-deps", *isolation, "--wheel-dir", directory, checkout.root)
+    if failure:
+        raise UserError(f"the wheel could not be built from {checkout.root}: {failure}")
+    return next(directory.glob("mkpc_kaggle-*.whl"))
+
+
+def collect_wheels(
+    requirements: Sequence[str], pythons: Iterable[str], directory: Path, *, kept: Path, wheels: Path | None
+) -> list[Path]:
+    """The wheels of these requirements for these Python versions (``3.11``), in order of their names.
+
+    They come from the directory ``wheels`` alone if one is given; else from ``kept``, where a former run may have
+    put them, or, if one is missing there, from pip's index. Raises :class:`UserError` where one cannot be had.
+    """
+    local = ("--no-index", "--find-links")
+    sources: list[tuple[str | Path, ...]] = [(*local, wheels)] if wheels else [(*local, kept), ()]
+    for python in pythons:
+        failure = ""
+        for source in sources:
+            failure = _download(requirements, python, directory, source)
+            if not failure:
+                break
+        else:
+            raise UserError(
+                f"no wheels of {', '.join(requirements)} for Python {python} on Linux x86-64"
+                + (f" in {wheels}" if wheels else "")
+                + f": {failure}. On a machine without internet, name a directory that has them with --wheels."
+            )
+    return sorted(directory.glob("*.whl"))
+
+
+def licence_of(wheel: Path) -> str:
+    """What a wheel says of its licence, which it has inside."""
+    with zipfile.ZipFile(wheel) as archive:
+        (name,) = (name for name in archive.namelist() if re.fullmatch(r"[^/]+\.dist-info/METADATA", name))
+        headers = Parser().parsestr(archive.read(name).decode())
+    classifiers = [text.rpartition(" :: ")[2] for text in headers.get_all("Classifier", []) if "License" in text]
+    named = [headers["License-Expression"], headers["License"], *classifiers]
+    return next(filter(None, named), "see its dist-info/licenses")
+
+
+def _download(requirements: Sequence[str], python: str, directory: Path, source: Sequence[str | Path]) -> str:
+    platforms = [option for platform in PLATFORMS for option in ("--platform", platform)]
+    only_these = ("--only-binary=:all:", "--no-deps", "--python-version", python)
+    return _pip("download", *only_these, *platforms, "--dest", directory, *source, *requirements)
+
+
+def _pip(*arguments: str | Path) -> str:
+    """Run this interpreter's pip; why it failed, or nothing."""
+    command = [sys.executable, "-m", "pip", "--disable-pip-version-check", *map(str, arguments)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode == 0:
+        return ""
+    lines = [line.removeprefix("ERROR: ") for line in done.stderr.splitlines() if line.strip()]
+    return lines[-1] if lines else f"pip ended with status {done.returncode}"
+
+
+def _pin(line: str) -> tuple[str, str]:
+    name, _, version = line.strip().partition("==")
+    return re.sub(r"[-_.]+", "-", name).lower(), version

@@ -1,0 +1,89 @@
+"""A stand-in for Kaggle's image: a virtual environment with the packages that it has and none of ours."""
+
+import os
+import re
+import sys
+import venv
+from collections.abc import Iterator, Sequence
+from importlib.metadata import Distribution, PackageNotFoundError, distribution
+from pathlib import Path
+from zipfile import ZipFile
+
+PACKAGES = (
+    "numpy",
+    "pandas",
+    "scipy",
+    "scikit-learn",
+    "opencv-python-headless",
+    "torch",
+    "matplotlib",
+    "tqdm",
+    "pip",
+    "ipykernel",
+    "nbclient",
+)
+
+
+def make_image(directory: Path) -> Path:
+    """Make the environment; its interpreter. It has links to this interpreter's copies of the packages."""
+    venv.create(directory, symlinks=True)
+    site = next(directory.glob("lib/python*/site-packages"))
+    for installed in closure(PACKAGES).values():
+        for entry in {
+            file.parts[0] for file in installed.files or () if file.parts[0] not in ("..", "__pycache__")
+        }:
+            link = site / entry
+            if not link.is_symlink():
+                link.symlink_to(Path(str(installed.locate_file(entry))))
+    return directory / "bin" / "python"
+
+
+def closure(names: Sequence[str]) -> dict[str, Distribution]:
+    """The named distributions and all that they need, as far as they are here, by name."""
+    found: dict[str, Distribution] = {}
+    waiting = list(names)
+    while waiting:
+        name = waiting.pop()
+        key = re.sub(r"[-_.]+", "-", name).lower()
+        try:
+            here = distribution(name)
+        except PackageNotFoundError:  # needed on other systems or Pythons alone
+            continue
+        if key not in found:
+            found[key] = here
+            plain = [text for text in here.requires or () if "extra ==" not in text]
+            waiting += [re.split(r"[^A-Za-z0-9._-]", text, maxsplit=1)[0] for text in plain]
+    return found
+
+
+def pack_wheel(name: str, directory: Path) -> Path:
+    """The wheel that an installed distribution came from, but for the order and dates of its entries."""
+    installed = distribution(name)
+    tags = re.findall(r"^Tag: (.*)$", installed.read_text("WHEEL") or "", re.MULTILINE)
+    columns = zip(*(tag.split("-") for tag in tags), strict=True)
+    pythons, abis, platforms = (".".join(dict.fromkeys(column)) for column in columns)
+    stem = f"{installed.name.replace('-', '_')}-{installed.version}"
+    path = directory / f"{stem}-{pythons}-{abis}-{platforms}.whl"
+    with ZipFile(path, "w") as archive:
+        for file in _packed(installed):
+            archive.write(Path(str(installed.locate_file(file))), file)
+    return path
+
+
+def _packed(installed: Distribution) -> Iterator[str]:
+    """The files that were in the wheel: not what pip wrote, and not what Python compiled."""
+    written_by_pip = ("INSTALLER", "REQUESTED", "direct_url.json")
+    for file in installed.files or ():
+        if file.parts[0] != ".." and "__pycache__" not in file.parts and file.name not in written_by_pip:
+            yield str(file)
+
+
+def environment(**more: str) -> dict[str, str]:
+    """This process's environment without what leads to its own packages, or tells that a test is running."""
+    hidden = ("PYTHONPATH", "VIRTUAL_ENV", "MKPC_WEIGHTS", "PYTEST_CURRENT_TEST")
+    kept = {name: value for name, value in os.environ.items() if name not in hidden}
+    return {**kept, "PYTHONNOUSERSITE": "1", **more}
+
+
+def python_version() -> str:
+    return f"{sys.version_info.major}.{sys.version_info.minor}"

@@ -1,0 +1,168 @@
+"""``submission.ipynb`` as Kaggle runs it: the dataset folder, an image without our package, and no network."""
+
+import json
+import shutil
+import subprocess
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import nbformat
+import pandas as pd
+import pytest
+from kaggle_image import environment, make_image, pack_wheel, python_version
+from shared import DATA, WEIGHTS, needs_data, needs_weights
+
+from mkpc_kaggle.competition import read_test_side, submission_problems
+from mkpc_kaggle.demo import DemoSet
+from mkpc_kaggle.package import Request, make_package
+from mkpc_kaggle.package.metadata import COMPETITION
+from mkpc_kaggle.package.wheels import BUNDLED
+
+NOTEBOOKS = sorted((Path(__file__).resolve().parents[1] / "notebooks").glob("*.ipynb"))
+EXECUTE = """
+import sys
+import nbformat
+from nbclient import NotebookClient
+from traitlets.config import Config
+
+notebook = nbformat.read(sys.argv[1], as_version=4)
+try:
+    # Sockets on disk: without a network there is no 127.0.0.1 either.
+    NotebookClient(notebook, timeout=None, config=Config(KernelManager={"transport": "ipc"})).execute()
+finally:
+    nbformat.write(notebook, sys.argv[2])
+"""
+OFFLINE = ("unshare", "--map-root-user", "--net")
+
+
+def no_namespaces() -> bool:
+    """Is there no way to a network namespace without interfaces?"""
+    return shutil.which("unshare") is None or subprocess.run([*OFFLINE, "true"], check=False).returncode != 0
+
+
+needs_namespaces = pytest.mark.skipif(no_namespaces(), reason="unshare --net is not permitted here")
+
+
+@pytest.fixture(scope="module")
+def image(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_image(tmp_path_factory.mktemp("image"))
+
+
+@pytest.fixture(scope="module")
+def wheels(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    directory = tmp_path_factory.mktemp("wheels")
+    for name in BUNDLED:
+        pack_wheel(name, directory)
+    return directory
+
+
+class Kaggle:
+    """A copy of Kaggle's directories: ``input`` with the competition and our dataset, and ``working``."""
+
+    def __init__(self, root: Path, image: Path, wheels: Path) -> None:
+        self.root = root
+        self.image = image
+        self._wheels = wheels
+        self.working = root / "working"
+        self.test_dir = root / "input" / COMPETITION
+        self.executed = root / "executed.ipynb"
+        self.working.mkdir(parents=True)
+
+    def add_test_side(self, test_dir: Path, pairs: int | None = None) -> None:
+        self.test_dir.mkdir(parents=True)
+        pd.read_csv(test_dir / "test.csv").head(pairs).to_csv(self.test_dir / "test.csv", index=False)
+        (self.test_dir / "test_images").symlink_to(test_dir / "test_images")
+
+    def add_dataset(self, packaged: Path, weights: tuple[Path, ...] = ()) -> None:
+        make_package(Request(packaged, "someone", weights, (python_version(),), self._wheels))
+        shutil.copytree(packaged / "dataset", self.root / "input" / "datasets" / "someone" / "mkpc-kaggle")
+        self.notebook = packaged / "kernel" / "submission.ipynb"
+
+    def set(self, former: str, new: str) -> None:
+        """Edit the notebook as a user would."""
+        text = self.notebook.read_text(encoding="utf-8")
+        assert former in text
+        self.notebook.write_text(text.replace(former, new), encoding="utf-8")
+
+    def run(self, **more: str) -> str:
+        """Execute the notebook; what it printed."""
+        command = [*OFFLINE, str(self.image), "-c", EXECUTE, str(self.notebook), str(self.executed)]
+        # Not under pytest's own directory: the path of a socket may have no more than 107 characters.
+        with TemporaryDirectory(prefix="mkpc-") as runtime:
+            variables = environment(KAGGLE_ROOT=str(self.root), JUPYTER_RUNTIME_DIR=runtime, **more)
+            done = subprocess.run(
+                command, capture_output=True, text=True, env=variables, cwd=self.working, check=False
+            )
+        assert done.returncode == 0, done.stderr
+        return "".join(
+            output["text"]
+            for cell in nbformat.read(self.executed, as_version=4).cells
+            for output in cell.get("outputs", ())
+            if output["output_type"] == "stream"
+        )
+
+    def figures(self) -> int:
+        """How many pictures the executed notebook shows."""
+        cells = nbformat.read(self.executed, as_version=4).cells
+        return sum("image/png" in output.get("data", {}) for cell in cells for output in cell.get("outputs", ()))
+
+    def problems(self) -> list[str]:
+        ids = [pair.id for pair in read_test_side(self.test_dir)]
+        return submission_problems(self.working / "submission.csv", ids)
+
+
+@pytest.fixture
+def kaggle(tmp_path: Path, image: Path, wheels: Path) -> Kaggle:
+    return Kaggle(tmp_path / "kaggle", image, wheels)
+
+
+def test_the_image_has_none_of_what_the_dataset_brings(image: Path) -> None:
+    code = "import numpy, pandas, scipy, sklearn, cv2, matplotlib, tqdm, importlib.util as u, json\n"
+    code += (
+        "print(json.dumps([n for n in ('mkpc_kaggle', 'kornia', 'kornia_rs', 'safetensors') if u.find_spec(n)]))"
+    )
+    out = subprocess.run(
+        [image, "-c", code], capture_output=True, text=True, check=True, env=environment(), cwd=image.parent
+    ).stdout
+    assert json.loads(out) == []
+
+
+@needs_namespaces
+def test_a_commit_run_without_network_leaves_a_submission_and_shows_pairs(
+    kaggle: Kaggle, demo: DemoSet, tmp_path: Path
+) -> None:
+    kaggle.add_test_side(demo.test_dir, pairs=3)
+    kaggle.add_dataset(tmp_path / "package")
+    printed = kaggle.run()
+    assert kaggle.problems() == []
+    assert "good: 3 rows" in printed
+    assert "recipe auto" in printed
+    assert "of 525 minutes used" in printed
+    assert kaggle.figures() == 3
+
+
+@needs_namespaces
+@needs_data
+@needs_weights
+@pytest.mark.slow
+def test_the_hidden_rerun_uses_the_weights_and_the_time_and_shows_nothing(kaggle: Kaggle, tmp_path: Path) -> None:
+    kaggle.add_test_side(DATA / "test")
+    kaggle.add_dataset(tmp_path / "package", (WEIGHTS,))
+    kaggle.set("TIME_LIMIT = 8.75 * 3600", "TIME_LIMIT = 90")
+    printed = kaggle.run(KAGGLE_IS_COMPETITION_RERUN="1")
+    assert kaggle.problems() == []
+    assert "good: 29 rows" in printed
+    assert "1:xfeat_lighterglue@1024 " in printed
+    assert kaggle.figures() == 0
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_notebooks_are_committed_in_one_form_without_outputs(path: Path) -> None:
+    text = path.read_text(encoding="utf-8")
+    notebook = nbformat.reads(text, as_version=4)
+    nbformat.validate(notebook)
+    assert nbformat.writes(notebook) + "\n" == text
+    code = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    assert code
+    assert all(cell.execution_count is None and not cell.outputs for cell in code)
+    assert set(notebook.metadata) == {"kernelspec", "language_info"}
