@@ -17,6 +17,8 @@ EXPLORE_SHARE = 0.25
 """The share of the time left that may be spent to learn what units cost that never ran."""
 JOB_SHARE = 0.1
 """The share of the time left that a job may be expected to take: what a job found late comes too late."""
+DEADLINE_SHARE = 0.5
+"""The share of the time left after which a job begins no more: where all is slower of a sudden, that is learnt."""
 SHRINK, LEAST_SHRINK = 0.7, 0.45
 """A unit that a worker fails at on one pair is tried on views whose sides are 0.7, then 0.49 times as long."""
 MOST_LOSSES = 4
@@ -32,13 +34,20 @@ class Patience:
     """When a worker is taken to hang: silent for ``floor`` seconds and ``factor`` times what a unit should take.
 
     It is heard of before each unit on each ``batch`` of pairs. ``unknown`` seconds are allowed where nobody knows
-    what a unit costs. A machine that is ten times slower of a sudden does not hang.
+    what a unit costs. A machine that is ten times slower of a sudden does not hang. A short run waits less: for
+    ``share`` of its limit, but ``least`` seconds, in place of the floor; an unknown unit has its exploration's time.
     """
 
     floor: float = 60.0
     factor: float = 10.0
     unknown: float = 600.0
     batch: int = 1
+    share: float = 0.02
+    least: float = 5.0
+
+    def silence(self, limit: float) -> float:
+        """The seconds allowed besides the unit's own, in a run of ``limit`` seconds."""
+        return min(self.floor, max(self.least, self.share * limit))
 
 
 @dataclass(frozen=True)
@@ -175,7 +184,7 @@ class Planner:
             tuple(todo),
             units,
             tuple(self.costs.most(unit.name) for unit in units),
-            now + self._allowance if unknown else self.budget.stop,
+            now + self._allowance if unknown else self._deadline(lacking, len(todo), now),
             self._timeout(lacking, len(todo), unknown=unknown),
             stretch.shrink,
             unknown,
@@ -183,7 +192,14 @@ class Planner:
 
     def _timeout(self, lacking: Iterable[Unit], pairs: int, *, unknown: bool) -> float:
         seconds = max(self.costs.most(unit.name) for unit in lacking) * min(pairs, self.patience.batch)
-        return self.patience.floor + self.patience.factor * seconds + (self.patience.unknown if unknown else 0.0)
+        warm_up = max(self.costs.warm_up(unit.name) for unit in lacking)
+        known = self.patience.silence(self.budget.limit) + warm_up + self.patience.factor * seconds
+        return known + (min(self.patience.unknown, self._allowance) if unknown else 0.0)
+
+    def _deadline(self, lacking: Iterable[Unit], pairs: int, now: float) -> float:
+        """Early enough to plan the rest anew, but late enough for twice what the job should take."""
+        seconds = pairs * (self.costs.overhead + sum(self.costs.most(unit.name) for unit in lacking))
+        return min(self.budget.stop, now + max(DEADLINE_SHARE * (self.budget.stop - now), 2 * seconds))
 
     def _can_gain(self, index: int, units: Iterable[Unit]) -> bool:
         return index not in self._aside and bool(self.records[index].lacking(units))
@@ -303,7 +319,16 @@ class Planner:
         if plan.exploring and now >= plan.deadline:
             for unit in plan.units:
                 self.costs.suppose(unit.name, self._allowance)
-        return [kept for outcome in finished.outcomes if (kept := self._merge(outcome, plan.phase, now))]
+        kept = [kept for outcome in finished.outcomes if (kept := self._merge(outcome, plan.phase, now))]
+        self._go_on(plan, now)
+        return kept
+
+    def _go_on(self, plan: Plan, now: float) -> None:
+        """What a job's own deadline cut off is planned anew."""
+        cut = now + max(plan.expected) >= plan.deadline
+        rest = tuple(index for index in plan.indices if self._can_gain(index, plan.units))
+        if cut and rest and not plan.exploring and plan.deadline < self.budget.stop:
+            self._again.append(Stretch(plan.phase, rest, plan.units, plan.shrink))
 
     def _measure(self, plan: Plan, measured: list[tuple[str, float]], now: float, pairs: int) -> None:
         if measured and plan.shrink == 1:
