@@ -123,7 +123,8 @@ class SimulatedPool:
 
     Of their seconds until ``stop``, ``kept`` went into jobs that came back in time. ``faults`` are what injected
     faults take whatever is planned: the unit that a crash cut short, of a hang as long as a stall might have
-    taken, which it cannot be told from sooner, and the new worker's start after either.
+    taken, which it cannot be told from sooner, a stall that was taken for a hang, and the new worker's start
+    after any of these.
     """
 
     def __init__(self, scenario: Scenario, clock: VirtualClock, stop: float) -> None:
@@ -187,13 +188,15 @@ class SimulatedPool:
                 if any(result.unit == unit for result in task.results) or now + expected[unit] >= plan.deadline:
                     continue
                 seconds = self._seconds(unit, worker, now) * plan.shrink**2
+                stalled = self._rng.random() < self.scenario.stalls
+                seconds *= STALL if stalled else 1.0
                 fate = self._rng.random()
                 if fate < self.scenario.crashes:
                     return now + seconds / 2, Lost(job, Cause.DIED), seconds / 2
                 if fate < self.scenario.crashes + self.scenario.hangs:
-                    return now + plan.timeout, Lost(job, Cause.HUNG), min(plan.timeout, STALL * seconds)
+                    return now + plan.timeout, Lost(job, Cause.HUNG), min(plan.timeout, STALL * seconds if not stalled else seconds)
                 if seconds > plan.timeout:
-                    return now + plan.timeout, Lost(job, Cause.HUNG), 0.0
+                    return now + plan.timeout, Lost(job, Cause.HUNG), plan.timeout if stalled else 0.0
                 now += seconds
                 found.append(UnitResult(unit, Matches.empty(), 0.0, seconds))
         outcomes = tuple(self._outcome(task, found, plan) for task, found in zip(job.tasks, results, strict=True))
@@ -206,8 +209,6 @@ class SimulatedPool:
             seconds *= scenario.miss_factor
         if now > scenario.turn * scenario.limit:
             seconds *= scenario.drift
-        if rng.random() < scenario.stalls:
-            seconds *= STALL
         if (worker, unit.name) not in self._warm:
             self._warm.add((worker, unit.name))
             seconds += scenario.warm_up

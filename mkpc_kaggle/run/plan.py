@@ -15,7 +15,7 @@ from mkpc_kaggle.run.jobs import Cause, Finished, Lost, Outcome, Phase, Plan, Re
 
 EXPLORE_SHARE = 0.25
 """The share of the time left that may be spent to learn what units cost that never ran."""
-JOB_SHARE = 0.1
+JOB_SHARE = 0.05
 """The share of the time left that a job may be expected to take: what a job found late comes too late."""
 DEADLINE_SHARE = 0.5
 """The share of the time left after which a job begins no more: where all is slower of a sudden, that is learnt."""
@@ -164,7 +164,8 @@ class Planner:
     ) -> Plan:
         """A plan for the first of the pairs; the others go back to the front of the queue.
 
-        It is one pair where some unit's cost is unknown and cannot be planned, and few where it gets late.
+        It is one pair where some unit's cost is unknown and cannot be planned, and few where it gets late; in
+        the end the first of its units, since what one job does comes back, or is lost, at once.
         """
         left = self.budget.stop - now
         seconds = self.costs.overhead + sum(self.costs.of(unit.name) for unit in lacking)
@@ -173,6 +174,10 @@ class Planner:
         if todo[most:]:
             self._again.appendleft(replace(stretch, indices=tuple(todo[most:])))
         todo = todo[:most]
+        if not unknown and len(lacking) > 1 and seconds > JOB_SHARE * left:
+            first, *rest = sorted(lacking, key=lambda unit: unit.stage)
+            self._again.appendleft(replace(stretch, indices=tuple(todo), units=tuple(rest)))
+            units = lacking = (first,)
         self._flying.update(todo)
         self._jobs_out += 1
         self._exploring += unknown
@@ -191,10 +196,10 @@ class Planner:
         )
 
     def _timeout(self, lacking: Iterable[Unit], pairs: int, *, unknown: bool) -> float:
-        seconds = max(self.costs.most(unit.name) for unit in lacking) * min(pairs, self.patience.batch)
-        warm_up = max(self.costs.warm_up(unit.name) for unit in lacking)
-        known = self.patience.silence(self.budget.limit) + warm_up + self.patience.factor * seconds
-        return known + (min(self.patience.unknown, self._allowance) if unknown else 0.0)
+        factor = self.patience.factor * min(pairs, self.patience.batch)
+        known = max(self.costs.longest(unit.name, factor) for unit in lacking)
+        silence = self.patience.silence(self.budget.limit)
+        return silence + known + (min(self.patience.unknown, self._allowance) if unknown else 0.0)
 
     def _deadline(self, lacking: Iterable[Unit], pairs: int, now: float) -> float:
         """Early enough to plan the rest anew, but late enough for twice what the job should take."""
@@ -208,12 +213,12 @@ class Planner:
         """The units for a stretch whose turn has come."""
         if stretch.units is None:
             regular = self._possible(self.recipe.regular)
-            return regular[: self._fit(regular, now)]
-        units = self._possible(stretch.units)
+            units = regular[: self._fit(regular, now)]
+        else:
+            units = self._possible(stretch.units)
         if stretch.phase is Phase.SWEEP:
             return units[:1]
-        # Towards the end, what still fits; a pass of all pairs is another matter.
-        return tuple(unit for unit in units if self.costs.most(unit.name) <= self.budget.stop - now)
+        return tuple(unit for unit in units if self.costs.most(unit.name) < self.budget.stop - now)
 
     def _possible(self, units: Iterable[Unit]) -> tuple[Unit, ...]:
         return tuple(unit for unit in units if unit.name not in self._hopeless)
@@ -296,7 +301,7 @@ class Planner:
         if not judged or not self._extras_help:
             return True
         if not self._flying.isdisjoint(judged) or any(set(judged) & set(one.indices) for one in self._again):
-            return False
+            return self._jobs_out < self.workers  # a worker that hangs does not keep the others waiting
         before = sum(inliers_before(self.records[index]) for index in judged)
         after = sum(self.records[index].inliers for index in judged)
         if after - before <= self.recipe.upgrade.least_gain * before:
