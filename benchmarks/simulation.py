@@ -179,7 +179,7 @@ class SimulatedPool:
         return True
 
     def _do(self, job: Job, worker: int, begun: float) -> tuple[float, Finished | Lost, float]:
-        """When the job ends, what comes back, and the seconds of it that an injected fault took from any planner."""
+        """When the job ends, what comes back, and the seconds of it that an injected fault took."""
         now, plan = begun, job.plan
         expected = dict(zip(plan.units, plan.expected, strict=True))
         results: list[list[UnitResult]] = [[] for _ in job.tasks]
@@ -187,14 +187,14 @@ class SimulatedPool:
             for task, found in zip(job.tasks, results, strict=True):
                 if any(result.unit == unit for result in task.results) or now + expected[unit] >= plan.deadline:
                     continue
-                seconds = self._seconds(unit, worker, now) * plan.shrink**2
                 stalled = self._rng.random() < self.scenario.stalls
-                seconds *= STALL if stalled else 1.0
+                usual = self._seconds(unit, now) * plan.shrink**2
+                seconds = usual * (STALL if stalled else 1.0) + self._warm_up(unit, worker)
                 fate = self._rng.random()
                 if fate < self.scenario.crashes:
                     return now + seconds / 2, Lost(job, Cause.DIED), seconds / 2
                 if fate < self.scenario.crashes + self.scenario.hangs:
-                    return now + plan.timeout, Lost(job, Cause.HUNG), min(plan.timeout, STALL * seconds if not stalled else seconds)
+                    return now + plan.timeout, Lost(job, Cause.HUNG), min(plan.timeout, STALL * usual)
                 if seconds > plan.timeout:
                     return now + plan.timeout, Lost(job, Cause.HUNG), plan.timeout if stalled else 0.0
                 now += seconds
@@ -202,16 +202,19 @@ class SimulatedPool:
         outcomes = tuple(self._outcome(task, found, plan) for task, found in zip(job.tasks, results, strict=True))
         return now, Finished(job, outcomes), 0.0
 
-    def _seconds(self, unit: Unit, worker: int, now: float) -> float:
+    def _warm_up(self, unit: Unit, worker: int) -> float:
+        if (worker, unit.name) in self._warm:
+            return 0.0
+        self._warm.add((worker, unit.name))
+        return self.scenario.warm_up
+
+    def _seconds(self, unit: Unit, now: float) -> float:
         scenario, rng = self.scenario, self._rng
         seconds = self._costs[unit.name] * math.exp(scenario.spread * rng.normal() - scenario.spread**2 / 2)
         if rng.random() < scenario.misses:
             seconds *= scenario.miss_factor
         if now > scenario.turn * scenario.limit:
             seconds *= scenario.drift
-        if (worker, unit.name) not in self._warm:
-            self._warm.add((worker, unit.name))
-            seconds += scenario.warm_up
         return seconds
 
     def _outcome(self, task: Task, found: list[UnitResult], plan: Plan) -> Outcome:

@@ -18,7 +18,7 @@ EXPLORE_SHARE = 0.25
 JOB_SHARE = 0.05
 """The share of the time left that a job may be expected to take: what a job found late comes too late."""
 DEADLINE_SHARE = 0.5
-"""The share of the time left after which a job begins no more: where all is slower of a sudden, that is learnt."""
+"""The share of the time left after which a job begins no unit: where all is slower of a sudden, that is learnt."""
 SHRINK, LEAST_SHRINK = 0.7, 0.45
 """A unit that a worker fails at on one pair is tried on views whose sides are 0.7, then 0.49 times as long."""
 MOST_LOSSES = 4
@@ -35,7 +35,8 @@ class Patience:
 
     It is heard of before each unit on each ``batch`` of pairs. ``unknown`` seconds are allowed where nobody knows
     what a unit costs. A machine that is ten times slower of a sudden does not hang. A short run waits less: for
-    ``share`` of its limit, but ``least`` seconds, in place of the floor; an unknown unit has its exploration's time.
+    ``share`` of its limit, but ``least`` seconds, in place of the floor; for an unknown unit as long as it may be
+    explored.
     """
 
     floor: float = 60.0
