@@ -115,7 +115,7 @@ def test_a_job_that_no_worker_began_is_planned_again_as_it_was() -> None:
 def test_what_a_jobs_deadline_cut_off_is_planned_again() -> None:
     one = planner(17)
     one.budget = Budget(0.0, 1000.0, lambda: 0.0)
-    for _ in range(3):  # two pairs are alone, the first to warm up
+    for _ in range(2):  # by then the unit is measured
         one.take(finished(plan := one.next(0.0), one), 0.0)  # type: ignore[arg-type]
     plan = one.next(0.0)
     assert plan is not None
