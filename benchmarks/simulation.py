@@ -28,6 +28,10 @@ from mkpc_kaggle.run.in_process import JOBS_A_WORKER
 from mkpc_kaggle.run.jobs import NOT_REACHED, Cause, Finished, Job, Lost, Outcome, Plan, Record, Task, UnitRecord
 
 RESTART_SECONDS = 8.0
+STALL = 20.0
+"""A unit that stalls takes that many times as long."""
+SWEEP_SHARE = 0.7
+"""The share of the limit within which the sweep is said to fit."""
 
 
 @dataclass(frozen=True)
@@ -68,8 +72,12 @@ class Scenario:
     def work(self) -> float:
         """Seconds that all regular units take on all pairs and workers, on average and without faults."""
         regular = self.costs[: len(self.costs) - self.extras]
-        cached = 1 + self.misses * (self.miss_factor - 1)
-        return self.pairs * sum(regular) * cached / self.workers
+        return self.pairs * sum(regular) * self.cached / self.workers
+
+    @property
+    def cached(self) -> float:
+        """What a unit costs on average, in terms of one on a cached view."""
+        return 1 + self.misses * (self.miss_factor - 1)
 
 
 def random_scenario(seed: int, pairs: int) -> Scenario:
@@ -92,8 +100,10 @@ def random_scenario(seed: int, pairs: int) -> Scenario:
         seed=seed,
     )
     limit = max(600.0, scenario.work * float(rng.uniform(0.3, 1.3)))
-    # Faults a run: some dozens of stalls, a crash or two, now and then a hang.
-    runs = min(scenario.work, limit) * scenario.workers / (sum(costs) / len(costs))
+    # Faults a run: some dozens of stalls, a crash or two, now and then a hang. With its extra units a run may do
+    # all units on all pairs, if the time suffices.
+    seconds = sum(costs) / len(costs) * scenario.cached
+    runs = min(scenario.pairs * len(costs), limit * scenario.workers / seconds)
     rates = [float(rng.uniform(0, most)) / runs if troubled else 0.0 for most in (30, 3, 1)]
     return Scenario(
         **{**vars(scenario), "limit": limit, "stalls": rates[0], "crashes": rates[1], "hangs": rates[2]}
@@ -109,14 +119,21 @@ class VirtualClock:
 
 
 class SimulatedPool:
-    """Workers that take their time on the virtual clock alone."""
+    """Workers that take their time on the virtual clock alone.
 
-    def __init__(self, scenario: Scenario, clock: VirtualClock) -> None:
+    Of their seconds until ``stop``, ``kept`` went into jobs that came back in time. ``faults`` are what injected
+    faults take whatever is planned: the unit that a crash cut short, of a hang as long as a stall might have
+    taken, which it cannot be told from sooner, a stall that was taken for a hang, and the new worker's start
+    after any of these.
+    """
+
+    def __init__(self, scenario: Scenario, clock: VirtualClock, stop: float) -> None:
         self.scenario = scenario
         self.clock = clock
-        self.productive = 0.0
+        self.kept = self.faults = 0.0
         self._rng = np.random.default_rng(scenario.seed)
         self._costs = {unit.name: cost for unit, cost in zip(scenario.recipe.units, scenario.costs, strict=True)}
+        self._stop = stop
         self._free = [RESTART_SECONDS] * scenario.workers
         self._warm: set[tuple[int, str]] = set()
         self._coming: list[tuple[float, int, float, Finished | Lost]] = []
@@ -136,21 +153,23 @@ class SimulatedPool:
     def submit(self, job: Job) -> None:
         worker = int(np.argmin(self._free))
         begun = max(self.clock.now, self._free[worker])
-        ended, back, productive = self._do(job, worker, begun)
+        ended, back, fault = self._do(job, worker, begun)
         lost = isinstance(back, Lost)
         self._free[worker] = ended + (RESTART_SECONDS if lost else 0.0)
         if lost:
+            self.faults += max(0.0, min(fault + RESTART_SECONDS * (fault > 0), self._stop - begun))
             self._warm = {(who, unit) for who, unit in self._warm if who != worker}
         self._count += 1
-        heapq.heappush(self._coming, (ended, self._count, productive, back))
+        kept = 0.0 if lost else min(ended, self._stop) - begun
+        heapq.heappush(self._coming, (ended, self._count, kept, back))
 
     def next(self, until: float) -> Finished | Lost | None:
         if not self._coming or self._coming[0][0] > until:
             self.clock.now = max(self.clock.now, until)
             return None
-        ended, _, productive, back = heapq.heappop(self._coming)
+        ended, _, kept, back = heapq.heappop(self._coming)
         self.clock.now = max(self.clock.now, ended)
-        self.productive += productive
+        self.kept += max(0.0, kept)
         return back
 
     def stop(self) -> None:
@@ -160,7 +179,7 @@ class SimulatedPool:
         return True
 
     def _do(self, job: Job, worker: int, begun: float) -> tuple[float, Finished | Lost, float]:
-        """When the job ends, what comes back, and how much of its time brought something."""
+        """When the job ends, what comes back, and the seconds of it that an injected fault took."""
         now, plan = begun, job.plan
         expected = dict(zip(plan.units, plan.expected, strict=True))
         results: list[list[UnitResult]] = [[] for _ in job.tasks]
@@ -168,29 +187,34 @@ class SimulatedPool:
             for task, found in zip(job.tasks, results, strict=True):
                 if any(result.unit == unit for result in task.results) or now + expected[unit] >= plan.deadline:
                     continue
-                seconds = self._seconds(unit, worker, now) * plan.shrink**2
+                stalled = self._rng.random() < self.scenario.stalls
+                usual = self._seconds(unit, now) * plan.shrink**2
+                seconds = usual * (STALL if stalled else 1.0) + self._warm_up(unit, worker)
                 fate = self._rng.random()
                 if fate < self.scenario.crashes:
-                    return now + seconds / 2, Lost(job, Cause.DIED), 0.0
-                if fate < self.scenario.crashes + self.scenario.hangs or seconds > plan.timeout:
-                    return now + plan.timeout, Lost(job, Cause.HUNG), 0.0
+                    return now + seconds / 2, Lost(job, Cause.DIED), seconds / 2
+                if fate < self.scenario.crashes + self.scenario.hangs:
+                    return now + plan.timeout, Lost(job, Cause.HUNG), min(plan.timeout, STALL * usual)
+                if seconds > plan.timeout:
+                    return now + plan.timeout, Lost(job, Cause.HUNG), plan.timeout if stalled else 0.0
                 now += seconds
                 found.append(UnitResult(unit, Matches.empty(), 0.0, seconds))
         outcomes = tuple(self._outcome(task, found, plan) for task, found in zip(job.tasks, results, strict=True))
-        return now, Finished(job, outcomes), now - begun
+        return now, Finished(job, outcomes), 0.0
 
-    def _seconds(self, unit: Unit, worker: int, now: float) -> float:
+    def _warm_up(self, unit: Unit, worker: int) -> float:
+        if (worker, unit.name) in self._warm:
+            return 0.0
+        self._warm.add((worker, unit.name))
+        return self.scenario.warm_up
+
+    def _seconds(self, unit: Unit, now: float) -> float:
         scenario, rng = self.scenario, self._rng
         seconds = self._costs[unit.name] * math.exp(scenario.spread * rng.normal() - scenario.spread**2 / 2)
         if rng.random() < scenario.misses:
             seconds *= scenario.miss_factor
         if now > scenario.turn * scenario.limit:
             seconds *= scenario.drift
-        if rng.random() < scenario.stalls:
-            seconds *= 20
-        if (worker, unit.name) not in self._warm:
-            self._warm.add((worker, unit.name))
-            seconds += scenario.warm_up
         return seconds
 
     def _outcome(self, task: Task, found: list[UnitResult], plan: Plan) -> Outcome:
@@ -226,8 +250,16 @@ class MemoryJournal:
 
 @dataclass(frozen=True)
 class Ran:
-    """What became of a scenario. ``utilisation`` is the share of the workers' time until the budget's stop that
-    went into units whose results were kept; ``late`` and ``lost`` must be 0.
+    """What became of a scenario; ``late`` and ``lost`` must be 0.
+
+    ``utilisation`` is what was used of what was given. Given are the workers' seconds from their start to the
+    budget's stop, without those that injected faults take from any planner (see :class:`SimulatedPool`). Used are
+    the seconds of jobs whose results came back in time, warm-ups and stalls included. So idle workers, the end of
+    a phase, what a lost job had done before, silence longer than a stall's, a slow unit taken to hang, and what
+    is still under way at the end all count against the engine.
+
+    ``lost`` counts pairs without the sweep's F where the sweep fits (see :func:`sweep_seconds`), and versions of
+    the submission that lack a row.
     """
 
     scenario: Scenario
@@ -247,7 +279,7 @@ def simulate(scenario: Scenario) -> Ran:
     """Run one scenario through the real engine."""
     clock = VirtualClock()
     budget = Budget(0.0, scenario.limit, clock)
-    pool = SimulatedPool(scenario, clock)
+    pool = SimulatedPool(scenario, clock, budget.stop)
     pairs = [Pair(str(n), "set", Path(f"{n:07d}"), Path("b")) for n in range(scenario.pairs)]
     published: list[int] = []
     engine = Engine(
@@ -273,13 +305,13 @@ def simulate(scenario: Scenario) -> Ran:
 
     engine.planner.next = timed  # type: ignore[method-assign]
     report = engine.run()
-    swept = bool(report.records) and sum(bool(record.units) for record in report.records)
-    sweep_fits = sweep_seconds(scenario) < 0.5 * scenario.limit
-    given = pool.workers * (min(budget.stop, clock.now) - RESTART_SECONDS)
+    swept = sum(record.matches > 0 for record in report.records)
+    sweep_fits = sweep_seconds(scenario) < SWEEP_SHARE * scenario.limit
+    given = pool.workers * (min(budget.stop, clock.now) - RESTART_SECONDS) - pool.faults
     return Ran(
         scenario,
         report,
-        pool.productive / given,
+        pool.kept / given,
         max(0.0, clock.now - scenario.limit),
         sum(length != scenario.pairs for length in published) + (scenario.pairs - swept if sweep_fits else 0),
         jobs,
@@ -288,9 +320,16 @@ def simulate(scenario: Scenario) -> Ran:
 
 
 def sweep_seconds(scenario: Scenario) -> float:
-    """What the sweep takes at worst: with the drift from its first moment on."""
-    cached = 1 + scenario.misses * (scenario.miss_factor - 1)
-    return scenario.pairs * scenario.costs[0] * cached * max(1.0, scenario.drift) / scenario.workers
+    """What the sweep takes: with the drift from its first moment on, its stalls, warm-ups, crashes and hangs.
+
+    The faults are those to expect; that there may be more of them is what the rest of the limit is for. Each
+    takes a worker's start and warm-up, a hang also as long as a stall would.
+    """
+    unit = scenario.costs[0] * scenario.cached * max(1.0, scenario.drift)
+    start = RESTART_SECONDS + scenario.warm_up
+    stalls = scenario.stalls * (STALL - 1) * unit
+    faults = (scenario.crashes + scenario.hangs) * start + scenario.hangs * STALL * unit
+    return start + scenario.pairs * (unit + stalls + faults) / scenario.workers
 
 
 def main() -> None:

@@ -19,7 +19,7 @@ from mkpc_kaggle.recipe import Recipe, UpgradeConfig
 from mkpc_kaggle.run.budget import Budget
 from mkpc_kaggle.run.engine import Ending
 from mkpc_kaggle.run.jobs import Cause, Finished, Job, Lost, Outcome, Phase, Plan, Record, UnitRecord
-from mkpc_kaggle.run.plan import Planner, is_weak
+from mkpc_kaggle.run.plan import Patience, Planner, is_weak
 
 
 def planner(count: int = 40, recipe: Recipe = THREE_UNITS, workers: int = 1) -> Planner:
@@ -112,6 +112,27 @@ def test_a_job_that_no_worker_began_is_planned_again_as_it_was() -> None:
     assert (again.indices, again.units, again.shrink) == (plan.indices, plan.units, 1.0)
 
 
+def test_what_a_jobs_deadline_cut_off_is_planned_again() -> None:
+    one = planner(17)
+    one.budget = Budget(0.0, 1000.0, lambda: 0.0)
+    for _ in range(2):  # by then the unit is measured
+        one.take(finished(plan := one.next(0.0), one), 0.0)  # type: ignore[arg-type]
+    plan = one.next(0.0)
+    assert plan is not None
+    assert plan.deadline < one.budget.stop
+    whole = finished(plan, one)
+    nothing = Outcome(Record.untouched(plan.indices[-1]))
+    one.take(replace(whole, outcomes=(*whole.outcomes[:-1], nothing)), plan.deadline)
+    again = one.next(plan.deadline)
+    assert again is not None
+    assert (again.phase, again.indices) == (plan.phase, plan.indices[-1:])
+
+
+def test_a_short_run_waits_less_for_a_silent_worker() -> None:
+    patience = Patience()
+    assert [patience.silence(limit) for limit in (20.0, 600.0, 32400.0)] == [5.0, 12.0, 60.0]
+
+
 def test_pairs_are_weak_for_few_inliers_a_low_share_or_an_uncertain_region() -> None:
     def record(matches: int, inliers: int, reason: RegionReason = RegionReason.CROPPED) -> Record:
         region = CriticalRegion(Box(0, 0, 9, 9), reason)
@@ -153,7 +174,7 @@ def test_random_runs_are_never_late_never_lose_a_row_and_use_their_time() -> Non
     runs = [simulate(random_scenario(seed, pairs=300)) for seed in range(150)]
     assert max(run.late for run in runs) == 0
     assert sum(run.lost for run in runs) == 0
-    assert median(run.utilisation for run in runs if run.work_left) > 0.95
+    assert median(run.utilisation for run in runs if run.work_left) > 0.98
 
 
 def test_undisturbed_runs_use_all_their_time() -> None:

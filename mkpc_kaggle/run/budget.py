@@ -154,6 +154,11 @@ class Costs:
         """Seconds within which the unit most likely ends on a pair."""
         return self._measured[unit].most if unit in self._measured else self._warm_up.get(unit, 0.0)
 
+    def longest(self, unit: str, factor: float) -> float:
+        """Seconds after which the unit hangs: its warm-up, as on a new worker, and ``factor`` times its cost."""
+        steady = self._measured[unit].most if unit in self._measured else 0.0
+        return self._warm_up.get(unit, 0.0) + factor * steady
+
     def forecast(self, unit: str) -> float:
         """Expected seconds with a safety margin, which shrinks as more is known."""
         count = self._measured[unit].count if unit in self._measured else 1

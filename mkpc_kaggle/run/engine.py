@@ -147,7 +147,8 @@ class Engine:
                 self._hand_out(plan)
             if self._out == 0:
                 return
-            self._gather()
+            while not self._gather() and not self.interrupt.is_set() and self.budget.left() > 0:
+                pass  # only a job that comes back changes the plan
 
     def _wait(self) -> None:
         """Let what is under way end, until nothing is waited for any longer."""
@@ -175,11 +176,11 @@ class Engine:
             self._fault(f"the journal cannot be read ({error})")
             return ()
 
-    def _gather(self) -> None:
-        """Take one job back, if one comes."""
+    def _gather(self) -> bool:
+        """Take one job back; whether one came."""
         back = self.pool.next(min(self.budget.clock() + LISTEN_SECONDS, self._wait_until))
         if back is None:
-            return
+            return False
         self._out -= 1
         now = self.budget.clock()
         if isinstance(back, Lost):
@@ -193,6 +194,7 @@ class Engine:
             self._bar.show(*self.planner.progress)
         if now - self._published > PUBLISH_SECONDS:
             self._publish()
+        return True
 
     def _keep(self, outcomes: Sequence[Outcome]) -> None:
         """Put outcomes into the journal; into memory those that it cannot take."""

@@ -15,8 +15,10 @@ from mkpc_kaggle.run.jobs import Cause, Finished, Lost, Outcome, Phase, Plan, Re
 
 EXPLORE_SHARE = 0.25
 """The share of the time left that may be spent to learn what units cost that never ran."""
-JOB_SHARE = 0.1
+JOB_SHARE = 0.05
 """The share of the time left that a job may be expected to take: what a job found late comes too late."""
+DEADLINE_SHARE = 0.5
+"""The share of the time left after which a job begins no unit: where all is slower of a sudden, that is learnt."""
 SHRINK, LEAST_SHRINK = 0.7, 0.45
 """A unit that a worker fails at on one pair is tried on views whose sides are 0.7, then 0.49 times as long."""
 MOST_LOSSES = 4
@@ -32,13 +34,21 @@ class Patience:
     """When a worker is taken to hang: silent for ``floor`` seconds and ``factor`` times what a unit should take.
 
     It is heard of before each unit on each ``batch`` of pairs. ``unknown`` seconds are allowed where nobody knows
-    what a unit costs. A machine that is ten times slower of a sudden does not hang.
+    what a unit costs. A machine that is ten times slower of a sudden does not hang. A short run waits less: for
+    ``share`` of its limit, but ``least`` seconds, in place of the floor; for an unknown unit as long as it may be
+    explored.
     """
 
     floor: float = 60.0
     factor: float = 10.0
     unknown: float = 600.0
     batch: int = 1
+    share: float = 0.02
+    least: float = 5.0
+
+    def silence(self, limit: float) -> float:
+        """The seconds allowed besides the unit's own, in a run of ``limit`` seconds."""
+        return min(self.floor, max(self.least, self.share * limit))
 
 
 @dataclass(frozen=True)
@@ -155,7 +165,8 @@ class Planner:
     ) -> Plan:
         """A plan for the first of the pairs; the others go back to the front of the queue.
 
-        It is one pair where some unit's cost is unknown and cannot be planned, and few where it gets late.
+        It is one pair where some unit's cost is unknown and cannot be planned, and few where it gets late; in
+        the end the first of its units, since what one job does comes back, or is lost, at once.
         """
         left = self.budget.stop - now
         seconds = self.costs.overhead + sum(self.costs.of(unit.name) for unit in lacking)
@@ -164,6 +175,10 @@ class Planner:
         if todo[most:]:
             self._again.appendleft(replace(stretch, indices=tuple(todo[most:])))
         todo = todo[:most]
+        if not unknown and len(lacking) > 1 and seconds > JOB_SHARE * left:
+            first, *rest = sorted(lacking, key=lambda unit: unit.stage)
+            self._again.appendleft(replace(stretch, indices=tuple(todo), units=tuple(rest)))
+            units = lacking = (first,)
         self._flying.update(todo)
         self._jobs_out += 1
         self._exploring += unknown
@@ -175,15 +190,22 @@ class Planner:
             tuple(todo),
             units,
             tuple(self.costs.most(unit.name) for unit in units),
-            now + self._allowance if unknown else self.budget.stop,
+            now + self._allowance if unknown else self._deadline(lacking, len(todo), now),
             self._timeout(lacking, len(todo), unknown=unknown),
             stretch.shrink,
             unknown,
         )
 
     def _timeout(self, lacking: Iterable[Unit], pairs: int, *, unknown: bool) -> float:
-        seconds = max(self.costs.most(unit.name) for unit in lacking) * min(pairs, self.patience.batch)
-        return self.patience.floor + self.patience.factor * seconds + (self.patience.unknown if unknown else 0.0)
+        factor = self.patience.factor * min(pairs, self.patience.batch)
+        known = max(self.costs.longest(unit.name, factor) for unit in lacking)
+        silence = self.patience.silence(self.budget.limit)
+        return silence + known + (min(self.patience.unknown, self._allowance) if unknown else 0.0)
+
+    def _deadline(self, lacking: Iterable[Unit], pairs: int, now: float) -> float:
+        """Early enough to plan the rest anew, but late enough for twice what the job should take."""
+        seconds = pairs * (self.costs.overhead + sum(self.costs.most(unit.name) for unit in lacking))
+        return min(self.budget.stop, now + max(DEADLINE_SHARE * (self.budget.stop - now), 2 * seconds))
 
     def _can_gain(self, index: int, units: Iterable[Unit]) -> bool:
         return index not in self._aside and bool(self.records[index].lacking(units))
@@ -192,12 +214,12 @@ class Planner:
         """The units for a stretch whose turn has come."""
         if stretch.units is None:
             regular = self._possible(self.recipe.regular)
-            return regular[: self._fit(regular, now)]
-        units = self._possible(stretch.units)
+            units = regular[: self._fit(regular, now)]
+        else:
+            units = self._possible(stretch.units)
         if stretch.phase is Phase.SWEEP:
             return units[:1]
-        # Towards the end, what still fits; a pass of all pairs is another matter.
-        return tuple(unit for unit in units if self.costs.most(unit.name) <= self.budget.stop - now)
+        return tuple(unit for unit in units if self.costs.most(unit.name) < self.budget.stop - now)
 
     def _possible(self, units: Iterable[Unit]) -> tuple[Unit, ...]:
         return tuple(unit for unit in units if unit.name not in self._hopeless)
@@ -280,7 +302,7 @@ class Planner:
         if not judged or not self._extras_help:
             return True
         if not self._flying.isdisjoint(judged) or any(set(judged) & set(one.indices) for one in self._again):
-            return False
+            return self._jobs_out < self.workers  # a worker that hangs does not keep the others waiting
         before = sum(inliers_before(self.records[index]) for index in judged)
         after = sum(self.records[index].inliers for index in judged)
         if after - before <= self.recipe.upgrade.least_gain * before:
@@ -303,7 +325,16 @@ class Planner:
         if plan.exploring and now >= plan.deadline:
             for unit in plan.units:
                 self.costs.suppose(unit.name, self._allowance)
-        return [kept for outcome in finished.outcomes if (kept := self._merge(outcome, plan.phase, now))]
+        kept = [kept for outcome in finished.outcomes if (kept := self._merge(outcome, plan.phase, now))]
+        self._go_on(plan, now)
+        return kept
+
+    def _go_on(self, plan: Plan, now: float) -> None:
+        """What a job's own deadline cut off is planned anew."""
+        cut = now + max(plan.expected) >= plan.deadline
+        rest = tuple(index for index in plan.indices if self._can_gain(index, plan.units))
+        if cut and rest and not plan.exploring and plan.deadline < self.budget.stop:
+            self._again.append(Stretch(plan.phase, rest, plan.units, plan.shrink))
 
     def _measure(self, plan: Plan, measured: list[tuple[str, float]], now: float, pairs: int) -> None:
         if measured and plan.shrink == 1:
