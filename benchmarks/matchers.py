@@ -8,13 +8,14 @@ is the largest of a process that does nothing else, Python and PyTorch included.
 """
 
 import argparse
-import resource
+import re
 import statistics
 import subprocess
 import sys
 import time
 from collections.abc import Callable
 from functools import cache, partial
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -41,7 +42,7 @@ Run = Callable[[], int]
 
 VGA, DKM_SIZE = Size(640, 480), Size(720, 540)
 YARDSTICK = "kornia LoFTR"
-KILO, MEGA, GIGA = 1e3, 1e6, 1e9
+GIGA = 1e9
 
 
 @cache
@@ -149,6 +150,13 @@ def peak(precision: torch.dtype) -> float:
     return 2 * weight[0].numel() * x.numel() / min(seconds_of(run) for _ in range(20))  # type: ignore[arg-type]
 
 
+def high_water() -> float:
+    """The most bytes that this process has held; what ``getrusage`` gives may be its parent's."""
+    kilobytes = re.search(r"VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text())
+    assert kilobytes is not None
+    return float(kilobytes[1]) * 1024
+
+
 def peak_memory(case: str, precision: str) -> float:
     """Bytes of a process of its own."""
     arguments = [sys.executable, "-m", "benchmarks.matchers", "--memory-of", case, "--precision", precision]
@@ -161,12 +169,13 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--precision", choices=list(Precision), default=Precision.FLOAT32)
     parser.add_argument("--only", default=",".join(CASES), help="parts of names of cases")
+    parser.add_argument("--large", action="store_true", help=f"also the memory at {LARGE.width} x {LARGE.height}")
     parser.add_argument("--memory-of", metavar="CASE", help="run this case once and print the process's peak")
     arguments = parser.parse_args()
     precision = Precision(arguments.precision)
     if arguments.memory_of:
         (CASES | LARGE_CASES)[arguments.memory_of](precision)()
-        print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024)
+        print(high_water())
         return
     chosen = [case for case in CASES if any(part in case for part in arguments.only.split(",") if part)]
     runs = {case: CASES[case](precision) for case in dict.fromkeys([YARDSTICK, *chosen])}
@@ -176,6 +185,8 @@ def main() -> None:
         for case, run in runs.items():
             times[case].append(seconds_of(run))
     report(found, work, times, peak(getattr(torch, precision)), precision)
+    for case in LARGE_CASES if arguments.large else ():
+        print(f"{case}: {peak_memory(case, precision) / GIGA:.2f} GB")
 
 
 def report(

@@ -3,9 +3,13 @@
 Colours are the Okabe-Ito palette, which colour-blind readers can tell apart.
 """
 
+import warnings
+from collections.abc import Mapping, Sequence
+from io import BytesIO, StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,6 +24,9 @@ if TYPE_CHECKING:
 
 INLIER, OUTLIER, REGION, DROPPED = "#009E73", "#D55E00", "#F0E442", "#999999"
 CLUSTERS = ("#56B4E9", "#E69F00", "#CC79A7", "#0072B2", "#009E73", "#D55E00")
+_CYCLE = tuple(CLUSTERS[place] for place in (3, 1, 4, 5, 0, 2))
+INK = "#010203"
+"""Stands for the colour of the text around a figure, until :func:`to_svg` makes it just that."""
 MOST_LINES = 150
 """Lines that an eye can follow; a figure with more matches shows an even sample and says so."""
 
@@ -50,6 +57,171 @@ def save(figure: "Figure", path: Path) -> None:
         figure.savefig(path, dpi=110)
     except (OSError, ValueError) as error:
         raise UserError(f"the figure {path} cannot be written: {error}") from error
+
+
+def to_svg(figure: "Figure") -> str:
+    """The figure as an ``<svg>`` element that takes over the colour of the text around it; fixed bytes."""
+    from matplotlib import rc_context
+
+    stream = StringIO()
+    with rc_context({"svg.fonttype": "none", "svg.hashsalt": "mkpc"}), warnings.catch_warnings():
+        # The reader's browser has the glyphs that matplotlib's own font lacks.
+        warnings.filterwarnings("ignore", message="Glyph .* missing")
+        nothing = dict.fromkeys(("Creator", "Date", "Format", "Type"))
+        figure.savefig(stream, format="svg", transparent=True, metadata=nothing)
+    text = stream.getvalue()
+    return text[text.index("<svg") :].replace(INK, "currentColor")
+
+
+def to_jpeg(figure: "Figure") -> bytes:
+    stream = BytesIO()
+    figure.savefig(stream, format="jpeg", dpi=110, pil_kwargs={"quality": 82})
+    return stream.getvalue()
+
+
+def draw_parts(parts: Mapping[str, float]) -> "Figure":
+    """Bars: the seconds of each part of the work."""
+    figure = new_figure(5.6, 0.5 + 0.32 * max(1, len(parts)))
+    axes = _plain_axes(figure, f"{sum(parts.values()):.0f} seconds of work, by part")
+    bars = axes.barh(list(parts), list(parts.values()), color=CLUSTERS[3], height=0.65)
+    axes.bar_label(bars, fmt="%.1f", padding=3, color=INK, fontsize=9)
+    axes.margins(x=0.12)
+    axes.invert_yaxis()
+    axes.set_xticks([])
+    axes.spines["bottom"].set_visible(False)
+    return figure
+
+
+def draw_budget(
+    ended: Mapping[str, Sequence[float]], marks: Mapping[str, Sequence[float]], limit: float | None
+) -> "Figure":
+    """Jobs ended over time, one colour a phase: ``ended`` and ``marks`` are seconds since the start by name."""
+    figure = new_figure(5.6, 3.2)
+    unit, name = _time_unit(max([limit or 0.0, *(second for times in ended.values() for second in times)]))
+    total = sum(map(len, ended.values()))
+    axes = _plain_axes(figure, f"{total} jobs ended, over {name} since the start")
+    below = 0
+    for colour, (phase, times) in zip(_CYCLE, ended.items(), strict=False):
+        # A flat piece is time without a result; 300 steps are as many as can be seen.
+        keep = _sample(np.ones(len(times), bool), 300)
+        x, y = [times[i] / unit for i in keep], [below + i + 1 for i in keep]
+        axes.step(x, y, where="post", color=colour, linewidth=2, label=phase, marker="o", markersize=2.5)
+        below += len(times)
+    for colour, style, (what, times) in zip((CLUSTERS[2], OUTLIER), (":", "--"), marks.items(), strict=False):
+        for number, second in enumerate(times[:MOST_LINES]):
+            label = what if number == 0 else None
+            axes.axvline(second / unit, color=colour, linewidth=1, linestyle=style, label=label)
+    if limit is not None:
+        axes.axvline(limit / unit, color=INK, linewidth=1.2, label="time limit")
+    axes.set_xlim(left=0)
+    axes.set_ylim(bottom=0)
+    axes.set_xlabel(name, color=INK)
+    _legend(axes)
+    return figure
+
+
+def draw_groups(groups: Mapping[str, Sequence[int]]) -> "Figure":
+    """A row a group, a dot a pair, a bar the median: inliers on a scale that grows by factors."""
+    figure = new_figure(5.6, 0.9 + 0.26 * max(1, len(groups)))
+    axes = _plain_axes(figure, "inliers of each pair, by batch; the line is the median")
+    for row, inliers in enumerate(groups.values()):
+        spread = np.linspace(-0.25, 0.25, len(inliers)) if len(inliers) > 1 else [0.0]
+        some = _sample(np.ones(len(inliers), bool), 120)
+        axes.scatter(
+            np.asarray(inliers)[some],
+            row + np.asarray(spread)[some],
+            s=16,
+            color=CLUSTERS[0],
+            alpha=0.7,
+            linewidths=0,
+        )
+        axes.vlines(np.median(inliers), row - 0.36, row + 0.36, color=OUTLIER, linewidth=2)
+    axes.set_yticks(range(len(groups)), [_short(name) for name in groups], parse_math=False, fontsize=8)
+    axes.set_ylim(len(groups) - 0.5, -0.5)
+    axes.set_xscale("symlog", linthresh=10)
+    axes.set_xlim(left=0)
+    axes.xaxis.set_major_formatter("{x:.0f}")
+    return figure
+
+
+def draw_crops(sizes: Mapping[str, Sequence[tuple[int, int]]]) -> "Figure":
+    """A dot a region at its width and height in pixels, one colour a reason."""
+    figure = new_figure(5.6, 3.6)
+    total = sum(map(len, sizes.values()))
+    axes = _plain_axes(figure, f"{total} critical regions: width and height in pixels, by reason")
+    for colour, (reason, values) in zip(_CYCLE, sizes.items(), strict=False):
+        some = _sample(np.ones(len(values), bool), 500)
+        x, y = np.asarray(values)[some].T
+        axes.scatter(x, y, s=12, color=colour, alpha=0.6, linewidths=0, label=f"{reason} ({len(values)})")
+    axes.set_xlim(left=0)
+    axes.set_ylim(bottom=0)
+    axes.set_xlabel("width", color=INK)
+    axes.set_ylabel("height", color=INK)
+    _legend(axes)
+    return figure
+
+
+def draw_strip(images: tuple[Image, Image], match: PairMatch) -> "Figure":
+    """The two images side by side at one height: lines are matches, boxes the critical regions; no text."""
+    height = 480
+    scales = [height / image.size.height for image in images]
+    widths = [max(1, round(image.size.width * scale)) for image, scale in zip(images, scales, strict=True)]
+    shown = [
+        cv2.resize(i.pixels, (w, height), interpolation=cv2.INTER_AREA)
+        for i, w in zip(images, widths, strict=True)
+    ]
+    figure = new_figure(sum(widths) / 110, height / 110)
+    figure.set_layout_engine("none")
+    axes = figure.add_axes((0, 0, 1, 1))
+    axes.imshow(np.hstack(shown))
+    axes.axis("off")
+    _draw_lines(axes, match, scales, widths[0])
+    for region, scale, shift in zip(match.regions or (), scales, (0, widths[0]), strict=False):
+        box = region.box
+        left, top = box.left * scale + shift - 0.5, box.top * scale - 0.5
+        axes.add_patch(_rectangle(left, top, box.size.width * scale, box.size.height * scale))
+    return figure
+
+
+def _draw_lines(axes: "Axes", match: PairMatch, scales: Sequence[float], shift: float) -> None:
+    from matplotlib.collections import LineCollection
+
+    matches, inliers = match.matches, match.estimate.inliers
+    ends0 = (matches.points0 + 0.5) * scales[0] - 0.5
+    ends1 = (matches.points1 + 0.5) * scales[1] - 0.5 + (shift, 0)
+    lines = np.stack([ends0, ends1], axis=1)
+    for mask, most, colour, width in (
+        (~inliers, MOST_LINES // 3, OUTLIER, 0.6),
+        (inliers, MOST_LINES, INLIER, 1.0),
+    ):
+        drawn = lines[_sample(mask, most)]
+        axes.add_collection(LineCollection(list(drawn), colors=colour, linewidths=width, alpha=0.75))
+        x, y = drawn.reshape(-1, 2).T
+        axes.scatter(x, y, s=5, color=colour, linewidths=0)
+
+
+def _plain_axes(figure: "Figure", title: str) -> "Axes":
+    axes = figure.subplots()
+    axes.set_title(title, loc="left", color=INK, fontsize=10)
+    axes.tick_params(colors=INK, labelsize=9)
+    for side, spine in axes.spines.items():
+        spine.set_color(INK)
+        spine.set_visible(side in ("left", "bottom"))
+    axes.patch.set_alpha(0)
+    return axes
+
+
+def _legend(axes: "Axes") -> None:
+    if axes.get_legend_handles_labels()[1]:
+        axes.legend(labelcolor=INK, fontsize=8, frameon=False, loc="best")
+
+
+def _time_unit(seconds: float) -> tuple[float, str]:
+    return next((pair for pair in ((3600, "hours"), (60, "minutes")) if seconds > 3 * pair[0]), (1, "seconds"))
+
+
+def _short(name: str, most: int = 18) -> str:
+    return name if len(name) <= most else name[: most - 1] + "…"
 
 
 def _draw_matches(axes: "NDArray[Any]", images: tuple[Image, Image], match: PairMatch) -> None:

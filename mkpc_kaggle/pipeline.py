@@ -83,15 +83,23 @@ class PairWork:
 class Pipeline:
     """A recipe's units, run on chunks of pairs with matchers that are loaded when first needed.
 
-    ``load(name)`` gives the matcher of that name. Views of one shape are encoded ``batch`` at a time.
+    ``load(name)`` gives the matcher of that name. Views of one shape are encoded ``batch`` at a time; encodings of
+    whole images are kept in ``cache_bytes``.
     """
 
-    def __init__(self, recipe: Recipe, load: Callable[[str], Matcher[Any]], *, batch: int = 1) -> None:
+    def __init__(
+        self,
+        recipe: Recipe,
+        load: Callable[[str], Matcher[Any]],
+        *,
+        batch: int = 1,
+        cache_bytes: int = ENCODING_CACHE_BYTES,
+    ) -> None:
         self.recipe = recipe
         self.batch = batch
         self._load = load
         self._matchers: dict[str, Matcher[Any]] = {}
-        self._encodings: ByteCache[tuple[str, str, View], Any] = ByteCache(ENCODING_CACHE_BYTES)
+        self._encodings: ByteCache[tuple[str, str, View], Any] = ByteCache(cache_bytes)
 
     def load(self) -> None:
         """Load all matchers of the recipe now; raises :class:`UserError` where one cannot be."""

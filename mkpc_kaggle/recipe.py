@@ -170,6 +170,12 @@ def parse_recipe(text: str, name: str) -> Recipe:
         table = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise UserError(f"{where} is not valid TOML: {error}") from error
+    return recipe_of(table, name)
+
+
+def recipe_of(table: Mapping[str, Any], name: str) -> Recipe:
+    """A recipe from a TOML file's table, or from a fingerprint; :class:`UserError` for what it cannot accept."""
+    where = f"recipe {name!r}"
     check_keys(table, ("description", "units", "mkpc", "magsac", "upgrade", "matchers"), where)
     units, matchers = table.get("units", []), table.get("matchers", {})
     if not isinstance(units, list):

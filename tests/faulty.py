@@ -11,7 +11,18 @@ from pathlib import Path
 import numpy as np
 from rectified import RectifiedMatcher, Seen
 
+from mkpc_kaggle.assembly import Assembly
 from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.pipeline import Pipeline
+
+
+def pipeline_once(assembly: Assembly, marker: Path) -> Pipeline:
+    """For the first worker; later ones die while they load."""
+    if marker.exists():
+        die()
+    marker.touch()
+    return assembly.pipeline()
+
 
 Fault = Callable[[], None]
 

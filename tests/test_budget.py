@@ -1,12 +1,21 @@
 import time
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.recipe import Unit
-from mkpc_kaggle.run.budget import WINDOW, Budget, Costs, format_duration, longest_prefix, parse_duration
+from mkpc_kaggle.run.budget import (
+    WINDOW,
+    Budget,
+    Costs,
+    format_duration,
+    longest_prefix,
+    monotonic_of,
+    parse_duration,
+)
 
 UNITS = (Unit(1, "a", 100), Unit(2, "b", 100), Unit(1, "c", 100))
 
@@ -116,3 +125,43 @@ def test_more_time_never_chooses_fewer_units(
     assert count <= longest_prefix(UNITS, lacking, costs, time_left * factor)
     needed = sum(costs.of(unit.name) * lacking[unit.name] for unit in UNITS[:count])
     assert needed <= time_left
+
+
+def test_forecasts_grow_surer_with_every_measurement() -> None:
+    costs, margins = Costs(), []
+    for _ in range(1000):
+        costs.observe("a", 1.0)
+        margins.append(costs.forecast("a") - 1)
+    assert margins[0] == pytest.approx(0.4)
+    assert margins[100] == pytest.approx(0.04)
+    assert margins[-1] == pytest.approx(0.0127, abs=1e-3)
+    assert margins == sorted(margins, reverse=True)
+
+
+def test_a_stall_is_cut_and_cached_encodings_are_not() -> None:
+    costs = Costs()
+    for number in range(WINDOW + 1):
+        costs.observe("cached", 5.0 if number % 4 == 0 else 1.0)
+        costs.observe("stalled", 1000.0 if number == 20 else 1.0)
+    assert costs.of("cached") == pytest.approx(2.0, rel=0.02)
+    assert costs.most("cached") == 5.0
+    assert costs.of("stalled") < 1.2
+    assert costs.most("stalled") == 1.0
+
+
+def test_forecasts_of_heavy_tailed_costs_are_not_too_low() -> None:
+    rng = np.random.default_rng(0)
+    shares = []
+    for _ in range(200):
+        costs = Costs()
+        for seconds in np.exp(rng.normal(size=WINDOW + 1)):
+            costs.observe("a", float(seconds))
+        shares.append(costs.of("a") / np.exp(0.5))
+    assert np.mean(shares) == pytest.approx(1, abs=0.04)
+
+
+def test_a_limit_may_count_from_an_earlier_moment(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert time.monotonic() - monotonic_of(time.time() - 90) == pytest.approx(90, abs=0.1)
+    for nonsense in (time.time() + 3600, float("nan"), float("-inf")):
+        with pytest.raises(UserError, match="no moment of the past"):
+            monotonic_of(nonsense)

@@ -6,6 +6,7 @@ import sqlite3
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -19,17 +20,22 @@ from faulty import (
     exhaust_gpu,
     exhaust_memory,
     hang,
+    pipeline_once,
 )
 from rectified import SECOND, SWEEP, THREE_UNITS, RectifiedMatcher, interrupt_after, run, write_pairs
 
+from mkpc_kaggle.assembly import Assembly
 from mkpc_kaggle.cli import main
 from mkpc_kaggle.competition import Pair, read_test_side, submission_problems
 from mkpc_kaggle.demo import DemoSet
+from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.pipeline import is_out_of_memory
+from mkpc_kaggle.run import session
 from mkpc_kaggle.run.engine import Ending, RunReport
 from mkpc_kaggle.run.jobs import NOT_REACHED, Record
 from mkpc_kaggle.run.journal import Journal
 from mkpc_kaggle.run.plan import Patience
+from mkpc_kaggle.run.processes import ProcessPool, Seat
 
 ROOT = Path(__file__).resolve().parents[1]
 COUNT = 12
@@ -321,6 +327,27 @@ def test_an_interrupt_reaches_workers_through_the_parent(pairs: list[Pair], tmp_
     assert report.ending is Ending.INTERRUPTED
     assert time.monotonic() - started < 9
     assert any(record.has(SWEEP) for record in report.records)
+
+
+def test_a_worker_that_cannot_be_started_again_ends_the_run_with_every_row_there(
+    pairs: list[Pair], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def one_life(assembly: Assembly, _: object) -> ProcessPool:
+        return ProcessPool([Seat("cpu", partial(pipeline_once, assembly, tmp_path / "marker"))], assembly.recipe)
+
+    monkeypatch.setattr(session, "pool_of", one_life)
+    report = run(pairs, THREE_UNITS, FaultyMatcher(), tmp_path / "work", workers=1)
+    assert report.ending is Ending.NO_WORKER
+    assert any("no worker could be started" in fault for fault in report.faults)
+    assert report.records[0].has(SWEEP)
+    assert len(report.records) == COUNT
+
+
+def test_workers_that_die_while_they_load_are_bad_input() -> None:
+    pool = ProcessPool([Seat("cpu", die)], THREE_UNITS)  # type: ignore[arg-type]
+    with pytest.raises(UserError, match="no worker could be started: the worker died: signal SIGKILL"):
+        pool.start()
+    assert pool.close()
 
 
 def test_what_says_that_memory_is_short() -> None:

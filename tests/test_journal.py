@@ -12,7 +12,7 @@ from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import Estimate, Model
 from mkpc_kaggle.pipeline import PairMatch, UnitResult
 from mkpc_kaggle.run.jobs import Outcome, Record, record_of
-from mkpc_kaggle.run.journal import Journal
+from mkpc_kaggle.run.journal import DRAWN, Journal
 
 OURS = {"recipe": {"a": 1}, "test set": "x"}
 UNITS = {unit.name: unit for unit in THREE_UNITS.units}
@@ -64,13 +64,30 @@ def test_a_later_outcome_replaces_the_former(tmp_path: Path) -> None:
     journal.close()
 
 
-def test_the_points_of_a_settled_pair_are_not_kept(tmp_path: Path) -> None:
+def points_of(journal: Journal, pair: int) -> int:
+    return sum(len(result.matches) for result in journal.results(pair, UNITS))
+
+
+def test_the_points_of_settled_pairs_are_kept_of_the_weakest_only(tmp_path: Path) -> None:
     journal = Journal(tmp_path, OURS)
-    journal.save([(outcome(), False)])
-    assert len(journal.results(7, UNITS)[0].matches) == 30
-    journal.save([(outcome(), True)])
-    assert len(journal.results(7, UNITS)[0].matches) == 0
-    assert journal.records()[7].units[0].matches == 30
+    count = 3 * DRAWN
+    saved = [outcome(index, seed=index) for index in range(count)]
+    for start in range(0, count, 7):
+        journal.save([(one, True) for one in saved[start : start + 7]])
+    by_strength = sorted(saved, key=lambda one: (one.record.inliers, one.record.index))
+    weakest = {one.record.index for one in by_strength[:DRAWN]}
+    assert {index for index in range(count) if points_of(journal, index)} == weakest
+    assert {record.units[0].matches for record in journal.records().values()} == {30}
+    journal.save([(outcome(count, seed=1), False)])
+    assert points_of(journal, count) == 30, "what a later job builds on is kept"
+    journal.close()
+
+
+def test_a_settled_pair_saved_again_is_counted_once_among_the_weakest(tmp_path: Path) -> None:
+    journal = Journal(tmp_path, OURS)
+    journal.save([(outcome(index, seed=index), True) for index in range(DRAWN)])
+    journal.save([(outcome(3, seed=3), True)])
+    assert all(points_of(journal, index) for index in range(DRAWN))
     journal.close()
 
 

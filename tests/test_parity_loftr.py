@@ -96,8 +96,10 @@ def test_sides_must_fit(size):
         network().encode(torch.zeros(1, 1, *size))
 
 
-def test_matches_are_the_mutual_maxima_of_both_softmaxes(monkeypatch):
+@pytest.mark.parametrize("held", [0, 2**20])
+def test_matches_are_the_mutual_maxima_of_both_softmaxes(monkeypatch, held):
     monkeypatch.setattr("mkpc_kaggle.matchers.networks.coarse_matching.ROWS_AT_ONCE", {"cpu": 7})
+    monkeypatch.setattr("mkpc_kaggle.matchers.networks.coarse_matching.HELD_FLOATS", held)
     generator = torch.Generator().manual_seed(0)
     grid0, grid1 = (torch.randn(2, 5, width, 16, generator=generator) for width in (6, 7))
     matches = coarse_matches(grid0, grid1, 0.5, 0.02, 0, None)

@@ -556,3 +556,8 @@ def test_a_mode_changes_the_units_that_run():
 def test_options_of_the_recipe_reach_the_matcher():
     match = TwoStageMatcher(replace(SIFT, matchers={"sift": {"features": 60}}))(*pair())
     assert 0 < len(match.matches) <= 61
+
+
+def test_what_another_precision_computes_is_another_run() -> None:
+    exact, half = (assemble("classical", precision=precision) for precision in ("float32", "bfloat16"))
+    assert exact.fingerprint() != half.fingerprint()

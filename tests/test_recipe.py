@@ -404,3 +404,8 @@ def test_the_fingerprint_leaves_out_name_and_description():
 )
 def test_the_fingerprint_changes_with_whatever_decides_the_numbers(other):
     assert json.dumps(other.fingerprint()) != json.dumps(ALL.fingerprint())
+
+
+def test_a_unit_can_be_shrunk() -> None:
+    assert Unit(1, "sift", 1000).shrunk(0.7) == Unit(1, "sift", 700)
+    assert Unit(2, "dkm", area="540x720", stretch=True).shrunk(0.5).name == "2:dkm@270x360!"

@@ -12,7 +12,7 @@ from typing import TextIO
 from mkpc_kaggle import __version__
 from mkpc_kaggle.errors import UserError
 
-COMMANDS = ("submit", "match", "validate", "recipes", "weights", "check", "demo")
+COMMANDS = ("submit", "match", "validate", "recipes", "weights", "check", "journal", "demo")
 EXIT_BAD_INPUT = 2
 
 _DESCRIPTION = """\
@@ -24,6 +24,7 @@ Two-stage image matching with Matching Key-Points Crop, offline, inside a time b
   recipes   the recipes, their units, and the weights that each lacks
   weights   the weight files: list, verify, locate, fetch, convert
   check     is this submission.csv what the competition takes?
+  journal   what a run did: overview, tables for pandas, report.html
   demo      render a small test set with known poses
 
 COMMAND --help tells more.

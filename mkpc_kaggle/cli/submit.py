@@ -1,9 +1,13 @@
 """a test directory -> submission.csv"""
 
 import argparse
+import time
 from pathlib import Path
 
 from mkpc_kaggle.cli import leave, options
+
+GRACE_SECONDS = 2.0
+"""How long an interrupted run writes its report: enough for the tables."""
 
 HELP = """\
 Match every pair of test.csv and write one fundamental matrix a row.
@@ -36,12 +40,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--fresh", action="store_true", help="forget what an earlier run left in the work directory"
     )
+    parser.add_argument(
+        "--report", type=Path, metavar="FILE.html", help="a page on the run; default: beside the output, NAME.html"
+    )
+    parser.add_argument("--no-report", action="store_true", help="write none")
 
 
 def run(arguments: argparse.Namespace) -> int:
     from mkpc_kaggle.assembly import Licence, assemble
     from mkpc_kaggle.competition import read_test_side
     from mkpc_kaggle.recipe import Mode
+    from mkpc_kaggle.report import report_run
     from mkpc_kaggle.run.session import Session, interruptible
     from mkpc_kaggle.run.summary import summary
     from mkpc_kaggle.submit import submit
@@ -68,5 +77,9 @@ def run(arguments: argparse.Namespace) -> int:
         print(
             f"submission: {output}" + (f" is not the last version: {report.unwritten}" if report.unwritten else "")
         )
+        if not arguments.no_report:
+            page = arguments.report or output.with_suffix(".html")
+            ends = time.monotonic() + GRACE_SECONDS if interrupt.signal else budget.started + budget.limit
+            print(report_run(work_dir, page, ends, pairs), flush=True)
         status = 128 + interrupt.signal if interrupt.signal else int(bool(report.unwritten))
         return leave(status, at_rest=at_rest)

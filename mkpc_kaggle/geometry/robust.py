@@ -164,6 +164,21 @@ def epipolar_distances(F: Matrix3, matches: Matches) -> NDArray[np.float64]:
     return np.asarray(residual / np.maximum(shortest, np.finfo(np.float64).tiny))
 
 
+def sampson_distances(F: Matrix3, matches: Matches) -> NDArray[np.float64]:
+    """(N,) Sampson distance in pixels: that by which OpenCV tells inliers of an F.
+
+    Source: Hartley and Zisserman, Multiple View Geometry, 11.4.3.
+    """
+    homogeneous0, homogeneous1 = (
+        np.column_stack([points.astype(np.float64), np.ones(len(matches))])
+        for points in (matches.points0, matches.points1)
+    )
+    lines1, lines0 = homogeneous0 @ F.T, homogeneous1 @ F
+    residual = np.abs(np.sum(homogeneous1 * lines1, axis=1))
+    slope = np.hypot(np.hypot(*lines0[:, :2].T), np.hypot(*lines1[:, :2].T))
+    return np.asarray(residual / np.maximum(slope, np.finfo(np.float64).tiny))
+
+
 def _distinct(pairs: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
     """The distinct rows of (N, 4) pairs in order of first appearance, and for each row its place there, (N,)."""
     _, first, inverse = np.unique(pairs, axis=0, return_index=True, return_inverse=True)

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import ceil
 from typing import Any
 
 import torch
@@ -39,6 +40,13 @@ class Encoded:
     maps: FeatureMaps
     content: Size
 
+    @property
+    def padded(self) -> bool:
+        """Whether there are coarse cells without content."""
+        height, width = self.maps.coarse.shape[2:]
+        filled = (ceil(side / COARSE_STRIDE) for side in self.content)
+        return (width, height) != tuple(filled)
+
 
 class SemiDenseMatcher:
     """A match's score is the confidence of its coarse cells."""
@@ -61,12 +69,33 @@ class SemiDenseMatcher:
 
     @torch.inference_mode()
     def match(self, encodings0: Sequence[Encoded], encodings1: Sequence[Encoded]) -> list[Matches]:
-        return [self._match(*pair) for pair in zip(encodings0, encodings1, strict=True)]
+        pairs = list(zip(encodings0, encodings1, strict=True))
+        alike: dict[tuple[Any, ...], list[int]] = {}
+        for number, pair in enumerate(pairs):
+            # Masks that mask nothing can still change what a network does, so they never come by a neighbour.
+            padded = any(encoded.padded for encoded in pair)
+            alike.setdefault((padded, *(encoded.maps.coarse.shape for encoded in pair)), []).append(number)
+        found = {
+            number: matches
+            for (padded, *_), numbers in alike.items()
+            for number, matches in zip(numbers, self._match([pairs[n] for n in numbers], padded), strict=True)
+        }
+        return [found[number] for number in range(len(pairs))]
 
-    def _match(self, encoded0: Encoded, encoded1: Encoded) -> Matches:
-        masks = content_mask(encoded0), content_mask(encoded1)
-        padded = not all(bool(mask.all()) for mask in masks)
-        return to_matches(self._network.match(encoded0.maps, encoded1.maps, masks if padded else None))
+    def _match(self, pairs: list[tuple[Encoded, Encoded]], padded: bool) -> list[Matches]:
+        """Pairs of one shape, in one batch."""
+        side0, side1 = zip(*pairs, strict=True)
+        masks = torch.cat([*map(content_mask, side0)]), torch.cat([*map(content_mask, side1)])
+        found = self._network.match(stacked(side0), stacked(side1), masks if padded else None)
+        return to_matches(found, len(pairs))
+
+
+def stacked(encodings: Sequence[Encoded]) -> FeatureMaps:
+    """Maps of one shape as one batch."""
+    if len(encodings) == 1:
+        return encodings[0].maps
+    coarse, fine = ([getattr(one.maps, name) for one in encodings] for name in ("coarse", "fine"))
+    return FeatureMaps(torch.cat(coarse), torch.cat(fine))
 
 
 def content_mask(encoded: Encoded) -> Tensor:
@@ -79,10 +108,12 @@ def content_mask(encoded: Encoded) -> Tensor:
     return (rows[:, None] & columns)[None]
 
 
-def to_matches(found: SemiDenseMatches) -> Matches:
-    """Matches in view pixels."""
+def to_matches(found: SemiDenseMatches, pairs: int) -> list[Matches]:
+    """The matches of each pair of the batch, in view pixels."""
     points0, points1 = (from_corner(points.float().cpu().numpy()) for points in (found.points0, found.points1))
-    return Matches(points0, points1, found.coarse.confidence.float().cpu().numpy())
+    matches = Matches(points0, points1, found.coarse.confidence.float().cpu().numpy())
+    batch = found.coarse.batch.cpu().numpy()
+    return [matches[batch == pair] for pair in range(pairs)]
 
 
 def load_network(network: SemiDenseNetwork[Any], weights: WeightStore, slot: str, *, unused: str = "$^") -> None:

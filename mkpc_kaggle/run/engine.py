@@ -15,6 +15,7 @@ from mkpc_kaggle.pipeline import UnitResult
 from mkpc_kaggle.recipe import Recipe, Unit
 from mkpc_kaggle.run.budget import Budget, format_duration
 from mkpc_kaggle.run.jobs import Finished, Job, Lost, Outcome, Phase, Plan, Record, Task, visiting_order
+from mkpc_kaggle.run.journal import EventKind
 from mkpc_kaggle.run.plan import Explanation, Patience, Planner
 from mkpc_kaggle.run.pool import Pool
 
@@ -217,19 +218,16 @@ class Engine:
     def _note_job(self, back: Finished) -> None:
         plan = back.job.plan
         seconds = sum(seconds for _, seconds in back.measured())
-        self._note("budget", plan.phase)
-        self._note("job", f"{plan.phase} {len(plan.indices)} pairs {seconds:.3f} s")
+        self._note(EventKind.BUDGET, plan.phase)
+        self._note(EventKind.JOB, f"{plan.phase} {len(plan.indices)} pairs {seconds:.3f} s")
 
     def _note_explanations(self) -> None:
         for one in self.planner.explanations[self._explained :]:
-            self._note("plan", one.text, one.seconds)
+            self.journal.note(EventKind.PLAN, one.seconds, one.text)
         self._explained = len(self.planner.explanations)
 
-    def _note(self, kind: str, text: str, seconds: float | None = None) -> None:
-        try:
-            self.journal.note(kind, self.budget.spent() if seconds is None else seconds, text)
-        except sqlite3.Error as error:
-            self._fault(f"the journal cannot be written ({error}): an interrupted run would have to do this again")
+    def _note(self, kind: EventKind, text: str) -> None:
+        self.journal.note(kind, self.budget.spent(), text)
 
     def _publish(self) -> None:
         with self._publishing:
@@ -244,6 +242,7 @@ class Engine:
     def _fault(self, what: str) -> None:
         if what not in self.faults:
             self.faults.append(what)
+            self._note(EventKind.FAULT, what)
 
     def _ending(self) -> Ending:
         if self.interrupt.is_set():

@@ -68,7 +68,10 @@ class InProcessPool:
             matched = self._bench.match(job, job.plan.deadline - time.monotonic())
             self._estimating.submit(self._estimate, job, matched)
         except Exception as error:
-            self._back.put(lost_by(job, error))
+            lost = lost_by(job, error)
+            if lost.cause is Cause.OUT_OF_MEMORY:
+                self._bench.forget()
+            self._back.put(lost)
 
     def _estimate(self, job: Job, matched: tuple) -> None:  # type: ignore[type-arg]
         try:

@@ -92,7 +92,7 @@ class Planner:
         self._queue: deque[Stretch] = deque()
         self._again: deque[Stretch] = deque()
         self._flying: set[int] = set()
-        self._jobs_out = 0
+        self._jobs_out = self._exploring = 0
         self._allowance = 0.0
         self._last_event = budget.clock()
         self._pairs_of_phase = self._pairs_queued = 0
@@ -120,7 +120,8 @@ class Planner:
             todo = [index for index in stretch.indices if self._can_gain(index, units)]
             lacking = list(dict.fromkeys(unit for index in todo for unit in self.records[index].lacking(units)))
             unknown = not all(self.costs.known(unit.name) for unit in lacking)
-            if unknown and self._jobs_out >= self.workers:  # it would wait behind another, its allowance running
+            if unknown and (self._exploring >= self.workers or self._jobs_out > self.workers):
+                # What has no known cost cannot be planned: one try a worker, not long behind another job.
                 self._again.appendleft(stretch)
                 return None
             if todo:
@@ -165,6 +166,7 @@ class Planner:
         todo = todo[:most]
         self._flying.update(todo)
         self._jobs_out += 1
+        self._exploring += unknown
         self._allowance = EXPLORE_SHARE * left
         if self._jobs_out == 1:
             self._last_event = now
@@ -337,6 +339,7 @@ class Planner:
     def _back(self, plan: Plan) -> None:
         self._flying.difference_update(plan.indices)
         self._jobs_out -= 1
+        self._exploring -= plan.exploring
 
     # What was lost
 

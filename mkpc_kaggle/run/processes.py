@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
 from pathlib import Path
-from typing import Protocol, TypeVar, cast
+from typing import Any, Protocol, TypeVar, cast
 
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.pipeline import Pipeline
@@ -114,10 +114,9 @@ class ProcessPool:
 
     def close(self) -> bool:
         idle = self._out == 0
-        for keeper in self._keepers:
-            keeper.close()
+        ended = [keeper.close() for keeper in self._keepers]
         self._estimating.shutdown(wait=idle, cancel_futures=True)
-        return idle
+        return idle and all(ended)
 
     def _take_on(self, seats: Sequence[Employer]) -> None:
         self._estimating = ThreadPoolExecutor(max(1, len(seats)), thread_name_prefix="estimate")
@@ -142,11 +141,10 @@ class Keeper:
     def __init__(self, seat: Employer, answered: Callable[[Job, Answer], None]) -> None:
         self.seat = seat
         self.usable = True
-        self.jobs = 0
         self._answered = answered
         self._queue: queue.SimpleQueue[Job | None] = queue.SimpleQueue()
         self._worker: Hired | None = None
-        self._closing = False
+        self._busy = self._closing = False
         self._started: Future[str] = Future()
         self._thread = threading.Thread(target=self._run, name=f"keeper of {seat.name}", daemon=True)
 
@@ -155,8 +153,12 @@ class Keeper:
         self._thread.start()
         return self._started
 
+    @property
+    def jobs(self) -> int:
+        """How many it has, under way and waiting."""
+        return self._queue.qsize() + self._busy
+
     def submit(self, job: Job) -> None:
-        self.jobs += 1
         worker = self._worker
         if worker is not None:
             worker.announce(path for task in job.tasks for path in task.pair.images)
@@ -167,7 +169,8 @@ class Keeper:
         if worker is not None:
             worker.stop()
 
-    def close(self) -> None:
+    def close(self) -> bool:
+        """Kill the worker; false where it is still being started, and will be killed then."""
         self._closing = True
         worker = self._worker
         if worker is not None:
@@ -175,6 +178,7 @@ class Keeper:
         self._queue.put(None)
         if self._thread.ident is not None:
             self._thread.join(timeout=1.0)
+        return not self._thread.is_alive()
 
     def _run(self) -> None:
         # Ctrl-C reaches every process of a terminal. The parent answers to it; workers inherit this mask.
@@ -186,15 +190,19 @@ class Keeper:
             self._started.set_exception(error)
             self.usable = False
         while (job := self._queue.get()) is not None:
+            self._busy = True
             answer = self._do(job)
-            self.jobs -= 1
+            self._busy = False
             self._answered(job, answer)
         if self._worker is not None:
             self._worker.kill()
 
     def _do(self, job: Job) -> Answer:
-        failure = self._ensure()
-        if self._worker is None:
+        try:
+            failure = self._ensure()
+        except (UserError, OSError) as error:
+            self.usable, failure = False, str(error)
+        if self._worker is None or not self.usable:
             return Lost(job, Cause.NO_WORKER, failure)
         answer = self._worker.do(job)
         if isinstance(answer, Lost) and answer.cause is not Cause.RAISED:
@@ -208,12 +216,11 @@ class Keeper:
         for _ in range(MOST_STARTS):
             if self._worker is not None or self._closing or not self.usable:
                 break
-            worker = self.seat.hire()
-            failure = worker.load()
+            self._worker = self.seat.hire()
+            failure = "closed" if self._closing else self._worker.load()
             if failure:
-                worker.kill()
-            else:
-                self._worker = worker
+                self._worker.kill()
+                self._worker = None
         self.usable = self._worker is not None
         return "" if self.usable else failure
 
@@ -238,7 +245,7 @@ class Worker:
 
     def load(self) -> str:
         """Wait until the matchers are loaded; empty, or why they are not. Raises the :class:`UserError` it met."""
-        answer = self._within(START_SECONDS, self._jobs.recv)
+        answer: object = self._within(START_SECONDS, self._jobs.recv)
         if isinstance(answer, UserError):
             raise answer
         if isinstance(answer, Cause):
@@ -248,7 +255,7 @@ class Worker:
     def do(self, job: Job) -> Answer:
         """Its answer, or what became of it."""
         order = (job, job.plan.deadline - time.monotonic())
-        answer = self._within(job.plan.timeout, lambda: self._jobs.send(order))
+        answer: Any = self._within(job.plan.timeout, lambda: self._jobs.send(order))
         while answer is None:  # an answer, or the sign that it lives
             answer = self._within(job.plan.timeout, self._jobs.recv)
         if not isinstance(answer, Cause):

@@ -9,6 +9,7 @@ import textwrap
 import threading
 import time
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -220,10 +221,11 @@ class RayWorker:
             self._actor.stop.remote()
 
     def kill(self) -> None:
-        if self._actor is not None and self._place is not None:
+        if self._actor is None or self._place is None:
+            return
+        with suppress(ray.exceptions.RayError):  # the cluster may have been let go of meanwhile, its actors with it
             ray.kill(self._actor)
-            self._floor.leave(self._place)
-            self._actor = None
+        self._floor.leave(self._place)
 
     def _silent_for(self) -> float:
         """Seconds since it last began a unit; for ever, if it does not even say that."""

@@ -2,15 +2,22 @@
 
 import hashlib
 import os
+import platform
 import signal
+import sqlite3
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from importlib import metadata
 from math import isfinite
 from pathlib import Path
 from types import FrameType
 
+import cv2
+import numpy as np
+
+from mkpc_kaggle import __version__
 from mkpc_kaggle.assembly import Assembly
 from mkpc_kaggle.competition import Pair
 from mkpc_kaggle.run.budget import Budget
@@ -18,7 +25,7 @@ from mkpc_kaggle.run.cluster import RayCluster
 from mkpc_kaggle.run.engine import Engine, RunReport
 from mkpc_kaggle.run.in_process import InProcessPool
 from mkpc_kaggle.run.jobs import Record
-from mkpc_kaggle.run.journal import Journal
+from mkpc_kaggle.run.journal import About, EventKind, Journal
 from mkpc_kaggle.run.plan import Patience
 from mkpc_kaggle.run.pool import Pool
 from mkpc_kaggle.run.processes import ProcessPool, Seat
@@ -60,7 +67,9 @@ def run_pairs(
     matcher cannot be loaded.
     """
     belongs_to = {"test set": digest_of(pairs), **assembly.fingerprint()}
-    journal = Journal(session.work_dir, belongs_to, fresh=session.fresh)
+    about = about_run(assembly, session.budget)
+    journal = Journal(session.work_dir, belongs_to, pairs=pairs, about=about, fresh=session.fresh)
+    journal.note(EventKind.START, session.budget.spent(), "")
     pool = pool_of(assembly, session.workers)
     engine = Engine(
         pairs,
@@ -76,10 +85,34 @@ def run_pairs(
     with watched(engine, session):
         try:
             report = engine.run()
+            journal.note(EventKind.END, report.seconds, report.ending)
         finally:
             at_rest = pool.close()
             journal.close()
     return report, at_rest
+
+
+def about_run(assembly: Assembly, budget: Budget) -> About:
+    """What a report tells of a run besides what its journal is held against."""
+    return About(
+        assembly.recipe.name,
+        str(assembly.placement),
+        budget.limit if isfinite(budget.limit) else None,
+        tuple(unit.name for unit in assembly.left_out),
+        versions(),
+    )
+
+
+def versions() -> dict[str, str]:
+    """The versions of what the results may depend on, by name."""
+    return {
+        "mkpc_kaggle": __version__,
+        "Python": platform.python_version(),
+        "PyTorch": metadata.version("torch"),
+        "OpenCV": cv2.__version__,
+        "NumPy": np.__version__,
+        "SQLite": sqlite3.sqlite_version,
+    }
 
 
 def pool_of(assembly: Assembly, workers: int | RayCluster | None) -> Pool:
@@ -88,7 +121,8 @@ def pool_of(assembly: Assembly, workers: int | RayCluster | None) -> Pool:
         return workers.pool(assembly)
     if workers == 0:
         return InProcessPool(assembly.pipeline, assembly.recipe)
-    # On a CPU one process with all threads, unless more are asked for: two with half of them each were no faster.
+    # On a CPU one process with all threads: two with half of them each do more (recipe light, two cores: the sweep
+    # over after 22 s instead of 31), but need twice the memory, and a network's last bits change with its threads.
     devices = assembly.devices
     places = [devices[number % len(devices)] for number in range(workers or len(devices))]
     share = len(places) if devices == ("cpu",) else 1

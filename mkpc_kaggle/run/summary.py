@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from statistics import mean, median
 
 from mkpc_kaggle.competition import Pair
@@ -16,55 +17,92 @@ MOST_LINES = 8
 def summary(pairs: Sequence[Pair], report: RunReport, left_out: Sequence[Unit] = ()) -> str:
     """The screen that ends a run."""
     records = report.records
-    solved = [record for record in records if not record.failure]
-    lines = [
-        f"{report.ending} after {format_duration(report.seconds)}: "
-        f"{len(solved)} of {len(records)} pairs have an F"
-        + (f", {report.resumed} of them from earlier runs" if report.resumed else "")
-    ]
-    if solved:
-        inliers = [record.inliers for record in solved]
+    resumed = f", {report.resumed} of them from earlier runs" if report.resumed else ""
+    names = [unit.name for unit in left_out]
+    first = headline(records, report.ending, report.seconds) + resumed
+    return "\n".join([first, *account(pairs, records, names, report.faults)])
+
+
+def headline(records: Sequence[Record], ending: str, seconds: float) -> str:
+    solved = sum(not record.failure for record in records)
+    return f"{ending} after {format_duration(seconds)}: {solved} of {len(records)} pairs have an F"
+
+
+def account(
+    pairs: Sequence[Pair], records: Sequence[Record], left_out: Sequence[str], faults: Sequence[str]
+) -> list[str]:
+    """Lines on what was found, what it cost and what failed; ``left_out`` are names of units."""
+    inliers = [record.inliers for record in records if not record.failure]
+    lines = []
+    if inliers:
         lines.append(f"inliers: median {median(inliers):.0f}, mean {mean(inliers):.1f}, least {min(inliers)}")
     lines += unit_table(records)
     lines += _counts("critical regions", (str(r.reason) for record in records for r in record.regions or ()))
     lines += _time_lines(records)
     lines += _upgrade_lines(records)
     if left_out:
-        names = ", ".join(unit.name for unit in left_out)
-        lines.append(f"units left out, their weights are missing or not permitted: {names}")
+        lines.append(f"units left out, their weights are missing or not permitted: {', '.join(left_out)}")
     failed = [f"{pairs[record.index].id}: {record.failure}" for record in records if record.failure]
     lines += _list("pairs with the fallback row", failed)
-    lines += _list("units that failed", _unit_failures(records))
-    lines += _list("faults", list(report.faults))
-    return "\n".join(lines)
+    lines += _list("units that failed", unit_failures(records))
+    lines += _list("faults", list(faults))
+    return lines
 
 
-def unit_table(records: Sequence[Record]) -> list[str]:
-    """For each unit: on how many pairs it ran, its matches, inliers and seconds on a pair (means)."""
+@dataclass(frozen=True)
+class UnitMeans:
+    """One unit over the ``pairs`` that it ran on: means of matches, inliers and seconds on a pair."""
+
+    unit: str
+    pairs: int
+    matches: float
+    inliers: float
+    seconds: float
+
+
+def unit_means(records: Sequence[Record]) -> list[UnitMeans]:
+    """One for each unit that ran, by name."""
     by_unit: dict[str, list[tuple[int, int, float]]] = {}
     for record in records:
         for unit in record.units:
             seconds = unit.encode_seconds + unit.match_seconds
             by_unit.setdefault(unit.unit, []).append((unit.matches, unit.inliers, seconds))
-    if not by_unit:
-        return []
-    lines = [f"{'unit':<30}{'pairs':>7}{'matches':>9}{'inliers':>9}{'seconds':>9}"]
-    for name, rows in sorted(by_unit.items()):
-        matches, inliers, seconds = (mean(column) for column in zip(*rows, strict=True))
-        lines.append(f"{name:<30}{len(rows):>7}{matches:>9.0f}{inliers:>9.0f}{seconds:>9.2f}")
-    return lines
+    return [
+        UnitMeans(name, len(rows), *(mean(column) for column in zip(*rows, strict=True)))
+        for name, rows in sorted(by_unit.items())
+    ]
 
 
-def _time_lines(records: Sequence[Record]) -> list[str]:
-    parts = {
+def unit_table(records: Sequence[Record]) -> list[str]:
+    """:func:`unit_means` as lines."""
+    rows = [
+        f"{one.unit:<30}{one.pairs:>7}{one.matches:>9.0f}{one.inliers:>9.0f}{one.seconds:>9.2f}"
+        for one in unit_means(records)
+    ]
+    return [f"{'unit':<30}{'pairs':>7}{'matches':>9}{'inliers':>9}{'seconds':>9}", *rows] if rows else []
+
+
+def seconds_by_part(records: Sequence[Record]) -> dict[str, float]:
+    """What the parts of the work took in all: the first four one after the other, MAGSAC beside them."""
+    return {
         "wait for decoding": sum(record.decode_seconds for record in records),
         "encode": sum(unit.encode_seconds for record in records for unit in record.units),
         "match": sum(unit.match_seconds for record in records for unit in record.units),
         "cluster": sum(record.cluster_seconds for record in records),
         "MAGSAC (beside matching)": sum(record.estimate_seconds for record in records),
     }
+
+
+def unit_failures(records: Sequence[Record]) -> list[str]:
+    """Why units failed, and on how many pairs; the most frequent reason first."""
+    counted = Counter(f"{unit.unit}: {unit.failure}" for r in records for unit in r.units if unit.failure)
+    return [f"{what} ({count} pairs)" for what, count in counted.most_common()]
+
+
+def _time_lines(records: Sequence[Record]) -> list[str]:
     count = max(1, len(records))
-    return ["seconds a pair: " + ", ".join(f"{name} {value / count:.3f}" for name, value in parts.items())]
+    parts = seconds_by_part(records).items()
+    return ["seconds a pair: " + ", ".join(f"{name} {value / count:.3f}" for name, value in parts)]
 
 
 def _upgrade_lines(records: Sequence[Record]) -> list[str]:
@@ -78,11 +116,6 @@ def _upgrade_lines(records: Sequence[Record]) -> list[str]:
 def _counts(title: str, values: Iterable[str]) -> list[str]:
     counted = Counter(values).most_common()
     return [f"{title}: " + ", ".join(f"{count} {value}" for value, count in counted)] if counted else []
-
-
-def _unit_failures(records: Sequence[Record]) -> list[str]:
-    counted = Counter(f"{unit.unit}: {unit.failure}" for r in records for unit in r.units if unit.failure)
-    return [f"{what} ({count} pairs)" for what, count in counted.most_common()]
 
 
 def _list(title: str, items: Sequence[str]) -> list[str]:

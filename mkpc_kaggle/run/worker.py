@@ -41,6 +41,10 @@ class Bench:
             self._pipeline.load()
         return self._pipeline
 
+    def forget(self) -> None:
+        """Let go of the matchers and all that they remember; they are loaded again when they are needed."""
+        self._pipeline = None
+
     def announce(self, paths: Iterable[Path]) -> None:
         """Decode these ahead, in the background."""
         self._images.announce(paths)

@@ -1,11 +1,11 @@
 """Matches of coarse cells: dual softmax, mutual nearest neighbours, threshold and border.
 
-Source: Sun et al. 2021, section 3.3. The matrix of all pairs of cells is never held: some rows at a time are
-computed twice, once for the sums of the softmaxes and once for the best of each row and column. At 1600 x 1200
-pixels the whole matrix would take 3.6 GB.
+Source: Sun et al. 2021, section 3.3. The matrix of all pairs of cells is held only where it is small: at
+1600 x 1200 pixels it would take 3.6 GB. Else some rows at a time are computed twice, once for the sums of the
+softmaxes and once for the best of each row and column.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import torch
@@ -15,6 +15,7 @@ from mkpc_kaggle.matchers.networks.layers import linear
 from mkpc_kaggle.matchers.networks.linear_attention import Masks
 
 ROWS_AT_ONCE = {"cpu": 256, "cuda": 8192}
+HELD_FLOATS = 2**25  # of the matrix: 128 MiB, at 640 x 480 it has 23 million
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,13 +88,11 @@ class Cells:
             yield products
 
 
-def half_log_sums(cells: Cells) -> tuple[Tensor, Tensor]:
-    """(L,) and (S,): half the logarithm of the sums of exp(similarity) over each row and each column."""
-    over_rows = []
-    over_columns = cells.features1.new_full(cells.content1.shape, -torch.inf, dtype=torch.float32)
-    for block in cells.similarity():
-        over_rows.append(block.logsumexp(dim=1))
-        over_columns = torch.logaddexp(over_columns, block.logsumexp(dim=0))
+def half_log_sums(blocks: Iterable[Tensor]) -> tuple[Tensor, Tensor]:
+    """Of blocks (l, S): half the logarithm of the sums of exp over each row (L,) and each column (S,)."""
+    rows_and_columns = [(block.logsumexp(dim=1), block.logsumexp(dim=0)) for block in blocks]
+    over_rows, of_blocks = (list(sums) for sums in zip(*rows_and_columns, strict=True))
+    over_columns = torch.stack(of_blocks).logsumexp(dim=0)
     # A row of padding alone sums to nothing; finite, it stays minus infinity when its sum is taken off.
     finite = torch.finfo(torch.float32).min
     return torch.cat(over_rows).clamp_(min=finite).div_(2), over_columns.clamp_(min=finite).div_(2)
@@ -105,9 +104,11 @@ def levels(cells: Cells) -> Iterator[Tensor]:
     The confidence is the softmax over the rows times that over the columns, so its logarithm is
     2 s_ij - log sum_j exp s_ij - log sum_i exp s_ij.
     """
-    over_rows, over_columns = half_log_sums(cells)
+    small = len(cells.features0) * len(cells.features1) <= HELD_FLOATS
+    held = list(cells.similarity()) if small else None
+    over_rows, over_columns = half_log_sums(held or cells.similarity())
     first = 0
-    for block in cells.similarity():
+    for block in held or cells.similarity():
         yield block.sub_(over_rows[first : first + len(block), None]).sub_(over_columns)
         first += len(block)
 

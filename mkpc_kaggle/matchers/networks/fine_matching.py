@@ -51,7 +51,7 @@ def cell_points(cells: Tensor, width: int) -> Tensor:
 
 
 def cut_windows(fine: Tensor, batch: Tensor, cells: Tensor) -> Tensor:
-    """Fine maps (N, C, Hf, Wf) and M coarse cells -> (M, 25, C): what lies around each, row by row.
+    """Fine maps (N, C, Hf, Wf) and M coarse cells -> (M, 25, C) float32: what lies around each, row by row.
 
     A cell's window is centred on the fine cell at its top-left corner; zero outside the map.
     """
@@ -64,7 +64,7 @@ def cut_windows(fine: Tensor, batch: Tensor, cells: Tensor) -> Tensor:
     columns = (cells % coarse_width * step)[:, None, None] + around  # (M, 1, 5)
     # Centres are at multiples of the step: windows reach beyond the top and the left only.
     index = (batch[:, None, None] * height + rows.clamp(min=0)) * width + columns.clamp(min=0)  # (M, 5, 5)
-    windows = grid.reshape(-1, channels).index_select(0, index.flatten()).view(-1, SIDE * SIDE, channels)
+    windows = grid.reshape(-1, channels).index_select(0, index.flatten()).float().view(-1, SIDE * SIDE, channels)
     return windows.masked_fill_(((rows < 0) | (columns < 0)).flatten(1)[..., None], 0.0)
 
 
@@ -73,7 +73,6 @@ def expected_offset(windows0: Tensor, windows1: Tensor) -> Tensor:
 
     The centre of window 0 is compared with all of window 1; the softmax is the distribution of the offset.
     """
-    windows0, windows1 = windows0.float(), windows1.float()
     logits = (windows1 @ windows0[:, CENTRE, :, None])[..., 0] / windows0.shape[2] ** 0.5  # (M, 25)
     axis = torch.linspace(-1.0, 1.0, SIDE, device=logits.device)
     offsets = torch.stack([axis.repeat(SIDE), axis.repeat_interleave(SIDE)], dim=1)  # (25, 2): (x, y)

@@ -47,11 +47,12 @@ class EncoderLayer(nn.Module):
 
     def forward(self, x: Tensor, source: Tensor, masks: Masks | None = None) -> Tensor:
         """Tokens (N, L, C) and source (N, S, C), with their masks (N, L) and (N, S) -> (N, L, C)."""
-        message = linear_attention(
-            self.q_proj(x), self.k_proj(source), self.v_proj(source), self.heads, masks
-        )  # (N, L, C)
-        message = self.norm1(self.merge(message))
-        update: Tensor = self.norm2(self.mlp(x, message))
+        # Cast once: each of the maps would do it anew.
+        seen = x.to(self.q_proj.weight.dtype)
+        other = seen if source is x else source.to(seen.dtype)
+        q, k, v = self.q_proj(seen).float(), self.k_proj(other).float(), self.v_proj(other).float()
+        message = self.norm1(self.merge(linear_attention(q, k, v, self.heads, masks)))  # (N, L, C)
+        update: Tensor = self.norm2(self.mlp(seen, message).float())
         return update.add_(x)
 
 

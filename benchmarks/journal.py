@@ -1,0 +1,76 @@
+"""Size of the journal of a long run, and the time to go on from it.
+
+python -m benchmarks.journal [--pairs 10000] [--units 5] [--matches 2000] [--settled 0.5]
+
+All pairs are swept, then given their units; the share ``--settled`` of them needs no more work after that. The
+size of the file is its greatest: SQLite uses the pages of dropped points again, and gives none back.
+"""
+
+import argparse
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
+from mkpc_kaggle.pipeline import UnitResult
+from mkpc_kaggle.recipe import Unit
+from mkpc_kaggle.run.jobs import CHUNK, Outcome, Record, UnitRecord
+from mkpc_kaggle.run.journal import Journal
+
+
+def results(units: list[Unit], matches: int, rng: np.random.Generator) -> tuple[UnitResult, ...]:
+    """Sub-pixel points on images of 1600 x 1200, in no order: little that a compressor could use."""
+    size = np.array([1600, 1200])
+    return tuple(
+        UnitResult(
+            unit, Matches(rng.random((matches, 2)) * size, rng.random((matches, 2)) * size, rng.random(matches))
+        )
+        for unit in units
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--pairs", type=int, default=10_000)
+    parser.add_argument("--units", type=int, default=5)
+    parser.add_argument("--matches", type=int, default=2000)
+    parser.add_argument("--settled", type=float, default=0.5)
+    arguments = parser.parse_args()
+    units = [Unit(1, f"m{number}", 1024) for number in range(arguments.units)]
+    rng = np.random.default_rng(0)
+    found = results(units, arguments.matches, rng)
+    records = [UnitRecord(unit.name, 1, arguments.matches, 100, 0.1, 0.1, "") for unit in units]
+    with tempfile.TemporaryDirectory() as directory:
+        journal = Journal(Path(directory), {"benchmark": 1})
+        started, saving = time.perf_counter(), 0.0
+        for first, last in ((0, 1), (1, len(units))):
+            for start in range(0, arguments.pairs, CHUNK):
+                outcomes = [
+                    (
+                        Outcome(Record(index, FALLBACK_FUNDAMENTAL, "", tuple(records[:last])), found[first:last]),
+                        last == len(units) and rng.random() < arguments.settled,
+                    )
+                    for index in range(start, min(start + CHUNK, arguments.pairs))
+                ]
+                journal.save(outcomes)
+        saving = time.perf_counter() - started
+        journal.close()
+        size = journal.path.stat().st_size
+        started = time.perf_counter()
+        again = Journal(Path(directory), {"benchmark": 1})
+        count = len(again.records())
+        resuming = time.perf_counter() - started
+        again.close()
+    print(
+        f"{count} pairs, {arguments.units} units of {arguments.matches} matches, {arguments.settled:.0%} settled"
+    )
+    print(
+        f"journal: {size / 1e6:.0f} MB; saving: {1e3 * saving / count:.1f} ms a pair; resuming: {resuming:.1f} s"
+    )
+
+
+if __name__ == "__main__":
+    main()

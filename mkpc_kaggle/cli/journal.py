@@ -1,0 +1,46 @@
+"""what a run did: overview, tables for pandas, report.html"""
+
+import argparse
+from pathlib import Path
+
+HELP = """\
+Read the journal of a run, at work or ended, and tell what it did. DIR is the run's work directory, NAME.work
+beside the submission. Without options: one screen.
+
+--csv writes long tables that pandas.read_csv takes as they are, with `pair`, the row of the test set, in common:
+  pairs.csv    ids, image names, failure, matches, inliers, seconds by part, F (f11 ... f33)
+  units.csv    for each unit on each pair: matches, inliers, seconds, failure
+  regions.csv  for each image (0 or 1) of each pair: the critical region's box and the reason for it
+  events.csv   what happened when: starts, plans, jobs that ended, faults, ends
+
+Exit status: 0 done, 2 there is no such journal, or a file cannot be written.
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("work_dir", type=Path, metavar="DIR")
+    parser.add_argument("--csv", type=Path, metavar="OUT", help="the directory for the tables")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="all in one file, each pair with its units")
+    parser.add_argument("--report", type=Path, metavar="FILE.html", help="a page to look at, pictures inside")
+    parser.add_argument("--test-dir", type=Path, metavar="DIR", help="where the images are that the report draws")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    from mkpc_kaggle.competition import read_test_side
+    from mkpc_kaggle.report import Artist, write_report
+    from mkpc_kaggle.run.log import overview, read_log, write_csv, write_json
+
+    log = read_log(arguments.work_dir)
+    if arguments.csv is not None:
+        for path in write_csv(log, arguments.csv):
+            print(path)
+    if arguments.json is not None:
+        write_json(log, arguments.json)
+        print(arguments.json)
+    if arguments.report is not None:
+        pairs = read_test_side(arguments.test_dir) if arguments.test_dir is not None else ()
+        write_report(log, arguments.report, Artist(pairs))
+        print(arguments.report)
+    if arguments.csv is None and arguments.json is None and arguments.report is None:
+        print(overview(log))
+    return 0

@@ -1,0 +1,146 @@
+"""What half precision changes: less than a grey level of noise in the pictures does, and little in all.
+
+The weights are stand-ins, so that the bounds are of the arithmetic, not of the matching.
+"""
+
+import numpy as np
+import pytest
+import torch
+from standin import filled, scene
+
+from mkpc_kaggle.assembly import fastest_precision, resolve_placement
+from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.geometry.coordinates import Size
+from mkpc_kaggle.matchers.contract import Placement, Precision
+from mkpc_kaggle.matchers.networks.aspanformer import AspanFormer
+from mkpc_kaggle.matchers.networks.dkm import DKM, network_input
+from mkpc_kaggle.matchers.networks.loftr import Loftr
+from mkpc_kaggle.matchers.networks.placement import placed
+from mkpc_kaggle.matchers.networks.quadtree import Quadtree
+from mkpc_kaggle.matchers.networks.superglue import ImageKeypoints, SuperGlue, SuperGlueConfig
+from mkpc_kaggle.matchers.networks.superpoint import SuperPoint, SuperPointConfig
+
+SIZE = Size(224, 160)
+MAKERS = {
+    "loftr": Loftr,
+    "quadtree": Quadtree,
+    "aspanformer": AspanFormer,
+    "superpoint": lambda: SuperPoint(SuperPointConfig(max_keypoints=400)).eval(),
+    "superglue": lambda: SuperGlue(SuperGlueConfig(20)),
+    "dkm": DKM,
+}
+half_precisions = pytest.mark.parametrize("precision", [Precision.BFLOAT16, Precision.FLOAT16])
+
+
+def network(name, precision=Precision.FLOAT32):
+    return placed(filled(MAKERS[name](), name), Placement(precision=precision))
+
+
+def pictures(size, channels):
+    """Two views (1, C, H, W) uint8, the second 8 pixels further right."""
+    picture = torch.from_numpy(scene(size.height, size.width + 8, channels)).permute(2, 0, 1)[None]
+    return picture[..., 8:], picture[..., :-8]
+
+
+def noisy(picture):
+    """Each value a grey level darker or lighter, or as it was."""
+    noise = torch.from_numpy(np.random.default_rng(0).integers(-1, 2, picture.shape))
+    return (picture + noise).clamp(0, 255).to(torch.uint8)
+
+
+def agreement(first, second, within):
+    """The share of the rows of either that lie within so many pixels of a row of the other."""
+    near = torch.cdist(first, second) <= within
+    return ((near.any(1).sum() + near.any(0).sum()) / (len(first) + len(second))).item()
+
+
+@torch.inference_mode()
+def semi_dense_matches(name, views, precision=Precision.FLOAT32):
+    """(M, 4): the points of both views."""
+    matcher = network(name, precision)
+    matches = matcher.match(*(matcher.encode(view.float() / 255) for view in views))
+    assert matches.points1.dtype == matches.coarse.confidence.dtype == torch.float32
+    return torch.cat([matches.points0, matches.points1], dim=1)
+
+
+@half_precisions
+@pytest.mark.parametrize("name", ["loftr", "quadtree", "aspanformer"])
+def test_semi_dense_matches_move_less_than_by_noise(name, precision):
+    views = pictures(SIZE, 1)
+    exact = semi_dense_matches(name, views)
+    half = semi_dense_matches(name, views, precision)
+    disturbed = semi_dense_matches(name, map(noisy, views))
+    assert len(exact) > 200
+    assert agreement(exact, half, within=0.25) > agreement(exact, disturbed, within=0.25)
+    assert agreement(exact, half, within=1.0) > 0.9
+    assert not torch.equal(exact, half)
+
+
+@half_precisions
+@torch.inference_mode()
+def test_superpoint_finds_the_same_keypoints(precision):
+    image = pictures(SIZE, 1)[0].float() / 255
+    exact, half = (network("superpoint", each)(image)[0] for each in (Precision.FLOAT32, precision))
+    assert len(exact.points) == 400
+    assert agreement(exact.points, half.points, within=0) > 0.85
+    index, partner = (torch.cdist(exact.points, half.points) == 0).nonzero().unbind(1)
+    assert (exact.descriptors[index] * half.descriptors[partner]).sum(1).min() > 0.99
+    assert half.descriptors.dtype == half.scores.dtype == torch.float32
+
+
+@half_precisions
+@torch.inference_mode()
+def test_superglue_finds_the_same_partners(precision):
+    superpoint = network("superpoint")
+    found = [superpoint(view.float() / 255)[0] for view in pictures(SIZE, 1)]
+    keypoints = [
+        ImageKeypoints(each.points[None], each.scores[None], each.descriptors[None], SIZE) for each in found
+    ]
+    exact, half = (network("superglue", each)(*keypoints) for each in (Precision.FLOAT32, precision))
+    matched = exact.matches0 >= 0
+    assert matched.sum() > 200
+    assert (exact.matches0 == half.matches0)[matched].float().mean() > 0.85
+    assert (exact.scores0 - half.scores0).abs().median() < 0.1
+    assert half.scores0.dtype == torch.float32
+
+
+@half_precisions
+@torch.inference_mode()
+def test_dkm_warps_move_less_than_by_noise(precision):
+    views = pictures(Size(128, 96), 3)
+
+    def targets(views, precision=Precision.FLOAT32):
+        matcher = network("dkm", precision)
+        dense = matcher.match(*(matcher.encode(network_input(view, (96, 128))) for view in views))[0]
+        assert dense.warp.dtype == dense.certainty.dtype == torch.float32
+        return dense.warp[..., 2:]
+
+    exact = targets(views)
+    moved = {
+        name: (exact - other).norm(dim=-1).median()
+        for name, other in (("half", targets(views, precision)), ("noise", targets([*map(noisy, views)])))
+    }
+    assert 0 < moved["half"] < 0.5 * moved["noise"]
+
+
+def test_auto_takes_half_precision_where_the_processor_has_it(monkeypatch):
+    for flags, expected in (
+        ({"avx512_bf16": True}, Precision.BFLOAT16),
+        ({"amx_bf16": True, "avx512_bf16": False}, Precision.BFLOAT16),
+        ({"avx2": True}, Precision.FLOAT32),
+    ):
+        monkeypatch.setattr(torch.cpu, "get_capabilities", lambda flags=flags: flags, raising=False)
+        assert resolve_placement("cpu", "auto") == Placement("cpu", expected)
+    monkeypatch.delattr(torch.cpu, "get_capabilities")
+    assert fastest_precision("cpu") is Precision.FLOAT32
+
+
+@pytest.mark.parametrize(("capability", "expected"), [((7, 5), Precision.FLOAT16), ((6, 1), Precision.FLOAT32)])
+def test_auto_takes_half_precision_on_a_gpu_with_tensor_cores(monkeypatch, capability, expected):
+    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device: capability)
+    assert fastest_precision("cuda:1") is expected
+
+
+def test_an_unknown_precision_is_refused():
+    with pytest.raises(UserError, match=r"'half'; known: auto, float32, bfloat16, float16"):
+        resolve_placement("cpu", "half")

@@ -1,0 +1,292 @@
+"""The journal command and report.html, on journals with known contents."""
+
+import json
+import re
+import sqlite3
+import sys
+import time
+from html.parser import HTMLParser
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pandas as pd
+import pytest
+from rectified import THREE_UNITS, RectifiedMatcher, run, write_pairs
+
+from mkpc_kaggle.cli import main
+from mkpc_kaggle.competition import Pair
+from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.markup import Markup, element
+from mkpc_kaggle.report import Artist, match_of, report_page, report_run
+from mkpc_kaggle.run.journal import DRAWN, About, EventKind, Journal, JournalReader
+from mkpc_kaggle.run.log import NOT_ENDED, RunLog, overview, read_log, tables
+
+EVIL = '<script>alert("$x$")</script>'
+BELONGS_TO = {"recipe": THREE_UNITS.fingerprint(), "test set": "abc", "weights": {"xfeat": "123"}}
+
+
+class Tags(HTMLParser):
+    """Which tags stand in a page, and what they ask for."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.names: list[str] = []
+        self.sources: list[str] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.names.append(tag)
+        self.sources += [value or "" for name, value in attrs if name in ("src", "href", "xlink:href")]
+
+
+def a_run(directory: Path, count: int = 12) -> list[Pair]:
+    """A run over pairs of which the second cannot be read; its work directory is ``directory``/work."""
+    pairs = write_pairs(directory / "images", count)
+    pairs[1].image1.write_bytes(b"")
+    run(pairs, THREE_UNITS, RectifiedMatcher(), directory / "work")
+    return pairs
+
+
+def empty_journal(work_dir: Path, pairs: list[Pair], **about: object) -> Journal:
+    return Journal(work_dir, BELONGS_TO, pairs=pairs, about=About("three", **about))  # type: ignore[arg-type]
+
+
+def evil_log(directory: Path) -> RunLog:
+    pairs = [Pair(EVIL, EVIL, Path(f"{EVIL.replace('/', '')}.png"), Path("b.png"))]
+    journal = empty_journal(directory, pairs, device=EVIL, left_out=(EVIL,), versions={EVIL: EVIL})
+    for kind in EventKind:
+        journal.note(kind, 1.0, EVIL)
+    journal.close()
+    return read_log(directory)
+
+
+def test_a_run_exports_tables_that_pandas_reads_as_they_are(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pairs = a_run(tmp_path)
+    assert main(["journal", str(tmp_path / "work"), "--csv", str(tmp_path / "csv")]) == 0
+    assert len(capsys.readouterr().out.splitlines()) == 4
+    log = read_log(tmp_path / "work")
+    for name, table in tables(log).items():
+        again = pd.read_csv(tmp_path / "csv" / f"{name}.csv", keep_default_na=False)
+        pd.testing.assert_frame_equal(again, table, check_dtype=False)
+    table = tables(log)
+    assert list(table["pairs"]["id"]) == [pair.id for pair in pairs]
+    assert "the file is empty" in table["pairs"]["failure"][1]
+    units = table["units"].merge(table["pairs"][["pair", "inliers"]], on="pair", suffixes=("", "_of_pair"))
+    summed = units.groupby("pair")["inliers"].sum()
+    assert (summed == units.groupby("pair")["inliers_of_pair"].first()).all()
+    assert len(table["units"]) == 3 * 11
+    assert len(table["regions"]) == 2 * 11
+    assert set(table["events"]["kind"]) >= {"start", "end"}
+
+
+def test_the_json_export_has_each_pair_with_its_units_and_regions(tmp_path: Path) -> None:
+    a_run(tmp_path)
+    assert main(["journal", str(tmp_path / "work"), "--json", str(tmp_path / "log.json")]) == 0
+    values = json.loads((tmp_path / "log.json").read_text())
+    assert [len(pair["units"]) for pair in values["pairs"]] == [3, 0] + [3] * 10
+    assert [len(pair["regions"]) for pair in values["pairs"]] == [2, 0] + [2] * 10
+    record = read_log(tmp_path / "work").records[4]
+    assert values["pairs"][4]["F"] == record.F.tolist()
+    assert values["ending"] == "complete"
+    assert values["recipe"]["units"][0]["long_side"] == THREE_UNITS.units[0].long_side
+
+
+def test_without_options_the_command_shows_one_screen(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    a_run(tmp_path)
+    assert main(["journal", str(tmp_path / "work")]) == 0
+    out = capsys.readouterr().out
+    assert "complete after" in out
+    assert "11 of 12 pairs have an F" in out
+    assert "the file is empty" in out
+
+
+@pytest.mark.parametrize("option", ["--csv", "--json", "--report"])
+def test_an_export_that_cannot_be_written_is_told(
+    tmp_path: Path, option: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    empty_journal(tmp_path, []).close()
+    (tmp_path / "file").touch()
+    assert main(["journal", str(tmp_path), option, str(tmp_path / "file" / "x")]) == 2
+    assert "cannot be written" in capsys.readouterr().err
+
+
+def test_a_directory_without_a_journal_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["journal", str(tmp_path)]) == 2
+    assert "has no journal.sqlite" in capsys.readouterr().err
+
+
+def test_a_journal_can_be_read_while_its_run_writes_it(tmp_path: Path) -> None:
+    journal = empty_journal(tmp_path, write_pairs(tmp_path / "images", 2))
+    journal.note(EventKind.START, 0.5, "")
+    with JournalReader(tmp_path) as reader:
+        assert [event.kind for event in reader.events()] == ["start"]
+        journal.note(EventKind.PLAN, 1.5, "no more")
+        assert len(reader.events()) == 1, "what is read is one moment"
+    assert [event.text for event in read_log(tmp_path).events] == ["", "no more"]
+    assert read_log(tmp_path).ending == NOT_ENDED
+    journal.close()
+
+
+def test_a_fresh_run_cannot_take_the_journal_of_a_run_at_work(tmp_path: Path) -> None:
+    journal = empty_journal(tmp_path, write_pairs(tmp_path / "images", 2))
+    with pytest.raises(UserError, match="is another run at work there"):
+        Journal(tmp_path, BELONGS_TO, fresh=True)
+    assert len(read_log(tmp_path).pairs) == 2
+    journal.close()
+
+
+def test_a_note_that_cannot_be_written_is_lost_and_no_more(tmp_path: Path) -> None:
+    journal = empty_journal(tmp_path, [])
+    journal._db.execute("PRAGMA query_only = 1")
+    journal.note(EventKind.FAULT, 1.0, "lost")
+    journal._db.execute("PRAGMA query_only = 0")
+    journal.note(EventKind.FAULT, 2.0, "kept")
+    journal.close()
+    assert read_log(tmp_path).faults == ["kept"]
+
+
+def test_a_journal_of_an_older_format_is_refused_and_left_as_it_was(tmp_path: Path) -> None:
+    path = tmp_path / "journal.sqlite"
+    db = sqlite3.connect(path)
+    db.execute("CREATE TABLE run (key TEXT PRIMARY KEY, value TEXT NOT NULL)")
+    db.execute("INSERT INTO run VALUES ('format', '1')")
+    db.commit()
+    db.close()
+    before = path.read_bytes()
+    with pytest.raises(UserError, match=r"journal format 1, this version has 2.*--fresh"):
+        Journal(tmp_path, BELONGS_TO)
+    with pytest.raises(UserError, match="journal format 1"):
+        read_log(tmp_path)
+    assert path.read_bytes() == before
+    Journal(tmp_path, BELONGS_TO, fresh=True).close()
+
+
+def test_a_resumed_run_is_a_second_session(tmp_path: Path) -> None:
+    pairs = a_run(tmp_path, 3)
+    run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
+    log = read_log(tmp_path / "work")
+    assert [event.kind for event in log.events if event.kind in ("start", "end")] == ["start", "end"] * 2
+    assert [event.kind for event in log.session if event.kind in ("start", "end")] == ["start", "end"]
+
+
+def test_the_page_has_all_sections_pictures_inside_and_asks_for_nothing(tmp_path: Path) -> None:
+    pairs = a_run(tmp_path)
+    work = tmp_path / "work"
+    assert report_run(work, tmp_path / "new" / "report.html", time.monotonic() + 600, pairs).startswith("report: ")
+    text = (tmp_path / "new" / "report.html").read_text(encoding="utf-8")
+    tags = Tags(text)
+    assert tags.names.count("h2") == 8
+    assert tags.names.count("img") == DRAWN
+    assert tags.names.count("svg") >= 3
+    assert "script" not in tags.names
+    assert all(source.startswith(("data:image/jpeg;base64,", "#")) for source in tags.sources)
+    assert not re.search(r"url\((?!#)|@import", text)
+    assert "the file is empty" in text
+    assert "Figures are missing" not in text
+
+
+def test_the_weakest_pairs_are_drawn_with_the_inliers_that_magsac_found(tmp_path: Path) -> None:
+    a_run(tmp_path)
+    log = read_log(tmp_path / "work")
+    assert len(log.weakest) == DRAWN
+    for weak in log.weakest:
+        match = match_of(weak, THREE_UNITS.magsac.threshold)
+        assert len(match.matches) == weak.record.matches
+        assert match.estimate.inlier_count == weak.record.inliers
+
+
+def test_what_comes_from_files_is_escaped(tmp_path: Path) -> None:
+    log = evil_log(tmp_path)
+    for artist in (Artist(), Artist(log.pairs)):
+        text = report_page(log, artist)
+        assert "script" not in Tags(text).names
+        assert "&lt;script&gt;" in text
+    assert EVIL in overview(log)
+
+
+def test_elements_escape_text_and_attributes_and_keep_markup() -> None:
+    assert element("p", "a<b", Markup("<i>c</i>"), class_='"x"') == '<p class="&quot;x&quot;">a&lt;b<i>c</i></p>'
+
+
+def test_without_matplotlib_the_page_has_tables_and_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pairs = a_run(tmp_path, 4)
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    text = report_page(read_log(tmp_path / "work"), Artist(pairs))
+    assert "matplotlib is not installed" in text
+    assert not {"img", "svg"} & set(Tags(text).names)
+    assert pairs[0].id in text
+
+
+def test_a_run_of_no_pairs_has_a_page(tmp_path: Path) -> None:
+    empty_journal(tmp_path, []).close()
+    log = read_log(tmp_path)
+    assert Tags(report_page(log, Artist())).names.count("h2") == 8
+    assert all(table.empty for name, table in tables(log).items() if name != "events")
+    assert overview(log)
+
+
+def test_images_that_are_gone_are_told(tmp_path: Path) -> None:
+    pairs = a_run(tmp_path, 3)
+    for path in pairs[0].images:
+        path.unlink()
+    text = report_page(read_log(tmp_path / "work"), Artist(pairs))
+    assert text.count("an image cannot be read any more") == 1
+    assert Tags(text).names.count("img") == 1
+
+
+def test_a_late_report_leaves_out_pictures_then_itself(tmp_path: Path) -> None:
+    pairs = a_run(tmp_path, 3)
+    path = tmp_path / "report.html"
+    line = report_run(tmp_path / "work", path, time.monotonic() + 0.1, pairs)
+    assert line.startswith("no report, the time is up")
+    assert not path.exists()
+    started = time.monotonic()
+    assert report_run(tmp_path / "work", path, started + 2, pairs) == f"report: {path}"
+    assert time.monotonic() - started < 1
+    text = path.read_text()
+    assert "little time was left" in text
+    assert "<img" not in text
+
+
+def test_a_report_that_fails_is_a_line_not_an_error(tmp_path: Path) -> None:
+    line = report_run(tmp_path / "nowhere", tmp_path / "report.html", time.monotonic() + 60)
+    assert line.startswith("warning: no report (")
+
+
+def test_the_command_draws_a_page_with_the_images_of_a_test_side(tmp_path: Path) -> None:
+    pairs = write_pairs(tmp_path / "test" / "test_images" / "set", 2)
+    rows = [f"{pair.id},set,{pair.image0.stem},{pair.image1.stem}" for pair in pairs]
+    (tmp_path / "test" / "test.csv").write_text("\n".join(["sample_id,batch_id,image_1_id,image_2_id", *rows]))
+    run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
+    page = tmp_path / "report.html"
+    options = ["--report", str(page), "--test-dir", str(tmp_path / "test")]
+    assert main(["journal", str(tmp_path / "work"), *options]) == 0
+    assert Tags(page.read_text()).names.count("img") == 2
+    assert main(["journal", str(tmp_path / "work"), "--report", str(page)]) == 0
+    assert "where the images lie was not told" in page.read_text()
+
+
+def test_a_strip_shows_both_images_at_one_height() -> None:
+    from mkpc_kaggle import figures
+    from mkpc_kaggle.geometry.matches import Matches
+    from mkpc_kaggle.geometry.robust import Estimate, Model
+    from mkpc_kaggle.images import Image
+    from mkpc_kaggle.pipeline import PairMatch, UnitResult
+
+    images = (
+        Image.of_array(np.full((100, 200, 3), 250, np.uint8)),
+        Image.of_array(np.full((300, 300, 3), 5, np.uint8)),
+    )
+    matches = Matches(np.array([[10.0, 10.0]]), np.array([[150.0, 150.0]]), np.ones(1))
+    result = UnitResult(THREE_UNITS.units[0], matches)
+    match = PairMatch((result,), None, Estimate(Model.F, np.eye(3), np.array([True])))
+    data = np.frombuffer(figures.to_jpeg(figures.draw_strip(images, match)), np.uint8)
+    drawn = cv2.imdecode(data, cv2.IMREAD_COLOR)
+    assert drawn.shape == (480, 960 + 480, 3)
+    assert drawn[400, 100].min() > 200
+    assert drawn[400, 1400].max() < 50
