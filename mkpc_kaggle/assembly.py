@@ -11,7 +11,7 @@ from mkpc_kaggle.matchers.contract import Matcher, Placement, Precision
 from mkpc_kaggle.matchers.registry import load_matcher, options_of, registry, slots_of
 from mkpc_kaggle.pipeline import Pipeline
 from mkpc_kaggle.recipe import Mode, Recipe, Unit, load_recipe
-from mkpc_kaggle.weights import WeightStore
+from mkpc_kaggle.weights import FoundFile, WeightStore
 
 AUTO = "auto"
 CUDA_BATCH = 8
@@ -31,7 +31,7 @@ class Assembly:
     """All that a worker needs to build its pipeline.
 
     ``left_out`` are the units of recipe ``auto`` whose weights are missing or not permitted; ``matchers`` are
-    ready ones of the user's own.
+    ready ones of the user's own. ``device`` is what the user asked for, be it here or elsewhere.
     """
 
     recipe: Recipe
@@ -39,6 +39,7 @@ class Assembly:
     placement: Placement
     left_out: tuple[Unit, ...] = ()
     matchers: Mapping[str, Matcher[Any]] = field(default_factory=dict)
+    device: str = AUTO
 
     @property
     def devices(self) -> tuple[str, ...]:
@@ -64,13 +65,18 @@ class Assembly:
 
     def fingerprint(self) -> dict[str, Any]:
         """What decides the numbers that come out: the recipe, the precision and the digests of the weights."""
-        slots = slots_of(self.recipe, not_own(self.recipe.matcher_names, self.matchers))
-        found = {slot: self.weights.find(slot) for slot in slots}
         return {
             "recipe": self.recipe.fingerprint(),
             "precision": self.placement.precision,
-            "weights": {slot: file.digest for slot, file in found.items() if file is not None},
+            "weights": {slot: file.digest for slot, file in self.weight_files.items()},
         }
+
+    @property
+    def weight_files(self) -> dict[str, FoundFile]:
+        """The files that the recipe's matchers load, by slot."""
+        slots = slots_of(self.recipe, not_own(self.recipe.matcher_names, self.matchers))
+        found = {slot: self.weights.find(slot) for slot in slots}
+        return {slot: file for slot, file in found.items() if file is not None}
 
     def _matcher(self, name: str) -> Matcher[Any]:
         return self.matchers.get(name) or load_matcher(self.recipe, name, self.weights, self.placement)
@@ -112,7 +118,7 @@ def assemble(
     lacking = {n for n in not_own(wanted.matcher_names, own) if not set(missing).isdisjoint(slots_of(wanted, [n]))}
     chosen = wanted.only(lambda unit: unit.matcher not in lacking | refused.keys())
     left_out = tuple(unit for unit in wanted.units if unit not in chosen.units)
-    return Assembly(chosen.in_mode(mode), store, resolve_placement(device, precision), left_out, own)
+    return Assembly(chosen.in_mode(mode), store, resolve_placement(device, precision), left_out, own, device)
 
 
 def missing_slots(recipe: Recipe, store: WeightStore, own: Container[str] = ()) -> list[str]:

@@ -2,7 +2,7 @@
 
 import hashlib
 import threading
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
@@ -66,13 +66,19 @@ def read_image(path: Path) -> Image | Unreadable:
     name = str(path)
     try:
         data = np.fromfile(path, np.uint8)
-        if data.size == 0:
-            return Unreadable(name, "the file is empty")
-        bgr = cv2.imdecode(data, cv2.IMREAD_COLOR)
     except FileNotFoundError:
         return Unreadable(name, "no such file")
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, MemoryError) as error:
         return Unreadable(name, f"cannot be read: {error}")
+    return decode_image(name, data)
+
+
+def decode_image(name: str, data: Pixels) -> Image | Unreadable:
+    """Decode the (N,) uint8 bytes of a file, as :func:`read_image` does; never raises."""
+    if data.size == 0:
+        return Unreadable(name, "the file is empty")
+    try:
+        bgr = cv2.imdecode(data, cv2.IMREAD_COLOR)
     except (cv2.error, MemoryError) as error:
         return Unreadable(name, f"cannot be decoded: {error}")
     if bgr is None:
@@ -81,9 +87,18 @@ def read_image(path: Path) -> Image | Unreadable:
 
 
 class ImageStore:
-    """Images by path, decoded in the background when they are announced, the last used kept."""
+    """Images by path, decoded in the background when they are announced, the last used kept.
 
-    def __init__(self, limit_bytes: int = 512 << 20, threads: int = 1) -> None:
+    ``read`` gets at one; it never raises.
+    """
+
+    def __init__(
+        self,
+        limit_bytes: int = 512 << 20,
+        threads: int = 1,
+        read: Callable[[Path], Image | Unreadable] = read_image,
+    ) -> None:
+        self._read = read
         self._images: ByteCache[Path, Image] = ByteCache(limit_bytes)
         self._coming: dict[Path, Future[Image | Unreadable]] = {}
         self._lock = threading.Lock()
@@ -94,7 +109,7 @@ class ImageStore:
         for path in paths:
             with self._lock:
                 if path not in self._coming and self._images.get(path) is None:
-                    self._coming[path] = self._decoders.submit(read_image, path)
+                    self._coming[path] = self._decoders.submit(self._read, path)
 
     def get(self, path: Path) -> Image | Unreadable:
         """The image, waiting for it if need be."""
@@ -102,7 +117,7 @@ class ImageStore:
             known = self._images.get(path)
             if known is not None:
                 return known
-            coming = self._coming.get(path) or self._decoders.submit(read_image, path)
+            coming = self._coming.get(path) or self._decoders.submit(self._read, path)
             self._coming[path] = coming
         image = coming.result()
         with self._lock:

@@ -20,6 +20,7 @@ from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import MatcherSpec, Picture
 from mkpc_kaggle.recipe import Recipe, Unit, UpgradeConfig
 from mkpc_kaggle.run.budget import Budget
+from mkpc_kaggle.run.cluster import RayCluster
 from mkpc_kaggle.run.engine import RunReport
 from mkpc_kaggle.run.jobs import Record
 from mkpc_kaggle.run.plan import Patience
@@ -91,7 +92,7 @@ def run(
     limit: float = float("inf"),
     interrupt: Interrupt | None = None,
     publish: Callable[[Sequence[Record]], None] = lambda _: None,
-    workers: int = 0,
+    workers: int | RayCluster | None = 0,
     patience: Patience | None = None,
 ) -> RunReport:
     assembly = assemble(recipe, matchers={matcher.name: matcher}, device="cpu")

@@ -5,6 +5,7 @@ from math import inf
 from pathlib import Path
 
 from mkpc_kaggle.run.budget import Budget, monotonic_of, parse_duration
+from mkpc_kaggle.run.cluster import RayCluster, parse_workers
 
 
 def add_matching(parser: argparse.ArgumentParser) -> None:
@@ -56,19 +57,20 @@ def add_engine(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--workers",
         type=workers,
-        metavar="N",
+        metavar="N|ray[://HOST:PORT]",
         help="worker processes; 0: none, all work is done in this one (default: one for each GPU, or one for "
-        "the CPU with all its threads)",
+        "the CPU with all its threads). ray: on the Ray cluster that this machine belongs to, one worker for each "
+        "GPU, or for each machine if it has none; HOST:PORT as `ray start --head` tells it",
     )
     parser.add_argument("--explain", action="store_true", help="say at the end what was planned when, and why")
 
 
-def workers(text: str) -> int:
-    """A number of worker processes."""
-    count = int(text)
-    if count < 0:
-        raise argparse.ArgumentTypeError("must be 0 or more")
-    return count
+def workers(text: str) -> int | RayCluster:
+    """A number of worker processes, or the cluster to work on."""
+    try:
+        return parse_workers(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
 
 
 def add_time_limit(parser: argparse.ArgumentParser, default: str | None) -> None:

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, Protocol, TypeVar, cast
 
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.pipeline import Pipeline
@@ -46,16 +46,41 @@ class Seat:
     make_pipeline: Callable[[], Pipeline]
     share: int = 1
 
+    def hire(self) -> "Worker":
+        return Worker(self)
+
+
+class Hired(Protocol):
+    """A worker as its keeper sees it, wherever it is."""
+
+    def load(self) -> str: ...
+
+    def do(self, job: Job) -> Answer: ...
+
+    def announce(self, paths: Iterable[Path]) -> None: ...
+
+    def stop(self) -> None: ...
+
+    def kill(self) -> None: ...
+
+
+class Employer(Protocol):
+    """Has workers made, one after the other."""
+
+    @property
+    def name(self) -> str: ...
+
+    def hire(self) -> Hired: ...
+
 
 class ProcessPool:
     """Matching in processes started with ``spawn``; F is estimated here, in threads, while they go on matching."""
 
-    def __init__(self, seats: Sequence[Seat], recipe: Recipe) -> None:
+    def __init__(self, seats: Sequence[Employer], recipe: Recipe) -> None:
         self._recipe = recipe
         self._back: queue.SimpleQueue[Finished | Lost] = queue.SimpleQueue()
-        self._estimating = ThreadPoolExecutor(max(1, len(seats)), thread_name_prefix="estimate")
-        self._keepers = [Keeper(seat, self._answered) for seat in seats]
         self._out = 0
+        self._take_on(seats)
 
     @property
     def workers(self) -> int:
@@ -93,6 +118,10 @@ class ProcessPool:
         self._estimating.shutdown(wait=idle, cancel_futures=True)
         return idle and all(ended)
 
+    def _take_on(self, seats: Sequence[Employer]) -> None:
+        self._estimating = ThreadPoolExecutor(max(1, len(seats)), thread_name_prefix="estimate")
+        self._keepers = [Keeper(seat, self._answered) for seat in seats]
+
     def _answered(self, job: Job, answer: Answer) -> None:
         if isinstance(answer, Lost):
             self._back.put(answer)
@@ -109,12 +138,12 @@ class ProcessPool:
 class Keeper:
     """Starts a worker, hands it one job after the other, and starts another where it died or had to be killed."""
 
-    def __init__(self, seat: Seat, answered: Callable[[Job, Answer], None]) -> None:
+    def __init__(self, seat: Employer, answered: Callable[[Job, Answer], None]) -> None:
         self.seat = seat
         self.usable = True
         self._answered = answered
         self._queue: queue.SimpleQueue[Job | None] = queue.SimpleQueue()
-        self._worker: Worker | None = None
+        self._worker: Hired | None = None
         self._busy = self._closing = False
         self._started: Future[str] = Future()
         self._thread = threading.Thread(target=self._run, name=f"keeper of {seat.name}", daemon=True)
@@ -187,7 +216,7 @@ class Keeper:
         for _ in range(MOST_STARTS):
             if self._worker is not None or self._closing or not self.usable:
                 break
-            self._worker = Worker(self.seat)
+            self._worker = self.seat.hire()
             failure = "closed" if self._closing else self._worker.load()
             if failure:
                 self._worker.kill()
@@ -288,11 +317,15 @@ def serve(seat: Seat, jobs: Connection, words: Connection) -> None:
         return
     while True:
         job, seconds = jobs.recv()
-        try:
-            answer: Answer = bench.match(job, seconds, alive=lambda: jobs.send(None))
-        except Exception as error:
-            answer = lost_by(job, error)
-        jobs.send(answer)
+        jobs.send(answer_of(bench, job, seconds, lambda: jobs.send(None)))
+
+
+def answer_of(bench: Bench, job: Job, seconds: float, alive: Callable[[], None]) -> Answer:
+    """What a worker answers to a job."""
+    try:
+        return bench.match(job, seconds, alive)
+    except Exception as error:
+        return lost_by(job, error)
 
 
 def _listen(bench: Bench, words: Connection) -> None:

@@ -21,6 +21,7 @@ from mkpc_kaggle import __version__
 from mkpc_kaggle.assembly import Assembly
 from mkpc_kaggle.competition import Pair
 from mkpc_kaggle.run.budget import Budget
+from mkpc_kaggle.run.cluster import RayCluster
 from mkpc_kaggle.run.engine import Engine, RunReport
 from mkpc_kaggle.run.in_process import InProcessPool
 from mkpc_kaggle.run.jobs import Record
@@ -40,8 +41,8 @@ class Interrupt(threading.Event):
 class Session:
     """What a run needs besides its pairs and its recipe.
 
-    ``workers`` is the number of worker processes; 0: none, the work is done in this one; ``None``: one a
-    device. ``guarded``: at the budget's last moment the process leaves, whatever hangs.
+    ``workers`` is the number of worker processes, or the cluster to work on; 0: none, the work is done in this
+    one; ``None``: one a device. ``guarded``: at the budget's last moment the process leaves, whatever hangs.
     """
 
     work_dir: Path
@@ -49,7 +50,7 @@ class Session:
     interrupt: Interrupt
     fresh: bool = False
     progress: bool = True
-    workers: int | None = 0
+    workers: int | RayCluster | None = 0
     guarded: bool = False
     patience: Patience | None = None
 
@@ -114,8 +115,10 @@ def versions() -> dict[str, str]:
     }
 
 
-def pool_of(assembly: Assembly, workers: int | None) -> Pool:
+def pool_of(assembly: Assembly, workers: int | RayCluster | None) -> Pool:
     """One process a device, or as many as are asked for, in turn on each device; or none."""
+    if isinstance(workers, RayCluster):
+        return workers.pool(assembly)
     if workers == 0:
         return InProcessPool(assembly.pipeline, assembly.recipe)
     # On a CPU one process with all threads: two with half of them each do more (recipe light, two cores: the sweep

@@ -28,10 +28,10 @@ class Opened:
 class Bench:
     """Where pairs are matched: a pipeline and the images at hand. Only :meth:`match` computes."""
 
-    def __init__(self, make_pipeline: Callable[[], Pipeline]) -> None:
+    def __init__(self, make_pipeline: Callable[[], Pipeline], images: ImageStore | None = None) -> None:
         self._make_pipeline = make_pipeline
         self._pipeline: Pipeline | None = None
-        self._images = ImageStore()
+        self._images = images or ImageStore()
         self._stopped = threading.Event()
 
     def load(self) -> Pipeline:

@@ -1,0 +1,82 @@
+"""What ``--workers`` means; and Ray, of which nothing is imported before it is asked for."""
+
+import os
+import re
+import signal
+import socket
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from mkpc_kaggle.errors import UserError
+
+if TYPE_CHECKING:
+    from mkpc_kaggle.assembly import Assembly
+    from mkpc_kaggle.run.pool import Pool
+
+FORMS = "a number of processes, ray (this machine's cluster, or one for this run), ray://HOST:PORT"
+REACH_SECONDS = 5.0
+
+
+@dataclass(frozen=True)
+class RayCluster:
+    """The Ray cluster to work on.
+
+    ``address``, HOST:PORT, is the one that ``ray start --head`` tells; this machine must be one of the cluster's.
+    Empty: the cluster that runs on this machine, or else one that is started for the run and ends with it.
+    """
+
+    address: str = ""
+
+    def pool(self, assembly: "Assembly") -> "Pool":
+        """A pool of its machines; raises :class:`UserError` where Ray is not installed."""
+        # Read when Ray is imported: it shall report to nobody, and not start a cluster because it was let go of.
+        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+        os.environ.setdefault("RAY_ENABLE_AUTO_CONNECT", "0")
+        try:
+            from mkpc_kaggle.run.ray_pool import RayPool
+        except ModuleNotFoundError as error:
+            if error.name != "ray":
+                raise
+            raise UserError(
+                '--workers ray needs Ray, which is not installed: pip install "mkpc-kaggle[ray]"'
+            ) from error
+        return RayPool(assembly, self)
+
+    def require_reachable(self) -> None:
+        """Raise :class:`UserError` where nothing listens at the address: Ray itself tries for minutes."""
+        host, _, port = self.address.rpartition(":")
+        try:
+            socket.create_connection((host, int(port)), timeout=REACH_SECONDS).close()
+        except OSError as error:
+            raise UserError(
+                f"--workers ray://{self.address}: no cluster answers there ({error.strerror or error}). Start one "
+                "with `ray start --head` and join it from the other machines; it tells the address to use."
+            ) from error
+
+
+def parse_workers(text: str) -> int | RayCluster:
+    """What the user wrote; ``ValueError`` that lists the forms for anything else."""
+    if re.fullmatch(r"\d+", text):
+        return int(text)
+    if text == "ray":
+        return RayCluster()
+    found = re.fullmatch(r"ray://([^/\s]+:\d{1,5})", text)
+    if found is None:
+        raise ValueError(f"{text!r} is none of: {FORMS}")
+    return RayCluster(found[1])
+
+
+@contextmanager
+def own_signals() -> Iterator[None]:
+    """Keep this process's answers to signals, which Ray replaces by its own when it starts."""
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    former = {number: signal.getsignal(number) for number in numbers}
+    try:
+        yield
+    finally:
+        if threading.current_thread() is threading.main_thread():
+            for number, handler in former.items():
+                signal.signal(number, handler)
