@@ -2,7 +2,6 @@
 
 import os
 import threading
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -63,9 +62,7 @@ def test_an_actor_that_is_lost_is_replaced(
     cluster: Any, pairs: list[Pair], undisturbed: RunReport, tmp_path: Path, fault: Any, told: str
 ) -> None:
     matcher = FaultyMatcher(fault=fault, once=tmp_path / "once")
-    report = run(
-        pairs, THREE_UNITS, matcher, tmp_path / "w", workers=RayCluster(cluster.address), patience=QUICK
-    )
+    report = run(pairs, THREE_UNITS, matcher, tmp_path / "w", workers=RayCluster(cluster.address), patience=QUICK)
     assert report.ending is Ending.COMPLETE
     assert [told in fault for fault in report.faults] == [True], report.faults
     assert matrices(report.records) == matrices(undisturbed.records)

@@ -223,7 +223,7 @@ class RayWorker:
     def kill(self) -> None:
         if self._actor is None or self._place is None:
             return
-        with suppress(ray.exceptions.RayError):  # the cluster may have been let go of meanwhile, its actors with it
+        with suppress(ray.exceptions.RayError):  # the cluster may be gone meanwhile, its actors with it
             ray.kill(self._actor)
         self._floor.leave(self._place)
 
