@@ -4,6 +4,7 @@ Each is looked after by a thread of the parent, as a worker process is. The pare
 Ray's head: without them there is no cluster, and another run goes on from the journal.
 """
 
+import re
 import tempfile
 import textwrap
 import threading
@@ -223,7 +224,9 @@ class RayWorker:
     def kill(self) -> None:
         if self._actor is None or self._place is None:
             return
-        with suppress(ray.exceptions.RayError):  # the cluster may have been let go of meanwhile, its actors with it
+        with suppress(
+            ray.exceptions.RayError
+        ):  # the cluster may have been let go of meanwhile, its actors with it
             ray.kill(self._actor)
         self._floor.leave(self._place)
 
@@ -246,9 +249,9 @@ class RayWorker:
 
     def _told(self, error: Exception) -> str:
         """Where it was and what Ray says of it, shortened: Ray is lengthy, and begins with its own ids."""
-        lines = [line for line in str(error).splitlines() if not line.startswith("\t") or " " in line.strip()]
+        lines = [line for line in str(error).splitlines() if not re.match(r"\t\w+: ", line)]
         host = self._place.host if self._place is not None else ""
-        return f"on {host}: {textwrap.shorten(' '.join(lines[1:] or lines), 200)}"
+        return f"on {host}: {textwrap.shorten(' '.join(lines[1:] or lines), 240)}"
 
 
 class Library:
