@@ -89,16 +89,19 @@ def decode_image(name: str, data: Pixels) -> Image | Unreadable:
 class ImageStore:
     """Images by path, decoded in the background when they are announced, the last used kept.
 
-    ``read`` gets at one; it never raises.
+    ``read`` gets at one, other than from a file if it is given; it never raises.
     """
+
+    read: Callable[[Path], Image | Unreadable] = staticmethod(read_image)
 
     def __init__(
         self,
         limit_bytes: int = 512 << 20,
         threads: int = 1,
-        read: Callable[[Path], Image | Unreadable] = read_image,
+        read: Callable[[Path], Image | Unreadable] | None = None,
     ) -> None:
-        self._read = read
+        if read is not None:
+            self.read = read
         self._images: ByteCache[Path, Image] = ByteCache(limit_bytes)
         self._coming: dict[Path, Future[Image | Unreadable]] = {}
         self._lock = threading.Lock()
@@ -109,7 +112,7 @@ class ImageStore:
         for path in paths:
             with self._lock:
                 if path not in self._coming and self._images.get(path) is None:
-                    self._coming[path] = self._decoders.submit(self._read, path)
+                    self._coming[path] = self._decoders.submit(self.read, path)
 
     def get(self, path: Path) -> Image | Unreadable:
         """The image, waiting for it if need be."""
@@ -117,7 +120,7 @@ class ImageStore:
             known = self._images.get(path)
             if known is not None:
                 return known
-            coming = self._coming.get(path) or self._decoders.submit(self._read, path)
+            coming = self._coming.get(path) or self._decoders.submit(self.read, path)
             self._coming[path] = coming
         image = coming.result()
         with self._lock:

@@ -13,6 +13,7 @@ from rectified import RectifiedMatcher, Seen
 
 from mkpc_kaggle.assembly import Assembly
 from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.images import Unreadable
 from mkpc_kaggle.pipeline import Pipeline
 
 
@@ -29,6 +30,10 @@ Fault = Callable[[], None]
 
 def die() -> None:
     os.kill(os.getpid(), signal.SIGKILL)
+
+
+def nothing() -> None:
+    """Only the mark is left that it was there."""
 
 
 def hang() -> None:
@@ -101,3 +106,15 @@ class VanishingMatcher(RectifiedMatcher):
     def _match(self, seen0: Seen, seen1: Seen) -> Matches:
         self.victim.unlink(missing_ok=True)
         return super()._match(seen0, seen1)
+
+
+@dataclass
+class FarMatcher(RectifiedMatcher):
+    """Where it is sent to, the paths of the machine it comes from lead nowhere."""
+
+    def __setstate__(self, state: dict[str, object]) -> None:
+        from mkpc_kaggle.run import ray_pool
+
+        vars(self).update(state)
+        ray_pool.stamp_of = lambda _: None
+        ray_pool.read_image = lambda path: Unreadable(str(path), "not on this machine")

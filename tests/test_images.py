@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from mkpc_kaggle import images
 from mkpc_kaggle.images import Image, ImageStore, Unreadable, read_image
 
 RED = (200, 30, 10)  # RGB
@@ -204,7 +203,7 @@ def decoded(monkeypatch):
             return Unreadable(str(path), "bad")
         return Image(str(path), np.zeros((10, 10, 3), np.uint8))
 
-    monkeypatch.setattr(images, "read_image", fake)
+    monkeypatch.setattr(ImageStore, "read", staticmethod(fake))
     return seen
 
 
@@ -224,7 +223,7 @@ def test_what_is_announced_is_decoded_in_the_background(store, monkeypatch):
         assert go.wait(10)
         return Image(str(path), np.zeros((1, 1, 3), np.uint8))
 
-    monkeypatch.setattr(images, "read_image", slow)
+    monkeypatch.setattr(ImageStore, "read", staticmethod(slow))
     store.announce([Path("a")])  # comes back although nothing can be decoded yet
     assert started.wait(10)
     go.set()

@@ -4,6 +4,7 @@ Each is looked after by a thread of the parent, as a worker process is. The pare
 Ray's head: without them there is no cluster, and another run goes on from the journal.
 """
 
+import re
 import tempfile
 import textwrap
 import threading
@@ -141,6 +142,10 @@ class Floor:
         with self._lock:
             self._taken.discard(place)
 
+    def stands(self, place: Place) -> bool:
+        """Is the machine still there?"""
+        return any(node["Alive"] for node in ray.nodes() if node["NodeID"] == place.node)
+
     def actor(self, place: Place) -> Any:
         """An actor in that place, and nowhere else."""
         assembly = self._assembly.on("cuda:0") if place.gpu else self._assembly
@@ -223,7 +228,9 @@ class RayWorker:
     def kill(self) -> None:
         if self._actor is None or self._place is None:
             return
-        with suppress(ray.exceptions.RayError):  # the cluster may be gone meanwhile, its actors with it
+        with suppress(
+            ray.exceptions.RayError
+        ):  # the cluster may have been let go of meanwhile, its actors with it
             ray.kill(self._actor)
         self._floor.leave(self._place)
 
@@ -242,13 +249,14 @@ class RayWorker:
         except ray.exceptions.OutOfMemoryError as error:
             return Silence(Cause.OUT_OF_MEMORY, self._told(error))
         except ray.exceptions.RayError as error:
-            return Silence(Cause.DIED, self._told(error))
+            stands = self._place is not None and self._floor.stands(self._place)
+            return Silence(Cause.DIED if stands else Cause.MACHINE, self._told(error))
 
     def _told(self, error: Exception) -> str:
         """Where it was and what Ray says of it, shortened: Ray is lengthy, and begins with its own ids."""
-        lines = [line for line in str(error).splitlines() if not line.startswith("\t") or " " in line.strip()]
+        lines = [line for line in str(error).splitlines() if not re.match(r"\t\w+: ", line)]
         host = self._place.host if self._place is not None else ""
-        return f"on {host}: {textwrap.shorten(' '.join(lines[1:] or lines), 200)}"
+        return f"on {host}: {textwrap.shorten(' '.join(lines[1:] or lines), 240)}"
 
 
 class Library:

@@ -1,0 +1,39 @@
+"""What --workers means, and what it says where Ray cannot be had."""
+
+import sys
+from pathlib import Path
+
+import pytest
+from rectified import THREE_UNITS, RectifiedMatcher, run, write_pairs
+
+from mkpc_kaggle.cli import main
+from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.run.cluster import RayCluster, parse_workers
+
+
+@pytest.mark.parametrize(
+    ("text", "meant"),
+    [("0", 0), ("12", 12), ("ray", RayCluster()), ("ray://10.0.0.1:6379", RayCluster("10.0.0.1:6379"))],
+)
+def test_forms_of_workers(text: str, meant: int | RayCluster) -> None:
+    assert parse_workers(text) == meant
+
+
+@pytest.mark.parametrize("text", ["-1", "two", "ray:", "ray://", "ray://host", "ray://host:port", "ssh://host:1"])
+def test_other_forms_are_refused_with_those_that_there_are(text: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["submit", "--test-dir", ".", f"--workers={text}"])
+    told = capsys.readouterr().err
+    assert all(form in told for form in ("a number of processes", "ray (", "ray://HOST:PORT")), told
+
+
+def test_without_ray_it_says_how_to_install_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "ray", None)
+    monkeypatch.delitem(sys.modules, "mkpc_kaggle.run.ray_pool", raising=False)
+    with pytest.raises(UserError, match=r'pip install "mkpc-kaggle\[ray\]"'):
+        run(write_pairs(tmp_path, 1), THREE_UNITS, RectifiedMatcher(), tmp_path / "w", workers=RayCluster())
+
+
+def test_an_address_where_nothing_answers_is_told_at_once() -> None:
+    with pytest.raises(UserError, match=r"ray://127\.0\.0\.1:1: no cluster answers there"):
+        RayCluster("127.0.0.1:1").require_reachable()
