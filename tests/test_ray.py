@@ -11,9 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from faulty import FarMatcher, FaultyMatcher, die, hang
+from faulty import FarMatcher, FaultyMatcher, die, hang, nothing
 from rectified import THREE_UNITS, RectifiedMatcher, run, write_pairs
 from test_faults import QUICK, matrices
+from weight_files import line
 
 from mkpc_kaggle.competition import Pair
 from mkpc_kaggle.run.cluster import RayCluster
@@ -72,15 +73,22 @@ def test_an_actor_that_is_lost_is_replaced(
     assert matrices(report.records) == matrices(undisturbed.records)
 
 
-def test_a_machine_lost_during_the_run_costs_time_alone(
-    cluster: Any, pairs: list[Pair], undisturbed: RunReport, tmp_path: Path
-) -> None:
+def test_a_machine_lost_during_the_run_costs_time_alone(cluster: Any, tmp_path: Path) -> None:
+    pairs = write_pairs(tmp_path / "pairs", 40)
+    undisturbed = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "undisturbed")
     lost = cluster.add_node(num_cpus=1, object_store_memory=80 * MEGABYTE)
-    matcher = RectifiedMatcher(seconds=0.2)
-    threading.Timer(4.0, cluster.remove_node, (lost,)).start()
+    matcher = FaultyMatcher(fault=nothing, at=20, seconds=0.1, once=tmp_path / "begun")
+
+    def lose() -> None:
+        while not (tmp_path / "begun").exists():
+            time.sleep(0.05)
+        cluster.remove_node(lost)
+
+    threading.Thread(target=lose, daemon=True).start()
     report = run(pairs, THREE_UNITS, matcher, tmp_path / "w", workers=RayCluster(cluster.address))
     assert report.ending is Ending.COMPLETE
-    assert any("node has died" in fault for fault in report.faults)
+    assert "the machine was lost: on " in report.faults[0]
+    assert all("the machine was lost" in fault or "could be started" in fault for fault in report.faults)
     assert matrices(report.records) == matrices(undisturbed.records)
 
 
@@ -118,29 +126,25 @@ def test_an_image_is_read_here_only_if_it_is_the_same_file(tmp_path: Path) -> No
 
 
 def test_weights_are_linked_where_they_are_and_sent_where_they_are_not(tmp_path: Path) -> None:
-    from hashlib import sha256
     from types import SimpleNamespace
 
     from mkpc_kaggle.run.ray_pool import Library, local_store
-    from mkpc_kaggle.weights import FoundFile, State, WeightFile
+    from mkpc_kaggle.weights import FoundFile, State
 
-    def found(name: str, path: Path, content: bytes) -> FoundFile:
-        digest = f"sha256:{sha256(content).hexdigest()}"
-        file = WeightFile(name=name, slot=name, size=len(content), digest=digest, licence="MIT", source="")
-        return FoundFile(file, path, State.GOOD, digest)
+    def found(path: Path, content: bytes) -> FoundFile:
+        file = line(f"{path.name}.pth", content, slot=path.name)
+        return FoundFile(file, path, State.GOOD, file.digest)
 
     (tmp_path / "a").write_bytes(b"here")
     (tmp_path / "b").write_bytes(b"there")
-    a, b = found("a.pth", tmp_path / "a", b"here"), found("b.pth", tmp_path / "lost" / "b", b"there")
-    assembly: Any = SimpleNamespace(
-        weight_files={"a.pth": a, "b.pth": b}, weights=SimpleNamespace(files=(a.file, b.file))
-    )
+    a, b = found(tmp_path / "a", b"here"), found(tmp_path / "lost" / "b", b"there")
+    assembly: Any = SimpleNamespace(weight_files={"a": a, "b": b}, weights=SimpleNamespace(files=(a.file, b.file)))
     home = tmp_path / "home"
     home.mkdir()
     store = local_store(assembly, home, lambda path, stamp: Library().fetch(tmp_path / path.name, stamp))
     assert (home / "a.pth").is_symlink()
     assert not (home / "b.pth").is_symlink()
-    assert [one.path.read_bytes() for one in map(store.find, ("a.pth", "b.pth")) if one] == [b"here", b"there"]
+    assert [one.path.read_bytes() for one in map(store.find, ("a", "b")) if one] == [b"here", b"there"]
 
 
 def node(name: str, alive: bool = True, **offer: float) -> dict[str, Any]:

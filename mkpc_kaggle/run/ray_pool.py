@@ -142,6 +142,10 @@ class Floor:
         with self._lock:
             self._taken.discard(place)
 
+    def stands(self, place: Place) -> bool:
+        """Is the machine still there?"""
+        return any(node["Alive"] for node in ray.nodes() if node["NodeID"] == place.node)
+
     def actor(self, place: Place) -> Any:
         """An actor in that place, and nowhere else."""
         assembly = self._assembly.on("cuda:0") if place.gpu else self._assembly
@@ -245,7 +249,8 @@ class RayWorker:
         except ray.exceptions.OutOfMemoryError as error:
             return Silence(Cause.OUT_OF_MEMORY, self._told(error))
         except ray.exceptions.RayError as error:
-            return Silence(Cause.DIED, self._told(error))
+            stands = self._place is not None and self._floor.stands(self._place)
+            return Silence(Cause.DIED if stands else Cause.MACHINE, self._told(error))
 
     def _told(self, error: Exception) -> str:
         """Where it was and what Ray says of it, shortened: Ray is lengthy, and begins with its own ids."""
