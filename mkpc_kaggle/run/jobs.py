@@ -166,6 +166,12 @@ class Cause(StrEnum):
     OUT_OF_MEMORY = "out of memory"
     RAISED = "the worker failed"
     NO_WORKER = "no worker could be started"
+    MACHINE = "the machine was lost"
+
+    @property
+    def blameless(self) -> bool:
+        """It says nothing against the job."""
+        return self in (Cause.NO_WORKER, Cause.MACHINE)
 
 
 @dataclass(frozen=True)

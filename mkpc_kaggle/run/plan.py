@@ -380,7 +380,7 @@ class Planner:
         self._back(plan)
         self._last_event = now
         stretch = Stretch(plan.phase, plan.indices, plan.units, plan.shrink)
-        if lost.cause is Cause.NO_WORKER:
+        if lost.cause.blameless:
             self._again.append(stretch)
         elif len(plan.indices) > 1:
             half = len(plan.indices) // 2
