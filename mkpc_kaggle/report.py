@@ -108,6 +108,7 @@ def report_page(log: RunLog, artist: Artist) -> Markup:
         _section("Where the time went", _time(log, artist)),
         _section("The budget over time", _budget(log, artist)),
         _section("Units given up, and faults", _plan(log)),
+        _section("What upgrades changed", _upgrades(log)),
         _section("Inliers by batch", _groups(log, artist)),
         _section("Critical regions", _regions(log, artist)),
         _section("The weakest pairs", _weakest(log, artist)),
@@ -185,6 +186,21 @@ def _plan(log: RunLog) -> Iterator[object]:
         return
     rows = [(format_duration(event.seconds), event.kind, event.text) for event in told]
     yield from _capped(("when", "what", "why"), rows)
+
+
+def _upgrades(log: RunLog) -> Iterator[object]:
+    """Extra units, and regular ones that had not fitted before: the pairs that gained most come first."""
+    upgraded = [(record, record.inliers - record.before) for record in log.records if record.before is not None]
+    if not upgraded:
+        yield element("p", "No pair was upgraded.", class_="dim")
+        return
+    before, after = sum(r.inliers - gain for r, gain in upgraded), sum(r.inliers for r, _ in upgraded)
+    counts = Counter("more" if gain > 0 else "fewer" if gain < 0 else "as many" for _, gain in upgraded)
+    told = ", ".join(f"{counts[what]} have {what} inliers" for what in ("more", "as many", "fewer"))
+    yield element("p", f"{len(upgraded)} pairs went from {before} to {after} inliers: {told}.")
+    upgraded.sort(key=lambda one: (-one[1], one[0].index))
+    rows = [(log.pairs[r.index].id, r.before, r.inliers, f"{gain:+d}") for r, gain in upgraded]
+    yield from _capped(("pair", "inliers before", "after", "gain"), rows)
 
 
 def _groups(log: RunLog, artist: Artist) -> Iterator[object]:

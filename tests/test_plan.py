@@ -149,6 +149,21 @@ def test_pairs_are_weak_for_few_inliers_a_low_share_or_an_uncertain_region() -> 
     assert not is_weak(record(100, 60, RegionReason.NO_CLUSTER), replace(config, uncertain=False))
 
 
+def test_a_pairs_seconds_are_those_of_all_its_jobs() -> None:
+    one = planner(1)
+    jobs = 0
+    while (plan := one.next(0.0)) is not None:
+        done = finished(plan, one)
+        jobs += 1
+        timed = [
+            replace(outcome, record=replace(outcome.record, cluster_seconds=1.0, estimate_seconds=2.0))
+            for outcome in done.outcomes
+        ]
+        one.take(replace(done, outcomes=tuple(timed)), 0.0)
+    assert jobs > 1
+    assert (one.records[0].cluster_seconds, one.records[0].estimate_seconds) == (jobs, 2 * jobs)
+
+
 @pytest.mark.parametrize(("gain", "upgraded"), [(0, 57), (20, 300)])
 def test_extra_units_end_where_nothing_is_gained_and_a_resumed_run_decides_the_same(
     gain: int, upgraded: int
