@@ -23,7 +23,7 @@ from mkpc_kaggle.run.budget import Budget
 from mkpc_kaggle.run.cluster import RayCluster
 from mkpc_kaggle.run.engine import RunReport
 from mkpc_kaggle.run.jobs import Record
-from mkpc_kaggle.run.plan import Patience
+from mkpc_kaggle.run.patience import Patience
 from mkpc_kaggle.run.session import Interrupt, Session, run_pairs
 
 

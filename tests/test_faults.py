@@ -34,7 +34,7 @@ from mkpc_kaggle.run import session
 from mkpc_kaggle.run.engine import Ending, RunReport
 from mkpc_kaggle.run.jobs import NOT_REACHED, Record
 from mkpc_kaggle.run.journal import Journal
-from mkpc_kaggle.run.plan import Patience
+from mkpc_kaggle.run.patience import Patience
 from mkpc_kaggle.run.processes import ProcessPool, Seat
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -19,7 +19,9 @@ from mkpc_kaggle.recipe import Recipe, UpgradeConfig
 from mkpc_kaggle.run.budget import Budget
 from mkpc_kaggle.run.engine import Ending
 from mkpc_kaggle.run.jobs import Cause, Finished, Job, Lost, Outcome, Phase, Plan, Record, UnitRecord
-from mkpc_kaggle.run.plan import Patience, Planner, is_weak
+from mkpc_kaggle.run.patience import Patience
+from mkpc_kaggle.run.plan import Planner
+from mkpc_kaggle.run.upgrade import Rounds, is_weak
 
 
 def planner(count: int = 40, recipe: Recipe = THREE_UNITS, workers: int = 1) -> Planner:
@@ -193,3 +195,15 @@ def test_planning_a_job_does_not_take_longer_for_many_pairs() -> None:
     assert ran.jobs > 2500
     assert ran.planning < 1e-3
     assert RESTART_SECONDS < ran.report.seconds < 20_000
+
+
+def test_extra_units_that_gained_nothing_in_a_round_stay_over() -> None:
+    rounds = Rounds(UpgradeConfig())
+    stretches = rounds.cut(range(100), (SWEEP, EXTRA))
+    third = next(stretch for stretch in stretches if stretch.round == 3)
+    judged = rounds.judged_before(third)
+    assert judged == [index for stretch in stretches if stretch.round == 1 for index in stretch.indices]
+    same = [replace(Record.untouched(index), before=0) for index in judged]
+    assert "went from 0 to 0 inliers" in rounds.judge(same)
+    assert rounds.over
+    assert all(not rounds.judged_before(stretch) for stretch in stretches)

@@ -226,7 +226,7 @@ def test_a_cluster_of_its_own_ends_with_the_run(tmp_path: Path, number: signal.S
     running.send_signal(number)
     told, _ = running.communicate(timeout=60)
     assert told == ("interrupted\n" if number is signal.SIGTERM else "")
-    deadline = time.monotonic() + 20
+    deadline = time.monotonic() + 60  # Ray's own agents take their time on a busy machine
     while processes_of(mark) and time.monotonic() < deadline:
         time.sleep(0.1)
     assert processes_of(mark) == []

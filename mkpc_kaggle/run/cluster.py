@@ -1,6 +1,5 @@
-"""What ``--workers`` means; and Ray, of which nothing is imported before it is asked for."""
+"""What ``--workers`` means, and what Ray's clusters ask of this process; Ray itself is not imported here."""
 
-import os
 import re
 import signal
 import socket
@@ -8,13 +7,8 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from mkpc_kaggle.errors import UserError
-
-if TYPE_CHECKING:
-    from mkpc_kaggle.assembly import Assembly
-    from mkpc_kaggle.run.pool import Pool
 
 FORMS = "a number of processes, ray (this machine's cluster, or one for this run), ray://HOST:PORT"
 REACH_SECONDS = 5.0
@@ -29,21 +23,6 @@ class RayCluster:
     """
 
     address: str = ""
-
-    def pool(self, assembly: "Assembly") -> "Pool":
-        """A pool of its machines; raises :class:`UserError` where Ray is not installed."""
-        # Read when Ray is imported: it shall report to nobody, and not start a cluster because it was let go of.
-        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-        os.environ.setdefault("RAY_ENABLE_AUTO_CONNECT", "0")
-        try:
-            from mkpc_kaggle.run.ray_pool import RayPool
-        except ModuleNotFoundError as error:
-            if error.name != "ray":
-                raise
-            raise UserError(
-                '--workers ray needs Ray, which is not installed: pip install "mkpc-kaggle[ray]"'
-            ) from error
-        return RayPool(assembly, self)
 
     def require_reachable(self) -> None:
         """Raise :class:`UserError` where nothing listens at the address: Ray itself tries for minutes."""

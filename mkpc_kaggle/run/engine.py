@@ -14,7 +14,8 @@ from mkpc_kaggle.recipe import Recipe, Unit
 from mkpc_kaggle.run.budget import Budget
 from mkpc_kaggle.run.jobs import Finished, Job, Lost, Outcome, Plan, Record, Task, visiting_order
 from mkpc_kaggle.run.journal import EventKind
-from mkpc_kaggle.run.plan import Explanation, Patience, Planner
+from mkpc_kaggle.run.patience import Patience
+from mkpc_kaggle.run.plan import Explanation, Planner
 from mkpc_kaggle.run.pool import Pool
 from mkpc_kaggle.run.progress import progress_on
 

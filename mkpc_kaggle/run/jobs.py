@@ -28,6 +28,17 @@ class Phase(StrEnum):
 
 
 @dataclass(frozen=True)
+class Stretch:
+    """Pairs that will be worked on together, when their turn comes; ``units`` None: as many as fit then."""
+
+    phase: Phase
+    indices: tuple[int, ...]
+    units: tuple[Unit, ...] | None = None
+    shrink: float = 1.0
+    round: int = 0
+
+
+@dataclass(frozen=True)
 class Plan:
     """What to do next: ``units`` on the pairs of ``indices``, those that a pair has had left out.
 

@@ -1,4 +1,4 @@
-"""The planner: what to do next, what a lost job means, and why; decisions on values, without threads or clocks.
+"""The planner: what to do next, and why; decisions on values, without threads or clocks.
 
 It looks at a job's worth of pairs at a time, so that a hundred thousand pairs cost no more to plan than ten.
 """
@@ -6,12 +6,16 @@ It looks at a job's worth of pairs at a time, so that a hundred thousand pairs c
 from collections import Counter, deque
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.pipeline import UnitResult
-from mkpc_kaggle.recipe import Recipe, Unit, UpgradeConfig
+from mkpc_kaggle.recipe import Recipe, Unit
 from mkpc_kaggle.run.budget import Budget, Costs, format_duration, needs
-from mkpc_kaggle.run.jobs import Cause, Finished, Lost, Outcome, Phase, Plan, Record, UnitRecord, chunks
+from mkpc_kaggle.run.jobs import Finished, Lost, Outcome, Phase, Plan, Record, Stretch, UnitRecord, chunks
+from mkpc_kaggle.run.losses import Losses
+from mkpc_kaggle.run.patience import Patience
+from mkpc_kaggle.run.upgrade import Rounds, inliers_before, is_weak
 
 EXPLORE_SHARE = 0.25
 """The share of the time left that may be spent to learn what units cost that never ran."""
@@ -19,36 +23,6 @@ JOB_SHARE = 0.05
 """The share of the time left that a job may be expected to take: what a job found late comes too late."""
 DEADLINE_SHARE = 0.5
 """The share of the time left after which a job begins no unit: where all is slower of a sudden, that is learnt."""
-SHRINK, LEAST_SHRINK = 0.7, 0.45
-"""A unit that a worker fails at on one pair is tried on views whose sides are 0.7, then 0.49 times as long."""
-MOST_LOSSES = 4
-"""A pair that cost that many jobs of its own is left alone."""
-HOPELESS = 3
-"""A unit that workers failed at on that many pairs and never ran is given up on all."""
-ROUND = 4
-"""Jobs of an upgrade whose gain is looked at together."""
-
-
-@dataclass(frozen=True)
-class Patience:
-    """When a worker is taken to hang: silent for ``floor`` seconds and ``factor`` times what a unit should take.
-
-    It is heard of before each unit on each ``batch`` of pairs. ``unknown`` seconds are allowed where nobody knows
-    what a unit costs. A machine that is ten times slower of a sudden does not hang. A short run waits less: for
-    ``share`` of its limit, but ``least`` seconds, in place of the floor; for an unknown unit as long as it may be
-    explored.
-    """
-
-    floor: float = 60.0
-    factor: float = 10.0
-    unknown: float = 600.0
-    batch: int = 1
-    share: float = 0.02
-    least: float = 5.0
-
-    def silence(self, limit: float) -> float:
-        """The seconds allowed besides the unit's own, in a run of ``limit`` seconds."""
-        return min(self.floor, max(self.least, self.share * limit))
 
 
 @dataclass(frozen=True)
@@ -60,17 +34,6 @@ class Explanation:
 
     def __str__(self) -> str:
         return f"{format_duration(self.seconds):>7}  {self.text}"
-
-
-@dataclass(frozen=True)
-class Stretch:
-    """Pairs that will be worked on together, when their turn comes; ``units`` None: as many as fit then."""
-
-    phase: Phase
-    indices: tuple[int, ...]
-    units: tuple[Unit, ...] | None = None
-    shrink: float = 1.0
-    round: int = 0
 
 
 class Planner:
@@ -107,13 +70,9 @@ class Planner:
         self._last_event = budget.clock()
         self._pairs_of_phase = self._pairs_queued = 0
         self._fitting = -1
-        self._rounds: dict[int, list[int]] = {}
-        self._extras_help = True
+        self._rounds = Rounds(recipe.upgrade)
+        self._losses = Losses()
         self._aside: set[int] = set()
-        self._losses: Counter[int] = Counter()
-        self._blamed: dict[str, set[int]] = {}
-        self._proven: set[str] = set()
-        self._hopeless: set[str] = set()
         self._lacking: Counter[str] = Counter()
         for record in records:
             if record.units:
@@ -191,16 +150,12 @@ class Planner:
             units,
             tuple(self.costs.most(unit.name) for unit in units),
             now + self._allowance if unknown else self._deadline(lacking, len(todo), now),
-            self._timeout(lacking, len(todo), unknown=unknown),
+            self.patience.timeout(
+                lacking, len(todo), self.costs, self.budget.limit, self._allowance if unknown else None
+            ),
             stretch.shrink,
             unknown,
         )
-
-    def _timeout(self, lacking: Iterable[Unit], pairs: int, *, unknown: bool) -> float:
-        factor = self.patience.factor * min(pairs, self.patience.batch)
-        known = max(self.costs.longest(unit.name, factor) for unit in lacking)
-        silence = self.patience.silence(self.budget.limit)
-        return silence + known + (min(self.patience.unknown, self._allowance) if unknown else 0.0)
 
     def _deadline(self, lacking: Iterable[Unit], pairs: int, now: float) -> float:
         """Early enough to plan the rest anew, but late enough for twice what the job should take."""
@@ -222,7 +177,7 @@ class Planner:
         return tuple(unit for unit in units if self.costs.most(unit.name) < self.budget.stop - now)
 
     def _possible(self, units: Iterable[Unit]) -> tuple[Unit, ...]:
-        return tuple(unit for unit in units if unit.name not in self._hopeless)
+        return tuple(unit for unit in units if unit.name not in self._losses.hopeless)
 
     def _fit(self, units: tuple[Unit, ...], now: float) -> int:
         """How many units all pairs can have in the time left; a change is explained."""
@@ -281,35 +236,21 @@ class Planner:
         chosen = {record.index for record in weak}
         others = [one for one in touched if one.index not in chosen and one.lacking(self.recipe.regular)]
         self._explain(now, f"upgrading begins: {len(weak)} weak pairs, {len(others)} others lack units")
-        stretches = [
-            Stretch(Phase.UPGRADE, indices, self.recipe.units, round=1 + number // ROUND if extras else 0)
-            for number, indices in enumerate(chunks(record.index for record in weak))
-        ]
-        for stretch in stretches:
-            self._rounds.setdefault(stretch.round, []).extend(stretch.indices)
         regular = self.recipe.regular
-        return stretches + [
-            Stretch(Phase.UPGRADE, indices, regular) for indices in chunks(record.index for record in others)
+        return self._rounds.cut((one.index for one in weak), self.recipe.units) + [
+            Stretch(Phase.UPGRADE, indices, regular) for indices in chunks(one.index for one in others)
         ]
 
     def _round_may_begin(self, stretch: Stretch, now: float) -> bool:
-        """False where the round before the last is not back yet; without gain there, the extra units end.
-
-        Not the last round, for which workers would have to wait, and not what happens to be back: the same
-        run has to end with the same bytes.
-        """
-        judged = self._rounds.get(stretch.round - 2, []) if stretch.round > 0 else []
-        if not judged or not self._extras_help:
+        """Whether the pairs that decide it are back; if they gained nothing, the extra units end."""
+        judged = self._rounds.judged_before(stretch)
+        if not judged:
             return True
-        if not self._flying.isdisjoint(judged) or any(set(judged) & set(one.indices) for one in self._again):
+        again = chain.from_iterable(one.indices for one in self._again)
+        if not self._flying.isdisjoint(judged) or not set(judged).isdisjoint(again):
             return self._jobs_out < self.workers  # a worker that hangs does not keep the others waiting
-        before = sum(inliers_before(self.records[index]) for index in judged)
-        after = sum(self.records[index].inliers for index in judged)
-        if after - before <= self.recipe.upgrade.least_gain * before:
-            self._extras_help = False
-            self._explain(
-                now, f"extra units end: the last {len(judged)} pairs went from {before} to {after} inliers"
-            )
+        if reason := self._rounds.judge([self.records[index] for index in judged]):
+            self._explain(now, reason)
             regular = self.recipe.regular
             self._queue = deque(replace(one, units=regular, round=0) for one in self._queue)
         return True
@@ -353,7 +294,7 @@ class Planner:
                 self._explain(now, f"pair {record.index} keeps the F it has: {record.failure}")
         if len(record.units) <= len(former.units) and (former.reached or not record.reached):
             return None
-        self._proven.update(result.unit.name for result in outcome.results)
+        self._losses.prove(result.unit for result in outcome.results)
         before = inliers_before(former) if phase is Phase.UPGRADE else former.before
         record = replace(record, before=before, regions=record.regions or former.regions)
         self._put(record)
@@ -372,46 +313,15 @@ class Planner:
         self._jobs_out -= 1
         self._exploring -= plan.exploring
 
-    # What was lost
-
     def lose(self, lost: Lost, now: float) -> list[Outcome]:
-        """Take note of a lost job: halve it, take its units apart, shrink them, give them up; what to keep."""
-        plan = lost.job.plan
-        self._back(plan)
+        """Take note of a lost job, plan anew what may still come of it; what to keep."""
+        self._back(lost.job.plan)
         self._last_event = now
-        stretch = Stretch(plan.phase, plan.indices, plan.units, plan.shrink)
-        if lost.cause.blameless:
-            self._again.append(stretch)
-        elif len(plan.indices) > 1:
-            half = len(plan.indices) // 2
-            self._again.append(replace(stretch, indices=plan.indices[:half]))
-            self._again.append(replace(stretch, indices=plan.indices[half:]))
-        else:
-            return self._lose_pair(stretch, lost, now)
-        return []
-
-    def _lose_pair(self, stretch: Stretch, lost: Lost, now: float) -> list[Outcome]:
-        (index,) = stretch.indices
-        lacking = self.records[index].lacking(stretch.units or ())
-        if len(lacking) > 1:  # stage 1 first: the critical regions depend on it
-            for unit in sorted(lacking, key=lambda unit: unit.stage):
-                self._again.append(replace(stretch, units=(unit,)))
-            return []
-        (unit,) = lacking
-        self._losses[index] += 1
-        self._blamed.setdefault(unit.name, set()).add(index)
-        if len(self._blamed[unit.name]) >= HOPELESS and unit.name not in self._proven | self._hopeless:
-            self._hopeless.add(unit.name)
-            self._explain(now, f"{unit.name} is given up: workers failed at it on {HOPELESS} pairs ({lost})")
-        if self._losses[index] >= MOST_LOSSES:
-            self._again = deque(one for one in self._again if one.indices != (index,))
-            self._explain(now, f"pair {index} is left alone after {MOST_LOSSES} lost jobs ({lost})")
-            return [self._give_up(index, self.records[index].lacking(self.recipe.units), lost)]
-        if lost.cause is Cause.RAISED or stretch.shrink * SHRINK < LEAST_SHRINK:
-            self._explain(now, f"{unit.name} is given up on pair {index} ({lost})")
-            return [self._give_up(index, [unit], lost)]
-        self._again.append(replace(stretch, units=(unit,), shrink=stretch.shrink * SHRINK))
-        return []
+        verdict = self._losses.judge(lost, self.records, self.recipe.units)
+        self._again.extend(verdict.again)
+        for reason in verdict.reasons:
+            self._explain(now, reason)
+        return [self._give_up(lost.job.plan.indices[0], verdict.given_up, lost)] if verdict.given_up else []
 
     def _give_up(self, index: int, units: Sequence[Unit], lost: Lost) -> Outcome:
         """The pair keeps the F that it has; the units are marked as had, with the reason."""
@@ -427,7 +337,7 @@ class Planner:
 
     def wanted(self, record: Record) -> list[Unit]:
         """The units that a pair shall have if there is time: the extra ones only where it is weak."""
-        extras = self._extras_help and is_weak(record, self.recipe.upgrade)
+        extras = not self._rounds.over and is_weak(record, self.recipe.upgrade)
         return record.lacking(self._possible(self.recipe.units if extras else self.recipe.regular))
 
     @property
@@ -446,18 +356,3 @@ class Planner:
 
     def _explain(self, now: float, text: str) -> None:
         self.explanations.append(Explanation(now - self.budget.started, text))
-
-
-def is_weak(record: Record, config: UpgradeConfig) -> bool:
-    """Whether more work may help: few inliers, a low share of them, or an uncertain critical region."""
-    unsure = record.regions is not None and not all(region.cropped for region in record.regions)
-    return (
-        record.inliers < config.below_inliers
-        or record.inliers < config.below_share * record.matches
-        or (config.uncertain and unsure)
-    )
-
-
-def inliers_before(record: Record) -> int:
-    """The inliers of a pair before it was upgraded."""
-    return record.inliers if record.before is None else record.before

@@ -21,13 +21,14 @@ import numpy as np
 from mkpc_kaggle import __version__
 from mkpc_kaggle.assembly import Assembly
 from mkpc_kaggle.competition import Pair
+from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.run.budget import Budget
 from mkpc_kaggle.run.cluster import RayCluster
 from mkpc_kaggle.run.engine import Engine, RunReport
 from mkpc_kaggle.run.in_process import InProcessPool
 from mkpc_kaggle.run.jobs import Record
 from mkpc_kaggle.run.journal import About, EventKind, Journal
-from mkpc_kaggle.run.plan import Patience
+from mkpc_kaggle.run.patience import Patience
 from mkpc_kaggle.run.pool import Pool
 from mkpc_kaggle.run.processes import ProcessPool, Seat
 
@@ -128,7 +129,7 @@ def versions() -> dict[str, str]:
 def pool_of(assembly: Assembly, workers: int | RayCluster | None) -> Pool:
     """One process a device, or as many as are asked for, in turn on each device; or none."""
     if isinstance(workers, RayCluster):
-        return workers.pool(assembly)
+        return _ray_pool(assembly, workers)
     if workers == 0:
         return InProcessPool(assembly.pipeline, assembly.recipe)
     # On a CPU one process with all threads: two with half of them each do more (recipe light, two cores: the sweep
@@ -138,6 +139,22 @@ def pool_of(assembly: Assembly, workers: int | RayCluster | None) -> Pool:
     share = len(places) if devices == ("cpu",) else 1
     seats = [Seat(f"{place} {number}", assembly.on(place).pipeline, share) for number, place in enumerate(places)]
     return ProcessPool(seats, assembly.recipe)
+
+
+def _ray_pool(assembly: Assembly, cluster: RayCluster) -> Pool:
+    """A pool of the cluster's machines; raises :class:`UserError` where Ray is not installed."""
+    # Read when Ray is imported: it shall report to nobody, and not start a cluster because it was let go of.
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    os.environ.setdefault("RAY_ENABLE_AUTO_CONNECT", "0")
+    try:
+        from mkpc_kaggle.run.ray_pool import RayPool
+    except ModuleNotFoundError as error:
+        if error.name != "ray":
+            raise
+        raise UserError(
+            '--workers ray needs Ray, which is not installed: pip install "mkpc-kaggle[ray]"'
+        ) from error
+    return RayPool(assembly, cluster)
 
 
 @contextmanager
