@@ -1,8 +1,14 @@
-"""Notebooks executed from a clean kernel in a network namespace without interfaces."""
+"""Notebooks executed from a clean kernel in a network namespace without interfaces.
 
+As a program it executes a notebook in place and keeps its pictures: ``offline_notebook.py NOTEBOOK``.
+"""
+
+import os
 import shutil
 import subprocess
+import sys
 from collections.abc import Mapping
+from copy import deepcopy
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -58,3 +64,30 @@ def pictures(notebook: nbformat.NotebookNode) -> int:
 
 def outputs(notebook: nbformat.NotebookNode) -> list[nbformat.NotebookNode]:
     return [output for cell in notebook.cells for output in cell.get("outputs", ())]
+
+
+def with_pictures_alone(notebook: nbformat.NotebookNode) -> nbformat.NotebookNode:
+    """The form in which the tour is committed: its pictures, and nothing else that tells of a run."""
+    kept = deepcopy(notebook)
+    kept.metadata = {name: kept.metadata[name] for name in ("kernelspec", "language_info")}
+    kept.metadata["language_info"] = {"name": "python"}
+    for cell in kept.cells:
+        cell.metadata = {}
+        if cell.cell_type == "code":
+            cell.execution_count = None
+            cell.outputs = [
+                nbformat.v4.new_output("display_data", {"image/jpeg": output["data"]["image/jpeg"]})
+                for output in cell.outputs
+                if "image/jpeg" in output.get("data", {})
+            ]
+    return kept
+
+
+def main(path: Path) -> None:
+    with TemporaryDirectory() as working:
+        executed = execute(path, Path(working) / "executed.ipynb", sys.executable, Path(working), os.environ)
+    path.write_text(nbformat.writes(with_pictures_alone(executed)) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]).resolve())

@@ -8,17 +8,39 @@ from mkpc_kaggle.figures.canvas import new_figure, save, to_jpeg, to_svg
 from mkpc_kaggle.figures.pair import draw_pair, draw_strip
 from mkpc_kaggle.figures.run import draw_budget, draw_crops, draw_groups, draw_parts
 from mkpc_kaggle.figures.scores import draw_errors, draw_gains, draw_scores
+from mkpc_kaggle.figures.steps import (
+    draw_both,
+    draw_boxes,
+    draw_clusters,
+    draw_epipolar,
+    draw_images,
+    draw_plane,
+    draw_pose_errors,
+    draw_sizes,
+    draw_stage,
+    draw_views,
+)
 
 __all__ = [
+    "draw_both",
+    "draw_boxes",
     "draw_budget",
+    "draw_clusters",
     "draw_crops",
+    "draw_epipolar",
     "draw_errors",
     "draw_gains",
     "draw_groups",
+    "draw_images",
     "draw_pair",
     "draw_parts",
+    "draw_plane",
+    "draw_pose_errors",
     "draw_scores",
+    "draw_sizes",
+    "draw_stage",
     "draw_strip",
+    "draw_views",
     "new_figure",
     "save",
     "to_jpeg",

@@ -4,6 +4,7 @@ Colours are the Okabe-Ito palette, which colour-blind readers can tell apart.
 """
 
 import warnings
+from collections.abc import Sequence
 from io import BytesIO, StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.geometry.coordinates import Box
 from mkpc_kaggle.images import Image
 
 if TYPE_CHECKING:
@@ -23,6 +25,8 @@ CLUSTERS = ("#56B4E9", "#E69F00", "#CC79A7", "#0072B2", "#009E73", "#D55E00")
 CYCLE = tuple(CLUSTERS[place] for place in (3, 1, 4, 5, 0, 2))
 INK = "#010203"
 """Stands for the colour of the text around a figure, until :func:`to_svg` makes it just that."""
+WIDTH = 10.0
+"""Inches across a notebook."""
 MOST_LINES = 150
 """Lines that an eye can follow; a figure with more matches shows an even sample and says so."""
 
@@ -59,9 +63,9 @@ def to_svg(figure: "Figure") -> str:
     return text[text.index("<svg") :].replace(INK, "currentColor")
 
 
-def to_jpeg(figure: "Figure") -> bytes:
+def to_jpeg(figure: "Figure", dpi: int = 110) -> bytes:
     stream = BytesIO()
-    figure.savefig(stream, format="jpeg", dpi=110, pil_kwargs={"quality": 82})
+    figure.savefig(stream, format="jpeg", dpi=dpi, pil_kwargs={"quality": 82})
     return stream.getvalue()
 
 
@@ -88,16 +92,33 @@ def short(name: str, most: int = 18) -> str:
     return name if len(name) <= most else name[: most - 1] + "…"
 
 
-def rectangle(left: float, top: float, width: float, height: float) -> Any:
+def add_box(axes: "Axes", box: Box, **style: Any) -> None:
+    """Frame a box of image pixels; ``style`` is matplotlib's."""
+    add_rectangle(axes, (box.left - 0.5, box.top - 0.5), box.size.width, box.size.height, **style)
+
+
+def add_rectangle(axes: "Axes", corner: tuple[float, float], width: float, height: float, **style: Any) -> None:
     from matplotlib.patches import Rectangle
 
-    return Rectangle((left, top), width, height, fill=False, edgecolor=REGION, linewidth=2.5)
+    style = {"edgecolor": REGION, "linewidth": 2.5, **style}
+    axes.add_patch(Rectangle(corner, width, height, fill=False, **style))
 
 
 def show(axes: "Axes", image: Image) -> None:
     axes.imshow(image.pixels)
     axes.set_xticks([])
     axes.set_yticks([])
+
+
+def side_by_side(images: Sequence[Image], extra: float = 0.3) -> "tuple[Figure, Sequence[Axes]]":
+    """Pictures in a row at one height, as wide as a notebook; ``extra`` inches are for titles and the like."""
+    aspects = [image.size.width / image.size.height for image in images]
+    gaps = 0.1 * (len(images) + 1)
+    figure = new_figure(WIDTH, min((WIDTH - gaps) / sum(aspects), 5.0) + extra)
+    row = figure.subplots(1, len(images), width_ratios=aspects, squeeze=False)[0]
+    for axes, image in zip(row, images, strict=True):
+        show(axes, image)
+    return figure, list(row)
 
 
 def sample(mask: NDArray[np.bool_], most: int) -> NDArray[np.intp]:

@@ -1,7 +1,7 @@
 """One pair at a glance: its matches, its clusters, its critical regions."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -13,12 +13,14 @@ from mkpc_kaggle.figures.canvas import (
     INLIER,
     MOST_LINES,
     OUTLIER,
+    add_box,
+    add_rectangle,
     new_figure,
-    rectangle,
     sample,
     show,
 )
-from mkpc_kaggle.geometry.critical_region import MkpcConfig, cluster_points, keep_clusters
+from mkpc_kaggle.geometry.critical_region import MkpcConfig, find_clusters
+from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.images import Image
 from mkpc_kaggle.pipeline import PairMatch
 
@@ -54,8 +56,8 @@ def draw_strip(images: tuple[Image, Image], match: PairMatch) -> "Figure":
     _draw_lines(axes, match, scales, widths[0])
     for region, scale, shift in zip(match.regions or (), scales, (0, widths[0]), strict=False):
         box = region.box
-        left, top = box.left * scale + shift - 0.5, box.top * scale - 0.5
-        axes.add_patch(rectangle(left, top, box.size.width * scale, box.size.height * scale))
+        corner = box.left * scale + shift - 0.5, box.top * scale - 0.5
+        add_rectangle(axes, corner, box.size.width * scale, box.size.height * scale)
     return figure
 
 
@@ -76,16 +78,23 @@ def _draw_lines(axes: "Axes", match: PairMatch, scales: Sequence[float], shift: 
         axes.scatter(x, y, s=5, color=colour, linewidths=0)
 
 
-def _draw_matches(axes: "NDArray[Any]", images: tuple[Image, Image], match: PairMatch) -> None:
-    from matplotlib.patches import ConnectionPatch
-
-    matches, inliers = match.matches, match.estimate.inliers
+def _draw_matches(axes: "Sequence[Axes]", images: tuple[Image, Image], match: PairMatch) -> None:
     for one, image in zip(axes, images, strict=True):
         show(one, image)
+    drawn = connect(axes, match.matches, match.estimate.inliers)
+    why = f"; {match.estimate.failure}" if match.estimate.failure else ""
+    axes[0].set_title(f"{len(match.matches)} matches, {match.estimate.inlier_count} inliers{why}", loc="left")
+    axes[1].set_title(drawn, loc="left")
+
+
+def connect(axes: "Sequence[Axes]", matches: Matches, inliers: NDArray[np.bool_]) -> str:
+    """Draw matches from one picture to the other, a sample of them where there are many; what was drawn."""
+    from matplotlib.patches import ConnectionPatch
+
     drawn = sample(~inliers, MOST_LINES // 5), sample(inliers, MOST_LINES)
     for indices, colour, width in ((drawn[0], OUTLIER, 0.5), (drawn[1], INLIER, 0.7)):
         for one, points in zip(axes, (matches.points0, matches.points1), strict=True):
-            one.scatter(*points[indices].T, s=6, c=colour, linewidths=0)
+            one.scatter(points[indices, 0], points[indices, 1], s=6, c=colour, linewidths=0)
         for index in indices:
             line = ConnectionPatch(
                 matches.points0[index],
@@ -99,10 +108,7 @@ def _draw_matches(axes: "NDArray[Any]", images: tuple[Image, Image], match: Pair
                 alpha=0.6,
             )
             axes[0].figure.add_artist(line)
-    shown = f"{len(drawn[1])} inliers (green) and {len(drawn[0])} outliers (orange) drawn"
-    why = f"; {match.estimate.failure}" if match.estimate.failure else ""
-    axes[0].set_title(f"{len(matches)} matches, {match.estimate.inlier_count} inliers{why}", loc="left")
-    axes[1].set_title(shown, loc="left")
+    return f"{len(drawn[1])} inliers (green) and {len(drawn[0])} outliers (orange) drawn"
 
 
 def _draw_clusters(axes: "Axes", image: Image, match: PairMatch, config: MkpcConfig, side: int) -> None:
@@ -111,19 +117,16 @@ def _draw_clusters(axes: "Axes", image: Image, match: PairMatch, config: MkpcCon
         axes.set_title("no stage 2: no critical region", loc="left")
         return
     region = match.regions[side]
-    stage1 = [result.matches for result in match.results if result.unit.stage == 1]
-    points = np.concatenate([part.points1 if side else part.points0 for part in stage1])
-    labels = cluster_points(points, image.size, config) if len(points) else np.zeros(0, np.intp)
-    sizes = np.bincount(labels[labels >= 0])
-    kept = keep_clusters(sizes, config.share, config.ratio) if len(sizes) else np.zeros(0, np.intp)
-    dropped = ~np.isin(labels, kept)
+    stage1 = match.matches[match.in_stage(1)]
+    points = stage1.points1 if side else stage1.points0
+    clusters = find_clusters(points, image.size, config)
+    dropped = ~clusters.keeps
     axes.scatter(points[dropped, 0], points[dropped, 1], s=8, c=DROPPED, marker="x", linewidths=0.7)
-    for rank, label in enumerate(kept):
-        x, y = points[labels == label].T
+    for rank, label in enumerate(clusters.kept):
+        x, y = points[clusters.labels == label].T
         axes.scatter(x, y, s=8, c=CLUSTERS[rank % len(CLUSTERS)], linewidths=0)
     box = region.box
-    left, top = box.left - 0.5, box.top - 0.5
-    axes.add_patch(rectangle(left, top, box.size.width, box.size.height))
+    add_box(axes, box)
     axes.set_title(
         f"critical region: {region.reason}, {100 * box.area / (image.size.width * image.size.height):.0f} % of "
         f"the image\n{region.kept} of {region.clusters} clusters kept; grey crosses: noise and dropped",
