@@ -131,6 +131,18 @@ def read_train_side(
     )
 
 
+def read_true_pair(directory: Path, pair: str) -> tuple[Scene, TruePair]:
+    """The pair ``SCENE;IMAGE-IMAGE`` of a train side, whatever its covisibility, and its scene.
+
+    Raises :class:`UserError` where there is none, besides what :func:`read_train_side` raises.
+    """
+    (scene,) = read_train_side(directory, scenes=[pair.partition(";")[0]], min_covisibility=0.0)
+    known = {true.pair.id: true for true in scene.pairs}
+    if pair not in known:
+        raise UserError(f"{directory}: unknown pair {pair!r}; known: {', '.join(list(known)[:3])}, ...")
+    return scene, known[pair]
+
+
 def read_cameras(path: Path) -> dict[str, Camera]:
     """The cameras of a ``calibration.csv`` by image id."""
     columns = ("image_id", "camera_intrinsics", "rotation_matrix", "translation_vector")

@@ -9,6 +9,9 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from mkpc_kaggle.cache import ByteCache
 from mkpc_kaggle.geometry.coordinates import Box, Size, View
 from mkpc_kaggle.geometry.critical_region import CriticalRegion, critical_region
@@ -62,6 +65,11 @@ class PairMatch:
     @property
     def inliers(self) -> Matches:
         return self.matches[self.estimate.inliers]
+
+    def in_stage(self, stage: int) -> NDArray[np.bool_]:
+        """(N,) mask: which of ``matches`` the units of that stage found."""
+        chosen = [result.unit.stage == stage for result in self.results]
+        return np.repeat(np.array(chosen, bool), [len(result.matches) for result in self.results])
 
 
 @dataclass(frozen=True, eq=False)

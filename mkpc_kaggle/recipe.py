@@ -35,6 +35,26 @@ class Mode(StrEnum):
 
 
 @dataclass(frozen=True)
+class Choice:
+    """A recipe by its name or file, and the mode to run it in."""
+
+    recipe: str
+    mode: Mode = Mode.TWO_STAGE
+
+    @classmethod
+    def parse(cls, text: str) -> "Choice":
+        """``NAME:MODE``; without a mode, the recipe as it is written."""
+        name, _, mode = text.rpartition(":")
+        return cls(name, Mode(mode)) if name and mode in list(Mode) else cls(text)
+
+    @property
+    def folder(self) -> str:
+        """A name for the directory of its run."""
+        text = self.recipe if self.mode is Mode.TWO_STAGE else f"{self.recipe}_{self.mode}"
+        return re.sub(r"[^\w.-]+", "_", text)
+
+
+@dataclass(frozen=True)
 class Unit:
     """One piece of work on one pair.
 

@@ -27,6 +27,7 @@ from mkpc_kaggle.run.budget import format_duration
 from mkpc_kaggle.run.journal import EventKind
 from mkpc_kaggle.run.log import RunLog, WeakPair, read_log
 from mkpc_kaggle.run.summary import seconds_by_part, unit_failures, unit_means
+from mkpc_kaggle.two_stage import to_image
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -163,20 +164,31 @@ def _time(log: RunLog, artist: Artist) -> Iterator[object]:
 
 
 def _budget(log: RunLog, artist: Artist) -> Iterator[object]:
-    ended: dict[str, list[float]] = {}
-    for event in log.session:
-        if event.kind == EventKind.BUDGET:
-            ended.setdefault(event.text, []).append(event.seconds)
+    ended = _jobs_ended(log)
     if not ended:
         yield element("p", "No job has ended in the last session.", class_="dim")
         return
+    yield artist.plot(lambda: budget_figure(log))
+    rows = [(phase, len(times), f"{min(times):.1f}", f"{max(times):.1f}") for phase, times in ended.items()]
+    yield table(("phase", "jobs", "first (s)", "last (s)"), rows)
+
+
+def budget_figure(log: RunLog) -> "Figure":
+    """The jobs that ended over the time of the last session; see :func:`mkpc_kaggle.figures.draw_budget`."""
     marks = {
         name: [event.seconds for event in log.session if event.kind == kind]
         for name, kind in (("plan changed", EventKind.PLAN), ("fault", EventKind.FAULT))
     }
-    yield artist.plot(lambda: figures.draw_budget(ended, marks, log.about.limit))
-    rows = [(phase, len(times), f"{min(times):.1f}", f"{max(times):.1f}") for phase, times in ended.items()]
-    yield table(("phase", "jobs", "first (s)", "last (s)"), rows)
+    return figures.draw_budget(_jobs_ended(log), marks, log.about.limit)
+
+
+def _jobs_ended(log: RunLog) -> dict[str, list[float]]:
+    """When the jobs of each phase ended, in seconds since the start of the last session."""
+    ended: dict[str, list[float]] = {}
+    for event in log.session:
+        if event.kind == EventKind.BUDGET:
+            ended.setdefault(event.text, []).append(event.seconds)
+    return ended
 
 
 def _plan(log: RunLog) -> Iterator[object]:
@@ -278,6 +290,15 @@ def _draw_weak(log: RunLog, weak: WeakPair, source: Pair | None, artist: Artist)
         return picture(data, "image/jpeg", told, f"the images of {source.id}, matches and critical regions")
 
     return artist.draw(make)
+
+
+def weak_figure(log: RunLog, weak: WeakPair, source: Pair) -> "Figure":
+    """Matches, clusters and critical regions of one of the weakest pairs, as the journal has them.
+
+    ``source`` is the pair with the paths of its images; raises :class:`UserError` where one cannot be read.
+    """
+    image0, image1 = map(to_image, source.images)
+    return figures.draw_pair(image0, image1, match_of(weak, log.recipe.magsac.threshold), log.recipe.mkpc)
 
 
 def match_of(weak: WeakPair, threshold: float) -> PairMatch:

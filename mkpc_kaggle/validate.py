@@ -73,6 +73,11 @@ class Validation:
         return mean(scene.auc(threshold) for scene in self.scenes)
 
     @property
+    def errors(self) -> list[PoseError]:
+        """Those of all pairs."""
+        return [error for scene in self.scenes for error in scene.errors]
+
+    @property
     def records(self) -> list[Record]:
         return [pair.record for scene in self.scenes for pair in scene.pairs if pair.record is not None]
 

@@ -14,7 +14,7 @@ from mkpc_kaggle.geometry.robust import Method, RobustConfig
 from mkpc_kaggle.matchers.contract import Training
 from mkpc_kaggle.matchers.registry import options_of, registry, slots_of
 from mkpc_kaggle.ranges import Range
-from mkpc_kaggle.recipe import DIRECTORY, Mode, Recipe, Unit, load_recipe, parse_recipe, recipe_names
+from mkpc_kaggle.recipe import DIRECTORY, Choice, Mode, Recipe, Unit, load_recipe, parse_recipe, recipe_names
 
 SIFT = 'units = [{ stage = 1, matcher = "sift", long_side = 640 }]\n'
 
@@ -409,3 +409,18 @@ def test_the_fingerprint_changes_with_whatever_decides_the_numbers(other):
 def test_a_unit_can_be_shrunk() -> None:
     assert Unit(1, "sift", 1000).shrunk(0.7) == Unit(1, "sift", 700)
     assert Unit(2, "dkm", area="540x720", stretch=True).shrunk(0.5).name == "2:dkm@270x360!"
+
+
+@pytest.mark.parametrize(
+    ("text", "choice", "folder"),
+    [
+        ("classical", Choice("classical"), "classical"),
+        ("classical:two-stage", Choice("classical"), "classical"),
+        ("my/own.toml:stage-1", Choice("my/own.toml", Mode.STAGE_1), "my_own.toml_stage-1"),
+        ("C:own.toml", Choice("C:own.toml"), "C_own.toml"),
+        (":stage-1", Choice(":stage-1"), "_stage-1"),
+    ],
+)
+def test_a_choice_is_a_recipe_and_perhaps_a_mode(text: str, choice: Choice, folder: str) -> None:
+    assert Choice.parse(text) == choice
+    assert choice.folder == folder

@@ -82,8 +82,8 @@ def test_a_killed_run_goes_on_and_ends_with_the_bytes_of_an_undisturbed_one(
     make(demo.test_dir, undisturbed, recipe)
     running = subprocess.Popen(command(demo.test_dir, output, recipe), stderr=subprocess.PIPE, text=True)
     assert running.stderr is not None
-    for line in iter(lambda: running.stderr.read(1), ""):  # the progress bar: the first deepened pair
-        if line == "d":
+    for line in running.stderr:  # the progress: the first deepened pair
+        if line.startswith("deepen"):
             break
     running.send_signal(signal.SIGKILL)
     running.wait()

@@ -13,6 +13,7 @@ from mkpc_kaggle.geometry.cameras import Camera, fundamental_of_cameras
 from mkpc_kaggle.geometry.metrics import AUC_THRESHOLDS
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
 from mkpc_kaggle.run.jobs import Record
+from mkpc_kaggle.run.log import read_log
 from mkpc_kaggle.validate import score_record, score_submission, score_table
 
 RECIPE = """
@@ -101,6 +102,17 @@ def test_modes_change_the_stages(demo: DemoSet, recipe: Path, tmp_path: Path, mo
     arguments = ["validate", "--train-dir", str(demo.train_dir), "--pairs-per-scene", "1", "--mode", mode]
     assert main([*arguments, "--recipe", str(recipe), "--json", str(out)]) == 0
     assert set(json.loads(out.read_text())["inliers_by_stage"]) == stages
+
+
+def test_a_work_directory_keeps_the_journal_and_a_report_that_shows_the_pairs(
+    demo: DemoSet, recipe: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["validate", "--train-dir", str(demo.train_dir), "--pairs-per-scene", "2", "--recipe", str(recipe)]
+    assert main([*arguments, "--work-dir", str(tmp_path / "work")]) == 0
+    page = tmp_path / "work" / "report.html"
+    assert f"report: {page}" in capsys.readouterr().out
+    assert page.read_text(encoding="utf-8").count("<img ") == 2
+    assert len(read_log(tmp_path / "work").pairs) == 2
 
 
 def test_scoring_a_file_needs_to_know_its_pairs(demo: DemoSet, capsys: pytest.CaptureFixture[str]) -> None:

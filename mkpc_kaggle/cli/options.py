@@ -3,9 +3,14 @@
 import argparse
 from math import inf
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from mkpc_kaggle.run.budget import Budget, monotonic_of, parse_duration
 from mkpc_kaggle.run.cluster import RayCluster, parse_workers
+
+if TYPE_CHECKING:
+    from mkpc_kaggle.assembly import Assembly
+    from mkpc_kaggle.recipe import Choice
 
 
 def add_matching(parser: argparse.ArgumentParser) -> None:
@@ -16,14 +21,7 @@ def add_matching(parser: argparse.ArgumentParser) -> None:
         metavar="NAME|FILE.toml",
         help="what to run; `recipes` lists the names. auto (the default): the best that the weights allow",
     )
-    parser.add_argument(
-        "--weights",
-        action="append",
-        default=[],
-        type=Path,
-        metavar="DIR",
-        help="where weight files lie; may be repeated. Also searched: $MKPC_WEIGHTS and /kaggle/input",
-    )
+    add_weights(parser)
     parser.add_argument(
         "--licence",
         choices=["any", "permissive"],
@@ -42,6 +40,17 @@ def add_matching(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_weights(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--weights",
+        action="append",
+        default=[],
+        type=Path,
+        metavar="DIR",
+        help="where weight files lie; may be repeated. Also searched: $MKPC_WEIGHTS and /kaggle/input",
+    )
+
+
 def add_mode(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--mode",
@@ -49,6 +58,20 @@ def add_mode(parser: argparse.ArgumentParser) -> None:
         default="two-stage",
         help="two-stage (the default): the recipe as written; stage-1: its units of stage 1 alone; whole-images: "
         "all its units on whole images, the naive ensemble of equal inference count",
+    )
+
+
+def assembly_of(arguments: argparse.Namespace, choice: "Choice") -> "Assembly":
+    """The parts of a run, as the options of :func:`add_matching` say, but for the choice of the recipe."""
+    from mkpc_kaggle.assembly import Licence, assemble
+
+    return assemble(
+        choice.recipe,
+        weights=arguments.weights,
+        device=arguments.device,
+        precision=arguments.precision,
+        mode=choice.mode,
+        licence=Licence(arguments.licence),
     )
 
 

@@ -5,6 +5,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from mkpc_kaggle.cli import options
 from mkpc_kaggle.cli.tables import print_table
 
 if TYPE_CHECKING:
@@ -22,14 +23,7 @@ Weights whose licences do not allow to pass them on are left out, unless --priva
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="where the two folders go")
     parser.add_argument("--owner", required=True, metavar="NAME", help="your user name on Kaggle")
-    parser.add_argument(
-        "--weights",
-        action="append",
-        default=[],
-        type=Path,
-        metavar="DIR",
-        help="where weight files lie; may be repeated. Also searched: $MKPC_WEIGHTS",
-    )
+    options.add_weights(parser)
     parser.add_argument(
         "--python",
         default="3.11,3.12",

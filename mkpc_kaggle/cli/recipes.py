@@ -1,7 +1,8 @@
 """the recipes, their units, and the weights that each lacks"""
 
 import argparse
-from pathlib import Path
+
+from mkpc_kaggle.cli import options
 
 HELP = """\
 List the recipes: their units in order of importance, and which weight files are missing. A unit reads
@@ -12,7 +13,7 @@ A recipe of your own is a TOML file of the form of those in the package: --recip
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--weights", action="append", default=[], type=Path, metavar="DIR", help="may be repeated")
+    options.add_weights(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:

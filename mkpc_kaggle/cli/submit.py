@@ -1,13 +1,9 @@
 """a test directory -> submission.csv"""
 
 import argparse
-import time
 from pathlib import Path
 
 from mkpc_kaggle.cli import leave, options
-
-GRACE_SECONDS = 2.0
-"""How long an interrupted run writes its report: enough for the tables."""
 
 HELP = """\
 Match every pair of test.csv and write one fundamental matrix a row.
@@ -47,9 +43,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    from mkpc_kaggle.assembly import Licence, assemble
     from mkpc_kaggle.competition import read_test_side
-    from mkpc_kaggle.recipe import Mode
+    from mkpc_kaggle.recipe import Choice, Mode
     from mkpc_kaggle.report import report_run
     from mkpc_kaggle.run.session import Session, interruptible
     from mkpc_kaggle.run.summary import summary
@@ -59,14 +54,7 @@ def run(arguments: argparse.Namespace) -> int:
     with interruptible() as interrupt:
         budget = options.budget_of(arguments)
         pairs = read_test_side(arguments.test_dir)
-        assembly = assemble(
-            arguments.recipe,
-            weights=arguments.weights,
-            device=arguments.device,
-            precision=arguments.precision,
-            mode=Mode(arguments.mode),
-            licence=Licence(arguments.licence),
-        )
+        assembly = options.assembly_of(arguments, Choice(arguments.recipe, Mode(arguments.mode)))
         work_dir = arguments.work_dir or output.with_name(f"{output.stem}.work")
         print(f"{len(pairs)} pairs, recipe {assembly.recipe.name}, {assembly.placement}, journal in {work_dir}")
         session = Session(work_dir, budget, interrupt, arguments.fresh, workers=arguments.workers, guarded=True)
@@ -79,7 +67,6 @@ def run(arguments: argparse.Namespace) -> int:
         )
         if not arguments.no_report:
             page = arguments.report or output.with_suffix(".html")
-            ends = time.monotonic() + GRACE_SECONDS if interrupt.signal else budget.started + budget.limit
-            print(report_run(work_dir, page, ends, pairs), flush=True)
+            print(report_run(work_dir, page, session.must_end(), pairs), flush=True)
         status = 128 + interrupt.signal if interrupt.signal else int(bool(report.unwritten))
         return leave(status, at_rest=at_rest)

@@ -2,7 +2,6 @@
 
 import argparse
 import json
-import re
 import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,7 +11,7 @@ from mkpc_kaggle.cli import leave, options
 if TYPE_CHECKING:
     from mkpc_kaggle.assembly import Assembly
     from mkpc_kaggle.competition import Scene
-    from mkpc_kaggle.recipe import Recipe
+    from mkpc_kaggle.recipe import Choice, Recipe
     from mkpc_kaggle.run.session import Interrupt, Session
     from mkpc_kaggle.validate import Validation
 
@@ -67,7 +66,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--work-dir",
         type=Path,
         metavar="DIR",
-        help="keep the journal there (with --compare one a recipe) and go on from it; default: a temporary one",
+        help="keep the journal there (with --compare one a recipe) and go on from it; report.html beside it tells "
+        "of the run (not with --pairs); default: a temporary one",
     )
     parser.add_argument(
         "--submission",
@@ -129,32 +129,39 @@ def _read_scenes(arguments: argparse.Namespace, work_dir: Path) -> "tuple[Scene,
 
 
 def _match_and_score(arguments: argparse.Namespace, scenes: "tuple[Scene, ...]", work_dir: Path) -> int:
+    from mkpc_kaggle.recipe import Choice, Mode
     from mkpc_kaggle.run.session import interruptible
     from mkpc_kaggle.validate import score_table, to_json, validate
 
     with interruptible() as interrupt:
-        assembly = _assemble(arguments, arguments.recipe, arguments.mode)
-        validation, at_rest = validate(scenes, assembly, _session(arguments, work_dir, interrupt))
+        assembly = _assemble(arguments, Choice(arguments.recipe, Mode(arguments.mode)))
+        session = _session(arguments, work_dir, interrupt)
+        validation, at_rest = validate(scenes, assembly, session)
     _print_summary(arguments, validation, scenes, assembly)
     print("\n".join(score_table(validation)))
     _write_json(arguments.json, to_json(validation))
+    _write_report(arguments, scenes, session)
     return leave(128 + interrupt.signal if interrupt.signal else 0, at_rest=at_rest)
 
 
 def _compare(arguments: argparse.Namespace, scenes: "tuple[Scene, ...]", work_dir: Path) -> int:
     from mkpc_kaggle.compare import Comparison, comparison_json, comparison_table
+    from mkpc_kaggle.recipe import Choice
     from mkpc_kaggle.run.engine import Ending
     from mkpc_kaggle.run.session import interruptible
     from mkpc_kaggle.validate import score_table, validate
 
     validations = []
     with interruptible() as interrupt:
-        assemblies = [_assemble(arguments, *_recipe_and_mode(choice)) for choice in arguments.compare]
-        for choice, assembly in zip(arguments.compare, assemblies, strict=True):
-            own_dir = work_dir / re.sub(r"[^\w.-]+", "_", choice)
-            validation, at_rest = validate(scenes, assembly, _session(arguments, own_dir, interrupt))
+        choices = [Choice.parse(text) for text in arguments.compare]
+        assemblies = [_assemble(arguments, choice) for choice in choices]
+        for choice, assembly in zip(choices, assemblies, strict=True):
+            session = _session(arguments, work_dir / choice.folder, interrupt)
+            validation, at_rest = validate(scenes, assembly, session)
             _print_summary(arguments, validation, scenes, assembly)
-            print("\n".join([*score_table(validation), ""]))
+            print("\n".join(score_table(validation)))
+            _write_report(arguments, scenes, session)
+            print()
             if validation.report is None or validation.report.ending is not Ending.COMPLETE:
                 print("nothing is compared before all is done; with a --work-dir, the same command goes on")
                 return leave(128 + interrupt.signal if interrupt.signal else 1, at_rest=at_rest)
@@ -171,28 +178,10 @@ def _session(arguments: argparse.Namespace, work_dir: Path, interrupt: "Interrup
     return Session(work_dir, options.budget_of(arguments), interrupt, workers=arguments.workers)
 
 
-def _recipe_and_mode(choice: str) -> tuple[str, str]:
-    """``NAME:MODE`` -> both; without a mode, as the recipe is written."""
-    from mkpc_kaggle.recipe import Mode
-
-    name, _, mode = choice.rpartition(":")
-    return (name, mode) if name and mode in list(Mode) else (choice, Mode.TWO_STAGE)
-
-
-def _assemble(arguments: argparse.Namespace, recipe: str, mode: str) -> "Assembly":
+def _assemble(arguments: argparse.Namespace, choice: "Choice") -> "Assembly":
     from dataclasses import replace
 
-    from mkpc_kaggle.assembly import Licence, assemble
-    from mkpc_kaggle.recipe import Mode
-
-    assembly = assemble(
-        recipe,
-        weights=arguments.weights,
-        device=arguments.device,
-        precision=arguments.precision,
-        mode=Mode(mode),
-        licence=Licence(arguments.licence),
-    )
+    assembly = options.assembly_of(arguments, choice)
     chosen = _with_units(assembly.recipe, arguments.units)
     return replace(assembly, recipe=_with_estimator(chosen, arguments))
 
@@ -237,6 +226,16 @@ def _print_summary(
         print("\n".join(["plan:", *map(str, validation.report.explanations)]))
     print(summary(pairs, validation.report, assembly.left_out))
     print(f"\nrecipe {validation.recipe}")
+
+
+def _write_report(arguments: argparse.Namespace, scenes: "tuple[Scene, ...]", session: "Session") -> None:
+    """The page on a run whose journal stays; it tells inliers by an F, so none where E was estimated."""
+    from mkpc_kaggle.report import report_run
+
+    if arguments.work_dir is not None and arguments.pairs is None:
+        pairs = [true.pair for scene in scenes for true in scene.pairs]
+        page = session.work_dir / "report.html"
+        print(report_run(session.work_dir, page, session.must_end(), pairs), flush=True)
 
 
 def _write_json(path: Path | None, values: dict[str, Any]) -> None:

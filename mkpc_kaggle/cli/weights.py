@@ -4,6 +4,7 @@ import argparse
 import sys
 from pathlib import Path
 
+from mkpc_kaggle.cli import options
 from mkpc_kaggle.cli.tables import print_table
 
 HELP = """\
@@ -32,14 +33,7 @@ _CONVERT = "Write a checkpoint's tensors as safetensors with the same names; pri
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     actions = parser.add_subparsers(required=True, metavar="ACTION")
     searching = argparse.ArgumentParser(add_help=False)
-    searching.add_argument(
-        "--weights",
-        action="append",
-        default=[],
-        type=Path,
-        metavar="DIR",
-        help="where weight files lie; may be repeated. Also searched: $MKPC_WEIGHTS and /kaggle/input",
-    )
+    options.add_weights(searching)
     actions.add_parser("list", parents=[searching], description=_LIST).set_defaults(act=_list)
     actions.add_parser("verify", parents=[searching], description=_VERIFY).set_defaults(act=_verify)
 

@@ -75,6 +75,24 @@ class CriticalRegion:
         return self.reason is RegionReason.CROPPED
 
 
+@dataclass(frozen=True, eq=False)
+class Clusters:
+    """Clusters of an image's N matched points.
+
+    ``labels`` is (N,), the cluster of each point, -1 for noise; ``sizes`` is (K,), the points of each cluster;
+    ``kept`` are the labels of those that span the critical region, largest first.
+    """
+
+    labels: NDArray[np.intp]
+    sizes: NDArray[np.intp]
+    kept: NDArray[np.intp]
+
+    @property
+    def keeps(self) -> NDArray[np.bool_]:
+        """(N,) mask of the points in kept clusters."""
+        return np.isin(self.labels, self.kept)
+
+
 def critical_region(points: Points, size: Size, config: MkpcConfig) -> CriticalRegion:
     """The critical region of an image of ``size`` with matched ``points``, (N, 2) float32 in image pixels.
 
@@ -84,17 +102,24 @@ def critical_region(points: Points, size: Size, config: MkpcConfig) -> CriticalR
     points = points[whole.contains(points)]
     if len(points) < config.min_samples:
         return CriticalRegion(whole, RegionReason.TOO_FEW_POINTS)
-    labels = cluster_points(points, size, config)
-    sizes = np.bincount(labels[labels >= 0])
-    if len(sizes) == 0:
+    clusters = find_clusters(points, size, config)
+    found, kept = len(clusters.sizes), len(clusters.kept)
+    if not found:
         return CriticalRegion(whole, RegionReason.NO_CLUSTER)
-    kept = keep_clusters(sizes, config.share, config.ratio)
-    if sizes.sum() / len(points) < config.min_clustered:
-        return CriticalRegion(whole, RegionReason.TOO_SCATTERED, len(sizes), len(kept))
-    box = expand_box(points[np.isin(labels, kept)], size, config.expand_x, config.expand_y)
+    if clusters.sizes.sum() / len(points) < config.min_clustered:
+        return CriticalRegion(whole, RegionReason.TOO_SCATTERED, found, kept)
+    box = expand_box(points[clusters.keeps], size, config.expand_x, config.expand_y)
     if min(box.size) < config.min_side:
-        return CriticalRegion(whole, RegionReason.TOO_SMALL, len(sizes), len(kept))
-    return CriticalRegion(box, RegionReason.CROPPED, len(sizes), len(kept))
+        return CriticalRegion(whole, RegionReason.TOO_SMALL, found, kept)
+    return CriticalRegion(box, RegionReason.CROPPED, found, kept)
+
+
+def find_clusters(points: Points, size: Size, config: MkpcConfig) -> Clusters:
+    """The clusters of an image's matched points, (N, 2) float32 in image pixels, and those that MKPC keeps."""
+    labels = cluster_points(points, size, config) if len(points) else np.zeros(0, np.intp)
+    sizes = np.bincount(labels[labels >= 0])
+    kept = keep_clusters(sizes, config.share, config.ratio) if len(sizes) else np.zeros(0, np.intp)
+    return Clusters(labels, sizes, kept)
 
 
 def cluster_points(points: Points, size: Size, config: MkpcConfig) -> NDArray[np.intp]:

@@ -1,24 +1,23 @@
 """The engine: plans, jobs and results, journalled as they come; every version of the submission is whole."""
 
 import sqlite3
+import sys
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from math import isfinite
-from typing import Any, Protocol
-
-from tqdm import tqdm
+from typing import Protocol
 
 from mkpc_kaggle.competition import Pair
 from mkpc_kaggle.pipeline import UnitResult
 from mkpc_kaggle.recipe import Recipe, Unit
-from mkpc_kaggle.run.budget import Budget, format_duration
-from mkpc_kaggle.run.jobs import Finished, Job, Lost, Outcome, Phase, Plan, Record, Task, visiting_order
+from mkpc_kaggle.run.budget import Budget
+from mkpc_kaggle.run.jobs import Finished, Job, Lost, Outcome, Plan, Record, Task, visiting_order
 from mkpc_kaggle.run.journal import EventKind
 from mkpc_kaggle.run.patience import Patience
 from mkpc_kaggle.run.plan import Explanation, Planner
 from mkpc_kaggle.run.pool import Pool
+from mkpc_kaggle.run.progress import progress_on
 
 PUBLISH_SECONDS = 30.0
 LISTEN_SECONDS = 0.2
@@ -99,7 +98,7 @@ class Engine:
         self._out = self._explained = 0
         self._published = budget.clock()
         self._wait_until = budget.end
-        self._bar = Bar(budget) if progress else None
+        self._progress = progress_on(sys.stderr, budget) if progress else None
         self._publishing = threading.Lock()
         self.planner = self._planner(patience)
 
@@ -112,8 +111,8 @@ class Engine:
             self.pool.start()
             self._work()
             self._wait()
-        if self._bar is not None:
-            self._bar.close()
+        if self._progress is not None:
+            self._progress.close()
         self._publish()
         self._note_explanations()
         return RunReport(
@@ -191,8 +190,8 @@ class Engine:
             self._keep(self.planner.take(back, now))
             self._note_job(back)
         self._note_explanations()
-        if self._bar is not None:
-            self._bar.show(*self.planner.progress)
+        if self._progress is not None:
+            self._progress.show(*self.planner.progress)
         if now - self._published > PUBLISH_SECONDS:
             self._publish()
         return True
@@ -253,25 +252,3 @@ class Engine:
         if self.planner.complete:
             return Ending.COMPLETE
         return Ending.TIME_IS_UP if self.pool.workers else Ending.NO_WORKER
-
-
-class Bar:
-    """The progress of the present pass, on the terminal."""
-
-    def __init__(self, budget: Budget) -> None:
-        self._budget = budget
-        self._bar: tqdm[Any] | None = None
-        self._phase: Phase | None = None
-
-    def show(self, phase: Phase, done: int, total: int) -> None:
-        if phase is not self._phase:
-            self.close()
-            self._bar, self._phase = tqdm(total=total, desc=phase, unit="pair"), phase
-        assert self._bar is not None
-        if isfinite(self._budget.limit):
-            self._bar.set_postfix_str(f"budget left {format_duration(self._budget.left())}", refresh=False)
-        self._bar.update(done - self._bar.n)
-
-    def close(self) -> None:
-        if self._bar is not None:
-            self._bar.close()

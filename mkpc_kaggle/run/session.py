@@ -6,6 +6,7 @@ import platform
 import signal
 import sqlite3
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -31,6 +32,9 @@ from mkpc_kaggle.run.patience import Patience
 from mkpc_kaggle.run.pool import Pool
 from mkpc_kaggle.run.processes import ProcessPool, Seat
 
+REPORT_SECONDS = 2.0
+"""How long an interrupted program may write its report: enough for the tables."""
+
 
 class Interrupt(threading.Event):
     """Set when the run shall end early; ``signal`` is what asked for it, 0 if nothing did."""
@@ -54,6 +58,12 @@ class Session:
     workers: int | RayCluster | None = 0
     guarded: bool = False
     patience: Patience | None = None
+
+    def must_end(self) -> float:
+        """When the program must have ended, by the monotonic clock: with its budget, or soon after a signal."""
+        if self.interrupt.signal:
+            return time.monotonic() + REPORT_SECONDS
+        return self.budget.started + self.budget.limit
 
 
 def run_pairs(

@@ -1,0 +1,67 @@
+"""Progress: a bar on a terminal, few lines where every line stays."""
+
+from io import StringIO
+
+import pytest
+
+from mkpc_kaggle.run.budget import Budget
+from mkpc_kaggle.run.jobs import Phase
+from mkpc_kaggle.run.progress import LINE_SECONDS, Bar, Lines, progress_on
+
+
+class Terminal(StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+@pytest.fixture(autouse=True)
+def no_notebook(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("JPY_PARENT_PID", raising=False)
+
+
+class Clock:
+    now = 0.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def test_a_terminal_has_a_bar_that_is_drawn_anew() -> None:
+    stream = Terminal()
+    progress = progress_on(stream, Budget(0.0, 100.0, Clock()))
+    assert isinstance(progress, Bar)
+    progress.show(Phase.SWEEP, 8, 8)
+    progress.show(Phase.DEEPEN, 2, 8)
+    progress.close()
+    assert stream.getvalue().count("\n") == 2
+    assert "budget left 1m38s" in stream.getvalue()
+
+
+def test_what_is_no_terminal_has_lines() -> None:
+    assert isinstance(progress_on(StringIO(), Budget(0.0)), Lines)
+
+
+def test_the_terminal_that_a_notebook_gives_its_commands_has_lines(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("JPY_PARENT_PID", "1")
+    assert isinstance(progress_on(Terminal(), Budget(0.0)), Lines)
+
+
+def test_lines_come_when_a_pass_begins_and_ends_and_now_and_then_between() -> None:
+    stream, clock = StringIO(), Clock()
+    lines = Lines(stream, Budget(0.0, clock=clock))
+    for done in range(1, 101):  # 100 seconds
+        clock.now += 1
+        lines.show(Phase.SWEEP, done, 100)
+    lines.show(Phase.DEEPEN, 1, 2)
+    clock.now += LINE_SECONDS - 1
+    lines.show(Phase.DEEPEN, 2, 2)
+    lines.close()
+    lines.close()
+    sweep = [f"sweep: {done} of 100 pairs" for done in (1, 31, 61, 91, 100)]
+    assert stream.getvalue().splitlines() == [*sweep, "deepen: 1 of 2 pairs", "deepen: 2 of 2 pairs"]
+
+
+def test_a_line_says_how_much_of_the_budget_is_left() -> None:
+    stream = StringIO()
+    Lines(stream, Budget(0.0, 10.0, Clock())).show(Phase.SWEEP, 3, 5)
+    assert stream.getvalue() == "sweep: 3 of 5 pairs, budget left 8.5s\n"
