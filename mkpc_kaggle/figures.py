@@ -221,7 +221,7 @@ def draw_errors(validations: Sequence["Validation"]) -> "Figure":
             axes.step(
                 x, share, where="post", color=style["color"], linestyle=dashes, linewidth=2, label=one.recipe
             )
-        axes.set(xscale="log", xlim=limits, ylim=(0, 100))
+        axes.set(xscale="log", xlim=limits, ylim=(0, 101))
         axes.xaxis.set_major_formatter("{x:g}")
         axes.set_xlabel(f"{kind} error in {measure}", color=INK)
     panels[0].set_ylabel("per cent of the pairs", color=INK)
@@ -252,7 +252,7 @@ def _rows(names: Sequence[str], title: str) -> "tuple[Figure, Axes]":
 
 def _beside(rows: int, place: int, places: int) -> NDArray[np.float64]:
     """(rows,) heights of the marks at one of several places that share each row."""
-    return np.arange(rows) + 0.5 * ((place + 0.5) / places - 0.5)
+    return np.arange(rows, dtype=np.float64) + 0.5 * ((place + 0.5) / places - 0.5)
 
 
 def _styles(start: int = 0) -> Iterator[dict[str, Any]]:
