@@ -6,6 +6,7 @@ Colours are the Okabe-Ito palette, which colour-blind readers can tell apart.
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from io import BytesIO, StringIO
+from itertools import cycle, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,6 +32,8 @@ CLUSTERS = ("#56B4E9", "#E69F00", "#CC79A7", "#0072B2", "#009E73", "#D55E00")
 _CYCLE = tuple(CLUSTERS[place] for place in (3, 1, 4, 5, 0, 2))
 INK = "#010203"
 """Stands for the colour of the text around a figure, until :func:`to_svg` makes it just that."""
+MOST_EMPTY = 4
+"""How many times as long as the run a time limit may be to be drawn beside it."""
 MOST_LINES = 150
 """Lines that an eye can follow; a figure with more matches shows an even sample and says so."""
 
@@ -99,11 +102,18 @@ def draw_parts(parts: Mapping[str, float]) -> "Figure":
 def draw_budget(
     ended: Mapping[str, Sequence[float]], marks: Mapping[str, Sequence[float]], limit: float | None
 ) -> "Figure":
-    """Jobs ended over time, one colour a phase: ``ended`` and ``marks`` are seconds since the start by name."""
+    """Jobs ended over time, one colour a phase: ``ended`` and ``marks`` are seconds since the start by name.
+
+    A limit that the run came nowhere near is told and not drawn: the jobs would have no room beside it.
+    """
+    from matplotlib.ticker import MaxNLocator
+
     figure = new_figure(5.6, 3.2)
-    unit, name = _time_unit(max([limit or 0.0, *(second for times in ended.values() for second in times)]))
+    latest = max((second for times in (*ended.values(), *marks.values()) for second in times), default=0.0)
+    is_near = limit is not None and limit < MOST_EMPTY * latest
+    unit, name = _time_unit(limit if limit is not None and is_near else latest)
     total = sum(map(len, ended.values()))
-    axes = _plain_axes(figure, f"{total} jobs ended, over {name} since the start")
+    axes = _plain_axes(figure, f"{total} jobs ended, over {name} since the start{_far(limit, is_near)}")
     below = 0
     for colour, (phase, times) in zip(_CYCLE, ended.items(), strict=False):
         # A flat piece is time without a result; 300 steps are as many as can be seen.
@@ -115,13 +125,21 @@ def draw_budget(
         for number, second in enumerate(times[:MOST_LINES]):
             label = what if number == 0 else None
             axes.axvline(second / unit, color=colour, linewidth=1, linestyle=style, label=label)
-    if limit is not None:
+    if limit is not None and is_near:
         axes.axvline(limit / unit, color=INK, linewidth=1.2, label="time limit")
     axes.set_xlim(left=0)
     axes.set_ylim(bottom=0)
+    axes.yaxis.set_major_locator(MaxNLocator(integer=True))
     axes.set_xlabel(name, color=INK)
     _legend(axes)
     return figure
+
+
+def _far(limit: float | None, is_near: bool) -> str:
+    if limit is None or is_near:
+        return ""
+    unit, name = _time_unit(limit)
+    return f"; the limit is {limit / unit:.3g} {name}"
 
 
 def draw_groups(groups: Mapping[str, Sequence[int]]) -> "Figure":
@@ -216,7 +234,7 @@ def draw_errors(validations: Sequence["Validation"]) -> "Figure":
             fontsize=9,
             color=INK,
         )
-        for style, dashes, one in zip(_styles(), ("-", "--", "-.", ":", "-", "--"), validations, strict=False):
+        for style, dashes, one in zip(_styles(), cycle(("-", "--", "-.", ":")), validations, strict=False):
             x, share = _cumulated([getattr(error, kind) for error in one.errors], limits)
             axes.step(
                 x, share, where="post", color=style["color"], linestyle=dashes, linewidth=2, label=one.recipe
@@ -256,8 +274,8 @@ def _beside(rows: int, place: int, places: int) -> NDArray[np.float64]:
 
 
 def _styles(start: int = 0) -> Iterator[dict[str, Any]]:
-    """One for each recipe, the same in all figures; told apart by shape, too."""
-    for colour, marker in zip(_CYCLE[start:], "osD^vP"[start:], strict=False):
+    """One for each recipe, the same in all figures; told apart by shape, too; 42 before they return."""
+    for colour, marker in islice(zip(cycle(_CYCLE), cycle("osD^vPX"), strict=False), start, None):
         yield {"color": colour, "marker": marker, "markersize": 7}
 
 

@@ -58,8 +58,9 @@ def test_errors_smaller_than_can_be_shown_count_from_the_left_edge() -> None:
 
 
 def test_many_recipes_are_told_apart_and_drawn(tmp_path: Path) -> None:
-    validations = [Validation(f"recipe {number}", FIRST.scenes) for number in range(6)]
+    validations = [Validation(f"recipe {number}", FIRST.scenes) for number in range(8)]
     for number, figure in enumerate((figures.draw_scores(validations), figures.draw_errors(validations))):
-        styles = {(line.get_color(), line.get_linestyle(), line.get_marker()) for line in figure.axes[0].lines}
-        assert len(styles) >= 6
+        drawn = [line for line in figure.axes[0].lines if line.get_label().startswith("recipe")]
+        assert len(drawn) == 8
+        assert len({(line.get_color(), line.get_linestyle(), line.get_marker()) for line in drawn}) == 8
         figures.save(figure, tmp_path / f"{number}.png")
