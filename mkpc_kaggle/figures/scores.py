@@ -25,7 +25,7 @@ def draw_scores(validations: Sequence["Validation"]) -> "Figure":
     for place, (style, one) in enumerate(zip(_styles(), validations, strict=False)):
         values = [*(scene.maa for scene in one.scenes), one.maa]
         axes.plot(values, _beside(len(values), place, len(validations)), **style, linestyle="", label=one.recipe)
-    axes.set_xlim(0, 1)
+    axes.set_xlim(-0.02, 1.02)
     axes.set_xlabel("mAA", color=INK)
     _legend_below(figure)
     return figure

@@ -74,7 +74,8 @@ class Lines:
         began = phase is not self._phase
         self._phase = phase
         left = f", budget left {format_duration(self._budget.left())}" if isfinite(self._budget.limit) else ""
-        self._waiting = f"{phase}: {done} of {total} pairs{left}"
+        # A pass is opened while jobs of the one before are out: what it has done means little yet.
+        self._waiting = f"{phase}: {total} pairs{left}" if began else f"{phase}: {done} of {total} pairs{left}"
         if began or self._budget.clock() - self._written >= LINE_SECONDS:
             self.close()
 
