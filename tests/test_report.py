@@ -295,6 +295,16 @@ def test_the_command_draws_a_page_with_the_images_of_a_test_side(tmp_path: Path)
     assert "where the images lie was not told" in page.read_text()
 
 
+def test_a_time_limit_is_drawn_where_the_run_came_near_it_and_told_where_not() -> None:
+    from mkpc_kaggle import figures
+
+    for limit, drawn in ((60.0, True), (8.75 * 3600, False), (None, False)):
+        axes = figures.draw_budget({"sweep": [5.0, 9.0], "deepen": [30.0]}, {"fault": [12.0]}, limit).axes[0]
+        assert ("time limit" in axes.get_legend_handles_labels()[1]) == drawn
+        assert ("the limit is 8.75 hours" in axes.get_title("left")) == (limit == 8.75 * 3600)
+        assert axes.get_xlabel() == "seconds"
+
+
 def test_a_strip_shows_both_images_at_one_height() -> None:
     from mkpc_kaggle import figures
     from mkpc_kaggle.geometry.matches import Matches
