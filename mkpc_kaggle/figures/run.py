@@ -81,6 +81,29 @@ def _far(limit: float | None, is_near: bool) -> str:
     return f"; the limit is {limit / unit:.3g} {name}"
 
 
+def draw_upgrades(before: Sequence[int], after: Sequence[int]) -> "Figure":
+    """A dot a pair: its inliers before and after it was upgraded; above the line it has more."""
+    figure = new_figure(5.6, 3.8)
+    axes = plain_axes(figure, f"inliers of {len(before)} upgraded pairs, before and after")
+    some = sample(np.ones(len(before), bool), 500)
+    axes.scatter(
+        np.asarray(before)[some], np.asarray(after)[some], s=16, color=CLUSTERS[3], alpha=0.7, linewidths=0
+    )
+    most = 1.3 * max(10, *before, *after)
+    axes.plot([0, most], [0, most], color=OUTLIER, linewidth=1, linestyle="--", label="as before")
+    for scale, limit, name in (
+        (axes.set_xscale, axes.set_xlim, axes.xaxis),
+        (axes.set_yscale, axes.set_ylim, axes.yaxis),
+    ):
+        scale("symlog", linthresh=10)
+        limit(0, most)
+        name.set_major_formatter("{x:.0f}")
+    axes.set_xlabel("before", color=INK)
+    axes.set_ylabel("after", color=INK)
+    legend(axes)
+    return figure
+
+
 def draw_groups(groups: Mapping[str, Sequence[int]]) -> "Figure":
     """A row a group, a dot a pair, a bar the median: inliers on a scale that grows by factors."""
     figure = new_figure(5.6, 0.9 + 0.26 * max(1, len(groups)))
