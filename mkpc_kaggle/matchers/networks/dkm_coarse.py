@@ -45,9 +45,14 @@ def posterior_mean(x: Tensor, y: Tensor, values: Tensor) -> Tensor:
 
 
 def kernel(x: Tensor, y: Tensor) -> Tensor:
-    """exp((cosine - 1) / T) of all pairs: (B, n, C) and (B, m, C) -> (B, n, m)."""
+    """exp((cosine - 1) / T) of all pairs: (B, n, C) and (B, m, C) -> (B, n, m), float32.
+
+    Computed in float64: the inverse of a covariance magnifies its rounding some fifteen times, and the refiners
+    that again, up to the tolerance of the golden vectors on some processors. It takes a tenth of a second.
+    """
+    x, y = x.double(), y.double()
     norms = (x.norm(dim=2)[:, :, None] * y.norm(dim=2)[:, None]).add_(1e-6)
-    return (x @ y.mT).div_(norms).sub_(1).div_(TEMPERATURE).exp_()
+    return (x @ y.mT).div_(norms).sub_(1).div_(TEMPERATURE).exp_().float()
 
 
 class EmbeddingDecoder(nn.Module):
