@@ -83,9 +83,13 @@ def test_titles_count_what_is_seen():
     assert titles(figures.draw_stage(IMAGES, match, 2))[0].startswith(
         "stage 2, on the crops: 20 matches, 5 inliers; 5 inliers (green) and 15 outliers"
     )
-    assert titles(figures.draw_clusters(IMAGES, points, clusters))[0].startswith("image 0: 1 clusters")
+    assert titles(figures.draw_clusters(IMAGES, points, clusters))[0].startswith("image 0, clusters found: 1\n")
     assert "0.05 of the largest, 2.0 points" in titles(figures.draw_sizes(clusters, CONFIG))[0]
     assert "together: 60 points, 45 inliers" in titles(figures.draw_both(IMAGES, match))[1]
+    uncropped = replace(match, regions=(REGIONS[1], REGIONS[1]))
+    assert titles(figures.draw_stage((IMAGES[1], IMAGES[1]), uncropped, 2))[0].startswith(
+        "stage 2, on the whole images"
+    )
     assert titles(figures.draw_views(IMAGES, REGIONS, UNITS[1])) == [
         "image 0, whole\n0.83 times enlarged",
         "image 0, crop\n2.50 times enlarged",

@@ -48,7 +48,8 @@ def test_pictures_alone_are_kept_of_a_run() -> None:
         nbformat.v4.new_output("display_data", picture),
     ]
     run = nbformat.v4.new_notebook(
-        cells=[cell], metadata={"kernelspec": KERNEL, "language_info": {"version": "3.12"}, "more": 1}
+        cells=[cell],
+        metadata={"kernelspec": KERNEL, "language_info": {"name": "python", "version": "3.12"}, "more": 1},
     )
     kept = with_pictures_alone(run)
     assert kept.cells[0].outputs == [nbformat.v4.new_output("display_data", {"image/jpeg": "AAAA"})]

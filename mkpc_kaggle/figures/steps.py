@@ -50,14 +50,14 @@ def draw_stage(images: Images, match: PairMatch, stage: int) -> "Figure":
     """The matches that one stage found, coloured by inlier; those of stage 2 on the crops."""
     mask = match.in_stage(stage)
     inliers = match.estimate.inliers[mask]
-    cropped = stage == 2 and match.regions is not None
-    boxes = [region.box for region in match.regions or ()] if cropped else [Box.whole(i.size) for i in images]
+    regions = match.regions if stage == 2 else None
+    boxes = [region.box for region in regions] if regions else [Box.whole(image.size) for image in images]
     figure, row = side_by_side([_cut(image, box) for image, box in zip(images, boxes, strict=True)])
     # The cut is shown as it is; points are moved with it.
     shift0, shift1 = (np.array([box.left, box.top], np.float32) for box in boxes)
     found = match.matches[mask]
     drawn = connect(row, Matches(found.points0 - shift0, found.points1 - shift1, found.scores), inliers)
-    what = "on the crops" if cropped else "on the whole images"
+    what = "on the crops" if any(region.cropped for region in regions or ()) else "on the whole images"
     counts = f"{len(found)} matches, {np.count_nonzero(inliers)} inliers"
     _title(row[0], f"stage {stage}, {what}: {counts}; {drawn}")
     return figure
@@ -75,7 +75,7 @@ def draw_clusters(images: Images, points: tuple[Points, Points], clusters: tuple
             _tag(axes, xy[found.labels == label], str(found.sizes[label]))
         _title(
             axes,
-            f"image {number}: {len(found.sizes)} clusters\nnumbers: their points; {len(noise)} points are noise",
+            f"image {number}, clusters found: {len(found.sizes)}\nnumbers: their points; {len(noise)} points are noise",
         )
     return figure
 
@@ -95,6 +95,7 @@ def _size_bars(axes: "Axes", clusters: Clusters, config: MkpcConfig) -> None:
     axes.set_xlabel("clusters by size; green: kept; orange, hatched: dropped", color=INK)
     axes.set_ylabel("points", color=INK)
     if not len(sizes):
+        axes.set(xticks=[], yticks=[])
         return
     ranks = np.arange(1, len(sizes) + 1)
     for part, colour, hatch in ((slice(kept), INLIER, ""), (slice(kept, None), OUTLIER, "//")):
