@@ -33,7 +33,7 @@ class Difference:
         return self.low > 0 or self.high < 0
 
     def __str__(self) -> str:
-        return f"{self.gain:+.4f} [{self.low:+.4f}, {self.high:+.4f}]"
+        return f"{self.gain:+z.4f} [{self.low:+z.4f}, {self.high:+z.4f}]"
 
 
 def paired_difference(scenes: Sequence[tuple[Values, Values]], *, seed: int = 0) -> Difference:

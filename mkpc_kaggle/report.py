@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 
 MOST_ROWS = 100
 MOST_GROUPS = 30
+MOST_CHANGES = 5
 DRAWING_SECONDS = 4.0
 """Time that must be left to begin to draw: matplotlib alone takes one or two to load."""
 WRITING_SECONDS, WRITING_SECONDS_PER_PAIR = 0.3, 0.0002
@@ -109,6 +110,7 @@ def report_page(log: RunLog, artist: Artist) -> Markup:
         _section("Where the time went", _time(log, artist)),
         _section("The budget over time", _budget(log, artist)),
         _section("Units given up, and faults", _plan(log)),
+        _section("What upgrades changed", _upgrades(log, artist)),
         _section("Inliers by batch", _groups(log, artist)),
         _section("Critical regions", _regions(log, artist)),
         _section("The weakest pairs", _weakest(log, artist)),
@@ -197,6 +199,28 @@ def _plan(log: RunLog) -> Iterator[object]:
         return
     rows = [(format_duration(event.seconds), event.kind, event.text) for event in told]
     yield from _capped(("when", "what", "why"), rows)
+
+
+def _upgrades(log: RunLog, artist: Artist) -> Iterator[object]:
+    """What pairs gained by extra units, and by regular ones that had not fitted before."""
+    changed = [(record, record.inliers - record.before) for record in log.records if record.before is not None]
+    if not changed:
+        yield element("p", "No pair was upgraded.", class_="dim")
+        return
+    after = [record.inliers for record, _ in changed]
+    before = [record.inliers - gain for record, gain in changed]
+    yield artist.plot(lambda: figures.draw_upgrades(before, after))
+    signs = Counter("more" if gain > 0 else "fewer" if gain < 0 else "as many" for _, gain in changed)
+    told = ", ".join(f"{signs[what]} have {what}" for what in ("more", "as many", "fewer"))
+    changed.sort(key=lambda one: (-one[1], one[0].index))
+    ends = changed if len(changed) <= 2 * MOST_CHANGES else changed[:MOST_CHANGES] + changed[-MOST_CHANGES:]
+    rows = [
+        (log.pairs[record.index].id, record.inliers - gain, record.inliers, f"{gain:+d}") for record, gain in ends
+    ]
+    yield table(("pair", "before", "after", "gain"), rows)
+    yield element("p", f"{len(changed)} pairs went from {sum(before)} to {sum(after)} inliers: {told}.")
+    if len(ends) < len(changed):
+        yield element("p", f"The {MOST_CHANGES} greatest gains and the {MOST_CHANGES} smallest.", class_="dim")
 
 
 def _groups(log: RunLog, artist: Artist) -> Iterator[object]:

@@ -212,3 +212,9 @@ def test_the_pose_auc_counts_the_larger_angle_of_a_pair():
     assert (
         pose_auc([PoseError(1.0, 5.0, 0.0)], 10) == pose_auc([PoseError(5.0, 1.0, 9.0)], 10) == pytest.approx(0.75)
     )
+
+
+def test_an_error_reads_as_a_sentence_whatever_is_known() -> None:
+    assert str(PoseError(1.26, 4.0, 0.333)) == "rotation 1.3 degrees off, translation 0.33 m"
+    assert str(PoseError(1.26, 4.0, float("nan"))) == "rotation 1.3 degrees off, translation 4.0 degrees"
+    assert str(PoseError.failed()) == "no pose"

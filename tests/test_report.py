@@ -5,6 +5,7 @@ import re
 import sqlite3
 import sys
 import time
+from contextlib import closing
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -12,13 +13,14 @@ import cv2
 import numpy as np
 import pandas as pd
 import pytest
-from rectified import THREE_UNITS, RectifiedMatcher, run, write_pairs
+from rectified import SWEEP, THREE_UNITS, RectifiedMatcher, run, write_pairs
 
 from mkpc_kaggle.cli import main
 from mkpc_kaggle.competition import Pair
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.markup import Markup, element
 from mkpc_kaggle.report import Artist, match_of, report_page, report_run
+from mkpc_kaggle.run.jobs import Outcome, Record, UnitRecord
 from mkpc_kaggle.run.journal import DRAWN, About, EventKind, Journal, JournalReader
 from mkpc_kaggle.run.log import NOT_ENDED, RunLog, overview, read_log, tables
 
@@ -178,7 +180,7 @@ def test_the_page_has_all_sections_pictures_inside_and_asks_for_nothing(tmp_path
     assert report_run(work, tmp_path / "new" / "report.html", time.monotonic() + 600, pairs).startswith("report: ")
     text = (tmp_path / "new" / "report.html").read_text(encoding="utf-8")
     tags = Tags(text)
-    assert tags.names.count("h2") == 8
+    assert tags.names.count("h2") == 9
     assert tags.names.count("img") == DRAWN
     assert tags.names.count("svg") >= 3
     assert "script" not in tags.names
@@ -186,6 +188,26 @@ def test_the_page_has_all_sections_pictures_inside_and_asks_for_nothing(tmp_path
     assert not re.search(r"url\((?!#)|@import", text)
     assert "the file is empty" in text
     assert "Figures are missing" not in text
+
+
+def test_the_page_tells_what_upgrades_changed_the_greatest_gain_first(tmp_path: Path) -> None:
+    pairs = write_pairs(tmp_path / "images", 3)
+    with closing(empty_journal(tmp_path / "work", pairs)) as journal:
+        for index, (before, after) in enumerate([(20, 30), (50, 200), (40, 35)]):
+            unit = UnitRecord(SWEEP.name, 1, 300, after, 0.0, 0.0, "")
+            journal.save([(Outcome(Record(index, np.eye(3), "", (unit,), before=before)), True)])
+    text = report_page(read_log(tmp_path / "work"), Artist())
+    assert "3 pairs went from 110 to 265 inliers: 2 have more, 0 have as many, 1 have fewer" in text
+    rows = [
+        cells
+        for row in re.findall(r"<tr>(.*?)</tr>", text)
+        if len(cells := re.findall(r"<td[^>]*>(.*?)</td>", row)) == 4
+    ]
+    assert [row[1:] for row in rows if row[0] in {pair.id for pair in pairs}][:3] == [
+        ["50", "200", "+150"],
+        ["20", "30", "+10"],
+        ["40", "35", "-5"],
+    ]
 
 
 def test_the_weakest_pairs_are_drawn_with_the_inliers_that_magsac_found(tmp_path: Path) -> None:
@@ -225,7 +247,7 @@ def test_without_matplotlib_the_page_has_tables_and_says_so(
 def test_a_run_of_no_pairs_has_a_page(tmp_path: Path) -> None:
     empty_journal(tmp_path, []).close()
     log = read_log(tmp_path)
-    assert Tags(report_page(log, Artist())).names.count("h2") == 8
+    assert Tags(report_page(log, Artist())).names.count("h2") == 9
     assert all(table.empty for name, table in tables(log).items() if name != "events")
     assert overview(log)
 
@@ -269,6 +291,16 @@ def test_the_command_draws_a_page_with_the_images_of_a_test_side(tmp_path: Path)
     assert Tags(page.read_text()).names.count("img") == 2
     assert main(["journal", str(tmp_path / "work"), "--report", str(page)]) == 0
     assert "where the images lie was not told" in page.read_text()
+
+
+def test_a_time_limit_is_drawn_where_the_run_came_near_it_and_told_where_not() -> None:
+    from mkpc_kaggle import figures
+
+    for limit, drawn in ((60.0, True), (8.75 * 3600, False), (None, False)):
+        axes = figures.draw_budget({"sweep": [5.0, 9.0], "deepen": [30.0]}, {"fault": [12.0]}, limit).axes[0]
+        assert ("time limit" in axes.get_legend_handles_labels()[1]) == drawn
+        assert ("the limit is 8.75 hours" in axes.get_title("left")) == (limit == 8.75 * 3600)
+        assert axes.get_xlabel() == "seconds"
 
 
 def test_a_strip_shows_both_images_at_one_height() -> None:

@@ -35,6 +35,19 @@ COMMAND --help tells more.
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; the exit status: 0 done, 1 a check failed, 2 bad input, 130 / 143 ended by a signal."""
     started = time.monotonic()
+    parsed = make_parser().parse_args(arguments)
+    parsed.started = started
+    with warnings.catch_warnings():
+        warnings.showwarning = _show_warning
+        try:
+            return int(parsed.run(parsed))
+        except UserError as error:
+            print(f"error: {error}", file=sys.stderr)
+            return EXIT_BAD_INPUT
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """The parser of all commands."""
     parser = argparse.ArgumentParser(
         "mkpc_kaggle", description=_DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -50,15 +63,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         )
         command.add_arguments(sub)
         sub.set_defaults(run=command.run)
-    parsed = parser.parse_args(arguments)
-    parsed.started = started
-    with warnings.catch_warnings():
-        warnings.showwarning = _show_warning
-        try:
-            return int(parsed.run(parsed))
-        except UserError as error:
-            print(f"error: {error}", file=sys.stderr)
-            return EXIT_BAD_INPUT
+    return parser
 
 
 def leave(status: int, *, at_rest: bool) -> int:

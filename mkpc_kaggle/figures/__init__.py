@@ -6,7 +6,7 @@ recipes do; ``canvas`` is what they share.
 
 from mkpc_kaggle.figures.canvas import new_figure, save, to_jpeg, to_svg
 from mkpc_kaggle.figures.pair import draw_pair, draw_strip
-from mkpc_kaggle.figures.run import draw_budget, draw_crops, draw_groups, draw_parts
+from mkpc_kaggle.figures.run import draw_budget, draw_crops, draw_groups, draw_parts, draw_upgrades
 from mkpc_kaggle.figures.scores import draw_errors, draw_gains, draw_scores
 from mkpc_kaggle.figures.steps import (
     draw_both,
@@ -40,6 +40,7 @@ __all__ = [
     "draw_sizes",
     "draw_stage",
     "draw_strip",
+    "draw_upgrades",
     "draw_views",
     "new_figure",
     "save",

@@ -21,6 +21,9 @@ from mkpc_kaggle.figures.canvas import (
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+MOST_EMPTY = 4
+"""How many times as long as the run a time limit may be to be drawn beside it."""
+
 
 def draw_parts(parts: Mapping[str, float]) -> "Figure":
     """Bars: the seconds of each part of the work."""
@@ -38,11 +41,18 @@ def draw_parts(parts: Mapping[str, float]) -> "Figure":
 def draw_budget(
     ended: Mapping[str, Sequence[float]], marks: Mapping[str, Sequence[float]], limit: float | None
 ) -> "Figure":
-    """Jobs ended over time, one colour a phase: ``ended`` and ``marks`` are seconds since the start by name."""
+    """Jobs ended over time, one colour a phase: ``ended`` and ``marks`` are seconds since the start by name.
+
+    A limit that the run came nowhere near is told and not drawn: the jobs would have no room beside it.
+    """
+    from matplotlib.ticker import MaxNLocator
+
     figure = new_figure(5.6, 3.2)
-    unit, name = _time_unit(max([limit or 0.0, *(second for times in ended.values() for second in times)]))
+    latest = max((second for times in (*ended.values(), *marks.values()) for second in times), default=0.0)
+    is_near = limit is not None and limit < MOST_EMPTY * latest
+    unit, name = _time_unit(limit if limit is not None and is_near else latest)
     total = sum(map(len, ended.values()))
-    axes = plain_axes(figure, f"{total} jobs ended, over {name} since the start")
+    axes = plain_axes(figure, f"{total} jobs ended, over {name} since the start{_far(limit, is_near)}")
     below = 0
     for colour, (phase, times) in zip(CYCLE, ended.items(), strict=False):
         # A flat piece is time without a result; 300 steps are as many as can be seen.
@@ -54,11 +64,42 @@ def draw_budget(
         for number, second in enumerate(times[:MOST_LINES]):
             label = what if number == 0 else None
             axes.axvline(second / unit, color=colour, linewidth=1, linestyle=style, label=label)
-    if limit is not None:
+    if limit is not None and is_near:
         axes.axvline(limit / unit, color=INK, linewidth=1.2, label="time limit")
     axes.set_xlim(left=0)
     axes.set_ylim(bottom=0)
+    axes.yaxis.set_major_locator(MaxNLocator(integer=True))
     axes.set_xlabel(name, color=INK)
+    legend(axes)
+    return figure
+
+
+def _far(limit: float | None, is_near: bool) -> str:
+    if limit is None or is_near:
+        return ""
+    unit, name = _time_unit(limit)
+    return f"; the limit is {limit / unit:.3g} {name}"
+
+
+def draw_upgrades(before: Sequence[int], after: Sequence[int]) -> "Figure":
+    """A dot a pair: its inliers before and after it was upgraded; above the line it has more."""
+    figure = new_figure(5.6, 3.8)
+    axes = plain_axes(figure, f"inliers of {len(before)} upgraded pairs, before and after")
+    some = sample(np.ones(len(before), bool), 500)
+    axes.scatter(
+        np.asarray(before)[some], np.asarray(after)[some], s=16, color=CLUSTERS[3], alpha=0.7, linewidths=0
+    )
+    most = 1.3 * max(10, *before, *after)
+    axes.plot([0, most], [0, most], color=OUTLIER, linewidth=1, linestyle="--", label="as before")
+    for scale, limit, name in (
+        (axes.set_xscale, axes.set_xlim, axes.xaxis),
+        (axes.set_yscale, axes.set_ylim, axes.yaxis),
+    ):
+        scale("symlog", linthresh=10)
+        limit(0, most)
+        name.set_major_formatter("{x:.0f}")
+    axes.set_xlabel("before", color=INK)
+    axes.set_ylabel("after", color=INK)
     legend(axes)
     return figure
 

@@ -1,6 +1,7 @@
 """How well recipes do: scores, gains, errors."""
 
 from collections.abc import Iterator, Sequence
+from itertools import cycle, islice
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -24,7 +25,7 @@ def draw_scores(validations: Sequence["Validation"]) -> "Figure":
     for place, (style, one) in enumerate(zip(_styles(), validations, strict=False)):
         values = [*(scene.maa for scene in one.scenes), one.maa]
         axes.plot(values, _beside(len(values), place, len(validations)), **style, linestyle="", label=one.recipe)
-    axes.set_xlim(0, 1)
+    axes.set_xlim(-0.02, 1.02)
     axes.set_xlabel("mAA", color=INK)
     _legend_below(figure)
     return figure
@@ -60,20 +61,14 @@ def draw_errors(validations: Sequence["Validation"]) -> "Figure":
     for axes, (kind, measure, thresholds, limits) in zip(panels, kinds, strict=True):
         plain(axes, f"pairs whose {kind} is less than x off")
         axes.axvspan(thresholds[0], thresholds[-1], color=DROPPED, alpha=0.2, linewidth=0)
-        axes.text(
-            *(np.sqrt(thresholds[0] * thresholds[-1]), 2),
-            "thresholds\nof the mAA",
-            ha="center",
-            va="bottom",
-            fontsize=9,
-            color=INK,
-        )
-        for style, dashes, one in zip(_styles(), ("-", "--", "-.", ":", "-", "--"), validations, strict=False):
+        middle = float(np.sqrt(thresholds[0] * thresholds[-1]))
+        axes.text(middle, 2, "thresholds\nof the mAA", ha="center", va="bottom", fontsize=9, color=INK)
+        for style, dashes, one in zip(_styles(), cycle(("-", "--", "-.", ":")), validations, strict=False):
             x, share = _cumulated([getattr(error, kind) for error in one.errors], limits)
             axes.step(
                 x, share, where="post", color=style["color"], linestyle=dashes, linewidth=2, label=one.recipe
             )
-        axes.set(xscale="log", xlim=limits, ylim=(0, 100))
+        axes.set(xscale="log", xlim=limits, ylim=(0, 101))
         axes.xaxis.set_major_formatter("{x:g}")
         axes.set_xlabel(f"{kind} error in {measure}", color=INK)
     panels[0].set_ylabel("per cent of the pairs", color=INK)
@@ -108,8 +103,8 @@ def _beside(rows: int, place: int, places: int) -> NDArray[np.float64]:
 
 
 def _styles(start: int = 0) -> Iterator[dict[str, Any]]:
-    """One for each recipe, the same in all figures; told apart by shape, too."""
-    for colour, marker in zip(CYCLE[start:], "osD^vP"[start:], strict=False):
+    """One for each recipe, the same in all figures; told apart by shape, too; 42 before they return."""
+    for colour, marker in islice(zip(cycle(CYCLE), cycle("osD^vPX"), strict=False), start, None):
         yield {"color": colour, "marker": marker, "markersize": 7}
 
 

@@ -73,10 +73,8 @@ def draw_clusters(images: Images, points: tuple[Points, Points], clusters: tuple
             _dots(axes, xy[found.labels == label], CLUSTERS[rank % len(CLUSTERS)])
         for label in _by_size(found):
             _tag(axes, xy[found.labels == label], str(found.sizes[label]))
-        _title(
-            axes,
-            f"image {number}, clusters found: {len(found.sizes)}\nnumbers: their points; {len(noise)} points are noise",
-        )
+        counts = f"numbers: their points; {len(noise)} points are noise"
+        _title(axes, f"image {number}, clusters found: {len(found.sizes)}\n{counts}")
     return figure
 
 

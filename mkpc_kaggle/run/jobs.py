@@ -1,7 +1,7 @@
 """What the engine hands to a worker and what it gets back: plain values, so that they can cross processes."""
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
@@ -110,7 +110,7 @@ class UnitRecord:
 class Record:
     """What is known of one pair: its F (its E, where the pair has intrinsics) and how it came about.
 
-    ``failure`` is empty, or says why ``F`` is the fallback. The seconds are those of the last job on the pair.
+    ``failure`` is empty, or says why ``F`` is the fallback. The seconds are those of all jobs on the pair.
     ``before`` is the number of inliers that it had when it was first upgraded; ``None`` if it never was.
     """
 
@@ -127,6 +127,17 @@ class Record:
     @classmethod
     def untouched(cls, index: int, reason: str = NOT_REACHED) -> "Record":
         return cls(index, FALLBACK_FUNDAMENTAL.copy(), reason)
+
+    def after(self, former: "Record", before: int | None) -> "Record":
+        """The record of a later job on a pair: with the seconds of the ``former`` ones, and their regions."""
+        return replace(
+            self,
+            regions=self.regions or former.regions,
+            decode_seconds=former.decode_seconds + self.decode_seconds,
+            cluster_seconds=former.cluster_seconds + self.cluster_seconds,
+            estimate_seconds=former.estimate_seconds + self.estimate_seconds,
+            before=before,
+        )
 
     @property
     def reached(self) -> bool:

@@ -295,8 +295,7 @@ class Planner:
         if len(record.units) <= len(former.units) and (former.reached or not record.reached):
             return None
         self._losses.prove(result.unit for result in outcome.results)
-        before = inliers_before(former) if phase is Phase.UPGRADE else former.before
-        record = replace(record, before=before, regions=record.regions or former.regions)
+        record = record.after(former, inliers_before(former) if phase is Phase.UPGRADE else former.before)
         self._put(record)
         return Outcome(record, outcome.results)
 

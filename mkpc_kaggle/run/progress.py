@@ -58,7 +58,10 @@ class Bar:
 
 
 class Lines:
-    """A line when a pass begins, every :data:`LINE_SECONDS` of the budget's clock, and when the pass ends."""
+    """A line when a pass begins, every :data:`LINE_SECONDS` of the budget's clock, and in the end.
+
+    A pass begins when the one before is done, so that no line need say so.
+    """
 
     def __init__(self, stream: TextIO, budget: Budget) -> None:
         self._stream = stream
@@ -69,11 +72,10 @@ class Lines:
 
     def show(self, phase: Phase, done: int, total: int) -> None:
         began = phase is not self._phase
-        if began:
-            self.close()
-            self._phase = phase
+        self._phase = phase
         left = f", budget left {format_duration(self._budget.left())}" if isfinite(self._budget.limit) else ""
-        self._waiting = f"{phase}: {done} of {total} pairs{left}"
+        # A pass is opened while jobs of the one before are out: what it has done means little yet.
+        self._waiting = f"{phase}: {total} pairs{left}" if began else f"{phase}: {done} of {total} pairs{left}"
         if began or self._budget.clock() - self._written >= LINE_SECONDS:
             self.close()
 

@@ -1,0 +1,121 @@
+"""What the engine costs beside the matchers, and how much of MAGSAC's time hides behind matching.
+
+python -m benchmarks.engine --test-dir DIR [--recipe classical] [--weights DIR] [--pairs 100]
+
+A run in this process, as ``submit --workers 0`` makes it, journal and submission included. The first job, which
+loads and warms up, is left out. What is no unit's own time, no clustering and no waiting for an image is the
+engine's.
+"""
+
+import argparse
+import tempfile
+import threading
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from mkpc_kaggle.assembly import Assembly, assemble
+from mkpc_kaggle.competition import Pair, read_test_side, write_submission
+from mkpc_kaggle.run.budget import Budget
+from mkpc_kaggle.run.engine import Engine
+from mkpc_kaggle.run.in_process import InProcessPool
+from mkpc_kaggle.run.jobs import Finished, Lost, Record
+from mkpc_kaggle.run.journal import Journal
+
+
+class WatchedPool(InProcessPool):
+    """Keeps what comes back, and when."""
+
+    def __init__(self, assembly: Assembly) -> None:
+        super().__init__(assembly.pipeline, assembly.recipe)
+        self.came: list[tuple[float, Finished]] = []
+
+    def next(self, until: float) -> Finished | Lost | None:
+        back = super().next(until)
+        if isinstance(back, Finished):
+            self.came.append((time.monotonic(), back))
+        return back
+
+
+@dataclass(frozen=True)
+class Spent:
+    """Seconds by what they went into, the first job's left out; ``wall`` is from its end to the last one's.
+
+    ``tail`` are MAGSAC's on the last job, which nothing can hide.
+    """
+
+    jobs: int
+    wall: float
+    units: float
+    clusters: float
+    images: float
+    magsac: float
+    tail: float
+
+    @classmethod
+    def of(cls, came: Sequence[tuple[float, Finished]]) -> "Spent":
+        rest = [finished for _, finished in came[1:]]
+        records = [outcome.record for finished in rest for outcome in finished.outcomes]
+        return cls(
+            len(rest),
+            came[-1][0] - came[0][0],
+            sum(seconds for finished in rest for _, seconds in finished.measured()),
+            sum(record.cluster_seconds for record in records),
+            sum(record.decode_seconds for record in records),
+            sum(record.estimate_seconds for record in records),
+            sum(outcome.record.estimate_seconds for outcome in rest[-1].outcomes),
+        )
+
+    @property
+    def engine(self) -> float:
+        return self.wall - self.tail - self.units - self.clusters - self.images
+
+    @property
+    def overlap(self) -> float:
+        """How much longer it would have taken one thing after the other."""
+        return self.units + self.clusters + self.images + self.magsac - self.wall
+
+
+def run(pairs: Sequence[Pair], assembly: Assembly, directory: Path) -> Spent:
+    """A run from start to end in ``directory``."""
+    pool = WatchedPool(assembly)
+    journal = Journal(directory, {"benchmark": 1}, pairs=pairs)
+
+    def publish(records: Sequence[Record]) -> None:
+        matrices = {pair.id: record.F for pair, record in zip(pairs, records, strict=True)}
+        write_submission(directory / "submission.csv", matrices)
+
+    try:
+        budget = Budget(time.monotonic())
+        engine = Engine(
+            pairs, assembly.recipe, pool, journal, budget, publish=publish, interrupt=threading.Event()
+        )
+        engine.run()
+    finally:
+        pool.close()
+        journal.close()
+    return Spent.of(pool.came)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--test-dir", type=Path, required=True)
+    parser.add_argument("--recipe", default="classical")
+    parser.add_argument("--weights", type=Path, action="append", default=[])
+    parser.add_argument("--pairs", type=int, default=100, help="at most (default: 100)")
+    arguments = parser.parse_args()
+    pairs = read_test_side(arguments.test_dir)[: arguments.pairs]
+    assembly = assemble(arguments.recipe, weights=arguments.weights)
+    with tempfile.TemporaryDirectory() as directory:
+        spent = run(pairs, assembly, Path(directory))
+    print(
+        f"{len(pairs)} pairs, recipe {assembly.recipe.name}, {spent.jobs} jobs after the first: {spent.wall:.1f} s"
+    )
+    print(f"units {spent.units:.1f} s, clusters {spent.clusters:.2f} s, waiting for images {spent.images:.2f} s")
+    print(f"engine: {spent.engine:.2f} s, {100 * spent.engine / spent.units:.2f} % of the units' time")
+    print(f"MAGSAC: {spent.magsac:.1f} s; one after the other all would have taken {spent.overlap:.1f} s longer")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,82 @@
+"""What the pages say is what the program says: messages, commands and options."""
+
+import argparse
+import ast
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from IPython.core.inputtransformer2 import TransformerManager
+
+from mkpc_kaggle.cli import make_parser
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+
+
+def texts_of(source: str) -> Iterator[str]:
+    """The texts of a program, with {} for what is put into them; adjoining ones are one."""
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.JoinedStr):
+            parts = [part.value if isinstance(part, ast.Constant) else "{}" for part in node.values]
+            yield "".join(map(str, parts))
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+            yield node.value
+
+
+def everything_said() -> str:
+    sources = [path.read_text(encoding="utf-8") for path in sorted((ROOT / "mkpc_kaggle").rglob("*.py"))]
+    cells = json.loads((ROOT / "notebooks" / "submission.ipynb").read_text(encoding="utf-8"))["cells"]
+    code = ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
+    python = [TransformerManager().transform_cell(text) for text in code]
+    return "\n".join(text for source in [*sources, *python] for text in texts_of(source))
+
+
+def messages() -> list[str]:
+    """What stands in backticks in the first column of the table of messages."""
+    rows = re.findall(r"^\| (.*?) \|", (ROOT / "docs" / "troubleshooting.md").read_text(encoding="utf-8"), re.M)
+    return [message for row in rows for message in re.findall(r"`([^`]+)`", row) if not message.startswith("--")]
+
+
+def pattern_of(message: str) -> str:
+    """Three dots stand for anything, F for the name of a model."""
+    literal = re.escape(message).replace(r"\ ", " ").replace(r"\.\.\.", ".*")
+    return re.sub(r"\bF\b", r"\\{\\}", literal)
+
+
+def test_every_message_of_the_troubleshooting_page_is_one_of_the_programs() -> None:
+    said = everything_said()
+    known = messages()
+    assert len(known) > 25
+    unknown = [one for one in known if not re.search(pattern_of(one), said)]
+    assert unknown == []
+
+
+def options_of(parser: argparse.ArgumentParser) -> set[str]:
+    return {text for action in parser._actions for text in action.option_strings}
+
+
+def subcommands() -> dict[str, argparse.ArgumentParser]:
+    (action,) = [one for one in make_parser()._actions if isinstance(one, argparse._SubParsersAction)]
+    return dict(action.choices)
+
+
+def commands(page: Path) -> Iterator[tuple[str, list[str]]]:
+    """Each command of ours on a page, and the options that it is given there."""
+    text = page.read_text(encoding="utf-8").replace("\\\n", " ")
+    for line in re.findall(r"(?:python -m mkpc_kaggle [a-z]|make_submission\.py )[^`\n#;]*", text):
+        name = "submit" if line.startswith("make") else line.split()[3]
+        yield name, re.findall(r"(?<= )--[a-z-]+", line)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_pages_name_commands_and_options_that_there_are(page: Path) -> None:
+    known = subcommands()
+    for name, options in commands(page):
+        assert name in known, name
+        inner = [one for one in known[name]._actions if isinstance(one, argparse._SubParsersAction)]
+        parsers = [known[name], *(parser for one in inner for parser in one.choices.values())]
+        have = set().union(*map(options_of, parsers))
+        assert set(options) <= have, (name, set(options) - have)

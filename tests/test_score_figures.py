@@ -1,0 +1,66 @@
+"""The figures of scores, gains and errors show the numbers that they are given."""
+
+from math import inf
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mkpc_kaggle import figures
+from mkpc_kaggle.compare import Comparison
+from mkpc_kaggle.geometry.metrics import PoseError
+from mkpc_kaggle.validate import PairScore, SceneScore, Validation
+
+
+def scene(name: str, *rotations: float) -> SceneScore:
+    """Pairs with these rotation errors, a tenth as many metres off; infinite: failed."""
+    scores = [PairScore(f"{name} {i}", 0.5, PoseError(r, r, r / 10)) for i, r in enumerate(rotations)]
+    return SceneScore(name, tuple(scores))
+
+
+FIRST = Validation("first", (scene("a", 0.5, 0.5, 20.0, inf), scene("b", 2.5, 2.5)))
+SECOND = Validation("second", (scene("a", 0.5, 0.5, 0.5, 0.5), scene("b", 2.5, 2.5)))
+
+
+def test_scores_stand_at_their_mean_average_accuracy() -> None:
+    axes = figures.draw_scores([FIRST, SECOND]).axes[0]
+    shown = {line.get_label(): list(line.get_xdata()) for line in axes.lines}
+    assert shown["first"] == pytest.approx([0.5, 0.8, 0.65])
+    assert shown["second"] == pytest.approx([1.0, 0.8, 0.9])
+    assert [label.get_text() for label in axes.get_yticklabels()] == ["a", "b", "mean over scenes"]
+
+
+def test_gains_stand_at_their_differences_with_intervals_around_them() -> None:
+    comparison = Comparison((FIRST, SECOND))
+    axes = figures.draw_gains(comparison).axes[0]
+    (bar,) = axes.containers
+    points, _, (spans,) = bar.lines
+    assert points.get_xdata() == pytest.approx([0.5, 0, 0.25])
+    shown = [(segment[0][0], segment[1][0]) for segment in spans.get_segments()]
+    found = [comparison.difference(1, "a"), comparison.difference(1, "b"), comparison.difference(1)]
+    assert np.array(shown) == pytest.approx(np.array([(one.low, one.high) for one in found]))
+
+
+def test_an_error_curve_has_the_share_of_pairs_below_and_leaves_failures_out() -> None:
+    rotation, translation = figures.draw_errors([FIRST, SECOND]).axes
+    curve = next(line for line in rotation.lines if line.get_label() == "first")
+    shares = dict(zip(curve.get_xdata(), curve.get_ydata(), strict=True))  # of equal x, the last
+    assert shares == pytest.approx({0.05: 0, 0.5: 200 / 6, 2.5: 400 / 6, 20: 500 / 6, 180: 500 / 6})
+    assert translation.get_xlabel() == "translation error in metres"
+    assert max(line.get_ydata()[-1] for line in translation.lines) == 100
+
+
+def test_errors_smaller_than_can_be_shown_count_from_the_left_edge() -> None:
+    exact = Validation("exact", (scene("a", 0.0, 1e-9),))
+    line = figures.draw_errors([exact]).axes[0].lines[0]
+    assert line.get_ydata()[-1] == 100
+    assert min(line.get_xdata()) == 0.05
+
+
+def test_many_recipes_are_told_apart_and_drawn(tmp_path: Path) -> None:
+    validations = [Validation(f"recipe {number}", FIRST.scenes) for number in range(8)]
+    for number, figure in enumerate((figures.draw_scores(validations), figures.draw_errors(validations))):
+        drawn = [line for line in figure.axes[0].lines if line.get_label().startswith("recipe")]
+        assert len(drawn) == 8
+        assert len({(line.get_color(), line.get_linestyle(), line.get_marker()) for line in drawn}) == 8
+        figures.save(figure, tmp_path / f"{number}.png")
