@@ -4,6 +4,7 @@ import sys
 from pathlib import Path
 
 import nbformat
+import pytest
 from kaggle_image import environment
 from offline_notebook import execute, needs_namespaces, outputs, pictures, printed, with_pictures_alone
 
@@ -31,6 +32,16 @@ def test_the_tour_runs_on_a_train_side_without_a_network(demo: DemoSet, tmp_path
     executed = execute(TOUR, tmp_path / "executed.ipynb", sys.executable, tmp_path, variables)
     assert pictures(executed) == figures_of(executed) == 14
     assert printed(executed) == ""
+
+
+@needs_namespaces
+@pytest.mark.slow
+def test_without_a_train_side_the_tour_renders_its_own(tmp_path: Path) -> None:
+    variables = environment(PYTHONPATH=str(ROOT), TMPDIR=str(tmp_path))
+    for name in ("MKPC_TRAIN_DIR", "MKPC_PAIR", "MKPC_OTHER_PAIR", "MKPC_RECIPE"):
+        variables.pop(name, None)
+    executed = execute(TOUR, tmp_path / "executed.ipynb", sys.executable, tmp_path, variables)
+    assert pictures(executed) == figures_of(executed)
 
 
 def test_the_tour_is_committed_with_all_its_pictures_and_nothing_else() -> None:
