@@ -14,6 +14,7 @@ from mkpc_kaggle.competition import (
     read_submission,
     read_test_side,
     read_train_side,
+    read_true_pair,
     submission_problems,
     write_submission,
 )
@@ -186,6 +187,25 @@ def test_pairs_below_the_covisibility_are_left_out_and_those_at_it_are_not(train
 )
 def test_pairs_per_scene_are_spread_over_the_table(train, most, chosen):
     assert keys(*read_train_side(train, pairs_per_scene=most)) == chosen
+
+
+def test_a_pair_is_found_by_its_id_whatever_its_covisibility(train):
+    scenes = read_train_side(train, min_covisibility=0)
+    scarce = min(scenes[0].pairs, key=lambda true: true.covisibility)
+    assert scarce.covisibility < 0.1
+    scene, true = read_true_pair(train, scarce.pair.id)
+    assert (scene.name, scene.metres_per_unit, true.pair) == ("s", 2.5, scarce.pair)
+
+
+@pytest.mark.parametrize("pair", ["s;a-b", "s;", "s;b-a-c"])
+def test_an_unknown_pair_is_refused_with_known_ones(train, pair):
+    with pytest.raises(UserError, match=rf"unknown pair '{pair}'; known: s;b-a, "):
+        read_true_pair(train, pair)
+
+
+def test_a_pair_of_an_unknown_scene_is_refused_with_the_known_ones(train):
+    with pytest.raises(UserError, match=r"unknown scene 'b-a'; known: absent, s"):
+        read_true_pair(train, "b-a")
 
 
 def test_an_unknown_scene_is_refused_with_the_known_ones(train):

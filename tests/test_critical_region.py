@@ -17,6 +17,7 @@ from mkpc_kaggle.geometry.critical_region import (
     cluster_points,
     critical_region,
     expand_box,
+    find_clusters,
     keep_clusters,
 )
 
@@ -124,6 +125,22 @@ def test_comparing_with_the_last_kept_goes_on_where_the_largest_stops():
 def test_clusters_of_one_size_keep_their_order_and_one_cluster_is_kept_whatever_the_share():
     assert_array_equal(keep_clusters(np.array([7, 9, 7, 9]), 0.05), [1, 3, 0, 2])
     assert_array_equal(keep_clusters(np.array([7]), 2.0), [0])
+
+
+def test_clusters_tell_their_points_from_noise_and_those_that_are_kept():
+    points = np.concatenate([block(600, 600, 640, 640, 5), lone(3), block(100, 100, 140, 140, 101)])
+    clusters = find_clusters(points, SQUARE, PAPER)
+    assert_array_equal(clusters.sizes, [5, 101])
+    assert_array_equal(clusters.labels, [0] * 5 + [-1] * 3 + [1] * 101)
+    assert_array_equal(clusters.kept, [1])  # 5 / 101 < 0.05
+    assert_array_equal(clusters.keeps, [False] * 8 + [True] * 101)
+
+
+@pytest.mark.parametrize("points", [NOTHING, lone(30)], ids=["no points", "noise alone"])
+def test_where_nothing_clusters_nothing_is_kept(points):
+    clusters = find_clusters(points, SQUARE, PAPER)
+    assert len(clusters.labels) == len(clusters.keeps) == len(points)
+    assert len(clusters.sizes) == len(clusters.kept) == clusters.keeps.sum() == 0
 
 
 def test_x_is_normalised_by_the_width_and_y_by_the_height():

@@ -190,6 +190,15 @@ def test_the_matches_of_all_units_follow_one_another_and_the_inliers_are_among_t
     assert all(result.failure == "" and result.seconds > 0 for result in match.results)
 
 
+def test_matches_know_the_stage_that_found_them():
+    match = two_stage_match()
+    first, second = (result.matches for result in match.results)
+    assert same(match.matches[match.in_stage(1)], first)
+    assert same(match.matches[match.in_stage(2)], second)
+    nothing = replace(match, results=())
+    assert nothing.in_stage(1).shape == (0,)
+
+
 def test_a_homography_comes_out_as_it_is():
     match = TwoStageMatcher(SIFT)(*pair(), model="H")
     assert match.estimate.model is Model.H

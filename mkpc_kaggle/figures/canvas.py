@@ -110,15 +110,23 @@ def show(axes: "Axes", image: Image) -> None:
     axes.set_yticks([])
 
 
-def side_by_side(images: Sequence[Image], extra: float = 0.3) -> "tuple[Figure, Sequence[Axes]]":
-    """Pictures in a row at one height, as wide as a notebook; ``extra`` inches are for titles and the like."""
+def side_by_side(images: Sequence[Image], title_lines: int = 1) -> "tuple[Figure, Sequence[Axes]]":
+    """Pictures in a row at one height, as wide as a notebook, with room for titles of that many lines above."""
     aspects = [image.size.width / image.size.height for image in images]
-    gaps = 0.1 * (len(images) + 1)
-    figure = new_figure(WIDTH, min((WIDTH - gaps) / sum(aspects), 5.0) + extra)
-    row = figure.subplots(1, len(images), width_ratios=aspects, squeeze=False)[0]
-    for axes, image in zip(row, images, strict=True):
+    height = min((WIDTH - 0.1 * (len(images) + 1)) / sum(aspects), 5.0)
+    gap = (WIDTH - height * sum(aspects)) / (len(images) + 1)
+    total = 0.1 + height + 0.15 + 0.17 * title_lines
+    figure = new_figure(WIDTH, total)
+    figure.set_layout_engine(
+        "none"
+    )  # the places are known, and room would be lost around pictures of fixed aspect
+    row, left = [], gap
+    for image, aspect in zip(images, aspects, strict=True):
+        axes = figure.add_axes((left / WIDTH, 0.1 / total, height * aspect / WIDTH, height / total))
         show(axes, image)
-    return figure, list(row)
+        row.append(axes)
+        left += height * aspect + gap
+    return figure, row
 
 
 def sample(mask: NDArray[np.bool_], most: int) -> NDArray[np.intp]:

@@ -42,7 +42,7 @@ def draw_images(images: Images) -> "Figure":
     """The two photographs."""
     figure, row = side_by_side(images)
     for number, (axes, image) in enumerate(zip(row, images, strict=True)):
-        axes.set_title(f"image {number}: {image.size.width} x {image.size.height} pixels", loc="left")
+        _title(axes, f"image {number}: {image.size.width} x {image.size.height} pixels")
     return figure
 
 
@@ -50,26 +50,22 @@ def draw_stage(images: Images, match: PairMatch, stage: int) -> "Figure":
     """The matches that one stage found, coloured by inlier; those of stage 2 on the crops."""
     mask = match.in_stage(stage)
     inliers = match.estimate.inliers[mask]
-    cropped = stage == 2 and match.regions is not None
-    boxes = [region.box for region in match.regions or ()] if cropped else [Box.whole(i.size) for i in images]
+    regions = match.regions if stage == 2 else None
+    boxes = [region.box for region in regions] if regions else [Box.whole(image.size) for image in images]
     figure, row = side_by_side([_cut(image, box) for image, box in zip(images, boxes, strict=True)])
     # The cut is shown as it is; points are moved with it.
     shift0, shift1 = (np.array([box.left, box.top], np.float32) for box in boxes)
     found = match.matches[mask]
     drawn = connect(row, Matches(found.points0 - shift0, found.points1 - shift1, found.scores), inliers)
-    what = "on the crops" if cropped else "on the whole images"
-    figure.suptitle(
-        f"stage {stage}, {what}: {len(found)} matches, {np.count_nonzero(inliers)} inliers; {drawn}",
-        x=0.01,
-        ha="left",
-        fontsize=11,
-    )
+    what = "on the crops" if any(region.cropped for region in regions or ()) else "on the whole images"
+    counts = f"{len(found)} matches, {np.count_nonzero(inliers)} inliers"
+    _title(row[0], f"stage {stage}, {what}: {counts}; {drawn}")
     return figure
 
 
 def draw_clusters(images: Images, points: tuple[Points, Points], clusters: tuple[Clusters, Clusters]) -> "Figure":
     """All clusters of each image, one colour each with its size beside it; noise as grey crosses."""
-    figure, row = side_by_side(images, extra=0.65)
+    figure, row = side_by_side(images, title_lines=2)
     for number, (axes, xy, found) in enumerate(zip(row, points, clusters, strict=True)):
         noise = xy[found.labels < 0]
         _crosses(axes, noise, DROPPED)
@@ -77,10 +73,8 @@ def draw_clusters(images: Images, points: tuple[Points, Points], clusters: tuple
             _dots(axes, xy[found.labels == label], CLUSTERS[rank % len(CLUSTERS)])
         for label in _by_size(found):
             _tag(axes, xy[found.labels == label], str(found.sizes[label]))
-        axes.set_title(
-            f"image {number}: {len(found.sizes)} clusters\nnumbers: their points; {len(noise)} points are noise",
-            loc="left",
-        )
+        counts = f"numbers: their points; {len(noise)} points are noise"
+        _title(axes, f"image {number}, clusters found: {len(found.sizes)}\n{counts}")
     return figure
 
 
@@ -99,6 +93,7 @@ def _size_bars(axes: "Axes", clusters: Clusters, config: MkpcConfig) -> None:
     axes.set_xlabel("clusters by size; green: kept; orange, hatched: dropped", color=INK)
     axes.set_ylabel("points", color=INK)
     if not len(sizes):
+        axes.set(xticks=[], yticks=[])
         return
     ranks = np.arange(1, len(sizes) + 1)
     for part, colour, hatch in ((slice(kept), INLIER, ""), (slice(kept, None), OUTLIER, "//")):
@@ -121,7 +116,7 @@ def draw_boxes(
     images: Images, points: tuple[Points, Points], clusters: tuple[Clusters, Clusters], config: MkpcConfig
 ) -> "Figure":
     """The bounding box of the kept clusters as it is, and with Crop Area Expansion; dropped points as crosses."""
-    figure, row = side_by_side(images, extra=0.65)
+    figure, row = side_by_side(images, title_lines=2)
     for number, (axes, image, xy, found) in enumerate(zip(row, images, points, clusters, strict=True)):
         kept = xy[found.keeps]
         _crosses(axes, xy[~found.keeps], OUTLIER)
@@ -134,7 +129,7 @@ def draw_boxes(
             add_box(axes, tight, edgecolor="white", linestyle="--", linewidth=1.5)
             title = f"image {number}: dashed, kept points, {tight.size.width} x {tight.size.height}\n"
             title += f"yellow, expanded, {wide.size.width} x {wide.size.height}"
-        axes.set_title(title, loc="left")
+        _title(axes, title)
     return figure
 
 
@@ -144,17 +139,16 @@ def draw_views(images: Images, regions: tuple[CriticalRegion, CriticalRegion], u
     boxes = [*pairs[0], *pairs[1]]
     views = [unit.view(box, 1) for box in boxes]
     pictures = [Image("", view.render(images[place // 2].pixels)) for place, view in enumerate(views)]
-    figure, row = side_by_side(pictures, extra=0.65)
-    for place, (axes, view) in enumerate(zip(row, views, strict=True)):
-        region = regions[place // 2]
-        what = f"crop: {region.reason}" if place % 2 and not region.cropped else ("crop" if place % 2 else "whole")
-        axes.set_title(f"image {place // 2}, {what}\n{view.scale[0]:.2f} times enlarged", loc="left", fontsize=10)
+    figure, row = side_by_side(pictures, title_lines=2)
+    names = [("whole", f"crop ({region.reason})" if not region.cropped else "crop") for region in regions]
+    for place, (axes, view, what) in enumerate(zip(row, views, [*names[0], *names[1]], strict=True)):
+        _title(axes, f"image {place // 2}, {what}\n{view.scale[0]:.2f} times enlarged")
     return figure
 
 
 def draw_both(images: Images, match: PairMatch) -> "Figure":
     """The points of both stages on the whole images: inliers in the colour of their stage, outliers grey."""
-    figure, row = side_by_side(images, extra=0.65)
+    figure, row = side_by_side(images, title_lines=2)
     inliers = match.estimate.inliers
     for axes, points in zip(row, (match.matches.points0, match.matches.points1), strict=True):
         _crosses(axes, points[~inliers], DROPPED)
@@ -166,9 +160,9 @@ def draw_both(images: Images, match: PairMatch) -> "Figure":
         f"{np.count_nonzero(match.in_stage(stage) & inliers)} inliers"
         for stage, what in ((1, "blue dots"), (2, "orange triangles"))
     ]
-    row[0].set_title("\n".join(told), loc="left", fontsize=10)
+    _title(row[0], "\n".join(told))
     total = f"together: {len(match.matches)} points, {match.estimate.inlier_count} inliers"
-    row[1].set_title(f"{total}\ngrey crosses: outliers", loc="left", fontsize=10)
+    _title(row[1], f"{total}\ngrey crosses: outliers")
     return figure
 
 
@@ -183,10 +177,10 @@ def draw_epipolar(
 
     The points are matches, far from each other; in image 1 the point that each was matched with is marked.
     """
-    figure, row = side_by_side([images[0], *[images[1]] * len(fundamentals)], extra=0.65)
+    figure, row = side_by_side([images[0], *[images[1]] * len(fundamentals)], title_lines=2)
     chosen = matches[_far_apart(matches.points0, count)]
     _numbered(row[0], chosen.points0)
-    row[0].set_title(f"image 0: {len(chosen)} matched points", loc="left", fontsize=10)
+    _title(row[0], f"image 0: {len(chosen)} matched points")
     for axes, (name, F) in zip(row[1:], fundamentals.items(), strict=True):
         for place, point in enumerate(chosen.points0):
             _line(axes, F, point, color=CYCLE[place % len(CYCLE)], linewidth=2)
@@ -196,7 +190,7 @@ def draw_epipolar(
         size = images[1].size
         axes.set(xlim=(-0.5, size.width - 0.5), ylim=(size.height - 0.5, -0.5))
         known = "\nwhite, dashed: the true lines" if truth is not None else ""
-        axes.set_title(f"image 1: lines of {name}{known}", loc="left", fontsize=10)
+        _title(axes, f"image 1: lines of {name}{known}")
     return figure
 
 
@@ -206,28 +200,33 @@ def draw_plane(images: Images, matches: Matches, homography: Estimate, threshold
     for axes, points in zip(row, (matches.points0, matches.points1), strict=True):
         _dots(axes, points[homography.inliers], CLUSTERS[0])
         _crosses(axes, points[~homography.inliers], OUTLIER)
-    explained = (
-        f"{homography.inlier_count} of {len(matches)} inliers of F fit one plane to {threshold:g} pixels (blue)"
-    )
-    row[0].set_title(explained, loc="left", fontsize=10)
-    row[1].set_title("orange crosses: off the plane", loc="left", fontsize=10)
+    explained = f"{homography.inlier_count} of {len(matches)} inliers of F"
+    _title(row[0], f"blue: {explained} fit one plane to {threshold:g} pixels")
+    _title(row[1], "orange crosses: those off the plane")
     return figure
 
 
 def draw_pose_errors(errors: Mapping[str, PoseError]) -> "Figure":
-    """Bars: the errors of the pose that each F stands for, in degrees."""
+    """Bars: the errors of the pose that each F stands for, in degrees; those of a failure are infinite."""
     figure = new_figure(WIDTH, 1.0 + 0.4 * len(errors))
     panels = figure.subplots(1, 2, sharey=True)
     for axes, kind, title in zip(
         panels, ("rotation", "translation_angle"), ("rotation", "direction of translation"), strict=True
     ):
         plain(axes, f"error of the {title}, in degrees")
-        values = [getattr(error, kind) for error in errors.values()]
-        bars = axes.barh([short(name, 40) for name in errors], values, color=CYCLE[: len(values)], height=0.6)
-        axes.bar_label(bars, fmt="%.2f", padding=3, color=INK)
+        angles = np.array([getattr(error, kind) for error in errors.values()])
+        known = np.isfinite(angles)
+        names = [short(name, 40) for name in errors]
+        bars = axes.barh(names, np.where(known, angles, 0), color=CYCLE[: len(names)], height=0.6)
+        labels = [f"{angle:.2f}" if ok else "no F" for angle, ok in zip(angles, known, strict=True)]
+        axes.bar_label(bars, labels, padding=3, color=INK)
         axes.margins(x=0.15)
     panels[0].invert_yaxis()
     return figure
+
+
+def _title(axes: "Axes", text: str) -> None:
+    axes.set_title(text, loc="left", fontsize=10)
 
 
 def _cut(image: Image, box: Box) -> Image:

@@ -1,0 +1,132 @@
+"""The steps of the method as figures: what their titles say is so, and none needs matches to be drawn."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from mkpc_kaggle import figures
+from mkpc_kaggle.figures.steps import _far_apart, _line
+from mkpc_kaggle.geometry.coordinates import Box, Size
+from mkpc_kaggle.geometry.critical_region import CriticalRegion, MkpcConfig, Ratio, RegionReason, find_clusters
+from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.geometry.metrics import PoseError
+from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL, Estimate, Model
+from mkpc_kaggle.images import Image
+from mkpc_kaggle.pipeline import PairMatch, UnitResult
+from mkpc_kaggle.recipe import Unit
+
+SIZES = Size(120, 80), Size(60, 90)
+IMAGES = tuple(Image.of_array(np.full((size.height, size.width, 3), 90, np.uint8)) for size in SIZES)
+CONFIG = MkpcConfig(min_side=8)
+UNITS = Unit(1, "sift", 100), Unit(2, "sift", 100)
+REGIONS = (
+    CriticalRegion(Box(20, 10, 60, 30), RegionReason.CROPPED, 1, 1),
+    CriticalRegion(Box.whole(SIZES[1]), RegionReason.NO_CLUSTER),
+)
+
+
+def some(n):
+    """n matches in a corner of both images."""
+    points = np.random.default_rng(n).uniform(21, 29, (n, 2))
+    return Matches(points, points, np.ones(n))
+
+
+def pair(first, second, inliers):
+    results = tuple(UnitResult(unit, some(n)) for unit, n in zip(UNITS, (first, second), strict=True))
+    mask = np.arange(first + second) < inliers
+    return PairMatch(results, REGIONS, Estimate(Model.F, FALLBACK_FUNDAMENTAL, mask))
+
+
+def titles(figure: Figure) -> list[str]:
+    figures.to_jpeg(figure)  # whatever cannot be drawn raises here
+    return [axes.get_title(loc="left") for axes in figure.axes]
+
+
+def clustered(match):
+    points = match.matches.points0, match.matches.points1
+    found = (find_clusters(xy, image.size, CONFIG) for xy, image in zip(points, IMAGES, strict=True))
+    return points, tuple(found)
+
+
+@pytest.mark.parametrize("count", [0, 1, 40])
+def test_every_step_is_drawn_whatever_was_found(count):
+    match = pair(count, count // 2, count)
+    points, clusters = clustered(match)
+    homography = Estimate.failed(Model.H, len(match.inliers), "none")
+    lines = {"stage 1": FALLBACK_FUNDAMENTAL, "both": np.zeros((3, 3))}
+    drawn = [
+        figures.draw_images(IMAGES),
+        figures.draw_stage(IMAGES, match, 1),
+        figures.draw_stage(IMAGES, match, 2),
+        figures.draw_stage(IMAGES, replace(match, regions=None), 2),
+        figures.draw_clusters(IMAGES, points, clusters),
+        figures.draw_sizes(clusters, CONFIG),
+        figures.draw_sizes(clusters, replace(CONFIG, ratio=Ratio.LAST_KEPT)),
+        figures.draw_boxes(IMAGES, points, clusters, CONFIG),
+        figures.draw_views(IMAGES, REGIONS, UNITS[1]),
+        figures.draw_both(IMAGES, match),
+        figures.draw_plane(IMAGES, match.inliers, homography, 3.0),
+        figures.draw_epipolar(IMAGES, match.inliers, lines, FALLBACK_FUNDAMENTAL),
+        figures.draw_pose_errors({"stage 1": PoseError(1.5, 2.5, 3.0), "both": PoseError.failed()}),
+    ]
+    assert all(any(titles(figure)) for figure in drawn)
+
+
+def test_titles_count_what_is_seen():
+    match = pair(40, 20, 45)
+    points, clusters = clustered(pair(40, 0, 0))
+    assert titles(figures.draw_stage(IMAGES, match, 1))[0].startswith(
+        "stage 1, on the whole images: 40 matches, 40 inliers; 40 inliers (green) and 0 outliers"
+    )
+    assert titles(figures.draw_stage(IMAGES, match, 2))[0].startswith(
+        "stage 2, on the crops: 20 matches, 5 inliers; 5 inliers (green) and 15 outliers"
+    )
+    assert titles(figures.draw_clusters(IMAGES, points, clusters))[0].startswith("image 0, clusters found: 1\n")
+    assert "0.05 of the largest, 2.0 points" in titles(figures.draw_sizes(clusters, CONFIG))[0]
+    assert "together: 60 points, 45 inliers" in titles(figures.draw_both(IMAGES, match))[1]
+    uncropped = replace(match, regions=(REGIONS[1], REGIONS[1]))
+    assert titles(figures.draw_stage((IMAGES[1], IMAGES[1]), uncropped, 2))[0].startswith(
+        "stage 2, on the whole images"
+    )
+    assert titles(figures.draw_views(IMAGES, REGIONS, UNITS[1])) == [
+        "image 0, whole\n0.83 times enlarged",
+        "image 0, crop\n2.50 times enlarged",
+        "image 1, whole\n1.12 times enlarged",
+        "image 1, crop (no cluster)\n1.12 times enlarged",
+    ]
+
+
+def test_points_of_stage_2_are_drawn_where_they_are_on_the_crop():
+    left, right = figures.draw_stage(IMAGES, pair(0, 20, 20), 2).axes
+    assert left.images[0].get_array().shape[:2] == (20, 40)
+    xy = np.concatenate([dots.get_offsets() for dots in left.collections])
+    np.testing.assert_allclose(xy, some(20).points0 - (20, 10))
+    assert right.images[0].get_array().shape[:2] == (90, 60)
+
+
+def test_a_pictures_title_has_room_above_it():
+    figure = figures.draw_boxes(IMAGES, *clustered(pair(40, 0, 0)), CONFIG)
+    figure.canvas.draw()
+    for axes in figure.axes:
+        extent = axes.get_tightbbox()
+        assert extent.y1 <= figure.bbox.height and extent.x0 >= 0
+
+
+def test_an_epipolar_line_is_that_of_the_point():
+    axes = figures.new_figure(3, 3).subplots()
+    F = np.array([[0.0, -1, 2], [1, 0, -3], [-2, 3, 0]])
+    point = np.array([7.0, 5.0], np.float32)
+    _line(axes, F, point, color="k")
+    (line,) = axes.lines
+    for on_line in (line.get_xy1(), line.get_xy2()):
+        assert abs(np.append(on_line, 1) @ F @ np.append(point, 1)) < 1e-9
+
+
+def test_chosen_points_lie_far_apart():
+    crowd = np.random.default_rng(0).normal(50, 0.1, (100, 2))
+    corners = np.array([[0.0, 0], [100, 0], [0, 100], [100, 100]])
+    points = np.concatenate([crowd, corners]).astype(np.float32)
+    assert sorted(_far_apart(points, 4)) == [100, 101, 102, 103]
+    assert len(_far_apart(points[:3], 6)) == 3

@@ -1,0 +1,69 @@
+"""``mkpc_tour.ipynb``: it runs on any train side without a network, and is committed with its pictures alone."""
+
+import sys
+from pathlib import Path
+
+import nbformat
+import pytest
+from kaggle_image import environment
+from offline_notebook import execute, needs_namespaces, outputs, pictures, printed, with_pictures_alone
+
+from mkpc_kaggle.demo import DemoSet
+
+ROOT = Path(__file__).resolve().parents[1]
+TOUR = ROOT / "notebooks" / "mkpc_tour.ipynb"
+KERNEL = {"name": "python3", "display_name": "Python 3"}
+LEAST_BYTES, MOST_BYTES = 500_000, 1_500_000
+
+
+def figures_of(notebook: nbformat.NotebookNode) -> int:
+    """How many figures its cells ask for."""
+    return sum(cell.source.count("show(figures.") for cell in notebook.cells if cell.cell_type == "code")
+
+
+@needs_namespaces
+def test_the_tour_runs_on_a_train_side_without_a_network(demo: DemoSet, tmp_path: Path) -> None:
+    variables = environment(
+        PYTHONPATH=str(ROOT),
+        MKPC_TRAIN_DIR=str(demo.train_dir),
+        MKPC_PAIR="courtyard;courtyard_0006-courtyard_0001",
+        MKPC_OTHER_PAIR="courtyard;courtyard_0003-courtyard_0000",
+    )
+    executed = execute(TOUR, tmp_path / "executed.ipynb", sys.executable, tmp_path, variables)
+    assert pictures(executed) == figures_of(executed) == 14
+    assert printed(executed) == ""
+
+
+@needs_namespaces
+@pytest.mark.slow
+def test_without_a_train_side_the_tour_renders_its_own(tmp_path: Path) -> None:
+    variables = environment(PYTHONPATH=str(ROOT), TMPDIR=str(tmp_path))
+    for name in ("MKPC_TRAIN_DIR", "MKPC_PAIR", "MKPC_OTHER_PAIR", "MKPC_RECIPE"):
+        variables.pop(name, None)
+    executed = execute(TOUR, tmp_path / "executed.ipynb", sys.executable, tmp_path, variables)
+    assert pictures(executed) == figures_of(executed)
+
+
+def test_the_tour_is_committed_with_all_its_pictures_and_nothing_else() -> None:
+    tour = nbformat.read(TOUR, as_version=4)
+    assert with_pictures_alone(tour) == tour
+    assert pictures(tour) == figures_of(tour) == len(outputs(tour))
+    assert LEAST_BYTES < TOUR.stat().st_size < MOST_BYTES
+
+
+def test_pictures_alone_are_kept_of_a_run() -> None:
+    picture = {"image/jpeg": "AAAA", "text/plain": "<Image>"}
+    cell = nbformat.v4.new_code_cell("show(x)", execution_count=3, metadata={"execution": {"started": "now"}})
+    cell.outputs = [
+        nbformat.v4.new_output("stream", text="/some/where"),
+        nbformat.v4.new_output("display_data", picture),
+    ]
+    run = nbformat.v4.new_notebook(
+        cells=[cell],
+        metadata={"kernelspec": KERNEL, "language_info": {"name": "python", "version": "3.12"}, "more": 1},
+    )
+    kept = with_pictures_alone(run)
+    assert kept.cells[0].outputs == [nbformat.v4.new_output("display_data", {"image/jpeg": "AAAA"})]
+    assert kept.cells[0].execution_count is None and kept.cells[0].metadata == {}
+    assert kept.metadata == {"kernelspec": KERNEL, "language_info": {"name": "python"}}
+    assert run.cells[0].execution_count == 3
