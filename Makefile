@@ -1,12 +1,13 @@
 # make demo: install, render a demo set, make its submission, score it, draw a pair.
 # make test: install, lint, types, tests.
+# make ray: the tests of worker machines, with Ray installed beside the rest.
 
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 DEMO := demo
 
-.PHONY: demo test install lint tests clean
+.PHONY: demo test ray install lint tests clean
 
 demo: install
 	$(BIN)/python -m mkpc_kaggle demo --out $(DEMO)
@@ -30,6 +31,10 @@ lint:
 
 tests:
 	$(BIN)/python -m pytest
+
+ray: install
+	$(BIN)/python -m pip install --quiet "ray>=2.9"
+	$(BIN)/python -m pytest tests/test_ray.py tests/test_cluster.py
 
 install: $(VENV)/installed
 

@@ -2,6 +2,7 @@
 
 import re
 import shutil
+import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -257,7 +258,13 @@ def _store(response: Any, part: Part, have: int, total: int | None) -> None:
     with (
         part.begin(mark, resumed=have > 0) as out,
         tqdm(
-            desc=part.file.name, initial=have, total=total, unit="B", unit_scale=True, unit_divisor=1024
+            desc=part.file.name,
+            initial=have,
+            total=total,
+            unit="B",
+            unit_scale=True,
+            unit_divisor=1024,
+            mininterval=0.1 if sys.stderr.isatty() else 30,  # a log keeps every state of the bar
         ) as progress,
     ):
         while block := response.read(BLOCK):
