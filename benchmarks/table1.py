@@ -15,7 +15,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import combinations
+from itertools import combinations, pairwise
 from pathlib import Path
 from statistics import mean
 
@@ -57,6 +57,8 @@ LAYOUTS = {
 CONTRASTS = (("three", "one + two"), ("three", "two + one"), ("six", "three + three"))
 """The same units, all on whole images and split over the stages."""
 ENSEMBLE_LAYOUTS = ("three", "two + one")
+COVISIBILITIES = (0.0, 0.3, 0.6, 1.01)
+"""Borders of the ranges in which gains are told."""
 MERGED_LAYOUTS = ("three", "two + one", "three + three")
 
 
@@ -204,27 +206,32 @@ class Tables:
     """What was found, by scene, on the pairs that are done."""
 
     scenes: Mapping[str, Sequence[Mapping[str, Found]]]
+    covisibility: Mapping[str, Sequence[float]]
 
     @classmethod
     def of(cls, scenes: Sequence[Scene], diary: Diary) -> "Tables":
-        done = {
-            scene.name: [diary.found[true.pair.id] for true in scene.pairs if true.pair.id in diary.found]
-            for scene in scenes
-        }
-        return cls({name: pairs for name, pairs in done.items() if pairs})
+        done = {scene.name: [true for true in scene.pairs if true.pair.id in diary.found] for scene in scenes}
+        done = {name: pairs for name, pairs in done.items() if pairs}
+        return cls(
+            {name: [diary.found[true.pair.id] for true in pairs] for name, pairs in done.items()},
+            {name: [true.covisibility for true in pairs] for name, pairs in done.items()},
+        )
 
     def markdown(self, ways: Sequence[Way]) -> Iterator[str]:
         counts = ", ".join(f"{name} {len(pairs)}" for name, pairs in self.scenes.items())
         yield f"Pairs: {counts}."
         yield from ("", "### Accuracy", "", *self.accuracy([way for way in ways if not way.merged]))
-        yield from ("", "### The same units, split over the stages or all on whole images", "")
         plain = {way.name: way for way in ways if not way.merged}
-        yield from self.gains(
+        contrasts = [
             (replace(way, layout=naive), way)
             for naive, split in CONTRASTS
             for way in plain.values()
             if way.layout == split and replace(way, layout=naive).name in plain
-        )
+        ]
+        yield from ("", "### The same units, split over the stages or all on whole images", "")
+        yield from self.gains(contrasts)
+        yield from ("", "### The same by covisibility, pairs of all scenes together", "")
+        yield from self.gains_by_covisibility(contrasts)
         yield from ("", "### Repeated points, merged or each counted", "")
         yield from self.gains((replace(way, merged=False), way) for way in ways if way.merged)
 
@@ -249,15 +256,32 @@ class Tables:
             by_scene = [str(self.difference(first, second, (name,))) for name in self.scenes]
             yield _row([second.name, first.name, *by_scene, f"**{overall}**"])
 
-    def difference(self, first: Way, second: Way, scenes: Sequence[str]) -> Difference:
-        values = [
-            (
-                [pair_accuracy(pair[first.name].error) for pair in self.scenes[name]],
-                [pair_accuracy(pair[second.name].error) for pair in self.scenes[name]],
-            )
-            for name in scenes
+    def gains_by_covisibility(self, contrasts: Iterable[tuple[Way, Way]]) -> Iterator[str]:
+        """A row a contrast, a column a range of covisibility: gains in mAA with intervals."""
+        pairs = [
+            (pair, covisibility)
+            for name, found in self.scenes.items()
+            for pair, covisibility in zip(found, self.covisibility[name], strict=True)
         ]
+        ranges = [
+            (f"{low} to {high}", [pair for pair, covisibility in pairs if low <= covisibility < high])
+            for low, high in pairwise(COVISIBILITIES)
+        ]
+        ranges = [(name, some) for name, some in ranges if some]
+        yield from _head(["way", "against", *(f"{name} ({len(some)} pairs)" for name, some in ranges)])
+        for first, second in contrasts:
+            cells = [str(paired_difference([_accuracies(some, first, second)])) for _, some in ranges]
+            yield _row([second.name, first.name, *cells])
+
+    def difference(self, first: Way, second: Way, scenes: Sequence[str]) -> Difference:
+        values = [_accuracies(self.scenes[name], first, second) for name in scenes]
         return paired_difference(values)
+
+
+def _accuracies(pairs: Sequence[Mapping[str, Found]], first: Way, second: Way) -> tuple[list[float], list[float]]:
+    """The accuracies of the same pairs in two ways."""
+    one, other = ([pair_accuracy(pair[way.name].error) for pair in pairs] for way in (first, second))
+    return one, other
 
 
 def _head(cells: Sequence[str]) -> list[str]:

@@ -7,12 +7,13 @@ import pytest
 
 from benchmarks import table1
 from benchmarks.merging import merged
-from benchmarks.table1 import CONTRASTS, Diary, Tables, Way, run_all, union, ways_of
+from benchmarks.table1 import CONTRASTS, Diary, Found, Tables, Way, run_all, union, ways_of
 from mkpc_kaggle.assembly import assemble
 from mkpc_kaggle.competition import read_train_side
 from mkpc_kaggle.demo import DemoSet
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.geometry.metrics import PoseError
 from mkpc_kaggle.recipe import Mode
 from mkpc_kaggle.run.budget import Budget
 from mkpc_kaggle.run.session import Interrupt, Session
@@ -106,5 +107,16 @@ def test_it_gives_what_the_engine_gives_and_goes_on_where_it_was(
         "| sift: three",
         "| sift: one + two",
         "| sift: one + two",
+        "| sift: one + two",
         "| sift: three, merged",
     ]
+
+
+def test_gains_by_covisibility_are_those_of_the_pairs_within() -> None:
+    first, second = Way(("sift",), "three"), Way(("sift",), "one + two")
+    good, bad = (Found(PoseError(angle, angle, 0.0), 100, 1.0) for angle in (0.5, 90.0))
+    pairs = [{first.name: bad, second.name: good}, {first.name: good, second.name: good}]
+    tables = Tables({"a": pairs, "b": pairs[:1]}, {"a": [0.2, 0.7], "b": [0.29]})
+    head, _, row = tables.gains_by_covisibility([(first, second)])
+    assert "0.0 to 0.3 (2 pairs) | 0.6 to 1.01 (1 pairs)" in head
+    assert "| +1.0000 [+1.0000, +1.0000] | +0.0000 [+0.0000, +0.0000] |" in row
