@@ -27,6 +27,10 @@ TOLERANCES = dict.fromkeys(("feat_", "layer", "coarse", "conf", "mconf", "expec_
 TOLERANCES |= {"win": 2e-4, "fine": 2e-4, "mkpts1_f": 5e-4}
 
 
+POSITION_TOLERANCES = {"chan_first24": 1e-6, "col": 1e-5, "corner": 1e-5}
+"""exp rounds the seventh frequency, near a tie, one way on AMD, the other on Intel; 256 times it is 7.6e-6."""
+
+
 @cache
 def standin():
     return ready(Loftr(), standin_state("loftr"))
@@ -42,7 +46,7 @@ def position_stages():
         table = sine_positions(256, 256, fall).permute(2, 0, 1)
         got = {"chan_first24": table[:24, :12, :16], "col": table[:, 7, 200], "corner": table[:, 255, 255]}
         for name, values in got.items():
-            yield Stage(f"{prefix}_{name}", values, golden[f"{prefix}_{name}"], 1e-6)
+            yield Stage(f"{prefix}_{name}", values, golden[f"{prefix}_{name}"], POSITION_TOLERANCES[name])
 
 
 @needs_golden
