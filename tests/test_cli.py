@@ -1,3 +1,4 @@
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -34,6 +35,16 @@ def test_every_command_has_a_help_that_teaches(command: str, capsys: pytest.Capt
         main([command, "--help"])
     assert left.value.code == 0
     assert len(capsys.readouterr().out.splitlines()) >= 8
+
+
+def test_a_reader_that_leaves_is_no_error_to_tell() -> None:
+    reader, writer = os.pipe()
+    os.close(reader)
+    with os.fdopen(writer, "wb") as out:
+        done = subprocess.run(
+            [sys.executable, "-m", "mkpc_kaggle", "recipes"], stdout=out, stderr=subprocess.PIPE, check=False
+        )
+    assert (done.returncode, done.stderr) == (141, b"")
 
 
 def test_recipes_are_listed_with_what_they_lack(

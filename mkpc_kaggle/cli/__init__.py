@@ -14,6 +14,7 @@ from mkpc_kaggle.errors import UserError
 
 COMMANDS = ("submit", "match", "validate", "recipes", "weights", "check", "journal", "package", "demo")
 EXIT_BAD_INPUT = 2
+EXIT_NO_READER = 128 + 13  # as a shell tells of SIGPIPE
 
 _DESCRIPTION = """\
 Two-stage image matching with Matching Key-Points Crop, offline, inside a time budget.
@@ -40,10 +41,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with warnings.catch_warnings():
         warnings.showwarning = _show_warning
         try:
-            return int(parsed.run(parsed))
+            status = int(parsed.run(parsed))
+            sys.stdout.flush()
+            return status
         except UserError as error:
             print(f"error: {error}", file=sys.stderr)
             return EXIT_BAD_INPUT
+        except BrokenPipeError:
+            # Who read the output has left, as head does. Python would complain once more when it ends.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            return EXIT_NO_READER
 
 
 def make_parser() -> argparse.ArgumentParser:
