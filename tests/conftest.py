@@ -1,10 +1,15 @@
 """What tests share: a small rendered data set, and a matcher whose answers are known."""
 
+import os
 from pathlib import Path
 
 import pytest
 
 from mkpc_kaggle.demo import DemoSet, write_demo
+
+# Before torch is imported, here and in the processes of the tests: their tensors are small, and on a busy machine
+# threads wait for each other more than they work.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
