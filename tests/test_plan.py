@@ -135,6 +135,25 @@ def test_a_short_run_waits_less_for_a_silent_worker() -> None:
     assert [patience.silence(limit) for limit in (20.0, 600.0, 32400.0)] == [5.0, 12.0, 60.0]
 
 
+def test_silence_is_borne_longer_while_one_job_after_the_other_hangs() -> None:
+    one = planner(40)
+    for _ in range(2):  # by then the unit is measured
+        one.take(finished(plan := one.next(0.0), one), 0.0)  # type: ignore[arg-type]
+    waits = []
+    for _ in range(5):
+        plan = one.next(0.0)
+        assert plan is not None
+        waits.append(plan.timeout)
+        one.lose(Lost(Job(plan, ()), Cause.HUNG), 0.0)
+    assert [wait / waits[0] for wait in waits] == [1, 2, 4, 8, 8]
+    plan = one.next(0.0)
+    assert plan is not None
+    one.take(finished(plan, one), 0.0)
+    plan = one.next(0.0)
+    assert plan is not None
+    assert plan.timeout == waits[0]
+
+
 def test_pairs_are_weak_for_few_inliers_a_low_share_or_an_uncertain_region() -> None:
     def record(matches: int, inliers: int, reason: RegionReason = RegionReason.CROPPED) -> Record:
         region = CriticalRegion(Box(0, 0, 9, 9), reason)

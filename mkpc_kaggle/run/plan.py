@@ -12,7 +12,7 @@ from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.pipeline import UnitResult
 from mkpc_kaggle.recipe import Recipe, Unit
 from mkpc_kaggle.run.budget import Budget, Costs, format_duration, needs
-from mkpc_kaggle.run.jobs import Finished, Lost, Outcome, Phase, Plan, Record, Stretch, UnitRecord, chunks
+from mkpc_kaggle.run.jobs import Cause, Finished, Lost, Outcome, Phase, Plan, Record, Stretch, UnitRecord, chunks
 from mkpc_kaggle.run.losses import Losses
 from mkpc_kaggle.run.patience import Patience
 from mkpc_kaggle.run.upgrade import Rounds, inliers_before, is_weak
@@ -23,6 +23,9 @@ JOB_SHARE = 0.05
 """The share of the time left that a job may be expected to take: what a job found late comes too late."""
 DEADLINE_SHARE = 0.5
 """The share of the time left after which a job begins no unit: where all is slower of a sudden, that is learnt."""
+
+MOST_DOUBLINGS = 3
+"""Of the silence that a job is allowed, while one job after the other hangs."""
 
 
 @dataclass(frozen=True)
@@ -73,6 +76,7 @@ class Planner:
         self._rounds = Rounds(recipe.upgrade)
         self._losses = Losses()
         self._aside: set[int] = set()
+        self._hung_in_a_row = 0
         self._lacking: Counter[str] = Counter()
         for record in records:
             if record.units:
@@ -150,12 +154,16 @@ class Planner:
             units,
             tuple(self.costs.most(unit.name) for unit in units),
             now + self._allowance if unknown else self._deadline(lacking, len(todo), now),
-            self.patience.timeout(
-                lacking, len(todo), self.costs, self.budget.limit, self._allowance if unknown else None
-            ),
+            self._timeout(lacking, len(todo), unknown=unknown),
             stretch.shrink,
             unknown,
         )
+
+    def _timeout(self, lacking: Sequence[Unit], pairs: int, *, unknown: bool) -> float:
+        """Twice as long after each job that hung with none ended since: it may be the machine that is slow."""
+        allowance = self._allowance if unknown else None
+        timeout = self.patience.timeout(lacking, pairs, self.costs, self.budget.limit, allowance)
+        return timeout * (1 << min(self._hung_in_a_row, MOST_DOUBLINGS))
 
     def _deadline(self, lacking: Iterable[Unit], pairs: int, now: float) -> float:
         """Early enough to plan the rest anew, but late enough for twice what the job should take."""
@@ -263,6 +271,7 @@ class Planner:
         measured = finished.measured()
         self._measure(plan, measured, now, len(finished.outcomes))
         self._back(plan)
+        self._hung_in_a_row = 0
         if plan.exploring and now >= plan.deadline:
             for unit in plan.units:
                 self.costs.suppose(unit.name, self._allowance)
@@ -315,6 +324,7 @@ class Planner:
     def lose(self, lost: Lost, now: float) -> list[Outcome]:
         """Take note of a lost job, plan anew what may still come of it; what to keep."""
         self._back(lost.job.plan)
+        self._hung_in_a_row += lost.cause is Cause.HUNG
         self._last_event = now
         verdict = self._losses.judge(lost, self.records, self.recipe.units)
         self._again.extend(verdict.again)
