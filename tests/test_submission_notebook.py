@@ -95,7 +95,8 @@ def test_the_image_has_none_of_what_the_dataset_brings(image: Path) -> None:
 def test_a_commit_run_without_network_leaves_a_submission_and_shows_pairs(
     kaggle: Kaggle, demo: DemoSet, tmp_path: Path
 ) -> None:
-    kaggle.add_test_side(demo.test_dir, pairs=3)
+    """As many pairs as Kaggle shows: photographs where there are some, else rendered ones."""
+    kaggle.add_test_side(DATA / "test" if DATA.is_dir() else demo.test_dir, pairs=3)
     kaggle.add_dataset(tmp_path / "package")
     printed = kaggle.run()
     assert kaggle.problems() == []
