@@ -39,9 +39,9 @@ def run(arguments: argparse.Namespace) -> int:
         print(
             f"  {result.unit.name:<30}{len(result.matches):>6} matches  {result.seconds:.2f} s  {result.failure}"
         )
-    for name, region in zip(("image 0", "image 1"), match.regions or (), strict=False):
+    for number, region in enumerate(match.regions or ()):
         box = region.box
-        print(f"{name}: {region.reason}, x {box.left}..{box.right - 1}, y {box.top}..{box.bottom - 1}")
+        print(f"image {number}: {region.reason}, x {box.left}..{box.right - 1}, y {box.top}..{box.bottom - 1}")
     if arguments.out is not None:
         figures.save(figures.draw_pair(*images, match, matcher.recipe.mkpc), arguments.out)
         print(f"figure: {arguments.out}")

@@ -54,8 +54,8 @@ def draw_strip(images: tuple[Image, Image], match: PairMatch) -> "Figure":
     axes.imshow(np.hstack(shown))
     axes.axis("off")
     _draw_lines(axes, match, scales, widths[0])
-    for region, scale, shift in zip(match.regions or (), scales, (0, widths[0]), strict=False):
-        box = region.box
+    for side, region in enumerate(match.regions or ()):
+        box, scale, shift = region.box, scales[side], side * widths[0]
         corner = box.left * scale + shift - 0.5, box.top * scale - 0.5
         add_rectangle(axes, corner, box.size.width * scale, box.size.height * scale)
     return figure
