@@ -68,3 +68,14 @@ def test_a_line_says_how_much_of_the_budget_is_left() -> None:
     lines.show(Phase.SWEEP, 3, 5)
     lines.close()
     assert stream.getvalue() == "sweep: 5 pairs, budget left 8.5s\nsweep: 3 of 5 pairs, budget left 8.5s\n"
+
+
+def test_a_log_whose_reader_has_left_does_not_end_the_run() -> None:
+    class Left(StringIO):
+        def write(self, text: str) -> int:
+            raise BrokenPipeError
+
+    lines = Lines(Left(), Budget(0.0, clock=Clock()))
+    lines.show(Phase.SWEEP, 1, 5)
+    lines.show(Phase.SWEEP, 5, 5)
+    lines.close()

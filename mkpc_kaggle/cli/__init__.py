@@ -34,7 +34,10 @@ COMMAND --help tells more.
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command; the exit status: 0 done, 1 a check failed, 2 bad input, 130 / 143 ended by a signal."""
+    """Run a command; the exit status: 0 done, 1 a check failed, 2 bad input, 130 / 143 ended by a signal.
+
+    141: whoever read the output has left.
+    """
     started = time.monotonic()
     parsed = make_parser().parse_args(arguments)
     parsed.started = started

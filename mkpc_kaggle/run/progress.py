@@ -1,6 +1,7 @@
 """How far the present pass of a run is: a bar on a terminal, a line now and then anywhere else."""
 
 import os
+from contextlib import suppress
 from math import isfinite
 from typing import Any, Protocol, TextIO
 
@@ -82,5 +83,6 @@ class Lines:
     def close(self) -> None:
         """Write the line that waits, if there is one."""
         if self._waiting:
-            print(self._waiting, file=self._stream, flush=True)
+            with suppress(OSError):  # whoever read the log may have left; the run goes on
+                print(self._waiting, file=self._stream, flush=True)
             self._waiting, self._written = "", self._budget.clock()
