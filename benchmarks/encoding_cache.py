@@ -9,13 +9,13 @@ from itertools import combinations
 import numpy as np
 
 from benchmarks.matchers import VGA, photographs
-from mkpc_kaggle.images import Image
+from mkpc_kaggle.data.images import Image
 from mkpc_kaggle.matchers.contract import Placement
 from mkpc_kaggle.matchers.loftr import SPEC
 from mkpc_kaggle.matchers.networks.loftr import Loftr
 from mkpc_kaggle.matchers.networks.placement import placed
 from mkpc_kaggle.matchers.semi_dense import SemiDenseMatcher
-from mkpc_kaggle.pipeline import ENCODING_CACHE_BYTES, PairWork, Pipeline
+from mkpc_kaggle.pipeline.stages import ENCODING_CACHE_BYTES, PairWork, Pipeline
 from mkpc_kaggle.recipe import Recipe, Unit
 from tests.standin import filled
 

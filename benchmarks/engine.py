@@ -15,13 +15,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from mkpc_kaggle.assembly import Assembly, assemble
-from mkpc_kaggle.competition import Pair, read_test_side, write_submission
-from mkpc_kaggle.run.budget import Budget
-from mkpc_kaggle.run.engine import Engine
-from mkpc_kaggle.run.in_process import InProcessPool
-from mkpc_kaggle.run.jobs import Finished, Lost, Record
-from mkpc_kaggle.run.journal import Journal
+from mkpc_kaggle.data.competition import Pair, read_test_side, write_submission
+from mkpc_kaggle.engine.budget import Budget
+from mkpc_kaggle.engine.engine import Engine
+from mkpc_kaggle.engine.jobs import Finished, Lost, Record
+from mkpc_kaggle.engine.journal import Journal
+from mkpc_kaggle.engine.pools.in_process import InProcessPool
+from mkpc_kaggle.pipeline.assembly import Assembly, assemble
 
 
 class WatchedPool(InProcessPool):

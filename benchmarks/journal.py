@@ -13,12 +13,12 @@ from pathlib import Path
 
 import numpy as np
 
+from mkpc_kaggle.engine.jobs import CHUNK, Outcome, Record, UnitRecord
+from mkpc_kaggle.engine.journal import Journal
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
-from mkpc_kaggle.pipeline import UnitResult
+from mkpc_kaggle.pipeline.stages import UnitResult
 from mkpc_kaggle.recipe import Unit
-from mkpc_kaggle.run.jobs import CHUNK, Outcome, Record, UnitRecord
-from mkpc_kaggle.run.journal import Journal
 
 
 def results(units: list[Unit], matches: int, rng: np.random.Generator) -> tuple[UnitResult, ...]:

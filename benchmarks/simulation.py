@@ -17,15 +17,26 @@ from pathlib import Path
 
 import numpy as np
 
-from mkpc_kaggle.competition import Pair
+from mkpc_kaggle.data.competition import Pair
+from mkpc_kaggle.engine.budget import Budget
+from mkpc_kaggle.engine.engine import Ending, Engine, RunReport
+from mkpc_kaggle.engine.jobs import (
+    NOT_REACHED,
+    Cause,
+    Finished,
+    Job,
+    Lost,
+    Outcome,
+    Plan,
+    Record,
+    Task,
+    UnitRecord,
+)
+from mkpc_kaggle.engine.pools.in_process import JOBS_A_WORKER
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
-from mkpc_kaggle.pipeline import UnitResult
+from mkpc_kaggle.pipeline.stages import UnitResult
 from mkpc_kaggle.recipe import Recipe, Unit
-from mkpc_kaggle.run.budget import Budget
-from mkpc_kaggle.run.engine import Ending, Engine, RunReport
-from mkpc_kaggle.run.in_process import JOBS_A_WORKER
-from mkpc_kaggle.run.jobs import NOT_REACHED, Cause, Finished, Job, Lost, Outcome, Plan, Record, Task, UnitRecord
 
 RESTART_SECONDS = 8.0
 STALL = 20.0

@@ -22,18 +22,18 @@ from statistics import mean
 from tqdm import tqdm
 
 from benchmarks.merging import merged
-from mkpc_kaggle.assembly import assemble
-from mkpc_kaggle.compare import Difference, paired_difference
-from mkpc_kaggle.competition import Scene, TruePair, read_train_side
+from mkpc_kaggle.data.competition import Scene, TruePair, read_train_side
+from mkpc_kaggle.data.images import ImageStore, Unreadable
+from mkpc_kaggle.engine.jobs import visiting_order
 from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.evaluation.compare import Difference, paired_difference
+from mkpc_kaggle.evaluation.validate import error_of
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.metrics import PoseError, pair_accuracy, pose_auc
 from mkpc_kaggle.geometry.robust import RobustConfig, estimate
-from mkpc_kaggle.images import ImageStore, Unreadable
-from mkpc_kaggle.pipeline import PairWork, Pipeline, UnitResult
+from mkpc_kaggle.pipeline.assembly import assemble
+from mkpc_kaggle.pipeline.stages import PairWork, Pipeline, UnitResult
 from mkpc_kaggle.recipe import Recipe, Unit
-from mkpc_kaggle.run.jobs import visiting_order
-from mkpc_kaggle.validate import error_of
 
 LONG_SIDES = {
     "sift": (1536, 1280, 1024, 1440, 1152, 1664),

@@ -18,14 +18,14 @@ import numpy as np
 from tqdm import tqdm
 
 from benchmarks.table1 import LONG_SIDES, MOST_MATCHES, OPTIONS
-from mkpc_kaggle.assembly import assemble
-from mkpc_kaggle.competition import Scene, TruePair, read_train_side
+from mkpc_kaggle.data.competition import Scene, TruePair, read_train_side
+from mkpc_kaggle.data.images import Image, Unreadable, read_image
 from mkpc_kaggle.geometry.cameras import fundamental_of_cameras
 from mkpc_kaggle.geometry.coordinates import Points, Size
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import Model, RobustConfig, estimate, sampson_distances
-from mkpc_kaggle.images import Image, Unreadable, read_image
-from mkpc_kaggle.pipeline import PairWork, Pipeline
+from mkpc_kaggle.pipeline.assembly import assemble
+from mkpc_kaggle.pipeline.stages import PairWork, Pipeline
 from mkpc_kaggle.recipe import Recipe, Unit
 
 RIGHT = 3.0

@@ -8,16 +8,16 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from mkpc_kaggle.pipeline import PairMatch
+    from mkpc_kaggle.pipeline.stages import PairMatch
+    from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher
     from mkpc_kaggle.recipe import Recipe
-    from mkpc_kaggle.two_stage import TwoStageMatcher
 
 __version__ = "0.1.0"
 __all__ = ["PairMatch", "Recipe", "TwoStageMatcher", "__version__"]
 
 _HOME = {
-    "PairMatch": "mkpc_kaggle.pipeline",
-    "TwoStageMatcher": "mkpc_kaggle.two_stage",
+    "PairMatch": "mkpc_kaggle.pipeline.stages",
+    "TwoStageMatcher": "mkpc_kaggle.pipeline.two_stage",
     "Recipe": "mkpc_kaggle.recipe",
 }
 

@@ -1,8 +1,9 @@
 """Frozen dataclasses from TOML tables: every key is known, every value has its type and is in its range."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import MISSING, Field, fields
+from dataclasses import MISSING, Field, dataclass, fields
 from enum import StrEnum
+from math import inf, isfinite
 from typing import Any, TypeVar, get_type_hints
 
 from mkpc_kaggle.errors import UserError
@@ -54,3 +55,35 @@ def convert(value: Any, kind: type, where: str) -> Any:
     if type(value) is not kind:
         raise UserError(f"{where}: expected {kind.__name__}, got {value!r}")
     return value
+
+
+@dataclass(frozen=True)
+class Range:
+    """Finite numbers from ``low`` to ``high``; ``bounds`` "[]", "(]", "[)" or "()" say which ends are in it."""
+
+    low: float
+    high: float = inf
+    bounds: str = "[]"
+
+    def __contains__(self, number: float) -> bool:
+        above = number >= self.low if self.bounds[0] == "[" else number > self.low
+        below = number <= self.high if self.bounds[1] == "]" else number < self.high
+        return above and below and isfinite(number)
+
+    def __str__(self) -> str:
+        left, right = self.bounds[0], ")" if self.high == inf else self.bounds[1]
+        return f"{left}{self.low:g}, {self.high:g}{right}"
+
+
+AT_LEAST_0, AT_LEAST_1 = Range(0), Range(1)
+POSITIVE = Range(0, bounds="(]")
+SHARE = Range(0, 1)
+"""Of a whole; also a score's range."""
+
+
+def check_ranges(config: Any, **ranges: Range) -> None:
+    """Raise ``ValueError`` for the first of these attributes of ``config`` that is out of its range."""
+    for name, allowed in ranges.items():
+        number = getattr(config, name)
+        if number not in allowed:
+            raise ValueError(f"{name} must be in {allowed}, not {number}")

@@ -11,12 +11,11 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
-from mkpc_kaggle.config import check_keys, from_table
+from mkpc_kaggle.config import AT_LEAST_0, AT_LEAST_1, SHARE, Range, check_keys, check_ranges, from_table
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Box, Size, View
 from mkpc_kaggle.geometry.critical_region import MkpcConfig
 from mkpc_kaggle.geometry.robust import RobustConfig
-from mkpc_kaggle.ranges import AT_LEAST_0, AT_LEAST_1, SHARE, Range, check_ranges
 
 DIRECTORY = Path(__file__).resolve().parent / "recipes"
 AREA = re.compile(r"[1-9]\d*x[1-9]\d*")

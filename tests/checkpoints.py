@@ -11,13 +11,13 @@ import torch
 from standin import STAND_INS, standin_state
 from torch import Tensor, nn
 
-from mkpc_kaggle import assembly
 from mkpc_kaggle.matchers.networks.aspanformer import AspanFormer
 from mkpc_kaggle.matchers.networks.dkm import DKM
 from mkpc_kaggle.matchers.networks.loftr import Loftr
 from mkpc_kaggle.matchers.networks.quadtree import Quadtree
 from mkpc_kaggle.matchers.networks.superglue import SuperGlue, SuperGlueConfig
 from mkpc_kaggle.matchers.networks.superpoint import SuperPoint, SuperPointConfig
+from mkpc_kaggle.pipeline import assembly
 from mkpc_kaggle.weights import WeightFile, WeightStore
 
 

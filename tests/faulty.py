@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 from rectified import RectifiedMatcher, Seen
 
-from mkpc_kaggle.assembly import Assembly
+from mkpc_kaggle.data.images import Unreadable
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.images import Unreadable
-from mkpc_kaggle.pipeline import Pipeline
+from mkpc_kaggle.pipeline.assembly import Assembly
+from mkpc_kaggle.pipeline.stages import Pipeline
 
 
 def pipeline_once(assembly: Assembly, marker: Path) -> Pipeline:
@@ -113,7 +113,7 @@ class FarMatcher(RectifiedMatcher):
     """Where it is sent to, the paths of the machine it comes from lead nowhere."""
 
     def __setstate__(self, state: dict[str, object]) -> None:
-        from mkpc_kaggle.run import ray_pool
+        from mkpc_kaggle.engine.pools import ray_pool
 
         vars(self).update(state)
         ray_pool.stamp_of = lambda _: None

@@ -1,11 +1,11 @@
-"""Writes pairs in the format that :mod:`mkpc_kaggle.pairs` reads."""
+"""Writes pairs in the format that :mod:`mkpc_kaggle.data.pairs` reads."""
 
 from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 
-from mkpc_kaggle.competition import Scene, TruePair
+from mkpc_kaggle.data.competition import Scene, TruePair
 from mkpc_kaggle.geometry.cameras import Camera, relative_pose
 
 

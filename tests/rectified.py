@@ -13,18 +13,18 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from mkpc_kaggle.assembly import assemble
-from mkpc_kaggle.competition import Pair
+from mkpc_kaggle.data.competition import Pair
+from mkpc_kaggle.engine.budget import Budget
+from mkpc_kaggle.engine.engine import RunReport
+from mkpc_kaggle.engine.jobs import Record
+from mkpc_kaggle.engine.patience import Patience
+from mkpc_kaggle.engine.pools.cluster import RayCluster
+from mkpc_kaggle.engine.session import Interrupt, Session, run_pairs
 from mkpc_kaggle.geometry.coordinates import View
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import MatcherSpec, Picture
+from mkpc_kaggle.pipeline.assembly import assemble
 from mkpc_kaggle.recipe import Recipe, Unit, UpgradeConfig
-from mkpc_kaggle.run.budget import Budget
-from mkpc_kaggle.run.cluster import RayCluster
-from mkpc_kaggle.run.engine import RunReport
-from mkpc_kaggle.run.jobs import Record
-from mkpc_kaggle.run.patience import Patience
-from mkpc_kaggle.run.session import Interrupt, Session, run_pairs
 
 
 @dataclass(frozen=True, eq=False)

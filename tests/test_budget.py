@@ -5,9 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.recipe import Unit
-from mkpc_kaggle.run.budget import (
+from mkpc_kaggle.engine.budget import (
     WINDOW,
     Budget,
     Costs,
@@ -16,6 +14,8 @@ from mkpc_kaggle.run.budget import (
     monotonic_of,
     parse_duration,
 )
+from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.recipe import Unit
 
 UNITS = (Unit(1, "a", 100), Unit(2, "b", 100), Unit(1, "c", 100))
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mkpc_kaggle.cli import COMMANDS, main
-from mkpc_kaggle.competition import read_test_side, write_submission
+from mkpc_kaggle.data.competition import read_test_side, write_submission
 from mkpc_kaggle.demo import DemoSet
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
 

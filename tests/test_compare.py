@@ -7,10 +7,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mkpc_kaggle.cli import main
-from mkpc_kaggle.compare import Comparison, paired_difference
 from mkpc_kaggle.demo import DemoSet
+from mkpc_kaggle.evaluation.compare import Comparison, paired_difference
+from mkpc_kaggle.evaluation.validate import PairScore, SceneScore, Validation
 from mkpc_kaggle.geometry.metrics import PoseError
-from mkpc_kaggle.validate import PairScore, SceneScore, Validation
 
 tenths = st.lists(st.integers(0, 10).map(lambda count: count / 10), min_size=1, max_size=30)
 RECIPE = """

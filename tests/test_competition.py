@@ -9,7 +9,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from shared import DATA, needs_data
 
-from mkpc_kaggle.competition import (
+from mkpc_kaggle.data.competition import (
     read_cameras,
     read_submission,
     read_test_side,

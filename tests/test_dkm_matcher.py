@@ -16,8 +16,8 @@ from mkpc_kaggle.matchers.dkm import DkmMatcher, DkmOptions
 from mkpc_kaggle.matchers.networks.dkm import DKM, DenseWarp, DkmFeatures
 from mkpc_kaggle.matchers.networks.dkm_refiner import identity_map
 from mkpc_kaggle.matchers.networks.grids import as_grid
+from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher
 from mkpc_kaggle.recipe import Recipe, Unit
-from mkpc_kaggle.two_stage import TwoStageMatcher
 from mkpc_kaggle.weights import UNVERIFIED, WeightFile, WeightStore
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*is not verified")

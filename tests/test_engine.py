@@ -20,12 +20,12 @@ from rectified import (
     write_pairs,
 )
 
-from mkpc_kaggle.assembly import Assembly
-from mkpc_kaggle.pipeline import Pipeline
+from mkpc_kaggle.engine.engine import Ending
+from mkpc_kaggle.engine.jobs import NOT_REACHED, Record
+from mkpc_kaggle.engine.journal import Journal
+from mkpc_kaggle.pipeline.assembly import Assembly
+from mkpc_kaggle.pipeline.stages import Pipeline
 from mkpc_kaggle.recipe import UpgradeConfig
-from mkpc_kaggle.run.engine import Ending
-from mkpc_kaggle.run.jobs import NOT_REACHED, Record
-from mkpc_kaggle.run.journal import Journal
 
 
 def matrices(records: tuple[Record, ...]) -> bytes:
@@ -229,7 +229,7 @@ def test_the_same_run_twice_gives_the_same_bytes(tmp_path: Path) -> None:
 
 
 def test_an_assembly_is_a_value_that_builds_pipelines(tmp_path: Path) -> None:
-    from mkpc_kaggle.assembly import assemble
+    from mkpc_kaggle.pipeline.assembly import assemble
 
     assembly = assemble(THREE_UNITS, matchers={"rectified": RectifiedMatcher()}, device="cpu")
     assert isinstance(assembly, Assembly)

@@ -24,18 +24,18 @@ from faulty import (
 )
 from rectified import SECOND, SWEEP, THREE_UNITS, RectifiedMatcher, interrupt_after, run, write_pairs
 
-from mkpc_kaggle.assembly import Assembly
 from mkpc_kaggle.cli import main
-from mkpc_kaggle.competition import Pair, read_test_side, submission_problems
+from mkpc_kaggle.data.competition import Pair, read_test_side, submission_problems
 from mkpc_kaggle.demo import DemoSet
+from mkpc_kaggle.engine import session
+from mkpc_kaggle.engine.engine import Ending, RunReport
+from mkpc_kaggle.engine.jobs import NOT_REACHED, Record
+from mkpc_kaggle.engine.journal import Journal
+from mkpc_kaggle.engine.patience import Patience
+from mkpc_kaggle.engine.pools.processes import ProcessPool, Seat
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.pipeline import is_out_of_memory
-from mkpc_kaggle.run import session
-from mkpc_kaggle.run.engine import Ending, RunReport
-from mkpc_kaggle.run.jobs import NOT_REACHED, Record
-from mkpc_kaggle.run.journal import Journal
-from mkpc_kaggle.run.patience import Patience
-from mkpc_kaggle.run.processes import ProcessPool, Seat
+from mkpc_kaggle.pipeline.assembly import Assembly
+from mkpc_kaggle.pipeline.stages import is_out_of_memory
 
 ROOT = Path(__file__).resolve().parents[1]
 COUNT = 12
@@ -183,7 +183,7 @@ def test_a_run_whose_journal_is_full_keeps_its_results_in_memory(
 def test_a_submission_that_the_disk_does_not_take_is_told_and_the_exit_status_is_one(
     demo: DemoSet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from mkpc_kaggle import submit
+    from mkpc_kaggle.engine import submit
 
     whole, versions = submit.write_submission, []
 
@@ -228,10 +228,10 @@ import sys, time
 sys.path[:0] = {path!r}
 from pathlib import Path
 from rectified import THREE_UNITS, RectifiedMatcher, write_pairs
-from mkpc_kaggle.assembly import assemble
-from mkpc_kaggle.run.budget import Budget
-from mkpc_kaggle.run.session import Interrupt, Session, run_pairs
-from mkpc_kaggle.run.in_process import InProcessPool
+from mkpc_kaggle.pipeline.assembly import assemble
+from mkpc_kaggle.engine.budget import Budget
+from mkpc_kaggle.engine.session import Interrupt, Session, run_pairs
+from mkpc_kaggle.engine.pools.in_process import InProcessPool
 
 taken = InProcessPool.next
 def stuck(self, until):
@@ -265,11 +265,11 @@ import sys, time
 sys.path[:0] = {path!r}
 from pathlib import Path
 from rectified import THREE_UNITS, RectifiedMatcher
-from mkpc_kaggle.assembly import assemble
-from mkpc_kaggle.competition import Pair
-from mkpc_kaggle.run.budget import Budget
-from mkpc_kaggle.run.session import Interrupt, Session
-from mkpc_kaggle.submit import submit
+from mkpc_kaggle.pipeline.assembly import assemble
+from mkpc_kaggle.data.competition import Pair
+from mkpc_kaggle.engine.budget import Budget
+from mkpc_kaggle.engine.session import Interrupt, Session
+from mkpc_kaggle.engine.submit import submit
 
 if __name__ == "__main__":
     home = Path(sys.argv[1])

@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from mkpc_kaggle import figures
-from mkpc_kaggle.figures.steps import _far_apart, _line
+from mkpc_kaggle.data.images import Image
 from mkpc_kaggle.geometry.coordinates import Box, Size
 from mkpc_kaggle.geometry.critical_region import CriticalRegion, MkpcConfig, Ratio, RegionReason, find_clusters
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.metrics import PoseError
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL, Estimate, Model
-from mkpc_kaggle.images import Image
-from mkpc_kaggle.pipeline import PairMatch, UnitResult
+from mkpc_kaggle.pipeline.stages import PairMatch, UnitResult
 from mkpc_kaggle.recipe import Unit
+from mkpc_kaggle.reporting import figures
+from mkpc_kaggle.reporting.figures.steps import _far_apart, _line
 
 SIZES = Size(120, 80), Size(60, 90)
 IMAGES = tuple(Image.of_array(np.full((size.height, size.width, 3), 90, np.uint8)) for size in SIZES)

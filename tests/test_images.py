@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from mkpc_kaggle.images import Image, ImageStore, Unreadable, read_image
+from mkpc_kaggle.data.images import Image, ImageStore, Unreadable, read_image
 
 RED = (200, 30, 10)  # RGB
 

@@ -5,14 +5,14 @@ import numpy as np
 import pytest
 from rectified import SECOND, SWEEP, THREE_UNITS
 
+from mkpc_kaggle.engine.jobs import Outcome, Record, record_of
+from mkpc_kaggle.engine.journal import DRAWN, Journal
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Box
 from mkpc_kaggle.geometry.critical_region import CriticalRegion, RegionReason
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import Estimate, Model
-from mkpc_kaggle.pipeline import PairMatch, UnitResult
-from mkpc_kaggle.run.jobs import Outcome, Record, record_of
-from mkpc_kaggle.run.journal import DRAWN, Journal
+from mkpc_kaggle.pipeline.stages import PairMatch, UnitResult
 
 OURS = {"recipe": {"a": 1}, "test set": "x"}
 UNITS = {unit.name: unit for unit in THREE_UNITS.units}

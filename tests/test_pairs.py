@@ -12,17 +12,17 @@ from shared import DATA, needs_data
 
 from mkpc_kaggle import TwoStageMatcher
 from mkpc_kaggle.cli import main
-from mkpc_kaggle.competition import Scene, read_train_side
+from mkpc_kaggle.data.competition import Scene, read_train_side
+from mkpc_kaggle.data.images import Image, read_image
+from mkpc_kaggle.data.pairs import parse_line, read_pairs
 from mkpc_kaggle.demo import DemoSet
+from mkpc_kaggle.engine.session import digest_of
 from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.evaluation.validate import error_of
 from mkpc_kaggle.geometry.cameras import Camera, fundamental_of_cameras
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.robust import Model
-from mkpc_kaggle.images import Image, read_image
-from mkpc_kaggle.pairs import parse_line, read_pairs
 from mkpc_kaggle.recipe import load_recipe
-from mkpc_kaggle.run.session import digest_of
-from mkpc_kaggle.validate import error_of
 
 FILE = Path("list.txt")
 EYE = " ".join(["1 0 0 0 1 0 0 0 1"] * 2 + ["1 0 0 1 0 1 0 0 0 0 1 0 0 0 0 1"])

@@ -19,13 +19,13 @@ from checkpoints import FILES, use_manifest, write_checkpoints
 from shared import DATA, needs_data
 from standin import scene
 
-from mkpc_kaggle.competition import read_submission, read_test_side, submission_problems
+from mkpc_kaggle.data.competition import read_submission, read_test_side, submission_problems
+from mkpc_kaggle.engine.journal import FILE_NAME
 from mkpc_kaggle.geometry.coordinates import View
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import MatcherSpec, Picture
+from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher
 from mkpc_kaggle.recipe import load_recipe
-from mkpc_kaggle.run.journal import FILE_NAME
-from mkpc_kaggle.two_stage import TwoStageMatcher
 from mkpc_kaggle.weights import WeightFile
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -12,17 +12,17 @@ from numpy.testing import assert_allclose
 from shared import WEIGHTS, needs_weights
 from sklearn.datasets import load_sample_image
 
-from mkpc_kaggle.assembly import Licence, assemble
+from mkpc_kaggle.data.images import Image
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Box, Size
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL, Model
-from mkpc_kaggle.images import Image
 from mkpc_kaggle.matchers.contract import Colour, MatcherSpec, Placement
 from mkpc_kaggle.matchers.sift import SiftMatcher, SiftOptions
-from mkpc_kaggle.pipeline import PairWork, Pipeline, finish
+from mkpc_kaggle.pipeline.assembly import Licence, assemble
+from mkpc_kaggle.pipeline.stages import PairWork, Pipeline, finish
+from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher
 from mkpc_kaggle.recipe import Mode, Recipe, Unit, load_recipe
-from mkpc_kaggle.two_stage import TwoStageMatcher
 from mkpc_kaggle.weights import UNVERIFIED, WeightFile, manifest
 from mkpc_kaggle.weights import store as weight_store
 

@@ -10,18 +10,18 @@ import pytest
 from rectified import EXTRA, SECOND, SWEEP, THREE_UNITS
 
 from benchmarks.simulation import RESTART_SECONDS, Scenario, random_scenario, simulate, without_records
+from mkpc_kaggle.engine.budget import Budget
+from mkpc_kaggle.engine.engine import Ending
+from mkpc_kaggle.engine.jobs import Cause, Finished, Job, Lost, Outcome, Phase, Plan, Record, UnitRecord
+from mkpc_kaggle.engine.patience import Patience
+from mkpc_kaggle.engine.planner import Planner
+from mkpc_kaggle.engine.upgrade import Rounds, is_weak
 from mkpc_kaggle.geometry.coordinates import Box
 from mkpc_kaggle.geometry.critical_region import CriticalRegion, RegionReason
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
-from mkpc_kaggle.pipeline import UnitResult
+from mkpc_kaggle.pipeline.stages import UnitResult
 from mkpc_kaggle.recipe import Recipe, UpgradeConfig
-from mkpc_kaggle.run.budget import Budget
-from mkpc_kaggle.run.engine import Ending
-from mkpc_kaggle.run.jobs import Cause, Finished, Job, Lost, Outcome, Phase, Plan, Record, UnitRecord
-from mkpc_kaggle.run.patience import Patience
-from mkpc_kaggle.run.plan import Planner
-from mkpc_kaggle.run.upgrade import Rounds, is_weak
 
 
 def planner(count: int = 40, recipe: Recipe = THREE_UNITS, workers: int = 1) -> Planner:

@@ -8,7 +8,6 @@ import pytest
 import torch
 from standin import filled, scene
 
-from mkpc_kaggle.assembly import fastest_precision, resolve_placement
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.matchers.contract import Placement, Precision
@@ -19,6 +18,7 @@ from mkpc_kaggle.matchers.networks.placement import placed
 from mkpc_kaggle.matchers.networks.quadtree import Quadtree
 from mkpc_kaggle.matchers.networks.superglue import ImageKeypoints, SuperGlue, SuperGlueConfig
 from mkpc_kaggle.matchers.networks.superpoint import SuperPoint, SuperPointConfig
+from mkpc_kaggle.pipeline.assembly import fastest_precision, resolve_placement
 
 SIZE = Size(224, 160)
 MAKERS = {

@@ -16,9 +16,9 @@ from rectified import THREE_UNITS, RectifiedMatcher, run, write_pairs
 from test_faults import QUICK, matrices
 from weight_files import line
 
-from mkpc_kaggle.competition import Pair
-from mkpc_kaggle.run.cluster import RayCluster
-from mkpc_kaggle.run.engine import Ending, RunReport
+from mkpc_kaggle.data.competition import Pair
+from mkpc_kaggle.engine.engine import Ending, RunReport
+from mkpc_kaggle.engine.pools.cluster import RayCluster
 
 ray = pytest.importorskip("ray", reason="Ray is not installed: pip install 'mkpc-kaggle[ray]'")
 
@@ -101,8 +101,8 @@ def test_images_are_sent_to_machines_that_cannot_read_them(
 
 
 def test_an_image_is_read_here_only_if_it_is_the_same_file(tmp_path: Path) -> None:
-    from mkpc_kaggle.images import Image, Unreadable
-    from mkpc_kaggle.run.ray_pool import Library, read_or_fetch
+    from mkpc_kaggle.data.images import Image, Unreadable
+    from mkpc_kaggle.engine.pools.ray_pool import Library, read_or_fetch
 
     pair, other = write_pairs(tmp_path, 2)
     library, asked = Library(), []
@@ -128,7 +128,7 @@ def test_an_image_is_read_here_only_if_it_is_the_same_file(tmp_path: Path) -> No
 def test_weights_are_linked_where_they_are_and_sent_where_they_are_not(tmp_path: Path) -> None:
     from types import SimpleNamespace
 
-    from mkpc_kaggle.run.ray_pool import Library, local_store
+    from mkpc_kaggle.engine.pools.ray_pool import Library, local_store
     from mkpc_kaggle.weights import FoundFile, State
 
     def found(path: Path, content: bytes) -> FoundFile:
@@ -159,7 +159,7 @@ def node(name: str, alive: bool = True, **offer: float) -> dict[str, Any]:
     ],
 )
 def test_places_are_the_gpus_or_else_the_machines(device: str, expected: list[tuple[str, int, int, bool]]) -> None:
-    from mkpc_kaggle.run.ray_pool import places_of
+    from mkpc_kaggle.engine.pools.ray_pool import places_of
 
     nodes = [
         node("cpus", CPU=6),
@@ -176,10 +176,10 @@ import sys, time
 sys.path[:0] = {path!r}
 from pathlib import Path
 from rectified import THREE_UNITS, RectifiedMatcher, write_pairs
-from mkpc_kaggle.assembly import assemble
-from mkpc_kaggle.run.budget import Budget
-from mkpc_kaggle.run.cluster import RayCluster
-from mkpc_kaggle.run.session import Session, interruptible, run_pairs
+from mkpc_kaggle.pipeline.assembly import assemble
+from mkpc_kaggle.engine.budget import Budget
+from mkpc_kaggle.engine.pools.cluster import RayCluster
+from mkpc_kaggle.engine.session import Session, interruptible, run_pairs
 
 home = Path(sys.argv[1])
 pairs = write_pairs(home / "pairs", 200)

@@ -7,13 +7,13 @@ from itertools import combinations
 
 import pytest
 
+from mkpc_kaggle.config import Range
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Box, Size, View
 from mkpc_kaggle.geometry.critical_region import MkpcConfig, Ratio
 from mkpc_kaggle.geometry.robust import Method, RobustConfig
 from mkpc_kaggle.matchers.contract import Training
 from mkpc_kaggle.matchers.registry import options_of, registry, slots_of
-from mkpc_kaggle.ranges import Range
 from mkpc_kaggle.recipe import DIRECTORY, Choice, Mode, Recipe, Unit, load_recipe, parse_recipe, recipe_names
 
 SIFT = 'units = [{ stage = 1, matcher = "sift", long_side = 640 }]\n'

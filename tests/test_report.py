@@ -16,13 +16,13 @@ import pytest
 from rectified import SWEEP, THREE_UNITS, RectifiedMatcher, run, write_pairs
 
 from mkpc_kaggle.cli import main
-from mkpc_kaggle.competition import Pair
+from mkpc_kaggle.data.competition import Pair
+from mkpc_kaggle.engine.jobs import Outcome, Record, UnitRecord
+from mkpc_kaggle.engine.journal import DRAWN, About, EventKind, Journal, JournalReader
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.markup import Markup, element
-from mkpc_kaggle.report import Artist, match_of, report_page, report_run
-from mkpc_kaggle.run.jobs import Outcome, Record, UnitRecord
-from mkpc_kaggle.run.journal import DRAWN, About, EventKind, Journal, JournalReader
-from mkpc_kaggle.run.log import NOT_ENDED, RunLog, overview, read_log, tables
+from mkpc_kaggle.reporting.markup import Markup, element
+from mkpc_kaggle.reporting.report import Artist, match_of, report_page, report_run
+from mkpc_kaggle.reporting.run_log import NOT_ENDED, RunLog, overview, read_log, tables
 
 EVIL = '<script>alert("$x$")</script>'
 BELONGS_TO = {"recipe": THREE_UNITS.fingerprint(), "test set": "abc", "weights": {"xfeat": "123"}}
@@ -294,7 +294,7 @@ def test_the_command_draws_a_page_with_the_images_of_a_test_side(tmp_path: Path)
 
 
 def test_a_time_limit_is_drawn_where_the_run_came_near_it_and_told_where_not() -> None:
-    from mkpc_kaggle import figures
+    from mkpc_kaggle.reporting import figures
 
     for limit, drawn in ((60.0, True), (8.75 * 3600, False), (None, False)):
         axes = figures.draw_budget({"sweep": [5.0, 9.0], "deepen": [30.0]}, {"fault": [12.0]}, limit).axes[0]
@@ -304,11 +304,11 @@ def test_a_time_limit_is_drawn_where_the_run_came_near_it_and_told_where_not() -
 
 
 def test_a_strip_shows_both_images_at_one_height() -> None:
-    from mkpc_kaggle import figures
+    from mkpc_kaggle.data.images import Image
     from mkpc_kaggle.geometry.matches import Matches
     from mkpc_kaggle.geometry.robust import Estimate, Model
-    from mkpc_kaggle.images import Image
-    from mkpc_kaggle.pipeline import PairMatch, UnitResult
+    from mkpc_kaggle.pipeline.stages import PairMatch, UnitResult
+    from mkpc_kaggle.reporting import figures
 
     images = (
         Image.of_array(np.full((100, 200, 3), 250, np.uint8)),

@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mkpc_kaggle import figures
-from mkpc_kaggle.compare import Comparison
+from mkpc_kaggle.evaluation.compare import Comparison
+from mkpc_kaggle.evaluation.validate import PairScore, SceneScore, Validation
 from mkpc_kaggle.geometry.metrics import PoseError
-from mkpc_kaggle.validate import PairScore, SceneScore, Validation
+from mkpc_kaggle.reporting import figures
 
 
 def scene(name: str, *rotations: float) -> SceneScore:

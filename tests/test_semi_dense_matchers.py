@@ -17,8 +17,8 @@ from mkpc_kaggle.matchers.networks.aspanformer import AspanFormer, AspanFormerCo
 from mkpc_kaggle.matchers.networks.loftr import Loftr, LoftrConfig
 from mkpc_kaggle.matchers.networks.quadtree import Quadtree, QuadtreeConfig
 from mkpc_kaggle.matchers.semi_dense import PREFIX, SemiDenseMatcher, SemiDenseOptions, content_mask
+from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher
 from mkpc_kaggle.recipe import Recipe, Unit
-from mkpc_kaggle.two_stage import TwoStageMatcher
 from mkpc_kaggle.weights import UNVERIFIED, WeightFile, WeightStore
 
 MODULES: list[tuple[ModuleType, type[nn.Module]]] = [

@@ -12,7 +12,7 @@ from kaggle_image import environment, make_image, pack_wheel, python_version
 from offline_notebook import execute, needs_namespaces, pictures, printed
 from shared import DATA, WEIGHTS, needs_data, needs_weights
 
-from mkpc_kaggle.competition import read_test_side, submission_problems
+from mkpc_kaggle.data.competition import read_test_side, submission_problems
 from mkpc_kaggle.demo import DemoSet
 from mkpc_kaggle.package import Request, make_package
 from mkpc_kaggle.package.metadata import COMPETITION

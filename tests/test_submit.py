@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from mkpc_kaggle.competition import read_submission, read_test_side, submission_problems
+from mkpc_kaggle.data.competition import read_submission, read_test_side, submission_problems
 from mkpc_kaggle.demo import DemoSet
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
 

@@ -13,8 +13,8 @@ from mkpc_kaggle.matchers import superglue
 from mkpc_kaggle.matchers.contract import Picture, Placement, Training, encoding_bytes
 from mkpc_kaggle.matchers.networks.superglue import SuperGlue, SuperGlueConfig
 from mkpc_kaggle.matchers.networks.superpoint import SuperPoint, SuperPointConfig
+from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher
 from mkpc_kaggle.recipe import Recipe, Unit
-from mkpc_kaggle.two_stage import TwoStageMatcher
 from mkpc_kaggle.weights import UNVERIFIED, WeightFile, WeightStore
 
 OPTIONS = superglue.SuperGlueOptions(max_keypoints=300, keypoint_threshold=0.0, match_threshold=0.0)

@@ -8,16 +8,16 @@ import pytest
 from benchmarks import table1
 from benchmarks.merging import merged
 from benchmarks.table1 import CONTRASTS, Diary, Found, Tables, Way, run_all, union, ways_of
-from mkpc_kaggle.assembly import assemble
-from mkpc_kaggle.competition import read_train_side
+from mkpc_kaggle.data.competition import read_train_side
 from mkpc_kaggle.demo import DemoSet
+from mkpc_kaggle.engine.budget import Budget
+from mkpc_kaggle.engine.session import Interrupt, Session
 from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.evaluation.validate import validate
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.metrics import PoseError
+from mkpc_kaggle.pipeline.assembly import assemble
 from mkpc_kaggle.recipe import Mode
-from mkpc_kaggle.run.budget import Budget
-from mkpc_kaggle.run.session import Interrupt, Session
-from mkpc_kaggle.validate import validate
 
 
 def matches(*points: tuple[float, float]) -> Matches:

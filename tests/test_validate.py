@@ -6,15 +6,15 @@ import pytest
 from shared import DATA, needs_data
 
 from mkpc_kaggle.cli import main
-from mkpc_kaggle.competition import Pair, Scene, TruePair, read_test_side, read_train_side, write_submission
+from mkpc_kaggle.data.competition import Pair, Scene, TruePair, read_test_side, read_train_side, write_submission
 from mkpc_kaggle.demo import DemoSet
+from mkpc_kaggle.engine.jobs import Record
 from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.evaluation.validate import score_record, score_submission, score_table
 from mkpc_kaggle.geometry.cameras import Camera, fundamental_of_cameras
 from mkpc_kaggle.geometry.metrics import AUC_THRESHOLDS
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
-from mkpc_kaggle.run.jobs import Record
-from mkpc_kaggle.run.log import read_log
-from mkpc_kaggle.validate import score_record, score_submission, score_table
+from mkpc_kaggle.reporting.run_log import read_log
 
 RECIPE = """
 units = [{ stage = 1, matcher = "sift", long_side = 320 }, { stage = 2, matcher = "sift", long_side = 400 }]

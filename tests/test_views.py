@@ -7,14 +7,14 @@ import pytest
 
 from benchmarks import views
 from benchmarks.views import Seen, Views, look, recipe_of, table
-from mkpc_kaggle.assembly import assemble
-from mkpc_kaggle.competition import Scene, TruePair, read_train_side
+from mkpc_kaggle.data.competition import Scene, TruePair, read_train_side
+from mkpc_kaggle.data.images import Image
 from mkpc_kaggle.demo import DemoSet
 from mkpc_kaggle.geometry.cameras import relative_pose
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.images import Image
-from mkpc_kaggle.two_stage import to_image
+from mkpc_kaggle.pipeline.assembly import assemble
+from mkpc_kaggle.pipeline.two_stage import to_image
 
 
 @pytest.fixture(scope="module")

@@ -16,7 +16,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    from mkpc_kaggle.competition import read_test_side, submission_problems
+    from mkpc_kaggle.data.competition import read_test_side, submission_problems
 
     pairs = read_test_side(arguments.test_dir)
     problems = submission_problems(arguments.submission, [pair.id for pair in pairs])

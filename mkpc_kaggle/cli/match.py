@@ -19,8 +19,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    from mkpc_kaggle import figures
-    from mkpc_kaggle.two_stage import TwoStageMatcher, to_image
+    from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher, to_image
+    from mkpc_kaggle.reporting import figures
 
     images = to_image(arguments.image0), to_image(arguments.image1)
     matcher = TwoStageMatcher(

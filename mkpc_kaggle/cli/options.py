@@ -5,11 +5,11 @@ from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mkpc_kaggle.run.budget import Budget, monotonic_of, parse_duration
-from mkpc_kaggle.run.cluster import RayCluster, parse_workers
+from mkpc_kaggle.engine.budget import Budget, monotonic_of, parse_duration
+from mkpc_kaggle.engine.pools.cluster import RayCluster, parse_workers
 
 if TYPE_CHECKING:
-    from mkpc_kaggle.assembly import Assembly
+    from mkpc_kaggle.pipeline.assembly import Assembly
     from mkpc_kaggle.recipe import Choice
 
 
@@ -63,7 +63,7 @@ def add_mode(parser: argparse.ArgumentParser) -> None:
 
 def assembly_of(arguments: argparse.Namespace, choice: "Choice") -> "Assembly":
     """The parts of a run, as the options of :func:`add_matching` say, but for the choice of the recipe."""
-    from mkpc_kaggle.assembly import Licence, assemble
+    from mkpc_kaggle.pipeline.assembly import Licence, assemble
 
     return assemble(
         choice.recipe,

@@ -17,7 +17,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    from mkpc_kaggle.assembly import missing_slots, what_is_missing
+    from mkpc_kaggle.pipeline.assembly import missing_slots, what_is_missing
     from mkpc_kaggle.recipe import load_recipe, recipe_names
     from mkpc_kaggle.weights import WeightStore
 

@@ -43,12 +43,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    from mkpc_kaggle.competition import read_test_side
+    from mkpc_kaggle.data.competition import read_test_side
+    from mkpc_kaggle.engine.session import Session, interruptible
+    from mkpc_kaggle.engine.submit import submit
     from mkpc_kaggle.recipe import Choice, Mode
-    from mkpc_kaggle.report import report_run
-    from mkpc_kaggle.run.session import Session, interruptible
-    from mkpc_kaggle.run.summary import summary
-    from mkpc_kaggle.submit import submit
+    from mkpc_kaggle.reporting.report import report_run
+    from mkpc_kaggle.reporting.summary import summary
 
     output: Path = arguments.output
     with interruptible() as interrupt:

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 from mkpc_kaggle.cli import leave, options
 
 if TYPE_CHECKING:
-    from mkpc_kaggle.assembly import Assembly
-    from mkpc_kaggle.competition import Scene
+    from mkpc_kaggle.data.competition import Scene
+    from mkpc_kaggle.engine.session import Interrupt, Session
+    from mkpc_kaggle.evaluation.validate import Validation
+    from mkpc_kaggle.pipeline.assembly import Assembly
     from mkpc_kaggle.recipe import Choice, Recipe
-    from mkpc_kaggle.run.session import Interrupt, Session
-    from mkpc_kaggle.validate import Validation
 
 HELP = """\
 Run a recipe, with the engine that makes submissions, on a train side (calibration.csv, pair_covisibility.csv
@@ -81,7 +81,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     from mkpc_kaggle.errors import UserError
-    from mkpc_kaggle.validate import score_submission, score_table
+    from mkpc_kaggle.evaluation.validate import score_submission, score_table
 
     if (arguments.submission is None) != (arguments.truth is None):
         raise UserError("--submission and --truth go together")
@@ -107,9 +107,9 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _read_scenes(arguments: argparse.Namespace, work_dir: Path) -> "tuple[Scene, ...]":
-    from mkpc_kaggle.competition import read_train_side
+    from mkpc_kaggle.data.competition import read_train_side
+    from mkpc_kaggle.data.pairs import read_pairs
     from mkpc_kaggle.geometry.robust import Model
-    from mkpc_kaggle.pairs import read_pairs
 
     if arguments.pairs is not None:
         scene = read_pairs(
@@ -129,9 +129,9 @@ def _read_scenes(arguments: argparse.Namespace, work_dir: Path) -> "tuple[Scene,
 
 
 def _match_and_score(arguments: argparse.Namespace, scenes: "tuple[Scene, ...]", work_dir: Path) -> int:
+    from mkpc_kaggle.engine.session import interruptible
+    from mkpc_kaggle.evaluation.validate import score_table, to_json, validate
     from mkpc_kaggle.recipe import Choice, Mode
-    from mkpc_kaggle.run.session import interruptible
-    from mkpc_kaggle.validate import score_table, to_json, validate
 
     with interruptible() as interrupt:
         assembly = _assemble(arguments, Choice(arguments.recipe, Mode(arguments.mode)))
@@ -145,11 +145,11 @@ def _match_and_score(arguments: argparse.Namespace, scenes: "tuple[Scene, ...]",
 
 
 def _compare(arguments: argparse.Namespace, scenes: "tuple[Scene, ...]", work_dir: Path) -> int:
-    from mkpc_kaggle.compare import Comparison, comparison_json, comparison_table
+    from mkpc_kaggle.engine.engine import Ending
+    from mkpc_kaggle.engine.session import interruptible
+    from mkpc_kaggle.evaluation.compare import Comparison, comparison_json, comparison_table
+    from mkpc_kaggle.evaluation.validate import score_table, validate
     from mkpc_kaggle.recipe import Choice
-    from mkpc_kaggle.run.engine import Ending
-    from mkpc_kaggle.run.session import interruptible
-    from mkpc_kaggle.validate import score_table, validate
 
     validations = []
     with interruptible() as interrupt:
@@ -173,7 +173,7 @@ def _compare(arguments: argparse.Namespace, scenes: "tuple[Scene, ...]", work_di
 
 
 def _session(arguments: argparse.Namespace, work_dir: Path, interrupt: "Interrupt") -> "Session":
-    from mkpc_kaggle.run.session import Session
+    from mkpc_kaggle.engine.session import Session
 
     return Session(work_dir, options.budget_of(arguments), interrupt, workers=arguments.workers)
 
@@ -218,7 +218,7 @@ def _with_estimator(recipe: "Recipe", arguments: argparse.Namespace) -> "Recipe"
 def _print_summary(
     arguments: argparse.Namespace, validation: "Validation", scenes: "tuple[Scene, ...]", assembly: "Assembly"
 ) -> None:
-    from mkpc_kaggle.run.summary import summary
+    from mkpc_kaggle.reporting.summary import summary
 
     pairs = [true.pair for scene in scenes for true in scene.pairs]
     assert validation.report is not None
@@ -230,7 +230,7 @@ def _print_summary(
 
 def _write_report(arguments: argparse.Namespace, scenes: "tuple[Scene, ...]", session: "Session") -> None:
     """The page on a run whose journal stays; it tells inliers by an F, so none where E was estimated."""
-    from mkpc_kaggle.report import report_run
+    from mkpc_kaggle.reporting.report import report_run
 
     if arguments.work_dir is not None and arguments.pairs is None:
         pairs = [true.pair for scene in scenes for true in scene.pairs]

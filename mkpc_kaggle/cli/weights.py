@@ -59,7 +59,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _list(arguments: argparse.Namespace) -> int:
-    from mkpc_kaggle.uses import matchers_with, recipes_with
+    from mkpc_kaggle.pipeline.uses import matchers_with, recipes_with
     from mkpc_kaggle.weights import WeightStore
 
     store = WeightStore(arguments.weights)
@@ -97,7 +97,7 @@ def _verify(arguments: argparse.Namespace) -> int:
 
 
 def _locate(arguments: argparse.Namespace) -> int:
-    from mkpc_kaggle.uses import files_of
+    from mkpc_kaggle.pipeline.uses import files_of
     from mkpc_kaggle.weights import WeightStore
 
     store = WeightStore(arguments.weights)
@@ -113,7 +113,7 @@ def _locate(arguments: argparse.Namespace) -> int:
 
 
 def _fetch(arguments: argparse.Namespace) -> int:
-    from mkpc_kaggle.uses import files_of
+    from mkpc_kaggle.pipeline.uses import files_of
     from mkpc_kaggle.weights import WeightStore
     from mkpc_kaggle.weights.fetch import Outcome, choose, fetch
 

@@ -11,9 +11,9 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from mkpc_kaggle.config import AT_LEAST_1, POSITIVE, SHARE, check_ranges
 from mkpc_kaggle.geometry.clustering import dbscan
 from mkpc_kaggle.geometry.coordinates import Box, Points, Size
-from mkpc_kaggle.ranges import AT_LEAST_1, POSITIVE, SHARE, check_ranges
 
 
 class Ratio(StrEnum):

@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mkpc_kaggle.config import AT_LEAST_1, POSITIVE, Range, check_ranges
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.ranges import AT_LEAST_1, POSITIVE, Range, check_ranges
 
 Matrix3 = NDArray[np.float64]
 

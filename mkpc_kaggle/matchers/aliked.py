@@ -6,11 +6,11 @@ from dataclasses import dataclass
 import torch
 from kornia.feature import ALIKED
 
+from mkpc_kaggle.config import AT_LEAST_1, SHARE, check_ranges
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import MatcherSpec, Picture, Placement
 from mkpc_kaggle.matchers.neighbours import mutual_neighbours
 from mkpc_kaggle.matchers.sparse import Keypoints, image_batch, matches_of
-from mkpc_kaggle.ranges import AT_LEAST_1, SHARE, check_ranges
 from mkpc_kaggle.weights import WeightStore, load_into
 
 SLOT = "aliked-n16"

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 import torch
 
+from mkpc_kaggle.config import AT_LEAST_1, SHARE, Range, check_ranges
 from mkpc_kaggle.geometry.coordinates import Size, from_normalised
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import MatcherSpec, Picture, Placement, Training
 from mkpc_kaggle.matchers.networks.dkm import DKM, DkmConfig, DkmFeatures, SamplingConfig, network_input, sample
 from mkpc_kaggle.matchers.networks.placement import placed
-from mkpc_kaggle.ranges import AT_LEAST_1, SHARE, Range, check_ranges
 from mkpc_kaggle.weights import WeightStore, load_into
 
 

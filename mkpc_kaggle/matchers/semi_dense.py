@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from mkpc_kaggle.config import SHARE, check_ranges
 from mkpc_kaggle.geometry.coordinates import Size, from_corner
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import MatcherSpec, Picture, Training
@@ -15,7 +16,6 @@ from mkpc_kaggle.matchers.networks.fine_matching import COARSE_STRIDE, SemiDense
 from mkpc_kaggle.matchers.networks.resnet_fpn import FeatureMaps
 from mkpc_kaggle.matchers.networks.semi_dense import SemiDenseNetwork
 from mkpc_kaggle.matchers.sparse import image_batch
-from mkpc_kaggle.ranges import SHARE, check_ranges
 from mkpc_kaggle.weights import WeightStore, load_into
 
 PREFIX = "matcher."

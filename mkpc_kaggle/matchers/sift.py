@@ -11,11 +11,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from mkpc_kaggle.config import AT_LEAST_0, AT_LEAST_1, SHARE, check_ranges
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import Colour, MatcherSpec, Picture, Placement
 from mkpc_kaggle.matchers.neighbours import mutual_neighbours
 from mkpc_kaggle.matchers.sparse import Keypoints, matches_of
-from mkpc_kaggle.ranges import AT_LEAST_0, AT_LEAST_1, SHARE, check_ranges
 from mkpc_kaggle.weights import WeightStore
 
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import torch
 
+from mkpc_kaggle.config import AT_LEAST_0, AT_LEAST_1, SHARE, check_ranges
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import Colour, MatcherSpec, Picture, Placement, Training
@@ -12,7 +13,6 @@ from mkpc_kaggle.matchers.networks.placement import placed
 from mkpc_kaggle.matchers.networks.superglue import ImageKeypoints, SuperGlue, SuperGlueConfig
 from mkpc_kaggle.matchers.networks.superpoint import SuperPoint, SuperPointConfig, SuperPointKeypoints
 from mkpc_kaggle.matchers.sparse import image_batch
-from mkpc_kaggle.ranges import AT_LEAST_0, AT_LEAST_1, SHARE, check_ranges
 from mkpc_kaggle.weights import WeightStore, load_into
 
 

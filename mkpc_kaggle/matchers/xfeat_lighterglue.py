@@ -8,11 +8,11 @@ import torch
 from kornia.feature import LightGlue, XFeat
 from torch import Tensor
 
+from mkpc_kaggle.config import AT_LEAST_1, SHARE, check_ranges
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import MatcherSpec, Picture, Placement
 from mkpc_kaggle.matchers.networks.placement import autocast
 from mkpc_kaggle.matchers.sparse import Keypoints, image_batch, matches_of
-from mkpc_kaggle.ranges import AT_LEAST_1, SHARE, check_ranges
 from mkpc_kaggle.weights import WeightStore, load_into
 
 XFEAT, LIGHTERGLUE = "xfeat", "xfeat-lighterglue"

@@ -1,0 +1,1 @@
+"""Files in and out: the competition directory, lists of pairs, images."""

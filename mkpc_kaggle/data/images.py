@@ -1,0 +1,134 @@
+"""Decoding images, ahead of need and once: an unreadable file is a value with a reason, not an exception."""
+
+import hashlib
+import threading
+from collections.abc import Callable, Iterable
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from mkpc_kaggle.data.cache import ByteCache
+from mkpc_kaggle.geometry.coordinates import Pixels, Size
+
+
+@dataclass(frozen=True, eq=False)
+class Image:
+    """A decoded picture: ``pixels`` is (H, W, 3) uint8 RGB; ``name`` tells it from all others of a run."""
+
+    name: str
+    pixels: Pixels
+
+    @classmethod
+    def of_array(cls, array: Pixels) -> "Image":
+        """From (H, W, 3) RGB or (H, W) gray uint8, named by its content; ``ValueError`` for anything else."""
+        if (
+            array.dtype != np.uint8
+            or array.ndim not in (2, 3)
+            or array.shape[2:] not in ((), (3,))
+            or not array.size
+        ):
+            raise ValueError(f"an image is uint8 (H, W) or (H, W, 3), not {array.dtype} {array.shape}")
+        pixels = np.ascontiguousarray(np.stack([array] * 3, axis=2) if array.ndim == 2 else array)
+        return cls(f"{hashlib.blake2b(pixels.tobytes()).hexdigest()[:32]} {pixels.shape}", pixels)
+
+    @property
+    def size(self) -> Size:
+        height, width = self.pixels.shape[:2]
+        return Size(width, height)
+
+    @cached_property
+    def gray(self) -> Pixels:
+        """(H, W) uint8."""
+        return np.asarray(cv2.cvtColor(self.pixels, cv2.COLOR_RGB2GRAY), np.uint8)
+
+
+@dataclass(frozen=True)
+class Unreadable:
+    """An image that could not be decoded, and why."""
+
+    name: str
+    reason: str
+
+    def __str__(self) -> str:
+        return f"{self.name}: {self.reason}"
+
+
+def read_image(path: Path) -> Image | Unreadable:
+    """Decode one file (png, jpg; 8 or 16 bit; gray, colour, with alpha) to 8-bit RGB; never raises.
+
+    16-bit values are divided by 256, alpha is dropped, an EXIF orientation is applied. Whether a damaged file
+    is readable is OpenCV's to say: version 5 refuses one that was cut off.
+    """
+    name = str(path)
+    try:
+        data = np.fromfile(path, np.uint8)
+    except FileNotFoundError:
+        return Unreadable(name, "no such file")
+    except (OSError, ValueError, MemoryError) as error:
+        return Unreadable(name, f"cannot be read: {error}")
+    return decode_image(name, data)
+
+
+def decode_image(name: str, data: Pixels) -> Image | Unreadable:
+    """Decode the (N,) uint8 bytes of a file, as :func:`read_image` does; never raises."""
+    if data.size == 0:
+        return Unreadable(name, "the file is empty")
+    try:
+        bgr = cv2.imdecode(data, cv2.IMREAD_COLOR)
+    except (cv2.error, MemoryError) as error:
+        return Unreadable(name, f"cannot be decoded: {error}")
+    if bgr is None:
+        return Unreadable(name, "not a picture, or cut off: it cannot be decoded")
+    return Image(name, np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8))
+
+
+class ImageStore:
+    """Images by path, decoded in the background when they are announced, the last used kept.
+
+    ``read`` gets at one, other than from a file if it is given; it never raises.
+    """
+
+    read: Callable[[Path], Image | Unreadable] = staticmethod(read_image)
+
+    def __init__(
+        self,
+        limit_bytes: int = 512 << 20,
+        threads: int = 1,
+        read: Callable[[Path], Image | Unreadable] | None = None,
+    ) -> None:
+        if read is not None:
+            self.read = read
+        self._images: ByteCache[Path, Image] = ByteCache(limit_bytes)
+        self._coming: dict[Path, Future[Image | Unreadable]] = {}
+        self._lock = threading.Lock()
+        self._decoders = ThreadPoolExecutor(threads, thread_name_prefix="decode")
+
+    def announce(self, paths: Iterable[Path]) -> None:
+        """Start decoding what is neither here nor on its way."""
+        for path in paths:
+            with self._lock:
+                if path not in self._coming and self._images.get(path) is None:
+                    self._coming[path] = self._decoders.submit(self.read, path)
+
+    def get(self, path: Path) -> Image | Unreadable:
+        """The image, waiting for it if need be."""
+        with self._lock:
+            known = self._images.get(path)
+            if known is not None:
+                return known
+            coming = self._coming.get(path) or self._decoders.submit(self.read, path)
+            self._coming[path] = coming
+        image = coming.result()
+        with self._lock:
+            if isinstance(image, Image):
+                self._images.put(path, image, image.pixels.nbytes)
+            if self._coming.get(path) is coming:
+                del self._coming[path]
+        return image
+
+    def close(self) -> None:
+        self._decoders.shutdown(wait=False, cancel_futures=True)

@@ -1,0 +1,254 @@
+"""The engine: plans, jobs and results, journalled as they come; every version of the submission is whole."""
+
+import sqlite3
+import sys
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Protocol
+
+from mkpc_kaggle.data.competition import Pair
+from mkpc_kaggle.engine.budget import Budget
+from mkpc_kaggle.engine.jobs import Finished, Job, Lost, Outcome, Plan, Record, Task, visiting_order
+from mkpc_kaggle.engine.journal import EventKind
+from mkpc_kaggle.engine.patience import Patience
+from mkpc_kaggle.engine.planner import Explanation, Planner
+from mkpc_kaggle.engine.pools.pool import Pool
+from mkpc_kaggle.engine.progress import progress_on
+from mkpc_kaggle.pipeline.stages import UnitResult
+from mkpc_kaggle.recipe import Recipe, Unit
+
+PUBLISH_SECONDS = 30.0
+LISTEN_SECONDS = 0.2
+"""How often an interrupt is looked for."""
+GRACE_SECONDS = 5.0
+"""How long an interrupted run waits for the unit that is running."""
+
+
+class Ending(StrEnum):
+    """Why a run ended."""
+
+    COMPLETE = "complete"
+    TIME_IS_UP = "time is up"
+    INTERRUPTED = "interrupted"
+    NO_WORKER = "no worker left"
+
+
+@dataclass(frozen=True)
+class RunReport:
+    """What a run leaves behind: a record for every pair, in their order, and how it went.
+
+    ``resumed`` pairs were done by earlier runs; ``faults`` are jobs that were lost and files that could not be
+    written, with their reasons; ``unwritten`` says why the last version of the submission could not be.
+    """
+
+    records: tuple[Record, ...]
+    ending: Ending
+    seconds: float
+    resumed: int
+    faults: tuple[str, ...]
+    explanations: tuple[Explanation, ...] = ()
+    unwritten: str = ""
+
+
+class Diary(Protocol):
+    """What the engine wants of a journal."""
+
+    def records(self) -> dict[int, Record]: ...
+
+    def results(self, pair: int, units: Mapping[str, Unit]) -> tuple[UnitResult, ...]: ...
+
+    def save(self, outcomes: list[tuple[Outcome, bool]]) -> None: ...
+
+    def note(self, kind: str, seconds: float, text: str) -> None: ...
+
+
+class Engine:
+    """One run over ``pairs``.
+
+    ``publish`` is called with all records, in the order of ``pairs``, when the run starts, every half minute,
+    and when it ends. Setting ``interrupt`` ends the run early, with all rows there.
+    """
+
+    def __init__(
+        self,
+        pairs: Sequence[Pair],
+        recipe: Recipe,
+        pool: Pool,
+        journal: Diary,
+        budget: Budget,
+        *,
+        publish: Callable[[Sequence[Record]], None],
+        interrupt: threading.Event,
+        progress: bool = True,
+        patience: Patience | None = None,
+    ) -> None:
+        self.pairs = pairs
+        self.recipe = recipe
+        self.pool = pool
+        self.journal = journal
+        self.budget = budget
+        self.publish = publish
+        self.interrupt = interrupt
+        self.faults: list[str] = []
+        self.unwritten = ""
+        self._units = {unit.name: unit for unit in recipe.units}
+        self._unjournalled: dict[int, tuple[UnitResult, ...]] = {}
+        self._out = self._explained = 0
+        self._published = budget.clock()
+        self._wait_until = budget.end
+        self._progress = progress_on(sys.stderr, budget) if progress else None
+        self._publishing = threading.Lock()
+        self.planner = self._planner(patience)
+
+    def run(self) -> RunReport:
+        """Run until all is done, the time is up, or an interrupt; raises only what the pool's start raises."""
+        records = self.planner.records
+        resumed = sum(not record.lacking(self.recipe.regular) for record in records)
+        self._publish()
+        if any(self.planner.wanted(record) for record in records):
+            self.pool.start()
+            self._work()
+            self._wait()
+        if self._progress is not None:
+            self._progress.close()
+        self._publish()
+        self._note_explanations()
+        return RunReport(
+            tuple(records),
+            self._ending(),
+            self.budget.spent(),
+            resumed,
+            tuple(self.faults),
+            tuple(self.planner.explanations),
+            self.unwritten,
+        )
+
+    def save_what_there_is(self, seconds: float) -> None:
+        """Write the submission from another thread, unless the engine's own is at it for longer than that."""
+        if self._publishing.acquire(timeout=seconds):
+            self.publish(list(self.planner.records))
+
+    def _planner(self, patience: Patience | None) -> Planner:
+        records = [Record.untouched(index) for index in range(len(self.pairs))]
+        for index, record in self.journal.records().items():
+            records[index] = record
+        return Planner(visiting_order(self.pairs), self.recipe, records, self.budget, patience=patience)
+
+    def _work(self) -> None:
+        """Hand out what is planned as long as there is room, and gather what comes back."""
+        while not self.interrupt.is_set() and self.budget.left() > 0:
+            self.planner.workers = max(1, self.pool.workers)
+            while self._out < self.pool.capacity:
+                plan = self.planner.next(self.budget.clock())
+                if plan is None:
+                    break
+                self._hand_out(plan)
+            if self._out == 0:
+                return
+            while not self._gather() and not self.interrupt.is_set() and self.budget.left() > 0:
+                pass  # only a job that comes back changes the plan
+
+    def _wait(self) -> None:
+        """Let what is under way end, until nothing is waited for any longer."""
+        while self._out > 0 and self.budget.clock() < self._wait_until:
+            if self.interrupt.is_set() and self._wait_until == self.budget.end:
+                self.pool.stop()
+                self._wait_until = min(self._wait_until, self.budget.clock() + GRACE_SECONDS)
+            self._gather()
+
+    def _hand_out(self, plan: Plan) -> None:
+        self._out += 1
+        self.pool.submit(
+            Job(plan, tuple(Task(index, self.pairs[index], self._results(index)) for index in plan.indices))
+        )
+
+    def _results(self, index: int) -> tuple[UnitResult, ...]:
+        """What earlier jobs found on a pair."""
+        if not self.planner.records[index].units:
+            return ()
+        if index in self._unjournalled:
+            return self._unjournalled[index]
+        try:
+            return self.journal.results(index, self._units)
+        except sqlite3.Error as error:  # without its former results a job gains nothing, and the F stays
+            self._fault(f"the journal cannot be read ({error})")
+            return ()
+
+    def _gather(self) -> bool:
+        """Take one job back; whether one came."""
+        back = self.pool.next(min(self.budget.clock() + LISTEN_SECONDS, self._wait_until))
+        if back is None:
+            return False
+        self._out -= 1
+        now = self.budget.clock()
+        if isinstance(back, Lost):
+            self._fault(f"a job was lost: {back}")
+            self._keep(self.planner.lose(back, now))
+        else:
+            self._keep(self.planner.take(back, now))
+            self._note_job(back)
+        self._note_explanations()
+        if self._progress is not None:
+            self._progress.show(*self.planner.progress)
+        if now - self._published > PUBLISH_SECONDS:
+            self._publish()
+        return True
+
+    def _keep(self, outcomes: Sequence[Outcome]) -> None:
+        """Put outcomes into the journal; into memory those that it cannot take."""
+        if not outcomes:
+            return
+        settled = [not self.planner.wanted(outcome.record) for outcome in outcomes]
+        try:
+            former = [self._unjournalled.get(outcome.record.index, ()) for outcome in outcomes]
+            whole = [
+                Outcome(outcome.record, before + outcome.results)
+                for outcome, before in zip(outcomes, former, strict=True)
+            ]
+            self.journal.save(list(zip(whole, settled, strict=True)))
+        except sqlite3.Error as error:
+            self._fault(f"the journal cannot be written ({error}): an interrupted run would have to do this again")
+            for outcome, done in zip(outcomes, settled, strict=True):
+                index = outcome.record.index
+                self._unjournalled[index] = () if done else self._results(index) + outcome.results
+            return
+        for outcome in outcomes:
+            self._unjournalled.pop(outcome.record.index, None)
+
+    def _note_job(self, back: Finished) -> None:
+        plan = back.job.plan
+        seconds = sum(seconds for _, seconds in back.measured())
+        self._note(EventKind.BUDGET, plan.phase)
+        self._note(EventKind.JOB, f"{plan.phase} {len(plan.indices)} pairs {seconds:.3f} s")
+
+    def _note_explanations(self) -> None:
+        for one in self.planner.explanations[self._explained :]:
+            self.journal.note(EventKind.PLAN, one.seconds, one.text)
+        self._explained = len(self.planner.explanations)
+
+    def _note(self, kind: EventKind, text: str) -> None:
+        self.journal.note(kind, self.budget.spent(), text)
+
+    def _publish(self) -> None:
+        with self._publishing:
+            try:
+                self.publish(self.planner.records)
+                self.unwritten = ""
+            except OSError as error:
+                self.unwritten = f"the submission cannot be written: {error}"
+                self._fault(self.unwritten)
+        self._published = self.budget.clock()
+
+    def _fault(self, what: str) -> None:
+        if what not in self.faults:
+            self.faults.append(what)
+            self._note(EventKind.FAULT, what)
+
+    def _ending(self) -> Ending:
+        if self.interrupt.is_set():
+            return Ending.INTERRUPTED
+        if self.planner.complete:
+            return Ending.COMPLETE
+        return Ending.TIME_IS_UP if self.pool.workers else Ending.NO_WORKER

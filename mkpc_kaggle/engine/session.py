@@ -1,0 +1,209 @@
+"""One run from its parts: journal, pool and engine opened, used and let go of."""
+
+import hashlib
+import os
+import platform
+import signal
+import sqlite3
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib import metadata
+from math import isfinite
+from pathlib import Path
+from types import FrameType
+
+import cv2
+import numpy as np
+
+from mkpc_kaggle import __version__
+from mkpc_kaggle.data.competition import Pair
+from mkpc_kaggle.engine.budget import Budget
+from mkpc_kaggle.engine.engine import Engine, RunReport
+from mkpc_kaggle.engine.jobs import Record
+from mkpc_kaggle.engine.journal import About, EventKind, Journal
+from mkpc_kaggle.engine.patience import Patience
+from mkpc_kaggle.engine.pools.cluster import RayCluster
+from mkpc_kaggle.engine.pools.in_process import InProcessPool
+from mkpc_kaggle.engine.pools.pool import Pool
+from mkpc_kaggle.engine.pools.processes import ProcessPool, Seat
+from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.pipeline.assembly import Assembly
+
+REPORT_SECONDS = 2.0
+"""How long an interrupted program may write its report: enough for the tables."""
+
+
+class Interrupt(threading.Event):
+    """Set when the run shall end early; ``signal`` is what asked for it, 0 if nothing did."""
+
+    signal = 0
+
+
+@dataclass(frozen=True)
+class Session:
+    """What a run needs besides its pairs and its recipe.
+
+    ``workers`` is the number of worker processes, or the cluster to work on; 0: none, the work is done in this
+    one; ``None``: one a device. ``guarded``: at the budget's last moment the process leaves, whatever hangs.
+    """
+
+    work_dir: Path
+    budget: Budget
+    interrupt: Interrupt
+    fresh: bool = False
+    progress: bool = True
+    workers: int | RayCluster | None = 0
+    guarded: bool = False
+    patience: Patience | None = None
+
+    def must_end(self) -> float:
+        """When the program must have ended, by the monotonic clock: with its budget, or soon after a signal."""
+        if self.interrupt.signal:
+            return time.monotonic() + REPORT_SECONDS
+        return self.budget.started + self.budget.limit
+
+
+def run_pairs(
+    pairs: Sequence[Pair],
+    assembly: Assembly,
+    session: Session,
+    publish: Callable[[Sequence[Record]], None] = lambda _: None,
+) -> tuple[RunReport, bool]:
+    """Run the recipe on all pairs; the report, and whether every thread has come to rest.
+
+    Raises :class:`mkpc_kaggle.errors.UserError` before any work where the journal is another run's, or a
+    matcher cannot be loaded.
+    """
+    belongs_to = {"test set": digest_of(pairs), **assembly.fingerprint()}
+    about = about_run(assembly, session.budget)
+    journal = Journal(session.work_dir, belongs_to, pairs=pairs, about=about, fresh=session.fresh)
+    journal.note(EventKind.START, session.budget.spent(), "")
+    pool = pool_of(assembly, session.workers)
+    engine = Engine(
+        pairs,
+        assembly.recipe,
+        pool,
+        journal,
+        session.budget,
+        publish=publish,
+        interrupt=session.interrupt,
+        progress=session.progress,
+        patience=session.patience or Patience(batch=assembly.batch),
+    )
+    with watched(engine, session):
+        try:
+            report = engine.run()
+            journal.note(EventKind.END, report.seconds, report.ending)
+        finally:
+            at_rest = pool.close()
+            journal.close()
+    return report, at_rest
+
+
+def about_run(assembly: Assembly, budget: Budget) -> About:
+    """What a report tells of a run besides what its journal is held against."""
+    return About(
+        assembly.recipe.name,
+        str(assembly.placement),
+        budget.limit if isfinite(budget.limit) else None,
+        tuple(unit.name for unit in assembly.left_out),
+        versions(),
+    )
+
+
+def versions() -> dict[str, str]:
+    """The versions of what the results may depend on, by name."""
+    return {
+        "mkpc_kaggle": __version__,
+        "Python": platform.python_version(),
+        "PyTorch": metadata.version("torch"),
+        "OpenCV": cv2.__version__,
+        "NumPy": np.__version__,
+        "SQLite": sqlite3.sqlite_version,
+    }
+
+
+def pool_of(assembly: Assembly, workers: int | RayCluster | None) -> Pool:
+    """One process a device, or as many as are asked for, in turn on each device; or none."""
+    if isinstance(workers, RayCluster):
+        return _ray_pool(assembly, workers)
+    if workers == 0:
+        return InProcessPool(assembly.pipeline, assembly.recipe)
+    # On a CPU one process with all threads: two with half of them each do more (recipe light, two cores: the sweep
+    # over after 22 s instead of 31), but need twice the memory, and a network's last bits change with its threads.
+    devices = assembly.devices
+    places = [devices[number % len(devices)] for number in range(workers or len(devices))]
+    share = len(places) if devices == ("cpu",) else 1
+    seats = [Seat(f"{place} {number}", assembly.on(place).pipeline, share) for number, place in enumerate(places)]
+    return ProcessPool(seats, assembly.recipe)
+
+
+def _ray_pool(assembly: Assembly, cluster: RayCluster) -> Pool:
+    """A pool of the cluster's machines; raises :class:`UserError` where Ray is not installed."""
+    # Read when Ray is imported: it shall report to nobody, and not start a cluster because it was let go of.
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    os.environ.setdefault("RAY_ENABLE_AUTO_CONNECT", "0")
+    try:
+        from mkpc_kaggle.engine.pools.ray_pool import RayPool
+    except ModuleNotFoundError as error:
+        if error.name != "ray":
+            raise
+        raise UserError(
+            '--workers ray needs Ray, which is not installed: pip install "mkpc-kaggle[ray]"'
+        ) from error
+    return RayPool(assembly, cluster)
+
+
+@contextmanager
+def watched(engine: Engine, session: Session) -> Iterator[None]:
+    """Leave the process at the budget's last moment, the submission written, if the run has not ended by then.
+
+    A thread does it, so that it helps wherever the others are stuck, short of holding the interpreter's lock:
+    that only a matcher in the engine's own process can do. Worker processes end with this one.
+    """
+    budget, over = session.budget, threading.Event()
+
+    def leave_in_the_end() -> None:
+        if not over.wait(budget.last - budget.clock()):
+            try:
+                engine.save_what_there_is(budget.reserve / 16)
+            finally:
+                os._exit(128 + session.interrupt.signal if session.interrupt.signal else 0)
+
+    if session.guarded and isfinite(budget.limit):
+        threading.Thread(target=leave_in_the_end, name="watchdog", daemon=True).start()
+    try:
+        yield
+    finally:
+        over.set()
+
+
+def digest_of(pairs: Sequence[Pair]) -> str:
+    """Tells one test set from another: the keys of its pairs, in order."""
+    return hashlib.sha256("\n".join(pair.key for pair in pairs).encode()).hexdigest()
+
+
+@contextmanager
+def interruptible() -> Iterator[Interrupt]:
+    """SIGTERM and Ctrl-C set the interrupt; a second one acts as if nobody listened."""
+    interrupt = Interrupt()
+    former = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+
+    def note(number: int, _: FrameType | None) -> None:
+        interrupt.signal = number
+        interrupt.set()
+        restore()
+
+    def restore() -> None:
+        for number, handler in former.items():
+            signal.signal(number, handler)
+
+    for number in former:
+        signal.signal(number, note)
+    try:
+        yield interrupt
+    finally:
+        restore()

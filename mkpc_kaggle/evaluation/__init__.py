@@ -1,0 +1,1 @@
+"""Runs held against known cameras."""

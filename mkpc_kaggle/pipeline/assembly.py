@@ -1,0 +1,186 @@
+"""Puts a run's parts together: a recipe by name, the weights it finds, the device, the matchers."""
+
+from collections.abc import Container, Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from enum import StrEnum
+from pathlib import Path
+from typing import Any
+
+from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.matchers.contract import Matcher, Placement, Precision
+from mkpc_kaggle.matchers.registry import load_matcher, options_of, registry, slots_of
+from mkpc_kaggle.pipeline.stages import Pipeline
+from mkpc_kaggle.recipe import Mode, Recipe, Unit, load_recipe
+from mkpc_kaggle.weights import FoundFile, WeightStore
+
+AUTO = "auto"
+CUDA_BATCH = 8
+PERMISSIVE_TAGS = frozenset({"Apache-2.0", "BSD-3-Clause", "MIT"})
+
+
+class Licence(StrEnum):
+    """Which weights may be used, by their licence."""
+
+    ANY = "any"
+    PERMISSIVE = "permissive"
+    """those that may be used for any purpose: Apache-2.0, BSD-3-Clause, MIT"""
+
+
+@dataclass(frozen=True)
+class Assembly:
+    """All that a worker needs to build its pipeline.
+
+    ``left_out`` are the units of recipe ``auto`` whose weights are missing or not permitted; ``matchers`` are
+    ready ones of the user's own. ``device`` is what the user asked for, be it here or elsewhere.
+    """
+
+    recipe: Recipe
+    weights: WeightStore
+    placement: Placement
+    left_out: tuple[Unit, ...] = ()
+    matchers: Mapping[str, Matcher[Any]] = field(default_factory=dict)
+    device: str = AUTO
+
+    @property
+    def devices(self) -> tuple[str, ...]:
+        """The devices to work on: every GPU where the placement names none of them."""
+        if self.placement.device != "cuda":
+            return (self.placement.device,)
+        import torch
+
+        return tuple(f"cuda:{number}" for number in range(torch.cuda.device_count()))
+
+    @property
+    def batch(self) -> int:
+        """How many pairs a unit takes at a time: batches pay on a GPU; on a CPU they only cost memory."""
+        return CUDA_BATCH if self.placement.device.startswith("cuda") else 1
+
+    def on(self, device: str) -> "Assembly":
+        """The same on one device."""
+        return replace(self, placement=replace(self.placement, device=device))
+
+    def pipeline(self) -> Pipeline:
+        """A pipeline whose matchers are loaded when they are first needed."""
+        return Pipeline(self.recipe, self._matcher, batch=self.batch)
+
+    def fingerprint(self) -> dict[str, Any]:
+        """What decides the numbers that come out: the recipe, the precision and the digests of the weights."""
+        return {
+            "recipe": self.recipe.fingerprint(),
+            "precision": self.placement.precision,
+            "weights": {slot: file.digest for slot, file in self.weight_files.items()},
+        }
+
+    @property
+    def weight_files(self) -> dict[str, FoundFile]:
+        """The files that the recipe's matchers load, by slot."""
+        slots = slots_of(self.recipe, not_own(self.recipe.matcher_names, self.matchers))
+        found = {slot: self.weights.find(slot) for slot in slots}
+        return {slot: file for slot, file in found.items() if file is not None}
+
+    def _matcher(self, name: str) -> Matcher[Any]:
+        return self.matchers.get(name) or load_matcher(self.recipe, name, self.weights, self.placement)
+
+
+def assemble(
+    recipe: Recipe | str,
+    *,
+    weights: Iterable[Path] = (),
+    device: str = AUTO,
+    precision: str = Precision.FLOAT32,
+    mode: Mode = Mode.TWO_STAGE,
+    licence: Licence = Licence.ANY,
+    matchers: Mapping[str, Matcher[Any]] | None = None,
+) -> Assembly:
+    """Everything checked before any work: recipe, options, licences, weights and their digests, device, precision.
+
+    Recipe ``auto`` drops the units whose weights are missing or not permitted; for any other, such weights raise
+    :class:`UserError`, as do unknown names and damaged files.
+    """
+    own = matchers or {}
+    store = WeightStore(weights)
+    wanted = load_recipe(recipe) if isinstance(recipe, str) else recipe
+    for name in {*wanted.matcher_names, *wanted.matchers} - own.keys():
+        options_of(wanted, name)
+    refused = restricted(wanted, store, own) if licence is Licence.PERMISSIVE else {}
+    if refused and recipe != AUTO:
+        weights_of = ", ".join(f"{name} ({', '.join(sorted(tags))})" for name, tags in refused.items())
+        raise UserError(
+            f"--licence permissive refuses recipe {wanted.name!r} for the weights of {weights_of}. Take a recipe "
+            "without them, such as permissive, or --recipe auto, which leaves them out."
+        )
+    missing = missing_slots(wanted, store, own)
+    if missing and recipe != AUTO:
+        raise UserError(
+            f"recipe {wanted.name!r} needs weights that were not found ({what_is_missing(missing, store)}). "
+            "Name their directory with --weights, or use --recipe auto, which does with what there is."
+        )
+    lacking = {n for n in not_own(wanted.matcher_names, own) if not set(missing).isdisjoint(slots_of(wanted, [n]))}
+    chosen = wanted.only(lambda unit: unit.matcher not in lacking | refused.keys())
+    left_out = tuple(unit for unit in wanted.units if unit not in chosen.units)
+    return Assembly(chosen.in_mode(mode), store, resolve_placement(device, precision), left_out, own, device)
+
+
+def missing_slots(recipe: Recipe, store: WeightStore, own: Container[str] = ()) -> list[str]:
+    """What the recipe's matchers need of the manifest and the store has not."""
+    slots = slots_of(recipe, not_own(recipe.matcher_names, own))
+    return [slot for slot in slots if store.find(slot) is None]
+
+
+def not_own(names: Iterable[str], own: Container[str]) -> list[str]:
+    """The names but those of the user's own matchers, which bring their weights along."""
+    return [name for name in names if name not in own]
+
+
+def restricted(recipe: Recipe, store: WeightStore, own: Mapping[str, Matcher[Any]]) -> dict[str, set[str]]:
+    """The recipe's matchers whose weights are not all permissively licensed, with the licences that are not."""
+    tags = {name: licences_of(recipe, name, store, own) - PERMISSIVE_TAGS for name in recipe.matcher_names}
+    return {name: others for name, others in tags.items() if others}
+
+
+def licences_of(recipe: Recipe, name: str, store: WeightStore, own: Mapping[str, Matcher[Any]]) -> set[str]:
+    """What a matcher says of its weights, and what the manifest says of the files that were found for it."""
+    if name in own:
+        return set(own[name].spec.licences)
+    found = [store.find(slot) for slot in slots_of(recipe, [name])]
+    return {*registry()[name].spec.licences, *(weights.file.licence for weights in found if weights)}
+
+
+def what_is_missing(slots: Iterable[str], store: WeightStore) -> str:
+    """The file names that would fill the slots."""
+    return "; ".join(f"{slot}: {' or '.join(file.name for file in store.alternatives(slot))}" for slot in slots)
+
+
+def resolve_placement(device: str, precision: str) -> Placement:
+    """The placement that the user's words mean; :class:`UserError` for what is unknown or not there."""
+    where = resolve_device(device)
+    if precision == AUTO:
+        return Placement(where, fastest_precision(where))
+    if precision not in list(Precision):
+        raise UserError(f"unknown precision {precision!r}; known: auto, {', '.join(Precision)}")
+    return Placement(where, Precision(precision))
+
+
+def fastest_precision(device: str) -> Precision:
+    """Half precision where the device has units for it."""
+    import torch
+
+    if device.startswith("cuda"):
+        has_tensor_cores = torch.cuda.get_device_capability(device) >= (7, 0)
+        return Precision.FLOAT16 if has_tensor_cores else Precision.FLOAT32
+    # Older versions of PyTorch do not tell; then float32 is safe.
+    able: Mapping[str, Any] = getattr(torch.cpu, "get_capabilities", dict)()
+    return Precision.BFLOAT16 if able.get("avx512_bf16") or able.get("amx_bf16") else Precision.FLOAT32
+
+
+def resolve_device(device: str) -> str:
+    """``auto`` becomes the GPUs, "cuda", or the CPU; :class:`UserError` for a GPU that is not there."""
+    import torch
+
+    if device == AUTO:
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    if device != "cpu" and not device.startswith("cuda"):
+        raise UserError(f"unknown device {device!r}; known: auto, cpu, cuda, cuda:N")
+    if device.startswith("cuda") and not torch.cuda.is_available():
+        raise UserError(f"--device {device}: this machine has no GPU that torch can use; try --device cpu")
+    return device

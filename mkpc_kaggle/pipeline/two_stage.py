@@ -1,0 +1,79 @@
+"""The library's face: one pair at a time."""
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mkpc_kaggle.data.images import Image, Unreadable, read_image
+from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.geometry.coordinates import Pixels
+from mkpc_kaggle.geometry.robust import Matrix3, Model
+from mkpc_kaggle.matchers.contract import Matcher
+from mkpc_kaggle.pipeline.assembly import Licence, assemble
+from mkpc_kaggle.pipeline.stages import PairMatch, PairWork, finish
+from mkpc_kaggle.recipe import Recipe
+
+
+class TwoStageMatcher:
+    """Matches one pair at a time::
+
+        match = TwoStageMatcher("classical")("a.jpg", "b.jpg")
+        F, points0 = match.estimate.matrix, match.inliers.points0
+
+    ``recipe`` is a :class:`Recipe`, a recipe's name, or a path to a TOML file; ``weights`` are directories to
+    search; with ``licence`` "permissive" those that forbid some uses are refused. ``matchers`` are matchers of
+    one's own, by the names under which the recipe's units call them.
+    Raises :class:`mkpc_kaggle.errors.UserError` for an unknown recipe, key or matcher, and for missing weights.
+    """
+
+    def __init__(
+        self,
+        recipe: Recipe | str = "auto",
+        *,
+        weights: Iterable[str | Path] = (),
+        device: str = "auto",
+        precision: str = "float32",
+        licence: Licence | str = Licence.ANY,
+        matchers: Mapping[str, Matcher[Any]] | None = None,
+    ) -> None:
+        assembly = assemble(
+            recipe,
+            weights=map(Path, weights),
+            device=device,
+            precision=precision,
+            licence=Licence(licence),
+            matchers=matchers,
+        )
+        self.recipe = assembly.recipe
+        self._pipeline = assembly.pipeline()
+
+    def __call__(
+        self,
+        image0: str | Path | Pixels | Image,
+        image1: str | Path | Pixels | Image,
+        *,
+        model: Model | str = Model.F,
+        intrinsics: tuple[Matrix3, Matrix3] | None = None,
+    ) -> PairMatch:
+        """Match two images: paths, or arrays (H, W, 3) RGB or (H, W) gray, uint8.
+
+        ``model`` E needs ``intrinsics``, the camera matrices in pixels. Raises :class:`UserError` for an
+        image that cannot be read; a pair that cannot be matched is a result with ``estimate.failure``.
+        """
+        work = PairWork((to_image(image0), to_image(image1)))
+        (work,) = self._pipeline.match([work], self.recipe.units)
+        return finish(work, self.recipe, Model(model), intrinsics)
+
+
+def to_image(source: str | Path | Pixels | Image) -> Image:
+    """An image from a path or an array; raises :class:`UserError` where there is none."""
+    if isinstance(source, Image):
+        return source
+    if isinstance(source, np.ndarray):
+        return Image.of_array(source)
+    image = read_image(Path(source))
+    if isinstance(image, Unreadable):
+        raise UserError(str(image))
+    return Image.of_array(image.pixels)  # named by its content: a file may change between two calls

@@ -1,0 +1,280 @@
+"""The method step by step, each step a figure: what one pair looks like on its way through the two stages."""
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mkpc_kaggle.data.images import Image
+from mkpc_kaggle.geometry.coordinates import Box, Points
+from mkpc_kaggle.geometry.critical_region import Clusters, CriticalRegion, MkpcConfig, Ratio, expand_box
+from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.geometry.metrics import PoseError
+from mkpc_kaggle.geometry.robust import Estimate, Matrix3
+from mkpc_kaggle.pipeline.stages import PairMatch
+from mkpc_kaggle.recipe import Unit
+from mkpc_kaggle.reporting.figures.canvas import (
+    CLUSTERS,
+    CYCLE,
+    DROPPED,
+    INK,
+    INLIER,
+    OUTLIER,
+    WIDTH,
+    add_box,
+    new_figure,
+    plain,
+    short,
+    side_by_side,
+)
+from mkpc_kaggle.reporting.figures.pair import connect
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+Images = tuple[Image, Image]
+_PAPER = {"boxstyle": "round,pad=0.15", "facecolor": "white", "alpha": 0.8, "linewidth": 0}
+
+
+def draw_images(images: Images) -> "Figure":
+    """The two photographs."""
+    figure, row = side_by_side(images)
+    for number, (axes, image) in enumerate(zip(row, images, strict=True)):
+        _title(axes, f"image {number}: {image.size.width} x {image.size.height} pixels")
+    return figure
+
+
+def draw_stage(images: Images, match: PairMatch, stage: int) -> "Figure":
+    """The matches that one stage found, coloured by inlier; those of stage 2 on the crops."""
+    mask = match.in_stage(stage)
+    inliers = match.estimate.inliers[mask]
+    regions = match.regions if stage == 2 else None
+    boxes = [region.box for region in regions] if regions else [Box.whole(image.size) for image in images]
+    figure, row = side_by_side([_cut(image, box) for image, box in zip(images, boxes, strict=True)])
+    # The cut is shown as it is; points are moved with it.
+    shift0, shift1 = (np.array([box.left, box.top], np.float32) for box in boxes)
+    found = match.matches[mask]
+    drawn = connect(row, Matches(found.points0 - shift0, found.points1 - shift1, found.scores), inliers)
+    what = "on the crops" if any(region.cropped for region in regions or ()) else "on the whole images"
+    counts = f"{len(found)} matches, {np.count_nonzero(inliers)} inliers"
+    _title(row[0], f"stage {stage}, {what}: {counts}; {drawn}")
+    return figure
+
+
+def draw_clusters(images: Images, points: tuple[Points, Points], clusters: tuple[Clusters, Clusters]) -> "Figure":
+    """All clusters of each image, one colour each with its size beside it; noise as grey crosses."""
+    figure, row = side_by_side(images, title_lines=2)
+    for number, (axes, xy, found) in enumerate(zip(row, points, clusters, strict=True)):
+        noise = xy[found.labels < 0]
+        _crosses(axes, noise, DROPPED)
+        for rank, label in enumerate(_by_size(found)):
+            _dots(axes, xy[found.labels == label], CLUSTERS[rank % len(CLUSTERS)])
+        for label in _by_size(found):
+            _tag(axes, xy[found.labels == label], str(found.sizes[label]))
+        counts = f"numbers: their points; {len(noise)} points are noise"
+        _title(axes, f"image {number}, clusters found: {len(found.sizes)}\n{counts}")
+    return figure
+
+
+def draw_sizes(clusters: tuple[Clusters, Clusters], config: MkpcConfig) -> "Figure":
+    """Bars: the clusters of each image by size, and the size below which they are dropped."""
+    figure = new_figure(WIDTH, 3.6)
+    for number, (axes, found) in enumerate(zip(figure.subplots(1, 2), clusters, strict=True)):
+        _size_bars(axes, found, config)
+        kept = f"image {number}: {len(found.kept)} of {len(found.sizes)} clusters kept"
+        plain(axes, kept + _limit(found, config))
+    return figure
+
+
+def _size_bars(axes: "Axes", clusters: Clusters, config: MkpcConfig) -> None:
+    sizes, kept = clusters.sizes[_by_size(clusters)], len(clusters.kept)
+    axes.set_xlabel("clusters by size; green: kept; orange, hatched: dropped", color=INK)
+    axes.set_ylabel("points", color=INK)
+    if not len(sizes):
+        axes.set(xticks=[], yticks=[])
+        return
+    ranks = np.arange(1, len(sizes) + 1)
+    for part, colour, hatch in ((slice(kept), INLIER, ""), (slice(kept, None), OUTLIER, "//")):
+        bars = axes.bar(ranks[part], sizes[part], color=colour, hatch=hatch, edgecolor="white", width=0.7)
+        shares = [f"\n{size / sizes[0]:.3f}" if len(sizes) <= 10 else "" for size in sizes]
+        labels = [f"{size}{share}" for size, share in zip(sizes[part], shares[part], strict=True)]
+        axes.bar_label(bars, labels, padding=3, color=INK, fontsize=9, bbox=_PAPER)
+    if config.ratio is Ratio.LARGEST:
+        axes.axhline(config.share * sizes[0], color=INK, linewidth=1.2, linestyle="--")
+    axes.set(yscale="log", ylim=(1, 8 * sizes[0]), xticks=ranks)
+
+
+def _limit(clusters: Clusters, config: MkpcConfig) -> str:
+    if config.ratio is not Ratio.LARGEST or not len(clusters.sizes):
+        return ""
+    return f"\ndashed: {config.share:g} of the largest, {config.share * clusters.sizes.max():.1f} points"
+
+
+def draw_boxes(
+    images: Images, points: tuple[Points, Points], clusters: tuple[Clusters, Clusters], config: MkpcConfig
+) -> "Figure":
+    """The bounding box of the kept clusters as it is, and with Crop Area Expansion; dropped points as crosses."""
+    figure, row = side_by_side(images, title_lines=2)
+    for number, (axes, image, xy, found) in enumerate(zip(row, images, points, clusters, strict=True)):
+        kept = xy[found.keeps]
+        _crosses(axes, xy[~found.keeps], OUTLIER)
+        _dots(axes, kept, INLIER)
+        title = f"image {number}: nothing kept, so no box"
+        if len(kept):
+            tight = expand_box(kept, image.size, 1, 1)
+            wide = expand_box(kept, image.size, config.expand_x, config.expand_y)
+            add_box(axes, wide)
+            add_box(axes, tight, edgecolor="white", linestyle="--", linewidth=1.5)
+            title = f"image {number}: dashed, kept points, {tight.size.width} x {tight.size.height}\n"
+            title += f"yellow, expanded, {wide.size.width} x {wide.size.height}"
+        _title(axes, title)
+    return figure
+
+
+def draw_views(images: Images, regions: tuple[CriticalRegion, CriticalRegion], unit: Unit) -> "Figure":
+    """A unit's view of each whole image and of its critical region, and how much each enlarges."""
+    pairs = [(Box.whole(image.size), region.box) for image, region in zip(images, regions, strict=True)]
+    boxes = [*pairs[0], *pairs[1]]
+    views = [unit.view(box, 1) for box in boxes]
+    pictures = [Image("", view.render(images[place // 2].pixels)) for place, view in enumerate(views)]
+    figure, row = side_by_side(pictures, title_lines=2)
+    names = [("whole", f"crop ({region.reason})" if not region.cropped else "crop") for region in regions]
+    for place, (axes, view, what) in enumerate(zip(row, views, [*names[0], *names[1]], strict=True)):
+        _title(axes, f"image {place // 2}, {what}\n{view.scale[0]:.2f} times enlarged")
+    return figure
+
+
+def draw_both(images: Images, match: PairMatch) -> "Figure":
+    """The points of both stages on the whole images: inliers in the colour of their stage, outliers grey."""
+    figure, row = side_by_side(images, title_lines=2)
+    inliers = match.estimate.inliers
+    for axes, points in zip(row, (match.matches.points0, match.matches.points1), strict=True):
+        _crosses(axes, points[~inliers], DROPPED)
+        for stage, marker in ((1, "o"), (2, "^")):
+            xy = points[match.in_stage(stage) & inliers]
+            axes.scatter(xy[:, 0], xy[:, 1], s=9, c=CLUSTERS[stage - 1], marker=marker, linewidths=0)
+    told = [
+        f"{what}: stage {stage}, {np.count_nonzero(match.in_stage(stage))} points, "
+        f"{np.count_nonzero(match.in_stage(stage) & inliers)} inliers"
+        for stage, what in ((1, "blue dots"), (2, "orange triangles"))
+    ]
+    _title(row[0], "\n".join(told))
+    total = f"together: {len(match.matches)} points, {match.estimate.inlier_count} inliers"
+    _title(row[1], f"{total}\ngrey crosses: outliers")
+    return figure
+
+
+def draw_epipolar(
+    images: Images,
+    matches: Matches,
+    fundamentals: Mapping[str, Matrix3],
+    truth: Matrix3 | None = None,
+    count: int = 6,
+) -> "Figure":
+    """``count`` points of image 0, and their epipolar lines in image 1 by each F; the true lines are dashed.
+
+    The points are matches, far from each other; in image 1 the point that each was matched with is marked.
+    """
+    figure, row = side_by_side([images[0], *[images[1]] * len(fundamentals)], title_lines=2)
+    chosen = matches[_far_apart(matches.points0, count)]
+    _numbered(row[0], chosen.points0)
+    _title(row[0], f"image 0: {len(chosen)} matched points")
+    for axes, (name, F) in zip(row[1:], fundamentals.items(), strict=True):
+        for place, point in enumerate(chosen.points0):
+            _line(axes, F, point, color=CYCLE[place % len(CYCLE)], linewidth=2)
+            if truth is not None:
+                _line(axes, truth, point, color="white", linewidth=1.2, linestyle=(0, (4, 4)))
+        _numbered(axes, chosen.points1)
+        size = images[1].size
+        axes.set(xlim=(-0.5, size.width - 0.5), ylim=(size.height - 0.5, -0.5))
+        known = "\nwhite, dashed: the true lines" if truth is not None else ""
+        _title(axes, f"image 1: lines of {name}{known}")
+    return figure
+
+
+def draw_plane(images: Images, matches: Matches, homography: Estimate, threshold: float) -> "Figure":
+    """Inliers of an F: those that one homography explains, too, and those that lie off its plane."""
+    figure, row = side_by_side(images)
+    for axes, points in zip(row, (matches.points0, matches.points1), strict=True):
+        _dots(axes, points[homography.inliers], CLUSTERS[0])
+        _crosses(axes, points[~homography.inliers], OUTLIER)
+    explained = f"{homography.inlier_count} of {len(matches)} inliers of F"
+    _title(row[0], f"blue: {explained} fit one plane to {threshold:g} pixels")
+    _title(row[1], "orange crosses: those off the plane")
+    return figure
+
+
+def draw_pose_errors(errors: Mapping[str, PoseError]) -> "Figure":
+    """Bars: the errors of the pose that each F stands for, in degrees; those of a failure are infinite."""
+    figure = new_figure(WIDTH, 1.0 + 0.4 * len(errors))
+    panels = figure.subplots(1, 2, sharey=True)
+    for axes, kind, title in zip(
+        panels, ("rotation", "translation_angle"), ("rotation", "direction of translation"), strict=True
+    ):
+        plain(axes, f"error of the {title}, in degrees")
+        angles = np.array([getattr(error, kind) for error in errors.values()])
+        known = np.isfinite(angles)
+        names = [short(name, 40) for name in errors]
+        bars = axes.barh(names, np.where(known, angles, 0), color=CYCLE[: len(names)], height=0.6)
+        labels = [f"{angle:.2f}" if ok else "no F" for angle, ok in zip(angles, known, strict=True)]
+        axes.bar_label(bars, labels, padding=3, color=INK)
+        axes.margins(x=0.15)
+    panels[0].invert_yaxis()
+    return figure
+
+
+def _title(axes: "Axes", text: str) -> None:
+    axes.set_title(text, loc="left", fontsize=10)
+
+
+def _cut(image: Image, box: Box) -> Image:
+    return Image(image.name, image.pixels[box.top : box.bottom, box.left : box.right])
+
+
+def _by_size(clusters: Clusters) -> NDArray[np.intp]:
+    """Labels, the largest cluster first: the order in which they are kept."""
+    return np.argsort(-clusters.sizes, kind="stable")
+
+
+def _dots(axes: "Axes", points: Points, colour: str) -> None:
+    axes.scatter(points[:, 0], points[:, 1], s=9, c=colour, linewidths=0)
+
+
+def _crosses(axes: "Axes", points: Points, colour: str) -> None:
+    axes.scatter(points[:, 0], points[:, 1], s=12, c=colour, marker="x", linewidths=0.8)
+
+
+def _tag(axes: "Axes", points: Points, text: str) -> None:
+    """A number above a group of points."""
+    x, y = points[:, 0].mean(), points[:, 1].min()
+    axes.text(x, y, text, fontsize=8, ha="center", va="bottom", bbox=_PAPER)
+
+
+def _numbered(axes: "Axes", points: Points) -> None:
+    for place, (x, y) in enumerate(points):
+        colour = CYCLE[place % len(CYCLE)]
+        axes.scatter(x, y, s=130, c=colour, edgecolors="white", linewidths=1, zorder=3)
+        axes.text(x, y, str(place + 1), color="white", fontsize=8, ha="center", va="center_baseline", zorder=4)
+
+
+def _line(axes: "Axes", F: Matrix3, point: Points, **style: Any) -> None:
+    """The epipolar line of a point of image 0, where axes show image 1: a x + b y + c = 0 with (a, b, c) = F x."""
+    a, b, c = F @ np.append(point.astype(np.float64), 1)
+    normal = a * a + b * b
+    if normal > 0:
+        foot = np.array([-a * c / normal, -b * c / normal])
+        axes.axline(tuple(foot), tuple(foot + (b, -a) / np.sqrt(normal)), **style)
+
+
+def _far_apart(points: Points, count: int) -> NDArray[np.intp]:
+    """Indices of points that lie far from each other: each next one is the farthest from those before it."""
+    if not len(points):
+        return np.zeros(0, np.intp)
+    chosen = [int(np.argmin(points.sum(axis=1)))]
+    distances = np.linalg.norm(points - points[chosen[0]], axis=1)
+    while len(chosen) < min(count, len(points)):
+        chosen.append(int(np.argmax(distances)))
+        distances = np.minimum(distances, np.linalg.norm(points - points[chosen[-1]], axis=1))
+    return np.array(chosen, np.intp)
