@@ -20,9 +20,10 @@ from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.jobs import Outcome, Record, UnitRecord
 from mkpc_kaggle.engine.journal import DRAWN, About, EventKind, Journal, JournalReader
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.reporting.markup import Markup, element
-from mkpc_kaggle.reporting.report import Artist, match_of, report_page, report_run
-from mkpc_kaggle.reporting.run_log import NOT_ENDED, RunLog, overview, read_log, tables
+from mkpc_kaggle.reporting.report import report_page, report_run
+from mkpc_kaggle.reporting.run_log import NOT_ENDED, RunLog, read_log
+from mkpc_kaggle.reporting.sections import Artist, match_of
+from mkpc_kaggle.reporting.summary import overview
 
 EVIL = '<script>alert("$x$")</script>'
 BELONGS_TO = {"recipe": THREE_UNITS.fingerprint(), "test set": "abc", "weights": {"xfeat": "123"}}
@@ -70,10 +71,10 @@ def test_a_run_exports_tables_that_pandas_reads_as_they_are(
     assert main(["journal", str(tmp_path / "work"), "--csv", str(tmp_path / "csv")]) == 0
     assert len(capsys.readouterr().out.splitlines()) == 4
     log = read_log(tmp_path / "work")
-    for name, table in tables(log).items():
+    for name, table in log.tables.named().items():
         again = pd.read_csv(tmp_path / "csv" / f"{name}.csv", keep_default_na=False)
         pd.testing.assert_frame_equal(again, table, check_dtype=False)
-    table = tables(log)
+    table = log.tables.named()
     assert list(table["pairs"]["id"]) == [pair.id for pair in pairs]
     assert "the file is empty" in table["pairs"]["failure"][1]
     units = table["units"].merge(table["pairs"][["pair", "inliers"]], on="pair", suffixes=("", "_of_pair"))
@@ -229,10 +230,6 @@ def test_what_comes_from_files_is_escaped(tmp_path: Path) -> None:
     assert EVIL in overview(log)
 
 
-def test_elements_escape_text_and_attributes_and_keep_markup() -> None:
-    assert element("p", "a<b", Markup("<i>c</i>"), class_='"x"') == '<p class="&quot;x&quot;">a&lt;b<i>c</i></p>'
-
-
 def test_without_matplotlib_the_page_has_tables_and_says_so(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -248,7 +245,7 @@ def test_a_run_of_no_pairs_has_a_page(tmp_path: Path) -> None:
     empty_journal(tmp_path, []).close()
     log = read_log(tmp_path)
     assert Tags(report_page(log, Artist())).names.count("h2") == 9
-    assert all(table.empty for name, table in tables(log).items() if name != "events")
+    assert all(table.empty for name, table in log.tables.named().items() if name != "events")
     assert overview(log)
 
 

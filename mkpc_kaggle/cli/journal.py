@@ -27,8 +27,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     from mkpc_kaggle.data.competition import read_test_side
-    from mkpc_kaggle.reporting.report import Artist, write_report
-    from mkpc_kaggle.reporting.run_log import overview, read_log, write_csv, write_json
+    from mkpc_kaggle.reporting.report import write_report
+    from mkpc_kaggle.reporting.run_log import read_log, write_csv, write_json
+    from mkpc_kaggle.reporting.sections import Artist
+    from mkpc_kaggle.reporting.summary import overview
 
     log = read_log(arguments.work_dir)
     if arguments.csv is not None:
