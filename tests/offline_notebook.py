@@ -84,8 +84,8 @@ def with_pictures_alone(notebook: nbformat.NotebookNode) -> nbformat.NotebookNod
 
 
 def main(path: Path) -> None:
-    with TemporaryDirectory() as working:
-        executed = execute(path, Path(working) / "executed.ipynb", sys.executable, Path(working), os.environ)
+    with TemporaryDirectory() as directory:
+        executed = execute(path, Path(directory) / "executed.ipynb", sys.executable, path.parent, os.environ)
     path.write_text(nbformat.writes(with_pictures_alone(executed)) + "\n", encoding="utf-8")
 
 

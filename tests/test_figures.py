@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import tour_figures as figures
 from matplotlib.figure import Figure
 
 from mkpc_kaggle.data.images import Image
@@ -14,8 +15,7 @@ from mkpc_kaggle.geometry.metrics import PoseError
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL, Estimate, Model
 from mkpc_kaggle.pipeline.stages import PairMatch, UnitResult
 from mkpc_kaggle.recipe import Unit
-from mkpc_kaggle.reporting import figures
-from mkpc_kaggle.reporting.figures.steps import _far_apart, _line
+from mkpc_kaggle.reporting.figures import to_jpeg
 
 SIZES = Size(120, 80), Size(60, 90)
 IMAGES = tuple(Image.of_array(np.full((size.height, size.width, 3), 90, np.uint8)) for size in SIZES)
@@ -40,7 +40,7 @@ def pair(first, second, inliers):
 
 
 def titles(figure: Figure) -> list[str]:
-    figures.to_jpeg(figure)  # whatever cannot be drawn raises here
+    to_jpeg(figure)  # whatever cannot be drawn raises here
     return [axes.get_title(loc="left") for axes in figure.axes]
 
 
@@ -118,7 +118,7 @@ def test_an_epipolar_line_is_that_of_the_point():
     axes = figures.new_figure(3, 3).subplots()
     F = np.array([[0.0, -1, 2], [1, 0, -3], [-2, 3, 0]])
     point = np.array([7.0, 5.0], np.float32)
-    _line(axes, F, point, color="k")
+    figures._line(axes, F, point, color="k")
     (line,) = axes.lines
     for on_line in (line.get_xy1(), line.get_xy2()):
         assert abs(np.append(on_line, 1) @ F @ np.append(point, 1)) < 1e-9
@@ -128,5 +128,5 @@ def test_chosen_points_lie_far_apart():
     crowd = np.random.default_rng(0).normal(50, 0.1, (100, 2))
     corners = np.array([[0.0, 0], [100, 0], [0, 100], [100, 100]])
     points = np.concatenate([crowd, corners]).astype(np.float32)
-    assert sorted(_far_apart(points, 4)) == [100, 101, 102, 103]
-    assert len(_far_apart(points[:3], 6)) == 3
+    assert sorted(figures._far_apart(points, 4)) == [100, 101, 102, 103]
+    assert len(figures._far_apart(points[:3], 6)) == 3

@@ -1,5 +1,6 @@
 """``mkpc_tour.ipynb``: it runs on any train side without a network, and is committed with its pictures alone."""
 
+import os
 import sys
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from mkpc_kaggle.demo import DemoSet
 
 ROOT = Path(__file__).resolve().parents[1]
 TOUR = ROOT / "notebooks" / "mkpc_tour.ipynb"
+PATHS = os.pathsep.join([str(ROOT), str(TOUR.parent)])  # Jupyter starts a kernel beside its notebook
 KERNEL = {"name": "python3", "display_name": "Python 3"}
 LEAST_BYTES, MOST_BYTES = 500_000, 1_500_000
 
@@ -24,7 +26,7 @@ def figures_of(notebook: nbformat.NotebookNode) -> int:
 @needs_namespaces
 def test_the_tour_runs_on_a_train_side_without_a_network(demo: DemoSet, tmp_path: Path) -> None:
     variables = environment(
-        PYTHONPATH=str(ROOT),
+        PYTHONPATH=PATHS,
         MKPC_TRAIN_DIR=str(demo.train_dir),
         MKPC_PAIR="courtyard;courtyard_0006-courtyard_0001",
         MKPC_OTHER_PAIR="courtyard;courtyard_0003-courtyard_0000",
@@ -37,7 +39,7 @@ def test_the_tour_runs_on_a_train_side_without_a_network(demo: DemoSet, tmp_path
 @needs_namespaces
 @pytest.mark.slow
 def test_without_a_train_side_the_tour_renders_its_own(tmp_path: Path) -> None:
-    variables = environment(PYTHONPATH=str(ROOT), TMPDIR=str(tmp_path))
+    variables = environment(PYTHONPATH=PATHS, TMPDIR=str(tmp_path))
     for name in ("MKPC_TRAIN_DIR", "MKPC_PAIR", "MKPC_OTHER_PAIR", "MKPC_RECIPE"):
         variables.pop(name, None)
     executed = execute(TOUR, tmp_path / "executed.ipynb", sys.executable, tmp_path, variables)
