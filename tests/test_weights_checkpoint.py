@@ -7,7 +7,8 @@ import pickle
 import sys
 import types
 import zipfile
-from collections import OrderedDict
+from argparse import Namespace
+from collections import Counter, OrderedDict
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -99,13 +100,9 @@ def framework() -> Iterator[types.ModuleType]:
     """A training framework that is gone once the checkpoint is written."""
     module = types.ModuleType("training_framework")
     source = (
-        "class Config(dict):\n"
-        "    pass\n"
-        "class Stack(list):\n"
-        "    pass\n"
         "class Checkpoint:\n"
         "    def __init__(self):\n"
-        "        self.best, self.kind = {'score': 0.5}, Config(lr=Config(base=1e-3))\n"
+        "        self.best, self.kind = {'score': 0.5}, Slotted()\n"
         "    def __setstate__(self, state):\n"
         "        raise SystemError('this must not run')\n"
         "class Slotted:\n"
@@ -127,7 +124,8 @@ def training_checkpoint(framework: types.ModuleType, state: dict[str, torch.Tens
         "pytorch-lightning_version": "1.3.5",
         "callbacks": {framework.Checkpoint: framework.Checkpoint(), "sizes": {1, 2}, "z": 1 + 2j, "b": b"x"},
         "optimizer_states": [{"state": {0: {"step": 3, "mean": torch.ones(2)}}}],
-        "hyper_parameters": framework.Config(a=framework.Stack([1, 2]), b=framework.schedule),
+        "hyper_parameters": Namespace(a=[1, 2], b=framework.schedule),
+        "lr_schedulers": [{"milestones": Counter([8, 12, 12])}],
         "misc": [framework.Slotted(), torch.float32, torch.Size([2]), torch.device("cpu"), Path("/x")],
         "state_dict": state,
     }
@@ -166,13 +164,6 @@ def test_a_training_checkpoint_with_unknown_classes_gives_its_tensors(
     )
 
 
-@pytest.mark.parametrize("protocol", [2, 3, 4, 5])
-def test_any_pickle_protocol_will_do(tmp_path: Path, framework: types.ModuleType, protocol: int) -> None:
-    torch.save(training_checkpoint(framework, TENSORS), tmp_path / "x.ckpt", pickle_protocol=protocol)
-    sys.modules.pop("training_framework")
-    assert_same(load_tensors(tmp_path / "x.ckpt"), TENSORS)
-
-
 def test_unknown_objects_among_the_tensors_are_named(tmp_path: Path, framework: types.ModuleType) -> None:
     state = {"a": torch.zeros(1), "odd": framework.Slotted()}
     torch.save(training_checkpoint(framework, state), tmp_path / "x.ckpt")
@@ -181,17 +172,10 @@ def test_unknown_objects_among_the_tensors_are_named(tmp_path: Path, framework: 
         load_tensors(tmp_path / "x.ckpt")
 
 
-def test_a_tensor_that_is_not_as_it_is_stored_is_refused(tmp_path: Path, framework: types.ModuleType) -> None:
-    torch.save(training_checkpoint(framework, {"a": torch.tensor([1 + 2j]).conj()}), tmp_path / "x.ckpt")
-    sys.modules.pop("training_framework")
-    with pytest.raises(UserError, match=r"x\.ckpt .* a tensor of a kind that is not read here"):
-        load_tensors(tmp_path / "x.ckpt")
-
-
 def test_the_old_format_with_unknown_classes_is_refused(tmp_path: Path, framework: types.ModuleType) -> None:
     save_legacy(training_checkpoint(framework, TENSORS), tmp_path / "x.ckpt")
     sys.modules.pop("training_framework")
-    with pytest.raises(UserError, match=r"x\.ckpt .* more than tensors in torch's old format"):
+    with pytest.raises(UserError, match=r"x\.ckpt .* holds objects that are not read here"):
         load_tensors(tmp_path / "x.ckpt")
 
 
@@ -286,14 +270,14 @@ BUILD_ON = {
 @pytest.mark.parametrize("target", BUILD_ON)
 @pytest.mark.parametrize("state", [b"}X\x01\0\0\0xK\x01s", b"N}X\x01\0\0\0xK\x01s\x86", b"}X\x04\0\0\0keysNs"])
 def test_a_pickle_cannot_change_what_it_is_given(tmp_path: Path, target: str, state: bytes) -> None:
-    from mkpc_kaggle.weights import inert
+    from mkpc_kaggle.weights.inert import Inert
 
-    before = [repr(sorted(vars(one))) for one in (inert.Inert, inert.Table)]
+    givens = (Inert, OrderedDict, torch.FloatStorage, torch._utils._rebuild_tensor_v2)
+    before = [sorted(vars(one)) for one in givens]
     path = with_pickle(tmp_path / "x.pt", b"\x80\x02}X\x01\0\0\0a" + BUILD_ON[target] + state + b"bs.")
     with pytest.raises(UserError, match=r"x\.pt cannot be read as a checkpoint"):
         load_tensors(path)
-    assert [repr(sorted(vars(one))) for one in (inert.Inert, inert.Table)] == before
-    assert not any(hasattr(value, "x") for value in inert.KNOWN.values())
+    assert [sorted(vars(one)) for one in givens] == before
 
 
 @pytest.mark.parametrize(
@@ -343,7 +327,7 @@ def test_a_tensor_lies_within_its_storage(tmp_path: Path) -> None:
 
 def test_compressed_records_are_refused(tmp_path: Path) -> None:
     path = with_pickle(tmp_path / "x.pt", tensor_pickle(6, 2, 3, 1), zipfile.ZIP_DEFLATED)
-    with pytest.raises(UserError, match=r"x\.pt cannot be read .* record \w+ is compressed"):
+    with pytest.raises(UserError, match=r"x\.pt cannot be read .* record [\w.]+ is compressed"):
         load_tensors(path)
 
 

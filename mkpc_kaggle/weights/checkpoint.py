@@ -4,6 +4,7 @@ import re
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
+from pickle import UnpicklingError
 from typing import TYPE_CHECKING, Any
 
 from mkpc_kaggle.errors import UserError
@@ -63,16 +64,13 @@ def _load_table(path: Path) -> Mapping[Any, Any]:
     import torch
 
     try:
-        return _state_dict(torch.load(path, map_location="cpu", weights_only=True))
-    except OSError:
-        raise
-    except Exception as refusal:
         if zipfile.is_zipfile(path):
-            return load_inert(path, _state_dict)
+            return _state_dict(load_inert(path))
+        return _state_dict(torch.load(path, map_location="cpu", weights_only=True))
+    except (RuntimeError, EOFError, UnpicklingError) as refusal:
         # torch's own words would advise to load it unsafely.
         raise ValueError(
-            "it is none, or holds more than tensors in torch's old format; of that format only plain state dicts "
-            "are read"
+            "it is none, or holds objects that are not read here; save the network's state_dict alone"
         ) from refusal
 
 
