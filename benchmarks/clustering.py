@@ -1,6 +1,6 @@
 """Time of `dbscan` beside scikit-learn's, for 20,000 points of many distributions.
 
-python benchmarks/clustering.py
+python -m benchmarks.clustering
 
 scikit-learn's is quadratic in time and memory when points are clumped: it runs on the first 4,000 points, which is
 where the labels are compared; on all of them for the uniform distribution alone. Both use one thread.

@@ -17,7 +17,7 @@ from mkpc_kaggle.matchers.networks.placement import placed
 from mkpc_kaggle.matchers.semi_dense import SemiDenseMatcher
 from mkpc_kaggle.pipeline.stages import ENCODING_CACHE_BYTES, PairWork, Pipeline
 from mkpc_kaggle.recipe import Recipe, Unit
-from tests.standin import filled
+from tests.support.standin import filled
 
 IMAGES = 9
 

@@ -35,7 +35,7 @@ from mkpc_kaggle.matchers.networks.placement import placed
 from mkpc_kaggle.matchers.networks.quadtree import Quadtree
 from mkpc_kaggle.matchers.networks.superglue import ImageKeypoints, SuperGlue, SuperGlueConfig
 from mkpc_kaggle.matchers.networks.superpoint import SuperPoint, SuperPointConfig
-from tests.standin import filled
+from tests.support.standin import filled
 
 Run = Callable[[], int]
 """Does the work once; the number of matches or keypoints that it found."""

@@ -1,8 +1,6 @@
 """`dbscan` against scikit-learn's, which is the definition, and against the clock."""
 
-import runpy
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,10 +9,10 @@ from hypothesis import strategies as st
 from numpy.testing import assert_array_equal
 from sklearn.cluster import DBSCAN
 
+from benchmarks.clustering import DISTRIBUTIONS
 from mkpc_kaggle.geometry import clustering
 from mkpc_kaggle.geometry.clustering import dbscan
 
-DISTRIBUTIONS = runpy.run_path(str(Path(__file__).parents[1] / "benchmarks" / "clustering.py"))["DISTRIBUTIONS"]
 SIZE = 20_000
 MILLISECONDS = 250  # five times the promise: it must fail for what is quadratic, not for a busy machine
 

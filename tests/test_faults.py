@@ -252,7 +252,7 @@ run_pairs(pairs, assembly, session, publish)
 
 
 def test_the_watchdog_writes_and_leaves_where_the_engine_is_stuck(tmp_path: Path) -> None:
-    code = WATCHED.format(path=[str(ROOT), str(ROOT / "tests")])
+    code = WATCHED.format(path=[str(ROOT), str(ROOT / "tests" / "support")])
     started = time.monotonic()
     made = subprocess.run([sys.executable, "-c", code, str(tmp_path)], timeout=30, check=False)
     assert made.returncode == 0
@@ -300,7 +300,7 @@ def test_a_parent_killed_at_any_moment_leaves_a_whole_file_no_orphans_and_a_run_
 ) -> None:
     pairs = write_pairs(tmp_path / "pairs", COUNT)
     script = tmp_path / "run.py"
-    script.write_text(KILLED.format(path=[str(ROOT), str(ROOT / "tests")]))
+    script.write_text(KILLED.format(path=[str(ROOT), str(ROOT / "tests" / "support")]))
     rng = random.Random(moments)
     for _ in range(moments):
         running = subprocess.Popen([sys.executable, str(script), str(tmp_path)])

@@ -8,8 +8,8 @@ from statistics import median
 import numpy as np
 import pytest
 from rectified import EXTRA, SECOND, SWEEP, THREE_UNITS
+from simulator import RESTART_SECONDS, Scenario, random_scenario, simulate, without_records
 
-from benchmarks.simulation import RESTART_SECONDS, Scenario, random_scenario, simulate, without_records
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.engine import Ending
 from mkpc_kaggle.engine.jobs import Cause, Finished, Job, Lost, Outcome, Phase, Plan, Record, UnitRecord

@@ -1,0 +1,345 @@
+"""The engine on a virtual clock: random runs without images, and how well each used its time.
+
+The planner and the engine are the real ones. Workers are simulated: what a unit costs is drawn at random, and
+drifts, stalls, crashes, hangs and wrong first estimates are thrown in.
+"""
+
+import heapq
+import math
+import threading
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from mkpc_kaggle.data.competition import Pair
+from mkpc_kaggle.engine.budget import Budget
+from mkpc_kaggle.engine.engine import Ending, Engine, RunReport
+from mkpc_kaggle.engine.jobs import (
+    NOT_REACHED,
+    Cause,
+    Finished,
+    Job,
+    Lost,
+    Outcome,
+    Plan,
+    Record,
+    Task,
+    UnitRecord,
+)
+from mkpc_kaggle.engine.pools.in_process import JOBS_A_WORKER
+from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
+from mkpc_kaggle.pipeline.stages import UnitResult
+from mkpc_kaggle.recipe import Recipe, Unit
+
+RESTART_SECONDS = 8.0
+STALL = 20.0
+"""A unit that stalls takes that many times as long."""
+SWEEP_SHARE = 0.7
+"""The share of the limit within which the sweep is said to fit."""
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """A run's circumstances. Costs are seconds of a unit on a pair; faults are probabilities a unit on a pair.
+
+    ``spread`` is the sigma of lognormal costs, ``misses`` the share of pairs whose views are not cached and cost
+    ``miss_factor`` times as much, ``warm_up`` what a unit takes the first time on a worker. From ``turn``, a share
+    of the limit, on costs are ``drift`` times as high.
+    """
+
+    pairs: int
+    costs: tuple[float, ...]
+    extras: int
+    workers: int
+    limit: float
+    spread: float = 0.3
+    misses: float = 0.3
+    miss_factor: float = 2.0
+    warm_up: float = 5.0
+    drift: float = 1.0
+    turn: float = 0.5
+    stalls: float = 0.0
+    crashes: float = 0.0
+    hangs: float = 0.0
+    seed: int = 0
+
+    @property
+    def recipe(self) -> Recipe:
+        count = len(self.costs)
+        units = [
+            Unit(1 if number % 2 == 0 else 2, f"m{number}", 100, extra=number >= count - self.extras)
+            for number in range(count)
+        ]
+        return Recipe(tuple(units))
+
+    @property
+    def work(self) -> float:
+        """Seconds that all regular units take on all pairs and workers, on average and without faults."""
+        regular = self.costs[: len(self.costs) - self.extras]
+        return self.pairs * sum(regular) * self.cached / self.workers
+
+    @property
+    def cached(self) -> float:
+        """What a unit costs on average, in terms of one on a cached view."""
+        return 1 + self.misses * (self.miss_factor - 1)
+
+
+def random_scenario(seed: int, pairs: int) -> Scenario:
+    """Anything that happens: from an ample limit to one that the sweep alone fills."""
+    rng = np.random.default_rng(seed)
+    costs = tuple(np.exp(rng.normal(-0.5, 0.8, rng.integers(1, 13))).tolist())
+    troubled = rng.random() < 0.5
+    scenario = Scenario(
+        pairs=int(pairs * rng.uniform(0.5, 1.5)),
+        costs=costs,
+        extras=int(rng.integers(0, len(costs))),
+        workers=int(rng.integers(1, 5)),
+        limit=math.inf,
+        spread=float(rng.uniform(0.05, 1.0)),
+        misses=float(rng.uniform(0, 0.6)),
+        miss_factor=float(rng.uniform(1, 5)),
+        warm_up=float(rng.uniform(0, 30)),
+        drift=float(rng.choice([0.3, 1, 1, 1, 2, 10])),
+        turn=float(rng.uniform(0.1, 0.9)),
+        seed=seed,
+    )
+    limit = max(600.0, scenario.work * float(rng.uniform(0.3, 1.3)))
+    # Faults a run: some dozens of stalls, a crash or two, now and then a hang. With its extra units a run may do
+    # all units on all pairs, if the time suffices.
+    seconds = sum(costs) / len(costs) * scenario.cached
+    runs = min(scenario.pairs * len(costs), limit * scenario.workers / seconds)
+    rates = [float(rng.uniform(0, most)) / runs if troubled else 0.0 for most in (30, 3, 1)]
+    return Scenario(
+        **{**vars(scenario), "limit": limit, "stalls": rates[0], "crashes": rates[1], "hangs": rates[2]}
+    )
+
+
+@dataclass
+class VirtualClock:
+    now: float = 0.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+class SimulatedPool:
+    """Workers that take their time on the virtual clock alone.
+
+    Of their seconds until ``stop``, ``kept`` went into jobs that came back in time. ``faults`` are what injected
+    faults take whatever is planned: the unit that a crash cut short, of a hang as long as a stall might have
+    taken, which it cannot be told from sooner, a stall that was taken for a hang, and the new worker's start
+    after any of these.
+    """
+
+    def __init__(self, scenario: Scenario, clock: VirtualClock, stop: float) -> None:
+        self.scenario = scenario
+        self.clock = clock
+        self.kept = self.faults = 0.0
+        self._rng = np.random.default_rng(scenario.seed)
+        self._costs = {unit.name: cost for unit, cost in zip(scenario.recipe.units, scenario.costs, strict=True)}
+        self._stop = stop
+        self._free = [RESTART_SECONDS] * scenario.workers
+        self._warm: set[tuple[int, str]] = set()
+        self._coming: list[tuple[float, int, float, Finished | Lost]] = []
+        self._count = 0
+
+    @property
+    def workers(self) -> int:
+        return self.scenario.workers
+
+    @property
+    def capacity(self) -> int:
+        return JOBS_A_WORKER * self.workers
+
+    def start(self) -> None:
+        pass
+
+    def submit(self, job: Job) -> None:
+        worker = int(np.argmin(self._free))
+        begun = max(self.clock.now, self._free[worker])
+        ended, back, fault = self._do(job, worker, begun)
+        lost = isinstance(back, Lost)
+        self._free[worker] = ended + (RESTART_SECONDS if lost else 0.0)
+        if lost:
+            self.faults += max(0.0, min(fault + RESTART_SECONDS * (fault > 0), self._stop - begun))
+            self._warm = {(who, unit) for who, unit in self._warm if who != worker}
+        self._count += 1
+        kept = 0.0 if lost else min(ended, self._stop) - begun
+        heapq.heappush(self._coming, (ended, self._count, kept, back))
+
+    def next(self, until: float) -> Finished | Lost | None:
+        if not self._coming or self._coming[0][0] > until:
+            self.clock.now = max(self.clock.now, until)
+            return None
+        ended, _, kept, back = heapq.heappop(self._coming)
+        self.clock.now = max(self.clock.now, ended)
+        self.kept += max(0.0, kept)
+        return back
+
+    def stop(self) -> None:
+        pass
+
+    def close(self) -> bool:
+        return True
+
+    def _do(self, job: Job, worker: int, begun: float) -> tuple[float, Finished | Lost, float]:
+        """When the job ends, what comes back, and the seconds of it that an injected fault took."""
+        now, plan = begun, job.plan
+        expected = dict(zip(plan.units, plan.expected, strict=True))
+        results: list[list[UnitResult]] = [[] for _ in job.tasks]
+        for unit in sorted(plan.units, key=lambda unit: unit.stage):
+            for task, found in zip(job.tasks, results, strict=True):
+                if any(result.unit == unit for result in task.results) or now + expected[unit] >= plan.deadline:
+                    continue
+                stalled = self._rng.random() < self.scenario.stalls
+                usual = self._seconds(unit, now) * plan.shrink**2
+                seconds = usual * (STALL if stalled else 1.0) + self._warm_up(unit, worker)
+                fate = self._rng.random()
+                if fate < self.scenario.crashes:
+                    return now + seconds / 2, Lost(job, Cause.DIED), seconds / 2
+                if fate < self.scenario.crashes + self.scenario.hangs:
+                    return now + plan.timeout, Lost(job, Cause.HUNG), min(plan.timeout, STALL * usual)
+                if seconds > plan.timeout:
+                    return now + plan.timeout, Lost(job, Cause.HUNG), plan.timeout if stalled else 0.0
+                now += seconds
+                found.append(UnitResult(unit, Matches.empty(), 0.0, seconds))
+        outcomes = tuple(self._outcome(task, found, plan) for task, found in zip(job.tasks, results, strict=True))
+        return now, Finished(job, outcomes), 0.0
+
+    def _warm_up(self, unit: Unit, worker: int) -> float:
+        if (worker, unit.name) in self._warm:
+            return 0.0
+        self._warm.add((worker, unit.name))
+        return self.scenario.warm_up
+
+    def _seconds(self, unit: Unit, now: float) -> float:
+        scenario, rng = self.scenario, self._rng
+        seconds = self._costs[unit.name] * math.exp(scenario.spread * rng.normal() - scenario.spread**2 / 2)
+        if rng.random() < scenario.misses:
+            seconds *= scenario.miss_factor
+        if now > scenario.turn * scenario.limit:
+            seconds *= scenario.drift
+        return seconds
+
+    def _outcome(self, task: Task, found: list[UnitResult], plan: Plan) -> Outcome:
+        if not found:
+            return Outcome(Record.untouched(task.index, NOT_REACHED))
+        units = tuple(
+            UnitRecord(one.unit.name, one.unit.stage, 200, 20 + task.index % 60, 0.0, one.seconds, plan.note)
+            for one in (*task.results, *found)
+        )
+        return Outcome(Record(task.index, FALLBACK_FUNDAMENTAL, "", units), tuple(found))
+
+
+class MemoryJournal:
+    """A journal that forgets with the process."""
+
+    def __init__(self) -> None:
+        self._results: dict[int, tuple[UnitResult, ...]] = {}
+
+    def records(self) -> dict[int, Record]:
+        return {}
+
+    def results(self, pair: int, units: Mapping[str, Unit]) -> tuple[UnitResult, ...]:
+        return self._results.get(pair, ())
+
+    def save(self, outcomes: list[tuple[Outcome, bool]]) -> None:
+        for outcome, _ in outcomes:
+            index = outcome.record.index
+            self._results[index] = self._results.get(index, ()) + outcome.results
+
+    def note(self, kind: str, seconds: float, text: str) -> None:
+        pass
+
+
+@dataclass(frozen=True)
+class Ran:
+    """What became of a scenario; ``late`` and ``lost`` must be 0.
+
+    ``utilisation`` is what was used of what was given. Given are the workers' seconds from their start to the
+    budget's stop, without those that injected faults take from any planner (see :class:`SimulatedPool`). Used are
+    the seconds of jobs whose results came back in time, warm-ups and stalls included. So idle workers, the end of
+    a phase, what a lost job had done before, silence longer than a stall's, a slow unit taken to hang, and what
+    is still under way at the end all count against the engine.
+
+    ``lost`` counts pairs without the sweep's F where the sweep fits (see :func:`sweep_seconds`), and versions of
+    the submission that lack a row.
+    """
+
+    scenario: Scenario
+    report: RunReport
+    utilisation: float
+    late: float
+    lost: int
+    jobs: int
+    planning: float
+
+    @property
+    def work_left(self) -> bool:
+        return self.report.ending is not Ending.COMPLETE
+
+
+def simulate(scenario: Scenario) -> Ran:
+    """Run one scenario through the real engine."""
+    clock = VirtualClock()
+    budget = Budget(0.0, scenario.limit, clock)
+    pool = SimulatedPool(scenario, clock, budget.stop)
+    pairs = [Pair(str(n), "set", Path(f"{n:07d}"), Path("b")) for n in range(scenario.pairs)]
+    published: list[int] = []
+    engine = Engine(
+        pairs,
+        scenario.recipe,
+        pool,
+        MemoryJournal(),
+        budget,
+        publish=lambda records: published.append(len(records)),
+        interrupt=threading.Event(),
+        progress=False,
+    )
+    planning, jobs = 0.0, 0
+    plan_next = engine.planner.next
+
+    def timed(now: float) -> Plan | None:
+        nonlocal planning, jobs
+        start = time.thread_time()  # whatever else the machine does
+        plan = plan_next(now)
+        planning += time.thread_time() - start
+        jobs += plan is not None
+        return plan
+
+    engine.planner.next = timed  # type: ignore[method-assign]
+    report = engine.run()
+    swept = sum(record.matches > 0 for record in report.records)
+    sweep_fits = sweep_seconds(scenario) < SWEEP_SHARE * scenario.limit
+    given = pool.workers * (min(budget.stop, clock.now) - RESTART_SECONDS) - pool.faults
+    return Ran(
+        scenario,
+        report,
+        pool.kept / given,
+        max(0.0, clock.now - scenario.limit),
+        sum(length != scenario.pairs for length in published) + (scenario.pairs - swept if sweep_fits else 0),
+        jobs,
+        planning / max(1, jobs),
+    )
+
+
+def sweep_seconds(scenario: Scenario) -> float:
+    """What the sweep takes: with the drift from its first moment on, its stalls, warm-ups, crashes and hangs.
+
+    The faults are those to expect; that there may be more of them is what the rest of the limit is for. Each
+    takes a worker's start and warm-up, a hang also as long as a stall would.
+    """
+    unit = scenario.costs[0] * scenario.cached * max(1.0, scenario.drift)
+    start = RESTART_SECONDS + scenario.warm_up
+    stalls = scenario.stalls * (STALL - 1) * unit
+    faults = (scenario.crashes + scenario.hangs) * start + scenario.hangs * STALL * unit
+    return start + scenario.pairs * (unit + stalls + faults) / scenario.workers
+
+
+def without_records(ran: Ran) -> Ran:
+    """The run without what it found: kept of a thousand runs, that would slow down all that come after."""
+    return replace(ran, report=replace(ran.report, records=()))
