@@ -15,7 +15,8 @@ from mkpc_kaggle.matchers.loftr import SPEC
 from mkpc_kaggle.matchers.networks.loftr import Loftr
 from mkpc_kaggle.matchers.networks.placement import placed
 from mkpc_kaggle.matchers.semi_dense import SemiDenseMatcher
-from mkpc_kaggle.pipeline.stages import ENCODING_CACHE_BYTES, PairWork, Pipeline
+from mkpc_kaggle.pipeline.pair import PairMatch
+from mkpc_kaggle.pipeline.stages import ENCODING_CACHE_BYTES, Pipeline
 from mkpc_kaggle.recipe import Recipe, Unit
 from tests.support.standin import filled
 
@@ -29,7 +30,7 @@ def main() -> None:
     recipe = Recipe(units=(Unit(1, "loftr", VGA.width),))
     seconds = {}
     for name, cache_bytes in (("warm-up", 0), ("not cached", 0), ("cached", ENCODING_CACHE_BYTES)):
-        works = [PairWork(pair) for pair in combinations(images, 2)][: 1 if name == "warm-up" else None]
+        works = [PairMatch(images=pair) for pair in combinations(images, 2)][: 1 if name == "warm-up" else None]
         pipeline = Pipeline(recipe, lambda _: matcher, cache_bytes=cache_bytes)
         start = time.perf_counter()
         pipeline.match(works, recipe.units)

@@ -13,27 +13,30 @@ import threading
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from mkpc_kaggle.data.competition import Pair, read_test_side, write_submission
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.engine import Engine
-from mkpc_kaggle.engine.jobs import Finished, Lost, Record
+from mkpc_kaggle.engine.jobs import JobFailure, JobResult
 from mkpc_kaggle.engine.journal import Journal
-from mkpc_kaggle.engine.pools.in_process import InProcessPool
+from mkpc_kaggle.engine.pools.local import LocalWorker
+from mkpc_kaggle.engine.pools.pool import Place, Pool
+from mkpc_kaggle.engine.records import PairRecord
 from mkpc_kaggle.pipeline.assembly import Assembly, assemble
 
 
-class WatchedPool(InProcessPool):
+class WatchedPool(Pool):
     """Keeps what comes back, and when."""
 
     def __init__(self, assembly: Assembly) -> None:
-        super().__init__(assembly.pipeline, assembly.recipe)
-        self.came: list[tuple[float, Finished]] = []
+        super().__init__([Place("this process", partial(LocalWorker, assembly.pipeline))], assembly.recipe)
+        self.came: list[tuple[float, JobResult]] = []
 
-    def next(self, until: float) -> Finished | Lost | None:
+    def next(self, until: float) -> JobResult | JobFailure | None:
         back = super().next(until)
-        if isinstance(back, Finished):
+        if isinstance(back, JobResult):
             self.came.append((time.monotonic(), back))
         return back
 
@@ -54,7 +57,7 @@ class Spent:
     tail: float
 
     @classmethod
-    def of(cls, came: Sequence[tuple[float, Finished]]) -> "Spent":
+    def of(cls, came: Sequence[tuple[float, JobResult]]) -> "Spent":
         rest = [finished for _, finished in came[1:]]
         records = [outcome.record for finished in rest for outcome in finished.outcomes]
         return cls(
@@ -82,7 +85,7 @@ def run(pairs: Sequence[Pair], assembly: Assembly, directory: Path) -> Spent:
     pool = WatchedPool(assembly)
     journal = Journal(directory, {"benchmark": 1}, pairs=pairs)
 
-    def publish(records: Sequence[Record]) -> None:
+    def publish(records: Sequence[PairRecord]) -> None:
         matrices = {pair.id: record.F for pair, record in zip(pairs, records, strict=True)}
         write_submission(directory / "submission.csv", matrices)
 

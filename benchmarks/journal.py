@@ -13,11 +13,12 @@ from pathlib import Path
 
 import numpy as np
 
-from mkpc_kaggle.engine.jobs import CHUNK, Outcome, Record, UnitRecord
+from mkpc_kaggle.engine.jobs import JOB_PAIRS, Outcome
 from mkpc_kaggle.engine.journal import Journal
+from mkpc_kaggle.engine.records import PairRecord, UnitRecord
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
-from mkpc_kaggle.pipeline.stages import UnitResult
+from mkpc_kaggle.pipeline.pair import UnitResult
 from mkpc_kaggle.recipe import Unit
 
 
@@ -47,13 +48,15 @@ def main() -> None:
         journal = Journal(Path(directory), {"benchmark": 1})
         started, saving = time.perf_counter(), 0.0
         for first, last in ((0, 1), (1, len(units))):
-            for start in range(0, arguments.pairs, CHUNK):
+            for start in range(0, arguments.pairs, JOB_PAIRS):
                 outcomes = [
                     (
-                        Outcome(Record(index, FALLBACK_FUNDAMENTAL, "", tuple(records[:last])), found[first:last]),
+                        Outcome(
+                            PairRecord(index, FALLBACK_FUNDAMENTAL, "", tuple(records[:last])), found[first:last]
+                        ),
                         last == len(units) and rng.random() < arguments.settled,
                     )
-                    for index in range(start, min(start + CHUNK, arguments.pairs))
+                    for index in range(start, min(start + JOB_PAIRS, arguments.pairs))
                 ]
                 journal.save(outcomes)
         saving = time.perf_counter() - started

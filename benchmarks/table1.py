@@ -32,7 +32,8 @@ from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.metrics import PoseError, pair_accuracy, pose_auc
 from mkpc_kaggle.geometry.robust import RobustConfig, estimate
 from mkpc_kaggle.pipeline.assembly import assemble
-from mkpc_kaggle.pipeline.stages import PairWork, Pipeline, UnitResult
+from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult
+from mkpc_kaggle.pipeline.stages import Pipeline
 from mkpc_kaggle.recipe import Recipe, Unit
 
 LONG_SIDES = {
@@ -115,12 +116,12 @@ class Found:
 
 
 def try_all(
-    ways: Sequence[Way], work: PairWork, true: TruePair, scene: Scene, pipeline: Pipeline, radius: float
+    ways: Sequence[Way], work: PairMatch, true: TruePair, scene: Scene, pipeline: Pipeline, radius: float
 ) -> dict[str, Found]:
     """Every way on one pair: units of stage 1 once, those of stage 2 once for each plain way."""
     (whole,) = pipeline.match([work], [unit for unit in pipeline.recipe.units if unit.stage == 1])
     known = {result.unit: result for result in whole.results}
-    done: dict[tuple[Unit, ...], PairWork] = {}
+    done: dict[tuple[Unit, ...], PairMatch] = {}
     for way in ways:
         if way.units not in done:
             stage1 = tuple(known[unit] for unit in way.units if unit.stage == 1)
@@ -134,7 +135,7 @@ def try_all(
 
 
 def _conclude(
-    way: Way, work: PairWork, *, true: TruePair, scene: Scene, config: RobustConfig, radius: float
+    way: Way, work: PairMatch, *, true: TruePair, scene: Scene, config: RobustConfig, radius: float
 ) -> Found:
     start = time.thread_time()  # several work at once
     parts = [result.matches for result in work.results]
@@ -192,7 +193,9 @@ def run_all(scenes: Sequence[Scene], ways: Sequence[Way], pipeline: Pipeline, di
             if isinstance(image0, Unreadable) or isinstance(image1, Unreadable):
                 diary.add(true.pair.id, {way.name: Found(PoseError.failed(), 0, 0.0) for way in ways})
                 continue
-            diary.add(true.pair.id, try_all(ways, PairWork((image0, image1)), true, scene, pipeline, radius))
+            diary.add(
+                true.pair.id, try_all(ways, PairMatch(images=(image0, image1)), true, scene, pipeline, radius)
+            )
     finally:
         images.close()
 

@@ -25,7 +25,8 @@ from mkpc_kaggle.geometry.coordinates import Points, Size
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import Model, RobustConfig, estimate, sampson_distances
 from mkpc_kaggle.pipeline.assembly import assemble
-from mkpc_kaggle.pipeline.stages import PairWork, Pipeline
+from mkpc_kaggle.pipeline.pair import PairMatch
+from mkpc_kaggle.pipeline.stages import Pipeline
 from mkpc_kaggle.recipe import Recipe, Unit
 
 RIGHT = 3.0
@@ -80,10 +81,10 @@ class Views:
 def look(images: tuple[Image, Image], true: TruePair, pipeline: Pipeline) -> Views | None:
     """One pair; ``None`` where a region is the whole image, and there is nothing to compare."""
     first, second = pipeline.recipe.units
-    (work,) = pipeline.match([PairWork(images)], [first, second])
+    (work,) = pipeline.match([PairMatch(images=images)], [first, second])
     if work.regions is None or not all(region.cropped for region in work.regions):
         return None
-    (whole,) = pipeline.match([PairWork(images)], [replace(second, stage=1)])
+    (whole,) = pipeline.match([PairMatch(images=images)], [replace(second, stage=1)])
     enlarged = [
         max(image.size.width, image.size.height) / max(region.box.size.width, region.box.size.height)
         for image, region in zip(images, work.regions, strict=True)

@@ -8,7 +8,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from mkpc_kaggle.pipeline.stages import PairMatch
+    from mkpc_kaggle.pipeline.pair import PairMatch
     from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher
     from mkpc_kaggle.recipe import Recipe
 
@@ -16,7 +16,7 @@ __version__ = "0.1.0"
 __all__ = ["PairMatch", "Recipe", "TwoStageMatcher", "__version__"]
 
 _HOME = {
-    "PairMatch": "mkpc_kaggle.pipeline.stages",
+    "PairMatch": "mkpc_kaggle.pipeline.pair",
     "TwoStageMatcher": "mkpc_kaggle.pipeline.two_stage",
     "Recipe": "mkpc_kaggle.recipe",
 }

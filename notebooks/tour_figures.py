@@ -12,7 +12,7 @@ from mkpc_kaggle.geometry.critical_region import Clusters, CriticalRegion, MkpcC
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.metrics import PoseError
 from mkpc_kaggle.geometry.robust import Estimate, Matrix3
-from mkpc_kaggle.pipeline.stages import PairMatch
+from mkpc_kaggle.pipeline.pair import PairMatch
 from mkpc_kaggle.recipe import Unit
 from mkpc_kaggle.reporting.figures.canvas import (
     CLUSTERS,

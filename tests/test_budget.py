@@ -5,15 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mkpc_kaggle.engine.budget import (
-    WINDOW,
-    Budget,
-    Costs,
-    format_duration,
-    longest_prefix,
-    monotonic_of,
-    parse_duration,
-)
+from mkpc_kaggle.engine.budget import Budget, format_duration, monotonic_of, parse_duration
+from mkpc_kaggle.engine.costs import WINDOW, Costs, needs
+from mkpc_kaggle.engine.planner import units_that_fit
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.recipe import Unit
 
@@ -92,22 +86,22 @@ def known_costs(*seconds: float) -> Costs:
 def test_the_longest_prefix_that_fits_is_chosen() -> None:
     costs = known_costs(1.0, 2.0, 4.0)
     lacking = {unit.name: 10 for unit in UNITS}
-    assert [longest_prefix(UNITS, lacking, costs, s) for s in (13, 15, 43, 99)] == [0, 1, 2, 3]
+    assert [units_that_fit(needs(UNITS, lacking, costs), s)[0] for s in (13, 15, 43, 99)] == [0, 1, 2, 3]
 
 
 def test_units_that_pairs_have_already_cost_nothing() -> None:
     costs = known_costs(1.0, 2.0, 4.0)
     lacking = {UNITS[0].name: 0, UNITS[1].name: 10, UNITS[2].name: 1}
-    assert longest_prefix(UNITS, lacking, costs, 34) == 3
+    assert units_that_fit(needs(UNITS, lacking, costs), 34)[0] == 3
 
 
 def test_waiting_counts_against_the_time_too() -> None:
     costs = known_costs(1.0, 2.0, 4.0)
     lacking = {unit.name: 10 for unit in UNITS}
-    before = longest_prefix(UNITS, lacking, costs, 45)
+    before = units_that_fit(needs(UNITS, lacking, costs), 45)[0]
     costs.observe_overhead(1.0)
     assert before == 2
-    assert longest_prefix(UNITS, lacking, costs, 45) == 1
+    assert units_that_fit(needs(UNITS, lacking, costs), 45)[0] == 1
 
 
 @given(
@@ -121,8 +115,8 @@ def test_more_time_never_chooses_fewer_units(
 ) -> None:
     costs = known_costs(*seconds)
     lacking = {unit.name: count for unit, count in zip(UNITS, pairs, strict=True)}
-    count = longest_prefix(UNITS, lacking, costs, time_left)
-    assert count <= longest_prefix(UNITS, lacking, costs, time_left * factor)
+    count = units_that_fit(needs(UNITS, lacking, costs), time_left)[0]
+    assert count <= units_that_fit(needs(UNITS, lacking, costs), time_left * factor)[0]
     needed = sum(costs.of(unit.name) * lacking[unit.name] for unit in UNITS[:count])
     assert needed <= time_left
 

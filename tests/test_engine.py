@@ -21,18 +21,18 @@ from rectified import (
 )
 
 from mkpc_kaggle.engine.engine import Ending
-from mkpc_kaggle.engine.jobs import NOT_REACHED, Record
 from mkpc_kaggle.engine.journal import Journal
+from mkpc_kaggle.engine.records import NOT_REACHED, PairRecord
 from mkpc_kaggle.pipeline.assembly import Assembly
 from mkpc_kaggle.pipeline.stages import Pipeline
 from mkpc_kaggle.recipe import UpgradeConfig
 
 
-def matrices(records: tuple[Record, ...]) -> bytes:
+def matrices(records: tuple[PairRecord, ...]) -> bytes:
     return b"".join(record.F.tobytes() for record in records)
 
 
-def units(record: Record) -> list[str]:
+def units(record: PairRecord) -> list[str]:
     return [unit.unit for unit in record.units]
 
 
@@ -59,7 +59,7 @@ def test_the_sweep_reaches_all_pairs_before_any_pair_is_deepened(tmp_path: Path)
 def test_every_published_version_is_whole_and_the_first_comes_before_any_work(tmp_path: Path) -> None:
     matcher, published = RectifiedMatcher(), []
 
-    def publish(records: list[Record]) -> None:
+    def publish(records: list[PairRecord]) -> None:
         published.append(([record.F.copy() for record in records], len(matcher.calls)))
 
     run(write_pairs(tmp_path, 5), THREE_UNITS, matcher, tmp_path / "work", publish=publish)

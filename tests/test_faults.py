@@ -22,25 +22,33 @@ from faulty import (
     hang,
     pipeline_once,
 )
-from rectified import SECOND, SWEEP, THREE_UNITS, RectifiedMatcher, interrupt_after, run, write_pairs
+from rectified import (
+    SECOND,
+    SWEEP,
+    THREE_UNITS,
+    RectifiedMatcher,
+    interrupt_after,
+    process_place,
+    run,
+    write_pairs,
+)
 
 from mkpc_kaggle.cli import main
 from mkpc_kaggle.data.competition import Pair, read_test_side, submission_problems
 from mkpc_kaggle.demo import DemoSet
 from mkpc_kaggle.engine import session
+from mkpc_kaggle.engine.costs import Timeouts
 from mkpc_kaggle.engine.engine import Ending, RunReport
-from mkpc_kaggle.engine.jobs import NOT_REACHED, Record
 from mkpc_kaggle.engine.journal import Journal
-from mkpc_kaggle.engine.patience import Patience
-from mkpc_kaggle.engine.pools.processes import ProcessPool, Seat
+from mkpc_kaggle.engine.pools.pool import Pool
+from mkpc_kaggle.engine.records import NOT_REACHED, PairRecord
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.pipeline.assembly import Assembly
-from mkpc_kaggle.pipeline.stages import is_out_of_memory
 
 ROOT = Path(__file__).resolve().parents[1]
 COUNT = 12
 VICTIM = 3  # brightness 13
-QUICK = Patience(floor=0.7, factor=20, unknown=0.0)
+QUICK = Timeouts(floor=0.7, factor=20, unknown=0.0)
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +61,7 @@ def undisturbed(pairs: list[Pair], tmp_path_factory: pytest.TempPathFactory) -> 
     return run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path_factory.mktemp("undisturbed"))
 
 
-def matrices(records: tuple[Record, ...] | list[Record]) -> list[bytes]:
+def matrices(records: tuple[PairRecord, ...] | list[PairRecord]) -> list[bytes]:
     return [record.F.tobytes() for record in records]
 
 
@@ -79,15 +87,18 @@ def test_worker_processes_give_the_bytes_of_a_run_in_one_process(
     [
         (die, "the worker died: signal SIGKILL"),
         (hang, "the worker hung: nothing heard for"),
-        (exhaust_memory, "out of memory: 1:rectified@96: "),
-        (exhaust_gpu, "out of memory: 1:rectified@96: RuntimeError: CUDA out of memory"),
+        (exhaust_memory, "out of memory: MemoryError: Unable to allocate 2.00 GiB"),
+        (
+            exhaust_gpu,
+            "out of memory: RuntimeError: CUDA out of memory. Tried to allocate 20.00 GiB, in 1:rectified@96",
+        ),
     ],
 )
 def test_a_worker_lost_once_costs_time_alone(
     pairs: list[Pair], undisturbed: RunReport, tmp_path: Path, fault: object, told: str
 ) -> None:
     matcher = FaultyMatcher(fault=fault, once=tmp_path / "once")  # type: ignore[arg-type]
-    report = run(pairs, THREE_UNITS, matcher, tmp_path / "work", workers=1, patience=QUICK)
+    report = run(pairs, THREE_UNITS, matcher, tmp_path / "work", workers=1, timeouts=QUICK)
     assert report.ending is Ending.COMPLETE
     assert len(report.faults) == 1
     assert told in report.faults[0]
@@ -231,15 +242,15 @@ from rectified import THREE_UNITS, RectifiedMatcher, write_pairs
 from mkpc_kaggle.pipeline.assembly import assemble
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.session import Interrupt, Session, run_pairs
-from mkpc_kaggle.engine.pools.in_process import InProcessPool
+from mkpc_kaggle.engine.pools.pool import Pool
 
-taken = InProcessPool.next
+taken = Pool.next
 def stuck(self, until):
     back = taken(self, until + 5)
     if time.monotonic() > started + 1:
         time.sleep(1000)
     return back
-InProcessPool.next = stuck
+Pool.next = stuck
 home = Path(sys.argv[1])
 assembly = assemble(THREE_UNITS, matchers={{"rectified": RectifiedMatcher(seconds=0.05)}}, device="cpu")
 pairs = write_pairs(home / "pairs", 40)
@@ -332,8 +343,8 @@ def test_an_interrupt_reaches_workers_through_the_parent(pairs: list[Pair], tmp_
 def test_a_worker_that_cannot_be_started_again_ends_the_run_with_every_row_there(
     pairs: list[Pair], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def one_life(assembly: Assembly, _: object) -> ProcessPool:
-        return ProcessPool([Seat("cpu", partial(pipeline_once, assembly, tmp_path / "marker"))], assembly.recipe)
+    def one_life(assembly: Assembly, _: object) -> Pool:
+        return Pool([process_place(partial(pipeline_once, assembly, tmp_path / "marker"))], assembly.recipe)
 
     monkeypatch.setattr(session, "pool_of", one_life)
     report = run(pairs, THREE_UNITS, FaultyMatcher(), tmp_path / "work", workers=1)
@@ -344,17 +355,7 @@ def test_a_worker_that_cannot_be_started_again_ends_the_run_with_every_row_there
 
 
 def test_workers_that_die_while_they_load_are_bad_input() -> None:
-    pool = ProcessPool([Seat("cpu", die)], THREE_UNITS)  # type: ignore[arg-type]
+    pool = Pool([process_place(die)], THREE_UNITS)  # type: ignore[arg-type]
     with pytest.raises(UserError, match="no worker could be started: the worker died: signal SIGKILL"):
         pool.start()
     assert pool.close()
-
-
-def test_what_says_that_memory_is_short() -> None:
-    import torch
-
-    assert is_out_of_memory(MemoryError())
-    assert is_out_of_memory(torch.OutOfMemoryError("CUDA out of memory."))
-    told = "[enforce fail at alloc_cpu.cpp:117] err == 0. DefaultCPUAllocator: can't allocate memory: you tried"
-    assert is_out_of_memory(RuntimeError(told))
-    assert not is_out_of_memory(RuntimeError("shapes differ"))

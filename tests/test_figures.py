@@ -13,7 +13,7 @@ from mkpc_kaggle.geometry.critical_region import CriticalRegion, MkpcConfig, Rat
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.metrics import PoseError
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL, Estimate, Model
-from mkpc_kaggle.pipeline.stages import PairMatch, UnitResult
+from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult
 from mkpc_kaggle.recipe import Unit
 from mkpc_kaggle.reporting.figures import to_jpeg
 

@@ -1,18 +1,20 @@
 import sqlite3
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from rectified import SECOND, SWEEP, THREE_UNITS
 
-from mkpc_kaggle.engine.jobs import Outcome, Record, record_of
+from mkpc_kaggle.engine.jobs import Outcome
 from mkpc_kaggle.engine.journal import DRAWN, Journal
+from mkpc_kaggle.engine.records import PairRecord
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Box
 from mkpc_kaggle.geometry.critical_region import CriticalRegion, RegionReason
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import Estimate, Model
-from mkpc_kaggle.pipeline.stages import PairMatch, UnitResult
+from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult
 
 OURS = {"recipe": {"a": 1}, "test set": "x"}
 UNITS = {unit.name: unit for unit in THREE_UNITS.units}
@@ -29,10 +31,11 @@ def outcome(index: int = 7, seed: int = 0) -> Outcome:
         CriticalRegion(Box(0, 0, 5, 6), RegionReason.TOO_SMALL),
     )
     match = PairMatch(results, regions, Estimate(Model.F, rng.random((3, 3)), rng.random(30) < 0.5))
-    return Outcome(record_of(index, match, decode=0.1, cluster=0.2, estimate=0.3), results)
+    match = replace(match, decode_seconds=0.1, cluster_seconds=0.2, estimate_seconds=0.3)
+    return Outcome(PairRecord.of(index, match), results)
 
 
-def assert_same(one: Record, other: Record) -> None:
+def assert_same(one: PairRecord, other: PairRecord) -> None:
     assert one.F.tobytes() == other.F.tobytes()
     assert one.units == other.units
     assert one.regions == other.regions
@@ -93,7 +96,7 @@ def test_a_settled_pair_saved_again_is_counted_once_among_the_weakest(tmp_path: 
 
 def test_a_job_is_saved_whole_or_not_at_all(tmp_path: Path) -> None:
     journal = Journal(tmp_path, OURS)
-    broken = Outcome(Record(8, "no matrix", ""))  # type: ignore[arg-type]
+    broken = Outcome(PairRecord(8, "no matrix", ""))  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="could not convert"):
         journal.save([(outcome(3), False), (broken, False)])
     assert journal.records() == {}

@@ -20,7 +20,8 @@ from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL, Model
 from mkpc_kaggle.matchers.contract import Colour, MatcherSpec, Placement
 from mkpc_kaggle.matchers.sift import SiftMatcher, SiftOptions
 from mkpc_kaggle.pipeline.assembly import Licence, assemble
-from mkpc_kaggle.pipeline.stages import PairWork, Pipeline, finish
+from mkpc_kaggle.pipeline.pair import PairMatch, with_estimate
+from mkpc_kaggle.pipeline.stages import Pipeline
 from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher
 from mkpc_kaggle.recipe import Mode, Recipe, Unit, load_recipe
 from mkpc_kaggle.weights import UNVERIFIED, WeightFile, manifest
@@ -283,7 +284,7 @@ def test_a_mirrored_unit_gives_points_of_the_image_that_is_not_mirrored():
 def works(count=1):
     image0, image1 = map(Image.of_array, pair())
     smaller = Image.of_array(np.ascontiguousarray(pair()[1][:300, 100:]))
-    return [PairWork((image0, other)) for other in (image1, smaller, image0)[:count]]
+    return [PairMatch(images=(image0, other)) for other in (image1, smaller, image0)[:count]]
 
 
 def pipeline(recipe, matcher=None, **what):
@@ -293,11 +294,11 @@ def pipeline(recipe, matcher=None, **what):
 
 def test_results_are_in_the_order_of_the_recipe_whatever_was_run_first():
     recipe = Recipe((Unit(1, "sift", 480), Unit(2, "sift", 440), Unit(1, "sift", 360)))
-    at_once = finish(pipeline(recipe).match(works(), recipe.units)[0], recipe)
+    at_once = with_estimate(pipeline(recipe).match(works(), recipe.units)[0], recipe)
     runner, (work,) = pipeline(recipe), works()
     for unit in (recipe.units[2], recipe.units[0], recipe.units[1]):
         (work,) = runner.match([work], [unit])
-    piecemeal = finish(work, recipe)
+    piecemeal = with_estimate(work, recipe)
     assert [result.unit for result in at_once.results] == list(recipe.units)
     assert [result.unit for result in piecemeal.results] == list(recipe.units)
     assert same(at_once.results[2].matches, piecemeal.results[2].matches)
@@ -318,7 +319,7 @@ def test_what_was_found_is_returned_when_there_is_no_going_on():
     assert [result.unit.stage for result in work.results] == [1]
     none = pipeline(TWO_STAGES).match(works(3), TWO_STAGES.units, lambda unit: False)
     assert [work.results for work in none] == [(), (), ()]
-    assert finish(none[0], TWO_STAGES).estimate.failure
+    assert with_estimate(none[0], TWO_STAGES).estimate.failure
 
 
 def test_a_batch_gives_what_pairs_give_alone():
@@ -331,8 +332,8 @@ def test_a_batch_gives_what_pairs_give_alone():
 def test_whole_images_are_encoded_once_and_crops_for_each_pair():
     sift = CountingSift()
     image0, image1 = works()[0].images
-    first = PairWork((image0, image1))
-    pipeline(TWO_STAGES, sift).match([first, PairWork((image1, image0)), first], TWO_STAGES.units)
+    first = PairMatch(images=(image0, image1))
+    pipeline(TWO_STAGES, sift).match([first, PairMatch(images=(image1, image0)), first], TWO_STAGES.units)
     assert sift.seen.pop(Box.whole(SIZE)) == 2
     assert len(sift.seen) >= 2
     assert sift.seen.total() == 6

@@ -11,47 +11,48 @@ from rectified import EXTRA, SECOND, SWEEP, THREE_UNITS
 from simulator import RESTART_SECONDS, Scenario, random_scenario, simulate, without_records
 
 from mkpc_kaggle.engine.budget import Budget
+from mkpc_kaggle.engine.costs import Timeouts
 from mkpc_kaggle.engine.engine import Ending
-from mkpc_kaggle.engine.jobs import Cause, Finished, Job, Lost, Outcome, Phase, Plan, Record, UnitRecord
-from mkpc_kaggle.engine.patience import Patience
+from mkpc_kaggle.engine.jobs import Cause, Job, JobFailure, JobResult, Outcome, Phase
 from mkpc_kaggle.engine.planner import Planner
-from mkpc_kaggle.engine.upgrade import Rounds, is_weak
+from mkpc_kaggle.engine.records import PairRecord, UnitRecord
+from mkpc_kaggle.engine.upgrade import UpgradeRounds, is_weak
 from mkpc_kaggle.geometry.coordinates import Box
 from mkpc_kaggle.geometry.critical_region import CriticalRegion, RegionReason
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
-from mkpc_kaggle.pipeline.stages import UnitResult
+from mkpc_kaggle.pipeline.pair import UnitResult
 from mkpc_kaggle.recipe import Recipe, UpgradeConfig
 
 
 def planner(count: int = 40, recipe: Recipe = THREE_UNITS, workers: int = 1) -> Planner:
-    records = [Record.untouched(index) for index in range(count)]
+    records = [PairRecord.untouched(index) for index in range(count)]
     return Planner(range(count), recipe, records, Budget(0.0, math.inf, lambda: 0.0), workers)
 
 
-def finished(plan: Plan, planner: Planner, inliers: int = 50) -> Finished:
-    """Every unit of a plan took a second and found some inliers."""
+def finished(job: Job, planner: Planner, inliers: int = 50) -> JobResult:
+    """Every unit of a job took a second and found some inliers."""
     outcomes = []
-    for index in plan.indices:
+    for index in job.indices:
         former = planner.records[index]
-        new = former.lacking(plan.units)
-        units = former.units + tuple(UnitRecord(u.name, u.stage, 100, inliers, 0.0, 1.0, plan.note) for u in new)
+        new = former.lacking(job.units)
+        units = former.units + tuple(UnitRecord(u.name, u.stage, 100, inliers, 0.0, 1.0, job.note) for u in new)
         results = tuple(UnitResult(unit, Matches.empty(), 0.0, 1.0) for unit in new)
-        outcomes.append(Outcome(Record(index, FALLBACK_FUNDAMENTAL, "", units), results))
-    return Finished(Job(plan, ()), tuple(outcomes))
+        outcomes.append(Outcome(PairRecord(index, FALLBACK_FUNDAMENTAL, "", units), results))
+    return JobResult(job, tuple(outcomes))
 
 
-def plans(planner: Planner) -> Iterator[Plan]:
-    """All plans of a run in which each job comes back before the next is planned."""
-    while (plan := planner.next(0.0)) is not None:
-        yield plan
-        if planner.records[plan.indices[0]].lacking(plan.units):
-            planner.take(finished(plan, planner), 0.0)
+def jobs_of(planner: Planner) -> Iterator[Job]:
+    """All jobs of a run in which each comes back before the next is planned."""
+    while (job := planner.next(0.0)) is not None:
+        yield job
+        if planner.records[job.indices[0]].lacking(job.units):
+            planner.take(finished(job, planner), 0.0)
 
 
 def test_the_passes_follow_each_other_and_every_pair_has_every_unit() -> None:
     one = planner()
-    phases = [plan.phase for plan in plans(one)]
+    phases = [job.phase for job in jobs_of(one)]
     assert phases == sorted(phases, key=list(Phase).index)
     assert one.complete
     assert all(not record.lacking(THREE_UNITS.units) for record in one.records)
@@ -61,24 +62,24 @@ def test_no_pair_is_in_two_jobs_at_a_time() -> None:
     one = planner(9, workers=4)
     first = one.next(0.0)
     out = [first]
-    while (plan := one.next(0.0)) is not None:
-        out.append(plan)
-    indices = [index for plan in out for index in plan.indices]  # type: ignore[union-attr]
+    while (job := one.next(0.0)) is not None:
+        out.append(job)
+    indices = [index for job in out for index in job.indices]  # type: ignore[union-attr]
     assert len(indices) == len(set(indices))
     assert len(out) == 4, "every worker tries a unit whose cost is unknown, on one pair"
 
 
 def test_a_lost_job_is_halved_taken_apart_shrunk_and_given_up() -> None:
     one = planner(9)
-    for plan in plans(one):
-        if plan.phase is Phase.DEEPEN and len(plan.indices) == 8:
+    for job in jobs_of(one):
+        if job.phase is Phase.DEEPEN and len(job.indices) == 8:
             break
     seen = []
-    one.lose(Lost(Job(plan, ()), Cause.DIED), 0.0)
+    one.lose(JobFailure(job, Cause.DIED), 0.0)
     while (again := one.next(0.0)) is not None and again.phase is Phase.DEEPEN:
         seen.append((again.indices, tuple(unit.name for unit in again.units), round(again.shrink, 2)))
         if 1 in again.indices:
-            one.lose(Lost(Job(again, ()), Cause.DIED), 0.0)
+            one.lose(JobFailure(again, Cause.DIED), 0.0)
         else:
             one.take(finished(again, one), 0.0)
     mine = [(units, shrink) for indices, units, shrink in seen if indices == (1,)]
@@ -93,12 +94,12 @@ def test_a_lost_job_is_halved_taken_apart_shrunk_and_given_up() -> None:
 def test_a_unit_that_workers_always_fail_at_is_given_up_on_all_pairs() -> None:
     one = planner(200)
     lost = 0
-    while (plan := one.next(0.0)) is not None:
-        if any(unit == SECOND for unit in plan.units) and one.records[plan.indices[0]].lacking([SECOND]):
+    while (job := one.next(0.0)) is not None:
+        if any(unit == SECOND for unit in job.units) and one.records[job.indices[0]].lacking([SECOND]):
             lost += 1
-            one.lose(Lost(Job(plan, ()), Cause.DIED), 0.0)
+            one.lose(JobFailure(job, Cause.DIED), 0.0)
         else:
-            one.take(finished(plan, one), 0.0)
+            one.take(finished(job, one), 0.0)
     assert lost < 40
     assert one.complete
     assert any(f"{SECOND.name} is given up: workers failed" in told.text for told in one.explanations)
@@ -106,59 +107,59 @@ def test_a_unit_that_workers_always_fail_at_is_given_up_on_all_pairs() -> None:
 
 def test_a_job_that_no_worker_began_is_planned_again_as_it_was() -> None:
     one = planner(9)
-    plan = one.next(0.0)
-    assert plan is not None
-    one.lose(Lost(Job(plan, ()), Cause.NO_WORKER), 0.0)
+    job = one.next(0.0)
+    assert job is not None
+    one.lose(JobFailure(job, Cause.NO_WORKER), 0.0)
     again = one.next(0.0)
     assert again is not None
-    assert (again.indices, again.units, again.shrink) == (plan.indices, plan.units, 1.0)
+    assert (again.indices, again.units, again.shrink) == (job.indices, job.units, 1.0)
 
 
 def test_what_a_jobs_deadline_cut_off_is_planned_again() -> None:
     one = planner(17)
     one.budget = Budget(0.0, 1000.0, lambda: 0.0)
     for _ in range(2):  # by then the unit is measured
-        one.take(finished(plan := one.next(0.0), one), 0.0)  # type: ignore[arg-type]
-    plan = one.next(0.0)
-    assert plan is not None
-    assert plan.deadline < one.budget.stop
-    whole = finished(plan, one)
-    nothing = Outcome(Record.untouched(plan.indices[-1]))
-    one.take(replace(whole, outcomes=(*whole.outcomes[:-1], nothing)), plan.deadline)
-    again = one.next(plan.deadline)
+        one.take(finished(job := one.next(0.0), one), 0.0)  # type: ignore[arg-type]
+    job = one.next(0.0)
+    assert job is not None
+    assert job.deadline < one.budget.stop
+    whole = finished(job, one)
+    nothing = Outcome(PairRecord.untouched(job.indices[-1]))
+    one.take(replace(whole, outcomes=(*whole.outcomes[:-1], nothing)), job.deadline)
+    again = one.next(job.deadline)
     assert again is not None
-    assert (again.phase, again.indices) == (plan.phase, plan.indices[-1:])
+    assert (again.phase, again.indices) == (job.phase, job.indices[-1:])
 
 
 def test_a_short_run_waits_less_for_a_silent_worker() -> None:
-    patience = Patience()
-    assert [patience.silence(limit) for limit in (20.0, 600.0, 32400.0)] == [5.0, 12.0, 60.0]
+    timeouts = Timeouts()
+    assert [timeouts.silence(limit) for limit in (20.0, 600.0, 32400.0)] == [5.0, 12.0, 60.0]
 
 
 def test_silence_is_borne_longer_while_one_job_after_the_other_hangs() -> None:
     one = planner(40)
     for _ in range(2):  # by then the unit is measured
-        one.take(finished(plan := one.next(0.0), one), 0.0)  # type: ignore[arg-type]
+        one.take(finished(job := one.next(0.0), one), 0.0)  # type: ignore[arg-type]
     waits = []
     for _ in range(5):
-        plan = one.next(0.0)
-        assert plan is not None
-        waits.append(plan.timeout)
-        one.lose(Lost(Job(plan, ()), Cause.HUNG), 0.0)
+        job = one.next(0.0)
+        assert job is not None
+        waits.append(job.timeout)
+        one.lose(JobFailure(job, Cause.HUNG), 0.0)
     assert [wait / waits[0] for wait in waits] == [1, 2, 4, 8, 8]
-    plan = one.next(0.0)
-    assert plan is not None
-    one.take(finished(plan, one), 0.0)
-    plan = one.next(0.0)
-    assert plan is not None
-    assert plan.timeout == waits[0]
+    job = one.next(0.0)
+    assert job is not None
+    one.take(finished(job, one), 0.0)
+    job = one.next(0.0)
+    assert job is not None
+    assert job.timeout == waits[0]
 
 
 def test_pairs_are_weak_for_few_inliers_a_low_share_or_an_uncertain_region() -> None:
-    def record(matches: int, inliers: int, reason: RegionReason = RegionReason.CROPPED) -> Record:
+    def record(matches: int, inliers: int, reason: RegionReason = RegionReason.CROPPED) -> PairRecord:
         region = CriticalRegion(Box(0, 0, 9, 9), reason)
         unit = UnitRecord(SWEEP.name, 1, matches, inliers, 0.0, 0.0, "")
-        return Record(0, FALLBACK_FUNDAMENTAL, "", (unit,), (region, region))
+        return PairRecord(0, FALLBACK_FUNDAMENTAL, "", (unit,), (region, region))
 
     config = UpgradeConfig(below_inliers=50, below_share=0.2)
     assert is_weak(record(100, 49), config)
@@ -171,8 +172,8 @@ def test_pairs_are_weak_for_few_inliers_a_low_share_or_an_uncertain_region() -> 
 def test_a_pairs_seconds_are_those_of_all_its_jobs() -> None:
     one = planner(1)
     jobs = 0
-    while (plan := one.next(0.0)) is not None:
-        done = finished(plan, one)
+    while (job := one.next(0.0)) is not None:
+        done = finished(job, one)
         jobs += 1
         timed = [
             replace(outcome, record=replace(outcome.record, cluster_seconds=1.0, estimate_seconds=2.0))
@@ -189,8 +190,8 @@ def test_extra_units_end_where_nothing_is_gained_and_a_resumed_run_decides_the_s
 ) -> None:
     recipe = Recipe((SWEEP, EXTRA), upgrade=UpgradeConfig(below_inliers=100))
     one = planner(300, recipe)
-    while (plan := one.next(0.0)) is not None:
-        one.take(finished(plan, one, 50 if plan.phase is Phase.SWEEP else gain), 0.0)
+    while (job := one.next(0.0)) is not None:
+        one.take(finished(job, one, 50 if job.phase is Phase.SWEEP else gain), 0.0)
     assert sum(record.has(EXTRA) for record in one.records) == upgraded
     assert one.complete
     again = Planner(range(300), recipe, list(one.records), one.budget)
@@ -243,12 +244,12 @@ def test_planning_a_job_does_not_take_longer_for_many_pairs() -> None:
 
 
 def test_extra_units_that_gained_nothing_in_a_round_stay_over() -> None:
-    rounds = Rounds(UpgradeConfig())
-    stretches = rounds.cut(range(100), (SWEEP, EXTRA))
-    third = next(stretch for stretch in stretches if stretch.round == 3)
+    rounds = UpgradeRounds(UpgradeConfig())
+    chunks = rounds.split(range(100), (SWEEP, EXTRA))
+    third = next(chunk for chunk in chunks if chunk.round == 3)
     judged = rounds.judged_before(third)
-    assert judged == [index for stretch in stretches if stretch.round == 1 for index in stretch.indices]
-    same = [replace(Record.untouched(index), before=0) for index in judged]
+    assert judged == [index for chunk in chunks if chunk.round == 1 for index in chunk.indices]
+    same = [replace(PairRecord.untouched(index), before=0) for index in judged]
     assert "went from 0 to 0 inliers" in rounds.judge(same)
     assert rounds.over
-    assert all(not rounds.judged_before(stretch) for stretch in stretches)
+    assert all(not rounds.judged_before(chunk) for chunk in chunks)

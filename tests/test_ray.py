@@ -67,7 +67,7 @@ def test_an_actor_that_is_lost_is_replaced(
     cluster: Any, pairs: list[Pair], undisturbed: RunReport, tmp_path: Path, fault: Any, told: str
 ) -> None:
     matcher = FaultyMatcher(fault=fault, once=tmp_path / "once")
-    report = run(pairs, THREE_UNITS, matcher, tmp_path / "w", workers=RayCluster(cluster.address), patience=QUICK)
+    report = run(pairs, THREE_UNITS, matcher, tmp_path / "w", workers=RayCluster(cluster.address), timeouts=QUICK)
     assert report.ending is Ending.COMPLETE
     assert [told in fault for fault in report.faults] == [True], report.faults
     assert matrices(report.records) == matrices(undisturbed.records)
@@ -102,17 +102,17 @@ def test_images_are_sent_to_machines_that_cannot_read_them(
 
 def test_an_image_is_read_here_only_if_it_is_the_same_file(tmp_path: Path) -> None:
     from mkpc_kaggle.data.images import Image, Unreadable
-    from mkpc_kaggle.engine.pools.ray_pool import Library, read_or_fetch
+    from mkpc_kaggle.engine.pools.ray_actor import FileServer, read_or_fetch
 
     pair, other = write_pairs(tmp_path, 2)
-    library, asked = Library(), []
+    server, asked = FileServer(), []
 
     def fetch(path: Path, stamp: tuple[int, int] | None) -> bytes | None:
-        asked.append(library.fetch(path, stamp))
+        asked.append(server.fetch(path, stamp))
         return asked[-1]
 
     def fetch_another(_: Path, stamp: tuple[int, int] | None) -> bytes | None:
-        return library.fetch(other.image0, stamp)
+        return server.fetch(other.image0, stamp)
 
     os.utime(other.image0, (1, 1))
     here = read_or_fetch(pair.image0, fetch)
@@ -128,7 +128,7 @@ def test_an_image_is_read_here_only_if_it_is_the_same_file(tmp_path: Path) -> No
 def test_weights_are_linked_where_they_are_and_sent_where_they_are_not(tmp_path: Path) -> None:
     from types import SimpleNamespace
 
-    from mkpc_kaggle.engine.pools.ray_pool import Library, local_store
+    from mkpc_kaggle.engine.pools.ray_actor import FileServer, local_store
     from mkpc_kaggle.weights import FoundFile, State
 
     def found(path: Path, content: bytes) -> FoundFile:
@@ -141,7 +141,7 @@ def test_weights_are_linked_where_they_are_and_sent_where_they_are_not(tmp_path:
     assembly: Any = SimpleNamespace(weight_files={"a": a, "b": b}, weights=SimpleNamespace(files=(a.file, b.file)))
     home = tmp_path / "home"
     home.mkdir()
-    store = local_store(assembly, home, lambda path, stamp: Library().fetch(tmp_path / path.name, stamp))
+    store = local_store(assembly, home, lambda path, stamp: FileServer().fetch(tmp_path / path.name, stamp))
     assert (home / "a.pth").is_symlink()
     assert not (home / "b.pth").is_symlink()
     assert [one.path.read_bytes() for one in map(store.find, ("a", "b")) if one] == [b"here", b"there"]
@@ -159,7 +159,7 @@ def node(name: str, alive: bool = True, **offer: float) -> dict[str, Any]:
     ],
 )
 def test_places_are_the_gpus_or_else_the_machines(device: str, expected: list[tuple[str, int, int, bool]]) -> None:
-    from mkpc_kaggle.engine.pools.ray_pool import places_of
+    from mkpc_kaggle.engine.pools.ray_pool import slots_of
 
     nodes = [
         node("cpus", CPU=6),
@@ -167,8 +167,8 @@ def test_places_are_the_gpus_or_else_the_machines(device: str, expected: list[tu
         node("gpus", CPU=8, GPU=2),
         node("head"),
     ]
-    places = places_of(nodes, device)
-    assert [(place.node, place.number, place.threads, place.gpu) for place in places] == expected
+    slots = slots_of(nodes, device)
+    assert [(slot.node, slot.number, slot.threads, slot.gpu) for slot in slots] == expected
 
 
 LOCAL = """
@@ -225,7 +225,7 @@ def test_a_cluster_of_its_own_ends_with_the_run(tmp_path: Path, number: signal.S
         text=True,
     )
     deadline = time.monotonic() + 60
-    while not any("RemoteBench" in line for line in processes_of(mark)) and time.monotonic() < deadline:
+    while not any("WorkerActor" in line for line in processes_of(mark)) and time.monotonic() < deadline:
         time.sleep(0.2)
     time.sleep(2.0)
     running.send_signal(number)

@@ -17,8 +17,9 @@ from rectified import SWEEP, THREE_UNITS, RectifiedMatcher, run, write_pairs
 
 from mkpc_kaggle.cli import main
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine.jobs import Outcome, Record, UnitRecord
+from mkpc_kaggle.engine.jobs import Outcome
 from mkpc_kaggle.engine.journal import DRAWN, About, EventKind, Journal, JournalReader
+from mkpc_kaggle.engine.records import PairRecord, UnitRecord
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.reporting.report import report_page, report_run
 from mkpc_kaggle.reporting.run_log import NOT_ENDED, RunLog, read_log
@@ -196,7 +197,7 @@ def test_the_page_tells_what_upgrades_changed_the_greatest_gain_first(tmp_path: 
     with closing(empty_journal(tmp_path / "work", pairs)) as journal:
         for index, (before, after) in enumerate([(20, 30), (50, 200), (40, 35)]):
             unit = UnitRecord(SWEEP.name, 1, 300, after, 0.0, 0.0, "")
-            journal.save([(Outcome(Record(index, np.eye(3), "", (unit,), before=before)), True)])
+            journal.save([(Outcome(PairRecord(index, np.eye(3), "", (unit,), before=before)), True)])
     text = report_page(read_log(tmp_path / "work"), Artist())
     assert "3 pairs went from 110 to 265 inliers: 2 have more, 0 have as many, 1 have fewer" in text
     rows = [
@@ -304,7 +305,7 @@ def test_a_strip_shows_both_images_at_one_height() -> None:
     from mkpc_kaggle.data.images import Image
     from mkpc_kaggle.geometry.matches import Matches
     from mkpc_kaggle.geometry.robust import Estimate, Model
-    from mkpc_kaggle.pipeline.stages import PairMatch, UnitResult
+    from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult
     from mkpc_kaggle.reporting import figures
 
     images = (

@@ -8,7 +8,7 @@ from shared import DATA, needs_data
 from mkpc_kaggle.cli import main
 from mkpc_kaggle.data.competition import Pair, Scene, TruePair, read_test_side, read_train_side, write_submission
 from mkpc_kaggle.demo import DemoSet
-from mkpc_kaggle.engine.jobs import Record
+from mkpc_kaggle.engine.records import PairRecord
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.evaluation.validate import score_record, score_submission, score_table
 from mkpc_kaggle.geometry.cameras import Camera, fundamental_of_cameras
@@ -68,8 +68,8 @@ def test_a_failed_pair_counts_as_failed_even_where_the_fallback_happens_to_be_ri
     camera0, camera1 = Camera(eye, eye, np.zeros(3)), Camera(eye, eye, np.array([1.0, 0, 0]))
     true = TruePair(Pair("p", "s", Path("a"), Path("b")), camera0, camera1, 0.5)
     scene = Scene("s", 1.0, (true,))
-    failed = score_record(true, Record(0, FALLBACK_FUNDAMENTAL.copy(), "too few matches"), scene)
-    right = score_record(true, Record(0, FALLBACK_FUNDAMENTAL.copy(), ""), scene)
+    failed = score_record(true, PairRecord(0, FALLBACK_FUNDAMENTAL.copy(), "too few matches"), scene)
+    right = score_record(true, PairRecord(0, FALLBACK_FUNDAMENTAL.copy(), ""), scene)
     assert failed.error.rotation == np.inf
     assert right.error.angle < 1e-6
 
@@ -131,7 +131,10 @@ def test_the_tables_of_real_scenes_agree_with_their_cameras() -> None:
         "scannet_samples": 15,
     }
     records = [
-        [Record(i, fundamental_of_cameras(true.camera0, true.camera1), "") for i, true in enumerate(scene.pairs)]
+        [
+            PairRecord(i, fundamental_of_cameras(true.camera0, true.camera1), "")
+            for i, true in enumerate(scene.pairs)
+        ]
         for scene in scenes
     ]
     for scene, found in zip(scenes, records, strict=True):

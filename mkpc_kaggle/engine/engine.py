@@ -3,20 +3,22 @@
 import sqlite3
 import sys
 import threading
+import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Protocol
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.budget import Budget
-from mkpc_kaggle.engine.jobs import Finished, Job, Lost, Outcome, Plan, Record, Task, visiting_order
+from mkpc_kaggle.engine.costs import Timeouts
+from mkpc_kaggle.engine.jobs import Job, JobFailure, JobResult, Outcome, visiting_order
 from mkpc_kaggle.engine.journal import EventKind
-from mkpc_kaggle.engine.patience import Patience
 from mkpc_kaggle.engine.planner import Explanation, Planner
 from mkpc_kaggle.engine.pools.pool import Pool
 from mkpc_kaggle.engine.progress import progress_on
-from mkpc_kaggle.pipeline.stages import UnitResult
+from mkpc_kaggle.engine.records import PairRecord
+from mkpc_kaggle.pipeline.pair import UnitResult
 from mkpc_kaggle.recipe import Recipe, Unit
 
 PUBLISH_SECONDS = 30.0
@@ -43,7 +45,7 @@ class RunReport:
     written, with their reasons; ``unwritten`` says why the last version of the submission could not be.
     """
 
-    records: tuple[Record, ...]
+    records: tuple[PairRecord, ...]
     ending: Ending
     seconds: float
     resumed: int
@@ -52,10 +54,10 @@ class RunReport:
     unwritten: str = ""
 
 
-class Diary(Protocol):
+class RunJournal(Protocol):
     """What the engine wants of a journal."""
 
-    def records(self) -> dict[int, Record]: ...
+    def records(self) -> dict[int, PairRecord]: ...
 
     def results(self, pair: int, units: Mapping[str, Unit]) -> tuple[UnitResult, ...]: ...
 
@@ -76,13 +78,13 @@ class Engine:
         pairs: Sequence[Pair],
         recipe: Recipe,
         pool: Pool,
-        journal: Diary,
+        journal: RunJournal,
         budget: Budget,
         *,
-        publish: Callable[[Sequence[Record]], None],
+        publish: Callable[[Sequence[PairRecord]], None],
         interrupt: threading.Event,
         progress: bool = True,
-        patience: Patience | None = None,
+        timeouts: Timeouts | None = None,
     ) -> None:
         self.pairs = pairs
         self.recipe = recipe
@@ -100,7 +102,7 @@ class Engine:
         self._wait_until = budget.end
         self._progress = progress_on(sys.stderr, budget) if progress else None
         self._publishing = threading.Lock()
-        self.planner = self._planner(patience)
+        self.planner = self._planner(timeouts)
 
     def run(self) -> RunReport:
         """Run until all is done, the time is up, or an interrupt; raises only what the pool's start raises."""
@@ -108,7 +110,9 @@ class Engine:
         resumed = sum(not record.lacking(self.recipe.regular) for record in records)
         self._publish()
         if any(self.planner.wanted(record) for record in records):
-            self.pool.start()
+            if message := self.pool.start():
+                warnings.warn(message, stacklevel=2)  # now, since the summary is hours away
+                self._fault(message)
             self._work()
             self._wait()
         if self._progress is not None:
@@ -130,21 +134,21 @@ class Engine:
         if self._publishing.acquire(timeout=seconds):
             self.publish(list(self.planner.records))
 
-    def _planner(self, patience: Patience | None) -> Planner:
-        records = [Record.untouched(index) for index in range(len(self.pairs))]
+    def _planner(self, timeouts: Timeouts | None) -> Planner:
+        records = [PairRecord.untouched(index) for index in range(len(self.pairs))]
         for index, record in self.journal.records().items():
             records[index] = record
-        return Planner(visiting_order(self.pairs), self.recipe, records, self.budget, patience=patience)
+        return Planner(visiting_order(self.pairs), self.recipe, records, self.budget, timeouts=timeouts)
 
     def _work(self) -> None:
         """Hand out what is planned as long as there is room, and gather what comes back."""
         while not self.interrupt.is_set() and self.budget.left() > 0:
             self.planner.workers = max(1, self.pool.workers)
             while self._out < self.pool.capacity:
-                plan = self.planner.next(self.budget.clock())
-                if plan is None:
+                job = self.planner.next(self.budget.clock())
+                if job is None:
                     break
-                self._hand_out(plan)
+                self._submit(job)
             if self._out == 0:
                 return
             while not self._gather() and not self.interrupt.is_set() and self.budget.left() > 0:
@@ -158,11 +162,10 @@ class Engine:
                 self._wait_until = min(self._wait_until, self.budget.clock() + GRACE_SECONDS)
             self._gather()
 
-    def _hand_out(self, plan: Plan) -> None:
+    def _submit(self, job: Job) -> None:
         self._out += 1
-        self.pool.submit(
-            Job(plan, tuple(Task(index, self.pairs[index], self._results(index)) for index in plan.indices))
-        )
+        pairs = tuple(self.pairs[index] for index in job.indices)
+        self.pool.submit(replace(job, pairs=pairs, known=tuple(map(self._results, job.indices))))
 
     def _results(self, index: int) -> tuple[UnitResult, ...]:
         """What earlier jobs found on a pair."""
@@ -183,7 +186,7 @@ class Engine:
             return False
         self._out -= 1
         now = self.budget.clock()
-        if isinstance(back, Lost):
+        if isinstance(back, JobFailure):
             self._fault(f"a job was lost: {back}")
             self._keep(self.planner.lose(back, now))
         else:
@@ -217,11 +220,11 @@ class Engine:
         for outcome in outcomes:
             self._unjournalled.pop(outcome.record.index, None)
 
-    def _note_job(self, back: Finished) -> None:
-        plan = back.job.plan
+    def _note_job(self, back: JobResult) -> None:
+        job = back.job
         seconds = sum(seconds for _, seconds in back.measured())
-        self._note(EventKind.BUDGET, plan.phase)
-        self._note(EventKind.JOB, f"{plan.phase} {len(plan.indices)} pairs {seconds:.3f} s")
+        self._note(EventKind.BUDGET, job.phase)
+        self._note(EventKind.JOB, f"{job.phase} {len(job.indices)} pairs {seconds:.3f} s")
 
     def _note_explanations(self) -> None:
         for one in self.planner.explanations[self._explained :]:

@@ -21,12 +21,13 @@ from typing import Any, Self
 import numpy as np
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine.jobs import Outcome, Record, UnitRecord
+from mkpc_kaggle.engine.jobs import Outcome
+from mkpc_kaggle.engine.records import PairRecord, UnitRecord
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Box
 from mkpc_kaggle.geometry.critical_region import CriticalRegion, RegionReason
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.pipeline.stages import UnitResult
+from mkpc_kaggle.pipeline.pair import UnitResult
 from mkpc_kaggle.recipe import Unit
 
 FORMAT = 2
@@ -100,7 +101,7 @@ class _Tables:
         self.path = path
         self._db = db
 
-    def records(self) -> dict[int, Record]:
+    def records(self) -> dict[int, PairRecord]:
         """All records by pair index."""
         units: dict[int, list[UnitRecord]] = {}
         columns = "pair, unit, stage, matches, inliers, encode_seconds, match_seconds, failure"
@@ -115,7 +116,7 @@ class _Tables:
             regions.setdefault(pair, []).append(region)
         columns = "pair, fundamental, failure, decode_seconds, cluster_seconds, estimate_seconds, before"
         return {
-            pair: Record(
+            pair: PairRecord(
                 pair,
                 np.frombuffer(F, np.float64).reshape(3, 3),
                 failure,

@@ -3,29 +3,19 @@
 It looks at a job's worth of pairs at a time, so that a hundred thousand pairs cost no more to plan than ten.
 """
 
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from itertools import chain
 
-from mkpc_kaggle.engine.budget import Budget, Costs, format_duration, needs
-from mkpc_kaggle.engine.jobs import (
-    Cause,
-    Finished,
-    Lost,
-    Outcome,
-    Phase,
-    Plan,
-    Record,
-    Stretch,
-    UnitRecord,
-    chunks,
-)
-from mkpc_kaggle.engine.losses import Losses
-from mkpc_kaggle.engine.patience import Patience
-from mkpc_kaggle.engine.upgrade import Rounds, inliers_before, is_weak
+from mkpc_kaggle.engine.budget import Budget, format_duration
+from mkpc_kaggle.engine.chunk_queue import ChunkQueue
+from mkpc_kaggle.engine.costs import Costs, Timeouts, needs
+from mkpc_kaggle.engine.jobs import Cause, Chunk, Job, JobFailure, JobResult, Outcome, Phase, split
+from mkpc_kaggle.engine.records import PairRecord, UnitRecord
+from mkpc_kaggle.engine.retries import Retries
+from mkpc_kaggle.engine.upgrade import UpgradeRounds, is_weak
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.pipeline.stages import UnitResult
+from mkpc_kaggle.pipeline.pair import UnitResult
 from mkpc_kaggle.recipe import Recipe, Unit
 
 EXPLORE_SHARE = 0.25
@@ -34,7 +24,6 @@ JOB_SHARE = 0.05
 """The share of the time left that a job may be expected to take: what a job found late comes too late."""
 DEADLINE_SHARE = 0.5
 """The share of the time left after which a job begins no unit: where all is slower of a sudden, that is learnt."""
-
 MOST_DOUBLINGS = 3
 """Of the silence that a job is allowed, while one job after the other hangs."""
 
@@ -50,6 +39,29 @@ class Explanation:
         return f"{format_duration(self.seconds):>7}  {self.text}"
 
 
+def pairs_that_fit(pairs: int, seconds: float, left: float) -> int:
+    """How many pairs of ``seconds`` each a job may have, with ``left`` seconds to go; at least one."""
+    return pairs if pairs * seconds <= JOB_SHARE * left else max(1, int(JOB_SHARE * left / seconds))
+
+
+def units_that_fit(needed: Iterable[float], left: float) -> tuple[int, float]:
+    """How many units all pairs can have in ``left`` seconds, and the seconds that one more would take.
+
+    ``needed`` are the seconds for the first unit, the first two, and so on, see :func:`needs`.
+    """
+    count = 0
+    for seconds in needed:
+        if seconds > left:
+            return count, seconds
+        count += 1
+    return count, 0.0
+
+
+def unique_lacking(records: Iterable[PairRecord], units: Sequence[Unit]) -> list[Unit]:
+    """Each of the units that some pair has not had, once."""
+    return list(dict.fromkeys(unit for record in records for unit in record.lacking(units)))
+
+
 class Planner:
     """Sweep, deepen, upgrade, over the pairs of ``order``.
 
@@ -61,33 +73,29 @@ class Planner:
         self,
         order: Sequence[int],
         recipe: Recipe,
-        records: list[Record],
+        records: list[PairRecord],
         budget: Budget,
         workers: int = 1,
-        patience: Patience | None = None,
+        timeouts: Timeouts | None = None,
     ) -> None:
         self.recipe = recipe
         self.records = records
         self.budget = budget
         self.workers = workers
-        self.patience = patience or Patience()
+        self.timeouts = timeouts or Timeouts()
         self.costs = Costs()
         self.explanations: list[Explanation] = []
-        self.phase = Phase.SWEEP
         self._order = order
         self._phases = iter((self._sweep, self._deepen, self._upgrade))
-        self._queue: deque[Stretch] = deque()
-        self._again: deque[Stretch] = deque()
-        self._flying: set[int] = set()
-        self._jobs_out = self._exploring = 0
+        self._queue = ChunkQueue()
+        self._rounds = UpgradeRounds(recipe.upgrade)
+        self._retries = Retries()
+        self._left_alone: set[int] = set()
+        self._exploring = 0
         self._allowance = 0.0
-        self._last_event = budget.clock()
-        self._pairs_of_phase = self._pairs_queued = 0
-        self._fitting = -1
-        self._rounds = Rounds(recipe.upgrade)
-        self._losses = Losses()
-        self._aside: set[int] = set()
         self._hung_in_a_row = 0
+        self._last_event = budget.clock()
+        self._fitting = -1
         self._lacking: Counter[str] = Counter()
         for record in records:
             if record.units:
@@ -95,85 +103,79 @@ class Planner:
 
     # What to do next
 
-    def next(self, now: float) -> Plan | None:
-        """The next plan; ``None`` where there is nothing to do, or nothing before a job comes back."""
+    def next(self, now: float) -> Job | None:
+        """The next job, without its pairs; ``None`` where there is nothing to do before another comes back."""
         if now >= self.budget.stop:
             return None
-        while (stretch := self._turn(now)) is not None:
-            units = self._units(stretch, now)
-            todo = [index for index in stretch.indices if self._can_gain(index, units)]
-            lacking = list(dict.fromkeys(unit for index in todo for unit in self.records[index].lacking(units)))
+        while (chunk := self._next_chunk(now)) is not None:
+            units = self._units(chunk, now)
+            todo = [index for index in chunk.indices if self._can_gain(index, units)]
+            lacking = unique_lacking((self.records[index] for index in todo), units)
             unknown = not all(self.costs.known(unit.name) for unit in lacking)
-            if unknown and (self._exploring >= self.workers or self._jobs_out > self.workers):
+            if unknown and (self._exploring >= self.workers or self._queue.jobs > self.workers):
                 # What has no known cost cannot be planned: one try a worker, not long behind another job.
-                self._again.appendleft(stretch)
+                self._queue.put_first(chunk)
                 return None
             if todo:
-                return self._plan(stretch, todo, units, lacking, now, unknown=unknown)
+                return self._job(chunk, todo, units, lacking, now, unknown=unknown)
         return None
 
-    def _turn(self, now: float) -> Stretch | None:
-        """Take the next stretch out whose pairs are all back."""
-        for stretch in self._again:
-            if self._flying.isdisjoint(stretch.indices):
-                self._again.remove(stretch)
-                return stretch
-        while not self._queue:
+    def _next_chunk(self, now: float) -> Chunk | None:
+        if (chunk := self._queue.pop_retry()) is not None:
+            return chunk
+        while self._queue.is_empty:
             if not self._open_phase(now):
                 return None
-        if not self._flying.isdisjoint(self._queue[0].indices) or not self._round_may_begin(self._queue[0], now):
+        first = self._queue.peek()
+        if first is None or not self._round_may_begin(first, now):
             return None
-        stretch = self._queue.popleft()
-        self._pairs_queued -= len(stretch.indices)
-        return stretch
+        return self._queue.pop()
 
-    def _plan(
+    def _job(
         self,
-        stretch: Stretch,
+        chunk: Chunk,
         todo: list[int],
         units: tuple[Unit, ...],
         lacking: Sequence[Unit],
         now: float,
         *,
         unknown: bool,
-    ) -> Plan:
-        """A plan for the first of the pairs; the others go back to the front of the queue.
+    ) -> Job:
+        """A job for the first of the pairs; the others go back to the front of the queue.
 
         It is one pair where some unit's cost is unknown and cannot be planned, and few where it gets late; in
         the end the first of its units, since what one job does comes back, or is lost, at once.
         """
         left = self.budget.stop - now
         seconds = self.costs.overhead + sum(self.costs.of(unit.name) for unit in lacking)
-        most = len(todo) if len(todo) * seconds <= JOB_SHARE * left else max(1, int(JOB_SHARE * left / seconds))
-        most = 1 if unknown else most
+        most = 1 if unknown else pairs_that_fit(len(todo), seconds, left)
         if todo[most:]:
-            self._again.appendleft(replace(stretch, indices=tuple(todo[most:])))
-        todo = todo[:most]
+            self._queue.put_first(replace(chunk, indices=tuple(todo[most:])))
+        indices = tuple(todo[:most])
         if not unknown and len(lacking) > 1 and seconds > JOB_SHARE * left:
             first, *rest = sorted(lacking, key=lambda unit: unit.stage)
-            self._again.appendleft(replace(stretch, indices=tuple(todo), units=tuple(rest)))
+            self._queue.put_first(replace(chunk, indices=indices, units=tuple(rest)))
             units = lacking = (first,)
-        self._flying.update(todo)
-        self._jobs_out += 1
+        self._queue.begin(indices)
         self._exploring += unknown
         self._allowance = EXPLORE_SHARE * left
-        if self._jobs_out == 1:
+        if self._queue.jobs == 1:
             self._last_event = now
-        return Plan(
-            stretch.phase,
-            tuple(todo),
+        return Job(
+            chunk.phase,
+            indices,
             units,
             tuple(self.costs.most(unit.name) for unit in units),
-            now + self._allowance if unknown else self._deadline(lacking, len(todo), now),
-            self._timeout(lacking, len(todo), unknown=unknown),
-            stretch.shrink,
+            now + self._allowance if unknown else self._deadline(lacking, len(indices), now),
+            self._timeout(lacking, len(indices), unknown=unknown),
+            chunk.shrink,
             unknown,
         )
 
     def _timeout(self, lacking: Sequence[Unit], pairs: int, *, unknown: bool) -> float:
         """Twice as long after each job that hung with none ended since: it may be the machine that is slow."""
         allowance = self._allowance if unknown else None
-        timeout = self.patience.timeout(lacking, pairs, self.costs, self.budget.limit, allowance)
+        timeout = self.timeouts.of_job(lacking, pairs, self.costs, self.budget.limit, allowance)
         return timeout * (1 << min(self._hung_in_a_row, MOST_DOUBLINGS))
 
     def _deadline(self, lacking: Iterable[Unit], pairs: int, now: float) -> float:
@@ -182,73 +184,67 @@ class Planner:
         return min(self.budget.stop, now + max(DEADLINE_SHARE * (self.budget.stop - now), 2 * seconds))
 
     def _can_gain(self, index: int, units: Iterable[Unit]) -> bool:
-        return index not in self._aside and bool(self.records[index].lacking(units))
+        return index not in self._left_alone and bool(self.records[index].lacking(units))
 
-    def _units(self, stretch: Stretch, now: float) -> tuple[Unit, ...]:
-        """The units for a stretch whose turn has come."""
-        if stretch.units is None:
-            regular = self._possible(self.recipe.regular)
+    def _units(self, chunk: Chunk, now: float) -> tuple[Unit, ...]:
+        """The units for a chunk whose turn has come."""
+        if chunk.units is None:
+            regular = self._usable(self.recipe.regular)
             units = regular[: self._fit(regular, now)]
         else:
-            units = self._possible(stretch.units)
-        if stretch.phase is Phase.SWEEP:
+            units = self._usable(chunk.units)
+        if chunk.phase is Phase.SWEEP:
             return units[:1]
         return tuple(unit for unit in units if self.costs.most(unit.name) < self.budget.stop - now)
 
-    def _possible(self, units: Iterable[Unit]) -> tuple[Unit, ...]:
-        return tuple(unit for unit in units if unit.name not in self._losses.hopeless)
+    def _usable(self, units: Iterable[Unit]) -> tuple[Unit, ...]:
+        return tuple(unit for unit in units if unit.name not in self._retries.unusable)
 
     def _fit(self, units: tuple[Unit, ...], now: float) -> int:
         """How many units all pairs can have in the time left; a change is explained."""
         left = (self.budget.stop - now) * self.workers
-        count, short = len(units), 0.0
-        for number, needed in enumerate(needs(units, self._lacking, self.costs)):
-            if needed > left:
-                count, short = number, needed
-                break
-        if count != self._fitting:
-            if count < len(units):
-                self._explain(
-                    now,
-                    f"{count} of {len(units)} units fit: up to {units[count].name} all pairs would need "
-                    f"{format_duration(short / self.workers)}, {format_duration(left / self.workers)} are left",
-                )
-            elif self._fitting >= 0:
-                self._explain(now, f"all {count} units fit again")
-            self._fitting = count
+        count, short = units_that_fit(needs(units, self._lacking, self.costs), left)
+        if count == self._fitting:
+            return count
+        if count < len(units):
+            self._explain(
+                now,
+                f"{count} of {len(units)} units fit: up to {units[count].name} all pairs would need "
+                f"{format_duration(short / self.workers)}, {format_duration(left / self.workers)} are left",
+            )
+        elif self._fitting >= 0:
+            self._explain(now, f"all {count} units fit again")
+        self._fitting = count
         return count
 
-    # The passes
+    # The phases
 
     def _open_phase(self, now: float) -> bool:
-        """Queue the next pass; false where it has to wait for jobs that are out, or there is none."""
-        if self.phase is not Phase.SWEEP and (self._flying or self._again):
-            return False  # who is weakest is known when all pairs are back
+        """Begin the next phase; false where it has to wait for jobs under way, or there is none."""
+        if self._queue.phase is not Phase.SWEEP and not self._queue.is_idle:
+            return False  # which pairs are weakest is known when all are back
         opened = next(self._phases, None)
         if opened is None:
             return False
-        self._queue.extend(opened(now))
-        self._pairs_of_phase = self._pairs_queued = sum(len(stretch.indices) for stretch in self._queue)
+        self._queue.open(*opened(now))
         return True
 
-    def _sweep(self, _: float) -> list[Stretch]:
+    def _sweep(self, _: float) -> tuple[Phase, list[Chunk]]:
         """The first unit on all pairs: an F for every pair, early."""
         first = tuple(unit for unit in self.recipe.regular if unit.stage == 1)
-        return [Stretch(Phase.SWEEP, indices, first) for indices in chunks(self._order)]
+        return Phase.SWEEP, [Chunk(Phase.SWEEP, indices, first) for indices in split(self._order)]
 
-    def _deepen(self, now: float) -> list[Stretch]:
+    def _deepen(self, now: float) -> tuple[Phase, list[Chunk]]:
         """The other units, chunk by chunk: as many as let all remaining pairs have them."""
-        self.phase = Phase.DEEPEN
         self._explain(now, "the sweep is over; deepening begins")
-        return [Stretch(Phase.DEEPEN, indices) for indices in chunks(self._order)]
+        return Phase.DEEPEN, [Chunk(Phase.DEEPEN, indices) for indices in split(self._order)]
 
-    def _upgrade(self, now: float) -> list[Stretch]:
+    def _upgrade(self, now: float) -> tuple[Phase, list[Chunk]]:
         """What was left out, the weakest pairs first, and for weak ones the extra units."""
-        self.phase = Phase.UPGRADE
         extras = [unit for unit in self.recipe.units if unit.extra]
-        touched = [record for record in self.records if record.units and record.index not in self._aside]
+        touched = [record for record in self.records if record.units and record.index not in self._left_alone]
         # By what they had before they were upgraded, so that a run that goes on decides as it did before.
-        touched.sort(key=lambda record: (inliers_before(record), record.index))
+        touched.sort(key=lambda record: (record.inliers_before, record.index))
         weak = [
             one for one in touched if is_weak(one, self.recipe.upgrade) or len(one.lacking(extras)) < len(extras)
         ]
@@ -256,52 +252,49 @@ class Planner:
         others = [one for one in touched if one.index not in chosen and one.lacking(self.recipe.regular)]
         self._explain(now, f"upgrading begins: {len(weak)} weak pairs, {len(others)} others lack units")
         regular = self.recipe.regular
-        return self._rounds.cut((one.index for one in weak), self.recipe.units) + [
-            Stretch(Phase.UPGRADE, indices, regular) for indices in chunks(one.index for one in others)
+        return Phase.UPGRADE, self._rounds.split((one.index for one in weak), self.recipe.units) + [
+            Chunk(Phase.UPGRADE, indices, regular) for indices in split(one.index for one in others)
         ]
 
-    def _round_may_begin(self, stretch: Stretch, now: float) -> bool:
+    def _round_may_begin(self, chunk: Chunk, now: float) -> bool:
         """Whether the pairs that decide it are back; if they gained nothing, the extra units end."""
-        judged = self._rounds.judged_before(stretch)
+        judged = self._rounds.judged_before(chunk)
         if not judged:
             return True
-        again = chain.from_iterable(one.indices for one in self._again)
-        if not self._flying.isdisjoint(judged) or not set(judged).isdisjoint(again):
-            return self._jobs_out < self.workers  # a worker that hangs does not keep the others waiting
+        if not self._queue.are_back(judged):
+            return self._queue.jobs < self.workers  # a worker that hangs does not keep the others waiting
         if reason := self._rounds.judge([self.records[index] for index in judged]):
             self._explain(now, reason)
-            regular = self.recipe.regular
-            self._queue = deque(replace(one, units=regular, round=0) for one in self._queue)
+            self._queue.limit_units(self.recipe.regular)
         return True
 
     # What came of it
 
-    def take(self, finished: Finished, now: float) -> list[Outcome]:
+    def take(self, result: JobResult, now: float) -> list[Outcome]:
         """Take note of a finished job; what it brought, to be kept."""
-        plan = finished.job.plan
-        measured = finished.measured()
-        self._measure(plan, measured, now, len(finished.outcomes))
-        self._back(plan)
+        job = result.job
+        self._measure(job, result.measured(), now, len(result.outcomes))
+        self._end(job)
         self._hung_in_a_row = 0
-        if plan.exploring and now >= plan.deadline:
-            for unit in plan.units:
+        if job.exploring and now >= job.deadline:
+            for unit in job.units:
                 self.costs.suppose(unit.name, self._allowance)
-        kept = [kept for outcome in finished.outcomes if (kept := self._merge(outcome, plan.phase, now))]
-        self._go_on(plan, now)
+        kept = [kept for outcome in result.outcomes if (kept := self._merge(outcome, job.phase, now))]
+        self._go_on(job, now)
         return kept
 
-    def _go_on(self, plan: Plan, now: float) -> None:
+    def _go_on(self, job: Job, now: float) -> None:
         """What a job's own deadline cut off is planned anew."""
-        cut = now + max(plan.expected) >= plan.deadline
-        rest = tuple(index for index in plan.indices if self._can_gain(index, plan.units))
-        if cut and rest and not plan.exploring and plan.deadline < self.budget.stop:
-            self._again.append(Stretch(plan.phase, rest, plan.units, plan.shrink))
+        cut = now + max(job.expected) >= job.deadline
+        rest = tuple(index for index in job.indices if self._can_gain(index, job.units))
+        if cut and rest and not job.exploring and job.deadline < self.budget.stop:
+            self._queue.retry([Chunk(job.phase, rest, job.units, job.shrink)])
 
-    def _measure(self, plan: Plan, measured: list[tuple[str, float]], now: float, pairs: int) -> None:
-        if measured and plan.shrink == 1:
+    def _measure(self, job: Job, measured: list[tuple[str, float]], now: float, pairs: int) -> None:
+        if measured and job.shrink == 1:
             for unit, seconds in measured:
                 self.costs.observe(unit, seconds)
-            elapsed = (now - self._last_event) * min(self.workers, self._jobs_out)
+            elapsed = (now - self._last_event) * min(self.workers, self._queue.jobs)
             self.costs.observe_overhead((elapsed - sum(seconds for _, seconds in measured)) / pairs)
         self._last_event = now
 
@@ -309,17 +302,17 @@ class Planner:
         """The outcome to keep, if the job brought anything: a unit more, or the reason why there can be none."""
         record, former = outcome.record, self.records[outcome.record.index]
         if not outcome.results and record.failure and record.reached:
-            self._aside.add(record.index)
+            self._left_alone.add(record.index)
             if former.units:
                 self._explain(now, f"pair {record.index} keeps the F it has: {record.failure}")
         if len(record.units) <= len(former.units) and (former.reached or not record.reached):
             return None
-        self._losses.prove(result.unit for result in outcome.results)
-        record = record.after(former, inliers_before(former) if phase is Phase.UPGRADE else former.before)
+        self._retries.prove(result.unit for result in outcome.results)
+        record = record.after(former, former.inliers_before if phase is Phase.UPGRADE else former.before)
         self._put(record)
         return Outcome(record, outcome.results)
 
-    def _put(self, record: Record) -> None:
+    def _put(self, record: PairRecord) -> None:
         former = self.records[record.index]
         had = {unit.name for unit in former.lacking(self.recipe.regular)} if former.units else set()
         lacks = {unit.name for unit in record.lacking(self.recipe.regular)} if record.units else set()
@@ -327,52 +320,59 @@ class Planner:
         self._lacking.update(lacks - had)
         self.records[record.index] = record
 
-    def _back(self, plan: Plan) -> None:
-        self._flying.difference_update(plan.indices)
-        self._jobs_out -= 1
-        self._exploring -= plan.exploring
+    def _end(self, job: Job) -> None:
+        self._queue.end(job.indices)
+        self._exploring -= job.exploring
 
-    def lose(self, lost: Lost, now: float) -> list[Outcome]:
-        """Take note of a lost job, plan anew what may still come of it; what to keep."""
-        self._back(lost.job.plan)
-        self._hung_in_a_row += lost.cause is Cause.HUNG
+    def lose(self, failure: JobFailure, now: float) -> list[Outcome]:
+        """Take note of a failed job, plan anew what may still come of it; what to keep."""
+        job = failure.job
+        self._end(job)
+        self._hung_in_a_row += failure.cause is Cause.HUNG
         self._last_event = now
-        verdict = self._losses.judge(lost, self.records, self.recipe.units)
-        self._again.extend(verdict.again)
-        for reason in verdict.reasons:
+        retry = self._retries.after(failure, self.records, self.recipe.units)
+        self._queue.retry(retry.chunks)
+        for reason in retry.reasons:
             self._explain(now, reason)
-        return [self._give_up(lost.job.plan.indices[0], verdict.given_up, lost)] if verdict.given_up else []
+        if retry.leave_pair:
+            self._leave_alone(job.indices[0], failure)
+        return [self._give_up(job.indices[0], retry.give_up, failure)] if retry.give_up else []
 
-    def _give_up(self, index: int, units: Sequence[Unit], lost: Lost) -> Outcome:
+    def _leave_alone(self, index: int, failure: JobFailure) -> None:
+        """The pair keeps the F that it has, and gets nothing more in this run; a later one tries again."""
+        self._left_alone.add(index)
+        if not self.records[index].reached:
+            self._put(PairRecord.untouched(index, f"left alone: {failure}"))
+
+    def _give_up(self, index: int, units: Sequence[Unit], failure: JobFailure) -> Outcome:
         """The pair keeps the F that it has; the units are marked as had, with the reason."""
-        record, reason = self.records[index], f"given up: {lost}"
+        record, reason = self.records[index], f"given up: {failure}"
         empty = tuple(UnitRecord(unit.name, unit.stage, 0, 0, 0.0, 0.0, reason) for unit in units)
-        failure = record.failure if record.reached else reason
-        self._put(replace(record, units=record.units + empty, failure=failure))
+        message = record.failure if record.reached else reason
+        self._put(replace(record, units=record.units + empty, failure=message))
         return Outcome(
             self.records[index], tuple(UnitResult(unit, Matches.empty(), failure=reason) for unit in units)
         )
 
     # What is left
 
-    def wanted(self, record: Record) -> list[Unit]:
+    def wanted(self, record: PairRecord) -> list[Unit]:
         """The units that a pair shall have if there is time: the extra ones only where it is weak."""
         extras = not self._rounds.over and is_weak(record, self.recipe.upgrade)
-        return record.lacking(self._possible(self.recipe.units if extras else self.recipe.regular))
+        return record.lacking(self._usable(self.recipe.units if extras else self.recipe.regular))
 
     @property
     def complete(self) -> bool:
         """Whether every pair has been reached and nothing is wanted for those that can be worked on."""
         return all(
-            record.reached and not (record.units and record.index not in self._aside and self.wanted(record))
+            record.reached and not (record.units and record.index not in self._left_alone and self.wanted(record))
             for record in self.records
         )
 
     @property
     def progress(self) -> tuple[Phase, int, int]:
-        """The present pass, how many of its pairs are behind, and how many there are."""
-        ahead = self._pairs_queued + len(self._flying) + sum(len(stretch.indices) for stretch in self._again)
-        return self.phase, max(0, self._pairs_of_phase - ahead), self._pairs_of_phase
+        """The present phase, how many of its pairs are done, and how many it has."""
+        return self._queue.progress
 
     def _explain(self, now: float, text: str) -> None:
         self.explanations.append(Explanation(now - self.budget.started, text))

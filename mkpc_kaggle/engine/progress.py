@@ -14,7 +14,7 @@ LINE_SECONDS = 30.0
 
 
 class Progress(Protocol):
-    """Told after every job how many pairs of the present pass are done."""
+    """Updated after every job how many pairs of the present pass are done."""
 
     def show(self, phase: Phase, done: int, total: int) -> None: ...
 

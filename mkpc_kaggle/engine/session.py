@@ -9,7 +9,8 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from importlib import metadata
 from math import isfinite
 from pathlib import Path
@@ -21,15 +22,16 @@ import numpy as np
 from mkpc_kaggle import __version__
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.budget import Budget
+from mkpc_kaggle.engine.costs import Timeouts
 from mkpc_kaggle.engine.engine import Engine, RunReport
-from mkpc_kaggle.engine.jobs import Record
 from mkpc_kaggle.engine.journal import About, EventKind, Journal
-from mkpc_kaggle.engine.patience import Patience
 from mkpc_kaggle.engine.pools.cluster import RayCluster
-from mkpc_kaggle.engine.pools.in_process import InProcessPool
-from mkpc_kaggle.engine.pools.pool import Pool
-from mkpc_kaggle.engine.pools.processes import ProcessPool, Seat
+from mkpc_kaggle.engine.pools.local import LocalWorker
+from mkpc_kaggle.engine.pools.pool import Place, Pool
+from mkpc_kaggle.engine.pools.process import ProcessWorker
+from mkpc_kaggle.engine.records import PairRecord
 from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.matchers.contract import Placement
 from mkpc_kaggle.pipeline.assembly import Assembly
 
 REPORT_SECONDS = 2.0
@@ -57,7 +59,7 @@ class Session:
     progress: bool = True
     workers: int | RayCluster | None = 0
     guarded: bool = False
-    patience: Patience | None = None
+    timeouts: Timeouts | None = None
 
     def must_end(self) -> float:
         """When the program must have ended, by the monotonic clock: with its budget, or soon after a signal."""
@@ -70,7 +72,7 @@ def run_pairs(
     pairs: Sequence[Pair],
     assembly: Assembly,
     session: Session,
-    publish: Callable[[Sequence[Record]], None] = lambda _: None,
+    publish: Callable[[Sequence[PairRecord]], None] = lambda _: None,
 ) -> tuple[RunReport, bool]:
     """Run the recipe on all pairs; the report, and whether every thread has come to rest.
 
@@ -91,7 +93,7 @@ def run_pairs(
         publish=publish,
         interrupt=session.interrupt,
         progress=session.progress,
-        patience=session.patience or Patience(batch=assembly.batch),
+        timeouts=session.timeouts or Timeouts(batch=assembly.batch),
     )
     with watched(engine, session):
         try:
@@ -131,14 +133,19 @@ def pool_of(assembly: Assembly, workers: int | RayCluster | None) -> Pool:
     if isinstance(workers, RayCluster):
         return _ray_pool(assembly, workers)
     if workers == 0:
-        return InProcessPool(assembly.pipeline, assembly.recipe)
+        return Pool([Place("this process", partial(LocalWorker, assembly.pipeline))], assembly.recipe)
     # On a CPU one process with all threads: two with half of them each do more (recipe light, two cores: the sweep
     # over after 22 s instead of 31), but need twice the memory, and a network's last bits change with its threads.
     devices = assembly.devices
-    places = [devices[number % len(devices)] for number in range(workers or len(devices))]
-    share = len(places) if devices == ("cpu",) else 1
-    seats = [Seat(f"{place} {number}", assembly.on(place).pipeline, share) for number, place in enumerate(places)]
-    return ProcessPool(seats, assembly.recipe)
+    used = [devices[number % len(devices)] for number in range(workers or len(devices))]
+    share = len(used) if devices == ("cpu",) else 1
+    places = [_process_place(f"{name} {number}", assembly.on(name), share) for number, name in enumerate(used)]
+    on_cpu = replace(assembly, placement=Placement())
+    return Pool(places, assembly.recipe, None if devices == ("cpu",) else _process_place("CPU", on_cpu))
+
+
+def _process_place(name: str, assembly: Assembly, share: int = 1) -> Place:
+    return Place(name, partial(ProcessWorker, name, assembly.pipeline, share))
 
 
 def _ray_pool(assembly: Assembly, cluster: RayCluster) -> Pool:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from mkpc_kaggle.data.competition import Pair, write_submission
 from mkpc_kaggle.engine.engine import RunReport
-from mkpc_kaggle.engine.jobs import Record
+from mkpc_kaggle.engine.records import PairRecord
 from mkpc_kaggle.engine.session import Session, run_pairs
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.pipeline.assembly import Assembly
@@ -18,7 +18,7 @@ def submit(pairs: Sequence[Pair], assembly: Assembly, session: Session, output: 
     :class:`mkpc_kaggle.errors.UserError` where ``output`` cannot be written, before any work.
     """
 
-    def publish(records: Sequence[Record]) -> None:
+    def publish(records: Sequence[PairRecord]) -> None:
         write_submission(output, {pair.id: record.F for pair, record in zip(pairs, records, strict=True)})
 
     require_writable(output)

@@ -2,14 +2,15 @@
 
 from collections.abc import Iterable, Sequence
 
-from mkpc_kaggle.engine.jobs import Phase, Record, Stretch, chunks
+from mkpc_kaggle.engine.jobs import Chunk, Phase, split
+from mkpc_kaggle.engine.records import PairRecord
 from mkpc_kaggle.recipe import Unit, UpgradeConfig
 
-ROUND = 4
+ROUND_JOBS = 4
 """Jobs of an upgrade whose gain is looked at together."""
 
 
-def is_weak(record: Record, config: UpgradeConfig) -> bool:
+def is_weak(record: PairRecord, config: UpgradeConfig) -> bool:
     """Whether more work may help: few inliers, a low share of them, or an uncertain critical region."""
     unsure = record.regions is not None and not all(region.cropped for region in record.regions)
     return (
@@ -19,12 +20,7 @@ def is_weak(record: Record, config: UpgradeConfig) -> bool:
     )
 
 
-def inliers_before(record: Record) -> int:
-    """The inliers of a pair before it was upgraded."""
-    return record.inliers if record.before is None else record.before
-
-
-class Rounds:
+class UpgradeRounds:
     """Weak pairs get the extra units in rounds of jobs, until a round gains nothing; then ``over``."""
 
     def __init__(self, config: UpgradeConfig) -> None:
@@ -32,28 +28,28 @@ class Rounds:
         self._least_gain = config.least_gain
         self._pairs: dict[int, list[int]] = {}
 
-    def cut(self, weak: Iterable[int], units: tuple[Unit, ...]) -> list[Stretch]:
-        """Stretches of the pairs ``weak``, each in its round; in none if no unit is an extra one."""
+    def split(self, weak: Iterable[int], units: tuple[Unit, ...]) -> list[Chunk]:
+        """Chunks of the pairs ``weak``, each in its round; in none if no unit is an extra one."""
         extras = any(unit.extra for unit in units)
-        stretches = [
-            Stretch(Phase.UPGRADE, indices, units, round=1 + number // ROUND if extras else 0)
-            for number, indices in enumerate(chunks(weak))
+        chunks = [
+            Chunk(Phase.UPGRADE, indices, units, round=1 + number // ROUND_JOBS if extras else 0)
+            for number, indices in enumerate(split(weak))
         ]
-        for stretch in stretches:
-            self._pairs.setdefault(stretch.round, []).extend(stretch.indices)
-        return stretches
+        for chunk in chunks:
+            self._pairs.setdefault(chunk.round, []).extend(chunk.indices)
+        return chunks
 
-    def judged_before(self, stretch: Stretch) -> list[int]:
-        """The pairs whose gain decides whether a stretch's round begins: those of the round before the last.
+    def judged_before(self, chunk: Chunk) -> list[int]:
+        """The pairs whose gain decides whether a chunk's round begins: those of the round before the last.
 
         Not the last round, for which workers would have to wait, and not what happens to be back: the same run
         has to end with the same bytes.
         """
-        return self._pairs.get(stretch.round - 2, []) if stretch.round > 0 and not self.over else []
+        return self._pairs.get(chunk.round - 2, []) if chunk.round > 0 and not self.over else []
 
-    def judge(self, records: Sequence[Record]) -> str:
+    def judge(self, records: Sequence[PairRecord]) -> str:
         """Look at a round's gain; why the extra units are over now, or nothing."""
-        before = sum(inliers_before(record) for record in records)
+        before = sum(record.inliers_before for record in records)
         after = sum(record.inliers for record in records)
         if after - before > self._least_gain * before:
             return ""

@@ -3,30 +3,26 @@
 import threading
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
-from mkpc_kaggle.data.images import ImageStore, Unreadable
-from mkpc_kaggle.engine.jobs import NOT_REACHED, Finished, Job, Matched, Outcome, Plan, Record, Task, record_of
-from mkpc_kaggle.pipeline.stages import PairWork, Pipeline, UnitResult, conclude
+from mkpc_kaggle.data.competition import Pair
+from mkpc_kaggle.data.images import Image, ImageStore
+from mkpc_kaggle.engine.jobs import Cause, Job, JobFailure, JobResult, Outcome
+from mkpc_kaggle.engine.records import NOT_REACHED, PairRecord
+from mkpc_kaggle.pipeline.failures import Failure, failure_of, reason_of
+from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult, with_estimate
+from mkpc_kaggle.pipeline.stages import Pipeline
 from mkpc_kaggle.recipe import Recipe, Unit
 
+Answer = tuple[PairMatch, ...] | JobFailure
+"""What a worker makes of a job: for each pair what this job found on it, or why there is nothing."""
 
-class OutOfMemoryError(Exception):
-    """A unit did not have memory enough."""
-
-
-@dataclass(frozen=True, eq=False)
-class Opened:
-    """A task with its images decoded, or why they cannot be; ``seconds`` were spent waiting for them."""
-
-    work: PairWork | None
-    seconds: float
-    failure: str = ""
+CAUSES = {Failure.OUT_OF_MEMORY: Cause.OUT_OF_MEMORY, Failure.DEVICE: Cause.DEVICE, Failure.ORDINARY: Cause.RAISED}
 
 
-class Bench:
-    """Where pairs are matched: a pipeline and the images at hand. Only :meth:`match` computes."""
+class Worker:
+    """Matches the pairs of jobs: a pipeline, loaded when it is first needed, and the images at hand."""
 
     def __init__(self, make_pipeline: Callable[[], Pipeline], images: ImageStore | None = None) -> None:
         self._make_pipeline = make_pipeline
@@ -41,34 +37,19 @@ class Bench:
             self._pipeline.load()
         return self._pipeline
 
-    def forget(self) -> None:
-        """Let go of the matchers and all that they remember; they are loaded again when they are needed."""
-        self._pipeline = None
-
-    def announce(self, paths: Iterable[Path]) -> None:
+    def prefetch(self, paths: Iterable[Path]) -> None:
         """Decode these ahead, in the background."""
         self._images.announce(paths)
 
-    def match(self, job: Job, seconds: float, alive: Callable[[], None] = lambda: None) -> tuple[Matched, ...]:
-        """First half of a job: no unit is begun that is expected to end later than ``seconds`` from now.
+    def run(self, job: Job, seconds: float, heartbeat: Callable[[], None] = lambda: None) -> Answer:
+        """Match the pairs of a job; no unit is begun that is expected to end later than ``seconds`` from now.
 
-        ``alive`` is called before each unit on each batch of pairs. Raises :class:`OutOfMemoryError`.
+        ``heartbeat`` is called before each unit on each batch of pairs. Never raises.
         """
-        pipeline, plan = self.load(), job.plan
-        deadline = time.monotonic() + seconds
-        units = {unit.shrunk(plan.shrink) if plan.shrink < 1 else unit: unit for unit in plan.units}
-        expected = dict(zip(units, plan.expected, strict=True))
-
-        def keep_on(unit: Unit) -> bool:
-            alive()
-            return not self._stopped.is_set() and time.monotonic() + expected[unit] < deadline
-
-        opened = [self._open(task) for task in job.tasks]
-        # A stand-in for a unit is no other unit: what a pair has had is left out here.
-        wanted = [unit for unit in units if not all(has(task, units[unit]) for task in job.tasks)]
-        matched = iter(pipeline.match([one.work for one in opened if one.work], wanted, keep_on))
-        done = [replace(one, work=next(matched)) if one.work else one for one in opened]
-        return tuple(_matched(task, one, units, plan) for task, one in zip(job.tasks, done, strict=True))
+        try:
+            return self._match(job, seconds, heartbeat)
+        except Exception as error:
+            return failed(job, error)
 
     def stop(self) -> None:
         """Begin no further unit."""
@@ -78,56 +59,61 @@ class Bench:
         self.stop()
         self._images.close()
 
-    def _open(self, task: Task) -> Opened:
+    def _match(self, job: Job, seconds: float, heartbeat: Callable[[], None]) -> tuple[PairMatch, ...]:
+        pipeline = self.load()
+        deadline = time.monotonic() + seconds
+        units = {unit.shrunk(job.shrink) if job.shrink < 1 else unit: unit for unit in job.units}
+        expected = dict(zip(units, job.expected, strict=True))
+
+        def may_start(unit: Unit) -> bool:
+            heartbeat()
+            return not self._stopped.is_set() and time.monotonic() + expected[unit] < deadline
+
+        opened = [self._open(pair, known) for pair, known in zip(job.pairs, job.known, strict=True)]
+        # A shrunk unit is another one to the pipeline: what a pair has had is left out here.
+        wanted = [unit for unit in units if not all(pair.has(units[unit]) for pair in opened)]
+        matched = iter(pipeline.match([pair for pair in opened if not pair.failure], wanted, may_start))
+        done = [pair if pair.failure else next(matched) for pair in opened]
+        return tuple(_found(pair, known, units, job) for pair, known in zip(done, job.known, strict=True))
+
+    def _open(self, pair: Pair, known: tuple[UnitResult, ...]) -> PairMatch:
+        """The pair with its images; ``failure`` says which of them cannot be read."""
         start = time.perf_counter()
-        image0, image1 = (self._images.get(path) for path in task.pair.images)
+        images = tuple(self._images.get(path) for path in pair.images)
         seconds = time.perf_counter() - start
-        if isinstance(image0, Unreadable):
-            return Opened(None, seconds, str(image0))
-        if isinstance(image1, Unreadable):
-            return Opened(None, seconds, str(image1))
-        return Opened(PairWork((image0, image1), task.results), seconds)
+        readable = tuple(image for image in images if isinstance(image, Image))
+        failure = next((str(image) for image in images if not isinstance(image, Image)), "")
+        return PairMatch(known, images=readable, failure=failure, decode_seconds=seconds)
 
 
-def has(task: Task, unit: Unit) -> bool:
-    return any(result.unit == unit for result in task.results)
+def _found(pair: PairMatch, known: tuple[UnitResult, ...], units: dict[Unit, Unit], job: Job) -> PairMatch:
+    """What a job found on a pair, without what was known before: that is all that has to travel."""
+    results = tuple(
+        replace(result, unit=units[result.unit], failure=result.failure or job.note)
+        for result in pair.results[len(known) :]
+    )
+    return replace(pair, results=results, images=())
 
 
-def _matched(task: Task, opened: Opened, units: dict[Unit, Unit], plan: Plan) -> Matched:
-    work = opened.work
-    if work is None:
-        return Matched(decode_seconds=opened.seconds, failure=opened.failure)
-    new = work.results[len(task.results) :]
-    short = next((result for result in new if result.exhausted), None)
-    if short is not None:
-        raise OutOfMemoryError(f"{units[short.unit].name}: {short.failure}")
-    results = tuple(as_written(result, units[result.unit], plan) for result in new)
-    return Matched(results, work.regions, opened.seconds, work.cluster_seconds)
+def failed(job: Job, error: Exception) -> JobFailure:
+    """What an error makes of a job."""
+    return JobFailure(job, CAUSES[failure_of(error)], reason_of(error))
 
 
-def as_written(result: UnitResult, unit: Unit, plan: Plan) -> UnitResult:
-    """The result under the name of the recipe's unit, with a note if the unit ran smaller than that."""
-    return replace(result, unit=unit, failure=result.failure or plan.note)
+def estimate(job: Job, found: Iterable[PairMatch], recipe: Recipe) -> JobResult | JobFailure:
+    """Second half of a job: F from all matches of each pair. Never raises."""
+    try:
+        pairs = zip(job.indices, job.pairs, job.known, found, strict=True)
+        return JobResult(job, tuple(_outcome(*one, recipe) for one in pairs))
+    except Exception as error:
+        return failed(job, error)
 
 
-def estimate(job: Job, matched: Iterable[Matched], recipe: Recipe) -> Finished:
-    """Second half of a job: F from all matches of each pair."""
-    return Finished(job, tuple(_outcome(task, one, recipe) for task, one in zip(job.tasks, matched, strict=True)))
-
-
-def _outcome(task: Task, matched: Matched, recipe: Recipe) -> Outcome:
-    if not matched.results:
-        return Outcome(Record.untouched(task.index, matched.failure or NOT_REACHED))
+def _outcome(index: int, pair: Pair, known: tuple[UnitResult, ...], found: PairMatch, recipe: Recipe) -> Outcome:
+    if not found.results:
+        return Outcome(PairRecord.untouched(index, found.failure or NOT_REACHED))
     start = time.perf_counter()
-    match = conclude(
-        task.results + matched.results, matched.regions, recipe, task.pair.model, task.pair.intrinsics
-    )
-    seconds = time.perf_counter() - start
-    record = record_of(
-        task.index,
-        match,
-        decode=matched.decode_seconds,
-        cluster=matched.cluster_seconds,
-        estimate=seconds,
-    )
-    return Outcome(record, matched.results)
+    whole = replace(found, results=known + found.results)
+    match = with_estimate(whole, recipe, pair.model, pair.intrinsics)
+    match = replace(match, estimate_seconds=time.perf_counter() - start)
+    return Outcome(PairRecord.of(index, match), found.results)

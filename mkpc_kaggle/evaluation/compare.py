@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mkpc_kaggle.engine.jobs import Record
+from mkpc_kaggle.engine.records import PairRecord
 from mkpc_kaggle.evaluation.validate import SceneScore, Validation, to_json
 from mkpc_kaggle.geometry.metrics import pair_accuracy
 
@@ -102,7 +102,7 @@ def _scene(validation: Validation, name: str) -> SceneScore:
     return next(scene for scene in validation.scenes if scene.scene == name)
 
 
-def seconds_of_work(record: Record) -> float:
+def seconds_of_work(record: PairRecord) -> float:
     """What a pair took: its units, clusters and last estimate, whichever run did them."""
     units = sum(unit.encode_seconds + unit.match_seconds for unit in record.units)
     return units + record.cluster_seconds + record.estimate_seconds

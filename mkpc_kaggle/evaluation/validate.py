@@ -12,7 +12,7 @@ import numpy as np
 
 from mkpc_kaggle.data.competition import Scene, TruePair, pair_id, read_submission, read_table
 from mkpc_kaggle.engine.engine import RunReport
-from mkpc_kaggle.engine.jobs import Record
+from mkpc_kaggle.engine.records import PairRecord
 from mkpc_kaggle.engine.session import Session, run_pairs
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.metrics import (
@@ -33,7 +33,7 @@ class PairScore:
     id: str
     covisibility: float
     error: PoseError
-    record: Record | None = None
+    record: PairRecord | None = None
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ class Validation:
         return [error for scene in self.scenes for error in scene.errors]
 
     @property
-    def records(self) -> list[Record]:
+    def records(self) -> list[PairRecord]:
         return [pair.record for scene in self.scenes for pair in scene.pairs if pair.record is not None]
 
 
@@ -98,7 +98,7 @@ def validate(scenes: Sequence[Scene], assembly: Assembly, session: Session) -> t
     return Validation(assembly.recipe.name, scored, report), at_rest
 
 
-def score_record(true: TruePair, record: Record, scene: Scene) -> PairScore:
+def score_record(true: TruePair, record: PairRecord, scene: Scene) -> PairScore:
     """The score of what the engine made of a pair; the fallback row counts as a failure."""
     error = PoseError.failed() if record.failure else error_of(record.F, true, scene)
     return PairScore(true.pair.id, true.covisibility, error, record)
@@ -184,7 +184,7 @@ def to_json(validation: Validation) -> dict[str, Any]:
     }
 
 
-def stage_means(records: Sequence[Record], what: str) -> Mapping[str, float]:
+def stage_means(records: Sequence[PairRecord], what: str) -> Mapping[str, float]:
     """Mean number of matches or inliers on a pair, by stage."""
     return {
         str(stage): float(

@@ -12,7 +12,7 @@ from mkpc_kaggle.geometry.coordinates import Pixels
 from mkpc_kaggle.geometry.robust import Matrix3, Model
 from mkpc_kaggle.matchers.contract import Matcher
 from mkpc_kaggle.pipeline.assembly import Licence, assemble
-from mkpc_kaggle.pipeline.stages import PairMatch, PairWork, finish
+from mkpc_kaggle.pipeline.pair import PairMatch, with_estimate
 from mkpc_kaggle.recipe import Recipe
 
 
@@ -62,9 +62,9 @@ class TwoStageMatcher:
         ``model`` E needs ``intrinsics``, the camera matrices in pixels. Raises :class:`UserError` for an
         image that cannot be read; a pair that cannot be matched is a result with ``estimate.failure``.
         """
-        work = PairWork((to_image(image0), to_image(image1)))
-        (work,) = self._pipeline.match([work], self.recipe.units)
-        return finish(work, self.recipe, Model(model), intrinsics)
+        pair = PairMatch(images=(to_image(image0), to_image(image1)))
+        (pair,) = self._pipeline.match([pair], self.recipe.units)
+        return with_estimate(pair, self.recipe, Model(model), intrinsics)
 
 
 def to_image(source: str | Path | Pixels | Image) -> Image:

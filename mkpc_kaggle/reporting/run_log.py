@@ -6,10 +6,10 @@ from functools import cached_property
 from pathlib import Path
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine.jobs import Record
 from mkpc_kaggle.engine.journal import DRAWN, About, Event, EventKind, JournalReader
+from mkpc_kaggle.engine.records import PairRecord
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.pipeline.stages import UnitResult
+from mkpc_kaggle.pipeline.pair import UnitResult
 from mkpc_kaggle.recipe import Recipe, recipe_of
 from mkpc_kaggle.reporting.tables import RunTables, run_tables, to_json
 
@@ -20,7 +20,7 @@ NOT_ENDED = "not ended (at work, or killed)"
 class WeakPair:
     """One of the weakest pairs, with its matches by unit where the journal still has them."""
 
-    record: Record
+    record: PairRecord
     results: tuple[UnitResult, ...]
 
 
@@ -38,7 +38,7 @@ class RunLog:
     recipe: Recipe
     digests: dict[str, str]
     pairs: tuple[Pair, ...]
-    records: tuple[Record, ...]
+    records: tuple[PairRecord, ...]
     events: tuple[Event, ...]
     weakest: tuple[WeakPair, ...]
 
@@ -81,7 +81,7 @@ def read_log(directory: Path) -> RunLog:
         about, belongs_to, pairs = journal.about(), journal.belongs_to(), journal.pairs()
         recipe = recipe_of(belongs_to.get("recipe", {}), about.recipe)
         known = journal.records()
-        records = tuple(known.get(index) or Record.untouched(index) for index in range(len(pairs)))
+        records = tuple(known.get(index) or PairRecord.untouched(index) for index in range(len(pairs)))
         touched = sorted((record for record in records if record.units), key=lambda r: (r.inliers, r.index))
         units = {unit.name: unit for unit in recipe.units}
         weakest = tuple(WeakPair(record, journal.results(record.index, units)) for record in touched[:DRAWN])

@@ -20,7 +20,7 @@ from mkpc_kaggle.engine.budget import format_duration
 from mkpc_kaggle.engine.journal import EventKind
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import Estimate, Model, sampson_distances
-from mkpc_kaggle.pipeline.stages import PairMatch
+from mkpc_kaggle.pipeline.pair import PairMatch
 from mkpc_kaggle.pipeline.two_stage import to_image
 from mkpc_kaggle.reporting import figures
 from mkpc_kaggle.reporting.blocks import (

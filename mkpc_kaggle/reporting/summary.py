@@ -1,11 +1,12 @@
 """One screen of summary: what a run did, what it cost, and which pairs it could not help."""
 
+from collections import Counter
 from collections.abc import Sequence
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.budget import format_duration
-from mkpc_kaggle.engine.engine import RunReport
-from mkpc_kaggle.engine.jobs import Record
+from mkpc_kaggle.engine.engine import Ending, RunReport
+from mkpc_kaggle.engine.records import PairRecord
 from mkpc_kaggle.recipe import Unit
 from mkpc_kaggle.reporting.run_log import RunLog
 from mkpc_kaggle.reporting.tables import RunTables, run_tables, seconds_by_part, unit_failures, unit_means
@@ -19,7 +20,34 @@ def summary(pairs: Sequence[Pair], report: RunReport, left_out: Sequence[Unit] =
     resumed = f", {report.resumed} of them from earlier runs" if report.resumed else ""
     names = [unit.name for unit in left_out]
     lines = [_headline(tables, report.ending, report.seconds) + resumed, *_counts(tables)]
-    return "\n".join(lines + _upgrades(report.records) + _troubles(tables, names, report.faults))
+    lines += _upgrades(report.records) + _troubles(tables, names, report.faults)
+    return "\n".join([*lines, *filter(None, [trouble(report)])])
+
+
+def trouble(report: RunReport) -> str:
+    """Why a run is no success, though its file is whole; empty if it is one.
+
+    Pairs without an F count where an error is the reason, be it that of a unit which found nothing; not where the
+    matches or the time did not suffice.
+    """
+    if report.ending is Ending.NO_WORKER:
+        return f"the run failed: {report.ending}, the faults say why; the same command goes on"
+    reached = [record for record in report.records if record.reached]
+    reasons = Counter(filter(None, map(_error, reached)))
+    if 2 * reasons.total() <= len(reached):
+        return ""
+    ((reason, count),) = reasons.most_common(1)
+    share = f"{reasons.total()} of {len(reached)} pairs"
+    return f"the run failed: errors left {share} without an F, {count} of them with this one: {reason}"
+
+
+def _error(record: PairRecord) -> str:
+    """The error that left a pair without an F, if it was one."""
+    if not record.failure:
+        return ""
+    if not record.units:
+        return record.failure
+    return next((unit.failure for unit in record.units if unit.failure and not unit.matches), "")
 
 
 def overview(log: RunLog) -> str:
@@ -62,7 +90,7 @@ def _counts(tables: RunTables) -> list[str]:
     return [*lines, "seconds a pair: " + ", ".join(parts)]
 
 
-def _upgrades(records: Sequence[Record]) -> list[str]:
+def _upgrades(records: Sequence[PairRecord]) -> list[str]:
     upgraded = [record for record in records if record.before is not None]
     if not upgraded:
         return []

@@ -7,8 +7,8 @@ from typing import Any
 import pandas as pd
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine.jobs import Record
 from mkpc_kaggle.engine.journal import Event
+from mkpc_kaggle.engine.records import PairRecord
 
 F_COLUMNS = tuple(f"f{row}{column}" for row in (1, 2, 3) for column in (1, 2, 3))
 SECONDS = ("decode_seconds", "encode_seconds", "match_seconds", "cluster_seconds", "estimate_seconds")
@@ -54,7 +54,7 @@ class RunTables:
         return {"pairs": self.pairs, "units": self.units, "regions": self.regions, "events": self.events}
 
 
-def run_tables(pairs: Sequence[Pair], records: Sequence[Record], events: Sequence[Event] = ()) -> RunTables:
+def run_tables(pairs: Sequence[Pair], records: Sequence[PairRecord], events: Sequence[Event] = ()) -> RunTables:
     """The tables of a run: one record a pair, in their order."""
     return RunTables(
         _table(_pair_rows(pairs, records), _PAIRS),
@@ -105,7 +105,7 @@ def _table(rows: Iterator[tuple[object, ...]], columns: dict[str, type]) -> pd.D
     return pd.DataFrame(list(rows), columns=list(columns)).astype(columns)
 
 
-def _pair_rows(pairs: Sequence[Pair], records: Sequence[Record]) -> Iterator[tuple[object, ...]]:
+def _pair_rows(pairs: Sequence[Pair], records: Sequence[PairRecord]) -> Iterator[tuple[object, ...]]:
     for pair, record in zip(pairs, records, strict=True):
         encode = sum(unit.encode_seconds for unit in record.units)
         match = sum(unit.match_seconds for unit in record.units)
@@ -117,14 +117,14 @@ def _pair_rows(pairs: Sequence[Pair], records: Sequence[Record]) -> Iterator[tup
         )
 
 
-def _unit_rows(records: Sequence[Record]) -> Iterator[tuple[object, ...]]:
+def _unit_rows(records: Sequence[PairRecord]) -> Iterator[tuple[object, ...]]:
     for record in records:
         for unit in record.units:
             counts = (unit.matches, unit.inliers, unit.encode_seconds, unit.match_seconds)
             yield (record.index, unit.unit, unit.stage, *counts, unit.failure)
 
 
-def _region_rows(records: Sequence[Record]) -> Iterator[tuple[object, ...]]:
+def _region_rows(records: Sequence[PairRecord]) -> Iterator[tuple[object, ...]]:
     for record in records:
         for image, region in enumerate(record.regions or ()):
             box = region.box

@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -15,15 +16,18 @@ import numpy as np
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.budget import Budget
+from mkpc_kaggle.engine.costs import Timeouts
 from mkpc_kaggle.engine.engine import RunReport
-from mkpc_kaggle.engine.jobs import Record
-from mkpc_kaggle.engine.patience import Patience
 from mkpc_kaggle.engine.pools.cluster import RayCluster
+from mkpc_kaggle.engine.pools.pool import Place
+from mkpc_kaggle.engine.pools.process import ProcessWorker
+from mkpc_kaggle.engine.records import PairRecord
 from mkpc_kaggle.engine.session import Interrupt, Session, run_pairs
 from mkpc_kaggle.geometry.coordinates import View
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import MatcherSpec, Picture
 from mkpc_kaggle.pipeline.assembly import assemble
+from mkpc_kaggle.pipeline.stages import Pipeline
 from mkpc_kaggle.recipe import Recipe, Unit, UpgradeConfig
 
 
@@ -91,14 +95,14 @@ def run(
     *,
     limit: float = float("inf"),
     interrupt: Interrupt | None = None,
-    publish: Callable[[Sequence[Record]], None] = lambda _: None,
+    publish: Callable[[Sequence[PairRecord]], None] = lambda _: None,
     workers: int | RayCluster | None = 0,
-    patience: Patience | None = None,
+    timeouts: Timeouts | None = None,
 ) -> RunReport:
     assembly = assemble(recipe, matchers={matcher.name: matcher}, device="cpu")
     budget = Budget(time.monotonic(), limit)
     session = Session(
-        work_dir, budget, interrupt or Interrupt(), progress=False, workers=workers, patience=patience
+        work_dir, budget, interrupt or Interrupt(), progress=False, workers=workers, timeouts=timeouts
     )
     report, _ = run_pairs(pairs, assembly, session, publish)
     return report
@@ -108,3 +112,8 @@ def interrupt_after(seconds: float) -> Interrupt:
     interrupt = Interrupt()
     threading.Timer(seconds, interrupt.set).start()
     return interrupt
+
+
+def process_place(make_pipeline: Callable[[], Pipeline]) -> Place:
+    """Where a pool starts worker processes with that pipeline."""
+    return Place("cpu", partial(ProcessWorker, "cpu", make_pipeline))

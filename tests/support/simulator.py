@@ -17,22 +17,12 @@ import numpy as np
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.engine import Ending, Engine, RunReport
-from mkpc_kaggle.engine.jobs import (
-    NOT_REACHED,
-    Cause,
-    Finished,
-    Job,
-    Lost,
-    Outcome,
-    Plan,
-    Record,
-    Task,
-    UnitRecord,
-)
-from mkpc_kaggle.engine.pools.in_process import JOBS_A_WORKER
+from mkpc_kaggle.engine.jobs import Cause, Job, JobFailure, JobResult, Outcome
+from mkpc_kaggle.engine.pools.pool import JOBS_A_WORKER
+from mkpc_kaggle.engine.records import NOT_REACHED, PairRecord, UnitRecord
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
-from mkpc_kaggle.pipeline.stages import UnitResult
+from mkpc_kaggle.pipeline.pair import UnitResult
 from mkpc_kaggle.recipe import Recipe, Unit
 
 RESTART_SECONDS = 8.0
@@ -144,7 +134,7 @@ class SimulatedPool:
         self._stop = stop
         self._free = [RESTART_SECONDS] * scenario.workers
         self._warm: set[tuple[int, str]] = set()
-        self._coming: list[tuple[float, int, float, Finished | Lost]] = []
+        self._coming: list[tuple[float, int, float, JobResult | JobFailure]] = []
         self._count = 0
 
     @property
@@ -155,14 +145,14 @@ class SimulatedPool:
     def capacity(self) -> int:
         return JOBS_A_WORKER * self.workers
 
-    def start(self) -> None:
-        pass
+    def start(self) -> str:
+        return ""
 
     def submit(self, job: Job) -> None:
         worker = int(np.argmin(self._free))
         begun = max(self.clock.now, self._free[worker])
         ended, back, fault = self._do(job, worker, begun)
-        lost = isinstance(back, Lost)
+        lost = isinstance(back, JobFailure)
         self._free[worker] = ended + (RESTART_SECONDS if lost else 0.0)
         if lost:
             self.faults += max(0.0, min(fault + RESTART_SECONDS * (fault > 0), self._stop - begun))
@@ -171,7 +161,7 @@ class SimulatedPool:
         kept = 0.0 if lost else min(ended, self._stop) - begun
         heapq.heappush(self._coming, (ended, self._count, kept, back))
 
-    def next(self, until: float) -> Finished | Lost | None:
+    def next(self, until: float) -> JobResult | JobFailure | None:
         if not self._coming or self._coming[0][0] > until:
             self.clock.now = max(self.clock.now, until)
             return None
@@ -186,29 +176,29 @@ class SimulatedPool:
     def close(self) -> bool:
         return True
 
-    def _do(self, job: Job, worker: int, begun: float) -> tuple[float, Finished | Lost, float]:
+    def _do(self, job: Job, worker: int, begun: float) -> tuple[float, JobResult | JobFailure, float]:
         """When the job ends, what comes back, and the seconds of it that an injected fault took."""
-        now, plan = begun, job.plan
-        expected = dict(zip(plan.units, plan.expected, strict=True))
-        results: list[list[UnitResult]] = [[] for _ in job.tasks]
-        for unit in sorted(plan.units, key=lambda unit: unit.stage):
-            for task, found in zip(job.tasks, results, strict=True):
-                if any(result.unit == unit for result in task.results) or now + expected[unit] >= plan.deadline:
+        now = begun
+        expected = dict(zip(job.units, job.expected, strict=True))
+        results: list[list[UnitResult]] = [[] for _ in job.indices]
+        for unit in sorted(job.units, key=lambda unit: unit.stage):
+            for known, found in zip(job.known, results, strict=True):
+                if any(result.unit == unit for result in known) or now + expected[unit] >= job.deadline:
                     continue
                 stalled = self._rng.random() < self.scenario.stalls
-                usual = self._seconds(unit, now) * plan.shrink**2
+                usual = self._seconds(unit, now) * job.shrink**2
                 seconds = usual * (STALL if stalled else 1.0) + self._warm_up(unit, worker)
                 fate = self._rng.random()
                 if fate < self.scenario.crashes:
-                    return now + seconds / 2, Lost(job, Cause.DIED), seconds / 2
+                    return now + seconds / 2, JobFailure(job, Cause.DIED), seconds / 2
                 if fate < self.scenario.crashes + self.scenario.hangs:
-                    return now + plan.timeout, Lost(job, Cause.HUNG), min(plan.timeout, STALL * usual)
-                if seconds > plan.timeout:
-                    return now + plan.timeout, Lost(job, Cause.HUNG), plan.timeout if stalled else 0.0
+                    return now + job.timeout, JobFailure(job, Cause.HUNG), min(job.timeout, STALL * usual)
+                if seconds > job.timeout:
+                    return now + job.timeout, JobFailure(job, Cause.HUNG), job.timeout if stalled else 0.0
                 now += seconds
                 found.append(UnitResult(unit, Matches.empty(), 0.0, seconds))
-        outcomes = tuple(self._outcome(task, found, plan) for task, found in zip(job.tasks, results, strict=True))
-        return now, Finished(job, outcomes), 0.0
+        pairs = zip(job.indices, job.known, results, strict=True)
+        return now, JobResult(job, tuple(self._outcome(job, *pair) for pair in pairs)), 0.0
 
     def _warm_up(self, unit: Unit, worker: int) -> float:
         if (worker, unit.name) in self._warm:
@@ -225,14 +215,14 @@ class SimulatedPool:
             seconds *= scenario.drift
         return seconds
 
-    def _outcome(self, task: Task, found: list[UnitResult], plan: Plan) -> Outcome:
+    def _outcome(self, job: Job, index: int, known: tuple[UnitResult, ...], found: list[UnitResult]) -> Outcome:
         if not found:
-            return Outcome(Record.untouched(task.index, NOT_REACHED))
+            return Outcome(PairRecord.untouched(index, NOT_REACHED))
         units = tuple(
-            UnitRecord(one.unit.name, one.unit.stage, 200, 20 + task.index % 60, 0.0, one.seconds, plan.note)
-            for one in (*task.results, *found)
+            UnitRecord(one.unit.name, one.unit.stage, 200, 20 + index % 60, 0.0, one.seconds, job.note)
+            for one in (*known, *found)
         )
-        return Outcome(Record(task.index, FALLBACK_FUNDAMENTAL, "", units), tuple(found))
+        return Outcome(PairRecord(index, FALLBACK_FUNDAMENTAL, "", units), tuple(found))
 
 
 class MemoryJournal:
@@ -241,7 +231,7 @@ class MemoryJournal:
     def __init__(self) -> None:
         self._results: dict[int, tuple[UnitResult, ...]] = {}
 
-    def records(self) -> dict[int, Record]:
+    def records(self) -> dict[int, PairRecord]:
         return {}
 
     def results(self, pair: int, units: Mapping[str, Unit]) -> tuple[UnitResult, ...]:
@@ -303,7 +293,7 @@ def simulate(scenario: Scenario) -> Ran:
     planning, jobs = 0.0, 0
     plan_next = engine.planner.next
 
-    def timed(now: float) -> Plan | None:
+    def timed(now: float) -> Job | None:
         nonlocal planning, jobs
         start = time.thread_time()  # whatever else the machine does
         plan = plan_next(now)

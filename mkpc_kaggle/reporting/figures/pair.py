@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from mkpc_kaggle.data.images import Image
 from mkpc_kaggle.geometry.critical_region import MkpcConfig, find_clusters
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.pipeline.stages import PairMatch
+from mkpc_kaggle.pipeline.pair import PairMatch
 from mkpc_kaggle.reporting.figures.canvas import (
     CLUSTERS,
     DROPPED,

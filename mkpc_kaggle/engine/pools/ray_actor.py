@@ -1,0 +1,132 @@
+"""A worker in a Ray actor: its images and weights come from shared paths, or else from the parent's machine."""
+
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import ray
+
+from mkpc_kaggle import __version__
+from mkpc_kaggle.data.images import Image, ImageStore, Unreadable, decode_image, read_image
+from mkpc_kaggle.engine.jobs import Job
+from mkpc_kaggle.engine.worker import Answer, Worker
+from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.pipeline.assembly import Assembly
+from mkpc_kaggle.pipeline.stages import Pipeline
+from mkpc_kaggle.weights import FoundFile, WeightStore
+from mkpc_kaggle.weights.digests import file_digests
+
+Stamp = tuple[int, int]
+Fetch = Callable[[Path, Stamp | None], bytes | None]
+
+
+class FileServer:
+    """An actor on the parent's machine that reads its files for machines that lack them."""
+
+    def fetch(self, path: Path, stamp: Stamp | None) -> bytes | None:
+        """The file's bytes; ``None`` where its stamp is ``stamp``. Raises ``OSError``."""
+        return None if stamp is not None and stamp == stamp_of(path) else path.read_bytes()
+
+
+def stamp_of(path: Path) -> Stamp | None:
+    """Size in bytes and time of change in nanoseconds: the same where a path leads to the same file."""
+    try:
+        status = path.stat()
+    except OSError:
+        return None
+    return status.st_size, status.st_mtime_ns
+
+
+class WorkerActor:
+    """A worker that says when it was last heard of; ``files`` is the :class:`FileServer`."""
+
+    def __init__(self, assembly: Assembly, threads: int, files: Any) -> None:
+        self._assembly = assembly
+        self._threads = threads
+        self._files = files
+        self._last_heartbeat = time.monotonic()
+        self._weights = WeightStore()
+        self._worker = Worker(self._pipeline, ImageStore(read=lambda path: read_or_fetch(path, self._fetch)))
+
+    def load(self, version: str) -> str | UserError:
+        """Empty; or what the user has to mend."""
+        if version != __version__:
+            host = ray.util.get_node_ip_address()
+            return UserError(
+                f"mkpc-kaggle is {__version__} on {host} and {version} here: install the same on both"
+            )
+        use_threads(self._threads)
+        try:
+            with tempfile.TemporaryDirectory() as home:
+                self._weights = local_store(self._assembly, Path(home), self._fetch)
+                self._worker.load()
+        except UserError as error:
+            return error
+        return ""
+
+    def run(self, job: Job, seconds: float) -> Answer:
+        self._heartbeat()
+        return self._worker.run(job, seconds, self._heartbeat)
+
+    def silent_for(self) -> float:
+        """Seconds since it last began something."""
+        return time.monotonic() - self._last_heartbeat
+
+    def prefetch(self, paths: tuple[Path, ...]) -> None:
+        self._worker.prefetch(paths)
+
+    def stop(self) -> None:
+        self._worker.stop()
+
+    def _heartbeat(self) -> None:
+        self._last_heartbeat = time.monotonic()
+
+    def _fetch(self, path: Path, stamp: Stamp | None) -> bytes | None:
+        found: bytes | None = ray.get(self._files.fetch.remote(path, stamp))
+        return found
+
+    def _pipeline(self) -> Pipeline:
+        return replace(self._assembly, weights=self._weights).pipeline()
+
+
+def read_or_fetch(path: Path, fetch: Fetch) -> Image | Unreadable:
+    """The image at ``path`` of the parent's machine: read here if the path leads to it here too; never raises."""
+    try:
+        data = fetch(path, stamp_of(path))
+    except FileNotFoundError:
+        return Unreadable(str(path), "no such file")
+    except (OSError, ray.exceptions.RayError) as error:
+        return Unreadable(str(path), f"cannot be fetched: {error}")
+    return read_image(path) if data is None else decode_image(str(path), np.frombuffer(data, np.uint8))
+
+
+def local_store(assembly: Assembly, home: Path, fetch: Fetch) -> WeightStore:
+    """A store of the weights that the parent found, put into ``home``: links to those that are here, or copies."""
+    for found in assembly.weight_files.values():
+        target = home / found.file.name
+        if is_here(found):
+            target.symlink_to(found.path)
+        else:
+            data = fetch(found.path, None)
+            assert data is not None
+            target.write_bytes(data)
+    return WeightStore([home], assembly.weights.files)
+
+
+def is_here(found: FoundFile) -> bool:
+    try:
+        return file_digests(found.path).sha256 == found.digest
+    except OSError:
+        return False
+
+
+def use_threads(count: int) -> None:
+    import torch
+
+    torch.set_num_threads(count)
+    cv2.setNumThreads(count)
