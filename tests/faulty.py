@@ -4,7 +4,7 @@ import os
 import resource
 import signal
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,6 +22,20 @@ def pipeline_once(assembly: Assembly, marker: Path) -> Pipeline:
     if marker.exists():
         die()
     marker.touch()
+    return assembly.pipeline()
+
+
+def pipeline_in_batches(assembly: Assembly, batch: int) -> Pipeline:
+    """As on a GPU."""
+    return Pipeline(assembly.recipe, assembly.matchers.__getitem__, batch=batch)
+
+
+def pipeline_telling_its_environment(assembly: Assembly, told: Path) -> Pipeline:
+    """What a worker's OpenMP is told, as the process was started with it."""
+    started_with = dict(
+        entry.split("=", 1) for entry in Path("/proc/self/environ").read_text().split("\0") if "=" in entry
+    )
+    told.write_text(", ".join(started_with.get(name, "") for name in ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT")))
     return assembly.pipeline()
 
 
@@ -73,6 +87,53 @@ class FaultyMatcher(RectifiedMatcher):
         due = not self.once.exists()
         self.once.touch()
         return due
+
+
+@dataclass
+class BrokenDeviceMatcher(RectifiedMatcher):
+    """A device that fails after ``good`` pairs, and from then on at everything in this process, as CUDA does; in
+    later ones too if it is broken ``for_good``. ``marker`` is a file that tells them that it has happened.
+    """
+
+    marker: Path = Path()
+    good: int = 5
+    for_good: bool = False
+    failed: bool = False
+
+    def _match(self, seen0: Seen, seen1: Seen) -> Matches:
+        happened = self.marker.exists()
+        if self.for_good if happened else len(self.calls) >= self.good:
+            self.marker.touch()
+            self.failed = True
+        if self.failed:
+            raise RuntimeError(
+                "CUDA error: an illegal memory access was encountered\n"
+                "CUDA kernel errors might be asynchronously reported at some other API call"
+            )
+        return super()._match(seen0, seen1)
+
+
+@dataclass
+class NarrowMatcher(RectifiedMatcher):
+    """Has no memory for more than ``most`` pairs at a time; writes how many it was given to the file ``sizes``."""
+
+    most: int = 1
+    sizes: Path = Path()
+
+    def match(self, encodings0: Sequence[Seen], encodings1: Sequence[Seen]) -> list[Matches]:
+        with self.sizes.open("a") as log:
+            log.write(f"{len(encodings0)} ")
+        if len(encodings0) > self.most:
+            raise RuntimeError("cuDNN error: CUDNN_STATUS_ALLOC_FAILED")
+        return super().match(encodings0, encodings1)
+
+
+@dataclass
+class RefusingMatcher(RectifiedMatcher):
+    """Raises at every pair."""
+
+    def _match(self, seen0: Seen, seen1: Seen) -> Matches:
+        raise ValueError("no such layer")
 
 
 @dataclass

@@ -12,8 +12,9 @@ submission.csv is complete from the start: pairs that were not reached hold a fa
 version is better. Killed at any point, the same command goes on where it was (its journal lies in the work
 directory). Ctrl-C and SIGTERM end the run early with a valid file.
 
-Exit status: 0 done, or the time was up; 1 the last version of the file could not be written (a full disk, say;
-an earlier one is there); 2 bad input; 130 or 143 ended by a signal (the file is valid).
+Exit status: 0 done, or the time was up; 1 the run failed (no worker was left, or errors left most pairs without
+an F), or the last version of the file could not be written (a full disk, say): a whole file is there; 2 bad input;
+130 or 143 ended by a signal (the file is whole).
 """
 
 
@@ -48,7 +49,7 @@ def run(arguments: argparse.Namespace) -> int:
     from mkpc_kaggle.engine.submit import submit
     from mkpc_kaggle.recipe import Choice, Mode
     from mkpc_kaggle.reporting.report import report_run
-    from mkpc_kaggle.reporting.summary import summary
+    from mkpc_kaggle.reporting.summary import summary, trouble
 
     output: Path = arguments.output
     with interruptible() as interrupt:
@@ -68,5 +69,5 @@ def run(arguments: argparse.Namespace) -> int:
         if not arguments.no_report:
             page = arguments.report or output.with_suffix(".html")
             print(report_run(work_dir, page, session.must_end(), pairs), flush=True)
-        status = 128 + interrupt.signal if interrupt.signal else int(bool(report.unwritten))
+        status = 128 + interrupt.signal if interrupt.signal else int(bool(report.unwritten or trouble(report)))
         return leave(status, at_rest=at_rest)

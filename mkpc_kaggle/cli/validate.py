@@ -132,6 +132,7 @@ def _match_and_score(arguments: argparse.Namespace, scenes: "tuple[Scene, ...]",
     from mkpc_kaggle.engine.session import interruptible
     from mkpc_kaggle.evaluation.validate import score_table, to_json, validate
     from mkpc_kaggle.recipe import Choice, Mode
+    from mkpc_kaggle.reporting.summary import trouble
 
     with interruptible() as interrupt:
         assembly = _assemble(arguments, Choice(arguments.recipe, Mode(arguments.mode)))
@@ -141,7 +142,9 @@ def _match_and_score(arguments: argparse.Namespace, scenes: "tuple[Scene, ...]",
     print("\n".join(score_table(validation)))
     _write_json(arguments.json, to_json(validation))
     _write_report(arguments, scenes, session)
-    return leave(128 + interrupt.signal if interrupt.signal else 0, at_rest=at_rest)
+    assert validation.report is not None
+    status = 128 + interrupt.signal if interrupt.signal else int(bool(trouble(validation.report)))
+    return leave(status, at_rest=at_rest)
 
 
 def _compare(arguments: argparse.Namespace, scenes: "tuple[Scene, ...]", work_dir: Path) -> int:

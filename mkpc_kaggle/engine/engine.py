@@ -3,6 +3,7 @@
 import sqlite3
 import sys
 import threading
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
@@ -108,7 +109,9 @@ class Engine:
         resumed = sum(not record.lacking(self.recipe.regular) for record in records)
         self._publish()
         if any(self.planner.wanted(record) for record in records):
-            self.pool.start()
+            if told := self.pool.start():
+                warnings.warn(told, stacklevel=2)  # now, since the summary is hours away
+                self._fault(told)
             self._work()
             self._wait()
         if self._progress is not None:

@@ -186,6 +186,7 @@ class Cause(StrEnum):
     DIED = "the worker died"
     HUNG = "the worker hung"
     OUT_OF_MEMORY = "out of memory"
+    DEVICE = "the device failed"
     RAISED = "the worker failed"
     NO_WORKER = "no worker could be started"
     MACHINE = "the machine was lost"

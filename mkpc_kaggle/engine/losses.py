@@ -11,17 +11,24 @@ SHRINK, LEAST_SHRINK = 0.7, 0.45
 """A unit that a worker fails at on one pair is tried on views whose sides are 0.7, then 0.49 times as long."""
 MOST_LOSSES = 4
 """A pair that cost that many jobs of its own is left alone."""
+DEVICE_TRIES = 2
+"""A pair at which, on its own, a device failed that often is left alone, but by this run only: a later one may do
+better."""
 HOPELESS = 3
 """A unit that workers failed at on that many pairs and never ran is given up on all."""
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What to do after a loss: what to try ``again``, the units ``given_up`` on the job's only pair, and why."""
+    """What to do after a loss: what to try ``again``, the units ``given_up`` on the job's only pair, and why.
+
+    ``aside``: this run leaves the pair alone, and nothing of that is kept for later ones.
+    """
 
     again: tuple[Stretch, ...] = ()
     given_up: tuple[Unit, ...] = ()
     reasons: tuple[str, ...] = ()
+    aside: bool = False
 
 
 class Losses:
@@ -48,11 +55,21 @@ class Losses:
             return Verdict(
                 (replace(stretch, indices=plan.indices[:half]), replace(stretch, indices=plan.indices[half:]))
             )
+        if lost.cause is Cause.DEVICE:
+            return self._judge_device(stretch, lost)
         record = records[plan.indices[0]]
         lacking = sorted(record.lacking(plan.units), key=lambda unit: unit.stage)
         if len(lacking) > 1:  # stage 1 first: the critical regions depend on it
             return Verdict(tuple(replace(stretch, units=(unit,)) for unit in lacking))
         return self._judge_unit(replace(stretch, units=(lacking[0],)), lacking[0], lost, record.lacking(units))
+
+    def _judge_device(self, stretch: Stretch, lost: Lost) -> Verdict:
+        """The device failed at a single pair."""
+        (index,) = stretch.indices
+        self._of_pair[index] += 1
+        if self._of_pair[index] < DEVICE_TRIES:
+            return Verdict((stretch,))
+        return Verdict(reasons=(f"pair {index} is left alone by this run ({lost})",), aside=True)
 
     def _judge_unit(self, stretch: Stretch, unit: Unit, lost: Lost, lacking: Sequence[Unit]) -> Verdict:
         """A single unit was lost on a single pair, which lacks that unit and maybe others."""

@@ -341,7 +341,15 @@ class Planner:
         self._again.extend(verdict.again)
         for reason in verdict.reasons:
             self._explain(now, reason)
+        if verdict.aside:
+            self._set_aside(lost.job.plan.indices[0], lost)
         return [self._give_up(lost.job.plan.indices[0], verdict.given_up, lost)] if verdict.given_up else []
+
+    def _set_aside(self, index: int, lost: Lost) -> None:
+        """The pair keeps the F that it has, and gets nothing more in this run; a later one tries again."""
+        self._aside.add(index)
+        if not self.records[index].reached:
+            self._put(Record.untouched(index, f"left alone: {lost}"))
 
     def _give_up(self, index: int, units: Sequence[Unit], lost: Lost) -> Outcome:
         """The pair keeps the F that it has; the units are marked as had, with the reason."""

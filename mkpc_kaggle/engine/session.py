@@ -9,7 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import metadata
 from math import isfinite
 from pathlib import Path
@@ -30,6 +30,7 @@ from mkpc_kaggle.engine.pools.in_process import InProcessPool
 from mkpc_kaggle.engine.pools.pool import Pool
 from mkpc_kaggle.engine.pools.processes import ProcessPool, Seat
 from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.matchers.contract import Placement
 from mkpc_kaggle.pipeline.assembly import Assembly
 
 REPORT_SECONDS = 2.0
@@ -138,7 +139,8 @@ def pool_of(assembly: Assembly, workers: int | RayCluster | None) -> Pool:
     places = [devices[number % len(devices)] for number in range(workers or len(devices))]
     share = len(places) if devices == ("cpu",) else 1
     seats = [Seat(f"{place} {number}", assembly.on(place).pipeline, share) for number, place in enumerate(places)]
-    return ProcessPool(seats, assembly.recipe)
+    fallback = None if devices == ("cpu",) else Seat("CPU", replace(assembly, placement=Placement()).pipeline)
+    return ProcessPool(seats, assembly.recipe, fallback)
 
 
 def _ray_pool(assembly: Assembly, cluster: RayCluster) -> Pool:

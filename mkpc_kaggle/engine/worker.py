@@ -12,10 +12,6 @@ from mkpc_kaggle.pipeline.stages import PairWork, Pipeline, UnitResult, conclude
 from mkpc_kaggle.recipe import Recipe, Unit
 
 
-class OutOfMemoryError(Exception):
-    """A unit did not have memory enough."""
-
-
 @dataclass(frozen=True, eq=False)
 class Opened:
     """A task with its images decoded, or why they cannot be; ``seconds`` were spent waiting for them."""
@@ -52,7 +48,7 @@ class Bench:
     def match(self, job: Job, seconds: float, alive: Callable[[], None] = lambda: None) -> tuple[Matched, ...]:
         """First half of a job: no unit is begun that is expected to end later than ``seconds`` from now.
 
-        ``alive`` is called before each unit on each batch of pairs. Raises :class:`OutOfMemoryError`.
+        ``alive`` is called before each unit on each batch of pairs. Raises what :meth:`Pipeline.match` raises.
         """
         pipeline, plan = self.load(), job.plan
         deadline = time.monotonic() + seconds
@@ -98,9 +94,6 @@ def _matched(task: Task, opened: Opened, units: dict[Unit, Unit], plan: Plan) ->
     if work is None:
         return Matched(decode_seconds=opened.seconds, failure=opened.failure)
     new = work.results[len(task.results) :]
-    short = next((result for result in new if result.exhausted), None)
-    if short is not None:
-        raise OutOfMemoryError(f"{units[short.unit].name}: {short.failure}")
     results = tuple(as_written(result, units[result.unit], plan) for result in new)
     return Matched(results, work.regions, opened.seconds, work.cluster_seconds)
 

@@ -9,6 +9,7 @@ from typing import Any
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.matchers.contract import Matcher, Placement, Precision
 from mkpc_kaggle.matchers.registry import load_matcher, options_of, registry, slots_of
+from mkpc_kaggle.pipeline.failures import require_device
 from mkpc_kaggle.pipeline.stages import Pipeline
 from mkpc_kaggle.recipe import Mode, Recipe, Unit, load_recipe
 from mkpc_kaggle.weights import FoundFile, WeightStore
@@ -60,7 +61,11 @@ class Assembly:
         return replace(self, placement=replace(self.placement, device=device))
 
     def pipeline(self) -> Pipeline:
-        """A pipeline whose matchers are loaded when they are first needed."""
+        """A pipeline whose matchers are loaded when they are first needed.
+
+        Raises :class:`mkpc_kaggle.pipeline.failures.DeviceError` where nothing can be computed on the device.
+        """
+        require_device(self.placement.device)
         return Pipeline(self.recipe, self._matcher, batch=self.batch)
 
     def fingerprint(self) -> dict[str, Any]:

@@ -19,6 +19,7 @@ from mkpc_kaggle.geometry.critical_region import CriticalRegion, critical_region
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import Estimate, Matrix3, Model, estimate
 from mkpc_kaggle.matchers.contract import Colour, Matcher, MatcherSpec, Picture, encoding_bytes
+from mkpc_kaggle.pipeline.failures import Failure, failure_of, reason_of
 from mkpc_kaggle.recipe import Recipe, Unit
 
 ENCODING_CACHE_BYTES = 2 << 30
@@ -30,8 +31,7 @@ Regions = tuple[CriticalRegion, CriticalRegion]
 class UnitResult:
     """What one unit found on one pair, in image pixels, and what it cost in seconds.
 
-    ``failure`` is empty, or says why there are no matches, or why the unit ran smaller than it is written;
-    ``exhausted`` that memory was short, so that the unit may do well on fewer pairs or smaller views.
+    ``failure`` is empty, or says why there are no matches, or why the unit ran smaller than it is written.
     """
 
     unit: Unit
@@ -39,7 +39,6 @@ class UnitResult:
     encode_seconds: float = 0.0
     match_seconds: float = 0.0
     failure: str = ""
-    exhausted: bool = False
 
     @property
     def seconds(self) -> float:
@@ -91,8 +90,9 @@ class PairWork:
 class Pipeline:
     """A recipe's units, run on chunks of pairs with matchers that are loaded when first needed.
 
-    ``load(name)`` gives the matcher of that name. Views of one shape are encoded ``batch`` at a time; encodings of
-    whole images are kept in ``cache_bytes``.
+    ``load(name)`` gives the matcher of that name. Pairs are matched, and views of one shape encoded, ``batch`` at
+    a time; fewer by a unit for which memory was short, from then on. Encodings of whole images are kept in
+    ``cache_bytes``.
     """
 
     def __init__(
@@ -107,6 +107,7 @@ class Pipeline:
         self.batch = batch
         self._load = load
         self._matchers: dict[str, Matcher[Any]] = {}
+        self._batches: dict[Unit, int] = {}
         self._encodings: ByteCache[tuple[str, str, View], Any] = ByteCache(cache_bytes)
 
     def load(self) -> None:
@@ -120,7 +121,9 @@ class Pipeline:
         """Run ``units`` on every pair that has not had them: stage 1, the critical regions, stage 2.
 
         ``keep_on(unit)`` is asked before each unit on each batch of pairs; once it says no, what was found
-        so far is returned. A unit that raises has failed on its batch, with the error as its reason.
+        so far is returned. A unit that raises has failed on its batch, with the error as its reason; but errors of
+        the device, and of memory that does not suffice for a single pair, are raised: see
+        :mod:`mkpc_kaggle.pipeline.failures`.
         """
         works = list(works)
         units = list(units)
@@ -140,20 +143,32 @@ class Pipeline:
     def _run_unit(self, unit: Unit, works: list[PairWork], keep_on: Callable[[Unit], bool]) -> list[PairWork]:
         works = list(works)
         waiting = [number for number, work in enumerate(works) if not work.has(unit)]
-        for start in range(0, len(waiting), self.batch):
-            if not keep_on(unit):
-                break
-            numbers = waiting[start : start + self.batch]
-            for number, result in zip(numbers, self._run_batch(unit, [works[n] for n in numbers]), strict=True):
+        while waiting and keep_on(unit):
+            numbers = waiting[: self._batches.get(unit, self.batch)]
+            results = self._run_batch(unit, [works[number] for number in numbers])
+            if results is None:
+                self._batches[unit] = len(numbers) // 2
+                continue
+            for number, result in zip(numbers, results, strict=True):
                 works[number] = replace(works[number], results=(*works[number].results, result))
+            waiting = waiting[len(numbers) :]
         return works
 
-    def _run_batch(self, unit: Unit, works: list[PairWork]) -> list[UnitResult]:
+    def _run_batch(self, unit: Unit, works: list[PairWork]) -> list[UnitResult] | None:
+        """The results of a batch; ``None`` where memory was short and fewer pairs may fit."""
         try:
             return self._match_batch(unit, works)
         except Exception as error:  # whatever a matcher raises costs these pairs this unit, not the run
-            lost = UnitResult(unit, Matches.empty(), failure=reason_of(error), exhausted=is_out_of_memory(error))
-            return [lost for _ in works]
+            failure = failure_of(error)
+            if failure is Failure.ORDINARY:
+                lost = UnitResult(unit, Matches.empty(), failure=reason_of(error))
+                return [lost for _ in works]
+            if failure is Failure.DEVICE or len(works) == 1:
+                error.add_note(f"in {unit.name}")
+                raise
+        # Not in the handler: until it is left, the error's traceback holds the tensors of the batch.
+        release_memory()
+        return None
 
     def _match_batch(self, unit: Unit, works: list[PairWork]) -> list[UnitResult]:
         matcher = self._matcher(unit.matcher)
@@ -164,7 +179,7 @@ class Pipeline:
             for work, pair in zip(works, views, strict=True)
             for image, view in zip(work.images, pair, strict=True)
         ]
-        encodings = self._encode(unit.matcher, wanted)
+        encodings = self._encode(unit, wanted)
         encoded = time.perf_counter()
         found = matcher.match(encodings[::2], encodings[1::2])
         matched = time.perf_counter()
@@ -178,8 +193,9 @@ class Pipeline:
             for matches, pair in zip(found, views, strict=True)
         ]
 
-    def _encode(self, name: str, wanted: Sequence[tuple[Image, View]]) -> list[Any]:
-        """The encodings of views by the matcher of that name, from the cache or made now, one shape together."""
+    def _encode(self, unit: Unit, wanted: Sequence[tuple[Image, View]]) -> list[Any]:
+        """The encodings of views by the unit's matcher, from the cache or made now, one shape together."""
+        name, size = unit.matcher, self._batches.get(unit, self.batch)
         matcher = self._matcher(name)
         keys = [(name, image.name, view) for image, view in wanted]
         known = {key: self._encodings.get(key) for key in keys}
@@ -188,8 +204,8 @@ class Pipeline:
         for key in missing:
             by_shape.setdefault(key[2].padded, []).append(key)
         for alike in by_shape.values():
-            for start in range(0, len(alike), self.batch):
-                batch = alike[start : start + self.batch]
+            for start in range(0, len(alike), size):
+                batch = alike[start : start + size]
                 pictures = [picture_of(*missing[key], matcher.spec.colour) for key in batch]
                 for key, encoding in zip(batch, matcher.encode(pictures), strict=True):
                     known[key] = encoding
@@ -204,15 +220,11 @@ class Pipeline:
         return self._matchers[name]
 
 
-def reason_of(error: BaseException) -> str:
-    return f"{type(error).__name__}: {error}"
+def release_memory() -> None:
+    """Give the GPU the memory back that PyTorch keeps for later: cuBLAS and cuDNN cannot use it."""
+    import torch
 
-
-def is_out_of_memory(error: BaseException) -> bool:
-    """Whether an error of Python, of OpenCV or of PyTorch, on a CPU or a GPU, says that memory is short."""
-    # PyTorch has a type for GPUs alone; on a CPU it raises a RuntimeError, and OpenCV an error of its own.
-    told = ("OutOfMemory", "can't allocate memory", "out of memory", "Insufficient memory", "Failed to allocate")
-    return isinstance(error, MemoryError) or any(sign in reason_of(error) for sign in told)
+    torch.cuda.empty_cache()
 
 
 def views_of(unit: Unit, spec: MatcherSpec, work: PairWork) -> tuple[View, View]:

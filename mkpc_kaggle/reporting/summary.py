@@ -7,7 +7,7 @@ from statistics import mean, median
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.budget import format_duration
-from mkpc_kaggle.engine.engine import RunReport
+from mkpc_kaggle.engine.engine import Ending, RunReport
 from mkpc_kaggle.engine.jobs import Record
 from mkpc_kaggle.recipe import Unit
 
@@ -20,7 +20,34 @@ def summary(pairs: Sequence[Pair], report: RunReport, left_out: Sequence[Unit] =
     resumed = f", {report.resumed} of them from earlier runs" if report.resumed else ""
     names = [unit.name for unit in left_out]
     first = headline(records, report.ending, report.seconds) + resumed
-    return "\n".join([first, *account(pairs, records, names, report.faults)])
+    lines = [first, *account(pairs, records, names, report.faults)]
+    return "\n".join([*lines, *filter(None, [trouble(report)])])
+
+
+def trouble(report: RunReport) -> str:
+    """Why a run is no success, though its file is whole; empty if it is one.
+
+    Pairs without an F count where an error is the reason, be it that of a unit which found nothing; not where the
+    matches or the time did not suffice.
+    """
+    if report.ending is Ending.NO_WORKER:
+        return f"the run failed: {report.ending}, the faults say why; the same command goes on"
+    reached = [record for record in report.records if record.reached]
+    reasons = Counter(filter(None, map(_error, reached)))
+    if 2 * reasons.total() <= len(reached):
+        return ""
+    ((reason, count),) = reasons.most_common(1)
+    share = f"{reasons.total()} of {len(reached)} pairs"
+    return f"the run failed: errors left {share} without an F, {count} of them with this one: {reason}"
+
+
+def _error(record: Record) -> str:
+    """The error that left a pair without an F, if it was one."""
+    if not record.failure:
+        return ""
+    if not record.units:
+        return record.failure
+    return next((unit.failure for unit in record.units if unit.failure and not unit.matches), "")
 
 
 def headline(records: Sequence[Record], ending: str, seconds: float) -> str:

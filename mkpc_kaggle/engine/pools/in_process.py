@@ -6,8 +6,9 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 from mkpc_kaggle.engine.jobs import Cause, Finished, Job, Lost
-from mkpc_kaggle.engine.worker import Bench, OutOfMemoryError, estimate
-from mkpc_kaggle.pipeline.stages import Pipeline, is_out_of_memory, reason_of
+from mkpc_kaggle.engine.worker import Bench, estimate
+from mkpc_kaggle.pipeline.failures import Failure, failure_of, reason_of
+from mkpc_kaggle.pipeline.stages import Pipeline
 from mkpc_kaggle.recipe import Recipe
 
 JOBS_A_WORKER = 2
@@ -18,7 +19,8 @@ class InProcessPool:
     """Matching in one thread, F of the pairs matched before in another, decoding ahead in a third.
 
     OpenCV and torch release the interpreter's lock while they compute, so that the three overlap. A matcher
-    that never returns cannot be stopped here, nor one that brings the process down: that takes processes.
+    that never returns cannot be stopped here, nor one that brings the process down, and a device that failed
+    does not come back: that takes processes.
     """
 
     def __init__(self, make_pipeline: Callable[[], Pipeline], recipe: Recipe) -> None:
@@ -28,17 +30,19 @@ class InProcessPool:
         self._estimating = ThreadPoolExecutor(1, thread_name_prefix="estimate")
         self._back: queue.SimpleQueue[Finished | Lost] = queue.SimpleQueue()
         self._out = 0
+        self._device_failed = False
 
     @property
     def workers(self) -> int:
-        return 1
+        return int(not self._device_failed)
 
     @property
     def capacity(self) -> int:
-        return JOBS_A_WORKER
+        return JOBS_A_WORKER * self.workers
 
-    def start(self) -> None:
+    def start(self) -> str:
         self._matching.submit(self._bench.load).result()
+        return ""
 
     def submit(self, job: Job) -> None:
         self._out += 1
@@ -71,6 +75,7 @@ class InProcessPool:
             lost = lost_by(job, error)
             if lost.cause is Cause.OUT_OF_MEMORY:
                 self._bench.forget()
+            self._device_failed |= lost.cause is Cause.DEVICE
             self._back.put(lost)
 
     def _estimate(self, job: Job, matched: tuple) -> None:  # type: ignore[type-arg]
@@ -82,7 +87,9 @@ class InProcessPool:
 
 def lost_by(job: Job, error: Exception) -> Lost:
     """What an error makes of a job."""
-    if isinstance(error, OutOfMemoryError):
-        return Lost(job, Cause.OUT_OF_MEMORY, str(error))
-    cause = Cause.OUT_OF_MEMORY if is_out_of_memory(error) else Cause.RAISED
-    return Lost(job, cause, reason_of(error))
+    causes = {
+        Failure.OUT_OF_MEMORY: Cause.OUT_OF_MEMORY,
+        Failure.DEVICE: Cause.DEVICE,
+        Failure.ORDINARY: Cause.RAISED,
+    }
+    return Lost(job, causes[failure_of(error)], reason_of(error))

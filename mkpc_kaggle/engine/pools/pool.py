@@ -22,8 +22,11 @@ class Pool(Protocol):
         """How many jobs may be out: enough that no worker waits for its next one."""
         ...
 
-    def start(self) -> None:
-        """Get ready to work; raises :class:`mkpc_kaggle.errors.UserError` where that cannot be."""
+    def start(self) -> str:
+        """Get ready to work; empty, or what the user should know of it.
+
+        Raises :class:`mkpc_kaggle.errors.UserError` where that cannot be.
+        """
         ...
 
     def submit(self, job: Job) -> None:

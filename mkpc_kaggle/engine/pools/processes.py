@@ -11,16 +11,18 @@ import queue
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
 from pathlib import Path
-from typing import Any, Protocol, TypeVar, cast
+from typing import Any, TypeVar, cast
 
 from mkpc_kaggle.engine.jobs import Cause, Finished, Job, Lost, Matched
 from mkpc_kaggle.engine.pools.in_process import JOBS_A_WORKER, lost_by
+from mkpc_kaggle.engine.pools.keeper import Answer, Employer, Keeper
 from mkpc_kaggle.engine.worker import Bench, estimate
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.pipeline.stages import Pipeline
@@ -28,11 +30,13 @@ from mkpc_kaggle.recipe import Recipe
 
 START_SECONDS = 300.0
 """How long a worker may take to load its matchers; over a network's disk that is not quick."""
-MOST_STARTS = 3
-"""A worker that fails to start that many times in a row is not started again."""
 
-Answer = tuple[Matched, ...] | Lost
+WORKER_ENVIRONMENT = {"OMP_WAIT_POLICY": "PASSIVE", "GOMP_SPINCOUNT": "0"}
+"""Threads of OpenMP that wait for each other sleep. By default they spin, and keep the cores from decoding, MAGSAC
+and other processes: ``python -m benchmarks.threads``. Read once, when PyTorch loads its OpenMP library."""
+
 Heard = TypeVar("Heard")
+_environment = threading.Lock()
 
 
 @dataclass(frozen=True)
@@ -50,34 +54,15 @@ class Seat:
         return Worker(self)
 
 
-class Hired(Protocol):
-    """A worker as its keeper sees it, wherever it is."""
-
-    def load(self) -> str: ...
-
-    def do(self, job: Job) -> Answer: ...
-
-    def announce(self, paths: Iterable[Path]) -> None: ...
-
-    def stop(self) -> None: ...
-
-    def kill(self) -> None: ...
-
-
-class Employer(Protocol):
-    """Has workers made, one after the other."""
-
-    @property
-    def name(self) -> str: ...
-
-    def hire(self) -> Hired: ...
-
-
 class ProcessPool:
-    """Matching in processes started with ``spawn``; F is estimated here, in threads, while they go on matching."""
+    """Matching in processes started with ``spawn``; F is estimated here, in threads, while they go on matching.
 
-    def __init__(self, seats: Sequence[Employer], recipe: Recipe) -> None:
+    Where no worker can be started in any of the ``seats``, the work is done in ``fallback``.
+    """
+
+    def __init__(self, seats: Sequence[Employer], recipe: Recipe, fallback: Employer | None = None) -> None:
         self._recipe = recipe
+        self._fallback = fallback
         self._back: queue.SimpleQueue[Finished | Lost] = queue.SimpleQueue()
         self._out = 0
         self._take_on(seats)
@@ -90,11 +75,18 @@ class ProcessPool:
     def capacity(self) -> int:
         return JOBS_A_WORKER * self.workers
 
-    def start(self) -> None:
-        started = [keeper.start() for keeper in self._keepers]
-        failures = [future.result() for future in started]
-        if all(failures):
-            raise UserError(f"no worker could be started: {failures[0]}")
+    def start(self) -> str:
+        failures = self._start_all()
+        told = "; ".join(filter(None, failures))
+        if not all(failures):
+            return told and f"some workers could not be started: {told}"
+        if self._fallback is not None:
+            for keeper in self._keepers:
+                keeper.close()
+            self._take_on([self._fallback])
+            if not any(self._start_all()):
+                return f"no worker could be started but on the {self._fallback.name}: {told}"
+        raise UserError(f"no worker could be started: {told}")
 
     def submit(self, job: Job) -> None:
         self._out += 1
@@ -118,6 +110,11 @@ class ProcessPool:
         self._estimating.shutdown(wait=idle, cancel_futures=True)
         return idle and all(ended)
 
+    def _start_all(self) -> list[str]:
+        """Start all workers at once; for each nothing, or why it could not be started."""
+        started = [keeper.start() for keeper in self._keepers]
+        return [future.result() for future in started]
+
     def _take_on(self, seats: Sequence[Employer]) -> None:
         self._estimating = ThreadPoolExecutor(max(1, len(seats)), thread_name_prefix="estimate")
         self._keepers = [Keeper(seat, self._answered) for seat in seats]
@@ -135,96 +132,6 @@ class ProcessPool:
             self._back.put(lost_by(job, error))
 
 
-class Keeper:
-    """Starts a worker, hands it one job after the other, and starts another where it died or had to be killed."""
-
-    def __init__(self, seat: Employer, answered: Callable[[Job, Answer], None]) -> None:
-        self.seat = seat
-        self.usable = True
-        self._answered = answered
-        self._queue: queue.SimpleQueue[Job | None] = queue.SimpleQueue()
-        self._worker: Hired | None = None
-        self._busy = self._closing = False
-        self._started: Future[str] = Future()
-        self._thread = threading.Thread(target=self._run, name=f"keeper of {seat.name}", daemon=True)
-
-    def start(self) -> "Future[str]":
-        """Start the worker; empty, or why it could not be. Raises what its pipeline's maker raises for users."""
-        self._thread.start()
-        return self._started
-
-    @property
-    def jobs(self) -> int:
-        """How many it has, under way and waiting."""
-        return self._queue.qsize() + self._busy
-
-    def submit(self, job: Job) -> None:
-        worker = self._worker
-        if worker is not None:
-            worker.announce(path for task in job.tasks for path in task.pair.images)
-        self._queue.put(job)
-
-    def stop(self) -> None:
-        worker = self._worker
-        if worker is not None:
-            worker.stop()
-
-    def close(self) -> bool:
-        """Kill the worker; false where it is still being started, and will be killed then."""
-        self._closing = True
-        worker = self._worker
-        if worker is not None:
-            worker.kill()
-        self._queue.put(None)
-        if self._thread.ident is not None:
-            self._thread.join(timeout=1.0)
-        return not self._thread.is_alive()
-
-    def _run(self) -> None:
-        # Ctrl-C reaches every process of a terminal. The parent answers to it; workers inherit this mask.
-        if hasattr(signal, "pthread_sigmask"):
-            signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
-        try:
-            self._started.set_result(self._ensure())
-        except Exception as error:
-            self._started.set_exception(error)
-            self.usable = False
-        while (job := self._queue.get()) is not None:
-            self._busy = True
-            answer = self._do(job)
-            self._busy = False
-            self._answered(job, answer)
-        if self._worker is not None:
-            self._worker.kill()
-
-    def _do(self, job: Job) -> Answer:
-        try:
-            failure = self._ensure()
-        except (UserError, OSError) as error:
-            self.usable, failure = False, str(error)
-        if self._worker is None or not self.usable:
-            return Lost(job, Cause.NO_WORKER, failure)
-        answer = self._worker.do(job)
-        if isinstance(answer, Lost) and answer.cause is not Cause.RAISED:
-            self._worker.kill()  # what ran out of memory has it in pieces
-            self._worker = None
-        return answer
-
-    def _ensure(self) -> str:
-        """See to it that there is a worker; empty, or why there can be none."""
-        failure = "its last worker could not be started"
-        for _ in range(MOST_STARTS):
-            if self._worker is not None or self._closing or not self.usable:
-                break
-            self._worker = self.seat.hire()
-            failure = "closed" if self._closing else self._worker.load()
-            if failure:
-                self._worker.kill()
-                self._worker = None
-        self.usable = self._worker is not None
-        return "" if self.usable else failure
-
-
 class Worker:
     """A worker process as its keeper sees it.
 
@@ -239,7 +146,8 @@ class Worker:
         self._process: SpawnProcess = context.Process(
             target=serve, args=(seat, its_jobs, its_words), name=f"mkpc {seat.name}", daemon=True
         )
-        self._process.start()
+        with worker_environment():
+            self._process.start()
         its_jobs.close()
         its_words.close()
 
@@ -302,6 +210,21 @@ class Worker:
     def _ended(self) -> str:
         code = self._process.exitcode
         return f"signal {signal.Signals(-code).name}" if code is not None and code < 0 else f"exit status {code}"
+
+
+@contextmanager
+def worker_environment() -> Iterator[None]:
+    """A process started meanwhile has :data:`WORKER_ENVIRONMENT`, but for what the user has set; this one has not
+    (its own OpenMP library is loaded already).
+    """
+    with _environment:
+        ours = {name: value for name, value in WORKER_ENVIRONMENT.items() if name not in os.environ}
+        os.environ.update(ours)
+        try:
+            yield
+        finally:
+            for name in ours:
+                del os.environ[name]
 
 
 def serve(seat: Seat, jobs: Connection, words: Connection) -> None:

@@ -24,7 +24,8 @@ from mkpc_kaggle import __version__
 from mkpc_kaggle.data.images import Image, ImageStore, Unreadable, decode_image, read_image
 from mkpc_kaggle.engine.jobs import Cause, Job, Lost
 from mkpc_kaggle.engine.pools.cluster import RayCluster, own_signals
-from mkpc_kaggle.engine.pools.processes import START_SECONDS, Answer, ProcessPool, answer_of
+from mkpc_kaggle.engine.pools.keeper import Answer
+from mkpc_kaggle.engine.pools.processes import START_SECONDS, ProcessPool, answer_of
 from mkpc_kaggle.engine.worker import Bench
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.pipeline.assembly import Assembly
@@ -52,13 +53,13 @@ class RayPool(ProcessPool):
         self._cluster = cluster
         self._joined = False
 
-    def start(self) -> None:
+    def start(self) -> str:
         self._joined = not ray.is_initialized()
         if self._joined:
             join(self._cluster)
         floor = Floor(self._assembly)
         self._take_on([RaySeat(f"actor {number}", floor) for number, _ in enumerate(floor.places())])
-        super().start()
+        return super().start()
 
     def close(self) -> bool:
         at_rest = super().close()
