@@ -104,6 +104,22 @@ def test_a_unit_that_workers_always_fail_at_is_given_up_on_all_pairs() -> None:
     assert any(f"{SECOND.name} is given up: workers failed" in told.text for told in one.explanations)
 
 
+def test_a_pair_at_which_the_device_always_fails_is_tried_twice_alone_and_nothing_of_it_is_kept() -> None:
+    one = planner(9)
+    seen = []
+    while (plan := one.next(0.0)) is not None:
+        if 3 in plan.indices:
+            seen.append((len(plan.indices), plan.shrink))
+            assert one.lose(Lost(Job(plan, ()), Cause.DEVICE, "CUDA error"), 0.0) == []
+        else:
+            one.take(finished(plan, one), 0.0)
+    assert seen == [(8, 1.0), (4, 1.0), (2, 1.0), (1, 1.0), (1, 1.0)]
+    assert one.complete
+    assert one.records[3].failure == "left alone: the device failed: CUDA error"
+    assert one.records[3].units == ()
+    assert all(not record.lacking(THREE_UNITS.units) for record in one.records if record.index != 3)
+
+
 def test_a_job_that_no_worker_began_is_planned_again_as_it_was() -> None:
     one = planner(9)
     plan = one.next(0.0)
