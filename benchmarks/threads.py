@@ -33,8 +33,9 @@ class Setting:
     spin: bool
 
     def __str__(self) -> str:
-        waiting = "spin" if self.spin else "sleep"
-        return f"{self.processes} x {self.threads} {'thread ' if self.threads == 1 else 'threads'}, {waiting}"
+        if self.threads == 1:
+            return f"{self.processes} x 1 thread"
+        return f"{self.processes} x {self.threads} threads, {'spin' if self.spin else 'sleep'}"
 
 
 @dataclass
