@@ -398,15 +398,19 @@ def test_points_on_the_padding_are_dropped():
     assert_allclose(match.matches.points0, [[99.5 * 4.8 - 0.5, 74.5 * 4.8 - 0.5]], atol=1e-3)
 
 
-@pytest.mark.parametrize(
-    "error", [RuntimeError("out of luck"), cv2.error("no"), MemoryError("full"), ValueError()]
-)
+@pytest.mark.parametrize("error", [RuntimeError("out of luck"), cv2.error("no"), ValueError()])
 def test_a_matcher_that_raises_costs_its_unit_and_the_run_goes_on(error):
     match = own(Unit(1, "bad", 480), Unit(1, "sift", 480), Unit(2, "bad", 480), bad=Scripted(error))(*pair())
     assert [bool(result.failure) for result in match.results] == [True, False, True]
     assert match.results[0].failure == f"{type(error).__name__}: {error}"
     assert len(match.results[0].matches) == 0
     assert match.estimate.ok
+
+
+@pytest.mark.parametrize("error", [MemoryError("full"), RuntimeError("CUDA error: unspecified launch failure")])
+def test_memory_and_devices_are_no_failure_of_a_matcher(error):
+    with pytest.raises(type(error), match=str(error)):
+        own(Unit(1, "bad", 480), bad=Scripted(error))(*pair())
 
 
 def test_a_matcher_that_answers_with_too_few_results_has_failed():

@@ -105,6 +105,22 @@ def test_a_unit_that_workers_always_fail_at_is_given_up_on_all_pairs() -> None:
     assert any(f"{SECOND.name} is given up: workers failed" in told.text for told in one.explanations)
 
 
+def test_a_pair_at_which_the_device_always_fails_is_left_alone_by_this_run_only() -> None:
+    one = planner(9)
+    seen = []
+    while (job := one.next(0.0)) is not None:
+        if 3 in job.indices:
+            seen.append((len(job.indices), job.shrink))
+            assert one.lose(JobFailure(job, Cause.DEVICE, "CUDA error"), 0.0) == []
+        else:
+            one.take(finished(job, one), 0.0)
+    assert seen == [(8, 1.0), (4, 1.0), (2, 1.0), (1, 1.0), (1, 1.0)]
+    assert one.complete
+    assert one.records[3].failure == "left alone: the device failed: CUDA error"
+    assert one.records[3].units == ()
+    assert all(not record.lacking(THREE_UNITS.units) for record in one.records if record.index != 3)
+
+
 def test_a_job_that_no_worker_began_is_planned_again_as_it_was() -> None:
     one = planner(9)
     job = one.next(0.0)

@@ -60,7 +60,8 @@ class TwoStageMatcher:
         """Match two images: paths, or arrays (H, W, 3) RGB or (H, W) gray, uint8.
 
         ``model`` E needs ``intrinsics``, the camera matrices in pixels. Raises :class:`UserError` for an
-        image that cannot be read; a pair that cannot be matched is a result with ``estimate.failure``.
+        image that cannot be read; a pair that cannot be matched is a result with ``estimate.failure``. Memory that
+        is too short, and a device that fails, are raised as they are.
         """
         pair = PairMatch(images=(to_image(image0), to_image(image1)))
         (pair,) = self._pipeline.match([pair], self.recipe.units)
