@@ -4,11 +4,11 @@
         network.to("cuda:1")(image.to("cuda:1"))
 
 It works with a CPU build of PyTorch. To PyTorch's own code a tagged tensor lies on ``meta:N``, a device for which
-every build has a guard; all that Python can ask it says ``cuda:N``, and every operator comes to :meth:`DeviceDouble.run`.
+every build has a guard; all that Python can ask it says ``cuda:N``, and all operators come to :meth:`DeviceDouble.run`.
 
-What raises :class:`MixedDevices`: an operator on tensors of two devices, but for a CPU tensor of no dimensions and
+What raises :class:`MixedDevicesError`: an operator on tensors of two devices, but for a CPU tensor of no dimensions and
 for CPU indices into a tagged tensor, which a GPU takes as well; a generator of another device. ``.numpy()`` of a
-tagged tensor is the TypeError that it is on a GPU. What it cannot show: a GPU's own rounding, its memory and its speed.
+tagged tensor is the TypeError that it is on a GPU. What it cannot show: a GPU's own rounding, its memory, its speed.
 Enter it in the thread that computes; networks that were moved within it are of no use outside of it.
 """
 
@@ -28,7 +28,7 @@ WIDENED = {"softmax", "log_softmax", "exp", "log", "pow", "sum", "cumsum", "norm
 INDEXING = {"index", "index_put", "index_put_", "_index_put_impl_", "_unsafe_index"}
 
 
-class MixedDevices(RuntimeError):
+class MixedDevicesError(RuntimeError):
     """Tensors, or a tensor and a generator, of different devices met in one operator."""
 
 
@@ -216,13 +216,13 @@ class DeviceDouble(TorchDispatchMode):
         met = {one.device for one in tensors if not any(one is other for other in free)}
         if len(met) > 1:
             found = ", ".join(sorted(map(str, met)))
-            raise MixedDevices(f"{name}: expected all tensors to be on the same device, but found {found}")
+            raise MixedDevicesError(f"{name}: expected all tensors to be on the same device, but found {found}")
         return wanted or (tagged[0].device if tagged else torch.device("cpu"))
 
     def _check_generator(self, name, generator, where):
         made_for = self._generators.get(generator._cdata) if generator is not None else where
         if made_for != where:
-            raise MixedDevices(f"{name}: a generator of {made_for} for a tensor on {where}")
+            raise MixedDevicesError(f"{name}: a generator of {made_for} for a tensor on {where}")
 
 
 def untagged(value):
@@ -230,7 +230,7 @@ def untagged(value):
 
 
 class Autocast(TorchFunctionMode):
-    """What autocast for GPUs does to tagged tensors; PyTorch's own does it by their device, which to it is none."""
+    """What autocast for GPUs does to tagged tensors; PyTorch's own does it by a device that these are not on."""
 
     def __init__(self):
         super().__init__()

@@ -1,6 +1,6 @@
 """Every matcher on the device double: nothing mixes devices, and the matches are those of the CPU.
 
-``python tests/test_device_double.py`` prints the table: matcher, precision, devices, batch, and how the matches differ.
+``python tests/test_device_double.py`` prints the table: matcher, precision, devices, batch, and how matches differ.
 A new matcher is one line in ``MATCHERS``.
 """
 
@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from device_double import DeviceDouble, MixedDevices
+from device_double import DeviceDouble
 from kornia.feature import ALIKED, XFeat
 from standin import filled, scene
 from torch import nn
@@ -70,6 +70,10 @@ def make_aliked() -> ALIKED:
     return ALIKED(model_name="aliked-n16", max_num_keypoints=200, detection_threshold=0.0)
 
 
+def make_xfeat() -> XFeat:
+    return XFeat(detection_threshold=0.0)
+
+
 def make_lighter_glue() -> nn.Module:
     return lighter_glue(layers=6, threshold=0.0)
 
@@ -94,7 +98,7 @@ def aliked_matcher(placement: Placement) -> AlikedMatcher:
 
 
 def xfeat_matcher(placement: Placement) -> XFeatLighterGlueMatcher:
-    networks = (copy.deepcopy(seeded(make)) for make in (XFeat, make_lighter_glue))
+    networks = (copy.deepcopy(seeded(make)) for make in (make_xfeat, make_lighter_glue))
     return XFeatLighterGlueMatcher(*networks, XFeatLighterGlueOptions(200, 0.0), placement)
 
 
@@ -185,7 +189,7 @@ CASES = [
 QUICK = [(name, Precision.FLOAT32, 2, 1) for name in MATCHERS]
 QUICK += [(name, Precision.FLOAT16, 1, 3) for name in MATCHERS if not name.startswith("dkm")]
 SAME = {Precision.FLOAT32: 0.98, Precision.FLOAT16: 0.7, Precision.BFLOAT16: 0.5}
-"""Of the matches, at least. In half precision an operator's order of sums tells, and with DKM which matches are drawn."""
+"""Of the matches, at least. In half precision the order of sums tells; with DKM so does which are drawn."""
 
 
 @pytest.mark.parametrize(

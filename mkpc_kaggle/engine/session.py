@@ -137,7 +137,10 @@ def pool_of(assembly: Assembly, workers: int | RayCluster | None) -> Pool:
     devices = assembly.devices
     places = [devices[number % len(devices)] for number in range(workers or len(devices))]
     share = len(places) if devices == ("cpu",) else 1
-    seats = [Seat(f"{place} {number}", assembly.on(place).pipeline, share) for number, place in enumerate(places)]
+    seats = [
+        Seat(f"{place} {number}", assembly.on(place, places.count(place)).pipeline, share)
+        for number, place in enumerate(places)
+    ]
     return ProcessPool(seats, assembly.recipe)
 
 

@@ -109,7 +109,7 @@ def lighter_glue(layers: int, threshold: float) -> LightGlue:
             depth_confidence=-1,
             width_confidence=-1,
             filter_threshold=threshold,
-            flash=False,  # on a GPU kornia's would take queries, keys and values in float16, whatever the precision
+            flash=False,  # which on a GPU is float16, whatever the precision
         )
     finally:
         torch.backends.cuda.enable_flash_sdp(flash)  # kornia sets it for the whole process

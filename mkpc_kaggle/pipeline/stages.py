@@ -5,6 +5,7 @@ both stages, in image pixels, are concatenated in the recipe's order, and MAGSAC
 """
 
 import time
+import warnings
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -18,7 +19,16 @@ from mkpc_kaggle.geometry.coordinates import Box, Size, View
 from mkpc_kaggle.geometry.critical_region import CriticalRegion, critical_region
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import Estimate, Matrix3, Model, estimate
-from mkpc_kaggle.matchers.contract import Colour, Matcher, MatcherSpec, Picture, encoding_bytes
+from mkpc_kaggle.matchers.contract import (
+    Colour,
+    Matcher,
+    MatcherSpec,
+    NonFiniteError,
+    Picture,
+    detached,
+    encoding_bytes,
+)
+from mkpc_kaggle.matchers.numbers import check_finite, exact_float32
 from mkpc_kaggle.recipe import Recipe, Unit
 
 ENCODING_CACHE_BYTES = 2 << 30
@@ -91,7 +101,7 @@ class PairWork:
 class Pipeline:
     """A recipe's units, run on chunks of pairs with matchers that are loaded when first needed.
 
-    ``load(name)`` gives the matcher of that name. Views of one shape are encoded ``batch`` at a time; encodings of
+    ``load(name)`` gives the matcher of that name, ``load_float32(name)`` the same in float32, if it is not. Views of one shape are encoded ``batch`` at a time; encodings of
     whole images are kept in ``cache_bytes``.
     """
 
@@ -102,11 +112,14 @@ class Pipeline:
         *,
         batch: int = 1,
         cache_bytes: int = ENCODING_CACHE_BYTES,
+        load_float32: Callable[[str], Matcher[Any]] | None = None,
     ) -> None:
         self.recipe = recipe
         self.batch = batch
         self._load = load
+        self._load_float32 = load_float32
         self._matchers: dict[str, Matcher[Any]] = {}
+        self._notes: dict[str, str] = {}
         self._encodings: ByteCache[tuple[str, str, View], Any] = ByteCache(cache_bytes)
 
     def load(self) -> None:
@@ -150,10 +163,25 @@ class Pipeline:
 
     def _run_batch(self, unit: Unit, works: list[PairWork]) -> list[UnitResult]:
         try:
-            return self._match_batch(unit, works)
+            return self._match_finite(unit, works)
         except Exception as error:  # whatever a matcher raises costs these pairs this unit, not the run
             lost = UnitResult(unit, Matches.empty(), failure=reason_of(error), exhausted=is_out_of_memory(error))
             return [lost for _ in works]
+
+    def _match_finite(self, unit: Unit, works: list[PairWork]) -> list[UnitResult]:
+        """Where half precision does not hold a matcher's numbers, it is loaded in float32 for good."""
+        name = unit.matcher
+        try:
+            results = self._match_batch(unit, works)
+        except NonFiniteError as error:
+            if self._load_float32 is None or name in self._notes:
+                raise
+            self._notes[name] = f"{name} runs in float32, for in half precision {error}"
+            warnings.warn(self._notes[name], RuntimeWarning, stacklevel=2)
+            self._encodings = ByteCache(self._encodings.limit)
+            self._matchers[name] = self._load_float32(name)
+            results = self._match_batch(unit, works)
+        return [replace(result, failure=self._notes.get(name, "")) for result in results]
 
     def _match_batch(self, unit: Unit, works: list[PairWork]) -> list[UnitResult]:
         matcher = self._matcher(unit.matcher)
@@ -166,7 +194,8 @@ class Pipeline:
         ]
         encodings = self._encode(unit.matcher, wanted)
         encoded = time.perf_counter()
-        found = matcher.match(encodings[::2], encodings[1::2])
+        with exact_float32():
+            found = matcher.match(encodings[::2], encodings[1::2])
         matched = time.perf_counter()
         return [
             UnitResult(
@@ -191,10 +220,14 @@ class Pipeline:
             for start in range(0, len(alike), self.batch):
                 batch = alike[start : start + self.batch]
                 pictures = [picture_of(*missing[key], matcher.spec.colour) for key in batch]
-                for key, encoding in zip(batch, matcher.encode(pictures), strict=True):
+                with exact_float32():
+                    encodings = matcher.encode(pictures)
+                check_finite(f"features of {name}", list(encodings))
+                for key, encoding in zip(batch, encodings, strict=True):
                     known[key] = encoding
                     image, view = missing[key]
                     if view.crop == Box.whole(image.size):  # a crop is one pair's own: no other will ask for it
+                        known[key] = encoding = detached(encoding)
                         self._encodings.put(key, encoding, encoding_bytes(encoding))
         return [known[key] for key in keys]
 
