@@ -3,12 +3,14 @@
     with DeviceDouble(count=2):
         network.to("cuda:1")(image.to("cuda:1"))
 
-It works with a CPU build of PyTorch. To PyTorch's own code a tagged tensor lies on ``meta:N``, a device for which
-every build has a guard; all that Python can ask it says ``cuda:N``, and all operators come to :meth:`DeviceDouble.run`.
+It works with a CPU build of PyTorch. To PyTorch's own code a tagged tensor lies on ``meta:N``, for which every
+build has a guard; all that Python can ask it says ``cuda:N``, and all operators come to :meth:`DeviceDouble.run`.
 
-What raises :class:`MixedDevicesError`: an operator on tensors of two devices, but for a CPU tensor of no dimensions and
-for CPU indices into a tagged tensor, which a GPU takes as well; a generator of another device. ``.numpy()`` of a
-tagged tensor is the TypeError that it is on a GPU. What it cannot show: a GPU's own rounding, its memory, its speed.
+What raises :class:`MixedDevicesError`: an operator on tensors of two devices, but for a CPU tensor of no
+dimensions and for CPU indices into a tagged tensor, which a GPU takes as well; a generator of another device.
+``.numpy()`` of a tagged tensor is the TypeError that it is on a GPU. What it cannot show: a GPU's rounding, its
+memory, its speed.
+
 Enter it in the thread that computes; networks that were moved within it are of no use outside of it.
 """
 
@@ -95,6 +97,8 @@ class DeviceDouble(TorchDispatchMode):
         self.count, self.capability, self.memory = count, capability, memory
         self.operators = 0
         """run on tagged tensors so far"""
+        self.dtypes = set()
+        """of the tagged tensors that operators have met"""
         self._generators = {}
         self._autocast = Autocast()
         self._undo = []
@@ -173,6 +177,7 @@ class DeviceDouble(TorchDispatchMode):
             return func(*args, **kwargs)
         name = func._schema.name.removeprefix("aten::")
         self.operators += 1
+        self.dtypes |= {one.dtype for one in tagged}
         if name == "_has_compatible_shallow_copy_type":
             return False
         if name == "_fused_sdp_choice":

@@ -1,6 +1,6 @@
 """Every matcher on the device double: nothing mixes devices, and the matches are those of the CPU.
 
-``python tests/test_device_double.py`` prints the table: matcher, precision, devices, batch, and how matches differ.
+``python tests/test_device_double.py`` prints the table: matcher, precision, devices, batch, equal matches.
 A new matcher is one line in ``MATCHERS``.
 """
 

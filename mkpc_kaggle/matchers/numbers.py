@@ -42,7 +42,8 @@ def exact_float32() -> Iterator[None]:
 def check_finite(what: str, *values: Any) -> None:
     """Raises :class:`NonFiniteError` where a tensor in the values has NaN or infinity.
 
-    ``what`` names the values, which may be nested dataclasses and sequences. It costs one pass over the tensors and one wait for the device.
+    ``what`` names the values, which may be nested dataclasses and sequences. It costs one pass over the
+    tensors and one wait for the device.
     """
     import torch
 

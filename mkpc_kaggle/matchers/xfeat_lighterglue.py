@@ -98,7 +98,7 @@ def load(weights: WeightStore, options: XFeatLighterGlueOptions, placement: Plac
 
 def lighter_glue(layers: int, threshold: float) -> LightGlue:
     """The network without weights; ``threshold`` of a match's score."""
-    flash = torch.backends.cuda.flash_sdp_enabled()
+    flash = torch.backends.cuda.flash_sdp_enabled()  # type: ignore[no-untyped-call]  # torch's own
     try:
         return LightGlue(
             None,  # type: ignore[arg-type]  # no download; kornia's annotation leaves it out

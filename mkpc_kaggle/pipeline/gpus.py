@@ -12,16 +12,19 @@ from mkpc_kaggle.errors import UserError
 Capability = tuple[int, int]
 CACHE_SHARE = 0.25
 """Of a GPU's free memory, for the encodings that all workers on it keep."""
-ASK = "import json, torch; c = torch.cuda; print(json.dumps([c.get_device_capability(i) for i in range(c.device_count())]))"
+ASK = """
+import json, torch
+gpus = range(torch.cuda.device_count())
+print(json.dumps([torch.cuda.get_device_capability(gpu) for gpu in gpus]))
+"""
 
 
 def capabilities() -> list[Capability]:
-    """The compute capability of each GPU, such as (7, 5); from a process of its own, for asking makes a context."""
+    """The compute capability of each GPU, such as (7, 5); asked in a process of its own, as it makes a context."""
     told = subprocess.run([sys.executable, "-c", ASK], capture_output=True, text=True, check=False)
     if told.returncode:
-        raise UserError(
-            f"PyTorch cannot use this machine's GPUs; try --device cpu. It says: {told.stderr.strip()[-300:]}"
-        )
+        reason = told.stderr.strip()[-300:]
+        raise UserError(f"PyTorch cannot use this machine's GPUs; try --device cpu. It says: {reason}")
     return [(major, minor) for major, minor in json.loads(told.stdout.splitlines()[-1])]
 
 

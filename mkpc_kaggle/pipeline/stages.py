@@ -101,8 +101,8 @@ class PairWork:
 class Pipeline:
     """A recipe's units, run on chunks of pairs with matchers that are loaded when first needed.
 
-    ``load(name)`` gives the matcher of that name, ``load_float32(name)`` the same in float32, if it is not. Views of one shape are encoded ``batch`` at a time; encodings of
-    whole images are kept in ``cache_bytes``.
+    ``load(name)`` gives the matcher of that name, ``load_float32(name)`` the same in float32, if that is another.
+    Views of one shape are encoded ``batch`` at a time; encodings of whole images are kept in ``cache_bytes``.
     """
 
     def __init__(
@@ -224,11 +224,11 @@ class Pipeline:
                     encodings = matcher.encode(pictures)
                 check_finite(f"features of {name}", list(encodings))
                 for key, encoding in zip(batch, encodings, strict=True):
-                    known[key] = encoding
                     image, view = missing[key]
-                    if view.crop == Box.whole(image.size):  # a crop is one pair's own: no other will ask for it
-                        known[key] = encoding = detached(encoding)
-                        self._encodings.put(key, encoding, encoding_bytes(encoding))
+                    whole = view.crop == Box.whole(image.size)
+                    known[key] = detached(encoding) if whole else encoding
+                    if whole:  # a crop is one pair's own: no other will ask for it
+                        self._encodings.put(key, known[key], encoding_bytes(known[key]))
         return [known[key] for key in keys]
 
     def _matcher(self, name: str) -> Matcher[Any]:
