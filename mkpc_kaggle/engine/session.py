@@ -139,7 +139,10 @@ def pool_of(assembly: Assembly, workers: int | RayCluster | None) -> Pool:
     devices = assembly.devices
     used = [devices[number % len(devices)] for number in range(workers or len(devices))]
     share = len(used) if devices == ("cpu",) else 1
-    places = [_process_place(f"{name} {number}", assembly.on(name), share) for number, name in enumerate(used)]
+    places = [
+        _process_place(f"{name} {number}", assembly.on(name, used.count(name)), share)
+        for number, name in enumerate(used)
+    ]
     on_cpu = replace(assembly, placement=Placement())
     return Pool(places, assembly.recipe, None if devices == ("cpu",) else _process_place("CPU", on_cpu))
 

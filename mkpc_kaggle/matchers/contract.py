@@ -5,14 +5,18 @@ One contract serves sparse, semi-dense and dense networks. ``encode`` does what 
 images come back in many pairs. ``match`` does the rest.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, is_dataclass, replace
 from enum import StrEnum
 from typing import Any, Protocol, TypeVar
 
 from mkpc_kaggle.geometry.coordinates import Pixels, Size, View
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.weights import WeightStore
+
+
+class NonFiniteError(ArithmeticError):
+    """A network's numbers became infinite or NaN: in half precision they may have been too large for it."""
 
 
 class Colour(StrEnum):
@@ -137,11 +141,37 @@ Registry = Mapping[str, MatcherEntry]
 
 
 def encoding_bytes(encoding: Any) -> int:
-    """The bytes of all arrays and tensors in an encoding, nested dataclasses and tuples included."""
-    if hasattr(encoding, "nbytes"):
-        return int(encoding.nbytes)
-    if is_dataclass(encoding):
-        return sum(encoding_bytes(getattr(encoding, field.name)) for field in fields(encoding))
-    if isinstance(encoding, tuple | list):
-        return sum(map(encoding_bytes, encoding))
-    return 0
+    """The bytes that an encoding keeps alive, nested dataclasses and tuples included.
+
+    A tensor counts with all of its storage, of which it may show a part; a storage counts once.
+    """
+    return sum(dict(_allocations(encoding)).values())
+
+
+def _allocations(encoding: Any) -> Iterator[tuple[int, int]]:
+    """Where the arrays' and tensors' memory is, and its bytes."""
+    if hasattr(encoding, "untyped_storage"):
+        storage = encoding.untyped_storage()
+        yield storage.data_ptr(), storage.nbytes()
+    elif hasattr(encoding, "nbytes"):
+        yield id(encoding), int(encoding.nbytes)
+    elif is_dataclass(encoding):
+        for field in fields(encoding):
+            yield from _allocations(getattr(encoding, field.name))
+    elif isinstance(encoding, tuple | list):
+        for one in encoding:
+            yield from _allocations(one)
+
+
+def detached(encoding: Any) -> Any:
+    """The encoding with copies of those tensors that show a part of a larger storage: a batch's, of which all
+    would stay alive for one.
+    """
+    if hasattr(encoding, "untyped_storage"):
+        return encoding.clone() if encoding.untyped_storage().nbytes() > encoding.nbytes else encoding
+    if is_dataclass(encoding) and not isinstance(encoding, type):
+        parts = {field.name: detached(getattr(encoding, field.name)) for field in fields(encoding) if field.init}
+        return replace(encoding, **parts)
+    if type(encoding) in (tuple, list):
+        return type(encoding)(map(detached, encoding))
+    return encoding

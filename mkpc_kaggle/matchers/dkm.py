@@ -12,6 +12,7 @@ from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import MatcherSpec, Picture, Placement, Training
 from mkpc_kaggle.matchers.networks.dkm import DKM, DkmConfig, DkmFeatures, SamplingConfig, network_input, sample
 from mkpc_kaggle.matchers.networks.placement import placed
+from mkpc_kaggle.matchers.numbers import check_finite
 from mkpc_kaggle.weights import WeightStore, load_into
 
 
@@ -91,6 +92,7 @@ class DkmMatcher:
         warps = self._network.match(encoded0.features, encoded1.features)
         warp = torch.cat([dense.warp.reshape(-1, 4) for dense in warps])
         certainty = torch.cat([dense.certainty.flatten() for dense in warps])
+        check_finite("certainties of dkm", certainty, warp)
         # PyTorch's generator on a CPU reads 32 bits of a seed, so both digests are mixed into so many.
         seed = zlib.crc32(encoded1.digest.to_bytes(4), encoded0.digest)
         generator = torch.Generator(warp.device).manual_seed(seed)

@@ -89,20 +89,30 @@ def load(weights: WeightStore, options: XFeatLighterGlueOptions, placement: Plac
     load_into(xfeat.net, weights.load(XFEAT), unused=r"fine_matcher\.", what=XFEAT)
     tensors = {layer_name(name): tensor for name, tensor in weights.load(LIGHTERGLUE).items()}
     layers = 1 + max(int(name.split(".")[1]) for name in tensors if name.startswith("transformers."))
-    glue = LightGlue(
-        None,  # type: ignore[arg-type]  # no download; kornia's annotation leaves it out
-        input_dim=64,
-        descriptor_dim=96,
-        n_layers=layers,
-        num_heads=1,
-        depth_confidence=-1,
-        width_confidence=-1,
-        filter_threshold=options.threshold,
-    )
+    glue = lighter_glue(layers, options.threshold)
     # Without early stopping and pruning only the last layer's assignment is used.
     early = rf"token_confidence\.|confidence_thresholds|log_assignment\.(?!{layers - 1}\.)"
     load_into(glue, tensors, unused=early, what=LIGHTERGLUE)
     return XFeatLighterGlueMatcher(xfeat, glue, options, placement)
+
+
+def lighter_glue(layers: int, threshold: float) -> LightGlue:
+    """The network without weights; ``threshold`` of a match's score."""
+    flash = torch.backends.cuda.flash_sdp_enabled()  # type: ignore[no-untyped-call]  # torch's own
+    try:
+        return LightGlue(
+            None,  # type: ignore[arg-type]  # no download; kornia's annotation leaves it out
+            input_dim=64,
+            descriptor_dim=96,
+            n_layers=layers,
+            num_heads=1,
+            depth_confidence=-1,
+            width_confidence=-1,
+            filter_threshold=threshold,
+            flash=False,  # which on a GPU is float16, whatever the precision
+        )
+    finally:
+        torch.backends.cuda.enable_flash_sdp(flash)  # kornia sets it for the whole process
 
 
 def layer_name(name: str) -> str:

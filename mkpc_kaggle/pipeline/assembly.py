@@ -10,7 +10,9 @@ from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.matchers.contract import Matcher, Placement, Precision
 from mkpc_kaggle.matchers.registry import load_matcher, options_of, registry, slots_of
 from mkpc_kaggle.pipeline.failures import require_device
+from mkpc_kaggle.pipeline.gpus import capabilities, encoding_cache_bytes, gpus_of
 from mkpc_kaggle.pipeline.stages import Pipeline
+from mkpc_kaggle.pipeline.units import ENCODING_CACHE_BYTES
 from mkpc_kaggle.recipe import Mode, Recipe, Unit, load_recipe
 from mkpc_kaggle.weights import FoundFile, WeightStore
 
@@ -32,7 +34,8 @@ class Assembly:
     """All that a worker needs to build its pipeline.
 
     ``left_out`` are the units of recipe ``auto`` whose weights are missing or not permitted; ``matchers`` are
-    ready ones of the user's own. ``device`` is what the user asked for, be it here or elsewhere.
+    ready ones of the user's own. ``device`` is what the user asked for, be it here or elsewhere;
+    ``sharing``: how many workers there are on the placement's device.
     """
 
     recipe: Recipe
@@ -41,24 +44,23 @@ class Assembly:
     left_out: tuple[Unit, ...] = ()
     matchers: Mapping[str, Matcher[Any]] = field(default_factory=dict)
     device: str = AUTO
+    sharing: int = 1
 
     @property
     def devices(self) -> tuple[str, ...]:
         """The devices to work on: every GPU where the placement names none of them."""
         if self.placement.device != "cuda":
             return (self.placement.device,)
-        import torch
-
-        return tuple(f"cuda:{number}" for number in range(torch.cuda.device_count()))
+        return tuple(f"cuda:{number}" for number in gpus_of("cuda"))
 
     @property
     def batch(self) -> int:
         """How many pairs a unit takes at a time: batches pay on a GPU; on a CPU they only cost memory."""
         return CUDA_BATCH if self.placement.device.startswith("cuda") else 1
 
-    def on(self, device: str) -> "Assembly":
-        """The same on one device."""
-        return replace(self, placement=replace(self.placement, device=device))
+    def on(self, device: str, sharing: int = 1) -> "Assembly":
+        """The same on one device, which so many workers share."""
+        return replace(self, placement=replace(self.placement, device=device), sharing=sharing)
 
     def pipeline(self) -> Pipeline:
         """A pipeline whose matchers are loaded when they are first needed.
@@ -66,7 +68,15 @@ class Assembly:
         Raises :class:`mkpc_kaggle.pipeline.failures.DeviceError` where nothing can be computed on the device.
         """
         require_device(self.placement.device)
-        return Pipeline(self.recipe, self._matcher, batch=self.batch)
+        device, half = self.placement.device, self.placement.precision is not Precision.FLOAT32
+        on_gpu = device.startswith("cuda")
+        return Pipeline(
+            self.recipe,
+            self._matcher,
+            batch=self.batch,
+            cache_bytes=encoding_cache_bytes(device, self.sharing) if on_gpu else ENCODING_CACHE_BYTES,
+            load_float32=self._float32_matcher if half else None,
+        )
 
     def fingerprint(self) -> dict[str, Any]:
         """What decides the numbers that come out: the recipe, the precision and the digests of the weights."""
@@ -85,6 +95,10 @@ class Assembly:
 
     def _matcher(self, name: str) -> Matcher[Any]:
         return self.matchers.get(name) or load_matcher(self.recipe, name, self.weights, self.placement)
+
+    def _float32_matcher(self, name: str) -> Matcher[Any]:
+        exact = replace(self.placement, precision=Precision.FLOAT32)
+        return self.matchers.get(name) or load_matcher(self.recipe, name, self.weights, exact)
 
 
 def assemble(
@@ -167,12 +181,12 @@ def resolve_placement(device: str, precision: str) -> Placement:
 
 
 def fastest_precision(device: str) -> Precision:
-    """Half precision where the device has units for it."""
+    """Half precision where the device has units for it; of several GPUs, where each of them has."""
     import torch
 
     if device.startswith("cuda"):
-        has_tensor_cores = torch.cuda.get_device_capability(device) >= (7, 0)
-        return Precision.FLOAT16 if has_tensor_cores else Precision.FLOAT32
+        able_gpus = [capability >= (7, 0) for capability in capabilities()]  # with tensor cores
+        return Precision.FLOAT16 if all(able_gpus[gpu] for gpu in gpus_of(device)) else Precision.FLOAT32
     # Older versions of PyTorch do not tell; then float32 is safe.
     able: Mapping[str, Any] = getattr(torch.cpu, "get_capabilities", dict)()
     return Precision.BFLOAT16 if able.get("avx512_bf16") or able.get("amx_bf16") else Precision.FLOAT32
@@ -184,8 +198,6 @@ def resolve_device(device: str) -> str:
 
     if device == AUTO:
         return "cuda" if torch.cuda.is_available() else "cpu"
-    if device != "cpu" and not device.startswith("cuda"):
-        raise UserError(f"unknown device {device!r}; known: auto, cpu, cuda, cuda:N")
-    if device.startswith("cuda") and not torch.cuda.is_available():
-        raise UserError(f"--device {device}: this machine has no GPU that torch can use; try --device cpu")
+    if device != "cpu":
+        gpus_of(device)
     return device

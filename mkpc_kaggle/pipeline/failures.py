@@ -94,4 +94,5 @@ def require_device(device: str) -> None:
     except Exception as error:
         if failure_of(error) is Failure.OUT_OF_MEMORY:
             raise
-        raise DeviceError(f"{device} cannot be used ({reason_of(error)}); try --device cpu") from error
+        reason = reason_of(error).partition("\n")[0]
+        raise DeviceError(f"{device} cannot be used ({reason}); try --device cpu") from error

@@ -20,6 +20,7 @@ from mkpc_kaggle.matchers.networks.fine_matching import (
 )
 from mkpc_kaggle.matchers.networks.linear_attention import LinearTransformer, Masks
 from mkpc_kaggle.matchers.networks.resnet_fpn import FINE, TOP, FeatureMaps, ResNetFpn
+from mkpc_kaggle.matchers.numbers import check_finite
 
 HEADS = 8
 WINDOWS_AT_ONCE = 1024
@@ -69,6 +70,7 @@ class SemiDenseNetwork(nn.Module, ABC, Generic[Transformer]):
     ) -> SemiDenseMatches:
         """Matches of B pairs; ``masks``: (B, H/8, W/8) bool of each image, True at its content at the top left."""
         grid0, grid1 = self.transform(features0.coarse, features1.coarse, masks)
+        check_finite("coarse features", grid0, grid1)
         coarse = coarse_matches(grid0, grid1, self.similarity_scale, self.threshold, self.border, masks)
         expectation = self.refine(coarse, features0.fine, features1.fine, grid0, grid1)
         points0, points1 = (

@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.matchers.networks.layers import attention, linear
+from mkpc_kaggle.matchers.numbers import check_finite
 
 CHANNELS = 256
 HEADS = 4
@@ -178,6 +179,7 @@ class SuperGlue(nn.Module):
             return no_assignment(image0.scores, image1.scores)
         x = torch.cat([self.encoded(image0), self.encoded(image1)], dim=1)
         scores = self.score_matrix(self.final_proj(self.gnn(x, n0)), n0)
+        check_finite("scores of superglue", scores)
         log_plan = log_optimal_transport(scores, self.bin_score, self.config.sinkhorn_iterations)
         return mutual_matches(log_plan, self.config.match_threshold)
 

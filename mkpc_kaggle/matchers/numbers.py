@@ -1,0 +1,65 @@
+"""What networks may compute with: float32 that is float32, and finite numbers."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import fields, is_dataclass
+from typing import Any
+
+from mkpc_kaggle.matchers.contract import NonFiniteError
+
+
+@contextmanager
+def exact_float32() -> Iterator[None]:
+    """Within it NVIDIA GPUs multiply float32 as float32, not as TF32 with its 10 bits of mantissa.
+
+    PyTorch takes TF32 for convolutions unless told otherwise. The settings are those of the process, and are put
+    back at the end.
+    """
+    import torch
+
+    backends = torch.backends
+    if not hasattr(backends.cudnn, "conv"):  # before PyTorch 2.9
+        former = torch.get_float32_matmul_precision()
+        torch.set_float32_matmul_precision("highest")
+        cudnn = backends.cudnn
+        try:
+            with cudnn.flags(cudnn.enabled, cudnn.benchmark, deterministic=cudnn.deterministic, allow_tf32=False):
+                yield
+        finally:
+            torch.set_float32_matmul_precision(former)
+        return
+    settings: tuple[Any, ...] = (backends.cudnn.conv, backends.cuda.matmul)
+    formerly = [setting.fp32_precision for setting in settings]
+    try:
+        for setting in settings:
+            setting.fp32_precision = "ieee"
+        yield
+    finally:
+        for setting, precision in zip(settings, formerly, strict=True):
+            setting.fp32_precision = precision
+
+
+def check_finite(what: str, *values: Any) -> None:
+    """Raises :class:`NonFiniteError` where a tensor in the values has NaN or infinity.
+
+    ``what`` names the values, which may be nested dataclasses and sequences. It costs one pass over the
+    tensors and one wait for the device.
+    """
+    import torch
+
+    # A sum is infinite or NaN where an addend is; half precision adds up in float32, so that nothing overflows.
+    sums = [tensor.sum(dtype=torch.float32) for tensor in float_tensors(values)]
+    if sums and not bool(torch.stack(sums).isfinite().all()):
+        raise NonFiniteError(f"{what} are not finite")
+
+
+def float_tensors(value: Any) -> Iterator[Any]:
+    if hasattr(value, "is_floating_point"):
+        if value.is_floating_point():
+            yield value
+    elif is_dataclass(value):
+        for field in fields(value):
+            yield from float_tensors(getattr(value, field.name))
+    elif isinstance(value, tuple | list):
+        for one in value:
+            yield from float_tensors(one)

@@ -1,0 +1,258 @@
+"""What a run asks of GPUs, shown on machines without: which there are, in which precision, with how much cache."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from device_double import DeviceDouble, MixedDevicesError
+from standin import filled
+
+from mkpc_kaggle.data.images import Image
+from mkpc_kaggle.engine import session
+from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.geometry.coordinates import Size
+from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.matchers.contract import (
+    MatcherSpec,
+    NonFiniteError,
+    Placement,
+    Precision,
+    detached,
+    encoding_bytes,
+)
+from mkpc_kaggle.matchers.networks.loftr import Loftr
+from mkpc_kaggle.matchers.networks.placement import placed
+from mkpc_kaggle.matchers.networks.superglue import ImageKeypoints, SuperGlue, SuperGlueConfig
+from mkpc_kaggle.matchers.numbers import check_finite, exact_float32
+from mkpc_kaggle.matchers.xfeat_lighterglue import lighter_glue
+from mkpc_kaggle.pipeline import assembly, gpus
+from mkpc_kaggle.pipeline.assembly import assemble, fastest_precision, resolve_device
+from mkpc_kaggle.pipeline.pair import PairMatch
+from mkpc_kaggle.pipeline.stages import Pipeline
+from mkpc_kaggle.pipeline.units import ENCODING_CACHE_BYTES
+from mkpc_kaggle.recipe import Recipe, Unit
+
+UNIT = Unit(1, "own", 64)
+RECIPE = Recipe((UNIT,))
+
+
+def gpus_here(monkeypatch: pytest.MonkeyPatch, *capabilities: tuple[int, int]) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: len(capabilities))
+    monkeypatch.setattr(assembly, "capabilities", lambda: list(capabilities))
+
+
+# The double itself
+
+
+@pytest.mark.parametrize(
+    "meet",
+    [
+        lambda x: x + torch.ones(3),
+        lambda x: x + x.to("cuda:0"),
+        lambda x: torch.ones(3)[x.long()],
+        lambda x: x.exponential_(generator=torch.Generator()),
+        lambda x: torch.cat([x, torch.ones(3)]),
+    ],
+)
+def test_the_double_raises_where_devices_meet(meet: Callable[[torch.Tensor], torch.Tensor]) -> None:
+    with DeviceDouble(2), pytest.raises(MixedDevicesError):
+        meet(torch.ones(3).to("cuda:1"))
+
+
+def test_the_double_refuses_numpy_and_lets_scalars_and_copies_pass() -> None:
+    with DeviceDouble(2):
+        x = torch.ones(3, device="cuda:1")
+        with pytest.raises(TypeError, match="cuda:1"):
+            x.numpy()
+        with pytest.raises(RuntimeError, match="invalid device ordinal"):
+            x.to("cuda:2")
+        assert ((x * torch.tensor(2.0)).device, x.is_cuda) == (torch.device("cuda:1"), True)
+        assert (2 * x).cpu().numpy().tolist() == [2, 2, 2]
+    assert not torch.cuda.is_available() or torch.version.cuda
+
+
+# Which GPUs
+
+
+@pytest.mark.parametrize("device", ["cuda:2", "cuda:9"])
+def test_a_gpu_that_is_not_there_is_refused(monkeypatch: pytest.MonkeyPatch, device: str) -> None:
+    gpus_here(monkeypatch, (7, 5), (7, 5))
+    assert resolve_device("cuda:1") == "cuda:1"
+    with pytest.raises(UserError, match=f"--device {device}: this machine has only cuda:0, cuda:1"):
+        resolve_device(device)
+
+
+@pytest.mark.parametrize("device", ["cuda:", "cuda:x", "cudas", "cuda:-1", "gpu"])
+def test_a_device_of_no_known_name_is_refused(monkeypatch: pytest.MonkeyPatch, device: str) -> None:
+    gpus_here(monkeypatch, (7, 5))
+    with pytest.raises(UserError, match="unknown device"):
+        resolve_device(device)
+
+
+def test_half_precision_asks_every_gpu_that_the_run_uses(monkeypatch: pytest.MonkeyPatch) -> None:
+    gpus_here(monkeypatch, (7, 5), (6, 0))
+    assert fastest_precision("cuda") is Precision.FLOAT32
+    assert fastest_precision("cuda:0") is Precision.FLOAT16
+    assert fastest_precision("cuda:1") is Precision.FLOAT32
+
+
+def test_the_parent_of_workers_never_initialises_cuda(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse() -> None:
+        raise AssertionError("CUDA was initialised in the parent")
+
+    monkeypatch.setattr(torch.cuda, "_lazy_init", refuse)
+    gpus_here(monkeypatch, (7, 5), (7, 5))
+    made = assemble("classical", device="cuda", precision="auto")
+    assert str(made.placement) == "device cuda in float16"
+    pool = session.pool_of(made, None)
+    assert pool.workers == 2
+    pool.close()
+
+
+def test_capabilities_are_asked_of_another_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gpus, "ASK", "print('a greeting'); print([[7, 5], [8, 0]])")
+    assert gpus.capabilities() == [(7, 5), (8, 0)]
+    monkeypatch.setattr(gpus, "ASK", "raise SystemExit('driver too old')")
+    with pytest.raises(UserError, match="driver too old"):
+        gpus.capabilities()
+
+
+# The cache
+
+
+@dataclass(frozen=True, eq=False)
+class Maps:
+    coarse: torch.Tensor
+    others: tuple[torch.Tensor, ...] = ()
+
+
+def test_an_encoding_counts_the_storage_that_it_keeps_alive() -> None:
+    batch = torch.zeros(8, 4, 5)
+    assert encoding_bytes(Maps(batch[:1])) == batch.nbytes
+    assert encoding_bytes(Maps(batch[0], (batch[1], torch.zeros(3)))) == batch.nbytes + 12
+
+
+def test_a_view_of_a_batch_is_copied_as_it_lies() -> None:
+    batch = torch.rand(8, 4, 6, 5).to(memory_format=torch.channels_last)
+    whole = torch.rand(3)
+    kept = detached(Maps(batch[2:3], (whole,)))
+    assert encoding_bytes(kept) == batch.nbytes // 8 + 12
+    assert torch.equal(kept.coarse, batch[2:3]) and kept.coarse.is_contiguous(memory_format=torch.channels_last)
+    assert kept.others[0] is whole
+
+
+def test_the_cache_is_sized_by_the_memory_that_is_free_and_the_workers_on_it() -> None:
+    made = assemble("classical", device="cpu")
+    assert made.pipeline()._runner._encodings.limit == ENCODING_CACHE_BYTES
+    with DeviceDouble(2, memory=12 << 30):
+        assert made.on("cuda:1").pipeline()._runner._encodings.limit == 3 << 30
+        assert made.on("cuda:1", 3).pipeline()._runner._encodings.limit == 1 << 30
+
+
+# Numbers
+
+
+def test_lighterglue_stays_in_float32_on_a_gpu_and_leaves_the_process_alone() -> None:
+    before = torch.backends.cuda.flash_sdp_enabled()
+    torch.manual_seed(0)
+    glue = lighter_glue(2, 0.0).eval()
+    assert torch.backends.cuda.flash_sdp_enabled() is before is True
+    side = {"keypoints": torch.rand(1, 9, 2) * 50, "descriptors": torch.rand(1, 9, 64)}
+    side["image_size"] = torch.tensor([[64.0, 48.0]])
+    with DeviceDouble() as double, torch.no_grad():
+        there = {name: tensor.to("cuda:0") for name, tensor in side.items()}
+        glue.to("cuda:0")({"image0": there, "image1": there})
+    assert torch.float32 in double.dtypes
+    assert double.dtypes.isdisjoint({torch.float16, torch.bfloat16})
+
+
+def settings() -> tuple[str, str]:
+    return torch.backends.cudnn.conv.fp32_precision, torch.backends.cuda.matmul.fp32_precision
+
+
+class Own:
+    """Encodes pictures as ``value`` and matches nothing; notes how GPUs were to compute."""
+
+    spec = MatcherSpec("own", "own")
+
+    def __init__(self, value: float) -> None:
+        self.value = value
+        self.seen: list[tuple[str, str]] = []
+        self.encoded = 0
+
+    def encode(self, pictures: Any) -> list[Maps]:
+        self.seen.append(settings())
+        self.encoded += len(pictures)
+        return [Maps(torch.full((4,), self.value)) for _ in pictures]
+
+    def match(self, encodings0: Any, encodings1: Any) -> list[Matches]:
+        self.seen.append(settings())
+        return [Matches.empty() for _ in encodings0]
+
+
+def works() -> list[PairMatch]:
+    rows = np.random.default_rng(0).integers(0, 255, (3, 48, 64, 3), np.uint8)
+    images = [Image.of_array(pixels) for pixels in rows]
+    return [PairMatch(images=(images[0], other)) for other in images[1:]]
+
+
+@pytest.mark.skipif(not hasattr(torch.backends.cudnn, "conv"), reason="PyTorch before 2.9 has other names for it")
+def test_matchers_run_without_tf32_and_the_process_keeps_its_settings() -> None:
+    before, own = settings(), Own(1.0)
+    Pipeline(RECIPE, lambda name: own).match(works(), RECIPE.units)
+    assert set(own.seen) == {("ieee", "ieee")}
+    assert settings() == before
+    with pytest.raises(ZeroDivisionError), exact_float32():
+        raise ZeroDivisionError
+    assert settings() == before
+
+
+def test_features_that_are_not_finite_load_the_matcher_in_float32() -> None:
+    half, exact = Own(float("inf")), Own(1.0)
+    runner = Pipeline(RECIPE, lambda name: half, load_float32=lambda name: exact)
+    with pytest.warns(RuntimeWarning, match="own runs in float32"):
+        done = runner.match(works(), RECIPE.units)
+    assert (half.encoded, exact.encoded) == (1, 3)
+    assert {work.results[0].failure for work in done} == {
+        "own runs in float32, for in half precision features of own are not finite"
+    }
+
+
+def test_features_that_are_not_finite_in_float32_are_an_error_of_the_unit() -> None:
+    runner = Pipeline(RECIPE, lambda name: Own(float("nan")))
+    for work in runner.match(works(), RECIPE.units):
+        assert work.results[0].failure == "NonFiniteError: features of own are not finite"
+
+
+def test_finite_numbers_pass_however_large_their_sum_and_whatever_holds_them() -> None:
+    check_finite("maps", Maps(torch.full((9, 9), 65504.0, dtype=torch.float16), (torch.arange(3),)), [])
+    with pytest.raises(NonFiniteError, match="maps are not finite"):
+        check_finite("maps", [Maps(torch.zeros(2), (torch.tensor([0.0, -torch.inf]),))])
+
+
+@torch.inference_mode()
+def test_superglue_says_so_when_float16_overflows() -> None:
+    network = filled(SuperGlue(SuperGlueConfig(5)), "superglue")
+    network.final_proj.weight.data.mul_(1e6)
+    torch.manual_seed(0)
+    found = ImageKeypoints(
+        torch.rand(1, 9, 2) * 60,
+        torch.rand(1, 9),
+        torch.nn.functional.normalize(torch.rand(1, 9, 256)),
+        Size(64, 64),
+    )
+    with pytest.raises(NonFiniteError, match="superglue"):
+        placed(network, Placement(precision=Precision.FLOAT16))(found, found)
+
+
+@torch.inference_mode()
+def test_a_semi_dense_network_says_so_when_its_transformer_overflows() -> None:
+    network = placed(filled(Loftr(), "loftr"), Placement(precision=Precision.FLOAT16))
+    maps = network.encode(torch.rand(1, 1, 64, 64))
+    network.loftr_coarse.layers[0].norm2.weight.data.fill_(torch.inf)
+    with pytest.raises(NonFiniteError, match="coarse features"):
+        network.match(maps, maps)
