@@ -161,7 +161,7 @@ def _time(log: RunLog, artist: Artist) -> Iterator[object]:
         )
     if log.about.left_out:
         names = ", ".join(log.about.left_out)
-        yield element("p", f"Left out, their weights are missing or not permitted: {names}.")
+        yield element("p", f"Left out (weights missing or not permitted, or matcher unusable): {names}.")
 
 
 def _budget(log: RunLog, artist: Artist) -> Iterator[object]:

@@ -41,7 +41,9 @@ def account(
     lines += _time_lines(records)
     lines += _upgrade_lines(records)
     if left_out:
-        lines.append(f"units left out, their weights are missing or not permitted: {', '.join(left_out)}")
+        lines.append(
+            f"units left out (weights missing or not permitted, or matcher unusable): {', '.join(left_out)}"
+        )
     failed = [f"{pairs[record.index].id}: {record.failure}" for record in records if record.failure]
     lines += _list("pairs with the fallback row", failed)
     lines += _list("units that failed", unit_failures(records))
