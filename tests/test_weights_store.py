@@ -191,6 +191,7 @@ def test_an_unpacked_checkpoint_is_found_and_read(tmp_path: Path, outer: str) ->
     file = line("x.pth", (tmp_path / "x.pth").read_bytes())
     with ZipFile(tmp_path / "x.pth") as archive:
         archive.extractall(tmp_path / "input" / "someones" / outer)
+    os.utime(tmp_path / "input" / "someones" / outer / "x" / "data.pkl", (0, 0))
     weights = WeightStore([tmp_path / "input"], [file])
     found = weights.find("slot")
     assert found is not None

@@ -5,7 +5,7 @@
 
 import hashlib
 import zipfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 
@@ -21,7 +21,8 @@ def names_of(directory: Path) -> frozenset[str]:
 
 def pack(directory: Path, file: Path) -> Path:
     """Write the checkpoint as the one archive that it was, ``file``; raises ``OSError``."""
-    with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
+    # Mounted files may be dated 1970, which is before the format's first year.
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED, strict_timestamps=False) as archive:
         for path in _records(directory):
             archive.write(path, f"archive/{path.relative_to(directory).as_posix()}")
     return file
@@ -36,5 +37,5 @@ def digest_of(directory: Path) -> str:
     return f"sha256:{whole.hexdigest()}"
 
 
-def _records(directory: Path) -> Iterator[Path]:
-    return iter(sorted(path for path in directory.rglob("*") if path.is_file()))
+def _records(directory: Path) -> list[Path]:
+    return sorted(path for path in directory.rglob("*") if path.is_file())
