@@ -16,9 +16,8 @@ from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Box, Size, View
 from mkpc_kaggle.matchers.contract import Colour, Picture, Placement, Training, encoding_bytes
 from mkpc_kaggle.matchers.neighbours import mutual_neighbours
-from mkpc_kaggle.matchers.registry import load_matcher, registry
+from mkpc_kaggle.matchers.registry import load_matcher, matcher_names, spec_of
 from mkpc_kaggle.matchers.xfeat_lighterglue import layer_name
-from mkpc_kaggle.recipe import Recipe, Unit
 from mkpc_kaggle.weights import WeightStore, load_into
 
 SIZE = Size(256, 192)
@@ -62,8 +61,8 @@ def photograph():
 
 @cache
 def matcher_of(name):
-    recipe = Recipe((Unit(1, name, 320),), matchers={name: {"features": 1000}})
-    return load_matcher(recipe, name, WeightStore([WEIGHTS] if WEIGHTS.is_dir() else []), Placement())
+    options = spec_of(name, "test").options(features=1000)
+    return load_matcher(name, WeightStore([WEIGHTS] if WEIGHTS.is_dir() else []), options, Placement())
 
 
 def picture(pixels, matcher, padding=(0, 0)):
@@ -99,12 +98,12 @@ def offsets(matches, H):
 
 
 def test_the_registry_knows_the_matchers_of_the_recipes():
-    assert {"sift", "aliked", "xfeat_lighterglue"} <= registry().keys()
+    assert {"sift", "aliked", "xfeat_lighterglue"} <= set(matcher_names())
 
 
 def test_every_spec_makes_sense():
-    for name, entry in registry().items():
-        spec = entry.spec
+    for name in matcher_names():
+        spec = spec_of(name, "test")
         assert (spec.name, bool(spec.summary), spec.multiple >= 1) == (name, True, True)
         assert is_dataclass(spec.options)
         spec.options()  # every option has a default
@@ -114,7 +113,7 @@ def test_every_spec_makes_sense():
 
 @every_matcher
 def test_a_loaded_matcher_has_the_spec_of_the_registry(name):
-    assert matcher_of(name).spec is registry()[name].spec
+    assert matcher_of(name).spec is spec_of(name, "test")
 
 
 # what they find

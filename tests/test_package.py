@@ -1,5 +1,6 @@
 """``python -m mkpc_kaggle package``: what lies in the two folders, and what must not."""
 
+import io
 import json
 import subprocess
 import sys
@@ -10,18 +11,30 @@ from pathlib import Path
 from zipfile import ZipFile
 
 import pytest
-from kaggle_image import environment, pack_wheel, python_version
-from weight_files import DATA, OTHER, line, put, search_nowhere_else
+import torch
+from kaggle_image import UNPACKED, environment, pack_wheel, python_version, upload
+from weight_files import digest_of, line, put, search_nowhere_else
 
 from mkpc_kaggle.cli import main
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.package import Request, make_package
 from mkpc_kaggle.package.checkout import find_checkout
-from mkpc_kaggle.package.wheels import BUNDLED, build_wheel, bundled_requirements
-from mkpc_kaggle.weights import store
+from mkpc_kaggle.package.metadata import Image
+from mkpc_kaggle.package.wheels import BUNDLED, PYTHONS, build_wheel, install_lines, pins
+from mkpc_kaggle.weights import WeightStore, load_tensors, store
+from mkpc_kaggle.weights.manifest import read_manifest
 
+
+def checkpoint(number: float) -> bytes:
+    """A torch checkpoint, which is a zip file."""
+    stream = io.BytesIO()
+    torch.save({"a": torch.full((3,), number)}, stream)
+    return stream.getvalue()
+
+
+DATA, OTHER = checkpoint(1), checkpoint(2)
 FILES = (
-    line("free.pt", slot="free"),
+    line("free.pt", DATA, slot="free"),
     replace(line("kept.pt", OTHER, slot="kept"), licence="Magic-Leap-noncommercial"),
     line("lost.pt", b"lost", slot="lost"),
 )
@@ -43,7 +56,7 @@ def wheels(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def wanted(tmp_path: Path, wheels: Path) -> Request:
-    weights = put(put(tmp_path / "weights", "another_name.pt"), "kept.pt", OTHER)
+    weights = put(put(tmp_path / "weights", "another_name.pt", DATA), "kept.pt", OTHER)
     return Request(tmp_path / "out", "someone", (weights,), (python_version(),), wheels)
 
 
@@ -62,14 +75,72 @@ def test_the_dataset_holds_wheels_weights_and_their_licences(wanted: Request) ->
         "kornia_rs",
         "safetensors",
     }
-    assert (dataset / "free.pt").read_bytes() == DATA
-    assert "kept.pt" not in names
+    assert torch.equal(load_tensors(dataset / "free.pt.safetensors")["a"], torch.ones(3))
+    assert not [name for name in names if name.startswith("kept.pt")]
     assert [item.name for item in package.restricted] == ["kept.pt"]
     assert "MIT" in json.loads((dataset / "dataset-metadata.json").read_text())["description"]
-    assert {item.name: item.licence for item in package.dataset}["free.pt"] == "MIT"
-    assert (dataset / "requirements.txt").read_text().splitlines()[1:] == list(
-        bundled_requirements(find_checkout())
+    assert {item.name: item.licence for item in package.dataset}["free.pt.safetensors"] == "MIT"
+
+
+def test_weights_survive_the_upload_and_are_held_against_the_datasets_manifest(
+    wanted: Request, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    make_package(wanted)
+    assert not [path for path in (wanted.out / "dataset").iterdir() if path.suffix in UNPACKED]
+    mount = tmp_path / "input" / "datasets" / "someone" / "mkpc-kaggle"
+    upload(wanted.out / "dataset", mount)
+    (told,) = read_manifest(mount / "weights_manifest.txt")
+    data = (mount / "free.pt.safetensors").read_bytes()
+    assert (told.name, told.size, told.digest) == ("free.pt.safetensors", len(data), digest_of(data))
+    assert (told.licence, told.slot) == ("MIT", "free")
+    assert told.source == f"free.pt ({digest_of(DATA)}) with the same tensor names"
+    found = WeightStore([tmp_path / "input"]).find("free")
+    assert found is not None
+    assert (found.state, found.path) == ("good", mount / "free.pt.safetensors")
+    verify = ["weights", "verify", "--weights", str(tmp_path / "input")]
+    verify += ["--manifest", str(mount / "weights_manifest.txt")]
+    assert main(verify) == 0
+    assert "1 files in" in capsys.readouterr().out
+    (mount / "free.pt.safetensors").write_bytes(data[:-1])
+    assert main(verify) == 1
+    assert "truncated" in capsys.readouterr().out
+    (mount / "free.pt.safetensors").unlink()
+    assert main(verify) == 1
+    assert "missing" in capsys.readouterr().out
+
+
+def test_the_folders_keep_the_limits_of_the_kaggle_command(wanted: Request) -> None:
+    make_package(wanted)
+    dataset = json.loads((wanted.out / "dataset" / "dataset-metadata.json").read_text())
+    kernel = json.loads((wanted.out / "kernel" / "kernel-metadata.json").read_text())
+    assert 6 <= len(dataset["title"]) <= 50
+    assert 20 <= len(dataset["subtitle"]) <= 80
+    assert len(dataset["licenses"]) == 1
+    assert len(kernel["title"]) >= 5
+    assert all(path.is_file() for folder in ("dataset", "kernel") for path in (wanted.out / folder).iterdir())
+    assert kernel["machine_shape"] == "NvidiaTeslaT4"
+    assert kernel["docker_image_pinning_type"] == "latest"
+    make_package(replace(wanted, image=Image.ORIGINAL))
+    kernel = json.loads((wanted.out / "kernel" / "kernel-metadata.json").read_text())
+    assert kernel["docker_image_pinning_type"] == "original"
+
+
+def test_what_the_image_has_is_used_where_it_satisfies_even_without_a_wheel_for_its_python(
+    wanted: Request, tmp_path: Path
+) -> None:
+    make_package(wanted)
+    dataset = wanted.out / "dataset"
+    lines = (dataset / "requirements.txt").read_text().splitlines()
+    assert lines[0].startswith("mkpc-kaggle==")
+    assert not [line for line in lines[1:] if "==" in line], "ranges: what satisfies them stays"
+    assert "kornia>=0.8.3" in lines
+    for path in dataset.glob("kornia*.whl"):
+        path.unlink()
+    dry = [sys.executable, "-m", "pip", "install", "--dry-run", "--no-index", "--no-deps", "--find-links"]
+    done = subprocess.run(
+        [*dry, str(dataset), *lines[1:]], capture_output=True, text=True, check=False, env=environment()
     )
+    assert done.returncode == 0, done.stderr
 
 
 def test_the_kernel_runs_on_a_gpu_without_internet_on_the_competition_and_the_dataset(wanted: Request) -> None:
@@ -88,10 +159,12 @@ def test_the_kernel_runs_on_a_gpu_without_internet_on_the_competition_and_the_da
 def test_the_same_request_gives_the_same_bytes_and_leaves_files_alone(wanted: Request, tmp_path: Path) -> None:
     make_package(wanted)
     former = {path: path.stat().st_mtime_ns for path in wanted.out.rglob("*")}
-    (wanted.out / "dataset" / "free.pt").write_bytes(b"broken off")
+    (wanted.out / "dataset" / "free.pt.safetensors").write_bytes(b"broken off")
     make_package(wanted)
     kept = [path for path, modified in former.items() if path.is_file() and path.stat().st_mtime_ns == modified]
-    assert {path.name for path in former if path.is_file()} - {path.name for path in kept} == {"free.pt"}
+    assert {path.name for path in former if path.is_file()} - {path.name for path in kept} == {
+        "free.pt.safetensors"
+    }
     make_package(replace(wanted, out=tmp_path / "again"))
     assert contents(tmp_path / "again") == contents(wanted.out)
 
@@ -106,10 +179,11 @@ def test_a_private_package_has_all_weights_and_a_public_one_refuses_to_be_laid_o
     out = " ".join(capsys.readouterr().out.split())
     assert "private on Kaggle and share it with nobody" in out
     assert "kept.pt (Magic-Leap-noncommercial)" in out
-    assert (wanted.out / "dataset" / "kept.pt").read_bytes() == OTHER
+    kept = wanted.out / "dataset" / "kept.pt.safetensors"
+    assert torch.equal(load_tensors(kept)["a"], torch.full((3,), 2.0))
     assert main(arguments) == 2
-    assert "kept.pt. Remove it" in capsys.readouterr().err
-    (wanted.out / "dataset" / "kept.pt").unlink()
+    assert "kept.pt.safetensors. Remove it" in capsys.readouterr().err
+    kept.unlink()
     assert main(arguments) == 0
     assert "Left out" in capsys.readouterr().out
 
@@ -141,9 +215,15 @@ def test_without_sources_it_says_that_a_checkout_is_needed(
 
 
 def test_a_bundled_package_is_pinned_and_is_one_that_the_wheel_needs() -> None:
-    checkout = find_checkout()
-    assert [pin.partition("==")[0] for pin in bundled_requirements(checkout)] == list(BUNDLED)
-    assert all(pin.partition("==")[2] for pin in bundled_requirements(checkout))
+    pinned = pins(find_checkout())
+    assert [pin.partition("==")[0] for pin in pinned] == list(BUNDLED)
+    assert all(pin.partition("==")[2] for pin in pinned)
+
+
+def test_what_is_installed_is_what_our_wheel_and_the_bundled_ones_ask_for(tmp_path: Path, wheels: Path) -> None:
+    own = build_wheel(find_checkout(), tmp_path)
+    names = [line.replace("_", "-").partition(">=")[0] for line in install_lines(own, wheels.iterdir())]
+    assert sorted(names[1:]) == sorted(BUNDLED)
 
 
 def test_the_wheel_installs_in_a_bare_environment_and_is_imported_at_once(tmp_path: Path) -> None:
@@ -172,25 +252,14 @@ def test_the_wheel_holds_what_a_run_needs_and_not_the_tests(tmp_path: Path) -> N
 
 
 @pytest.mark.slow
-def test_wheels_come_from_the_index_for_other_pythons_too(wanted: Request, tmp_path: Path) -> None:
-    pins = bundled_requirements(find_checkout())
-    probe = [
-        sys.executable,
-        "-m",
-        "pip",
-        "download",
-        "--quiet",
-        "--no-deps",
-        "--dest",
-        str(tmp_path / "probe"),
-        pins[0],
-    ]
-    if subprocess.run(probe, check=False, capture_output=True).returncode != 0:
+def test_wheels_come_from_the_index_for_all_pythons(wanted: Request, tmp_path: Path) -> None:
+    probe = [sys.executable, "-m", "pip", "download", "--quiet", "--no-deps", "--dest", str(tmp_path / "probe")]
+    if subprocess.run([*probe, pins(find_checkout())[0]], check=False, capture_output=True).returncode != 0:
         pytest.skip("pip reaches no index from here")
-    request = replace(wanted, wheels=None, pythons=("3.11", "3.12"))
+    request = replace(wanted, wheels=None, pythons=PYTHONS)
     make_package(request)
     names = [path.name for path in (request.out / "dataset").glob("kornia_rs-*.whl")]
-    assert sorted(name.split("-")[2] for name in names) == ["cp311", "cp312"]
+    assert sorted(name.split("-")[2] for name in names) == ["cp311", "cp312", "cp313", "cp314"]
     written = contents(request.out)
     make_package(request)
     assert contents(request.out) == written

@@ -13,7 +13,8 @@ from mkpc_kaggle.geometry.coordinates import Box, Size, View
 from mkpc_kaggle.geometry.critical_region import MkpcConfig, Ratio
 from mkpc_kaggle.geometry.robust import Method, RobustConfig
 from mkpc_kaggle.matchers.contract import Training
-from mkpc_kaggle.matchers.registry import options_of, registry, slots_of
+from mkpc_kaggle.matchers.registry import matcher_names, spec_of
+from mkpc_kaggle.pipeline.uses import options_of, slots_of
 from mkpc_kaggle.recipe import DIRECTORY, Choice, Mode, Recipe, Unit, load_recipe, parse_recipe, recipe_names
 
 SIFT = 'units = [{ stage = 1, matcher = "sift", long_side = 640 }]\n'
@@ -40,7 +41,7 @@ def test_a_recipe_of_the_package_loads_with_options_for_every_matcher(name):
     assert recipe.name == name
     assert recipe.description
     for matcher in {*recipe.matcher_names, *recipe.matchers}:
-        assert isinstance(options_of(recipe, matcher), registry()[matcher].spec.options)
+        assert isinstance(options_of(recipe, matcher), spec_of(matcher, "test").options)
     assert set(recipe.matchers) <= set(recipe.matcher_names)
 
 
@@ -62,7 +63,7 @@ def test_every_recipe_of_the_package_says_all_it_has_in_toml():
 def test_whatever_matchers_are_left_of_recipe_auto_the_first_unit_can_sweep():
     recipe = load_recipe("auto")
     names = recipe.matcher_names
-    assert set(registry()) == set(names)
+    assert set(matcher_names()) == set(names)
     for count in range(1, len(names) + 1):
         for kept in combinations(names, count):
             remaining = recipe.only(lambda unit, kept=kept: unit.matcher in kept)

@@ -1,22 +1,23 @@
 """``submission.ipynb`` as Kaggle runs it: the dataset folder, an image without our package, and no network."""
 
 import json
-import shutil
 import subprocess
+import tomllib
 from pathlib import Path
 
 import nbformat
 import pandas as pd
 import pytest
-from kaggle_image import environment, make_image, pack_wheel, python_version
+from kaggle_image import IMAGES, Image, environment, install_image, make_image, pack_wheel, python_version, upload
 from offline_notebook import execute, needs_namespaces, pictures, printed
+from packaging.requirements import Requirement
 from shared import DATA, WEIGHTS, needs_data, needs_weights
 
 from mkpc_kaggle.data.competition import read_test_side, submission_problems
 from mkpc_kaggle.demo import DemoSet
 from mkpc_kaggle.package import Request, make_package
 from mkpc_kaggle.package.metadata import COMPETITION
-from mkpc_kaggle.package.wheels import BUNDLED
+from mkpc_kaggle.package.wheels import BUNDLED, PYTHONS
 
 NOTEBOOKS = sorted((Path(__file__).resolve().parents[1] / "notebooks").glob("*.ipynb"))
 
@@ -37,12 +38,13 @@ def wheels(tmp_path_factory: pytest.TempPathFactory) -> Path:
 class Kaggle:
     """A copy of Kaggle's directories: ``input`` with the competition and our dataset, and ``working``."""
 
-    def __init__(self, root: Path, image: Path, wheels: Path) -> None:
+    def __init__(self, root: Path, image: Path, wheels: Path | None) -> None:
         self.root = root
         self.image = image
         self._wheels = wheels
         self.working = root / "working"
-        self.test_dir = root / "input" / COMPETITION
+        self.test_dir = root / "input" / "competitions" / COMPETITION
+        self.dataset = root / "input" / "datasets" / "someone" / "mkpc-kaggle"
         self.executed = root / "executed.ipynb"
         self.working.mkdir(parents=True)
 
@@ -52,8 +54,9 @@ class Kaggle:
         (self.test_dir / "test_images").symlink_to(test_dir / "test_images")
 
     def add_dataset(self, packaged: Path, weights: tuple[Path, ...] = ()) -> None:
-        make_package(Request(packaged, "someone", weights, (python_version(),), self._wheels))
-        shutil.copytree(packaged / "dataset", self.root / "input" / "datasets" / "someone" / "mkpc-kaggle")
+        pythons = (python_version(),) if self._wheels else PYTHONS
+        make_package(Request(packaged, "someone", weights, pythons, self._wheels))
+        upload(packaged / "dataset", self.dataset)
         self.notebook = packaged / "kernel" / "submission.ipynb"
 
     def set(self, former: str, new: str) -> None:
@@ -91,13 +94,26 @@ def test_the_image_has_none_of_what_the_dataset_brings(image: Path) -> None:
     assert json.loads(out) == []
 
 
+@pytest.mark.parametrize("image", IMAGES, ids=str)
+def test_every_image_has_what_the_package_takes_from_it(image: Image) -> None:
+    project = tomllib.loads((NOTEBOOKS[0].parents[1] / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    taken = {need.name: need for need in map(Requirement, project["dependencies"])}
+    for name, _, version in (pin.partition("==") for pin in image.versions):
+        assert version in taken[name].specifier, name
+    assert image.python in PYTHONS
+
+
 @needs_namespaces
+@pytest.mark.timeout(900)  # every weight is in use: five minutes beside much other work
 def test_a_commit_run_without_network_leaves_a_submission_and_shows_pairs(
     kaggle: Kaggle, demo: DemoSet, tmp_path: Path
 ) -> None:
     """As many pairs as Kaggle shows: photographs where there are some, else rendered ones."""
     kaggle.add_test_side(DATA / "test" if DATA.is_dir() else demo.test_dir, pairs=3)
-    kaggle.add_dataset(tmp_path / "package")
+    kaggle.add_dataset(tmp_path / "package", (WEIGHTS,) if WEIGHTS.is_dir() else ())
+    mounted = tmp_path / "mounted"
+    kaggle.dataset.rename(mounted)
+    kaggle.dataset.symlink_to(mounted)
     printed = kaggle.run()
     assert kaggle.problems() == []
     assert "good: 3 rows" in printed
@@ -107,6 +123,28 @@ def test_a_commit_run_without_network_leaves_a_submission_and_shows_pairs(
     assert f"report: {kaggle.working / 'submission.html'}" in printed
     assert (kaggle.working / "submission.html").is_file()
     assert kaggle.figures() == 1 + 3, "the budget and the pairs"
+    if WEIGHTS.is_dir():
+        assert_all_weights_are_used(printed)
+
+
+def assert_all_weights_are_used(printed: str) -> None:
+    assert "3 files in" in printed
+    assert "0 of them not found or wrong" in printed
+    assert "1:xfeat_lighterglue@1024 " in printed
+    assert "1:aliked@1024 " in printed
+
+
+@needs_namespaces
+@needs_weights
+def test_the_notebook_stops_where_a_packaged_weight_did_not_arrive(
+    kaggle: Kaggle, demo: DemoSet, tmp_path: Path
+) -> None:
+    kaggle.add_test_side(demo.test_dir, pairs=3)
+    kaggle.add_dataset(tmp_path / "package", (WEIGHTS,))
+    (kaggle.dataset / "aliked-n16.safetensors").unlink()
+    with pytest.raises(AssertionError, match="not all weights of the dataset arrived"):
+        kaggle.run()
+    assert "missing" in printed(nbformat.read(kaggle.executed, as_version=4))
 
 
 @needs_namespaces
@@ -122,6 +160,29 @@ def test_the_hidden_rerun_uses_the_weights_and_the_time_and_shows_nothing(kaggle
     assert "good: 29 rows" in printed
     assert "1:xfeat_lighterglue@1024 " in printed
     assert kaggle.figures() == 0
+
+
+@needs_namespaces
+@needs_data
+@needs_weights
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize("image", IMAGES, ids=str)
+def test_the_notebook_runs_on_an_image_of_kaggles_versions(
+    image: Image, tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
+    """As the README's commands make it, wheels from the index included."""
+    directory = request.config.cache.mkdir("kaggle_images") / str(image)
+    python = install_image(image, directory)
+    if python is None:
+        pytest.skip(f"no Python {image.python} on PATH, or pip reaches no index from here")
+    kaggle = Kaggle(tmp_path / "kaggle", python, wheels=None)
+    kaggle.add_test_side(DATA / "test", pairs=3)
+    kaggle.add_dataset(tmp_path / "package", (WEIGHTS,))
+    printed = kaggle.run()
+    assert kaggle.problems() == []
+    assert f"Python {image.python}" in printed
+    assert_all_weights_are_used(printed)
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)

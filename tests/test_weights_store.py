@@ -5,6 +5,7 @@ import subprocess
 import sys
 import warnings
 from pathlib import Path
+from zipfile import ZipFile
 
 import pytest
 import torch
@@ -12,7 +13,8 @@ from shared import WEIGHTS, needs_weights
 from weight_files import DATA, OTHER, digest_of, line, put, search_nowhere_else
 
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.weights import UNVERIFIED, State, WeightStore, digests, store, tree
+from mkpc_kaggle.weights import UNVERIFIED, State, WeightStore, digests, load_tensors, store, tree
+from mkpc_kaggle.weights.convert import convert
 
 
 @pytest.fixture(autouse=True)
@@ -161,13 +163,70 @@ def test_a_name_goes_before_a_digest(tmp_path: Path) -> None:
     assert found_by(WeightStore([tmp_path], files)).name == "b.bin"
 
 
-def test_links_to_directories_are_not_followed(tmp_path: Path) -> None:
+def test_links_to_directories_are_followed_once(tmp_path: Path) -> None:
     put(tmp_path / "outside", "b.pth")
     inside = put(tmp_path / "inside" / "deep", "a.pth")
     (inside / "loop").symlink_to(tmp_path / "inside")
     (inside / "out").symlink_to(tmp_path / "outside")
     (inside / "file.pth").symlink_to(tmp_path / "outside" / "b.pth")
-    assert [path.name for path in tree.Tree(tmp_path / "inside").files] == ["a.pth", "file.pth"]
+    assert [path.name for path in tree.Tree(tmp_path / "inside").files] == ["a.pth", "file.pth", "b.pth"]
+
+
+@pytest.mark.parametrize("mount", ["weights", "datasets/someone/weights", "competitions/weights"])
+def test_weights_are_found_in_every_mount_of_kaggles(tmp_path: Path, mount: str) -> None:
+    real = put(tmp_path / "elsewhere")
+    link = tmp_path / "input" / mount
+    link.parent.mkdir(parents=True)
+    link.symlink_to(real)
+    assert found_by(WeightStore([tmp_path / "input"], [line()])) == link / "a.bin"
+
+
+# checkpoints that were unpacked
+
+
+@pytest.mark.parametrize("outer", ["x.pth", "x"])
+def test_an_unpacked_checkpoint_is_found_and_read(tmp_path: Path, outer: str) -> None:
+    tensors = {"a": torch.arange(6.0).reshape(2, 3), "b": torch.tensor([1, 2])}
+    torch.save({"state_dict": tensors, "epoch": 3}, tmp_path / "x.pth")
+    file = line("x.pth", (tmp_path / "x.pth").read_bytes())
+    with ZipFile(tmp_path / "x.pth") as archive:
+        archive.extractall(tmp_path / "input" / "someones" / outer)
+    os.utime(tmp_path / "input" / "someones" / outer / "x" / "data.pkl", (0, 0))
+    weights = WeightStore([tmp_path / "input"], [file])
+    found = weights.find("slot")
+    assert found is not None
+    assert (found.state, found.path) == (State.UNPACKED, tmp_path / "input" / "someones" / outer / "x")
+    with pytest.warns(UserWarning, match=r"x is not verified: this checkpoint was unpacked"):
+        loaded = weights.load("slot")
+    assert loaded.keys() == tensors.keys()
+    assert all(torch.equal(loaded[name], tensor) for name, tensor in tensors.items())
+    assert [one.state for one in weights.verify()] == [State.UNPACKED]
+    line_made = convert(found.path, tmp_path / "x.safetensors")
+    assert found.digest in line_made.source
+    assert load_tensors(tmp_path / "x.safetensors").keys() == tensors.keys()
+
+
+def test_an_unpacked_checkpoint_whose_record_is_cut_off_is_refused_when_it_is_read(tmp_path: Path) -> None:
+    torch.save({"a": torch.arange(6.0)}, tmp_path / "x.pth")
+    with ZipFile(tmp_path / "x.pth") as archive:
+        archive.extractall(tmp_path / "input" / "x.pth")
+    record = tmp_path / "input" / "x.pth" / "x" / "data" / "0"
+    record.write_bytes(record.read_bytes()[:-4])
+    with pytest.raises(UserError, match="cannot be read as a checkpoint"):
+        load_tensors(record.parents[1])
+
+
+def test_a_manifest_beside_weights_adds_lines_and_overrides_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    search_nowhere_else(monkeypatch, tmp_path)
+    monkeypatch.setattr(store, "manifest", lambda: (line("a.bin"),))
+    put(tmp_path / "deep", "b.bin", OTHER)
+    lines = (line("a.bin", OTHER), line("b.bin", OTHER))
+    (tmp_path / "deep" / "weights_manifest.txt").write_text("".join(f"{file.line}\n" for file in lines))
+    weights = WeightStore([tmp_path])
+    assert weights.files == (line("a.bin"), line("b.bin", OTHER))
+    assert found_by(weights).name == "b.bin"
 
 
 # what is not what it should be

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 
 from mkpc_kaggle.cli import options
 from mkpc_kaggle.cli.tables import print_table
+from mkpc_kaggle.package.metadata import Image
+from mkpc_kaggle.package.wheels import PYTHONS
 
 if TYPE_CHECKING:
     from mkpc_kaggle.package import Item
@@ -16,6 +18,7 @@ Write DIR/dataset (our wheel, the wheels that Kaggle's image may lack, weights w
 (the submission notebook), each with the metadata that the `kaggle` command reads. It runs in a checkout, on a
 machine with internet or with the wheels in a directory (--wheels). Run again, it keeps what is there already.
 
+Torch checkpoints are converted to safetensors, since Kaggle unpacks uploaded archives, which these are.
 Weights whose licences do not allow to pass them on are left out, unless --private is given.
 """
 
@@ -26,15 +29,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     options.add_weights(parser)
     parser.add_argument(
         "--python",
-        default="3.11,3.12",
+        default=",".join(PYTHONS),
         metavar="VERSIONS",
-        help="the Python versions that Kaggle's image may have (default: 3.11,3.12)",
+        help="the Python versions that Kaggle's image may have (default: %(default)s)",
     )
     parser.add_argument("--wheels", type=Path, metavar="DIR", help="take wheels from there and use no network")
     parser.add_argument(
         "--private",
         action="store_true",
         help="put weights in that must not be passed on: the dataset must stay private then",
+    )
+    parser.add_argument(
+        "--image",
+        choices=list(Image),
+        default=Image.LATEST,
+        help="Kaggle's latest image (the default), or for good the one of the kernel's first version",
     )
 
 
@@ -44,7 +53,8 @@ def run(arguments: argparse.Namespace) -> int:
     pythons = tuple(version.strip() for version in arguments.python.split(","))
     weights = tuple(arguments.weights)
     out: Path = arguments.out
-    package = make_package(Request(out, arguments.owner, weights, pythons, arguments.wheels, arguments.private))
+    wheels, private, image = arguments.wheels, arguments.private, Image(arguments.image)
+    package = make_package(Request(out, arguments.owner, weights, pythons, wheels, private, image))
     print(f"{out / 'dataset'}")
     _print_files(package.dataset)
     print(f"\n{out / 'kernel'}")

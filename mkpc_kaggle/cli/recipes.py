@@ -17,7 +17,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    from mkpc_kaggle.pipeline.assembly import missing_slots, what_is_missing
+    from mkpc_kaggle.pipeline.assembly import what_is_missing
+    from mkpc_kaggle.pipeline.uses import slots_of_recipe, unusable
     from mkpc_kaggle.recipe import load_recipe, recipe_names
     from mkpc_kaggle.weights import WeightStore
 
@@ -28,6 +29,8 @@ def run(arguments: argparse.Namespace) -> int:
         for unit in recipe.units:
             extra = "  (extra: for weak pairs, if time is left)" if unit.extra else ""
             print(f"    {unit.name}  at most {unit.max_matches}{extra}")
-        missing = missing_slots(recipe, store)
+        for one in unusable(recipe.matcher_names):
+            print(f"    {one}")
+        missing = [slot for slot in slots_of_recipe(recipe) if store.find(slot) is None]
         print(f"    missing: {what_is_missing(missing, store)}" if missing else "    all weights are there")
     return 0

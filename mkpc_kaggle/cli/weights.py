@@ -35,7 +35,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     searching = argparse.ArgumentParser(add_help=False)
     options.add_weights(searching)
     actions.add_parser("list", parents=[searching], description=_LIST).set_defaults(act=_list)
-    actions.add_parser("verify", parents=[searching], description=_VERIFY).set_defaults(act=_verify)
+    verify = actions.add_parser("verify", parents=[searching], description=_VERIFY)
+    verify.add_argument("--manifest", type=Path, metavar="FILE", help="is every file of this manifest there?")
+    verify.set_defaults(act=_verify)
 
     locate = actions.add_parser("locate", parents=[searching], description=_LOCATE)
     locate.add_argument("name", metavar="NAME|SLOT", help="a file or a slot that `list` names")
@@ -59,7 +61,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _list(arguments: argparse.Namespace) -> int:
-    from mkpc_kaggle.pipeline.uses import matchers_with, recipes_with
+    from mkpc_kaggle.matchers.registry import matcher_names
+    from mkpc_kaggle.pipeline.uses import matchers_with, recipes_with, unusable
     from mkpc_kaggle.weights import WeightStore
 
     store = WeightStore(arguments.weights)
@@ -78,12 +81,16 @@ def _list(arguments: argparse.Namespace) -> int:
             uses += [f"recipe {name}" for name in recipes_with(slot)]
             names = " or ".join(file.name for file in alternatives)
             print(f"missing: {slot} ({names}), for {', '.join(uses) or 'no matcher of this version'}")
+    for one in unusable(matcher_names()):
+        print(one)
     return 0
 
 
 def _verify(arguments: argparse.Namespace) -> int:
     from mkpc_kaggle.weights import WeightStore
 
+    if arguments.manifest:
+        return _verify_manifest(arguments)
     store = WeightStore(arguments.weights)
     found = store.verify()
     if not found:
@@ -94,6 +101,24 @@ def _verify(arguments: argparse.Namespace) -> int:
     wrong = sum(not one.state.usable for one in found)
     print(f"{len(found)} files, {wrong} wrong")
     return 1 if wrong else 0
+
+
+def _verify_manifest(arguments: argparse.Namespace) -> int:
+    from mkpc_kaggle.weights import WeightStore
+    from mkpc_kaggle.weights.manifest import read_manifest
+
+    store = WeightStore(arguments.weights, read_manifest(arguments.manifest))
+    rows, absent = [("file", "state", "path", "note")], 0
+    for file in store.files:
+        search = store.search([file])
+        for one in (search.found,) if search.found else search.refused:
+            rows.append((file.name, str(one.state), str(one.path), one.note))
+        if not search.found and not search.refused:
+            rows.append((file.name, "missing", "", f"searched {store.searched}"))
+        absent += search.found is None
+    print_table(rows)
+    print(f"{len(store.files)} files in {arguments.manifest}, {absent} of them not found or wrong")
+    return 1 if absent else 0
 
 
 def _locate(arguments: argparse.Namespace) -> int:

@@ -5,7 +5,7 @@ One contract serves sparse, semi-dense and dense networks. ``encode`` does what 
 images come back in many pairs. ``match`` does the rest.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from enum import StrEnum
 from typing import Any, Protocol, TypeVar
@@ -137,7 +137,15 @@ class MatcherEntry:
     load: Loader
 
 
-Registry = Mapping[str, MatcherEntry]
+@dataclass(frozen=True)
+class Unusable:
+    """A matcher that cannot be imported on this machine, and why."""
+
+    name: str
+    reason: str
+
+    def __str__(self) -> str:
+        return f"matcher {self.name} cannot be used here ({self.reason})"
 
 
 def encoding_bytes(encoding: Any) -> int:

@@ -18,10 +18,6 @@ class Checkout:
         return self.root / "LICENSE"
 
     @property
-    def weights_manifest(self) -> Path:
-        return self.root / "weights_manifest.txt"
-
-    @property
     def pins(self) -> Path:
         """The versions of all dependencies that the tests run with, ``name==version`` a line."""
         return self.root / "requirements-dev.txt"

@@ -3,8 +3,18 @@
 import json
 import re
 from collections.abc import Iterable
+from enum import StrEnum
 
 from mkpc_kaggle.errors import UserError
+
+
+class Image(StrEnum):
+    """Which image of Kaggle's the kernel runs on, by the words of ``docker_image_pinning_type``."""
+
+    LATEST = "latest"
+    ORIGINAL = "original"
+    """the one of the kernel's first version, in later versions too"""
+
 
 COMPETITION = "image-matching-challenge-2022"
 DATASET_SLUG = "mkpc-kaggle"
@@ -37,8 +47,11 @@ def dataset_metadata(owner: str, licences: Iterable[str]) -> str:
     )
 
 
-def kernel_metadata(owner: str, notebook: str) -> str:
-    """``kernel-metadata.json``: GPU on, internet off, the competition and our dataset attached."""
+def kernel_metadata(owner: str, notebook: str, image: Image) -> str:
+    """``kernel-metadata.json``: GPU on, internet off, the competition and our dataset attached.
+
+    The machine is named: current torch builds have no kernels for the P100.
+    """
     return _json(
         {
             "id": f"{owner}/{KERNEL_SLUG}",
@@ -48,6 +61,8 @@ def kernel_metadata(owner: str, notebook: str) -> str:
             "kernel_type": "notebook",
             "is_private": True,
             "enable_gpu": True,
+            "machine_shape": "NvidiaTeslaT4",
+            "docker_image_pinning_type": image,
             "enable_internet": False,
             "competition_sources": [COMPETITION],
             "dataset_sources": [f"{owner}/{DATASET_SLUG}"],

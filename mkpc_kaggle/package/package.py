@@ -7,10 +7,11 @@ from tempfile import TemporaryDirectory
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.package.checkout import Checkout, find_checkout
 from mkpc_kaggle.package.folder import Item, fill, refuse_strangers
-from mkpc_kaggle.package.metadata import check_owner, dataset_metadata, kernel_metadata
+from mkpc_kaggle.package.metadata import Image, check_owner, dataset_metadata, kernel_metadata
 from mkpc_kaggle.package.weights import Chosen, choose_weights
-from mkpc_kaggle.package.wheels import build_wheel, bundled_requirements, collect_wheels, licence_of
+from mkpc_kaggle.package.wheels import PYTHONS, build_wheel, collect_wheels, install_lines, licence_of, pins
 from mkpc_kaggle.weights import WeightStore
+from mkpc_kaggle.weights.manifest import MANIFEST
 
 
 @dataclass(frozen=True)
@@ -18,15 +19,16 @@ class Request:
     """``owner`` is a user of Kaggle; ``pythons`` are versions such as ``3.11``.
 
     ``wheels`` is a directory to take wheels from, instead of pip's index. ``private`` puts weights in that must
-    not be passed on.
+    not be passed on. ``image`` says which of its images Kaggle should run the kernel on.
     """
 
     out: Path
     owner: str
     weights: tuple[Path, ...] = ()
-    pythons: tuple[str, ...] = ("3.11", "3.12")
+    pythons: tuple[str, ...] = PYTHONS
     wheels: Path | None = None
     private: bool = False
+    image: Image = Image.LATEST
 
 
 @dataclass(frozen=True)
@@ -48,10 +50,10 @@ def make_package(request: Request) -> Package:
     if request.wheels is not None and not request.wheels.is_dir():
         raise UserError(f"--wheels {request.wheels}: no such directory")
     checkout = find_checkout()
-    chosen = choose_weights(WeightStore(request.weights), checkout, private=request.private)
     dataset, kernel = request.out / "dataset", request.out / "kernel"
     with TemporaryDirectory(prefix="mkpc-") as temporary:
         staging = Path(temporary)
+        chosen = choose_weights(WeightStore(request.weights), checkout, staging, private=request.private)
         dataset_items = _dataset_items(request, checkout, chosen, staging)
         kernel_items = _kernel_items(request, checkout, staging)
         refuse_strangers(dataset, dataset_items)
@@ -63,20 +65,17 @@ def make_package(request: Request) -> Package:
 
 def _dataset_items(request: Request, checkout: Checkout, chosen: Chosen, staging: Path) -> tuple[Item, ...]:
     own, others = staging / "own", staging / "others"
-    requirements = bundled_requirements(checkout)
     wheel = build_wheel(checkout, own)
     wheels = collect_wheels(
-        requirements, request.pythons, others, kept=request.out / "dataset", wheels=request.wheels
+        pins(checkout), request.pythons, others, kept=request.out / "dataset", wheels=request.wheels
     )
-    own_version = wheel.name.split("-")[1]
-    lines = [f"mkpc-kaggle=={own_version}", *requirements]
     licences = [item.licence for item in chosen.items]
     return (
         _text(staging, "dataset-metadata.json", dataset_metadata(request.owner, licences)),
         *(Item(path.name, path, licence_of(path)) for path in (wheel, *wheels)),
-        _text(staging, "requirements.txt", "\n".join(lines) + "\n"),
+        _text(staging, "requirements.txt", "\n".join(install_lines(wheel, wheels)) + "\n"),
         Item("LICENSE", checkout.licence),
-        Item("weights_manifest.txt", checkout.weights_manifest),
+        _text(staging, MANIFEST, chosen.manifest),
         *chosen.licence_texts,
         *chosen.items,
     )
@@ -85,7 +84,7 @@ def _dataset_items(request: Request, checkout: Checkout, chosen: Chosen, staging
 def _kernel_items(request: Request, checkout: Checkout, staging: Path) -> tuple[Item, ...]:
     notebook = checkout.submission_notebook
     return (
-        _text(staging, "kernel-metadata.json", kernel_metadata(request.owner, notebook.name)),
+        _text(staging, "kernel-metadata.json", kernel_metadata(request.owner, notebook.name, request.image)),
         Item(notebook.name, notebook),
     )
 

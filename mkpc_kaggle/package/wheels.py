@@ -5,6 +5,7 @@ import subprocess
 import sys
 import zipfile
 from collections.abc import Iterable, Sequence
+from email.message import Message
 from email.parser import Parser
 from importlib.util import find_spec
 from pathlib import Path
@@ -12,17 +13,35 @@ from pathlib import Path
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.package.checkout import Checkout
 
-BUNDLED = ("kornia", "kornia-rs", "safetensors")
-"""What of our dependencies, and of theirs, Kaggle's image may lack or have in a version that nobody tested here.
+BUNDLED = (
+    "kornia",
+    "kornia-rs",
+    "safetensors",
+)
+"""What of our dependencies, and of theirs, Kaggle's image may lack or have in a version that does not do.
 The others (torch, numpy, scipy, pandas, scikit-learn, OpenCV, matplotlib, tqdm) are the image's own."""
+PYTHONS = ("3.11", "3.12", "3.13", "3.14")
+"""What Kaggle's images have, pinned older ones included, and what they may have next."""
 PLATFORMS = ("manylinux_2_28_x86_64", "manylinux_2_17_x86_64", "manylinux2014_x86_64")
 
 
-def bundled_requirements(checkout: Checkout) -> tuple[str, ...]:
-    """``name==version`` of each bundled dependency, the version being the one that the tests run with."""
+def pins(checkout: Checkout) -> tuple[str, ...]:
+    """``name==version`` of each bundled package, the version being the one that the tests run with."""
     lines = checkout.pins.read_text(encoding="utf-8").splitlines()
     pinned = dict(_pin(line) for line in lines if line and not line.startswith("#"))
     return tuple(f"{name}=={pinned[name]}" for name in BUNDLED)
+
+
+def install_lines(own: Path, wheels: Iterable[Path]) -> tuple[str, ...]:
+    """What the notebook lets pip install: our wheel, and what it and the others ask of the bundled packages.
+
+    These are ranges: what an image has within them stays, whether there is a wheel for its Python or not.
+    """
+    version = _metadata(own)["Version"]
+    asked = (line for wheel in (own, *wheels) for line in _metadata(wheel).get_all("Requires-Dist", []))
+    plain = (line.partition(";")[0].strip() for line in asked if "extra ==" not in line)
+    bundled = (line for line in plain if _normal(re.split(r"[^A-Za-z0-9._-]", line, maxsplit=1)[0]) in BUNDLED)
+    return (f"mkpc-kaggle=={version}", *sorted(set(bundled)))
 
 
 def build_wheel(checkout: Checkout, directory: Path) -> Path:
@@ -62,12 +81,16 @@ def collect_wheels(
 
 def licence_of(wheel: Path) -> str:
     """What a wheel says of its licence, which it has inside."""
-    with zipfile.ZipFile(wheel) as archive:
-        (name,) = (name for name in archive.namelist() if re.fullmatch(r"[^/]+\.dist-info/METADATA", name))
-        headers = Parser().parsestr(archive.read(name).decode())
+    headers = _metadata(wheel)
     classifiers = [text.rpartition(" :: ")[2] for text in headers.get_all("Classifier", []) if "License" in text]
     named = [headers["License-Expression"], headers["License"], *classifiers]
     return next(filter(None, named), "see its dist-info/licenses")
+
+
+def _metadata(wheel: Path) -> Message:
+    with zipfile.ZipFile(wheel) as archive:
+        (name,) = (name for name in archive.namelist() if re.fullmatch(r"[^/]+\.dist-info/METADATA", name))
+        return Parser().parsestr(archive.read(name).decode())
 
 
 def _download(requirements: Sequence[str], python: str, directory: Path, source: Sequence[str | Path]) -> str:
@@ -88,4 +111,9 @@ def _pip(*arguments: str | Path) -> str:
 
 def _pin(line: str) -> tuple[str, str]:
     name, _, version = line.strip().partition("==")
-    return re.sub(r"[-_.]+", "-", name).lower(), version
+    return _normal(name), version
+
+
+def _normal(name: str) -> str:
+    """A package's name as the index compares it."""
+    return re.sub(r"[-_.]+", "-", name).lower()

@@ -8,13 +8,15 @@ from typing import Any
 
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.matchers.contract import Matcher, Placement, Precision
-from mkpc_kaggle.matchers.registry import load_matcher, options_of, registry, slots_of
+from mkpc_kaggle.matchers.registry import load_matcher, spec_of
 from mkpc_kaggle.pipeline.failures import require_device
 from mkpc_kaggle.pipeline.gpus import capabilities, encoding_cache_bytes, gpus_of
 from mkpc_kaggle.pipeline.stages import Pipeline
 from mkpc_kaggle.pipeline.units import ENCODING_CACHE_BYTES
+from mkpc_kaggle.pipeline.uses import options_of, slots_of, unusable
 from mkpc_kaggle.recipe import Mode, Recipe, Unit, load_recipe
 from mkpc_kaggle.weights import FoundFile, WeightStore
+from mkpc_kaggle.weights.notices import warn_once
 
 AUTO = "auto"
 CUDA_BATCH = 8
@@ -33,7 +35,7 @@ class Licence(StrEnum):
 class Assembly:
     """All that a worker needs to build its pipeline.
 
-    ``left_out`` are the units of recipe ``auto`` whose weights are missing or not permitted; ``matchers`` are
+    ``left_out`` are the units of recipe ``auto`` that cannot run here, or not with these weights; ``matchers`` are
     ready ones of the user's own. ``device`` is what the user asked for, be it here or elsewhere;
     ``sharing``: how many workers there are on the placement's device.
     """
@@ -94,11 +96,14 @@ class Assembly:
         return {slot: file for slot, file in found.items() if file is not None}
 
     def _matcher(self, name: str) -> Matcher[Any]:
-        return self.matchers.get(name) or load_matcher(self.recipe, name, self.weights, self.placement)
+        return self._placed(name, self.placement)
 
     def _float32_matcher(self, name: str) -> Matcher[Any]:
-        exact = replace(self.placement, precision=Precision.FLOAT32)
-        return self.matchers.get(name) or load_matcher(self.recipe, name, self.weights, exact)
+        return self._placed(name, replace(self.placement, precision=Precision.FLOAT32))
+
+    def _placed(self, name: str, placement: Placement) -> Matcher[Any]:
+        own = self.matchers.get(name)
+        return own or load_matcher(name, self.weights, options_of(self.recipe, name), placement)
 
 
 def assemble(
@@ -113,13 +118,19 @@ def assemble(
 ) -> Assembly:
     """Everything checked before any work: recipe, options, licences, weights and their digests, device, precision.
 
-    Recipe ``auto`` drops the units whose weights are missing or not permitted; for any other, such weights raise
-    :class:`UserError`, as do unknown names and damaged files.
+    Recipe ``auto`` drops the units whose matcher cannot be imported here, with a warning, and those whose weights
+    are missing or not permitted; for any other recipe these raise :class:`UserError`, as do unknown names and
+    damaged files.
     """
     own = matchers or {}
     store = WeightStore(weights)
-    wanted = load_recipe(recipe) if isinstance(recipe, str) else recipe
-    for name in {*wanted.matcher_names, *wanted.matchers} - own.keys():
+    whole = load_recipe(recipe) if isinstance(recipe, str) else recipe
+    broken = unusable(not_own(whole.matcher_names, own)) if recipe == AUTO else ()
+    for one in broken:
+        warn_once(f"recipe auto does without it: {one}")
+    unusable_names = {one.name for one in broken}
+    wanted = whole.only(lambda unit: unit.matcher not in unusable_names)
+    for name in sorted({*wanted.matcher_names, *wanted.matchers} - own.keys() - unusable_names):
         options_of(wanted, name)
     refused = restricted(wanted, store, own) if licence is Licence.PERMISSIVE else {}
     if refused and recipe != AUTO:
@@ -136,7 +147,7 @@ def assemble(
         )
     lacking = {n for n in not_own(wanted.matcher_names, own) if not set(missing).isdisjoint(slots_of(wanted, [n]))}
     chosen = wanted.only(lambda unit: unit.matcher not in lacking | refused.keys())
-    left_out = tuple(unit for unit in wanted.units if unit not in chosen.units)
+    left_out = tuple(unit for unit in whole.units if unit not in chosen.units)
     return Assembly(chosen.in_mode(mode), store, resolve_placement(device, precision), left_out, own, device)
 
 
@@ -162,7 +173,10 @@ def licences_of(recipe: Recipe, name: str, store: WeightStore, own: Mapping[str,
     if name in own:
         return set(own[name].spec.licences)
     found = [store.find(slot) for slot in slots_of(recipe, [name])]
-    return {*registry()[name].spec.licences, *(weights.file.licence for weights in found if weights)}
+    return {
+        *spec_of(name, f"recipe {recipe.name!r}").licences,
+        *(weights.file.licence for weights in found if weights),
+    }
 
 
 def what_is_missing(slots: Iterable[str], store: WeightStore) -> str:

@@ -106,7 +106,9 @@ def _time(log: RunLog, artist: Artist) -> Iterator[Block]:
     if rows:
         yield Table(("unit (means)", "pairs", "matches", "inliers", "seconds"), rows)
     if log.about.left_out:
-        yield Text(f"Left out, their weights are missing or not permitted: {', '.join(log.about.left_out)}.")
+        yield Text(
+            f"Left out (weights missing or not permitted, or matcher unusable): {', '.join(log.about.left_out)}."
+        )
 
 
 def _budget(log: RunLog, artist: Artist) -> Iterator[Block]:

@@ -102,7 +102,8 @@ def _troubles(tables: RunTables, left_out: Sequence[str], faults: Sequence[str])
     """What was left out, and what failed."""
     lines = []
     if left_out:
-        lines.append(f"units left out, their weights are missing or not permitted: {', '.join(left_out)}")
+        reasons = "weights missing or not permitted, or matcher unusable"
+        lines.append(f"units left out ({reasons}): {', '.join(left_out)}")
     failed = tables.failed
     lines += _list("pairs with the fallback row", list(failed["id"] + ": " + failed["failure"]))
     lines += _list("units that failed", unit_failures(tables))

@@ -5,10 +5,12 @@ import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from pickle import UnpicklingError
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.weights.inert import load_inert
+from mkpc_kaggle.weights.unpacked import pack
 
 if TYPE_CHECKING:
     import torch
@@ -18,6 +20,7 @@ if TYPE_CHECKING:
 def load_tensors(path: Path) -> "dict[str, torch.Tensor]":
     """Tensors by name, on the CPU, from a safetensors file or a torch checkpoint; nothing in the file is executed.
 
+    ``path`` may be the directory into which a torch checkpoint was unpacked (``NAME/NAME`` on Kaggle).
     A training checkpoint keeps them under ``state_dict``; what lies beside them there is left out. Raises
     :class:`UserError` for a file that cannot be read, or whose table of tensors holds anything else.
     """
@@ -57,6 +60,9 @@ def load_into(
 
 
 def _load_table(path: Path) -> Mapping[Any, Any]:
+    if path.is_dir():
+        with TemporaryDirectory(prefix="mkpc-") as temporary:
+            return _load_table(pack(path, Path(temporary) / "checkpoint.pt"))
     if path.suffix == ".safetensors":
         from safetensors.torch import load_file
 

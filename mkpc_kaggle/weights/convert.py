@@ -6,6 +6,7 @@ from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.weights.checkpoint import load_tensors
 from mkpc_kaggle.weights.digests import file_digests
 from mkpc_kaggle.weights.manifest import UNVERIFIED, WeightFile, manifest
+from mkpc_kaggle.weights.unpacked import digest_of, names_of
 
 
 def convert(source: Path, target: Path) -> WeightFile:
@@ -32,9 +33,24 @@ def convert(source: Path, target: Path) -> WeightFile:
 
 
 def _line(source: Path, target: Path) -> WeightFile:
-    made, origin = file_digests(target), file_digests(source)
-    known = next((file for file in manifest() if origin.have(file.digest)), None) or next(
-        (file for file in manifest() if (file.name, file.digest) == (source.name, UNVERIFIED)), None
-    )
+    made = file_digests(target)
+    digest = digest_of(source) if source.is_dir() else file_digests(source).sha256
+    known = next(filter(None, (_known_by_digest(source), _known_by_name(source))), None)
     licence, slot, name = (known.licence, known.slot, known.name) if known else ("?", "?", source.name)
-    return WeightFile(target.name, made.size, made.sha256, licence, slot, f"{name} with the same tensor names")
+    return WeightFile(
+        target.name, made.size, made.sha256, licence, slot, f"{name} ({digest}) with the same tensor names"
+    )
+
+
+def _known_by_digest(source: Path) -> WeightFile | None:
+    if source.is_dir():
+        return None
+    origin = file_digests(source)
+    return next((file for file in manifest() if origin.have(file.digest)), None)
+
+
+def _known_by_name(source: Path) -> WeightFile | None:
+    """The line that names the file and has no digest, or that names what was unpacked into the directory."""
+    if source.is_dir():
+        return next((file for file in manifest() if names_of(source) & {file.name, Path(file.name).stem}), None)
+    return next((file for file in manifest() if (file.name, file.digest) == (source.name, UNVERIFIED)), None)

@@ -9,6 +9,7 @@ from pathlib import Path
 from mkpc_kaggle.weights.digests import Digests, file_digests
 from mkpc_kaggle.weights.manifest import UNVERIFIED, WeightFile
 from mkpc_kaggle.weights.notices import warn_once
+from mkpc_kaggle.weights.unpacked import digest_of
 
 
 class State(StrEnum):
@@ -19,6 +20,8 @@ class State(StrEnum):
     """another name, but the bytes of a file of the manifest: as good"""
     UNVERIFIED = "unverified"
     """the manifest has no digest for it"""
+    UNPACKED = "unpacked"
+    """a checkpoint that was unpacked into a directory: readable, but its file's digest is gone"""
     TRUNCATED = "truncated"
     SWAPPED = "another file"
     """the right name, other bytes"""
@@ -26,12 +29,15 @@ class State(StrEnum):
 
     @property
     def usable(self) -> bool:
-        return self in (State.GOOD, State.RENAMED, State.UNVERIFIED)
+        return self in (State.GOOD, State.RENAMED, State.UNVERIFIED, State.UNPACKED)
 
 
 @dataclass(frozen=True)
 class FoundFile:
-    """``digest`` is ``sha256:<hex>`` of the bytes, empty for an unreadable file; ``note`` explains the state."""
+    """``digest`` is ``sha256:<hex>`` of the bytes, empty for an unreadable file; ``note`` explains the state.
+
+    ``path`` is a directory where the state is ``UNPACKED``.
+    """
 
     file: WeightFile
     path: Path
@@ -50,6 +56,19 @@ def examine(path: Path, file: WeightFile, files: Iterable[WeightFile]) -> FoundF
         return FoundFile(file, path, State.UNREADABLE, "", f"cannot be read: {error.strerror}")
     state, note = _judge(digests, file, files)
     return FoundFile(file, path, state, digests.sha256, note)
+
+
+def examine_unpacked(directory: Path, file: WeightFile) -> FoundFile:
+    """A directory into which ``file``, by its name, was unpacked."""
+    try:
+        digest = digest_of(directory)
+    except OSError as error:
+        return FoundFile(file, directory, State.UNREADABLE, "", f"cannot be read: {error.strerror}")
+    note = (
+        "this checkpoint was unpacked into a directory, as Kaggle does; it is read from there, but cannot be held "
+        "against the manifest's digest. Upload it as safetensors (python -m mkpc_kaggle weights convert)"
+    )
+    return FoundFile(file, directory, State.UNPACKED, digest, note)
 
 
 def recognise(path: Path, file: WeightFile) -> FoundFile | None:

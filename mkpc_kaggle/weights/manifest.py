@@ -16,6 +16,7 @@ from pathlib import Path
 
 from mkpc_kaggle.errors import UserError
 
+MANIFEST = "weights_manifest.txt"
 UNVERIFIED = "unverified"
 DIGEST = re.compile(rf"sha256:[0-9a-f]{{64}}|git-blob:[0-9a-f]{{40}}|{UNVERIFIED}")
 
@@ -48,6 +49,14 @@ def parse_manifest(text: str, where: str = "the weights manifest") -> tuple[Weig
     return tuple(files)
 
 
+def read_manifest(path: Path) -> tuple[WeightFile, ...]:
+    """A manifest's file; raises :class:`UserError` where it or one of its lines cannot be read."""
+    try:
+        return parse_manifest(path.read_text(encoding="utf-8"), str(path))
+    except (OSError, UnicodeError) as error:
+        raise UserError(f"{path} cannot be read: {error}") from error
+
+
 def _parse_line(columns: list[str], where: str) -> WeightFile:
     if len(columns) != 6:
         raise UserError(f"{where}: expected 6 columns, found {len(columns)}")
@@ -68,7 +77,7 @@ def _parse_line(columns: list[str], where: str) -> WeightFile:
 def manifest() -> tuple[WeightFile, ...]:
     """The manifest that came with the package (in a wheel: inside it; in a checkout: beside it)."""
     package = Path(__file__).resolve().parents[1]
-    for path in (package / "weights_manifest.txt", package.parent / "weights_manifest.txt"):
+    for path in (package / MANIFEST, package.parent / MANIFEST):
         if path.is_file():
-            return parse_manifest(path.read_text(encoding="utf-8"), str(path))
-    raise UserError(f"weights_manifest.txt is missing from {package}: install the package again")
+            return read_manifest(path)
+    raise UserError(f"{MANIFEST} is missing from {package}: install the package again")

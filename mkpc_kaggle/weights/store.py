@@ -3,13 +3,14 @@
 import os
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.weights.checkpoint import load_tensors
-from mkpc_kaggle.weights.found import FoundFile, State, examine, recognise
-from mkpc_kaggle.weights.manifest import UNVERIFIED, WeightFile, manifest
+from mkpc_kaggle.weights.found import FoundFile, State, examine, examine_unpacked, recognise
+from mkpc_kaggle.weights.manifest import MANIFEST, UNVERIFIED, WeightFile, manifest, read_manifest
 from mkpc_kaggle.weights.notices import warn_once
 from mkpc_kaggle.weights.tree import Tree
 
@@ -28,7 +29,11 @@ class Search:
 
 
 class WeightStore:
-    """Weight files in search directories: ``--weights``, then ``$MKPC_WEIGHTS``, then ``/kaggle/input/**``."""
+    """Weight files in search directories: ``--weights``, then ``$MKPC_WEIGHTS``, then ``/kaggle/input/**``.
+
+    They are held against ``files``; without those, against the package's manifest and the further lines of the
+    manifests in the search directories, which tell of weights that ``package`` converted.
+    """
 
     def __init__(self, directories: Iterable[Path] = (), files: Sequence[WeightFile] | None = None) -> None:
         given = list(directories)
@@ -37,9 +42,21 @@ class WeightStore:
                 raise UserError(f"--weights {directory}: no such directory")
         environment = [Path(part) for part in os.environ.get("MKPC_WEIGHTS", "").split(os.pathsep) if part]
         self.directories = given + environment + ([KAGGLE_INPUT] if KAGGLE_INPUT.is_dir() else [])
-        self.files = manifest() if files is None else tuple(files)
+        self._given_files = None if files is None else tuple(files)
         self._trees = [Tree(place) for place in dict.fromkeys(self.directories) if place.is_dir()]
         self._searches: dict[tuple[WeightFile, ...], Search] = {}
+
+    @cached_property
+    def files(self) -> tuple[WeightFile, ...]:
+        """The lines that weights are held against; the package's own come first, and no name comes twice."""
+        if self._given_files is not None:
+            return self._given_files
+        lines = {file.name: file for file in manifest()}
+        for tree in self._trees:
+            for path in tree.named(MANIFEST):
+                for file in read_manifest(path):
+                    lines.setdefault(file.name, file)
+        return tuple(lines.values())
 
     def alternatives(self, slot: str) -> list[WeightFile]:
         """The manifest's lines for a slot, in order of preference; raises ``KeyError`` for an unknown slot."""
@@ -74,7 +91,7 @@ class WeightStore:
         if found is None:
             names = " or ".join(file.name for file in self.alternatives(slot))
             raise UserError(f"no weights for {slot!r}: {names} not found (searched {self.searched})")
-        if found.state is State.UNVERIFIED:
+        if found.state in (State.UNVERIFIED, State.UNPACKED):
             warn_once(f"{found.path} is not verified: {found.note}")
         return load_tensors(found.path)
 
@@ -99,7 +116,7 @@ class WeightStore:
             for path in tree.files
             if path.name in lines
         }
-        for one in self._by_digest(self.files):
+        for one in (*self._unpacked(self.files), *self._by_digest(self.files)):
             found.setdefault(one.path, one)
         return sorted(found.values(), key=lambda one: one.path)
 
@@ -109,7 +126,7 @@ class WeightStore:
             if one.state.usable:
                 return Search(one, tuple(refused))
             refused.append(one)
-        found = next(self._by_digest(lines), None)
+        found = next(self._by_digest(lines), None) or next(self._unpacked(lines), None)
         return Search(found, tuple(one for one in refused if found is None or one.path != found.path))
 
     def _by_name(self, lines: Sequence[WeightFile]) -> Iterator[FoundFile]:
@@ -117,6 +134,12 @@ class WeightStore:
             for tree in self._trees:
                 for path in tree.named(file.name):
                     yield examine(path, file, self.files)
+
+    def _unpacked(self, lines: Sequence[WeightFile]) -> Iterator[FoundFile]:
+        for file in lines:
+            for tree in self._trees:
+                for path in tree.unpacked_named(file.name):
+                    yield examine_unpacked(path, file)
 
     def _by_digest(self, lines: Sequence[WeightFile]) -> Iterator[FoundFile]:
         for file in lines:

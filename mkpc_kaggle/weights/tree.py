@@ -7,6 +7,7 @@ from functools import cached_property
 from pathlib import Path
 
 from mkpc_kaggle.weights.notices import warn_once
+from mkpc_kaggle.weights.unpacked import is_unpacked, names_of
 
 PICTURES = frozenset({".jpg", ".jpeg", ".png"})
 CHECKPOINTS = frozenset({".pth", ".pt", ".ckpt", ".safetensors", ".bin", ".pkl", ""})
@@ -17,8 +18,8 @@ LARGEST_OF_UNKNOWN_SIZE = 1 << 28
 class Tree:
     """A directory and all below it, walked once, when that is first needed.
 
-    Links to files count, links to directories are not followed: they may lead back, or out. What cannot be
-    read is passed over with a warning.
+    Links are followed, since Kaggle mounts inputs by links; no directory is entered twice, so that none leads
+    round. What cannot be read is passed over with a warning.
     """
 
     def __init__(self, root: Path) -> None:
@@ -38,13 +39,36 @@ class Tree:
             if its_size == size or (size < 0 and likely):
                 yield path
 
-    @cached_property
+    def unpacked_named(self, name: str) -> Iterator[Path]:
+        """Directories into which a checkpoint of this name was unpacked."""
+        return (path for path in self.unpacked if names_of(path) & {name, Path(name).stem})
+
+    @property
     def files(self) -> tuple[Path, ...]:
         """All files in order of their paths, pictures apart: a competition's input has thousands of those."""
+        return self._walked[0]
+
+    @property
+    def unpacked(self) -> tuple[Path, ...]:
+        """The directories that hold what is inside of a torch checkpoint; their files are not among ``files``."""
+        return self._walked[1]
+
+    @cached_property
+    def _walked(self) -> tuple[tuple[Path, ...], tuple[Path, ...]]:
         found: list[Path] = []
-        for folder, _, names in os.walk(self.root, onerror=_pass_over):
-            found += [Path(folder, name) for name in names if Path(name).suffix.lower() not in PICTURES]
-        return tuple(sorted(found))
+        unpacked: list[Path] = []
+        entered: set[tuple[int, int]] = set()
+        for folder, folders, names in os.walk(self.root, onerror=_pass_over, followlinks=True):
+            status = Path(folder).stat()
+            again, checkpoint = (status.st_dev, status.st_ino) in entered, is_unpacked(folders, names)
+            entered.add((status.st_dev, status.st_ino))
+            if again or checkpoint:
+                folders.clear()  # os.walk goes no deeper
+            if checkpoint and not again:
+                unpacked.append(Path(folder))
+            elif not again:
+                found += [Path(folder, name) for name in names if Path(name).suffix.lower() not in PICTURES]
+        return tuple(sorted(found)), tuple(sorted(unpacked))
 
     @cached_property
     def _by_name(self) -> dict[str, list[Path]]:

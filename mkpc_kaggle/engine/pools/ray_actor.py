@@ -18,8 +18,9 @@ from mkpc_kaggle.engine.worker import Answer, Worker
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.pipeline.assembly import Assembly
 from mkpc_kaggle.pipeline.stages import Pipeline
-from mkpc_kaggle.weights import FoundFile, WeightStore
+from mkpc_kaggle.weights import FoundFile, State, WeightStore
 from mkpc_kaggle.weights.digests import file_digests
+from mkpc_kaggle.weights.unpacked import digest_of
 
 Stamp = tuple[int, int]
 Fetch = Callable[[Path, Stamp | None], bytes | None]
@@ -111,6 +112,8 @@ def local_store(assembly: Assembly, home: Path, fetch: Fetch) -> WeightStore:
         target = home / found.file.name
         if is_here(found):
             target.symlink_to(found.path)
+        elif found.state is State.UNPACKED:
+            raise UserError(f"{found.path} cannot be sent to other machines: {found.note}")
         else:
             data = fetch(found.path, None)
             assert data is not None
@@ -120,7 +123,8 @@ def local_store(assembly: Assembly, home: Path, fetch: Fetch) -> WeightStore:
 
 def is_here(found: FoundFile) -> bool:
     try:
-        return file_digests(found.path).sha256 == found.digest
+        unpacked = found.state is State.UNPACKED
+        return (digest_of(found.path) if unpacked else file_digests(found.path).sha256) == found.digest
     except OSError:
         return False
 

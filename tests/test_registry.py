@@ -1,0 +1,85 @@
+"""The registry: a matcher is imported when it is asked for, and a broken import costs that matcher alone."""
+
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from mkpc_kaggle import matchers
+from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.matchers.contract import Unusable
+from mkpc_kaggle.matchers.registry import find_matcher, matcher_names, spec_of
+
+WITHOUT_KORNIA = """
+import sys
+sys.modules["kornia"] = None
+from mkpc_kaggle.cli import main
+from mkpc_kaggle.pipeline.assembly import assemble
+
+main(["weights", "list"])
+main(["recipes"])
+assembly = assemble("auto")
+print(assembly.recipe.matcher_names, {unit.matcher for unit in assembly.left_out} >= {"aliked"})
+assemble("light")
+"""
+
+
+@pytest.fixture
+def more_matchers(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Path]:
+    """A folder whose files are matchers too."""
+    monkeypatch.setattr(matchers, "__path__", [*matchers.__path__, str(tmp_path)])
+    matcher_names.cache_clear()
+    find_matcher.cache_clear()
+    yield tmp_path
+    matcher_names.cache_clear()
+    find_matcher.cache_clear()
+    for name in ("new", "broken"):
+        sys.modules.pop(f"{matchers.__name__}.{name}", None)
+
+
+def run(code: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+
+
+def test_a_new_matcher_is_a_new_file(more_matchers: Path) -> None:
+    (more_matchers / "new.py").write_text(
+        "from mkpc_kaggle.matchers.contract import MatcherSpec\n"
+        "SPEC = MatcherSpec('new', 'one more')\n"
+        "def load(weights, options, placement): ...\n"
+    )
+    assert "new" in matcher_names()
+    assert spec_of("new", "test").summary == "one more"
+
+
+def test_a_broken_matcher_is_told_with_its_reason_and_costs_no_other(more_matchers: Path) -> None:
+    (more_matchers / "broken.py").write_text("from json import no_such_thing\nSPEC = None\n")
+    found = find_matcher("broken")
+    assert isinstance(found, Unusable)
+    assert "no_such_thing" in found.reason
+    with pytest.raises(UserError, match=r"my recipe: matcher broken cannot be used here \(ImportError: .*"):
+        spec_of("broken", "my recipe")
+    assert spec_of("sift", "test").name == "sift"
+
+
+def test_files_without_a_spec_are_no_matchers() -> None:
+    assert not {"contract", "registry", "sparse", "neighbours"} & set(matcher_names())
+    with pytest.raises(UserError, match="unknown matcher 'sparse'; known: aliked, "):
+        spec_of("sparse", "test")
+
+
+def test_a_matcher_is_imported_when_it_is_asked_for() -> None:
+    code = "import sys; from mkpc_kaggle.matchers.registry import spec_of; spec_of('sift', 'test')"
+    done = run(f"{code}; print('kornia' in sys.modules, 'mkpc_kaggle.matchers.dkm' in sys.modules)")
+    assert done.stdout.split() == ["False", "False"], done.stderr
+
+
+def test_without_kornia_its_matchers_alone_are_lost(clean_environment: None) -> None:
+    done = run(WITHOUT_KORNIA)
+    assert "superglue_outdoor.pth" in done.stdout, done.stderr
+    assert "\nmatcher aliked cannot be used here (ModuleNotFoundError" in done.stdout
+    assert "    matcher aliked cannot be used here (ModuleNotFoundError" in done.stdout
+    assert "('sift',) True" in done.stdout
+    assert "recipe auto does without it: matcher aliked cannot be used here" in done.stderr
+    assert "recipe 'light': matcher aliked cannot be used here" in done.stderr
