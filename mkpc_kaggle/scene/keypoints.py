@@ -60,14 +60,19 @@ def merge_points(points: Points, cell: float) -> tuple[Points, NDArray[np.intp]]
     weight: NDArray[np.float64] = np.ones(len(points))
     place: NDArray[np.intp] = np.arange(len(points))
     for shift in (0.0, 0.5):
-        cells = np.floor(total / np.maximum(weight, 1)[:, None] / cell + shift).astype(np.int64)
-        _, inverse = np.unique(cells, axis=0, return_inverse=True)
+        cells = np.floor(total / weight[:, None] / cell + shift).astype(np.int64)
+        distinct, inverse = np.unique(cells, axis=0, return_inverse=True)
         inverse = inverse.ravel()
-        count = int(inverse.max()) + 1 if len(inverse) else 0
-        total = np.stack([np.bincount(inverse, total[:, axis], count) for axis in (0, 1)], axis=1)
-        weight = np.bincount(inverse, weight, count)
+        total, weight = sums(total, inverse, len(distinct)), sums(weight, inverse, len(distinct))
         place = inverse[place]
-    return (total / np.maximum(weight, 1)[:, None]).astype(np.float32), place
+    return (total / weight[:, None]).astype(np.float32), place
+
+
+def sums(values: NDArray[np.float64], group: NDArray[np.intp], count: int) -> NDArray[np.float64]:
+    """The sum of the values (N, ...) of each of ``count`` groups, (count, ...)."""
+    total = np.zeros((count, *values.shape[1:]))
+    np.add.at(total, group, values)
+    return total
 
 
 def one_to_one(index: NDArray[np.intp]) -> NDArray[np.uint32]:
