@@ -1,0 +1,90 @@
+"""What a reconstruction is given: the images of a batch by content, and the matches of its pairs."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from mkpc_kaggle.geometry.coordinates import Size
+from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.geometry.robust import Matrix3
+
+
+@dataclass(frozen=True)
+class BatchImage:
+    """An image of a batch: ``name`` is what pairs call it, ``digest`` that of its content, ``size`` in pixels.
+
+    Two names with one digest are one image.
+    """
+
+    name: str
+    digest: str
+    size: Size
+
+
+@dataclass(frozen=True, eq=False)
+class BatchPair:
+    """A pair of a batch by the names of its images, with its matches in full-image pixels, which may be empty.
+
+    ``own`` is the F, (3, 3), that the pair's matches alone gave; ``None`` where they gave none.
+    """
+
+    image0: str
+    image1: str
+    matches: Matches
+    own: Matrix3 | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Batch:
+    """Images and pairs to reconstruct together; raises ``ValueError`` for a pair of an unknown image."""
+
+    images: tuple[BatchImage, ...]
+    pairs: tuple[BatchPair, ...]
+
+    def __post_init__(self) -> None:
+        known = {image.name for image in self.images}
+        if len(known) < len(self.images):
+            raise ValueError("two images of the batch have one name")
+        for pair in self.pairs:
+            for name in (pair.image0, pair.image1):
+                if name not in known:
+                    raise ValueError(f"a pair has the image {name!r}, which the batch lacks")
+
+
+@dataclass(frozen=True, eq=False)
+class Edge:
+    """All matches between two distinct images, given by their places in a list of images, ``first < second``."""
+
+    first: int
+    second: int
+    matches: Matches
+
+
+def distinct_images(images: Iterable[BatchImage]) -> tuple[BatchImage, ...]:
+    """The first image of every digest, in order."""
+    first: dict[str, BatchImage] = {}
+    for image in images:
+        first.setdefault(image.digest, image)
+    return tuple(first.values())
+
+
+def edges_of(batch: Batch) -> tuple[Edge, ...]:
+    """The batch's pairs between its distinct images, in order of the two images.
+
+    Pairs of the same two images are one, whatever their order; a pair of an image with itself is left out, since
+    it says nothing, and so is one without matches.
+    """
+    place = {image.digest: number for number, image in enumerate(distinct_images(batch.images))}
+    number_of = {image.name: place[image.digest] for image in batch.images}
+    parts: dict[tuple[int, int], list[Matches]] = {}
+    for pair in batch.pairs:
+        first, second = number_of[pair.image0], number_of[pair.image1]
+        if first == second or not len(pair.matches):
+            continue
+        matches = pair.matches if first < second else turned(pair.matches)
+        parts.setdefault((min(first, second), max(first, second)), []).append(matches)
+    return tuple(Edge(*ends, Matches.concatenate(parts[ends])) for ends in sorted(parts))
+
+
+def turned(matches: Matches) -> Matches:
+    """The same matches with the two images in the other order."""
+    return Matches(matches.points1, matches.points0, matches.scores)

@@ -1,0 +1,75 @@
+"""Which fundamental matrix a pair gets: the scene's, or the one that its own matches gave."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+
+from mkpc_kaggle.geometry.cameras import fundamental_of_cameras
+from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.geometry.robust import Matrix3, sampson_distances
+from mkpc_kaggle.scene.config import SceneConfig
+from mkpc_kaggle.scene.model import Model, PlacedImage
+
+
+class Reason(StrEnum):
+    """Why a pair has the F that it has; the first alone means the scene's."""
+
+    SCENE = "both cameras are known"
+    UNPLACED = "an image has no camera"
+    APART = "the cameras are of different models"
+    SAME_IMAGE = "both images are the same picture"
+    SAME_CENTRE = "both cameras stand at one point"
+    CONTRADICTION = "the pair's own matches contradict the scene"
+
+
+@dataclass(frozen=True, eq=False)
+class Choice:
+    """``F`` is the scene's, (3, 3) of unit norm with x1^T F x0 = 0; ``None`` where the pair keeps its own."""
+
+    F: Matrix3 | None
+    reason: Reason
+
+    @property
+    def from_scene(self) -> bool:
+        return self.F is not None
+
+
+def choose(
+    models: Sequence[Model], image0: str, image1: str, matches: Matches, own: Matrix3 | None, config: SceneConfig
+) -> Choice:
+    """The F of a pair from the first of the models that has both of its images.
+
+    ``own`` is what the pair's ``matches`` alone gave, ``None`` if nothing.
+    """
+    if image0 == image1:
+        return Choice(None, Reason.SAME_IMAGE)
+    cameras = [(placed_in(model, image0), placed_in(model, image1)) for model in models]
+    both = [(first.camera, second.camera) for first, second in cameras if first and second]
+    if not both:
+        apart = any(first for first, _ in cameras) and any(second for _, second in cameras)
+        return Choice(None, Reason.APART if apart else Reason.UNPLACED)
+    try:
+        F = fundamental_of_cameras(*both[0])
+    except ValueError:
+        return Choice(None, Reason.SAME_CENTRE)
+    if own is not None and contradicts(F, own, matches, config):
+        return Choice(None, Reason.CONTRADICTION)
+    return Choice(F, Reason.SCENE)
+
+
+def contradicts(F: Matrix3, own: Matrix3, matches: Matches, config: SceneConfig) -> bool:
+    """Whether far fewer of the pair's matches agree with the scene's F than with its own.
+
+    To agree is to be within ``contradiction_error`` pixels by Sampson's distance. A pair's own F always has more
+    of its own matches, so only a large difference counts, and only where the own F has many.
+    """
+    with_own, with_scene = (
+        np.count_nonzero(sampson_distances(matrix, matches) < config.contradiction_error) for matrix in (own, F)
+    )
+    return bool(with_own >= config.contradiction_matches and with_scene < config.contradiction_share * with_own)
+
+
+def placed_in(model: Model, name: str) -> PlacedImage | None:
+    return next((image for image in model.images if image.name == name), None)

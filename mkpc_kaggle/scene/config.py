@@ -1,0 +1,75 @@
+"""Settings of the reconstruction: the table ``[scene]`` of a recipe."""
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+from mkpc_kaggle.config import AT_LEAST_0, AT_LEAST_1, POSITIVE, SHARE, Range, check_ranges
+
+
+class Mapper(StrEnum):
+    """The two mappers of pycolmap: image by image, or all rotations and then all positions at once."""
+
+    INCREMENTAL = "incremental"
+    GLOBAL = "global"
+
+
+class CameraModel(StrEnum):
+    """COLMAP's models of one focal length, the principal point at the centre; RADIAL has a distortion too."""
+
+    PINHOLE = "SIMPLE_PINHOLE"
+    RADIAL = "SIMPLE_RADIAL"
+
+
+@dataclass(frozen=True)
+class SceneConfig:
+    """Settings of :func:`mkpc_kaggle.scene.solve.solve`.
+
+    Keypoints: ``cell``, in pixels, is what points of an image are merged in. Verification of a pair's matches:
+    ``verification_error`` in pixels, and the ``least_inliers`` that it needs. Cameras: ``camera_model``, and the
+    focal length that they start with, ``prior_focal`` long sides; with ``trust_prior`` pairs are verified by E at
+    that focal length where it fits as well as F. A scene has ``least_images``; above ``most_images`` it is
+    reconstructed in overlapping parts, by the incremental mapper whatever ``mapper`` says.
+
+    Checks: an image's focal length is between ``lowest_focal`` and ``highest_focal`` long sides, and it sees
+    ``least_points`` points. A pair keeps its own F if ``contradiction_matches`` of its matches are within
+    ``contradiction_error`` pixels of it and the scene's has less than ``contradiction_share`` of as many.
+    """
+
+    mapper: Mapper = Mapper.GLOBAL
+    camera_model: CameraModel = CameraModel.PINHOLE
+    cell: float = 0.75
+    verification_error: float = 4.0
+    least_inliers: int = 15
+    prior_focal: float = 1.1
+    trust_prior: bool = True
+    least_images: int = 3
+    most_images: int = 500
+    lowest_focal: float = 0.25
+    highest_focal: float = 6.0
+    least_points: int = 15
+    contradiction_error: float = 2.0
+    contradiction_matches: int = 30
+    contradiction_share: float = 0.3
+    seed: int = 0
+    threads: int = 1
+
+    def __post_init__(self) -> None:
+        check_ranges(
+            self,
+            cell=POSITIVE,
+            verification_error=POSITIVE,
+            least_inliers=Range(8),
+            prior_focal=POSITIVE,
+            least_images=Range(3),
+            most_images=Range(3),
+            lowest_focal=POSITIVE,
+            highest_focal=POSITIVE,
+            least_points=AT_LEAST_0,
+            contradiction_error=POSITIVE,
+            contradiction_matches=AT_LEAST_1,
+            contradiction_share=SHARE,
+            seed=Range(0, 2**31 - 1),
+            threads=AT_LEAST_1,
+        )
+        if self.lowest_focal >= self.highest_focal:
+            raise ValueError(f"lowest_focal {self.lowest_focal} is not below highest_focal {self.highest_focal}")

@@ -1,0 +1,74 @@
+"""The layer's face: a batch in, cameras and the pairs' choices out; plain values that go through a pipe."""
+
+from dataclasses import dataclass
+
+from mkpc_kaggle.scene.batch import Batch, BatchImage, distinct_images, edges_of
+from mkpc_kaggle.scene.checks import believable
+from mkpc_kaggle.scene.choose import Choice, choose
+from mkpc_kaggle.scene.config import SceneConfig
+from mkpc_kaggle.scene.graph import Component, components
+from mkpc_kaggle.scene.keypoints import scene_keypoints
+from mkpc_kaggle.scene.model import Model, PlacedImage, Scene
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """What is known of a batch: its scenes, and for each of its pairs, in order, which F it gets.
+
+    Images go by the name under which they came first; ``names`` has that of every other name too.
+    """
+
+    scenes: tuple[Scene, ...]
+    choices: tuple[Choice, ...]
+    names: tuple[tuple[str, str], ...]
+
+    def placed(self, name: str) -> PlacedImage | None:
+        """The camera of an image in the largest model that has it."""
+        first = dict(self.names)[name]
+        found = [image for model in models_of(self.scenes) for image in model.images if image.name == first]
+        return found[0] if found else None
+
+
+def solve(batch: Batch, config: SceneConfig) -> Solution:
+    """Reconstruct every connected component of a batch, and choose an F for each pair.
+
+    Whatever the matches are, the answer is a :class:`Solution`: what could not be had has a reason. It takes
+    seconds to minutes and may end the process, see :mod:`mkpc_kaggle.scene.reconstruct`.
+    """
+    images = distinct_images(batch.images)
+    first_name = {image.digest: image.name for image in images}
+    name_of = {image.name: first_name[image.digest] for image in batch.images}
+    scenes = tuple(
+        scene_of(component, images, config)
+        for component in components(len(images), edges_of(batch), config.least_inliers)
+    )
+    models = models_of(scenes)
+    choices = tuple(
+        choose(models, name_of[pair.image0], name_of[pair.image1], pair.matches, pair.own, config)
+        for pair in batch.pairs
+    )
+    return Solution(scenes, choices, tuple(name_of.items()))
+
+
+def scene_of(component: Component, images: tuple[BatchImage, ...], config: SceneConfig) -> Scene:
+    """The reconstruction of one component, or why there is none."""
+    members = [images[place] for place in component.images]
+    names = tuple(image.name for image in members)
+    if len(members) < config.least_images:
+        return Scene(names, failure=f"{len(members)} images are connected; a scene needs {config.least_images}")
+    keypoints = scene_keypoints(len(members), component.edges, config.cell)
+    try:
+        from mkpc_kaggle.scene.reconstruct import reconstruct
+
+        found = reconstruct(names, [image.size for image in members], keypoints, config)
+    except ImportError as error:
+        return Scene(names, failure=f"pycolmap cannot be imported: {error}")
+    except (RuntimeError, ValueError) as error:
+        return Scene(names, failure=f"pycolmap failed: {error}")
+    models, doubts = believable(found, config)
+    failure = "" if models else "; ".join(("no model came of the matches", *doubts))
+    return Scene(names, models, doubts, failure)
+
+
+def models_of(scenes: tuple[Scene, ...]) -> tuple[Model, ...]:
+    return tuple(model for scene in scenes for model in scene.models)

@@ -1,0 +1,131 @@
+"""Which F a pair gets, what cameras are believed, and the settings' ranges."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from benchmarks.synthetic_scene import SIZE, SyntheticScene, synthetic_scene
+from mkpc_kaggle.config import from_table
+from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.geometry.cameras import Camera
+from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.scene.checks import believable
+from mkpc_kaggle.scene.choose import Choice, Reason, choose
+from mkpc_kaggle.scene.config import Mapper, SceneConfig
+from mkpc_kaggle.scene.model import Model, PlacedImage
+
+CONFIG = SceneConfig()
+
+
+@pytest.fixture(scope="module")
+def scene() -> SyntheticScene:
+    return synthetic_scene(4, points=600, outliers=0.3)
+
+
+def model(cameras: dict[str, Camera], points: int = 100) -> Model:
+    placed = tuple(PlacedImage(name, SIZE, camera, points) for name, camera in cameras.items())
+    return Model(placed, np.zeros((points, 3)), 0.5)
+
+
+def choice(models: list[Model], scene: SyntheticScene, own: np.ndarray | None = None, **names: str) -> Choice:
+    pair = replace(scene.batch.pairs[0], **names)
+    return choose(models, pair.image0, pair.image1, pair.matches, own, CONFIG)
+
+
+def test_the_scenes_fundamental_is_that_of_the_cameras(scene: SyntheticScene) -> None:
+    chosen = choice([model(scene.cameras)], scene)
+    assert chosen.from_scene
+    assert chosen.reason is Reason.SCENE
+    np.testing.assert_allclose(chosen.F, scene.true_fundamental(scene.batch.pairs[0]))
+
+
+def test_an_image_without_a_camera_leaves_the_pair_its_own(scene: SyntheticScene) -> None:
+    rest = {name: camera for name, camera in scene.cameras.items() if name != "0000"}
+    assert choice([model(rest)], scene).reason is Reason.UNPLACED
+    assert choice([], scene).reason is Reason.UNPLACED
+
+
+def test_cameras_of_two_models_make_no_fundamental(scene: SyntheticScene) -> None:
+    apart = [model({name: scene.cameras[name]}) for name in ("0000", "0001")]
+    assert choice(apart, scene).reason is Reason.APART
+
+
+def test_the_first_model_that_has_both_images_counts(scene: SyntheticScene) -> None:
+    other = {name: replace(camera, t=camera.t + 1) for name, camera in scene.cameras.items()}
+    first = choice([model({"0000": scene.cameras["0000"]}), model(scene.cameras), model(other)], scene)
+    np.testing.assert_allclose(first.F, scene.true_fundamental(scene.batch.pairs[0]))
+
+
+def test_a_picture_and_itself_have_no_fundamental(scene: SyntheticScene) -> None:
+    assert choice([model(scene.cameras)], scene, image1="0000").reason is Reason.SAME_IMAGE
+
+
+def test_two_cameras_at_one_point_have_no_fundamental(scene: SyntheticScene) -> None:
+    cameras = scene.cameras | {"0001": scene.cameras["0000"]}
+    assert choice([model(cameras)], scene).reason is Reason.SAME_CENTRE
+
+
+def test_a_wrong_camera_is_contradicted_by_the_pairs_matches(scene: SyntheticScene) -> None:
+    wrong = scene.cameras | {"0001": scene.cameras["0003"]}
+    own = scene.true_fundamental(scene.batch.pairs[0])
+    assert choice([model(wrong)], scene, own).reason is Reason.CONTRADICTION
+    assert choice([model(wrong)], scene, None).from_scene  # without an F of its own, nothing contradicts
+
+
+def test_a_good_camera_is_not_contradicted_by_an_own_fundamental_with_a_few_more_matches(
+    scene: SyntheticScene,
+) -> None:
+    pair = scene.batch.pairs[0]
+    truth = scene.true_fundamental(pair)
+    assert choice([model(scene.cameras)], scene, truth).from_scene
+    few = Matches.empty()
+    assert choose([model(scene.cameras)], pair.image0, pair.image1, few, truth, CONFIG).from_scene
+
+
+def with_camera(scene: SyntheticScene, **changes: object) -> Model:
+    cameras = model(scene.cameras)
+    return replace(cameras, images=(replace(cameras.images[0], **changes), *cameras.images[1:]))
+
+
+@pytest.mark.parametrize(
+    ("focal", "told"), [(-900.0, "-1.12"), (0.0, "0 long"), (1e5, "125"), (np.nan, "not finite")]
+)
+def test_an_absurd_focal_length_is_left_out(scene: SyntheticScene, focal: float, told: str) -> None:
+    camera = scene.cameras["0000"]
+    bad = replace(camera, K=np.diag([focal, focal, 1.0]))
+    (kept,), (doubt,) = believable((with_camera(scene, camera=bad),), CONFIG)
+    assert [image.name for image in kept.images] == ["0001", "0002", "0003"]
+    assert "0000" in doubt
+    assert told in doubt
+
+
+def test_an_image_that_sees_too_few_points_is_left_out(scene: SyntheticScene) -> None:
+    (kept,), (doubt,) = believable((with_camera(scene, points=CONFIG.least_points - 1),), CONFIG)
+    assert len(kept.images) == 3
+    assert f"fewer than {CONFIG.least_points}" in doubt
+
+
+def test_a_model_that_is_too_small_is_left_out(scene: SyntheticScene) -> None:
+    small = model({name: scene.cameras[name] for name in ("0000", "0001")})
+    kept, doubts = believable((small, model(scene.cameras)), CONFIG)
+    assert [len(one.images) for one in kept] == [4]
+    assert doubts == ("a model of 2 images is too small",)
+
+
+def test_models_are_in_order_of_what_is_left_of_them(scene: SyntheticScene) -> None:
+    three = model({name: scene.cameras[name] for name in ("0001", "0002", "0003")})
+    kept, _ = believable((three, model(scene.cameras)), CONFIG)
+    assert [len(one.images) for one in kept] == [4, 3]
+
+
+def test_settings_come_from_a_table() -> None:
+    config = from_table(SceneConfig, {"mapper": "incremental", "cell": 1}, "[scene]")
+    assert config.mapper is Mapper.INCREMENTAL
+    assert config.cell == 1.0
+    with pytest.raises(UserError, match=r"unknown key 'cells'.*mapper"):
+        from_table(SceneConfig, {"cells": 1.0}, "[scene]")
+    with pytest.raises(UserError, match=r"\[scene\]: cell must be in"):
+        from_table(SceneConfig, {"cell": 0}, "[scene]")
+    with pytest.raises(UserError, match="not below"):
+        from_table(SceneConfig, {"lowest_focal": 3.0, "highest_focal": 2.0}, "[scene]")
