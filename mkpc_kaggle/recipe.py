@@ -11,11 +11,12 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
-from mkpc_kaggle.config import AT_LEAST_0, AT_LEAST_1, SHARE, Range, check_keys, check_ranges, from_table
+from mkpc_kaggle.config import AT_LEAST_0, AT_LEAST_1, SHARE, Config, Range, check_keys, check_ranges, from_table
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Box, Size, View
 from mkpc_kaggle.geometry.critical_region import MkpcConfig
 from mkpc_kaggle.geometry.robust import RobustConfig
+from mkpc_kaggle.scene.config import SceneConfig
 
 DIRECTORY = Path(__file__).resolve().parent / "recipes"
 AREA = re.compile(r"[1-9]\d*x[1-9]\d*")
@@ -127,6 +128,8 @@ class UpgradeConfig:
 class Recipe:
     """Units in order of importance and the settings of MKPC, MAGSAC, the upgrade pass and the matchers.
 
+    With ``scene`` the pairs of a batch are reconstructed together; ``None``: every pair is on its own.
+
     The first unit is the sweep's: it has stage 1 and is not extra. Raises :class:`UserError` otherwise.
     """
 
@@ -137,6 +140,7 @@ class Recipe:
     magsac: RobustConfig = field(default_factory=RobustConfig)
     upgrade: UpgradeConfig = field(default_factory=UpgradeConfig)
     matchers: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    scene: SceneConfig | None = None
 
     def __post_init__(self) -> None:
         where = f"recipe {self.name!r}"
@@ -195,7 +199,7 @@ def parse_recipe(text: str, name: str) -> Recipe:
 def recipe_of(table: Mapping[str, Any], name: str) -> Recipe:
     """A recipe from a TOML file's table, or from a fingerprint; :class:`UserError` for what it cannot accept."""
     where = f"recipe {name!r}"
-    check_keys(table, ("description", "units", "mkpc", "magsac", "upgrade", "matchers"), where)
+    check_keys(table, ("description", "units", "mkpc", "magsac", "upgrade", "matchers", "scene"), where)
     units, matchers = table.get("units", []), table.get("matchers", {})
     if not isinstance(units, list):
         raise UserError(f"{where}: units must be a list of tables, not {units!r}")
@@ -211,7 +215,12 @@ def recipe_of(table: Mapping[str, Any], name: str) -> Recipe:
         magsac=from_table(RobustConfig, table.get("magsac", {}), f"{where}, table [magsac]"),
         upgrade=from_table(UpgradeConfig, table.get("upgrade", {}), f"{where}, table [upgrade]"),
         matchers=matchers,
+        scene=_optional(SceneConfig, table.get("scene"), f"{where}, table [scene]"),
     )
+
+
+def _optional(cls: type[Config], table: Mapping[str, Any] | None, where: str) -> Config | None:
+    return None if table is None else from_table(cls, table, where)
 
 
 def recipe_names() -> list[str]:

@@ -3,8 +3,9 @@
 import sqlite3
 import sys
 import threading
+import time
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Protocol
@@ -17,9 +18,12 @@ from mkpc_kaggle.engine.journal import EventKind
 from mkpc_kaggle.engine.planner import Explanation, Planner
 from mkpc_kaggle.engine.pools.pool import Pool
 from mkpc_kaggle.engine.progress import progress_on
-from mkpc_kaggle.engine.records import PairRecord
+from mkpc_kaggle.engine.records import PairRecord, SceneRecord
+from mkpc_kaggle.engine.scenes import ScenePair, SceneQueue, SceneResult
+from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.pipeline.pair import UnitResult
 from mkpc_kaggle.recipe import Recipe, Unit
+from mkpc_kaggle.scene.choose import Choice
 
 PUBLISH_SECONDS = 30.0
 LISTEN_SECONDS = 0.2
@@ -63,6 +67,10 @@ class RunJournal(Protocol):
 
     def save(self, outcomes: list[tuple[Outcome, bool]]) -> None: ...
 
+    def save_scene(self, scene: SceneRecord, choices: Mapping[int, Choice]) -> None: ...
+
+    def settle(self, indices: Iterable[int]) -> None: ...
+
     def note(self, kind: str, seconds: float, text: str) -> None: ...
 
 
@@ -103,18 +111,24 @@ class Engine:
         self._progress = progress_on(sys.stderr, budget) if progress else None
         self._publishing = threading.Lock()
         self.planner = self._planner(timeouts)
+        self.scenes = SceneQueue(pairs, recipe.scene)
+        self.scenes.note_solved(record.index for record in self.planner.records if record.scene is not None)
 
     def run(self) -> RunReport:
         """Run until all is done, the time is up, or an interrupt; raises only what the pool's start raises."""
         records = self.planner.records
         resumed = sum(not record.lacking(self.recipe.regular) for record in records)
         self._publish()
-        if any(self.planner.wanted(record) for record in records):
-            if message := self.pool.start():
-                warnings.warn(message, stacklevel=2)  # now, since the summary is hours away
-                self._fault(message)
-            self._work()
+        try:
+            if any(self.planner.wanted(record) for record in records):
+                if message := self.pool.start():
+                    warnings.warn(message, stacklevel=2)  # now, since the summary is hours away
+                    self._fault(message)
+                self._work()
+            self._finish_scenes()
             self._wait()
+        finally:
+            self.scenes.close()
         if self._progress is not None:
             self._progress.close()
         self._publish()
@@ -152,7 +166,46 @@ class Engine:
             if self._out == 0:
                 return
             while not self._gather() and not self.interrupt.is_set() and self.budget.left() > 0:
-                pass  # only a job that comes back changes the plan
+                self._reconstruct(self.planner.deepened)  # only a job that comes back changes the plan
+
+    def _finish_scenes(self) -> None:
+        """Reconstruct what is left: batches that were not done beside matching, or changed since."""
+        everything = set(range(len(self.pairs)))
+        while not self.interrupt.is_set() and self.budget.left() > 0:
+            self._reconstruct(everything)
+            if self.scenes.running is None:
+                return
+            if not self._gather():
+                time.sleep(LISTEN_SECONDS)
+
+    def _reconstruct(self, matched: set[int]) -> None:
+        """Take a reconstruction back, and begin the next one whose pairs are all ``matched``."""
+        if (result := self.scenes.finished()) is not None:
+            self._keep_scene(result)
+        if (batch := self.scenes.due(matched)) is not None:
+            self.scenes.start(batch, [self._scene_pair(index) for index in self.scenes.batches[batch]])
+        self.planner.reserve = self.scenes.reserve
+
+    def _scene_pair(self, index: int) -> ScenePair:
+        record = self.planner.records[index]
+        matches = Matches.concatenate(result.matches for result in self._results(index))
+        images = self.pairs[index].images
+        return ScenePair(index, images, matches, None if record.failure else record.F)
+
+    def _keep_scene(self, result: SceneResult) -> None:
+        choices = dict(result.choices or {})
+        record = SceneRecord.of(result.batch, result.scenes, result.seconds, result.failure)
+        for index, choice in choices.items():
+            self.planner.set_scene(index, choice)
+        if result.failure:
+            self._fault(f"batch {result.batch} was not reconstructed: {result.failure}")
+        self._note(EventKind.SCENE, f"{record.batch}: {record.placed} of {record.images} images")
+        done = [i for i in self.scenes.batches[result.batch] if not self.planner.wanted(self.planner.records[i])]
+        try:
+            self.journal.save_scene(record, choices)
+            self.journal.settle(done)
+        except sqlite3.Error as error:
+            self._fault(f"the journal cannot be written ({error}): an interrupted run would have to do this again")
 
     def _wait(self) -> None:
         """Let what is under way end, until nothing is waited for any longer."""
@@ -203,7 +256,12 @@ class Engine:
         """Put outcomes into the journal; into memory those that it cannot take."""
         if not outcomes:
             return
-        settled = [not self.planner.wanted(outcome.record) for outcome in outcomes]
+        for outcome in outcomes:
+            self.scenes.note_change(outcome.record.index)
+        settled = [
+            not self.planner.wanted(outcome.record) and not self.scenes.needs(outcome.record.index)
+            for outcome in outcomes
+        ]
         try:
             former = [self._unjournalled.get(outcome.record.index, ()) for outcome in outcomes]
             whole = [

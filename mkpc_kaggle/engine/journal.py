@@ -3,6 +3,7 @@
 Tables: ``run`` (what the journal belongs to and who wrote it), ``sample`` (the ids of the pairs), ``pair`` (F,
 failure, seconds, inliers before an upgrade), ``unit`` (counts and seconds of each unit on each pair, and its
 points while a later pass may build on them or the report may draw them), ``region`` (the critical regions),
+``choice`` (which F the reconstruction of its batch gives a pair, and why), ``scene`` (what came of each batch),
 ``event`` (what happened when).
 """
 
@@ -10,9 +11,9 @@ import json
 import os
 import sqlite3
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, astuple, dataclass, field, replace
 from enum import StrEnum
 from pathlib import Path
 from types import TracebackType
@@ -22,15 +23,17 @@ import numpy as np
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.jobs import Outcome
-from mkpc_kaggle.engine.records import PairRecord, UnitRecord
+from mkpc_kaggle.engine.records import CameraRecord, PairRecord, SceneRecord, UnitRecord
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Box
 from mkpc_kaggle.geometry.critical_region import CriticalRegion, RegionReason
 from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.geometry.robust import Matrix3
 from mkpc_kaggle.pipeline.pair import UnitResult
 from mkpc_kaggle.recipe import Unit
+from mkpc_kaggle.scene.choose import Choice, Reason
 
-FORMAT = 2
+FORMAT = 3
 FILE_NAME = "journal.sqlite"
 LOCK_NAME = "journal.lock"
 DRAWN = 10
@@ -50,6 +53,10 @@ CREATE TABLE IF NOT EXISTS unit (
 CREATE TABLE IF NOT EXISTS region (
     pair INTEGER, image INTEGER, "left" INTEGER, top INTEGER, "right" INTEGER, bottom INTEGER,
     reason TEXT, clusters INTEGER, kept INTEGER, PRIMARY KEY (pair, image));
+CREATE TABLE IF NOT EXISTS choice (pair INTEGER PRIMARY KEY, fundamental BLOB, reason TEXT NOT NULL);
+CREATE TABLE IF NOT EXISTS scene (
+    batch TEXT PRIMARY KEY, images INTEGER, placed INTEGER, models INTEGER, points INTEGER, seconds REAL,
+    failure TEXT NOT NULL, cameras TEXT NOT NULL);
 CREATE TABLE IF NOT EXISTS event (place INTEGER PRIMARY KEY, kind TEXT, seconds REAL, text TEXT);
 """
 
@@ -65,6 +72,8 @@ class EventKind(StrEnum):
     """a job of the phase that the text names has ended"""
     JOB = "job"
     """what that job was"""
+    SCENE = "scene"
+    """a batch was reconstructed; the text says how much of it"""
     FAULT = "fault"
     END = "end"
     """the run ended; the text says how"""
@@ -114,18 +123,38 @@ class _Tables:
         ):
             region = CriticalRegion(Box(left, top, right, bottom), RegionReason(reason), *counts)
             regions.setdefault(pair, []).append(region)
+        choices = {
+            pair: Choice(None if F is None else _matrix(F), Reason(reason))
+            for pair, F, reason in self._db.execute("SELECT pair, fundamental, reason FROM choice")
+        }
         columns = "pair, fundamental, failure, decode_seconds, cluster_seconds, estimate_seconds, before"
         return {
             pair: PairRecord(
                 pair,
-                np.frombuffer(F, np.float64).reshape(3, 3),
+                _matrix(F),
                 failure,
                 tuple(units.get(pair, ())),
                 (regions[pair][0], regions[pair][1]) if pair in regions else None,
-                *seconds,
+                decode,
+                cluster,
+                estimate,
+                before,
+                choices.get(pair),
             )
-            for pair, F, failure, *seconds in self._db.execute(f"SELECT {columns} FROM pair")
+            for pair, F, failure, decode, cluster, estimate, before in self._db.execute(
+                f"SELECT {columns} FROM pair"
+            )
         }
+
+    def scenes(self) -> tuple[SceneRecord, ...]:
+        """What came of each batch that was reconstructed, by name."""
+        columns = "batch, images, placed, models, points, seconds, failure"
+        rows = self._db.execute(f"SELECT {columns}, cameras FROM scene ORDER BY batch")
+        found = []
+        for *values, cameras in rows:
+            known = tuple(CameraRecord(**camera) for camera in json.loads(cameras))
+            found.append(replace(SceneRecord(*values), cameras=known))
+        return tuple(found)
 
     def results(self, pair: int, units: Mapping[str, Unit]) -> tuple[UnitResult, ...]:
         """What the units found on a pair, for a later job to build on; ``units`` by name."""
@@ -235,6 +264,22 @@ class Journal(_Tables):
             for outcome, settled in outcomes:
                 self._save(outcome, settled and not self._is_weak(outcome, drawn))
         self._drawn = drawn
+
+    def save_scene(self, scene: SceneRecord, choices: Mapping[int, Choice]) -> None:
+        """Put down what came of a batch, and which F its pairs get, by their places."""
+        rows = [(i, None if one.F is None else one.F.tobytes(), str(one.reason)) for i, one in choices.items()]
+        values = [*astuple(scene)[:-1], json.dumps([asdict(camera) for camera in scene.cameras])]
+        with self._db:
+            self._db.execute("BEGIN")
+            self._db.executemany("REPLACE INTO choice VALUES (?, ?, ?)", rows)
+            self._db.execute("REPLACE INTO scene VALUES (?, ?, ?, ?, ?, ?, ?, ?)", values)
+
+    def settle(self, indices: Iterable[int]) -> None:
+        """Drop the points of pairs that no later job or scene needs; the weakest keep theirs for the report."""
+        with self._db:
+            self._db.execute("BEGIN")
+            for index in set(indices) - self._drawn.keys():
+                self._db.execute("UPDATE unit SET points = NULL WHERE pair = ?", [index])
 
     def note(self, kind: str, seconds: float, text: str) -> None:
         """Put down what happened, ``seconds`` after the start; ``kind`` is an :class:`EventKind`.
@@ -367,6 +412,10 @@ def _told(db: sqlite3.Connection) -> dict[str, Any]:
     if not db.execute("SELECT 1 FROM sqlite_master WHERE name = 'run'").fetchone():
         return {}
     return {key: json.loads(value) for key, value in db.execute("SELECT key, value FROM run")}
+
+
+def _matrix(blob: bytes) -> Matrix3:
+    return np.frombuffer(blob, np.float64).reshape(3, 3)
 
 
 def _blob(matches: Matches) -> bytes:

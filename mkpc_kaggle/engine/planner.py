@@ -17,6 +17,7 @@ from mkpc_kaggle.engine.upgrade import UpgradeRounds, is_weak
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.pipeline.pair import UnitResult
 from mkpc_kaggle.recipe import Recipe, Unit
+from mkpc_kaggle.scene.choose import Choice
 
 EXPLORE_SHARE = 0.25
 """The share of the time left that may be spent to learn what units cost that never ran."""
@@ -24,6 +25,8 @@ JOB_SHARE = 0.05
 """The share of the time left that a job may be expected to take: what a job found late comes too late."""
 DEADLINE_SHARE = 0.5
 """The share of the time left after which a job begins no unit: where all is slower of a sudden, that is learnt."""
+RESERVE_SHARE = 0.2
+"""The share of the limit that is left to reconstruction at most."""
 MOST_DOUBLINGS = 3
 """Of the silence that a job is allowed, while one job after the other hangs."""
 
@@ -66,7 +69,8 @@ class Planner:
     """Sweep, deepen, upgrade, over the pairs of ``order``.
 
     ``records`` (one a pair, by index) are the state that it decides upon; it alone changes them. ``workers``
-    work at a time.
+    work at a time. ``deepened`` are the pairs that have all units that fit; ``reserve`` seconds of the end are
+    left to others.
     """
 
     def __init__(
@@ -90,6 +94,8 @@ class Planner:
         self._queue = ChunkQueue()
         self._rounds = UpgradeRounds(recipe.upgrade)
         self._retries = Retries()
+        self.deepened: set[int] = set()
+        self.reserve = 0.0
         self._left_alone: set[int] = set()
         self._exploring = 0
         self._allowance = 0.0
@@ -105,11 +111,13 @@ class Planner:
 
     def next(self, now: float) -> Job | None:
         """The next job, without its pairs; ``None`` where there is nothing to do before another comes back."""
-        if now >= self.budget.stop:
+        if now >= self._stop:
             return None
         while (chunk := self._next_chunk(now)) is not None:
             units = self._units(chunk, now)
             todo = [index for index in chunk.indices if self._can_gain(index, units)]
+            if chunk.phase is Phase.DEEPEN:
+                self.deepened.update(set(chunk.indices) - set(todo))
             lacking = unique_lacking((self.records[index] for index in todo), units)
             unknown = not all(self.costs.known(unit.name) for unit in lacking)
             if unknown and (self._exploring >= self.workers or self._queue.jobs > self.workers):
@@ -119,6 +127,11 @@ class Planner:
             if todo:
                 return self._job(chunk, todo, units, lacking, now, unknown=unknown)
         return None
+
+    @property
+    def _stop(self) -> float:
+        """When no unit may be running any more."""
+        return self.budget.stop - min(self.reserve, RESERVE_SHARE * self.budget.limit)
 
     def _next_chunk(self, now: float) -> Chunk | None:
         if (chunk := self._queue.pop_retry()) is not None:
@@ -146,7 +159,7 @@ class Planner:
         It is one pair where some unit's cost is unknown and cannot be planned, and few where it gets late; in
         the end the first of its units, since what one job does comes back, or is lost, at once.
         """
-        left = self.budget.stop - now
+        left = self._stop - now
         seconds = self.costs.overhead + sum(self.costs.of(unit.name) for unit in lacking)
         most = 1 if unknown else pairs_that_fit(len(todo), seconds, left)
         if todo[most:]:
@@ -181,7 +194,7 @@ class Planner:
     def _deadline(self, lacking: Iterable[Unit], pairs: int, now: float) -> float:
         """Early enough to plan the rest anew, but late enough for twice what the job should take."""
         seconds = pairs * (self.costs.overhead + sum(self.costs.most(unit.name) for unit in lacking))
-        return min(self.budget.stop, now + max(DEADLINE_SHARE * (self.budget.stop - now), 2 * seconds))
+        return min(self._stop, now + max(DEADLINE_SHARE * (self._stop - now), 2 * seconds))
 
     def _can_gain(self, index: int, units: Iterable[Unit]) -> bool:
         return index not in self._left_alone and bool(self.records[index].lacking(units))
@@ -195,14 +208,14 @@ class Planner:
             units = self._usable(chunk.units)
         if chunk.phase is Phase.SWEEP:
             return units[:1]
-        return tuple(unit for unit in units if self.costs.most(unit.name) < self.budget.stop - now)
+        return tuple(unit for unit in units if self.costs.most(unit.name) < self._stop - now)
 
     def _usable(self, units: Iterable[Unit]) -> tuple[Unit, ...]:
         return tuple(unit for unit in units if unit.name not in self._retries.unusable)
 
     def _fit(self, units: tuple[Unit, ...], now: float) -> int:
         """How many units all pairs can have in the time left; a change is explained."""
-        left = (self.budget.stop - now) * self.workers
+        left = (self._stop - now) * self.workers
         count, short = units_that_fit(needs(units, self._lacking, self.costs), left)
         if count == self._fitting:
             return count
@@ -279,6 +292,8 @@ class Planner:
         if job.exploring and now >= job.deadline:
             for unit in job.units:
                 self.costs.suppose(unit.name, self._allowance)
+        if job.phase is Phase.DEEPEN:
+            self.deepened.update(job.indices)
         kept = [kept for outcome in result.outcomes if (kept := self._merge(outcome, job.phase, now))]
         self._go_on(job, now)
         return kept
@@ -287,7 +302,7 @@ class Planner:
         """What a job's own deadline cut off is planned anew."""
         cut = now + max(job.expected) >= job.deadline
         rest = tuple(index for index in job.indices if self._can_gain(index, job.units))
-        if cut and rest and not job.exploring and job.deadline < self.budget.stop:
+        if cut and rest and not job.exploring and job.deadline < self._stop:
             self._queue.retry([Chunk(job.phase, rest, job.units, job.shrink)])
 
     def _measure(self, job: Job, measured: list[tuple[str, float]], now: float, pairs: int) -> None:
@@ -297,6 +312,10 @@ class Planner:
             elapsed = (now - self._last_event) * min(self.workers, self._queue.jobs)
             self.costs.observe_overhead((elapsed - sum(seconds for _, seconds in measured)) / pairs)
         self._last_event = now
+
+    def set_scene(self, index: int, choice: Choice) -> None:
+        """Which F a pair gets by the reconstruction of its batch."""
+        self.records[index] = replace(self.records[index], scene=choice)
 
     def _merge(self, outcome: Outcome, phase: Phase, now: float) -> Outcome | None:
         """The outcome to keep, if the job brought anything: a unit more, or the reason why there can be none."""
@@ -332,6 +351,8 @@ class Planner:
         self._last_event = now
         retry = self._retries.after(failure, self.records, self.recipe.units)
         self._queue.retry(retry.chunks)
+        if job.phase is Phase.DEEPEN and not retry.chunks:
+            self.deepened.update(job.indices)
         for reason in retry.reasons:
             self._explain(now, reason)
         if retry.leave_pair:

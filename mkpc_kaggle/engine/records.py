@@ -1,6 +1,6 @@
 """What is durable of a pair: its F, how it came about, and what each unit found and cost."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -8,6 +8,8 @@ import numpy as np
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL, Matrix3
 from mkpc_kaggle.pipeline.pair import PairMatch, Regions
 from mkpc_kaggle.recipe import Unit
+from mkpc_kaggle.scene.choose import Choice
+from mkpc_kaggle.scene.model import Scene
 
 NOT_REACHED = "not reached in time"
 
@@ -31,6 +33,7 @@ class PairRecord:
 
     ``failure`` is empty, or says why ``F`` is the fallback. The seconds are those of all jobs on the pair.
     ``before`` is the number of inliers that it had when it was first upgraded; ``None`` if it never was.
+    ``scene`` is what its batch's reconstruction says of it, ``None`` if there was none.
     """
 
     index: int
@@ -42,6 +45,7 @@ class PairRecord:
     cluster_seconds: float = 0.0
     estimate_seconds: float = 0.0
     before: int | None = None
+    scene: Choice | None = None
 
     @classmethod
     def untouched(cls, index: int, reason: str = NOT_REACHED) -> "PairRecord":
@@ -76,7 +80,20 @@ class PairRecord:
             cluster_seconds=former.cluster_seconds + self.cluster_seconds,
             estimate_seconds=former.estimate_seconds + self.estimate_seconds,
             before=before,
+            scene=former.scene,
         )
+
+    @property
+    def fundamental(self) -> Matrix3:
+        """The scene's F where it has one, else its own."""
+        return self.F if self.scene is None or self.scene.F is None else self.scene.F
+
+    @property
+    def source(self) -> str:
+        """Where :attr:`fundamental` comes from: "scene", "pair" or "fallback"."""
+        if self.scene is not None and self.scene.from_scene:
+            return "scene"
+        return "fallback" if self.failure else "pair"
 
     @property
     def reached(self) -> bool:
@@ -102,3 +119,59 @@ class PairRecord:
         """Those of ``units`` that the pair has not had."""
         had = {record.unit for record in self.units}
         return [unit for unit in units if unit.name not in had]
+
+
+@dataclass(frozen=True)
+class CameraRecord:
+    """A camera of a scene: where it is and looks, in its model's units, and its focal length in pixels.
+
+    ``model`` numbers the models of the batch, the largest is 0; ``seen`` are the points that the image sees.
+    """
+
+    image: str
+    model: int
+    centre: list[float]
+    forward: list[float]
+    focal: float
+    seen: int
+
+
+@dataclass(frozen=True)
+class SceneRecord:
+    """What came of a batch: how many of its images have a camera, in how many models, with how many points."""
+
+    batch: str
+    images: int
+    placed: int
+    models: int
+    points: int
+    seconds: float
+    failure: str
+    cameras: tuple[CameraRecord, ...] = ()
+
+    @classmethod
+    def of(cls, batch: str, scenes: Sequence[Scene], seconds: float, failure: str) -> "SceneRecord":
+        models = sorted((model for scene in scenes for model in scene.models), key=lambda one: -len(one.images))
+        cameras = tuple(
+            CameraRecord(
+                image.name,
+                number,
+                (-image.camera.R.T @ image.camera.t).tolist(),
+                image.camera.R[2].tolist(),
+                image.focal,
+                image.points,
+            )
+            for number, model in enumerate(models)
+            for image in model.images
+        )
+        reasons = [scene.failure for scene in scenes if scene.failure] if not models else []
+        return cls(
+            batch,
+            sum(len(scene.names) for scene in scenes),
+            sum(scene.placed for scene in scenes),
+            len(models),
+            sum(len(model.points) for model in models),
+            seconds,
+            failure or "; ".join(dict.fromkeys(reasons)) or ("" if models else "no matches connect its images"),
+            cameras,
+        )

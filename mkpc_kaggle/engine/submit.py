@@ -19,7 +19,9 @@ def submit(pairs: Sequence[Pair], assembly: Assembly, session: Session, output: 
     """
 
     def publish(records: Sequence[PairRecord]) -> None:
-        write_submission(output, {pair.id: record.F for pair, record in zip(pairs, records, strict=True)})
+        write_submission(
+            output, {pair.id: record.fundamental for pair, record in zip(pairs, records, strict=True)}
+        )
 
     require_writable(output)
     return run_pairs(pairs, assembly, session, publish)

@@ -100,7 +100,7 @@ def validate(scenes: Sequence[Scene], assembly: Assembly, session: Session) -> t
 
 def score_record(true: TruePair, record: PairRecord, scene: Scene) -> PairScore:
     """The score of what the engine made of a pair; the fallback row counts as a failure."""
-    error = PoseError.failed() if record.failure else error_of(record.F, true, scene)
+    error = PoseError.failed() if record.source == "fallback" else error_of(record.fundamental, true, scene)
     return PairScore(true.pair.id, true.covisibility, error, record)
 
 

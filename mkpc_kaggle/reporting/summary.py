@@ -43,7 +43,7 @@ def trouble(report: RunReport) -> str:
 
 def _error(record: PairRecord) -> str:
     """The error that left a pair without an F, if it was one."""
-    if not record.failure:
+    if record.source != "fallback":
         return ""
     if not record.units:
         return record.failure

@@ -14,7 +14,7 @@ F_COLUMNS = tuple(f"f{row}{column}" for row in (1, 2, 3) for column in (1, 2, 3)
 SECONDS = ("decode_seconds", "encode_seconds", "match_seconds", "cluster_seconds", "estimate_seconds")
 
 _PAIRS = {
-    **{"pair": int, "id": str, "group": str, "image0": str, "image1": str, "failure": str},
+    **{"pair": int, "id": str, "group": str, "image0": str, "image1": str, "failure": str, "source": str},
     **{"matches": int, "inliers": int, **dict.fromkeys(SECONDS, float), **dict.fromkeys(F_COLUMNS, float)},
 }
 _UNITS = {
@@ -41,13 +41,13 @@ class RunTables:
 
     @property
     def solved(self) -> pd.DataFrame:
-        """The pairs that have an F."""
-        return self.pairs[self.pairs["failure"] == ""]
+        """The pairs that have an F, of their own or of their scene."""
+        return self.pairs[self.pairs["source"] != "fallback"]
 
     @property
     def failed(self) -> pd.DataFrame:
         """The pairs that have the fallback row."""
-        return self.pairs[self.pairs["failure"] != ""]
+        return self.pairs[self.pairs["source"] == "fallback"]
 
     def named(self) -> dict[str, pd.DataFrame]:
         """The tables by name, as they are exported."""
@@ -111,9 +111,9 @@ def _pair_rows(pairs: Sequence[Pair], records: Sequence[PairRecord]) -> Iterator
         match = sum(unit.match_seconds for unit in record.units)
         yield (
             *(record.index, pair.id, pair.group, pair.image0.name, pair.image1.name),
-            *(record.failure, record.matches, record.inliers),
+            *(record.failure, record.source, record.matches, record.inliers),
             *(record.decode_seconds, encode, match, record.cluster_seconds, record.estimate_seconds),
-            *record.F.ravel(),
+            *record.fundamental.ravel(),
         )
 
 
