@@ -52,7 +52,7 @@ def _write(path: Path, sizes: Sequence[Size], keypoints: SceneKeypoints, config:
             camera = pycolmap.Camera.create_from_model_name(
                 number, config.camera_model.value, config.prior_focal * max(size), *size
             )
-            camera.has_prior_focal_length = config.trust_prior
+            camera.has_prior_focal_length = True  # a pair that E explains at the prior is used as calibrated
             database.write_camera(camera, use_camera_id=True)
             rig = pycolmap.Rig(rig_id=number)
             rig.add_ref_sensor(camera.sensor_id)
