@@ -4,9 +4,9 @@ python -m benchmarks.scene_settings --train-dir DIR --matches DIR [--recipe clas
     [--scenes NAME ...] [--shares 1 0.3 0.12] [--settings default incremental ...]
 
 All pairs with a covisibility of at least 0.1 are matched once, into the directory of `--matches`, which a second
-run reads. A share below 1 takes that many of a scene's pairs by a fixed seed. `own` is the mAA of one MAGSAC on each
-pair's own matches, `scene` that of the cameras alone, where a pair without two of them counts as lost, `chosen` that
-of the F which the pair gets in the end.
+run reads. A share below 1 takes that many of a scene's pairs by a fixed seed. `own` is the mAA of one MAGSAC a
+pair, `scene` that of the cameras alone, where a pair without two of them counts as lost, `chosen` that of the F
+which the pair gets in the end.
 """
 
 import argparse

@@ -9,6 +9,7 @@ of the distance of true correspondences from the F that the pair got.
 import argparse
 import resource
 import time
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from multiprocessing import get_context
 
@@ -60,8 +61,8 @@ def main() -> None:
         f"{'images':>7}{'pairs':>7}{'matches':>9}" + "".join(f"{h:>9}" for h in heads[:4]) + "  scenes  median px"
     )
     for size in arguments.sizes:
-        with get_context("spawn").Pool(1) as pool:
-            print(pool.apply(row, (size, arguments.outliers, config)), flush=True)
+        with ProcessPoolExecutor(1, get_context("spawn")) as pool:
+            print(pool.submit(row, size, arguments.outliers, config).result(), flush=True)
 
 
 if __name__ == "__main__":

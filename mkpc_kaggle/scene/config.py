@@ -26,8 +26,8 @@ class SceneConfig:
 
     Keypoints: ``cell``, in pixels, is what points of an image are merged in. Verification of a pair's matches:
     ``verification_error`` in pixels, and the ``least_inliers`` that it needs. Cameras: ``camera_model``, and the
-    focal length that they start with, ``prior_focal`` long sides. A scene has ``least_images``; above ``most_images``
-    it is reconstructed in overlapping parts, by the incremental mapper whatever ``mapper`` says.
+    focal length that they start with, ``prior_focal`` long sides. A scene has ``least_images``; above
+    ``most_images`` it is reconstructed in overlapping parts, by the incremental mapper whatever ``mapper`` says.
 
     Checks: an image's focal length is between ``lowest_focal`` and ``highest_focal`` long sides, and it sees
     ``least_points`` points. A pair keeps its own F if ``contradiction_matches`` of its matches are within

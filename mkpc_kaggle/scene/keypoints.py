@@ -17,7 +17,10 @@ from mkpc_kaggle.scene.batch import Edge
 
 @dataclass(frozen=True, eq=False)
 class EdgeKeypoints:
-    """Matches between the keypoints of two images, given by their places: ``index`` is (M, 2) uint32."""
+    """Matches between the keypoints of two images: ``index`` is (M, 2) uint32, their places, no row twice.
+
+    A keypoint may have several matches, where matchers disagree: verification tells.
+    """
 
     first: int
     second: int
@@ -46,7 +49,9 @@ def scene_keypoints(image_count: int, edges: Sequence[Edge], cell: float) -> Sce
         for end in (edge.first, edge.second):
             sides.append(merged[end][1][used[end] : used[end] + len(edge.matches)])
             used[end] += len(edge.matches)
-        keypoint_edges.append(EdgeKeypoints(edge.first, edge.second, one_to_one(np.stack(sides, axis=1))))
+        keypoint_edges.append(
+            EdgeKeypoints(edge.first, edge.second, np.unique(np.stack(sides, axis=1), axis=0).astype(np.uint32))
+        )
     return SceneKeypoints(tuple(points for points, _ in merged), tuple(keypoint_edges))
 
 
@@ -73,23 +78,3 @@ def sums(values: NDArray[np.float64], group: NDArray[np.intp], count: int) -> ND
     total = np.zeros((count, *values.shape[1:]))
     np.add.at(total, group, values)
     return total
-
-
-def one_to_one(index: NDArray[np.intp]) -> NDArray[np.uint32]:
-    """(N, 2) pairs of keypoints -> (M, 2) in which no keypoint is twice.
-
-    Pairs that were found more often go first, then earlier ones: matchers that disagree about a keypoint cannot
-    both be right.
-    """
-    distinct, first, count = np.unique(index, axis=0, return_index=True, return_counts=True)
-    order = np.lexsort((first, -count))
-    taken0: set[int] = set()
-    taken1: set[int] = set()
-    kept = []
-    for number in order:
-        i, j = distinct[number].tolist()
-        if i not in taken0 and j not in taken1:
-            taken0.add(i)
-            taken1.add(j)
-            kept.append(number)
-    return distinct[np.sort(np.array(kept, np.intp))].astype(np.uint32).reshape(-1, 2)
