@@ -1,6 +1,6 @@
 """What a user would take instead: pycolmap's own SIFT, exhaustive matching and mappers, on the same pairs.
 
-python benchmarks/pycolmap_alone.py --train-dir DIR [--scenes NAME ...] [--mappers incremental global]
+python -m benchmarks.pycolmap_alone --train-dir DIR [--scenes NAME ...] [--mappers incremental global]
 
 DIR is a train side in the layout of the Image Matching Challenge 2022. Everything is as pycolmap has it, but for
 one SIMPLE_RADIAL camera an image. A pair whose images are not both in one model counts as lost. It prints the mAA

@@ -1,6 +1,6 @@
 """Time, memory and accuracy of a batch's reconstruction, from matches of known cameras with noise and wrong ones.
 
-python benchmarks/scenes.py [26:304 50:700 100:2000] [--mapper global] [--threads 1] [--outliers 0.2]
+python -m benchmarks.scenes [26:304 50:700 100:2000] [--mapper global] [--threads 1] [--outliers 0.2]
 
 Each size is images:pairs, and runs in a process of its own, as in the engine. `median px` is the median over pairs
 of the distance of true correspondences from the F that the pair got.
