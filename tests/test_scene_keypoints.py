@@ -10,7 +10,7 @@ from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.scene.batch import Batch, BatchImage, BatchPair, Edge, edges_of
 from mkpc_kaggle.scene.graph import components
-from mkpc_kaggle.scene.keypoints import merge_points, scene_keypoints
+from mkpc_kaggle.scene.keypoints import merge_points, one_to_one, scene_keypoints
 
 SIZE = Size(100, 80)
 
@@ -58,11 +58,17 @@ def test_keypoints_do_not_depend_on_the_order_of_the_points() -> None:
     np.testing.assert_array_equal(moved, place[order])
 
 
-def test_a_match_that_two_matchers_found_is_one() -> None:
-    edge = Edge(0, 1, matches((10, 10, 20, 20), (10.1, 10, 20, 20.1), (10, 10, 60, 60)))
+def test_a_match_that_two_matchers_found_is_one_and_outvotes_another() -> None:
+    edge = Edge(0, 1, matches((10, 10, 60, 60), (10, 10, 20, 20), (10.1, 10, 20, 20.1)))
     keypoints = scene_keypoints(2, [edge], 0.75)
-    assert keypoints.edges[0].index.dtype == np.uint32
-    assert sorted(keypoints.edges[0].index.tolist()) == [[0, 0], [0, 1]]
+    ((index,),) = [edge.index.tolist() for edge in keypoints.edges]
+    np.testing.assert_allclose(keypoints.points[1][index[1]], [20, 20.05], atol=1e-5)
+
+
+def test_a_keypoint_is_matched_once_and_to_what_was_found_most_often() -> None:
+    index = np.array([[0, 5], [0, 6], [0, 6], [1, 6], [2, 7], [2, 8]])
+    assert one_to_one(index).tolist() == [[0, 6], [2, 7]]
+    assert one_to_one(np.zeros((0, 2), np.intp)).shape == (0, 2)
 
 
 def test_a_point_seen_in_two_pairs_is_one_keypoint() -> None:

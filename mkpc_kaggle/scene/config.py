@@ -47,7 +47,7 @@ class SceneConfig:
     least_points: int = 30
     contradiction_error: float = 2.0
     contradiction_matches: int = 30
-    contradiction_share: float = 0.3
+    contradiction_share: float = 0.05
     seed: int = 0
     threads: int = 1
 

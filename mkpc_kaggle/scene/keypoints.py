@@ -17,10 +17,7 @@ from mkpc_kaggle.scene.batch import Edge
 
 @dataclass(frozen=True, eq=False)
 class EdgeKeypoints:
-    """Matches between the keypoints of two images: ``index`` is (M, 2) uint32, their places, no row twice.
-
-    A keypoint may have several matches, where matchers disagree: verification tells.
-    """
+    """Matches between the keypoints of two images: ``index`` is (M, 2) uint32, their places."""
 
     first: int
     second: int
@@ -47,7 +44,7 @@ def scene_keypoints(image_count: int, edges: Sequence[Edge], cell: float) -> Sce
     return SceneKeypoints(
         tuple(points for points, _ in merged),
         tuple(
-            EdgeKeypoints(edge.first, edge.second, np.unique(index, axis=0).astype(np.uint32))
+            EdgeKeypoints(edge.first, edge.second, one_to_one(index))
             for edge, index in zip(edges, matched, strict=True)
         ),
     )
@@ -82,3 +79,23 @@ def sums(values: NDArray[np.float64], group: NDArray[np.intp], count: int) -> ND
     total = np.zeros((count, *values.shape[1:]))
     np.add.at(total, group, values)
     return total
+
+
+def one_to_one(index: NDArray[np.intp]) -> NDArray[np.uint32]:
+    """(N, 2) pairs of keypoints -> (M, 2) in which no keypoint is twice.
+
+    Pairs that were found more often go first, then earlier ones: matchers that disagree about a keypoint cannot
+    both be right.
+    """
+    distinct, first, count = np.unique(index, axis=0, return_index=True, return_counts=True)
+    order = np.lexsort((first, -count))
+    taken0: set[int] = set()
+    taken1: set[int] = set()
+    kept = []
+    for number in order:
+        i, j = distinct[number].tolist()
+        if i not in taken0 and j not in taken1:
+            taken0.add(i)
+            taken1.add(j)
+            kept.append(number)
+    return distinct[np.sort(np.array(kept, np.intp))].astype(np.uint32).reshape(-1, 2)
