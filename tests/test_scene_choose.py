@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -67,7 +68,8 @@ def test_two_cameras_at_one_point_have_no_fundamental(scene: SyntheticScene) -> 
 
 
 def test_a_wrong_camera_is_contradicted_by_the_pairs_matches(scene: SyntheticScene) -> None:
-    wrong = scene.cameras | {"0001": scene.cameras["0003"]}
+    camera, tilt = scene.cameras["0001"], cv2.Rodrigues(np.array([np.radians(15), 0, 0]))[0]
+    wrong = scene.cameras | {"0001": Camera(camera.K, tilt @ camera.R, tilt @ camera.t)}
     own = scene.true_fundamental(scene.batch.pairs[0])
     assert choice([model(wrong)], scene, own).reason is Reason.CONTRADICTION
     assert choice([model(wrong)], scene, None).from_scene  # without an F of its own, nothing contradicts

@@ -58,6 +58,13 @@ def test_keypoints_do_not_depend_on_the_order_of_the_points() -> None:
     np.testing.assert_array_equal(moved, place[order])
 
 
+def test_a_match_that_two_matchers_found_is_one_and_outvotes_another() -> None:
+    edge = Edge(0, 1, matches((10, 10, 60, 60), (10, 10, 20, 20), (10.1, 10, 20, 20.1)))
+    keypoints = scene_keypoints(2, [edge], 0.75)
+    ((index,),) = [edge.index.tolist() for edge in keypoints.edges]
+    np.testing.assert_allclose(keypoints.points[1][index[1]], [20, 20.05], atol=1e-5)
+
+
 def test_a_keypoint_is_matched_once_and_to_what_was_found_most_often() -> None:
     index = np.array([[0, 5], [0, 6], [0, 6], [1, 6], [2, 7], [2, 8]])
     assert one_to_one(index).tolist() == [[0, 6], [2, 7]]

@@ -111,9 +111,9 @@ def test_two_places_in_a_batch_are_two_scenes(scene: SyntheticScene) -> None:
 def test_a_pair_whose_matches_agree_on_something_else_keeps_its_own(scene: SyntheticScene) -> None:
     """As on a facade that repeats itself; whether it is right nobody knows, so the pair's own F stays."""
     pair = scene.batch.pairs[-1]
-    shifted = replace(pair.matches, points1=pair.matches.points0 + np.array([40, 0], np.float32))
-    rows = np.array([[0, 0, 0], [0, 0, -1], [0, 1, 0]]) / np.sqrt(2)
-    pairs = (*scene.batch.pairs[:-1], replace(pair, matches=shifted, own=rows))
+    shifted = replace(pair.matches, points1=pair.matches.points0 + np.array([0, 90], np.float32))
+    columns = np.array([[0, 0, 1], [0, 0, 0], [-1, 0, 0]]) / np.sqrt(2)
+    pairs = (*scene.batch.pairs[:-1], replace(pair, matches=shifted, own=columns))
     solution = solve(replace(scene.batch, pairs=pairs), SceneConfig())
     assert solution.choices[-1].reason is Reason.CONTRADICTION
     assert all(choice.from_scene for choice in solution.choices[:-1])

@@ -16,6 +16,7 @@ from mkpc_kaggle.package.checkout import Checkout
 BUNDLED = (
     "kornia",
     "kornia-rs",
+    "pycolmap",
     "safetensors",
 )
 """What of our dependencies, and of theirs, Kaggle's image may lack or have in a version that does not do.

@@ -63,7 +63,8 @@ def contradicts(F: Matrix3, own: Matrix3, matches: Matches, config: SceneConfig)
     """Whether far fewer of the pair's matches agree with the scene's F than with its own.
 
     To agree is to be within ``contradiction_error`` pixels by Sampson's distance. A pair's own F always has more
-    of its own matches, so only a large difference counts, and only where the own F has many.
+    of its own matches, and on a facade that repeats itself it may have many times as many and be wrong: only next
+    to none counts against the scene.
     """
     with_own, with_scene = (
         np.count_nonzero(sampson_distances(matrix, matches) < config.contradiction_error) for matrix in (own, F)

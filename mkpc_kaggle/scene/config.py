@@ -26,9 +26,8 @@ class SceneConfig:
 
     Keypoints: ``cell``, in pixels, is what points of an image are merged in. Verification of a pair's matches:
     ``verification_error`` in pixels, and the ``least_inliers`` that it needs. Cameras: ``camera_model``, and the
-    focal length that they start with, ``prior_focal`` long sides; with ``trust_prior`` pairs are verified by E at
-    that focal length where it fits as well as F. A scene has ``least_images``; above ``most_images`` it is
-    reconstructed in overlapping parts, by the incremental mapper whatever ``mapper`` says.
+    focal length that they start with, ``prior_focal`` long sides. A scene has ``least_images``; above
+    ``most_images`` it is reconstructed in overlapping parts, by the incremental mapper whatever ``mapper`` says.
 
     Checks: an image's focal length is between ``lowest_focal`` and ``highest_focal`` long sides, and it sees
     ``least_points`` points. A pair keeps its own F if ``contradiction_matches`` of its matches are within
@@ -38,18 +37,17 @@ class SceneConfig:
     mapper: Mapper = Mapper.GLOBAL
     camera_model: CameraModel = CameraModel.PINHOLE
     cell: float = 0.75
-    verification_error: float = 4.0
+    verification_error: float = 2.0
     least_inliers: int = 15
     prior_focal: float = 1.1
-    trust_prior: bool = True
     least_images: int = 3
     most_images: int = 500
-    lowest_focal: float = 0.25
-    highest_focal: float = 6.0
-    least_points: int = 15
+    lowest_focal: float = 0.3
+    highest_focal: float = 5.0
+    least_points: int = 30
     contradiction_error: float = 2.0
     contradiction_matches: int = 30
-    contradiction_share: float = 0.3
+    contradiction_share: float = 0.05
     seed: int = 0
     threads: int = 1
 

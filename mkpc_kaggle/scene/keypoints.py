@@ -5,7 +5,7 @@ resolution, or when it is another matcher's. Structure from motion follows point
 an image that are less than a pixel apart have to be one.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,7 +17,7 @@ from mkpc_kaggle.scene.batch import Edge
 
 @dataclass(frozen=True, eq=False)
 class EdgeKeypoints:
-    """Matches between the keypoints of two images, given by their places: ``index`` is (M, 2) uint32."""
+    """Matches between the keypoints of two images: ``index`` is (M, 2) uint32, their places."""
 
     first: int
     second: int
@@ -39,15 +39,21 @@ def scene_keypoints(image_count: int, edges: Sequence[Edge], cell: float) -> Sce
         parts[edge.first].append(edge.matches.points0)
         parts[edge.second].append(edge.matches.points1)
     merged = [merge_points(np.concatenate(part), cell) for part in parts]
-    used = [0] * image_count
-    keypoint_edges = []
-    for edge in edges:
-        sides = []
-        for end in (edge.first, edge.second):
-            sides.append(merged[end][1][used[end] : used[end] + len(edge.matches)])
-            used[end] += len(edge.matches)
-        keypoint_edges.append(EdgeKeypoints(edge.first, edge.second, one_to_one(np.stack(sides, axis=1))))
-    return SceneKeypoints(tuple(points for points, _ in merged), tuple(keypoint_edges))
+    places = [cut_like(place, part) for (_, place), part in zip(merged, parts, strict=True)]
+    matched = [np.stack([next(places[edge.first]), next(places[edge.second])], axis=1) for edge in edges]
+    return SceneKeypoints(
+        tuple(points for points, _ in merged),
+        tuple(
+            EdgeKeypoints(edge.first, edge.second, one_to_one(index))
+            for edge, index in zip(edges, matched, strict=True)
+        ),
+    )
+
+
+def cut_like(place: NDArray[np.intp], parts: Sequence[Points]) -> Iterator[NDArray[np.intp]]:
+    """``place`` cut into the lengths of ``parts``, without the empty one that they begin with."""
+    ends = np.cumsum([len(part) for part in parts])
+    return iter(np.split(place, ends[:-1])[1:])
 
 
 def merge_points(points: Points, cell: float) -> tuple[Points, NDArray[np.intp]]:

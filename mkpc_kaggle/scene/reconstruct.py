@@ -1,7 +1,8 @@
 """Structure from motion by pycolmap: keypoints and their matches in, cameras and points out.
 
-pycolmap can end the process on its own (an assertion, a segmentation fault, memory), and the global mapper has no
-time limit: whoever cannot afford that calls this in a process of its own.
+pycolmap can end the process on its own (a failed assertion, memory), the global mapper has no time limit, and once
+it is imported a SIGTERM ends the process with a stack trace on stderr: whoever cannot afford that calls this in a
+process of its own.
 
 The same input gives the same bytes on one machine with ``threads = 1``. With more threads, sums are added in
 another order each time, and the last digits differ.
@@ -52,7 +53,7 @@ def _write(path: Path, sizes: Sequence[Size], keypoints: SceneKeypoints, config:
             camera = pycolmap.Camera.create_from_model_name(
                 number, config.camera_model.value, config.prior_focal * max(size), *size
             )
-            camera.has_prior_focal_length = config.trust_prior
+            camera.has_prior_focal_length = True  # a pair that E explains at the prior is used as calibrated
             database.write_camera(camera, use_camera_id=True)
             rig = pycolmap.Rig(rig_id=number)
             rig.add_ref_sensor(camera.sensor_id)

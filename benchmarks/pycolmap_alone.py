@@ -1,0 +1,104 @@
+"""What a user would take instead: pycolmap's own SIFT, exhaustive matching and mappers, on the same pairs.
+
+python -m benchmarks.pycolmap_alone --train-dir DIR [--scenes NAME ...] [--mappers incremental global]
+
+DIR is a train side in the layout of the Image Matching Challenge 2022. Everything is as pycolmap has it, but for
+one SIMPLE_RADIAL camera an image. A pair whose images are not both in one model counts as lost. It prints the mAA
+over all pairs with a covisibility of at least 0.1, and the processor's seconds.
+"""
+
+import argparse
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from mkpc_kaggle.data.competition import Scene, TruePair, read_train_side
+from mkpc_kaggle.geometry.cameras import Camera, fundamental_of_cameras
+from mkpc_kaggle.geometry.metrics import PoseError, mean_average_accuracy, pose_error
+
+CENTRE = 0.5
+"""In COLMAP the top-left pixel's centre is (0.5, 0.5); in the tables it is (0, 0)."""
+
+Cameras = dict[str, Camera]
+
+
+def matched(folder: Path, database: Path, images: Path) -> None:
+    """Write SIFT features of all images, and verified matches of every two, to the database."""
+    reader = pycolmap.ImageReaderOptions()
+    reader.camera_model = "SIMPLE_RADIAL"
+    pycolmap.extract_features(
+        database,
+        images,
+        camera_mode=pycolmap.CameraMode.PER_IMAGE,
+        reader_options=reader,
+        device=pycolmap.Device.cpu,
+    )
+    pycolmap.match_exhaustive(database, device=pycolmap.Device.cpu)
+
+
+def models(mapper: str, database: Path, images: Path, folder: Path) -> list[Cameras]:
+    """The cameras of every model by image id, the largest model first."""
+    mapping = pycolmap.incremental_mapping if mapper == "incremental" else pycolmap.global_mapping
+    found = mapping(database, images, folder)
+    return sorted((cameras_of(model) for model in found.values()), key=len, reverse=True)
+
+
+def cameras_of(model: pycolmap.Reconstruction) -> Cameras:
+    cameras = {}
+    for number in model.reg_image_ids():
+        image = model.images[number]
+        pose, K = image.cam_from_world().matrix(), image.camera.calibration_matrix()
+        K[:2, 2] -= CENTRE
+        cameras[Path(image.name).stem] = Camera(K, pose[:, :3], pose[:, 3])
+    return cameras
+
+
+def error_of(true: TruePair, found: list[Cameras], metres_per_unit: float) -> PoseError:
+    names = [path.stem for path in true.pair.images]
+    for cameras in found:
+        if all(name in cameras for name in names):
+            F = fundamental_of_cameras(*(cameras[name] for name in names))
+            return pose_error(F, true.camera0, true.camera1, metres_per_unit)
+    return PoseError.failed()
+
+
+def run(scene: Scene, images: Path, mappers: list[str]) -> None:
+    with tempfile.TemporaryDirectory() as name:
+        folder, database = Path(name), Path(name) / "database.db"
+        begin = time.process_time()
+        matched(folder, database, images)
+        matching = time.process_time() - begin
+        for mapper in mappers:
+            begin = time.process_time()
+            found = models(mapper, database, images, folder)
+            errors = [error_of(true, found, scene.metres_per_unit) for true in scene.pairs]
+            lost = np.mean([not np.isfinite(error.rotation) for error in errors])
+            sizes = ", ".join(str(len(cameras)) for cameras in found) or "none"
+            print(
+                f"{scene.name:20}{mapper:13}{len(scene.pairs):6}{mean_average_accuracy(errors):9.4f}{lost:8.2f}"
+                f"{matching:10.0f}{time.process_time() - begin:9.0f}  {sizes}",
+                flush=True,
+            )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--train-dir", type=Path, required=True)
+    parser.add_argument("--scenes", nargs="*", default=())
+    parser.add_argument(
+        "--mappers", nargs="+", default=["incremental", "global"], choices=["incremental", "global"]
+    )
+    arguments = parser.parse_args()
+    pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
+    print(
+        f"{'scene':20}{'mapper':13}{'pairs':>6}{'mAA':>9}{'lost':>8}{'match s':>10}{'map s':>9}  images of models"
+    )
+    for scene in read_train_side(arguments.train_dir, scenes=arguments.scenes):
+        run(scene, arguments.train_dir / scene.name / "images", arguments.mappers)
+
+
+if __name__ == "__main__":
+    main()

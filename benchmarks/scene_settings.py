@@ -1,0 +1,125 @@
+"""The score of scenes under different settings, on the same matches.
+
+python -m benchmarks.scene_settings --train-dir DIR --matches DIR [--recipe classical] [--weights DIR]
+    [--scenes NAME ...] [--shares 1 0.3 0.12] [--settings default incremental ...]
+
+All pairs with a covisibility of at least 0.1 are matched once, into the directory of `--matches`, which a second
+run reads. A share below 1 takes that many of a scene's pairs by a fixed seed. `own` is the mAA of one MAGSAC a
+pair, `scene` that of the cameras alone, where a pair without two of them counts as lost, `chosen` that of the F
+which the pair gets in the end.
+"""
+
+import argparse
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from mkpc_kaggle.data.competition import Scene, TruePair, read_train_side
+from mkpc_kaggle.data.images import Image, Unreadable, read_image
+from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.geometry.metrics import PoseError, mean_average_accuracy, pose_error
+from mkpc_kaggle.geometry.robust import Matrix3, RobustConfig, estimate
+from mkpc_kaggle.pipeline.assembly import assemble
+from mkpc_kaggle.pipeline.stages import PairWork, Pipeline
+from mkpc_kaggle.scene.batch import Batch, BatchImage, BatchPair
+from mkpc_kaggle.scene.config import CameraModel, Mapper, SceneConfig
+from mkpc_kaggle.scene.solve import solve
+
+DEFAULT = SceneConfig()
+SETTINGS = {
+    "default": DEFAULT,
+    "incremental": replace(DEFAULT, mapper=Mapper.INCREMENTAL),
+    "radial": replace(DEFAULT, camera_model=CameraModel.RADIAL),
+    "cell 0.4": replace(DEFAULT, cell=0.4),
+    "cell 1.5": replace(DEFAULT, cell=1.5),
+    "verify 0.5": replace(DEFAULT, verification_error=0.5),
+    "verify 1": replace(DEFAULT, verification_error=1.0),
+    "verify 4": replace(DEFAULT, verification_error=4.0),
+    "seed 1": replace(DEFAULT, seed=1),
+}
+ONE_MAGSAC = RobustConfig(orders=1)
+
+
+def matched(true: TruePair, pipeline: Pipeline, folder: Path) -> BatchPair:
+    """A pair with its matches, from the folder or made now, and the F of one MAGSAC."""
+    names = [path.stem for path in true.pair.images]
+    file = folder / f"{names[0]}-{names[1]}.npz"
+    if not file.exists():
+        (work,) = pipeline.match(
+            [PairWork((readable(true.pair.image0), readable(true.pair.image1)))], pipeline.recipe.units
+        )
+        found = Matches.concatenate(result.matches for result in work.results)
+        folder.mkdir(parents=True, exist_ok=True)
+        np.savez(file, points0=found.points0, points1=found.points1, scores=found.scores)
+    with np.load(file) as kept:
+        matches = Matches(kept["points0"], kept["points1"], kept["scores"])
+    own = estimate(matches, ONE_MAGSAC)
+    return BatchPair(names[0], names[1], matches, own.matrix if own.ok else None)
+
+
+def readable(path: Path) -> Image:
+    image = read_image(path)
+    if isinstance(image, Unreadable):
+        raise UserError(str(image))
+    return image
+
+
+def score(scene: Scene, chosen: list[TruePair], matrices: list[Matrix3 | None]) -> float:
+    errors = [
+        PoseError.failed() if F is None else pose_error(F, true.camera0, true.camera1, scene.metres_per_unit)
+        for true, F in zip(chosen, matrices, strict=True)
+    ]
+    return mean_average_accuracy(errors)
+
+
+def row(name: str, scene: Scene, share: float, pairs: dict[str, BatchPair], images: dict[str, BatchImage]) -> str:
+    rng = np.random.default_rng(0)
+    places = np.sort(rng.choice(len(scene.pairs), round(share * len(scene.pairs)), replace=False))
+    chosen = [scene.pairs[place] for place in places]
+    asked = [pairs[true.pair.id] for true in chosen]
+    used = {end for pair in asked for end in (pair.image0, pair.image1)}
+    batch = Batch(tuple(images[end] for end in sorted(used)), tuple(asked))
+    begin = time.process_time()
+    solution = solve(batch, SETTINGS[name])
+    seconds = time.process_time() - begin
+    own = score(scene, chosen, [pair.own for pair in asked])
+    cameras = score(scene, chosen, [choice.F for choice in solution.choices])
+    best = [
+        pair.own if choice.F is None else choice.F for pair, choice in zip(asked, solution.choices, strict=True)
+    ]
+    placed = sum(one.placed for one in solution.scenes)
+    return (
+        f"{scene.name:16}{len(asked):6}  {name:14}{own:8.4f}{cameras:8.4f}{score(scene, chosen, best):8.4f}"
+        f"{placed:5}/{len(used):<4}{seconds:8.1f}"
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--train-dir", type=Path, required=True)
+    parser.add_argument("--matches", type=Path, required=True)
+    parser.add_argument("--recipe", default="classical")
+    parser.add_argument("--weights", type=Path, action="append", default=[])
+    parser.add_argument("--scenes", nargs="*", default=())
+    parser.add_argument("--shares", nargs="+", type=float, default=[1.0])
+    parser.add_argument("--settings", nargs="+", choices=list(SETTINGS), default=list(SETTINGS))
+    arguments = parser.parse_args()
+    pipeline = assemble(arguments.recipe, weights=arguments.weights).pipeline()
+    print(
+        f"{'scene':16}{'pairs':>6}  {'settings':14}{'own':>8}{'scene':>8}{'chosen':>8}{'placed':>10}{'cpu s':>8}"
+    )
+    for scene in read_train_side(arguments.train_dir, scenes=arguments.scenes):
+        folder = arguments.matches / scene.name
+        pairs = {true.pair.id: matched(true, pipeline, folder) for true in scene.pairs}
+        paths = {path.stem: path for true in scene.pairs for path in true.pair.images}
+        images = {name: BatchImage(name, name, readable(path).size) for name, path in paths.items()}
+        for share in arguments.shares:
+            for name in arguments.settings:
+                print(row(name, scene, share, pairs, images), flush=True)
+
+
+if __name__ == "__main__":
+    main()
