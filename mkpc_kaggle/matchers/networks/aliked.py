@@ -21,7 +21,7 @@ STRIDES = (1, 2, 8, 32)
 RADIUS = 2  # of non-maximum suppression and of the window that refines a keypoint
 TEMPERATURE = 0.1  # of that refinement's softmax
 PATCH = 3  # pixels that a keypoint's offsets are computed from, each way
-ROWS_AT_ONCE = 64  # of the full-size map
+ROWS_AT_ONCE, POSITIONS_AT_ONCE = 16, 1024  # what is made of them stays in a CPU's cache
 
 
 @dataclass(frozen=True)
@@ -153,7 +153,7 @@ def conv3x3(conv: type[nn.Conv2d], channels: int, out_channels: int) -> nn.Conv2
 
 
 class JoinedMap:
-    """The unit features of pixels of the full-size map, of which only those that are asked for are computed."""
+    """The unit features of the pixels of the full-size map, of which only those that are asked for are computed."""
 
     def __init__(self, network: Aliked, maps: tuple[Tensor, ...]) -> None:
         self._conv1 = network.conv1
@@ -162,17 +162,26 @@ class JoinedMap:
         self._tables = [as_grid(x1).flatten(0, 2), *map(table_of, parts)]
         self._sizes = [part.shape[2:] for part in parts]
 
-    def __call__(self, pixels: Tensor) -> Tensor:
+    def at(self, pixels: Tensor) -> Tensor:
         """Pixels (P,) int64 of the table of the full-size map -> (P, C) float32."""
         height, width = self.size
         full, *tables = self._tables
         image = pixels // (height * width)
         positions = torch.stack([pixels % width, pixels // width % height], dim=1).float()
-        parts = [torch.selu_(pointwise(self._conv1, full[pixels]).float())]
+        parts = [torch.selu_(pointwise(self._conv1, full.index_select(0, pixels)).float())]
         for table, size in zip(tables, self._sizes, strict=True):
             ratio = positions.new_tensor([_step(size[1], width), _step(size[0], height)])
             parts.append(weighted_rows(table, *corners(positions * ratio, image, size)))
         return functional.normalize(torch.cat(parts, dim=1), dim=1)
+
+    def sampled(self, positions: Tensor, image: Tensor) -> Tensor:
+        """Positions (Q, 2) in the images ``image`` (Q,) -> (Q, C) float32, zero outside."""
+        pixels, weights = corners(positions, image, self.size)  # (Q, 4)
+        order = torch.arange(pixels.numel(), device=pixels.device).view_as(pixels)
+        blocks = (values.split(POSITIONS_AT_ONCE) for values in (pixels, weights))
+        return torch.cat(
+            [weighted_rows(self.at(some.flatten()), order[: len(some)], shares) for some, shares in zip(*blocks)]
+        )
 
 
 class DescriptorHead(nn.Module):
@@ -190,33 +199,26 @@ class DescriptorHead(nn.Module):
 
     def forward(self, joined: JoinedMap, points: Tensor, image: Tensor) -> Tensor:
         """Descriptors (K, C) at points (K, 2) of the images ``image`` (K,)."""
+        if len(points) == 0:
+            return points.new_zeros(0, self.agg_weights.shape[2])
         height, width = joined.size
         corner = (points.long() - 1).clamp_(min=0)
         corner = torch.minimum(corner, corner.new_tensor([width - PATCH - 1, height - PATCH - 1]))  # as trained
         steps = torch.arange(PATCH, device=points.device)
         rows = (image * height + corner[:, 1])[:, None] + steps  # (K, 3)
         patches = (rows * width)[:, :, None] + (corner[:, :1] + steps)[:, None]  # (K, 3, 3)
-        features, places = computed_once(joined, patches.flatten(1))
-        offsets = self.offsets(features[places].flatten(1), max(height, width) / 4)  # (K, M, 2)
+        offsets = self.offsets(joined.at(patches.flatten()).view(len(points), -1), max(height, width) / 4)
 
-        positions = (points[:, None] + offsets).flatten(0, 1)
-        index, weights = corners(positions, image.repeat_interleave(offsets.shape[1]), joined.size)
-        features, places = computed_once(joined, index)
-        read = torch.selu_(pointwise(self.sf_conv, weighted_rows(features, places, weights)))  # (K M, C)
-        described = linear(read.view(len(points), -1), self.agg_weights.flatten(0, 1).T)
-        return functional.normalize(described, dim=1)
+        positions = (points[:, None] + offsets).flatten(0, 1)  # (K M, 2)
+        read = joined.sampled(positions, image.repeat_interleave(offsets.shape[1]))  # (K M, C)
+        read = torch.selu_(pointwise(self.sf_conv, read)).view(len(points), -1)
+        return functional.normalize(linear(read, self.agg_weights.flatten(0, 1).T), dim=1)
 
     def offsets(self, patches: Tensor, reach: float) -> Tensor:
         """Patches (K, 9 C), row by row -> (x, y) offsets (K, M, 2) in pixels."""
         whole, _, last = self.offset_conv
         hidden = torch.selu_(linear(patches, whole.weight.permute(0, 2, 3, 1).flatten(1), whole.bias))
         return pointwise(last, hidden).clamp_(-reach, reach).unflatten(1, (2, -1)).mT
-
-
-def computed_once(joined: JoinedMap, pixels: Tensor) -> tuple[Tensor, Tensor]:
-    """The features (P, C) of all different pixels, and where each of ``pixels`` is among them."""
-    different, places = pixels.unique(return_inverse=True)
-    return joined(different), places
 
 
 def enlarged(maps: Tensor, size: torch.Size) -> Tensor:
@@ -231,7 +233,9 @@ def _step(length: int, full: int) -> float:
 
 def strict_maxima(scores: Tensor, count: int) -> Tensor:
     """The best pixels of a map (H, W) that exceed all others around them, best first: (K,) int64, row by row."""
-    peaks = scores == functional.max_pool2d(scores[None], 2 * RADIUS + 1, 1, RADIUS)[0]
+    width = 2 * RADIUS + 1
+    along = functional.max_pool2d(scores[None], (1, width), 1, (0, RADIUS))
+    peaks = scores == functional.max_pool2d(along, (width, 1), 1, (RADIUS, 0))[0]
     inner = torch.zeros_like(peaks)
     inner[RADIUS:-RADIUS, RADIUS:-RADIUS] = True
     index = (peaks & inner).flatten().nonzero()[:, 0]

@@ -25,15 +25,22 @@ def corners(positions: Tensor, image: Tensor, size: torch.Size) -> tuple[Tensor,
     Pixels outside the map, of ``size`` (h, w), have the weight 0 and the index of another.
     """
     height, width = size
-    first = positions.floor()
-    fraction = positions - first
-    x, y = (first.long()[:, :, None] + torch.arange(2, device=positions.device)).unbind(1)  # (Q, 2)
-    along_x, along_y = torch.stack([1 - fraction, fraction], dim=2).unbind(1)  # (Q, 2)
-    along_x = along_x.masked_fill((x < 0) | (x >= width), 0)
-    along_y = along_y.masked_fill((y < 0) | (y >= height), 0)
-    rows = image[:, None] * height + y.clamp(0, height - 1)
-    index = (rows * width)[:, :, None] + x.clamp(0, width - 1)[:, None]
-    return index.flatten(1), (along_y[:, :, None] * along_x[:, None]).flatten(1)
+    x, y = positions.unbind(1)
+    first = image * (height * width)
+    rows = [(first + row * width, weight) for row, weight in neighbours(y, height)]
+    columns = neighbours(x, width)
+    index = torch.stack([row + column for row, _ in rows for column, _ in columns], dim=1)
+    return index, torch.stack([along_y * along_x for _, along_y in rows for _, along_x in columns], dim=1)
+
+
+def neighbours(positions: Tensor, length: int) -> list[tuple[Tensor, Tensor]]:
+    """On one axis the pixel before each position (Q,) and the one after it, int64, with their weights."""
+    before = positions.floor()
+    share = positions - before
+    return [
+        (pixel.clamp(0, length - 1).long(), weight.masked_fill((pixel < 0) | (pixel >= length), 0))
+        for pixel, weight in ((before, 1 - share), (before + 1, share))
+    ]
 
 
 def weighted_rows(table: Tensor, index: Tensor, weights: Tensor) -> Tensor:
