@@ -1,5 +1,5 @@
-"""ALIKED: Zhao et al., "ALIKED: A Lighter Keypoint and Descriptor Extraction Network via Deformable Transformation",
-IEEE Transactions on Instrumentation and Measurement 2023.
+"""ALIKED: Zhao et al., "ALIKED: A Lighter Keypoint and Descriptor Extraction Network via Deformable
+Transformation", IEEE Transactions on Instrumentation and Measurement 2023.
 
 A map of four scales, joined at full size, gives a score at every pixel; descriptors are read where each keypoint's
 offsets point. The joined map is never made: scores need 8 channels of it, and descriptors some thousand pixels.
@@ -90,12 +90,12 @@ class Aliked(nn.Module):
             torch.tensor(counts, device=images.device)
         )
         descriptors = self.desc_head(JoinedMap(self, maps), torch.cat(points), image)
-        return [AlikedKeypoints(*each) for each in zip(points, descriptors.split(counts), strict=True)]
+        return [AlikedKeypoints(*each) for each in zip(points, torch.split(descriptors, counts), strict=True)]
 
     def maps(self, images: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """(B, c1, H, W) at stride 1, the input of its part; and the parts themselves at strides 2, 8 and 32."""
-        x = images.contiguous(memory_format=torch.channels_last).to(self.conv1.weight.dtype)
-        x1 = self.block1(x)
+        # Channels first: of three channels the convolution is faster so; its own result has them last.
+        x1 = self.block1(images.contiguous().to(self.conv1.weight.dtype))
         x2 = self.block2(functional.avg_pool2d(x1, 2))
         x3 = self.block3(functional.avg_pool2d(x2, 4))
         x4 = self.block4(functional.avg_pool2d(x3, 4))
@@ -111,7 +111,7 @@ class Aliked(nn.Module):
         total = torch.cat(
             [
                 functional.conv2d(torch.selu_(self.conv1(rows)).float(), weights[0])
-                for rows in x1.split(ROWS_AT_ONCE, dim=2)
+                for rows in torch.split(x1, ROWS_AT_ONCE, dim=2)
             ],
             dim=2,
         )
@@ -153,7 +153,7 @@ def conv3x3(conv: type[nn.Conv2d], channels: int, out_channels: int) -> nn.Conv2
 
 
 class JoinedMap:
-    """The unit features of the pixels of the full-size map, of which only those that are asked for are computed."""
+    """The unit features of the full-size map, computed for the pixels that are asked for alone."""
 
     def __init__(self, network: Aliked, maps: tuple[Tensor, ...]) -> None:
         self._conv1 = network.conv1
@@ -178,9 +178,12 @@ class JoinedMap:
         """Positions (Q, 2) in the images ``image`` (Q,) -> (Q, C) float32, zero outside."""
         pixels, weights = corners(positions, image, self.size)  # (Q, 4)
         order = torch.arange(pixels.numel(), device=pixels.device).view_as(pixels)
-        blocks = (values.split(POSITIONS_AT_ONCE) for values in (pixels, weights))
+        blocks = (torch.split(values, POSITIONS_AT_ONCE) for values in (pixels, weights))
         return torch.cat(
-            [weighted_rows(self.at(some.flatten()), order[: len(some)], shares) for some, shares in zip(*blocks)]
+            [
+                weighted_rows(self.at(some.flatten()), order[: len(some)], shares)
+                for some, shares in zip(*blocks, strict=True)
+            ]
         )
 
 
@@ -216,9 +219,12 @@ class DescriptorHead(nn.Module):
 
     def offsets(self, patches: Tensor, reach: float) -> Tensor:
         """Patches (K, 9 C), row by row -> (x, y) offsets (K, M, 2) in pixels."""
-        whole, _, last = self.offset_conv
-        hidden = torch.selu_(linear(patches, whole.weight.permute(0, 2, 3, 1).flatten(1), whole.bias))
-        return pointwise(last, hidden).clamp_(-reach, reach).unflatten(1, (2, -1)).mT
+        whole, bias, last, last_bias = (
+            self.offset_conv.get_parameter(name) for name in ("0.weight", "0.bias", "2.weight", "2.bias")
+        )
+        hidden = torch.selu_(linear(patches, whole.permute(0, 2, 3, 1).flatten(1), bias))
+        moved = linear(hidden, last.flatten(1), last_bias).clamp_(-reach, reach)
+        return moved.view(len(patches), 2, -1).mT
 
 
 def enlarged(maps: Tensor, size: torch.Size) -> Tensor:

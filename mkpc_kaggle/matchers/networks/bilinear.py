@@ -1,7 +1,7 @@
 """Bilinear samples of tables of pixels, and the deformable convolution that is made of them (Dai et al. 2017).
 
-A table (P, C) holds the pixels of B maps of one size, row by row and one map after the other: a channels-last batch
-seen as rows. Positions are (x, y) in pixels of their map.
+A table (P, C) holds the pixels of B maps of one size, row by row and one map after the other: a channels-last
+batch seen as rows. Positions are (x, y) in pixels of their map.
 """
 
 import torch
@@ -54,7 +54,7 @@ def sampled(maps: Tensor, positions: Tensor, image: Tensor) -> Tensor:
 
 
 class DeformableConv2d(nn.Conv2d):
-    """A 3x3 convolution whose nine taps stand where ``offset_conv`` moves them from each pixel's own neighbours."""
+    """A 3x3 convolution whose nine taps ``offset_conv`` moves, at each pixel, away from its neighbours."""
 
     def __init__(self, channels: int, out_channels: int) -> None:
         super().__init__(channels, out_channels, KERNEL, padding=1, bias=False)
@@ -64,11 +64,11 @@ class DeformableConv2d(nn.Conv2d):
         """(B, C, h, w) -> (B, out_channels, h, w), like ``x``."""
         batch, _, height, width = x.shape
         reach = max(height, width) / 4
-        offsets = as_grid(self.offset_conv(x.float())).clamp(-reach, reach)  # (B, h, w, 18): y, x of each tap
+        offsets = as_grid(self.offset_conv(x.float())).clamp(-reach, reach)  # (B, h, w, 18): y, x by tap
         rows, columns = (torch.arange(n, device=x.device) for n in (height, width))
         taps = torch.cartesian_prod(*2 * [torch.arange(KERNEL, device=x.device) - 1]).flip(1)  # (9, 2): x, y
         pixels = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), dim=2)[:, :, None]  # (h, w, 1, 2)
-        positions = offsets.unflatten(3, (-1, 2)).flip(4) + (pixels + taps)  # (B, h, w, 9, 2)
+        positions = offsets.view(batch, height, width, -1, 2).flip(4) + (pixels + taps)  # (B, h, w, 9, 2)
         image = torch.arange(batch, device=x.device).repeat_interleave(height * width * KERNEL**2)
         seen = sampled(x, positions.flatten(0, 3), image).view(batch, height, width, -1)  # (B, h, w, 9 C)
         weight = self.weight.permute(0, 2, 3, 1).flatten(1)  # (out, 9 C)
