@@ -70,7 +70,7 @@ def load_glue(weights: WeightStore, slot: str, threshold: float, **shape: Any) -
     tensors = {layer_name(name): tensor for name, tensor in weights.load(slot).items()}
     numbers = (int(name.split(".")[1]) for name in tensors if name.startswith("transformers."))
     layers = 1 + max(numbers, default=0)
-    flash = torch.backends.cuda.flash_sdp_enabled()
+    flash = torch.backends.cuda.flash_sdp_enabled()  # type: ignore[no-untyped-call]
     glue = LightGlue(
         None,  # type: ignore[arg-type]  # no download; kornia's annotation leaves it out
         n_layers=layers,

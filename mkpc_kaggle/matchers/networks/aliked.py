@@ -105,9 +105,9 @@ class Aliked(nn.Module):
 
     def score_map(self, maps: tuple[Tensor, ...]) -> Tensor:
         """(B, H, W) float32 in (0, 1)."""
-        first, *rest = self.score_head
         x1, *parts = maps
-        weights = first.weight.chunk(4, dim=1)  # (8, C / 4, 1, 1) each: a 1x1 convolution may precede upsampling
+        # (8, C / 4, 1, 1) each: a 1x1 convolution may precede upsampling.
+        weights = self.score_head.get_parameter("0.weight").chunk(4, dim=1)
         total = torch.cat(
             [
                 functional.conv2d(torch.selu_(self.conv1(rows)).float(), weights[0])
@@ -117,9 +117,8 @@ class Aliked(nn.Module):
         )
         for part, weight in zip(parts, weights[1:], strict=True):
             total += enlarged(functional.conv2d(part.float(), weight), x1.shape[2:])
-        for layer in rest:
-            total = layer(total)
-        return total[:, 0].sigmoid_()
+        scores: Tensor = self.score_head[1:](total)
+        return scores[:, 0].sigmoid_()
 
 
 class Block(nn.Module):
