@@ -15,15 +15,17 @@ import numpy as np
 import pytest
 import torch
 from device_double import DeviceDouble
-from kornia.feature import ALIKED, XFeat
+from kornia.feature import XFeat
 from standin import filled, scene
 from torch import nn
 
 from mkpc_kaggle.geometry.coordinates import Box, Size, View
-from mkpc_kaggle.matchers import aspanformer, dkm, loftr, quadtree
-from mkpc_kaggle.matchers.aliked import AlikedMatcher, AlikedOptions
+from mkpc_kaggle.matchers import aspanformer, dkm, loftr, quadtree, xfeat_lighterglue
+from mkpc_kaggle.matchers.aliked import AlikedEncoder, AlikedMatcher, AlikedOptions
 from mkpc_kaggle.matchers.contract import Colour, Picture, Placement, Precision
 from mkpc_kaggle.matchers.dkm import DkmMatcher, DkmOptions
+from mkpc_kaggle.matchers.lightglue import LightGlueMatcher, LightGlueOptions, light_glue
+from mkpc_kaggle.matchers.networks.aliked import Aliked
 from mkpc_kaggle.matchers.networks.aspanformer import AspanFormer
 from mkpc_kaggle.matchers.networks.dkm import DKM
 from mkpc_kaggle.matchers.networks.loftr import Loftr
@@ -33,7 +35,6 @@ from mkpc_kaggle.matchers.networks.superglue import SuperGlue, SuperGlueConfig
 from mkpc_kaggle.matchers.networks.superpoint import SuperPoint, SuperPointConfig
 from mkpc_kaggle.matchers.semi_dense import SemiDenseMatcher
 from mkpc_kaggle.matchers.superglue import SuperGlueMatcher
-from mkpc_kaggle.matchers.xfeat_lighterglue import XFeatLighterGlueMatcher, XFeatLighterGlueOptions, lighter_glue
 
 SIZE = Size(96, 64)
 SHIFT = 8
@@ -66,16 +67,12 @@ def make_superglue() -> SuperGlue:
     return SuperGlue(SuperGlueConfig(20))
 
 
-def make_aliked() -> ALIKED:
-    return ALIKED(model_name="aliked-n16", max_num_keypoints=200, detection_threshold=0.0)
-
-
 def make_xfeat() -> XFeat:
     return XFeat(detection_threshold=0.0)
 
 
 def make_lighter_glue() -> nn.Module:
-    return lighter_glue(layers=6, threshold=0.0)
+    return light_glue(6, 0.0, **xfeat_lighterglue.SHAPE)
 
 
 def superglue_matcher(placement: Placement) -> SuperGlueMatcher:
@@ -94,12 +91,14 @@ def dkm_matcher(passes: int) -> Callable[[Placement], DkmMatcher]:
 
 
 def aliked_matcher(placement: Placement) -> AlikedMatcher:
-    return AlikedMatcher(copy.deepcopy(seeded(make_aliked)), AlikedOptions(), placement.device)
+    return AlikedMatcher(AlikedEncoder(fresh("aliked", Aliked, placement), placement.device), AlikedOptions())
 
 
-def xfeat_matcher(placement: Placement) -> XFeatLighterGlueMatcher:
-    networks = (copy.deepcopy(seeded(make)) for make in (make_xfeat, make_lighter_glue))
-    return XFeatLighterGlueMatcher(*networks, XFeatLighterGlueOptions(200, 0.0), placement)
+def xfeat_matcher(placement: Placement) -> LightGlueMatcher:
+    network, glue = (copy.deepcopy(seeded(make)) for make in (make_xfeat, make_lighter_glue))
+    options = LightGlueOptions(200, 0.0)
+    encoder = xfeat_lighterglue.XFeatEncoder(network, options.features, placement)
+    return LightGlueMatcher(xfeat_lighterglue.SPEC, encoder, glue, options, placement)
 
 
 MATCHERS: dict[str, Callable[[Placement], Any]] = {

@@ -23,11 +23,12 @@ from mkpc_kaggle.matchers.contract import (
     detached,
     encoding_bytes,
 )
+from mkpc_kaggle.matchers.lightglue import light_glue
 from mkpc_kaggle.matchers.networks.loftr import Loftr
 from mkpc_kaggle.matchers.networks.placement import placed
 from mkpc_kaggle.matchers.networks.superglue import ImageKeypoints, SuperGlue, SuperGlueConfig
 from mkpc_kaggle.matchers.numbers import check_finite, exact_float32
-from mkpc_kaggle.matchers.xfeat_lighterglue import lighter_glue
+from mkpc_kaggle.matchers.xfeat_lighterglue import SHAPE
 from mkpc_kaggle.pipeline import assembly, gpus
 from mkpc_kaggle.pipeline.assembly import assemble, fastest_precision, resolve_device
 from mkpc_kaggle.pipeline.pair import PairMatch
@@ -159,7 +160,7 @@ def test_the_cache_is_sized_by_the_memory_that_is_free_and_the_workers_on_it() -
 def test_lighterglue_stays_in_float32_on_a_gpu_and_leaves_the_process_alone() -> None:
     before = torch.backends.cuda.flash_sdp_enabled()
     torch.manual_seed(0)
-    glue = lighter_glue(2, 0.0).eval()
+    glue = light_glue(2, 0.0, **SHAPE).eval()
     assert torch.backends.cuda.flash_sdp_enabled() is before is True
     side = {"keypoints": torch.rand(1, 9, 2) * 50, "descriptors": torch.rand(1, 9, 64)}
     side["image_size"] = torch.tensor([[64.0, 48.0]])

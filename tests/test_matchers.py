@@ -15,9 +15,9 @@ from torch import nn
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Box, Size, View
 from mkpc_kaggle.matchers.contract import Colour, Picture, Placement, Training, encoding_bytes
+from mkpc_kaggle.matchers.lightglue import layer_name
 from mkpc_kaggle.matchers.neighbours import mutual_neighbours
 from mkpc_kaggle.matchers.registry import load_matcher, matcher_names, spec_of
-from mkpc_kaggle.matchers.xfeat_lighterglue import layer_name
 from mkpc_kaggle.weights import WeightStore, load_into
 
 SIZE = Size(256, 192)

@@ -37,8 +37,9 @@ def test_list_says_what_is_there_and_what_the_missing_would_enable(
     assert main(["weights", "list", "--weights", str(weights)]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[1].split() == ["sift.pt", "21", "MIT", "sift", "-", str(weights / "sift.pt")]
-    assert lines[2].split() == ["a.pt", "21", "MIT", "aliked-n16", "aliked", str(weights / "renamed.pt")]
-    assert lines[3].split() == ["b.pt", "?", "MIT", "aliked-n16", "aliked", "missing"]
+    users = ["aliked,", "aliked_lightglue"]
+    assert lines[2].split() == ["a.pt", "21", "MIT", "aliked-n16", *users, str(weights / "renamed.pt")]
+    assert lines[3].split() == ["b.pt", "?", "MIT", "aliked-n16", *users, "missing"]
     assert lines[5].startswith("missing: superpoint (lost.pt), for matcher superglue")
     assert "recipe yfcc" in lines[5]
     assert len(lines) == 6

@@ -1,15 +1,16 @@
-"""ALIKED keypoints (Zhao et al. 2023, kornia's network) with mutual nearest neighbours."""
+"""ALIKED keypoints (Zhao et al. 2023) with mutual nearest neighbours."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from kornia.feature import ALIKED
 
 from mkpc_kaggle.config import AT_LEAST_1, SHARE, check_ranges
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import MatcherSpec, Picture, Placement
 from mkpc_kaggle.matchers.neighbours import mutual_neighbours
+from mkpc_kaggle.matchers.networks.aliked import Aliked, own_name
+from mkpc_kaggle.matchers.networks.placement import placed
 from mkpc_kaggle.matchers.sparse import Keypoints, image_batch, matches_of
 from mkpc_kaggle.weights import WeightStore, load_into
 
@@ -37,23 +38,32 @@ SPEC = MatcherSpec(
 )
 
 
-class AlikedMatcher:
-    """A match's score is the cosine of its descriptors. Always in float32: kornia's network knows nothing else."""
+class AlikedEncoder:
+    """What every matcher of ALIKED's keypoints looks at one picture with."""
 
-    spec = SPEC
-
-    def __init__(self, network: ALIKED, options: AlikedOptions, device: str) -> None:
-        self.options = options
+    def __init__(self, network: Aliked, device: str) -> None:
         self.device = device
-        self._network = network.eval().to(device)
+        self._network = network
 
     @torch.inference_mode()
     def encode(self, pictures: Sequence[Picture]) -> list[Keypoints]:
+        if not pictures:
+            return []
         found = self._network(image_batch(list(pictures), self.device))
         return [
-            Keypoints.on_content(features.keypoints, features.descriptors, picture.content)
-            for features, picture in zip(found, pictures, strict=True)
+            Keypoints.on_content(keypoints.points, keypoints.descriptors, picture.content)
+            for keypoints, picture in zip(found, pictures, strict=True)
         ]
+
+
+class AlikedMatcher:
+    """A match's score is the cosine of its descriptors."""
+
+    spec = SPEC
+
+    def __init__(self, encoder: AlikedEncoder, options: AlikedOptions) -> None:
+        self.options = options
+        self.encode = encoder.encode
 
     @torch.inference_mode()
     def match(self, encodings0: Sequence[Keypoints], encodings1: Sequence[Keypoints]) -> list[Matches]:
@@ -67,8 +77,12 @@ class AlikedMatcher:
         )
 
 
+def load_encoder(weights: WeightStore, features: int, placement: Placement) -> AlikedEncoder:
+    network = Aliked(max_keypoints=features)
+    tensors = {own_name(name): tensor for name, tensor in weights.load(SLOT).items()}
+    load_into(network, tensors, what=SLOT)
+    return AlikedEncoder(placed(network, placement), placement.device)
+
+
 def load(weights: WeightStore, options: AlikedOptions, placement: Placement) -> AlikedMatcher:
-    network = ALIKED(model_name="aliked-n16", max_num_keypoints=options.features, detection_threshold=0.0)
-    # The sampling grid is a computed buffer that checkpoints do not carry.
-    load_into(network, weights.load(SLOT), what=SLOT, unused=r"dkd\.hw_grid")
-    return AlikedMatcher(network, options, placement.device)
+    return AlikedMatcher(load_encoder(weights, options.features, placement), options)

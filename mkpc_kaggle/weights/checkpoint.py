@@ -21,8 +21,9 @@ def load_tensors(path: Path) -> "dict[str, torch.Tensor]":
     """Tensors by name, on the CPU, from a safetensors file or a torch checkpoint; nothing in the file is executed.
 
     ``path`` may be the directory into which a torch checkpoint was unpacked (``NAME/NAME`` on Kaggle).
-    A training checkpoint keeps them under ``state_dict``; what lies beside them there is left out. Raises
-    :class:`UserError` for a file that cannot be read, or whose table of tensors holds anything else.
+    A training checkpoint keeps them under ``state_dict``, DISK's under ``extractor``; what lies beside them there
+    is left out. Raises :class:`UserError` for a file that cannot be read, or whose table of tensors holds anything
+    else.
     """
     import torch
 
@@ -82,7 +83,9 @@ def _load_table(path: Path) -> Mapping[Any, Any]:
 
 def _state_dict(contents: object) -> Mapping[Any, Any]:
     """The table of tensors in what a file holds."""
-    table = contents.get("state_dict", contents) if isinstance(contents, dict) else contents
+    table = contents
+    if isinstance(contents, dict):
+        table = contents.get("state_dict", contents.get("extractor", contents))
     if not isinstance(table, dict):
         raise ValueError("it holds no table of tensors by name")
     return table

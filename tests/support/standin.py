@@ -51,6 +51,12 @@ STAND_INS = {
         {"backbone.layer3_outconv.weight": 2.0, "loftr_coarse.layers.*.flow_decoder.2.weight": 0.3},
         {"coarse_matching.temperature": 6.0},
     ),
+    "aliked": StandIn(2.0, {"score_head.6.weight": 3.0, "desc_head.offset_conv.2.*": 3.0}),
+    "disk": StandIn(2.0),
+    "lightglue": StandIn(
+        1.0,
+        {"input_proj.weight": 16.0, "transformers.*.ffn.3.*": 0.1, "log_assignment.*.final_proj.weight": 4.0},
+    ),
     "dkm": StandIn(
         1.5,
         {

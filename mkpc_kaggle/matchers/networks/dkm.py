@@ -1,7 +1,7 @@
 """DKM v3: Edstedt et al., "DKM: Dense Kernelized Feature Matching for Geometry Estimation", CVPR 2023.
 
 Two views of a pair are compared whole; every pixel of each gets a place in the other, and a certainty. The views
-may have any sizes; the published code wants one size of both, where the results are the same.
+may have any sizes; the published code wants one size of both. Pixels of windows and corrections are the query's.
 Coordinates are normalised: (x, y) in [-1, 1], where +-1 are the outer edges of an image (see dkm_refiner).
 Parameter names are those of the public checkpoints. For inference only.
 """
@@ -73,8 +73,10 @@ class DenseWarp:
 def network_input(pixels: Tensor, size: tuple[int, int]) -> Tensor:
     """RGB images (B, 3, H, W) uint8 on the CPU -> (B, 3, *size) float32, resized and normalised.
 
-    Bicubic with antialiasing in 8 bits; differs from PIL, with which the network was trained, by a grey level in
-    less than a hundredth of the values. The second pass needs the image itself resized anew.
+    Bicubic with antialiasing in 8 bits, the width first, as by Pillow up to version 12, with which the network was
+    trained: less than a hundredth of the values differ, by a grey level or two. Pillow 13 begins with the height
+    where it shrinks and the width grows; there a fifth of the values differ or more. The second pass needs the
+    image itself resized anew.
     """
     if pixels.shape[2:] != size:
         pixels = functional.interpolate(pixels, size, mode="bicubic", antialias=True, align_corners=False)
@@ -169,7 +171,7 @@ class Decoder(nn.Module):
 
     def correct(self, estimate: Estimate, query: Pyramid, support: Pyramid, stride: int) -> Estimate:
         corrections = self.conv_refiner[str(stride)](query.at(stride), support.at(stride), estimate.flow)
-        return refined(estimate, corrections, stride, _size(support, 1))
+        return refined(estimate, corrections, stride, _size(query, 1))
 
 
 def _size(pyramid: Pyramid, stride: int) -> torch.Size:

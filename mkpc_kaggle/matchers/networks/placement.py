@@ -26,7 +26,8 @@ def placed(network: Network, placement: Placement) -> Network:
     fold_norms(network)
     for layer in network.modules():
         if isinstance(layer, Layer) and not isinstance(layer, Exact):
-            layer.to(dtype_of(placement))
+            for parameter in layer.parameters(recurse=False):
+                parameter.data = parameter.to(dtype_of(placement))
     return network.to(placement.device)
 
 

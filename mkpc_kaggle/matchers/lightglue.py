@@ -1,0 +1,99 @@
+"""LightGlue (Lindenberger et al. 2023, kornia's network): what all matchers that end in it share."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import torch
+from kornia.feature import LightGlue
+from torch import Tensor
+
+from mkpc_kaggle.config import AT_LEAST_1, SHARE, check_ranges
+from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.matchers.contract import MatcherSpec, Picture, Placement
+from mkpc_kaggle.matchers.networks.placement import autocast
+from mkpc_kaggle.matchers.sparse import Keypoints, matches_of
+from mkpc_kaggle.weights import WeightStore, load_into
+
+
+@dataclass(frozen=True)
+class LightGlueOptions:
+    """``features``: the strongest kept in each picture. ``threshold``: matches must score above it."""
+
+    features: int = 2048
+    threshold: float = 0.1
+
+    def __post_init__(self) -> None:
+        check_ranges(self, features=AT_LEAST_1, threshold=SHARE)
+
+
+class Encoder(Protocol):
+    def encode(self, pictures: Sequence[Picture]) -> list[Keypoints]: ...
+
+
+class LightGlueMatcher:
+    """A match's score is LightGlue's."""
+
+    def __init__(
+        self, spec: MatcherSpec, encoder: Encoder, glue: LightGlue, options: LightGlueOptions, placement: Placement
+    ) -> None:
+        self.spec = spec
+        self.options = options
+        self.placement = placement
+        self.encode = encoder.encode
+        self._glue = glue.eval().to(placement.device)
+
+    @torch.inference_mode()
+    def match(self, encodings0: Sequence[Keypoints], encodings1: Sequence[Keypoints]) -> list[Matches]:
+        return [self._match(*pair) for pair in zip(encodings0, encodings1, strict=True)]
+
+    def _match(self, keypoints0: Keypoints, keypoints1: Keypoints) -> Matches:
+        if len(keypoints0) == 0 or len(keypoints1) == 0:
+            return Matches.empty()
+        with autocast(self.placement):
+            found = self._glue({"image0": _glue_input(keypoints0), "image1": _glue_input(keypoints1)})
+        pairs, scores = found["matches"][0], found["scores"][0]  # (M, 2), (M,)
+        return matches_of(keypoints0, keypoints1, pairs[:, 0], pairs[:, 1], scores.float())
+
+
+def _glue_input(keypoints: Keypoints) -> dict[str, Tensor]:
+    return {
+        "keypoints": keypoints.points[None],
+        "descriptors": keypoints.descriptors[None],
+        "image_size": keypoints.points.new_tensor([keypoints.content]),
+    }
+
+
+def load_glue(weights: WeightStore, slot: str, threshold: float, **shape: Any) -> LightGlue:
+    """With as many layers as the checkpoint has; ``shape``: kornia's ``input_dim`` and so on."""
+    tensors = {layer_name(name): tensor for name, tensor in weights.load(slot).items()}
+    numbers = (int(name.split(".")[1]) for name in tensors if name.startswith("transformers."))
+    layers = 1 + max(numbers, default=0)
+    glue = light_glue(layers, threshold, **shape)
+    # Without early stopping and pruning only the last layer's assignment is used.
+    early = rf"token_confidence\.|confidence_thresholds|log_assignment\.(?!{layers - 1}\.)"
+    load_into(glue, tensors, unused=early, what=slot)
+    return glue
+
+
+def light_glue(layers: int, threshold: float, **shape: Any) -> LightGlue:
+    """The network without weights; ``threshold`` of a match's score."""
+    flash = torch.backends.cuda.flash_sdp_enabled()  # type: ignore[no-untyped-call]  # torch's own
+    try:
+        return LightGlue(
+            None,  # type: ignore[arg-type]  # no download; kornia's annotation leaves it out
+            n_layers=layers,
+            flash=False,  # else kornia halves queries, keys and values on a GPU, float32 or not
+            depth_confidence=-1,
+            width_confidence=-1,
+            filter_threshold=threshold,
+            **shape,
+        )
+    finally:
+        torch.backends.cuda.enable_flash_sdp(flash)  # kornia sets it for the whole process
+
+
+def layer_name(name: str) -> str:
+    """LightGlue's present parameter name for that of an older checkpoint or of a training wrapper."""
+    return re.sub(r"^(self|cross)_attn\.(\d+)\.", r"transformers.\2.\1_attn.", name.removeprefix("matcher."))

@@ -1,0 +1,270 @@
+"""ALIKED: Zhao et al., "ALIKED: A Lighter Keypoint and Descriptor Extraction Network via Deformable
+Transformation", IEEE Transactions on Instrumentation and Measurement 2023.
+
+A map of four scales, joined at full size, gives a score at every pixel; descriptors are read where each keypoint's
+offsets point. The joined map is never made: scores need 8 channels of it, and descriptors some thousand pixels.
+Parameter names are those of the public checkpoints, apart from ``regular_conv`` (see :func:`own_name`).
+For inference only.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from mkpc_kaggle.matchers.networks.bilinear import DeformableConv2d, corners, table_of, weighted_rows
+from mkpc_kaggle.matchers.networks.grids import as_grid, pointwise
+from mkpc_kaggle.matchers.networks.layers import ExactConv2d, linear
+
+STRIDES = (1, 2, 8, 32)
+RADIUS = 2  # of non-maximum suppression and of the window that refines a keypoint
+TEMPERATURE = 0.1  # of that refinement's softmax
+PATCH = 3  # pixels that a keypoint's offsets are computed from, each way
+ROWS_AT_ONCE, POSITIONS_AT_ONCE = 16, 1024  # what is made of them stays in a CPU's cache
+
+
+@dataclass(frozen=True)
+class AlikedShape:
+    """``channels`` of the four scales, the last also that of descriptors; ``positions`` read for each."""
+
+    channels: tuple[int, int, int, int]
+    positions: int
+
+
+SHAPES = {
+    "t16": AlikedShape((8, 16, 32, 64), 16),
+    "n16": AlikedShape((16, 32, 64, 128), 16),
+    "n32": AlikedShape((16, 32, 64, 128), 32),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class AlikedKeypoints:
+    """K keypoints of one image, best first: ``points`` (K, 2) float32, x and y in pixels with centres at integers;
+    unit ``descriptors`` (K, D) float32.
+    """
+
+    points: Tensor
+    descriptors: Tensor
+
+
+class Aliked(nn.Module):
+    """``max_keypoints``: the strongest kept in each image."""
+
+    multiple = 32
+
+    def __init__(self, shape: AlikedShape = SHAPES["n16"], max_keypoints: int = 2048) -> None:
+        super().__init__()
+        self.max_keypoints = max_keypoints
+        c1, c2, c3, c4 = shape.channels
+        part = c4 // 4
+        self.block1 = Block(nn.Conv2d, 3, c1)
+        self.block2 = ResidualBlock(nn.Conv2d, c1, c2)
+        self.block3 = ResidualBlock(DeformableConv2d, c2, c3)
+        self.block4 = ResidualBlock(DeformableConv2d, c3, c4)
+        self.conv1, self.conv2, self.conv3, self.conv4 = (
+            nn.Conv2d(channels, part, 1, bias=False) for channels in shape.channels
+        )
+        self.score_head = nn.Sequential(
+            ExactConv2d(c4, 8, 1, bias=False),
+            nn.SELU(inplace=True),
+            ExactConv2d(8, 4, 3, padding=1, bias=False),
+            nn.SELU(inplace=True),
+            ExactConv2d(4, 4, 3, padding=1, bias=False),
+            nn.SELU(inplace=True),
+            ExactConv2d(4, 1, 3, padding=1, bias=False),
+        )
+        self.desc_head = DescriptorHead(c4, shape.positions)
+        self.eval().requires_grad_(False)
+        self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # missing in torch's stubs
+
+    def forward(self, images: Tensor) -> list[AlikedKeypoints]:
+        """Images (B, 3, H, W) float32 RGB in [0, 1], sides multiples of 32."""
+        maps = self.maps(images)
+        points = [
+            refined_maxima(scores, strict_maxima(scores, self.max_keypoints)) for scores in self.score_map(maps)
+        ]
+        counts = [len(each) for each in points]
+        image = torch.arange(len(points), device=images.device).repeat_interleave(
+            torch.tensor(counts, device=images.device)
+        )
+        descriptors = self.desc_head(JoinedMap(self, maps), torch.cat(points), image)
+        return [AlikedKeypoints(*each) for each in zip(points, torch.split(descriptors, counts), strict=True)]
+
+    def maps(self, images: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """(B, c1, H, W) at stride 1, the input of its part; and the parts themselves at strides 2, 8 and 32."""
+        # Channels first: of three channels the convolution is faster so; its own result has them last.
+        x1 = self.block1(images.contiguous().to(self.conv1.weight.dtype))
+        x2 = self.block2(functional.avg_pool2d(x1, 2))
+        x3 = self.block3(functional.avg_pool2d(x2, 4))
+        x4 = self.block4(functional.avg_pool2d(x3, 4))
+        coarse = ((self.conv2, x2), (self.conv3, x3), (self.conv4, x4))
+        part2, part3, part4 = (torch.selu_(conv(x)) for conv, x in coarse)
+        return x1, part2, part3, part4
+
+    def score_map(self, maps: tuple[Tensor, ...]) -> Tensor:
+        """(B, H, W) float32 in (0, 1)."""
+        x1, *parts = maps
+        # (8, C / 4, 1, 1) each: a 1x1 convolution may precede upsampling.
+        weights = self.score_head.get_parameter("0.weight").chunk(4, dim=1)
+        total = torch.cat(
+            [
+                functional.conv2d(torch.selu_(self.conv1(rows)).float(), weights[0])
+                for rows in torch.split(x1, ROWS_AT_ONCE, dim=2)
+            ],
+            dim=2,
+        )
+        for part, weight in zip(parts, weights[1:], strict=True):
+            total += enlarged(functional.conv2d(part.float(), weight), x1.shape[2:])
+        scores: Tensor = self.score_head[1:](total)
+        return scores[:, 0].sigmoid_()
+
+
+class Block(nn.Module):
+    """Two 3x3 convolutions, each with a batch norm and a SELU."""
+
+    def __init__(self, conv: type[nn.Conv2d], channels: int, out_channels: int) -> None:
+        super().__init__()
+        self.conv1 = conv3x3(conv, channels, out_channels)
+        self.bn1 = nn.BatchNorm2d(out_channels)
+        self.conv2 = conv3x3(conv, out_channels, out_channels)
+        self.bn2 = nn.BatchNorm2d(out_channels)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return torch.selu_(self.bn2(self.conv2(torch.selu_(self.bn1(self.conv1(x))))))
+
+
+class ResidualBlock(Block):
+    def __init__(self, conv: type[nn.Conv2d], channels: int, out_channels: int) -> None:
+        super().__init__(conv, channels, out_channels)
+        self.downsample = nn.Conv2d(channels, out_channels, 1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        out = self.bn2(self.conv2(torch.selu_(self.bn1(self.conv1(x)))))
+        return torch.selu_(out + self.downsample(x))
+
+
+def conv3x3(conv: type[nn.Conv2d], channels: int, out_channels: int) -> nn.Conv2d:
+    if conv is DeformableConv2d:
+        return DeformableConv2d(channels, out_channels)
+    return nn.Conv2d(channels, out_channels, 3, padding=1, bias=False)
+
+
+class JoinedMap:
+    """The unit features of the full-size map, computed for the pixels that are asked for alone."""
+
+    def __init__(self, network: Aliked, maps: tuple[Tensor, ...]) -> None:
+        self._conv1 = network.conv1
+        x1, *parts = maps
+        self.size = x1.shape[2:]
+        self._tables = [as_grid(x1).flatten(0, 2), *map(table_of, parts)]
+        self._sizes = [part.shape[2:] for part in parts]
+
+    def at(self, pixels: Tensor) -> Tensor:
+        """Pixels (P,) int64 of the table of the full-size map -> (P, C) float32."""
+        height, width = self.size
+        full, *tables = self._tables
+        image = pixels // (height * width)
+        positions = torch.stack([pixels % width, pixels // width % height], dim=1).float()
+        parts = [torch.selu_(pointwise(self._conv1, full.index_select(0, pixels)).float())]
+        for table, size in zip(tables, self._sizes, strict=True):
+            ratio = positions.new_tensor([_step(size[1], width), _step(size[0], height)])
+            parts.append(weighted_rows(table, *corners(positions * ratio, image, size)))
+        return functional.normalize(torch.cat(parts, dim=1), dim=1)
+
+    def sampled(self, positions: Tensor, image: Tensor) -> Tensor:
+        """Positions (Q, 2) in the images ``image`` (Q,) -> (Q, C) float32, zero outside."""
+        pixels, weights = corners(positions, image, self.size)  # (Q, 4)
+        order = torch.arange(pixels.numel(), device=pixels.device).view_as(pixels)
+        blocks = (torch.split(values, POSITIONS_AT_ONCE) for values in (pixels, weights))
+        return torch.cat(
+            [
+                weighted_rows(self.at(some.flatten()), order[: len(some)], shares)
+                for some, shares in zip(*blocks, strict=True)
+            ]
+        )
+
+
+class DescriptorHead(nn.Module):
+    """Features at each keypoint's own positions, weighed by learnt maps."""
+
+    def __init__(self, channels: int, positions: int) -> None:
+        super().__init__()
+        self.offset_conv = nn.Sequential(
+            ExactConv2d(channels, 2 * positions, PATCH),
+            nn.SELU(inplace=True),
+            ExactConv2d(2 * positions, 2 * positions, 1),
+        )
+        self.sf_conv = ExactConv2d(channels, channels, 1, bias=False)
+        self.agg_weights = nn.Parameter(torch.zeros(positions, channels, channels))
+
+    def forward(self, joined: JoinedMap, points: Tensor, image: Tensor) -> Tensor:
+        """Descriptors (K, C) at points (K, 2) of the images ``image`` (K,)."""
+        if len(points) == 0:
+            return points.new_zeros(0, self.agg_weights.shape[2])
+        height, width = joined.size
+        corner = (points.long() - 1).clamp_(min=0)
+        corner = torch.minimum(corner, corner.new_tensor([width - PATCH - 1, height - PATCH - 1]))  # as trained
+        steps = torch.arange(PATCH, device=points.device)
+        rows = (image * height + corner[:, 1])[:, None] + steps  # (K, 3)
+        patches = (rows * width)[:, :, None] + (corner[:, :1] + steps)[:, None]  # (K, 3, 3)
+        offsets = self.offsets(joined.at(patches.flatten()).view(len(points), -1), max(height, width) / 4)
+
+        positions = (points[:, None] + offsets).flatten(0, 1)  # (K M, 2)
+        read = joined.sampled(positions, image.repeat_interleave(offsets.shape[1]))  # (K M, C)
+        read = torch.selu_(pointwise(self.sf_conv, read)).view(len(points), -1)
+        return functional.normalize(linear(read, self.agg_weights.flatten(0, 1).T), dim=1)
+
+    def offsets(self, patches: Tensor, reach: float) -> Tensor:
+        """Patches (K, 9 C), row by row -> (x, y) offsets (K, M, 2) in pixels."""
+        whole, bias, last, last_bias = (
+            self.offset_conv.get_parameter(name) for name in ("0.weight", "0.bias", "2.weight", "2.bias")
+        )
+        hidden = torch.selu_(linear(patches, whole.permute(0, 2, 3, 1).flatten(1), bias))
+        moved = linear(hidden, last.flatten(1), last_bias).clamp_(-reach, reach)
+        return moved.view(len(patches), 2, -1).mT
+
+
+def enlarged(maps: Tensor, size: torch.Size) -> Tensor:
+    """Bilinear; the corner pixels' centres stay at the corners."""
+    return functional.interpolate(maps, tuple(size), mode="bilinear", align_corners=True)
+
+
+def _step(length: int, full: int) -> float:
+    """A pixel of the full length in pixels of a shorter map with the corners' centres in common."""
+    return (length - 1) / max(full - 1, 1)
+
+
+def strict_maxima(scores: Tensor, count: int) -> Tensor:
+    """The best pixels of a map (H, W) that exceed all others around them, best first: (K,) int64, row by row."""
+    width = 2 * RADIUS + 1
+    along = functional.max_pool2d(scores[None], (1, width), 1, (0, RADIUS))
+    peaks = scores == functional.max_pool2d(along, (width, 1), 1, (RADIUS, 0))[0]
+    inner = torch.zeros_like(peaks)
+    inner[RADIUS:-RADIUS, RADIUS:-RADIUS] = True
+    index = (peaks & inner).flatten().nonzero()[:, 0]
+    window = windows(scores, index)
+    index = index[(window == window.amax(dim=1, keepdim=True)).sum(dim=1) == 1]
+    return index[scores.flatten()[index].topk(min(count, len(index))).indices]
+
+
+def refined_maxima(scores: Tensor, index: Tensor) -> Tensor:
+    """The maxima (K,) of a map (H, W) with a softmax's mean offset in the window around each: (K, 2), x and y."""
+    shares = torch.softmax(windows(scores, index) / TEMPERATURE, dim=1)  # (K, 25)
+    steps = torch.arange(-RADIUS, RADIUS + 1, device=scores.device).float()
+    offsets = shares @ torch.cartesian_prod(steps, steps).flip(1)
+    width = scores.shape[1]
+    return torch.stack([index % width, index // width], dim=1) + offsets
+
+
+def windows(scores: Tensor, index: Tensor) -> Tensor:
+    """The scores (K, 25) around inner pixels (K,) of a map (H, W), row by row."""
+    steps = torch.arange(-RADIUS, RADIUS + 1, device=scores.device)
+    around = (steps[:, None] * scores.shape[1] + steps).flatten()
+    return scores.flatten()[index[:, None] + around]
+
+
+def own_name(name: str) -> str:
+    """Our name of a checkpoint's parameter: a deformable convolution's weight is its own here."""
+    return name.replace(".regular_conv.", ".")

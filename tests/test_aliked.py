@@ -1,0 +1,130 @@
+"""ALIKED against kornia's on stand-in weights and on the real ones, and its parts by hand."""
+
+import pytest
+import torch
+from kornia.feature import ALIKED
+from shared import WEIGHTS, needs_weights
+from sklearn.datasets import load_sample_image
+from standin import STAND_INS, scene, standin_state
+from torch.nn import functional
+
+from mkpc_kaggle.matchers.contract import Placement, Precision
+from mkpc_kaggle.matchers.networks.aliked import SHAPES, Aliked, own_name, refined_maxima, strict_maxima
+from mkpc_kaggle.matchers.networks.bilinear import DeformableConv2d, sampled
+from mkpc_kaggle.matchers.networks.placement import placed
+from mkpc_kaggle.weights import load_tensors
+
+
+def image_of(pixels):
+    return torch.from_numpy(pixels.copy()).permute(2, 0, 1)[None].float() / 255
+
+
+def both(variant, state, features=300):
+    """Our network as it runs, and kornia's, of which only the grid of a window is no parameter."""
+    theirs = ALIKED(f"aliked-{variant}", max_num_keypoints=features, detection_threshold=0.0).eval()
+    grid = {"dkd.hw_grid": theirs.dkd.hw_grid}
+    theirs.load_state_dict(state | grid)
+    ours = Aliked(SHAPES[variant], features)
+    ours.load_state_dict({own_name(name): tensor for name, tensor in state.items()})
+    return placed(ours, Placement()), theirs
+
+
+def standin(variant):
+    network = ALIKED(f"aliked-{variant}")
+    state = standin_state(network, STAND_INS["aliked"])
+    del state["dkd.hw_grid"]
+    return state
+
+
+def assert_alike(found, expected):
+    distances = torch.cdist(found.points.double(), expected.keypoints.double())
+    nearest = distances.argmin(dim=1)
+    assert len(found.points) == expected.n > 100
+    assert (distances.amin(dim=1) < 0.01).double().mean() > 0.99
+    assert (distances.amin(dim=0) < 0.01).double().mean() > 0.99
+    close = distances.amin(dim=1) < 0.01
+    cosines = (found.descriptors * expected.descriptors[nearest]).sum(dim=1)[close]
+    # A coordinate within rounding of a whole pixel may take its offsets from the next pixel.
+    assert (cosines > 0.9999).double().mean() > 0.99
+    assert cosines.median() > 0.999999
+
+
+@torch.inference_mode()
+@pytest.mark.parametrize("variant", SHAPES)
+def test_it_finds_what_kornias_finds(variant):
+    ours, theirs = both(variant, standin(variant))
+    images = torch.cat([image_of(scene(96, 160, 3)), image_of(scene(96, 160, 3, "another"))])
+    for found, expected in zip(ours(images), theirs(images), strict=True):
+        assert_alike(found, expected)
+
+
+@needs_weights
+@torch.inference_mode()
+@pytest.mark.parametrize("variant", SHAPES)
+def test_it_finds_what_kornias_finds_with_the_published_weights(variant):
+    ours, theirs = both(variant, load_tensors(WEIGHTS / f"aliked-{variant}.safetensors"), 1000)
+    photograph = image_of(load_sample_image("china.jpg")[:256, :320])
+    assert_alike(ours(photograph)[0], theirs(photograph)[0])
+
+
+@torch.inference_mode()
+@pytest.mark.parametrize("precision", [Precision.BFLOAT16, Precision.FLOAT16])
+def test_half_precision_moves_little(precision):
+    image = image_of(scene(96, 128, 3))
+    exact, half = (
+        placed(filled_network(), Placement(precision=each))(image)[0] for each in (Precision.FLOAT32, precision)
+    )
+    distances = torch.cdist(exact.points, half.points)
+    nearest = distances.argmin(dim=1)
+    common = distances.amin(dim=1) < 0.25
+    assert common.float().mean() > 0.9
+    assert (exact.descriptors * half.descriptors[nearest]).sum(dim=1)[common].median() > 0.999
+    assert half.points.dtype == half.descriptors.dtype == torch.float32
+    assert not torch.equal(exact.descriptors, half.descriptors)
+
+
+def filled_network():
+    network = Aliked(max_keypoints=200)
+    network.load_state_dict({own_name(name): tensor for name, tensor in standin("n16").items()})
+    return network
+
+
+@torch.inference_mode()
+def test_a_flat_picture_has_no_keypoints():
+    found = placed(filled_network(), Placement())(torch.zeros(2, 3, 32, 64))
+    assert all(each.descriptors.shape == (len(each.points), 128) for each in found)
+    assert strict_maxima(torch.full((8, 9), 0.5), 10).tolist() == []
+
+
+def test_maxima_are_strict_inner_and_the_best_come_first():
+    scores = torch.zeros(12, 15)
+    scores[3, 4], scores[8, 9], scores[1, 12] = 0.5, 0.9, 0.95  # the last lies in the border
+    scores[8, 2], scores[8, 3] = 0.7, 0.7  # a tie
+    scores[5, 4] = 0.4  # beside a stronger one
+    assert strict_maxima(scores, 10).tolist() == [8 * 15 + 9, 3 * 15 + 4]
+    assert strict_maxima(scores, 1).tolist() == [8 * 15 + 9]
+    scores[8, 10] = 0.9 - 0.1 * torch.log(torch.tensor(2.0))  # half its weight
+    x, y = refined_maxima(scores, torch.tensor([8 * 15 + 9]))[0]
+    weights = torch.exp((scores[6:11, 7:12] - 0.9) / 0.1)
+    torch.testing.assert_close(x, 9 + (weights.sum(0) * torch.arange(-2.0, 3)).sum() / weights.sum())
+    torch.testing.assert_close(y, torch.tensor(8.0), rtol=0, atol=1e-5)
+
+
+def test_samples_are_bilinear_and_zero_outside():
+    generator = torch.Generator().manual_seed(0)
+    maps = torch.randn(2, 5, 6, 7, generator=generator)
+    positions = torch.rand(2, 40, 2, generator=generator) * 12 - 3
+    grid = 2 * positions[:, None] / torch.tensor([6, 5]) - 1
+    expected = functional.grid_sample(maps, grid, align_corners=True)[:, :, 0].mT.flatten(0, 1)
+    found = sampled(maps, positions.flatten(0, 1), torch.arange(2).repeat_interleave(40))
+    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
+
+
+@torch.inference_mode()
+def test_a_deformable_convolution_moved_by_whole_pixels_is_one_of_the_moved_map():
+    torch.manual_seed(0)
+    conv, x = DeformableConv2d(4, 6), torch.randn(1, 4, 10, 12)
+    conv.offset_conv.weight.zero_()
+    conv.offset_conv.bias.copy_(torch.tensor([1.0, -2.0]).repeat(9))  # y, x of each tap
+    moved = functional.conv2d(functional.pad(x, (8, 8, 8, 8)), conv.weight)
+    torch.testing.assert_close(conv(x), moved[:, :, 8:18, 5:17], rtol=1e-4, atol=1e-5)

@@ -1,0 +1,126 @@
+"""ALIKED and DISK with LightGlue, from checkpoints laid out as the public ones are, with stand-in weights."""
+
+import re
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from checkpoints import PublicFile, use_manifest, write_checkpoints
+from kornia.feature import DISK, LightGlue
+from standin import scene
+from torch import Tensor, nn
+
+from mkpc_kaggle.geometry.coordinates import Box, Size, View
+from mkpc_kaggle.matchers.contract import Picture, Placement, Precision, encoding_bytes
+from mkpc_kaggle.matchers.lightglue import LightGlueOptions
+from mkpc_kaggle.matchers.networks.aliked import Aliked
+from mkpc_kaggle.matchers.registry import load_matcher
+from mkpc_kaggle.matchers.sparse import Keypoints
+from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher
+from mkpc_kaggle.recipe import Recipe, Unit
+from mkpc_kaggle.weights import WeightStore, manifest
+
+NAMES = ["aliked_lightglue", "disk_lightglue"]
+
+
+def glue() -> nn.Module:
+    return LightGlue(None, input_dim=128, n_layers=2, flash=False)  # type: ignore[arg-type]  # no download
+
+
+def old_names(state: dict[str, Tensor]) -> dict[str, Any]:
+    """As the public files name a layer's attentions; the thresholds are computed."""
+    renamed = {
+        re.sub(r"^transformers\.(\d+)\.(self|cross)_attn", r"\2_attn.\1", name): state[name] for name in state
+    }
+    return {name: tensor for name, tensor in renamed.items() if name != "confidence_thresholds"}
+
+
+def published_aliked(state: dict[str, Tensor]) -> dict[str, Any]:
+    return {
+        re.sub(r"(block[34]\.conv[12])\.weight", r"\1.regular_conv.weight", name): state[name] for name in state
+    }
+
+
+def beside_an_optimizer(state: dict[str, Tensor]) -> dict[str, Any]:
+    return {"extractor": state, "optim": {"lr": 0.1}}
+
+
+FILES = (
+    PublicFile("aliked-n16.pth", "aliked_lightglue", "aliked-n16", "aliked", Aliked, published_aliked),
+    PublicFile("aliked_lightglue.pth", "aliked_lightglue", "aliked-lightglue", "lightglue", glue, old_names),
+    PublicFile("depth-save.pth", "disk_lightglue", "disk", "disk", DISK, beside_an_optimizer),
+    PublicFile("disk_lightglue.pth", "disk_lightglue", "disk-lightglue", "lightglue", glue, old_names),
+)
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> WeightStore:
+    directory = tmp_path_factory.mktemp("weights")
+    return WeightStore([directory], write_checkpoints(directory, FILES))
+
+
+def load(name: str, store: WeightStore, precision: Precision = Precision.FLOAT32, **options: Any) -> Any:
+    return load_matcher(name, store, LightGlueOptions(**options), Placement(precision=precision))
+
+
+def picture(height: int, width: int, name: str = "scene", multiple: int = 32) -> Picture:
+    view = View.fit(Box.whole(Size(width, height)), long_side=max(width, height), multiple=multiple)
+    return Picture(view.render(scene(height, width, 3, name)), view)
+
+
+@pytest.mark.parametrize("precision", [Precision.FLOAT32, Precision.BFLOAT16])
+@pytest.mark.parametrize("name", NAMES)
+def test_a_picture_matches_itself_point_by_point(name: str, precision: Precision, store: WeightStore) -> None:
+    matcher = load(name, store, precision, features=300, threshold=0.0)
+    first = picture(97, 131)
+    encodings = matcher.encode([first, picture(97, 131, "another")])
+    (matches,) = matcher.match(encodings[:1], encodings[:1])
+    assert 50 < len(encodings[0]) <= 300
+    assert len(matches) > 0.9 * len(encodings[0])
+    assert (matches.points0 == matches.points1).all(axis=1).mean() > 0.9
+    assert Box.whole(first.content).contains(matches.points0).all()
+    assert matches.scores.dtype == encodings[0].descriptors.numpy().dtype == np.float32
+    assert encoding_bytes(encodings[0]) == len(encodings[0]) * (2 + 128) * 4
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_pictures_in_a_batch_are_encoded_as_they_are_alone(name: str, store: WeightStore) -> None:
+    matcher = load(name, store, features=200)
+    pictures = [picture(96, 128), picture(96, 128, "another")]
+    for together, one in zip(matcher.encode(pictures), pictures, strict=True):
+        (alone,) = matcher.encode([one])
+        distances = torch.cdist(together.points.double(), alone.points.double())
+        assert (distances.amin(dim=1) < 1e-3).double().mean() > 0.98
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_pictures_without_keypoints_have_no_matches(name: str, store: WeightStore) -> None:
+    matcher = load(name, store)
+    assert matcher.encode([]) == []
+    full = matcher.encode([picture(64, 96)])
+    nothing = [Keypoints(torch.zeros(0, 2), torch.zeros(0, 128), Size(9, 5))]
+    for pair in ((nothing, full), (full, nothing), (nothing, nothing)):
+        assert [len(matches) for matches in matcher.match(*pair)] == [0]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_it_runs_end_to_end(name: str, store: WeightStore, monkeypatch: pytest.MonkeyPatch) -> None:
+    use_manifest(monkeypatch, store.files)
+    matcher = load(name, store, features=300, threshold=0.0)
+    recipe = Recipe((Unit(1, name, 128), Unit(2, name, 96)))
+    whole = scene(104, 144, 3)
+    match = TwoStageMatcher(recipe, matchers={name: matcher})(whole[:96, 16:], whole[8:, :128])
+    assert [result.failure for result in match.results] == ["", ""]
+    assert np.isfinite(match.estimate.matrix).all()
+
+
+def test_kornia_leaves_the_process_as_it_was(store: WeightStore) -> None:
+    before = torch.backends.cuda.flash_sdp_enabled()
+    load("aliked_lightglue", store)
+    assert torch.backends.cuda.flash_sdp_enabled() == before
+
+
+def test_the_manifest_knows_every_file() -> None:
+    listed = {(file.name, file.slot) for file in manifest() if file.digest.startswith("sha256:")}
+    assert {(file.name, file.slot) for file in FILES} <= listed
