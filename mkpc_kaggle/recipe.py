@@ -15,6 +15,7 @@ from mkpc_kaggle.config import AT_LEAST_0, AT_LEAST_1, SHARE, Range, check_keys,
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Box, Size, View
 from mkpc_kaggle.geometry.critical_region import MkpcConfig
+from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.geometry.robust import RobustConfig
 
 DIRECTORY = Path(__file__).resolve().parent / "recipes"
@@ -127,7 +128,8 @@ class UpgradeConfig:
 class Recipe:
     """Units in order of importance and the settings of MKPC, MAGSAC, the upgrade pass and the matchers.
 
-    The first unit is the sweep's: it has stage 1 and is not extra. Raises :class:`UserError` otherwise.
+    The first unit is the sweep's: it has stage 1 and is not extra. Raises :class:`UserError` otherwise. Without
+    ``focal``, the table ``[focal]``, F is MAGSAC's alone, and nothing is supposed of focal lengths.
     """
 
     units: tuple[Unit, ...]
@@ -135,6 +137,7 @@ class Recipe:
     description: str = ""
     mkpc: MkpcConfig = field(default_factory=MkpcConfig)
     magsac: RobustConfig = field(default_factory=RobustConfig)
+    focal: FocalConfig | None = None
     upgrade: UpgradeConfig = field(default_factory=UpgradeConfig)
     matchers: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
@@ -195,8 +198,9 @@ def parse_recipe(text: str, name: str) -> Recipe:
 def recipe_of(table: Mapping[str, Any], name: str) -> Recipe:
     """A recipe from a TOML file's table, or from a fingerprint; :class:`UserError` for what it cannot accept."""
     where = f"recipe {name!r}"
-    check_keys(table, ("description", "units", "mkpc", "magsac", "upgrade", "matchers"), where)
+    check_keys(table, ("description", "units", "mkpc", "magsac", "focal", "upgrade", "matchers"), where)
     units, matchers = table.get("units", []), table.get("matchers", {})
+    focal = table.get("focal")  # a fingerprint has None where there is no such table
     if not isinstance(units, list):
         raise UserError(f"{where}: units must be a list of tables, not {units!r}")
     if not isinstance(matchers, dict):
@@ -209,6 +213,7 @@ def recipe_of(table: Mapping[str, Any], name: str) -> Recipe:
         description=str(table.get("description", "")),
         mkpc=from_table(MkpcConfig, table.get("mkpc", {}), f"{where}, table [mkpc]"),
         magsac=from_table(RobustConfig, table.get("magsac", {}), f"{where}, table [magsac]"),
+        focal=None if focal is None else from_table(FocalConfig, focal, f"{where}, table [focal]"),
         upgrade=from_table(UpgradeConfig, table.get("upgrade", {}), f"{where}, table [upgrade]"),
         matchers=matchers,
     )

@@ -7,6 +7,7 @@ from enum import StrEnum
 import numpy as np
 
 from mkpc_kaggle.data.competition import Pair
+from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.critical_region import CriticalRegion
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL, Matrix3
 from mkpc_kaggle.pipeline.stages import PairMatch, Regions, UnitResult
@@ -83,11 +84,12 @@ class Job:
 class Matched:
     """What a worker found on one task: the results of the units that it ran, without earlier ones.
 
-    ``failure`` is empty, or says which image cannot be read.
+    ``sizes`` are those of the images, ``None`` where one cannot be read; ``failure`` is empty, or says which.
     """
 
     results: tuple[UnitResult, ...] = ()
     regions: Regions | None = None
+    sizes: tuple[Size, Size] | None = None
     decode_seconds: float = 0.0
     cluster_seconds: float = 0.0
     failure: str = ""

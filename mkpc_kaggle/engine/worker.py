@@ -102,7 +102,7 @@ def _matched(task: Task, opened: Opened, units: dict[Unit, Unit], plan: Plan) ->
     if short is not None:
         raise OutOfMemoryError(f"{units[short.unit].name}: {short.failure}")
     results = tuple(as_written(result, units[result.unit], plan) for result in new)
-    return Matched(results, work.regions, opened.seconds, work.cluster_seconds)
+    return Matched(results, work.regions, work.sizes, opened.seconds, work.cluster_seconds)
 
 
 def as_written(result: UnitResult, unit: Unit, plan: Plan) -> UnitResult:
@@ -116,11 +116,16 @@ def estimate(job: Job, matched: Iterable[Matched], recipe: Recipe) -> Finished:
 
 
 def _outcome(task: Task, matched: Matched, recipe: Recipe) -> Outcome:
-    if not matched.results:
+    if not matched.results or matched.sizes is None:
         return Outcome(Record.untouched(task.index, matched.failure or NOT_REACHED))
     start = time.perf_counter()
     match = conclude(
-        task.results + matched.results, matched.regions, recipe, task.pair.model, task.pair.intrinsics
+        task.results + matched.results,
+        matched.regions,
+        matched.sizes,
+        recipe,
+        task.pair.model,
+        task.pair.intrinsics,
     )
     seconds = time.perf_counter() - start
     record = record_of(

@@ -1,7 +1,8 @@
 """The two-stage pipeline on a chunk of pairs.
 
 Stage 1 matches whole images, MKPC finds the critical region of each, stage 2 matches the crops; the points of
-both stages, in image pixels, are concatenated in the recipe's order, and MAGSAC does the rest.
+both stages, in image pixels, are concatenated in the recipe's order, and MAGSAC does the rest, alone or under the
+recipe's prior on focal lengths.
 """
 
 import time
@@ -16,6 +17,7 @@ from mkpc_kaggle.data.cache import ByteCache
 from mkpc_kaggle.data.images import Image
 from mkpc_kaggle.geometry.coordinates import Box, Size, View
 from mkpc_kaggle.geometry.critical_region import CriticalRegion, critical_region
+from mkpc_kaggle.geometry.focal_prior import FocalPrior, estimate_with_prior
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import Estimate, Matrix3, Model, estimate
 from mkpc_kaggle.matchers.contract import Colour, Matcher, MatcherSpec, Picture, encoding_bytes
@@ -80,6 +82,10 @@ class PairWork:
     results: tuple[UnitResult, ...] = ()
     regions: Regions | None = None
     cluster_seconds: float = 0.0
+
+    @property
+    def sizes(self) -> tuple[Size, Size]:
+        return self.images[0].size, self.images[1].size
 
     def has(self, unit: Unit) -> bool:
         return any(result.unit == unit for result in self.results)
@@ -248,18 +254,29 @@ def finish(
     intrinsics: tuple[Matrix3, Matrix3] | None = None,
 ) -> PairMatch:
     """The pair's two-view model from all its matches, see :func:`conclude`."""
-    return conclude(work.results, work.regions, recipe, model, intrinsics)
+    return conclude(work.results, work.regions, work.sizes, recipe, model, intrinsics)
 
 
 def conclude(
     results: Iterable[UnitResult],
     regions: Regions | None,
+    sizes: tuple[Size, Size],
     recipe: Recipe,
     model: Model = Model.F,
     intrinsics: tuple[Matrix3, Matrix3] | None = None,
 ) -> PairMatch:
-    """The two-view model from all matches of a pair, in the recipe's order: MAGSAC's result depends on it."""
+    """The two-view model from all matches of a pair, in the recipe's order: MAGSAC's result depends on it.
+
+    ``sizes`` are those of the images: where the recipe has a prior on focal lengths, it goes by them, unless the
+    ``intrinsics`` are given.
+    """
     order = {unit: number for number, unit in enumerate(recipe.units)}
     ordered = tuple(sorted(results, key=lambda result: order[result.unit]))
     matches = Matches.concatenate(result.matches for result in ordered)
-    return PairMatch(ordered, regions, estimate(matches, recipe.magsac, model, intrinsics))
+    if recipe.focal is None or model is Model.H:
+        return PairMatch(ordered, regions, estimate(matches, recipe.magsac, model, intrinsics))
+    if intrinsics is not None:
+        priors = FocalPrior(intrinsics[0], 0.0), FocalPrior(intrinsics[1], 0.0)
+    else:
+        priors = FocalPrior.of_image(sizes[0], recipe.focal), FocalPrior.of_image(sizes[1], recipe.focal)
+    return PairMatch(ordered, regions, estimate_with_prior(matches, priors, recipe.magsac, recipe.focal, model))
