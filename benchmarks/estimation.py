@@ -3,8 +3,8 @@
 python -m benchmarks.estimation --train-dir DIR --matches DIR [--recipe classical] [--scenes A,B] [--every N]
 
 Matches of the recipe are found once and kept, a file a pair; then every pair is estimated in all ways, in turns,
-in this process. For each way: mAA by scene and seconds a pair; for each but the first, its gain over the first with
-the 95 % interval of resampled pairs.
+in this process. For each way: mAA by scene and seconds a pair; for each but the first, its gain over the first
+with the 95 % interval of resampled pairs.
 """
 
 import argparse
@@ -61,7 +61,6 @@ def ways_of(config: FocalConfig) -> dict[str, Way]:
         "MAGSAC, 8 orders": plain(8),
         "MAGSAC, 1 order": plain(1),
         "1 order and prior": with_prior(1, config),
-        "2 orders and prior": with_prior(2, config),
     }
 
 

@@ -36,6 +36,8 @@ from mkpc_kaggle.geometry.two_view import Problem, TwoView, Vectors, sampson
 
 ANNEALING = (4.0, 2.0, 1.0)
 """Times the scale, one after the other: a wide loss has fewer local minima."""
+FOCAL_GRID = (-0.7, -0.35, 0.0, 0.35, 0.7)
+"""log f / g: the focal lengths that MAGSAC's F is read with; the search starts from the best."""
 VAGUE_DIRECTION = 0.5
 """Radians: where the direction of t has a larger standard deviation, the matches do not tell it."""
 UNLIKELY = 3.0
@@ -48,14 +50,15 @@ class FocalConfig:
 
     An unknown focal length is ``ratio`` times the image's long side, and its logarithm has the standard deviation
     ``sigma``; ``scale``, in pixels, is that of the loss. E at these focal lengths is sought within
-    ``essential_threshold`` pixels and ``essential_iterations``, on ``essential_orders`` of the matches. The search looks at ``most_matches``, evenly
-    spread, and its outcome is judged on all. MAGSAC's own F is kept where it costs less by ``free_cost``: no
-    plausible focal lengths explain it, so the principal points may be elsewhere.
+    ``essential_threshold`` pixels and ``essential_iterations``, on ``essential_orders`` of the matches; F as
+    :class:`RobustConfig` says. The search looks at ``most_matches``, evenly spread, and its outcome is judged on
+    all. MAGSAC's own F is kept where it costs less by ``free_cost``: no plausible focal lengths explain the
+    matches, so the principal points may be elsewhere.
     """
 
     ratio: float = 1.1
     sigma: float = 0.4
-    scale: float = 0.4
+    scale: float = 0.35
     essential_threshold: float = 1.0
     essential_iterations: int = 5000
     essential_orders: int = 2
@@ -124,9 +127,9 @@ def estimate_with_prior(
     """F of ``matches`` (image pixels), or E where both K are known: of all candidates the one of lowest cost.
 
     Inliers are nearer than MAGSAC's threshold by their Sampson distance. MAGSAC's own F is a candidate, so that
-    the winner never costs more. ``remark`` says what is to mind about it, and which candidates could not be had. Six
-    distinct matches are enough. The same input gives the same bytes. Raises ``ValueError`` for H, which has no
-    focal lengths, and for E with a focal length that is not known.
+    the winner never costs more. ``remark`` says what is to mind about it, and which candidates could not be had.
+    Six distinct matches are enough. The same input gives the same bytes. Raises ``ValueError`` for H, which has
+    no focal lengths, and for E with a focal length that is not known.
     """
     if model is Model.H or (model is Model.E and any(prior.sigma for prior in priors)):
         raise ValueError(f"{model} has no use for a prior on focal lengths")
@@ -180,7 +183,7 @@ class _Search:
             plain = self._consensus(number, magsac, Model.F)
             if plain.ok:
                 F = self._for_rays(plain.matrix)
-                found.append(self._refined(Origin.FROM_F, F))
+                found.append(self._refined(Origin.FROM_F, self._decomposed(F)))
                 if model is Model.F:
                     cost = robust_cost(sampson(F, *self.rays), self._config.scale)
                     found.append(_Candidate(Origin.MAGSAC, F, cost + self._config.free_cost))
@@ -188,7 +191,10 @@ class _Search:
                 found.append(plain.failure)
         for number in range(self._config.essential_orders):
             calibrated = self._consensus(number, self._config.essential(magsac), Model.E)
-            found.append(self._refined(Origin.FROM_E, calibrated.matrix) if calibrated.ok else calibrated.failure)
+            if calibrated.ok:
+                found.append(self._refined(Origin.FROM_E, TwoView.nearest(calibrated.matrix)))
+            else:
+                found.append(calibrated.failure)
         return found
 
     def _consensus(self, number: int, magsac: RobustConfig, model: Model) -> Estimate:
@@ -228,12 +234,18 @@ class _Search:
         F = np.linalg.inv(self._priors[1].to_ray).T @ F @ np.linalg.inv(self._priors[0].to_ray)
         return F / np.linalg.norm(F)
 
-    def _refined(self, origin: Origin, F: Matrix3) -> _Candidate:
-        """The two views nearest to an F for rays, and where the search leads from there: what costs less."""
-        start = view = TwoView.nearest(F)
+    def _refined(self, origin: Origin, start: TwoView) -> _Candidate:
+        """Where the search leads from there, or the start itself if that costs less."""
+        view = start
         for factor in ANNEALING:
             view = self._sample.fit(view, factor * self._config.scale)
         cost, view = min(
-            ((self._all.cost(one, self._config.scale), one) for one in (view, start)), key=lambda x: x[0]
+            ((self._all.cost(one, self._config.scale), one) for one in (view, start)), key=lambda pair: pair[0]
         )
         return _Candidate(origin, view.fundamental, cost, view)
+
+    def _decomposed(self, F: Matrix3) -> TwoView:
+        """An F for rays as two views: of focal lengths on a grid those that explain the matches best."""
+        grid0, grid1 = (FOCAL_GRID if prior.sigma else (0.0,) for prior in self._priors)
+        views = [TwoView.nearest(F, log0, log1) for log0 in grid0 for log1 in grid1]
+        return min(views, key=lambda view: self._sample.cost(view, ANNEALING[0] * self._config.scale))

@@ -42,15 +42,15 @@ class TwoView:
     logs: Vectors
 
     @classmethod
-    def nearest(cls, F: Matrix3) -> "TwoView":
-        """Those whose F, with the focal lengths that are expected, is nearest to a multiple of this one.
+    def nearest(cls, F: Matrix3, log0: float = 0.0, log1: float = 0.0) -> "TwoView":
+        """Those of these focal lengths whose E is nearest to the one that an F would have with them.
 
         One of two rotations and two signs of t; all four stand for one F. Raises ``LinAlgError`` for what is
         not finite.
         """
-        U, _, Vt = np.linalg.svd(F)
+        U, _, Vt = np.linalg.svd(F / _focal_factors(np.array([log0, log1])))
         quarter = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, np.linalg.det(U) * np.linalg.det(Vt)]])
-        return cls(U @ quarter @ Vt, U[:, 2], np.zeros(2))
+        return cls(U @ quarter @ Vt, U[:, 2], np.array([log0, log1]))
 
     @property
     def fundamental(self) -> Matrix3:
@@ -71,8 +71,7 @@ class TwoView:
         return TwoView(_rotation(step[:3]) @ self.R, t / np.linalg.norm(t), self.logs + step[5:])
 
     def _with_focals(self, E: NDArray[np.float64]) -> NDArray[np.float64]:
-        ratio0, ratio1 = np.exp(self.logs)
-        return np.asarray(E * np.array([[1, 1, ratio0], [1, 1, ratio0], [ratio1, ratio1, ratio0 * ratio1]]))
+        return np.asarray(E * _focal_factors(self.logs))
 
     def _across(self) -> NDArray[np.float64]:
         """(3, 2) unit vectors at right angles to t and to each other."""
@@ -173,6 +172,12 @@ def _lines(F: Matrix3, rays0: Vectors, rays1: Vectors) -> tuple[Vectors, Vectors
     lines0, lines1 = rays1 @ F, rays0 @ F.T
     squares = np.sum(lines0[:, :2] ** 2, axis=1) + np.sum(lines1[:, :2] ** 2, axis=1)
     return lines0, lines1, np.sqrt(squares) + TINY
+
+
+def _focal_factors(logs: Vectors) -> Matrix3:
+    """What the elements of E are multiplied with to have those of F."""
+    ratio0, ratio1 = np.exp(logs)
+    return np.array([[1, 1, ratio0], [1, 1, ratio0], [ratio1, ratio1, ratio0 * ratio1]])
 
 
 def _cross(t: Vectors) -> Matrix3:
