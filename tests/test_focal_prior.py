@@ -73,25 +73,17 @@ def test_focal_lengths_and_pose_are_found_among_outliers():
     assert result.inliers[400:].mean() < 0.05
 
 
-def test_few_noisy_matches_have_a_better_pose_than_with_magsac_alone():
-    errors = {"prior": [], "alone": []}
-    for seed in range(8):
-        matches = seen(CAMERAS, 40, 0.3, 20, seed, depth=(5, 6))
-        errors["prior"].append(pose_error(with_prior(matches).matrix, *CAMERAS, 1.0).angle)
-        errors["alone"].append(pose_error(estimate(matches, RobustConfig(orders=1)).matrix, *CAMERAS, 1.0).angle)
-    assert np.median(errors["prior"]) < 0.7 * np.median(errors["alone"])
-
-
-def test_a_sure_focal_length_is_kept_and_helps():
-    weak, sure = [], []
-    for seed in range(8):
-        matches = seen(CAMERAS, 40, 0.3, 20, seed, depth=(5, 6))
-        priors = FocalPrior.of_focal(900, 0.01, SIZE), FocalPrior.of_focal(1300, 0.01, SIZE)
-        result = with_prior(matches, priors)
-        assert_allclose(result.focals, (900, 1300), rtol=0.03)
-        sure.append(pose_error(result.matrix, *CAMERAS, 1.0).angle)
-        weak.append(pose_error(with_prior(matches).matrix, *CAMERAS, 1.0).angle)
-    assert np.median(sure) < np.median(weak)
+def test_few_noisy_matches_have_a_better_pose_the_more_is_known_of_the_focal_lengths():
+    sure = FocalPrior.of_focal(900, 0.01, SIZE), FocalPrior.of_focal(1300, 0.01, SIZE)
+    alone, weakly, surely = [], [], []
+    for seed in range(6):
+        matches = seen(CAMERAS, 30, 0.2, 20, seed, depth=(5, 6))
+        known = with_prior(matches, sure)
+        assert_allclose(known.focals, (900, 1300), rtol=0.03)
+        for result, errors in ((estimate(matches, MAGSAC), alone), (with_prior(matches), weakly), (known, surely)):
+            errors.append(pose_error(result.matrix, *CAMERAS, 1.0).angle)
+    assert np.median(weakly) < 0.7 * np.median(alone)
+    assert np.median(surely) < 0.7 * np.median(weakly)
 
 
 def test_known_cameras_of_two_focal_lengths_and_any_centre_give_their_essential_matrix():
@@ -121,7 +113,7 @@ def test_a_principal_point_far_off_leaves_magsac_its_matrix_with_the_reason():
     assert sampson_distances(result.matrix, matches).max() < 0.1
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_nothing_costs_more_than_magsacs_own_matrix_and_the_price_of_its_freedom(seed):
     matches = seen(CAMERAS, 60, 0.4, 60, seed)
     alone, result = estimate(matches, MAGSAC), with_prior(matches)
@@ -198,10 +190,10 @@ def test_repetitions_and_what_is_not_finite_change_nothing():
 
 
 def test_the_same_input_gives_the_same_bytes_in_threads_too():
-    inputs = [seen(CAMERAS, 60, 0.2, 30, seed) for seed in range(3)] * 2
+    inputs = [seen(CAMERAS, 60, 0.2, 30, seed) for seed in range(2)] * 2
     alone = [as_bytes(with_prior(matches)) for matches in inputs]
-    assert alone[:3] == alone[3:]
-    with ThreadPoolExecutor(3) as threads:
+    assert alone[:2] == alone[2:]
+    with ThreadPoolExecutor(2) as threads:
         assert list(threads.map(lambda matches: as_bytes(with_prior(matches)), inputs)) == alone
 
 
@@ -219,7 +211,7 @@ def test_what_makes_no_prior_is_an_error():
 
 
 @given(data=st.data(), n=st.integers(0, 24))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=40, deadline=None)
 def test_whatever_the_points_are_the_answer_is_an_estimate(data, n):
     some = [
         st.floats(width=32),
