@@ -18,7 +18,7 @@ from mkpc_kaggle.geometry.robust import Model, Origin, RobustConfig, estimate, r
 
 SIZE = Size(1024, 768)
 CENTRE = np.array([511.5, 383.5])
-MAGSAC = RobustConfig(orders=1, max_iterations=5000)
+MAGSAC = RobustConfig(orders=1, max_iterations=2000)
 CONFIG = FocalConfig()
 WEAK = FocalPrior.of_image(SIZE, CONFIG), FocalPrior.of_image(SIZE, CONFIG)
 

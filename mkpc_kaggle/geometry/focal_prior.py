@@ -140,7 +140,7 @@ def estimate_with_prior(
         candidates = [one for one in tried if not isinstance(one, str) and np.isfinite(one.cost)]
         reasons = list(dict.fromkeys(one for one in tried if isinstance(one, str)))
         if not candidates:
-            return Estimate.failed(model, len(matches), "; ".join(reasons))
+            return Estimate.failed(model, len(matches), "; ".join(reasons) or "no candidate has a finite cost")
         best = min(candidates, key=lambda candidate: candidate.cost)
         inliers = np.abs(sampson(best.fundamental, *search.rays)) < magsac.threshold
         reasons += search.remarks(best)
