@@ -100,8 +100,8 @@ class Problem:
     def fit(self, start: TwoView, scale: float) -> TwoView:
         """A local minimum of :meth:`cost` near ``start``, by Levenberg-Marquardt on the reweighted squares."""
         view, cost, damping = start, self.cost(start, scale), FIRST_DAMPING
-        gradient, curvature = self._slopes(view, scale)
         for _ in range(MOST_STEPS):
+            gradient, curvature = self._slopes(view, scale)
             while damping < MOST_DAMPING:
                 moved = view.moved(self._step(gradient, curvature, damping))
                 moved_cost = self.cost(moved, scale) if np.abs(moved.logs).max() < FOCAL_BOUND else np.inf
@@ -112,7 +112,6 @@ class Problem:
                 break
             gain, view, cost = cost - moved_cost, moved, moved_cost
             damping = max(damping / 10, LEAST_DAMPING)
-            gradient, curvature = self._slopes(view, scale)
             if gain < LEAST_GAIN:
                 break
         return view
@@ -146,7 +145,7 @@ class Problem:
     def _slopes(self, view: TwoView, scale: float) -> tuple[Vectors, NDArray[np.float64]]:
         """The gradient (7,) of the cost and its curvature (7, 7), that of the squares with the loss's weights."""
         lines0, lines1, slope = _lines(view.fundamental, self.rays0, self.rays1)
-        distances = np.sum(self.rays1 * lines1, axis=1) / slope
+        distances = _dots(self.rays1, lines1) / slope
         lean = (distances / slope)[:, None]
         a, b = self.rays1.copy(), -lean * lines0
         a[:, :2] -= lean * lines1[:, :2]
@@ -164,14 +163,19 @@ class Problem:
 def sampson(F: Matrix3, rays0: Vectors, rays1: Vectors) -> Vectors:
     """(N,) Sampson distance of (N, 3) rays to an F that is meant for them, with its sign, in pixels."""
     _, lines1, slope = _lines(F, rays0, rays1)
-    return np.asarray(np.sum(rays1 * lines1, axis=1) / slope)
+    return np.asarray(_dots(rays1, lines1) / slope)
 
 
 def _lines(F: Matrix3, rays0: Vectors, rays1: Vectors) -> tuple[Vectors, Vectors, Vectors]:
     """The epipolar lines (N, 3) in both images, and the length (N,) of the gradient of y1^T F y0."""
     lines0, lines1 = rays1 @ F, rays0 @ F.T
-    squares = np.sum(lines0[:, :2] ** 2, axis=1) + np.sum(lines1[:, :2] ** 2, axis=1)
+    squares = _dots(lines0[:, :2], lines0[:, :2]) + _dots(lines1[:, :2], lines1[:, :2])
     return lines0, lines1, np.sqrt(squares) + TINY
+
+
+def _dots(a: Vectors, b: Vectors) -> Vectors:
+    """The products (N,) of the rows of two (N, K) arrays."""
+    return np.asarray(np.einsum("nk,nk->n", a, b))
 
 
 def _focal_factors(logs: Vectors) -> Matrix3:
