@@ -15,6 +15,7 @@ from mkpc_kaggle.config import AT_LEAST_0, AT_LEAST_1, SHARE, Config, Range, che
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Box, Size, View
 from mkpc_kaggle.geometry.critical_region import MkpcConfig
+from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.geometry.robust import RobustConfig
 from mkpc_kaggle.scene.config import SceneConfig
 
@@ -128,9 +129,9 @@ class UpgradeConfig:
 class Recipe:
     """Units in order of importance and the settings of MKPC, MAGSAC, the upgrade pass and the matchers.
 
-    With ``scene`` the pairs of a batch are reconstructed together; ``None``: every pair is on its own.
-
-    The first unit is the sweep's: it has stage 1 and is not extra. Raises :class:`UserError` otherwise.
+    The first unit is the sweep's: it has stage 1 and is not extra. Raises :class:`UserError` otherwise. Without
+    ``focal``, the table ``[focal]``, F is MAGSAC's alone, and nothing is supposed of focal lengths. With
+    ``scene``, the table ``[scene]``, the pairs of a batch are reconstructed together.
     """
 
     units: tuple[Unit, ...]
@@ -138,6 +139,7 @@ class Recipe:
     description: str = ""
     mkpc: MkpcConfig = field(default_factory=MkpcConfig)
     magsac: RobustConfig = field(default_factory=RobustConfig)
+    focal: FocalConfig | None = None
     upgrade: UpgradeConfig = field(default_factory=UpgradeConfig)
     matchers: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     scene: SceneConfig | None = None
@@ -199,7 +201,8 @@ def parse_recipe(text: str, name: str) -> Recipe:
 def recipe_of(table: Mapping[str, Any], name: str) -> Recipe:
     """A recipe from a TOML file's table, or from a fingerprint; :class:`UserError` for what it cannot accept."""
     where = f"recipe {name!r}"
-    check_keys(table, ("description", "units", "mkpc", "magsac", "upgrade", "matchers", "scene"), where)
+    known = ("description", "units", "mkpc", "magsac", "focal", "upgrade", "matchers", "scene")
+    check_keys(table, known, where)
     units, matchers = table.get("units", []), table.get("matchers", {})
     if not isinstance(units, list):
         raise UserError(f"{where}: units must be a list of tables, not {units!r}")
@@ -213,6 +216,7 @@ def recipe_of(table: Mapping[str, Any], name: str) -> Recipe:
         description=str(table.get("description", "")),
         mkpc=from_table(MkpcConfig, table.get("mkpc", {}), f"{where}, table [mkpc]"),
         magsac=from_table(RobustConfig, table.get("magsac", {}), f"{where}, table [magsac]"),
+        focal=_optional(FocalConfig, table.get("focal"), f"{where}, table [focal]"),
         upgrade=from_table(UpgradeConfig, table.get("upgrade", {}), f"{where}, table [upgrade]"),
         matchers=matchers,
         scene=_optional(SceneConfig, table.get("scene"), f"{where}, table [scene]"),
@@ -220,6 +224,7 @@ def recipe_of(table: Mapping[str, Any], name: str) -> Recipe:
 
 
 def _optional(cls: type[Config], table: Mapping[str, Any] | None, where: str) -> Config | None:
+    """``None`` where there is no such table; a fingerprint says so by ``None``."""
     return None if table is None else from_table(cls, table, where)
 
 

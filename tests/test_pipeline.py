@@ -15,8 +15,9 @@ from sklearn.datasets import load_sample_image
 from mkpc_kaggle.data.images import Image
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Box, Size
+from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL, Model
+from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL, Model, Origin
 from mkpc_kaggle.matchers.contract import Colour, MatcherSpec, Placement
 from mkpc_kaggle.matchers.sift import SiftMatcher, SiftOptions
 from mkpc_kaggle.pipeline.assembly import Licence, assemble
@@ -217,6 +218,23 @@ def test_an_essential_matrix_needs_the_cameras():
     E = matcher(*pair(), model=Model.E, intrinsics=(K, K)).estimate.matrix
     values = np.linalg.svd(E, compute_uv=False)
     assert_allclose(values / values[0], [1, 1, 0], atol=1e-6)
+
+
+def test_a_prior_on_focal_lengths_goes_by_the_sizes_of_the_images_unless_the_cameras_are_known():
+    prior = FocalConfig(sigma=1e-3)
+    matcher = TwoStageMatcher(replace(SIFT, focal=prior))
+    K = np.array([[400.0, 0, 240], [0, 400, 180], [0, 0, 1]])
+    by_size = matcher(*pair()).estimate
+    assert by_size.origin in (Origin.FROM_F, Origin.FROM_E)
+    assert_allclose(by_size.focals, [prior.ratio * max(image.shape[:2]) for image in pair()], rtol=0.02)
+    for model in (Model.F, Model.E):
+        known = matcher(*pair(), model=model, intrinsics=(K, K)).estimate
+        assert known.model is model
+        assert_allclose(known.focals, 400)
+    with pytest.raises(ValueError, match="E"):
+        matcher(*pair(), model=Model.E)
+    assert matcher(*pair(), model=Model.H).estimate.focals is None
+    assert TwoStageMatcher(SIFT)(*pair()).estimate.focals is None
 
 
 def test_the_same_pair_twice_gives_the_same_bytes():

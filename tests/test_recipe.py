@@ -11,6 +11,7 @@ from mkpc_kaggle.config import Range
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Box, Size, View
 from mkpc_kaggle.geometry.critical_region import MkpcConfig, Ratio
+from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.geometry.robust import Method, RobustConfig
 from mkpc_kaggle.matchers.contract import Training
 from mkpc_kaggle.matchers.registry import matcher_names, spec_of
@@ -71,16 +72,32 @@ def test_whatever_matchers_are_left_of_recipe_auto_the_first_unit_can_sweep():
             assert remaining.units[0].stage == 1
 
 
-@pytest.mark.parametrize("name", ["yfcc", "scannet"])
-def test_a_naive_recipe_is_the_whole_images_mode_of_the_other(name):
-    naive, whole = load_recipe(f"{name}_naive"), load_recipe(name).in_mode(Mode.WHOLE_IMAGES)
-    assert set(naive.units) == set(whole.units)
-    assert naive.matchers == whole.matchers
+@pytest.mark.parametrize(
+    ("name", "stage1", "stage2", "naive"),
+    [
+        ("yfcc", {840, 1200, 1600}, {1200, 1400, 1600}, {840, 1200, 1400, 1600}),
+        ("scannet", {840, 1024, 1280}, {840, 1280}, {640, 840, 1024, 1280, 1536}),
+    ],
+)
+def test_the_papers_recipes_have_the_resolutions_of_its_tables(name, stage1, stage2, naive):
+    recipe, whole = load_recipe(name), load_recipe(f"{name}_naive")
+    for stage, sides in ((1, stage1), (2, stage2)):
+        assert {unit.long_side for unit in recipe.units if unit.stage == stage} == sides
+    assert {(unit.stage, unit.long_side) for unit in whole.units} == {(1, side) for side in naive}
+    assert whole.matchers == recipe.matchers
+    assert {unit.max_matches for unit in (*recipe.units, *whole.units)} == {2048}
 
 
-def test_scannet_is_yfcc_with_indoor_weights_and_their_settings():
+@pytest.mark.parametrize("name", recipe_names())
+def test_the_papers_recipes_suppose_nothing_of_focal_lengths(name):
+    recipe = load_recipe(name)
+    paper = name.startswith(("yfcc", "scannet", "imc2022"))
+    assert (recipe.focal is None) == paper
+    assert recipe.magsac.orders == (8 if paper else 1)
+
+
+def test_scannet_has_indoor_weights_and_their_settings():
     outdoor, indoor = load_recipe("yfcc"), load_recipe("scannet")
-    assert outdoor.units == indoor.units
     options = options_of(indoor, "superglue")
     assert (options.training, options.max_keypoints, options.nms_radius) == (Training.INDOOR, 1024, 4)
     assert slots_of(indoor, ["superglue"]) == ("superpoint", "superglue-indoor")
@@ -104,7 +121,7 @@ def test_a_recipe_reads_as_written():
             '{ stage = 2, matcher = "dkm", area = "540x720", stretch = true }',
         )
         + '[mkpc]\neps = 0.1\nmin_samples = 7\nratio = "last-kept"\nexpand_x = 2\n'
-        + '[magsac]\nmethod = "ransac"\nthreshold = 1.5\n[upgrade]\nbelow_inliers = 9\n'
+        + '[magsac]\nmethod = "ransac"\nthreshold = 1.5\n[focal]\nsigma = 0.2\n[upgrade]\nbelow_inliers = 9\n'
         + "[matchers.sift]\nfeatures = 10\n"
     )
     assert recipe.units == (
@@ -116,6 +133,7 @@ def test_a_recipe_reads_as_written():
     assert recipe.mkpc == MkpcConfig(eps=0.1, min_samples=7, ratio=Ratio.LAST_KEPT, expand_x=2.0)
     assert type(recipe.mkpc.expand_x) is float
     assert recipe.magsac == RobustConfig(Method.RANSAC, threshold=1.5)
+    assert recipe.focal == FocalConfig(sigma=0.2)
     assert recipe.upgrade.below_inliers == 9
     assert (recipe.name, recipe.description) == ("mine", "two")
     assert options_of(recipe, "sift").features == 10
@@ -156,7 +174,10 @@ def test_a_unit_shows_a_crop_at_its_size():
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("colour = 1\n" + SIFT, r"'colour'; known keys: description, units, mkpc, magsac, upgrade, matchers"),
+        (
+            "colour = 1\n" + SIFT,
+            r"'colour'; known keys: description, units, mkpc, magsac, focal, upgrade, matchers",
+        ),
         (
             units('{ stage = 1, matcher = "sift", longside = 640 }'),
             r"unit 1.*'longside'.*stage, matcher, long_side, max_matches, flip, extra",
@@ -208,6 +229,8 @@ def test_an_unknown_matcher_lists_the_known_ones():
         ("units = [1]\n", "unit 1"),
         (SIFT + "mkpc = 3\n", "mkpc"),
         (SIFT + "magsac = [1]\n", "magsac"),
+        (SIFT + "focal = true\n", "focal"),
+        (SIFT + "[focal]\nsigmas = 1\n", r"\[focal\].*'sigmas'; known keys: ratio, sigma, scale"),
         (SIFT + "upgrade = true\n", "upgrade"),
     ],
 )
@@ -269,6 +292,8 @@ def test_units_that_make_no_run_are_refused(text, says):
         ("magsac", "confidence = 1", r"confidence must be in \(0, 1\), not 1"),
         ("magsac", "max_iterations = 3_000_000_000", r"max_iterations must be in \[1, 2.14748e\+09\]"),
         ("magsac", "orders = 0", "orders"),
+        ("focal", "sigma = 0", "sigma"),
+        ("focal", "most_matches = 0", "most_matches"),
         ("upgrade", "below_inliers = -1", r"below_inliers must be in \[0, inf\), not -1"),
     ],
 )
@@ -399,6 +424,7 @@ def test_the_fingerprint_leaves_out_name_and_description():
         replace(ALL, units=(replace(ALL.units[0], max_matches=7), *ALL.units[1:])),
         replace(ALL, mkpc=replace(ALL.mkpc, share=0.06)),
         replace(ALL, magsac=RobustConfig(threshold=0.21)),
+        replace(ALL, focal=FocalConfig()),
         replace(ALL, magsac=RobustConfig(Method.RANSAC)),
         replace(ALL, matchers={"sift": {"features": 9}}),
     ],

@@ -4,7 +4,7 @@ An estimate is always a value: where no model can be had, it says why and carrie
 is finite and of the right rank, so that a submission never has a hole.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import cast
 
@@ -55,7 +55,8 @@ class RobustConfig:
     """Settings of :func:`estimate`: the threshold in image pixels, the confidence, the iteration limit.
 
     The estimator stops by chance before it has found the best model, and where depends on the order of the
-    matches: it is run on ``orders`` fixed permutations of them, and the model with most inliers is kept.
+    matches: it is run on ``orders`` fixed permutations of them, and the model of the lowest :func:`robust_cost`
+    at twice the threshold is kept.
     """
 
     method: Method = Method.MAGSAC
@@ -69,19 +70,34 @@ class RobustConfig:
         check_ranges(self, orders=AT_LEAST_1)
 
 
+class Origin(StrEnum):
+    """Which candidate an estimate comes from."""
+
+    MAGSAC = "MAGSAC"
+    """the robust estimator's model as it is"""
+    FROM_F = "F, refined"
+    """MAGSAC's F, refined under the prior on the focal lengths"""
+    FROM_E = "E, refined"
+    """MAGSAC's E at the prior's focal lengths, or at the known ones, refined"""
+
+
 @dataclass(frozen=True, eq=False)
 class Estimate:
     """A two-view model of one pair.
 
     ``matrix`` is (3, 3) float64, finite, of unit Frobenius norm; for F, x1^T F x0 = 0 in homogeneous image
-    pixels. ``inliers`` is an (N,) mask over the matches that were given. ``failure`` is empty, or says why
-    ``matrix`` is only the fallback.
+    pixels. ``inliers`` is an (N,) mask over the matches that were given: those nearer than the threshold.
+    ``failure`` is empty, or says why ``matrix`` is only the fallback. ``focals`` are the focal lengths in pixels
+    that it stands for, ``None`` where nobody asked for them; ``remark`` is what to mind about it, or empty.
     """
 
     model: Model
     matrix: Matrix3
     inliers: NDArray[np.bool_]
     failure: str = ""
+    origin: Origin = Origin.MAGSAC
+    focals: tuple[float, float] | None = None
+    remark: str = ""
 
     @property
     def ok(self) -> bool:
@@ -113,26 +129,65 @@ def estimate(
     """
     if model is Model.E and intrinsics is None:
         raise ValueError("an essential matrix needs the intrinsics of both cameras")
-    pairs = np.hstack([matches.points0, matches.points1]).astype(np.float64)
-    finite = np.flatnonzero(np.isfinite(pairs).all(axis=1))
-    distinct, representative = _distinct(pairs[finite])
-    if len(distinct) < model.least_matches:
-        return Estimate.failed(model, len(matches), f"too few distinct matches for {model}: {len(distinct)}")
-    points0, points1, threshold = distinct[:, :2], distinct[:, 2:], config.threshold
+    distinct = Distinct.of(matches)
+    found = consensus(distinct.points0, distinct.points1, config, model, intrinsics)
+    return replace(found, inliers=distinct.spread(found.inliers))
+
+
+def consensus(
+    points0: NDArray[np.float64],
+    points1: NDArray[np.float64],
+    config: RobustConfig,
+    model: Model,
+    intrinsics: tuple[Matrix3, Matrix3] | None = None,
+) -> Estimate:
+    """:func:`estimate` for (N, 2) finite points without repetitions."""
+    count, threshold = len(points0), config.threshold
+    if count < model.least_matches:
+        return Estimate.failed(model, count, f"too few distinct matches for {model}: {count}")
     if intrinsics is not None and model is Model.E:
         points0, points1 = calibrate(points0, intrinsics[0]), calibrate(points1, intrinsics[1])
-        threshold /= np.mean([intrinsics[i][j, j] for i in (0, 1) for j in (0, 1)])
+        threshold /= float(np.mean([K[axis, axis] for K in intrinsics for axis in (0, 1)]))
     try:
         matrix, mask = _best_of_orders(model, points0, points1, threshold, config)
     except cv2.error as error:
-        return Estimate.failed(model, len(matches), f"OpenCV refused the points: {error.err}")
+        return Estimate.failed(model, count, f"OpenCV refused the points: {error.err}")
     if matrix is None:
-        return Estimate.failed(model, len(matches), f"no {model} fits {len(distinct)} distinct matches")
-    inliers = np.zeros(len(matches), bool)
-    inliers[finite] = mask[representative]
-    if not inliers.any():
-        return Estimate.failed(model, len(matches), f"no {model} has inliers among {len(distinct)} matches")
-    return Estimate(model, matrix / np.linalg.norm(matrix), inliers)
+        return Estimate.failed(model, count, f"no {model} fits {count} distinct matches")
+    if not mask.any():
+        return Estimate.failed(model, count, f"no {model} has inliers among {count} distinct matches")
+    return Estimate(model, matrix / np.linalg.norm(matrix), mask)
+
+
+@dataclass(frozen=True, eq=False)
+class Distinct:
+    """The (M, 2) finite distinct matches among N, in order of first appearance.
+
+    ``finite`` are the indices of the finite matches, ``place`` the row in ``points0`` and ``points1`` of each.
+    """
+
+    points0: NDArray[np.float64]
+    points1: NDArray[np.float64]
+    count: int
+    finite: NDArray[np.intp]
+    place: NDArray[np.intp]
+
+    @classmethod
+    def of(cls, matches: Matches) -> "Distinct":
+        pairs = np.hstack([matches.points0, matches.points1]).astype(np.float64)
+        finite = np.flatnonzero(np.isfinite(pairs).all(axis=1))
+        _, first, inverse = np.unique(pairs[finite], axis=0, return_index=True, return_inverse=True)
+        order = np.argsort(first)
+        place = np.empty_like(order)
+        place[order] = np.arange(len(order))
+        pairs = pairs[finite][first[order]]
+        return cls(pairs[:, :2], pairs[:, 2:], len(matches), finite, place[inverse.ravel()])
+
+    def spread(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """An (M,) mask of the distinct matches as an (N,) one: repetitions are like the first."""
+        whole = np.zeros(self.count, bool)
+        whole[self.finite] = mask[self.place]
+        return whole
 
 
 def calibrate(points: NDArray[np.float64], K: Matrix3) -> NDArray[np.float64]:
@@ -169,23 +224,34 @@ def sampson_distances(F: Matrix3, matches: Matches) -> NDArray[np.float64]:
 
     Source: Hartley and Zisserman, Multiple View Geometry, 11.4.3.
     """
-    homogeneous0, homogeneous1 = (
-        np.column_stack([points.astype(np.float64), np.ones(len(matches))])
-        for points in (matches.points0, matches.points1)
-    )
-    lines1, lines0 = homogeneous0 @ F.T, homogeneous1 @ F
-    residual = np.abs(np.sum(homogeneous1 * lines1, axis=1))
-    slope = np.hypot(np.hypot(*lines0[:, :2].T), np.hypot(*lines1[:, :2].T))
-    return np.asarray(residual / np.maximum(slope, np.finfo(np.float64).tiny))
+    return _distances(Model.F, F, matches.points0.astype(np.float64), matches.points1.astype(np.float64))
 
 
-def _distinct(pairs: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
-    """The distinct rows of (N, 4) pairs in order of first appearance, and for each row its place there, (N,)."""
-    _, first, inverse = np.unique(pairs, axis=0, return_index=True, return_inverse=True)
-    order = np.argsort(first)
-    place = np.empty_like(order)
-    place[order] = np.arange(len(order))
-    return pairs[np.sort(first)], place[inverse.ravel()]
+def robust_cost(distances: NDArray[np.float64], scale: float) -> float:
+    """The sum of x^2 / (2 (1 + x^2)), x = distance / scale: Geman and McClure, 1985. What is far costs a half."""
+    squares = np.square(distances / scale)
+    return float(0.5 * np.sum(1 - 1 / (1 + squares)))
+
+
+def _distances(
+    model: Model, matrix: Matrix3, points0: NDArray[np.float64], points1: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """(N,) Sampson distances to an F or E; distances in the second image to where an H takes the points."""
+    homogeneous0, homogeneous1 = (np.column_stack([points, np.ones(len(points))]) for points in (points0, points1))
+    mapped = homogeneous0 @ matrix.T
+    tiny = np.finfo(np.float64).tiny
+    if model is Model.H:
+        depth = np.where(np.abs(mapped[:, 2:]) > tiny, mapped[:, 2:], tiny)
+        return np.asarray(np.hypot(*(mapped[:, :2] / depth - points1).T))
+    lines0 = homogeneous1 @ matrix
+    residual = np.abs(np.sum(homogeneous1 * mapped, axis=1))
+    slope = np.hypot(np.hypot(*lines0[:, :2].T), np.hypot(*mapped[:, :2].T))
+    return np.asarray(residual / np.maximum(slope, tiny))
+
+
+def nth_order(number: int, count: int) -> NDArray[np.intp]:
+    """A fixed permutation of ``count`` matches; number 0 is the order in which they are."""
+    return np.random.default_rng(number).permutation(count) if number else np.arange(count)
 
 
 def _best_of_orders(
@@ -195,14 +261,15 @@ def _best_of_orders(
     threshold: float,
     config: RobustConfig,
 ) -> tuple[Matrix3 | None, NDArray[np.bool_]]:
-    """The model with most inliers over fixed permutations, the given order first, and its mask (N,).
+    """The model of the lowest robust cost over fixed permutations, the given order first, and its mask (N,).
 
+    MAGSAC's own score reaches over several times the threshold, so that the count of inliers says little of it.
     OpenCV now and then refuses points in one order and not in another; raises its error where it refused some
     and the others gave nothing.
     """
-    best, best_mask, refusal = None, np.zeros(len(points0), bool), None
+    best, best_mask, least, refusal = None, np.zeros(len(points0), bool), np.inf, None
     for number in range(config.orders):
-        order = np.random.default_rng(number).permutation(len(points0)) if number else np.arange(len(points0))
+        order = nth_order(number, len(points0))
         try:
             matrix, mask = _solve(model, points0[order], points1[order], threshold, config)
         except cv2.error as error:
@@ -210,8 +277,10 @@ def _best_of_orders(
             continue
         if matrix is None or matrix.shape != (3, 3) or not np.isfinite(matrix).all() or not matrix.any():
             continue
-        if best is None or np.count_nonzero(mask) > np.count_nonzero(best_mask):
-            best, best_mask[order] = matrix, mask.ravel().astype(bool)
+        with np.errstate(over="ignore", invalid="ignore"):  # of points that are no pixels
+            cost = robust_cost(_distances(model, matrix, points0, points1), 2 * threshold)
+        if best is None or cost < least:
+            best, best_mask[order], least = matrix, mask.ravel().astype(bool), cost
     if best is None and refusal is not None:
         raise refusal
     return best, best_mask

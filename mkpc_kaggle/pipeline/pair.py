@@ -6,7 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mkpc_kaggle.data.images import Image
+from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.critical_region import CriticalRegion
+from mkpc_kaggle.geometry.focal_prior import FocalPrior, estimate_with_prior
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import Estimate, Matrix3, Model, estimate
 from mkpc_kaggle.recipe import Recipe, Unit
@@ -40,13 +42,15 @@ class PairMatch:
 
     ``regions`` is ``None`` until a unit of stage 2 wanted them. ``matches`` are those of all units, and
     ``estimate.inliers`` is a mask over them; with the estimate they come into the recipe's order. ``images`` are
-    the two images, there while units run. ``failure`` is empty, or says which image cannot be read.
+    the two images, there while units run; their ``sizes`` stay. ``failure`` is empty, or says which image cannot
+    be read.
     """
 
     results: tuple[UnitResult, ...] = ()
     regions: Regions | None = None
     estimate: Estimate = NOT_ESTIMATED
     images: tuple[Image, ...] = ()
+    sizes: tuple[Size, ...] = ()
     failure: str = ""
     decode_seconds: float = 0.0
     cluster_seconds: float = 0.0
@@ -79,8 +83,18 @@ def with_estimate(
     model: Model = Model.F,
     intrinsics: tuple[Matrix3, Matrix3] | None = None,
 ) -> PairMatch:
-    """The pair with its two-view model from all matches, in the recipe's order: MAGSAC's result depends on it."""
+    """The pair with its two-view model from all matches, in the recipe's order: MAGSAC's result depends on it.
+
+    Where the recipe has a prior on focal lengths, it goes by the images' sizes, unless ``intrinsics`` are given.
+    """
     order = {unit: number for number, unit in enumerate(recipe.units)}
     results = tuple(sorted(pair.results, key=lambda result: order[result.unit]))
     matches = Matches.concatenate(result.matches for result in results)
-    return replace(pair, results=results, estimate=estimate(matches, recipe.magsac, model, intrinsics))
+    if recipe.focal is None or model is Model.H:
+        found = estimate(matches, recipe.magsac, model, intrinsics)
+    else:
+        sizes = pair.sizes or tuple(image.size for image in pair.images)
+        known = [FocalPrior(K, 0.0) for K in intrinsics or ()]
+        first, second = known or [FocalPrior.of_image(size, recipe.focal) for size in sizes]
+        found = estimate_with_prior(matches, (first, second), recipe.magsac, recipe.focal, model)
+    return replace(pair, results=results, estimate=found)

@@ -1,7 +1,8 @@
 """The two-stage pipeline on a chunk of pairs.
 
 Stage 1 matches whole images, MKPC finds the critical region of each, stage 2 matches the crops; the points of
-both stages, in image pixels, are concatenated in the recipe's order, and MAGSAC does the rest.
+both stages, in image pixels, are concatenated in the recipe's order, and MAGSAC does the rest, alone or under the
+recipe's prior on focal lengths.
 """
 
 import time

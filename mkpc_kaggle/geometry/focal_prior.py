@@ -1,0 +1,251 @@
+"""F of one pair under a prior on the focal lengths of its two cameras.
+
+The seven degrees of freedom of F are a relative pose and two focal lengths, once the principal points are known,
+and cameras have plausible focal lengths. What is minimised over the pose and log f0, log f1 is the negative
+logarithm of a posterior density,
+
+    sum_n rho(r_n / scale) + sum_i (log f_i - log g_i)^2 / (2 sigma_i^2),     rho(x) = x^2 / (2 (1 + x^2)),
+
+r being the Sampson distance in pixels (:mod:`mkpc_kaggle.geometry.two_view`), g the focal lengths that are
+expected, and rho the loss of Geman and McClure (1985): a far match costs a half, as much as a focal length one
+sigma off. Where the matches tell the focal lengths they decide, elsewhere the prior does.
+
+The search is local, so it has several starts: the F of MAGSAC, and the E of MAGSAC at the expected focal lengths.
+The two rotations that an E stands for are not two starts: both give one F and the same derivatives of it.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mkpc_kaggle.config import AT_LEAST_0, AT_LEAST_1, POSITIVE, check_ranges
+from mkpc_kaggle.geometry.coordinates import Size
+from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.geometry.robust import (
+    Distinct,
+    Estimate,
+    Matrix3,
+    Model,
+    Origin,
+    RobustConfig,
+    consensus,
+    nth_order,
+    robust_cost,
+)
+from mkpc_kaggle.geometry.two_view import Problem, TwoView, Vectors, sampson
+
+ANNEALING = (4.0, 2.0, 1.0)
+"""Times the scale, one after the other: a wide loss has fewer local minima."""
+FOCAL_GRID = (-0.7, -0.35, 0.0, 0.35, 0.7)
+"""log f / g: the focal lengths that MAGSAC's F is read with; the search starts from the best."""
+VAGUE_DIRECTION = 0.5
+"""Radians: where the direction of t has a larger standard deviation, the matches do not tell it."""
+UNLIKELY = 3.0
+"""Standard deviations."""
+
+
+@dataclass(frozen=True)
+class FocalConfig:
+    """Settings of :func:`estimate_with_prior`, table ``[focal]`` of a recipe; without the table MAGSAC is alone.
+
+    An unknown focal length is ``ratio`` times the image's long side, and its logarithm has the standard deviation
+    ``sigma``; ``scale``, in pixels, is that of the loss. E at these focal lengths is sought within
+    ``essential_threshold`` pixels and ``essential_iterations``, on ``essential_orders`` of the matches; F as
+    :class:`RobustConfig` says. The search looks at ``most_matches``, evenly spread, and its outcome is judged on
+    all. MAGSAC's own F is kept where it costs less by ``free_cost``: no plausible focal lengths explain the
+    matches, so the principal points may be elsewhere.
+    """
+
+    ratio: float = 1.1
+    sigma: float = 0.4
+    scale: float = 0.35
+    essential_threshold: float = 1.0
+    essential_iterations: int = 5000
+    essential_orders: int = 2
+    most_matches: int = 1500
+    free_cost: float = 10.0
+
+    def __post_init__(self) -> None:
+        check_ranges(self, ratio=POSITIVE, sigma=POSITIVE, scale=POSITIVE, essential_threshold=POSITIVE)
+        check_ranges(self, essential_iterations=AT_LEAST_1, essential_orders=AT_LEAST_1)
+        check_ranges(self, most_matches=AT_LEAST_1, free_cost=AT_LEAST_0)
+
+    def essential(self, magsac: RobustConfig) -> RobustConfig:
+        """How E is sought where F is sought in that way."""
+        return replace(magsac, threshold=self.essential_threshold, max_iterations=self.essential_iterations)
+
+
+@dataclass(frozen=True, eq=False)
+class FocalPrior:
+    """What is known of a camera: ``K`` (3, 3) in pixels, and the standard deviation of its log focal length.
+
+    ``sigma`` 0 says that K is known. ``ValueError`` for a negative one, and for a K that is no camera matrix.
+    """
+
+    K: Matrix3
+    sigma: float
+
+    def __post_init__(self) -> None:
+        if not self.sigma >= 0:
+            raise ValueError(f"sigma must be at least 0, not {self.sigma}")
+        focals = np.diag(self.K)[:2]
+        if self.K.shape != (3, 3) or not np.isfinite(self.K).all() or not (focals > 0).all():
+            raise ValueError(f"K must be a camera matrix with positive focal lengths, not {self.K.tolist()}")
+
+    @classmethod
+    def of_image(cls, size: Size, config: FocalConfig) -> "FocalPrior":
+        """The weak prior for an image of which the size alone is known."""
+        return cls.of_focal(config.ratio * max(size), config.sigma, size)
+
+    @classmethod
+    def of_focal(cls, focal: float, sigma: float, size: Size) -> "FocalPrior":
+        """A focal length in pixels and how sure it is; the principal point is the image's centre."""
+        centre = (size.width - 1) / 2, (size.height - 1) / 2
+        return cls(np.array([[focal, 0, centre[0]], [0, focal, centre[1]], [0, 0, 1]]), sigma)
+
+    @property
+    def focal(self) -> float:
+        """Pixels, the mean of both axes."""
+        return float(self.K[0, 0] + self.K[1, 1]) / 2
+
+    @property
+    def to_ray(self) -> Matrix3:
+        """Homogeneous pixels -> rays (u, v, g)."""
+        return np.asarray(self.focal * np.linalg.inv(self.K))
+
+    def rays(self, points: Vectors) -> Vectors:
+        """(N, 2) pixels -> (N, 3)."""
+        return np.column_stack([points, np.ones(len(points))]) @ self.to_ray.T
+
+
+Priors = tuple[FocalPrior, FocalPrior]
+
+
+def estimate_with_prior(
+    matches: Matches, priors: Priors, magsac: RobustConfig, config: FocalConfig, model: Model = Model.F
+) -> Estimate:
+    """F of ``matches`` (image pixels), or E where both K are known: of all candidates the one of lowest cost.
+
+    Inliers are nearer than MAGSAC's threshold by their Sampson distance. MAGSAC's own F is a candidate, so that
+    the winner never costs more. ``remark`` says what is to mind about it, and which candidates could not be had.
+    Six distinct matches are enough. The same input gives the same bytes. Raises ``ValueError`` for H, which has
+    no focal lengths, and for E with a focal length that is not known.
+    """
+    if model is Model.H or (model is Model.E and any(prior.sigma for prior in priors)):
+        raise ValueError(f"{model} has no use for a prior on focal lengths")
+    distinct = Distinct.of(matches)
+    with np.errstate(all="ignore"):  # points need not be pixels; what overflows loses
+        search = _Search(distinct, priors, config)
+        tried = search.candidates(magsac, model)
+        candidates = [one for one in tried if not isinstance(one, str) and np.isfinite(one.cost)]
+        reasons = list(dict.fromkeys(one for one in tried if isinstance(one, str)))
+        if not candidates:
+            return Estimate.failed(model, len(matches), "; ".join(reasons) or "no candidate has a finite cost")
+        best = min(candidates, key=lambda candidate: candidate.cost)
+        inliers = np.abs(sampson(best.fundamental, *search.rays)) < magsac.threshold
+        reasons += search.remarks(best)
+    matrix = best.fundamental if model is Model.E else search.for_pixels(best.fundamental)
+    return Estimate(
+        model,
+        matrix / np.linalg.norm(matrix),
+        distinct.spread(inliers),
+        origin=best.origin,
+        focals=search.focals(best.view) if best.view else None,
+        remark="; ".join(reasons),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Candidate:
+    """An F (3, 3) for rays, what it costs, and the two views that it is of; MAGSAC's own F has none."""
+
+    origin: Origin
+    fundamental: Matrix3
+    cost: float
+    view: TwoView | None = None
+
+
+class _Search:
+    """The distinct matches of a pair as ``rays``, and what can be made of them."""
+
+    def __init__(self, distinct: Distinct, priors: Priors, config: FocalConfig) -> None:
+        self._distinct, self._priors, self._config = distinct, priors, config
+        self.rays = priors[0].rays(distinct.points0), priors[1].rays(distinct.points1)
+        sigmas, count = np.array([prior.sigma for prior in priors]), len(self.rays[0])
+        few = np.linspace(0, count - 1, min(count, config.most_matches)).astype(int)
+        self._all = Problem(*self.rays, sigmas)
+        self._sample = Problem(self.rays[0][few], self.rays[1][few], sigmas, count / max(len(few), 1))
+
+    def candidates(self, magsac: RobustConfig, model: Model) -> list[_Candidate | str]:
+        """MAGSAC's F as it is and refined, its E refined; or why one cannot be had."""
+        found: list[_Candidate | str] = []
+        for number in range(magsac.orders):
+            plain = self._consensus(number, magsac, Model.F)
+            if plain.ok:
+                F = self._for_rays(plain.matrix)
+                found.append(self._refined(Origin.FROM_F, self._decomposed(F)))
+                if model is Model.F:
+                    cost = robust_cost(sampson(F, *self.rays), self._config.scale)
+                    found.append(_Candidate(Origin.MAGSAC, F, cost + self._config.free_cost))
+            else:
+                found.append(plain.failure)
+        for number in range(self._config.essential_orders):
+            calibrated = self._consensus(number, self._config.essential(magsac), Model.E)
+            if calibrated.ok:
+                found.append(self._refined(Origin.FROM_E, TwoView.nearest(calibrated.matrix)))
+            else:
+                found.append(calibrated.failure)
+        return found
+
+    def _consensus(self, number: int, magsac: RobustConfig, model: Model) -> Estimate:
+        """MAGSAC on one order of the matches."""
+        order = nth_order(number, len(self.rays[0]))
+        points0, points1 = self._distinct.points0[order], self._distinct.points1[order]
+        return consensus(
+            points0, points1, replace(magsac, orders=1), model, (self._priors[0].K, self._priors[1].K)
+        )
+
+    def remarks(self, best: _Candidate) -> list[str]:
+        """What is to mind about the winner."""
+        if best.view is None:
+            return ["no plausible focal lengths explain the matches"]
+        remarks = [
+            f"the focal length of image {number} is {abs(log) / prior.sigma:.1f} sigma from what is expected"
+            for number, (log, prior) in enumerate(zip(best.view.logs, self._priors, strict=True))
+            if abs(log) > UNLIKELY * prior.sigma
+        ]
+        if self._all.direction_error(best.view, self._config.scale) > VAGUE_DIRECTION:
+            remarks.append("the matches do not tell the direction of motion")
+        return remarks
+
+    def focals(self, view: TwoView) -> tuple[float, float]:
+        """Pixels."""
+        first, second = (
+            prior.focal * float(np.exp(log)) for prior, log in zip(self._priors, view.logs, strict=True)
+        )
+        return first, second
+
+    def for_pixels(self, F: Matrix3) -> Matrix3:
+        """The F for homogeneous pixels, of one for rays."""
+        return self._priors[1].to_ray.T @ F @ self._priors[0].to_ray
+
+    def _for_rays(self, F: Matrix3) -> Matrix3:
+        """The other way, of unit norm."""
+        F = np.linalg.inv(self._priors[1].to_ray).T @ F @ np.linalg.inv(self._priors[0].to_ray)
+        return F / np.linalg.norm(F)
+
+    def _refined(self, origin: Origin, start: TwoView) -> _Candidate:
+        """Where the search leads from there, or the start itself if that costs less."""
+        view = start
+        for factor in ANNEALING:
+            view = self._sample.fit(view, factor * self._config.scale)
+        cost, view = min(
+            ((self._all.cost(one, self._config.scale), one) for one in (view, start)), key=lambda pair: pair[0]
+        )
+        return _Candidate(origin, view.fundamental, cost, view)
+
+    def _decomposed(self, F: Matrix3) -> TwoView:
+        """An F for rays as two views: of focal lengths on a grid those that explain the matches best."""
+        grid0, grid1 = (FOCAL_GRID if prior.sigma else (0.0,) for prior in self._priors)
+        views = [TwoView.nearest(F, log0, log1) for log0 in grid0 for log1 in grid1]
+        return min(views, key=lambda view: self._sample.cost(view, ANNEALING[0] * self._config.scale))

@@ -1,0 +1,195 @@
+"""Two cameras as rotation, direction and focal lengths, fitted to matches by a robust loss.
+
+With rays y = (u, v, g), pixels from the principal point and the focal length that is expected, two views have
+
+    F = diag(1, 1, f1 / g1) [t]x R diag(1, 1, f0 / g0),     y1^T F y0 = 0,
+
+since K^-1 = diag(1, 1, f) / f there. The Sampson distance (Sampson, 1982; Hartley and Zisserman, Multiple View
+Geometry, 11.4.3) is r = y1^T F y0 / s, s being the length of its gradient by the four coordinates: pixels, as the
+third element of a ray has no part in it. With P = diag(1, 1, 0) its derivative by the elements of F is
+
+    dr = (a^T dF y0 + y1^T dF b) / s,     a = y1 - (r / s) P F y0,     b = -(r / s) P F^T y1.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mkpc_kaggle.geometry.robust import Matrix3, robust_cost
+
+Vectors = NDArray[np.float64]
+
+MOST_STEPS = 10
+"""Of Levenberg-Marquardt at one scale."""
+LEAST_GAIN = 1e-3
+"""A step that lowers the cost by less is the last one; a match costs up to a half."""
+LEAST_DAMPING, FIRST_DAMPING, MOST_DAMPING = 1e-9, 1e-3, 1e6
+FOCAL_BOUND = 2.0
+"""The largest |log f / g|: a factor of 7.4 in either direction."""
+TINY = float(np.finfo(np.float64).tiny)
+CROSS: NDArray[np.float64] = np.swapaxes(np.cross(np.eye(3)[:, None], np.eye(3)), 1, 2)
+"""(3, 3, 3): [e_k]x for the three axes."""
+CROSS.setflags(write=False)
+
+
+@dataclass(frozen=True, eq=False)
+class TwoView:
+    """X_1 = R X_0 + t up to the scale of t, (3,) of unit length; ``logs`` (2,) are log f / g of both cameras."""
+
+    R: Matrix3
+    t: Vectors
+    logs: Vectors
+
+    @classmethod
+    def nearest(cls, F: Matrix3, log0: float = 0.0, log1: float = 0.0) -> "TwoView":
+        """Those of these focal lengths whose E is nearest to the one that an F would have with them.
+
+        One of two rotations and two signs of t; all four stand for one F. Raises ``LinAlgError`` for what is
+        not finite.
+        """
+        U, _, Vt = np.linalg.svd(F / _focal_factors(np.array([log0, log1])))
+        quarter = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, np.linalg.det(U) * np.linalg.det(Vt)]])
+        return cls(U @ quarter @ Vt, U[:, 2], np.array([log0, log1]))
+
+    @property
+    def fundamental(self) -> Matrix3:
+        return self._with_focals(_cross(self.t) @ self.R)
+
+    def tangent(self) -> NDArray[np.float64]:
+        """(9, 7): F's elements by a turn of R (3), a shift of t on the sphere (2) and the logs (2)."""
+        F, cross = self.fundamental, _cross(self.t)
+        turns = self._with_focals(cross @ CROSS @ self.R)
+        shifts = self._with_focals(np.tensordot(self._across().T, CROSS, 1) @ self.R)
+        by_log0, by_log1 = np.zeros((3, 3)), np.zeros((3, 3))
+        by_log0[:, 2], by_log1[2] = F[:, 2], F[2]
+        return np.concatenate([turns, shifts, [by_log0, by_log1]]).reshape(7, 9).T
+
+    def moved(self, step: Vectors) -> "TwoView":
+        """After a step (7,) along the columns of :meth:`tangent`."""
+        t = self.t + self._across() @ step[3:5]
+        return TwoView(_rotation(step[:3]) @ self.R, t / np.linalg.norm(t), self.logs + step[5:])
+
+    def _with_focals(self, E: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.asarray(E * _focal_factors(self.logs))
+
+    def _across(self) -> NDArray[np.float64]:
+        """(3, 2) unit vectors at right angles to t and to each other."""
+        first = _cross(self.t)[np.argmin(np.abs(self.t))]
+        first = first / np.linalg.norm(first)
+        return np.column_stack([first, _cross(self.t) @ first])
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """Rays (N, 3) of both images, each counted ``weight`` times, and the standard deviations of log f / g (2,).
+
+    A deviation of 0 keeps that focal length where it is.
+    """
+
+    rays0: Vectors
+    rays1: Vectors
+    sigmas: Vectors
+    weight: float = 1.0
+
+    def cost(self, view: TwoView, scale: float) -> float:
+        """The robust cost of the Sampson distances and half the squares of the logs over their deviations."""
+        distances = sampson(view.fundamental, self.rays0, self.rays1)
+        return self.weight * robust_cost(distances, scale) + 0.5 * float(self._precisions @ view.logs**2)
+
+    def fit(self, start: TwoView, scale: float) -> TwoView:
+        """A local minimum of :meth:`cost` near ``start``, by Levenberg-Marquardt on the reweighted squares."""
+        view, cost, damping = start, self.cost(start, scale), FIRST_DAMPING
+        for _ in range(MOST_STEPS):
+            gradient, curvature = self._slopes(view, scale)
+            while damping < MOST_DAMPING:
+                moved = view.moved(self._step(gradient, curvature, damping))
+                moved_cost = self.cost(moved, scale) if np.abs(moved.logs).max() < FOCAL_BOUND else np.inf
+                if moved_cost < cost:
+                    break
+                damping *= 10
+            else:
+                break
+            gain, view, cost = cost - moved_cost, moved, moved_cost
+            damping = max(damping / 10, LEAST_DAMPING)
+            if gain < LEAST_GAIN:
+                break
+        return view
+
+    def direction_error(self, view: TwoView, scale: float) -> float:
+        """The standard deviation of t's direction at a minimum, in radians, where it is largest."""
+        free = self._free
+        curvature = self._slopes(view, scale)[1][np.ix_(free, free)]
+        covariance = np.linalg.pinv(curvature, hermitian=True)[3:5, 3:5]
+        return float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
+
+    @property
+    def _free(self) -> NDArray[np.bool_]:
+        """Which of the seven steps may be other than 0."""
+        return np.concatenate([np.ones(5, bool), self.sigmas > 0])
+
+    @property
+    def _precisions(self) -> Vectors:
+        return np.array([1 / sigma**2 if sigma else 0.0 for sigma in self.sigmas])
+
+    def _step(self, gradient: Vectors, curvature: NDArray[np.float64], damping: float) -> Vectors:
+        """The damped step (7,); not a number where there is none, so that it is not taken."""
+        free = self._free
+        step, damped = np.zeros(7), curvature + damping * np.diag(np.diag(curvature) + LEAST_DAMPING)
+        try:
+            step[free] = -np.linalg.solve(damped[np.ix_(free, free)], gradient[free])
+        except np.linalg.LinAlgError:
+            step[free] = np.nan
+        return step
+
+    def _slopes(self, view: TwoView, scale: float) -> tuple[Vectors, NDArray[np.float64]]:
+        """The gradient (7,) of the cost and its curvature (7, 7), that of the squares with the loss's weights."""
+        lines0, lines1, slope = _lines(view.fundamental, self.rays0, self.rays1)
+        distances = _dots(self.rays1, lines1) / slope
+        lean = (distances / slope)[:, None]
+        a, b = self.rays1.copy(), -lean * lines0
+        a[:, :2] -= lean * lines1[:, :2]
+        b[:, 2] = 0
+        rows = a[:, :, None] * self.rays0[:, None] + self.rays1[:, :, None] * b[:, None]
+        jacobian = rows.reshape(-1, 9) @ view.tangent() / (scale * slope)[:, None]
+        weights = self.weight / np.square(1 + np.square(distances / scale))
+        weighted = jacobian * weights[:, None]
+        gradient, curvature = weighted.T @ (distances / scale), weighted.T @ jacobian
+        gradient[5:] += self._precisions * view.logs
+        curvature[[5, 6], [5, 6]] += self._precisions
+        return gradient, curvature
+
+
+def sampson(F: Matrix3, rays0: Vectors, rays1: Vectors) -> Vectors:
+    """(N,) Sampson distance of (N, 3) rays to an F that is meant for them, with its sign, in pixels."""
+    _, lines1, slope = _lines(F, rays0, rays1)
+    return np.asarray(_dots(rays1, lines1) / slope)
+
+
+def _lines(F: Matrix3, rays0: Vectors, rays1: Vectors) -> tuple[Vectors, Vectors, Vectors]:
+    """The epipolar lines (N, 3) in both images, and the length (N,) of the gradient of y1^T F y0."""
+    lines0, lines1 = rays1 @ F, rays0 @ F.T
+    squares = _dots(lines0[:, :2], lines0[:, :2]) + _dots(lines1[:, :2], lines1[:, :2])
+    return lines0, lines1, np.sqrt(squares) + TINY
+
+
+def _dots(a: Vectors, b: Vectors) -> Vectors:
+    """The products (N,) of the rows of two (N, K) arrays."""
+    return np.asarray(np.einsum("nk,nk->n", a, b))
+
+
+def _focal_factors(logs: Vectors) -> Matrix3:
+    """What the elements of E are multiplied with to have those of F."""
+    ratio0, ratio1 = np.exp(logs)
+    return np.array([[1, 1, ratio0], [1, 1, ratio0], [ratio1, ratio1, ratio0 * ratio1]])
+
+
+def _cross(t: Vectors) -> Matrix3:
+    return np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
+
+
+def _rotation(turn: Vectors) -> Matrix3:
+    """The rotation about ``turn`` by its length in radians: Rodrigues' formula."""
+    angle = float(np.linalg.norm(turn))
+    K = _cross(turn)
+    return np.asarray(np.eye(3) + np.sinc(angle / np.pi) * K + 0.5 * np.sinc(angle / (2 * np.pi)) ** 2 * K @ K)

@@ -1,0 +1,226 @@
+"""F under a prior on focal lengths: nearer to the truth than MAGSAC alone, and always a value with its reason."""
+
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from numpy.testing import assert_allclose, assert_array_equal
+
+from mkpc_kaggle.geometry.cameras import Camera
+from mkpc_kaggle.geometry.coordinates import Size
+from mkpc_kaggle.geometry.focal_prior import FocalConfig, FocalPrior, estimate_with_prior
+from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.geometry.metrics import pose_error
+from mkpc_kaggle.geometry.robust import Model, Origin, RobustConfig, estimate, robust_cost, sampson_distances
+
+SIZE = Size(1024, 768)
+CENTRE = np.array([511.5, 383.5])
+MAGSAC = RobustConfig(orders=1, max_iterations=2000)
+CONFIG = FocalConfig()
+WEAK = FocalPrior.of_image(SIZE, CONFIG), FocalPrior.of_image(SIZE, CONFIG)
+
+
+def camera(focal, turn=0.0, t=(0, 0, 0), centre=CENTRE):
+    c, s = np.cos(turn), np.sin(turn)
+    K = np.array([[focal, 0, centre[0]], [0, focal, centre[1]], [0, 0, 1.0]])
+    return Camera(K, np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]), np.array(t, float))
+
+
+CAMERAS = camera(900.0), camera(1300.0, 0.15, (-1.0, 0.1, 0.2))
+
+
+def seen(cameras, n=200, noise=0.0, outliers=0, seed=0, depth=(4, 9)):
+    """n matches of random points, then wild ones."""
+    rng = np.random.default_rng(seed)
+    X = rng.uniform((-1.5, -1.2, depth[0]), (1.5, 1.2, depth[1]), (n, 3))
+    points = []
+    for one in cameras:
+        x = (X @ one.R.T + one.t) @ one.K.T
+        points.append(x[:, :2] / x[:, 2:] + rng.normal(scale=noise, size=(n, 2)))
+    wild = [rng.uniform(0, SIZE, (outliers, 2)) for _ in range(2)]
+    return Matches(*(np.vstack(both) for both in zip(points, wild, strict=True)), np.ones(n + outliers))
+
+
+def with_prior(matches, priors=WEAK, magsac=MAGSAC, config=CONFIG, model=Model.F):
+    return estimate_with_prior(matches, priors, magsac, config, model)
+
+
+def as_bytes(result):
+    return result.matrix.tobytes(), result.inliers.tobytes(), result.focals, result.remark
+
+
+def assert_is_a_value(result, count):
+    assert result.matrix.shape == (3, 3)
+    assert np.isfinite(result.matrix).all()
+    assert np.linalg.norm(result.matrix) == pytest.approx(1)
+    assert result.inliers.shape == (count,)
+    if not result.ok:
+        assert result.inlier_count == 0
+
+
+def test_focal_lengths_and_pose_are_found_among_outliers():
+    result = with_prior(seen(CAMERAS, 400, 0.05, 150))
+    assert result.ok and result.remark == ""
+    assert result.origin in (Origin.FROM_F, Origin.FROM_E)
+    assert_allclose(result.focals, (900, 1300), rtol=0.1)
+    error = pose_error(result.matrix, *CAMERAS, 1.0)
+    assert error.rotation < 1
+    assert error.translation_angle < 2
+    assert result.inliers[:400].mean() > 0.95
+    assert result.inliers[400:].mean() < 0.05
+
+
+def test_few_noisy_matches_have_a_better_pose_the_more_is_known_of_the_focal_lengths():
+    sure = FocalPrior.of_focal(900, 0.01, SIZE), FocalPrior.of_focal(1300, 0.01, SIZE)
+    alone, weakly, surely = [], [], []
+    for seed in range(6):
+        matches = seen(CAMERAS, 30, 0.2, 20, seed, depth=(5, 6))
+        known = with_prior(matches, sure)
+        assert_allclose(known.focals, (900, 1300), rtol=0.03)
+        for result, errors in ((estimate(matches, MAGSAC), alone), (with_prior(matches), weakly), (known, surely)):
+            errors.append(pose_error(result.matrix, *CAMERAS, 1.0).angle)
+    assert np.median(weakly) < 0.7 * np.median(alone)
+    assert np.median(surely) < 0.7 * np.median(weakly)
+
+
+def test_known_cameras_of_two_focal_lengths_and_any_centre_give_their_essential_matrix():
+    K0 = np.array([[820.0, 0, 400], [0, 860, 390], [0, 0, 1]])
+    first = Camera(K0, np.eye(3), np.zeros(3))
+    second = CAMERAS[1]
+    matches = seen((first, second), 100, 0.2, 40)
+    result = with_prior(matches, (FocalPrior(K0, 0), FocalPrior(second.K, 0)), model=Model.E)
+    assert result.ok
+    assert_allclose(np.linalg.svd(result.matrix, compute_uv=False), np.array([1, 1, 0]) / np.sqrt(2), atol=1e-9)
+    assert pose_error(result.matrix, first.calibrated, second.calibrated, 1.0).angle < 2
+    assert_allclose(result.focals, (840, 1300))
+    assert result.inlier_count > 0
+
+
+def test_a_principal_point_far_off_leaves_magsac_its_matrix_with_the_reason():
+    cropped = camera(700.0, centre=(-900, 1500)), camera(800.0, 0.3, (-2.0, 0.3, 0.5), centre=(2500, -800))
+    rng = np.random.default_rng(0)
+    X = rng.uniform((-4, -4, 4), (4, 4, 9), (400, 3))
+    x0, x1 = (((X @ one.R.T + one.t) @ one.K.T) for one in cropped)
+    matches = Matches(x0[:, :2] / x0[:, 2:], x1[:, :2] / x1[:, 2:], np.ones(400))
+    result = with_prior(matches)
+    assert result.ok
+    assert result.origin is Origin.MAGSAC
+    assert result.focals is None
+    assert "no plausible focal lengths" in result.remark
+    assert sampson_distances(result.matrix, matches).max() < 0.1
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_nothing_costs_more_than_magsacs_own_matrix_and_the_price_of_its_freedom(seed):
+    matches = seen(CAMERAS, 60, 0.4, 60, seed)
+    alone, result = estimate(matches, MAGSAC), with_prior(matches)
+    ours, theirs = (robust_cost(sampson_distances(one.matrix, matches), CONFIG.scale) for one in (result, alone))
+    assert ours <= theirs + CONFIG.free_cost
+    free = with_prior(matches, config=FocalConfig(free_cost=0))
+    assert robust_cost(sampson_distances(free.matrix, matches), CONFIG.scale) <= theirs + 1e-9
+
+
+def degenerate():
+    rng = np.random.default_rng(0)
+    turned = seen((camera(1100), camera(1100, 0.1)), 80, 0.1)
+    along = np.linspace(0, 700, 40)
+    X = np.column_stack([rng.uniform(-1, 1, (80, 2)), np.full(80, 5.0)])
+    plane = [((X @ one.R.T + one.t) @ one.K.T) for one in CAMERAS]
+    return {
+        "a pure rotation": turned,
+        "one plane": Matches(*(x[:, :2] / x[:, 2:] for x in plane), np.ones(80)),
+        "a line": Matches(np.column_stack([along, along]), np.column_stack([along, 2 * along]), np.ones(40)),
+        "eight": seen(CAMERAS, 8),
+        "six": seen(CAMERAS, 6),
+        "five": seen(CAMERAS, 5),
+        "none": Matches.empty(),
+        "repeated": seen(CAMERAS, 5)[np.tile(np.arange(5), 20)],
+        "one point": Matches(np.full((30, 2), 5.5), np.full((30, 2), 9.25), np.ones(30)),
+        "no numbers": Matches(np.full((30, 2), np.nan), np.full((30, 2), 9.25), np.ones(30)),
+        "the same points": Matches(*2 * [rng.uniform(0, 700, (50, 2))], np.ones(50)),
+        "far points": Matches(*(rng.normal(size=(40, 2)) * 1e18 for _ in range(2)), np.ones(40)),
+    }
+
+
+@pytest.mark.parametrize("name", degenerate())
+def test_degenerate_matches_end_in_a_value(name):
+    matches = degenerate()[name]
+    result = with_prior(matches)
+    assert_is_a_value(result, len(matches))
+    assert result.ok != bool(result.failure)
+    if name in ("five", "none", "repeated", "one point", "no numbers"):
+        assert "too few distinct matches" in result.failure
+    if name == "six":
+        assert result.ok and result.origin is Origin.FROM_E
+        assert "too few distinct matches for F: 6" in result.remark
+
+
+def test_a_pure_rotation_is_said_not_to_tell_the_direction_of_motion():
+    assert "direction of motion" in with_prior(degenerate()["a pure rotation"]).remark
+    assert "direction of motion" not in with_prior(seen(CAMERAS, 80, 0.1)).remark
+
+
+def test_an_unlikely_focal_length_is_told():
+    tele = camera(6000.0), camera(6000.0, 0.15, (-1.0, 0.1, 0.2))
+    rng = np.random.default_rng(0)
+    X = rng.uniform((-0.5, -0.4, 4), (0.9, 0.4, 9), (600, 3))
+    x0, x1 = (((X @ one.R.T + one.t) @ one.K.T) for one in tele)
+    result = with_prior(Matches(x0[:, :2] / x0[:, 2:], x1[:, :2] / x1[:, 2:], np.ones(600)))
+    assert result.ok
+    assert "sigma from what is expected" in result.remark or result.origin is Origin.MAGSAC
+
+
+def test_the_search_may_look_at_few_matches_and_inliers_are_of_all():
+    matches = seen(CAMERAS, 600, 0.05)
+    result = with_prior(matches, config=FocalConfig(most_matches=100))
+    assert result.inliers.mean() > 0.9
+    assert_array_equal(result.inliers, sampson_distances(result.matrix, matches) < MAGSAC.threshold)
+
+
+def test_repetitions_and_what_is_not_finite_change_nothing():
+    matches = seen(CAMERAS, 80, 0.1, 20)
+    bad = Matches(np.full((9, 2), np.nan), np.full((9, 2), 1.0), np.ones(9))
+    more = with_prior(Matches.concatenate([matches, matches, bad]))
+    once = with_prior(matches)
+    assert_array_equal(more.matrix, once.matrix)
+    assert_array_equal(more.inliers, np.concatenate([once.inliers, once.inliers, np.zeros(9, bool)]))
+
+
+def test_the_same_input_gives_the_same_bytes_in_threads_too():
+    inputs = [seen(CAMERAS, 60, 0.2, 30, seed) for seed in range(2)] * 2
+    alone = [as_bytes(with_prior(matches)) for matches in inputs]
+    assert alone[:2] == alone[2:]
+    with ThreadPoolExecutor(2) as threads:
+        assert list(threads.map(lambda matches: as_bytes(with_prior(matches)), inputs)) == alone
+
+
+def test_what_makes_no_prior_is_an_error():
+    with pytest.raises(ValueError, match="H"):
+        with_prior(Matches.empty(), model=Model.H)
+    with pytest.raises(ValueError, match="E"):
+        with_prior(Matches.empty(), model=Model.E)
+    with pytest.raises(ValueError, match="sigma"):
+        FocalPrior(np.eye(3), -1)
+    with pytest.raises(ValueError, match="camera matrix"):
+        FocalPrior(np.diag([0.0, 1, 1]), 1)
+    with pytest.raises(ValueError, match="scale"):
+        FocalConfig(scale=0)
+
+
+@given(data=st.data(), n=st.integers(0, 24))
+@settings(max_examples=40, deadline=None)
+def test_whatever_the_points_are_the_answer_is_an_estimate(data, n):
+    some = [
+        st.floats(width=32),
+        st.sampled_from([0.0, 1.0, -1.0, 1e-20, 1e20, 3e38]),
+        st.integers(0, 5).map(float),
+    ]
+    rows = data.draw(arrays(np.float32, (n, 4), elements=data.draw(st.sampled_from(some))))
+    result = with_prior(
+        Matches(rows[:, :2], rows[:, 2:], np.ones(n)), magsac=RobustConfig(max_iterations=100, orders=1)
+    )
+    assert_is_a_value(result, n)
+    assert not result.inliers[~np.isfinite(rows).all(axis=1)].any()

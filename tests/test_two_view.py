@@ -1,0 +1,91 @@
+"""Two views: F and its derivatives, the Sampson distance, and the way downhill."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.geometry.robust import sampson_distances
+from mkpc_kaggle.geometry.two_view import Problem, TwoView, sampson
+
+STEP = 1e-6
+
+
+def unit(vector):
+    return vector / np.linalg.norm(vector)
+
+
+def random_view(seed, logs=(0.2, -0.3)):
+    rng = np.random.default_rng(seed)
+    R = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    return TwoView(R * np.linalg.det(R), unit(rng.normal(size=3)), np.array(logs))
+
+
+def rays(seed, n=60):
+    rng = np.random.default_rng(seed)
+    return tuple(np.column_stack([rng.normal(size=(n, 2)) * 300, np.full(n, g)]) for g in (900.0, 800.0))
+
+
+def each_way(k):
+    step = np.zeros(7)
+    step[k] = STEP
+    return step, -step
+
+
+@pytest.mark.parametrize("k", range(7))
+def test_the_derivatives_of_the_fundamental_matrix_are_those_of_finite_differences(k):
+    view = random_view(0)
+    forth, back = (view.moved(step).fundamental.ravel() for step in each_way(k))
+    assert_allclose(view.tangent()[:, k], (forth - back) / (2 * STEP), atol=1e-8)
+
+
+@pytest.mark.parametrize("k", range(7))
+def test_the_gradient_of_the_cost_is_that_of_finite_differences(k):
+    view, problem = random_view(1), Problem(*rays(1), np.array([0.4, 0.2]), weight=2.0)
+    forth, back = (problem.cost(view.moved(step), 30.0) for step in each_way(k))
+    gradient, curvature = problem._slopes(view, 30.0)
+    assert gradient[k] == pytest.approx((forth - back) / (2 * STEP), abs=1e-5)
+    assert_allclose(curvature, curvature.T)
+
+
+def test_a_moved_view_is_still_a_rotation_and_a_direction():
+    view = random_view(2).moved(np.array([0.5, -1, 2, 0.7, -0.4, 0, 0]))
+    assert_allclose(view.R @ view.R.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(view.R) == pytest.approx(1)
+    assert np.linalg.norm(view.t) == pytest.approx(1)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_views_nearest_to_an_essential_matrix_have_it(seed):
+    E = random_view(seed, (0, 0)).fundamental
+    for times in (1, -7):
+        found = TwoView.nearest(times * E)
+        assert np.linalg.det(found.R) == pytest.approx(1)
+        sign = np.sign(np.sum(found.fundamental * E))
+        assert_allclose(sign * found.fundamental, E, atol=1e-12)
+
+
+def test_both_rotations_of_an_essential_matrix_give_one_cost_and_one_span_of_derivatives():
+    view = random_view(3)
+    turned = TwoView((2 * np.outer(view.t, view.t) - np.eye(3)) @ view.R, view.t, view.logs)
+    assert_allclose(turned.fundamental, -view.fundamental, atol=1e-12)
+    together = np.hstack([view.tangent(), turned.tangent()])
+    assert np.linalg.matrix_rank(view.tangent(), tol=1e-9) == np.linalg.matrix_rank(together, tol=1e-9) == 7
+
+
+def test_the_sampson_distance_is_that_of_pixels():
+    rays0, rays1 = rays(4)
+    F = random_view(4).fundamental
+    pixels = Matches(rays0[:, :2], rays1[:, :2], np.ones(60))
+    scaled = np.diag([1, 1, 800.0]) @ F @ np.diag([1, 1, 900.0])
+    assert_allclose(np.abs(sampson(F, rays0, rays1)), sampson_distances(scaled, pixels), rtol=1e-4)
+
+
+@pytest.mark.parametrize("sigmas", [(0.4, 0.4), (0, 0.4), (0, 0)])
+def test_a_fit_never_costs_more_and_leaves_known_focal_lengths_alone(sigmas):
+    start = random_view(5, (0, 0))
+    problem = Problem(*rays(5), np.array(sigmas))
+    found = problem.fit(start, 50.0)
+    assert problem.cost(found, 50.0) < problem.cost(start, 50.0)
+    assert_allclose(found.logs[np.array(sigmas) == 0], 0, atol=0)
+    assert problem.direction_error(found, 50.0) > 0
