@@ -21,6 +21,7 @@ from torch.nn import functional
 
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.matchers.networks.aspanformer import AspanFormer, AspanFormerConfig
+from mkpc_kaggle.matchers.networks.assignment import mutual_matches
 from mkpc_kaggle.matchers.networks.dkm import (
     DKM,
     DkmConfig,
@@ -38,7 +39,6 @@ from mkpc_kaggle.matchers.networks.superglue import (
     SuperGlue,
     SuperGlueConfig,
     log_optimal_transport,
-    mutual_matches,
 )
 from mkpc_kaggle.matchers.networks.superpoint import SuperPoint, SuperPointConfig, score_map, suppress_non_maxima
 
@@ -129,7 +129,9 @@ def superglue_values(counts, batch=1, **options):
     yield "plan", log_plan.exp()
     yield "log plan", log_plan
     found = network(image0, image1)
-    assert torch.equal(found.matches0, mutual_matches(log_plan, network.config.match_threshold).matches0)
+    assert torch.equal(
+        found.matches0, mutual_matches(log_plan[:, :-1, :-1], network.config.match_threshold).matches0
+    )
     batches, index0 = torch.nonzero(found.matches0 >= 0, as_tuple=True)
     rows = torch.stack([batches, index0, found.matches0[batches, index0]], dim=1)
     yield "matches", Found(rows, found.scores0[batches, index0, None])

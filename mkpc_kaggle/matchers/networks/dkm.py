@@ -12,7 +12,6 @@ from enum import StrEnum
 
 import torch
 from torch import Generator, Tensor, nn
-from torch.nn import functional
 
 from mkpc_kaggle.matchers.networks.dkm_coarse import FEATURES, STRIDES, WIDTH, EmbeddingDecoder, GaussianProcess
 from mkpc_kaggle.matchers.networks.dkm_refiner import (
@@ -24,6 +23,7 @@ from mkpc_kaggle.matchers.networks.dkm_refiner import (
     resize,
 )
 from mkpc_kaggle.matchers.networks.grids import as_grid
+from mkpc_kaggle.matchers.networks.pixels import resized
 from mkpc_kaggle.matchers.networks.resnet50 import ResNet50
 
 MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
@@ -73,13 +73,10 @@ class DenseWarp:
 def network_input(pixels: Tensor, size: tuple[int, int]) -> Tensor:
     """RGB images (B, 3, H, W) uint8 on the CPU -> (B, 3, *size) float32, resized and normalised.
 
-    Bicubic with antialiasing in 8 bits; differs from PIL, with which the network was trained, by a grey level in
-    less than a hundredth of the values. The second pass needs the image itself resized anew.
+    The second pass needs the image itself resized anew.
     """
-    if pixels.shape[2:] != size:
-        pixels = functional.interpolate(pixels, size, mode="bicubic", antialias=True, align_corners=False)
     mean, std = (torch.tensor(values)[:, None, None] for values in (MEAN, STD))
-    return pixels.float().div_(255).sub_(mean).div_(std)
+    return resized(pixels, size).sub_(mean).div_(std)
 
 
 class DKM(nn.Module):
