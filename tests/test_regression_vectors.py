@@ -22,17 +22,16 @@ from torch.nn import functional
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.matchers.networks.aspanformer import AspanFormer, AspanFormerConfig
 from mkpc_kaggle.matchers.networks.assignment import mutual_matches
-from mkpc_kaggle.matchers.networks.dkm import (
-    DKM,
-    DkmConfig,
+from mkpc_kaggle.matchers.networks.dense_sampling import (
     SamplingConfig,
     balancing_weights,
     density,
     draw,
-    network_input,
     weights_of,
 )
+from mkpc_kaggle.matchers.networks.dkm import DKM, DkmConfig
 from mkpc_kaggle.matchers.networks.loftr import Loftr, LoftrConfig
+from mkpc_kaggle.matchers.networks.pixels import network_input
 from mkpc_kaggle.matchers.networks.quadtree import Quadtree, QuadtreeConfig
 from mkpc_kaggle.matchers.networks.superglue import (
     ImageKeypoints,
