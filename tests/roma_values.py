@@ -5,8 +5,25 @@ from dense import joined, one_thread, recorded_refinement, refiner_values
 from golden import recorded
 
 from mkpc_kaggle.matchers.networks.dense_warp import side_by_side
+from mkpc_kaggle.matchers.networks.dinov2 import DinoV2Config
 from mkpc_kaggle.matchers.networks.gaussian_process import kernel, tokens
 from mkpc_kaggle.matchers.networks.grids import as_map
+from mkpc_kaggle.matchers.networks.roma import RomaConfig
+from mkpc_kaggle.matchers.networks.warp_refiner import RefinerShape
+
+NARROW = RomaConfig(
+    dinov2=DinoV2Config(width=64, blocks=2, heads=2, positions=5),
+    refiners={
+        16: RefinerShape(64, 16, 7, 369),
+        8: RefinerShape(48, 8, 3, 153),
+        4: RefinerShape(32, 8, 2, 97),
+        2: RefinerShape(16, 4, None, 36),
+        1: RefinerShape(9, 6, None, 24),
+    },
+    blocks=2,
+    heads=2,
+)
+"""The same network with fewer channels, a thirtieth of its size: most of what is left is VGG."""
 
 DINOV2_BLOCKS, DECODER_BLOCKS = (1, 12, 24), (1, 5)
 

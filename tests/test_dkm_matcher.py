@@ -144,7 +144,7 @@ class Given:
     def to(self, device: str) -> "Given":
         return self
 
-    def encode(self, image: torch.Tensor) -> DkmFeatures:
+    def encode(self, image: torch.Tensor, fine: torch.Tensor | None = None) -> DkmFeatures:
         return None  # type: ignore[return-value]
 
     def match(self, first: DkmFeatures, second: DkmFeatures) -> tuple[DenseWarp, ...]:
