@@ -35,6 +35,7 @@ from mkpc_kaggle.matchers.networks.loftr import Loftr
 from mkpc_kaggle.matchers.networks.pixels import network_input
 from mkpc_kaggle.matchers.networks.placement import placed
 from mkpc_kaggle.matchers.networks.quadtree import Quadtree
+from mkpc_kaggle.matchers.networks.roma import RoMa, RomaFeatures
 from mkpc_kaggle.matchers.networks.superglue import ImageKeypoints, SuperGlue, SuperGlueConfig
 from mkpc_kaggle.matchers.networks.superpoint import SuperPoint, SuperPointConfig
 from tests.standin import filled
@@ -43,6 +44,7 @@ Run = Callable[[], int]
 """Does the work once; the number of matches or keypoints that it found."""
 
 VGA, DKM_SIZE = Size(640, 480), Size(720, 540)
+ROMA_SIZES = Size(560, 560), Size(864, 864)
 YARDSTICK = "kornia LoFTR"
 GIGA = 1e9
 
@@ -110,6 +112,41 @@ def dkm(precision: Precision) -> Run:
     return run
 
 
+@cache
+def random_roma(precision: Precision) -> RoMa:
+    """With weights that keep activations of order 1; the stand-ins take a minute for so many."""
+    with torch.device("meta"):
+        network = RoMa()
+    network = network.to_empty(device="cpu")
+    generator = torch.Generator().manual_seed(0)
+    for name, tensor in network.state_dict().items():
+        if tensor.ndim > 1:
+            tensor.normal_(std=tensor[0].numel() ** -0.5, generator=generator)
+        else:
+            tensor.fill_(1 if name.endswith(("weight", "running_var", "gamma")) else 0)
+    return placed(network, Placement(precision=precision))
+
+
+def roma(passes: int, cached: bool, precision: Precision) -> Run:
+    """At the published sizes, both ways, with the encodings' time or without."""
+    network = random_roma(precision)
+    pictures = [torch.from_numpy(view).permute(2, 0, 1)[None] for view in photographs(ROMA_SIZES[-1])]
+
+    def encoded() -> list[RomaFeatures]:
+        inputs = ([network_input(picture, size) for size in ROMA_SIZES[:passes]] for picture in pictures)
+        return [network.encode(*images) for images in inputs]
+
+    given = encoded() if cached else None
+
+    def run() -> int:
+        warps = network.match(*(given or encoded()))
+        warp = torch.cat([one.warp.reshape(-1, 4) for one in warps])
+        certainty = torch.cat([one.certainty.flatten() for one in warps])
+        return len(sample(warp, certainty, SamplingConfig()).matches)
+
+    return run
+
+
 CASES: dict[str, Callable[[Precision], Run]] = {
     YARDSTICK: kornia_loftr,
     "LoFTR": semi_dense(Loftr, "loftr", VGA),
@@ -119,6 +156,10 @@ CASES: dict[str, Callable[[Precision], Run]] = {
     "QuadTree": semi_dense(Quadtree, "quadtree", VGA),
     "ASpanFormer": semi_dense(AspanFormer, "aspanformer", VGA),
     "DKM 540x720, one pass": dkm,
+    "RoMa 560": partial(roma, 1, False),
+    "RoMa 560, encodings cached": partial(roma, 1, True),
+    "RoMa 560 + 864": partial(roma, 2, False),
+    "RoMa 560 + 864, encodings cached": partial(roma, 2, True),
 }
 LARGE = Size(1600, 1216)
 LARGE_CASES = {
