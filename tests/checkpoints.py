@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from mkpc_kaggle.matchers.networks.aspanformer import AspanFormer
 from mkpc_kaggle.matchers.networks.dkm import DKM
 from mkpc_kaggle.matchers.networks.loftr import Loftr
+from mkpc_kaggle.matchers.networks.loma import Loma, Variant
 from mkpc_kaggle.matchers.networks.quadtree import Quadtree
 from mkpc_kaggle.matchers.networks.superglue import SuperGlue, SuperGlueConfig
 from mkpc_kaggle.matchers.networks.superpoint import SuperPoint, SuperPointConfig
@@ -38,6 +39,14 @@ def wrapped_aspanformer(state: dict[str, Tensor]) -> dict[str, Any]:
     """With the offsets that the published network keeps and does not read."""
     offsets = {f"loftr_coarse.layers.{index}.attention.sample_offset": torch.ones(64, 2) for index in range(4)}
     return wrapped(state | offsets)
+
+
+def published_loma(state: dict[str, Tensor]) -> dict[str, Any]:
+    """The matcher's names bare, with the assignments of the other layers that training had."""
+    names = {name: name.removeprefix("matcher.") for name in state}
+    names |= {name: f"_{name}" for name in state if name.startswith(("detector.", "descriptor."))}
+    earlier = {f"log_assignment.{index}.matchability.bias": torch.ones(1) for index in range(9)}
+    return {names[name]: tensor for name, tensor in state.items()} | earlier
 
 
 @dataclass(frozen=True)
@@ -74,6 +83,7 @@ FILES = (
         wrapped_aspanformer,
     ),
     PublicFile("DKMv3_outdoor.pth", "dkm", "dkm-outdoor", "dkm", DKM),
+    PublicFile("loma_B128.pth", "loma", "loma-b128", "loma", lambda: Loma(Variant.B128), published_loma),
 )
 
 

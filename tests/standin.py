@@ -58,6 +58,16 @@ STAND_INS = {
             "decoder.conv_refiner.*.out_conv.weight": 2.0,
         },
     ),
+    "loma": StandIn(
+        2.0,
+        {
+            "matcher.posenc.Wr.weight": 3.0,
+            "matcher.transformers.*.Wqkv.weight": 1.4,
+            "matcher.transformers.*.to_qk.weight": 1.4,
+            "matcher.transformers.*.ffn.3.weight": 0.3,
+            "matcher.log_assignment.*.weight": 1.0,
+        },
+    ),
 }
 
 
