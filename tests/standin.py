@@ -51,6 +51,16 @@ STAND_INS = {
         {"backbone.layer3_outconv.weight": 2.0, "loftr_coarse.layers.*.flow_decoder.2.weight": 0.3},
         {"coarse_matching.temperature": 6.0},
     ),
+    "roma": StandIn(
+        1.5,
+        {
+            "dinov2.*.gamma": 10.0,
+            "dinov2.cls_token": 10.0,
+            "dinov2.pos_embed": 40.0,
+            "decoder.embedding_decoder.to_out.weight": 1.0,
+            "decoder.conv_refiner.*.out_conv.weight": 10.0,
+        },
+    ),
     "dkm": StandIn(
         1.5,
         {

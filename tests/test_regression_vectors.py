@@ -6,12 +6,14 @@ wanted, and only while the parity tests pass: it is they that say what the numbe
 """
 
 import sys
+from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import pytest
+import roma_values
 import torch
 from dense import batch_of, computed
 from golden import Stage, assert_stages, print_table
@@ -22,18 +24,18 @@ from torch.nn import functional
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.matchers.networks.aspanformer import AspanFormer, AspanFormerConfig
 from mkpc_kaggle.matchers.networks.assignment import mutual_matches
-from mkpc_kaggle.matchers.networks.dkm import (
-    DKM,
-    DkmConfig,
+from mkpc_kaggle.matchers.networks.dense_sampling import (
     SamplingConfig,
     balancing_weights,
     density,
     draw,
-    network_input,
     weights_of,
 )
+from mkpc_kaggle.matchers.networks.dkm import DKM, DkmConfig
 from mkpc_kaggle.matchers.networks.loftr import Loftr, LoftrConfig
+from mkpc_kaggle.matchers.networks.pixels import network_input
 from mkpc_kaggle.matchers.networks.quadtree import Quadtree, QuadtreeConfig
+from mkpc_kaggle.matchers.networks.roma import RoMa
 from mkpc_kaggle.matchers.networks.superglue import (
     ImageKeypoints,
     SuperGlue,
@@ -45,7 +47,7 @@ from mkpc_kaggle.matchers.networks.superpoint import SuperPoint, SuperPointConfi
 DATA = Path(__file__).with_name("data")
 SAMPLES, STEP = 200, 1_000_003  # a prime, so that samples lie in all channels, rows and columns
 TOLERANCE = 1e-3  # of a stage's largest value; on the slowest and fastest code paths it takes a tenth of it
-EDGES = 3e-3  # instead, for DKM: refiners see a picture's edges where the flow points, which magnifies rounding
+EDGES = 3e-3  # for DKM and RoMa: refiners see a picture's edges where the flow points, which magnifies rounding
 LEEWAY = 20  # of so many keypoints or matches one may be another: a threshold or a tie within rounding
 
 
@@ -189,15 +191,41 @@ def input_of(picture):
     return network_input(batch_of(torch.from_numpy(picture)), picture.shape[:2])
 
 
-def dkm_values(size, fine=None, symmetric=True):
-    """``fine`` versions repeat pixels: interpolation in whole grey levels would round them either way."""
+def shifted_inputs(size, fine=None):
+    """Both images, and both of them larger or None twice.
+
+    ``fine`` versions repeat pixels: interpolation in whole grey levels would round them either way.
+    """
     whole = scene(size[0] + 8, size[1] + 16, channels=3)
     pictures = [whole[: size[0], 16:], whole[8:, : size[1]]]
     images, fine_images = [input_of(picture) for picture in pictures], (None, None)
     if fine is not None:
         rows, columns = (np.arange(many) * few // many for many, few in zip(fine, size, strict=True))
         fine_images = [input_of(picture[rows][:, columns]) for picture in pictures]
-    yield from computed(dkm(symmetric=symmetric), images, fine_images).items()
+    return images, fine_images
+
+
+def dkm_values(size, fine=None, symmetric=True):
+    yield from computed(dkm(symmetric=symmetric), *shifted_inputs(size, fine)).items()
+
+
+# RoMa
+
+
+@cache
+def narrow_roma():
+    return filled(RoMa(roma_values.NARROW), "roma")
+
+
+def roma_stages(size, fine=None, symmetric=True):
+    network = narrow_roma()
+    network.config = replace(network.config, symmetric=symmetric)
+    for name, value in roma_values.computed(network, *shifted_inputs(size, fine)).items():
+        if name == "cls_mode":
+            rows = torch.nonzero(value >= 0)
+            yield name, Found(torch.cat([rows, value.reshape(-1, 1)], dim=1), torch.ones(len(rows), 1))
+        else:
+            yield name, value
 
 
 def dkm_sampling_values():
@@ -254,6 +282,8 @@ CASES = {
     ("dkm", "one pass"): partial(dkm_values, (64, 80)),
     ("dkm", "two passes, one way"): partial(dkm_values, (61, 83), (90, 118), symmetric=False),
     ("dkm", "sampling"): dkm_sampling_values,
+    ("roma", "one pass"): partial(roma_stages, (70, 84)),
+    ("roma", "two passes, one way"): partial(roma_stages, (56, 70), (75, 101), symmetric=False),
 }
 
 
@@ -278,7 +308,7 @@ def stored_values(network, case):
 def stages_of(network, case):
     stored, got = stored_values(network, case), computed_values(network, case)
     assert list(got) == list(stored), "the stages are not those of the file"
-    tolerance = EDGES if network == "dkm" else TOLERANCE
+    tolerance = EDGES if network in ("dkm", "roma") else TOLERANCE
     plain = (name for name in got if not name.endswith((", rows", ", values")))
     yield from (
         Stage(name, got[name], stored[name], tolerance * max(stored[name].abs().max().item(), 1e-6))
