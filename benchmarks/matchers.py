@@ -26,12 +26,15 @@ from torch import Tensor
 from torch.nn import functional
 from torch.utils.flop_counter import FlopCounterMode
 
-from mkpc_kaggle.geometry.coordinates import Size
-from mkpc_kaggle.matchers.contract import Placement, Precision
+from mkpc_kaggle.geometry.coordinates import Box, Size, View
+from mkpc_kaggle.matchers.contract import Picture, Placement, Precision
+from mkpc_kaggle.matchers.loma import Encoded, LomaAdapter, LomaOptions
 from mkpc_kaggle.matchers.networks.aspanformer import AspanFormer
 from mkpc_kaggle.matchers.networks.dense_sampling import SamplingConfig, sample
 from mkpc_kaggle.matchers.networks.dkm import DKM
 from mkpc_kaggle.matchers.networks.loftr import Loftr
+from mkpc_kaggle.matchers.networks.loma import WIDTHS, Loma, Variant
+from mkpc_kaggle.matchers.networks.loma_matcher import LomaKeypoints
 from mkpc_kaggle.matchers.networks.pixels import network_input
 from mkpc_kaggle.matchers.networks.placement import placed
 from mkpc_kaggle.matchers.networks.quadtree import Quadtree
@@ -110,6 +113,37 @@ def dkm(precision: Precision) -> Run:
     return run
 
 
+def loma(variant: Variant, number: int, precision: Precision) -> LomaAdapter:
+    """With random weights, which take neither the time nor the memory of stand-ins."""
+    with torch.device("meta"):
+        network = Loma(variant)
+    network.to_empty(device="cpu")
+    torch.manual_seed(0)
+    for tensor in network.state_dict().values():
+        if tensor.ndim > 1:
+            tensor.normal_(std=(2 / tensor[0].numel()) ** 0.5)
+        else:
+            tensor.fill_(1 if tensor.is_floating_point() else 0)
+    options = LomaOptions(variant, max_keypoints=number)
+    return LomaAdapter(placed(network, Placement(precision=precision)), options, "cpu")
+
+
+def loma_encode(variant: Variant, long_side: int, number: int, precision: Precision) -> Run:
+    matcher = loma(variant, number, precision)
+    size = Size(long_side, long_side * 3 // 4)
+    picture = Picture(photographs(size)[0], View(Box.whole(size), size, size))
+    return lambda: matcher.encode([picture])[0].keypoints.points.shape[1]
+
+
+def loma_match(variant: Variant, number: int, precision: Precision) -> Run:
+    matcher = loma(variant, number, precision)
+    generator = torch.Generator().manual_seed(0)
+    points = torch.rand(1, number, 2, generator=generator) * 2 - 1
+    descriptors = torch.randn(1, number, WIDTHS[variant].descriptor, generator=generator)
+    encoded = Encoded(LomaKeypoints(points, descriptors), VGA)
+    return lambda: len(matcher.match([encoded], [encoded])[0])
+
+
 CASES: dict[str, Callable[[Precision], Run]] = {
     YARDSTICK: kornia_loftr,
     "LoFTR": semi_dense(Loftr, "loftr", VGA),
@@ -119,6 +153,11 @@ CASES: dict[str, Callable[[Precision], Run]] = {
     "QuadTree": semi_dense(Quadtree, "quadtree", VGA),
     "ASpanFormer": semi_dense(AspanFormer, "aspanformer", VGA),
     "DKM 540x720, one pass": dkm,
+    "LoMa-B128 encode 1024": partial(loma_encode, Variant.B128, 1024, 2048),
+    "LoMa-B128 encode 512": partial(loma_encode, Variant.B128, 512, 1024),
+    "LoMa-B encode 1024": partial(loma_encode, Variant.B, 1024, 2048),
+    "LoMa-B128 match 2048": partial(loma_match, Variant.B128, 2048),
+    "LoMa-B128 match 1024": partial(loma_match, Variant.B128, 1024),
 }
 LARGE = Size(1600, 1216)
 LARGE_CASES = {

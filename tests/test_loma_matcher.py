@@ -68,7 +68,8 @@ def test_a_shifted_picture_is_matched_by_its_shift(store: WeightStore) -> None:
     (matches,) = matcher.match([first], [second])
     offsets = matches.points1 - matches.points0
     good = np.abs(offsets - (16, -8)).max(axis=1) < 1.5
-    assert good.sum() >= 5
+    assert good.sum() >= 20
+    assert good.mean() > 0.8
     assert np.abs(np.median(offsets[good], axis=0) - (16, -8)).max() < 0.2
 
 
@@ -146,9 +147,7 @@ def test_checkpoints_that_lack_or_add_something_are_refused(store: WeightStore) 
             loma.load(Holding(good | change), OPTIONS, Placement())
 
 
-def test_weights_in_half_precision_and_of_deeper_training_load(
-    store: WeightStore, network: Loma
-) -> None:
+def test_weights_in_half_precision_and_of_deeper_training_load(store: WeightStore, network: Loma) -> None:
     good = store.load("loma-b128")
     stored = {name: tensor.bfloat16() if name.endswith("Wqkv.weight") else tensor for name, tensor in good.items()}
     deeper = {"transformers.9.self_attn.out_proj.bias": torch.ones(256), "transformers.10.x": torch.ones(1)}
