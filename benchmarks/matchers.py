@@ -26,14 +26,17 @@ from torch import Tensor
 from torch.nn import functional
 from torch.utils.flop_counter import FlopCounterMode
 
-from mkpc_kaggle.geometry.coordinates import Size
-from mkpc_kaggle.matchers.contract import Placement, Precision
+from mkpc_kaggle.geometry.coordinates import Box, Size, View
+from mkpc_kaggle.matchers.contract import Picture, Placement, Precision
+from mkpc_kaggle.matchers.loma import Encoded, LomaAdapter, LomaOptions
 from mkpc_kaggle.matchers.networks.aspanformer import AspanFormer
 from mkpc_kaggle.matchers.networks.dense_sampling import SamplingConfig, sample
 from mkpc_kaggle.matchers.networks.dkm import DKM
 from mkpc_kaggle.matchers.networks.loftr import Loftr
+from mkpc_kaggle.matchers.networks.loma import WIDTHS, Loma, Variant
+from mkpc_kaggle.matchers.networks.loma_matcher import LomaKeypoints
 from mkpc_kaggle.matchers.networks.pixels import network_input
-from mkpc_kaggle.matchers.networks.placement import placed
+from mkpc_kaggle.matchers.networks.placement import Network, placed
 from mkpc_kaggle.matchers.networks.quadtree import Quadtree
 from mkpc_kaggle.matchers.networks.roma import RoMa, RomaFeatures
 from mkpc_kaggle.matchers.networks.superglue import ImageKeypoints, SuperGlue, SuperGlueConfig
@@ -112,12 +115,11 @@ def dkm(precision: Precision) -> Run:
     return run
 
 
-@cache
-def random_roma(precision: Precision) -> RoMa:
-    """With weights that keep activations of order 1; the stand-ins take a minute for so many."""
+def with_random_weights(make: Callable[[], Network], precision: Precision) -> Network:
+    """With weights that keep activations of order 1, for networks whose stand-ins take much time and memory."""
     with torch.device("meta"):
-        network = RoMa()
-    network = network.to_empty(device="cpu")
+        network = make()
+    network.to_empty(device="cpu")
     generator = torch.Generator().manual_seed(0)
     for name, tensor in network.state_dict().items():
         if tensor.ndim > 1:
@@ -129,7 +131,7 @@ def random_roma(precision: Precision) -> RoMa:
 
 def roma(passes: int, cached: bool, precision: Precision) -> Run:
     """At the published sizes, both ways, with the encodings' time or without."""
-    network = random_roma(precision)
+    network = with_random_weights(RoMa, precision)
     pictures = [torch.from_numpy(view).permute(2, 0, 1)[None] for view in photographs(ROMA_SIZES[-1])]
 
     def encoded() -> list[RomaFeatures]:
@@ -147,6 +149,27 @@ def roma(passes: int, cached: bool, precision: Precision) -> Run:
     return run
 
 
+def loma(variant: Variant, number: int, precision: Precision) -> LomaAdapter:
+    network = with_random_weights(partial(Loma, variant), precision)
+    return LomaAdapter(network, LomaOptions(variant, max_keypoints=number), "cpu")
+
+
+def loma_encode(variant: Variant, long_side: int, number: int, precision: Precision) -> Run:
+    matcher = loma(variant, number, precision)
+    size = Size(long_side, long_side * 3 // 4)
+    picture = Picture(photographs(size)[0], View(Box.whole(size), size, size))
+    return lambda: matcher.encode([picture])[0].keypoints.points.shape[1]
+
+
+def loma_match(variant: Variant, number: int, precision: Precision) -> Run:
+    matcher = loma(variant, number, precision)
+    generator = torch.Generator().manual_seed(0)
+    points = torch.rand(1, number, 2, generator=generator) * 2 - 1
+    descriptors = torch.randn(1, number, WIDTHS[variant].descriptor, generator=generator)
+    encoded = Encoded(LomaKeypoints(points, descriptors), VGA)
+    return lambda: len(matcher.match([encoded], [encoded])[0])
+
+
 CASES: dict[str, Callable[[Precision], Run]] = {
     YARDSTICK: kornia_loftr,
     "LoFTR": semi_dense(Loftr, "loftr", VGA),
@@ -160,6 +183,11 @@ CASES: dict[str, Callable[[Precision], Run]] = {
     "RoMa 560, encodings cached": partial(roma, 1, True),
     "RoMa 560 + 864": partial(roma, 2, False),
     "RoMa 560 + 864, encodings cached": partial(roma, 2, True),
+    "LoMa-B128 encode 1024": partial(loma_encode, Variant.B128, 1024, 2048),
+    "LoMa-B128 encode 512": partial(loma_encode, Variant.B128, 512, 1024),
+    "LoMa-B encode 1024": partial(loma_encode, Variant.B, 1024, 2048),
+    "LoMa-B128 match 2048": partial(loma_match, Variant.B128, 2048),
+    "LoMa-B128 match 1024": partial(loma_match, Variant.B128, 1024),
 }
 LARGE = Size(1600, 1216)
 LARGE_CASES = {

@@ -42,10 +42,26 @@ def detector_values(detector, images, number):
     }
 
 
+def features_of(encoder, images):
+    """The encoder's values, those of its vision transformer included if it has one, and its levels."""
+    if not hasattr(encoder, "frozen_dinov2"):
+        levels = encoder(images)
+        return encoded(levels, (1, 2, 4, 8)), levels
+    last = len(encoder.frozen_dinov2["dinov2_vitl14"].blocks)
+    blocks = {
+        number: f"frozen_dinov2.dinov2_vitl14.blocks.{number - 1}" for number in (1, 2, 12, 24) if number <= last
+    }
+    with recorded(encoder, blocks.values()) as calls:
+        levels = encoder(images)
+    values = {"vit_tokens": calls[blocks[1]][0][0][0]}
+    values |= {f"vit_block{number}": calls[block][0][1] for number, block in blocks.items()}
+    return values | encoded(levels, (1, 2, 4, 8, 14)), levels
+
+
 @torch.inference_mode()
 def descriptor_values(descriptor, images, points):
-    levels = descriptor.encoder(images)
-    values = encoded(levels, (1, 2, 4, 8, 14)[: len(levels)]) | refined(descriptor.decoder, levels)
+    values, levels = features_of(descriptor.encoder, images)
+    values |= refined(descriptor.decoder, levels)
     height, width = images.shape[2:]
     rows, columns = ((2 * torch.arange(side) + 1) / side - 1 for side in (height, width))
     pixels = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), dim=2).view(1, -1, 2)

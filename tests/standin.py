@@ -68,6 +68,17 @@ STAND_INS = {
             "decoder.conv_refiner.*.out_conv.weight": 2.0,
         },
     ),
+    "loma": StandIn(
+        2.0,
+        {
+            # What coarse features say is not of one place, so that shifted pictures would have little in common.
+            "*decoder.layers.[48].out_conv.*": 0.05,
+            "matcher.posenc.Wr.weight": 3.0,
+            "matcher.transformers.*.Wqkv.weight": 1.4,
+            "matcher.transformers.*.to_qk.weight": 1.4,
+            "matcher.transformers.*.ffn.3.weight": 0.1,
+        },
+    ),
 }
 
 

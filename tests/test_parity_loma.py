@@ -18,7 +18,8 @@ from semi_dense import tolerance_of
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.matchers.contract import Placement
 from mkpc_kaggle.matchers.networks.dad import Dad, select_keypoints
-from mkpc_kaggle.matchers.networks.dedode import dedode_b
+from mkpc_kaggle.matchers.networks.dedode import dedode_b, dedode_g
+from mkpc_kaggle.matchers.networks.dinov2 import DinoV2, DinoV2Config
 from mkpc_kaggle.matchers.networks.loma import UNUSED, Loma, Variant, detector_size, parameter_name
 from mkpc_kaggle.matchers.networks.loma_matcher import LomaKeypoints, LomaMatcher
 from mkpc_kaggle.matchers.networks.pixels import resized
@@ -56,8 +57,9 @@ def detector():
 
 
 @cache
-def descriptor():
-    return filled(dedode_b(128), standin_state("loma", "B128", "_descriptor."), "descriptor.")
+def descriptor(variant):
+    network = {"B128": partial(dedode_b, 128), "B": partial(dedode_g, 256)}[variant]()
+    return filled(network, standin_state("loma", variant, "_descriptor."), "descriptor.")
 
 
 @cache
@@ -159,10 +161,22 @@ def resize_stages():
         yield Stage(f"{width} x {height}", torch.tensor(got), torch.tensor(expected))
 
 
-def descriptor_b128_stages():
-    golden = golden_arrays("loma", "descriptor_b128_157x203")
-    values = descriptor_values(descriptor(), image_of(golden["image"]), golden["keypoints"][None])
+def descriptor_stages(variant, case):
+    golden = golden_arrays("loma", f"descriptor_{case}")
+    values = descriptor_values(descriptor(variant), image_of(golden["image"]), golden["keypoints"][None])
+    for name in values:
+        if name.startswith("vit"):
+            values[name] = values[name][..., ::32]
     yield from exhausted(compared(values, golden, DESCRIPTOR, DESCRIPTOR_STEPS), golden, "keypoints")
+
+
+def position_stages():
+    prefix = "_descriptor.encoder.frozen_dinov2.dinov2_vitl14."
+    network = DinoV2(DinoV2Config(blocks=0))
+    network.pos_embed.copy_(standin_state("loma", "B", f"{prefix}pos_embed")[f"{prefix}pos_embed"])
+    for name, expected in golden_arrays("loma", "vit_positions").items():
+        height, width = map(int, name.removeprefix("pos_").split("x"))
+        yield Stage(name, network.positions(height, width)[0, :, ::128], expected, 3e-5)
 
 
 INPUTS = ("keypoints0", "keypoints1", "descriptors0", "descriptors1", "thresholds")
@@ -190,16 +204,17 @@ def matcher_stages(case):
 def pipeline_stages(case, network):
     """From picture to matched points; at the published settings keypoints are compared as sets, all but one."""
     golden = golden_arrays("loma", case)
+    images = golden if "image0" in golden else golden_arrays("loma", "pipeline_b128")
     side, number = int(golden["descriptor_side"]), int(golden["num_keypoints"])
     as_sets = case.startswith("default")
     found = []
     for index in (0, 1):
-        pixels = golden[f"image{index}"]
+        pixels = images[f"image{index}"]
         size = detector_size(Size(pixels.shape[1], pixels.shape[0]), int(golden["detector_size"]))
         assert (1, 3, size.height, size.width) == tuple(golden[f"detector_input_shape{index}"].tolist())
-        images = [image_of(resized_by_pil(pixels, shape)) for shape in (size[::-1], (side, side))]
-        keypoints = network.encode(*images, number)
-        (detected,) = network.detector(images[0], number)
+        seen = [image_of(resized_by_pil(pixels, shape)) for shape in (size[::-1], (side, side))]
+        keypoints = network.encode(*seen, number)
+        (detected,) = network.detector(seen[0], number)
         found.append(keypoints)
         mine = {"keypoints": keypoints.points[0], "keypoint_probs": detected.scores}
         mine["descriptors"] = keypoints.descriptors[0][:, ::32] if as_sets else keypoints.descriptors[0]
@@ -225,7 +240,7 @@ def pipeline_stages(case, network):
     both = index0, matches.matches0[0, index0]
     points = []
     for index, of in enumerate(both):
-        pixels = golden[f"image{index}"]
+        pixels = images[f"image{index}"]
         points.append((found[index].points[0, of] + 1) / 2 * torch.tensor([pixels.shape[1], pixels.shape[0]]))
     mine, theirs = torch.cat(points, dim=1), torch.cat([golden["points0"], golden["points1"]], dim=1)
     if as_sets:
@@ -242,13 +257,18 @@ def whole(variant):
 
 
 CASES = {f"detector_{case}": partial(detector_stages, case) for case in ("160x208", "157x203", "batch2_72x96")}
-CASES |= {"sampling": sampling_stages, "resize": resize_stages, "descriptor_b128": descriptor_b128_stages}
+CASES |= {"sampling": sampling_stages, "resize": resize_stages, "vit_positions": position_stages}
+CASES["descriptor_b128"] = partial(descriptor_stages, "B128", "b128_157x203")
 CASES |= {
     f"matcher_{case}": partial(matcher_stages, case)
     for case in ("b_60x47", "b128_33x71", "l_24x18", "g_14x11", "b_batch2_20x26", "b_1x3", "b_1x1")
 }
 CASES["pipeline_b128"] = lambda: pipeline_stages("pipeline_b128", whole(Variant.B128))
-SLOW = {"default_b128": lambda: pipeline_stages("default_b128", whole(Variant.B128))}
+SLOW = {
+    "descriptor_g": partial(descriptor_stages, "B", "g_168x210"),
+    "pipeline_b": lambda: pipeline_stages("pipeline_b", whole(Variant.B)),
+    "default_b128": lambda: pipeline_stages("default_b128", whole(Variant.B128)),
+}
 
 
 @needs_golden

@@ -17,13 +17,16 @@ import roma_values
 import torch
 from dense import batch_of, computed
 from golden import Stage, assert_stages, print_table
+from loma_values import descriptor_values, detector_values, matcher_values
 from semi_dense import traced
 from standin import filled, scene, uniform
 from torch.nn import functional
 
 from mkpc_kaggle.geometry.coordinates import Size
+from mkpc_kaggle.matchers.contract import Placement
 from mkpc_kaggle.matchers.networks.aspanformer import AspanFormer, AspanFormerConfig
 from mkpc_kaggle.matchers.networks.assignment import mutual_matches
+from mkpc_kaggle.matchers.networks.dedode import dedode_g
 from mkpc_kaggle.matchers.networks.dense_sampling import (
     SamplingConfig,
     balancing_weights,
@@ -31,9 +34,13 @@ from mkpc_kaggle.matchers.networks.dense_sampling import (
     draw,
     weights_of,
 )
+from mkpc_kaggle.matchers.networks.dinov2 import DinoV2Config
 from mkpc_kaggle.matchers.networks.dkm import DKM, DkmConfig
 from mkpc_kaggle.matchers.networks.loftr import Loftr, LoftrConfig
+from mkpc_kaggle.matchers.networks.loma import Loma, Variant
+from mkpc_kaggle.matchers.networks.loma_matcher import LomaKeypoints
 from mkpc_kaggle.matchers.networks.pixels import network_input
+from mkpc_kaggle.matchers.networks.placement import placed
 from mkpc_kaggle.matchers.networks.quadtree import Quadtree, QuadtreeConfig
 from mkpc_kaggle.matchers.networks.roma import RoMa
 from mkpc_kaggle.matchers.networks.superglue import (
@@ -245,9 +252,61 @@ def dkm_sampling_values():
     yield "samples", Found(samples[:, None], evenness[samples, None])
 
 
+# LoMa
+
+
+@cache
+def loma():
+    return placed(filled(Loma(Variant.B128), "loma"), Placement())
+
+
+def rgb_of(height, width):
+    return torch.from_numpy(scene(height, width, channels=3)).permute(2, 0, 1)[None].float() / 255
+
+
+def detector_stages(size):
+    values = detector_values(loma().detector, rgb_of(*size), 100)
+    points, scores = values.pop("keypoints")[0], values.pop("keypoint_probs")[0]
+    yield from values.items()
+    pixels = ((points + 1) * torch.tensor([size[1], size[0]]) / 2).floor()
+    offsets = (points + 1) * torch.tensor([size[1], size[0]]) / 2 - pixels
+    yield "keypoints", Found(pixels, torch.cat([offsets, scores[:, None]], dim=1))
+
+
+def descriptor_stages(size, vit=None):
+    descriptor = loma().descriptor
+    if vit is not None:
+        descriptor = placed(filled(dedode_g(32, vit), "loma"), Placement())
+    points = torch.from_numpy(1.05 * uniform("points", (1, 60, 2))).float()
+    yield from descriptor_values(descriptor, rgb_of(*size), points).items()
+
+
+def loma_matcher_stages(counts, batch=1):
+    numbers = [torch.from_numpy(uniform(f"points {i}", (batch, n, 2))).float() for i, n in enumerate(counts)]
+    described = torch.from_numpy(2 * uniform("descriptors", (batch, sum(counts), 128))).float()
+    first, second = described.split(counts, dim=1)
+    common = min(counts) // 2
+    second[:, :common] = first[:, :common] + 0.3 * second[:, :common]
+    values = matcher_values(
+        loma().matcher, *map(LomaKeypoints, numbers, (first, second.contiguous())), threshold=0.0
+    )
+    matches, scores = values.pop("matches0"), values.pop("matching_scores0")
+    for name in ("matches1", "matching_scores1"):
+        del values[name]
+    yield from values.items()
+    batches, index0 = torch.nonzero(matches >= 0, as_tuple=True)
+    rows = torch.stack([batches, index0, matches[batches, index0]], dim=1)
+    yield "matches", Found(rows, scores[batches, index0, None])
+
+
 SAME, DIFFERENT = ((96, 128), (96, 128)), ((96, 128), (128, 64))
 SMALL, SMALL_DIFFERENT = ((64, 96), (64, 96)), ((64, 96), (96, 64))
 CASES = {
+    ("loma", "detector"): partial(detector_stages, (61, 83)),
+    ("loma", "descriptor"): partial(descriptor_stages, (61, 83)),
+    ("loma", "descriptor with a vision transformer"): partial(descriptor_stages, (56, 70), DinoV2Config(blocks=1)),
+    ("loma", "matcher"): partial(loma_matcher_stages, (60, 47)),
+    ("loma", "matcher, batch"): partial(loma_matcher_stages, (9, 31), batch=2),
     ("superpoint", "default"): partial(superpoint_values, (96, 128)),
     ("superpoint", "outdoor, odd size"): partial(superpoint_values, (75, 101), nms_radius=3, max_keypoints=60),
     ("superpoint", "batch"): partial(superpoint_values, (64, 72), batch=2, remove_borders=0),

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mkpc_kaggle.matchers.networks.dedode_decoder import Decoder
+from mkpc_kaggle.matchers.networks.dinov2 import DinoV2, DinoV2Config
 from mkpc_kaggle.matchers.networks.vgg import VGG19, Vgg
 
 BLOCKS = 5
@@ -63,5 +64,24 @@ def read_enlarged(x: Tensor, pixels: Tensor, shares: Tensor, size: torch.Size) -
     return (read * shares[:, None]).sum(dim=3).mT
 
 
+class VggAndVit(nn.Module):
+    """DINOv2's features besides VGG's; sides must be multiples of 14."""
+
+    def __init__(self, vit: DinoV2Config | None) -> None:
+        super().__init__()
+        self.vgg = Vgg(VGG19)
+        self.frozen_dinov2 = nn.ModuleDict({"dinov2_vitl14": DinoV2(vit)})
+
+    def forward(self, image: Tensor) -> list[Tensor]:
+        # First what needs most memory on the way.
+        coarsest = self.frozen_dinov2["dinov2_vitl14"](image)
+        return [*self.vgg(image), coarsest]
+
+
 def dedode_b(channels: int) -> Dedode:
     return Dedode(Vgg(VGG19), (8, 4, 2, 1), channels)
+
+
+def dedode_g(channels: int, vit: DinoV2Config | None = None) -> Dedode:
+    """``vit`` of ViT-L/14 unless given."""
+    return Dedode(VggAndVit(vit), (14, 8, 4, 2, 1), channels)

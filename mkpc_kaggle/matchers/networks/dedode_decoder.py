@@ -52,7 +52,7 @@ class Refiner(nn.Module):
         """(B, hidden, h, w) from features (B, C, h, w) and the coarser stride's context (B, C', h', w')."""
         entry, norm, relu, mix = self.block1
         weight, bias = entry.get_parameter("weight"), entry.get_parameter("bias")
-        x = functional.conv2d(features, weight[:, : self.features], bias)
+        x = functional.conv2d(features.to(weight.dtype), weight[:, : self.features], bias)
         if context is not None:
             # A 1x1 convolution of the enlarged context is the enlarged one of the context.
             part = functional.conv2d(context.to(weight.dtype), weight[:, self.features :])

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.matchers.networks.dad import Dad
-from mkpc_kaggle.matchers.networks.dedode import Dedode, dedode_b
+from mkpc_kaggle.matchers.networks.dedode import dedode_b, dedode_g
 from mkpc_kaggle.matchers.networks.loma_matcher import LAYERS, LomaKeypoints, LomaMatcher
 
 
@@ -51,7 +51,8 @@ class Loma(nn.Module):
         super().__init__()
         widths = WIDTHS[variant]
         self.detector = Dad()
-        self.descriptor = descriptor_of(variant, widths.descriptor)
+        describe = dedode_b if variant is Variant.B128 else dedode_g
+        self.descriptor = describe(widths.descriptor)
         self.matcher = LomaMatcher(widths.descriptor, widths.matcher)
         self.eval().requires_grad_(False)
 
@@ -63,12 +64,6 @@ class Loma(nn.Module):
         (found,) = self.detector(detected, number)
         points = found.points[None]
         return LomaKeypoints(points, self.descriptor(described, points))
-
-
-def descriptor_of(variant: Variant, channels: int) -> Dedode:
-    if variant is not Variant.B128:
-        raise NotImplementedError
-    return dedode_b(channels)
 
 
 def parameter_name(published: str) -> str:
