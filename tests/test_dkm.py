@@ -10,22 +10,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.nn import functional
 
-from mkpc_kaggle.matchers.networks.dkm import (
-    DKM,
-    DkmConfig,
+from mkpc_kaggle.matchers.networks.dense_sampling import (
     SamplingConfig,
     Weighting,
     balancing_weights,
-    dense_warp,
     density,
-    network_input,
     sample,
-    side_by_side,
-    swapped,
 )
-from mkpc_kaggle.matchers.networks.dkm_coarse import posterior_mean
-from mkpc_kaggle.matchers.networks.dkm_refiner import Estimate, identity_map, local_correlation, refined
+from mkpc_kaggle.matchers.networks.dense_warp import dense_warp, side_by_side, swapped
+from mkpc_kaggle.matchers.networks.dkm import DKM, DkmConfig
+from mkpc_kaggle.matchers.networks.gaussian_process import coefficients, kernel
+from mkpc_kaggle.matchers.networks.pixels import network_input
 from mkpc_kaggle.matchers.networks.resnet50 import ResNet50
+from mkpc_kaggle.matchers.networks.warp_refiner import Estimate, identity_map, local_correlation, refined
 
 
 @cache
@@ -217,7 +214,7 @@ def test_the_posterior_is_that_of_the_textbook():
 
     inverse = torch.linalg.inv(k(y, y) + 0.1 * torch.eye(11))
     expected = k(x, y) @ inverse @ values.double()
-    torch.testing.assert_close(posterior_mean(x, y, values).double(), expected, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close((kernel(x, y) @ coefficients(y, values)).double(), expected, rtol=1e-4, atol=1e-5)
 
 
 def test_a_unit_of_correction_is_an_eighth_of_a_pixel_of_its_stride():

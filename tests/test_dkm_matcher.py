@@ -12,10 +12,12 @@ from mkpc_kaggle.geometry.coordinates import Box, Size, View
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers import dkm
 from mkpc_kaggle.matchers.contract import Picture, Placement, Training, encoding_bytes
+from mkpc_kaggle.matchers.dense import Encoded
 from mkpc_kaggle.matchers.dkm import DkmMatcher, DkmOptions
-from mkpc_kaggle.matchers.networks.dkm import DKM, DenseWarp, DkmFeatures
-from mkpc_kaggle.matchers.networks.dkm_refiner import identity_map
+from mkpc_kaggle.matchers.networks.dense_warp import DenseWarp
+from mkpc_kaggle.matchers.networks.dkm import DKM, DkmFeatures
 from mkpc_kaggle.matchers.networks.grids import as_grid
+from mkpc_kaggle.matchers.networks.warp_refiner import identity_map
 from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher
 from mkpc_kaggle.recipe import Recipe, Unit
 from mkpc_kaggle.weights import UNVERIFIED, WeightFile, WeightStore
@@ -101,10 +103,10 @@ def test_which_matches_are_drawn_depends_on_both_pictures(matcher: DkmMatcher) -
     """Features of one pair, digests of others: the same warp is drawn from in other ways."""
     first, second = matcher.encode([picture(40, 56, seed) for seed in (0, 1)])
     drawn = [
-        matcher.match([dkm.Encoded(first.features, first.content, digest0)], [second])[0]
+        matcher.match([Encoded(first.features, first.content, digest0)], [second])[0]
         for digest0 in (first.digest, first.digest, 7)
     ]
-    drawn += matcher.match([first], [dkm.Encoded(second.features, second.content, 7)])
+    drawn += matcher.match([first], [Encoded(second.features, second.content, 7)])
     assert [same(drawn[0], other) for other in drawn] == [True, True, False, False]
 
 
@@ -142,7 +144,7 @@ class Given:
     def to(self, device: str) -> "Given":
         return self
 
-    def encode(self, image: torch.Tensor) -> DkmFeatures:
+    def encode(self, image: torch.Tensor, fine: torch.Tensor | None = None) -> DkmFeatures:
         return None  # type: ignore[return-value]
 
     def match(self, first: DkmFeatures, second: DkmFeatures) -> tuple[DenseWarp, ...]:

@@ -13,16 +13,15 @@ from dense import MODES, batch_of, computed, grey_levels, resized_by_pil
 from golden import GOLDEN, Stage, assert_stages, golden_arrays, needs_golden, print_table, ready, seeded_tensor
 
 from mkpc_kaggle.geometry.coordinates import Size, from_normalised
-from mkpc_kaggle.matchers.networks.dkm import (
-    DKM,
-    DkmConfig,
+from mkpc_kaggle.matchers.networks.dense_sampling import (
     SamplingConfig,
     balancing_weights,
     density,
     draw,
-    network_input,
     sample,
 )
+from mkpc_kaggle.matchers.networks.dkm import DKM, DkmConfig
+from mkpc_kaggle.matchers.networks.pixels import network_input
 
 
 @cache

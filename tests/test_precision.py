@@ -12,8 +12,9 @@ from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.matchers.contract import Placement, Precision
 from mkpc_kaggle.matchers.networks.aspanformer import AspanFormer
-from mkpc_kaggle.matchers.networks.dkm import DKM, network_input
+from mkpc_kaggle.matchers.networks.dkm import DKM
 from mkpc_kaggle.matchers.networks.loftr import Loftr
+from mkpc_kaggle.matchers.networks.pixels import network_input
 from mkpc_kaggle.matchers.networks.placement import placed
 from mkpc_kaggle.matchers.networks.quadtree import Quadtree
 from mkpc_kaggle.matchers.networks.superglue import ImageKeypoints, SuperGlue, SuperGlueConfig

@@ -8,7 +8,9 @@ images come back in many pairs. ``match`` does the rest.
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from enum import StrEnum
-from typing import Any, Protocol, TypeVar
+from itertools import product
+from string import Formatter
+from typing import Any, Protocol, TypeVar, get_type_hints
 
 from mkpc_kaggle.geometry.coordinates import Pixels, Size, View
 from mkpc_kaggle.geometry.matches import Matches
@@ -85,9 +87,14 @@ class MatcherSpec:
 
     @property
     def every_slot(self) -> tuple[str, ...]:
-        """The slots of all trainings."""
-        slots = (slot.format_map({"training": training}) for training in Training for slot in self.slots)
-        return tuple(dict.fromkeys(slots))
+        """The slots of all trainings and variants: of every choice that the options name."""
+        kinds = get_type_hints(self.options)
+        found: list[str] = []
+        for slot in self.slots:
+            names = [name for _, name, _, _ in Formatter().parse(slot) if name]
+            for choice in product(*(kinds[name] for name in names)):
+                found.append(slot.format_map(dict(zip(names, choice, strict=True))))
+        return tuple(dict.fromkeys(found))
 
 
 @dataclass(frozen=True, eq=False)

@@ -49,7 +49,8 @@ def load_into(
 ) -> None:
     """Load a checkpoint into a network: every name and every shape must agree.
 
-    Only entries whose names match the pattern ``unused`` may be missing or surplus. Raises
+    Only entries whose names match the pattern ``unused`` may be missing or surplus. A network made on the device
+    "meta" takes over the tensors themselves, so that a large one is not in memory twice. Raises
     :class:`UserError` naming some of those that do not fit.
     """
     own = network.state_dict()
@@ -57,7 +58,8 @@ def load_into(
     odd += [name for name in own.keys() & tensors.keys() if own[name].shape != tensors[name].shape]
     if odd:
         raise UserError(f"the weights for {what!r} do not fit the network: {', '.join(sorted(odd)[:5])}")
-    network.load_state_dict({**own, **{name: tensor for name, tensor in tensors.items() if name in own}})
+    fitting = {name: tensor.to(own[name].dtype) for name, tensor in tensors.items() if name in own}
+    network.load_state_dict({**own, **fitting}, assign=any(tensor.is_meta for tensor in own.values()))
 
 
 def _load_table(path: Path) -> Mapping[Any, Any]:

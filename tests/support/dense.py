@@ -1,4 +1,4 @@
-"""What tests of DKM share: all intermediate values of a match, and pictures as the network wants them."""
+"""What tests of DKM and RoMa share: all intermediate values of a match, and pictures as the network wants them."""
 
 from contextlib import contextmanager
 
@@ -7,9 +7,11 @@ import pytest
 import torch
 from golden import recorded
 
-from mkpc_kaggle.matchers.networks.dkm import MEAN, STD, Weighting, side_by_side
-from mkpc_kaggle.matchers.networks.dkm_coarse import kernel
-from mkpc_kaggle.matchers.networks.dkm_refiner import local_correlation
+from mkpc_kaggle.matchers.networks.dense_sampling import Weighting
+from mkpc_kaggle.matchers.networks.dense_warp import side_by_side
+from mkpc_kaggle.matchers.networks.gaussian_process import kernel
+from mkpc_kaggle.matchers.networks.pixels import MEAN, STD
+from mkpc_kaggle.matchers.networks.warp_refiner import local_correlation
 
 MODES = {  # of sampling, by the golden files' names
     "threshold": (Weighting.THRESHOLD, False),
@@ -48,7 +50,8 @@ def recorded_refinement(decoder):
         return estimates[f"estimate.{stride}"][-1]
 
     decoder.correct = recording
-    names = ["gps.32", "gps.16", "embedding_decoder", *(f"conv_refiner.{stride}" for stride in strides)]
+    names = [f"gps.{stride}" for stride in decoder.gps]
+    names += ["embedding_decoder", *(f"conv_refiner.{stride}" for stride in strides)]
     try:
         with recorded(decoder, names) as calls:
             yield calls | estimates
@@ -86,8 +89,8 @@ def coarse_values(decoder, calls):
     """Projections, kernels, posteriors and first estimates at strides 32 and 16."""
     values = {}
     for s in (32, 16):
-        query, support = _joined(got for got, _ in calls[f"gps.{s}"])
-        flow, certainty, context = _joined(
+        query, support = joined(got for got, _ in calls[f"gps.{s}"])
+        flow, certainty, context = joined(
             (e.flow, e.certainty, z) for (at, *_), (e, z) in calls["embedding_decoder"] if at == s
         )
         x, y = query.flatten(2).mT, support.flatten(2).mT
@@ -101,8 +104,11 @@ def coarse_values(decoder, calls):
     return values
 
 
-def refiner_values(decoder, calls, number, passes):
-    """Correlations, corrections and estimates of one of the passes; the second has no stride 16."""
+def refiner_values(decoder, calls, number, passes, certainty=0):
+    """Correlations, corrections and estimates of one of the passes; the second has no stride 16.
+
+    ``certainty``: its channel in the corrections.
+    """
     values = {}
     for s, refiner in decoder.conv_refiner.items():
         if number and s == "16":
@@ -110,16 +116,16 @@ def refiner_values(decoder, calls, number, passes):
         every = 1 if s == "16" else passes
         calls_of_pass = calls[f"conv_refiner.{s}"][number::every]
         if refiner.radius is not None:
-            seen = [local_correlation(*got, refiner.radius) for got, _ in calls_of_pass]
+            seen = [local_correlation(*got[:3], refiner.radius) for got, _ in calls_of_pass]
             values[f"corr_r{refiner.radius}"] = torch.cat(seen)
-        corrections = torch.cat([gave for _, gave in calls_of_pass])
-        flow, certainty = _joined((e.flow, e.certainty) for e in calls[f"estimate.{s}"][number::every])
+        corrections = torch.cat([gave for _, gave in calls_of_pass]).roll(-certainty, dims=1)
+        flow, logits = joined((e.flow, e.certainty) for e in calls[f"estimate.{s}"][number::every])
         values |= {f"ref{s}_dcert": corrections[:, :1], f"ref{s}_disp": corrections[:, 1:]}
-        values |= {f"flow{s}": flow, f"cert{s}": certainty}
+        values |= {f"flow{s}": flow, f"cert{s}": logits}
     return values
 
 
-def _joined(calls):
+def joined(calls):
     return [torch.cat(parts) for parts in zip(*calls, strict=True)]
 
 

@@ -28,10 +28,13 @@ def golden_arrays(network, case):
     }
 
 
-def standin_state(network):
-    """The stand-in checkpoint that the folder's ``standin.py`` makes, as tensors."""
+def standin_state(network, *which, **part):
+    """The stand-in checkpoint that the folder's ``standin.py`` makes, or that part of it, as tensors."""
     recipe = _module(GOLDEN / network / "standin.py")
-    return {name: torch.from_numpy(np.asarray(value)) for name, value in recipe.standin_state_dict().items()}
+    return {
+        name: torch.from_numpy(np.asarray(value))
+        for name, value in recipe.standin_state_dict(*which, **part).items()
+    }
 
 
 def seeded_tensor(name, shape, gain=1.0):

@@ -57,11 +57,32 @@ STAND_INS = {
         1.0,
         {"input_proj.weight": 16.0, "transformers.*.ffn.3.*": 0.1, "log_assignment.*.final_proj.weight": 4.0},
     ),
+    "roma": StandIn(
+        1.5,
+        {
+            "dinov2.*.gamma": 10.0,
+            "dinov2.cls_token": 10.0,
+            "dinov2.pos_embed": 40.0,
+            "decoder.embedding_decoder.to_out.weight": 1.0,
+            "decoder.conv_refiner.*.out_conv.weight": 10.0,
+        },
+    ),
     "dkm": StandIn(
         1.5,
         {
             "decoder.embedding_decoder.terminal_module.*.weight": 2.0,
             "decoder.conv_refiner.*.out_conv.weight": 2.0,
+        },
+    ),
+    "loma": StandIn(
+        2.0,
+        {
+            # What coarse features say is not of one place, so that shifted pictures would have little in common.
+            "*decoder.layers.[48].out_conv.*": 0.05,
+            "matcher.posenc.Wr.weight": 3.0,
+            "matcher.transformers.*.Wqkv.weight": 1.4,
+            "matcher.transformers.*.to_qk.weight": 1.4,
+            "matcher.transformers.*.ffn.3.weight": 0.1,
         },
     ),
 }

@@ -2,37 +2,22 @@
 
 Two views of a pair are compared whole; every pixel of each gets a place in the other, and a certainty. The views
 may have any sizes; the published code wants one size of both. Pixels of windows and corrections are the query's.
-Coordinates are normalised: (x, y) in [-1, 1], where +-1 are the outer edges of an image (see dkm_refiner).
+Coordinates are normalised: (x, y) in [-1, 1], where +-1 are the outer edges of an image (see warp_refiner).
 Parameter names are those of the public checkpoints. For inference only.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import StrEnum
 
 import torch
-from torch import Generator, Tensor, nn
-from torch.nn import functional
+from torch import Tensor, nn
 
-from mkpc_kaggle.matchers.networks.dkm_coarse import FEATURES, STRIDES, WIDTH, EmbeddingDecoder, GaussianProcess
-from mkpc_kaggle.matchers.networks.dkm_refiner import (
-    SHAPES,
-    Estimate,
-    Refiner,
-    identity_map,
-    refined,
-    resize,
-)
-from mkpc_kaggle.matchers.networks.grids import as_grid
+from mkpc_kaggle.matchers.networks.dense_warp import DenseWarp, Pyramid, warps_of
+from mkpc_kaggle.matchers.networks.dkm_coarse import FEATURES, POSTERIOR, STRIDES, WIDTH, EmbeddingDecoder
+from mkpc_kaggle.matchers.networks.gaussian_process import GaussianProcess
 from mkpc_kaggle.matchers.networks.resnet50 import ResNet50
+from mkpc_kaggle.matchers.networks.warp_refiner import SHAPES, Estimate, Refiner, refined, resize
 
-MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 FINE_COARSEST = 8  # the coarsest stride that the second pass looks at
-OVERSAMPLING = 4  # before matches are balanced
-BANDWIDTH = 0.1  # of the density's kernel, in normalised coordinates
-MIN_DENSITY, LAST_RESORT = 10, 1e-7  # isolated matches are drawn only when no others are left
-BLOCK_FLOATS = 2**20
-LEAST_EXPONENT = -80  # e to less is denormal, which takes a processor ten times as long and adds nothing
 
 
 @dataclass(frozen=True)
@@ -43,45 +28,11 @@ class DkmConfig:
 
 
 @dataclass(frozen=True, eq=False)
-class Pyramid:
-    """Of B images, (B, C, h, w) each, in the network's precision: at strides 1, 2, 4, 8 and maybe 16 and 32."""
-
-    levels: tuple[Tensor, ...]
-
-    def at(self, stride: int) -> Tensor:
-        return self.levels[stride.bit_length() - 1]
-
-
-@dataclass(frozen=True, eq=False)
 class DkmFeatures:
     """What one image alone yields: for the first pass and, from a larger version of it, for the second."""
 
     coarse: Pyramid
     fine: Pyramid | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class DenseWarp:
-    """Of B pairs, float32: ``warp`` (B, H, W, 4), (x, y) in the first image and (x, y) in the second, in [-1, 1];
-    ``certainty`` (B, H, W) in [0, 1], 0 where the target is outside. The grid is that of one of the images.
-    """
-
-    warp: Tensor
-    certainty: Tensor
-
-
-def network_input(pixels: Tensor, size: tuple[int, int]) -> Tensor:
-    """RGB images (B, 3, H, W) uint8 on the CPU -> (B, 3, *size) float32, resized and normalised.
-
-    Bicubic with antialiasing in 8 bits, the width first, as by Pillow up to version 12, with which the network was
-    trained: less than a hundredth of the values differ, by a grey level or two. Pillow 13 begins with the height
-    where it shrinks and the width grows; there a fifth of the values differ or more. The second pass needs the
-    image itself resized anew.
-    """
-    if pixels.shape[2:] != size:
-        pixels = functional.interpolate(pixels, size, mode="bicubic", antialias=True, align_corners=False)
-    mean, std = (torch.tensor(values)[:, None, None] for values in (MEAN, STD))
-    return pixels.float().div_(255).sub_(mean).div_(std)
 
 
 class DKM(nn.Module):
@@ -97,7 +48,7 @@ class DKM(nn.Module):
         self.eval().requires_grad_(False)
 
     def encode(self, image: Tensor, fine: Tensor | None = None) -> DkmFeatures:
-        """Images (B, 3, H, W) as :func:`network_input` makes them, of any size, and for a second pass larger."""
+        """Images (B, 3, H, W) as :func:`pixels.network_input` makes them, of any size; larger for a second one."""
         coarse = self.decoder.projected(self.encoder(image))
         return DkmFeatures(coarse, None if fine is None else self.encoder(fine, FINE_COARSEST))
 
@@ -107,13 +58,7 @@ class DKM(nn.Module):
         One way there is the former alone. With a second pass where both images have features for it; ValueError
         where only one has.
         """
-        if (first.fine is None) != (second.fine is None):
-            raise ValueError("of a pair either both images or neither must have features for a second pass")
-        forward = dense_warp(*self.decoder(first, second))
-        if not self.config.symmetric:
-            return (forward,)
-        # One after the other: as one batch both directions would take twice the memory and no less time.
-        return forward, swapped(dense_warp(*self.decoder(second, first)))
+        return warps_of(self.decoder, first, second, symmetric=self.config.symmetric)
 
 
 class Encoder(nn.Module):
@@ -134,7 +79,7 @@ class Decoder(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.embedding_decoder = EmbeddingDecoder()
-        self.gps = nn.ModuleDict({str(s): GaussianProcess() for s in STRIDES})
+        self.gps = nn.ModuleDict({str(s): GaussianProcess(POSTERIOR) for s in STRIDES})
         self.proj = nn.ModuleDict({"16": nn.Conv2d(1024, FEATURES, 1), "32": nn.Conv2d(2048, FEATURES, 1)})
         self.conv_refiner = nn.ModuleDict({str(s): Refiner(shape) for s, shape in SHAPES.items()})
 
@@ -176,120 +121,3 @@ class Decoder(nn.Module):
 
 def _size(pyramid: Pyramid, stride: int) -> torch.Size:
     return pyramid.at(stride).shape[2:]
-
-
-def dense_warp(estimate: Estimate, coarse_logits: Tensor) -> DenseWarp:
-    """One direction on the query's grid; ``coarse_logits`` (B, 1, h, w): those of stride 16, first pass."""
-    flow, logits = estimate.flow, estimate.certainty
-    # Half of the coarse evidence against a match is taken back.
-    doubts = resize(coarse_logits, logits.shape[2:]).clamp(max=0)
-    certainty = torch.sigmoid(logits - 0.5 * doubts)[:, 0]  # (B, H, W)
-    outside = (flow.abs() > 1).any(dim=1)
-    pixels = identity_map(flow).expand_as(flow)
-    warp = torch.cat([as_grid(pixels), as_grid(flow.clamp(-1, 1))], dim=3)  # (B, H, W, 4)
-    return DenseWarp(warp, certainty.masked_fill_(outside, 0))
-
-
-def swapped(dense: DenseWarp) -> DenseWarp:
-    """The same pairs of points, the other image's coordinates first."""
-    return DenseWarp(torch.cat([dense.warp[..., 2:], dense.warp[..., :2]], dim=3), dense.certainty)
-
-
-def side_by_side(warps: Sequence[DenseWarp]) -> DenseWarp:
-    """The published layout (B, H, 2 W, 4) of both directions, for images of one size."""
-    return DenseWarp(
-        torch.cat([dense.warp for dense in warps], dim=2), torch.cat([dense.certainty for dense in warps], dim=2)
-    )
-
-
-class Weighting(StrEnum):
-    """What the certainty is taken for: see :func:`weights_of`."""
-
-    THRESHOLD = "threshold"
-    CUBE_ROOT = "cube root"
-    UNIFORM = "uniform"
-    PLAIN = "plain"
-
-
-@dataclass(frozen=True)
-class SamplingConfig:
-    """As published. ``number``: how many matches at most. ``balanced``: spread evenly over the images."""
-
-    number: int = 5000
-    weighting: Weighting = Weighting.THRESHOLD
-    threshold: float = 0.05
-    balanced: bool = True
-
-    def __post_init__(self) -> None:
-        if self.number < 1:
-            raise ValueError(f"number must be at least 1, not {self.number}")
-
-
-@dataclass(frozen=True, eq=False)
-class SampledMatches:
-    """``matches`` (M, 4) float32, normalised (x, y) in either image; ``certainty`` (M,), as it was weighted;
-    ``index`` (M,) int64, where they stand in the warp laid flat.
-    """
-
-    matches: Tensor
-    certainty: Tensor
-    index: Tensor
-
-
-def sample(
-    warp: Tensor, certainty: Tensor, config: SamplingConfig, generator: Generator | None = None
-) -> SampledMatches:
-    """Draws from a warp (..., 4) with its certainty (...), all pairs of a batch in one pool.
-
-    Fewer than ``config.number`` where fewer have any weight, none at all being legal; ValueError where a
-    certainty is not finite. ``generator`` (on the tensors' device; else PyTorch's own) fixes the outcome, also
-    that of ``torch.multinomial`` for the same draws.
-    """
-    matches, weights = warp.reshape(-1, 4), weights_of(certainty.reshape(-1), config)
-    if not weights.isfinite().all():
-        raise ValueError("certainties must be finite")
-    index = draw(weights, noise_like(weights, generator), config.number * (OVERSAMPLING if config.balanced else 1))
-    if config.balanced:
-        evenness = balancing_weights(density(matches[index]))
-        index = index[draw(evenness, noise_like(evenness, generator), config.number)]
-    return SampledMatches(matches[index], weights[index], index)
-
-
-def weights_of(certainty: Tensor, config: SamplingConfig) -> Tensor:
-    match config.weighting:
-        case Weighting.THRESHOLD:
-            return certainty.masked_fill(certainty > config.threshold, 1)
-        case Weighting.CUBE_ROOT:
-            return certainty ** (1 / 3)
-        case Weighting.UNIFORM:
-            return torch.ones_like(certainty)
-        case Weighting.PLAIN:
-            return certainty
-
-
-def noise_like(weights: Tensor, generator: Generator | None) -> Tensor:
-    return torch.empty_like(weights).exponential_(generator=generator)
-
-
-def draw(weights: Tensor, noise: Tensor, number: int) -> Tensor:
-    """Indices (M,) int64 of at most ``number`` entries of weights (N,), none twice, none of weight 0.
-
-    With exponential noise (N,) the order of weight / noise is one of successive draws in proportion to weight.
-    """
-    drawn = (weights / noise).topk(min(number, len(weights))).indices
-    return drawn[weights[drawn] > 0]
-
-
-def density(points: Tensor) -> Tensor:
-    """Sum over all points (N, D), itself included, of exp(-|p - q|^2 / (2 bandwidth^2)): (N,)."""
-    density = points.new_empty(len(points))
-    rows = max(1, BLOCK_FLOATS // max(1, len(points)))
-    for some, out in zip(torch.split(points, rows), torch.split(density, rows), strict=True):
-        exponents = torch.cdist(some, points).square_().div_(-2 * BANDWIDTH**2)
-        torch.sum(exponents.clamp_(min=LEAST_EXPONENT).exp_(), dim=1, out=out)
-    return density
-
-
-def balancing_weights(density: Tensor) -> Tensor:
-    """(N,) -> (N,): the denser, the less, yet next to nothing for isolated points."""
-    return (1 / (density + 1)).masked_fill_(density < MIN_DENSITY, LAST_RESORT)

@@ -1,60 +1,16 @@
-"""DKM's global matcher: Gaussian-process regression of coordinates, and the decoder of what it gives.
+"""The decoder of DKM's global matcher, which turns what the Gaussian process regressed into a first estimate.
 
-Source: Edstedt et al. 2023, section 3.2. Normalised coordinates as in dkm_refiner.
+Source: Edstedt et al. 2023, section 3.2. Normalised coordinates as in warp_refiner.
 """
-
-import math
 
 import torch
 from torch import Tensor, nn
 
-from mkpc_kaggle.matchers.networks.dkm_refiner import Estimate, identity_map
 from mkpc_kaggle.matchers.networks.layers import ExactConv2d
+from mkpc_kaggle.matchers.networks.warp_refiner import Estimate
 
 STRIDES = (32, 16)
 FEATURES, POSTERIOR, WIDTH = 512, 256, 384  # channels
-TEMPERATURE, NOISE_VARIANCE = 0.2, 0.1
-
-
-class GaussianProcess(nn.Module):
-    """Regresses from the support's features to the embedded coordinates of its pixels."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.pos_conv = ExactConv2d(2, POSTERIOR, 1)
-
-    def forward(self, query: Tensor, support: Tensor) -> Tensor:
-        """Posterior mean (B, 256, h, w) of features (B, 512, h, w) and (B, 512, h', w')."""
-        x, y = query.float().flatten(2).mT, support.float().flatten(2).mT  # (B, n, 512), (B, n', 512)
-        coordinates = self.embed_coordinates(support).flatten(2).mT  # (1, n', 256)
-        mean = posterior_mean(x, y, coordinates)  # (B, n, 256)
-        return mean.mT.reshape(len(query), POSTERIOR, *query.shape[2:])
-
-    def embed_coordinates(self, like: Tensor) -> Tensor:
-        """(1, 256, h, w) for a map (..., h, w)."""
-        return torch.cos(8 * math.pi * self.pos_conv(identity_map(like)))
-
-
-def posterior_mean(x: Tensor, y: Tensor, values: Tensor) -> Tensor:
-    """K_xy (K_yy + noise)^-1 values: (B, n, C), (B, m, C) and (B or 1, m, D) -> (B, n, D)."""
-    covariance = kernel(y, y)
-    covariance.diagonal(dim1=1, dim2=2).add_(NOISE_VARIANCE)
-    # Positive definite. LU would cost twice as much, and batched it is broken in PyTorch's MKL builds.
-    factor = torch.linalg.cholesky(covariance)
-    return kernel(x, y) @ torch.cholesky_solve(values.expand(len(y), -1, -1), factor)
-
-
-def kernel(x: Tensor, y: Tensor) -> Tensor:
-    """exp((cosine - 1) / T) of all pairs: (B, n, C) and (B, m, C) -> (B, n, m), float32.
-
-    Computed in float64: the inverse of a covariance magnifies its rounding some fifteen times, and the refiners
-    that again, up to the tolerance of the golden vectors on some processors. It takes a tenth of a
-    second on a CPU. For a pair of 540 x 720, both ways, these products are 10.2 GFLOP (1530 cells at stride 16,
-    391 at 32): 40 ms at the peak of a T4, whose float64 has 1/32 of its float32's rate.
-    """
-    x, y = x.double(), y.double()
-    norms = (x.norm(dim=2)[:, :, None] * y.norm(dim=2)[:, None]).add_(1e-6)
-    return (x @ y.mT).div_(norms).sub_(1).div_(TEMPERATURE).exp_().float()
 
 
 class EmbeddingDecoder(nn.Module):

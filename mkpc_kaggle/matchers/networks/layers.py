@@ -34,7 +34,11 @@ class Linear(nn.Linear):
 
 
 class Exact:
-    """Marks layers whose results are coordinates: they stay in float32 whatever the network's precision."""
+    """Marks layers whose results are coordinates, or choose them: they stay in float32 in any precision."""
+
+
+class ExactLinear(Exact, Linear):
+    pass
 
 
 class ExactConv1d(Exact, nn.Conv1d):

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from mkpc_kaggle.geometry.coordinates import Size
+from mkpc_kaggle.matchers.networks.assignment import Assignment, mutual_matches, no_assignment
 from mkpc_kaggle.matchers.networks.layers import attention, linear
 from mkpc_kaggle.matchers.numbers import check_finite
 
@@ -51,20 +52,6 @@ class ImageKeypoints:
     scores: Tensor
     descriptors: Tensor
     size: Size
-
-
-@dataclass(frozen=True, eq=False)
-class Assignment:
-    """``matches0`` (B, N0) int64: each keypoint's partner in image 1, or -1; ``matches1`` (B, N1) the inverse.
-
-    ``scores0`` (B, N0) and ``scores1`` (B, N1) float32: the transported share in 0..1 of every pair of mutual
-    best partners, also of those whose match the threshold refused; 0 for other keypoints.
-    """
-
-    matches0: Tensor
-    matches1: Tensor
-    scores0: Tensor
-    scores1: Tensor
 
 
 class Pointwise(nn.Conv1d):
@@ -181,7 +168,7 @@ class SuperGlue(nn.Module):
         scores = self.score_matrix(self.final_proj(self.gnn(x, n0)), n0)
         check_finite("scores of superglue", scores)
         log_plan = log_optimal_transport(scores, self.bin_score, self.config.sinkhorn_iterations)
-        return mutual_matches(log_plan, self.config.match_threshold)
+        return mutual_matches(log_plan[:, :-1, :-1], self.config.match_threshold)
 
     def encoded(self, image: ImageKeypoints) -> Tensor:
         """The features (B, N, 256) with which an image enters the graph: what it shows and where it is."""
@@ -247,22 +234,3 @@ def log_optimal_transport(scores: Tensor, bin_score: Tensor, iterations: int) ->
             column_scale = columns / (row_scale[:, None] @ plan)[:, 0]
         u, v = u + row_scale.log(), v + column_scale.log()
     return (couplings + u[:, :, None]).add_(v[:, None]).add_(math.log(m + n))
-
-
-def mutual_matches(log_plan: Tensor, threshold: float) -> Assignment:
-    """Pairs of keypoints that are each other's best in a plan (B, N0 + 1, N1 + 1), the dustbins left out."""
-    inner = log_plan[:, :-1, :-1]
-    (best0, partner0), partner1 = inner.max(dim=2), inner.argmax(dim=1)  # (B, N0), (B, N0), (B, N1)
-    mutual0 = partner1.gather(1, partner0) == torch.arange(inner.shape[1], device=inner.device)
-    mutual1 = partner0.gather(1, partner1) == torch.arange(inner.shape[2], device=inner.device)
-    scores0 = best0.exp().where(mutual0, 0)
-    scores1 = scores0.gather(1, partner1).where(mutual1, 0)
-    matches0 = partner0.where(mutual0 & (scores0 > threshold), -1)
-    matches1 = partner1.where(mutual1 & (scores1 > threshold), -1)
-    return Assignment(matches0, matches1, scores0, scores1)
-
-
-def no_assignment(scores0: Tensor, scores1: Tensor) -> Assignment:
-    """No matches between images of which at least one has no keypoints; takes shapes and device from scores."""
-    matches0, matches1 = (torch.full_like(scores, -1, dtype=torch.int64) for scores in (scores0, scores1))
-    return Assignment(matches0, matches1, torch.zeros_like(scores0).float(), torch.zeros_like(scores1).float())

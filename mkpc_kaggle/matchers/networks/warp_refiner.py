@@ -1,4 +1,4 @@
-"""DKM's warp refiners and the local correlation that they look at (Edstedt et al. 2023, section 3.3).
+"""Warp refiners, DKM's and RoMa's, and the local correlation that they look at (Edstedt et al. 2023, section 3.3).
 
 Normalised coordinates: (x, y) in [-1, 1], where +-1 are the outer edges of an image; the centre of pixel
 (column j, row i) of w x h is ((2 j + 1) / w - 1, (2 i + 1) / h - 1). Resizing a map of them leaves its values.
@@ -65,24 +65,24 @@ class Refiner(nn.Module):
         self.out_conv = ExactConv2d(shape.hidden, 3, 1)
         self.disp_emb = ExactConv2d(2, shape.embedding, 1)
 
-    def forward(self, query: Tensor, support: Tensor, flow: Tensor) -> Tensor:
+    def forward(self, query: Tensor, support: Tensor, flow: Tensor, stretch: float = 1) -> Tensor:
         """Corrections (B, 3, h, w) of features (B, C, h, w) and (B, C, h', w') and a flow (B, 2, h, w).
 
-        Channel 0 is added to the certainty's logit; 1 and 2 are x and y in eighths of the query's pixel at this
-        scale, as shares of the image's sides.
+        Displacements are shown to the network multiplied by ``stretch``. Channel 0 is added to the certainty's
+        logit; 1 and 2 are x and y in eighths of the query's pixel at this scale, as shares of the image's sides.
         """
-        x = self._look(query, support, flow)  # (B, inputs, h, w)
+        x = self._look(query, support, flow, stretch)  # (B, inputs, h, w)
         for depthwise, norm, _, mix in (self.block1, *self.hidden_blocks):
             # One name for all: no more than two maps are alive at a time.
             x = by_rows(mix, torch.relu_(norm(depthwise(x))))
         corrections: Tensor = self.out_conv(x.float())
         return corrections
 
-    def _look(self, query: Tensor, support: Tensor, flow: Tensor) -> Tensor:
+    def _look(self, query: Tensor, support: Tensor, flow: Tensor, stretch: float = 1) -> Tensor:
         seen = functional.grid_sample(
             support.float(), as_grid(flow), mode="bilinear", padding_mode="zeros", align_corners=False
         )
-        parts = [query, seen, self.disp_emb(flow - identity_map(flow))]
+        parts = [query, seen, self.disp_emb(stretch * (flow - identity_map(flow)))]
         if self.radius is not None:
             parts.append(local_correlation(query, support, flow, self.radius))
         precision = self.block1.get_parameter("0.weight").dtype

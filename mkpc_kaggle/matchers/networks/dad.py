@@ -1,0 +1,76 @@
+"""DaD, a keypoint detector (Edstedt et al. 2025, arXiv 2503.07347): a map of logits and its strongest maxima.
+
+Normalised coordinates: (x, y) in [-1, 1], where +-1 are the outer edges of an image. Parameter names are those of
+the public checkpoint. For inference only.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from mkpc_kaggle.matchers.networks.dedode_decoder import Decoder, resize
+from mkpc_kaggle.matchers.networks.superpoint import window_maximum
+from mkpc_kaggle.matchers.networks.vgg import VGG11, Vgg
+
+MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+TEMPERATURE = 0.5
+"""Of the softmax over the nine pixels that place a keypoint between pixels."""
+
+
+@dataclass(frozen=True, eq=False)
+class DadKeypoints:
+    """K keypoints of one image by descending score, float32: ``points`` (K, 2) normalised, up to half a pixel
+    beyond the edges; ``scores`` (K,), probabilities that sum to 1 over all pixels.
+    """
+
+    points: Tensor
+    scores: Tensor
+
+
+class Dad(nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        self.encoder = Vgg(VGG11)
+        self.decoder = Decoder((8, 4, 2, 1), answer=1, blocks=3, mode="bicubic")
+        self.eval().requires_grad_(False)
+
+    def forward(self, image: Tensor, number: int) -> list[DadKeypoints]:
+        """At most ``number`` keypoints of each image of (B, 3, H, W), RGB in 0..1, sides of at least 8.
+
+        Trained with sides that are multiples of 8, the longer one 1024.
+        """
+        return [select_keypoints(logits, number) for logits in self.logits(image)]
+
+    def logits(self, image: Tensor) -> Tensor:
+        """(B, H, W) float32."""
+        mean, std = (image.new_tensor(values)[:, None, None] for values in (MEAN, STD))
+        answer, hidden = self.decoder(self.encoder((image - mean) / std))
+        part = self.decoder.last.outputs(hidden)[:, :1]
+        return resize(answer, part.shape[2:], "bicubic").add_(part)[:, 0]
+
+
+def select_keypoints(logits: Tensor, number: int) -> DadKeypoints:
+    """The largest maxima of 3 x 3 pixels of a map (H, W); equal ones in one window are all kept."""
+    height, width = logits.shape
+    probability = logits.flatten().softmax(dim=0).view(1, height, width)
+    maxima = probability.where(probability == window_maximum(probability, 1), 0).flatten()
+    scores, pixels = maxima.topk(min(number, len(maxima)))
+    scores, pixels = scores[scores > 0], pixels[scores > 0]
+    rows, columns = pixels // width, pixels % width
+    places = torch.stack([columns, rows], dim=1) + subpixel_offsets(logits, rows, columns)
+    return DadKeypoints((2 * places + 1) / places.new_tensor([width, height]) - 1, scores)
+
+
+def subpixel_offsets(logits: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
+    """(K, 2) float32 in pixels, each within -1..1: the mean of a softmax around pixels (K,) of a map (H, W).
+
+    Pixels beyond the map count as logits of 0, as they did in training.
+    """
+    padded = functional.pad(logits, (1, 1, 1, 1))
+    steps = torch.arange(3, device=logits.device)
+    windows = padded[(rows[:, None] + steps)[:, :, None], (columns[:, None] + steps)[:, None]]  # (K, 3, 3)
+    shares = (windows.flatten(1) / TEMPERATURE).softmax(dim=1).view_as(windows)
+    moves = steps.float() - 1
+    return torch.stack([shares.sum(dim=1) @ moves, shares.sum(dim=2) @ moves], dim=1)

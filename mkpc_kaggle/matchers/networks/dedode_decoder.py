@@ -1,0 +1,133 @@
+"""The decoder of DeDoDe (Edstedt et al. 2024, arXiv 2308.08479) and of the detector DaD: maps, coarse to fine.
+
+At each stride a refiner looks at the features there and at the context of the coarser strides, adds its part to
+the answer and hands on a context. Answers are float32 in any precision.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from mkpc_kaggle.matchers.networks.layers import ExactConv2d
+from mkpc_kaggle.matchers.networks.strips import in_strips
+
+KERNEL = 5
+
+
+@dataclass(frozen=True)
+class RefinerShape:
+    """Channels: of the ``features`` looked at, inside, and of the ``context`` handed on."""
+
+    features: int
+    hidden: int
+    context: int
+
+
+SHAPES = {  # by stride
+    14: RefinerShape(1024, 768, 512),
+    8: RefinerShape(512, 512, 256),
+    4: RefinerShape(256, 256, 128),
+    2: RefinerShape(128, 64, 32),
+    1: RefinerShape(64, 32, 1),
+}
+
+
+class Refiner(nn.Module):
+    """1x1 convolutions of features and context, then depthwise 5x5 and 1x1 convolutions by turns."""
+
+    def __init__(self, shape: RefinerShape, context: int, answer: int, blocks: int) -> None:
+        super().__init__()
+        width = shape.hidden
+        self.features = shape.features
+        self.block1 = nn.Sequential(
+            nn.Conv2d(shape.features + context, width, 1), *normalised(width), nn.Conv2d(width, width, 1)
+        )
+        self.hidden_blocks = nn.Sequential(*(block(width) for _ in range(blocks)))
+        self.out_conv = ExactConv2d(width, answer + shape.context, 1)
+
+    def mixed(self, features: Tensor, context: Tensor | None) -> Tensor:
+        """(B, hidden, h, w) from features (B, C, h, w) and the coarser stride's context (B, C', h', w')."""
+        entry, norm, relu, mix = self.block1
+        weight, bias = entry.get_parameter("weight"), entry.get_parameter("bias")
+        x = functional.conv2d(features.to(weight.dtype), weight[:, : self.features], bias)
+        if context is not None:
+            # A 1x1 convolution of the enlarged context is the enlarged one of the context.
+            part = functional.conv2d(context.to(weight.dtype), weight[:, self.features :])
+            x += resize(part, x.shape[2:], "bilinear")
+        mixed: Tensor = mix(relu(norm(x)))
+        return mixed
+
+    def hidden(self, mixed: Tensor) -> Tensor:
+        """What is in :meth:`mixed` and what the blocks make of it: (B, hidden, h, w) again."""
+        reach = KERNEL // 2 * len(self.hidden_blocks)
+        return in_strips(self._hidden, mixed, reach=reach, channels=mixed.shape[1])
+
+    def outputs(self, hidden: Tensor) -> Tensor:
+        """(B, answer + context, h, w) float32, the part of the answer first."""
+        outputs: Tensor = self.out_conv(hidden.float())
+        return outputs
+
+    def _hidden(self, mixed: Tensor) -> Tensor:
+        blocks: Tensor = self.hidden_blocks(mixed)
+        return blocks.add_(mixed).div_(1.4)
+
+
+class Decoder(nn.Module):
+    """``answer`` channels, ``blocks`` in each refiner; the answer is enlarged in ``mode`` (interpolate's)."""
+
+    def __init__(self, strides: Sequence[int], answer: int, blocks: int, mode: str) -> None:
+        super().__init__()
+        self.answer, self.mode = answer, mode
+        self.layers = nn.ModuleDict()
+        context = 0
+        for stride in strides:
+            self.layers[str(stride)] = Refiner(SHAPES[stride], context, answer, blocks)
+            context = SHAPES[stride].context
+
+    @property
+    def last(self) -> Refiner:
+        return self.at(1)
+
+    def at(self, stride: int) -> Refiner:
+        refiner = self.layers[str(stride)]
+        assert isinstance(refiner, Refiner)
+        return refiner
+
+    def forward(self, levels: list[Tensor]) -> tuple[Tensor, Tensor]:
+        """The answer (B, answer, h, w) after stride 2, and what the last refiner has hidden, (B, 32, H, W).
+
+        ``levels`` are the features from fine to coarse; the list is emptied, so that each is held only until used.
+        """
+        answer: Tensor | None = None
+        context: Tensor | None = None
+        for stride in list(self.layers)[:-1]:
+            answer, context = self.refined(int(stride), levels.pop(), answer, context)
+        assert answer is not None
+        mixed = self.last.mixed(levels.pop(), context)
+        return answer, self.last.hidden(mixed)
+
+    def refined(
+        self, stride: int, features: Tensor, answer: Tensor | None, context: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        """The answer with what this stride adds, and its context."""
+        refiner = self.at(stride)
+        outputs = refiner.outputs(refiner.hidden(refiner.mixed(features, context)))
+        part, context = outputs[:, : self.answer], outputs[:, self.answer :]
+        return part if answer is None else resize(answer, part.shape[2:], self.mode).add_(part), context
+
+
+def resize(x: Tensor, size: torch.Size, mode: str) -> Tensor:
+    """(B, C, h, w) -> (B, C, *size), without antialiasing, half-pixel centres."""
+    return functional.interpolate(x, tuple(size), mode=mode, align_corners=False)
+
+
+def block(width: int) -> nn.Sequential:
+    depthwise = nn.Conv2d(width, width, KERNEL, padding=KERNEL // 2, groups=width)
+    return nn.Sequential(depthwise, *normalised(width), nn.Conv2d(width, width, 1))
+
+
+def normalised(width: int) -> tuple[nn.Module, nn.Module]:
+    return nn.BatchNorm2d(width), nn.ReLU(inplace=True)

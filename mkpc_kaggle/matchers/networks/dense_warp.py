@@ -1,0 +1,86 @@
+"""What dense matchers make of two images: a place in the other for every pixel, and how certain it is.
+
+Normalised coordinates as in warp_refiner. Source: Edstedt et al. 2023, "DKM", section 3.4, and its published code.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Protocol, TypeVar
+
+import torch
+from torch import Tensor
+
+from mkpc_kaggle.matchers.networks.grids import as_grid
+from mkpc_kaggle.matchers.networks.warp_refiner import Estimate, identity_map, resize
+
+
+@dataclass(frozen=True, eq=False)
+class Pyramid:
+    """Of B images, (B, C, h, w) each, in the network's precision: at strides 1, 2, 4, 8 and maybe more."""
+
+    levels: tuple[Tensor, ...]
+
+    def at(self, stride: int) -> Tensor:
+        return self.levels[stride.bit_length() - 1]
+
+
+@dataclass(frozen=True, eq=False)
+class DenseWarp:
+    """Of B pairs, float32: ``warp`` (B, H, W, 4), (x, y) in the first image and (x, y) in the second, in [-1, 1];
+    ``certainty`` (B, H, W) in [0, 1], 0 where the target is outside. The grid is that of one of the images.
+    """
+
+    warp: Tensor
+    certainty: Tensor
+
+
+class Features(Protocol):
+    """Of one image; ``fine`` where there is to be a second pass."""
+
+    @property
+    def fine(self) -> Pyramid | None: ...
+
+
+SomeFeatures = TypeVar("SomeFeatures", bound=Features)
+Decoder = Callable[[SomeFeatures, SomeFeatures], tuple[Estimate, Tensor]]
+"""From a query and a support to the flow between them and the first pass's logits at the coarsest stride."""
+
+
+def warps_of(
+    decoder: Decoder[SomeFeatures], first: SomeFeatures, second: SomeFeatures, *, symmetric: bool
+) -> tuple[DenseWarp, ...]:
+    """The warp on the first image's grid and, if ``symmetric``, that on the second's.
+
+    ValueError where only one of them has features for a second pass.
+    """
+    if (first.fine is None) != (second.fine is None):
+        raise ValueError("of a pair either both images or neither must have features for a second pass")
+    forward = dense_warp(*decoder(first, second))
+    if not symmetric:
+        return (forward,)
+    # One after the other: as one batch both directions would take twice the memory and no less time.
+    return forward, swapped(dense_warp(*decoder(second, first)))
+
+
+def dense_warp(estimate: Estimate, coarse_logits: Tensor) -> DenseWarp:
+    """One direction on the query's grid; ``coarse_logits`` (B, 1, h, w): those of stride 16, first pass."""
+    flow, logits = estimate.flow, estimate.certainty
+    # Half of the coarse evidence against a match is taken back.
+    doubts = resize(coarse_logits, logits.shape[2:]).clamp(max=0)
+    certainty = torch.sigmoid(logits - 0.5 * doubts)[:, 0]  # (B, H, W)
+    outside = (flow.abs() > 1).any(dim=1)
+    pixels = identity_map(flow).expand_as(flow)
+    warp = torch.cat([as_grid(pixels), as_grid(flow.clamp(-1, 1))], dim=3)  # (B, H, W, 4)
+    return DenseWarp(warp, certainty.masked_fill_(outside, 0))
+
+
+def swapped(dense: DenseWarp) -> DenseWarp:
+    """The same pairs of points, the other image's coordinates first."""
+    return DenseWarp(torch.cat([dense.warp[..., 2:], dense.warp[..., :2]], dim=3), dense.certainty)
+
+
+def side_by_side(warps: Sequence[DenseWarp]) -> DenseWarp:
+    """The published layout (B, H, 2 W, 4) of both directions, for images of one size."""
+    return DenseWarp(
+        torch.cat([dense.warp for dense in warps], dim=2), torch.cat([dense.certainty for dense in warps], dim=2)
+    )

@@ -1,0 +1,85 @@
+"""DINOv2's vision transformer: Oquab et al., "DINOv2: Learning Robust Visual Features without Supervision", 2023.
+
+Without register tokens. Parameter names are those of the public checkpoints. For inference only.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from mkpc_kaggle.matchers.networks.grids import as_grid, as_map
+from mkpc_kaggle.matchers.networks.transformer_block import Block
+
+PATCH = 14  # pixels a side: the stride of the features
+EPSILON = 1e-6  # of the norms
+OFFSET = 0.1  # added to a grid's sides where positions are resampled, as in training
+
+
+@dataclass(frozen=True)
+class DinoV2Config:
+    """Of ViT-L/14. ``positions``: the side of the stored grid of positional embeddings, in patches."""
+
+    width: int = 1024
+    blocks: int = 24
+    heads: int = 16
+    positions: int = 37
+
+
+class DinoV2(nn.Module):
+    """Features of 14 x 14 patches."""
+
+    def __init__(self, config: DinoV2Config | None = None) -> None:
+        super().__init__()
+        self.config = config = config or DinoV2Config()
+        self.cls_token = nn.Parameter(torch.zeros(1, 1, config.width))
+        self.pos_embed = nn.Parameter(torch.zeros(1, 1 + config.positions**2, config.width))
+        self.mask_token = nn.Parameter(torch.zeros(1, config.width))  # of the training; checkpoints carry it
+        self.patch_embed = PatchEmbedding(config.width)
+        self.blocks = nn.ModuleList(
+            Block(config.width, config.heads, EPSILON, bias=True, scaled=True) for _ in range(config.blocks)
+        )
+        self.norm = nn.LayerNorm(config.width, EPSILON)
+        self.eval().requires_grad_(False)
+
+    def forward(self, image: Tensor) -> Tensor:
+        """(B, 3, 14 h, 14 w), normalised as the network wants it -> (B, C, h, w) float32, channels last.
+
+        ValueError where a side is no multiple of 14.
+        """
+        if image.shape[2] % PATCH or image.shape[3] % PATCH:
+            raise ValueError(f"both sides of an image must be multiples of {PATCH}, not {tuple(image.shape[2:])}")
+        patches = as_grid(self.patch_embed(image))  # (B, h, w, C)
+        classes = self.cls_token.expand(len(image), -1, -1)
+        tokens = torch.cat([classes, patches.flatten(1, 2)], dim=1).add_(self.positions(*patches.shape[1:3]))
+        for block in self.blocks:
+            tokens = block(tokens)
+        normed: Tensor = self.norm(tokens)
+        return as_map(normed[:, 1:].reshape(patches.shape))
+
+    def positions(self, height: int, width: int) -> Tensor:
+        """What is added to the tokens (1, 1 + h w, C) of a grid of patches, the class token's first.
+
+        The stored grid is resampled by factors that are a little more than the ratios of the sides, and read where
+        the factors say.
+        """
+        side = self.config.positions
+        if (height, width) == (side, side):
+            return self.pos_embed
+        stored = as_map(self.pos_embed[:, 1:].reshape(1, side, side, -1))  # (1, C, side, side)
+        factors = (height + OFFSET) / side, (width + OFFSET) / side
+        resampled = functional.interpolate(stored, scale_factor=factors, mode="bicubic", align_corners=False)
+        assert resampled.shape[2:] == (height, width)
+        return torch.cat([self.pos_embed[:, :1], as_grid(resampled).flatten(1, 2)], dim=1)
+
+
+class PatchEmbedding(nn.Module):
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.proj = nn.Conv2d(3, width, PATCH, PATCH)
+
+    def forward(self, image: Tensor) -> Tensor:
+        """(B, 3, 14 h, 14 w) -> (B, C, h, w) float32."""
+        patches: Tensor = self.proj(image.to(self.proj.weight.dtype))
+        return patches.float()

@@ -1,0 +1,80 @@
+"""LoMa (Nordström et al. 2026, arXiv 2604.04931): DaD keypoints, DeDoDe descriptors, a LightGlue-like matcher.
+
+One public checkpoint has all three; its variants differ in the descriptor and in the matcher's width. For
+inference only.
+"""
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+from torch import Tensor, nn
+
+from mkpc_kaggle.geometry.coordinates import Size
+from mkpc_kaggle.matchers.networks.dad import Dad
+from mkpc_kaggle.matchers.networks.dedode import dedode_b, dedode_g
+from mkpc_kaggle.matchers.networks.loma_matcher import LAYERS, LomaKeypoints, LomaMatcher
+
+
+class Variant(StrEnum):
+    """The published checkpoints. Only B128 has the light descriptor without a vision transformer; R is B trained
+    with rotations; L and G have wider matchers.
+    """
+
+    B128 = "b128"
+    B = "b"
+    R = "r"
+    L = "l"
+    G = "g"
+
+
+@dataclass(frozen=True)
+class Widths:
+    """Channels of descriptors and of the matcher."""
+
+    descriptor: int
+    matcher: int
+
+
+WIDTHS = {
+    Variant.B128: Widths(128, 256),
+    Variant.B: Widths(256, 256),
+    Variant.R: Widths(256, 256),
+    Variant.L: Widths(256, 512),
+    Variant.G: Widths(256, 1024),
+}
+UNUSED = rf"matcher\.(log_assignment\.(?!{LAYERS - 1}\.final_proj\.)|transformers\.(?![0-{LAYERS - 1}]\.))"
+"""What checkpoints hold for training alone: assignments of other layers, matchability, further layers."""
+
+
+class Loma(nn.Module):
+    def __init__(self, variant: Variant) -> None:
+        super().__init__()
+        widths = WIDTHS[variant]
+        self.detector = Dad()
+        describe = dedode_b if variant is Variant.B128 else dedode_g
+        self.descriptor = describe(widths.descriptor)
+        self.matcher = LomaMatcher(widths.descriptor, widths.matcher)
+        self.eval().requires_grad_(False)
+
+    def encode(self, detected: Tensor, described: Tensor, number: int) -> LomaKeypoints:
+        """At most ``number`` keypoints of one image, strongest first.
+
+        It comes in two sizes, (1, 3, H, W) each, RGB in 0..1: as the detector and as the descriptor see it.
+        """
+        (found,) = self.detector(detected, number)
+        points = found.points[None]
+        return LomaKeypoints(points, self.descriptor(described, points))
+
+
+def parameter_name(published: str) -> str:
+    """Ours for a checkpoint's: ``_detector.*``, ``_descriptor.*``; all else is the matcher's."""
+    return published[1:] if published.startswith("_") else f"matcher.{published}"
+
+
+def detector_size(image: Size, long_side: int) -> Size:
+    """What the detector is shown of an image: its longer side ``long_side``, both rounded down to multiples of 8.
+
+    Computed as when it was trained: where the product falls just below ``long_side``, that side gets 8 less.
+    """
+    scale = long_side / max(image)
+    return Size(*(8 * int(scale * side / 8) for side in image))

@@ -1,0 +1,169 @@
+"""RoMa: Edstedt et al., "RoMa: Robust Dense Feature Matching", CVPR 2024.
+
+Like DKM with other features: the coarse ones are DINOv2's, of patches of 14 x 14 pixels, though their stride is
+named 16 in the checkpoints and taken for 16 pixels where displacements are measured. Images may have any sizes.
+Coordinates are normalised: (x, y) in [-1, 1], where +-1 are the outer edges of an image (see warp_refiner).
+Parameter names are those of the public checkpoints, DINOv2's under the prefix "dinov2.". For inference only.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from math import sqrt
+
+import torch
+from torch import Tensor, nn
+
+from mkpc_kaggle.matchers.networks.anchor_decoder import AnchorDecoder
+from mkpc_kaggle.matchers.networks.dense_warp import DenseWarp, Pyramid, warps_of
+from mkpc_kaggle.matchers.networks.dinov2 import DinoV2, DinoV2Config
+from mkpc_kaggle.matchers.networks.gaussian_process import GaussianProcess
+from mkpc_kaggle.matchers.networks.vgg import VGG19, WIDTHS, Vgg
+from mkpc_kaggle.matchers.networks.warp_refiner import (
+    SHAPES,
+    Estimate,
+    Refiner,
+    RefinerShape,
+    by_rows,
+    refined,
+)
+
+COARSEST = 16
+REFINERS = SHAPES | {1: RefinerShape(9, 6, None, 24)}
+DISPLACEMENT, TRAINED_SIDE = 1.25, 560  # the factor of displacements in a square of this side
+
+
+@dataclass(frozen=True)
+class RomaConfig:
+    """``symmetric``: match both ways; else from the query to the support only. The rest is the published one's:
+    the shapes of the refiners by their stride, and the coarse decoder's blocks and heads.
+    """
+
+    symmetric: bool = True
+    dinov2: DinoV2Config = field(default_factory=DinoV2Config)
+    refiners: Mapping[int, RefinerShape] = field(default_factory=lambda: REFINERS)
+    blocks: int = 5
+    heads: int = 8
+
+
+@dataclass(frozen=True, eq=False)
+class RomaFeatures:
+    """What one image alone yields: for the first pass, strides 1 to 16, and from a larger version of it for the
+    second; ``coefficients`` (B, n, C): what the Gaussian process makes of it as a support.
+    """
+
+    coarse: Pyramid
+    coefficients: Tensor
+    fine: Pyramid | None = None
+
+
+class RoMa(nn.Module):
+    """Trained at 560 x 560, with a second pass at 864 x 864."""
+
+    def __init__(self, config: RomaConfig | None = None) -> None:
+        super().__init__()
+        self.config = config = config or RomaConfig()
+        self.dinov2 = DinoV2(config.dinov2)
+        self.encoder = Encoder()
+        self.decoder = Decoder(config)
+        self.eval().requires_grad_(False)
+
+    def encode(self, image: Tensor, fine: Tensor | None = None) -> RomaFeatures:
+        """Images (B, 3, H, W) as :func:`pixels.network_input` makes them, sides multiples of 14; for a second pass
+        larger ones, of any size of at least 8.
+        """
+        coarse = self.decoder.projected([*self.encoder(image), self.dinov2(image)])
+        coefficients = self.decoder.process.regress(coarse.at(COARSEST))
+        return RomaFeatures(
+            coarse, coefficients, None if fine is None else self.decoder.projected(self.encoder(fine))
+        )
+
+    def match(self, first: RomaFeatures, second: RomaFeatures) -> tuple[DenseWarp, ...]:
+        """B pairs, whose images may differ in size: the warp on the first image's grid, then that on the second's.
+
+        One way there is the former alone. With a second pass where both images have features for it; ValueError
+        where only one has.
+        """
+        return warps_of(self.decoder, first, second, symmetric=self.config.symmetric)
+
+
+class Encoder(nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        self.cnn = Vgg(VGG19)
+
+    def forward(self, image: Tensor) -> list[Tensor]:
+        """Features at strides 1, 2, 4 and 8 of an image (B, 3, H, W)."""
+        levels: list[Tensor] = self.cnn(image)
+        return levels
+
+
+class Decoder(nn.Module):
+    """From the features of two images to the flow from the one to the other."""
+
+    def __init__(self, config: RomaConfig) -> None:
+        super().__init__()
+        width = config.refiners[COARSEST].features
+        inputs = dict(zip((1, 2, 4, 8, COARSEST), (*WIDTHS, config.dinov2.width), strict=True))
+        self.embedding_decoder = AnchorDecoder(2 * width, config.blocks, config.heads)
+        self.gps = nn.ModuleDict({str(COARSEST): GaussianProcess(width)})
+        self.proj = nn.ModuleDict(
+            {str(s): Projection(inputs[s], shape.features) for s, shape in config.refiners.items()}
+        )
+        self.conv_refiner = nn.ModuleDict({str(s): Refiner(shape) for s, shape in config.refiners.items()})
+
+    def projected(self, levels: Sequence[Tensor]) -> Pyramid:
+        """Features at strides 1, 2, 4, ... as all that follows looks at them."""
+        return Pyramid(tuple(self.proj[str(2**i)](features) for i, features in enumerate(levels)))
+
+    @property
+    def process(self) -> GaussianProcess:
+        process = self.gps[str(COARSEST)]
+        assert isinstance(process, GaussianProcess)
+        return process
+
+    def forward(self, query: RomaFeatures, support: RomaFeatures) -> tuple[Estimate, Tensor]:
+        """The flow from query to support at stride 1 of the last pass, and the first pass's logits at 16."""
+        estimate = self.coarse_estimate(query, support)
+        logits = estimate.certainty
+        estimate = self.refine(estimate, query.coarse, support.coarse)
+        if query.fine is not None and support.fine is not None:
+            estimate = self.refine(estimate, query.fine, support.fine)
+        return estimate, logits
+
+    def coarse_estimate(self, query: RomaFeatures, support: RomaFeatures) -> Estimate:
+        """At stride 16, refined."""
+        features = query.coarse.at(COARSEST)
+        posterior = self.process.predict(features, support.coarse.at(COARSEST), support.coefficients)
+        return self.correct(self.embedding_decoder(posterior, features), query.coarse, support.coarse, COARSEST)
+
+    def refine(self, estimate: Estimate, query: Pyramid, support: Pyramid) -> Estimate:
+        """Down to stride 1 from an estimate of any size."""
+        for stride in (8, 4, 2, 1):
+            estimate = self.correct(estimate.resized(query.at(stride).shape[2:]), query, support, stride)
+        return estimate
+
+    def correct(self, estimate: Estimate, query: Pyramid, support: Pyramid, stride: int) -> Estimate:
+        size = query.at(1).shape[2:]
+        refiner = self.conv_refiner[str(stride)]
+        corrections = refiner(query.at(stride), support.at(stride), estimate.flow, stretch(size))
+        # In this network the certainty's comes last.
+        return refined(estimate, corrections.roll(1, dims=1), stride, size)
+
+
+class Projection(nn.Sequential):
+    """To the channels that the decoder compares."""
+
+    def __init__(self, inputs: int, outputs: int) -> None:
+        super().__init__(nn.Conv2d(inputs, outputs, 1), nn.BatchNorm2d(outputs))
+
+    def forward(self, features: Tensor) -> Tensor:
+        """(B, C, h, w) -> (B, C', h, w), both channels last."""
+        mix, norm = self
+        assert isinstance(mix, nn.Conv2d)
+        projected: Tensor = norm(by_rows(mix, features.to(mix.weight.dtype)))
+        return projected
+
+
+def stretch(size: torch.Size) -> float:
+    """Of displacements in an image (H, W), so that they are shown in about the same unit of pixels at any size."""
+    return DISPLACEMENT * sqrt(size.numel()) / TRAINED_SIDE

@@ -1,0 +1,60 @@
+"""VGG with batch norms as a pyramid of features: Simonyan and Zisserman, "Very Deep Convolutional Networks", 2015.
+
+Layers are numbered as in the usual classifiers, so that ``layers.N`` are the usual parameter names. For inference
+in evaluation mode only.
+"""
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import torch
+from torch import Tensor, nn
+
+from mkpc_kaggle.matchers.networks.strips import in_strips
+
+WIDTHS = (64, 128, 256, 512)
+"""Channels at strides 1, 2, 4 and 8."""
+
+VGG11, VGG19 = (1, 1, 2, 2), (2, 2, 4, 4)
+"""Convolutions at each of these strides."""
+
+
+class Vgg(nn.Module):
+    """Up to stride 8; the classifiers' last level is left out."""
+
+    def __init__(self, convolutions: Sequence[int]) -> None:
+        super().__init__()
+        levels: list[list[nn.Module]] = []
+        for count, (narrow, wide) in zip(convolutions, pairwise((3, *WIDTHS)), strict=True):
+            widths = pairwise((narrow, *[wide] * count))
+            levels.append([layer for width_in, width_out in widths for layer in convolution(width_in, width_out)])
+        layers = levels[0]
+        for level in levels[1:]:
+            layers += [nn.MaxPool2d(2), *level]
+        self.layers = nn.Sequential(*layers)
+        self.convolutions = tuple(convolutions)
+
+    def forward(self, image: Tensor) -> list[Tensor]:
+        """Features (B, C, h, w) at strides 1, 2, 4 and 8 of images (B, 3, H, W), before the pooling that follows.
+
+        Sides of at least 8; every halving rounds down.
+        """
+        first = next(self.parameters())
+        x = image.to(first.dtype).contiguous(memory_format=torch.channels_last)
+        features: list[Tensor] = []
+        for level, count, width in zip(self._levels(), self.convolutions, WIDTHS, strict=True):
+            if features:
+                x = nn.functional.max_pool2d(x, 2)
+            x = in_strips(level, x, reach=count, channels=width)
+            features.append(x)
+        return features
+
+    def _levels(self) -> list[nn.Sequential]:
+        """The layers between poolings."""
+        layers = list(self.layers)
+        pools = [i for i, layer in enumerate(layers) if isinstance(layer, nn.MaxPool2d)]
+        return [nn.Sequential(*layers[start + 1 : end]) for start, end in pairwise([-1, *pools, len(layers)])]
+
+
+def convolution(width_in: int, width_out: int) -> tuple[nn.Module, ...]:
+    return nn.Conv2d(width_in, width_out, 3, padding=1), nn.BatchNorm2d(width_out), nn.ReLU(inplace=True)

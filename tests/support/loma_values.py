@@ -1,0 +1,101 @@
+"""What tests of LoMa share: all intermediate values of its networks, batched, by the golden files' names."""
+
+import torch
+from golden import recorded
+
+from mkpc_kaggle.matchers.networks.loma_matcher import LAYERS, LomaKeypoints, log_scores
+
+
+def refined(decoder, levels):
+    """The values of every refiner, and the answer after each but the last."""
+    values, answer, context = {}, None, None
+    for stride in decoder.layers:
+        refiner, features = decoder.at(stride), levels.pop()
+        mixed = refiner.mixed(features, context)
+        outputs = refiner.outputs(refiner.hidden(mixed))
+        values[f"block1_{stride}"] = mixed
+        values[f"delta_{stride}"] = outputs[:, : decoder.answer]
+        values[f"context_{stride}"] = outputs[:, decoder.answer :]
+        if stride != "1":
+            answer, context = decoder.refined(int(stride), features, answer, context)
+            values[f"answer_{stride}"] = answer
+    return values
+
+
+def encoded(levels, strides):
+    return {f"encoder_{stride}": level for stride, level in zip(strides, levels, strict=True)}
+
+
+@torch.inference_mode()
+def detector_values(detector, images, number):
+    with recorded(detector, ["encoder"]) as calls:
+        logits = detector.logits(images)
+    ((network_input, _),) = calls["encoder"]
+    levels = detector.encoder(*network_input)
+    values = encoded(levels, (1, 2, 4, 8)) | refined(detector.decoder, levels)
+    found = detector(images, number)
+    return values | {
+        "score_map": logits,
+        "dense_probs": logits.flatten(1).softmax(dim=1).view_as(logits),
+        "keypoints": torch.stack([one.points for one in found]),
+        "keypoint_probs": torch.stack([one.scores for one in found]),
+    }
+
+
+def features_of(encoder, images):
+    """The encoder's values, those of its vision transformer included if it has one, and its levels."""
+    if not hasattr(encoder, "frozen_dinov2"):
+        levels = encoder(images)
+        return encoded(levels, (1, 2, 4, 8)), levels
+    last = len(encoder.frozen_dinov2["dinov2_vitl14"].blocks)
+    blocks = {
+        number: f"frozen_dinov2.dinov2_vitl14.blocks.{number - 1}" for number in (1, 2, 12, 24) if number <= last
+    }
+    with recorded(encoder, blocks.values()) as calls:
+        levels = encoder(images)
+    values = {"vit_tokens": calls[blocks[1]][0][0][0]}
+    values |= {f"vit_block{number}": calls[block][0][1] for number, block in blocks.items()}
+    return values | encoded(levels, (1, 2, 4, 8, 14)), levels
+
+
+@torch.inference_mode()
+def descriptor_values(descriptor, images, points):
+    values, levels = features_of(descriptor.encoder, images)
+    values |= refined(descriptor.decoder, levels)
+    height, width = images.shape[2:]
+    rows, columns = ((2 * torch.arange(side) + 1) / side - 1 for side in (height, width))
+    pixels = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), dim=2).view(1, -1, 2)
+    dense = descriptor(images, pixels.expand(len(images), -1, -1))
+    return values | {
+        "dense_descriptors": dense.mT.unflatten(2, (height, width)),
+        "descriptors": descriptor(images, points),
+    }
+
+
+@torch.inference_mode()
+def matcher_values(matcher, image0, image1, threshold):
+    names = ["input_proj", "transformers.0.self_attn", *(f"transformers.{index}" for index in (0, 4, 8))]
+    assignment = f"log_assignment.{LAYERS - 1}.final_proj"
+    with recorded(matcher, ["posenc", *names, assignment]) as calls:
+        found = matcher(image0, image1, threshold)
+    n0 = image0.points.shape[1]
+    rotation = calls["posenc"][0][1][:, 0, :n0].repeat_interleave(2, dim=2)
+    values = {"rotary_cos0": rotation.real, "rotary_sin0": rotation.imag}
+    files = ["input_proj", "layer1_self", "layer1", "layer5", "layer9", "final_proj"]
+    for name, call in zip(files, [*names, assignment], strict=True):
+        output = calls[call][0][1]
+        values |= {f"{name}_0": output[:, :n0], f"{name}_1": output[:, n0:]}
+    similarity = matcher.similarity(calls[f"transformers.{LAYERS - 1}"][0][1], n0)
+    return values | {
+        "similarity": similarity,
+        "scores": log_scores(similarity).exp(),
+        "matches0": found.matches0,
+        "matches1": found.matches1,
+        "matching_scores0": found.scores0,
+        "matching_scores1": found.scores1,
+    }
+
+
+def keypoints_of(arrays, side):
+    """Those of a golden file without a batch axis."""
+    return LomaKeypoints(arrays[f"keypoints{side}"][None], arrays[f"descriptors{side}"][None])

@@ -1,0 +1,261 @@
+"""LoMa as a matcher, and what its networks do beside the numbers of the golden files."""
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from checkpoints import FILES, write_checkpoints
+from standin import filled, scene
+
+from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.geometry.coordinates import Box, Size, View
+from mkpc_kaggle.matchers import loma
+from mkpc_kaggle.matchers.contract import Picture, Placement, encoding_bytes
+from mkpc_kaggle.matchers.loma import LomaAdapter, LomaOptions
+from mkpc_kaggle.matchers.networks import strips
+from mkpc_kaggle.matchers.networks.dad import select_keypoints
+from mkpc_kaggle.matchers.networks.dedode import dedode_g
+from mkpc_kaggle.matchers.networks.dinov2 import DinoV2Config
+from mkpc_kaggle.matchers.networks.loma import Loma, Variant, detector_size
+from mkpc_kaggle.matchers.networks.loma_matcher import LomaKeypoints, LomaMatcher, log_scores
+from mkpc_kaggle.matchers.networks.placement import placed
+from mkpc_kaggle.weights import WeightStore
+
+OPTIONS = LomaOptions(Variant.B128, max_keypoints=200, match_threshold=0.0)
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> WeightStore:
+    directory = tmp_path_factory.mktemp("weights")
+    lines = write_checkpoints(directory, [file for file in FILES if file.matcher == "loma"])
+    return WeightStore([directory], lines)
+
+
+@pytest.fixture(scope="module")
+def matcher(store: WeightStore) -> LomaAdapter:
+    return loma.load(store, OPTIONS, Placement())
+
+
+@pytest.fixture(scope="module")
+def network(matcher: LomaAdapter) -> Loma:
+    return matcher._network
+
+
+class Holding(WeightStore):
+    """A store whose file holds these tensors, whatever the slot."""
+
+    def __init__(self, tensors: dict[str, torch.Tensor]) -> None:
+        self.tensors = tensors
+
+    def load(self, slot: str) -> dict[str, torch.Tensor]:
+        return self.tensors
+
+
+def picture(pixels: np.ndarray, padding: int = 0) -> Picture:
+    size = Size(pixels.shape[1], pixels.shape[0])
+    view = View(Box.whole(size), size, Size(size.width + padding, size.height + 2 * padding))
+    return Picture(view.render(pixels), view)
+
+
+def image_of(pixels: np.ndarray) -> torch.Tensor:
+    return torch.from_numpy(pixels.copy()).permute(2, 0, 1)[None].float() / 255
+
+
+def test_a_shifted_picture_is_matched_by_its_shift(store: WeightStore) -> None:
+    matcher = loma.load(store, LomaOptions(Variant.B128, max_keypoints=300), Placement())
+    whole = scene(136, 208, channels=3)
+    first, second = matcher.encode([picture(whole[:128, 16:]), picture(whole[8:, :192])])
+    (matches,) = matcher.match([first], [second])
+    offsets = matches.points1 - matches.points0
+    good = np.abs(offsets - (16, -8)).max(axis=1) < 1.5
+    assert good.sum() >= 20
+    assert good.mean() > 0.8
+    assert np.abs(np.median(offsets[good], axis=0) - (16, -8)).max() < 0.2
+
+
+@pytest.mark.parametrize("sizes", [((64, 96), (90, 50)), ((33, 47), (131, 40)), ((8, 120), (40, 9))])
+def test_matches_lie_on_the_pictures_whatever_their_sizes(
+    matcher: LomaAdapter, sizes: tuple[tuple[int, int], tuple[int, int]]
+) -> None:
+    pictures = [picture(scene(*size, channels=3, name=f"{size}")) for size in sizes]
+    encodings = matcher.encode(pictures)
+    (matches,) = matcher.match(encodings[:1], encodings[1:])
+    assert 0 < len(matches) <= 200
+    # Half a pixel of the picture that the detector saw is the most that a keypoint leaves the edge.
+    for points, size in zip((matches.points0, matches.points1), sizes, strict=True):
+        reach = 0.5 * max(size) / (max(size) - 7)
+        assert (points > -0.5 - reach).all()
+        assert (points < np.array(size[::-1]) - 0.5 + reach).all()
+
+
+def test_keypoints_are_where_the_detector_saw_them(matcher: LomaAdapter) -> None:
+    """A dot stays in its place when the detector's picture has other sides than the view."""
+    pixels = np.full((101, 135, 3), 90, np.uint8)
+    cv2.circle(pixels, (70, 40), 2, (250, 240, 230), -1)
+    (encoded,) = matcher.encode([picture(pixels)])
+    assert detector_size(Size(135, 101), 135) == (128, 96)
+    points = loma.from_normalised(encoded.keypoints.points[0].numpy(), Size(135, 101))
+    assert np.hypot(*(points - (70, 40)).T).min() < 4
+
+
+def test_padding_changes_nothing(matcher: LomaAdapter) -> None:
+    pixels = scene(75, 101, channels=3)
+    plain, padded = matcher.encode([picture(pixels), picture(pixels, padding=13)])
+    assert torch.equal(plain.keypoints.points, padded.keypoints.points)
+    assert torch.equal(plain.keypoints.descriptors, padded.keypoints.descriptors)
+    assert encoding_bytes(plain) == 200 * (2 + 128) * 4
+
+
+@pytest.mark.parametrize("size", [(7, 90), (1, 1), (90, 5)])
+def test_pictures_too_small_for_the_detector_have_no_matches(matcher: LomaAdapter, size: tuple[int, int]) -> None:
+    tiny, plain = matcher.encode([picture(scene(*size, channels=3)), picture(scene(64, 64, channels=3))])
+    assert [len(matches) for matches in matcher.match([tiny, plain, tiny], [plain, tiny, tiny])] == [0, 0, 0]
+    assert matcher.encode([]) == []
+    assert matcher.match([], []) == []
+
+
+def test_the_sizes_are_the_releases_on_views_of_1024_pixels(
+    matcher: LomaAdapter, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen = []
+
+    def encode(to_detect: torch.Tensor, to_describe: torch.Tensor, number: int) -> LomaKeypoints:
+        seen.append((to_detect.shape[2:], to_describe.shape[2:], number))
+        return LomaKeypoints(torch.zeros(1, 0, 2), torch.zeros(1, 0, 128))
+
+    monkeypatch.setattr(matcher._network, "encode", encode)
+    published = LomaAdapter(matcher._network, LomaOptions(Variant.B128), "cpu")
+    for size in ((683, 1024), (512, 384), (6, 3)):
+        published.encode([picture(np.zeros((*size, 3), np.uint8))])
+    assert seen == [((680, 1024), (784, 784), 2048), ((512, 384), (392, 392), 2048)]
+
+
+def test_variants_are_slots_of_their_own(store: WeightStore) -> None:
+    assert set(loma.SPEC.every_slot) == {"loma-b128", "loma-b", "loma-r", "loma-l", "loma-g"}
+    with pytest.raises(KeyError, match="loma-g"):
+        loma.load(store, LomaOptions(Variant.G), Placement())
+
+
+def test_checkpoints_that_lack_or_add_something_are_refused(store: WeightStore) -> None:
+    good = store.load("loma-b128")
+    for change in (
+        {"_detector.encoder.layers.0.weight": torch.ones(64, 3, 3, 1)},
+        {"transformers.8.self_attn.surplus": torch.ones(1)},
+        {"_descriptor.surplus": torch.ones(1)},
+    ):
+        with pytest.raises(UserError, match="'loma-b128' do not fit the network"):
+            loma.load(Holding(good | change), OPTIONS, Placement())
+
+
+def test_weights_in_half_precision_and_of_deeper_training_load(store: WeightStore, network: Loma) -> None:
+    good = store.load("loma-b128")
+    stored = {name: tensor.bfloat16() if name.endswith("Wqkv.weight") else tensor for name, tensor in good.items()}
+    deeper = {"transformers.9.self_attn.out_proj.bias": torch.ones(256), "transformers.10.x": torch.ones(1)}
+    loaded = loma.load(Holding(stored | deeper), OPTIONS, Placement())._network
+    name = "matcher.transformers.3.self_attn.Wqkv.weight"
+    assert torch.equal(loaded.get_parameter(name), network.get_parameter(name).bfloat16().float())
+    assert {parameter.dtype for parameter in loaded.parameters()} == {torch.float32}
+
+
+# the networks
+
+
+@torch.inference_mode()
+def test_strips_of_rows_give_what_the_whole_gives(network: Loma, monkeypatch: pytest.MonkeyPatch) -> None:
+    image = image_of(scene(157, 83, channels=3))
+    points = torch.rand(1, 50, 2, generator=torch.Generator().manual_seed(0)) * 2 - 1
+    logits, descriptors = network.detector.logits(image), network.descriptor(image, points)
+    monkeypatch.setattr(strips, "FLOATS", 83 * 32 * 50)
+    torch.testing.assert_close(network.detector.logits(image), logits, rtol=0, atol=1e-3)
+    torch.testing.assert_close(network.descriptor(image, points), descriptors, rtol=0, atol=1e-3)
+
+
+@pytest.mark.parametrize("rows", [1, 8, 13, 200])
+def test_every_row_of_a_strip_has_its_neighbours(rows: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    heights = []
+
+    def blurred(x: torch.Tensor) -> torch.Tensor:
+        heights.append(x.shape[2])
+        return torch.nn.functional.avg_pool2d(x, (5, 1), stride=1, padding=(2, 0))
+
+    x = torch.rand(2, 3, 50, 7, generator=torch.Generator().manual_seed(0))
+    expected = blurred(x)
+    monkeypatch.setattr(strips, "FLOATS", 2 * 3 * 7 * rows)
+    torch.testing.assert_close(strips.in_strips(blurred, x, reach=2, channels=3), expected)
+    assert max(heights[1:]) <= max(rows, 8) + 4
+    assert len(heights) > 2 or rows == 200
+
+
+@torch.inference_mode()
+@pytest.mark.parametrize("kind", ["b", "g"])
+def test_descriptors_are_read_from_a_map_that_is_never_made(network: Loma, kind: str) -> None:
+    descriptor = network.descriptor
+    if kind == "g":
+        small = dedode_g(32, DinoV2Config(blocks=1))
+        descriptor = placed(filled(small, "loma"), Placement())
+    image = image_of(scene(42, 70, channels=3))
+    edges = torch.tensor([[-1.0, -1], [1, 1], [-1.02, 0.3], [0.2, 1.03], [3, 0], [-0.99, 0.995]])
+    points = torch.cat([edges, torch.rand(40, 2, generator=torch.Generator().manual_seed(0)) * 2 - 1])[None]
+    answer, hidden = descriptor.decoder(descriptor.encoder(image))
+    part = descriptor.decoder.last.outputs(hidden)[:, :-1]
+    dense = torch.nn.functional.interpolate(answer, image.shape[2:], mode="bilinear") + part
+    expected = torch.nn.functional.grid_sample(dense, points[:, None], align_corners=False)[:, :, 0].mT
+    torch.testing.assert_close(descriptor(image, points), expected, rtol=0, atol=1e-5)
+    assert (expected[0, 4] == 0).all()
+    assert expected[0, 0].abs().max() > 0
+
+
+def test_no_more_keypoints_than_there_are_maxima() -> None:
+    logits = torch.full((6, 9), -1.0)
+    logits[2, 3], logits[5, 8] = 4, 3
+    found = select_keypoints(logits, 100)
+    assert len(found.points) == 2 + (
+        6 * 9 - 9 - 4
+    )  # all pixels of the plain are equal, but for the maxima's windows
+    assert found.scores[:2].tolist() == pytest.approx(logits.flatten().softmax(dim=0)[[21, 53]].tolist())
+    assert len(select_keypoints(logits * 1000, 100).points) == 1  # the other is less likely than any float32
+    assert len(select_keypoints(logits, 1).points) == 1
+
+
+@pytest.fixture(scope="module")
+def pair() -> tuple[LomaKeypoints, LomaKeypoints]:
+    generator = torch.Generator().manual_seed(0)
+    points = torch.rand(1, 40, 2, generator=generator) * 2 - 1
+    descriptors = torch.randn(1, 40, 128, generator=generator)
+    return LomaKeypoints(points[:, :30], descriptors[:, :30]), LomaKeypoints(points[:, 5:], descriptors[:, 5:])
+
+
+@torch.inference_mode()
+def test_the_order_of_images_and_of_keypoints_changes_nothing(
+    network: Loma, pair: tuple[LomaKeypoints, LomaKeypoints]
+) -> None:
+    first, second = pair
+    there, back = network.matcher(first, second, 0.0), network.matcher(second, first, 0.0)
+    assert (there.matches0 >= 0).sum() >= 10
+    assert torch.equal(there.matches0, back.matches1)
+    torch.testing.assert_close(there.scores1, back.scores0, rtol=0, atol=1e-4)
+    backwards = LomaKeypoints(second.points.flip(1), second.descriptors.flip(1))
+    turned = network.matcher(first, backwards, 0.0).matches0
+    assert torch.equal(torch.where(turned >= 0, 34 - turned, -1), there.matches0)
+
+
+@torch.inference_mode()
+def test_no_keypoints_on_a_side_give_no_matches(network: Loma, pair: tuple[LomaKeypoints, LomaKeypoints]) -> None:
+    nothing = LomaKeypoints(torch.zeros(1, 0, 2), torch.zeros(1, 0, 128))
+    found = network.matcher(pair[0], nothing, 0.0)
+    assert found.matches0.tolist() == [[-1] * 30]
+    assert found.scores0.tolist() == [[0] * 30]
+    assert (found.matches1.shape, found.scores1.shape) == ((1, 0), (1, 0))
+
+
+def test_the_matrix_of_scores_is_a_product_of_two_softmaxes() -> None:
+    similarity = torch.randn(2, 5, 7, generator=torch.Generator().manual_seed(0)) * 10
+    expected = similarity.softmax(dim=1) * similarity.softmax(dim=2)
+    torch.testing.assert_close(log_scores(similarity).exp(), expected)
+
+
+def test_the_wide_matchers_project_descriptors() -> None:
+    for width in (256, 512):
+        with torch.device("meta"):
+            names = LomaMatcher(256, width).state_dict().keys()
+        assert any(name.startswith("input_proj") for name in names) == (width != 256)

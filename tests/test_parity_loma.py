@@ -1,0 +1,292 @@
+"""LoMa against golden vectors of the reference, with its stand-in weights, stage by stage, norms folded.
+
+``python tests/test_parity_loma.py`` prints how far each stage is off.
+"""
+
+import re
+import sys
+from functools import cache, partial
+
+import numpy as np
+import pytest
+import torch
+from dense import batch_of, resized_by_pil
+from golden import Stage, assert_stages, golden_arrays, needs_golden, print_table, standin_state
+from loma_values import descriptor_values, detector_values, keypoints_of, matcher_values
+from semi_dense import tolerance_of
+
+from mkpc_kaggle.geometry.coordinates import Size
+from mkpc_kaggle.matchers.contract import Placement
+from mkpc_kaggle.matchers.networks.dad import Dad, select_keypoints
+from mkpc_kaggle.matchers.networks.dedode import dedode_b, dedode_g
+from mkpc_kaggle.matchers.networks.dinov2 import DinoV2, DinoV2Config
+from mkpc_kaggle.matchers.networks.loma import UNUSED, Loma, Variant, detector_size, parameter_name
+from mkpc_kaggle.matchers.networks.loma_matcher import LomaKeypoints, LomaMatcher
+from mkpc_kaggle.matchers.networks.pixels import resized
+from mkpc_kaggle.matchers.networks.placement import placed
+from mkpc_kaggle.weights import load_into
+
+DETECTOR = {
+    "encoder": 1e-4,
+    "block1": 1e-4,
+    "delta": 1e-4,
+    "context": 1e-4,
+    "score_map": 1e-4,
+    "keypoints": 1e-6,
+}
+DESCRIPTOR = {"encoder_14": 1.5e-4, "vit": 1.5e-4} | dict.fromkeys(
+    ("encoder", "delta", "context", "dense_descriptors", "descriptors"), 2e-4
+)
+MATCHER = {
+    "rotary": 4e-6,
+    "input_proj": 2e-5,
+    "layer1": 2e-5,
+    "layer5": 5e-5,
+    "layer9": 2e-4,
+    "final_proj": 2e-4,
+    "similarity": 1e-3,
+    "scores": 1e-4,
+    "matching_scores": 1e-4,
+}
+PIPELINE = {"keypoints": 1e-6, "descriptors": 2e-4, "matching_scores": 4e-4, "points": 1e-3}
+
+
+@cache
+def detector():
+    return filled(Dad(), standin_state("loma", "B128", "_detector."), "detector.")
+
+
+@cache
+def descriptor(variant):
+    network = {"B128": partial(dedode_b, 128), "B": partial(dedode_g, 256)}[variant]()
+    return filled(network, standin_state("loma", variant, "_descriptor."), "descriptor.")
+
+
+@cache
+def matcher(variant):
+    descriptors, width = {"B128": (128, 256), "B": (256, 256), "L": (256, 512), "G": (256, 1024)}[variant]
+    tensors = standin_state("loma", variant, not_prefix="_d")
+    return filled(LomaMatcher(descriptors, width), tensors, "matcher.")
+
+
+def filled(network, tensors, part):
+    ours = {parameter_name(name): tensor for name, tensor in tensors.items()}
+    fitting = {name.removeprefix(part): tensor for name, tensor in ours.items() if not re.match(UNUSED, name)}
+    load_into(network, fitting, what="golden")
+    return placed(network, Placement())
+
+
+def image_of(pixels):
+    """(..., H, W, 3) uint8 -> (B, 3, H, W) in 0..1."""
+    return (
+        torch.from_numpy((pixels.numpy() / 255).astype(np.float32))
+        .reshape(-1, *pixels.shape[-3:])
+        .permute(0, 3, 1, 2)
+    )
+
+
+def compared(values, golden, tolerances, steps):
+    """Stages for all arrays of a golden file that ``values`` has; ``steps`` (channels, pixels) by name."""
+    batched = golden.get("image", torch.zeros(0)).ndim == 4
+    for name, expected in golden.items():
+        if name not in values:
+            continue
+        got = values[name]
+        if name in steps:
+            channels, pixels = steps[name]
+            got = got[:, ::channels, ::pixels, ::pixels]
+        got = got if batched else got[0]
+        if name.endswith("probs"):
+            yield Stage(name, got / expected, torch.ones_like(expected), 1e-4)
+        else:
+            yield Stage(name, got.reshape(expected.shape), expected, tolerance_of(name, tolerances))
+
+
+def exhausted(stages, golden, *inputs):
+    """The stages; none of the file's results may be left out."""
+    stages = list(stages)
+    left = {name for name in golden if golden[name].is_floating_point()} - {stage.name for stage in stages}
+    assert left == set(inputs), left
+    return stages
+
+
+DETECTOR_STEPS = {f"encoder_{s}": (16, 4 if s < 4 else 2) for s in (1, 2, 4, 8)} | {
+    f"{kind}_{s}": (16, 8 // s) for kind in ("block1", "context") for s in (1, 2, 4, 8)
+}
+DESCRIPTOR_STEPS = (
+    {f"encoder_{s}": (32, 4 if s < 4 else 2) for s in (1, 2, 4, 8)}
+    | {"encoder_14": (32, 1), "delta_14": (32, 1), "context_14": (32, 1), "dense_descriptors": (32, 3)}
+    | {f"{kind}_{s}": (32, 8 // s) for kind in ("delta", "context") for s in (1, 2, 4, 8)}
+)
+
+
+def detector_stages(case):
+    golden = golden_arrays("loma", f"detector_{case}")
+    number = golden["keypoints"].shape[-2]
+    values = detector_values(detector(), image_of(golden["image"]), number)
+    yield from exhausted(compared(values, golden, DETECTOR, DETECTOR_STEPS), golden)
+
+
+def sampling_stages():
+    golden = golden_arrays("loma", "sampling_cases")
+    for name in ("ties", "few", "border", "random"):
+        found = select_keypoints(golden[f"{name}_map"], int(golden[f"{name}_asked"]))
+        rows = torch.cat([found.points, found.scores[:, None]], dim=1)
+        expected = torch.cat([golden[f"{name}_keypoints"], golden[f"{name}_probs"][:, None]], dim=1)
+        if name == "ties":
+            rows, expected = (torch.tensor(sorted(of.tolist())) for of in (rows, expected))
+        yield Stage(f"{name} points", rows[:, :2], expected[:, :2], 1e-6)
+        yield Stage(f"{name} scores", rows[:, 2] / expected[:, 2], torch.ones(len(expected)), 1e-4)
+
+
+def resize_stages():
+    golden = golden_arrays("loma", "resize_cases")
+    source = golden["source"]
+    for name, expected in golden.items():
+        if name.startswith(("detector", "descriptor")) and not name.endswith("float"):
+            size = tuple(expected.shape[:2])
+            by_name = int(name.split("_")[1])
+            wanted = Size(by_name, by_name)
+            if name.startswith("detector"):
+                wanted = detector_size(Size(source.shape[1], source.shape[0]), by_name)
+            yield Stage(f"{name} size", torch.tensor(wanted[::-1]), torch.tensor(size))
+            yield Stage(f"{name} by PIL", resized_by_pil(source, size), expected)
+            got = (resized(batch_of(source), size) * 255).round()
+            yield Stage(name, got, batch_of(expected).float(), 1)
+            yield Stage(f"{name}, share", (got != batch_of(expected)).float().mean(), torch.tensor(0.0), 0.02)
+    exact = resized(batch_of(golden["detector_48"]), golden["detector_48"].shape[:2])
+    yield Stage("detector_48_float", exact[0], golden["detector_48_float"], 1e-7)
+    for width, height, long_side, *expected in golden["size_table"].tolist():
+        got = detector_size(Size(width, height), long_side)
+        yield Stage(f"{width} x {height}", torch.tensor(got), torch.tensor(expected))
+
+
+def descriptor_stages(variant, case):
+    golden = golden_arrays("loma", f"descriptor_{case}")
+    values = descriptor_values(descriptor(variant), image_of(golden["image"]), golden["keypoints"][None])
+    for name in values:
+        if name.startswith("vit"):
+            values[name] = values[name][..., ::32]
+    yield from exhausted(compared(values, golden, DESCRIPTOR, DESCRIPTOR_STEPS), golden, "keypoints")
+
+
+def position_stages():
+    prefix = "_descriptor.encoder.frozen_dinov2.dinov2_vitl14."
+    network = DinoV2(DinoV2Config(blocks=0))
+    network.pos_embed.copy_(standin_state("loma", "B", f"{prefix}pos_embed")[f"{prefix}pos_embed"])
+    for name, expected in golden_arrays("loma", "vit_positions").items():
+        height, width = map(int, name.removeprefix("pos_").split("x"))
+        yield Stage(name, network.positions(height, width)[0, :, ::128], expected, 3e-5)
+
+
+INPUTS = ("keypoints0", "keypoints1", "descriptors0", "descriptors1", "thresholds")
+
+
+def matcher_stages(case):
+    golden = golden_arrays("loma", f"matcher_{case}")
+    if golden["keypoints0"].ndim == 3:
+        sides = [LomaKeypoints(golden[f"keypoints{side}"], golden[f"descriptors{side}"]) for side in (0, 1)]
+        golden["image"] = torch.zeros(1, 1, 1, 1)  # says that there is a batch axis
+    else:
+        sides = [keypoints_of(golden, side) for side in (0, 1)]
+    network = matcher(case.split("_")[0].upper())
+    first, *others = (round(threshold, 3) for threshold in golden["thresholds"].tolist())
+    values = matcher_values(network, *sides, first)
+    for threshold in others:
+        found = network(*sides, threshold)
+        values |= {f"matches{side}_threshold{threshold}": getattr(found, f"matches{side}") for side in (0, 1)}
+    golden_matches = {name for name in golden if name.startswith("matches")}
+    stages = exhausted(compared(values, golden, MATCHER, {}), golden, *INPUTS, *{"image"} & golden.keys())
+    assert golden_matches <= {stage.name for stage in stages}
+    yield from stages
+
+
+def pipeline_stages(case, network):
+    """From picture to matched points; at the published settings keypoints are compared as sets, all but one."""
+    golden = golden_arrays("loma", case)
+    images = golden if "image0" in golden else golden_arrays("loma", "pipeline_b128")
+    side, number = int(golden["descriptor_side"]), int(golden["num_keypoints"])
+    as_sets = case.startswith("default")
+    found = []
+    for index in (0, 1):
+        pixels = images[f"image{index}"]
+        size = detector_size(Size(pixels.shape[1], pixels.shape[0]), int(golden["detector_size"]))
+        assert (1, 3, size.height, size.width) == tuple(golden[f"detector_input_shape{index}"].tolist())
+        seen = [image_of(resized_by_pil(pixels, shape)) for shape in (size[::-1], (side, side))]
+        keypoints = network.encode(*seen, number)
+        (detected,) = network.detector(seen[0], number)
+        found.append(keypoints)
+        mine = {"keypoints": keypoints.points[0], "keypoint_probs": detected.scores}
+        mine["descriptors"] = keypoints.descriptors[0][:, ::32] if as_sets else keypoints.descriptors[0]
+        theirs = {name: golden[f"{name}{index}"] for name in mine}
+        if as_sets:
+            distance = torch.cdist(mine["keypoints"].double(), theirs["keypoints"].double())
+            nearest, partner = distance.min(dim=0)
+            assert (nearest > 1e-6).sum() <= 1
+            mine = {name: value[partner] for name, value in mine.items()}
+            kept = nearest <= 1e-6
+            mine, theirs = ({name: value[kept] for name, value in of.items()} for of in (mine, theirs))
+        mine["keypoint_probs"] = mine["keypoint_probs"] / theirs["keypoint_probs"]
+        theirs["keypoint_probs"] = torch.ones_like(theirs["keypoint_probs"])
+        for name, tolerance in (("keypoints", 1e-6), ("keypoint_probs", 1e-4), ("descriptors", 2e-4)):
+            yield Stage(f"{name}{index}", mine[name], theirs[name], tolerance)
+    matches = network.matcher(*found, float(golden["threshold"]))
+    if not as_sets:
+        for index in (0, 1):
+            yield Stage(f"matches{index}", getattr(matches, f"matches{index}")[0], golden[f"matches{index}"])
+            scores = getattr(matches, f"scores{index}")[0]
+            yield Stage(f"matching_scores{index}", scores, golden[f"matching_scores{index}"], 4e-4)
+    index0 = torch.nonzero(matches.matches0[0] >= 0)[:, 0]
+    both = index0, matches.matches0[0, index0]
+    points = []
+    for index, of in enumerate(both):
+        pixels = images[f"image{index}"]
+        points.append((found[index].points[0, of] + 1) / 2 * torch.tensor([pixels.shape[1], pixels.shape[0]]))
+    mine, theirs = torch.cat(points, dim=1), torch.cat([golden["points0"], golden["points1"]], dim=1)
+    if as_sets:
+        mine, theirs = (torch.tensor(sorted(of.tolist())) for of in (mine, theirs))
+    yield Stage("points", mine, theirs, 1e-3)
+
+
+@cache
+def whole(variant):
+    network = Loma(variant)
+    tensors = {parameter_name(n): t for n, t in standin_state("loma", variant.upper()).items()}
+    load_into(network, tensors, what="golden", unused=UNUSED)
+    return placed(network, Placement())
+
+
+CASES = {f"detector_{case}": partial(detector_stages, case) for case in ("160x208", "157x203", "batch2_72x96")}
+CASES |= {"sampling": sampling_stages, "resize": resize_stages, "vit_positions": position_stages}
+CASES["descriptor_b128"] = partial(descriptor_stages, "B128", "b128_157x203")
+CASES |= {
+    f"matcher_{case}": partial(matcher_stages, case)
+    for case in ("b_60x47", "b128_33x71", "l_24x18", "g_14x11", "b_batch2_20x26", "b_1x3", "b_1x1")
+}
+CASES["pipeline_b128"] = lambda: pipeline_stages("pipeline_b128", whole(Variant.B128))
+SLOW = {
+    "descriptor_g": partial(descriptor_stages, "B", "g_168x210"),
+    "pipeline_b": lambda: pipeline_stages("pipeline_b", whole(Variant.B)),
+    "default_b128": lambda: pipeline_stages("default_b128", whole(Variant.B128)),
+}
+
+
+@needs_golden
+@pytest.mark.parametrize("case", CASES)
+@torch.inference_mode()
+def test_every_stage_is_the_golden_one(case):
+    assert_stages(CASES[case]())
+
+
+@needs_golden
+@pytest.mark.slow
+@pytest.mark.parametrize("case", SLOW)
+@torch.inference_mode()
+def test_every_stage_is_the_golden_one_at_the_published_settings(case):
+    assert_stages(SLOW[case]())
+
+
+if __name__ == "__main__":
+    with torch.inference_mode():
+        cases = CASES | SLOW if "--slow" in sys.argv else CASES
+        print_table("loma", [(case, list(stages())) for case, stages in cases.items()])

@@ -1,0 +1,221 @@
+"""RoMa and its DINOv2 stage by stage against their golden vectors.
+
+``python tests/test_parity_roma.py`` prints how far every stage of every case is off.
+"""
+
+import json
+import re
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import cache
+
+import pytest
+import torch
+from dense import MODES, batch_of, resized_by_pil
+from golden import (
+    GOLDEN,
+    Stage,
+    assert_stages,
+    golden_arrays,
+    needs_golden,
+    print_table,
+    ready,
+    seeded_tensor,
+)
+from roma_values import computed
+
+from mkpc_kaggle.geometry.coordinates import Size, from_normalised
+from mkpc_kaggle.matchers.networks import roma
+from mkpc_kaggle.matchers.networks.anchor_decoder import anchor_mean
+from mkpc_kaggle.matchers.networks.dense_sampling import (
+    SamplingConfig,
+    balancing_weights,
+    density,
+    draw,
+    sample,
+)
+from mkpc_kaggle.matchers.networks.grids import as_grid, as_map
+from mkpc_kaggle.matchers.networks.pixels import network_input
+from mkpc_kaggle.matchers.networks.roma import RoMa
+
+
+def standin():
+    """The checkpoints of RoMa and of DINOv2 as one."""
+    shapes, gains = (json.loads((GOLDEN / "roma" / f"{name}.json").read_text()) for name in ("shapes", "gains"))
+
+    def gain(part, name):
+        prefixes = [prefix for prefix in gains[part]["prefixes"] if name.startswith(prefix)]
+        return gains[part]["prefixes"][max(prefixes, key=len)] if prefixes else gains["default"]
+
+    return {
+        prefix + name: seeded_tensor(name, shape, gain(part, name))
+        for part, prefix in (("dinov2", "dinov2."), ("roma", ""))
+        for name, shape in shapes[part].items()
+    }
+
+
+@cache
+def golden_network():
+    return ready(RoMa(), standin())
+
+
+@contextmanager
+def one_way(network):
+    """The network as it is, matching from the first image to the second only."""
+    both = network.config
+    network.config = replace(both, symmetric=False)
+    try:
+        yield network
+    finally:
+        network.config = both
+
+
+def within(name, got, expected):
+    """The tolerance of the golden files: a share of the array's largest value."""
+    share = 3e-4 if re.fullmatch("(.*_)?certainty", name) and "__" not in name else 1e-4
+    return Stage(name, got, expected, share * expected.abs().max().item())
+
+
+def compared(values, golden):
+    """Stages in the order of the network for all arrays of a golden file that ``values`` has.
+
+    Of some batches the file has the first item only.
+    """
+    for name, value in values.items():
+        for key in golden:
+            reduced = re.fullmatch(rf"{name}(?:_ch(\d+))?", key)
+            if reduced:
+                step = int(reduced[1] or 1)
+                got = value[..., ::step] if value.ndim == 3 else value[:, ::step]
+                yield within(key, got[: len(golden[key])], golden[key])
+
+
+def input_of(pixels):
+    """(H, W, 3) uint8 that has its size already."""
+    return network_input(batch_of(pixels), tuple(pixels.shape[:2]))
+
+
+def main_images():
+    golden = golden_arrays("roma", "main")
+    return [input_of(golden[key]) for key in ("rsA", "rsB")]
+
+
+def resized_images(size):
+    golden = golden_arrays("roma", "main")
+    return [input_of(resized_by_pil(golden[key], size)) for key in ("imA", "imB")]
+
+
+def main_stages():
+    golden = golden_arrays("roma", "main")
+    values = computed(golden_network(), main_images())
+    yield from exhausted(compared(values, golden), golden)
+
+
+def upsample_stages():
+    golden = golden_arrays("roma", "upsample")
+    values = computed(golden_network(), main_images(), resized_images((168, 168)))
+    yield from exhausted(compared(second_pass(values, "warp", "certainty"), golden), golden)
+
+
+def second_pass(values, *plain):
+    """The second pass's values alone; ``plain`` are named without "up_" in the file."""
+    values = {name: value for name, value in values.items() if name.startswith("up_")}
+    return {name.removeprefix("up_") if name[3:] in plain else name: value for name, value in values.items()}
+
+
+def unequal_one_way_stages():
+    golden = golden_arrays("roma", "unequal_one_way")
+    images = resized_images((112, 140))
+    with one_way(golden_network()) as network:
+        values = computed(network, images) | second_pass(computed(network, images, resized_images((150, 202))))
+    yield from exhausted(compared(values, golden), golden)
+
+
+def batched_stages():
+    golden = golden_arrays("roma", "batched")
+    pair, high = ([golden[f"{side}{name}"] for side in ("query", "support")] for name in ("", "_high"))
+    network = golden_network()
+    values = computed(network, pair) | second_pass(computed(network, pair, high))
+    with one_way(network):
+        forward = computed(network, pair)
+    values |= {f"one_way_{name}": forward[name] for name in ("warp", "certainty")}
+    with pytest.MonkeyPatch.context() as patch:  # the release's displacements follow its settings' size
+        patch.setattr(roma, "stretch", lambda size: 1.25 * 112 / 560)
+        other = computed(network, pair)
+    values |= {f"other_setting_{name}": other[name] for name in ("warp", "certainty")}
+    yield from exhausted(compared(values, golden), golden)
+
+
+@torch.inference_mode()
+def parts_stages():
+    golden, network = golden_arrays("roma", "parts"), golden_network()
+    dinov2 = network.dinov2
+    values = {f"pos_{h}x{w}": dinov2.positions(h, w) for h, w in ((40, 40), (37, 37), (5, 6), (40, 30))}
+    values |= {"small_dino_block1": dinov2.blocks[0](golden["small_tokens"])}
+    values |= {"small_dino_norm": dinov2.norm(golden["small_tokens"])}
+    values |= {"small_dec_block1": network.decoder.embedding_decoder.blocks[0](golden["small_tokens"])}
+    logits = seeded_tensor("golden.cls_logits", (2, 4096, 5, 6), 4096 * 30 * 0.25)
+    for position, anchor in enumerate(golden["cls_boost_index"].tolist()):
+        logits[:, anchor, position // 6, position % 6] += 3
+    values |= {"cls_mode": logits.argmax(dim=1), "cls_flow": as_map(anchor_mean(as_grid(logits)))}
+    yield from exhausted(compared(values, golden), golden)
+
+
+def exhausted(stages, golden):
+    """The stages; none of the file's results may be left out."""
+    stages = list(stages)
+    given = {"query", "support", "query_high", "support_high", "imA", "imB", "rsA", "rsB"}
+    given |= {"small_tokens", "cls_boost_index"}
+    assert not {stage.name for stage in stages} ^ (golden.keys() - given)
+    return stages
+
+
+def sampling_stages():
+    golden, dense = golden_arrays("roma", "sampling"), golden_arrays("roma", "main")
+    warp, certainty = dense["warp"], dense["certainty"]
+    modes = {"threshold": "threshold", "raw": "raw"}
+    modes |= {f"{mode}_float32": mode for mode in ("threshold_balanced", "balanced")}
+    for name, mode in modes.items():
+        weighting, balanced = MODES[mode]
+        generator = torch.Generator().manual_seed(1234)
+        found = sample(warp, certainty, SamplingConfig(1000, weighting, 0.05, balanced), generator)
+        yield Stage(f"{name}__matches", found.matches, golden[f"{name}__matches"])
+        yield within(f"{name}__certainty", found.certainty, golden[f"{name}__certainty"])
+    weights = certainty.flatten().masked_fill(certainty.flatten() > 0.05, 1)
+    good = draw(weights, golden["noise1"], 4000)
+    yield Stage("good_index", good, golden["good_index"])
+    neighbours = density(warp.reshape(-1, 4)[golden["good_index"]])
+    for key in ("density", "density_exact"):
+        yield within(key, neighbours, golden[key])
+    evenness = balancing_weights(golden["density"])
+    yield within("balance_p", evenness, golden["balance_p"])
+    yield Stage("balanced_index", draw(evenness, golden["noise2"], 1000), golden["balanced_index"])
+    # The release computes densities in half precision, and draws by them what no other device would.
+    half = golden["density_half"]
+    yield Stage("density_half", neighbours, half, 0.1 * half.max().item())
+    height0, width0, height1, width1 = golden["pixel_sizes_HA_WA_HB_WB"].tolist()
+    sides = golden["pixel_in"].numpy().reshape(-1, 2, 2).swapaxes(0, 1)
+    sizes = Size(width0, height0), Size(width1, height1)
+    for name, points, size in zip(("pixel_A", "pixel_B"), sides, sizes, strict=True):
+        got = torch.from_numpy(from_normalised(points, size))
+        yield within(name, got + 0.5, golden[name])  # theirs have pixel centres at halves
+
+
+CASES = {
+    "main": main_stages,
+    "upsample": upsample_stages,
+    "unequal_one_way": unequal_one_way_stages,
+    "batched": batched_stages,
+    "parts": parts_stages,
+    "sampling": sampling_stages,
+}
+
+
+@needs_golden
+@pytest.mark.parametrize("case", CASES)
+def test_every_stage_is_the_golden_one(case):
+    assert_stages(CASES[case]())
+
+
+if __name__ == "__main__":
+    print_table("roma", [(case, stages()) for case, stages in CASES.items()])
