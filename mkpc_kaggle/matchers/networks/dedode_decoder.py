@@ -125,7 +125,8 @@ class Decoder(nn.Module):
         """The answer with what this stride adds, and its context."""
         refiner = self.at(stride)
         outputs = refiner.outputs(refiner.hidden(refiner.mixed(entry, context)))
-        part, context = outputs[:, : self.answer], outputs[:, self.answer :]
+        # A copy: a view would hold the answer's part as long.
+        part, context = outputs[:, : self.answer], outputs[:, self.answer :].clone()
         return part if answer is None else resize(answer, part.shape[2:], self.mode).add_(part), context
 
 

@@ -62,7 +62,7 @@ def halved(x: Tensor) -> Tensor:
     """Maxima of 2 x 2 pixels. PyTorch's pooling has indices besides, twice as large as the maxima themselves."""
     height, width = (side // 2 * 2 for side in x.shape[2:])
     first, *others = (x[:, :, row:height:2, column:width:2] for row in (0, 1) for column in (0, 1))
-    maxima = first.clone()
+    maxima = first.clone(memory_format=torch.channels_last)
     for pixels in others:
         torch.maximum(maxima, pixels, out=maxima)
     return maxima
