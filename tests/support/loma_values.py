@@ -11,13 +11,13 @@ def refined(decoder, levels):
     values, answer, context = {}, None, None
     for stride in decoder.layers:
         refiner, features = decoder.at(stride), levels.pop()
-        mixed = refiner.mixed(features, context)
+        mixed = refiner.mixed(refiner.entry(features), context)
         outputs = refiner.outputs(refiner.hidden(mixed))
         values[f"block1_{stride}"] = mixed
         values[f"delta_{stride}"] = outputs[:, : decoder.answer]
         values[f"context_{stride}"] = outputs[:, decoder.answer :]
         if stride != "1":
-            answer, context = decoder.refined(int(stride), features, answer, context)
+            answer, context = decoder.refined(int(stride), refiner.entry(features), answer, context)
             values[f"answer_{stride}"] = answer
     return values
 
@@ -28,10 +28,8 @@ def encoded(levels, strides):
 
 @torch.inference_mode()
 def detector_values(detector, images, number):
-    with recorded(detector, ["encoder"]) as calls:
-        logits = detector.logits(images)
-    ((network_input, _),) = calls["encoder"]
-    levels = detector.encoder(*network_input)
+    logits = detector.logits(images)
+    levels = list(detector.levels(images))
     values = encoded(levels, (1, 2, 4, 8)) | refined(detector.decoder, levels)
     found = detector(images, number)
     return values | {
@@ -45,14 +43,14 @@ def detector_values(detector, images, number):
 def features_of(encoder, images):
     """The encoder's values, those of its vision transformer included if it has one, and its levels."""
     if not hasattr(encoder, "frozen_dinov2"):
-        levels = encoder(images)
+        levels = list(encoder.levels(images))
         return encoded(levels, (1, 2, 4, 8)), levels
     last = len(encoder.frozen_dinov2["dinov2_vitl14"].blocks)
     blocks = {
         number: f"frozen_dinov2.dinov2_vitl14.blocks.{number - 1}" for number in (1, 2, 12, 24) if number <= last
     }
     with recorded(encoder, blocks.values()) as calls:
-        levels = encoder(images)
+        levels = list(encoder.levels(images))
     values = {"vit_tokens": calls[blocks[1]][0][0][0]}
     values |= {f"vit_block{number}": calls[block][0][1] for number, block in blocks.items()}
     return values | encoded(levels, (1, 2, 4, 8, 14)), levels

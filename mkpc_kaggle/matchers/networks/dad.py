@@ -4,6 +4,7 @@ Normalised coordinates: (x, y) in [-1, 1], where +-1 are the outer edges of an i
 the public checkpoint. For inference only.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
@@ -45,10 +46,14 @@ class Dad(nn.Module):
 
     def logits(self, image: Tensor) -> Tensor:
         """(B, H, W) float32."""
-        mean, std = (image.new_tensor(values)[:, None, None] for values in (MEAN, STD))
-        answer, hidden = self.decoder(self.encoder((image - mean) / std))
+        answer, hidden = self.decoder(self.levels(image))
         part = self.decoder.last.outputs(hidden)[:, :1]
         return resize(answer, part.shape[2:], "bicubic").add_(part)[:, 0]
+
+    def levels(self, image: Tensor) -> Iterator[Tensor]:
+        """The features at strides 1, 2, 4 and 8."""
+        mean, std = (image.new_tensor(values)[:, None, None] for values in (MEAN, STD))
+        return self.encoder.levels((image - mean) / std)
 
 
 def select_keypoints(logits: Tensor, number: int) -> DadKeypoints:

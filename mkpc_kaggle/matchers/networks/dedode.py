@@ -4,6 +4,8 @@ B is of VGG-19 alone; G adds DINOv2 at stride 14. Coordinates are normalised as 
 of the public checkpoints. For inference only.
 """
 
+from collections.abc import Iterator
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
@@ -16,9 +18,9 @@ BLOCKS = 5
 
 
 class Dedode(nn.Module):
-    """``encoder``: of features at the ``strides``, from fine to coarse, of images (B, 3, H, W)."""
+    """``encoder``: of features at the ``strides``."""
 
-    def __init__(self, encoder: nn.Module, strides: tuple[int, ...], channels: int) -> None:
+    def __init__(self, encoder: "Vgg | VggAndVit", strides: tuple[int, ...], channels: int) -> None:
         super().__init__()
         self.encoder = encoder
         self.decoder = Decoder(strides, channels, BLOCKS, "bilinear")
@@ -29,7 +31,7 @@ class Dedode(nn.Module):
 
         The images are not normalised. Beyond the image, descriptors fade to 0 within a pixel.
         """
-        answer, hidden = self.decoder(self.encoder(image))
+        answer, hidden = self.decoder(self.encoder.levels(image))
         # The map at full resolution is never made: of either of its parts only what the points need.
         head = self.decoder.last.out_conv
         weight, bias = (
@@ -72,10 +74,9 @@ class VggAndVit(nn.Module):
         self.vgg = Vgg(VGG19)
         self.frozen_dinov2 = nn.ModuleDict({"dinov2_vitl14": DinoV2(vit)})
 
-    def forward(self, image: Tensor) -> list[Tensor]:
-        # First what needs most memory on the way.
-        coarsest = self.frozen_dinov2["dinov2_vitl14"](image)
-        return [*self.vgg(image), coarsest]
+    def levels(self, image: Tensor) -> Iterator[Tensor]:
+        yield from self.vgg.levels(image)
+        yield self.frozen_dinov2["dinov2_vitl14"](image)
 
 
 def dedode_b(channels: int) -> Dedode:

@@ -4,7 +4,7 @@ At each stride a refiner looks at the features there and at the context of the c
 the answer and hands on a context. Answers are float32 in any precision.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -48,16 +48,19 @@ class Refiner(nn.Module):
         self.hidden_blocks = nn.Sequential(*(block(width) for _ in range(blocks)))
         self.out_conv = ExactConv2d(width, answer + shape.context, 1)
 
-    def mixed(self, features: Tensor, context: Tensor | None) -> Tensor:
-        """(B, hidden, h, w) from features (B, C, h, w) and the coarser stride's context (B, C', h', w')."""
-        entry, norm, relu, mix = self.block1
-        weight, bias = entry.get_parameter("weight"), entry.get_parameter("bias")
-        x = functional.conv2d(features.to(weight.dtype), weight[:, : self.features], bias)
+    def entry(self, features: Tensor) -> Tensor:
+        """What the first convolution makes of features (B, C, h, w) alone: (B, hidden, h, w)."""
+        weight, bias = (self.block1.get_parameter(f"0.{name}") for name in ("weight", "bias"))
+        return functional.conv2d(features.to(weight.dtype), weight[:, : self.features], bias)
+
+    def mixed(self, entry: Tensor, context: Tensor | None) -> Tensor:
+        """(B, hidden, h, w) from an :meth:`entry`, which is overwritten, and the coarser stride's context."""
+        first, norm, relu, mix = self.block1
         if context is not None:
             # A 1x1 convolution of the enlarged context is the enlarged one of the context.
-            part = functional.conv2d(context.to(weight.dtype), weight[:, self.features :])
-            x += resize(part, x.shape[2:], "bilinear")
-        mixed: Tensor = mix(relu(norm(x)))
+            weight = first.get_parameter("weight")[:, self.features :]
+            entry += resize(functional.conv2d(context.to(weight.dtype), weight), entry.shape[2:], "bilinear")
+        mixed: Tensor = mix(relu(norm(entry)))
         return mixed
 
     def hidden(self, mixed: Tensor) -> Tensor:
@@ -96,26 +99,34 @@ class Decoder(nn.Module):
         assert isinstance(refiner, Refiner)
         return refiner
 
-    def forward(self, levels: list[Tensor]) -> tuple[Tensor, Tensor]:
+    def forward(self, levels: Iterable[Tensor]) -> tuple[Tensor, Tensor]:
         """The answer (B, answer, h, w) after stride 2, and what the last refiner has hidden, (B, 32, H, W).
 
-        ``levels`` are the features from fine to coarse; the list is emptied, so that each is held only until used.
+        ``levels`` are the features from fine to coarse, made one by one: none need be held once the next is asked
+        for.
         """
+        strides = [int(stride) for stride in self.layers]
+        # A loop would hold the features while the next ones are made.
+        entries = list(map(self.entry, reversed(strides), levels))
         answer: Tensor | None = None
         context: Tensor | None = None
-        for stride in list(self.layers)[:-1]:
-            answer, context = self.refined(int(stride), levels.pop(), answer, context)
+        for stride in strides[:-1]:
+            answer, context = self.refined(stride, entries.pop(), answer, context)
         assert answer is not None
-        mixed = self.last.mixed(levels.pop(), context)
+        mixed = self.last.mixed(entries.pop(), context)
         return answer, self.last.hidden(mixed)
 
+    def entry(self, stride: int, features: Tensor) -> Tensor:
+        return self.at(stride).entry(features)
+
     def refined(
-        self, stride: int, features: Tensor, answer: Tensor | None, context: Tensor | None
+        self, stride: int, entry: Tensor, answer: Tensor | None, context: Tensor | None
     ) -> tuple[Tensor, Tensor]:
         """The answer with what this stride adds, and its context."""
         refiner = self.at(stride)
-        outputs = refiner.outputs(refiner.hidden(refiner.mixed(features, context)))
-        part, context = outputs[:, : self.answer], outputs[:, self.answer :]
+        outputs = refiner.outputs(refiner.hidden(refiner.mixed(entry, context)))
+        # A copy: a view would hold the answer's part as long.
+        part, context = outputs[:, : self.answer], outputs[:, self.answer :].clone()
         return part if answer is None else resize(answer, part.shape[2:], self.mode).add_(part), context
 
 

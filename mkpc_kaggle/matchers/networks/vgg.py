@@ -4,7 +4,7 @@ Layers are numbered as in the usual classifiers, so that ``layers.N`` are the us
 in evaluation mode only.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
 
 import torch
@@ -39,21 +39,33 @@ class Vgg(nn.Module):
 
         Sides of at least 8; every halving rounds down.
         """
+        return list(self.levels(image))
+
+    def levels(self, image: Tensor) -> Iterator[Tensor]:
+        """The same one by one, so that not all of them need be held."""
         first = next(self.parameters())
         x = image.to(first.dtype).contiguous(memory_format=torch.channels_last)
-        features: list[Tensor] = []
-        for level, count, width in zip(self._levels(), self.convolutions, WIDTHS, strict=True):
-            if features:
-                x = nn.functional.max_pool2d(x, 2)
-            x = in_strips(level, x, reach=count, channels=width)
-            features.append(x)
-        return features
+        for number, level in enumerate(self._levels()):
+            if number > 0:
+                x = halved(x)
+            x = in_strips(level, x, reach=self.convolutions[number], channels=WIDTHS[number])
+            yield x
 
     def _levels(self) -> list[nn.Sequential]:
         """The layers between poolings."""
         layers = list(self.layers)
         pools = [i for i, layer in enumerate(layers) if isinstance(layer, nn.MaxPool2d)]
         return [nn.Sequential(*layers[start + 1 : end]) for start, end in pairwise([-1, *pools, len(layers)])]
+
+
+def halved(x: Tensor) -> Tensor:
+    """Maxima of 2 x 2 pixels. PyTorch's pooling has indices besides, twice as large as the maxima themselves."""
+    height, width = (side // 2 * 2 for side in x.shape[2:])
+    first, *others = (x[:, :, row:height:2, column:width:2] for row in (0, 1) for column in (0, 1))
+    maxima = first.clone(memory_format=torch.channels_last)
+    for pixels in others:
+        torch.maximum(maxima, pixels, out=maxima)
+    return maxima
 
 
 def convolution(width_in: int, width_out: int) -> tuple[nn.Module, ...]:
