@@ -128,14 +128,14 @@ def picture(colour: Colour, number: int, shift: int) -> Picture:
     return Picture(pixels, View(Box.whole(SIZE), SIZE, SIZE))
 
 
-def matched(matcher: Any, batch: int) -> list[Any]:
+def matched(name: str, placement: Placement, batch: int) -> list[Any]:
     """``batch`` pairs encoded together, then matched together."""
+    matcher = MATCHERS[name](placement)
     encodings = [
         matcher.encode([picture(matcher.spec.colour, number, shift) for number in range(batch)])
         for shift in (SHIFT, 0)
     ]
-    device = torch.device(matcher.device if hasattr(matcher, "device") else matcher.placement.device)
-    assert {tensor.device for tensor in tensors_of(encodings)} == {device}
+    assert {tensor.device for tensor in tensors_of(encodings)} == {torch.device(placement.device)}
     return list(matcher.match(*encodings))
 
 
@@ -149,14 +149,13 @@ def tensors_of(value: Any) -> list[torch.Tensor]:
 
 @cache
 def on_cpu(name: str, precision: Precision, batch: int) -> list[Any]:
-    return matched(MATCHERS[name](Placement("cpu", precision)), batch)
+    return matched(name, Placement("cpu", precision), batch)
 
 
 def on_double(name: str, precision: Precision, devices: tuple[str, ...], batch: int) -> list[list[Any]]:
-    """What each of the devices finds, with matchers on all of them alive at once."""
+    """What each of the devices finds."""
     with DeviceDouble(len(devices)) as double:
-        matchers = [MATCHERS[name](Placement(device, precision)) for device in devices]
-        found = [matched(matcher, batch) for matcher in matchers]
+        found = [matched(name, Placement(device, precision), batch) for device in devices]
         assert double.operators > 0
     return found
 
