@@ -36,8 +36,9 @@ from mkpc_kaggle.matchers.networks.loftr import Loftr
 from mkpc_kaggle.matchers.networks.loma import WIDTHS, Loma, Variant
 from mkpc_kaggle.matchers.networks.loma_matcher import LomaKeypoints
 from mkpc_kaggle.matchers.networks.pixels import network_input
-from mkpc_kaggle.matchers.networks.placement import placed
+from mkpc_kaggle.matchers.networks.placement import Network, placed
 from mkpc_kaggle.matchers.networks.quadtree import Quadtree
+from mkpc_kaggle.matchers.networks.roma import RoMa, RomaFeatures
 from mkpc_kaggle.matchers.networks.superglue import ImageKeypoints, SuperGlue, SuperGlueConfig
 from mkpc_kaggle.matchers.networks.superpoint import SuperPoint, SuperPointConfig
 from tests.standin import filled
@@ -46,6 +47,7 @@ Run = Callable[[], int]
 """Does the work once; the number of matches or keypoints that it found."""
 
 VGA, DKM_SIZE = Size(640, 480), Size(720, 540)
+ROMA_SIZES = Size(560, 560), Size(864, 864)
 YARDSTICK = "kornia LoFTR"
 GIGA = 1e9
 
@@ -113,19 +115,43 @@ def dkm(precision: Precision) -> Run:
     return run
 
 
-def loma(variant: Variant, number: int, precision: Precision) -> LomaAdapter:
-    """With random weights, which take neither the time nor the memory of stand-ins."""
+def with_random_weights(make: Callable[[], Network], precision: Precision) -> Network:
+    """With weights that keep activations of order 1, for networks whose stand-ins take much time and memory."""
     with torch.device("meta"):
-        network = Loma(variant)
+        network = make()
     network.to_empty(device="cpu")
-    torch.manual_seed(0)
-    for tensor in network.state_dict().values():
+    generator = torch.Generator().manual_seed(0)
+    for name, tensor in network.state_dict().items():
         if tensor.ndim > 1:
-            tensor.normal_(std=(2 / tensor[0].numel()) ** 0.5)
+            tensor.normal_(std=tensor[0].numel() ** -0.5, generator=generator)
         else:
-            tensor.fill_(1 if tensor.is_floating_point() else 0)
-    options = LomaOptions(variant, max_keypoints=number)
-    return LomaAdapter(placed(network, Placement(precision=precision)), options, "cpu")
+            tensor.fill_(1 if name.endswith(("weight", "running_var", "gamma")) else 0)
+    return placed(network, Placement(precision=precision))
+
+
+def roma(passes: int, cached: bool, precision: Precision) -> Run:
+    """At the published sizes, both ways, with the encodings' time or without."""
+    network = with_random_weights(RoMa, precision)
+    pictures = [torch.from_numpy(view).permute(2, 0, 1)[None] for view in photographs(ROMA_SIZES[-1])]
+
+    def encoded() -> list[RomaFeatures]:
+        inputs = ([network_input(picture, size) for size in ROMA_SIZES[:passes]] for picture in pictures)
+        return [network.encode(*images) for images in inputs]
+
+    given = encoded() if cached else None
+
+    def run() -> int:
+        warps = network.match(*(given or encoded()))
+        warp = torch.cat([one.warp.reshape(-1, 4) for one in warps])
+        certainty = torch.cat([one.certainty.flatten() for one in warps])
+        return len(sample(warp, certainty, SamplingConfig()).matches)
+
+    return run
+
+
+def loma(variant: Variant, number: int, precision: Precision) -> LomaAdapter:
+    network = with_random_weights(partial(Loma, variant), precision)
+    return LomaAdapter(network, LomaOptions(variant, max_keypoints=number), "cpu")
 
 
 def loma_encode(variant: Variant, long_side: int, number: int, precision: Precision) -> Run:
@@ -153,6 +179,10 @@ CASES: dict[str, Callable[[Precision], Run]] = {
     "QuadTree": semi_dense(Quadtree, "quadtree", VGA),
     "ASpanFormer": semi_dense(AspanFormer, "aspanformer", VGA),
     "DKM 540x720, one pass": dkm,
+    "RoMa 560": partial(roma, 1, False),
+    "RoMa 560, encodings cached": partial(roma, 1, True),
+    "RoMa 560 + 864": partial(roma, 2, False),
+    "RoMa 560 + 864, encodings cached": partial(roma, 2, True),
     "LoMa-B128 encode 1024": partial(loma_encode, Variant.B128, 1024, 2048),
     "LoMa-B128 encode 512": partial(loma_encode, Variant.B128, 512, 1024),
     "LoMa-B encode 1024": partial(loma_encode, Variant.B, 1024, 2048),

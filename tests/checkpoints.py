@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 import torch
+from roma_values import NARROW
 from standin import STAND_INS, standin_state
 from torch import Tensor, nn
 
@@ -16,6 +17,7 @@ from mkpc_kaggle.matchers.networks.dkm import DKM
 from mkpc_kaggle.matchers.networks.loftr import Loftr
 from mkpc_kaggle.matchers.networks.loma import Loma, Variant
 from mkpc_kaggle.matchers.networks.quadtree import Quadtree
+from mkpc_kaggle.matchers.networks.roma import RoMa
 from mkpc_kaggle.matchers.networks.superglue import SuperGlue, SuperGlueConfig
 from mkpc_kaggle.matchers.networks.superpoint import SuperPoint, SuperPointConfig
 from mkpc_kaggle.pipeline import assembly
@@ -39,6 +41,15 @@ def wrapped_aspanformer(state: dict[str, Tensor]) -> dict[str, Any]:
     """With the offsets that the published network keeps and does not read."""
     offsets = {f"loftr_coarse.layers.{index}.attention.sample_offset": torch.ones(64, 2) for index in range(4)}
     return wrapped(state | offsets)
+
+
+def roma_alone(state: dict[str, Tensor]) -> dict[str, Any]:
+    return {name: tensor for name, tensor in state.items() if not name.startswith("dinov2.")}
+
+
+def dinov2_alone(state: dict[str, Tensor]) -> dict[str, Any]:
+    """The backbone has a file of its own."""
+    return {name.removeprefix("dinov2."): tensor for name, tensor in state.items() if name.startswith("dinov2.")}
 
 
 def published_loma(state: dict[str, Tensor]) -> dict[str, Any]:
@@ -83,6 +94,9 @@ FILES = (
         wrapped_aspanformer,
     ),
     PublicFile("DKMv3_outdoor.pth", "dkm", "dkm-outdoor", "dkm", DKM),
+    # Narrow ones, which load where ``roma_values.use_narrow`` was called.
+    PublicFile("roma_outdoor.pth", "roma", "roma-outdoor", "roma", lambda: RoMa(NARROW), roma_alone),
+    PublicFile("dinov2_vitl14_pretrain.pth", "roma", "dinov2-vitl14", "roma", lambda: RoMa(NARROW), dinov2_alone),
     PublicFile("loma_B128.pth", "loma", "loma-b128", "loma", lambda: Loma(Variant.B128), published_loma),
 )
 

@@ -1,15 +1,20 @@
 """All intermediate values of RoMa on the way to a pair's match, by the names of the golden files."""
 
+from dataclasses import replace
+
 import torch
 from dense import joined, one_thread, recorded_refinement, refiner_values
 from golden import recorded
 
+from mkpc_kaggle.matchers import roma as adapter
 from mkpc_kaggle.matchers.networks.dense_warp import side_by_side
 from mkpc_kaggle.matchers.networks.dinov2 import DinoV2Config
 from mkpc_kaggle.matchers.networks.gaussian_process import kernel, tokens
 from mkpc_kaggle.matchers.networks.grids import as_map
 from mkpc_kaggle.matchers.networks.roma import RomaConfig
 from mkpc_kaggle.matchers.networks.warp_refiner import RefinerShape
+
+DINOV2_BLOCKS, DECODER_BLOCKS = (1, 12, 24), (1, 5)
 
 NARROW = RomaConfig(
     dinov2=DinoV2Config(width=64, blocks=2, heads=2, positions=5),
@@ -25,7 +30,10 @@ NARROW = RomaConfig(
 )
 """The same network with fewer channels, a thirtieth of its size: most of what is left is VGG."""
 
-DINOV2_BLOCKS, DECODER_BLOCKS = (1, 12, 24), (1, 5)
+
+def use_narrow(monkeypatch):
+    """RoMas that are loaded from now on are narrow ones, and so must their files be."""
+    monkeypatch.setattr(adapter, "RomaConfig", lambda symmetric: replace(NARROW, symmetric=symmetric))
 
 
 @one_thread()

@@ -1,12 +1,12 @@
 """RoMa as a matcher, from checkpoints in the public files' format, with fewer channels and stand-in weights."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from roma_values import NARROW
+from checkpoints import dinov2_alone, roma_alone
+from roma_values import NARROW, use_narrow
 from standin import filled, scene
 
 from mkpc_kaggle.errors import UserError
@@ -26,21 +26,20 @@ pytestmark = pytest.mark.filterwarnings("ignore:.*is not verified")
 
 @pytest.fixture(autouse=True)
 def narrow(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(roma, "RomaConfig", lambda symmetric: replace(NARROW, symmetric=symmetric))
+    use_narrow(monkeypatch)
 
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> WeightStore:
     """Both files, RoMa's own for outdoors alone."""
     state = filled(RoMa(NARROW), "roma").state_dict()
-    backbone = {
-        name.removeprefix("dinov2."): tensor for name, tensor in state.items() if name.startswith("dinov2.")
-    }
-    own = {name: tensor for name, tensor in state.items() if not name.startswith("dinov2.")}
     directory = tmp_path_factory.mktemp("weights")
     lines = []
-    for tensors, name, slot in ((own, "roma.pth", "roma-outdoor"), (backbone, "dinov2.pth", "dinov2-vitl14")):
-        torch.save(tensors, directory / name)
+    for layout, name, slot in (
+        (roma_alone, "roma.pth", "roma-outdoor"),
+        (dinov2_alone, "dinov2.pth", "dinov2-vitl14"),
+    ):
+        torch.save(layout(state), directory / name)
         lines.append(WeightFile(name, -1, UNVERIFIED, "none", slot, "made here"))
     return WeightStore([directory], lines)
 

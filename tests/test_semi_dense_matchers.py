@@ -10,13 +10,15 @@ import pytest
 import torch
 from torch import nn
 
+from mkpc_kaggle.config import from_table
+from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Box, Size, View
 from mkpc_kaggle.matchers import aspanformer, loftr, quadtree
 from mkpc_kaggle.matchers.contract import Picture, Placement, Training, encoding_bytes
 from mkpc_kaggle.matchers.networks.aspanformer import AspanFormer, AspanFormerConfig, pooling_factor
 from mkpc_kaggle.matchers.networks.loftr import Loftr, LoftrConfig
 from mkpc_kaggle.matchers.networks.quadtree import Quadtree, QuadtreeConfig
-from mkpc_kaggle.matchers.semi_dense import PREFIX, SemiDenseMatcher, SemiDenseOptions, content_mask
+from mkpc_kaggle.matchers.semi_dense import PREFIX, SemiDenseMatcher, content_mask
 from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher
 from mkpc_kaggle.recipe import Recipe, Unit
 from mkpc_kaggle.weights import UNVERIFIED, WeightFile, WeightStore
@@ -29,14 +31,17 @@ MODULES: list[tuple[ModuleType, type[nn.Module]]] = [
 pytestmark = pytest.mark.filterwarnings("ignore:.*is not verified")
 
 
-def load_standin(module: ModuleType, network: type[nn.Module], directory: Path, training: Training) -> Any:
+def load_standin(
+    module: ModuleType, network: type[nn.Module], directory: Path, training: Training, **options: Any
+) -> Any:
     """The matcher with random weights, which are there for this training alone."""
     torch.manual_seed(0)
-    wrapped = {PREFIX + name: tensor for name, tensor in network().state_dict().items()}
+    state = network().state_dict() | options.pop("surplus", {})
+    wrapped = {PREFIX + name: tensor for name, tensor in state.items()}
     torch.save({"state_dict": wrapped, "epoch": 3}, directory / "network.ckpt")
     slot = f"{module.SPEC.name}-{training}"
     store = WeightStore([directory], [WeightFile("network.ckpt", -1, UNVERIFIED, "none", slot, "made here")])
-    return module.load(store, SemiDenseOptions(threshold=0.0, training=training), Placement())
+    return module.load(store, module.SPEC.options(threshold=0.0, training=training, **options), Placement())
 
 
 @pytest.fixture(scope="module", params=MODULES, ids=["loftr", "quadtree", "aspanformer"])
@@ -58,7 +63,7 @@ def picture(height: int, width: int, matcher: SemiDenseMatcher, seed: int = 0) -
 
 
 INDOOR: list[tuple[ModuleType, type[nn.Module], Any]] = [
-    (loftr, Loftr, LoftrConfig(threshold=0.0, fixed_positions=True)),
+    (loftr, Loftr, LoftrConfig(threshold=0.0, border=0, fixed_positions=True)),
     (quadtree, Quadtree, QuadtreeConfig(threshold=0.0, topks=(32, 16))),
     (aspanformer, AspanFormer, AspanFormerConfig(threshold=0.0, border=0, train_size=(480, 640))),
 ]
@@ -73,6 +78,39 @@ def test_indoor_weights_come_with_their_settings_and_run_at_any_size(
     encoded = [matcher.encode([picture(*size, matcher)])[0] for size in ((97, 131), (160, 88))]
     (matches,) = matcher.match(encoded[:1], encoded[1:])
     assert np.isfinite(matches.points1).all()
+
+
+@pytest.mark.parametrize(
+    ("training", "border", "expected"),
+    [(Training.OUTDOOR, -1, 2), (Training.INDOOR, -1, 0), (Training.OUTDOOR, 0, 0), (Training.INDOOR, 3, 3)],
+)
+def test_loftrs_border_is_the_published_one_or_the_recipes(training: Training, border: int, expected: int) -> None:
+    table = {} if border < 0 else {"border": border}
+    options = from_table(loftr.SPEC.options, {"training": training, **table}, "recipe")
+    assert loftr.config_of(options).border == expected
+
+
+def test_loftr_finds_matches_along_the_border_where_it_is_told_to(tmp_path: Path) -> None:
+    found = {}
+    for border in (0, 2):
+        matcher = load_standin(loftr, Loftr, tmp_path, Training.INDOOR, border=border)
+        (encoded,) = matcher.encode([picture(96, 128, matcher)])
+        found[border] = matcher.match([encoded], [encoded])[0].points0
+    assert found[0].min() < 8
+    assert found[2].min() >= 15.5
+    assert len(found[2]) < len(found[0])
+
+
+@pytest.mark.parametrize("border", [-2, 1.5])
+def test_a_border_that_makes_no_sense_is_refused(border: float) -> None:
+    with pytest.raises(UserError, match="border"):
+        from_table(loftr.SPEC.options, {"border": border}, "recipe")
+
+
+def test_weights_with_optimal_transport_are_refused_with_what_to_take_instead(tmp_path: Path) -> None:
+    surplus = {"coarse_matching.bin_score": torch.ones(())}
+    with pytest.raises(UserError, match=r"'loftr-outdoor' match by optimal transport.*outdoor_ds"):
+        load_standin(loftr, Loftr, tmp_path, Training.OUTDOOR, surplus=surplus)
 
 
 def test_aspanformers_indoor_settings_are_the_published_ones_at_the_published_size() -> None:

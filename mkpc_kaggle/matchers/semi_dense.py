@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from mkpc_kaggle.config import SHARE, check_ranges
+from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Size, from_corner
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import MatcherSpec, Picture, Training
@@ -20,6 +21,8 @@ from mkpc_kaggle.weights import WeightStore, load_into
 
 PREFIX = "matcher."
 """Of every parameter's name in the published training checkpoints."""
+TRANSPORT = "coarse_matching.bin_score"
+"""In checkpoints of networks with optimal transport alone."""
 
 
 @dataclass(frozen=True)
@@ -119,7 +122,13 @@ def to_matches(found: SemiDenseMatches, pairs: int) -> list[Matches]:
 def load_network(network: SemiDenseNetwork[Any], weights: WeightStore, slot: str, *, unused: str = "$^") -> None:
     """Fill a network from the published checkpoint, whose names have the training wrapper's prefix.
 
-    Position tables, which are computed, and names that match ``unused`` are set aside.
+    Position tables, which are computed, and names that match ``unused`` are set aside. Raises :class:`UserError`
+    for weights that were trained with optimal transport.
     """
     tensors = {name.removeprefix(PREFIX): tensor for name, tensor in weights.load(slot).items()}
+    if TRANSPORT in tensors:
+        raise UserError(
+            f"the weights for {slot!r} match by optimal transport, this network by dual softmax: take the file "
+            "trained with it (LoFTR's are called outdoor_ds and indoor_ds_new, not outdoor_ot and indoor_ot)"
+        )
     load_into(network, tensors, what=slot, unused=rf".*pos_encoding\.pe$|{unused}")

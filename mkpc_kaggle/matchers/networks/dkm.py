@@ -1,7 +1,7 @@
 """DKM v3: Edstedt et al., "DKM: Dense Kernelized Feature Matching for Geometry Estimation", CVPR 2023.
 
 Two views of a pair are compared whole; every pixel of each gets a place in the other, and a certainty. The views
-may have any sizes; the published code wants one size of both, where the results are the same.
+may have any sizes; the published code wants one size of both. Pixels of windows and corrections are the query's.
 Coordinates are normalised: (x, y) in [-1, 1], where +-1 are the outer edges of an image (see warp_refiner).
 Parameter names are those of the public checkpoints. For inference only.
 """
@@ -116,7 +116,7 @@ class Decoder(nn.Module):
 
     def correct(self, estimate: Estimate, query: Pyramid, support: Pyramid, stride: int) -> Estimate:
         corrections = self.conv_refiner[str(stride)](query.at(stride), support.at(stride), estimate.flow)
-        return refined(estimate, corrections, stride, _size(support, 1))
+        return refined(estimate, corrections, stride, _size(query, 1))
 
 
 def _size(pyramid: Pyramid, stride: int) -> torch.Size:

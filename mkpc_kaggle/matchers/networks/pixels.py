@@ -11,8 +11,9 @@ MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 def resized(pixels: Tensor, size: tuple[int, int]) -> Tensor:
     """Images (B, C, H, W) uint8 on the CPU -> (B, C, *size) float32 in 0..1.
 
-    Bicubic with antialiasing in 8 bits; differs from PIL, with which networks are trained, by a grey level in
-    about a hundredth of the values.
+    Bicubic with antialiasing in 8 bits, the width first, as by Pillow up to version 12, with which networks are
+    trained: about a hundredth of the values differ, by a grey level or two. Pillow 13 begins with the height where
+    it shrinks and the width grows; there a fifth of the values differ or more.
     """
     if pixels.shape[2:] != size:
         pixels = functional.interpolate(pixels, size, mode="bicubic", antialias=True, align_corners=False)

@@ -5,6 +5,7 @@ Normalised coordinates: (x, y) in [-1, 1], where +-1 are the outer edges of an i
 """
 
 from dataclasses import dataclass
+from math import ceil
 
 import torch
 from torch import Tensor, nn
@@ -67,10 +68,8 @@ class Refiner(nn.Module):
     def forward(self, query: Tensor, support: Tensor, flow: Tensor, stretch: float = 1) -> Tensor:
         """Corrections (B, 3, h, w) of features (B, C, h, w) and (B, C, h', w') and a flow (B, 2, h, w).
 
-        Displacements are shown to the network multiplied by ``stretch``.
-
-        Channel 0 is added to the certainty's logit; 1 and 2 are x and y in eighths of the support's pixel at this
-        scale.
+        Displacements are shown to the network multiplied by ``stretch``. Channel 0 is added to the certainty's
+        logit; 1 and 2 are x and y in eighths of the query's pixel at this scale, as shares of the image's sides.
         """
         x = self._look(query, support, flow, stretch)  # (B, inputs, h, w)
         for depthwise, norm, _, mix in (self.block1, *self.hidden_blocks):
@@ -112,7 +111,7 @@ def by_rows(pointwise: nn.Conv2d, x: Tensor) -> Tensor:
 
 
 def refined(estimate: Estimate, corrections: Tensor, stride: int, full: torch.Size) -> Estimate:
-    """The estimate after a refiner's corrections; ``full`` (H, W): the support's size in the same pass."""
+    """The estimate after a refiner's corrections; ``full`` (H, W): the query's size in the same pass."""
     height, width = full
     unit = corrections.new_tensor([stride / (4 * width), stride / (4 * height)])  # an eighth of a pixel
     flow = estimate.flow + corrections[:, 1:] * unit[:, None, None]
@@ -122,34 +121,47 @@ def refined(estimate: Estimate, corrections: Tensor, stride: int, full: torch.Si
 def local_correlation(query: Tensor, support: Tensor, flow: Tensor, radius: int) -> Tensor:
     """Dot products of each pixel's features with the support's around its target, over sqrt(C).
 
-    (B, C, h, w), (B, C, h', w') and (B, 2, h, w) -> (B, (2 radius + 1)^2, h, w), float32. The window moves in
-    steps of one pixel of the support, row by row; the support is zero outside, bilinear between pixels.
+    (B, C, h, w), (B, C, h', w') and (B, 2, h, w) -> (B, (2 radius + 1)^2, h, w), float32. The window moves row by
+    row in steps of 2 / w and 2 / h, one pixel of the query; the support is zero outside, bilinear between pixels.
 
-    All samples of a pixel have one fraction: its products with the (2 radius + 2)^2 nearest pixels are blended.
+    A product with a bilinear sample is the bilinear sample of products: each pixel meets the whole pixels that its
+    window covers, and both axes are interpolated afterwards.
     """
-    batch, channels, height, width = support.shape
-    size = flow.new_tensor([width, height])
-    target = ((as_grid(flow) + 1) * size - 1) / 2  # (B, h, w, 2) pixels
-    corner = target.floor()
-    fraction_x, fraction_y = (target - corner).reshape(-1, 2, 1, 1).unbind(1)  # (P, 1, 1)
-
-    reach = torch.arange(-radius, radius + 2, device=flow.device)
-    columns, rows = (corner.reshape(-1, 2, 1).long() + reach).unbind(1)  # (P, 2 radius + 2)
-    outside = _beyond(rows, height)[:, :, None] | _beyond(columns, width)[:, None]  # (P, 2 r + 2, 2 r + 2)
-    pixels = flow.shape[2] * flow.shape[3]  # of one query
-    image = torch.arange(batch, device=flow.device).repeat_interleave(pixels)[:, None] * height
-    index = ((image + rows.clamp(0, height - 1)) * width)[:, :, None] + columns.clamp(0, width - 1)[:, None]
+    size, size1 = query.shape[2:], support.shape[2:]
+    targets = ((as_grid(flow).reshape(-1, 2) + 1) * flow.new_tensor(size1[::-1]) - 1) / 2  # (P, 2) pixels
+    along_x, along_y = (
+        Taps.around(targets[:, axis], length1, length1 / length, radius)
+        for axis, length, length1 in ((0, size[1], size1[1]), (1, size[0], size1[0]))
+    )
+    image = torch.arange(len(query), device=flow.device).repeat_interleave(size.numel())  # (P,)
+    rows = image[:, None] * size1[0] + along_y.pixels
+    index = (rows * size1[1])[:, :, None] + along_x.pixels[:, None]  # (P, Ky, Kx)
 
     queries, keys = (as_grid(features.float()).flatten(0, 2) for features in (query, support))
-    products = _products(queries, keys, index.flatten(1))
-    products = products.view_as(index).masked_fill_(outside, 0)
-    products = torch.lerp(products[:, :-1], products[:, 1:], fraction_y)
-    products = torch.lerp(products[..., :-1], products[..., 1:], fraction_x)  # (P, 2 r + 1, 2 r + 1)
-    return as_map(products.mul_(channels**-0.5).view(batch, *flow.shape[2:], -1))
+    products = _products(queries, keys, index.flatten(1)).view_as(index)
+    window = along_y.weights @ products @ along_x.weights.mT  # (P, 2 radius + 1, 2 radius + 1)
+    return as_map(window.mul_(query.shape[1] ** -0.5).view(len(query), *size, -1))
 
 
-def _beyond(index: Tensor, length: int) -> Tensor:
-    return (index < 0) | (index >= length)
+@dataclass(frozen=True, eq=False)
+class Taps:
+    """Of P targets on one axis the K whole ``pixels`` (P, K) int64 that their windows cover, and their ``weights``
+    (P, 2 radius + 1, K) in each step of the window: linear, zero outside the axis.
+    """
+
+    pixels: Tensor
+    weights: Tensor
+
+    @classmethod
+    def around(cls, targets: Tensor, length: int, step: float, radius: int) -> "Taps":
+        steps = torch.arange(-radius, radius + 1, device=targets.device) * step
+        first = (targets - radius * step).floor()
+        reach = torch.arange(ceil(2 * radius * step) + 2, device=targets.device)
+        positions = (targets - first)[:, None] + steps  # (P, 2 radius + 1), from the first pixel
+        weights = (positions[:, :, None] - reach).abs_().neg_().add_(1).clamp_(min=0)
+        pixels = first[:, None].long() + reach
+        outside = (pixels < 0) | (pixels >= length)
+        return cls(pixels.clamp_(0, length - 1), weights.masked_fill_(outside[:, None], 0))
 
 
 def _products(queries: Tensor, keys: Tensor, index: Tensor) -> Tensor:
