@@ -54,8 +54,7 @@ TRIALS = {
     "aspanformer": SEMI_DENSE,
     "loma": Trial(
         ("long_side = 209", "long_side = 150"),
-        easy="match_threshold = 0.0",
-        options='variant = "b128"\nmax_keypoints = 300',
+        options='variant = "b128"\nmax_keypoints = 300\nmatch_threshold = 0.0',
     ),
     "dkm": Trial(('area = "96x128"', 'area = "70x90"'), options="matches = 300"),
     "roma": Trial(('area = "96x128"', 'area = "70x90"'), options="matches = 300"),
