@@ -181,6 +181,12 @@ class Recipe:
             whole.setdefault(unit.name, unit)
         return replace(self, name=name, units=tuple(whole.values()))
 
+    def with_scenes(self, on: bool | None) -> "Recipe":
+        """The recipe with the reconstruction of batches switched on or off; ``None``: as it is."""
+        if on is None or on == (self.scene is not None):
+            return self
+        return replace(self, scene=SceneConfig() if on else None)
+
     def fingerprint(self) -> dict[str, Any]:
         """All that decides what a run computes, as JSON-able values; name and description are no part of it."""
         values = asdict(self)

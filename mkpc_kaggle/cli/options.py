@@ -61,6 +61,32 @@ def add_mode(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_scenes(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--scenes",
+        action=argparse.BooleanOptionalAction,
+        help="reconstruct the pairs of a batch together and take F from the cameras, or not (default: as the "
+        "recipe has it; the paper's recipes have not). A pair's F then comes from other pairs, too: read your "
+        "competition's rules on that, and compare published stereo scores with --no-scenes",
+    )
+
+
+def add_no_scenes(parser: argparse.ArgumentParser) -> None:
+    """Where ``--scenes`` has another meaning."""
+    parser.add_argument(
+        "--no-scenes",
+        action="store_true",
+        help="F from each pair's own matches alone, whatever the recipe has",
+    )
+
+
+def scenes_of(arguments: argparse.Namespace) -> bool | None:
+    """What is to be done with a recipe's reconstruction of batches; ``None``: as the recipe has it."""
+    if "no_scenes" in arguments:
+        return False if arguments.no_scenes else None
+    return getattr(arguments, "scenes", None)
+
+
 def assembly_of(arguments: argparse.Namespace, choice: "Choice") -> "Assembly":
     """The parts of a run, as the options of :func:`add_matching` say, but for the choice of the recipe."""
     from mkpc_kaggle.pipeline.assembly import Licence, assemble
@@ -72,6 +98,7 @@ def assembly_of(arguments: argparse.Namespace, choice: "Choice") -> "Assembly":
         precision=arguments.precision,
         mode=choice.mode,
         licence=Licence(arguments.licence),
+        scenes=scenes_of(arguments),
     )
 
 

@@ -29,6 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--output", type=Path, default=Path("submission.csv"), help="default: submission.csv")
     options.add_matching(parser)
     options.add_mode(parser)
+    options.add_scenes(parser)
     options.add_time_limit(parser, default="8h45m")
     options.add_engine(parser)
     parser.add_argument(

@@ -42,6 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     options.add_matching(parser)
     options.add_mode(parser)
+    options.add_no_scenes(parser)
     parser.add_argument(
         "--units", metavar="A,B", help="only these of the recipe's units, such as 1:sift@1536; default: all"
     )
@@ -130,7 +131,7 @@ def _read_scenes(arguments: argparse.Namespace, work_dir: Path) -> "tuple[Scene,
 
 def _match_and_score(arguments: argparse.Namespace, scenes: "tuple[Scene, ...]", work_dir: Path) -> int:
     from mkpc_kaggle.engine.session import interruptible
-    from mkpc_kaggle.evaluation.validate import score_table, to_json, validate
+    from mkpc_kaggle.evaluation.validate import own_scores, score_table, to_json, validate
     from mkpc_kaggle.recipe import Choice, Mode
     from mkpc_kaggle.reporting.summary import trouble
 
@@ -139,6 +140,10 @@ def _match_and_score(arguments: argparse.Namespace, scenes: "tuple[Scene, ...]",
         session = _session(arguments, work_dir, interrupt)
         validation, at_rest = validate(scenes, assembly, session)
     _print_summary(arguments, validation, scenes, assembly)
+    if any(record.scene is not None for record in validation.records):
+        print("F of each pair's own matches:")
+        print("\n".join(score_table(own_scores(validation, scenes))))
+        print("F of the scene where there is one:")
     print("\n".join(score_table(validation)))
     _write_json(arguments.json, to_json(validation))
     _write_report(arguments, scenes, session)

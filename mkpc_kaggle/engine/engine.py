@@ -46,7 +46,8 @@ class RunReport:
     """What a run leaves behind: a record for every pair, in their order, and how it went.
 
     ``resumed`` pairs were done by earlier runs; ``faults`` are jobs that were lost and files that could not be
-    written, with their reasons; ``unwritten`` says why the last version of the submission could not be.
+    written, with their reasons; ``unwritten`` says why the last version of the submission could not be. ``scenes``
+    are the batches that were reconstructed, or could not be.
     """
 
     records: tuple[PairRecord, ...]
@@ -56,6 +57,7 @@ class RunReport:
     faults: tuple[str, ...]
     explanations: tuple[Explanation, ...] = ()
     unwritten: str = ""
+    scenes: tuple[SceneRecord, ...] = ()
 
 
 class RunJournal(Protocol):
@@ -66,6 +68,8 @@ class RunJournal(Protocol):
     def results(self, pair: int, units: Mapping[str, Unit]) -> tuple[UnitResult, ...]: ...
 
     def save(self, outcomes: list[tuple[Outcome, bool]]) -> None: ...
+
+    def scenes(self) -> tuple[SceneRecord, ...]: ...
 
     def save_scene(self, scene: SceneRecord, choices: Mapping[int, Choice]) -> None: ...
 
@@ -112,6 +116,7 @@ class Engine:
         self._publishing = threading.Lock()
         self.planner = self._planner(timeouts)
         self.scenes = SceneQueue(pairs, recipe.scene)
+        self._scene_records = {scene.batch: scene for scene in journal.scenes()}
         self.scenes.note_solved(record.index for record in self.planner.records if record.scene is not None)
 
     def run(self) -> RunReport:
@@ -141,6 +146,7 @@ class Engine:
             tuple(self.faults),
             tuple(self.planner.explanations),
             self.unwritten,
+            tuple(self._scene_records.values()),
         )
 
     def save_what_there_is(self, seconds: float) -> None:
@@ -195,6 +201,7 @@ class Engine:
     def _keep_scene(self, result: SceneResult) -> None:
         choices = dict(result.choices or {})
         record = SceneRecord.of(result.batch, result.scenes, result.seconds, result.failure)
+        self._scene_records[result.batch] = record
         for index, choice in choices.items():
             self.planner.set_scene(index, choice)
         if result.failure:

@@ -98,6 +98,28 @@ def validate(scenes: Sequence[Scene], assembly: Assembly, session: Session) -> t
     return Validation(assembly.recipe.name, scored, report), at_rest
 
 
+def own_scores(validation: Validation, scenes: Sequence[Scene]) -> Validation:
+    """The same run, each pair scored by the F of its own matches: what its scene's cameras are compared with."""
+    scored = tuple(
+        SceneScore(
+            score.scene,
+            tuple(
+                PairScore(pair.id, pair.covisibility, _own_error(pair, true, scene), pair.record)
+                for pair, true in zip(score.pairs, scene.pairs, strict=True)
+            ),
+            score.in_metres,
+        )
+        for score, scene in zip(validation.scenes, scenes, strict=True)
+    )
+    return Validation(validation.recipe, scored, validation.report)
+
+
+def _own_error(pair: PairScore, true: TruePair, scene: Scene) -> PoseError:
+    if pair.record is None or pair.record.failure:
+        return PoseError.failed()
+    return error_of(pair.record.F, true, scene)
+
+
 def score_record(true: TruePair, record: PairRecord, scene: Scene) -> PairScore:
     """The score of what the engine made of a pair; the fallback row counts as a failure."""
     error = PoseError.failed() if record.source == "fallback" else error_of(record.fundamental, true, scene)

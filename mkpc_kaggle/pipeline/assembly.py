@@ -113,6 +113,7 @@ def assemble(
     device: str = AUTO,
     precision: str = Precision.FLOAT32,
     mode: Mode = Mode.TWO_STAGE,
+    scenes: bool | None = None,
     licence: Licence = Licence.ANY,
     matchers: Mapping[str, Matcher[Any]] | None = None,
 ) -> Assembly:
@@ -120,7 +121,7 @@ def assemble(
 
     Recipe ``auto`` drops the units whose matcher cannot be imported here, with a warning, and those whose weights
     are missing or not permitted; for any other recipe these raise :class:`UserError`, as do unknown names and
-    damaged files.
+    damaged files. ``scenes`` switches the reconstruction of batches on or off; ``None``: as the recipe has it.
     """
     own = matchers or {}
     store = WeightStore(weights)
@@ -146,7 +147,7 @@ def assemble(
             "Name their directory with --weights, or use --recipe auto, which does with what there is."
         )
     lacking = {n for n in not_own(wanted.matcher_names, own) if not set(missing).isdisjoint(slots_of(wanted, [n]))}
-    chosen = wanted.only(lambda unit: unit.matcher not in lacking | refused.keys())
+    chosen = wanted.only(lambda unit: unit.matcher not in lacking | refused.keys()).with_scenes(scenes)
     left_out = tuple(unit for unit in whole.units if unit not in chosen.units)
     return Assembly(chosen.in_mode(mode), store, resolve_placement(device, precision), left_out, own, device)
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.journal import DRAWN, About, Event, EventKind, JournalReader
-from mkpc_kaggle.engine.records import PairRecord
+from mkpc_kaggle.engine.records import PairRecord, SceneRecord
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.pipeline.pair import UnitResult
 from mkpc_kaggle.recipe import Recipe, recipe_of
@@ -30,7 +30,7 @@ class RunLog:
 
     ``records`` are one a pair, in order, those not reached among them. ``events`` are those of all sessions;
     ``weakest`` are the pairs with the fewest inliers of those that were matched. ``digests`` are those of the
-    test set and of the weights, by name.
+    test set and of the weights, by name. ``scenes`` are the batches that were reconstructed, or could not be.
     """
 
     path: Path
@@ -41,6 +41,7 @@ class RunLog:
     records: tuple[PairRecord, ...]
     events: tuple[Event, ...]
     weakest: tuple[WeakPair, ...]
+    scenes: tuple[SceneRecord, ...] = ()
 
     @cached_property
     def tables(self) -> RunTables:
@@ -86,7 +87,8 @@ def read_log(directory: Path) -> RunLog:
         units = {unit.name: unit for unit in recipe.units}
         weakest = tuple(WeakPair(record, journal.results(record.index, units)) for record in touched[:DRAWN])
         digests = {"test set": str(belongs_to.get("test set", "")), **belongs_to.get("weights", {})}
-        return RunLog(journal.path, about, recipe, digests, pairs, records, journal.events(), weakest)
+        events, scenes = journal.events(), journal.scenes()
+        return RunLog(journal.path, about, recipe, digests, pairs, records, events, weakest, scenes)
 
 
 def write_csv(log: RunLog, directory: Path) -> list[Path]:

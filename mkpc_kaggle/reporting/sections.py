@@ -7,8 +7,10 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from importlib.util import find_spec
 from math import inf
+from statistics import median
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
@@ -42,6 +44,7 @@ if TYPE_CHECKING:
 
 MOST_GROUPS = 30
 MOST_CHANGES = 5
+MOST_SCENES = 4
 DRAWING_SECONDS = 4.0
 """Time that must be left to begin to draw: matplotlib alone takes one or two to load."""
 
@@ -88,6 +91,7 @@ def sections_of(log: RunLog, artist: Artist) -> list[Section]:
         Section("What upgrades changed", [*_upgrades(log, artist)]),
         Section("Inliers by batch", [*_groups(log, artist)]),
         Section("Critical regions", [*_regions(log, artist)]),
+        Section("Scenes", [*_scenes(log, artist)]),
         Section("The weakest pairs", [*_weakest(log, artist)]),
         Section("Failures", [*_failures(log)]),
         Section("What made this", [*_origin(log)]),
@@ -201,6 +205,32 @@ def _regions(log: RunLog, artist: Artist) -> Iterator[Block]:
     rows = [(reason, len(some), *(f"{side:.0f}" for side in some.median())) for reason, some in by_reason.items()]
     yield Table(("reason", "regions", "width", "height"), rows)
     yield Text("Width and height are medians. For any reason but “cropped” the whole image stands in.")
+
+
+def _scenes(log: RunLog, artist: Artist) -> Iterator[Block]:
+    """The batches that were reconstructed: cameras from above, and which pairs have their F from there."""
+    if not log.scenes:
+        yield Text("No batch was reconstructed: recipe or command say so, or none has three images.", dim=True)
+        return
+    largest = sorted((scene for scene in log.scenes if scene.placed), key=lambda scene: -scene.placed)
+    for scene in largest[:MOST_SCENES]:
+        yield from artist.plot(partial(figures.draw_cameras, scene))
+    pairs = log.tables.pairs
+    counts = pairs[pairs["source"] == "scene"].groupby("group").size()
+    rows = [
+        (
+            *(scene.batch, f"{scene.placed} of {scene.images}", scene.models, scene.points),
+            f"{median(camera.focal for camera in scene.cameras):.0f}" if scene.cameras else "-",
+            *(f"{scene.seconds:.1f}", int(counts.get(scene.batch, 0)), scene.failure),
+        )
+        for scene in log.scenes
+    ]
+    heads = ("batch", "images", "models", "points", "focal (px)", "seconds", "pairs", "failure")
+    yield from first_rows(heads, rows)
+    reasons = Counter(str(record.scene.reason) for record in log.records if record.scene is not None)
+    yield Table(("which F a pair has, and why", "pairs"), list(reasons.most_common()))
+    alone = sum(record.source == "scene" and bool(record.failure) for record in log.records)
+    yield Text(f"{alone} pairs would have no F without their scene.")
 
 
 def _weakest(log: RunLog, artist: Artist) -> Iterator[Block]:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.budget import format_duration
 from mkpc_kaggle.engine.engine import Ending, RunReport
-from mkpc_kaggle.engine.records import PairRecord
+from mkpc_kaggle.engine.records import PairRecord, SceneRecord
 from mkpc_kaggle.recipe import Unit
 from mkpc_kaggle.reporting.run_log import RunLog
 from mkpc_kaggle.reporting.tables import RunTables, run_tables, seconds_by_part, unit_failures, unit_means
@@ -20,6 +20,7 @@ def summary(pairs: Sequence[Pair], report: RunReport, left_out: Sequence[Unit] =
     resumed = f", {report.resumed} of them from earlier runs" if report.resumed else ""
     names = [unit.name for unit in left_out]
     lines = [_headline(tables, report.ending, report.seconds) + resumed, *_counts(tables)]
+    lines += _scenes(tables, report.scenes)
     lines += _upgrades(report.records) + _troubles(tables, names, report.faults)
     return "\n".join([*lines, *filter(None, [trouble(report)])])
 
@@ -56,6 +57,7 @@ def overview(log: RunLog) -> str:
         _headline(log.tables, log.ending, log.seconds),
         f"recipe {log.about.recipe}, {log.about.device}, {len(log.events)} events",
         *_counts(log.tables),
+        *_scenes(log.tables, log.scenes),
     ]
     return "\n".join(lines + _upgrades(log.records) + _troubles(log.tables, log.about.left_out, log.faults))
 
@@ -88,6 +90,20 @@ def _counts(tables: RunTables) -> list[str]:
     pairs = max(1, len(tables.pairs))
     parts = [f"{name} {seconds / pairs:.3f}" for name, seconds in seconds_by_part(tables).items()]
     return [*lines, "seconds a pair: " + ", ".join(parts)]
+
+
+def _scenes(tables: RunTables, scenes: Sequence[SceneRecord]) -> list[str]:
+    """How many batches and images were reconstructed, whose F is from there, and why the others were not."""
+    if not scenes:
+        return []
+    made = [scene for scene in scenes if scene.placed]
+    images = f"{sum(scene.placed for scene in scenes)} of {sum(scene.images for scene in scenes)} images"
+    pairs = f"F of {sum(tables.pairs['source'] == 'scene')} of {len(tables.pairs)} pairs is from them"
+    reasons = Counter(scene.failure for scene in scenes if scene.failure)
+    lines = [f"scenes: {len(made)} of {len(scenes)} batches reconstructed with {images}; {pairs}"]
+    return lines + [
+        f"  {count} batches without a scene: {reason}" for reason, count in reasons.most_common(MOST_LINES)
+    ]
 
 
 def _upgrades(records: Sequence[PairRecord]) -> list[str]:

@@ -66,8 +66,7 @@ def scene_of(component: Component, images: tuple[BatchImage, ...], config: Scene
     except (RuntimeError, ValueError) as error:
         return Scene(names, failure=f"pycolmap failed: {error}")
     models, doubts = believable(found, config)
-    failure = "" if models else "; ".join(("no model came of the matches", *doubts))
-    return Scene(names, models, doubts, failure)
+    return Scene(names, models, doubts, "" if models else "no believable model came of the matches")
 
 
 def models_of(scenes: tuple[Scene, ...]) -> tuple[Model, ...]:

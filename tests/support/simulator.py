@@ -8,7 +8,7 @@ import heapq
 import math
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -19,11 +19,12 @@ from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.engine import Ending, Engine, RunReport
 from mkpc_kaggle.engine.jobs import Cause, Job, JobFailure, JobResult, Outcome
 from mkpc_kaggle.engine.pools.pool import JOBS_A_WORKER
-from mkpc_kaggle.engine.records import NOT_REACHED, PairRecord, UnitRecord
+from mkpc_kaggle.engine.records import NOT_REACHED, PairRecord, SceneRecord, UnitRecord
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
 from mkpc_kaggle.pipeline.pair import UnitResult
 from mkpc_kaggle.recipe import Recipe, Unit
+from mkpc_kaggle.scene.choose import Choice
 
 RESTART_SECONDS = 8.0
 STALL = 20.0
@@ -241,6 +242,15 @@ class MemoryJournal:
         for outcome, _ in outcomes:
             index = outcome.record.index
             self._results[index] = self._results.get(index, ()) + outcome.results
+
+    def scenes(self) -> tuple[SceneRecord, ...]:
+        return ()
+
+    def save_scene(self, scene: SceneRecord, choices: Mapping[int, Choice]) -> None:
+        pass
+
+    def settle(self, indices: Iterable[int]) -> None:
+        pass
 
     def note(self, kind: str, seconds: float, text: str) -> None:
         pass

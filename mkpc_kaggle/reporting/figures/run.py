@@ -14,6 +14,7 @@ from mkpc_kaggle.reporting.figures.canvas import (
     OUTLIER,
     legend,
     new_figure,
+    plain,
     plain_axes,
     sample,
     short,
@@ -21,6 +22,8 @@ from mkpc_kaggle.reporting.figures.canvas import (
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+    from mkpc_kaggle.engine.records import SceneRecord
 
 MOST_EMPTY = 4
 """How many times as long as the run a time limit may be to be drawn beside it."""
@@ -144,6 +147,30 @@ def draw_crops(sizes: Mapping[str, Sequence[tuple[int, int]]]) -> "Figure":
     axes.set_xlabel("width", color=INK)
     axes.set_ylabel("height", color=INK)
     legend(axes)
+    return figure
+
+
+def draw_cameras(scene: "SceneRecord") -> "Figure":
+    """The cameras of a batch from above and from the side, an arrow the way each looks; in the models' own units.
+
+    Above is where the cameras' common up direction points, as far as they were held upright.
+    """
+    figure = new_figure(8.4, 3.6)
+    cameras = [camera for camera in scene.cameras if camera.model == 0]
+    centres = np.array([camera.centre for camera in cameras])
+    looks = np.array([camera.forward for camera in cameras])
+    axes = np.linalg.svd(centres - centres.mean(axis=0))[2]  # along, across, and up for cameras on the ground
+    spread = np.ptp(centres @ axes.T, axis=0).max() or 1.0
+    for panel, (first, second), name in zip(
+        figure.subplots(1, 2), ((0, 1), (0, 2)), ("above", "the side"), strict=True
+    ):
+        plain(panel, f"{short(scene.batch)}: {len(cameras)} cameras from {name}")
+        x, y = centres @ axes[first], centres @ axes[second]
+        u, v = looks @ axes[first], looks @ axes[second]
+        panel.quiver(x, y, u, v, color=CLUSTERS[3], angles="xy", scale_units="xy", scale=8 / spread, width=0.004)
+        panel.scatter(x, y, s=14, color=OUTLIER, linewidths=0, zorder=3)
+        panel.set_aspect("equal", adjustable="datalim")
+        panel.margins(0.2)
     return figure
 
 
