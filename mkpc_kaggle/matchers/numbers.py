@@ -1,5 +1,6 @@
 """What networks may compute with: float32 that is float32, and finite numbers."""
 
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
@@ -13,8 +14,11 @@ def exact_float32() -> Iterator[None]:
     """Within it NVIDIA GPUs multiply float32 as float32, not as TF32 with its 10 bits of mantissa.
 
     PyTorch takes TF32 for convolutions unless told otherwise. The settings are those of the process, and are put
-    back at the end.
+    back at the end. Where nothing has imported PyTorch, which takes seconds, nothing computes with it.
     """
+    if "torch" not in sys.modules:
+        yield
+        return
     import torch
 
     backends = torch.backends
@@ -45,11 +49,14 @@ def check_finite(what: str, *values: Any) -> None:
     ``what`` names the values, which may be nested dataclasses and sequences. It costs one pass over the
     tensors and one wait for the device.
     """
+    tensors = list(float_tensors(values))
+    if not tensors:
+        return
     import torch
 
     # A sum is infinite or NaN where an addend is; half precision adds up in float32, so that nothing overflows.
-    sums = [tensor.sum(dtype=torch.float32) for tensor in float_tensors(values)]
-    if sums and not bool(torch.stack(sums).isfinite().all()):
+    sums = [tensor.sum(dtype=torch.float32) for tensor in tensors]
+    if not bool(torch.stack(sums).isfinite().all()):
         raise NonFiniteError(f"{what} are not finite")
 
 

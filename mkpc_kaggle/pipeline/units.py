@@ -1,5 +1,6 @@
 """One unit on a batch of pairs: views, encodings, matches; and what to do where memory or numbers do not hold."""
 
+import sys
 import time
 import warnings
 from collections.abc import Callable, Sequence
@@ -150,9 +151,10 @@ class UnitRunner:
 
 def release_memory() -> None:
     """Give the GPU the memory back that PyTorch keeps for later: cuBLAS and cuDNN cannot use it."""
-    import torch
+    if "torch" in sys.modules:
+        import torch
 
-    torch.cuda.empty_cache()
+        torch.cuda.empty_cache()
 
 
 def views_of(unit: Unit, spec: MatcherSpec, pair: PairMatch) -> tuple[View, View]:

@@ -161,12 +161,11 @@ def draw_cameras(scene: "SceneRecord") -> "Figure":
     looks = np.array([camera.forward for camera in cameras])
     axes = np.linalg.svd(centres - centres.mean(axis=0))[2]  # along, across, and up for cameras on the ground
     spread = np.ptp(centres @ axes.T, axis=0).max() or 1.0
-    for panel, (first, second), name in zip(
-        figure.subplots(1, 2), ((0, 1), (0, 2)), ("above", "the side"), strict=True
-    ):
+    sides = (("above", 1), ("the side", 2))
+    for panel, (name, upward) in zip(figure.subplots(1, 2), sides, strict=True):
         plain(panel, f"{short(scene.batch)}: {len(cameras)} cameras from {name}")
-        x, y = centres @ axes[first], centres @ axes[second]
-        u, v = looks @ axes[first], looks @ axes[second]
+        x, y = centres @ axes[0], centres @ axes[upward]
+        u, v = looks @ axes[0], looks @ axes[upward]
         panel.quiver(x, y, u, v, color=CLUSTERS[3], angles="xy", scale_units="xy", scale=8 / spread, width=0.004)
         panel.scatter(x, y, s=14, color=OUTLIER, linewidths=0, zorder=3)
         panel.set_aspect("equal", adjustable="datalim")
