@@ -160,7 +160,7 @@ def test_a_journal_of_an_older_format_is_refused_and_left_as_it_was(tmp_path: Pa
     db.commit()
     db.close()
     before = path.read_bytes()
-    with pytest.raises(UserError, match=r"journal format 1, this version has 2.*--fresh"):
+    with pytest.raises(UserError, match=r"journal format 1, this version has 3.*--fresh"):
         Journal(tmp_path, BELONGS_TO)
     with pytest.raises(UserError, match="journal format 1"):
         read_log(tmp_path)
@@ -182,7 +182,7 @@ def test_the_page_has_all_sections_pictures_inside_and_asks_for_nothing(tmp_path
     assert report_run(work, tmp_path / "new" / "report.html", time.monotonic() + 600, pairs).startswith("report: ")
     text = (tmp_path / "new" / "report.html").read_text(encoding="utf-8")
     tags = Tags(text)
-    assert tags.names.count("h2") == 9
+    assert tags.names.count("h2") == 10
     assert tags.names.count("img") == DRAWN
     assert tags.names.count("svg") >= 3
     assert "script" not in tags.names
@@ -245,7 +245,7 @@ def test_without_matplotlib_the_page_has_tables_and_says_so(
 def test_a_run_of_no_pairs_has_a_page(tmp_path: Path) -> None:
     empty_journal(tmp_path, []).close()
     log = read_log(tmp_path)
-    assert Tags(report_page(log, Artist())).names.count("h2") == 9
+    assert Tags(report_page(log, Artist())).names.count("h2") == 10
     assert all(table.empty for name, table in log.tables.named().items() if name != "events")
     assert overview(log)
 

@@ -73,7 +73,7 @@ class RunJournal(Protocol):
 
     def save_scene(self, scene: SceneRecord, choices: Mapping[int, Choice]) -> None: ...
 
-    def settle(self, indices: Iterable[int]) -> None: ...
+    def settle(self, records: Iterable[PairRecord]) -> None: ...
 
     def note(self, kind: str, seconds: float, text: str) -> None: ...
 
@@ -207,10 +207,10 @@ class Engine:
         if result.failure:
             self._fault(f"batch {result.batch} was not reconstructed: {result.failure}")
         self._note(EventKind.SCENE, f"{record.batch}: {record.placed} of {record.images} images")
-        done = [i for i in self.scenes.batches[result.batch] if not self.planner.wanted(self.planner.records[i])]
+        records = [self.planner.records[index] for index in self.scenes.batches[result.batch]]
         try:
             self.journal.save_scene(record, choices)
-            self.journal.settle(done)
+            self.journal.settle(one for one in records if one.units and not self.planner.wanted(one))
         except sqlite3.Error as error:
             self._fault(f"the journal cannot be written ({error}): an interrupted run would have to do this again")
 

@@ -262,7 +262,10 @@ class Journal(_Tables):
         with self._db:
             self._db.execute("BEGIN")
             for outcome, settled in outcomes:
-                self._save(outcome, settled and not self._is_weak(outcome, drawn))
+                stronger = self._enter(outcome.record, drawn) if settled and outcome.results else None
+                self._save(outcome, settled and (not outcome.results or stronger == outcome.record.index))
+                if stronger is not None:
+                    self._drop_points(stronger)
         self._drawn = drawn
 
     def save_scene(self, scene: SceneRecord, choices: Mapping[int, Choice]) -> None:
@@ -274,12 +277,16 @@ class Journal(_Tables):
             self._db.executemany("REPLACE INTO choice VALUES (?, ?, ?)", rows)
             self._db.execute("REPLACE INTO scene VALUES (?, ?, ?, ?, ?, ?, ?, ?)", values)
 
-    def settle(self, indices: Iterable[int]) -> None:
+    def settle(self, records: Iterable[PairRecord]) -> None:
         """Drop the points of pairs that no later job or scene needs; the weakest keep theirs for the report."""
+        drawn = dict(self._drawn)
         with self._db:
             self._db.execute("BEGIN")
-            for index in set(indices) - self._drawn.keys():
-                self._db.execute("UPDATE unit SET points = NULL WHERE pair = ?", [index])
+            for record in records:
+                stronger = self._enter(record, drawn)
+                if stronger is not None:
+                    self._drop_points(stronger)
+        self._drawn = drawn
 
     def note(self, kind: str, seconds: float, text: str) -> None:
         """Put down what happened, ``seconds`` after the start; ``kind`` is an :class:`EventKind`.
@@ -295,17 +302,17 @@ class Journal(_Tables):
         self._db.close()
         self._lock.close()
 
-    def _is_weak(self, outcome: Outcome, drawn: dict[int, int]) -> bool:
-        """Enter a settled pair among the weakest so far if it is one of them; who leaves loses its points."""
-        if not outcome.results:
-            return False
-        drawn[outcome.record.index] = outcome.record.inliers
+    def _enter(self, record: PairRecord, drawn: dict[int, int]) -> int | None:
+        """Enter a settled pair among the weakest so far; the pair that is too strong to be among them, if any."""
+        drawn[record.index] = record.inliers
         if len(drawn) <= DRAWN:
-            return True
+            return None
         strongest = max(drawn, key=lambda index: (drawn[index], index))
         del drawn[strongest]
-        self._db.execute("UPDATE unit SET points = NULL WHERE pair = ?", [strongest])
-        return strongest != outcome.record.index
+        return strongest
+
+    def _drop_points(self, index: int) -> None:
+        self._db.execute("UPDATE unit SET points = NULL WHERE pair = ?", [index])
 
     def _save(self, outcome: Outcome, settled: bool) -> None:
         record = outcome.record

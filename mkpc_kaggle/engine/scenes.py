@@ -71,6 +71,7 @@ class Reconstruction:
         try:
             scenes, choices = self._answers.recv()
         except (EOFError, OSError):
+            self._process.join(timeout=1.0)  # its pipe closes before it has ended
             self.kill()
             return SceneResult(self.batch, seconds=seconds, failure=f"its process ended: {self._ended()}")
         self.kill()

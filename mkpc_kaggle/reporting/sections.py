@@ -219,13 +219,13 @@ def _scenes(log: RunLog, artist: Artist) -> Iterator[Block]:
     counts = pairs[pairs["source"] == "scene"].groupby("group").size()
     rows = [
         (
-            *(scene.batch, f"{scene.placed} of {scene.images}", scene.models, scene.points),
+            *(scene.batch, f"{scene.placed} of {scene.images}", scene.points),
             f"{median(camera.focal for camera in scene.cameras):.0f}" if scene.cameras else "-",
             *(f"{scene.seconds:.1f}", int(counts.get(scene.batch, 0)), scene.failure),
         )
         for scene in log.scenes
     ]
-    heads = ("batch", "images", "models", "points", "focal (px)", "seconds", "pairs", "failure")
+    heads = ("batch", "images", "points", "focal (px)", "seconds", "pairs", "failure")
     yield from first_rows(heads, rows)
     reasons = Counter(str(record.scene.reason) for record in log.records if record.scene is not None)
     yield Table(("which F a pair has, and why", "pairs"), list(reasons.most_common()))

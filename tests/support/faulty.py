@@ -3,18 +3,26 @@
 import os
 import resource
 import signal
+import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from multiprocessing.connection import Connection
 from pathlib import Path
 
 import numpy as np
 from rectified import RectifiedMatcher, Seen
 
 from mkpc_kaggle.data.images import Unreadable
+from mkpc_kaggle.engine.scenes import ScenePair, reconstruct_batch
+from mkpc_kaggle.geometry.cameras import Camera
+from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.pipeline.assembly import Assembly
 from mkpc_kaggle.pipeline.stages import Pipeline
+from mkpc_kaggle.scene.choose import Choice, Reason
+from mkpc_kaggle.scene.config import SceneConfig
+from mkpc_kaggle.scene.model import Model, PlacedImage, Scene
 
 
 def pipeline_once(assembly: Assembly, marker: Path) -> Pipeline:
@@ -179,3 +187,39 @@ class FarMatcher(RectifiedMatcher):
         vars(self).update(state)
         ray_actor.stamp_of = lambda _: None
         ray_actor.read_image = lambda path: Unreadable(str(path), "not on this machine")
+
+
+SCENE_F = np.array([[0.0, 0, 0.2], [0, 0, -0.5], [-0.3, 0.6, 0.5]])
+"""What the scene of these tests says of every pair."""
+
+
+def choose_scene_for_all_but_the_first(pairs: Sequence[ScenePair], _: SceneConfig, answers: Connection) -> None:
+    """As a reconstruction would, without one."""
+    choices = {pair.index: Choice(SCENE_F, Reason.SCENE) for pair in pairs[1:]}
+    choices[pairs[0].index] = Choice(None, Reason.CONTRADICTION)
+    names = tuple(sorted({str(path) for pair in pairs for path in pair.images}))
+    camera = Camera(np.eye(3), np.eye(3), np.zeros(3))
+    placed = tuple(PlacedImage(name, Size(80, 72), camera, 99) for name in names)
+    answers.send(((Scene(names, (Model(placed, np.zeros((5, 3)), 0.5),)),), choices))
+
+
+def die_as_scene(*_: object) -> None:
+    die()
+
+
+def raise_as_scene(*_: object) -> None:
+    raise SystemExit(3)
+
+
+def hang_as_scene(*_: object) -> None:
+    hang()
+
+
+def exhaust_memory_as_scene(*_: object) -> None:
+    sys.stderr = open(os.devnull, "w")  # noqa: PTH123, SIM115  # its traceback is no part of the test's output
+    exhaust_memory()
+
+
+def scene_without_pycolmap(pairs: Sequence[ScenePair], config: SceneConfig, answers: Connection) -> None:
+    sys.modules["pycolmap"] = None  # type: ignore[assignment]  # an import of it fails now
+    reconstruct_batch(pairs, config, answers)

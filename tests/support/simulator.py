@@ -249,7 +249,7 @@ class MemoryJournal:
     def save_scene(self, scene: SceneRecord, choices: Mapping[int, Choice]) -> None:
         pass
 
-    def settle(self, indices: Iterable[int]) -> None:
+    def settle(self, records: Iterable[PairRecord]) -> None:
         pass
 
     def note(self, kind: str, seconds: float, text: str) -> None:

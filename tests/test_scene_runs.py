@@ -1,0 +1,120 @@
+"""Scenes in whole runs: whose F a pair gets, and what a reconstruction that goes wrong costs."""
+
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import faulty
+import numpy as np
+import pytest
+from rectified import SWEEP, THREE_UNITS, RectifiedMatcher, run
+
+from mkpc_kaggle.data.competition import Pair
+from mkpc_kaggle.engine import scenes
+from mkpc_kaggle.engine.engine import Ending
+from mkpc_kaggle.recipe import Recipe
+from mkpc_kaggle.reporting.report import report_page
+from mkpc_kaggle.reporting.run_log import read_log
+from mkpc_kaggle.reporting.sections import Artist
+from mkpc_kaggle.reporting.summary import overview
+from mkpc_kaggle.scene.choose import Reason
+from mkpc_kaggle.scene.config import SceneConfig
+
+RECIPE = replace(THREE_UNITS, scene=SceneConfig())
+SCENE_F = faulty.SCENE_F
+
+
+def batch_pairs(directory: Path, images: int = 4, batch: str = "one") -> list[Pair]:
+    """All pairs of flat images, each with a brightness of its own: 10, 20, ..."""
+    directory.mkdir(parents=True, exist_ok=True)
+    paths = [directory / f"{number}.png" for number in range(images)]
+    for number, path in enumerate(paths):
+        cv2.imwrite(str(path), np.full((72, 80, 3), 10 + 10 * number, np.uint8))
+    chosen = [(i, j) for i in range(images) for j in range(i + 1, images)]
+    return [Pair(f"{batch};{i}-{j}", batch, paths[i], paths[j]) for i, j in chosen]
+
+
+def fault(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    monkeypatch.setattr(scenes, "reconstruct_batch", getattr(faulty, name))
+
+
+def own_matrices(pairs: list[Pair], directory: Path) -> list[bytes]:
+    report = run(pairs, THREE_UNITS, RectifiedMatcher(), directory)
+    return [record.F.tobytes() for record in report.records]
+
+
+def test_pairs_get_the_f_of_their_scene_and_keep_their_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fault(monkeypatch, "choose_scene_for_all_but_the_first")
+    pairs, published = batch_pairs(tmp_path / "images"), []
+    report = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work", publish=lambda r: published.append(list(r)))
+    assert report.ending is Ending.COMPLETE
+    assert [record.source for record in report.records] == ["pair"] + ["scene"] * 5
+    assert all(np.array_equal(record.fundamental, SCENE_F) for record in report.records[1:])
+    assert [record.F.tobytes() for record in report.records] == own_matrices(pairs, tmp_path / "alone")
+    assert published[-1][0].scene.reason is Reason.CONTRADICTION
+    log = read_log(tmp_path / "work")
+    assert "scenes: 1 of 1 batches reconstructed with 4 of 4 images; F of 5 of 6 pairs is from them" in overview(
+        log
+    )
+    assert "both cameras are known" in report_page(log, Artist())
+    assert all(len(weak.results[0].matches) for weak in log.weakest), "what is drawn keeps its points"
+
+
+def test_a_run_that_goes_on_does_not_reconstruct_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fault(monkeypatch, "choose_scene_for_all_but_the_first")
+    pairs = batch_pairs(tmp_path / "images")
+    first = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
+    fault(monkeypatch, "die_as_scene")
+    again = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
+    assert again.faults == ()
+    assert [r.fundamental.tobytes() for r in again.records] == [r.fundamental.tobytes() for r in first.records]
+    assert again.scenes == first.scenes
+
+
+@pytest.mark.parametrize(
+    ("name", "reason"),
+    [("die_as_scene", "signal SIGKILL"), ("exhaust_memory_as_scene", "exit status 1"), ("raise_as_scene", "exit")],
+)
+def test_a_reconstruction_that_dies_costs_its_scene_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, reason: str
+) -> None:
+    fault(monkeypatch, name)
+    pairs = batch_pairs(tmp_path / "images") + batch_pairs(tmp_path / "others", 3, "two")
+    report = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
+    assert report.ending is Ending.COMPLETE
+    assert [record.F.tobytes() for record in report.records] == own_matrices(pairs, tmp_path / "alone")
+    assert all(record.source == "pair" for record in report.records)
+    assert [fault.partition(": its process ended: ")[0] for fault in report.faults] == [
+        f"batch {batch} was not reconstructed" for batch in ("one", "two")
+    ]
+    assert all(reason in scene.failure for scene in report.scenes)
+    assert len(report.scenes) == 2
+
+
+def test_a_reconstruction_that_hangs_ends_with_the_limit_and_every_row_is_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fault(monkeypatch, "hang_as_scene")
+    pairs = batch_pairs(tmp_path / "images")
+    started = time.monotonic()
+    report = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work", limit=8.0)
+    assert time.monotonic() - started < 8.0
+    assert [len(record.units) for record in report.records] == [3] * 6
+    assert all(record.source == "pair" for record in report.records)
+
+
+def test_without_pycolmap_a_line_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fault(monkeypatch, "scene_without_pycolmap")
+    report = run(batch_pairs(tmp_path / "images"), RECIPE, RectifiedMatcher(), tmp_path / "work")
+    assert all(record.source == "pair" for record in report.records)
+    assert "pycolmap cannot be imported" in overview(read_log(tmp_path / "work"))
+
+
+def test_a_recipe_without_scenes_starts_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fault(monkeypatch, "die_as_scene")
+    report = run(batch_pairs(tmp_path / "images"), Recipe((SWEEP,)), RectifiedMatcher(), tmp_path / "work")
+    assert report.scenes == ()
+    assert report.faults == ()
