@@ -288,7 +288,7 @@ def test_the_command_draws_a_page_with_the_images_of_a_test_side(tmp_path: Path)
     assert main(["journal", str(tmp_path / "work"), *options]) == 0
     assert Tags(page.read_text()).names.count("img") == 2
     assert main(["journal", str(tmp_path / "work"), "--report", str(page)]) == 0
-    assert "where the images lie was not told" in page.read_text()
+    assert "where the images are is not known" in page.read_text()
 
 
 def test_a_time_limit_is_drawn_where_the_run_came_near_it_and_told_where_not() -> None:

@@ -1,4 +1,4 @@
-"""Jobs: what a worker is told and what comes back. Plain values, so that they can cross processes."""
+"""Jobs: what a worker gets and what comes back. Plain values, so that they can cross processes."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass

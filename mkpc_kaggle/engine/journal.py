@@ -90,7 +90,7 @@ class Event:
 
 @dataclass(frozen=True)
 class About:
-    """Who wrote a journal last: it is told, and held against nothing.
+    """Who wrote a journal last: for reports, and compared with nothing.
 
     ``limit`` is the time limit in seconds, ``None`` if there was none; ``left_out`` are names of units whose
     weights were missing or not permitted; ``versions`` are those of the package and what it stands on.
@@ -182,7 +182,7 @@ class JournalReader(_Tables):
         try:
             db = sqlite3.connect(f"{path.resolve().as_uri()}?{mode}", uri=True, timeout=5.0, isolation_level=None)
             db.execute("BEGIN")
-            require_format(path, _told(db))
+            require_format(path, _header(db))
         except sqlite3.OperationalError as error:
             raise UserError(f"{path} cannot be read now ({error}); try again when its run has ended") from error
         except sqlite3.DatabaseError as error:
@@ -199,10 +199,10 @@ class JournalReader(_Tables):
 
     def belongs_to(self) -> dict[str, Any]:
         """What the run computes, by name: the recipe's fingerprint, digests of the test set and the weights."""
-        return {key: value for key, value in _told(self._db).items() if key not in ("format", "about")}
+        return {key: value for key, value in _header(self._db).items() if key not in ("format", "about")}
 
     def about(self) -> About:
-        values = _told(self._db).get("about", {})
+        values = _header(self._db).get("about", {})
         return About(**{**values, "left_out": tuple(values.get("left_out", ()))})
 
     def pairs(self) -> tuple[Pair, ...]:
@@ -371,9 +371,9 @@ class Journal(_Tables):
         )
 
     def _claim(self, belongs_to: Mapping[str, Any], pairs: Sequence[Pair], about: About) -> None:
-        """Write down what the journal belongs to, or hold it against what stands there."""
+        """Write down what the journal belongs to, or compare it with what stands there."""
         try:
-            stored = _told(self._db)
+            stored = _header(self._db)
             if stored:
                 require_format(self.path, stored)
                 self._require_same(stored, belongs_to)
@@ -387,16 +387,16 @@ class Journal(_Tables):
             self._db.execute("BEGIN")
             for statement in filter(str.strip, _SCHEMA.split(";")):
                 self._db.execute(statement)
-            told = {**belongs_to, "about": asdict(about)}.items()
-            rows = [(key, json.dumps(value, sort_keys=True)) for key, value in told]
+            values = {**belongs_to, "about": asdict(about)}.items()
+            rows = [(key, json.dumps(value, sort_keys=True)) for key, value in values]
             self._db.executemany("REPLACE INTO run VALUES (?, ?)", rows)
             if not stored:
                 names = ((i, p.id, p.group, p.image0.name, p.image1.name) for i, p in enumerate(pairs))
                 self._db.executemany("INSERT INTO sample VALUES (?, ?, ?, ?, ?)", names)
 
     def _require_same(self, stored: Mapping[str, Any], belongs_to: Mapping[str, Any]) -> None:
-        told = json.loads(json.dumps(belongs_to))
-        other = [key for key in told if stored.get(key) != told[key]]
+        wanted = json.loads(json.dumps(belongs_to))
+        other = [key for key in wanted if stored.get(key) != wanted[key]]
         if other:
             raise UserError(
                 f"{self.path} belongs to another run: its {' and '.join(other)} differ. "
@@ -404,9 +404,9 @@ class Journal(_Tables):
             )
 
 
-def require_format(path: Path, told: Mapping[str, Any]) -> None:
+def require_format(path: Path, header: Mapping[str, Any]) -> None:
     """Raise :class:`UserError` unless the journal was written in this version's format."""
-    written = told.get("format")
+    written = header.get("format")
     if written != FORMAT:
         raise UserError(
             f"{path} was written by another version of this program (journal format {written}, this version has "
@@ -414,7 +414,7 @@ def require_format(path: Path, told: Mapping[str, Any]) -> None:
         )
 
 
-def _told(db: sqlite3.Connection) -> dict[str, Any]:
+def _header(db: sqlite3.Connection) -> dict[str, Any]:
     """The table ``run``; empty where the journal is new."""
     if not db.execute("SELECT 1 FROM sqlite_master WHERE name = 'run'").fetchone():
         return {}

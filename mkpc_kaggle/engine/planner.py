@@ -65,6 +65,25 @@ def unique_lacking(records: Iterable[PairRecord], units: Sequence[Unit]) -> list
     return list(dict.fromkeys(unit for record in records for unit in record.lacking(units)))
 
 
+def sweep_chunks(order: Sequence[int], recipe: Recipe) -> list[Chunk]:
+    """The first unit on all pairs: an F for every pair, early."""
+    first = tuple(unit for unit in recipe.regular if unit.stage == 1)
+    return [Chunk(Phase.SWEEP, indices, first) for indices in split(order)]
+
+
+def weakest_first(records: Iterable[PairRecord], recipe: Recipe) -> tuple[list[int], list[int]]:
+    """The pairs for the recipe's extra units, the weakest first, and the others that lack regular ones.
+
+    Pairs are weak by what they had before they were upgraded, so that a run that goes on decides as it did before.
+    """
+    extras = [unit for unit in recipe.units if unit.extra]
+    ranked = sorted(records, key=lambda record: (record.inliers_before, record.index))
+    weak = [one for one in ranked if is_weak(one, recipe.upgrade) or len(one.lacking(extras)) < len(extras)]
+    chosen = {record.index for record in weak}
+    others = [one.index for one in ranked if one.index not in chosen and one.lacking(recipe.regular)]
+    return [one.index for one in weak], others
+
+
 class Planner:
     """Sweep, deepen, upgrade, over the pairs of ``order``.
 
@@ -243,31 +262,18 @@ class Planner:
         return True
 
     def _sweep(self, _: float) -> tuple[Phase, list[Chunk]]:
-        """The first unit on all pairs: an F for every pair, early."""
-        first = tuple(unit for unit in self.recipe.regular if unit.stage == 1)
-        return Phase.SWEEP, [Chunk(Phase.SWEEP, indices, first) for indices in split(self._order)]
+        return Phase.SWEEP, sweep_chunks(self._order, self.recipe)
 
     def _deepen(self, now: float) -> tuple[Phase, list[Chunk]]:
-        """The other units, chunk by chunk: as many as let all remaining pairs have them."""
         self._explain(now, "the sweep is over; deepening begins")
         return Phase.DEEPEN, [Chunk(Phase.DEEPEN, indices) for indices in split(self._order)]
 
     def _upgrade(self, now: float) -> tuple[Phase, list[Chunk]]:
-        """What was left out, the weakest pairs first, and for weak ones the extra units."""
-        extras = [unit for unit in self.recipe.units if unit.extra]
-        touched = [record for record in self.records if record.units and record.index not in self._left_alone]
-        # By what they had before they were upgraded, so that a run that goes on decides as it did before.
-        touched.sort(key=lambda record: (record.inliers_before, record.index))
-        weak = [
-            one for one in touched if is_weak(one, self.recipe.upgrade) or len(one.lacking(extras)) < len(extras)
-        ]
-        chosen = {record.index for record in weak}
-        others = [one for one in touched if one.index not in chosen and one.lacking(self.recipe.regular)]
+        workable = [one for one in self.records if one.units and one.index not in self._left_alone]
+        weak, others = weakest_first(workable, self.recipe)
         self._explain(now, f"upgrading begins: {len(weak)} weak pairs, {len(others)} others lack units")
-        regular = self.recipe.regular
-        return Phase.UPGRADE, self._rounds.split((one.index for one in weak), self.recipe.units) + [
-            Chunk(Phase.UPGRADE, indices, regular) for indices in split(one.index for one in others)
-        ]
+        regular = [Chunk(Phase.UPGRADE, indices, self.recipe.regular) for indices in split(others)]
+        return Phase.UPGRADE, self._rounds.split(weak, self.recipe.units) + regular
 
     def _round_may_begin(self, chunk: Chunk, now: float) -> bool:
         """Whether the pairs that decide it are back; if they gained nothing, the extra units end."""
@@ -378,7 +384,7 @@ class Planner:
     # What is left
 
     def wanted(self, record: PairRecord) -> list[Unit]:
-        """The units that a pair shall have if there is time: the extra ones only where it is weak."""
+        """The units that a pair gets if there is time: the extra ones only where it is weak."""
         extras = not self._rounds.over and is_weak(record, self.recipe.upgrade)
         return record.lacking(self._usable(self.recipe.units if extras else self.recipe.regular))
 

@@ -83,6 +83,6 @@ class Lines:
     def close(self) -> None:
         """Write the line that waits, if there is one."""
         if self._waiting:
-            with suppress(OSError):  # whoever read the log may have left; the run goes on
+            with suppress(OSError):  # the reader of the log may have left; the run goes on
                 print(self._waiting, file=self._stream, flush=True)
             self._waiting, self._written = "", self._budget.clock()

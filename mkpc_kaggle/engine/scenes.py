@@ -128,7 +128,7 @@ class SceneQueue:
         return self._batch_of.get(index) in self._changed
 
     def due(self, deepened: set[int]) -> str | None:
-        """A batch whose pairs are all matched as far as they shall be, while none is under way."""
+        """A batch whose pairs are all matched, as far as time allows; ``None`` while one is under way."""
         if self.running is not None:
             return None
         for name in self.batches:

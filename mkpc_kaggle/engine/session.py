@@ -39,7 +39,7 @@ REPORT_SECONDS = 2.0
 
 
 class Interrupt(threading.Event):
-    """Set when the run shall end early; ``signal`` is what asked for it, 0 if nothing did."""
+    """Set when the run has to end early; ``signal`` is what asked for it, 0 if nothing did."""
 
     signal = 0
 
@@ -106,7 +106,7 @@ def run_pairs(
 
 
 def about_run(assembly: Assembly, budget: Budget) -> About:
-    """What a report tells of a run besides what its journal is held against."""
+    """What a report says of a run, besides what its journal is compared with."""
     return About(
         assembly.recipe.name,
         str(assembly.placement),
@@ -153,7 +153,7 @@ def _process_place(name: str, assembly: Assembly, share: int = 1) -> Place:
 
 def _ray_pool(assembly: Assembly, cluster: RayCluster) -> Pool:
     """A pool of the cluster's machines; raises :class:`UserError` where Ray is not installed."""
-    # Read when Ray is imported: it shall report to nobody, and not start a cluster because it was let go of.
+    # Read when Ray is imported: it must not report usage, and not start a cluster after it was shut down.
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     os.environ.setdefault("RAY_ENABLE_AUTO_CONNECT", "0")
     try:

@@ -74,15 +74,15 @@ def reason_of(error: BaseException) -> str:
     PyTorch's advice for debugging, on further lines of the errors of a device, is left out.
     """
     text = str(error)
-    told = text.partition("\n")[0] if any(sign in text for sign in _DEVICE) else text
-    return ", ".join([f"{type(error).__name__}: {told}", *getattr(error, "__notes__", ())])
+    short = text.partition("\n")[0] if any(sign in text for sign in _DEVICE) else text
+    return ", ".join([f"{type(error).__name__}: {short}", *getattr(error, "__notes__", ())])
 
 
 def require_device(device: str) -> None:
     """Compute something on a device; raises :class:`DeviceError` where that fails.
 
     PyTorch counts GPUs for which its build has no kernels (a P100, since builds begin at compute capability 7.0)
-    among the available ones: only a kernel that runs tells.
+    among the available ones: only a kernel that runs is proof.
     """
     if device == "cpu":
         return

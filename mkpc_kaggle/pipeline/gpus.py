@@ -1,6 +1,6 @@
 """What is asked of the machine's GPUs before any work, without becoming a process that computes on them.
 
-A CUDA context takes some hundred MB of a GPU's memory: the parent of workers shall have none.
+A CUDA context takes some hundred MB of a GPU's memory: the parent of workers must have none.
 """
 
 import json
@@ -21,11 +21,11 @@ print(json.dumps([torch.cuda.get_device_capability(gpu) for gpu in gpus]))
 
 def capabilities() -> list[Capability]:
     """The compute capability of each GPU, such as (7, 5); asked in a process of its own, as it makes a context."""
-    told = subprocess.run([sys.executable, "-c", ASK], capture_output=True, text=True, check=False)
-    if told.returncode:
-        reason = told.stderr.strip()[-300:]
+    asked = subprocess.run([sys.executable, "-c", ASK], capture_output=True, text=True, check=False)
+    if asked.returncode:
+        reason = asked.stderr.strip()[-300:]
         raise UserError(f"PyTorch cannot use this machine's GPUs; try --device cpu. It says: {reason}")
-    return [(major, minor) for major, minor in json.loads(told.stdout.splitlines()[-1])]
+    return [(major, minor) for major, minor in json.loads(asked.stdout.splitlines()[-1])]
 
 
 def gpus_of(device: str) -> list[int]:

@@ -1,1 +1,1 @@
-"""What a run tells: summary, tables, pages, figures."""
+"""What a run did: summary, tables, pages, figures."""

@@ -1,4 +1,4 @@
-"""What a journal tells of a run: read at one moment, kept as a value, exported to files."""
+"""What a journal says of a run: read at one moment, kept as a value, exported to files."""
 
 import json
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ class WeakPair:
 
 @dataclass(frozen=True, eq=False)
 class RunLog:
-    """A run as its journal tells it.
+    """A run as its journal has it.
 
     ``records`` are one a pair, in order, those not reached among them. ``events`` are those of all sessions;
     ``weakest`` are the pairs with the fewest inliers of those that were matched. ``digests`` are those of the

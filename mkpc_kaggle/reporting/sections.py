@@ -254,7 +254,7 @@ def _weakest(log: RunLog, artist: Artist) -> Iterator[Block]:
     if shown:
         yield Pictures(shown)
     if not sources:
-        yield Text("No pictures: where the images lie was not told (--test-dir).", dim=True)
+        yield Text("No pictures: where the images are is not known (--test-dir).", dim=True)
     if rows:
         yield Table(("pair", "matches", "inliers", "why"), rows)
 
@@ -287,7 +287,7 @@ def weak_figure(log: RunLog, weak: WeakPair, source: Pair) -> "Figure":
 
 
 def match_of(weak: WeakPair, threshold: float) -> PairMatch:
-    """The pair as MAGSAC left it, without running it again; ``threshold`` in pixels tells the inliers."""
+    """The pair as MAGSAC left it, without running it again; inliers are within ``threshold`` pixels."""
     record = weak.record
     matches = Matches.concatenate(result.matches for result in weak.results)
     inliers = sampson_distances(record.F, matches) < threshold

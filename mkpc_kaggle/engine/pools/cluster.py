@@ -18,7 +18,7 @@ REACH_SECONDS = 5.0
 class RayCluster:
     """The Ray cluster to work on.
 
-    ``address``, HOST:PORT, is the one that ``ray start --head`` tells; this machine must be one of the cluster's.
+    ``address``, HOST:PORT, is the one that ``ray start --head`` prints; this machine must be one of the cluster's.
     Empty: the cluster that runs on this machine, or else one that is started for the run and ends with it.
     """
 
@@ -32,7 +32,7 @@ class RayCluster:
         except OSError as error:
             raise UserError(
                 f"--workers ray://{self.address}: no cluster answers there ({error.strerror or error}). Start one "
-                "with `ray start --head` and join it from the other machines; it tells the address to use."
+                "with `ray start --head` and join it from the other machines; it prints the address to use."
             ) from error
 
 

@@ -32,7 +32,7 @@ REPLY_SECONDS = 20.0
 LONGEST_WAIT = 3600.0
 """Ray takes no endless waits; this one is repeated."""
 THREADS = 4
-"""Of an actor: one matches, the others hear what it is told meanwhile."""
+"""Of an actor: one matches, the others take messages meanwhile."""
 
 
 class RayPool(Pool):
@@ -85,7 +85,7 @@ class Slot:
 
 
 def slots_of(nodes: Iterable[Mapping[str, Any]], device: str) -> list[Slot]:
-    """The slots of a cluster, as ``ray.nodes()`` tells of it.
+    """The slots of a cluster, as ``ray.nodes()`` lists them.
 
     A machine that offers no CPUs is not worked on; ``device`` "cpu" keeps the work off GPUs.
     """

@@ -47,7 +47,7 @@ def draw_budget(
 ) -> "Figure":
     """Jobs ended over time, one colour a phase: ``ended`` and ``marks`` are seconds since the start by name.
 
-    A limit that the run came nowhere near is told and not drawn: the jobs would have no room beside it.
+    A limit that the run came nowhere near is in the title and not drawn: the jobs would have no room beside it.
     """
     from matplotlib.ticker import MaxNLocator
 

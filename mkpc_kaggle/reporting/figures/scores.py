@@ -45,7 +45,7 @@ def draw_gains(comparison: "Comparison") -> "Figure":
             [one.gain for one in found], y, xerr=reach, **style, linestyle="", capsize=4, label=other.recipe
         )
     axes.axvline(0, color=INK, linewidth=1)
-    axes.set_xlabel("mAA gained; an interval that holds 0 tells nothing apart", color=INK)
+    axes.set_xlabel("mAA gained; an interval that holds 0 proves nothing", color=INK)
     _legend_below(figure)
     return figure
 
