@@ -7,7 +7,8 @@ import pytest
 from rectified import SECOND, SWEEP, THREE_UNITS
 
 from mkpc_kaggle.engine.jobs import Outcome
-from mkpc_kaggle.engine.journal import DRAWN, Journal
+from mkpc_kaggle.engine.journal import Journal
+from mkpc_kaggle.engine.journal_tables import DRAWN
 from mkpc_kaggle.engine.records import PairRecord
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Box

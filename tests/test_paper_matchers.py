@@ -21,7 +21,7 @@ from shared import DATA, needs_data
 from standin import scene
 
 from mkpc_kaggle.data.competition import read_submission, read_test_side, submission_problems
-from mkpc_kaggle.engine.journal import FILE_NAME
+from mkpc_kaggle.engine.journal_tables import FILE_NAME
 from mkpc_kaggle.geometry.coordinates import View
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import MatcherSpec, Picture

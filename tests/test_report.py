@@ -18,7 +18,8 @@ from rectified import SWEEP, THREE_UNITS, RectifiedMatcher, run, write_pairs
 from mkpc_kaggle.cli import main
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.jobs import Outcome
-from mkpc_kaggle.engine.journal import DRAWN, About, EventKind, Journal, JournalReader
+from mkpc_kaggle.engine.journal import Journal
+from mkpc_kaggle.engine.journal_tables import DRAWN, About, EventKind, JournalReader
 from mkpc_kaggle.engine.records import PairRecord, UnitRecord
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.reporting.report import report_page, report_run

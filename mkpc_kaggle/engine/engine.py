@@ -14,7 +14,7 @@ from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.costs import Timeouts
 from mkpc_kaggle.engine.jobs import Job, JobFailure, JobResult, Outcome, visiting_order
-from mkpc_kaggle.engine.journal import EventKind
+from mkpc_kaggle.engine.journal_tables import EventKind
 from mkpc_kaggle.engine.planner import Explanation, Planner
 from mkpc_kaggle.engine.pools.pool import Pool
 from mkpc_kaggle.engine.progress import progress_on
@@ -203,7 +203,7 @@ class Engine:
         record = SceneRecord.of(result.batch, result.scenes, result.seconds, result.failure)
         self._scene_records[result.batch] = record
         for index, choice in choices.items():
-            self.planner.set_scene(index, choice)
+            self.planner.state.set_scene(index, choice)
         if result.failure:
             self._fault(f"batch {result.batch} was not reconstructed: {result.failure}")
         self._note(EventKind.SCENE, f"{record.batch}: {record.placed} of {record.images} images")

@@ -3,7 +3,6 @@
 It looks at a job's worth of pairs at a time, so that a hundred thousand pairs cost no more to plan than ten.
 """
 
-from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
@@ -11,13 +10,11 @@ from mkpc_kaggle.engine.budget import Budget, format_duration
 from mkpc_kaggle.engine.chunk_queue import ChunkQueue
 from mkpc_kaggle.engine.costs import Costs, Timeouts, needs
 from mkpc_kaggle.engine.jobs import Cause, Chunk, Job, JobFailure, JobResult, Outcome, Phase, split
-from mkpc_kaggle.engine.records import PairRecord, UnitRecord
+from mkpc_kaggle.engine.records import PairRecord
 from mkpc_kaggle.engine.retries import Retries
+from mkpc_kaggle.engine.state import RunState
 from mkpc_kaggle.engine.upgrade import UpgradeRounds, is_weak
-from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.pipeline.pair import UnitResult
 from mkpc_kaggle.recipe import Recipe, Unit
-from mkpc_kaggle.scene.choose import Choice
 
 EXPLORE_SHARE = 0.25
 """The share of the time left that may be spent to learn what units cost that never ran."""
@@ -60,11 +57,6 @@ def units_that_fit(needed: Iterable[float], left: float) -> tuple[int, float]:
     return count, 0.0
 
 
-def unique_lacking(records: Iterable[PairRecord], units: Sequence[Unit]) -> list[Unit]:
-    """Each of the units that some pair has not had, once."""
-    return list(dict.fromkeys(unit for record in records for unit in record.lacking(units)))
-
-
 def sweep_chunks(order: Sequence[int], recipe: Recipe) -> list[Chunk]:
     """The first unit on all pairs: an F for every pair, early."""
     first = tuple(unit for unit in recipe.regular if unit.stage == 1)
@@ -87,7 +79,7 @@ def weakest_first(records: Iterable[PairRecord], recipe: Recipe) -> tuple[list[i
 class Planner:
     """Sweep, deepen, upgrade, over the pairs of ``order``.
 
-    ``records`` (one a pair, by index) are the state that it decides upon; it alone changes them. ``workers``
+    ``records``, one a pair, by index, are in its ``state``, which jobs and scenes change through it. ``workers``
     work at a time. ``deepened`` are the pairs that have all units that fit; ``reserve`` seconds of the end are
     left to others.
     """
@@ -102,7 +94,7 @@ class Planner:
         timeouts: Timeouts | None = None,
     ) -> None:
         self.recipe = recipe
-        self.records = records
+        self.state = RunState(recipe, records)
         self.budget = budget
         self.workers = workers
         self.timeouts = timeouts or Timeouts()
@@ -115,16 +107,15 @@ class Planner:
         self._retries = Retries()
         self.deepened: set[int] = set()
         self.reserve = 0.0
-        self._left_alone: set[int] = set()
         self._exploring = 0
         self._allowance = 0.0
         self._hung_in_a_row = 0
         self._last_event = budget.clock()
         self._fitting = -1
-        self._lacking: Counter[str] = Counter()
-        for record in records:
-            if record.units:
-                self._lacking.update(unit.name for unit in record.lacking(recipe.regular))
+
+    @property
+    def records(self) -> list[PairRecord]:
+        return self.state.records
 
     # What to do next
 
@@ -134,10 +125,10 @@ class Planner:
             return None
         while (chunk := self._next_chunk(now)) is not None:
             units = self._units(chunk, now)
-            todo = [index for index in chunk.indices if self._can_gain(index, units)]
+            todo = [index for index in chunk.indices if self.state.can_gain(index, units)]
             if chunk.phase is Phase.DEEPEN:
                 self.deepened.update(set(chunk.indices) - set(todo))
-            lacking = unique_lacking((self.records[index] for index in todo), units)
+            lacking = self.state.lacking_units(todo, units)
             unknown = not all(self.costs.known(unit.name) for unit in lacking)
             if unknown and (self._exploring >= self.workers or self._queue.jobs > self.workers):
                 # What has no known cost cannot be planned: one try a worker, not long behind another job.
@@ -215,9 +206,6 @@ class Planner:
         seconds = pairs * (self.costs.overhead + sum(self.costs.most(unit.name) for unit in lacking))
         return min(self._stop, now + max(DEADLINE_SHARE * (self._stop - now), 2 * seconds))
 
-    def _can_gain(self, index: int, units: Iterable[Unit]) -> bool:
-        return index not in self._left_alone and bool(self.records[index].lacking(units))
-
     def _units(self, chunk: Chunk, now: float) -> tuple[Unit, ...]:
         """The units for a chunk whose turn has come."""
         if chunk.units is None:
@@ -235,7 +223,7 @@ class Planner:
     def _fit(self, units: tuple[Unit, ...], now: float) -> int:
         """How many units all pairs can have in the time left; a change is explained."""
         left = (self._stop - now) * self.workers
-        count, short = units_that_fit(needs(units, self._lacking, self.costs), left)
+        count, short = units_that_fit(needs(units, self.state.lacking, self.costs), left)
         if count == self._fitting:
             return count
         if count < len(units):
@@ -269,8 +257,7 @@ class Planner:
         return Phase.DEEPEN, [Chunk(Phase.DEEPEN, indices) for indices in split(self._order)]
 
     def _upgrade(self, now: float) -> tuple[Phase, list[Chunk]]:
-        workable = [one for one in self.records if one.units and one.index not in self._left_alone]
-        weak, others = weakest_first(workable, self.recipe)
+        weak, others = weakest_first(self.state.workable, self.recipe)
         self._explain(now, f"upgrading begins: {len(weak)} weak pairs, {len(others)} others lack units")
         regular = [Chunk(Phase.UPGRADE, indices, self.recipe.regular) for indices in split(others)]
         return Phase.UPGRADE, self._rounds.split(weak, self.recipe.units) + regular
@@ -300,14 +287,20 @@ class Planner:
                 self.costs.suppose(unit.name, self._allowance)
         if job.phase is Phase.DEEPEN:
             self.deepened.update(job.indices)
-        kept = [kept for outcome in result.outcomes if (kept := self._merge(outcome, job.phase, now))]
+        kept = []
+        for outcome in result.outcomes:
+            if reason := self.state.stuck(outcome):
+                self._explain(now, reason)
+            if (changed := self.state.merge(outcome, job.phase)) is not None:
+                kept.append(changed)
+                self._retries.prove(one.unit for one in outcome.results)
         self._go_on(job, now)
         return kept
 
     def _go_on(self, job: Job, now: float) -> None:
         """What a job's own deadline cut off is planned anew."""
         cut = now + max(job.expected) >= job.deadline
-        rest = tuple(index for index in job.indices if self._can_gain(index, job.units))
+        rest = tuple(index for index in job.indices if self.state.can_gain(index, job.units))
         if cut and rest and not job.exploring and job.deadline < self._stop:
             self._queue.retry([Chunk(job.phase, rest, job.units, job.shrink)])
 
@@ -318,32 +311,6 @@ class Planner:
             elapsed = (now - self._last_event) * min(self.workers, self._queue.jobs)
             self.costs.observe_overhead((elapsed - sum(seconds for _, seconds in measured)) / pairs)
         self._last_event = now
-
-    def set_scene(self, index: int, choice: Choice) -> None:
-        """Which F a pair gets by the reconstruction of its batch."""
-        self.records[index] = replace(self.records[index], scene=choice)
-
-    def _merge(self, outcome: Outcome, phase: Phase, now: float) -> Outcome | None:
-        """The outcome to keep, if the job brought anything: a unit more, or the reason why there can be none."""
-        record, former = outcome.record, self.records[outcome.record.index]
-        if not outcome.results and record.failure and record.reached:
-            self._left_alone.add(record.index)
-            if former.units:
-                self._explain(now, f"pair {record.index} keeps the F it has: {record.failure}")
-        if len(record.units) <= len(former.units) and (former.reached or not record.reached):
-            return None
-        self._retries.prove(result.unit for result in outcome.results)
-        record = record.after(former, former.inliers_before if phase is Phase.UPGRADE else former.before)
-        self._put(record)
-        return Outcome(record, outcome.results)
-
-    def _put(self, record: PairRecord) -> None:
-        former = self.records[record.index]
-        had = {unit.name for unit in former.lacking(self.recipe.regular)} if former.units else set()
-        lacks = {unit.name for unit in record.lacking(self.recipe.regular)} if record.units else set()
-        self._lacking.subtract(had - lacks)
-        self._lacking.update(lacks - had)
-        self.records[record.index] = record
 
     def _end(self, job: Job) -> None:
         self._queue.end(job.indices)
@@ -362,24 +329,8 @@ class Planner:
         for reason in retry.reasons:
             self._explain(now, reason)
         if retry.leave_pair:
-            self._leave_alone(job.indices[0], failure)
-        return [self._give_up(job.indices[0], retry.give_up, failure)] if retry.give_up else []
-
-    def _leave_alone(self, index: int, failure: JobFailure) -> None:
-        """The pair keeps the F that it has, and gets nothing more in this run; a later one tries again."""
-        self._left_alone.add(index)
-        if not self.records[index].reached:
-            self._put(PairRecord.untouched(index, f"left alone: {failure}"))
-
-    def _give_up(self, index: int, units: Sequence[Unit], failure: JobFailure) -> Outcome:
-        """The pair keeps the F that it has; the units are marked as had, with the reason."""
-        record, reason = self.records[index], f"given up: {failure}"
-        empty = tuple(UnitRecord(unit.name, unit.stage, 0, 0, 0.0, 0.0, reason) for unit in units)
-        message = record.failure if record.reached else reason
-        self._put(replace(record, units=record.units + empty, failure=message))
-        return Outcome(
-            self.records[index], tuple(UnitResult(unit, Matches.empty(), failure=reason) for unit in units)
-        )
+            self.state.leave_alone(job.indices[0], failure)
+        return [self.state.give_up(job.indices[0], retry.give_up, failure)] if retry.give_up else []
 
     # What is left
 
@@ -392,7 +343,8 @@ class Planner:
     def complete(self) -> bool:
         """Whether every pair has been reached and nothing is wanted for those that can be worked on."""
         return all(
-            record.reached and not (record.units and record.index not in self._left_alone and self.wanted(record))
+            record.reached
+            and not (record.units and record.index not in self.state.left_alone and self.wanted(record))
             for record in self.records
         )
 

@@ -24,7 +24,8 @@ from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.costs import Timeouts
 from mkpc_kaggle.engine.engine import Engine, RunReport
-from mkpc_kaggle.engine.journal import About, EventKind, Journal
+from mkpc_kaggle.engine.journal import Journal
+from mkpc_kaggle.engine.journal_tables import About, EventKind
 from mkpc_kaggle.engine.pools.cluster import RayCluster
 from mkpc_kaggle.engine.pools.local import LocalWorker
 from mkpc_kaggle.engine.pools.pool import Place, Pool

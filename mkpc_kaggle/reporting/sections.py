@@ -19,7 +19,7 @@ import pandas as pd
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.data.images import Unreadable, read_image
 from mkpc_kaggle.engine.budget import format_duration
-from mkpc_kaggle.engine.journal import EventKind
+from mkpc_kaggle.engine.journal_tables import EventKind
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import Estimate, Model, sampson_distances
 from mkpc_kaggle.pipeline.pair import PairMatch

@@ -7,7 +7,7 @@ from typing import Any
 import pandas as pd
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine.journal import Event
+from mkpc_kaggle.engine.journal_tables import Event
 from mkpc_kaggle.engine.records import PairRecord
 
 F_COLUMNS = tuple(f"f{row}{column}" for row in (1, 2, 3) for column in (1, 2, 3))
