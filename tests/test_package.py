@@ -72,6 +72,7 @@ def test_the_dataset_holds_wheels_weights_and_their_licences(wanted: Request) ->
     assert {name.partition("-")[0] for name in names if name.endswith(".whl")} == {
         "mkpc_kaggle",
         "kornia",
+        "pycolmap",
         "kornia_rs",
         "safetensors",
     }
