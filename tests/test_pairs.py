@@ -139,7 +139,8 @@ def test_the_true_matrix_has_no_error(
         cameras = true.camera0, true.camera1
         if model is Model.E:
             cameras = true.camera0.calibrated, true.camera1.calibrated
-        assert error_of(fundamental_of_cameras(*cameras), true, read).angle < 1e-6
+        # Near a cosine of 1 the angle of a rounding error is a millionth of a degree.
+        assert error_of(fundamental_of_cameras(*cameras), true, read).angle < 1e-5
         assert all(path.is_file() for path in true.pair.images)
 
 
