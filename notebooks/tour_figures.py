@@ -118,8 +118,8 @@ def draw_boxes(
     """The bounding box of the kept clusters as it is, and with Crop Area Expansion; dropped points as crosses."""
     figure, row = side_by_side(images, title_lines=2)
     for number, (axes, image, xy, found) in enumerate(zip(row, images, points, clusters, strict=True)):
-        kept = xy[found.keeps]
-        _crosses(axes, xy[~found.keeps], OUTLIER)
+        kept = xy[found.in_kept]
+        _crosses(axes, xy[~found.in_kept], OUTLIER)
         _dots(axes, kept, INLIER)
         title = f"image {number}: nothing kept, so no box"
         if len(kept):
