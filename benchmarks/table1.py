@@ -188,7 +188,7 @@ def run_all(scenes: Sequence[Scene], ways: Sequence[Way], pipeline: Pipeline, di
     images = ImageStore()
     try:
         for place, (scene, true) in enumerate(tqdm(todo, unit="pair", smoothing=0.05)):
-            images.announce(path for _, coming in todo[place : place + 2] for path in coming.pair.images)
+            images.prefetch(path for _, coming in todo[place : place + 2] for path in coming.pair.images)
             image0, image1 = (images.get(path) for path in true.pair.images)
             if isinstance(image0, Unreadable) or isinstance(image1, Unreadable):
                 diary.add(true.pair.id, {way.name: Found(PoseError.failed(), 0, 0.0) for way in ways})

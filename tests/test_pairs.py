@@ -98,7 +98,7 @@ def test_a_malformed_line_is_named_with_what_was_expected(line: str, expected: s
 )
 def test_no_name_leads_out_of_the_image_root(name: str) -> None:
     for names in (f"{name} ok.jpg", f"ok.jpg {name}"):
-        with pytest.raises(UserError, match=r"list.txt, line 2: .* leads out of the image root"):
+        with pytest.raises(UserError, match=r"list.txt, line 2: .* points outside the image root"):
             parse_line(f"{names} 0 0 {EYE}", 2, FILE)
 
 
