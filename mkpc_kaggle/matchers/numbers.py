@@ -1,4 +1,4 @@
-"""What networks may compute with: float32 that is float32, and finite numbers."""
+"""Numerical checks of networks: float32 without TF32, and finite values."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -10,10 +10,9 @@ from mkpc_kaggle.matchers.contract import NonFiniteError
 
 @contextmanager
 def exact_float32() -> Iterator[None]:
-    """Within it NVIDIA GPUs multiply float32 as float32, not as TF32 with its 10 bits of mantissa.
+    """A context in which NVIDIA GPUs multiply float32 as float32, not as TF32 with its 10 bits of mantissa.
 
-    PyTorch takes TF32 for convolutions unless told otherwise. The settings are those of the process, and are put
-    back at the end.
+    PyTorch's default for convolutions is TF32. The settings are those of the process, and are restored at the end.
     """
     import torch
 
@@ -47,7 +46,7 @@ def check_finite(what: str, *values: Any) -> None:
     """
     import torch
 
-    # A sum is infinite or NaN where an addend is; half precision adds up in float32, so that nothing overflows.
+    # A sum is infinite or NaN if a value is; half precision is summed in float32, so that nothing overflows.
     sums = [tensor.sum(dtype=torch.float32) for tensor in float_tensors(values)]
     if sums and not bool(torch.stack(sums).isfinite().all()):
         raise NonFiniteError(f"{what} are not finite")
