@@ -92,7 +92,7 @@ def read_test_side(directory: Path) -> tuple[Pair, ...]:
     repeated = table["sample_id"][table["sample_id"].duplicated()]
     if not repeated.empty:
         times = int((table["sample_id"] == repeated.iloc[0]).sum())
-        raise UserError(f"{path}: the sample_id {repeated.iloc[0]!r} stands there {times} times")
+        raise UserError(f"{path}: the sample_id {repeated.iloc[0]!r} occurs {times} times")
     return tuple(
         Pair(
             str(sample),
