@@ -1,13 +1,18 @@
 # make demo: install, render a demo set, make its submission, score it, draw a pair.
 # make test: install, lint, types, tests.
 # make ray: the tests of worker machines, with Ray installed beside the rest.
+# make oldest: the tests with the lowest versions that pyproject.toml declares, on Python 3.11, in .venv-oldest.
 
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 DEMO := demo
+OLDEST := .venv-oldest
+PYTHON311 ?= python3.11
+# Not the declared floor: on most indexes old versions of torch have no build for the CPU, and bring CUDA along.
+TORCH ?= $(shell grep '^torch==' requirements-dev.txt)
 
-.PHONY: demo test ray install lint tests clean
+.PHONY: demo test ray oldest install lint tests clean
 
 demo: install
 	$(BIN)/python -m mkpc_kaggle demo --out $(DEMO)
@@ -36,6 +41,18 @@ ray: install
 	$(BIN)/python -m pip install --quiet "ray>=2.9"
 	$(BIN)/python -m pytest tests/test_ray.py tests/test_cluster.py
 
+# Old versions of libraries warn of what newer ones of Python and torch deprecate; test_package.py packs the wheels
+# of the pinned versions, which are not installed there.
+oldest: $(OLDEST)/installed
+	$(OLDEST)/bin/python -m pytest -W ignore::DeprecationWarning --ignore=tests/test_package.py
+
+$(OLDEST)/installed: pyproject.toml tests/support/oldest.py
+	$(PYTHON311) -m venv --clear $(OLDEST)
+	$(PYTHON311) tests/support/oldest.py dev > $(OLDEST)/lowest.txt
+	$(OLDEST)/bin/python -m pip install --quiet "$(TORCH)" --requirement $(OLDEST)/lowest.txt hatchling editables
+	$(OLDEST)/bin/python -m pip install --quiet --no-deps --no-build-isolation --editable .
+	touch $@
+
 install: $(VENV)/installed
 
 $(VENV)/installed: requirements-dev.txt pyproject.toml
@@ -46,4 +63,4 @@ $(VENV)/installed: requirements-dev.txt pyproject.toml
 	touch $@
 
 clean:
-	rm -rf $(VENV) $(DEMO)
+	rm -rf $(VENV) $(OLDEST) $(DEMO)

@@ -3,8 +3,7 @@
 python -m benchmarks.engine --test-dir DIR [--recipe classical] [--weights DIR] [--pairs 100]
 
 A run in this process, as ``submit --workers 0`` makes it, journal and submission included. The first job, which
-loads and warms up, is left out. What is no unit's own time, no clustering and no waiting for an image is the
-engine's.
+loads and warms up, is left out. Time that is not a unit's, clustering or waiting for an image is the engine's.
 """
 
 import argparse
@@ -27,22 +26,22 @@ from mkpc_kaggle.engine.records import PairRecord
 from mkpc_kaggle.pipeline.assembly import Assembly, assemble
 
 
-class WatchedPool(Pool):
-    """Keeps what comes back, and when."""
+class RecordingPool(Pool):
+    """Keeps the results of jobs, and when they came."""
 
     def __init__(self, assembly: Assembly) -> None:
         super().__init__([Place("this process", partial(LocalWorker, assembly.pipeline))], assembly.recipe)
-        self.came: list[tuple[float, JobResult]] = []
+        self.results: list[tuple[float, JobResult]] = []
 
     def next(self, until: float) -> JobResult | JobFailure | None:
-        back = super().next(until)
-        if isinstance(back, JobResult):
-            self.came.append((time.monotonic(), back))
-        return back
+        result = super().next(until)
+        if isinstance(result, JobResult):
+            self.results.append((time.monotonic(), result))
+        return result
 
 
 @dataclass(frozen=True)
-class Spent:
+class TimeSpent:
     """Seconds by what they went into, the first job's left out; ``wall`` is from its end to the last one's.
 
     ``tail`` are MAGSAC's on the last job, which nothing can hide.
@@ -57,13 +56,13 @@ class Spent:
     tail: float
 
     @classmethod
-    def of(cls, came: Sequence[tuple[float, JobResult]]) -> "Spent":
-        rest = [finished for _, finished in came[1:]]
-        records = [outcome.record for finished in rest for outcome in finished.outcomes]
+    def of(cls, results: Sequence[tuple[float, JobResult]]) -> "TimeSpent":
+        rest = [result for _, result in results[1:]]
+        records = [outcome.record for result in rest for outcome in result.outcomes]
         return cls(
             len(rest),
-            came[-1][0] - came[0][0],
-            sum(seconds for finished in rest for _, seconds in finished.measured()),
+            results[-1][0] - results[0][0],
+            sum(seconds for result in rest for _, seconds in result.measured()),
             sum(record.cluster_seconds for record in records),
             sum(record.decode_seconds for record in records),
             sum(record.estimate_seconds for record in records),
@@ -76,13 +75,13 @@ class Spent:
 
     @property
     def overlap(self) -> float:
-        """How much longer it would have taken one thing after the other."""
+        """How much longer it would have taken sequentially."""
         return self.units + self.clusters + self.images + self.magsac - self.wall
 
 
-def run(pairs: Sequence[Pair], assembly: Assembly, directory: Path) -> Spent:
+def run(pairs: Sequence[Pair], assembly: Assembly, directory: Path) -> TimeSpent:
     """A run from start to end in ``directory``."""
-    pool = WatchedPool(assembly)
+    pool = RecordingPool(assembly)
     journal = Journal(directory, {"benchmark": 1}, pairs=pairs)
 
     def publish(records: Sequence[PairRecord]) -> None:
@@ -98,7 +97,7 @@ def run(pairs: Sequence[Pair], assembly: Assembly, directory: Path) -> Spent:
     finally:
         pool.close()
         journal.close()
-    return Spent.of(pool.came)
+    return TimeSpent.of(pool.results)
 
 
 def main() -> None:

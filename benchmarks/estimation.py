@@ -2,16 +2,16 @@
 
 python -m benchmarks.estimation --train-dir DIR --matches DIR [--recipe classical] [--scenes A,B] [--every N]
 
-Matches of the recipe are found once and kept, a file a pair; then every pair is estimated in all ways, in turns,
-in this process. For each way: mAA by scene and seconds a pair; for each but the first, its gain over the first
-with the 95 % interval of resampled pairs.
+Matches of the recipe are found once and kept, a file for each pair; then every pair is estimated in all ways,
+alternating, in this process. For each way: mAA by scene and seconds a pair; for each but the first, its gain over
+the first with the 95 % interval of resampled pairs.
 """
 
 import argparse
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import mean
 
@@ -28,7 +28,8 @@ from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.metrics import PoseError, pair_accuracy
 from mkpc_kaggle.geometry.robust import Estimate, RobustConfig, estimate
 from mkpc_kaggle.pipeline.assembly import assemble
-from mkpc_kaggle.pipeline.stages import PairWork, Pipeline, finish
+from mkpc_kaggle.pipeline.pair import PairMatch
+from mkpc_kaggle.pipeline.stages import Pipeline
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,10 +84,11 @@ def matches_of(true: TruePair, pipeline: Pipeline, directory: Path, images: dict
                 if isinstance(image, Unreadable):
                     raise SystemExit(str(image))
                 images[image_path] = image
-        work = PairWork((images[true.pair.image0], images[true.pair.image1]))
-        recipe = replace(pipeline.recipe, magsac=RobustConfig(orders=1, max_iterations=1), focal=None)
-        (work,) = pipeline.match([work], recipe.units)
-        matches = finish(work, recipe).matches
+        pair = PairMatch(images=(images[true.pair.image0], images[true.pair.image1]))
+        (pair,) = pipeline.match([pair], pipeline.recipe.units)
+        order = {unit: number for number, unit in enumerate(pipeline.recipe.units)}
+        results = sorted(pair.results, key=lambda result: order[result.unit])
+        matches = Matches.concatenate(result.matches for result in results)
         path.parent.mkdir(parents=True, exist_ok=True)
         part = path.with_suffix(".part")
         with part.open("wb") as stream:
@@ -95,8 +97,8 @@ def matches_of(true: TruePair, pipeline: Pipeline, directory: Path, images: dict
                 points0=matches.points0,
                 points1=matches.points1,
                 scores=matches.scores,
-                size0=work.sizes[0],
-                size1=work.sizes[1],
+                size0=pair.images[0].size,
+                size1=pair.images[1].size,
             )
         part.replace(path)
     with np.load(path) as kept:
@@ -104,11 +106,13 @@ def matches_of(true: TruePair, pipeline: Pipeline, directory: Path, images: dict
         return Found(Matches(kept["points0"], kept["points1"], kept["scores"]), (size0, size1))
 
 
-def try_all(found: Found, true: TruePair, scene: Scene, ways: Mapping[str, Way], turn: int) -> dict[str, Outcome]:
-    """All ways on one pair; the first of the turn changes from pair to pair."""
+def try_all(
+    found: Found, true: TruePair, scene: Scene, ways: Mapping[str, Way], number: int
+) -> dict[str, Outcome]:
+    """All ways on one pair; which comes first changes with the ``number`` of the pair."""
     names = list(ways)
     outcomes = {}
-    for name in names[turn % len(names) :] + names[: turn % len(names)]:
+    for name in names[number % len(names) :] + names[: number % len(names)]:
         start = time.perf_counter()
         result = ways[name](found)
         seconds = time.perf_counter() - start
@@ -156,9 +160,9 @@ def main() -> None:
     for scene in read_train_side(arguments.train_dir, scenes=filter(None, arguments.scenes.split(","))):
         images: dict[Path, Image] = {}
         done[scene.name] = []
-        for turn, true in enumerate(tqdm(scene.pairs[:: arguments.every], desc=scene.name, smoothing=0.05)):
+        for number, true in enumerate(tqdm(scene.pairs[:: arguments.every], desc=scene.name, smoothing=0.05)):
             found = matches_of(true, pipeline, arguments.matches, images)
-            done[scene.name].append(try_all(found, true, scene, ways, turn))
+            done[scene.name].append(try_all(found, true, scene, ways, number))
     print("\n".join(table(done, list(ways))))
 
 

@@ -3,7 +3,7 @@
 python -m benchmarks.journal [--pairs 10000] [--units 5] [--matches 2000] [--settled 0.5]
 
 All pairs are swept, then given their units; the share ``--settled`` of them needs no more work after that. The
-size of the file is its greatest: SQLite uses the pages of dropped points again, and gives none back.
+size of the file is the largest: SQLite reuses the pages of deleted points and does not shrink the file.
 """
 
 import argparse

@@ -1,4 +1,4 @@
-"""Time, work and memory of every network beside kornia's LoFTR at 640 x 480, in one process, in turns.
+"""Time, work and memory of every network beside kornia's LoFTR at 640 x 480, in one process, alternating.
 
 python -m benchmarks.matchers [--rounds 5] [--precision bfloat16] [--only loftr,dkm]
 

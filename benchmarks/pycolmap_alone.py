@@ -1,10 +1,10 @@
-"""What a user would take instead: pycolmap's own SIFT, exhaustive matching and mappers, on the same pairs.
+"""The alternative: pycolmap's SIFT, exhaustive matching and mappers, on the same pairs.
 
 python -m benchmarks.pycolmap_alone --train-dir DIR [--scenes NAME ...] [--mappers incremental global]
 
-DIR is a train side in the layout of the Image Matching Challenge 2022. Everything is as pycolmap has it, but for
-one SIMPLE_RADIAL camera an image. A pair whose images are not both in one model counts as lost. It prints the mAA
-over all pairs with a covisibility of at least 0.1, and the processor's seconds.
+DIR is a train side in the layout of the Image Matching Challenge 2022. All settings are pycolmap's defaults, but
+for one SIMPLE_RADIAL camera for each image. A pair whose images are not in one model fails. It prints the
+mAA over all pairs with a covisibility of at least 0.1, and CPU seconds.
 """
 
 import argparse

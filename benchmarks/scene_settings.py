@@ -5,7 +5,7 @@ python -m benchmarks.scene_settings --train-dir DIR --matches DIR [--recipe clas
 
 All pairs with a covisibility of at least 0.1 are matched once, into the directory of `--matches`, which a second
 run reads. A share below 1 takes that many of a scene's pairs by a fixed seed. `own` is the mAA of one MAGSAC a
-pair, `scene` that of the cameras alone, where a pair without two of them counts as lost, `chosen` that of the F
+pair, `scene` that of the cameras alone, where a pair without two of them counts as failed, `chosen` that of the F
 which the pair gets in the end.
 """
 
@@ -23,7 +23,8 @@ from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.metrics import PoseError, mean_average_accuracy, pose_error
 from mkpc_kaggle.geometry.robust import Matrix3, RobustConfig, estimate
 from mkpc_kaggle.pipeline.assembly import assemble
-from mkpc_kaggle.pipeline.stages import PairWork, Pipeline
+from mkpc_kaggle.pipeline.pair import PairMatch
+from mkpc_kaggle.pipeline.stages import Pipeline
 from mkpc_kaggle.scene.batch import Batch, BatchImage, BatchPair
 from mkpc_kaggle.scene.config import CameraModel, Mapper, SceneConfig
 from mkpc_kaggle.scene.solve import solve
@@ -48,10 +49,9 @@ def matched(true: TruePair, pipeline: Pipeline, folder: Path) -> BatchPair:
     names = [path.stem for path in true.pair.images]
     file = folder / f"{names[0]}-{names[1]}.npz"
     if not file.exists():
-        (work,) = pipeline.match(
-            [PairWork((readable(true.pair.image0), readable(true.pair.image1)))], pipeline.recipe.units
-        )
-        found = Matches.concatenate(result.matches for result in work.results)
+        pair = PairMatch(images=(readable(true.pair.image0), readable(true.pair.image1)))
+        (pair,) = pipeline.match([pair], pipeline.recipe.units)
+        found = pair.matches
         folder.mkdir(parents=True, exist_ok=True)
         np.savez(file, points0=found.points0, points1=found.points1, scores=found.scores)
     with np.load(file) as kept:

@@ -16,7 +16,7 @@ SIZE = Size(800, 600)
 
 @dataclass(frozen=True, eq=False)
 class SyntheticScene:
-    """A batch and the cameras that are behind it, by the names of the images."""
+    """A batch and its true cameras, by image name."""
 
     batch: Batch
     cameras: dict[str, Camera]

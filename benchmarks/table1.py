@@ -41,7 +41,7 @@ LONG_SIDES = {
     "aliked": (1024, 832, 640, 928, 736, 1120),
     "xfeat_lighterglue": (1024, 1280, 800, 1152, 896, 1408),
 }
-"""In the order in which recipes take them up: all differ, since to look twice at the same finds the same."""
+"""In the order in which recipes use them; all differ, since the same size would give the same matches."""
 MOST_MATCHES = {"sift": 8000}
 OPTIONS: Mapping[str, Mapping[str, float]] = {"sift": {"features": 8000, "ratio": 0.8}}
 
@@ -59,7 +59,7 @@ CONTRASTS = (("three", "one + two"), ("three", "two + one"), ("six", "three + th
 """The same units, all on whole images and split over the stages."""
 ENSEMBLE_LAYOUTS = ("three", "two + one")
 COVISIBILITIES = (0.0, 0.3, 0.6, 1.01)
-"""Borders of the ranges in which gains are told."""
+"""Borders of the ranges of covisibility for which gains are printed."""
 MERGED_LAYOUTS = ("three", "two + one", "three + three")
 
 
@@ -150,23 +150,23 @@ def _seconds(results: Iterable[UnitResult]) -> float:
     return sum(result.seconds for result in results)
 
 
-class Diary:
-    """The pairs that are done, in a file of JSON lines; the first says what they were done with."""
+class ResultsFile:
+    """The results of pairs in a file of JSON lines, of which the first has the settings."""
 
     def __init__(self, path: Path, settings: Mapping[str, object]) -> None:
         self.path = path
         self.found: dict[str, dict[str, Found]] = {}
-        told = json.dumps(settings, sort_keys=True)
+        header = json.dumps(settings, sort_keys=True)
         text = path.read_text(encoding="utf-8") if path.exists() else ""
         whole = text[: text.rfind("\n") + 1]  # a line that was cut off is done again
-        head, *lines = whole.splitlines() or [told]
-        if head != told:
+        head, *lines = whole.splitlines() or [header]
+        if head != header:
             raise UserError(f"{path} was made with other settings; name another --out")
         for line in lines:
             pair, found = json.loads(line)
             self.found[pair] = {way: Found(PoseError(*error), *rest) for way, (error, *rest) in found.items()}
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(whole or told + "\n", encoding="utf-8")
+        path.write_text(whole or header + "\n", encoding="utf-8")
 
     def add(self, pair: str, found: Mapping[str, Found]) -> None:
         values = {
@@ -182,18 +182,20 @@ class Diary:
         self.found[pair] = dict(found)
 
 
-def run_all(scenes: Sequence[Scene], ways: Sequence[Way], pipeline: Pipeline, diary: Diary, radius: float) -> None:
-    """Every way on every pair that the diary lacks; unreadable images are failures of every way."""
-    todo = [(scene, true) for scene in scenes for true in _in_order(scene) if true.pair.id not in diary.found]
+def run_all(
+    scenes: Sequence[Scene], ways: Sequence[Way], pipeline: Pipeline, results: ResultsFile, radius: float
+) -> None:
+    """Every way on every pair that is not in the file; unreadable images are failures of every way."""
+    todo = [(scene, true) for scene in scenes for true in _in_order(scene) if true.pair.id not in results.found]
     images = ImageStore()
     try:
         for place, (scene, true) in enumerate(tqdm(todo, unit="pair", smoothing=0.05)):
-            images.announce(path for _, coming in todo[place : place + 2] for path in coming.pair.images)
+            images.prefetch(path for _, coming in todo[place : place + 2] for path in coming.pair.images)
             image0, image1 = (images.get(path) for path in true.pair.images)
             if isinstance(image0, Unreadable) or isinstance(image1, Unreadable):
-                diary.add(true.pair.id, {way.name: Found(PoseError.failed(), 0, 0.0) for way in ways})
+                results.add(true.pair.id, {way.name: Found(PoseError.failed(), 0, 0.0) for way in ways})
                 continue
-            diary.add(
+            results.add(
                 true.pair.id, try_all(ways, PairMatch(images=(image0, image1)), true, scene, pipeline, radius)
             )
     finally:
@@ -212,11 +214,11 @@ class Tables:
     covisibility: Mapping[str, Sequence[float]]
 
     @classmethod
-    def of(cls, scenes: Sequence[Scene], diary: Diary) -> "Tables":
-        done = {scene.name: [true for true in scene.pairs if true.pair.id in diary.found] for scene in scenes}
+    def of(cls, scenes: Sequence[Scene], results: ResultsFile) -> "Tables":
+        done = {scene.name: [true for true in scene.pairs if true.pair.id in results.found] for scene in scenes}
         done = {name: pairs for name, pairs in done.items() if pairs}
         return cls(
-            {name: [diary.found[true.pair.id] for true in pairs] for name, pairs in done.items()},
+            {name: [results.found[true.pair.id] for true in pairs] for name, pairs in done.items()},
             {name: [true.covisibility for true in pairs] for name, pairs in done.items()},
         )
 
@@ -321,10 +323,10 @@ def main() -> None:
         "merge radius": arguments.merge_radius,
         "ways": [way.name for way in ways],
     }
-    diary = Diary(arguments.out / "pairs.jsonl", settings)
+    results = ResultsFile(arguments.out / "pairs.jsonl", settings)
     if not arguments.tables:
-        run_all(scenes, ways, assembly.pipeline(), diary, arguments.merge_radius)
-    print("\n".join(Tables.of(scenes, diary).markdown(ways)))
+        run_all(scenes, ways, assembly.pipeline(), results, arguments.merge_radius)
+    print("\n".join(Tables.of(scenes, results).markdown(ways)))
 
 
 if __name__ == "__main__":

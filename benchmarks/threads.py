@@ -2,10 +2,9 @@
 
 python -m benchmarks.threads [--cores 4] [--rounds 5] [--keypoints 1024]
 
-The processes of each setting take their turn once in every round: threads that spin while they wait (OpenMP's
-default) or sleep, as in the engine's workers, and fewer threads. The processes of one setting match at the same
-time, and what they do together in a second is told. Medians of the rounds. The cores are those that this process
-may run on, or the first of them.
+Each round measures every setting once: threads that spin while they wait (OpenMP's default) or sleep, as in the
+engine's workers, and fewer threads. The processes of one setting match at the same time, and their joint matches a
+second are printed. Medians of the rounds. The cores are those that this process may run on, or the first of them.
 """
 
 import argparse
@@ -39,30 +38,30 @@ class Setting:
 
 
 @dataclass
-class Crew:
-    """The processes of one setting, and the seconds of its turns, by the number of busy processes beside it."""
+class WorkerGroup:
+    """The processes of one setting, and the seconds of its rounds, by the number of busy processes beside it."""
 
     setting: Setting
-    members: list[tuple[BaseProcess, Connection]] = field(default_factory=list)
+    workers: list[tuple[BaseProcess, Connection]] = field(default_factory=list)
     seconds: dict[int, list[float]] = field(default_factory=dict)
 
     def start(self, keypoints: int) -> None:
         for _ in range(self.setting.processes):
-            ours, theirs = CONTEXT.Pipe()
-            process = CONTEXT.Process(target=match, args=(self.setting.threads, keypoints, theirs), daemon=True)
+            parent, child = CONTEXT.Pipe()
+            process = CONTEXT.Process(target=match, args=(self.setting.threads, keypoints, child), daemon=True)
             with started_with(self.setting.spin):
                 process.start()
-            self.members.append((process, ours))
-        for _, member in self.members:
-            member.recv()
+            self.workers.append((process, parent))
+        for _, worker in self.workers:
+            worker.recv()
 
-    def turn(self, busy: int) -> None:
+    def run_round(self, busy: int) -> None:
         """All match at once; the slowest counts."""
         start = time.perf_counter()
-        for _, member in self.members:
-            member.send(None)
-        for _, member in self.members:
-            member.recv()
+        for _, worker in self.workers:
+            worker.send(None)
+        for _, worker in self.workers:
+            worker.recv()
         self.seconds.setdefault(busy, []).append(time.perf_counter() - start)
 
     def rate(self, busy: int) -> float:
@@ -70,7 +69,7 @@ class Crew:
         return self.setting.processes / statistics.median(self.seconds[busy])
 
     def end(self) -> None:
-        for process, _ in self.members:
+        for process, _ in self.workers:
             process.kill()
             process.join()
 
@@ -84,8 +83,8 @@ def started_with(spin: bool) -> Iterator[None]:
         yield
 
 
-def match(threads: int, keypoints: int, told: Connection) -> None:
-    """A process's life: one match each time it is told to."""
+def match(threads: int, keypoints: int, connection: Connection) -> None:
+    """The worker's loop: one match for each message."""
     import torch
 
     from benchmarks.matchers import superglue
@@ -95,11 +94,11 @@ def match(threads: int, keypoints: int, told: Connection) -> None:
     with torch.inference_mode():
         run = superglue(keypoints, Precision.FLOAT32)
         run()
-        told.send(None)
+        connection.send(None)
         while True:
-            told.recv()
+            connection.recv()
             run()
-            told.send(None)
+            connection.send(None)
 
 
 def compute(_: int) -> None:
@@ -137,23 +136,25 @@ def main() -> None:
     arguments = parser.parse_args()
     os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[: arguments.cores])
     loads = (0, 1)
-    crews = [Crew(setting) for setting in settings_of(arguments.cores)]
+    groups = [WorkerGroup(setting) for setting in settings_of(arguments.cores)]
     try:
-        for crew in crews:
-            crew.start(arguments.keypoints)
+        for group in groups:
+            group.start(arguments.keypoints)
         for _ in range(arguments.rounds):
             for busy in loads:
                 with busy_processes(busy):
-                    for crew in crews:
-                        crew.turn(busy)
+                    for group in groups:
+                        group.run_round(busy)
     finally:
-        for crew in crews:
-            crew.end()
-    print(f"{arguments.cores} cores, SuperGlue on {arguments.keypoints} keypoints: seconds a turn, pairs a second")
+        for group in groups:
+            group.end()
+    print(
+        f"{arguments.cores} cores, SuperGlue on {arguments.keypoints} keypoints: seconds a round, pairs a second"
+    )
     print(f"{'processes x threads':<24}{'alone':>8}{'':>8}{'beside a busy process':>24}")
-    for crew in crews:
-        columns = [(statistics.median(crew.seconds[busy]), crew.rate(busy)) for busy in loads]
-        print(f"{crew.setting!s:<24}" + "".join(f"{seconds:>9.2f}{rate:>8.2f}" for seconds, rate in columns))
+    for group in groups:
+        columns = [(statistics.median(group.seconds[busy]), group.rate(busy)) for busy in loads]
+        print(f"{group.setting!s:<24}" + "".join(f"{seconds:>9.2f}{rate:>8.2f}" for seconds, rate in columns))
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""What a matcher finds on critical regions and on whole images at one long side, held against the true cameras.
+"""What a matcher finds on critical regions and on whole images at one long side, compared with the true cameras.
 
 python -m benchmarks.views --train-dir DIR [--weights DIR] [--pairs-per-scene 6] [--matchers sift,aliked]
 

@@ -118,8 +118,8 @@ def draw_boxes(
     """The bounding box of the kept clusters as it is, and with Crop Area Expansion; dropped points as crosses."""
     figure, row = side_by_side(images, title_lines=2)
     for number, (axes, image, xy, found) in enumerate(zip(row, images, points, clusters, strict=True)):
-        kept = xy[found.keeps]
-        _crosses(axes, xy[~found.keeps], OUTLIER)
+        kept = xy[found.in_kept]
+        _crosses(axes, xy[~found.in_kept], OUTLIER)
         _dots(axes, kept, INLIER)
         title = f"image {number}: nothing kept, so no box"
         if len(kept):
@@ -217,7 +217,7 @@ def draw_pose_errors(errors: Mapping[str, PoseError]) -> "Figure":
         angles = np.array([getattr(error, kind) for error in errors.values()])
         known = np.isfinite(angles)
         names = [short(name, 40) for name in errors]
-        bars = axes.barh(names, np.where(known, angles, 0), color=CYCLE[: len(names)], height=0.6)
+        bars = axes.barh(names, np.where(known, angles, 0), color=list(CYCLE[: len(names)]), height=0.6)
         labels = [f"{angle:.2f}" if ok else "no F" for angle, ok in zip(angles, known, strict=True)]
         axes.bar_label(bars, labels, padding=3, color=INK)
         axes.margins(x=0.15)

@@ -133,14 +133,14 @@ def test_clusters_tell_their_points_from_noise_and_those_that_are_kept():
     assert_array_equal(clusters.sizes, [5, 101])
     assert_array_equal(clusters.labels, [0] * 5 + [-1] * 3 + [1] * 101)
     assert_array_equal(clusters.kept, [1])  # 5 / 101 < 0.05
-    assert_array_equal(clusters.keeps, [False] * 8 + [True] * 101)
+    assert_array_equal(clusters.in_kept, [False] * 8 + [True] * 101)
 
 
 @pytest.mark.parametrize("points", [NOTHING, lone(30)], ids=["no points", "noise alone"])
 def test_where_nothing_clusters_nothing_is_kept(points):
     clusters = find_clusters(points, SQUARE, PAPER)
-    assert len(clusters.labels) == len(clusters.keeps) == len(points)
-    assert len(clusters.sizes) == len(clusters.kept) == clusters.keeps.sum() == 0
+    assert len(clusters.labels) == len(clusters.in_kept) == len(points)
+    assert len(clusters.sizes) == len(clusters.kept) == clusters.in_kept.sum() == 0
 
 
 def test_x_is_normalised_by_the_width_and_y_by_the_height():

@@ -12,7 +12,6 @@ from torch.nn import functional
 
 from mkpc_kaggle.matchers.networks.dense_sampling import (
     SamplingConfig,
-    Weighting,
     balancing_weights,
     density,
     sample,
@@ -250,9 +249,9 @@ def warp_and_certainty(count=3000, seed=5):
 
 @pytest.mark.parametrize("mode", MODES)
 def test_samples_repeat_with_a_seed_and_hold_no_match_twice(mode):
-    weighting, balanced = MODES[mode]
+    threshold, balanced = MODES[mode]
     warp, certainty = warp_and_certainty()
-    config = SamplingConfig(400, weighting, balanced=balanced)
+    config = SamplingConfig(400, threshold, balanced)
     first, again, other = (
         sample(warp, certainty, config, torch.Generator().manual_seed(seed)) for seed in (1, 1, 2)
     )
@@ -267,7 +266,7 @@ def test_samples_repeat_with_a_seed_and_hold_no_match_twice(mode):
 def test_without_balance_it_is_pytorchs_multinomial():
     warp, certainty = warp_and_certainty()
     drawn = torch.multinomial(certainty, 50, generator=torch.Generator().manual_seed(6))
-    config = SamplingConfig(50, Weighting.PLAIN, balanced=False)
+    config = SamplingConfig(50, threshold=1, balanced=False)
     found = sample(warp, certainty, config, torch.Generator().manual_seed(6))
     assert torch.equal(found.matches, warp[drawn])
     assert torch.equal(found.certainty, certainty[drawn])

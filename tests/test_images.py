@@ -215,7 +215,7 @@ def store():
     made.close()
 
 
-def test_what_is_announced_is_decoded_in_the_background(store, monkeypatch):
+def test_prefetched_images_are_decoded_in_the_background(store, monkeypatch):
     started, go = threading.Event(), threading.Event()
 
     def slow(path):
@@ -224,16 +224,16 @@ def test_what_is_announced_is_decoded_in_the_background(store, monkeypatch):
         return Image(str(path), np.zeros((1, 1, 3), np.uint8))
 
     monkeypatch.setattr(ImageStore, "read", staticmethod(slow))
-    store.announce([Path("a")])  # comes back although nothing can be decoded yet
+    store.prefetch([Path("a")])  # comes back although nothing can be decoded yet
     assert started.wait(10)
     go.set()
     assert store.get(Path("a")).name == "a"
 
 
-def test_a_file_is_decoded_once_however_often_it_is_announced_and_asked_for(store, decoded):
+def test_a_file_is_decoded_once_however_often_it_is_asked_for(store, decoded):
     paths = [Path("a"), Path("b")]
     for _ in range(3):
-        store.announce([*paths, *paths])
+        store.prefetch([*paths, *paths])
         assert [store.get(path).name for path in paths] == ["a", "b"]
     assert decoded == paths
 

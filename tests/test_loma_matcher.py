@@ -198,9 +198,9 @@ def test_descriptors_are_read_from_a_map_that_is_never_made(network: Loma, kind:
     image = image_of(scene(42, 70, channels=3))
     edges = torch.tensor([[-1.0, -1], [1, 1], [-1.02, 0.3], [0.2, 1.03], [3, 0], [-0.99, 0.995]])
     points = torch.cat([edges, torch.rand(40, 2, generator=torch.Generator().manual_seed(0)) * 2 - 1])[None]
-    answer, hidden = descriptor.decoder(descriptor.encoder.levels(image))
+    prediction, hidden = descriptor.decoder(descriptor.encoder.levels(image))
     part = descriptor.decoder.last.outputs(hidden)[:, :-1]
-    dense = torch.nn.functional.interpolate(answer, image.shape[2:], mode="bilinear") + part
+    dense = torch.nn.functional.interpolate(prediction, image.shape[2:], mode="bilinear") + part
     expected = torch.nn.functional.grid_sample(dense, points[:, None], align_corners=False)[:, :, 0].mT
     torch.testing.assert_close(descriptor(image, points), expected, rtol=0, atol=1e-5)
     assert (expected[0, 4] == 0).all()

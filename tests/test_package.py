@@ -178,7 +178,7 @@ def test_a_private_package_has_all_weights_and_a_public_one_refuses_to_be_laid_o
     arguments += ["--wheels", str(wanted.wheels), "--weights", str(wanted.weights[0])]
     assert main([*arguments, "--private"]) == 0
     out = " ".join(capsys.readouterr().out.split())
-    assert "private on Kaggle and share it with nobody" in out
+    assert "private on Kaggle, do not share it" in out
     assert "kept.pt (Magic-Leap-noncommercial)" in out
     kept = wanted.out / "dataset" / "kept.pt.safetensors"
     assert torch.equal(load_tensors(kept)["a"], torch.full((3,), 2.0))

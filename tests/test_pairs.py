@@ -98,7 +98,7 @@ def test_a_malformed_line_is_named_with_what_was_expected(line: str, expected: s
 )
 def test_no_name_leads_out_of_the_image_root(name: str) -> None:
     for names in (f"{name} ok.jpg", f"ok.jpg {name}"):
-        with pytest.raises(UserError, match=r"list.txt, line 2: .* leads out of the image root"):
+        with pytest.raises(UserError, match=r"list.txt, line 2: .* points outside the image root"):
             parse_line(f"{names} 0 0 {EYE}", 2, FILE)
 
 
@@ -139,7 +139,8 @@ def test_the_true_matrix_has_no_error(
         cameras = true.camera0, true.camera1
         if model is Model.E:
             cameras = true.camera0.calibrated, true.camera1.calibrated
-        assert error_of(fundamental_of_cameras(*cameras), true, read).angle < 1e-6
+        # Near a cosine of 1 the angle of a rounding error is a millionth of a degree.
+        assert error_of(fundamental_of_cameras(*cameras), true, read).angle < 1e-5
         assert all(path.is_file() for path in true.pair.images)
 
 

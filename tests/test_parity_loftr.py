@@ -19,7 +19,7 @@ from semi_dense import (
 from mkpc_kaggle.matchers.networks.coarse_matching import coarse_matches
 from mkpc_kaggle.matchers.networks.fine_matching import cut_windows
 from mkpc_kaggle.matchers.networks.loftr import Loftr, LoftrConfig
-from mkpc_kaggle.matchers.networks.position import FIXED_FALL, ORIGINAL_FALL, sine_positions
+from mkpc_kaggle.matchers.networks.position import FIXED_DECAY, ORIGINAL_DECAY, sine_positions
 from mkpc_kaggle.matchers.networks.resnet_fpn import FeatureMaps
 
 CASES = ("same_size", "diff_size", "masked_batch", "no_match")
@@ -42,8 +42,8 @@ def stages_of(case):
 
 def position_stages():
     golden = golden_arrays("loftr", "pos_encoding")
-    for prefix, fall in (("buggy", ORIGINAL_FALL), ("fixed", FIXED_FALL)):
-        table = sine_positions(256, 256, fall).permute(2, 0, 1)
+    for prefix, decay in (("buggy", ORIGINAL_DECAY), ("fixed", FIXED_DECAY)):
+        table = sine_positions(256, 256, decay).permute(2, 0, 1)
         got = {"chan_first24": table[:24, :12, :16], "col": table[:, 7, 200], "corner": table[:, 255, 255]}
         for name, values in got.items():
             yield Stage(f"{prefix}_{name}", values, golden[f"{prefix}_{name}"], POSITION_TOLERANCES[name])

@@ -14,7 +14,7 @@ from semi_dense import (
     textured,
 )
 
-from mkpc_kaggle.matchers.networks.grids import mean_pool, quads, unquads
+from mkpc_kaggle.matchers.networks.grids import from_2x2_blocks, mean_pool, to_2x2_blocks
 from mkpc_kaggle.matchers.networks.quadtree import Quadtree, QuadtreeConfig, attend, quadtree_attention
 
 CASES = ("same_size", "diff_size_extension", "masked_batch")
@@ -105,9 +105,9 @@ def test_sides_must_fit():
 
 def test_quads_and_back():
     grid = torch.arange(2 * 4 * 6 * 3).view(2, 4, 6, 3)
-    cells = quads(grid)
+    cells = to_2x2_blocks(grid)
     assert cells[1, 4].tolist() == grid[1, 2:4, 2:4].flatten(0, 1).tolist()
-    assert torch.equal(unquads(cells, 4, 6), grid)
+    assert torch.equal(from_2x2_blocks(cells, 4, 6), grid)
 
 
 def test_attention_with_all_cells_kept_is_that_of_each_level():

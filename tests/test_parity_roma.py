@@ -176,9 +176,9 @@ def sampling_stages():
     modes = {"threshold": "threshold", "raw": "raw"}
     modes |= {f"{mode}_float32": mode for mode in ("threshold_balanced", "balanced")}
     for name, mode in modes.items():
-        weighting, balanced = MODES[mode]
+        threshold, balanced = MODES[mode]
         generator = torch.Generator().manual_seed(1234)
-        found = sample(warp, certainty, SamplingConfig(1000, weighting, 0.05, balanced), generator)
+        found = sample(warp, certainty, SamplingConfig(1000, threshold, balanced), generator)
         yield Stage(f"{name}__matches", found.matches, golden[f"{name}__matches"])
         yield within(f"{name}__certainty", found.certainty, golden[f"{name}__certainty"])
     weights = certainty.flatten().masked_fill(certainty.flatten() > 0.05, 1)

@@ -21,7 +21,7 @@ from mkpc_kaggle.pipeline.assembly import assemble
 main(["weights", "list"])
 main(["recipes"])
 assembly = assemble("auto")
-print(assembly.recipe.matcher_names, {unit.matcher for unit in assembly.left_out} >= {"aliked"})
+print(assembly.recipe.matcher_names, {unit.matcher for unit in assembly.left_out} >= {"xfeat_lighterglue"})
 assemble("light")
 """
 
@@ -78,8 +78,8 @@ def test_a_matcher_is_imported_when_it_is_asked_for() -> None:
 def test_without_kornia_its_matchers_alone_are_lost(clean_environment: None) -> None:
     done = run(WITHOUT_KORNIA)
     assert "superglue_outdoor.pth" in done.stdout, done.stderr
-    assert "\nmatcher aliked cannot be used here (ModuleNotFoundError" in done.stdout
-    assert "    matcher aliked cannot be used here (ModuleNotFoundError" in done.stdout
+    assert "\nmatcher xfeat_lighterglue cannot be used here (ModuleNotFoundError" in done.stdout
+    assert "    matcher xfeat_lighterglue cannot be used here (ModuleNotFoundError" in done.stdout
     assert "('sift',) True" in done.stdout
-    assert "recipe auto does without it: matcher aliked cannot be used here" in done.stderr
-    assert "recipe 'light': matcher aliked cannot be used here" in done.stderr
+    assert "recipe auto does without it: matcher xfeat_lighterglue cannot be used here" in done.stderr
+    assert "recipe 'light': matcher xfeat_lighterglue cannot be used here" in done.stderr

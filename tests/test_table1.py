@@ -7,7 +7,7 @@ import pytest
 
 from benchmarks import table1
 from benchmarks.merging import merged
-from benchmarks.table1 import CONTRASTS, Diary, Found, Tables, Way, run_all, union, ways_of
+from benchmarks.table1 import CONTRASTS, Found, ResultsFile, Tables, Way, run_all, union, ways_of
 from mkpc_kaggle.data.competition import read_train_side
 from mkpc_kaggle.demo import DemoSet
 from mkpc_kaggle.engine.budget import Budget
@@ -72,9 +72,9 @@ def test_it_gives_what_the_engine_gives_and_goes_on_where_it_was(
     (scene,) = read_train_side(demo.train_dir, pairs_per_scene=3)
     assembly = assemble(union(small))
     path = tmp_path / "out" / "pairs.jsonl"
-    run_all([scene], small, assembly.pipeline(), Diary(path, {"a": 1}), 1.0)
-    diary = Diary(path, {"a": 1})
-    assert set(diary.found) == {true.pair.id for true in scene.pairs}
+    run_all([scene], small, assembly.pipeline(), ResultsFile(path, {"a": 1}), 1.0)
+    results = ResultsFile(path, {"a": 1})
+    assert set(results.found) == {true.pair.id for true in scene.pairs}
 
     way = next(way for way in small if way.name == "sift: one + two")
     recipe = assemble(union([way]))
@@ -82,22 +82,24 @@ def test_it_gives_what_the_engine_gives_and_goes_on_where_it_was(
     validation, _ = validate([scene], recipe, session)
     for score in validation.scenes[0].pairs:
         assert score.record is not None
-        found = diary.found[score.id][way.name]
+        found = results.found[score.id][way.name]
         assert found.matches == score.record.matches
         assert found.error == score.error
         assert (
-            0 < diary.found[score.id]["sift: three, merged"].matches < diary.found[score.id]["sift: three"].matches
+            0
+            < results.found[score.id]["sift: three, merged"].matches
+            < results.found[score.id]["sift: three"].matches
         )
 
     whole = path.read_bytes()
     last = whole.splitlines(keepends=True)[-1]
     path.write_bytes(whole[: -len(last) // 2])  # the last line was cut off
-    again = Diary(path, {"a": 1})
+    again = ResultsFile(path, {"a": 1})
     assert len(again.found) == len(scene.pairs) - 1
     run_all([scene], small, assembly.pipeline(), again, 1.0)
-    assert Diary(path, {"a": 1}).found.keys() == diary.found.keys()
+    assert ResultsFile(path, {"a": 1}).found.keys() == results.found.keys()
     with pytest.raises(UserError, match="other settings"):
-        Diary(path, {"a": 2})
+        ResultsFile(path, {"a": 2})
 
     lines = list(Tables.of([scene], again).markdown(small))
     assert lines[0] == "Pairs: courtyard 3."

@@ -43,7 +43,7 @@ def test_the_derivatives_of_the_fundamental_matrix_are_those_of_finite_differenc
 def test_the_gradient_of_the_cost_is_that_of_finite_differences(k):
     view, problem = random_view(1), Problem(*rays(1), np.array([0.4, 0.2]), weight=2.0)
     forth, back = (problem.cost(view.moved(step), 30.0) for step in each_way(k))
-    gradient, curvature = problem._slopes(view, 30.0)
+    gradient, curvature = problem._derivatives(view, 30.0)
     assert gradient[k] == pytest.approx((forth - back) / (2 * STEP), abs=1e-5)
     assert_allclose(curvature, curvature.T)
 

@@ -174,7 +174,7 @@ def test_only_the_web_is_redirected_to(site: Site, tmp_path: Path, target: str) 
 
 def test_no_redirection_leaves_https() -> None:
     with pytest.raises(UserError, match="redirects to http://x/b, which is not followed"):
-        fetch._OnlyWeb().redirect_request(Request("https://x/a"), BytesIO(), 302, "", {}, "http://x/b")
+        fetch._HttpRedirectHandler().redirect_request(Request("https://x/a"), BytesIO(), 302, "", {}, "http://x/b")
 
 
 def test_a_redirection_keeps_the_part_that_is_asked_for(site: Site, tmp_path: Path) -> None:

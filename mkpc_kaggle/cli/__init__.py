@@ -14,7 +14,7 @@ from mkpc_kaggle.errors import UserError
 
 COMMANDS = ("submit", "match", "validate", "recipes", "weights", "check", "journal", "package", "demo")
 EXIT_BAD_INPUT = 2
-EXIT_NO_READER = 128 + 13  # as a shell tells of SIGPIPE
+EXIT_BROKEN_PIPE = 128 + 13  # a shell's status for SIGPIPE
 
 _DESCRIPTION = """\
 Two-stage image matching with Matching Key-Points Crop, offline, inside a time budget.
@@ -36,7 +36,7 @@ COMMAND --help tells more.
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; the exit status: 0 done, 1 a check failed, 2 bad input, 130 / 143 ended by a signal.
 
-    141: whoever read the output has left.
+    141: the reader of the output closed the pipe.
     """
     started = time.monotonic()
     parsed = make_parser().parse_args(arguments)
@@ -51,9 +51,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             print(f"error: {error}", file=sys.stderr)
             return EXIT_BAD_INPUT
         except BrokenPipeError:
-            # Who read the output has left, as head does. Python would complain once more when it ends.
+            # The reader closed the pipe, as head does. Without this Python would print a second error at exit.
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            return EXIT_NO_READER
+            return EXIT_BROKEN_PIPE
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -76,8 +76,8 @@ def make_parser() -> argparse.ArgumentParser:
     return parser
 
 
-def leave(status: int, *, at_rest: bool) -> int:
-    """Return ``status``; or leave at once where a thread cannot be stopped: all that matters is on disk."""
+def finish(status: int, *, at_rest: bool) -> int:
+    """Return ``status``, or exit at once if a thread cannot be stopped: all results are on disk."""
     if at_rest:
         return status
     sys.stdout.flush()
@@ -93,5 +93,5 @@ def _show_warning(
     file: TextIO | None = None,
     line: str | None = None,
 ) -> None:
-    """A user wants the message, not the line of code it came from."""
+    """Prints the message without the line of code that it came from."""
     print(f"warning: {message}", file=sys.stderr)

@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 
 HELP = """\
-Hold a submission against test.csv: header, ids and their order, nine finite numbers a row.
+Compare a submission with test.csv: header, ids and their order, nine finite numbers a row.
 Exit status: 0 it is good, 1 it is not (each problem on a line), 2 the test side cannot be read.
 """
 MOST_LINES = 20

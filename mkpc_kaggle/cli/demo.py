@@ -15,7 +15,7 @@ DIR/train with poses, DIR/test without, DIR/test_truth.csv to score a submission
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, default=Path("demo"), metavar="DIR", help="default: demo")
-    parser.add_argument("--seed", type=int, default=0, help="another seed, other pictures")
+    parser.add_argument("--seed", type=int, default=0, help="another seed gives other pictures")
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 
 HELP = """\
-Read the journal of a run, at work or ended, and tell what it did. DIR is the run's work directory, NAME.work
+Read the journal of a run, running or ended, and show what it did. DIR is the run's work directory, NAME.work
 beside the submission. Without options: one screen.
 
 --csv writes long tables that pandas.read_csv takes as they are, with `pair`, the row of the test set, in common:

@@ -19,7 +19,7 @@ Write DIR/dataset (our wheel, the wheels that Kaggle's image may lack, weights w
 machine with internet or with the wheels in a directory (--wheels). Run again, it keeps what is there already.
 
 Torch checkpoints are converted to safetensors, since Kaggle unpacks uploaded archives, which these are.
-Weights whose licences do not allow to pass them on are left out, unless --private is given.
+Weights whose licences do not allow redistribution are left out, unless --private is given.
 """
 
 
@@ -37,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--private",
         action="store_true",
-        help="put weights in that must not be passed on: the dataset must stay private then",
+        help="include weights that must not be redistributed: the dataset must stay private then",
     )
     parser.add_argument(
         "--image",
@@ -67,10 +67,10 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 _LEFT_OUT = """\
-Left out, because their licences do not allow, or not clearly, to pass them on (--private puts them in)"""
+Left out, because their licences do not clearly allow redistribution (--private includes them)"""
 _PRIVATE = """\
-In this dataset, though their licences do not allow, or not clearly, to pass them on. Keep the dataset private on
-Kaggle and share it with nobody; mind, too, what the licences say of competitions. These are"""
+In this dataset, though their licences do not clearly allow redistribution. Keep the dataset private on Kaggle,
+do not share it, and check what the licences say of competitions. These are"""
 _NEXT = """
 Next, with the `kaggle` command (README, On Kaggle):
   kaggle datasets create -p {out}/dataset

@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from mkpc_kaggle.cli import leave, options
+from mkpc_kaggle.cli import finish, options
 
 HELP = """\
 Match every pair of test.csv and write one fundamental matrix a row.
@@ -71,4 +71,4 @@ def run(arguments: argparse.Namespace) -> int:
             page = arguments.report or output.with_suffix(".html")
             print(report_run(work_dir, page, session.must_end(), pairs), flush=True)
         status = 128 + interrupt.signal if interrupt.signal else int(bool(report.unwritten or trouble(report)))
-        return leave(status, at_rest=at_rest)
+        return finish(status, at_rest=at_rest)

@@ -6,7 +6,7 @@ import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mkpc_kaggle.cli import leave, options
+from mkpc_kaggle.cli import finish, options
 
 if TYPE_CHECKING:
     from mkpc_kaggle.data.competition import Scene
@@ -50,7 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--compare",
         nargs="+",
         metavar="RECIPE[:MODE]",
-        help="run these in place of --recipe and --mode, and give the gain of each over the first with its 95 %% "
+        help="run these instead of --recipe and --mode, and give the gain of each over the first with its 95 %% "
         "interval; such as classical:whole-images classical",
     )
     parser.add_argument(
@@ -67,8 +67,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--work-dir",
         type=Path,
         metavar="DIR",
-        help="keep the journal there (with --compare one a recipe) and go on from it; report.html beside it tells "
-        "of the run (not with --pairs); default: a temporary one",
+        help="keep the journal there (with --compare one a recipe) and go on from it; report.html beside it shows "
+        "the run (not with --pairs); default: a temporary one",
     )
     parser.add_argument(
         "--submission",
@@ -149,7 +149,7 @@ def _match_and_score(arguments: argparse.Namespace, scenes: "tuple[Scene, ...]",
     _write_report(arguments, scenes, session)
     assert validation.report is not None
     status = 128 + interrupt.signal if interrupt.signal else int(bool(trouble(validation.report)))
-    return leave(status, at_rest=at_rest)
+    return finish(status, at_rest=at_rest)
 
 
 def _compare(arguments: argparse.Namespace, scenes: "tuple[Scene, ...]", work_dir: Path) -> int:
@@ -172,12 +172,12 @@ def _compare(arguments: argparse.Namespace, scenes: "tuple[Scene, ...]", work_di
             print()
             if validation.report is None or validation.report.ending is not Ending.COMPLETE:
                 print("nothing is compared before all is done; with a --work-dir, the same command goes on")
-                return leave(128 + interrupt.signal if interrupt.signal else 1, at_rest=at_rest)
+                return finish(128 + interrupt.signal if interrupt.signal else 1, at_rest=at_rest)
             validations.append(validation)
     comparison = Comparison(tuple(validations))
     print("\n".join(comparison_table(comparison)))
     _write_json(arguments.json, comparison_json(comparison))
-    return leave(0, at_rest=at_rest)
+    return finish(0, at_rest=at_rest)
 
 
 def _session(arguments: argparse.Namespace, work_dir: Path, interrupt: "Interrupt") -> "Session":
@@ -237,7 +237,7 @@ def _print_summary(
 
 
 def _write_report(arguments: argparse.Namespace, scenes: "tuple[Scene, ...]", session: "Session") -> None:
-    """The page on a run whose journal stays; it tells inliers by an F, so none where E was estimated."""
+    """The report of a run whose journal is kept; its inliers are of F, so there is none where E was estimated."""
     from mkpc_kaggle.reporting.report import report_run
 
     if arguments.work_dir is not None and arguments.pairs is None:

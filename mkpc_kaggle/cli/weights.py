@@ -11,7 +11,7 @@ HELP = """\
 The files that the matchers load their weights from; none comes with the package.
 
   list      every file: size, licence, who uses it, where it lies; what the missing ones would enable
-  verify    hold every file found against the manifest
+  verify    compare every file found with the manifest
   locate    where is the file that a matcher would get?
   fetch     download files, on a machine with internet
   convert   a checkpoint -> safetensors, and its line for the manifest
@@ -21,12 +21,12 @@ ACTION --help tells more.
 """
 _LIST = "Every file of the manifest, who uses it and where it lies; and what the missing ones would enable."
 _VERIFY = """\
-Hold every file found against the manifest: truncated ones, other files under the right name, files under another
+Compare every file found with the manifest: truncated ones, other files under the right name, files under another
 name (which do as well), and files that the manifest has no digest for."""
 _LOCATE = "Print the path of the file that would be taken; exit status 1 where there is none."
 _FETCH = """\
-Download files: what broke off goes on where it was, and a file gets its name when its digest is right. Each
-licence is printed before; mind it."""
+Download files: interrupted downloads are resumed, and a file gets its name when its digest is right. Each
+licence is printed first; check it."""
 _CONVERT = "Write a checkpoint's tensors as safetensors with the same names; print the manifest's line for it."
 
 

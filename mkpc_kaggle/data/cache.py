@@ -10,7 +10,7 @@ Value = TypeVar("Value")
 
 
 class ByteCache(Generic[Key, Value]):
-    """Keeps the values used last, at most ``limit`` bytes of them; a value above the limit is not kept."""
+    """Keeps the most recently used values, ``limit`` bytes at most; a larger value is not kept."""
 
     def __init__(self, limit: int) -> None:
         self.limit = limit

@@ -1,8 +1,8 @@
 """Files of the Image Matching Challenge 2022: the test side, the train side, submissions.
 
 Matrices and vectors in cells are separated by blanks, row by row. A test image is
-``test_images/<batch_id>/<image_id>.png``, a train image ``<scene>/images/<image_id>.jpg``; any of png, jpg and
-jpeg will do on both sides. F of a pair satisfies x2^T F x1 = 0, image 1 being the first.
+``test_images/<batch_id>/<image_id>.png``, a train image ``<scene>/images/<image_id>.jpg``; png, jpg and
+jpeg are accepted on both sides. F of a pair satisfies x2^T F x1 = 0, image 1 being the first.
 """
 
 import csv
@@ -32,7 +32,7 @@ Item = TypeVar("Item")
 class Pair:
     """Two images to match: ``id`` is unique in a run, ``group`` the batch or scene they belong to.
 
-    With ``intrinsics``, the camera matrices, E is estimated in F's stead.
+    With ``intrinsics``, the camera matrices, E is estimated instead of F.
     """
 
     id: str
@@ -51,7 +51,7 @@ class Pair:
 
     @property
     def key(self) -> str:
-        """What tells it from other pairs in a journal: the id, and the intrinsics that E depends on."""
+        """What identifies it in a journal: the id, and the intrinsics that E depends on."""
         return self.id if self.intrinsics is None else f"{self.id} {[K.tolist() for K in self.intrinsics]}"
 
 
@@ -67,7 +67,7 @@ class TruePair:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Pairs with cameras, and the metres that one unit of their world is long, NaN where nobody knows."""
+    """Pairs with cameras, and the metres that one unit of their world is long, NaN where that is unknown."""
 
     name: str
     metres_per_unit: float
@@ -78,7 +78,7 @@ def read_test_side(directory: Path) -> tuple[Pair, ...]:
     """The pairs of ``test.csv``, in its order.
 
     ``directory`` holds ``test.csv`` and ``test_images/``, or is ``test_images`` itself with ``test.csv``
-    beside it. An image that is not there is no error here: its path is then one that does not exist. Raises
+    beside it. A missing image is no error here: its path does not exist. Raises
     :class:`UserError` for a missing or unreadable table, missing columns, no rows, repeated sample ids, and
     ids that are not plain names.
     """
@@ -92,7 +92,7 @@ def read_test_side(directory: Path) -> tuple[Pair, ...]:
     repeated = table["sample_id"][table["sample_id"].duplicated()]
     if not repeated.empty:
         times = int((table["sample_id"] == repeated.iloc[0]).sum())
-        raise UserError(f"{path}: the sample_id {repeated.iloc[0]!r} stands there {times} times")
+        raise UserError(f"{path}: the sample_id {repeated.iloc[0]!r} occurs {times} times")
     return tuple(
         Pair(
             str(sample),
@@ -153,9 +153,9 @@ def read_cameras(path: Path) -> dict[str, Camera]:
 
 
 def write_submission(path: Path, rows: Mapping[str, Matrix3]) -> None:
-    """Write ``sample_id,fundamental_matrix`` in the order of ``rows``; the file is replaced at one stroke.
+    """Write ``sample_id,fundamental_matrix`` in the order of ``rows``; the file is replaced atomically.
 
-    Raises ``OSError`` where it cannot be written; the former file is then untouched.
+    Raises ``OSError`` where it cannot be written; an earlier file is then unchanged.
     """
     part = path.with_name(f".{path.name}.part")
     with part.open("w", encoding="utf-8", newline="") as stream:
@@ -175,7 +175,7 @@ def read_submission(path: Path) -> dict[str, Matrix3]:
 
 
 def submission_problems(path: Path, sample_ids: Sequence[str]) -> list[str]:
-    """What is wrong with a submission, one sentence each; empty if the competition will take it."""
+    """What is wrong with a submission, one sentence each; empty if the competition accepts it."""
     try:
         table = read_table(path, SUBMISSION_COLUMNS)
     except UserError as error:
@@ -218,7 +218,7 @@ def read_table(path: Path, columns: Sequence[str]) -> pd.DataFrame:
 
 
 def plain_name(name: str, where: Path) -> str:
-    """``name`` if it is the name of one file or directory; an id must not lead out of its directory."""
+    """``name`` if it is the name of one file or directory; an id must not point outside its directory."""
     if name in ("", ".", "..") or any(mark in name for mark in ("/", "\\", "\0")):
         raise UserError(f"{where}: the id {name!r} is not a plain name, so it cannot name a file here")
     return name
@@ -284,5 +284,5 @@ def _difference(found: Sequence[str], expected: Sequence[str]) -> str:
     if surplus:
         return f"{len(surplus)} samples are not in test.csv, the first is {surplus[0]}"
     if len(found) != len(expected):
-        return "a sample stands there twice"
+        return "a sample is there twice"
     return "the samples are not in the order of test.csv"

@@ -1,4 +1,4 @@
-"""Decoding images, ahead of need and once: an unreadable file is a value with a reason, not an exception."""
+"""Decoding images, in the background and once: an unreadable file is a value with a reason, not an exception."""
 
 import hashlib
 import threading
@@ -17,7 +17,7 @@ from mkpc_kaggle.geometry.coordinates import Pixels, Size
 
 @dataclass(frozen=True, eq=False)
 class Image:
-    """A decoded picture: ``pixels`` is (H, W, 3) uint8 RGB; ``name`` tells it from all others of a run."""
+    """A decoded picture: ``pixels`` is (H, W, 3) uint8 RGB; ``name`` is unique in a run."""
 
     name: str
     pixels: Pixels
@@ -60,8 +60,8 @@ class Unreadable:
 def read_image(path: Path) -> Image | Unreadable:
     """Decode one file (png, jpg; 8 or 16 bit; gray, colour, with alpha) to 8-bit RGB; never raises.
 
-    16-bit values are divided by 256, alpha is dropped, an EXIF orientation is applied. Whether a damaged file
-    is readable is OpenCV's to say: version 5 refuses one that was cut off.
+    16-bit values are divided by 256, alpha is dropped, an EXIF orientation is applied. OpenCV decides whether
+    a damaged file is readable: version 5 refuses a truncated one.
     """
     name = str(path)
     try:
@@ -87,9 +87,9 @@ def decode_image(name: str, data: Pixels) -> Image | Unreadable:
 
 
 class ImageStore:
-    """Images by path, decoded in the background when they are announced, the last used kept.
+    """Images by path, decoded in the background by :meth:`prefetch`; the most recently used are kept.
 
-    ``read`` gets at one, other than from a file if it is given; it never raises.
+    ``read`` replaces :func:`read_image`; it never raises.
     """
 
     read: Callable[[Path], Image | Unreadable] = staticmethod(read_image)
@@ -103,31 +103,31 @@ class ImageStore:
         if read is not None:
             self.read = read
         self._images: ByteCache[Path, Image] = ByteCache(limit_bytes)
-        self._coming: dict[Path, Future[Image | Unreadable]] = {}
+        self._pending: dict[Path, Future[Image | Unreadable]] = {}
         self._lock = threading.Lock()
         self._decoders = ThreadPoolExecutor(threads, thread_name_prefix="decode")
 
-    def announce(self, paths: Iterable[Path]) -> None:
-        """Start decoding what is neither here nor on its way."""
+    def prefetch(self, paths: Iterable[Path]) -> None:
+        """Start decoding the images that are neither cached nor being decoded."""
         for path in paths:
             with self._lock:
-                if path not in self._coming and self._images.get(path) is None:
-                    self._coming[path] = self._decoders.submit(self.read, path)
+                if path not in self._pending and self._images.get(path) is None:
+                    self._pending[path] = self._decoders.submit(self.read, path)
 
     def get(self, path: Path) -> Image | Unreadable:
-        """The image, waiting for it if need be."""
+        """The image; waits until it is decoded."""
         with self._lock:
             known = self._images.get(path)
             if known is not None:
                 return known
-            coming = self._coming.get(path) or self._decoders.submit(self.read, path)
-            self._coming[path] = coming
-        image = coming.result()
+            pending = self._pending.get(path) or self._decoders.submit(self.read, path)
+            self._pending[path] = pending
+        image = pending.result()
         with self._lock:
             if isinstance(image, Image):
                 self._images.put(path, image, image.pixels.nbytes)
-            if self._coming.get(path) is coming:
-                del self._coming[path]
+            if self._pending.get(path) is pending:
+                del self._pending[path]
         return image
 
     def close(self) -> None:

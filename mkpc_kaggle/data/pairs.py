@@ -2,7 +2,7 @@
 
 A line a pair: ``name0 name1 turns0 turns1 K0 K1 T_0to1``, separated by blanks. Names are paths under one image
 root. ``turns`` are the quarter turns, counter-clockwise, that set an image upright. K (9 numbers) and T (16), row
-by row, are those of the images as they lie there: X_1 = R X_0 + t with T = [R t; 0 1].
+by row, are those of the images as they are stored: X_1 = R X_0 + t with T = [R t; 0 1].
 """
 
 import hashlib
@@ -29,8 +29,8 @@ ORTHOGONAL = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
-class Line:
-    """One line as it stands there: ``names`` are relative paths, ``cameras`` those of the images not turned."""
+class PairLine:
+    """One parsed line: ``names`` are relative paths, ``cameras`` those of the images before turning."""
 
     number: int
     names: tuple[str, str]
@@ -43,8 +43,8 @@ def read_pairs(file: Path, image_root: Path, model: Model, *, copies: Path, most
 
     ``most`` takes that many pairs, evenly spread over the list. A turned copy of every image that has to be turned
     is written to the directory ``copies``, and the cameras are those of the copies. An image that cannot be read
-    is no error here: the run will say so. Raises :class:`UserError` for a missing or empty file, a malformed line,
-    and a name that leads out of ``image_root``.
+    is no error here: the run reports it. Raises :class:`UserError` for a missing or empty file, a malformed line,
+    and a name that points outside ``image_root``.
     """
     if not image_root.is_dir():
         raise UserError(f"--image-root {image_root}: no such directory")
@@ -61,14 +61,14 @@ def read_pairs(file: Path, image_root: Path, model: Model, *, copies: Path, most
         raise UserError(f"{file} has no pairs; expected lines {EXPECTED}")
 
     @cache
-    def upright(name: str, turns: int) -> Upright:
+    def upright(name: str, turns: int) -> UprightImage:
         return turned_copy(image_root / name, turns, copies)
 
     chosen = evenly_spread(lines, most)
     return Scene(file.stem, nan, tuple(_true_pair(line, upright, model, file.stem) for line in chosen))
 
 
-def parse_line(line: str, number: int, file: Path) -> Line:
+def parse_line(line: str, number: int, file: Path) -> PairLine:
     """One line of a list; raises :class:`UserError` that names file, line and what was expected."""
     where, cells = f"{file}, line {number}", line.split()
     if len(cells) != FIELDS:
@@ -88,16 +88,16 @@ def parse_line(line: str, number: int, file: Path) -> Line:
     R, t = T[:3, :3], T[:3, 3]
     if tuple(T[3]) != (0, 0, 0, 1) or np.abs(R @ R.T - np.eye(3)).max() > ORTHOGONAL or np.linalg.det(R) < 0:
         raise UserError(f"{where}: expected T_0to1 = [R t; 0 0 0 1] with R a rotation")
-    return Line(number, names, turns, (Camera(K0, np.eye(3), np.zeros(3)), Camera(K1, R, t)))
+    return PairLine(number, names, turns, (Camera(K0, np.eye(3), np.zeros(3)), Camera(K1, R, t)))
 
 
 def confined(name: str, where: str) -> str:
-    """``name`` if it is a relative path that cannot lead out of a directory."""
-    # Windows' rules know drives and backslashes, and all that other systems call absolute.
+    """``name`` if it is a relative path that cannot point outside a directory."""
+    # Windows' rules are the strictest: drives and backslashes, besides what is absolute elsewhere.
     path = PureWindowsPath(name)
     if path.anchor or ".." in path.parts or "\0" in name:
         raise UserError(
-            f"{where}: the name {name!r} leads out of the image root; expected a relative path without .."
+            f"{where}: the name {name!r} points outside the image root; expected a relative path without .."
         )
     return name
 
@@ -109,18 +109,18 @@ def quarter_turns(cell: str, where: str) -> int:
 
 
 @dataclass(frozen=True)
-class Upright:
-    """An image as it will be matched; ``size`` is that before turning, ``None`` where nothing was turned."""
+class UprightImage:
+    """An image to match; ``size`` is that before turning, ``None`` if it was not turned."""
 
     path: Path
     size: Size | None = None
 
 
-def turned_copy(image: Path, turns: int, copies: Path) -> Upright:
-    """The image turned by ``turns`` quarters, in ``copies``; itself where there is nothing to turn or to read."""
+def turned_copy(image: Path, turns: int, copies: Path) -> UprightImage:
+    """The image turned by ``turns`` quarters, in ``copies``; ``image`` itself if unturned or unreadable."""
     picture = read_image(image) if turns else None
     if picture is None or isinstance(picture, Unreadable):
-        return Upright(image)
+        return UprightImage(image)
     name = hashlib.sha256(str(image).encode()).hexdigest()[:16]
     path = copies / f"{image.stem}-{name}-{turns}.png"
     bgr = cv2.cvtColor(np.ascontiguousarray(np.rot90(picture.pixels, turns)), cv2.COLOR_RGB2BGR)
@@ -129,21 +129,21 @@ def turned_copy(image: Path, turns: int, copies: Path) -> Upright:
         path.write_bytes(cv2.imencode(".png", bgr)[1].tobytes())
     except OSError as error:
         raise UserError(f"the turned copy {path} cannot be written: {error.strerror}") from error
-    return Upright(path, picture.size)
+    return UprightImage(path, picture.size)
 
 
-def _true_pair(line: Line, upright: Callable[[str, int], Upright], model: Model, group: str) -> TruePair:
+def _true_pair(line: PairLine, upright: Callable[[str, int], UprightImage], model: Model, group: str) -> TruePair:
     shown = [upright(name, turns) for name, turns in zip(line.names, line.turns, strict=True)]
     camera0, camera1 = (
         camera.turned(turns, image.size) if image.size else camera
         for camera, turns, image in zip(line.cameras, line.turns, shown, strict=True)
     )
-    told = " ".join(
+    names = " ".join(
         name + ("" if turns == 0 else f" turned {turns}")
         for name, turns in zip(line.names, line.turns, strict=True)
     )
     pair = Pair(
-        f"{line.number}: {told}",
+        f"{line.number}: {names}",
         group,
         shown[0].path,
         shown[1].path,

@@ -1,4 +1,4 @@
-"""Pinhole cameras that look at things, and where the things come to lie.
+"""Pinhole cameras, and projection between world points and pixels.
 
 Pixel centres are at integer coordinates: (0, 0) is the centre of the top-left pixel, x to the right, y down.
 The world has z up; a camera looks along its +z. `X_cam = R X + t`.

@@ -31,7 +31,7 @@ def fractal(
 
 
 def weathered(rng: np.random.Generator, picture: Picture, strength: float = 0.1) -> Picture:
-    """The picture under stains and grain: it looks the same from nowhere twice, and close up it has detail."""
+    """The picture with stains and grain, so that no two places look the same and there is detail close up."""
     height, width = picture.shape[:2]
     stains = 1 + np.float32(strength) * fractal(rng, (width, height), persistence=0.85)
     return to_picture(picture * stains[..., None])

@@ -7,9 +7,9 @@ from mkpc_kaggle.demo.texture import FloatImage, Picture
 
 
 def develop(image: FloatImage, rng: np.random.Generator) -> Picture:
-    """(H, W, 3) float32 in 0..255 to uint8 as a camera of its own settings would have taken it.
+    """(H, W, 3) float32 in 0..255 to uint8, with random camera settings.
 
-    Nothing moves: the geometry of the picture stays exact.
+    The geometry of the picture does not change.
     """
     height, width = image.shape[:2]
     gain = 2.0 ** rng.uniform(-0.4, 0.3)

@@ -1,4 +1,4 @@
-"""The two photographs that lend the scenes their texture, and pieces cut out of them.
+"""The two photographs that scenes are textured with, and pieces cut out of them.
 
 Pictures are (H, W, 3) uint8 BGR; sizes are (width, height) in texels.
 """
@@ -43,7 +43,7 @@ def crop(photograph: Picture, box: Box, size: tuple[int, int]) -> Picture:
 
 
 def random_cut(rng: np.random.Generator, photographs: Photographs, size: tuple[int, int]) -> Picture:
-    """A lively piece of one of the photographs, mirrored or not, tinted."""
+    """A piece with much texture of one of the photographs, mirrored or not, tinted."""
     busy = [(photographs.china, PAGODA), (photographs.china, TREES), (photographs.flower, DAHLIA)]
     photograph, (left, top, right, bottom) = busy[int(rng.integers(len(busy)))]
     share = rng.uniform(0.35, 0.75)

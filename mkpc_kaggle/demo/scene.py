@@ -1,4 +1,4 @@
-"""What a scene is: surfaces that stay, a sky, and the views that were taken of it."""
+"""Scenes: static surfaces, a sky, and the views of it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -27,7 +27,7 @@ class Shot:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A camera, the direction of the light when it was there, and what stood in its way just then."""
+    """A camera, the direction of light at that time, and the occluders at that time."""
 
     camera: Camera
     sun: Floats
@@ -50,7 +50,7 @@ class Scene:
 
 
 def take(rng: np.random.Generator, shots: Sequence[Shot], photographs: Photographs) -> tuple[View, ...]:
-    """The views of the shots, each a little off its mark, with other light and other people about."""
+    """The views of the shots, each with a small random offset, other light and other people."""
     clutter = [mipmap(random_cut(rng, photographs, (160, 480))) for _ in range(4)]
     return tuple(_view(rng, shot, clutter) for shot in shots)
 

@@ -68,7 +68,7 @@ def sample(texture: Texture, u: FloatImage, v: FloatImage, footprint: FloatImage
 
 
 def _sample_level(texture: Texture, u: FloatImage, v: FloatImage, level: NDArray[np.intp]) -> FloatImage:
-    """Bilinear look-up in one level per sample; clamped so that it never reads the level next door."""
+    """Bilinear look-up in one level per sample; clamped so that it never reads a neighbouring level."""
     coordinates = []
     for axis, share in enumerate((u, v)):
         size = texture.sizes[:, axis][level]

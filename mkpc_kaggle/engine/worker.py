@@ -39,7 +39,7 @@ class Worker:
 
     def prefetch(self, paths: Iterable[Path]) -> None:
         """Decode these ahead, in the background."""
-        self._images.announce(paths)
+        self._images.prefetch(paths)
 
     def run(self, job: Job, seconds: float, heartbeat: Callable[[], None] = lambda: None) -> Answer:
         """Match the pairs of a job; no unit is begun that is expected to end later than ``seconds`` from now.

@@ -1,1 +1,1 @@
-"""Runs held against known cameras."""
+"""Scores of runs against known cameras, and comparisons of scores."""

@@ -1,4 +1,4 @@
-"""The same pairs under several recipes: differences of mAA, with the intervals that chance leaves them."""
+"""Recipes compared on the same pairs: differences of mAA with bootstrap intervals."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,15 +21,15 @@ Values = Sequence[float] | NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Difference:
-    """What the second of two ways gains over the first, and the interval that holds it at :data:`LEVEL`."""
+    """The gain of the second of two recipes over the first, and its confidence interval at :data:`LEVEL`."""
 
     gain: float
     low: float
     high: float
 
     @property
-    def told(self) -> bool:
-        """Whether the interval tells the two ways apart."""
+    def significant(self) -> bool:
+        """Whether the interval excludes 0."""
         return self.low > 0 or self.high < 0
 
     def __str__(self) -> str:
@@ -37,12 +37,12 @@ class Difference:
 
 
 def paired_difference(scenes: Sequence[tuple[Values, Values]], *, seed: int = 0) -> Difference:
-    """The mean over scenes of the mean gain on a pair, from the pairs' values under the first and second way.
+    """The mean over scenes of the mean gain on a pair, from the pairs' values under the first and second recipe.
 
-    Both values of a pair stand at the same place. The interval is the percentile bootstrap's: the pairs of each
-    scene are drawn anew, with replacement, :data:`RESAMPLES` times; the scenes stay. It takes pairs for
-    independent, which those that share an image are not quite. The same input gives the same interval.
-    ``ValueError`` without scenes, for a scene without pairs, and where the two ways differ in pairs.
+    Both values of a pair have the same index. The interval is the percentile bootstrap's: the pairs of each
+    scene are resampled with replacement, :data:`RESAMPLES` times; the scenes stay. It assumes independent pairs,
+    which those that share an image are not quite. The same input gives the same interval.
+    ``ValueError`` without scenes, for a scene without pairs, and where the two have different pairs.
     Source: Efron and Tibshirani, An Introduction to the Bootstrap, 13.3.
     """
     if not scenes:
@@ -56,7 +56,7 @@ def paired_difference(scenes: Sequence[tuple[Values, Values]], *, seed: int = 0)
 
 def _gains(first: Values, second: Values) -> NDArray[np.float64]:
     if len(first) != len(second):
-        raise ValueError(f"the two ways have {len(first)} and {len(second)} pairs in a scene")
+        raise ValueError(f"{len(first)} and {len(second)} values for the pairs of a scene")
     if len(first) == 0:
         raise ValueError("a scene has no pairs")
     return np.asarray(second, np.float64) - np.asarray(first, np.float64)
@@ -64,7 +64,7 @@ def _gains(first: Values, second: Values) -> NDArray[np.float64]:
 
 def _means_of_resamples(gains: NDArray[np.float64], generator: np.random.Generator) -> NDArray[np.float64]:
     """(RESAMPLES,) means of as many pairs as there are, drawn with replacement."""
-    # Accuracies are tenths: drawing how often each value comes up is the same as drawing the pairs, and quicker.
+    # Accuracies are multiples of 0.1: drawing the count of each value is equivalent to drawing pairs, and faster.
     values, counts = np.unique(gains.round(12), return_counts=True)
     drawn = generator.multinomial(len(gains), counts / len(gains), size=RESAMPLES)
     return np.asarray(drawn @ values / len(gains))
@@ -94,7 +94,7 @@ class Comparison:
 
 
 def accuracies(validation: Validation, scene: str) -> list[float]:
-    """What each pair of a scene contributes to its mAA."""
+    """The accuracy of each pair of a scene, whose mean is the mAA."""
     return [pair_accuracy(error) for error in _scene(validation, scene).errors]
 
 
@@ -103,7 +103,7 @@ def _scene(validation: Validation, name: str) -> SceneScore:
 
 
 def seconds_of_work(record: PairRecord) -> float:
-    """What a pair took: its units, clusters and last estimate, whichever run did them."""
+    """Seconds of a pair's units, clustering and last estimate, over all runs of its journal."""
     units = sum(unit.encode_seconds + unit.match_seconds for unit in record.units)
     return units + record.cluster_seconds + record.estimate_seconds
 

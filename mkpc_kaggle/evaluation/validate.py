@@ -83,7 +83,7 @@ class Validation:
 
 
 def validate(scenes: Sequence[Scene], assembly: Assembly, session: Session) -> tuple[Validation, bool]:
-    """Match all pairs of the scenes and score them; also whether every thread has come to rest."""
+    """Match all pairs of the scenes and score them; also whether every thread has stopped."""
     pairs = [true.pair for scene in scenes for true in scene.pairs]
     report, at_rest = run_pairs(pairs, assembly, session)
     records = iter(report.records)
@@ -121,7 +121,7 @@ def _own_error(pair: PairScore, true: TruePair, scene: Scene) -> PoseError:
 
 
 def score_record(true: TruePair, record: PairRecord, scene: Scene) -> PairScore:
-    """The score of what the engine made of a pair; the fallback row counts as a failure."""
+    """The score of a pair's record; the fallback row counts as a failure."""
     error = PoseError.failed() if record.source == "fallback" else error_of(record.fundamental, true, scene)
     return PairScore(true.pair.id, true.covisibility, error, record)
 

@@ -1,4 +1,4 @@
-"""DBSCAN in the plane: scikit-learn's labels, at a cost that clumped points do not blow up.
+"""DBSCAN in the plane: scikit-learn's labels, with memory and time that dense clumps do not blow up.
 
 The clusters are those of Ester, Kriegel, Sander and Xu (1996). The grid is Gunawan's (2013): in a cell of side
 eps / sqrt(2) all points are within eps of one another, hence a cell of `min_samples` points is all core, and only
@@ -146,8 +146,8 @@ class _Cells:
 
 def _chunks(rows: Indices, cost: Indices) -> Iterator[Indices]:
     """Consecutive parts of `rows`, each of a total cost of about `_CHUNK`."""
-    turn = np.cumsum(cost) // _CHUNK
-    yield from np.split(rows, np.flatnonzero(np.diff(turn)) + 1)
+    chunk = np.cumsum(cost) // _CHUNK
+    yield from np.split(rows, np.flatnonzero(np.diff(chunk)) + 1)
 
 
 def _grid(xy: Floats, eps: float) -> _Cells:
@@ -246,12 +246,12 @@ def _touching(cells: _Cells, a: Indices, b: Indices) -> NDArray[np.bool_]:
     p, q = cells.copies(a), cells.copies(b)  # their keys are the pairs' places
     p, q = _facing(p, q)
     q, p = _facing(q, p)
-    p, q = _facing(p, q)  # p's box has shrunk, and so q's: once more pays
+    p, q = _facing(p, q)  # again, since q's box has shrunk
     decided = np.zeros(len(p.keys), dtype=np.bool_)
     touching = np.zeros(len(a), dtype=np.bool_)
     for r in np.flatnonzero(p.size * q.size >= _HEAVY_PAIR):
         trees = [KDTree(c.xy[c.start[r] :][: c.size[r]], balanced_tree=False) for c in (p, q)]
-        # The trees round in another way than `within`: they decide where the last digits do not matter.
+        # KDTree rounds differently from `within`: its answer is used only where rounding does not matter.
         surely, possibly = np.asarray(trees[0].count_neighbors(trees[1], p.eps * np.array([1 - 1e-9, 1 + 1e-9])))
         touching[p.keys[r]] = surely > 0
         decided[r] = surely > 0 or possibly == 0

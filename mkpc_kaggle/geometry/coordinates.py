@@ -5,7 +5,7 @@ image of width w covers [-0.5, w - 0.5). A resize by s maps ``x_view = (x + 0.5)
 each axis from the *actual* sizes. A crop subtracts an integer offset. Padding goes to the right and the
 bottom, so it moves nothing. A flip mirrors the resized content: ``x_view = w - 1 - x``.
 
-Networks have conventions of their own: :func:`from_corner` and :func:`from_normalised` lead to this one.
+Networks use other conventions: :func:`from_corner` and :func:`from_normalised` convert to this one.
 """
 
 from dataclasses import dataclass
@@ -53,7 +53,7 @@ class Box:
         return self.size.width * self.size.height
 
     def contains(self, points: NDArray[np.floating]) -> NDArray[np.bool_]:
-        """Which points, (N, 2) in image pixels, lie on the box's pixels; NaN lies nowhere."""
+        """Which points, (N, 2) in image pixels, lie on the box's pixels; never for NaN."""
         x, y = points[:, 0], points[:, 1]
         return (x >= self.left - 0.5) & (x < self.right - 0.5) & (y >= self.top - 0.5) & (y < self.bottom - 0.5)
 
@@ -124,7 +124,7 @@ class View:
         return np.asarray((resized + 0.5) / self.scale - 0.5 + offset, np.float64)
 
     def holds(self, points: NDArray[np.floating]) -> NDArray[np.bool_]:
-        """Which (N, 2) view points lie on content rather than on padding or outside; NaN lies nowhere."""
+        """Which (N, 2) view points lie on content rather than on padding or outside; never for NaN."""
         return Box.whole(self.content).contains(points)
 
     def render(self, image: Pixels) -> Pixels:

@@ -2,7 +2,7 @@
 
 Each image is treated on its own: its matched points of stage 1, normalised by its width and height, are
 clustered; the big clusters are kept; their bounding box, scaled about its centre, is the critical region.
-Where that cannot be trusted the whole image stands in, and the region says why.
+Where that cannot be trusted the region is the whole image, with the reason.
 """
 
 from dataclasses import dataclass
@@ -49,7 +49,7 @@ class MkpcConfig:
 
 
 class RegionReason(StrEnum):
-    """Why a region is what it is: the first is a crop, the others say why the whole image stands in."""
+    """``CROPPED``, or why the region is the whole image."""
 
     CROPPED = "cropped"
     TOO_FEW_POINTS = "too few points"
@@ -88,7 +88,7 @@ class Clusters:
     kept: NDArray[np.intp]
 
     @property
-    def keeps(self) -> NDArray[np.bool_]:
+    def in_kept(self) -> NDArray[np.bool_]:
         """(N,) mask of the points in kept clusters."""
         return np.isin(self.labels, self.kept)
 
@@ -96,7 +96,7 @@ class Clusters:
 def critical_region(points: Points, size: Size, config: MkpcConfig) -> CriticalRegion:
     """The critical region of an image of ``size`` with matched ``points``, (N, 2) float32 in image pixels.
 
-    Points that are not finite or not on the image are ignored. Never raises on account of the points.
+    Points that are not finite or not on the image are ignored. Never raises, whatever the points are.
     """
     whole = Box.whole(size)
     points = points[whole.contains(points)]
@@ -108,7 +108,7 @@ def critical_region(points: Points, size: Size, config: MkpcConfig) -> CriticalR
         return CriticalRegion(whole, RegionReason.NO_CLUSTER)
     if clusters.sizes.sum() / len(points) < config.min_clustered:
         return CriticalRegion(whole, RegionReason.TOO_SCATTERED, found, kept)
-    box = expand_box(points[clusters.keeps], size, config.expand_x, config.expand_y)
+    box = expand_box(points[clusters.in_kept], size, config.expand_x, config.expand_y)
     if min(box.size) < config.min_side:
         return CriticalRegion(whole, RegionReason.TOO_SMALL, found, kept)
     return CriticalRegion(box, RegionReason.CROPPED, found, kept)

@@ -7,8 +7,8 @@ logarithm of a posterior density,
     sum_n rho(r_n / scale) + sum_i (log f_i - log g_i)^2 / (2 sigma_i^2),     rho(x) = x^2 / (2 (1 + x^2)),
 
 r being the Sampson distance in pixels (:mod:`mkpc_kaggle.geometry.two_view`), g the focal lengths that are
-expected, and rho the loss of Geman and McClure (1985): a far match costs a half, as much as a focal length one
-sigma off. Where the matches tell the focal lengths they decide, elsewhere the prior does.
+expected, and rho the loss of Geman and McClure (1985): an outlier costs a half, as much as a focal length one
+sigma off. Where the matches determine the focal lengths they decide, elsewhere the prior does.
 
 The search is local, so it has several starts: the F of MAGSAC, and the E of MAGSAC at the expected focal lengths.
 The two rotations that an E stands for are not two starts: both give one F and the same derivatives of it.
@@ -22,7 +22,7 @@ from mkpc_kaggle.config import AT_LEAST_0, AT_LEAST_1, POSITIVE, check_ranges
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import (
-    Distinct,
+    DistinctMatches,
     Estimate,
     Matrix3,
     Model,
@@ -38,9 +38,9 @@ ANNEALING = (4.0, 2.0, 1.0)
 """Times the scale, one after the other: a wide loss has fewer local minima."""
 FOCAL_GRID = (-0.7, -0.35, 0.0, 0.35, 0.7)
 """log f / g: the focal lengths that MAGSAC's F is read with; the search starts from the best."""
-VAGUE_DIRECTION = 0.5
-"""Radians: where the direction of t has a larger standard deviation, the matches do not tell it."""
-UNLIKELY = 3.0
+UNCERTAIN_DIRECTION = 0.5
+"""Radians: with a larger standard deviation the matches do not determine the direction of t."""
+UNLIKELY_FOCAL = 3.0
 """Standard deviations."""
 
 
@@ -51,7 +51,7 @@ class FocalConfig:
     An unknown focal length is ``ratio`` times the image's long side, and its logarithm has the standard deviation
     ``sigma``; ``scale``, in pixels, is that of the loss. E at these focal lengths is sought within
     ``essential_threshold`` pixels and ``essential_iterations``, on ``essential_orders`` of the matches; F as
-    :class:`RobustConfig` says. The search looks at ``most_matches``, evenly spread, and its outcome is judged on
+    :class:`RobustConfig` says. The search uses ``most_matches``, evenly spread, and its result is scored on
     all. MAGSAC's own F is kept where it costs less by ``free_cost``: no plausible focal lengths explain the
     matches, so the principal points may be elsewhere.
     """
@@ -127,13 +127,13 @@ def estimate_with_prior(
     """F of ``matches`` (image pixels), or E where both K are known: of all candidates the one of lowest cost.
 
     Inliers are nearer than MAGSAC's threshold by their Sampson distance. MAGSAC's own F is a candidate, so that
-    the winner never costs more. ``remark`` says what is to mind about it, and which candidates could not be had.
+    the winner never costs more. ``remark`` has warnings about the result, and why candidates are missing.
     Six distinct matches are enough. The same input gives the same bytes. Raises ``ValueError`` for H, which has
     no focal lengths, and for E with a focal length that is not known.
     """
     if model is Model.H or (model is Model.E and any(prior.sigma for prior in priors)):
-        raise ValueError(f"{model} has no use for a prior on focal lengths")
-    distinct = Distinct.of(matches)
+        raise ValueError(f"{model} cannot use a prior on focal lengths")
+    distinct = DistinctMatches.of(matches)
     with np.errstate(all="ignore"):  # points need not be pixels; what overflows loses
         search = _Search(distinct, priors, config)
         tried = search.candidates(magsac, model)
@@ -148,7 +148,7 @@ def estimate_with_prior(
     return Estimate(
         model,
         matrix / np.linalg.norm(matrix),
-        distinct.spread(inliers),
+        distinct.mask_of_all(inliers),
         origin=best.origin,
         focals=search.focals(best.view) if best.view else None,
         remark="; ".join(reasons),
@@ -157,7 +157,7 @@ def estimate_with_prior(
 
 @dataclass(frozen=True, eq=False)
 class _Candidate:
-    """An F (3, 3) for rays, what it costs, and the two views that it is of; MAGSAC's own F has none."""
+    """An F (3, 3) for rays, its cost, and its two views; ``None`` for MAGSAC's F as it is."""
 
     origin: Origin
     fundamental: Matrix3
@@ -166,9 +166,9 @@ class _Candidate:
 
 
 class _Search:
-    """The distinct matches of a pair as ``rays``, and what can be made of them."""
+    """The candidates from the distinct matches of a pair, as ``rays``."""
 
-    def __init__(self, distinct: Distinct, priors: Priors, config: FocalConfig) -> None:
+    def __init__(self, distinct: DistinctMatches, priors: Priors, config: FocalConfig) -> None:
         self._distinct, self._priors, self._config = distinct, priors, config
         self.rays = priors[0].rays(distinct.points0), priors[1].rays(distinct.points1)
         sigmas, count = np.array([prior.sigma for prior in priors]), len(self.rays[0])
@@ -177,7 +177,7 @@ class _Search:
         self._sample = Problem(self.rays[0][few], self.rays[1][few], sigmas, count / max(len(few), 1))
 
     def candidates(self, magsac: RobustConfig, model: Model) -> list[_Candidate | str]:
-        """MAGSAC's F as it is and refined, its E refined; or why one cannot be had."""
+        """MAGSAC's F as it is and refined, its E refined; a reason in place of one that failed."""
         found: list[_Candidate | str] = []
         for number in range(magsac.orders):
             plain = self._consensus(number, magsac, Model.F)
@@ -206,16 +206,16 @@ class _Search:
         )
 
     def remarks(self, best: _Candidate) -> list[str]:
-        """What is to mind about the winner."""
+        """Warnings about the winner."""
         if best.view is None:
             return ["no plausible focal lengths explain the matches"]
         remarks = [
             f"the focal length of image {number} is {abs(log) / prior.sigma:.1f} sigma from what is expected"
             for number, (log, prior) in enumerate(zip(best.view.logs, self._priors, strict=True))
-            if abs(log) > UNLIKELY * prior.sigma
+            if abs(log) > UNLIKELY_FOCAL * prior.sigma
         ]
-        if self._all.direction_error(best.view, self._config.scale) > VAGUE_DIRECTION:
-            remarks.append("the matches do not tell the direction of motion")
+        if self._all.direction_error(best.view, self._config.scale) > UNCERTAIN_DIRECTION:
+            remarks.append("the matches do not determine the direction of motion")
         return remarks
 
     def focals(self, view: TwoView) -> tuple[float, float]:
@@ -226,16 +226,16 @@ class _Search:
         return first, second
 
     def for_pixels(self, F: Matrix3) -> Matrix3:
-        """The F for homogeneous pixels, of one for rays."""
+        """The F for homogeneous pixels, from one for rays."""
         return self._priors[1].to_ray.T @ F @ self._priors[0].to_ray
 
     def _for_rays(self, F: Matrix3) -> Matrix3:
-        """The other way, of unit norm."""
+        """The F for rays, of unit norm, from one for pixels."""
         F = np.linalg.inv(self._priors[1].to_ray).T @ F @ np.linalg.inv(self._priors[0].to_ray)
         return F / np.linalg.norm(F)
 
     def _refined(self, origin: Origin, start: TwoView) -> _Candidate:
-        """Where the search leads from there, or the start itself if that costs less."""
+        """The local minimum from there, or the start itself if that costs less."""
         view = start
         for factor in ANNEALING:
             view = self._sample.fit(view, factor * self._config.scale)
@@ -245,7 +245,7 @@ class _Search:
         return _Candidate(origin, view.fundamental, cost, view)
 
     def _decomposed(self, F: Matrix3) -> TwoView:
-        """An F for rays as two views: of focal lengths on a grid those that explain the matches best."""
+        """An F for rays as two views, with the focal lengths of a grid that fit the matches best."""
         grid0, grid1 = (FOCAL_GRID if prior.sigma else (0.0,) for prior in self._priors)
         views = [TwoView.nearest(F, log0, log1) for log0 in grid0 for log1 in grid1]
         return min(views, key=lambda view: self._sample.cost(view, ANNEALING[0] * self._config.scale))

@@ -13,9 +13,9 @@ from mkpc_kaggle.geometry.coordinates import Box, Points, Size, View
 class Matches:
     """N corresponding points with scores; pixel centres at integers, (x, y).
 
-    ``points0`` and ``points1`` are (N, 2) float32, ``scores`` is (N,) float32, higher is surer. The order is
-    the matcher's own and is kept everywhere, because MAGSAC's result depends on it. Input of another dtype is
-    cast; shapes that disagree raise ``ValueError``.
+    ``points0`` and ``points1`` are (N, 2) float32, ``scores`` is (N,) float32, higher is more certain. The
+    matcher's order is kept everywhere, because MAGSAC's result depends on it. Input of another dtype is cast;
+    shapes that disagree raise ``ValueError``.
     """
 
     points0: Points
@@ -67,7 +67,7 @@ class Matches:
         return self[on_images & np.isfinite(self.scores)]
 
     def to_image(self, view0: View, view1: View) -> "Matches":
-        """Matches in view pixels -> image pixels, the way out of a matcher.
+        """Matches in view pixels -> image pixels.
 
         Dropped here: points that are not finite, points on padding or outside their view, non-finite scores.
         """

@@ -50,8 +50,8 @@ class PoseError:
 def pose_error(F: Matrix3, camera0: Camera, camera1: Camera, metres_per_unit: float) -> PoseError:
     """The error of the pose that F stands for.
 
-    The competition is handed F alone, without points that could tell the two rotations of an F apart: the one
-    nearer to the truth counts, and the translation's sign is free.
+    The competition gets F alone, without points to tell its two rotations apart: the one nearer to the truth
+    counts, and the translation's sign is free.
     """
     R, t = relative_pose(camera0, camera1)
     rotations, direction = poses_of_fundamental(F, camera0.K, camera1.K)

@@ -1,7 +1,7 @@
 """Two-view models from matches: F, E or H by MAGSAC++, and the poses that an F stands for.
 
-An estimate is always a value: where no model can be had, it says why and carries the fallback matrix, which
-is finite and of the right rank, so that a submission never has a hole.
+An estimate is always a value: where no model is found, it has the reason and the fallback matrix, which is
+finite and of the right rank, so that a submission is always complete.
 """
 
 from dataclasses import dataclass, replace
@@ -88,7 +88,7 @@ class Estimate:
     ``matrix`` is (3, 3) float64, finite, of unit Frobenius norm; for F, x1^T F x0 = 0 in homogeneous image
     pixels. ``inliers`` is an (N,) mask over the matches that were given: those nearer than the threshold.
     ``failure`` is empty, or says why ``matrix`` is only the fallback. ``focals`` are the focal lengths in pixels
-    that it stands for, ``None`` where nobody asked for them; ``remark`` is what to mind about it, or empty.
+    that it stands for, ``None`` without a prior; ``remark`` is a warning about it, or empty.
     """
 
     model: Model
@@ -122,16 +122,16 @@ def estimate(
 ) -> Estimate:
     """The model of ``model``'s kind that ``matches`` (image pixels) agree on.
 
-    Non-finite points and exact repetitions are set aside first; an inlier's repetitions are inliers too. E
+    Non-finite points and exact duplicates are left out first; an inlier's duplicates are inliers too. E
     needs the two camera matrices, (3, 3) each: the points are then calibrated and the threshold is divided
-    by the mean focal length. Raises ``ValueError`` for E without intrinsics; whatever the points are, the
-    answer is an :class:`Estimate`. The same input gives the same bytes.
+    by the mean focal length. Raises ``ValueError`` for E without intrinsics, and never on account of the
+    points. The same input gives the same bytes.
     """
     if model is Model.E and intrinsics is None:
         raise ValueError("an essential matrix needs the intrinsics of both cameras")
-    distinct = Distinct.of(matches)
+    distinct = DistinctMatches.of(matches)
     found = consensus(distinct.points0, distinct.points1, config, model, intrinsics)
-    return replace(found, inliers=distinct.spread(found.inliers))
+    return replace(found, inliers=distinct.mask_of_all(found.inliers))
 
 
 def consensus(
@@ -141,7 +141,7 @@ def consensus(
     model: Model,
     intrinsics: tuple[Matrix3, Matrix3] | None = None,
 ) -> Estimate:
-    """:func:`estimate` for (N, 2) finite points without repetitions."""
+    """:func:`estimate` for (N, 2) finite points without duplicates."""
     count, threshold = len(points0), config.threshold
     if count < model.least_matches:
         return Estimate.failed(model, count, f"too few distinct matches for {model}: {count}")
@@ -160,7 +160,7 @@ def consensus(
 
 
 @dataclass(frozen=True, eq=False)
-class Distinct:
+class DistinctMatches:
     """The (M, 2) finite distinct matches among N, in order of first appearance.
 
     ``finite`` are the indices of the finite matches, ``place`` the row in ``points0`` and ``points1`` of each.
@@ -173,7 +173,7 @@ class Distinct:
     place: NDArray[np.intp]
 
     @classmethod
-    def of(cls, matches: Matches) -> "Distinct":
+    def of(cls, matches: Matches) -> "DistinctMatches":
         pairs = np.hstack([matches.points0, matches.points1]).astype(np.float64)
         finite = np.flatnonzero(np.isfinite(pairs).all(axis=1))
         _, first, inverse = np.unique(pairs[finite], axis=0, return_index=True, return_inverse=True)
@@ -183,8 +183,8 @@ class Distinct:
         pairs = pairs[finite][first[order]]
         return cls(pairs[:, :2], pairs[:, 2:], len(matches), finite, place[inverse.ravel()])
 
-    def spread(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """An (M,) mask of the distinct matches as an (N,) one: repetitions are like the first."""
+    def mask_of_all(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """An (M,) mask of the distinct matches as an (N,) one of all: duplicates are like the first."""
         whole = np.zeros(self.count, bool)
         whole[self.finite] = mask[self.place]
         return whole
@@ -207,20 +207,8 @@ def poses_of_fundamental(F: Matrix3, K0: Matrix3, K1: Matrix3) -> tuple[tuple[Ma
     return rotations, np.asarray(translation, np.float64).ravel()
 
 
-def epipolar_distances(F: Matrix3, matches: Matches) -> NDArray[np.float64]:
-    """(N,) symmetric epipolar distance in pixels: the larger of the distances to the two epipolar lines."""
-    homogeneous0, homogeneous1 = (
-        np.column_stack([points.astype(np.float64), np.ones(len(matches))])
-        for points in (matches.points0, matches.points1)
-    )
-    lines1, lines0 = homogeneous0 @ F.T, homogeneous1 @ F
-    residual = np.abs(np.sum(homogeneous1 * lines1, axis=1))
-    shortest = np.minimum(np.hypot(*lines0[:, :2].T), np.hypot(*lines1[:, :2].T))
-    return np.asarray(residual / np.maximum(shortest, np.finfo(np.float64).tiny))
-
-
 def sampson_distances(F: Matrix3, matches: Matches) -> NDArray[np.float64]:
-    """(N,) Sampson distance in pixels: that by which OpenCV tells inliers of an F.
+    """(N,) Sampson distance in pixels; OpenCV's inliers of an F have it below the threshold.
 
     Source: Hartley and Zisserman, Multiple View Geometry, 11.4.3.
     """
@@ -228,7 +216,7 @@ def sampson_distances(F: Matrix3, matches: Matches) -> NDArray[np.float64]:
 
 
 def robust_cost(distances: NDArray[np.float64], scale: float) -> float:
-    """The sum of x^2 / (2 (1 + x^2)), x = distance / scale: Geman and McClure, 1985. What is far costs a half."""
+    """The sum of x^2 / (2 (1 + x^2)), x = distance / scale: Geman and McClure, 1985. An outlier costs a half."""
     squares = np.square(distances / scale)
     return float(0.5 * np.sum(1 - 1 / (1 + squares)))
 
@@ -263,9 +251,8 @@ def _best_of_orders(
 ) -> tuple[Matrix3 | None, NDArray[np.bool_]]:
     """The model of the lowest robust cost over fixed permutations, the given order first, and its mask (N,).
 
-    MAGSAC's own score reaches over several times the threshold, so that the count of inliers says little of it.
-    OpenCV now and then refuses points in one order and not in another; raises its error where it refused some
-    and the others gave nothing.
+    Not the one with most inliers: MAGSAC's score depends on distances up to several times the threshold.
+    OpenCV sometimes rejects points in one order and not in another; its error is raised if no order gave a model.
     """
     best, best_mask, least, refusal = None, np.zeros(len(points0), bool), np.inf, None
     for number in range(config.orders):
@@ -277,7 +264,7 @@ def _best_of_orders(
             continue
         if matrix is None or matrix.shape != (3, 3) or not np.isfinite(matrix).all() or not matrix.any():
             continue
-        with np.errstate(over="ignore", invalid="ignore"):  # of points that are no pixels
+        with np.errstate(over="ignore", invalid="ignore"):  # points may be anything
             cost = robust_cost(_distances(model, matrix, points0, points1), 2 * threshold)
         if best is None or cost < least:
             best, best_mask[order], least = matrix, mask.ravel().astype(bool), cost

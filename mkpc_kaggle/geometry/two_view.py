@@ -43,7 +43,7 @@ class TwoView:
 
     @classmethod
     def nearest(cls, F: Matrix3, log0: float = 0.0, log1: float = 0.0) -> "TwoView":
-        """Those of these focal lengths whose E is nearest to the one that an F would have with them.
+        """The views of these focal lengths whose E is nearest to the one that F gives with them.
 
         One of two rotations and two signs of t; all four stand for one F. Raises ``LinAlgError`` for what is
         not finite.
@@ -60,20 +60,20 @@ class TwoView:
         """(9, 7): F's elements by a turn of R (3), a shift of t on the sphere (2) and the logs (2)."""
         F, cross = self.fundamental, _cross(self.t)
         turns = self._with_focals(cross @ CROSS @ self.R)
-        shifts = self._with_focals(np.tensordot(self._across().T, CROSS, 1) @ self.R)
+        shifts = self._with_focals(np.tensordot(self._tangent_basis().T, CROSS, 1) @ self.R)
         by_log0, by_log1 = np.zeros((3, 3)), np.zeros((3, 3))
         by_log0[:, 2], by_log1[2] = F[:, 2], F[2]
         return np.concatenate([turns, shifts, [by_log0, by_log1]]).reshape(7, 9).T
 
     def moved(self, step: Vectors) -> "TwoView":
         """After a step (7,) along the columns of :meth:`tangent`."""
-        t = self.t + self._across() @ step[3:5]
+        t = self.t + self._tangent_basis() @ step[3:5]
         return TwoView(_rotation(step[:3]) @ self.R, t / np.linalg.norm(t), self.logs + step[5:])
 
     def _with_focals(self, E: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.asarray(E * _focal_factors(self.logs))
 
-    def _across(self) -> NDArray[np.float64]:
+    def _tangent_basis(self) -> NDArray[np.float64]:
         """(3, 2) unit vectors at right angles to t and to each other."""
         first = _cross(self.t)[np.argmin(np.abs(self.t))]
         first = first / np.linalg.norm(first)
@@ -101,7 +101,7 @@ class Problem:
         """A local minimum of :meth:`cost` near ``start``, by Levenberg-Marquardt on the reweighted squares."""
         view, cost, damping = start, self.cost(start, scale), FIRST_DAMPING
         for _ in range(MOST_STEPS):
-            gradient, curvature = self._slopes(view, scale)
+            gradient, curvature = self._derivatives(view, scale)
             while damping < MOST_DAMPING:
                 moved = view.moved(self._step(gradient, curvature, damping))
                 moved_cost = self.cost(moved, scale) if np.abs(moved.logs).max() < FOCAL_BOUND else np.inf
@@ -119,7 +119,7 @@ class Problem:
     def direction_error(self, view: TwoView, scale: float) -> float:
         """The standard deviation of t's direction at a minimum, in radians, where it is largest."""
         free = self._free
-        curvature = self._slopes(view, scale)[1][np.ix_(free, free)]
+        curvature = self._derivatives(view, scale)[1][np.ix_(free, free)]
         covariance = np.linalg.pinv(curvature, hermitian=True)[3:5, 3:5]
         return float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
 
@@ -133,7 +133,7 @@ class Problem:
         return np.array([1 / sigma**2 if sigma else 0.0 for sigma in self.sigmas])
 
     def _step(self, gradient: Vectors, curvature: NDArray[np.float64], damping: float) -> Vectors:
-        """The damped step (7,); not a number where there is none, so that it is not taken."""
+        """The damped step (7,); NaN for a singular system, so that it is rejected."""
         free = self._free
         step, damped = np.zeros(7), curvature + damping * np.diag(np.diag(curvature) + LEAST_DAMPING)
         try:
@@ -142,13 +142,13 @@ class Problem:
             step[free] = np.nan
         return step
 
-    def _slopes(self, view: TwoView, scale: float) -> tuple[Vectors, NDArray[np.float64]]:
-        """The gradient (7,) of the cost and its curvature (7, 7), that of the squares with the loss's weights."""
+    def _derivatives(self, view: TwoView, scale: float) -> tuple[Vectors, NDArray[np.float64]]:
+        """The gradient (7,) of the cost, and its curvature (7, 7) as that of the reweighted squares."""
         lines0, lines1, slope = _lines(view.fundamental, self.rays0, self.rays1)
-        distances = _dots(self.rays1, lines1) / slope
-        lean = (distances / slope)[:, None]
-        a, b = self.rays1.copy(), -lean * lines0
-        a[:, :2] -= lean * lines1[:, :2]
+        distances = _row_dots(self.rays1, lines1) / slope
+        ratio = (distances / slope)[:, None]  # r / s
+        a, b = self.rays1.copy(), -ratio * lines0
+        a[:, :2] -= ratio * lines1[:, :2]
         b[:, 2] = 0
         rows = a[:, :, None] * self.rays0[:, None] + self.rays1[:, :, None] * b[:, None]
         jacobian = rows.reshape(-1, 9) @ view.tangent() / (scale * slope)[:, None]
@@ -163,23 +163,23 @@ class Problem:
 def sampson(F: Matrix3, rays0: Vectors, rays1: Vectors) -> Vectors:
     """(N,) Sampson distance of (N, 3) rays to an F that is meant for them, with its sign, in pixels."""
     _, lines1, slope = _lines(F, rays0, rays1)
-    return np.asarray(_dots(rays1, lines1) / slope)
+    return np.asarray(_row_dots(rays1, lines1) / slope)
 
 
 def _lines(F: Matrix3, rays0: Vectors, rays1: Vectors) -> tuple[Vectors, Vectors, Vectors]:
     """The epipolar lines (N, 3) in both images, and the length (N,) of the gradient of y1^T F y0."""
     lines0, lines1 = rays1 @ F, rays0 @ F.T
-    squares = _dots(lines0[:, :2], lines0[:, :2]) + _dots(lines1[:, :2], lines1[:, :2])
+    squares = _row_dots(lines0[:, :2], lines0[:, :2]) + _row_dots(lines1[:, :2], lines1[:, :2])
     return lines0, lines1, np.sqrt(squares) + TINY
 
 
-def _dots(a: Vectors, b: Vectors) -> Vectors:
+def _row_dots(a: Vectors, b: Vectors) -> Vectors:
     """The products (N,) of the rows of two (N, K) arrays."""
     return np.asarray(np.einsum("nk,nk->n", a, b))
 
 
 def _focal_factors(logs: Vectors) -> Matrix3:
-    """What the elements of E are multiplied with to have those of F."""
+    """(3, 3) factors from the elements of E to those of F."""
     ratio0, ratio1 = np.exp(logs)
     return np.array([[1, 1, ratio0], [1, 1, ratio0], [ratio1, ratio1, ratio0 * ratio1]])
 

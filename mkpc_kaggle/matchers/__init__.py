@@ -1,1 +1,1 @@
-"""The matchers: one contract, one registry, one file each."""
+"""The matchers: one interface, one registry, one file each."""

@@ -39,7 +39,7 @@ SPEC = MatcherSpec(
 
 
 class AlikedEncoder:
-    """What every matcher of ALIKED's keypoints looks at one picture with."""
+    """Keypoints of one picture, for every matcher of ALIKED's keypoints."""
 
     def __init__(self, network: Aliked, device: str) -> None:
         self.device = device

@@ -19,7 +19,7 @@ SPEC = MatcherSpec(
 
 def load(weights: WeightStore, options: SemiDenseOptions, placement: Placement) -> SemiDenseMatcher:
     network = AspanFormer(config_of(options))
-    # Checkpoints hold offsets besides that the published network never reads.
+    # Checkpoints also have offsets that the published network never reads.
     load_network(network, weights, *SPEC.slots_for(options), unused=r".*\.sample_offset$")
     return SemiDenseMatcher(placed(network, placement), SPEC, placement.device)
 
@@ -27,6 +27,6 @@ def load(weights: WeightStore, options: SemiDenseOptions, placement: Placement) 
 def config_of(options: SemiDenseOptions) -> AspanFormerConfig:
     if options.training is Training.OUTDOOR:
         return AspanFormerConfig(threshold=options.threshold)
-    # Published for 480 x 640 alone: positions as they are, the global level of 15 x 20 cells. At that size the
-    # positions stretched to the extent trained on and the pooling by four, which fit all sizes, are just these.
+    # Published for 480 x 640 only, with unscaled positions and a global level of 15 x 20 cells. At that size our
+    # defaults, positions scaled to the training size and pooling by four, are the same.
     return AspanFormerConfig(threshold=options.threshold, border=0, train_size=(480, 640))

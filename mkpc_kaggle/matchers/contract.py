@@ -1,8 +1,8 @@
-"""What a matcher is: it looks at each picture alone, then at two of them together.
+"""The interface of matchers: each picture is encoded alone, then encodings are matched in pairs.
 
 One contract serves sparse, semi-dense and dense networks. ``encode`` does what depends on one picture
 (keypoints and descriptors, or a backbone's feature maps); its results are cached, because views of whole
-images come back in many pairs. ``match`` does the rest.
+images are used in many pairs. ``match`` does the rest.
 """
 
 from collections.abc import Iterator, Sequence
@@ -18,11 +18,11 @@ from mkpc_kaggle.weights import WeightStore
 
 
 class NonFiniteError(ArithmeticError):
-    """A network's numbers became infinite or NaN: in half precision they may have been too large for it."""
+    """A network's values are infinite or NaN, as may happen in half precision."""
 
 
 class Colour(StrEnum):
-    """What a matcher's pictures hold: (H, W, 3) RGB or (H, W) gray."""
+    """The format of a matcher's pictures: (H, W, 3) RGB or (H, W) gray."""
 
     RGB = "rgb"
     GRAY = "gray"
@@ -59,17 +59,17 @@ class Training(StrEnum):
 
 @dataclass(frozen=True)
 class NoOptions:
-    """For a matcher that has nothing to set."""
+    """For a matcher without settings."""
 
 
 @dataclass(frozen=True)
 class MatcherSpec:
-    """What can be said of a matcher before it is loaded.
+    """The description of a matcher, known before it is loaded.
 
     ``multiple``: both sides of its pictures are padded to a multiple of it. ``same_size``: both pictures of a
-    pair must have one size. ``licences``: tags of its weights. ``slots``: what it needs of the manifest, with an
-    option's value in place of its ``{name}``. ``options``: a frozen dataclass of its settings, which a recipe's
-    table ``[matchers.NAME]`` may change.
+    pair must have one size. ``licences``: tags of its weights. ``slots``: the manifest's slots that it needs, with
+    the value of an option in place of its ``{name}``. ``options``: a frozen dataclass of its settings, which a
+    recipe's table ``[matchers.NAME]`` may change.
     """
 
     name: str
@@ -99,7 +99,7 @@ class MatcherSpec:
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """What a matcher is shown: ``pixels`` uint8, (H, W, 3) RGB or (H, W) gray, and how it was cut.
+    """A matcher's input: ``pixels`` uint8, (H, W, 3) RGB or (H, W) gray, and the view that they show.
 
     Only the top-left ``content`` holds the image; the rest is padding, on which no point may lie.
     """
@@ -116,7 +116,7 @@ Encoding = TypeVar("Encoding")
 
 
 class Matcher(Protocol[Encoding]):
-    """A loaded matcher. Both calls answer item by item, in order."""
+    """A loaded matcher. Both methods return one item for each input, in order."""
 
     @property
     def spec(self) -> MatcherSpec: ...
@@ -164,7 +164,7 @@ def encoding_bytes(encoding: Any) -> int:
 
 
 def _allocations(encoding: Any) -> Iterator[tuple[int, int]]:
-    """Where the arrays' and tensors' memory is, and its bytes."""
+    """Address and bytes of the memory of each array and tensor."""
     if hasattr(encoding, "untyped_storage"):
         storage = encoding.untyped_storage()
         yield storage.data_ptr(), storage.nbytes()
@@ -179,8 +179,9 @@ def _allocations(encoding: Any) -> Iterator[tuple[int, int]]:
 
 
 def detached(encoding: Any) -> Any:
-    """The encoding with copies of those tensors that show a part of a larger storage: a batch's, of which all
-    would stay alive for one.
+    """The encoding, with copies of tensors that are views of a larger storage.
+
+    A view of one item would keep the whole batch in memory.
     """
     if hasattr(encoding, "untyped_storage"):
         return encoding.clone() if encoding.untyped_storage().nbytes() > encoding.nbytes else encoding

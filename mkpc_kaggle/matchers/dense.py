@@ -1,4 +1,4 @@
-"""The adapter of the dense networks: features once a picture, and matches drawn from the warps of a pair."""
+"""The adapter of the dense networks: features for each picture, matches sampled from the warps of a pair."""
 
 import zlib
 from collections.abc import Sequence
@@ -20,11 +20,11 @@ from mkpc_kaggle.matchers.numbers import check_finite
 
 @dataclass(frozen=True)
 class DenseOptions:
-    """``passes``: 1, or 2: then the first looks at pictures with their sides shrunk to the share ``first_pass``,
-    the second at all of them.
+    """``passes``: 1 or 2; with 2 the first is on pictures whose sides are scaled by ``first_pass``, the second on
+    the full ones.
 
-    ``matches``: drawn at most, spread evenly if ``balanced``; certainties above ``threshold`` count alike.
-    ``symmetric``: from both pictures to the other, else from the first to the second only, in half the time.
+    ``matches``: most to sample, spread evenly if ``balanced``; certainties above ``threshold`` count as 1.
+    ``symmetric``: match both ways, else from the first to the second only, in half the time.
     """
 
     passes: int = 1
@@ -49,7 +49,7 @@ class DenseNetwork(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Encoded:
-    """One picture's features, the size of its content, and a number that stands for its pixels."""
+    """One picture's features, the size of its content, and a checksum of its pixels."""
 
     features: Any
     content: Size
@@ -57,10 +57,10 @@ class Encoded:
 
 
 class DenseMatcher:
-    """A match's score is its certainty. Which matches are drawn depends on the two pictures alone.
+    """A match's score is its certainty. Which matches are sampled depends on the two pictures alone.
 
-    Pictures and pairs are taken one by one, so that no batch changes what is found. ``multiple``: of it are the
-    sides of the image that the first pass sees; ``least``: no image has a shorter side.
+    Pictures and pairs are processed one by one, so that results do not depend on the batch. ``multiple``: sides of
+    the first pass's image are multiples of it; ``least``: the shortest side of any image.
     """
 
     spec: ClassVar[MatcherSpec]
@@ -83,7 +83,7 @@ class DenseMatcher:
 
     def _encode(self, picture: Picture) -> Encoded:
         width, height = picture.content
-        # The network takes any size, so it never sees the padding.
+        # The network takes any size, so that padding is cut off.
         content = picture.pixels[:height, :width].copy()
         pixels = torch.from_numpy(content).permute(2, 0, 1)[None]  # (1, 3, H, W)
         first = network_input(pixels, self._first_size(picture.content)).to(self.device)
@@ -105,7 +105,7 @@ class DenseMatcher:
         warp = torch.cat([dense.warp.reshape(-1, 4) for dense in warps])
         certainty = torch.cat([dense.certainty.flatten() for dense in warps])
         check_finite(f"certainties of {self.spec.name}", certainty, warp)
-        # PyTorch's generator on a CPU reads 32 bits of a seed, so both digests are mixed into so many.
+        # PyTorch's CPU generator uses 32 bits of a seed, so both checksums are combined into 32.
         seed = zlib.crc32(encoded1.digest.to_bytes(4), encoded0.digest)
         generator = torch.Generator(warp.device).manual_seed(seed)
         found = sample(warp, certainty, self._sampling, generator)

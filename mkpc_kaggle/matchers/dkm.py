@@ -1,4 +1,4 @@
-"""DKM v3 (Edstedt et al. 2023): places for all pixels of either view in the other; matches are drawn from them."""
+"""DKM v3 (Edstedt et al. 2023): dense warps between two views; matches are sampled from them."""
 
 from dataclasses import dataclass
 

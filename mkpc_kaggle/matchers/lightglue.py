@@ -1,4 +1,4 @@
-"""LightGlue (Lindenberger et al. 2023, kornia's network): what all matchers that end in it share."""
+"""LightGlue (Lindenberger et al. 2023, kornia's network): shared by all matchers that use it."""
 
 import re
 from collections.abc import Sequence
@@ -79,7 +79,7 @@ def load_glue(weights: WeightStore, slot: str, threshold: float, **shape: Any) -
 
 def light_glue(layers: int, threshold: float, **shape: Any) -> LightGlue:
     """The network without weights; ``threshold`` of a match's score."""
-    flash = torch.backends.cuda.flash_sdp_enabled()  # type: ignore[no-untyped-call]  # torch's own
+    flash = torch.backends.cuda.flash_sdp_enabled()  # type: ignore[no-untyped-call]  # torch's
     try:
         return LightGlue(
             None,  # type: ignore[arg-type]  # no download; kornia's annotation leaves it out
@@ -95,5 +95,5 @@ def light_glue(layers: int, threshold: float, **shape: Any) -> LightGlue:
 
 
 def layer_name(name: str) -> str:
-    """LightGlue's present parameter name for that of an older checkpoint or of a training wrapper."""
+    """LightGlue's current name of a parameter of an older checkpoint or of a training wrapper."""
     return re.sub(r"^(self|cross)_attn\.(\d+)\.", r"transformers.\2.\1_attn.", name.removeprefix("matcher."))

@@ -43,6 +43,6 @@ def load(weights: WeightStore, options: LoftrOptions, placement: Placement) -> S
 
 def config_of(options: LoftrOptions) -> LoftrConfig:
     border = BORDERS[options.training] if options.border == AS_PUBLISHED else options.border
-    # The indoor weights are the later ones, trained with the mended position encoding.
+    # The indoor weights are the later ones, trained with the corrected position encoding.
     fixed_positions = options.training is Training.INDOOR
     return LoftrConfig(options.threshold, border, fixed_positions=fixed_positions)

@@ -1,4 +1,4 @@
-"""LoMa (Nordström et al. 2026): keypoints that are matched by a transformer, the strongest sparse matcher here."""
+"""LoMa (Nordström et al. 2026): keypoints matched by a transformer, the strongest sparse matcher here."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,15 +16,15 @@ from mkpc_kaggle.matchers.networks.placement import placed
 from mkpc_kaggle.weights import WeightStore, load_into
 
 PATCH = 14
-"""The side of the picture that the descriptor sees is a multiple of this."""
+"""The side of the descriptor's input is a multiple of this."""
 
 
 @dataclass(frozen=True)
 class LomaOptions:
     """The release's settings for views with a long side of 1024.
 
-    ``descriptor_scale``: the side of the square picture that the descriptor sees, relative to the view's longer
-    side, which is the detector's; 784 of 1024 pixels.
+    ``descriptor_scale``: the side of the descriptor's square input relative to the view's longer side, which is
+    the detector's; 784 of 1024 pixels.
     """
 
     variant: Variant = Variant.B
@@ -54,9 +54,9 @@ class Encoded:
 
 
 class LomaAdapter:
-    """A match's score is the product of the shares that each keypoint gives to the other.
+    """A match's score is the product of the softmax over either picture's keypoints.
 
-    Pictures and pairs are taken one by one, so that no batch changes what is found.
+    Pictures and pairs are processed one by one, so that results do not depend on the batch.
     """
 
     spec = SPEC
@@ -81,7 +81,7 @@ class LomaAdapter:
             channels = WIDTHS[self.options.variant].descriptor
             return LomaKeypoints(torch.zeros(1, 0, 2), torch.zeros(1, 0, channels))
         side = PATCH * max(1, round(self.options.descriptor_scale * longest / PATCH))
-        # The networks take the content alone: padding would be described, too.
+        # Without padding, which would affect the descriptors.
         pixels = torch.from_numpy(picture.pixels[: content.height, : content.width].copy()).permute(2, 0, 1)[None]
         to_detect = resized(pixels, (detected.height, detected.width)).to(self.device)
         to_describe = resized(pixels, (side, side)).to(self.device)

@@ -1,4 +1,4 @@
-"""Mutual nearest neighbours of descriptors, in blocks, so that no N x M matrix is ever held."""
+"""Mutual nearest neighbours of descriptors, in blocks, so that the N x M matrix is never stored."""
 
 from dataclasses import dataclass
 
@@ -23,7 +23,7 @@ class Neighbours:
 def mutual_neighbours(descriptors0: Tensor, descriptors1: Tensor) -> Neighbours:
     """Pairs of unit descriptors, (N, D) and (M, D), each other's nearest; in order of the first image.
 
-    Of equal neighbours the one of lower index counts. With fewer than two descriptors on a side there is no
+    Among equal neighbours the one of lower index is taken. With fewer than two descriptors on a side there is no
     second neighbour: the ratio is that of a second at the greatest distance.
     """
     if len(descriptors0) == 0 or len(descriptors1) == 0:

@@ -1,4 +1,4 @@
-"""What networks may compute with: float32 that is float32, and finite numbers."""
+"""Numerical checks of networks: float32 without TF32, and finite values."""
 
 import sys
 from collections.abc import Iterator
@@ -11,10 +11,10 @@ from mkpc_kaggle.matchers.contract import NonFiniteError
 
 @contextmanager
 def exact_float32() -> Iterator[None]:
-    """Within it NVIDIA GPUs multiply float32 as float32, not as TF32 with its 10 bits of mantissa.
+    """A context in which NVIDIA GPUs multiply float32 as float32, not as TF32 with its 10 bits of mantissa.
 
-    PyTorch takes TF32 for convolutions unless told otherwise. The settings are those of the process, and are put
-    back at the end. Where nothing has imported PyTorch, which takes seconds, nothing computes with it.
+    PyTorch's default for convolutions is TF32. The settings are those of the process, and are restored at the end.
+    Where nothing has imported PyTorch, which takes seconds, nothing computes with it.
     """
     if "torch" not in sys.modules:
         yield
@@ -54,7 +54,7 @@ def check_finite(what: str, *values: Any) -> None:
         return
     import torch
 
-    # A sum is infinite or NaN where an addend is; half precision adds up in float32, so that nothing overflows.
+    # A sum is infinite or NaN if a value is; half precision is summed in float32, so that nothing overflows.
     sums = [tensor.sum(dtype=torch.float32) for tensor in tensors]
     if not bool(torch.stack(sums).isfinite().all()):
         raise NonFiniteError(f"{what} are not finite")

@@ -32,7 +32,7 @@ def find_matcher(name: str) -> MatcherEntry | Unusable:
     try:
         module = import_module(_module(name))
         return MatcherEntry(module.SPEC, module.load)
-    except Exception as error:  # whatever a library does at import: it concerns this matcher alone
+    except Exception as error:  # any error at import affects this matcher only
         return Unusable(name, f"{type(error).__name__}: {error}")
 
 

@@ -14,8 +14,8 @@ from mkpc_kaggle.weights import WeightStore, load_into
 
 @dataclass(frozen=True)
 class RomaOptions(DenseOptions):
-    """Published are two passes of 560 x 560 and 864 x 864, which a stretched unit of 864 x 864 is, and, indoors,
-    one of 560 x 560.
+    """Published: two passes of 560 x 560 and 864 x 864, as a stretched unit of 864 x 864 has; indoors one of
+    560 x 560.
     """
 
     passes: int = 2

@@ -1,4 +1,4 @@
-"""The adapter of the semi-dense networks: backbone maps once a picture, matches of coarse cells for a pair."""
+"""The adapter of the semi-dense networks: feature maps for each picture, matches of coarse cells for each pair."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,14 +20,14 @@ from mkpc_kaggle.matchers.sparse import image_batch
 from mkpc_kaggle.weights import WeightStore, load_into
 
 PREFIX = "matcher."
-"""Of every parameter's name in the published training checkpoints."""
+"""The prefix of parameter names in the published training checkpoints."""
 TRANSPORT = "coarse_matching.bin_score"
-"""In checkpoints of networks with optimal transport alone."""
+"""Only in checkpoints of networks with optimal transport."""
 
 
 @dataclass(frozen=True)
 class SemiDenseOptions:
-    """``threshold``: matches must be surer than this."""
+    """``threshold``: a match's confidence is above it."""
 
     threshold: float = 0.2
     training: Training = Training.OUTDOOR
@@ -75,7 +75,7 @@ class SemiDenseMatcher:
         pairs = list(zip(encodings0, encodings1, strict=True))
         alike: dict[tuple[Any, ...], list[int]] = {}
         for number, pair in enumerate(pairs):
-            # Masks that mask nothing can still change what a network does, so they never come by a neighbour.
+            # Even a mask that is all True can change rounding, so padded pairs get batches of their own.
             padded = any(encoded.padded for encoded in pair)
             alike.setdefault((padded, *(encoded.maps.coarse.shape for encoded in pair)), []).append(number)
         found = {
@@ -122,7 +122,7 @@ def to_matches(found: SemiDenseMatches, pairs: int) -> list[Matches]:
 def load_network(network: SemiDenseNetwork[Any], weights: WeightStore, slot: str, *, unused: str = "$^") -> None:
     """Fill a network from the published checkpoint, whose names have the training wrapper's prefix.
 
-    Position tables, which are computed, and names that match ``unused`` are set aside. Raises :class:`UserError`
+    Position tables, which are computed, and names that match ``unused`` are ignored. Raises :class:`UserError`
     for weights that were trained with optimal transport.
     """
     tensors = {name.removeprefix(PREFIX): tensor for name, tensor in weights.load(slot).items()}

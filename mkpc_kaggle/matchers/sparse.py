@@ -1,4 +1,4 @@
-"""What keypoint matchers share: the encoding of a picture, and matches from pairs of indices."""
+"""Shared by keypoint matchers: the encoding of a picture, and matches from pairs of indices."""
 
 from dataclasses import dataclass
 
@@ -21,7 +21,7 @@ class Keypoints:
 
     @classmethod
     def on_content(cls, points: Tensor, descriptors: Tensor, content: Size) -> "Keypoints":
-        """Those that lie on the picture's content rather than on its padding."""
+        """The keypoints on the picture's content, without those on its padding."""
         upper = points.new_tensor(content) - 0.5
         kept = ((points >= -0.5) & (points < upper)).all(dim=1)
         return cls(points[kept], descriptors[kept], content)

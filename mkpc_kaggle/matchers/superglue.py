@@ -45,7 +45,7 @@ SPEC = MatcherSpec(
     slots=("superpoint", "superglue-{training}"),
 )
 LEAST_SIDE = 8
-"""Of a picture that SuperPoint can look at."""
+"""Pixels: SuperPoint needs at least one cell."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +57,7 @@ class Encoded:
 
 
 class SuperGlueMatcher:
-    """A match's score is the share of its keypoint that the optimal transport moves."""
+    """A match's score is the keypoint's mass that the optimal transport assigns to it."""
 
     spec = SPEC
 

@@ -27,7 +27,7 @@ class Checkout:
         return self.root / "notebooks" / "submission.ipynb"
 
     def licence_text(self, tag: str) -> Path | None:
-        """The text of a licence that the manifest names, if it is one that allows to pass a file on with it."""
+        """The text of a licence that the manifest names, if the checkout has it: those allow redistribution."""
         path = self.licence if tag == "Apache-2.0" else self.root / "licences" / f"{tag}.txt"
         return path if path.is_file() else None
 

@@ -1,4 +1,4 @@
-"""A folder that holds exactly the files that it should."""
+"""Writing a folder that has exactly the given files."""
 
 import filecmp
 import shutil
@@ -11,7 +11,7 @@ from mkpc_kaggle.errors import UserError
 
 @dataclass(frozen=True)
 class Item:
-    """A file to be: its name in the folder, and where its bytes are; its licence, where it has one of its own."""
+    """A file to write: its name in the folder, its source, and its licence if it has one of its own."""
 
     name: str
     source: Path
@@ -24,8 +24,8 @@ class Item:
         return self.source.stat().st_size
 
 
-def refuse_strangers(directory: Path, items: Sequence[Item]) -> None:
-    """Raise :class:`UserError` where the folder holds other files: they would be uploaded with ours."""
+def refuse_other_files(directory: Path, items: Sequence[Item]) -> None:
+    """Raise :class:`UserError` where the folder has other files: they would be uploaded too."""
     names = {item.name for item in items} | {_part(item.name) for item in items}
     others = (
         sorted(path.name for path in directory.iterdir() if path.name not in names) if directory.is_dir() else []
@@ -37,10 +37,10 @@ def refuse_strangers(directory: Path, items: Sequence[Item]) -> None:
         )
 
 
-def fill(directory: Path, items: Sequence[Item]) -> None:
-    """Have these files in the folder; those that are there with the same bytes are left alone.
+def write_files(directory: Path, items: Sequence[Item]) -> None:
+    """Write these files into the folder, but for those that are there with the same bytes.
 
-    Raises :class:`UserError` where one cannot be written; the same call goes on there.
+    Raises :class:`UserError` where one cannot be written; the same call continues there.
     """
     try:
         directory.mkdir(parents=True, exist_ok=True)

@@ -9,7 +9,7 @@ from mkpc_kaggle.errors import UserError
 
 
 class Image(StrEnum):
-    """Which image of Kaggle's the kernel runs on, by the words of ``docker_image_pinning_type``."""
+    """Which of Kaggle's images the kernel runs on, as values of ``docker_image_pinning_type``."""
 
     LATEST = "latest"
     ORIGINAL = "original"
@@ -20,7 +20,7 @@ COMPETITION = "image-matching-challenge-2022"
 DATASET_SLUG = "mkpc-kaggle"
 KERNEL_TITLE = "MKPC submission"
 KERNEL_SLUG = KERNEL_TITLE.lower().replace(" ", "-")
-"""Kaggle makes the slug from the title in this way, and wants both to agree."""
+"""Kaggle derives the slug from the title like this, and requires that both agree."""
 
 
 def check_owner(owner: str) -> None:
@@ -33,7 +33,7 @@ def check_owner(owner: str) -> None:
 
 
 def dataset_metadata(owner: str, licences: Iterable[str]) -> str:
-    """``dataset-metadata.json``. Kaggle takes one licence a dataset; the description tells the others."""
+    """``dataset-metadata.json``. Kaggle takes one licence for each dataset; the description lists the others."""
     return _json(
         {
             "id": f"{owner}/{DATASET_SLUG}",

@@ -6,9 +6,9 @@ from tempfile import TemporaryDirectory
 
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.package.checkout import Checkout, find_checkout
-from mkpc_kaggle.package.folder import Item, fill, refuse_strangers
+from mkpc_kaggle.package.folder import Item, refuse_other_files, write_files
 from mkpc_kaggle.package.metadata import Image, check_owner, dataset_metadata, kernel_metadata
-from mkpc_kaggle.package.weights import Chosen, choose_weights
+from mkpc_kaggle.package.weights import ChosenWeights, choose_weights
 from mkpc_kaggle.package.wheels import PYTHONS, build_wheel, collect_wheels, install_lines, licence_of, pins
 from mkpc_kaggle.weights import WeightStore
 from mkpc_kaggle.weights.manifest import MANIFEST
@@ -18,8 +18,8 @@ from mkpc_kaggle.weights.manifest import MANIFEST
 class Request:
     """``owner`` is a user of Kaggle; ``pythons`` are versions such as ``3.11``.
 
-    ``wheels`` is a directory to take wheels from, instead of pip's index. ``private`` puts weights in that must
-    not be passed on. ``image`` says which of its images Kaggle should run the kernel on.
+    ``wheels`` is a directory to take wheels from, instead of pip's index. ``private`` includes weights that must
+    not be redistributed. ``image`` says which of its images Kaggle should run the kernel on.
     """
 
     out: Path
@@ -33,7 +33,7 @@ class Request:
 
 @dataclass(frozen=True)
 class Package:
-    """What was written: the files of both folders, and the weights whose licences do not allow to pass them on."""
+    """What was written: the files of both folders, and the weights whose licences do not allow redistribution."""
 
     dataset: tuple[Item, ...]
     kernel: tuple[Item, ...]
@@ -44,7 +44,7 @@ def make_package(request: Request) -> Package:
     """Write both folders; the same request gives the same bytes, and files that are there already are kept.
 
     Raises :class:`UserError`, before anything is written, without a checkout, for files in the folders that do not
-    belong there, for damaged weights, and where wheels cannot be built or had.
+    belong there, for damaged weights, and where wheels cannot be built or found.
     """
     check_owner(request.owner)
     if request.wheels is not None and not request.wheels.is_dir():
@@ -56,14 +56,14 @@ def make_package(request: Request) -> Package:
         chosen = choose_weights(WeightStore(request.weights), checkout, staging, private=request.private)
         dataset_items = _dataset_items(request, checkout, chosen, staging)
         kernel_items = _kernel_items(request, checkout, staging)
-        refuse_strangers(dataset, dataset_items)
-        refuse_strangers(kernel, kernel_items)
-        fill(dataset, dataset_items)
-        fill(kernel, kernel_items)
-    return Package(_there(dataset, dataset_items), _there(kernel, kernel_items), chosen.restricted)
+        refuse_other_files(dataset, dataset_items)
+        refuse_other_files(kernel, kernel_items)
+        write_files(dataset, dataset_items)
+        write_files(kernel, kernel_items)
+    return Package(_written(dataset, dataset_items), _written(kernel, kernel_items), chosen.restricted)
 
 
-def _dataset_items(request: Request, checkout: Checkout, chosen: Chosen, staging: Path) -> tuple[Item, ...]:
+def _dataset_items(request: Request, checkout: Checkout, chosen: ChosenWeights, staging: Path) -> tuple[Item, ...]:
     own, others = staging / "own", staging / "others"
     wheel = build_wheel(checkout, own)
     wheels = collect_wheels(
@@ -95,5 +95,5 @@ def _text(staging: Path, name: str, text: str) -> Item:
     return Item(name, path)
 
 
-def _there(directory: Path, items: tuple[Item, ...]) -> tuple[Item, ...]:
+def _written(directory: Path, items: tuple[Item, ...]) -> tuple[Item, ...]:
     return tuple(Item(item.name, directory / item.name, item.licence, item.note) for item in items)

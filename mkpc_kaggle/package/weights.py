@@ -12,8 +12,8 @@ HEADER = "# The weights of this dataset; the columns are name, bytes, digest, li
 
 
 @dataclass(frozen=True)
-class Chosen:
-    """The files that go in, with the texts of their licences, and those that must not be passed on.
+class ChosenWeights:
+    """The files to include, with the texts of their licences, and those that must not be redistributed.
 
     ``manifest`` has a line for each of the ``items``. ``restricted`` are left out, or, in a private package, are
     among the ``items``.
@@ -25,10 +25,10 @@ class Chosen:
     restricted: tuple[Item, ...]
 
 
-def choose_weights(store: WeightStore, checkout: Checkout, staging: Path, *, private: bool) -> Chosen:
+def choose_weights(store: WeightStore, checkout: Checkout, staging: Path, *, private: bool) -> ChosenWeights:
     """The file of each slot that the store has, as safetensors: Kaggle would unpack a torch checkpoint.
 
-    Conversions go into ``staging``. A licence allows to pass a file on if it is one whose text the checkout has.
+    Conversions go into ``staging``. Licences whose text the checkout has allow redistribution.
     Raises :class:`mkpc_kaggle.errors.UserError` for a slot of which only damaged files were found, and for a
     checkpoint that cannot be read.
     """
@@ -38,7 +38,7 @@ def choose_weights(store: WeightStore, checkout: Checkout, staging: Path, *, pri
     shipped = [one for one in found if private or one not in restricted]
     texts = {checkout.licence_text(one.file.licence) for one in shipped} - {None, checkout.licence}
     files = [_as_safetensors(one, staging) for one in shipped]
-    return Chosen(
+    return ChosenWeights(
         tuple(
             Item(file.name, path, file.licence, _note(one))
             for (file, path), one in zip(files, shipped, strict=True)
@@ -50,7 +50,7 @@ def choose_weights(store: WeightStore, checkout: Checkout, staging: Path, *, pri
 
 
 def _as_safetensors(found: FoundFile, staging: Path) -> tuple[WeightFile, Path]:
-    """The manifest's line of what is shipped, and where it lies now."""
+    """The manifest's line of the safetensors file, and its path."""
     if found.path.suffix == ".safetensors":
         return replace(found.file, size=found.path.stat().st_size, digest=found.digest), found.path
     # The whole name, suffix included: the manifest may know another conversion under the shorter one.

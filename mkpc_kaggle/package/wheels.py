@@ -19,10 +19,10 @@ BUNDLED = (
     "pycolmap",
     "safetensors",
 )
-"""What of our dependencies, and of theirs, Kaggle's image may lack or have in a version that does not do.
-The others (torch, numpy, scipy, pandas, scikit-learn, OpenCV, matplotlib, tqdm) are the image's own."""
+"""Direct and indirect dependencies that Kaggle's image may lack or have in a version that is too old.
+The others (torch, numpy, scipy, pandas, scikit-learn, OpenCV, matplotlib, tqdm) are in the image."""
 PYTHONS = ("3.11", "3.12", "3.13", "3.14")
-"""What Kaggle's images have, pinned older ones included, and what they may have next."""
+"""Versions in Kaggle's images, pinned older ones included, and likely next ones."""
 PLATFORMS = ("manylinux_2_28_x86_64", "manylinux_2_17_x86_64", "manylinux2014_x86_64")
 
 
@@ -34,20 +34,22 @@ def pins(checkout: Checkout) -> tuple[str, ...]:
 
 
 def install_lines(own: Path, wheels: Iterable[Path]) -> tuple[str, ...]:
-    """What the notebook lets pip install: our wheel, and what it and the others ask of the bundled packages.
+    """What the notebook installs: our wheel, and the ranges of bundled packages that the wheels require.
 
-    These are ranges: what an image has within them stays, whether there is a wheel for its Python or not.
+    A version of the image within the range stays, whether there is a wheel for its Python or not.
     """
     version = _metadata(own)["Version"]
     asked = (line for wheel in (own, *wheels) for line in _metadata(wheel).get_all("Requires-Dist", []))
     plain = (line.partition(";")[0].strip() for line in asked if "extra ==" not in line)
-    bundled = (line for line in plain if _normal(re.split(r"[^A-Za-z0-9._-]", line, maxsplit=1)[0]) in BUNDLED)
+    bundled = (
+        line for line in plain if _canonical_name(re.split(r"[^A-Za-z0-9._-]", line, maxsplit=1)[0]) in BUNDLED
+    )
     return (f"mkpc-kaggle=={version}", *sorted(set(bundled)))
 
 
 def build_wheel(checkout: Checkout, directory: Path) -> Path:
     """Build our wheel into the directory; the same sources give the same bytes. Raises :class:`UserError`."""
-    # Without hatchling here, pip gets it for the build, which needs a network.
+    # If hatchling is not installed, pip downloads it for the build.
     isolation = ["--no-build-isolation"] if find_spec("hatchling") else []
     failure = _pip("wheel", "--no-deps", *isolation, "--wheel-dir", directory, checkout.root)
     if failure:
@@ -60,8 +62,8 @@ def collect_wheels(
 ) -> list[Path]:
     """The wheels of these requirements for these Python versions (``3.11``), in order of their names.
 
-    They come from the directory ``wheels`` alone if one is given; else from ``kept``, where a former run may have
-    put them, or, if one is missing there, from pip's index. Raises :class:`UserError` where one cannot be had.
+    They come from the directory ``wheels`` if given; else from ``kept``, the output of an earlier run, or, if one
+    is missing there, from pip's index. Raises :class:`UserError` where one is not found.
     """
     local = ("--no-index", "--find-links")
     sources: list[tuple[str | Path, ...]] = [(*local, wheels)] if wheels else [(*local, kept), ()]
@@ -81,7 +83,7 @@ def collect_wheels(
 
 
 def licence_of(wheel: Path) -> str:
-    """What a wheel says of its licence, which it has inside."""
+    """The licence that a wheel's metadata names."""
     headers = _metadata(wheel)
     classifiers = [text.rpartition(" :: ")[2] for text in headers.get_all("Classifier", []) if "License" in text]
     named = [headers["License-Expression"], headers["License"], *classifiers]
@@ -101,7 +103,7 @@ def _download(requirements: Sequence[str], python: str, directory: Path, source:
 
 
 def _pip(*arguments: str | Path) -> str:
-    """Run this interpreter's pip; why it failed, or nothing."""
+    """Run this interpreter's pip; the reason if it failed, else empty."""
     command = [sys.executable, "-m", "pip", "--disable-pip-version-check", *map(str, arguments)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode == 0:
@@ -112,9 +114,9 @@ def _pip(*arguments: str | Path) -> str:
 
 def _pin(line: str) -> tuple[str, str]:
     name, _, version = line.strip().partition("==")
-    return _normal(name), version
+    return _canonical_name(name), version
 
 
-def _normal(name: str) -> str:
+def _canonical_name(name: str) -> str:
     """A package's name as the index compares it."""
     return re.sub(r"[-_.]+", "-", name).lower()

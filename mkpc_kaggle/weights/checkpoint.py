@@ -1,4 +1,4 @@
-"""Tensors from a checkpoint file, none of whose code is run, and from there into a network."""
+"""Tensors from a checkpoint file, without running any code in it, and from there into a network."""
 
 import re
 import zipfile
@@ -21,8 +21,8 @@ def load_tensors(path: Path) -> "dict[str, torch.Tensor]":
     """Tensors by name, on the CPU, from a safetensors file or a torch checkpoint; nothing in the file is executed.
 
     ``path`` may be the directory into which a torch checkpoint was unpacked (``NAME/NAME`` on Kaggle).
-    A training checkpoint keeps them under ``state_dict``, DISK's under ``extractor``; what lies beside them there
-    is left out. Raises :class:`UserError` for a file that cannot be read, or whose table of tensors holds anything
+    A training checkpoint has them under ``state_dict``, DISK's under ``extractor``; its other entries are left
+    out. Raises :class:`UserError` for a file that cannot be read, or whose table of tensors holds anything
     else.
     """
     import torch
@@ -47,7 +47,7 @@ def load_tensors(path: Path) -> "dict[str, torch.Tensor]":
 def load_into(
     network: "nn.Module", tensors: "Mapping[str, torch.Tensor]", *, what: str, unused: str = "$^"
 ) -> None:
-    """Load a checkpoint into a network: every name and every shape must agree.
+    """Load a checkpoint into a network: all names and shapes must agree.
 
     Only entries whose names match the pattern ``unused`` may be missing or surplus. A network made on the device
     "meta" takes over the tensors themselves, so that a large one is not in memory twice. Raises
@@ -77,7 +77,7 @@ def _load_table(path: Path) -> Mapping[Any, Any]:
             return _state_dict(load_inert(path))
         return _state_dict(torch.load(path, map_location="cpu", weights_only=True))
     except (RuntimeError, EOFError, UnpicklingError) as refusal:
-        # torch's own words would advise to load it unsafely.
+        # torch's message advises to load it unsafely.
         raise ValueError(
             "it is none, or holds objects that are not read here; save the network's state_dict alone"
         ) from refusal

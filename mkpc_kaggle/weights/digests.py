@@ -1,4 +1,4 @@
-"""The digests of a file, both kinds from one reading, remembered while the process lives."""
+"""The digests of a file, both kinds in one pass, cached for the process."""
 
 import hashlib
 from dataclasses import dataclass
@@ -28,7 +28,7 @@ def file_digests(path: Path) -> Digests:
 
 @cache
 def _digests(path: Path, size: int, modified: int) -> Digests:
-    """``modified``, in nanoseconds, and ``size`` tell a file that was replaced from the one read before."""
+    """``modified``, in nanoseconds, and ``size`` are part of the cache key: the file may be replaced."""
     sha256 = hashlib.sha256()
     blob = hashlib.sha1(b"blob %d\0" % size, usedforsecurity=False)
     with path.open("rb") as stream:

@@ -1,4 +1,4 @@
-"""Downloads files of the manifest: resumed where they broke off, named only once their bytes are right."""
+"""Downloads files of the manifest: resumed after interruptions, renamed once their digest is verified."""
 
 import re
 import shutil
@@ -36,16 +36,16 @@ ATTEMPTS = 5
 TIMEOUT = 30.0
 """Seconds without a byte."""
 BLOCK = 1 << 20
-PAGES = ("drive.google.com",)
-"""Hosts that answer with a page for people instead of the file."""
-BROKEN = (URLError, ConnectionError, TimeoutError, HTTPException, SSLError)
-PASSING = (408, 425, 429, 500, 502, 503, 504)
-"""What a server says that may answer a minute later."""
-NOTHING_LEFT = 416
+WEB_PAGE_HOSTS = ("drive.google.com",)
+"""Hosts that answer with a web page instead of the file."""
+CONNECTION_ERRORS = (URLError, ConnectionError, TimeoutError, HTTPException, SSLError)
+TRANSIENT_STATUSES = (408, 425, 429, 500, 502, 503, 504)
+"""HTTP status codes after which a retry may succeed."""
+RANGE_NOT_SATISFIABLE = 416
 
 
 class Outcome(StrEnum):
-    """What became of a file that was to be fetched."""
+    """The outcome of fetching a file."""
 
     FETCHED = "fetched"
     ALREADY_THERE = "already there"
@@ -67,7 +67,7 @@ def url_of(file: WeightFile) -> str | None:
     """Where the file can be downloaded as it is, or ``None``."""
     url = file.source.split()[0]
     parts = urlsplit(url)
-    return url if parts.scheme in ("http", "https") and parts.hostname not in PAGES else None
+    return url if parts.scheme in ("http", "https") and parts.hostname not in WEB_PAGE_HOSTS else None
 
 
 def choose(alternatives: Sequence[WeightFile], directory: Path) -> WeightFile:
@@ -77,7 +77,7 @@ def choose(alternatives: Sequence[WeightFile], directory: Path) -> WeightFile:
 
 
 def fetch(file: WeightFile, directory: Path, *, wait: Callable[[float], None] = time.sleep) -> Fetched:
-    """Have the file in the directory, which is made. Bytes that came stay in ``NAME.part`` for the next call.
+    """Download the file into the directory, which is created. A partial download stays in ``NAME.part``.
 
     ``wait`` is called with the seconds to pause before another attempt.
     """
@@ -89,7 +89,7 @@ def fetch(file: WeightFile, directory: Path, *, wait: Callable[[float], None] = 
         return Fetched(file, path, Outcome.BY_HAND, f"get it from {file.source} and save it as {path}")
     try:
         directory.mkdir(parents=True, exist_ok=True)
-        part = Part(path, file)
+        part = PartialFile(path, file)
         _download(url, part, wait)
         note = part.finish()
     except UserError as error:
@@ -103,46 +103,46 @@ def _state(file: WeightFile, directory: Path) -> State:
     return examine(directory / file.name, file, ()).state
 
 
-class Part:
-    """The bytes that came so far, ``NAME.part``, and the server's mark of the version that they belong to."""
+class PartialFile:
+    """A partial download, ``NAME.part``, and the HTTP validator (ETag or date) of its version."""
 
     def __init__(self, path: Path, file: WeightFile) -> None:
         self.path = path
         self.file = file
-        self._bytes = path.with_name(f"{path.name}.part")
-        self._mark = path.with_name(f"{path.name}.part.mark")
+        self._data = path.with_name(f"{path.name}.part")
+        self._validator_file = path.with_name(f"{path.name}.part.mark")
         if 0 <= file.size < self.size:
             self.remove()
 
     @property
     def size(self) -> int:
-        return self._bytes.stat().st_size if self._bytes.exists() else 0
+        return self._data.stat().st_size if self._data.exists() else 0
 
     @property
-    def whole(self) -> bool:
-        """All bytes are here, as far as the manifest knows."""
+    def complete(self) -> bool:
+        """All bytes are here, by the size in the manifest."""
         return self.file.size == self.size
 
     @property
-    def request_headers(self) -> dict[str, str]:
-        """What asks for the rest: none where nobody could tell that the rest belongs to these bytes."""
-        mark = self._mark.read_text(encoding="latin-1") if self._mark.exists() else ""
-        if self.size == 0 or not (mark or self.file.digest != UNVERIFIED):
+    def range_headers(self) -> dict[str, str]:
+        """Headers that ask for the rest; empty where nothing would show that the rest fits."""
+        validator = self._validator_file.read_text(encoding="latin-1") if self._validator_file.exists() else ""
+        if self.size == 0 or not (validator or self.file.digest != UNVERIFIED):
             return {}
-        return {"Range": f"bytes={self.size}-"} | ({"If-Range": mark} if mark else {})
+        return {"Range": f"bytes={self.size}-"} | ({"If-Range": validator} if validator else {})
 
-    def begin(self, mark: str, *, resumed: bool) -> IO[bytes]:
-        """The file to write to: behind the bytes that are here, or anew."""
-        self._mark.write_text(mark, encoding="latin-1")
-        return self._bytes.open("ab" if resumed else "wb")
+    def begin(self, validator: str, *, resumed: bool) -> IO[bytes]:
+        """The file to write to, appending if ``resumed``."""
+        self._validator_file.write_text(validator, encoding="latin-1")
+        return self._data.open("ab" if resumed else "wb")
 
     def remove(self) -> None:
-        self._bytes.unlink(missing_ok=True)
-        self._mark.unlink(missing_ok=True)
+        self._data.unlink(missing_ok=True)
+        self._validator_file.unlink(missing_ok=True)
 
     def finish(self) -> str:
-        """Give the file its name; raises :class:`UserError`, the bytes removed, if they are not the manifest's."""
-        digests = file_digests(self._bytes)
+        """Verify the bytes and give the file its name; on a mismatch remove them and raise :class:`UserError`."""
+        digests = file_digests(self._data)
         file = self.file
         if 0 <= file.size != digests.size:
             self.remove()
@@ -153,18 +153,18 @@ class Part:
                 f"what came has the digest {digests.sha256}, the manifest says {file.digest}: not the file that "
                 "the matchers were tested with; it was removed"
             )
-        self._bytes.replace(self.path)
+        self._data.replace(self.path)
         self.remove()
         if file.digest == UNVERIFIED:
             return f"not verified: the manifest has no digest for it; this file's is {digests.sha256}"
         return ""
 
 
-class _BrokenError(ConnectionError):
+class _IncompleteError(ConnectionError):
     """The connection ended before the file did."""
 
 
-class _OnlyWeb(HTTPRedirectHandler):
+class _HttpRedirectHandler(HTTPRedirectHandler):
     """Follows redirections to http and https alone, and never from https to http."""
 
     def redirect_request(
@@ -177,43 +177,50 @@ class _OnlyWeb(HTTPRedirectHandler):
 
 
 def _opener() -> OpenerDirector:
-    """What opens http and https and nothing else; urllib's own would open files too."""
+    """Opens http and https only; urllib's default opener would open files too."""
     opener = OpenerDirector()
-    handlers = (ProxyHandler, HTTPHandler, HTTPSHandler, HTTPDefaultErrorHandler, HTTPErrorProcessor, _OnlyWeb)
+    handlers = (
+        ProxyHandler,
+        HTTPHandler,
+        HTTPSHandler,
+        HTTPDefaultErrorHandler,
+        HTTPErrorProcessor,
+        _HttpRedirectHandler,
+    )
     for handler in handlers:
         opener.add_handler(handler())
     return opener
 
 
-def _download(url: str, part: Part, wait: Callable[[float], None]) -> None:
-    """Ask until all is there; raises :class:`UserError` where that is hopeless."""
-    trouble: Exception | None = None
+def _download(url: str, part: PartialFile, wait: Callable[[float], None]) -> None:
+    """Request until the file is complete; raises :class:`UserError` where a retry cannot help or all failed."""
+    last_error: Exception | None = None
     for attempt in range(ATTEMPTS):
-        if trouble is not None:
+        if last_error is not None:
             wait(2.0 ** (attempt - 1))
         try:
-            if part.whole or _receive(url, part):
+            if part.complete or _receive(url, part):
                 return
         except HTTPError as error:
             error.close()
-            if error.code not in PASSING:
+            if error.code not in TRANSIENT_STATUSES:
                 raise UserError(f"{url}: the server says {error.code} {error.reason}") from error
-            trouble = error
-        except BROKEN as error:
-            trouble = error
+            last_error = error
+        except CONNECTION_ERRORS as error:
+            last_error = error
     raise UserError(
-        f"{url}: the connection failed {ATTEMPTS} times (the last time: {trouble}). What came is kept: the same "
-        "command goes on there."
+        f"{url}: the connection failed {ATTEMPTS} times (the last time: {last_error}). What came is kept: "
+        "the same command goes on there."
     )
 
 
-def _receive(url: str, part: Part) -> bool:
-    """One request for what is missing; is the file whole? Raises what a broken connection raises."""
-    request = Request(url, headers={"User-Agent": f"mkpc_kaggle/{__version__}", **part.request_headers})
+def _receive(url: str, part: PartialFile) -> bool:
+    """One request for what is missing; whether the file is now complete. Raises on a broken connection."""
+    request = Request(url, headers={"User-Agent": f"mkpc_kaggle/{__version__}", **part.range_headers})
     try:
         response = _opener().open(request, timeout=TIMEOUT)
     except HTTPError as error:
-        if error.code != NOTHING_LEFT or part.size == 0:
+        if error.code != RANGE_NOT_SATISFIABLE or part.size == 0:
             raise
         error.close()
         if error.headers.get("Content-Range") == f"bytes */{part.size}":
@@ -221,27 +228,27 @@ def _receive(url: str, part: Part) -> bool:
         part.remove()  # these bytes belong to another version
         return False
     with response:
-        have = part.size if _is_the_rest(response, part) else 0
+        have = part.size if _is_partial_content(response, part) else 0
         total = None if response.length is None else have + response.length
         _check_total(total, have, part)
         _store(response, part, have, total)
     if total is not None and part.size != total:
-        raise _BrokenError(f"it broke off after {part.size} of {total} bytes")
+        raise _IncompleteError(f"it broke off after {part.size} of {total} bytes")
     return True
 
 
-def _is_the_rest(response: Any, part: Part) -> bool:
-    """Does the server send what follows on the bytes that are here, and not the whole file again?"""
+def _is_partial_content(response: Any, part: PartialFile) -> bool:
+    """Whether the server sends the missing range, and not the complete file again."""
     if response.status != 206:
         return False
     first = re.match(r"bytes (\d+)-", response.headers.get("Content-Range", ""))
     if first is None or int(first[1]) != part.size:
         part.remove()
-        raise _BrokenError("the server sent another part than was asked for")
+        raise _IncompleteError("the server sent another part than was asked for")
     return True
 
 
-def _check_total(total: int | None, have: int, part: Part) -> None:
+def _check_total(total: int | None, have: int, part: PartialFile) -> None:
     if total is None:
         return
     if 0 <= part.file.size != total:
@@ -252,11 +259,11 @@ def _check_total(total: int | None, have: int, part: Part) -> None:
         raise UserError(f"{total - have} bytes are to come, but {part.path.parent} has only {free} bytes free")
 
 
-def _store(response: Any, part: Part, have: int, total: int | None) -> None:
+def _store(response: Any, part: PartialFile, have: int, total: int | None) -> None:
     tag = response.headers.get("ETag", "")
-    mark = response.headers.get("Last-Modified", "") if not tag or tag.startswith("W/") else tag
+    validator = response.headers.get("Last-Modified", "") if not tag or tag.startswith("W/") else tag
     with (
-        part.begin(mark, resumed=have > 0) as out,
+        part.begin(validator, resumed=have > 0) as out,
         tqdm(
             desc=part.file.name,
             initial=have,
@@ -264,7 +271,7 @@ def _store(response: Any, part: Part, have: int, total: int | None) -> None:
             unit="B",
             unit_scale=True,
             unit_divisor=1024,
-            mininterval=0.1 if sys.stderr.isatty() else 30,  # a log keeps every state of the bar
+            mininterval=0.1 if sys.stderr.isatty() else 30,  # a log file gets a line for each update
         ) as progress,
     ):
         while block := response.read(BLOCK):

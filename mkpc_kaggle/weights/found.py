@@ -1,4 +1,4 @@
-"""A file on this machine held against its line of the manifest."""
+"""A file on this machine compared with its line of the manifest."""
 
 import stat
 from collections.abc import Iterable
@@ -13,7 +13,7 @@ from mkpc_kaggle.weights.unpacked import digest_of
 
 
 class State(StrEnum):
-    """What a file's bytes say of it."""
+    """What the comparison with the manifest says of a file."""
 
     GOOD = "good"
     RENAMED = "renamed"
@@ -21,7 +21,7 @@ class State(StrEnum):
     UNVERIFIED = "unverified"
     """the manifest has no digest for it"""
     UNPACKED = "unpacked"
-    """a checkpoint that was unpacked into a directory: readable, but its file's digest is gone"""
+    """a checkpoint that was unpacked into a directory: readable, but the file's digest is lost"""
     TRUNCATED = "truncated"
     SWAPPED = "another file"
     """the right name, other bytes"""
@@ -47,7 +47,7 @@ class FoundFile:
 
 
 def examine(path: Path, file: WeightFile, files: Iterable[WeightFile]) -> FoundFile:
-    """What the file at ``path``, which bears the name of ``file``, really is; ``files`` are all that are known."""
+    """The state of the file at ``path``, named as ``file``; ``files`` are all lines of the manifest."""
     try:
         if not stat.S_ISREG(path.stat().st_mode):
             return FoundFile(file, path, State.UNREADABLE, "", "no regular file")

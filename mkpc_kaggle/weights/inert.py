@@ -1,8 +1,8 @@
-"""Reads a checkpoint whose pickle holds more than tensors, and runs nothing of it.
+"""Reads a checkpoint whose pickle holds more than tensors, without running any of its code.
 
 Training frameworks pickle callbacks and hyper-parameters beside the tensors, of classes that are not installed
-here; ``torch.load(weights_only=True)`` refuses such files. It takes them once every name that it does not know
-stands for :class:`Inert`, which does nothing; names of the operating system it refuses all the same.
+here; ``torch.load(weights_only=True)`` refuses such files. It reads them once every name that it does not know
+is mapped to :class:`Inert`, which does nothing; names of the operating system are still refused.
 """
 
 import zipfile
@@ -10,7 +10,7 @@ from pathlib import Path
 
 
 class Inert:
-    """Stands for every class and function that torch does not know: whatever is done to it does nothing."""
+    """Stands for every class and function that torch does not know; all calls do nothing."""
 
     __slots__ = ()
 
@@ -28,9 +28,9 @@ class Inert:
 
 
 def load_inert(path: Path) -> object:
-    """What a zip checkpoint holds, its tensors on the CPU; what is no tensor, container or number is inert.
+    """The contents of a zip checkpoint, tensors on the CPU; all but tensors, containers and numbers is inert.
 
-    Raises ``ValueError``, ``pickle.UnpicklingError`` and what else a malformed file provokes.
+    Raises ``ValueError``, ``pickle.UnpicklingError`` and other errors for a malformed file.
     """
     import torch
     from torch.serialization import get_unsafe_globals_in_checkpoint, safe_globals

@@ -1,4 +1,4 @@
-"""Warnings that one process gives once."""
+"""Warnings that are given once a process."""
 
 import warnings
 from functools import cache
@@ -6,5 +6,5 @@ from functools import cache
 
 @cache
 def warn_once(message: str) -> None:
-    """Warn unless this process has said the very same before."""
+    """Warn unless this process has given the same warning before."""
     warnings.warn(message, stacklevel=3)

@@ -22,7 +22,7 @@ KAGGLE_INPUT = Path("/kaggle/input")
 
 @dataclass(frozen=True)
 class Search:
-    """What was found, if anything, and files that bear the right name but were refused."""
+    """What was found, if anything, and files of the right name that were refused."""
 
     found: FoundFile | None
     refused: tuple[FoundFile, ...] = ()
@@ -31,8 +31,8 @@ class Search:
 class WeightStore:
     """Weight files in search directories: ``--weights``, then ``$MKPC_WEIGHTS``, then ``/kaggle/input/**``.
 
-    They are held against ``files``; without those, against the package's manifest and the further lines of the
-    manifests in the search directories, which tell of weights that ``package`` converted.
+    They are compared with ``files``; by default the package's manifest and those in the search directories, which
+    list weights that ``package`` converted.
     """
 
     def __init__(self, directories: Iterable[Path] = (), files: Sequence[WeightFile] | None = None) -> None:
@@ -48,7 +48,7 @@ class WeightStore:
 
     @cached_property
     def files(self) -> tuple[WeightFile, ...]:
-        """The lines that weights are held against; the package's own come first, and no name comes twice."""
+        """The lines to compare with, one for each name; the package's manifest comes first."""
         if self._given_files is not None:
             return self._given_files
         lines = {file.name: file for file in manifest()}
@@ -68,18 +68,18 @@ class WeightStore:
     def find(self, slot: str) -> FoundFile | None:
         """The slot's file, its bytes checked against the manifest; ``None`` where there is none.
 
-        A file that is not what the manifest says is passed over with a warning; where there is no other,
+        A file that is not what the manifest says is skipped with a warning; where there is no other,
         :class:`UserError` is raised.
         """
         search = self.search(self.alternatives(slot))
-        complaints = [f"{one.path}: {one.note}" for one in search.refused]
-        if complaints and search.found is None:
+        refusals = [f"{one.path}: {one.note}" for one in search.refused]
+        if refusals and search.found is None:
             raise UserError(
-                f"no good file for {slot!r}. Found {'; '.join(complaints)}. Fetch it again "
+                f"no good file for {slot!r}. Found {'; '.join(refusals)}. Fetch it again "
                 f"(python -m mkpc_kaggle weights fetch {slot} --out DIR, on a machine with internet)."
             )
-        for complaint in complaints:
-            warn_once(f"passed over: {complaint}")
+        for refusal in refusals:
+            warn_once(f"passed over: {refusal}")
         return search.found
 
     def load(self, slot: str) -> "dict[str, torch.Tensor]":
@@ -101,14 +101,14 @@ class WeightStore:
         return ", ".join(map(str, self.directories)) or "nowhere: name a directory with --weights"
 
     def search(self, lines: Sequence[WeightFile]) -> Search:
-        """The first good file of these lines, sought by name and then by digest; remembered."""
+        """The first good file of these lines, searched by name and then by digest; cached."""
         key = tuple(lines)
         if key not in self._searches:
             self._searches[key] = self._search(lines)
         return self._searches[key]
 
     def verify(self) -> list[FoundFile]:
-        """Every file found, by path: those that bear a name of the manifest, and others that have its bytes."""
+        """Every file found, by path: those with a name of the manifest, and others with one of its digests."""
         lines = {file.name: file for file in self.files}
         found = {
             path: examine(path, lines[path.name], self.files)

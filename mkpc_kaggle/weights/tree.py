@@ -1,4 +1,4 @@
-"""A directory that is searched for weights: its files by name, and those that may be one under another name."""
+"""A directory that is searched for weights: its files by name, and candidates under other names."""
 
 import os
 import stat
@@ -9,17 +9,17 @@ from pathlib import Path
 from mkpc_kaggle.weights.notices import warn_once
 from mkpc_kaggle.weights.unpacked import is_unpacked, names_of
 
-PICTURES = frozenset({".jpg", ".jpeg", ".png"})
-CHECKPOINTS = frozenset({".pth", ".pt", ".ckpt", ".safetensors", ".bin", ".pkl", ""})
+IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png"})
+CHECKPOINT_SUFFIXES = frozenset({".pth", ".pt", ".ckpt", ".safetensors", ".bin", ".pkl", ""})
 LARGEST_OF_UNKNOWN_SIZE = 1 << 28
-"""Bytes. The files whose size nobody published have some 50 MB; bigger ones need not be read to tell."""
+"""Bytes. The files whose size is not known have some 50 MB; larger ones need not be read."""
 
 
 class Tree:
-    """A directory and all below it, walked once, when that is first needed.
+    """A directory and all below it, walked once, on first use.
 
-    Links are followed, since Kaggle mounts inputs by links; no directory is entered twice, so that none leads
-    round. What cannot be read is passed over with a warning.
+    Links are followed, since Kaggle mounts inputs by links; no directory is entered twice, so that cycles
+    end. What cannot be read is skipped with a warning.
     """
 
     def __init__(self, root: Path) -> None:
@@ -35,7 +35,7 @@ class Tree:
     def candidates(self, size: int) -> Iterator[Path]:
         """Files that may be one of ``size`` bytes under another name; where that is -1, small checkpoints."""
         for path, its_size in self._sizes.items():
-            likely = path.suffix.lower() in CHECKPOINTS and its_size <= LARGEST_OF_UNKNOWN_SIZE
+            likely = path.suffix.lower() in CHECKPOINT_SUFFIXES and its_size <= LARGEST_OF_UNKNOWN_SIZE
             if its_size == size or (size < 0 and likely):
                 yield path
 
@@ -45,12 +45,12 @@ class Tree:
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """All files in order of their paths, pictures apart: a competition's input has thousands of those."""
+        """All files by path, without images, of which a competition's input has thousands."""
         return self._walked[0]
 
     @property
     def unpacked(self) -> tuple[Path, ...]:
-        """The directories that hold what is inside of a torch checkpoint; their files are not among ``files``."""
+        """The directories with the contents of a torch checkpoint; their files are not among ``files``."""
         return self._walked[1]
 
     @cached_property
@@ -58,7 +58,7 @@ class Tree:
         found: list[Path] = []
         unpacked: list[Path] = []
         entered: set[tuple[int, int]] = set()
-        for folder, folders, names in os.walk(self.root, onerror=_pass_over, followlinks=True):
+        for folder, folders, names in os.walk(self.root, onerror=_warn_unreadable, followlinks=True):
             status = Path(folder).stat()
             again, checkpoint = (status.st_dev, status.st_ino) in entered, is_unpacked(folders, names)
             entered.add((status.st_dev, status.st_ino))
@@ -67,7 +67,7 @@ class Tree:
             if checkpoint and not again:
                 unpacked.append(Path(folder))
             elif not again:
-                found += [Path(folder, name) for name in names if Path(name).suffix.lower() not in PICTURES]
+                found += [Path(folder, name) for name in names if Path(name).suffix.lower() not in IMAGE_SUFFIXES]
         return tuple(sorted(found)), tuple(sorted(unpacked))
 
     @cached_property
@@ -79,13 +79,13 @@ class Tree:
 
     @cached_property
     def _sizes(self) -> dict[Path, int]:
-        """Bytes of each file that is one: no pipe, no broken link."""
+        """Bytes of each regular file."""
         sizes = {}
         for path in self.files:
             try:
                 status = path.stat()
             except OSError as error:
-                _pass_over(error)
+                _warn_unreadable(error)
                 continue
             if stat.S_ISREG(status.st_mode):
                 sizes[path] = status.st_size
@@ -93,7 +93,7 @@ class Tree:
 
 
 def _is_entry(path: Path) -> bool:
-    """Is there something that is no directory? Broken links count, so that they are told of."""
+    """Whether there is anything but a directory; broken links count, so that they are reported."""
     try:
         path.lstat()
         return not path.is_dir()
@@ -101,5 +101,5 @@ def _is_entry(path: Path) -> bool:
         return False
 
 
-def _pass_over(error: OSError) -> None:
+def _warn_unreadable(error: OSError) -> None:
     warn_once(f"{error.filename} cannot be read, so it is not searched for weights: {error.strerror}")

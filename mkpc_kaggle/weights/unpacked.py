@@ -10,17 +10,17 @@ from pathlib import Path
 
 
 def is_unpacked(folders: Sequence[str], files: Sequence[str]) -> bool:
-    """Is a directory with these entries the inside of a torch checkpoint?"""
+    """Whether a directory with these entries has the contents of a torch checkpoint."""
     return "data" in folders and "data.pkl" in files
 
 
 def names_of(directory: Path) -> frozenset[str]:
-    """What the file that was unpacked into ``directory`` may have been called, with or without its suffix."""
+    """Possible names of the file that was unpacked into ``directory``, with or without its suffix."""
     return frozenset((directory.name, directory.parent.name))
 
 
 def pack(directory: Path, file: Path) -> Path:
-    """Write the checkpoint as the one archive that it was, ``file``; raises ``OSError``."""
+    """Write the checkpoint as one archive again, ``file``; raises ``OSError``."""
     # Mounted files may be dated 1970, which is before the format's first year.
     with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED, strict_timestamps=False) as archive:
         for path in _records(directory):

@@ -7,18 +7,18 @@ from mkpc_kaggle.matchers.networks.loma_matcher import LAYERS, LomaKeypoints, lo
 
 
 def refined(decoder, levels):
-    """The values of every refiner, and the answer after each but the last."""
-    values, answer, context = {}, None, None
+    """The values of every refiner, and the prediction after each but the last."""
+    values, prediction, context = {}, None, None
     for stride in decoder.layers:
         refiner, features = decoder.at(stride), levels.pop()
         mixed = refiner.mixed(refiner.entry(features), context)
         outputs = refiner.outputs(refiner.hidden(mixed))
         values[f"block1_{stride}"] = mixed
-        values[f"delta_{stride}"] = outputs[:, : decoder.answer]
-        values[f"context_{stride}"] = outputs[:, decoder.answer :]
+        values[f"delta_{stride}"] = outputs[:, : decoder.prediction]
+        values[f"context_{stride}"] = outputs[:, decoder.prediction :]
         if stride != "1":
-            answer, context = decoder.refined(int(stride), refiner.entry(features), answer, context)
-            values[f"answer_{stride}"] = answer
+            prediction, context = decoder.refined(int(stride), refiner.entry(features), prediction, context)
+            values[f"answer_{stride}"] = prediction
     return values
 
 

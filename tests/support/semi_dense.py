@@ -6,7 +6,7 @@ import torch
 from golden import Stage, golden_arrays, recorded
 from torch import Tensor
 
-from mkpc_kaggle.matchers.networks.coarse_matching import Cells, levels
+from mkpc_kaggle.matchers.networks.coarse_matching import Cells, half_log_confidences
 from mkpc_kaggle.matchers.networks.fine_matching import SemiDenseMatches, cell_points
 from mkpc_kaggle.matchers.networks.resnet_fpn import FeatureMaps
 
@@ -19,7 +19,7 @@ def confidence_of(network, grid0, grid1, masks=None):
         Cells(first.flatten(0, 1), second.flatten(0, 1), mask0.flatten(), mask1.flatten())
         for first, second, mask0, mask1 in pairs
     ]
-    return torch.stack([torch.cat(list(levels(cells))) for cells in all_cells]).mul(2).exp()
+    return torch.stack([torch.cat(list(half_log_confidences(cells))) for cells in all_cells]).mul(2).exp()
 
 
 def tolerance_of(name, tolerances):

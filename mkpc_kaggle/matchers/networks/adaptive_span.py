@@ -10,11 +10,11 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from mkpc_kaggle.matchers.networks.grids import mask_valid, mean_pool, quads, softmax_attention
+from mkpc_kaggle.matchers.networks.grids import mask_valid, mean_pool, softmax_attention, to_2x2_blocks
 
 SIDE = 8  # samples on each axis
 SAMPLES = SIDE * SIDE
-CELLS_AT_ONCE = {"cpu": 256, "cuda": 8192}  # a cell's samples take 128 KiB; a CPU likes them in its cache
+CELLS_AT_ONCE = {"cpu": 256, "cuda": 8192}  # a cell's samples take 128 KiB: on a CPU they must fit the cache
 MASKED = -1e8  # a logit; finite, so that where all are masked the attention is uniform
 
 
@@ -66,19 +66,19 @@ def span_attention(
     """Queries (N, h, w, C), keys and values (N, h_key, w_key, C), samples (N, h w / 4, 64, 2) -> (N, h, w, C).
 
     Samples outside the key map have a zero key and value, yet take part unless ``usable`` excludes them. The
-    messages stand cell after cell, four queries each, and are read as rows of the map as they stand: the
+    messages are ordered by cell, four queries each, and read as rows of the map without reordering: the
     published networks were trained with this permutation within each two rows.
     """
     table = torch.cat([k, v], dim=-1)  # (N, h_key, w_key, 2 C)
     index, weight = bilinear_taps(samples.flatten(0, 1), len(samples), table.shape[1], table.shape[2])
-    cells = quads(q).flatten(0, 1) * (q.shape[3] // heads) ** -0.5  # (N P, 4, C)
+    cells = to_2x2_blocks(q).flatten(0, 1) * (q.shape[3] // heads) ** -0.5  # (N P, 4, C)
     rows = table.flatten(0, 2)
     messages = []
     at_once = CELLS_AT_ONCE.get(q.device.type, 256)
     for start in range(0, len(cells), at_once):
         part = slice(start, start + at_once)
         taps, shares = index[part].flatten(0, 1), weight[part].flatten(0, 1)
-        # A bag of four weighted rows is bilinear sampling, all channels of keys and values at one go.
+        # A bag of four weighted rows is bilinear sampling, all channels of keys and values at once.
         read = functional.embedding_bag(taps, rows, per_sample_weights=shares, mode="sum")  # (p 64, 2 C)
         out = None if usable is None else ~usable.flatten(0, 1)[part]
         messages.append(_attend_cells(cells[part], read.view(-1, SAMPLES, read.shape[1]), heads, out))
@@ -88,7 +88,7 @@ def span_attention(
 def bilinear_taps(samples: Tensor, batch: int, height: int, width: int) -> tuple[Tensor, Tensor]:
     """Samples (N P, 64, 2) of N maps -> the rows (N P, 64, 4) int64 of the flattened maps, and their weights.
 
-    Rows outside the map have no weight.
+    Rows outside the map have weight 0.
     """
     corner = (samples - 0.5).floor()
     part = samples - 0.5 - corner  # (N P, 64, 2)

@@ -2,7 +2,7 @@
 Transformation", IEEE Transactions on Instrumentation and Measurement 2023.
 
 A map of four scales, joined at full size, gives a score at every pixel; descriptors are read where each keypoint's
-offsets point. The joined map is never made: scores need 8 channels of it, and descriptors some thousand pixels.
+offsets point. The joined map is never stored: scores need 8 channels of it, and descriptors some thousand pixels.
 Parameter names are those of the public checkpoints, apart from ``regular_conv`` (see :func:`own_name`).
 For inference only.
 """
@@ -21,7 +21,7 @@ STRIDES = (1, 2, 8, 32)
 RADIUS = 2  # of non-maximum suppression and of the window that refines a keypoint
 TEMPERATURE = 0.1  # of that refinement's softmax
 PATCH = 3  # pixels that a keypoint's offsets are computed from, each way
-ROWS_AT_ONCE, POSITIONS_AT_ONCE = 16, 1024  # what is made of them stays in a CPU's cache
+ROWS_AT_ONCE, POSITIONS_AT_ONCE = 16, 1024  # intermediate maps fit a CPU's cache
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ class Aliked(nn.Module):
 
     def maps(self, images: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """(B, c1, H, W) at stride 1, the input of its part; and the parts themselves at strides 2, 8 and 32."""
-        # Channels first: of three channels the convolution is faster so; its own result has them last.
+        # Channels first: with three channels the convolution is faster; its result is channels last.
         x1 = self.block1(images.contiguous().to(self.conv1.weight.dtype))
         x2 = self.block2(functional.avg_pool2d(x1, 2))
         x3 = self.block3(functional.avg_pool2d(x2, 4))
@@ -152,7 +152,7 @@ def conv3x3(conv: type[nn.Conv2d], channels: int, out_channels: int) -> nn.Conv2
 
 
 class JoinedMap:
-    """The unit features of the full-size map, computed for the pixels that are asked for alone."""
+    """The unit features of the full-size map, computed only at the pixels that are needed."""
 
     def __init__(self, network: Aliked, maps: tuple[Tensor, ...]) -> None:
         self._conv1 = network.conv1
@@ -187,7 +187,7 @@ class JoinedMap:
 
 
 class DescriptorHead(nn.Module):
-    """Features at each keypoint's own positions, weighed by learnt maps."""
+    """Features at positions around each keypoint, weighted by learned maps."""
 
     def __init__(self, channels: int, positions: int) -> None:
         super().__init__()
@@ -266,5 +266,5 @@ def windows(scores: Tensor, index: Tensor) -> Tensor:
 
 
 def own_name(name: str) -> str:
-    """Our name of a checkpoint's parameter: a deformable convolution's weight is its own here."""
+    """Our name of a checkpoint's parameter: here the module is the convolution itself."""
     return name.replace(".regular_conv.", ".")

@@ -4,13 +4,12 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional
 
 from mkpc_kaggle.matchers.networks.aspan_transformer import AspanTransformer, Factor, Side
 from mkpc_kaggle.matchers.networks.fine_matching import COARSE_STRIDE
 from mkpc_kaggle.matchers.networks.grids import as_grid
 from mkpc_kaggle.matchers.networks.linear_attention import Masks
-from mkpc_kaggle.matchers.networks.position import FIXED_FALL, sine_positions
+from mkpc_kaggle.matchers.networks.position import FIXED_DECAY, sine_positions
 from mkpc_kaggle.matchers.networks.resnet_fpn import TOP
 from mkpc_kaggle.matchers.networks.semi_dense import SemiDenseNetwork
 
@@ -76,7 +75,7 @@ class AspanFormer(SemiDenseNetwork[AspanTransformer]):
             train_height / (COARSE_STRIDE * height),
             train_width / (COARSE_STRIDE * width),
         )
-        positions = sine_positions(height, width, FIXED_FALL, scale, grid.device)[None]  # (1, h, w, 256)
+        positions = sine_positions(height, width, FIXED_DECAY, scale, grid.device)[None]  # (1, h, w, 256)
         projected = self.loftr_coarse.project(positions)
         visual = (grid + positions).contiguous()
         return Side(
@@ -90,9 +89,3 @@ def pooling_factor(height: int, width: int, coarsest: tuple[int, int] | None) ->
     if 0 in factor or height % factor[0] or width % factor[1]:
         raise ValueError(f"a coarse map of {height} x {width} cannot be pooled by {factor}")
     return factor
-
-
-def resized_to_multiple(image: Tensor, multiple: int = AspanFormer.multiple) -> Tensor:
-    """Images (B, 1, H, W) -> both sides rounded down to the multiple: bilinear, not antialiased, as published."""
-    size = [side // multiple * multiple for side in image.shape[2:]]
-    return image if list(image.shape[2:]) == size else functional.interpolate(image, size=size, mode="bilinear")

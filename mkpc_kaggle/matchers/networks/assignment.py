@@ -1,4 +1,4 @@
-"""Partners among the keypoints of two images, from a matrix of how sure each pair is."""
+"""Mutual matches of the keypoints of two images from a matrix of scores."""
 
 from dataclasses import dataclass
 
@@ -8,10 +8,10 @@ from torch import Tensor
 
 @dataclass(frozen=True, eq=False)
 class Assignment:
-    """``matches0`` (B, N0) int64: each keypoint's partner in image 1, or -1; ``matches1`` (B, N1) the inverse.
+    """``matches0`` (B, N0) int64: each keypoint's match in image 1, or -1; ``matches1`` (B, N1) the inverse.
 
-    ``scores0`` (B, N0) and ``scores1`` (B, N1) float32: in 0..1 the score of every pair of mutual best partners,
-    also of those whose match the threshold refused; 0 for other keypoints.
+    ``scores0`` (B, N0) and ``scores1`` (B, N1) float32: in 0..1 the score of every mutual nearest pair,
+    also of those below the threshold; 0 for other keypoints.
     """
 
     matches0: Tensor

@@ -1,8 +1,8 @@
 """Matches of coarse cells: dual softmax, mutual nearest neighbours, threshold and border.
 
-Source: Sun et al. 2021, section 3.3. The matrix of all pairs of cells is held only where it is small: at
-1600 x 1200 pixels it would take 3.6 GB. Else some rows at a time are computed twice, once for the sums of the
-softmaxes and once for the best of each row and column.
+Source: Sun et al. 2021, section 3.3. The matrix of all pairs of cells is stored only if it is small: at
+1600 x 1200 pixels it would take 3.6 GB. Otherwise blocks of rows are computed twice, once for the sums of the
+softmaxes and once for the maximum of each row and column.
 """
 
 from collections.abc import Iterable, Iterator
@@ -37,7 +37,8 @@ def coarse_matches(
     """Grids (N, h0, w0, C) and (N, h1, w1, C), whose similarity is ``scale`` times their dot product.
 
     A match is above ``threshold`` and the best of its row and of its column, border cells included; then those
-    with a cell within ``border`` of the border of its content go. ``masks``: (N, h, w) bool, True at content.
+    with a cell within ``border`` of the border of its content are dropped. ``masks``: (N, h, w) bool, True at
+    content.
     """
     masks0, masks1 = masks or (grid0.new_ones(grid.shape[:3], dtype=torch.bool) for grid in (grid0, grid1))
     found = [
@@ -59,7 +60,7 @@ def _matches_of_pair(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """``cell0``, ``cell1`` and ``confidence`` of one pair; grids (h, w, C), masks (h, w)."""
     cells = Cells(grid0.flatten(0, 1) * scale, grid1.flatten(0, 1), mask0.flatten(), mask1.flatten())
-    best0, partner, best1 = best_levels(cells)
+    best0, partner, best1 = row_and_column_maxima(cells)
     inner0, inner1 = inner_cells(mask0, border), inner_cells(mask1, border)
     confidence = torch.exp(2 * best0)
     kept = (confidence > threshold) & (best0 == best1[partner]) & inner0 & inner1[partner]
@@ -93,12 +94,12 @@ def half_log_sums(blocks: Iterable[Tensor]) -> tuple[Tensor, Tensor]:
     rows_and_columns = [(block.logsumexp(dim=1), block.logsumexp(dim=0)) for block in blocks]
     over_rows, of_blocks = (list(sums) for sums in zip(*rows_and_columns, strict=True))
     over_columns = torch.stack(of_blocks).logsumexp(dim=0)
-    # A row of padding alone sums to nothing; finite, it stays minus infinity when its sum is taken off.
+    # The sum of a row of padding is minus infinity; clamped, subtracting it gives no NaN.
     finite = torch.finfo(torch.float32).min
     return torch.cat(over_rows).clamp_(min=finite).div_(2), over_columns.clamp_(min=finite).div_(2)
 
 
-def levels(cells: Cells) -> Iterator[Tensor]:
+def half_log_confidences(cells: Cells) -> Iterator[Tensor]:
     """Blocks of rows (l, S): half the logarithm of the confidence.
 
     The confidence is the softmax over the rows times that over the columns, so its logarithm is
@@ -113,11 +114,11 @@ def levels(cells: Cells) -> Iterator[Tensor]:
         first += len(block)
 
 
-def best_levels(cells: Cells) -> tuple[Tensor, Tensor, Tensor]:
-    """Of each row the best level (L,) and where it is (L,), and of each column the best (S,)."""
+def row_and_column_maxima(cells: Cells) -> tuple[Tensor, Tensor, Tensor]:
+    """Half the log confidence: each row's maximum (L,) and its column (L,), and each column's maximum (S,)."""
     of_rows = []
     of_columns = cells.features1.new_full(cells.content1.shape, -torch.inf, dtype=torch.float32)
-    for block in levels(cells):
+    for block in half_log_confidences(cells):
         of_rows.append(block.max(dim=1))
         of_columns = torch.maximum(of_columns, block.amax(dim=0))
     best, partner = (torch.cat(values) for values in zip(*of_rows, strict=True))

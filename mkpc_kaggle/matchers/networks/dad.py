@@ -34,7 +34,7 @@ class Dad(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.encoder = Vgg(VGG11)
-        self.decoder = Decoder((8, 4, 2, 1), answer=1, blocks=3, mode="bicubic")
+        self.decoder = Decoder((8, 4, 2, 1), prediction=1, blocks=3, mode="bicubic")
         self.eval().requires_grad_(False)
 
     def forward(self, image: Tensor, number: int) -> list[DadKeypoints]:
@@ -46,9 +46,9 @@ class Dad(nn.Module):
 
     def logits(self, image: Tensor) -> Tensor:
         """(B, H, W) float32."""
-        answer, hidden = self.decoder(self.levels(image))
+        prediction, hidden = self.decoder(self.levels(image))
         part = self.decoder.last.outputs(hidden)[:, :1]
-        return resize(answer, part.shape[2:], "bicubic").add_(part)[:, 0]
+        return resize(prediction, part.shape[2:], "bicubic").add_(part)[:, 0]
 
     def levels(self, image: Tensor) -> Iterator[Tensor]:
         """The features at strides 1, 2, 4 and 8."""

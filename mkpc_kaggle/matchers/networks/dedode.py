@@ -31,15 +31,15 @@ class Dedode(nn.Module):
 
         The images are not normalised. Beyond the image, descriptors fade to 0 within a pixel.
         """
-        answer, hidden = self.decoder(self.encoder.levels(image))
-        # The map at full resolution is never made: of either of its parts only what the points need.
+        prediction, hidden = self.decoder(self.encoder.levels(image))
+        # The map at full resolution is never computed, only its two parts at the points.
         head = self.decoder.last.out_conv
         weight, bias = (
-            parameter[: self.decoder.answer] for parameter in (head.weight, head.get_parameter("bias"))
+            parameter[: self.decoder.prediction] for parameter in (head.weight, head.get_parameter("bias"))
         )
         read = functional.grid_sample(hidden.float(), points[:, None], align_corners=False)[:, :, 0]  # (B, 32, K)
         indices, shares = nearest_pixels(points, hidden.shape[2:])
-        enlarged = read_enlarged(answer, indices, shares, hidden.shape[2:])
+        enlarged = read_enlarged(prediction, indices, shares, hidden.shape[2:])
         fine = functional.linear(read.mT, weight.flatten(1))
         return enlarged + fine + shares.sum(dim=2, keepdim=True) * bias
 
@@ -47,7 +47,7 @@ class Dedode(nn.Module):
 def nearest_pixels(points: Tensor, size: torch.Size) -> tuple[Tensor, Tensor]:
     """The four pixels (B, K, 4, 2), column and row, around points (B, K, 2), and their bilinear shares (B, K, 4).
 
-    Pixels beyond an image of ``size`` (height, width) have no share.
+    Pixels outside an image of ``size`` (height, width) have weight 0.
     """
     extent = points.new_tensor([size[1], size[0]])
     places = ((points + 1) * extent - 1) / 2
@@ -67,7 +67,7 @@ def read_enlarged(x: Tensor, pixels: Tensor, shares: Tensor, size: torch.Size) -
 
 
 class VggAndVit(nn.Module):
-    """DINOv2's features besides VGG's; sides must be multiples of 14."""
+    """DINOv2's features and VGG's; sides must be multiples of 14."""
 
     def __init__(self, vit: DinoV2Config | None) -> None:
         super().__init__()

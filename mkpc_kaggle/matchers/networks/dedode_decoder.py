@@ -1,7 +1,7 @@
 """The decoder of DeDoDe (Edstedt et al. 2024, arXiv 2308.08479) and of the detector DaD: maps, coarse to fine.
 
-At each stride a refiner looks at the features there and at the context of the coarser strides, adds its part to
-the answer and hands on a context. Answers are float32 in any precision.
+At each stride a refiner looks at the features there and at the context of the coarser strides, adds to the
+prediction and passes on a context. Predictions are float32 in any precision.
 """
 
 from collections.abc import Iterable, Sequence
@@ -19,7 +19,7 @@ KERNEL = 5
 
 @dataclass(frozen=True)
 class RefinerShape:
-    """Channels: of the ``features`` looked at, inside, and of the ``context`` handed on."""
+    """Channels: of the ``features`` looked at, inside, and of the ``context`` passed on."""
 
     features: int
     hidden: int
@@ -36,9 +36,9 @@ SHAPES = {  # by stride
 
 
 class Refiner(nn.Module):
-    """1x1 convolutions of features and context, then depthwise 5x5 and 1x1 convolutions by turns."""
+    """1x1 convolutions of features and context, then alternating depthwise 5x5 and 1x1 convolutions."""
 
-    def __init__(self, shape: RefinerShape, context: int, answer: int, blocks: int) -> None:
+    def __init__(self, shape: RefinerShape, context: int, prediction: int, blocks: int) -> None:
         super().__init__()
         width = shape.hidden
         self.features = shape.features
@@ -46,7 +46,7 @@ class Refiner(nn.Module):
             nn.Conv2d(shape.features + context, width, 1), *normalised(width), nn.Conv2d(width, width, 1)
         )
         self.hidden_blocks = nn.Sequential(*(block(width) for _ in range(blocks)))
-        self.out_conv = ExactConv2d(width, answer + shape.context, 1)
+        self.out_conv = ExactConv2d(width, prediction + shape.context, 1)
 
     def entry(self, features: Tensor) -> Tensor:
         """What the first convolution makes of features (B, C, h, w) alone: (B, hidden, h, w)."""
@@ -69,7 +69,7 @@ class Refiner(nn.Module):
         return in_strips(self._hidden, mixed, reach=reach, channels=mixed.shape[1])
 
     def outputs(self, hidden: Tensor) -> Tensor:
-        """(B, answer + context, h, w) float32, the part of the answer first."""
+        """(B, prediction + context, h, w) float32, the part of the prediction first."""
         outputs: Tensor = self.out_conv(hidden.float())
         return outputs
 
@@ -79,15 +79,15 @@ class Refiner(nn.Module):
 
 
 class Decoder(nn.Module):
-    """``answer`` channels, ``blocks`` in each refiner; the answer is enlarged in ``mode`` (interpolate's)."""
+    """``prediction`` channels, ``blocks`` in each refiner; it is upsampled in interpolate's ``mode``."""
 
-    def __init__(self, strides: Sequence[int], answer: int, blocks: int, mode: str) -> None:
+    def __init__(self, strides: Sequence[int], prediction: int, blocks: int, mode: str) -> None:
         super().__init__()
-        self.answer, self.mode = answer, mode
+        self.prediction, self.mode = prediction, mode
         self.layers = nn.ModuleDict()
         context = 0
         for stride in strides:
-            self.layers[str(stride)] = Refiner(SHAPES[stride], context, answer, blocks)
+            self.layers[str(stride)] = Refiner(SHAPES[stride], context, prediction, blocks)
             context = SHAPES[stride].context
 
     @property
@@ -100,34 +100,34 @@ class Decoder(nn.Module):
         return refiner
 
     def forward(self, levels: Iterable[Tensor]) -> tuple[Tensor, Tensor]:
-        """The answer (B, answer, h, w) after stride 2, and what the last refiner has hidden, (B, 32, H, W).
+        """The prediction (B, prediction, h, w) after stride 2, and the last refiner's hidden map, (B, 32, H, W).
 
-        ``levels`` are the features from fine to coarse, made one by one: none need be held once the next is asked
-        for.
+        ``levels`` are the features from fine to coarse, computed one by one, so that none is kept in memory
+        once the next is requested.
         """
         strides = [int(stride) for stride in self.layers]
-        # A loop would hold the features while the next ones are made.
+        # A for loop would keep the features alive while the next ones are computed.
         entries = list(map(self.entry, reversed(strides), levels))
-        answer: Tensor | None = None
+        prediction: Tensor | None = None
         context: Tensor | None = None
         for stride in strides[:-1]:
-            answer, context = self.refined(stride, entries.pop(), answer, context)
-        assert answer is not None
+            prediction, context = self.refined(stride, entries.pop(), prediction, context)
+        assert prediction is not None
         mixed = self.last.mixed(entries.pop(), context)
-        return answer, self.last.hidden(mixed)
+        return prediction, self.last.hidden(mixed)
 
     def entry(self, stride: int, features: Tensor) -> Tensor:
         return self.at(stride).entry(features)
 
     def refined(
-        self, stride: int, entry: Tensor, answer: Tensor | None, context: Tensor | None
+        self, stride: int, entry: Tensor, prediction: Tensor | None, context: Tensor | None
     ) -> tuple[Tensor, Tensor]:
-        """The answer with what this stride adds, and its context."""
+        """The prediction with what this stride adds, and its context."""
         refiner = self.at(stride)
         outputs = refiner.outputs(refiner.hidden(refiner.mixed(entry, context)))
-        # A copy: a view would hold the answer's part as long.
-        part, context = outputs[:, : self.answer], outputs[:, self.answer :].clone()
-        return part if answer is None else resize(answer, part.shape[2:], self.mode).add_(part), context
+        # A copy: a view would hold the prediction's part as long.
+        part, context = outputs[:, : self.prediction], outputs[:, self.prediction :].clone()
+        return part if prediction is None else resize(prediction, part.shape[2:], self.mode).add_(part), context
 
 
 def resize(x: Tensor, size: torch.Size, mode: str) -> Tensor:

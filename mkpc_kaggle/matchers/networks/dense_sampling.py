@@ -1,7 +1,6 @@
 """Draws matches from a dense warp, spread evenly over the images: Edstedt et al. 2023, "DKM", section 3.5."""
 
 from dataclasses import dataclass
-from enum import StrEnum
 
 import torch
 from torch import Generator, Tensor
@@ -10,24 +9,17 @@ OVERSAMPLING = 4  # before matches are balanced
 BANDWIDTH = 0.1  # of the density's kernel, in normalised coordinates
 MIN_DENSITY, LAST_RESORT = 10, 1e-7  # isolated matches are drawn only when no others are left
 BLOCK_FLOATS = 2**20
-LEAST_EXPONENT = -80  # e to less is denormal, which takes a processor ten times as long and adds nothing
-
-
-class Weighting(StrEnum):
-    """What the certainty is taken for: see :func:`weights_of`."""
-
-    THRESHOLD = "threshold"
-    CUBE_ROOT = "cube root"
-    UNIFORM = "uniform"
-    PLAIN = "plain"
+LEAST_EXPONENT = -80  # exp of less is denormal: ten times slower, and adds nothing
 
 
 @dataclass(frozen=True)
 class SamplingConfig:
-    """As published. ``number``: how many matches at most. ``balanced``: spread evenly over the images."""
+    """As published. ``number``: how many matches at most. Certainties above ``threshold`` count as 1.
+
+    ``balanced``: matches are spread evenly over the images.
+    """
 
     number: int = 5000
-    weighting: Weighting = Weighting.THRESHOLD
     threshold: float = 0.05
     balanced: bool = True
 
@@ -38,8 +30,8 @@ class SamplingConfig:
 
 @dataclass(frozen=True, eq=False)
 class SampledMatches:
-    """``matches`` (M, 4) float32, normalised (x, y) in either image; ``certainty`` (M,), as it was weighted;
-    ``index`` (M,) int64, where they stand in the warp laid flat.
+    """``matches`` (M, 4) float32, normalised (x, y) in either image; ``certainty`` (M,), see :func:`weights_of`;
+    ``index`` (M,) int64 into the flattened warp.
     """
 
     matches: Tensor
@@ -50,11 +42,11 @@ class SampledMatches:
 def sample(
     warp: Tensor, certainty: Tensor, config: SamplingConfig, generator: Generator | None = None
 ) -> SampledMatches:
-    """Draws from a warp (..., 4) with its certainty (...), all pairs of a batch in one pool.
+    """Draws from a warp (..., 4) with its certainty (...); a batch of pairs is drawn from as one.
 
     Fewer than ``config.number`` where fewer have any weight, none at all being legal; ValueError where a
-    certainty is not finite. ``generator`` (on the tensors' device; else PyTorch's own) fixes the outcome, also
-    that of ``torch.multinomial`` for the same draws.
+    certainty is not finite. ``generator`` (on the tensors' device; default: PyTorch's) fixes the result, which is
+    also that of ``torch.multinomial`` for the same draws.
     """
     matches, weights = warp.reshape(-1, 4), weights_of(certainty.reshape(-1), config)
     if not weights.isfinite().all():
@@ -67,15 +59,8 @@ def sample(
 
 
 def weights_of(certainty: Tensor, config: SamplingConfig) -> Tensor:
-    match config.weighting:
-        case Weighting.THRESHOLD:
-            return certainty.masked_fill(certainty > config.threshold, 1)
-        case Weighting.CUBE_ROOT:
-            return certainty ** (1 / 3)
-        case Weighting.UNIFORM:
-            return torch.ones_like(certainty)
-        case Weighting.PLAIN:
-            return certainty
+    """The certainty, 1 where it is above the threshold."""
+    return certainty.masked_fill(certainty > config.threshold, 1)
 
 
 def noise_like(weights: Tensor, generator: Generator | None) -> Tensor:
@@ -102,5 +87,5 @@ def density(points: Tensor) -> Tensor:
 
 
 def balancing_weights(density: Tensor) -> Tensor:
-    """(N,) -> (N,): the denser, the less, yet next to nothing for isolated points."""
+    """(N,) -> (N,): lower where the density is higher, and almost 0 for isolated points."""
     return (1 / (density + 1)).masked_fill_(density < MIN_DENSITY, LAST_RESORT)

@@ -1,4 +1,4 @@
-"""What dense matchers make of two images: a place in the other for every pixel, and how certain it is.
+"""Dense warps: for every pixel its position in the other image and a certainty.
 
 Normalised coordinates as in warp_refiner. Source: Edstedt et al. 2023, "DKM", section 3.4, and its published code.
 """
@@ -58,14 +58,14 @@ def warps_of(
     forward = dense_warp(*decoder(first, second))
     if not symmetric:
         return (forward,)
-    # One after the other: as one batch both directions would take twice the memory and no less time.
+    # Sequential: one batch of both directions would take twice the memory and as much time.
     return forward, swapped(dense_warp(*decoder(second, first)))
 
 
 def dense_warp(estimate: Estimate, coarse_logits: Tensor) -> DenseWarp:
     """One direction on the query's grid; ``coarse_logits`` (B, 1, h, w): those of stride 16, first pass."""
     flow, logits = estimate.flow, estimate.certainty
-    # Half of the coarse evidence against a match is taken back.
+    # Half of the coarse logits that speak against a match is subtracted again.
     doubts = resize(coarse_logits, logits.shape[2:]).clamp(max=0)
     certainty = torch.sigmoid(logits - 0.5 * doubts)[:, 0]  # (B, H, W)
     outside = (flow.abs() > 1).any(dim=1)

@@ -35,7 +35,7 @@ class DinoV2(nn.Module):
         self.config = config = config or DinoV2Config()
         self.cls_token = nn.Parameter(torch.zeros(1, 1, config.width))
         self.pos_embed = nn.Parameter(torch.zeros(1, 1 + config.positions**2, config.width))
-        self.mask_token = nn.Parameter(torch.zeros(1, config.width))  # of the training; checkpoints carry it
+        self.mask_token = nn.Parameter(torch.zeros(1, config.width))  # used in training; checkpoints have it
         self.patch_embed = PatchEmbedding(config.width)
         self.blocks = nn.ModuleList(
             Block(config.width, config.heads, EPSILON, bias=True, scaled=True) for _ in range(config.blocks)

@@ -1,7 +1,7 @@
 """DKM v3: Edstedt et al., "DKM: Dense Kernelized Feature Matching for Geometry Estimation", CVPR 2023.
 
-Two views of a pair are compared whole; every pixel of each gets a place in the other, and a certainty. The views
-may have any sizes; the published code wants one size of both. Pixels of windows and corrections are the query's.
+Every pixel of each image gets a position in the other and a certainty. Images may have any sizes; the published
+code needs the same size for both. Pixels of windows and corrections are the query's.
 Coordinates are normalised: (x, y) in [-1, 1], where +-1 are the outer edges of an image (see warp_refiner).
 Parameter names are those of the public checkpoints. For inference only.
 """
@@ -29,7 +29,7 @@ class DkmConfig:
 
 @dataclass(frozen=True, eq=False)
 class DkmFeatures:
-    """What one image alone yields: for the first pass and, from a larger version of it, for the second."""
+    """Features of one image: for the first pass and, from a larger version of it, for the second."""
 
     coarse: Pyramid
     fine: Pyramid | None = None

@@ -1,4 +1,4 @@
-"""The decoder of DKM's global matcher, which turns what the Gaussian process regressed into a first estimate.
+"""The decoder of DKM's global matcher, from the Gaussian process's posterior to a first estimate.
 
 Source: Edstedt et al. 2023, section 3.2. Normalised coordinates as in warp_refiner.
 """
@@ -14,7 +14,7 @@ FEATURES, POSTERIOR, WIDTH = 512, 256, 384  # channels
 
 
 class EmbeddingDecoder(nn.Module):
-    """Turns the posterior into a first estimate, scale by scale, with a context that goes on to the next."""
+    """Turns the posterior into a first estimate, scale by scale, with a context passed to the next."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -54,7 +54,7 @@ class ResidualRefinement(nn.Module):
 
 
 class ChannelAttention(nn.Module):
-    """Adds the new embedding to the context, channel by channel as much as the means of both call for."""
+    """Adds the new embedding to the context, with a weight per channel from the means of both."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -56,8 +56,8 @@ def coefficients(y: Tensor, values: Tensor) -> Tensor:
 def kernel(x: Tensor, y: Tensor) -> Tensor:
     """exp((cosine - 1) / T) of all pairs: (B, n, C) and (B, m, C) -> (B, n, m), float32.
 
-    Computed in float64: the inverse of a covariance magnifies its rounding some fifteen times, and the refiners
-    that again, up to the tolerance of the golden vectors on some processors. It takes a tenth of a
+    Computed in float64: the inverse of a covariance amplifies rounding errors some fifteen times, and the
+    refiners do again, up to the tolerance of the golden vectors on some processors. It takes a tenth of a
     second on a CPU. For DKM on a pair of 540 x 720, both ways, these products are 10.2 GFLOP (1530 cells at stride
     16, 391 at 32): 40 ms at the peak of a T4, whose float64 has 1/32 of its float32's rate.
     """

@@ -1,6 +1,6 @@
 """What the matchers' transformers do with token grids, (..., h, w, C) with the channels last.
 
-A grid is a channels-last feature map seen the other way round, so neither view of it copies anything.
+A grid is a view of a channels-last feature map, so that converting copies nothing.
 """
 
 import torch
@@ -27,15 +27,15 @@ def mean_pool(grid: Tensor, factor: int | tuple[int, int]) -> Tensor:
     return grid if factor == 1 else as_grid(functional.avg_pool2d(as_map(grid), factor))
 
 
-def quads(grid: Tensor) -> Tensor:
+def to_2x2_blocks(grid: Tensor) -> Tensor:
     """(..., h, w, E) -> (..., h/2 * w/2, 4, E): 2x2 cells row by row, and row by row within each."""
     *lead, h, w, width = grid.shape
     cells = grid.reshape(*lead, h // 2, 2, w // 2, 2, width).transpose(-4, -3)  # (..., h/2, w/2, 2, 2, E)
     return cells.reshape(*lead, h * w // 4, 4, width)
 
 
-def unquads(cells: Tensor, h: int, w: int) -> Tensor:
-    """(..., h/2 * w/2, 4, E) -> (..., h, w, E): undoes :func:`quads`."""
+def from_2x2_blocks(cells: Tensor, h: int, w: int) -> Tensor:
+    """(..., h/2 * w/2, 4, E) -> (..., h, w, E): undoes :func:`to_2x2_blocks`."""
     *lead, _, _, width = cells.shape
     rows = cells.reshape(*lead, h // 2, w // 2, 2, 2, width).transpose(-4, -3)  # (..., h/2, 2, w/2, 2, E)
     return rows.reshape(*lead, h, w, width)
@@ -47,7 +47,7 @@ def pointwise(layer: nn.Conv1d | nn.Conv2d, x: Tensor) -> Tensor:
 
 
 def linear_of_two(weight: Tensor, x: Tensor, y: Tensor) -> Tensor:
-    """``weight`` (out, C_x + C_y) on the concatenation of (..., C_x) and (..., C_y), never built."""
+    """``weight`` (out, C_x + C_y) on the concatenation of (..., C_x) and (..., C_y), without building it."""
     of_x, of_y = torch.split(weight, [x.shape[-1], y.shape[-1]], dim=1)
     return linear(x, of_x).add_(linear(y, of_y))
 
@@ -64,7 +64,7 @@ class Perceptron(nn.Module):
         self.add_module("2", second)
 
     def forward(self, x: Tensor, y: Tensor | None = None) -> Tensor:
-        """(..., C), or two inputs (..., C_x) and (..., C_y) that stand for their concatenation -> (..., C_out)."""
+        """(..., C), or two inputs (..., C_x) and (..., C_y) in place of their concatenation -> (..., C_out)."""
         first, second = self.get_parameter("0.weight"), self.get_parameter("2.weight")
         weight, seen = first.flatten(1), x.to(first.dtype)
         hidden = linear(seen, weight) if y is None else linear_of_two(weight, seen, y.to(first.dtype))

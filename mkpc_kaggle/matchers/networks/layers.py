@@ -1,4 +1,4 @@
-"""Linear maps as they run fastest; for inference only.
+"""Linear maps and attention, fast on CPUs; for inference only.
 
 A weight may be kept in half precision (see ``placement``): the product is then taken in it, and a linear map's
 result has its input's precision again.
@@ -34,7 +34,7 @@ class Linear(nn.Linear):
 
 
 class Exact:
-    """Marks layers whose results are coordinates, or choose them: they stay in float32 in any precision."""
+    """Marks layers whose outputs are or select coordinates: they stay in float32 in any precision."""
 
 
 class ExactLinear(Exact, Linear):
@@ -57,11 +57,11 @@ def attention(q: Tensor, k: Tensor, v: Tensor, precision: torch.dtype) -> Tensor
     if q.device.type != "cpu":
         queries, keys, values = (x.to(precision) for x in (q, k, v))
         return functional.scaled_dot_product_attention(queries, keys, values).to(q.dtype)
-    # Faster than PyTorch's own, whose products are MKL's.
-    answers = torch.empty_like(q, memory_format=torch.contiguous_format)
+    # Faster than PyTorch's, which multiplies by MKL.
+    outputs = torch.empty_like(q, memory_format=torch.contiguous_format)
     scaled, keys, values = q * q.shape[-1] ** -0.5, k.to(precision), v.mT.to(precision)
-    for head in zip(*(x.flatten(0, 1) for x in (scaled, keys, values, answers)), strict=True):
+    for head in zip(*(x.flatten(0, 1) for x in (scaled, keys, values, outputs)), strict=True):
         queries, keys, values, out = head
-        for some, answer in zip(queries.split(ROWS_AT_ONCE), out.split(ROWS_AT_ONCE), strict=True):
-            answer.copy_(linear(linear(some, keys).softmax(dim=1), values))
-    return answers
+        for some, output in zip(queries.split(ROWS_AT_ONCE), out.split(ROWS_AT_ONCE), strict=True):
+            output.copy_(linear(linear(some, keys).softmax(dim=1), values))
+    return outputs

@@ -16,8 +16,8 @@ Masks = tuple[Tensor, Tensor]
 def linear_attention(q: Tensor, k: Tensor, v: Tensor, heads: int, masks: Masks | None = None) -> Tensor:
     """Queries (N, L, C), keys and values (N, S, C) -> (N, L, C); head h owns channels h C/heads and on.
 
-    ``masks``: of the queries (N, L) and of the keys (N, S), True at content. A masked query gets zero, a masked
-    key counts nothing. ``q`` and ``k`` are overwritten.
+    ``masks``: of the queries (N, L) and of the keys (N, S), True at content. A masked query's output is zero, a
+    masked key has no effect. ``q`` and ``k`` are overwritten.
     """
     q, k = functional.elu(q, inplace=True).add_(1.0), functional.elu(k, inplace=True).add_(1.0)
     if masks is not None:
@@ -32,7 +32,7 @@ def linear_attention(q: Tensor, k: Tensor, v: Tensor, heads: int, masks: Masks |
 
 
 class EncoderLayer(nn.Module):
-    """Updates tokens from a source: attention, then a multi-layer perceptron on the tokens and what they got."""
+    """Updates tokens from a source: attention, then a multi-layer perceptron on the tokens and the messages."""
 
     def __init__(self, width: int, heads: int) -> None:
         super().__init__()
@@ -47,7 +47,7 @@ class EncoderLayer(nn.Module):
 
     def forward(self, x: Tensor, source: Tensor, masks: Masks | None = None) -> Tensor:
         """Tokens (N, L, C) and source (N, S, C), with their masks (N, L) and (N, S) -> (N, L, C)."""
-        # Cast once: each of the maps would do it anew.
+        # Cast once, not in each projection.
         seen = x.to(self.q_proj.weight.dtype)
         other = seen if source is x else source.to(seen.dtype)
         q, k, v = self.q_proj(seen).float(), self.k_proj(other).float(), self.v_proj(other).float()

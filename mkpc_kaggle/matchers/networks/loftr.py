@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from mkpc_kaggle.matchers.networks.linear_attention import LinearTransformer, Masks
-from mkpc_kaggle.matchers.networks.position import FIXED_FALL, ORIGINAL_FALL, with_positions
+from mkpc_kaggle.matchers.networks.position import FIXED_DECAY, ORIGINAL_DECAY, with_positions
 from mkpc_kaggle.matchers.networks.resnet_fpn import TOP
 from mkpc_kaggle.matchers.networks.semi_dense import HEADS, SemiDenseNetwork
 
@@ -34,8 +34,8 @@ class Loftr(SemiDenseNetwork[LinearTransformer]):
         return 1 / (TOP * self.config.temperature)
 
     def transform(self, coarse0: Tensor, coarse1: Tensor, masks: Masks | None = None) -> tuple[Tensor, Tensor]:
-        fall = FIXED_FALL if self.config.fixed_positions else ORIGINAL_FALL
-        grid0, grid1 = with_positions(coarse0, fall), with_positions(coarse1, fall)
+        decay = FIXED_DECAY if self.config.fixed_positions else ORIGINAL_DECAY
+        grid0, grid1 = with_positions(coarse0, decay), with_positions(coarse1, decay)
         flat_masks = None if masks is None else (masks[0].flatten(1), masks[1].flatten(1))
         tokens0, tokens1 = self.loftr_coarse(grid0.flatten(1, 2), grid1.flatten(1, 2), flat_masks)
         return tokens0.view_as(grid0), tokens1.view_as(grid1)

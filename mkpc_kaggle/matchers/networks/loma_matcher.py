@@ -1,4 +1,4 @@
-"""LoMa's matcher (Nordström et al. 2026, arXiv 2604.04931): LightGlue (Lindenberger et al. 2023) run to its end.
+"""LoMa's matcher (Nordström et al. 2026, arXiv 2604.04931): LightGlue (Lindenberger et al. 2023), all layers.
 
 Inside, the keypoints of both images stand in one tensor (B, N0 + N1, d): only attention tells the images apart.
 Parameter names are those of the public checkpoints. For inference only.
@@ -48,7 +48,7 @@ def turned(x: Tensor, rotation: Tensor) -> Tensor:
 
 
 class Update(nn.Sequential):
-    """What a message changes in a keypoint's features."""
+    """The update of a keypoint's features by a message."""
 
     def __init__(self, width: int) -> None:
         super().__init__(
@@ -72,8 +72,8 @@ class SelfAttention(nn.Module):
         q, k = turned(q, rotation), turned(k, rotation)
         precision = self.out_proj.weight.dtype
         images = slice(None, n0), slice(n0, None)
-        answers = [attention(q[:, :, of], k[:, :, of], v[:, :, of], precision) for of in images]
-        return updated(x, answers, self.out_proj, self.ffn)
+        outputs = [attention(q[:, :, of], k[:, :, of], v[:, :, of], precision) for of in images]
+        return updated(x, outputs, self.out_proj, self.ffn)
 
 
 class CrossAttention(nn.Module):
@@ -91,14 +91,14 @@ class CrossAttention(nn.Module):
         qk, v = (layer(x).view(*x.shape[:2], -1, HEAD).transpose(1, 2) for layer in (self.to_qk, self.to_v))
         (qk0, qk1), (v0, v1) = ((part[:, :, :n0], part[:, :, n0:]) for part in (qk, v))
         precision = self.to_out.weight.dtype
-        answers = [attention(qk0, qk1, v1, precision), attention(qk1, qk0, v0, precision)]
-        return updated(x, answers, self.to_out, self.ffn)
+        outputs = [attention(qk0, qk1, v1, precision), attention(qk1, qk0, v0, precision)]
+        return updated(x, outputs, self.to_out, self.ffn)
 
 
-def updated(x: Tensor, answers: list[Tensor], out: Linear, ffn: Update) -> Tensor:
-    """Features (B, N, d) after the answers (B, heads, Ni, 64) that attention gave the keypoints of both images."""
-    answer = torch.cat([one.transpose(1, 2) for one in answers], dim=1).flatten(2)  # (B, N, d)
-    change: Tensor = ffn(torch.cat([x, out(answer)], dim=2))
+def updated(x: Tensor, outputs: list[Tensor], out: Linear, ffn: Update) -> Tensor:
+    """Features (B, N, d) updated by the attention outputs (B, heads, Ni, 64) of both images."""
+    output = torch.cat([one.transpose(1, 2) for one in outputs], dim=1).flatten(2)  # (B, N, d)
+    change: Tensor = ffn(torch.cat([x, out(output)], dim=2))
     return x + change
 
 

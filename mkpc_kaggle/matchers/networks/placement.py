@@ -1,4 +1,4 @@
-"""Makes a loaded network ready to run: batch norms folded, on its device, in its precision."""
+"""Prepares a loaded network for inference: batch norms folded, on its device, in its precision."""
 
 from itertools import pairwise
 from typing import TypeVar
@@ -17,7 +17,7 @@ Layer = nn.Linear | nn.Conv1d | nn.Conv2d
 
 
 def placed(network: Network, placement: Placement) -> Network:
-    """The network, changed in place: after it no checkpoint loads any more.
+    """The network, changed in place; checkpoints cannot be loaded afterwards.
 
     The weights of convolutions and linear layers, :class:`Exact` ones apart, get the placement's precision, and
     with them the maps between convolutions. All else stays float32: what transformers add up, softmax, transport,

@@ -9,34 +9,34 @@ from mkpc_kaggle.matchers.networks.grids import as_grid
 
 CHANNELS = 256
 
-# Falls of the frequencies. LoFTR's first checkpoints were trained with an encoding whose floor division makes
-# the exponent -1, so that all but the first frequencies vanish; later ones have the intended fall.
-ORIGINAL_FALL = 1.0
-FIXED_FALL = math.log(10000.0) / (CHANNELS // 2)
+# Decay of the frequencies. LoFTR's first checkpoints were trained with an encoding whose floor division makes
+# the exponent -1, so that all but the first frequencies vanish; later ones have the intended decay.
+ORIGINAL_DECAY = 1.0
+FIXED_DECAY = math.log(10000.0) / (CHANNELS // 2)
 
 
 def sine_positions(
     height: int,
     width: int,
-    fall: float,
+    decay: float,
     scale: tuple[float, float] = (1.0, 1.0),
     device: torch.device | None = None,
 ) -> Tensor:
     """(height, width, 256) float32: for g = 0..63 the sine and cosine of x w_g, then of y w_g.
 
-    w_g = exp(-2 g fall); x and y are the column and row counted from one, times ``scale`` (y, x).
+    w_g = exp(-2 g decay); x and y are the column and row counted from one, times ``scale`` (y, x).
     """
-    frequency = torch.exp(torch.arange(0, CHANNELS // 2, 2, dtype=torch.float32, device=device) * -fall)  # (64,)
+    frequency = torch.exp(torch.arange(0, CHANNELS // 2, 2, dtype=torch.float32, device=device) * -decay)  # (64,)
     y = _waves(height, scale[0], frequency)[:, None].expand(-1, width, -1, -1)  # (height, width, 64, 2)
     x = _waves(width, scale[1], frequency).expand(height, -1, -1, -1)  # (height, width, 64, 2)
     return torch.cat([x, y], dim=-1).flatten(2)
 
 
-def with_positions(coarse: Tensor, fall: float) -> Tensor:
+def with_positions(coarse: Tensor, decay: float) -> Tensor:
     """A coarse map (N, 256, h, w) -> the grid (N, h, w, 256), contiguous, with its positions added."""
     grid = as_grid(coarse)
     _, height, width, _ = grid.shape
-    return (grid + sine_positions(height, width, fall, device=grid.device)).contiguous()
+    return (grid + sine_positions(height, width, decay, device=grid.device)).contiguous()
 
 
 def _waves(length: int, scale: float, frequency: Tensor) -> Tensor:

@@ -10,10 +10,17 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mkpc_kaggle.matchers.networks.grids import as_grid, as_map, mean_pool, pointwise, quads, unquads
+from mkpc_kaggle.matchers.networks.grids import (
+    as_grid,
+    as_map,
+    from_2x2_blocks,
+    mean_pool,
+    pointwise,
+    to_2x2_blocks,
+)
 from mkpc_kaggle.matchers.networks.layers import Linear
 from mkpc_kaggle.matchers.networks.linear_attention import Masks
-from mkpc_kaggle.matchers.networks.position import FIXED_FALL, with_positions
+from mkpc_kaggle.matchers.networks.position import FIXED_DECAY, with_positions
 from mkpc_kaggle.matchers.networks.resnet_fpn import TOP
 from mkpc_kaggle.matchers.networks.semi_dense import HEADS, SemiDenseNetwork
 
@@ -53,11 +60,11 @@ def attend_children(q: Tensor, k: Tensor, v: Tensor, parents: Tensor, keep: int 
     """A finer level: maps (B, h, w, D) of queries, and (B, h_key, w_key, D) of keys and values.
 
     ``parents``: (B, h w / 4, K) int64, for each 2x2 cell of queries the key cells of the level above whose
-    children it sees. Children of one parent lie together, so that they are gathered at one go.
+    children it sees. Children of one parent lie together, so that they are gathered in one read.
     """
     w_key = k.shape[2]
     candidates = partial(_children_of, parents=parents)
-    found = attend(quads(q), candidates(quads(k)), candidates(quads(v)), keep)
+    found = attend(to_2x2_blocks(q), candidates(to_2x2_blocks(k)), candidates(to_2x2_blocks(v)), keep)
     if found.kept is None:
         return found
     parent = parents[:, :, None].expand(-1, -1, 4, -1).gather(3, found.kept // 4)  # (B, P, 4, keep)
@@ -86,11 +93,11 @@ def quadtree_attention(q: Tensor, k: Tensor, v: Tensor, shares: Tensor, topks: t
     assert dense.kept is not None
     middle = attend_children(q1, k1, v1, dense.kept[:, 0], topks[1])
     assert middle.kept is not None
-    fine = attend_children(q, k, v, unquads(middle.kept, 2 * h0, 2 * w0).flatten(1, 2), None)
-    # A cell's children take its message over: in quads that is broadcasting.
+    fine = attend_children(q, k, v, from_2x2_blocks(middle.kept, 2 * h0, 2 * w0).flatten(1, 2), None)
+    # A cell's children inherit its message: in 2x2 blocks that is broadcasting.
     coarse = dense.message[:, 0, :, None] * shares[0]  # (B, h0 w0, 1, D)
-    merged = unquads(coarse + middle.message * shares[1], 2 * h0, 2 * w0)  # (B, 2 h0, 2 w0, D)
-    return unquads(fine.message * shares[2] + merged.flatten(1, 2)[:, :, None], 4 * h0, 4 * w0)
+    merged = from_2x2_blocks(coarse + middle.message * shares[1], 2 * h0, 2 * w0)  # (B, 2 h0, 2 w0, D)
+    return from_2x2_blocks(fine.message * shares[2] + merged.flatten(1, 2)[:, :, None], 4 * h0, 4 * w0)
 
 
 class LevelWeights(nn.Module):
@@ -194,7 +201,7 @@ class QuadtreeTransformer(nn.Module):
 
 
 class Quadtree(SemiDenseNetwork[QuadtreeTransformer]):
-    """Sides are multiples of 32. The published code asks for two images of one size; nothing learned does.
+    """Sides are multiples of 32. The published code needs two images of one size; the weights do not.
 
     Masks act in the matching of coarse cells alone, as published: attention sees the padding.
     """
@@ -210,5 +217,7 @@ class Quadtree(SemiDenseNetwork[QuadtreeTransformer]):
         return 1 / (TOP * self.config.temperature)
 
     def transform(self, coarse0: Tensor, coarse1: Tensor, masks: Masks | None = None) -> tuple[Tensor, Tensor]:
-        grid0, grid1 = self.loftr_coarse(with_positions(coarse0, FIXED_FALL), with_positions(coarse1, FIXED_FALL))
+        grid0, grid1 = self.loftr_coarse(
+            with_positions(coarse0, FIXED_DECAY), with_positions(coarse1, FIXED_DECAY)
+        )
         return grid0, grid1

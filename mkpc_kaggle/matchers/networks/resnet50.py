@@ -41,7 +41,7 @@ def stage(inputs: int, width: int, blocks: int, stride: int) -> nn.Sequential:
 
 
 class ResNet50(nn.Module):
-    """The classifier is loaded because checkpoints carry it, and never used."""
+    """The classifier is there because checkpoints have it; it is not used."""
 
     def __init__(self) -> None:
         super().__init__()

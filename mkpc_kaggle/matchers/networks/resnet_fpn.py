@@ -45,7 +45,7 @@ class ResidualBlock(nn.Module):
 
 
 def smoothing(inputs: int, outputs: int) -> nn.Sequential:
-    """What follows where two levels of the pyramid meet."""
+    """The convolutions after two levels of the pyramid are merged."""
     return nn.Sequential(
         nn.Conv2d(inputs, inputs, 3, padding=1, bias=False),
         nn.BatchNorm2d(inputs),
@@ -69,7 +69,7 @@ class ResNetFpn(nn.Module):
         self.layer2_outconv2 = smoothing(TOP, MIDDLE)
         self.layer1_outconv = nn.Conv2d(STEM, MIDDLE, 1, bias=False)
         self.layer1_outconv2 = smoothing(MIDDLE, FINE)
-        # Weights that lie channels last make every map so; loading a checkpoint keeps it.
+        # Channels-last weights make all activations channels last; loading a checkpoint keeps that.
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # missing in torch's stubs
 
     def forward(self, image: Tensor) -> FeatureMaps:

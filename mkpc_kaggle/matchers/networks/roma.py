@@ -47,8 +47,8 @@ class RomaConfig:
 
 @dataclass(frozen=True, eq=False)
 class RomaFeatures:
-    """What one image alone yields: for the first pass, strides 1 to 16, and from a larger version of it for the
-    second; ``coefficients`` (B, n, C): what the Gaussian process makes of it as a support.
+    """Features of one image: for the first pass, strides 1 to 16, and from a larger version of it for the second;
+    ``coefficients`` (B, n, C): those of the Gaussian process with it as the support.
     """
 
     coarse: Pyramid
@@ -165,5 +165,5 @@ class Projection(nn.Sequential):
 
 
 def stretch(size: torch.Size) -> float:
-    """Of displacements in an image (H, W), so that they are shown in about the same unit of pixels at any size."""
+    """The factor of displacements in an image (H, W): their scale in pixels is about the same at any size."""
     return DISPLACEMENT * sqrt(size.numel()) / TRAINED_SIDE

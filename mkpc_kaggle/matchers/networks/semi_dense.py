@@ -1,4 +1,4 @@
-"""The frame that LoFTR, QuadTree and ASpanFormer fill: all but their coarse transformers is one network.
+"""The network that LoFTR, QuadTree and ASpanFormer share: all but their coarse transformers.
 
 Backbone, coarse transformer, dual softmax of all pairs of coarse cells, refinement in fine windows.
 """

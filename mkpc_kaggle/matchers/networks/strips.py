@@ -1,4 +1,4 @@
-"""Runs convolutions of large maps on strips of rows: these fit a processor's cache, and less memory is held."""
+"""Runs convolutions of large maps on strips of rows, which fit a processor's cache and take less memory."""
 
 from collections.abc import Callable
 

@@ -1,8 +1,8 @@
 """SuperGlue (Sarlin et al. 2020, arXiv 1911.11763): matches of two sets of keypoints with descriptors.
 
 Parameter names are those of ``superglue_outdoor.pth`` and ``superglue_indoor.pth``, which load strictly; their
-terms (noncommercial research) bind whoever uses them. Inside, the keypoints of both images stand in one tensor
-(B, N0 + N1, 256), keypoints before channels: all maps act on the rows, and only attention tells the images apart.
+terms (noncommercial research) apply to every use. Inside, the keypoints of both images are in one tensor
+(B, N0 + N1, 256), keypoints before channels: all layers act on rows, and only attention separates the images.
 """
 
 import math
@@ -106,14 +106,14 @@ class Attention(nn.Module):
         if cross:
             key0, key1, value0, value1 = key1, key0, value1, value0
         precision = self.merge.weight.dtype
-        answer0 = attention(query0, key0, value0, precision)  # (B, 4, N0, 64)
-        answer1 = attention(query1, key1, value1, precision)  # (B, 4, N1, 64)
-        answer = torch.cat([answer0.transpose(1, 2), answer1.transpose(1, 2)], dim=1).flatten(2)  # (B, N, 256)
-        return linear(answer, _by_head(self.merge.weight[:, :, 0].T).T, self.merge.bias)
+        output0 = attention(query0, key0, value0, precision)  # (B, 4, N0, 64)
+        output1 = attention(query1, key1, value1, precision)  # (B, 4, N1, 64)
+        output = torch.cat([output0.transpose(1, 2), output1.transpose(1, 2)], dim=1).flatten(2)  # (B, N, 256)
+        return linear(output, _by_head(self.merge.weight[:, :, 0].T).T, self.merge.bias)
 
 
 class Layer(nn.Module):
-    """One layer of the graph network: what a keypoint hears from the others changes its features."""
+    """One layer of the graph network: messages from other keypoints update a keypoint's features."""
 
     def __init__(self, *, cross: bool) -> None:
         super().__init__()
@@ -155,7 +155,7 @@ class SuperGlue(nn.Module):
         self.kenc = KeypointEncoder()
         self.gnn = GraphNetwork()
         self.final_proj = Pointwise(CHANNELS, CHANNELS)
-        self.bin_score = nn.Parameter(torch.tensor(1.0))  # the score of having no partner
+        self.bin_score = nn.Parameter(torch.tensor(1.0))  # the score of being unmatched
         self.eval()
 
     @torch.inference_mode()
@@ -171,11 +171,11 @@ class SuperGlue(nn.Module):
         return mutual_matches(log_plan[:, :-1, :-1], self.config.match_threshold)
 
     def encoded(self, image: ImageKeypoints) -> Tensor:
-        """The features (B, N, 256) with which an image enters the graph: what it shows and where it is."""
+        """The input features (B, N, 256) of the graph network: descriptor and encoded position."""
         return image.descriptors.float() + self.position(image)
 
     def position(self, image: ImageKeypoints) -> Tensor:
-        """What the keypoint encoder says of an image's keypoints, (B, N, 256)."""
+        """The keypoint encoder's output for an image, (B, N, 256)."""
         points = normalise_points(image.points, image.size)
         placed = torch.cat([points, image.scores.float()[..., None]], dim=2)  # (B, N, 3)
         encoded: Tensor = self.kenc(placed)
@@ -209,13 +209,13 @@ def normalise_points(points: Tensor, size: Size) -> Tensor:
 def log_optimal_transport(scores: Tensor, bin_score: Tensor, iterations: int) -> Tensor:
     """Sinkhorn's plan (B, m + 1, n + 1) float32 as logarithms, from scores (B, m, n); dustbins come last.
 
-    Each keypoint holds mass 1 and may give it to the other image's dustbin, which has room for all of them. An
+    Each keypoint has mass 1 and may give it to the other image's dustbin, which can take all of them. An
     iteration scales the rows, then the columns to their masses.
 
     The first iteration is done in the log domain, after which no entry of the plan exceeds 1 and no row or
     column sum is below (m + n)^-2. Iterations on the plan itself are then matrix-vector products. Every few of
-    them the scales go back into the potentials u and v and the plan is made anew, so that they cannot leave
-    float32's range, and an entry that underflows is one that a few scalings do not make count.
+    them the scales are absorbed into the potentials u and v and the plan is recomputed, so that they stay in
+    float32's range, and entries that underflow are negligible.
     """
     batch, m, n = scores.shape
     couplings = bin_score.float().expand(batch, m + 1, n + 1).clone()

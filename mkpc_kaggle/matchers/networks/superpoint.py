@@ -1,8 +1,8 @@
 """SuperPoint (DeTone et al. 2018, arXiv 1712.07629): keypoints of a gray image and their descriptors.
 
 Parameter names are those of ``superpoint_v1.pth``, which loads strictly; its terms (noncommercial research)
-bind whoever uses it. The numbers are those with which SuperGlue's weights were published, a slip in the
-sampling of descriptors included. Pixel centres are at integers, as everywhere in the package.
+apply to every use. The computation is the one that SuperGlue's weights were published with, including an error
+in the sampling of descriptors. Pixel centres are at integers, as everywhere in the package.
 """
 
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ CELL = 8
 """The stride of the features: a cell of the maps stands for 8 x 8 pixels."""
 
 SUPPRESSION_ROUNDS = 2
-"""How often points are looked for again among those that only a suppressed point outdid."""
+"""Rounds of recovering points that only a suppressed point exceeded."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ class SuperPoint(nn.Module):
         self.convPb = nn.Conv2d(256, CELL * CELL + 1, 1)
         self.convDa = nn.Conv2d(128, 256, 3, padding=1)
         self.convDb = nn.Conv2d(256, 256, 1)
-        # The layout of the weights decides that of the activations, the one-channel image's being ambiguous.
+        # The weights' layout decides that of the activations, since a one-channel image's is ambiguous.
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # missing in torch's stubs
 
     @torch.inference_mode()
@@ -126,8 +126,8 @@ def score_map(logits: Tensor) -> Tensor:
 def suppress_non_maxima(scores: Tensor, radius: int) -> Tensor:
     """``scores`` (B, H, W), at least 0, with those set to 0 that are no maximum of their square window.
 
-    Equal maxima in one window are all kept. A point that only suppressed points outdo is found again, but not
-    further down a chain than two rounds reach: neither greedy suppression nor its fixed point.
+    Equal maxima in one window are all kept. A point that only suppressed points exceed is recovered, in
+    two rounds: neither greedy suppression nor its fixed point.
     """
     kept = scores == window_maximum(scores, radius)
     for _ in range(SUPPRESSION_ROUNDS):
@@ -141,7 +141,7 @@ def window_maximum(values: Tensor, radius: int) -> Tensor:
     """The maximum over (2 radius + 1)^2 pixels about each pixel of ``values`` (B, H, W), at least 0 or bool.
 
     Axis by axis and by doubling, in a few vectorised passes where a pooling layer makes (2 radius + 1)^2
-    comparisons a pixel. The zeros beyond the border never win.
+    comparisons a pixel. The padding of zeros is never the maximum.
     """
     window = 2 * radius + 1
     padded = functional.pad(values, (radius,) * 4)

@@ -49,8 +49,8 @@ class SelfAttention(nn.Module):
         split = projected.view(*projected.shape[:2], 3, self.heads, -1).permute(
             2, 0, 3, 1, 4
         )  # (3, B, heads, n, D)
-        answers = functional.scaled_dot_product_attention(*split.unbind())
-        mixed: Tensor = self.proj(answers.transpose(1, 2).flatten(2))
+        outputs = functional.scaled_dot_product_attention(*split.unbind())
+        mixed: Tensor = self.proj(outputs.transpose(1, 2).flatten(2))
         return mixed
 
 

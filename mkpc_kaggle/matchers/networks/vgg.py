@@ -42,7 +42,7 @@ class Vgg(nn.Module):
         return list(self.levels(image))
 
     def levels(self, image: Tensor) -> Iterator[Tensor]:
-        """The same one by one, so that not all of them need be held."""
+        """The same one by one, so that not all of them are in memory."""
         first = next(self.parameters())
         x = image.to(first.dtype).contiguous(memory_format=torch.channels_last)
         for number, level in enumerate(self._levels()):
@@ -59,7 +59,7 @@ class Vgg(nn.Module):
 
 
 def halved(x: Tensor) -> Tensor:
-    """Maxima of 2 x 2 pixels. PyTorch's pooling has indices besides, twice as large as the maxima themselves."""
+    """Maxima of 2 x 2 pixels. PyTorch's pooling also stores indices, twice as large as the maxima."""
     height, width = (side // 2 * 2 for side in x.shape[2:])
     first, *others = (x[:, :, row:height:2, column:width:2] for row in (0, 1) for column in (0, 1))
     maxima = first.clone(memory_format=torch.channels_last)

@@ -1,4 +1,4 @@
-"""Warp refiners, DKM's and RoMa's, and the local correlation that they look at (Edstedt et al. 2023, section 3.3).
+"""Warp refiners, DKM's and RoMa's, and their local correlation (Edstedt et al. 2023, section 3.3).
 
 Normalised coordinates: (x, y) in [-1, 1], where +-1 are the outer edges of an image; the centre of pixel
 (column j, row i) of w x h is ((2 j + 1) / w - 1, (2 i + 1) / h - 1). Resizing a map of them leaves its values.
@@ -55,7 +55,7 @@ class Estimate:
 
 
 class Refiner(nn.Module):
-    """Depthwise 5x5 and 1x1 convolutions by turns on what both images show where the flow puts them."""
+    """Alternating depthwise 5x5 and 1x1 convolutions of both images' features, aligned by the flow."""
 
     def __init__(self, shape: RefinerShape) -> None:
         super().__init__()
@@ -73,7 +73,7 @@ class Refiner(nn.Module):
         """
         x = self._look(query, support, flow, stretch)  # (B, inputs, h, w)
         for depthwise, norm, _, mix in (self.block1, *self.hidden_blocks):
-            # One name for all: no more than two maps are alive at a time.
+            # One variable for all: no more than two maps are alive at a time.
             x = by_rows(mix, torch.relu_(norm(depthwise(x))))
         corrections: Tensor = self.out_conv(x.float())
         return corrections

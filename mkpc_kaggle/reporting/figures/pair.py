@@ -120,7 +120,7 @@ def _draw_clusters(axes: "Axes", image: Image, match: PairMatch, config: MkpcCon
     stage1 = match.matches[match.in_stage(1)]
     points = stage1.points1 if side else stage1.points0
     clusters = find_clusters(points, image.size, config)
-    dropped = ~clusters.keeps
+    dropped = ~clusters.in_kept
     axes.scatter(points[dropped, 0], points[dropped, 1], s=8, c=DROPPED, marker="x", linewidths=0.7)
     for rank, label in enumerate(clusters.kept):
         x, y = points[clusters.labels == label].T
