@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 import torch
 from checkpoints import PublicFile, use_manifest, write_checkpoints
-from kornia.feature import DISK, LightGlue
+from kornia.feature import DISK
 from standin import scene
 from torch import Tensor, nn
 
 from mkpc_kaggle.geometry.coordinates import Box, Size, View
 from mkpc_kaggle.matchers.contract import Picture, Placement, Precision, encoding_bytes
-from mkpc_kaggle.matchers.lightglue import LightGlueOptions
+from mkpc_kaggle.matchers.lightglue import LightGlueOptions, light_glue
 from mkpc_kaggle.matchers.networks.aliked import Aliked
 from mkpc_kaggle.matchers.registry import load_matcher
 from mkpc_kaggle.matchers.sparse import Keypoints
@@ -25,7 +25,7 @@ NAMES = ["aliked_lightglue", "disk_lightglue"]
 
 
 def glue() -> nn.Module:
-    return LightGlue(None, input_dim=128, n_layers=2, flash=False)  # type: ignore[arg-type]  # no download
+    return light_glue(2, 0.1, input_dim=128)
 
 
 def old_names(state: dict[str, Tensor]) -> dict[str, Any]:
@@ -113,6 +113,20 @@ def test_it_runs_end_to_end(name: str, store: WeightStore, monkeypatch: pytest.M
     match = TwoStageMatcher(recipe, matchers={name: matcher})(whole[:96, 16:], whole[8:, :128])
     assert [result.failure for result in match.results] == ["", ""]
     assert np.isfinite(match.estimate.matrix).all()
+
+
+@pytest.mark.parametrize("precision", Precision)
+def test_layers_compute_in_the_precision_that_is_asked_for(precision: Precision, store: WeightStore) -> None:
+    """LightGlue turns off any autocast around it: what counts is set around its layers."""
+    matcher, seen = load("aliked_lightglue", store, precision), []
+    for part in ("posenc.Wr", "transformers.1._layer.cross_attn.to_out", "transformers.1", "log_assignment.1"):
+        matcher._glue.get_submodule(part).register_forward_hook(
+            lambda part, given, found: seen.append(found[0].dtype)
+        )
+    encodings = matcher.encode([picture(64, 96)])
+    matcher.match(encodings, encodings)
+    exact = torch.float32
+    assert seen == [exact, exact, *2 * [getattr(torch, precision)], exact, exact]
 
 
 def test_kornia_leaves_the_process_as_it_was(store: WeightStore) -> None:

@@ -8,6 +8,7 @@ from kornia.feature import DISK
 from mkpc_kaggle.matchers.contract import MatcherSpec, Picture, Placement
 from mkpc_kaggle.matchers.lightglue import LightGlueMatcher, LightGlueOptions, load_glue
 from mkpc_kaggle.matchers.networks.placement import autocast
+from mkpc_kaggle.matchers.numbers import check_results
 from mkpc_kaggle.matchers.sparse import Keypoints, image_batch
 from mkpc_kaggle.weights import WeightStore, load_into
 
@@ -25,6 +26,7 @@ SPEC = MatcherSpec(
 class DiskEncoder:
     def __init__(self, network: DISK, features: int, placement: Placement) -> None:
         self._network = network.eval().to(placement.device)
+        check_results("features of disk", network.unet)
         self._features = features
         self._placement = placement
 

@@ -7,12 +7,13 @@ from typing import Any, Protocol
 
 import torch
 from kornia.feature import LightGlue
-from torch import Tensor
+from torch import Tensor, nn
 
 from mkpc_kaggle.config import AT_LEAST_1, SHARE, check_ranges
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import MatcherSpec, Picture, Placement
 from mkpc_kaggle.matchers.networks.placement import autocast
+from mkpc_kaggle.matchers.numbers import check_finite
 from mkpc_kaggle.matchers.sparse import Keypoints, matches_of
 from mkpc_kaggle.weights import WeightStore, load_into
 
@@ -43,6 +44,7 @@ class LightGlueMatcher:
         self.placement = placement
         self.encode = encoder.encode
         self._glue = glue.eval().to(placement.device)
+        glue.transformers = nn.ModuleList(Cast(layer, placement) for layer in glue.transformers)
 
     @torch.inference_mode()
     def match(self, encodings0: Sequence[Keypoints], encodings1: Sequence[Keypoints]) -> list[Matches]:
@@ -51,10 +53,27 @@ class LightGlueMatcher:
     def _match(self, keypoints0: Keypoints, keypoints1: Keypoints) -> Matches:
         if len(keypoints0) == 0 or len(keypoints1) == 0:
             return Matches.empty()
-        with autocast(self.placement):
-            found = self._glue({"image0": _glue_input(keypoints0), "image1": _glue_input(keypoints1)})
+        found = self._glue({"image0": _glue_input(keypoints0), "image1": _glue_input(keypoints1)})
+        check_finite(f"scores of {self.spec.name}", found["log_assignment"])
         pairs, scores = found["matches"][0], found["scores"][0]  # (M, 2), (M,)
-        return matches_of(keypoints0, keypoints1, pairs[:, 0], pairs[:, 1], scores.float())
+        return matches_of(keypoints0, keypoints1, pairs[:, 0], pairs[:, 1], scores)
+
+
+class Cast(nn.Module):
+    """A layer of LightGlue's in the placement's precision: float32 goes in and, as a sum with it, comes out.
+
+    Where keypoints lie, and the scores, stay float32. LightGlue itself turns off the autocast around it.
+    """
+
+    def __init__(self, layer: nn.Module, placement: Placement) -> None:
+        super().__init__()
+        self._layer = layer
+        self._placement = placement
+
+    def forward(self, *values: Tensor, **masks: Tensor | None) -> tuple[Tensor, Tensor]:
+        with autocast(self._placement):
+            features: tuple[Tensor, Tensor] = self._layer(*values, **masks)
+        return features
 
 
 def _glue_input(keypoints: Keypoints) -> dict[str, Tensor]:

@@ -4,9 +4,12 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mkpc_kaggle.matchers.contract import NonFiniteError
+
+if TYPE_CHECKING:
+    from torch.nn import Module
 
 
 @contextmanager
@@ -58,6 +61,11 @@ def check_finite(what: str, *values: Any) -> None:
     sums = [tensor.sum(dtype=torch.float32) for tensor in tensors]
     if not bool(torch.stack(sums).isfinite().all()):
         raise NonFiniteError(f"{what} are not finite")
+
+
+def check_results(what: str, network: "Module") -> None:
+    """From now on the network checks what it returns: one of a library's, whose caller would not."""
+    network.register_forward_hook(lambda network, given, found: check_finite(what, found))
 
 
 def float_tensors(value: Any) -> Iterator[Any]:

@@ -8,6 +8,7 @@ from kornia.feature import XFeat
 from mkpc_kaggle.matchers.contract import MatcherSpec, Picture, Placement
 from mkpc_kaggle.matchers.lightglue import LightGlueMatcher, LightGlueOptions, load_glue
 from mkpc_kaggle.matchers.networks.placement import autocast
+from mkpc_kaggle.matchers.numbers import check_results
 from mkpc_kaggle.matchers.sparse import Keypoints, image_batch
 from mkpc_kaggle.weights import WeightStore, load_into
 
@@ -27,6 +28,7 @@ SPEC = MatcherSpec(
 class XFeatEncoder:
     def __init__(self, network: XFeat, features: int, placement: Placement) -> None:
         self._network = network.eval().to(placement.device)
+        check_results("features of xfeat", network.net)
         self._features = features
         self._placement = placement
 

@@ -25,7 +25,8 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_flatten, tree_map
 
 # Some of what autocast takes in half precision on a GPU, and in float32.
-HALVED = {"conv2d", "linear", "matmul", "__matmul__", "bmm", "mm", "einsum", "scaled_dot_product_attention"}
+PRODUCTS = {"conv2d", "linear", "matmul", "__matmul__", "bmm", "mm", "einsum"}
+HALVED = PRODUCTS | {"prelu", "scaled_dot_product_attention"}
 WIDENED = {"softmax", "log_softmax", "exp", "log", "pow", "sum", "cumsum", "norm", "normalize", "logsigmoid"}
 INDEXING = {"index", "index_put", "index_put_", "_index_put_impl_", "_unsafe_index"}
 

@@ -16,6 +16,7 @@ from torch.nn import functional
 from mkpc_kaggle.matchers.networks.bilinear import DeformableConv2d, corners, table_of, weighted_rows
 from mkpc_kaggle.matchers.networks.grids import as_grid, pointwise
 from mkpc_kaggle.matchers.networks.layers import ExactConv2d, linear
+from mkpc_kaggle.matchers.numbers import check_finite
 
 STRIDES = (1, 2, 8, 32)
 RADIUS = 2  # of non-maximum suppression and of the window that refines a keypoint
@@ -117,8 +118,9 @@ class Aliked(nn.Module):
         )
         for part, weight in zip(parts, weights[1:], strict=True):
             total += enlarged(functional.conv2d(part.float(), weight), x1.shape[2:])
-        scores: Tensor = self.score_head[1:](total)
-        return scores[:, 0].sigmoid_()
+        logits: Tensor = self.score_head[1:](total)
+        check_finite("keypoint scores of aliked", logits)
+        return logits[:, 0].sigmoid_()
 
 
 class Block(nn.Module):

@@ -34,11 +34,14 @@ def corners(positions: Tensor, image: Tensor, size: torch.Size) -> tuple[Tensor,
 
 
 def neighbours(positions: Tensor, length: int) -> list[tuple[Tensor, Tensor]]:
-    """On one axis the pixel before each position (Q,) and the one after it, int64, with their weights."""
+    """On one axis the pixel before each position (Q,) and the one after it, int64, with their weights.
+
+    A position that is NaN has some pixel, for a GPU is lost after an index out of range, and NaN for its weight.
+    """
     before = positions.floor()
     share = positions - before
     return [
-        (pixel.clamp(0, length - 1).long(), weight.masked_fill((pixel < 0) | (pixel >= length), 0))
+        (pixel.clamp(0, length - 1).nan_to_num(0).long(), weight.masked_fill((pixel < 0) | (pixel >= length), 0))
         for pixel, weight in ((before, 1 - share), (before + 1, share))
     ]
 

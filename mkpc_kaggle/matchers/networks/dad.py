@@ -14,6 +14,7 @@ from torch.nn import functional
 from mkpc_kaggle.matchers.networks.dedode_decoder import Decoder, resize
 from mkpc_kaggle.matchers.networks.superpoint import window_maximum
 from mkpc_kaggle.matchers.networks.vgg import VGG11, Vgg
+from mkpc_kaggle.matchers.numbers import check_finite
 
 MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 TEMPERATURE = 0.5
@@ -42,7 +43,9 @@ class Dad(nn.Module):
 
         Trained with sides that are multiples of 8, the longer one 1024.
         """
-        return [select_keypoints(logits, number) for logits in self.logits(image)]
+        maps = self.logits(image)
+        check_finite("keypoint scores of loma", maps)
+        return [select_keypoints(logits, number) for logits in maps]
 
     def logits(self, image: Tensor) -> Tensor:
         """(B, H, W) float32."""

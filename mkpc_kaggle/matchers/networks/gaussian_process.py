@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from mkpc_kaggle.matchers.networks.layers import ExactConv2d
 from mkpc_kaggle.matchers.networks.warp_refiner import identity_map
+from mkpc_kaggle.matchers.numbers import check_finite
 
 TEMPERATURE, NOISE_VARIANCE = 0.2, 0.1
 
@@ -46,6 +47,7 @@ def tokens(feature_map: Tensor) -> Tensor:
 
 def coefficients(y: Tensor, values: Tensor) -> Tensor:
     """(K_yy + noise)^-1 values: (B, m, C) and (B or 1, m, D) -> (B, m, D)."""
+    check_finite("coarse features", y)
     covariance = kernel(y, y)
     covariance.diagonal(dim1=1, dim2=2).add_(NOISE_VARIANCE)
     # Positive definite. LU would cost twice as much, and batched it is broken in PyTorch's MKL builds.

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from mkpc_kaggle.matchers.networks.assignment import Assignment, mutual_matches, no_assignment
 from mkpc_kaggle.matchers.networks.layers import Linear, attention
+from mkpc_kaggle.matchers.numbers import check_finite
 
 HEAD = 64
 """Channels of an attention head."""
@@ -131,7 +132,9 @@ class LomaMatcher(nn.Module):
         n0, n1 = image0.points.shape[1], image1.points.shape[1]
         if n0 == 0 or n1 == 0:
             return no_assignment(image0.points[..., 0], image1.points[..., 0])
-        return mutual_matches(log_scores(self.similarity(self.features(image0, image1), n0)), threshold)
+        similarity = self.similarity(self.features(image0, image1), n0)
+        check_finite("scores of loma", similarity)
+        return mutual_matches(log_scores(similarity), threshold)
 
     def features(self, image0: LomaKeypoints, image1: LomaKeypoints) -> Tensor:
         """(B, N0 + N1, d) after all layers."""

@@ -12,6 +12,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from mkpc_kaggle.matchers.numbers import check_finite
+
 CELL = 8
 """The stride of the features: a cell of the maps stands for 8 x 8 pixels."""
 
@@ -81,7 +83,9 @@ class SuperPoint(nn.Module):
         Sides need not be multiples of 8; the at most 7 last rows and columns beyond carry no keypoint.
         """
         features = self.features(image)
-        scores = suppress_non_maxima(score_map(self.logits(features)), self.config.nms_radius)
+        logits = self.logits(features)
+        check_finite("keypoint scores of superpoint", logits)
+        scores = suppress_non_maxima(score_map(logits), self.config.nms_radius)
         return list(starmap(self._describe, zip(scores, self.descriptor_field(features), strict=True)))
 
     def features(self, image: Tensor) -> Tensor:
