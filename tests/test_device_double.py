@@ -15,6 +15,7 @@ import pytest
 import torch
 from device_double import DeviceDouble
 from light_matchers import MATCHERS, SHIFT, picture
+from torch.nn.attention import SDPBackend, sdpa_kernel
 
 from mkpc_kaggle.matchers.contract import Placement, Precision
 
@@ -51,7 +52,9 @@ def tensors_of(value: Any) -> list[torch.Tensor]:
 
 @cache
 def on_cpu(name: str, precision: Precision, batch: int) -> list[Any]:
-    return matched(name, Placement("cpu", precision), batch)
+    """With attention by its definition, as the double has it: another order of sums chooses other anchors."""
+    with sdpa_kernel(SDPBackend.MATH):
+        return matched(name, Placement("cpu", precision), batch)
 
 
 def on_double(name: str, precision: Precision, devices: tuple[str, ...], batch: int) -> list[list[Any]]:
@@ -89,13 +92,8 @@ CASES = [
 HALVED = ("superglue", "aliked_lightglue", "xfeat_lighterglue")
 QUICK = {(name, Precision.FLOAT32, 2, 1) for name in MATCHERS if name != "dkm, two passes"}
 QUICK |= {(name, Precision.FLOAT16, 1, 3) for name in HALVED}
-UNSTABLE = {("roma", Precision.BFLOAT16)}
-"""These weights hold several anchors for equally good: another order of sums in attention makes another the best,
-and other matches are drawn.
-"""
-
 SAME = {Precision.FLOAT32: 0.98, Precision.FLOAT16: 0.7, Precision.BFLOAT16: 0.5}
-"""Of the matches, at least. In half precision the order of sums tells; with DKM so does which are drawn."""
+"""Of the matches, at least. In half precision the order of sums tells."""
 
 
 @pytest.mark.parametrize(
@@ -105,8 +103,7 @@ SAME = {Precision.FLOAT32: 0.98, Precision.FLOAT16: 0.7, Precision.BFLOAT16: 0.5
 def test_a_matcher_finds_on_a_gpu_what_it_finds_on_the_cpu(name, precision, devices, batch):
     number, agreed = compared(name, precision, devices, batch)
     assert number > 0
-    if (name, precision) not in UNSTABLE:
-        assert agreed >= SAME[precision]
+    assert agreed >= SAME[precision]
 
 
 def main() -> None:
