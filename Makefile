@@ -9,6 +9,8 @@ BIN := $(VENV)/bin
 DEMO := demo
 OLDEST := .venv-oldest
 PYTHON311 ?= python3.11
+# Each test runs on one thread.
+TEST_PROCESSES ?= 2
 # Not the declared floor: on most indexes old versions of torch have no build for the CPU, and bring CUDA along.
 TORCH ?= $(shell grep '^torch==' requirements-dev.txt)
 
@@ -35,7 +37,7 @@ lint:
 	$(BIN)/mypy
 
 tests:
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest --numprocesses $(TEST_PROCESSES) --dist loadfile
 
 ray: install
 	$(BIN)/python -m pip install --quiet "ray>=2.9"
