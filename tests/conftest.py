@@ -4,12 +4,18 @@ import os
 from pathlib import Path
 
 import pytest
+from hypothesis import HealthCheck, settings
 
 from mkpc_kaggle.demo import DemoSet, write_demo
 
 # Before torch is imported, here and in the processes of the tests: their tensors are small, and on a busy machine
 # threads wait for each other more than they work.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+
+# How long an example takes is the machine's affair; tests that are about time measure it.
+settings.register_profile("any machine", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("any machine")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
