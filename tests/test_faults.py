@@ -225,9 +225,12 @@ def test_a_wall_clock_that_jumps_moves_no_limit(tmp_path: Path, monkeypatch: pyt
 
 
 def test_a_worker_ten_times_slower_from_half_way_on_still_ends_in_time(tmp_path: Path) -> None:
+    import torch  # noqa: F401  # it takes seconds, before the run's clock starts
+
+    pairs = write_pairs(tmp_path, 60)
     started = time.monotonic()
     matcher = SlowingMatcher(seconds=0.005, turn=90)
-    report = run(write_pairs(tmp_path, 60), THREE_UNITS, matcher, tmp_path / "work", limit=4.0)
+    report = run(pairs, THREE_UNITS, matcher, tmp_path / "work", limit=4.0)
     assert time.monotonic() - started < 4.0
     assert all(record.units for record in report.records)
     assert any("units fit" in one.text for one in report.explanations)
