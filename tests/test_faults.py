@@ -230,11 +230,11 @@ def test_a_worker_ten_times_slower_from_half_way_on_still_ends_in_time(tmp_path:
     pairs = write_pairs(tmp_path, 60)
     started = time.monotonic()
     matcher = SlowingMatcher(seconds=0.005, turn=90)
-    report = run(pairs, THREE_UNITS, matcher, tmp_path / "work", limit=4.0)
-    assert time.monotonic() - started < 4.0
+    report = run(pairs, THREE_UNITS, matcher, tmp_path / "work", limit=6.0)
+    assert time.monotonic() - started < 6.0
     assert all(record.units for record in report.records)
     assert any("units fit" in one.text for one in report.explanations)
-    assert time.monotonic() - started > 2.0, "the time is used"
+    assert time.monotonic() - started > 3.0, "the time is used"
 
 
 WATCHED = """
