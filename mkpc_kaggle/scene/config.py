@@ -26,8 +26,10 @@ class SceneConfig:
 
     Keypoints: ``cell``, in pixels, is what points of an image are merged in. Verification of a pair's matches:
     ``verification_error`` in pixels, and the ``least_inliers`` that it needs. Cameras: ``camera_model``, and the
-    focal length that they start with, ``prior_focal`` long sides. A scene has ``least_images``; above
-    ``most_images`` it is reconstructed in overlapping parts, by the incremental mapper whatever ``mapper`` says.
+    focal length that they start with, ``prior_focal`` long sides. A scene has
+    ``least_images``, and ``least_pairs_per_image`` times as many connected pairs: with fewer there is little that
+    could contradict its cameras. Above ``most_images`` it is reconstructed in overlapping parts, by the incremental
+    mapper whatever ``mapper`` says.
 
     Checks: an image's focal length is between ``lowest_focal`` and ``highest_focal`` long sides, and it sees
     ``least_points`` points. A pair keeps its own F if ``contradiction_matches`` of its matches are within
@@ -41,6 +43,7 @@ class SceneConfig:
     least_inliers: int = 15
     prior_focal: float = 1.1
     least_images: int = 3
+    least_pairs_per_image: float = 1.5
     most_images: int = 500
     lowest_focal: float = 0.3
     highest_focal: float = 5.0
@@ -59,6 +62,7 @@ class SceneConfig:
             least_inliers=Range(8),
             prior_focal=POSITIVE,
             least_images=Range(3),
+            least_pairs_per_image=AT_LEAST_0,
             most_images=Range(3),
             lowest_focal=POSITIVE,
             highest_focal=POSITIVE,

@@ -56,6 +56,9 @@ def scene_of(component: Component, images: tuple[BatchImage, ...], config: Scene
     names = tuple(image.name for image in members)
     if len(members) < config.least_images:
         return Scene(names, failure=f"{len(members)} images are connected; a scene needs {config.least_images}")
+    if len(component.edges) < config.least_pairs_per_image * len(members):
+        few = f"{len(component.edges)} pairs connect {len(members)} images"
+        return Scene(names, failure=f"{few}; a scene needs {config.least_pairs_per_image:g} an image")
     keypoints = scene_keypoints(len(members), component.edges, config.cell)
     try:
         from mkpc_kaggle.scene.reconstruct import reconstruct
