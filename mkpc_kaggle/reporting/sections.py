@@ -261,20 +261,23 @@ def _weakest(log: RunLog, artist: Artist) -> Iterator[Block]:
 
 def _draw_weak(log: RunLog, weak: WeakPair, source: Pair, artist: Artist) -> Picture | str:
     """The pair with its matches; or why it is not drawn."""
-    record = weak.record
-    caption = f"{source.id}: {record.inliers} inliers of {record.matches} matches"
-    if record.failure:
-        caption += f"; {record.failure}"
-    image0, image1 = map(read_image, source.images)
-    if isinstance(image0, Unreadable) or isinstance(image1, Unreadable):
-        return "an image cannot be read any more"
-    match = match_of(weak, log.recipe.magsac.threshold)
-    if len(match.matches) < record.matches:
-        caption += "; the points are no longer known"
-    drawn = artist.draw(lambda: figures.to_jpeg(figures.draw_strip((image0, image1), match)))
-    if not drawn:
-        return "not drawn"
-    return Picture(drawn[0], caption, f"the images of {source.id}, matches and critical regions")
+
+    def make() -> Picture | str:
+        record = weak.record
+        image0, image1 = map(read_image, source.images)
+        if isinstance(image0, Unreadable) or isinstance(image1, Unreadable):
+            return "an image cannot be read any more"
+        match = match_of(weak, log.recipe.magsac.threshold)
+        caption = f"{source.id}: {record.inliers} inliers of {record.matches} matches"
+        if record.failure:
+            caption += f"; {record.failure}"
+        if len(match.matches) < record.matches:
+            caption += "; the points are no longer known"
+        jpeg = figures.to_jpeg(figures.draw_strip((image0, image1), match))
+        return Picture(jpeg, caption, f"the images of {source.id}, matches and critical regions")
+
+    drawn = artist.draw(make)
+    return drawn[0] if drawn else "not drawn"
 
 
 def weak_figure(log: RunLog, weak: WeakPair, source: Pair) -> "Figure":
