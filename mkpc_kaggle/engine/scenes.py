@@ -14,6 +14,7 @@ from multiprocessing.context import SpawnProcess
 from pathlib import Path
 
 from mkpc_kaggle.data.competition import Pair
+from mkpc_kaggle.engine.exits import how_it_ended
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import Matrix3, Model
 from mkpc_kaggle.scene.choose import Choice
@@ -73,17 +74,15 @@ class Reconstruction:
         except (EOFError, OSError):
             self._process.join(timeout=1.0)  # its pipe closes before it has ended
             self.kill()
-            return SceneResult(self.batch, seconds=seconds, failure=f"its process ended: {self._ended()}")
+            return SceneResult(
+                self.batch, seconds=seconds, failure=f"its process ended: {how_it_ended(self._process)}"
+            )
         self.kill()
         return SceneResult(self.batch, scenes, choices, seconds)
 
     def kill(self) -> None:
         self._process.kill()
         self._process.join(timeout=1.0)
-
-    def _ended(self) -> str:
-        code = self._process.exitcode
-        return f"signal {signal.Signals(-code).name}" if code is not None and code < 0 else f"exit status {code}"
 
 
 def reconstruct_batch(pairs: Sequence[ScenePair], config: SceneConfig, answers: Connection) -> None:

@@ -7,7 +7,6 @@ them for good; and it cannot tell a busy worker which images come next.
 
 import multiprocessing
 import os
-import signal
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -17,6 +16,7 @@ from multiprocessing.context import SpawnProcess
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar, cast
 
+from mkpc_kaggle.engine.exits import how_it_ended
 from mkpc_kaggle.engine.jobs import Cause, Job, JobFailure
 from mkpc_kaggle.engine.pools.pool import START_SECONDS
 from mkpc_kaggle.engine.worker import Answer, Worker
@@ -58,7 +58,7 @@ class ProcessWorker:
         if isinstance(answer, UserError):
             raise answer
         if isinstance(answer, Cause):
-            return f"{answer}: {self._ended()}"
+            return f"{answer}: {how_it_ended(self._process)}"
         return str(answer)
 
     def run(self, job: Job) -> Answer:
@@ -68,7 +68,7 @@ class ProcessWorker:
             answer = self._within(job.timeout, self._jobs.recv)
         if not isinstance(answer, Cause):
             return cast(Answer, answer)
-        message = f"nothing heard for {job.timeout:.0f} s" if answer is Cause.HUNG else self._ended()
+        message = f"nothing heard for {job.timeout:.0f} s" if answer is Cause.HUNG else how_it_ended(self._process)
         return JobFailure(job, answer, message)
 
     def prefetch(self, paths: Iterable[Path]) -> None:
@@ -105,10 +105,6 @@ class ProcessWorker:
             return Cause.HUNG if hung.is_set() else Cause.DIED
         finally:
             timer.cancel()
-
-    def _ended(self) -> str:
-        code = self._process.exitcode
-        return f"signal {signal.Signals(-code).name}" if code is not None and code < 0 else f"exit status {code}"
 
 
 @contextmanager
