@@ -14,7 +14,6 @@ import pytest
 from faulty import FarMatcher, FaultyMatcher, die, hang, nothing
 from rectified import THREE_UNITS, RectifiedMatcher, run, write_pairs
 from test_faults import QUICK, matrices
-from weight_files import line
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.engine import Ending, RunReport
@@ -123,28 +122,6 @@ def test_an_image_is_read_here_only_if_it_is_the_same_file(tmp_path: Path) -> No
     assert (int(here.pixels.max()), int(sent.pixels.max())) == (10, 11)
     nowhere = read_or_fetch(tmp_path / "no.png", fetch)
     assert nowhere == Unreadable(str(tmp_path / "no.png"), "no such file")
-
-
-def test_weights_are_linked_where_they_are_and_sent_where_they_are_not(tmp_path: Path) -> None:
-    from types import SimpleNamespace
-
-    from mkpc_kaggle.engine.pools.ray_actor import FileServer, local_store
-    from mkpc_kaggle.weights import FoundFile, State
-
-    def found(path: Path, content: bytes) -> FoundFile:
-        file = line(f"{path.name}.pth", content, slot=path.name)
-        return FoundFile(file, path, State.GOOD, file.digest)
-
-    (tmp_path / "a").write_bytes(b"here")
-    (tmp_path / "b").write_bytes(b"there")
-    a, b = found(tmp_path / "a", b"here"), found(tmp_path / "lost" / "b", b"there")
-    assembly: Any = SimpleNamespace(weight_files={"a": a, "b": b}, weights=SimpleNamespace(files=(a.file, b.file)))
-    home = tmp_path / "home"
-    home.mkdir()
-    store = local_store(assembly, home, lambda path, stamp: FileServer().fetch(tmp_path / path.name, stamp))
-    assert (home / "a.pth").is_symlink()
-    assert not (home / "b.pth").is_symlink()
-    assert [one.path.read_bytes() for one in map(store.find, ("a", "b")) if one] == [b"here", b"there"]
 
 
 def node(name: str, alive: bool = True, **offer: float) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from shared import WEIGHTS, needs_weights
 from weight_files import DATA, OTHER, digest_of, line, put, search_nowhere_else
 
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.weights import UNVERIFIED, State, WeightStore, digests, load_tensors, store, tree
+from mkpc_kaggle.weights import UNVERIFIED, FoundFile, State, WeightStore, digests, load_tensors, store, tree
 from mkpc_kaggle.weights.convert import convert
 
 
@@ -353,3 +353,23 @@ def test_verify_reports_what_cannot_be_read(tmp_path: Path) -> None:
         warnings.simplefilter("always")
         (checked,) = WeightStore([tmp_path], [line()]).verify()
     assert checked.state is State.UNREADABLE
+
+
+def test_found_files_are_linked_where_they_are_and_fetched_where_they_are_not(tmp_path: Path) -> None:
+    def found(path: Path, content: bytes) -> FoundFile:
+        file = line(f"{path.name}.pth", content, slot=path.name)
+        return FoundFile(file, path, State.GOOD, file.digest)
+
+    (tmp_path / "a").write_bytes(b"here")
+    home = tmp_path / "home"
+    home.mkdir()
+    files = found(tmp_path / "a", b"here"), found(tmp_path / "lost" / "b", b"there")
+    for one in files:
+        one.link_or_copy(home, lambda path: b"there" if path.name == "b" else b"")
+    assert (home / "a.pth").is_symlink()
+    assert not (home / "b.pth").is_symlink()
+    store = WeightStore([home], [one.file for one in files])
+    assert [found_by(store, slot).read_bytes() for slot in ("a", "b")] == [b"here", b"there"]
+    unpacked = FoundFile(files[1].file, tmp_path / "lost" / "b", State.UNPACKED, "sha256:0")
+    with pytest.raises(UserError, match="cannot be sent to other machines"):
+        unpacked.link_or_copy(home, lambda _: b"")

@@ -61,7 +61,6 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _list(arguments: argparse.Namespace) -> int:
-    from mkpc_kaggle.matchers.registry import matcher_names
     from mkpc_kaggle.pipeline.uses import matchers_with, recipes_with, unusable
     from mkpc_kaggle.weights import WeightStore
 
@@ -81,7 +80,7 @@ def _list(arguments: argparse.Namespace) -> int:
             uses += [f"recipe {name}" for name in recipes_with(slot)]
             names = " or ".join(file.name for file in alternatives)
             print(f"missing: {slot} ({names}), for {', '.join(uses) or 'no matcher of this version'}")
-    for one in unusable(matcher_names()):
+    for one in unusable():
         print(one)
     return 0
 

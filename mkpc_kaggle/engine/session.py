@@ -9,7 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from importlib import metadata
 from math import isfinite
@@ -32,7 +32,6 @@ from mkpc_kaggle.engine.pools.pool import Place, Pool
 from mkpc_kaggle.engine.pools.process import ProcessWorker
 from mkpc_kaggle.engine.records import PairRecord
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.matchers.contract import Placement
 from mkpc_kaggle.pipeline.assembly import Assembly
 
 REPORT_SECONDS = 2.0
@@ -144,8 +143,8 @@ def pool_of(assembly: Assembly, workers: int | RayCluster | None) -> Pool:
         _process_place(f"{name} {number}", assembly.on(name, used.count(name)), share)
         for number, name in enumerate(used)
     ]
-    on_cpu = replace(assembly, placement=Placement())
-    return Pool(places, assembly.recipe, None if devices == ("cpu",) else _process_place("CPU", on_cpu))
+    fallback = None if devices == ("cpu",) else _process_place("CPU", assembly.on_cpu())
+    return Pool(places, assembly.recipe, fallback)
 
 
 def _process_place(name: str, assembly: Assembly, share: int = 1) -> Place:

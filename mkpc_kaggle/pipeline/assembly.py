@@ -1,6 +1,6 @@
 """Puts a run's parts together: a recipe by name, the weights it finds, the device, the matchers."""
 
-from collections.abc import Container, Iterable, Mapping
+from collections.abc import Callable, Container, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from pathlib import Path
@@ -63,6 +63,16 @@ class Assembly:
     def on(self, device: str, sharing: int = 1) -> "Assembly":
         """The same on one device, which so many workers share."""
         return replace(self, placement=replace(self.placement, device=device), sharing=sharing)
+
+    def on_cpu(self) -> "Assembly":
+        """The same on the CPU, in float32."""
+        return replace(self, placement=Placement(), sharing=1)
+
+    def with_weights_in(self, directory: Path, fetch: Callable[[Path], bytes]) -> "Assembly":
+        """The same with its weight files in an empty directory: links to those here, or fetched copies."""
+        for found in self.weight_files.values():
+            found.link_or_copy(directory, fetch)
+        return replace(self, weights=WeightStore([directory], self.weights.files))
 
     def pipeline(self) -> Pipeline:
         """A pipeline whose matchers are loaded when they are first needed.

@@ -25,9 +25,10 @@ def slots_of(recipe: Recipe, names: Iterable[str]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(slots))
 
 
-def unusable(names: Iterable[str]) -> tuple[Unusable, ...]:
-    """Those of these matchers that cannot be imported here; names that no matcher has are passed over."""
-    found = (find_matcher(name) for name in dict.fromkeys(names) if name in matcher_names())
+def unusable(names: Iterable[str] | None = None) -> tuple[Unusable, ...]:
+    """Those of these matchers, or of all, that cannot be imported here; names of no matcher are passed over."""
+    asked = matcher_names() if names is None else dict.fromkeys(names)
+    found = (find_matcher(name) for name in asked if name in matcher_names())
     return tuple(one for one in found if isinstance(one, Unusable))
 
 

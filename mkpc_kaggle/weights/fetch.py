@@ -26,7 +26,6 @@ from urllib.request import (
 
 from tqdm import tqdm
 
-from mkpc_kaggle import __version__
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.weights.digests import file_digests
 from mkpc_kaggle.weights.found import State, examine
@@ -216,7 +215,7 @@ def _download(url: str, part: PartialFile, wait: Callable[[float], None]) -> Non
 
 def _receive(url: str, part: PartialFile) -> bool:
     """One request for what is missing; whether the file is now complete. Raises on a broken connection."""
-    request = Request(url, headers={"User-Agent": f"mkpc_kaggle/{__version__}", **part.range_headers})
+    request = Request(url, headers={"User-Agent": "mkpc_kaggle", **part.range_headers})
     try:
         response = _opener().open(request, timeout=TIMEOUT)
     except HTTPError as error:

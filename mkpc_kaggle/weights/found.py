@@ -1,11 +1,12 @@
 """A file on this machine compared with its line of the manifest."""
 
 import stat
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 
+from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.weights.digests import Digests, file_digests
 from mkpc_kaggle.weights.manifest import UNVERIFIED, WeightFile
 from mkpc_kaggle.weights.notices import warn_once
@@ -44,6 +45,25 @@ class FoundFile:
     state: State
     digest: str
     note: str = ""
+
+    @property
+    def is_here(self) -> bool:
+        """Whether its path leads to the same bytes on this machine, wherever it was found."""
+        try:
+            unpacked = self.state is State.UNPACKED
+            return (digest_of(self.path) if unpacked else file_digests(self.path).sha256) == self.digest
+        except OSError:
+            return False
+
+    def link_or_copy(self, directory: Path, fetch: Callable[[Path], bytes]) -> None:
+        """Put it into a directory under its name: a link if it is here, else the bytes that ``fetch`` brings."""
+        target = directory / self.file.name
+        if self.is_here:
+            target.symlink_to(self.path)
+        elif self.state is State.UNPACKED:
+            raise UserError(f"{self.path} cannot be sent to other machines: {self.note}")
+        else:
+            target.write_bytes(fetch(self.path))
 
 
 def examine(path: Path, file: WeightFile, files: Iterable[WeightFile]) -> FoundFile:

@@ -3,7 +3,6 @@
 import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +17,6 @@ from mkpc_kaggle.engine.worker import Answer, Worker
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.pipeline.assembly import Assembly
 from mkpc_kaggle.pipeline.stages import Pipeline
-from mkpc_kaggle.weights import FoundFile, State, WeightStore
-from mkpc_kaggle.weights.digests import file_digests
-from mkpc_kaggle.weights.unpacked import digest_of
 
 Stamp = tuple[int, int]
 Fetch = Callable[[Path, Stamp | None], bytes | None]
@@ -51,7 +47,6 @@ class WorkerActor:
         self._threads = threads
         self._files = files
         self._last_heartbeat = time.monotonic()
-        self._weights = WeightStore()
         self._worker = Worker(self._pipeline, ImageStore(read=lambda path: read_or_fetch(path, self._fetch)))
 
     def load(self, version: str) -> str | UserError:
@@ -64,7 +59,7 @@ class WorkerActor:
         use_threads(self._threads)
         try:
             with tempfile.TemporaryDirectory() as home:
-                self._weights = local_store(self._assembly, Path(home), self._fetch)
+                self._assembly = self._assembly.with_weights_in(Path(home), self._fetch_whole)
                 self._worker.load()
         except UserError as error:
             return error
@@ -91,8 +86,13 @@ class WorkerActor:
         found: bytes | None = ray.get(self._files.fetch.remote(path, stamp))
         return found
 
+    def _fetch_whole(self, path: Path) -> bytes:
+        data = self._fetch(path, None)
+        assert data is not None
+        return data
+
     def _pipeline(self) -> Pipeline:
-        return replace(self._assembly, weights=self._weights).pipeline()
+        return self._assembly.pipeline()
 
 
 def read_or_fetch(path: Path, fetch: Fetch) -> Image | Unreadable:
@@ -104,29 +104,6 @@ def read_or_fetch(path: Path, fetch: Fetch) -> Image | Unreadable:
     except (OSError, ray.exceptions.RayError) as error:
         return Unreadable(str(path), f"cannot be fetched: {error}")
     return read_image(path) if data is None else decode_image(str(path), np.frombuffer(data, np.uint8))
-
-
-def local_store(assembly: Assembly, home: Path, fetch: Fetch) -> WeightStore:
-    """A store of the weights that the parent found, put into ``home``: links to those that are here, or copies."""
-    for found in assembly.weight_files.values():
-        target = home / found.file.name
-        if is_here(found):
-            target.symlink_to(found.path)
-        elif found.state is State.UNPACKED:
-            raise UserError(f"{found.path} cannot be sent to other machines: {found.note}")
-        else:
-            data = fetch(found.path, None)
-            assert data is not None
-            target.write_bytes(data)
-    return WeightStore([home], assembly.weights.files)
-
-
-def is_here(found: FoundFile) -> bool:
-    try:
-        unpacked = found.state is State.UNPACKED
-        return (digest_of(found.path) if unpacked else file_digests(found.path).sha256) == found.digest
-    except OSError:
-        return False
 
 
 def use_threads(count: int) -> None:
