@@ -4,11 +4,16 @@ import argparse
 import ast
 import json
 import re
+import sys
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
+import cv2
 import pytest
 from IPython.core.inputtransformer2 import TransformerManager
+from sklearn.datasets import load_sample_image
+from vismatch_standin import OrbLikeVismatch
 
 from mkpc_kaggle.cli import make_parser
 
@@ -80,3 +85,21 @@ def test_pages_name_commands_and_options_that_there_are(page: Path) -> None:
         parsers = [known[name], *(parser for one in inner for parser in one.choices.values())]
         have = set().union(*map(options_of, parsers))
         assert set(options) <= have, (name, set(options) - have)
+
+
+BLOCKS = re.findall(r"^```python\n(.*?)^```", PAGES[0].read_text(encoding="utf-8"), re.M | re.S)
+
+
+@pytest.mark.parametrize("block", BLOCKS, ids=range(len(BLOCKS)))
+def test_the_python_of_the_readme_runs(block: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On two parts of a photograph, with a stand-in for vismatch."""
+    photograph = load_sample_image("china.jpg")
+    for name, shift in (("a.jpg", 0), ("b.jpg", 40)):
+        assert cv2.imwrite(str(tmp_path / name), photograph[:, shift : shift + 560, ::-1])
+    monkeypatch.chdir(tmp_path)
+    vismatch = SimpleNamespace(get_matcher=lambda name, device: OrbLikeVismatch())
+    monkeypatch.setitem(sys.modules, "vismatch", vismatch)  # type: ignore[arg-type]  # has what is imported
+    names: dict[str, object] = {}
+    exec(compile(block, "README.md", "exec"), names)
+    match = names["match"]
+    assert match.estimate.inlier_count > 50  # type: ignore[attr-defined]  # a PairMatch
