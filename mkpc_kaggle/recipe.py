@@ -5,7 +5,7 @@ A recipe is a TOML file: ``mkpc_kaggle/recipes/NAME.toml`` or one of the user's 
 
 import re
 import tomllib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Container, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from enum import StrEnum
 from pathlib import Path
@@ -62,7 +62,9 @@ class Unit:
     ``stage`` 1 looks at whole images, 2 at the critical regions. A view's longer side gets ``long_side`` pixels,
     or the view as many pixels as ``area`` has, height by width such as "540x720"; its aspect is kept either way,
     but with ``stretch`` it gets just that height and width. The ``max_matches`` surest matches are kept. ``flip``
-    mirrors both views. An ``extra`` unit is left for the upgrade pass. ``ValueError`` for what makes no unit.
+    mirrors both views. An ``extra`` unit is left for the upgrade pass. ``fallback``: the matcher that takes the
+    place of this one where it cannot run, or not with the weights that are there. ``ValueError`` for what makes no
+    unit.
     """
 
     stage: int
@@ -73,6 +75,7 @@ class Unit:
     extra: bool = False
     area: str = ""
     stretch: bool = False
+    fallback: str = ""
 
     def __post_init__(self) -> None:
         check_ranges(self, stage=Range(1, 2), long_side=AT_LEAST_0, max_matches=AT_LEAST_1)
@@ -88,6 +91,11 @@ class Unit:
         """Such as ``2:sift@1280`` or ``1:dkm@540x720``; "!" says stretched, "~" mirrored. Unique in a recipe."""
         marks = ("!" if self.stretch else "") + ("~" if self.flip else "")
         return f"{self.stage}:{self.matcher}@{self.long_side or self.area}{marks}"
+
+    @property
+    def with_fallback(self) -> "Unit":
+        """The same unit with its fallback in its matcher's place, if it has one."""
+        return replace(self, matcher=self.fallback or self.matcher, fallback="")
 
     def shrunk(self, factor: float) -> "Unit":
         """The same unit on views whose sides are ``factor`` times as long."""
@@ -150,7 +158,9 @@ class Recipe:
             raise UserError(f"{where} has no units")
         if self.units[0].stage != 1 or self.units[0].extra:
             raise UserError(f"{where}: the first unit sweeps all pairs, so it must have stage 1 and not be extra")
-        names = [unit.name for unit in self.units]
+        names = [unit.name for unit in self.units] + [
+            unit.with_fallback.name for unit in self.units if unit.fallback
+        ]
         for name in names:
             if names.count(name) > 1:
                 raise UserError(f"{where} has the unit {name} twice")
@@ -168,6 +178,11 @@ class Recipe:
     def only(self, wanted: Callable[[Unit], bool]) -> "Recipe":
         """The same recipe with the units that ``wanted`` lets through."""
         return replace(self, units=tuple(filter(wanted, self.units)))
+
+    def decided(self, unfit: Container[str]) -> "Recipe":
+        """The recipe that is run: fallbacks have taken the places of ``unfit`` matchers, or are forgotten."""
+        units = (u.with_fallback if u.matcher in unfit else replace(u, fallback="") for u in self.units)
+        return replace(self, units=tuple(units))
 
     def in_mode(self, mode: Mode) -> "Recipe":
         """The recipe run another way, see :class:`Mode`."""

@@ -471,9 +471,10 @@ def test_recipe_auto_leaves_out_the_units_whose_weights_are_missing():
 @needs_weights
 def test_recipe_auto_takes_all_whose_weights_are_there():
     assembly = assemble("auto", weights=[WEIGHTS])
-    recipe, light = load_recipe("auto"), load_recipe("light")
-    assert set(assembly.recipe.matcher_names) == set(light.matcher_names)
-    assert assembly.recipe == recipe.only(lambda unit: unit.matcher in light.matcher_names)
+    recipe = load_recipe("auto")
+    there = {"xfeat_lighterglue", "sift", "aliked"}
+    assert set(assembly.recipe.matcher_names) == there
+    assert assembly.recipe == recipe.only(lambda unit: unit.matcher in there)
     assert assembly.left_out == tuple(unit for unit in recipe.units if unit not in assembly.recipe.units)
     assert all(digest.startswith("sha256:") for digest in assembly.fingerprint()["weights"].values())
     assert set(assembly.fingerprint()["weights"]) == {"xfeat", "xfeat-lighterglue", "aliked-n16"}
@@ -485,6 +486,20 @@ def test_a_named_recipe_without_its_weights_is_refused_with_the_file_names(recip
         UserError, match=r"needs weights.*xfeat\.pt or xfeat_sparse.*aliked-n16\.pth or .*--weights"
     ):
         assemble(recipe)
+
+
+@needs_weights
+def test_a_fallback_stands_in_for_a_matcher_whose_weights_are_missing():
+    assembly, recipe = assemble("light", weights=[WEIGHTS]), load_recipe("light")
+    assert assembly.recipe.matcher_names == ("xfeat_lighterglue", "sift", "aliked")
+    assert [unit.name for unit in assembly.left_out] == ["1:aliked_lightglue@1024", "2:aliked_lightglue@800"]
+    assert [unit.stage for unit in assembly.recipe.units] == [unit.stage for unit in recipe.units]
+    assert assembly.recipe.fingerprint() == assembly.recipe.decided(()).fingerprint()
+
+
+def test_an_unknown_fallback_is_refused_even_where_it_is_not_needed():
+    with pytest.raises(UserError, match="unknown matcher 'alked'"):
+        assemble(Recipe((Unit(1, "sift", 640, fallback="alked"),)))
 
 
 def standins(directory, *names):
@@ -520,6 +535,17 @@ def test_a_permissive_run_leaves_out_of_recipe_auto_what_is_licensed_otherwise(k
     assert set(some.fingerprint()["weights"]) == {"loftr-outdoor", "dkm-outdoor"}
 
 
+@pytest.mark.filterwarnings("ignore:.*is not verified")
+def test_a_fallback_stands_in_for_a_matcher_whose_weights_are_not_permitted_or_not_there(known_files):
+    recipe = Recipe((Unit(1, "superglue", 640, fallback="loftr"), Unit(2, "dkm", area="90x120")))
+    every = assemble(recipe, weights=[known_files])
+    assert (every.recipe.matcher_names, every.left_out) == (("superglue", "dkm"), ())
+    some = assemble(recipe, weights=[known_files], licence=Licence.PERMISSIVE)
+    assert (some.recipe.matcher_names, some.left_out) == (("loftr", "dkm"), recipe.units[:1])
+    (known_files / "sp.pth").unlink()
+    assert assemble(recipe, weights=[known_files]).recipe == some.recipe
+
+
 @pytest.mark.parametrize("recipe", ["yfcc", "imc2022", load_recipe("scannet")])
 def test_a_permissive_run_refuses_a_recipe_by_matcher_and_licence_and_says_what_to_do(recipe):
     says = r"permissive refuses recipe '\w+' .*superglue \(Magic-Leap-noncommercial\).*recipe auto"
@@ -547,8 +573,9 @@ def test_the_licence_of_a_matcher_of_ones_own_counts():
 
 
 def test_the_permissive_recipe_is_refused_for_nothing_but_missing_weights():
-    with pytest.raises(UserError, match="needs weights"):
-        assemble("permissive", licence=Licence.PERMISSIVE)
+    for recipe in ("permissive", "best"):
+        with pytest.raises(UserError, match="needs weights"):
+            assemble(recipe, licence=Licence.PERMISSIVE)
 
 
 def test_damaged_weights_are_refused_by_recipe_auto_too(tmp_path):

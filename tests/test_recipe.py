@@ -106,7 +106,28 @@ def test_scannet_has_indoor_weights_and_their_settings():
 
 def test_the_ensembles_have_the_matchers_that_they_are_said_to_have():
     assert set(load_recipe("imc2022").matcher_names) == {"superglue", "loftr", "dkm", "quadtree", "aspanformer"}
-    assert set(load_recipe("permissive").matcher_names) == {"loftr", "quadtree", "dkm"}
+    assert set(load_recipe("permissive").matcher_names) == {"loma", "roma", "loftr", "dkm"}
+    assert set(load_recipe("best").matcher_names) == {"loma", "roma", "superglue", "loftr"}
+
+
+@pytest.mark.parametrize("name", recipe_names())
+def test_recipes_for_every_user_name_no_weights_for_noncommercial_use_but_with_a_fallback(name):
+    """Those with such weights say so in the README: the paper's."""
+    recipe = load_recipe(name)
+    bound = {n for n in recipe.matcher_names if any("noncommercial" in tag for tag in spec_of(n, "test").licences)}
+    free = {unit.matcher for unit in recipe.units if not unit.fallback}
+    assert bool(bound & free) == name.startswith(("yfcc", "scannet", "imc2022", "auto"))
+
+
+def test_fallbacks_take_the_places_of_matchers_that_are_unfit_and_are_forgotten_otherwise():
+    recipe = Recipe((Unit(1, "a", 640), Unit(1, "b", 640, fallback="c"), Unit(2, "b", 800, 9, fallback="c")))
+    assert recipe.decided({"b", "a"}).units == (Unit(1, "a", 640), Unit(1, "c", 640), Unit(2, "c", 800, 9))
+    assert recipe.decided({"c"}).units == (Unit(1, "a", 640), Unit(1, "b", 640), Unit(2, "b", 800, 9))
+
+
+def test_a_fallback_may_not_stand_beside_the_same_unit():
+    with pytest.raises(UserError, match="1:b@640 twice"):
+        Recipe((Unit(1, "a", 640, fallback="b"), Unit(1, "b", 640)))
 
 
 # reading
@@ -344,7 +365,7 @@ def test_a_range_says_which_ends_are_in_it(bounds, inside, text):
 
 
 def test_an_unknown_recipe_lists_the_known_ones():
-    with pytest.raises(UserError, match=r"'clasical'; known: auto, classical, imc2022, light.*\.toml"):
+    with pytest.raises(UserError, match=r"'clasical'; known: auto, best, classical, imc2022, light.*\.toml"):
         load_recipe("clasical")
 
 

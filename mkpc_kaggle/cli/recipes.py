@@ -28,7 +28,8 @@ def run(arguments: argparse.Namespace) -> int:
         print(f"{name}: {recipe.description}")
         for unit in recipe.units:
             extra = "  (extra: for weak pairs, if time is left)" if unit.extra else ""
-            print(f"    {unit.name}  at most {unit.max_matches}{extra}")
+            fallback = f"  (or {unit.fallback}, where its weights are missing)" if unit.fallback else ""
+            print(f"    {unit.name}  at most {unit.max_matches}{extra}{fallback}")
         for one in unusable(recipe.matcher_names):
             print(f"    {one}")
         missing = [slot for slot in slots_of_recipe(recipe) if store.find(slot) is None]

@@ -35,9 +35,9 @@ class Licence(StrEnum):
 class Assembly:
     """All that a worker needs to build its pipeline.
 
-    ``left_out`` are the units of recipe ``auto`` that cannot run here, or not with these weights; ``matchers`` are
-    ready ones of the user's own. ``device`` is what the user asked for, be it here or elsewhere;
-    ``sharing``: how many workers there are on the placement's device.
+    ``left_out`` are the units of recipe ``auto`` that cannot run here, or not with these weights, and those of any
+    recipe that a fallback replaces; ``matchers`` are ready ones of the user's own. ``device`` is what the user
+    asked for, be it here or elsewhere; ``sharing``: how many workers there are on the placement's device.
     """
 
     recipe: Recipe
@@ -130,12 +130,14 @@ def assemble(
     """Everything checked before any work: recipe, options, licences, weights and their digests, device, precision.
 
     Recipe ``auto`` drops the units whose matcher cannot be imported here, with a warning, and those whose weights
-    are missing or not permitted; for any other recipe these raise :class:`UserError`, as do unknown names and
-    damaged files. ``scenes`` switches the reconstruction of batches on or off; ``None``: as the recipe has it.
+    are missing or not permitted; of any other recipe such units take their fallback, and without one raise
+    :class:`UserError`, as do unknown names and damaged files. ``scenes`` switches the reconstruction of batches on
+    or off; ``None``: as the recipe has it.
     """
     own = matchers or {}
     store = WeightStore(weights)
-    whole = load_recipe(recipe) if isinstance(recipe, str) else recipe
+    written = load_recipe(recipe) if isinstance(recipe, str) else recipe
+    whole = with_fallbacks(written, store, licence, own)
     broken = unusable(not_own(whole.matcher_names, own)) if recipe == AUTO else ()
     for one in broken:
         warn_once(f"recipe auto does without it: {one}")
@@ -158,8 +160,25 @@ def assemble(
         )
     lacking = {n for n in not_own(wanted.matcher_names, own) if not set(missing).isdisjoint(slots_of(wanted, [n]))}
     chosen = wanted.only(lambda unit: unit.matcher not in lacking | refused.keys()).with_scenes(scenes)
-    left_out = tuple(unit for unit in whole.units if unit not in chosen.units)
+    left_out = tuple(unit for unit in written.units if replace(unit, fallback="") not in chosen.units)
     return Assembly(chosen.in_mode(mode), store, resolve_placement(device, precision), left_out, own, device)
+
+
+def with_fallbacks(
+    recipe: Recipe, store: WeightStore, licence: Licence, own: Mapping[str, Matcher[Any]]
+) -> Recipe:
+    """The recipe with its fallbacks for matchers that cannot run here, or not with weights there and permitted."""
+    fallbacks = {unit.matcher: unit.fallback for unit in recipe.units if unit.fallback}
+    for name in not_own(fallbacks.values(), own):
+        options_of(recipe, name)  # an unknown one is an error even where it is not needed
+    unfit = {
+        name
+        for name in not_own(fallbacks, own)
+        if unusable([name])
+        or None in map(store.find, slots_of(recipe, [name]))
+        or (licence is Licence.PERMISSIVE and licences_of(recipe, name, store, own) - PERMISSIVE_TAGS)
+    }
+    return recipe.decided(unfit)
 
 
 def missing_slots(recipe: Recipe, store: WeightStore, own: Container[str] = ()) -> list[str]:
