@@ -4,12 +4,15 @@ import contextlib
 import operator
 import os
 import pickle
+import pickletools
 import sys
 import types
+import warnings
 import zipfile
 from argparse import Namespace
 from collections import Counter, OrderedDict
 from collections.abc import Callable, Iterator
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -82,7 +85,7 @@ def test_a_checkpoint_without_a_table_of_tensors_is_refused(tmp_path: Path, valu
 @pytest.mark.parametrize("save", [save_zip, save_legacy])
 def test_what_is_no_tensor_with_a_name_is_named(tmp_path: Path, save: Save) -> None:
     save({"a": torch.zeros(1), "epoch": 3, 7: torch.zeros(1)}, tmp_path / "x.pt")
-    with pytest.raises(UserError, match=r"not all of its entries are tensors with a name: epoch, 7\."):
+    with pytest.raises(UserError, match=r"not all of its entries are plain tensors with a name: epoch, 7\."):
         load_tensors(tmp_path / "x.pt")
 
 
@@ -168,7 +171,7 @@ def test_unknown_objects_among_the_tensors_are_named(tmp_path: Path, framework: 
     state = {"a": torch.zeros(1), "odd": framework.Slotted()}
     torch.save(training_checkpoint(framework, state), tmp_path / "x.ckpt")
     sys.modules.pop("training_framework")
-    with pytest.raises(UserError, match=r"x\.ckpt .* tensors with a name: odd\."):
+    with pytest.raises(UserError, match=r"x\.ckpt .* plain tensors with a name: odd\."):
         load_tensors(tmp_path / "x.ckpt")
 
 
@@ -329,6 +332,83 @@ def test_compressed_records_are_refused(tmp_path: Path) -> None:
     path = with_pickle(tmp_path / "x.pt", tensor_pickle(6, 2, 3, 1), zipfile.ZIP_DEFLATED)
     with pytest.raises(UserError, match=r"x\.pt cannot be read .* record [\w.]+ is compressed"):
         load_tensors(path)
+
+
+def legacy_with_pickle(path: Path, data: bytes) -> Path:
+    """The same in the format before zip archives: the fourth of its pickles is the table."""
+    whole = BytesIO()
+    torch.save(TENSORS, whole, _use_new_zipfile_serialization=False)
+    whole.seek(0)
+    ends = []
+    for _ in range(4):
+        list(pickletools.genops(whole))
+        ends.append(whole.tell())
+    path.write_bytes(whole.getvalue()[: ends[2]] + data + whole.getvalue()[ends[3] :])
+    return path
+
+
+TOO_LARGE = {
+    "a deep tuple as a key": b"\x80\x02})" + b"\x85" * 1_000_000 + b"K\x01s.",
+    "a tuple of pairs of pairs as a key": b"\x80\x02})" + b"q\x01h\x01\x86" * 40 + b"K\x01s.",
+    "a bytearray of 6 GB": b"\x80\x02cbuiltins\nbytearray\n\x8a\x08"
+    + (6 * 10**9).to_bytes(8, "little")
+    + b"\x85R.",
+    "many sets": b"\x80\x02(" + b"\x8f" * 2_000_000 + b"t.",
+    "a string that is not there": b"\x80\x02}X\xff\xff\xff\xffa.",
+}
+
+
+@pytest.mark.parametrize("write", [with_pickle, legacy_with_pickle])
+@pytest.mark.parametrize("data", TOO_LARGE)
+def test_a_pickle_of_too_large_objects_is_refused(
+    tmp_path: Path, data: str, write: Callable[[Path, bytes], Path]
+) -> None:
+    with pytest.raises(UserError, match=r"x\.pt cannot be read as a checkpoint"):
+        load_tensors(write(tmp_path / "x.pt", TOO_LARGE[data]))
+
+
+def test_records_that_overlap_are_refused(tmp_path: Path) -> None:
+    path = with_pickle(tmp_path / "x.pt", tensor_pickle(6, 2, 3, 1))
+    with zipfile.ZipFile(path, "a") as archive:
+        same = next(one for one in archive.infolist() if one.filename.endswith("/data/0"))
+        archive.writestr("x/big", bytes(20_000))
+        big = archive.getinfo("x/big")
+        same.header_offset, same.file_size, same.compress_size = big.header_offset, 20_000, 20_000
+        same.CRC = big.CRC
+    with pytest.raises(UserError, match="its records overlap"):
+        load_tensors(path)
+
+
+def odd_tensors() -> dict[str, torch.Tensor]:
+    ones = torch.ones(2, 3)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # prototypes, says torch
+        return {
+            "sparse": ones.to_sparse(),
+            "compressed sparse": ones.to_sparse_csr(),
+            "on no device": ones.to("meta"),
+            "quantised": torch.quantize_per_tensor(ones, 0.1, 0, torch.quint8),
+            "nested": torch.nested.nested_tensor([ones[0], ones[1, :2]]),
+            "one element many times": torch.zeros(1).expand(1_000_000),
+        }
+
+
+@pytest.mark.filterwarnings("ignore:.*quantized storage|.*[Ss]parse|.*nested")
+@pytest.mark.parametrize("save", [save_zip, save_legacy])
+@pytest.mark.parametrize("kind", odd_tensors())
+def test_tensors_that_are_not_plain_are_refused(tmp_path: Path, kind: str, save: Save) -> None:
+    save({"a": torch.ones(1), "odd": odd_tensors()[kind]}, tmp_path / "x.pt")
+    with pytest.raises(UserError, match=r"x\.pt cannot be read as a checkpoint"):
+        load_tensors(tmp_path / "x.pt")
+
+
+def test_tensors_that_share_their_bytes_are_not_many_times_the_file(tmp_path: Path) -> None:
+    base = torch.zeros(10_000)
+    torch.save({str(number): base for number in range(3)}, tmp_path / "x.pt")
+    assert len(load_tensors(tmp_path / "x.pt")) == 3
+    torch.save({str(number): base for number in range(100)}, tmp_path / "x.pt")
+    with pytest.raises(UserError, match="its tensors are larger than the file"):
+        load_tensors(tmp_path / "x.pt")
 
 
 @settings(max_examples=200, deadline=None)

@@ -1,5 +1,6 @@
 """Checkpoints as safetensors."""
 
+import os
 from pathlib import Path
 
 import pytest
@@ -51,11 +52,27 @@ def test_the_line_takes_over_what_the_manifest_knows(tmp_path: Path, monkeypatch
     assert told == [("MIT", "slot", "known.pt"), ("BSD", "other", "x.pt"), ("?", "?", "x.pt")]
 
 
+@pytest.mark.filterwarnings("ignore:ComplexHalf")
 def test_what_cannot_be_converted_is_told(tmp_path: Path) -> None:
     torch.save({"a": torch.zeros(1)}, tmp_path / "x.pt")
     with pytest.raises(UserError, match=r"x\.bin: the name must end in \.safetensors"):
         convert(tmp_path / "x.pt", tmp_path / "x.bin")
     with pytest.raises(UserError, match=r"gone\.pt cannot be read"):
         convert(tmp_path / "gone.pt", tmp_path / "x.safetensors")
+    os.mkfifo(tmp_path / "pipe.pt")
+    with pytest.raises(UserError, match=r"pipe\.pt cannot be read as a checkpoint: no regular file"):
+        convert(tmp_path / "pipe.pt", tmp_path / "x.safetensors")
+    torch.save({"a": torch.zeros(1).to(torch.complex32)}, tmp_path / "odd.pt")
+    with pytest.raises(UserError, match=r"odd\.pt: safetensors has no type for tensors of torch\.complex32"):
+        convert(tmp_path / "odd.pt", tmp_path / "x.safetensors")
     with pytest.raises(UserError, match=r"x\.safetensors cannot be written"):
         convert(tmp_path / "x.pt", tmp_path / "x.pt" / "x.safetensors")
+
+
+def test_a_link_in_the_place_of_the_partial_file_is_not_followed(tmp_path: Path) -> None:
+    torch.save({"a": torch.zeros(1)}, tmp_path / "x.pt")
+    (tmp_path / "other").write_bytes(b"mine")
+    (tmp_path / "x.safetensors.part").symlink_to(tmp_path / "other")
+    convert(tmp_path / "x.pt", tmp_path / "x.safetensors")
+    assert (tmp_path / "other").read_bytes() == b"mine"
+    assert not (tmp_path / "x.safetensors").is_symlink()

@@ -1,7 +1,8 @@
 """Downloads against a local server: whole, broken off, resumed, wrong, impossible."""
 
+import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
@@ -67,22 +68,19 @@ def test_another_call_goes_on_where_the_last_one_gave_up(site: Site, tmp_path: P
     assert f"failed {ATTEMPTS} times" in failed.note
     assert f"{CUT} of {len(BIG)} bytes" in failed.note
     assert (len(site.asked), pauses) == (ATTEMPTS, [1, 2, 4, 8])
-    assert names_in(tmp_path) == ["a.bin.part", "a.bin.part.mark"]
+    assert names_in(tmp_path) == ["a.bin.part"]
     assert get(site, tmp_path).outcome is Outcome.FETCHED
     assert (tmp_path / "a.bin").read_bytes() == BIG
     assert site.sent == len(BIG)
     assert names_in(tmp_path) == ["a.bin"]
 
 
-@pytest.mark.parametrize("digest", [UNVERIFIED, None])
-def test_a_file_that_changed_meanwhile_is_taken_anew(site: Site, tmp_path: Path, digest: str | None) -> None:
-    site.breaks = [CUT] + [0] * (ATTEMPTS - 1)
-    old = bytes(len(BIG))
-    site.data, site.tag = old, '"old"'
-    get(site, tmp_path, line(data=old, size=-1, digest=digest))
-    site.data, site.tag = BIG, '"new"'
-    assert get(site, tmp_path, line(data=BIG, size=-1, digest=digest)).outcome is Outcome.FETCHED
-    assert site.asked[-1] == f"bytes={CUT}-"
+def test_a_part_of_another_version_is_found_out_and_removed(site: Site, tmp_path: Path) -> None:
+    put(tmp_path, "a.bin.part", bytes(CUT))
+    failed = get(site, tmp_path)
+    assert (failed.outcome, site.asked) == (Outcome.FAILED, [f"bytes={CUT}-"])
+    assert names_in(tmp_path) == []
+    assert get(site, tmp_path).outcome is Outcome.FETCHED
     assert (tmp_path / "a.bin").read_bytes() == BIG
 
 
@@ -94,7 +92,7 @@ def test_a_server_that_knows_no_ranges_sends_all_again(site: Site, tmp_path: Pat
 
 
 def test_bytes_that_nobody_can_vouch_for_are_not_gone_on_with(site: Site, tmp_path: Path) -> None:
-    site.tag, site.breaks = "", [CUT]
+    site.breaks = [CUT]
     assert get(site, tmp_path, line(data=BIG, digest=UNVERIFIED)).outcome is Outcome.FETCHED
     assert site.asked == ["", ""]
     assert (tmp_path / "a.bin").read_bytes() == BIG
@@ -198,6 +196,72 @@ def test_an_unverified_file_comes_with_its_digest(site: Site, tmp_path: Path) ->
     fetched = get(site, tmp_path, line(size=-1, digest=UNVERIFIED))
     assert fetched.outcome is Outcome.FETCHED
     assert fetched.note.endswith(digest_of(BIG))
+
+
+# malice
+
+
+@pytest.mark.parametrize(
+    "target",
+    [
+        "http://[bad/a",
+        "http://a..b/x",
+        f"http://{'a' * 64}.org/x",
+        "http://127.0.0.1:99999/",
+        "http://127.0.0.1:port/",
+        "http:///",
+        "http://\u00e9/x",
+    ],
+)
+def test_a_redirection_to_nowhere_is_told(site: Site, tmp_path: Path, target: str) -> None:
+    site.redirect = target
+    failed = get(site, tmp_path)
+    assert (failed.outcome, names_in(tmp_path)) == (Outcome.FAILED, [])
+    assert site.url in failed.note
+
+
+@pytest.mark.parametrize("size", [b"-5", b"zz", b"ffffffffffffffffffffffff", b"", b"1" * 70_000])
+def test_chunks_of_no_size_are_told(site: Site, tmp_path: Path, size: bytes) -> None:
+    site.chunk_size = size
+    assert get(site, tmp_path).outcome is Outcome.FAILED
+
+
+def test_no_more_bytes_are_taken_than_the_manifest_has(site: Site, tmp_path: Path) -> None:
+    site.data, site.length = BIG + bytes(10 * BLOCK), 0
+    failed = get(site, tmp_path)
+    assert failed.outcome is Outcome.FAILED
+    assert f"more than {len(BIG)} bytes came" in failed.note
+    assert sum(path.stat().st_size for path in tmp_path.iterdir()) <= len(BIG)
+
+
+@pytest.mark.parametrize("drip", [b"HTTP/1.1 200 OK\r\nA: ", b"HTTP/1.1 200 OK\r\nContent-Length: 256000\r\n\r\n"])
+def test_a_server_that_sends_a_byte_now_and_then_is_left(
+    site: Site, tmp_path: Path, drip: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(fetch, "TIMEOUT", 0.3)
+    site.drip = drip
+    failed = get(site, tmp_path)
+    assert failed.outcome is Outcome.FAILED
+    assert "bytes came in 0 s" in failed.note
+
+
+@pytest.mark.parametrize("make", [lambda path, to: path.symlink_to(to), lambda path, _: os.mkfifo(path)])
+def test_a_part_that_is_no_file_is_replaced(
+    site: Site, tmp_path: Path, make: Callable[[Path, Path], None]
+) -> None:
+    other = tmp_path / "other"
+    other.write_bytes(b"mine")
+    make(tmp_path / "a.bin.part", other)
+    assert get(site, tmp_path).outcome is Outcome.FETCHED
+    assert (tmp_path / "a.bin").read_bytes() == BIG
+    assert not (tmp_path / "a.bin").is_symlink()
+    assert other.read_bytes() == b"mine"
+
+
+def test_a_mark_of_an_earlier_version_is_not_read(site: Site, tmp_path: Path) -> None:
+    put(tmp_path, "a.bin.part", BIG[:CUT])
+    put(tmp_path, "a.bin.part.mark", b"one\r\nHost: elsewhere")
+    assert get(site, tmp_path).outcome is Outcome.FETCHED
 
 
 def test_a_full_disk_is_told_before_the_download(

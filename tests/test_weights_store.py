@@ -234,28 +234,31 @@ def test_a_manifest_beside_weights_adds_lines_and_overrides_none(
 
 def test_a_truncated_file_is_refused_with_both_sizes(tmp_path: Path) -> None:
     put(tmp_path, data=DATA[:-1])
-    with pytest.raises(UserError, match=r"a\.bin: 20 bytes, the manifest says 21: truncated.*weights fetch slot"):
-        WeightStore([tmp_path], [line()]).find("slot")
+    with pytest.warns(UserWarning, match=r"passed over: .*a\.bin: 20 bytes, the manifest says 21: truncated"):
+        assert WeightStore([tmp_path], [line()]).find("slot") is None
 
 
 def test_other_bytes_of_the_same_size_are_refused_with_both_digests(tmp_path: Path) -> None:
     put(tmp_path, data=OTHER)
-    with pytest.raises(UserError, match=f"a.bin: .*{digest_of(OTHER)}.*{digest_of(DATA)}"):
+    with (
+        pytest.warns(UserWarning, match=f"a.bin: .*{digest_of(OTHER)}.*{digest_of(DATA)}"),
+        pytest.raises(UserError, match="no weights for 'slot'"),
+    ):
         WeightStore([tmp_path], [line()]).load("slot")
 
 
 def test_a_file_of_unknown_size_is_still_held_against_its_digest(tmp_path: Path) -> None:
     file = line(size=-1)
     assert WeightStore([put(tmp_path / "good")], [file]).find("slot") is not None
-    with pytest.raises(UserError, match="digest"):
-        WeightStore([put(tmp_path / "bad", data=OTHER)], [file]).find("slot")
+    with pytest.warns(UserWarning, match="digest"):
+        assert WeightStore([put(tmp_path / "bad", data=OTHER)], [file]).find("slot") is None
 
 
 def test_another_file_of_the_manifest_under_the_wrong_name_is_called_by_its_own(tmp_path: Path) -> None:
     put(tmp_path, "a.bin", OTHER)
     weights = WeightStore([tmp_path], [line("a.bin", digest=UNVERIFIED), line("b.bin", OTHER, slot="other")])
-    with pytest.raises(UserError, match=r"a\.bin: its bytes are those of b\.bin"):
-        weights.find("slot")
+    with pytest.warns(UserWarning, match=r"a\.bin: its bytes are those of b\.bin"):
+        assert weights.find("slot") is None
     assert found_by(weights, "other").name == "a.bin"
 
 
@@ -282,9 +285,9 @@ def test_what_cannot_be_read_is_reported(tmp_path: Path) -> None:
     weights = WeightStore([tmp_path], [line()])
     with (
         pytest.warns(UserWarning, match=r"a\.bin cannot be read"),
-        pytest.raises(UserError, match=r"a\.bin: cannot be read: No such file"),
+        pytest.warns(UserWarning, match=r"passed over: .*a\.bin: cannot be read: No such file"),
     ):
-        weights.find("slot")
+        assert weights.find("slot") is None
 
 
 def test_a_file_that_cannot_be_read_is_passed_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -303,8 +306,19 @@ def test_a_file_that_cannot_be_read_is_passed_over(tmp_path: Path, monkeypatch: 
 
 def test_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "a.bin")
-    with pytest.raises(UserError, match=r"a\.bin: no regular file"):
-        WeightStore([tmp_path], [line()]).find("slot")
+    with pytest.warns(UserWarning, match=r"a\.bin: no regular file"):
+        assert WeightStore([tmp_path], [line()]).find("slot") is None
+
+
+@pytest.mark.parametrize("kind", ["pipe", "garbage", "too large"])
+def test_a_manifest_that_cannot_be_read_is_passed_over(tmp_path: Path, kind: str) -> None:
+    path = put(tmp_path) / "weights_manifest.txt"
+    if kind == "pipe":
+        os.mkfifo(path)
+    else:
+        path.write_bytes(b"no manifest" if kind == "garbage" else b"#" * (1 << 21))
+    with pytest.warns(UserWarning, match=r"passed over: .*weights_manifest\.txt"):
+        assert WeightStore([tmp_path]).files
 
 
 def test_an_unverified_file_warns_when_it_is_loaded_once_in_a_process(tmp_path: Path) -> None:

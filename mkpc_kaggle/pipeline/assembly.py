@@ -130,9 +130,9 @@ def assemble(
     """Everything checked before any work: recipe, options, licences, weights and their digests, device, precision.
 
     Recipe ``auto`` drops the units whose matcher cannot be imported here, with a warning, and those whose weights
-    are missing or not permitted; of any other recipe such units take their fallback, and without one raise
-    :class:`UserError`, as do unknown names and damaged files. ``scenes`` switches the reconstruction of batches on
-    or off; ``None``: as the recipe has it.
+    are missing, damaged or not permitted; of any other recipe such units take their fallback, and without one
+    raise :class:`UserError`, as do unknown names. ``scenes`` switches the reconstruction of batches on or off;
+    ``None``: as the recipe has it.
     """
     own = matchers or {}
     store = WeightStore(weights)
@@ -159,6 +159,8 @@ def assemble(
             "Name their directory with --weights, or use --recipe auto, which does with what there is."
         )
     lacking = {n for n in not_own(wanted.matcher_names, own) if not set(missing).isdisjoint(slots_of(wanted, [n]))}
+    if recipe == AUTO:
+        lacking |= unreadable(wanted, store, not_own(wanted.matcher_names, {*own, *lacking, *refused}))
     chosen = wanted.only(lambda unit: unit.matcher not in lacking | refused.keys()).with_scenes(scenes)
     left_out = tuple(unit for unit in written.units if replace(unit, fallback="") not in chosen.units)
     return Assembly(chosen.in_mode(mode), store, resolve_placement(device, precision), left_out, own, device)
@@ -185,6 +187,20 @@ def missing_slots(recipe: Recipe, store: WeightStore, own: Container[str] = ()) 
     """What the recipe's matchers need of the manifest and the store has not."""
     slots = slots_of(recipe, not_own(recipe.matcher_names, own))
     return [slot for slot in slots if store.find(slot) is None]
+
+
+def unreadable(recipe: Recipe, store: WeightStore, names: Iterable[str]) -> set[str]:
+    """The matchers that cannot load their weights. Only files without a digest to compare with are tried."""
+    bad = set()
+    for name in names:
+        found = [store.find(slot) for slot in slots_of(recipe, [name])]
+        try:
+            if any(file is not None and not file.verified for file in found):
+                load_matcher(name, store, options_of(recipe, name), Placement())
+        except UserError as error:
+            warn_once(f"recipe auto does without {name}: {error}")
+            bad.add(name)
+    return bad
 
 
 def not_own(names: Iterable[str], own: Container[str]) -> list[str]:

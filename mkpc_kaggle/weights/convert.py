@@ -24,9 +24,12 @@ def convert(source: Path, target: Path) -> WeightFile:
     partial = target.with_name(f"{target.name}.part")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
+        partial.unlink(missing_ok=True)  # it may be a link
         # safetensors takes no views and no two tensors that share their bytes.
         save_file({name: tensor.contiguous().clone() for name, tensor in tensors.items()}, partial)
         partial.replace(target)
+    except KeyError as error:
+        raise UserError(f"{source}: safetensors has no type for tensors of {error}") from error
     except (OSError, SafetensorError) as error:
         raise UserError(f"{target} cannot be written: {error}") from error
     return _line(source, target)

@@ -2,16 +2,18 @@
 
 import re
 import shutil
+import stat
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from enum import StrEnum
-from http.client import HTTPException
 from pathlib import Path
-from ssl import SSLError
+from queue import Empty, Queue
+from threading import Thread
 from typing import IO, Any
-from urllib.error import HTTPError, URLError
+from urllib.error import HTTPError
 from urllib.parse import urlsplit
 from urllib.request import (
     HTTPDefaultErrorHandler,
@@ -34,10 +36,13 @@ from mkpc_kaggle.weights.manifest import UNVERIFIED, WeightFile
 ATTEMPTS = 5
 TIMEOUT = 30.0
 """Seconds without a byte."""
+LEAST_SPEED = 10_000.0
+"""Bytes a second, once ``TIMEOUT`` is over; a slower connection counts as broken."""
+LARGEST = 1 << 33
+"""Bytes of a file whose size the manifest does not know."""
 BLOCK = 1 << 20
 WEB_PAGE_HOSTS = ("drive.google.com",)
 """Hosts that answer with a web page instead of the file."""
-CONNECTION_ERRORS = (URLError, ConnectionError, TimeoutError, HTTPException, SSLError)
 TRANSIENT_STATUSES = (408, 425, 429, 500, 502, 503, 504)
 """HTTP status codes after which a retry may succeed."""
 RANGE_NOT_SATISFIABLE = 416
@@ -76,9 +81,10 @@ def choose(alternatives: Sequence[WeightFile], directory: Path) -> WeightFile:
 
 
 def fetch(file: WeightFile, directory: Path, *, wait: Callable[[float], None] = time.sleep) -> Fetched:
-    """Download the file into the directory, which is created. A partial download stays in ``NAME.part``.
+    """Download the file into the directory, which is created.
 
-    ``wait`` is called with the seconds to pause before another attempt.
+    A partial download stays in ``NAME.part``; it is continued if the manifest has a digest, which tells whether
+    the parts are of one file. ``wait`` is called with the seconds to pause before another attempt.
     """
     path = directory / file.name
     if _state(file, directory).usable:
@@ -86,11 +92,13 @@ def fetch(file: WeightFile, directory: Path, *, wait: Callable[[float], None] = 
     url = url_of(file)
     if url is None:
         return Fetched(file, path, Outcome.BY_HAND, f"get it from {file.source} and save it as {path}")
+    part = path.with_name(f"{path.name}.part")
     try:
         directory.mkdir(parents=True, exist_ok=True)
-        part = PartialFile(path, file)
-        _download(url, part, wait)
-        note = part.finish()
+        if not (_size_of(part) and file_digests(part).have(file.digest)):
+            _download(url, part, file, wait)
+        note = _verify(part, file)
+        part.replace(path)
     except UserError as error:
         return Fetched(file, path, Outcome.FAILED, str(error))
     except OSError as error:
@@ -102,65 +110,43 @@ def _state(file: WeightFile, directory: Path) -> State:
     return examine(directory / file.name, file, ()).state
 
 
-class PartialFile:
-    """A partial download, ``NAME.part``, and the HTTP validator (ETag or date) of its version."""
+def _size_of(part: Path) -> int:
+    """Bytes of the partial download; what is no regular file is removed, and no link is followed."""
+    try:
+        status = part.lstat()
+    except FileNotFoundError:
+        return 0
+    if not stat.S_ISREG(status.st_mode):
+        part.unlink()
+        return 0
+    return status.st_size
 
-    def __init__(self, path: Path, file: WeightFile) -> None:
-        self.path = path
-        self.file = file
-        self._data = path.with_name(f"{path.name}.part")
-        self._validator_file = path.with_name(f"{path.name}.part.mark")
-        if 0 <= file.size < self.size:
-            self.remove()
 
-    @property
-    def size(self) -> int:
-        return self._data.stat().st_size if self._data.exists() else 0
-
-    @property
-    def complete(self) -> bool:
-        """All bytes are here, by the size in the manifest."""
-        return self.file.size == self.size
-
-    @property
-    def range_headers(self) -> dict[str, str]:
-        """Headers that ask for the rest; empty where nothing would show that the rest fits."""
-        validator = self._validator_file.read_text(encoding="latin-1") if self._validator_file.exists() else ""
-        if self.size == 0 or not (validator or self.file.digest != UNVERIFIED):
-            return {}
-        return {"Range": f"bytes={self.size}-"} | ({"If-Range": validator} if validator else {})
-
-    def begin(self, validator: str, *, resumed: bool) -> IO[bytes]:
-        """The file to write to, appending if ``resumed``."""
-        self._validator_file.write_text(validator, encoding="latin-1")
-        return self._data.open("ab" if resumed else "wb")
-
-    def remove(self) -> None:
-        self._data.unlink(missing_ok=True)
-        self._validator_file.unlink(missing_ok=True)
-
-    def finish(self) -> str:
-        """Verify the bytes and give the file its name; on a mismatch remove them and raise :class:`UserError`."""
-        digests = file_digests(self._data)
-        file = self.file
-        if 0 <= file.size != digests.size:
-            self.remove()
-            raise UserError(f"{digests.size} bytes came, the manifest says {file.size}; they were removed")
-        if file.digest != UNVERIFIED and not digests.have(file.digest):
-            self.remove()
-            raise UserError(
-                f"what came has the digest {digests.sha256}, the manifest says {file.digest}: not the file that "
-                "the matchers were tested with; it was removed"
-            )
-        self._data.replace(self.path)
-        self.remove()
-        if file.digest == UNVERIFIED:
-            return f"not verified: the manifest has no digest for it; this file's is {digests.sha256}"
+def _verify(part: Path, file: WeightFile) -> str:
+    """What to say of the complete download; where it is another file, remove it and raise :class:`UserError`."""
+    digests = file_digests(part)
+    if file.digest == UNVERIFIED and file.size in (-1, digests.size):
+        return f"not verified: the manifest has no digest for it; this file's is {digests.sha256}"
+    if digests.have(file.digest):
         return ""
+    part.unlink()
+    raise UserError(
+        f"what came has {digests.size} bytes and the digest {digests.sha256}, the manifest says {file.digest}: "
+        "not the file that the matchers were tested with; it was removed"
+    )
 
 
-class _IncompleteError(ConnectionError):
-    """The connection ended before the file did."""
+@dataclass(frozen=True)
+class _Head:
+    """Of a server's answer; ``length`` of the body in bytes, ``None`` where it is not told."""
+
+    status: int
+    content_range: str
+    length: int | None
+
+
+class _BrokenConnectionError(Exception):
+    """Another attempt may succeed."""
 
 
 class _HttpRedirectHandler(HTTPRedirectHandler):
@@ -169,8 +155,9 @@ class _HttpRedirectHandler(HTTPRedirectHandler):
     def redirect_request(
         self, req: Request, fp: IO[bytes], code: int, msg: str, headers: Any, newurl: str
     ) -> Request | None:
-        scheme = urlsplit(newurl).scheme
+        scheme = newurl.partition(":")[0]
         if scheme not in ("http", "https") or (req.type == "https" and scheme == "http"):
+            fp.close()
             raise UserError(f"{req.full_url} redirects to {newurl}, which is not followed")
         return super().redirect_request(req, fp, code, msg, headers, newurl)
 
@@ -191,21 +178,15 @@ def _opener() -> OpenerDirector:
     return opener
 
 
-def _download(url: str, part: PartialFile, wait: Callable[[float], None]) -> None:
+def _download(url: str, part: Path, file: WeightFile, wait: Callable[[float], None]) -> None:
     """Request until the file is complete; raises :class:`UserError` where a retry cannot help or all failed."""
     last_error: Exception | None = None
     for attempt in range(ATTEMPTS):
         if last_error is not None:
             wait(2.0 ** (attempt - 1))
         try:
-            if part.complete or _receive(url, part):
-                return
-        except HTTPError as error:
-            error.close()
-            if error.code not in TRANSIENT_STATUSES:
-                raise UserError(f"{url}: the server says {error.code} {error.reason}") from error
-            last_error = error
-        except CONNECTION_ERRORS as error:
+            return _receive(url, part, file)
+        except _BrokenConnectionError as error:
             last_error = error
     raise UserError(
         f"{url}: the connection failed {ATTEMPTS} times (the last time: {last_error}). What came is kept: "
@@ -213,58 +194,101 @@ def _download(url: str, part: PartialFile, wait: Callable[[float], None]) -> Non
     )
 
 
-def _receive(url: str, part: PartialFile) -> bool:
-    """One request for what is missing; whether the file is now complete. Raises on a broken connection."""
-    request = Request(url, headers={"User-Agent": "mkpc_kaggle", **part.range_headers})
-    try:
-        response = _opener().open(request, timeout=TIMEOUT)
-    except HTTPError as error:
-        if error.code != RANGE_NOT_SATISFIABLE or part.size == 0:
-            raise
-        error.close()
-        if error.headers.get("Content-Range") == f"bytes */{part.size}":
-            return True
-        part.remove()  # these bytes belong to another version
-        return False
-    with response:
-        have = part.size if _is_partial_content(response, part) else 0
-        total = None if response.length is None else have + response.length
-        _check_total(total, have, part)
-        _store(response, part, have, total)
-    if total is not None and part.size != total:
-        raise _IncompleteError(f"it broke off after {part.size} of {total} bytes")
-    return True
+def _receive(url: str, part: Path, file: WeightFile) -> None:
+    """One request for what is missing."""
+    have = _size_of(part)
+    if file.digest == UNVERIFIED or have >= _most_bytes(file):
+        have = 0
+    wanted = {"Range": f"bytes={have}-"} if have else {}
+    answer = _answer(Request(url, headers={"User-Agent": "mkpc_kaggle", **wanted}))
+    with closing(answer):
+        try:
+            head = next(answer)
+        except HTTPError as error:
+            error.close()
+            if error.code == RANGE_NOT_SATISFIABLE and have:
+                part.unlink()  # these bytes belong to another version
+            elif error.code not in TRANSIENT_STATUSES:
+                raise UserError(f"{url}: the server says {error.code} {error.reason}") from error
+            raise _BrokenConnectionError(f"{error.code} {error.reason}") from error
+        assert isinstance(head, _Head)
+        have = have if _is_partial_content(head, part, have) else 0
+        total = None if head.length is None else have + head.length
+        _check_total(total, have, part, file)
+        have = _store(answer, part, have, total, file)
+    if total is not None and have < total:
+        raise _BrokenConnectionError(f"it broke off after {have} of {total} bytes")
 
 
-def _is_partial_content(response: Any, part: PartialFile) -> bool:
+def _answer(request: Request) -> Generator[_Head | bytes, None, None]:
+    """The head of the answer, then its body in blocks.
+
+    They are read in a thread: a server that sends a byte now and then keeps a socket's own timeout from passing.
+    """
+    arrived: Queue[_Head | bytes | Exception] = Queue(maxsize=2)
+
+    def read() -> None:
+        try:
+            with _opener().open(request, timeout=TIMEOUT) as response:
+                arrived.put(_Head(response.status, response.headers.get("Content-Range", ""), response.length))
+                while block := response.read1(BLOCK):
+                    arrived.put(block)
+                arrived.put(b"")
+        except Exception as error:
+            arrived.put(error)
+
+    Thread(target=read, daemon=True).start()
+    begun, size = time.monotonic(), 0
+    while True:
+        last = begun + TIMEOUT + size / LEAST_SPEED
+        try:
+            one = arrived.get(timeout=max(0.0, last - time.monotonic()))
+        except Empty:
+            raise _BrokenConnectionError(f"{size} bytes came in {time.monotonic() - begun:.0f} s") from None
+        if isinstance(one, (HTTPError, UserError)):
+            raise one
+        if isinstance(one, (ValueError, OverflowError)):  # as urllib says of malformed addresses and chunks
+            raise UserError(f"{request.full_url}: the server's answer cannot be read: {one}") from one
+        if isinstance(one, Exception):
+            raise _BrokenConnectionError(f"{one}") from one
+        if one == b"":
+            return
+        size += len(one) if isinstance(one, bytes) else 0
+        yield one
+
+
+def _is_partial_content(head: _Head, part: Path, have: int) -> bool:
     """Whether the server sends the missing range, and not the complete file again."""
-    if response.status != 206:
+    if head.status != 206:
         return False
-    first = re.match(r"bytes (\d+)-", response.headers.get("Content-Range", ""))
-    if first is None or int(first[1]) != part.size:
-        part.remove()
-        raise _IncompleteError("the server sent another part than was asked for")
+    first = re.match(r"bytes (\d+)-", head.content_range)
+    if first is None or int(first[1]) != have:
+        part.unlink(missing_ok=True)
+        raise _BrokenConnectionError("the server sent another part than was asked for")
     return True
 
 
-def _check_total(total: int | None, have: int, part: PartialFile) -> None:
+def _most_bytes(file: WeightFile) -> int:
+    return LARGEST if file.size < 0 else file.size
+
+
+def _check_total(total: int | None, have: int, part: Path, file: WeightFile) -> None:
     if total is None:
         return
-    if 0 <= part.file.size != total:
-        part.remove()
-        raise UserError(f"the server's file has {total} bytes, the manifest says {part.file.size}: another file")
-    free = shutil.disk_usage(part.path.parent).free + part.size - have
+    if 0 <= file.size != total:
+        part.unlink(missing_ok=True)
+        raise UserError(f"the server's file has {total} bytes, the manifest says {file.size}: another file")
+    free = shutil.disk_usage(part.parent).free + _size_of(part) - have
     if total - have > free:
-        raise UserError(f"{total - have} bytes are to come, but {part.path.parent} has only {free} bytes free")
+        raise UserError(f"{total - have} bytes are to come, but {part.parent} has only {free} bytes free")
 
 
-def _store(response: Any, part: PartialFile, have: int, total: int | None) -> None:
-    tag = response.headers.get("ETag", "")
-    validator = response.headers.get("Last-Modified", "") if not tag or tag.startswith("W/") else tag
+def _store(answer: Iterator[Any], part: Path, have: int, total: int | None, file: WeightFile) -> int:
+    """Write the blocks to the file, after the ``have`` bytes there; the size that it has then."""
     with (
-        part.begin(validator, resumed=have > 0) as out,
+        part.open("ab" if have else "wb") as out,
         tqdm(
-            desc=part.file.name,
+            desc=file.name,
             initial=have,
             total=total,
             unit="B",
@@ -273,6 +297,10 @@ def _store(response: Any, part: PartialFile, have: int, total: int | None) -> No
             mininterval=0.1 if sys.stderr.isatty() else 30,  # a log file gets a line for each update
         ) as progress,
     ):
-        while block := response.read(BLOCK):
+        for block in answer:
+            have += len(block)
+            if have > _most_bytes(file):
+                raise UserError(f"more than {_most_bytes(file)} bytes came, the most that {file.name} may have")
             out.write(block)
             progress.update(len(block))
+    return have

@@ -47,6 +47,11 @@ class FoundFile:
     note: str = ""
 
     @property
+    def verified(self) -> bool:
+        """The bytes are those of the manifest."""
+        return self.state in (State.GOOD, State.RENAMED)
+
+    @property
     def is_here(self) -> bool:
         """Whether its path leads to the same bytes on this machine, wherever it was found."""
         try:

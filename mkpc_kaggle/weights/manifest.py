@@ -17,6 +17,8 @@ from pathlib import Path
 from mkpc_kaggle.errors import UserError
 
 MANIFEST = "weights_manifest.txt"
+LARGEST = 1 << 20
+"""Bytes."""
 UNVERIFIED = "unverified"
 DIGEST = re.compile(rf"sha256:[0-9a-f]{{64}}|git-blob:[0-9a-f]{{40}}|{UNVERIFIED}")
 
@@ -52,6 +54,8 @@ def parse_manifest(text: str, where: str = "the weights manifest") -> tuple[Weig
 def read_manifest(path: Path) -> tuple[WeightFile, ...]:
     """A manifest's file; raises :class:`UserError` where it or one of its lines cannot be read."""
     try:
+        if not path.is_file() or path.stat().st_size > LARGEST:
+            raise OSError(f"it is no regular file of at most {LARGEST} bytes")
         return parse_manifest(path.read_text(encoding="utf-8"), str(path))
     except (OSError, UnicodeError) as error:
         raise UserError(f"{path} cannot be read: {error}") from error

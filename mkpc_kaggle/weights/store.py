@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.weights.checkpoint import load_tensors
-from mkpc_kaggle.weights.found import FoundFile, State, examine, examine_unpacked, recognise
+from mkpc_kaggle.weights.found import FoundFile, examine, examine_unpacked, recognise
 from mkpc_kaggle.weights.manifest import MANIFEST, UNVERIFIED, WeightFile, manifest, read_manifest
 from mkpc_kaggle.weights.notices import warn_once
 from mkpc_kaggle.weights.tree import Tree
@@ -54,8 +54,11 @@ class WeightStore:
         lines = {file.name: file for file in manifest()}
         for tree in self._trees:
             for path in tree.named(MANIFEST):
-                for file in read_manifest(path):
-                    lines.setdefault(file.name, file)
+                try:
+                    for file in read_manifest(path):
+                        lines.setdefault(file.name, file)
+                except UserError as error:
+                    warn_once(f"passed over: {error}")
         return tuple(lines.values())
 
     def alternatives(self, slot: str) -> list[WeightFile]:
@@ -68,18 +71,11 @@ class WeightStore:
     def find(self, slot: str) -> FoundFile | None:
         """The slot's file, its bytes checked against the manifest; ``None`` where there is none.
 
-        A file that is not what the manifest says is skipped with a warning; where there is no other,
-        :class:`UserError` is raised.
+        A file that is not what the manifest says is skipped with a warning.
         """
         search = self.search(self.alternatives(slot))
-        refusals = [f"{one.path}: {one.note}" for one in search.refused]
-        if refusals and search.found is None:
-            raise UserError(
-                f"no good file for {slot!r}. Found {'; '.join(refusals)}. Fetch it again "
-                f"(python -m mkpc_kaggle weights fetch {slot} --out DIR, on a machine with internet)."
-            )
-        for refusal in refusals:
-            warn_once(f"passed over: {refusal}")
+        for one in search.refused:
+            warn_once(f"passed over: {one.path}: {one.note}")
         return search.found
 
     def load(self, slot: str) -> "dict[str, torch.Tensor]":
@@ -91,7 +87,7 @@ class WeightStore:
         if found is None:
             names = " or ".join(file.name for file in self.alternatives(slot))
             raise UserError(f"no weights for {slot!r}: {names} not found (searched {self.searched})")
-        if found.state in (State.UNVERIFIED, State.UNPACKED):
+        if not found.verified:
             warn_once(f"{found.path} is not verified: {found.note}")
         return load_tensors(found.path)
 

@@ -8,6 +8,8 @@ import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 
+from mkpc_kaggle.weights.digests import file_digests
+
 
 def is_unpacked(folders: Sequence[str], files: Sequence[str]) -> bool:
     """Whether a directory with these entries has the contents of a torch checkpoint."""
@@ -32,7 +34,7 @@ def digest_of(directory: Path) -> str:
     """``sha256:<hex>`` of all records and their names; it is not the digest of the file that was unpacked."""
     whole = hashlib.sha256()
     for path in _records(directory):
-        record = hashlib.sha256(path.read_bytes()).hexdigest()
+        record = file_digests(path).sha256.removeprefix("sha256:")
         whole.update(f"{record} {path.relative_to(directory).as_posix()}\n".encode())
     return f"sha256:{whole.hexdigest()}"
 

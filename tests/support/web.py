@@ -2,8 +2,9 @@
 
 import re
 import threading
+import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
@@ -21,10 +22,14 @@ class Site:
     statuses: list[int] = field(default_factory=list)
     """errors that the first requests get"""
     length: int | None = None
-    """a Content-Length that is not true"""
+    """a Content-Length that is not true; 0: none is sent"""
     shift: int = 0
     """begins the part that was asked for so many bytes later"""
     redirect: str = ""
+    chunk_size: bytes | None = None
+    """send the file as one chunk of this size"""
+    drip: bytes = b""
+    """send this, and then a byte now and then until the connection is closed"""
     asked: list[str] = field(default_factory=list)
     sent: int = 0
     """bytes of bodies"""
@@ -37,14 +42,24 @@ class _Handler(BaseHTTPRequestHandler):
     def do_GET(self) -> None:
         site = self.site
         site.asked.append(self.headers.get("Range", ""))
-        if site.redirect:
-            self.send_response(302)
-            self.send_header("Location", site.redirect)
-            self.end_headers()
+        if site.drip:
+            self._drip(site.drip)
+        elif site.chunk_size is not None:
+            self.wfile.write(b"HTTP/1.1 200 OK\r\nTransfer-Encoding: chunked\r\n\r\n" + site.chunk_size + b"\r\n")
+            self.wfile.write(site.data)
+        elif site.redirect:
+            self.wfile.write(b"HTTP/1.1 302 Found\r\nLocation: " + site.redirect.encode() + b"\r\n\r\n")
         elif site.statuses:
             self.send_error(site.statuses.pop(0))
         else:
             self._send(site, self._start(site))
+
+    def _drip(self, begin: bytes) -> None:
+        self.wfile.write(begin)
+        with suppress(ConnectionError):
+            for _ in range(100):
+                time.sleep(0.02)
+                self.wfile.write(b"x")
 
     def _start(self, site: Site) -> int:
         if not site.ranges or self.headers.get("If-Range", site.tag) != site.tag:
@@ -65,10 +80,12 @@ class _Handler(BaseHTTPRequestHandler):
             self.send_header("Content-Range", f"bytes {start}-{len(site.data) - 1}/{len(site.data)}")
         if site.tag:
             self.send_header("ETag", site.tag)
-        self.send_header("Content-Length", str(site.length or len(body)))
+        if site.length != 0:
+            self.send_header("Content-Length", str(site.length or len(body)))
         self.end_headers()
         body = body[: site.breaks.pop(0)] if site.breaks else body
-        self.wfile.write(body)
+        with suppress(ConnectionError):
+            self.wfile.write(body)
         site.sent += len(body)
 
     def log_message(self, *_: object) -> None:
