@@ -7,10 +7,14 @@ import pytest
 import torch
 from shared import WEIGHTS, needs_weights
 from web import Site, serve
-from weight_files import DATA, OTHER, line, put, search_nowhere_else
+from weight_files import DATA, OTHER, digest_of, line, put, search_nowhere_else
 
 from mkpc_kaggle.cli import main
+from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.pipeline.uses import files_of
 from mkpc_kaggle.weights import UNVERIFIED, WeightFile, manifest, store
+from mkpc_kaggle.weights.fetch import url_of
+from mkpc_kaggle.weights.manifest import pin
 
 FILES = (
     line("sift.pt", slot="sift"),
@@ -119,7 +123,86 @@ def test_fetch_takes_files_slots_and_recipes(
     again = capsys.readouterr().out
     assert f"a.pt: by hand: get it from by hand and save it as {tmp_path / 'out' / 'a.pt'}" in again
     assert "sift.pt: already there\n" in again
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["b.pt", "sift.pt"]
+    there = ["b.pt", "sift.pt", "weights_manifest.txt"]
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == there
+
+
+def test_the_first_download_of_a_file_without_a_digest_is_the_one_that_is_accepted_from_then_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("no_proxy", "127.0.0.1")
+    out = tmp_path / "out"
+    fetch = ["weights", "fetch", "b.pt", "--out", str(out)]
+    with serve(Site(DATA)) as site:
+        monkeypatch.setattr(store, "manifest", lambda: (replace(FILES[2], licence="own", source=site.url),))
+        assert main(fetch) == 0
+        (pinned,) = store.WeightStore([out]).files
+        assert (pinned.size, pinned.digest, pinned.licence) == (len(DATA), digest_of(DATA), "own")
+        (out / "b.pt").unlink()
+        assert main(fetch) == 0
+        (out / "b.pt").unlink()
+        site.data = OTHER
+        capsys.readouterr()
+        assert main(fetch) == 1
+    assert (
+        f"what came has the digest {digest_of(OTHER)}, the manifest says {digest_of(DATA)}"
+        in capsys.readouterr().out
+    )
+    assert not (out / "b.pt").exists()
+    (out / "b.pt").write_bytes(OTHER)
+    with pytest.raises(UserError, match="no good file for 'aliked-n16'"):
+        store.WeightStore([out]).find("aliked-n16")
+
+
+def test_a_manifest_beside_the_weights_does_not_change_what_the_packages_says(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(store, "manifest", lambda: FILES)
+    put(tmp_path, "a.pt", DATA)
+    pin(replace(FILES[1], licence="anything"), tmp_path / "a.pt")
+    assert store.WeightStore([tmp_path]).files == FILES
+
+
+# the files of the matchers of today
+
+TODAY = {
+    *("roma_outdoor.pth", "roma_indoor.pth", "dinov2_vitl14_pretrain.pth"),
+    *("loma_B128.pth", "loma_B.pt", "loma_R.pth", "loma_L.pth", "loma_G.pth"),
+    *("aliked-n16.pth", "aliked_lightglue.pth", "depth-save.pth", "disk_lightglue.pth"),
+}
+
+
+@pytest.mark.parametrize("name", sorted(TODAY))
+def test_a_file_of_the_real_manifest_is_fetched_by_its_name(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """From a server in the place of the real one: what it sends is refused where size and digest are known."""
+    monkeypatch.setenv("no_proxy", "127.0.0.1")
+    (file,) = (file for file in manifest() if file.name == name)
+    assert url_of(file) == file.source
+    with serve(Site(DATA)) as site:
+        monkeypatch.setattr(store, "manifest", lambda: (replace(file, source=site.url),))
+        status = main(["weights", "fetch", name, "--out", str(tmp_path / "out")])
+    out = capsys.readouterr().out
+    assert f"{name}: licence {file.licence}" in out
+    if file.digest == UNVERIFIED and file.size < 0:
+        assert status == 0
+        assert (tmp_path / "out" / name).read_bytes() == DATA
+        return
+    assert status == 1
+    assert "the manifest says" in out
+    assert not (tmp_path / "out" / name).exists()
+
+
+def test_recipes_of_today_name_these_files(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(store, "manifest", manifest)
+    wanted = {
+        file.name
+        for recipe in ("best", "permissive", "light", "auto")
+        for lines in files_of(recipe, store.WeightStore())
+        for file in lines
+    }
+    assert TODAY - wanted == {"roma_indoor.pth", "loma_R.pth", "loma_G.pth"}
 
 
 def test_convert_prints_the_line_for_the_manifest(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

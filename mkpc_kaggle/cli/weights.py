@@ -25,7 +25,8 @@ Compare every file found with the manifest: truncated ones, other files under th
 name (which do as well), and files that the manifest has no digest for."""
 _LOCATE = "Print the path of the file that would be taken; exit status 1 where there is none."
 _FETCH = """\
-Download files: interrupted downloads are resumed, and a file gets its name when its digest is right. Each
+Download files: interrupted downloads are resumed, and a file gets its name when its digest is right. Where none is
+published, the first download's is kept in DIR/weights_manifest.txt, and the file must have it from then on. Each
 licence is printed first; check it."""
 _CONVERT = "Write a checkpoint's tensors as safetensors with the same names; print the manifest's line for it."
 
@@ -140,14 +141,17 @@ def _fetch(arguments: argparse.Namespace) -> int:
     from mkpc_kaggle.pipeline.uses import files_of
     from mkpc_kaggle.weights import WeightStore
     from mkpc_kaggle.weights.fetch import Outcome, choose, fetch
+    from mkpc_kaggle.weights.manifest import UNVERIFIED, pin
 
-    store = WeightStore()
+    store = WeightStore([arguments.out] if arguments.out.is_dir() else [])
     wanted = [lines for name in arguments.names for lines in files_of(name, store)]
     outcomes = []
     for file in dict.fromkeys(choose(lines, arguments.out) for lines in wanted):
         print(f"{file.name}: licence {file.licence}, from {file.source}", flush=True)
         fetched = fetch(file, arguments.out)
         print(f"{file.name}: {fetched.outcome}{fetched.note and ': '}{fetched.note}")
+        if fetched.outcome is Outcome.FETCHED and file.digest == UNVERIFIED:
+            pin(file, fetched.path)
         outcomes.append(fetched.outcome)
     return 1 if {Outcome.FAILED, Outcome.BY_HAND} & set(outcomes) else 0
 

@@ -10,11 +10,12 @@ the first that is found is taken.
 """
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
 from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.weights.digests import file_digests
 
 MANIFEST = "weights_manifest.txt"
 LARGEST = 1 << 20
@@ -59,6 +60,18 @@ def read_manifest(path: Path) -> tuple[WeightFile, ...]:
         return parse_manifest(path.read_text(encoding="utf-8"), str(path))
     except (OSError, UnicodeError) as error:
         raise UserError(f"{path} cannot be read: {error}") from error
+
+
+def pin(file: WeightFile, path: Path) -> WeightFile:
+    """The line with the size and digest of what lies at ``path``, also added to the manifest in its directory."""
+    digests = file_digests(path)
+    pinned = replace(file, size=digests.size, digest=digests.sha256)
+    own = path.with_name(MANIFEST)
+    former = own.read_text(encoding="utf-8") if own.is_file() else ""
+    part = own.with_name(f"{MANIFEST}.part")
+    part.write_text(f"{former}{pinned.line}\n", encoding="utf-8")
+    part.replace(own)
+    return pinned
 
 
 def _parse_line(columns: list[str], where: str) -> WeightFile:

@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -48,17 +48,24 @@ class WeightStore:
 
     @cached_property
     def files(self) -> tuple[WeightFile, ...]:
-        """The lines to compare with, one for each name; the package's manifest comes first."""
+        """The lines to compare with, one for each name; the package's manifest comes first.
+
+        Where it has no digest, one of a manifest in the search directories counts: what was first fetched there.
+        """
         if self._given_files is not None:
             return self._given_files
         lines = {file.name: file for file in manifest()}
         for tree in self._trees:
             for path in tree.named(MANIFEST):
                 try:
-                    for file in read_manifest(path):
-                        lines.setdefault(file.name, file)
+                    here = read_manifest(path)
                 except UserError as error:
                     warn_once(f"passed over: {error}")
+                    continue
+                for file in here:
+                    known = lines.setdefault(file.name, file)
+                    if known.digest == UNVERIFIED:
+                        lines[file.name] = replace(known, size=file.size, digest=file.digest)
         return tuple(lines.values())
 
     def alternatives(self, slot: str) -> list[WeightFile]:
