@@ -1,10 +1,10 @@
 """Time, work and memory of every network beside kornia's LoFTR at 640 x 480, in one process, alternating.
 
-python -m benchmarks.matchers [--rounds 5] [--precision bfloat16] [--only loftr,dkm]
+python -m benchmarks.matchers [--rounds 5] [--precision bfloat16] [--only LoFTR,DKM]
 
-Weights are the tests' stand-ins, the pictures a photograph and its shifted copy. The work is counted by PyTorch
-(matrix products and convolutions); the peak is what a large convolution reaches in the same process. The memory
-is the largest of a process that does nothing else, Python and PyTorch included.
+Weights are the tests' stand-ins, or random ones; the pictures a photograph and its shifted copy. The work is
+counted by PyTorch (matrix products and convolutions); the peak is the most that a large convolution reaches in any
+of the rounds. The memory is the largest of a process that does nothing else, Python and PyTorch included.
 """
 
 import argparse
@@ -25,10 +25,12 @@ from sklearn.datasets import load_sample_images
 from torch import Tensor
 from torch.nn import functional
 from torch.utils.flop_counter import FlopCounterMode
+from tqdm import tqdm
 
 from mkpc_kaggle.geometry.coordinates import Box, Size, View
 from mkpc_kaggle.matchers.contract import Picture, Placement, Precision
 from mkpc_kaggle.matchers.loma import Encoded, LomaAdapter, LomaOptions
+from mkpc_kaggle.matchers.networks.aliked import Aliked, own_name
 from mkpc_kaggle.matchers.networks.aspanformer import AspanFormer
 from mkpc_kaggle.matchers.networks.dense_sampling import SamplingConfig, sample
 from mkpc_kaggle.matchers.networks.dkm import DKM
@@ -48,6 +50,7 @@ Run = Callable[[], int]
 
 VGA, DKM_SIZE = Size(640, 480), Size(720, 540)
 ROMA_SIZES = Size(560, 560), Size(864, 864)
+ALIKED_SIZE = Size(1024, 768)
 YARDSTICK = "kornia LoFTR"
 GIGA = 1e9
 
@@ -116,7 +119,7 @@ def dkm(precision: Precision) -> Run:
 
 
 def with_random_weights(make: Callable[[], Network], precision: Precision) -> Network:
-    """With weights that keep activations of order 1, for networks whose stand-ins take much time and memory."""
+    """With weights that keep activations of order 1: stand-ins of such large networks take minutes."""
     with torch.device("meta"):
         network = make()
     network.to_empty(device="cpu")
@@ -129,14 +132,23 @@ def with_random_weights(make: Callable[[], Network], precision: Precision) -> Ne
     return placed(network, Placement(precision=precision))
 
 
+@cache
+def roma_network(precision: Precision) -> RoMa:
+    return with_random_weights(RoMa, precision)
+
+
+def roma_images(passes: int = 2) -> list[list[Tensor]]:
+    """Of two pictures, versions for each pass."""
+    pictures = [torch.from_numpy(view).permute(2, 0, 1)[None] for view in photographs(ROMA_SIZES[-1])]
+    return [[network_input(picture, size) for size in ROMA_SIZES[:passes]] for picture in pictures]
+
+
 def roma(passes: int, cached: bool, precision: Precision) -> Run:
     """At the published sizes, both ways, with the encodings' time or without."""
-    network = with_random_weights(RoMa, precision)
-    pictures = [torch.from_numpy(view).permute(2, 0, 1)[None] for view in photographs(ROMA_SIZES[-1])]
+    network = roma_network(precision)
 
     def encoded() -> list[RomaFeatures]:
-        inputs = ([network_input(picture, size) for size in ROMA_SIZES[:passes]] for picture in pictures)
-        return [network.encode(*images) for images in inputs]
+        return [network.encode(*images) for images in roma_images(passes)]
 
     given = encoded() if cached else None
 
@@ -149,9 +161,37 @@ def roma(passes: int, cached: bool, precision: Precision) -> Run:
     return run
 
 
+def roma_encoder(part: str, precision: Precision) -> Run:
+    """One of the two networks that look at an image, at the size at which it takes most."""
+    network = roma_network(precision)
+    coarse, fine = roma_images()[0]
+    return {
+        "dinov2": lambda: network.dinov2(coarse).shape[1],
+        "vgg": lambda: len(network.encoder(fine)),
+    }[part]
+
+
+def roma_decoder(part: str, precision: Precision) -> Run:
+    """One direction of what looks at a pair: the coarse estimate, or the second pass's refiners."""
+    network = roma_network(precision)
+    query, support = (network.encode(*images) for images in roma_images())
+    estimate = network.decoder.coarse_estimate(query, support)
+    assert query.fine is not None
+    assert support.fine is not None
+    fine0, fine1 = query.fine, support.fine
+    return {
+        "coarse": lambda: network.decoder.coarse_estimate(query, support).flow.shape[1],
+        "refiners": lambda: network.decoder.refine(estimate, fine0, fine1).flow.shape[1],
+    }[part]
+
+
+@cache
+def loma_network(variant: Variant, precision: Precision) -> Loma:
+    return with_random_weights(partial(Loma, variant), precision)
+
+
 def loma(variant: Variant, number: int, precision: Precision) -> LomaAdapter:
-    network = with_random_weights(partial(Loma, variant), precision)
-    return LomaAdapter(network, LomaOptions(variant, max_keypoints=number), "cpu")
+    return LomaAdapter(loma_network(variant, precision), LomaOptions(variant, max_keypoints=number), "cpu")
 
 
 def loma_encode(variant: Variant, long_side: int, number: int, precision: Precision) -> Run:
@@ -168,6 +208,21 @@ def loma_match(variant: Variant, number: int, precision: Precision) -> Run:
     descriptors = torch.randn(1, number, WIDTHS[variant].descriptor, generator=generator)
     encoded = Encoded(LomaKeypoints(points, descriptors), VGA)
     return lambda: len(matcher.match([encoded], [encoded])[0])
+
+
+def aliked(kornias: bool, precision: Precision) -> Run:
+    """n16; kornia's always in float32, with the same weights."""
+    from kornia.feature import ALIKED
+
+    theirs = filled(ALIKED("aliked-n16", max_num_keypoints=2048, detection_threshold=0.0).eval(), "aliked")
+    image = torch.from_numpy(photographs(ALIKED_SIZE)[0]).permute(2, 0, 1)[None].float() / 255
+    if kornias:
+        return lambda: int(theirs(image)[0].n)
+    ours = Aliked(max_keypoints=2048)
+    tensors = {own_name(name): tensor for name, tensor in theirs.state_dict().items()}
+    ours.load_state_dict({name: tensor for name, tensor in tensors.items() if name in ours.state_dict()})
+    network = placed(ours, Placement(precision=precision))
+    return lambda: len(network(image)[0].points)
 
 
 CASES: dict[str, Callable[[Precision], Run]] = {
@@ -188,7 +243,17 @@ CASES: dict[str, Callable[[Precision], Run]] = {
     "LoMa-B encode 1024": partial(loma_encode, Variant.B, 1024, 2048),
     "LoMa-B128 match 2048": partial(loma_match, Variant.B128, 2048),
     "LoMa-B128 match 1024": partial(loma_match, Variant.B128, 1024),
+    "LoMa-B match 2048": partial(loma_match, Variant.B, 2048),
+    "kornia ALIKED n16 1024": partial(aliked, True),
+    "ALIKED n16 1024": partial(aliked, False),
 }
+PARTS: dict[str, Callable[[Precision], Run]] = {
+    "RoMa, DINOv2 560": partial(roma_encoder, "dinov2"),
+    "RoMa, VGG 864": partial(roma_encoder, "vgg"),
+    "RoMa, coarse estimate 560": partial(roma_decoder, "coarse"),
+    "RoMa, refiners 864": partial(roma_decoder, "refiners"),
+}
+"""Of a case each: their memory is not told."""
 LARGE = Size(1600, 1216)
 LARGE_CASES = {
     f"{label}, {LARGE.width} x {LARGE.height}": semi_dense(make, name, LARGE)
@@ -239,7 +304,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--precision", choices=list(Precision), default=Precision.FLOAT32)
-    parser.add_argument("--only", default=",".join(CASES), help="parts of names of cases")
+    parser.add_argument(
+        "--only", default=",".join(CASES), metavar="PARTS", help="cases with one of these in their names"
+    )
     parser.add_argument("--large", action="store_true", help=f"also the memory at {LARGE.width} x {LARGE.height}")
     parser.add_argument("--memory-of", metavar="CASE", help="run this case once and print the process's peak")
     arguments = parser.parse_args()
@@ -248,14 +315,17 @@ def main() -> None:
         (CASES | LARGE_CASES)[arguments.memory_of](precision)()
         print(high_water())
         return
-    chosen = [case for case in CASES if any(part in case for part in arguments.only.split(",") if part)]
-    runs = {case: CASES[case](precision) for case in dict.fromkeys([YARDSTICK, *chosen])}
+    every = CASES | PARTS
+    chosen = [case for case in every if any(part in case for part in arguments.only.split(",") if part)]
+    runs = {case: every[case](precision) for case in dict.fromkeys([YARDSTICK, *chosen])}
     found, work = {case: run() for case, run in runs.items()}, {case: work_of(run) for case, run in runs.items()}
     times: dict[str, list[float]] = {case: [] for case in runs}
-    for _ in range(arguments.rounds):
+    peaks = []
+    for _ in tqdm(range(arguments.rounds), desc="rounds"):
+        peaks.append(peak(getattr(torch, precision)))
         for case, run in runs.items():
             times[case].append(seconds_of(run))
-    report(found, work, times, peak(getattr(torch, precision)), precision)
+    report(found, work, times, max(peaks), precision)
     for case in LARGE_CASES if arguments.large else ():
         print(f"{case}: {peak_memory(case, precision) / GIGA:.2f} GB")
 
@@ -270,10 +340,11 @@ def report(
     yardstick = statistics.median(times[YARDSTICK])
     for case, seconds in times.items():
         median = statistics.median(seconds)
+        memory = f"{peak_memory(case, precision) / GIGA:.2f} GB" if case in CASES else ""
         print(
             f"| {case} | {found[case]} | {median:.3f} | {median / yardstick:.2f} | {work[case] / GIGA:.0f} "
-            f"| {work[case] / median / GIGA:.0f} | {work[case] / median / most:.0%} "
-            f"| {peak_memory(case, precision) / GIGA:.2f} GB |"
+            f"| {work[case] / median / GIGA:.0f} | {work[case] / median / most:.0%} | {memory} |",
+            flush=True,
         )
 
 

@@ -3,6 +3,7 @@
 ``python tests/test_parity_loma.py`` prints how far each stage is off.
 """
 
+import json
 import re
 import sys
 from functools import cache, partial
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 from dense import batch_of, resized_by_pil
-from golden import Stage, assert_stages, golden_arrays, needs_golden, print_table, standin_state
+from golden import GOLDEN, Stage, assert_stages, golden_arrays, needs_golden, print_table, standin_state
 from loma_values import descriptor_values, detector_values, keypoints_of, matcher_values
 from semi_dense import tolerance_of
 
@@ -284,6 +285,19 @@ def test_every_stage_is_the_golden_one(case):
 @torch.inference_mode()
 def test_every_stage_is_the_golden_one_at_the_published_settings(case):
     assert_stages(SLOW[case]())
+
+
+@needs_golden
+@pytest.mark.parametrize("variant", Variant)
+def test_the_published_files_have_the_networks_parameters_and_what_training_alone_used(variant):
+    shapes = json.loads((GOLDEN / "loma" / "shapes.json").read_text())
+    name = variant.upper()
+    published = shapes["B128"] if name == "B128" else shapes["B"] | shapes.get(name, {})
+    used = {parameter_name(name): shape for name, shape in published.items()}
+    used = {name: shape for name, shape in used.items() if not re.match(UNUSED, name)}
+    with torch.device("meta"):
+        network = Loma(variant)
+    assert {name: list(tensor.shape) for name, tensor in network.state_dict().items()} == used
 
 
 if __name__ == "__main__":

@@ -217,5 +217,14 @@ def test_every_stage_is_the_golden_one(case):
     assert_stages(CASES[case]())
 
 
+@needs_golden
+def test_the_published_files_have_the_networks_parameters_and_no_others():
+    shapes = json.loads((GOLDEN / "roma" / "shapes.json").read_text())
+    published = {f"dinov2.{name}": shape for name, shape in shapes["dinov2"].items()} | shapes["roma"]
+    with torch.device("meta"):
+        network = RoMa()
+    assert {name: list(tensor.shape) for name, tensor in network.state_dict().items()} == published
+
+
 if __name__ == "__main__":
     print_table("roma", [(case, stages()) for case, stages in CASES.items()])

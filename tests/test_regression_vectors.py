@@ -1,32 +1,20 @@
-"""The paper's networks stage by stage against vectors of our own, ``data/NAME.npz``: they need no golden files.
+"""The paper's networks stage by stage against vectors of our own, which need no golden files: see ``vectors``."""
 
-Networks have the weights of ``standin.py`` and see its pictures, so nothing but the code decides the numbers.
-``python tests/test_regression_vectors.py --write`` writes the vectors anew. That is right only when a change is
-wanted, and only while the parity tests pass: it is they that say what the numbers should be.
-"""
-
-import sys
-from dataclasses import replace
 from functools import cache, partial
-from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import pytest
-import roma_values
 import torch
-from dense import batch_of, computed
-from golden import Stage, assert_stages, print_table
-from loma_values import descriptor_values, detector_values, matcher_values
+from dense import computed
+from golden import assert_stages
 from semi_dense import traced
 from standin import filled, scene, uniform
 from torch.nn import functional
+from vectors import Found, main, shifted_inputs, stages_of
 
 from mkpc_kaggle.geometry.coordinates import Size
-from mkpc_kaggle.matchers.contract import Placement
 from mkpc_kaggle.matchers.networks.aspanformer import AspanFormer, AspanFormerConfig
 from mkpc_kaggle.matchers.networks.assignment import mutual_matches
-from mkpc_kaggle.matchers.networks.dedode import dedode_g
 from mkpc_kaggle.matchers.networks.dense_sampling import (
     SamplingConfig,
     balancing_weights,
@@ -34,15 +22,9 @@ from mkpc_kaggle.matchers.networks.dense_sampling import (
     draw,
     weights_of,
 )
-from mkpc_kaggle.matchers.networks.dinov2 import DinoV2Config
 from mkpc_kaggle.matchers.networks.dkm import DKM, DkmConfig
 from mkpc_kaggle.matchers.networks.loftr import Loftr, LoftrConfig
-from mkpc_kaggle.matchers.networks.loma import Loma, Variant
-from mkpc_kaggle.matchers.networks.loma_matcher import LomaKeypoints
-from mkpc_kaggle.matchers.networks.pixels import network_input
-from mkpc_kaggle.matchers.networks.placement import placed
 from mkpc_kaggle.matchers.networks.quadtree import Quadtree, QuadtreeConfig
-from mkpc_kaggle.matchers.networks.roma import RoMa
 from mkpc_kaggle.matchers.networks.superglue import (
     ImageKeypoints,
     SuperGlue,
@@ -50,28 +32,6 @@ from mkpc_kaggle.matchers.networks.superglue import (
     log_optimal_transport,
 )
 from mkpc_kaggle.matchers.networks.superpoint import SuperPoint, SuperPointConfig, score_map, suppress_non_maxima
-
-DATA = Path(__file__).with_name("data")
-SAMPLES, STEP = 200, 1_000_003  # a prime, so that samples lie in all channels, rows and columns
-TOLERANCE = 1e-3  # of a stage's largest value; on the slowest and fastest code paths it takes a tenth of it
-EDGES = 3e-3  # for DKM and RoMa: refiners see a picture's edges where the flow points, which magnifies rounding
-LEEWAY = 20  # of so many keypoints or matches one may be another: a threshold or a tie within rounding
-
-
-class Found(NamedTuple):
-    """M keypoints or matches: what tells them apart, whole numbers (M, K), and what is said of each, (M, V)."""
-
-    rows: torch.Tensor
-    values: torch.Tensor
-
-
-def sampled(values):
-    """Some of the numbers of a tensor, then their mean and root mean square over all of it."""
-    flat = values.flatten().double()
-    if len(flat) == 0:
-        return flat.float()
-    index = torch.arange(min(len(flat), SAMPLES)) * STEP % len(flat)
-    return torch.cat([flat[index], flat.mean()[None], flat.square().mean().sqrt()[None]]).float()
 
 
 def image_of(pixels):
@@ -194,45 +154,8 @@ def dkm(*, symmetric):
     return filled(DKM(DkmConfig(symmetric)), "dkm")
 
 
-def input_of(picture):
-    return network_input(batch_of(torch.from_numpy(picture)), picture.shape[:2])
-
-
-def shifted_inputs(size, fine=None):
-    """Both images, and both of them larger or None twice.
-
-    ``fine`` versions repeat pixels: interpolation in whole grey levels would round them either way.
-    """
-    whole = scene(size[0] + 8, size[1] + 16, channels=3)
-    pictures = [whole[: size[0], 16:], whole[8:, : size[1]]]
-    images, fine_images = [input_of(picture) for picture in pictures], (None, None)
-    if fine is not None:
-        rows, columns = (np.arange(many) * few // many for many, few in zip(fine, size, strict=True))
-        fine_images = [input_of(picture[rows][:, columns]) for picture in pictures]
-    return images, fine_images
-
-
 def dkm_values(size, fine=None, symmetric=True):
     yield from computed(dkm(symmetric=symmetric), *shifted_inputs(size, fine)).items()
-
-
-# RoMa
-
-
-@cache
-def narrow_roma():
-    return filled(RoMa(roma_values.NARROW), "roma")
-
-
-def roma_stages(size, fine=None, symmetric=True):
-    network = narrow_roma()
-    network.config = replace(network.config, symmetric=symmetric)
-    for name, value in roma_values.computed(network, *shifted_inputs(size, fine)).items():
-        if name == "cls_mode":
-            rows = torch.nonzero(value >= 0)
-            yield name, Found(torch.cat([rows, value.reshape(-1, 1)], dim=1), torch.ones(len(rows), 1))
-        else:
-            yield name, value
 
 
 def dkm_sampling_values():
@@ -252,61 +175,9 @@ def dkm_sampling_values():
     yield "samples", Found(samples[:, None], evenness[samples, None])
 
 
-# LoMa
-
-
-@cache
-def loma():
-    return placed(filled(Loma(Variant.B128), "loma"), Placement())
-
-
-def rgb_of(height, width):
-    return torch.from_numpy(scene(height, width, channels=3)).permute(2, 0, 1)[None].float() / 255
-
-
-def detector_stages(size):
-    values = detector_values(loma().detector, rgb_of(*size), 100)
-    points, scores = values.pop("keypoints")[0], values.pop("keypoint_probs")[0]
-    yield from values.items()
-    pixels = ((points + 1) * torch.tensor([size[1], size[0]]) / 2).floor()
-    offsets = (points + 1) * torch.tensor([size[1], size[0]]) / 2 - pixels
-    yield "keypoints", Found(pixels, torch.cat([offsets, scores[:, None]], dim=1))
-
-
-def descriptor_stages(size, vit=None):
-    descriptor = loma().descriptor
-    if vit is not None:
-        descriptor = placed(filled(dedode_g(32, vit), "loma"), Placement())
-    points = torch.from_numpy(1.05 * uniform("points", (1, 60, 2))).float()
-    yield from descriptor_values(descriptor, rgb_of(*size), points).items()
-
-
-def loma_matcher_stages(counts, batch=1):
-    numbers = [torch.from_numpy(uniform(f"points {i}", (batch, n, 2))).float() for i, n in enumerate(counts)]
-    described = torch.from_numpy(2 * uniform("descriptors", (batch, sum(counts), 128))).float()
-    first, second = described.split(counts, dim=1)
-    common = min(counts) // 2
-    second[:, :common] = first[:, :common] + 0.3 * second[:, :common]
-    values = matcher_values(
-        loma().matcher, *map(LomaKeypoints, numbers, (first, second.contiguous())), threshold=0.0
-    )
-    matches, scores = values.pop("matches0"), values.pop("matching_scores0")
-    for name in ("matches1", "matching_scores1"):
-        del values[name]
-    yield from values.items()
-    batches, index0 = torch.nonzero(matches >= 0, as_tuple=True)
-    rows = torch.stack([batches, index0, matches[batches, index0]], dim=1)
-    yield "matches", Found(rows, scores[batches, index0, None])
-
-
 SAME, DIFFERENT = ((96, 128), (96, 128)), ((96, 128), (128, 64))
 SMALL, SMALL_DIFFERENT = ((64, 96), (64, 96)), ((64, 96), (96, 64))
 CASES = {
-    ("loma", "detector"): partial(detector_stages, (61, 83)),
-    ("loma", "descriptor"): partial(descriptor_stages, (61, 83)),
-    ("loma", "descriptor with a vision transformer"): partial(descriptor_stages, (56, 70), DinoV2Config(blocks=1)),
-    ("loma", "matcher"): partial(loma_matcher_stages, (60, 47)),
-    ("loma", "matcher, batch"): partial(loma_matcher_stages, (9, 31), batch=2),
     ("superpoint", "default"): partial(superpoint_values, (96, 128)),
     ("superpoint", "outdoor, odd size"): partial(superpoint_values, (75, 101), nms_radius=3, max_keypoints=60),
     ("superpoint", "batch"): partial(superpoint_values, (64, 72), batch=2, remove_borders=0),
@@ -341,76 +212,13 @@ CASES = {
     ("dkm", "one pass"): partial(dkm_values, (64, 80)),
     ("dkm", "two passes, one way"): partial(dkm_values, (61, 83), (90, 118), symmetric=False),
     ("dkm", "sampling"): dkm_sampling_values,
-    ("roma", "one pass"): partial(roma_stages, (70, 84)),
-    ("roma", "two passes, one way"): partial(roma_stages, (56, 70), (75, 101), symmetric=False),
 }
-
-
-@torch.inference_mode()
-def computed_values(network, case):
-    """What is kept of a case, by the stage's name: samples, and all that was found."""
-    kept = {}
-    for name, value in CASES[network, case]():
-        if isinstance(value, Found):
-            kept |= {f"{name}, rows": value.rows.int(), f"{name}, values": value.values.float()}
-        else:
-            kept[name] = sampled(value)
-    return kept
-
-
-def stored_values(network, case):
-    with np.load(DATA / f"{network}.npz") as file:
-        names = [name for name in file if name.startswith(f"{case}: ")]
-        return {name.removeprefix(f"{case}: "): torch.from_numpy(file[name]) for name in names}
-
-
-def stages_of(network, case):
-    stored, got = stored_values(network, case), computed_values(network, case)
-    assert list(got) == list(stored), "the stages are not those of the file"
-    tolerance = EDGES if network in ("dkm", "roma") else TOLERANCE
-    plain = (name for name in got if not name.endswith((", rows", ", values")))
-    yield from (
-        Stage(name, got[name], stored[name], tolerance * max(stored[name].abs().max().item(), 1e-6))
-        for name in plain
-    )
-    for name in (name.removesuffix(", rows") for name in got if name.endswith(", rows")):
-        yield from found_stages(
-            name, *(Found(kept[f"{name}, rows"], kept[f"{name}, values"]) for kept in (got, stored))
-        )
-
-
-def found_stages(name, got, expected):
-    """How many are others, and what is said of those in common, in shares of each column's largest value."""
-    places, known = ({tuple(row): i for i, row in enumerate(found.rows.tolist())} for found in (got, expected))
-    others = len(places.keys() ^ known.keys())
-    yield Stage(f"{name} that differ", torch.tensor(others), torch.tensor(0), len(known) // LEEWAY)
-    common = sorted(places.keys() & known.keys())
-    largest = expected.values.abs().amax(dim=0) if known else 1.0
-    mine, theirs = (
-        found.values[[index[row] for row in common]] / largest
-        for found, index in ((got, places), (expected, known))
-    )
-    yield Stage(f"{name}, values", mine, theirs, TOLERANCE)
 
 
 @pytest.mark.parametrize(("network", "case"), CASES)
 def test_every_stage_is_that_of_the_vectors(network, case):
-    assert_stages(stages_of(network, case))
-
-
-def write():
-    for network in dict.fromkeys(network for network, _ in CASES):
-        arrays = {
-            f"{case}: {name}": value.numpy()
-            for of, case in CASES
-            if of == network
-            for name, value in computed_values(network, case).items()
-        }
-        np.savez_compressed(DATA / f"{network}.npz", **arrays)
+    assert_stages(stages_of(CASES, network, case))
 
 
 if __name__ == "__main__":
-    if "--write" in sys.argv:
-        write()
-    for network in dict.fromkeys(network for network, _ in CASES):
-        print_table(network, [(case, stages_of(network, case)) for of, case in CASES if of == network])
+    main(CASES)
