@@ -10,7 +10,6 @@ from web import Site, serve
 from weight_files import DATA, OTHER, digest_of, line, put, search_nowhere_else
 
 from mkpc_kaggle.cli import main
-from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.pipeline.uses import files_of
 from mkpc_kaggle.weights import UNVERIFIED, WeightFile, manifest, store
 from mkpc_kaggle.weights.fetch import url_of
@@ -144,14 +143,13 @@ def test_the_first_download_of_a_file_without_a_digest_is_the_one_that_is_accept
         site.data = OTHER
         capsys.readouterr()
         assert main(fetch) == 1
-    assert (
-        f"what came has the digest {digest_of(OTHER)}, the manifest says {digest_of(DATA)}"
-        in capsys.readouterr().out
-    )
+    told = capsys.readouterr().out
+    assert digest_of(OTHER) in told
+    assert digest_of(DATA) in told
     assert not (out / "b.pt").exists()
     (out / "b.pt").write_bytes(OTHER)
-    with pytest.raises(UserError, match="no good file for 'aliked-n16'"):
-        store.WeightStore([out]).find("aliked-n16")
+    with pytest.warns(UserWarning, match="damaged, or another file"):
+        assert store.WeightStore([out]).find("aliked-n16") is None
 
 
 def test_a_manifest_beside_the_weights_does_not_change_what_the_packages_says(

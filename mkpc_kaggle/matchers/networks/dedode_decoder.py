@@ -15,6 +15,7 @@ from mkpc_kaggle.matchers.networks.layers import ExactConv2d
 from mkpc_kaggle.matchers.networks.strips import in_strips
 
 KERNEL = 5
+CHANNELS = 32  # of a prediction that are enlarged at a time
 
 
 @dataclass(frozen=True)
@@ -127,7 +128,11 @@ class Decoder(nn.Module):
         outputs = refiner.outputs(refiner.hidden(refiner.mixed(entry, context)))
         # A copy: a view would hold the prediction's part as long.
         part, context = outputs[:, : self.prediction], outputs[:, self.prediction :].clone()
-        return part if prediction is None else resize(prediction, part.shape[2:], self.mode).add_(part), context
+        if prediction is not None:
+            # In parts, since at stride 2 the enlarged one is the largest map of all.
+            for some, coarser in zip(part.split(CHANNELS, 1), prediction.split(CHANNELS, 1), strict=True):
+                some += resize(coarser, some.shape[2:], self.mode)
+        return part, context
 
 
 def resize(x: Tensor, size: torch.Size, mode: str) -> Tensor:
