@@ -130,8 +130,9 @@ class Decoder(nn.Module):
         part, context = outputs[:, : self.prediction], outputs[:, self.prediction :].clone()
         if prediction is not None:
             # In parts, since at stride 2 the enlarged one is the largest map of all.
-            for some, coarser in zip(part.split(CHANNELS, 1), prediction.split(CHANNELS, 1), strict=True):
-                some += resize(coarser, some.shape[2:], self.mode)
+            chunks = (torch.split(map_, CHANNELS, dim=1) for map_ in (part, prediction))
+            for some, coarser in zip(*chunks, strict=True):
+                some.add_(resize(coarser, some.shape[2:], self.mode))
         return part, context
 
 
