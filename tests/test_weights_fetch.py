@@ -68,10 +68,30 @@ def test_another_call_goes_on_where_the_last_one_gave_up(site: Site, tmp_path: P
     assert f"failed {ATTEMPTS} times" in failed.note
     assert f"{CUT} of {len(BIG)} bytes" in failed.note
     assert (len(site.asked), pauses) == (ATTEMPTS, [1, 2, 4, 8])
-    assert names_in(tmp_path) == ["a.bin.part"]
+    assert names_in(tmp_path) == ["a.bin.part", "a.bin.part.mark"]
     assert get(site, tmp_path).outcome is Outcome.FETCHED
     assert (tmp_path / "a.bin").read_bytes() == BIG
     assert site.sent == len(BIG)
+    assert names_in(tmp_path) == ["a.bin"]
+
+
+@pytest.mark.parametrize("digest", [UNVERIFIED, None])
+def test_a_file_that_changed_meanwhile_is_taken_anew(site: Site, tmp_path: Path, digest: str | None) -> None:
+    site.breaks = [CUT] + [0] * (ATTEMPTS - 1)
+    old = bytes(len(BIG))
+    site.data, site.tag = old, '"old"'
+    get(site, tmp_path, line(data=old, size=-1, digest=digest))
+    site.data, site.tag = BIG, '"new"'
+    assert get(site, tmp_path, line(data=BIG, size=-1, digest=digest)).outcome is Outcome.FETCHED
+    assert site.asked[-1] == f"bytes={CUT}-"
+    assert (tmp_path / "a.bin").read_bytes() == BIG
+
+
+def test_a_file_without_a_digest_goes_on_by_the_validator(site: Site, tmp_path: Path) -> None:
+    site.breaks = [CUT]
+    assert get(site, tmp_path, line(data=BIG, digest=UNVERIFIED)).outcome is Outcome.FETCHED
+    assert (site.asked, site.sent) == (["", f"bytes={CUT}-"], len(BIG))
+    assert (tmp_path / "a.bin").read_bytes() == BIG
     assert names_in(tmp_path) == ["a.bin"]
 
 
@@ -92,7 +112,7 @@ def test_a_server_that_knows_no_ranges_sends_all_again(site: Site, tmp_path: Pat
 
 
 def test_bytes_that_nobody_can_vouch_for_are_not_gone_on_with(site: Site, tmp_path: Path) -> None:
-    site.breaks = [CUT]
+    site.tag, site.breaks = "", [CUT]
     assert get(site, tmp_path, line(data=BIG, digest=UNVERIFIED)).outcome is Outcome.FETCHED
     assert site.asked == ["", ""]
     assert (tmp_path / "a.bin").read_bytes() == BIG
@@ -258,10 +278,20 @@ def test_a_part_that_is_no_file_is_replaced(
     assert other.read_bytes() == b"mine"
 
 
-def test_a_mark_of_an_earlier_version_is_not_read(site: Site, tmp_path: Path) -> None:
+@pytest.mark.parametrize("mark", [b"one\r\nHost: elsewhere", b'"one"\n', b"\xe9", b"a" * 100_000])
+def test_a_mark_that_is_no_validator_is_not_sent(site: Site, tmp_path: Path, mark: bytes) -> None:
     put(tmp_path, "a.bin.part", BIG[:CUT])
-    put(tmp_path, "a.bin.part.mark", b"one\r\nHost: elsewhere")
+    put(tmp_path, "a.bin.part.mark", mark)
+    assert get(site, tmp_path, line(data=BIG, digest=UNVERIFIED)).outcome is Outcome.FETCHED
+    assert site.asked == [""]
+    assert names_in(tmp_path) == ["a.bin"]
+
+
+def test_a_mark_that_is_a_link_is_not_followed(site: Site, tmp_path: Path) -> None:
+    put(tmp_path, "mine", b"mine")
+    (tmp_path / "a.bin.part.mark").symlink_to(tmp_path / "mine")
     assert get(site, tmp_path).outcome is Outcome.FETCHED
+    assert (tmp_path / "mine").read_bytes() == b"mine"
 
 
 def test_a_full_disk_is_told_before_the_download(

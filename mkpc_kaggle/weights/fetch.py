@@ -40,6 +40,7 @@ LEAST_SPEED = 10_000.0
 """Bytes a second, once ``TIMEOUT`` is over; a slower connection counts as broken."""
 LARGEST = 1 << 33
 """Bytes of a file whose size the manifest does not know."""
+LONGEST_VALIDATOR = 200
 BLOCK = 1 << 20
 WEB_PAGE_HOSTS = ("drive.google.com",)
 """Hosts that answer with a web page instead of the file."""
@@ -83,8 +84,9 @@ def choose(alternatives: Sequence[WeightFile], directory: Path) -> WeightFile:
 def fetch(file: WeightFile, directory: Path, *, wait: Callable[[float], None] = time.sleep) -> Fetched:
     """Download the file into the directory, which is created.
 
-    A partial download stays in ``NAME.part``; it is continued if the manifest has a digest, which tells whether
-    the parts are of one file. ``wait`` is called with the seconds to pause before another attempt.
+    A partial download stays in ``NAME.part``. It is continued where something tells whether the rest is of the
+    same file: the manifest's digest, or the server's validator, which is kept in ``NAME.part.mark``. ``wait`` is
+    called with the seconds to pause before another attempt.
     """
     path = directory / file.name
     if _state(file, directory).usable:
@@ -99,6 +101,7 @@ def fetch(file: WeightFile, directory: Path, *, wait: Callable[[float], None] = 
             _download(url, part, file, wait)
         note = _verify(part, file)
         part.replace(path)
+        _remove(part)
     except UserError as error:
         return Fetched(file, path, Outcome.FAILED, str(error))
     except OSError as error:
@@ -122,6 +125,26 @@ def _size_of(part: Path) -> int:
     return status.st_size
 
 
+def _mark_of(part: Path) -> Path:
+    return part.with_name(f"{part.name}.mark")
+
+
+def _remove(part: Path) -> None:
+    for path in (part, _mark_of(part)):
+        path.unlink(missing_ok=True)
+
+
+def _range_headers(part: Path, have: int, file: WeightFile) -> dict[str, str]:
+    """Headers that ask for the rest; empty where nothing would show that the rest fits."""
+    mark = _mark_of(part)
+    validator = mark.read_text(encoding="latin-1") if 0 < _size_of(mark) <= LONGEST_VALIDATOR else ""
+    if not re.fullmatch(r"[ -~]+", validator):  # what is sent must be one line
+        validator = ""
+    if not 0 < have < _most_bytes(file) or (not validator and file.digest == UNVERIFIED):
+        return {}
+    return {"Range": f"bytes={have}-"} | ({"If-Range": validator} if validator else {})
+
+
 def _verify(part: Path, file: WeightFile) -> str:
     """What to say of the complete download; where it is another file, remove it and raise :class:`UserError`."""
     digests = file_digests(part)
@@ -129,7 +152,7 @@ def _verify(part: Path, file: WeightFile) -> str:
         return f"not verified: the manifest has no digest for it; this file's is {digests.sha256}"
     if digests.have(file.digest):
         return ""
-    part.unlink()
+    _remove(part)
     raise UserError(
         f"what came has {digests.size} bytes and the digest {digests.sha256}, the manifest says {file.digest}: "
         "not the file that the matchers were tested with; it was removed"
@@ -138,11 +161,20 @@ def _verify(part: Path, file: WeightFile) -> str:
 
 @dataclass(frozen=True)
 class _Head:
-    """Of a server's answer; ``length`` of the body in bytes, ``None`` where it is not told."""
+    """Of a server's answer; ``length`` of the body in bytes, ``None`` where it is not told; ``validator``: the
+    ETag or date by which the server knows this version of the file.
+    """
 
     status: int
     content_range: str
     length: int | None
+    validator: str
+
+    @classmethod
+    def of(cls, response: Any) -> "_Head":
+        tag = response.headers.get("ETag", "")
+        validator = response.headers.get("Last-Modified", "") if not tag or tag.startswith("W/") else tag
+        return cls(response.status, response.headers.get("Content-Range", ""), response.length, validator)
 
 
 class _BrokenConnectionError(Exception):
@@ -197,24 +229,23 @@ def _download(url: str, part: Path, file: WeightFile, wait: Callable[[float], No
 def _receive(url: str, part: Path, file: WeightFile) -> None:
     """One request for what is missing."""
     have = _size_of(part)
-    if file.digest == UNVERIFIED or have >= _most_bytes(file):
-        have = 0
-    wanted = {"Range": f"bytes={have}-"} if have else {}
+    wanted = _range_headers(part, have, file)
     answer = _answer(Request(url, headers={"User-Agent": "mkpc_kaggle", **wanted}))
     with closing(answer):
         try:
             head = next(answer)
         except HTTPError as error:
             error.close()
-            if error.code == RANGE_NOT_SATISFIABLE and have:
-                part.unlink()  # these bytes belong to another version
+            if error.code == RANGE_NOT_SATISFIABLE and wanted:
+                _remove(part)  # these bytes belong to another version
             elif error.code not in TRANSIENT_STATUSES:
                 raise UserError(f"{url}: the server says {error.code} {error.reason}") from error
             raise _BrokenConnectionError(f"{error.code} {error.reason}") from error
         assert isinstance(head, _Head)
-        have = have if _is_partial_content(head, part, have) else 0
+        have = have if wanted and _is_partial_content(head, part, have) else 0
         total = None if head.length is None else have + head.length
         _check_total(total, have, part, file)
+        _mark_of(part).write_text(head.validator, encoding="latin-1")
         have = _store(answer, part, have, total, file)
     if total is not None and have < total:
         raise _BrokenConnectionError(f"it broke off after {have} of {total} bytes")
@@ -230,7 +261,7 @@ def _answer(request: Request) -> Generator[_Head | bytes, None, None]:
     def read() -> None:
         try:
             with _opener().open(request, timeout=TIMEOUT) as response:
-                arrived.put(_Head(response.status, response.headers.get("Content-Range", ""), response.length))
+                arrived.put(_Head.of(response))
                 while block := response.read1(BLOCK):
                     arrived.put(block)
                 arrived.put(b"")
@@ -263,7 +294,7 @@ def _is_partial_content(head: _Head, part: Path, have: int) -> bool:
         return False
     first = re.match(r"bytes (\d+)-", head.content_range)
     if first is None or int(first[1]) != have:
-        part.unlink(missing_ok=True)
+        _remove(part)
         raise _BrokenConnectionError("the server sent another part than was asked for")
     return True
 
@@ -276,7 +307,7 @@ def _check_total(total: int | None, have: int, part: Path, file: WeightFile) -> 
     if total is None:
         return
     if 0 <= file.size != total:
-        part.unlink(missing_ok=True)
+        _remove(part)
         raise UserError(f"the server's file has {total} bytes, the manifest says {file.size}: another file")
     free = shutil.disk_usage(part.parent).free + _size_of(part) - have
     if total - have > free:
