@@ -3,11 +3,13 @@
 import json
 import subprocess
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 
 import nbformat
 import pandas as pd
 import pytest
+from checkpoints import FILES, write_checkpoints
 from kaggle_image import IMAGES, Image, environment, install_image, make_image, pack_wheel, python_version, upload
 from offline_notebook import execute, needs_namespaces, pictures, printed
 from packaging.requirements import Requirement
@@ -15,6 +17,7 @@ from shared import DATA, WEIGHTS, needs_data, needs_weights
 
 from mkpc_kaggle.data.competition import read_test_side, submission_problems
 from mkpc_kaggle.demo import DemoSet
+from mkpc_kaggle.matchers.networks.roma import RoMa
 from mkpc_kaggle.package import Request, make_package
 from mkpc_kaggle.package.metadata import COMPETITION
 from mkpc_kaggle.package.wheels import BUNDLED, PYTHONS
@@ -160,6 +163,33 @@ def test_the_hidden_rerun_uses_the_weights_and_the_time_and_shows_nothing(kaggle
     assert "good: 29 rows" in printed
     assert "1:xfeat_lighterglue@1024 " in printed
     assert kaggle.figures() == 0
+
+
+@needs_namespaces
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize("matcher", ["loma", "roma"])
+def test_matchers_run_offline_from_packaged_stand_ins_of_their_full_size(
+    kaggle: Kaggle, demo: DemoSet, tmp_path: Path, matcher: str
+) -> None:
+    weights = tmp_path / "weights"
+    weights.mkdir()
+    whole = [replace(file, name=f"standin_{file.name}") for file in FILES if file.matcher == matcher]
+    if matcher == "roma":
+        whole = [replace(file, network=RoMa) for file in whole]
+    lines = [replace(line, licence="MIT").line for line in write_checkpoints(weights, whole)]
+    (weights / "weights_manifest.txt").write_text("\n".join(lines))
+    kaggle.add_test_side(demo.test_dir, pairs=3)
+    kaggle.add_dataset(tmp_path / "package", (weights,))
+    recipe = tmp_path / "small.toml"
+    units = [f'{{ stage = {stage}, matcher = "{matcher}", area = "112x140" }}' for stage in (1, 2)]
+    recipe.write_text(f'units = [{", ".join(units)}]\n[matchers.loma]\nvariant = "b128"')
+    kaggle.set('RECIPE = "auto"', f'RECIPE = "{recipe}"')
+    printed = kaggle.run()
+    assert kaggle.problems() == []
+    assert f"{len(lines)} files in" in printed
+    assert "0 of them not found or wrong" in printed
+    assert f"2:{matcher}@112x140 " in printed
 
 
 @needs_namespaces
