@@ -1,5 +1,5 @@
 import json
-import re
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -10,8 +10,10 @@ from hypothesis import strategies as st
 from pair_lists import line_of, line_of_pair, write_list
 from shared import DATA, needs_data
 
+from benchmarks import paper_tables
 from mkpc_kaggle import TwoStageMatcher
 from mkpc_kaggle.cli import main
+from mkpc_kaggle.cli.validate import with_units
 from mkpc_kaggle.data.competition import Scene, read_train_side
 from mkpc_kaggle.data.images import Image, read_image
 from mkpc_kaggle.data.pairs import parse_line, read_pairs
@@ -277,10 +279,36 @@ def test_a_threshold_of_nothing_is_refused(demo: DemoSet, capsys: pytest.Capture
     assert "threshold must be in" in capsys.readouterr().err
 
 
-def test_the_commands_of_the_docs_name_units_that_there_are() -> None:
+def test_the_papers_tables_are_made_with_one_command(
+    demo: DemoSet, scenes: tuple[Scene, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    listed = write_list(tmp_path / "list.txt", [replace(scenes[0], pairs=scenes[0].pairs[:1])], demo.train_dir)
+    where = ["--scannet", str(listed), str(demo.train_dir), "--out", str(tmp_path / "out"), "--matcher", "sift"]
+    paper_tables.main([*where, "--rows", "one", "two + one"])
+    heads, _, one, two, empty = capsys.readouterr().out.splitlines()
+    assert heads.startswith("| scannet: 1 pairs | whole images | critical regions | AUC 5 |")
+    assert one.startswith("| one | 1280 | - | ")
+    assert two.startswith("| two + one | 1024, 1280 | 1280 | ")
+    assert all(0 <= float(area) <= 100 for row in (one, two) for area in row.split("|")[4:7])
+    assert float(one.split("|")[6]) > 10
+    assert empty == ""
+
+
+def test_every_row_of_the_papers_tables_is_a_part_of_its_recipe() -> None:
     text = (Path(__file__).resolve().parents[1] / "docs" / "benchmarks.md").read_text()
-    commands = re.findall(r"--recipe (\w+)(?: --units ([\w:@,]+))?", text)
-    assert {name for name, _ in commands} == {"yfcc", "yfcc_naive", "scannet", "scannet_naive"}
-    for name, units in commands:
-        known = {unit.name for unit in load_recipe(name).units}
-        assert set(filter(None, units.split(","))) <= known
+    for dataset, rows in paper_tables.TABLES.items():
+        assert {unit.name for unit in rows[-1].of(dataset, "superglue").units} == {
+            unit.name for unit in load_recipe(dataset).units
+        }
+        for row in rows:
+            recipe = row.of(dataset, "superglue")
+            assert {unit.long_side for unit in recipe.units if unit.stage == 1} == set(row.stage1)
+            told = ", ".join(map(str, row.stage1)) + (
+                f" + {', '.join(map(str, row.stage2))}" if row.stage2 else ""
+            )
+            assert f"| {told} |" in text
+
+
+def test_units_are_taken_in_the_order_in_which_they_are_named() -> None:
+    recipe = with_units(load_recipe("yfcc"), "1:superglue@1600,2:superglue@1400")
+    assert [unit.name for unit in recipe.units] == ["1:superglue@1600", "2:superglue@1400"]

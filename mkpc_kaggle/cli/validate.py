@@ -44,7 +44,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     options.add_mode(parser)
     options.add_no_scenes(parser)
     parser.add_argument(
-        "--units", metavar="A,B", help="only these of the recipe's units, such as 1:sift@1536; default: all"
+        "--units",
+        metavar="A,B",
+        help="only these of the recipe's units, in this order, such as 1:sift@1536; default: all",
     )
     parser.add_argument(
         "--compare",
@@ -190,19 +192,21 @@ def _assemble(arguments: argparse.Namespace, choice: "Choice") -> "Assembly":
     from dataclasses import replace
 
     assembly = options.assembly_of(arguments, choice)
-    chosen = _with_units(assembly.recipe, arguments.units)
+    chosen = with_units(assembly.recipe, arguments.units)
     return replace(assembly, recipe=_with_estimator(chosen, arguments))
 
 
-def _with_units(recipe: "Recipe", wanted: str | None) -> "Recipe":
-    """The recipe with the units of these names alone; all of them where none are named."""
+def with_units(recipe: "Recipe", wanted: str | None) -> "Recipe":
+    """The recipe with the units of these names alone, in this order; all of them where none are named."""
+    from dataclasses import replace
+
     from mkpc_kaggle.errors import UserError
 
-    known, names = [unit.name for unit in recipe.units], wanted.split(",") if wanted is not None else []
+    known, names = {unit.name: unit for unit in recipe.units}, wanted.split(",") if wanted is not None else []
     for name in names:
         if name not in known:
             raise UserError(f"--units: recipe {recipe.name!r} has no unit {name!r}; it has {', '.join(known)}")
-    return recipe.only(lambda unit: unit.name in names) if names else recipe
+    return replace(recipe, units=tuple(known[name] for name in names)) if names else recipe
 
 
 def _with_estimator(recipe: "Recipe", arguments: argparse.Namespace) -> "Recipe":
