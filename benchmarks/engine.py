@@ -62,7 +62,7 @@ class TimeSpent:
         return cls(
             len(rest),
             results[-1][0] - results[0][0],
-            sum(seconds for result in rest for _, seconds in result.measured()),
+            sum(result.unit_seconds for result in rest),
             sum(record.cluster_seconds for record in records),
             sum(record.decode_seconds for record in records),
             sum(record.estimate_seconds for record in records),

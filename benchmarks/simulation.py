@@ -1,14 +1,34 @@
 """How well the engine uses its time, on random simulated runs.
 
 python -m benchmarks.simulation [--scenarios 1000] [--seed 0] [--pairs 10000]
+python -m benchmarks.simulation --costs 0.6 0.4 0.35 [--batches 15] [--pairs 10000] [--scene-seconds 0.15]
+    [--limit 8h45m] [--workers 1]
+
+With `--costs`, the seconds of each unit on a pair, one run is simulated and told: when what happened.
 """
 
 import argparse
 import math
+from collections import Counter
 
 import numpy as np
 
-from tests.support.simulator import random_scenario, simulate, without_records
+from mkpc_kaggle.engine.budget import format_duration, parse_duration
+from tests.support.simulator import Scenario, random_scenario, simulate, without_records
+
+
+def tell(scenario: Scenario) -> None:
+    """When the phases of a run began, and the scenes of its batches."""
+    ran = simulate(scenario)
+    for one in ran.report.explanations:
+        print(one)
+    for scene in ran.scenes:
+        begun, ended = map(format_duration, (scene.begun, scene.begun + scene.seconds))
+        print(f"{begun:>7}  batch {scene.batch} is reconstructed until {ended}")
+    units = Counter(len(record.units) for record in ran.report.records)
+    had = ", ".join(f"{pairs} pairs with {count} units" for count, pairs in sorted(units.items()))
+    print(f"{format_duration(ran.report.seconds):>7}  {ran.report.ending}: {had}; {ran.missed} scenes missed")
+    print(f"workers busy: {ran.utilisation:.4f} of their time; late: {ran.late:.0f} s; rows lost: {ran.lost}")
 
 
 def main() -> None:
@@ -16,7 +36,26 @@ def main() -> None:
     parser.add_argument("--scenarios", type=int, default=1000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--pairs", type=int, default=1000, help="on average; the scale of a run (default: 1000)")
+    parser.add_argument("--costs", type=float, nargs="+")
+    parser.add_argument("--batches", type=int, default=15)
+    parser.add_argument("--scene-seconds", type=float, default=Scenario.scene_seconds, help="for each pair")
+    parser.add_argument("--limit", type=parse_duration, default=parse_duration("8h45m"))
+    parser.add_argument("--workers", type=int, default=1)
     arguments = parser.parse_args()
+    if arguments.costs is not None:
+        tell(
+            Scenario(
+                arguments.pairs,
+                tuple(arguments.costs),
+                0,
+                arguments.workers,
+                arguments.limit,
+                batches=arguments.batches,
+                scene_seconds=arguments.scene_seconds,
+                seed=arguments.seed,
+            )
+        )
+        return
     runs = [
         without_records(simulate(random_scenario(seed, arguments.pairs)))
         for seed in range(arguments.seed, arguments.seed + arguments.scenarios)
@@ -24,6 +63,9 @@ def main() -> None:
     busy = [run.utilisation for run in runs if run.work_left]
     print(f"{len(runs)} scenarios, {len(busy)} with work left at the end")
     print(f"late: {sum(run.late > 0 for run in runs)}, rows lost: {sum(run.lost for run in runs)}")
+    fit = [run for run in runs if run.scenario.batches and run.scenes_fit]
+    batches, missed = sum(run.scenario.batches for run in fit), sum(run.missed for run in fit)
+    print(f"scenes: {len(fit)} scenarios in which they fit, {missed} of {batches} batches missed")
     low, middle = np.percentile(busy, [5, 50]) if busy else (math.nan, math.nan)
     print(f"utilisation: median {middle:.4f}, 5th percentile {low:.4f}, least {min(busy, default=math.nan):.4f}")
     worst = max(runs, key=lambda run: run.planning)

@@ -52,11 +52,13 @@ def test_a_spent_budget_has_nothing_left() -> None:
 def test_the_warm_up_counts_only_until_there_is_another_measurement() -> None:
     costs = Costs()
     assert not costs.known("a")
-    costs.observe("a", 10.0)
-    assert costs.known("a")
+    costs.observe("a", 10.0, warm_up=True)
+    assert not costs.known("a")
     assert costs.of("a") == 10.0
     costs.observe("a", 1.0)
+    costs.observe("a", 9.0, warm_up=True)  # another worker's
     costs.observe("a", 2.0)
+    assert costs.known("a")
     assert costs.of("a") == 1.5
 
 

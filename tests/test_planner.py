@@ -236,9 +236,30 @@ def test_random_runs_are_never_late_never_lose_a_row_and_use_their_time(
     runs = [without_records(simulate(random_scenario(seed, pairs))) for seed in range(scenarios)]
     assert max(run.late for run in runs) == 0
     assert sum(run.lost for run in runs) == 0
+    assert sum(run.missed for run in runs if run.scenes_fit) == 0
     used = [run.utilisation for run in runs if run.work_left]
     assert median(used) > middle
     assert np.percentile(used, 5) > low
+
+
+def test_scenes_are_done_beside_matching_and_the_last_one_in_the_time_kept_for_it() -> None:
+    costs = (0.5, 1.0, 1.0)
+    ran = simulate(Scenario(600, costs, 0, 1, 1200.0, warm_up=1, batches=6, scene_seconds=0.3))
+    assert ran.late == ran.lost == ran.missed == 0
+    assert ran.work_left
+    assert len({scene.batch for scene in ran.scenes}) == 6
+    beside = [scene for scene in ran.scenes if scene.begun + scene.seconds < ran.last_job]
+    assert len(beside) >= 5
+    assert max(scene.seen for scene in ran.scenes) < 1200.0
+    assert ran.utilisation > 0.95
+
+
+def test_a_scene_that_hangs_is_ended_and_the_others_have_their_turn() -> None:
+    ran = simulate(Scenario(900, (0.5, 1.0), 0, 1, 3600.0, batches=9, scene_faults=0.4, seed=3))
+    hung = [scene for scene in ran.scenes if scene.seconds == float("inf")]
+    assert hung
+    assert ran.late == ran.lost == ran.missed == 0
+    assert any("it hung" in fault for fault in ran.report.faults)
 
 
 def test_undisturbed_runs_use_all_their_time() -> None:

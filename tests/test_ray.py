@@ -13,6 +13,8 @@ from typing import Any
 import pytest
 from faulty import FarMatcher, FaultyMatcher, die, hang, nothing
 from rectified import THREE_UNITS, RectifiedMatcher, run, write_pairs
+from synthetic import RECIPE as SYNTHETIC
+from synthetic import SyntheticMatcher, synthetic_pairs
 from test_faults import QUICK, matrices
 
 from mkpc_kaggle.data.competition import Pair
@@ -22,6 +24,8 @@ from mkpc_kaggle.engine.pools.cluster import RayCluster
 ray = pytest.importorskip("ray", reason="Ray is not installed: pip install 'mkpc-kaggle[ray]'")
 
 TESTS = Path(__file__).parent
+IMPORTED = [str(TESTS.parent), str(TESTS / "support")]
+"""What machines can import."""
 COUNT = 12
 MEGABYTE = 1 << 20
 
@@ -32,7 +36,7 @@ def cluster() -> Iterator[Any]:
     from ray.cluster_utils import Cluster
 
     patch = pytest.MonkeyPatch()
-    patch.setenv("PYTHONPATH", os.pathsep.join([str(TESTS.parent), str(TESTS)]))  # what machines can import
+    patch.setenv("PYTHONPATH", os.pathsep.join(IMPORTED))
     small = {"num_cpus": 1, "object_store_memory": 80 * MEGABYTE, "include_dashboard": False}
     cluster = Cluster(initialize_head=True, head_node_args=small)
     cluster.add_node(num_cpus=1, object_store_memory=80 * MEGABYTE)
@@ -89,6 +93,50 @@ def test_a_machine_lost_during_the_run_costs_time_alone(cluster: Any, tmp_path: 
     assert "the machine was lost: on " in report.faults[0]
     assert all("the machine was lost" in fault or "could be started" in fault for fault in report.faults)
     assert matrices(report.records) == matrices(undisturbed.records)
+
+
+def kill_the_first_scene_actor(cluster: Any, report: list[str]) -> None:
+    """Wait until it is there, and note where it was."""
+    while not report:
+        for process in Path("/proc").glob("[0-9]*/cmdline"):
+            try:
+                told = process.read_text()
+            except OSError:
+                continue
+            if "SceneActor" in told:
+                os.kill(int(process.parent.name), signal.SIGKILL)
+                report.append(told)
+                return
+        time.sleep(0.02)
+
+
+@pytest.fixture(scope="module")
+def batch(tmp_path_factory: pytest.TempPathFactory) -> list[Pair]:
+    return synthetic_pairs(tmp_path_factory.mktemp("batch"))
+
+
+def test_batches_are_reconstructed_on_the_cluster_to_the_same_bytes(
+    cluster: Any, batch: list[Pair], tmp_path: Path
+) -> None:
+    here = run(batch, SYNTHETIC, SyntheticMatcher(), tmp_path / "here")
+    report = run(batch, SYNTHETIC, SyntheticMatcher(), tmp_path / "w", workers=RayCluster(cluster.address))
+    assert report.faults == ()
+    assert [record.source for record in report.records] == ["scene"] * len(batch)
+    assert [one.fundamental.tobytes() for one in report.records] == [
+        one.fundamental.tobytes() for one in here.records
+    ]
+
+
+def test_a_reconstruction_that_dies_on_the_cluster_costs_its_scene_alone(
+    cluster: Any, batch: list[Pair], tmp_path: Path
+) -> None:
+    killed: list[str] = []
+    threading.Thread(target=kill_the_first_scene_actor, args=(cluster, killed), daemon=True).start()
+    report = run(batch, SYNTHETIC, SyntheticMatcher(), tmp_path / "w", workers=RayCluster(cluster.address))
+    killed.append("the run is over")
+    assert report.ending is Ending.COMPLETE
+    assert [record.source for record in report.records] == ["pair"] * len(batch)
+    assert "batch batch was not reconstructed: on " in report.faults[0]
 
 
 def test_images_are_sent_to_machines_that_cannot_read_them(
@@ -191,12 +239,11 @@ def at_work(mark: str) -> list[str]:
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
 def test_a_cluster_of_its_own_ends_with_the_run(tmp_path: Path, number: signal.Signals) -> None:
-    path = [str(TESTS.parent), str(TESTS)]
     mark = f"MKPC_TEST={tmp_path}"
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(path), "MKPC_TEST": str(tmp_path)}
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(IMPORTED), "MKPC_TEST": str(tmp_path)}
     environment["RAY_ADDRESS"] = "local"
     running = subprocess.Popen(
-        [sys.executable, "-c", LOCAL.format(path=path), str(tmp_path)],
+        [sys.executable, "-c", LOCAL.format(path=IMPORTED), str(tmp_path)],
         env=environment,
         stdout=subprocess.PIPE,
         text=True,

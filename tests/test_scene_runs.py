@@ -8,12 +8,15 @@ import cv2
 import faulty
 import numpy as np
 import pytest
-from rectified import SWEEP, THREE_UNITS, RectifiedMatcher, run
+from rectified import EXTRA, SWEEP, THREE_UNITS, RectifiedMatcher, run
+from synthetic import RECIPE as SYNTHETIC
+from synthetic import SyntheticMatcher, synthetic_pairs
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine import scenes
+from mkpc_kaggle.engine.costs import Timeouts
 from mkpc_kaggle.engine.engine import Ending
-from mkpc_kaggle.recipe import Recipe
+from mkpc_kaggle.engine.pools import scene_process
+from mkpc_kaggle.recipe import Recipe, UpgradeConfig
 from mkpc_kaggle.reporting.report import report_page
 from mkpc_kaggle.reporting.run_log import read_log
 from mkpc_kaggle.reporting.sections import Artist
@@ -36,7 +39,7 @@ def batch_pairs(directory: Path, images: int = 4, batch: str = "one") -> list[Pa
 
 
 def fault(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
-    monkeypatch.setattr(scenes, "reconstruct_batch", getattr(faulty, name))
+    monkeypatch.setattr(scene_process, "serve_scene", getattr(faulty, name))
 
 
 def own_matrices(pairs: list[Pair], directory: Path) -> list[bytes]:
@@ -111,6 +114,46 @@ def test_without_pycolmap_a_line_says_so(tmp_path: Path, monkeypatch: pytest.Mon
     report = run(batch_pairs(tmp_path / "images"), RECIPE, RectifiedMatcher(), tmp_path / "work")
     assert all(record.source == "pair" for record in report.records)
     assert "pycolmap cannot be imported" in overview(read_log(tmp_path / "work"))
+
+
+def test_a_reconstruction_that_hangs_costs_its_scene_and_the_next_batch_has_its_turn(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fault(monkeypatch, "hang_as_scene_of_batch_one")
+    pairs = batch_pairs(tmp_path / "images") + batch_pairs(tmp_path / "others", 3, "two")
+    quick = Timeouts(floor=4.0, factor=2.0)
+    report = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work", timeouts=quick)
+    assert [record.source for record in report.records] == ["pair"] * 7 + ["scene"] * 2
+    assert [fault[:50] for fault in report.faults] == ["batch one was not reconstructed: it hung: no answe"]
+
+
+def test_a_batch_is_reconstructed_again_from_all_matches_when_pairs_of_it_got_more(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fault(monkeypatch, "choose_scene_for_all_but_the_first")
+    recipe = replace(RECIPE, units=(SWEEP, EXTRA), upgrade=UpgradeConfig(100, uncertain=False))
+    matcher = RectifiedMatcher(matches=lambda brightness: 50 if brightness == 10 else 150)
+    report = run(batch_pairs(tmp_path / "images"), recipe, matcher, tmp_path / "work")
+    assert [len(record.units) for record in report.records] == [2, 2, 2, 1, 1, 1]
+    assert report.scenes[0].points == 3 * 2 * 50 + 3 * 150
+
+
+def test_a_run_reconstructs_the_true_cameras(tmp_path: Path) -> None:
+    matcher = SyntheticMatcher()
+    report = run(synthetic_pairs(tmp_path / "images"), SYNTHETIC, matcher, tmp_path / "work")
+    assert [record.source for record in report.records] == ["scene"] * 15
+    pairs = zip(report.records, matcher.scene.batch.pairs, strict=True)
+    assert max(matcher.scene.median_distance(record.fundamental, pair) for record, pair in pairs) < 0.5
+
+
+def test_memory_that_ends_within_pycolmap_costs_the_scene_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fault(monkeypatch, "exhaust_memory_within_pycolmap")
+    report = run(synthetic_pairs(tmp_path / "images"), SYNTHETIC, SyntheticMatcher(), tmp_path / "work")
+    assert report.ending is Ending.COMPLETE
+    assert [record.source for record in report.records] == ["pair"] * 15
+    assert report.scenes[0].failure
 
 
 def test_a_recipe_without_scenes_starts_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

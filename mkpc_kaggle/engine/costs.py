@@ -48,18 +48,22 @@ class Measurements:
 class Costs:
     """What units cost on a pair, in seconds, as measured in this run.
 
-    A unit's first measurement is its warm-up, and counts only as long as there is no other.
+    A worker's first run of a unit is its warm-up, which says nothing of the pairs to come: it counts only as long
+    as there is no other measurement, and in no forecast.
     """
 
     def __init__(self) -> None:
         self._measured: dict[str, Measurements] = {}
         self._warm_up: dict[str, float] = {}
+        self._supposed: set[str] = set()
         self._overhead = Measurements()
 
-    def observe(self, unit: str, seconds: float) -> None:
-        if unit not in self._warm_up:
+    def observe(self, unit: str, seconds: float, *, warm_up: bool = False) -> None:
+        if unit in self._supposed:
+            self._supposed.remove(unit)
+            del self._measured[unit]
+        if warm_up:
             self._warm_up[unit] = seconds
-            self._measured.pop(unit, None)
         else:
             self._measured.setdefault(unit, Measurements()).add(seconds)
 
@@ -69,11 +73,13 @@ class Costs:
 
     def suppose(self, unit: str, seconds: float) -> None:
         """For a unit that was never reached: at least this much, until it is measured."""
-        if unit not in self._warm_up:
+        if unit in self._supposed or (unit not in self._warm_up and unit not in self._measured):
+            self._supposed.add(unit)
             self._measured.setdefault(unit, Measurements()).add(seconds)
 
     def known(self, unit: str) -> bool:
-        return unit in self._warm_up or unit in self._measured
+        """Whether more than its warm-up is known."""
+        return unit in self._measured
 
     def of(self, unit: str) -> float:
         """Expected seconds on a pair; 0 for a unit that nothing is known of."""
@@ -89,9 +95,10 @@ class Costs:
         return self._warm_up.get(unit, 0.0) + factor * steady
 
     def forecast(self, unit: str) -> float:
-        """Expected seconds with a safety margin, which shrinks as more is known."""
-        count = self._measured[unit].count if unit in self._measured else 1
-        return self.of(unit) * (1 + max(LEAST_DOUBT, DOUBT / sqrt(count)))
+        """Expected seconds with a safety margin, which shrinks as more is known; 0 as long as nothing is."""
+        if unit not in self._measured:
+            return 0.0
+        return self.of(unit) * (1 + max(LEAST_DOUBT, DOUBT / sqrt(self._measured[unit].count)))
 
     @property
     def overhead(self) -> float:
@@ -139,3 +146,7 @@ class Timeouts:
         known = max(costs.longest(unit.name, factor) for unit in units)
         unknown = 0.0 if allowance is None else min(self.unknown, allowance)
         return self.silence(limit) + known + unknown
+
+    def of_scene(self, seconds: float, limit: float) -> float:
+        """Seconds that a reconstruction may take of which ``seconds`` are expected."""
+        return self.silence(limit) + self.factor * seconds

@@ -3,7 +3,6 @@
 import sqlite3
 import sys
 import threading
-import time
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -19,7 +18,7 @@ from mkpc_kaggle.engine.planner import Explanation, Planner
 from mkpc_kaggle.engine.pools.pool import Pool
 from mkpc_kaggle.engine.progress import progress_on
 from mkpc_kaggle.engine.records import PairRecord, SceneRecord
-from mkpc_kaggle.engine.scenes import ScenePair, SceneQueue, SceneResult
+from mkpc_kaggle.engine.scenes import SceneJob, ScenePair, SceneQueue, SceneResult
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.pipeline.pair import UnitResult
 from mkpc_kaggle.recipe import Recipe, Unit
@@ -115,7 +114,7 @@ class Engine:
         self._progress = progress_on(sys.stderr, budget) if progress else None
         self._publishing = threading.Lock()
         self.planner = self._planner(timeouts)
-        self.scenes = SceneQueue(pairs, recipe.scene)
+        self.scenes = SceneQueue(pairs, recipe.scene, budget.clock, self.planner.timeouts, budget.limit)
         self._scene_records = {scene.batch: scene for scene in journal.scenes()}
         self.scenes.note_solved(record.index for record in self.planner.records if record.scene is not None)
 
@@ -130,8 +129,7 @@ class Engine:
                     warnings.warn(message, stacklevel=2)  # now, since the summary is hours away
                     self._fault(message)
                 self._work()
-            self._finish_scenes()
-            self._wait()
+            self._finish()
         finally:
             self.scenes.close()
         if self._progress is not None:
@@ -162,7 +160,8 @@ class Engine:
 
     def _work(self) -> None:
         """Hand out what is planned as long as there is room, and gather what comes back."""
-        while not self.interrupt.is_set() and self.budget.left() > 0:
+        while self._may_hand_out():
+            self._reconstruct(self.planner.deepened)
             self.planner.workers = max(1, self.pool.workers)
             while self._out < self.pool.capacity:
                 job = self.planner.next(self.budget.clock())
@@ -171,26 +170,48 @@ class Engine:
                 self._submit(job)
             if self._out == 0:
                 return
-            while not self._gather() and not self.interrupt.is_set() and self.budget.left() > 0:
+            while not self._gather() and self._may_hand_out():
                 self._reconstruct(self.planner.deepened)  # only a job that comes back changes the plan
 
-    def _finish_scenes(self) -> None:
-        """Reconstruct what is left: batches that were not done beside matching, or changed since."""
-        everything = set(range(len(self.pairs)))
-        while not self.interrupt.is_set() and self.budget.left() > 0:
-            self._reconstruct(everything)
-            if self.scenes.running is None:
-                return
-            if not self._gather():
-                time.sleep(LISTEN_SECONDS)
+    def _may_hand_out(self) -> bool:
+        return not self.interrupt.is_set() and self.budget.clock() < self.planner.stop
 
-    def _reconstruct(self, matched: set[int]) -> None:
-        """Take a reconstruction back, and begin the next one whose pairs are all ``matched``."""
-        if (result := self.scenes.finished()) is not None:
+    def _finish(self) -> None:
+        """Let what is under way end and reconstruct what is left, until nothing is waited for any longer.
+
+        What is left are the batches that were not done beside matching, and those that changed since.
+        """
+        everything = set(range(len(self.pairs)))
+        while self.budget.clock() < self._wait_until:
+            if self.interrupt.is_set():
+                self._cut_short()
+            else:
+                self._reconstruct(everything, again=True)
+            if self._out == 0 and (self.interrupt.is_set() or not self.scenes.running):
+                return
+            self._gather()
+
+    def _cut_short(self) -> None:
+        if self._wait_until == self.budget.end:
+            self.pool.stop()
+            self._wait_until = min(self._wait_until, self.budget.clock() + GRACE_SECONDS)
+
+    def _reconstruct(self, matched: set[int], *, again: bool = False) -> None:
+        """Take reconstructions back, and begin those whose pairs are all ``matched``."""
+        for result in self.scenes.finished():
             self._keep_scene(result)
-        if (batch := self.scenes.due(matched)) is not None:
-            self.scenes.start(batch, [self._scene_pair(index) for index in self.scenes.batches[batch]])
-        self.planner.reserve = self.scenes.reserve
+        at_once = self.pool.scenes_at_once
+        while len(self.scenes.running) < at_once and self.budget.left() > 0:
+            batch = self.scenes.due(matched, again=again)
+            if batch is None:
+                break
+            self.scenes.start(batch, self.pool.reconstruct(self._scene_job(batch)))
+        self.planner.reserve = self.scenes.reserve(at_once)
+
+    def _scene_job(self, batch: str) -> SceneJob:
+        assert self.recipe.scene is not None
+        pairs = tuple(self._scene_pair(index) for index in self.scenes.batches[batch])
+        return SceneJob(batch, pairs, self.recipe.scene)
 
     def _scene_pair(self, index: int) -> ScenePair:
         record = self.planner.records[index]
@@ -199,28 +220,24 @@ class Engine:
         return ScenePair(index, images, matches, None if record.failure else record.F)
 
     def _keep_scene(self, result: SceneResult) -> None:
-        choices = dict(result.choices or {})
         record = SceneRecord.of(result.batch, result.scenes, result.seconds, result.failure)
-        self._scene_records[result.batch] = record
-        for index, choice in choices.items():
-            self.planner.state.set_scene(index, choice)
         if result.failure:
             self._fault(f"batch {result.batch} was not reconstructed: {result.failure}")
+            if result.batch in self._scene_records:
+                return  # what was found before its pairs got further matches still stands
+        self._scene_records[result.batch] = record
+        for index, choice in result.choices.items():
+            self.planner.state.set_scene(index, choice)
         self._note(EventKind.SCENE, f"{record.batch}: {record.placed} of {record.images} images")
         records = [self.planner.records[index] for index in self.scenes.batches[result.batch]]
+        # A batch is reconstructed from the points of all its pairs: none can go while one of them may change.
+        may_change = any(self.planner.may_gain(one) or self.scenes.needs(one.index) for one in records)
         try:
-            self.journal.save_scene(record, choices)
-            self.journal.settle(one for one in records if one.units and not self.planner.wanted(one))
+            self.journal.save_scene(record, result.choices)
+            if not result.failure and not may_change:
+                self.journal.settle(one for one in records if one.units)
         except sqlite3.Error as error:
             self._fault(f"the journal cannot be written ({error}): an interrupted run would have to do this again")
-
-    def _wait(self) -> None:
-        """Let what is under way end, until nothing is waited for any longer."""
-        while self._out > 0 and self.budget.clock() < self._wait_until:
-            if self.interrupt.is_set() and self._wait_until == self.budget.end:
-                self.pool.stop()
-                self._wait_until = min(self._wait_until, self.budget.clock() + GRACE_SECONDS)
-            self._gather()
 
     def _submit(self, job: Job) -> None:
         self._out += 1
@@ -287,9 +304,8 @@ class Engine:
 
     def _note_job(self, back: JobResult) -> None:
         job = back.job
-        seconds = sum(seconds for _, seconds in back.measured())
         self._note(EventKind.BUDGET, job.phase)
-        self._note(EventKind.JOB, f"{job.phase} {len(job.indices)} pairs {seconds:.3f} s")
+        self._note(EventKind.JOB, f"{job.phase} {len(job.indices)} pairs {back.unit_seconds:.3f} s")
 
     def _note_explanations(self) -> None:
         for one in self.planner.explanations[self._explained :]:

@@ -80,9 +80,14 @@ class JobResult:
     job: Job
     outcomes: tuple[Outcome, ...]
 
-    def measured(self) -> list[tuple[str, float]]:
-        """Unit name and seconds of every unit that this job ran on a pair."""
-        return [(result.unit.name, result.seconds) for outcome in self.outcomes for result in outcome.results]
+    @property
+    def results(self) -> list[UnitResult]:
+        """Those of every unit that this job ran on a pair."""
+        return [result for outcome in self.outcomes for result in outcome.results]
+
+    @property
+    def unit_seconds(self) -> float:
+        return sum(result.seconds for result in self.results)
 
 
 class Cause(StrEnum):

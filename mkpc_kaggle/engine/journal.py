@@ -83,11 +83,12 @@ class Journal(JournalTables):
     def save_scene(self, scene: SceneRecord, choices: Mapping[int, Choice]) -> None:
         """Put down what came of a batch, and which F its pairs get, by their places."""
         rows = [(i, None if one.F is None else one.F.tobytes(), str(one.reason)) for i, one in choices.items()]
-        values = [*astuple(scene)[:-1], json.dumps([asdict(camera) for camera in scene.cameras])]
+        drawn = json.dumps([asdict(camera) for camera in scene.cameras]), json.dumps(scene.cloud)
+        values = [*astuple(scene)[:-2], *drawn]
         with self._db:
             self._db.execute("BEGIN")
             self._db.executemany("REPLACE INTO choice VALUES (?, ?, ?)", rows)
-            self._db.execute("REPLACE INTO scene VALUES (?, ?, ?, ?, ?, ?, ?, ?)", values)
+            self._db.execute("REPLACE INTO scene VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)", values)
 
     def settle(self, records: Iterable[PairRecord]) -> None:
         """Drop the points of pairs that no later job or scene needs; the weakest keep theirs for the report."""

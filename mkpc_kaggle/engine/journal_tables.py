@@ -12,7 +12,7 @@ import os
 import sqlite3
 import zlib
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
 from types import TracebackType
@@ -31,7 +31,7 @@ from mkpc_kaggle.pipeline.pair import UnitResult
 from mkpc_kaggle.recipe import Unit
 from mkpc_kaggle.scene.choose import Choice, Reason
 
-FORMAT = 3
+FORMAT = 4
 FILE_NAME = "journal.sqlite"
 LOCK_NAME = "journal.lock"
 DRAWN = 10
@@ -54,7 +54,7 @@ CREATE TABLE IF NOT EXISTS region (
 CREATE TABLE IF NOT EXISTS choice (pair INTEGER PRIMARY KEY, fundamental BLOB, reason TEXT NOT NULL);
 CREATE TABLE IF NOT EXISTS scene (
     batch TEXT PRIMARY KEY, images INTEGER, placed INTEGER, models INTEGER, points INTEGER, seconds REAL,
-    failure TEXT NOT NULL, cameras TEXT NOT NULL);
+    failure TEXT NOT NULL, cameras TEXT NOT NULL, cloud TEXT NOT NULL);
 CREATE TABLE IF NOT EXISTS event (place INTEGER PRIMARY KEY, kind TEXT, seconds REAL, text TEXT);
 """
 
@@ -147,12 +147,13 @@ class JournalTables:
     def scenes(self) -> tuple[SceneRecord, ...]:
         """What came of each batch that was reconstructed, by name."""
         columns = "batch, images, placed, models, points, seconds, failure"
-        rows = self._db.execute(f"SELECT {columns}, cameras FROM scene ORDER BY batch")
-        found = []
-        for *values, cameras in rows:
-            known = tuple(CameraRecord(**camera) for camera in json.loads(cameras))
-            found.append(replace(SceneRecord(*values), cameras=known))
-        return tuple(found)
+        rows = self._db.execute(f"SELECT {columns}, cameras, cloud FROM scene ORDER BY batch")
+        return tuple(
+            SceneRecord(
+                *values, tuple(CameraRecord(**one) for one in json.loads(cameras)), tuple(json.loads(cloud))
+            )
+            for *values, cameras, cloud in rows
+        )
 
     def results(self, pair: int, units: Mapping[str, Unit]) -> tuple[UnitResult, ...]:
         """What the units found on a pair, for a later job to build on; ``units`` by name."""

@@ -121,7 +121,7 @@ class Planner:
 
     def next(self, now: float) -> Job | None:
         """The next job, without its pairs; ``None`` where there is nothing to do before another comes back."""
-        if now >= self._stop:
+        if now >= self.stop:
             return None
         while (chunk := self._next_chunk(now)) is not None:
             units = self._units(chunk, now)
@@ -139,7 +139,7 @@ class Planner:
         return None
 
     @property
-    def _stop(self) -> float:
+    def stop(self) -> float:
         """When no unit may be running any more."""
         return self.budget.stop - min(self.reserve, RESERVE_SHARE * self.budget.limit)
 
@@ -169,7 +169,7 @@ class Planner:
         It is one pair where some unit's cost is unknown and cannot be planned, and few where it gets late; in
         the end the first of its units, since what one job does comes back, or is lost, at once.
         """
-        left = self._stop - now
+        left = self.stop - now
         seconds = self.costs.overhead + sum(self.costs.of(unit.name) for unit in lacking)
         most = 1 if unknown else pairs_that_fit(len(todo), seconds, left)
         if todo[most:]:
@@ -204,7 +204,7 @@ class Planner:
     def _deadline(self, lacking: Iterable[Unit], pairs: int, now: float) -> float:
         """Early enough to plan the rest anew, but late enough for twice what the job should take."""
         seconds = pairs * (self.costs.overhead + sum(self.costs.most(unit.name) for unit in lacking))
-        return min(self._stop, now + max(DEADLINE_SHARE * (self._stop - now), 2 * seconds))
+        return min(self.stop, now + max(DEADLINE_SHARE * (self.stop - now), 2 * seconds))
 
     def _units(self, chunk: Chunk, now: float) -> tuple[Unit, ...]:
         """The units for a chunk whose turn has come."""
@@ -215,14 +215,14 @@ class Planner:
             units = self._usable(chunk.units)
         if chunk.phase is Phase.SWEEP:
             return units[:1]
-        return tuple(unit for unit in units if self.costs.most(unit.name) < self._stop - now)
+        return tuple(unit for unit in units if self.costs.most(unit.name) < self.stop - now)
 
     def _usable(self, units: Iterable[Unit]) -> tuple[Unit, ...]:
         return tuple(unit for unit in units if unit.name not in self._retries.unusable)
 
     def _fit(self, units: tuple[Unit, ...], now: float) -> int:
         """How many units all pairs can have in the time left; a change is explained."""
-        left = (self._stop - now) * self.workers
+        left = (self.stop - now) * self.workers
         count, short = units_that_fit(needs(units, self.state.lacking, self.costs), left)
         if count == self._fitting:
             return count
@@ -279,7 +279,7 @@ class Planner:
     def take(self, result: JobResult, now: float) -> list[Outcome]:
         """Take note of a finished job; what it brought, to be kept."""
         job = result.job
-        self._measure(job, result.measured(), now, len(result.outcomes))
+        self._measure(result, now)
         self._end(job)
         self._hung_in_a_row = 0
         if job.exploring and now >= job.deadline:
@@ -301,15 +301,15 @@ class Planner:
         """What a job's own deadline cut off is planned anew."""
         cut = now + max(job.expected) >= job.deadline
         rest = tuple(index for index in job.indices if self.state.can_gain(index, job.units))
-        if cut and rest and not job.exploring and job.deadline < self._stop:
+        if cut and rest and not job.exploring and job.deadline < self.stop:
             self._queue.retry([Chunk(job.phase, rest, job.units, job.shrink)])
 
-    def _measure(self, job: Job, measured: list[tuple[str, float]], now: float, pairs: int) -> None:
-        if measured and job.shrink == 1:
-            for unit, seconds in measured:
-                self.costs.observe(unit, seconds)
+    def _measure(self, result: JobResult, now: float) -> None:
+        if result.results and result.job.shrink == 1:
+            for one in result.results:
+                self.costs.observe(one.unit.name, one.seconds, warm_up=one.warm_up)
             elapsed = (now - self._last_event) * min(self.workers, self._queue.jobs)
-            self.costs.observe_overhead((elapsed - sum(seconds for _, seconds in measured)) / pairs)
+            self.costs.observe_overhead((elapsed - result.unit_seconds) / len(result.outcomes))
         self._last_event = now
 
     def _end(self, job: Job) -> None:
@@ -339,14 +339,14 @@ class Planner:
         extras = not self._rounds.over and is_weak(record, self.recipe.upgrade)
         return record.lacking(self._usable(self.recipe.units if extras else self.recipe.regular))
 
+    def may_gain(self, record: PairRecord) -> bool:
+        """Whether a pair has an F and can get units that it wants."""
+        return bool(record.units and record.index not in self.state.left_alone and self.wanted(record))
+
     @property
     def complete(self) -> bool:
         """Whether every pair has been reached and nothing is wanted for those that can be worked on."""
-        return all(
-            record.reached
-            and not (record.units and record.index not in self.state.left_alone and self.wanted(record))
-            for record in self.records
-        )
+        return all(record.reached and not self.may_gain(record) for record in self.records)
 
     @property
     def progress(self) -> tuple[Phase, int, int]:

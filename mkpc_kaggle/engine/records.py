@@ -4,6 +4,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL, Matrix3
 from mkpc_kaggle.pipeline.pair import PairMatch, Regions
@@ -12,6 +13,8 @@ from mkpc_kaggle.scene.choose import Choice
 from mkpc_kaggle.scene.model import Scene
 
 NOT_REACHED = "not reached in time"
+MOST_POINTS = 400
+"""Of a scene's points that are kept to be drawn."""
 
 
 @dataclass(frozen=True)
@@ -125,20 +128,26 @@ class PairRecord:
 class CameraRecord:
     """A camera of a scene: where it is and looks, in its model's units, and its focal length in pixels.
 
-    ``model`` numbers the models of the batch, the largest is 0; ``seen`` are the points that the image sees.
+    ``down`` is where the image's lower border is; ``size`` are its width and height in pixels. ``model`` numbers
+    the models of the batch, the largest is 0; ``seen`` are the points that the image sees.
     """
 
     image: str
     model: int
     centre: list[float]
     forward: list[float]
+    down: list[float]
     focal: float
+    size: list[int]
     seen: int
 
 
 @dataclass(frozen=True)
 class SceneRecord:
-    """What came of a batch: how many of its images have a camera, in how many models, with how many points."""
+    """What came of a batch: how many of its images have a camera, in how many models, with how many points.
+
+    ``cloud`` are some points of the largest model, evenly chosen, in its units.
+    """
 
     batch: str
     images: int
@@ -148,6 +157,7 @@ class SceneRecord:
     seconds: float
     failure: str
     cameras: tuple[CameraRecord, ...] = ()
+    cloud: tuple[list[float], ...] = ()
 
     @classmethod
     def of(cls, batch: str, scenes: Sequence[Scene], seconds: float, failure: str) -> "SceneRecord":
@@ -158,7 +168,9 @@ class SceneRecord:
                 number,
                 (-image.camera.R.T @ image.camera.t).tolist(),
                 image.camera.R[2].tolist(),
+                image.camera.R[1].tolist(),
                 image.focal,
+                list(image.size),
                 image.points,
             )
             for number, model in enumerate(models)
@@ -174,4 +186,12 @@ class SceneRecord:
             seconds,
             failure or "; ".join(dict.fromkeys(reasons)) or ("" if models else "no matches connect its images"),
             cameras,
+            tuple(evenly(models[0].points, MOST_POINTS).round(4).tolist()) if models else (),
         )
+
+
+def evenly(points: NDArray[np.float64], most: int) -> NDArray[np.float64]:
+    """At most that many of the rows, evenly chosen."""
+    places = np.linspace(0, len(points) - 1, min(most, len(points))).round().astype(int)
+    chosen: NDArray[np.float64] = points[places]
+    return chosen

@@ -1,20 +1,17 @@
-"""Batches reconstructed beside matching: each in a process of its own, which may crash, hang or be killed.
+"""Batches reconstructed beside matching: which of them, when, and for how long.
 
 A batch is taken up when all of its pairs are matched as far as time allows, and once more in the end if pairs of
 it got further matches since. Pairs have the F of their own matches all the while.
 """
 
-import multiprocessing
-import signal
-import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from multiprocessing.connection import Connection
-from multiprocessing.context import SpawnProcess
 from pathlib import Path
+from typing import Protocol
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine.exits import how_it_ended
+from mkpc_kaggle.data.images import Image, Unreadable, read_image
+from mkpc_kaggle.engine.costs import Timeouts
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import Matrix3, Model
 from mkpc_kaggle.scene.choose import Choice
@@ -24,9 +21,11 @@ from mkpc_kaggle.scene.model import Scene
 LEAST_PAIRS = 2
 """Of which three images can be connected."""
 START_SECONDS = 3.0
-"""What a process takes to begin, as far as nothing is known."""
+"""What a process takes to begin."""
 PAIR_SECONDS = 0.2
 """What a pair adds to a reconstruction, as far as nothing is known."""
+MARGIN = 1.5
+"""A batch is given that many times the seconds that those before it took by their pairs."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,82 +39,88 @@ class ScenePair:
 
 
 @dataclass(frozen=True, eq=False)
+class SceneJob:
+    """A batch to reconstruct; plain values, so that it can go to another process or machine."""
+
+    batch: str
+    pairs: tuple[ScenePair, ...]
+    config: SceneConfig
+
+
+SceneAnswer = tuple[tuple[Scene, ...], dict[int, Choice]]
+"""The scenes of a batch, and by a pair's place in the run which F it gets."""
+
+
+class Reconstruction(Protocol):
+    """A batch under way somewhere: it may crash, hang or be killed."""
+
+    def answer(self) -> SceneAnswer | str | None:
+        """What came of it, or why nothing did; ``None`` while it is under way. Does not wait."""
+        ...
+
+    def kill(self) -> None: ...
+
+
+def reconstruct(job: SceneJob, read: Callable[[Path], Image | Unreadable] = read_image) -> SceneAnswer:
+    """Do a job, here; it may end the process, see :mod:`mkpc_kaggle.scene.reconstruct`."""
+    from mkpc_kaggle.scene.read import batch_of
+    from mkpc_kaggle.scene.solve import solve
+
+    readable, batch = batch_of([(pair.images, pair.matches, pair.own) for pair in job.pairs], read)
+    solution = solve(batch, job.config)
+    indices = [job.pairs[place].index for place in readable]
+    return solution.scenes, dict(zip(indices, solution.choices, strict=True))
+
+
+@dataclass(frozen=True, eq=False)
 class SceneResult:
     """What came of a batch: its scenes, and by pair which F it gets; ``failure`` is empty, or says why nothing."""
 
     batch: str
-    scenes: tuple[Scene, ...] = ()
-    choices: Mapping[int, Choice] | None = None
-    seconds: float = 0.0
+    scenes: tuple[Scene, ...]
+    choices: Mapping[int, Choice]
+    seconds: float
     failure: str = ""
 
 
-class Reconstruction:
-    """One batch under way in a process of its own."""
+@dataclass(frozen=True, eq=False)
+class Running:
+    """A reconstruction that began at ``started`` and is taken to hang ``timeout`` seconds later."""
 
-    def __init__(self, batch: str, pairs: Sequence[ScenePair], config: SceneConfig) -> None:
-        self.batch = batch
-        self._started = time.monotonic()
-        context = multiprocessing.get_context("spawn")
-        self._answers, its_answers = context.Pipe(duplex=False)
-        self._process: SpawnProcess = context.Process(
-            target=reconstruct_batch, args=(tuple(pairs), config, its_answers), name="mkpc scene", daemon=True
-        )
-        self._process.start()
-        its_answers.close()
-
-    def result(self) -> SceneResult | None:
-        """What came of it; ``None`` while it is under way."""
-        seconds = time.monotonic() - self._started
-        if not self._answers.poll() and self._process.is_alive():
-            return None
-        try:
-            scenes, choices = self._answers.recv()
-        except (EOFError, OSError):
-            self._process.join(timeout=1.0)  # its pipe closes before it has ended
-            self.kill()
-            return SceneResult(
-                self.batch, seconds=seconds, failure=f"its process ended: {how_it_ended(self._process)}"
-            )
-        self.kill()
-        return SceneResult(self.batch, scenes, choices, seconds)
-
-    def kill(self) -> None:
-        self._process.kill()
-        self._process.join(timeout=1.0)
-
-
-def reconstruct_batch(pairs: Sequence[ScenePair], config: SceneConfig, answers: Connection) -> None:
-    """The life of a process: sends the scenes, and the choice for each pair by its place in the run."""
-    # Ctrl-C reaches every process of a terminal; the parent answers to it, and kills this one.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    from mkpc_kaggle.scene.read import batch_of
-    from mkpc_kaggle.scene.solve import solve
-
-    readable, batch = batch_of([(pair.images, pair.matches, pair.own) for pair in pairs])
-    solution = solve(batch, config)
-    indices = [pairs[place].index for place in readable]
-    answers.send((solution.scenes, dict(zip(indices, solution.choices, strict=True))))
+    reconstruction: Reconstruction
+    started: float
+    timeout: float
 
 
 class SceneQueue:
-    """Which batches to reconstruct, and when: one at a time, beside matching."""
+    """Which batches to reconstruct, and when; ``clock`` and ``limit`` are the run's."""
 
-    def __init__(self, pairs: Sequence[Pair], config: SceneConfig | None) -> None:
+    def __init__(
+        self,
+        pairs: Sequence[Pair],
+        config: SceneConfig | None,
+        clock: Callable[[], float],
+        timeouts: Timeouts,
+        limit: float,
+    ) -> None:
         self.config = config
         batches: dict[str, list[int]] = {}
         for index, pair in enumerate(pairs) if config is not None else ():
             if pair.model is Model.F and pair.intrinsics is None:
                 batches.setdefault(pair.group, []).append(index)
         self.batches = {name: indices for name, indices in batches.items() if len(indices) >= LEAST_PAIRS}
+        self.running: dict[str, Running] = {}
         self._batch_of = {index: name for name, indices in self.batches.items() for index in indices}
         self._changed = set(self.batches)
+        self._taken_up: set[str] = set()
+        self._clock, self._timeouts, self._limit = clock, timeouts, limit
         self._spent_seconds = self._spent_pairs = 0.0
-        self.running: Reconstruction | None = None
 
     def note_solved(self, indices: Iterable[int]) -> None:
         """Pairs that an earlier run had reconstructed: their batches need not be again."""
-        self._changed -= {self._batch_of[index] for index in indices if index in self._batch_of}
+        solved = {self._batch_of[index] for index in indices if index in self._batch_of}
+        self._changed -= solved
+        self._taken_up |= solved
 
     def note_change(self, index: int) -> None:
         """A pair got further matches."""
@@ -126,36 +131,53 @@ class SceneQueue:
         """Whether a reconstruction to come wants the pair's matches."""
         return self._batch_of.get(index) in self._changed
 
-    def due(self, deepened: set[int]) -> str | None:
-        """A batch whose pairs are all matched, as far as time allows; ``None`` while one is under way."""
-        if self.running is not None:
-            return None
+    def due(self, deepened: set[int], *, again: bool) -> str | None:
+        """A batch whose pairs are all matched, as far as time allows; one that was taken up before only ``again``,
+        since its pairs may go on changing.
+        """
         for name in self.batches:
-            if name in self._changed and deepened.issuperset(self.batches[name]):
+            if name not in self._changed or name in self.running or (name in self._taken_up and not again):
+                continue
+            if deepened.issuperset(self.batches[name]):
                 return name
         return None
 
-    def start(self, batch: str, pairs: Sequence[ScenePair]) -> None:
-        assert self.config is not None
+    def start(self, batch: str, reconstruction: Reconstruction) -> None:
+        """Take note of what has begun."""
         self._changed.discard(batch)
-        self.running = Reconstruction(batch, pairs, self.config)
+        self._taken_up.add(batch)
+        timeout = self._timeouts.of_scene(self._forecast(batch), self._limit)
+        self.running[batch] = Running(reconstruction, self._clock(), timeout)
 
-    def finished(self) -> SceneResult | None:
-        """The reconstruction that has ended since, if one has."""
-        result = self.running.result() if self.running is not None else None
-        if result is not None:
-            self.running = None
-            self._spent_seconds += result.seconds
-            self._spent_pairs += len(self.batches[result.batch])
-        return result
+    def finished(self) -> list[SceneResult]:
+        """What has ended since, by itself or because it hung."""
+        ended = [self._result(batch, running) for batch, running in self.running.items()]
+        results = [result for result in ended if result is not None]
+        for result in results:
+            self.running.pop(result.batch).reconstruction.kill()
+        return results
 
     def close(self) -> None:
-        if self.running is not None:
-            self.running.kill()
+        for running in self.running.values():
+            running.reconstruction.kill()
 
-    @property
-    def reserve(self) -> float:
-        """Seconds that the largest batch still to do will most likely take: what comes last cannot run beside."""
-        left = [len(self.batches[name]) for name in self._changed]
-        rate = self._spent_seconds / self._spent_pairs if self._spent_pairs else PAIR_SECONDS
-        return START_SECONDS + rate * max(left) if left else 0.0
+    def reserve(self, at_once: int) -> float:
+        """The seconds that what is left to do will most likely take, ``at_once`` at a time."""
+        left = [self._forecast(name) for name in self._changed | set(self.running)]
+        return max([*left, sum(left) / at_once], default=0.0)
+
+    def _forecast(self, batch: str) -> float:
+        rate = MARGIN * self._spent_seconds / self._spent_pairs if self._spent_pairs else PAIR_SECONDS
+        return START_SECONDS + rate * len(self.batches[batch])
+
+    def _result(self, batch: str, running: Running) -> SceneResult | None:
+        answer, seconds = running.reconstruction.answer(), self._clock() - running.started
+        if answer is None and seconds < running.timeout:
+            return None
+        if answer is None:
+            return SceneResult(batch, (), {}, seconds, f"it hung: no answer for {running.timeout:.0f} s")
+        if isinstance(answer, str):
+            return SceneResult(batch, (), {}, seconds, answer)
+        self._spent_seconds += max(0.0, seconds - START_SECONDS)
+        self._spent_pairs += len(self.batches[batch])
+        return SceneResult(batch, *answer, seconds)

@@ -23,6 +23,7 @@ class UnitResult:
     """What one unit found on one pair, in image pixels, and what it cost in seconds.
 
     ``failure`` is empty, or says why there are no matches, or why the unit ran smaller than it is written.
+    ``warm_up`` says that this process ran the unit for the first time, which may take much longer than later runs.
     """
 
     unit: Unit
@@ -30,6 +31,7 @@ class UnitResult:
     encode_seconds: float = 0.0
     match_seconds: float = 0.0
     failure: str = ""
+    warm_up: bool = False
 
     @property
     def seconds(self) -> float:

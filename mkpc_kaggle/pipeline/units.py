@@ -52,6 +52,7 @@ class UnitRunner:
         self._load_float32 = load_float32
         self._batch = batch
         self._batches: dict[Unit, int] = {}
+        self._ran: set[Unit] = set()
         self._matchers: dict[str, Matcher[Any]] = {}
         self._notes: dict[str, str] = {}
         self._encodings: ByteCache[ViewKey, Any] = ByteCache(cache_bytes)
@@ -110,12 +111,15 @@ class UnitRunner:
         with exact_float32():
             found = matcher.match(encodings[::2], encodings[1::2])
         matched = time.perf_counter()
+        warm_up = unit not in self._ran
+        self._ran.add(unit)
         return [
             UnitResult(
                 unit,
                 matches.to_image(*both).best(unit.max_matches),
                 (encoded - start) / len(pairs),
                 (matched - encoded) / len(pairs),
+                warm_up=warm_up,
             )
             for matches, both in zip(found, views, strict=True)
         ]

@@ -9,7 +9,8 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from importlib.util import find_spec
-from math import inf
+from math import inf, isfinite
+from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, TypeVar
 
@@ -20,7 +21,10 @@ from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.data.images import Unreadable, read_image
 from mkpc_kaggle.engine.budget import format_duration
 from mkpc_kaggle.engine.journal_tables import EventKind
+from mkpc_kaggle.engine.records import SceneRecord
+from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.geometry.metrics import epipolar_shift
 from mkpc_kaggle.geometry.robust import Estimate, Model, sampson_distances
 from mkpc_kaggle.pipeline.pair import PairMatch
 from mkpc_kaggle.pipeline.two_stage import to_image
@@ -208,7 +212,7 @@ def _regions(log: RunLog, artist: Artist) -> Iterator[Block]:
 
 
 def _scenes(log: RunLog, artist: Artist) -> Iterator[Block]:
-    """The batches that were reconstructed: cameras from above, and which pairs have their F from there."""
+    """The batches that were reconstructed: cameras and points, and which pairs have their F from there."""
     if not log.scenes:
         yield Text("No batch was reconstructed: recipe or command say so, or none has three images.", dim=True)
         return
@@ -220,17 +224,49 @@ def _scenes(log: RunLog, artist: Artist) -> Iterator[Block]:
     rows = [
         (
             *(scene.batch, f"{scene.placed} of {scene.images}", scene.points),
-            f"{median(camera.focal for camera in scene.cameras):.0f}" if scene.cameras else "-",
+            _focals(scene),
             *(f"{scene.seconds:.1f}", int(counts.get(scene.batch, 0)), scene.failure),
         )
         for scene in log.scenes
     ]
-    heads = ("batch", "images", "points", "focal (px)", "seconds", "pairs", "failure")
+    heads = ("batch", "images", "points", "focals (px): least / median / most", "seconds", "pairs", "failure")
     yield from first_rows(heads, rows)
     reasons = Counter(str(record.scene.reason) for record in log.records if record.scene is not None)
     yield Table(("which F a pair has, and why", "pairs"), list(reasons.most_common()))
     alone = sum(record.source == "scene" and bool(record.failure) for record in log.records)
     yield Text(f"{alone} pairs would have no F without their scene.")
+    yield from _shifts(log)
+
+
+def _focals(scene: SceneRecord) -> str:
+    focals = [camera.focal for camera in scene.cameras]
+    return f"{min(focals):.0f} / {median(focals):.0f} / {max(focals):.0f}" if focals else "-"
+
+
+def _shifts(log: RunLog) -> Iterator[Block]:
+    """The pairs whose F the scene changed, and by how much."""
+    sizes = {
+        (scene.batch, Path(camera.image).name): Size(*camera.size)
+        for scene in log.scenes
+        for camera in scene.cameras
+    }
+    moved = []
+    for record in log.records:
+        pair = log.pairs[record.index]
+        size0, size1 = (sizes.get((pair.group, image.name)) for image in pair.images)
+        if record.source == "scene" and not record.failure and size0 and size1:
+            shift = epipolar_shift(record.F, record.fundamental, size0, size1)
+            moved.append((pair.id, record.matches, record.inliers, shift))
+    moved = sorted((row for row in moved if isfinite(row[3])), key=lambda row: -row[3])
+    if not moved:
+        return
+    low, middle, high = np.percentile([shift for *_, shift in moved], (10, 50, 90))
+    yield Text(
+        f"The scene moved the epipolar lines of {len(moved)} pairs by {middle:.1f} pixels in the median "
+        f"(a tenth by less than {low:.1f}, a tenth by more than {high:.1f}). The most:"
+    )
+    rows = [(*rest, f"{shift:.1f}") for *rest, shift in moved[: 2 * MOST_CHANGES]]
+    yield Table(("pair", "matches", "own inliers", "moved (px)"), rows)
 
 
 def _weakest(log: RunLog, artist: Artist) -> Iterator[Block]:

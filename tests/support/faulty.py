@@ -14,14 +14,14 @@ import numpy as np
 from rectified import RectifiedMatcher, Seen
 
 from mkpc_kaggle.data.images import Unreadable
-from mkpc_kaggle.engine.scenes import ScenePair, reconstruct_batch
+from mkpc_kaggle.engine.pools.scene_process import serve_scene
+from mkpc_kaggle.engine.scenes import SceneJob
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.pipeline.assembly import Assembly
 from mkpc_kaggle.pipeline.stages import Pipeline
 from mkpc_kaggle.scene.choose import Choice, Reason
-from mkpc_kaggle.scene.config import SceneConfig
 from mkpc_kaggle.scene.model import Model, PlacedImage, Scene
 
 
@@ -64,9 +64,14 @@ def hang() -> None:
 
 def exhaust_memory() -> None:
     """Ask for more than a limit allows."""
-    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-    resource.setrlimit(resource.RLIMIT_AS, (used + (64 << 20), resource.RLIM_INFINITY))
+    limit_memory(64 << 20)
     np.ones(1 << 28)
+
+
+def limit_memory(bytes_left: int) -> None:
+    """Let this process have so much more than it has now."""
+    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (used + bytes_left, resource.RLIM_INFINITY))
 
 
 def exhaust_gpu() -> None:
@@ -193,14 +198,15 @@ SCENE_F = np.array([[0.0, 0, 0.2], [0, 0, -0.5], [-0.3, 0.6, 0.5]])
 """What the scene of these tests says of every pair."""
 
 
-def choose_scene_for_all_but_the_first(pairs: Sequence[ScenePair], _: SceneConfig, answers: Connection) -> None:
-    """As a reconstruction would, without one."""
-    choices = {pair.index: Choice(SCENE_F, Reason.SCENE) for pair in pairs[1:]}
-    choices[pairs[0].index] = Choice(None, Reason.CONTRADICTION)
-    names = tuple(sorted({str(path) for pair in pairs for path in pair.images}))
+def choose_scene_for_all_but_the_first(job: SceneJob, answers: Connection) -> None:
+    """As a reconstruction would, without one; it makes as many points as there are matches."""
+    choices = {pair.index: Choice(SCENE_F, Reason.SCENE) for pair in job.pairs[1:]}
+    choices[job.pairs[0].index] = Choice(None, Reason.CONTRADICTION)
+    names = tuple(sorted({str(path) for pair in job.pairs for path in pair.images}))
     camera = Camera(np.eye(3), np.eye(3), np.zeros(3))
     placed = tuple(PlacedImage(name, Size(80, 72), camera, 99) for name in names)
-    answers.send(((Scene(names, (Model(placed, np.zeros((5, 3)), 0.5),)),), choices))
+    points = np.zeros((sum(len(pair.matches) for pair in job.pairs), 3))
+    answers.send(((Scene(names, (Model(placed, points, 0.5),)),), choices))
 
 
 def die_as_scene(*_: object) -> None:
@@ -215,11 +221,26 @@ def hang_as_scene(*_: object) -> None:
     hang()
 
 
+def hang_as_scene_of_batch_one(job: SceneJob, answers: Connection) -> None:
+    if job.batch == "one":
+        hang()
+    choose_scene_for_all_but_the_first(job, answers)
+
+
 def exhaust_memory_as_scene(*_: object) -> None:
     sys.stderr = open(os.devnull, "w")  # noqa: PTH123, SIM115  # its traceback is no part of the test's output
     exhaust_memory()
 
 
-def scene_without_pycolmap(pairs: Sequence[ScenePair], config: SceneConfig, answers: Connection) -> None:
+def exhaust_memory_within_pycolmap(job: SceneJob, answers: Connection) -> None:
+    """Four megabytes are left when it begins."""
+    import mkpc_kaggle.scene.reconstruct  # noqa: F401  # that is not what fails
+
+    limit_memory(4 << 20)
+    os.close(2)
+    serve_scene(job, answers)
+
+
+def scene_without_pycolmap(job: SceneJob, answers: Connection) -> None:
     sys.modules["pycolmap"] = None  # type: ignore[assignment]  # an import of it fails now
-    reconstruct_batch(pairs, config, answers)
+    serve_scene(job, answers)

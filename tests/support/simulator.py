@@ -1,7 +1,8 @@
 """The engine on a virtual clock: random runs without images, and how well each used its time.
 
 The planner and the engine are the real ones. Workers are simulated: what a unit costs is drawn at random, and
-drifts, stalls, crashes, hangs and wrong first estimates are thrown in.
+drifts, stalls, crashes, hangs and wrong first estimates are thrown in. So are reconstructions of batches, which
+crash, run out of memory and hang as well.
 """
 
 import heapq
@@ -9,7 +10,7 @@ import math
 import threading
 import time
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,13 +19,16 @@ from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.engine import Ending, Engine, RunReport
 from mkpc_kaggle.engine.jobs import Cause, Job, JobFailure, JobResult, Outcome
+from mkpc_kaggle.engine.planner import RESERVE_SHARE
 from mkpc_kaggle.engine.pools.pool import JOBS_A_WORKER
 from mkpc_kaggle.engine.records import NOT_REACHED, PairRecord, SceneRecord, UnitRecord
+from mkpc_kaggle.engine.scenes import MARGIN, START_SECONDS, SceneAnswer, SceneJob
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
 from mkpc_kaggle.pipeline.pair import UnitResult
 from mkpc_kaggle.recipe import Recipe, Unit
-from mkpc_kaggle.scene.choose import Choice
+from mkpc_kaggle.scene.choose import Choice, Reason
+from mkpc_kaggle.scene.config import SceneConfig
 
 RESTART_SECONDS = 8.0
 STALL = 20.0
@@ -40,6 +44,9 @@ class Scenario:
     ``spread`` is the sigma of lognormal costs, ``misses`` the share of pairs whose views are not cached and cost
     ``miss_factor`` times as much, ``warm_up`` what a unit takes the first time on a worker. From ``turn``, a share
     of the limit, on costs are ``drift`` times as high.
+
+    The pairs are in so many ``batches``; 0: there are no scenes. A scene takes ``scene_seconds`` a pair of its
+    batch, and with the probability ``scene_faults`` it crashes, runs out of memory or hangs.
     """
 
     pairs: int
@@ -56,6 +63,9 @@ class Scenario:
     stalls: float = 0.0
     crashes: float = 0.0
     hangs: float = 0.0
+    batches: int = 0
+    scene_seconds: float = 0.06
+    scene_faults: float = 0.0
     seed: int = 0
 
     @property
@@ -65,7 +75,7 @@ class Scenario:
             Unit(1 if number % 2 == 0 else 2, f"m{number}", 100, extra=number >= count - self.extras)
             for number in range(count)
         ]
-        return Recipe(tuple(units))
+        return Recipe(tuple(units), scene=SceneConfig() if self.batches else None)
 
     @property
     def work(self) -> float:
@@ -77,6 +87,11 @@ class Scenario:
     def cached(self) -> float:
         """What a unit costs on average, in terms of one on a cached view."""
         return 1 + self.misses * (self.miss_factor - 1)
+
+    @property
+    def longest_scenes(self) -> float:
+        """Seconds that all scenes take on average, if all is slow from the first moment on."""
+        return max(1.0, self.drift) * (self.batches * START_SECONDS + self.pairs * self.scene_seconds)
 
 
 def random_scenario(seed: int, pairs: int) -> Scenario:
@@ -104,8 +119,15 @@ def random_scenario(seed: int, pairs: int) -> Scenario:
     seconds = sum(costs) / len(costs) * scenario.cached
     runs = min(scenario.pairs * len(costs), limit * scenario.workers / seconds)
     rates = [float(rng.uniform(0, most)) / runs if troubled else 0.0 for most in (30, 3, 1)]
-    return Scenario(
-        **{**vars(scenario), "limit": limit, "stalls": rates[0], "crashes": rates[1], "hangs": rates[2]}
+    return replace(
+        scenario,
+        limit=limit,
+        stalls=rates[0],
+        crashes=rates[1],
+        hangs=rates[2],
+        batches=int(rng.choice([0, 1, 5, 15, 40])),
+        scene_seconds=float(np.exp(rng.normal(np.log(0.06), 0.8))),
+        scene_faults=float(rng.uniform(0, 0.3)) if troubled else 0.0,
     )
 
 
@@ -123,14 +145,17 @@ class SimulatedPool:
     Of their seconds until ``stop``, ``kept`` went into jobs that came back in time. ``faults`` are what injected
     faults take whatever is planned: the unit that a crash cut short, of a hang as long as a stall might have
     taken, which it cannot be told from sooner, a stall that was taken for a hang, and the new worker's start
-    after any of these.
+    after any of these. ``scenes`` are those under way and done.
     """
 
     def __init__(self, scenario: Scenario, clock: VirtualClock, stop: float) -> None:
         self.scenario = scenario
         self.clock = clock
         self.kept = self.faults = 0.0
+        self.scenes: list[SimulatedScene] = []
+        self.last_job = 0.0
         self._rng = np.random.default_rng(scenario.seed)
+        self._scene_rng = np.random.default_rng([scenario.seed, 1])
         self._costs = {unit.name: cost for unit, cost in zip(scenario.recipe.units, scenario.costs, strict=True)}
         self._stop = stop
         self._free = [RESTART_SECONDS] * scenario.workers
@@ -162,12 +187,28 @@ class SimulatedPool:
         kept = 0.0 if lost else min(ended, self._stop) - begun
         heapq.heappush(self._coming, (ended, self._count, kept, back))
 
+    scenes_at_once = 1
+
+    def reconstruct(self, job: SceneJob) -> "SimulatedScene":
+        scenario, rng = self.scenario, self._scene_rng
+        spread = math.exp(0.3 * rng.normal() - 0.3**2 / 2)
+        seconds = START_SECONDS + spread * scenario.scene_seconds * len(job.pairs)
+        if self.clock.now > scenario.turn * scenario.limit:
+            seconds *= scenario.drift
+        answer: SceneAnswer | str
+        answer = (), {pair.index: Choice(FALLBACK_FUNDAMENTAL, Reason.SCENE) for pair in job.pairs}
+        if rng.random() < scenario.scene_faults:
+            faults = ((seconds / 2, "signal SIGSEGV"), (seconds / 3, "exit status 1"), (math.inf, "it hangs"))
+            seconds, answer = faults[rng.integers(len(faults))]
+        self.scenes.append(SimulatedScene(self.clock, self.clock.now, seconds, answer, job.batch))
+        return self.scenes[-1]
+
     def next(self, until: float) -> JobResult | JobFailure | None:
         if not self._coming or self._coming[0][0] > until:
             self.clock.now = max(self.clock.now, until)
             return None
         ended, _, kept, back = heapq.heappop(self._coming)
-        self.clock.now = max(self.clock.now, ended)
+        self.clock.now = self.last_job = max(self.clock.now, ended)
         self.kept += max(0.0, kept)
         return back
 
@@ -188,7 +229,9 @@ class SimulatedPool:
                     continue
                 stalled = self._rng.random() < self.scenario.stalls
                 usual = self._seconds(unit, now) * job.shrink**2
-                seconds = usual * (STALL if stalled else 1.0) + self._warm_up(unit, worker)
+                warm_up = (worker, unit.name) not in self._warm
+                self._warm.add((worker, unit.name))
+                seconds = usual * (STALL if stalled else 1.0) + self.scenario.warm_up * warm_up
                 fate = self._rng.random()
                 if fate < self.scenario.crashes:
                     return now + seconds / 2, JobFailure(job, Cause.DIED), seconds / 2
@@ -197,15 +240,9 @@ class SimulatedPool:
                 if seconds > job.timeout:
                     return now + job.timeout, JobFailure(job, Cause.HUNG), job.timeout if stalled else 0.0
                 now += seconds
-                found.append(UnitResult(unit, Matches.empty(), 0.0, seconds))
+                found.append(UnitResult(unit, Matches.empty(), 0.0, seconds, warm_up=warm_up))
         pairs = zip(job.indices, job.known, results, strict=True)
         return now, JobResult(job, tuple(self._outcome(job, *pair) for pair in pairs)), 0.0
-
-    def _warm_up(self, unit: Unit, worker: int) -> float:
-        if (worker, unit.name) in self._warm:
-            return 0.0
-        self._warm.add((worker, unit.name))
-        return self.scenario.warm_up
 
     def _seconds(self, unit: Unit, now: float) -> float:
         scenario, rng = self.scenario, self._rng
@@ -224,6 +261,27 @@ class SimulatedPool:
             for one in (*known, *found)
         )
         return Outcome(PairRecord(index, FALLBACK_FUNDAMENTAL, "", units), tuple(found))
+
+
+@dataclass
+class SimulatedScene:
+    """A reconstruction that ends by itself; ``seen`` is when somebody asked after that."""
+
+    clock: VirtualClock
+    begun: float
+    seconds: float
+    found: SceneAnswer | str
+    batch: str
+    seen: float = field(default=0.0, init=False)
+
+    def answer(self) -> SceneAnswer | str | None:
+        if self.clock.now < self.begun + self.seconds:
+            return None
+        self.seen = self.clock.now
+        return self.found
+
+    def kill(self) -> None:
+        pass
 
 
 class MemoryJournal:
@@ -264,10 +322,13 @@ class Ran:
     budget's stop, without those that injected faults take from any planner (see :class:`SimulatedPool`). Used are
     the seconds of jobs whose results came back in time, warm-ups and stalls included. So idle workers, the end of
     a phase, what a lost job had done before, silence longer than a stall's, a slow unit taken to hang, and what
-    is still under way at the end all count against the engine.
+    is still under way at the end all count against the engine. Nothing else can be done while the last scenes are
+    reconstructed: what they take after the last job is used.
 
     ``lost`` counts pairs without the sweep's F where the sweep fits (see :func:`sweep_seconds`), and versions of
-    the submission that lack a row.
+    the submission that lack a row. ``missed`` are batches without a scene that no fault befell; ``scenes_fit``
+    says that what is left to scenes at most suffices for all, and that none hung while others waited. ``last_job``
+    is when the last job came back.
     """
 
     scenario: Scenario
@@ -275,6 +336,10 @@ class Ran:
     utilisation: float
     late: float
     lost: int
+    missed: int
+    scenes_fit: bool
+    last_job: float
+    scenes: tuple[SimulatedScene, ...]
     jobs: int
     planning: float
 
@@ -288,7 +353,8 @@ def simulate(scenario: Scenario) -> Ran:
     clock = VirtualClock()
     budget = Budget(0.0, scenario.limit, clock)
     pool = SimulatedPool(scenario, clock, budget.stop)
-    pairs = [Pair(str(n), "set", Path(f"{n:07d}"), Path("b")) for n in range(scenario.pairs)]
+    share = max(1, scenario.batches) / scenario.pairs
+    pairs = [Pair(str(n), f"{int(n * share):03d}", Path(f"{n:07d}"), Path("b")) for n in range(scenario.pairs)]
     published: list[int] = []
     engine = Engine(
         pairs,
@@ -316,15 +382,27 @@ def simulate(scenario: Scenario) -> Ran:
     swept = sum(record.matches > 0 for record in report.records)
     sweep_fits = sweep_seconds(scenario) < SWEEP_SHARE * scenario.limit
     given = pool.workers * (min(budget.stop, clock.now) - RESTART_SECONDS) - pool.faults
+    last_scene = max((scene.seen for scene in pool.scenes), default=0.0)
+    used = pool.kept + pool.workers * max(0.0, min(last_scene, budget.stop) - pool.last_job)
+    faulty = {scene.batch for scene in pool.scenes if isinstance(scene.found, str)}
+    made = {pairs[record.index].group for record in report.records if record.scene is not None}
     return Ran(
         scenario,
         report,
-        pool.kept / given,
+        used / given,
         max(0.0, clock.now - scenario.limit),
         sum(length != scenario.pairs for length in published) + (scenario.pairs - swept if sweep_fits else 0),
+        len(set(engine.scenes.batches) - faulty - made),
+        MARGIN * scenario.longest_scenes < RESERVE_SHARE * scenario.limit and not any(map(_hangs, pool.scenes)),
+        pool.last_job,
+        tuple(pool.scenes),
         jobs,
         planning / max(1, jobs),
     )
+
+
+def _hangs(scene: SimulatedScene) -> bool:
+    return math.isinf(scene.seconds)
 
 
 def sweep_seconds(scenario: Scenario) -> float:
@@ -342,4 +420,4 @@ def sweep_seconds(scenario: Scenario) -> float:
 
 def without_records(ran: Ran) -> Ran:
     """The run without what it found: kept of a thousand runs, that would slow down all that come after."""
-    return replace(ran, report=replace(ran.report, records=()))
+    return replace(ran, report=replace(ran.report, records=()), scenes=())

@@ -12,6 +12,8 @@ from pathlib import Path
 from typing import ClassVar, Protocol
 
 from mkpc_kaggle.engine.jobs import Cause, Job, JobFailure, JobResult
+from mkpc_kaggle.engine.pools.scene_process import SceneProcess
+from mkpc_kaggle.engine.scenes import Reconstruction, SceneJob
 from mkpc_kaggle.engine.worker import Answer, estimate
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.pipeline.failures import DeviceError
@@ -119,6 +121,15 @@ class Pool:
             return None
         self._out -= 1
         return back
+
+    @property
+    def scenes_at_once(self) -> int:
+        """How many batches may be reconstructed at a time, beside matching."""
+        return 1
+
+    def reconstruct(self, job: SceneJob) -> Reconstruction:
+        """Begin to reconstruct a batch."""
+        return SceneProcess(job)
 
     def stop(self) -> None:
         """Begin no further unit: jobs under way and those that wait end with what they have."""

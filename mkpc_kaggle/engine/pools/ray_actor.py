@@ -3,6 +3,7 @@
 import tempfile
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import ray
 from mkpc_kaggle import __version__
 from mkpc_kaggle.data.images import Image, ImageStore, Unreadable, decode_image, read_image
 from mkpc_kaggle.engine.jobs import Job
+from mkpc_kaggle.engine.scenes import SceneAnswer, SceneJob, reconstruct
 from mkpc_kaggle.engine.worker import Answer, Worker
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.pipeline.assembly import Assembly
@@ -83,8 +85,7 @@ class WorkerActor:
         self._last_heartbeat = time.monotonic()
 
     def _fetch(self, path: Path, stamp: Stamp | None) -> bytes | None:
-        found: bytes | None = ray.get(self._files.fetch.remote(path, stamp))
-        return found
+        return fetch_from(self._files, path, stamp)
 
     def _fetch_whole(self, path: Path) -> bytes:
         data = self._fetch(path, None)
@@ -93,6 +94,22 @@ class WorkerActor:
 
     def _pipeline(self) -> Pipeline:
         return self._assembly.pipeline()
+
+
+class SceneActor:
+    """Reconstructs one batch; ``files`` is the :class:`FileServer`."""
+
+    def __init__(self, files: Any) -> None:
+        self._files = files
+
+    def reconstruct(self, job: SceneJob) -> SceneAnswer:
+        return reconstruct(job, lambda path: read_or_fetch(path, partial(fetch_from, self._files)))
+
+
+def fetch_from(files: Any, path: Path, stamp: Stamp | None) -> bytes | None:
+    """What the :class:`FileServer` answers, see there."""
+    found: bytes | None = ray.get(files.fetch.remote(path, stamp))
+    return found
 
 
 def read_or_fetch(path: Path, fetch: Fetch) -> Image | Unreadable:

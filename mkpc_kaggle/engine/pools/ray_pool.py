@@ -8,6 +8,7 @@ import re
 import textwrap
 import threading
 import time
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -22,7 +23,8 @@ from mkpc_kaggle import __version__
 from mkpc_kaggle.engine.jobs import Cause, Job, JobFailure
 from mkpc_kaggle.engine.pools.cluster import RayCluster, own_signals
 from mkpc_kaggle.engine.pools.pool import START_SECONDS, Place, Pool
-from mkpc_kaggle.engine.pools.ray_actor import FileServer, WorkerActor
+from mkpc_kaggle.engine.pools.ray_actor import FileServer, SceneActor, WorkerActor
+from mkpc_kaggle.engine.scenes import Reconstruction, SceneAnswer, SceneJob
 from mkpc_kaggle.engine.worker import Answer
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.pipeline.assembly import Assembly
@@ -43,15 +45,25 @@ class RayPool(Pool):
         self._assembly = assembly
         self._cluster = cluster
         self._joined = False
+        self._slots: Slots | None = None
 
     def start(self) -> str:
         self._joined = not ray.is_initialized()
         if self._joined:
             join(self._cluster)
-        slots = Slots(self._assembly)
-        start = partial(RayWorker, slots)
-        self._settle([Place(f"actor {number}", start) for number, _ in enumerate(slots.all())])
+        self._slots = Slots(self._assembly)
+        start = partial(RayWorker, self._slots)
+        self._settle([Place(f"actor {number}", start) for number, _ in enumerate(self._slots.all())])
         return super().start()
+
+    @property
+    def scenes_at_once(self) -> int:
+        """One on each machine."""
+        return max(1, len(self._slots.machines())) if self._slots is not None else super().scenes_at_once
+
+    def reconstruct(self, job: SceneJob) -> Reconstruction:
+        """On a machine of the cluster; here in a run that had nothing to match, and joined none."""
+        return super().reconstruct(job) if self._slots is None else RayScene(self._slots, job)
 
     def close(self) -> bool:
         at_rest = super().close()
@@ -102,11 +114,12 @@ def slots_of(nodes: Iterable[Mapping[str, Any]], device: str) -> list[Slot]:
 
 
 class Slots:
-    """The cluster's slots, each taken by one actor at most."""
+    """The cluster's slots, each taken by one actor at most; ``scenes`` counts those under way on each machine."""
 
     def __init__(self, assembly: Assembly) -> None:
         self._assembly = assembly
         self._taken: set[Slot] = set()
+        self.scenes: Counter[str] = Counter()
         self._lock = threading.Lock()
         here = ray.get_runtime_context().get_node_id()
         self._files = (
@@ -131,6 +144,10 @@ class Slots:
                 self._taken.add(slot)
             return slot
 
+    def machines(self) -> list[Slot]:
+        """A slot of each machine that there is now, taken or not."""
+        return list({slot.node: slot for slot in slots_of(ray.nodes(), self._assembly.device)}.values())
+
     def release(self, slot: Slot) -> None:
         with self._lock:
             self._taken.discard(slot)
@@ -138,6 +155,11 @@ class Slots:
     def is_alive(self, slot: Slot) -> bool:
         """Is the machine still there?"""
         return any(node["Alive"] for node in ray.nodes() if node["NodeID"] == slot.node)
+
+    def scene_actor(self, slot: Slot) -> Any:
+        """An actor for one batch on that slot's machine, beside the worker."""
+        where = on_node(slot.node)
+        return ray.remote(SceneActor).options(num_cpus=0, scheduling_strategy=where).remote(self._files)
 
     def actor(self, slot: Slot) -> Any:
         """An actor in that slot, and nowhere else."""
@@ -233,7 +255,53 @@ class RayWorker:
             return NoAnswer(Cause.DIED if alive else Cause.MACHINE, self._message(error))
 
     def _message(self, error: Exception) -> str:
-        """Where it was and what Ray says of it, shortened: Ray is lengthy, and begins with its own ids."""
-        lines = [line for line in str(error).splitlines() if not re.match(r"\t\w+: ", line)]
-        host = self._slot.host if self._slot is not None else ""
-        return f"on {host}: {textwrap.shorten(' '.join(lines[1:] or lines), 240)}"
+        return message_of(error, self._slot.host if self._slot is not None else "")
+
+
+class RayScene:
+    """A batch under way in an actor of its own; begun again on another machine where its own is lost.
+
+    See :class:`mkpc_kaggle.engine.scenes.Reconstruction`.
+    """
+
+    def __init__(self, slots: Slots, job: SceneJob) -> None:
+        self._slots = slots
+        self._job = job
+        self._failure = ""
+        self._actor: Any = None
+        self._begin()
+
+    def answer(self) -> SceneAnswer | str | None:
+        if self._failure or not ray.wait([self._coming], timeout=0)[0]:
+            return self._failure or None
+        try:
+            answer: SceneAnswer = ray.get(self._coming)
+        except ray.exceptions.RayError as error:
+            if self._slots.is_alive(self._slot):
+                return message_of(error, self._slot.host)
+            self._begin()
+            return self._failure or None
+        return answer
+
+    def kill(self) -> None:
+        if self._actor is not None:
+            with suppress(ray.exceptions.RayError):
+                ray.kill(self._actor)
+            self._slots.scenes[self._slot.node] -= 1
+
+    def _begin(self) -> None:
+        """On the machine that has the fewest of these; or fail, where there is none any more."""
+        machines = self._slots.machines()
+        if not machines:
+            self._failure = "the cluster has lost its machines"
+            return
+        self._slot = min(machines, key=lambda slot: self._slots.scenes[slot.node])
+        self._slots.scenes[self._slot.node] += 1
+        self._actor = self._slots.scene_actor(self._slot)
+        self._coming = self._actor.reconstruct.remote(self._job)
+
+
+def message_of(error: Exception, host: str) -> str:
+    """Where it was and what Ray says of it, shortened: Ray is lengthy, and begins with its own ids."""
+    lines = [line for line in str(error).splitlines() if not re.match(r"\t\w+: ", line)]
+    return f"on {host}: {textwrap.shorten(' '.join(lines[1:] or lines), 240)}"

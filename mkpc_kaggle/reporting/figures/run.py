@@ -5,10 +5,12 @@ from itertools import cycle
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mkpc_kaggle.reporting.figures.canvas import (
     CLUSTERS,
     CYCLE,
+    DROPPED,
     INK,
     MOST_LINES,
     OUTLIER,
@@ -23,7 +25,7 @@ from mkpc_kaggle.reporting.figures.canvas import (
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from mkpc_kaggle.engine.records import SceneRecord
+    from mkpc_kaggle.engine.records import CameraRecord, SceneRecord
 
 MOST_EMPTY = 4
 """How many times as long as the run a time limit may be to be drawn beside it."""
@@ -151,26 +153,49 @@ def draw_crops(sizes: Mapping[str, Sequence[tuple[int, int]]]) -> "Figure":
 
 
 def draw_cameras(scene: "SceneRecord") -> "Figure":
-    """The cameras of a batch from above and from the side, an arrow the way each looks; in the models' own units.
+    """The cameras and points of a batch's largest model from above and from the side, in its own units.
 
-    Above is where the cameras' common up direction points, as far as they were held upright.
+    An arrow points the way a camera looks. Up is where the images' upper borders are on average, and the cameras
+    look ahead. Points far away from nearly all others are cut off.
     """
-    figure = new_figure(8.4, 3.6)
+    figure = new_figure(8.4, 4.0)
     cameras = [camera for camera in scene.cameras if camera.model == 0]
+    right, ahead, up = axes_of(cameras)
     centres = np.array([camera.centre for camera in cameras])
     looks = np.array([camera.forward for camera in cameras])
-    axes = np.linalg.svd(centres - centres.mean(axis=0))[2]  # along, across, and up for cameras on the ground
-    spread = np.ptp(centres @ axes.T, axis=0).max() or 1.0
-    sides = (("above", 1), ("the side", 2))
-    for panel, (name, upward) in zip(figure.subplots(1, 2), sides, strict=True):
+    cloud = np.array(scene.cloud).reshape(-1, 3)
+    arrow = 0.25 * (np.ptp(centres, axis=0).max() or 1.0)
+    sides = (("above", right, ahead), ("the side", ahead, up))
+    for panel, (name, across, upward) in zip(figure.subplots(1, 2), sides, strict=True):
         plain(panel, f"{short(scene.batch)}: {len(cameras)} cameras from {name}")
-        x, y = centres @ axes[0], centres @ axes[upward]
-        u, v = looks @ axes[0], looks @ axes[upward]
-        panel.quiver(x, y, u, v, color=CLUSTERS[3], angles="xy", scale_units="xy", scale=8 / spread, width=0.004)
+        x, y = centres @ across, centres @ upward
+        near = _near(cloud @ across) & _near(cloud @ upward)
+        panel.scatter(cloud[near] @ across, cloud[near] @ upward, s=2, color=DROPPED, linewidths=0)
+        panel.quiver(
+            *(x, y, arrow * looks @ across, arrow * looks @ upward),
+            **{"angles": "xy", "scale_units": "xy", "scale": 1, "width": 0.004, "color": CLUSTERS[3]},
+        )
         panel.scatter(x, y, s=14, color=OUTLIER, linewidths=0, zorder=3)
         panel.set_aspect("equal", adjustable="datalim")
-        panel.margins(0.2)
+        panel.margins(0.1)
     return figure
+
+
+def axes_of(cameras: "Sequence[CameraRecord]") -> NDArray[np.float64]:
+    """(3, 3), rows right, ahead and up of a scene as :func:`draw_cameras` shows it, in its own units."""
+    down = np.mean([camera.down for camera in cameras], axis=0)
+    forward = np.mean([camera.forward for camera in cameras], axis=0)
+    up = -down / np.linalg.norm(down)
+    ahead = forward - forward @ up * up
+    ahead /= np.linalg.norm(ahead)
+    return np.stack([np.cross(ahead, up), ahead, up])
+
+
+def _near(values: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Which values are not much farther out than nearly all of them."""
+    low, high = np.percentile(values, (3, 97)) if len(values) else (0.0, 0.0)
+    near: NDArray[np.bool_] = np.abs(values - (low + high) / 2) <= 0.7 * (high - low)
+    return near
 
 
 def _time_unit(seconds: float) -> tuple[float, str]:
