@@ -18,7 +18,7 @@ from mkpc_kaggle.engine.planner import Explanation, Planner
 from mkpc_kaggle.engine.pools.pool import Pool
 from mkpc_kaggle.engine.progress import progress_on
 from mkpc_kaggle.engine.records import PairRecord, SceneRecord
-from mkpc_kaggle.engine.scenes import SceneJob, ScenePair, SceneQueue, SceneResult
+from mkpc_kaggle.engine.scenes import SceneJob, ScenePair, SceneQueue, SceneResult, pairs_to_add
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.pipeline.pair import UnitResult
 from mkpc_kaggle.recipe import Recipe, Unit
@@ -97,7 +97,8 @@ class Engine:
         progress: bool = True,
         timeouts: Timeouts | None = None,
     ) -> None:
-        self.pairs = pairs
+        self.asked = len(pairs)
+        self.pairs = [*pairs, *pairs_to_add(pairs, recipe.scene)]
         self.recipe = recipe
         self.pool = pool
         self.journal = journal
@@ -114,21 +115,21 @@ class Engine:
         self._progress = progress_on(sys.stderr, budget) if progress else None
         self._publishing = threading.Lock()
         self.planner = self._planner(timeouts)
-        self.scenes = SceneQueue(pairs, recipe.scene, budget.clock, self.planner.timeouts, budget.limit)
+        self.scenes = SceneQueue(self.pairs, recipe.scene, budget.clock, self.planner.timeouts, budget.limit)
         self._scene_records = {scene.batch: scene for scene in journal.scenes()}
         self.scenes.note_solved(record.index for record in self.planner.records if record.scene is not None)
 
     def run(self) -> RunReport:
         """Run until all is done, the time is up, or an interrupt; raises only what the pool's start raises."""
-        records = self.planner.records
-        resumed = sum(not record.lacking(self.recipe.regular) for record in records)
+        resumed = sum(not record.lacking(self.recipe.regular) for record in self.records)
         self._publish()
         try:
-            if any(self.planner.wanted(record) for record in records):
+            if any(self.planner.wanted(record) for record in self.records):
                 if message := self.pool.start():
                     warnings.warn(message, stacklevel=2)  # now, since the summary is hours away
                     self._fault(message)
-                self._work()
+                while self._work():
+                    self._finish()  # what scenes need less than was kept for them is matching's again
             self._finish()
         finally:
             self.scenes.close()
@@ -137,7 +138,7 @@ class Engine:
         self._publish()
         self._note_explanations()
         return RunReport(
-            tuple(records),
+            tuple(self.records),
             self._ending(),
             self.budget.spent(),
             resumed,
@@ -147,19 +148,33 @@ class Engine:
             tuple(self._scene_records.values()),
         )
 
+    @property
+    def records(self) -> list[PairRecord]:
+        """Those of the pairs that were asked for, in their order."""
+        return self.planner.records[: self.asked]
+
     def save_what_there_is(self, seconds: float) -> None:
         """Write the submission from another thread, unless the engine's own is at it for longer than that."""
         if self._publishing.acquire(timeout=seconds):
-            self.publish(list(self.planner.records))
+            self.publish(self.records)
 
     def _planner(self, timeouts: Timeouts | None) -> Planner:
         records = [PairRecord.untouched(index) for index in range(len(self.pairs))]
         for index, record in self.journal.records().items():
             records[index] = record
-        return Planner(visiting_order(self.pairs), self.recipe, records, self.budget, timeouts=timeouts)
+        asked, unasked = self.pairs[: self.asked], self.pairs[self.asked :]
+        return Planner(
+            visiting_order(asked),
+            self.recipe,
+            records,
+            self.budget,
+            timeouts=timeouts,
+            unasked=[self.asked + place for place in visiting_order(unasked)],
+        )
 
-    def _work(self) -> None:
-        """Hand out what is planned as long as there is room, and gather what comes back."""
+    def _work(self) -> bool:
+        """Hand out what is planned as long as there is room, and gather what comes back; whether there was any."""
+        begun = False
         while self._may_hand_out():
             self._reconstruct(self.planner.deepened)
             self.planner.workers = max(1, self.pool.workers)
@@ -168,10 +183,12 @@ class Engine:
                 if job is None:
                     break
                 self._submit(job)
+                begun = True
             if self._out == 0:
-                return
+                return begun
             while not self._gather() and self._may_hand_out():
                 self._reconstruct(self.planner.deepened)  # only a job that comes back changes the plan
+        return begun
 
     def _may_hand_out(self) -> bool:
         return not self.interrupt.is_set() and self.budget.clock() < self.planner.stop
@@ -318,7 +335,7 @@ class Engine:
     def _publish(self) -> None:
         with self._publishing:
             try:
-                self.publish(self.planner.records)
+                self.publish(self.records)
                 self.unwritten = ""
             except OSError as error:
                 self.unwritten = f"the submission cannot be written: {error}"

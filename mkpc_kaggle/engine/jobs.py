@@ -18,6 +18,7 @@ class Phase(StrEnum):
     """The passes of a run, in order."""
 
     SWEEP = "sweep"
+    CONNECT = "connect"
     DEEPEN = "deepen"
     UPGRADE = "upgrade"
 

@@ -150,7 +150,9 @@ class JournalTables:
         rows = self._db.execute(f"SELECT {columns}, cameras, cloud FROM scene ORDER BY batch")
         return tuple(
             SceneRecord(
-                *values, tuple(CameraRecord(**one) for one in json.loads(cameras)), tuple(json.loads(cloud))
+                *values,
+                cameras=tuple(CameraRecord(**one) for one in json.loads(cameras)),
+                cloud=tuple(json.loads(cloud)),
             )
             for *values, cameras, cloud in rows
         )

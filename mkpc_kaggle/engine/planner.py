@@ -22,6 +22,8 @@ JOB_SHARE = 0.05
 """The share of the time left that a job may be expected to take: what a job found late comes too late."""
 DEADLINE_SHARE = 0.5
 """The share of the time left after which a job begins no unit: where all is slower of a sudden, that is learnt."""
+CONNECT_SHARE = 0.1
+"""The share of the time left after the sweep that pairs may take which no row names."""
 RESERVE_SHARE = 0.2
 """The share of the limit that is left to reconstruction at most."""
 MOST_DOUBLINGS = 3
@@ -77,11 +79,11 @@ def weakest_first(records: Iterable[PairRecord], recipe: Recipe) -> tuple[list[i
 
 
 class Planner:
-    """Sweep, deepen, upgrade, over the pairs of ``order``.
+    """Sweep, deepen, upgrade, over the pairs of ``order``; after the sweep, that of the pairs of ``unasked``.
 
-    ``records``, one a pair, by index, are in its ``state``, which jobs and scenes change through it. ``workers``
-    work at a time. ``deepened`` are the pairs that have all units that fit; ``reserve`` seconds of the end are
-    left to others.
+    ``records``, one a pair, by index, those of unasked pairs last, are in its ``state``, which jobs and scenes
+    change through it. ``workers`` work at a time. ``deepened`` are the pairs that have all units that fit;
+    ``reserve`` seconds of the end are left to others.
     """
 
     def __init__(
@@ -92,20 +94,22 @@ class Planner:
         budget: Budget,
         workers: int = 1,
         timeouts: Timeouts | None = None,
+        unasked: Sequence[int] = (),
     ) -> None:
         self.recipe = recipe
-        self.state = RunState(recipe, records)
+        self.state = RunState(recipe, records, len(order))
         self.budget = budget
         self.workers = workers
         self.timeouts = timeouts or Timeouts()
         self.costs = Costs()
         self.explanations: list[Explanation] = []
         self._order = order
-        self._phases = iter((self._sweep, self._deepen, self._upgrade))
+        self._unasked = unasked
+        self._phases = iter((self._sweep, self._connect, self._deepen, self._upgrade))
         self._queue = ChunkQueue()
         self._rounds = UpgradeRounds(recipe.upgrade)
         self._retries = Retries()
-        self.deepened: set[int] = set()
+        self.deepened = set(unasked)
         self.reserve = 0.0
         self._exploring = 0
         self._allowance = 0.0
@@ -241,7 +245,7 @@ class Planner:
 
     def _open_phase(self, now: float) -> bool:
         """Begin the next phase; false where it has to wait for jobs under way, or there is none."""
-        if self._queue.phase is not Phase.SWEEP and not self._queue.is_idle:
+        if self._queue.phase is Phase.DEEPEN and not self._queue.is_idle:
             return False  # which pairs are weakest is known when all are back
         opened = next(self._phases, None)
         if opened is None:
@@ -251,6 +255,16 @@ class Planner:
 
     def _sweep(self, _: float) -> tuple[Phase, list[Chunk]]:
         return Phase.SWEEP, sweep_chunks(self._order, self.recipe)
+
+    def _connect(self, now: float) -> tuple[Phase, list[Chunk]]:
+        """The first unit on pairs that no row names, as many as a share of the time left allows."""
+        first = self.recipe.regular[:1]
+        left = CONNECT_SHARE * (self.stop - now) * self.workers
+        seconds = self.costs.overhead + self.costs.of(first[0].name)
+        count = len(self._unasked) if seconds * len(self._unasked) <= left else int(left / seconds)
+        if self._unasked:
+            self._explain(now, f"{count} of {len(self._unasked)} pairs are matched for the scenes' sake alone")
+        return Phase.CONNECT, [Chunk(Phase.CONNECT, indices, first) for indices in split(self._unasked[:count])]
 
     def _deepen(self, now: float) -> tuple[Phase, list[Chunk]]:
         self._explain(now, "the sweep is over; deepening begins")
@@ -336,6 +350,8 @@ class Planner:
 
     def wanted(self, record: PairRecord) -> list[Unit]:
         """The units that a pair gets if there is time: the extra ones only where it is weak."""
+        if record.index >= self.state.asked:
+            return []
         extras = not self._rounds.over and is_weak(record, self.recipe.upgrade)
         return record.lacking(self._usable(self.recipe.units if extras else self.recipe.regular))
 
@@ -346,7 +362,8 @@ class Planner:
     @property
     def complete(self) -> bool:
         """Whether every pair has been reached and nothing is wanted for those that can be worked on."""
-        return all(record.reached and not self.may_gain(record) for record in self.records)
+        asked = self.records[: self.state.asked]
+        return all(record.reached and not self.may_gain(record) for record in asked)
 
     @property
     def progress(self) -> tuple[Phase, int, int]:

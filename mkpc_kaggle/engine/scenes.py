@@ -17,6 +17,7 @@ from mkpc_kaggle.geometry.robust import Matrix3, Model
 from mkpc_kaggle.scene.choose import Choice
 from mkpc_kaggle.scene.config import SceneConfig
 from mkpc_kaggle.scene.model import Scene
+from mkpc_kaggle.scene.unasked import unasked_pairs
 
 LEAST_PAIRS = 2
 """Of which three images can be connected."""
@@ -72,6 +73,28 @@ def reconstruct(job: SceneJob, read: Callable[[Path], Image | Unreadable] = read
     return solution.scenes, dict(zip(indices, solution.choices, strict=True))
 
 
+def pairs_to_add(pairs: Sequence[Pair], config: SceneConfig | None) -> list[Pair]:
+    """Pairs of images of a batch that no row names, to be matched for its scene; see ``SceneConfig``."""
+    added: list[Pair] = []
+    for batch, asked in batches_of(pairs).items() if config is not None else ():
+        paths = list(dict.fromkeys(path for pair in asked for path in pair.images))
+        place = {path: number for number, path in enumerate(paths)}
+        ends = [(place[pair.image0], place[pair.image1]) for pair in asked]
+        assert config is not None
+        found = unasked_pairs(len(paths), ends, config.pairs_per_image)
+        added += [Pair(f"{batch};{paths[i].stem}-{paths[j].stem}", batch, paths[i], paths[j]) for i, j in found]
+    return added
+
+
+def batches_of(pairs: Iterable[Pair]) -> dict[str, list[Pair]]:
+    """The pairs of each batch that may be reconstructed: F is wanted, and nothing is known of their cameras."""
+    batches: dict[str, list[Pair]] = {}
+    for pair in pairs:
+        if pair.model is Model.F and pair.intrinsics is None:
+            batches.setdefault(pair.group, []).append(pair)
+    return {name: members for name, members in batches.items() if len(members) >= LEAST_PAIRS}
+
+
 @dataclass(frozen=True, eq=False)
 class SceneResult:
     """What came of a batch: its scenes, and by pair which F it gets; ``failure`` is empty, or says why nothing."""
@@ -104,11 +127,11 @@ class SceneQueue:
         limit: float,
     ) -> None:
         self.config = config
-        batches: dict[str, list[int]] = {}
-        for index, pair in enumerate(pairs) if config is not None else ():
-            if pair.model is Model.F and pair.intrinsics is None:
-                batches.setdefault(pair.group, []).append(index)
-        self.batches = {name: indices for name, indices in batches.items() if len(indices) >= LEAST_PAIRS}
+        names = batches_of(pairs) if config is not None else {}
+        self.batches: dict[str, list[int]] = {name: [] for name in names}
+        for index, pair in enumerate(pairs):
+            if pair.group in names and pair.model is Model.F and pair.intrinsics is None:
+                self.batches[pair.group].append(index)
         self.running: dict[str, Running] = {}
         self._batch_of = {index: name for name, indices in self.batches.items() for index in indices}
         self._changed = set(self.batches)

@@ -13,20 +13,20 @@ from mkpc_kaggle.scene.choose import Choice
 
 
 class RunState:
-    """The records of all pairs, by index.
+    """The records of all pairs, by index; from index ``asked`` on they are of pairs that no row names.
 
-    ``lacking`` counts the pairs that have an F and lack a regular unit, by its name. ``left_alone`` are pairs that
-    get nothing more in this run.
+    ``lacking`` counts the asked pairs that have an F and lack a regular unit, by its name. ``left_alone`` are
+    pairs that get nothing more in this run.
     """
 
-    def __init__(self, recipe: Recipe, records: list[PairRecord]) -> None:
+    def __init__(self, recipe: Recipe, records: list[PairRecord], asked: int) -> None:
         self.recipe = recipe
         self.records = records
+        self.asked = asked
         self.left_alone: set[int] = set()
         self.lacking: Counter[str] = Counter()
         for record in records:
-            if record.units:
-                self.lacking.update(unit.name for unit in record.lacking(recipe.regular))
+            self.lacking.update(self._lacks(record))
 
     def can_gain(self, index: int, units: Iterable[Unit]) -> bool:
         """Whether a pair may have one of the units that it has not had."""
@@ -38,8 +38,8 @@ class RunState:
 
     @property
     def workable(self) -> list[PairRecord]:
-        """The pairs that have an F and may be worked on."""
-        return [one for one in self.records if one.units and one.index not in self.left_alone]
+        """The asked pairs that have an F and may be worked on."""
+        return [one for one in self.records[: self.asked] if one.units and one.index not in self.left_alone]
 
     def stuck(self, outcome: Outcome) -> str:
         """Leave a pair alone that nothing can come of; why it keeps the F that it has, if it has one."""
@@ -78,9 +78,13 @@ class RunState:
         self.records[index] = replace(self.records[index], scene=choice)
 
     def _put(self, record: PairRecord) -> None:
-        former = self.records[record.index]
-        had = {unit.name for unit in former.lacking(self.recipe.regular)} if former.units else set()
-        lacks = {unit.name for unit in record.lacking(self.recipe.regular)} if record.units else set()
+        had, lacks = self._lacks(self.records[record.index]), self._lacks(record)
         self.lacking.subtract(had - lacks)
         self.lacking.update(lacks - had)
         self.records[record.index] = record
+
+    def _lacks(self, record: PairRecord) -> set[str]:
+        """The regular units that a pair is to get yet, if it has an F."""
+        if not record.units or record.index >= self.asked:
+            return set()
+        return {unit.name for unit in record.lacking(self.recipe.regular)}

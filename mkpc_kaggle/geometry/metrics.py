@@ -94,7 +94,8 @@ def points_on_lines(F: Matrix3, size0: Size, size1: Size) -> Matches:
         along = np.stack(np.broadcast_arrays(-(b * y + c) / a, y), axis=-1)
     on_line = np.where((np.abs(b) >= np.abs(a))[..., None], across, along).reshape(-1, 2)
     inside = Box.whole(size1).contains(on_line)
-    return Matches(np.repeat(grid[:, 0], GRID, axis=0)[inside], on_line[inside], np.ones(inside.sum()))
+    points = np.column_stack([np.repeat(grid[:, 0], GRID, axis=0), on_line])[inside].astype(np.float32)
+    return Matches(points[:, :2], points[:, 2:], np.ones(len(points), np.float32))
 
 
 def rotation_angle(R: Matrix3) -> float:

@@ -28,8 +28,9 @@ class SceneConfig:
     ``verification_error`` in pixels, and the ``least_inliers`` that it needs. Cameras: ``camera_model``, and the
     focal length that they start with, ``prior_focal`` long sides. A scene has
     ``least_images``, and ``least_pairs_per_image`` times as many connected pairs: with fewer there is little that
-    could contradict its cameras. Above ``most_images`` it is reconstructed in overlapping parts, by the
-    incremental mapper whatever ``mapper`` says.
+    could contradict its cameras. A batch that has fewer pairs than ``pairs_per_image`` for each of its images
+    gets others that no row names, matched by the recipe's first unit; 0: none. Above ``most_images`` it is
+    reconstructed in overlapping parts, by the incremental mapper whatever ``mapper`` says.
 
     Checks: an image's focal length is between ``lowest_focal`` and ``highest_focal`` long sides, and it sees
     ``least_points`` points. A pair keeps its own F if ``contradiction_matches`` of its matches are within
@@ -44,6 +45,7 @@ class SceneConfig:
     prior_focal: float = 1.1
     least_images: int = 3
     least_pairs_per_image: float = 1.5
+    pairs_per_image: float = 5.0
     most_images: int = 500
     lowest_focal: float = 0.3
     highest_focal: float = 5.0
@@ -63,6 +65,7 @@ class SceneConfig:
             prior_focal=POSITIVE,
             least_images=Range(3),
             least_pairs_per_image=AT_LEAST_0,
+            pairs_per_image=AT_LEAST_0,
             most_images=Range(3),
             lowest_focal=POSITIVE,
             highest_focal=POSITIVE,

@@ -45,8 +45,9 @@ class Scenario:
     ``miss_factor`` times as much, ``warm_up`` what a unit takes the first time on a worker. From ``turn``, a share
     of the limit, on costs are ``drift`` times as high.
 
-    The pairs are in so many ``batches``; 0: there are no scenes. A scene takes ``scene_seconds`` a pair of its
-    batch, and with the probability ``scene_faults`` it crashes, runs out of memory or hangs.
+    The pairs are in so many ``batches``; 0: there are no scenes. Each image but one is in a single pair, and where
+    ``pairs_per_image`` is above 1 others are matched for the scene's sake. A scene takes ``scene_seconds`` a pair
+    of its batch, and with the probability ``scene_faults`` it crashes, runs out of memory or hangs.
     """
 
     pairs: int
@@ -64,6 +65,7 @@ class Scenario:
     crashes: float = 0.0
     hangs: float = 0.0
     batches: int = 0
+    pairs_per_image: float = 0.0
     scene_seconds: float = 0.06
     scene_faults: float = 0.0
     seed: int = 0
@@ -75,7 +77,8 @@ class Scenario:
             Unit(1 if number % 2 == 0 else 2, f"m{number}", 100, extra=number >= count - self.extras)
             for number in range(count)
         ]
-        return Recipe(tuple(units), scene=SceneConfig() if self.batches else None)
+        scene = SceneConfig(pairs_per_image=self.pairs_per_image) if self.batches else None
+        return Recipe(tuple(units), scene=scene)
 
     @property
     def work(self) -> float:
@@ -126,6 +129,7 @@ def random_scenario(seed: int, pairs: int) -> Scenario:
         crashes=rates[1],
         hangs=rates[2],
         batches=int(rng.choice([0, 1, 5, 15, 40])),
+        pairs_per_image=float(rng.choice([0, 1.5])),
         scene_seconds=float(np.exp(rng.normal(np.log(0.06), 0.8))),
         scene_faults=float(rng.uniform(0, 0.3)) if troubled else 0.0,
     )
@@ -145,7 +149,8 @@ class SimulatedPool:
     Of their seconds until ``stop``, ``kept`` went into jobs that came back in time. ``faults`` are what injected
     faults take whatever is planned: the unit that a crash cut short, of a hang as long as a stall might have
     taken, which it cannot be told from sooner, a stall that was taken for a hang, and the new worker's start
-    after any of these. ``scenes`` are those under way and done.
+    after any of these. ``scenes`` are those under way and done; ``for_scenes`` are the workers' seconds in which
+    nothing else was under way.
     """
 
     def __init__(self, scenario: Scenario, clock: VirtualClock, stop: float) -> None:
@@ -153,7 +158,7 @@ class SimulatedPool:
         self.clock = clock
         self.kept = self.faults = 0.0
         self.scenes: list[SimulatedScene] = []
-        self.last_job = 0.0
+        self.last_job = self.for_scenes = 0.0
         self._rng = np.random.default_rng(scenario.seed)
         self._scene_rng = np.random.default_rng([scenario.seed, 1])
         self._costs = {unit.name: cost for unit, cost in zip(scenario.recipe.units, scenario.costs, strict=True)}
@@ -205,7 +210,10 @@ class SimulatedPool:
 
     def next(self, until: float) -> JobResult | JobFailure | None:
         if not self._coming or self._coming[0][0] > until:
-            self.clock.now = max(self.clock.now, until)
+            waited = max(0.0, until - self.clock.now)
+            if not self._coming and any(not scene.over for scene in self.scenes):
+                self.for_scenes += self.workers * waited
+            self.clock.now += waited
             return None
         ended, _, kept, back = heapq.heappop(self._coming)
         self.clock.now = self.last_job = max(self.clock.now, ended)
@@ -265,7 +273,7 @@ class SimulatedPool:
 
 @dataclass
 class SimulatedScene:
-    """A reconstruction that ends by itself; ``seen`` is when somebody asked after that."""
+    """A reconstruction that ends by itself; ``seen`` is when somebody asked after that, ``over`` that it ended."""
 
     clock: VirtualClock
     begun: float
@@ -273,6 +281,7 @@ class SimulatedScene:
     found: SceneAnswer | str
     batch: str
     seen: float = field(default=0.0, init=False)
+    over: bool = field(default=False, init=False)
 
     def answer(self) -> SceneAnswer | str | None:
         if self.clock.now < self.begun + self.seconds:
@@ -281,7 +290,7 @@ class SimulatedScene:
         return self.found
 
     def kill(self) -> None:
-        pass
+        self.over = True
 
 
 class MemoryJournal:
@@ -322,8 +331,8 @@ class Ran:
     budget's stop, without those that injected faults take from any planner (see :class:`SimulatedPool`). Used are
     the seconds of jobs whose results came back in time, warm-ups and stalls included. So idle workers, the end of
     a phase, what a lost job had done before, silence longer than a stall's, a slow unit taken to hang, and what
-    is still under way at the end all count against the engine. Nothing else can be done while the last scenes are
-    reconstructed: what they take after the last job is used.
+    is still under way at the end all count against the engine. Workers' time while nothing but scenes is under way
+    is used.
 
     ``lost`` counts pairs without the sweep's F where the sweep fits (see :func:`sweep_seconds`), and versions of
     the submission that lack a row. ``missed`` are batches without a scene that no fault befell; ``scenes_fit``
@@ -382,14 +391,12 @@ def simulate(scenario: Scenario) -> Ran:
     swept = sum(record.matches > 0 for record in report.records)
     sweep_fits = sweep_seconds(scenario) < SWEEP_SHARE * scenario.limit
     given = pool.workers * (min(budget.stop, clock.now) - RESTART_SECONDS) - pool.faults
-    last_scene = max((scene.seen for scene in pool.scenes), default=0.0)
-    used = pool.kept + pool.workers * max(0.0, min(last_scene, budget.stop) - pool.last_job)
     faulty = {scene.batch for scene in pool.scenes if isinstance(scene.found, str)}
     made = {pairs[record.index].group for record in report.records if record.scene is not None}
     return Ran(
         scenario,
         report,
-        used / given,
+        (pool.kept + pool.for_scenes) / given,
         max(0.0, clock.now - scenario.limit),
         sum(length != scenario.pairs for length in published) + (scenario.pairs - swept if sweep_fits else 0),
         len(set(engine.scenes.batches) - faulty - made),

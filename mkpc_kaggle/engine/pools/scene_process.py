@@ -27,7 +27,7 @@ class SceneProcess:
         try:
             answer: SceneAnswer = self._answers.recv()
         except (EOFError, OSError):
-            self._process.join(timeout=1.0)  # its pipe closes before it has ended
+            self._process.join(timeout=5.0)  # its pipe closes before it has ended
             return f"its process ended: {how_it_ended(self._process)}"
         return answer
 

@@ -1,0 +1,70 @@
+"""Pairs that no row names: which they are, and what a run makes of them."""
+
+from dataclasses import replace
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+from rectified import run
+from simulator import Scenario, simulate
+from synthetic import RECIPE, SyntheticMatcher, synthetic_pairs
+
+from mkpc_kaggle.engine.engine import Ending
+from mkpc_kaggle.reporting.run_log import read_log
+from mkpc_kaggle.scene.config import SceneConfig
+from mkpc_kaggle.scene.unasked import unasked_pairs
+
+CHAIN = [(0, 1), (1, 2), (2, 3), (3, 4), (4, 5)]
+
+
+@given(st.integers(2, 12), st.floats(0, 8), st.integers(0, 2**32 - 1))
+def test_a_batch_gets_as_many_pairs_as_it_lacks_and_none_twice(images: int, wanted: float, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    every = list(combinations(range(images), 2))
+    asked = [ends if rng.random() < 0.5 else ends[::-1] for ends in every if rng.random() < 0.4]
+    chosen = unasked_pairs(images, asked, wanted)
+    known = {(min(ends), max(ends)) for ends in asked}
+    assert len(set(chosen)) == len(chosen)
+    assert set(chosen) <= set(every) - known
+    assert len(chosen) == max(0, min(int(np.ceil(wanted * images)), len(every)) - len(known))
+
+
+def test_images_in_few_pairs_come_first_and_get_partners_that_have_the_same_partners() -> None:
+    assert unasked_pairs(6, CHAIN, 1) == [(0, 2)], "0 and 2 have 1 in common"
+    degrees = np.bincount(np.ravel([*CHAIN, *unasked_pairs(6, CHAIN, 1.5)]))
+    assert degrees.min() >= 2
+    assert unasked_pairs(6, CHAIN, 0) == []
+
+
+def test_a_sparse_batch_has_a_scene_by_pairs_that_no_row_names(tmp_path: Path) -> None:
+    every, matcher = synthetic_pairs(tmp_path / "images"), SyntheticMatcher()
+    asked = [every[list(combinations(range(6), 2)).index(ends)] for ends in CHAIN]
+    published: list[int] = []
+    recipe = replace(RECIPE, scene=SceneConfig(pairs_per_image=2))
+    report = run(asked, recipe, matcher, tmp_path / "work", publish=lambda rows: published.append(len(rows)))
+    assert report.ending is Ending.COMPLETE
+    assert [record.source for record in report.records] == ["scene"] * 5
+    true = [matcher.scene.batch.pairs[list(combinations(range(6), 2)).index(ends)] for ends in CHAIN]
+    found = zip(report.records, true, strict=True)
+    assert max(matcher.scene.median_distance(record.fundamental, pair) for record, pair in found) < 0.5
+    assert len(matcher.calls) == 12
+    assert set(published) == {5}
+    assert len(read_log(tmp_path / "work").records) == 5
+    assert run(asked, recipe, SyntheticMatcher(), tmp_path / "work").scenes == report.scenes
+
+
+def test_a_sparse_batch_without_them_has_none(tmp_path: Path) -> None:
+    asked = synthetic_pairs(tmp_path / "images")[:5]
+    report = run(asked, replace(RECIPE, scene=SceneConfig(pairs_per_image=0)), SyntheticMatcher(), tmp_path / "w")
+    assert [record.source for record in report.records] == ["pair"] * 5
+
+
+def test_they_take_a_small_share_of_the_time() -> None:
+    scenario = Scenario(400, (1.0, 1.0), 0, 1, 900.0, warm_up=1, misses=0, batches=4, pairs_per_image=4)
+    ran = simulate(scenario)
+    assert ran.late == ran.lost == ran.missed == 0
+    told = next(one.text for one in ran.report.explanations if "for the scenes' sake" in one.text)
+    assert 10 < int(told.split()[0]) < 60
+    assert len(ran.report.records) == 400
