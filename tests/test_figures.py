@@ -8,6 +8,7 @@ import tour_figures as figures
 from matplotlib.figure import Figure
 
 from mkpc_kaggle.data.images import Image
+from mkpc_kaggle.engine.records import CameraRecord, SceneRecord
 from mkpc_kaggle.geometry.coordinates import Box, Size
 from mkpc_kaggle.geometry.critical_region import CriticalRegion, MkpcConfig, Ratio, RegionReason, find_clusters
 from mkpc_kaggle.geometry.matches import Matches
@@ -15,7 +16,7 @@ from mkpc_kaggle.geometry.metrics import PoseError
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL, Estimate, Model
 from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult
 from mkpc_kaggle.recipe import Unit
-from mkpc_kaggle.reporting.figures import to_jpeg
+from mkpc_kaggle.reporting.figures import draw_cameras, to_jpeg
 
 SIZES = Size(120, 80), Size(60, 90)
 IMAGES = tuple(Image.of_array(np.full((size.height, size.width, 3), 90, np.uint8)) for size in SIZES)
@@ -130,3 +131,19 @@ def test_chosen_points_lie_far_apart():
     points = np.concatenate([crowd, corners]).astype(np.float32)
     assert sorted(figures._far_apart(points, 4)) == [100, 101, 102, 103]
     assert len(figures._far_apart(points[:3], 6)) == 3
+
+
+def test_cameras_are_seen_from_above_and_from_the_side_with_the_points_before_them():
+    """Two cameras two units apart look along the world's x axis, its z axis is up; a wall is ten units ahead."""
+    cameras = tuple(
+        CameraRecord(f"{n}.png", 0, [0, 2 * n, 1], [1, 0, 0], [0, 0, -1], 900, [80, 60], 9) for n in (0, 1)
+    )
+    wall = tuple([10, y, z] for y in range(5) for z in range(8))
+    above, side = draw_cameras(SceneRecord("batch", 2, 2, 1, 40, 1.0, "", cameras, wall)).axes
+    (cloud, _, centres), (seen, _, points) = ([*panel.collections] for panel in (above, side))
+    assert np.ptp(centres.get_offsets(), axis=0).tolist() == [2, 0]
+    assert np.ptp(cloud.get_offsets(), axis=0).tolist() == [4, 0], "from above a wall is a line"
+    assert (cloud.get_offsets()[:, 1] == 10).all()
+    assert np.ptp(points.get_offsets(), axis=0).tolist() == [0, 0], "one behind the other"
+    assert np.ptp(seen.get_offsets(), axis=0).tolist() == [0, 7]
+    assert seen.get_offsets()[:, 1].max() == 7, "up is up"

@@ -12,7 +12,7 @@ import os
 import sqlite3
 import zlib
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from pathlib import Path
 from types import TracebackType
@@ -149,9 +149,9 @@ class JournalTables:
         columns = "batch, images, placed, models, points, seconds, failure"
         rows = self._db.execute(f"SELECT {columns}, cameras, cloud FROM scene ORDER BY batch")
         return tuple(
-            SceneRecord(
-                *values,
-                cameras=tuple(CameraRecord(**one) for one in json.loads(cameras)),
+            replace(
+                SceneRecord(*values),
+                cameras=tuple(CameraRecord(**camera) for camera in json.loads(cameras)),
                 cloud=tuple(json.loads(cloud)),
             )
             for *values, cameras, cloud in rows

@@ -13,7 +13,7 @@ from mkpc_kaggle.scene.choose import Choice
 from mkpc_kaggle.scene.model import Scene
 
 NOT_REACHED = "not reached in time"
-MOST_POINTS = 400
+MOST_POINTS = 300
 """Of a scene's points that are kept to be drawn."""
 
 

@@ -210,10 +210,9 @@ class SimulatedPool:
 
     def next(self, until: float) -> JobResult | JobFailure | None:
         if not self._coming or self._coming[0][0] > until:
-            waited = max(0.0, until - self.clock.now)
             if not self._coming and any(not scene.over for scene in self.scenes):
-                self.for_scenes += self.workers * waited
-            self.clock.now += waited
+                self.for_scenes += self.workers * max(0.0, min(until, self._stop) - self.clock.now)
+            self.clock.now = max(self.clock.now, until)
             return None
         ended, _, kept, back = heapq.heappop(self._coming)
         self.clock.now = self.last_job = max(self.clock.now, ended)

@@ -164,7 +164,7 @@ def draw_cameras(scene: "SceneRecord") -> "Figure":
     centres = np.array([camera.centre for camera in cameras])
     looks = np.array([camera.forward for camera in cameras])
     cloud = np.array(scene.cloud).reshape(-1, 3)
-    arrow = 0.25 * (np.ptp(centres, axis=0).max() or 1.0)
+    arrow = 0.12 * (np.ptp(centres, axis=0).max() or 1.0)
     sides = (("above", right, ahead), ("the side", ahead, up))
     for panel, (name, across, upward) in zip(figure.subplots(1, 2), sides, strict=True):
         plain(panel, f"{short(scene.batch)}: {len(cameras)} cameras from {name}")
