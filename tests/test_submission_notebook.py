@@ -184,7 +184,7 @@ def test_matchers_run_offline_from_packaged_stand_ins_of_their_full_size(
     recipe = tmp_path / "small.toml"
     units = [f'{{ stage = {stage}, matcher = "{matcher}", area = "112x140" }}' for stage in (1, 2)]
     recipe.write_text(f'units = [{", ".join(units)}]\n[matchers.loma]\nvariant = "b128"')
-    kaggle.set('RECIPE = "auto"', f'RECIPE = "{recipe}"')
+    kaggle.set(r"RECIPE = \"auto\"", rf"RECIPE = \"{recipe}\"")
     printed = kaggle.run()
     assert kaggle.problems() == []
     assert f"{len(lines)} files in" in printed
