@@ -9,10 +9,9 @@ from functools import cache
 
 import pytest
 import torch
-from dense import MODES, batch_of, computed, grey_levels, resized_by_pil
+from dense import MODES, batch_of, computed, grey_levels, pixels_of, resized_by_pil
 from golden import GOLDEN, Stage, assert_stages, golden_arrays, needs_golden, print_table, ready, seeded_tensor
 
-from mkpc_kaggle.geometry.coordinates import Size, from_normalised
 from mkpc_kaggle.matchers.networks.dense_sampling import (
     SamplingConfig,
     balancing_weights,
@@ -153,12 +152,7 @@ def sampling_stages():
     yield Stage("balanced_index", draw(balance, golden["noise2"], number), golden["balanced_index"])
     for key in ("kde_density", "kde_density_exact"):
         yield within(key, density(golden["kde_points"]), golden[key])
-    height0, width0, height1, width1 = golden["pixel_sizes_HA_WA_HB_WB"].tolist()
-    sides = golden["pixel_in"].numpy().reshape(-1, 2, 2).swapaxes(0, 1)
-    sizes = Size(width0, height0), Size(width1, height1)
-    for name, points, size in zip(("pixel_A", "pixel_B"), sides, sizes, strict=True):
-        got = torch.from_numpy(from_normalised(points, size))
-        yield within(name, got + 0.5, golden[name])  # theirs have pixel centres at halves
+    yield from (within(name, got, golden[name]) for name, got in pixels_of(golden))
 
 
 CASES = {

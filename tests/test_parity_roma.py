@@ -11,7 +11,7 @@ from functools import cache
 
 import pytest
 import torch
-from dense import MODES, batch_of, resized_by_pil
+from dense import MODES, batch_of, pixels_of, resized_by_pil
 from golden import (
     GOLDEN,
     Stage,
@@ -24,7 +24,6 @@ from golden import (
 )
 from roma_values import computed
 
-from mkpc_kaggle.geometry.coordinates import Size, from_normalised
 from mkpc_kaggle.matchers.networks import roma
 from mkpc_kaggle.matchers.networks.anchor_decoder import anchor_mean
 from mkpc_kaggle.matchers.networks.dense_sampling import (
@@ -193,12 +192,7 @@ def sampling_stages():
     # The release computes densities in half precision, and draws by them what no other device would.
     half = golden["density_half"]
     yield Stage("density_half", neighbours, half, 0.1 * half.max().item())
-    height0, width0, height1, width1 = golden["pixel_sizes_HA_WA_HB_WB"].tolist()
-    sides = golden["pixel_in"].numpy().reshape(-1, 2, 2).swapaxes(0, 1)
-    sizes = Size(width0, height0), Size(width1, height1)
-    for name, points, size in zip(("pixel_A", "pixel_B"), sides, sizes, strict=True):
-        got = torch.from_numpy(from_normalised(points, size))
-        yield within(name, got + 0.5, golden[name])  # theirs have pixel centres at halves
+    yield from (within(name, got, golden[name]) for name, got in pixels_of(golden))
 
 
 CASES = {

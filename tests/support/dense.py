@@ -7,6 +7,7 @@ import pytest
 import torch
 from golden import recorded
 
+from mkpc_kaggle.geometry.coordinates import Size, from_normalised
 from mkpc_kaggle.matchers.networks.dense_warp import side_by_side
 from mkpc_kaggle.matchers.networks.gaussian_process import kernel
 from mkpc_kaggle.matchers.networks.pixels import MEAN, STD
@@ -137,3 +138,12 @@ def resized_by_pil(pixels, size):
 def grey_levels(image):
     mean, std = (torch.tensor(values)[:, None, None] for values in (MEAN, STD))
     return ((image * std + mean) * 255).round()
+
+
+def pixels_of(golden):
+    """By the golden files' names, what normalised points are in pixels whose centres are at halves."""
+    height0, width0, height1, width1 = golden["pixel_sizes_HA_WA_HB_WB"].tolist()
+    sides = golden["pixel_in"].numpy().reshape(-1, 2, 2).swapaxes(0, 1)
+    sizes = Size(width0, height0), Size(width1, height1)
+    for name, points, size in zip(("pixel_A", "pixel_B"), sides, sizes, strict=True):
+        yield name, torch.from_numpy(from_normalised(points, size)) + 0.5

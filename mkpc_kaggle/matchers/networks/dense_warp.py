@@ -3,12 +3,13 @@
 Normalised coordinates as in warp_refiner. Source: Edstedt et al. 2023, "DKM", section 3.4, and its published code.
 """
 
-from collections.abc import Callable, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol, TypeVar
+from typing import Generic, Protocol, TypeVar
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from mkpc_kaggle.matchers.networks.grids import as_grid
 from mkpc_kaggle.matchers.networks.warp_refiner import Estimate, identity_map, resize
@@ -38,16 +39,44 @@ class Features(Protocol):
     """Of one image; ``fine`` where there is to be a second pass."""
 
     @property
+    def coarse(self) -> Pyramid: ...
+
+    @property
     def fine(self) -> Pyramid | None: ...
 
 
 SomeFeatures = TypeVar("SomeFeatures", bound=Features)
-Decoder = Callable[[SomeFeatures, SomeFeatures], tuple[Estimate, Tensor]]
-"""From a query and a support to the flow between them and the first pass's logits at the coarsest stride."""
+
+
+class WarpDecoder(nn.Module, ABC, Generic[SomeFeatures]):
+    """From the features of two images to the flow from the one to the other."""
+
+    def forward(self, query: SomeFeatures, support: SomeFeatures) -> tuple[Estimate, Tensor]:
+        """The flow from query to support at stride 1 of the last pass, and the first pass's logits at 16."""
+        estimate = self.coarse_estimate(query, support)
+        logits = estimate.certainty
+        estimate = self.refine(estimate, query.coarse, support.coarse)
+        if query.fine is not None and support.fine is not None:
+            estimate = self.refine(estimate, query.fine, support.fine)
+        return estimate, logits
+
+    def refine(self, estimate: Estimate, query: Pyramid, support: Pyramid) -> Estimate:
+        """Down to stride 1 from an estimate of any size."""
+        for stride in (8, 4, 2, 1):
+            estimate = self.correct(estimate.resized(query.at(stride).shape[2:]), query, support, stride)
+        return estimate
+
+    @abstractmethod
+    def coarse_estimate(self, query: SomeFeatures, support: SomeFeatures) -> Estimate:
+        """At stride 16, refined."""
+
+    @abstractmethod
+    def correct(self, estimate: Estimate, query: Pyramid, support: Pyramid, stride: int) -> Estimate:
+        """What the refiner of a stride makes of an estimate of that size."""
 
 
 def warps_of(
-    decoder: Decoder[SomeFeatures], first: SomeFeatures, second: SomeFeatures, *, symmetric: bool
+    decoder: WarpDecoder[SomeFeatures], first: SomeFeatures, second: SomeFeatures, *, symmetric: bool
 ) -> tuple[DenseWarp, ...]:
     """The warp on the first image's grid and, if ``symmetric``, that on the second's.
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from mkpc_kaggle.matchers.networks.dense_warp import DenseWarp, Pyramid, warps_of
+from mkpc_kaggle.matchers.networks.dense_warp import DenseWarp, Pyramid, WarpDecoder, warps_of
 from mkpc_kaggle.matchers.networks.dkm_coarse import FEATURES, POSTERIOR, STRIDES, WIDTH, EmbeddingDecoder
 from mkpc_kaggle.matchers.networks.gaussian_process import GaussianProcess
 from mkpc_kaggle.matchers.networks.resnet50 import ResNet50
@@ -73,9 +73,7 @@ class Encoder(nn.Module):
         return Pyramid((image, *features))
 
 
-class Decoder(nn.Module):
-    """From the features of two images to the flow from the one to the other."""
-
+class Decoder(WarpDecoder[DkmFeatures]):
     def __init__(self) -> None:
         super().__init__()
         self.embedding_decoder = EmbeddingDecoder()
@@ -88,36 +86,18 @@ class Decoder(nn.Module):
         *finer, at16, at32 = pyramid.levels
         return Pyramid((*finer, self.proj["16"](at16), self.proj["32"](at32)))
 
-    def forward(self, query: DkmFeatures, support: DkmFeatures) -> tuple[Estimate, Tensor]:
-        """The flow from query to support at stride 1 of the last pass, and the first pass's logits at 16."""
-        estimate = self.coarse_estimate(query.coarse, support.coarse)
-        logits = estimate.certainty
-        estimate = self.refine(estimate, query.coarse, support.coarse)
-        if query.fine is not None and support.fine is not None:
-            estimate = self.refine(estimate, query.fine, support.fine)
-        return estimate, logits
-
-    def coarse_estimate(self, query: Pyramid, support: Pyramid) -> Estimate:
-        """At stride 16, refined. Of what stride 32 found only the context is used."""
-        batch, _, height, width = query.at(32).shape
-        context = query.at(32).new_zeros(batch, WIDTH, height, width)
+    def coarse_estimate(self, query: DkmFeatures, support: DkmFeatures) -> Estimate:
+        """Of what stride 32 found only the context is used."""
+        first, second = query.coarse, support.coarse
+        batch, _, height, width = first.at(32).shape
+        context = first.at(32).new_zeros(batch, WIDTH, height, width)
         for stride in STRIDES:
-            features = query.at(stride)
-            posterior = self.gps[str(stride)](features, support.at(stride))
-            context = resize(context, _size(query, stride))
+            features = first.at(stride)
+            posterior = self.gps[str(stride)](features, second.at(stride))
+            context = resize(context, features.shape[2:])
             estimate, context = self.embedding_decoder(stride, posterior, features, context)
-        return self.correct(estimate, query, support, STRIDES[-1])
-
-    def refine(self, estimate: Estimate, query: Pyramid, support: Pyramid) -> Estimate:
-        """Down to stride 1 from an estimate of any size."""
-        for stride in (8, 4, 2, 1):
-            estimate = self.correct(estimate.resized(_size(query, stride)), query, support, stride)
-        return estimate
+        return self.correct(estimate, first, second, STRIDES[-1])
 
     def correct(self, estimate: Estimate, query: Pyramid, support: Pyramid, stride: int) -> Estimate:
         corrections = self.conv_refiner[str(stride)](query.at(stride), support.at(stride), estimate.flow)
-        return refined(estimate, corrections, stride, _size(query, 1))
-
-
-def _size(pyramid: Pyramid, stride: int) -> torch.Size:
-    return pyramid.at(stride).shape[2:]
+        return refined(estimate, corrections, stride, query.at(1).shape[2:])

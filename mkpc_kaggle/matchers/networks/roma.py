@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from mkpc_kaggle.matchers.networks.anchor_decoder import AnchorDecoder
-from mkpc_kaggle.matchers.networks.dense_warp import DenseWarp, Pyramid, warps_of
+from mkpc_kaggle.matchers.networks.dense_warp import DenseWarp, Pyramid, WarpDecoder, warps_of
 from mkpc_kaggle.matchers.networks.dinov2 import DinoV2, DinoV2Config
 from mkpc_kaggle.matchers.networks.gaussian_process import GaussianProcess
 from mkpc_kaggle.matchers.networks.vgg import VGG19, WIDTHS, Vgg
@@ -97,9 +97,7 @@ class Encoder(nn.Module):
         return levels
 
 
-class Decoder(nn.Module):
-    """From the features of two images to the flow from the one to the other."""
-
+class Decoder(WarpDecoder[RomaFeatures]):
     def __init__(self, config: RomaConfig) -> None:
         super().__init__()
         width = config.refiners[COARSEST].features
@@ -121,26 +119,10 @@ class Decoder(nn.Module):
         assert isinstance(process, GaussianProcess)
         return process
 
-    def forward(self, query: RomaFeatures, support: RomaFeatures) -> tuple[Estimate, Tensor]:
-        """The flow from query to support at stride 1 of the last pass, and the first pass's logits at 16."""
-        estimate = self.coarse_estimate(query, support)
-        logits = estimate.certainty
-        estimate = self.refine(estimate, query.coarse, support.coarse)
-        if query.fine is not None and support.fine is not None:
-            estimate = self.refine(estimate, query.fine, support.fine)
-        return estimate, logits
-
     def coarse_estimate(self, query: RomaFeatures, support: RomaFeatures) -> Estimate:
-        """At stride 16, refined."""
         features = query.coarse.at(COARSEST)
         posterior = self.process.predict(features, support.coarse.at(COARSEST), support.coefficients)
         return self.correct(self.embedding_decoder(posterior, features), query.coarse, support.coarse, COARSEST)
-
-    def refine(self, estimate: Estimate, query: Pyramid, support: Pyramid) -> Estimate:
-        """Down to stride 1 from an estimate of any size."""
-        for stride in (8, 4, 2, 1):
-            estimate = self.correct(estimate.resized(query.at(stride).shape[2:]), query, support, stride)
-        return estimate
 
     def correct(self, estimate: Estimate, query: Pyramid, support: Pyramid, stride: int) -> Estimate:
         size = query.at(1).shape[2:]
