@@ -57,6 +57,7 @@ def test_recipes_are_listed_with_what_they_lack(
     classical = out[out.index("classical: ") : out.index("light: ")]
     assert "all weights are there" in classical
     assert "    2:dkm@630x840  at most 4096\n" in out
+    assert "    1:aliked_lightglue@1024  at most 4096  (or aliked, where its weights are missing)\n" in light
 
 
 def test_check_tells_good_from_bad(demo: DemoSet, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

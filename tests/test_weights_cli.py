@@ -161,16 +161,16 @@ def test_a_manifest_beside_the_weights_does_not_change_what_the_packages_says(
     assert store.WeightStore([tmp_path]).files == FILES
 
 
-# the files of the matchers of today
+# the files of LoMa, RoMa and LightGlue
 
-TODAY = {
+FILE_NAMES = {
     *("roma_outdoor.pth", "roma_indoor.pth", "dinov2_vitl14_pretrain.pth"),
     *("loma_B128.pth", "loma_B.pt", "loma_R.pth", "loma_L.pth", "loma_G.pth"),
     *("aliked-n16.pth", "aliked_lightglue.pth", "depth-save.pth", "disk_lightglue.pth"),
 }
 
 
-@pytest.mark.parametrize("name", sorted(TODAY))
+@pytest.mark.parametrize("name", sorted(FILE_NAMES))
 def test_a_file_of_the_real_manifest_is_fetched_by_its_name(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -192,7 +192,7 @@ def test_a_file_of_the_real_manifest_is_fetched_by_its_name(
     assert not (tmp_path / "out" / name).exists()
 
 
-def test_recipes_of_today_name_these_files(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_recipes_want_these_files_but_indoor_and_other_variants(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(store, "manifest", manifest)
     wanted = {
         file.name
@@ -200,7 +200,7 @@ def test_recipes_of_today_name_these_files(monkeypatch: pytest.MonkeyPatch) -> N
         for lines in files_of(recipe, store.WeightStore())
         for file in lines
     }
-    assert TODAY - wanted == {"roma_indoor.pth", "loma_R.pth", "loma_G.pth"}
+    assert FILE_NAMES - wanted == {"roma_indoor.pth", "loma_R.pth", "loma_G.pth"}
 
 
 def test_convert_prints_the_line_for_the_manifest(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

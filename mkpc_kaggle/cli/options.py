@@ -27,7 +27,7 @@ def add_matching(parser: argparse.ArgumentParser) -> None:
         choices=["any", "permissive"],
         default="any",
         help="permissive: use no weights but those under Apache-2.0, BSD-3-Clause or MIT; recipe auto then leaves "
-        "the others out, any other recipe that has them is refused (default: any)",
+        "the others out, units with a fallback take it, any other recipe that has them is refused (default: any)",
     )
     parser.add_argument(
         "--device", default="auto", help="cpu, cuda, cuda:N, or auto (the default): the GPUs if there are any"
