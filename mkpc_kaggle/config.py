@@ -10,6 +10,9 @@ from mkpc_kaggle.errors import UserError
 
 Config = TypeVar("Config")
 
+MOST_INTEGER = 2**63 - 1
+"""As TOML has it."""
+
 
 def from_table(cls: type[Config], table: Mapping[str, Any], where: str) -> Config:
     """Build the dataclass ``cls`` from a TOML table.
@@ -50,6 +53,8 @@ def convert(value: Any, kind: type, where: str) -> Any:
         if value not in list(kind):
             raise UserError(f"{where}: {value!r} is none of {', '.join(repr(str(one)) for one in kind)}")
         return kind(value)
+    if type(value) is int and abs(value) > MOST_INTEGER:
+        raise UserError(f"{where}: an integer of more than 64 bits")
     if kind is float and type(value) is int:
         return float(value)
     if type(value) is not kind:

@@ -211,12 +211,10 @@ class Recipe:
 
 def parse_recipe(text: str, name: str) -> Recipe:
     """A recipe from TOML text; raises :class:`UserError` for what it cannot accept."""
-    where = f"recipe {name!r}"
     try:
-        table = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise UserError(f"{where} is not valid TOML: {error}") from error
-    return recipe_of(table, name)
+        return recipe_of(tomllib.loads(text), name)
+    except (ValueError, RecursionError) as error:  # numbers of thousands of digits, tables in tables in tables
+        raise UserError(f"recipe {name!r} is not valid TOML: {error}") from error
 
 
 def recipe_of(table: Mapping[str, Any], name: str) -> Recipe:
@@ -262,7 +260,9 @@ def load_recipe(name: str) -> Recipe:
             f"unknown recipe {name!r}; known: {', '.join(recipe_names())}, or a path that ends in .toml"
         )
     try:
-        return parse_recipe(path.read_text(encoding="utf-8"), path.stem)
+        if path.exists() and not path.is_file():
+            raise UserError(f"recipe file {path} cannot be read: not a regular file")
+        return parse_recipe(path.read_text(encoding="utf-8-sig"), path.stem)
     except OSError as error:
         raise UserError(f"recipe file {path} cannot be read: {error.strerror}") from error
     except UnicodeDecodeError as error:

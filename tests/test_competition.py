@@ -3,6 +3,7 @@
 import os
 import re
 import time
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -10,14 +11,17 @@ from numpy.testing import assert_allclose, assert_array_equal
 from shared import DATA, needs_data
 
 from mkpc_kaggle.data.competition import (
+    discard_parts,
     read_cameras,
     read_submission,
     read_test_side,
     read_train_side,
     read_true_pair,
+    replacing,
     submission_problems,
     write_submission,
 )
+from mkpc_kaggle.data.images import Unreadable, read_image
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.cameras import fundamental_of_cameras
 
@@ -350,3 +354,79 @@ def test_a_large_submission_in_the_wrong_order_is_checked_at_once(tmp_path):
     start = time.perf_counter()
     assert submission_problems(tmp_path / "x.csv", ids)
     assert time.perf_counter() - start < 1
+
+
+# hostile tables and places
+
+
+@pytest.mark.parametrize("character", ["\r", "\n", "\x00", "\x1b", "\x85", "\u2028"])
+def test_a_sample_id_with_a_control_character_is_refused(side, character):
+    home = side(f'"a{character}b",b,1,2')
+    with pytest.raises(UserError, match=r"test\.csv: .* has control characters|cannot be read as a table"):
+        read_test_side(home)
+
+
+@pytest.mark.parametrize("name", ["C:x", "c:", "a\x1bb", "a\x7f"])
+def test_drives_and_control_characters_are_no_plain_names(side, name):
+    with pytest.raises(UserError, match="is not a plain name"):
+        read_test_side(side(f"s,{name},1,2"))
+
+
+def test_a_batch_or_image_with_a_name_that_no_file_can_have_is_missing(side):
+    pairs = read_test_side(side(f"s,{'b' * 5000},1,2", f"t,b,{'i' * 5000},2", images=["b/2.png"]))
+    answers = [read_image(path) for pair in pairs for path in pair.images]
+    assert [isinstance(answer, Unreadable) for answer in answers[:3]] == [True] * 3
+
+
+def test_images_that_are_added_later_are_found(side):
+    home = side("s,b,1,2", images=["b/2.png"])
+    assert not read_test_side(home)[0].image0.is_file()
+    (home / "test_images" / "b" / "1.jpg").write_bytes(b"")
+    assert read_test_side(home)[0].image0.name == "1.jpg"
+
+
+def test_a_table_that_is_a_pipe_is_refused(tmp_path):
+    (tmp_path / "test_images").mkdir()
+    os.mkfifo(tmp_path / "test.csv")
+    with pytest.raises(UserError, match="is not a regular file"):
+        read_test_side(tmp_path)
+
+
+def test_two_writers_of_one_file_are_not_in_each_others_way_and_a_link_is_not_followed(tmp_path):
+    path, victim = tmp_path / "submission.csv", tmp_path / "victim"
+    victim.write_text("precious")
+    (tmp_path / ".submission.csv.part").symlink_to(victim)
+    with replacing(path) as first, replacing(path) as second:
+        first.write("first\n" * 3)
+        second.write("second\n")
+    assert path.read_text() == "first\n" * 3
+    assert victim.read_text() == "precious"
+    assert sorted(one.name for one in tmp_path.iterdir()) == [".submission.csv.part", "submission.csv", "victim"]
+
+
+def test_what_is_half_written_when_the_process_is_left_is_removed(tmp_path):
+    with pytest.raises(FileNotFoundError), replacing(tmp_path / "submission.csv") as stream:
+        stream.write("half")
+        discard_parts()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_scene_without_a_pair_of_that_covisibility_is_told(train):
+    with pytest.raises(
+        UserError, match=r"pair_covisibility\.csv has no pair with a covisibility of at least 1\.1"
+    ):
+        read_train_side(train, min_covisibility=1.1)
+
+
+def test_a_large_table_is_read_and_written_in_little_time_and_memory(side):
+    count = 100_000
+    home = side(*(f"sample;{number},b,{number % 50},{number}" for number in range(count)))
+    tracemalloc.start()
+    start = time.process_time()
+    pairs = read_test_side(home)
+    write_submission(home / "x.csv", dict.fromkeys((pair.id for pair in pairs), EYE))
+    seconds, (_, most) = time.process_time() - start, tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert len(pairs) == count
+    assert most / count < 700  # bytes a row, strings of the ids among them
+    assert seconds < 10  # tracing takes most of them

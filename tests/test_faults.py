@@ -1,11 +1,15 @@
 """Faults injected into real runs, on real images, with worker processes."""
 
+import os
+import pickle
 import random
+import shutil
 import signal
 import sqlite3
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -39,8 +43,10 @@ from mkpc_kaggle.demo import DemoSet
 from mkpc_kaggle.engine import session
 from mkpc_kaggle.engine.costs import Timeouts
 from mkpc_kaggle.engine.engine import Ending, RunReport
+from mkpc_kaggle.engine.jobs import Cause, Job, JobFailure, Phase
 from mkpc_kaggle.engine.journal import Journal
 from mkpc_kaggle.engine.pools.pool import Pool
+from mkpc_kaggle.engine.pools.process import ProcessWorker
 from mkpc_kaggle.engine.records import NOT_REACHED, PairRecord
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.pipeline.assembly import Assembly
@@ -244,7 +250,7 @@ from pathlib import Path
 from rectified import THREE_UNITS, RectifiedMatcher, write_pairs
 from mkpc_kaggle.pipeline.assembly import assemble
 from mkpc_kaggle.engine.budget import Budget
-from mkpc_kaggle.engine.session import Interrupt, Session, run_pairs
+from mkpc_kaggle.engine.session import Interrupt, Session, Watchdog, run_pairs
 from mkpc_kaggle.engine.pools.pool import Pool
 
 taken = Pool.next
@@ -258,10 +264,12 @@ home = Path(sys.argv[1])
 assembly = assemble(THREE_UNITS, matchers={{"rectified": RectifiedMatcher(seconds=0.05)}}, device="cpu")
 pairs = write_pairs(home / "pairs", 40)
 started = time.monotonic()
-session = Session(home / "work", Budget(started, 3.0), Interrupt(), progress=False, guarded=True)
+budget, interrupt = Budget(started, 3.0), Interrupt()
 def publish(records):
     (home / "out").write_text(str(sum(bool(record.units) for record in records)))
-run_pairs(pairs, assembly, session, publish)
+with Watchdog(budget, interrupt) as watchdog:
+    session = Session(home / "work", budget, interrupt, progress=False, watchdog=watchdog)
+    run_pairs(pairs, assembly, session, publish)
 """
 
 
@@ -288,7 +296,7 @@ from mkpc_kaggle.engine.submit import submit
 if __name__ == "__main__":
     home = Path(sys.argv[1])
     images = sorted((home / "pairs").iterdir())
-    pairs = [Pair(f"set;{{n:03d}}", "set", *images[2 * n : 2 * n + 2]) for n in range(len(images) // 2)]
+    pairs = [Pair(f"set;{{n:03d}}", "set", *map(str, images[2 * n : 2 * n + 2])) for n in range(len(images) // 2)]
     assembly = assemble(THREE_UNITS, matchers={{"rectified": RectifiedMatcher(seconds=0.02)}}, device="cpu")
     session = Session(home / "work", Budget(time.monotonic()), Interrupt(), progress=False, workers=1)
     submit(pairs, assembly, session, home / "submission.csv")
@@ -362,3 +370,116 @@ def test_workers_that_die_while_they_load_are_bad_input() -> None:
     with pytest.raises(UserError, match="no worker could be started: the worker died: signal SIGKILL"):
         pool.start()
     assert pool.close()
+
+
+def test_an_image_replaced_after_the_run_is_matched_anew(tmp_path: Path) -> None:
+    pairs = write_pairs(tmp_path / "pairs", 5)
+    first = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
+    shutil.copy(pairs[4].image0, pairs[VICTIM].image0)
+    os.utime(pairs[0].image0)
+    with pytest.warns(UserWarning, match="images have changed since they were matched: 1 pairs are matched anew"):
+        again = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
+    anew = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "anew")
+    assert matrices(again.records) == matrices(anew.records)
+    changed = [one != other for one, other in zip(matrices(first.records), matrices(again.records), strict=True)]
+    assert changed == [False, False, False, True, False]
+    assert again.resumed == 4
+
+
+def test_a_table_whose_rows_name_other_images_is_another_test_set(tmp_path: Path) -> None:
+    pairs = write_pairs(tmp_path / "pairs", 3)
+    run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
+    pairs[1] = replace(pairs[1], file0=pairs[1].file1, file1=pairs[1].file0)
+    with pytest.raises(UserError, match="belongs to another run: its test set differ"):
+        run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
+
+
+def test_a_supervisor_that_meets_an_unexpected_error_gives_the_job_back(
+    pairs: list[Pair], undisturbed: RunReport, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run_job, broken = ProcessWorker.run, [True]
+
+    def fail_once(worker: ProcessWorker, job: Job) -> object:
+        if broken.pop() if broken else False:
+            raise pickle.UnpicklingError("what came was no answer")
+        return run_job(worker, job)
+
+    monkeypatch.setattr(ProcessWorker, "run", fail_once)
+    report = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work", workers=1)
+    assert report.ending is Ending.COMPLETE
+    assert report.faults == ("a job was lost: the worker failed: UnpicklingError: what came was no answer",)
+    assert {record.units[0].failure for record in report.records if not record.units[0].matches} <= {
+        "given up: the worker failed: UnpicklingError: what came was no answer"
+    }
+
+
+def test_a_job_for_workers_that_were_all_given_up_comes_back(tmp_path: Path) -> None:
+    pool = Pool([process_place(die)], THREE_UNITS)  # type: ignore[arg-type]
+    with pytest.raises(UserError):
+        pool.start()
+    pool.submit(Job(Phase.SWEEP, (0,), (SWEEP,), (1.0,), time.monotonic() + 5, 5.0))
+    back = pool.next(time.monotonic() + 5)
+    assert isinstance(back, JobFailure)
+    assert back.cause is Cause.NO_WORKER
+    pool.close()
+
+
+GUARDED = """
+import multiprocessing, os, signal, sys, time
+from mkpc_kaggle.engine.budget import Budget
+from mkpc_kaggle.engine.session import Interrupt, Watchdog
+
+if __name__ == "__main__":
+    with Watchdog(Budget(time.monotonic(), float(sys.argv[1])), Interrupt()) as watchdog:
+        {body}
+"""
+
+
+def guarded(body: str, limit: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-c", GUARDED.format(body=body), limit],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+
+
+def test_a_child_that_was_stopped_does_not_outlive_the_watchdog() -> None:
+    child = "multiprocessing.get_context('fork').Process(target=time.sleep, args=[600], daemon=True)"
+    stop = "os.kill(child.pid, signal.SIGSTOP); print(child.pid, flush=True)"
+    done = guarded(f"child = {child}; child.start(); {stop}; time.sleep(600)", "4")
+    assert done.returncode == 1  # nothing was written
+    assert "before a first version of the submission was written" in done.stderr
+    assert not Path(f"/proc/{done.stdout.strip()}").exists()
+
+
+def test_the_watchdog_leaves_though_writing_hangs() -> None:
+    started = time.monotonic()
+    done = guarded("watchdog.save = lambda: time.sleep(600) or ''; time.sleep(600)", "4")
+    assert done.returncode == 1
+    assert time.monotonic() - started > 3
+
+
+def test_the_watchdog_keeps_the_status_of_a_run_that_is_left_while_it_tells_of_it() -> None:
+    assert guarded("watchdog.save = lambda: ''; watchdog.status = 1; time.sleep(600)", "4").returncode == 1
+    assert guarded("watchdog.save = lambda: ''; time.sleep(600)", "4").returncode == 0
+
+
+def test_a_limit_of_ten_million_years_is_none() -> None:
+    done = guarded("time.sleep(0.5); print('ended by itself')", "359999999996400")
+    assert (done.returncode, done.stdout, done.stderr) == (0, "ended by itself\n", "")
+
+
+def test_writing_that_takes_long_is_begun_so_much_earlier(tmp_path: Path) -> None:
+    versions = []
+
+    def publish(records: object) -> None:
+        time.sleep(0.4)
+        versions.append(time.monotonic())
+
+    started = time.monotonic()
+    matcher = RectifiedMatcher(seconds=0.05)
+    run(write_pairs(tmp_path / "pairs", 60), THREE_UNITS, matcher, tmp_path / "work", limit=8.0, publish=publish)
+    assert len(versions) == 2
+    assert versions[-1] - started < 8.0 - 1.5 / 2 - 0.6

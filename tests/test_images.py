@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from mkpc_kaggle.data.images import Image, ImageStore, Unreadable, read_image
+from mkpc_kaggle.data.images import Image, ImageStore, Unreadable, decode_image, is_unchanged, read_image
 
 RED = (200, 30, 10)  # RGB
 
@@ -281,3 +281,41 @@ def test_threads_that_press_on_a_small_store_get_what_they_ask_for(decoded):
     with ThreadPoolExecutor(4) as pool:
         assert list(pool.map(lambda name: store.get(Path(name)).name, names)) == names
     store.close()
+
+
+# what is no picture, and what has become another
+
+
+def test_a_pipe_and_a_device_are_not_read(tmp_path):
+    os.mkfifo(tmp_path / "pipe.png")
+    (tmp_path / "device.png").symlink_to("/dev/zero")
+    for name in ("pipe.png", "device.png"):
+        assert reason(tmp_path / name) == "cannot be read: not a regular file"
+
+
+@pytest.mark.parametrize(("shape", "told"), [((3, 300), "300 x 3 pixels"), ((300, 3), "3 x 300 pixels")])
+def test_a_picture_that_is_a_line_is_unreadable(tmp_path, shape, told):
+    assert told in reason(write(tmp_path / "line.png", noise(*shape)))
+    assert isinstance(read_image(write(tmp_path / "strip.png", noise(10, 300))), Image)
+
+
+def test_a_file_with_the_same_bytes_is_unchanged_and_one_with_others_is_not(tmp_path):
+    path = write(tmp_path / "a.png", noise(5, 7))
+    version = read_image(path).version
+    assert is_unchanged(path, version)
+    os.utime(path, (1, 1))
+    assert is_unchanged(path, version)
+    write(path, noise(5, 7) + 1)
+    assert not is_unchanged(path, version)
+    path.unlink()
+    assert is_unchanged(path, version), "what is gone has no other content"
+
+
+def test_bytes_that_came_without_a_file_tell_its_content_too(tmp_path):
+    path = write(tmp_path / "a.png", noise(5, 7))
+    assert is_unchanged(path, decode_image("a", np.fromfile(path, np.uint8)).version)
+
+
+def test_a_path_that_is_no_utf8_is_told_in_letters(tmp_path):
+    path = tmp_path / os.fsdecode(b"\xff.png")
+    assert str(read_image(path)) == f"{tmp_path}/\\udcff.png: no such file"

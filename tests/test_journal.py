@@ -1,4 +1,7 @@
+import os
+import re
 import sqlite3
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -6,16 +9,18 @@ import numpy as np
 import pytest
 from rectified import SECOND, SWEEP, THREE_UNITS
 
+from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.jobs import Outcome
 from mkpc_kaggle.engine.journal import Journal
 from mkpc_kaggle.engine.journal_tables import DRAWN
-from mkpc_kaggle.engine.records import PairRecord
+from mkpc_kaggle.engine.records import CameraRecord, PairRecord, SceneRecord
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Box
 from mkpc_kaggle.geometry.critical_region import CriticalRegion, RegionReason
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import Estimate, Model
 from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult
+from mkpc_kaggle.scene.choose import Choice, Reason
 
 OURS = {"recipe": {"a": 1}, "test set": "x"}
 UNITS = {unit.name: unit for unit in THREE_UNITS.units}
@@ -153,3 +158,131 @@ def test_a_failed_save_leaves_the_journal_usable(tmp_path: Path) -> None:
     journal.save([(outcome(999), False)])
     assert set(journal.records()) == {*kept, 999}
     journal.close()
+
+
+def damaged_journal(directory: Path, damage: str) -> Path:
+    """A journal of two pairs and a scene, after a statement that no run makes."""
+    pairs = [Pair(str(number), "batch", "a.png", "b.png") for number in range(8)]
+    journal = Journal(directory, OURS, pairs=pairs)
+    journal.save([(outcome(3, seed=1), False), (outcome(7, seed=2), False)])
+    camera = CameraRecord("a", 0, [0.0, 0.0, 1.0], [0.0, 0.0, 1.0], 500.0, 9)
+    scene = SceneRecord("batch", 2, 2, 1, 9, 1.5, "", (camera,))
+    journal.save_scene(scene, {3: Choice(np.eye(3), Reason.SCENE), 7: Choice(None, Reason.UNPLACED)})
+    journal.close()
+    with closing(sqlite3.connect(directory / "journal.sqlite")) as db:
+        db.execute(damage.format(nan=np.full(9, np.nan).tobytes().hex(), zero=bytes(72).hex()))
+        db.commit()
+    return directory / "journal.sqlite"
+
+
+def read_all(journal: Journal) -> None:
+    journal.records()
+    journal.scenes()
+    for index in (3, 7):
+        journal.results(index, UNITS)
+
+
+DAMAGES = [
+    "UPDATE pair SET fundamental = x'{nan}'",
+    "UPDATE pair SET fundamental = x'{zero}'",
+    "UPDATE pair SET fundamental = x'00'",
+    "UPDATE pair SET fundamental = 'text'",
+    "UPDATE pair SET failure = x'ff'",
+    "UPDATE pair SET failure = cast(x'ff' AS TEXT)",
+    "UPDATE pair SET decode_seconds = 'x'",
+    "UPDATE pair SET before = 'x'",
+    "UPDATE pair SET version0 = x'00'",
+    "UPDATE unit SET matches = 'x'",
+    "UPDATE unit SET failure = NULL",
+    "UPDATE unit SET unit = 'another' WHERE place = 0",
+    "UPDATE unit SET points = x'00'",
+    "UPDATE unit SET points = zeroblob(1000)",
+    "UPDATE region SET reason = 'x'",
+    'UPDATE region SET "left" = "right"',
+    "DELETE FROM region WHERE image = 1",
+    "UPDATE choice SET fundamental = x'{nan}'",
+    "UPDATE choice SET fundamental = x'00'",
+    "UPDATE choice SET reason = 'x'",
+    "UPDATE scene SET cameras = '['",
+    "UPDATE scene SET cameras = '[1]'",
+    "UPDATE scene SET cameras = '[{{}}]'",
+    "UPDATE scene SET cameras = replace(cameras, '1.0', 'null')",
+    "UPDATE scene SET images = 'x'",
+    "UPDATE run SET value = '{{'",
+    "DROP TABLE unit",
+    "DROP TABLE scene",
+    "ALTER TABLE pair DROP COLUMN before",
+]
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_damage_anywhere_is_told_as_such(tmp_path: Path, damage: str) -> None:
+    path = damaged_journal(tmp_path, damage)
+    told = rf"{re.escape(str(path))} is damaged \(.*start anew with --fresh"
+    with pytest.raises(UserError, match=told), Journal(tmp_path, OURS) as journal:
+        read_all(journal)
+    with Journal(tmp_path, OURS, fresh=True) as journal:
+        assert journal.records() == {}
+
+
+def test_pairs_that_the_test_set_has_not_are_damage(tmp_path: Path) -> None:
+    damaged_journal(tmp_path, "UPDATE pair SET pair = pair + 1000")
+    pairs = [Pair(str(number), "batch", "a.png", "b.png") for number in range(8)]
+    with Journal(tmp_path, OURS) as journal, pytest.raises(UserError, match="damaged"):
+        journal.forget_changed(pairs)
+
+
+def test_bytes_damaged_at_random_never_end_in_a_traceback(tmp_path: Path) -> None:
+    path = damaged_journal(tmp_path, "UPDATE pair SET failure = ''")
+    good, rng, refused = path.read_bytes(), np.random.default_rng(0), 0
+    for number in range(60):
+        data = bytearray(good)
+        start = int(rng.integers(len(good)))
+        data[start : start + 200] = rng.bytes(200)
+        path.write_bytes(bytes(data[: len(good)]) if number % 3 else good[:start])
+        for name in ("journal.sqlite-wal", "journal.sqlite-journal"):
+            (tmp_path / name).unlink(missing_ok=True)
+        try:
+            with Journal(tmp_path, OURS) as journal:
+                read_all(journal)
+                assert all(np.isfinite(record.fundamental).all() for record in journal.records().values())
+        except UserError:
+            refused += 1
+    assert 10 < refused < 60
+
+
+def test_a_lock_that_is_none_is_named(tmp_path: Path) -> None:
+    (tmp_path / "journal.lock").write_bytes(b"this is no database" * 100)
+    with pytest.raises(UserError, match=r"journal\.lock is no lock of this program .*remove it"):
+        Journal(tmp_path, OURS)
+
+
+def test_a_pipe_in_the_place_of_the_journal_is_refused(tmp_path: Path) -> None:
+    for number, name in enumerate(("journal.lock", "journal.sqlite")):
+        directory = tmp_path / str(number)
+        directory.mkdir()
+        os.mkfifo(directory / name)
+        with pytest.raises(UserError, match=f"{name} is not a regular file"):
+            Journal(directory, OURS)
+
+
+def test_a_refused_journal_holds_no_lock_and_no_file(tmp_path: Path) -> None:
+    Journal(tmp_path, OURS).close()
+    kept = []
+    for belongs_to, damage in (({**OURS, "recipe": {}}, False), (OURS, True)):
+        if damage:
+            (tmp_path / "journal.sqlite").write_bytes(b"this is no database" * 100)
+        with pytest.raises(UserError) as caught:
+            Journal(tmp_path, belongs_to)
+        kept.append(caught)  # as a notebook keeps the last traceback
+        open_files = [str(link.readlink()) for link in Path("/proc/self/fd").iterdir() if link.is_symlink()]
+        assert not [name for name in open_files if name.startswith(str(tmp_path))]
+    Journal(tmp_path, OURS, fresh=True).close()
+
+
+def test_text_that_is_no_utf8_is_kept_in_letters(tmp_path: Path) -> None:
+    with Journal(tmp_path, OURS) as journal:
+        record = PairRecord.untouched(3, os.fsdecode(b"\xff: no such file"))
+        journal.save([(Outcome(record), False)])
+        journal.note("fault", 0.0, os.fsdecode(b"\xff"))
+        assert journal.records()[3].failure == "\\udcff: no such file"

@@ -1,6 +1,7 @@
 """Recipes: those that come with the package work, and a wrong one is refused in words that help."""
 
 import json
+import os
 import tomllib
 from dataclasses import replace
 from itertools import combinations
@@ -472,3 +473,31 @@ def test_a_unit_can_be_shrunk() -> None:
 def test_a_choice_is_a_recipe_and_perhaps_a_mode(text: str, choice: Choice, folder: str) -> None:
     assert Choice.parse(text) == choice
     assert choice.folder == folder
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        (
+            f"units = [{{ stage = 1, matcher = 'sift', long_side = {'9' * 400} }}]",
+            "an integer of more than 64 bits",
+        ),
+        (f"units = [{{ stage = 1, matcher = 'sift', long_side = {'9' * 5000} }}]", "is not valid TOML"),
+        (f"units = 0x{'f' * 9999}", "is not valid TOML"),
+        (f"{SIFT}\n[magsac]\nthreshold = {'9' * 400}", "an integer of more than 64 bits"),
+        ("units = " + "[" * 20_000 + "]" * 20_000, "is not valid TOML"),
+        ("a." * 20_000 + "b = 1", "recipe 'x'"),
+    ],
+    ids=["400 digits", "5000 digits", "hexadecimal", "float", "nested", "dotted"],
+)
+def test_numbers_and_tables_out_of_all_proportion_are_refused(text, told):
+    with pytest.raises(UserError, match=told):
+        parse_recipe(text, "x")
+
+
+def test_a_recipe_file_may_begin_with_a_byte_order_mark_and_must_be_a_file(tmp_path):
+    (tmp_path / "x.toml").write_bytes(b"\xef\xbb\xbf" + SIFT.encode())
+    assert load_recipe(str(tmp_path / "x.toml")).units[0].matcher == "sift"
+    os.mkfifo(tmp_path / "pipe.toml")
+    with pytest.raises(UserError, match="not a regular file"):
+        load_recipe(str(tmp_path / "pipe.toml"))

@@ -58,7 +58,7 @@ def empty_journal(work_dir: Path, pairs: list[Pair], **about: object) -> Journal
 
 
 def evil_log(directory: Path) -> RunLog:
-    pairs = [Pair(EVIL, EVIL, Path(f"{EVIL.replace('/', '')}.png"), Path("b.png"))]
+    pairs = [Pair(EVIL, EVIL, f"{EVIL.replace('/', '')}.png", "b.png")]
     journal = empty_journal(directory, pairs, device=EVIL, left_out=(EVIL,), versions={EVIL: EVIL})
     for kind in EventKind:
         journal.note(kind, 1.0, EVIL)
@@ -321,3 +321,15 @@ def test_a_strip_shows_both_images_at_one_height() -> None:
     assert drawn.shape[:2] == pytest.approx((480, 960 + 480), abs=1)  # older versions of matplotlib round down
     assert drawn[400, 100].min() > 200
     assert drawn[400, 1400].max() < 50
+
+
+def test_a_strip_of_long_pictures_stays_small() -> None:
+    from mkpc_kaggle.data.images import Image
+    from mkpc_kaggle.pipeline.pair import PairMatch
+    from mkpc_kaggle.reporting import figures
+
+    long = Image("long", np.zeros((20, 640, 3), np.uint8))
+    figure = figures.draw_strip((long, long), PairMatch())
+    width, height = figure.get_size_inches() * 110
+    assert width * height < 2_100_000
+    assert width / height == pytest.approx(64, rel=0.05)

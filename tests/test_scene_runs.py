@@ -35,7 +35,7 @@ def batch_pairs(directory: Path, images: int = 4, batch: str = "one") -> list[Pa
     for number, path in enumerate(paths):
         cv2.imwrite(str(path), np.full((72, 80, 3), 10 + 10 * number, np.uint8))
     chosen = [(i, j) for i in range(images) for j in range(i + 1, images)]
-    return [Pair(f"{batch};{i}-{j}", batch, paths[i], paths[j]) for i, j in chosen]
+    return [Pair(f"{batch};{i}-{j}", batch, str(paths[i]), str(paths[j])) for i, j in chosen]
 
 
 def fault(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
@@ -163,3 +163,18 @@ def test_a_recipe_without_scenes_starts_none(tmp_path: Path, monkeypatch: pytest
     report = run(batch_pairs(tmp_path / "images"), Recipe((SWEEP,)), RectifiedMatcher(), tmp_path / "work")
     assert report.scenes == ()
     assert report.faults == ()
+
+
+def test_an_image_replaced_after_the_run_drops_the_scene_and_its_batch_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fault(monkeypatch, "choose_scene_for_all_but_the_first")
+    pairs = batch_pairs(tmp_path / "images") + batch_pairs(tmp_path / "others", 3, "two")
+    run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
+    cv2.imwrite(str(pairs[0].image0), np.full((72, 80, 3), 200, np.uint8))
+    fault(monkeypatch, "die_as_scene")
+    with pytest.warns(UserWarning, match="6 pairs are matched anew"):
+        again = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
+    assert [record.source for record in again.records] == ["pair"] * 6 + ["pair", "scene", "scene"]
+    assert {scene.batch: bool(scene.failure) for scene in again.scenes} == {"one": True, "two": False}
+    assert [record.F.tobytes() for record in again.records] == own_matrices(pairs, tmp_path / "alone")

@@ -7,6 +7,7 @@ import time
 import warnings
 from collections.abc import Sequence
 from importlib import import_module
+from io import TextIOWrapper
 from typing import TextIO
 
 from mkpc_kaggle import __version__
@@ -39,6 +40,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     141: the reader of the output closed the pipe.
     """
     started = time.monotonic()
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):  # paths and ids may be of letters that the terminal has not
+            stream.reconfigure(errors="backslashreplace")
     parsed = make_parser().parse_args(arguments)
     parsed.started = started
     with warnings.catch_warnings():
@@ -78,11 +82,13 @@ def make_parser() -> argparse.ArgumentParser:
 
 def finish(status: int, *, at_rest: bool) -> int:
     """Return ``status``, or exit at once if a thread cannot be stopped: all results are on disk."""
-    if at_rest:
-        return status
-    sys.stdout.flush()
-    sys.stderr.flush()
-    os._exit(status)
+    if not at_rest:
+        from mkpc_kaggle.engine.session import leave
+
+        sys.stdout.flush()
+        sys.stderr.flush()
+        leave(status)
+    return status
 
 
 def _show_warning(

@@ -3,6 +3,8 @@
 import argparse
 from pathlib import Path
 
+from mkpc_kaggle.cli import options
+
 HELP = """\
 Read the journal of a run, running or ended, and show what it did. DIR is the run's work directory, NAME.work
 beside the submission. Without options: one screen.
@@ -32,6 +34,8 @@ def run(arguments: argparse.Namespace) -> int:
     from mkpc_kaggle.reporting.sections import Artist
     from mkpc_kaggle.reporting.summary import overview
 
+    files = {"--json": arguments.json, "--report": arguments.report}
+    options.require_apart(files, arguments.work_dir, [])
     log = read_log(arguments.work_dir)
     if arguments.csv is not None:
         for path in write_csv(log, arguments.csv):

@@ -1,12 +1,15 @@
 """Options that several commands share."""
 
 import argparse
+import os
+from collections.abc import Mapping, Sequence
 from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mkpc_kaggle.engine.budget import Budget, monotonic_of, parse_duration
 from mkpc_kaggle.engine.pools.cluster import RayCluster, parse_workers
+from mkpc_kaggle.errors import UserError
 
 if TYPE_CHECKING:
     from mkpc_kaggle.pipeline.assembly import Assembly
@@ -123,6 +126,13 @@ def workers(text: str) -> int | RayCluster:
         raise argparse.ArgumentTypeError(str(error)) from error
 
 
+def at_least_1(text: str) -> int:
+    """A count of something."""
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text!r} is no number of 1 or more")
+    return int(text)
+
+
 def add_time_limit(parser: argparse.ArgumentParser, default: str | None) -> None:
     parser.add_argument(
         "--time-limit",
@@ -138,6 +148,44 @@ def add_time_limit(parser: argparse.ArgumentParser, default: str | None) -> None
         help="count the limit from this moment instead, in seconds since 1970: a notebook that started before "
         "gives the time.time() of its first cell, a script $(date +%%s)",
     )
+
+
+def require_apart(files: Mapping[str, Path | None], work_dir: Path | None, inputs: Sequence[Path]) -> None:
+    """Refuse to write over what is read, or over another output; raises :class:`UserError`.
+
+    ``files`` are what a command writes, by option, beside the journal in ``work_dir``. Of ``inputs``, directories
+    are taken with all that is in them.
+    """
+    for option, path in files.items():
+        if path is None:
+            continue
+        if not path.name or path.is_dir():
+            raise UserError(f"{option} {str(path)!r} is a directory; name a file")
+        for other, its_path in files.items():
+            if other != option and its_path is not None and _same(path, its_path):
+                raise UserError(
+                    f"{option} {path} and {other} {its_path} are one file; name another for one of them"
+                )
+        if work_dir is not None and (
+            _within(work_dir, path) or (_same(path.parent, work_dir) and path.name.startswith("journal."))
+        ):
+            raise UserError(f"{option} {path} and the work directory {work_dir} are in each other's way")
+    for option, path in {**files, "--work-dir": work_dir}.items():
+        for there in inputs:
+            if path is not None and _within(path, there):
+                raise UserError(f"{option} {path} would be written over the input {there}; name another place")
+
+
+def _within(path: Path, other: Path) -> bool:
+    """Whether ``path`` is the other or lies in it."""
+    return any(_same(one, other) for one in (path, *Path(os.path.realpath(path)).parents))
+
+
+def _same(path: Path, other: Path) -> bool:
+    try:  # links, and file systems that do not tell A from a
+        return os.path.realpath(path) == os.path.realpath(other) or path.samefile(other)
+    except OSError:
+        return False
 
 
 def budget_of(arguments: argparse.Namespace) -> Budget:

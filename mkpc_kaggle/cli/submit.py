@@ -45,22 +45,28 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    from mkpc_kaggle.data.competition import read_test_side
-    from mkpc_kaggle.engine.session import Session, interruptible
+    from mkpc_kaggle.data.competition import read_test_side, test_side
+    from mkpc_kaggle.engine.session import Session, Watchdog, interruptible
     from mkpc_kaggle.engine.submit import submit
     from mkpc_kaggle.recipe import Choice, Mode
     from mkpc_kaggle.reporting.report import report_run
     from mkpc_kaggle.reporting.summary import summary, trouble
 
     output: Path = arguments.output
-    with interruptible() as interrupt:
-        budget = options.budget_of(arguments)
+    work_dir: Path = arguments.work_dir or output.parent / f"{output.stem}.work"
+    page: Path = arguments.report or output.parent / f"{output.stem}.html"
+    files = {"--output": output, "--report": None if arguments.no_report else page}
+    options.require_apart(files, work_dir, [*test_side(arguments.test_dir), Path(arguments.recipe)])
+    budget = options.budget_of(arguments)
+    with interruptible() as interrupt, Watchdog(budget, interrupt) as watchdog:
         pairs = read_test_side(arguments.test_dir)
         assembly = options.assembly_of(arguments, Choice(arguments.recipe, Mode(arguments.mode)))
-        work_dir = arguments.work_dir or output.with_name(f"{output.stem}.work")
         print(f"{len(pairs)} pairs, recipe {assembly.recipe.name}, {assembly.placement}, journal in {work_dir}")
-        session = Session(work_dir, budget, interrupt, arguments.fresh, workers=arguments.workers, guarded=True)
+        session = Session(
+            work_dir, budget, interrupt, arguments.fresh, workers=arguments.workers, watchdog=watchdog
+        )
         report, at_rest = submit(pairs, assembly, session, output)
+        watchdog.status = int(bool(report.unwritten or trouble(report)))
         if arguments.explain:
             print("\n".join(["plan:", *map(str, report.explanations)]))
         print(summary(pairs, report, assembly.left_out))
@@ -68,7 +74,5 @@ def run(arguments: argparse.Namespace) -> int:
             f"submission: {output}" + (f" is not the last version: {report.unwritten}" if report.unwritten else "")
         )
         if not arguments.no_report:
-            page = arguments.report or output.with_suffix(".html")
             print(report_run(work_dir, page, session.must_end(), pairs), flush=True)
-        status = 128 + interrupt.signal if interrupt.signal else int(bool(report.unwritten or trouble(report)))
-        return finish(status, at_rest=at_rest)
+        return finish(128 + interrupt.signal if interrupt.signal else watchdog.status, at_rest=at_rest)

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mkpc_kaggle.cli import finish, options
+from mkpc_kaggle.errors import UserError
 
 if TYPE_CHECKING:
     from mkpc_kaggle.data.competition import Scene
@@ -36,7 +37,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     source.add_argument("--pairs", type=Path, metavar="FILE", help="a list of pairs with K and poses")
     parser.add_argument("--image-root", type=Path, metavar="DIR", help="where the images of --pairs lie")
     parser.add_argument("--scenes", default="", metavar="A,B", help="of --train-dir; default: all")
-    parser.add_argument("--pairs-per-scene", type=int, metavar="N", help="evenly spread; default: all")
+    parser.add_argument(
+        "--pairs-per-scene", type=options.at_least_1, metavar="N", help="evenly spread; default: all"
+    )
     parser.add_argument(
         "--min-covisibility", type=float, default=0.1, help="of --train-dir; default: 0.1, as in the competition"
     )
@@ -83,7 +86,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    from mkpc_kaggle.errors import UserError
     from mkpc_kaggle.evaluation.validate import score_submission, score_table
 
     if (arguments.submission is None) != (arguments.truth is None):
@@ -96,6 +98,8 @@ def run(arguments: argparse.Namespace) -> int:
         raise UserError("--units chooses from one recipe; --compare takes recipes as they are")
     if arguments.compare is not None and len(arguments.compare) < 2:
         raise UserError(f"--compare needs two recipes or more, not only {arguments.compare[0]}")
+    inputs = [arguments.pairs, arguments.truth, *(arguments.submission or ())]
+    options.require_apart({"--json": arguments.json}, arguments.work_dir, [path for path in inputs if path])
     with tempfile.TemporaryDirectory(prefix="mkpc-") as temporary:
         work_dir = arguments.work_dir or Path(temporary)
         scenes = _read_scenes(arguments, work_dir)
@@ -200,8 +204,6 @@ def with_units(recipe: "Recipe", wanted: str | None) -> "Recipe":
     """The recipe with the units of these names alone, in this order; all of them where none are named."""
     from dataclasses import replace
 
-    from mkpc_kaggle.errors import UserError
-
     known, names = {unit.name: unit for unit in recipe.units}, wanted.split(",") if wanted is not None else []
     for name in names:
         if name not in known:
@@ -213,7 +215,6 @@ def _with_estimator(recipe: "Recipe", arguments: argparse.Namespace) -> "Recipe"
     """The recipe with the robust method and threshold that the command names."""
     from dataclasses import replace
 
-    from mkpc_kaggle.errors import UserError
     from mkpc_kaggle.geometry.robust import Method
 
     config = recipe.magsac
@@ -252,4 +253,7 @@ def _write_report(arguments: argparse.Namespace, scenes: "tuple[Scene, ...]", se
 
 def _write_json(path: Path | None, values: dict[str, Any]) -> None:
     if path is not None:
-        path.write_text(json.dumps(values, indent=1) + "\n", encoding="utf-8")
+        try:
+            path.write_text(json.dumps(values, indent=1) + "\n", encoding="utf-8")
+        except OSError as error:
+            raise UserError(f"--json {path} cannot be written: {error.strerror}") from error

@@ -7,11 +7,14 @@ jpeg are accepted on both sides. F of a pair satisfies x2^T F x1 = 0, image 1 be
 
 import csv
 import os
-from collections.abc import Iterable, Mapping, Sequence
+import re
+import secrets
+import sys
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
-from functools import cache
 from pathlib import Path
-from typing import TypeVar
+from typing import TextIO, TypeVar
 
 import numpy as np
 import pandas as pd
@@ -25,25 +28,47 @@ TEST_COLUMNS = ("sample_id", "batch_id", "image_1_id", "image_2_id")
 SUBMISSION_COLUMNS = ("sample_id", "fundamental_matrix")
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 
+CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]")
+"""Characters that end lines, or drive a terminal."""
+NOT_PLAIN = re.compile(rf"^\.{{0,2}}$|^[A-Za-z]:|[/\\]|{CONTROL.pattern}")
+"""Names of directories, of drives (Windows), and of no file."""
+
 Item = TypeVar("Item")
 
+_parts: set[Path] = set()
+"""Files that :func:`replacing` is writing."""
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, slots=True)
 class Pair:
     """Two images to match: ``id`` is unique in a run, ``group`` the batch or scene they belong to.
 
-    With ``intrinsics``, the camera matrices, E is estimated instead of F.
+    ``file0`` and ``file1`` are the images' paths; as text, since a table may have a million rows. With
+    ``intrinsics``, the camera matrices, E is estimated instead of F.
     """
 
     id: str
     group: str
-    image0: Path
-    image1: Path
+    file0: str
+    file1: str
     intrinsics: tuple[Matrix3, Matrix3] | None = field(default=None, compare=False)
+
+    @property
+    def image0(self) -> Path:
+        return Path(self.file0)
+
+    @property
+    def image1(self) -> Path:
+        return Path(self.file1)
 
     @property
     def images(self) -> tuple[Path, Path]:
         return self.image0, self.image1
+
+    @property
+    def names(self) -> tuple[str, str]:
+        """The names of the images' files."""
+        return self.file0.rpartition(os.sep)[2], self.file1.rpartition(os.sep)[2]
 
     @property
     def model(self) -> Model:
@@ -74,16 +99,21 @@ class Scene:
     pairs: tuple[TruePair, ...]
 
 
+def test_side(directory: Path) -> tuple[Path, Path]:
+    """The table and the directory of the images of a test side."""
+    home = directory.parent if directory.name == "test_images" else directory
+    return home / "test.csv", home / "test_images"
+
+
 def read_test_side(directory: Path) -> tuple[Pair, ...]:
     """The pairs of ``test.csv``, in its order.
 
     ``directory`` holds ``test.csv`` and ``test_images/``, or is ``test_images`` itself with ``test.csv``
     beside it. A missing image is no error here: its path does not exist. Raises
-    :class:`UserError` for a missing or unreadable table, missing columns, no rows, repeated sample ids, and
-    ids that are not plain names.
+    :class:`UserError` for a missing or unreadable table, missing columns, no rows, sample ids that are repeated or
+    have control characters, and other ids that are not plain names.
     """
-    home = directory.parent if directory.name == "test_images" else directory
-    path, images = home / "test.csv", home / "test_images"
+    path, images = test_side(directory)
     table = read_table(path, TEST_COLUMNS)
     if not images.is_dir():
         raise UserError(f"{images}: no such directory; --test-dir must hold test.csv and test_images/")
@@ -93,14 +123,16 @@ def read_test_side(directory: Path) -> tuple[Pair, ...]:
     if not repeated.empty:
         times = int((table["sample_id"] == repeated.iloc[0]).sum())
         raise UserError(f"{path}: the sample_id {repeated.iloc[0]!r} occurs {times} times")
+    if odd := next(filter(CONTROL.search, table["sample_id"]), None):
+        raise UserError(f"{path}: the sample_id {odd!r} has control characters, which a submission cannot hold")
+    for column in TEST_COLUMNS[1:]:
+        for name in table[column].unique():
+            plain_name(name, path)
+    found = {batch: Images(images / batch) for batch in table["batch_id"].unique()}
+    rows = (table[column].tolist() for column in TEST_COLUMNS)
     return tuple(
-        Pair(
-            str(sample),
-            str(batch),
-            image_path(images / plain_name(batch, path), plain_name(first, path)),
-            image_path(images / batch, plain_name(second, path)),
-        )
-        for sample, batch, first, second in table[list(TEST_COLUMNS)].itertuples(index=False)
+        Pair(sample, sys.intern(batch), found[batch][first], found[batch][second])
+        for sample, batch, first, second in zip(*rows, strict=True)
     )
 
 
@@ -157,14 +189,45 @@ def write_submission(path: Path, rows: Mapping[str, Matrix3]) -> None:
 
     Raises ``OSError`` where it cannot be written; an earlier file is then unchanged.
     """
-    part = path.with_name(f".{path.name}.part")
-    with part.open("w", encoding="utf-8", newline="") as stream:
+    with replacing(path) as stream:
         table = csv.writer(stream, lineterminator="\n")
         table.writerow(SUBMISSION_COLUMNS)
-        table.writerows([sample, " ".join(f"{value:.12g}" for value in F.ravel())] for sample, F in rows.items())
-        stream.flush()
-        os.fsync(stream.fileno())
-    part.replace(path)
+        table.writerows(zip(rows, _cells(rows.values()), strict=True))
+
+
+def _cells(matrices: Iterable[Matrix3]) -> Iterator[str]:
+    """Each matrix as text; a matrix that follows itself, as the fallback does, is not formatted again."""
+    last, text = None, ""
+    for F in matrices:
+        if F is not last:
+            last, text = F, " ".join(f"{value:.12g}" for value in F.ravel())
+        yield text
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[TextIO]:
+    """A file to write, under a name of its own, that takes the place of ``path`` when all of it is on the disk.
+
+    Raises ``OSError`` where it cannot be written; nothing is left of it then.
+    """
+    part = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")  # two runs may have one output
+    _parts.add(part)
+    try:
+        with part.open("x", encoding="utf-8", newline="") as stream:
+            yield stream
+            stream.flush()
+            os.fsync(stream.fileno())
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
+        _parts.discard(part)
+
+
+def discard_parts() -> None:
+    """Remove what this process has begun to write and not finished, before it is left at once."""
+    for part in tuple(_parts):
+        with suppress(OSError):
+            part.unlink(missing_ok=True)
 
 
 def read_submission(path: Path) -> dict[str, Matrix3]:
@@ -201,6 +264,8 @@ def submission_problems(path: Path, sample_ids: Sequence[str]) -> list[str]:
 
 def read_table(path: Path, columns: Sequence[str]) -> pd.DataFrame:
     """A CSV file with all cells as text; raises :class:`UserError` unless it has these columns."""
+    if path.exists() and not path.is_file():
+        raise UserError(f"{path} is not a regular file")
     try:
         table = pd.read_csv(path, dtype=str, keep_default_na=False)
     except FileNotFoundError as error:
@@ -219,7 +284,7 @@ def read_table(path: Path, columns: Sequence[str]) -> pd.DataFrame:
 
 def plain_name(name: str, where: Path) -> str:
     """``name`` if it is the name of one file or directory; an id must not point outside its directory."""
-    if name in ("", ".", "..") or any(mark in name for mark in ("/", "\\", "\0")):
+    if NOT_PLAIN.search(name):
         raise UserError(f"{where}: the id {name!r} is not a plain name, so it cannot name a file here")
     return name
 
@@ -236,32 +301,36 @@ def evenly_spread(items: Sequence[Item], most: int | None) -> list[Item]:
     return [items[index] for index in np.linspace(0, len(items) - 1, most).round().astype(int)]
 
 
-def image_path(directory: Path, image_id: str) -> Path:
-    """The image of that id in a directory; a png that does not exist where there is none."""
-    return _images_of(directory).get(image_id, directory / f"{image_id}.png")
+class Images(dict[str, str]):
+    """Paths of the images of a directory, as it is now, by id; for any other id a png that does not exist."""
 
+    def __init__(self, directory: Path) -> None:
+        self.directory = str(directory)
+        try:
+            images = sorted(path for path in directory.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES)
+        except OSError:  # there is none, or none can have a name as long as that
+            images = []
+        super().__init__((path.stem, str(path)) for path in reversed(images))
 
-@cache
-def _images_of(directory: Path) -> dict[str, Path]:
-    if not directory.is_dir():
-        return {}
-    images = sorted(path for path in directory.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES)
-    return {path.stem: path for path in reversed(images)}
+    def __missing__(self, image_id: str) -> str:
+        return f"{self.directory}{os.sep}{image_id}.png"
 
 
 def _read_scene(directory: Path, metres: float, min_covisibility: float, most: int | None) -> Scene:
     cameras = read_cameras(directory / "calibration.csv")
     path, columns = directory / "pair_covisibility.csv", ["pair", "covisibility"]
-    pairs = []
+    images, pairs = Images(directory / "images"), []
     for key, cell in read_table(path, columns)[columns].itertuples(index=False):
         covisibility = float(_numbers(cell, path, 1)[0])
         first, dash, second = key.partition("-")
         if not dash or first not in cameras or second not in cameras:
             raise UserError(f"{path}: the pair {key!r} is not two images of calibration.csv")
         if covisibility >= min_covisibility:
-            image0, image1 = (image_path(directory / "images", plain_name(name, path)) for name in (first, second))
+            image0, image1 = (images[plain_name(name, path)] for name in (first, second))
             pair = Pair(pair_id(directory.name, first, second), directory.name, image0, image1)
             pairs.append(TruePair(pair, cameras[first], cameras[second], covisibility))
+    if not pairs:
+        raise UserError(f"{path} has no pair with a covisibility of at least {min_covisibility:g}")
     return Scene(directory.name, metres, tuple(evenly_spread(pairs, most)))
 
 

@@ -1,6 +1,8 @@
 """Decoding images, in the background and once: an unreadable file is a value with a reason, not an exception."""
 
 import hashlib
+import os
+import stat
 import threading
 from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -14,13 +16,23 @@ import numpy as np
 from mkpc_kaggle.data.cache import ByteCache
 from mkpc_kaggle.geometry.coordinates import Pixels, Size
 
+MOST_ASPECT = 32
+"""Of the longer side to the shorter one. A picture beyond it is taken for damaged: views of it would be a few
+pixels high, or would not fit into memory."""
+
+Stamp = tuple[int, ...]
+
 
 @dataclass(frozen=True, eq=False)
 class Image:
-    """A decoded picture: ``pixels`` is (H, W, 3) uint8 RGB; ``name`` is unique in a run."""
+    """A decoded picture: ``pixels`` is (H, W, 3) uint8 RGB; ``name`` is unique in a run.
+
+    ``version`` tells the content of its file, see :func:`is_unchanged`; empty where there is none.
+    """
 
     name: str
     pixels: Pixels
+    version: str = ""
 
     @classmethod
     def of_array(cls, array: Pixels) -> "Image":
@@ -54,7 +66,7 @@ class Unreadable:
     reason: str
 
     def __str__(self) -> str:
-        return f"{self.name}: {self.reason}"
+        return f"{printable(self.name)}: {self.reason}"
 
 
 def read_image(path: Path) -> Image | Unreadable:
@@ -65,16 +77,22 @@ def read_image(path: Path) -> Image | Unreadable:
     """
     name = str(path)
     try:
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode):  # a pipe or a device may never end
+            return Unreadable(name, "cannot be read: not a regular file")
         data = np.fromfile(path, np.uint8)
     except FileNotFoundError:
         return Unreadable(name, "no such file")
     except (OSError, ValueError, MemoryError) as error:
         return Unreadable(name, f"cannot be read: {error}")
-    return decode_image(name, data)
+    return decode_image(name, data, stamp_of(status))
 
 
-def decode_image(name: str, data: Pixels) -> Image | Unreadable:
-    """Decode the (N,) uint8 bytes of a file, as :func:`read_image` does; never raises."""
+def decode_image(name: str, data: Pixels, stamp: Stamp = ()) -> Image | Unreadable:
+    """Decode the (N,) uint8 bytes of a file, as :func:`read_image` does; never raises.
+
+    ``stamp`` is what the file had before it was read.
+    """
     if data.size == 0:
         return Unreadable(name, "the file is empty")
     try:
@@ -83,7 +101,40 @@ def decode_image(name: str, data: Pixels) -> Image | Unreadable:
         return Unreadable(name, f"cannot be decoded: {error}")
     if bgr is None:
         return Unreadable(name, "not a picture, or cut off: it cannot be decoded")
-    return Image(name, np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8))
+    height, width = bgr.shape[:2]
+    if max(height, width) > MOST_ASPECT * min(height, width):
+        return Unreadable(name, f"{width} x {height} pixels: one side is more than {MOST_ASPECT} times the other")
+    version = " ".join(map(str, (digest_of(data), *stamp)))
+    return Image(name, np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8), version)
+
+
+def is_unchanged(path: Path, version: str) -> bool:
+    """Whether a file still has the content that it had when an image of that ``version`` was read from it.
+
+    A file whose size and times are the same is not read. One that cannot be read any more has no other content.
+    """
+    digest, *stamp = version.split()
+    try:
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode) or list(map(str, stamp_of(status))) == stamp:
+            return True
+        return digest_of(np.fromfile(path, np.uint8)) == digest
+    except (OSError, ValueError):
+        return True
+
+
+def stamp_of(status: os.stat_result) -> Stamp:
+    """Size in bytes and times of change in nanoseconds: a file's content does not change without them."""
+    return status.st_size, status.st_mtime_ns, status.st_ctime_ns
+
+
+def digest_of(data: Pixels) -> str:
+    return hashlib.blake2b(data.data, digest_size=16).hexdigest()
+
+
+def printable(text: str) -> str:
+    """``text`` in UTF-8's alphabet: paths may hold bytes that are none of it."""
+    return text.encode("utf-8", "backslashreplace").decode()
 
 
 class ImageStore:

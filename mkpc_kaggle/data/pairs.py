@@ -6,6 +6,7 @@ by row, are those of the images as they are stored: X_1 = R X_0 + t with T = [R 
 """
 
 import hashlib
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
@@ -121,7 +122,7 @@ def turned_copy(image: Path, turns: int, copies: Path) -> UprightImage:
     picture = read_image(image) if turns else None
     if picture is None or isinstance(picture, Unreadable):
         return UprightImage(image)
-    name = hashlib.sha256(str(image).encode()).hexdigest()[:16]
+    name = hashlib.sha256(os.fsencode(image)).hexdigest()[:16]
     path = copies / f"{image.stem}-{name}-{turns}.png"
     bgr = cv2.cvtColor(np.ascontiguousarray(np.rot90(picture.pixels, turns)), cv2.COLOR_RGB2BGR)
     try:
@@ -145,8 +146,8 @@ def _true_pair(line: PairLine, upright: Callable[[str, int], UprightImage], mode
     pair = Pair(
         f"{line.number}: {names}",
         group,
-        shown[0].path,
-        shown[1].path,
+        str(shown[0].path),
+        str(shown[1].path),
         (camera0.K, camera1.K) if model is Model.E else None,
     )
     return TruePair(pair, camera0, camera1, nan)

@@ -28,17 +28,25 @@ def format_duration(seconds: float) -> str:
     return f"{minutes}m{rest:02d}s" if minutes < 60 else f"{minutes // 60}h{minutes % 60:02d}m"
 
 
-@dataclass(frozen=True)
+TELLING = 5
+"""What the summary of a run takes at most, as a multiple of what writing its submission takes."""
+MOST_WRITING = 0.05
+"""The share of the limit that writing may be thought to take."""
+
+
+@dataclass
 class Budget:
     """The time a run is given, in seconds of ``clock`` since ``started``; the clock never jumps.
 
     ``stop`` is when no unit may be running any more, ``end`` when nothing is waited for any longer; what is
-    left then suffices to write the submission and to end; a process that has not ended by ``last`` is made to.
+    left then suffices to write the submission and to end; a process that has not ended by ``last`` is made to,
+    the submission written once more if need be. ``writing`` are the seconds which that takes, learnt in the run.
     """
 
     started: float
     limit: float = inf
     clock: Callable[[], float] = time.monotonic
+    writing: float = 0.0
 
     @property
     def reserve(self) -> float:
@@ -46,15 +54,20 @@ class Budget:
 
     @property
     def stop(self) -> float:
-        return self.started + self.limit - self.reserve
+        return self.end - self.reserve / 2
 
     @property
     def end(self) -> float:
-        return self.started + self.limit - self.reserve / 2
+        return self.last - self.reserve / 4 - TELLING * min(self.writing, MOST_WRITING * self.limit)
 
     @property
     def last(self) -> float:
-        return self.started + self.limit - self.reserve / 4
+        return self.over - self.reserve / 4 - self.writing
+
+    @property
+    def over(self) -> float:
+        """When the limit is over."""
+        return self.started + self.limit
 
     def left(self) -> float:
         """Seconds until :attr:`stop`; never negative."""

@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from math import inf
 from typing import Protocol
 
 from mkpc_kaggle.data.competition import Pair
@@ -19,12 +20,16 @@ from mkpc_kaggle.engine.pools.pool import Pool
 from mkpc_kaggle.engine.progress import progress_on
 from mkpc_kaggle.engine.records import PairRecord, SceneRecord
 from mkpc_kaggle.engine.scenes import SceneJob, ScenePair, SceneQueue, SceneResult, pairs_to_add
+from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.pipeline.pair import UnitResult
 from mkpc_kaggle.recipe import Recipe, Unit
 from mkpc_kaggle.scene.choose import Choice
 
-PUBLISH_SECONDS = 30.0
+PUBLISH_SECONDS, PUBLISH_SHARE = 30.0, 0.05
+"""How often the submission is written: at most that share of the time goes into it."""
+WRITING_DOUBT = 1.5
+"""How much longer than it ever took writing the submission may take."""
 LISTEN_SECONDS = 0.2
 """How often an interrupt is looked for."""
 GRACE_SECONDS = 5.0
@@ -62,6 +67,8 @@ class RunReport:
 class RunJournal(Protocol):
     """What the engine wants of a journal."""
 
+    def forget_changed(self, pairs: Sequence[Pair]) -> int: ...
+
     def records(self) -> dict[int, PairRecord]: ...
 
     def results(self, pair: int, units: Mapping[str, Unit]) -> tuple[UnitResult, ...]: ...
@@ -80,8 +87,8 @@ class RunJournal(Protocol):
 class Engine:
     """One run over ``pairs``.
 
-    ``publish`` is called with all records, in the order of ``pairs``, when the run starts, every half minute,
-    and when it ends. Setting ``interrupt`` ends the run early, with all rows there.
+    ``publish`` is called with all records, in the order of ``pairs``, when the run starts, every half minute (less
+    often where it takes long), and when it ends. Setting ``interrupt`` ends the run early, with all rows there.
     """
 
     def __init__(
@@ -111,9 +118,10 @@ class Engine:
         self._unjournalled: dict[int, tuple[UnitResult, ...]] = {}
         self._out = self._explained = 0
         self._published = budget.clock()
-        self._wait_until = budget.end
+        self._grace_ends = inf
         self._progress = progress_on(sys.stderr, budget) if progress else None
         self._publishing = threading.Lock()
+        self._ended = False
         self.planner = self._planner(timeouts)
         self.scenes = SceneQueue(self.pairs, recipe.scene, budget.clock, self.planner.timeouts, budget.limit)
         self._scene_records = {scene.batch: scene for scene in journal.scenes()}
@@ -136,6 +144,7 @@ class Engine:
         if self._progress is not None:
             self._progress.close()
         self._publish()
+        self._ended = True
         self._note_explanations()
         return RunReport(
             tuple(self.records),
@@ -153,12 +162,23 @@ class Engine:
         """Those of the pairs that were asked for, in their order."""
         return self.planner.records[: self.asked]
 
-    def save_what_there_is(self, seconds: float) -> None:
-        """Write the submission from another thread, unless the engine's own is at it for longer than that."""
-        if self._publishing.acquire(timeout=seconds):
-            self.publish(self.records)
+    def save_what_there_is(self) -> str:
+        """Write the submission from another thread, unless the run has ended by itself; why it could not be.
+
+        Waits for the engine's own thread until the limit is almost over where that is at it.
+        """
+        patience = self.budget.over - self.budget.reserve / 8 - self.budget.clock()
+        if not self._publishing.acquire(timeout=max(0.0, patience)):
+            return "the time was up before the last version of the submission was written"
+        if not self._ended:
+            self._write()
+        return self.unwritten
 
     def _planner(self, timeouts: Timeouts | None) -> Planner:
+        if forgotten := self.journal.forget_changed(self.pairs):
+            text = f"images have changed since they were matched: {forgotten} pairs are matched anew"
+            warnings.warn(text, stacklevel=2)
+            self._fault(text)
         records = [PairRecord.untouched(index) for index in range(len(self.pairs))]
         for index, record in self.journal.records().items():
             records[index] = record
@@ -209,9 +229,9 @@ class Engine:
             self._gather()
 
     def _cut_short(self) -> None:
-        if self._wait_until == self.budget.end:
+        if self._grace_ends == inf:
             self.pool.stop()
-            self._wait_until = min(self._wait_until, self.budget.clock() + GRACE_SECONDS)
+            self._grace_ends = self.budget.clock() + GRACE_SECONDS
 
     def _reconstruct(self, matched: set[int], *, again: bool = False) -> None:
         """Take reconstructions back, and begin those whose pairs are all ``matched``."""
@@ -227,7 +247,8 @@ class Engine:
 
     def _scene_job(self, batch: str) -> SceneJob:
         assert self.recipe.scene is not None
-        pairs = tuple(self._scene_pair(index) for index in self.scenes.batches[batch])
+        found = (index for index in self.scenes.batches[batch] if self.planner.records[index].units)
+        pairs = tuple(map(self._scene_pair, found))
         return SceneJob(batch, pairs, self.recipe.scene)
 
     def _scene_pair(self, index: int) -> ScenePair:
@@ -256,6 +277,11 @@ class Engine:
         except sqlite3.Error as error:
             self._fault(f"the journal cannot be written ({error}): an interrupted run would have to do this again")
 
+    @property
+    def _wait_until(self) -> float:
+        """When nothing is waited for any longer."""
+        return min(self._grace_ends, self.budget.end)
+
     def _submit(self, job: Job) -> None:
         self._out += 1
         pairs = tuple(self.pairs[index] for index in job.indices)
@@ -269,7 +295,7 @@ class Engine:
             return self._unjournalled[index]
         try:
             return self.journal.results(index, self._units)
-        except sqlite3.Error as error:  # without its former results a job gains nothing, and the F stays
+        except (sqlite3.Error, UserError) as error:  # without them a job gains nothing, and the F stays
             self._fault(f"the journal cannot be read ({error})")
             return ()
 
@@ -289,7 +315,7 @@ class Engine:
         self._note_explanations()
         if self._progress is not None:
             self._progress.show(*self.planner.progress)
-        if now - self._published > PUBLISH_SECONDS:
+        if now - self._published > max(PUBLISH_SECONDS, self.budget.writing / PUBLISH_SHARE):
             self._publish()
         return True
 
@@ -333,14 +359,20 @@ class Engine:
         self.journal.note(kind, self.budget.spent(), text)
 
     def _publish(self) -> None:
+        start = self.budget.clock()
         with self._publishing:
-            try:
-                self.publish(self.records)
-                self.unwritten = ""
-            except OSError as error:
-                self.unwritten = f"the submission cannot be written: {error}"
-                self._fault(self.unwritten)
+            self._write()
         self._published = self.budget.clock()
+        self.budget.writing = max(self.budget.writing, WRITING_DOUBT * (self._published - start))
+        if self.unwritten:
+            self._fault(self.unwritten)
+
+    def _write(self) -> None:
+        try:
+            self.publish(self.records)
+            self.unwritten = ""
+        except OSError as error:
+            self.unwritten = f"the submission cannot be written: {error}"
 
     def _fault(self, what: str) -> None:
         if what not in self.faults:

@@ -122,7 +122,9 @@ class JobFailure:
 
 def visiting_order(pairs: Sequence[Pair]) -> list[int]:
     """Indices of pairs such that views of one image follow each other, and the encoding cache hits."""
-    return sorted(range(len(pairs)), key=lambda index: (pairs[index].group, *map(str, pairs[index].images)))
+    return sorted(
+        range(len(pairs)), key=lambda index: (pairs[index].group, pairs[index].file0, pairs[index].file1)
+    )
 
 
 def split(indices: Iterable[int]) -> Iterator[tuple[int, ...]]:

@@ -3,14 +3,16 @@
 import json
 import sqlite3
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, closing, suppress
 from dataclasses import asdict, astuple
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mkpc_kaggle.data.competition import Pair
+from mkpc_kaggle.data.images import is_unchanged, printable
 from mkpc_kaggle.engine.jobs import Outcome
 from mkpc_kaggle.engine.journal_tables import (
     DRAWN,
@@ -20,9 +22,12 @@ from mkpc_kaggle.engine.journal_tables import (
     SCHEMA,
     About,
     JournalTables,
+    connect,
     header_of,
+    reading,
     require_format,
     to_blob,
+    undamaged,
 )
 from mkpc_kaggle.engine.records import PairRecord, SceneRecord
 from mkpc_kaggle.errors import UserError
@@ -46,23 +51,53 @@ class Journal(JournalTables):
         fresh: bool = False,
     ) -> None:
         path = directory / FILE_NAME
+        with ExitStack() as opened:  # nothing stays open where something fails
+            try:
+                directory.mkdir(parents=True, exist_ok=True)
+                self._lock = opened.enter_context(closing(connect(directory / LOCK_NAME)))
+                self._take_lock(directory / LOCK_NAME)
+                if fresh:
+                    for ending in ("", "-journal", "-wal", "-shm"):
+                        path.with_name(FILE_NAME + ending).unlink(missing_ok=True)
+            except OSError as error:
+                raise UserError(f"the work directory {directory} cannot be written: {error.strerror}") from error
+            super().__init__(path, opened.enter_context(closing(connect(path))))
+            with undamaged(path):
+                self._claim({"format": FORMAT, **belongs_to}, pairs, about or About())
+            opened.pop_all()
+        self._drawn: dict[int, int] = {}
+
+    def _take_lock(self, path: Path) -> None:
+        """A lock of its own, so that the journal itself can be read while the run is at work."""
         try:
-            directory.mkdir(parents=True, exist_ok=True)
-            # A lock of its own, so that the journal itself can be read while the run is at work.
-            self._lock = sqlite3.connect(directory / LOCK_NAME, timeout=1.0, isolation_level=None)
             self._lock.execute("BEGIN EXCLUSIVE")
-            if fresh:
-                for ending in ("", "-journal", "-wal", "-shm"):
-                    path.with_name(FILE_NAME + ending).unlink(missing_ok=True)
-            super().__init__(path, sqlite3.connect(path, timeout=1.0, isolation_level=None))
-            self._claim({"format": FORMAT, **belongs_to}, pairs, about or About())
-        except OSError as error:
-            raise UserError(f"the work directory {directory} cannot be written: {error.strerror}") from error
         except sqlite3.OperationalError as error:
             raise UserError(f"{path} cannot be used: {error}; is another run at work there?") from error
         except sqlite3.DatabaseError as error:
-            raise UserError(f"{path} is damaged ({error}); start anew with --fresh") from error
-        self._drawn: dict[int, int] = {}
+            raise UserError(f"{path} is no lock of this program ({error}); remove it") from error
+
+    @reading
+    def forget_changed(self, pairs: Sequence[Pair]) -> int:
+        """Forget the pairs of which an image has not the content any more that was matched; how many these are.
+
+        Where such an image was in a scene, all pairs of its batch are forgotten, and the scene: those that had all
+        they wanted have no points any more to reconstruct it from.
+        """
+        same = cache(is_unchanged)
+        records = self.records()
+        if any(not 0 <= index < len(pairs) for index in records):
+            raise LookupError("it has pairs that the test set has not")
+        changed = {
+            index for index, record in records.items() if not all(map(same, pairs[index].images, record.versions))
+        }
+        scenes = {pairs[index].group for index in changed} & {scene.batch for scene in self.scenes()}
+        forgotten = changed | {index for index, pair in enumerate(pairs) if pair.group in scenes}
+        with self._db:
+            self._db.execute("BEGIN")
+            for table in ("pair", "unit", "region", "choice"):
+                self._db.executemany(f"DELETE FROM {table} WHERE pair = ?", [[index] for index in forgotten])
+            self._db.executemany("DELETE FROM scene WHERE batch = ?", [[batch] for batch in scenes])
+        return len(forgotten)
 
     def save(self, outcomes: list[tuple[Outcome, bool]]) -> None:
         """Put down a job's outcomes, all or none; the points of those marked True no later job needs.
@@ -84,7 +119,8 @@ class Journal(JournalTables):
         """Put down what came of a batch, and which F its pairs get, by their places."""
         rows = [(i, None if one.F is None else one.F.tobytes(), str(one.reason)) for i, one in choices.items()]
         drawn = json.dumps([asdict(camera) for camera in scene.cameras]), json.dumps(scene.cloud)
-        values = [*astuple(scene)[:-2], *drawn]
+        *values, failure = astuple(scene)[:-2]
+        values = [*values, printable(failure), *drawn]
         with self._db:
             self._db.execute("BEGIN")
             self._db.executemany("REPLACE INTO choice VALUES (?, ?, ?)", rows)
@@ -107,12 +143,14 @@ class Journal(JournalTables):
         Notes explain a run and must not end it: where the journal cannot be written, they are lost.
         """
         with suppress(sqlite3.Error):
-            self._db.execute("INSERT INTO event (kind, seconds, text) VALUES (?, ?, ?)", [kind, seconds, text])
+            self._db.execute(
+                "INSERT INTO event (kind, seconds, text) VALUES (?, ?, ?)", [kind, seconds, printable(text)]
+            )
 
     def close(self) -> None:
         with suppress(sqlite3.Error):  # a reader may be at it: then it stays as it is
             self._db.execute("PRAGMA journal_mode = DELETE")  # one file again, which can be copied
-        self._db.close()
+        super().close()
         self._lock.close()
 
     def _enter(self, record: PairRecord, drawn: dict[int, int]) -> int | None:
@@ -130,15 +168,16 @@ class Journal(JournalTables):
     def _save(self, outcome: Outcome, settled: bool) -> None:
         record = outcome.record
         self._db.execute(
-            "REPLACE INTO pair VALUES (?, ?, ?, ?, ?, ?, ?)",
+            "REPLACE INTO pair VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)",
             [
                 record.index,
                 np.ascontiguousarray(record.F, np.float64).tobytes(),
-                record.failure,
+                printable(record.failure),
                 record.decode_seconds,
                 record.cluster_seconds,
                 record.estimate_seconds,
                 record.before,
+                *(record.versions or ("", "")),
             ],
         )
         points = {} if settled else {result.unit.name: to_blob(result.matches) for result in outcome.results}
@@ -158,7 +197,7 @@ class Journal(JournalTables):
                     unit.inliers,
                     unit.encode_seconds,
                     unit.match_seconds,
-                    unit.failure,
+                    printable(unit.failure),
                     place,
                     points.get(unit.unit),
                 ]
@@ -185,26 +224,22 @@ class Journal(JournalTables):
 
     def _claim(self, belongs_to: Mapping[str, Any], pairs: Sequence[Pair], about: About) -> None:
         """Write down what the journal belongs to, or compare it with what stands there."""
-        try:
-            stored = header_of(self._db)
-            if stored:
-                require_format(self.path, stored)
-                self._require_same(stored, belongs_to)
-        except UserError:
-            self.close()
-            raise
+        stored = header_of(self._db)
+        if stored:
+            require_format(self.path, stored)
+            self._require_same(stored, belongs_to)
         # Readers do not hold up the writer then. Killed, no result is lost; with the power, the last ones.
         self._db.execute("PRAGMA journal_mode = WAL")
         self._db.execute("PRAGMA synchronous = NORMAL")
         with self._db:
             self._db.execute("BEGIN")
-            for statement in filter(str.strip, SCHEMA.split(";")):
+            for statement in SCHEMA.split(";")[:-1] if not stored else ():
                 self._db.execute(statement)
             values = {**belongs_to, "about": asdict(about)}.items()
             rows = [(key, json.dumps(value, sort_keys=True)) for key, value in values]
             self._db.executemany("REPLACE INTO run VALUES (?, ?)", rows)
             if not stored:
-                names = ((i, p.id, p.group, p.image0.name, p.image1.name) for i, p in enumerate(pairs))
+                names = ((i, p.id, p.group, *p.names) for i, p in enumerate(pairs))
                 self._db.executemany("INSERT INTO sample VALUES (?, ?, ?, ?, ?)", names)
 
     def _require_same(self, stored: Mapping[str, Any], belongs_to: Mapping[str, Any]) -> None:

@@ -1,22 +1,24 @@
 """The tables of a run's journal, an SQLite file, and how they are read.
 
 Tables: ``run`` (what the journal belongs to and who wrote it), ``sample`` (the ids of the pairs), ``pair`` (F,
-failure, seconds, inliers before an upgrade), ``unit`` (counts and seconds of each unit on each pair, and its
-points while a later pass may build on them or the report may draw them), ``region`` (the critical regions),
-``choice`` (which F the reconstruction of its batch gives a pair, and why), ``scene`` (what came of each batch),
-``event`` (what happened when).
+failure, seconds, inliers before an upgrade, what tells the contents of its images), ``unit`` (counts and seconds
+of each unit on each pair, and its points while a later pass may build on them or the report may draw them),
+``region`` (the critical regions), ``choice`` (which F the reconstruction of its batch gives a pair, and why),
+``scene`` (what came of each batch), ``event`` (what happened when).
 """
 
 import json
 import os
 import sqlite3
 import zlib
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
+from functools import wraps
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Concatenate, ParamSpec, Self, TypeVar
 
 import numpy as np
 
@@ -37,25 +39,35 @@ LOCK_NAME = "journal.lock"
 DRAWN = 10
 """How many of the weakest pairs keep their points when no later pass needs them: the report draws them."""
 
+UNUSABLE = {3, 5, 6, 8, 10, 13, 14}
+"""SQLite's primary result codes that say nothing against a file: no permission, busy, locked, read only, input or
+output failed, full, cannot be opened."""
+
+Tables = TypeVar("Tables", bound="JournalTables")
+Arguments = ParamSpec("Arguments")
+Result = TypeVar("Result")
+Row = TypeVar("Row")
+
 SCHEMA = """
-CREATE TABLE IF NOT EXISTS run (key TEXT PRIMARY KEY, value TEXT NOT NULL);
-CREATE TABLE IF NOT EXISTS sample (
+CREATE TABLE run (key TEXT PRIMARY KEY, value TEXT NOT NULL);
+CREATE TABLE sample (
     pair INTEGER PRIMARY KEY, id TEXT NOT NULL, "group" TEXT NOT NULL, image0 TEXT NOT NULL, image1 TEXT NOT NULL);
-CREATE TABLE IF NOT EXISTS pair (
+CREATE TABLE pair (
     pair INTEGER PRIMARY KEY, fundamental BLOB NOT NULL, failure TEXT NOT NULL,
-    decode_seconds REAL, cluster_seconds REAL, estimate_seconds REAL, before INTEGER);
-CREATE TABLE IF NOT EXISTS unit (
+    decode_seconds REAL, cluster_seconds REAL, estimate_seconds REAL, before INTEGER,
+    version0 TEXT NOT NULL, version1 TEXT NOT NULL);
+CREATE TABLE unit (
     pair INTEGER, unit TEXT, stage INTEGER, matches INTEGER, inliers INTEGER,
     encode_seconds REAL, match_seconds REAL, failure TEXT, place INTEGER, points BLOB,
     PRIMARY KEY (pair, unit));
-CREATE TABLE IF NOT EXISTS region (
+CREATE TABLE region (
     pair INTEGER, image INTEGER, "left" INTEGER, top INTEGER, "right" INTEGER, bottom INTEGER,
     reason TEXT, clusters INTEGER, kept INTEGER, PRIMARY KEY (pair, image));
-CREATE TABLE IF NOT EXISTS choice (pair INTEGER PRIMARY KEY, fundamental BLOB, reason TEXT NOT NULL);
-CREATE TABLE IF NOT EXISTS scene (
+CREATE TABLE choice (pair INTEGER PRIMARY KEY, fundamental BLOB, reason TEXT NOT NULL);
+CREATE TABLE scene (
     batch TEXT PRIMARY KEY, images INTEGER, placed INTEGER, models INTEGER, points INTEGER, seconds REAL,
     failure TEXT NOT NULL, cameras TEXT NOT NULL, cloud TEXT NOT NULL);
-CREATE TABLE IF NOT EXISTS event (place INTEGER PRIMARY KEY, kind TEXT, seconds REAL, text TEXT);
+CREATE TABLE event (place INTEGER PRIMARY KEY, kind TEXT, seconds REAL, text TEXT);
 """
 
 
@@ -101,6 +113,32 @@ class About:
     versions: Mapping[str, str] = field(default_factory=dict)
 
 
+@contextmanager
+def undamaged(path: Path) -> Iterator[None]:
+    """Raises :class:`UserError` where what is read of a journal is not what was written, or cannot be read now."""
+    try:
+        yield
+    except sqlite3.Error as error:
+        if getattr(error, "sqlite_errorcode", sqlite3.SQLITE_ERROR) & 0xFF in UNUSABLE:
+            raise UserError(f"{path} cannot be used: {error}; is another run at work there?") from error
+        raise UserError(f"{path} is damaged ({error}); start anew with --fresh") from error
+    except (ValueError, TypeError, LookupError, AttributeError, OverflowError, zlib.error) as error:
+        raise UserError(f"{path} is damaged ({error}); start anew with --fresh") from error
+
+
+def reading(
+    method: Callable[Concatenate[Tables, Arguments], Result],
+) -> Callable[Concatenate[Tables, Arguments], Result]:
+    """A method that reads a journal under :func:`undamaged`."""
+
+    @wraps(method)
+    def read(tables: Tables, /, *arguments: Arguments.args, **options: Arguments.kwargs) -> Result:
+        with undamaged(tables.path):
+            return method(tables, *arguments, **options)
+
+    return read
+
+
 class JournalTables:
     """The reading side of an open journal."""
 
@@ -108,12 +146,24 @@ class JournalTables:
         self.path = path
         self._db = db
 
+    def close(self) -> None:
+        self._db.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    @reading
     def records(self) -> dict[int, PairRecord]:
         """All records by pair index."""
         units: dict[int, list[UnitRecord]] = {}
         columns = "pair, unit, stage, matches, inliers, encode_seconds, match_seconds, failure"
         for pair, *values in self._db.execute(f"SELECT {columns} FROM unit ORDER BY pair, place"):
-            units.setdefault(pair, []).append(UnitRecord(*values))
+            units.setdefault(pair, []).append(row_of(UnitRecord, values))
         regions: dict[int, list[CriticalRegion]] = {}
         columns = 'pair, "left", top, "right", bottom, reason, clusters, kept'
         for pair, left, top, right, bottom, reason, *counts in self._db.execute(
@@ -125,9 +175,11 @@ class JournalTables:
             pair: Choice(None if F is None else matrix_of(F), Reason(reason))
             for pair, F, reason in self._db.execute("SELECT pair, fundamental, reason FROM choice")
         }
-        columns = "pair, fundamental, failure, decode_seconds, cluster_seconds, estimate_seconds, before"
-        return {
-            pair: PairRecord(
+        columns = "failure, decode_seconds, cluster_seconds, estimate_seconds, version0, version1, before"
+        found = {}
+        for pair, F, *values, before in self._db.execute(f"SELECT pair, fundamental, {columns} FROM pair"):
+            failure, decode, cluster, estimate, *versions = typed(values, (str, float, float, float, str, str))
+            found[pair] = PairRecord(
                 pair,
                 matrix_of(F),
                 failure,
@@ -136,27 +188,27 @@ class JournalTables:
                 decode,
                 cluster,
                 estimate,
-                before,
+                None if before is None else int(before),
                 choices.get(pair),
+                tuple(filter(None, versions)),
             )
-            for pair, F, failure, decode, cluster, estimate, before in self._db.execute(
-                f"SELECT {columns} FROM pair"
-            )
-        }
+        return found
 
+    @reading
     def scenes(self) -> tuple[SceneRecord, ...]:
         """What came of each batch that was reconstructed, by name."""
         columns = "batch, images, placed, models, points, seconds, failure"
         rows = self._db.execute(f"SELECT {columns}, cameras, cloud FROM scene ORDER BY batch")
-        return tuple(
-            replace(
-                SceneRecord(*values),
-                cameras=tuple(CameraRecord(**camera) for camera in json.loads(cameras)),
-                cloud=tuple(json.loads(cloud)),
-            )
-            for *values, cameras, cloud in rows
-        )
+        found = []
+        for *values, cameras, cloud in rows:
+            known, points = [CameraRecord(**camera) for camera in json.loads(cameras)], json.loads(cloud)
+            for numbers in (*((*one.centre, *one.forward, one.focal) for one in known), *points):
+                typed(numbers, (float,) * len(numbers))
+            cloud = tuple(points)
+            found.append(replace(row_of(SceneRecord, values), cameras=tuple(known), cloud=cloud))
+        return tuple(found)
 
+    @reading
     def results(self, pair: int, units: Mapping[str, Unit]) -> tuple[UnitResult, ...]:
         """What the units found on a pair, for a later job to build on; ``units`` by name."""
         columns = "unit, points, encode_seconds, match_seconds, failure"
@@ -180,41 +232,38 @@ class JournalReader(JournalTables):
             raise UserError(f"{directory} has no {FILE_NAME}: name the work directory of a run (NAME.work)")
         # A directory that cannot be written has no room for SQLite's locks, and needs none.
         mode = "mode=ro" if os.access(directory, os.W_OK) else "mode=ro&immutable=1"
-        try:
-            db = sqlite3.connect(f"{path.resolve().as_uri()}?{mode}", uri=True, timeout=5.0, isolation_level=None)
+        with ExitStack() as opened, undamaged(path):
+            uri = f"{path.resolve().as_uri()}?{mode}"
+            db = opened.enter_context(closing(sqlite3.connect(uri, uri=True, timeout=5.0, isolation_level=None)))
             db.execute("BEGIN")
             require_format(path, header_of(db))
-        except sqlite3.OperationalError as error:
-            raise UserError(f"{path} cannot be read now ({error}); try again when its run has ended") from error
-        except sqlite3.DatabaseError as error:
-            raise UserError(f"{path} is damaged ({error})") from error
+            opened.pop_all()
         super().__init__(path, db)
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._db.close()
-
+    @reading
     def belongs_to(self) -> dict[str, Any]:
         """What the run computes, by name: the recipe's fingerprint, digests of the test set and the weights."""
         return {key: value for key, value in header_of(self._db).items() if key not in ("format", "about")}
 
+    @reading
     def about(self) -> About:
         values = header_of(self._db).get("about", {})
-        return About(**{**values, "left_out": tuple(values.get("left_out", ()))})
+        about = About(**{**values, "left_out": tuple(values.get("left_out", ()))})
+        names = (about.recipe, about.device, *about.left_out, *dict(about.versions).values())
+        typed((*names, about.limit or 0.0), (str,) * len(names) + (float,))
+        return about
 
+    @reading
     def pairs(self) -> tuple[Pair, ...]:
         """All pairs of the run, in order; of the images the journal knows the names of the files alone."""
         rows = self._db.execute('SELECT id, "group", image0, image1 FROM sample ORDER BY pair')
-        return tuple(Pair(id_, group, Path(image0), Path(image1)) for id_, group, image0, image1 in rows)
+        return tuple(row_of(Pair, row) for row in rows)
 
+    @reading
     def events(self) -> tuple[Event, ...]:
         """All events of all sessions of the run, in order."""
         return tuple(
-            Event(*row) for row in self._db.execute("SELECT kind, seconds, text FROM event ORDER BY place")
+            row_of(Event, row) for row in self._db.execute("SELECT kind, seconds, text FROM event ORDER BY place")
         )
 
 
@@ -235,8 +284,33 @@ def header_of(db: sqlite3.Connection) -> dict[str, Any]:
     return {key: json.loads(value) for key, value in db.execute("SELECT key, value FROM run")}
 
 
+def connect(path: Path) -> sqlite3.Connection:
+    """Open a database to write; raises :class:`UserError` where that cannot be."""
+    if path.exists() and not path.is_file():
+        raise UserError(f"{path} is not a regular file; remove it, or name another --work-dir")
+    with undamaged(path):
+        return sqlite3.connect(path, timeout=1.0, isolation_level=None)
+
+
+def typed(values: Sequence[Any], kinds: Sequence[Any]) -> Sequence[Any]:
+    """The values, if each is of its kind; ``ValueError`` if not, since SQLite takes any into any column."""
+    for value, kind in zip(values, kinds, strict=True):
+        if type(value) is not kind:
+            raise ValueError(f"{value!r} is no {kind.__name__}")
+    return values
+
+
+def row_of(cls: type[Row], values: Sequence[Any]) -> Row:
+    """The first fields of a dataclass from a row, each of its kind."""
+    return cls(*typed(values, [*cls.__annotations__.values()][: len(values)]))
+
+
 def matrix_of(blob: bytes) -> Matrix3:
-    return np.frombuffer(blob, np.float64).reshape(3, 3)
+    """F from its bytes; ``ValueError`` for one that no submission may have."""
+    matrix = np.frombuffer(blob, np.float64).reshape(3, 3)
+    if not np.isfinite(matrix).all() or not matrix.any():
+        raise ValueError("a matrix is zero or not finite")
+    return matrix
 
 
 def to_blob(matches: Matches) -> bytes:

@@ -30,13 +30,14 @@ class UnitRecord:
     failure: str
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, slots=True)
 class PairRecord:
     """What is known of one pair: its F (its E, where the pair has intrinsics) and how it came about.
 
     ``failure`` is empty, or says why ``F`` is the fallback. The seconds are those of all jobs on the pair.
     ``before`` is the number of inliers that it had when it was first upgraded; ``None`` if it never was.
-    ``scene`` is what its batch's reconstruction says of it, ``None`` if there was none.
+    ``scene`` is what its batch's reconstruction says of it, ``None`` if there was none. ``versions`` tell the
+    contents of the two images that were matched, empty where no file tells them.
     """
 
     index: int
@@ -49,10 +50,11 @@ class PairRecord:
     estimate_seconds: float = 0.0
     before: int | None = None
     scene: Choice | None = None
+    versions: tuple[str, ...] = ()
 
     @classmethod
     def untouched(cls, index: int, reason: str = NOT_REACHED) -> "PairRecord":
-        return cls(index, FALLBACK_FUNDAMENTAL.copy(), reason)
+        return cls(index, FALLBACK_FUNDAMENTAL, reason)
 
     @classmethod
     def of(cls, index: int, match: PairMatch) -> "PairRecord":
@@ -72,7 +74,9 @@ class PairRecord:
             for result, mask in zip(match.results, inliers, strict=True)
         )
         estimate, seconds = match.estimate, (match.decode_seconds, match.cluster_seconds, match.estimate_seconds)
-        return cls(index, estimate.matrix, estimate.failure, units, match.regions, *seconds)
+        return cls(
+            index, estimate.matrix, estimate.failure, units, match.regions, *seconds, versions=match.versions
+        )
 
     def after(self, former: "PairRecord", before: int | None) -> "PairRecord":
         """The record of a later job on a pair: with the seconds of the ``former`` ones, and their regions."""

@@ -77,12 +77,14 @@ def pairs_to_add(pairs: Sequence[Pair], config: SceneConfig | None) -> list[Pair
     """Pairs of images of a batch that no row names, to be matched for its scene; see ``SceneConfig``."""
     added: list[Pair] = []
     for batch, asked in batches_of(pairs).items() if config is not None else ():
-        paths = list(dict.fromkeys(path for pair in asked for path in pair.images))
-        place = {path: number for number, path in enumerate(paths)}
-        ends = [(place[pair.image0], place[pair.image1]) for pair in asked]
+        files = list(dict.fromkeys(file for pair in asked for file in (pair.file0, pair.file1)))
         assert config is not None
-        found = unasked_pairs(len(paths), ends, config.pairs_per_image)
-        added += [Pair(f"{batch};{paths[i].stem}-{paths[j].stem}", batch, paths[i], paths[j]) for i, j in found]
+        if len(files) > config.most_images:  # to look for partners takes the square of their number
+            continue
+        place = {file: number for number, file in enumerate(files)}
+        ends = [(place[pair.file0], place[pair.file1]) for pair in asked]
+        found = [(files[i], files[j]) for i, j in unasked_pairs(len(files), ends, config.pairs_per_image)]
+        added += [Pair(f"{batch};{Path(a).stem}-{Path(b).stem}", batch, a, b) for a, b in found]
     return added
 
 

@@ -1,10 +1,12 @@
 """One run from its parts: journal, pool and engine opened, used and let go of."""
 
 import hashlib
+import multiprocessing
 import os
 import platform
 import signal
 import sqlite3
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -14,16 +16,17 @@ from functools import partial
 from importlib import metadata
 from math import isfinite
 from pathlib import Path
-from types import FrameType
+from types import FrameType, TracebackType
+from typing import NoReturn, Self
 
 import cv2
 import numpy as np
 
 from mkpc_kaggle import __version__
-from mkpc_kaggle.data.competition import Pair
+from mkpc_kaggle.data.competition import Pair, discard_parts
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.costs import Timeouts
-from mkpc_kaggle.engine.engine import Engine, RunReport
+from mkpc_kaggle.engine.engine import LISTEN_SECONDS, Engine, RunReport
 from mkpc_kaggle.engine.journal import Journal
 from mkpc_kaggle.engine.journal_tables import About, EventKind
 from mkpc_kaggle.engine.pools.cluster import RayCluster
@@ -34,6 +37,8 @@ from mkpc_kaggle.engine.records import PairRecord
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.pipeline.assembly import Assembly
 
+LEAVING_SECONDS = 0.1
+"""What the system takes to end a process."""
 REPORT_SECONDS = 2.0
 """How long an interrupted program may write its report: enough for the tables."""
 
@@ -49,7 +54,7 @@ class Session:
     """What a run needs besides its pairs and its recipe.
 
     ``workers`` is the number of worker processes, or the cluster to work on; 0: none, the work is done in this
-    one; ``None``: one a device. ``guarded``: at the budget's last moment the process leaves, whatever hangs.
+    one; ``None``: one a device. ``watchdog`` is told how to write the submission in the end.
     """
 
     work_dir: Path
@@ -58,7 +63,7 @@ class Session:
     fresh: bool = False
     progress: bool = True
     workers: int | RayCluster | None = 0
-    guarded: bool = False
+    watchdog: "Watchdog | None" = None
     timeouts: Timeouts | None = None
 
     def must_end(self) -> float:
@@ -81,27 +86,27 @@ def run_pairs(
     """
     belongs_to = {"test set": digest_of(pairs), **assembly.fingerprint()}
     about = about_run(assembly, session.budget)
-    journal = Journal(session.work_dir, belongs_to, pairs=pairs, about=about, fresh=session.fresh)
-    journal.note(EventKind.START, session.budget.spent(), "")
-    pool = pool_of(assembly, session.workers)
-    engine = Engine(
-        pairs,
-        assembly.recipe,
-        pool,
-        journal,
-        session.budget,
-        publish=publish,
-        interrupt=session.interrupt,
-        progress=session.progress,
-        timeouts=session.timeouts or Timeouts(batch=assembly.batch),
-    )
-    with watched(engine, session):
+    with Journal(session.work_dir, belongs_to, pairs=pairs, about=about, fresh=session.fresh) as journal:
+        journal.note(EventKind.START, session.budget.spent(), "")
+        pool = pool_of(assembly, session.workers)
+        engine = Engine(
+            pairs,
+            assembly.recipe,
+            pool,
+            journal,
+            session.budget,
+            publish=publish,
+            interrupt=session.interrupt,
+            progress=session.progress,
+            timeouts=session.timeouts or Timeouts(batch=assembly.batch),
+        )
+        if session.watchdog is not None:
+            session.watchdog.save = engine.save_what_there_is
         try:
             report = engine.run()
             journal.note(EventKind.END, report.seconds, report.ending)
         finally:
             at_rest = pool.close()
-            journal.close()
     return report, at_rest
 
 
@@ -167,33 +172,67 @@ def _ray_pool(assembly: Assembly, cluster: RayCluster) -> Pool:
     return RayPool(assembly, cluster)
 
 
-@contextmanager
-def watched(engine: Engine, session: Session) -> Iterator[None]:
-    """Leave the process at the budget's last moment, the submission written, if the run has not ended by then.
+class Watchdog:
+    """Leaves the process at the budget's last moment, the submission written, if the program has not ended.
 
     A thread does it, so that it helps wherever the others are stuck, short of holding the interpreter's lock:
-    that only a matcher in the engine's own process can do. Worker processes end with this one.
+    that only a matcher in the program's own process can do. Worker processes are ended with this one.
+
+    ``save`` writes the submission, or says why it is not the last version; ``status`` is the exit status of a
+    program that is left while it tells what it has done.
     """
-    budget, over = session.budget, threading.Event()
 
-    def leave_in_the_end() -> None:
-        if not over.wait(budget.last - budget.clock()):
-            try:
-                engine.save_what_there_is(budget.reserve / 16)
-            finally:
-                os._exit(128 + session.interrupt.signal if session.interrupt.signal else 0)
+    def __init__(self, budget: Budget, interrupt: Interrupt) -> None:
+        self.save: Callable[[], str] = lambda: (
+            "the time was up before a first version of the submission was written"
+        )
+        self.status = 0
+        self._budget = budget
+        self._interrupt = interrupt
+        self._over = threading.Event()
 
-    if session.guarded and isfinite(budget.limit):
-        threading.Thread(target=leave_in_the_end, name="watchdog", daemon=True).start()
-    try:
-        yield
-    finally:
-        over.set()
+    def __enter__(self) -> Self:
+        if isfinite(self._budget.limit):
+            threading.Thread(target=self._watch, name="watchdog", daemon=True).start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._over.set()
+
+    def _watch(self) -> None:
+        while (left := self._budget.last - self._budget.clock()) > 0:  # it moves while the run learns
+            if self._over.wait(min(left, LISTEN_SECONDS)):
+                return
+        status = 1
+        last_resort = threading.Timer(
+            max(0.0, self._budget.over - LEAVING_SECONDS - self._budget.clock()), leave, [1]
+        )
+        last_resort.daemon = True
+        last_resort.start()  # the disk may hang, or who reads what is printed
+        try:
+            trouble = self.save()
+            status = self.status or int(bool(trouble))
+            if trouble:
+                os.write(sys.stderr.fileno(), f"error: {trouble}\n".encode())
+        finally:
+            leave(128 + self._interrupt.signal if self._interrupt.signal else status)
+
+
+def leave(status: int) -> NoReturn:
+    """End the process at once, and its children, one that was stopped (SIGSTOP) among them."""
+    discard_parts()
+    for child in multiprocessing.active_children():
+        child.kill()
+    os._exit(status)
 
 
 def digest_of(pairs: Sequence[Pair]) -> str:
-    """Tells one test set from another: the keys of its pairs, in order."""
-    return hashlib.sha256("\n".join(pair.key for pair in pairs).encode()).hexdigest()
+    """Tells one test set from another: the keys of its pairs with the ids of their images, in order."""
+    ids = ((pair.key, pair.group, *(name.rpartition(".")[0] for name in pair.names)) for pair in pairs)
+    rows = map("\t".join, ids)
+    return hashlib.sha256("\n".join(rows).encode()).hexdigest()
 
 
 @contextmanager

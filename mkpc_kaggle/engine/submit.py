@@ -36,5 +36,3 @@ def require_writable(output: Path) -> None:
         probe.unlink()
     except OSError as error:
         raise UserError(f"--output {output} cannot be written: {error.strerror}") from error
-    if output.is_dir():
-        raise UserError(f"--output {output} is a directory; name a file")

@@ -92,7 +92,9 @@ def _found(pair: PairMatch, known: tuple[UnitResult, ...], units: dict[Unit, Uni
         replace(result, unit=units[result.unit], failure=result.failure or job.note)
         for result in pair.results[len(known) :]
     )
-    return replace(pair, results=results, images=(), sizes=tuple(image.size for image in pair.images))
+    sizes = tuple(image.size for image in pair.images)
+    versions = tuple(image.version for image in pair.images)
+    return replace(pair, results=results, images=(), sizes=sizes, versions=versions)
 
 
 def failed(job: Job, error: Exception) -> JobFailure:

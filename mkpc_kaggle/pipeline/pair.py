@@ -44,8 +44,8 @@ class PairMatch:
 
     ``regions`` is ``None`` until a unit of stage 2 wanted them. ``matches`` are those of all units, and
     ``estimate.inliers`` is a mask over them; with the estimate they come into the recipe's order. ``images`` are
-    the two images, there while units run; their ``sizes`` stay. ``failure`` is empty, or says which image cannot
-    be read.
+    the two images, there while units run; their ``sizes`` and ``versions`` stay. ``failure`` is empty, or says
+    which image cannot be read.
     """
 
     results: tuple[UnitResult, ...] = ()
@@ -53,6 +53,7 @@ class PairMatch:
     estimate: Estimate = NOT_ESTIMATED
     images: tuple[Image, ...] = ()
     sizes: tuple[Size, ...] = ()
+    versions: tuple[str, ...] = ()
     failure: str = ""
     decode_seconds: float = 0.0
     cluster_seconds: float = 0.0

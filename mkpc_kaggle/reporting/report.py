@@ -7,7 +7,8 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from mkpc_kaggle.data.competition import Pair
+from mkpc_kaggle.data.competition import Pair, replacing
+from mkpc_kaggle.data.images import printable
 from mkpc_kaggle.engine.budget import format_duration
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.reporting.run_log import RunLog, read_log
@@ -39,11 +40,10 @@ def report_run(work_dir: Path, path: Path, ends: float, pairs: Sequence[Pair] = 
 def write_report(log: RunLog, path: Path, artist: Artist) -> None:
     """Write the page; raises :class:`UserError` where ``path`` cannot be written."""
     text = report_page(log, artist)
-    part = path.with_name(f".{path.name}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        part.write_text(text, encoding="utf-8", errors="replace")
-        part.replace(path)
+        with replacing(path) as stream:
+            stream.write(printable(text))
     except OSError as error:
         raise UserError(f"the report {path} cannot be written: {error.strerror}") from error
 

@@ -6,7 +6,7 @@ from functools import cached_property
 from pathlib import Path
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine.journal_tables import DRAWN, About, Event, EventKind, JournalReader
+from mkpc_kaggle.engine.journal_tables import DRAWN, About, Event, EventKind, JournalReader, undamaged
 from mkpc_kaggle.engine.records import PairRecord, SceneRecord
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.pipeline.pair import UnitResult
@@ -78,7 +78,7 @@ def read_log(directory: Path) -> RunLog:
 
     Raises :class:`UserError` where there is none, or none that this version can read.
     """
-    with JournalReader(directory) as journal:
+    with JournalReader(directory) as journal, undamaged(journal.path):
         about, belongs_to, pairs = journal.about(), journal.belongs_to(), journal.pairs()
         recipe = recipe_of(belongs_to.get("recipe", {}), about.recipe)
         known = journal.records()

@@ -4,6 +4,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from mkpc_kaggle.data.competition import Pair
@@ -57,7 +58,7 @@ class RunTables:
 def run_tables(pairs: Sequence[Pair], records: Sequence[PairRecord], events: Sequence[Event] = ()) -> RunTables:
     """The tables of a run: one record a pair, in their order."""
     return RunTables(
-        _table(_pair_rows(pairs, records), _PAIRS),
+        _pair_table(pairs, records),
         _table(_unit_rows(records), _UNITS),
         _table(_region_rows(records), _REGIONS),
         _table(((event.kind, event.seconds, event.text) for event in events), _EVENTS),
@@ -105,16 +106,29 @@ def _table(rows: Iterator[tuple[object, ...]], columns: dict[str, type]) -> pd.D
     return pd.DataFrame(list(rows), columns=list(columns)).astype(columns)
 
 
-def _pair_rows(pairs: Sequence[Pair], records: Sequence[PairRecord]) -> Iterator[tuple[object, ...]]:
-    for pair, record in zip(pairs, records, strict=True):
-        encode = sum(unit.encode_seconds for unit in record.units)
-        match = sum(unit.match_seconds for unit in record.units)
-        yield (
-            *(record.index, pair.id, pair.group, pair.image0.name, pair.image1.name),
-            *(record.failure, record.source, record.matches, record.inliers),
-            *(record.decode_seconds, encode, match, record.cluster_seconds, record.estimate_seconds),
-            *record.fundamental.ravel(),
-        )
+def _pair_table(pairs: Sequence[Pair], records: Sequence[PairRecord]) -> pd.DataFrame:
+    """Column by column: a row as a tuple of its own takes a kilobyte, and there may be a million."""
+    encode = [sum(unit.encode_seconds for unit in record.units) for record in records]
+    match = [sum(unit.match_seconds for unit in record.units) for record in records]
+    columns: dict[str, Any] = {
+        "pair": [record.index for record in records],
+        "id": [pair.id for pair in pairs],
+        "group": [pair.group for pair in pairs],
+        "image0": [pair.names[0] for pair in pairs],
+        "image1": [pair.names[1] for pair in pairs],
+        "failure": [record.failure for record in records],
+        "source": [record.source for record in records],
+        "matches": [record.matches for record in records],
+        "inliers": [record.inliers for record in records],
+        "decode_seconds": [record.decode_seconds for record in records],
+        "encode_seconds": encode,
+        "match_seconds": match,
+        "cluster_seconds": [record.cluster_seconds for record in records],
+        "estimate_seconds": [record.estimate_seconds for record in records],
+    }
+    F = np.array([record.fundamental for record in records], np.float64).reshape(-1, len(F_COLUMNS))
+    columns |= dict(zip(F_COLUMNS, F.T, strict=True))
+    return pd.DataFrame(columns).astype(_PAIRS)
 
 
 def _unit_rows(records: Sequence[PairRecord]) -> Iterator[tuple[object, ...]]:

@@ -83,7 +83,7 @@ def write_pairs(directory: Path, count: int) -> list[Pair]:
         paths = [directory / f"{index:03d}_{side}.png" for side in (0, 1)]
         for path in paths:
             cv2.imwrite(str(path), np.full((72, 80, 3), 10 + index, np.uint8))
-        pairs.append(Pair(f"set;{index:03d}", "set", *paths))
+        pairs.append(Pair(f"set;{index:03d}", "set", *map(str, paths)))
     return pairs
 
 

@@ -298,6 +298,9 @@ class MemoryJournal:
     def __init__(self) -> None:
         self._results: dict[int, tuple[UnitResult, ...]] = {}
 
+    def forget_changed(self, pairs: Sequence[Pair]) -> int:
+        return 0
+
     def records(self) -> dict[int, PairRecord]:
         return {}
 
@@ -362,7 +365,7 @@ def simulate(scenario: Scenario) -> Ran:
     budget = Budget(0.0, scenario.limit, clock)
     pool = SimulatedPool(scenario, clock, budget.stop)
     share = max(1, scenario.batches) / scenario.pairs
-    pairs = [Pair(str(n), f"{int(n * share):03d}", Path(f"{n:07d}"), Path("b")) for n in range(scenario.pairs)]
+    pairs = [Pair(str(n), f"{int(n * share):03d}", f"{n:07d}", "b") for n in range(scenario.pairs)]
     published: list[int] = []
     engine = Engine(
         pairs,

@@ -45,4 +45,4 @@ def synthetic_pairs(directory: Path, images: int = 6) -> list[Pair]:
     for number, path in enumerate(paths):
         cv2.imwrite(str(path), np.full((SIZE.height, SIZE.width, 3), DARKEST + STEP * number, np.uint8))
     chosen = [(i, j) for i in range(images) for j in range(i + 1, images)]
-    return [Pair(f"batch;{i}-{j}", "batch", paths[i], paths[j]) for i, j in chosen]
+    return [Pair(f"batch;{i}-{j}", "batch", str(paths[i]), str(paths[j])) for i, j in chosen]

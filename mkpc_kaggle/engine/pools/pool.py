@@ -14,7 +14,7 @@ from typing import ClassVar, Protocol
 from mkpc_kaggle.engine.jobs import Cause, Job, JobFailure, JobResult
 from mkpc_kaggle.engine.pools.scene_process import SceneProcess
 from mkpc_kaggle.engine.scenes import Reconstruction, SceneJob
-from mkpc_kaggle.engine.worker import Answer, estimate
+from mkpc_kaggle.engine.worker import Answer, estimate, failed
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.pipeline.failures import DeviceError
 from mkpc_kaggle.pipeline.pair import PairMatch
@@ -111,7 +111,8 @@ class Pool:
     def submit(self, job: Job) -> None:
         """Queue a job; its images may be decoded ahead from now on."""
         self._out += 1
-        min((one for one in self._supervisors if one.usable), key=lambda one: one.jobs).submit(job)
+        usable = [one for one in self._supervisors if one.usable] or self._supervisors  # who has given up says so
+        min(usable, key=lambda one: one.jobs).submit(job)
 
     def next(self, until: float) -> JobResult | JobFailure | None:
         """A job that has come back, waiting for it if need be; ``None`` at ``until``, of the engine's clock."""
@@ -226,11 +227,19 @@ class Supervisor:
             self._started.set_exception(error)
         while (job := self._queue.get()) is not None:
             self._busy = True
-            answer = self._do(job)
+            try:
+                answer = self._do(job)
+            except Exception as error:  # without this thread the run would wait for ever
+                answer = failed(job, error)
+                self._end_worker()
             self._busy = False
             self._answered(job, answer)
-        if self._worker is not None:
-            self._worker.kill()
+        self._end_worker()
+
+    def _end_worker(self) -> None:
+        worker, self._worker = self._worker, None
+        if worker is not None:
+            worker.kill()
 
     def _do(self, job: Job) -> Answer:
         try:
@@ -243,8 +252,7 @@ class Supervisor:
         if not isinstance(answer, JobFailure):
             self._device_failures = 0
         elif answer.cause is not Cause.RAISED:
-            self._worker.kill()  # what ran out of memory has it in pieces
-            self._worker = None
+            self._end_worker()  # what ran out of memory has it in pieces
             self._device_failures += answer.cause is Cause.DEVICE
         if self._device_failures >= MOST_DEVICE_FAILURES:
             self._given_up = f"{answer} ({MOST_DEVICE_FAILURES} times in a row)"
@@ -259,8 +267,7 @@ class Supervisor:
             self._worker = self._place.start()
             failure = "closed" if self._closing else self._load(self._worker)
             if failure:
-                self._worker.kill()
-                self._worker = None
+                self._end_worker()
         if self._worker is None:
             self._given_up = self._given_up or failure
 

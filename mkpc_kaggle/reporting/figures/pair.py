@@ -1,6 +1,7 @@
 """One pair at a glance: its matches, its clusters, its critical regions."""
 
 from collections.abc import Sequence
+from math import sqrt
 from typing import TYPE_CHECKING
 
 import cv2
@@ -24,6 +25,8 @@ from mkpc_kaggle.reporting.figures.canvas import (
     show,
 )
 
+STRIP_HEIGHT, STRIP_PIXELS = 480, 2_000_000
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
@@ -40,8 +43,12 @@ def draw_pair(image0: Image, image1: Image, match: PairMatch, config: MkpcConfig
 
 
 def draw_strip(images: tuple[Image, Image], match: PairMatch) -> "Figure":
-    """The two images side by side at one height: lines are matches, boxes the critical regions; no text."""
-    height = 480
+    """The two images side by side at one height: lines are matches, boxes the critical regions; no text.
+
+    The strip has at most :data:`STRIP_PIXELS`.
+    """
+    aspect = sum(image.size.width / image.size.height for image in images)
+    height = max(1, min(STRIP_HEIGHT, int(sqrt(STRIP_PIXELS / aspect))))
     scales = [height / image.size.height for image in images]
     widths = [max(1, round(image.size.width * scale)) for image, scale in zip(images, scales, strict=True)]
     shown = [
