@@ -60,6 +60,34 @@ def test_recipes_are_listed_with_what_they_lack(
     assert "    1:aliked_lightglue@1024  at most 4096  (or aliked, where its weights are missing)\n" in light
 
 
+@pytest.mark.parametrize("count", ["0", "-1", "x", "9" * 5000])
+def test_a_number_of_pairs_below_one_is_refused(count: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as left:
+        main(["validate", "--train-dir", ".", "--pairs-per-scene", count])
+    assert left.value.code == 2
+    assert "--pairs-per-scene: " in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("covisibility", ["1.1", "nan"])
+def test_a_covisibility_that_no_pair_has_is_told(
+    demo: DemoSet, covisibility: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["validate", "--train-dir", str(demo.train_dir), "--min-covisibility", covisibility]
+    assert main([*arguments, "--recipe", "classical"]) == 2
+    assert f"has no pair with a covisibility of at least {covisibility}" in capsys.readouterr().err
+
+
+def test_a_figure_is_not_drawn_over_an_image_nor_an_export_over_the_journal(
+    demo: DemoSet, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    first, second, *_ = sorted(map(str, demo.train_dir.rglob("*.jpg")))
+    assert main(["match", first, second, "--out", first]) == 2
+    assert main(["journal", str(tmp_path), "--json", str(tmp_path / "journal.sqlite")]) == 2
+    told = capsys.readouterr().err.splitlines()
+    assert "would be written over the input" in told[0]
+    assert "are in each other's way" in told[1]
+
+
 def test_check_tells_good_from_bad(demo: DemoSet, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     ids = [pair.id for pair in read_test_side(demo.test_dir)]
     path = tmp_path / "submission.csv"

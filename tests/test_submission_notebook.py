@@ -125,6 +125,8 @@ def test_a_commit_run_without_network_leaves_a_submission_and_shows_pairs(
     assert printed.count("sweep: ") == 1, "a notebook keeps every line, so progress is few of them"
     assert f"report: {kaggle.working / 'submission.html'}" in printed
     assert (kaggle.working / "submission.html").is_file()
+    assert (kaggle.root / "temp" / "submission.work" / "journal.sqlite").is_file()
+    assert not list(kaggle.working.rglob("journal*")), "what lies here is published"
     assert kaggle.figures() == 1 + 3, "the budget and the pairs"
     if WEIGHTS.is_dir():
         assert_all_weights_are_used(printed)

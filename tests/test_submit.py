@@ -1,6 +1,8 @@
 """``make_submission.py`` as a person runs it: a process, real pictures, files on disk."""
 
+import itertools
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -197,6 +199,114 @@ def test_bad_input_is_told_in_one_line_before_any_work(
     assert told in captured.err
     assert len(captured.err.splitlines()) == 1
     assert not output.exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["--output", ""], "is a directory; name a file"),
+        (["--output", "."], "is a directory; name a file"),
+        (["--output", "/"], "is a directory; name a file"),
+        (["--output", "test/test.csv"], "would be written over the input test/test.csv"),
+        (["--output", "linked.csv"], "would be written over the input test/test.csv"),
+        (["--output", "test/test_images/x.csv"], "would be written over the input test/test_images"),
+        (["--work-dir", "test/test_images"], "would be written over the input test/test_images"),
+        (["--report", "test/test.csv"], "would be written over the input test/test.csv"),
+        (["--recipe", "r.toml", "--output", "r.toml"], "would be written over the input r.toml"),
+        (["--output", "s.html"], "are one file"),
+        (["--output", "s.csv", "--report", "./s.csv"], "are one file"),
+        (["--output", "q.work"], "are in each other's way"),
+        (["--output", "q", "--work-dir", "q/w"], "are in each other's way"),
+        (["--output", "w/journal.sqlite", "--work-dir", "w"], "are in each other's way"),
+        (["--report", "w/journal.lock", "--work-dir", "w"], "are in each other's way"),
+    ],
+)
+def test_what_would_be_written_over_an_input_or_a_result_is_refused_before_any_work(
+    demo: DemoSet,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    arguments: list[str],
+    told: str,
+) -> None:
+    from mkpc_kaggle.cli import main
+
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(demo.test_dir, "test")
+    Path("linked.csv").hardlink_to("test/test.csv")
+    Path("r.toml").write_text(RECIPE)
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    assert main(["submit", "--test-dir", "test", *arguments]) == 2
+    assert told in capsys.readouterr().err
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+
+
+def test_a_limit_that_ends_before_the_first_version_is_told(demo: DemoSet, tmp_path: Path) -> None:
+    made = make(demo.test_dir, tmp_path / "submission.csv", "classical", "--time-limit", "0.1s")
+    assert made.returncode == 1
+    assert "the time was up before a first version of the submission was written" in made.stderr
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "utf-8"])
+def test_paths_that_the_terminal_cannot_spell_cost_no_result(
+    demo: DemoSet, recipe: Path, tmp_path: Path, encoding: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    test_dir = tmp_path / os.fsdecode("é".encode() + b"\xff")
+    shutil.copytree(demo.test_dir, test_dir)
+    next(test_dir.rglob("*.png")).unlink()
+    monkeypatch.setenv("PYTHONIOENCODING", encoding)
+    made = make(test_dir, tmp_path / "submission.csv", recipe, "--workers", "0")
+    assert (made.returncode, "Traceback" in made.stderr) == (0, False)
+    assert "\\udcff" in made.stdout
+    assert "no such file" in made.stdout
+    assert_good(tmp_path / "submission.csv", test_dir)
+
+
+def test_a_pipe_or_a_line_for_an_image_costs_its_pairs_alone(demo: DemoSet, recipe: Path, tmp_path: Path) -> None:
+    test_dir = tmp_path / "test"
+    shutil.copytree(demo.test_dir, test_dir)
+    pipe, line, *good = sorted(test_dir.rglob("*.png"))
+    two = [(pipe, good[0]), (line, good[0]), *itertools.combinations(good, 2)]
+    rows = [f"{a.stem}-{b.stem},{pipe.parent.name},{a.stem},{b.stem}" for a, b in two]
+    header = "sample_id,batch_id,image_1_id,image_2_id"
+    (test_dir / "test.csv").write_text("\n".join([header, *rows]) + "\n")
+    pipe.unlink()
+    os.mkfifo(pipe)
+    cv2.imwrite(str(line), np.full((3, 30_000, 3), 90, np.uint8))
+    made = make(test_dir, tmp_path / "submission.csv", recipe, "--workers", "1", "--time-limit", "10m")
+    assert made.returncode == 0, made.stderr
+    assert "complete after" in made.stdout
+    assert "cannot be read: not a regular file" in made.stdout
+    assert "30000 x 3 pixels: one side is more than 32 times the other" in made.stdout
+    assert "report: " in made.stdout
+    assert_good(tmp_path / "submission.csv", test_dir)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("images", ["shared by many rows", "of one row each, and missing"])
+def test_a_million_rows_are_in_time_and_in_memory(demo: DemoSet, tmp_path: Path, images: str) -> None:
+    test_dir, count = tmp_path / "test", 1_000_000
+    shutil.copytree(demo.test_dir, test_dir)
+    batch = next((test_dir / "test_images").iterdir())
+    known = sorted(path.stem for path in batch.iterdir())
+    with (test_dir / "test.csv").open("w") as table:
+        table.write("sample_id,batch_id,image_1_id,image_2_id\n")
+        for number in range(count):
+            two = [f"a{number}", f"b{number}"] if "missing" in images else [known[number % 6], known[number % 5]]
+            table.write(f"sample;{number},{batch.name},{','.join(two)}\n")
+    output = tmp_path / "submission.csv"
+    started = time.monotonic()
+    running = subprocess.Popen(command(test_dir, output, "classical", "--workers", "1", "--time-limit", "60s"))
+    while running.poll() is None and not output.exists():
+        time.sleep(0.1)
+    assert time.monotonic() - started < 20
+    _, status, used = os.wait4(running.pid, 0)
+    assert time.monotonic() - started < 60
+    assert os.waitstatus_to_exitcode(status) == 0
+    assert used.ru_maxrss < 1.5e6  # kilobytes
+    with output.open() as rows:
+        assert sum(1 for _ in rows) == count + 1
+    assert not list(tmp_path.glob(".*.part"))
 
 
 def test_a_recipe_with_an_unknown_key_is_refused_with_the_known_ones(

@@ -13,8 +13,8 @@ version is better. Killed at any point, the same command goes on where it was (i
 directory). Ctrl-C and SIGTERM end the run early with a valid file.
 
 Exit status: 0 done, or the time was up; 1 the run failed (no worker was left, or errors left most pairs without
-an F), or the last version of the file could not be written (a full disk, say): a whole file is there; 2 bad input;
-130 or 143 ended by a signal (the file is whole).
+an F), or the last version of the file could not be written (a full disk, say, or a limit too short for the table):
+an earlier one, if there was time for it, is whole; 2 bad input; 130 or 143 ended by a signal (the file is whole).
 """
 
 

@@ -37,7 +37,7 @@ from mkpc_kaggle.engine.records import PairRecord
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.pipeline.assembly import Assembly
 
-LEAVING_SECONDS = 0.1
+LEAVING_SECONDS = 0.2
 """What the system takes to end a process."""
 REPORT_SECONDS = 2.0
 """How long an interrupted program may write its report: enough for the tables."""
@@ -206,9 +206,8 @@ class Watchdog:
             if self._over.wait(min(left, LISTEN_SECONDS)):
                 return
         status = 1
-        last_resort = threading.Timer(
-            max(0.0, self._budget.over - LEAVING_SECONDS - self._budget.clock()), leave, [1]
-        )
+        patience = self._budget.over - self._budget.clock() - LEAVING_SECONDS
+        last_resort = threading.Timer(max(LEAVING_SECONDS, patience), leave, [1])
         last_resort.daemon = True
         last_resort.start()  # the disk may hang, or who reads what is printed
         try:

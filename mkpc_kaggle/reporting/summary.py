@@ -120,15 +120,17 @@ def _troubles(tables: RunTables, left_out: Sequence[str], faults: Sequence[str])
     if left_out:
         reasons = "weights missing or not permitted, or matcher unusable"
         lines.append(f"units left out ({reasons}): {', '.join(left_out)}")
-    failed = tables.failed
-    lines += _list("pairs with the fallback row", list(failed["id"] + ": " + failed["failure"]))
+    failed, first = tables.failed, tables.failed.head(MOST_LINES)
+    lines += _list("pairs with the fallback row", list(first["id"] + ": " + first["failure"]), len(failed))
     lines += _list("units that failed", unit_failures(tables))
     return lines + _list("faults", faults)
 
 
-def _list(title: str, items: Sequence[str]) -> list[str]:
-    if not items:
+def _list(title: str, items: Sequence[str], count: int | None = None) -> list[str]:
+    """The first of the items, and how many there are: ``count``, if not all of them are given."""
+    count = len(items) if count is None else count
+    if not count:
         return []
     shown = [f"  {item}" for item in items[:MOST_LINES]]
-    more = [f"  ... and {len(items) - MOST_LINES} more"] if len(items) > MOST_LINES else []
-    return [f"{title}: {len(items)}", *shown, *more]
+    more = [f"  ... and {count - MOST_LINES} more"] if count > MOST_LINES else []
+    return [f"{title}: {count}", *shown, *more]
