@@ -1,5 +1,6 @@
 """The two stages on pictures whose correspondence is known, with real matchers and with those that misbehave."""
 
+import time
 from collections import Counter
 from dataclasses import dataclass, replace
 from functools import cache
@@ -21,6 +22,7 @@ from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL, Model, Origin
 from mkpc_kaggle.matchers.contract import Colour, MatcherSpec, Placement
 from mkpc_kaggle.matchers.sift import SiftMatcher, SiftOptions
+from mkpc_kaggle.pipeline import units
 from mkpc_kaggle.pipeline.assembly import Licence, assemble
 from mkpc_kaggle.pipeline.pair import PairMatch, with_estimate
 from mkpc_kaggle.pipeline.stages import Pipeline
@@ -623,3 +625,16 @@ def test_options_of_the_recipe_reach_the_matcher():
 def test_what_another_precision_computes_is_another_run() -> None:
     exact, half = (assemble("classical", precision=precision) for precision in ("float32", "bfloat16"))
     assert exact.fingerprint() != half.fingerprint()
+
+
+def test_the_wait_for_the_device_counts_as_encoding_not_as_matching(monkeypatch):
+    """Kernels run on while Python goes on; looking for NaN in the features is what waits for them."""
+    check = units.check_finite
+
+    def wait(*values):
+        time.sleep(0.2)
+        check(*values)
+
+    monkeypatch.setattr(units, "check_finite", wait)
+    (result,) = TwoStageMatcher(SIFT)(*pair()).results
+    assert result.encode_seconds >= 2 * 0.2  # two images, one at a time
