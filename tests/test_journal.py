@@ -165,8 +165,8 @@ def damaged_journal(directory: Path, damage: str) -> Path:
     pairs = [Pair(str(number), "batch", "a.png", "b.png") for number in range(8)]
     journal = Journal(directory, OURS, pairs=pairs)
     journal.save([(outcome(3, seed=1), False), (outcome(7, seed=2), False)])
-    camera = CameraRecord("a", 0, [0.0, 0.0, 1.0], [0.0, 0.0, 1.0], 500.0, 9)
-    scene = SceneRecord("batch", 2, 2, 1, 9, 1.5, "", (camera,))
+    camera = CameraRecord("a", 0, [0.0, 0.0, 1.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0], 500.0, [640, 480], 9)
+    scene = SceneRecord("batch", 2, 2, 1, 9, 1.5, "", (camera,), ([0.0, 0.0, 5.0],))
     journal.save_scene(scene, {3: Choice(np.eye(3), Reason.SCENE), 7: Choice(None, Reason.UNPLACED)})
     journal.close()
     with closing(sqlite3.connect(directory / "journal.sqlite")) as db:
@@ -208,6 +208,7 @@ DAMAGES = [
     "UPDATE scene SET cameras = '[{{}}]'",
     "UPDATE scene SET cameras = replace(cameras, '1.0', 'null')",
     "UPDATE scene SET images = 'x'",
+    "UPDATE scene SET cloud = '[[0.0, 1.0]]'",
     "UPDATE run SET value = '{{'",
     "DROP TABLE unit",
     "DROP TABLE scene",

@@ -202,10 +202,12 @@ class JournalTables:
         found = []
         for *values, cameras, cloud in rows:
             known, points = [CameraRecord(**camera) for camera in json.loads(cameras)], json.loads(cloud)
-            for numbers in (*((*one.centre, *one.forward, one.focal) for one in known), *points):
-                typed(numbers, (float,) * len(numbers))
-            cloud = tuple(points)
-            found.append(replace(row_of(SceneRecord, values), cameras=tuple(known), cloud=cloud))
+            for one in known:
+                numbers = (*one.centre, *one.forward, *one.down, one.focal, *one.size, one.model, one.seen)
+                typed(numbers, (float,) * 10 + (int,) * 4)
+            for point in points:
+                typed(point, (float,) * 3)
+            found.append(replace(row_of(SceneRecord, values), cameras=tuple(known), cloud=tuple(points)))
         return tuple(found)
 
     @reading
