@@ -1,12 +1,13 @@
 """The method step by step, each step a figure: what one pair looks like on its way through the two stages."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mkpc_kaggle.data.images import Image
+from mkpc_kaggle.engine.records import SceneRecord
 from mkpc_kaggle.geometry.coordinates import Box, Points
 from mkpc_kaggle.geometry.critical_region import Clusters, CriticalRegion, MkpcConfig, Ratio, expand_box
 from mkpc_kaggle.geometry.matches import Matches
@@ -14,6 +15,7 @@ from mkpc_kaggle.geometry.metrics import PoseError
 from mkpc_kaggle.geometry.robust import Estimate, Matrix3
 from mkpc_kaggle.pipeline.pair import PairMatch
 from mkpc_kaggle.recipe import Unit
+from mkpc_kaggle.reporting.figures import draw_cameras
 from mkpc_kaggle.reporting.figures.canvas import (
     CLUSTERS,
     CYCLE,
@@ -29,6 +31,7 @@ from mkpc_kaggle.reporting.figures.canvas import (
     side_by_side,
 )
 from mkpc_kaggle.reporting.figures.pair import connect
+from mkpc_kaggle.scene.model import Scene
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -278,3 +281,8 @@ def _far_apart(points: Points, count: int) -> NDArray[np.intp]:
         chosen.append(int(np.argmax(distances)))
         distances = np.minimum(distances, np.linalg.norm(points - points[chosen[-1]], axis=1))
     return np.array(chosen, np.intp)
+
+
+def draw_scene(name: str, scenes: Sequence[Scene]) -> "Figure":
+    """The cameras and points of the largest model of a batch, from above and from the side."""
+    return draw_cameras(SceneRecord.of(name, scenes, 0.0, ""))

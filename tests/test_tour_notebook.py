@@ -32,7 +32,7 @@ def test_the_tour_runs_on_a_train_side_without_a_network(demo: DemoSet, tmp_path
         MKPC_OTHER_PAIR="courtyard;courtyard_0003-courtyard_0000",
     )
     executed = execute(TOUR, tmp_path / "executed.ipynb", sys.executable, tmp_path, variables)
-    assert pictures(executed) == figures_of(executed) == 14
+    assert pictures(executed) == figures_of(executed) == 16
     assert printed(executed) == ""
 
 
