@@ -29,8 +29,8 @@ class SceneConfig:
     focal length that they start with, ``prior_focal`` long sides. A scene has
     ``least_images``, and ``least_pairs_per_image`` times as many connected pairs: with fewer there is little that
     could contradict its cameras. A batch that has fewer pairs than ``pairs_per_image`` for each of its images
-    gets others that no row names, matched by the recipe's first unit; 0: none. Above ``most_images`` it is
-    reconstructed in overlapping parts, by the incremental mapper whatever ``mapper`` says.
+    gets others that no row names, matched by the recipe's first unit; 0: none. Above ``most_images`` it
+    gets none, and is reconstructed in overlapping parts, by the incremental mapper whatever ``mapper`` says.
 
     Checks: an image's focal length is between ``lowest_focal`` and ``highest_focal`` long sides, and it sees
     ``least_points`` points. A pair keeps its own F if ``contradiction_matches`` of its matches are within
