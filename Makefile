@@ -1,6 +1,7 @@
 # make demo: install, render a demo set, make its submission, score it, draw a pair.
 # make test: install, lint, types, tests.
 # make ray: the tests of worker machines, with Ray installed beside the rest.
+# make hostile: some 700 hostile inputs (tests/hostile), each in a process with 4 GB; prints a table.
 # make oldest: the tests with the lowest versions that pyproject.toml declares, on Python 3.11, in .venv-oldest.
 
 PYTHON ?= python3
@@ -14,7 +15,7 @@ TEST_PROCESSES ?= 2
 # Not the declared floor: on most indexes old versions of torch have no build for the CPU, and bring CUDA along.
 TORCH ?= $(shell grep '^torch==' requirements-dev.txt)
 
-.PHONY: demo test ray oldest install lint tests clean
+.PHONY: demo test ray hostile oldest install lint tests clean
 
 demo: install
 	$(BIN)/python -m mkpc_kaggle demo --out $(DEMO)
@@ -42,6 +43,9 @@ tests:
 ray: install
 	$(BIN)/python -m pip install --quiet "ray>=2.9"
 	$(BIN)/python -m pytest tests/test_ray.py tests/test_cluster.py
+
+hostile: install
+	$(BIN)/python -m pytest --slow tests/hostile --quiet --numprocesses $(TEST_PROCESSES) --dist load
 
 # Old versions of libraries warn of what newer ones of Python and torch deprecate; test_package.py packs the wheels
 # of the pinned versions, which are not installed there.

@@ -1,0 +1,195 @@
+"""One hostile case: a room with an input, the real command in it as a process of its own, what must come of it."""
+
+import os
+import shlex
+import signal
+import subprocess
+import sys
+import time
+import uuid
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import pytest
+
+from mkpc_kaggle.data.competition import read_test_side, submission_problems
+
+ROOT = Path(__file__).resolve().parents[2]
+MEMORY_KIB = 4 << 20
+"""Of data, for each process; not of address space, of which CUDA builds of PyTorch reserve more."""
+REFUSED = (2,)
+DONE = (0,)
+EITHER = (0, 2)
+"""A valid result, or a clear refusal."""
+CRASHES = ("Traceback (most recent call last)", "Fatal Python error", "Segmentation fault", "core dumped")
+MARK = "MKPC_HOSTILE_CASE"
+
+Make = Callable[[Path], None]
+Act = Callable[["subprocess.Popen[bytes]"], None]
+
+
+def nothing(_: object) -> None:
+    """Leave the room as it is."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """``make`` changes the room; ``command`` runs in it, ``act`` disturbs it.
+
+    It must end within ``seconds`` (more on a machine with other work) with one of ``statuses``, and its output
+    have ``says``. It may write to the room's folder ``out`` alone. Where it makes a submission, ``out/s.csv`` must
+    be valid and complete unless the command was refused or ``submission`` says no. ``then`` is a second command,
+    judged as the first.
+    """
+
+    group: str
+    name: str
+    command: str
+    make: Make = nothing
+    statuses: tuple[int, ...] = DONE
+    says: str = ""
+    seconds: float = 60.0
+    act: Act | None = None
+    then: str = ""
+    env: dict[str, str] = field(default_factory=dict)
+    submission: bool = True
+
+    @property
+    def id(self) -> str:
+        return f"{self.group}: {self.name}"
+
+
+def slowness() -> float:
+    """How many times slower than alone a process of this machine is, about."""
+    return max(1.0, 2 * os.getloadavg()[0] / (os.cpu_count() or 1))
+
+
+def attack(case: Case, room: Path) -> None:
+    """Run the case in the room; the test fails with all that was wrong."""
+    for folder in ("out", "tmp", "home"):
+        (room / folder).mkdir(exist_ok=True)
+    case.make(room)
+    before = _snapshot(room)
+    mark = uuid.uuid4().hex
+    faults = []
+    for number, command in enumerate(filter(None, (case.command, case.then))):
+        process = _start(command, room, {**case.env, MARK: mark})
+        if number == 0 and case.act is not None:
+            case.act(process)
+        allowed = case.seconds + 5 * slowness()
+        status, seconds, output = _wait(process, room, allowed)
+        faults += _faults(case, status, seconds, allowed, output, room)
+        faults += [f"left running: {line}" for line in _orphans(mark)]
+        if "submit" in command and status in (0, 1, 128 + signal.SIGINT, 128 + signal.SIGTERM):
+            faults += _submission_faults(room)
+    faults += [f"changed: {name}" for name in _changed(before, _snapshot(room))]
+    if faults:
+        pytest.fail("\n".join([case.id, case.command, *faults, f"output:\n{output[-3000:]}"]), pytrace=False)
+
+
+def prepared(command: str, room: Path) -> int:
+    """The exit status of a command that nobody disturbs."""
+    for folder in ("out", "tmp", "home"):
+        (room / folder).mkdir(exist_ok=True)
+    return _start(command, room, {}).wait()
+
+
+def _start(command: str, room: Path, env: dict[str, str]) -> "subprocess.Popen[bytes]":
+    words = [word.format(room=room) for word in shlex.split(command)]
+    limited = ["sh", "-c", f'ulimit -d {MEMORY_KIB}; ulimit -c 0; exec "$@"', "sh"]
+    own = {
+        "PATH": os.environ["PATH"],
+        "PYTHONPATH": str(ROOT),
+        "OMP_NUM_THREADS": "1",
+        "HOME": str(room / "home"),
+        "TMPDIR": str(room / "tmp"),
+        "PYTHONDONTWRITEBYTECODE": "1",
+        "no_proxy": "*",
+    }
+    with (room / "out" / "log").open("ab") as log:
+        return subprocess.Popen(
+            [*limited, sys.executable, "-m", "mkpc_kaggle", *words],
+            cwd=room,
+            env=own | env,
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
+        )
+
+
+def _wait(process: "subprocess.Popen[bytes]", room: Path, allowed: float) -> tuple[int | None, float, str]:
+    """The status, ``None`` where it had to be killed, the seconds and the output."""
+    begun = time.monotonic()
+    try:
+        status: int | None = process.wait(allowed)
+    except subprocess.TimeoutExpired:
+        status = None
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+    return status, time.monotonic() - begun, (room / "out" / "log").read_text(errors="replace")
+
+
+def _faults(case: Case, status: int | None, seconds: float, allowed: float, output: str, room: Path) -> list[str]:
+    faults = [f"the output has {crash!r}" for crash in CRASHES if crash in output]
+    if status is None:
+        faults.append(f"not over after {seconds:.0f} s, {allowed:.0f} were allowed")
+    elif status not in case.statuses:
+        faults.append(f"exit status {status}, not one of {case.statuses}")
+    if status in REFUSED and "error:" not in output:
+        faults.append("refused without a word")
+    if case.says not in output:
+        faults.append(f"the output lacks {case.says!r}")
+    if status in (0, 1, 2) and (left := sorted(path.name for path in (room / "tmp").iterdir())):
+        faults.append(f"left in the folder for temporary files: {left}")
+    return faults
+
+
+def _submission_faults(room: Path) -> list[str]:
+    ids = [pair.id for pair in read_test_side(room / "D")]
+    return [f"submission: {problem}" for problem in submission_problems(room / "out" / "s.csv", ids)]
+
+
+def _orphans(mark: str) -> list[str]:
+    """Command lines of processes of the case that are still there; they are killed."""
+    deadline = time.monotonic() + 2 + slowness()
+    while (left := _marked(mark)) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    lines = []
+    for process in left:
+        try:
+            lines.append(f"{process} {Path(f'/proc/{process}/cmdline').read_bytes()[:200]!r}")
+            os.kill(process, signal.SIGKILL)
+        except OSError:
+            continue  # it ended meanwhile
+    return lines
+
+
+def _marked(mark: str) -> list[int]:
+    found = []
+    for process in Path("/proc").glob("[0-9]*"):
+        try:
+            if mark.encode() in (process / "environ").read_bytes():
+                found.append(int(process.name))
+        except OSError:
+            continue  # another user's, or it ended meanwhile
+    return found
+
+
+def _snapshot(room: Path) -> dict[str, tuple[object, ...]]:
+    """What identifies the state of each file of the room but those that a command may write."""
+    states: dict[str, tuple[object, ...]] = {}
+    for folder, folders, names in os.walk(os.fsencode(room)):
+        if folder == os.fsencode(room):
+            folders[:] = [name for name in folders if name not in (b"out", b"tmp")]
+        for name in folders + names:
+            path = os.path.join(folder, name)  # noqa: PTH118  bytes: a name may be no text
+            status = os.lstat(path)
+            contents = (status.st_size, status.st_mtime_ns, status.st_ino) if name in names else ()
+            states[repr(path)] = (status.st_mode, *contents)
+    return states
+
+
+def _changed(before: dict[str, tuple[object, ...]], after: dict[str, tuple[object, ...]]) -> list[str]:
+    return [name for name in sorted(before.keys() | after.keys()) if before.get(name) != after.get(name)]

@@ -1,0 +1,163 @@
+"""Limits that are none, and runs that are ended in every way."""
+
+import os
+import signal
+import subprocess
+import time
+
+from attack import EITHER, REFUSED, Act, Case
+from room import SUBMIT
+
+PLAIN = SUBMIT.replace(" --time-limit 5m", "").replace(" --workers 0", "")
+NONE = {
+    "--time-limit": [
+        "0",
+        "-1",
+        "nan",
+        "inf",
+        "''",
+        "8h45",
+        "1d",
+        "5x",
+        "0x10",
+        "1h1h",
+        "--5",
+        "1:30",
+        "\uff11s s",
+        "1e400",
+    ],
+    "--started-at": ["nan", "inf", "-inf", "-1", "1e400", "0", "abc", "99999999999", "1e-300", "''"],
+    "--workers": ["-1", "abc", "''", "1.5", "99999999999999999999", "1e3", "ray://", "inf", "\u0663x"],
+    "--device": ["foo", "cuda:99", "''", "cpu:0", "cuda:-1", "mps", "meta"],
+    "--precision": ["foo", "''", "int8"],
+    "--mode": ["foo", "''"],
+    "--licence": ["foo"],
+    "--recipe": [
+        "foo",
+        "''",
+        "foo.toml",
+        "../quick",
+        "D/test.csv",
+        "/dev/null",
+        "quick.toml/x.toml",
+        "D",
+        "x" * 5000,
+    ],
+    "--weights": ["foo", "''", "D/test.csv", "/dev/null"],
+}
+ODD_LIMITS = ["1s", "0.001s", "3s", "99999999999h", "5m5m", "1e3", "+60", "' 60s '", "60S", "1e9"]
+SOON = (0.05, 0.3, 1.0, 3.0, 6.0)
+ENDS = {"SIGINT": 130, "SIGTERM": 143}
+CRUEL = {"SIGKILL": -9, "SIGHUP": -1, "SIGQUIT": -3, "SIGUSR1": -10, "SIGXCPU": -24, "SIGSEGV": -11}
+
+
+def sends(name: str, *after: float, group: bool = False) -> Act:
+    """Send the signal after so many seconds, and once more after each further time."""
+
+    def act(process: "subprocess.Popen[bytes]") -> None:
+        for seconds in after:
+            time.sleep(seconds)
+            if process.poll() is None:
+                send = os.killpg if group else os.kill
+                send(process.pid, signal.Signals[name])
+
+    return act
+
+
+def to_workers(name: str, after: float) -> Act:
+    """Send the signal to the processes that the program has then."""
+
+    def act(process: "subprocess.Popen[bytes]") -> None:
+        time.sleep(after)
+        found = subprocess.run(["ps", "-o", "pid=", "--ppid", str(process.pid)], capture_output=True, check=False)
+        for one in found.stdout.split():
+            os.kill(int(one), signal.Signals[name])
+
+    return act
+
+
+def stopped_for(seconds: float) -> Act:
+    """The whole program stands still for a while."""
+
+    def act(process: "subprocess.Popen[bytes]") -> None:
+        time.sleep(2.0)
+        os.killpg(process.pid, signal.SIGSTOP)
+        time.sleep(seconds)
+        os.killpg(process.pid, signal.SIGCONT)
+
+    return act
+
+
+LONG = PLAIN.replace("quick.toml", "classical")
+STATUSES: dict[str, tuple[int, ...]] = {name: (0, status, -status + 128) for name, status in ENDS.items()}
+
+CASES = [
+    *(
+        Case("limits", f"{option} {value[:20]}", f"{SUBMIT} {option}={value}", statuses=REFUSED)
+        for option, values in NONE.items()
+        for value in values
+    ),
+    *(
+        Case("limits", f"--time-limit {value}", f"{PLAIN} --workers 1 --time-limit={value}", statuses=EITHER)
+        for value in ODD_LIMITS
+    ),
+    *(
+        Case(
+            "limits",
+            f"{limit} with {workers} workers",
+            f"{LONG} --workers {workers} --time-limit {limit}s",
+            seconds=limit,
+        )
+        for limit in (5, 15)
+        for workers in (0, 1, 2)
+    ),
+    Case("limits", "begun an hour ago", f"{PLAIN} --time-limit 60s --started-at 1000000000", statuses=EITHER),
+    *(
+        Case(
+            "signals",
+            f"{name} after {after} s",
+            f"{LONG} --workers 1",
+            statuses=STATUSES[name],
+            act=sends(name, after),
+        )
+        for name in ENDS
+        for after in SOON
+    ),
+    *(
+        Case(
+            "signals",
+            f"{name} to all after {after} s",
+            f"{LONG} --workers 1",
+            statuses=STATUSES[name],
+            act=sends(name, after, group=True),
+        )
+        for name in ENDS
+        for after in SOON[1::2]
+    ),
+    *(
+        Case("signals", f"{name} twice", f"{LONG} --workers 1", statuses=STATUSES[name], act=sends(name, 3.0, 0.2))
+        for name in ENDS
+    ),
+    *(
+        Case(
+            "signals",
+            f"{name} and once more",
+            f"{LONG} --workers 1",
+            statuses=(status, 0),
+            act=sends(name, 4.0),
+            then=SUBMIT.replace("quick.toml", "classical"),
+        )
+        for name, status in CRUEL.items()
+    ),
+    *(
+        Case(
+            "signals",
+            f"{name} to the worker after {after} s",
+            f"{PLAIN} --workers 1 --time-limit 60s",
+            act=to_workers(name, after),
+        )
+        for name in ("SIGKILL", "SIGSTOP", "SIGTERM", "SIGSEGV")
+        for after in (3.0, 6.0)
+    ),
+    Case("signals", "stopped for a while", f"{LONG} --workers 1 --time-limit 60s", act=stopped_for(5.0)),
+]

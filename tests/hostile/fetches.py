@@ -1,0 +1,135 @@
+"""Servers that lie, wander or dawdle: ``weights fetch`` from a server of the test's own."""
+
+import contextlib
+import hashlib
+import os
+import socket
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from attack import Case, nothing
+
+DATA = bytes(range(256)) * 400
+DIGEST = "sha256:" + hashlib.sha256(DATA).hexdigest()
+OK = b"HTTP/1.1 200 OK\r\n"
+WHOLE = OK + b"Content-Length: 102400\r\n\r\n"
+CHUNKED = OK + b"Transfer-Encoding: chunked\r\n\r\n"
+
+
+def redirect(target: str) -> bytes:
+    return b"HTTP/1.1 302 Found\r\nLocation: " + target.encode() + b"\r\n\r\n"
+
+
+ANSWERS: dict[str, list[bytes]] = {
+    "nothing": [b""],
+    "noise": [os.urandom(10_000)],
+    "another protocol": [b"SSH-2.0-OpenSSH_9.6\r\n"],
+    "a status of text": [b"HTTP/1.1 fine OK\r\n\r\n"],
+    "a status of 999": [b"HTTP/1.1 999 OK\r\n\r\n"],
+    "a head of 10 MB": [OK, b"A: " + b"x" * 10_000_000],
+    "a million heads": [OK, b"A: x\r\n" * 1_000_000],
+    "heads without end": [OK + b"A: b"],
+    "a length of text": [OK + b"Content-Length: many\r\n\r\n", DATA],
+    "a length below none": [OK + b"Content-Length: -5\r\n\r\n", DATA],
+    "a length of 10^30": [OK + b"Content-Length: 1" + b"0" * 30 + b"\r\n\r\n", DATA],
+    "two lengths": [OK + b"Content-Length: 1\r\nContent-Length: 102400\r\n\r\n", DATA],
+    "too many bytes": [OK + b"\r\n", DATA, DATA],
+    "bytes without end": [OK + b"\r\n", b"x" * 1_000_000] * 1,
+    "too few bytes": [WHOLE, DATA[:1000]],
+    "other bytes": [WHOLE, DATA[::-1]],
+    "a page": [OK + b"Content-Type: text/html\r\n\r\n<html>sign in</html>"],
+    "a chunk of less than nothing": [CHUNKED, b"-5\r\n", DATA],
+    "a chunk of text": [CHUNKED, b"zz\r\n", DATA],
+    "a chunk of 2^100": [CHUNKED, b"1" + b"0" * 25 + b"\r\n", DATA],
+    "a chunk size of 10 MB": [CHUNKED, b"1" * 10_000_000],
+    "chunks of one byte": [CHUNKED, b"1\r\nx\r\n" * 150_000],
+    "compressed": [OK + b"Content-Encoding: gzip\r\n\r\n", DATA],
+    "a part that nobody asked for": [b"HTTP/1.1 206 Partial\r\nContent-Range: bytes 5-9/102400\r\n\r\n", DATA],
+    "a redirection to a file": [redirect("file:///etc/hostname")],
+    "a redirection to a broken address": [redirect("http://[bad/")],
+    "a redirection to an empty label": [redirect("http://a..b/")],
+    "a redirection to a long label": [redirect(f"http://{'a' * 64}.org/")],
+    "a redirection to a port of text": [redirect("http://127.0.0.1:port/")],
+    "a redirection to port 99999": [redirect("http://127.0.0.1:99999/")],
+    "a redirection to no host": [redirect("http:///")],
+    "a redirection to itself": [redirect("/a.bin")],
+    "a redirection with a blank": [redirect("http://127.0.0.1:9/a b")],
+    "a redirection to 1 MB": [redirect("http://127.0.0.1:9/" + "a" * 60_000)],
+    "a redirection without a place": [b"HTTP/1.1 302 Found\r\n\r\n"],
+    "only errors": [b"HTTP/1.1 404 Not Found\r\nContent-Length: 5\r\n\r\nsorry"],
+    "cookies and more": [OK + b'Set-Cookie: a=b\r\nETag: "x\r\n y"\r\nContent-Length: 5\r\n\r\nhello'],
+}
+PARTS: dict[str, Callable[[Path], object]] = {
+    "a link": lambda path: path.symlink_to("../../quick.toml"),
+    "a pipe": os.mkfifo,
+    "a directory": Path.mkdir,
+    "other bytes": lambda path: path.write_bytes(b"x" * 500),
+    "too many bytes": lambda path: path.write_bytes(DATA * 2),
+    "a mark with a line feed": lambda path: [
+        path.write_bytes(DATA[:500]),
+        path.with_name("a.bin.part.mark").write_text("a\r\nHost: b"),
+    ],
+}
+
+
+class Server:
+    """Gives each connection the same answer, whatever is asked."""
+
+    def __init__(self, answer: list[bytes], pause: float = 0.0) -> None:
+        self._socket = socket.create_server(("127.0.0.1", 0))
+        self.port = self._socket.getsockname()[1]
+        self._answer, self._pause = answer, pause
+        threading.Thread(target=self._serve, daemon=True).start()
+
+    def _serve(self) -> None:
+        while True:
+            connection, _ = self._socket.accept()
+            threading.Thread(target=self._talk, args=(connection,), daemon=True).start()
+
+    def _talk(self, connection: socket.socket) -> None:
+        with contextlib.suppress(OSError), connection:
+            connection.recv(65536)
+            for part in self._answer:
+                connection.sendall(part)
+            while self._pause:
+                time.sleep(self._pause)
+                connection.sendall(b"x")
+
+
+def served(
+    answer: list[bytes], pause: float = 0.0, size: str = "102400", part: Callable[[Path], object] = nothing
+):
+    """A manifest beside weights, with a file from a server that answers so."""
+
+    def make(room: Path) -> None:
+        server = Server(answer, pause)
+        (room / "listed").mkdir()
+        line = f"a.bin  {size}  {DIGEST}  MIT  slot  http://127.0.0.1:{server.port}/a.bin\n"
+        (room / "listed" / "weights_manifest.txt").write_text(line)
+        (room / "out" / "w").mkdir()
+        part(room / "out" / "w" / "a.bin.part")
+
+    return make
+
+
+FETCH = "weights fetch a.bin --out out/w"
+ENV = {"MKPC_WEIGHTS": "listed"}
+CASES = [
+    *(Case("fetches", name, FETCH, served(answer), (1,), env=ENV) for name, answer in ANSWERS.items()),
+    *(
+        Case("fetches", f"{name}, of unknown size", FETCH, served(answer, size="?"), (1,), env=ENV)
+        for name, answer in list(ANSWERS.items())[12:17]
+    ),
+    *(
+        Case("fetches", f"{name} for the part", FETCH, served([WHOLE, DATA], part=part), (0, 1), env=ENV)
+        for name, part in PARTS.items()
+    ),
+    *(
+        Case(
+            "fetches", f"{name}, a byte now and then", FETCH, served(answer, pause=5.0), (1,), env=ENV, seconds=240
+        )
+        for name, answer in (("a head", [OK + b"A: "]), ("a body", [WHOLE]))
+    ),
+]

@@ -1,0 +1,99 @@
+"""Places for the results that are none, or that hold what must not be lost."""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+from attack import EITHER, REFUSED, Case, nothing
+from room import SUBMIT
+
+INPUTS = {
+    "the table": "--output D/test.csv",
+    "the table by another way": "--output D/test_images/../test.csv",
+    "an image": "--output D/test_images/b1/x.png",
+    "the images' directory": "--output D/test_images",
+    "the recipe": "--output quick.toml",
+    "no name": "--output ''",
+    "here": "--output .",
+    "the root": "--output /",
+    "a directory": "--output out/",
+    "the report's place": "--output out/s.html --report out/s.html",
+    "a page without a report's name": "--output out/s.html",
+    "the work directory": "--output out/s.work --work-dir out/s.work",
+    "a name that ends as work directories do": "--output out/q.work",
+    "the report in the table's place": "--output out/s.csv --report D/test.csv",
+    "the report in the submission's place": "--output out/s.csv --report out/s.csv",
+    "the report in an image's place": "--output out/s.csv --report D/test_images/b1/x.png",
+    "the journal in the table's place": "--output out/s.csv --work-dir D/test.csv",
+    "a name of 300 characters": f"--output out/{'s' * 300}.csv",
+    "below a file": "--output D/test.csv/s.csv",
+    "below /proc": "--output /proc/s.csv",
+    "below /dev/null": "--output /dev/null/s.csv",
+    "the submission in the journal's place": "--work-dir out --output out/journal.sqlite",
+    "the submission in the lock's place": "--work-dir out --output out/journal.lock",
+}
+ODD = {
+    "a name with a line feed": "--output 'out/a\nb.csv'",
+    "a name of other scripts": "--output out/\u202e\U0001f600.csv",
+    "a name like an option": "--output=--fresh",
+    "no suffix": "--output out/s",
+    "two suffixes": "--output out/s.csv.gz",
+    "directories that are not there": "--output out/a/b/c/d/s.csv",
+    "the null device": "--output /dev/null",
+    "the full device": "--output /dev/full",
+    "the journal among the images": "--output out/s.csv --work-dir D/test_images",
+    "the journal beside the table": "--output out/s.csv --work-dir D",
+    "no name for the journal": "--output out/s.csv --work-dir ''",
+    "no name for the report": "--output out/s.csv --report ''",
+    "a directory for the report": "--output out/s.csv --report out",
+}
+THERE: dict[str, Callable[[Path], object]] = {
+    "a link to the table": lambda path: path.symlink_to("../D/test.csv"),
+    "a hard link to the table": lambda path: os.link(path.parent.parent / "D" / "test.csv", path),
+    "a link to itself": lambda path: path.symlink_to(path),
+    "a link to nothing": lambda path: path.symlink_to("nothing.csv"),
+    "a pipe": os.mkfifo,
+    "a directory": Path.mkdir,
+    "an older file": lambda path: path.write_text("old"),
+    "a file for the journal's directory": lambda path: path.with_suffix(".work").write_text("old"),
+    "a pipe for the journal's directory": lambda path: os.mkfifo(path.with_suffix(".work")),
+    "a link for the journal's directory": lambda path: path.with_suffix(".work").symlink_to("../D"),
+    "a directory for the partial file": lambda path: path.with_name(".s.csv.part").mkdir(),
+    "a link for the partial file": lambda path: path.with_name(".s.csv.part").symlink_to("../D/test.csv"),
+    "a pipe for the partial file": lambda path: os.mkfifo(path.with_name(".s.csv.part")),
+    "a link for the report": lambda path: path.with_suffix(".html").symlink_to("../D/test.csv"),
+    "a pipe for the report": lambda path: os.mkfifo(path.with_suffix(".html")),
+    "a directory for the report ": lambda path: path.with_suffix(".html").mkdir(),
+}
+PLAIN = SUBMIT.replace("--output out/s.csv --no-report ", "")
+
+
+def placed(make: Callable[[Path], object]) -> Callable[[Path], None]:
+    return lambda room: nothing(make(room / "out" / "s.csv"))
+
+
+CASES = [
+    *(Case("outputs", name, f"{PLAIN} {options}", statuses=REFUSED) for name, options in INPUTS.items()),
+    *(
+        Case("outputs", name, f"{PLAIN} {options}", statuses=(0, 1, 2), submission="out/s.csv" in options)
+        for name, options in ODD.items()
+    ),
+    *(
+        Case("outputs", f"there is {name}", f"{PLAIN} --output out/s.csv", placed(make), (0, 1, 2))
+        for name, make in THERE.items()
+    ),
+    Case(
+        "outputs",
+        "text that the terminal has not",
+        PLAIN + " --output out/s.csv",
+        env={"PYTHONIOENCODING": "ascii"},
+    ),
+    Case(
+        "outputs",
+        "the C locale",
+        PLAIN + " --output out/\u00e9.csv",
+        statuses=EITHER,
+        env={"LC_ALL": "C"},
+        submission=False,
+    ),
+]

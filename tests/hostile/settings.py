@@ -1,0 +1,233 @@
+"""Recipes as nobody should write them, and arguments of ``validate`` and ``package`` that make no sense."""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+from attack import EITHER, REFUSED, Case
+from room import RECIPE, SUBMIT, encoded, picture
+
+UNIT = 'units = [{ stage = 1, matcher = "sift", long_side = 200 }]\n'
+RECIPES = {
+    "an empty file": "",
+    "no units": "units = []",
+    "units that are no list": "units = 3",
+    "units that are no tables": "units = [1, 2]",
+    "a unit without a size": 'units = [{ stage = 1, matcher = "sift" }]',
+    "a unit of two sizes": 'units = [{ stage = 1, matcher = "sift", long_side = 200, area = "2x2" }]',
+    "a stage of text": UNIT.replace("= 1,", '= "1",'),
+    "a third stage": UNIT.replace("= 1,", "= 3,"),
+    "stage 2 first": UNIT.replace("= 1,", "= 2,"),
+    "a size below zero": UNIT.replace("200", "-200"),
+    "a size of 400 digits": UNIT.replace("200", "9" * 400),
+    "a size of 5,000 digits": UNIT.replace("200", "9" * 5000),
+    "a size that is no whole number": UNIT.replace("200", "200.5"),
+    "a size of NaN": UNIT.replace("200", "nan"),
+    "an area of nothing": UNIT.replace("long_side = 200", 'area = "0x0"'),
+    "an area of 10^40": UNIT.replace("long_side = 200", f'area = "{10**20}x{10**20}"'),
+    "a size of 10^9": UNIT.replace("200", "1000000000"),
+    "a matcher nobody knows": UNIT.replace("sift", "foo"),
+    "a matcher that is a path": UNIT.replace("sift", "../sift"),
+    "a matcher that is no matcher": UNIT.replace("sift", "registry"),
+    "the same unit twice": UNIT.replace("[{", '[{ stage = 1, matcher = "sift", long_side = 200 }, {'),
+    "an unknown key": UNIT.replace("200", "200, foo = 1"),
+    "an unknown table": UNIT + "[foo]\nx = 1",
+    "a key twice": UNIT + UNIT,
+    "a value for a table": UNIT + "mkpc = 3",
+    "a matcher's table that is none": UNIT + "matchers = 3",
+    "a matcher's table of another": UNIT + "[matchers]\nsift = 3",
+    "a matcher's options nobody knows": UNIT + "[matchers.sift]\nfoo = 1",
+    "no features": UNIT + "[matchers.sift]\nfeatures = 0",
+    "a ratio of NaN": UNIT + "[matchers.sift]\nratio = nan",
+    "no threshold": UNIT + "[magsac]\nthreshold = 0",
+    "a threshold of infinity": UNIT + "[magsac]\nthreshold = inf",
+    "10^12 iterations": UNIT + "[magsac]\niterations = 1000000000000",
+    "iterations of text": UNIT + '[magsac]\niterations = "many"',
+    "a method nobody knows": UNIT + '[magsac]\nmethod = "foo"',
+    "shares above one": UNIT + "[mkpc]\nmin_share = 7",
+    "deep lists": "units = " + "[" * 100_000,
+    "deep tables": "units = " + "{a=" * 20_000,
+    "no TOML": "units = [",
+    "a byte order mark": "\ufeff" + RECIPE,
+    "NUL bytes": RECIPE.replace("sift", "si\0ft"),
+    "lines of another system": RECIPE.replace("\n", "\r\n"),
+    "a description of a list": "description = [1]\n" + RECIPE,
+    "a million comments": "# nothing\n" * 1_000_000 + RECIPE,
+    "10,000 units": "units = [" + 10_000 * '{ stage = 1, matcher = "sift", long_side = 200 },' + "]",
+}
+VALID = (
+    "lines of another system",
+    "a description of a list",
+    "a million comments",
+    "a size of 10^9",
+    "a byte order mark",
+)
+
+
+def sparse(path: Path) -> None:
+    with path.open("wb") as stream:
+        stream.truncate(1 << 40)
+
+
+PLACES: dict[str, Callable[[Path], object]] = {
+    "a directory": Path.mkdir,
+    "a pipe": os.mkfifo,
+    "a link to /dev/zero": lambda path: path.symlink_to("/dev/zero"),
+    "a link to itself": lambda path: path.symlink_to(path),
+    "UTF-16": lambda path: path.write_text(RECIPE, encoding="utf-16"),
+    "bytes that are no text": lambda path: path.write_bytes(b"\xff\xfe\x00"),
+    "a sparse file of 1 TB": sparse,
+}
+
+CALIBRATION = "image_id,camera_intrinsics,rotation_matrix,translation_vector\n" + "".join(
+    f"{name},200 0 80 0 200 80 0 0 1,1 0 0 0 1 0 0 0 1,{shift} 0 0\n" for shift, name in enumerate("xyz")
+)
+COVISIBILITY = "pair,covisibility\nx-y,0.9\ny-z,0.8\nx-z,0.05\n"
+FACTORS = "scene,scaling_factor\ns,1.5\n"
+VALIDATE = "validate --train-dir T --recipe quick.toml --workers 0 --no-scenes"
+SCORE = "validate --train-dir T --submission out/sub.csv --truth truth.csv"
+ARGUMENTS = {
+    "covisibility above one": "--min-covisibility 1.1",
+    "covisibility of NaN": "--min-covisibility nan",
+    "covisibility of infinity": "--min-covisibility inf",
+    "no pairs a scene": "--pairs-per-scene 0",
+    "fewer pairs than none": "--pairs-per-scene -1",
+    "half a pair": "--pairs-per-scene 0.5",
+    "a scene nobody knows": "--scenes foo",
+    "a scene above": "--scenes ../T",
+    "a unit nobody knows": "--units foo",
+    "no unit": "--units ''",
+    "no threshold": "--threshold 0",
+    "a threshold of NaN": "--threshold nan",
+    "a threshold below zero": "--threshold -1",
+    "a method nobody knows": "--method foo",
+    "a comparison of one": "--compare quick.toml",
+    "a comparison with nothing": "--compare quick.toml foo",
+    "a comparison of units": "--compare quick.toml quick.toml --units 1:sift@200",
+    "a submission without truth": "--submission out/sub.csv",
+    "truth without a submission": "--truth truth.csv",
+    "pairs beside the train side": "--pairs truth.csv",
+    "a model nobody knows": "--estimate H",
+    "figures in a directory": "--json out --pairs-per-scene 1",
+    "figures in the table": "--json T/scaling_factors.csv --pairs-per-scene 1",
+    "a file for the work directory": "--work-dir truth.csv",
+    "no time": "--time-limit 0",
+}
+TRAIN = {
+    "scaling_factors.csv": {
+        "empty": "",
+        "of text": "scene,scaling_factor\ns,x\n",
+        "of NaN": "scene,scaling_factor\ns,nan\n",
+        "with a path": "scene,scaling_factor\n../T,1\n",
+    },
+    "s/calibration.csv": {
+        "empty": "",
+        "of few numbers": CALIBRATION.replace("200 0 80", "200"),
+        "of NaN": CALIBRATION.replace("200 0 80", "nan nan nan"),
+        "of zeros": CALIBRATION.replace("200 0 80 0 200 80 0 0 1", "0 0 0 0 0 0 0 0 0"),
+        "with a rotation that is none": CALIBRATION.replace("1 0 0 0 1 0 0 0 1", "1 2 3 4 5 6 7 8 9"),
+    },
+    "s/pair_covisibility.csv": {
+        "empty": "",
+        "of strangers": "pair,covisibility\na-b,1\n",
+        "of no pair": "pair,covisibility\nxy,1\n",
+        "of text": "pair,covisibility\nx-y,much\n",
+        "of NaN": "pair,covisibility\nx-y,nan\n",
+        "with an image twice": "pair,covisibility\nx-x,1\n",
+    },
+}
+ROW = "1," + " ".join("123456789")
+SUBMISSIONS = {
+    "empty": "",
+    "a header alone": "sample_id,fundamental_matrix\n",
+    "of NaN": "sample_id,fundamental_matrix\n1,nan nan nan nan nan nan nan nan nan\n",
+    "of zeros": "sample_id,fundamental_matrix\n1,0 0 0 0 0 0 0 0 0\n",
+    "of infinity": "sample_id,fundamental_matrix\n1,inf 0 0 0 0 0 0 0 0\n",
+    "of huge numbers": "sample_id,fundamental_matrix\n1,1e308 1e308 1 1 1 1 1 1 1\n",
+    "of eight numbers": "sample_id,fundamental_matrix\n1,1 2 3 4 5 6 7 8\n",
+    "of text": "sample_id,fundamental_matrix\n1,a b c d e f g h i\n",
+    "of strangers": f"sample_id,fundamental_matrix\n9{ROW}\n",
+    "twice": f"sample_id,fundamental_matrix\n{ROW}\n{ROW}\n",
+}
+PACKAGES = {
+    "no owner": "--owner ''",
+    "an owner that is a path": "--owner ../x",
+    "an owner with a line feed": "--owner 'a\nb'",
+    "an owner of 5,000 characters": f"--owner {'x' * 5000}",
+    "wheels that are not there": "--owner me --wheels foo",
+    "wheels that are a file": "--owner me --wheels quick.toml",
+    "an empty directory of wheels": "--owner me --wheels home",
+    "a Python nobody knows": "--owner me --wheels home --python foo",
+    "no Python": "--owner me --wheels home --python ''",
+    "an image nobody knows": "--owner me --image foo",
+    "weights that are not there": "--owner me --weights foo",
+}
+
+
+def recipe(text: str) -> Callable[[Path], object]:
+    return lambda room: (room / "quick.toml").write_bytes(text.encode())
+
+
+def replaced(make: Callable[[Path], object]) -> Callable[[Path], None]:
+    def replace(room: Path) -> None:
+        (room / "quick.toml").unlink()
+        make(room / "quick.toml")
+
+    return replace
+
+
+def train_side(name: str = "", text: str = "", submission: str = "") -> Callable[[Path], None]:
+    """A train side of one scene, one of its files changed, and a submission with what its sample is."""
+
+    def make(room: Path) -> None:
+        images = room / "T" / "s" / "images"
+        images.mkdir(parents=True)
+        for number, image in enumerate("xyz"):
+            (images / f"{image}.jpg").write_bytes(encoded(".jpg", picture(12 * number)))
+        files = {
+            "scaling_factors.csv": FACTORS,
+            "s/calibration.csv": CALIBRATION,
+            "s/pair_covisibility.csv": COVISIBILITY,
+        }
+        for file, contents in {**files, **({name: text} if name else {})}.items():
+            (room / "T" / file).write_text(contents)
+        (room / "truth.csv").write_text("sample_id,scene,image_1_id,image_2_id\n1,s,x,y\n")
+        (room / "out" / "sub.csv").write_text(submission or f"sample_id,fundamental_matrix\n{ROW}\n")
+
+    return make
+
+
+CASES = [
+    *(
+        Case("recipes", name, SUBMIT, recipe(text), EITHER if name in VALID else REFUSED, seconds=120)
+        for name, text in RECIPES.items()
+    ),
+    *(Case("recipes", name, SUBMIT, replaced(make), REFUSED) for name, make in PLACES.items()),
+    *(
+        Case("arguments", name, f"{VALIDATE} {options}", train_side(), (0, 1, 2))
+        for name, options in ARGUMENTS.items()
+    ),
+    *(
+        Case("arguments", f"{file} {name}", f"{VALIDATE} --pairs-per-scene 1", train_side(file, text), (0, 1, 2))
+        for file, texts in TRAIN.items()
+        for name, text in texts.items()
+    ),
+    *(
+        Case("arguments", f"a submission {name}", SCORE, train_side(submission=text), EITHER)
+        for name, text in SUBMISSIONS.items()
+    ),
+    *(
+        Case(
+            "arguments",
+            f"check of a submission {name}",
+            "check out/sub.csv --test-dir D",
+            train_side(submission=text),
+            (1,),
+        )
+        for name, text in SUBMISSIONS.items()
+    ),
+    *(
+        Case("packages", name, f"package --out out/p {options}", statuses=REFUSED, seconds=180)
+        for name, options in PACKAGES.items()
+    ),
+]

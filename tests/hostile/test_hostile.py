@@ -1,0 +1,58 @@
+"""The standing attack: the real command on hostile inputs, each case in a process of its own (see ``attack``)."""
+
+from pathlib import Path
+
+import ends
+import fetches
+import images
+import journals
+import outputs
+import pytest
+import settings
+import tables
+import weight_bombs
+from attack import Case, attack
+from room import furnish, write_template
+
+ALL: list[Case] = [
+    case
+    for group in (tables, images, outputs, ends, journals, weight_bombs, settings, fetches)
+    for case in group.CASES
+]
+QUICK = (
+    "tables: an id twice",
+    "tables: a batch further above",
+    "tables: bytes that are no UTF-8",
+    "images: png: its first half",
+    "images: a pipe",
+    "outputs: the table",
+    "limits: --time-limit nan",
+    "signals: SIGTERM after 1.0 s",
+    "journals: its first half, resumed",
+    "weights: a tuple in a tuple, a million times",
+    "recipes: deep lists",
+    "fetches: a chunk of less than nothing",
+    "fetches: a link for the part",
+    "arguments: check of a submission of NaN",
+    "packages: an owner that is a path",
+)
+"""These run with the other tests."""
+
+
+@pytest.fixture(scope="session")
+def template(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_template(tmp_path_factory.mktemp("template") / "room")
+
+
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize(
+    "case", [pytest.param(case, id=case.id, marks=() if case.id in QUICK else pytest.mark.slow) for case in ALL]
+)
+def test_a_hostile_input_is_survived(case: Case, template: Path, tmp_path: Path) -> None:
+    attack(case, furnish(tmp_path / "room", template))
+
+
+def test_the_names_of_cases_are_unique_and_the_quick_ones_are_among_them() -> None:
+    names = [case.id for case in ALL]
+    assert len(set(names)) == len(names) >= 300
+    assert set(QUICK) <= set(names)

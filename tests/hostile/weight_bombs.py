@@ -1,0 +1,211 @@
+"""Weight files that would run code, take all memory, or are no tensors; and directories with them."""
+
+import io
+import os
+import pickle
+import pickletools
+import warnings
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from attack import EITHER, REFUSED, Case
+from room import SUBMIT
+
+CONVERT = "weights convert a.pt --out out/a.safetensors"
+LENGTH = (6 * 10**9).to_bytes(8, "little")
+PICKLES = {
+    "nothing": b"",
+    "a tuple in a tuple, a million times": b"\x80\x02})" + b"\x85" * 1_000_000 + b"K\x01s.",
+    "pairs of pairs": b"\x80\x02})" + b"q\x01h\x01\x86" * 40 + b"K\x01s.",
+    "lists of lists": b"\x80\x02" + b"]" * 500_000 + b"a" * 499_999 + b".",
+    "a place for 400 million objects": b"\x80\x02}r\x00\x84\xd7\x17.",
+    "a bytearray of 6 GB": b"\x80\x02cbuiltins\nbytearray\n\x8a\x08" + LENGTH + b"\x85R.",
+    "a string of 4 GB": b"\x80\x02}X\xff\xff\xff\xffa.",
+    "a bytes object of 6 GB": b"\x80\x04\x8e" + LENGTH + b"a.",
+    "a frame of 6 GB": b"\x80\x04\x95" + LENGTH + b"}.",
+    "a million sets": b"\x80\x04(" + b"\x8f" * 1_000_000 + b"t.",
+    "a tensor of 6 GB": b"\x80\x02ctorch\nFloatTensor\n\x8a\x08" + LENGTH + b"\x85R.",
+    "a call of the system": b"\x80\x02cposix\nsystem\nX\x10\x00\x00\x00touch out/called\x85R.",
+    "a call of eval": b"\x80\x02cbuiltins\neval\nX\x01\x00\x00\x001\x85R.",
+    "a foreign class": b"\x80\x02}X\x01\x00\x00\x00acnowhere\nThing\n)Rs.",
+    "a stack that is empty": b"\x80\x02000.",
+    "a mark that is missing": b"\x80\x02tu.",
+    "no end": b"\x80\x02}",
+    "an unknown protocol": b"\x80\xff}.",
+    "numbers for names": b"\x80\x02}K\x01K\x02s.",
+    "nothing for a table": b"\x80\x02N.",
+}
+TENSORS = {
+    "sparse": "t.to_sparse()",
+    "compressed sparse": "t.to_sparse_csr()",
+    "on no device": "t.to('meta')",
+    "quantised": "torch.quantize_per_tensor(t, 0.1, 0, torch.quint8)",
+    "nested": "torch.nested.nested_tensor([t[0], t[1, :2]])",
+    "of half complex numbers": "t.to(torch.complex32)",
+    "one element a billion times": "torch.zeros(1).expand(1_000_000_000)",
+    "of eight bits": "t.to(torch.float8_e4m3fn)",
+    "of no elements": "torch.zeros(0, 1 << 40)",
+    "of NaN": "t * float('nan')",
+    "conjugated": "torch.view_as_complex(torch.ones(3, 2)).conj()",
+}
+
+
+def unpacked(path: Path) -> None:
+    (path / "data").mkdir(parents=True)
+    (path / "data.pkl").write_bytes(pickle.dumps({}, protocol=2))
+    os.mkfifo(path / "data" / "0")
+
+
+FILES: dict[str, Callable[[Path], object]] = {
+    "a pipe": os.mkfifo,
+    "a directory": Path.mkdir,
+    "a link to /dev/zero": lambda path: path.symlink_to("/dev/zero"),
+    "a link to itself": lambda path: path.symlink_to(path),
+    "nothing there": lambda path: None,
+    "an empty file": lambda path: path.touch(),
+    "text": lambda path: path.write_text("no checkpoint"),
+    "an empty archive": lambda path: path.write_bytes(b"PK\x05\x06" + bytes(18)),
+    "an archive cut off": lambda path: path.write_bytes(b"PK\x03\x04" + bytes(100)),
+    "a compressed gigabyte": lambda path: archive(path, zipfile.ZIP_DEFLATED, bytes(1_000_000_000)),
+    "other records": lambda path: archive(path, zipfile.ZIP_STORED, b"x"),
+    "an unpacked directory of a pipe": unpacked,
+}
+SAFETENSORS = {
+    "empty": b"",
+    "a head of 2^63 bytes": (2**63).to_bytes(8, "little") + b"{}",
+    "a head that is longer than the file": (10**6).to_bytes(8, "little") + b"{}",
+    "deep JSON": (200_000).to_bytes(8, "little") + b"[" * 200_000,
+    "a tensor beyond the end": (80).to_bytes(8, "little")
+    + b'{"a":{"dtype":"F32","shape":[99],"data_offsets":[0,396]}}'.ljust(80),
+    "a shape of 2^62": (80).to_bytes(8, "little")
+    + b'{"a":{"dtype":"F32","shape":[4611686018427387904,4],"data_offsets":[0,0]}}'.ljust(80),
+    "no tensors": (2).to_bytes(8, "little") + b"{}",
+}
+LISTED = ("xfeat_sparse_bnfolded.safetensors", "superpoint_v1.pth", "quadtree_outdoor.ckpt", "loma_B128.pth")
+
+
+def archive(path: Path, method: int, data: bytes) -> None:
+    with zipfile.ZipFile(path, "w", method) as file:
+        file.writestr("a/data.pkl", pickle.dumps({}, protocol=2))
+        file.writestr("a/data/0", data)
+
+
+def saved(value: Any, **options: Any) -> bytes:
+    import torch
+
+    stream = io.BytesIO()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # prototypes, says torch
+        torch.save(value, stream, **options)
+    return stream.getvalue()
+
+
+def with_pickle(data: bytes) -> bytes:
+    """An archive as torch writes it, its pickle replaced."""
+    import torch
+
+    whole = io.BytesIO()
+    with zipfile.ZipFile(io.BytesIO(saved({"a": torch.zeros(2)}))) as old, zipfile.ZipFile(whole, "w") as new:
+        for name in old.namelist():
+            new.writestr(name, data if name.endswith("/data.pkl") else old.read(name))
+    return whole.getvalue()
+
+
+def legacy_with_pickle(data: bytes) -> bytes:
+    """The same in the format before archives: the fourth of its pickles is the table."""
+    import torch
+
+    whole = saved({"a": torch.zeros(2)}, _use_new_zipfile_serialization=False)
+    stream, ends = io.BytesIO(whole), []
+    for _ in range(4):
+        list(pickletools.genops(stream))
+        ends.append(stream.tell())
+    return whole[: ends[2]] + data + whole[ends[3] :]
+
+
+def tensor_of(expression: str, **options: Any) -> bytes:
+    import torch
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return saved({"a": eval(expression, {"torch": torch, "t": torch.ones(2, 3)})}, **options)
+
+
+def at(name: str, make: Callable[[], bytes]) -> Callable[[Path], object]:
+    return lambda room: (room / name).write_bytes(make())
+
+
+def listed(name: str, make: Callable[[Path], object]) -> Callable[[Path], object]:
+    """The searched directory with one bad file."""
+
+    def place(room: Path) -> None:
+        (room / "weights" / "deep").mkdir(parents=True)
+        make(room / "weights" / "deep" / name)
+
+    return place
+
+
+SEARCHED = {
+    "cut off": lambda path: path.write_bytes(b"cut off"),
+    "a pipe": os.mkfifo,
+    "a link to nothing": lambda path: path.symlink_to("nothing"),
+    "a bomb": lambda path: path.write_bytes(with_pickle(PICKLES["a tuple in a tuple, a million times"])),
+}
+AUTO = SUBMIT.replace("quick.toml", "auto") + " --weights weights --mode stage-1"
+CASES = [
+    *(
+        Case("weights", name, CONVERT, at("a.pt", lambda d=data: with_pickle(d)), EITHER)
+        for name, data in PICKLES.items()
+    ),
+    *(
+        Case("weights", f"{name}, old format", CONVERT, at("a.pt", lambda d=data: legacy_with_pickle(d)), EITHER)
+        for name, data in PICKLES.items()
+    ),
+    *(
+        Case("weights", f"a tensor {name}", CONVERT, at("a.pt", lambda e=expression: tensor_of(e)), EITHER)
+        for name, expression in TENSORS.items()
+    ),
+    *(
+        Case("weights", name, CONVERT, lambda room, m=make: m(room / "a.pt"), REFUSED)
+        for name, make in FILES.items()
+    ),
+    *(
+        Case(
+            "weights",
+            f"safetensors: {name}",
+            CONVERT.replace("a.pt", "a.safetensors"),
+            at("a.safetensors", lambda d=data: d),
+            EITHER,
+        )
+        for name, data in SAFETENSORS.items()
+    ),
+    *(
+        Case(
+            "weights",
+            f"{file}, {name}: {command}",
+            f"weights {command} --weights weights",
+            listed(file, make),
+            (0, 1),
+        )
+        for command in ("list", "verify", "locate superpoint")
+        for file in LISTED[:2]
+        for name, make in SEARCHED.items()
+    ),
+    *(
+        Case("weights", f"{file}, {name}: recipe auto", AUTO, listed(file, make), says=file, seconds=120)
+        for file in LISTED
+        for name, make in SEARCHED.items()
+    ),
+    *(
+        Case(
+            "weights",
+            f"a manifest, {name}",
+            "weights list --weights weights",
+            listed("weights_manifest.txt", make),
+            (0,),
+        )
+        for name, make in {**SEARCHED, "a directory": Path.mkdir}.items()
+    ),
+]
