@@ -20,8 +20,8 @@ MEMORY_KIB = 4 << 20
 """Of data, for each process; not of address space, of which CUDA builds of PyTorch reserve more."""
 REFUSED = (2,)
 DONE = (0,)
-EITHER = (0, 2)
-"""A valid result, or a clear refusal."""
+EITHER = (0, 1, 2)
+"""A valid result, one that says what is missing of it, or a clear refusal."""
 CRASHES = ("Traceback (most recent call last)", "Fatal Python error", "Segmentation fault", "core dumped")
 MARK = "MKPC_HOSTILE_CASE"
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 from attack import EITHER, Case, prepared
-from room import SUBMIT, furnish
+from room import SUBMIT, write_template
 
 PAGE = 4096
 READ = "journal out/s.work"
@@ -107,7 +107,7 @@ BESIDE: dict[str, Callable[[Path], object]] = {
 @cache
 def finished() -> Path:
     """The room of a run that has ended, made once a process."""
-    room = furnish(Path(tempfile.mkdtemp(prefix="hostile-")) / "room")
+    room = write_template(Path(tempfile.mkdtemp(prefix="hostile-")) / "room")
     done = prepared(SUBMIT, room)
     assert done == 0, "the undisturbed run failed"
     return room
