@@ -99,7 +99,7 @@ def _start(command: str, room: Path, env: dict[str, str]) -> "subprocess.Popen[b
     words = [word.format(room=room) for word in shlex.split(command)]
     limited = ["sh", "-c", f'ulimit -d {MEMORY_KIB}; ulimit -c 0; exec "$@"', "sh"]
     own = {
-        "PATH": os.environ["PATH"],
+        "PATH": os.defpath,
         "PYTHONPATH": str(ROOT),
         "OMP_NUM_THREADS": "1",
         "HOME": str(room / "home"),

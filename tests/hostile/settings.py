@@ -153,14 +153,13 @@ PACKAGES = {
     "no owner": "--owner ''",
     "an owner that is a path": "--owner ../x",
     "an owner with a line feed": "--owner 'a\nb'",
-    "an owner of 5,000 characters": f"--owner {'x' * 5000}",
     "wheels that are not there": "--owner me --wheels foo",
     "wheels that are a file": "--owner me --wheels quick.toml",
     "an empty directory of wheels": "--owner me --wheels home",
     "a Python nobody knows": "--owner me --wheels home --python foo",
     "no Python": "--owner me --wheels home --python ''",
-    "an image nobody knows": "--owner me --image foo",
-    "weights that are not there": "--owner me --weights foo",
+    "an image nobody knows": "--owner me --wheels home --image foo",
+    "weights that are not there": "--owner me --wheels home --weights foo",
 }
 
 
