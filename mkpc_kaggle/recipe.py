@@ -20,7 +20,9 @@ from mkpc_kaggle.geometry.robust import RobustConfig
 from mkpc_kaggle.scene.config import SceneConfig
 
 DIRECTORY = Path(__file__).resolve().parent / "recipes"
-AREA = re.compile(r"[1-9]\d*x[1-9]\d*")
+LONGEST = 99_999
+"""Pixels a side."""
+AREA = re.compile(r"[1-9]\d{0,4}x[1-9]\d{0,4}", re.ASCII)
 
 
 class Mode(StrEnum):
@@ -78,11 +80,13 @@ class Unit:
     fallback: str = ""
 
     def __post_init__(self) -> None:
-        check_ranges(self, stage=Range(1, 2), long_side=AT_LEAST_0, max_matches=AT_LEAST_1)
+        check_ranges(self, stage=Range(1, 2), long_side=Range(0, LONGEST), max_matches=AT_LEAST_1)
         if bool(self.long_side) == bool(self.area):
             raise ValueError("one of long_side and area must be given, and not both")
         if self.area and not AREA.fullmatch(self.area):
-            raise ValueError(f'area must be height x width such as "540x720", not {self.area!r}')
+            raise ValueError(
+                f'area must be height x width such as "540x720", at most {LONGEST} each, not {self.area!r}'
+            )
         if self.stretch and not self.area:
             raise ValueError("stretch needs an area, the height and width to stretch views to")
 

@@ -41,6 +41,10 @@ ROUGH: dict[str, Callable[[bytes], bytes]] = {
         for place in (0, 8, 2000)
     },
 }
+OTHER_PAIR = (
+    "CREATE TEMP TABLE other AS SELECT * FROM pair LIMIT 1; UPDATE other SET pair = {};"
+    "INSERT INTO pair SELECT * FROM other"
+)
 FINE = {
     "F of NaN": "UPDATE pair SET fundamental = zeroblob(72); UPDATE choice SET fundamental = NULL;"
     "UPDATE pair SET fundamental = X'" + np.full(9, np.nan).tobytes().hex() + "'",
@@ -50,9 +54,9 @@ FINE = {
     "an F that is text": "UPDATE pair SET fundamental = 'F'",
     "a chosen F of NaN": "REPLACE INTO choice VALUES (0, X'" + np.full(9, np.nan).tobytes().hex() + "', 'scene')",
     "a reason nobody knows": "REPLACE INTO choice VALUES (0, NULL, 'because')",
-    "a pair that is not there": "INSERT INTO pair VALUES (99, zeroblob(72), '', 0, 0, 0, 0)",
-    "a pair before the first": "INSERT INTO pair VALUES (-1, zeroblob(72), '', 0, 0, 0, 0)",
-    "a pair of 2^62": f"INSERT INTO pair VALUES ({2**62}, zeroblob(72), '', 0, 0, 0, 0)",
+    "a pair that is not there": OTHER_PAIR.format(99),
+    "a pair before the first": OTHER_PAIR.format(-1),
+    "a pair of 2^62": OTHER_PAIR.format(2**62),
     "no pairs": "DELETE FROM pair",
     "no units": "DELETE FROM unit",
     "no samples": "DELETE FROM sample",
