@@ -84,9 +84,7 @@ class Unit:
         if bool(self.long_side) == bool(self.area):
             raise ValueError("one of long_side and area must be given, and not both")
         if self.area and not AREA.fullmatch(self.area):
-            raise ValueError(
-                f'area must be height x width such as "540x720", at most {LONGEST} each, not {self.area!r}'
-            )
+            raise ValueError(f'area must be height x width such as "540x720", not {self.area!r}')
         if self.stretch and not self.area:
             raise ValueError("stretch needs an area, the height and width to stretch views to")
 

@@ -281,7 +281,11 @@ def test_matcher_settings_that_are_no_table_are_refused(text):
             SIFT.replace("}]", '}, { stage = 3, matcher = "sift", long_side = 640 }]'),
             r"unit 2: stage must be in \[1, 2\], not 3",
         ),
-        (units('{ stage = 1, matcher = "sift", long_side = -9 }'), r"unit 1: long_side must be in \[0, inf\)"),
+        (
+            units('{ stage = 1, matcher = "sift", area = "640x100000" }'),
+            "area must be height x width.*not '640x100000'",
+        ),
+        (units('{ stage = 1, matcher = "sift", long_side = -9 }'), r"unit 1: long_side must be in \[0, 99999\]"),
         (units('{ stage = 1, matcher = "sift", long_side = 0 }'), "one of long_side and area must be given"),
         (units('{ stage = 1, matcher = "sift" }'), "one of long_side and area must be given"),
         (units('{ stage = 1, matcher = "sift", long_side = 9, area = "9x9" }'), "and not both"),

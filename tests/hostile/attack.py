@@ -24,6 +24,7 @@ DONE = (0,)
 EITHER = (0, 1, 2)
 """A valid result, one that says what is missing of it, or a clear refusal."""
 CRASHES = ("Traceback (most recent call last)", "Fatal Python error", "Segmentation fault", "core dumped")
+TOO_LATE = "the time was up before a first version"
 MARK = "MKPC_HOSTILE_CASE"
 
 Make = Callable[[Path], None]

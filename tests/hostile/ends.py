@@ -16,7 +16,6 @@ NONE = {
         "nan",
         "inf",
         "''",
-        "8h45",
         "1d",
         "5x",
         "0x10",
@@ -26,7 +25,7 @@ NONE = {
         "\uff11s s",
         "1e400",
     ],
-    "--started-at": ["nan", "inf", "-inf", "-1", "1e400", "0", "abc", "99999999999", "1e-300", "''"],
+    "--started-at": ["nan", "inf", "-inf", "1e400", "abc", "99999999999", "''"],
     "--workers": ["-1", "abc", "''", "1.5", "99999999999999999999", "1e3", "ray://", "inf", "\u0663x"],
     "--device": ["foo", "cuda:99", "''", "cpu:0", "cuda:-1", "mps", "meta"],
     "--precision": ["foo", "''", "int8"],
@@ -43,9 +42,9 @@ NONE = {
         "D",
         "x" * 5000,
     ],
-    "--weights": ["foo", "''", "D/test.csv", "/dev/null"],
+    "--weights": ["foo", "D/test.csv", "/dev/null"],
 }
-ODD_LIMITS = ["1s", "0.001s", "3s", "99999999999h", "5m5m", "1e3", "+60", "' 60s '", "60S", "1e9"]
+ODD_LIMITS = ["1s", "0.001s", "3s", "99999999999h", "8h45", "5m5m", "1e3", "+60", "' 60s '", "60S", "1e9"]
 SOON = (0.05, 0.3, 1.0, 3.0, 6.0)
 ENDS = {"SIGINT": 130, "SIGTERM": 143}
 CRUEL = {"SIGKILL": -9, "SIGHUP": -1, "SIGQUIT": -3, "SIGUSR1": -10, "SIGXCPU": -24, "SIGSEGV": -11}
@@ -106,6 +105,7 @@ CASES = [
             "limits",
             f"{limit} with {workers} workers",
             f"{LONG} --workers {workers} --time-limit {limit}s",
+            statuses=(0, 1),
             seconds=limit,
         )
         for limit in (5, 15)

@@ -38,7 +38,7 @@ class RayCluster:
 
 def parse_workers(text: str) -> int | RayCluster:
     """What the user wrote; ``ValueError`` that lists the forms for anything else."""
-    if re.fullmatch(r"\d+", text):
+    if re.fullmatch(r"\d{1,3}", text):
         return int(text)
     if text == "ray":
         return RayCluster()
