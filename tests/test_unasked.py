@@ -1,5 +1,6 @@
 """Pairs that no row names: which they are, and what a run makes of them."""
 
+import time
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
@@ -11,7 +12,9 @@ from rectified import run
 from simulator import Scenario, simulate
 from synthetic import RECIPE, SyntheticMatcher, synthetic_pairs
 
+from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.engine import Ending
+from mkpc_kaggle.engine.scenes import pairs_to_add
 from mkpc_kaggle.reporting.run_log import read_log
 from mkpc_kaggle.scene.config import SceneConfig
 from mkpc_kaggle.scene.unasked import unasked_pairs
@@ -68,3 +71,16 @@ def test_they_take_a_small_share_of_the_time() -> None:
     told = next(one.text for one in ran.report.explanations if "for the scenes' sake" in one.text)
     assert 10 < int(told.split()[0]) < 60
     assert len(ran.report.records) == 400
+
+
+def test_a_batch_of_more_images_than_are_looked_at_together_gets_no_further_pairs() -> None:
+    chain = [Pair(str(n), "batch", f"{n}.png", f"{n + 1}.png") for n in range(6)]
+    assert pairs_to_add(chain, SceneConfig(most_images=7))
+    assert pairs_to_add(chain, SceneConfig(most_images=6)) == []
+
+
+def test_a_batch_of_a_hundred_thousand_images_is_passed_over_at_once() -> None:
+    pairs = [Pair(str(n), "batch", f"a{n}.png", f"b{n}.png") for n in range(50_000)]
+    start = time.process_time()
+    assert pairs_to_add(pairs, SceneConfig()) == []
+    assert time.process_time() - start < 5
