@@ -1,15 +1,17 @@
-"""MAGSAC on eight orders beside one order under a prior on focal lengths, on the same matches.
+"""F by MAGSAC, under a prior on focal lengths, and from the cameras of the batch, on the same matches.
 
-python -m benchmarks.estimation --train-dir DIR --matches DIR [--recipe classical] [--scenes A,B] [--every N]
+python -m benchmarks.estimation --train-dir DIR --matches DIR --ways sift light xfeat+sift
+    [--scenes NAME ...] [--shares 1 0.3 0.12] [--seeds 1] [--estimates NAME ...] [--every N]
 
-Matches of the recipe are found once and kept, a file for each pair; then every pair is estimated in all ways,
-alternating, in this process. For each way: mAA by scene and seconds a pair; for each but the first, its gain over
-the first with the 95 % interval of resampled pairs.
+MATCHES is what `benchmarks.ways` wrote; A+B are the matches of both. Pairs without a file there are left out. For
+each way and share of a scene's pairs, drawn by seed, a row for each estimate: mAA by scene and in the mean, its
+gain over the first estimate with the 95 % interval of resampled pairs, and seconds of this process, a pair or a
+batch.
 """
 
 import argparse
 import time
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,152 +20,177 @@ from statistics import mean
 import numpy as np
 from tqdm import tqdm
 
+from benchmarks import saved_matches
+from benchmarks.saved_matches import SavedMatches
 from mkpc_kaggle.data.competition import Scene, TruePair, read_train_side
-from mkpc_kaggle.data.images import Image, Unreadable, read_image
 from mkpc_kaggle.evaluation.compare import paired_difference
 from mkpc_kaggle.evaluation.validate import error_of
-from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.focal_prior import FocalConfig, FocalPrior, estimate_with_prior
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.metrics import PoseError, pair_accuracy
-from mkpc_kaggle.geometry.robust import Estimate, RobustConfig, estimate
-from mkpc_kaggle.pipeline.assembly import assemble
-from mkpc_kaggle.pipeline.pair import PairMatch
-from mkpc_kaggle.pipeline.stages import Pipeline
+from mkpc_kaggle.geometry.robust import Estimate, Matrix3, RobustConfig, estimate
+from mkpc_kaggle.scene.batch import Batch, BatchImage, BatchPair
+from mkpc_kaggle.scene.config import SceneConfig
+from mkpc_kaggle.scene.solve import solve
+
+MAGSAC = RobustConfig(orders=1)
+FOCAL = FocalConfig()
+
+
+def with_prior(found: SavedMatches) -> Estimate:
+    size0, size1 = found.sizes
+    priors = FocalPrior.of_image(size0, FOCAL), FocalPrior.of_image(size1, FOCAL)
+    return estimate_with_prior(found.matches, priors, MAGSAC, FOCAL)
+
+
+PAIR_ESTIMATES: dict[str, Callable[[SavedMatches], Estimate]] = {
+    "MAGSAC, 8 orders": lambda found: estimate(found.matches, RobustConfig(orders=8)),
+    "MAGSAC": lambda found: estimate(found.matches, MAGSAC),
+    "prior": with_prior,
+}
+SCENE = "scene"
+"""The F of the batch's cameras, or that of the prior where the pair keeps its own."""
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
-    """The matches of a pair, and the sizes of its images."""
+class Estimated:
+    """A pair with its matches, and by estimate its F (``None`` where it failed), its accuracy and seconds."""
 
-    matches: Matches
-    sizes: tuple[Size, Size]
-
-
-Way = Callable[[Found], Estimate]
-
-
-def plain(orders: int) -> Way:
-    return lambda found: estimate(found.matches, RobustConfig(orders=orders))
-
-
-def with_prior(orders: int, config: FocalConfig) -> Way:
-    def way(found: Found) -> Estimate:
-        size0, size1 = found.sizes
-        priors = FocalPrior.of_image(size0, config), FocalPrior.of_image(size1, config)
-        return estimate_with_prior(found.matches, priors, RobustConfig(orders=orders), config)
-
-    return way
-
-
-def ways_of(config: FocalConfig) -> dict[str, Way]:
-    """By name; the first is what the others are compared with."""
-    return {
-        "MAGSAC, 8 orders": plain(8),
-        "MAGSAC, 1 order": plain(1),
-        "1 order and prior": with_prior(1, config),
-    }
+    true: TruePair
+    found: SavedMatches
+    matrices: Mapping[str, Matrix3 | None]
+    accuracies: Mapping[str, float]
+    seconds: Mapping[str, float]
 
 
 @dataclass(frozen=True)
-class Outcome:
-    """What one way made of one pair."""
+class Score:
+    """What one estimate made of the chosen pairs of one scene: their accuracies, and seconds in all."""
 
-    accuracy: float
+    accuracies: tuple[float, ...]
     seconds: float
-    origin: str
 
 
-def matches_of(true: TruePair, pipeline: Pipeline, directory: Path, images: dict[Path, Image]) -> Found:
-    """From the file of the pair, or found now and kept there. Images that were read are put into ``images``."""
-    path = directory / true.pair.group / f"{true.pair.image0.stem}-{true.pair.image1.stem}.npz"
-    if not path.exists():
-        for image_path in true.pair.images:
-            if image_path not in images:
-                image = read_image(image_path)
-                if isinstance(image, Unreadable):
-                    raise SystemExit(str(image))
-                images[image_path] = image
-        pair = PairMatch(images=(images[true.pair.image0], images[true.pair.image1]))
-        (pair,) = pipeline.match([pair], pipeline.recipe.units)
-        order = {unit: number for number, unit in enumerate(pipeline.recipe.units)}
-        results = sorted(pair.results, key=lambda result: order[result.unit])
-        matches = Matches.concatenate(result.matches for result in results)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        part = path.with_suffix(".part")
-        with part.open("wb") as stream:
-            np.savez(
-                stream,
-                points0=matches.points0,
-                points1=matches.points1,
-                scores=matches.scores,
-                size0=pair.images[0].size,
-                size1=pair.images[1].size,
-            )
-        part.replace(path)
-    with np.load(path) as kept:
-        size0, size1 = (Size(*map(int, kept[name])) for name in ("size0", "size1"))
-        return Found(Matches(kept["points0"], kept["points1"], kept["scores"]), (size0, size1))
+def read(folder: Path, ways: Sequence[str], true: TruePair) -> SavedMatches | None:
+    """The matches of all these ways together; ``None`` if a file is not there."""
+    files = [saved_matches.file_of(folder / way, true) for way in ways]
+    if not all(file.exists() for file in files):
+        return None
+    found = [saved_matches.read(file) for file in files]
+    return SavedMatches(Matches.concatenate(one.matches for one in found), found[0].sizes)
 
 
-def try_all(
-    found: Found, true: TruePair, scene: Scene, ways: Mapping[str, Way], number: int
-) -> dict[str, Outcome]:
-    """All ways on one pair; which comes first changes with the ``number`` of the pair."""
-    names = list(ways)
-    outcomes = {}
-    for name in names[number % len(names) :] + names[: number % len(names)]:
-        start = time.perf_counter()
-        result = ways[name](found)
-        seconds = time.perf_counter() - start
-        error = error_of(result.matrix, true, scene) if result.ok else PoseError.failed()
-        outcomes[name] = Outcome(pair_accuracy(error), seconds, str(result.origin) if result.ok else "failed")
-    return {name: outcomes[name] for name in names}
+def accuracy(F: Matrix3 | None, true: TruePair, scene: Scene) -> float:
+    return pair_accuracy(PoseError.failed() if F is None else error_of(F, true, scene))
 
 
-def table(done: Mapping[str, Sequence[Mapping[str, Outcome]]], ways: Sequence[str]) -> list[str]:
-    """Markdown: a row a way."""
-    counts = [f"{scene} ({len(pairs)})" for scene, pairs in done.items()]
-    lines = [f"| way | {' | '.join(counts)} | mean over scenes | seconds a pair | of the first's |"]
-    lines.append("|" + " --- |" * (len(done) + 4))
-    every = [pair for pairs in done.values() for pair in pairs]
-    first = ways[0]
-    for way in ways:
-        scores = {scene: [pair[way].accuracy for pair in pairs] for scene, pairs in done.items()}
-        means = [mean(values) for values in scores.values()]
-        seconds = mean(pair[way].seconds for pair in every)
-        share = seconds / mean(pair[first].seconds for pair in every)
-        cells = [f"{value:.3f}" for value in (*means, mean(means))]
-        lines.append(f"| {way} | {' | '.join(cells)} | {seconds:.3f} | {share:.2f} |")
-        if way != first:
-            values = [([pair[first].accuracy for pair in done[scene]], scores[scene]) for scene in done]
-            gains = [str(paired_difference([value])) for value in values]
-            lines.append(f"| its gain | {' | '.join(gains)} | {paired_difference(values)} | | |")
-    lines.append("")
-    for way in ways:
-        lines.append(f"{way}: {dict(Counter(pair[way].origin for pair in every))}")
+def estimated(true: TruePair, found: SavedMatches, scene: Scene, names: Sequence[str]) -> Estimated:
+    """A pair by every estimate of pairs that is wanted; the prior's is what a scene is compared with."""
+    matrices: dict[str, Matrix3 | None] = {}
+    seconds = {}
+    for name in names:
+        start = time.process_time()
+        result = PAIR_ESTIMATES[name](found)
+        seconds[name] = time.process_time() - start
+        matrices[name] = result.matrix if result.ok else None
+    accuracies = {name: accuracy(F, true, scene) for name, F in matrices.items()}
+    return Estimated(true, found, matrices, accuracies, seconds)
+
+
+def by_scene(pairs: Sequence[Estimated], scene: Scene) -> Score:
+    """The accuracy of the pairs as one batch."""
+    images = {
+        path.stem: BatchImage(path.stem, path.stem, size)
+        for pair in pairs
+        for path, size in zip(pair.true.pair.images, pair.found.sizes, strict=True)
+    }
+    asked = [
+        BatchPair(
+            pair.true.pair.image0.stem, pair.true.pair.image1.stem, pair.found.matches, pair.matrices["prior"]
+        )
+        for pair in pairs
+    ]
+    start = time.process_time()
+    choices = solve(Batch(tuple(images.values()), tuple(asked)), SceneConfig()).choices
+    seconds = time.process_time() - start
+    matrices = [
+        pair.matrices["prior"] if choice.F is None else choice.F
+        for pair, choice in zip(pairs, choices, strict=True)
+    ]
+    return Score(tuple(accuracy(F, pair.true, scene) for F, pair in zip(matrices, pairs, strict=True)), seconds)
+
+
+def drawn(pairs: Sequence[Estimated], share: float, seed: int) -> list[Estimated]:
+    """That share of the pairs, in their order."""
+    count = round(share * len(pairs))
+    places = np.sort(np.random.default_rng(seed).choice(len(pairs), count, replace=False))
+    return [pairs[place] for place in places]
+
+
+def scores(pairs: Sequence[Estimated], scene: Scene, names: Sequence[str]) -> dict[str, Score]:
+    """By estimate."""
+    return {
+        name: by_scene(pairs, scene)
+        if name == SCENE
+        else Score(tuple(pair.accuracies[name] for pair in pairs), sum(pair.seconds[name] for pair in pairs))
+        for name in names
+    }
+
+
+def table(title: str, done: Mapping[str, Sequence[Mapping[str, Score]]], names: Sequence[str]) -> list[str]:
+    """Markdown; ``done``: by scene, for each seed the scores by estimate, whose pairs count together."""
+    joined = {
+        name: {scene: [value for one in seeds for value in one[name].accuracies] for scene, seeds in done.items()}
+        for name in names
+    }
+    counts = [f"{scene} ({len(values)})" for scene, values in joined[names[0]].items()]
+    lines = [f"| {title} | {' | '.join(counts)} | mean | gain over the first | seconds |"]
+    lines.append("|" + " --- |" * (len(counts) + 4))
+    for name in names:
+        means = [mean(values) for values in joined[name].values()]
+        cells = " | ".join(f"{value:.3f}" for value in (*means, mean(means)))
+        spent = [one[name] for seeds in done.values() for one in seeds]
+        runs = len(spent) if name == SCENE else sum(len(one.accuracies) for one in spent)
+        seconds = sum(one.seconds for one in spent) / runs
+        gain = str(paired_difference(list(zip(joined[names[0]].values(), joined[name].values(), strict=True))))
+        lines.append(f"| {name} | {cells} | {'' if name == names[0] else gain} | {seconds:.2f} |")
+        if name != names[0]:
+            gains = [str(paired_difference([(joined[names[0]][scene], joined[name][scene])])) for scene in done]
+            lines.append(f"| its gain | {' | '.join(gains)} | | | |")
     return lines
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--train-dir", type=Path, required=True)
-    parser.add_argument("--matches", type=Path, required=True, help="where they are kept; made if it is not there")
-    parser.add_argument("--recipe", default="classical")
-    parser.add_argument("--weights", type=Path, action="append", default=[])
-    parser.add_argument("--scenes", default="", help="default: all")
-    parser.add_argument("--every", type=int, default=1, help="of each scene's pairs; default: all of them")
+    parser.add_argument("--matches", type=Path, required=True)
+    parser.add_argument("--ways", nargs="+", required=True)
+    parser.add_argument("--scenes", nargs="*", default=())
+    parser.add_argument("--shares", nargs="+", type=float, default=[1.0])
+    parser.add_argument("--seeds", type=int, default=1, help="samples of each share below 1")
+    parser.add_argument("--every", type=int, default=1, help="of a scene's pairs; default: all of them")
+    names = [*PAIR_ESTIMATES, SCENE]
+    parser.add_argument("--estimates", nargs="+", choices=names, default=names)
     arguments = parser.parse_args()
-    pipeline = assemble(arguments.recipe, weights=arguments.weights).pipeline()
-    ways = ways_of(pipeline.recipe.focal or FocalConfig())
-    done: dict[str, list[dict[str, Outcome]]] = {}
-    for scene in read_train_side(arguments.train_dir, scenes=filter(None, arguments.scenes.split(","))):
-        images: dict[Path, Image] = {}
-        done[scene.name] = []
-        for number, true in enumerate(tqdm(scene.pairs[:: arguments.every], desc=scene.name, smoothing=0.05)):
-            found = matches_of(true, pipeline, arguments.matches, images)
-            done[scene.name].append(try_all(found, true, scene, ways, number))
-    print("\n".join(table(done, list(ways))))
+    for way in arguments.ways:
+        done: dict[float, dict[str, list[dict[str, Score]]]] = defaultdict(lambda: defaultdict(list))
+        wanted = [name for name in PAIR_ESTIMATES if name in arguments.estimates or name == "prior"]
+        for scene in read_train_side(arguments.train_dir, scenes=arguments.scenes):
+            pairs = [
+                estimated(true, found, scene, wanted)
+                for true in tqdm(scene.pairs[:: arguments.every], desc=f"{way}, {scene.name}", smoothing=0.05)
+                if (found := read(arguments.matches, way.split("+"), true)) is not None
+            ]
+            for share in arguments.shares:
+                for seed in range(arguments.seeds if share < 1 else 1):
+                    if chosen := drawn(pairs, share, seed):
+                        done[share][scene.name].append(scores(chosen, scene, arguments.estimates))
+        for share, by_name in done.items():
+            print(
+                "\n".join(table(f"{way}, {share:.0%} of the pairs", by_name, arguments.estimates)),
+                "\n",
+                flush=True,
+            )
 
 
 if __name__ == "__main__":

@@ -1,10 +1,10 @@
 """The score of scenes under different settings, on the same matches.
 
-python -m benchmarks.scene_settings --train-dir DIR --matches DIR [--recipe classical] [--weights DIR]
-    [--scenes NAME ...] [--shares 1 0.3 0.12] [--settings default incremental ...]
+python -m benchmarks.scene_settings --train-dir DIR --matches DIR [--scenes NAME ...] [--shares 1 0.3 0.12]
+    [--settings default incremental ...]
 
-All pairs with a covisibility of at least 0.1 are matched once, into the directory of `--matches`, which a second
-run reads. A share below 1 takes that many of a scene's pairs by a fixed seed. `own` is the mAA of one MAGSAC a
+The matches of all pairs with a covisibility of at least 0.1 are those of one way of `benchmarks.ways`: DIR is its
+directory. A share below 1 takes that many of a scene's pairs by a fixed seed. `own` is the mAA of one MAGSAC a
 pair, `scene` that of the cameras alone, where a pair without two of them counts as failed, `chosen` that of the F
 which the pair gets in the end.
 """
@@ -16,15 +16,11 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks import saved_matches
+from benchmarks.saved_matches import SavedMatches
 from mkpc_kaggle.data.competition import Scene, TruePair, read_train_side
-from mkpc_kaggle.data.images import Image, Unreadable, read_image
-from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.metrics import PoseError, mean_average_accuracy, pose_error
 from mkpc_kaggle.geometry.robust import Matrix3, RobustConfig, estimate
-from mkpc_kaggle.pipeline.assembly import assemble
-from mkpc_kaggle.pipeline.pair import PairMatch
-from mkpc_kaggle.pipeline.stages import Pipeline
 from mkpc_kaggle.scene.batch import Batch, BatchImage, BatchPair
 from mkpc_kaggle.scene.config import CameraModel, Mapper, SceneConfig
 from mkpc_kaggle.scene.solve import solve
@@ -44,27 +40,14 @@ SETTINGS = {
 ONE_MAGSAC = RobustConfig(orders=1)
 
 
-def matched(true: TruePair, pipeline: Pipeline, folder: Path) -> BatchPair:
-    """A pair with its matches, from the folder or made now, and the F of one MAGSAC."""
-    names = [path.stem for path in true.pair.images]
-    file = folder / f"{names[0]}-{names[1]}.npz"
-    if not file.exists():
-        pair = PairMatch(images=(readable(true.pair.image0), readable(true.pair.image1)))
-        (pair,) = pipeline.match([pair], pipeline.recipe.units)
-        found = pair.matches
-        folder.mkdir(parents=True, exist_ok=True)
-        np.savez(file, points0=found.points0, points1=found.points1, scores=found.scores)
-    with np.load(file) as kept:
-        matches = Matches(kept["points0"], kept["points1"], kept["scores"])
-    own = estimate(matches, ONE_MAGSAC)
-    return BatchPair(names[0], names[1], matches, own.matrix if own.ok else None)
+def matched(true: TruePair, found: SavedMatches) -> BatchPair:
+    """A pair with its matches, and the F of one MAGSAC."""
+    own = estimate(found.matches, ONE_MAGSAC)
+    return BatchPair(*names_of(true), found.matches, own.matrix if own.ok else None)
 
 
-def readable(path: Path) -> Image:
-    image = read_image(path)
-    if isinstance(image, Unreadable):
-        raise UserError(str(image))
-    return image
+def names_of(true: TruePair) -> tuple[str, str]:
+    return true.pair.image0.stem, true.pair.image1.stem
 
 
 def score(scene: Scene, chosen: list[TruePair], matrices: list[Matrix3 | None]) -> float:
@@ -101,21 +84,19 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--train-dir", type=Path, required=True)
     parser.add_argument("--matches", type=Path, required=True)
-    parser.add_argument("--recipe", default="classical")
-    parser.add_argument("--weights", type=Path, action="append", default=[])
     parser.add_argument("--scenes", nargs="*", default=())
     parser.add_argument("--shares", nargs="+", type=float, default=[1.0])
     parser.add_argument("--settings", nargs="+", choices=list(SETTINGS), default=list(SETTINGS))
     arguments = parser.parse_args()
-    pipeline = assemble(arguments.recipe, weights=arguments.weights).pipeline()
     print(
         f"{'scene':16}{'pairs':>6}  {'settings':14}{'own':>8}{'scene':>8}{'chosen':>8}{'placed':>10}{'cpu s':>8}"
     )
     for scene in read_train_side(arguments.train_dir, scenes=arguments.scenes):
-        folder = arguments.matches / scene.name
-        pairs = {true.pair.id: matched(true, pipeline, folder) for true in scene.pairs}
-        paths = {path.stem: path for true in scene.pairs for path in true.pair.images}
-        images = {name: BatchImage(name, name, readable(path).size) for name, path in paths.items()}
+        found = [saved_matches.read(saved_matches.file_of(arguments.matches, true)) for true in scene.pairs]
+        known = list(zip(scene.pairs, found, strict=True))
+        pairs = {true.pair.id: matched(true, one) for true, one in known}
+        sizes = {name: size for true, one in known for name, size in zip(names_of(true), one.sizes, strict=True)}
+        images = {name: BatchImage(name, name, size) for name, size in sizes.items()}
         for share in arguments.shares:
             for name in arguments.settings:
                 print(row(name, scene, share, pairs, images), flush=True)

@@ -126,6 +126,12 @@ def test_two_images_are_no_scene(scene: SyntheticScene) -> None:
     assert solution.choices[0].reason is Reason.UNPLACED
 
 
+def test_a_scene_of_too_few_pairs_is_none(scene: SyntheticScene) -> None:
+    two = tuple(pair for pair in scene.batch.pairs if pair.image0 == scene.batch.pairs[0].image0)[:2]
+    (one,) = solve(Batch(scene.batch.images, two), SceneConfig()).scenes
+    assert one.failure == "2 pairs connect 3 images; a scene needs 1.35 an image"
+
+
 def test_a_batch_without_matches_has_no_scene() -> None:
     assert solve(batch_of(0), SceneConfig()).scenes == ()
     solution = solve(batch_of(3, BatchPair("0", "1", Matches.empty())), SceneConfig())

@@ -89,3 +89,33 @@ def test_a_fit_never_costs_more_and_leaves_known_focal_lengths_alone(sigmas):
     assert problem.cost(found, 50.0) < problem.cost(start, 50.0)
     assert_allclose(found.logs[np.array(sigmas) == 0], 0, atol=0)
     assert problem.direction_error(found, 50.0) > 0
+
+
+def rays_of(points, view):
+    """Rays (N, 3) of points (N, 3) in camera 0's world, for both images of a view with focal lengths of 1000."""
+    both = points, points @ view.R.T + view.t
+    return tuple(
+        np.column_stack([1000 * np.exp(log) * x[:, :2] / x[:, 2:], np.full(len(x), 1000.0)])
+        for x, log in zip(both, view.logs, strict=True)
+    )
+
+
+def test_points_are_in_front_of_both_cameras_behind_both_or_between():
+    turn = np.array([[0.98, 0, 0.199], [0, 1, 0], [-0.199, 0, 0.98]])
+    view = TwoView(
+        np.linalg.qr(turn)[0] * np.sign(np.diag(np.linalg.qr(turn)[1])), unit([1, 0.1, 1]), np.array([0.2, -0.3])
+    )
+    points = np.random.default_rng(0).uniform((-1, -1, 3), (1, 1, 6), (50, 3))
+    assert_allclose(sampson(view.fundamental, *rays_of(points, view)), 0, atol=1e-6)
+    assert (view.depth_signs(*rays_of(points, view), 1.0) == 1).all()
+    assert (view.depth_signs(*rays_of(points * -1 - 2 * view.R.T @ view.t, view), 1.0) == -1).all()
+    between = np.array([[0.01, 0.02, -0.3]])  # behind camera 0, in front of camera 1
+    assert (view.depth_signs(*rays_of(between, view), 1.0) == 0).all()
+    assert_allclose(view.twisted.fundamental, -view.fundamental, atol=1e-12)
+    assert not (view.twisted.depth_signs(*rays_of(points, view), 1.0) > 0).any()
+
+
+def test_points_at_infinity_are_on_neither_side():
+    view = random_view(4)
+    far = np.random.default_rng(0).uniform((-1, -1, 3), (1, 1, 6), (20, 3)) * 1e7
+    assert np.isnan(view.depth_signs(*rays_of(far, view), 1.0)).all()

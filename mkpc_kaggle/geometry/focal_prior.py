@@ -10,15 +10,20 @@ r being the Sampson distance in pixels (:mod:`mkpc_kaggle.geometry.two_view`), g
 expected, and rho the loss of Geman and McClure (1985): an outlier costs a half, as much as a focal length one
 sigma off. Where the matches determine the focal lengths they decide, elsewhere the prior does.
 
-The search is local, so it has several starts: the F of MAGSAC, and the E of MAGSAC at the expected focal lengths.
-The two rotations that an E stands for are not two starts: both give one F and the same derivatives of it.
+A match whose point would lie behind a camera is an outlier, too.
+
+The search is local, so it has several starts: the F of MAGSAC, and E by MAGSAC at several focal lengths, each
+on another part of the matches. What a short search on few matches makes of each is compared, and the best are
+refined. The two rotations that an E stands for are not two starts: both give one F and the same derivatives of it.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from statistics import NormalDist
 
 import numpy as np
 
-from mkpc_kaggle.config import AT_LEAST_0, AT_LEAST_1, POSITIVE, check_ranges
+from mkpc_kaggle.config import AT_LEAST_0, AT_LEAST_1, POSITIVE, SHARE, check_ranges
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import (
@@ -30,12 +35,14 @@ from mkpc_kaggle.geometry.robust import (
     RobustConfig,
     consensus,
     nth_order,
-    robust_cost,
+    robust_costs,
 )
 from mkpc_kaggle.geometry.two_view import Problem, TwoView, Vectors, sampson
 
-ANNEALING = (4.0, 2.0, 1.0)
+ROUGHLY, FINELY = (4.0,), (2.0, 1.0)
 """Times the scale, one after the other: a wide loss has fewer local minima."""
+LEAST_PART = 50
+"""Matches, if there are as many, that E is sought on."""
 FOCAL_GRID = (-0.7, -0.35, 0.0, 0.35, 0.7)
 """log f / g: the focal lengths that MAGSAC's F is read with; the search starts from the best."""
 UNCERTAIN_DIRECTION = 0.5
@@ -49,30 +56,38 @@ class FocalConfig:
     """Settings of :func:`estimate_with_prior`, table ``[focal]`` of a recipe; without the table MAGSAC is alone.
 
     An unknown focal length is ``ratio`` times the image's long side, and its logarithm has the standard deviation
-    ``sigma``; ``scale``, in pixels, is that of the loss. E at these focal lengths is sought within
-    ``essential_threshold`` pixels and ``essential_iterations``, on ``essential_orders`` of the matches; F as
-    :class:`RobustConfig` says. The search uses ``most_matches``, evenly spread, and its result is scored on
-    all. MAGSAC's own F is kept where it costs less by ``free_cost``: no plausible focal lengths explain the
-    matches, so the principal points may be elsewhere.
+    ``sigma``; ``scale``, in pixels, is that of the loss. F is sought as :class:`RobustConfig` says, and E
+    ``essential_starts`` times, at focal lengths spread evenly over the prior's distribution, each time on
+    another ``essential_share`` of the matches, within ``essential_threshold`` pixels and
+    ``essential_iterations``. From each a search on ``rough_matches`` begins; the best ``refined`` results are
+    refined on ``most_matches``, evenly spread, and scored on all. MAGSAC's own F is kept where it costs less
+    by ``free_cost``: no plausible focal lengths explain the matches, so the principal points may be elsewhere.
     """
 
     ratio: float = 1.1
     sigma: float = 0.4
     scale: float = 0.35
-    essential_threshold: float = 1.0
-    essential_iterations: int = 5000
-    essential_orders: int = 2
-    most_matches: int = 1500
+    essential_threshold: float = 0.4
+    essential_iterations: int = 300
+    essential_starts: int = 5
+    essential_share: float = 0.25
+    rough_matches: int = 300
+    refined: int = 2
+    most_matches: int = 1000
     free_cost: float = 10.0
 
     def __post_init__(self) -> None:
         check_ranges(self, ratio=POSITIVE, sigma=POSITIVE, scale=POSITIVE, essential_threshold=POSITIVE)
-        check_ranges(self, essential_iterations=AT_LEAST_1, essential_orders=AT_LEAST_1)
-        check_ranges(self, most_matches=AT_LEAST_1, free_cost=AT_LEAST_0)
+        check_ranges(self, essential_iterations=AT_LEAST_1, essential_starts=AT_LEAST_1, essential_share=SHARE)
+        check_ranges(
+            self, rough_matches=AT_LEAST_1, refined=AT_LEAST_1, most_matches=AT_LEAST_1, free_cost=AT_LEAST_0
+        )
 
     def essential(self, magsac: RobustConfig) -> RobustConfig:
         """How E is sought where F is sought in that way."""
-        return replace(magsac, threshold=self.essential_threshold, max_iterations=self.essential_iterations)
+        return replace(
+            magsac, orders=1, threshold=self.essential_threshold, max_iterations=self.essential_iterations
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,6 +127,10 @@ class FocalPrior:
     def to_ray(self) -> Matrix3:
         """Homogeneous pixels -> rays (u, v, g)."""
         return np.asarray(self.focal * np.linalg.inv(self.K))
+
+    def scaled(self, factor: float) -> Matrix3:
+        """The camera matrix of a focal length that is ``factor`` times as long."""
+        return np.asarray(self.K * np.array([[factor, factor, 1], [1, factor, 1], [1, 1, 1]]))
 
     def rays(self, points: Vectors) -> Vectors:
         """(N, 2) pixels -> (N, 3)."""
@@ -171,39 +190,76 @@ class _Search:
     def __init__(self, distinct: DistinctMatches, priors: Priors, config: FocalConfig) -> None:
         self._distinct, self._priors, self._config = distinct, priors, config
         self.rays = priors[0].rays(distinct.points0), priors[1].rays(distinct.points1)
-        sigmas, count = np.array([prior.sigma for prior in priors]), len(self.rays[0])
-        few = np.linspace(0, count - 1, min(count, config.most_matches)).astype(int)
-        self._all = Problem(*self.rays, sigmas)
-        self._sample = Problem(self.rays[0][few], self.rays[1][few], sigmas, count / max(len(few), 1))
+        self._sigmas = np.array([prior.sigma for prior in priors])
+        self._all = Problem(*self.rays, self._sigmas)
+        self._many, self._few = (self._sample(most) for most in (config.most_matches, config.rough_matches))
+
+    def _sample(self, most: int) -> Problem:
+        """At most as many matches, evenly spread, in place of all."""
+        count = len(self.rays[0])
+        few = np.linspace(0, count - 1, min(count, most)).astype(int)
+        return Problem(self.rays[0][few], self.rays[1][few], self._sigmas, count / max(len(few), 1))
 
     def candidates(self, magsac: RobustConfig, model: Model) -> list[_Candidate | str]:
-        """MAGSAC's F as it is and refined, its E refined; a reason in place of one that failed."""
+        """MAGSAC's F as it is, and the best of what F and E became; a reason in place of a start that failed."""
         found: list[_Candidate | str] = []
+        starts: list[tuple[Origin, TwoView]] = []
         for number in range(magsac.orders):
-            plain = self._consensus(number, magsac, Model.F)
-            if plain.ok:
-                F = self._for_rays(plain.matrix)
-                found.append(self._refined(Origin.FROM_F, self._decomposed(F)))
-                if model is Model.F:
-                    cost = robust_cost(sampson(F, *self.rays), self._config.scale)
-                    found.append(_Candidate(Origin.MAGSAC, F, cost + self._config.free_cost))
-            else:
+            plain = self._plain(number, magsac)
+            if not plain.ok:
                 found.append(plain.failure)
-        for number in range(self._config.essential_orders):
-            calibrated = self._consensus(number, self._config.essential(magsac), Model.E)
-            if calibrated.ok:
-                found.append(self._refined(Origin.FROM_E, TwoView.nearest(calibrated.matrix)))
+                continue
+            F = self._for_rays(plain.matrix)
+            starts.append((Origin.FROM_F, self._decomposed(F)))
+            if model is Model.F:
+                cost = self._cost(F, starts[-1][1]) + self._config.free_cost
+                found.append(_Candidate(Origin.MAGSAC, F, cost))
+        for number in range(self._config.essential_starts):
+            start = self._essential(number, magsac)
+            if isinstance(start, str):
+                found.append(start)
             else:
-                found.append(calibrated.failure)
+                starts.append((Origin.FROM_E, start))
+        rough = [(origin, self._searched(self._few, start, ROUGHLY)) for origin, start in starts]
+        rough.sort(key=lambda one: self._many.cost(one[1], self._config.scale))
+        for origin, view in rough[: self._config.refined]:
+            best = self._searched(self._many, view, FINELY)
+            cost = self._cost(best.fundamental, best) + self._all.prior_cost(best)
+            found.append(_Candidate(origin, best.fundamental, cost, best))
         return found
 
-    def _consensus(self, number: int, magsac: RobustConfig, model: Model) -> Estimate:
-        """MAGSAC on one order of the matches."""
+    def _searched(self, problem: Problem, view: TwoView, factors: Sequence[float]) -> TwoView:
+        """The local minimum near a view, with a loss that narrows."""
+        for factor in factors:
+            view = problem.fit(view, factor * self._config.scale)
+        return view
+
+    def _cost(self, F: Matrix3, view: TwoView) -> float:
+        """What an F for rays costs by all matches; those behind a camera of ``view`` are outliers."""
+        distances = sampson(F, *self.rays)
+        saved = 0.5 - robust_costs(distances, self._config.scale)
+        error = 3 * self._config.scale
+        signs = (one.depth_signs(*self.rays, error) for one in (view, view.twisted))
+        behind = min(saved[one * sign <= 0].sum() for one in signs for sign in (1, -1))
+        return float((0.5 - saved).sum() + behind)
+
+    def _plain(self, number: int, magsac: RobustConfig) -> Estimate:
+        """MAGSAC's F on one order of the matches."""
         order = nth_order(number, len(self.rays[0]))
-        points0, points1 = self._distinct.points0[order], self._distinct.points1[order]
         return consensus(
-            points0, points1, replace(magsac, orders=1), model, (self._priors[0].K, self._priors[1].K)
+            self._distinct.points0[order], self._distinct.points1[order], replace(magsac, orders=1), Model.F
         )
+
+    def _essential(self, number: int, magsac: RobustConfig) -> TwoView | str:
+        """E of a part of the matches, at focal lengths at a quantile of the prior; or why there is none."""
+        count = len(self.rays[0])
+        part = nth_order(number + 1, count)[: max(LEAST_PART, round(self._config.essential_share * count))]
+        quantile = NormalDist().inv_cdf((number + 0.5) / self._config.essential_starts)
+        logs = quantile * self._sigmas
+        K0, K1 = (prior.scaled(float(np.exp(log))) for prior, log in zip(self._priors, logs, strict=True))
+        points0, points1 = self._distinct.points0[part], self._distinct.points1[part]
+        found = consensus(points0, points1, self._config.essential(magsac), Model.E, (K0, K1))
+        return replace(TwoView.nearest(found.matrix), logs=logs) if found.ok else found.failure
 
     def remarks(self, best: _Candidate) -> list[str]:
         """Warnings about the winner."""
@@ -234,18 +290,8 @@ class _Search:
         F = np.linalg.inv(self._priors[1].to_ray).T @ F @ np.linalg.inv(self._priors[0].to_ray)
         return F / np.linalg.norm(F)
 
-    def _refined(self, origin: Origin, start: TwoView) -> _Candidate:
-        """The local minimum from there, or the start itself if that costs less."""
-        view = start
-        for factor in ANNEALING:
-            view = self._sample.fit(view, factor * self._config.scale)
-        cost, view = min(
-            ((self._all.cost(one, self._config.scale), one) for one in (view, start)), key=lambda pair: pair[0]
-        )
-        return _Candidate(origin, view.fundamental, cost, view)
-
     def _decomposed(self, F: Matrix3) -> TwoView:
         """An F for rays as two views, with the focal lengths of a grid that fit the matches best."""
         grid0, grid1 = (FOCAL_GRID if prior.sigma else (0.0,) for prior in self._priors)
         views = [TwoView.nearest(F, log0, log1) for log0 in grid0 for log1 in grid1]
-        return min(views, key=lambda view: self._sample.cost(view, ANNEALING[0] * self._config.scale))
+        return min(views, key=lambda view: self._few.cost(view, ROUGHLY[0] * self._config.scale))

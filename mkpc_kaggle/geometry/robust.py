@@ -216,9 +216,13 @@ def sampson_distances(F: Matrix3, matches: Matches) -> NDArray[np.float64]:
 
 
 def robust_cost(distances: NDArray[np.float64], scale: float) -> float:
-    """The sum of x^2 / (2 (1 + x^2)), x = distance / scale: Geman and McClure, 1985. An outlier costs a half."""
-    squares = np.square(distances / scale)
-    return float(0.5 * np.sum(1 - 1 / (1 + squares)))
+    """The sum of :func:`robust_costs`."""
+    return float(np.sum(robust_costs(distances, scale)))
+
+
+def robust_costs(distances: NDArray[np.float64], scale: float) -> NDArray[np.float64]:
+    """x^2 / (2 (1 + x^2)), x = distance / scale: Geman and McClure, 1985. An outlier costs a half."""
+    return np.asarray(0.5 - 0.5 / (1 + np.square(distances / scale)))
 
 
 def _distances(

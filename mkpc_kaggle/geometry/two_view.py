@@ -56,6 +56,24 @@ class TwoView:
     def fundamental(self) -> Matrix3:
         return self._with_focals(_cross(self.t) @ self.R)
 
+    @property
+    def twisted(self) -> "TwoView":
+        """The other rotation that stands for the same F."""
+        return TwoView((2 * np.outer(self.t, self.t) - np.eye(3)) @ self.R, self.t, self.logs)
+
+    def depth_signs(self, rays0: Vectors, rays1: Vectors, error: float) -> NDArray[np.float64]:
+        """(N,) 1 for a match whose point is in front of both cameras, -1 behind both, 0 in front of one alone.
+
+        The point is where X_1 = R X_0 + t holds best. With -t every sign is the other. NaN for a match whose rays
+        are parallel but for an ``error`` in pixels: its point may be at infinity.
+        """
+        ratio0, ratio1 = np.exp(self.logs)
+        a, b = (rays0 * (1, 1, ratio0)) @ self.R.T, rays1 * (1, 1, ratio1)
+        aa, bb, ab, at, bt = _row_dots(a, a), _row_dots(b, b), _row_dots(a, b), a @ self.t, b @ self.t
+        signs = (np.sign(ab * bt - bb * at) + np.sign(aa * bt - ab * at)) / 2
+        apart = np.sqrt(np.maximum(aa * bb - ab**2, 0) / aa) > error  # in pixels, as b is
+        return np.where(apart, signs, np.nan)
+
     def tangent(self) -> NDArray[np.float64]:
         """(9, 7): F's elements by a turn of R (3), a shift of t on the sphere (2) and the logs (2)."""
         F, cross = self.fundamental, _cross(self.t)
@@ -93,9 +111,13 @@ class Problem:
     weight: float = 1.0
 
     def cost(self, view: TwoView, scale: float) -> float:
-        """The robust cost of the Sampson distances and half the squares of the logs over their deviations."""
+        """The robust cost of the Sampson distances and :meth:`prior_cost`."""
         distances = sampson(view.fundamental, self.rays0, self.rays1)
-        return self.weight * robust_cost(distances, scale) + 0.5 * float(self._precisions @ view.logs**2)
+        return self.weight * robust_cost(distances, scale) + self.prior_cost(view)
+
+    def prior_cost(self, view: TwoView) -> float:
+        """Half the squares of the logs over their deviations."""
+        return 0.5 * float(self._precisions @ view.logs**2)
 
     def fit(self, start: TwoView, scale: float) -> TwoView:
         """A local minimum of :meth:`cost` near ``start``, by Levenberg-Marquardt on the reweighted squares."""

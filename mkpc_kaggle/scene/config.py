@@ -44,7 +44,7 @@ class SceneConfig:
     least_inliers: int = 15
     prior_focal: float = 1.1
     least_images: int = 3
-    least_pairs_per_image: float = 1.5
+    least_pairs_per_image: float = 1.35
     pairs_per_image: float = 5.0
     most_images: int = 500
     lowest_focal: float = 0.3
