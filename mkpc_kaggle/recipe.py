@@ -20,6 +20,7 @@ from mkpc_kaggle.geometry.robust import RobustConfig
 from mkpc_kaggle.scene.config import SceneConfig
 
 DIRECTORY = Path(__file__).resolve().parent / "recipes"
+LARGEST_FILE = 1 << 24
 LONGEST = 99_999
 """Pixels a side."""
 AREA = re.compile(r"[1-9]\d{0,4}x[1-9]\d{0,4}", re.ASCII)
@@ -262,8 +263,10 @@ def load_recipe(name: str) -> Recipe:
             f"unknown recipe {name!r}; known: {', '.join(recipe_names())}, or a path that ends in .toml"
         )
     try:
-        if path.exists() and not path.is_file():
-            raise UserError(f"recipe file {path} cannot be read: not a regular file")
+        if path.exists() and (not path.is_file() or path.stat().st_size > LARGEST_FILE):
+            raise UserError(
+                f"recipe file {path} cannot be read: not a regular file of at most {LARGEST_FILE} bytes"
+            )
         return parse_recipe(path.read_text(encoding="utf-8-sig"), path.stem)
     except OSError as error:
         raise UserError(f"recipe file {path} cannot be read: {error.strerror}") from error

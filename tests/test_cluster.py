@@ -19,7 +19,9 @@ def test_forms_of_workers(text: str, meant: int | RayCluster) -> None:
     assert parse_workers(text) == meant
 
 
-@pytest.mark.parametrize("text", ["-1", "two", "ray:", "ray://", "ray://host", "ray://host:port", "ssh://host:1"])
+@pytest.mark.parametrize(
+    "text", ["-1", "1000", "two", "ray:", "ray://", "ray://host", "ray://host:port", "ssh://host:1"]
+)
 def test_other_forms_are_refused_with_those_that_there_are(text: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         main(["submit", "--test-dir", ".", f"--workers={text}"])

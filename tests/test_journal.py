@@ -1,6 +1,7 @@
 import os
 import re
 import sqlite3
+import zlib
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -197,6 +198,8 @@ DAMAGES = [
     "UPDATE unit SET unit = 'another' WHERE place = 0",
     "UPDATE unit SET points = x'00'",
     "UPDATE unit SET points = zeroblob(1000)",
+    f"UPDATE unit SET points = x'{zlib.compress(bytes(100_000_000)).hex()}'",
+    "UPDATE unit SET encode_seconds = 9e999",
     "UPDATE region SET reason = 'x'",
     'UPDATE region SET "left" = "right"',
     "DELETE FROM region WHERE image = 1",
@@ -210,6 +213,7 @@ DAMAGES = [
     "UPDATE scene SET images = 'x'",
     "UPDATE scene SET cloud = '[[0.0, 1.0]]'",
     "UPDATE run SET value = '{{'",
+    f"UPDATE run SET value = '{'[' * 100_000}'",
     "DROP TABLE unit",
     "DROP TABLE scene",
     "ALTER TABLE pair DROP COLUMN before",

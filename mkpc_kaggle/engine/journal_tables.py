@@ -16,6 +16,7 @@ from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from functools import wraps
+from math import isfinite
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Concatenate, ParamSpec, Self, TypeVar
@@ -36,6 +37,8 @@ from mkpc_kaggle.scene.choose import Choice, Reason
 FORMAT = 4
 FILE_NAME = "journal.sqlite"
 LOCK_NAME = "journal.lock"
+MOST_POINT_BYTES = 1 << 26
+"""Of one unit on one pair: three million matches; a damaged journal may promise more."""
 DRAWN = 10
 """How many of the weakest pairs keep their points when no later pass needs them: the report draws them."""
 
@@ -122,7 +125,15 @@ def undamaged(path: Path) -> Iterator[None]:
         if getattr(error, "sqlite_errorcode", sqlite3.SQLITE_ERROR) & 0xFF in UNUSABLE:
             raise UserError(f"{path} cannot be used: {error}; is another run at work there?") from error
         raise UserError(f"{path} is damaged ({error}); start anew with --fresh") from error
-    except (ValueError, TypeError, LookupError, AttributeError, OverflowError, zlib.error) as error:
+    except (
+        ValueError,
+        TypeError,
+        LookupError,
+        AttributeError,
+        OverflowError,
+        RecursionError,
+        zlib.error,
+    ) as error:
         raise UserError(f"{path} is damaged ({error}); start anew with --fresh") from error
 
 
@@ -297,7 +308,7 @@ def connect(path: Path) -> sqlite3.Connection:
 def typed(values: Sequence[Any], kinds: Sequence[Any]) -> Sequence[Any]:
     """The values, if each is of its kind; ``ValueError`` if not, since SQLite takes any into any column."""
     for value, kind in zip(values, kinds, strict=True):
-        if type(value) is not kind:
+        if type(value) is not kind or (kind is float and not isfinite(value)):
             raise ValueError(f"{value!r} is no {kind.__name__}")
     return values
 
@@ -323,6 +334,10 @@ def to_blob(matches: Matches) -> bytes:
 
 
 def from_blob(blob: bytes | None) -> Matches:
-    planes = np.frombuffer(zlib.decompress(blob) if blob else b"", np.uint8).reshape(4, -1)
+    stream = zlib.decompressobj()
+    data = stream.decompress(blob, MOST_POINT_BYTES) if blob else b""
+    if blob and not stream.eof:
+        raise ValueError("points are cut off, or more than there can be")
+    planes = np.frombuffer(data, np.uint8).reshape(4, -1)
     table = np.ascontiguousarray(planes.T).view(np.float32).reshape(5, -1)
     return Matches(table[:2].T, table[2:4].T, table[4])

@@ -20,10 +20,10 @@ ALL: list[Case] = [
     for case in group.CASES
 ]
 QUICK = (
+    "images: png: its first half",
     "tables: an id twice",
     "tables: a batch further above",
     "tables: bytes that are no UTF-8",
-    "images: png: its first half",
     "limits: --time-limit nan",
     "signals: SIGTERM after 1.0 s",
     "weights: a tuple in a tuple, a million times",
