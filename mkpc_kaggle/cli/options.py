@@ -159,7 +159,7 @@ def require_apart(files: Mapping[str, Path | None], work_dir: Path | None, input
     for option, path in files.items():
         if path is None:
             continue
-        if not path.name or path.is_dir():
+        if not path.name or os.path.isdir(path):  # noqa: PTH112  Path raises for a name that is too long
             raise UserError(f"{option} {str(path)!r} is a directory; name a file")
         for other, its_path in files.items():
             if other != option and its_path is not None and _same(path, its_path):

@@ -83,7 +83,13 @@ def attack(case: Case, room: Path) -> None:
         status, seconds, output = _wait(process, room, allowed)
         faults += _faults(case, status, seconds, allowed, output, room)
         faults += [f"left running: {line}" for line in _orphans(mark)]
-        if "submit" in command and status in (0, 1, 128 + signal.SIGINT, 128 + signal.SIGTERM):
+        too_late = status == 1 and TOO_LATE in output
+        if (
+            case.submission
+            and not too_late
+            and "submit" in command
+            and status in (0, 1, 128 + signal.SIGINT, 128 + signal.SIGTERM)
+        ):
             faults += _submission_faults(room)
     faults += [f"changed: {name}" for name in _changed(before, _snapshot(room))]
     if faults:

@@ -35,15 +35,12 @@ INPUTS = {
 ODD = {
     "a name with a line feed": "--output 'out/a\nb.csv'",
     "a name of other scripts": "--output out/\u202e\U0001f600.csv",
-    "a name like an option": "--output=--fresh",
     "no suffix": "--output out/s",
     "two suffixes": "--output out/s.csv.gz",
     "directories that are not there": "--output out/a/b/c/d/s.csv",
     "the null device": "--output /dev/null",
     "the full device": "--output /dev/full",
     "the journal among the images": "--output out/s.csv --work-dir D/test_images",
-    "the journal beside the table": "--output out/s.csv --work-dir D",
-    "no name for the journal": "--output out/s.csv --work-dir ''",
     "no name for the report": "--output out/s.csv --report ''",
     "a directory for the report": "--output out/s.csv --report out",
 }
@@ -57,7 +54,6 @@ THERE: dict[str, Callable[[Path], object]] = {
     "an older file": lambda path: path.write_text("old"),
     "a file for the journal's directory": lambda path: path.with_suffix(".work").write_text("old"),
     "a pipe for the journal's directory": lambda path: os.mkfifo(path.with_suffix(".work")),
-    "a link for the journal's directory": lambda path: path.with_suffix(".work").symlink_to("../D"),
     "a directory for the partial file": lambda path: path.with_name(".s.csv.part").mkdir(),
     "a link for the partial file": lambda path: path.with_name(".s.csv.part").symlink_to("../D/test.csv"),
     "a pipe for the partial file": lambda path: os.mkfifo(path.with_name(".s.csv.part")),
@@ -75,7 +71,7 @@ def placed(make: Callable[[Path], object]) -> Callable[[Path], None]:
 CASES = [
     *(Case("outputs", name, f"{PLAIN} {options}", statuses=REFUSED) for name, options in INPUTS.items()),
     *(
-        Case("outputs", name, f"{PLAIN} {options}", statuses=(0, 1, 2), submission="out/s.csv" in options)
+        Case("outputs", name, f"{PLAIN} {options}", statuses=(0, 1, 2), submission="out/s.csv " in f"{options} ")
         for name, options in ODD.items()
     ),
     *(
