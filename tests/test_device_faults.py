@@ -149,7 +149,8 @@ def test_a_batch_that_memory_is_too_short_for_is_halved_once_and_no_worker_lost(
     assert report.faults == ()
     assert matrices(report) == matrices(undisturbed)
     sizes = (tmp_path / "sizes").read_text().split()
-    assert sorted(size for size in sizes if int(size) > 2) == ["4", "4", "4", "8", "8", "8"], "once a unit"
+    # Of the job of eight pairs one runs alone: the first measures a unit's warm-up, the second its cost.
+    assert sorted(size for size in sizes if int(size) > 2) == ["3", "3", "3", "7", "7", "7"], "once a unit"
 
 
 @pytest.mark.parametrize(

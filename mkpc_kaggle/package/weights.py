@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.package.checkout import Checkout
 from mkpc_kaggle.package.folder import Item
 from mkpc_kaggle.weights import FoundFile, State, WeightFile, WeightStore
@@ -33,7 +34,7 @@ def choose_weights(store: WeightStore, checkout: Checkout, staging: Path, *, pri
     checkpoint that cannot be read.
     """
     slots = dict.fromkeys(file.slot for file in store.files)
-    found = [one for one in map(store.find, slots) if one is not None]
+    found = [one for one in (_good_file(store, slot) for slot in slots) if one is not None]
     restricted = [one for one in found if checkout.licence_text(one.file.licence) is None]
     shipped = [one for one in found if private or one not in restricted]
     texts = {checkout.licence_text(one.file.licence) for one in shipped} - {None, checkout.licence}
@@ -47,6 +48,17 @@ def choose_weights(store: WeightStore, checkout: Checkout, staging: Path, *, pri
         tuple(Item(path.name, path) for path in sorted(filter(None, texts))),
         tuple(Item(one.file.name, one.path, one.file.licence) for one in restricted),
     )
+
+
+def _good_file(store: WeightStore, slot: str) -> FoundFile | None:
+    search = store.search(store.alternatives(slot))
+    if search.found is None and search.refused:
+        refusals = "; ".join(f"{one.path}: {one.note}" for one in search.refused)
+        raise UserError(
+            f"no good file for {slot!r}. Found {refusals}. Fetch it again "
+            f"(python -m mkpc_kaggle weights fetch {slot} --out DIR), or take it out of the directory."
+        )
+    return search.found
 
 
 def _as_safetensors(found: FoundFile, staging: Path) -> tuple[WeightFile, Path]:
