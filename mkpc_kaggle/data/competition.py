@@ -13,6 +13,7 @@ import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TextIO, TypeVar
 
@@ -267,6 +268,9 @@ def read_table(path: Path, columns: Sequence[str]) -> pd.DataFrame:
     if path.exists() and not path.is_file():
         raise UserError(f"{path} is not a regular file")
     try:
+        with path.open("rb") as stream:
+            if any(b"\0" in block for block in iter(partial(stream.read, 1 << 20), b"")):
+                raise ValueError("it has NUL characters")  # some versions of pandas end the cell there
         table = pd.read_csv(path, dtype=str, keep_default_na=False)
     except FileNotFoundError as error:
         raise UserError(f"{path}: no such file") from error
