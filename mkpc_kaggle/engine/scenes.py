@@ -76,24 +76,25 @@ def reconstruct(job: SceneJob, read: Callable[[Path], Image | Unreadable] = read
 def pairs_to_add(pairs: Sequence[Pair], config: SceneConfig | None) -> list[Pair]:
     """Pairs of images of a batch that no row names, to be matched for its scene; see ``SceneConfig``."""
     added: list[Pair] = []
-    for batch, asked in batches_of(pairs).items() if config is not None else ():
+    for batch, places in batches_of(pairs).items() if config is not None else ():
+        asked = [pairs[place] for place in places]
         files = list(dict.fromkeys(file for pair in asked for file in (pair.file0, pair.file1)))
         assert config is not None
         if len(files) > config.most_images:  # to look for partners takes the square of their number
             continue
-        place = {file: number for number, file in enumerate(files)}
-        ends = [(place[pair.file0], place[pair.file1]) for pair in asked]
+        number = {file: place for place, file in enumerate(files)}
+        ends = [(number[pair.file0], number[pair.file1]) for pair in asked]
         found = [(files[i], files[j]) for i, j in unasked_pairs(len(files), ends, config.pairs_per_image)]
         added += [Pair(f"{batch};{Path(a).stem}-{Path(b).stem}", batch, a, b) for a, b in found]
     return added
 
 
-def batches_of(pairs: Iterable[Pair]) -> dict[str, list[Pair]]:
-    """The pairs of each batch that may be reconstructed: F is wanted, and nothing is known of their cameras."""
-    batches: dict[str, list[Pair]] = {}
-    for pair in pairs:
+def batches_of(pairs: Iterable[Pair]) -> dict[str, list[int]]:
+    """By batch, the places of the pairs that may be reconstructed: F is wanted, and no camera is known."""
+    batches: dict[str, list[int]] = {}
+    for place, pair in enumerate(pairs):
         if pair.model is Model.F and pair.intrinsics is None:
-            batches.setdefault(pair.group, []).append(pair)
+            batches.setdefault(pair.group, []).append(place)
     return {name: members for name, members in batches.items() if len(members) >= LEAST_PAIRS}
 
 
@@ -129,11 +130,7 @@ class SceneQueue:
         limit: float,
     ) -> None:
         self.config = config
-        names = batches_of(pairs) if config is not None else {}
-        self.batches: dict[str, list[int]] = {name: [] for name in names}
-        for index, pair in enumerate(pairs):
-            if pair.group in names and pair.model is Model.F and pair.intrinsics is None:
-                self.batches[pair.group].append(index)
+        self.batches = batches_of(pairs) if config is not None else {}
         self.running: dict[str, Running] = {}
         self._batch_of = {index: name for name, indices in self.batches.items() for index in indices}
         self._changed = set(self.batches)

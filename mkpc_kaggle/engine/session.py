@@ -206,8 +206,8 @@ class Watchdog:
             if self._over.wait(min(left, LISTEN_SECONDS)):
                 return
         status = 1
-        patience = self._budget.over - self._budget.clock() - LEAVING_SECONDS
-        last_resort = threading.Timer(max(LEAVING_SECONDS, patience), leave, [1])
+        left = self._budget.over - self._budget.clock() - LEAVING_SECONDS
+        last_resort = threading.Timer(max(LEAVING_SECONDS, left), leave, [1])
         last_resort.daemon = True
         last_resort.start()  # the disk may hang, or who reads what is printed
         try:

@@ -1,7 +1,6 @@
 """What a run did: time, budget, inliers, crops."""
 
 from collections.abc import Mapping, Sequence
-from itertools import cycle
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -60,14 +59,16 @@ def draw_budget(
     total = sum(map(len, ended.values()))
     axes = plain_axes(figure, f"{total} jobs ended, over {name} since the start{_far(limit, is_near)}")
     below = 0
-    for colour, (phase, times) in zip(cycle(CYCLE), ended.items(), strict=False):
+    for place, (phase, times) in enumerate(ended.items()):
+        colour = CYCLE[place % len(CYCLE)]
         # A flat piece is time without a result; 300 steps are as many as can be seen.
         keep = sample(np.ones(len(times), bool), 300)
         x, y = [times[i] / unit for i in keep], [below + i + 1 for i in keep]
         axes.step(x, y, where="post", color=colour, linewidth=2, label=phase, marker="o", markersize=2.5)
         below += len(times)
-    styles = cycle([(CLUSTERS[2], ":"), (OUTLIER, "--")])
-    for (colour, style), (what, times) in zip(styles, marks.items(), strict=False):
+    styles = (CLUSTERS[2], ":"), (OUTLIER, "--")
+    for place, (what, times) in enumerate(marks.items()):
+        colour, style = styles[place % len(styles)]
         for number, second in enumerate(times[:MOST_LINES]):
             label = what if number == 0 else None
             axes.axvline(second / unit, color=colour, linewidth=1, linestyle=style, label=label)
@@ -140,7 +141,8 @@ def draw_crops(sizes: Mapping[str, Sequence[tuple[int, int]]]) -> "Figure":
     figure = new_figure(5.6, 3.6)
     total = sum(map(len, sizes.values()))
     axes = plain_axes(figure, f"{total} critical regions: width and height in pixels, by reason")
-    for colour, (reason, values) in zip(cycle(CYCLE), sizes.items(), strict=False):
+    for place, (reason, values) in enumerate(sizes.items()):
+        colour = CYCLE[place % len(CYCLE)]
         some = sample(np.ones(len(values), bool), 500)
         x, y = np.asarray(values)[some].T
         axes.scatter(x, y, s=12, color=colour, alpha=0.6, linewidths=0, label=f"{reason} ({len(values)})")

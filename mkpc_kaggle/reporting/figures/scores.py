@@ -1,7 +1,6 @@
 """How well recipes do: scores, gains, errors."""
 
-from collections.abc import Iterator, Sequence
-from itertools import cycle, islice
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,11 +17,16 @@ if TYPE_CHECKING:
     from mkpc_kaggle.evaluation.validate import Validation
 
 
+MARKERS = "osD^vPX"
+DASHES = ("-", "--", "-.", ":")
+
+
 def draw_scores(validations: Sequence["Validation"]) -> "Figure":
     """A row a scene and one for their mean, a mark a recipe: its mAA."""
     scenes = [scene.scene for scene in validations[0].scenes]
     figure, axes = _rows([*scenes, "mean over scenes"], "mAA of each scene, by recipe")
-    for place, (style, one) in enumerate(zip(_styles(), validations, strict=False)):
+    for place, one in enumerate(validations):
+        style = _style(place)
         values = [*(scene.maa for scene in one.scenes), one.maa]
         axes.plot(values, _beside(len(values), place, len(validations)), **style, linestyle="", label=one.recipe)
     axes.set_xlim(-0.02, 1.02)
@@ -36,7 +40,8 @@ def draw_gains(comparison: "Comparison") -> "Figure":
     first, *others = comparison.validations
     names = [*comparison.scenes, "mean over scenes"]
     figure, axes = _rows(names, f"gain of mAA over {first.recipe}, with 95 % intervals")
-    for place, (style, other) in enumerate(zip(_styles(1), others, strict=False)):
+    for place, other in enumerate(others):
+        style = _style(place + 1)
         scenes = [comparison.difference(place + 1, name) for name in comparison.scenes]
         found = [*scenes, comparison.difference(place + 1)]
         reach = [[one.gain - one.low for one in found], [one.high - one.gain for one in found]]
@@ -63,11 +68,10 @@ def draw_errors(validations: Sequence["Validation"]) -> "Figure":
         axes.axvspan(thresholds[0], thresholds[-1], color=DROPPED, alpha=0.2, linewidth=0)
         middle = float(np.sqrt(thresholds[0] * thresholds[-1]))
         axes.text(middle, 2, "thresholds\nof the mAA", ha="center", va="bottom", fontsize=9, color=INK)
-        for style, dashes, one in zip(_styles(), cycle(("-", "--", "-.", ":")), validations, strict=False):
+        for place, one in enumerate(validations):
+            colour, dashes = _style(place)["color"], DASHES[place % len(DASHES)]
             x, share = _cumulated([getattr(error, kind) for error in one.errors], limits)
-            axes.step(
-                x, share, where="post", color=style["color"], linestyle=dashes, linewidth=2, label=one.recipe
-            )
+            axes.step(x, share, where="post", color=colour, linestyle=dashes, linewidth=2, label=one.recipe)
         axes.set(xscale="log", xlim=limits, ylim=(0, 101))
         axes.xaxis.set_major_formatter("{x:g}")
         axes.set_xlabel(f"{kind} error in {measure}", color=INK)
@@ -102,10 +106,9 @@ def _beside(rows: int, place: int, places: int) -> NDArray[np.float64]:
     return np.arange(rows, dtype=np.float64) + 0.5 * ((place + 0.5) / places - 0.5)
 
 
-def _styles(start: int = 0) -> Iterator[dict[str, Any]]:
-    """One for each recipe, the same in all figures; told apart by shape, too; 42 before they return."""
-    for colour, marker in islice(zip(cycle(CYCLE), cycle("osD^vPX"), strict=False), start, None):
-        yield {"color": colour, "marker": marker, "markersize": 7}
+def _style(place: int) -> dict[str, Any]:
+    """The style of a recipe, by its place, the same in all figures; told apart by shape, too; 42 in all."""
+    return {"color": CYCLE[place % len(CYCLE)], "marker": MARKERS[place % len(MARKERS)], "markersize": 7}
 
 
 def _legend_below(figure: "Figure") -> None:
