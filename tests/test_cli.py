@@ -47,6 +47,23 @@ def test_a_reader_that_leaves_is_no_error_to_tell() -> None:
     assert (done.returncode, done.stderr) == (141, b"")
 
 
+def test_ctrl_c_before_a_run_begins_ends_the_program_in_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted(name: str) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("mkpc_kaggle.cli.import_module", interrupted)
+    assert main(["recipes"]) == 130
+    assert capsys.readouterr().err == "interrupted\n"
+
+
+@pytest.mark.parametrize("option", ["--test-dir", "--weights", "--output", "--work-dir"])
+def test_a_name_that_is_too_long_is_told(option: str, demo: DemoSet, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["submit", "--test-dir", str(demo.test_dir), option, "d" * 5000]) == 2
+    assert "File name too long" in capsys.readouterr().err
+
+
 def test_recipes_are_listed_with_what_they_lack(
     clean_environment: None, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -75,6 +92,14 @@ def test_a_covisibility_that_no_pair_has_is_told(
     arguments = ["validate", "--train-dir", str(demo.train_dir), "--min-covisibility", covisibility]
     assert main([*arguments, "--recipe", "classical"]) == 2
     assert f"has no pair with a covisibility of at least {covisibility}" in capsys.readouterr().err
+
+
+def test_figures_are_not_written_into_the_train_side(demo: DemoSet, capsys: pytest.CaptureFixture[str]) -> None:
+    path = demo.train_dir / "scaling_factors.csv"
+    before = path.read_bytes()
+    assert main(["validate", "--train-dir", str(demo.train_dir), "--json", str(path)]) == 2
+    assert f"--json {path} would be written over the input" in capsys.readouterr().err
+    assert path.read_bytes() == before
 
 
 def test_a_figure_is_not_drawn_over_an_image_nor_an_export_over_the_journal(

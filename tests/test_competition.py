@@ -11,9 +11,11 @@ from numpy.testing import assert_allclose, assert_array_equal
 from shared import DATA, needs_data
 
 from mkpc_kaggle.data.competition import (
+    TEST_COLUMNS,
     discard_parts,
     read_cameras,
     read_submission,
+    read_table,
     read_test_side,
     read_train_side,
     read_true_pair,
@@ -383,6 +385,12 @@ def test_images_that_are_added_later_are_found(side):
     assert not read_test_side(home)[0].image0.is_file()
     (home / "test_images" / "b" / "1.jpg").write_bytes(b"")
     assert read_test_side(home)[0].image0.name == "1.jpg"
+
+
+def test_a_table_of_a_hundred_thousand_columns_is_refused_at_once(tmp_path):
+    (tmp_path / "test.csv").write_text(",".join(TEST_COLUMNS) + ",c" * 100_000 + "\n1,b,x,y\n")
+    with pytest.raises(UserError, match="it has more than 1000 columns"):
+        read_table(tmp_path / "test.csv", TEST_COLUMNS)
 
 
 def test_a_table_that_is_a_pipe_is_refused(tmp_path):

@@ -1,7 +1,9 @@
 """The command line: ``python -m mkpc_kaggle COMMAND`` and ``make_submission.py``."""
 
 import argparse
+import errno
 import os
+import signal
 import sys
 import time
 import warnings
@@ -15,7 +17,8 @@ from mkpc_kaggle.errors import UserError
 
 COMMANDS = ("submit", "match", "validate", "recipes", "weights", "check", "journal", "package", "demo")
 EXIT_BAD_INPUT = 2
-EXIT_BROKEN_PIPE = 128 + 13  # a shell's status for SIGPIPE
+EXIT_BROKEN_PIPE = 128 + signal.SIGPIPE
+EXIT_INTERRUPTED = 128 + signal.SIGINT
 
 _DESCRIPTION = """\
 Two-stage image matching with Matching Key-Points Crop, offline, inside a time budget.
@@ -43,21 +46,29 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):  # paths and ids may be of letters that the terminal has not
             stream.reconfigure(errors="backslashreplace")
-    parsed = make_parser().parse_args(arguments)
-    parsed.started = started
     with warnings.catch_warnings():
         warnings.showwarning = _show_warning
         try:
+            parsed = make_parser().parse_args(arguments)
+            parsed.started = started
             status = int(parsed.run(parsed))
             sys.stdout.flush()
             return status
         except UserError as error:
             print(f"error: {error}", file=sys.stderr)
             return EXIT_BAD_INPUT
+        except KeyboardInterrupt:
+            print("interrupted", file=sys.stderr)
+            return EXIT_INTERRUPTED
         except BrokenPipeError:
             # The reader closed the pipe, as head does. Without this Python would print a second error at exit.
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return EXIT_BROKEN_PIPE
+        except OSError as error:
+            if error.errno != errno.ENAMETOOLONG:
+                raise
+            print(f"error: {error.strerror}: {str(error.filename)[:80]}...", file=sys.stderr)
+            return EXIT_BAD_INPUT
 
 
 def make_parser() -> argparse.ArgumentParser:

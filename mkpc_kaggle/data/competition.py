@@ -34,6 +34,9 @@ CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]")
 NOT_PLAIN = re.compile(rf"^\.{{0,2}}$|^[A-Za-z]:|[/\\]|{CONTROL.pattern}")
 """Names of directories, of drives (Windows), and of no file."""
 
+MOST_COLUMNS = 1000
+"""Of a table: with a hundred thousand, pandas takes minutes."""
+
 Item = TypeVar("Item")
 
 _parts: set[Path] = set()
@@ -269,6 +272,9 @@ def read_table(path: Path, columns: Sequence[str]) -> pd.DataFrame:
         raise UserError(f"{path} is not a regular file")
     try:
         with path.open("rb") as stream:
+            if stream.readline(1 << 20).count(b",") >= MOST_COLUMNS:
+                raise ValueError(f"it has more than {MOST_COLUMNS} columns")
+            stream.seek(0)
             if any(b"\0" in block for block in iter(partial(stream.read, 1 << 20), b"")):
                 raise ValueError("it has NUL characters")  # some versions of pandas end the cell there
         table = pd.read_csv(path, dtype=str, keep_default_na=False)

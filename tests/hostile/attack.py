@@ -83,10 +83,10 @@ def attack(case: Case, room: Path) -> None:
         status, seconds, output = _wait(process, room, allowed)
         faults += _faults(case, status, seconds, allowed, output, room)
         faults += [f"left running: {line}" for line in _orphans(mark)]
-        too_late = status == 1 and TOO_LATE in output
+        nothing = (status == 1 and TOO_LATE in output) or output.strip() == "interrupted"  # before it began
         if (
             case.submission
-            and not too_late
+            and not nothing
             and "submit" in command
             and status in (0, 1, 128 + signal.SIGINT, 128 + signal.SIGTERM)
         ):

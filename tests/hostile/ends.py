@@ -64,13 +64,14 @@ def sends(name: str, *after: float, group: bool = False) -> Act:
 
 
 def to_workers(name: str, after: float) -> Act:
-    """Send the signal to the processes that the program has then."""
+    """Send the signal to the workers that the program has then."""
 
     def act(process: "subprocess.Popen[bytes]") -> None:
         time.sleep(after)
-        found = subprocess.run(["ps", "-o", "pid=", "--ppid", str(process.pid)], capture_output=True, check=False)
-        for one in found.stdout.split():
-            os.kill(int(one), signal.Signals[name])
+        children = ["ps", "-o", "pid=,args=", "--ppid", str(process.pid)]
+        for line in subprocess.run(children, capture_output=True, check=False, text=True).stdout.splitlines():
+            if "spawn_main" in line:  # not Python's own tracker of semaphores
+                os.kill(int(line.split()[0]), signal.Signals[name])
 
     return act
 

@@ -103,7 +103,8 @@ def bound(path: Path) -> None:
     here = Path.cwd()
     os.chdir(path.parent)  # the path of a socket must be short
     try:
-        socket.socket(socket.AF_UNIX).bind(path.name)
+        with socket.socket(socket.AF_UNIX) as listener:
+            listener.bind(path.name)
     finally:
         os.chdir(here)
 

@@ -1,7 +1,6 @@
 """A pool of workers, each supervised by a thread of the parent, which hands it one job after the other."""
 
 import queue
-import signal
 import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -216,9 +215,6 @@ class Supervisor:
         return not self._thread.is_alive()
 
     def _run(self) -> None:
-        # Ctrl-C reaches every process of a terminal. The parent answers to it; workers inherit this mask.
-        if hasattr(signal, "pthread_sigmask"):
-            signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
         try:
             self._ensure_worker()
             self._started.set_result(self._given_up)

@@ -19,6 +19,7 @@ from typing import Any, ClassVar, TypeVar, cast
 from mkpc_kaggle.engine.exits import how_it_ended
 from mkpc_kaggle.engine.jobs import Cause, Job, JobFailure
 from mkpc_kaggle.engine.pools.pool import START_SECONDS
+from mkpc_kaggle.engine.pools.spawn import signals_blocked
 from mkpc_kaggle.engine.worker import Answer, Worker
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.pipeline.stages import Pipeline
@@ -48,7 +49,7 @@ class ProcessWorker:
         self._process: SpawnProcess = context.Process(
             target=serve, args=(make_pipeline, share, its_jobs, its_messages), name=f"mkpc {name}", daemon=True
         )
-        with worker_environment():
+        with worker_environment(), signals_blocked():
             self._process.start()
         its_jobs.close()
         its_messages.close()

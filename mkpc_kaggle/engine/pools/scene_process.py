@@ -1,11 +1,11 @@
 """A reconstruction in a process of its own on this machine."""
 
 import multiprocessing
-import signal
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
 
 from mkpc_kaggle.engine.exits import how_it_ended
+from mkpc_kaggle.engine.pools.spawn import signals_blocked
 from mkpc_kaggle.engine.scenes import SceneAnswer, SceneJob, reconstruct
 
 
@@ -18,7 +18,8 @@ class SceneProcess:
         self._process: SpawnProcess = context.Process(
             target=serve_scene, args=(job, its_answers), name="mkpc scene", daemon=True
         )
-        self._process.start()
+        with signals_blocked():
+            self._process.start()
         its_answers.close()
 
     def answer(self) -> SceneAnswer | str | None:
@@ -38,6 +39,4 @@ class SceneProcess:
 
 def serve_scene(job: SceneJob, answers: Connection) -> None:
     """The life of the process."""
-    # Ctrl-C reaches every process of a terminal; the parent answers to it, and kills this one.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
     answers.send(reconstruct(job))
