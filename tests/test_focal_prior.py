@@ -71,6 +71,8 @@ def test_focal_lengths_and_pose_are_found_among_outliers():
     assert error.translation_angle < 2
     assert result.inliers[:400].mean() > 0.95
     assert result.inliers[400:].mean() < 0.05
+    plain = estimate(seen(CAMERAS, 400, 0.05, 150), MAGSAC).matrix
+    assert_allclose(result.magsac, np.sign(np.sum(result.magsac * plain)) * plain, atol=1e-12)
 
 
 def test_few_noisy_matches_have_a_better_pose_the_more_is_known_of_the_focal_lengths():
@@ -97,6 +99,7 @@ def test_known_cameras_of_two_focal_lengths_and_any_centre_give_their_essential_
     assert pose_error(result.matrix, first.calibrated, second.calibrated, 1.0).angle < 2
     assert_allclose(result.focals, (840, 1300))
     assert result.inlier_count > 0
+    assert result.magsac is None
 
 
 def test_a_principal_point_far_off_leaves_magsac_its_matrix_with_the_reason():

@@ -37,20 +37,24 @@ def outcome(index: int = 7, seed: int = 0) -> Outcome:
         CriticalRegion(Box(1, 2, 30, 40), RegionReason.CROPPED, 3, 2),
         CriticalRegion(Box(0, 0, 5, 6), RegionReason.TOO_SMALL),
     )
-    match = PairMatch(results, regions, Estimate(Model.F, rng.random((3, 3)), rng.random(30) < 0.5))
+    magsac = rng.random((3, 3)) if seed else None
+    found = Estimate(Model.F, rng.random((3, 3)), rng.random(30) < 0.5, magsac=magsac)
+    match = PairMatch(results, regions, found)
     match = replace(match, decode_seconds=0.1, cluster_seconds=0.2, estimate_seconds=0.3)
     return Outcome(PairRecord.of(index, match), results)
 
 
 def assert_same(one: PairRecord, other: PairRecord) -> None:
     assert one.F.tobytes() == other.F.tobytes()
+    assert (one.magsac is None) == (other.magsac is None)
+    assert one.magsac is None or one.magsac.tobytes() == other.magsac.tobytes()
     assert one.units == other.units
     assert one.regions == other.regions
     assert (one.index, one.failure, one.decode_seconds) == (other.index, other.failure, other.decode_seconds)
 
 
 def test_what_is_saved_is_there_after_opening_again(tmp_path: Path) -> None:
-    saved = [outcome(3, seed=1), outcome(7, seed=2)]
+    saved = [outcome(3, seed=0), outcome(7, seed=2)]
     journal = Journal(tmp_path, OURS)
     journal.save([(one, False) for one in saved])
     journal.close()
@@ -193,6 +197,7 @@ DAMAGES = [
     "UPDATE pair SET decode_seconds = 'x'",
     "UPDATE pair SET before = 'x'",
     "UPDATE pair SET version0 = x'00'",
+    "UPDATE pair SET magsac = x'{nan}'",
     "UPDATE unit SET matches = 'x'",
     "UPDATE unit SET failure = NULL",
     "UPDATE unit SET unit = 'another' WHERE place = 0",

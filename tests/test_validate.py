@@ -94,6 +94,40 @@ def test_validate_scores_a_recipe_and_writes_all_figures(
         assert set(pair["matches"]) == {"1:sift@320", "2:sift@400"}
 
 
+def test_each_step_of_the_estimate_has_a_column(
+    demo: DemoSet, recipe: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = [
+        "validate",
+        "--train-dir",
+        str(demo.train_dir),
+        "--json",
+        str(tmp_path / "scores.json"),
+        "--recipe",
+    ]
+    recipe.write_text(RECIPE + "[magsac]\norders = 1\n")
+    assert main([*arguments, str(recipe)]) == 0
+    plain = json.loads((tmp_path / "scores.json").read_text())
+    assert plain["mAA_by_step"] == {"MAGSAC": plain["mAA"]}
+    capsys.readouterr()
+
+    recipe.write_text(recipe.read_text() + "[focal]\n[scene]\n")
+    assert main([*arguments, str(recipe)]) == 0
+    printed = capsys.readouterr().out
+    scores = json.loads((tmp_path / "scores.json").read_text())
+    by_step = scores["mAA_by_step"]
+    assert list(by_step) == ["MAGSAC", "+ prior", "+ scene"]
+    assert by_step["MAGSAC"] == pytest.approx(plain["mAA"])
+    assert by_step["+ scene"] == scores["mAA"]
+    assert f"{'mean over scenes':<20}{18:>6}" + "".join(f"{value:>9.4f}" for value in by_step.values()) in printed
+    assert (
+        f"gain of + prior over the step before, 95% interval: {by_step['+ prior'] - by_step['MAGSAC']:+.4f}"
+        in printed
+    )
+    for pair, former in zip(scores["scenes"][0]["pairs"], plain["scenes"][0]["pairs"], strict=True):
+        assert pair["accuracy_by_step"]["MAGSAC"] == former["accuracy_by_step"]["MAGSAC"]
+
+
 @pytest.mark.parametrize(
     ("mode", "stages"), [("stage-1", {"1"}), ("whole-images", {"1"}), ("two-stage", {"1", "2"})]
 )

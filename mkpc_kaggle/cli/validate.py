@@ -20,7 +20,8 @@ HELP = """\
 Run a recipe, with the engine that makes submissions, on a train side (calibration.csv, pair_covisibility.csv
 and images/ in each scene, scaling_factors.csv beside the scenes), and score it as the competition does: mAA
 over rotation errors of 1 to 10 degrees and translation errors of 0.2 to 5 metres, for each scene, then the
-mean of the scenes; beside it the AUC of the larger angular error up to 5, 10 and 20 degrees.
+mean of the scenes; beside it the AUC of the larger angular error up to 5, 10 and 20 degrees. The mAA has a column
+for each step of the estimate: MAGSAC alone, with the prior on focal lengths, with the cameras of the scene.
 
 With --compare, several recipes run on the same pairs; each is compared with the first.
 
@@ -98,7 +99,8 @@ def run(arguments: argparse.Namespace) -> int:
         raise UserError("--units chooses from one recipe; --compare takes recipes as they are")
     if arguments.compare is not None and len(arguments.compare) < 2:
         raise UserError(f"--compare needs two recipes or more, not only {arguments.compare[0]}")
-    inputs = [arguments.pairs, arguments.truth, *(arguments.submission or ())]
+    sides = [arguments.train_dir, arguments.image_root]
+    inputs = [*sides, arguments.pairs, arguments.truth, *(arguments.submission or ())]
     options.require_apart({"--json": arguments.json}, arguments.work_dir, [path for path in inputs if path])
     with tempfile.TemporaryDirectory(prefix="mkpc-") as temporary:
         work_dir = arguments.work_dir or Path(temporary)
@@ -137,7 +139,8 @@ def _read_scenes(arguments: argparse.Namespace, work_dir: Path) -> "tuple[Scene,
 
 def _match_and_score(arguments: argparse.Namespace, scenes: "tuple[Scene, ...]", work_dir: Path) -> int:
     from mkpc_kaggle.engine.session import interruptible
-    from mkpc_kaggle.evaluation.validate import own_scores, score_table, to_json, validate
+    from mkpc_kaggle.evaluation.compare import step_gains
+    from mkpc_kaggle.evaluation.validate import score_table, to_json, validate
     from mkpc_kaggle.recipe import Choice, Mode
     from mkpc_kaggle.reporting.summary import trouble
 
@@ -146,11 +149,7 @@ def _match_and_score(arguments: argparse.Namespace, scenes: "tuple[Scene, ...]",
         session = _session(arguments, work_dir, interrupt)
         validation, at_rest = validate(scenes, assembly, session)
     _print_summary(arguments, validation, scenes, assembly)
-    if any(record.scene is not None for record in validation.records):
-        print("F of each pair's own matches:")
-        print("\n".join(score_table(own_scores(validation, scenes))))
-        print("F of the scene where there is one:")
-    print("\n".join(score_table(validation)))
+    print("\n".join([*score_table(validation), *step_gains(validation)]))
     _write_json(arguments.json, to_json(validation))
     _write_report(arguments, scenes, session)
     assert validation.report is not None

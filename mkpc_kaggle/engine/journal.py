@@ -31,6 +31,7 @@ from mkpc_kaggle.engine.journal_tables import (
 )
 from mkpc_kaggle.engine.records import PairRecord, SceneRecord
 from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.geometry.robust import Matrix3
 from mkpc_kaggle.scene.choose import Choice
 
 
@@ -117,7 +118,7 @@ class Journal(JournalTables):
 
     def save_scene(self, scene: SceneRecord, choices: Mapping[int, Choice]) -> None:
         """Put down what came of a batch, and which F its pairs get, by their places."""
-        rows = [(i, None if one.F is None else one.F.tobytes(), str(one.reason)) for i, one in choices.items()]
+        rows = [(i, _blob(one.F), str(one.reason)) for i, one in choices.items()]
         drawn = json.dumps([asdict(camera) for camera in scene.cameras]), json.dumps(scene.cloud)
         *values, failure = astuple(scene)[:-2]
         values = [*values, printable(failure), *drawn]
@@ -168,16 +169,17 @@ class Journal(JournalTables):
     def _save(self, outcome: Outcome, settled: bool) -> None:
         record = outcome.record
         self._db.execute(
-            "REPLACE INTO pair VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)",
+            "REPLACE INTO pair VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
             [
                 record.index,
-                np.ascontiguousarray(record.F, np.float64).tobytes(),
+                _blob(record.F),
                 printable(record.failure),
                 record.decode_seconds,
                 record.cluster_seconds,
                 record.estimate_seconds,
                 record.before,
                 *(record.versions or ("", "")),
+                _blob(record.magsac),
             ],
         )
         points = {} if settled else {result.unit.name: to_blob(result.matches) for result in outcome.results}
@@ -250,3 +252,7 @@ class Journal(JournalTables):
                 f"{self.path} belongs to another run: its {' and '.join(other)} differ. "
                 "Start anew with --fresh, or name another --work-dir."
             )
+
+
+def _blob(matrix: Matrix3 | None) -> bytes | None:
+    return None if matrix is None else np.ascontiguousarray(matrix, np.float64).tobytes()

@@ -1,10 +1,10 @@
 """The tables of a run's journal, an SQLite file, and how they are read.
 
 Tables: ``run`` (what the journal belongs to and who wrote it), ``sample`` (the ids of the pairs), ``pair`` (F,
-failure, seconds, inliers before an upgrade, what tells the contents of its images), ``unit`` (counts and seconds
-of each unit on each pair, and its points while a later pass may build on them or the report may draw them),
-``region`` (the critical regions), ``choice`` (which F the reconstruction of its batch gives a pair, and why),
-``scene`` (what came of each batch), ``event`` (what happened when).
+failure, seconds, inliers before an upgrade, what tells the contents of its images, MAGSAC's F alone), ``unit``
+(counts and seconds of each unit on each pair, and its points while a later pass may build on them or the report
+may draw them), ``region`` (the critical regions), ``choice`` (which F the reconstruction of its batch gives a
+pair, and why), ``scene`` (what came of each batch), ``event`` (what happened when).
 """
 
 import json
@@ -34,7 +34,7 @@ from mkpc_kaggle.pipeline.pair import UnitResult
 from mkpc_kaggle.recipe import Unit
 from mkpc_kaggle.scene.choose import Choice, Reason
 
-FORMAT = 4
+FORMAT = 5
 FILE_NAME = "journal.sqlite"
 LOCK_NAME = "journal.lock"
 MOST_POINT_BYTES = 1 << 26
@@ -58,7 +58,7 @@ CREATE TABLE sample (
 CREATE TABLE pair (
     pair INTEGER PRIMARY KEY, fundamental BLOB NOT NULL, failure TEXT NOT NULL,
     decode_seconds REAL, cluster_seconds REAL, estimate_seconds REAL, before INTEGER,
-    version0 TEXT NOT NULL, version1 TEXT NOT NULL);
+    version0 TEXT NOT NULL, version1 TEXT NOT NULL, magsac BLOB);
 CREATE TABLE unit (
     pair INTEGER, unit TEXT, stage INTEGER, matches INTEGER, inliers INTEGER,
     encode_seconds REAL, match_seconds REAL, failure TEXT, place INTEGER, points BLOB,
@@ -183,12 +183,12 @@ class JournalTables:
             region = CriticalRegion(Box(left, top, right, bottom), RegionReason(reason), *counts)
             regions.setdefault(pair, []).append(region)
         choices = {
-            pair: Choice(None if F is None else matrix_of(F), Reason(reason))
+            pair: Choice(optional_matrix_of(F), Reason(reason))
             for pair, F, reason in self._db.execute("SELECT pair, fundamental, reason FROM choice")
         }
-        columns = "failure, decode_seconds, cluster_seconds, estimate_seconds, version0, version1, before"
+        columns = "failure, decode_seconds, cluster_seconds, estimate_seconds, version0, version1, before, magsac"
         found = {}
-        for pair, F, *values, before in self._db.execute(f"SELECT pair, fundamental, {columns} FROM pair"):
+        for pair, F, *values, before, magsac in self._db.execute(f"SELECT pair, fundamental, {columns} FROM pair"):
             failure, decode, cluster, estimate, *versions = typed(values, (str, float, float, float, str, str))
             found[pair] = PairRecord(
                 pair,
@@ -202,6 +202,7 @@ class JournalTables:
                 None if before is None else int(before),
                 choices.get(pair),
                 tuple(filter(None, versions)),
+                optional_matrix_of(magsac),
             )
         return found
 
@@ -324,6 +325,10 @@ def matrix_of(blob: bytes) -> Matrix3:
     if not np.isfinite(matrix).all() or not matrix.any():
         raise ValueError("a matrix is zero or not finite")
     return matrix
+
+
+def optional_matrix_of(blob: bytes | None) -> Matrix3 | None:
+    return None if blob is None else matrix_of(blob)
 
 
 def to_blob(matches: Matches) -> bytes:

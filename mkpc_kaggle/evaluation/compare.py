@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from math import nan
 from statistics import mean
 from typing import Any
@@ -10,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mkpc_kaggle.engine.records import PairRecord
-from mkpc_kaggle.evaluation.validate import SceneScore, Validation, to_json
+from mkpc_kaggle.evaluation.validate import SceneScore, Step, Validation, to_json
 from mkpc_kaggle.geometry.metrics import pair_accuracy
 
 LEVEL = 0.95
@@ -126,6 +127,22 @@ def comparison_table(comparison: Comparison) -> list[str]:
         total = sum(len(scene.pairs) for scene in first.scenes)
         lines.append(f"{'mean over scenes':<20}{total:>6}  {comparison.difference(number)}")
     return lines
+
+
+def step_gains(validation: Validation) -> list[str]:
+    """Lines: the gain of mAA, as the mean over scenes, of each step over the one before; none without metres."""
+    scenes = [scene for scene in validation.scenes if scene.pairs]
+    if not scenes or not all(scene.in_metres for scene in scenes):
+        return []
+    lines = []
+    for former, step in pairwise(validation.steps):
+        gains = paired_difference([(_after(scene, former), _after(scene, step)) for scene in scenes])
+        lines.append(f"gain of {step} over the step before, {LEVEL:.0%} interval: {gains}")
+    return lines
+
+
+def _after(scene: SceneScore, step: Step) -> list[float]:
+    return [pair_accuracy(pair.steps[step]) for pair in scene.pairs]
 
 
 def comparison_json(comparison: Comparison) -> dict[str, Any]:

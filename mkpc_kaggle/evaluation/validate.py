@@ -2,7 +2,8 @@
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from enum import StrEnum
 from math import isfinite, nan
 from pathlib import Path
 from statistics import mean
@@ -19,21 +20,37 @@ from mkpc_kaggle.geometry.metrics import (
     AUC_THRESHOLDS,
     PoseError,
     mean_average_accuracy,
+    pair_accuracy,
     pose_auc,
     pose_error,
 )
 from mkpc_kaggle.geometry.robust import Matrix3, Model
 from mkpc_kaggle.pipeline.assembly import Assembly
+from mkpc_kaggle.recipe import Recipe
+
+
+class Step(StrEnum):
+    """The estimates of a pair's F, in the order in which they are made."""
+
+    MAGSAC = "MAGSAC"
+    PRIOR = "+ prior"
+    """with the prior on the focal lengths"""
+    SCENE = "+ scene"
+    """with the cameras of its batch, where these give an F"""
 
 
 @dataclass(frozen=True)
 class PairScore:
-    """One pair's error, infinite for a failed pair, and its record where the engine made one."""
+    """One pair's error, infinite for a failed pair, and its record where the engine made one.
+
+    ``steps`` are the errors after each :class:`Step` that was made; the last is ``error``.
+    """
 
     id: str
     covisibility: float
     error: PoseError
     record: PairRecord | None = None
+    steps: Mapping[Step, PoseError] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -52,22 +69,32 @@ class SceneScore:
     def maa(self) -> float:
         return mean_average_accuracy(self.errors) if self.in_metres else nan
 
+    def maa_after(self, step: Step) -> float:
+        return mean_average_accuracy([pair.steps[step] for pair in self.pairs]) if self.in_metres else nan
+
     def auc(self, threshold: float) -> float:
         return pose_auc(self.errors, threshold)
 
 
 @dataclass(frozen=True)
 class Validation:
-    """The scores of all scenes under one recipe; ``report`` is ``None`` for a submission scored from its file."""
+    """The scores of all scenes under one recipe.
+
+    A submission that is scored from its file has no ``report`` and no ``steps``.
+    """
 
     recipe: str
     scenes: tuple[SceneScore, ...]
     report: RunReport | None = None
+    steps: tuple[Step, ...] = ()
 
     @property
     def maa(self) -> float:
         """The mean of the scenes' mAA: the competition's figure."""
         return mean(scene.maa for scene in self.scenes)
+
+    def maa_after(self, step: Step) -> float:
+        return mean(scene.maa_after(step) for scene in self.scenes)
 
     def auc(self, threshold: float) -> float:
         return mean(scene.auc(threshold) for scene in self.scenes)
@@ -86,48 +113,43 @@ def validate(scenes: Sequence[Scene], assembly: Assembly, session: Session) -> t
     """Match all pairs of the scenes and score them; also whether every thread has stopped."""
     pairs = [true.pair for scene in scenes for true in scene.pairs]
     report, at_rest = run_pairs(pairs, assembly, session)
+    steps = steps_of(assembly.recipe, report.records)
     records = iter(report.records)
     scored = tuple(
         SceneScore(
             scene.name,
-            tuple(score_record(true, next(records), scene) for true in scene.pairs),
+            tuple(score_record(true, next(records), scene, steps) for true in scene.pairs),
             isfinite(scene.metres_per_unit),
         )
         for scene in scenes
     )
-    return Validation(assembly.recipe.name, scored, report), at_rest
+    return Validation(assembly.recipe.name, scored, report, steps), at_rest
 
 
-def own_scores(validation: Validation, scenes: Sequence[Scene]) -> Validation:
-    """The same run, each pair scored by the F of its own matches: what its scene's cameras are compared with."""
-    scored = tuple(
-        SceneScore(
-            score.scene,
-            tuple(
-                PairScore(pair.id, pair.covisibility, _own_error(pair, true, scene), pair.record)
-                for pair, true in zip(score.pairs, scene.pairs, strict=True)
-            ),
-            score.in_metres,
-        )
-        for score, scene in zip(validation.scenes, scenes, strict=True)
-    )
-    return Validation(validation.recipe, scored, validation.report)
+def steps_of(recipe: Recipe, records: Sequence[PairRecord]) -> tuple[Step, ...]:
+    """The steps that a run made; where E is sought at known focal lengths, there is no MAGSAC alone."""
+    steps = [Step.MAGSAC] if recipe.focal is None or any(one.magsac is not None for one in records) else []
+    steps += [Step.PRIOR] if recipe.focal is not None else []
+    return (*steps, Step.SCENE) if any(one.scene is not None for one in records) else tuple(steps)
 
 
-def _own_error(pair: PairScore, true: TruePair, scene: Scene) -> PoseError:
-    if pair.record is None or pair.record.failure:
-        return PoseError.failed()
-    return error_of(pair.record.F, true, scene)
-
-
-def score_record(true: TruePair, record: PairRecord, scene: Scene) -> PairScore:
+def score_record(true: TruePair, record: PairRecord, scene: Scene, steps: Sequence[Step] = ()) -> PairScore:
     """The score of a pair's record; the fallback row counts as a failure."""
-    error = PoseError.failed() if record.source == "fallback" else error_of(record.fundamental, true, scene)
-    return PairScore(true.pair.id, true.covisibility, error, record)
+    own = None if record.failure else record.F
+    found = {
+        Step.MAGSAC: record.magsac if Step.PRIOR in steps else own,
+        Step.PRIOR: own,
+        Step.SCENE: None if record.source == "fallback" else record.fundamental,
+    }
+    error = error_of(found[Step.SCENE], true, scene)
+    errors = {step: error_of(found[step], true, scene) for step in steps}
+    return PairScore(true.pair.id, true.covisibility, error, record, errors)
 
 
-def error_of(matrix: Matrix3, true: TruePair, scene: Scene) -> PoseError:
-    """The error of a pair's F, or of its E if that is what was estimated."""
+def error_of(matrix: Matrix3 | None, true: TruePair, scene: Scene) -> PoseError:
+    """The error of a pair's F, or of its E if that is what was estimated; infinite where there is none."""
+    if matrix is None:
+        return PoseError.failed()
     cameras = true.camera0, true.camera1
     if true.pair.model is Model.E:
         cameras = true.camera0.calibrated, true.camera1.calibrated
@@ -166,15 +188,25 @@ def score_submission(submission: Path, truth: Path, scenes: Sequence[Scene]) -> 
 
 
 def score_table(validation: Validation) -> list[str]:
-    """Lines: a row a scene and their mean, with mAA and pose AUC; a dash for the mAA of unknown metres."""
-    heads = [f"AUC {threshold:.0f}" for threshold in AUC_THRESHOLDS]
-    lines = [f"{'scene':<20}{'pairs':>6}{'mAA':>9}" + "".join(f"{head:>9}" for head in heads)]
-    for scene in validation.scenes:
-        aucs = "".join(f"{scene.auc(threshold):>9.4f}" for threshold in AUC_THRESHOLDS)
-        lines.append(f"{scene.scene:<20}{len(scene.pairs):>6}{_cell(scene.maa)}{aucs}")
-    aucs = "".join(f"{validation.auc(threshold):>9.4f}" for threshold in AUC_THRESHOLDS)
-    count = sum(len(scene.pairs) for scene in validation.scenes)
-    return [*lines, f"{'mean over scenes':<20}{count:>6}{_cell(validation.maa)}{aucs}"]
+    """Lines: a row a scene and their mean; a dash for the mAA of unknown metres.
+
+    The columns are the mAA, after each step where there are several, and the pose AUC after the last.
+    """
+    several = len(validation.steps) > 1
+    heads = [
+        *(validation.steps if several else ["mAA"]),
+        *(f"AUC {threshold:.0f}" for threshold in AUC_THRESHOLDS),
+    ]
+    lines = [f"{'scene':<20}{'pairs':>6}" + "".join(f"{head:>9}" for head in heads)]
+    rows: list[tuple[str, int, SceneScore | Validation]] = [
+        (one.scene, len(one.pairs), one) for one in validation.scenes
+    ]
+    rows.append(("mean over scenes", sum(count for _, count, _ in rows), validation))
+    for name, count, scores in rows:
+        accuracies = map(scores.maa_after, validation.steps) if several else [scores.maa]
+        values = [*accuracies, *map(scores.auc, AUC_THRESHOLDS)]
+        lines.append(f"{name:<20}{count:>6}" + "".join(map(_cell, values)))
+    return ["mAA after each step, AUC after the last:", *lines] if several else lines
 
 
 def _cell(value: float) -> str:
@@ -188,6 +220,7 @@ def to_json(validation: Validation) -> dict[str, Any]:
     return {
         "recipe": validation.recipe,
         "mAA": _finite(validation.maa),
+        "mAA_by_step": {step: _finite(validation.maa_after(step)) for step in validation.steps},
         "AUC": {f"{threshold:g}": validation.auc(threshold) for threshold in AUC_THRESHOLDS},
         "seconds": validation.report.seconds if validation.report else None,
         "seconds_per_pair": validation.report.seconds / len(records) if validation.report else None,
@@ -198,6 +231,7 @@ def to_json(validation: Validation) -> dict[str, Any]:
             {
                 "scene": scene.scene,
                 "mAA": _finite(scene.maa),
+                "mAA_by_step": {step: _finite(scene.maa_after(step)) for step in validation.steps},
                 "AUC": {f"{threshold:g}": scene.auc(threshold) for threshold in AUC_THRESHOLDS},
                 "pairs": [_pair_json(pair) for pair in scene.pairs],
             }
@@ -224,6 +258,7 @@ def _pair_json(pair: PairScore) -> dict[str, Any]:
         "rotation_error_degrees": _finite(error.rotation),
         "translation_error_metres": _finite(error.translation),
         "translation_error_degrees": _finite(error.translation_angle),
+        "accuracy_by_step": {step: pair_accuracy(error) for step, error in pair.steps.items()},
     }
     if record is not None:
         values |= {

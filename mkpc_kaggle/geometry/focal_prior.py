@@ -160,16 +160,19 @@ def estimate_with_prior(
         reasons = list(dict.fromkeys(one for one in tried if isinstance(one, str)))
         if not candidates:
             return Estimate.failed(model, len(matches), "; ".join(reasons) or "no candidate has a finite cost")
-        best = min(candidates, key=lambda candidate: candidate.cost)
+        best = min(candidates, key=_cost_of)
+        plain = [one for one in candidates if one.origin is Origin.MAGSAC]
+        unrefined = _unit(search.for_pixels(min(plain, key=_cost_of).fundamental)) if plain else None
         inliers = np.abs(sampson(best.fundamental, *search.rays)) < magsac.threshold
         reasons += search.remarks(best)
     matrix = best.fundamental if model is Model.E else search.for_pixels(best.fundamental)
     return Estimate(
         model,
-        matrix / np.linalg.norm(matrix),
+        _unit(matrix),
         distinct.mask_of_all(inliers),
         origin=best.origin,
         focals=search.focals(best.view) if best.view else None,
+        magsac=unrefined,
         remark="; ".join(reasons),
     )
 
@@ -182,6 +185,14 @@ class _Candidate:
     fundamental: Matrix3
     cost: float
     view: TwoView | None = None
+
+
+def _cost_of(candidate: _Candidate) -> float:
+    return candidate.cost
+
+
+def _unit(matrix: Matrix3) -> Matrix3:
+    return np.asarray(matrix / np.linalg.norm(matrix))
 
 
 class _Search:
@@ -287,8 +298,7 @@ class _Search:
 
     def _for_rays(self, F: Matrix3) -> Matrix3:
         """The F for rays, of unit norm, from one for pixels."""
-        F = np.linalg.inv(self._priors[1].to_ray).T @ F @ np.linalg.inv(self._priors[0].to_ray)
-        return F / np.linalg.norm(F)
+        return _unit(np.linalg.inv(self._priors[1].to_ray).T @ F @ np.linalg.inv(self._priors[0].to_ray))
 
     def _decomposed(self, F: Matrix3) -> TwoView:
         """An F for rays as two views, with the focal lengths of a grid that fit the matches best."""

@@ -88,7 +88,8 @@ class Estimate:
     ``matrix`` is (3, 3) float64, finite, of unit Frobenius norm; for F, x1^T F x0 = 0 in homogeneous image
     pixels. ``inliers`` is an (N,) mask over the matches that were given: those nearer than the threshold.
     ``failure`` is empty, or says why ``matrix`` is only the fallback. ``focals`` are the focal lengths in pixels
-    that it stands for, ``None`` without a prior; ``remark`` is a warning about it, or empty.
+    that it stands for, ``None`` without a prior; ``magsac`` is the (3, 3) F that MAGSAC alone gives,
+    ``None`` without a prior and where it gives none; ``remark`` is a warning about it, or empty.
     """
 
     model: Model
@@ -97,6 +98,7 @@ class Estimate:
     failure: str = ""
     origin: Origin = Origin.MAGSAC
     focals: tuple[float, float] | None = None
+    magsac: Matrix3 | None = None
     remark: str = ""
 
     @property
