@@ -5,8 +5,9 @@ python -m benchmarks.unasked --train-dir DIR --matches DIR [--scenes reichstag_2
 
 Of a scene's pairs with a covisibility of at least 0.1 a share is asked for, drawn by a seed. Their matches are
 those of `--matches` (a file SCENE/IMAGE0-IMAGE1.npz for each pair, of all of the recipe's units); further ones are
-found here by its first unit, as in a run. `own` is the mAA of the asked pairs' own F, `with` that of the F which
-they get.
+found here by its first unit, as in a run. `own` is the mAA of the asked pairs' own F; `scene` where they get that
+of their cameras, if there is one; `focals` where the others are also estimated anew at the focal lengths that the
+scene knows, as in a run.
 """
 
 import argparse
@@ -27,6 +28,7 @@ from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult, with_estimate
 from mkpc_kaggle.pipeline.two_stage import to_image
 from mkpc_kaggle.scene.batch import Batch, BatchPair
 from mkpc_kaggle.scene.config import SceneConfig
+from mkpc_kaggle.scene.known_focals import KnownFocals
 from mkpc_kaggle.scene.read import described
 from mkpc_kaggle.scene.solve import solve
 from mkpc_kaggle.scene.unasked import unasked_pairs
@@ -67,13 +69,18 @@ def rows(scene: Scene, matched: Matched, share: float, seed: int, densities: lis
     for density in densities:
         added = [matched.unasked(paths[i], paths[j]) for i, j in unasked_pairs(len(paths), ends, density)]
         batch = Batch(tuple(matched.images[path] for path in paths), (*asked, *added))
-        solution = solve(batch, SceneConfig())
-        answers = zip(asked, solution.choices[: len(asked)], strict=True)
+        recipe, config = matched.pipeline.recipe, SceneConfig()
+        known_focals = KnownFocals(recipe.magsac, recipe.focal, config.focal_sigma) if recipe.focal else None
+        solution = solve(batch, config, known_focals)
+        answers = list(zip(asked, solution.choices[: len(asked)], strict=True))
+        with_scene = [choice.F if choice.from_scene else pair.own for pair, choice in answers]
         best = [pair.own if choice.F is None else choice.F for pair, choice in answers]
+        others = sum(choice.F is not None and not choice.from_scene for _, choice in answers)
         placed = sum(one.placed for one in solution.scenes)
         yield (
             f"{scene.name:16}{share:6.2f}{seed:5}{len(asked):6}{density:10.1f}{len(added):7}"
-            f"{own:8.4f}{score(scene, chosen, best):8.4f}{placed:6}/{len(paths)}"
+            f"{own:8.4f}{score(scene, chosen, with_scene):8.4f}{score(scene, chosen, best):8.4f}{others:7}"
+            f"{placed:6}/{len(paths)}"
         )
 
 
@@ -93,7 +100,8 @@ def main() -> None:
     parser.add_argument("--pairs-per-image", nargs="+", type=float, default=[0, 3, 5])
     parser.add_argument("--recipe", default="classical")
     arguments = parser.parse_args()
-    print(f"{'scene':16}{'share':>6}{'seed':>5}{'pairs':>6}{'per image':>10}{'added':>7}{'own':>8}{'with':>8}")
+    print(f"{'scene':16}{'share':>6}{'seed':>5}{'pairs':>6}{'per image':>10}{'added':>7}{'own':>8}", end="")
+    print(f"{'scene':>8}{'focals':>8}{'pairs':>7}{'images':>8}")
     for scene in read_train_side(arguments.train_dir, scenes=arguments.scenes):
         matched = Matched(scene, arguments.matches, arguments.recipe)
         for share in arguments.shares:

@@ -8,10 +8,13 @@ import numpy as np
 import pytest
 
 from benchmarks.synthetic_scene import SIZE, SyntheticScene, synthetic_scene
+from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.geometry.robust import RobustConfig
 from mkpc_kaggle.scene.batch import Batch, BatchImage, BatchPair
 from mkpc_kaggle.scene.choose import Reason
 from mkpc_kaggle.scene.config import CameraModel, Mapper, SceneConfig
+from mkpc_kaggle.scene.known_focals import KnownFocals
 from mkpc_kaggle.scene.solve import Solution, solve
 
 BOTH = pytest.mark.parametrize("config", [SceneConfig(mapper=mapper) for mapper in Mapper], ids=list(Mapper))
@@ -77,6 +80,22 @@ def test_a_pair_with_few_matches_of_its_own_gets_the_scenes_fundamental(scene: S
 def test_a_pair_without_matches_gets_the_scenes_fundamental(scene: SyntheticScene) -> None:
     pairs = (replace(scene.batch.pairs[3], matches=Matches.empty()), *scene.batch.pairs)
     assert solve(replace(scene.batch, pairs=pairs), SceneConfig()).choices[0].from_scene
+
+
+def test_a_pair_that_the_scene_lacks_is_estimated_at_its_focal_lengths(scene: SyntheticScene) -> None:
+    last = scene.batch.images[-1].name
+    inside = [pair for pair in scene.batch.pairs if last not in (pair.image0, pair.image1)]
+    outside = next(pair for pair in scene.batch.pairs if last in (pair.image0, pair.image1))
+    few = replace(outside, matches=outside.matches[:14])  # too few to place the image
+    batch = replace(scene.batch, pairs=(few, replace(few, matches=few.matches[:3]), *inside))
+    known = KnownFocals(RobustConfig(orders=1, max_iterations=2000), FocalConfig(), sigma=0.05)
+    solution = solve(batch, SceneConfig(), known)
+    found, hopeless, *others = solution.choices
+    assert (found.reason, found.from_scene) == (Reason.UNPLACED, False)
+    assert scene.median_distance(found.F, few) < 5
+    assert (hopeless.reason, hopeless.F) == (Reason.UNPLACED, None)
+    assert all(choice.from_scene for choice in others)
+    assert solve(batch, SceneConfig()).choices[0].F is None
 
 
 def test_a_turned_pair_gets_the_transposed_fundamental(scene: SyntheticScene) -> None:

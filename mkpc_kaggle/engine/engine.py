@@ -25,6 +25,7 @@ from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.pipeline.pair import UnitResult
 from mkpc_kaggle.recipe import Recipe, Unit
 from mkpc_kaggle.scene.choose import Choice
+from mkpc_kaggle.scene.known_focals import KnownFocals
 
 PUBLISH_SECONDS, PUBLISH_SHARE = 30.0, 0.05
 """How often the submission is written: at most that share of the time goes into it."""
@@ -246,10 +247,12 @@ class Engine:
         self.planner.reserve = self.scenes.reserve(at_once)
 
     def _scene_job(self, batch: str) -> SceneJob:
-        assert self.recipe.scene is not None
+        recipe = self.recipe
+        assert recipe.scene is not None
+        known_focals = KnownFocals(recipe.magsac, recipe.focal, recipe.scene.focal_sigma) if recipe.focal else None
         found = (index for index in self.scenes.batches[batch] if self.planner.records[index].units)
         pairs = tuple(map(self._scene_pair, found))
-        return SceneJob(batch, pairs, self.recipe.scene)
+        return SceneJob(batch, pairs, recipe.scene, known_focals)
 
     def _scene_pair(self, index: int) -> ScenePair:
         record = self.planner.records[index]

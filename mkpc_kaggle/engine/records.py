@@ -37,7 +37,8 @@ class PairRecord:
     ``failure`` is empty, or says why ``F`` is the fallback. The seconds are those of all jobs on the pair.
     ``before`` is the number of inliers that it had when it was first upgraded; ``None`` if it never was.
     ``scene`` is what its batch's reconstruction says of it, ``None`` if there was none. ``versions`` tell the
-    contents of the two images that were matched, empty where no file tells them.
+    contents of the two images that were matched, empty where no file tells them. ``magsac`` is MAGSAC's F alone,
+    where ``F`` comes from more than that.
     """
 
     index: int
@@ -51,6 +52,7 @@ class PairRecord:
     before: int | None = None
     scene: Choice | None = None
     versions: tuple[str, ...] = ()
+    magsac: Matrix3 | None = None
 
     @classmethod
     def untouched(cls, index: int, reason: str = NOT_REACHED) -> "PairRecord":
@@ -73,9 +75,16 @@ class PairRecord:
             )
             for result, mask in zip(match.results, inliers, strict=True)
         )
-        estimate, seconds = match.estimate, (match.decode_seconds, match.cluster_seconds, match.estimate_seconds)
+        found, seconds = match.estimate, (match.decode_seconds, match.cluster_seconds, match.estimate_seconds)
         return cls(
-            index, estimate.matrix, estimate.failure, units, match.regions, *seconds, versions=match.versions
+            index,
+            found.matrix,
+            found.failure,
+            units,
+            match.regions,
+            *seconds,
+            versions=match.versions,
+            magsac=found.magsac,
         )
 
     def after(self, former: "PairRecord", before: int | None) -> "PairRecord":
@@ -92,14 +101,14 @@ class PairRecord:
 
     @property
     def fundamental(self) -> Matrix3:
-        """The scene's F where it has one, else its own."""
+        """What its batch's reconstruction gives it, else its own."""
         return self.F if self.scene is None or self.scene.F is None else self.scene.F
 
     @property
     def source(self) -> str:
         """Where :attr:`fundamental` comes from: "scene", "pair" or "fallback"."""
-        if self.scene is not None and self.scene.from_scene:
-            return "scene"
+        if self.scene is not None and self.scene.F is not None:
+            return "scene" if self.scene.from_scene else "pair"
         return "fallback" if self.failure else "pair"
 
     @property

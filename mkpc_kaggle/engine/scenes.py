@@ -16,6 +16,7 @@ from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import Matrix3, Model
 from mkpc_kaggle.scene.choose import Choice
 from mkpc_kaggle.scene.config import SceneConfig
+from mkpc_kaggle.scene.known_focals import KnownFocals
 from mkpc_kaggle.scene.model import Scene
 from mkpc_kaggle.scene.unasked import unasked_pairs
 
@@ -46,6 +47,7 @@ class SceneJob:
     batch: str
     pairs: tuple[ScenePair, ...]
     config: SceneConfig
+    known_focals: KnownFocals | None = None
 
 
 SceneAnswer = tuple[tuple[Scene, ...], dict[int, Choice]]
@@ -68,7 +70,7 @@ def reconstruct(job: SceneJob, read: Callable[[Path], Image | Unreadable] = read
     from mkpc_kaggle.scene.solve import solve
 
     readable, batch = batch_of([(pair.images, pair.matches, pair.own) for pair in job.pairs], read)
-    solution = solve(batch, job.config)
+    solution = solve(batch, job.config, job.known_focals)
     indices = [job.pairs[place].index for place in readable]
     return solution.scenes, dict(zip(indices, solution.choices, strict=True))
 

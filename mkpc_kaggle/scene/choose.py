@@ -26,14 +26,16 @@ class Reason(StrEnum):
 
 @dataclass(frozen=True, eq=False)
 class Choice:
-    """``F`` is the scene's, (3, 3) of unit norm with x1^T F x0 = 0; ``None`` where the pair keeps its own."""
+    """``F`` is the scene's, (3, 3) of unit norm with x1^T F x0 = 0, or that of the pair's own matches at the focal
+    lengths that the scene found; ``None`` where the pair keeps the F that it had.
+    """
 
     F: Matrix3 | None
     reason: Reason
 
     @property
     def from_scene(self) -> bool:
-        return self.F is not None
+        return self.reason is Reason.SCENE
 
 
 def choose(

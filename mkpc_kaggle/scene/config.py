@@ -32,6 +32,9 @@ class SceneConfig:
     gets others that no row names, matched by the recipe's first unit; 0: none. Above ``most_images`` it
     gets none, and is reconstructed in overlapping parts, by the incremental mapper whatever ``mapper`` says.
 
+    A pair that the scene gives no F is estimated anew from its own matches: ``focal_sigma`` is the standard
+    deviation of the logarithm of a focal length that the scene found, where the recipe has a prior on them.
+
     Checks: an image's focal length is between ``lowest_focal`` and ``highest_focal`` long sides, and it sees
     ``least_points`` points. A pair keeps its own F if ``contradiction_matches`` of its matches are within
     ``contradiction_error`` pixels of it and the scene's has less than ``contradiction_share`` of as many.
@@ -53,6 +56,7 @@ class SceneConfig:
     contradiction_error: float = 2.0
     contradiction_matches: int = 30
     contradiction_share: float = 0.05
+    focal_sigma: float = 0.1
     seed: int = 0
     threads: int = 1
 
@@ -73,6 +77,7 @@ class SceneConfig:
             contradiction_error=POSITIVE,
             contradiction_matches=AT_LEAST_1,
             contradiction_share=SHARE,
+            focal_sigma=POSITIVE,
             seed=Range(0, 2**31 - 1),
             threads=AT_LEAST_1,
         )

@@ -1,13 +1,14 @@
 """The layer's face: a batch in, cameras and the pairs' choices out; plain values that go through a pipe."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from mkpc_kaggle.scene.batch import Batch, BatchImage, distinct_images, edges_of
+from mkpc_kaggle.scene.batch import Batch, BatchImage, BatchPair, distinct_images, edges_of
 from mkpc_kaggle.scene.checks import believable
-from mkpc_kaggle.scene.choose import Choice, choose
+from mkpc_kaggle.scene.choose import Choice, Reason, choose
 from mkpc_kaggle.scene.config import SceneConfig
 from mkpc_kaggle.scene.graph import Component, components
 from mkpc_kaggle.scene.keypoints import scene_keypoints
+from mkpc_kaggle.scene.known_focals import KnownFocals
 from mkpc_kaggle.scene.model import Model, PlacedImage, Scene
 
 
@@ -29,9 +30,10 @@ class Solution:
         return found[0] if found else None
 
 
-def solve(batch: Batch, config: SceneConfig) -> Solution:
+def solve(batch: Batch, config: SceneConfig, known_focals: KnownFocals | None = None) -> Solution:
     """Reconstruct every connected component of a batch, and choose an F for each pair.
 
+    With ``known_focals``, pairs that get no F from their cameras are estimated anew where a focal length is known.
     Whatever the matches are, the answer is a :class:`Solution`: what could not be had has a reason. It takes
     seconds to minutes and may end the process, see :mod:`mkpc_kaggle.scene.reconstruct`.
     """
@@ -47,7 +49,27 @@ def solve(batch: Batch, config: SceneConfig) -> Solution:
         choose(models, name_of[pair.image0], name_of[pair.image1], pair.matches, pair.own, config)
         for pair in batch.pairs
     )
+    if known_focals is not None:
+        of_name = {image.name: image for image in images}
+        choices = tuple(
+            _at_known_focals(
+                choice, pair, (of_name[name_of[pair.image0]], of_name[name_of[pair.image1]]), models, known_focals
+            )
+            for choice, pair in zip(choices, batch.pairs, strict=True)
+        )
     return Solution(scenes, choices, tuple(name_of.items()))
+
+
+def _at_known_focals(
+    choice: Choice,
+    pair: BatchPair,
+    images: tuple[BatchImage, BatchImage],
+    models: tuple[Model, ...],
+    known_focals: KnownFocals,
+) -> Choice:
+    if choice.from_scene or choice.reason is Reason.SAME_IMAGE:
+        return choice
+    return replace(choice, F=known_focals.fundamental(models, *images, pair.matches))
 
 
 def scene_of(component: Component, images: tuple[BatchImage, ...], config: SceneConfig) -> Scene:

@@ -1,0 +1,44 @@
+"""F of a pair that the scene gives none, from its own matches, at the focal lengths that the scene knows."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from mkpc_kaggle.geometry.focal_prior import FocalConfig, FocalPrior, estimate_with_prior
+from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.geometry.robust import Matrix3, RobustConfig
+from mkpc_kaggle.scene.batch import BatchImage
+from mkpc_kaggle.scene.choose import placed_in
+from mkpc_kaggle.scene.model import Model
+
+
+@dataclass(frozen=True)
+class KnownFocals:
+    """How F is estimated: ``magsac`` and ``focal`` are those of a pair alone, but the log focal length of an image
+    that has a camera in a model has the standard deviation ``sigma``.
+    """
+
+    magsac: RobustConfig
+    focal: FocalConfig
+    sigma: float
+
+    def fundamental(
+        self, models: Sequence[Model], image0: BatchImage, image1: BatchImage, matches: Matches
+    ) -> Matrix3 | None:
+        """F, (3, 3); ``None`` where neither image has a camera or the matches give none."""
+        focals = focal_in(models, image0.name), focal_in(models, image1.name)
+        if focals == (None, None):
+            return None
+        first, second = (
+            FocalPrior.of_image(image.size, self.focal)
+            if focal is None
+            else FocalPrior.of_focal(focal, self.sigma, image.size)
+            for image, focal in zip((image0, image1), focals, strict=True)
+        )
+        found = estimate_with_prior(matches, (first, second), self.magsac, self.focal)
+        return found.matrix if found.ok else None
+
+
+def focal_in(models: Sequence[Model], name: str) -> float | None:
+    """The focal length, in pixels, of an image's camera in the first model that has it."""
+    placed = [image for model in models if (image := placed_in(model, name)) is not None]
+    return placed[0].focal if placed else None
