@@ -158,6 +158,14 @@ def test_memory_that_ends_within_pycolmap_costs_the_scene_alone(
     assert report.scenes[0].failure
 
 
+def test_a_gigabyte_is_enough_for_a_small_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fault(monkeypatch, "scene_in_a_gigabyte")
+    report = run(synthetic_pairs(tmp_path / "images"), SYNTHETIC, SyntheticMatcher(), tmp_path / "work")
+    assert report.ending is Ending.COMPLETE
+    assert report.faults == ()
+    assert [record.source for record in report.records] == ["scene"] * 15
+
+
 def test_a_recipe_without_scenes_starts_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     fault(monkeypatch, "die_as_scene")
     report = run(batch_pairs(tmp_path / "images"), Recipe((SWEEP,)), RectifiedMatcher(), tmp_path / "work")

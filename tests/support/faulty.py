@@ -241,6 +241,12 @@ def exhaust_memory_within_pycolmap(job: SceneJob, answers: Connection) -> None:
     serve_scene(job, answers)
 
 
+def scene_in_a_gigabyte(job: SceneJob, answers: Connection) -> None:
+    """All that it may have; libraries that are only mapped are not counted."""
+    resource.setrlimit(resource.RLIMIT_DATA, (1 << 30, 1 << 30))
+    serve_scene(job, answers)
+
+
 def scene_without_pycolmap(job: SceneJob, answers: Connection) -> None:
     sys.modules["pycolmap"] = None  # type: ignore[assignment]  # an import of it fails now
     serve_scene(job, answers)
