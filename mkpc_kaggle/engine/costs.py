@@ -122,9 +122,9 @@ class Timeouts:
     """When a silent worker is taken to hang: after ``floor`` seconds and ``factor`` times what a unit should take.
 
     It is heard of before each unit on each ``batch`` of pairs. ``unknown`` seconds are allowed where nobody knows
-    what a unit costs. A machine that is ten times slower of a sudden does not hang. A short run waits less: for
-    ``share`` of its limit, but ``least`` seconds, in place of the floor; for an unknown unit as long as it may be
-    explored.
+    what a unit costs. A machine that suddenly becomes ten times slower is not taken to hang. A short run
+    waits less: for ``share`` of its limit, but ``least`` seconds, in place of the floor; for an unknown unit as
+    long as it may be explored.
     """
 
     floor: float = 60.0

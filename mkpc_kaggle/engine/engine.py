@@ -168,8 +168,8 @@ class Engine:
 
         Waits for the engine's own thread until the limit is almost over where that is at it.
         """
-        patience = self.budget.over - self.budget.reserve / 8 - self.budget.clock()
-        if not self._publishing.acquire(timeout=max(0.0, patience)):
+        left = self.budget.over - self.budget.reserve / 8 - self.budget.clock()
+        if not self._publishing.acquire(timeout=max(0.0, left)):
             return "the time was up before the last version of the submission was written"
         if not self._ended:
             self._write()

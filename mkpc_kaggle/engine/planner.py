@@ -21,7 +21,7 @@ EXPLORE_SHARE = 0.25
 JOB_SHARE = 0.05
 """The share of the time left that a job may be expected to take: what a job found late comes too late."""
 DEADLINE_SHARE = 0.5
-"""The share of the time left after which a job begins no unit: where all is slower of a sudden, that is learnt."""
+"""The share of the time left after which a job begins no unit, so that a sudden slowdown is noticed."""
 CONNECT_SHARE = 0.1
 """The share of the time left after the sweep that pairs may take which no row names."""
 RESERVE_SHARE = 0.2
