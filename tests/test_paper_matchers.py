@@ -175,7 +175,16 @@ def run(
         make_submission(
             monkeypatch,
             *("--test-dir", test_dir, "--output", output, "--recipe", write_recipe(tmp_path, matcher, easy=easy)),
-            *("--weights", checkpoints.directory, "--time-limit", "10m", "--device", "cpu", *workers),
+            *(
+                "--weights",
+                checkpoints.directory,
+                "--time-limit",
+                "10m",
+                "--device",
+                "cpu",
+                "--no-report",
+                *workers,
+            ),
         )
         assert_good(output, test_dir)
         return Made(output, matches_found(tmp_path / f"{name}.work"))

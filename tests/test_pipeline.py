@@ -23,7 +23,8 @@ from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL, Model, Origin
 from mkpc_kaggle.matchers.contract import Colour, MatcherSpec, Placement
 from mkpc_kaggle.matchers.sift import SiftMatcher, SiftOptions
 from mkpc_kaggle.pipeline import units
-from mkpc_kaggle.pipeline.assembly import Licence, assemble
+from mkpc_kaggle.pipeline.assembly import assemble
+from mkpc_kaggle.pipeline.obstacles import Licence
 from mkpc_kaggle.pipeline.pair import PairMatch, with_estimate
 from mkpc_kaggle.pipeline.stages import Pipeline
 from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher

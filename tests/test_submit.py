@@ -70,10 +70,10 @@ def test_a_submission_is_made_resumed_and_repeated_to_the_byte(
     assert "complete after" in first.stdout
     assert_good(output, demo.test_dir)
     written = output.read_bytes()
-    second = make(demo.test_dir, output, recipe)
+    second = make(demo.test_dir, output, recipe, "--no-report")
     assert "8 of them from earlier runs" in second.stdout
     assert output.read_bytes() == written
-    make(demo.test_dir, tmp_path / "again.csv", recipe)
+    make(demo.test_dir, tmp_path / "again.csv", recipe, "--no-report")
     assert (tmp_path / "again.csv").read_bytes() == written
 
 
@@ -81,8 +81,10 @@ def test_a_killed_run_goes_on_and_ends_with_the_bytes_of_an_undisturbed_one(
     demo: DemoSet, recipe: Path, tmp_path: Path
 ) -> None:
     undisturbed, output = tmp_path / "undisturbed.csv", tmp_path / "submission.csv"
-    make(demo.test_dir, undisturbed, recipe)
-    running = subprocess.Popen(command(demo.test_dir, output, recipe), stderr=subprocess.PIPE, text=True)
+    make(demo.test_dir, undisturbed, recipe, "--no-report")
+    running = subprocess.Popen(
+        command(demo.test_dir, output, recipe, "--no-report"), stderr=subprocess.PIPE, text=True
+    )
     assert running.stderr is not None
     for line in running.stderr:  # the progress: the first deepened pair
         if line.startswith("deepen"):
@@ -91,7 +93,7 @@ def test_a_killed_run_goes_on_and_ends_with_the_bytes_of_an_undisturbed_one(
     running.wait()
     running.stderr.close()
     assert_good(output, demo.test_dir)
-    resumed = make(demo.test_dir, output, recipe)
+    resumed = make(demo.test_dir, output, recipe, "--no-report")
     assert resumed.returncode == 0, resumed.stderr
     assert output.read_bytes() == undisturbed.read_bytes()
 
@@ -321,12 +323,12 @@ def test_a_recipe_with_an_unknown_key_is_refused_with_the_known_ones(
 
 
 def test_another_recipe_in_the_same_work_directory_is_refused(demo: DemoSet, recipe: Path, tmp_path: Path) -> None:
-    output = tmp_path / "submission.csv"
-    make(demo.test_dir, output, recipe)
+    output, here = tmp_path / "submission.csv", ("--workers", "0", "--no-report")
+    make(demo.test_dir, output, recipe, *here)
     written = output.read_bytes()
     recipe.write_text(RECIPE.replace("400", "401"))
-    refused = make(demo.test_dir, output, recipe)
+    refused = make(demo.test_dir, output, recipe, *here)
     assert refused.returncode == 2
     assert "belongs to another run: its recipe differ" in refused.stderr
     assert output.read_bytes() == written
-    assert make(demo.test_dir, output, recipe, "--fresh").returncode == 0
+    assert make(demo.test_dir, output, recipe, "--fresh", *here).returncode == 0

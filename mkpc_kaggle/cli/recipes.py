@@ -17,7 +17,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    from mkpc_kaggle.pipeline.assembly import what_is_missing
+    from mkpc_kaggle.pipeline.obstacles import what_is_missing
     from mkpc_kaggle.pipeline.uses import slots_of_recipe, unusable
     from mkpc_kaggle.recipe import load_recipe, recipe_names
     from mkpc_kaggle.weights import WeightStore

@@ -2,33 +2,24 @@
 
 from collections.abc import Callable, Container, Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.matchers.contract import Matcher, Placement, Precision
-from mkpc_kaggle.matchers.registry import load_matcher, spec_of
+from mkpc_kaggle.matchers.registry import load_matcher
 from mkpc_kaggle.pipeline.failures import require_device
 from mkpc_kaggle.pipeline.gpus import capabilities, encoding_cache_bytes, gpus_of
+from mkpc_kaggle.pipeline.obstacles import Check, Hindrance, Licence, Obstacle, require_none
 from mkpc_kaggle.pipeline.stages import Pipeline
 from mkpc_kaggle.pipeline.units import ENCODING_CACHE_BYTES
-from mkpc_kaggle.pipeline.uses import options_of, slots_of, unusable
+from mkpc_kaggle.pipeline.uses import options_of, slots_of
 from mkpc_kaggle.recipe import Mode, Recipe, Unit, load_recipe
 from mkpc_kaggle.weights import FoundFile, WeightStore
 from mkpc_kaggle.weights.notices import warn_once
 
 AUTO = "auto"
 CUDA_BATCH = 8
-PERMISSIVE_TAGS = frozenset({"Apache-2.0", "BSD-3-Clause", "MIT"})
-
-
-class Licence(StrEnum):
-    """Which weights may be used, by their licence."""
-
-    ANY = "any"
-    PERMISSIVE = "permissive"
-    """those that may be used for any purpose: Apache-2.0, BSD-3-Clause, MIT"""
 
 
 @dataclass(frozen=True)
@@ -135,99 +126,42 @@ def assemble(
     ``None``: as the recipe has it.
     """
     own = matchers or {}
-    store = WeightStore(weights)
+    check = Check(WeightStore(weights), licence, own)
     written = load_recipe(recipe) if isinstance(recipe, str) else recipe
-    whole = with_fallbacks(written, store, licence, own)
-    broken = unusable(not_own(whole.matcher_names, own)) if recipe == AUTO else ()
-    for one in broken:
-        warn_once(f"recipe auto does without it: {one}")
-    unusable_names = {one.name for one in broken}
-    wanted = whole.only(lambda unit: unit.matcher not in unusable_names)
-    for name in sorted({*wanted.matcher_names, *wanted.matchers} - own.keys() - unusable_names):
-        options_of(wanted, name)
-    refused = restricted(wanted, store, own) if licence is Licence.PERMISSIVE else {}
-    if refused and recipe != AUTO:
-        weights_of = ", ".join(f"{name} ({', '.join(sorted(tags))})" for name, tags in refused.items())
-        raise UserError(
-            f"--licence permissive refuses recipe {wanted.name!r} for the weights of {weights_of}. Take a recipe "
-            "without them, such as permissive, or --recipe auto, which leaves them out."
-        )
-    missing = missing_slots(wanted, store, own)
-    if missing and recipe != AUTO:
-        raise UserError(
-            f"recipe {wanted.name!r} needs weights that were not found ({what_is_missing(missing, store)}). "
-            "Name their directory with --weights, or use --recipe auto, which does with what there is."
-        )
-    lacking = {n for n in not_own(wanted.matcher_names, own) if not set(missing).isdisjoint(slots_of(wanted, [n]))}
+    whole = with_fallbacks(written, check)
+    obstacles = check.obstacles(whole, whole.matcher_names, load=recipe == AUTO)
     if recipe == AUTO:
-        lacking |= unreadable(wanted, store, not_own(wanted.matcher_names, {*own, *lacking, *refused}))
-    chosen = wanted.only(lambda unit: unit.matcher not in lacking | refused.keys()).with_scenes(scenes)
+        warn_of(obstacles)
+    else:
+        require_none(whole, obstacles, check.store)
+    left = {one.matcher for one in obstacles}
+    for name in sorted(whole.matchers.keys() - own.keys() - left):
+        options_of(whole, name)  # those of a matcher that no unit names are checked too
+    chosen = whole.only(lambda unit: unit.matcher not in left).with_scenes(scenes)
     left_out = tuple(unit for unit in written.units if replace(unit, fallback="") not in chosen.units)
-    return Assembly(chosen.in_mode(mode), store, resolve_placement(device, precision), left_out, own, device)
+    return Assembly(chosen.in_mode(mode), check.store, resolve_placement(device, precision), left_out, own, device)
 
 
-def with_fallbacks(
-    recipe: Recipe, store: WeightStore, licence: Licence, own: Mapping[str, Matcher[Any]]
-) -> Recipe:
-    """The recipe with its fallbacks for matchers that cannot run here, or not with weights there and permitted."""
+def with_fallbacks(recipe: Recipe, check: Check) -> Recipe:
+    """The recipe with its fallbacks for matchers that cannot run here."""
     fallbacks = {unit.matcher: unit.fallback for unit in recipe.units if unit.fallback}
-    for name in not_own(fallbacks.values(), own):
+    for name in not_own(fallbacks.values(), check.own):
         options_of(recipe, name)  # an unknown one is an error even where it is not needed
-    unfit = {
-        name
-        for name in not_own(fallbacks, own)
-        if unusable([name])
-        or None in map(store.find, slots_of(recipe, [name]))
-        or (licence is Licence.PERMISSIVE and licences_of(recipe, name, store, own) - PERMISSIVE_TAGS)
-    }
-    return recipe.decided(unfit)
+    return recipe.decided({one.matcher for one in check.obstacles(recipe, not_own(fallbacks, check.own))})
 
 
-def missing_slots(recipe: Recipe, store: WeightStore, own: Container[str] = ()) -> list[str]:
-    """What the recipe's matchers need of the manifest and the store has not."""
-    slots = slots_of(recipe, not_own(recipe.matcher_names, own))
-    return [slot for slot in slots if store.find(slot) is None]
-
-
-def unreadable(recipe: Recipe, store: WeightStore, names: Iterable[str]) -> set[str]:
-    """The matchers that cannot load their weights. Only files without a digest to compare with are tried."""
-    bad = set()
-    for name in names:
-        found = [store.find(slot) for slot in slots_of(recipe, [name])]
-        try:
-            if any(file is not None and not file.verified for file in found):
-                load_matcher(name, store, options_of(recipe, name), Placement())
-        except UserError as error:
-            warn_once(f"recipe auto does without {name}: {error}")
-            bad.add(name)
-    return bad
+def warn_of(obstacles: Iterable[Obstacle]) -> None:
+    """Recipe ``auto`` says what is broken; that weights are not there is in its summary."""
+    for one in obstacles:
+        if one.hindrance is Hindrance.BROKEN:
+            warn_once(f"recipe auto does without it: {one.details[0]}")
+        elif one.hindrance is Hindrance.UNREADABLE:
+            warn_once(f"recipe auto does without {one.matcher}: {one.details[0]}")
 
 
 def not_own(names: Iterable[str], own: Container[str]) -> list[str]:
     """The names but those of the user's own matchers, which bring their weights along."""
     return [name for name in names if name not in own]
-
-
-def restricted(recipe: Recipe, store: WeightStore, own: Mapping[str, Matcher[Any]]) -> dict[str, set[str]]:
-    """The recipe's matchers whose weights are not all permissively licensed, with the licences that are not."""
-    tags = {name: licences_of(recipe, name, store, own) - PERMISSIVE_TAGS for name in recipe.matcher_names}
-    return {name: others for name, others in tags.items() if others}
-
-
-def licences_of(recipe: Recipe, name: str, store: WeightStore, own: Mapping[str, Matcher[Any]]) -> set[str]:
-    """What a matcher says of its weights, and what the manifest says of the files that were found for it."""
-    if name in own:
-        return set(own[name].spec.licences)
-    found = [store.find(slot) for slot in slots_of(recipe, [name])]
-    return {
-        *spec_of(name, f"recipe {recipe.name!r}").licences,
-        *(weights.file.licence for weights in found if weights),
-    }
-
-
-def what_is_missing(slots: Iterable[str], store: WeightStore) -> str:
-    """The file names that would fill the slots."""
-    return "; ".join(f"{slot}: {' or '.join(file.name for file in store.alternatives(slot))}" for slot in slots)
 
 
 def resolve_placement(device: str, precision: str) -> Placement:

@@ -11,7 +11,8 @@ from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Pixels
 from mkpc_kaggle.geometry.robust import Matrix3, Model
 from mkpc_kaggle.matchers.contract import Matcher
-from mkpc_kaggle.pipeline.assembly import Licence, assemble
+from mkpc_kaggle.pipeline.assembly import assemble
+from mkpc_kaggle.pipeline.obstacles import Licence
 from mkpc_kaggle.pipeline.pair import PairMatch, with_estimate
 from mkpc_kaggle.recipe import Recipe
 
