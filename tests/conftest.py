@@ -7,6 +7,7 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 from mkpc_kaggle.demo import DemoSet, write_demo
+from mkpc_kaggle.weights import store as weight_store
 
 # Before torch is imported, here and in the processes of the tests: their tensors are small, and on a busy machine
 # threads wait for each other more than they work.
@@ -39,3 +40,10 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> DemoSet:
 def clean_environment(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.delenv("MKPC_WEIGHTS", raising=False)
     monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture
+def nowhere_else(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Weights are searched only in the directories that a test names."""
+    monkeypatch.delenv("MKPC_WEIGHTS", raising=False)
+    monkeypatch.setattr(weight_store, "KAGGLE_INPUT", tmp_path / "no kaggle")

@@ -13,7 +13,7 @@ from zipfile import ZipFile
 import pytest
 import torch
 from kaggle_image import UNPACKED, environment, pack_wheel, python_version, upload
-from weight_files import digest_of, line, put, search_nowhere_else
+from weight_files import digest_of, line, put
 
 from mkpc_kaggle.cli import main
 from mkpc_kaggle.errors import UserError
@@ -41,8 +41,7 @@ FILES = (
 
 
 @pytest.fixture(autouse=True)
-def own_manifest(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    search_nowhere_else(monkeypatch, tmp_path)
+def own_manifest(monkeypatch: pytest.MonkeyPatch, nowhere_else: None) -> None:
     monkeypatch.setattr(store, "manifest", lambda: FILES)
 
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 from shared import WEIGHTS, needs_weights
 from web import Site, serve
-from weight_files import DATA, OTHER, digest_of, line, put, search_nowhere_else
+from weight_files import DATA, OTHER, digest_of, line, put
 
 from mkpc_kaggle.cli import main
 from mkpc_kaggle.pipeline.uses import files_of
@@ -24,8 +24,7 @@ FILES = (
 
 
 @pytest.fixture(autouse=True)
-def own_manifest(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    search_nowhere_else(monkeypatch, tmp_path)
+def own_manifest(monkeypatch: pytest.MonkeyPatch, nowhere_else: None) -> None:
     monkeypatch.setattr(store, "manifest", lambda: FILES)
 
 

@@ -10,16 +10,13 @@ from zipfile import ZipFile
 import pytest
 import torch
 from shared import WEIGHTS, needs_weights
-from weight_files import DATA, OTHER, digest_of, line, put, search_nowhere_else
+from weight_files import DATA, OTHER, digest_of, line, put
 
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.weights import UNVERIFIED, FoundFile, State, WeightStore, digests, load_tensors, store, tree
 from mkpc_kaggle.weights.convert import convert
 
-
-@pytest.fixture(autouse=True)
-def nowhere_else(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    search_nowhere_else(monkeypatch, tmp_path)
+pytestmark = pytest.mark.usefixtures("nowhere_else")
 
 
 def found_by(weights: WeightStore, slot: str = "slot") -> Path:
@@ -219,7 +216,6 @@ def test_an_unpacked_checkpoint_whose_record_is_cut_off_is_refused_when_it_is_re
 def test_a_manifest_beside_weights_adds_lines_and_overrides_none(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    search_nowhere_else(monkeypatch, tmp_path)
     monkeypatch.setattr(store, "manifest", lambda: (line("a.bin"),))
     put(tmp_path / "deep", "b.bin", OTHER)
     lines = (line("a.bin", OTHER), line("b.bin", OTHER))

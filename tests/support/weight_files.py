@@ -3,18 +3,10 @@
 import hashlib
 from pathlib import Path
 
-import pytest
-
-from mkpc_kaggle.weights import WeightFile, store
+from mkpc_kaggle.weights import WeightFile
 
 DATA = b"these are the weights"
 OTHER = b"those were the weights"[:21]
-
-
-def search_nowhere_else(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Only the directories that a test names are searched."""
-    monkeypatch.delenv("MKPC_WEIGHTS", raising=False)
-    monkeypatch.setattr(store, "KAGGLE_INPUT", tmp_path / "no kaggle")
 
 
 def digest_of(data: bytes) -> str:

@@ -1,0 +1,189 @@
+"""Putting a run together: which units a recipe keeps here, and why others go or are refused."""
+
+from dataclasses import dataclass, replace
+
+import pytest
+import torch
+from shared import WEIGHTS, needs_weights
+from weight_files import digest_of
+
+from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.matchers.contract import MatcherSpec, Placement
+from mkpc_kaggle.pipeline.assembly import assemble
+from mkpc_kaggle.pipeline.obstacles import Licence
+from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher
+from mkpc_kaggle.recipe import Mode, Recipe, Unit, load_recipe
+from mkpc_kaggle.weights import WeightFile, manifest
+from mkpc_kaggle.weights import store as weight_store
+
+pytestmark = pytest.mark.usefixtures("nowhere_else")
+
+
+@dataclass
+class Own:
+    """A matcher of one's own that is never run."""
+
+    spec: MatcherSpec
+
+
+def own(*licences):
+    return {"own": Own(MatcherSpec("own", "for tests", licences=licences))}
+
+
+def test_recipe_auto_leaves_out_the_units_whose_weights_are_missing():
+    assembly = assemble("auto")
+    recipe = load_recipe("auto")
+    assert assembly.recipe.matcher_names == ("sift",)
+    assert assembly.left_out == tuple(unit for unit in recipe.units if unit.matcher != "sift")
+    assert assembly.left_out
+    assert assembly.fingerprint()["weights"] == {}
+
+
+@needs_weights
+def test_recipe_auto_takes_all_whose_weights_are_there():
+    assembly = assemble("auto", weights=[WEIGHTS])
+    recipe = load_recipe("auto")
+    there = {"xfeat_lighterglue", "sift", "aliked"}
+    assert set(assembly.recipe.matcher_names) == there
+    assert assembly.recipe == recipe.only(lambda unit: unit.matcher in there)
+    assert assembly.left_out == tuple(unit for unit in recipe.units if unit not in assembly.recipe.units)
+    assert all(digest.startswith("sha256:") for digest in assembly.fingerprint()["weights"].values())
+    assert set(assembly.fingerprint()["weights"]) == {"xfeat", "xfeat-lighterglue", "aliked-n16"}
+
+
+@pytest.mark.parametrize("recipe", ["light", replace(load_recipe("light"), name="x")])
+def test_a_named_recipe_without_its_weights_is_refused_with_the_file_names(recipe):
+    with pytest.raises(
+        UserError, match=r"needs weights.*xfeat\.pt or xfeat_sparse.*aliked-n16\.pth or .*--weights"
+    ):
+        assemble(recipe)
+
+
+@needs_weights
+def test_a_fallback_stands_in_for_a_matcher_whose_weights_are_missing():
+    assembly, recipe = assemble("light", weights=[WEIGHTS]), load_recipe("light")
+    assert assembly.recipe.matcher_names == ("xfeat_lighterglue", "sift", "aliked")
+    assert [unit.name for unit in assembly.left_out] == ["1:aliked_lightglue@1024", "2:aliked_lightglue@800"]
+    assert [unit.stage for unit in assembly.recipe.units] == [unit.stage for unit in recipe.units]
+    assert assembly.recipe.fingerprint() == assembly.recipe.decided(()).fingerprint()
+
+
+def test_an_unknown_fallback_is_refused_even_where_it_is_not_needed():
+    with pytest.raises(UserError, match="unknown matcher 'alked'"):
+        assemble(Recipe((Unit(1, "sift", 640, fallback="alked"),)))
+
+
+def standins(directory, *names):
+    """A search directory with files of these names, and a manifest that knows them by slot and licence."""
+    for name, _, _ in names:
+        (directory / name).write_bytes(name.encode())
+    return [WeightFile(name, -1, digest_of(name.encode()), licence, slot, "here") for name, slot, licence in names]
+
+
+SUPERGLUE = (
+    ("sp.pth", "superpoint", "Magic-Leap-noncommercial"),
+    ("sg.pth", "superglue-outdoor", "Magic-Leap-noncommercial"),
+)
+PERMITTED = (("loftr.ckpt", "loftr-outdoor", "Apache-2.0"), ("dkm.pth", "dkm-outdoor", "MIT"))
+
+
+@pytest.fixture
+def known_files(monkeypatch, tmp_path):
+    """SuperGlue's, LoFTR's and DKM's weights are there, DKM's also for indoors, of unclear terms."""
+    files = standins(tmp_path, *SUPERGLUE, *PERMITTED, ("dkm_in.pth", "dkm-indoor", "unclear"))
+    others = [file for file in manifest() if file.slot not in {known.slot for known in files}]
+    monkeypatch.setattr(weight_store, "manifest", lambda: (*files, *others))
+    return tmp_path
+
+
+def test_a_permissive_run_leaves_out_of_recipe_auto_what_is_licensed_otherwise(known_files):
+    every = assemble("auto", weights=[known_files])
+    assert every.recipe.matcher_names == ("superglue", "loftr", "sift", "dkm")
+    some = assemble("auto", weights=[known_files], licence=Licence.PERMISSIVE)
+    assert some.recipe.matcher_names == ("loftr", "sift", "dkm")
+    assert {unit.matcher for unit in some.left_out} >= {"superglue", "aspanformer"}
+    assert set(some.fingerprint()["weights"]) == {"loftr-outdoor", "dkm-outdoor"}
+
+
+@pytest.mark.filterwarnings("ignore:.*is not verified")
+def test_a_fallback_stands_in_for_a_matcher_whose_weights_are_not_permitted_or_not_there(known_files):
+    recipe = Recipe((Unit(1, "superglue", 640, fallback="loftr"), Unit(2, "dkm", area="90x120")))
+    every = assemble(recipe, weights=[known_files])
+    assert (every.recipe.matcher_names, every.left_out) == (("superglue", "dkm"), ())
+    some = assemble(recipe, weights=[known_files], licence=Licence.PERMISSIVE)
+    assert (some.recipe.matcher_names, some.left_out) == (("loftr", "dkm"), recipe.units[:1])
+    (known_files / "sp.pth").unlink()
+    assert assemble(recipe, weights=[known_files]).recipe == some.recipe
+
+
+@pytest.mark.parametrize("recipe", ["yfcc", "imc2022", load_recipe("scannet")])
+def test_a_permissive_run_refuses_a_recipe_by_matcher_and_licence_and_says_what_to_do(recipe):
+    says = r"permissive refuses recipe '\w+' .*superglue \(Magic-Leap-noncommercial\).*recipe auto"
+    with pytest.raises(UserError, match=says):
+        TwoStageMatcher(recipe, licence="permissive")
+
+
+def test_the_licence_of_the_file_counts_too(known_files):
+    recipe = Recipe((Unit(1, "dkm", area="90x120"),), matchers={"dkm": {"training": "outdoor"}})
+    assert assemble(recipe, weights=[known_files], licence=Licence.PERMISSIVE).left_out == ()
+    indoors = replace(recipe, matchers={"dkm": {"training": "indoor"}})
+    assert set(assemble(indoors, weights=[known_files]).fingerprint()["weights"]) == {"dkm-indoor"}
+    with pytest.raises(UserError, match=r"dkm \(unclear\)"):
+        assemble(indoors, weights=[known_files], licence=Licence.PERMISSIVE)
+
+
+def test_the_licence_of_a_matcher_of_ones_own_counts():
+    recipe = Recipe((Unit(1, "own", 480),))
+    for tags in ((), ("MIT",)):
+        assert assemble(recipe, matchers=own(*tags), licence=Licence.PERMISSIVE).recipe == recipe
+    with pytest.raises(UserError, match=r"own \(GPL\)"):
+        assemble(recipe, matchers=own("GPL", "MIT"), licence=Licence.PERMISSIVE)
+
+
+def test_the_permissive_recipe_is_refused_for_nothing_but_missing_weights():
+    for recipe in ("permissive", "best"):
+        with pytest.raises(UserError, match="needs weights"):
+            assemble(recipe, licence=Licence.PERMISSIVE)
+
+
+@pytest.mark.filterwarnings("ignore:.*is not verified")
+@pytest.mark.parametrize("name", ["xfeat_sparse_bnfolded.safetensors", "DKMv3_outdoor.pth"])
+def test_recipe_auto_passes_damaged_weights_over(tmp_path, name):
+    """The second has no digest in the manifest: it is found out when it is read."""
+    (tmp_path / name).write_bytes(b"cut off")
+    with pytest.warns(UserWarning, match=rf"(passed over|does without dkm): .*{name}"):
+        assembly = assemble("auto", weights=[tmp_path])
+    assert not {"dkm", "xfeat_lighterglue"} & set(assembly.recipe.matcher_names)
+
+
+@pytest.mark.parametrize("device", ["gpu", "", "CPU", "mps"])
+def test_an_unknown_device_is_refused_with_the_known_ones(device):
+    with pytest.raises(UserError, match=r"unknown device.*auto, cpu, cuda, cuda:N"):
+        assemble("classical", device=device)
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a GPU")
+def test_a_gpu_that_is_not_there_is_refused_and_auto_takes_the_cpu():
+    with pytest.raises(UserError, match=r"cuda:0.*no GPU.*--device cpu"):
+        assemble("classical", device="cuda:0")
+    assert assemble("classical").placement == Placement()
+
+
+def test_an_unknown_matcher_or_option_is_refused_before_any_work():
+    with pytest.raises(UserError, match="unknown matcher 'own'"):
+        assemble(Recipe((Unit(1, "own", 480),)))
+    with pytest.raises(UserError, match=r"unknown key 'x'"):
+        assemble(Recipe((Unit(1, "sift", 480),), matchers={"sift": {"x": 1}}))
+    with pytest.raises(UserError, match="unknown recipe 'x'"):
+        TwoStageMatcher("x")
+
+
+def test_a_mode_changes_the_units_that_run():
+    assembly = assemble("classical", mode=Mode.STAGE_1)
+    assert {unit.stage for unit in assembly.recipe.units} == {1}
+    assert assembly.fingerprint() != assemble("classical").fingerprint()
+
+
+def test_what_another_precision_computes_is_another_run() -> None:
+    exact, half = (assemble("classical", precision=precision) for precision in ("float32", "bfloat16"))
+    assert exact.fingerprint() != half.fingerprint()
