@@ -21,7 +21,7 @@ from shared import DATA, needs_data
 from standin import scene
 
 from mkpc_kaggle.data.competition import read_submission, read_test_side, submission_problems
-from mkpc_kaggle.engine.journal_tables import FILE_NAME
+from mkpc_kaggle.engine.journal_tables import FILE_NAME, JournalReader
 from mkpc_kaggle.geometry.coordinates import View
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import MatcherSpec, Picture
@@ -119,10 +119,10 @@ def write_pairs(directory: Path, rows: Sequence[tuple[str, ...]]) -> None:
         csv.writer(file).writerows([COLUMNS, *rows])
 
 
-def write_recipe(directory: Path, matcher: str, *, easy: bool) -> Path:
+def write_recipe(directory: Path, matcher: str, *, easy: bool, tables: str = "") -> Path:
     path, trial = directory / "small.toml", TRIALS[matcher]
     units = [f'{{ stage = {n}, matcher = "{matcher}", {size} }}' for n, size in enumerate(trial.sizes, start=1)]
-    options = [f"[matchers.{matcher}]", trial.options, trial.easy if easy else ""]
+    options = [f"[matchers.{matcher}]", trial.options, trial.easy if easy else "", tables]
     path.write_text("\n".join([f"units = [{', '.join(units)}]", *options]), encoding="utf-8")
     return path
 
@@ -167,14 +167,16 @@ def run(
 ) -> Callable[..., Made]:
     """A function that makes a submission of a test side with one of the matchers."""
 
-    def made(matcher: str, test_dir: Path, name: str = "submission", *, easy: bool = False) -> Made:
+    def made(
+        matcher: str, test_dir: Path, name: str = "submission", *, easy: bool = False, tables: str = ""
+    ) -> Made:
         use_manifest(monkeypatch, checkpoints.of(matcher))
         use_narrow(monkeypatch)
         workers = ("--workers", "0") if matcher == "roma" else ()  # other processes know no narrow network
-        output = tmp_path / f"{name}.csv"
+        output, recipe = tmp_path / f"{name}.csv", write_recipe(tmp_path, matcher, easy=easy, tables=tables)
         make_submission(
             monkeypatch,
-            *("--test-dir", test_dir, "--output", output, "--recipe", write_recipe(tmp_path, matcher, easy=easy)),
+            *("--test-dir", test_dir, "--output", output, "--recipe", recipe),
             *(
                 "--weights",
                 checkpoints.directory,
@@ -208,6 +210,22 @@ def test_real_pictures_go_through(run: Callable[..., Made], matcher: str, real_s
     made = run(matcher, real_side, easy=True)
     assert len(made.matches) == 4
     assert min(made.matches.values()) > 0
+
+
+@pytest.mark.parametrize("matcher", ["loma", "roma"])
+def test_a_batch_is_reconstructed_from_their_matches(
+    run: Callable[..., Made], matcher: str, made_side: Path
+) -> None:
+    """All it can come to is a reason: the pictures are pieces of one, which no two cameras have seen."""
+    made = run(matcher, made_side, easy=True, tables="[focal]\n[scene]\nleast_pairs_per_image = 0")
+    work_dir = made.output.with_suffix(".work")
+    with JournalReader(work_dir) as journal:
+        (scene,) = journal.scenes()
+        choices = [journal.records()[pair].scene for pair in range(3)]
+    assert scene.images == 4
+    assert scene.failure or scene.placed
+    assert scene.seconds > 0
+    assert None not in choices
 
 
 class Clump:
