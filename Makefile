@@ -50,7 +50,8 @@ hostile: install
 # Old versions of libraries warn of what newer ones of Python and torch deprecate; test_package.py packs the wheels
 # of the pinned versions, which are not installed there.
 oldest: $(OLDEST)/installed
-	$(OLDEST)/bin/python -m pytest -W ignore::DeprecationWarning --ignore=tests/test_package.py
+	$(OLDEST)/bin/python -m pytest -W ignore::DeprecationWarning --ignore=tests/test_package.py \
+	    --numprocesses $(TEST_PROCESSES) --dist loadfile
 
 $(OLDEST)/installed: pyproject.toml tests/support/oldest.py
 	$(PYTHON311) -m venv --clear $(OLDEST)
