@@ -25,7 +25,6 @@ from benchmarks.merging import merged
 from mkpc_kaggle.data.competition import Scene, TruePair, read_train_side
 from mkpc_kaggle.data.images import ImageStore, Unreadable
 from mkpc_kaggle.engine.jobs import visiting_order
-from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.evaluation.compare import Difference, paired_difference
 from mkpc_kaggle.evaluation.validate import error_of
 from mkpc_kaggle.geometry.matches import Matches
@@ -161,7 +160,7 @@ class ResultsFile:
         whole = text[: text.rfind("\n") + 1]  # a line that was cut off is done again
         head, *lines = whole.splitlines() or [header]
         if head != header:
-            raise UserError(f"{path} was made with other settings; name another --out")
+            raise SystemExit(f"{path} was made with other settings; name another --out")
         for line in lines:
             pair, found = json.loads(line)
             self.found[pair] = {way: Found(PoseError(*error), *rest) for way, (error, *rest) in found.items()}

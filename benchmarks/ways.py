@@ -16,11 +16,11 @@ from tqdm import tqdm
 
 from benchmarks import saved_matches
 from mkpc_kaggle.data.competition import TruePair, read_train_side
-from mkpc_kaggle.data.images import Image, Unreadable, read_image
-from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.data.images import Image
 from mkpc_kaggle.pipeline.assembly import assemble
 from mkpc_kaggle.pipeline.pair import PairMatch
 from mkpc_kaggle.pipeline.stages import Pipeline
+from mkpc_kaggle.pipeline.two_stage import to_image
 from mkpc_kaggle.recipe import Recipe, Unit
 
 XFEAT = (Unit(1, "xfeat_lighterglue", 1024), Unit(2, "xfeat_lighterglue", 1280))
@@ -63,10 +63,7 @@ def readable(true: TruePair, images: dict[Path, Image]) -> tuple[Image, Image]:
     """The two images, read once each."""
     for path in true.pair.images:
         if path not in images:
-            image = read_image(path)
-            if isinstance(image, Unreadable):
-                raise UserError(str(image))
-            images[path] = image
+            images[path] = to_image(path)
     return images[true.pair.image0], images[true.pair.image1]
 
 

@@ -16,7 +16,7 @@ from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Box, Size, View
 from mkpc_kaggle.geometry.critical_region import MkpcConfig
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
-from mkpc_kaggle.geometry.robust import RobustConfig
+from mkpc_kaggle.geometry.robust import Method, RobustConfig
 from mkpc_kaggle.scene.config import SceneConfig
 
 DIRECTORY = Path(__file__).resolve().parent / "recipes"
@@ -186,6 +186,15 @@ class Recipe:
         """The recipe that is run: fallbacks have taken the places of ``unfit`` matchers, or are forgotten."""
         units = (u.with_fallback if u.matcher in unfit else replace(u, fallback="") for u in self.units)
         return replace(self, units=tuple(units))
+
+    def with_magsac(self, method: str | None = None, threshold: float | None = None) -> "Recipe":
+        """The recipe with another robust method and threshold in pixels, where they are given.
+
+        Raises ``ValueError`` for what :class:`RobustConfig` does not take.
+        """
+        given = {"method": method and Method(method), "threshold": threshold}
+        changes: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
+        return replace(self, magsac=replace(self.magsac, **changes))
 
     def in_mode(self, mode: Mode) -> "Recipe":
         """The recipe run another way, see :class:`Mode`."""

@@ -12,7 +12,6 @@ from mkpc_kaggle.data.competition import read_train_side
 from mkpc_kaggle.demo import DemoSet
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.session import Interrupt, Session
-from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.evaluation.validate import validate
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.metrics import PoseError
@@ -98,7 +97,7 @@ def test_it_gives_what_the_engine_gives_and_goes_on_where_it_was(
     assert len(again.found) == len(scene.pairs) - 1
     run_all([scene], small, assembly.pipeline(), again, 1.0)
     assert ResultsFile(path, {"a": 1}).found.keys() == results.found.keys()
-    with pytest.raises(UserError, match="other settings"):
+    with pytest.raises(SystemExit, match="other settings"):
         ResultsFile(path, {"a": 2})
 
     lines = list(Tables.of([scene], again).markdown(small))

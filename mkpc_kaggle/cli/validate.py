@@ -118,13 +118,12 @@ def run(arguments: argparse.Namespace) -> int:
 def _read_scenes(arguments: argparse.Namespace, work_dir: Path) -> "tuple[Scene, ...]":
     from mkpc_kaggle.data.competition import read_train_side
     from mkpc_kaggle.data.pairs import read_pairs
-    from mkpc_kaggle.geometry.robust import Model
 
     if arguments.pairs is not None:
         scene = read_pairs(
             arguments.pairs,
             arguments.image_root,
-            Model(arguments.estimate),
+            arguments.estimate,
             copies=work_dir / "turned",
             most=arguments.pairs_per_scene,
         )
@@ -212,19 +211,10 @@ def with_units(recipe: "Recipe", wanted: str | None) -> "Recipe":
 
 def _with_estimator(recipe: "Recipe", arguments: argparse.Namespace) -> "Recipe":
     """The recipe with the robust method and threshold that the command names."""
-    from dataclasses import replace
-
-    from mkpc_kaggle.geometry.robust import Method
-
-    config = recipe.magsac
     try:
-        if arguments.method is not None:
-            config = replace(config, method=Method(arguments.method))
-        if arguments.threshold is not None:
-            config = replace(config, threshold=arguments.threshold)
+        return recipe.with_magsac(arguments.method, arguments.threshold)
     except ValueError as error:
         raise UserError(f"--threshold: {error}") from error
-    return replace(recipe, magsac=config)
 
 
 def _print_summary(

@@ -39,8 +39,10 @@ class PairLine:
     cameras: tuple[Camera, Camera]
 
 
-def read_pairs(file: Path, image_root: Path, model: Model, *, copies: Path, most: int | None = None) -> Scene:
-    """The pairs of a list as one scene of unknown scale, to estimate E or F on.
+def read_pairs(
+    file: Path, image_root: Path, model: Model | str, *, copies: Path, most: int | None = None
+) -> Scene:
+    """The pairs of a list as one scene of unknown scale, to estimate ``model``, E or F, on.
 
     ``most`` takes that many pairs, evenly spread over the list. A turned copy of every image that has to be turned
     is written to the directory ``copies``, and the cameras are those of the copies. An image that cannot be read
@@ -66,7 +68,7 @@ def read_pairs(file: Path, image_root: Path, model: Model, *, copies: Path, most
         return turned_copy(image_root / name, turns, copies)
 
     chosen = evenly_spread(lines, most)
-    return Scene(file.stem, nan, tuple(_true_pair(line, upright, model, file.stem) for line in chosen))
+    return Scene(file.stem, nan, tuple(_true_pair(line, upright, Model(model), file.stem) for line in chosen))
 
 
 def parse_line(line: str, number: int, file: Path) -> PairLine:

@@ -26,7 +26,6 @@ from mkpc_kaggle.geometry.metrics import (
 )
 from mkpc_kaggle.geometry.robust import Matrix3, Model
 from mkpc_kaggle.pipeline.assembly import Assembly
-from mkpc_kaggle.recipe import Recipe
 
 
 class Step(StrEnum):
@@ -113,7 +112,7 @@ def validate(scenes: Sequence[Scene], assembly: Assembly, session: Session) -> t
     """Match all pairs of the scenes and score them; also whether every thread has stopped."""
     pairs = [true.pair for scene in scenes for true in scene.pairs]
     report, at_rest = run_pairs(pairs, assembly, session)
-    steps = steps_of(assembly.recipe, report.records)
+    steps = steps_of(report.records, prior=assembly.recipe.focal is not None)
     records = iter(report.records)
     scored = tuple(
         SceneScore(
@@ -126,10 +125,10 @@ def validate(scenes: Sequence[Scene], assembly: Assembly, session: Session) -> t
     return Validation(assembly.recipe.name, scored, report, steps), at_rest
 
 
-def steps_of(recipe: Recipe, records: Sequence[PairRecord]) -> tuple[Step, ...]:
+def steps_of(records: Sequence[PairRecord], *, prior: bool) -> tuple[Step, ...]:
     """The steps that a run made; where E is sought at known focal lengths, there is no MAGSAC alone."""
-    steps = [Step.MAGSAC] if recipe.focal is None or any(one.magsac is not None for one in records) else []
-    steps += [Step.PRIOR] if recipe.focal is not None else []
+    steps = [Step.MAGSAC] if not prior or any(one.magsac is not None for one in records) else []
+    steps += [Step.PRIOR] if prior else []
     return (*steps, Step.SCENE) if any(one.scene is not None for one in records) else tuple(steps)
 
 
