@@ -147,3 +147,10 @@ def test_cameras_are_seen_from_above_and_from_the_side_with_the_points_before_th
     assert np.ptp(points.get_offsets(), axis=0).tolist() == [0, 0], "one behind the other"
     assert np.ptp(seen.get_offsets(), axis=0).tolist() == [0, 7]
     assert seen.get_offsets()[:, 1].max() == 7, "up is up"
+
+
+def test_a_batch_without_cameras_is_a_line_of_text():
+    figure = draw_cameras(SceneRecord("batch", 2, 0, 0, 0, 1.0, "too few matches", (), ()))
+    (text,) = figure.texts
+    assert text.get_text() == "batch: no cameras (too few matches)"
+    assert figure.axes == []

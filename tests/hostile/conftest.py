@@ -3,10 +3,10 @@
 import re
 from collections import defaultdict
 
-import pytest
+from _pytest.terminal import TerminalReporter  # pytest's own name for it is younger than our floor
 
 
-def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+def pytest_terminal_summary(terminalreporter: TerminalReporter) -> None:
     done: dict[str, list[tuple[bool, float]]] = defaultdict(list)
     for outcome in ("passed", "failed"):
         for report in terminalreporter.stats.get(outcome, []):

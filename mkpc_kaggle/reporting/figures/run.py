@@ -158,10 +158,13 @@ def draw_cameras(scene: "SceneRecord") -> "Figure":
     """The cameras and points of a batch's largest model from above and from the side, in its own units.
 
     An arrow points the way a camera looks. Up is where the images' upper borders are on average, and the cameras
-    look ahead. Points far away from nearly all others are cut off.
+    look ahead. Points far away from nearly all others are cut off. A batch without cameras has a line instead.
     """
     figure = new_figure(8.4, 4.0)
     cameras = [camera for camera in scene.cameras if camera.model == 0]
+    if not cameras:
+        figure.text(0.5, 0.5, f"{short(scene.batch)}: no cameras ({scene.failure})", ha="center", wrap=True)
+        return figure
     right, ahead, up = axes_of(cameras)
     centres = np.array([camera.centre for camera in cameras])
     looks = np.array([camera.forward for camera in cameras])
