@@ -1,5 +1,6 @@
 """A run as four tables: all that the summary, the report and the exports count is counted on these."""
 
+import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -108,14 +109,14 @@ def _table(rows: Iterator[tuple[object, ...]], columns: dict[str, type]) -> pd.D
 
 def _pair_table(pairs: Sequence[Pair], records: Sequence[PairRecord]) -> pd.DataFrame:
     """Column by column: a row as a tuple of its own takes a kilobyte, and there may be a million."""
-    encode = [sum(unit.encode_seconds for unit in record.units) for record in records]
-    match = [sum(unit.match_seconds for unit in record.units) for record in records]
+    encode = [sum((unit.encode_seconds for unit in record.units), 0.0) for record in records]
+    match = [sum((unit.match_seconds for unit in record.units), 0.0) for record in records]
     columns: dict[str, Any] = {
         "pair": [record.index for record in records],
         "id": [pair.id for pair in pairs],
         "group": [pair.group for pair in pairs],
-        "image0": [pair.names[0] for pair in pairs],
-        "image1": [pair.names[1] for pair in pairs],
+        "image0": [sys.intern(pair.names[0]) for pair in pairs],
+        "image1": [sys.intern(pair.names[1]) for pair in pairs],
         "failure": [record.failure for record in records],
         "source": [record.source for record in records],
         "matches": [record.matches for record in records],
@@ -128,7 +129,8 @@ def _pair_table(pairs: Sequence[Pair], records: Sequence[PairRecord]) -> pd.Data
     }
     F = np.array([record.fundamental for record in records], np.float64).reshape(-1, len(F_COLUMNS))
     columns |= dict(zip(F_COLUMNS, F.T, strict=True))
-    return pd.DataFrame(columns).astype(_PAIRS)
+    table = pd.DataFrame(columns)
+    return table if len(table) else table.astype(_PAIRS)  # which would copy all of it
 
 
 def _unit_rows(records: Sequence[PairRecord]) -> Iterator[tuple[object, ...]]:
