@@ -17,7 +17,7 @@ from mkpc_kaggle.errors import UserError
 
 COMMANDS = ("submit", "match", "validate", "recipes", "weights", "check", "journal", "package", "demo")
 EXIT_BAD_INPUT = 2
-EXIT_BROKEN_PIPE = 128 + signal.SIGPIPE
+EXIT_BROKEN_PIPE = 128 + 13  # a shell's status for SIGPIPE, which Windows lacks
 EXIT_INTERRUPTED = 128 + signal.SIGINT
 
 _DESCRIPTION = """\

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, replace
 
-from mkpc_kaggle.scene.batch import Batch, BatchImage, BatchPair, distinct_images, edges_of
+from mkpc_kaggle.scene.batch import Batch, BatchImage, distinct_images, edges_of
 from mkpc_kaggle.scene.checks import believable
 from mkpc_kaggle.scene.choose import Choice, Reason, choose
 from mkpc_kaggle.scene.config import SceneConfig
@@ -38,38 +38,22 @@ def solve(batch: Batch, config: SceneConfig, known_focals: KnownFocals | None = 
     seconds to minutes and may end the process, see :mod:`mkpc_kaggle.scene.reconstruct`.
     """
     images = distinct_images(batch.images)
-    first_name = {image.digest: image.name for image in images}
-    name_of = {image.name: first_name[image.digest] for image in batch.images}
+    first = {image.digest: image for image in images}
+    image_of = {image.name: first[image.digest] for image in batch.images}
     scenes = tuple(
         scene_of(component, images, config)
         for component in components(len(images), edges_of(batch), config.least_inliers)
     )
     models = models_of(scenes)
-    choices = tuple(
-        choose(models, name_of[pair.image0], name_of[pair.image1], pair.matches, pair.own, config)
-        for pair in batch.pairs
-    )
-    if known_focals is not None:
-        of_name = {image.name: image for image in images}
-        choices = tuple(
-            _at_known_focals(
-                choice, pair, (of_name[name_of[pair.image0]], of_name[name_of[pair.image1]]), models, known_focals
-            )
-            for choice, pair in zip(choices, batch.pairs, strict=True)
-        )
-    return Solution(scenes, choices, tuple(name_of.items()))
-
-
-def _at_known_focals(
-    choice: Choice,
-    pair: BatchPair,
-    images: tuple[BatchImage, BatchImage],
-    models: tuple[Model, ...],
-    known_focals: KnownFocals,
-) -> Choice:
-    if choice.from_scene or choice.reason is Reason.SAME_IMAGE:
-        return choice
-    return replace(choice, F=known_focals.fundamental(models, *images, pair.matches))
+    choices = []
+    for pair in batch.pairs:
+        image0, image1 = image_of[pair.image0], image_of[pair.image1]
+        choice = choose(models, image0.name, image1.name, pair.matches, pair.own, config)
+        if known_focals is not None and choice.reason not in (Reason.SCENE, Reason.SAME_IMAGE):
+            choice = replace(choice, F=known_focals.fundamental(models, image0, image1, pair.matches))
+        choices.append(choice)
+    names = tuple((name, image.name) for name, image in image_of.items())
+    return Solution(scenes, tuple(choices), names)
 
 
 def scene_of(component: Component, images: tuple[BatchImage, ...], config: SceneConfig) -> Scene:
