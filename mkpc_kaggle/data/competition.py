@@ -6,6 +6,7 @@ jpeg are accepted on both sides. F of a pair satisfies x2^T F x1 = 0, image 1 be
 """
 
 import csv
+import gc
 import os
 import re
 import secrets
@@ -109,6 +110,19 @@ def test_side(directory: Path) -> tuple[Path, Path]:
     return home / "test.csv", home / "test_images"
 
 
+@contextmanager
+def uncollected() -> Iterator[None]:
+    """Garbage collection waits: while a million values are made and kept, it would search them over and over."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
+
+
+@uncollected()
 def read_test_side(directory: Path) -> tuple[Pair, ...]:
     """The pairs of ``test.csv``, in its order.
 

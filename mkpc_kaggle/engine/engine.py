@@ -10,7 +10,7 @@ from enum import StrEnum
 from math import inf
 from typing import Protocol
 
-from mkpc_kaggle.data.competition import Pair
+from mkpc_kaggle.data.competition import Pair, uncollected
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.costs import Timeouts
 from mkpc_kaggle.engine.jobs import Job, JobFailure, JobResult, Outcome, visiting_order
@@ -130,8 +130,9 @@ class Engine:
 
     def run(self) -> RunReport:
         """Run until all is done, the time is up, or an interrupt; raises only what the pool's start raises."""
-        resumed = sum(not record.lacking(self.recipe.regular) for record in self.records)
         self._publish()
+        regular = self.recipe.regular
+        resumed = sum(not record.lacking(regular) for record in self.records if record.units)
         try:
             if any(self.planner.wanted(record) for record in self.records):
                 if message := self.pool.start():
@@ -175,6 +176,7 @@ class Engine:
             self._write()
         return self.unwritten
 
+    @uncollected()
     def _planner(self, timeouts: Timeouts | None) -> Planner:
         if forgotten := self.journal.forget_changed(self.pairs):
             text = f"images have changed since they were matched: {forgotten} pairs are matched anew"

@@ -128,6 +128,14 @@ class PairRecord:
     def matches(self) -> int:
         return sum(unit.matches for unit in self.units)
 
+    @property
+    def encode_seconds(self) -> float:
+        return sum(unit.encode_seconds for unit in self.units)
+
+    @property
+    def match_seconds(self) -> float:
+        return sum(unit.match_seconds for unit in self.units)
+
     def has(self, unit: Unit) -> bool:
         return any(record.unit == unit.name for record in self.units)
 

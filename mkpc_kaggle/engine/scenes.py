@@ -13,7 +13,7 @@ from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.data.images import Image, Unreadable, read_image
 from mkpc_kaggle.engine.costs import Timeouts
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.geometry.robust import Matrix3, Model
+from mkpc_kaggle.geometry.robust import Matrix3
 from mkpc_kaggle.scene.choose import Choice
 from mkpc_kaggle.scene.config import SceneConfig
 from mkpc_kaggle.scene.known_focals import KnownFocals
@@ -95,7 +95,7 @@ def batches_of(pairs: Iterable[Pair]) -> dict[str, list[int]]:
     """By batch, the places of the pairs that may be reconstructed: F is wanted, and no camera is known."""
     batches: dict[str, list[int]] = {}
     for place, pair in enumerate(pairs):
-        if pair.model is Model.F and pair.intrinsics is None:
+        if pair.intrinsics is None:
             batches.setdefault(pair.group, []).append(place)
     return {name: members for name, members in batches.items() if len(members) >= LEAST_PAIRS}
 

@@ -24,9 +24,7 @@ class RunState:
         self.records = records
         self.asked = asked
         self.left_alone: set[int] = set()
-        self.lacking: Counter[str] = Counter()
-        for record in records:
-            self.lacking.update(self._lacks(record))
+        self.lacking = Counter(unit for record in records for unit in self._lacks(record))
 
     def can_gain(self, index: int, units: Iterable[Unit]) -> bool:
         """Whether a pair may have one of the units that it has not had."""

@@ -105,7 +105,7 @@ def _scene(validation: Validation, name: str) -> SceneScore:
 
 def seconds_of_work(record: PairRecord) -> float:
     """Seconds of a pair's units, clustering and last estimate, over all runs of its journal."""
-    units = sum(unit.encode_seconds + unit.match_seconds for unit in record.units)
+    units = record.encode_seconds + record.match_seconds
     return units + record.cluster_seconds + record.estimate_seconds
 
 
