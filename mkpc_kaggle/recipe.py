@@ -66,8 +66,8 @@ class Unit:
     or the view as many pixels as ``area`` has, height by width such as "540x720"; its aspect is kept either way,
     but with ``stretch`` it gets just that height and width. The ``max_matches`` surest matches are kept. ``flip``
     mirrors both views. An ``extra`` unit is left for the upgrade pass. ``fallback``: the matcher that takes the
-    place of this one where it cannot run, or not with the weights that are there. ``ValueError`` for what makes no
-    unit.
+    place of this one where it cannot run, or not with the weights that are there. Without ``tracks``, a scene is
+    made of its matches only where a pair has few others. ``ValueError`` for what makes no unit.
     """
 
     stage: int
@@ -79,6 +79,7 @@ class Unit:
     area: str = ""
     stretch: bool = False
     fallback: str = ""
+    tracks: bool = True
 
     def __post_init__(self) -> None:
         check_ranges(self, stage=Range(1, 2), long_side=Range(0, LONGEST), max_matches=AT_LEAST_1)

@@ -105,6 +105,14 @@ def test_the_same_picture_under_two_names_is_one_image() -> None:
     assert edges[0].matches.points1.tolist() == [[2, 2], [4, 4]]
 
 
+def test_a_scene_is_made_of_a_pairs_tracks_where_it_has_some() -> None:
+    images = (BatchImage("A", "A", SIZE), BatchImage("B", "B", SIZE))
+    pair = BatchPair("B", "A", matches((1,) * 4, (2, 2, 3, 3)), tracks=matches((2, 2, 3, 3)))
+    (edge,) = edges_of(Batch(images, (pair,)))
+    assert edge.matches.points0.tolist() == [[3, 3]]
+    assert edge.matches.points1.tolist() == [[2, 2]]
+
+
 def test_pairs_without_matches_are_no_edges() -> None:
     assert edges_of(batch("AB", ("A", "B", Matches.empty()))) == ()
 

@@ -16,7 +16,11 @@ from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.costs import Timeouts
 from mkpc_kaggle.engine.engine import Ending
 from mkpc_kaggle.engine.pools import scene_process
-from mkpc_kaggle.recipe import Recipe, UpgradeConfig
+from mkpc_kaggle.engine.pools.pool import Pool
+from mkpc_kaggle.engine.scenes import Reconstruction, SceneJob, ScenePair, track_matches
+from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.pipeline.pair import UnitResult
+from mkpc_kaggle.recipe import Recipe, Unit, UpgradeConfig
 from mkpc_kaggle.reporting.report import report_page
 from mkpc_kaggle.reporting.run_log import read_log
 from mkpc_kaggle.reporting.sections import Artist
@@ -164,6 +168,36 @@ def test_a_gigabyte_is_enough_for_a_small_scene(tmp_path: Path, monkeypatch: pyt
     assert report.ending is Ending.COMPLETE
     assert report.faults == ()
     assert [record.source for record in report.records] == ["scene"] * 15
+
+
+def results_of(*counts: int) -> list[UnitResult]:
+    """Of a unit whose matches make no tracks, and of one whose matches do, that many each."""
+    rows = [np.arange(2 * count, dtype=np.float32).reshape(count, 2) for count in counts]
+    units = (Unit(1, "coarse", 640, tracks=False), Unit(1, "fine", 640))
+    return [UnitResult(unit, Matches(row, row, np.zeros(len(row)))) for unit, row in zip(units, rows, strict=True)]
+
+
+@pytest.mark.parametrize(("fine", "used"), [(20, 20), (19, 49), (0, 30)])
+def test_matches_without_tracks_are_for_pairs_with_few_others(fine: int, used: int) -> None:
+    assert len(track_matches(results_of(30, fine), least=20)) == used
+
+
+def test_the_scene_of_a_run_is_made_of_tracks_and_judged_by_all_matches(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given: list[ScenePair] = []
+    made = Pool.reconstruct
+
+    def note(pool: Pool, job: SceneJob) -> Reconstruction:
+        given.extend(job.pairs)
+        return made(pool, job)
+
+    monkeypatch.setattr(Pool, "reconstruct", note)
+    first, *others = THREE_UNITS.units
+    recipe = replace(RECIPE, units=(replace(first, tracks=False), *others))
+    run(batch_pairs(tmp_path / "images"), recipe, RectifiedMatcher(), tmp_path / "work")
+    assert len(given) == 6
+    assert all(0 < len(pair.tracks) < len(pair.matches) for pair in given)
 
 
 def test_a_recipe_without_scenes_starts_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -19,7 +19,7 @@ from mkpc_kaggle.engine.planner import Explanation, Planner
 from mkpc_kaggle.engine.pools.pool import Pool
 from mkpc_kaggle.engine.progress import progress_on
 from mkpc_kaggle.engine.records import PairRecord, SceneRecord
-from mkpc_kaggle.engine.scenes import SceneJob, ScenePair, SceneQueue, SceneResult, pairs_to_add
+from mkpc_kaggle.engine.scenes import SceneJob, ScenePair, SceneQueue, SceneResult, pairs_to_add, track_matches
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.pipeline.pair import UnitResult
@@ -257,10 +257,15 @@ class Engine:
         return SceneJob(batch, pairs, recipe.scene, known_focals)
 
     def _scene_pair(self, index: int) -> ScenePair:
-        record = self.planner.records[index]
-        matches = Matches.concatenate(result.matches for result in self._results(index))
-        images = self.pairs[index].images
-        return ScenePair(index, images, matches, None if record.failure else record.F)
+        assert self.recipe.scene is not None
+        record, results = self.planner.records[index], self._results(index)
+        return ScenePair(
+            index,
+            self.pairs[index].images,
+            Matches.concatenate(result.matches for result in results),
+            None if record.failure else record.F,
+            track_matches(results, self.recipe.scene.least_tracks),
+        )
 
     def _keep_scene(self, result: SceneResult) -> None:
         record = SceneRecord.of(result.batch, result.scenes, result.seconds, result.failure)

@@ -14,6 +14,7 @@ from mkpc_kaggle.data.images import Image, Unreadable, read_image
 from mkpc_kaggle.engine.costs import Timeouts
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import Matrix3
+from mkpc_kaggle.pipeline.pair import UnitResult
 from mkpc_kaggle.scene.choose import Choice
 from mkpc_kaggle.scene.config import SceneConfig
 from mkpc_kaggle.scene.known_focals import KnownFocals
@@ -32,12 +33,16 @@ MARGIN = 1.5
 
 @dataclass(frozen=True, eq=False)
 class ScenePair:
-    """A pair as a reconstruction is given it: its place in the run, its images' files, its matches and own F."""
+    """A pair as a reconstruction is given it: its place in the run, its images' files, its matches and own F.
+
+    ``tracks`` are the matches that the scene is made of.
+    """
 
     index: int
     images: tuple[Path, Path]
     matches: Matches
     own: Matrix3 | None
+    tracks: Matches
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,10 +74,18 @@ def reconstruct(job: SceneJob, read: Callable[[Path], Image | Unreadable] = read
     from mkpc_kaggle.scene.read import batch_of
     from mkpc_kaggle.scene.solve import solve
 
-    readable, batch = batch_of([(pair.images, pair.matches, pair.own) for pair in job.pairs], read)
+    readable, batch = batch_of([(pair.images, pair.matches, pair.own, pair.tracks) for pair in job.pairs], read)
     solution = solve(batch, job.config, job.known_focals)
     indices = [job.pairs[place].index for place in readable]
     return solution.scenes, dict(zip(indices, solution.choices, strict=True))
+
+
+def track_matches(results: Sequence[UnitResult], least: int) -> Matches:
+    """The matches that a scene is made of: those of units that make tracks, or all where these are fewer."""
+    chosen = [result.matches for result in results if result.unit.tracks]
+    if sum(map(len, chosen)) < least:
+        chosen = [result.matches for result in results]
+    return Matches.concatenate(chosen)
 
 
 def pairs_to_add(pairs: Sequence[Pair], config: SceneConfig | None) -> list[Pair]:

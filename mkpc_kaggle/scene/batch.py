@@ -24,13 +24,15 @@ class BatchImage:
 class BatchPair:
     """A pair of a batch by the names of its images, with its matches in full-image pixels, which may be empty.
 
-    ``own`` is the F, (3, 3), that the pair's matches alone gave; ``None`` where they gave none.
+    ``own`` is the F, (3, 3), that the pair's matches alone gave; ``None`` where they gave none. ``tracks`` are the
+    matches that the scene is made of; ``None``: all.
     """
 
     image0: str
     image1: str
     matches: Matches
     own: Matrix3 | None = None
+    tracks: Matches | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,9 +80,10 @@ def edges_of(batch: Batch) -> tuple[Edge, ...]:
     parts: dict[tuple[int, int], list[Matches]] = {}
     for pair in batch.pairs:
         first, second = number_of[pair.image0], number_of[pair.image1]
-        if first == second or not len(pair.matches):
+        tracks = pair.matches if pair.tracks is None else pair.tracks
+        if first == second or not len(tracks):
             continue
-        matches = pair.matches if first < second else turned(pair.matches)
+        matches = tracks if first < second else turned(tracks)
         parts.setdefault((min(first, second), max(first, second)), []).append(matches)
     return tuple(Edge(*ends, Matches.concatenate(parts[ends])) for ends in sorted(parts))
 

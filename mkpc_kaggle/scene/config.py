@@ -24,7 +24,8 @@ class CameraModel(StrEnum):
 class SceneConfig:
     """Settings of :func:`mkpc_kaggle.scene.solve.solve`.
 
-    Keypoints: ``cell``, in pixels, is what points of an image are merged in. Verification of a pair's matches:
+    Keypoints: ``cell``, in pixels, is what points of an image are merged in; a pair with fewer matches than
+    ``least_tracks`` of units that make tracks gives those of all its units. Verification of a pair's matches:
     ``verification_error`` in pixels, and the ``least_inliers`` that it needs. Cameras: ``camera_model``, and the
     focal length that they start with, ``prior_focal`` long sides. A scene has
     ``least_images``, and ``least_pairs_per_image`` times as many connected pairs: with fewer there is little that
@@ -43,6 +44,7 @@ class SceneConfig:
     mapper: Mapper = Mapper.GLOBAL
     camera_model: CameraModel = CameraModel.PINHOLE
     cell: float = 0.75
+    least_tracks: int = 50
     verification_error: float = 2.0
     least_inliers: int = 15
     prior_focal: float = 1.1
@@ -64,6 +66,7 @@ class SceneConfig:
         check_ranges(
             self,
             cell=POSITIVE,
+            least_tracks=AT_LEAST_0,
             verification_error=POSITIVE,
             least_inliers=Range(8),
             prior_focal=POSITIVE,

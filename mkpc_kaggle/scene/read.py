@@ -13,9 +13,9 @@ Read = Callable[[Path], Image | Unreadable]
 
 
 def batch_of(
-    pairs: Sequence[tuple[tuple[Path, Path], Matches, Matrix3 | None]], read: Read = read_image
+    pairs: Sequence[tuple[tuple[Path, Path], Matches, Matrix3 | None, Matches]], read: Read = read_image
 ) -> tuple[list[int], Batch]:
-    """The batch of pairs, given by their images' files, matches and own F; images go by their paths.
+    """The batch of pairs, given by their images' files, matches, own F and tracks; images go by their paths.
 
     Also the places of its pairs among ``pairs``: those with an image that cannot be read are left out.
     """
@@ -24,7 +24,10 @@ def batch_of(
     chosen = [pairs[place] for place in readable]
     return readable, Batch(
         tuple(image for image in images.values() if image is not None),
-        tuple(BatchPair(str(paths[0]), str(paths[1]), matches, own) for paths, matches, own in chosen),
+        tuple(
+            BatchPair(str(first), str(second), matches, own, tracks)
+            for (first, second), matches, own, tracks in chosen
+        ),
     )
 
 
