@@ -26,7 +26,6 @@ from mkpc_kaggle.data.competition import Scene, TruePair, read_train_side
 from mkpc_kaggle.evaluation.compare import paired_difference
 from mkpc_kaggle.evaluation.validate import error_of
 from mkpc_kaggle.geometry.focal_prior import FocalConfig, FocalPrior, estimate_with_prior
-from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.metrics import PoseError, pair_accuracy
 from mkpc_kaggle.geometry.robust import Estimate, Matrix3, RobustConfig, estimate
 from mkpc_kaggle.scene.batch import Batch, BatchImage, BatchPair
@@ -77,7 +76,7 @@ def read(folder: Path, ways: Sequence[str], true: TruePair) -> SavedMatches | No
     if not all(file.exists() for file in files):
         return None
     found = [saved_matches.read(file) for file in files]
-    return SavedMatches(Matches.concatenate(one.matches for one in found), found[0].sizes)
+    return SavedMatches(tuple(result for one in found for result in one.results), found[0].sizes)
 
 
 def accuracy(F: Matrix3 | None, true: TruePair, scene: Scene) -> float:
@@ -106,7 +105,11 @@ def by_scene(pairs: Sequence[Estimated], scene: Scene) -> Score:
     }
     asked = [
         BatchPair(
-            pair.true.pair.image0.stem, pair.true.pair.image1.stem, pair.found.matches, pair.matrices["prior"]
+            pair.true.pair.image0.stem,
+            pair.true.pair.image1.stem,
+            pair.found.matches,
+            pair.matrices["prior"],
+            pair.found.tracks,
         )
         for pair in pairs
     ]

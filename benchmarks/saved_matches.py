@@ -1,26 +1,41 @@
 """Matches of pairs with known cameras, kept on disk: found once, read by every benchmark of what follows them.
 
 A file for each pair, FOLDER/SCENE/IMAGE0-IMAGE1.npz: ``points0``, ``points1`` (N, 2) and ``scores`` (N,) in image
-pixels; ``size0`` and ``size1``, width and height.
+pixels, unit by unit; ``units``, each as JSON, and ``lengths``, the numbers of their matches; ``size0`` and
+``size1``, width and height.
 """
 
-from dataclasses import dataclass
+import json
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
 
 from mkpc_kaggle.data.competition import TruePair
+from mkpc_kaggle.engine.scenes import tracks_of
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.pipeline.pair import PairMatch
+from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult
+from mkpc_kaggle.recipe import Unit
+from mkpc_kaggle.scene.config import SceneConfig
 
 
 @dataclass(frozen=True, eq=False)
 class SavedMatches:
-    """The matches of a pair, and the sizes of its images."""
+    """What each unit found on a pair, and the sizes of its images."""
 
-    matches: Matches
+    results: tuple[UnitResult, ...]
     sizes: tuple[Size, Size]
+
+    @property
+    def matches(self) -> Matches:
+        """Those of all units."""
+        return Matches.concatenate(result.matches for result in self.results)
+
+    @property
+    def tracks(self) -> dict[str, Matches]:
+        """Those that a scene is made of, by their matchers."""
+        return tracks_of(self.results, SceneConfig().least_tracks)
 
 
 def file_of(folder: Path, true: TruePair) -> Path:
@@ -38,6 +53,8 @@ def write(path: Path, pair: PairMatch) -> None:
             points0=matches.points0,
             points1=matches.points1,
             scores=matches.scores,
+            units=[json.dumps(asdict(result.unit)) for result in pair.results],
+            lengths=[len(result.matches) for result in pair.results],
             size0=pair.images[0].size,
             size1=pair.images[1].size,
         )
@@ -47,5 +64,10 @@ def write(path: Path, pair: PairMatch) -> None:
 def read(path: Path) -> SavedMatches:
     with np.load(path) as kept:
         matches = Matches(kept["points0"], kept["points1"], kept["scores"])
+        ends = np.cumsum(kept["lengths"])
+        results = tuple(
+            UnitResult(Unit(**json.loads(str(unit))), matches[slice(end - length, end)])
+            for unit, length, end in zip(kept["units"], kept["lengths"], ends, strict=True)
+        )
         size0, size1 = (Size(*map(int, kept[name])) for name in ("size0", "size1"))
-        return SavedMatches(matches, (size0, size1))
+        return SavedMatches(results, (size0, size1))

@@ -1,10 +1,10 @@
 """The score of scenes under different settings, on the same matches.
 
 python -m benchmarks.scene_settings --train-dir DIR --matches DIR [--scenes NAME ...] [--shares 1 0.3 0.12]
-    [--settings default incremental ...]
+    [--settings default incremental ...] [--seed 0]
 
 The matches of all pairs with a covisibility of at least 0.1 are those of one way of `benchmarks.ways`: DIR is its
-directory. A share below 1 takes that many of a scene's pairs by a fixed seed. `own` is the mAA of one MAGSAC a
+directory. A share below 1 takes that many of a scene's pairs by the seed. `own` is the mAA of one MAGSAC a
 pair, `scene` that of the cameras alone, where a pair without two of them counts as failed, `chosen` that of the F
 which the pair gets in the end.
 """
@@ -33,9 +33,10 @@ SETTINGS = {
     "cell 0.4": replace(DEFAULT, cell=0.4),
     "cell 1.5": replace(DEFAULT, cell=1.5),
     "verify 0.5": replace(DEFAULT, verification_error=0.5),
-    "verify 1": replace(DEFAULT, verification_error=1.0),
+    "verify 2": replace(DEFAULT, verification_error=2.0),
     "verify 4": replace(DEFAULT, verification_error=4.0),
     "seed 1": replace(DEFAULT, seed=1),
+    "together": replace(DEFAULT, each_matcher=False),
 }
 ONE_MAGSAC = RobustConfig(orders=1)
 
@@ -43,7 +44,7 @@ ONE_MAGSAC = RobustConfig(orders=1)
 def matched(true: TruePair, found: SavedMatches) -> BatchPair:
     """A pair with its matches, and the F of one MAGSAC."""
     own = estimate(found.matches, ONE_MAGSAC)
-    return BatchPair(*names_of(true), found.matches, own.matrix if own.ok else None)
+    return BatchPair(*names_of(true), found.matches, own.matrix if own.ok else None, found.tracks)
 
 
 def names_of(true: TruePair) -> tuple[str, str]:
@@ -58,8 +59,15 @@ def score(scene: Scene, chosen: list[TruePair], matrices: list[Matrix3 | None]) 
     return mean_average_accuracy(errors)
 
 
-def row(name: str, scene: Scene, share: float, pairs: dict[str, BatchPair], images: dict[str, BatchImage]) -> str:
-    rng = np.random.default_rng(0)
+def row(
+    name: str,
+    scene: Scene,
+    share: float,
+    seed: int,
+    pairs: dict[str, BatchPair],
+    images: dict[str, BatchImage],
+) -> str:
+    rng = np.random.default_rng(seed)
     places = np.sort(rng.choice(len(scene.pairs), round(share * len(scene.pairs)), replace=False))
     chosen = [scene.pairs[place] for place in places]
     asked = [pairs[true.pair.id] for true in chosen]
@@ -87,6 +95,7 @@ def main() -> None:
     parser.add_argument("--scenes", nargs="*", default=())
     parser.add_argument("--shares", nargs="+", type=float, default=[1.0])
     parser.add_argument("--settings", nargs="+", choices=list(SETTINGS), default=list(SETTINGS))
+    parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
     print(
         f"{'scene':16}{'pairs':>6}  {'settings':14}{'own':>8}{'scene':>8}{'chosen':>8}{'placed':>10}{'cpu s':>8}"
@@ -99,7 +108,7 @@ def main() -> None:
         images = {name: BatchImage(name, name, size) for name, size in sizes.items()}
         for share in arguments.shares:
             for name in arguments.settings:
-                print(row(name, scene, share, pairs, images), flush=True)
+                print(row(name, scene, share, arguments.seed, pairs, images), flush=True)
 
 
 if __name__ == "__main__":

@@ -23,7 +23,10 @@ from mkpc_kaggle.pipeline.stages import Pipeline
 from mkpc_kaggle.pipeline.two_stage import to_image
 from mkpc_kaggle.recipe import Recipe, Unit
 
-XFEAT = (Unit(1, "xfeat_lighterglue", 1024), Unit(2, "xfeat_lighterglue", 1280))
+XFEAT = (
+    Unit(1, "xfeat_lighterglue", 1024, tracks=False),
+    Unit(2, "xfeat_lighterglue", 1280, tracks=False),
+)
 ALIKED = (Unit(1, "aliked", 1024), Unit(2, "aliked", 800))
 SIFT = (
     Unit(1, "sift", 1536, max_matches=8000),

@@ -31,7 +31,7 @@ def model(cameras: dict[str, Camera], points: int = 100) -> Model:
 
 def choice(models: list[Model], scene: SyntheticScene, own: np.ndarray | None = None, **names: str) -> Choice:
     pair = replace(scene.batch.pairs[0], **names)
-    return choose(models, pair.image0, pair.image1, pair.matches, own, CONFIG)
+    return choose([models], pair.image0, pair.image1, pair.matches, own, CONFIG)
 
 
 def test_the_scenes_fundamental_is_that_of_the_cameras(scene: SyntheticScene) -> None:
@@ -50,6 +50,39 @@ def test_an_image_without_a_camera_leaves_the_pair_its_own(scene: SyntheticScene
 def test_cameras_of_two_models_make_no_fundamental(scene: SyntheticScene) -> None:
     apart = [model({name: scene.cameras[name]}) for name in ("0000", "0001")]
     assert choice(apart, scene).reason is Reason.APART
+
+
+def moved(scene: SyntheticScene, degrees: float, zoom: float = 1.0) -> Model:
+    """A model in a world of its own in which the second image's camera is turned and has another focal length."""
+    turn, _ = cv2.Rodrigues(np.radians([0, degrees, 0]))
+    world, _ = cv2.Rodrigues(np.array([0.3, -0.2, 0.1]))
+    cameras = {name: replace(camera, R=camera.R @ world, t=3 * camera.t) for name, camera in scene.cameras.items()}
+    second = cameras["0001"]
+    K = second.K * [[zoom, 1, 1], [1, zoom, 1], [1, 1, 1]]
+    return model({**cameras, "0001": Camera(K, turn @ second.R, turn @ second.t)})
+
+
+def test_what_several_reconstructions_say_is_averaged(scene: SyntheticScene) -> None:
+    pair = scene.batch.pairs[0]
+    one, other = moved(scene, 1.0, 1.25), moved(scene, -1.0, 0.8)
+    both = choose([[one], [other]], pair.image0, pair.image1, pair.matches, None, CONFIG)
+    assert both.F is not None
+    assert scene.median_distance(both.F, pair) < 0.01
+    assert scene.median_distance(choice([one], scene).F, pair) > 2
+
+
+def test_a_reconstruction_that_says_something_else_is_not_averaged(scene: SyntheticScene) -> None:
+    pair = scene.batch.pairs[0]
+    first, other = moved(scene, 0.0), moved(scene, CONFIG.agreement + 1)
+    both = choose([[first], [], [other]], pair.image0, pair.image1, pair.matches, None, CONFIG)
+    np.testing.assert_allclose(both.F, scene.true_fundamental(pair), atol=1e-9)
+
+
+def test_an_image_that_one_reconstruction_lacks_is_taken_from_another(scene: SyntheticScene) -> None:
+    pair = scene.batch.pairs[0]
+    rest = model({name: camera for name, camera in scene.cameras.items() if name != "0000"})
+    found = choose([[rest], [model(scene.cameras)]], pair.image0, pair.image1, pair.matches, None, CONFIG)
+    np.testing.assert_allclose(found.F, scene.true_fundamental(pair))
 
 
 def test_the_first_model_that_has_both_images_counts(scene: SyntheticScene) -> None:
@@ -82,7 +115,7 @@ def test_a_good_camera_is_not_contradicted_by_an_own_fundamental_with_a_few_more
     truth = scene.true_fundamental(pair)
     assert choice([model(scene.cameras)], scene, truth).from_scene
     few = Matches.empty()
-    assert choose([model(scene.cameras)], pair.image0, pair.image1, few, truth, CONFIG).from_scene
+    assert choose([[model(scene.cameras)]], pair.image0, pair.image1, few, truth, CONFIG).from_scene
 
 
 def with_camera(scene: SyntheticScene, **changes: object) -> Model:

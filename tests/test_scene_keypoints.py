@@ -8,7 +8,7 @@ from hypothesis.extra.numpy import arrays
 
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.scene.batch import Batch, BatchImage, BatchPair, Edge, edges_of
+from mkpc_kaggle.scene.batch import Batch, BatchImage, BatchPair, Edge, edges_of, matchers_of
 from mkpc_kaggle.scene.graph import components
 from mkpc_kaggle.scene.keypoints import merge_points, one_to_one, scene_keypoints
 
@@ -107,10 +107,14 @@ def test_the_same_picture_under_two_names_is_one_image() -> None:
 
 def test_a_scene_is_made_of_a_pairs_tracks_where_it_has_some() -> None:
     images = (BatchImage("A", "A", SIZE), BatchImage("B", "B", SIZE))
-    pair = BatchPair("B", "A", matches((1,) * 4, (2, 2, 3, 3)), tracks=matches((2, 2, 3, 3)))
-    (edge,) = edges_of(Batch(images, (pair,)))
-    assert edge.matches.points0.tolist() == [[3, 3]]
-    assert edge.matches.points1.tolist() == [[2, 2]]
+    tracks = {"fine": matches((2, 2, 3, 3)), "finer": matches((4, 4, 5, 5))}
+    pair = BatchPair("B", "A", matches((1,) * 4, (2, 2, 3, 3), (4, 4, 5, 5)), tracks=tracks)
+    of_scene = Batch(images, (pair,))
+    assert matchers_of(of_scene) == ("fine", "finer")
+    assert [len(edge.matches) for edge in edges_of(of_scene)] == [2]
+    (edge,) = edges_of(of_scene, "finer")
+    assert edge.matches.points0.tolist() == [[5, 5]]
+    assert edge.matches.points1.tolist() == [[4, 4]]
 
 
 def test_pairs_without_matches_are_no_edges() -> None:

@@ -2,7 +2,9 @@
 
 import pickle
 import sys
+from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,10 +13,12 @@ from benchmarks.synthetic_scene import SIZE, SyntheticScene, synthetic_scene
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import RobustConfig
+from mkpc_kaggle.scene import reconstruct
 from mkpc_kaggle.scene.batch import Batch, BatchImage, BatchPair
 from mkpc_kaggle.scene.choose import Reason
 from mkpc_kaggle.scene.config import CameraModel, Mapper, SceneConfig
 from mkpc_kaggle.scene.known_focals import KnownFocals
+from mkpc_kaggle.scene.model import Model
 from mkpc_kaggle.scene.solve import Solution, solve
 
 BOTH = pytest.mark.parametrize("config", [SceneConfig(mapper=mapper) for mapper in Mapper], ids=list(Mapper))
@@ -60,6 +64,27 @@ def test_cameras_are_right_in_spite_of_noise_and_wrong_matches(
 @BOTH
 def test_the_same_batch_gives_the_same_bytes(scene: SyntheticScene, config: SceneConfig) -> None:
     assert pickle.dumps(solve(scene.batch, config)) == pickle.dumps(solve(scene.batch, config))
+
+
+@pytest.mark.parametrize(("each_matcher", "times"), [(True, 3), (False, 1)])
+def test_what_each_matcher_found_is_reconstructed_alone_too(
+    scene: SyntheticScene, monkeypatch: pytest.MonkeyPatch, each_matcher: bool, times: int
+) -> None:
+    called: list[int] = []
+
+    def note(names: Sequence[str], *rest: Any) -> tuple[Model, ...]:
+        called.append(len(names))
+        return made(names, *rest)
+
+    made = reconstruct.reconstruct
+    monkeypatch.setattr(reconstruct, "reconstruct", note)
+    halves = [
+        replace(pair, tracks={"even": pair.matches[::2], "odd": pair.matches[1::2]}) for pair in scene.batch.pairs
+    ]
+    solution = solve(replace(scene.batch, pairs=tuple(halves)), SceneConfig(each_matcher=each_matcher))
+    assert called == [6] * times
+    assert len(solution.scenes) == 1
+    assert max(distances(solution, scene)) < 0.5
 
 
 def test_a_solution_goes_through_a_pipe(scene: SyntheticScene) -> None:

@@ -17,7 +17,7 @@ from mkpc_kaggle.engine.costs import Timeouts
 from mkpc_kaggle.engine.engine import Ending
 from mkpc_kaggle.engine.pools import scene_process
 from mkpc_kaggle.engine.pools.pool import Pool
-from mkpc_kaggle.engine.scenes import Reconstruction, SceneJob, ScenePair, track_matches
+from mkpc_kaggle.engine.scenes import Reconstruction, SceneJob, ScenePair, tracks_of
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.pipeline.pair import UnitResult
 from mkpc_kaggle.recipe import Recipe, Unit, UpgradeConfig
@@ -179,7 +179,7 @@ def results_of(*counts: int) -> list[UnitResult]:
 
 @pytest.mark.parametrize(("fine", "used"), [(20, 20), (19, 49), (0, 30)])
 def test_matches_without_tracks_are_for_pairs_with_few_others(fine: int, used: int) -> None:
-    assert len(track_matches(results_of(30, fine), least=20)) == used
+    assert sum(map(len, tracks_of(results_of(30, fine), least=20).values())) == used
 
 
 def test_the_scene_of_a_run_is_made_of_tracks_and_judged_by_all_matches(
@@ -197,7 +197,7 @@ def test_the_scene_of_a_run_is_made_of_tracks_and_judged_by_all_matches(
     recipe = replace(RECIPE, units=(replace(first, tracks=False), *others))
     run(batch_pairs(tmp_path / "images"), recipe, RectifiedMatcher(), tmp_path / "work")
     assert len(given) == 6
-    assert all(0 < len(pair.tracks) < len(pair.matches) for pair in given)
+    assert all(0 < sum(map(len, pair.tracks.values())) < len(pair.matches) for pair in given)
 
 
 def test_a_recipe_without_scenes_starts_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

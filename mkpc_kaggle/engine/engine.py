@@ -19,7 +19,7 @@ from mkpc_kaggle.engine.planner import Explanation, Planner
 from mkpc_kaggle.engine.pools.pool import Pool
 from mkpc_kaggle.engine.progress import progress_on
 from mkpc_kaggle.engine.records import PairRecord, SceneRecord
-from mkpc_kaggle.engine.scenes import SceneJob, ScenePair, SceneQueue, SceneResult, pairs_to_add, track_matches
+from mkpc_kaggle.engine.scenes import SceneJob, ScenePair, SceneQueue, SceneResult, pairs_to_add, tracks_of
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.pipeline.pair import UnitResult
@@ -264,7 +264,7 @@ class Engine:
             self.pairs[index].images,
             Matches.concatenate(result.matches for result in results),
             None if record.failure else record.F,
-            track_matches(results, self.recipe.scene.least_tracks),
+            tracks_of(results, self.recipe.scene.least_tracks),
         )
 
     def _keep_scene(self, result: SceneResult) -> None:

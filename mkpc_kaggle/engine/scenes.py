@@ -35,14 +35,14 @@ MARGIN = 1.5
 class ScenePair:
     """A pair as a reconstruction is given it: its place in the run, its images' files, its matches and own F.
 
-    ``tracks`` are the matches that the scene is made of.
+    ``tracks`` are the matches that the scene is made of, by their matchers.
     """
 
     index: int
     images: tuple[Path, Path]
     matches: Matches
     own: Matrix3 | None
-    tracks: Matches
+    tracks: Mapping[str, Matches]
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,12 +80,16 @@ def reconstruct(job: SceneJob, read: Callable[[Path], Image | Unreadable] = read
     return solution.scenes, dict(zip(indices, solution.choices, strict=True))
 
 
-def track_matches(results: Sequence[UnitResult], least: int) -> Matches:
-    """The matches that a scene is made of: those of units that make tracks, or all where these are fewer."""
-    chosen = [result.matches for result in results if result.unit.tracks]
-    if sum(map(len, chosen)) < least:
-        chosen = [result.matches for result in results]
-    return Matches.concatenate(chosen)
+def tracks_of(results: Sequence[UnitResult], least: int) -> dict[str, Matches]:
+    """The matches that a scene is made of, by their matchers: of units that make tracks, or all if few are."""
+    chosen = [result for result in results if result.unit.tracks]
+    if sum(len(result.matches) for result in chosen) < least:
+        chosen = list(results)
+    matchers = dict.fromkeys(result.unit.matcher for result in chosen)
+    return {
+        name: Matches.concatenate(result.matches for result in chosen if result.unit.matcher == name)
+        for name in matchers
+    }
 
 
 def pairs_to_add(pairs: Sequence[Pair], config: SceneConfig | None) -> list[Pair]:

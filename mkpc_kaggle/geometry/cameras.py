@@ -1,9 +1,11 @@
 """Calibrated cameras, turned ones too, and the exact geometry of two of them."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.robust import Matrix3
@@ -57,3 +59,35 @@ def fundamental_of_cameras(camera0: Camera, camera1: Camera) -> Matrix3:
     cross = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
     F = np.linalg.inv(camera1.K).T @ cross @ R @ np.linalg.inv(camera0.K)
     return np.asarray(F / np.linalg.norm(F))
+
+
+def mean_cameras(pairs: Sequence[tuple[Camera, Camera]], most_degrees: float) -> tuple[Camera, Camera]:
+    """Two cameras whose relative pose and focal lengths are the mean of what ``pairs`` say of the same two.
+
+    Each has a world of its own. A pair whose relative rotation is more than ``most_degrees`` from the first one's
+    is left out. The directions of translation are averaged as unit vectors, focal lengths geometrically; principal
+    points are the first pair's. Raises ``ValueError`` where a pair that is left has both cameras at one point.
+    """
+    poses = [relative_pose(*pair) for pair in pairs]
+    rotations = Rotation.from_matrix(np.stack([R for R, _ in poses]))
+    near = np.degrees((rotations * rotations[0].inv()).magnitude()) <= most_degrees
+    directions = [_unit(t) for (_, t), kept in zip(poses, near, strict=True) if kept]
+    kept_pairs = [pair for pair, kept in zip(pairs, near, strict=True) if kept]
+    K0, K1 = (_mean_intrinsics([pair[side].K for pair in kept_pairs]) for side in (0, 1))
+    return Camera(K0, np.eye(3), np.zeros(3)), Camera(
+        K1, rotations[near].mean().as_matrix(), _unit(np.sum(directions, axis=0))
+    )
+
+
+def _unit(t: NDArray[np.float64]) -> NDArray[np.float64]:
+    length = float(np.linalg.norm(t))
+    if length < 1e-9:
+        raise ValueError("the two cameras have one centre")
+    return t / length
+
+
+def _mean_intrinsics(matrices: Sequence[Matrix3]) -> Matrix3:
+    mean = matrices[0].copy()
+    for axis in (0, 1):
+        mean[axis, axis] = np.exp(np.mean([np.log(K[axis, axis]) for K in matrices]))
+    return mean

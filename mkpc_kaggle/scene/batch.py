@@ -1,6 +1,6 @@
 """What a reconstruction is given: the images of a batch by content, and the matches of its pairs."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 from mkpc_kaggle.geometry.coordinates import Size
@@ -25,14 +25,20 @@ class BatchPair:
     """A pair of a batch by the names of its images, with its matches in full-image pixels, which may be empty.
 
     ``own`` is the F, (3, 3), that the pair's matches alone gave; ``None`` where they gave none. ``tracks`` are the
-    matches that the scene is made of; ``None``: all.
+    matches that the scene is made of, by the names of their matchers; ``None``: all, of one matcher.
     """
 
     image0: str
     image1: str
     matches: Matches
     own: Matrix3 | None = None
-    tracks: Matches | None = None
+    tracks: Mapping[str, Matches] | None = None
+
+    def tracks_of(self, matcher: str = "") -> Matches:
+        """The matches that the scene is made of, or those of one matcher among them."""
+        if self.tracks is None:
+            return self.matches
+        return Matches.concatenate(found for name, found in self.tracks.items() if matcher in ("", name))
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,8 +75,13 @@ def distinct_images(images: Iterable[BatchImage]) -> tuple[BatchImage, ...]:
     return tuple(first.values())
 
 
-def edges_of(batch: Batch) -> tuple[Edge, ...]:
-    """The batch's pairs between its distinct images, in order of the two images.
+def matchers_of(batch: Batch) -> tuple[str, ...]:
+    """The matchers of its pairs' tracks, by name."""
+    return tuple(sorted({name for pair in batch.pairs for name in pair.tracks or ()}))
+
+
+def edges_of(batch: Batch, matcher: str = "") -> tuple[Edge, ...]:
+    """The batch's pairs between its distinct images, in order of the two images; of one matcher, or of all.
 
     Pairs of the same two images are one, whatever their order; a pair of an image with itself is left out, since
     it says nothing, and so is one without matches.
@@ -80,7 +91,7 @@ def edges_of(batch: Batch) -> tuple[Edge, ...]:
     parts: dict[tuple[int, int], list[Matches]] = {}
     for pair in batch.pairs:
         first, second = number_of[pair.image0], number_of[pair.image1]
-        tracks = pair.matches if pair.tracks is None else pair.tracks
+        tracks = pair.tracks_of(matcher)
         if first == second or not len(tracks):
             continue
         matches = tracks if first < second else turned(tracks)

@@ -6,7 +6,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from mkpc_kaggle.geometry.cameras import fundamental_of_cameras
+from mkpc_kaggle.geometry.cameras import Camera, fundamental_of_cameras, mean_cameras
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import Matrix3, sampson_distances
 from mkpc_kaggle.scene.config import SceneConfig
@@ -39,26 +39,40 @@ class Choice:
 
 
 def choose(
-    models: Sequence[Model], image0: str, image1: str, matches: Matches, own: Matrix3 | None, config: SceneConfig
+    reconstructions: Sequence[Sequence[Model]],
+    image0: str,
+    image1: str,
+    matches: Matches,
+    own: Matrix3 | None,
+    config: SceneConfig,
 ) -> Choice:
-    """The F of a pair from the first of the models that has both of its images.
+    """The F of a pair, the mean over the reconstructions, each several models in order, that have both images.
 
-    ``own`` is what the pair's ``matches`` alone gave, ``None`` if nothing.
+    The first reconstruction rules, see :func:`mkpc_kaggle.geometry.cameras.mean_cameras`. ``own`` is what the
+    pair's ``matches`` alone gave, ``None`` if nothing.
     """
     if image0 == image1:
         return Choice(None, Reason.SAME_IMAGE)
-    cameras = [(placed_in(model, image0), placed_in(model, image1)) for model in models]
-    both = [(first.camera, second.camera) for first, second in cameras if first and second]
-    if not both:
-        apart = any(first for first, _ in cameras) and any(second for _, second in cameras)
-        return Choice(None, Reason.APART if apart else Reason.UNPLACED)
+    found = [both for models in reconstructions if (both := cameras_in(models, image0, image1))]
+    if not found:
+        placed = {image.name for models in reconstructions for model in models for image in model.images}
+        return Choice(None, Reason.APART if {image0, image1} <= placed else Reason.UNPLACED)
     try:
-        F = fundamental_of_cameras(*both[0])
+        F = fundamental_of_cameras(*(found[0] if len(found) == 1 else mean_cameras(found, config.agreement)))
     except ValueError:
         return Choice(None, Reason.SAME_CENTRE)
     if own is not None and contradicts(F, own, matches, config):
         return Choice(None, Reason.CONTRADICTION)
     return Choice(F, Reason.SCENE)
+
+
+def cameras_in(models: Sequence[Model], image0: str, image1: str) -> tuple[Camera, Camera] | None:
+    """Those of two images in the first model that has both."""
+    for model in models:
+        first, second = placed_in(model, image0), placed_in(model, image1)
+        if first and second:
+            return first.camera, second.camera
+    return None
 
 
 def contradicts(F: Matrix3, own: Matrix3, matches: Matches, config: SceneConfig) -> bool:

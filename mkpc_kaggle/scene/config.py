@@ -27,10 +27,12 @@ class SceneConfig:
     Keypoints: ``cell``, in pixels, is what points of an image are merged in; a pair with fewer matches than
     ``least_tracks`` of units that make tracks gives those of all its units. Verification of a pair's matches:
     ``verification_error`` in pixels, and the ``least_inliers`` that it needs. Cameras: ``camera_model``, and the
-    focal length that they start with, ``prior_focal`` long sides. A scene has
-    ``least_images``, and ``least_pairs_per_image`` times as many connected pairs: with fewer there is little that
-    could contradict its cameras. A batch that has fewer pairs than ``pairs_per_image`` for each of its images
-    gets others that no row names, matched by the recipe's first unit; 0: none. Above ``most_images`` it
+    focal length that they start with, ``prior_focal`` long sides. With ``each_matcher``, what each matcher found
+    is reconstructed alone, too; a pair gets the mean of its cameras that are within ``agreement`` degrees.
+
+    A scene has ``least_images``, and ``least_pairs_per_image`` times as many connected pairs: with fewer there is
+    little that could contradict its cameras. A batch that has fewer pairs than ``pairs_per_image`` for each of its
+    images gets others that no row names, matched by the recipe's first unit; 0: none. Above ``most_images`` it
     gets none, and is reconstructed in overlapping parts, by the incremental mapper whatever ``mapper`` says.
 
     A pair that the scene gives no F is estimated anew from its own matches: ``focal_sigma`` is the standard
@@ -45,7 +47,9 @@ class SceneConfig:
     camera_model: CameraModel = CameraModel.PINHOLE
     cell: float = 0.75
     least_tracks: int = 50
-    verification_error: float = 2.0
+    each_matcher: bool = True
+    agreement: float = 5.0
+    verification_error: float = 1.0
     least_inliers: int = 15
     prior_focal: float = 1.1
     least_images: int = 3
@@ -67,6 +71,7 @@ class SceneConfig:
             self,
             cell=POSITIVE,
             least_tracks=AT_LEAST_0,
+            agreement=POSITIVE,
             verification_error=POSITIVE,
             least_inliers=Range(8),
             prior_focal=POSITIVE,

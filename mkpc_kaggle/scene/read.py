@@ -1,7 +1,7 @@
 """A batch from files: which images there are, by content, and how large they are."""
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from mkpc_kaggle.data.images import Image, Unreadable, read_image
@@ -13,7 +13,8 @@ Read = Callable[[Path], Image | Unreadable]
 
 
 def batch_of(
-    pairs: Sequence[tuple[tuple[Path, Path], Matches, Matrix3 | None, Matches]], read: Read = read_image
+    pairs: Sequence[tuple[tuple[Path, Path], Matches, Matrix3 | None, Mapping[str, Matches]]],
+    read: Read = read_image,
 ) -> tuple[list[int], Batch]:
     """The batch of pairs, given by their images' files, matches, own F and tracks; images go by their paths.
 

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, replace
 
-from mkpc_kaggle.scene.batch import Batch, BatchImage, distinct_images, edges_of
+from mkpc_kaggle.scene.batch import Batch, BatchImage, Edge, distinct_images, edges_of, matchers_of
 from mkpc_kaggle.scene.checks import believable
 from mkpc_kaggle.scene.choose import Choice, Reason, choose
 from mkpc_kaggle.scene.config import SceneConfig
@@ -15,6 +15,8 @@ from mkpc_kaggle.scene.model import Model, PlacedImage, Scene
 @dataclass(frozen=True, eq=False)
 class Solution:
     """What is known of a batch: its scenes, and for each of its pairs, in order, which F it gets.
+
+    The scenes are those of all matches together; what single matchers' matches gave is in the choices alone.
 
     Images go by the name under which they came first; ``names`` has that of every other name too.
     """
@@ -40,20 +42,26 @@ def solve(batch: Batch, config: SceneConfig, known_focals: KnownFocals | None = 
     images = distinct_images(batch.images)
     first = {image.digest: image for image in images}
     image_of = {image.name: first[image.digest] for image in batch.images}
-    scenes = tuple(
-        scene_of(component, images, config)
-        for component in components(len(images), edges_of(batch), config.least_inliers)
-    )
-    models = models_of(scenes)
+    scenes = scenes_of(images, edges_of(batch), config)
+    matchers = matchers_of(batch) if config.each_matcher else ()
+    alone = [scenes_of(images, edges_of(batch, name), config) for name in matchers] if len(matchers) > 1 else []
+    reconstructions = [models_of(found) for found in (scenes, *alone)]
+    models = [model for found in reconstructions for model in found]
     choices = []
     for pair in batch.pairs:
         image0, image1 = image_of[pair.image0], image_of[pair.image1]
-        choice = choose(models, image0.name, image1.name, pair.matches, pair.own, config)
+        choice = choose(reconstructions, image0.name, image1.name, pair.matches, pair.own, config)
         if known_focals is not None and choice.reason not in (Reason.SCENE, Reason.SAME_IMAGE):
             choice = replace(choice, F=known_focals.fundamental(models, image0, image1, pair.matches))
         choices.append(choice)
     names = tuple((name, image.name) for name, image in image_of.items())
     return Solution(scenes, tuple(choices), names)
+
+
+def scenes_of(images: tuple[BatchImage, ...], edges: tuple[Edge, ...], config: SceneConfig) -> tuple[Scene, ...]:
+    """The reconstruction of each connected component."""
+    found = components(len(images), edges, config.least_inliers)
+    return tuple(scene_of(component, images, config) for component in found)
 
 
 def scene_of(component: Component, images: tuple[BatchImage, ...], config: SceneConfig) -> Scene:
