@@ -17,7 +17,7 @@ from mkpc_kaggle.engine.costs import Timeouts
 from mkpc_kaggle.engine.engine import Ending
 from mkpc_kaggle.engine.pools import scene_process
 from mkpc_kaggle.engine.pools.pool import Pool
-from mkpc_kaggle.engine.scenes import Reconstruction, SceneJob, ScenePair, tracks_of
+from mkpc_kaggle.engine.scenes import Reconstruction, SceneJob, tracks_of
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.pipeline.pair import UnitResult
 from mkpc_kaggle.recipe import Recipe, Unit, UpgradeConfig
@@ -25,6 +25,7 @@ from mkpc_kaggle.reporting.report import report_page
 from mkpc_kaggle.reporting.run_log import read_log
 from mkpc_kaggle.reporting.sections import Artist
 from mkpc_kaggle.reporting.summary import overview
+from mkpc_kaggle.scene.batch import BatchPair
 from mkpc_kaggle.scene.choose import Reason
 from mkpc_kaggle.scene.config import SceneConfig
 
@@ -185,7 +186,7 @@ def test_matches_without_tracks_are_for_pairs_with_few_others(fine: int, used: i
 def test_the_scene_of_a_run_is_made_of_tracks_and_judged_by_all_matches(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    given: list[ScenePair] = []
+    given: list[BatchPair] = []
     made = Pool.reconstruct
 
     def note(pool: Pool, job: SceneJob) -> Reconstruction:

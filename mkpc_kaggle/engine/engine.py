@@ -19,11 +19,12 @@ from mkpc_kaggle.engine.planner import Explanation, Planner
 from mkpc_kaggle.engine.pools.pool import Pool
 from mkpc_kaggle.engine.progress import progress_on
 from mkpc_kaggle.engine.records import PairRecord, SceneRecord
-from mkpc_kaggle.engine.scenes import SceneJob, ScenePair, SceneQueue, SceneResult, pairs_to_add, tracks_of
+from mkpc_kaggle.engine.scenes import SceneJob, SceneQueue, SceneResult, pairs_to_add, tracks_of
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.pipeline.pair import UnitResult
 from mkpc_kaggle.recipe import Recipe, Unit
+from mkpc_kaggle.scene.batch import BatchPair
 from mkpc_kaggle.scene.choose import Choice
 from mkpc_kaggle.scene.known_focals import KnownFocals
 
@@ -252,16 +253,16 @@ class Engine:
         recipe = self.recipe
         assert recipe.scene is not None
         known_focals = KnownFocals(recipe.magsac, recipe.focal, recipe.scene.focal_sigma) if recipe.focal else None
-        found = (index for index in self.scenes.batches[batch] if self.planner.records[index].units)
-        pairs = tuple(map(self._scene_pair, found))
-        return SceneJob(batch, pairs, recipe.scene, known_focals)
+        found = tuple(index for index in self.scenes.batches[batch] if self.planner.records[index].units)
+        return SceneJob(batch, found, tuple(map(self._batch_pair, found)), recipe.scene, known_focals)
 
-    def _scene_pair(self, index: int) -> ScenePair:
+    def _batch_pair(self, index: int) -> BatchPair:
         assert self.recipe.scene is not None
         record, results = self.planner.records[index], self._results(index)
-        return ScenePair(
-            index,
-            self.pairs[index].images,
+        image0, image1 = self.pairs[index].images
+        return BatchPair(
+            str(image0),
+            str(image1),
             Matches.concatenate(result.matches for result in results),
             None if record.failure else record.F,
             tracks_of(results, self.recipe.scene.least_tracks),

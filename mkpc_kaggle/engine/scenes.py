@@ -13,8 +13,8 @@ from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.data.images import Image, Unreadable, read_image
 from mkpc_kaggle.engine.costs import Timeouts
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.geometry.robust import Matrix3
 from mkpc_kaggle.pipeline.pair import UnitResult
+from mkpc_kaggle.scene.batch import BatchPair
 from mkpc_kaggle.scene.choose import Choice
 from mkpc_kaggle.scene.config import SceneConfig
 from mkpc_kaggle.scene.known_focals import KnownFocals
@@ -32,25 +32,15 @@ MARGIN = 1.5
 
 
 @dataclass(frozen=True, eq=False)
-class ScenePair:
-    """A pair as a reconstruction is given it: its place in the run, its images' files, its matches and own F.
+class SceneJob:
+    """A batch to reconstruct; plain values, so that it can go to another process or machine.
 
-    ``tracks`` are the matches that the scene is made of, by their matchers.
+    ``indices`` are the places of its ``pairs`` in the run; their images go by the paths of their files.
     """
 
-    index: int
-    images: tuple[Path, Path]
-    matches: Matches
-    own: Matrix3 | None
-    tracks: Mapping[str, Matches]
-
-
-@dataclass(frozen=True, eq=False)
-class SceneJob:
-    """A batch to reconstruct; plain values, so that it can go to another process or machine."""
-
     batch: str
-    pairs: tuple[ScenePair, ...]
+    indices: tuple[int, ...]
+    pairs: tuple[BatchPair, ...]
     config: SceneConfig
     known_focals: KnownFocals | None = None
 
@@ -74,9 +64,9 @@ def reconstruct(job: SceneJob, read: Callable[[Path], Image | Unreadable] = read
     from mkpc_kaggle.scene.read import batch_of
     from mkpc_kaggle.scene.solve import solve
 
-    readable, batch = batch_of([(pair.images, pair.matches, pair.own, pair.tracks) for pair in job.pairs], read)
+    readable, batch = batch_of(job.pairs, read)
     solution = solve(batch, job.config, job.known_focals)
-    indices = [job.pairs[place].index for place in readable]
+    indices = [job.indices[place] for place in readable]
     return solution.scenes, dict(zip(indices, solution.choices, strict=True))
 
 

@@ -46,10 +46,11 @@ def choose(
     own: Matrix3 | None,
     config: SceneConfig,
 ) -> Choice:
-    """The F of a pair, the mean over the reconstructions, each several models in order, that have both images.
+    """The F of a pair, from the mean of its cameras in all reconstructions of the batch that have both.
 
-    The first reconstruction rules, see :func:`mkpc_kaggle.geometry.cameras.mean_cameras`. ``own`` is what the
-    pair's ``matches`` alone gave, ``None`` if nothing.
+    A reconstruction is several models; the first that has both images counts. What is far from the first
+    reconstruction's is left out, see :func:`mkpc_kaggle.geometry.cameras.mean_cameras`. ``own`` is what the pair's
+    ``matches`` alone gave, ``None`` if nothing.
     """
     if image0 == image1:
         return Choice(None, Reason.SAME_IMAGE)

@@ -200,9 +200,9 @@ SCENE_F = np.array([[0.0, 0, 0.2], [0, 0, -0.5], [-0.3, 0.6, 0.5]])
 
 def choose_scene_for_all_but_the_first(job: SceneJob, answers: Connection) -> None:
     """As a reconstruction would, without one; it makes as many points as there are matches."""
-    choices = {pair.index: Choice(SCENE_F, Reason.SCENE) for pair in job.pairs[1:]}
-    choices[job.pairs[0].index] = Choice(None, Reason.CONTRADICTION)
-    names = tuple(sorted({str(path) for pair in job.pairs for path in pair.images}))
+    choices = {index: Choice(SCENE_F, Reason.SCENE) for index in job.indices[1:]}
+    choices[job.indices[0]] = Choice(None, Reason.CONTRADICTION)
+    names = tuple(sorted({name for pair in job.pairs for name in (pair.image0, pair.image1)}))
     camera = Camera(np.eye(3), np.eye(3), np.zeros(3))
     placed = tuple(PlacedImage(name, Size(80, 72), camera, 99) for name in names)
     points = np.zeros((sum(len(pair.matches) for pair in job.pairs), 3))

@@ -200,7 +200,7 @@ class SimulatedPool:
         if self.clock.now > scenario.turn * scenario.limit:
             seconds *= scenario.drift
         answer: SceneAnswer | str
-        answer = (), {pair.index: Choice(FALLBACK_FUNDAMENTAL, Reason.SCENE) for pair in job.pairs}
+        answer = (), {index: Choice(FALLBACK_FUNDAMENTAL, Reason.SCENE) for index in job.indices}
         if rng.random() < scenario.scene_faults:
             faults = ((seconds / 2, "signal SIGSEGV"), (seconds / 3, "exit status 1"), (math.inf, "it hangs"))
             seconds, answer = faults[rng.integers(len(faults))]
