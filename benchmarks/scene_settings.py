@@ -37,6 +37,7 @@ SETTINGS = {
     "verify 4": replace(DEFAULT, verification_error=4.0),
     "seed 1": replace(DEFAULT, seed=1),
     "together": replace(DEFAULT, each_matcher=False),
+    "own cameras": replace(DEFAULT, one_camera=0.0),
 }
 ONE_MAGSAC = RobustConfig(orders=1)
 

@@ -1,6 +1,7 @@
 """A batch from known cameras: matches of true points with noise, and wrong ones."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -41,15 +42,20 @@ def synthetic_scene(
     outliers: float = 0.2,
     seed: int = 0,
     prefix: str = "",
+    focals: Sequence[float] = (),
 ) -> SyntheticScene:
     """Cameras on an arc before a front with depth; ``pairs`` of all pairs, chosen evenly, or all of them.
 
     A point is where the image's detector finds it, ``noise`` pixels off in each coordinate, and the same in every
     pair of the image but for a twentieth of a pixel. ``outliers`` is the share of matches between other points.
+    Without ``focals``, in pixels, each camera has a focal length of its own.
     """
     rng = np.random.default_rng(seed)
     world = front(rng, points)
-    cameras = {f"{prefix}{number:04}": arc_camera(rng, number / max(images - 1, 1)) for number in range(images)}
+    arc = [arc_camera(rng, number / max(images - 1, 1)) for number in range(images)]
+    if focals:
+        arc = [zoomed(camera, focal) for camera, focal in zip(arc, focals, strict=True)]
+    cameras = {f"{prefix}{number:04}": camera for number, camera in enumerate(arc)}
     seen = {name: project(camera, world) + rng.normal(0, noise, (points, 2)) for name, camera in cameras.items()}
     named = tuple(BatchImage(name, f"digest of {name}", SIZE) for name in cameras)
     chosen = list(combinations(cameras, 2))
@@ -76,9 +82,13 @@ def arc_camera(rng: np.random.Generator, where: float) -> Camera:
     right = np.cross([0.0, 1, 0], ahead)
     right /= np.linalg.norm(right)
     R = np.stack([right, np.cross(ahead, right), ahead])
-    focal = max(SIZE) * np.exp(rng.normal(np.log(1.1), 0.2))
+    return zoomed(Camera(np.eye(3), R, -R @ centre), max(SIZE) * np.exp(rng.normal(np.log(1.1), 0.2)))
+
+
+def zoomed(camera: Camera, focal: float) -> Camera:
+    """The camera with another focal length, in pixels."""
     K = np.array([[focal, 0, SIZE.width / 2 - 0.5], [0, focal, SIZE.height / 2 - 0.5], [0, 0, 1]])
-    return Camera(K, R, -R @ centre)
+    return replace(camera, K=K)
 
 
 def project(camera: Camera, world: np.ndarray) -> np.ndarray:

@@ -30,6 +30,11 @@ class SceneConfig:
     focal length that they start with, ``prior_focal`` long sides. With ``each_matcher``, what each matcher found
     is reconstructed alone, too; a pair gets the mean of its cameras that are within ``agreement`` degrees.
 
+    One camera: where more than half of ``one_camera_images`` or more of one size have focal lengths within a
+    share of ``one_camera`` of their median, the scene is made anew with one camera for that size, but for images
+    that are not within and see ``one_camera_weak`` times as many points as the median image, or more. It stays if
+    images see points ``one_camera_points`` times as often as before, or more. ``one_camera = 0``: never.
+
     A scene has ``least_images``, and ``least_pairs_per_image`` times as many connected pairs: with fewer there is
     little that could contradict its cameras. A batch that has fewer pairs than ``pairs_per_image`` for each of its
     images gets others that no row names, matched by the recipe's first unit; 0: none. Above ``most_images`` it
@@ -49,6 +54,10 @@ class SceneConfig:
     least_tracks: int = 50
     each_matcher: bool = True
     agreement: float = 5.0
+    one_camera: float = 0.02
+    one_camera_images: int = 5
+    one_camera_weak: float = 0.5
+    one_camera_points: float = 0.99
     verification_error: float = 1.0
     least_inliers: int = 15
     prior_focal: float = 1.1
@@ -72,6 +81,10 @@ class SceneConfig:
             cell=POSITIVE,
             least_tracks=AT_LEAST_0,
             agreement=POSITIVE,
+            one_camera=AT_LEAST_0,
+            one_camera_images=Range(3),
+            one_camera_weak=AT_LEAST_0,
+            one_camera_points=AT_LEAST_0,
             verification_error=POSITIVE,
             least_inliers=Range(8),
             prior_focal=POSITIVE,

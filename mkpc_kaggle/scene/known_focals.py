@@ -9,12 +9,13 @@ from mkpc_kaggle.geometry.robust import Matrix3, RobustConfig
 from mkpc_kaggle.scene.batch import BatchImage
 from mkpc_kaggle.scene.choose import placed_in
 from mkpc_kaggle.scene.model import Model
+from mkpc_kaggle.scene.one_camera import OneCameras
 
 
 @dataclass(frozen=True)
 class KnownFocals:
     """How F is estimated: ``magsac`` and ``focal`` are those of a pair alone, but the log focal length of an image
-    that has a camera in a model has the standard deviation ``sigma``.
+    that has a camera in a model, or is by one camera with others, has the standard deviation ``sigma``.
     """
 
     magsac: RobustConfig
@@ -22,10 +23,15 @@ class KnownFocals:
     sigma: float
 
     def fundamental(
-        self, models: Sequence[Model], image0: BatchImage, image1: BatchImage, matches: Matches
+        self,
+        models: Sequence[Model],
+        cameras: OneCameras,
+        image0: BatchImage,
+        image1: BatchImage,
+        matches: Matches,
     ) -> Matrix3 | None:
-        """F, (3, 3); ``None`` where neither image has a camera or the matches give none."""
-        focals = focal_in(models, image0.name), focal_in(models, image1.name)
+        """F, (3, 3); ``None`` where neither focal length is known or the matches give none."""
+        focals = focal_of(models, cameras, image0), focal_of(models, cameras, image1)
         if focals == (None, None):
             return None
         first, second = (
@@ -38,7 +44,10 @@ class KnownFocals:
         return found.matrix if found.ok else None
 
 
-def focal_in(models: Sequence[Model], name: str) -> float | None:
-    """The focal length, in pixels, of an image's camera in the first model that has it."""
-    placed = [image for model in models if (image := placed_in(model, name)) is not None]
-    return placed[0].focal if placed else None
+def focal_of(models: Sequence[Model], cameras: OneCameras, image: BatchImage) -> float | None:
+    """The focal length, in pixels, of an image's camera: the first model's, or one that took others too."""
+    placed = [found for model in models if (found := placed_in(model, image.name)) is not None]
+    if placed:
+        return placed[0].focal
+    camera = cameras.get(image.size)
+    return camera.focal if camera and image.name in camera.images else None

@@ -23,51 +23,73 @@ from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.scene.config import Mapper, SceneConfig
 from mkpc_kaggle.scene.keypoints import SceneKeypoints
 from mkpc_kaggle.scene.model import Model, PlacedImage
+from mkpc_kaggle.scene.one_camera import OneCameras
 
 CENTRE = 0.5
 """In COLMAP the top-left pixel's centre is (0.5, 0.5); here it is (0, 0)."""
 
 
 def reconstruct(
-    names: Sequence[str], sizes: Sequence[Size], keypoints: SceneKeypoints, config: SceneConfig
+    names: Sequence[str],
+    sizes: Sequence[Size],
+    keypoints: SceneKeypoints,
+    config: SceneConfig,
+    known: OneCameras | None = None,
 ) -> tuple[Model, ...]:
     """The models that pycolmap makes of connected images, as they come, the largest first; perhaps none.
 
-    ``names``, ``sizes`` and ``keypoints.points`` are of the same images.
+    ``names``, ``sizes`` and ``keypoints.points`` are of the same images. Each image has a camera of its own but
+    those of ``known`` cameras, which start at their focal lengths.
     """
     pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
     pycolmap.set_random_seed(config.seed)
     with tempfile.TemporaryDirectory(prefix="scene-") as folder:
         database = Path(folder) / "database.db"
-        _write(database, sizes, keypoints, config)
+        _write(database, names, sizes, keypoints, config, known or {})
         _verify(database, config)
         found = _map(database, Path(folder), len(sizes), config)
         models = [_model(found[number], names, sizes) for number in sorted(found)]
     return tuple(sorted(models, key=lambda model: (-len(model.images), -len(model.points))))
 
 
-def _write(path: Path, sizes: Sequence[Size], keypoints: SceneKeypoints, config: SceneConfig) -> None:
-    """Each image gets a camera, a rig and a frame of its own, all under the image's place plus one."""
+def _write(
+    path: Path,
+    names: Sequence[str],
+    sizes: Sequence[Size],
+    keypoints: SceneKeypoints,
+    config: SceneConfig,
+    known: OneCameras,
+) -> None:
+    """Images and frames are numbered by the image's place plus one, cameras and rigs by their first image."""
+    first: dict[Size, int] = {}
     with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
-        for number, (size, points) in enumerate(zip(sizes, keypoints.points, strict=True), start=1):
-            camera = pycolmap.Camera.create_from_model_name(
-                number, config.camera_model.value, config.prior_focal * max(size), *size
-            )
-            camera.has_prior_focal_length = True  # a pair that E explains at the prior is used as calibrated
-            database.write_camera(camera, use_camera_id=True)
-            rig = pycolmap.Rig(rig_id=number)
-            rig.add_ref_sensor(camera.sensor_id)
-            database.write_rig(rig, use_rig_id=True)
+        for number, (name, size, points) in enumerate(zip(names, sizes, keypoints.points, strict=True), start=1):
+            camera = known.get(size)
+            shared = camera is not None and name in camera.images
+            taken_by = first.setdefault(size, number) if shared else number
+            if taken_by == number:
+                focal = camera.focal if camera and shared else config.prior_focal * max(size)
+                _write_camera(database, number, size, focal, config)
             image = pycolmap.Image(
-                name=f"{number:06}", camera_id=number, image_id=number, keypoints=np.zeros((0, 2))
+                name=f"{number:06}", camera_id=taken_by, image_id=number, keypoints=np.zeros((0, 2))
             )
             database.write_image(image, use_image_id=True)
-            frame = pycolmap.Frame(frame_id=number, rig_id=number)
+            frame = pycolmap.Frame(frame_id=number, rig_id=taken_by)
             frame.add_data_id(image.data_id)
             database.write_frame(frame, use_frame_id=True)
             database.write_keypoints(number, points + np.float32(CENTRE))
         for edge in keypoints.edges:
             database.write_matches(edge.first + 1, edge.second + 1, edge.index)
+
+
+def _write_camera(database: Any, number: int, size: Size, focal: float, config: SceneConfig) -> None:
+    """A camera, and a rig of it alone."""
+    camera = pycolmap.Camera.create_from_model_name(number, config.camera_model.value, focal, *size)
+    camera.has_prior_focal_length = True  # a pair that E explains at the prior is used as calibrated
+    database.write_camera(camera, use_camera_id=True)
+    rig = pycolmap.Rig(rig_id=number)
+    rig.add_ref_sensor(camera.sensor_id)
+    database.write_rig(rig, use_rig_id=True)
 
 
 def _verify(database: Path, config: SceneConfig) -> None:

@@ -10,6 +10,7 @@ from mkpc_kaggle.scene.graph import Component, components
 from mkpc_kaggle.scene.keypoints import scene_keypoints
 from mkpc_kaggle.scene.known_focals import KnownFocals
 from mkpc_kaggle.scene.model import Model, PlacedImage, Scene
+from mkpc_kaggle.scene.one_camera import OneCameras, one_cameras
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,9 +43,10 @@ def solve(batch: Batch, config: SceneConfig, known_focals: KnownFocals | None = 
     images = distinct_images(batch.images)
     first = {image.digest: image for image in images}
     image_of = {image.name: first[image.digest] for image in batch.images}
-    scenes = scenes_of(images, edges_of(batch), config)
+    scenes, known = scenes_and_cameras(images, edges_of(batch), config)
     matchers = matchers_of(batch) if config.each_matcher else ()
-    alone = [scenes_of(images, edges_of(batch, name), config) for name in matchers] if len(matchers) > 1 else []
+    single = matchers if len(matchers) > 1 else ()
+    alone = [scenes_of(images, edges_of(batch, name), config, known) for name in single]
     reconstructions = [models_of(found) for found in (scenes, *alone)]
     models = [model for found in reconstructions for model in found]
     choices = []
@@ -52,19 +54,44 @@ def solve(batch: Batch, config: SceneConfig, known_focals: KnownFocals | None = 
         image0, image1 = image_of[pair.image0], image_of[pair.image1]
         choice = choose(reconstructions, image0.name, image1.name, pair.matches, pair.own, config)
         if known_focals is not None and choice.reason not in (Reason.SCENE, Reason.SAME_IMAGE):
-            choice = replace(choice, F=known_focals.fundamental(models, image0, image1, pair.matches))
+            choice = replace(choice, F=known_focals.fundamental(models, known, image0, image1, pair.matches))
         choices.append(choice)
     names = tuple((name, image.name) for name, image in image_of.items())
     return Solution(scenes, tuple(choices), names)
 
 
-def scenes_of(images: tuple[BatchImage, ...], edges: tuple[Edge, ...], config: SceneConfig) -> tuple[Scene, ...]:
+def scenes_and_cameras(
+    images: tuple[BatchImage, ...], edges: tuple[Edge, ...], config: SceneConfig
+) -> tuple[tuple[Scene, ...], OneCameras]:
+    """The reconstruction of each connected component, and the cameras that took several images of it.
+
+    What looks like one camera's is reconstructed anew as such; if images see fewer points then, it was not.
+    """
+    scenes = scenes_of(images, edges, config, {})
+    known = one_cameras(images, models_of(scenes), config)
+    if known:
+        anew = scenes_of(images, edges, config, known)
+        if observations(anew) >= config.one_camera_points * observations(scenes):
+            return anew, known
+    return scenes, {}
+
+
+def observations(scenes: tuple[Scene, ...]) -> int:
+    """How often images see points."""
+    return sum(image.points for model in models_of(scenes) for image in model.images)
+
+
+def scenes_of(
+    images: tuple[BatchImage, ...], edges: tuple[Edge, ...], config: SceneConfig, known: OneCameras
+) -> tuple[Scene, ...]:
     """The reconstruction of each connected component."""
     found = components(len(images), edges, config.least_inliers)
-    return tuple(scene_of(component, images, config) for component in found)
+    return tuple(scene_of(component, images, config, known) for component in found)
 
 
-def scene_of(component: Component, images: tuple[BatchImage, ...], config: SceneConfig) -> Scene:
+def scene_of(
+    component: Component, images: tuple[BatchImage, ...], config: SceneConfig, known: OneCameras
+) -> Scene:
     """The reconstruction of one component, or why there is none."""
     members = [images[place] for place in component.images]
     names = tuple(image.name for image in members)
@@ -77,7 +104,7 @@ def scene_of(component: Component, images: tuple[BatchImage, ...], config: Scene
     try:
         from mkpc_kaggle.scene.reconstruct import reconstruct
 
-        found = reconstruct(names, [image.size for image in members], keypoints, config)
+        found = reconstruct(names, [image.size for image in members], keypoints, config, known)
     except ImportError as error:
         return Scene(names, failure=f"pycolmap cannot be imported: {error}")
     except (RuntimeError, ValueError) as error:
