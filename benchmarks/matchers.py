@@ -4,7 +4,8 @@ python -m benchmarks.matchers [--rounds 5] [--precision bfloat16] [--only LoFTR,
 
 Weights are the tests' stand-ins, or random ones; the pictures a photograph and its shifted copy. The work is
 counted by PyTorch (matrix products and convolutions); the peak is the most that a large convolution reaches in any
-of the rounds. The memory is the largest of a process that does nothing else, Python and PyTorch included.
+of the rounds. The memory is the largest of a process that does nothing else, Python and PyTorch included. To have
+what a worker has, run it with ``THP_MEM_ALLOC_ENABLE=1``.
 """
 
 import argparse

@@ -1,6 +1,6 @@
 """Time, memory and accuracy of a batch's reconstruction, from matches of known cameras with noise and wrong ones.
 
-python -m benchmarks.scenes [26:304 50:700 100:2000] [--mapper global] [--threads 1] [--outliers 0.2]
+python -m benchmarks.scenes [26:304 50:700 100:2000] [--mapper global] [--threads 1] [--points 2500]
 
 Each size is images:pairs, and runs in a process of its own, as in the engine. `median px` is the median over pairs
 of the distance of true correspondences from the F that the pair got.
@@ -19,13 +19,10 @@ from benchmarks.synthetic_scene import SyntheticScene, synthetic_scene
 from mkpc_kaggle.scene.config import Mapper, SceneConfig
 from mkpc_kaggle.scene.solve import Solution, solve
 
-POINTS = 2500
-"""Of the front; with the losses of matching this is about as many keypoints an image as RootSIFT matches."""
 
-
-def row(size: str, outliers: float, config: SceneConfig) -> str:
+def row(size: str, points: int, outliers: float, config: SceneConfig) -> str:
     images, pairs = map(int, size.split(":"))
-    scene = synthetic_scene(images, pairs, points=POINTS, outliers=outliers)
+    scene = synthetic_scene(images, pairs, points=points, outliers=outliers)
     begin, used = time.perf_counter(), time.process_time()
     solution = solve(scene.batch, config)
     wall, used = time.perf_counter() - begin, time.process_time() - used
@@ -52,6 +49,12 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--most-images", type=int, default=SceneConfig().most_images)
     parser.add_argument("--outliers", type=float, default=0.2)
+    parser.add_argument(
+        "--points",
+        type=int,
+        default=2500,
+        help="of the front; by default an image has as many as RootSIFT matches",
+    )
     arguments = parser.parse_args()
     config = replace(
         SceneConfig(), mapper=arguments.mapper, threads=arguments.threads, most_images=arguments.most_images
@@ -62,7 +65,7 @@ def main() -> None:
     )
     for size in arguments.sizes:
         with ProcessPoolExecutor(1, get_context("spawn")) as pool:
-            print(pool.submit(row, size, arguments.outliers, config).result(), flush=True)
+            print(pool.submit(row, size, arguments.points, arguments.outliers, config).result(), flush=True)
 
 
 if __name__ == "__main__":

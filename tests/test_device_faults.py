@@ -22,6 +22,7 @@ from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.engine import Ending, RunReport
 from mkpc_kaggle.engine.pools import pool
 from mkpc_kaggle.engine.pools.pool import Pool
+from mkpc_kaggle.engine.pools.process import WORKER_ENVIRONMENT
 from mkpc_kaggle.engine.session import Interrupt, Session, run_pairs
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.pipeline import assembly as assemblies
@@ -186,13 +187,15 @@ def test_a_run_that_failed_has_exit_status_one_and_a_line(
     assert submission_problems(output, [pair.id for pair in read_test_side(demo.test_dir)]) == []
 
 
-def test_workers_are_told_not_to_spin_and_nobody_else_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)
+def test_workers_are_told_not_to_spin_and_to_use_huge_pages_and_nobody_else_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in WORKER_ENVIRONMENT:
+        monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("GOMP_SPINCOUNT", "7")
     make = partial(pipeline_telling_its_environment, assembly_of(RectifiedMatcher()), tmp_path / "told")
     pool = Pool([process_place(make)], THREE_UNITS)
     assert pool.start() == ""
     assert pool.close()
-    assert (tmp_path / "told").read_text() == "PASSIVE, 7"
-    assert "OMP_WAIT_POLICY" not in os.environ
-    assert os.environ["GOMP_SPINCOUNT"] == "7"
+    assert (tmp_path / "told").read_text() == "PASSIVE, 7, 1"
+    assert {name: os.environ[name] for name in WORKER_ENVIRONMENT if name in os.environ} == {"GOMP_SPINCOUNT": "7"}

@@ -14,6 +14,7 @@ import numpy as np
 from rectified import RectifiedMatcher, Seen
 
 from mkpc_kaggle.data.images import Unreadable
+from mkpc_kaggle.engine.pools.process import WORKER_ENVIRONMENT
 from mkpc_kaggle.engine.pools.scene_process import serve_scene
 from mkpc_kaggle.engine.scenes import SceneJob
 from mkpc_kaggle.geometry.cameras import Camera
@@ -39,11 +40,11 @@ def pipeline_in_batches(assembly: Assembly, batch: int) -> Pipeline:
 
 
 def pipeline_telling_its_environment(assembly: Assembly, told: Path) -> Pipeline:
-    """What a worker's OpenMP is told, as the process was started with it."""
+    """What a worker's PyTorch is told, as the process was started with it."""
     started_with = dict(
         entry.split("=", 1) for entry in Path("/proc/self/environ").read_text().split("\0") if "=" in entry
     )
-    told.write_text(", ".join(started_with.get(name, "") for name in ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT")))
+    told.write_text(", ".join(started_with.get(name, "") for name in WORKER_ENVIRONMENT))
     return assembly.pipeline()
 
 

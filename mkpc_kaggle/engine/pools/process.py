@@ -24,9 +24,13 @@ from mkpc_kaggle.engine.worker import Answer, Worker
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.pipeline.stages import Pipeline
 
-WORKER_ENVIRONMENT = {"OMP_WAIT_POLICY": "PASSIVE", "GOMP_SPINCOUNT": "0"}
-"""Threads of OpenMP that wait for each other sleep. By default they spin, and keep the cores from decoding, MAGSAC
-and other processes: ``python -m benchmarks.threads``. Read once, when PyTorch loads its OpenMP library."""
+WORKER_ENVIRONMENT = {"OMP_WAIT_POLICY": "PASSIVE", "GOMP_SPINCOUNT": "0", "THP_MEM_ALLOC_ENABLE": "1"}
+"""For PyTorch, which reads them once.
+
+Threads of OpenMP that wait for each other sleep. By default they spin, and keep the cores from decoding, MAGSAC
+and other processes: ``python -m benchmarks.threads``. Tensors of 2 MiB and more come in huge pages, on Linux: in
+small ones a fresh map costs a network as much time as many of its convolutions.
+"""
 
 Received = TypeVar("Received")
 _environment = threading.Lock()
