@@ -1,10 +1,11 @@
 """The alternative: pycolmap's SIFT, exhaustive matching and mappers, on the same pairs.
 
 python -m benchmarks.pycolmap_alone --train-dir DIR [--scenes NAME ...] [--mappers incremental global]
+    [--one-camera]
 
 DIR is a train side in the layout of the Image Matching Challenge 2022. All settings are pycolmap's defaults, but
-for one SIMPLE_RADIAL camera for each image. A pair whose images are not in one model fails. It prints the
-mAA over all pairs with a covisibility of at least 0.1, and CPU seconds.
+for one SIMPLE_RADIAL camera for each image, or for all of a scene with ``--one-camera``. A pair whose images are
+not in one model fails. It prints the mAA over all pairs with a covisibility of at least 0.1, and CPU seconds.
 """
 
 import argparse
@@ -25,14 +26,14 @@ CENTRE = 0.5
 Cameras = dict[str, Camera]
 
 
-def matched(folder: Path, database: Path, images: Path) -> None:
+def matched(database: Path, images: Path, one_camera: bool) -> None:
     """Write SIFT features of all images, and verified matches of every two, to the database."""
     reader = pycolmap.ImageReaderOptions()
     reader.camera_model = "SIMPLE_RADIAL"
     pycolmap.extract_features(
         database,
         images,
-        camera_mode=pycolmap.CameraMode.PER_IMAGE,
+        camera_mode=pycolmap.CameraMode.SINGLE if one_camera else pycolmap.CameraMode.PER_IMAGE,
         reader_options=reader,
         device=pycolmap.Device.cpu,
     )
@@ -65,11 +66,11 @@ def error_of(true: TruePair, found: list[Cameras], metres_per_unit: float) -> Po
     return PoseError.failed()
 
 
-def run(scene: Scene, images: Path, mappers: list[str]) -> None:
+def run(scene: Scene, images: Path, mappers: list[str], one_camera: bool) -> None:
     with tempfile.TemporaryDirectory() as name:
         folder, database = Path(name), Path(name) / "database.db"
         begin = time.process_time()
-        matched(folder, database, images)
+        matched(database, images, one_camera)
         matching = time.process_time() - begin
         for mapper in mappers:
             begin = time.process_time()
@@ -91,13 +92,14 @@ def main() -> None:
     parser.add_argument(
         "--mappers", nargs="+", default=["incremental", "global"], choices=["incremental", "global"]
     )
+    parser.add_argument("--one-camera", action="store_true", help="that took all images of a scene")
     arguments = parser.parse_args()
     pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
     print(
         f"{'scene':20}{'mapper':13}{'pairs':>6}{'mAA':>9}{'lost':>8}{'match s':>10}{'map s':>9}  images of models"
     )
     for scene in read_train_side(arguments.train_dir, scenes=arguments.scenes):
-        run(scene, arguments.train_dir / scene.name / "images", arguments.mappers)
+        run(scene, arguments.train_dir / scene.name / "images", arguments.mappers, arguments.one_camera)
 
 
 if __name__ == "__main__":

@@ -50,7 +50,7 @@ class Dad(nn.Module):
     def logits(self, image: Tensor) -> Tensor:
         """(B, H, W) float32."""
         prediction, hidden = self.decoder(self.levels(image))
-        part = self.decoder.last.outputs(hidden)[:, :1]
+        part = self.decoder.last.outputs(hidden, slice(1))
         return resize(prediction, part.shape[2:], "bicubic").add_(part)[:, 0]
 
     def levels(self, image: Tensor) -> Iterator[Tensor]:

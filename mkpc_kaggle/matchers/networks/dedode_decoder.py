@@ -69,10 +69,10 @@ class Refiner(nn.Module):
         reach = KERNEL // 2 * len(self.hidden_blocks)
         return in_strips(self._hidden, mixed, reach=reach, channels=mixed.shape[1])
 
-    def outputs(self, hidden: Tensor) -> Tensor:
-        """(B, prediction + context, h, w) float32, the part of the prediction first."""
-        outputs: Tensor = self.out_conv(hidden.float())
-        return outputs
+    def outputs(self, hidden: Tensor, which: slice = slice(None)) -> Tensor:
+        """(B, n, h, w) float32: ``which`` of the channels, the prediction's first and then the context's."""
+        weight, bias = (self.out_conv.get_parameter(name)[which] for name in ("weight", "bias"))
+        return functional.conv2d(hidden.float(), weight, bias)
 
     def _hidden(self, mixed: Tensor) -> Tensor:
         blocks: Tensor = self.hidden_blocks(mixed)
@@ -125,9 +125,10 @@ class Decoder(nn.Module):
     ) -> tuple[Tensor, Tensor]:
         """The prediction with what this stride adds, and its context."""
         refiner = self.at(stride)
-        outputs = refiner.outputs(refiner.hidden(refiner.mixed(entry, context)))
-        # A copy: a view would hold the prediction's part as long.
-        part, context = outputs[:, : self.prediction], outputs[:, self.prediction :].clone()
+        hidden = refiner.hidden(refiner.mixed(entry, context))
+        del entry  # the maps that follow are the most that is in memory at a time
+        part = refiner.outputs(hidden, slice(self.prediction))
+        context = refiner.outputs(hidden, slice(self.prediction, None))
         if prediction is not None:
             # In parts, since at stride 2 the enlarged one is the largest map of all.
             chunks = (torch.split(map_, CHANNELS, dim=1) for map_ in (part, prediction))
