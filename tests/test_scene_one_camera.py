@@ -88,6 +88,8 @@ def test_few_images_of_each_of_two_sizes_are_few() -> None:
 def test_zero_turns_it_off() -> None:
     found = model(*((WIDE, focal, 100) for focal in (838.0, 839, 840, 841, 842)))
     assert one_cameras(batch_images(5), [found], OWN) == {}
+    unmoved = model(*[(WIDE, FOCAL, 100)] * 5)  # the prior's, in all of them
+    assert one_cameras(batch_images(5), [unmoved], OWN) == {}
 
 
 def focals_of(solution: Solution) -> list[float]:

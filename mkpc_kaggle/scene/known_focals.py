@@ -9,7 +9,7 @@ from mkpc_kaggle.geometry.robust import Matrix3, RobustConfig
 from mkpc_kaggle.scene.batch import BatchImage
 from mkpc_kaggle.scene.choose import placed_in
 from mkpc_kaggle.scene.model import Model
-from mkpc_kaggle.scene.one_camera import OneCameras
+from mkpc_kaggle.scene.one_camera import OneCameras, camera_of
 
 
 @dataclass(frozen=True)
@@ -49,5 +49,5 @@ def focal_of(models: Sequence[Model], cameras: OneCameras, image: BatchImage) ->
     placed = [found for model in models if (found := placed_in(model, image.name)) is not None]
     if placed:
         return placed[0].focal
-    camera = cameras.get(image.size)
-    return camera.focal if camera and image.name in camera.images else None
+    camera = camera_of(cameras, image.name, image.size)
+    return camera.focal if camera else None

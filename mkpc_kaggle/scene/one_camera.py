@@ -43,10 +43,16 @@ def one_cameras(images: Sequence[BatchImage], models: Iterable[Model], config: S
     for size in {image.size for image in placed.values()}:
         alike = [image for image in placed.values() if image.size == size]
         focal = float(np.median([image.focal for image in alike]))
-        near = [image for image in alike if abs(image.focal / focal - 1) <= config.one_camera]
+        near = [image for image in alike if abs(image.focal / focal - 1) < config.one_camera]
         if len(alike) >= config.one_camera_images and len(near) > len(alike) / 2:
             many = config.one_camera_weak * float(np.median([image.points for image in alike]))
             zoomed = {image.name for image in alike if image not in near and image.points >= many}
             names = {image.name for image in images if image.size == size}
             found[size] = OneCamera(focal, frozenset(names - zoomed))
     return found
+
+
+def camera_of(known: OneCameras, name: str, size: Size) -> OneCamera | None:
+    """The camera that took the image with others."""
+    camera = known.get(size)
+    return camera if camera and name in camera.images else None

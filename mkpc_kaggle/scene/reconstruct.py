@@ -23,7 +23,7 @@ from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.scene.config import Mapper, SceneConfig
 from mkpc_kaggle.scene.keypoints import SceneKeypoints
 from mkpc_kaggle.scene.model import Model, PlacedImage
-from mkpc_kaggle.scene.one_camera import OneCameras
+from mkpc_kaggle.scene.one_camera import OneCameras, camera_of
 
 CENTRE = 0.5
 """In COLMAP the top-left pixel's centre is (0.5, 0.5); here it is (0, 0)."""
@@ -34,7 +34,7 @@ def reconstruct(
     sizes: Sequence[Size],
     keypoints: SceneKeypoints,
     config: SceneConfig,
-    known: OneCameras | None = None,
+    known: OneCameras,
 ) -> tuple[Model, ...]:
     """The models that pycolmap makes of connected images, as they come, the largest first; perhaps none.
 
@@ -45,7 +45,7 @@ def reconstruct(
     pycolmap.set_random_seed(config.seed)
     with tempfile.TemporaryDirectory(prefix="scene-") as folder:
         database = Path(folder) / "database.db"
-        _write(database, names, sizes, keypoints, config, known or {})
+        _write(database, names, sizes, keypoints, config, known)
         _verify(database, config)
         found = _map(database, Path(folder), len(sizes), config)
         models = [_model(found[number], names, sizes) for number in sorted(found)]
@@ -64,11 +64,10 @@ def _write(
     first: dict[Size, int] = {}
     with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
         for number, (name, size, points) in enumerate(zip(names, sizes, keypoints.points, strict=True), start=1):
-            camera = known.get(size)
-            shared = camera is not None and name in camera.images
-            taken_by = first.setdefault(size, number) if shared else number
+            camera = camera_of(known, name, size)
+            taken_by = first.setdefault(size, number) if camera else number
             if taken_by == number:
-                focal = camera.focal if camera and shared else config.prior_focal * max(size)
+                focal = camera.focal if camera else config.prior_focal * max(size)
                 _write_camera(database, number, size, focal, config)
             image = pycolmap.Image(
                 name=f"{number:06}", camera_id=taken_by, image_id=number, keypoints=np.zeros((0, 2))
