@@ -9,6 +9,7 @@ from multiprocessing.context import SpawnProcess
 import numpy as np
 import pytest
 
+from mkpc_kaggle.engine.pools import scene_process
 from mkpc_kaggle.engine.pools.scene_process import SceneProcess
 from mkpc_kaggle.engine.scenes import SceneJob
 from mkpc_kaggle.geometry.matches import Matches
@@ -50,3 +51,13 @@ def test_a_process_that_dies_or_stops_at_its_birth_blocks_nothing(
     while process.answer() is None:
         threading.Event().wait(0.05)
     assert "its process ended: signal SIGKILL" in str(process.answer())
+
+
+def test_a_process_that_cannot_be_started_is_a_failure_of_the_scene(monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_memory(_: SpawnProcess) -> None:
+        raise OSError(12, "Cannot allocate memory")
+
+    monkeypatch.setattr(scene_process.SpawnProcess, "start", no_memory)
+    process = SceneProcess(LARGE)
+    assert "cannot be started: [Errno 12] Cannot allocate memory" in str(process.answer())
+    process.kill()

@@ -26,17 +26,24 @@ class SceneProcess:
         self._process: SpawnProcess = context.Process(
             target=begin, args=(serve_scene, its_pipe), name="mkpc scene", daemon=True
         )
-        with signals_blocked():
-            self._process.start()
-        its_pipe.close()
+        try:
+            with signals_blocked():
+                self._process.start()
+        except OSError as error:  # no memory, or no process more
+            self._pipe.close()
+            self._answer = f"its process cannot be started: {error}"
+            return
+        finally:
+            its_pipe.close()
         threading.Thread(target=self._ask, name="scene", daemon=True).start()
 
     def answer(self) -> SceneAnswer | str | None:
         return self._answer
 
     def kill(self) -> None:
-        self._process.kill()
-        self._process.join(timeout=1.0)
+        if self._process.pid is not None:
+            self._process.kill()
+            self._process.join(timeout=1.0)
 
     def _ask(self) -> None:
         try:
