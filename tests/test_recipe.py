@@ -3,12 +3,13 @@
 import json
 import os
 import tomllib
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import combinations
+from typing import ClassVar
 
 import pytest
 
-from mkpc_kaggle.config import Range
+from mkpc_kaggle.config import Range, from_table
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Box, Size, View
 from mkpc_kaggle.geometry.critical_region import MkpcConfig, Ratio
@@ -218,6 +219,21 @@ def test_a_unit_shows_a_crop_at_its_size():
 def test_unknown_and_missing_keys_are_named_with_the_known_ones(text, says):
     with pytest.raises(UserError, match=f"'mine'.*{says}"):
         parse(text)
+
+
+@dataclass(frozen=True)
+class Settings:
+    RENAMED: ClassVar = {"old": "new"}
+    REMOVED: ClassVar = ("gone",)
+    new: int = 1
+
+
+@pytest.mark.parametrize(
+    ("key", "says"), [("old", "'old' is now called 'new'"), ("gone", "'gone' was removed"), ("x", "keys: new$")]
+)
+def test_a_former_key_is_refused_with_what_became_of_it(key, says):
+    with pytest.raises(UserError, match=f"table t.*{says}"):
+        from_table(Settings, {key: 1}, "table t")
 
 
 def test_an_unknown_key_of_a_matcher_lists_its_options():
