@@ -32,7 +32,7 @@ from mkpc_kaggle.scene.batch import Batch, BatchImage, BatchPair
 from mkpc_kaggle.scene.config import SceneConfig
 from mkpc_kaggle.scene.solve import solve
 
-MAGSAC = RobustConfig(orders=1)
+MAGSAC = RobustConfig(permutations=1)
 FOCAL = FocalConfig()
 
 
@@ -43,7 +43,7 @@ def with_prior(found: SavedMatches) -> Estimate:
 
 
 PAIR_ESTIMATES: dict[str, Callable[[SavedMatches], Estimate]] = {
-    "MAGSAC, 8 orders": lambda found: estimate(found.matches, RobustConfig(orders=8)),
+    "MAGSAC, 8 orders": lambda found: estimate(found.matches, RobustConfig(permutations=8)),
     "MAGSAC": lambda found: estimate(found.matches, MAGSAC),
     "prior": with_prior,
 }

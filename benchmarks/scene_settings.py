@@ -39,7 +39,7 @@ SETTINGS = {
     "together": replace(DEFAULT, each_matcher=False),
     "own cameras": replace(DEFAULT, one_camera=0.0),
 }
-ONE_MAGSAC = RobustConfig(orders=1)
+ONE_MAGSAC = RobustConfig(permutations=1)
 
 
 def matched(true: TruePair, found: SavedMatches) -> BatchPair:

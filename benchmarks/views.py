@@ -23,7 +23,7 @@ from mkpc_kaggle.data.images import Image, Unreadable, read_image
 from mkpc_kaggle.geometry.cameras import fundamental_of_cameras
 from mkpc_kaggle.geometry.coordinates import Points, Size
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.geometry.robust import Model, RobustConfig, estimate, sampson_distances
+from mkpc_kaggle.geometry.robust import ModelKind, RobustConfig, estimate, sampson_distances
 from mkpc_kaggle.pipeline.assembly import assemble
 from mkpc_kaggle.pipeline.pair import PairMatch
 from mkpc_kaggle.pipeline.stages import Pipeline
@@ -57,7 +57,7 @@ class Seen:
         right = matches[is_right]
         covers = [hull_share(right.points0, images[0].size), hull_share(right.points1, images[1].size)]
         error = float(np.median(distances[is_right])) if len(right) else np.nan
-        plane = estimate(right, RobustConfig(threshold=PLANE), Model.H)
+        plane = estimate(right, RobustConfig(threshold=PLANE), ModelKind.H)
         share = plane.inlier_count / len(right) if plane.ok else np.nan
         return cls(len(matches), float(is_right.mean()), error, fmean(covers), share)
 

@@ -12,6 +12,7 @@ from sklearn.cluster import DBSCAN
 from benchmarks.clustering import DISTRIBUTIONS
 from mkpc_kaggle.geometry.clustering import dbscan
 
+
 def reference(points, *, eps, min_samples):
     # The k-d tree always: the brute force that "auto" takes for a few points rounds |a|^2 - 2ab + |b|^2.
     return DBSCAN(eps=eps, min_samples=min_samples, algorithm="kd_tree").fit_predict(points)

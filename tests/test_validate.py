@@ -105,7 +105,7 @@ def test_each_step_of_the_estimate_has_a_column(
         str(tmp_path / "scores.json"),
         "--recipe",
     ]
-    recipe.write_text(RECIPE + "[magsac]\norders = 1\n")
+    recipe.write_text(RECIPE + "[magsac]\npermutations = 1\n")
     assert main([*arguments, str(recipe)]) == 0
     plain = json.loads((tmp_path / "scores.json").read_text())
     assert plain["mAA_by_step"] == {"MAGSAC": plain["mAA"]}

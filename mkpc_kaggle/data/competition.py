@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.cameras import Camera
-from mkpc_kaggle.geometry.robust import Matrix3, Model
+from mkpc_kaggle.geometry.robust import Matrix3, ModelKind
 
 TEST_COLUMNS = ("sample_id", "batch_id", "image_1_id", "image_2_id")
 SUBMISSION_COLUMNS = ("sample_id", "fundamental_matrix")
@@ -76,8 +76,8 @@ class Pair:
         return self.file0.rpartition(os.sep)[2], self.file1.rpartition(os.sep)[2]
 
     @property
-    def model(self) -> Model:
-        return Model.F if self.intrinsics is None else Model.E
+    def model(self) -> ModelKind:
+        return ModelKind.F if self.intrinsics is None else ModelKind.E
 
     @property
     def key(self) -> str:

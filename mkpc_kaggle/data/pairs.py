@@ -21,7 +21,7 @@ from mkpc_kaggle.data.images import Unreadable, read_image
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Size
-from mkpc_kaggle.geometry.robust import Model
+from mkpc_kaggle.geometry.robust import ModelKind
 
 FIELDS = 2 + 2 + 9 + 9 + 16
 EXPECTED = "name0 name1 turns0 turns1 K0 (9 numbers) K1 (9) T_0to1 (16)"
@@ -40,7 +40,7 @@ class PairLine:
 
 
 def read_pairs(
-    file: Path, image_root: Path, model: Model | str, *, copies: Path, most: int | None = None
+    file: Path, image_root: Path, model: ModelKind | str, *, copies: Path, most: int | None = None
 ) -> Scene:
     """The pairs of a list as one scene of unknown scale, to estimate ``model``, E or F, on.
 
@@ -68,7 +68,7 @@ def read_pairs(
         return turned_copy(image_root / name, turns, copies)
 
     chosen = evenly_spread(lines, most)
-    return Scene(file.stem, nan, tuple(_true_pair(line, upright, Model(model), file.stem) for line in chosen))
+    return Scene(file.stem, nan, tuple(_true_pair(line, upright, ModelKind(model), file.stem) for line in chosen))
 
 
 def parse_line(line: str, number: int, file: Path) -> PairLine:
@@ -135,10 +135,12 @@ def turned_copy(image: Path, turns: int, copies: Path) -> UprightImage:
     return UprightImage(path, picture.size)
 
 
-def _true_pair(line: PairLine, upright: Callable[[str, int], UprightImage], model: Model, group: str) -> TruePair:
+def _true_pair(
+    line: PairLine, upright: Callable[[str, int], UprightImage], model: ModelKind, group: str
+) -> TruePair:
     shown = [upright(name, turns) for name, turns in zip(line.names, line.turns, strict=True)]
     camera0, camera1 = (
-        camera.turned(turns, image.size) if image.size else camera
+        camera.rotated_90(turns, image.size) if image.size else camera
         for camera, turns, image in zip(line.cameras, line.turns, shown, strict=True)
     )
     names = " ".join(
@@ -150,6 +152,6 @@ def _true_pair(line: PairLine, upright: Callable[[str, int], UprightImage], mode
         group,
         str(shown[0].path),
         str(shown[1].path),
-        (camera0.K, camera1.K) if model is Model.E else None,
+        (camera0.K, camera1.K) if model is ModelKind.E else None,
     )
     return TruePair(pair, camera0, camera1, nan)

@@ -24,7 +24,7 @@ from mkpc_kaggle.geometry.metrics import (
     pose_auc,
     pose_error,
 )
-from mkpc_kaggle.geometry.robust import Matrix3, Model
+from mkpc_kaggle.geometry.robust import Matrix3, ModelKind
 from mkpc_kaggle.pipeline.assembly import Assembly
 
 
@@ -150,7 +150,7 @@ def error_of(matrix: Matrix3 | None, true: TruePair, scene: Scene) -> PoseError:
     if matrix is None:
         return PoseError.failed()
     cameras = true.camera0, true.camera1
-    if true.pair.model is Model.E:
+    if true.pair.model is ModelKind.E:
         cameras = true.camera0.calibrated, true.camera1.calibrated
     return pose_error(matrix, *cameras, scene.metres_per_unit)
 
