@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from mkpc_kaggle.data.competition import Scene
+from mkpc_kaggle.data.competition import TrainScene
 from mkpc_kaggle.data.pairs import read_pairs
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.session import Session, interruptible
@@ -68,7 +68,7 @@ TABLES = {
 """The sizes of the last row and of "all sizes" are the paper's; the others are a choice among the last's."""
 
 
-def table(dataset: str, scene: Scene, arguments: argparse.Namespace) -> Iterator[str]:
+def table(dataset: str, scene: TrainScene, arguments: argparse.Namespace) -> Iterator[str]:
     """The table in Markdown."""
     heads = " | ".join(f"AUC {threshold:g}" for threshold in AUC_THRESHOLDS)
     yield f"| {dataset}: {len(scene.pairs)} pairs | whole images | critical regions | {heads} |"
@@ -81,7 +81,7 @@ def table(dataset: str, scene: Scene, arguments: argparse.Namespace) -> Iterator
             yield "| " + " | ".join([row.name, *sizes, *areas]) + " |"
 
 
-def run(row: Row, dataset: str, scene: Scene, arguments: argparse.Namespace) -> Validation:
+def run(row: Row, dataset: str, scene: TrainScene, arguments: argparse.Namespace) -> Validation:
     recipe = row.of(dataset, arguments.matcher)
     magsac = replace(recipe.magsac, method=arguments.method, threshold=arguments.threshold)
     assembly = assemble(replace(recipe, magsac=magsac), weights=arguments.weights)

@@ -18,7 +18,7 @@ import numpy as np
 from tqdm import tqdm
 
 from benchmarks.table1 import LONG_SIDES, MOST_MATCHES, OPTIONS
-from mkpc_kaggle.data.competition import Scene, TruePair, read_train_side
+from mkpc_kaggle.data.competition import TrainScene, TruePair, read_train_side
 from mkpc_kaggle.data.images import Image, Unreadable, read_image
 from mkpc_kaggle.geometry.cameras import fundamental_of_cameras
 from mkpc_kaggle.geometry.coordinates import Points, Size
@@ -93,7 +93,7 @@ def look(images: tuple[Image, Image], true: TruePair, pipeline: Pipeline) -> Vie
     return Views(*found, fmean(enlarged))
 
 
-def looks(scene: Scene, pipeline: Pipeline) -> list[Views | None]:
+def looks(scene: TrainScene, pipeline: Pipeline) -> list[Views | None]:
     """The pairs of a scene; those with an image that cannot be read are left out."""
     found = []
     for true in tqdm(scene.pairs, desc=f"{scene.name}, {pipeline.recipe.name}", unit="pair", leave=False):

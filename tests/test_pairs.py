@@ -14,7 +14,7 @@ from benchmarks import paper_tables
 from mkpc_kaggle import TwoStageMatcher
 from mkpc_kaggle.cli import main
 from mkpc_kaggle.cli.validate import with_units
-from mkpc_kaggle.data.competition import Scene, read_train_side
+from mkpc_kaggle.data.competition import TrainScene, read_train_side
 from mkpc_kaggle.data.images import Image, read_image
 from mkpc_kaggle.data.pairs import parse_line, read_pairs
 from mkpc_kaggle.demo import DemoSet
@@ -26,7 +26,7 @@ from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.robust import ModelKind
 from mkpc_kaggle.recipe import load_recipe
 
-FILE = Path("list.txt")
+WHERE = "list.txt, line 7"
 EYE = " ".join(["1 0 0 0 1 0 0 0 1"] * 2 + ["1 0 0 1 0 1 0 0 0 0 1 0 0 0 0 1"])
 K = np.array([[500.0, 0, 31.5], [0, 450, 20.25], [0, 0, 1]])
 R = cv2.Rodrigues(np.array([0.1, -0.3, 0.2]))[0]
@@ -63,11 +63,14 @@ def test_a_turned_camera_is_a_camera(turns: int) -> None:
 
 def test_a_line_is_what_was_written() -> None:
     first = Camera(K, R, np.array([1.0, 2, 3]))
-    line = parse_line(line_of(("a/b.jpg", "c.png"), (first, CAMERA), (3, 1)), 7, FILE)
-    assert (line.number, line.names, line.turns) == (7, ("a/b.jpg", "c.png"), (3, 1))
-    np.testing.assert_array_equal(line.cameras[0].K, K)
+    images = parse_line(line_of(("a/b.jpg", "c.png"), (first, CAMERA), (3, 1)), WHERE)
+    assert [(image.name, image.turns) for image in images] == [("a/b.jpg", 3), ("c.png", 1)]
+    assert list(map(str, images)) == ["a/b.jpg turned 3", "c.png turned 1"]
+    np.testing.assert_array_equal(images[0].camera.K, K)
     np.testing.assert_allclose(
-        fundamental_of_cameras(*line.cameras), fundamental_of_cameras(first, CAMERA), atol=1e-15
+        fundamental_of_cameras(*(image.camera for image in images)),
+        fundamental_of_cameras(first, CAMERA),
+        atol=1e-15,
     )
 
 
@@ -87,8 +90,8 @@ def test_a_line_is_what_was_written() -> None:
     ],
 )
 def test_a_malformed_line_is_named_with_what_was_expected(line: str, expected: str) -> None:
-    with pytest.raises(UserError, match=rf"^list.txt, line 3: .*({expected})"):
-        parse_line(line, 3, FILE)
+    with pytest.raises(UserError, match=rf"^list.txt, line 7: .*({expected})"):
+        parse_line(line, WHERE)
 
 
 @pytest.mark.parametrize(
@@ -100,12 +103,13 @@ def test_a_malformed_line_is_named_with_what_was_expected(line: str, expected: s
 )
 def test_no_name_leads_out_of_the_image_root(name: str) -> None:
     for names in (f"{name} ok.jpg", f"ok.jpg {name}"):
-        with pytest.raises(UserError, match=r"list.txt, line 2: .* points outside the image root"):
-            parse_line(f"{names} 0 0 {EYE}", 2, FILE)
+        with pytest.raises(UserError, match=r"list.txt, line 7: .* points outside the image root"):
+            parse_line(f"{names} 0 0 {EYE}", WHERE)
 
 
 def test_names_with_dots_in_them_are_fine() -> None:
-    assert parse_line(f"a/b..c.jpg ./d.jpg 0 0 {EYE}", 1, FILE).names == ("a/b..c.jpg", "./d.jpg")
+    images = parse_line(f"a/b..c.jpg ./d.jpg 0 0 {EYE}", WHERE)
+    assert [image.name for image in images] == ["a/b..c.jpg", "./d.jpg"]
 
 
 @pytest.mark.parametrize(("content", "told"), [(b"\n \n", "has no pairs"), (b"\xff\xfe", "not UTF-8")])
@@ -123,13 +127,13 @@ def test_what_is_not_there_is_named(tmp_path: Path) -> None:
 
 
 @pytest.fixture
-def scenes(demo: DemoSet) -> tuple[Scene, ...]:
+def scenes(demo: DemoSet) -> tuple[TrainScene, ...]:
     return read_train_side(demo.train_dir, pairs_per_scene=3)
 
 
 @pytest.mark.parametrize("model", [ModelKind.E, ModelKind.F])
 def test_the_true_matrix_has_no_error(
-    demo: DemoSet, scenes: tuple[Scene, ...], tmp_path: Path, model: ModelKind
+    demo: DemoSet, scenes: tuple[TrainScene, ...], tmp_path: Path, model: ModelKind
 ) -> None:
     read = read_pairs(
         write_list(tmp_path / "list.txt", scenes, demo.train_dir), demo.train_dir, model, copies=tmp_path
@@ -147,7 +151,7 @@ def test_the_true_matrix_has_no_error(
 
 
 def test_images_are_set_upright_and_their_cameras_with_them(
-    demo: DemoSet, scenes: tuple[Scene, ...], tmp_path: Path
+    demo: DemoSet, scenes: tuple[TrainScene, ...], tmp_path: Path
 ) -> None:
     """Images that lie on their sides, with cameras to match, come back as what they were."""
     lines, originals = [], [true for scene in scenes for true in scene.pairs]
@@ -179,7 +183,7 @@ def test_images_are_set_upright_and_their_cameras_with_them(
 
 
 def test_a_journal_knows_what_was_estimated_and_with_which_cameras(
-    scenes: tuple[Scene, ...], demo: DemoSet, tmp_path: Path
+    scenes: tuple[TrainScene, ...], demo: DemoSet, tmp_path: Path
 ) -> None:
     path = write_list(tmp_path / "list.txt", scenes, demo.train_dir)
 
@@ -237,7 +241,7 @@ def test_a_list_of_real_pairs_scores_as_the_train_side_does(tmp_path: Path) -> N
 
 
 def test_failures_count_as_such(
-    demo: DemoSet, scenes: tuple[Scene, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    demo: DemoSet, scenes: tuple[TrainScene, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """One pair of two cannot be read: half of what the other reaches is left."""
     true = max(scenes[0].pairs, key=lambda true: true.covisibility)
@@ -282,7 +286,7 @@ def test_a_threshold_of_nothing_is_refused(demo: DemoSet, capsys: pytest.Capture
 
 
 def test_the_papers_tables_are_made_with_one_command(
-    demo: DemoSet, scenes: tuple[Scene, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    demo: DemoSet, scenes: tuple[TrainScene, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     listed = write_list(tmp_path / "list.txt", [replace(scenes[0], pairs=scenes[0].pairs[:1])], demo.train_dir)
     where = ["--scannet", str(listed), str(demo.train_dir), "--out", str(tmp_path / "out"), "--matcher", "sift"]

@@ -10,7 +10,7 @@ from enum import StrEnum
 from math import inf
 from typing import Protocol
 
-from mkpc_kaggle.data.competition import Pair, uncollected
+from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.costs import Timeouts
 from mkpc_kaggle.engine.jobs import Job, JobFailure, JobResult, Outcome, visiting_order
@@ -177,7 +177,6 @@ class Engine:
             self._write()
         return self.unwritten
 
-    @uncollected()
     def _planner(self, timeouts: Timeouts | None) -> Planner:
         if forgotten := self.journal.forget_changed(self.pairs):
             text = f"images have changed since they were matched: {forgotten} pairs are matched anew"

@@ -23,7 +23,8 @@ import cv2
 import numpy as np
 
 from mkpc_kaggle import __version__
-from mkpc_kaggle.data.competition import Pair, discard_parts
+from mkpc_kaggle.data.competition import Pair
+from mkpc_kaggle.data.outputs import discard_parts
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.costs import Timeouts
 from mkpc_kaggle.engine.engine import LISTEN_SECONDS, Engine, RunReport

@@ -15,8 +15,8 @@ A match whose point would lie behind a camera is an outlier, too.
 The search is local, so it has several starts: the F of MAGSAC, and E by MAGSAC at several focal lengths, each
 on another part of the matches. What a short search on few matches makes of each is compared, and the best are
 refined. MAGSAC's own F is kept where it costs much less: then no plausible focal lengths explain the matches, and
-the principal points may be elsewhere. The two rotations that an E stands for are not two starts: both give the same F
-and the same derivatives of it.
+the principal points may be elsewhere. The two rotations that an E stands for are not two starts: both give the
+same F and the same derivatives of it.
 """
 
 from collections.abc import Sequence
