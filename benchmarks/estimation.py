@@ -22,7 +22,7 @@ from tqdm import tqdm
 
 from benchmarks import saved_matches
 from benchmarks.saved_matches import SavedMatches
-from mkpc_kaggle.data.competition import Scene, TruePair, read_train_side
+from mkpc_kaggle.data.competition import TrainScene, TruePair, read_train_side
 from mkpc_kaggle.evaluation.compare import paired_difference
 from mkpc_kaggle.evaluation.validate import error_of
 from mkpc_kaggle.geometry.focal_prior import FocalConfig, FocalPrior, estimate_with_prior
@@ -32,7 +32,7 @@ from mkpc_kaggle.scene.batch import Batch, BatchImage, BatchPair
 from mkpc_kaggle.scene.config import SceneConfig
 from mkpc_kaggle.scene.solve import solve
 
-MAGSAC = RobustConfig(orders=1)
+MAGSAC = RobustConfig(permutations=1)
 FOCAL = FocalConfig()
 
 
@@ -43,7 +43,7 @@ def with_prior(found: SavedMatches) -> Estimate:
 
 
 PAIR_ESTIMATES: dict[str, Callable[[SavedMatches], Estimate]] = {
-    "MAGSAC, 8 orders": lambda found: estimate(found.matches, RobustConfig(orders=8)),
+    "MAGSAC, 8 orders": lambda found: estimate(found.matches, RobustConfig(permutations=8)),
     "MAGSAC": lambda found: estimate(found.matches, MAGSAC),
     "prior": with_prior,
 }
@@ -79,11 +79,11 @@ def read(folder: Path, ways: Sequence[str], true: TruePair) -> SavedMatches | No
     return SavedMatches(tuple(result for one in found for result in one.results), found[0].sizes)
 
 
-def accuracy(F: Matrix3 | None, true: TruePair, scene: Scene) -> float:
+def accuracy(F: Matrix3 | None, true: TruePair, scene: TrainScene) -> float:
     return pair_accuracy(PoseError.failed() if F is None else error_of(F, true, scene))
 
 
-def estimated(true: TruePair, found: SavedMatches, scene: Scene, names: Sequence[str]) -> Estimated:
+def estimated(true: TruePair, found: SavedMatches, scene: TrainScene, names: Sequence[str]) -> Estimated:
     """A pair by every estimate of pairs that is wanted; the prior's is what a scene is compared with."""
     matrices: dict[str, Matrix3 | None] = {}
     seconds = {}
@@ -96,7 +96,7 @@ def estimated(true: TruePair, found: SavedMatches, scene: Scene, names: Sequence
     return Estimated(true, found, matrices, accuracies, seconds)
 
 
-def by_scene(pairs: Sequence[Estimated], scene: Scene) -> Score:
+def by_scene(pairs: Sequence[Estimated], scene: TrainScene) -> Score:
     """The accuracy of the pairs as one batch."""
     images = {
         path.stem: BatchImage(path.stem, path.stem, size)
@@ -130,7 +130,7 @@ def drawn(pairs: Sequence[Estimated], share: float, seed: int) -> list[Estimated
     return [pairs[place] for place in places]
 
 
-def scores(pairs: Sequence[Estimated], scene: Scene, names: Sequence[str]) -> dict[str, Score]:
+def scores(pairs: Sequence[Estimated], scene: TrainScene, names: Sequence[str]) -> dict[str, Score]:
     """By estimate."""
     return {
         name: by_scene(pairs, scene)

@@ -15,13 +15,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from mkpc_kaggle.data.competition import Scene
+from mkpc_kaggle.data.competition import TrainScene
 from mkpc_kaggle.data.pairs import read_pairs
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.session import Session, interruptible
 from mkpc_kaggle.evaluation.validate import Validation, validate
 from mkpc_kaggle.geometry.metrics import AUC_THRESHOLDS
-from mkpc_kaggle.geometry.robust import Method, Model
+from mkpc_kaggle.geometry.robust import Method, ModelKind
 from mkpc_kaggle.pipeline.assembly import assemble
 from mkpc_kaggle.recipe import Recipe, load_recipe
 
@@ -68,7 +68,7 @@ TABLES = {
 """The sizes of the last row and of "all sizes" are the paper's; the others are a choice among the last's."""
 
 
-def table(dataset: str, scene: Scene, arguments: argparse.Namespace) -> Iterator[str]:
+def table(dataset: str, scene: TrainScene, arguments: argparse.Namespace) -> Iterator[str]:
     """The table in Markdown."""
     heads = " | ".join(f"AUC {threshold:g}" for threshold in AUC_THRESHOLDS)
     yield f"| {dataset}: {len(scene.pairs)} pairs | whole images | critical regions | {heads} |"
@@ -81,7 +81,7 @@ def table(dataset: str, scene: Scene, arguments: argparse.Namespace) -> Iterator
             yield "| " + " | ".join([row.name, *sizes, *areas]) + " |"
 
 
-def run(row: Row, dataset: str, scene: Scene, arguments: argparse.Namespace) -> Validation:
+def run(row: Row, dataset: str, scene: TrainScene, arguments: argparse.Namespace) -> Validation:
     recipe = row.of(dataset, arguments.matcher)
     magsac = replace(recipe.magsac, method=arguments.method, threshold=arguments.threshold)
     assembly = assemble(replace(recipe, magsac=magsac), weights=arguments.weights)
@@ -110,7 +110,7 @@ def main(arguments: list[str] | None = None) -> None:
     given = parser.parse_args(arguments)
     for dataset in TABLES:
         if (paths := vars(given)[dataset]) is not None:
-            scene = read_pairs(*paths, Model.E, copies=given.out / dataset / "turned", most=given.pairs)
+            scene = read_pairs(*paths, ModelKind.E, copies=given.out / dataset / "turned", most=given.pairs)
             print("\n".join([*table(dataset, scene, given), ""]))
 
 

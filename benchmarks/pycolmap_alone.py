@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from mkpc_kaggle.data.competition import Scene, TruePair, read_train_side
+from mkpc_kaggle.data.competition import TrainScene, TruePair, read_train_side
 from mkpc_kaggle.geometry.cameras import Camera, fundamental_of_cameras
 from mkpc_kaggle.geometry.metrics import PoseError, mean_average_accuracy, pose_error
 
@@ -66,7 +66,7 @@ def error_of(true: TruePair, found: list[Cameras], metres_per_unit: float) -> Po
     return PoseError.failed()
 
 
-def run(scene: Scene, images: Path, mappers: list[str], one_camera: bool) -> None:
+def run(scene: TrainScene, images: Path, mappers: list[str], one_camera: bool) -> None:
     with tempfile.TemporaryDirectory() as name:
         folder, database = Path(name), Path(name) / "database.db"
         begin = time.process_time()

@@ -18,7 +18,7 @@ import numpy as np
 
 from benchmarks import saved_matches
 from benchmarks.saved_matches import SavedMatches
-from mkpc_kaggle.data.competition import Scene, TruePair, read_train_side
+from mkpc_kaggle.data.competition import TrainScene, TruePair, read_train_side
 from mkpc_kaggle.geometry.metrics import PoseError, mean_average_accuracy, pose_error
 from mkpc_kaggle.geometry.robust import Matrix3, RobustConfig, estimate
 from mkpc_kaggle.scene.batch import Batch, BatchImage, BatchPair
@@ -39,7 +39,7 @@ SETTINGS = {
     "together": replace(DEFAULT, each_matcher=False),
     "own cameras": replace(DEFAULT, one_camera=0.0),
 }
-ONE_MAGSAC = RobustConfig(orders=1)
+ONE_MAGSAC = RobustConfig(permutations=1)
 
 
 def matched(true: TruePair, found: SavedMatches) -> BatchPair:
@@ -52,7 +52,7 @@ def names_of(true: TruePair) -> tuple[str, str]:
     return true.pair.image0.stem, true.pair.image1.stem
 
 
-def score(scene: Scene, chosen: list[TruePair], matrices: list[Matrix3 | None]) -> float:
+def score(scene: TrainScene, chosen: list[TruePair], matrices: list[Matrix3 | None]) -> float:
     errors = [
         PoseError.failed() if F is None else pose_error(F, true.camera0, true.camera1, scene.metres_per_unit)
         for true, F in zip(chosen, matrices, strict=True)
@@ -62,7 +62,7 @@ def score(scene: Scene, chosen: list[TruePair], matrices: list[Matrix3 | None]) 
 
 def row(
     name: str,
-    scene: Scene,
+    scene: TrainScene,
     share: float,
     seed: int,
     pairs: dict[str, BatchPair],

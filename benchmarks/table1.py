@@ -22,7 +22,7 @@ from statistics import mean
 from tqdm import tqdm
 
 from benchmarks.merging import merged
-from mkpc_kaggle.data.competition import Scene, TruePair, read_train_side
+from mkpc_kaggle.data.competition import TrainScene, TruePair, read_train_side
 from mkpc_kaggle.data.images import ImageStore, Unreadable
 from mkpc_kaggle.engine.jobs import visiting_order
 from mkpc_kaggle.evaluation.compare import Difference, paired_difference
@@ -115,7 +115,7 @@ class Found:
 
 
 def try_all(
-    ways: Sequence[Way], work: PairMatch, true: TruePair, scene: Scene, pipeline: Pipeline, radius: float
+    ways: Sequence[Way], work: PairMatch, true: TruePair, scene: TrainScene, pipeline: Pipeline, radius: float
 ) -> dict[str, Found]:
     """Every way on one pair: units of stage 1 once, those of stage 2 once for each plain way."""
     (whole,) = pipeline.match([work], [unit for unit in pipeline.recipe.units if unit.stage == 1])
@@ -134,7 +134,7 @@ def try_all(
 
 
 def _conclude(
-    way: Way, work: PairMatch, *, true: TruePair, scene: Scene, config: RobustConfig, radius: float
+    way: Way, work: PairMatch, *, true: TruePair, scene: TrainScene, config: RobustConfig, radius: float
 ) -> Found:
     start = time.thread_time()  # several work at once
     parts = [result.matches for result in work.results]
@@ -182,7 +182,7 @@ class ResultsFile:
 
 
 def run_all(
-    scenes: Sequence[Scene], ways: Sequence[Way], pipeline: Pipeline, results: ResultsFile, radius: float
+    scenes: Sequence[TrainScene], ways: Sequence[Way], pipeline: Pipeline, results: ResultsFile, radius: float
 ) -> None:
     """Every way on every pair that is not in the file; unreadable images are failures of every way."""
     todo = [(scene, true) for scene in scenes for true in _in_order(scene) if true.pair.id not in results.found]
@@ -201,7 +201,7 @@ def run_all(
         images.close()
 
 
-def _in_order(scene: Scene) -> list[TruePair]:
+def _in_order(scene: TrainScene) -> list[TruePair]:
     return [scene.pairs[index] for index in visiting_order([true.pair for true in scene.pairs])]
 
 
@@ -213,7 +213,7 @@ class Tables:
     covisibility: Mapping[str, Sequence[float]]
 
     @classmethod
-    def of(cls, scenes: Sequence[Scene], results: ResultsFile) -> "Tables":
+    def of(cls, scenes: Sequence[TrainScene], results: ResultsFile) -> "Tables":
         done = {scene.name: [true for true in scene.pairs if true.pair.id in results.found] for scene in scenes}
         done = {name: pairs for name, pairs in done.items() if pairs}
         return cls(

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mkpc_kaggle.data.competition import Scene, TruePair, read_train_side
+from mkpc_kaggle.data.competition import TrainScene, TruePair, read_train_side
 from mkpc_kaggle.data.images import read_image
 from mkpc_kaggle.evaluation.validate import error_of
 from mkpc_kaggle.geometry.matches import Matches
@@ -37,7 +37,7 @@ from mkpc_kaggle.scene.unasked import unasked_pairs
 class Matched:
     """The pairs of a scene as a reconstruction is given them, each found once."""
 
-    def __init__(self, scene: Scene, folder: Path, recipe: str) -> None:
+    def __init__(self, scene: TrainScene, folder: Path, recipe: str) -> None:
         self.folder = folder / scene.name
         self.pipeline = assemble(recipe).pipeline()
         self.paths = list(dict.fromkeys(path for true in scene.pairs for path in true.pair.images))
@@ -58,7 +58,7 @@ class Matched:
         return BatchPair(str(first), str(second), pair.matches)
 
 
-def rows(scene: Scene, matched: Matched, share: float, seed: int, densities: list[float]) -> Iterator[str]:
+def rows(scene: TrainScene, matched: Matched, share: float, seed: int, densities: list[float]) -> Iterator[str]:
     rng = np.random.default_rng(seed)
     places = np.sort(rng.choice(len(scene.pairs), round(share * len(scene.pairs)), replace=False))
     chosen = [scene.pairs[place] for place in places]
@@ -84,7 +84,7 @@ def rows(scene: Scene, matched: Matched, share: float, seed: int, densities: lis
         )
 
 
-def score(scene: Scene, chosen: list[TruePair], matrices: list[Matrix3 | None]) -> float:
+def score(scene: TrainScene, chosen: list[TruePair], matrices: list[Matrix3 | None]) -> float:
     answers = zip(chosen, matrices, strict=True)
     errors = [PoseError.failed() if F is None else error_of(F, true, scene) for true, F in answers]
     return mean_average_accuracy(errors)

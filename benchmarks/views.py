@@ -18,12 +18,12 @@ import numpy as np
 from tqdm import tqdm
 
 from benchmarks.table1 import LONG_SIDES, MOST_MATCHES, OPTIONS
-from mkpc_kaggle.data.competition import Scene, TruePair, read_train_side
+from mkpc_kaggle.data.competition import TrainScene, TruePair, read_train_side
 from mkpc_kaggle.data.images import Image, Unreadable, read_image
 from mkpc_kaggle.geometry.cameras import fundamental_of_cameras
 from mkpc_kaggle.geometry.coordinates import Points, Size
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.geometry.robust import Model, RobustConfig, estimate, sampson_distances
+from mkpc_kaggle.geometry.robust import ModelKind, RobustConfig, estimate, sampson_distances
 from mkpc_kaggle.pipeline.assembly import assemble
 from mkpc_kaggle.pipeline.pair import PairMatch
 from mkpc_kaggle.pipeline.stages import Pipeline
@@ -57,7 +57,7 @@ class Seen:
         right = matches[is_right]
         covers = [hull_share(right.points0, images[0].size), hull_share(right.points1, images[1].size)]
         error = float(np.median(distances[is_right])) if len(right) else np.nan
-        plane = estimate(right, RobustConfig(threshold=PLANE), Model.H)
+        plane = estimate(right, RobustConfig(threshold=PLANE), ModelKind.H)
         share = plane.inlier_count / len(right) if plane.ok else np.nan
         return cls(len(matches), float(is_right.mean()), error, fmean(covers), share)
 
@@ -93,7 +93,7 @@ def look(images: tuple[Image, Image], true: TruePair, pipeline: Pipeline) -> Vie
     return Views(*found, fmean(enlarged))
 
 
-def looks(scene: Scene, pipeline: Pipeline) -> list[Views | None]:
+def looks(scene: TrainScene, pipeline: Pipeline) -> list[Views | None]:
     """The pairs of a scene; those with an image that cannot be read are left out."""
     found = []
     for true in tqdm(scene.pairs, desc=f"{scene.name}, {pipeline.recipe.name}", unit="pair", leave=False):

@@ -1,27 +1,30 @@
 """Frozen dataclasses from TOML tables: every key is known, every value has its type and is in its range."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Container, Iterable, Mapping
 from dataclasses import MISSING, Field, dataclass, fields
 from enum import StrEnum
 from math import inf, isfinite
+from types import MappingProxyType
 from typing import Any, TypeVar, get_type_hints
 
 from mkpc_kaggle.errors import UserError
 
 Config = TypeVar("Config")
 
-MOST_INTEGER = 2**63 - 1
-"""As TOML has it."""
+MAX_INTEGER = 2**63 - 1  # as in TOML
 
 
 def from_table(cls: type[Config], table: Mapping[str, Any], where: str) -> Config:
     """Build the dataclass ``cls`` from a TOML table.
 
     ``where`` names the table in messages. Raises :class:`UserError` for an unknown key (listing the known
-    ones), a missing one, a value of another type, or one that the dataclass refuses with a ``ValueError``.
+    keys), a missing key, a value of another type, or a value that the dataclass refuses with a ``ValueError``.
+
+    A dataclass names its former keys in two class variables: ``RENAMED``, a mapping of old to new key, and
+    ``REMOVED``, a collection of keys.
     """
     known: dict[str, Field[Any]] = {field.name: field for field in fields(cls)}  # type: ignore[arg-type]
-    check_keys(table, known, where)
+    check_keys(table, known, where, getattr(cls, "RENAMED", {}), getattr(cls, "REMOVED", ()))
     missing = [
         name
         for name, field in known.items()
@@ -37,12 +40,22 @@ def from_table(cls: type[Config], table: Mapping[str, Any], where: str) -> Confi
         raise UserError(f"{where}: {error}") from error
 
 
-def check_keys(table: Mapping[str, Any], known: Iterable[str], where: str) -> None:
-    """Raise :class:`UserError` for what is no table, and for the first key that is not among ``known``."""
+def check_keys(
+    table: Mapping[str, Any],
+    known: Iterable[str],
+    where: str,
+    renamed: Mapping[str, str] = MappingProxyType({}),
+    removed: Container[str] = (),
+) -> None:
+    """Raise :class:`UserError` if ``table`` is not a table, or for its first key that is not among ``known``."""
     if not isinstance(table, Mapping):
         raise UserError(f"{where} must be a table, not {table!r}")
     known = list(known)
     for key in table:
+        if key in renamed:
+            raise UserError(f"{where}: the key {key!r} is now called {renamed[key]!r}")
+        if key in removed:
+            raise UserError(f"{where}: the key {key!r} was removed and has no successor; delete it")
         if key not in known:
             raise UserError(f"{where} has the unknown key {key!r}; known keys: {', '.join(known)}")
 
@@ -53,7 +66,7 @@ def convert(value: Any, kind: type, where: str) -> Any:
         if value not in list(kind):
             raise UserError(f"{where}: {value!r} is none of {', '.join(repr(str(one)) for one in kind)}")
         return kind(value)
-    if type(value) is int and abs(value) > MOST_INTEGER:
+    if type(value) is int and abs(value) > MAX_INTEGER:
         raise UserError(f"{where}: an integer of more than 64 bits")
     if kind is float and type(value) is int:
         return float(value)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from mkpc_kaggle.data.images import Image
 from mkpc_kaggle.engine.records import SceneRecord
 from mkpc_kaggle.geometry.coordinates import Box, Points
-from mkpc_kaggle.geometry.critical_region import Clusters, CriticalRegion, MkpcConfig, Ratio, expand_box
+from mkpc_kaggle.geometry.critical_region import Clusters, CriticalRegion, MkpcConfig, expand_box
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.metrics import PoseError
 from mkpc_kaggle.geometry.robust import Estimate, Matrix3
@@ -104,13 +104,12 @@ def _size_bars(axes: "Axes", clusters: Clusters, config: MkpcConfig) -> None:
         shares = [f"\n{size / sizes[0]:.3f}" if len(sizes) <= 10 else "" for size in sizes]
         labels = [f"{size}{share}" for size, share in zip(sizes[part], shares[part], strict=True)]
         axes.bar_label(bars, labels, padding=3, color=INK, fontsize=9, bbox=_PAPER)
-    if config.ratio is Ratio.LARGEST:
-        axes.axhline(config.share * sizes[0], color=INK, linewidth=1.2, linestyle="--")
+    axes.axhline(config.share * sizes[0], color=INK, linewidth=1.2, linestyle="--")
     axes.set(yscale="log", ylim=(1, 8 * sizes[0]), xticks=ranks)
 
 
 def _limit(clusters: Clusters, config: MkpcConfig) -> str:
-    if config.ratio is not Ratio.LARGEST or not len(clusters.sizes):
+    if not len(clusters.sizes):
         return ""
     return f"\ndashed: {config.share:g} of the largest, {config.share * clusters.sizes.max():.1f} points"
 

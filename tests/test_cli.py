@@ -108,9 +108,11 @@ def test_a_figure_is_not_drawn_over_an_image_nor_an_export_over_the_journal(
     first, second, *_ = sorted(map(str, demo.train_dir.rglob("*.jpg")))
     assert main(["match", first, second, "--out", first]) == 2
     assert main(["journal", str(tmp_path), "--json", str(tmp_path / "journal.sqlite")]) == 2
+    assert main(["journal", str(tmp_path), "--json", first]) == 2
     told = capsys.readouterr().err.splitlines()
     assert "would be written over the input" in told[0]
     assert "are in each other's way" in told[1]
+    assert "exists and is not a .json file" in told[2]
 
 
 def test_check_tells_good_from_bad(demo: DemoSet, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -12,9 +12,7 @@ from numpy.testing import assert_array_equal
 from mkpc_kaggle.geometry.coordinates import Box, Size
 from mkpc_kaggle.geometry.critical_region import (
     MkpcConfig,
-    Ratio,
     RegionReason,
-    cluster_points,
     critical_region,
     expand_box,
     find_clusters,
@@ -89,13 +87,12 @@ def test_a_cluster_of_exactly_the_share_is_kept_and_a_point_fewer_is_not(k):
     assert (dropped.box, dropped.clusters, dropped.kept) == (one, 2, 1)
 
 
-@pytest.mark.parametrize("ratio", Ratio)
-def test_the_share_is_compared_to_the_letter(ratio):
+def test_the_share_is_compared_to_the_letter():
     for percent, hundreds in product(range(1, 100), (1, 7, 11)):
         share, largest, least = percent / 100, 100 * hundreds, percent * hundreds
         assert least / largest >= share  # Algorithm 1's own words
-        assert len(keep_clusters(np.array([largest, least]), share, ratio)) == 2, (least, largest)
-        assert len(keep_clusters(np.array([largest, least - 1]), share, ratio)) == 1, (least, largest)
+        assert len(keep_clusters(np.array([largest, least]), share)) == 2, (least, largest)
+        assert len(keep_clusters(np.array([largest, least - 1]), share)) == 1, (least, largest)
 
 
 @pytest.mark.parametrize("k", [1, 3, 49, 333, 9973])
@@ -107,24 +104,10 @@ def test_the_papers_share_is_compared_to_the_letter(k):
 def test_the_first_cluster_that_fails_ends_it():
     sizes = np.array([4, 100, 6, 5, 3, 50])
     assert_array_equal(keep_clusters(sizes, 0.05), [1, 5, 2, 3])
-    # Against the last kept, 100 -> 6 fails; a later 5 would pass against 6.
-    assert_array_equal(keep_clusters(np.array([100, 6, 5]), 0.1, Ratio.LAST_KEPT), [0])
 
 
-def test_comparing_with_the_last_kept_goes_on_where_the_largest_stops():
-    sizes = np.array([100, 20, 4, 1])
-    assert_array_equal(keep_clusters(sizes, 0.05, Ratio.LARGEST), [0, 1])
-    assert_array_equal(keep_clusters(sizes, 0.05, Ratio.LAST_KEPT), [0, 1, 2, 3])
-    parts = [block(100, 100, 130, 130, 400), block(300, 300, 330, 330, 40), block(700, 600, 730, 630, 6)]
-    largest = region(*parts)
-    last = region(*parts, config=replace(BARE, ratio=Ratio.LAST_KEPT))
-    assert (largest.box, largest.kept) == (Box(100, 100, 331, 331), 2)
-    assert (last.box, last.kept) == (Box(100, 100, 731, 631), 3)
-
-
-def test_clusters_of_one_size_keep_their_order_and_one_cluster_is_kept_whatever_the_share():
+def test_clusters_of_equal_size_keep_their_order():
     assert_array_equal(keep_clusters(np.array([7, 9, 7, 9]), 0.05), [1, 3, 0, 2])
-    assert_array_equal(keep_clusters(np.array([7]), 2.0), [0])
 
 
 def test_clusters_tell_their_points_from_noise_and_those_that_are_kept():
@@ -148,8 +131,8 @@ def test_x_is_normalised_by_the_width_and_y_by_the_height():
     stack = np.repeat(np.array([[500, 100]], np.float32), 6, axis=0)
     for shift, last_label in [((40, 0), 0), ((60, 0), 1), ((0, 9), 0), ((0, 20), 1)]:
         points = np.concatenate([stack, stack + np.float32(shift)])
-        assert cluster_points(points, size, PAPER).max() == last_label
-        assert cluster_points(points[:, ::-1], Size(200, 1000), PAPER).max() == last_label
+        assert find_clusters(points, size, PAPER).labels.max() == last_label
+        assert find_clusters(points[:, ::-1], Size(200, 1000), PAPER).labels.max() == last_label
 
 
 def test_noise_does_not_widen_the_box():
@@ -198,7 +181,6 @@ def test_points_that_are_not_finite_or_not_on_the_image_are_ignored():
     config=st.builds(
         MkpcConfig,
         share=st.sampled_from([0.0, 0.05, 0.5, 1.0]),
-        ratio=st.sampled_from(Ratio),
         expand_x=st.floats(1, 3),
         expand_y=st.floats(1, 3),
         min_side=st.integers(1, 64),
@@ -218,10 +200,9 @@ def test_the_box_is_on_the_image_and_holds_every_kept_point(seed, size, config):
         assert box == Box.whole(size)
         return
     on_image = points[Box.whole(size).contains(points)]
-    labels = cluster_points(on_image, size, config)
-    kept = keep_clusters(np.bincount(labels[labels >= 0]), config.share, config.ratio)
-    assert len(kept) == got.kept
-    assert box.contains(on_image[np.isin(labels, kept)]).all()
+    clusters = find_clusters(on_image, size, config)
+    assert len(clusters.kept) == got.kept
+    assert box.contains(on_image[clusters.in_kept]).all()
     assert min(box.size) >= config.min_side
 
 
@@ -233,7 +214,5 @@ def test_the_order_of_the_points_does_not_matter(seed):
     centres = np.array([(x, y) for x in (0.15, 0.45, 0.75) for y in (0.15, 0.45, 0.75)])[rng.permutation(9)[:4]]
     clumps = [centre + rng.uniform(-0.02, 0.02, (rng.integers(2, 90), 2)) for centre in centres]
     points = (np.concatenate([*clumps, rng.random((3, 2))]) * (640, 480)).astype(np.float32)
-    for ratio in Ratio:
-        config = replace(PAPER, ratio=ratio)
-        got = critical_region(points, Size(640, 480), config)
-        assert critical_region(rng.permutation(points), Size(640, 480), config) == got
+    got = critical_region(points, Size(640, 480), PAPER)
+    assert critical_region(rng.permutation(points), Size(640, 480), PAPER) == got

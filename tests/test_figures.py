@@ -10,10 +10,10 @@ from matplotlib.figure import Figure
 from mkpc_kaggle.data.images import Image
 from mkpc_kaggle.engine.records import CameraRecord, SceneRecord
 from mkpc_kaggle.geometry.coordinates import Box, Size
-from mkpc_kaggle.geometry.critical_region import CriticalRegion, MkpcConfig, Ratio, RegionReason, find_clusters
+from mkpc_kaggle.geometry.critical_region import CriticalRegion, MkpcConfig, RegionReason, find_clusters
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.metrics import PoseError
-from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL, Estimate, Model
+from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL, Estimate, ModelKind
 from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult
 from mkpc_kaggle.recipe import Unit
 from mkpc_kaggle.reporting.figures import draw_cameras, to_jpeg
@@ -37,7 +37,7 @@ def some(n):
 def pair(first, second, inliers):
     results = tuple(UnitResult(unit, some(n)) for unit, n in zip(UNITS, (first, second), strict=True))
     mask = np.arange(first + second) < inliers
-    return PairMatch(results, REGIONS, Estimate(Model.F, FALLBACK_FUNDAMENTAL, mask))
+    return PairMatch(results, REGIONS, Estimate(ModelKind.F, FALLBACK_FUNDAMENTAL, mask))
 
 
 def titles(figure: Figure) -> list[str]:
@@ -55,7 +55,7 @@ def clustered(match):
 def test_every_step_is_drawn_whatever_was_found(count):
     match = pair(count, count // 2, count)
     points, clusters = clustered(match)
-    homography = Estimate.failed(Model.H, len(match.inliers), "none")
+    homography = Estimate.failed(ModelKind.H, len(match.inliers), "none")
     lines = {"stage 1": FALLBACK_FUNDAMENTAL, "both": np.zeros((3, 3))}
     drawn = [
         figures.draw_images(IMAGES),
@@ -64,7 +64,6 @@ def test_every_step_is_drawn_whatever_was_found(count):
         figures.draw_stage(IMAGES, replace(match, regions=None), 2),
         figures.draw_clusters(IMAGES, points, clusters),
         figures.draw_sizes(clusters, CONFIG),
-        figures.draw_sizes(clusters, replace(CONFIG, ratio=Ratio.LAST_KEPT)),
         figures.draw_boxes(IMAGES, points, clusters, CONFIG),
         figures.draw_views(IMAGES, REGIONS, UNITS[1]),
         figures.draw_both(IMAGES, match),

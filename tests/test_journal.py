@@ -19,7 +19,7 @@ from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Box
 from mkpc_kaggle.geometry.critical_region import CriticalRegion, RegionReason
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.geometry.robust import Estimate, Model
+from mkpc_kaggle.geometry.robust import Estimate, ModelKind
 from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult
 from mkpc_kaggle.scene.choose import Choice, Reason
 
@@ -38,7 +38,7 @@ def outcome(index: int = 7, seed: int = 0) -> Outcome:
         CriticalRegion(Box(0, 0, 5, 6), RegionReason.TOO_SMALL),
     )
     magsac = rng.random((3, 3)) if seed else None
-    found = Estimate(Model.F, rng.random((3, 3)), rng.random(30) < 0.5, magsac=magsac)
+    found = Estimate(ModelKind.F, rng.random((3, 3)), rng.random(30) < 0.5, magsac=magsac)
     match = PairMatch(results, regions, found)
     match = replace(match, decode_seconds=0.1, cluster_seconds=0.2, estimate_seconds=0.3)
     return Outcome(PairRecord.of(index, match), results)

@@ -10,13 +10,11 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from mkpc_kaggle.geometry.cameras import Camera, fundamental_of_cameras, relative_pose
-from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.metrics import (
     AUC_THRESHOLDS,
     ROTATION_THRESHOLDS,
     TRANSLATION_THRESHOLDS,
     PoseError,
-    epipolar_shift,
     mean_average_accuracy,
     pair_accuracy,
     pose_auc,
@@ -24,7 +22,6 @@ from mkpc_kaggle.geometry.metrics import (
     rotation_angle,
 )
 
-SIZES = Size(640, 480), Size(300, 500)
 SEEDS = st.integers(0, 2**32 - 1)
 PERFECT = PoseError(0.0, 0.0, 0.0)
 
@@ -221,22 +218,3 @@ def test_an_error_reads_as_a_sentence_whatever_is_known() -> None:
     assert str(PoseError(1.26, 4.0, 0.333)) == "rotation 1.3 degrees off, translation 0.33 m"
     assert str(PoseError(1.26, 4.0, float("nan"))) == "rotation 1.3 degrees off, translation 4.0 degrees"
     assert str(PoseError.failed()) == "no pose"
-
-
-def test_a_shift_of_the_lines_is_told_in_pixels():
-    """Lines along the rows, and the same two rows lower: Sampson's distance is 2 / sqrt(1 + 1)."""
-    rows = np.array([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]])
-    lower = np.array([[0.0, 0, 0], [0, 0, -1], [0, 1, -2]])
-    assert epipolar_shift(rows, lower, *SIZES) == pytest.approx(2**0.5)
-
-
-@given(SEEDS)
-def test_a_shift_of_nothing_is_nothing_whatever_the_scale_and_it_has_no_direction(seed):
-    rng = np.random.default_rng(seed)
-    cameras = [random_camera(rng) for _ in range(3)]
-    F, other = fundamental_of_cameras(*cameras[:2]), fundamental_of_cameras(*cameras[::2])
-    assert not epipolar_shift(F, -3 * F, *SIZES) > 1e-2
-    forth, back = epipolar_shift(F, other, *SIZES), epipolar_shift(other, F, *SIZES)
-    turned = epipolar_shift(F.T, other.T, *SIZES[::-1])
-    assert isnan(forth) or forth >= 0
-    assert_allclose([back, turned], forth, rtol=1e-6)

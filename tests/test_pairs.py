@@ -14,7 +14,7 @@ from benchmarks import paper_tables
 from mkpc_kaggle import TwoStageMatcher
 from mkpc_kaggle.cli import main
 from mkpc_kaggle.cli.validate import with_units
-from mkpc_kaggle.data.competition import Scene, read_train_side
+from mkpc_kaggle.data.competition import TrainScene, read_train_side
 from mkpc_kaggle.data.images import Image, read_image
 from mkpc_kaggle.data.pairs import parse_line, read_pairs
 from mkpc_kaggle.demo import DemoSet
@@ -23,10 +23,10 @@ from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.evaluation.validate import error_of
 from mkpc_kaggle.geometry.cameras import Camera, fundamental_of_cameras
 from mkpc_kaggle.geometry.coordinates import Size
-from mkpc_kaggle.geometry.robust import Model
+from mkpc_kaggle.geometry.robust import ModelKind
 from mkpc_kaggle.recipe import load_recipe
 
-FILE = Path("list.txt")
+WHERE = "list.txt, line 7"
 EYE = " ".join(["1 0 0 0 1 0 0 0 1"] * 2 + ["1 0 0 1 0 1 0 0 0 0 1 0 0 0 0 1"])
 K = np.array([[500.0, 0, 31.5], [0, 450, 20.25], [0, 0, 1]])
 R = cv2.Rodrigues(np.array([0.1, -0.3, 0.2]))[0]
@@ -43,7 +43,7 @@ def test_a_turned_camera_sees_what_the_turned_picture_shows(turns: int, x: int, 
     picture[y, x] = 1
     shown_y, shown_x = np.argwhere(np.rot90(picture, turns))[0]
     point = R.T @ (depth * np.linalg.inv(K) @ [x, y, 1] - CAMERA.t)
-    turned = CAMERA.turned(turns, size)
+    turned = CAMERA.rotated_90(turns, size)
     projected = turned.K @ (turned.R @ point + turned.t)
     assert projected[2] == pytest.approx(depth)
     np.testing.assert_allclose(projected[:2] / projected[2], [shown_x, shown_y], atol=1e-9)
@@ -51,23 +51,26 @@ def test_a_turned_camera_sees_what_the_turned_picture_shows(turns: int, x: int, 
 
 @pytest.mark.parametrize("turns", range(4))
 def test_a_turned_camera_is_a_camera(turns: int) -> None:
-    turned = CAMERA.turned(turns, Size(64, 40))
+    turned = CAMERA.rotated_90(turns, Size(64, 40))
     np.testing.assert_allclose(turned.R @ turned.R.T, np.eye(3), atol=1e-12)
     assert np.linalg.det(turned.R) == pytest.approx(1)
     np.testing.assert_array_equal(turned.K[np.tril_indices(3, -1)], 0)
     assert [turned.K[0, 0], turned.K[1, 1]] == ([500, 450] if turns % 2 == 0 else [450, 500])
-    back = turned.turned(-turns, Size(64, 40) if turns % 2 == 0 else Size(40, 64))
+    back = turned.rotated_90(-turns, Size(64, 40) if turns % 2 == 0 else Size(40, 64))
     for one, other in ((back.K, K), (back.R, R), (back.t, CAMERA.t)):
         np.testing.assert_allclose(one, other, atol=1e-12)
 
 
 def test_a_line_is_what_was_written() -> None:
     first = Camera(K, R, np.array([1.0, 2, 3]))
-    line = parse_line(line_of(("a/b.jpg", "c.png"), (first, CAMERA), (3, 1)), 7, FILE)
-    assert (line.number, line.names, line.turns) == (7, ("a/b.jpg", "c.png"), (3, 1))
-    np.testing.assert_array_equal(line.cameras[0].K, K)
+    images = parse_line(line_of(("a/b.jpg", "c.png"), (first, CAMERA), (3, 1)), WHERE)
+    assert [(image.name, image.turns) for image in images] == [("a/b.jpg", 3), ("c.png", 1)]
+    assert list(map(str, images)) == ["a/b.jpg turned 3", "c.png turned 1"]
+    np.testing.assert_array_equal(images[0].camera.K, K)
     np.testing.assert_allclose(
-        fundamental_of_cameras(*line.cameras), fundamental_of_cameras(first, CAMERA), atol=1e-15
+        fundamental_of_cameras(*(image.camera for image in images)),
+        fundamental_of_cameras(first, CAMERA),
+        atol=1e-15,
     )
 
 
@@ -87,8 +90,8 @@ def test_a_line_is_what_was_written() -> None:
     ],
 )
 def test_a_malformed_line_is_named_with_what_was_expected(line: str, expected: str) -> None:
-    with pytest.raises(UserError, match=rf"^list.txt, line 3: .*({expected})"):
-        parse_line(line, 3, FILE)
+    with pytest.raises(UserError, match=rf"^list.txt, line 7: .*({expected})"):
+        parse_line(line, WHERE)
 
 
 @pytest.mark.parametrize(
@@ -100,36 +103,37 @@ def test_a_malformed_line_is_named_with_what_was_expected(line: str, expected: s
 )
 def test_no_name_leads_out_of_the_image_root(name: str) -> None:
     for names in (f"{name} ok.jpg", f"ok.jpg {name}"):
-        with pytest.raises(UserError, match=r"list.txt, line 2: .* points outside the image root"):
-            parse_line(f"{names} 0 0 {EYE}", 2, FILE)
+        with pytest.raises(UserError, match=r"list.txt, line 7: .* points outside the image root"):
+            parse_line(f"{names} 0 0 {EYE}", WHERE)
 
 
 def test_names_with_dots_in_them_are_fine() -> None:
-    assert parse_line(f"a/b..c.jpg ./d.jpg 0 0 {EYE}", 1, FILE).names == ("a/b..c.jpg", "./d.jpg")
+    images = parse_line(f"a/b..c.jpg ./d.jpg 0 0 {EYE}", WHERE)
+    assert [image.name for image in images] == ["a/b..c.jpg", "./d.jpg"]
 
 
 @pytest.mark.parametrize(("content", "told"), [(b"\n \n", "has no pairs"), (b"\xff\xfe", "not UTF-8")])
 def test_a_list_without_pairs_is_refused(tmp_path: Path, content: bytes, told: str) -> None:
     (tmp_path / "list.txt").write_bytes(content)
     with pytest.raises(UserError, match=told):
-        read_pairs(tmp_path / "list.txt", tmp_path, Model.E, copies=tmp_path)
+        read_pairs(tmp_path / "list.txt", tmp_path, ModelKind.E, copies=tmp_path)
 
 
 def test_what_is_not_there_is_named(tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"none.txt cannot be read: No such file"):
-        read_pairs(tmp_path / "none.txt", tmp_path, Model.E, copies=tmp_path)
+        read_pairs(tmp_path / "none.txt", tmp_path, ModelKind.E, copies=tmp_path)
     with pytest.raises(UserError, match=r"--image-root .*: no such directory"):
-        read_pairs(tmp_path / "none.txt", tmp_path / "images", Model.E, copies=tmp_path)
+        read_pairs(tmp_path / "none.txt", tmp_path / "images", ModelKind.E, copies=tmp_path)
 
 
 @pytest.fixture
-def scenes(demo: DemoSet) -> tuple[Scene, ...]:
+def scenes(demo: DemoSet) -> tuple[TrainScene, ...]:
     return read_train_side(demo.train_dir, pairs_per_scene=3)
 
 
-@pytest.mark.parametrize("model", [Model.E, Model.F])
+@pytest.mark.parametrize("model", [ModelKind.E, ModelKind.F])
 def test_the_true_matrix_has_no_error(
-    demo: DemoSet, scenes: tuple[Scene, ...], tmp_path: Path, model: Model
+    demo: DemoSet, scenes: tuple[TrainScene, ...], tmp_path: Path, model: ModelKind
 ) -> None:
     read = read_pairs(
         write_list(tmp_path / "list.txt", scenes, demo.train_dir), demo.train_dir, model, copies=tmp_path
@@ -139,7 +143,7 @@ def test_the_true_matrix_has_no_error(
     for true in read.pairs:
         assert true.pair.model is model
         cameras = true.camera0, true.camera1
-        if model is Model.E:
+        if model is ModelKind.E:
             cameras = true.camera0.calibrated, true.camera1.calibrated
         # Near a cosine of 1 the angle of a rounding error is a millionth of a degree.
         assert error_of(fundamental_of_cameras(*cameras), true, read).angle < 1e-5
@@ -147,7 +151,7 @@ def test_the_true_matrix_has_no_error(
 
 
 def test_images_are_set_upright_and_their_cameras_with_them(
-    demo: DemoSet, scenes: tuple[Scene, ...], tmp_path: Path
+    demo: DemoSet, scenes: tuple[TrainScene, ...], tmp_path: Path
 ) -> None:
     """Images that lie on their sides, with cameras to match, come back as what they were."""
     lines, originals = [], [true for scene in scenes for true in scene.pairs]
@@ -159,10 +163,10 @@ def test_images_are_set_upright_and_their_cameras_with_them(
             names.append(f"{number}-{path.stem}.png")
             lying = cv2.cvtColor(np.ascontiguousarray(np.rot90(image.pixels, -quarters)), cv2.COLOR_RGB2BGR)
             cv2.imwrite(str(tmp_path / names[-1]), lying)
-            cameras.append(camera.turned(-quarters, image.size))
+            cameras.append(camera.rotated_90(-quarters, image.size))
         lines.append(line_of((names[0], names[1]), (cameras[0], cameras[1]), turns))
     (tmp_path / "list.txt").write_text("\n".join(lines))
-    read = read_pairs(tmp_path / "list.txt", tmp_path, Model.E, copies=tmp_path / "copies")
+    read = read_pairs(tmp_path / "list.txt", tmp_path, ModelKind.E, copies=tmp_path / "copies")
     for true, original in zip(read.pairs, originals, strict=True):
         for path, former in zip(true.pair.images, original.pair.images, strict=True):
             image, upright = read_image(path), read_image(former)
@@ -179,19 +183,19 @@ def test_images_are_set_upright_and_their_cameras_with_them(
 
 
 def test_a_journal_knows_what_was_estimated_and_with_which_cameras(
-    scenes: tuple[Scene, ...], demo: DemoSet, tmp_path: Path
+    scenes: tuple[TrainScene, ...], demo: DemoSet, tmp_path: Path
 ) -> None:
     path = write_list(tmp_path / "list.txt", scenes, demo.train_dir)
 
-    def digest(model: Model) -> str:
+    def digest(model: ModelKind) -> str:
         return digest_of([true.pair for true in read_pairs(path, demo.train_dir, model, copies=tmp_path).pairs])
 
-    before = digest(Model.E), digest(Model.F)
+    before = digest(ModelKind.E), digest(ModelKind.F)
     assert before[0] != before[1]
     first, *rest = path.read_text().splitlines()
     K00, others = first.split()[4], first.split()[5:]
     path.write_text("\n".join([" ".join([*first.split()[:4], str(float(K00) + 1), *others]), *rest]))
-    assert (digest(Model.E) == before[0], digest(Model.F) == before[1]) == (False, True)
+    assert (digest(ModelKind.E) == before[0], digest(ModelKind.F) == before[1]) == (False, True)
 
 
 def errors_of(out: Path) -> list[tuple[float | None, float | None]]:
@@ -216,9 +220,11 @@ def same_errors(train_dir: Path, scene: str, tmp_path: Path) -> None:
     np.testing.assert_allclose(errors_of(out), on_train_side, atol=1e-4)
 
     assert main(pairs) == 0
-    read = read_pairs(listed, train_dir, Model.E, copies=tmp_path)
+    read = read_pairs(listed, train_dir, ModelKind.E, copies=tmp_path)
     matcher = TwoStageMatcher(str(recipe))
-    matches = [matcher(*true.pair.images, model=Model.E, intrinsics=true.pair.intrinsics) for true in read.pairs]
+    matches = [
+        matcher(*true.pair.images, model=ModelKind.E, intrinsics=true.pair.intrinsics) for true in read.pairs
+    ]
     errors = [error_of(match.estimate.matrix, true, read) for match, true in zip(matches, read.pairs, strict=True)]
     expected = [(error.rotation, error.translation_angle) for error in errors]
     np.testing.assert_allclose(errors_of(out), expected, atol=1e-9)
@@ -235,7 +241,7 @@ def test_a_list_of_real_pairs_scores_as_the_train_side_does(tmp_path: Path) -> N
 
 
 def test_failures_count_as_such(
-    demo: DemoSet, scenes: tuple[Scene, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    demo: DemoSet, scenes: tuple[TrainScene, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """One pair of two cannot be read: half of what the other reaches is left."""
     true = max(scenes[0].pairs, key=lambda true: true.covisibility)
@@ -280,7 +286,7 @@ def test_a_threshold_of_nothing_is_refused(demo: DemoSet, capsys: pytest.Capture
 
 
 def test_the_papers_tables_are_made_with_one_command(
-    demo: DemoSet, scenes: tuple[Scene, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    demo: DemoSet, scenes: tuple[TrainScene, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     listed = write_list(tmp_path / "list.txt", [replace(scenes[0], pairs=scenes[0].pairs[:1])], demo.train_dir)
     where = ["--scannet", str(listed), str(demo.train_dir), "--out", str(tmp_path / "out"), "--matcher", "sift"]

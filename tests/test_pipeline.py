@@ -8,15 +8,15 @@ from functools import cache
 import cv2
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 from sklearn.datasets import load_sample_image
 
 from mkpc_kaggle.data.images import Image
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Box, Size
-from mkpc_kaggle.geometry.focal_prior import FocalConfig
+from mkpc_kaggle.geometry.focal_prior import FocalConfig, FocalPrior, estimate_with_prior
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL, Model, Origin
+from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL, ModelKind
 from mkpc_kaggle.matchers.contract import Colour, MatcherSpec
 from mkpc_kaggle.matchers.sift import SiftMatcher, SiftOptions
 from mkpc_kaggle.pipeline import units
@@ -196,7 +196,7 @@ def test_matches_know_the_stage_that_found_them():
 
 def test_a_homography_comes_out_as_it_is():
     match = TwoStageMatcher(SIFT)(*pair(), model="H")
-    assert match.estimate.model is Model.H
+    assert match.estimate.model is ModelKind.H
     found = match.estimate.matrix / match.estimate.matrix[2, 2]
     corners = np.array([[[60.0, 130], [290, 130], [290, 310], [60, 310]]])
     moved, true = (cv2.perspectiveTransform(corners, matrix) for matrix in (found, H))
@@ -208,26 +208,28 @@ def test_an_essential_matrix_needs_the_cameras():
     matcher = TwoStageMatcher(SIFT)
     with pytest.raises(ValueError, match="intrinsics"):
         matcher(*pair(), model="E")
-    E = matcher(*pair(), model=Model.E, intrinsics=(K, K)).estimate.matrix
+    E = matcher(*pair(), model=ModelKind.E, intrinsics=(K, K)).estimate.matrix
     values = np.linalg.svd(E, compute_uv=False)
     assert_allclose(values / values[0], [1, 1, 0], atol=1e-6)
 
 
 def test_a_prior_on_focal_lengths_goes_by_the_sizes_of_the_images_unless_the_cameras_are_known():
-    prior = FocalConfig(sigma=1e-3)
-    matcher = TwoStageMatcher(replace(SIFT, focal=prior))
+    focal = FocalConfig(sigma=1e-3)
+    matcher = TwoStageMatcher(replace(SIFT, focal=focal))
     K = np.array([[400.0, 0, 240], [0, 400, 180], [0, 0, 1]])
-    by_size = matcher(*pair()).estimate
-    assert by_size.origin in (Origin.FROM_F, Origin.FROM_E)
-    assert_allclose(by_size.focals, [prior.ratio * max(image.shape[:2]) for image in pair()], rtol=0.02)
-    for model in (Model.F, Model.E):
-        known = matcher(*pair(), model=model, intrinsics=(K, K)).estimate
-        assert known.model is model
-        assert_allclose(known.focals, 400)
-    with pytest.raises(ValueError, match="E"):
-        matcher(*pair(), model=Model.E)
-    assert matcher(*pair(), model=Model.H).estimate.focals is None
-    assert TwoStageMatcher(SIFT)(*pair()).estimate.focals is None
+    by_size = matcher(*pair())
+    sizes = [Size(*image.shape[1::-1]) for image in pair()]
+    for match, priors in [
+        (by_size, [FocalPrior.of_image(size, focal) for size in sizes]),
+        (matcher(*pair(), intrinsics=(K, K)), [FocalPrior(K, 0.0)] * 2),
+    ]:
+        expected = estimate_with_prior(match.matches, tuple(priors), SIFT.magsac, focal)
+        assert_array_equal(match.estimate.matrix, expected.matrix)
+        assert match.estimate.magsac is not None
+    with pytest.raises(ValueError, match="needs the intrinsics"):
+        matcher(*pair(), model=ModelKind.E)
+    assert matcher(*pair(), model=ModelKind.E, intrinsics=(K, K)).estimate.ok
+    assert matcher(*pair(), model=ModelKind.H).estimate.magsac is None
 
 
 def test_the_same_pair_twice_gives_the_same_bytes():

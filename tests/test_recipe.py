@@ -3,15 +3,16 @@
 import json
 import os
 import tomllib
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import combinations
+from typing import ClassVar
 
 import pytest
 
-from mkpc_kaggle.config import Range
+from mkpc_kaggle.config import Range, from_table
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Box, Size, View
-from mkpc_kaggle.geometry.critical_region import MkpcConfig, Ratio
+from mkpc_kaggle.geometry.critical_region import MkpcConfig
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.geometry.robust import Method, RobustConfig
 from mkpc_kaggle.matchers.contract import Training
@@ -94,7 +95,7 @@ def test_the_papers_recipes_suppose_nothing_of_focal_lengths(name):
     recipe = load_recipe(name)
     paper = name.startswith(("yfcc", "scannet", "imc2022"))
     assert (recipe.focal is None) == paper
-    assert recipe.magsac.orders == (8 if paper else 1)
+    assert recipe.magsac.permutations == (8 if paper else 1)
 
 
 def test_scannet_has_indoor_weights_and_their_settings():
@@ -142,7 +143,7 @@ def test_a_recipe_reads_as_written():
             '{ stage = 2, matcher = "x", long_side = 800, max_matches = 5, flip = true, extra = true }',
             '{ stage = 2, matcher = "dkm", area = "540x720", stretch = true }',
         )
-        + '[mkpc]\neps = 0.1\nmin_samples = 7\nratio = "last-kept"\nexpand_x = 2\n'
+        + "[mkpc]\neps = 0.1\nmin_samples = 7\nexpand_x = 2\n"
         + '[magsac]\nmethod = "ransac"\nthreshold = 1.5\n[focal]\nsigma = 0.2\n[upgrade]\nbelow_inliers = 9\n'
         + "[matchers.sift]\nfeatures = 10\n"
     )
@@ -152,7 +153,7 @@ def test_a_recipe_reads_as_written():
         Unit(2, "dkm", area="540x720", stretch=True),
     )
     assert recipe.regular == (recipe.units[0], recipe.units[2])
-    assert recipe.mkpc == MkpcConfig(eps=0.1, min_samples=7, ratio=Ratio.LAST_KEPT, expand_x=2.0)
+    assert recipe.mkpc == MkpcConfig(eps=0.1, min_samples=7, expand_x=2.0)
     assert type(recipe.mkpc.expand_x) is float
     assert recipe.magsac == RobustConfig(Method.RANSAC, threshold=1.5)
     assert recipe.focal == FocalConfig(sigma=0.2)
@@ -204,13 +205,16 @@ def test_a_unit_shows_a_crop_at_its_size():
             units('{ stage = 1, matcher = "sift", longside = 640 }'),
             r"unit 1.*'longside'.*stage, matcher, long_side, max_matches, flip, extra",
         ),
-        (SIFT + "[mkpc]\nepsilon = 1\n", r"\[mkpc\].*'epsilon'.*eps, min_samples, share, ratio, expand_x"),
+        (SIFT + "[mkpc]\nepsilon = 1\n", r"\[mkpc\].*'epsilon'.*eps, min_samples, share, expand_x"),
         (SIFT + "[magsac]\nmax_iters = 1\n", r"\[magsac\].*method, threshold, confidence, max_iterations"),
         (
             SIFT + "[upgrade]\nbelow = 1\n",
             r"\[upgrade\].*'below'; known keys: below_inliers, below_share, uncertain, least_gain",
         ),
         (units('{ matcher = "sift", long_side = 640 }'), r"unit 1 lacks 'stage'"),
+        (SIFT + "[magsac]\norders = 8\n", "'orders' is now called 'permutations'"),
+        (SIFT + '[mkpc]\nratio = "largest"\n', "'ratio' was removed"),
+        (SIFT + "[focal]\nfree_cost = 1\n", "'free_cost' was removed"),
         ("", "no units"),
         ("units = [", "not valid TOML"),
     ],
@@ -218,6 +222,21 @@ def test_a_unit_shows_a_crop_at_its_size():
 def test_unknown_and_missing_keys_are_named_with_the_known_ones(text, says):
     with pytest.raises(UserError, match=f"'mine'.*{says}"):
         parse(text)
+
+
+@dataclass(frozen=True)
+class Settings:
+    RENAMED: ClassVar = {"old": "new"}
+    REMOVED: ClassVar = ("gone",)
+    new: int = 1
+
+
+@pytest.mark.parametrize(
+    ("key", "says"), [("old", "'old' is now called 'new'"), ("gone", "'gone' was removed"), ("x", "keys: new$")]
+)
+def test_a_former_key_is_refused_with_what_became_of_it(key, says):
+    with pytest.raises(UserError, match=f"table t.*{says}"):
+        from_table(Settings, {key: 1}, "table t")
 
 
 def test_an_unknown_key_of_a_matcher_lists_its_options():
@@ -239,8 +258,6 @@ def test_an_unknown_matcher_lists_the_known_ones():
         (SIFT + "[mkpc]\nmin_samples = true\n", r"expected int, got True"),
         (SIFT + "[mkpc]\neps = true\n", r"expected float, got True"),
         (SIFT + '[mkpc]\neps = "0.1"\n', r"expected float, got '0.1'"),
-        (SIFT + '[mkpc]\nratio = "first"\n', r"'first' is none of 'largest', 'last-kept'"),
-        (SIFT + '[mkpc]\nratio = ["largest"]\n', r"is none of 'largest', 'last-kept'"),
         (SIFT + '[magsac]\nmethod = "MAGSAC"\n', r"'MAGSAC' is none of 'magsac', 'ransac'"),
         (units('{ stage = 1, matcher = "sift", long_side = "640" }'), r"unit 1, key 'long_side': expected int"),
         (units('{ stage = true, matcher = "sift", long_side = 640 }'), r"key 'stage': expected int, got True"),
@@ -308,18 +325,17 @@ def test_units_that_make_no_run_are_refused(text, says):
 @pytest.mark.parametrize(
     ("table", "line", "says"),
     [
-        ("mkpc", "eps = -0.1", r"eps must be in \(0, inf\), not -0.1"),
-        ("mkpc", "eps = nan", r"eps must be in \(0, inf\), not nan"),
+        ("mkpc", "eps = -0.1", r"eps must be in \[1e-06, inf\), not -0.1"),
+        ("mkpc", "eps = nan", r"eps must be in \[1e-06, inf\), not nan"),
         ("mkpc", "expand_x = inf", r"expand_x must be in \(0, inf\), not inf"),
         ("mkpc", "share = 1.1", r"share must be in \[0, 1\], not 1.1"),
-        ("mkpc", "min_samples = 0", r"min_samples must be in \[1, inf\), not 0"),
+        ("mkpc", "min_samples = 0", r"min_samples must be in \[1, 100\], not 0"),
         ("mkpc", "min_side = 0", "min_side"),
         ("magsac", "threshold = 0", r"threshold must be in \(0, inf\), not 0"),
         ("magsac", "confidence = 1", r"confidence must be in \(0, 1\), not 1"),
-        ("magsac", "max_iterations = 3_000_000_000", r"max_iterations must be in \[1, 2.14748e\+09\]"),
-        ("magsac", "orders = 0", "orders"),
+        ("magsac", "max_iterations = 3_000_000", r"max_iterations must be in \[1, 1e\+06\]"),
+        ("magsac", "permutations = 1_000_000_000", r"permutations must be in \[1, 100\]"),
         ("focal", "sigma = 0", "sigma"),
-        ("focal", "most_matches = 0", "most_matches"),
         ("upgrade", "below_inliers = -1", r"below_inliers must be in \[0, inf\), not -1"),
     ],
 )
@@ -432,9 +448,9 @@ def test_the_whole_images_mode_takes_stages_that_differ_in_more_than_the_stage(s
 
 
 def test_the_fingerprint_survives_json():
-    recipe = parse(SIFT + '[mkpc]\nratio = "last-kept"\n[matchers.sift]\nfeatures = 10\n')
+    recipe = parse(SIFT + '[magsac]\nmethod = "ransac"\n[matchers.sift]\nfeatures = 10\n')
     assert json.loads(json.dumps(recipe.fingerprint()))["matchers"] == {"sift": {"features": 10}}
-    assert "last-kept" in json.dumps(recipe.fingerprint())
+    assert "ransac" in json.dumps(recipe.fingerprint())
 
 
 def test_the_fingerprint_leaves_out_name_and_description():

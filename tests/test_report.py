@@ -305,7 +305,7 @@ def test_a_time_limit_is_drawn_where_the_run_came_near_it_and_told_where_not() -
 def test_a_strip_shows_both_images_at_one_height() -> None:
     from mkpc_kaggle.data.images import Image
     from mkpc_kaggle.geometry.matches import Matches
-    from mkpc_kaggle.geometry.robust import Estimate, Model
+    from mkpc_kaggle.geometry.robust import Estimate, ModelKind
     from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult
     from mkpc_kaggle.reporting import figures
 
@@ -315,7 +315,7 @@ def test_a_strip_shows_both_images_at_one_height() -> None:
     )
     matches = Matches(np.array([[10.0, 10.0]]), np.array([[150.0, 150.0]]), np.ones(1))
     result = UnitResult(THREE_UNITS.units[0], matches)
-    match = PairMatch((result,), None, Estimate(Model.F, np.eye(3), np.array([True])))
+    match = PairMatch((result,), None, Estimate(ModelKind.F, np.eye(3), np.array([True])))
     data = np.frombuffer(figures.to_jpeg(figures.draw_strip(images, match)), np.uint8)
     drawn = cv2.imdecode(data, cv2.IMREAD_COLOR)
     assert drawn.shape[:2] == pytest.approx((480, 960 + 480), abs=1)  # older versions of matplotlib round down

@@ -154,6 +154,6 @@ def test_an_image_that_the_scene_lacks_has_the_one_cameras_focal_length() -> Non
     images = (batch_images(1)[0], unseen, zoomed)
     assert [focal_of([placed], known, image) for image in images] == [850, FOCAL, None]
     pair = synthetic_scene(2, points=300, focals=[FOCAL] * 2).batch.pairs[0]
-    focals = KnownFocals(RobustConfig(orders=1, max_iterations=2000), FocalConfig(), sigma=0.05)
+    focals = KnownFocals(RobustConfig(permutations=1, max_iterations=2000), FocalConfig(), sigma=0.05)
     assert focals.fundamental([], known, unseen, unseen, pair.matches) is not None
     assert focals.fundamental([], {}, unseen, unseen, pair.matches) is None

@@ -113,7 +113,7 @@ def test_a_pair_that_the_scene_lacks_is_estimated_at_its_focal_lengths(scene: Sy
     outside = next(pair for pair in scene.batch.pairs if last in (pair.image0, pair.image1))
     few = replace(outside, matches=outside.matches[:14])  # too few to place the image
     batch = replace(scene.batch, pairs=(few, replace(few, matches=few.matches[:3]), *inside))
-    known = KnownFocals(RobustConfig(orders=1, max_iterations=2000), FocalConfig(), sigma=0.05)
+    known = KnownFocals(RobustConfig(permutations=1, max_iterations=2000), FocalConfig(), sigma=0.05)
     solution = solve(batch, SceneConfig(), known)
     found, hopeless, *others = solution.choices
     assert (found.reason, found.from_scene) == (Reason.UNPLACED, False)

@@ -211,7 +211,9 @@ def test_bad_input_is_told_in_one_line_before_any_work(
         (["--output", "/"], "is a directory; name a file"),
         (["--output", "test/test.csv"], "would be written over the input test/test.csv"),
         (["--output", "linked.csv"], "would be written over the input test/test.csv"),
-        (["--output", "test/test_images/x.csv"], "would be written over the input test/test_images"),
+        (["--output", "test/test_images/b/x.png"], "would be written over the input test/test_images"),
+        (["--output", "w/m.pth", "--weights", "w"], "would be written over the input w"),
+        (["--report", "r.toml"], "exists and is not a .html file"),
         (["--work-dir", "test/test_images"], "would be written over the input test/test_images"),
         (["--report", "test/test.csv"], "would be written over the input test/test.csv"),
         (["--recipe", "r.toml", "--output", "r.toml"], "would be written over the input r.toml"),
@@ -237,6 +239,10 @@ def test_what_would_be_written_over_an_input_or_a_result_is_refused_before_any_w
     shutil.copytree(demo.test_dir, "test")
     Path("linked.csv").hardlink_to("test/test.csv")
     Path("r.toml").write_text(RECIPE)
+    Path("test/test_images/b").mkdir()
+    Path("w").mkdir()
+    for place in ("test/test_images/b/x.png", "w/m.pth"):
+        Path(place).touch()
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     assert main(["submit", "--test-dir", "test", *arguments]) == 2
     assert told in capsys.readouterr().err

@@ -67,9 +67,8 @@ def test_the_views_nearest_to_an_essential_matrix_have_it(seed):
 
 def test_both_rotations_of_an_essential_matrix_give_one_cost_and_one_span_of_derivatives():
     view = random_view(3)
-    turned = TwoView((2 * np.outer(view.t, view.t) - np.eye(3)) @ view.R, view.t, view.logs)
-    assert_allclose(turned.fundamental, -view.fundamental, atol=1e-12)
-    together = np.hstack([view.tangent(), turned.tangent()])
+    together = np.hstack([view.tangent(), view.twisted.tangent()])
+    assert_allclose(view.twisted.fundamental, -view.fundamental, atol=1e-12)
     assert np.linalg.matrix_rank(view.tangent(), tol=1e-9) == np.linalg.matrix_rank(together, tol=1e-9) == 7
 
 
@@ -88,7 +87,6 @@ def test_a_fit_never_costs_more_and_leaves_known_focal_lengths_alone(sigmas):
     found = problem.fit(start, 50.0)
     assert problem.cost(found, 50.0) < problem.cost(start, 50.0)
     assert_allclose(found.logs[np.array(sigmas) == 0], 0, atol=0)
-    assert problem.direction_error(found, 50.0) > 0
 
 
 def rays_of(points, view):

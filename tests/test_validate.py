@@ -6,7 +6,14 @@ import pytest
 from shared import DATA, needs_data
 
 from mkpc_kaggle.cli import main
-from mkpc_kaggle.data.competition import Pair, Scene, TruePair, read_test_side, read_train_side, write_submission
+from mkpc_kaggle.data.competition import (
+    Pair,
+    TrainScene,
+    TruePair,
+    read_test_side,
+    read_train_side,
+    write_submission,
+)
 from mkpc_kaggle.demo import DemoSet
 from mkpc_kaggle.engine.records import PairRecord
 from mkpc_kaggle.errors import UserError
@@ -67,7 +74,7 @@ def test_a_failed_pair_counts_as_failed_even_where_the_fallback_happens_to_be_ri
     eye = np.eye(3)
     camera0, camera1 = Camera(eye, eye, np.zeros(3)), Camera(eye, eye, np.array([1.0, 0, 0]))
     true = TruePair(Pair("p", "s", Path("a"), Path("b")), camera0, camera1, 0.5)
-    scene = Scene("s", 1.0, (true,))
+    scene = TrainScene("s", 1.0, (true,))
     failed = score_record(true, PairRecord(0, FALLBACK_FUNDAMENTAL.copy(), "too few matches"), scene)
     right = score_record(true, PairRecord(0, FALLBACK_FUNDAMENTAL.copy(), ""), scene)
     assert failed.error.rotation == np.inf
@@ -105,7 +112,7 @@ def test_each_step_of_the_estimate_has_a_column(
         str(tmp_path / "scores.json"),
         "--recipe",
     ]
-    recipe.write_text(RECIPE + "[magsac]\norders = 1\n")
+    recipe.write_text(RECIPE + "[magsac]\npermutations = 1\n")
     assert main([*arguments, str(recipe)]) == 0
     plain = json.loads((tmp_path / "scores.json").read_text())
     assert plain["mAA_by_step"] == {"MAGSAC": plain["mAA"]}

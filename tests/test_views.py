@@ -7,7 +7,7 @@ import pytest
 
 from benchmarks import views
 from benchmarks.views import Seen, Views, look, recipe_of, table
-from mkpc_kaggle.data.competition import Scene, TruePair, read_train_side
+from mkpc_kaggle.data.competition import TrainScene, TruePair, read_train_side
 from mkpc_kaggle.data.images import Image
 from mkpc_kaggle.demo import DemoSet
 from mkpc_kaggle.geometry.cameras import relative_pose
@@ -18,7 +18,7 @@ from mkpc_kaggle.pipeline.two_stage import to_image
 
 
 @pytest.fixture(scope="module")
-def scene(demo: DemoSet) -> Scene:
+def scene(demo: DemoSet) -> TrainScene:
     (scene,) = read_train_side(demo.train_dir, pairs_per_scene=3)
     return scene
 
@@ -40,7 +40,7 @@ def seen_points(true: TruePair, size: Size, count: int = 200) -> Matches:
     return Matches(pixels, projected[:, :2] / projected[:, 2:], np.ones(count))
 
 
-def test_true_matches_are_right_cover_the_image_and_lie_on_no_plane(scene: Scene) -> None:
+def test_true_matches_are_right_cover_the_image_and_lie_on_no_plane(scene: TrainScene) -> None:
     true = scene.pairs[0]
     image0, image1 = images_of(true)
     matches = seen_points(true, image0.size)
@@ -53,7 +53,7 @@ def test_true_matches_are_right_cover_the_image_and_lie_on_no_plane(scene: Scene
     assert Seen.of(quarter, true, (image0, image1)).cover < seen.cover
 
 
-def test_wrong_matches_are_told_and_none_are_legal(scene: Scene) -> None:
+def test_wrong_matches_are_told_and_none_are_legal(scene: TrainScene) -> None:
     true = scene.pairs[0]
     images = images_of(true)
     matches = seen_points(true, images[0].size)
@@ -66,7 +66,7 @@ def test_wrong_matches_are_told_and_none_are_legal(scene: Scene) -> None:
 
 
 def test_a_pair_is_looked_at_both_ways_and_scenes_are_tabled(
-    scene: Scene, monkeypatch: pytest.MonkeyPatch
+    scene: TrainScene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(views, "LONG_SIDES", {"sift": (480, 400)})
     pipeline = assemble(recipe_of("sift")).pipeline()

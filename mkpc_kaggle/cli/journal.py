@@ -29,14 +29,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    from mkpc_kaggle.data.competition import read_test_side
+    from mkpc_kaggle.data.competition import read_test_side, test_side
     from mkpc_kaggle.reporting.report import write_report
     from mkpc_kaggle.reporting.run_log import read_log, write_csv, write_json
     from mkpc_kaggle.reporting.sections import Artist
     from mkpc_kaggle.reporting.summary import overview
 
     files = {"--json": arguments.json, "--report": arguments.report}
-    options.require_apart(files, arguments.work_dir, [])
+    options.require_apart(files, arguments.work_dir, test_side(arguments.test_dir) if arguments.test_dir else [])
     log = read_log(arguments.work_dir)
     if arguments.csv is not None:
         for path in write_csv(log, arguments.csv):

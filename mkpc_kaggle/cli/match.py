@@ -22,7 +22,8 @@ def run(arguments: argparse.Namespace) -> int:
     from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher, to_image
     from mkpc_kaggle.reporting import figures
 
-    options.require_apart({"--out": arguments.out}, None, [arguments.image0, arguments.image1])
+    inputs = [arguments.image0, arguments.image1, Path(arguments.recipe)]
+    options.require_apart({"--out": arguments.out}, None, inputs, arguments.weights)
     images = to_image(arguments.image0), to_image(arguments.image1)
     matcher = TwoStageMatcher(
         arguments.recipe,

@@ -151,42 +151,34 @@ def add_time_limit(parser: argparse.ArgumentParser, default: str | None) -> None
     )
 
 
-def require_apart(files: Mapping[str, Path | None], work_dir: Path | None, inputs: Sequence[Path]) -> None:
-    """Refuse to write over what is read, or over another output; raises :class:`UserError`.
+def require_apart(
+    files: Mapping[str, Path | None], work_dir: Path | None, inputs: Sequence[Path], weights: Sequence[Path] = ()
+) -> None:
+    """Refuse outputs that are in each other's way, or would overwrite an input; raises :class:`UserError`.
 
-    ``files`` are what a command writes, by option, beside the journal in ``work_dir``. Of ``inputs``, directories
-    are taken with all that is in them.
+    ``files`` are what a command writes, by option, beside the journal in ``work_dir``; ``inputs`` and ``weights``
+    as for :func:`mkpc_kaggle.data.outputs.require_no_input`.
     """
-    for option, path in files.items():
-        if path is None:
-            continue
+    from mkpc_kaggle.data.outputs import lies_in, require_no_input, same_file
+
+    given = {option: path for option, path in files.items() if path is not None}
+    for option, path in given.items():
         if not path.name or os.path.isdir(path):  # noqa: PTH112  Path raises for a name that is too long
             raise UserError(f"{option} {str(path)!r} is a directory; name a file")
-        for other, its_path in files.items():
-            if other != option and its_path is not None and _same(path, its_path):
+        for other, its_path in given.items():
+            if other != option and same_file(path, its_path):
                 raise UserError(
                     f"{option} {path} and {other} {its_path} are one file; name another for one of them"
                 )
         if work_dir is not None and (
-            _within(work_dir, path) or (_same(path.parent, work_dir) and path.name.startswith("journal."))
+            lies_in(work_dir, path) or (same_file(path.parent, work_dir) and path.name.startswith("journal."))
         ):
             raise UserError(f"{option} {path} and the work directory {work_dir} are in each other's way")
-    for option, path in {**files, "--work-dir": work_dir}.items():
-        for there in inputs:
-            if path is not None and _within(path, there):
-                raise UserError(f"{option} {path} would be written over the input {there}; name another place")
-
-
-def _within(path: Path, other: Path) -> bool:
-    """Whether ``path`` is the other or lies in it."""
-    return any(_same(one, other) for one in (path, *Path(os.path.realpath(path)).parents))
-
-
-def _same(path: Path, other: Path) -> bool:
-    try:  # links, and file systems that do not tell A from a
-        return os.path.realpath(path) == os.path.realpath(other) or path.samefile(other)
-    except OSError:
-        return False
+    environment = (Path(part) for part in os.environ.get("MKPC_WEIGHTS", "").split(os.pathsep) if part)
+    require_no_input(given, inputs, [*weights, *environment])
+    for place in inputs:
+        if work_dir is not None and lies_in(work_dir, place):
+            raise UserError(f"--work-dir {work_dir} would be written over the input {place}; name another place")
 
 
 def budget_of(arguments: argparse.Namespace) -> Budget:

@@ -56,7 +56,8 @@ def run(arguments: argparse.Namespace) -> int:
     work_dir: Path = arguments.work_dir or output.parent / f"{output.stem}.work"
     page: Path = arguments.report or output.parent / f"{output.stem}.html"
     files = {"--output": output, "--report": None if arguments.no_report else page}
-    options.require_apart(files, work_dir, [*test_side(arguments.test_dir), Path(arguments.recipe)])
+    inputs = [*test_side(arguments.test_dir), Path(arguments.recipe)]
+    options.require_apart(files, work_dir, inputs, arguments.weights)
     budget = options.budget_of(arguments)
     with interruptible() as interrupt, Watchdog(budget, interrupt) as watchdog:
         pairs = read_test_side(arguments.test_dir)

@@ -10,7 +10,7 @@ from mkpc_kaggle.cli import finish, options
 from mkpc_kaggle.errors import UserError
 
 if TYPE_CHECKING:
-    from mkpc_kaggle.data.competition import Scene
+    from mkpc_kaggle.data.competition import TrainScene
     from mkpc_kaggle.engine.session import Interrupt, Session
     from mkpc_kaggle.evaluation.validate import Validation
     from mkpc_kaggle.pipeline.assembly import Assembly
@@ -100,8 +100,9 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.compare is not None and len(arguments.compare) < 2:
         raise UserError(f"--compare needs two recipes or more, not only {arguments.compare[0]}")
     sides = [arguments.train_dir, arguments.image_root]
-    inputs = [*sides, arguments.pairs, arguments.truth, *(arguments.submission or ())]
-    options.require_apart({"--json": arguments.json}, arguments.work_dir, [path for path in inputs if path])
+    inputs = [*sides, arguments.pairs, arguments.truth, *(arguments.submission or ()), Path(arguments.recipe)]
+    inputs = [path for path in inputs if path]
+    options.require_apart({"--json": arguments.json}, arguments.work_dir, inputs, arguments.weights)
     with tempfile.TemporaryDirectory(prefix="mkpc-") as temporary:
         work_dir = arguments.work_dir or Path(temporary)
         scenes = _read_scenes(arguments, work_dir)
@@ -115,7 +116,7 @@ def run(arguments: argparse.Namespace) -> int:
         return _match_and_score(arguments, scenes, work_dir)
 
 
-def _read_scenes(arguments: argparse.Namespace, work_dir: Path) -> "tuple[Scene, ...]":
+def _read_scenes(arguments: argparse.Namespace, work_dir: Path) -> "tuple[TrainScene, ...]":
     from mkpc_kaggle.data.competition import read_train_side
     from mkpc_kaggle.data.pairs import read_pairs
 
@@ -136,7 +137,7 @@ def _read_scenes(arguments: argparse.Namespace, work_dir: Path) -> "tuple[Scene,
     )
 
 
-def _match_and_score(arguments: argparse.Namespace, scenes: "tuple[Scene, ...]", work_dir: Path) -> int:
+def _match_and_score(arguments: argparse.Namespace, scenes: "tuple[TrainScene, ...]", work_dir: Path) -> int:
     from mkpc_kaggle.engine.session import interruptible
     from mkpc_kaggle.evaluation.compare import step_gains
     from mkpc_kaggle.evaluation.validate import score_table, to_json, validate
@@ -156,7 +157,7 @@ def _match_and_score(arguments: argparse.Namespace, scenes: "tuple[Scene, ...]",
     return finish(status, at_rest=at_rest)
 
 
-def _compare(arguments: argparse.Namespace, scenes: "tuple[Scene, ...]", work_dir: Path) -> int:
+def _compare(arguments: argparse.Namespace, scenes: "tuple[TrainScene, ...]", work_dir: Path) -> int:
     from mkpc_kaggle.engine.engine import Ending
     from mkpc_kaggle.engine.session import interruptible
     from mkpc_kaggle.evaluation.compare import Comparison, comparison_json, comparison_table
@@ -218,7 +219,7 @@ def _with_estimator(recipe: "Recipe", arguments: argparse.Namespace) -> "Recipe"
 
 
 def _print_summary(
-    arguments: argparse.Namespace, validation: "Validation", scenes: "tuple[Scene, ...]", assembly: "Assembly"
+    arguments: argparse.Namespace, validation: "Validation", scenes: "tuple[TrainScene, ...]", assembly: "Assembly"
 ) -> None:
     from mkpc_kaggle.reporting.summary import summary
 
@@ -230,7 +231,7 @@ def _print_summary(
     print(f"\nrecipe {validation.recipe}")
 
 
-def _write_report(arguments: argparse.Namespace, scenes: "tuple[Scene, ...]", session: "Session") -> None:
+def _write_report(arguments: argparse.Namespace, scenes: "tuple[TrainScene, ...]", session: "Session") -> None:
     """The report of a run whose journal is kept; its inliers are of F, so there is none where E was estimated."""
     from mkpc_kaggle.reporting.report import report_run
 

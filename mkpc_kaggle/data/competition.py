@@ -6,42 +6,32 @@ jpeg are accepted on both sides. F of a pair satisfies x2^T F x1 = 0, image 1 be
 """
 
 import csv
-import gc
 import os
 import re
-import secrets
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
-from typing import TextIO, TypeVar
+from typing import TypeVar
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 
+from mkpc_kaggle.data.outputs import replacing
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.cameras import Camera
-from mkpc_kaggle.geometry.robust import Matrix3, Model
+from mkpc_kaggle.geometry.coordinates import Matrix3
+from mkpc_kaggle.geometry.robust import ModelKind
 
 TEST_COLUMNS = ("sample_id", "batch_id", "image_1_id", "image_2_id")
 SUBMISSION_COLUMNS = ("sample_id", "fundamental_matrix")
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 
-CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]")
-"""Characters that end lines, or drive a terminal."""
+CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]")  # characters that end lines, or drive a terminal
+# Names of directories, of drives (Windows), and names that no file can have.
 NOT_PLAIN = re.compile(rf"^\.{{0,2}}$|^[A-Za-z]:|[/\\]|{CONTROL.pattern}")
-"""Names of directories, of drives (Windows), and of no file."""
-
-MOST_COLUMNS = 1000
-"""Of a table: with a hundred thousand, pandas takes minutes."""
 
 Item = TypeVar("Item")
-
-_parts: set[Path] = set()
-"""Files that :func:`replacing` is writing."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,8 +66,8 @@ class Pair:
         return self.file0.rpartition(os.sep)[2], self.file1.rpartition(os.sep)[2]
 
     @property
-    def model(self) -> Model:
-        return Model.F if self.intrinsics is None else Model.E
+    def model(self) -> ModelKind:
+        return ModelKind.F if self.intrinsics is None else ModelKind.E
 
     @property
     def key(self) -> str:
@@ -96,8 +86,8 @@ class TruePair:
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
-    """Pairs with cameras, and the metres that one unit of their world is long, NaN where that is unknown."""
+class TrainScene:
+    """Pairs with cameras, and the metres that a unit of their world is long, NaN where that is unknown."""
 
     name: str
     metres_per_unit: float
@@ -110,48 +100,34 @@ def test_side(directory: Path) -> tuple[Path, Path]:
     return home / "test.csv", home / "test_images"
 
 
-@contextmanager
-def uncollected() -> Iterator[None]:
-    """Garbage collection waits: while a million values are made and kept, it would search them over and over."""
-    enabled = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if enabled:
-            gc.enable()
-
-
-@uncollected()
 def read_test_side(directory: Path) -> tuple[Pair, ...]:
     """The pairs of ``test.csv``, in its order.
 
     ``directory`` holds ``test.csv`` and ``test_images/``, or is ``test_images`` itself with ``test.csv``
-    beside it. A missing image is no error here: its path does not exist. Raises
-    :class:`UserError` for a missing or unreadable table, missing columns, no rows, sample ids that are repeated or
-    have control characters, and other ids that are not plain names.
+    beside it. A missing image is no error here: its path does not exist. Raises :class:`UserError` for a table
+    that cannot be read or has no rows, for sample ids that are repeated or have control characters, and for other
+    ids that are not plain names.
     """
     path, images = test_side(directory)
-    table = read_table(path, TEST_COLUMNS)
+    pairs: dict[str, Pair] = {}
+    batches: dict[str, dict[str, str]] = {}
+    for line, (sample, batch, *names) in read_rows(path, TEST_COLUMNS):
+        where = f"{path}, line {line}"
+        if sample in pairs:
+            raise UserError(f"{where}: the sample_id {sample!r} is not unique")
+        if CONTROL.search(sample):
+            raise UserError(f"{where}: the sample_id {sample!r} has control characters: no submission can hold it")
+        for name in (batch, *names):
+            plain_name(name, where)
+        if batch not in batches:
+            batches[batch] = ImageFiles(images / batch)
+        first, second = (batches[batch][name] for name in names)
+        pairs[sample] = Pair(sample, sys.intern(batch), first, second)
     if not images.is_dir():
         raise UserError(f"{images}: no such directory; --test-dir must hold test.csv and test_images/")
-    if table.empty:
+    if not pairs:
         raise UserError(f"{path} has no rows: there is nothing to match")
-    repeated = table["sample_id"][table["sample_id"].duplicated()]
-    if not repeated.empty:
-        times = int((table["sample_id"] == repeated.iloc[0]).sum())
-        raise UserError(f"{path}: the sample_id {repeated.iloc[0]!r} occurs {times} times")
-    if odd := next(filter(CONTROL.search, table["sample_id"]), None):
-        raise UserError(f"{path}: the sample_id {odd!r} has control characters, which a submission cannot hold")
-    for column in TEST_COLUMNS[1:]:
-        for name in table[column].unique():
-            plain_name(name, path)
-    found = {batch: Images(images / batch) for batch in table["batch_id"].unique()}
-    rows = (table[column].tolist() for column in TEST_COLUMNS)
-    return tuple(
-        Pair(sample, sys.intern(batch), found[batch][first], found[batch][second])
-        for sample, batch, first, second in zip(*rows, strict=True)
-    )
+    return tuple(pairs.values())
 
 
 def read_train_side(
@@ -160,15 +136,15 @@ def read_train_side(
     scenes: Iterable[str] = (),
     min_covisibility: float = 0.1,
     pairs_per_scene: int | None = None,
-) -> tuple[Scene, ...]:
+) -> tuple[TrainScene, ...]:
     """The scenes of a train side (all, or those named), with the pairs of at least that covisibility.
 
     ``pairs_per_scene`` takes that many of a scene's pairs, evenly spread over its table. Raises
     :class:`UserError` for missing files, columns or scenes, and for cells that cannot be read.
     """
-    factors = read_table(directory / "scaling_factors.csv", ("scene", "scaling_factor"))
-    cells = zip(factors["scene"], factors["scaling_factor"], strict=True)
-    metres = {scene: float(_numbers(cell, directory / "scaling_factors.csv", 1)[0]) for scene, cell in cells}
+    path = directory / "scaling_factors.csv"
+    rows = read_rows(path, ("scene", "scaling_factor"))
+    metres = {scene: float(_numbers(cell, f"{path}, line {line}", 1)[0]) for line, (scene, cell) in rows}
     wanted = list(scenes) or sorted(name for name in metres if (directory / name).is_dir())
     for name in wanted:
         if name not in metres:
@@ -176,15 +152,34 @@ def read_train_side(
     if not wanted:
         raise UserError(f"{directory} has none of the scenes of its scaling_factors.csv")
     return tuple(
-        _read_scene(directory / plain_name(name, directory), metres[name], min_covisibility, pairs_per_scene)
+        _read_scene(directory / plain_name(name, path), metres[name], min_covisibility, pairs_per_scene)
         for name in wanted
     )
 
 
-def read_true_pair(directory: Path, pair: str) -> tuple[Scene, TruePair]:
+def _read_scene(directory: Path, metres: float, min_covisibility: float, most: int | None) -> TrainScene:
+    cameras = read_cameras(directory / "calibration.csv")
+    path = directory / "pair_covisibility.csv"
+    images, pairs = ImageFiles(directory / "images"), []
+    for line, (key, cell) in read_rows(path, ("pair", "covisibility")):
+        where = f"{path}, line {line}"
+        covisibility = float(_numbers(cell, where, 1)[0])
+        first, dash, second = key.partition("-")
+        if not dash or first not in cameras or second not in cameras:
+            raise UserError(f"{where}: the pair {key!r} is not two images of calibration.csv")
+        if covisibility >= min_covisibility:
+            image0, image1 = (images[plain_name(name, where)] for name in (first, second))
+            pair = Pair(pair_id(directory.name, first, second), directory.name, image0, image1)
+            pairs.append(TruePair(pair, cameras[first], cameras[second], covisibility))
+    if not pairs:
+        raise UserError(f"{path} has no pair with a covisibility of at least {min_covisibility:g}")
+    return TrainScene(directory.name, metres, tuple(evenly_spread(pairs, most)))
+
+
+def read_true_pair(directory: Path, pair: str) -> tuple[TrainScene, TruePair]:
     """The pair ``SCENE;IMAGE-IMAGE`` of a train side, whatever its covisibility, and its scene.
 
-    Raises :class:`UserError` where there is none, besides what :func:`read_train_side` raises.
+    Raises :class:`UserError` for an unknown pair, besides what :func:`read_train_side` raises.
     """
     (scene,) = read_train_side(directory, scenes=[pair.partition(";")[0]], min_covisibility=0.0)
     known = {true.pair.id: true for true in scene.pairs}
@@ -195,11 +190,14 @@ def read_true_pair(directory: Path, pair: str) -> tuple[Scene, TruePair]:
 
 def read_cameras(path: Path) -> dict[str, Camera]:
     """The cameras of a ``calibration.csv`` by image id."""
+    cameras = {}
     columns = ("image_id", "camera_intrinsics", "rotation_matrix", "translation_vector")
-    return {
-        image: Camera(_numbers(K, path, 9).reshape(3, 3), _numbers(R, path, 9).reshape(3, 3), _numbers(t, path, 3))
-        for image, K, R, t in read_table(path, columns)[list(columns)].itertuples(index=False)
-    }
+    for line, (image, *cells) in read_rows(path, columns):
+        K, R, t = (
+            _numbers(cell, f"{path}, line {line}", count) for cell, count in zip(cells, (9, 9, 3), strict=True)
+        )
+        cameras[image] = Camera(K.reshape(3, 3), R.reshape(3, 3), t)
+    return cameras
 
 
 def write_submission(path: Path, rows: Mapping[str, Matrix3]) -> None:
@@ -222,92 +220,81 @@ def _cells(matrices: Iterable[Matrix3]) -> Iterator[str]:
         yield text
 
 
-@contextmanager
-def replacing(path: Path) -> Iterator[TextIO]:
-    """A file to write, under a name of its own, that takes the place of ``path`` when all of it is on the disk.
-
-    Raises ``OSError`` where it cannot be written; nothing is left of it then.
-    """
-    part = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")  # two runs may have one output
-    _parts.add(part)
-    try:
-        with part.open("x", encoding="utf-8", newline="") as stream:
-            yield stream
-            stream.flush()
-            os.fsync(stream.fileno())
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
-        _parts.discard(part)
-
-
-def discard_parts() -> None:
-    """Remove what this process has begun to write and not finished, before it is left at once."""
-    for part in tuple(_parts):
-        with suppress(OSError):
-            part.unlink(missing_ok=True)
-
-
 def read_submission(path: Path) -> dict[str, Matrix3]:
-    """F by sample id; raises :class:`UserError` for a file that is no submission."""
-    table = read_table(path, SUBMISSION_COLUMNS)
-    cells = zip(table["sample_id"], table["fundamental_matrix"], strict=True)
-    return {sample: _numbers(cell, path, 9).reshape(3, 3) for sample, cell in cells}
+    """F by sample id; raises :class:`UserError` for a file that is not a submission."""
+    rows = read_rows(path, SUBMISSION_COLUMNS)
+    return {sample: _numbers(cell, f"{path}, line {line}", 9).reshape(3, 3) for line, (sample, cell) in rows}
 
 
 def submission_problems(path: Path, sample_ids: Sequence[str]) -> list[str]:
-    """What is wrong with a submission, one sentence each; empty if the competition accepts it."""
+    """What is wrong with a submission, a sentence each; empty if the competition accepts it."""
+    problems, found = [], []
     try:
-        table = read_table(path, SUBMISSION_COLUMNS)
+        for _, (sample, cell) in read_rows(path, SUBMISSION_COLUMNS, only=True):
+            found.append(sample)
+            try:
+                F = _numbers(cell, sample, 9)
+            except UserError as error:
+                problems.append(str(error))
+                continue
+            if not np.isfinite(F).all():
+                problems.append(f"{sample}: a number is not finite")
+            elif not F.any():
+                problems.append(f"{sample}: the matrix is zero")
     except UserError as error:
         return [str(error)]
-    problems = []
-    if tuple(table.columns) != SUBMISSION_COLUMNS:
-        problems.append(f"the header is {','.join(table.columns)}, not {','.join(SUBMISSION_COLUMNS)}")
-    found = list(table["sample_id"])
     if found != list(sample_ids):
-        problems.append(_difference(found, sample_ids))
-    for sample, cell in zip(found, table["fundamental_matrix"], strict=True):
-        try:
-            F = _numbers(cell, path, 9)
-        except UserError as error:
-            problems.append(f"{sample}: {error}")
-            continue
-        if not np.isfinite(F).all():
-            problems.append(f"{sample}: a number is not finite")
-        elif not F.any():
-            problems.append(f"{sample}: the matrix is zero")
+        problems.insert(0, _difference(found, sample_ids))
     return problems
 
 
-def read_table(path: Path, columns: Sequence[str]) -> pd.DataFrame:
-    """A CSV file with all cells as text; raises :class:`UserError` unless it has these columns."""
-    if path.exists() and not path.is_file():
-        raise UserError(f"{path} is not a regular file")
+def _difference(found: Sequence[str], expected: Sequence[str]) -> str:
+    present, wanted = set(found), set(expected)
+    missing = [sample for sample in expected if sample not in present]
+    surplus = [sample for sample in found if sample not in wanted]
+    if missing:
+        return f"{len(missing)} samples are missing, the first is {missing[0]}"
+    if surplus:
+        return f"{len(surplus)} samples are not in test.csv, the first is {surplus[0]}"
+    return (
+        "a sample is there twice"
+        if len(found) != len(expected)
+        else "the samples are not in the order of test.csv"
+    )
+
+
+def read_rows(path: Path, columns: Sequence[str], *, only: bool = False) -> Iterator[tuple[int, list[str]]]:
+    """Line number and cells of these columns of each row of a CSV file, all as text.
+
+    Raises :class:`UserError` for a file that cannot be read, for missing columns (with ``only`` for other columns,
+    too), and for a row that has not as many cells as the header.
+    """
     try:
-        with path.open("rb") as stream:
-            if stream.readline(1 << 20).count(b",") >= MOST_COLUMNS:
-                raise ValueError(f"it has more than {MOST_COLUMNS} columns")
-            stream.seek(0)
-            if any(b"\0" in block for block in iter(partial(stream.read, 1 << 20), b"")):
-                raise ValueError("it has NUL characters")  # some versions of pandas end the cell there
-        table = pd.read_csv(path, dtype=str, keep_default_na=False)
+        if path.exists() and not path.is_file():
+            raise UserError(f"{path} is not a regular file")
+        with path.open(encoding="utf-8-sig", newline="") as stream:
+            table = csv.reader(stream)
+            header = next(filter(None, table), [])
+            if missing := [column for column in columns if column not in header]:
+                found = ", ".join(header)[:200] or "nothing"
+                raise UserError(f"{path} lacks the columns {', '.join(missing)}; it has {found}")
+            if only and header != list(columns):
+                raise UserError(f"{path}: the header is {','.join(header)[:200]}, not {','.join(columns)}")
+            places = [header.index(column) for column in columns]
+            for row in filter(None, table):
+                if len(row) != len(header):
+                    raise UserError(
+                        f"{path}, line {table.line_num}: {len(row)} cells, the header has {len(header)}"
+                    )
+                yield table.line_num, [row[place] for place in places]
     except FileNotFoundError as error:
         raise UserError(f"{path}: no such file") from error
-    except pd.errors.EmptyDataError as error:
-        raise UserError(f"{path} is empty; expected the columns {', '.join(columns)}") from error
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, csv.Error) as error:
         raise UserError(f"{path} cannot be read as a table: {error}") from error
-    if not isinstance(table.index, pd.RangeIndex):  # pandas took the first column for an index
-        raise UserError(f"{path} has rows with more cells than its header: {', '.join(table.columns)}")
-    missing = [column for column in columns if column not in table.columns]
-    if missing:
-        raise UserError(f"{path} lacks the columns {', '.join(missing)}; it has {', '.join(table.columns)}")
-    return table
 
 
-def plain_name(name: str, where: Path) -> str:
-    """``name`` if it is the name of one file or directory; an id must not point outside its directory."""
+def plain_name(name: str, where: object) -> str:
+    """``name`` if it is the name of a file or directory; an id must not point outside its directory."""
     if NOT_PLAIN.search(name):
         raise UserError(f"{where}: the id {name!r} is not a plain name, so it cannot name a file here")
     return name
@@ -325,14 +312,17 @@ def evenly_spread(items: Sequence[Item], most: int | None) -> list[Item]:
     return [items[index] for index in np.linspace(0, len(items) - 1, most).round().astype(int)]
 
 
-class Images(dict[str, str]):
+class ImageFiles(dict[str, str]):
     """Paths of the images of a directory, as it is now, by id; for any other id a png that does not exist."""
 
     def __init__(self, directory: Path) -> None:
         self.directory = str(directory)
         try:
             images = sorted(path for path in directory.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES)
-        except OSError:  # there is none, or none can have a name as long as that
+        except (
+            OSError,
+            ValueError,
+        ):  # it is not there, or its name is too long or not of the file system's encoding
             images = []
         super().__init__((path.stem, str(path)) for path in reversed(images))
 
@@ -340,25 +330,7 @@ class Images(dict[str, str]):
         return f"{self.directory}{os.sep}{image_id}.png"
 
 
-def _read_scene(directory: Path, metres: float, min_covisibility: float, most: int | None) -> Scene:
-    cameras = read_cameras(directory / "calibration.csv")
-    path, columns = directory / "pair_covisibility.csv", ["pair", "covisibility"]
-    images, pairs = Images(directory / "images"), []
-    for key, cell in read_table(path, columns)[columns].itertuples(index=False):
-        covisibility = float(_numbers(cell, path, 1)[0])
-        first, dash, second = key.partition("-")
-        if not dash or first not in cameras or second not in cameras:
-            raise UserError(f"{path}: the pair {key!r} is not two images of calibration.csv")
-        if covisibility >= min_covisibility:
-            image0, image1 = (images[plain_name(name, path)] for name in (first, second))
-            pair = Pair(pair_id(directory.name, first, second), directory.name, image0, image1)
-            pairs.append(TruePair(pair, cameras[first], cameras[second], covisibility))
-    if not pairs:
-        raise UserError(f"{path} has no pair with a covisibility of at least {min_covisibility:g}")
-    return Scene(directory.name, metres, tuple(evenly_spread(pairs, most)))
-
-
-def _numbers(cell: str, where: Path, count: int) -> NDArray[np.float64]:
+def _numbers(cell: str, where: str, count: int) -> NDArray[np.float64]:
     try:
         numbers = np.array([float(part) for part in cell.split()])
     except ValueError as error:
@@ -366,16 +338,3 @@ def _numbers(cell: str, where: Path, count: int) -> NDArray[np.float64]:
     if numbers.size != count:
         raise UserError(f"{where}: expected {count} numbers, found {numbers.size}: {cell!r}")
     return numbers
-
-
-def _difference(found: Sequence[str], expected: Sequence[str]) -> str:
-    are, should_be = set(found), set(expected)
-    missing = [sample for sample in expected if sample not in are]
-    surplus = [sample for sample in found if sample not in should_be]
-    if missing:
-        return f"{len(missing)} samples are missing, the first is {missing[0]}"
-    if surplus:
-        return f"{len(surplus)} samples are not in test.csv, the first is {surplus[0]}"
-    if len(found) != len(expected):
-        return "a sample is there twice"
-    return "the samples are not in the order of test.csv"

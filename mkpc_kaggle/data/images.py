@@ -1,7 +1,6 @@
-"""Decoding images, in the background and once: an unreadable file is a value with a reason, not an exception."""
+"""Images: decoded in the background and once. An unreadable file is a value with a reason, not an exception."""
 
 import hashlib
-import os
 import stat
 import threading
 from collections.abc import Callable, Iterable
@@ -16,18 +15,16 @@ import numpy as np
 from mkpc_kaggle.data.cache import ByteCache
 from mkpc_kaggle.geometry.coordinates import Pixels, Size
 
-MOST_ASPECT = 32
-"""Of the longer side to the shorter one. A picture beyond it is taken for damaged: views of it would be a few
-pixels high, or would not fit into memory."""
-
-Stamp = tuple[int, ...]
+# Of the longer side to the shorter. Beyond it an image counts as damaged: its views would be a few pixels high, or
+# would not fit into memory.
+MAX_ASPECT = 32
 
 
 @dataclass(frozen=True, eq=False)
 class Image:
-    """A decoded picture: ``pixels`` is (H, W, 3) uint8 RGB; ``name`` is unique in a run.
+    """A decoded image: ``pixels`` is (H, W, 3) uint8 RGB; ``name`` is unique in a run.
 
-    ``version`` tells the content of its file, see :func:`is_unchanged`; empty where there is none.
+    ``version`` identifies the content of its file for :func:`is_unchanged`; empty where it has no file.
     """
 
     name: str
@@ -37,15 +34,10 @@ class Image:
     @classmethod
     def of_array(cls, array: Pixels) -> "Image":
         """From (H, W, 3) RGB or (H, W) gray uint8, named by its content; ``ValueError`` for anything else."""
-        if (
-            array.dtype != np.uint8
-            or array.ndim not in (2, 3)
-            or array.shape[2:] not in ((), (3,))
-            or not array.size
-        ):
+        if array.dtype != np.uint8 or array.ndim < 2 or array.shape[2:] not in ((), (3,)) or not array.size:
             raise ValueError(f"an image is uint8 (H, W) or (H, W, 3), not {array.dtype} {array.shape}")
         pixels = np.ascontiguousarray(np.stack([array] * 3, axis=2) if array.ndim == 2 else array)
-        return cls(f"{hashlib.blake2b(pixels.tobytes()).hexdigest()[:32]} {pixels.shape}", pixels)
+        return cls(f"{_content_digest(pixels)} {pixels.shape}", pixels)
 
     @property
     def size(self) -> Size:
@@ -70,7 +62,7 @@ class Unreadable:
 
 
 def read_image(path: Path) -> Image | Unreadable:
-    """Decode one file (png, jpg; 8 or 16 bit; gray, colour, with alpha) to 8-bit RGB; never raises.
+    """Decode a file (png, jpg; 8 or 16 bit; gray, colour, with alpha) to 8-bit RGB; never raises.
 
     16-bit values are divided by 256, alpha is dropped, an EXIF orientation is applied. OpenCV decides whether
     a damaged file is readable: version 5 refuses a truncated one.
@@ -85,13 +77,13 @@ def read_image(path: Path) -> Image | Unreadable:
         return Unreadable(name, "no such file")
     except (OSError, ValueError, MemoryError) as error:
         return Unreadable(name, f"cannot be read: {error}")
-    return decode_image(name, data, stamp_of(status))
+    return decode_image(name, data, status.st_ctime_ns)
 
 
-def decode_image(name: str, data: Pixels, stamp: Stamp = ()) -> Image | Unreadable:
+def decode_image(name: str, data: Pixels, changed_ns: int = 0) -> Image | Unreadable:
     """Decode the (N,) uint8 bytes of a file, as :func:`read_image` does; never raises.
 
-    ``stamp`` is what the file had before it was read.
+    ``changed_ns`` is the file's time of change before it was read.
     """
     if data.size == 0:
         return Unreadable(name, "the file is empty")
@@ -102,38 +94,33 @@ def decode_image(name: str, data: Pixels, stamp: Stamp = ()) -> Image | Unreadab
     if bgr is None:
         return Unreadable(name, "not a picture, or cut off: it cannot be decoded")
     height, width = bgr.shape[:2]
-    if max(height, width) > MOST_ASPECT * min(height, width):
-        return Unreadable(name, f"{width} x {height} pixels: one side is more than {MOST_ASPECT} times the other")
-    version = " ".join(map(str, (digest_of(data), *stamp)))
-    return Image(name, np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8), version)
+    if max(height, width) > MAX_ASPECT * min(height, width):
+        return Unreadable(name, f"{width} x {height} pixels: one side is more than {MAX_ASPECT} times the other")
+    pixels = np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)
+    return Image(name, pixels, f"{_content_digest(data)} {changed_ns}")
 
 
 def is_unchanged(path: Path, version: str) -> bool:
     """Whether a file still has the content that it had when an image of that ``version`` was read from it.
 
-    A file whose size and times are the same is not read. One that cannot be read any more has no other content.
+    A file that has not been written to since is not read. A file that cannot be read counts as unchanged.
     """
-    digest, *stamp = version.split()
+    digest, changed_ns = version.split()
     try:
         status = path.stat()
-        if not stat.S_ISREG(status.st_mode) or list(map(str, stamp_of(status))) == stamp:
+        if not stat.S_ISREG(status.st_mode) or str(status.st_ctime_ns) == changed_ns:
             return True
-        return digest_of(np.fromfile(path, np.uint8)) == digest
+        return _content_digest(np.fromfile(path, np.uint8)) == digest
     except (OSError, ValueError):
         return True
 
 
-def stamp_of(status: os.stat_result) -> Stamp:
-    """Size in bytes and times of change in nanoseconds: a file's content does not change without them."""
-    return status.st_size, status.st_mtime_ns, status.st_ctime_ns
-
-
-def digest_of(data: Pixels) -> str:
+def _content_digest(data: Pixels) -> str:
     return hashlib.blake2b(data.data, digest_size=16).hexdigest()
 
 
 def printable(text: str) -> str:
-    """``text`` in UTF-8's alphabet: paths may hold bytes that are none of it."""
+    """``text`` with escapes for characters that UTF-8 cannot encode, which paths may have."""
     return text.encode("utf-8", "backslashreplace").decode()
 
 
@@ -160,10 +147,10 @@ class ImageStore:
 
     def prefetch(self, paths: Iterable[Path]) -> None:
         """Start decoding the images that are neither cached nor being decoded."""
-        for path in paths:
-            with self._lock:
-                if path not in self._pending and self._images.get(path) is None:
-                    self._pending[path] = self._decoders.submit(self.read, path)
+        with self._lock:
+            for path in paths:
+                if self._images.get(path) is None:
+                    self._decoding(path)
 
     def get(self, path: Path) -> Image | Unreadable:
         """The image; waits until it is decoded."""
@@ -171,8 +158,7 @@ class ImageStore:
             known = self._images.get(path)
             if known is not None:
                 return known
-            pending = self._pending.get(path) or self._decoders.submit(self.read, path)
-            self._pending[path] = pending
+            pending = self._decoding(path)
         image = pending.result()
         with self._lock:
             if isinstance(image, Image):
@@ -183,3 +169,8 @@ class ImageStore:
 
     def close(self) -> None:
         self._decoders.shutdown(wait=False, cancel_futures=True)
+
+    def _decoding(self, path: Path) -> "Future[Image | Unreadable]":
+        if path not in self._pending:
+            self._pending[path] = self._decoders.submit(self.read, path)
+        return self._pending[path]

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from mkpc_kaggle.data.competition import Scene, TruePair, pair_id, read_submission, read_table
+from mkpc_kaggle.data.competition import TrainScene, TruePair, pair_id, read_rows, read_submission
 from mkpc_kaggle.engine.engine import RunReport
 from mkpc_kaggle.engine.records import PairRecord
 from mkpc_kaggle.engine.session import Session, run_pairs
@@ -24,7 +24,7 @@ from mkpc_kaggle.geometry.metrics import (
     pose_auc,
     pose_error,
 )
-from mkpc_kaggle.geometry.robust import Matrix3, Model
+from mkpc_kaggle.geometry.robust import Matrix3, ModelKind
 from mkpc_kaggle.pipeline.assembly import Assembly
 
 
@@ -108,7 +108,7 @@ class Validation:
         return [pair.record for scene in self.scenes for pair in scene.pairs if pair.record is not None]
 
 
-def validate(scenes: Sequence[Scene], assembly: Assembly, session: Session) -> tuple[Validation, bool]:
+def validate(scenes: Sequence[TrainScene], assembly: Assembly, session: Session) -> tuple[Validation, bool]:
     """Match all pairs of the scenes and score them; also whether every thread has stopped."""
     pairs = [true.pair for scene in scenes for true in scene.pairs]
     report, at_rest = run_pairs(pairs, assembly, session)
@@ -132,7 +132,7 @@ def steps_of(records: Sequence[PairRecord], *, prior: bool) -> tuple[Step, ...]:
     return (*steps, Step.SCENE) if any(one.scene is not None for one in records) else tuple(steps)
 
 
-def score_record(true: TruePair, record: PairRecord, scene: Scene, steps: Sequence[Step] = ()) -> PairScore:
+def score_record(true: TruePair, record: PairRecord, scene: TrainScene, steps: Sequence[Step] = ()) -> PairScore:
     """The score of a pair's record; the fallback row counts as a failure."""
     own = None if record.failure else record.F
     found = {
@@ -145,17 +145,17 @@ def score_record(true: TruePair, record: PairRecord, scene: Scene, steps: Sequen
     return PairScore(true.pair.id, true.covisibility, error, record, errors)
 
 
-def error_of(matrix: Matrix3 | None, true: TruePair, scene: Scene) -> PoseError:
+def error_of(matrix: Matrix3 | None, true: TruePair, scene: TrainScene) -> PoseError:
     """The error of a pair's F, or of its E if that is what was estimated; infinite where there is none."""
     if matrix is None:
         return PoseError.failed()
     cameras = true.camera0, true.camera1
-    if true.pair.model is Model.E:
+    if true.pair.model is ModelKind.E:
         cameras = true.camera0.calibrated, true.camera1.calibrated
     return pose_error(matrix, *cameras, scene.metres_per_unit)
 
 
-def score_submission(submission: Path, truth: Path, scenes: Sequence[Scene]) -> Validation:
+def score_submission(submission: Path, truth: Path, scenes: Sequence[TrainScene]) -> Validation:
     """Score a submission whose samples are known pairs of a train side.
 
     ``truth`` is a table ``sample_id,scene,image_1_id,image_2_id``, the images named as in the train side.
@@ -165,7 +165,7 @@ def score_submission(submission: Path, truth: Path, scenes: Sequence[Scene]) -> 
     found = read_submission(submission)
     columns = ("sample_id", "scene", "image_1_id", "image_2_id")
     known: dict[str, Matrix3] = {}  # F by the id that the pair has in the train side, in either order
-    for sample, scene, first, second in read_table(truth, columns)[list(columns)].itertuples(index=False):
+    for _, (sample, scene, first, second) in read_rows(truth, columns):
         if sample in found:
             known[pair_id(scene, first, second)] = found[sample]
             known[pair_id(scene, second, first)] = found[sample].T

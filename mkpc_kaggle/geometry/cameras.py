@@ -1,4 +1,4 @@
-"""Calibrated cameras, turned ones too, and the exact geometry of two of them."""
+"""Calibrated cameras and the exact geometry of two of them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -7,12 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from mkpc_kaggle.geometry.coordinates import Size
-from mkpc_kaggle.geometry.robust import Matrix3
+from mkpc_kaggle.geometry.coordinates import Matrix3, Size
 
+# A quarter turn of a picture, counter-clockwise: (x, y) goes to (y, -x), y being down.
 QUARTER: Matrix3 = np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])
-"""A quarter turn, counter-clockwise as one looks at the picture: (x, y) goes to (y, -x), y being down."""
 QUARTER.setflags(write=False)
+MIN_BASELINE = 1e-9  # below it, in units of the world, two cameras stand at the same point
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,17 +25,17 @@ class Camera:
 
     @property
     def calibrated(self) -> "Camera":
-        """The same camera with rays for pixels: the F of two such is the E of the two."""
+        """The same camera with K the identity: F of two such cameras is E of the two."""
         return replace(self, K=np.eye(3))
 
-    def turned(self, quarters: int, size: Size) -> "Camera":
-        """The camera that takes ``np.rot90(picture, quarters)``, where this one takes a picture of ``size``.
+    def rotated_90(self, times: int, size: Size) -> "Camera":
+        """The camera that takes ``np.rot90(picture, times)`` where this camera takes a picture of ``size``.
 
-        A quarter turn moves the pixel (x, y) to (y, width - 1 - x). The camera turns about its axis by as much,
-        so that K stays what K is, with its focal lengths and its centre changing places.
+        A quarter turn moves the pixel (x, y) to (y, width - 1 - x). The camera turns about its axis, so that in K
+        focal lengths and the centre's coordinates only change places.
         """
         camera, (width, height) = self, size
-        for _ in range(quarters % 4):
+        for _ in range(times % 4):
             moved = np.array([[1.0, 0, 0], [0, 1, width - 1], [0, 0, 1]]) @ QUARTER
             camera = Camera(moved @ camera.K @ QUARTER.T, QUARTER @ camera.R, QUARTER @ camera.t)
             width, height = height, width
@@ -49,39 +49,37 @@ def relative_pose(camera0: Camera, camera1: Camera) -> tuple[Matrix3, NDArray[np
 
 
 def fundamental_of_cameras(camera0: Camera, camera1: Camera) -> Matrix3:
-    """The true F with x1^T F x0 = 0 and unit Frobenius norm: K1^-T [t]_x R K0^-1.
+    """The true F, x1^T F x0 = 0, of unit Frobenius norm: K1^-T [t]_x R K0^-1.
 
-    Raises ``ValueError`` when the two cameras stand at the same point: there is no F then.
+    Raises ``ValueError`` when the two cameras stand at the same point: then F is not defined.
     """
     R, t = relative_pose(camera0, camera1)
-    if np.linalg.norm(t) < 1e-9 * max(1.0, float(np.linalg.norm(camera0.t))):
+    if np.linalg.norm(t) < MIN_BASELINE * max(1.0, float(np.linalg.norm(camera0.t))):
         raise ValueError("the two cameras have one centre: F is not defined")
     cross = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
     F = np.linalg.inv(camera1.K).T @ cross @ R @ np.linalg.inv(camera0.K)
     return np.asarray(F / np.linalg.norm(F))
 
 
-def mean_cameras(pairs: Sequence[tuple[Camera, Camera]], most_degrees: float) -> tuple[Camera, Camera]:
-    """Two cameras whose relative pose and focal lengths are the mean of what ``pairs`` say of the same two.
+def mean_cameras(pairs: Sequence[tuple[Camera, Camera]], max_degrees: float) -> tuple[Camera, Camera]:
+    """Two cameras whose relative pose and focal lengths are the mean of several answers for the same two cameras.
 
-    Each has a world of its own. A pair whose relative rotation is more than ``most_degrees`` from the first one's
-    is left out. The directions of translation are averaged as unit vectors, focal lengths geometrically; principal
-    points are the first pair's. Raises ``ValueError`` where a pair that is left has both cameras at one point.
+    Each answer has a world of its own. An answer whose relative rotation is more than ``max_degrees`` from that of
+    the first is left out. The directions of translation are averaged as unit vectors, focal lengths geometrically;
+    principal points are those of the first. Raises ``ValueError`` if the cameras of an answer have one centre.
     """
     poses = [relative_pose(*pair) for pair in pairs]
     rotations = Rotation.from_matrix(np.stack([R for R, _ in poses]))
-    near = np.degrees((rotations * rotations[0].inv()).magnitude()) <= most_degrees
-    directions = [_unit(t) for (_, t), kept in zip(poses, near, strict=True) if kept]
-    kept_pairs = [pair for pair, kept in zip(pairs, near, strict=True) if kept]
-    K0, K1 = (_mean_intrinsics([pair[side].K for pair in kept_pairs]) for side in (0, 1))
-    return Camera(K0, np.eye(3), np.zeros(3)), Camera(
-        K1, rotations[near].mean().as_matrix(), _unit(np.sum(directions, axis=0))
-    )
+    near = np.degrees((rotations * rotations[0].inv()).magnitude()) <= max_degrees
+    kept = np.flatnonzero(near).tolist()
+    direction = np.sum([_unit(poses[place][1]) for place in kept], axis=0)
+    K0, K1 = (_mean_intrinsics([pairs[place][side].K for place in kept]) for side in (0, 1))
+    return Camera(K0, np.eye(3), np.zeros(3)), Camera(K1, rotations[near].mean().as_matrix(), _unit(direction))
 
 
 def _unit(t: NDArray[np.float64]) -> NDArray[np.float64]:
     length = float(np.linalg.norm(t))
-    if length < 1e-9:
+    if length < MIN_BASELINE:
         raise ValueError("the two cameras have one centre")
     return t / length
 

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 Points = NDArray[np.float32]
 Pixels = NDArray[np.uint8]
+Matrix3 = NDArray[np.float64]  # (3, 3)
 
 
 class Size(NamedTuple):

@@ -2,50 +2,38 @@
 
 Each image is treated on its own: its matched points of stage 1, normalised by its width and height, are
 clustered; the big clusters are kept; their bounding box, scaled about its centre, is the critical region.
-Where that cannot be trusted the region is the whole image, with the reason.
+Where that cannot be trusted, the region is the whole image, with the reason.
 """
 
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mkpc_kaggle.config import AT_LEAST_1, POSITIVE, SHARE, check_ranges
+from mkpc_kaggle.config import AT_LEAST_1, POSITIVE, SHARE, Range, check_ranges
 from mkpc_kaggle.geometry.clustering import dbscan
 from mkpc_kaggle.geometry.coordinates import Box, Points, Size
 
 
-class Ratio(StrEnum):
-    """What a cluster's size is compared with."""
-
-    LARGEST = "largest"
-    """the largest cluster: Algorithm 1"""
-    LAST_KEPT = "last-kept"
-    """the cluster kept before it: a reading found in published code"""
-
-
 @dataclass(frozen=True)
 class MkpcConfig:
-    """Settings of :func:`critical_region`.
+    """Settings of :func:`critical_region`, table ``[mkpc]`` of a recipe."""
 
-    ``eps`` is in units of the image's width and height, ``share`` is Algorithm 1's T, ``min_clustered`` the
-    least share of points that must lie in clusters, ``min_side`` the least side of a crop in pixels.
-    ``expand_x`` and ``expand_y`` are the paper's e_h and e_v.
-    """
+    REMOVED: ClassVar = ("ratio",)
 
-    eps: float = 0.05
-    min_samples: int = 5
-    share: float = 0.05
-    ratio: Ratio = Ratio.LARGEST
-    expand_x: float = 1.05
-    expand_y: float = 1.0
-    min_clustered: float = 0.2
-    min_side: int = 32
+    eps: float = 0.05  # of DBSCAN, in units of the image's width and height
+    min_samples: int = 5  # of DBSCAN
+    share: float = 0.05  # Algorithm 1's T: a cluster that is kept has that share of the largest cluster's points
+    expand_x: float = 1.05  # the paper's e_h
+    expand_y: float = 1.0  # the paper's e_v
+    min_clustered: float = 0.2  # share of the points that must be in clusters
+    min_side: int = 32  # of a crop, in pixels
 
     def __post_init__(self) -> None:
-        check_ranges(self, eps=POSITIVE, min_samples=AT_LEAST_1, share=SHARE, expand_x=POSITIVE, expand_y=POSITIVE)
-        check_ranges(self, min_clustered=SHARE, min_side=AT_LEAST_1)
+        check_ranges(self, eps=Range(1e-6), min_samples=Range(1, 100), share=SHARE, min_clustered=SHARE)
+        check_ranges(self, expand_x=POSITIVE, expand_y=POSITIVE, min_side=AT_LEAST_1)
 
 
 class RegionReason(StrEnum):
@@ -115,31 +103,23 @@ def critical_region(points: Points, size: Size, config: MkpcConfig) -> CriticalR
 
 
 def find_clusters(points: Points, size: Size, config: MkpcConfig) -> Clusters:
-    """The clusters of an image's matched points, (N, 2) float32 in image pixels, and those that MKPC keeps."""
-    labels = cluster_points(points, size, config) if len(points) else np.zeros(0, np.intp)
-    sizes = np.bincount(labels[labels >= 0])
-    kept = keep_clusters(sizes, config.share, config.ratio) if len(sizes) else np.zeros(0, np.intp)
-    return Clusters(labels, sizes, kept)
+    """The clusters of an image's matched points, (N, 2) float32 in image pixels, and those that MKPC keeps.
 
-
-def cluster_points(points: Points, size: Size, config: MkpcConfig) -> NDArray[np.intp]:
-    """DBSCAN label of each point, (N,), -1 for noise; x is normalised by the width and y by the height."""
+    DBSCAN sees x over the image's width and y over its height.
+    """
     normalised = np.asarray(points, np.float64) / (size.width, size.height)
-    return dbscan(normalised, eps=config.eps, min_samples=config.min_samples)
+    labels = dbscan(normalised, eps=config.eps, min_samples=config.min_samples)
+    sizes = np.bincount(labels[labels >= 0])
+    return Clusters(labels, sizes, keep_clusters(sizes, config.share))
 
 
-def keep_clusters(sizes: NDArray[np.intp], share: float, ratio: Ratio = Ratio.LARGEST) -> NDArray[np.intp]:
+def keep_clusters(sizes: NDArray[np.intp], share: float) -> NDArray[np.intp]:
     """Labels of the clusters to keep, largest first; ``sizes`` is (K,), the number of points by label.
 
-    The largest is kept, then the next while its size is at least ``share`` of the largest (or of the last
-    kept); the first that fails ends it. Clusters of one size keep their label order.
+    These have at least ``share`` of the largest cluster's points. Clusters of equal size keep their label order.
     """
     by_size = np.argsort(-sizes, kind="stable")
-    ranked = sizes[by_size]
-    against = ranked[0] if ratio is Ratio.LARGEST else ranked[:-1]
-    fails = ranked[1:] / against < share
-    stop = 1 + int(np.argmax(fails)) if fails.any() else len(ranked)
-    kept: NDArray[np.intp] = by_size[:stop]
+    kept: NDArray[np.intp] = by_size[sizes[by_size] / sizes.max(initial=1) >= share]
     return kept
 
 

@@ -8,18 +8,13 @@ import numpy as np
 from scipy.integrate import trapezoid
 
 from mkpc_kaggle.geometry.cameras import Camera, relative_pose
-from mkpc_kaggle.geometry.coordinates import Box, Size
-from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.geometry.robust import Matrix3, poses_of_fundamental, sampson_distances
+from mkpc_kaggle.geometry.coordinates import Matrix3
+from mkpc_kaggle.geometry.robust import poses_of_fundamental
 
+# The competition's rules: the i-th threshold in degrees goes with the i-th in metres.
 ROTATION_THRESHOLDS = np.linspace(1, 10, 10)
-"""Degrees; the i-th goes with the i-th of :data:`TRANSLATION_THRESHOLDS` (competition rules)."""
 TRANSLATION_THRESHOLDS = np.geomspace(0.2, 5, 10)
-"""Metres."""
-AUC_THRESHOLDS = (5.0, 10.0, 20.0)
-"""Degrees."""
-GRID = 7
-"""Points in a row, a column and along a line, of :func:`epipolar_shift`."""
+AUC_THRESHOLDS = (5.0, 10.0, 20.0)  # degrees
 
 
 @dataclass(frozen=True)
@@ -67,35 +62,6 @@ def pose_error(F: Matrix3, camera0: Camera, camera1: Camera, metres_per_unit: fl
         translation_angle=float(np.degrees(np.arccos(min(cosine, 1.0)))),
         translation=apart * metres_per_unit,
     )
-
-
-def epipolar_shift(F: Matrix3, other: Matrix3, size0: Size, size1: Size) -> float:
-    """How far two F of a pair are from each other: the mean Sampson distance, in pixels, of points that agree with
-    one of them from the other; NaN where neither has such points.
-
-    After Zhang, Determining the epipolar geometry and its uncertainty, 1998, who draws the points at random; here
-    they are of a grid over an image, each with points along its line in the other.
-    """
-    ways = [(F, other, size0, size1), (F.T, other.T, size1, size0)]
-    ways += [(other, F, size0, size1), (other.T, F.T, size1, size0)]
-    distances = [sampson_distances(two, points_on_lines(one, here, there)) for one, two, here, there in ways]
-    found = np.concatenate(distances)
-    return float(found.mean()) if len(found) else float("nan")
-
-
-def points_on_lines(F: Matrix3, size0: Size, size1: Size) -> Matches:
-    """Points of a grid over image 0, each matched with the points along its epipolar line that image 1 has."""
-    (w0, h0), (w1, h1) = ((size.width - 1, size.height - 1) for size in (size0, size1))
-    grid = np.stack(np.meshgrid(np.linspace(0, w0, GRID), np.linspace(0, h0, GRID)), axis=-1).reshape(-1, 1, 2)
-    a, b, c = np.moveaxis(np.concatenate([grid, np.ones_like(grid[..., :1])], axis=-1) @ F.T, -1, 0)
-    x, y = np.linspace(0, w1, GRID), np.linspace(0, h1, GRID)
-    with np.errstate(divide="ignore", invalid="ignore"):  # at an epipole there is no line
-        across = np.stack(np.broadcast_arrays(x, -(a * x + c) / b), axis=-1)
-        along = np.stack(np.broadcast_arrays(-(b * y + c) / a, y), axis=-1)
-    on_line = np.where((np.abs(b) >= np.abs(a))[..., None], across, along).reshape(-1, 2)
-    inside = Box.whole(size1).contains(on_line)
-    points = np.column_stack([np.repeat(grid[:, 0], GRID, axis=0), on_line])[inside].astype(np.float32)
-    return Matches(points[:, :2], points[:, 2:], np.ones(len(points), np.float32))
 
 
 def rotation_angle(R: Matrix3) -> float:

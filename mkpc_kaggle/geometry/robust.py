@@ -4,25 +4,27 @@ An estimate is always a value: where no model is found, it has the reason and th
 finite and of the right rank, so that a submission is always complete.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import cast
+from typing import Any, ClassVar, NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mkpc_kaggle.config import AT_LEAST_1, POSITIVE, Range, check_ranges
+from mkpc_kaggle.config import POSITIVE, Range, check_ranges
+from mkpc_kaggle.geometry.coordinates import Matrix3 as Matrix3  # noqa: PLC0414  importers find it here
 from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.geometry.two_view import Vectors, robust_cost, sampson
 
-Matrix3 = NDArray[np.float64]
-
+# The F of a pure sideways motion, [e_x]_x: finite, rank 2; epipolar lines are the image rows.
 FALLBACK_FUNDAMENTAL: Matrix3 = np.array([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]])
-"""The F of a pure sideways motion, [e_x]_x: finite, rank 2; epipolar lines are the image rows."""
 FALLBACK_FUNDAMENTAL.setflags(write=False)
+NEEDS_INTRINSICS = "an essential matrix needs the intrinsics, the camera matrix K of both images"
 
 
-class Model(StrEnum):
+class ModelKind(StrEnum):
     """The two-view model to estimate: fundamental matrix, essential matrix, homography."""
 
     F = "F"
@@ -30,13 +32,9 @@ class Model(StrEnum):
     H = "H"
 
     @property
-    def least_matches(self) -> int:
-        """How many distinct matches an estimate needs here (one more than the minimal F, to tell a model)."""
-        return {Model.F: 8, Model.E: 6, Model.H: 5}[self]
-
-    @property
-    def fallback(self) -> Matrix3:
-        return np.eye(3) if self is Model.H else FALLBACK_FUNDAMENTAL.copy()
+    def min_matches(self) -> int:
+        """How many distinct matches an estimate needs here (more than the minimal F, to tell a model)."""
+        return _SOLVERS[self].min_matches
 
 
 class Method(StrEnum):
@@ -52,54 +50,40 @@ class Method(StrEnum):
 
 @dataclass(frozen=True)
 class RobustConfig:
-    """Settings of :func:`estimate`: the threshold in image pixels, the confidence, the iteration limit.
+    """Settings of :func:`estimate`, table ``[magsac]`` of a recipe.
 
-    The estimator stops by chance before it has found the best model, and where depends on the order of the
-    matches: it is run on ``orders`` fixed permutations of them, and the model of the lowest :func:`robust_cost`
-    at twice the threshold is kept.
+    The estimator stops by chance before it has found the best model; where depends on the order of the matches. So
+    it runs on several permutations, and the model of the lowest robust cost at twice the threshold is kept.
     """
 
+    RENAMED: ClassVar = {"orders": "permutations"}
+
     method: Method = Method.MAGSAC
-    threshold: float = 0.2
+    threshold: float = 0.2  # image pixels
     confidence: float = 0.99999
     max_iterations: int = 50_000
-    orders: int = 8
+    permutations: int = 8  # fixed; the first is the matches' own order
 
     def __post_init__(self) -> None:
-        check_ranges(self, threshold=POSITIVE, confidence=Range(0, 1, "()"), max_iterations=Range(1, 2**31 - 1))
-        check_ranges(self, orders=AT_LEAST_1)
-
-
-class Origin(StrEnum):
-    """Which candidate an estimate comes from."""
-
-    MAGSAC = "MAGSAC"
-    """the robust estimator's model as it is"""
-    FROM_F = "F, refined"
-    """MAGSAC's F, refined under the prior on the focal lengths"""
-    FROM_E = "E, refined"
-    """MAGSAC's E at the prior's focal lengths, or at the known ones, refined"""
+        check_ranges(self, threshold=POSITIVE, confidence=Range(0, 1, "()"), max_iterations=Range(1, 10**6))
+        check_ranges(self, permutations=Range(1, 100))
 
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """A two-view model of one pair.
+    """A two-view model of a pair.
 
     ``matrix`` is (3, 3) float64, finite, of unit Frobenius norm; for F, x1^T F x0 = 0 in homogeneous image
     pixels. ``inliers`` is an (N,) mask over the matches that were given: those nearer than the threshold.
-    ``failure`` is empty, or says why ``matrix`` is only the fallback. ``focals`` are the focal lengths in pixels
-    that it stands for, ``None`` without a prior; ``magsac`` is the (3, 3) F that MAGSAC alone gives,
-    ``None`` without a prior and where it gives none; ``remark`` is a warning about it, or empty.
+    ``failure`` is empty, or says why ``matrix`` is only the fallback. ``magsac`` is the (3, 3) F of MAGSAC alone,
+    ``None`` without a prior on focal lengths and where MAGSAC finds none.
     """
 
-    model: Model
+    model: ModelKind
     matrix: Matrix3
     inliers: NDArray[np.bool_]
     failure: str = ""
-    origin: Origin = Origin.MAGSAC
-    focals: tuple[float, float] | None = None
     magsac: Matrix3 | None = None
-    remark: str = ""
 
     @property
     def ok(self) -> bool:
@@ -110,55 +94,54 @@ class Estimate:
         return int(self.inliers.sum())
 
     @classmethod
-    def failed(cls, model: Model, count: int, reason: str) -> "Estimate":
+    def failed(cls, model: ModelKind, count: int, reason: str) -> "Estimate":
         """The fallback for ``count`` matches, with the reason."""
-        matrix = model.fallback
-        return cls(model, matrix / np.linalg.norm(matrix), np.zeros(count, bool), reason)
+        return cls(model, unit_norm(_SOLVERS[model].fallback), np.zeros(count, bool), reason)
 
 
 def estimate(
     matches: Matches,
     config: RobustConfig,
-    model: Model = Model.F,
+    model: ModelKind = ModelKind.F,
     intrinsics: tuple[Matrix3, Matrix3] | None = None,
 ) -> Estimate:
-    """The model of ``model``'s kind that ``matches`` (image pixels) agree on.
+    """The model of that kind that ``matches`` (image pixels) agree on.
 
     Non-finite points and exact duplicates are left out first; an inlier's duplicates are inliers too. E
     needs the two camera matrices, (3, 3) each: the points are then calibrated and the threshold is divided
     by the mean focal length. Raises ``ValueError`` for E without intrinsics, and never on account of the
     points. The same input gives the same bytes.
     """
-    if model is Model.E and intrinsics is None:
-        raise ValueError("an essential matrix needs the intrinsics of both cameras")
+    if model is ModelKind.E and intrinsics is None:
+        raise ValueError(NEEDS_INTRINSICS)
     distinct = DistinctMatches.of(matches)
     found = consensus(distinct.points0, distinct.points1, config, model, intrinsics)
     return replace(found, inliers=distinct.mask_of_all(found.inliers))
 
 
 def consensus(
-    points0: NDArray[np.float64],
-    points1: NDArray[np.float64],
+    points0: Vectors,
+    points1: Vectors,
     config: RobustConfig,
-    model: Model,
+    model: ModelKind,
     intrinsics: tuple[Matrix3, Matrix3] | None = None,
 ) -> Estimate:
     """:func:`estimate` for (N, 2) finite points without duplicates."""
     count, threshold = len(points0), config.threshold
-    if count < model.least_matches:
+    if count < model.min_matches:
         return Estimate.failed(model, count, f"too few distinct matches for {model}: {count}")
-    if intrinsics is not None and model is Model.E:
+    if intrinsics is not None and model is ModelKind.E:
         points0, points1 = calibrate(points0, intrinsics[0]), calibrate(points1, intrinsics[1])
         threshold /= float(np.mean([K[axis, axis] for K in intrinsics for axis in (0, 1)]))
     try:
-        matrix, mask = _best_of_orders(model, points0, points1, threshold, config)
+        matrix, mask = _best_of_permutations(_SOLVERS[model], points0, points1, threshold, config)
     except cv2.error as error:
         return Estimate.failed(model, count, f"OpenCV refused the points: {error.err}")
     if matrix is None:
         return Estimate.failed(model, count, f"no {model} fits {count} distinct matches")
     if not mask.any():
         return Estimate.failed(model, count, f"no {model} has inliers among {count} distinct matches")
-    return Estimate(model, matrix / np.linalg.norm(matrix), mask)
+    return Estimate(model, unit_norm(matrix), mask)
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,8 +151,8 @@ class DistinctMatches:
     ``finite`` are the indices of the finite matches, ``place`` the row in ``points0`` and ``points1`` of each.
     """
 
-    points0: NDArray[np.float64]
-    points1: NDArray[np.float64]
+    points0: Vectors
+    points1: Vectors
     count: int
     finite: NDArray[np.intp]
     place: NDArray[np.intp]
@@ -186,20 +169,24 @@ class DistinctMatches:
         return cls(pairs[:, :2], pairs[:, 2:], len(matches), finite, place[inverse.ravel()])
 
     def mask_of_all(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """An (M,) mask of the distinct matches as an (N,) one of all: duplicates are like the first."""
+        """An (M,) mask of the distinct matches as an (N,) mask of all: duplicates are like the first."""
         whole = np.zeros(self.count, bool)
         whole[self.finite] = mask[self.place]
         return whole
 
 
-def calibrate(points: NDArray[np.float64], K: Matrix3) -> NDArray[np.float64]:
+def unit_norm(matrix: Matrix3) -> Matrix3:
+    return np.asarray(matrix / np.linalg.norm(matrix))
+
+
+def calibrate(points: Vectors, K: Matrix3) -> Vectors:
     """(N, 2) pixels -> (N, 2) coordinates in the plane z = 1 of the camera with matrix K."""
-    homogeneous = np.column_stack([points, np.ones(len(points))]) @ np.linalg.inv(K).T
+    homogeneous = _homogeneous(points) @ np.linalg.inv(K).T
     return np.asarray(homogeneous[:, :2] / homogeneous[:, 2:])
 
 
-def poses_of_fundamental(F: Matrix3, K0: Matrix3, K1: Matrix3) -> tuple[tuple[Matrix3, Matrix3], Matrix3]:
-    """The two rotations, and the translation of unit length and unknown sign, that an F stands for.
+def poses_of_fundamental(F: Matrix3, K0: Matrix3, K1: Matrix3) -> tuple[tuple[Matrix3, Matrix3], Vectors]:
+    """The two rotations, and the translation (3,) of unit length and unknown sign, that an F stands for.
 
     X_1 = R X_0 + t takes camera 0 to camera 1. Which rotation and sign hold, only points in front of both
     cameras can tell. Source: Hartley and Zisserman, Multiple View Geometry, 9.6.2.
@@ -209,90 +196,80 @@ def poses_of_fundamental(F: Matrix3, K0: Matrix3, K1: Matrix3) -> tuple[tuple[Ma
     return rotations, np.asarray(translation, np.float64).ravel()
 
 
-def sampson_distances(F: Matrix3, matches: Matches) -> NDArray[np.float64]:
+def sampson_distances(F: Matrix3, matches: Matches) -> Vectors:
     """(N,) Sampson distance in pixels; OpenCV's inliers of an F have it below the threshold.
 
     Source: Hartley and Zisserman, Multiple View Geometry, 11.4.3.
     """
-    return _distances(Model.F, F, matches.points0.astype(np.float64), matches.points1.astype(np.float64))
+    return _epipolar_distances(F, matches.points0.astype(np.float64), matches.points1.astype(np.float64))
 
 
-def robust_cost(distances: NDArray[np.float64], scale: float) -> float:
-    """The sum of :func:`robust_costs`."""
-    return float(np.sum(robust_costs(distances, scale)))
-
-
-def robust_costs(distances: NDArray[np.float64], scale: float) -> NDArray[np.float64]:
-    """x^2 / (2 (1 + x^2)), x = distance / scale: Geman and McClure, 1985. An outlier costs a half."""
-    return np.asarray(0.5 - 0.5 / (1 + np.square(distances / scale)))
-
-
-def _distances(
-    model: Model, matrix: Matrix3, points0: NDArray[np.float64], points1: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """(N,) Sampson distances to an F or E; distances in the second image to where an H takes the points."""
-    homogeneous0, homogeneous1 = (np.column_stack([points, np.ones(len(points))]) for points in (points0, points1))
-    mapped = homogeneous0 @ matrix.T
-    tiny = np.finfo(np.float64).tiny
-    if model is Model.H:
-        depth = np.where(np.abs(mapped[:, 2:]) > tiny, mapped[:, 2:], tiny)
-        return np.asarray(np.hypot(*(mapped[:, :2] / depth - points1).T))
-    lines0 = homogeneous1 @ matrix
-    residual = np.abs(np.sum(homogeneous1 * mapped, axis=1))
-    slope = np.hypot(np.hypot(*lines0[:, :2].T), np.hypot(*mapped[:, :2].T))
-    return np.asarray(residual / np.maximum(slope, tiny))
-
-
-def nth_order(number: int, count: int) -> NDArray[np.intp]:
-    """A fixed permutation of ``count`` matches; number 0 is the order in which they are."""
+def permutation(number: int, count: int) -> NDArray[np.intp]:
+    """A fixed permutation of ``count`` matches; number 0 is their own order."""
     return np.random.default_rng(number).permutation(count) if number else np.arange(count)
 
 
-def _best_of_orders(
-    model: Model,
-    points0: NDArray[np.float64],
-    points1: NDArray[np.float64],
-    threshold: float,
-    config: RobustConfig,
+def _best_of_permutations(
+    solver: "_Solver", points0: Vectors, points1: Vectors, threshold: float, config: RobustConfig
 ) -> tuple[Matrix3 | None, NDArray[np.bool_]]:
-    """The model of the lowest robust cost over fixed permutations, the given order first, and its mask (N,).
+    """The model of the lowest robust cost over fixed permutations, and its mask (N,).
 
-    Not the one with most inliers: MAGSAC's score depends on distances up to several times the threshold.
-    OpenCV sometimes rejects points in one order and not in another; its error is raised if no order gave a model.
+    Most inliers do not decide: MAGSAC's score depends on distances up to several times the threshold. OpenCV
+    sometimes rejects points in one order and not in another; its error is raised if no order gave a model.
     """
-    best, best_mask, least, refusal = None, np.zeros(len(points0), bool), np.inf, None
-    for number in range(config.orders):
-        order = nth_order(number, len(points0))
+    settings = {"method": config.method.flag, "confidence": config.confidence, "maxIters": config.max_iterations}
+    best, best_mask, lowest, refusal = None, np.zeros(len(points0), bool), np.inf, None
+    for number in range(config.permutations):
+        order = permutation(number, len(points0))
         try:
-            matrix, mask = _solve(model, points0[order], points1[order], threshold, config)
+            matrix, mask = solver.find(points0[order], points1[order], ransacReprojThreshold=threshold, **settings)
         except cv2.error as error:
             refusal = error
             continue
         if matrix is None or matrix.shape != (3, 3) or not np.isfinite(matrix).all() or not matrix.any():
             continue
         with np.errstate(over="ignore", invalid="ignore"):  # points may be anything
-            cost = robust_cost(_distances(model, matrix, points0, points1), 2 * threshold)
-        if best is None or cost < least:
-            best, best_mask[order], least = matrix, mask.ravel().astype(bool), cost
+            cost = robust_cost(solver.distances(matrix, points0, points1), 2 * threshold)
+        if best is None or cost < lowest:
+            best, best_mask[order], lowest = matrix, mask.ravel().astype(bool), cost
     if best is None and refusal is not None:
         raise refusal
     return best, best_mask
 
 
-def _solve(
-    model: Model,
-    points0: NDArray[np.float64],
-    points1: NDArray[np.float64],
-    threshold: float,
-    config: RobustConfig,
-) -> tuple[Matrix3 | None, NDArray[np.uint8]]:
-    flag, confidence, limit = config.method.flag, config.confidence, config.max_iterations
-    match model:
-        case Model.F:
-            answer = cv2.findFundamentalMat(points0, points1, flag, threshold, confidence, limit)
-        case Model.E:
-            answer = cv2.findEssentialMat(points0, points1, np.eye(3), flag, confidence, threshold, limit)
-        case Model.H:
-            answer = cv2.findHomography(points0, points1, flag, threshold, maxIters=limit, confidence=confidence)
-    # OpenCV's stubs promise arrays; without a model they are None.
-    return cast(tuple[Matrix3 | None, NDArray[np.uint8]], answer)
+def _homogeneous(points: Vectors) -> Vectors:
+    return np.column_stack([points, np.ones(len(points))])
+
+
+def _epipolar_distances(matrix: Matrix3, points0: Vectors, points1: Vectors) -> Vectors:
+    """(N,) Sampson distances to an F or E."""
+    return np.abs(sampson(matrix, _homogeneous(points0), _homogeneous(points1)))
+
+
+def _transfer_distances(matrix: Matrix3, points0: Vectors, points1: Vectors) -> Vectors:
+    """(N,) distances in the second image to where an H takes the points of the first."""
+    mapped = _homogeneous(points0) @ matrix.T
+    tiny = np.finfo(np.float64).tiny
+    depth = np.where(np.abs(mapped[:, 2:]) > tiny, mapped[:, 2:], tiny)
+    return np.asarray(np.hypot(*(mapped[:, :2] / depth - points1).T))
+
+
+class _Solver(NamedTuple):
+    """What a kind of model needs. ``find`` gives OpenCV's matrix and mask, ``None`` where no model is found."""
+
+    min_matches: int
+    fallback: Matrix3
+    find: Callable[..., Any]
+    distances: Callable[[Matrix3, Vectors, Vectors], Vectors]
+
+
+def _find_essential(points0: Vectors, points1: Vectors, confidence: float, **settings: Any) -> Any:
+    settings["threshold"] = settings.pop("ransacReprojThreshold")
+    return cv2.findEssentialMat(points0, points1, np.eye(3), prob=confidence, **settings)
+
+
+_SOLVERS = {
+    ModelKind.F: _Solver(8, FALLBACK_FUNDAMENTAL, cv2.findFundamentalMat, _epipolar_distances),
+    ModelKind.E: _Solver(6, FALLBACK_FUNDAMENTAL, _find_essential, _epipolar_distances),
+    ModelKind.H: _Solver(5, np.eye(3), cv2.findHomography, _transfer_distances),
+}

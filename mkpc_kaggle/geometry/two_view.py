@@ -16,20 +16,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mkpc_kaggle.geometry.robust import Matrix3, robust_cost
+from mkpc_kaggle.geometry.coordinates import Matrix3
 
 Vectors = NDArray[np.float64]
 
-MOST_STEPS = 10
-"""Of Levenberg-Marquardt at one scale."""
-LEAST_GAIN = 1e-3
-"""A step that lowers the cost by less is the last one; a match costs up to a half."""
-LEAST_DAMPING, FIRST_DAMPING, MOST_DAMPING = 1e-9, 1e-3, 1e6
-FOCAL_BOUND = 2.0
-"""The largest |log f / g|: a factor of 7.4 in either direction."""
+MAX_STEPS = 10  # of Levenberg-Marquardt at one scale
+MIN_GAIN = 1e-3  # a step that lowers the cost by less is the last; a match costs up to a half
+MIN_DAMPING, FIRST_DAMPING, MAX_DAMPING = 1e-9, 1e-3, 1e6
+MAX_LOG_FOCAL = 2.0  # |log f / g|: a factor of 7.4 in either direction
 TINY = float(np.finfo(np.float64).tiny)
-CROSS: NDArray[np.float64] = np.swapaxes(np.cross(np.eye(3)[:, None], np.eye(3)), 1, 2)
-"""(3, 3, 3): [e_k]x for the three axes."""
+CROSS: NDArray[np.float64] = np.swapaxes(np.cross(np.eye(3)[:, None], np.eye(3)), 1, 2)  # [e_k]x of three axes
 CROSS.setflags(write=False)
 
 
@@ -45,8 +41,8 @@ class TwoView:
     def nearest(cls, F: Matrix3, log0: float = 0.0, log1: float = 0.0) -> "TwoView":
         """The views of these focal lengths whose E is nearest to the one that F gives with them.
 
-        One of two rotations and two signs of t; all four stand for one F. Raises ``LinAlgError`` for what is
-        not finite.
+        This is one of two rotations and two signs of t; all four stand for the same F. Raises ``LinAlgError`` for
+        an F that is not finite.
         """
         U, _, Vt = np.linalg.svd(F / _focal_factors(np.array([log0, log1])))
         quarter = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, np.linalg.det(U) * np.linalg.det(Vt)]])
@@ -62,10 +58,10 @@ class TwoView:
         return TwoView((2 * np.outer(self.t, self.t) - np.eye(3)) @ self.R, self.t, self.logs)
 
     def depth_signs(self, rays0: Vectors, rays1: Vectors, error: float) -> NDArray[np.float64]:
-        """(N,) 1 for a match whose point is in front of both cameras, -1 behind both, 0 in front of one alone.
+        """(N,) 1 for a match whose point is in front of both cameras, -1 behind both, 0 in front of only one.
 
-        The point is where X_1 = R X_0 + t holds best. With -t every sign is the other. NaN for a match whose rays
-        are parallel but for an ``error`` in pixels: its point may be at infinity.
+        The point is where X_1 = R X_0 + t holds best. With -t the signs are opposite. NaN for a match whose rays
+        are parallel within ``error`` pixels: its point may be at infinity.
         """
         ratio0, ratio1 = np.exp(self.logs)
         a, b = (rays0 * (1, 1, ratio0)) @ self.R.T, rays1 * (1, 1, ratio1)
@@ -122,28 +118,21 @@ class Problem:
     def fit(self, start: TwoView, scale: float) -> TwoView:
         """A local minimum of :meth:`cost` near ``start``, by Levenberg-Marquardt on the reweighted squares."""
         view, cost, damping = start, self.cost(start, scale), FIRST_DAMPING
-        for _ in range(MOST_STEPS):
+        for _ in range(MAX_STEPS):
             gradient, curvature = self._derivatives(view, scale)
-            while damping < MOST_DAMPING:
+            while damping < MAX_DAMPING:
                 moved = view.moved(self._step(gradient, curvature, damping))
-                moved_cost = self.cost(moved, scale) if np.abs(moved.logs).max() < FOCAL_BOUND else np.inf
+                moved_cost = self.cost(moved, scale) if np.abs(moved.logs).max() < MAX_LOG_FOCAL else np.inf
                 if moved_cost < cost:
                     break
                 damping *= 10
             else:
                 break
             gain, view, cost = cost - moved_cost, moved, moved_cost
-            damping = max(damping / 10, LEAST_DAMPING)
-            if gain < LEAST_GAIN:
+            damping = max(damping / 10, MIN_DAMPING)
+            if gain < MIN_GAIN:
                 break
         return view
-
-    def direction_error(self, view: TwoView, scale: float) -> float:
-        """The standard deviation of t's direction at a minimum, in radians, where it is largest."""
-        free = self._free
-        curvature = self._derivatives(view, scale)[1][np.ix_(free, free)]
-        covariance = np.linalg.pinv(curvature, hermitian=True)[3:5, 3:5]
-        return float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
 
     @property
     def _free(self) -> NDArray[np.bool_]:
@@ -157,7 +146,7 @@ class Problem:
     def _step(self, gradient: Vectors, curvature: NDArray[np.float64], damping: float) -> Vectors:
         """The damped step (7,); NaN for a singular system, so that it is rejected."""
         free = self._free
-        step, damped = np.zeros(7), curvature + damping * np.diag(np.diag(curvature) + LEAST_DAMPING)
+        step, damped = np.zeros(7), curvature + damping * np.diag(np.diag(curvature) + MIN_DAMPING)
         try:
             step[free] = -np.linalg.solve(damped[np.ix_(free, free)], gradient[free])
         except np.linalg.LinAlgError:
@@ -182,8 +171,18 @@ class Problem:
         return gradient, curvature
 
 
+def robust_cost(distances: Vectors, scale: float) -> float:
+    """The sum of :func:`robust_costs`."""
+    return float(np.sum(robust_costs(distances, scale)))
+
+
+def robust_costs(distances: Vectors, scale: float) -> Vectors:
+    """x^2 / (2 (1 + x^2)), x = distance / scale: Geman and McClure, 1985. An outlier costs a half."""
+    return np.asarray(0.5 - 0.5 / (1 + np.square(distances / scale)))
+
+
 def sampson(F: Matrix3, rays0: Vectors, rays1: Vectors) -> Vectors:
-    """(N,) Sampson distance of (N, 3) rays to an F that is meant for them, with its sign, in pixels."""
+    """(N,) signed Sampson distances, in pixels, of (N, 3) rays to an F for rays."""
     _, lines1, slope = _lines(F, rays0, rays1)
     return np.asarray(_row_dots(rays1, lines1) / slope)
 

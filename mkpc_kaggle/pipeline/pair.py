@@ -10,12 +10,12 @@ from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.critical_region import CriticalRegion
 from mkpc_kaggle.geometry.focal_prior import FocalPrior, estimate_with_prior
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.geometry.robust import Estimate, Matrix3, Model, estimate
+from mkpc_kaggle.geometry.robust import Estimate, Matrix3, ModelKind, estimate
 from mkpc_kaggle.recipe import Recipe, Unit
 
 Regions = tuple[CriticalRegion, CriticalRegion]
 
-NOT_ESTIMATED = Estimate.failed(Model.F, 0, "not estimated yet")
+NOT_ESTIMATED = Estimate.failed(ModelKind.F, 0, "not estimated yet")
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +83,7 @@ class PairMatch:
 def with_estimate(
     pair: PairMatch,
     recipe: Recipe,
-    model: Model = Model.F,
+    model: ModelKind = ModelKind.F,
     intrinsics: tuple[Matrix3, Matrix3] | None = None,
 ) -> PairMatch:
     """The pair with its two-view model from all matches, in the recipe's order: MAGSAC's result depends on it.
@@ -93,7 +93,7 @@ def with_estimate(
     order = {unit: number for number, unit in enumerate(recipe.units)}
     results = tuple(sorted(pair.results, key=lambda result: order[result.unit]))
     matches = Matches.concatenate(result.matches for result in results)
-    if recipe.focal is None or model is Model.H:
+    if recipe.focal is None or model is ModelKind.H:
         found = estimate(matches, recipe.magsac, model, intrinsics)
     else:
         sizes = pair.sizes or tuple(image.size for image in pair.images)

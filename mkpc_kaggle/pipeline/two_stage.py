@@ -9,7 +9,7 @@ import numpy as np
 from mkpc_kaggle.data.images import Image, Unreadable, read_image
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Pixels
-from mkpc_kaggle.geometry.robust import Matrix3, Model
+from mkpc_kaggle.geometry.robust import Matrix3, ModelKind
 from mkpc_kaggle.matchers.contract import Matcher
 from mkpc_kaggle.pipeline.assembly import assemble
 from mkpc_kaggle.pipeline.obstacles import Licence
@@ -55,7 +55,7 @@ class TwoStageMatcher:
         image0: str | Path | Pixels | Image,
         image1: str | Path | Pixels | Image,
         *,
-        model: Model | str = Model.F,
+        model: ModelKind | str = ModelKind.F,
         intrinsics: tuple[Matrix3, Matrix3] | None = None,
     ) -> PairMatch:
         """Match two images: paths, or arrays (H, W, 3) RGB or (H, W) gray, uint8.
@@ -66,7 +66,7 @@ class TwoStageMatcher:
         """
         pair = PairMatch(images=(to_image(image0), to_image(image1)))
         (pair,) = self._pipeline.match([pair], self.recipe.units)
-        return with_estimate(pair, self.recipe, Model(model), intrinsics)
+        return with_estimate(pair, self.recipe, ModelKind(model), intrinsics)
 
 
 def to_image(source: str | Path | Pixels | Image) -> Image:

@@ -7,8 +7,9 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from mkpc_kaggle.data.competition import Pair, replacing
+from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.data.images import printable
+from mkpc_kaggle.data.outputs import replacing
 from mkpc_kaggle.engine.budget import format_duration
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.reporting.run_log import RunLog, read_log

@@ -9,8 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from importlib.util import find_spec
-from math import inf, isfinite
-from pathlib import Path
+from math import inf
 from statistics import median
 from typing import TYPE_CHECKING, TypeVar
 
@@ -22,10 +21,8 @@ from mkpc_kaggle.data.images import Unreadable, read_image
 from mkpc_kaggle.engine.budget import format_duration
 from mkpc_kaggle.engine.journal_tables import EventKind
 from mkpc_kaggle.engine.records import SceneRecord
-from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.geometry.metrics import epipolar_shift
-from mkpc_kaggle.geometry.robust import Estimate, Model, sampson_distances
+from mkpc_kaggle.geometry.robust import Estimate, ModelKind, sampson_distances
 from mkpc_kaggle.pipeline.pair import PairMatch
 from mkpc_kaggle.pipeline.two_stage import to_image
 from mkpc_kaggle.reporting import figures
@@ -235,38 +232,11 @@ def _scenes(log: RunLog, artist: Artist) -> Iterator[Block]:
     yield Table(("which F a pair has, and why", "pairs"), list(reasons.most_common()))
     alone = sum(record.source == "scene" and bool(record.failure) for record in log.records)
     yield Text(f"{alone} pairs would have no F without their scene.")
-    yield from _shifts(log)
 
 
 def _focals(scene: SceneRecord) -> str:
     focals = [camera.focal for camera in scene.cameras]
     return f"{min(focals):.0f} / {median(focals):.0f} / {max(focals):.0f}" if focals else "-"
-
-
-def _shifts(log: RunLog) -> Iterator[Block]:
-    """The pairs whose F the scene changed, and by how much."""
-    sizes = {
-        (scene.batch, Path(camera.image).name): Size(*camera.size)
-        for scene in log.scenes
-        for camera in scene.cameras
-    }
-    moved = []
-    for record in log.records:
-        pair = log.pairs[record.index]
-        size0, size1 = (sizes.get((pair.group, image.name)) for image in pair.images)
-        if record.source == "scene" and not record.failure and size0 and size1:
-            shift = epipolar_shift(record.F, record.fundamental, size0, size1)
-            moved.append((pair.id, record.matches, record.inliers, shift))
-    moved = sorted((row for row in moved if isfinite(row[3])), key=lambda row: -row[3])
-    if not moved:
-        return
-    low, middle, high = np.percentile([shift for *_, shift in moved], (10, 50, 90))
-    yield Text(
-        f"The scene moved the epipolar lines of {len(moved)} pairs by {middle:.1f} pixels in the median "
-        f"(a tenth by less than {low:.1f}, a tenth by more than {high:.1f}). The most:"
-    )
-    rows = [(*rest, f"{shift:.1f}") for *rest, shift in moved[: 2 * MOST_CHANGES]]
-    yield Table(("pair", "matches", "own inliers", "moved (px)"), rows)
 
 
 def _weakest(log: RunLog, artist: Artist) -> Iterator[Block]:
@@ -332,7 +302,7 @@ def match_of(weak: WeakPair, threshold: float) -> PairMatch:
     inliers = sampson_distances(record.F, matches) < threshold
     if record.failure:
         inliers = np.zeros(len(matches), bool)
-    return PairMatch(weak.results, record.regions, Estimate(Model.F, record.F, inliers, record.failure))
+    return PairMatch(weak.results, record.regions, Estimate(ModelKind.F, record.F, inliers, record.failure))
 
 
 def _failures(log: RunLog) -> Iterator[Block]:

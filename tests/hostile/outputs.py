@@ -61,6 +61,22 @@ THERE: dict[str, Callable[[Path], object]] = {
     "a pipe for the report": lambda path: os.mkfifo(path.with_suffix(".html")),
     "a directory for the report ": lambda path: path.with_suffix(".html").mkdir(),
 }
+WEIGHTS = (b"\x08\x00\x00\x00\x00\x00\x00\x00{}      ", "W/w.safetensors")  # a file without tensors
+OVER = {
+    "a weight file": "submit --test-dir D --recipe quick.toml --weights W --output W/w.safetensors",
+    "a drawing in an image's place": "match D/test_images/b1/x.png quick.toml --out D/test_images/b1/x.png",
+    "an export in the table's place": "journal out/s.work --json D/test.csv",
+    "a page in an image's place": "journal out/s.work --report D/test_images/b1/x.png",
+    "a conversion in its source's place": "weights convert W/w.safetensors --out W/w.safetensors",
+}
+
+
+def weights(room: Path) -> None:
+    data, name = WEIGHTS
+    (room / "W").mkdir()
+    (room / name).write_bytes(data)
+
+
 PLAIN = SUBMIT.replace("--output out/s.csv --no-report ", "")
 
 
@@ -78,6 +94,7 @@ CASES = [
         Case("outputs", f"there is {name}", f"{PLAIN} --output out/s.csv", placed(make), (0, 1, 2))
         for name, make in THERE.items()
     ),
+    *(Case("outputs", name, command, weights, REFUSED, "name another") for name, command in OVER.items()),
     Case(
         "outputs",
         "text that the terminal has not",

@@ -98,6 +98,15 @@ DIRECTORIES = {
 }
 
 CASES = [
+    Case(
+        "tables",
+        "a batch that the file system's encoding lacks",
+        SUBMIT,
+        written((HEADER + "1,\u00e9,x,y\n2,b1,x,y\n").encode()),
+        EITHER,
+        says="1 of 2 pairs",
+        env={"LC_ALL": "C", "PYTHONUTF8": "0"},
+    ),
     *(Case("tables", name, SUBMIT, written(data), REFUSED) for name, data in REFUSALS.items()),
     *(Case("tables", name, SUBMIT, written(data), EITHER) for name, data in EITHERS.items()),
     *(Case("tables", name, SUBMIT, in_place(make), REFUSED) for name, make in PLACES.items()),

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mkpc_kaggle.data.competition import Scene, TruePair
+from mkpc_kaggle.data.competition import TrainScene, TruePair
 from mkpc_kaggle.geometry.cameras import Camera, relative_pose
 
 
@@ -21,7 +21,7 @@ def line_of_pair(true: TruePair, image_root: Path) -> str:
     return line_of((image0, image1), (true.camera0, true.camera1))
 
 
-def write_list(path: Path, scenes: Iterable[Scene], image_root: Path) -> Path:
+def write_list(path: Path, scenes: Iterable[TrainScene], image_root: Path) -> Path:
     lines = [line_of_pair(true, image_root) for scene in scenes for true in scene.pairs]
     path.write_text("\n".join(lines) + "\n")
     return path

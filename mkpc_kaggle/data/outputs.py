@@ -1,0 +1,99 @@
+"""Files that a command writes: an input is never overwritten, and a file is replaced only by a whole one."""
+
+import os
+import re
+import secrets
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import TextIO
+
+from mkpc_kaggle.errors import UserError
+
+# Suffixes by the option that writes the file: an existing file of another suffix is not an earlier result.
+RESULTS = {"--json": (".json",), "--report": (".html", ".htm")}
+NO_WEIGHTS = (
+    ".csv",
+    ".html",
+    ".json",
+    ".jpg",
+    ".pdf",
+    ".png",
+    ".svg",
+)  # in a directory of weights, not weights
+
+_parts: set[Path] = set()  # files that this process is writing
+
+
+def require_no_input(
+    outputs: Mapping[str, Path | None], inputs: Iterable[Path], weights: Iterable[Path] = ()
+) -> None:
+    """Refuse to overwrite an existing file that is an input; a new file is fine, wherever it is.
+
+    ``outputs`` are files to write, by option. In a directory among ``inputs`` all files are inputs, except the
+    results of an earlier run; in directories of ``weights``, all files except tables, pages and pictures. Raises
+    :class:`UserError`.
+    """
+    inputs, weights = list(inputs), list(weights)
+    for option, path in outputs.items():
+        if path is None or not os.path.lexists(path):
+            continue
+        is_result = path.suffix.lower() in RESULTS.get(option, ())
+        places = inputs + weights * (path.suffix.lower() not in NO_WEIGHTS)
+        for place in places:
+            if same_file(path, place) or (lies_in(path, place) and not is_result):
+                raise UserError(f"{option} {path} would be written over the input {place}; name another file")
+        if option in RESULTS and not is_result and path.is_file():
+            raise UserError(f"{option} {path} exists and is not a {RESULTS[option][0]} file; name another file")
+
+
+def lies_in(path: Path, directory: Path) -> bool:
+    """Whether ``path`` is ``directory`` or in it, links resolved."""
+    return any(same_file(place, directory) for place in (path, *Path(os.path.realpath(path)).parents))
+
+
+def same_file(path: Path, other: Path) -> bool:
+    try:  # links, and file systems that do not tell A from a
+        return os.path.realpath(path) == os.path.realpath(other) or path.samefile(other)
+    except OSError:
+        return False
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[TextIO]:
+    """A file to write that takes the place of ``path`` when all of it is on the disk.
+
+    Until then it lies beside ``path`` under a name of its own; such files of dead processes are removed. Raises
+    ``OSError`` where it cannot be written; nothing is left of it then.
+    """
+    _remove_abandoned(path)
+    part = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.part")
+    _parts.add(part)
+    try:
+        with part.open("x", encoding="utf-8", newline="") as stream:  # "x" follows no link
+            yield stream
+            stream.flush()
+            os.fsync(stream.fileno())
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
+        _parts.discard(part)
+
+
+def _remove_abandoned(path: Path) -> None:
+    name = re.compile(rf"\.{re.escape(path.name)}\.(\d+)-[0-9a-f]{{8}}\.part")
+    for part in path.parent.iterdir():
+        if found := name.fullmatch(part.name):
+            try:
+                os.kill(int(found[1]), 0)
+            except (ProcessLookupError, OverflowError):
+                part.unlink(missing_ok=True)
+            except PermissionError:
+                continue  # another user's process is alive
+
+
+def discard_parts() -> None:
+    """Remove what this process has begun to write and not finished, before it is left at once."""
+    for part in tuple(_parts):
+        with suppress(OSError):
+            part.unlink(missing_ok=True)

@@ -1,0 +1,99 @@
+"""Files that a command writes: whole or not at all, never over an input, and nothing is left beside them."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from mkpc_kaggle.data.outputs import discard_parts, replacing, require_no_input
+from mkpc_kaggle.errors import UserError
+
+
+@pytest.fixture
+def place(tmp_path):
+    """Inputs: a table, a directory with an image, a directory with a weight file and an earlier submission."""
+    for name in ("test.csv", "images/x.png", "weights/m.pth", "weights/s.csv", "images/scores.json"):
+        path = tmp_path / name
+        path.parent.mkdir(exist_ok=True)
+        path.write_text("precious")
+    (tmp_path / "link.csv").symlink_to("test.csv")
+    (tmp_path / "hard.csv").hardlink_to(tmp_path / "test.csv")
+    return tmp_path
+
+
+def refuse(place, option, name):
+    require_no_input({option: place / name}, [place / "test.csv", place / "images"], [place / "weights"])
+
+
+@pytest.mark.parametrize(
+    ("option", "name"),
+    [
+        ("--output", "test.csv"),
+        ("--output", "images/../test.csv"),
+        ("--output", "link.csv"),
+        ("--output", "hard.csv"),
+        ("--output", "images/x.png"),
+        ("--output", "weights/m.pth"),
+        ("--report", "test.csv"),
+        ("--json", "images/x.png"),
+    ],
+)
+def test_an_existing_input_is_never_overwritten(place, option, name):
+    with pytest.raises(UserError, match="would be written over the input"):
+        refuse(place, option, name)
+
+
+@pytest.mark.parametrize(
+    ("option", "name"),
+    [
+        ("--output", "new.csv"),
+        ("--output", "images/new.csv"),
+        ("--output", "weights/s.csv"),
+        ("--output", "weights/new.pth"),
+        ("--json", "images/new.txt"),
+        ("--json", "images/scores.json"),
+        ("--output", "n" * 300),
+    ],
+)
+def test_a_new_file_and_an_earlier_result_are_fine(place, option, name):
+    refuse(place, option, name)
+
+
+@pytest.mark.parametrize(("option", "kind"), [("--json", "json"), ("--report", "html")])
+def test_a_page_or_export_replaces_only_its_own_kind(place, option, kind):
+    (place / "submission.csv").touch()
+    with pytest.raises(UserError, match=f"exists and is not a .{kind} file"):
+        refuse(place, option, "submission.csv")
+
+
+def test_two_writers_of_a_file_are_not_in_each_others_way(tmp_path):
+    path = tmp_path / "submission.csv"
+    with replacing(path) as first, replacing(path) as second:
+        first.write("first\n" * 3)
+        second.write("second\n")
+    assert path.read_text() == "first\n" * 3
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_nothing_is_left_of_a_file_that_cannot_be_finished(tmp_path):
+    with pytest.raises(RuntimeError), replacing(tmp_path / "submission.csv") as stream:
+        stream.write("half")
+        raise RuntimeError
+    with pytest.raises(FileNotFoundError), replacing(tmp_path / "submission.csv") as stream:
+        stream.write("half")
+        discard_parts()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_a_dead_process_has_left_is_removed_and_what_a_living_one_writes_is_not(tmp_path):
+    dead = subprocess.Popen([sys.executable, "-c", ""])
+    dead.wait()
+    left = tmp_path / f".submission.csv.{dead.pid}-0123abcd.part"
+    other = tmp_path / f".submission.csv.{os.getpid()}-0123abcd.part"
+    kept = tmp_path / ".submission.csv.part"  # not one of ours
+    for path in (left, other, kept):
+        path.touch()
+    with replacing(tmp_path / "submission.csv") as stream:
+        stream.write("whole")
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted([other.name, kept.name, "submission.csv"])
