@@ -273,14 +273,14 @@ BUILD_ON = {
 @pytest.mark.parametrize("target", BUILD_ON)
 @pytest.mark.parametrize("state", [b"}X\x01\0\0\0xK\x01s", b"N}X\x01\0\0\0xK\x01s\x86", b"}X\x04\0\0\0keysNs"])
 def test_a_pickle_cannot_change_what_it_is_given(tmp_path: Path, target: str, state: bytes) -> None:
-    from mkpc_kaggle.weights.inert import Inert
+    from mkpc_kaggle.weights.checkpoint import Inert
 
     givens = (Inert, OrderedDict, torch.FloatStorage, torch._utils._rebuild_tensor_v2)
-    before = [sorted(vars(one)) for one in givens]
+    before = [sorted(vars(given)) for given in givens]
     path = with_pickle(tmp_path / "x.pt", b"\x80\x02}X\x01\0\0\0a" + BUILD_ON[target] + state + b"bs.")
     with pytest.raises(UserError, match=r"x\.pt cannot be read as a checkpoint"):
         load_tensors(path)
-    assert [sorted(vars(one)) for one in givens] == before
+    assert [sorted(vars(given)) for given in givens] == before
 
 
 @pytest.mark.parametrize(
@@ -328,9 +328,11 @@ def test_a_tensor_lies_within_its_storage(tmp_path: Path) -> None:
             load_tensors(with_pickle(path, tensor_pickle(*wrong)))
 
 
-def test_compressed_records_are_refused(tmp_path: Path) -> None:
-    path = with_pickle(tmp_path / "x.pt", tensor_pickle(6, 2, 3, 1), zipfile.ZIP_DEFLATED)
-    with pytest.raises(UserError, match=r"x\.pt cannot be read .* record [\w.]+ is compressed"):
+def test_records_that_unpack_to_more_than_the_file_are_refused(tmp_path: Path) -> None:
+    path = with_pickle(tmp_path / "x.pt", tensor_pickle(6, 2, 3, 1))
+    with zipfile.ZipFile(path, "a", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("x/big", bytes(1_000_000))
+    with pytest.raises(UserError, match=r"x\.pt cannot be read .* records are compressed or overlap"):
         load_tensors(path)
 
 
@@ -348,8 +350,6 @@ def legacy_with_pickle(path: Path, data: bytes) -> Path:
 
 
 TOO_LARGE = {
-    "a deep tuple as a key": b"\x80\x02})" + b"\x85" * 1_000_000 + b"K\x01s.",
-    "a tuple of pairs of pairs as a key": b"\x80\x02})" + b"q\x01h\x01\x86" * 40 + b"K\x01s.",
     "a bytearray of 6 GB": b"\x80\x02cbuiltins\nbytearray\n\x8a\x08"
     + (6 * 10**9).to_bytes(8, "little")
     + b"\x85R.",
@@ -375,7 +375,7 @@ def test_records_that_overlap_are_refused(tmp_path: Path) -> None:
         big = archive.getinfo("x/big")
         same.header_offset, same.file_size, same.compress_size = big.header_offset, 20_000, 20_000
         same.CRC = big.CRC
-    with pytest.raises(UserError, match="its records overlap"):
+    with pytest.raises(UserError, match="compressed or overlap"):
         load_tensors(path)
 
 

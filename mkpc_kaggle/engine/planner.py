@@ -13,7 +13,7 @@ from mkpc_kaggle.engine.jobs import Cause, Chunk, Job, JobFailure, JobResult, Ou
 from mkpc_kaggle.engine.records import PairRecord
 from mkpc_kaggle.engine.retries import Retries
 from mkpc_kaggle.engine.state import RunState
-from mkpc_kaggle.engine.upgrade import UpgradeRounds, is_weak
+from mkpc_kaggle.engine.upgrade import UpgradeConfig, UpgradeRounds, is_weak
 from mkpc_kaggle.recipe import Recipe, Unit
 
 EXPLORE_SHARE = 0.25
@@ -70,9 +70,8 @@ def weakest_first(records: Iterable[PairRecord], recipe: Recipe) -> tuple[list[i
 
     Pairs are weak by what they had before they were upgraded, so that a run that goes on decides as it did before.
     """
-    extras = [unit for unit in recipe.units if unit.extra]
     ranked = sorted(records, key=lambda record: (record.inliers_before, record.index))
-    weak = [one for one in ranked if is_weak(one, recipe.upgrade) or len(one.lacking(extras)) < len(extras)]
+    weak = [one for one in ranked if is_weak(one, UpgradeConfig())]
     chosen = {record.index for record in weak}
     others = [one.index for one in ranked if one.index not in chosen and one.lacking(recipe.regular)]
     return [one.index for one in weak], others
@@ -107,7 +106,7 @@ class Planner:
         self._unasked = unasked
         self._phases = iter((self._sweep, self._connect, self._deepen, self._upgrade))
         self._queue = ChunkQueue()
-        self._rounds = UpgradeRounds(recipe.upgrade)
+        self._rounds = UpgradeRounds(UpgradeConfig())
         self._retries = Retries()
         self.deepened = set(unasked)
         self.reserve = 0.0
@@ -352,7 +351,7 @@ class Planner:
         """The units that a pair gets if there is time: the extra ones only where it is weak."""
         if record.index >= self.state.asked:
             return []
-        extras = not self._rounds.over and is_weak(record, self.recipe.upgrade)
+        extras = not self._rounds.over and is_weak(record, UpgradeConfig())
         return record.lacking(self._usable(self.recipe.units if extras else self.recipe.regular))
 
     def may_gain(self, record: PairRecord) -> bool:

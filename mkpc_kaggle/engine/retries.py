@@ -8,7 +8,7 @@ from mkpc_kaggle.engine.jobs import Cause, Chunk, JobFailure
 from mkpc_kaggle.engine.records import PairRecord
 from mkpc_kaggle.recipe import Unit
 
-SHRINK, LEAST_SHRINK = 0.7, 0.45
+SHRINK, LEAST_SHRINK = 0.7, 1.0
 """A unit that a worker fails at on one pair is tried on views whose sides are 0.7, then 0.49 times as long."""
 MOST_FAILURES = 4
 """A pair at which that many jobs of its own failed is left alone."""

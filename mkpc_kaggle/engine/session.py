@@ -98,7 +98,7 @@ def run_pairs(
             publish=publish,
             interrupt=session.interrupt,
             progress=session.progress,
-            timeouts=session.timeouts or Timeouts(batch=assembly.batch),
+            timeouts=session.timeouts or Timeouts(batch=assembly.minibatch),
         )
         if session.watchdog is not None:
             session.watchdog.save = engine.save_what_there_is
@@ -116,7 +116,7 @@ def about_run(assembly: Assembly, budget: Budget) -> About:
         assembly.recipe.name,
         str(assembly.placement),
         budget.limit if isfinite(budget.limit) else None,
-        tuple(unit.name for unit in assembly.left_out),
+        assembly.left_out,
         versions(),
     )
 

@@ -1,13 +1,21 @@
 """Which pairs more work may help, and whether it does."""
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 
 from mkpc_kaggle.engine.jobs import Chunk, Phase, split
 from mkpc_kaggle.engine.records import PairRecord
-from mkpc_kaggle.recipe import Unit, UpgradeConfig
+from mkpc_kaggle.recipe import Unit
 
-ROUND_JOBS = 4
-"""Jobs of an upgrade whose gain is looked at together."""
+
+@dataclass(frozen=True)
+class UpgradeConfig:
+    """Which pairs are weak."""
+
+    below_inliers: int = 100
+    below_share: float = 0.0
+    uncertain: bool = True
+    least_gain: float = 0.01
 
 
 def is_weak(record: PairRecord, config: UpgradeConfig) -> bool:
@@ -30,11 +38,7 @@ class UpgradeRounds:
 
     def split(self, weak: Iterable[int], units: tuple[Unit, ...]) -> list[Chunk]:
         """Chunks of the pairs ``weak``, each in its round; in none if no unit is an extra one."""
-        extras = any(unit.extra for unit in units)
-        chunks = [
-            Chunk(Phase.UPGRADE, indices, units, round=1 + number // ROUND_JOBS if extras else 0)
-            for number, indices in enumerate(split(weak))
-        ]
+        chunks = [Chunk(Phase.UPGRADE, indices, units) for indices in split(weak)]
         for chunk in chunks:
             self._pairs.setdefault(chunk.round, []).extend(chunk.indices)
         return chunks

@@ -62,7 +62,7 @@ class Worker:
     def _match(self, job: Job, seconds: float, heartbeat: Callable[[], None]) -> tuple[PairMatch, ...]:
         pipeline = self.load()
         deadline = time.monotonic() + seconds
-        units = {unit.shrunk(job.shrink) if job.shrink < 1 else unit: unit for unit in job.units}
+        units = {unit: unit for unit in job.units}
         expected = dict(zip(units, job.expected, strict=True))
 
         def may_start(unit: Unit) -> bool:
@@ -70,7 +70,6 @@ class Worker:
             return not self._stopped.is_set() and time.monotonic() + expected[unit] < deadline
 
         opened = [self._open(pair, known) for pair, known in zip(job.pairs, job.known, strict=True)]
-        # A shrunk unit is another one to the pipeline: what a pair has had is left out here.
         wanted = [unit for unit in units if not all(pair.has(units[unit]) for pair in opened)]
         matched = iter(pipeline.match([pair for pair in opened if not pair.failure], wanted, may_start))
         done = [pair if pair.failure else next(matched) for pair in opened]

@@ -72,10 +72,7 @@ class Scenario:
     @property
     def recipe(self) -> Recipe:
         count = len(self.costs)
-        units = [
-            Unit(1 if number % 2 == 0 else 2, f"m{number}", 100, extra=number >= count - self.extras)
-            for number in range(count)
-        ]
+        units = [Unit(1 if number % 2 == 0 else 2, f"m{number}", 100) for number in range(count)]
         scene = SceneConfig(pairs_per_image=self.pairs_per_image) if self.batches else None
         return Recipe(tuple(units), scene=scene)
 

@@ -1,6 +1,5 @@
 """A worker in a Ray actor: its images and weights come from shared paths, or else from the parent's machine."""
 
-import tempfile
 import time
 from collections.abc import Callable
 from functools import partial
@@ -60,9 +59,7 @@ class WorkerActor:
             )
         use_threads(self._threads)
         try:
-            with tempfile.TemporaryDirectory() as home:
-                self._assembly = self._assembly.with_weights_in(Path(home), self._fetch_whole)
-                self._worker.load()
+            self._worker.load()
         except UserError as error:
             return error
         return ""
@@ -86,11 +83,6 @@ class WorkerActor:
 
     def _fetch(self, path: Path, stamp: Stamp | None) -> bytes | None:
         return fetch_from(self._files, path, stamp)
-
-    def _fetch_whole(self, path: Path) -> bytes:
-        data = self._fetch(path, None)
-        assert data is not None
-        return data
 
     def _pipeline(self) -> Pipeline:
         return self._assembly.pipeline()
