@@ -158,6 +158,15 @@ def test_a_manifest_beside_the_weights_does_not_change_what_the_packages_says(
     assert store.WeightStore([tmp_path]).files == FILES
 
 
+def test_a_link_in_the_place_of_the_partial_manifest_is_not_followed(tmp_path: Path) -> None:
+    put(tmp_path, "a.pt", DATA)
+    put(tmp_path, "mine", b"mine")
+    (tmp_path / "weights_manifest.txt.part").symlink_to(tmp_path / "mine")
+    pin(FILES[1], tmp_path / "a.pt")
+    assert (tmp_path / "mine").read_bytes() == b"mine"
+    assert not (tmp_path / "weights_manifest.txt").is_symlink()
+
+
 # the files of LoMa, RoMa and LightGlue
 
 FILE_NAMES = {

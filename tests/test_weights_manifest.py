@@ -6,7 +6,7 @@ import pytest
 
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.matchers.registry import matcher_names, spec_of
-from mkpc_kaggle.weights import UNVERIFIED, WeightFile, manifest, parse_manifest
+from mkpc_kaggle.weights.manifest import UNVERIFIED, WeightFile, manifest, parse_manifest
 
 SHA256 = "sha256:" + "0f" * 32
 

@@ -15,7 +15,7 @@ from weight_files import DATA, OTHER, digest_of, line, put
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.weights import UNVERIFIED, State, WeightStore, load_tensors, store
 from mkpc_kaggle.weights.convert import convert
-from mkpc_kaggle.weights.manifest import file_digest
+from mkpc_kaggle.weights.manifest import digest_of as file_digest
 
 pytestmark = pytest.mark.usefixtures("nowhere_else")
 
@@ -119,7 +119,7 @@ def test_without_a_size_only_small_checkpoints_are_read_for_their_digest(
 
 def test_files_of_another_size_are_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     read: list[Path] = []
-    monkeypatch.setattr(store, "file_digest", lambda path: read.append(path) or file_digest(path))
+    monkeypatch.setattr(store, "digest_of", lambda path: read.append(path) or file_digest(path))
     put(tmp_path, "long.pth", DATA + b"!")
     put(tmp_path, "same.pth", OTHER)
     assert WeightStore([tmp_path], [line()]).find("slot") is None
@@ -256,7 +256,7 @@ def test_a_file_that_cannot_be_read_is_passed_over(tmp_path: Path, monkeypatch: 
             raise PermissionError(13, "Permission denied", str(path))
         return file_digest(path)
 
-    monkeypatch.setattr(store, "file_digest", read)
+    monkeypatch.setattr(store, "digest_of", read)
     put(tmp_path, "locked.bin")
     put(tmp_path, "renamed.bin")
     assert found_by(WeightStore([tmp_path], [line()])).name == "renamed.bin"

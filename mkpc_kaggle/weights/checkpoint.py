@@ -38,26 +38,11 @@ def load_tensors(path: Path) -> "dict[str, torch.Tensor]":
     left out. Raises :class:`UserError` if the file cannot be read, if an entry is not a dense tensor with a name,
     or if the tensors have many more bytes than the file.
     """
-    import torch
-
     try:
         table = _load_table(path)
+        _require_plain(table, path)
     except Exception as error:
         raise UserError(f"{path} cannot be read as a checkpoint: {error}") from error
-    odd = [
-        str(name)
-        for name, value in table.items()
-        if not isinstance(name, str) or not isinstance(value, torch.Tensor) or not _is_plain(value)
-    ]
-    if odd:
-        raise UserError(
-            f"{path} cannot be read as a checkpoint: not all of its entries are plain tensors with a name: "
-            f"{', '.join(odd[:5])}. Save the network's state_dict alone."
-        )
-    files = [path] if path.is_file() else list(path.rglob("*"))
-    file_bytes = sum(file.stat().st_size for file in files if file.is_file())
-    if sum(tensor.nbytes for tensor in table.values()) > MAX_EXPANSION * file_bytes:
-        raise UserError(f"{path} cannot be read as a checkpoint: its tensors are larger than the file")
     return {name: tensor.detach() for name, tensor in table.items()}
 
 
@@ -79,16 +64,30 @@ def load_into(
     network.load_state_dict({**own, **fitting}, assign=any(tensor.is_meta for tensor in own.values()))
 
 
-def _is_plain(tensor: "torch.Tensor") -> bool:
-    """Whether the tensor's elements lie in memory, each with bytes of its own."""
+def _require_plain(table: Mapping[Any, Any], path: Path) -> None:
+    """Raise ``ValueError`` unless all entries have a name and are tensors whose elements lie in memory."""
     import torch
 
-    return (
-        tensor.layout is torch.strided
-        and tensor.device.type == "cpu"
-        and not (tensor.is_quantized or tensor.is_nested)
-        and tensor.nbytes <= tensor.untyped_storage().nbytes()
-    )
+    odd = [
+        str(name)
+        for name, value in table.items()
+        if not isinstance(name, str)
+        or not isinstance(value, torch.Tensor)
+        or value.layout is not torch.strided
+        or value.device.type != "cpu"
+        or value.is_quantized
+        or value.is_nested
+        or value.nbytes > value.untyped_storage().nbytes()
+    ]
+    if odd:
+        raise ValueError(
+            f"not all of its entries are plain tensors with a name: {', '.join(odd[:5])}. Save the network's "
+            "state_dict alone."
+        )
+    files = [path] if path.is_file() else list(path.rglob("*"))
+    file_bytes = sum(file.stat().st_size for file in files if file.is_file())
+    if sum(tensor.nbytes for tensor in table.values()) > MAX_EXPANSION * file_bytes:
+        raise ValueError("its tensors are larger than the file")
 
 
 def _load_table(path: Path) -> Mapping[Any, Any]:

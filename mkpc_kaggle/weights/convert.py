@@ -4,8 +4,8 @@ from pathlib import Path
 
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.weights.checkpoint import load_tensors
-from mkpc_kaggle.weights.manifest import UNVERIFIED, WeightFile, directory_digest, file_digest, manifest
-from mkpc_kaggle.weights.store import names_of_unpacked
+from mkpc_kaggle.weights.manifest import UNVERIFIED, WeightFile, digest_of, manifest
+from mkpc_kaggle.weights.store import is_unpacked_from
 
 
 def convert(source: Path, target: Path) -> WeightFile:
@@ -35,18 +35,11 @@ def convert(source: Path, target: Path) -> WeightFile:
 
 
 def _line(source: Path, target: Path) -> WeightFile:
-    digest = directory_digest(source) if source.is_dir() else file_digest(source)
-    known = _line_of(source, digest)
-    licence, slot, name = (known.licence, known.slot, known.name) if known else ("?", "?", source.name)
-    source_note = f"{name} ({digest}) with the same tensor names"
-    return WeightFile(target.name, target.stat().st_size, file_digest(target), licence, slot, source_note)
-
-
-def _line_of(source: Path, digest: str) -> WeightFile | None:
-    """The manifest's line of the source: by its digest, or by its name if no digest can be compared."""
-    lines = manifest()
-    if source.is_dir():
-        names = names_of_unpacked(source)
-        return next((file for file in lines if names & {file.name, Path(file.name).stem}), None)
-    by_name = [file for file in lines if (file.name, file.digest) == (source.name, UNVERIFIED)]
-    return next(iter([file for file in lines if file.digest == digest] + by_name), None)
+    """The target's line, with what the manifest knows of the source: by its digest, or else by its name."""
+    digest, lines = digest_of(source), manifest()
+    known = [file for file in lines if file.digest == digest]
+    known += [file for file in lines if (file.name, file.digest) == (source.name, UNVERIFIED)]
+    known += [file for file in lines if source.is_dir() and is_unpacked_from(source, file)]
+    licence, slot, name = (known[0].licence, known[0].slot, known[0].name) if known else ("?", "?", source.name)
+    origin = f"{name} ({digest}) with the same tensor names"
+    return WeightFile(target.name, target.stat().st_size, digest_of(target), licence, slot, origin)

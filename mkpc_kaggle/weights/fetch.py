@@ -16,7 +16,7 @@ from urllib.request import Request, urlopen
 from tqdm import tqdm
 
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.weights.manifest import UNVERIFIED, WeightFile, file_digest
+from mkpc_kaggle.weights.manifest import UNVERIFIED, WeightFile, digest_of
 from mkpc_kaggle.weights.store import judge
 
 ATTEMPTS = 5
@@ -75,7 +75,7 @@ def fetch(file: WeightFile, directory: Path, *, wait: Callable[[float], None] = 
     part = path.with_name(f"{path.name}.part")
     try:
         directory.mkdir(parents=True, exist_ok=True)
-        if not (_size_of(part) and file_digest(part) == file.digest):
+        if not (_size_of(part) and digest_of(part) == file.digest):
             _download(url, part, file, wait)
         note = _verify(part, file)
         part.replace(path)
@@ -100,7 +100,7 @@ def _size_of(part: Path) -> int:
 
 def _verify(part: Path, file: WeightFile) -> str:
     """A note on the complete download; if it is another file, remove it and raise :class:`UserError`."""
-    digest, size = file_digest(part), part.stat().st_size
+    digest, size = digest_of(part), part.stat().st_size
     if file.digest == UNVERIFIED and file.size in (-1, size):
         return f"not verified: the manifest has no digest for it; this file's is {digest}"
     if file.digest == digest:

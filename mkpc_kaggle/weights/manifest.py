@@ -72,37 +72,34 @@ def manifest() -> tuple[WeightFile, ...]:
     raise UserError(f"{MANIFEST} is missing from {package}: install the package again")
 
 
-def pin(file: WeightFile, path: Path) -> WeightFile:
-    """The line with the size and digest of the file at ``path``, also added to the manifest in its directory."""
-    pinned = replace(file, size=path.stat().st_size, digest=file_digest(path))
+def pin(file: WeightFile, path: Path) -> None:
+    """Add the line, with the size and digest of the file at ``path``, to the manifest in its directory."""
+    pinned = replace(file, size=path.stat().st_size, digest=digest_of(path))
     own = path.with_name(MANIFEST)
     former = own.read_text(encoding="utf-8") if own.is_file() else ""
     part = own.with_name(f"{MANIFEST}.part")
     part.unlink(missing_ok=True)  # it may be a link
     part.write_text(f"{former}{pinned.line}\n", encoding="utf-8")
     part.replace(own)
-    return pinned
 
 
-def file_digest(path: Path) -> str:
-    """``sha256:<hex>`` of a regular file, cached for the process; raises ``OSError`` if it cannot be read."""
+def digest_of(path: Path) -> str:
+    """``sha256:<hex>`` of a file, cached for the process, or of all files in a directory and of their names.
+
+    Raises ``OSError`` if it cannot be read.
+    """
+    if path.is_dir():
+        files = sorted(file for file in path.rglob("*") if file.is_file())
+        lines = (f"{digest_of(file)[7:]} {file.relative_to(path).as_posix()}\n" for file in files)
+        return f"sha256:{hashlib.sha256(''.join(lines).encode()).hexdigest()}"
     status = path.stat()
     if not stat.S_ISREG(status.st_mode):
         raise OSError(errno.EINVAL, "not a regular file", str(path))
-    return _digest(path.resolve(), status.st_size, status.st_mtime_ns)
-
-
-def directory_digest(directory: Path) -> str:
-    """``sha256:<hex>`` of all files in a directory and of their names; raises ``OSError``."""
-    whole = hashlib.sha256()
-    for path in sorted(path for path in directory.rglob("*") if path.is_file()):
-        digest = file_digest(path).removeprefix("sha256:")
-        whole.update(f"{digest} {path.relative_to(directory).as_posix()}\n".encode())
-    return f"sha256:{whole.hexdigest()}"
+    return _file_digest(path.resolve(), status.st_size, status.st_mtime_ns)
 
 
 @cache
-def _digest(path: Path, _size: int, _modified_ns: int) -> str:  # size and time are part of the cache's key
+def _file_digest(path: Path, _size: int, _modified_ns: int) -> str:  # size and time are part of the cache's key
     with path.open("rb") as stream:
         return f"sha256:{hashlib.file_digest(stream, 'sha256').hexdigest()}"
 

@@ -1,7 +1,6 @@
 """The weight files of this machine, found by name or by digest and judged against the manifest."""
 
 import os
-import stat
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
@@ -11,15 +10,7 @@ from typing import TYPE_CHECKING
 
 from mkpc_kaggle.errors import UserError, warn_once
 from mkpc_kaggle.weights.checkpoint import load_tensors
-from mkpc_kaggle.weights.manifest import (
-    MANIFEST,
-    UNVERIFIED,
-    WeightFile,
-    directory_digest,
-    file_digest,
-    manifest,
-    read_manifest,
-)
+from mkpc_kaggle.weights.manifest import MANIFEST, UNVERIFIED, WeightFile, digest_of, manifest, read_manifest
 
 if TYPE_CHECKING:
     import torch
@@ -28,6 +19,10 @@ KAGGLE_INPUT = Path("/kaggle/input")
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png"})  # a competition's input has thousands of them
 CHECKPOINT_SUFFIXES = frozenset({".pth", ".pt", ".ckpt", ".safetensors", ".bin", ".pkl", ""})
 MAX_UNKNOWN_SIZE_BYTES = 1 << 28  # the files whose size is not known have some 50 MB; larger files are not read
+UNPACKED = (
+    "this checkpoint was unpacked into a directory, as Kaggle does; it is read from there, but cannot be held "
+    "against the manifest's digest. Upload it as safetensors (python -m mkpc_kaggle weights convert)"
+)
 
 
 class State(StrEnum):
@@ -158,27 +153,23 @@ class WeightStore:
         for file in lines:
             for path in self._named(file.name):
                 yield judge(path, file, self.files)
+        sizes, unpacked = self._walked
+        for file in (line for line in lines if line.digest != UNVERIFIED):
+            for path, size in sizes.items():
+                small = 0 <= size <= MAX_UNKNOWN_SIZE_BYTES and path.suffix.lower() in CHECKPOINT_SUFFIXES
+                if size == file.size or (file.size < 0 and small):
+                    found = judge(path, file)
+                    if found.state is State.GOOD:
+                        yield found
         for file in lines:
-            yield from self._with_digest(file) if file.digest != UNVERIFIED else ()
-        for file in lines:
-            for directory in self._walked[1]:
-                if names_of_unpacked(directory) & {file.name, Path(file.name).stem}:
-                    yield judge_unpacked(directory, file)
-
-    def _with_digest(self, file: WeightFile) -> Iterator[FoundFile]:
-        for path, size in self._walked[0].items():
-            small = 0 <= size <= MAX_UNKNOWN_SIZE_BYTES and path.suffix.lower() in CHECKPOINT_SUFFIXES
-            if size == file.size or (file.size < 0 and small):
-                found = judge(path, file)
-                if found.state is State.GOOD:
-                    yield found
+            yield from (judge(directory, file) for directory in unpacked if is_unpacked_from(directory, file))
 
     def _named(self, name: str) -> list[Path]:
         return [path for path in self._walked[0] if path.name == name]
 
     @cached_property
     def _walked(self) -> tuple[dict[Path, int], list[Path]]:
-        """Bytes of all files but images (-1: cannot be read), by search directory and depth; unpacked checkpoints.
+        """Bytes of all files but images (-1: not a regular file), by directory and depth; unpacked checkpoints.
 
         Links are followed, since Kaggle mounts inputs by links; no directory is entered twice, so that cycles end.
         """
@@ -198,21 +189,24 @@ class WeightStore:
                     unpacked.append(Path(folder))
                 elif not again:
                     files += [Path(folder, name) for name in names]
-            files = [path for path in files if path.suffix.lower() not in IMAGE_SUFFIXES]
-            sizes |= {path: _size(path) for path in sorted(files, key=lambda path: (len(path.parts), path))}
+            for path in sorted(files, key=lambda path: (len(path.parts), path)):
+                if path.suffix.lower() not in IMAGE_SUFFIXES:
+                    sizes[path] = path.stat().st_size if os.path.isfile(path) else -1  # noqa: PTH113  never raises
         return sizes, unpacked
 
 
 def judge(path: Path, file: WeightFile, files: Iterable[WeightFile] = ()) -> FoundFile:
-    """The file at ``path``, named as ``file``; ``files`` are all lines of the manifest."""
+    """The file at ``path``, or unpacked into it, by the name of ``file``; ``files`` is the whole manifest."""
     try:
-        digest, size = file_digest(path), path.stat().st_size
+        digest, size = digest_of(path), path.stat().st_size
     except OSError as error:
         return FoundFile(file, path, State.REFUSED, "", f"cannot be read: {error.strerror}")
     other = next((line.name for line in files if line.digest == digest), "")
     state, note = State.REFUSED, ""
     if digest == file.digest:
         state, note = State.GOOD, "" if path.name == file.name else f"it is {file.name}"
+    elif path.is_dir():
+        state, note = State.UNVERIFIED, UNPACKED
     elif other:
         note = f"its bytes are those of {other}"
     elif 0 <= file.size != size:
@@ -224,31 +218,10 @@ def judge(path: Path, file: WeightFile, files: Iterable[WeightFile] = ()) -> Fou
     return FoundFile(file, path, state, digest, note)
 
 
-def judge_unpacked(directory: Path, file: WeightFile) -> FoundFile:
-    """A directory into which ``file``, by its name, was unpacked."""
-    try:
-        digest = directory_digest(directory)
-    except OSError as error:
-        return FoundFile(file, directory, State.REFUSED, "", f"cannot be read: {error.strerror}")
-    note = (
-        "this checkpoint was unpacked into a directory, as Kaggle does; it is read from there, but cannot be held "
-        "against the manifest's digest. Upload it as safetensors (python -m mkpc_kaggle weights convert)"
-    )
-    return FoundFile(file, directory, State.UNVERIFIED, digest, note)
-
-
-def names_of_unpacked(directory: Path) -> frozenset[str]:
-    """Possible names of the file that was unpacked into ``directory``, with or without its suffix.
+def is_unpacked_from(directory: Path, file: WeightFile) -> bool:
+    """Whether ``directory`` has a name that Kaggle gives to the unpacked ``file``.
 
     Kaggle unpacks uploaded archives, and torch's checkpoints are archives: ``NAME.pth`` becomes
     ``NAME/NAME/{data.pkl, data/, version, ...}``, with or without the suffix in the outer name.
     """
-    return frozenset((directory.name, directory.parent.name))
-
-
-def _size(path: Path) -> int:
-    try:
-        status = path.stat()
-    except OSError:
-        return -1  # such as a broken link
-    return status.st_size if stat.S_ISREG(status.st_mode) else -1
+    return bool({directory.name, directory.parent.name} & {file.name, Path(file.name).stem})
