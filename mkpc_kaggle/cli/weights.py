@@ -123,7 +123,7 @@ def _verify_manifest(arguments: argparse.Namespace) -> int:
             rows.append((file.name, "missing", "", f"searched {store.searched}"))
         absent += search.found is None
     print_table(rows)
-    print(f"{len(store.files)} files in {arguments.manifest}, {absent} of them not found or refused")
+    print(f"{len(store.files)} files in {arguments.manifest}, {absent} of them not found or wrong")
     return 1 if absent else 0
 
 
