@@ -82,13 +82,6 @@ def test_a_part_of_another_version_is_found_out_and_removed(site: Site, tmp_path
     assert (tmp_path / "a.bin").read_bytes() == BIG
 
 
-def test_a_server_that_knows_no_ranges_sends_all_again(site: Site, tmp_path: Path) -> None:
-    site.ranges, site.breaks = False, [CUT]
-    assert get(site, tmp_path).outcome is FetchOutcome.FETCHED
-    assert (tmp_path / "a.bin").read_bytes() == BIG
-    assert site.sent == CUT + len(BIG)
-
-
 def test_a_file_without_a_digest_is_begun_anew(site: Site, tmp_path: Path) -> None:
     site.breaks = [CUT]
     assert get(site, tmp_path, line(data=BIG, digest=UNVERIFIED)).outcome is FetchOutcome.FETCHED
@@ -189,31 +182,6 @@ def test_an_unverified_file_comes_with_its_digest(site: Site, tmp_path: Path) ->
 
 
 # malice
-
-
-@pytest.mark.parametrize(
-    "target",
-    [
-        "http://[bad/a",
-        "http://a..b/x",
-        f"http://{'a' * 64}.org/x",
-        "http://127.0.0.1:99999/",
-        "http://127.0.0.1:port/",
-        "http:///",
-        "http://\u00e9/x",
-    ],
-)
-def test_a_redirection_to_nowhere_is_told(site: Site, tmp_path: Path, target: str) -> None:
-    site.redirect = target
-    failed = get(site, tmp_path)
-    assert (failed.outcome, names_in(tmp_path)) == (FetchOutcome.FAILED, [])
-    assert site.url in failed.note
-
-
-@pytest.mark.parametrize("size", [b"-5", b"zz", b"ffffffffffffffffffffffff", b"", b"1" * 70_000])
-def test_chunks_of_no_size_are_told(site: Site, tmp_path: Path, size: bytes) -> None:
-    site.chunk_size = size
-    assert get(site, tmp_path).outcome is FetchOutcome.FAILED
 
 
 def test_no_more_bytes_are_taken_than_the_manifest_has(site: Site, tmp_path: Path) -> None:

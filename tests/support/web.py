@@ -13,13 +13,11 @@ class Site:
     """What the server does; it may be changed between requests. ``asked`` gets each request's Range header."""
 
     data: bytes
-    ranges: bool = True  # honour Range
     breaks: list[int] = field(default_factory=list)  # bytes after which the first connections break
     statuses: list[int] = field(default_factory=list)  # errors that the first requests get
     length: int | None = None  # a Content-Length that is not true; 0: none is sent
     shift: int = 0  # the part that was asked for begins so many bytes later
     redirect: str = ""
-    chunk_size: bytes | None = None  # the file is sent as a chunk of this size
     asked: list[str] = field(default_factory=list)
     sent: int = 0  # bytes of bodies
     url: str = ""
@@ -31,10 +29,7 @@ class _Handler(BaseHTTPRequestHandler):
     def do_GET(self) -> None:
         site = self.site
         site.asked.append(self.headers.get("Range", ""))
-        if site.chunk_size is not None:
-            self.wfile.write(b"HTTP/1.1 200 OK\r\nTransfer-Encoding: chunked\r\n\r\n" + site.chunk_size + b"\r\n")
-            self.wfile.write(site.data)
-        elif site.redirect:
+        if site.redirect:
             self.wfile.write(b"HTTP/1.1 302 Found\r\nLocation: " + site.redirect.encode() + b"\r\n\r\n")
         elif site.statuses:
             self.send_error(site.statuses.pop(0))
@@ -42,8 +37,6 @@ class _Handler(BaseHTTPRequestHandler):
             self._send(site, self._start(site))
 
     def _start(self, site: Site) -> int:
-        if not site.ranges:
-            return 0
         wanted = re.fullmatch(r"bytes=(\d+)-", self.headers.get("Range", ""))
         return int(wanted[1]) + site.shift if wanted else 0
 
