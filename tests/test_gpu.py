@@ -31,7 +31,7 @@ from mkpc_kaggle.matchers.numbers import check_finite, exact_float32
 from mkpc_kaggle.matchers.xfeat_lighterglue import SHAPE
 from mkpc_kaggle.pipeline import devices
 from mkpc_kaggle.pipeline.assembly import assemble
-from mkpc_kaggle.pipeline.devices import fastest_precision, gpu_capabilities, require_device, resolve_device
+from mkpc_kaggle.pipeline.devices import fastest_precision, gpu_capabilities, require_device, resolve_placement
 from mkpc_kaggle.pipeline.failures import DeviceError
 from mkpc_kaggle.pipeline.pair import PairMatch
 from mkpc_kaggle.pipeline.stages import ENCODING_CACHE_BYTES, Pipeline
@@ -83,16 +83,16 @@ def test_the_double_refuses_numpy_and_lets_scalars_and_copies_pass() -> None:
 @pytest.mark.parametrize("device", ["cuda:2", "cuda:9"])
 def test_a_gpu_that_is_not_there_is_refused(monkeypatch: pytest.MonkeyPatch, device: str) -> None:
     gpus_here(monkeypatch, (7, 5), (7, 5))
-    assert resolve_device("cuda:1") == "cuda:1"
+    assert resolve_placement("cuda:1", "float32").device == "cuda:1"
     with pytest.raises(UserError, match=f"--device {device}: this machine has only cuda:0, cuda:1"):
-        resolve_device(device)
+        resolve_placement(device, "float32")
 
 
 @pytest.mark.parametrize("device", ["cuda:", "cuda:x", "cudas", "cuda:-1", "gpu"])
 def test_a_device_of_no_known_name_is_refused(monkeypatch: pytest.MonkeyPatch, device: str) -> None:
     gpus_here(monkeypatch, (7, 5))
     with pytest.raises(UserError, match="unknown device"):
-        resolve_device(device)
+        resolve_placement(device, "float32")
 
 
 def test_half_precision_asks_every_gpu_that_the_run_uses(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,19 +8,11 @@ from typing import Any
 from mkpc_kaggle.errors import warn_once
 from mkpc_kaggle.matchers.contract import Matcher, Placement, Precision
 from mkpc_kaggle.matchers.registry import load_matcher
-from mkpc_kaggle.pipeline.availability import (
-    Cause,
-    Licence,
-    by_cause,
-    options_of,
-    refusal,
-    slots_of,
-    unavailable,
-)
+from mkpc_kaggle.pipeline.availability import Cause, Licence, by_cause, options_of, refusal, slots_of, unavailable
 from mkpc_kaggle.pipeline.devices import AUTO, encoding_cache_bytes, gpus_of, require_device, resolve_placement
 from mkpc_kaggle.pipeline.stages import ENCODING_CACHE_BYTES, Pipeline
 from mkpc_kaggle.recipe import Mode, Recipe, load_recipe
-from mkpc_kaggle.weights import FoundFile, WeightStore
+from mkpc_kaggle.weights import WeightStore
 
 CUDA_MINIBATCH = 8
 
@@ -75,18 +67,13 @@ class Assembly:
 
     def fingerprint(self) -> dict[str, Any]:
         """What decides the numbers that come out: the recipe, the precision and the digests of the weights."""
+        names = [name for name in self.recipe.matcher_names if name not in self.matchers]
+        found = {slot: self.weights.find(slot) for slot in slots_of(self.recipe, names)}
         return {
             "recipe": self.recipe.fingerprint(),
             "precision": self.placement.precision,
-            "weights": {slot: file.digest for slot, file in self.weight_files.items()},
+            "weights": {slot: file.digest for slot, file in found.items() if file is not None},
         }
-
-    @property
-    def weight_files(self) -> dict[str, FoundFile]:
-        """The files that the recipe's matchers load, by slot."""
-        slots = slots_of(self.recipe, [name for name in self.recipe.matcher_names if name not in self.matchers])
-        found = {slot: self.weights.find(slot) for slot in slots}
-        return {slot: file for slot, file in found.items() if file is not None}
 
     def _load(self, name: str, placement: Placement) -> Matcher[Any]:
         own = self.matchers.get(name)

@@ -20,24 +20,21 @@ print(json.dumps([torch.cuda.get_device_capability(gpu) for gpu in range(torch.c
 
 
 def resolve_placement(device: str, precision: str) -> Placement:
-    """The placement that the user's words mean; :class:`UserError` if one is unknown or the GPU is not there."""
-    where = resolve_device(device)
-    if precision == AUTO:
-        return Placement(where, fastest_precision(where))
-    if precision not in list(Precision):
-        raise UserError(f"unknown precision {precision!r}; known: auto, {', '.join(Precision)}")
-    return Placement(where, Precision(precision))
+    """The placement that the user's words mean: ``auto`` are the GPUs, "cuda", or the CPU.
 
-
-def resolve_device(device: str) -> str:
-    """``auto`` becomes the GPUs, "cuda", or the CPU; :class:`UserError` for a GPU that is not there."""
+    Raises :class:`UserError` for an unknown word, and for a GPU that is not there.
+    """
     import torch
 
     if device == AUTO:
-        return "cuda" if torch.cuda.is_available() else "cpu"
-    if device != "cpu":
+        device = "cuda" if torch.cuda.is_available() else "cpu"
+    elif device != "cpu":
         gpus_of(device)
-    return device
+    if precision == AUTO:
+        return Placement(device, fastest_precision(device))
+    if precision not in list(Precision):
+        raise UserError(f"unknown precision {precision!r}; known: auto, {', '.join(Precision)}")
+    return Placement(device, Precision(precision))
 
 
 def fastest_precision(device: str) -> Precision:

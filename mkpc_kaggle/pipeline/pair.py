@@ -61,10 +61,6 @@ class PairMatch:
     def inliers(self) -> Matches:
         return self.matches[self.estimate.inliers]
 
-    @property
-    def stage1_matches(self) -> Matches:
-        return Matches.concatenate(result.matches for result in self.results if result.unit.stage == 1)
-
     def has(self, unit: Unit) -> bool:
         return any(result.unit == unit for result in self.results)
 

@@ -195,7 +195,7 @@ def views_of(unit: Unit, multiple: int, pair: PairMatch) -> tuple[View, View]:
 def with_regions(pair: PairMatch, recipe: Recipe) -> PairMatch:
     """The pair with the critical region of each image, from the matched points of stage 1."""
     start = time.perf_counter()
-    matches = pair.stage1_matches
+    matches = pair.matches[pair.in_stage(1)]
     region0, region1 = (
         critical_region(points, image.size, recipe.mkpc)
         for points, image in zip((matches.points0, matches.points1), pair.images, strict=True)
