@@ -57,38 +57,35 @@ def unavailable(
     unknown are loaded, which shows whether they are damaged. Raises :class:`UserError` for an unknown matcher or
     option.
     """
+
+    def not_permitted(tags: Iterable[str]) -> Reason | None:
+        others = sorted(set(tags) - PERMISSIVE_TAGS) if licence is Licence.PERMISSIVE else []
+        return Reason(Cause.NOT_PERMITTED, ", ".join(others)) if others else None
+
+    def reason_of(name: str) -> Reason | None:
+        if name in own:
+            return not_permitted(own[name].spec.licences)
+        entry = find_matcher(name) if name in matcher_names() else None
+        if isinstance(entry, Unusable):
+            return Reason(Cause.NOT_IMPORTABLE, entry.reason)
+        options = options_of(recipe, name)
+        spec = spec_of(name, f"recipe {recipe.name!r}")
+        found = {slot: store.find(slot) for slot in spec.slots_for(options)}
+        files = [file for file in found.values() if file is not None]
+        if reason := not_permitted([*spec.licences, *(file.file.licence for file in files)]):
+            return reason
+        if missing := [slot for slot, file in found.items() if file is None]:
+            return Reason(Cause.NO_WEIGHTS, missing_files(missing, store))
+        try:
+            if load and any(file.state is State.UNVERIFIED for file in files):
+                load_matcher(name, store, options, Placement())
+        except UserError as error:
+            return Reason(Cause.UNREADABLE, str(error))
+        return None
+
     names = [name for unit in recipe.units for name in (unit.matcher, unit.fallback) if name]
-    found = {name: _reason(recipe, name, store, licence, own, load) for name in dict.fromkeys(names)}
+    found = {name: reason_of(name) for name in dict.fromkeys(names)}
     return {name: reason for name, reason in found.items() if reason is not None}
-
-
-def _reason(
-    recipe: Recipe, name: str, store: WeightStore, licence: Licence, own: Mapping[str, Matcher[Any]], load: bool
-) -> Reason | None:
-    if name in own:
-        return _not_permitted(own[name].spec.licences, licence)
-    entry = find_matcher(name) if name in matcher_names() else None
-    if isinstance(entry, Unusable):
-        return Reason(Cause.NOT_IMPORTABLE, entry.reason)
-    options = options_of(recipe, name)
-    spec = spec_of(name, f"recipe {recipe.name!r}")
-    found = {slot: store.find(slot) for slot in spec.slots_for(options)}
-    files = [file for file in found.values() if file is not None]
-    if reason := _not_permitted([*spec.licences, *(file.file.licence for file in files)], licence):
-        return reason
-    if len(files) < len(found):
-        return Reason(Cause.NO_WEIGHTS, missing_files([slot for slot in found if found[slot] is None], store))
-    try:
-        if load and any(file.state is State.UNVERIFIED for file in files):
-            load_matcher(name, store, options, Placement())
-    except UserError as error:
-        return Reason(Cause.UNREADABLE, str(error))
-    return None
-
-
-def _not_permitted(tags: Iterable[str], licence: Licence) -> Reason | None:
-    others = sorted(set(tags) - PERMISSIVE_TAGS)
-    return Reason(Cause.NOT_PERMITTED, ", ".join(others)) if licence is Licence.PERMISSIVE and others else None
 
 
 def missing_files(slots: Iterable[str], store: WeightStore) -> str:
