@@ -8,7 +8,7 @@ import cv2
 import faulty
 import numpy as np
 import pytest
-from rectified import EXTRA, SWEEP, THREE_UNITS, RectifiedMatcher, run
+from rectified import SWEEP, THREE_UNITS, RectifiedMatcher, run
 from synthetic import RECIPE as SYNTHETIC
 from synthetic import SyntheticMatcher, synthetic_pairs
 
@@ -20,7 +20,7 @@ from mkpc_kaggle.engine.pools.pool import Pool
 from mkpc_kaggle.engine.scenes import Reconstruction, SceneJob, tracks_of
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.pipeline.pair import UnitResult
-from mkpc_kaggle.recipe import Recipe, Unit, UpgradeConfig
+from mkpc_kaggle.recipe import Recipe, Unit
 from mkpc_kaggle.reporting.report import report_page
 from mkpc_kaggle.reporting.run_log import read_log
 from mkpc_kaggle.reporting.sections import Artist
@@ -132,17 +132,6 @@ def test_a_reconstruction_that_hangs_costs_its_scene_and_the_next_batch_has_its_
     report = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work", timeouts=quick)
     assert [record.source for record in report.records] == ["pair"] * 7 + ["scene"] * 2
     assert [fault[:50] for fault in report.faults] == ["batch one was not reconstructed: it hung: no answe"]
-
-
-def test_a_batch_is_reconstructed_again_from_all_matches_when_pairs_of_it_got_more(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    fault(monkeypatch, "choose_scene_for_all_but_the_first")
-    recipe = replace(RECIPE, units=(SWEEP, EXTRA), upgrade=UpgradeConfig(100, uncertain=False))
-    matcher = RectifiedMatcher(matches=lambda brightness: 50 if brightness == 10 else 150)
-    report = run(batch_pairs(tmp_path / "images"), recipe, matcher, tmp_path / "work")
-    assert [len(record.units) for record in report.records] == [2, 2, 2, 1, 1, 1]
-    assert report.scenes[0].points == 3 * 2 * 50 + 3 * 150
 
 
 def test_a_run_reconstructs_the_true_cameras(tmp_path: Path) -> None:

@@ -93,7 +93,7 @@ def scenes_of(arguments: argparse.Namespace) -> bool | None:
 def assembly_of(arguments: argparse.Namespace, choice: "Choice") -> "Assembly":
     """The parts of a run, as the options of :func:`add_matching` say, but for the choice of the recipe."""
     from mkpc_kaggle.pipeline.assembly import assemble
-    from mkpc_kaggle.pipeline.obstacles import Licence
+    from mkpc_kaggle.pipeline.availability import Licence
 
     return assemble(
         choice.recipe,

@@ -111,9 +111,7 @@ def _time(log: RunLog, artist: Artist) -> Iterator[Block]:
     if rows:
         yield Table(("unit (means)", "pairs", "matches", "inliers", "seconds"), rows)
     if log.about.left_out:
-        yield Text(
-            f"Left out (weights missing or not permitted, or matcher unusable): {', '.join(log.about.left_out)}."
-        )
+        yield Text(f"Left out: {'; '.join(log.about.left_out)}.")
 
 
 def _budget(log: RunLog, artist: Artist) -> Iterator[Block]:
@@ -324,6 +322,6 @@ def _failures(log: RunLog) -> Iterator[Block]:
 def _origin(log: RunLog) -> Iterator[Block]:
     yield Table(("software", "version"), [*log.about.versions.items()])
     yield Table(("digest of", "SHA-256"), [*log.digests.items()])
-    units = ", ".join(unit.name + (" (extra)" if unit.extra else "") for unit in log.recipe.units)
+    units = ", ".join(unit.name for unit in log.recipe.units)
     yield Text(f"Units of the recipe, in order of importance: {units}.", dim=True)
     yield Text(f"Journal: {log.path}", dim=True)

@@ -7,21 +7,19 @@ from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.budget import format_duration
 from mkpc_kaggle.engine.engine import Ending, RunReport
 from mkpc_kaggle.engine.records import PairRecord, SceneRecord
-from mkpc_kaggle.recipe import Unit
 from mkpc_kaggle.reporting.run_log import RunLog
 from mkpc_kaggle.reporting.tables import RunTables, run_tables, seconds_by_part, unit_failures, unit_means
 
 MOST_LINES = 8
 
 
-def summary(pairs: Sequence[Pair], report: RunReport, left_out: Sequence[Unit] = ()) -> str:
+def summary(pairs: Sequence[Pair], report: RunReport, left_out: Sequence[str] = ()) -> str:
     """The screen that ends a run."""
     tables = run_tables(pairs, report.records)
     resumed = f", {report.resumed} of them from earlier runs" if report.resumed else ""
-    names = [unit.name for unit in left_out]
     lines = [_headline(tables, report.ending, report.seconds) + resumed, *_counts(tables)]
     lines += _scenes(tables, report.scenes)
-    lines += _upgrades(report.records) + _troubles(tables, names, report.faults)
+    lines += _upgrades(report.records) + _troubles(tables, left_out, report.faults)
     return "\n".join([*lines, *filter(None, [trouble(report)])])
 
 
@@ -118,8 +116,7 @@ def _troubles(tables: RunTables, left_out: Sequence[str], faults: Sequence[str])
     """What was left out, and what failed."""
     lines = []
     if left_out:
-        reasons = "weights missing or not permitted, or matcher unusable"
-        lines.append(f"units left out ({reasons}): {', '.join(left_out)}")
+        lines.append(f"left out, {'; '.join(left_out)} (get weights: python -m mkpc_kaggle weights fetch)")
     failed, first = tables.failed, tables.failed.head(MOST_LINES)
     lines += _list("pairs with the fallback row", list(first["id"] + ": " + first["failure"]), len(failed))
     lines += _list("units that failed", unit_failures(tables))

@@ -36,7 +36,7 @@ def pipeline_once(assembly: Assembly, marker: Path) -> Pipeline:
 
 def pipeline_in_batches(assembly: Assembly, batch: int) -> Pipeline:
     """As on a GPU."""
-    return Pipeline(assembly.recipe, assembly.matchers.__getitem__, batch=batch)
+    return Pipeline(assembly.recipe, assembly.matchers.__getitem__, minibatch=batch)
 
 
 def pipeline_telling_its_environment(assembly: Assembly, told: Path) -> Pipeline:
