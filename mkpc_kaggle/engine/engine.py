@@ -19,14 +19,14 @@ from mkpc_kaggle.engine.planner import Explanation, Planner
 from mkpc_kaggle.engine.pools.pool import Pool
 from mkpc_kaggle.engine.progress import progress_on
 from mkpc_kaggle.engine.records import PairRecord, SceneRecord
-from mkpc_kaggle.engine.scenes import SceneJob, SceneQueue, SceneResult, pairs_to_add, tracks_of
+from mkpc_kaggle.engine.scenes import SceneJob, SceneQueue, SceneResult, pairs_to_add
 from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.pipeline.pair import UnitResult
 from mkpc_kaggle.recipe import Recipe, Unit
-from mkpc_kaggle.scene.batch import BatchPair
 from mkpc_kaggle.scene.choose import Choice
-from mkpc_kaggle.scene.known_focals import KnownFocals
+from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair, tracks_of
 
 PUBLISH_SECONDS, PUBLISH_SHARE = 30.0, 0.05
 """How often the submission is written: at most that share of the time goes into it."""
@@ -252,20 +252,19 @@ class Engine:
     def _scene_job(self, batch: str) -> SceneJob:
         recipe = self.recipe
         assert recipe.scene is not None
-        known_focals = KnownFocals(recipe.magsac, recipe.focal, recipe.scene.focal_sigma) if recipe.focal else None
         found = tuple(index for index in self.scenes.batches[batch] if self.planner.records[index].units)
-        return SceneJob(batch, found, tuple(map(self._batch_pair, found)), recipe.scene, known_focals)
+        pairs = tuple(map(self._batch_pair, found))
+        return SceneJob(batch, found, pairs, recipe.scene, recipe.focal, recipe.magsac)
 
     def _batch_pair(self, index: int) -> BatchPair:
-        assert self.recipe.scene is not None
         record, results = self.planner.records[index], self._results(index)
         image0, image1 = self.pairs[index].images
         return BatchPair(
-            str(image0),
-            str(image1),
+            BatchImage(str(image0), "", Size(0, 0)),
+            BatchImage(str(image1), "", Size(0, 0)),
             Matches.concatenate(result.matches for result in results),
             None if record.failure else record.F,
-            tracks_of(results, self.recipe.scene.least_tracks),
+            tracks_of(results),
         )
 
     def _keep_scene(self, result: SceneResult) -> None:

@@ -10,7 +10,7 @@ from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL, Matrix3
 from mkpc_kaggle.pipeline.pair import PairMatch, Regions
 from mkpc_kaggle.recipe import Unit
 from mkpc_kaggle.scene.choose import Choice
-from mkpc_kaggle.scene.model import Scene
+from mkpc_kaggle.scene.reconstruction import Reconstruction
 
 NOT_REACHED = "not reached in time"
 MOST_POINTS = 300
@@ -181,17 +181,17 @@ class SceneRecord:
     cloud: tuple[list[float], ...] = ()
 
     @classmethod
-    def of(cls, batch: str, scenes: Sequence[Scene], seconds: float, failure: str) -> "SceneRecord":
+    def of(cls, batch: str, scenes: Sequence[Reconstruction], seconds: float, failure: str) -> "SceneRecord":
         models = sorted((model for scene in scenes for model in scene.models), key=lambda one: -len(one.images))
         cameras = tuple(
             CameraRecord(
-                image.name,
+                image.image.name,
                 number,
                 (-image.camera.R.T @ image.camera.t).tolist(),
                 image.camera.R[2].tolist(),
                 image.camera.R[1].tolist(),
                 image.focal,
-                list(image.size),
+                list(image.image.size),
                 image.points,
             )
             for number, model in enumerate(models)
@@ -201,7 +201,7 @@ class SceneRecord:
         return cls(
             batch,
             sum(len(scene.names) for scene in scenes),
-            sum(scene.placed for scene in scenes),
+            sum(scene.registered for scene in scenes),
             len(models),
             sum(len(model.points) for model in models),
             seconds,

@@ -4,22 +4,22 @@ A batch is taken up when all of its pairs are matched as far as time allows, and
 it got further matches since. Pairs have the F of their own matches all the while.
 """
 
+import hashlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.data.images import Image, Unreadable, read_image
 from mkpc_kaggle.engine.costs import Timeouts
-from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.pipeline.pair import UnitResult
-from mkpc_kaggle.scene.batch import BatchPair
+from mkpc_kaggle.geometry.focal_prior import FocalConfig
+from mkpc_kaggle.geometry.robust import RobustConfig
 from mkpc_kaggle.scene.choose import Choice
 from mkpc_kaggle.scene.config import SceneConfig
-from mkpc_kaggle.scene.known_focals import KnownFocals
-from mkpc_kaggle.scene.model import Scene
-from mkpc_kaggle.scene.unasked import unasked_pairs
+from mkpc_kaggle.scene.densify import extra_pairs
+from mkpc_kaggle.scene.reconstruction import Reconstruction as Scene
+from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair
 
 LEAST_PAIRS = 2
 """Of which three images can be connected."""
@@ -35,14 +35,16 @@ MARGIN = 1.5
 class SceneJob:
     """A batch to reconstruct; plain values, so that it can go to another process or machine.
 
-    ``indices`` are the places of its ``pairs`` in the run; their images go by the paths of their files.
+    ``indices`` are the places of its ``pairs`` in the run. Their images go by the paths of their files, and lack
+    digest and size until :func:`reconstruct` has read them.
     """
 
     batch: str
     indices: tuple[int, ...]
     pairs: tuple[BatchPair, ...]
     config: SceneConfig
-    known_focals: KnownFocals | None = None
+    focal: FocalConfig | None = None
+    magsac: RobustConfig | None = None
 
 
 SceneAnswer = tuple[tuple[Scene, ...], dict[int, Choice]]
@@ -60,26 +62,26 @@ class Reconstruction(Protocol):
 
 
 def reconstruct(job: SceneJob, read: Callable[[Path], Image | Unreadable] = read_image) -> SceneAnswer:
-    """Do a job, here; it may end the process, see :mod:`mkpc_kaggle.scene.reconstruct`."""
-    from mkpc_kaggle.scene.read import batch_of
-    from mkpc_kaggle.scene.solve import solve
+    """Do a job, here; it may end the process, see :mod:`mkpc_kaggle.scene.colmap`."""
+    from mkpc_kaggle.scene.reconstruct import reconstruct_batch
 
-    readable, batch = batch_of(job.pairs, read)
-    solution = solve(batch, job.config, job.known_focals)
-    indices = [job.indices[place] for place in readable]
-    return solution.scenes, dict(zip(indices, solution.choices, strict=True))
-
-
-def tracks_of(results: Sequence[UnitResult], least: int) -> dict[str, Matches]:
-    """The matches that a scene is made of, by their matchers: of units that make tracks, or all if few are."""
-    chosen = [result for result in results if result.unit.tracks]
-    if sum(len(result.matches) for result in chosen) < least:
-        chosen = list(results)
-    matchers = dict.fromkeys(result.unit.matcher for result in chosen)
-    return {
-        name: Matches.concatenate(result.matches for result in chosen if result.unit.matcher == name)
-        for name in matchers
+    names = dict.fromkeys(image.name for pair in job.pairs for image in (pair.image0, pair.image1))
+    known = {name: image for name in names if (image := described(Path(name), read)) is not None}
+    pairs = {
+        index: replace(pair, image0=known[pair.image0.name], image1=known[pair.image1.name])
+        for index, pair in zip(job.indices, job.pairs, strict=True)
+        if {pair.image0.name, pair.image1.name} <= known.keys()
     }
+    solution = reconstruct_batch(list(pairs.values()), job.config, job.focal, job.magsac)
+    return solution.reconstructions, dict(zip(pairs, solution.choices, strict=True))
+
+
+def described(path: Path, read: Callable[[Path], Image | Unreadable]) -> BatchImage | None:
+    """An image by the digest of its pixels; ``None`` where it cannot be read."""
+    image = read(path)
+    if not isinstance(image, Image):
+        return None
+    return BatchImage(str(path), hashlib.sha256(image.pixels.tobytes()).hexdigest(), image.size)
 
 
 def pairs_to_add(pairs: Sequence[Pair], config: SceneConfig | None) -> list[Pair]:
@@ -89,11 +91,9 @@ def pairs_to_add(pairs: Sequence[Pair], config: SceneConfig | None) -> list[Pair
         asked = [pairs[place] for place in places]
         files = list(dict.fromkeys(file for pair in asked for file in (pair.file0, pair.file1)))
         assert config is not None
-        if len(files) > config.most_images:  # to look for partners takes the square of their number
-            continue
         number = {file: place for place, file in enumerate(files)}
         ends = [(number[pair.file0], number[pair.file1]) for pair in asked]
-        found = [(files[i], files[j]) for i, j in unasked_pairs(len(files), ends, config.pairs_per_image)]
+        found = [(files[i], files[j]) for i, j in extra_pairs(len(files), ends, config.pairs_per_image)]
         added += [Pair(f"{batch};{Path(a).stem}-{Path(b).stem}", batch, a, b) for a, b in found]
     return added
 
