@@ -28,9 +28,9 @@ from mkpc_kaggle.evaluation.validate import error_of
 from mkpc_kaggle.geometry.focal_prior import FocalConfig, FocalPrior, estimate_with_prior
 from mkpc_kaggle.geometry.metrics import PoseError, pair_accuracy
 from mkpc_kaggle.geometry.robust import Estimate, Matrix3, RobustConfig, estimate
-from mkpc_kaggle.scene.batch import Batch, BatchImage, BatchPair
 from mkpc_kaggle.scene.config import SceneConfig
-from mkpc_kaggle.scene.solve import solve
+from mkpc_kaggle.scene.reconstruct import reconstruct_batch
+from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair
 
 MAGSAC = RobustConfig(permutations=1)
 FOCAL = FocalConfig()
@@ -96,25 +96,18 @@ def estimated(true: TruePair, found: SavedMatches, scene: TrainScene, names: Seq
     return Estimated(true, found, matrices, accuracies, seconds)
 
 
+def batch_pair(true: TruePair, found: SavedMatches, F: Matrix3 | None) -> BatchPair:
+    """A pair as a reconstruction is given it."""
+    ends = zip(true.pair.images, found.sizes, strict=True)
+    image0, image1 = (BatchImage(path.stem, path.stem, size) for path, size in ends)
+    return BatchPair(image0, image1, found.matches, F, found.tracks)
+
+
 def by_scene(pairs: Sequence[Estimated], scene: TrainScene) -> Score:
     """The accuracy of the pairs as one batch."""
-    images = {
-        path.stem: BatchImage(path.stem, path.stem, size)
-        for pair in pairs
-        for path, size in zip(pair.true.pair.images, pair.found.sizes, strict=True)
-    }
-    asked = [
-        BatchPair(
-            pair.true.pair.image0.stem,
-            pair.true.pair.image1.stem,
-            pair.found.matches,
-            pair.matrices["prior"],
-            pair.found.tracks,
-        )
-        for pair in pairs
-    ]
+    batch = [batch_pair(pair.true, pair.found, pair.matrices["prior"]) for pair in pairs]
     start = time.process_time()
-    choices = solve(Batch(tuple(images.values()), tuple(asked)), SceneConfig()).choices
+    choices = reconstruct_batch(batch, SceneConfig()).choices
     seconds = time.process_time() - start
     matrices = [
         pair.matrices["prior"] if choice.F is None else choice.F

@@ -31,7 +31,7 @@ from mkpc_kaggle.reporting.figures.canvas import (
     side_by_side,
 )
 from mkpc_kaggle.reporting.figures.pair import connect
-from mkpc_kaggle.scene.model import Scene
+from mkpc_kaggle.scene.reconstruction import Reconstruction
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -282,6 +282,6 @@ def _far_apart(points: Points, count: int) -> NDArray[np.intp]:
     return np.array(chosen, np.intp)
 
 
-def draw_scene(name: str, scenes: Sequence[Scene]) -> "Figure":
+def draw_scene(name: str, scenes: Sequence[Reconstruction]) -> "Figure":
     """The cameras and points of the largest model of a batch, from above and from the side."""
     return draw_cameras(SceneRecord.of(name, scenes, 0.0, ""))
