@@ -85,6 +85,14 @@ def test_a_number_of_pairs_below_one_is_refused(count: str, capsys: pytest.Captu
     assert "--pairs-per-scene: " in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(("text", "meant"), [("8h45", "8h45m"), ("1h30m20", "1h30m20s"), ("5m30", "5m30s")])
+def test_a_time_limit_whose_last_number_has_no_unit_is_refused(
+    text: str, meant: str, demo: DemoSet, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["submit", "--test-dir", str(demo.test_dir), "--time-limit", text]) == 2
+    assert f"write {meant}\n" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("covisibility", ["1.1", "nan"])
 def test_a_covisibility_that_no_pair_has_is_told(
     demo: DemoSet, covisibility: str, capsys: pytest.CaptureFixture[str]

@@ -11,10 +11,13 @@ from mkpc_kaggle.errors import UserError
 
 def parse_duration(text: str) -> float:
     """Seconds from ``8h45m``, ``90m``, ``60s`` or plain seconds; raises :class:`UserError` for anything else."""
-    parts = re.fullmatch(r"(?:(\d+)h)?(?:(\d+)m)?(?:(\d+(?:\.\d+)?)s?)?", text.strip())
+    parts = re.fullmatch(r"(?:(\d+)h)?(?:(\d+)m)?(?:(\d+(?:\.\d+)?)(s?))?", text.strip())
     if parts is None or not any(parts.groups()):
         raise UserError(f"{text!r} is no duration; write it as 8h45m, 90m, 60s or a number of seconds")
-    hours, minutes, seconds = (float(part or 0) for part in parts.groups())
+    if parts[3] and not parts[4] and (parts[1] or parts[2]):
+        unit = "s" if parts[2] else "m"
+        raise UserError(f"{text!r} does not say what {parts[3]} counts; write {text.strip()}{unit}")
+    hours, minutes, seconds = (float(part or 0) for part in parts.groups()[:3])
     if hours + minutes + seconds == 0:
         raise UserError("a time limit of nothing leaves no time to work")
     return hours * 3600 + minutes * 60 + seconds
