@@ -32,7 +32,6 @@ def run(arguments: argparse.Namespace) -> int:
     from mkpc_kaggle.data.competition import read_test_side
     from mkpc_kaggle.reporting.report import write_report
     from mkpc_kaggle.reporting.run_log import read_log, write_csv, write_json
-    from mkpc_kaggle.reporting.sections import Artist
     from mkpc_kaggle.reporting.summary import overview
 
     files = {"--json": arguments.json, "--report": arguments.report}
@@ -46,7 +45,7 @@ def run(arguments: argparse.Namespace) -> int:
         print(arguments.json)
     if arguments.report is not None:
         pairs = read_test_side(arguments.test_dir) if arguments.test_dir is not None else ()
-        write_report(log, arguments.report, Artist(pairs))
+        write_report(log, arguments.report, pairs)
         print(arguments.report)
     if arguments.csv is None and arguments.json is None and arguments.report is None:
         print(overview(log))

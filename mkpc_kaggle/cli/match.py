@@ -20,7 +20,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher, to_image
-    from mkpc_kaggle.reporting import figures
+    from mkpc_kaggle.reporting.figures.pair import draw_pair
+    from mkpc_kaggle.reporting.figures.style import save
 
     options.require_apart({"--out": arguments.out}, None, [arguments.image0, arguments.image1])
     images = to_image(arguments.image0), to_image(arguments.image1)
@@ -44,6 +45,6 @@ def run(arguments: argparse.Namespace) -> int:
         box = region.box
         print(f"image {number}: {region.reason}, x {box.left}..{box.right - 1}, y {box.top}..{box.bottom - 1}")
     if arguments.out is not None:
-        figures.save(figures.draw_pair(*images, match, matcher.recipe.mkpc), arguments.out)
+        save(draw_pair(*images, match, matcher.recipe.mkpc), arguments.out)
         print(f"figure: {arguments.out}")
     return 0
