@@ -10,7 +10,7 @@ class UserError(Exception):
 
 @contextmanager
 def writing(what: str) -> Iterator[None]:
-    """Write ``what``, a file by its name or option; an ``OSError`` becomes the :class:`UserError` that names it."""
+    """Write the file that ``what`` names; an ``OSError`` becomes a :class:`UserError` that says so."""
     try:
         yield
     except OSError as error:

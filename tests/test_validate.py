@@ -148,7 +148,7 @@ def test_a_work_directory_keeps_the_journal_and_a_report_that_shows_the_pairs(
     assert main([*arguments, "--work-dir", str(tmp_path / "work")]) == 0
     page = tmp_path / "work" / "report.html"
     assert f"report: {page}" in capsys.readouterr().out
-    assert page.read_text(encoding="utf-8").count("<img ") == 2
+    assert page.read_text(encoding="utf-8").count("<img ") == 2 + 1
     assert len(read_log(tmp_path / "work").pairs) == 2
 
 

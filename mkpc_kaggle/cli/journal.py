@@ -37,16 +37,13 @@ def run(arguments: argparse.Namespace) -> int:
     files = {"--json": arguments.json, "--report": arguments.report}
     options.require_apart(files, arguments.work_dir, [])
     log = read_log(arguments.work_dir)
-    if arguments.csv is not None:
-        for path in write_csv(log, arguments.csv):
-            print(path)
+    written = write_csv(log, arguments.csv) if arguments.csv is not None else []
     if arguments.json is not None:
         write_json(log, arguments.json)
-        print(arguments.json)
+        written.append(arguments.json)
     if arguments.report is not None:
         pairs = read_test_side(arguments.test_dir) if arguments.test_dir is not None else ()
         write_report(log, arguments.report, pairs)
-        print(arguments.report)
-    if arguments.csv is None and arguments.json is None and arguments.report is None:
-        print(overview(log))
+        written.append(arguments.report)
+    print("\n".join(map(str, written)) or overview(log))
     return 0

@@ -7,7 +7,7 @@ from mkpc_kaggle.cli import options
 HELP = """\
 List the recipes: their units in order of importance, and which weight files are missing. A unit reads
 stage:matcher@size, where the size is the view's long side, or the height x width whose area the view gets at
-its own aspect ("!": that height and width themselves; "~": mirrored), and the most matches that are kept.
+its own aspect ("!": that height and width themselves), and the most matches that are kept.
 A recipe of your own is a TOML file of the form of those in the package: --recipe FILE.toml.
 """
 
@@ -27,9 +27,8 @@ def run(arguments: argparse.Namespace) -> int:
         recipe = load_recipe(name)
         print(f"{name}: {recipe.description}")
         for unit in recipe.units:
-            extra = "  (extra: for weak pairs, if time is left)" if unit.extra else ""
             fallback = f"  (or {unit.fallback}, where its weights are missing)" if unit.fallback else ""
-            print(f"    {unit.name}  at most {unit.max_matches}{extra}{fallback}")
+            print(f"    {unit.name}  at most {unit.max_matches}{fallback}")
         for one in unusable(recipe.matcher_names):
             print(f"    {one}")
         missing = [slot for slot in slots_of_recipe(recipe) if store.find(slot) is None]

@@ -67,12 +67,10 @@ def run(arguments: argparse.Namespace) -> int:
         )
         report, at_rest = submit(pairs, assembly, session, output)
         watchdog.status = int(bool(report.unwritten or trouble(report)))
-        if arguments.explain:
-            print("\n".join(["plan:", *map(str, report.explanations)]))
-        print(summary(pairs, report, assembly.left_out))
-        print(
-            f"submission: {output}" + (f" is not the last version: {report.unwritten}" if report.unwritten else "")
-        )
+        explained = ["plan:", *map(str, report.explanations)] if arguments.explain else []
+        unwritten = f" is not the last version: {report.unwritten}" if report.unwritten else ""
+        told = [*explained, summary(pairs, report, assembly.left_out), f"submission: {output}{unwritten}"]
+        print("\n".join(told), flush=True)  # the watchdog may end the program while it draws
         if not arguments.no_report:
             print(report_run(work_dir, page, session.must_end(), pairs), flush=True)
         return finish(128 + interrupt.signal if interrupt.signal else watchdog.status, at_rest=at_rest)
