@@ -132,13 +132,20 @@ def test_each_step_of_the_estimate_has_a_column(
 
 
 @pytest.mark.parametrize(
-    ("mode", "stages"), [("stage-1", {"1"}), ("whole-images", {"1"}), ("two-stage", {"1", "2"})]
+    ("options", "units"),
+    [
+        (["--mode", "stage-1"], {"1:sift@320"}),
+        (["--mode", "whole-images", "--units", "1:sift@400"], {"1:sift@400"}),
+    ],
 )
-def test_modes_change_the_stages(demo: DemoSet, recipe: Path, tmp_path: Path, mode: str, stages: set[str]) -> None:
+def test_modes_and_units_change_what_is_run(
+    demo: DemoSet, recipe: Path, tmp_path: Path, options: list[str], units: set[str]
+) -> None:
     out = tmp_path / "scores.json"
-    arguments = ["validate", "--train-dir", str(demo.train_dir), "--pairs-per-scene", "1", "--mode", mode]
+    arguments = ["validate", "--train-dir", str(demo.train_dir), "--pairs-per-scene", "1", *options]
     assert main([*arguments, "--recipe", str(recipe), "--json", str(out)]) == 0
-    assert set(json.loads(out.read_text())["inliers_by_stage"]) == stages
+    (pair,) = json.loads(out.read_text())["scenes"][0]["pairs"]
+    assert set(pair["matches"]) == units
 
 
 def test_a_work_directory_keeps_the_journal_and_a_report_that_shows_the_pairs(
@@ -201,14 +208,6 @@ def test_the_table_has_a_row_a_scene_and_their_mean(demo: DemoSet, tmp_path: Pat
     lines = score_table(scored)
     assert [line.split()[0] for line in lines] == ["scene", "courtyard", "mean"]
     assert lines[1].split()[1:3] == ["8", "1.0000"]
-
-
-def test_some_of_a_recipes_units(demo: DemoSet, recipe: Path, tmp_path: Path) -> None:
-    out = tmp_path / "scores.json"
-    arguments = ["validate", "--train-dir", str(demo.train_dir), "--pairs-per-scene", "1", "--recipe", str(recipe)]
-    assert main([*arguments, "--units", "1:sift@320", "--json", str(out)]) == 0
-    (pair,) = json.loads(out.read_text())["scenes"][0]["pairs"]
-    assert set(pair["matches"]) == {"1:sift@320"}
 
 
 def test_an_unknown_unit_is_told_with_the_known_ones(

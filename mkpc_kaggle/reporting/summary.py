@@ -1,5 +1,6 @@
 """One screen of summary: what a run did, what it cost, and which pairs it could not help."""
 
+import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 
@@ -60,13 +61,10 @@ def _error(record: PairRecord) -> str:
     return next((unit.failure for unit in record.units if unit.failure and not unit.matches), "")
 
 
-def left_out_line(units: Sequence[str]) -> str:
+def left_out_line(left_out: Sequence[str]) -> str:
     """Which matchers of the recipe had to be left out, from the names of their units; empty if all are there."""
-    matchers = dict.fromkeys(unit.partition(":")[2].partition("@")[0] or unit for unit in units)
-    if not matchers:
-        return ""
-    where = "`python -m mkpc_kaggle weights list` says what each needs"
-    return f"left out, no weights or not permitted: {', '.join(matchers)}; {where}"
+    matchers = dict.fromkeys(re.sub(r"^\d:(.*)@.*", r"\1", name) for name in left_out)
+    return f"left out: {', '.join(matchers)}; `python -m mkpc_kaggle weights list` says why" if matchers else ""
 
 
 def _lines(tables: RunTables, run: RunReport | RunLog, left_out: Sequence[str]) -> list[str]:

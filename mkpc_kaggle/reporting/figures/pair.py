@@ -95,7 +95,7 @@ def _draw_clusters(axes: "Axes", image: Image, match: PairMatch, config: MkpcCon
     share = region.box.area / (image.size.width * image.size.height)
     axes.set_title(
         f"critical region: {region.reason}, {100 * share:.0f} % of the image\n"
-        f"{region.kept} of {region.clusters} clusters kept; grey crosses: noise and dropped clusters",
+        f"{region.kept} of {region.clusters} clusters kept, grey: the other points",
         loc="left",
     )
 

@@ -57,8 +57,10 @@ def draw_errors(validations: Sequence["Validation"]) -> "Figure":
     """Two panels: the share of pairs whose rotation, and whose translation, is less than x off."""
     figure = new_figure(9, 4.2)
     for axes, (kind, unit, thresholds, limits) in zip(figure.subplots(1, 2, sharey=True), PANELS, strict=True):
-        plain(axes, f"pairs whose {kind} is less than x off; grey: the thresholds of the mAA")
-        axes.axvspan(thresholds[0], thresholds[-1], color=DROPPED, alpha=0.2, linewidth=0)
+        plain(axes, f"pairs whose {kind} is less than x off")
+        axes.axvspan(
+            thresholds[0], thresholds[-1], color=DROPPED, alpha=0.2, linewidth=0, label="mAA's thresholds"
+        )
         for place, validation in enumerate(validations):
             # Failures are infinite: they go beyond the right edge, so that their curve ends below 1.
             errors = np.clip([getattr(error, kind) for error in validation.errors], limits[0], 2 * limits[1])
