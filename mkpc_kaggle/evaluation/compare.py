@@ -16,8 +16,6 @@ from mkpc_kaggle.geometry.metrics import PoseError, pair_accuracy
 LEVEL = 0.95
 RESAMPLES = 10_000
 
-Values = Sequence[float] | NDArray[np.float64]
-
 
 @dataclass(frozen=True)
 class Difference:
@@ -31,7 +29,7 @@ class Difference:
         return f"{self.gain:+z.4f} [{self.low:+z.4f}, {self.high:+z.4f}]"
 
 
-def paired_difference(scenes: Sequence[tuple[Values, Values]], *, seed: int = 0) -> Difference:
+def paired_difference(scenes: Sequence[tuple[Sequence[float], Sequence[float]]], *, seed: int = 0) -> Difference:
     """The mean over scenes of the mean gain on a pair, from the pairs' values under the first and second recipe.
 
     Both values of a pair have the same index. The interval is the percentile bootstrap's: the pairs of each
@@ -41,8 +39,7 @@ def paired_difference(scenes: Sequence[tuple[Values, Values]], *, seed: int = 0)
     Source: Efron and Tibshirani, An Introduction to the Bootstrap, 13.3.
     """
     if not scenes or any(len(first) != len(second) or not len(first) for first, second in scenes):
-        counts = [(len(first), len(second)) for first, second in scenes]
-        raise ValueError(f"a comparison needs scenes with the same pairs under both recipes, not {counts} pairs")
+        raise ValueError("a comparison needs scenes, and each with the same pairs under both recipes")
     generator = np.random.default_rng(seed)
     gains = [np.asarray(second, np.float64) - np.asarray(first, np.float64) for first, second in scenes]
     means = np.mean([_means_of_resamples(gain, generator) for gain in gains], axis=0)
@@ -109,9 +106,7 @@ def comparison_table(comparison: Comparison) -> list[str]:
 
 def step_gains(validation: Validation) -> list[str]:
     """Lines: the gain of mAA, as the mean over scenes, of each step over the one before; none without metres."""
-    scenes = [scene for scene in validation.scenes if scene.pairs]
-    if not scenes or not all(scene.in_metres for scene in scenes):
-        return []
+    scenes = [scene for scene in validation.scenes if scene.pairs and scene.in_metres]
     after = {
         step: [_accuracies(pair.steps[step] for pair in scene.pairs) for scene in scenes]
         for step in validation.steps
@@ -120,6 +115,7 @@ def step_gains(validation: Validation) -> list[str]:
         f"gain of {step} over the step before, {LEVEL:.0%} interval: "
         f"{paired_difference([*zip(after[former], after[step], strict=True)])}"
         for former, step in pairwise(validation.steps)
+        if scenes
     ]
 
 
