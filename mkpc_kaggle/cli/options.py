@@ -29,7 +29,7 @@ def add_matching(parser: argparse.ArgumentParser) -> None:
         "--licence",
         choices=["any", "permissive"],
         default="any",
-        help="permissive: use no weights but those under Apache-2.0, BSD-3-Clause or MIT; recipe auto then leaves "
+        help="permissive: use weights under Apache-2.0, BSD-3-Clause or MIT only; recipe auto then leaves "
         "the others out, units with a fallback take it, any other recipe that has them is refused (default: any)",
     )
     parser.add_argument(
@@ -126,7 +126,7 @@ def workers(text: str) -> int | RayCluster:
 def at_least_1(text: str) -> int:
     """A count of something."""
     if not text.isdecimal() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"{text!r} is no number of 1 or more")
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number of 1 or more")
     return int(text)
 
 

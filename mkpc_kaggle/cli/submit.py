@@ -6,7 +6,7 @@ from pathlib import Path
 from mkpc_kaggle.cli import finish, options
 
 HELP = """\
-Match every pair of test.csv and write one fundamental matrix a row.
+Match every pair of test.csv and write its fundamental matrix, a row for each pair.
 
 submission.csv is complete from the start: pairs that were not reached hold a fallback matrix, and every later
 version is better. Killed at any point, the same command goes on where it was (its journal lies in the work
@@ -14,7 +14,8 @@ directory). Ctrl-C and SIGTERM end the run early with a valid file.
 
 Exit status: 0 done, or the time was up; 1 the run failed (no worker was left, or errors left most pairs without
 an F), or the last version of the file could not be written (a full disk, say, or a limit too short for the table):
-an earlier one, if there was time for it, is whole; 2 bad input; 130 or 143 ended by a signal (the file is whole).
+an earlier version, if there was time for it, is whole; 2 bad input; 130 or 143 ended by a signal (the file is
+whole).
 """
 
 

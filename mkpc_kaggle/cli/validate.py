@@ -74,8 +74,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--work-dir",
         type=Path,
         metavar="DIR",
-        help="keep the journal there (with --compare one a recipe) and go on from it; report.html beside it shows "
-        "the run (not with --pairs); default: a temporary one",
+        help="keep the journal there (with --compare, a journal for each recipe) and go on from it; report.html "
+        "beside it shows the run (not with --pairs); default: a temporary directory",
     )
     parser.add_argument(
         "--submission",
@@ -84,7 +84,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="CSV",
         help="score it and match nothing; may be repeated",
     )
-    parser.add_argument("--truth", type=Path, metavar="CSV", help="which pairs its samples are (demo writes one)")
+    parser.add_argument(
+        "--truth", type=Path, metavar="CSV", help="which pairs its samples are (`demo` writes such a table)"
+    )
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -138,7 +140,7 @@ def _score_submissions(arguments: argparse.Namespace, scenes: "tuple[Scene, ...]
 
 
 def _match_and_score(arguments: argparse.Namespace, scenes: "tuple[Scene, ...]", work_dir: Path) -> int:
-    """Run one recipe, or several to compare; with several, each has a journal in a directory of its own."""
+    """Run a recipe, or several to compare, each then with a journal in a directory of its own."""
     from mkpc_kaggle.engine.engine import Ending
     from mkpc_kaggle.engine.session import interruptible
     from mkpc_kaggle.evaluation.compare import Comparison, comparison_json, comparison_table

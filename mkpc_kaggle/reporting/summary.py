@@ -36,7 +36,7 @@ def headline(tables: RunTables, run: RunReport | RunLog) -> str:
 
 
 def trouble(run: RunReport | RunLog) -> str:
-    """Why a run is no success, though its file is whole; empty if it is a success.
+    """Why a run failed, though its file is whole; empty if it did not fail.
 
     Pairs without an F count if the reason is an error, be it of a unit that found nothing. They do not count if
     the matches or the time did not suffice.

@@ -25,7 +25,7 @@ PANELS = (  # what draw_errors draws: kind, unit, thresholds of the mAA, limits 
 
 
 def draw_scores(validations: Sequence["Validation"]) -> "Figure":
-    """A row for each scene and one for their mean, a mark for each recipe: its mAA."""
+    """A row for each scene and for their mean, a mark for each recipe: its mAA."""
     figure, axes = _rows([scene.scene for scene in validations[0].scenes], "mAA of each scene, by recipe")
     for place, validation in enumerate(validations):
         values = [*(scene.maa for scene in validation.scenes), validation.maa]
@@ -37,7 +37,7 @@ def draw_scores(validations: Sequence["Validation"]) -> "Figure":
 
 
 def draw_gains(comparison: "Comparison") -> "Figure":
-    """A row for each scene and one for their mean: what each recipe gains over the first, with its interval."""
+    """A row for each scene and for their mean: what each recipe gains over the first, with its interval."""
     first, *others = comparison.validations
     figure, axes = _rows(comparison.scenes, f"gain of mAA over {first.recipe}, with 95 % intervals")
     for place, other in enumerate(others):
@@ -86,7 +86,7 @@ def _rows(scenes: Sequence[str], title: str) -> "tuple[Figure, Axes]":
 
 
 def _beside(rows: int, place: int, places: int) -> NDArray[np.float64]:
-    """(rows,) heights of the marks at one of several places that share each row."""
+    """(rows,) heights of the marks of a recipe, at ``place`` of the ``places`` that share each row."""
     return np.arange(rows, dtype=np.float64) + 0.5 * ((place + 0.5) / places - 0.5)
 
 
