@@ -38,8 +38,7 @@ def headline(tables: RunTables, run: RunReport | RunLog) -> str:
 def trouble(run: RunReport | RunLog) -> str:
     """Why a run failed, though its file is whole; empty if it did not fail.
 
-    Pairs without an F count if the reason is an error, be it of a unit that found nothing. They do not count if
-    the matches or the time did not suffice.
+    Pairs without an F count if an error is the reason, and not if the matches or the time did not suffice.
     """
     if run.ending == Ending.NO_WORKER:
         return f"the run failed: {run.ending}, the faults say why; the same command goes on"

@@ -21,9 +21,8 @@ SECONDS = {  # what the parts of a pair's work are called; MAGSAC runs beside th
 }
 _COLUMNS = {"failure": object, "source": object, "matches": int, "inliers": int} | dict.fromkeys(SECONDS, float)
 _UNIT_COLUMNS = {"pair": int, **UnitRecord.__annotations__}
-_REGION_COLUMNS = dict.fromkeys(("pair", "image", "left", "top", "right", "bottom"), int) | {
-    **{"reason": str, "clusters": int, "kept": int}
-}
+_BOX_COLUMNS = dict.fromkeys(("pair", "image", "left", "top", "right", "bottom"), int)
+_REGION_COLUMNS = {**_BOX_COLUMNS, "reason": str, "clusters": int, "kept": int}
 
 
 @dataclass(frozen=True, eq=False)
