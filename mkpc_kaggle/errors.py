@@ -1,6 +1,8 @@
 """Errors and warnings for the user, told so that the user can mend the cause."""
 
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cache
 
 
@@ -12,3 +14,12 @@ class UserError(Exception):
 def warn_once(message: str) -> None:
     """Warn, unless this process has given the same warning before."""
     warnings.warn(message, stacklevel=3)
+
+
+@contextmanager
+def writing(what: str) -> Iterator[None]:
+    """Write the file that ``what`` names; an ``OSError`` becomes a :class:`UserError` that says so."""
+    try:
+        yield
+    except OSError as error:
+        raise UserError(f"{what} cannot be written: {error.strerror}") from error

@@ -10,7 +10,6 @@ import warnings
 from collections.abc import Sequence
 from importlib import import_module
 from io import TextIOWrapper
-from typing import TextIO
 
 from mkpc_kaggle import __version__
 from mkpc_kaggle.errors import UserError
@@ -44,10 +43,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     started = time.monotonic()
     for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, TextIOWrapper):  # paths and ids may be of letters that the terminal has not
+        if isinstance(stream, TextIOWrapper):  # paths and ids may have letters that the terminal lacks
             stream.reconfigure(errors="backslashreplace")
     with warnings.catch_warnings():
-        warnings.showwarning = _show_warning
+        warnings.showwarning = lambda message, *_, **__: print(f"warning: {message}", file=sys.stderr)
         try:
             parsed = make_parser().parse_args(arguments)
             parsed.started = started
@@ -100,15 +99,3 @@ def finish(status: int, *, at_rest: bool) -> int:
         sys.stderr.flush()
         leave(status)
     return status
-
-
-def _show_warning(
-    message: Warning | str,
-    category: type[Warning],
-    filename: str,
-    lineno: int,
-    file: TextIO | None = None,
-    line: str | None = None,
-) -> None:
-    """Prints the message without the line of code that it came from."""
-    print(f"warning: {message}", file=sys.stderr)

@@ -6,7 +6,7 @@ from pathlib import Path
 from mkpc_kaggle.cli import finish, options
 
 HELP = """\
-Match every pair of test.csv and write one fundamental matrix a row.
+Match every pair of test.csv and write its fundamental matrix, a row for each pair.
 
 submission.csv is complete from the start: pairs that were not reached hold a fallback matrix, and every later
 version is better. Killed at any point, the same command goes on where it was (its journal lies in the work
@@ -14,7 +14,8 @@ directory). Ctrl-C and SIGTERM end the run early with a valid file.
 
 Exit status: 0 done, or the time was up; 1 the run failed (no worker was left, or errors left most pairs without
 an F), or the last version of the file could not be written (a full disk, say, or a limit too short for the table):
-an earlier one, if there was time for it, is whole; 2 bad input; 130 or 143 ended by a signal (the file is whole).
+an earlier version, if there was time for it, is whole; 2 bad input; 130 or 143 ended by a signal (the file is
+whole).
 """
 
 
@@ -68,12 +69,10 @@ def run(arguments: argparse.Namespace) -> int:
         )
         report, at_rest = submit(pairs, assembly, session, output)
         watchdog.status = int(bool(report.unwritten or trouble(report)))
-        if arguments.explain:
-            print("\n".join(["plan:", *map(str, report.explanations)]))
-        print(summary(pairs, report, assembly.left_out))
-        print(
-            f"submission: {output}" + (f" is not the last version: {report.unwritten}" if report.unwritten else "")
-        )
+        explained = ["plan:", *map(str, report.explanations)] if arguments.explain else []
+        unwritten = f" is not the last version: {report.unwritten}" if report.unwritten else ""
+        told = [*explained, summary(pairs, report, assembly.left_out), f"submission: {output}{unwritten}"]
+        print("\n".join(told), flush=True)  # the watchdog may end the program while it draws
         if not arguments.no_report:
             print(report_run(work_dir, page, session.must_end(), pairs), flush=True)
         return finish(128 + interrupt.signal if interrupt.signal else watchdog.status, at_rest=at_rest)
