@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mkpc_kaggle.engine.budget import Budget, monotonic_of, parse_duration
-from mkpc_kaggle.engine.pools.cluster import RayCluster, parse_workers
 from mkpc_kaggle.errors import UserError
 
 if TYPE_CHECKING:
+    from mkpc_kaggle.engine.cluster import RayCluster
     from mkpc_kaggle.pipeline.assembly import Assembly
     from mkpc_kaggle.recipe import Choice
 
@@ -115,8 +115,10 @@ def add_engine(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--explain", action="store_true", help="say at the end what was planned when, and why")
 
 
-def workers(text: str) -> int | RayCluster:
+def workers(text: str) -> "int | RayCluster":
     """A number of worker processes, or the cluster to work on."""
+    from mkpc_kaggle.engine.cluster import parse_workers
+
     try:
         return parse_workers(text)
     except ValueError as error:

@@ -8,7 +8,7 @@ HELP = """\
 List the recipes: their units in order of importance, and which weight files are missing. A unit reads
 stage:matcher@size, where the size is the view's long side, or the height x width whose area the view gets at
 its own aspect ("!": that height and width themselves), and the most matches that are kept.
-A recipe of your own is a TOML file of the same form as the package's: --recipe FILE.toml.
+A recipe of your own is a TOML file of the form of those in the package: --recipe FILE.toml.
 """
 
 
@@ -30,8 +30,9 @@ def run(arguments: argparse.Namespace) -> int:
         for unit in recipe.units:
             fallback = f"  (or {unit.fallback}, where its weights are missing)" if unit.fallback else ""
             print(f"    {unit.name}  at most {unit.max_matches}{fallback}")
-        for reason in unusable(recipe.matcher_names):
-            print(f"    {reason}")
-        missing = [slot for slot in slots_of_recipe(recipe) if store.find(slot) is None]
-        print(f"    missing: {what_is_missing(missing, store)}" if missing else "    all weights are there")
+        for matcher in map(find_matcher, recipe.matcher_names):
+            if isinstance(matcher, Unusable):
+                print(f"    {matcher}")
+        missing = [slot for slot in slots_of(recipe) if store.find(slot) is None]
+        print(f"    missing: {missing_files(missing, store)}" if missing else "    all weights are there")
     return 0

@@ -7,11 +7,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mkpc_kaggle.cli import finish, options
+from mkpc_kaggle.cli import options
+from mkpc_kaggle.engine.console import say
 from mkpc_kaggle.errors import UserError, writing
 
 if TYPE_CHECKING:
-    from mkpc_kaggle.data.competition import Scene
+    from mkpc_kaggle.data.competition import TrainScene
     from mkpc_kaggle.engine.session import Interrupt
     from mkpc_kaggle.evaluation.validate import Validation
     from mkpc_kaggle.pipeline.assembly import Assembly
@@ -131,15 +132,15 @@ def _read_scenes(arguments: argparse.Namespace, work_dir: Path) -> "tuple[TrainS
     )
 
 
-def _score_submissions(arguments: argparse.Namespace, scenes: "tuple[Scene, ...]") -> int:
+def _score_submissions(arguments: argparse.Namespace, scenes: "tuple[TrainScene, ...]") -> int:
     from mkpc_kaggle.evaluation.validate import score_submission, score_table
 
     for submission in arguments.submission:
-        print("\n".join([str(submission), *score_table(score_submission(submission, arguments.truth, scenes))]))
+        say("\n".join([str(submission), *score_table(score_submission(submission, arguments.truth, scenes))]))
     return 0
 
 
-def _match_and_score(arguments: argparse.Namespace, scenes: "tuple[Scene, ...]", work_dir: Path) -> int:
+def _match_and_score(arguments: argparse.Namespace, scenes: "tuple[TrainScene, ...]", work_dir: Path) -> int:
     """Run a recipe, or several to compare, each then with a journal in a directory of its own."""
     from mkpc_kaggle.engine.engine import Ending
     from mkpc_kaggle.engine.session import interruptible
@@ -156,32 +157,32 @@ def _match_and_score(arguments: argparse.Namespace, scenes: "tuple[Scene, ...]",
         assemblies = [_assemble(arguments, choice) for choice in choices]
         for choice, assembly in zip(choices, assemblies, strict=True):
             place = work_dir / choice.folder if compared else work_dir
-            validation, at_rest = _validate(arguments, scenes, assembly, place, interrupt)
+            validation = _validate(arguments, scenes, assembly, place, interrupt)
             validations.append(validation)
             assert validation.report is not None
             status = 128 + interrupt.signal if interrupt.signal else int(bool(trouble(validation.report)))
             if compared and validation.report.ending != Ending.COMPLETE:
-                print("nothing is compared before all is done; with a --work-dir, the same command goes on")
-                return finish(status or 1, at_rest=at_rest)
+                say("nothing is compared before all is done; with a --work-dir, the same command goes on")
+                return status or 1
     figures = to_json(validations[0])
     if compared:
         comparison, status = Comparison(tuple(validations)), 0
-        print("\n".join(["", *comparison_table(comparison)]))
+        say("\n".join(["", *comparison_table(comparison)]))
         figures = comparison_json(comparison)
     if arguments.json is not None:
         with writing(f"--json {arguments.json}"):
             arguments.json.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
-    return finish(status, at_rest=at_rest)
+    return status
 
 
 def _validate(
     arguments: argparse.Namespace,
-    scenes: "tuple[Scene, ...]",
+    scenes: "tuple[TrainScene, ...]",
     assembly: "Assembly",
     work_dir: Path,
     interrupt: "Interrupt",
-) -> "tuple[Validation, bool]":
-    """Run a recipe and print its summary and its scores; also whether every thread has stopped."""
+) -> "Validation":
+    """Run a recipe and print its summary and its scores."""
     from mkpc_kaggle.engine.session import Session
     from mkpc_kaggle.evaluation.compare import step_gains
     from mkpc_kaggle.evaluation.validate import score_table, validate
@@ -189,16 +190,16 @@ def _validate(
     from mkpc_kaggle.reporting.summary import summary
 
     session = Session(work_dir, options.budget_of(arguments), interrupt, workers=arguments.workers)
-    validation, at_rest = validate(scenes, assembly, session)
+    validation = validate(scenes, assembly, session)
     pairs = [true.pair for scene in scenes for true in scene.pairs]
     assert validation.report is not None
     explained = ["plan:", *map(str, validation.report.explanations)] if arguments.explain else []
     told = [*explained, summary(pairs, validation.report, assembly.left_out), "", f"recipe {validation.recipe}"]
-    print("\n".join([*told, *score_table(validation), *step_gains(validation)]), flush=True)
+    say("\n".join([*told, *score_table(validation), *step_gains(validation)]))
     # The report's inliers are of F: there is none for a list of pairs, whose E is estimated.
     if arguments.work_dir is not None and arguments.pairs is None:
-        print(report_run(work_dir, work_dir / "report.html", session.must_end(), pairs), flush=True)
-    return validation, at_rest
+        say(report_run(work_dir, work_dir / "report.html", session.must_end(), pairs))
+    return validation
 
 
 def _assemble(arguments: argparse.Namespace, choice: "Choice") -> "Assembly":

@@ -139,7 +139,7 @@ class RaySite:
         return Place(name, partial(self._worker, make, **where))
 
     def _worker(self, make: Callable[[], Runner], **where: Any) -> "RayWorker":
-        paths = tuple(found.path for found in self._assembly.weight_files.values())
+        paths = self._assembly.weight_paths
         return RayWorker(make, where, paths, self._coming)
 
 

@@ -4,17 +4,18 @@ A terminal may go away (EIO), a pipe lose its reader, a disk be full, or a strea
 goes on, and its files tell what happened.
 """
 
+import multiprocessing
 import os
 import sys
 from collections.abc import Callable
 from contextlib import suppress
 from math import isfinite
-from typing import Any, TextIO
+from typing import Any, NoReturn, TextIO
 
 from tqdm import tqdm
 
+from mkpc_kaggle.data.outputs import discard_parts
 from mkpc_kaggle.engine.budget import Budget, format_duration
-from mkpc_kaggle.engine.jobs import Phase
 
 LINE_INTERVAL_S = 30.0  # between lines of progress where a line cannot be drawn again
 
@@ -40,6 +41,18 @@ def _print(text: str, stream: TextIO | None) -> None:
             print(text, file=stream, flush=True)
 
 
+def leave(status: int) -> NoReturn:
+    """End the process at once, and its children, one that was stopped (SIGSTOP) among them."""
+    discard_parts()
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(OSError, ValueError):
+            if stream is not None:
+                stream.flush()
+    for child in multiprocessing.active_children():
+        child.kill()
+    os._exit(status)
+
+
 def redraws(stream: TextIO) -> bool:
     """Whether a line on the stream can be drawn again.
 
@@ -55,12 +68,12 @@ class Progress:
     def __init__(self, budget: Budget, stream: TextIO | None = None) -> None:
         self._budget = budget
         self._stream = stream or sys.stderr
-        self._phase: Phase | None = None
+        self._phase = ""
         self._bar: tqdm[Any] | None = None
         self._waiting = ""
         self._written = budget.clock()
 
-    def show(self, phase: Phase, done: int, total: int) -> None:
+    def show(self, phase: str, done: int, total: int) -> None:
         """Called after every job."""
         self._guarded(lambda: self._show(phase, done, total))
 
@@ -68,9 +81,9 @@ class Progress:
         """End the bar, or write the line that waits."""
         self._guarded(self._close)
 
-    def _show(self, phase: Phase, done: int, total: int) -> None:
+    def _show(self, phase: str, done: int, total: int) -> None:
         left = f"budget left {format_duration(self._budget.left())}" if isfinite(self._budget.time_limit) else ""
-        began, self._phase = phase is not self._phase, phase
+        began, self._phase = phase != self._phase, phase
         if redraws(self._stream):
             if began:
                 self._close()

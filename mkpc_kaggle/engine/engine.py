@@ -291,7 +291,7 @@ class Engine:
         record: SceneRecord | None
         if isinstance(answer, SceneResult):
             choices = answer.choices
-            record = SceneRecord.of(job.batch, answer.scenes, job.made_from, seconds)
+            record = SceneRecord.of(job.batch, answer.reconstructions, job.made_from, seconds)
             self.scenes.on_result(job, record)
             for index, choice in choices.items():
                 self.plan.set_scene(index, choice)

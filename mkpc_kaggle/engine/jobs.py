@@ -8,13 +8,14 @@ from typing import Protocol
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.records import PairRecord
+from mkpc_kaggle.geometry.focal_prior import FocalConfig
+from mkpc_kaggle.geometry.robust import RobustConfig
 from mkpc_kaggle.pipeline.pair import UnitResult
 from mkpc_kaggle.recipe import Unit
-from mkpc_kaggle.scene.batch import BatchPair
 from mkpc_kaggle.scene.choose import Choice
 from mkpc_kaggle.scene.config import SceneConfig
-from mkpc_kaggle.scene.known_focals import KnownFocals
-from mkpc_kaggle.scene.model import Scene
+from mkpc_kaggle.scene.reconstruction import Reconstruction
+from mkpc_kaggle.scene.view_graph import BatchPair
 
 
 class Phase(StrEnum):
@@ -54,7 +55,7 @@ class MatchJob:
 
 @dataclass(frozen=True, eq=False)
 class SceneJob:
-    """Reconstruct a batch: ``indices`` are the places of its ``pairs`` in the run; images go by their paths.
+    """Reconstruct a batch: ``indices`` are the places of its ``pairs`` in the run; images go by their digests.
 
     ``made_from`` counts the unit results that its matches are of; see :class:`SceneRecord`.
     """
@@ -63,7 +64,8 @@ class SceneJob:
     indices: tuple[int, ...]
     pairs: tuple[BatchPair, ...]
     config: SceneConfig
-    known_focals: KnownFocals | None = None
+    focal: FocalConfig | None = None
+    magsac: RobustConfig | None = None
     made_from: int = 0
 
 
@@ -103,7 +105,7 @@ class MatchResult:
 class SceneResult:
     """The reconstructions of a batch, and which F each pair gets, by its place in the run."""
 
-    scenes: tuple[Scene, ...]
+    reconstructions: tuple[Reconstruction, ...]
     choices: Mapping[int, Choice]
 
 

@@ -176,7 +176,7 @@ class Journal(JournalTables):
     def _save(self, outcome: Outcome, settled: bool) -> None:
         record = outcome.record
         self._db.execute(
-            "REPLACE INTO pair VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)",
+            "REPLACE INTO pair VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
             [
                 record.index,
                 _blob(record.pair_fundamental),
@@ -185,6 +185,7 @@ class Journal(JournalTables):
                 record.cluster_seconds,
                 record.estimate_seconds,
                 *(record.versions or ("", "")),
+                *([side for size in record.sizes for side in size] or (None,) * 4),
                 _blob(record.magsac_fundamental),
             ],
         )

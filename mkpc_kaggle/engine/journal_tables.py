@@ -26,7 +26,7 @@ import numpy as np
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.records import CameraRecord, PairRecord, SceneRecord, UnitRecord
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.geometry.coordinates import Box
+from mkpc_kaggle.geometry.coordinates import Box, Size
 from mkpc_kaggle.geometry.critical_region import CriticalRegion, RegionReason
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import Matrix3
@@ -58,7 +58,8 @@ CREATE TABLE sample (
 CREATE TABLE pair (
     pair INTEGER PRIMARY KEY, fundamental BLOB NOT NULL, failure TEXT NOT NULL,
     decode_seconds REAL, cluster_seconds REAL, estimate_seconds REAL,
-    version0 TEXT NOT NULL, version1 TEXT NOT NULL, magsac BLOB);
+    version0 TEXT NOT NULL, version1 TEXT NOT NULL,
+    width0 INTEGER, height0 INTEGER, width1 INTEGER, height1 INTEGER, magsac BLOB);
 CREATE TABLE unit (
     pair INTEGER, unit TEXT, stage INTEGER, matches INTEGER, inliers INTEGER,
     encode_seconds REAL, match_seconds REAL, failure TEXT, place INTEGER, points BLOB,
@@ -105,8 +106,8 @@ class Event:
 class About:
     """Who wrote a journal last: for reports, and compared with nothing.
 
-    ``limit`` is the time limit in seconds, ``None`` if there was none; ``left_out`` are names of units whose
-    weights were missing or not permitted; ``versions`` are those of the package and what it stands on.
+    ``limit`` is the time limit in seconds, ``None`` if there was none; ``left_out`` says which matchers
+    did not run, by cause; ``versions`` are those of the package and what it stands on.
     """
 
     recipe: str = "unnamed"
@@ -186,10 +187,14 @@ class JournalTables:
             pair: Choice(optional_matrix_of(F), Reason(reason))
             for pair, F, reason in self._db.execute("SELECT pair, fundamental, reason FROM choice")
         }
-        columns = "failure, decode_seconds, cluster_seconds, estimate_seconds, version0, version1, magsac"
+        columns = "failure, decode_seconds, cluster_seconds, estimate_seconds, version0, version1"
         found = {}
-        for pair, F, *values, magsac in self._db.execute(f"SELECT pair, fundamental, {columns} FROM pair"):
+        sides = "width0, height0, width1, height1, magsac"
+        rows = self._db.execute(f"SELECT pair, fundamental, {columns}, {sides} FROM pair")
+        for pair, F, *values, width0, height0, width1, height1, magsac in rows:
             failure, decode, cluster, estimate, *versions = typed(values, (str, float, float, float, str, str))
+            sizes = (Size(width0, height0), Size(width1, height1)) if width0 else ()
+            typed([side for size in sizes for side in size], (int,) * 2 * len(sizes))
             found[pair] = PairRecord(
                 pair,
                 matrix_of(F),
@@ -200,6 +205,7 @@ class JournalTables:
                 cluster,
                 estimate,
                 choices.get(pair),
+                sizes,
                 tuple(filter(None, versions)),
                 optional_matrix_of(magsac),
             )

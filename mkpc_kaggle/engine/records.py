@@ -6,11 +6,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL, Matrix3
 from mkpc_kaggle.pipeline.pair import PairMatch, Regions
 from mkpc_kaggle.recipe import Unit
 from mkpc_kaggle.scene.choose import Choice
-from mkpc_kaggle.scene.model import Scene
+from mkpc_kaggle.scene.reconstruction import Reconstruction
 
 NOT_REACHED = "not reached in time"
 GIVEN_UP = "given up: "  # how the failure of a unit begins that workers were lost at
@@ -37,7 +38,8 @@ class PairRecord:
     ``pair_fundamental`` is from the pair's own matches, and the fallback where ``failure`` says why there is none;
     ``magsac_fundamental`` is MAGSAC's alone, where the former comes from more than that. The seconds are those of
     all jobs on the pair. ``scene`` is what its batch's reconstruction says of it, ``None`` if there was none.
-    ``versions`` tell the contents of the two images that were matched, empty where no file tells them.
+    ``sizes`` and ``versions`` are of
+    the two images that were matched; a version tells the content of a file.
     """
 
     index: int
@@ -49,6 +51,7 @@ class PairRecord:
     cluster_seconds: float = 0.0
     estimate_seconds: float = 0.0
     scene: Choice | None = None
+    sizes: tuple[Size, ...] = ()
     versions: tuple[str, ...] = ()
     magsac_fundamental: Matrix3 | None = None
 
@@ -82,6 +85,7 @@ class PairRecord:
             match.decode_seconds,
             match.cluster_seconds,
             match.estimate_seconds,
+            sizes=match.sizes,
             versions=match.versions,
             magsac_fundamental=match.estimate.magsac,
         )
@@ -188,30 +192,34 @@ class SceneRecord:
 
     @classmethod
     def of(
-        cls, batch: str, scenes: Sequence[Scene], made_from: int, seconds: float, failure: str = ""
+        cls,
+        batch: str,
+        reconstructions: Sequence[Reconstruction],
+        made_from: int,
+        seconds: float,
+        failure: str = "",
     ) -> "SceneRecord":
-        models = sorted(
-            (model for scene in scenes for model in scene.models), key=lambda model: -len(model.images)
-        )
+        found = (model for reconstruction in reconstructions for model in reconstruction.models)
+        models = sorted(found, key=lambda model: -len(model.images))
         cameras = tuple(
             CameraRecord(
-                image.name,
+                found.image.name,
                 number,
-                (-image.camera.R.T @ image.camera.t).tolist(),
-                image.camera.R[2].tolist(),
-                image.camera.R[1].tolist(),
-                image.focal,
-                list(image.size),
-                image.points,
+                (-found.camera.R.T @ found.camera.t).tolist(),
+                found.camera.R[2].tolist(),
+                found.camera.R[1].tolist(),
+                found.focal,
+                list(found.image.size),
+                found.points,
             )
             for number, model in enumerate(models)
-            for image in model.images
+            for found in model.images
         )
-        reasons = [scene.failure for scene in scenes if scene.failure] if not models else []
+        reasons = [each.failure for each in reconstructions if each.failure and not models]
         return cls(
             batch,
-            sum(len(scene.names) for scene in scenes),
-            sum(scene.placed for scene in scenes),
+            sum(len(each.names) for each in reconstructions),
+            sum(each.registered for each in reconstructions),
             len(models),
             sum(len(model.points) for model in models),
             made_from,

@@ -15,10 +15,9 @@ from mkpc_kaggle.engine.records import PairRecord, SceneRecord
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.pipeline.pair import UnitResult
 from mkpc_kaggle.recipe import Recipe
-from mkpc_kaggle.scene.batch import BatchPair
 from mkpc_kaggle.scene.config import SceneConfig
-from mkpc_kaggle.scene.known_focals import KnownFocals
-from mkpc_kaggle.scene.unasked import unasked_pairs
+from mkpc_kaggle.scene.densify import extra_pairs
+from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair, tracks_of
 
 MIN_PAIRS = 2  # they can connect three images
 MAX_TRIES = 2  # of a reconstruction that is lost
@@ -52,11 +51,9 @@ def extra_pairs_of(pairs: Sequence[Pair], config: SceneConfig | None) -> tuple[l
     for batch, places in batches_of(pairs).items():
         asked = [pairs[place] for place in places]
         files = list(dict.fromkeys(file for pair in asked for file in (pair.file0, pair.file1)))
-        if len(files) > config.most_images:  # to look for partners takes the square of their number
-            continue
         number = {file: place for place, file in enumerate(files)}
         ends = [(number[pair.file0], number[pair.file1]) for pair in asked]
-        found = unasked_pairs(len(files), ends, max(config.pairs_per_image, DENSIFY_PAIRS_PER_IMAGE))
+        found = extra_pairs(len(files), ends, max(config.pairs_per_image, DENSIFY_PAIRS_PER_IMAGE))
         named = [(files[i], files[j]) for i, j in found]
         extra = [Pair(f"{batch};{Path(a).stem}-{Path(b).stem}", batch, a, b) for a, b in named]
         distinct = len({tuple(sorted(pair)) for pair in ends})
@@ -65,18 +62,6 @@ def extra_pairs_of(pairs: Sequence[Pair], config: SceneConfig | None) -> tuple[l
         further.append((distinct / len(files), extra[count:]))
     further.sort(key=lambda batch: batch[0])
     return connecting + [pair for _, extra in further for pair in extra], len(connecting)
-
-
-def tracks_of(results: Sequence[UnitResult], min_matches: int) -> dict[str, Matches]:
-    """The matches that a scene is made of, by their matchers: of units that make tracks, or all if few are."""
-    chosen = [result for result in results if result.unit.tracks]
-    if sum(len(result.matches) for result in chosen) < min_matches:
-        chosen = list(results)
-    matchers = dict.fromkeys(result.unit.matcher for result in chosen)
-    return {
-        name: Matches.concatenate(result.matches for result in chosen if result.unit.matcher == name)
-        for name in matchers
-    }
 
 
 class Scenes:
@@ -118,11 +103,10 @@ class Scenes:
         """The job that reconstructs a batch; ``results_of`` gives what was found on a pair."""
         recipe, config = self._recipe, self._recipe.scene
         assert config is not None
-        known_focals = KnownFocals(recipe.magsac, recipe.focal, config.focal_sigma) if recipe.focal else None
-        found = tuple(index for index in self.batches[batch] if self._records[index].units)
-        pairs = tuple(self._batch_pair(index, results_of(index), config) for index in found)
+        found = tuple(index for index in self.batches[batch] if self._records[index].sizes)
+        pairs = tuple(self._batch_pair(index, results_of(index)) for index in found)
         self.running.add(batch)
-        return SceneJob(batch, found, pairs, config, known_focals, self._unit_counts[batch])
+        return SceneJob(batch, found, pairs, config, recipe.focal, recipe.magsac, self._unit_counts[batch])
 
     def on_result(self, job: SceneJob, record: SceneRecord) -> None:
         self.running.discard(job.batch)
@@ -167,13 +151,12 @@ class Scenes:
     def _made_from(self, batch: str) -> int:
         return self.made[batch].made_from if batch in self.made else 0
 
-    def _batch_pair(self, index: int, results: Sequence[UnitResult], config: SceneConfig) -> BatchPair:
+    def _batch_pair(self, index: int, results: Sequence[UnitResult]) -> BatchPair:
         record = self._records[index]
-        image0, image1 = self._pairs[index].images
-        return BatchPair(
-            str(image0),
-            str(image1),
-            Matches.concatenate(result.matches for result in results),
-            None if record.failure else record.pair_fundamental,
-            tracks_of(results, config.least_tracks),
+        image0, image1 = (
+            BatchImage(path.stem, version.split()[0], size)
+            for path, version, size in zip(self._pairs[index].images, record.versions, record.sizes, strict=True)
         )
+        matches = Matches.concatenate(result.matches for result in results)
+        own = None if record.failure else record.pair_fundamental
+        return BatchPair(image0, image1, matches, own, tracks_of(results))

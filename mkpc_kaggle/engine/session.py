@@ -1,8 +1,6 @@
 """A run from its parts: journal, site and engine opened, used and let go of; signals, and the end at the limit."""
 
 import hashlib
-import multiprocessing
-import os
 import platform
 import signal
 import sqlite3
@@ -15,13 +13,13 @@ from importlib import metadata
 from math import isfinite
 from pathlib import Path
 from types import FrameType, TracebackType
-from typing import NoReturn, Self
+from typing import Self
 
 import cv2
 import numpy as np
 
 from mkpc_kaggle import __version__
-from mkpc_kaggle.data.competition import Pair, discard_parts, write_submission
+from mkpc_kaggle.data.competition import Pair, write_submission
 from mkpc_kaggle.engine import console
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.cluster import RayCluster, ray_site
@@ -113,7 +111,7 @@ def run_pairs(
             publish=publish,
             interrupt=session.interrupt,
             progress=session.progress,
-            minibatch=assembly.batch,
+            minibatch=assembly.minibatch,
         )
         if session.watchdog is not None:
             session.watchdog.save = engine.save_what_there_is
@@ -135,7 +133,7 @@ def about_run(assembly: Assembly, budget: Budget) -> About:
         assembly.recipe.name,
         str(assembly.placement),
         budget.time_limit if isfinite(budget.time_limit) else None,
-        tuple(unit.name for unit in assembly.left_out),
+        assembly.left_out,
         versions(),
     )
 
@@ -200,15 +198,7 @@ class Watchdog:
             threading.Thread(target=console.complain, args=(trouble[-1],), daemon=True).start()
             time.sleep(EXIT_S / 4)  # who reads it may hang
         status = self.status or int(bool(trouble[-1]))
-        leave(128 + self._interrupt.signal if self._interrupt.signal else status)
-
-
-def leave(status: int) -> NoReturn:
-    """End the process at once, and its children, one that was stopped (SIGSTOP) among them."""
-    discard_parts()
-    for child in multiprocessing.active_children():
-        child.kill()
-    os._exit(status)
+        console.leave(128 + self._interrupt.signal if self._interrupt.signal else status)
 
 
 @contextmanager

@@ -98,8 +98,8 @@ class MatchRunner:
         units = sorted(job.units, key=lambda unit: unit.stage)
         matched = self._pipeline.match([pairs[number] for number in readable], units[:-1], may_start)
         estimates: dict[int, Future[Outcome]] = {}
-        for start in range(0, len(matched), self._pipeline.batch):
-            part = slice(start, start + self._pipeline.batch)
+        for start in range(0, len(matched), self._pipeline.minibatch):
+            part = slice(start, start + self._pipeline.minibatch)
             for number, pair in zip(
                 readable[part], self._pipeline.match(matched[part], units[-1:], may_start), strict=True
             ):
@@ -138,18 +138,15 @@ class MatchRunner:
 
 
 class SceneRunner:
-    """Reconstructs batches. pycolmap may end the process: see :mod:`mkpc_kaggle.scene.reconstruct`."""
+    """Reconstructs batches. pycolmap may end the process: see :mod:`mkpc_kaggle.scene.colmap`."""
 
     def load(self) -> None:
         """Nothing is needed before the job."""
 
     def run(self, job: Job, seconds: float) -> SceneResult:
         """The cameras of a batch, and which F each of its pairs gets; ``seconds`` are not looked at."""
-        from mkpc_kaggle.scene.read import batch_of
-        from mkpc_kaggle.scene.solve import solve
+        from mkpc_kaggle.scene.reconstruct import reconstruct_batch
 
         assert isinstance(job, SceneJob)
-        readable, batch = batch_of(job.pairs)
-        solution = solve(batch, job.config, job.known_focals)
-        indices = [job.indices[place] for place in readable]
-        return SceneResult(solution.scenes, dict(zip(indices, solution.choices, strict=True)))
+        solution = reconstruct_batch(job.pairs, job.config, job.focal, job.magsac)
+        return SceneResult(solution.reconstructions, dict(zip(job.indices, solution.choices, strict=True)))

@@ -9,7 +9,7 @@ from pathlib import Path
 from statistics import mean
 from typing import Any
 
-from mkpc_kaggle.data.competition import Scene, TruePair, pair_id, read_submission, read_table
+from mkpc_kaggle.data.competition import TrainScene, TruePair, pair_id, read_rows, read_submission
 from mkpc_kaggle.engine.engine import RunReport
 from mkpc_kaggle.engine.records import PairRecord
 from mkpc_kaggle.engine.session import Session, run_pairs
@@ -100,21 +100,21 @@ class Validation:
         return [error for scene in self.scenes for error in scene.errors]
 
 
-def validate(scenes: Sequence[TrainScene], assembly: Assembly, session: Session) -> tuple[Validation, bool]:
-    """Match all pairs of the scenes and score them; also whether every thread has stopped."""
-    report, at_rest = run_pairs([true.pair for scene in scenes for true in scene.pairs], assembly, session)
+def validate(scenes: Sequence[TrainScene], assembly: Assembly, session: Session) -> Validation:
+    """Match all pairs of the scenes and score them."""
+    report = run_pairs([true.pair for scene in scenes for true in scene.pairs], assembly, session)
     steps = _steps_of(report.records, prior=assembly.recipe.focal is not None)
     records, scored = iter(report.records), []
     for scene in scenes:
         pairs = tuple(score_record(true, next(records), scene, steps) for true in scene.pairs)
         scored.append(SceneScore(scene.name, pairs, isfinite(scene.metres_per_unit)))
-    return Validation(assembly.recipe.name, tuple(scored), report, steps), at_rest
+    return Validation(assembly.recipe.name, tuple(scored), report, steps)
 
 
 def _steps_of(records: Sequence[PairRecord], *, prior: bool) -> tuple[Step, ...]:
     """The steps that a run made; if E is sought at known focal lengths, there is no MAGSAC alone."""
     made = {
-        Step.MAGSAC: not prior or any(record.magsac is not None for record in records),
+        Step.MAGSAC: not prior or any(record.magsac_fundamental is not None for record in records),
         Step.PRIOR: prior,
         Step.SCENE: any(record.scene is not None for record in records),
     }
@@ -123,11 +123,11 @@ def _steps_of(records: Sequence[PairRecord], *, prior: bool) -> tuple[Step, ...]
 
 def score_record(true: TruePair, record: PairRecord, scene: TrainScene, steps: Sequence[Step] = ()) -> PairScore:
     """The score of a pair's record; the fallback row counts as a failure."""
-    own = None if record.failure else record.F
+    own = None if record.failure else record.pair_fundamental
     matrices = {
-        Step.MAGSAC: record.magsac if Step.PRIOR in steps else own,
+        Step.MAGSAC: record.magsac_fundamental if Step.PRIOR in steps else own,
         Step.PRIOR: own,
-        Step.SCENE: None if record.source == "fallback" else record.fundamental,
+        Step.SCENE: None if record.source == "fallback" else record.chosen_fundamental,
     }
     errors = {step: error_of(matrix, true, scene) for step, matrix in matrices.items()}
     return PairScore(
@@ -135,12 +135,12 @@ def score_record(true: TruePair, record: PairRecord, scene: TrainScene, steps: S
     )
 
 
-def error_of(matrix: Matrix3 | None, true: TruePair, scene: Scene) -> PoseError:
+def error_of(matrix: Matrix3 | None, true: TruePair, scene: TrainScene) -> PoseError:
     """The error of a pair's F, or of its E if that is what was estimated; infinite if there is none."""
     if matrix is None:
         return PoseError.failed()
     camera0, camera1 = true.camera0, true.camera1
-    if true.pair.model is Model.E:
+    if true.pair.model is ModelKind.E:
         camera0, camera1 = camera0.calibrated, camera1.calibrated
     return pose_error(matrix, camera0, camera1, scene.metres_per_unit)
 

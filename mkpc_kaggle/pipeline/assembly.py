@@ -12,7 +12,7 @@ from mkpc_kaggle.pipeline.availability import Cause, Licence, by_cause, options_
 from mkpc_kaggle.pipeline.devices import AUTO, encoding_cache_bytes, gpus_of, require_device, resolve_placement
 from mkpc_kaggle.pipeline.stages import ENCODING_CACHE_BYTES, Pipeline
 from mkpc_kaggle.recipe import Mode, Recipe, load_recipe
-from mkpc_kaggle.weights import WeightStore
+from mkpc_kaggle.weights import FoundFile, WeightStore
 
 CUDA_MINIBATCH = 8
 
@@ -67,13 +67,21 @@ class Assembly:
 
     def fingerprint(self) -> dict[str, Any]:
         """What decides the numbers that come out: the recipe, the precision and the digests of the weights."""
-        names = [name for name in self.recipe.matcher_names if name not in self.matchers]
-        found = {slot: self.weights.find(slot) for slot in slots_of(self.recipe, names)}
         return {
             "recipe": self.recipe.fingerprint(),
             "precision": self.placement.precision,
-            "weights": {slot: file.digest for slot, file in found.items() if file is not None},
+            "weights": {slot: file.digest for slot, file in self._weight_files().items()},
         }
+
+    @property
+    def weight_paths(self) -> tuple[Path, ...]:
+        """The files that the matchers load."""
+        return tuple(file.path for file in self._weight_files().values())
+
+    def _weight_files(self) -> dict[str, FoundFile]:
+        names = [name for name in self.recipe.matcher_names if name not in self.matchers]
+        found = {slot: self.weights.find(slot) for slot in slots_of(self.recipe, names)}
+        return {slot: file for slot, file in found.items() if file is not None}
 
     def _load(self, name: str, placement: Placement) -> Matcher[Any]:
         own = self.matchers.get(name)

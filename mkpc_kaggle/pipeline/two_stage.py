@@ -64,7 +64,7 @@ class TwoStageMatcher:
         Raises :class:`UserError` for an image that cannot be read. A pair that cannot be matched is a result with
         ``estimate.failure``. Errors of memory and of the device are raised as they are.
         """
-        if Model(model) is Model.E and intrinsics is None:
+        if ModelKind(model) is ModelKind.E and intrinsics is None:
             raise ValueError("model E needs intrinsics=(K0, K1), the camera matrices of both images in pixels")
         pair = PairMatch(images=(to_image(image0), to_image(image1)))
         (pair,) = self._pipeline.match([pair], self.recipe.units)

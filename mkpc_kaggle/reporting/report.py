@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING
 
 import pandas as pd
 
-from mkpc_kaggle.data.competition import Pair, replacing
+from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.data.images import Unreadable, printable, read_image
+from mkpc_kaggle.data.outputs import replacing
 from mkpc_kaggle.engine.budget import format_duration
 from mkpc_kaggle.engine.journal_tables import EventKind
 from mkpc_kaggle.engine.records import SceneRecord

@@ -10,7 +10,7 @@ from mkpc_kaggle.engine.journal_tables import DRAWN, About, Event, EventKind, Jo
 from mkpc_kaggle.engine.records import PairRecord, SceneRecord
 from mkpc_kaggle.errors import writing
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.geometry.robust import Estimate, Model, sampson_distances
+from mkpc_kaggle.geometry.robust import Estimate, ModelKind, sampson_distances
 from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult
 from mkpc_kaggle.recipe import Recipe, recipe_of
 from mkpc_kaggle.reporting.tables import RunTables, run_tables, to_json
@@ -29,8 +29,10 @@ class WeakPair:
         """The pair as MAGSAC left it, without running it again; inliers are within ``threshold`` pixels."""
         record = self.record
         matches = Matches.concatenate(result.matches for result in self.results)
-        inliers = (sampson_distances(record.F, matches) < threshold) & (not record.failure)
-        return PairMatch(self.results, record.regions, Estimate(Model.F, record.F, inliers, record.failure))
+        inliers = (sampson_distances(record.pair_fundamental, matches) < threshold) & (not record.failure)
+        return PairMatch(
+            self.results, record.regions, Estimate(ModelKind.F, record.pair_fundamental, inliers, record.failure)
+        )
 
 
 @dataclass(frozen=True, eq=False)

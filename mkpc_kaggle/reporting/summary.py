@@ -1,6 +1,5 @@
 """One screen of summary: what a run did, what it cost, and which pairs it could not help."""
 
-import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 
@@ -16,10 +15,10 @@ MAX_LINES = 8  # of each list
 
 def summary(pairs: Sequence[Pair], report: RunReport, left_out: Sequence[str] = ()) -> str:
     """The screen that ends a run."""
-    tables, names = run_tables(pairs, report.records), [unit.name for unit in left_out]
+    tables = run_tables(pairs, report.records)
     resumed = f", {report.resumed} of them from earlier runs" if report.resumed else ""
     failed = filter(None, [trouble(report)])
-    return "\n".join([headline(tables, report) + resumed, *_lines(tables, report, names), *failed])
+    return "\n".join([headline(tables, report) + resumed, *_lines(tables, report, left_out), *failed])
 
 
 def overview(log: RunLog) -> str:
@@ -39,7 +38,7 @@ def trouble(run: RunReport | RunLog) -> str:
 
     Pairs without an F count if an error is the reason, and not if the matches or the time did not suffice.
     """
-    if run.ending == Ending.NO_WORKER:
+    if run.ending in (Ending.NO_WORKER, Ending.NOTHING_RUNS):
         return f"the run failed: {run.ending}, the faults say why; the same command goes on"
     reached = [record for record in run.records if record.reached]
     reasons = Counter(filter(None, map(_error, reached)))
@@ -60,9 +59,10 @@ def _error(record: PairRecord) -> str:
 
 
 def left_out_line(left_out: Sequence[str]) -> str:
-    """Which matchers of the recipe had to be left out, from the names of their units; empty if all are there."""
-    matchers = dict.fromkeys(re.sub(r"^\d:(.*)@.*", r"\1", name) for name in left_out)
-    return f"left out: {', '.join(matchers)}; `python -m mkpc_kaggle weights list` says why" if matchers else ""
+    """Which matchers did not run, by cause, and how to get weights; empty if all ran."""
+    return (
+        f"left out, {'; '.join(left_out)} (get weights: python -m mkpc_kaggle weights fetch)" if left_out else ""
+    )
 
 
 def _lines(tables: RunTables, run: RunReport | RunLog, left_out: Sequence[str]) -> list[str]:

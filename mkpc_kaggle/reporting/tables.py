@@ -120,7 +120,7 @@ def _pair_table(pairs: Sequence[Pair], records: Sequence[PairRecord]) -> pd.Data
     }
     for name, kind in _COLUMNS.items():
         columns[name] = np.fromiter((getattr(record, name) for record in records), kind, size)
-    F = np.array([record.fundamental for record in records]).reshape(size, 9)
+    F = np.array([record.chosen_fundamental for record in records]).reshape(size, 9)
     columns |= dict(zip(F_COLUMNS, F.T, strict=True))
     return pd.DataFrame(columns, copy=False)
 
