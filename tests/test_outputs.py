@@ -23,7 +23,7 @@ def place(tmp_path):
 
 
 def refuse(place, option, name):
-    require_no_input({option: place / name}, [place / "test.csv", place / "images"], [place / "weights"])
+    require_no_input({option: place / name}, [place / "test.csv", place / "images", place / "weights"])
 
 
 @pytest.mark.parametrize(

@@ -127,19 +127,16 @@ def printable(text: str) -> str:
 class ImageStore:
     """Images by path, decoded in the background by :meth:`prefetch`; the most recently used are kept.
 
-    ``read`` replaces :func:`read_image`; it never raises.
+    ``read`` decodes a file and never raises.
     """
-
-    read: Callable[[Path], Image | Unreadable] = staticmethod(read_image)
 
     def __init__(
         self,
         limit_bytes: int = 512 << 20,
         threads: int = 1,
-        read: Callable[[Path], Image | Unreadable] | None = None,
+        read: Callable[[Path], Image | Unreadable] = read_image,
     ) -> None:
-        if read is not None:
-            self.read = read
+        self.read = read
         self._images: ByteCache[Path, Image] = ByteCache(limit_bytes)
         self._pending: dict[Path, Future[Image | Unreadable]] = {}
         self._lock = threading.Lock()

@@ -63,14 +63,8 @@ class FocalConfig:
     """Settings of :func:`estimate_with_prior`, table ``[focal]`` of a recipe; without it MAGSAC is alone."""
 
     REMOVED: ClassVar = (
-        "essential_threshold",
-        "essential_iterations",
-        "essential_starts",
-        "essential_share",
-        "rough_matches",
-        "refined",
-        "most_matches",
-        "free_cost",
+        *("essential_threshold", "essential_iterations", "essential_starts", "essential_share"),
+        *("rough_matches", "refined", "most_matches", "free_cost"),
     )
 
     ratio: float = 1.1  # of an unknown focal length to the image's long side
