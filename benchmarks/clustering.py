@@ -2,7 +2,7 @@
 
 python -m benchmarks.clustering
 
-scikit-learn's is quadratic in time and memory when points are clumped: it runs on the first 4,000 points, and on them
+scikit-learn's is quadratic in time and memory when points are clumped: it runs on the first 4,000 points, on which
 the labels are compared. Both use one thread.
 """
 
