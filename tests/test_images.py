@@ -37,7 +37,7 @@ def reason(path):
     return answer.reason
 
 
-# one file
+# a file
 
 
 def test_a_colour_png_is_read_as_it_is(tmp_path):

@@ -57,8 +57,8 @@ def test_a_turned_camera_is_a_camera(turns: int) -> None:
     np.testing.assert_array_equal(turned.K[np.tril_indices(3, -1)], 0)
     assert [turned.K[0, 0], turned.K[1, 1]] == ([500, 450] if turns % 2 == 0 else [450, 500])
     back = turned.rotated_90(-turns, Size(64, 40) if turns % 2 == 0 else Size(40, 64))
-    for one, other in ((back.K, K), (back.R, R), (back.t, CAMERA.t)):
-        np.testing.assert_allclose(one, other, atol=1e-12)
+    for found, true in ((back.K, K), (back.R, R), (back.t, CAMERA.t)):
+        np.testing.assert_allclose(found, true, atol=1e-12)
 
 
 def test_a_line_is_what_was_written() -> None:
@@ -291,12 +291,12 @@ def test_the_papers_tables_are_made_with_one_command(
     listed = write_list(tmp_path / "list.txt", [replace(scenes[0], pairs=scenes[0].pairs[:1])], demo.train_dir)
     where = ["--scannet", str(listed), str(demo.train_dir), "--out", str(tmp_path / "out"), "--matcher", "sift"]
     paper_tables.main([*where, "--rows", "one", "two + one"])
-    heads, _, one, two, empty = capsys.readouterr().out.splitlines()
+    heads, _, first, second, empty = capsys.readouterr().out.splitlines()
     assert heads.startswith("| scannet: 1 pairs | whole images | critical regions | AUC 5 |")
-    assert one.startswith("| one | 1280 | - | ")
-    assert two.startswith("| two + one | 1024, 1280 | 1280 | ")
-    assert all(0 <= float(area) <= 100 for row in (one, two) for area in row.split("|")[4:7])
-    assert float(one.split("|")[6]) > 10
+    assert first.startswith("| one | 1280 | - | ")
+    assert second.startswith("| two + one | 1024, 1280 | 1280 | ")
+    assert all(0 <= float(area) <= 100 for row in (first, second) for area in row.split("|")[4:7])
+    assert float(first.split("|")[6]) > 10
     assert empty == ""
 
 

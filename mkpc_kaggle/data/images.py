@@ -65,7 +65,7 @@ def read_image(path: Path) -> Image | Unreadable:
     """Decode a file (png, jpg; 8 or 16 bit; gray, colour, with alpha) to 8-bit RGB; never raises.
 
     16-bit values are divided by 256, alpha is dropped, an EXIF orientation is applied. OpenCV decides whether
-    a damaged file is readable: version 5 refuses a truncated one.
+    a damaged file is readable: version 5 refuses a truncated file.
     """
     name = str(path)
     try:

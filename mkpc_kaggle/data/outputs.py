@@ -1,4 +1,4 @@
-"""Files that a command writes: an input is never overwritten, and a file is replaced only by a whole one."""
+"""Files that a command writes: an input is never overwritten, and a file is replaced only by a whole file."""
 
 import os
 import re
@@ -22,7 +22,7 @@ _parts: set[Path] = set()  # files that this process is writing
 
 
 def require_no_input(outputs: Mapping[str, Path | None], inputs: Iterable[Path]) -> None:
-    """Refuse to overwrite an existing input, a file or one in a directory; a new file is fine, wherever it is.
+    """Refuse to overwrite an existing input file, by name or in a directory; a new file is fine, wherever it is.
 
     ``outputs`` are files to write, by option. ``--json`` and ``--report`` overwrite nothing but their own kind.
     Raises :class:`UserError`.
