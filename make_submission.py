@@ -2,7 +2,7 @@
 
 import sys
 
-from mkpc_kaggle.cli import main
+from mkpc_kaggle.cli import program
 
 if __name__ == "__main__":
-    sys.exit(main(["submit", *sys.argv[1:]]))
+    program(["submit", *sys.argv[1:]])

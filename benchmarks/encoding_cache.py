@@ -16,8 +16,7 @@ from mkpc_kaggle.matchers.networks.loftr import Loftr
 from mkpc_kaggle.matchers.networks.placement import placed
 from mkpc_kaggle.matchers.semi_dense import SemiDenseMatcher
 from mkpc_kaggle.pipeline.pair import PairMatch
-from mkpc_kaggle.pipeline.stages import Pipeline
-from mkpc_kaggle.pipeline.units import ENCODING_CACHE_BYTES
+from mkpc_kaggle.pipeline.stages import ENCODING_CACHE_BYTES, Pipeline
 from mkpc_kaggle.recipe import Recipe, Unit
 from tests.support.standin import filled
 

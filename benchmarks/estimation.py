@@ -1,18 +1,23 @@
-"""F by MAGSAC and under a prior on focal lengths, on the same matches: what the default of ``[focal]`` stands on.
+"""F by MAGSAC, under a prior on focal lengths, and from the cameras of the batch, on the same matches.
 
-python -m benchmarks.estimation --train-dir DIR --matches DIR --ways sift light xfeat+sift [--scenes NAME ...]
+python -m benchmarks.estimation --train-dir DIR --matches DIR --ways sift light xfeat+sift
+    [--scenes NAME ...] [--shares 1 0.3 0.12] [--seeds 1] [--estimates NAME ...] [--every N]
 
 MATCHES is what `benchmarks.ways` wrote; A+B are the matches of both. Pairs without a file there are left out. For
-each way a row for each estimate: mAA by scene and in the mean, its gain over the first estimate with the 95 %
-interval of resampled pairs, and seconds of this process for a pair.
+each way and share of a scene's pairs, drawn by seed, a row for each estimate: mAA by scene and in the mean, its
+gain over the first estimate with the 95 % interval of resampled pairs, and seconds of this process, a pair or a
+batch.
 """
 
 import argparse
 import time
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import mean
 
+import numpy as np
 from tqdm import tqdm
 
 from benchmarks import saved_matches
@@ -22,12 +27,13 @@ from mkpc_kaggle.evaluation.compare import paired_difference
 from mkpc_kaggle.evaluation.validate import error_of
 from mkpc_kaggle.geometry.focal_prior import FocalConfig, FocalPrior, estimate_with_prior
 from mkpc_kaggle.geometry.metrics import PoseError, pair_accuracy
-from mkpc_kaggle.geometry.robust import Estimate, RobustConfig, estimate
+from mkpc_kaggle.geometry.robust import Estimate, Matrix3, RobustConfig, estimate
+from mkpc_kaggle.scene.config import SceneConfig
+from mkpc_kaggle.scene.reconstruct import reconstruct_batch
+from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair
 
 MAGSAC = RobustConfig(permutations=1)
 FOCAL = FocalConfig()
-
-Score = tuple[float, float]  # of a pair: its accuracy, and seconds
 
 
 def with_prior(found: SavedMatches) -> Estimate:
@@ -36,11 +42,32 @@ def with_prior(found: SavedMatches) -> Estimate:
     return estimate_with_prior(found.matches, priors, MAGSAC, FOCAL)
 
 
-ESTIMATES: dict[str, Callable[[SavedMatches], Estimate]] = {
+PAIR_ESTIMATES: dict[str, Callable[[SavedMatches], Estimate]] = {
     "MAGSAC, 8 permutations": lambda found: estimate(found.matches, RobustConfig(permutations=8)),
     "MAGSAC": lambda found: estimate(found.matches, MAGSAC),
     "prior": with_prior,
 }
+SCENE = "scene"
+"""The F of the batch's cameras, or that of the prior where the pair keeps its own."""
+
+
+@dataclass(frozen=True, eq=False)
+class Estimated:
+    """A pair with its matches, and by estimate its F (``None`` where it failed), its accuracy and seconds."""
+
+    true: TruePair
+    found: SavedMatches
+    matrices: Mapping[str, Matrix3 | None]
+    accuracies: Mapping[str, float]
+    seconds: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class Score:
+    """What one estimate made of the chosen pairs of one scene: their accuracies, and seconds in all."""
+
+    accuracies: tuple[float, ...]
+    seconds: float
 
 
 def read(folder: Path, ways: Sequence[str], true: TruePair) -> SavedMatches | None:
@@ -49,34 +76,83 @@ def read(folder: Path, ways: Sequence[str], true: TruePair) -> SavedMatches | No
     if not all(file.exists() for file in files):
         return None
     found = [saved_matches.read(file) for file in files]
-    return SavedMatches(tuple(result for saved in found for result in saved.results), found[0].sizes)
+    return SavedMatches(tuple(result for one in found for result in one.results), found[0].sizes)
 
 
-def score(
-    make: Callable[[SavedMatches], Estimate], found: SavedMatches, true: TruePair, scene: TrainScene
-) -> Score:
+def accuracy(F: Matrix3 | None, true: TruePair, scene: TrainScene) -> float:
+    return pair_accuracy(PoseError.failed() if F is None else error_of(F, true, scene))
+
+
+def estimated(true: TruePair, found: SavedMatches, scene: TrainScene, names: Sequence[str]) -> Estimated:
+    """A pair by every estimate of pairs that is wanted; the prior's is what a scene is compared with."""
+    matrices: dict[str, Matrix3 | None] = {}
+    seconds = {}
+    for name in names:
+        start = time.process_time()
+        result = PAIR_ESTIMATES[name](found)
+        seconds[name] = time.process_time() - start
+        matrices[name] = result.matrix if result.ok else None
+    accuracies = {name: accuracy(F, true, scene) for name, F in matrices.items()}
+    return Estimated(true, found, matrices, accuracies, seconds)
+
+
+def batch_pair(true: TruePair, found: SavedMatches, F: Matrix3 | None) -> BatchPair:
+    """A pair as a reconstruction is given it."""
+    ends = zip(true.pair.images, found.sizes, strict=True)
+    image0, image1 = (BatchImage(path.stem, path.stem, size) for path, size in ends)
+    return BatchPair(image0, image1, found.matches, F, found.tracks)
+
+
+def by_scene(pairs: Sequence[Estimated], scene: TrainScene) -> Score:
+    """The accuracy of the pairs as one batch."""
+    batch = [batch_pair(pair.true, pair.found, pair.matrices["prior"]) for pair in pairs]
     start = time.process_time()
-    result = make(found)
+    choices = reconstruct_batch(batch, SceneConfig()).choices
     seconds = time.process_time() - start
-    return pair_accuracy(error_of(result.matrix, true, scene) if result.ok else PoseError.failed()), seconds
+    matrices = [
+        pair.matrices["prior"] if choice.F is None else choice.F
+        for pair, choice in zip(pairs, choices, strict=True)
+    ]
+    return Score(tuple(accuracy(F, pair.true, scene) for F, pair in zip(matrices, pairs, strict=True)), seconds)
 
 
-def table(title: str, scores: Mapping[str, Mapping[str, Sequence[Score]]]) -> list[str]:
-    """Markdown; ``scores``: by estimate and scene."""
-    accuracies = {
-        name: {scene: [accuracy for accuracy, _ in pairs] for scene, pairs in by_scene.items()}
-        for name, by_scene in scores.items()
+def drawn(pairs: Sequence[Estimated], share: float, seed: int) -> list[Estimated]:
+    """That share of the pairs, in their order."""
+    count = round(share * len(pairs))
+    places = np.sort(np.random.default_rng(seed).choice(len(pairs), count, replace=False))
+    return [pairs[place] for place in places]
+
+
+def scores(pairs: Sequence[Estimated], scene: TrainScene, names: Sequence[str]) -> dict[str, Score]:
+    """By estimate."""
+    return {
+        name: by_scene(pairs, scene)
+        if name == SCENE
+        else Score(tuple(pair.accuracies[name] for pair in pairs), sum(pair.seconds[name] for pair in pairs))
+        for name in names
     }
-    first = next(iter(accuracies.values()))
-    counts = [f"{scene} ({len(values)})" for scene, values in first.items()]
+
+
+def table(title: str, done: Mapping[str, Sequence[Mapping[str, Score]]], names: Sequence[str]) -> list[str]:
+    """Markdown; ``done``: by scene, for each seed the scores by estimate, whose pairs count together."""
+    joined = {
+        name: {scene: [value for one in seeds for value in one[name].accuracies] for scene, seeds in done.items()}
+        for name in names
+    }
+    counts = [f"{scene} ({len(values)})" for scene, values in joined[names[0]].items()]
     lines = [f"| {title} | {' | '.join(counts)} | mean | gain over the first | seconds |"]
     lines.append("|" + " --- |" * (len(counts) + 4))
-    for name, by_scene in accuracies.items():
-        means = [mean(values) for values in by_scene.values()]
+    for name in names:
+        means = [mean(values) for values in joined[name].values()]
         cells = " | ".join(f"{value:.3f}" for value in (*means, mean(means)))
-        seconds = mean(spent for pairs in scores[name].values() for _, spent in pairs)
-        gain = str(paired_difference(list(zip(first.values(), by_scene.values(), strict=True))))
-        lines.append(f"| {name} | {cells} | {'' if by_scene is first else gain} | {seconds:.2f} |")
+        spent = [one[name] for seeds in done.values() for one in seeds]
+        runs = len(spent) if name == SCENE else sum(len(one.accuracies) for one in spent)
+        seconds = sum(one.seconds for one in spent) / runs
+        gain = str(paired_difference(list(zip(joined[names[0]].values(), joined[name].values(), strict=True))))
+        lines.append(f"| {name} | {cells} | {'' if name == names[0] else gain} | {seconds:.2f} |")
+        if name != names[0]:
+            gains = [str(paired_difference([(joined[names[0]][scene], joined[name][scene])])) for scene in done]
+            lines.append(f"| its gain | {' | '.join(gains)} | | | |")
     return lines
 
 
@@ -86,15 +162,31 @@ def main() -> None:
     parser.add_argument("--matches", type=Path, required=True)
     parser.add_argument("--ways", nargs="+", required=True)
     parser.add_argument("--scenes", nargs="*", default=())
+    parser.add_argument("--shares", nargs="+", type=float, default=[1.0])
+    parser.add_argument("--seeds", type=int, default=1, help="samples of each share below 1")
+    parser.add_argument("--every", type=int, default=1, help="of a scene's pairs; default: all of them")
+    names = [*PAIR_ESTIMATES, SCENE]
+    parser.add_argument("--estimates", nargs="+", choices=names, default=names)
     arguments = parser.parse_args()
     for way in arguments.ways:
-        scores: dict[str, dict[str, list[Score]]] = {name: {} for name in ESTIMATES}
+        done: dict[float, dict[str, list[dict[str, Score]]]] = defaultdict(lambda: defaultdict(list))
+        wanted = [name for name in PAIR_ESTIMATES if name in arguments.estimates or name == "prior"]
         for scene in read_train_side(arguments.train_dir, scenes=arguments.scenes):
-            for true in tqdm(scene.pairs, desc=f"{way}, {scene.name}", smoothing=0.05):
-                if (found := read(arguments.matches, way.split("+"), true)) is not None:
-                    for name, make in ESTIMATES.items():
-                        scores[name].setdefault(scene.name, []).append(score(make, found, true, scene))
-        print("\n".join(table(way, scores)), "\n", flush=True)
+            pairs = [
+                estimated(true, found, scene, wanted)
+                for true in tqdm(scene.pairs[:: arguments.every], desc=f"{way}, {scene.name}", smoothing=0.05)
+                if (found := read(arguments.matches, way.split("+"), true)) is not None
+            ]
+            for share in arguments.shares:
+                for seed in range(arguments.seeds if share < 1 else 1):
+                    if chosen := drawn(pairs, share, seed):
+                        done[share][scene.name].append(scores(chosen, scene, arguments.estimates))
+        for share, by_name in done.items():
+            print(
+                "\n".join(table(f"{way}, {share:.0%} of the pairs", by_name, arguments.estimates)),
+                "\n",
+                flush=True,
+            )
 
 
 if __name__ == "__main__":

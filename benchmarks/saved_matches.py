@@ -12,12 +12,11 @@ from pathlib import Path
 import numpy as np
 
 from mkpc_kaggle.data.competition import TruePair
-from mkpc_kaggle.engine.scenes import tracks_of
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult
 from mkpc_kaggle.recipe import Unit
-from mkpc_kaggle.scene.config import SceneConfig
+from mkpc_kaggle.scene.view_graph import tracks_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +34,7 @@ class SavedMatches:
     @property
     def tracks(self) -> dict[str, Matches]:
         """Those that a scene is made of, by their matchers."""
-        return tracks_of(self.results, SceneConfig().least_tracks)
+        return tracks_of(self.results)
 
 
 def file_of(folder: Path, true: TruePair) -> Path:

@@ -10,35 +10,34 @@ import argparse
 import resource
 import time
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import replace
 from multiprocessing import get_context
 
 import numpy as np
 
 from benchmarks.synthetic_scene import SyntheticScene, synthetic_scene
 from mkpc_kaggle.scene.config import Mapper, SceneConfig
-from mkpc_kaggle.scene.solve import Solution, solve
+from mkpc_kaggle.scene.reconstruct import Solution, reconstruct_batch
 
 
 def row(size: str, points: int, outliers: float, config: SceneConfig) -> str:
     images, pairs = map(int, size.split(":"))
     scene = synthetic_scene(images, pairs, points=points, outliers=outliers)
     begin, used = time.perf_counter(), time.process_time()
-    solution = solve(scene.batch, config)
+    solution = reconstruct_batch(scene.pairs, config)
     wall, used = time.perf_counter() - begin, time.process_time() - used
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    matches = np.mean([len(pair.matches) for pair in scene.batch.pairs])
-    placed = sum(one.placed for one in solution.scenes)
+    matches = np.mean([len(pair.matches) for pair in scene.pairs])
+    placed = sum(found.registered for found in solution.reconstructions)
     distances = distances_of(solution, scene)
     median = f"{np.median(distances):.2f}" if distances else "-"
     return (
-        f"{images:7}{len(scene.batch.pairs):7}{matches:9.0f}{wall:9.1f}{used:9.1f}{memory:9.0f}{placed:9}"
-        f"{len(distances) / len(scene.batch.pairs):8.2f}{median:>11}"
+        f"{images:7}{len(scene.pairs):7}{matches:9.0f}{wall:9.1f}{used:9.1f}{memory:9.0f}{placed:9}"
+        f"{len(distances) / len(scene.pairs):8.2f}{median:>11}"
     )
 
 
 def distances_of(solution: Solution, scene: SyntheticScene) -> list[float]:
-    answers = zip(solution.choices, scene.batch.pairs, strict=True)
+    answers = zip(solution.choices, scene.pairs, strict=True)
     return [scene.median_distance(choice.F, pair) for choice, pair in answers if choice.F is not None]
 
 
@@ -47,7 +46,6 @@ def main() -> None:
     parser.add_argument("sizes", nargs="*", default=["10:45", "26:304", "50:700", "100:2000"])
     parser.add_argument("--mapper", type=Mapper, choices=list(Mapper), default=SceneConfig().mapper)
     parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--most-images", type=int, default=SceneConfig().most_images)
     parser.add_argument("--outliers", type=float, default=0.2)
     parser.add_argument(
         "--points",
@@ -56,9 +54,7 @@ def main() -> None:
         help="of the front; by default an image has as many as RootSIFT matches",
     )
     arguments = parser.parse_args()
-    config = replace(
-        SceneConfig(), mapper=arguments.mapper, threads=arguments.threads, most_images=arguments.most_images
-    )
+    config = SceneConfig(mapper=arguments.mapper, threads=arguments.threads)
     heads = ("wall s", "cpu s", "MB", "placed", "F from")
     print(
         f"{'images':>7}{'pairs':>7}{'matches':>9}" + "".join(f"{h:>9}" for h in heads[:4]) + "  scenes  median px"

@@ -20,8 +20,8 @@ from tests.support.simulator import Scenario, random_scenario, simulate, without
 def tell(scenario: Scenario) -> None:
     """When the phases of a run began, and the scenes of its batches."""
     ran = simulate(scenario)
-    for one in ran.report.explanations:
-        print(one)
+    for explanation in ran.report.explanations:
+        print(explanation)
     for scene in ran.scenes:
         begun, ended = map(format_duration, (scene.begun, scene.begun + scene.seconds))
         print(f"{begun:>7}  batch {scene.batch} is reconstructed until {ended}")
@@ -47,7 +47,6 @@ def main() -> None:
             Scenario(
                 arguments.pairs,
                 tuple(arguments.costs),
-                0,
                 arguments.workers,
                 arguments.limit,
                 batches=arguments.batches,

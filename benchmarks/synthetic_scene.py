@@ -10,26 +10,27 @@ from mkpc_kaggle.geometry.cameras import Camera, fundamental_of_cameras
 from mkpc_kaggle.geometry.coordinates import Box, Size
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import Matrix3, sampson_distances
-from mkpc_kaggle.scene.batch import Batch, BatchImage, BatchPair
+from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair
 
 SIZE = Size(800, 600)
 
 
 @dataclass(frozen=True, eq=False)
 class SyntheticScene:
-    """A batch and its true cameras, by image name."""
+    """A batch's images and pairs, and the true cameras by image name."""
 
-    batch: Batch
+    images: tuple[BatchImage, ...]
+    pairs: tuple[BatchPair, ...]
     cameras: dict[str, Camera]
 
     def true_fundamental(self, pair: BatchPair) -> Matrix3:
-        return fundamental_of_cameras(self.cameras[pair.image0], self.cameras[pair.image1])
+        return fundamental_of_cameras(self.cameras[pair.image0.name], self.cameras[pair.image1.name])
 
     def median_distance(self, F: Matrix3, pair: BatchPair) -> float:
         """How far true correspondences of a pair are from an F: the median of Sampson's distance, in pixels."""
         rng = np.random.default_rng(0)
         world = front(rng, 400)
-        points = [project(self.cameras[name], world) for name in (pair.image0, pair.image1)]
+        points = [project(self.cameras[image.name], world) for image in (pair.image0, pair.image1)]
         return float(np.median(sampson_distances(F, Matches(*points, np.ones(len(world))))))
 
 
@@ -58,11 +59,11 @@ def synthetic_scene(
     cameras = {f"{prefix}{number:04}": camera for number, camera in enumerate(arc)}
     seen = {name: project(camera, world) + rng.normal(0, noise, (points, 2)) for name, camera in cameras.items()}
     named = tuple(BatchImage(name, f"digest of {name}", SIZE) for name in cameras)
-    chosen = list(combinations(cameras, 2))
+    chosen = list(combinations(named, 2))
     if pairs is not None and pairs < len(chosen):
         chosen = [chosen[index] for index in np.sort(rng.choice(len(chosen), pairs, replace=False))]
-    batch = Batch(named, tuple(match(rng, first, second, seen, outliers) for first, second in chosen))
-    return SyntheticScene(batch, cameras)
+    made = tuple(match(rng, first, second, seen, outliers) for first, second in chosen)
+    return SyntheticScene(named, made, cameras)
 
 
 def front(rng: np.random.Generator, count: int) -> np.ndarray:
@@ -98,15 +99,19 @@ def project(camera: Camera, world: np.ndarray) -> np.ndarray:
 
 
 def match(
-    rng: np.random.Generator, first: str, second: str, seen: dict[str, np.ndarray], outliers: float
+    rng: np.random.Generator,
+    first: BatchImage,
+    second: BatchImage,
+    seen: dict[str, np.ndarray],
+    outliers: float,
 ) -> BatchPair:
     """The points that both images see, some of them lost and some mixed up."""
     whole = Box.whole(SIZE)
-    common = np.flatnonzero(whole.contains(seen[first]) & whole.contains(seen[second]))
+    common = np.flatnonzero(whole.contains(seen[first.name]) & whole.contains(seen[second.name]))
     common = common[rng.random(len(common)) < 0.5]
-    points0 = seen[first][common] + rng.normal(0, 0.05, (len(common), 2))
+    points0 = seen[first.name][common] + rng.normal(0, 0.05, (len(common), 2))
     wrong = rng.random(len(common)) < outliers
     other = common.copy()
     other[wrong] = rng.permutation(common[wrong])
-    points1 = seen[second][other] + rng.normal(0, 0.05, (len(common), 2))
+    points1 = seen[second.name][other] + rng.normal(0, 0.05, (len(common), 2))
     return BatchPair(first, second, Matches(points0, points1, np.ones(len(common))))

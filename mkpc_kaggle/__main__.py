@@ -1,8 +1,6 @@
 """``python -m mkpc_kaggle``."""
 
-import sys
-
-from mkpc_kaggle.cli import main
+from mkpc_kaggle.cli import program
 
 if __name__ == "__main__":
-    sys.exit(main())
+    program()

@@ -1,4 +1,4 @@
-"""Frozen dataclasses from TOML tables: every key is known, every value has its type and is in its range."""
+"""Settings: frozen dataclasses from TOML tables, with every key known and every value in its range."""
 
 from collections.abc import Container, Iterable, Mapping
 from dataclasses import MISSING, Field, dataclass, fields
@@ -64,7 +64,7 @@ def convert(value: Any, kind: type, where: str) -> Any:
     """``value`` as ``kind`` (int, float, bool, str or an enum of strings), or :class:`UserError`."""
     if issubclass(kind, StrEnum):
         if value not in list(kind):
-            raise UserError(f"{where}: {value!r} is none of {', '.join(repr(str(one)) for one in kind)}")
+            raise UserError(f"{where}: {value!r} is none of {', '.join(repr(str(member)) for member in kind)}")
         return kind(value)
     if type(value) is int and abs(value) > MAX_INTEGER:
         raise UserError(f"{where}: an integer of more than 64 bits")
@@ -77,7 +77,7 @@ def convert(value: Any, kind: type, where: str) -> Any:
 
 @dataclass(frozen=True)
 class Range:
-    """Finite numbers from ``low`` to ``high``; ``bounds`` "[]", "(]", "[)" or "()" say which ends are in it."""
+    """Finite numbers from ``low`` to ``high``; ``bounds`` "[]", "(]", "[)" or "()" say which ends belong to it."""
 
     low: float
     high: float = inf
@@ -95,8 +95,7 @@ class Range:
 
 AT_LEAST_0, AT_LEAST_1 = Range(0), Range(1)
 POSITIVE = Range(0, bounds="(]")
-SHARE = Range(0, 1)
-"""Of a whole; also a score's range."""
+SHARE = Range(0, 1)  # of a whole; also a score's range
 
 
 def check_ranges(config: Any, **ranges: Range) -> None:

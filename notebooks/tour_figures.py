@@ -15,22 +15,18 @@ from mkpc_kaggle.geometry.metrics import PoseError
 from mkpc_kaggle.geometry.robust import Estimate, Matrix3
 from mkpc_kaggle.pipeline.pair import PairMatch
 from mkpc_kaggle.recipe import Unit
-from mkpc_kaggle.reporting.figures import draw_cameras
-from mkpc_kaggle.reporting.figures.canvas import (
-    CLUSTERS,
-    CYCLE,
+from mkpc_kaggle.reporting.figures.run import draw_cameras
+from mkpc_kaggle.reporting.figures.style import (
+    COLOURS,
     DROPPED,
-    INK,
     INLIER,
     OUTLIER,
-    WIDTH,
-    add_box,
+    REGION,
     new_figure,
     plain,
+    sample,
     short,
-    side_by_side,
 )
-from mkpc_kaggle.reporting.figures.pair import connect
 from mkpc_kaggle.scene.model import Scene
 
 if TYPE_CHECKING:
@@ -38,6 +34,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Images = tuple[Image, Image]
+WIDTH = 10.0  # inches, across a notebook
+MAX_INLIERS, MAX_OUTLIERS = 150, 30  # lines that an eye can follow
 _PAPER = {"boxstyle": "round,pad=0.15", "facecolor": "white", "alpha": 0.8, "linewidth": 0}
 
 
@@ -73,7 +71,7 @@ def draw_clusters(images: Images, points: tuple[Points, Points], clusters: tuple
         noise = xy[found.labels < 0]
         _crosses(axes, noise, DROPPED)
         for rank, label in enumerate(_by_size(found)):
-            _dots(axes, xy[found.labels == label], CLUSTERS[rank % len(CLUSTERS)])
+            _dots(axes, xy[found.labels == label], COLOURS[rank % len(COLOURS)])
         for label in _by_size(found):
             _tag(axes, xy[found.labels == label], str(found.sizes[label]))
         counts = f"numbers: their points; {len(noise)} points are noise"
@@ -93,8 +91,8 @@ def draw_sizes(clusters: tuple[Clusters, Clusters], config: MkpcConfig) -> "Figu
 
 def _size_bars(axes: "Axes", clusters: Clusters, config: MkpcConfig) -> None:
     sizes, kept = clusters.sizes[_by_size(clusters)], len(clusters.kept)
-    axes.set_xlabel("clusters by size; green: kept; orange, hatched: dropped", color=INK)
-    axes.set_ylabel("points", color=INK)
+    axes.set_xlabel("clusters by size; green: kept; orange, hatched: dropped")
+    axes.set_ylabel("points")
     if not len(sizes):
         axes.set(xticks=[], yticks=[])
         return
@@ -103,8 +101,9 @@ def _size_bars(axes: "Axes", clusters: Clusters, config: MkpcConfig) -> None:
         bars = axes.bar(ranks[part], sizes[part], color=colour, hatch=hatch, edgecolor="white", width=0.7)
         shares = [f"\n{size / sizes[0]:.3f}" if len(sizes) <= 10 else "" for size in sizes]
         labels = [f"{size}{share}" for size, share in zip(sizes[part], shares[part], strict=True)]
-        axes.bar_label(bars, labels, padding=3, color=INK, fontsize=9, bbox=_PAPER)
-    axes.axhline(config.share * sizes[0], color=INK, linewidth=1.2, linestyle="--")
+        axes.bar_label(bars, labels, padding=3, fontsize=9, bbox=_PAPER)
+    if config.ratio is Ratio.LARGEST:
+        axes.axhline(config.share * sizes[0], color="black", linewidth=1.2, linestyle="--")
     axes.set(yscale="log", ylim=(1, 8 * sizes[0]), xticks=ranks)
 
 
@@ -156,7 +155,7 @@ def draw_both(images: Images, match: PairMatch) -> "Figure":
         _crosses(axes, points[~inliers], DROPPED)
         for stage, marker in ((1, "o"), (2, "^")):
             xy = points[match.in_stage(stage) & inliers]
-            axes.scatter(xy[:, 0], xy[:, 1], s=9, c=CLUSTERS[stage - 1], marker=marker, linewidths=0)
+            axes.scatter(xy[:, 0], xy[:, 1], s=9, c=COLOURS[stage - 1], marker=marker, linewidths=0)
     told = [
         f"{what}: stage {stage}, {np.count_nonzero(match.in_stage(stage))} points, "
         f"{np.count_nonzero(match.in_stage(stage) & inliers)} inliers"
@@ -185,7 +184,7 @@ def draw_epipolar(
     _title(row[0], f"image 0: {len(chosen)} matched points")
     for axes, (name, F) in zip(row[1:], fundamentals.items(), strict=True):
         for place, point in enumerate(chosen.points0):
-            _line(axes, F, point, color=CYCLE[place % len(CYCLE)], linewidth=2)
+            _line(axes, F, point, color=COLOURS[place % len(COLOURS)], linewidth=2)
             if truth is not None:
                 _line(axes, truth, point, color="white", linewidth=1.2, linestyle=(0, (4, 4)))
         _numbered(axes, chosen.points1)
@@ -200,7 +199,7 @@ def draw_plane(images: Images, matches: Matches, homography: Estimate, threshold
     """Inliers of an F: those that one homography explains, too, and those that lie off its plane."""
     figure, row = side_by_side(images)
     for axes, points in zip(row, (matches.points0, matches.points1), strict=True):
-        _dots(axes, points[homography.inliers], CLUSTERS[0])
+        _dots(axes, points[homography.inliers], COLOURS[0])
         _crosses(axes, points[~homography.inliers], OUTLIER)
     explained = f"{homography.inlier_count} of {len(matches)} inliers of F"
     _title(row[0], f"blue: {explained} fit one plane to {threshold:g} pixels")
@@ -219,12 +218,50 @@ def draw_pose_errors(errors: Mapping[str, PoseError]) -> "Figure":
         angles = np.array([getattr(error, kind) for error in errors.values()])
         known = np.isfinite(angles)
         names = [short(name, 40) for name in errors]
-        bars = axes.barh(names, np.where(known, angles, 0), color=list(CYCLE[: len(names)]), height=0.6)
+        bars = axes.barh(names, np.where(known, angles, 0), color=list(COLOURS[: len(names)]), height=0.6)
         labels = [f"{angle:.2f}" if ok else "no F" for angle, ok in zip(angles, known, strict=True)]
-        axes.bar_label(bars, labels, padding=3, color=INK)
+        axes.bar_label(bars, labels, padding=3)
         axes.margins(x=0.15)
     panels[0].invert_yaxis()
     return figure
+
+
+def side_by_side(images: Sequence[Image], title_lines: int = 1) -> "tuple[Figure, Sequence[Axes]]":
+    """Pictures in a row at one height, with room for titles of that many lines above."""
+    aspects = [image.size.width / image.size.height for image in images]
+    height = min((WIDTH - 0.1 * (len(images) + 1)) / sum(aspects), 5.0)
+    figure = new_figure(WIDTH, height + 0.3 + 0.17 * title_lines)
+    figure.set_layout_engine("compressed")
+    row = figure.subplots(1, len(images), width_ratios=aspects, squeeze=False)[0]
+    for axes, image in zip(row, images, strict=True):
+        axes.imshow(image.pixels)
+        axes.set(xticks=[], yticks=[])
+    return figure, row
+
+
+def connect(axes: "Sequence[Axes]", matches: Matches, inliers: NDArray[np.bool_]) -> str:
+    """Draw matches from one picture to the other, a sample of them where there are many; what was drawn."""
+    from matplotlib.patches import ConnectionPatch
+
+    drawn = sample(~inliers, MAX_OUTLIERS), sample(inliers, MAX_INLIERS)
+    for indices, colour, width in ((drawn[0], OUTLIER, 0.5), (drawn[1], INLIER, 0.7)):
+        for panel, points in zip(axes, (matches.points0, matches.points1), strict=True):
+            panel.scatter(points[indices, 0], points[indices, 1], s=6, c=colour, linewidths=0)
+        style = {"coordsA": "data", "coordsB": "data", "color": colour, "linewidth": width, "alpha": 0.6}
+        for index in indices:
+            ends = matches.points0[index], matches.points1[index]
+            line = ConnectionPatch(*ends, axesA=axes[0], axesB=axes[1], **style)
+            axes[0].figure.add_artist(line)
+    return f"{len(drawn[1])} inliers (green) and {len(drawn[0])} outliers (orange) drawn"
+
+
+def add_box(axes: "Axes", box: Box, **style: Any) -> None:
+    """Frame a box of image pixels; ``style`` is matplotlib's."""
+    from matplotlib.patches import Rectangle
+
+    style = {"edgecolor": REGION, "linewidth": 2.5, **style}
+    corner = box.left - 0.5, box.top - 0.5
+    axes.add_patch(Rectangle(corner, box.size.width, box.size.height, fill=False, **style))
 
 
 def _title(axes: "Axes", text: str) -> None:
@@ -256,7 +293,7 @@ def _tag(axes: "Axes", points: Points, text: str) -> None:
 
 def _numbered(axes: "Axes", points: Points) -> None:
     for place, (x, y) in enumerate(points):
-        colour = CYCLE[place % len(CYCLE)]
+        colour = COLOURS[place % len(COLOURS)]
         axes.scatter(x, y, s=130, c=colour, edgecolors="white", linewidths=1, zorder=3)
         axes.text(x, y, str(place + 1), color="white", fontsize=8, ha="center", va="center_baseline", zorder=4)
 
@@ -282,6 +319,6 @@ def _far_apart(points: Points, count: int) -> NDArray[np.intp]:
     return np.array(chosen, np.intp)
 
 
-def draw_scene(name: str, scenes: Sequence[Scene]) -> "Figure":
+def draw_scene(name: str, scenes: Sequence[Reconstruction]) -> "Figure":
     """The cameras and points of the largest model of a batch, from above and from the side."""
     return draw_cameras(SceneRecord.of(name, scenes, 0.0, ""))

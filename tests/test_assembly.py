@@ -10,7 +10,7 @@ from weight_files import digest_of
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.matchers.contract import MatcherSpec, Placement
 from mkpc_kaggle.pipeline.assembly import assemble
-from mkpc_kaggle.pipeline.obstacles import Licence
+from mkpc_kaggle.pipeline.availability import Licence
 from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher
 from mkpc_kaggle.recipe import Mode, Recipe, Unit, load_recipe
 from mkpc_kaggle.weights import WeightFile, manifest
@@ -32,10 +32,9 @@ def own(*licences):
 
 def test_recipe_auto_leaves_out_the_units_whose_weights_are_missing():
     assembly = assemble("auto")
-    recipe = load_recipe("auto")
+    others = [name for name in load_recipe("auto").matcher_names if name != "sift"]
     assert assembly.recipe.matcher_names == ("sift",)
-    assert assembly.left_out == tuple(unit for unit in recipe.units if unit.matcher != "sift")
-    assert assembly.left_out
+    assert assembly.left_out == (f"no weights: {', '.join(others)}",)
     assert assembly.fingerprint()["weights"] == {}
 
 
@@ -46,7 +45,8 @@ def test_recipe_auto_takes_all_whose_weights_are_there():
     there = {"xfeat_lighterglue", "sift", "aliked"}
     assert set(assembly.recipe.matcher_names) == there
     assert assembly.recipe == recipe.only(lambda unit: unit.matcher in there)
-    assert assembly.left_out == tuple(unit for unit in recipe.units if unit not in assembly.recipe.units)
+    others = [name for name in recipe.matcher_names if name not in there]
+    assert assembly.left_out == (f"no weights: {', '.join(others)}",)
     assert all(digest.startswith("sha256:") for digest in assembly.fingerprint()["weights"].values())
     assert set(assembly.fingerprint()["weights"]) == {"xfeat", "xfeat-lighterglue", "aliked-n16"}
 
@@ -63,9 +63,9 @@ def test_a_named_recipe_without_its_weights_is_refused_with_the_file_names(recip
 def test_a_fallback_stands_in_for_a_matcher_whose_weights_are_missing():
     assembly, recipe = assemble("light", weights=[WEIGHTS]), load_recipe("light")
     assert assembly.recipe.matcher_names == ("xfeat_lighterglue", "sift", "aliked")
-    assert [unit.name for unit in assembly.left_out] == ["1:aliked_lightglue@1024", "2:aliked_lightglue@800"]
+    assert assembly.left_out == ("no weights: aliked_lightglue",)
     assert [unit.stage for unit in assembly.recipe.units] == [unit.stage for unit in recipe.units]
-    assert assembly.recipe.fingerprint() == assembly.recipe.decided(()).fingerprint()
+    assert assembly.recipe.fingerprint() == assembly.recipe.with_fallbacks(()).fingerprint()
 
 
 def test_an_unknown_fallback_is_refused_even_where_it_is_not_needed():
@@ -101,7 +101,7 @@ def test_a_permissive_run_leaves_out_of_recipe_auto_what_is_licensed_otherwise(k
     assert every.recipe.matcher_names == ("superglue", "loftr", "sift", "dkm")
     some = assemble("auto", weights=[known_files], licence=Licence.PERMISSIVE)
     assert some.recipe.matcher_names == ("loftr", "sift", "dkm")
-    assert {unit.matcher for unit in some.left_out} >= {"superglue", "aspanformer"}
+    assert some.left_out[1].startswith("weights not permitted: superglue, aspanformer")
     assert set(some.fingerprint()["weights"]) == {"loftr-outdoor", "dkm-outdoor"}
 
 
@@ -111,7 +111,7 @@ def test_a_fallback_stands_in_for_a_matcher_whose_weights_are_not_permitted_or_n
     every = assemble(recipe, weights=[known_files])
     assert (every.recipe.matcher_names, every.left_out) == (("superglue", "dkm"), ())
     some = assemble(recipe, weights=[known_files], licence=Licence.PERMISSIVE)
-    assert (some.recipe.matcher_names, some.left_out) == (("loftr", "dkm"), recipe.units[:1])
+    assert (some.recipe.matcher_names, some.left_out) == (("loftr", "dkm"), ("weights not permitted: superglue",))
     (known_files / "sp.pth").unlink()
     assert assemble(recipe, weights=[known_files]).recipe == some.recipe
 

@@ -27,7 +27,8 @@ from mkpc_kaggle.engine.session import Interrupt, Session, run_pairs
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.pipeline import assembly as assemblies
 from mkpc_kaggle.pipeline.assembly import Assembly, assemble
-from mkpc_kaggle.pipeline.failures import Failure, failure_of, reason_of, require_device
+from mkpc_kaggle.pipeline.devices import require_device
+from mkpc_kaggle.pipeline.failures import Failure, failure_of, reason_of
 from mkpc_kaggle.reporting.summary import trouble
 
 COUNT = 12

@@ -3,13 +3,11 @@
 import sqlite3
 import time
 from collections import Counter
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from rectified import (
-    EXTRA,
     SECOND,
     SWEEP,
     THIRD,
@@ -25,7 +23,6 @@ from mkpc_kaggle.engine.journal import Journal
 from mkpc_kaggle.engine.records import NOT_REACHED, PairRecord
 from mkpc_kaggle.pipeline.assembly import Assembly
 from mkpc_kaggle.pipeline.stages import Pipeline
-from mkpc_kaggle.recipe import UpgradeConfig
 
 
 def matrices(records: tuple[PairRecord, ...]) -> bytes:
@@ -98,17 +95,6 @@ def test_a_limit_shorter_than_the_sweep_still_gives_every_row(tmp_path: Path) ->
     assert report.ending is Ending.TIME_IS_UP
     assert {record.failure for record in report.records if not record.units} == {NOT_REACHED}
     assert all(np.isfinite(record.F).all() and np.linalg.matrix_rank(record.F) == 2 for record in report.records)
-
-
-def test_time_left_goes_to_the_weakest_pairs_first(tmp_path: Path) -> None:
-    # The fewer matches, the brighter: the last pairs are the weakest.
-    matcher = RectifiedMatcher(matches=lambda brightness: 200 - 5 * brightness)
-    recipe = replace(THREE_UNITS, units=(SWEEP, EXTRA), upgrade=UpgradeConfig(below_inliers=120))
-    report = run(write_pairs(tmp_path, 12), recipe, matcher, tmp_path / "work")
-    extra = [brightness for side, brightness in matcher.calls if side == EXTRA.long_side]
-    assert extra == [21, 20, 19, 18, 17]
-    assert report.ending is Ending.COMPLETE
-    assert [len(record.units) for record in report.records] == [1] * 7 + [2] * 5
 
 
 def test_an_interrupted_run_goes_on_where_it_was_and_ends_with_the_same_bytes(tmp_path: Path) -> None:
@@ -233,5 +219,5 @@ def test_an_assembly_is_a_value_that_builds_pipelines(tmp_path: Path) -> None:
 
     assembly = assemble(THREE_UNITS, matchers={"rectified": RectifiedMatcher()}, device="cpu")
     assert isinstance(assembly, Assembly)
-    assert assembly.pipeline().batch == 1
+    assert assembly.pipeline().minibatch == 1
     assert assembly.fingerprint()["weights"] == {}

@@ -1,7 +1,8 @@
-"""The steps of the method as figures: what their titles say is so, and none needs matches to be drawn."""
+"""Figures of a pair, of a scene and of a run: what their titles say is so, and none needs matches to be drawn."""
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 import tour_figures as figures
@@ -16,7 +17,9 @@ from mkpc_kaggle.geometry.metrics import PoseError
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL, Estimate, ModelKind
 from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult
 from mkpc_kaggle.recipe import Unit
-from mkpc_kaggle.reporting.figures import draw_cameras, to_jpeg
+from mkpc_kaggle.reporting.figures.pair import draw_pair, draw_strip
+from mkpc_kaggle.reporting.figures.run import draw_budget, draw_cameras
+from mkpc_kaggle.reporting.figures.style import encode
 
 SIZES = Size(120, 80), Size(60, 90)
 IMAGES = tuple(Image.of_array(np.full((size.height, size.width, 3), 90, np.uint8)) for size in SIZES)
@@ -41,7 +44,7 @@ def pair(first, second, inliers):
 
 
 def titles(figure: Figure) -> list[str]:
-    to_jpeg(figure)  # whatever cannot be drawn raises here
+    encode(figure, "jpeg")  # whatever cannot be drawn raises here
     return [axes.get_title(loc="left") for axes in figure.axes]
 
 
@@ -64,6 +67,7 @@ def test_every_step_is_drawn_whatever_was_found(count):
         figures.draw_stage(IMAGES, replace(match, regions=None), 2),
         figures.draw_clusters(IMAGES, points, clusters),
         figures.draw_sizes(clusters, CONFIG),
+        draw_pair(*IMAGES, match, CONFIG),
         figures.draw_boxes(IMAGES, points, clusters, CONFIG),
         figures.draw_views(IMAGES, REGIONS, UNITS[1]),
         figures.draw_both(IMAGES, match),
@@ -151,5 +155,37 @@ def test_cameras_are_seen_from_above_and_from_the_side_with_the_points_before_th
 def test_a_batch_without_cameras_is_a_line_of_text():
     figure = draw_cameras(SceneRecord("batch", 2, 0, 0, 0, 1.0, "too few matches", (), ()))
     (text,) = figure.texts
-    assert text.get_text() == "batch: no cameras (too few matches)"
+    assert text.get_text() == "no cameras: too few matches"
     assert figure.axes == []
+
+
+def test_a_strip_shows_both_images_at_one_height_with_matches_where_they_are():
+    images = (
+        Image.of_array(np.full((100, 200, 3), 250, np.uint8)),
+        Image.of_array(np.full((300, 300, 3), 5, np.uint8)),
+    )
+    matches = Matches(np.array([[9.5, 9.5]]), np.array([[149.5, 149.5]]), np.ones(1))
+    found = Estimate(Model.F, np.eye(3), np.array([True]))
+    figure = draw_strip(images, PairMatch((UnitResult(UNITS[0], matches),), None, found))
+    drawn = cv2.imdecode(np.frombuffer(encode(figure, "jpeg"), np.uint8), cv2.IMREAD_COLOR)
+    assert drawn.shape[:2] == pytest.approx((480, 960 + 480), abs=1)  # older versions of matplotlib round down
+    assert drawn[400, 100].min() > 200
+    assert drawn[400, 1400].max() < 50
+    ends = np.concatenate(
+        [dots.get_offsets() for dots in figure.axes[0].collections if len(dots.get_offsets()) > 1]
+    )
+    np.testing.assert_allclose(ends, [[0.1, 0.1], [2 + 0.5, 0.5]])
+
+
+def test_a_strip_of_long_pictures_stays_small():
+    long = Image("long", np.zeros((20, 640, 3), np.uint8))
+    width, height = draw_strip((long, long), PairMatch()).get_size_inches() * 110
+    assert width * height < 2_100_000
+    assert width / height == pytest.approx(64, rel=0.05)
+
+
+@pytest.mark.parametrize(("limit", "drawn"), [(60.0, True), (8.75 * 3600, False), (None, False)])
+def test_a_time_limit_is_drawn_if_the_run_came_near_it(limit, drawn):
+    axes = draw_budget({"sweep": [5.0, 9.0], "deepen": [30.0]}, limit).axes[0]
+    assert ("time limit" in axes.get_legend_handles_labels()[1]) == drawn
+    assert axes.get_title("left").startswith("3 jobs ended")

@@ -29,11 +29,12 @@ from mkpc_kaggle.matchers.networks.placement import placed
 from mkpc_kaggle.matchers.networks.superglue import ImageKeypoints, SuperGlue, SuperGlueConfig
 from mkpc_kaggle.matchers.numbers import check_finite, exact_float32
 from mkpc_kaggle.matchers.xfeat_lighterglue import SHAPE
-from mkpc_kaggle.pipeline import assembly, gpus
-from mkpc_kaggle.pipeline.assembly import assemble, fastest_precision, resolve_device
+from mkpc_kaggle.pipeline import devices
+from mkpc_kaggle.pipeline.assembly import assemble
+from mkpc_kaggle.pipeline.devices import fastest_precision, gpu_capabilities, require_device, resolve_placement
+from mkpc_kaggle.pipeline.failures import DeviceError
 from mkpc_kaggle.pipeline.pair import PairMatch
-from mkpc_kaggle.pipeline.stages import Pipeline
-from mkpc_kaggle.pipeline.units import ENCODING_CACHE_BYTES
+from mkpc_kaggle.pipeline.stages import ENCODING_CACHE_BYTES, Pipeline
 from mkpc_kaggle.recipe import Recipe, Unit
 
 UNIT = Unit(1, "own", 64)
@@ -43,7 +44,7 @@ RECIPE = Recipe((UNIT,))
 def gpus_here(monkeypatch: pytest.MonkeyPatch, *capabilities: tuple[int, int]) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: len(capabilities))
-    monkeypatch.setattr(assembly, "capabilities", lambda: list(capabilities))
+    monkeypatch.setattr(devices, "gpu_capabilities", lambda: list(capabilities))
 
 
 # The double itself
@@ -82,16 +83,16 @@ def test_the_double_refuses_numpy_and_lets_scalars_and_copies_pass() -> None:
 @pytest.mark.parametrize("device", ["cuda:2", "cuda:9"])
 def test_a_gpu_that_is_not_there_is_refused(monkeypatch: pytest.MonkeyPatch, device: str) -> None:
     gpus_here(monkeypatch, (7, 5), (7, 5))
-    assert resolve_device("cuda:1") == "cuda:1"
+    assert resolve_placement("cuda:1", "float32").device == "cuda:1"
     with pytest.raises(UserError, match=f"--device {device}: this machine has only cuda:0, cuda:1"):
-        resolve_device(device)
+        resolve_placement(device, "float32")
 
 
 @pytest.mark.parametrize("device", ["cuda:", "cuda:x", "cudas", "cuda:-1", "gpu"])
 def test_a_device_of_no_known_name_is_refused(monkeypatch: pytest.MonkeyPatch, device: str) -> None:
     gpus_here(monkeypatch, (7, 5))
     with pytest.raises(UserError, match="unknown device"):
-        resolve_device(device)
+        resolve_placement(device, "float32")
 
 
 def test_half_precision_asks_every_gpu_that_the_run_uses(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -115,11 +116,23 @@ def test_the_parent_of_workers_never_initialises_cuda(monkeypatch: pytest.Monkey
 
 
 def test_capabilities_are_asked_of_another_process(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(gpus, "ASK", "print('a greeting'); print([[7, 5], [8, 0]])")
-    assert gpus.capabilities() == [(7, 5), (8, 0)]
-    monkeypatch.setattr(gpus, "ASK", "raise SystemExit('driver too old')")
+    monkeypatch.setattr(devices, "ASK_CAPABILITIES", "print('a greeting'); print([[7, 5], [8, 0]])")
+    assert gpu_capabilities() == [(7, 5), (8, 0)]
+    monkeypatch.setattr(devices, "ASK_CAPABILITIES", "raise SystemExit('driver too old')")
     with pytest.raises(UserError, match="driver too old"):
-        gpus.capabilities()
+        gpu_capabilities()
+
+
+def test_a_device_that_multiplies_and_cannot_convolve_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    def convolve(*_: object) -> None:
+        raise RuntimeError("cuDNN error: CUDNN_STATUS_EXECUTION_FAILED_CUDART")
+
+    with DeviceDouble(1) as double:
+        require_device("cuda:0")
+        assert double.operators > 0
+        monkeypatch.setattr(torch.nn.functional, "conv2d", convolve)
+        with pytest.raises(DeviceError, match=r"cuda:0 cannot be used \(RuntimeError: cuDNN error"):
+            require_device("cuda:0")
 
 
 # The cache
@@ -148,10 +161,10 @@ def test_a_view_of_a_batch_is_copied_as_it_lies() -> None:
 
 def test_the_cache_is_sized_by_the_memory_that_is_free_and_the_workers_on_it() -> None:
     made = assemble("classical", device="cpu")
-    assert made.pipeline()._runner._encodings.limit == ENCODING_CACHE_BYTES
+    assert made.pipeline()._encodings.limit == ENCODING_CACHE_BYTES
     with DeviceDouble(2, memory=12 << 30):
-        assert made.on("cuda:1").pipeline()._runner._encodings.limit == 3 << 30
-        assert made.on("cuda:1", 3).pipeline()._runner._encodings.limit == 1 << 30
+        assert made.on("cuda:1").pipeline()._encodings.limit == 3 << 30
+        assert made.on("cuda:1", 3).pipeline()._encodings.limit == 1 << 30
 
 
 # Numbers

@@ -172,7 +172,7 @@ def damaged_journal(directory: Path, damage: str) -> Path:
     journal.save([(outcome(3, seed=1), False), (outcome(7, seed=2), False)])
     camera = CameraRecord("a", 0, [0.0, 0.0, 1.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0], 500.0, [640, 480], 9)
     scene = SceneRecord("batch", 2, 2, 1, 9, 1.5, "", (camera,), ([0.0, 0.0, 5.0],))
-    journal.save_scene(scene, {3: Choice(np.eye(3), Reason.SCENE), 7: Choice(None, Reason.UNPLACED)})
+    journal.save_scene(scene, {3: Choice(np.eye(3), Reason.SCENE), 7: Choice(None, Reason.UNREGISTERED)})
     journal.close()
     with closing(sqlite3.connect(directory / "journal.sqlite")) as db:
         db.execute(damage.format(nan=np.full(9, np.nan).tobytes().hex(), zero=bytes(72).hex()))

@@ -19,6 +19,7 @@ from mkpc_kaggle.cli import main
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.package import Request, make_package
 from mkpc_kaggle.package.checkout import find_checkout
+from mkpc_kaggle.package.folder import Item, write_files
 from mkpc_kaggle.package.metadata import Image
 from mkpc_kaggle.package.wheels import BUNDLED, PYTHONS, build_wheel, install_lines, pins
 from mkpc_kaggle.weights import WeightStore, load_tensors, store
@@ -263,3 +264,13 @@ def test_wheels_come_from_the_index_for_all_pythons(wanted: Request, tmp_path: P
     written = contents(request.out)
     make_package(request)
     assert contents(request.out) == written
+
+
+def test_a_link_in_the_place_of_a_partial_file_is_not_followed(tmp_path: Path) -> None:
+    (tmp_path / "source").write_bytes(b"ours")
+    (tmp_path / "mine").write_bytes(b"mine")
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / ".a.part").symlink_to(tmp_path / "mine")
+    write_files(tmp_path / "out", [Item("a", tmp_path / "source")])
+    assert (tmp_path / "mine").read_bytes() == b"mine"
+    assert [(path.name, path.is_symlink()) for path in (tmp_path / "out").iterdir()] == [("a", False)]

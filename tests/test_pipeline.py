@@ -19,7 +19,7 @@ from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL, ModelKind
 from mkpc_kaggle.matchers.contract import Colour, MatcherSpec
 from mkpc_kaggle.matchers.sift import SiftMatcher, SiftOptions
-from mkpc_kaggle.pipeline import units
+from mkpc_kaggle.pipeline import stages
 from mkpc_kaggle.pipeline.pair import PairMatch, with_estimate
 from mkpc_kaggle.pipeline.stages import Pipeline
 from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher
@@ -226,7 +226,7 @@ def test_a_prior_on_focal_lengths_goes_by_the_sizes_of_the_images_unless_the_cam
         expected = estimate_with_prior(match.matches, tuple(priors), SIFT.magsac, focal)
         assert_array_equal(match.estimate.matrix, expected.matrix)
         assert match.estimate.magsac is not None
-    with pytest.raises(ValueError, match="needs the intrinsics"):
+    with pytest.raises(ValueError, match="model E needs intrinsics"):
         matcher(*pair(), model=ModelKind.E)
     assert matcher(*pair(), model=ModelKind.E, intrinsics=(K, K)).estimate.ok
     assert matcher(*pair(), model=ModelKind.H).estimate.magsac is None
@@ -284,13 +284,6 @@ def test_at_most_so_many_matches_are_kept_and_they_are_the_surest():
     assert some.scores.min() >= np.sort(every.scores)[-50]
 
 
-def test_a_mirrored_unit_gives_points_of_the_image_that_is_not_mirrored():
-    match = own(Unit(1, "sift", 480, flip=True))(*pair())
-    assert len(match.matches) > 100
-    assert np.median(errors(match.matches)) < 0.5
-    assert Box(50, 120, 300, 320).contains(match.matches.points0).all()
-
-
 # the order of things
 
 
@@ -335,8 +328,8 @@ def test_what_was_found_is_returned_when_there_is_no_going_on():
     assert with_estimate(none[0], TWO_STAGES).estimate.failure
 
 
-def test_a_batch_gives_what_pairs_give_alone():
-    alone, together = (pipeline(TWO_STAGES, batch=size).match(works(3), TWO_STAGES.units) for size in (1, 4))
+def test_a_minibatch_gives_what_pairs_give_alone():
+    alone, together = (pipeline(TWO_STAGES, minibatch=size).match(works(3), TWO_STAGES.units) for size in (1, 4))
     for one, other in zip(alone, together, strict=True):
         assert one.regions == other.regions
         assert all(same(a.matches, b.matches) for a, b in zip(one.results, other.results, strict=True))
@@ -350,16 +343,6 @@ def test_whole_images_are_encoded_once_and_crops_for_each_pair():
     assert sift.seen.pop(Box.whole(SIZE)) == 2
     assert len(sift.seen) >= 2
     assert sift.seen.total() == 6
-
-
-def test_matchers_of_one_size_get_pictures_of_one_size():
-    matcher = Scripted(same_size=True, multiple=32)
-    tall, wide = np.full((300, 100, 3), 9, np.uint8), np.full((100, 280, 3), 9, np.uint8)
-    own(Unit(1, "own", 256), own=matcher)(tall, wide)
-    assert [picture.pixels.shape for picture in matcher.shown] == [(256, 256, 3)] * 2
-    assert [picture.content for picture in matcher.shown] == [(85, 256), (256, 91)]
-    assert not matcher.shown[0].pixels[:, 85:].any()
-    assert matcher.shown[0].pixels[:, :85].all()
 
 
 def test_matchers_see_gray_or_colour_and_multiples_as_they_ask():
@@ -458,12 +441,12 @@ def test_options_of_the_recipe_reach_the_matcher():
 
 def test_the_wait_for_the_device_counts_as_encoding_not_as_matching(monkeypatch):
     """Kernels run on while Python goes on; looking for NaN in the features is what waits for them."""
-    check = units.check_finite
+    check = stages.check_finite
 
     def wait(*values):
         time.sleep(0.2)
         check(*values)
 
-    monkeypatch.setattr(units, "check_finite", wait)
+    monkeypatch.setattr(stages, "check_finite", wait)
     (result,) = TwoStageMatcher(SIFT)(*pair()).results
     assert result.encode_seconds >= 2 * 0.2  # two images, one at a time

@@ -7,7 +7,7 @@ from statistics import median
 
 import numpy as np
 import pytest
-from rectified import EXTRA, SECOND, SWEEP, THREE_UNITS
+from rectified import SECOND, SWEEP, THREE_UNITS
 from simulator import RESTART_SECONDS, Scenario, random_scenario, simulate, without_records
 
 from mkpc_kaggle.engine.budget import Budget
@@ -16,13 +16,13 @@ from mkpc_kaggle.engine.engine import Ending
 from mkpc_kaggle.engine.jobs import Cause, Job, JobFailure, JobResult, Outcome, Phase
 from mkpc_kaggle.engine.planner import Planner
 from mkpc_kaggle.engine.records import PairRecord, UnitRecord
-from mkpc_kaggle.engine.upgrade import UpgradeRounds, is_weak
+from mkpc_kaggle.engine.upgrade import UpgradeConfig, is_weak
 from mkpc_kaggle.geometry.coordinates import Box
 from mkpc_kaggle.geometry.critical_region import CriticalRegion, RegionReason
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
 from mkpc_kaggle.pipeline.pair import UnitResult
-from mkpc_kaggle.recipe import Recipe, UpgradeConfig
+from mkpc_kaggle.recipe import Recipe
 
 
 def planner(count: int = 40, recipe: Recipe = THREE_UNITS, workers: int = 1) -> Planner:
@@ -200,21 +200,6 @@ def test_a_pairs_seconds_are_those_of_all_its_jobs() -> None:
     assert (one.records[0].cluster_seconds, one.records[0].estimate_seconds) == (jobs, 2 * jobs)
 
 
-@pytest.mark.parametrize(("gain", "upgraded"), [(0, 57), (20, 300)])
-def test_extra_units_end_where_nothing_is_gained_and_a_resumed_run_decides_the_same(
-    gain: int, upgraded: int
-) -> None:
-    recipe = Recipe((SWEEP, EXTRA), upgrade=UpgradeConfig(below_inliers=100))
-    one = planner(300, recipe)
-    while (job := one.next(0.0)) is not None:
-        one.take(finished(job, one, 50 if job.phase is Phase.SWEEP else gain), 0.0)
-    assert sum(record.has(EXTRA) for record in one.records) == upgraded
-    assert one.complete
-    again = Planner(range(300), recipe, list(one.records), one.budget)
-    assert again.next(0.0) is None
-    assert again.complete
-
-
 def test_costs_that_change_are_planned_for_and_explained() -> None:
     ran = simulate(Scenario(400, (0.5, 1.0, 1.0), 0, 1, 1100.0, warm_up=1, misses=0, drift=10, turn=0.5))
     assert ran.late == 0
@@ -278,15 +263,3 @@ def test_planning_a_job_does_not_take_longer_for_many_pairs() -> None:
     assert ran.jobs > 2500
     assert ran.planning < 1e-3
     assert RESTART_SECONDS < ran.report.seconds < 20_000
-
-
-def test_extra_units_that_gained_nothing_in_a_round_stay_over() -> None:
-    rounds = UpgradeRounds(UpgradeConfig())
-    chunks = rounds.split(range(100), (SWEEP, EXTRA))
-    third = next(chunk for chunk in chunks if chunk.round == 3)
-    judged = rounds.judged_before(third)
-    assert judged == [index for chunk in chunks if chunk.round == 1 for index in chunk.indices]
-    same = [replace(PairRecord.untouched(index), before=0) for index in judged]
-    assert "went from 0 to 0 inliers" in rounds.judge(same)
-    assert rounds.over
-    assert all(not rounds.judged_before(chunk) for chunk in chunks)

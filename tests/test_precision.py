@@ -19,8 +19,8 @@ from mkpc_kaggle.matchers.networks.placement import placed
 from mkpc_kaggle.matchers.networks.quadtree import Quadtree
 from mkpc_kaggle.matchers.networks.superglue import ImageKeypoints, SuperGlue, SuperGlueConfig
 from mkpc_kaggle.matchers.networks.superpoint import SuperPoint, SuperPointConfig
-from mkpc_kaggle.pipeline import assembly
-from mkpc_kaggle.pipeline.assembly import fastest_precision, resolve_placement
+from mkpc_kaggle.pipeline import devices
+from mkpc_kaggle.pipeline.devices import fastest_precision, resolve_placement
 
 SIZE = Size(224, 160)
 MAKERS = {
@@ -139,8 +139,8 @@ def test_auto_takes_half_precision_where_the_processor_has_it(monkeypatch):
 
 @pytest.mark.parametrize(("capability", "expected"), [((7, 5), Precision.FLOAT16), ((6, 1), Precision.FLOAT32)])
 def test_auto_takes_half_precision_on_a_gpu_with_tensor_cores(monkeypatch, capability, expected):
-    monkeypatch.setattr(assembly, "capabilities", lambda: [(5, 2), capability])
-    monkeypatch.setattr(assembly, "gpus_of", lambda device: [1])
+    monkeypatch.setattr(devices, "gpu_capabilities", lambda: [(5, 2), capability])
+    monkeypatch.setattr(devices, "gpus_of", lambda device: [1])
     assert fastest_precision("cuda:1") is expected
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from benchmarks import saved_matches
-from benchmarks.estimation import read, table
+from benchmarks.estimation import Score, read, table
 from benchmarks.ways import WAYS, recipe_of
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.data.images import Image
@@ -56,12 +56,9 @@ def test_a_way_on_whole_images_has_the_same_sizes(way):
         assert [unit.name for unit in WAYS[way]] == [unit.name.replace("2:", "1:") for unit in WAYS[way[:-6]]]
 
 
-def test_gains_are_on_the_same_pairs():
-    scores = {
-        "MAGSAC": {"castle": [(0.0, 0.5), (0.5, 1.5)] * 2},
-        "prior": {"castle": [(0.5, 30.0), (1.0, 30.0)] * 2},
-    }
-    lines = table("sift", scores)
+def test_gains_are_on_the_same_pairs_and_samples_of_a_scene_count_together():
+    half = {"MAGSAC": Score((0.0, 0.5), 2.0), "scene": Score((0.5, 1.0), 30.0)}
+    lines = table("sift", {"castle": [half, half]}, ["MAGSAC", "scene"])
     assert "castle (4)" in lines[0]
     assert lines[2] == "| MAGSAC | 0.250 | 0.250 |  | 1.00 |"
-    assert lines[3] == "| prior | 0.750 | 0.750 | +0.5000 [+0.5000, +0.5000] | 30.00 |"
+    assert lines[3] == "| scene | 0.750 | 0.750 | +0.5000 [+0.5000, +0.5000] | 30.00 |"

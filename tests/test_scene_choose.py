@@ -1,4 +1,4 @@
-"""Which F a pair gets, what cameras are believed, and the settings' ranges."""
+"""Which F a pair gets, which cameras are rejected, and the settings' keys."""
 
 from dataclasses import replace
 
@@ -11,12 +11,10 @@ from mkpc_kaggle.config import from_table
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.scene.checks import believable
-from mkpc_kaggle.scene.choose import Choice, Reason, choose
+from mkpc_kaggle.scene.choose import MAX_DISAGREEMENT_DEG, Choice, Reason, choose
 from mkpc_kaggle.scene.config import Mapper, SceneConfig
-from mkpc_kaggle.scene.model import Model, PlacedImage
-
-CONFIG = SceneConfig()
+from mkpc_kaggle.scene.reconstruction import MIN_POINTS, RegisteredImage, SfmModel, filter_models
+from mkpc_kaggle.scene.view_graph import BatchImage
 
 
 @pytest.fixture(scope="module")
@@ -24,27 +22,35 @@ def scene() -> SyntheticScene:
     return synthetic_scene(4, points=600, outliers=0.3)
 
 
-def model(cameras: dict[str, Camera], points: int = 100) -> Model:
-    placed = tuple(PlacedImage(name, SIZE, camera, points) for name, camera in cameras.items())
-    return Model(placed, np.zeros((points, 3)), 0.5)
+def model(cameras: dict[str, Camera], points: int = 100) -> SfmModel:
+    registered = (
+        RegisteredImage(BatchImage(name, f"digest of {name}", SIZE), camera, points)
+        for name, camera in cameras.items()
+    )
+    return SfmModel(tuple(registered), np.zeros((points, 3)), 0.5)
 
 
-def choice(models: list[Model], scene: SyntheticScene, own: np.ndarray | None = None, **names: str) -> Choice:
-    pair = replace(scene.batch.pairs[0], **names)
-    return choose([models], pair.image0, pair.image1, pair.matches, own, CONFIG)
+def choice_of(scene: SyntheticScene, *reconstructions: list[SfmModel], **changes: object) -> Choice:
+    """What the first pair gets."""
+    found = [[{image.image.digest: image for image in model.images} for model in each] for each in reconstructions]
+    return choose(replace(scene.pairs[0], **changes), found)
+
+
+def choice(models: list[SfmModel], scene: SyntheticScene, own: np.ndarray | None = None) -> Choice:
+    return choice_of(scene, models, pair_fundamental=own)
 
 
 def test_the_scenes_fundamental_is_that_of_the_cameras(scene: SyntheticScene) -> None:
     chosen = choice([model(scene.cameras)], scene)
     assert chosen.from_scene
     assert chosen.reason is Reason.SCENE
-    np.testing.assert_allclose(chosen.F, scene.true_fundamental(scene.batch.pairs[0]))
+    np.testing.assert_allclose(chosen.F, scene.true_fundamental(scene.pairs[0]))
 
 
 def test_an_image_without_a_camera_leaves_the_pair_its_own(scene: SyntheticScene) -> None:
     rest = {name: camera for name, camera in scene.cameras.items() if name != "0000"}
-    assert choice([model(rest)], scene).reason is Reason.UNPLACED
-    assert choice([], scene).reason is Reason.UNPLACED
+    assert choice([model(rest)], scene).reason is Reason.UNREGISTERED
+    assert choice([], scene).reason is Reason.UNREGISTERED
 
 
 def test_cameras_of_two_models_make_no_fundamental(scene: SyntheticScene) -> None:
@@ -52,7 +58,7 @@ def test_cameras_of_two_models_make_no_fundamental(scene: SyntheticScene) -> Non
     assert choice(apart, scene).reason is Reason.APART
 
 
-def moved(scene: SyntheticScene, degrees: float, zoom: float = 1.0) -> Model:
+def moved(scene: SyntheticScene, degrees: float, zoom: float = 1.0) -> SfmModel:
     """A model in a world of its own in which the second image's camera is turned and has another focal length."""
     turn, _ = cv2.Rodrigues(np.radians([0, degrees, 0]))
     world, _ = cv2.Rodrigues(np.array([0.3, -0.2, 0.1]))
@@ -63,36 +69,36 @@ def moved(scene: SyntheticScene, degrees: float, zoom: float = 1.0) -> Model:
 
 
 def test_what_several_reconstructions_say_is_averaged(scene: SyntheticScene) -> None:
-    pair = scene.batch.pairs[0]
-    one, other = moved(scene, 1.0, 1.25), moved(scene, -1.0, 0.8)
-    both = choose([[one], [other]], pair.image0, pair.image1, pair.matches, None, CONFIG)
+    pair = scene.pairs[0]
+    left, right = moved(scene, 1.0, 1.25), moved(scene, -1.0, 0.8)
+    both = choice_of(scene, [left], [right])
     assert both.F is not None
     assert scene.median_distance(both.F, pair) < 0.01
-    assert scene.median_distance(choice([one], scene).F, pair) > 2
+    assert scene.median_distance(choice([left], scene).F, pair) > 2
 
 
 def test_a_reconstruction_that_says_something_else_is_not_averaged(scene: SyntheticScene) -> None:
-    pair = scene.batch.pairs[0]
-    first, other = moved(scene, 0.0), moved(scene, CONFIG.agreement + 1)
-    both = choose([[first], [], [other]], pair.image0, pair.image1, pair.matches, None, CONFIG)
+    pair = scene.pairs[0]
+    first, other = moved(scene, 0.0), moved(scene, MAX_DISAGREEMENT_DEG + 1)
+    both = choice_of(scene, [first], [], [other])
     np.testing.assert_allclose(both.F, scene.true_fundamental(pair), atol=1e-9)
 
 
 def test_an_image_that_one_reconstruction_lacks_is_taken_from_another(scene: SyntheticScene) -> None:
-    pair = scene.batch.pairs[0]
+    pair = scene.pairs[0]
     rest = model({name: camera for name, camera in scene.cameras.items() if name != "0000"})
-    found = choose([[rest], [model(scene.cameras)]], pair.image0, pair.image1, pair.matches, None, CONFIG)
+    found = choice_of(scene, [rest], [model(scene.cameras)])
     np.testing.assert_allclose(found.F, scene.true_fundamental(pair))
 
 
 def test_the_first_model_that_has_both_images_counts(scene: SyntheticScene) -> None:
     other = {name: replace(camera, t=camera.t + 1) for name, camera in scene.cameras.items()}
     first = choice([model({"0000": scene.cameras["0000"]}), model(scene.cameras), model(other)], scene)
-    np.testing.assert_allclose(first.F, scene.true_fundamental(scene.batch.pairs[0]))
+    np.testing.assert_allclose(first.F, scene.true_fundamental(scene.pairs[0]))
 
 
 def test_a_picture_and_itself_have_no_fundamental(scene: SyntheticScene) -> None:
-    assert choice([model(scene.cameras)], scene, image1="0000").reason is Reason.SAME_IMAGE
+    assert choice_of(scene, [model(scene.cameras)], image1=scene.images[0]).reason is Reason.SAME_IMAGE
 
 
 def test_two_cameras_at_one_point_have_no_fundamental(scene: SyntheticScene) -> None:
@@ -103,7 +109,7 @@ def test_two_cameras_at_one_point_have_no_fundamental(scene: SyntheticScene) -> 
 def test_a_wrong_camera_is_contradicted_by_the_pairs_matches(scene: SyntheticScene) -> None:
     camera, tilt = scene.cameras["0001"], cv2.Rodrigues(np.array([np.radians(15), 0, 0]))[0]
     wrong = scene.cameras | {"0001": Camera(camera.K, tilt @ camera.R, tilt @ camera.t)}
-    own = scene.true_fundamental(scene.batch.pairs[0])
+    own = scene.true_fundamental(scene.pairs[0])
     assert choice([model(wrong)], scene, own).reason is Reason.CONTRADICTION
     assert choice([model(wrong)], scene, None).from_scene  # without an F of its own, nothing contradicts
 
@@ -111,14 +117,13 @@ def test_a_wrong_camera_is_contradicted_by_the_pairs_matches(scene: SyntheticSce
 def test_a_good_camera_is_not_contradicted_by_an_own_fundamental_with_a_few_more_matches(
     scene: SyntheticScene,
 ) -> None:
-    pair = scene.batch.pairs[0]
-    truth = scene.true_fundamental(pair)
+    truth = scene.true_fundamental(scene.pairs[0])
     assert choice([model(scene.cameras)], scene, truth).from_scene
-    few = Matches.empty()
-    assert choose([[model(scene.cameras)]], pair.image0, pair.image1, few, truth, CONFIG).from_scene
+    few = choice_of(scene, [model(scene.cameras)], matches=Matches.empty(), pair_fundamental=truth)
+    assert few.from_scene
 
 
-def with_camera(scene: SyntheticScene, **changes: object) -> Model:
+def with_camera(scene: SyntheticScene, **changes: object) -> SfmModel:
     cameras = model(scene.cameras)
     return replace(cameras, images=(replace(cameras.images[0], **changes), *cameras.images[1:]))
 
@@ -129,38 +134,39 @@ def with_camera(scene: SyntheticScene, **changes: object) -> Model:
 def test_an_absurd_focal_length_is_left_out(scene: SyntheticScene, focal: float, told: str) -> None:
     camera = scene.cameras["0000"]
     bad = replace(camera, K=np.diag([focal, focal, 1.0]))
-    (kept,), (doubt,) = believable((with_camera(scene, camera=bad),), CONFIG)
-    assert [image.name for image in kept.images] == ["0001", "0002", "0003"]
-    assert "0000" in doubt
-    assert told in doubt
+    (kept,), (reason,) = filter_models((with_camera(scene, camera=bad),))
+    assert [found.image.name for found in kept.images] == ["0001", "0002", "0003"]
+    assert "0000" in reason
+    assert told in reason
 
 
 def test_an_image_that_sees_too_few_points_is_left_out(scene: SyntheticScene) -> None:
-    (kept,), (doubt,) = believable((with_camera(scene, points=CONFIG.least_points - 1),), CONFIG)
+    (kept,), (reason,) = filter_models((with_camera(scene, points=MIN_POINTS - 1),))
     assert len(kept.images) == 3
-    assert f"fewer than {CONFIG.least_points}" in doubt
+    assert f"fewer than {MIN_POINTS}" in reason
 
 
 def test_a_model_that_is_too_small_is_left_out(scene: SyntheticScene) -> None:
     small = model({name: scene.cameras[name] for name in ("0000", "0001")})
-    kept, doubts = believable((small, model(scene.cameras)), CONFIG)
-    assert [len(one.images) for one in kept] == [4]
-    assert doubts == ("a model of 2 images is too small",)
+    kept, reasons = filter_models((small, model(scene.cameras)))
+    assert [len(each.images) for each in kept] == [4]
+    assert reasons == ("a model of 2 images is too small",)
 
 
 def test_models_are_in_order_of_what_is_left_of_them(scene: SyntheticScene) -> None:
     three = model({name: scene.cameras[name] for name in ("0001", "0002", "0003")})
-    kept, _ = believable((three, model(scene.cameras)), CONFIG)
-    assert [len(one.images) for one in kept] == [4, 3]
+    kept, _ = filter_models((three, model(scene.cameras)))
+    assert [len(each.images) for each in kept] == [4, 3]
 
 
 def test_settings_come_from_a_table() -> None:
-    config = from_table(SceneConfig, {"mapper": "incremental", "cell": 1}, "[scene]")
-    assert config.mapper is Mapper.INCREMENTAL
-    assert config.cell == 1.0
+    config = from_table(SceneConfig, {"mapper": "incremental", "verification_error": 2}, "[scene]")
+    assert (config.mapper, config.verification_error) == (Mapper.INCREMENTAL, 2.0)
     with pytest.raises(UserError, match=r"unknown key 'cells'.*mapper"):
         from_table(SceneConfig, {"cells": 1.0}, "[scene]")
-    with pytest.raises(UserError, match=r"\[scene\]: cell must be in"):
-        from_table(SceneConfig, {"cell": 0}, "[scene]")
-    with pytest.raises(UserError, match="not below"):
-        from_table(SceneConfig, {"lowest_focal": 3.0, "highest_focal": 2.0}, "[scene]")
+    with pytest.raises(UserError, match=r"\[scene\]: verification_error must be in"):
+        from_table(SceneConfig, {"verification_error": 0}, "[scene]")
+    with pytest.raises(UserError, match=r"'one_camera' is now called 'shared_intrinsics'"):
+        from_table(SceneConfig, {"one_camera": 0}, "[scene]")
+    with pytest.raises(UserError, match=r"'most_images' was removed"):
+        from_table(SceneConfig, {"most_images": 9}, "[scene]")

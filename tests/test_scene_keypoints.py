@@ -1,4 +1,4 @@
-"""Points of all pairs of an image become keypoints; matches are between keypoints."""
+"""The view graph of a batch, and its keypoints: points of all pairs of an image, merged."""
 
 import numpy as np
 import pytest
@@ -8,9 +8,10 @@ from hypothesis.extra.numpy import arrays
 
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.scene.batch import Batch, BatchImage, BatchPair, Edge, edges_of, matchers_of
-from mkpc_kaggle.scene.graph import components
-from mkpc_kaggle.scene.keypoints import merge_points, one_to_one, scene_keypoints
+from mkpc_kaggle.pipeline.pair import UnitResult
+from mkpc_kaggle.recipe import Unit
+from mkpc_kaggle.scene.keypoints import SceneKeypoints, merge_points, one_to_one, scene_keypoints
+from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair, Edge, ViewGraph, tracks_of
 
 SIZE = Size(100, 80)
 
@@ -20,9 +21,17 @@ def matches(*rows: tuple[float, float, float, float]) -> Matches:
     return Matches(table[:, :2], table[:, 2:], np.ones(len(table)))
 
 
-def batch(names: str, *pairs: tuple[str, str, Matches]) -> Batch:
-    """One-letter images, of which the small letter has the content of the capital one."""
-    return Batch(tuple(BatchImage(n, n.upper(), SIZE) for n in names), tuple(BatchPair(*pair) for pair in pairs))
+def image(name: str) -> BatchImage:
+    """A small letter has the content of its capital letter."""
+    return BatchImage(name, name.upper(), SIZE)
+
+
+def pair(names: str, found: Matches) -> BatchPair:
+    return BatchPair(image(names[0]), image(names[1]), found)
+
+
+def keypoints_of(count: int, *edges: Edge) -> SceneKeypoints:
+    return scene_keypoints(ViewGraph(tuple(map(image, "ABC"[:count])), edges))
 
 
 @given(arrays(np.float32, st.tuples(st.integers(0, 60), st.just(2)), elements=st.floats(-5, 5, width=32)))
@@ -60,8 +69,8 @@ def test_keypoints_do_not_depend_on_the_order_of_the_points() -> None:
 
 def test_a_match_that_two_matchers_found_is_one_and_outvotes_another() -> None:
     edge = Edge(0, 1, matches((10, 10, 60, 60), (10, 10, 20, 20), (10.1, 10, 20, 20.1)))
-    keypoints = scene_keypoints(2, [edge], 0.75)
-    ((index,),) = [edge.index.tolist() for edge in keypoints.edges]
+    keypoints = keypoints_of(2, edge)
+    ((index,),) = [index.tolist() for index in keypoints.matches]
     np.testing.assert_allclose(keypoints.points[1][index[1]], [20, 20.05], atol=1e-5)
 
 
@@ -77,63 +86,66 @@ def test_a_point_seen_in_two_pairs_is_one_keypoint() -> None:
         Edge(0, 2, matches((10.1, 9.9, 50, 50))),
         Edge(1, 2, matches((20.05, 20, 50.1, 50))),
     ]
-    keypoints = scene_keypoints(3, edges, 0.75)
+    keypoints = keypoints_of(3, *edges)
     assert [len(points) for points in keypoints.points] == [2, 2, 1]
-    tracks = {(edge.first, edge.second): edge.index.tolist() for edge in keypoints.edges}
-    (a, b), (a2, c) = tracks[0, 1][0], tracks[0, 2][0]
+    first, second, third = (index.tolist() for index in keypoints.matches)
+    (a, b), (a2, c) = first[0], second[0]
     assert a == a2
-    assert tracks[1, 2] == [[b, c]]
+    assert third == [[b, c]]
     np.testing.assert_allclose(keypoints.points[0][a], [10.05, 9.95], atol=1e-5)
 
 
 def test_an_image_without_matches_has_no_keypoints() -> None:
-    keypoints = scene_keypoints(3, [Edge(0, 2, matches((1, 1, 2, 2)))], 0.75)
+    keypoints = keypoints_of(3, Edge(0, 2, matches((1, 1, 2, 2))))
     assert [points.shape for points in keypoints.points] == [(1, 2), (0, 2), (1, 2)]
 
 
 def test_the_same_picture_under_two_names_is_one_image() -> None:
-    edges = edges_of(
-        batch(
-            "ABa",
-            ("A", "B", matches((1, 1, 2, 2))),
-            ("B", "a", matches((4, 4, 3, 3))),
-            ("A", "a", matches((1,) * 4)),
-        )
-    )
-    assert [(edge.first, edge.second) for edge in edges] == [(0, 1)]
-    assert edges[0].matches.points0.tolist() == [[1, 1], [3, 3]]
-    assert edges[0].matches.points1.tolist() == [[2, 2], [4, 4]]
+    there, back, same = matches((1, 1, 2, 2)), matches((4, 4, 3, 3)), matches((1,) * 4)
+    graph = ViewGraph.of_pairs([pair("AB", there), pair("Ba", back), pair("Aa", same)])
+    assert [found.name for found in graph.images] == ["A", "B"]
+    assert [(edge.first, edge.second) for edge in graph.edges] == [(0, 1)]
+    assert graph.edges[0].matches.points0.tolist() == [[1, 1], [3, 3]]
+    assert graph.edges[0].matches.points1.tolist() == [[2, 2], [4, 4]]
 
 
-def test_a_scene_is_made_of_a_pairs_tracks_where_it_has_some() -> None:
-    images = (BatchImage("A", "A", SIZE), BatchImage("B", "B", SIZE))
+def test_a_graph_is_made_of_a_pairs_tracks_where_it_has_some() -> None:
     tracks = {"fine": matches((2, 2, 3, 3)), "finer": matches((4, 4, 5, 5))}
-    pair = BatchPair("B", "A", matches((1,) * 4, (2, 2, 3, 3), (4, 4, 5, 5)), tracks=tracks)
-    of_scene = Batch(images, (pair,))
-    assert matchers_of(of_scene) == ("fine", "finer")
-    assert [len(edge.matches) for edge in edges_of(of_scene)] == [2]
-    (edge,) = edges_of(of_scene, "finer")
+    pairs = [
+        pair("AB", Matches.empty()),
+        BatchPair(image("B"), image("A"), matches((1,) * 4, (2, 2, 3, 3), (4, 4, 5, 5)), tracks=tracks),
+    ]
+    assert [len(edge.matches) for edge in ViewGraph.of_pairs(pairs).edges] == [2]
+    (edge,) = ViewGraph.of_pairs(pairs, "finer").edges
     assert edge.matches.points0.tolist() == [[5, 5]]
     assert edge.matches.points1.tolist() == [[4, 4]]
 
 
-def test_pairs_without_matches_are_no_edges() -> None:
-    assert edges_of(batch("AB", ("A", "B", Matches.empty()))) == ()
-
-
-@pytest.mark.parametrize("names", ["A", "AA"])
-def test_a_batch_of_unknown_or_repeated_images_is_refused(names: str) -> None:
-    with pytest.raises(ValueError, match=r"one name|lacks"):
-        batch(names, ("A", "B", Matches.empty()))
+def test_a_pair_without_matches_makes_no_edge() -> None:
+    graph = ViewGraph.of_pairs([pair("AB", Matches.empty())])
+    assert len(graph.images) == 2
+    assert graph.edges == ()
 
 
 def test_components_are_connected_by_pairs_with_enough_matches() -> None:
     def edge(first: int, second: int, count: int) -> Edge:
         return Edge(first, second, Matches(np.zeros((count, 2)), np.zeros((count, 2)), np.zeros(count)))
 
-    edges = [edge(1, 3, 20), edge(1, 4, 20), edge(3, 5, 4), edge(5, 6, 15)]
-    found = components(8, edges, 15)
-    assert [component.images for component in found] == [(1, 3, 4), (5, 6)]
-    assert [[(e.first, e.second) for e in c.edges] for c in found] == [[(0, 1), (0, 2)], [(0, 1)]]
-    assert components(8, [], 15) == ()
-    assert components(0, [], 15) == ()
+    edges = (edge(1, 3, 20), edge(1, 4, 20), edge(3, 5, 4), edge(5, 6, 15))
+    found = ViewGraph(tuple(map(image, "ABCDEFGH")), edges).components()
+    assert ["".join(each.name for each in graph.images) for graph in found] == ["BDE", "FG"]
+    assert [[(e.first, e.second) for e in graph.edges] for graph in found] == [[(0, 1), (0, 2)], [(0, 1)]]
+    assert ViewGraph((image("A"),), ()).components() == ()
+    assert ViewGraph((), ()).components() == ()
+
+
+def results_of(*counts: int) -> list[UnitResult]:
+    """Of a unit whose matches make no tracks, and of a unit whose matches do, that many each."""
+    rows = [np.arange(2 * count, dtype=np.float32).reshape(count, 2) for count in counts]
+    units = (Unit(1, "coarse", 640, tracks=False), Unit(1, "fine", 640))
+    return [UnitResult(unit, Matches(row, row, np.zeros(len(row)))) for unit, row in zip(units, rows, strict=True)]
+
+
+@pytest.mark.parametrize(("fine", "used"), [(50, 50), (49, 79), (0, 30)])
+def test_matches_without_tracks_are_for_pairs_with_few_others(fine: int, used: int) -> None:
+    assert sum(map(len, tracks_of(results_of(30, fine)).values())) == used

@@ -2,8 +2,9 @@
 
 import pickle
 import sys
-from collections.abc import Sequence
+import tempfile
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,13 +14,12 @@ from benchmarks.synthetic_scene import SIZE, SyntheticScene, synthetic_scene
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import RobustConfig
-from mkpc_kaggle.scene import reconstruct
-from mkpc_kaggle.scene.batch import Batch, BatchImage, BatchPair
+from mkpc_kaggle.scene import colmap
 from mkpc_kaggle.scene.choose import Reason
 from mkpc_kaggle.scene.config import CameraModel, Mapper, SceneConfig
-from mkpc_kaggle.scene.known_focals import KnownFocals
-from mkpc_kaggle.scene.model import Model
-from mkpc_kaggle.scene.solve import Solution, solve
+from mkpc_kaggle.scene.reconstruct import Solution, reconstruct_batch
+from mkpc_kaggle.scene.reconstruction import SfmModel
+from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair, ViewGraph
 
 BOTH = pytest.mark.parametrize("config", [SceneConfig(mapper=mapper) for mapper in Mapper], ids=list(Mapper))
 
@@ -29,15 +29,15 @@ def scene() -> SyntheticScene:
     return synthetic_scene(6, points=500)
 
 
-def batch_of(count: int, *pairs: BatchPair) -> Batch:
-    return Batch(tuple(BatchImage(str(n), f"digest {n}", SIZE) for n in range(count)), pairs)
+def pair_of(names: str, matches: Matches) -> BatchPair:
+    return BatchPair(*(BatchImage(name, f"digest {name}", SIZE) for name in names), matches)
 
 
 def distances(solution: Solution, scene: SyntheticScene) -> list[float]:
     """How far true correspondences are from the F that each pair got, in pixels; infinite without one."""
     return [
         np.inf if choice.F is None else scene.median_distance(choice.F, pair)
-        for choice, pair in zip(solution.choices, scene.batch.pairs, strict=True)
+        for choice, pair in zip(solution.choices, scene.pairs, strict=True)
     ]
 
 
@@ -46,24 +46,25 @@ def distances(solution: Solution, scene: SyntheticScene) -> list[float]:
 def test_cameras_are_right_in_spite_of_noise_and_wrong_matches(
     scene: SyntheticScene, config: SceneConfig, camera_model: CameraModel
 ) -> None:
-    solution = solve(scene.batch, replace(config, camera_model=camera_model))
-    (one,) = solution.scenes
-    assert (one.placed, one.failure, one.doubts) == (6, "", ())
+    solution = reconstruct_batch(scene.pairs, replace(config, camera_model=camera_model))
+    (found,) = solution.reconstructions
+    assert (found.registered, found.failure, found.rejections) == (6, "", ())
     assert max(distances(solution, scene)) < 0.5
-    for name, camera in scene.cameras.items():
-        placed = solution.placed(name)
-        assert placed is not None
-        assert placed.focal == pytest.approx(camera.K[0, 0], rel=0.03)
-        assert placed.camera.K[:2, 2].tolist() == [SIZE.width / 2 - 0.5, SIZE.height / 2 - 0.5]
-        assert placed.points > 50
-    (model,) = one.models
+    for image in scene.images:
+        registered = solution.registered(image)
+        assert registered is not None
+        assert registered.focal == pytest.approx(scene.cameras[image.name].K[0, 0], rel=0.03)
+        assert registered.camera.K[:2, 2].tolist() == [SIZE.width / 2 - 0.5, SIZE.height / 2 - 0.5]
+        assert registered.points > 50
+    (model,) = found.models
     assert 0.1 < model.reprojection_error < 1
     assert len(model.points) > 200
 
 
 @BOTH
 def test_the_same_batch_gives_the_same_bytes(scene: SyntheticScene, config: SceneConfig) -> None:
-    assert pickle.dumps(solve(scene.batch, config)) == pickle.dumps(solve(scene.batch, config))
+    first, again = (pickle.dumps(reconstruct_batch(scene.pairs, config)) for _ in range(2))
+    assert first == again
 
 
 @pytest.mark.parametrize(("each_matcher", "times"), [(True, 3), (False, 1)])
@@ -72,115 +73,113 @@ def test_what_each_matcher_found_is_reconstructed_alone_too(
 ) -> None:
     called: list[int] = []
 
-    def note(names: Sequence[str], *rest: Any) -> tuple[Model, ...]:
-        called.append(len(names))
-        return made(names, *rest)
+    def note(graph: ViewGraph, *rest: Any) -> tuple[SfmModel, ...]:
+        called.append(len(graph.images))
+        return made(graph, *rest)
 
-    made = reconstruct.reconstruct
-    monkeypatch.setattr(reconstruct, "reconstruct", note)
-    halves = [
-        replace(pair, tracks={"even": pair.matches[::2], "odd": pair.matches[1::2]}) for pair in scene.batch.pairs
-    ]
-    solution = solve(replace(scene.batch, pairs=tuple(halves)), SceneConfig(each_matcher=each_matcher))
+    made = colmap.structure_from_motion
+    monkeypatch.setattr(colmap, "structure_from_motion", note)
+    halves = [replace(pair, tracks={"even": pair.matches[::2], "odd": pair.matches[1::2]}) for pair in scene.pairs]
+    solution = reconstruct_batch(halves, SceneConfig(each_matcher=each_matcher))
     assert called == [6] * times
-    assert len(solution.scenes) == 1
+    assert len(solution.reconstructions) == 1
     assert max(distances(solution, scene)) < 0.5
 
 
 def test_a_solution_goes_through_a_pipe(scene: SyntheticScene) -> None:
-    solution = solve(pickle.loads(pickle.dumps(scene.batch)), SceneConfig())
+    solution = reconstruct_batch(pickle.loads(pickle.dumps(scene.pairs)), SceneConfig())
     copy = pickle.loads(pickle.dumps(solution))
     assert [choice.reason for choice in copy.choices] == [choice.reason for choice in solution.choices]
-    np.testing.assert_array_equal(copy.scenes[0].models[0].points, solution.scenes[0].models[0].points)
+    np.testing.assert_array_equal(
+        copy.reconstructions[0].models[0].points, solution.reconstructions[0].models[0].points
+    )
 
 
 def test_a_pair_with_few_matches_of_its_own_gets_the_scenes_fundamental(scene: SyntheticScene) -> None:
-    pairs = list(scene.batch.pairs)
+    pairs = list(scene.pairs)
     pairs[0] = replace(pairs[0], matches=pairs[0].matches[:3])
-    solution = solve(replace(scene.batch, pairs=tuple(pairs)), SceneConfig())
+    solution = reconstruct_batch(pairs, SceneConfig())
     assert solution.choices[0].from_scene
     assert scene.median_distance(solution.choices[0].F, pairs[0]) < 0.5
 
 
 def test_a_pair_without_matches_gets_the_scenes_fundamental(scene: SyntheticScene) -> None:
-    pairs = (replace(scene.batch.pairs[3], matches=Matches.empty()), *scene.batch.pairs)
-    assert solve(replace(scene.batch, pairs=pairs), SceneConfig()).choices[0].from_scene
+    pairs = (replace(scene.pairs[3], matches=Matches.empty()), *scene.pairs)
+    assert reconstruct_batch(pairs, SceneConfig()).choices[0].from_scene
 
 
 def test_a_pair_that_the_scene_lacks_is_estimated_at_its_focal_lengths(scene: SyntheticScene) -> None:
-    last = scene.batch.images[-1].name
-    inside = [pair for pair in scene.batch.pairs if last not in (pair.image0, pair.image1)]
-    outside = next(pair for pair in scene.batch.pairs if last in (pair.image0, pair.image1))
+    last = scene.images[-1]
+    inside = [pair for pair in scene.pairs if last not in (pair.image0, pair.image1)]
+    outside = next(pair for pair in scene.pairs if last in (pair.image0, pair.image1))
     few = replace(outside, matches=outside.matches[:14])  # too few to place the image
-    batch = replace(scene.batch, pairs=(few, replace(few, matches=few.matches[:3]), *inside))
-    known = KnownFocals(RobustConfig(permutations=1, max_iterations=2000), FocalConfig(), sigma=0.05)
-    solution = solve(batch, SceneConfig(), known)
+    pairs = (few, replace(few, matches=few.matches[:3]), *inside)
+    magsac = RobustConfig(permutations=1, max_iterations=2000)
+    solution = reconstruct_batch(pairs, SceneConfig(), FocalConfig(), magsac)
     found, hopeless, *others = solution.choices
-    assert (found.reason, found.from_scene) == (Reason.UNPLACED, False)
+    assert (found.reason, found.from_scene) == (Reason.UNREGISTERED, False)
     assert scene.median_distance(found.F, few) < 5
-    assert (hopeless.reason, hopeless.F) == (Reason.UNPLACED, None)
+    assert (hopeless.reason, hopeless.F) == (Reason.UNREGISTERED, None)
     assert all(choice.from_scene for choice in others)
-    assert solve(batch, SceneConfig()).choices[0].F is None
+    assert reconstruct_batch(pairs, SceneConfig()).choices[0].F is None
 
 
-def test_a_turned_pair_gets_the_transposed_fundamental(scene: SyntheticScene) -> None:
-    pair = scene.batch.pairs[0]
+def test_a_swapped_pair_gets_the_transposed_fundamental(scene: SyntheticScene) -> None:
+    pair = scene.pairs[0]
     back = BatchPair(pair.image1, pair.image0, Matches.empty())
-    solution = solve(replace(scene.batch, pairs=(*scene.batch.pairs, back)), SceneConfig())
+    solution = reconstruct_batch((*scene.pairs, back), SceneConfig())
     there, back_again = solution.choices[0].F, solution.choices[-1].F
     assert abs(np.sum(there * back_again.T)) == pytest.approx(1)
 
 
 def test_a_picture_under_two_names_is_one_camera(scene: SyntheticScene) -> None:
-    images = (*scene.batch.images, replace(scene.batch.images[0], name="again"))
-    pair = scene.batch.pairs[0]
-    pairs = (*scene.batch.pairs, replace(pair, image0="again"), BatchPair("again", "0000", pair.matches))
-    solution = solve(Batch(images, pairs), SceneConfig())
-    assert len(solution.scenes[0].names) == 6
-    assert solution.placed("again") is solution.placed("0000")
+    pair, again = scene.pairs[0], replace(scene.images[0], name="again")
+    pairs = (*scene.pairs, replace(pair, image0=again), BatchPair(again, pair.image0, pair.matches))
+    solution = reconstruct_batch(pairs, SceneConfig())
+    assert len(solution.reconstructions[0].names) == 6
+    assert solution.registered(again) is solution.registered(pair.image0)
     np.testing.assert_array_equal(solution.choices[-2].F, solution.choices[0].F)
     assert solution.choices[-1].reason is Reason.SAME_IMAGE
 
 
 def test_two_places_in_a_batch_are_two_scenes(scene: SyntheticScene) -> None:
     other = synthetic_scene(4, points=500, seed=7, prefix="b")
-    across = BatchPair("0000", "b0000", Matches.empty())
-    both = Batch(scene.batch.images + other.batch.images, (*scene.batch.pairs, *other.batch.pairs, across))
-    solution = solve(both, SceneConfig())
-    assert [one.placed for one in solution.scenes] == [6, 4]
+    across = BatchPair(scene.images[0], other.images[0], Matches.empty())
+    solution = reconstruct_batch((*scene.pairs, *other.pairs, across), SceneConfig())
+    assert [found.registered for found in solution.reconstructions] == [6, 4]
     assert solution.choices[-1].reason is Reason.APART
     assert all(choice.from_scene for choice in solution.choices[:-1])
 
 
 def test_a_pair_whose_matches_agree_on_something_else_keeps_its_own(scene: SyntheticScene) -> None:
     """As on a facade that repeats itself; whether it is right nobody knows, so the pair's own F stays."""
-    pair = scene.batch.pairs[-1]
+    pair = scene.pairs[-1]
     shifted = replace(pair.matches, points1=pair.matches.points0 + np.array([0, 90], np.float32))
     columns = np.array([[0, 0, 1], [0, 0, 0], [-1, 0, 0]]) / np.sqrt(2)
-    pairs = (*scene.batch.pairs[:-1], replace(pair, matches=shifted, own=columns))
-    solution = solve(replace(scene.batch, pairs=pairs), SceneConfig())
+    pairs = (*scene.pairs[:-1], replace(pair, matches=shifted, pair_fundamental=columns))
+    solution = reconstruct_batch(pairs, SceneConfig())
     assert solution.choices[-1].reason is Reason.CONTRADICTION
     assert all(choice.from_scene for choice in solution.choices[:-1])
 
 
 def test_two_images_are_no_scene(scene: SyntheticScene) -> None:
-    pair = scene.batch.pairs[0]
-    solution = solve(Batch(scene.batch.images[:2], (pair,)), SceneConfig())
-    assert [one.failure for one in solution.scenes] == ["2 images are connected; a scene needs 3"]
-    assert solution.choices[0].reason is Reason.UNPLACED
+    solution = reconstruct_batch(scene.pairs[:1], SceneConfig())
+    assert [found.failure for found in solution.reconstructions] == ["2 images are connected; a scene needs 3"]
+    assert solution.choices[0].reason is Reason.UNREGISTERED
 
 
 def test_a_scene_of_too_few_pairs_is_none(scene: SyntheticScene) -> None:
-    two = tuple(pair for pair in scene.batch.pairs if pair.image0 == scene.batch.pairs[0].image0)[:2]
-    (one,) = solve(Batch(scene.batch.images, two), SceneConfig()).scenes
-    assert one.failure == "2 pairs connect 3 images; a scene needs 1.35 an image"
+    two = tuple(pair for pair in scene.pairs if pair.image0 == scene.pairs[0].image0)[:2]
+    (found,) = reconstruct_batch(two, SceneConfig()).reconstructions
+    assert found.failure == "2 pairs connect 3 images; a scene needs 1.35 an image"
 
 
 def test_a_batch_without_matches_has_no_scene() -> None:
-    assert solve(batch_of(0), SceneConfig()).scenes == ()
-    solution = solve(batch_of(3, BatchPair("0", "1", Matches.empty())), SceneConfig())
-    assert solution.scenes == ()
-    assert solution.placed("0") is None
+    assert reconstruct_batch([], SceneConfig()).reconstructions == ()
+    pair = pair_of("01", Matches.empty())
+    solution = reconstruct_batch([pair], SceneConfig())
+    assert solution.reconstructions == ()
+    assert solution.registered(pair.image0) is None
 
 
 def junk(kind: str, count: int = 60) -> Matches:
@@ -203,10 +202,9 @@ def junk(kind: str, count: int = 60) -> Matches:
 @BOTH
 @pytest.mark.parametrize("kind", ["random", "one point", "a line", "the same places", "a homography"])
 def test_degenerate_matches_give_a_reason(kind: str, config: SceneConfig) -> None:
-    pairs = [BatchPair(a, b, junk(kind)) for a, b in (("0", "1"), ("1", "2"), ("0", "2"), ("2", "3"))]
-    solution = solve(batch_of(4, *pairs), config)
-    (one,) = solution.scenes
-    assert one.models or one.failure
+    solution = reconstruct_batch([pair_of(names, junk(kind)) for names in ("01", "12", "02", "23")], config)
+    (found,) = solution.reconstructions
+    assert found.models or found.failure
     for choice in solution.choices:
         assert choice.from_scene or choice.reason is not Reason.SCENE
         assert choice.F is None or np.isfinite(choice.F).all()
@@ -216,34 +214,33 @@ def test_degenerate_matches_give_a_reason(kind: str, config: SceneConfig) -> Non
 def test_a_chain_of_images_is_a_legal_graph(config: SceneConfig) -> None:
     """Every image is in two pairs only: no point need be in three images."""
     scene = synthetic_scene(6, points=500)
-    chain = tuple(p for p in scene.batch.pairs if int(p.image1) - int(p.image0) == 1)
-    solution = solve(replace(scene.batch, pairs=chain), config)
+    chain = tuple(p for p in scene.pairs if int(p.image1.name) - int(p.image0.name) == 1)
+    solution = reconstruct_batch(chain, config)
     assert len(solution.choices) == 5
-    assert solution.scenes[0].models or solution.scenes[0].failure
+    assert solution.reconstructions[0].models or solution.reconstructions[0].failure
 
 
 def test_without_pycolmap_every_scene_says_so(scene: SyntheticScene, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delitem(sys.modules, "mkpc_kaggle.scene.reconstruct", raising=False)
+    monkeypatch.delitem(sys.modules, "mkpc_kaggle.scene.colmap", raising=False)
     monkeypatch.setitem(sys.modules, "pycolmap", None)
-    solution = solve(scene.batch, SceneConfig())
-    assert "pycolmap cannot be imported" in solution.scenes[0].failure
-    assert {choice.reason for choice in solution.choices} == {Reason.UNPLACED}
+    solution = reconstruct_batch(scene.pairs, SceneConfig())
+    assert "pycolmap cannot be imported" in solution.reconstructions[0].failure
+    assert {choice.reason for choice in solution.choices} == {Reason.UNREGISTERED}
 
 
 def test_what_pycolmap_raises_is_a_reason(scene: SyntheticScene, monkeypatch: pytest.MonkeyPatch) -> None:
     def broken(*_: object) -> None:
         raise RuntimeError("disk I/O error")
 
-    monkeypatch.setattr("mkpc_kaggle.scene.reconstruct.reconstruct", broken)
-    (one,) = solve(scene.batch, SceneConfig()).scenes
-    assert one.failure == "pycolmap failed: disk I/O error"
+    monkeypatch.setattr(colmap, "structure_from_motion", broken)
+    (found,) = reconstruct_batch(scene.pairs, SceneConfig()).reconstructions
+    assert found.failure == "pycolmap failed: disk I/O error"
 
 
-def test_many_images_are_reconstructed_in_parts() -> None:
-    large = synthetic_scene(14, points=500)
-    solution = solve(large.batch, SceneConfig(most_images=8))
-    placed = {image.name for model in solution.scenes[0].models for image in model.images}
-    assert len(placed) >= 12
-    got = [distance for distance in distances(solution, large) if np.isfinite(distance)]
-    assert len(got) > 60
-    assert np.median(got) < 0.5
+def test_nothing_is_written_to_disk(
+    scene: SyntheticScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    assert reconstruct_batch(scene.pairs, SceneConfig()).choices[0].from_scene
+    assert list(tmp_path.iterdir()) == []

@@ -1,5 +1,6 @@
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -81,15 +82,20 @@ def test_a_failed_pair_counts_as_failed_even_where_the_fallback_happens_to_be_ri
     assert right.error.angle < 1e-6
 
 
+def scores_of(demo: DemoSet, recipe: Path, *options: str) -> dict[str, Any]:
+    """What `validate --json` writes."""
+    out = recipe.with_suffix(".json")
+    arguments = ["validate", "--train-dir", str(demo.train_dir), "--recipe", str(recipe), "--json", str(out)]
+    assert main([*arguments, *options]) == 0
+    scores: dict[str, Any] = json.loads(out.read_text())
+    return scores
+
+
 def test_validate_scores_a_recipe_and_writes_all_figures(
-    demo: DemoSet, recipe: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    demo: DemoSet, recipe: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    out = tmp_path / "scores.json"
-    arguments = ["validate", "--train-dir", str(demo.train_dir), "--pairs-per-scene", "5"]
-    assert main([*arguments, "--recipe", str(recipe), "--json", str(out)]) == 0
-    printed = capsys.readouterr().out
-    scores = json.loads(out.read_text())
-    assert f"{'mean over scenes':<20}{5:>6}{scores['mAA']:>9.4f}" in printed
+    scores = scores_of(demo, recipe, "--pairs-per-scene", "5")
+    assert f"{'mean over scenes':<20}{5:>6}{scores['mAA']:>9.4f}" in capsys.readouterr().out
     (scene,) = scores["scenes"]
     assert scene["scene"] == "courtyard"
     assert len(scene["pairs"]) == 5
@@ -102,50 +108,38 @@ def test_validate_scores_a_recipe_and_writes_all_figures(
 
 
 def test_each_step_of_the_estimate_has_a_column(
-    demo: DemoSet, recipe: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    demo: DemoSet, recipe: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    arguments = [
-        "validate",
-        "--train-dir",
-        str(demo.train_dir),
-        "--json",
-        str(tmp_path / "scores.json"),
-        "--recipe",
-    ]
-    recipe.write_text(RECIPE + "[magsac]\npermutations = 1\n")
-    assert main([*arguments, str(recipe)]) == 0
-    plain = json.loads((tmp_path / "scores.json").read_text())
+    plain = scores_of(demo, recipe)
     assert plain["mAA_by_step"] == {"MAGSAC": plain["mAA"]}
     capsys.readouterr()
-
-    recipe.write_text(recipe.read_text() + "[focal]\n[scene]\n")
-    assert main([*arguments, str(recipe)]) == 0
+    recipe.write_text(RECIPE + "[focal]\n[scene]\n")
+    scores = scores_of(demo, recipe)
     printed = capsys.readouterr().out
-    scores = json.loads((tmp_path / "scores.json").read_text())
     by_step = scores["mAA_by_step"]
     assert list(by_step) == ["MAGSAC", "+ prior", "+ scene"]
     assert by_step["MAGSAC"] == pytest.approx(plain["mAA"])
     assert by_step["+ scene"] == scores["mAA"]
-    count = len(scores["scenes"][0]["pairs"])
-    assert (
-        f"{'mean over scenes':<20}{count:>6}" + "".join(f"{value:>9.4f}" for value in by_step.values()) in printed
-    )
-    assert (
-        f"gain of + prior over the step before, 95% interval: {by_step['+ prior'] - by_step['MAGSAC']:+.4f}"
-        in printed
-    )
+    cells = "".join(f"{value:>9.4f}" for value in by_step.values())
+    assert f"{'mean over scenes':<20}{len(scores['scenes'][0]['pairs']):>6}{cells}" in printed
+    gain = by_step["+ prior"] - by_step["MAGSAC"]
+    assert f"gain of + prior over the step before, 95% interval: {gain:+.4f}" in printed
     for pair, former in zip(scores["scenes"][0]["pairs"], plain["scenes"][0]["pairs"], strict=True):
         assert pair["accuracy_by_step"]["MAGSAC"] == former["accuracy_by_step"]["MAGSAC"]
 
 
 @pytest.mark.parametrize(
-    ("mode", "stages"), [("stage-1", {"1"}), ("whole-images", {"1"}), ("two-stage", {"1", "2"})]
+    ("options", "units"),
+    [
+        (["--mode", "stage-1"], {"1:sift@320"}),
+        (["--mode", "whole-images", "--units", "1:sift@400"], {"1:sift@400"}),
+    ],
 )
-def test_modes_change_the_stages(demo: DemoSet, recipe: Path, tmp_path: Path, mode: str, stages: set[str]) -> None:
-    out = tmp_path / "scores.json"
-    arguments = ["validate", "--train-dir", str(demo.train_dir), "--pairs-per-scene", "1", "--mode", mode]
-    assert main([*arguments, "--recipe", str(recipe), "--json", str(out)]) == 0
-    assert set(json.loads(out.read_text())["inliers_by_stage"]) == stages
+def test_modes_and_units_change_what_is_run(
+    demo: DemoSet, recipe: Path, options: list[str], units: set[str]
+) -> None:
+    (pair,) = scores_of(demo, recipe, "--pairs-per-scene", "1", *options)["scenes"][0]["pairs"]
+    assert set(pair["matches"]) == units
 
 
 def test_a_work_directory_keeps_the_journal_and_a_report_that_shows_the_pairs(
@@ -155,7 +149,7 @@ def test_a_work_directory_keeps_the_journal_and_a_report_that_shows_the_pairs(
     assert main([*arguments, "--work-dir", str(tmp_path / "work")]) == 0
     page = tmp_path / "work" / "report.html"
     assert f"report: {page}" in capsys.readouterr().out
-    assert page.read_text(encoding="utf-8").count("<img ") == 2
+    assert page.read_text(encoding="utf-8").count("<img ") == 2 + 1
     assert len(read_log(tmp_path / "work").pairs) == 2
 
 
@@ -208,14 +202,6 @@ def test_the_table_has_a_row_a_scene_and_their_mean(demo: DemoSet, tmp_path: Pat
     lines = score_table(scored)
     assert [line.split()[0] for line in lines] == ["scene", "courtyard", "mean"]
     assert lines[1].split()[1:3] == ["8", "1.0000"]
-
-
-def test_some_of_a_recipes_units(demo: DemoSet, recipe: Path, tmp_path: Path) -> None:
-    out = tmp_path / "scores.json"
-    arguments = ["validate", "--train-dir", str(demo.train_dir), "--pairs-per-scene", "1", "--recipe", str(recipe)]
-    assert main([*arguments, "--units", "1:sift@320", "--json", str(out)]) == 0
-    (pair,) = json.loads(out.read_text())["scenes"][0]["pairs"]
-    assert set(pair["matches"]) == {"1:sift@320"}
 
 
 def test_an_unknown_unit_is_told_with_the_known_ones(

@@ -60,7 +60,7 @@ def test_what_cannot_be_converted_is_told(tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"gone\.pt cannot be read"):
         convert(tmp_path / "gone.pt", tmp_path / "x.safetensors")
     os.mkfifo(tmp_path / "pipe.pt")
-    with pytest.raises(UserError, match=r"pipe\.pt cannot be read as a checkpoint: no regular file"):
+    with pytest.raises(UserError, match=r"pipe\.pt cannot be read as a checkpoint: not a regular file"):
         convert(tmp_path / "pipe.pt", tmp_path / "x.safetensors")
     torch.save({"a": torch.zeros(1).to(torch.complex32)}, tmp_path / "odd.pt")
     with pytest.raises(UserError, match=r"odd\.pt: safetensors has no type for tensors of torch\.complex32"):

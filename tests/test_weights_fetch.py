@@ -1,20 +1,18 @@
 """Downloads against a local server: whole, broken off, resumed, wrong, impossible."""
 
 import os
-import shutil
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from dataclasses import replace
-from io import BytesIO
 from pathlib import Path
-from urllib.request import Request
+from types import SimpleNamespace
 
 import pytest
 from web import Site, serve
 from weight_files import DATA, digest_of, line, put
 
-from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.weights import UNVERIFIED, WeightFile, fetch
-from mkpc_kaggle.weights.fetch import ATTEMPTS, BLOCK, Fetched, Outcome, choose, url_of
+from mkpc_kaggle.weights.fetch import ATTEMPTS, BLOCK_BYTES, Fetched, FetchOutcome, choose, url_of
 
 BIG = bytes(range(256)) * 1000
 CUT = 100_000
@@ -45,7 +43,7 @@ def names_in(directory: Path) -> list[str]:
 
 def test_a_file_comes_whole_into_a_new_directory(site: Site, tmp_path: Path) -> None:
     fetched = get(site, tmp_path / "new" / "weights")
-    assert (fetched.outcome, fetched.note) == (Outcome.FETCHED, "")
+    assert (fetched.outcome, fetched.note) == (FetchOutcome.FETCHED, "")
     assert fetched.path.read_bytes() == BIG
     assert names_in(fetched.path.parent) == ["a.bin"]
 
@@ -53,7 +51,7 @@ def test_a_file_comes_whole_into_a_new_directory(site: Site, tmp_path: Path) -> 
 def test_a_broken_connection_is_taken_up_where_it_broke(site: Site, tmp_path: Path) -> None:
     site.breaks = [CUT, 5]
     pauses = Pauses()
-    assert get(site, tmp_path, pauses=pauses).outcome is Outcome.FETCHED
+    assert get(site, tmp_path, pauses=pauses).outcome is FetchOutcome.FETCHED
     assert (tmp_path / "a.bin").read_bytes() == BIG
     assert site.asked == ["", f"bytes={CUT}-", f"bytes={CUT + 5}-"]
     assert site.sent == len(BIG)
@@ -64,63 +62,36 @@ def test_another_call_goes_on_where_the_last_one_gave_up(site: Site, tmp_path: P
     site.breaks = [CUT] + [0] * (ATTEMPTS - 1)
     pauses = Pauses()
     failed = get(site, tmp_path, pauses=pauses)
-    assert failed.outcome is Outcome.FAILED
-    assert f"failed {ATTEMPTS} times" in failed.note
+    assert failed.outcome is FetchOutcome.FAILED
+    assert f"{ATTEMPTS} attempts failed" in failed.note
     assert f"{CUT} of {len(BIG)} bytes" in failed.note
     assert (len(site.asked), pauses) == (ATTEMPTS, [1, 2, 4, 8])
-    assert names_in(tmp_path) == ["a.bin.part", "a.bin.part.mark"]
-    assert get(site, tmp_path).outcome is Outcome.FETCHED
+    assert names_in(tmp_path) == ["a.bin.part"]
+    assert get(site, tmp_path).outcome is FetchOutcome.FETCHED
     assert (tmp_path / "a.bin").read_bytes() == BIG
     assert site.sent == len(BIG)
-    assert names_in(tmp_path) == ["a.bin"]
-
-
-@pytest.mark.parametrize("digest", [UNVERIFIED, None])
-def test_a_file_that_changed_meanwhile_is_taken_anew(site: Site, tmp_path: Path, digest: str | None) -> None:
-    site.breaks = [CUT] + [0] * (ATTEMPTS - 1)
-    old = bytes(len(BIG))
-    site.data, site.tag = old, '"old"'
-    get(site, tmp_path, line(data=old, size=-1, digest=digest))
-    site.data, site.tag = BIG, '"new"'
-    assert get(site, tmp_path, line(data=BIG, size=-1, digest=digest)).outcome is Outcome.FETCHED
-    assert site.asked[-1] == f"bytes={CUT}-"
-    assert (tmp_path / "a.bin").read_bytes() == BIG
-
-
-def test_a_file_without_a_digest_goes_on_by_the_validator(site: Site, tmp_path: Path) -> None:
-    site.breaks = [CUT]
-    assert get(site, tmp_path, line(data=BIG, digest=UNVERIFIED)).outcome is Outcome.FETCHED
-    assert (site.asked, site.sent) == (["", f"bytes={CUT}-"], len(BIG))
-    assert (tmp_path / "a.bin").read_bytes() == BIG
     assert names_in(tmp_path) == ["a.bin"]
 
 
 def test_a_part_of_another_version_is_found_out_and_removed(site: Site, tmp_path: Path) -> None:
     put(tmp_path, "a.bin.part", bytes(CUT))
     failed = get(site, tmp_path)
-    assert (failed.outcome, site.asked) == (Outcome.FAILED, [f"bytes={CUT}-"])
+    assert (failed.outcome, site.asked) == (FetchOutcome.FAILED, [f"bytes={CUT}-"])
     assert names_in(tmp_path) == []
-    assert get(site, tmp_path).outcome is Outcome.FETCHED
+    assert get(site, tmp_path).outcome is FetchOutcome.FETCHED
     assert (tmp_path / "a.bin").read_bytes() == BIG
 
 
-def test_a_server_that_knows_no_ranges_sends_all_again(site: Site, tmp_path: Path) -> None:
-    site.ranges, site.breaks = False, [CUT]
-    assert get(site, tmp_path).outcome is Outcome.FETCHED
-    assert (tmp_path / "a.bin").read_bytes() == BIG
-    assert site.sent == CUT + len(BIG)
-
-
-def test_bytes_that_nobody_can_vouch_for_are_not_gone_on_with(site: Site, tmp_path: Path) -> None:
-    site.tag, site.breaks = "", [CUT]
-    assert get(site, tmp_path, line(data=BIG, digest=UNVERIFIED)).outcome is Outcome.FETCHED
+def test_a_file_without_a_digest_is_begun_anew(site: Site, tmp_path: Path) -> None:
+    site.breaks = [CUT]
+    assert get(site, tmp_path, line(data=BIG, digest=UNVERIFIED)).outcome is FetchOutcome.FETCHED
     assert site.asked == ["", ""]
     assert (tmp_path / "a.bin").read_bytes() == BIG
 
 
 def test_another_part_than_was_asked_for_is_not_taken(site: Site, tmp_path: Path) -> None:
     site.breaks, site.shift = [CUT], 7
-    assert get(site, tmp_path).outcome is Outcome.FETCHED
+    assert get(site, tmp_path).outcome is FetchOutcome.FETCHED
     assert site.asked == ["", f"bytes={CUT}-", ""]
     assert (tmp_path / "a.bin").read_bytes() == BIG
 
@@ -128,35 +99,24 @@ def test_another_part_than_was_asked_for_is_not_taken(site: Site, tmp_path: Path
 @pytest.mark.parametrize("size", [-1, len(BIG)])
 def test_a_part_that_is_whole_only_lacks_its_name(site: Site, tmp_path: Path, size: int) -> None:
     put(tmp_path, "a.bin.part", BIG)
-    assert get(site, tmp_path, line(data=BIG, size=size)).outcome is Outcome.FETCHED
+    assert get(site, tmp_path, line(data=BIG, size=size)).outcome is FetchOutcome.FETCHED
     assert (site.sent, names_in(tmp_path)) == (0, ["a.bin"])
 
 
 @pytest.mark.parametrize("size", [-1, len(BIG)])
 def test_a_part_that_is_too_long_is_dropped(site: Site, tmp_path: Path, size: int) -> None:
     put(tmp_path, "a.bin.part", BIG + b"!")
-    assert get(site, tmp_path, line(data=BIG, size=size)).outcome is Outcome.FETCHED
+    assert get(site, tmp_path, line(data=BIG, size=size)).outcome is FetchOutcome.FETCHED
     assert (tmp_path / "a.bin").read_bytes() == BIG
 
 
 def test_a_wrong_digest_gives_no_name_and_leaves_nothing(site: Site, tmp_path: Path) -> None:
     wanted = bytes(len(BIG))
     failed = get(site, tmp_path, line(data=wanted))
-    assert failed.outcome is Outcome.FAILED
+    assert failed.outcome is FetchOutcome.FAILED
     assert digest_of(BIG) in failed.note
     assert digest_of(wanted) in failed.note
     assert names_in(tmp_path) == []
-
-
-@pytest.mark.parametrize("length", [len(BIG) + 1, len(BIG) - 1])
-def test_a_server_that_has_another_size_is_refused_before_the_download(
-    site: Site, tmp_path: Path, length: int
-) -> None:
-    site.length = length
-    failed = get(site, tmp_path)
-    assert failed.outcome is Outcome.FAILED
-    assert f"has {length} bytes, the manifest says {len(BIG)}" in failed.note
-    assert (len(site.asked), names_in(tmp_path)) == (1, [])
 
 
 @pytest.mark.parametrize(("status", "requests"), [(404, 1), (403, 1), (503, 2), (429, 2)])
@@ -167,102 +127,69 @@ def test_errors_that_pass_are_waited_for_and_others_are_told(
     fetched = get(site, tmp_path)
     assert len(site.asked) == requests
     if requests == 1:
-        assert (fetched.outcome, names_in(tmp_path)) == (Outcome.FAILED, [])
+        assert (fetched.outcome, names_in(tmp_path)) == (FetchOutcome.FAILED, [])
         assert f"the server says {status}" in fetched.note
     else:
-        assert fetched.outcome is Outcome.FETCHED
+        assert fetched.outcome is FetchOutcome.FETCHED
 
 
 def test_a_server_that_is_not_there_is_told(site: Site, tmp_path: Path) -> None:
     gone = replace(line(), source="http://127.0.0.1:9/a.bin")
     pauses = Pauses()
     failed = fetch.fetch(gone, tmp_path, wait=pauses)
-    assert (failed.outcome, len(pauses)) == (Outcome.FAILED, ATTEMPTS - 1)
+    assert (failed.outcome, len(pauses)) == (FetchOutcome.FAILED, ATTEMPTS - 1)
     assert "127.0.0.1:9" in failed.note
 
 
-@pytest.mark.parametrize("target", ["file:///etc/hostname", "ftp://127.0.0.1/a.bin", "data:,x"])
+@pytest.mark.parametrize("target", ["file:///etc/hostname", "data:,x"])
 def test_only_the_web_is_redirected_to(site: Site, tmp_path: Path, target: str) -> None:
     site.redirect = target
     failed = get(site, tmp_path, line(size=-1, digest=UNVERIFIED))
-    assert failed.outcome is Outcome.FAILED
+    assert failed.outcome is FetchOutcome.FAILED
     assert target in failed.note
     assert names_in(tmp_path) == []
 
 
-def test_no_redirection_leaves_https() -> None:
-    with pytest.raises(UserError, match="redirects to http://x/b, which is not followed"):
-        fetch._HttpRedirectHandler().redirect_request(Request("https://x/a"), BytesIO(), 302, "", {}, "http://x/b")
+def test_no_download_leaves_https(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    answer = closing(SimpleNamespace(url="http://x.org/a.bin", close=lambda: None))
+    monkeypatch.setattr(fetch, "urlopen", lambda *_, **__: answer)
+    failed = fetch.fetch(line(source="https://x.org/a.bin"), tmp_path)
+    assert (failed.outcome, names_in(tmp_path)) == (FetchOutcome.FAILED, [])
+    assert failed.note == "https://x.org/a.bin redirects to http://x.org/a.bin, which is not followed"
 
 
 def test_a_redirection_keeps_the_part_that_is_asked_for(site: Site, tmp_path: Path) -> None:
     site.breaks = [CUT] + [0] * (ATTEMPTS - 1)
     get(site, tmp_path)
     with serve(Site(b"", redirect=site.url)) as front:
-        assert get(front, tmp_path).outcome is Outcome.FETCHED
+        assert get(front, tmp_path).outcome is FetchOutcome.FETCHED
     assert site.sent == len(BIG)
 
 
 def test_a_good_file_is_not_asked_for_and_a_bad_one_is_replaced(site: Site, tmp_path: Path) -> None:
     put(tmp_path, data=BIG)
-    assert get(site, tmp_path).outcome is Outcome.ALREADY_THERE
+    assert get(site, tmp_path).outcome is FetchOutcome.ALREADY_THERE
     assert site.asked == []
     put(tmp_path, data=BIG[:-1])
-    assert get(site, tmp_path).outcome is Outcome.FETCHED
+    assert get(site, tmp_path).outcome is FetchOutcome.FETCHED
     assert (tmp_path / "a.bin").read_bytes() == BIG
 
 
 def test_an_unverified_file_comes_with_its_digest(site: Site, tmp_path: Path) -> None:
     fetched = get(site, tmp_path, line(size=-1, digest=UNVERIFIED))
-    assert fetched.outcome is Outcome.FETCHED
+    assert fetched.outcome is FetchOutcome.FETCHED
     assert fetched.note.endswith(digest_of(BIG))
 
 
 # malice
 
 
-@pytest.mark.parametrize(
-    "target",
-    [
-        "http://[bad/a",
-        "http://a..b/x",
-        f"http://{'a' * 64}.org/x",
-        "http://127.0.0.1:99999/",
-        "http://127.0.0.1:port/",
-        "http:///",
-        "http://\u00e9/x",
-    ],
-)
-def test_a_redirection_to_nowhere_is_told(site: Site, tmp_path: Path, target: str) -> None:
-    site.redirect = target
-    failed = get(site, tmp_path)
-    assert (failed.outcome, names_in(tmp_path)) == (Outcome.FAILED, [])
-    assert site.url in failed.note
-
-
-@pytest.mark.parametrize("size", [b"-5", b"zz", b"ffffffffffffffffffffffff", b"", b"1" * 70_000])
-def test_chunks_of_no_size_are_told(site: Site, tmp_path: Path, size: bytes) -> None:
-    site.chunk_size = size
-    assert get(site, tmp_path).outcome is Outcome.FAILED
-
-
 def test_no_more_bytes_are_taken_than_the_manifest_has(site: Site, tmp_path: Path) -> None:
-    site.data, site.length = BIG + bytes(10 * BLOCK), 0
+    site.data, site.length = BIG + bytes(10 * BLOCK_BYTES), 0
     failed = get(site, tmp_path)
-    assert failed.outcome is Outcome.FAILED
+    assert failed.outcome is FetchOutcome.FAILED
     assert f"more than {len(BIG)} bytes came" in failed.note
     assert sum(path.stat().st_size for path in tmp_path.iterdir()) <= len(BIG)
-
-
-@pytest.mark.parametrize("drip", [b"HTTP/1.1 200 OK\r\nA: ", b"HTTP/1.1 200 OK\r\nContent-Length: 256000\r\n\r\n"])
-def test_a_server_that_sends_a_byte_now_and_then_is_left(
-    site: Site, tmp_path: Path, drip: bytes, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(fetch, "TIMEOUT", 0.3)
-    site.drip = drip
-    failed = get(site, tmp_path)
-    assert failed.outcome is Outcome.FAILED
-    assert "bytes came in 0 s" in failed.note
 
 
 @pytest.mark.parametrize("make", [lambda path, to: path.symlink_to(to), lambda path, _: os.mkfifo(path)])
@@ -272,43 +199,16 @@ def test_a_part_that_is_no_file_is_replaced(
     other = tmp_path / "other"
     other.write_bytes(b"mine")
     make(tmp_path / "a.bin.part", other)
-    assert get(site, tmp_path).outcome is Outcome.FETCHED
+    assert get(site, tmp_path).outcome is FetchOutcome.FETCHED
     assert (tmp_path / "a.bin").read_bytes() == BIG
     assert not (tmp_path / "a.bin").is_symlink()
     assert other.read_bytes() == b"mine"
 
 
-@pytest.mark.parametrize("mark", [b"one\r\nHost: elsewhere", b'"one"\n', b"\xe9", b"a" * 100_000])
-def test_a_mark_that_is_no_validator_is_not_sent(site: Site, tmp_path: Path, mark: bytes) -> None:
-    put(tmp_path, "a.bin.part", BIG[:CUT])
-    put(tmp_path, "a.bin.part.mark", mark)
-    assert get(site, tmp_path, line(data=BIG, digest=UNVERIFIED)).outcome is Outcome.FETCHED
-    assert site.asked == [""]
-    assert names_in(tmp_path) == ["a.bin"]
-
-
-def test_a_mark_that_is_a_link_is_not_followed(site: Site, tmp_path: Path) -> None:
-    put(tmp_path, "mine", b"mine")
-    (tmp_path / "a.bin.part.mark").symlink_to(tmp_path / "mine")
-    assert get(site, tmp_path).outcome is Outcome.FETCHED
-    assert (tmp_path / "mine").read_bytes() == b"mine"
-
-
-def test_a_full_disk_is_told_before_the_download(
-    site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    usage = shutil.disk_usage(tmp_path)._replace(free=len(BIG) - 1)
-    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage)
-    failed = get(site, tmp_path)
-    assert failed.outcome is Outcome.FAILED
-    assert f"only {len(BIG) - 1} bytes free" in failed.note
-    assert site.sent <= BLOCK
-
-
 def test_a_directory_that_cannot_be_made_is_told(site: Site, tmp_path: Path) -> None:
     put(tmp_path, "file")
     failed = get(site, tmp_path / "file" / "weights")
-    assert failed.outcome is Outcome.FAILED
+    assert failed.outcome is FetchOutcome.FAILED
     assert "cannot be written" in failed.note
 
 
@@ -325,7 +225,7 @@ def test_what_cannot_be_downloaded_as_it_is_is_for_the_user(tmp_path: Path, sour
     file = line(source=source)
     assert url_of(file) is None
     by_hand = fetch.fetch(file, tmp_path)
-    assert by_hand.outcome is Outcome.BY_HAND
+    assert by_hand.outcome is FetchOutcome.BY_HAND
     assert by_hand.note == f"get it from {source} and save it as {tmp_path / 'a.bin'}"
 
 

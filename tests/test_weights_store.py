@@ -13,8 +13,9 @@ from shared import WEIGHTS, needs_weights
 from weight_files import DATA, OTHER, digest_of, line, put
 
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.weights import UNVERIFIED, FoundFile, State, WeightStore, digests, load_tensors, store, tree
+from mkpc_kaggle.weights import UNVERIFIED, State, WeightStore, load_tensors, store
 from mkpc_kaggle.weights.convert import convert
+from mkpc_kaggle.weights.manifest import digest_of as file_digest
 
 pytestmark = pytest.mark.usefixtures("nowhere_else")
 
@@ -23,11 +24,6 @@ def found_by(weights: WeightStore, slot: str = "slot") -> Path:
     found = weights.find(slot)
     assert found is not None
     return found.path
-
-
-def git_blob(path: Path) -> str:
-    run = subprocess.run(["git", "hash-object", str(path)], capture_output=True, text=True, check=True)
-    return "git-blob:" + run.stdout.strip()
 
 
 @needs_weights
@@ -97,11 +93,6 @@ def test_missing_weights_are_named_with_all_alternatives_and_where_they_were_sea
         WeightStore([], [line()]).load("slot")
 
 
-def test_an_unknown_slot_is_a_mistake_in_the_code() -> None:
-    with pytest.raises(KeyError, match="'slto'"):
-        WeightStore([], [line()]).find("slto")
-
-
 # by digest
 
 
@@ -111,13 +102,13 @@ def test_a_renamed_file_is_found_by_its_size_and_digest(tmp_path: Path, name: st
     put(tmp_path, "same size.dat", OTHER)
     found = WeightStore([tmp_path], [line()]).find("slot")
     assert found is not None
-    assert (found.path.name, found.state, found.note) == (name, State.RENAMED, "it is a.bin")
+    assert (found.path.name, found.state, found.note) == (name, State.GOOD, "it is a.bin")
 
 
 def test_without_a_size_only_small_checkpoints_are_read_for_their_digest(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(tree, "LARGEST_OF_UNKNOWN_SIZE", len(DATA))
+    monkeypatch.setattr(store, "MAX_UNKNOWN_SIZE_BYTES", len(DATA))
     put(tmp_path, "table.csv")
     put(tmp_path, "picture.png")
     put(tmp_path, "big.pth", DATA * 2)
@@ -126,18 +117,9 @@ def test_without_a_size_only_small_checkpoints_are_read_for_their_digest(
     assert found_by(WeightStore([tmp_path], [line(size=-1)])).name == "renamed.ckpt"
 
 
-def test_a_file_is_known_by_the_digest_that_git_gives(tmp_path: Path) -> None:
-    put(tmp_path, "renamed.pt")
-    file = line(digest=git_blob(tmp_path / "renamed.pt"))
-    found = WeightStore([tmp_path], [file]).find("slot")
-    assert found is not None
-    assert (found.state, found.digest) == (State.RENAMED, digest_of(DATA))
-
-
 def test_files_of_another_size_are_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     read: list[Path] = []
-    real = digests._digests
-    monkeypatch.setattr(digests, "_digests", lambda path, *rest: read.append(path) or real(path, *rest))
+    monkeypatch.setattr(store, "digest_of", lambda path: read.append(path) or file_digest(path))
     put(tmp_path, "long.pth", DATA + b"!")
     put(tmp_path, "same.pth", OTHER)
     assert WeightStore([tmp_path], [line()]).find("slot") is None
@@ -146,11 +128,9 @@ def test_files_of_another_size_are_not_read(tmp_path: Path, monkeypatch: pytest.
 
 def test_a_file_is_read_once_until_it_changes(tmp_path: Path) -> None:
     path = put(tmp_path) / "a.bin"
-    before = digests._digests.cache_info()
-    assert digests.file_digests(path) is digests.file_digests(path)
+    assert file_digest(path) is file_digest(path)
     path.write_bytes(OTHER + b"longer")
-    assert digests.file_digests(path).sha256 == digest_of(OTHER + b"longer")
-    assert digests._digests.cache_info().misses - before.misses == 2
+    assert file_digest(path) == digest_of(OTHER + b"longer")
 
 
 def test_a_name_goes_before_a_digest(tmp_path: Path) -> None:
@@ -166,7 +146,8 @@ def test_links_to_directories_are_followed_once(tmp_path: Path) -> None:
     (inside / "loop").symlink_to(tmp_path / "inside")
     (inside / "out").symlink_to(tmp_path / "outside")
     (inside / "file.pth").symlink_to(tmp_path / "outside" / "b.pth")
-    assert [path.name for path in tree.Tree(tmp_path / "inside").files] == ["a.pth", "file.pth", "b.pth"]
+    found = WeightStore([tmp_path / "inside"], [line("a.pth"), line("b.pth"), line("file.pth")]).verify()
+    assert [file.path.name for file in found] == ["a.pth", "file.pth", "b.pth"]
 
 
 @pytest.mark.parametrize("mount", ["weights", "datasets/someone/weights", "competitions/weights"])
@@ -192,12 +173,12 @@ def test_an_unpacked_checkpoint_is_found_and_read(tmp_path: Path, outer: str) ->
     weights = WeightStore([tmp_path / "input"], [file])
     found = weights.find("slot")
     assert found is not None
-    assert (found.state, found.path) == (State.UNPACKED, tmp_path / "input" / "someones" / outer / "x")
+    assert (found.state, found.path) == (State.UNVERIFIED, tmp_path / "input" / "someones" / outer / "x")
     with pytest.warns(UserWarning, match=r"x is not verified: this checkpoint was unpacked"):
         loaded = weights.load("slot")
     assert loaded.keys() == tensors.keys()
     assert all(torch.equal(loaded[name], tensor) for name, tensor in tensors.items())
-    assert [one.state for one in weights.verify()] == [State.UNPACKED]
+    assert [one.state for one in weights.verify()] == [State.UNVERIFIED]
     line_made = convert(found.path, tmp_path / "x.safetensors")
     assert found.digest in line_made.source
     assert load_tensors(tmp_path / "x.safetensors").keys() == tensors.keys()
@@ -243,26 +224,11 @@ def test_other_bytes_of_the_same_size_are_refused_with_both_digests(tmp_path: Pa
         WeightStore([tmp_path], [line()]).load("slot")
 
 
-def test_a_file_of_unknown_size_is_still_held_against_its_digest(tmp_path: Path) -> None:
-    file = line(size=-1)
-    assert WeightStore([put(tmp_path / "good")], [file]).find("slot") is not None
-    with pytest.warns(UserWarning, match="digest"):
-        assert WeightStore([put(tmp_path / "bad", data=OTHER)], [file]).find("slot") is None
-
-
-def test_another_file_of_the_manifest_under_the_wrong_name_is_called_by_its_own(tmp_path: Path) -> None:
-    put(tmp_path, "a.bin", OTHER)
-    weights = WeightStore([tmp_path], [line("a.bin", digest=UNVERIFIED), line("b.bin", OTHER, slot="other")])
-    with pytest.warns(UserWarning, match=r"a\.bin: its bytes are those of b\.bin"):
-        assert weights.find("slot") is None
-    assert found_by(weights, "other").name == "a.bin"
-
-
 def test_an_alternative_under_the_name_of_another_is_taken_without_complaint(tmp_path: Path) -> None:
     put(tmp_path, "a.bin", OTHER)
     found = WeightStore([tmp_path], [line("a.bin"), line("b.bin", OTHER)]).find("slot")
     assert found is not None
-    assert (found.file.name, found.path.name, found.state) == ("b.bin", "a.bin", State.RENAMED)
+    assert (found.file.name, found.path.name, found.state) == ("b.bin", "a.bin", State.GOOD)
 
 
 @pytest.mark.parametrize("second", ["two/a.bin", "two/b.bin", "two/renamed.bin"])
@@ -279,30 +245,26 @@ def test_after_a_bad_file_the_search_goes_on(tmp_path: Path, second: str) -> Non
 def test_what_cannot_be_read_is_reported(tmp_path: Path) -> None:
     (tmp_path / "a.bin").symlink_to(tmp_path / "nothing")
     weights = WeightStore([tmp_path], [line()])
-    with (
-        pytest.warns(UserWarning, match=r"a\.bin cannot be read"),
-        pytest.warns(UserWarning, match=r"passed over: .*a\.bin: cannot be read: No such file"),
-    ):
+    with pytest.warns(UserWarning, match=r"passed over: .*a\.bin: cannot be read: No such file"):
         assert weights.find("slot") is None
+    assert [file.state for file in weights.verify()] == [State.REFUSED]
 
 
 def test_a_file_that_cannot_be_read_is_passed_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def read(path: Path, *rest: int) -> digests.Digests:
+    def read(path: Path) -> str:
         if path.name == "locked.bin":
             raise PermissionError(13, "Permission denied", str(path))
-        return real(path, *rest)
+        return file_digest(path)
 
-    real = digests._digests
-    monkeypatch.setattr(digests, "_digests", read)
+    monkeypatch.setattr(store, "digest_of", read)
     put(tmp_path, "locked.bin")
     put(tmp_path, "renamed.bin")
-    with pytest.warns(UserWarning, match=r"locked\.bin cannot be read.*Permission denied"):
-        assert found_by(WeightStore([tmp_path], [line()])).name == "renamed.bin"
+    assert found_by(WeightStore([tmp_path], [line()])).name == "renamed.bin"
 
 
 def test_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "a.bin")
-    with pytest.warns(UserWarning, match=r"a\.bin: no regular file"):
+    with pytest.warns(UserWarning, match=r"a\.bin: cannot be read: not a regular file"):
         assert WeightStore([tmp_path], [line()]).find("slot") is None
 
 
@@ -346,40 +308,12 @@ def test_verify_tells_good_truncated_swapped_renamed_and_unverified_files_apart(
     checked = {one.path.name: (one.state, one.note) for one in WeightStore([tmp_path], files).verify()}
     assert {name: state for name, (state, _) in checked.items()} == {
         "good.pt": State.GOOD,
-        "cut.pt": State.TRUNCATED,
-        "swapped.pt": State.SWAPPED,
-        "damaged.pt": State.SWAPPED,
-        "renamed.pt": State.RENAMED,
+        "cut.pt": State.REFUSED,
+        "swapped.pt": State.REFUSED,
+        "damaged.pt": State.REFUSED,
+        "renamed.pt": State.GOOD,
         "free.pt": State.UNVERIFIED,
     }
     assert checked["swapped.pt"][1] == "its bytes are those of good.pt"
     assert checked["renamed.pt"][1] == "it is lost.pt"
     assert digest_of(contents["free"]) in checked["free.pt"][1]
-
-
-def test_verify_reports_what_cannot_be_read(tmp_path: Path) -> None:
-    (tmp_path / "a.bin").symlink_to(tmp_path / "a.bin")
-    with warnings.catch_warnings(record=True):
-        warnings.simplefilter("always")
-        (checked,) = WeightStore([tmp_path], [line()]).verify()
-    assert checked.state is State.UNREADABLE
-
-
-def test_found_files_are_linked_where_they_are_and_fetched_where_they_are_not(tmp_path: Path) -> None:
-    def found(path: Path, content: bytes) -> FoundFile:
-        file = line(f"{path.name}.pth", content, slot=path.name)
-        return FoundFile(file, path, State.GOOD, file.digest)
-
-    (tmp_path / "a").write_bytes(b"here")
-    home = tmp_path / "home"
-    home.mkdir()
-    files = found(tmp_path / "a", b"here"), found(tmp_path / "lost" / "b", b"there")
-    for one in files:
-        one.link_or_copy(home, lambda path: b"there" if path.name == "b" else b"")
-    assert (home / "a.pth").is_symlink()
-    assert not (home / "b.pth").is_symlink()
-    store = WeightStore([home], [one.file for one in files])
-    assert [found_by(store, slot).read_bytes() for slot in ("a", "b")] == [b"here", b"there"]
-    unpacked = FoundFile(files[1].file, tmp_path / "lost" / "b", State.UNPACKED, "sha256:0")
-    with pytest.raises(UserError, match="cannot be sent to other machines"):
-        unpacked.link_or_copy(home, lambda _: b"")

@@ -2,7 +2,6 @@
 
 import argparse
 import errno
-import os
 import signal
 import sys
 import time
@@ -10,9 +9,11 @@ import warnings
 from collections.abc import Sequence
 from importlib import import_module
 from io import TextIOWrapper
-from typing import TextIO
+from typing import NoReturn
 
 from mkpc_kaggle import __version__
+from mkpc_kaggle.engine.budget import process_started
+from mkpc_kaggle.engine.console import complain, leave, warn
 from mkpc_kaggle.errors import UserError
 
 COMMANDS = ("submit", "match", "validate", "recipes", "weights", "check", "journal", "package", "demo")
@@ -37,37 +38,37 @@ COMMAND --help tells more.
 """
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+def program(arguments: Sequence[str] | None = None) -> NoReturn:
+    """Run a command and end the process, without what an interpreter would still do for a second or longer."""
+    leave(main(arguments, started=process_started()))
+
+
+def main(arguments: Sequence[str] | None = None, *, started: float | None = None) -> int:
     """Run a command; the exit status: 0 done, 1 a check failed, 2 bad input, 130 / 143 ended by a signal.
 
-    141: the reader of the output closed the pipe.
+    141: the reader of the output closed the pipe. The time limit counts from ``started``; default: now.
     """
-    started = time.monotonic()
     for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, TextIOWrapper):  # paths and ids may be of letters that the terminal has not
+        if isinstance(stream, TextIOWrapper):  # paths and ids may have letters that the terminal lacks
             stream.reconfigure(errors="backslashreplace")
     with warnings.catch_warnings():
-        warnings.showwarning = _show_warning
+        warnings.showwarning = lambda message, *_, **__: warn(str(message))
         try:
             parsed = make_parser().parse_args(arguments)
-            parsed.started = started
-            status = int(parsed.run(parsed))
-            sys.stdout.flush()
-            return status
+            parsed.started = time.monotonic() if started is None else started
+            return int(parsed.run(parsed))
         except UserError as error:
-            print(f"error: {error}", file=sys.stderr)
+            complain(str(error))
             return EXIT_BAD_INPUT
         except KeyboardInterrupt:
-            print("interrupted", file=sys.stderr)
+            complain("interrupted")
             return EXIT_INTERRUPTED
-        except BrokenPipeError:
-            # The reader closed the pipe, as head does. Without this Python would print a second error at exit.
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        except BrokenPipeError:  # the reader closed the pipe, as head does
             return EXIT_BROKEN_PIPE
         except OSError as error:
             if error.errno != errno.ENAMETOOLONG:
                 raise
-            print(f"error: {error.strerror}: {str(error.filename)[:80]}...", file=sys.stderr)
+            complain(f"{error.strerror}: {str(error.filename)[:80]}...")
             return EXIT_BAD_INPUT
 
 
@@ -89,26 +90,3 @@ def make_parser() -> argparse.ArgumentParser:
         command.add_arguments(sub)
         sub.set_defaults(run=command.run)
     return parser
-
-
-def finish(status: int, *, at_rest: bool) -> int:
-    """Return ``status``, or exit at once if a thread cannot be stopped: all results are on disk."""
-    if not at_rest:
-        from mkpc_kaggle.engine.session import leave
-
-        sys.stdout.flush()
-        sys.stderr.flush()
-        leave(status)
-    return status
-
-
-def _show_warning(
-    message: Warning | str,
-    category: type[Warning],
-    filename: str,
-    lineno: int,
-    file: TextIO | None = None,
-    line: str | None = None,
-) -> None:
-    """Prints the message without the line of code that it came from."""
-    print(f"warning: {message}", file=sys.stderr)

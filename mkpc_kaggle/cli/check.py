@@ -7,7 +7,7 @@ HELP = """\
 Compare a submission with test.csv: header, ids and their order, nine finite numbers a row.
 Exit status: 0 it is good, 1 it is not (each problem on a line), 2 the test side cannot be read.
 """
-MOST_LINES = 20
+MAX_LINES = 20
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -20,9 +20,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     pairs = read_test_side(arguments.test_dir)
     problems = submission_problems(arguments.submission, [pair.id for pair in pairs])
-    for problem in problems[:MOST_LINES]:
-        print(problem)
-    if len(problems) > MOST_LINES:
-        print(f"... and {len(problems) - MOST_LINES} more")
-    print(f"{arguments.submission}: {len(problems)} problems" if problems else f"good: {len(pairs)} rows")
+    more = [f"... and {len(problems) - MAX_LINES} more"] if len(problems) > MAX_LINES else []
+    verdict = f"{arguments.submission}: {len(problems)} problems" if problems else f"good: {len(pairs)} rows"
+    print("\n".join([*problems[:MAX_LINES], *more, verdict]))
     return 1 if problems else 0

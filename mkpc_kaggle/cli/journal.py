@@ -32,22 +32,18 @@ def run(arguments: argparse.Namespace) -> int:
     from mkpc_kaggle.data.competition import read_test_side, test_side
     from mkpc_kaggle.reporting.report import write_report
     from mkpc_kaggle.reporting.run_log import read_log, write_csv, write_json
-    from mkpc_kaggle.reporting.sections import Artist
     from mkpc_kaggle.reporting.summary import overview
 
     files = {"--json": arguments.json, "--report": arguments.report}
     options.require_apart(files, arguments.work_dir, test_side(arguments.test_dir) if arguments.test_dir else [])
     log = read_log(arguments.work_dir)
-    if arguments.csv is not None:
-        for path in write_csv(log, arguments.csv):
-            print(path)
+    written = write_csv(log, arguments.csv) if arguments.csv is not None else []
     if arguments.json is not None:
         write_json(log, arguments.json)
-        print(arguments.json)
+        written.append(arguments.json)
     if arguments.report is not None:
         pairs = read_test_side(arguments.test_dir) if arguments.test_dir is not None else ()
-        write_report(log, arguments.report, Artist(pairs))
-        print(arguments.report)
-    if arguments.csv is None and arguments.json is None and arguments.report is None:
-        print(overview(log))
+        write_report(log, arguments.report, pairs)
+        written.append(arguments.report)
+    print("\n".join(map(str, written)) or overview(log))
     return 0

@@ -20,7 +20,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher, to_image
-    from mkpc_kaggle.reporting import figures
+    from mkpc_kaggle.reporting.figures.pair import draw_pair
+    from mkpc_kaggle.reporting.figures.style import save
 
     inputs = [arguments.image0, arguments.image1, Path(arguments.recipe)]
     options.require_apart({"--out": arguments.out}, None, inputs, arguments.weights)
@@ -33,18 +34,20 @@ def run(arguments: argparse.Namespace) -> int:
         licence=arguments.licence,
     )
     match = matcher(*images)
-    print("\n".join(" ".join(f"{value: .9e}" for value in row) for row in match.estimate.matrix))
+    told = [" ".join(f"{value: .9e}" for value in row) for row in match.estimate.matrix]
     if match.estimate.failure:
-        print(f"this is the fallback: {match.estimate.failure}")
-    print(f"{len(match.matches)} matches, {match.estimate.inlier_count} inliers")
+        told.append(f"this is the fallback: {match.estimate.failure}")
+    told.append(f"{len(match.matches)} matches, {match.estimate.inlier_count} inliers")
     for result in match.results:
-        print(
-            f"  {result.unit.name:<30}{len(result.matches):>6} matches  {result.seconds:.2f} s  {result.failure}"
-        )
+        counts = f"{len(result.matches):>6} matches  {result.seconds:.2f} s  {result.failure}"
+        told.append(f"  {result.unit.name:<30}{counts}")
     for number, region in enumerate(match.regions or ()):
         box = region.box
-        print(f"image {number}: {region.reason}, x {box.left}..{box.right - 1}, y {box.top}..{box.bottom - 1}")
+        told.append(
+            f"image {number}: {region.reason}, x {box.left}..{box.right - 1}, y {box.top}..{box.bottom - 1}"
+        )
+    print("\n".join(told))
     if arguments.out is not None:
-        figures.save(figures.draw_pair(*images, match, matcher.recipe.mkpc), arguments.out)
+        save(draw_pair(*images, match, matcher.recipe.mkpc), arguments.out)
         print(f"figure: {arguments.out}")
     return 0

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mkpc_kaggle.engine.budget import Budget, monotonic_of, parse_duration
-from mkpc_kaggle.engine.pools.cluster import RayCluster, parse_workers
 from mkpc_kaggle.errors import UserError
 
 if TYPE_CHECKING:
+    from mkpc_kaggle.engine.cluster import RayCluster
     from mkpc_kaggle.pipeline.assembly import Assembly
     from mkpc_kaggle.recipe import Choice
 
@@ -29,7 +29,7 @@ def add_matching(parser: argparse.ArgumentParser) -> None:
         "--licence",
         choices=["any", "permissive"],
         default="any",
-        help="permissive: use no weights but those under Apache-2.0, BSD-3-Clause or MIT; recipe auto then leaves "
+        help="permissive: use weights under Apache-2.0, BSD-3-Clause or MIT only; recipe auto then leaves "
         "the others out, units with a fallback take it, any other recipe that has them is refused (default: any)",
     )
     parser.add_argument(
@@ -67,6 +67,7 @@ def add_mode(parser: argparse.ArgumentParser) -> None:
 def add_scenes(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--scenes",
+        dest="reconstruct",
         action=argparse.BooleanOptionalAction,
         help="reconstruct the pairs of a batch together and take F from the cameras, or not (default: as the "
         "recipe has it; the paper's recipes have not). A pair's F then comes from other pairs, too: read your "
@@ -75,25 +76,20 @@ def add_scenes(parser: argparse.ArgumentParser) -> None:
 
 
 def add_no_scenes(parser: argparse.ArgumentParser) -> None:
-    """Where ``--scenes`` has another meaning."""
+    """The same, for commands whose ``--scenes`` has another meaning."""
     parser.add_argument(
         "--no-scenes",
-        action="store_true",
+        dest="reconstruct",
+        action="store_const",
+        const=False,
         help="F from each pair's own matches alone, whatever the recipe has",
     )
-
-
-def scenes_of(arguments: argparse.Namespace) -> bool | None:
-    """What is to be done with a recipe's reconstruction of batches; ``None``: as the recipe has it."""
-    if "no_scenes" in arguments:
-        return False if arguments.no_scenes else None
-    return getattr(arguments, "scenes", None)
 
 
 def assembly_of(arguments: argparse.Namespace, choice: "Choice") -> "Assembly":
     """The parts of a run, as the options of :func:`add_matching` say, but for the choice of the recipe."""
     from mkpc_kaggle.pipeline.assembly import assemble
-    from mkpc_kaggle.pipeline.obstacles import Licence
+    from mkpc_kaggle.pipeline.availability import Licence
 
     return assemble(
         choice.recipe,
@@ -102,7 +98,7 @@ def assembly_of(arguments: argparse.Namespace, choice: "Choice") -> "Assembly":
         precision=arguments.precision,
         mode=choice.mode,
         licence=Licence(arguments.licence),
-        scenes=scenes_of(arguments),
+        scenes=arguments.reconstruct,
     )
 
 
@@ -119,8 +115,10 @@ def add_engine(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--explain", action="store_true", help="say at the end what was planned when, and why")
 
 
-def workers(text: str) -> int | RayCluster:
+def workers(text: str) -> "int | RayCluster":
     """A number of worker processes, or the cluster to work on."""
+    from mkpc_kaggle.engine.cluster import parse_workers
+
     try:
         return parse_workers(text)
     except ValueError as error:
@@ -130,7 +128,7 @@ def workers(text: str) -> int | RayCluster:
 def at_least_1(text: str) -> int:
     """A count of something."""
     if not text.isdecimal() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"{text!r} is no number of 1 or more")
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number of 1 or more")
     return int(text)
 
 

@@ -7,7 +7,7 @@ from mkpc_kaggle.cli import options
 HELP = """\
 List the recipes: their units in order of importance, and which weight files are missing. A unit reads
 stage:matcher@size, where the size is the view's long side, or the height x width whose area the view gets at
-its own aspect ("!": that height and width themselves; "~": mirrored), and the most matches that are kept.
+its own aspect ("!": that height and width themselves), and the most matches that are kept.
 A recipe of your own is a TOML file of the form of those in the package: --recipe FILE.toml.
 """
 
@@ -17,8 +17,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    from mkpc_kaggle.pipeline.obstacles import what_is_missing
-    from mkpc_kaggle.pipeline.uses import slots_of_recipe, unusable
+    from mkpc_kaggle.matchers.contract import Unusable
+    from mkpc_kaggle.matchers.registry import find_matcher
+    from mkpc_kaggle.pipeline.availability import missing_files, slots_of
     from mkpc_kaggle.recipe import load_recipe, recipe_names
     from mkpc_kaggle.weights import WeightStore
 
@@ -27,11 +28,11 @@ def run(arguments: argparse.Namespace) -> int:
         recipe = load_recipe(name)
         print(f"{name}: {recipe.description}")
         for unit in recipe.units:
-            extra = "  (extra: for weak pairs, if time is left)" if unit.extra else ""
             fallback = f"  (or {unit.fallback}, where its weights are missing)" if unit.fallback else ""
-            print(f"    {unit.name}  at most {unit.max_matches}{extra}{fallback}")
-        for one in unusable(recipe.matcher_names):
-            print(f"    {one}")
-        missing = [slot for slot in slots_of_recipe(recipe) if store.find(slot) is None]
-        print(f"    missing: {what_is_missing(missing, store)}" if missing else "    all weights are there")
+            print(f"    {unit.name}  at most {unit.max_matches}{fallback}")
+        for matcher in map(find_matcher, recipe.matcher_names):
+            if isinstance(matcher, Unusable):
+                print(f"    {matcher}")
+        missing = [slot for slot in slots_of(recipe) if store.find(slot) is None]
+        print(f"    missing: {missing_files(missing, store)}" if missing else "    all weights are there")
     return 0

@@ -3,10 +3,11 @@
 import argparse
 from pathlib import Path
 
-from mkpc_kaggle.cli import finish, options
+from mkpc_kaggle.cli import options
+from mkpc_kaggle.engine.console import say
 
 HELP = """\
-Match every pair of test.csv and write one fundamental matrix a row.
+Match every pair of test.csv and write its fundamental matrix, a row for each pair.
 
 submission.csv is complete from the start: pairs that were not reached hold a fallback matrix, and every later
 version is better. Killed at any point, the same command goes on where it was (its journal lies in the work
@@ -14,7 +15,8 @@ directory). Ctrl-C and SIGTERM end the run early with a valid file.
 
 Exit status: 0 done, or the time was up; 1 the run failed (no worker was left, or errors left most pairs without
 an F), or the last version of the file could not be written (a full disk, say, or a limit too short for the table):
-an earlier one, if there was time for it, is whole; 2 bad input; 130 or 143 ended by a signal (the file is whole).
+an earlier version, if there was time for it, is whole; 2 bad input; 130 or 143 ended by a signal (the file is
+whole).
 """
 
 
@@ -46,8 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     from mkpc_kaggle.data.competition import read_test_side, test_side
-    from mkpc_kaggle.engine.session import Session, Watchdog, interruptible
-    from mkpc_kaggle.engine.submit import submit
+    from mkpc_kaggle.engine.session import Session, Watchdog, interruptible, submit
     from mkpc_kaggle.recipe import Choice, Mode
     from mkpc_kaggle.reporting.report import report_run
     from mkpc_kaggle.reporting.summary import summary, trouble
@@ -62,18 +63,16 @@ def run(arguments: argparse.Namespace) -> int:
     with interruptible() as interrupt, Watchdog(budget, interrupt) as watchdog:
         pairs = read_test_side(arguments.test_dir)
         assembly = options.assembly_of(arguments, Choice(arguments.recipe, Mode(arguments.mode)))
-        print(f"{len(pairs)} pairs, recipe {assembly.recipe.name}, {assembly.placement}, journal in {work_dir}")
+        say(f"{len(pairs)} pairs, recipe {assembly.recipe.name}, {assembly.placement}, journal in {work_dir}")
         session = Session(
             work_dir, budget, interrupt, arguments.fresh, workers=arguments.workers, watchdog=watchdog
         )
-        report, at_rest = submit(pairs, assembly, session, output)
+        report = submit(pairs, assembly, session, output)
         watchdog.status = int(bool(report.unwritten or trouble(report)))
-        if arguments.explain:
-            print("\n".join(["plan:", *map(str, report.explanations)]))
-        print(summary(pairs, report, assembly.left_out))
-        print(
-            f"submission: {output}" + (f" is not the last version: {report.unwritten}" if report.unwritten else "")
-        )
+        explained = ["plan:", *map(str, report.explanations)] if arguments.explain else []
+        unwritten = f" is not the last version: {report.unwritten}" if report.unwritten else ""
+        told = [*explained, summary(pairs, report, assembly.left_out), f"submission: {output}{unwritten}"]
+        say("\n".join(told))  # the watchdog may end the program while it draws
         if not arguments.no_report:
-            print(report_run(work_dir, page, session.must_end(), pairs), flush=True)
-        return finish(128 + interrupt.signal if interrupt.signal else watchdog.status, at_rest=at_rest)
+            say(report_run(work_dir, page, session.must_end(), pairs))
+        return 128 + interrupt.signal if interrupt.signal else watchdog.status

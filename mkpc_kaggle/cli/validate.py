@@ -3,15 +3,17 @@
 import argparse
 import json
 import tempfile
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from mkpc_kaggle.cli import finish, options
-from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.cli import options
+from mkpc_kaggle.engine.console import say
+from mkpc_kaggle.errors import UserError, writing
 
 if TYPE_CHECKING:
     from mkpc_kaggle.data.competition import TrainScene
-    from mkpc_kaggle.engine.session import Interrupt, Session
+    from mkpc_kaggle.engine.session import Interrupt
     from mkpc_kaggle.evaluation.validate import Validation
     from mkpc_kaggle.pipeline.assembly import Assembly
     from mkpc_kaggle.recipe import Choice, Recipe
@@ -73,8 +75,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--work-dir",
         type=Path,
         metavar="DIR",
-        help="keep the journal there (with --compare one a recipe) and go on from it; report.html beside it shows "
-        "the run (not with --pairs); default: a temporary one",
+        help="keep the journal there (with --compare, a journal for each recipe) and go on from it; report.html "
+        "beside it shows the run (not with --pairs); default: a temporary directory",
     )
     parser.add_argument(
         "--submission",
@@ -83,12 +85,26 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="CSV",
         help="score it and match nothing; may be repeated",
     )
-    parser.add_argument("--truth", type=Path, metavar="CSV", help="which pairs its samples are (demo writes one)")
+    parser.add_argument(
+        "--truth", type=Path, metavar="CSV", help="which pairs its samples are (`demo` writes such a table)"
+    )
 
 
 def run(arguments: argparse.Namespace) -> int:
-    from mkpc_kaggle.evaluation.validate import score_submission, score_table
+    _require_a_whole(arguments)
+    sides = [arguments.train_dir, arguments.image_root]
+    inputs = [*sides, arguments.pairs, arguments.truth, *(arguments.submission or ())]
+    options.require_apart({"--json": arguments.json}, arguments.work_dir, [path for path in inputs if path])
+    with tempfile.TemporaryDirectory(prefix="mkpc-") as temporary:
+        work_dir = arguments.work_dir or Path(temporary)
+        scenes = _read_scenes(arguments, work_dir)
+        if arguments.submission is not None:
+            return _score_submissions(arguments, scenes)
+        return _match_and_score(arguments, scenes, work_dir)
 
+
+def _require_a_whole(arguments: argparse.Namespace) -> None:
+    """Raise :class:`UserError` for options that do not go together."""
     if (arguments.submission is None) != (arguments.truth is None):
         raise UserError("--submission and --truth go together")
     if (arguments.pairs is None) != (arguments.image_root is None):
@@ -99,21 +115,6 @@ def run(arguments: argparse.Namespace) -> int:
         raise UserError("--units chooses from one recipe; --compare takes recipes as they are")
     if arguments.compare is not None and len(arguments.compare) < 2:
         raise UserError(f"--compare needs two recipes or more, not only {arguments.compare[0]}")
-    sides = [arguments.train_dir, arguments.image_root]
-    inputs = [*sides, arguments.pairs, arguments.truth, *(arguments.submission or ()), Path(arguments.recipe)]
-    inputs = [path for path in inputs if path]
-    options.require_apart({"--json": arguments.json}, arguments.work_dir, inputs, arguments.weights)
-    with tempfile.TemporaryDirectory(prefix="mkpc-") as temporary:
-        work_dir = arguments.work_dir or Path(temporary)
-        scenes = _read_scenes(arguments, work_dir)
-        if arguments.submission is not None:
-            for submission in arguments.submission:
-                print(submission)
-                print("\n".join(score_table(score_submission(submission, arguments.truth, scenes))))
-            return 0
-        if arguments.compare is not None:
-            return _compare(arguments, scenes, work_dir)
-        return _match_and_score(arguments, scenes, work_dir)
 
 
 def _read_scenes(arguments: argparse.Namespace, work_dir: Path) -> "tuple[TrainScene, ...]":
@@ -121,14 +122,8 @@ def _read_scenes(arguments: argparse.Namespace, work_dir: Path) -> "tuple[TrainS
     from mkpc_kaggle.data.pairs import read_pairs
 
     if arguments.pairs is not None:
-        scene = read_pairs(
-            arguments.pairs,
-            arguments.image_root,
-            arguments.estimate,
-            copies=work_dir / "turned",
-            most=arguments.pairs_per_scene,
-        )
-        return (scene,)
+        copies, most = work_dir / "turned", arguments.pairs_per_scene
+        return (read_pairs(arguments.pairs, arguments.image_root, arguments.estimate, copies=copies, most=most),)
     return read_train_side(
         arguments.train_dir,
         scenes=filter(None, arguments.scenes.split(",")),
@@ -137,113 +132,90 @@ def _read_scenes(arguments: argparse.Namespace, work_dir: Path) -> "tuple[TrainS
     )
 
 
+def _score_submissions(arguments: argparse.Namespace, scenes: "tuple[TrainScene, ...]") -> int:
+    from mkpc_kaggle.evaluation.validate import score_submission, score_table
+
+    for submission in arguments.submission:
+        say("\n".join([str(submission), *score_table(score_submission(submission, arguments.truth, scenes))]))
+    return 0
+
+
 def _match_and_score(arguments: argparse.Namespace, scenes: "tuple[TrainScene, ...]", work_dir: Path) -> int:
-    from mkpc_kaggle.engine.session import interruptible
-    from mkpc_kaggle.evaluation.compare import step_gains
-    from mkpc_kaggle.evaluation.validate import score_table, to_json, validate
-    from mkpc_kaggle.recipe import Choice, Mode
-    from mkpc_kaggle.reporting.summary import trouble
-
-    with interruptible() as interrupt:
-        assembly = _assemble(arguments, Choice(arguments.recipe, Mode(arguments.mode)))
-        session = _session(arguments, work_dir, interrupt)
-        validation, at_rest = validate(scenes, assembly, session)
-    _print_summary(arguments, validation, scenes, assembly)
-    print("\n".join([*score_table(validation), *step_gains(validation)]))
-    _write_json(arguments.json, to_json(validation))
-    _write_report(arguments, scenes, session)
-    assert validation.report is not None
-    status = 128 + interrupt.signal if interrupt.signal else int(bool(trouble(validation.report)))
-    return finish(status, at_rest=at_rest)
-
-
-def _compare(arguments: argparse.Namespace, scenes: "tuple[TrainScene, ...]", work_dir: Path) -> int:
+    """Run a recipe, or several to compare, each then with a journal in a directory of its own."""
     from mkpc_kaggle.engine.engine import Ending
     from mkpc_kaggle.engine.session import interruptible
     from mkpc_kaggle.evaluation.compare import Comparison, comparison_json, comparison_table
-    from mkpc_kaggle.evaluation.validate import score_table, validate
-    from mkpc_kaggle.recipe import Choice
+    from mkpc_kaggle.evaluation.validate import to_json
+    from mkpc_kaggle.recipe import Choice, Mode
+    from mkpc_kaggle.reporting.summary import trouble
 
+    compared = arguments.compare is not None
+    choices = [Choice.parse(text) for text in arguments.compare or ()]
+    choices = choices or [Choice(arguments.recipe, Mode(arguments.mode))]
     validations = []
     with interruptible() as interrupt:
-        choices = [Choice.parse(text) for text in arguments.compare]
         assemblies = [_assemble(arguments, choice) for choice in choices]
         for choice, assembly in zip(choices, assemblies, strict=True):
-            session = _session(arguments, work_dir / choice.folder, interrupt)
-            validation, at_rest = validate(scenes, assembly, session)
-            _print_summary(arguments, validation, scenes, assembly)
-            print("\n".join(score_table(validation)))
-            _write_report(arguments, scenes, session)
-            print()
-            if validation.report is None or validation.report.ending is not Ending.COMPLETE:
-                print("nothing is compared before all is done; with a --work-dir, the same command goes on")
-                return finish(128 + interrupt.signal if interrupt.signal else 1, at_rest=at_rest)
+            place = work_dir / choice.folder if compared else work_dir
+            validation = _validate(arguments, scenes, assembly, place, interrupt)
             validations.append(validation)
-    comparison = Comparison(tuple(validations))
-    print("\n".join(comparison_table(comparison)))
-    _write_json(arguments.json, comparison_json(comparison))
-    return finish(0, at_rest=at_rest)
+            assert validation.report is not None
+            status = 128 + interrupt.signal if interrupt.signal else int(bool(trouble(validation.report)))
+            if compared and validation.report.ending != Ending.COMPLETE:
+                say("nothing is compared before all is done; with a --work-dir, the same command goes on")
+                return status or 1
+    figures = to_json(validations[0])
+    if compared:
+        comparison, status = Comparison(tuple(validations)), 0
+        say("\n".join(["", *comparison_table(comparison)]))
+        figures = comparison_json(comparison)
+    if arguments.json is not None:
+        with writing(f"--json {arguments.json}"):
+            arguments.json.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
+    return status
 
 
-def _session(arguments: argparse.Namespace, work_dir: Path, interrupt: "Interrupt") -> "Session":
+def _validate(
+    arguments: argparse.Namespace,
+    scenes: "tuple[TrainScene, ...]",
+    assembly: "Assembly",
+    work_dir: Path,
+    interrupt: "Interrupt",
+) -> "Validation":
+    """Run a recipe and print its summary and its scores."""
     from mkpc_kaggle.engine.session import Session
+    from mkpc_kaggle.evaluation.compare import step_gains
+    from mkpc_kaggle.evaluation.validate import score_table, validate
+    from mkpc_kaggle.reporting.report import report_run
+    from mkpc_kaggle.reporting.summary import summary
 
-    return Session(work_dir, options.budget_of(arguments), interrupt, workers=arguments.workers)
+    session = Session(work_dir, options.budget_of(arguments), interrupt, workers=arguments.workers)
+    validation = validate(scenes, assembly, session)
+    pairs = [true.pair for scene in scenes for true in scene.pairs]
+    assert validation.report is not None
+    explained = ["plan:", *map(str, validation.report.explanations)] if arguments.explain else []
+    told = [*explained, summary(pairs, validation.report, assembly.left_out), "", f"recipe {validation.recipe}"]
+    say("\n".join([*told, *score_table(validation), *step_gains(validation)]))
+    # The report's inliers are of F: there is none for a list of pairs, whose E is estimated.
+    if arguments.work_dir is not None and arguments.pairs is None:
+        say(report_run(work_dir, work_dir / "report.html", session.must_end(), pairs))
+    return validation
 
 
 def _assemble(arguments: argparse.Namespace, choice: "Choice") -> "Assembly":
-    from dataclasses import replace
-
+    """The parts of a run of a recipe, with the units and the robust method that the command names."""
     assembly = options.assembly_of(arguments, choice)
-    chosen = with_units(assembly.recipe, arguments.units)
-    return replace(assembly, recipe=_with_estimator(chosen, arguments))
+    recipe = with_units(assembly.recipe, arguments.units)
+    try:
+        return replace(assembly, recipe=recipe.with_magsac(arguments.method, arguments.threshold))
+    except ValueError as error:
+        raise UserError(f"--threshold: {error}") from error
 
 
 def with_units(recipe: "Recipe", wanted: str | None) -> "Recipe":
-    """The recipe with the units of these names alone, in this order; all of them where none are named."""
-    from dataclasses import replace
-
+    """The recipe with the units of these names alone, in this order; all of them if none are named."""
     known, names = {unit.name: unit for unit in recipe.units}, wanted.split(",") if wanted is not None else []
     for name in names:
         if name not in known:
             raise UserError(f"--units: recipe {recipe.name!r} has no unit {name!r}; it has {', '.join(known)}")
     return replace(recipe, units=tuple(known[name] for name in names)) if names else recipe
-
-
-def _with_estimator(recipe: "Recipe", arguments: argparse.Namespace) -> "Recipe":
-    """The recipe with the robust method and threshold that the command names."""
-    try:
-        return recipe.with_magsac(arguments.method, arguments.threshold)
-    except ValueError as error:
-        raise UserError(f"--threshold: {error}") from error
-
-
-def _print_summary(
-    arguments: argparse.Namespace, validation: "Validation", scenes: "tuple[TrainScene, ...]", assembly: "Assembly"
-) -> None:
-    from mkpc_kaggle.reporting.summary import summary
-
-    pairs = [true.pair for scene in scenes for true in scene.pairs]
-    assert validation.report is not None
-    if arguments.explain:
-        print("\n".join(["plan:", *map(str, validation.report.explanations)]))
-    print(summary(pairs, validation.report, assembly.left_out))
-    print(f"\nrecipe {validation.recipe}")
-
-
-def _write_report(arguments: argparse.Namespace, scenes: "tuple[TrainScene, ...]", session: "Session") -> None:
-    """The report of a run whose journal is kept; its inliers are of F, so there is none where E was estimated."""
-    from mkpc_kaggle.reporting.report import report_run
-
-    if arguments.work_dir is not None and arguments.pairs is None:
-        pairs = [true.pair for scene in scenes for true in scene.pairs]
-        page = session.work_dir / "report.html"
-        print(report_run(session.work_dir, page, session.must_end(), pairs), flush=True)
-
-
-def _write_json(path: Path | None, values: dict[str, Any]) -> None:
-    if path is not None:
-        try:
-            path.write_text(json.dumps(values, indent=1) + "\n", encoding="utf-8")
-        except OSError as error:
-            raise UserError(f"--json {path} cannot be written: {error.strerror}") from error

@@ -3,14 +3,19 @@
 import argparse
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from mkpc_kaggle.cli import options
 from mkpc_kaggle.cli.tables import print_table
+from mkpc_kaggle.errors import UserError
+
+if TYPE_CHECKING:
+    from mkpc_kaggle.weights import WeightFile, WeightStore
 
 HELP = """\
 The files that the matchers load their weights from; none comes with the package.
 
-  list      every file: size, licence, who uses it, where it lies; what the missing ones would enable
+  list      what each matcher needs, and where it lies
   verify    compare every file found with the manifest
   locate    where is the file that a matcher would get?
   fetch     download files, on a machine with internet
@@ -19,15 +24,17 @@ The files that the matchers load their weights from; none comes with the package
 Exit status: 0 done, 1 a file is not there, is wrong or could not be fetched, 2 bad input.
 ACTION --help tells more.
 """
-_LIST = "Every file of the manifest, who uses it and where it lies; and what the missing ones would enable."
+_LIST = """\
+A line for each slot of the manifest, which is what a matcher asks for: the licence of its weights, the matchers
+that use it, and the file, or the names of the files that would do. Matchers that cannot be imported come last."""
 _VERIFY = """\
-Compare every file found with the manifest: truncated ones, other files under the right name, files under another
-name (which do as well), and files that the manifest has no digest for."""
-_LOCATE = "Print the path of the file that would be taken; exit status 1 where there is none."
+Compare every file found with the manifest: it is good (also under another name), unverified (the manifest has no
+digest for it, or Kaggle unpacked it into a directory) or refused, with the reason."""
+_LOCATE = "Print the path of the file that would be taken; exit status 1 if there is none."
 _FETCH = """\
-Download files: interrupted downloads are resumed, and a file gets its name when its digest is right. Where none is
-published, the first download's is kept in DIR/weights_manifest.txt, and the file must have it from then on. Each
-licence is printed first; check it."""
+Download files. A file gets its name when its digest is right; an interrupted download is resumed. If no digest is
+published, a download is begun anew, and its digest is kept in DIR/weights_manifest.txt: the file must have it from
+then on. Each licence is printed first; check it."""
 _CONVERT = "Write a checkpoint's tensors as safetensors with the same names; print the manifest's line for it."
 
 
@@ -62,27 +69,26 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _list(arguments: argparse.Namespace) -> int:
-    from mkpc_kaggle.pipeline.uses import matchers_with, recipes_with, unusable
+    from mkpc_kaggle.matchers.contract import MatcherEntry, Unusable
+    from mkpc_kaggle.matchers.registry import find_matcher, matcher_names
     from mkpc_kaggle.weights import WeightStore
 
     store = WeightStore(arguments.weights)
-    rows = [("file", "bytes", "licence", "slot", "matchers", "where")]
-    for file in store.files:
-        search = store.search([file])
-        where = [str(search.found.path)] if search.found else [f"{one.path}: {one.note}" for one in search.refused]
-        size = "?" if file.size < 0 else str(file.size)
-        matchers = ", ".join(matchers_with(file.slot)) or "-"
-        rows.append((file.name, size, file.licence, file.slot, matchers, "; ".join(where) or "missing"))
-    print_table(rows)
+    matchers = {name: find_matcher(name) for name in matcher_names()}
+    specs = [matcher.spec for matcher in matchers.values() if isinstance(matcher, MatcherEntry)]
+    rows = [("slot", "licence", "matchers", "file")]
     for slot in dict.fromkeys(file.slot for file in store.files):
-        alternatives = store.alternatives(slot)
-        if store.search(alternatives).found is None:
-            uses = [f"matcher {name}" for name in matchers_with(slot)]
-            uses += [f"recipe {name}" for name in recipes_with(slot)]
-            names = " or ".join(file.name for file in alternatives)
-            print(f"missing: {slot} ({names}), for {', '.join(uses) or 'no matcher of this version'}")
-    for one in unusable():
-        print(one)
+        files = store.alternatives(slot)
+        search = store.search(files)
+        names = " or ".join(file.name for file in files)
+        where = [str(search.found.path)] if search.found else [f"missing: {names}"]
+        where += [f"refused: {file.path}: {file.note}" for file in search.refused if not search.found]
+        users = [spec.name for spec in specs if slot in spec.every_slot]
+        rows.append((slot, files[0].licence, ", ".join(users) or "-", "; ".join(where)))
+    print_table(rows)
+    for matcher in matchers.values():
+        if isinstance(matcher, Unusable):
+            print(matcher)
     return 0
 
 
@@ -96,11 +102,11 @@ def _verify(arguments: argparse.Namespace) -> int:
     if not found:
         print(f"no weight files found (searched {store.searched})")
         return 0
-    rows = [(one.file.name, str(one.state), str(one.path), one.note) for one in found]
+    rows = [(file.file.name, str(file.state), str(file.path), file.note) for file in found]
     print_table([("file", "state", "path", "note"), *rows])
-    wrong = sum(not one.state.usable for one in found)
-    print(f"{len(found)} files, {wrong} wrong")
-    return 1 if wrong else 0
+    refused = sum(not file.usable for file in found)
+    print(f"{len(found)} files, {refused} refused")
+    return 1 if refused else 0
 
 
 def _verify_manifest(arguments: argparse.Namespace) -> int:
@@ -111,8 +117,8 @@ def _verify_manifest(arguments: argparse.Namespace) -> int:
     rows, absent = [("file", "state", "path", "note")], 0
     for file in store.files:
         search = store.search([file])
-        for one in (search.found,) if search.found else search.refused:
-            rows.append((file.name, str(one.state), str(one.path), one.note))
+        for found in (search.found,) if search.found else search.refused:
+            rows.append((file.name, str(found.state), str(found.path), found.note))
         if not search.found and not search.refused:
             rows.append((file.name, "missing", "", f"searched {store.searched}"))
         absent += search.found is None
@@ -122,14 +128,13 @@ def _verify_manifest(arguments: argparse.Namespace) -> int:
 
 
 def _locate(arguments: argparse.Namespace) -> int:
-    from mkpc_kaggle.pipeline.uses import files_of
     from mkpc_kaggle.weights import WeightStore
 
     store = WeightStore(arguments.weights)
     searches = [store.search(lines) for lines in files_of(arguments.name, store)]
     for search in searches:
-        for one in search.refused:
-            print(f"refused: {one.path}: {one.note}", file=sys.stderr)
+        for refused in search.refused:
+            print(f"refused: {refused.path}: {refused.note}", file=sys.stderr)
         if search.found:
             print(search.found.path)
         else:
@@ -138,9 +143,8 @@ def _locate(arguments: argparse.Namespace) -> int:
 
 
 def _fetch(arguments: argparse.Namespace) -> int:
-    from mkpc_kaggle.pipeline.uses import files_of
     from mkpc_kaggle.weights import WeightStore
-    from mkpc_kaggle.weights.fetch import Outcome, choose, fetch
+    from mkpc_kaggle.weights.fetch import FetchOutcome, choose, fetch
     from mkpc_kaggle.weights.manifest import UNVERIFIED, pin
 
     store = WeightStore([arguments.out] if arguments.out.is_dir() else [])
@@ -150,14 +154,36 @@ def _fetch(arguments: argparse.Namespace) -> int:
         print(f"{file.name}: licence {file.licence}, from {file.source}", flush=True)
         fetched = fetch(file, arguments.out)
         print(f"{file.name}: {fetched.outcome}{fetched.note and ': '}{fetched.note}")
-        if fetched.outcome is Outcome.FETCHED and file.digest == UNVERIFIED:
+        if fetched.outcome is FetchOutcome.FETCHED and file.digest == UNVERIFIED:
             pin(file, fetched.path)
         outcomes.append(fetched.outcome)
-    return 1 if {Outcome.FAILED, Outcome.BY_HAND} & set(outcomes) else 0
+    return 1 if {FetchOutcome.FAILED, FetchOutcome.BY_HAND} & set(outcomes) else 0
 
 
 def _convert(arguments: argparse.Namespace) -> int:
     from mkpc_kaggle.weights.convert import convert
 
+    options.require_apart({"--out": arguments.out}, None, [arguments.file])
     print(convert(arguments.file, arguments.out).line)
     return 0
+
+
+def files_of(name: str, store: "WeightStore") -> "list[list[WeightFile]]":
+    """The files that the name of a file, a slot or a recipe stands for: a list of alternatives for each slot.
+
+    Raises :class:`UserError` with the known names for an unknown name.
+    """
+    from mkpc_kaggle.pipeline.availability import slots_of
+    from mkpc_kaggle.recipe import load_recipe, recipe_names
+
+    if named := [file for file in store.files if file.name == name]:
+        return [named]
+    slots = list(dict.fromkeys(file.slot for file in store.files))
+    if name in slots:
+        return [store.alternatives(name)]
+    if name in recipe_names() or name.endswith(".toml"):
+        return [store.alternatives(slot) for slot in slots_of(load_recipe(name))]
+    raise UserError(
+        f"{name!r} is neither a file of the manifest (python -m mkpc_kaggle weights list names them), nor a slot "
+        f"({', '.join(slots)}), nor a recipe ({', '.join(recipe_names())})"
+    )

@@ -1,22 +1,33 @@
-"""The clock: durations, and how much of a run's time is left."""
+"""The clock of a run: durations, the time left, and the four moments at which a run must let go of something."""
 
+import os
 import re
 import time
+from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import inf
+from pathlib import Path
 
 from mkpc_kaggle.errors import UserError
+
+SUMMARY_FACTOR = 5  # telling what a run did takes at most this many times what writing its submission takes
+WRITE_MARGIN = 1.5  # the next write may take this many times what the latest took
+MAX_WRITE_SHARE = 0.05  # of the limit, which writing is expected to take at most
+MAX_PROCESS_AGE_S = 60.0  # a process that claims to be older when it begins to work does not tell its age
 
 
 def parse_duration(text: str) -> float:
     """Seconds from ``8h45m``, ``90m``, ``60s`` or plain seconds; raises :class:`UserError` for anything else."""
-    parts = re.fullmatch(r"(?:(\d+)h)?(?:(\d+)m)?(?:(\d+(?:\.\d+)?)s?)?", text.strip())
+    parts = re.fullmatch(r"(?:(\d+)h)?(?:(\d+)m)?(?:(\d+(?:\.\d+)?)(s?))?", text.strip())
     if parts is None or not any(parts.groups()):
-        raise UserError(f"{text!r} is no duration; write it as 8h45m, 90m, 60s or a number of seconds")
-    hours, minutes, seconds = (float(part or 0) for part in parts.groups())
+        raise UserError(f"{text!r} is not a duration; write it as 8h45m, 90m, 60s or a number of seconds")
+    hours, minutes, seconds = (float(part or 0) for part in parts.groups()[:3])
+    if parts[3] and not parts[4] and (parts[1] or parts[2]):
+        unit = "s" if parts[2] else "m"
+        raise UserError(f"{text!r} does not say what {parts[3]} counts: write {text.strip()}{unit}")
     if hours + minutes + seconds == 0:
-        raise UserError("a time limit of nothing leaves no time to work")
+        raise UserError("a time limit of 0 leaves no time to work")
     return hours * 3600 + minutes * 60 + seconds
 
 
@@ -28,50 +39,55 @@ def format_duration(seconds: float) -> str:
     return f"{minutes}m{rest:02d}s" if minutes < 60 else f"{minutes // 60}h{minutes % 60:02d}m"
 
 
-TELLING = 5
-"""What the summary of a run takes at most, as a multiple of what writing its submission takes."""
-MOST_WRITING = 0.05
-"""The share of the limit that writing may be thought to take."""
-
-
 @dataclass
 class Budget:
-    """The time a run is given, in seconds of ``clock`` since ``started``; the clock never jumps.
+    """The time that a run has, in seconds of ``clock``, which never jumps, since ``started``.
 
-    ``stop`` is when no unit may be running any more, ``end`` when nothing is waited for any longer; what is
-    left then suffices to write the submission and to end; a process that has not ended by ``last`` is made to,
-    the submission written once more if need be. ``writing`` are the seconds which that takes, learnt in the run.
+    No unit runs after ``stop_units``; no answer is waited for after ``stop_waiting``; the last version of the
+    submission is written at ``final_write``; the process is gone at ``limit``.
     """
 
     started: float
-    limit: float = inf
+    time_limit: float = inf
     clock: Callable[[], float] = time.monotonic
-    writing: float = 0.0
+    _writes: deque[float] = field(default_factory=lambda: deque(maxlen=5))
+
+    def note_write(self, seconds: float) -> None:
+        """Record how long it took to write the submission."""
+        self._writes.append(seconds)
+
+    @property
+    def writing(self) -> float:
+        """Seconds that the next write may take, by the median of the latest: a single slow write is forgotten."""
+        if not self._writes:
+            return 0.0
+        median = sorted(self._writes)[(len(self._writes) - 1) // 2]
+        return min(WRITE_MARGIN * median, MAX_WRITE_SHARE * self.time_limit)
 
     @property
     def reserve(self) -> float:
-        return min(max(1.5, 0.005 * self.limit), 60.0)
+        """Seconds at the end in which no unit runs."""
+        return min(max(1.5, 0.005 * self.time_limit), 60.0)
 
     @property
-    def stop(self) -> float:
-        return self.end - self.reserve / 2
+    def stop_units(self) -> float:
+        return self.stop_waiting - self.reserve / 2
 
     @property
-    def end(self) -> float:
-        return self.last - self.reserve / 4 - TELLING * min(self.writing, MOST_WRITING * self.limit)
+    def stop_waiting(self) -> float:
+        return self.final_write - self.reserve / 4 - SUMMARY_FACTOR * self.writing
 
     @property
-    def last(self) -> float:
-        return self.over - self.reserve / 4 - self.writing
+    def final_write(self) -> float:
+        return self.limit - self.reserve / 4 - self.writing
 
     @property
-    def over(self) -> float:
-        """When the limit is over."""
-        return self.started + self.limit
+    def limit(self) -> float:
+        return self.started + self.time_limit
 
     def left(self) -> float:
-        """Seconds until :attr:`stop`; never negative."""
-        return max(0.0, self.stop - self.clock())
+        """Seconds until :attr:`stop_units`; never negative."""
+        return max(0.0, self.stop_units - self.clock())
 
     def spent(self) -> float:
         """Seconds since the start."""
@@ -81,10 +97,27 @@ class Budget:
 def monotonic_of(epoch: float) -> float:
     """The monotonic clock's time at a moment of the wall clock, in seconds since 1970.
 
-    Asked once, when a run starts: however the wall clock jumps later, the run's limit does not move. Raises
-    :class:`UserError` for a moment to come.
+    Called once, when a run starts: however the wall clock jumps later, the run's limit does not move. Raises
+    :class:`UserError` for a moment in the future.
     """
     ago = time.time() - epoch
     if not 0 <= ago < inf:
-        raise UserError(f"--started-at {epoch:g} is no moment of the past; it is in seconds since 1970 (date +%s)")
+        raise UserError(
+            f"--started-at {epoch:g} is not a moment of the past; it is in seconds since 1970 (date +%s)"
+        )
     return time.monotonic() - ago
+
+
+def process_started() -> float:
+    """The monotonic clock's time at which this process began: imports count, too.
+
+    From Linux's /proc/self/stat (field 22, clock ticks since boot); elsewhere the time of the call.
+    """
+    now = time.monotonic()
+    try:
+        fields = Path("/proc/self/stat").read_text().rpartition(")")[2].split()
+        began = int(fields[19]) / os.sysconf("SC_CLK_TCK")
+        age = time.clock_gettime(time.CLOCK_BOOTTIME) - began
+    except (OSError, AttributeError, ValueError, IndexError):
+        return now
+    return now - age if 0 <= age < MAX_PROCESS_AGE_S else now

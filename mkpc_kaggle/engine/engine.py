@@ -1,41 +1,39 @@
-"""The engine: plans, jobs and results, journalled as they come; every version of the submission is whole."""
+"""The engine: one loop on one thread that hands out jobs, takes in answers, keeps the journal, and publishes."""
 
 import sqlite3
-import sys
 import threading
-import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from functools import partial
 from math import inf
 from typing import Protocol
 
 from mkpc_kaggle.data.competition import Pair
+from mkpc_kaggle.engine import console
 from mkpc_kaggle.engine.budget import Budget
-from mkpc_kaggle.engine.costs import Timeouts
-from mkpc_kaggle.engine.jobs import Job, JobFailure, JobResult, Outcome, visiting_order
+from mkpc_kaggle.engine.jobs import (
+    Answer,
+    Failure,
+    Loaded,
+    MatchJob,
+    MatchResult,
+    Outcome,
+    SceneJob,
+    SceneResult,
+    visiting_order,
+)
 from mkpc_kaggle.engine.journal_tables import EventKind
-from mkpc_kaggle.engine.planner import Explanation, Planner
-from mkpc_kaggle.engine.pools.pool import Pool
-from mkpc_kaggle.engine.progress import progress_on
+from mkpc_kaggle.engine.places import Place, Site
+from mkpc_kaggle.engine.plan import Explanation, Plan
 from mkpc_kaggle.engine.records import PairRecord, SceneRecord
-from mkpc_kaggle.engine.scenes import SceneJob, SceneQueue, SceneResult, pairs_to_add, tracks_of
+from mkpc_kaggle.engine.scenes import Scenes, extra_pairs_of
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.pipeline.pair import UnitResult
 from mkpc_kaggle.recipe import Recipe, Unit
-from mkpc_kaggle.scene.batch import BatchPair
 from mkpc_kaggle.scene.choose import Choice
-from mkpc_kaggle.scene.known_focals import KnownFocals
 
-PUBLISH_SECONDS, PUBLISH_SHARE = 30.0, 0.05
-"""How often the submission is written: at most that share of the time goes into it."""
-WRITING_DOUBT = 1.5
-"""How much longer than it ever took writing the submission may take."""
-LISTEN_SECONDS = 0.2
-"""How often an interrupt is looked for."""
-GRACE_SECONDS = 5.0
-"""How long an interrupted run waits for the unit that is running."""
+PUBLISH_INTERVAL_S, PUBLISH_SHARE = 30.0, 0.05  # how often the submission is written, and its share of the time
 
 
 class Ending(StrEnum):
@@ -45,6 +43,7 @@ class Ending(StrEnum):
     TIME_IS_UP = "time is up"
     INTERRUPTED = "interrupted"
     NO_WORKER = "no worker left"
+    NOTHING_RUNS = "every unit was given up"
 
 
 @dataclass(frozen=True)
@@ -71,6 +70,8 @@ class RunJournal(Protocol):
 
     def forget_changed(self, pairs: Sequence[Pair]) -> int: ...
 
+    def forget_given_up(self) -> None: ...
+
     def records(self) -> dict[int, PairRecord]: ...
 
     def results(self, pair: int, units: Mapping[str, Unit]) -> tuple[UnitResult, ...]: ...
@@ -90,26 +91,27 @@ class Engine:
     """One run over ``pairs``.
 
     ``publish`` is called with all records, in the order of ``pairs``, when the run starts, every half minute (less
-    often where it takes long), and when it ends. Setting ``interrupt`` ends the run early, with all rows there.
+    often where it takes long), and when it ends, in whatever way. Setting ``interrupt`` ends the run early.
     """
 
     def __init__(
         self,
         pairs: Sequence[Pair],
         recipe: Recipe,
-        pool: Pool,
+        site: Site,
         journal: RunJournal,
         budget: Budget,
         *,
         publish: Callable[[Sequence[PairRecord]], None],
         interrupt: threading.Event,
         progress: bool = True,
-        timeouts: Timeouts | None = None,
+        minibatch: int = 1,
     ) -> None:
+        extra, connecting = extra_pairs_of(pairs, recipe.scene)
         self.asked = len(pairs)
-        self.pairs = [*pairs, *pairs_to_add(pairs, recipe.scene)]
+        self.pairs = [*pairs, *extra]
         self.recipe = recipe
-        self.pool = pool
+        self.site = site
         self.journal = journal
         self.budget = budget
         self.publish = publish
@@ -118,188 +120,212 @@ class Engine:
         self.unwritten = ""
         self._units = {unit.name: unit for unit in recipe.units}
         self._unjournalled: dict[int, tuple[UnitResult, ...]] = {}
-        self._out = self._explained = 0
+        self._explained = 0
         self._published = budget.clock()
-        self._grace_ends = inf
-        self._progress = progress_on(sys.stderr, budget) if progress else None
+        self._progress = console.Progress(budget) if progress else None
         self._publishing = threading.Lock()
-        self._ended = False
-        self.planner = self._planner(timeouts)
-        self.scenes = SceneQueue(self.pairs, recipe.scene, budget.clock, self.planner.timeouts, budget.limit)
-        self._scene_records = {scene.batch: scene for scene in journal.scenes()}
-        self.scenes.note_solved(record.index for record in self.planner.records if record.scene is not None)
+        self._has_ended = self._has_loaded = False
+        self.plan = Plan(
+            visiting_order(pairs),
+            recipe,
+            self._read_records(),
+            budget,
+            extra=[self.asked + place for place in visiting_order(extra[:connecting])]
+            + list(range(self.asked + connecting, len(self.pairs))),
+            connecting=connecting,
+            minibatch=minibatch,
+        )
+        self.scenes = Scenes(self.pairs, recipe, self.plan.records, journal.scenes())
+        self._scene_places: list[Place] = []
 
     def run(self) -> RunReport:
-        """Run until all is done, the time is up, or an interrupt; raises only what the pool's start raises."""
-        self._publish()
-        regular = self.recipe.regular
-        resumed = sum(not record.lacking(regular) for record in self.records if record.units)
+        """Run until all is done, the time is up, or an interrupt.
+
+        Raises :class:`UserError` where no worker can be started.
+        """
+        resumed = sum(not record.lacking(self.recipe.units) for record in self.records if record.units)
         try:
-            if any(self.planner.wanted(record) for record in self.records):
-                if message := self.pool.start():
-                    warnings.warn(message, stacklevel=2)  # now, since the summary is hours away
-                    self._fault(message)
-                while self._work():
-                    self._finish()  # what scenes need less than was kept for them is matching's again
-            self._finish()
+            self._publish()
+            self._loop()
         finally:
-            self.scenes.close()
-        if self._progress is not None:
-            self._progress.close()
-        self._publish()
-        self._ended = True
-        self._note_explanations()
+            for place in (*self.site.places, *self._scene_places):
+                place.kill()
+            self.site.close()
+            if self._progress is not None:
+                self._progress.close()
+            self._publish()
+            self._has_ended = True
+            self._note_explanations()
         return RunReport(
             tuple(self.records),
             self._ending(),
             self.budget.spent(),
             resumed,
             tuple(self.faults),
-            tuple(self.planner.explanations),
+            tuple(self.plan.explanations),
             self.unwritten,
-            tuple(self._scene_records.values()),
+            tuple(self.scenes.made.values()),
         )
 
     @property
     def records(self) -> list[PairRecord]:
-        """Those of the pairs that were asked for, in their order."""
-        return self.planner.records[: self.asked]
+        """Of the pairs that were asked for, in their order."""
+        return self.plan.records[: self.asked]
 
     def save_what_there_is(self) -> str:
         """Write the submission from another thread, unless the run has ended by itself; why it could not be.
 
-        Waits for the engine's own thread until the limit is almost over where that is at it.
+        Waits for the engine's own thread where that is writing.
         """
-        left = self.budget.over - self.budget.reserve / 8 - self.budget.clock()
-        if not self._publishing.acquire(timeout=max(0.0, left)):
-            return "the time was up before the last version of the submission was written"
-        if not self._ended:
-            self._write()
+        with self._publishing:
+            if not self._has_ended:
+                self._write()
         return self.unwritten
 
-    def _planner(self, timeouts: Timeouts | None) -> Planner:
+    # The loop
+
+    def _loop(self) -> None:
+        everything = range(len(self.pairs))
+        if any(self.plan.wanted(record) for record in self.records):
+            self.site.open()
+        while not self.interrupt.is_set() and (now := self.budget.clock()) < self.budget.stop_waiting:
+            for place in (*self.site.places, *self._scene_places):
+                self._take_answer(place, now)
+            self._fall_back(now)
+            self._hand_out(now)
+            is_matching = self._is_matching(now)
+            self._start_scenes(self.plan.done if is_matching else everything, now)
+            if not is_matching and not self._scene_places:
+                return
+            if now - self._published > max(PUBLISH_INTERVAL_S, self.budget.writing / PUBLISH_SHARE):
+                self._publish()
+            limits = (place.limit for place in (*self.site.places, *self._scene_places))
+            self.site.wait(min(self.budget.stop_waiting, *(limit for limit in limits if limit > now), inf))
+
+    def _hand_out(self, now: float) -> None:
+        """A worker for each place that lacks one, and a job for each worker that is idle."""
+        self.plan.workers = max(1, sum(not place.closed for place in self.site.places))
+        for place in self.site.places:
+            if now >= self.plan.stop or not self.plan.has_work:
+                return
+            if place.may_start(now):
+                self._start(place, now)
+            elif place.is_idle and (job := self.plan.next(now, place.name, cautious=place.losses > 0)):
+                pairs = tuple(self.pairs[index] for index in job.indices)
+                job = replace(job, pairs=pairs, known=tuple(map(self._results, job.indices)))
+                place.submit(job, job.seconds, job.time_limit, now)
+
+    def _start(self, place: Place, now: float) -> None:
+        try:
+            place.start(now)
+        except (RuntimeError, OSError) as error:  # no thread more
+            place.closed = f"{place.name}: {error}"
+
+    def _is_matching(self, now: float) -> bool:
+        """Whether a job is under way, or will be when a worker has started."""
+        may_begin = now < self.plan.stop and self.plan.has_work
+        return any(place.job is not None or (place.is_starting and may_begin) for place in self.site.places)
+
+    def _take_answer(self, place: Place, now: float) -> None:
+        answer, job, seconds = place.poll(now), place.job, now - place.since
+        if answer is None:
+            return
+        if isinstance(answer, Loaded):
+            self._has_loaded = True
+            if isinstance(job, SceneJob):
+                limit = self.scenes.time_limit(job.batch, self.budget.time_limit)
+                place.submit(job, inf, limit, now)
+            return
+        place.job = None
+        if isinstance(job, SceneJob):
+            self._scene_places.remove(place)
+            place.kill()
+            self._take_scene(job, answer, seconds)
+        elif isinstance(job, MatchJob) and isinstance(answer, MatchResult):
+            self._keep(self.plan.on_result(job, answer, seconds, now))
+            self._note(EventKind.BUDGET, job.phase)
+            self._note(EventKind.JOB, f"{job.phase} {len(job.indices)} pairs {answer.unit_seconds:.3f} s")
+        elif isinstance(answer, Failure):
+            self._fault(f"a job was lost on {place.name}: {answer}" if job else f"{place.name}: {answer}")
+            if isinstance(job, MatchJob):
+                self._keep(self.plan.on_failure(job, answer, place.name, now))
+            if place.closed:
+                self.plan.explain(now, f"no worker is started any more on {place.closed}")
+        self._note_explanations()
+        if self._progress is not None:
+            self._progress.show(*self.plan.progress)
+
+    def _fall_back(self, now: float) -> None:
+        """Go on elsewhere when the last place is closed, or had to give up every unit."""
+        closed = [place.closed for place in self.site.places if place.closed]
+        are_closed = len(closed) == len(self.site.places) > 0
+        if not are_closed and not self.plan.nothing_runs:
+            return
+        if self.site.fallback:
+            reason = "; ".join(closed) if are_closed else "every unit was given up"
+            self._fault(text := f"the work goes on on the {self.site.fallback[0].name}: {reason}")
+            console.warn(text)
+            for place in self.site.places:
+                place.kill()
+            self.site.places, self.site.fallback = self.site.fallback, []
+            for index, change in self.plan.restart(now, text).items():
+                self.scenes.note_units(index, change)
+            self._guarded(self.journal.forget_given_up)
+        elif are_closed and not self._has_loaded:
+            raise UserError(f"no worker could be started: {'; '.join(closed)}")
+
+    # Scenes
+
+    def _start_scenes(self, done: Collection[int], now: float) -> None:
+        """Begin to reconstruct batches whose pairs are all ``done``."""
+        at_once = self.site.scenes_at_once
+        while len(self._scene_places) < at_once and (batch := self.scenes.due(done)) is not None:
+            place = Place(f"scene of batch {batch}", self.site.scene_worker)
+            place.job = self.scenes.job(batch, self._results)
+            self._scene_places.append(place)
+            self._start(place, now)
+        self.plan.reserve = self.scenes.reserve(at_once)
+
+    def _take_scene(self, job: SceneJob, answer: Answer, seconds: float) -> None:
+        choices: Mapping[int, Choice] = {}
+        record: SceneRecord | None
+        if isinstance(answer, SceneResult):
+            choices = answer.choices
+            record = SceneRecord.of(job.batch, answer.reconstructions, job.made_from, seconds)
+            self.scenes.on_result(job, record)
+            for index, choice in choices.items():
+                self.plan.set_scene(index, choice)
+            self._note(EventKind.SCENE, f"{record.batch}: {record.placed} of {record.images} images")
+        else:
+            self._fault(f"batch {job.batch} was not reconstructed: {answer}")
+            record = self.scenes.on_failure(job, str(answer), seconds)
+        if record is not None:
+            self._guarded(partial(self._save_scene, record, choices))
+
+    def _save_scene(self, record: SceneRecord, choices: Mapping[int, Choice]) -> None:
+        self.journal.save_scene(record, choices)
+        # A batch is reconstructed from the points of all its pairs: none can go while one of them may change.
+        records = [self.plan.records[index] for index in self.scenes.batches[record.batch]]
+        if not record.failure and not any(
+            self.plan.may_gain(pair) or self.scenes.needs(pair.index) for pair in records
+        ):
+            self.journal.settle(pair for pair in records if pair.units)
+
+    # The journal and the submission
+
+    def _read_records(self) -> list[PairRecord]:
         if forgotten := self.journal.forget_changed(self.pairs):
             text = f"images have changed since they were matched: {forgotten} pairs are matched anew"
-            warnings.warn(text, stacklevel=2)
+            console.warn(text)
             self._fault(text)
         records = [PairRecord.untouched(index) for index in range(len(self.pairs))]
         for index, record in self.journal.records().items():
             records[index] = record
-        asked, unasked = self.pairs[: self.asked], self.pairs[self.asked :]
-        return Planner(
-            visiting_order(asked),
-            self.recipe,
-            records,
-            self.budget,
-            timeouts=timeouts,
-            unasked=[self.asked + place for place in visiting_order(unasked)],
-        )
-
-    def _work(self) -> bool:
-        """Hand out what is planned as long as there is room, and gather what comes back; whether there was any."""
-        begun = False
-        while self._may_hand_out():
-            self._reconstruct(self.planner.deepened)
-            self.planner.workers = max(1, self.pool.workers)
-            while self._out < self.pool.capacity:
-                job = self.planner.next(self.budget.clock())
-                if job is None:
-                    break
-                self._submit(job)
-                begun = True
-            if self._out == 0:
-                return begun
-            while not self._gather() and self._may_hand_out():
-                self._reconstruct(self.planner.deepened)  # only a job that comes back changes the plan
-        return begun
-
-    def _may_hand_out(self) -> bool:
-        return not self.interrupt.is_set() and self.budget.clock() < self.planner.stop
-
-    def _finish(self) -> None:
-        """Let what is under way end and reconstruct what is left, until nothing is waited for any longer.
-
-        What is left are the batches that were not done beside matching, and those that changed since.
-        """
-        everything = set(range(len(self.pairs)))
-        while self.budget.clock() < self._wait_until:
-            if self.interrupt.is_set():
-                self._cut_short()
-            else:
-                self._reconstruct(everything, again=True)
-            if self._out == 0 and (self.interrupt.is_set() or not self.scenes.running):
-                return
-            self._gather()
-
-    def _cut_short(self) -> None:
-        if self._grace_ends == inf:
-            self.pool.stop()
-            self._grace_ends = self.budget.clock() + GRACE_SECONDS
-
-    def _reconstruct(self, matched: set[int], *, again: bool = False) -> None:
-        """Take reconstructions back, and begin those whose pairs are all ``matched``."""
-        for result in self.scenes.finished():
-            self._keep_scene(result)
-        at_once = self.pool.scenes_at_once
-        while len(self.scenes.running) < at_once and self.budget.left() > 0:
-            batch = self.scenes.due(matched, again=again)
-            if batch is None:
-                break
-            self.scenes.start(batch, self.pool.reconstruct(self._scene_job(batch)))
-        self.planner.reserve = self.scenes.reserve(at_once)
-
-    def _scene_job(self, batch: str) -> SceneJob:
-        recipe = self.recipe
-        assert recipe.scene is not None
-        known_focals = KnownFocals(recipe.magsac, recipe.focal, recipe.scene.focal_sigma) if recipe.focal else None
-        found = tuple(index for index in self.scenes.batches[batch] if self.planner.records[index].units)
-        return SceneJob(batch, found, tuple(map(self._batch_pair, found)), recipe.scene, known_focals)
-
-    def _batch_pair(self, index: int) -> BatchPair:
-        assert self.recipe.scene is not None
-        record, results = self.planner.records[index], self._results(index)
-        image0, image1 = self.pairs[index].images
-        return BatchPair(
-            str(image0),
-            str(image1),
-            Matches.concatenate(result.matches for result in results),
-            None if record.failure else record.F,
-            tracks_of(results, self.recipe.scene.least_tracks),
-        )
-
-    def _keep_scene(self, result: SceneResult) -> None:
-        record = SceneRecord.of(result.batch, result.scenes, result.seconds, result.failure)
-        if result.failure:
-            self._fault(f"batch {result.batch} was not reconstructed: {result.failure}")
-            if result.batch in self._scene_records:
-                return  # what was found before its pairs got further matches still stands
-        self._scene_records[result.batch] = record
-        for index, choice in result.choices.items():
-            self.planner.state.set_scene(index, choice)
-        self._note(EventKind.SCENE, f"{record.batch}: {record.placed} of {record.images} images")
-        records = [self.planner.records[index] for index in self.scenes.batches[result.batch]]
-        # A batch is reconstructed from the points of all its pairs: none can go while one of them may change.
-        may_change = any(self.planner.may_gain(one) or self.scenes.needs(one.index) for one in records)
-        try:
-            self.journal.save_scene(record, result.choices)
-            if not result.failure and not may_change:
-                self.journal.settle(one for one in records if one.units)
-        except sqlite3.Error as error:
-            self._fault(f"the journal cannot be written ({error}): an interrupted run would have to do this again")
-
-    @property
-    def _wait_until(self) -> float:
-        """When nothing is waited for any longer."""
-        return min(self._grace_ends, self.budget.end)
-
-    def _submit(self, job: Job) -> None:
-        self._out += 1
-        pairs = tuple(self.pairs[index] for index in job.indices)
-        self.pool.submit(replace(job, pairs=pairs, known=tuple(map(self._results, job.indices))))
+        return records
 
     def _results(self, index: int) -> tuple[UnitResult, ...]:
         """What earlier jobs found on a pair."""
-        if not self.planner.records[index].units:
+        if not self.plan.records[index].units:
             return ()
         if index in self._unjournalled:
             return self._unjournalled[index]
@@ -309,71 +335,54 @@ class Engine:
             self._fault(f"the journal cannot be read ({error})")
             return ()
 
-    def _gather(self) -> bool:
-        """Take one job back; whether one came."""
-        back = self.pool.next(min(self.budget.clock() + LISTEN_SECONDS, self._wait_until))
-        if back is None:
-            return False
-        self._out -= 1
-        now = self.budget.clock()
-        if isinstance(back, JobFailure):
-            self._fault(f"a job was lost: {back}")
-            self._keep(self.planner.lose(back, now))
-        else:
-            self._keep(self.planner.take(back, now))
-            self._note_job(back)
-        self._note_explanations()
-        if self._progress is not None:
-            self._progress.show(*self.planner.progress)
-        if now - self._published > max(PUBLISH_SECONDS, self.budget.writing / PUBLISH_SHARE):
-            self._publish()
-        return True
-
     def _keep(self, outcomes: Sequence[Outcome]) -> None:
         """Put outcomes into the journal; into memory those that it cannot take."""
-        if not outcomes:
-            return
         for outcome in outcomes:
-            self.scenes.note_change(outcome.record.index)
+            self.scenes.note_units(outcome.record.index, len(outcome.results))
         settled = [
-            not self.planner.wanted(outcome.record) and not self.scenes.needs(outcome.record.index)
+            not self.plan.wanted(outcome.record) and not self.scenes.needs(outcome.record.index)
             for outcome in outcomes
         ]
+        indices = [outcome.record.index for outcome in outcomes]
+        whole = [
+            Outcome(outcome.record, self._unjournalled.get(index, ()) + outcome.results)
+            for index, outcome in zip(indices, outcomes, strict=True)
+        ]
+        if self._guarded(lambda: self.journal.save(list(zip(whole, settled, strict=True)))):
+            for index in indices:
+                self._unjournalled.pop(index, None)
+            return
+        for index, outcome, is_settled in zip(indices, outcomes, settled, strict=True):
+            self._unjournalled[index] = () if is_settled else self._results(index) + outcome.results
+
+    def _guarded(self, save: Callable[[], None]) -> bool:
+        """Whether the journal could take it: a full disk costs what a later run would have had of it."""
         try:
-            former = [self._unjournalled.get(outcome.record.index, ()) for outcome in outcomes]
-            whole = [
-                Outcome(outcome.record, before + outcome.results)
-                for outcome, before in zip(outcomes, former, strict=True)
-            ]
-            self.journal.save(list(zip(whole, settled, strict=True)))
+            save()
         except sqlite3.Error as error:
             self._fault(f"the journal cannot be written ({error}): an interrupted run would have to do this again")
-            for outcome, done in zip(outcomes, settled, strict=True):
-                index = outcome.record.index
-                self._unjournalled[index] = () if done else self._results(index) + outcome.results
-            return
-        for outcome in outcomes:
-            self._unjournalled.pop(outcome.record.index, None)
-
-    def _note_job(self, back: JobResult) -> None:
-        job = back.job
-        self._note(EventKind.BUDGET, job.phase)
-        self._note(EventKind.JOB, f"{job.phase} {len(job.indices)} pairs {back.unit_seconds:.3f} s")
+            return False
+        return True
 
     def _note_explanations(self) -> None:
-        for one in self.planner.explanations[self._explained :]:
-            self.journal.note(EventKind.PLAN, one.seconds, one.text)
-        self._explained = len(self.planner.explanations)
+        for explanation in self.plan.explanations[self._explained :]:
+            self.journal.note(EventKind.PLAN, explanation.seconds, explanation.text)
+        self._explained = len(self.plan.explanations)
 
     def _note(self, kind: EventKind, text: str) -> None:
         self.journal.note(kind, self.budget.spent(), text)
+
+    def _fault(self, what: str) -> None:
+        if what not in self.faults:
+            self.faults.append(what)
+            self._note(EventKind.FAULT, what)
 
     def _publish(self) -> None:
         start = self.budget.clock()
         with self._publishing:
             self._write()
         self._published = self.budget.clock()
-        self.budget.writing = max(self.budget.writing, WRITING_DOUBT * (self._published - start))
+        self.budget.note_write(self._published - start)
         if self.unwritten:
             self._fault(self.unwritten)
 
@@ -384,14 +393,12 @@ class Engine:
         except OSError as error:
             self.unwritten = f"the submission cannot be written: {error}"
 
-    def _fault(self, what: str) -> None:
-        if what not in self.faults:
-            self.faults.append(what)
-            self._note(EventKind.FAULT, what)
-
     def _ending(self) -> Ending:
         if self.interrupt.is_set():
             return Ending.INTERRUPTED
-        if self.planner.complete:
+        if self.plan.nothing_runs:
+            return Ending.NOTHING_RUNS
+        if self.plan.is_complete:
             return Ending.COMPLETE
-        return Ending.TIME_IS_UP if self.pool.workers else Ending.NO_WORKER
+        are_closed = self.site.places and all(place.closed for place in self.site.places)
+        return Ending.NO_WORKER if are_closed else Ending.TIME_IS_UP

@@ -1,69 +1,80 @@
-"""Jobs: what a worker gets and what comes back. Plain values, so that they can cross processes."""
+"""What crosses between the engine and a worker: two kinds of job, and their answers. Plain values."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
+from typing import Protocol
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.records import PairRecord
+from mkpc_kaggle.geometry.focal_prior import FocalConfig
+from mkpc_kaggle.geometry.robust import RobustConfig
 from mkpc_kaggle.pipeline.pair import UnitResult
 from mkpc_kaggle.recipe import Unit
-
-JOB_PAIRS = 8
-"""Pairs in a job: enough for a batch on a GPU, few enough to plan anew every some seconds."""
+from mkpc_kaggle.scene.choose import Choice
+from mkpc_kaggle.scene.config import SceneConfig
+from mkpc_kaggle.scene.reconstruction import Reconstruction
+from mkpc_kaggle.scene.view_graph import BatchPair
 
 
 class Phase(StrEnum):
     """The passes of a run, in order."""
 
-    SWEEP = "sweep"
-    CONNECT = "connect"
-    DEEPEN = "deepen"
-    UPGRADE = "upgrade"
+    SWEEP = "sweep"  # the first unit on all pairs
+    CONNECT = "connect"  # the first unit on pairs that no row names, where a batch has few
+    DEEPEN = "deepen"  # the other units, as many as fit
+    FILL = "fill"  # units that did not fit for all, on the weakest pairs first, in the time that is left
+    DENSIFY = "densify"  # the first unit on further pairs that no row names, in the time left after that
 
 
 @dataclass(frozen=True)
-class Chunk:
-    """Pairs that wait for their turn; ``units`` None: as many as fit when it comes."""
+class MatchJob:
+    """Run ``units`` on the pairs of ``indices``; what a pair has had, ``known``, is left out.
 
-    phase: Phase
-    indices: tuple[int, ...]
-    units: tuple[Unit, ...] | None = None
-    shrink: float = 1.0
-    round: int = 0
-
-
-@dataclass(frozen=True)
-class Job:
-    """``units`` to run on the pairs of ``indices``; those that a pair has had are left out.
-
-    ``expected`` are the seconds within which each unit most likely ends on a pair. No unit is begun that is
-    expected to end after ``deadline``, in seconds of the parent's clock. A worker that begins no unit and does not
-    answer for ``timeout`` seconds hangs. The views' sides are ``shrink`` times as long as the units say.
-    ``pairs`` and ``known``, what earlier jobs found on each, go along with it to the worker.
+    ``expected`` are the seconds within which each unit most likely ends on a pair. Units may begin in the first
+    ``seconds`` of the job if they are expected to end in them. After ``time_limit`` seconds without an answer the
+    worker hangs. ``exploring``: its unit has never run, and nobody knows what it costs.
     """
 
     phase: Phase
     indices: tuple[int, ...]
     units: tuple[Unit, ...]
     expected: tuple[float, ...]
-    deadline: float
-    timeout: float
-    shrink: float = 1.0
+    seconds: float
+    time_limit: float
     exploring: bool = False
     pairs: tuple[Pair, ...] = ()
     known: tuple[tuple[UnitResult, ...], ...] = ()
 
     @property
-    def note(self) -> str:
-        """What the units' records say of it; empty for units that run as they are written."""
-        return f"ran at {self.shrink:.2g} of its size, the worker failed at more" if self.shrink < 1 else ""
-
-    @property
     def images(self) -> Iterator[Path]:
         """The files that it needs."""
         return (path for pair in self.pairs for path in pair.images)
+
+
+@dataclass(frozen=True, eq=False)
+class SceneJob:
+    """Reconstruct a batch: ``indices`` are the places of its ``pairs`` in the run; images go by their digests.
+
+    ``made_from`` counts the unit results that its matches are of; see :class:`SceneRecord`.
+    """
+
+    batch: str
+    indices: tuple[int, ...]
+    pairs: tuple[BatchPair, ...]
+    config: SceneConfig
+    focal: FocalConfig | None = None
+    magsac: RobustConfig | None = None
+    made_from: int = 0
+
+
+Job = MatchJob | SceneJob
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """A worker's first answer: it is ready for a job."""
 
 
 @dataclass(frozen=True)
@@ -75,15 +86,14 @@ class Outcome:
 
 
 @dataclass(frozen=True)
-class JobResult:
-    """The outcomes of a job, one a pair, in order."""
+class MatchResult:
+    """The outcomes of a match job, one a pair, in order."""
 
-    job: Job
     outcomes: tuple[Outcome, ...]
 
     @property
     def results(self) -> list[UnitResult]:
-        """Those of every unit that this job ran on a pair."""
+        """Of every unit that this job ran on a pair."""
         return [result for outcome in self.outcomes for result in outcome.results]
 
     @property
@@ -91,28 +101,35 @@ class JobResult:
         return sum(result.seconds for result in self.results)
 
 
-class Cause(StrEnum):
-    """Why a job failed."""
+@dataclass(frozen=True, eq=False)
+class SceneResult:
+    """The reconstructions of a batch, and which F each pair gets, by its place in the run."""
 
+    reconstructions: tuple[Reconstruction, ...]
+    choices: Mapping[int, Choice]
+
+
+class Cause(StrEnum):
+    """Why a worker has no result."""
+
+    NOT_STARTED = "the worker could not be started"
+    REFUSED = "the matchers cannot be loaded"
     DIED = "the worker died"
-    HUNG = "the worker hung"
-    OUT_OF_MEMORY = "out of memory"
+    TIMED_OUT = "the worker hung"
     DEVICE = "the device failed"
+    OUT_OF_MEMORY = "out of memory"
     RAISED = "the worker failed"
-    NO_WORKER = "no worker could be started"
-    MACHINE = "the machine was lost"
 
     @property
-    def blameless(self) -> bool:
-        """It says nothing against the job."""
-        return self in (Cause.NO_WORKER, Cause.MACHINE)
+    def is_of_place(self) -> bool:
+        """Whether it counts against the place where the worker was, rather than against the units alone."""
+        return self not in (Cause.OUT_OF_MEMORY, Cause.RAISED)
 
 
 @dataclass(frozen=True)
-class JobFailure:
-    """A job that brought nothing, and why."""
+class Failure:
+    """The answer that a job came to nothing, or a worker to no job, and why."""
 
-    job: Job
     cause: Cause
     message: str = ""
 
@@ -120,21 +137,31 @@ class JobFailure:
         return f"{self.cause}: {self.message}" if self.message else str(self.cause)
 
 
+Answer = Loaded | MatchResult | SceneResult | Failure
+
+
+class Worker(Protocol):
+    """What does jobs, one at a time, somewhere. No call blocks, whatever became of it.
+
+    After ``start`` it answers once, :class:`Loaded` or :class:`Failure`; after each ``submit`` once more. It is
+    not used again after a failure of its place, nor after ``kill``.
+    """
+
+    def start(self) -> None: ...
+
+    def submit(self, job: Job, seconds: float) -> None:
+        """Hand over a job; units may begin within ``seconds``."""
+        ...
+
+    def answer(self) -> Answer | None:
+        """Its answer, once; ``None`` as long as there is none."""
+        ...
+
+    def kill(self) -> None: ...
+
+
 def visiting_order(pairs: Sequence[Pair]) -> list[int]:
     """Indices of pairs such that views of one image follow each other, and the encoding cache hits."""
     return sorted(
         range(len(pairs)), key=lambda index: (pairs[index].group, pairs[index].file0, pairs[index].file1)
     )
-
-
-def split(indices: Iterable[int]) -> Iterator[tuple[int, ...]]:
-    """One index alone, so that costs are known early, then :data:`JOB_PAIRS` at a time.
-
-    The same for every run of the same pairs, whatever was done before: a batch's composition can move the
-    last bits of a network's output.
-    """
-    indices = list(indices)
-    if indices:
-        yield (indices[0],)
-    for start in range(1, len(indices), JOB_PAIRS):
-        yield tuple(indices[start : start + JOB_PAIRS])

@@ -29,7 +29,7 @@ from mkpc_kaggle.engine.journal_tables import (
     to_blob,
     undamaged,
 )
-from mkpc_kaggle.engine.records import PairRecord, SceneRecord
+from mkpc_kaggle.engine.records import GIVEN_UP, PairRecord, SceneRecord
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.robust import Matrix3
 from mkpc_kaggle.scene.choose import Choice
@@ -100,10 +100,17 @@ class Journal(JournalTables):
             self._db.executemany("DELETE FROM scene WHERE batch = ?", [[batch] for batch in scenes])
         return len(forgotten)
 
+    def forget_given_up(self) -> None:
+        """Forget that units were given up on pairs: they are tried again; a pair that has had no other is new."""
+        with self._db:
+            self._db.execute("BEGIN")
+            self._db.execute("DELETE FROM unit WHERE substr(failure, 1, ?) = ?", [len(GIVEN_UP), GIVEN_UP])
+            self._db.execute("DELETE FROM pair WHERE pair NOT IN (SELECT pair FROM unit)")
+
     def save(self, outcomes: list[tuple[Outcome, bool]]) -> None:
         """Put down a job's outcomes, all or none; the points of those marked True no later job needs.
 
-        Of these, the weakest keep them for the report: at most :data:`DRAWN` of one session. An outcome's results
+        Of these, the weakest keep them for the report: at most :data:`DRAWN` of one run. An outcome's results
         may be the new ones alone: what was put down of others stays.
         """
         drawn = dict(self._drawn)
@@ -118,14 +125,14 @@ class Journal(JournalTables):
 
     def save_scene(self, scene: SceneRecord, choices: Mapping[int, Choice]) -> None:
         """Put down what came of a batch, and which F its pairs get, by their places."""
-        rows = [(i, _blob(one.F), str(one.reason)) for i, one in choices.items()]
+        rows = [(index, _blob(choice.F), str(choice.reason)) for index, choice in choices.items()]
         drawn = json.dumps([asdict(camera) for camera in scene.cameras]), json.dumps(scene.cloud)
         *values, failure = astuple(scene)[:-2]
         values = [*values, printable(failure), *drawn]
         with self._db:
             self._db.execute("BEGIN")
             self._db.executemany("REPLACE INTO choice VALUES (?, ?, ?)", rows)
-            self._db.execute("REPLACE INTO scene VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)", values)
+            self._db.execute("REPLACE INTO scene VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)", values)
 
     def settle(self, records: Iterable[PairRecord]) -> None:
         """Drop the points of pairs that no later job or scene needs; the weakest keep theirs for the report."""
@@ -169,17 +176,17 @@ class Journal(JournalTables):
     def _save(self, outcome: Outcome, settled: bool) -> None:
         record = outcome.record
         self._db.execute(
-            "REPLACE INTO pair VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+            "REPLACE INTO pair VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
             [
                 record.index,
-                _blob(record.F),
+                _blob(record.pair_fundamental),
                 printable(record.failure),
                 record.decode_seconds,
                 record.cluster_seconds,
                 record.estimate_seconds,
-                record.before,
                 *(record.versions or ("", "")),
-                _blob(record.magsac),
+                *([side for size in record.sizes for side in size] or (None,) * 4),
+                _blob(record.magsac_fundamental),
             ],
         )
         points = {} if settled else {result.unit.name: to_blob(result.matches) for result in outcome.results}

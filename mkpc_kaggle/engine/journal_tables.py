@@ -1,7 +1,7 @@
 """The tables of a run's journal, an SQLite file, and how they are read.
 
 Tables: ``run`` (what the journal belongs to and who wrote it), ``sample`` (the ids of the pairs), ``pair`` (F,
-failure, seconds, inliers before an upgrade, what tells the contents of its images, MAGSAC's F alone), ``unit``
+failure, seconds, what tells the contents of its images, MAGSAC's F alone), ``unit``
 (counts and seconds of each unit on each pair, and its points while a later pass may build on them or the report
 may draw them), ``region`` (the critical regions), ``choice`` (which F the reconstruction of its batch gives a
 pair, and why), ``scene`` (what came of each batch), ``event`` (what happened when).
@@ -26,7 +26,7 @@ import numpy as np
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.records import CameraRecord, PairRecord, SceneRecord, UnitRecord
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.geometry.coordinates import Box
+from mkpc_kaggle.geometry.coordinates import Box, Size
 from mkpc_kaggle.geometry.critical_region import CriticalRegion, RegionReason
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import Matrix3
@@ -34,7 +34,7 @@ from mkpc_kaggle.pipeline.pair import UnitResult
 from mkpc_kaggle.recipe import Unit
 from mkpc_kaggle.scene.choose import Choice, Reason
 
-FORMAT = 5
+FORMAT = 6
 FILE_NAME = "journal.sqlite"
 LOCK_NAME = "journal.lock"
 MOST_POINT_BYTES = 1 << 26
@@ -57,8 +57,9 @@ CREATE TABLE sample (
     pair INTEGER PRIMARY KEY, id TEXT NOT NULL, "group" TEXT NOT NULL, image0 TEXT NOT NULL, image1 TEXT NOT NULL);
 CREATE TABLE pair (
     pair INTEGER PRIMARY KEY, fundamental BLOB NOT NULL, failure TEXT NOT NULL,
-    decode_seconds REAL, cluster_seconds REAL, estimate_seconds REAL, before INTEGER,
-    version0 TEXT NOT NULL, version1 TEXT NOT NULL, magsac BLOB);
+    decode_seconds REAL, cluster_seconds REAL, estimate_seconds REAL,
+    version0 TEXT NOT NULL, version1 TEXT NOT NULL,
+    width0 INTEGER, height0 INTEGER, width1 INTEGER, height1 INTEGER, magsac BLOB);
 CREATE TABLE unit (
     pair INTEGER, unit TEXT, stage INTEGER, matches INTEGER, inliers INTEGER,
     encode_seconds REAL, match_seconds REAL, failure TEXT, place INTEGER, points BLOB,
@@ -68,8 +69,8 @@ CREATE TABLE region (
     reason TEXT, clusters INTEGER, kept INTEGER, PRIMARY KEY (pair, image));
 CREATE TABLE choice (pair INTEGER PRIMARY KEY, fundamental BLOB, reason TEXT NOT NULL);
 CREATE TABLE scene (
-    batch TEXT PRIMARY KEY, images INTEGER, placed INTEGER, models INTEGER, points INTEGER, seconds REAL,
-    failure TEXT NOT NULL, cameras TEXT NOT NULL, cloud TEXT NOT NULL);
+    batch TEXT PRIMARY KEY, images INTEGER, placed INTEGER, models INTEGER, points INTEGER, made_from INTEGER,
+    seconds REAL, failure TEXT NOT NULL, cameras TEXT NOT NULL, cloud TEXT NOT NULL);
 CREATE TABLE event (place INTEGER PRIMARY KEY, kind TEXT, seconds REAL, text TEXT);
 """
 
@@ -105,8 +106,8 @@ class Event:
 class About:
     """Who wrote a journal last: for reports, and compared with nothing.
 
-    ``limit`` is the time limit in seconds, ``None`` if there was none; ``left_out`` are names of units whose
-    weights were missing or not permitted; ``versions`` are those of the package and what it stands on.
+    ``limit`` is the time limit in seconds, ``None`` if there was none; ``left_out`` says which matchers
+    did not run, by cause; ``versions`` are those of the package and what it stands on.
     """
 
     recipe: str = "unnamed"
@@ -186,10 +187,14 @@ class JournalTables:
             pair: Choice(optional_matrix_of(F), Reason(reason))
             for pair, F, reason in self._db.execute("SELECT pair, fundamental, reason FROM choice")
         }
-        columns = "failure, decode_seconds, cluster_seconds, estimate_seconds, version0, version1, before, magsac"
+        columns = "failure, decode_seconds, cluster_seconds, estimate_seconds, version0, version1"
         found = {}
-        for pair, F, *values, before, magsac in self._db.execute(f"SELECT pair, fundamental, {columns} FROM pair"):
+        sides = "width0, height0, width1, height1, magsac"
+        rows = self._db.execute(f"SELECT pair, fundamental, {columns}, {sides} FROM pair")
+        for pair, F, *values, width0, height0, width1, height1, magsac in rows:
             failure, decode, cluster, estimate, *versions = typed(values, (str, float, float, float, str, str))
+            sizes = (Size(width0, height0), Size(width1, height1)) if width0 else ()
+            typed([side for size in sizes for side in size], (int,) * 2 * len(sizes))
             found[pair] = PairRecord(
                 pair,
                 matrix_of(F),
@@ -199,8 +204,8 @@ class JournalTables:
                 decode,
                 cluster,
                 estimate,
-                None if before is None else int(before),
                 choices.get(pair),
+                sizes,
                 tuple(filter(None, versions)),
                 optional_matrix_of(magsac),
             )
@@ -209,13 +214,14 @@ class JournalTables:
     @reading
     def scenes(self) -> tuple[SceneRecord, ...]:
         """What came of each batch that was reconstructed, by name."""
-        columns = "batch, images, placed, models, points, seconds, failure"
+        columns = "batch, images, placed, models, points, made_from, seconds, failure"
         rows = self._db.execute(f"SELECT {columns}, cameras, cloud FROM scene ORDER BY batch")
         found = []
         for *values, cameras, cloud in rows:
             known, points = [CameraRecord(**camera) for camera in json.loads(cameras)], json.loads(cloud)
-            for one in known:
-                numbers = (*one.centre, *one.forward, *one.down, one.focal, *one.size, one.model, one.seen)
+            for camera in known:
+                numbers = (*camera.centre, *camera.forward, *camera.down)
+                numbers += (camera.focal, *camera.size, camera.model, camera.seen)
                 typed(numbers, (float,) * 10 + (int,) * 4)
             for point in points:
                 typed(point, (float,) * 3)

@@ -6,15 +6,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL, Matrix3
 from mkpc_kaggle.pipeline.pair import PairMatch, Regions
 from mkpc_kaggle.recipe import Unit
 from mkpc_kaggle.scene.choose import Choice
-from mkpc_kaggle.scene.model import Scene
+from mkpc_kaggle.scene.reconstruction import Reconstruction
 
 NOT_REACHED = "not reached in time"
-MOST_POINTS = 300
-"""Of a scene's points that are kept to be drawn."""
+GIVEN_UP = "given up: "  # how the failure of a unit begins that workers were lost at
+MAX_DRAWN_POINTS = 300  # of a scene, which are kept to be drawn
 
 
 @dataclass(frozen=True)
@@ -34,25 +35,25 @@ class UnitRecord:
 class PairRecord:
     """What is known of one pair: its F (its E, where the pair has intrinsics) and how it came about.
 
-    ``failure`` is empty, or says why ``F`` is the fallback. The seconds are those of all jobs on the pair.
-    ``before`` is the number of inliers that it had when it was first upgraded; ``None`` if it never was.
-    ``scene`` is what its batch's reconstruction says of it, ``None`` if there was none. ``versions`` tell the
-    contents of the two images that were matched, empty where no file tells them. ``magsac`` is MAGSAC's F alone,
-    where ``F`` comes from more than that.
+    ``pair_fundamental`` is from the pair's own matches, and the fallback where ``failure`` says why there is none;
+    ``magsac_fundamental`` is MAGSAC's alone, where the former comes from more than that. The seconds are those of
+    all jobs on the pair. ``scene`` is what its batch's reconstruction says of it, ``None`` if there was none.
+    ``sizes`` and ``versions`` are of
+    the two images that were matched; a version tells the content of a file.
     """
 
     index: int
-    F: Matrix3
+    pair_fundamental: Matrix3
     failure: str
     units: tuple[UnitRecord, ...] = ()
     regions: Regions | None = None
     decode_seconds: float = 0.0
     cluster_seconds: float = 0.0
     estimate_seconds: float = 0.0
-    before: int | None = None
     scene: Choice | None = None
+    sizes: tuple[Size, ...] = ()
     versions: tuple[str, ...] = ()
-    magsac: Matrix3 | None = None
+    magsac_fundamental: Matrix3 | None = None
 
     @classmethod
     def untouched(cls, index: int, reason: str = NOT_REACHED) -> "PairRecord":
@@ -75,19 +76,21 @@ class PairRecord:
             )
             for result, mask in zip(match.results, inliers, strict=True)
         )
-        found, seconds = match.estimate, (match.decode_seconds, match.cluster_seconds, match.estimate_seconds)
         return cls(
             index,
-            found.matrix,
-            found.failure,
+            match.estimate.matrix,
+            match.estimate.failure,
             units,
             match.regions,
-            *seconds,
+            match.decode_seconds,
+            match.cluster_seconds,
+            match.estimate_seconds,
+            sizes=match.sizes,
             versions=match.versions,
-            magsac=found.magsac,
+            magsac_fundamental=match.estimate.magsac,
         )
 
-    def after(self, former: "PairRecord", before: int | None) -> "PairRecord":
+    def after(self, former: "PairRecord") -> "PairRecord":
         """The record of a later job on a pair: with the seconds of the ``former`` ones, and their regions."""
         return replace(
             self,
@@ -95,18 +98,28 @@ class PairRecord:
             decode_seconds=former.decode_seconds + self.decode_seconds,
             cluster_seconds=former.cluster_seconds + self.cluster_seconds,
             estimate_seconds=former.estimate_seconds + self.estimate_seconds,
-            before=before,
             scene=former.scene,
         )
 
+    def without_given_up(self) -> "PairRecord":
+        """The record without the units that were given up: they may be tried again."""
+        units = tuple(unit for unit in self.units if not unit.failure.startswith(GIVEN_UP))
+        if len(units) == len(self.units):
+            return self
+        return replace(self, units=units) if units else PairRecord.untouched(self.index)
+
     @property
-    def fundamental(self) -> Matrix3:
-        """What its batch's reconstruction gives it, else its own."""
-        return self.F if self.scene is None or self.scene.F is None else self.scene.F
+    def scene_fundamental(self) -> Matrix3 | None:
+        return None if self.scene is None else self.scene.F
+
+    @property
+    def chosen_fundamental(self) -> Matrix3:
+        """The F that is written: what its batch's reconstruction gives the pair, else its own."""
+        return self.pair_fundamental if self.scene_fundamental is None else self.scene_fundamental
 
     @property
     def source(self) -> str:
-        """Where :attr:`fundamental` comes from: "scene", "pair" or "fallback"."""
+        """Where :attr:`chosen_fundamental` comes from: "scene", "pair" or "fallback"."""
         if self.scene is not None and self.scene.F is not None:
             return "scene" if self.scene.from_scene else "pair"
         return "fallback" if self.failure else "pair"
@@ -118,11 +131,6 @@ class PairRecord:
     @property
     def inliers(self) -> int:
         return sum(unit.inliers for unit in self.units)
-
-    @property
-    def inliers_before(self) -> int:
-        """The inliers of a pair before it was upgraded."""
-        return self.inliers if self.before is None else self.before
 
     @property
     def matches(self) -> int:
@@ -167,7 +175,8 @@ class CameraRecord:
 class SceneRecord:
     """What came of a batch: how many of its images have a camera, in how many models, with how many points.
 
-    ``cloud`` are some points of the largest model, evenly chosen, in its units.
+    It was made from so many unit results on its pairs: if these have more now, the scene is out of date. ``cloud``
+    are some points of the largest model, evenly chosen, in its units.
     """
 
     batch: str
@@ -175,44 +184,54 @@ class SceneRecord:
     placed: int
     models: int
     points: int
+    made_from: int
     seconds: float
     failure: str
     cameras: tuple[CameraRecord, ...] = ()
     cloud: tuple[list[float], ...] = ()
 
     @classmethod
-    def of(cls, batch: str, scenes: Sequence[Scene], seconds: float, failure: str) -> "SceneRecord":
-        models = sorted((model for scene in scenes for model in scene.models), key=lambda one: -len(one.images))
+    def of(
+        cls,
+        batch: str,
+        reconstructions: Sequence[Reconstruction],
+        made_from: int,
+        seconds: float,
+        failure: str = "",
+    ) -> "SceneRecord":
+        found = (model for reconstruction in reconstructions for model in reconstruction.models)
+        models = sorted(found, key=lambda model: -len(model.images))
         cameras = tuple(
             CameraRecord(
-                image.name,
+                found.image.name,
                 number,
-                (-image.camera.R.T @ image.camera.t).tolist(),
-                image.camera.R[2].tolist(),
-                image.camera.R[1].tolist(),
-                image.focal,
-                list(image.size),
-                image.points,
+                (-found.camera.R.T @ found.camera.t).tolist(),
+                found.camera.R[2].tolist(),
+                found.camera.R[1].tolist(),
+                found.focal,
+                list(found.image.size),
+                found.points,
             )
             for number, model in enumerate(models)
-            for image in model.images
+            for found in model.images
         )
-        reasons = [scene.failure for scene in scenes if scene.failure] if not models else []
+        reasons = [each.failure for each in reconstructions if each.failure and not models]
         return cls(
             batch,
-            sum(len(scene.names) for scene in scenes),
-            sum(scene.placed for scene in scenes),
+            sum(len(each.names) for each in reconstructions),
+            sum(each.registered for each in reconstructions),
             len(models),
             sum(len(model.points) for model in models),
+            made_from,
             seconds,
             failure or "; ".join(dict.fromkeys(reasons)) or ("" if models else "no matches connect its images"),
             cameras,
-            tuple(evenly(models[0].points, MOST_POINTS).round(4).tolist()) if models else (),
+            tuple(evenly(models[0].points, MAX_DRAWN_POINTS).round(4).tolist()) if models else (),
         )
 
 
-def evenly(points: NDArray[np.float64], most: int) -> NDArray[np.float64]:
+def evenly(points: NDArray[np.float64], count: int) -> NDArray[np.float64]:
     """At most that many of the rows, evenly chosen."""
-    places = np.linspace(0, len(points) - 1, min(most, len(points))).round().astype(int)
+    places = np.linspace(0, len(points) - 1, min(count, len(points))).round().astype(int)
     chosen: NDArray[np.float64] = points[places]
     return chosen

@@ -1,101 +1,32 @@
 """Batches reconstructed beside matching: which of them, when, and for how long.
 
-A batch is taken up when all of its pairs are matched as far as time allows, and once more in the end if pairs of
-it got further matches since. Pairs have the F of their own matches all the while.
+A batch is due when all of its pairs are matched as far as time allows, and again when they have further matches
+since. Pairs have the F of their own matches all the while.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Iterable, Sequence
+from dataclasses import replace
+from math import ceil
 from pathlib import Path
-from typing import Protocol
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.data.images import Image, Unreadable, read_image
-from mkpc_kaggle.engine.costs import Timeouts
+from mkpc_kaggle.engine.jobs import SceneJob
+from mkpc_kaggle.engine.records import PairRecord, SceneRecord
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.pipeline.pair import UnitResult
-from mkpc_kaggle.scene.batch import BatchPair
-from mkpc_kaggle.scene.choose import Choice
+from mkpc_kaggle.recipe import Recipe
 from mkpc_kaggle.scene.config import SceneConfig
-from mkpc_kaggle.scene.known_focals import KnownFocals
-from mkpc_kaggle.scene.model import Scene
-from mkpc_kaggle.scene.unasked import unasked_pairs
+from mkpc_kaggle.scene.densify import extra_pairs
+from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair, tracks_of
 
-LEAST_PAIRS = 2
-"""Of which three images can be connected."""
-START_SECONDS = 3.0
-"""What a process takes to begin."""
-PAIR_SECONDS = 0.2
-"""What a pair adds to a reconstruction, as far as nothing is known."""
-MARGIN = 1.5
-"""A batch is given that many times the seconds that those before it took by their pairs."""
-
-
-@dataclass(frozen=True, eq=False)
-class SceneJob:
-    """A batch to reconstruct; plain values, so that it can go to another process or machine.
-
-    ``indices`` are the places of its ``pairs`` in the run; their images go by the paths of their files.
-    """
-
-    batch: str
-    indices: tuple[int, ...]
-    pairs: tuple[BatchPair, ...]
-    config: SceneConfig
-    known_focals: KnownFocals | None = None
-
-
-SceneAnswer = tuple[tuple[Scene, ...], dict[int, Choice]]
-"""The scenes of a batch, and by a pair's place in the run which F it gets."""
-
-
-class Reconstruction(Protocol):
-    """A batch under way somewhere: it may crash, hang or be killed."""
-
-    def answer(self) -> SceneAnswer | str | None:
-        """What came of it, or why nothing did; ``None`` while it is under way. Does not wait."""
-        ...
-
-    def kill(self) -> None: ...
-
-
-def reconstruct(job: SceneJob, read: Callable[[Path], Image | Unreadable] = read_image) -> SceneAnswer:
-    """Do a job, here; it may end the process, see :mod:`mkpc_kaggle.scene.reconstruct`."""
-    from mkpc_kaggle.scene.read import batch_of
-    from mkpc_kaggle.scene.solve import solve
-
-    readable, batch = batch_of(job.pairs, read)
-    solution = solve(batch, job.config, job.known_focals)
-    indices = [job.indices[place] for place in readable]
-    return solution.scenes, dict(zip(indices, solution.choices, strict=True))
-
-
-def tracks_of(results: Sequence[UnitResult], least: int) -> dict[str, Matches]:
-    """The matches that a scene is made of, by their matchers: of units that make tracks, or all if few are."""
-    chosen = [result for result in results if result.unit.tracks]
-    if sum(len(result.matches) for result in chosen) < least:
-        chosen = list(results)
-    matchers = dict.fromkeys(result.unit.matcher for result in chosen)
-    return {
-        name: Matches.concatenate(result.matches for result in chosen if result.unit.matcher == name)
-        for name in matchers
-    }
-
-
-def pairs_to_add(pairs: Sequence[Pair], config: SceneConfig | None) -> list[Pair]:
-    """Pairs of images of a batch that no row names, to be matched for its scene; see ``SceneConfig``."""
-    added: list[Pair] = []
-    for batch, places in batches_of(pairs).items() if config is not None else ():
-        asked = [pairs[place] for place in places]
-        files = list(dict.fromkeys(file for pair in asked for file in (pair.file0, pair.file1)))
-        assert config is not None
-        if len(files) > config.most_images:  # to look for partners takes the square of their number
-            continue
-        number = {file: place for place, file in enumerate(files)}
-        ends = [(number[pair.file0], number[pair.file1]) for pair in asked]
-        found = [(files[i], files[j]) for i, j in unasked_pairs(len(files), ends, config.pairs_per_image)]
-        added += [Pair(f"{batch};{Path(a).stem}-{Path(b).stem}", batch, a, b) for a, b in found]
-    return added
+MIN_PAIRS = 2  # they can connect three images
+MAX_TRIES = 2  # of a reconstruction that is lost
+DENSIFY_PAIRS_PER_IMAGE = 15.0  # of a batch, once all units have run: above, pairs add time alone
+START_S = 3.0  # that a process takes to begin
+PAIR_S = 0.2  # that a pair adds to a reconstruction, as long as nothing is known
+FORECAST_MARGIN = 1.5  # a reconstruction may take this many times what its pairs took in earlier ones
+HANGS = 10.0  # one that takes this many times its forecast hangs,
+SILENCE_SHARE, MIN_SILENCE_S, MAX_SILENCE_S = 0.02, 5.0, 60.0  # besides a share of the limit
 
 
 def batches_of(pairs: Iterable[Pair]) -> dict[str, list[int]]:
@@ -104,111 +35,128 @@ def batches_of(pairs: Iterable[Pair]) -> dict[str, list[int]]:
     for place, pair in enumerate(pairs):
         if pair.intrinsics is None:
             batches.setdefault(pair.group, []).append(place)
-    return {name: members for name, members in batches.items() if len(members) >= LEAST_PAIRS}
+    return {name: members for name, members in batches.items() if len(members) >= MIN_PAIRS}
 
 
-@dataclass(frozen=True, eq=False)
-class SceneResult:
-    """What came of a batch: its scenes, and by pair which F it gets; ``failure`` is empty, or says why nothing."""
+def extra_pairs_of(pairs: Sequence[Pair], config: SceneConfig | None) -> tuple[list[Pair], int]:
+    """Pairs of images of a batch that no row names, to be matched for its scene alone, in order of their use.
 
-    batch: str
-    scenes: tuple[Scene, ...]
-    choices: Mapping[int, Choice]
-    seconds: float
-    failure: str = ""
+    The second value is how many of them connect batches that have less than ``pairs_per_image``; the others add to
+    those with the fewest first, in the time that is left.
+    """
+    if config is None or not config.pairs_per_image:
+        return [], 0
+    connecting: list[Pair] = []
+    further: list[tuple[float, list[Pair]]] = []
+    for batch, places in batches_of(pairs).items():
+        asked = [pairs[place] for place in places]
+        files = list(dict.fromkeys(file for pair in asked for file in (pair.file0, pair.file1)))
+        number = {file: place for place, file in enumerate(files)}
+        ends = [(number[pair.file0], number[pair.file1]) for pair in asked]
+        found = extra_pairs(len(files), ends, max(config.pairs_per_image, DENSIFY_PAIRS_PER_IMAGE))
+        named = [(files[i], files[j]) for i, j in found]
+        extra = [Pair(f"{batch};{Path(a).stem}-{Path(b).stem}", batch, a, b) for a, b in named]
+        distinct = len({tuple(sorted(pair)) for pair in ends})
+        count = max(0, ceil(config.pairs_per_image * len(files)) - distinct)
+        connecting += extra[:count]
+        further.append((distinct / len(files), extra[count:]))
+    further.sort(key=lambda batch: batch[0])
+    return connecting + [pair for _, extra in further for pair in extra], len(connecting)
 
 
-@dataclass(frozen=True, eq=False)
-class Running:
-    """A reconstruction that began at ``started`` and is taken to hang ``timeout`` seconds later."""
-
-    reconstruction: Reconstruction
-    started: float
-    timeout: float
-
-
-class SceneQueue:
-    """Which batches to reconstruct, and when; ``clock`` and ``limit`` are the run's."""
+class Scenes:
+    """What came of each batch of a run so far, and which is due; ``records`` are those of all pairs, by index."""
 
     def __init__(
-        self,
-        pairs: Sequence[Pair],
-        config: SceneConfig | None,
-        clock: Callable[[], float],
-        timeouts: Timeouts,
-        limit: float,
+        self, pairs: Sequence[Pair], recipe: Recipe, records: Sequence[PairRecord], made: Iterable[SceneRecord]
     ) -> None:
-        self.config = config
-        self.batches = batches_of(pairs) if config is not None else {}
-        self.running: dict[str, Running] = {}
+        self.made = {scene.batch: scene for scene in made}
+        self.batches = batches_of(pairs) if recipe.scene is not None else {}
+        self.running: set[str] = set()
+        self._pairs, self._recipe, self._records = pairs, recipe, records
         self._batch_of = {index: name for name, indices in self.batches.items() for index in indices}
-        self._changed = set(self.batches)
-        self._taken_up: set[str] = set()
-        self._clock, self._timeouts, self._limit = clock, timeouts, limit
-        self._spent_seconds = self._spent_pairs = 0.0
+        self._unit_counts = {
+            name: sum(len(records[index].units) for index in indices) for name, indices in self.batches.items()
+        }
+        self._losses: dict[tuple[str, int], int] = {}
+        self._spent_s = self._spent_pairs = 0.0
 
-    def note_solved(self, indices: Iterable[int]) -> None:
-        """Pairs that an earlier run had reconstructed: their batches need not be again."""
-        solved = {self._batch_of[index] for index in indices if index in self._batch_of}
-        self._changed -= solved
-        self._taken_up |= solved
-
-    def note_change(self, index: int) -> None:
-        """A pair got further matches."""
+    def note_units(self, index: int, change: int) -> None:
+        """Record that a pair has got so many more units, or lost them."""
         if index in self._batch_of:
-            self._changed.add(self._batch_of[index])
+            self._unit_counts[self._batch_of[index]] += change
 
-    def needs(self, index: int) -> bool:
-        """Whether a reconstruction to come wants the pair's matches."""
-        return self._batch_of.get(index) in self._changed
-
-    def due(self, deepened: set[int], *, again: bool) -> str | None:
-        """A batch whose pairs are all matched, as far as time allows; one that was taken up before only ``again``,
-        since its pairs may go on changing.
-        """
-        for name in self.batches:
-            if name not in self._changed or name in self.running or (name in self._taken_up and not again):
-                continue
-            if deepened.issuperset(self.batches[name]):
+    def due(self, done: Collection[int]) -> str | None:
+        """A batch to reconstruct now: its matches have changed since it was, and all of its pairs are ``done``."""
+        for name, indices in self.batches.items():
+            outdated = name not in self.running and self._made_from(name) != self._unit_counts[name]
+            if outdated and all(index in done for index in indices):
                 return name
         return None
 
-    def start(self, batch: str, reconstruction: Reconstruction) -> None:
-        """Take note of what has begun."""
-        self._changed.discard(batch)
-        self._taken_up.add(batch)
-        timeout = self._timeouts.of_scene(self._forecast(batch), self._limit)
-        self.running[batch] = Running(reconstruction, self._clock(), timeout)
+    def needs(self, index: int) -> bool:
+        """Whether a reconstruction to come wants the pair's matches."""
+        batch = self._batch_of.get(index)
+        return batch is not None and self._is_open(batch)
 
-    def finished(self) -> list[SceneResult]:
-        """What has ended since, by itself or because it hung."""
-        ended = [self._result(batch, running) for batch, running in self.running.items()]
-        results = [result for result in ended if result is not None]
-        for result in results:
-            self.running.pop(result.batch).reconstruction.kill()
-        return results
+    def job(self, batch: str, results_of: Callable[[int], tuple[UnitResult, ...]]) -> SceneJob:
+        """The job that reconstructs a batch; ``results_of`` gives what was found on a pair."""
+        recipe, config = self._recipe, self._recipe.scene
+        assert config is not None
+        found = tuple(index for index in self.batches[batch] if self._records[index].sizes)
+        pairs = tuple(self._batch_pair(index, results_of(index)) for index in found)
+        self.running.add(batch)
+        return SceneJob(batch, found, pairs, config, recipe.focal, recipe.magsac, self._unit_counts[batch])
 
-    def close(self) -> None:
-        for running in self.running.values():
-            running.reconstruction.kill()
+    def on_result(self, job: SceneJob, record: SceneRecord) -> None:
+        self.running.discard(job.batch)
+        self.made[job.batch] = record
+        self._spent_s += max(0.0, record.seconds - START_S)
+        self._spent_pairs += len(self.batches[job.batch])
+
+    def on_failure(self, job: SceneJob, failure: str, seconds: float) -> SceneRecord | None:
+        """Record a reconstruction that was lost; what to keep if it is not tried again.
+
+        What was found before its pairs got further matches still stands.
+        """
+        self.running.discard(job.batch)
+        losses = self._losses[job.batch, job.made_from] = self._losses.get((job.batch, job.made_from), 0) + 1
+        if losses < MAX_TRIES:
+            return None
+        former = self.made.get(job.batch)
+        if former is None or former.failure:
+            self.made[job.batch] = SceneRecord.of(job.batch, (), job.made_from, seconds, failure)
+        else:
+            self.made[job.batch] = replace(former, made_from=job.made_from)
+        return self.made[job.batch]
+
+    def time_limit(self, batch: str, limit: float) -> float:
+        """Seconds after which a reconstruction hangs, in a run of ``limit`` seconds."""
+        silence = min(MAX_SILENCE_S, max(MIN_SILENCE_S, SILENCE_SHARE * limit))
+        return silence + HANGS * self._forecast(batch)
 
     def reserve(self, at_once: int) -> float:
-        """The seconds that what is left to do will most likely take, ``at_once`` at a time."""
-        left = [self._forecast(name) for name in self._changed | set(self.running)]
+        """The seconds that what is left to reconstruct will most likely take, ``at_once`` at a time."""
+        left = [self._forecast(name) for name in self.batches if self._is_open(name)]
         return max([*left, sum(left) / at_once], default=0.0)
 
     def _forecast(self, batch: str) -> float:
-        rate = MARGIN * self._spent_seconds / self._spent_pairs if self._spent_pairs else PAIR_SECONDS
-        return START_SECONDS + rate * len(self.batches[batch])
+        rate = FORECAST_MARGIN * self._spent_s / self._spent_pairs if self._spent_pairs else PAIR_S
+        return START_S + rate * len(self.batches[batch])
 
-    def _result(self, batch: str, running: Running) -> SceneResult | None:
-        answer, seconds = running.reconstruction.answer(), self._clock() - running.started
-        if answer is None and seconds < running.timeout:
-            return None
-        if answer is None:
-            return SceneResult(batch, (), {}, seconds, f"it hung: no answer for {running.timeout:.0f} s")
-        if isinstance(answer, str):
-            return SceneResult(batch, (), {}, seconds, answer)
-        self._spent_seconds += max(0.0, seconds - START_SECONDS)
-        self._spent_pairs += len(self.batches[batch])
-        return SceneResult(batch, *answer, seconds)
+    def _is_open(self, batch: str) -> bool:
+        """Whether it is to be reconstructed, for the first time or anew."""
+        return batch not in self.made or self._made_from(batch) != self._unit_counts[batch]
+
+    def _made_from(self, batch: str) -> int:
+        return self.made[batch].made_from if batch in self.made else 0
+
+    def _batch_pair(self, index: int, results: Sequence[UnitResult]) -> BatchPair:
+        record = self._records[index]
+        image0, image1 = (
+            BatchImage(path.stem, version.split()[0], size)
+            for path, version, size in zip(self._pairs[index].images, record.versions, record.sizes, strict=True)
+        )
+        matches = Matches.concatenate(result.matches for result in results)
+        own = None if record.failure else record.pair_fundamental
+        return BatchPair(image0, image1, matches, own, tracks_of(results))

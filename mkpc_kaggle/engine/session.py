@@ -1,47 +1,38 @@
-"""One run from its parts: journal, pool and engine opened, used and let go of."""
+"""A run from its parts: journal, site and engine opened, used and let go of; signals, and the end at the limit."""
 
 import hashlib
-import multiprocessing
-import os
 import platform
 import signal
 import sqlite3
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial
 from importlib import metadata
 from math import isfinite
 from pathlib import Path
 from types import FrameType, TracebackType
-from typing import NoReturn, Self
+from typing import Self
 
 import cv2
 import numpy as np
 
 from mkpc_kaggle import __version__
-from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.data.outputs import discard_parts
+from mkpc_kaggle.data.competition import Pair, write_submission
+from mkpc_kaggle.engine import console
 from mkpc_kaggle.engine.budget import Budget
-from mkpc_kaggle.engine.costs import Timeouts
-from mkpc_kaggle.engine.engine import LISTEN_SECONDS, Engine, RunReport
+from mkpc_kaggle.engine.cluster import RayCluster, ray_site
+from mkpc_kaggle.engine.engine import Engine, RunReport
 from mkpc_kaggle.engine.journal import Journal
 from mkpc_kaggle.engine.journal_tables import About, EventKind
-from mkpc_kaggle.engine.pools.cluster import RayCluster
-from mkpc_kaggle.engine.pools.local import LocalWorker
-from mkpc_kaggle.engine.pools.pool import Place, Pool
-from mkpc_kaggle.engine.pools.process import ProcessWorker
+from mkpc_kaggle.engine.places import LISTEN_S, LocalSite, Site
 from mkpc_kaggle.engine.records import PairRecord
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.pipeline.assembly import Assembly
 
-LEAVING_SECONDS = 0.2
-"""What the system takes to end a process."""
-REPORT_SECONDS = 2.0
-"""How long an interrupted program may write its report: enough for the tables."""
+EXIT_S = 0.2  # that the system takes to end a process
+REPORT_S = 2.0  # that an interrupted program may take for its report: enough for the tables
 
 
 class Interrupt(threading.Event):
@@ -65,13 +56,35 @@ class Session:
     progress: bool = True
     workers: int | RayCluster | None = 0
     watchdog: "Watchdog | None" = None
-    timeouts: Timeouts | None = None
 
     def must_end(self) -> float:
         """When the program must have ended, by the monotonic clock: with its budget, or soon after a signal."""
-        if self.interrupt.signal:
-            return time.monotonic() + REPORT_SECONDS
-        return self.budget.started + self.budget.limit
+        return time.monotonic() + REPORT_S if self.interrupt.signal else self.budget.limit
+
+
+def submit(pairs: Sequence[Pair], assembly: Assembly, session: Session, output: Path) -> RunReport:
+    """Match all pairs and keep ``output`` whole from the start: one row a pair, the fallback where no F is known.
+
+    Raises :class:`mkpc_kaggle.errors.UserError` where ``output`` cannot be written, before any work.
+    """
+
+    def publish(records: Sequence[PairRecord]) -> None:
+        rows = zip(pairs, records, strict=True)
+        write_submission(output, {pair.id: record.chosen_fundamental for pair, record in rows})
+
+    require_writable(output)
+    return run_pairs(pairs, assembly, session, publish)
+
+
+def require_writable(output: Path) -> None:
+    """Make the file's directory if need be; :class:`UserError` where the file cannot be written."""
+    probe = output.with_name(f".{output.name}.probe")
+    try:
+        output.parent.mkdir(parents=True, exist_ok=True)
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise UserError(f"--output {output} cannot be written: {error.strerror}") from error
 
 
 def run_pairs(
@@ -79,36 +92,39 @@ def run_pairs(
     assembly: Assembly,
     session: Session,
     publish: Callable[[Sequence[PairRecord]], None] = lambda _: None,
-) -> tuple[RunReport, bool]:
-    """Run the recipe on all pairs; the report, and whether every thread has come to rest.
+) -> RunReport:
+    """Run the recipe on all pairs.
 
     Raises :class:`mkpc_kaggle.errors.UserError` before any work where the journal is another run's, or a
     matcher cannot be loaded.
     """
-    belongs_to = {"test set": digest_of(pairs), **assembly.fingerprint()}
+    belongs_to = {"test set": digest_of_pairs(pairs), **assembly.fingerprint()}
     about = about_run(assembly, session.budget)
     with Journal(session.work_dir, belongs_to, pairs=pairs, about=about, fresh=session.fresh) as journal:
         journal.note(EventKind.START, session.budget.spent(), "")
-        pool = pool_of(assembly, session.workers)
         engine = Engine(
             pairs,
             assembly.recipe,
-            pool,
+            site_of(assembly, session),
             journal,
             session.budget,
             publish=publish,
             interrupt=session.interrupt,
             progress=session.progress,
-            timeouts=session.timeouts or Timeouts(batch=assembly.batch),
+            minibatch=assembly.minibatch,
         )
         if session.watchdog is not None:
             session.watchdog.save = engine.save_what_there_is
-        try:
-            report = engine.run()
-            journal.note(EventKind.END, report.seconds, report.ending)
-        finally:
-            at_rest = pool.close()
-    return report, at_rest
+        report = engine.run()
+        journal.note(EventKind.END, report.seconds, report.ending)
+    return report
+
+
+def site_of(assembly: Assembly, session: Session) -> Site:
+    """Where the workers are that the session asks for."""
+    if isinstance(session.workers, RayCluster):
+        return ray_site(assembly, session.workers, session.budget.clock)
+    return LocalSite(assembly, session.workers, session.budget.clock)
 
 
 def about_run(assembly: Assembly, budget: Budget) -> About:
@@ -116,8 +132,8 @@ def about_run(assembly: Assembly, budget: Budget) -> About:
     return About(
         assembly.recipe.name,
         str(assembly.placement),
-        budget.limit if isfinite(budget.limit) else None,
-        tuple(unit.name for unit in assembly.left_out),
+        budget.time_limit if isfinite(budget.time_limit) else None,
+        assembly.left_out,
         versions(),
     )
 
@@ -134,47 +150,15 @@ def versions() -> dict[str, str]:
     }
 
 
-def pool_of(assembly: Assembly, workers: int | RayCluster | None) -> Pool:
-    """One process a device, or as many as are asked for, in turn on each device; or none."""
-    if isinstance(workers, RayCluster):
-        return _ray_pool(assembly, workers)
-    if workers == 0:
-        return Pool([Place("this process", partial(LocalWorker, assembly.pipeline))], assembly.recipe)
-    # On a CPU one process with all threads: two with half of them each do more (recipe light, two cores: the sweep
-    # over after 22 s instead of 31), but need twice the memory, and a network's last bits change with its threads.
-    devices = assembly.devices
-    used = [devices[number % len(devices)] for number in range(workers or len(devices))]
-    share = len(used) if devices == ("cpu",) else 1
-    places = [
-        _process_place(f"{name} {number}", assembly.on(name, used.count(name)), share)
-        for number, name in enumerate(used)
-    ]
-    fallback = None if devices == ("cpu",) else _process_place("CPU", assembly.on_cpu())
-    return Pool(places, assembly.recipe, fallback)
-
-
-def _process_place(name: str, assembly: Assembly, share: int = 1) -> Place:
-    return Place(name, partial(ProcessWorker, name, assembly.pipeline, share))
-
-
-def _ray_pool(assembly: Assembly, cluster: RayCluster) -> Pool:
-    """A pool of the cluster's machines; raises :class:`UserError` where Ray is not installed."""
-    # Read when Ray is imported: it must not report usage, and not start a cluster after it was shut down.
-    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    os.environ.setdefault("RAY_ENABLE_AUTO_CONNECT", "0")
-    try:
-        from mkpc_kaggle.engine.pools.ray_pool import RayPool
-    except ModuleNotFoundError as error:
-        if error.name != "ray":
-            raise
-        raise UserError(
-            '--workers ray needs Ray, which is not installed: pip install "mkpc-kaggle[ray]"'
-        ) from error
-    return RayPool(assembly, cluster)
+def digest_of_pairs(pairs: Sequence[Pair]) -> str:
+    """Tells one test set from another: the keys of its pairs with the ids of their images, in order."""
+    ids = ((pair.key, pair.group, *(name.rpartition(".")[0] for name in pair.names)) for pair in pairs)
+    rows = map("\t".join, ids)
+    return hashlib.sha256("\n".join(rows).encode()).hexdigest()
 
 
 class Watchdog:
-    """Leaves the process at the budget's last moment, the submission written, if the program has not ended.
+    """Leaves the process before the limit, the submission written, if the program has not ended by itself.
 
     A thread does it, so that it helps wherever the others are stuck, short of holding the interpreter's lock:
     that only a matcher in the program's own process can do. Worker processes are ended with this one.
@@ -193,7 +177,7 @@ class Watchdog:
         self._over = threading.Event()
 
     def __enter__(self) -> Self:
-        if isfinite(self._budget.limit):
+        if isfinite(self._budget.time_limit):
             threading.Thread(target=self._watch, name="watchdog", daemon=True).start()
         return self
 
@@ -203,36 +187,18 @@ class Watchdog:
         self._over.set()
 
     def _watch(self) -> None:
-        while (left := self._budget.last - self._budget.clock()) > 0:  # it moves while the run learns
-            if self._over.wait(min(left, LISTEN_SECONDS)):
+        while (left := self._budget.final_write - self._budget.clock()) > 0:  # it moves while the run learns
+            if self._over.wait(min(left, LISTEN_S)):
                 return
-        status = 1
-        left = self._budget.over - self._budget.clock() - LEAVING_SECONDS
-        last_resort = threading.Timer(max(LEAVING_SECONDS, left), leave, [1])
-        last_resort.daemon = True
-        last_resort.start()  # the disk may hang, or who reads what is printed
-        try:
-            trouble = self.save()
-            status = self.status or int(bool(trouble))
-            if trouble:
-                os.write(sys.stderr.fileno(), f"error: {trouble}\n".encode())
-        finally:
-            leave(128 + self._interrupt.signal if self._interrupt.signal else status)
-
-
-def leave(status: int) -> NoReturn:
-    """End the process at once, and its children, one that was stopped (SIGSTOP) among them."""
-    discard_parts()
-    for child in multiprocessing.active_children():
-        child.kill()
-    os._exit(status)
-
-
-def digest_of(pairs: Sequence[Pair]) -> str:
-    """Tells one test set from another: the keys of its pairs with the ids of their images, in order."""
-    ids = ((pair.key, pair.group, *(name.rpartition(".")[0] for name in pair.names)) for pair in pairs)
-    rows = map("\t".join, ids)
-    return hashlib.sha256("\n".join(rows).encode()).hexdigest()
+        trouble = ["the time was up before the last version of the submission was written"]
+        writer = threading.Thread(target=lambda: trouble.append(self.save()), name="final write", daemon=True)
+        writer.start()  # the disk may hang
+        writer.join(max(EXIT_S, self._budget.limit - self._budget.clock() - EXIT_S))
+        if trouble[-1]:
+            threading.Thread(target=console.complain, args=(trouble[-1],), daemon=True).start()
+            time.sleep(EXIT_S / 4)  # who reads it may hang
+        status = self.status or int(bool(trouble[-1]))
+        console.leave(128 + self._interrupt.signal if self._interrupt.signal else status)
 
 
 @contextmanager

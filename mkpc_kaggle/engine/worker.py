@@ -1,80 +1,117 @@
-"""The two halves of a job: matching, where the device is, and the estimation of F, where the engine is."""
+"""What a worker does with its jobs, in whatever process it is: matching and F of pairs, the cameras of a batch."""
 
-import threading
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
-from pathlib import Path
+from typing import Protocol
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.data.images import Image, ImageStore
-from mkpc_kaggle.engine.jobs import Cause, Job, JobFailure, JobResult, Outcome
+from mkpc_kaggle.engine.jobs import (
+    Answer,
+    Cause,
+    Failure,
+    Job,
+    Loaded,
+    MatchJob,
+    MatchResult,
+    Outcome,
+    SceneJob,
+    SceneResult,
+)
 from mkpc_kaggle.engine.records import NOT_REACHED, PairRecord
-from mkpc_kaggle.pipeline.failures import Failure, failure_of, reason_of
+from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.pipeline import failures
 from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult, with_estimate
 from mkpc_kaggle.pipeline.stages import Pipeline
-from mkpc_kaggle.recipe import Recipe, Unit
+from mkpc_kaggle.recipe import Unit
 
-Answer = tuple[PairMatch, ...] | JobFailure
-"""What a worker makes of a job: for each pair what this job found on it, or why there is nothing."""
+ESTIMATE_THREADS = 2  # OpenCV releases the interpreter's lock: F of pairs is estimated while the next are matched
 
-CAUSES = {Failure.OUT_OF_MEMORY: Cause.OUT_OF_MEMORY, Failure.DEVICE: Cause.DEVICE, Failure.ORDINARY: Cause.RAISED}
+CAUSES = {
+    failures.Failure.OUT_OF_MEMORY: Cause.OUT_OF_MEMORY,
+    failures.Failure.DEVICE: Cause.DEVICE,
+    failures.Failure.ORDINARY: Cause.RAISED,
+}
 
 
-class Worker:
-    """Matches the pairs of jobs: a pipeline, loaded when it is first needed, and the images at hand."""
+class Runner(Protocol):
+    """Does jobs of one kind. Both calls may raise anything, never return, or end the process."""
 
-    def __init__(self, make_pipeline: Callable[[], Pipeline], images: ImageStore | None = None) -> None:
-        self._make_pipeline = make_pipeline
-        self._pipeline: Pipeline | None = None
-        self._images = images or ImageStore()
-        self._stopped = threading.Event()
+    def load(self) -> None: ...
 
-    def load(self) -> Pipeline:
+    def run(self, job: Job, seconds: float) -> Answer: ...
+
+
+def load(make: Callable[[], Runner]) -> tuple[Runner | None, Answer]:
+    """The runner that ``make`` makes, ready for jobs, or why there is none. Never raises."""
+    try:
+        runner = make()
+        runner.load()
+    except failures.DeviceError as error:
+        return None, Failure(Cause.DEVICE, str(error))
+    except UserError as error:
+        return None, Failure(Cause.REFUSED, str(error))
+    except Exception as error:
+        return None, failure_of(error)
+    return runner, Loaded()
+
+
+def run(runner: Runner, job: Job, seconds: float) -> Answer:
+    """What the runner makes of a job. Never raises."""
+    try:
+        return runner.run(job, seconds)
+    except Exception as error:
+        return failure_of(error)
+
+
+def failure_of(error: Exception) -> Failure:
+    """What an error makes of a job."""
+    return Failure(CAUSES[failures.failure_of(error)], failures.reason_of(error))
+
+
+class MatchRunner:
+    """Matches the pairs of jobs and estimates their F, in threads, while the next minibatch is matched."""
+
+    def __init__(self, make_pipeline: Callable[[], Pipeline]) -> None:
+        self._pipeline = make_pipeline()
+        self._images = ImageStore()
+        self._estimators = ThreadPoolExecutor(ESTIMATE_THREADS, thread_name_prefix="estimate")
+
+    def load(self) -> None:
         """Load all matchers; raises :class:`mkpc_kaggle.errors.UserError` where one cannot be."""
-        if self._pipeline is None:
-            self._pipeline = self._make_pipeline()
-            self._pipeline.load()
-        return self._pipeline
+        self._pipeline.load()
 
-    def prefetch(self, paths: Iterable[Path]) -> None:
-        """Decode these ahead, in the background."""
-        self._images.prefetch(paths)
-
-    def run(self, job: Job, seconds: float, heartbeat: Callable[[], None] = lambda: None) -> Answer:
-        """Match the pairs of a job; no unit is begun that is expected to end later than ``seconds`` from now.
-
-        ``heartbeat`` is called before each unit on each batch of pairs. Never raises.
-        """
-        try:
-            return self._match(job, seconds, heartbeat)
-        except Exception as error:
-            return failed(job, error)
-
-    def stop(self) -> None:
-        """Begin no further unit."""
-        self._stopped.set()
-
-    def close(self) -> None:
-        self.stop()
-        self._images.close()
-
-    def _match(self, job: Job, seconds: float, heartbeat: Callable[[], None]) -> tuple[PairMatch, ...]:
-        pipeline = self.load()
+    def run(self, job: Job, seconds: float) -> MatchResult:
+        """Match the pairs of a job; no unit begins that is expected to end later than ``seconds`` from now."""
+        assert isinstance(job, MatchJob)
         deadline = time.monotonic() + seconds
-        units = {unit.shrunk(job.shrink) if job.shrink < 1 else unit: unit for unit in job.units}
-        expected = dict(zip(units, job.expected, strict=True))
+        expected = dict(zip(job.units, job.expected, strict=True))
 
         def may_start(unit: Unit) -> bool:
-            heartbeat()
-            return not self._stopped.is_set() and time.monotonic() + expected[unit] < deadline
+            return time.monotonic() + expected[unit] < deadline
 
-        opened = [self._open(pair, known) for pair, known in zip(job.pairs, job.known, strict=True)]
-        # A shrunk unit is another one to the pipeline: what a pair has had is left out here.
-        wanted = [unit for unit in units if not all(pair.has(units[unit]) for pair in opened)]
-        matched = iter(pipeline.match([pair for pair in opened if not pair.failure], wanted, may_start))
-        done = [pair if pair.failure else next(matched) for pair in opened]
-        return tuple(_found(pair, known, units, job) for pair, known in zip(done, job.known, strict=True))
+        self._images.prefetch(job.images)
+        pairs = [self._open(pair, known) for pair, known in zip(job.pairs, job.known, strict=True)]
+        readable = [number for number, pair in enumerate(pairs) if not pair.failure]
+        units = sorted(job.units, key=lambda unit: unit.stage)
+        matched = self._pipeline.match([pairs[number] for number in readable], units[:-1], may_start)
+        estimates: dict[int, Future[Outcome]] = {}
+        for start in range(0, len(matched), self._pipeline.minibatch):
+            part = slice(start, start + self._pipeline.minibatch)
+            for number, pair in zip(
+                readable[part], self._pipeline.match(matched[part], units[-1:], may_start), strict=True
+            ):
+                estimates[number] = self._estimators.submit(self._estimate, job, number, pair)
+        return MatchResult(
+            tuple(
+                estimates[number].result()
+                if number in estimates
+                else Outcome(PairRecord.untouched(job.indices[number], pair.failure))
+                for number, pair in enumerate(pairs)
+            )
+        )
 
     def _open(self, pair: Pair, known: tuple[UnitResult, ...]) -> PairMatch:
         """The pair with its images; ``failure`` says which of them cannot be read."""
@@ -85,37 +122,31 @@ class Worker:
         failure = next((str(image) for image in images if not isinstance(image, Image)), "")
         return PairMatch(known, images=readable, failure=failure, decode_seconds=seconds)
 
-
-def _found(pair: PairMatch, known: tuple[UnitResult, ...], units: dict[Unit, Unit], job: Job) -> PairMatch:
-    """What a job found on a pair, without what was known before: that is all that has to travel."""
-    results = tuple(
-        replace(result, unit=units[result.unit], failure=result.failure or job.note)
-        for result in pair.results[len(known) :]
-    )
-    sizes = tuple(image.size for image in pair.images)
-    versions = tuple(image.version for image in pair.images)
-    return replace(pair, results=results, images=(), sizes=sizes, versions=versions)
-
-
-def failed(job: Job, error: Exception) -> JobFailure:
-    """What an error makes of a job."""
-    return JobFailure(job, CAUSES[failure_of(error)], reason_of(error))
+    def _estimate(self, job: MatchJob, number: int, pair: PairMatch) -> Outcome:
+        """F from all matches of a pair; the outcome has the new results alone, since only these have to travel."""
+        index, known = job.indices[number], job.known[number]
+        found = pair.results[len(known) :]
+        if not found:
+            return Outcome(PairRecord.untouched(index, NOT_REACHED))
+        start = time.perf_counter()
+        sizes = tuple(image.size for image in pair.images)
+        versions = tuple(image.version for image in pair.images)
+        pair = replace(pair, images=(), sizes=sizes, versions=versions)
+        pair = with_estimate(pair, self._pipeline.recipe, job.pairs[number].model, job.pairs[number].intrinsics)
+        record = PairRecord.of(index, replace(pair, estimate_seconds=time.perf_counter() - start))
+        return Outcome(record, found)
 
 
-def estimate(job: Job, found: Iterable[PairMatch], recipe: Recipe) -> JobResult | JobFailure:
-    """Second half of a job: F from all matches of each pair. Never raises."""
-    try:
-        pairs = zip(job.indices, job.pairs, job.known, found, strict=True)
-        return JobResult(job, tuple(_outcome(*one, recipe) for one in pairs))
-    except Exception as error:
-        return failed(job, error)
+class SceneRunner:
+    """Reconstructs batches. pycolmap may end the process: see :mod:`mkpc_kaggle.scene.colmap`."""
 
+    def load(self) -> None:
+        """Nothing is needed before the job."""
 
-def _outcome(index: int, pair: Pair, known: tuple[UnitResult, ...], found: PairMatch, recipe: Recipe) -> Outcome:
-    if not found.results:
-        return Outcome(PairRecord.untouched(index, found.failure or NOT_REACHED))
-    start = time.perf_counter()
-    whole = replace(found, results=known + found.results)
-    match = with_estimate(whole, recipe, pair.model, pair.intrinsics)
-    match = replace(match, estimate_seconds=time.perf_counter() - start)
-    return Outcome(PairRecord.of(index, match), found.results)
+    def run(self, job: Job, seconds: float) -> SceneResult:
+        """The cameras of a batch, and which F each of its pairs gets; ``seconds`` are not looked at."""
+        from mkpc_kaggle.scene.reconstruct import reconstruct_batch
+
+        assert isinstance(job, SceneJob)
+        solution = reconstruct_batch(job.pairs, job.config, job.focal, job.magsac)
+        return SceneResult(solution.reconstructions, dict(zip(job.indices, solution.choices, strict=True)))

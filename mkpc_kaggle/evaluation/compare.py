@@ -1,6 +1,6 @@
 """Recipes compared on the same pairs: differences of mAA with bootstrap intervals."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from math import nan
@@ -10,14 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mkpc_kaggle.engine.records import PairRecord
-from mkpc_kaggle.evaluation.validate import SceneScore, Step, Validation, to_json
-from mkpc_kaggle.geometry.metrics import pair_accuracy
+from mkpc_kaggle.evaluation.validate import Validation, to_json
+from mkpc_kaggle.geometry.metrics import PoseError, pair_accuracy
 
 LEVEL = 0.95
 RESAMPLES = 10_000
-
-Values = Sequence[float] | NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -28,39 +25,26 @@ class Difference:
     low: float
     high: float
 
-    @property
-    def significant(self) -> bool:
-        """Whether the interval excludes 0."""
-        return self.low > 0 or self.high < 0
-
     def __str__(self) -> str:
         return f"{self.gain:+z.4f} [{self.low:+z.4f}, {self.high:+z.4f}]"
 
 
-def paired_difference(scenes: Sequence[tuple[Values, Values]], *, seed: int = 0) -> Difference:
+def paired_difference(scenes: Sequence[tuple[Sequence[float], Sequence[float]]], *, seed: int = 0) -> Difference:
     """The mean over scenes of the mean gain on a pair, from the pairs' values under the first and second recipe.
 
     Both values of a pair have the same index. The interval is the percentile bootstrap's: the pairs of each
     scene are resampled with replacement, :data:`RESAMPLES` times; the scenes stay. It assumes independent pairs,
-    which those that share an image are not quite. The same input gives the same interval.
-    ``ValueError`` without scenes, for a scene without pairs, and where the two have different pairs.
+    which pairs that share an image are not quite. The same input gives the same interval. ``ValueError`` without
+    scenes, for a scene without pairs, and if the two have different numbers of pairs.
     Source: Efron and Tibshirani, An Introduction to the Bootstrap, 13.3.
     """
-    if not scenes:
-        raise ValueError("no scenes to compare on")
+    if not scenes or any(len(first) != len(second) or not len(first) for first, second in scenes):
+        raise ValueError("a comparison needs scenes, and each with the same pairs under both recipes")
     generator = np.random.default_rng(seed)
-    gains = [_gains(first, second) for first, second in scenes]
+    gains = [np.asarray(second, np.float64) - np.asarray(first, np.float64) for first, second in scenes]
     means = np.mean([_means_of_resamples(gain, generator) for gain in gains], axis=0)
     low, high = np.quantile(means, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
     return Difference(mean(float(gain.mean()) for gain in gains), float(low), float(high))
-
-
-def _gains(first: Values, second: Values) -> NDArray[np.float64]:
-    if len(first) != len(second):
-        raise ValueError(f"{len(first)} and {len(second)} values for the pairs of a scene")
-    if len(first) == 0:
-        raise ValueError("a scene has no pairs")
-    return np.asarray(second, np.float64) - np.asarray(first, np.float64)
 
 
 def _means_of_resamples(gains: NDArray[np.float64], generator: np.random.Generator) -> NDArray[np.float64]:
@@ -78,95 +62,77 @@ class Comparison:
     validations: tuple[Validation, ...]
 
     def __post_init__(self) -> None:
-        known = [[[pair.id for pair in scene.pairs] for scene in one.scenes] for one in self.validations]
+        known = [[[pair.id for pair in scene.pairs] for scene in run.scenes] for run in self.validations]
         if any(ids != known[0] for ids in known):
             raise ValueError("the recipes ran on different pairs")
 
     @property
     def scenes(self) -> tuple[str, ...]:
-        """Those that have pairs."""
+        """The scenes that have pairs."""
         return tuple(scene.scene for scene in self.validations[0].scenes if scene.pairs)
 
     def difference(self, number: int, scene: str | None = None) -> Difference:
         """MAA of the validation of that number less the first's, in a scene or as the mean over scenes."""
-        names = self.scenes if scene is None else (scene,)
-        first, second = self.validations[0], self.validations[number]
-        return paired_difference([(accuracies(first, name), accuracies(second, name)) for name in names])
+        wanted = self.scenes if scene is None else (scene,)
+        runs = self.validations[0], self.validations[number]
+        values = [[_accuracies(part.errors) for part in run.scenes if part.scene in wanted] for run in runs]
+        return paired_difference([*zip(*values, strict=True)])
 
 
-def accuracies(validation: Validation, scene: str) -> list[float]:
-    """The accuracy of each pair of a scene, whose mean is the mAA."""
-    return [pair_accuracy(error) for error in _scene(validation, scene).errors]
-
-
-def _scene(validation: Validation, name: str) -> SceneScore:
-    return next(scene for scene in validation.scenes if scene.scene == name)
-
-
-def seconds_of_work(record: PairRecord) -> float:
-    """Seconds of a pair's units, clustering and last estimate, over all runs of its journal."""
-    units = record.encode_seconds + record.match_seconds
-    return units + record.cluster_seconds + record.estimate_seconds
+def _accuracies(errors: Iterable[PoseError]) -> list[float]:
+    return [pair_accuracy(error) for error in errors]
 
 
 def seconds_per_pair(validation: Validation) -> float:
-    """Mean seconds of work; NaN without records."""
-    return mean(map(seconds_of_work, validation.records)) if validation.records else nan
+    """Mean seconds of units, clustering and last estimate, over all runs of the journal; NaN if unknown."""
+    records = validation.report.records if validation.report else ()
+    seconds = (r.encode_seconds + r.match_seconds + r.cluster_seconds + r.estimate_seconds for r in records)
+    return mean(seconds) if records else nan
 
 
 def comparison_table(comparison: Comparison) -> list[str]:
     """Lines: mAA and seconds a pair of each recipe, then its gain over the first, in each scene and overall."""
     first, *others = comparison.validations
     lines = [f"{'recipe':<40}{'mAA':>9}{'seconds a pair':>16}"]
-    lines += [f"{one.recipe:<40}{one.maa:>9.4f}{seconds_per_pair(one):>16.3f}" for one in comparison.validations]
+    lines += [f"{run.recipe:<40}{run.maa:>9.4f}{seconds_per_pair(run):>16.3f}" for run in comparison.validations]
+    counts = {scene.scene: len(scene.pairs) for scene in first.scenes}
     for number, other in enumerate(others, start=1):
         lines += ["", f"{other.recipe} against {first.recipe}: gain of mAA, {LEVEL:.0%} interval"]
-        for name in comparison.scenes:
-            pairs = len(_scene(first, name).pairs)
-            lines.append(f"{name:<20}{pairs:>6}  {comparison.difference(number, name)}")
-        total = sum(len(scene.pairs) for scene in first.scenes)
-        lines.append(f"{'mean over scenes':<20}{total:>6}  {comparison.difference(number)}")
+        for name in (*comparison.scenes, None):
+            count = sum(counts.values()) if name is None else counts[name]
+            lines.append(f"{name or 'mean over scenes':<20}{count:>6}  {comparison.difference(number, name)}")
     return lines
 
 
 def step_gains(validation: Validation) -> list[str]:
     """Lines: the gain of mAA, as the mean over scenes, of each step over the one before; none without metres."""
-    scenes = [scene for scene in validation.scenes if scene.pairs]
-    if not scenes or not all(scene.in_metres for scene in scenes):
-        return []
-    lines = []
-    for former, step in pairwise(validation.steps):
-        gains = paired_difference([(_after(scene, former), _after(scene, step)) for scene in scenes])
-        lines.append(f"gain of {step} over the step before, {LEVEL:.0%} interval: {gains}")
-    return lines
-
-
-def _after(scene: SceneScore, step: Step) -> list[float]:
-    return [pair_accuracy(pair.steps[step]) for pair in scene.pairs]
+    scenes = [scene for scene in validation.scenes if scene.pairs and scene.in_metres]
+    after = {
+        step: [_accuracies(pair.steps[step] for pair in scene.pairs) for scene in scenes]
+        for step in validation.steps
+    }
+    return [
+        f"gain of {step} over the step before, {LEVEL:.0%} interval: "
+        f"{paired_difference([*zip(after[former], after[step], strict=True)])}"
+        for former, step in pairwise(validation.steps)
+        if scenes
+    ]
 
 
 def comparison_json(comparison: Comparison) -> dict[str, Any]:
-    """All figures as JSON values: each validation, and each one's gain over the first."""
+    """All figures as JSON values: each validation, and each later one's gain over the first."""
+
+    def gain(number: int, name: str | None = None) -> dict[str, float]:
+        difference = comparison.difference(number, name)
+        return {"mAA": difference.gain, "low": difference.low, "high": difference.high}
+
     first, *others = comparison.validations
-    return {
-        "recipes": [
-            {**to_json(one), "work_seconds_per_pair": seconds_per_pair(one)} for one in comparison.validations
-        ],
-        "level": LEVEL,
-        "gains": [
-            {
-                "recipe": other.recipe,
-                "against": first.recipe,
-                **_difference_json(comparison.difference(number)),
-                "scenes": [
-                    {"scene": name, **_difference_json(comparison.difference(number, name))}
-                    for name in comparison.scenes
-                ],
-            }
-            for number, other in enumerate(others, start=1)
-        ],
-    }
-
-
-def _difference_json(difference: Difference) -> dict[str, float]:
-    return {"mAA": difference.gain, "low": difference.low, "high": difference.high}
+    runs = [{**to_json(run), "work_seconds_per_pair": seconds_per_pair(run)} for run in comparison.validations]
+    gains = [
+        {
+            **{"recipe": other.recipe, "against": first.recipe, **gain(number)},
+            "scenes": [{"scene": name, **gain(number, name)} for name in comparison.scenes],
+        }
+        for number, other in enumerate(others, start=1)
+    ]
+    return {"recipes": runs, "level": LEVEL, "gains": gains}

@@ -9,8 +9,6 @@ from pathlib import Path
 from statistics import mean
 from typing import Any
 
-import numpy as np
-
 from mkpc_kaggle.data.competition import TrainScene, TruePair, pair_id, read_rows, read_submission
 from mkpc_kaggle.engine.engine import RunReport
 from mkpc_kaggle.engine.records import PairRecord
@@ -32,15 +30,13 @@ class Step(StrEnum):
     """The estimates of a pair's F, in the order in which they are made."""
 
     MAGSAC = "MAGSAC"
-    PRIOR = "+ prior"
-    """with the prior on the focal lengths"""
-    SCENE = "+ scene"
-    """with the cameras of its batch, where these give an F"""
+    PRIOR = "+ prior"  # on the focal lengths
+    SCENE = "+ scene"  # with the cameras of the pair's batch, if these give an F
 
 
 @dataclass(frozen=True)
 class PairScore:
-    """One pair's error, infinite for a failed pair, and its record where the engine made one.
+    """One pair's error, infinite for a failed pair, and its record if the engine made one.
 
     ``steps`` are the errors after each :class:`Step` that was made; the last is ``error``.
     """
@@ -100,67 +96,60 @@ class Validation:
 
     @property
     def errors(self) -> list[PoseError]:
-        """Those of all pairs."""
+        """The errors of all pairs."""
         return [error for scene in self.scenes for error in scene.errors]
 
-    @property
-    def records(self) -> list[PairRecord]:
-        return [pair.record for scene in self.scenes for pair in scene.pairs if pair.record is not None]
+
+def validate(scenes: Sequence[TrainScene], assembly: Assembly, session: Session) -> Validation:
+    """Match all pairs of the scenes and score them."""
+    report = run_pairs([true.pair for scene in scenes for true in scene.pairs], assembly, session)
+    steps = _steps_of(report.records, prior=assembly.recipe.focal is not None)
+    records, scored = iter(report.records), []
+    for scene in scenes:
+        pairs = tuple(score_record(true, next(records), scene, steps) for true in scene.pairs)
+        scored.append(SceneScore(scene.name, pairs, isfinite(scene.metres_per_unit)))
+    return Validation(assembly.recipe.name, tuple(scored), report, steps)
 
 
-def validate(scenes: Sequence[TrainScene], assembly: Assembly, session: Session) -> tuple[Validation, bool]:
-    """Match all pairs of the scenes and score them; also whether every thread has stopped."""
-    pairs = [true.pair for scene in scenes for true in scene.pairs]
-    report, at_rest = run_pairs(pairs, assembly, session)
-    steps = steps_of(report.records, prior=assembly.recipe.focal is not None)
-    records = iter(report.records)
-    scored = tuple(
-        SceneScore(
-            scene.name,
-            tuple(score_record(true, next(records), scene, steps) for true in scene.pairs),
-            isfinite(scene.metres_per_unit),
-        )
-        for scene in scenes
-    )
-    return Validation(assembly.recipe.name, scored, report, steps), at_rest
-
-
-def steps_of(records: Sequence[PairRecord], *, prior: bool) -> tuple[Step, ...]:
-    """The steps that a run made; where E is sought at known focal lengths, there is no MAGSAC alone."""
-    steps = [Step.MAGSAC] if not prior or any(one.magsac is not None for one in records) else []
-    steps += [Step.PRIOR] if prior else []
-    return (*steps, Step.SCENE) if any(one.scene is not None for one in records) else tuple(steps)
+def _steps_of(records: Sequence[PairRecord], *, prior: bool) -> tuple[Step, ...]:
+    """The steps that a run made; if E is sought at known focal lengths, there is no MAGSAC alone."""
+    made = {
+        Step.MAGSAC: not prior or any(record.magsac_fundamental is not None for record in records),
+        Step.PRIOR: prior,
+        Step.SCENE: any(record.scene is not None for record in records),
+    }
+    return tuple(step for step in Step if made[step])
 
 
 def score_record(true: TruePair, record: PairRecord, scene: TrainScene, steps: Sequence[Step] = ()) -> PairScore:
     """The score of a pair's record; the fallback row counts as a failure."""
-    own = None if record.failure else record.F
-    found = {
-        Step.MAGSAC: record.magsac if Step.PRIOR in steps else own,
+    own = None if record.failure else record.pair_fundamental
+    matrices = {
+        Step.MAGSAC: record.magsac_fundamental if Step.PRIOR in steps else own,
         Step.PRIOR: own,
-        Step.SCENE: None if record.source == "fallback" else record.fundamental,
+        Step.SCENE: None if record.source == "fallback" else record.chosen_fundamental,
     }
-    error = error_of(found[Step.SCENE], true, scene)
-    errors = {step: error_of(found[step], true, scene) for step in steps}
-    return PairScore(true.pair.id, true.covisibility, error, record, errors)
+    errors = {step: error_of(matrix, true, scene) for step, matrix in matrices.items()}
+    return PairScore(
+        true.pair.id, true.covisibility, errors[Step.SCENE], record, {step: errors[step] for step in steps}
+    )
 
 
 def error_of(matrix: Matrix3 | None, true: TruePair, scene: TrainScene) -> PoseError:
-    """The error of a pair's F, or of its E if that is what was estimated; infinite where there is none."""
+    """The error of a pair's F, or of its E if that is what was estimated; infinite if there is none."""
     if matrix is None:
         return PoseError.failed()
-    cameras = true.camera0, true.camera1
+    camera0, camera1 = true.camera0, true.camera1
     if true.pair.model is ModelKind.E:
-        cameras = true.camera0.calibrated, true.camera1.calibrated
-    return pose_error(matrix, *cameras, scene.metres_per_unit)
+        camera0, camera1 = camera0.calibrated, camera1.calibrated
+    return pose_error(matrix, camera0, camera1, scene.metres_per_unit)
 
 
 def score_submission(submission: Path, truth: Path, scenes: Sequence[TrainScene]) -> Validation:
     """Score a submission whose samples are known pairs of a train side.
 
     ``truth`` is a table ``sample_id,scene,image_1_id,image_2_id``, the images named as in the train side.
-    Samples that the table or the scenes lack are left out; raises
-    :class:`mkpc_kaggle.errors.UserError` for files that cannot be read.
+    Samples that the table or the scenes lack are left out; :class:`UserError` for files that cannot be read.
     """
     found = read_submission(submission)
     columns = ("sample_id", "scene", "image_1_id", "image_2_id")
@@ -169,103 +158,82 @@ def score_submission(submission: Path, truth: Path, scenes: Sequence[TrainScene]
         if sample in found:
             known[pair_id(scene, first, second)] = found[sample]
             known[pair_id(scene, second, first)] = found[sample].T
-    scores = [
-        SceneScore(
-            scene.name,
-            tuple(
-                PairScore(true.pair.id, true.covisibility, error_of(known[true.pair.id], true, scene))
-                for true in scene.pairs
-                if true.pair.id in known
-            ),
-        )
-        for scene in scenes
-    ]
-    scored = tuple(scene for scene in scores if scene.pairs)
+    scored = []
+    for there in scenes:
+        of_scene = [(true, known[true.pair.id]) for true in there.pairs if true.pair.id in known]
+        pairs = [PairScore(true.pair.id, true.covisibility, error_of(F, true, there)) for true, F in of_scene]
+        scored += [SceneScore(there.name, tuple(pairs))] if pairs else []
     if not scored:
         raise UserError(f"{truth} names no pair of the scenes that {submission} has a row for")
-    return Validation(submission.name, scored)
+    return Validation(submission.name, tuple(scored))
 
 
 def score_table(validation: Validation) -> list[str]:
-    """Lines: a row a scene and their mean; a dash for the mAA of unknown metres.
+    """Lines: a row for each scene and their mean; a dash for the mAA of unknown metres.
 
-    The columns are the mAA, after each step where there are several, and the pose AUC after the last.
+    The columns are the mAA, after each step if there are several, and the pose AUC after the last.
     """
     several = len(validation.steps) > 1
-    heads = [
-        *(validation.steps if several else ["mAA"]),
-        *(f"AUC {threshold:.0f}" for threshold in AUC_THRESHOLDS),
-    ]
+    heads = [*(validation.steps if several else ["mAA"]), *(f"AUC {angle:.0f}" for angle in AUC_THRESHOLDS)]
     lines = [f"{'scene':<20}{'pairs':>6}" + "".join(f"{head:>9}" for head in heads)]
-    rows: list[tuple[str, int, SceneScore | Validation]] = [
-        (one.scene, len(one.pairs), one) for one in validation.scenes
-    ]
-    rows.append(("mean over scenes", sum(count for _, count, _ in rows), validation))
-    for name, count, scores in rows:
+    rows: list[tuple[str, SceneScore | Validation]] = [(scene.scene, scene) for scene in validation.scenes]
+    for name, scores in [*rows, ("mean over scenes", validation)]:
         accuracies = map(scores.maa_after, validation.steps) if several else [scores.maa]
-        values = [*accuracies, *map(scores.auc, AUC_THRESHOLDS)]
-        lines.append(f"{name:<20}{count:>6}" + "".join(map(_cell, values)))
+        values = (*accuracies, *map(scores.auc, AUC_THRESHOLDS))
+        cells = (f"{value:>9.4f}" if isfinite(value) else f"{'-':>9}" for value in values)
+        lines.append(f"{name:<20}{len(scores.errors):>6}" + "".join(cells))
     return ["mAA after each step, AUC after the last:", *lines] if several else lines
-
-
-def _cell(value: float) -> str:
-    return f"{value:>9.4f}" if isfinite(value) else f"{'-':>9}"
 
 
 def to_json(validation: Validation) -> dict[str, Any]:
     """All figures of a validation as JSON values: overall, per scene, per pair; what is not finite is null."""
-    records = validation.records
+    steps, report = validation.steps, validation.report
+    records = report.records if report else ()
     reasons = Counter(str(region.reason) for record in records for region in record.regions or ())
     return {
         "recipe": validation.recipe,
-        "mAA": _finite(validation.maa),
-        "mAA_by_step": {step: _finite(validation.maa_after(step)) for step in validation.steps},
-        "AUC": {f"{threshold:g}": validation.auc(threshold) for threshold in AUC_THRESHOLDS},
-        "seconds": validation.report.seconds if validation.report else None,
-        "seconds_per_pair": validation.report.seconds / len(records) if validation.report else None,
-        "matches_by_stage": stage_means(records, "matches"),
-        "inliers_by_stage": stage_means(records, "inliers"),
+        **_scores_json(validation, steps),
+        "seconds": report and report.seconds,
+        "seconds_per_pair": report and report.seconds / len(records),
+        "matches_by_stage": _stage_means(records, "matches"),
+        "inliers_by_stage": _stage_means(records, "inliers"),
         "region_reasons": dict(reasons),
         "scenes": [
-            {
-                "scene": scene.scene,
-                "mAA": _finite(scene.maa),
-                "mAA_by_step": {step: _finite(scene.maa_after(step)) for step in validation.steps},
-                "AUC": {f"{threshold:g}": scene.auc(threshold) for threshold in AUC_THRESHOLDS},
-                "pairs": [_pair_json(pair) for pair in scene.pairs],
-            }
+            {"scene": scene.scene, **_scores_json(scene, steps), "pairs": [*map(_pair_json, scene.pairs)]}
             for scene in validation.scenes
         ],
     }
 
 
-def stage_means(records: Sequence[PairRecord], what: str) -> Mapping[str, float]:
-    """Mean number of matches or inliers on a pair, by stage."""
+def _scores_json(scores: SceneScore | Validation, steps: Sequence[Step]) -> dict[str, Any]:
     return {
-        str(stage): float(
-            np.mean([sum(getattr(unit, what) for unit in r.units if unit.stage == stage) for r in records])
-        )
-        for stage in sorted({unit.stage for record in records for unit in record.units})
+        "mAA": _finite(scores.maa),
+        "mAA_by_step": {step: _finite(scores.maa_after(step)) for step in steps},
+        "AUC": {f"{threshold:g}": scores.auc(threshold) for threshold in AUC_THRESHOLDS},
     }
+
+
+def _stage_means(records: Sequence[PairRecord], what: str) -> dict[str, float]:
+    """Mean number of matches or inliers on a pair, by stage."""
+    sums = Counter[int]()
+    for unit in (unit for record in records for unit in record.units):
+        sums[unit.stage] += getattr(unit, what)
+    return {str(stage): sums[stage] / len(records) for stage in sorted(sums)}
 
 
 def _pair_json(pair: PairScore) -> dict[str, Any]:
-    error, record = pair.error, pair.record
     values: dict[str, Any] = {
         "pair": pair.id,
         "covisibility": _finite(pair.covisibility),
-        "rotation_error_degrees": _finite(error.rotation),
-        "translation_error_metres": _finite(error.translation),
-        "translation_error_degrees": _finite(error.translation_angle),
+        "rotation_error_degrees": _finite(pair.error.rotation),
+        "translation_error_metres": _finite(pair.error.translation),
+        "translation_error_degrees": _finite(pair.error.translation_angle),
         "accuracy_by_step": {step: pair_accuracy(error) for step, error in pair.steps.items()},
     }
-    if record is not None:
-        values |= {
-            "failure": record.failure,
-            "inliers": record.inliers,
-            "matches": {unit.unit: unit.matches for unit in record.units},
-            "regions": [str(region.reason) for region in record.regions or ()],
-        }
+    if (record := pair.record) is not None:
+        values |= {"failure": record.failure, "inliers": record.inliers}
+        values["matches"] = {unit.unit: unit.matches for unit in record.units}
+        values["regions"] = [str(region.reason) for region in record.regions or ()]
     return values
 
 

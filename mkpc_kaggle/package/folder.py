@@ -46,10 +46,10 @@ def write_files(directory: Path, items: Sequence[Item]) -> None:
         directory.mkdir(parents=True, exist_ok=True)
         for item in items:
             target, part = directory / item.name, directory / _part(item.name)
+            part.unlink(missing_ok=True)  # it may be a link
             if not (target.is_file() and filecmp.cmp(item.source, target, shallow=False)):
                 shutil.copyfile(item.source, part)
                 part.replace(target)
-            part.unlink(missing_ok=True)
     except OSError as error:
         raise UserError(f"{directory} cannot be written: {error}") from error
 

@@ -73,4 +73,4 @@ def _as_safetensors(found: FoundFile, staging: Path) -> tuple[WeightFile, Path]:
 
 
 def _note(found: FoundFile) -> str:
-    return "" if found.state in (State.GOOD, State.RENAMED) else "its original is not verified"
+    return "" if found.state is State.GOOD else "its original is not verified"

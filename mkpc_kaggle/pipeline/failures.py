@@ -1,7 +1,7 @@
-"""What an error says of the process that it was raised in: memory was short, the device failed, or neither.
+"""The kinds of errors of a matcher: memory was short, the device failed, or the matcher cannot do the pair.
 
-Errors are told apart by their text, since their types differ between versions: until PyTorch 2.7 a failed kernel
-was a plain ``RuntimeError``, since 2.8 it is a ``torch.AcceleratorError``. The texts come from
+They are told apart by their text, since their types differ between versions: until PyTorch 2.7 a failed kernel was
+a plain ``RuntimeError``, since 2.8 it is a ``torch.AcceleratorError``. The texts come from
 
 - Python (``MemoryError``), OpenCV ("Insufficient memory", "Failed to allocate") and PyTorch's CPU allocator
   ("DefaultCPUAllocator: can't allocate memory");
@@ -46,16 +46,13 @@ _DEVICE = (
 class Failure(Enum):
     """What an error means for what comes after it."""
 
-    OUT_OF_MEMORY = auto()
-    """fewer pairs at a time, or smaller views, may do well"""
-    DEVICE = auto()
-    """nothing more can be computed in this process; it says nothing against the pair"""
-    ORDINARY = auto()
-    """the matcher cannot do this pair"""
+    OUT_OF_MEMORY = auto()  # fewer pairs at a time may do
+    DEVICE = auto()  # this process can compute nothing more; the pair is not to blame
+    ORDINARY = auto()  # the matcher cannot do this pair
 
 
 class DeviceError(UserError):
-    """A device on which nothing can be computed."""
+    """A device that cannot compute."""
 
 
 def failure_of(error: BaseException) -> Failure:
@@ -69,30 +66,7 @@ def failure_of(error: BaseException) -> Failure:
 
 
 def reason_of(error: BaseException) -> str:
-    """Its type and text, and the notes that it was given on its way.
-
-    PyTorch's advice for debugging, on further lines of the errors of a device, is left out.
-    """
+    """The error's type, text and notes, without PyTorch's advice for debugging on further lines."""
     text = str(error)
     short = text.partition("\n")[0] if any(sign in text for sign in _DEVICE) else text
     return ", ".join([f"{type(error).__name__}: {short}", *getattr(error, "__notes__", ())])
-
-
-def require_device(device: str) -> None:
-    """Compute something on a device; raises :class:`DeviceError` where that fails.
-
-    PyTorch counts GPUs for which its build has no kernels (a P100, since builds begin at compute capability 7.0)
-    among the available ones: only a kernel that runs is proof.
-    """
-    if device == "cpu":
-        return
-    import torch
-
-    try:
-        square = torch.ones(8, 8, device=device)
-        (square @ square).sum().item()
-    except Exception as error:
-        if failure_of(error) is Failure.OUT_OF_MEMORY:
-            raise
-        reason = reason_of(error).partition("\n")[0]
-        raise DeviceError(f"{device} cannot be used ({reason}); try --device cpu") from error

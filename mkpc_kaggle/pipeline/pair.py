@@ -1,4 +1,4 @@
-"""What is known of one pair on its way through the stages."""
+"""A pair on its way through the stages: results of units, critical regions, the two-view model."""
 
 from dataclasses import dataclass, replace
 
@@ -20,18 +20,14 @@ NOT_ESTIMATED = Estimate.failed(ModelKind.F, 0, "not estimated yet")
 
 @dataclass(frozen=True, eq=False)
 class UnitResult:
-    """What one unit found on one pair, in image pixels, and what it cost in seconds.
-
-    ``failure`` is empty, or says why there are no matches, or why the unit ran smaller than it is written.
-    ``warm_up`` says that this process ran the unit for the first time, which may take much longer than later runs.
-    """
+    """What a unit found on a pair, in image pixels, and what it cost."""
 
     unit: Unit
     matches: Matches
     encode_seconds: float = 0.0
     match_seconds: float = 0.0
-    failure: str = ""
-    warm_up: bool = False
+    failure: str = ""  # why there are no matches, or why the unit ran otherwise than it is written
+    warm_up: bool = False  # this process ran the unit for the first time, which may take much longer
 
     @property
     def seconds(self) -> float:
@@ -40,21 +36,19 @@ class UnitResult:
 
 @dataclass(frozen=True, eq=False)
 class PairMatch:
-    """All that is known of one pair: each unit's matches, the critical regions, the two-view model.
+    """All that is known of a pair: each unit's matches, the critical regions, the two-view model.
 
-    ``regions`` is ``None`` until a unit of stage 2 wanted them. ``matches`` are those of all units, and
-    ``estimate.inliers`` is a mask over them; with the estimate they come into the recipe's order. ``images`` are
-    the two images, there while units run; their ``sizes`` and ``versions`` stay. ``failure`` is empty, or says
-    which image cannot be read.
+    ``matches`` are those of all units, and ``estimate.inliers`` is a mask over them. They are in the order in
+    which units ran, and with the estimate in the recipe's order.
     """
 
     results: tuple[UnitResult, ...] = ()
-    regions: Regions | None = None
+    regions: Regions | None = None  # None until a unit of stage 2 needs them
     estimate: Estimate = NOT_ESTIMATED
-    images: tuple[Image, ...] = ()
-    sizes: tuple[Size, ...] = ()
+    images: tuple[Image, ...] = ()  # both, while units run
+    sizes: tuple[Size, ...] = ()  # of the images, and their versions, when they are no longer at hand
     versions: tuple[str, ...] = ()
-    failure: str = ""
+    failure: str = ""  # which image cannot be read
     decode_seconds: float = 0.0
     cluster_seconds: float = 0.0
     estimate_seconds: float = 0.0
@@ -66,10 +60,6 @@ class PairMatch:
     @property
     def inliers(self) -> Matches:
         return self.matches[self.estimate.inliers]
-
-    @property
-    def stage1_matches(self) -> Matches:
-        return Matches.concatenate(result.matches for result in self.results if result.unit.stage == 1)
 
     def has(self, unit: Unit) -> bool:
         return any(result.unit == unit for result in self.results)
@@ -88,7 +78,7 @@ def with_estimate(
 ) -> PairMatch:
     """The pair with its two-view model from all matches, in the recipe's order: MAGSAC's result depends on it.
 
-    Where the recipe has a prior on focal lengths, it goes by the images' sizes, unless ``intrinsics`` are given.
+    The recipe's prior on focal lengths, if it has one, goes by the images' sizes unless ``intrinsics`` are given.
     """
     order = {unit: number for number, unit in enumerate(recipe.units)}
     results = tuple(sorted(pair.results, key=lambda result: order[result.unit]))

@@ -1,78 +1,201 @@
 """The two-stage pipeline on a chunk of pairs.
 
-Stage 1 matches whole images, MKPC finds the critical region of each, stage 2 matches the crops; the points of
-both stages, in image pixels, are concatenated in the recipe's order, and MAGSAC does the rest, alone or under the
+Stage 1 matches whole images, MKPC finds the critical region of each, stage 2 matches the crops. The points of both
+stages, in image pixels, are concatenated in the recipe's order, and MAGSAC does the rest, alone or under the
 recipe's prior on focal lengths.
 """
 
+import sys
 import time
+import warnings
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
+from itertools import chain
 from typing import Any
 
+from mkpc_kaggle.data.cache import ByteCache
+from mkpc_kaggle.data.images import Image
+from mkpc_kaggle.geometry.coordinates import Box, Size, View
 from mkpc_kaggle.geometry.critical_region import critical_region
-from mkpc_kaggle.matchers.contract import Matcher
-from mkpc_kaggle.pipeline.pair import PairMatch
-from mkpc_kaggle.pipeline.units import ENCODING_CACHE_BYTES, UnitRunner
+from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.matchers.contract import Colour, Matcher, NonFiniteError, Picture, detached, encoding_bytes
+from mkpc_kaggle.matchers.numbers import check_finite, exact_float32
+from mkpc_kaggle.pipeline.failures import Failure, failure_of, reason_of
+from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult
 from mkpc_kaggle.recipe import Recipe, Unit
+
+ENCODING_CACHE_BYTES = 2 << 30
+
+ViewKey = tuple[str, str, View]  # matcher, image and view: what an encoding is of
 
 
 class Pipeline:
-    """A recipe's units, run on chunks of pairs; see :class:`UnitRunner` for the arguments."""
+    """A recipe's units, run on chunks of pairs with matchers that are loaded when first needed.
+
+    ``load(name)`` gives the matcher of that name, ``load_float32(name)`` the same in float32, if that is another:
+    it takes over for good if half precision does not hold a matcher's numbers. Pairs are matched, and views of one
+    shape encoded, ``minibatch`` at a time; fewer by a unit for which memory was short, from then on. Encodings of
+    whole images, which come back in many pairs, are kept in ``cache_bytes``.
+    """
 
     def __init__(
         self,
         recipe: Recipe,
         load: Callable[[str], Matcher[Any]],
         *,
-        batch: int = 1,
+        minibatch: int = 1,
         cache_bytes: int = ENCODING_CACHE_BYTES,
         load_float32: Callable[[str], Matcher[Any]] | None = None,
     ) -> None:
         self.recipe = recipe
-        self.batch = batch
-        self._runner = UnitRunner(load, batch, cache_bytes, load_float32)
+        self.minibatch = minibatch
+        self._load = load
+        self._load_float32 = load_float32
+        self._minibatches: dict[Unit, int] = {}
+        self._ran: set[Unit] = set()
+        self._matchers: dict[str, Matcher[Any]] = {}
+        self._notes: dict[str, str] = {}  # on matchers that run in float32 though they should not
+        self._encodings: ByteCache[ViewKey, Any] = ByteCache(cache_bytes)
 
     def load(self) -> None:
-        """Load all matchers of the recipe now; raises :class:`UserError` where one cannot be."""
+        """Load all matchers of the recipe now; raises :class:`UserError` if one cannot be loaded."""
         for name in self.recipe.matcher_names:
-            self._runner.matcher(name)
+            self._matcher(name)
 
     def match(
         self, pairs: Sequence[PairMatch], units: Iterable[Unit], may_start: Callable[[Unit], bool] = lambda _: True
     ) -> list[PairMatch]:
         """Run ``units`` on every pair that has not had them: stage 1, the critical regions, stage 2.
 
-        ``may_start(unit)`` is asked before each unit on each batch of pairs; once it says no, what was found
-        so far is returned. A unit that raises has failed on its batch, with the error as its reason; but errors of
-        the device, and of memory that does not suffice for a single pair, are raised: see
+        ``may_start(unit)`` is asked before each unit on each minibatch of pairs; once it is false, the results so
+        far are returned. If a matcher raises, the error is the failure of this unit's results on the minibatch.
+        Errors of the device, and of memory that does not suffice for a single pair, are raised: see
         :mod:`mkpc_kaggle.pipeline.failures`.
         """
         pairs, units = list(pairs), list(units)
         for unit in (unit for unit in units if unit.stage == 1):
-            pairs = self._run(unit, pairs, may_start)
+            self._run(unit, pairs, may_start)
         if any(unit.stage == 2 for unit in units):
             pairs = [with_regions(pair, self.recipe) for pair in pairs]
         for unit in (unit for unit in units if unit.stage == 2):
-            pairs = self._run(unit, pairs, may_start)
+            self._run(unit, pairs, may_start)
         return pairs
 
-    def _run(self, unit: Unit, pairs: list[PairMatch], may_start: Callable[[Unit], bool]) -> list[PairMatch]:
-        pairs = list(pairs)
+    def _run(self, unit: Unit, pairs: list[PairMatch], may_start: Callable[[Unit], bool]) -> None:
+        """Put the unit's results into the pairs."""
         waiting = [number for number, pair in enumerate(pairs) if not pair.has(unit)]
         while waiting and may_start(unit):
-            batch = waiting[: self._runner.batch_of(unit)]
-            results = self._runner.run(unit, [pairs[number] for number in batch])
-            for number, result in zip(batch[: len(results)], results, strict=True):  # none where memory was short
+            numbers = waiting[: self._minibatches.get(unit, self.minibatch)]
+            results = self._run_minibatch(unit, [pairs[number] for number in numbers])
+            for number, result in zip(numbers[: len(results)], results, strict=True):
                 pairs[number] = replace(pairs[number], results=(*pairs[number].results, result))
             waiting = waiting[len(results) :]
-        return pairs
+
+    def _run_minibatch(self, unit: Unit, pairs: list[PairMatch]) -> list[UnitResult]:
+        """The unit's result on each of the pairs; none if memory was short and fewer pairs may fit."""
+        try:
+            return self._match(unit, pairs)
+        except Exception as error:
+            failure = failure_of(error)
+            if isinstance(error, NonFiniteError) and self._fall_back_to_float32(unit.matcher, error):
+                return []
+            if failure is Failure.ORDINARY:
+                return [UnitResult(unit, Matches.empty(), failure=reason_of(error))] * len(pairs)
+            if failure is Failure.DEVICE or len(pairs) == 1:
+                error.add_note(f"in {unit.name}")
+                raise
+        # Not in the handler: until it is left, the error's traceback holds the tensors of the minibatch.
+        if "torch" in sys.modules:
+            import torch
+
+            torch.cuda.empty_cache()  # cuBLAS and cuDNN cannot use what PyTorch keeps for later
+        self._minibatches[unit] = len(pairs) // 2
+        return []
+
+    def _fall_back_to_float32(self, name: str, error: NonFiniteError) -> bool:
+        """Whether the matcher runs in float32 from now on, and did not before."""
+        if self._load_float32 is None or name in self._notes:
+            return False
+        self._notes[name] = f"{name} runs in float32, for in half precision {error}"
+        warnings.warn(self._notes[name], RuntimeWarning, stacklevel=2)
+        self._encodings = ByteCache(self._encodings.limit)
+        self._matchers[name] = self._load_float32(name)
+        return True
+
+    def _match(self, unit: Unit, pairs: list[PairMatch]) -> list[UnitResult]:
+        matcher = self._matcher(unit.matcher)
+        views = [views_of(unit, matcher.spec.multiple, pair) for pair in pairs]
+        start = time.perf_counter()
+        shown = [zip(pair.images, both, strict=True) for pair, both in zip(pairs, views, strict=True)]
+        encodings = self._encode(unit, list(chain.from_iterable(shown)))
+        encoded = time.perf_counter()
+        with exact_float32():
+            found = matcher.match(encodings[::2], encodings[1::2])
+        matched = time.perf_counter()
+        warm_up = unit not in self._ran
+        self._ran.add(unit)
+        return [
+            UnitResult(
+                unit,
+                matches.to_image(*both).best(unit.max_matches),
+                (encoded - start) / len(pairs),
+                (matched - encoded) / len(pairs),
+                self._notes.get(unit.matcher, ""),
+                warm_up,
+            )
+            for matches, both in zip(found, views, strict=True)
+        ]
+
+    def _encode(self, unit: Unit, wanted: Sequence[tuple[Image, View]]) -> list[Any]:
+        """The encodings of views by the unit's matcher, from the cache or made now, one shape at a time."""
+        keys = [(unit.matcher, image.name, view) for image, view in wanted]
+        known = {key: self._encodings.get(key) for key in keys}
+        missing = {key: item for key, item in zip(keys, wanted, strict=True) if known[key] is None}
+        by_shape: dict[Size, list[ViewKey]] = {}
+        for key in missing:
+            by_shape.setdefault(key[2].padded, []).append(key)
+        size = self._minibatches.get(unit, self.minibatch)
+        for alike in by_shape.values():
+            for start in range(0, len(alike), size):
+                known |= self._encode_minibatch(unit, {key: missing[key] for key in alike[start : start + size]})
+        return [known[key] for key in keys]
+
+    def _encode_minibatch(self, unit: Unit, items: dict[ViewKey, tuple[Image, View]]) -> dict[ViewKey, Any]:
+        matcher, encoded = self._matcher(unit.matcher), {}
+        gray = matcher.spec.colour is Colour.GRAY
+        pictures = [
+            Picture(view.render(image.gray if gray else image.pixels), view) for image, view in items.values()
+        ]
+        with exact_float32():
+            encodings = matcher.encode(pictures)
+        check_finite(f"features of {unit.matcher}", list(encodings))
+        for (key, (image, view)), encoding in zip(items.items(), encodings, strict=True):
+            encoded[key] = encoding
+            if view.crop == Box.whole(image.size):  # a crop is one pair's own: no other will ask for it
+                encoded[key] = detached(encoding)
+                self._encodings.put(key, encoded[key], encoding_bytes(encoded[key]))
+        return encoded
+
+    def _matcher(self, name: str) -> Matcher[Any]:
+        if name not in self._matchers:
+            self._matchers[name] = self._load(name)
+        return self._matchers[name]
+
+
+def views_of(unit: Unit, multiple: int, pair: PairMatch) -> tuple[View, View]:
+    """What a unit looks at: whole images in stage 1, critical regions in stage 2."""
+    if unit.stage == 1 or pair.regions is None:
+        boxes = [Box.whole(image.size) for image in pair.images]
+    else:
+        boxes = [region.box for region in pair.regions]
+    view0, view1 = (unit.view(box, multiple) for box in boxes)
+    return view0, view1
 
 
 def with_regions(pair: PairMatch, recipe: Recipe) -> PairMatch:
     """The pair with the critical region of each image, from the matched points of stage 1."""
     start = time.perf_counter()
-    matches = pair.stage1_matches
+    matches = pair.matches[pair.in_stage(1)]
     region0, region1 = (
         critical_region(points, image.size, recipe.mkpc)
         for points, image in zip((matches.points0, matches.points1), pair.images, strict=True)

@@ -1,4 +1,4 @@
-"""The library's face: one pair at a time."""
+"""The Python API: two images in, their matches and two-view model out."""
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -12,7 +12,7 @@ from mkpc_kaggle.geometry.coordinates import Pixels
 from mkpc_kaggle.geometry.robust import Matrix3, ModelKind
 from mkpc_kaggle.matchers.contract import Matcher
 from mkpc_kaggle.pipeline.assembly import assemble
-from mkpc_kaggle.pipeline.obstacles import Licence
+from mkpc_kaggle.pipeline.availability import Licence
 from mkpc_kaggle.pipeline.pair import PairMatch, with_estimate
 from mkpc_kaggle.recipe import Recipe
 
@@ -24,8 +24,8 @@ class TwoStageMatcher:
         F, points0 = match.estimate.matrix, match.inliers.points0
 
     ``recipe`` is a :class:`Recipe`, a recipe's name, or a path to a TOML file; ``weights`` are directories to
-    search; with ``licence`` "permissive" those that forbid some uses are refused. ``matchers`` are matchers of
-    one's own, by the names under which the recipe's units call them.
+    search; with ``licence`` "permissive" weights that forbid some uses are refused. ``matchers`` are matchers of
+    your own, by the names under which the recipe's units call them.
     Raises :class:`mkpc_kaggle.errors.UserError` for an unknown recipe, key or matcher, and for missing weights.
     """
 
@@ -60,17 +60,19 @@ class TwoStageMatcher:
     ) -> PairMatch:
         """Match two images: paths, or arrays (H, W, 3) RGB or (H, W) gray, uint8.
 
-        ``model`` E needs ``intrinsics``, the camera matrices in pixels. Raises :class:`UserError` for an
-        image that cannot be read; a pair that cannot be matched is a result with ``estimate.failure``. Memory that
-        is too short, and a device that fails, are raised as they are.
+        ``model`` E needs ``intrinsics``, the camera matrices in pixels; without them ``ValueError`` is raised.
+        Raises :class:`UserError` for an image that cannot be read. A pair that cannot be matched is a result with
+        ``estimate.failure``. Errors of memory and of the device are raised as they are.
         """
+        if ModelKind(model) is ModelKind.E and intrinsics is None:
+            raise ValueError("model E needs intrinsics=(K0, K1), the camera matrices of both images in pixels")
         pair = PairMatch(images=(to_image(image0), to_image(image1)))
         (pair,) = self._pipeline.match([pair], self.recipe.units)
         return with_estimate(pair, self.recipe, ModelKind(model), intrinsics)
 
 
 def to_image(source: str | Path | Pixels | Image) -> Image:
-    """An image from a path or an array; raises :class:`UserError` where there is none."""
+    """An image from a path or an array; raises :class:`UserError` if it cannot be read."""
     if isinstance(source, Image):
         return source
     if isinstance(source, np.ndarray):

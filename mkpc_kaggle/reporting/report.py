@@ -1,77 +1,210 @@
-"""``report.html``: one page on a run, from its journal, that needs nothing but itself.
+"""``report.html``: one page about a run, made from its journal; it needs no other file.
 
-Figures need matplotlib and pictures the images; where either or the time is lacking, the page says so.
+Drawings need matplotlib, pictures of pairs the images; if something is lacking, the page says so.
 """
 
+import base64
 import time
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from importlib.util import find_spec
 from pathlib import Path
+from statistics import median
+from typing import TYPE_CHECKING
+
+import pandas as pd
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.data.images import printable
+from mkpc_kaggle.data.images import Unreadable, printable, read_image
 from mkpc_kaggle.data.outputs import replacing
 from mkpc_kaggle.engine.budget import format_duration
-from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.reporting.run_log import RunLog, read_log
-from mkpc_kaggle.reporting.sections import Artist, sections_of
+from mkpc_kaggle.engine.journal_tables import EventKind
+from mkpc_kaggle.engine.records import SceneRecord
+from mkpc_kaggle.errors import writing
+from mkpc_kaggle.pipeline.two_stage import to_image
+from mkpc_kaggle.reporting.figures.pair import draw_pair, draw_strip
+from mkpc_kaggle.reporting.figures.run import draw_budget, draw_cameras
+from mkpc_kaggle.reporting.figures.style import encode
+from mkpc_kaggle.reporting.run_log import RunLog, WeakPair, read_log
+from mkpc_kaggle.reporting.summary import headline, left_out_line, trouble
+from mkpc_kaggle.reporting.tables import seconds_by_part, unit_failures, unit_means
 
-WRITING_SECONDS, WRITING_SECONDS_PER_PAIR = 0.3, 0.0002
-"""Time that must be left to write a report without figures."""
-LEAVING_SECONDS = 0.3
-"""Time that a program needs to end."""
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+WRITING_S, WRITING_S_PER_PAIR = 0.6, 0.0002  # what a page without drawings takes
+DRAWING_S = 5.0  # drawings are not begun with less time left
+MAX_ROWS = 100  # of a table; the exports of the journal command have all
+MAX_SCENES = 12  # drawn
 
 
 def report_run(work_dir: Path, path: Path, ends: float, pairs: Sequence[Pair] = ()) -> str:
     """Write the report of a run that has just ended; the line that says so, or why there is none.
 
+    The page is written without drawings first, so that a page is there if the program is ended while it draws.
     ``ends`` is when the program must have ended, in seconds of the monotonic clock; ``pairs`` are the run's, to
     be drawn. Never raises: a report must not cost a run that went well its exit status.
     """
     later = f"python -m mkpc_kaggle journal {work_dir} --report {path}"
-    needed = WRITING_SECONDS + WRITING_SECONDS_PER_PAIR * len(pairs) + LEAVING_SECONDS
-    if time.monotonic() + needed > ends:
+    left = ends - time.monotonic()
+    if left < WRITING_S + WRITING_S_PER_PAIR * len(pairs):
         return f"no report, the time is up; later: {later}"
     try:
-        write_report(read_log(work_dir), path, Artist(pairs, ends - LEAVING_SECONDS))
+        log = read_log(work_dir)
+        write_report(log, path, pairs, undrawn="little time was left; the journal command draws them")
+        if left > DRAWING_S:
+            write_report(log, path, pairs)
     except Exception as error:
-        return f"warning: no report ({error}); later: {later}"
+        return f"warning: no report, or a report without drawings ({error}); later: {later}"
     return f"report: {path}"
 
 
-def write_report(log: RunLog, path: Path, artist: Artist) -> None:
-    """Write the page; raises :class:`UserError` where ``path`` cannot be written."""
-    text = report_page(log, artist)
-    try:
+def write_report(log: RunLog, path: Path, pairs: Sequence[Pair] = (), *, undrawn: str = "") -> None:
+    """Write the page of :func:`report_page`; raises :class:`UserError` if ``path`` cannot be written."""
+    text = report_page(log, pairs, undrawn=undrawn)
+    with writing(f"the report {path}"):
         path.parent.mkdir(parents=True, exist_ok=True)
         with replacing(path) as stream:
             stream.write(printable(text))
-    except OSError as error:
-        raise UserError(f"the report {path} cannot be written: {error.strerror}") from error
 
 
-def report_page(log: RunLog, artist: Artist) -> str:
-    """The whole document; all that comes from files is escaped by the template's engine."""
+def report_page(log: RunLog, pairs: Sequence[Pair] = (), *, undrawn: str = "") -> str:
+    """The whole document; the template escapes all text that comes from files.
+
+    ``pairs`` have the paths of the images of the pairs to be drawn; ``undrawn`` says why nothing is drawn.
+    """
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
+    if not undrawn and find_spec("matplotlib") is None:
+        undrawn = "matplotlib is not installed: pip install 'mkpc-kaggle[plots]'"
+    sources = {} if undrawn else {pair.id: pair for pair in pairs}
+    placed = [scene for scene in log.scenes if scene.placed]
+    largest = sorted(placed, key=lambda scene: -scene.placed)[:MAX_SCENES]
+    has_jobs = any(event.kind == EventKind.JOB for event in log.session)
     pages = Environment(loader=PackageLoader("mkpc_kaggle.reporting"), autoescape=True, undefined=StrictUndefined)
-    sections = sections_of(log, artist)
     return pages.get_template("report.html").render(
-        title=f"{log.about.recipe}: {len(log.pairs)} pairs",
-        heading=f"Recipe {log.about.recipe} on {len(log.pairs)} pairs",
-        device=log.about.device,
-        facts=_facts(log),
-        missing=artist.missing,
-        sections=sections,
+        log=log,
+        verdict=headline(log.tables, log),
+        trouble=trouble(log),
+        facts=[*_facts(log)],
+        left_out=left_out_line(log.about.left_out),
+        faults=_events(log, EventKind.FAULT),
+        failures=_failures(log),
+        unit_failures=pd.DataFrame({"units that failed": unit_failures(log.tables)}),
+        weakest=[_weak(log, weak, sources) for weak in log.weakest],
+        scenes=_scenes(log),
+        cameras=[] if undrawn else [(scene.batch, _data_uri(draw_cameras(scene), "png")) for scene in largest],
+        jobs=_data_uri(budget_figure(log), "png") if has_jobs and not undrawn else "",
+        costs=_costs(log),
+        plans=_events(log, EventKind.PLAN),
+        undrawn=undrawn,
+        max_rows=MAX_ROWS,
     )
 
 
-def _facts(log: RunLog) -> list[tuple[str, str, str]]:
+def _facts(log: RunLog) -> Iterator[tuple[str, str, str]]:
     """What a reader wants to know first: name, value, remark."""
-    solved = log.tables.solved
+    solved, sources = log.tables.solved, log.tables.pairs["source"].value_counts()
+    parts = (("scene", "from scenes"), ("pair", "from their own matches"), ("fallback", "fallback"))
+    from_where = ", ".join(f"{sources[source]} {what}" for source, what in parts if source in sources)
+    yield "pairs with an F", f"{len(solved)} of {len(log.pairs)}", from_where
+    if len(solved):
+        least = f"median of a pair, at least {solved['inliers'].min()}"
+        yield "inliers", f"{solved['inliers'].median():.0f}", least
     limit = f"of {format_duration(log.about.limit)}" if log.about.limit is not None else "no time limit"
-    return [
-        ("pairs with an F", str(len(solved)), f"of {len(log.pairs)}"),
-        ("time", format_duration(log.seconds), limit),
-        ("inliers", f"{solved['inliers'].median():.0f}" if len(solved) else "-", "median of a pair"),
-        ("ending", log.ending, f"session {log.sessions}" if log.sessions > 1 else "in one session"),
+    yield "time", format_duration(log.seconds), limit + (f", session {log.sessions}" if log.sessions > 1 else "")
+    reasons = log.tables.regions["reason"].value_counts()
+    if len(reasons):
+        others = ", ".join(f"{count} {reason}" for reason, count in reasons.items())
+        yield "critical regions", f"{reasons.get('cropped', 0)} of {reasons.sum()}", others
+    if log.scenes:
+        placed, images = (sum(getattr(scene, name) for scene in log.scenes) for name in ("placed", "images"))
+        yield "images with a camera", f"{placed} of {images}", f"in {len(log.scenes)} batches"
+
+
+def _events(log: RunLog, kind: EventKind) -> pd.DataFrame:
+    rows = [(format_duration(event.seconds), event.text) for event in log.events if event.kind == kind]
+    return pd.DataFrame(rows, columns=["when", kind.value])
+
+
+def _failures(log: RunLog) -> list[pd.DataFrame]:
+    """How often which reason left a pair without an F, where pairs share a reason; and the pairs."""
+    failed = log.tables.failed[["id", "group", "failure"]]
+    counts = failed["failure"].value_counts()
+    reasons = pd.DataFrame({"pairs with the fallback row": counts, "reason": counts.index})
+    by_pair = failed.set_axis(["pair with the fallback row", "batch", "reason"], axis=1)
+    return [reasons, by_pair] if len(counts) < len(failed) else [by_pair]
+
+
+def _weak(log: RunLog, weak: WeakPair, sources: dict[str, Pair]) -> tuple[str, str, str]:
+    """What the page says of a weak pair: its picture, empty if it is not drawn; counts and remarks; id."""
+    record, pair, picture = weak.record, log.pairs[weak.record.index], ""
+    match = weak.match(log.recipe.magsac.threshold)
+    told = [f"{record.inliers} inliers of {record.matches} matches", record.failure]
+    if record.source == "scene":
+        told.append("F is the scene's")
+    if len(match.matches) < record.matches:
+        told.append("the points are no longer known")
+    if pair.id in sources:
+        image0, image1 = map(read_image, sources[pair.id].images)
+        if isinstance(image0, Unreadable) or isinstance(image1, Unreadable):
+            told.append("an image cannot be read any more")
+        else:
+            picture = _data_uri(draw_strip((image0, image1), match), "jpeg")
+    return picture, "; ".join(filter(None, told)), pair.id
+
+
+def weak_figure(log: RunLog, weak: WeakPair, source: Pair) -> "Figure":
+    """Matches, clusters and critical regions of a weak pair, as the journal has them.
+
+    ``source`` is the pair with the paths of its images; raises :class:`UserError` if an image cannot be read.
+    """
+    image0, image1 = map(to_image, source.images)
+    return draw_pair(image0, image1, weak.match(log.recipe.magsac.threshold), log.recipe.mkpc)
+
+
+def _scenes(log: RunLog) -> list[pd.DataFrame]:
+    """The batches that were reconstructed; which F the pairs have, and why."""
+    pairs = log.tables.pairs
+    counts = pairs[pairs["source"] == "scene"].groupby("group").size()
+    rows = [
+        (
+            *(scene.batch, scene.images, scene.placed, scene.points, _focals(scene)),
+            *(scene.seconds, int(counts.get(scene.batch, 0)), scene.failure),
+        )
+        for scene in log.scenes
     ]
+    heads = ["batch", "images", "cameras", "points", "focals (px)", "seconds", "pairs with its F", "failure"]
+    reasons = Counter(str(record.scene.reason) for record in log.records if record.scene is not None)
+    batches = pd.DataFrame(rows, columns=heads)
+    return [
+        batches if batches["failure"].any() else batches.drop(columns="failure"),
+        pd.DataFrame(reasons.most_common(), columns=["which F a pair has", "pairs"]),
+    ]
+
+
+def _focals(scene: SceneRecord) -> str:
+    focals = [camera.focal for camera in scene.cameras]
+    return f"{median(focals):.0f} ({min(focals):.0f} to {max(focals):.0f})" if focals else ""
+
+
+def _costs(log: RunLog) -> list[pd.DataFrame]:
+    """Seconds by unit, and by part of the work."""
+    units = unit_means(log.tables).rename(columns={"unit": "unit (means)"})
+    units["seconds in all"] = units["pairs"] * units["seconds"]
+    parts = pd.DataFrame(seconds_by_part(log.tables).items(), columns=["part of the work", "seconds in all"])
+    parts["seconds a pair"] = parts["seconds in all"] / max(1, len(log.pairs))
+    return [units, parts] if len(units) else []
+
+
+def budget_figure(log: RunLog) -> "Figure":
+    """The jobs that ended over the time of the last session; see :func:`draw_budget`."""
+    ended: dict[str, list[float]] = {}
+    for event in log.session:
+        if event.kind == EventKind.JOB:
+            ended.setdefault(event.text.partition(" ")[0], []).append(event.seconds)
+    return draw_budget(ended, log.about.limit)
+
+
+def _data_uri(figure: "Figure", kind: str) -> str:
+    return f"data:image/{kind};base64,{base64.b64encode(encode(figure, kind)).decode()}"

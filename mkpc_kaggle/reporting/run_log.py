@@ -8,8 +8,10 @@ from pathlib import Path
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.journal_tables import DRAWN, About, Event, EventKind, JournalReader, undamaged
 from mkpc_kaggle.engine.records import PairRecord, SceneRecord
-from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.pipeline.pair import UnitResult
+from mkpc_kaggle.errors import writing
+from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.geometry.robust import Estimate, ModelKind, sampson_distances
+from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult
 from mkpc_kaggle.recipe import Recipe, recipe_of
 from mkpc_kaggle.reporting.tables import RunTables, run_tables, to_json
 
@@ -18,30 +20,34 @@ NOT_ENDED = "not ended (at work, or killed)"
 
 @dataclass(frozen=True, eq=False)
 class WeakPair:
-    """One of the weakest pairs, with its matches by unit where the journal still has them."""
+    """A pair with few inliers, with its matches by unit if the journal still has them."""
 
     record: PairRecord
     results: tuple[UnitResult, ...]
 
+    def match(self, threshold: float) -> PairMatch:
+        """The pair as MAGSAC left it, without running it again; inliers are within ``threshold`` pixels."""
+        record = self.record
+        matches = Matches.concatenate(result.matches for result in self.results)
+        inliers = (sampson_distances(record.pair_fundamental, matches) < threshold) & (not record.failure)
+        return PairMatch(
+            self.results, record.regions, Estimate(ModelKind.F, record.pair_fundamental, inliers, record.failure)
+        )
+
 
 @dataclass(frozen=True, eq=False)
 class RunLog:
-    """A run as its journal has it.
+    """A run as its journal has it."""
 
-    ``records`` are one a pair, in order, those not reached among them. ``events`` are those of all sessions;
-    ``weakest`` are the pairs with the fewest inliers of those that were matched. ``digests`` are those of the
-    test set and of the weights, by name. ``scenes`` are the batches that were reconstructed, or could not be.
-    """
-
-    path: Path
+    path: Path  # of the journal
     about: About
     recipe: Recipe
-    digests: dict[str, str]
+    digests: dict[str, str]  # of the test set and of the weights, by name
     pairs: tuple[Pair, ...]
-    records: tuple[PairRecord, ...]
-    events: tuple[Event, ...]
-    weakest: tuple[WeakPair, ...]
-    scenes: tuple[SceneRecord, ...] = ()
+    records: tuple[PairRecord, ...]  # a record for each pair, in order, reached or not
+    events: tuple[Event, ...]  # of all sessions
+    weakest: tuple[WeakPair, ...]  # of the pairs that were matched, the fewest inliers first
+    scenes: tuple[SceneRecord, ...] = ()  # the batches that were reconstructed, or could not be
 
     @cached_property
     def tables(self) -> RunTables:
@@ -76,7 +82,7 @@ class RunLog:
 def read_log(directory: Path) -> RunLog:
     """Read the journal of a work directory, of a run at work or ended.
 
-    Raises :class:`UserError` where there is none, or none that this version can read.
+    Raises :class:`UserError` if there is none, or none that this version can read.
     """
     with JournalReader(directory) as journal, undamaged(journal.path):
         about, belongs_to, pairs = journal.about(), journal.belongs_to(), journal.pairs()
@@ -92,20 +98,18 @@ def read_log(directory: Path) -> RunLog:
 
 
 def write_csv(log: RunLog, directory: Path) -> list[Path]:
-    """Write each of the log's tables to a file of its name; :class:`UserError` where they cannot be written."""
+    """Write each table to a file of its name; :class:`UserError` if they cannot be written."""
     paths = []
-    try:
+    with writing(f"--csv {directory}"):
         directory.mkdir(parents=True, exist_ok=True)
         for name, table in log.tables.named().items():
             paths.append(directory / f"{name}.csv")
             table.to_csv(paths[-1], index=False)
-    except OSError as error:
-        raise UserError(f"--csv {directory} cannot be written: {error.strerror}") from error
     return paths
 
 
 def write_json(log: RunLog, path: Path) -> None:
-    """Write all there is as one JSON value, each pair with its units and regions; :class:`UserError` as above."""
+    """Write everything as one JSON value, each pair with its units and regions; :class:`UserError` as above."""
     values = {
         "recipe": {"name": log.about.recipe, **log.recipe.fingerprint()},
         "device": log.about.device,
@@ -116,8 +120,6 @@ def write_json(log: RunLog, path: Path) -> None:
         "digests": log.digests,
         **to_json(log.tables),
     }
-    try:
+    with writing(f"--json {path}"):
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps(values, allow_nan=False) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise UserError(f"--json {path} cannot be written: {error.strerror}") from error

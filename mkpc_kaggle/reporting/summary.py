@@ -1,39 +1,46 @@
 """One screen of summary: what a run did, what it cost, and which pairs it could not help."""
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.budget import format_duration
 from mkpc_kaggle.engine.engine import Ending, RunReport
 from mkpc_kaggle.engine.records import PairRecord, SceneRecord
-from mkpc_kaggle.recipe import Unit
 from mkpc_kaggle.reporting.run_log import RunLog
 from mkpc_kaggle.reporting.tables import RunTables, run_tables, seconds_by_part, unit_failures, unit_means
 
-MOST_LINES = 8
+MAX_LINES = 8  # of each list
 
 
-def summary(pairs: Sequence[Pair], report: RunReport, left_out: Sequence[Unit] = ()) -> str:
+def summary(pairs: Sequence[Pair], report: RunReport, left_out: Sequence[str] = ()) -> str:
     """The screen that ends a run."""
     tables = run_tables(pairs, report.records)
     resumed = f", {report.resumed} of them from earlier runs" if report.resumed else ""
-    names = [unit.name for unit in left_out]
-    lines = [_headline(tables, report.ending, report.seconds) + resumed, *_counts(tables)]
-    lines += _scenes(tables, report.scenes)
-    lines += _upgrades(report.records) + _troubles(tables, names, report.faults)
-    return "\n".join([*lines, *filter(None, [trouble(report)])])
+    failed = filter(None, [trouble(report)])
+    return "\n".join([headline(tables, report) + resumed, *_lines(tables, report, left_out), *failed])
 
 
-def trouble(report: RunReport) -> str:
-    """Why a run is no success, though its file is whole; empty if it is one.
+def overview(log: RunLog) -> str:
+    """The same screen from a journal."""
+    about = f"recipe {log.about.recipe}, {log.about.device}, {len(log.events)} events"
+    return "\n".join([headline(log.tables, log), about, *_lines(log.tables, log, log.about.left_out)])
 
-    Pairs without an F count where an error is the reason, be it that of a unit which found nothing; not where the
-    matches or the time did not suffice.
+
+def headline(tables: RunTables, run: RunReport | RunLog) -> str:
+    """How the run ended, and how many pairs have an F."""
+    count = f"{len(tables.solved)} of {len(tables.pairs)} pairs have an F"
+    return f"{run.ending} after {format_duration(run.seconds)}: {count}"
+
+
+def trouble(run: RunReport | RunLog) -> str:
+    """Why a run failed, though its file is whole; empty if it did not fail.
+
+    Pairs without an F count if an error is the reason, and not if the matches or the time did not suffice.
     """
-    if report.ending is Ending.NO_WORKER:
-        return f"the run failed: {report.ending}, the faults say why; the same command goes on"
-    reached = [record for record in report.records if record.reached]
+    if run.ending in (Ending.NO_WORKER, Ending.NOTHING_RUNS):
+        return f"the run failed: {run.ending}, the faults say why; the same command goes on"
+    reached = [record for record in run.records if record.reached]
     reasons = Counter(filter(None, map(_error, reached)))
     if 2 * reasons.total() <= len(reached):
         return ""
@@ -43,7 +50,7 @@ def trouble(report: RunReport) -> str:
 
 
 def _error(record: PairRecord) -> str:
-    """The error that left a pair without an F, if it was one."""
+    """The error that left a pair without an F, if there was an error."""
     if record.source != "fallback":
         return ""
     if not record.units:
@@ -51,79 +58,54 @@ def _error(record: PairRecord) -> str:
     return next((unit.failure for unit in record.units if unit.failure and not unit.matches), "")
 
 
-def overview(log: RunLog) -> str:
-    """The same of a journal."""
-    lines = [
-        _headline(log.tables, log.ending, log.seconds),
-        f"recipe {log.about.recipe}, {log.about.device}, {len(log.events)} events",
-        *_counts(log.tables),
-        *_scenes(log.tables, log.scenes),
+def left_out_line(left_out: Sequence[str]) -> str:
+    """Which matchers did not run, by cause, and how to get weights; empty if all ran."""
+    return (
+        f"left out, {'; '.join(left_out)} (get weights: python -m mkpc_kaggle weights fetch)" if left_out else ""
+    )
+
+
+def _lines(tables: RunTables, run: RunReport | RunLog, left_out: Sequence[str]) -> list[str]:
+    failed = tables.failed
+    reasons = list(failed["id"][:MAX_LINES] + ": " + failed["failure"][:MAX_LINES])
+    return [
+        *_found(tables),
+        *_scenes(tables, run.scenes),
+        *filter(None, [left_out_line(left_out)]),
+        *_list("pairs with the fallback row", reasons, len(failed)),
+        *_list("units that failed", unit_failures(tables)),
+        *_list("faults", run.faults),
     ]
-    return "\n".join(lines + _upgrades(log.records) + _troubles(log.tables, log.about.left_out, log.faults))
 
 
-def _unit_table(tables: RunTables) -> list[str]:
-    """The means of each unit on a pair, as lines."""
-    rows = [
-        f"{one.Index:<30}{one.pairs:>7}{one.matches:>9.0f}{one.inliers:>9.0f}{one.seconds:>9.2f}"
-        for one in unit_means(tables).itertuples()
-    ]
-    return [f"{'unit':<30}{'pairs':>7}{'matches':>9}{'inliers':>9}{'seconds':>9}", *rows] if rows else []
-
-
-def _headline(tables: RunTables, ending: str, seconds: float) -> str:
-    count = f"{len(tables.solved)} of {len(tables.pairs)} pairs have an F"
-    return f"{ending} after {format_duration(seconds)}: {count}"
-
-
-def _counts(tables: RunTables) -> list[str]:
-    """What was found, and what it cost."""
-    lines = []
-    inliers = tables.solved["inliers"]
+def _found(tables: RunTables) -> Iterator[str]:
+    """What was found on a pair, by which unit, and what it cost."""
+    inliers, means = tables.solved["inliers"], unit_means(tables)
     if len(inliers):
-        least = f"median {inliers.median():.0f}, mean {inliers.mean():.1f}, least {inliers.min()}"
-        lines.append(f"inliers: {least}")
-    lines += _unit_table(tables)
-    reasons = tables.regions["reason"].value_counts()
-    if len(reasons):
-        lines.append("critical regions: " + ", ".join(f"{count} {reason}" for reason, count in reasons.items()))
+        yield f"inliers: median {inliers.median():.0f}, mean {inliers.mean():.1f}, least {inliers.min()}"
+    if len(means):
+        yield f"{'unit':<30}{'pairs':>7}{'matches':>9}{'inliers':>9}{'seconds':>9}"
+    for unit in means.itertuples():
+        yield f"{unit.unit:<30}{unit.pairs:>7}{unit.matches:>9.0f}{unit.inliers:>9.0f}{unit.seconds:>9.2f}"
+    if reasons := [f"{count} {reason}" for reason, count in tables.regions["reason"].value_counts().items()]:
+        yield f"critical regions: {', '.join(reasons)}"
     pairs = max(1, len(tables.pairs))
-    parts = [f"{name} {seconds / pairs:.3f}" for name, seconds in seconds_by_part(tables).items()]
-    return [*lines, "seconds a pair: " + ", ".join(parts)]
+    parts = (f"{name} {seconds / pairs:.3f}" for name, seconds in seconds_by_part(tables).items())
+    yield f"seconds a pair: {', '.join(parts)}"
 
 
 def _scenes(tables: RunTables, scenes: Sequence[SceneRecord]) -> list[str]:
     """How many batches and images were reconstructed, whose F is from there, and why the others were not."""
     if not scenes:
         return []
-    made = [scene for scene in scenes if scene.placed]
+    made = sum(scene.placed > 0 for scene in scenes)
     images = f"{sum(scene.placed for scene in scenes)} of {sum(scene.images for scene in scenes)} images"
     pairs = f"F of {sum(tables.pairs['source'] == 'scene')} of {len(tables.pairs)} pairs is from them"
-    reasons = Counter(scene.failure for scene in scenes if scene.failure)
-    lines = [f"scenes: {len(made)} of {len(scenes)} batches reconstructed with {images}; {pairs}"]
-    return lines + [
-        f"  {count} batches without a scene: {reason}" for reason, count in reasons.most_common(MOST_LINES)
+    reasons = Counter(scene.failure for scene in scenes if scene.failure).most_common(MAX_LINES)
+    return [
+        f"scenes: {made} of {len(scenes)} batches reconstructed with {images}; {pairs}",
+        *(f"  {count} batches without a scene: {reason}" for reason, count in reasons),
     ]
-
-
-def _upgrades(records: Sequence[PairRecord]) -> list[str]:
-    upgraded = [record for record in records if record.before is not None]
-    if not upgraded:
-        return []
-    before, after = sum(r.before or 0 for r in upgraded), sum(r.inliers for r in upgraded)
-    return [f"upgraded {len(upgraded)} pairs: {before} inliers before, {after} after"]
-
-
-def _troubles(tables: RunTables, left_out: Sequence[str], faults: Sequence[str]) -> list[str]:
-    """What was left out, and what failed."""
-    lines = []
-    if left_out:
-        reasons = "weights missing or not permitted, or matcher unusable"
-        lines.append(f"units left out ({reasons}): {', '.join(left_out)}")
-    failed, first = tables.failed, tables.failed.head(MOST_LINES)
-    lines += _list("pairs with the fallback row", list(first["id"] + ": " + first["failure"]), len(failed))
-    lines += _list("units that failed", unit_failures(tables))
-    return lines + _list("faults", faults)
 
 
 def _list(title: str, items: Sequence[str], count: int | None = None) -> list[str]:
@@ -131,6 +113,6 @@ def _list(title: str, items: Sequence[str], count: int | None = None) -> list[st
     count = len(items) if count is None else count
     if not count:
         return []
-    shown = [f"  {item}" for item in items[:MOST_LINES]]
-    more = [f"  ... and {count - MOST_LINES} more"] if count > MOST_LINES else []
+    shown = [f"  {item}" for item in items[:MAX_LINES]]
+    more = [f"  ... and {count - MAX_LINES} more"] if count > MAX_LINES else []
     return [f"{title}: {count}", *shown, *more]

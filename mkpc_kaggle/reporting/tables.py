@@ -1,7 +1,7 @@
-"""A run as four tables: all that the summary, the report and the exports count is counted on these."""
+"""A run as four tables, which the summary, the report and the exports count on."""
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import astuple, dataclass
 from typing import Any
 
 import numpy as np
@@ -9,27 +9,27 @@ import pandas as pd
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.journal_tables import Event
-from mkpc_kaggle.engine.records import PairRecord
+from mkpc_kaggle.engine.records import PairRecord, UnitRecord
 
 F_COLUMNS = tuple(f"f{row}{column}" for row in (1, 2, 3) for column in (1, 2, 3))
-SECONDS = ("decode_seconds", "encode_seconds", "match_seconds", "cluster_seconds", "estimate_seconds")
-
-_TEXTS = dict.fromkeys(("id", "group", "failure", "source"), str)
-_UNITS = {
-    **{"pair": int, "unit": str, "stage": int, "matches": int, "inliers": int},
-    **{"encode_seconds": float, "match_seconds": float, "failure": str},
+SECONDS = {  # what the parts of a pair's work are called; MAGSAC runs beside the others
+    "decode_seconds": "wait for decoding",
+    "encode_seconds": "encode",
+    "match_seconds": "match",
+    "cluster_seconds": "cluster",
+    "estimate_seconds": "MAGSAC (beside matching)",
 }
-_REGIONS = {
-    **{"pair": int, "image": int, "left": int, "top": int, "right": int, "bottom": int},
-    **{"reason": str, "clusters": int, "kept": int},
-}
-_EVENTS = {"kind": str, "seconds": float, "text": str}
+_COLUMNS = {"failure": object, "source": object, "matches": int, "inliers": int} | dict.fromkeys(SECONDS, float)
+_UNIT_COLUMNS = {"pair": int, **UnitRecord.__annotations__}
+_BOX_COLUMNS = dict.fromkeys(("pair", "image", "left", "top", "right", "bottom"), int)
+_REGION_COLUMNS = {**_BOX_COLUMNS, "reason": str, "clusters": int, "kept": int}
 
 
 @dataclass(frozen=True, eq=False)
 class RunTables:
-    """Long tables, a row a pair, a unit on a pair, an image of a pair that was looked at for its critical region,
-    and an event; ``pair`` is the row of ``test_set``. Seconds are of work, boxes and points in image pixels.
+    """Long tables: pairs; units on pairs; critical regions, two for a pair; events.
+
+    ``pair`` is the row of ``test_set``. Seconds are of work, boxes are in image pixels.
     """
 
     pairs: pd.DataFrame
@@ -57,21 +57,23 @@ class RunTables:
 
 
 def run_tables(pairs: Sequence[Pair], records: Sequence[PairRecord], events: Sequence[Event] = ()) -> RunTables:
-    """The tables of a run: one record a pair, in their order."""
+    """The tables of a run: a record for each pair, in the same order."""
     return RunTables(
         _pair_table(pairs, records),
-        _table(_unit_rows(records), _UNITS),
-        _table(_region_rows(records), _REGIONS),
-        _table(((event.kind, event.seconds, event.text) for event in events), _EVENTS),
+        _table(((r.index, *astuple(unit)) for r in records for unit in r.units), _UNIT_COLUMNS),
+        _table(_region_rows(records), _REGION_COLUMNS),
+        _table(map(astuple, events), Event.__annotations__),
         pairs,
     )
 
 
 def unit_means(tables: RunTables) -> pd.DataFrame:
-    """A row a unit that ran: on how many ``pairs``, and the means of ``matches``, ``inliers`` and ``seconds``."""
+    """Each ``unit``, how many ``pairs`` it ran on, and its mean ``matches``, ``inliers`` and ``seconds`` there."""
     units = tables.units.assign(seconds=tables.units["encode_seconds"] + tables.units["match_seconds"])
-    by_unit = units.groupby("unit")
-    return by_unit[["matches", "inliers", "seconds"]].mean().assign(pairs=by_unit.size())
+    by_unit = units.groupby("unit", sort=False)
+    means = by_unit[["matches", "inliers", "seconds"]].mean()
+    means.insert(0, "pairs", by_unit.size())
+    return means.reset_index()
 
 
 def unit_failures(tables: RunTables) -> list[str]:
@@ -82,15 +84,14 @@ def unit_failures(tables: RunTables) -> list[str]:
 
 
 def seconds_by_part(tables: RunTables) -> dict[str, float]:
-    """What the parts of the work took in all: the first four one after the other, MAGSAC beside them."""
-    names = ("wait for decoding", "encode", "match", "cluster", "MAGSAC (beside matching)")
-    return {name: float(tables.pairs[part].sum()) for name, part in zip(names, SECONDS, strict=True)}
+    """Seconds that each part of the work took on all pairs."""
+    return {name: float(tables.pairs[column].sum()) for column, name in SECONDS.items()}
 
 
 def to_json(tables: RunTables) -> dict[str, list[dict[str, Any]]]:
     """``pairs``, each with its F and the rows of its ``units`` and ``regions``, and ``events``."""
     named = tables.named()
-    pairs: list[dict[str, Any]] = _rows(named["pairs"].drop(columns=list(F_COLUMNS)))
+    pairs = _rows(named["pairs"].drop(columns=list(F_COLUMNS)))
     for pair, F in zip(pairs, tables.pairs[list(F_COLUMNS)].to_numpy(), strict=True):
         pair |= {"F": F.reshape(3, 3).tolist(), "units": [], "regions": []}
     for name in ("units", "regions"):
@@ -104,9 +105,9 @@ def _rows(table: pd.DataFrame) -> list[dict[str, Any]]:
     return rows
 
 
-def _table(rows: Iterator[tuple[object, ...]], columns: dict[str, type]) -> pd.DataFrame:
+def _table(rows: Iterator[tuple[object, ...]], columns: Mapping[str, type]) -> pd.DataFrame:
     # Without a row pandas would not know the columns' types.
-    return pd.DataFrame(list(rows), columns=list(columns)).astype(columns)
+    return pd.DataFrame(list(rows), columns=list(columns)).astype(dict(columns))
 
 
 def _pair_table(pairs: Sequence[Pair], records: Sequence[PairRecord]) -> pd.DataFrame:
@@ -114,31 +115,14 @@ def _pair_table(pairs: Sequence[Pair], records: Sequence[PairRecord]) -> pd.Data
     size = len(pairs)
     columns: dict[str, Any] = {
         "pair": np.fromiter((record.index for record in records), int, size),
-        "id": [pair.id for pair in pairs],
-        "group": [pair.group for pair in pairs],
-        "failure": [record.failure for record in records],
-        "source": [record.source for record in records],
-        "matches": np.fromiter((record.matches for record in records), int, size),
-        "inliers": np.fromiter((record.inliers for record in records), int, size),
-        "decode_seconds": np.fromiter((record.decode_seconds for record in records), float, size),
-        "encode_seconds": np.fromiter((record.encode_seconds for record in records), float, size),
-        "match_seconds": np.fromiter((record.match_seconds for record in records), float, size),
-        "cluster_seconds": np.fromiter((record.cluster_seconds for record in records), float, size),
-        "estimate_seconds": np.fromiter((record.estimate_seconds for record in records), float, size),
+        "id": np.fromiter((pair.id for pair in pairs), object, size),
+        "group": np.fromiter((pair.group for pair in pairs), object, size),
     }
-    F = np.empty((len(F_COLUMNS), size))
-    for place, record in enumerate(records):
-        F[:, place] = record.fundamental.ravel()
-    columns |= dict(zip(F_COLUMNS, F, strict=True))
-    table = pd.DataFrame(columns, copy=False)
-    return table if size else table.astype(_TEXTS)
-
-
-def _unit_rows(records: Sequence[PairRecord]) -> Iterator[tuple[object, ...]]:
-    for record in records:
-        for unit in record.units:
-            counts = (unit.matches, unit.inliers, unit.encode_seconds, unit.match_seconds)
-            yield (record.index, unit.unit, unit.stage, *counts, unit.failure)
+    for name, kind in _COLUMNS.items():
+        columns[name] = np.fromiter((getattr(record, name) for record in records), kind, size)
+    F = np.array([record.chosen_fundamental for record in records]).reshape(size, 9)
+    columns |= dict(zip(F_COLUMNS, F.T, strict=True))
+    return pd.DataFrame(columns, copy=False)
 
 
 def _region_rows(records: Sequence[PairRecord]) -> Iterator[tuple[object, ...]]:

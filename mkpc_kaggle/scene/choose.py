@@ -1,23 +1,34 @@
-"""Which fundamental matrix a pair gets: the scene's, or the one that its own matches gave."""
+"""Which fundamental matrix a pair gets: the scene's, or that of its own matches, at known focal lengths or not."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import TypeAlias
 
 import numpy as np
 
-from mkpc_kaggle.geometry.cameras import Camera, fundamental_of_cameras, mean_cameras
-from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.geometry.robust import Matrix3, sampson_distances
-from mkpc_kaggle.scene.config import SceneConfig
-from mkpc_kaggle.scene.model import Model, PlacedImage
+from mkpc_kaggle.geometry.cameras import fundamental_of_cameras, mean_cameras
+from mkpc_kaggle.geometry.focal_prior import FocalConfig, FocalPrior, estimate_with_prior
+from mkpc_kaggle.geometry.robust import Matrix3, RobustConfig, sampson_distances
+from mkpc_kaggle.scene.reconstruction import RegisteredImage
+from mkpc_kaggle.scene.shared_intrinsics import SharedIntrinsics
+from mkpc_kaggle.scene.view_graph import BatchPair
+
+MAX_DISAGREEMENT_DEG = 5.0  # between the rotations that are averaged over reconstructions
+CONTRADICTION_ERROR_PX = 2.0
+CONTRADICTION_MATCHES = 30
+CONTRADICTION_SHARE = 0.05
+FOCAL_SIGMA = 0.1  # standard deviation of the logarithm of a focal length that the scene found
+
+ModelImages: TypeAlias = Mapping[str, RegisteredImage]
+"""The registered images of one model, by digest."""
 
 
 class Reason(StrEnum):
     """Why a pair has the F that it has; the first alone means the scene's."""
 
     SCENE = "both cameras are known"
-    UNPLACED = "an image has no camera"
+    UNREGISTERED = "an image has no camera"
     APART = "the cameras are of different models"
     SAME_IMAGE = "both images are the same picture"
     SAME_CENTRE = "both cameras stand at one point"
@@ -38,56 +49,72 @@ class Choice:
         return self.reason is Reason.SCENE
 
 
-def choose(
-    reconstructions: Sequence[Sequence[Model]],
-    image0: str,
-    image1: str,
-    matches: Matches,
-    own: Matrix3 | None,
-    config: SceneConfig,
-) -> Choice:
+def choose(pair: BatchPair, reconstructions: Sequence[Sequence[ModelImages]]) -> Choice:
     """The F of a pair, from the mean of its cameras in all reconstructions of the batch that have both.
 
-    A reconstruction is several models; the first that has both images counts. What is far from the first
-    reconstruction's is left out, see :func:`mkpc_kaggle.geometry.cameras.mean_cameras`. ``own`` is what the pair's
-    ``matches`` alone gave, ``None`` if nothing.
+    A reconstruction is several models; the first that has both images counts. A rotation that is more than
+    ``MAX_DISAGREEMENT_DEG`` from the first reconstruction's is left out.
     """
-    if image0 == image1:
+    digests = pair.image0.digest, pair.image1.digest
+    if digests[0] == digests[1]:
         return Choice(None, Reason.SAME_IMAGE)
-    found = [both for models in reconstructions if (both := cameras_in(models, image0, image1))]
-    if not found:
-        placed = {image.name for models in reconstructions for model in models for image in model.images}
-        return Choice(None, Reason.APART if {image0, image1} <= placed else Reason.UNPLACED)
+    holding = [[model for model in models if model.keys() >= set(digests)] for models in reconstructions]
+    cameras = [(models[0][digests[0]].camera, models[0][digests[1]].camera) for models in holding if models]
+    if not cameras:
+        registered = {
+            digest for models in reconstructions for model in models for digest in digests if digest in model
+        }
+        return Choice(None, Reason.APART if len(registered) == 2 else Reason.UNREGISTERED)
     try:
-        F = fundamental_of_cameras(*(found[0] if len(found) == 1 else mean_cameras(found, config.agreement)))
+        both = cameras[0] if len(cameras) == 1 else mean_cameras(cameras, MAX_DISAGREEMENT_DEG)
+        F = fundamental_of_cameras(*both)
     except ValueError:
         return Choice(None, Reason.SAME_CENTRE)
-    if own is not None and contradicts(F, own, matches, config):
-        return Choice(None, Reason.CONTRADICTION)
-    return Choice(F, Reason.SCENE)
+    return Choice(None, Reason.CONTRADICTION) if contradicts(F, pair) else Choice(F, Reason.SCENE)
 
 
-def cameras_in(models: Sequence[Model], image0: str, image1: str) -> tuple[Camera, Camera] | None:
-    """Those of two images in the first model that has both."""
-    for model in models:
-        first, second = placed_in(model, image0), placed_in(model, image1)
-        if first and second:
-            return first.camera, second.camera
-    return None
-
-
-def contradicts(F: Matrix3, own: Matrix3, matches: Matches, config: SceneConfig) -> bool:
+def contradicts(F: Matrix3, pair: BatchPair) -> bool:
     """Whether far fewer of the pair's matches agree with the scene's F than with its own.
 
-    To agree is to be within ``contradiction_error`` pixels by Sampson's distance. A pair's own F always has more
-    of its own matches, and on a facade that repeats itself it may have many times as many and be wrong: only next
-    to none counts against the scene.
+    To agree is to be within ``CONTRADICTION_ERROR_PX`` by Sampson's distance. A pair's own F always has more of
+    its own matches. On a facade that repeats itself it may have many times as many and be wrong: only a share of
+    next to nothing counts against the scene.
     """
+    if pair.pair_fundamental is None:
+        return False
     with_own, with_scene = (
-        np.count_nonzero(sampson_distances(matrix, matches) < config.contradiction_error) for matrix in (own, F)
+        np.count_nonzero(sampson_distances(matrix, pair.matches) < CONTRADICTION_ERROR_PX)
+        for matrix in (pair.pair_fundamental, F)
     )
-    return bool(with_own >= config.contradiction_matches and with_scene < config.contradiction_share * with_own)
+    return bool(with_own >= CONTRADICTION_MATCHES and with_scene < CONTRADICTION_SHARE * with_own)
 
 
-def placed_in(model: Model, name: str) -> PlacedImage | None:
-    return next((image for image in model.images if image.name == name), None)
+def estimate_at_known_focals(
+    pair: BatchPair,
+    models: Sequence[ModelImages],
+    shared: SharedIntrinsics,
+    focal_config: FocalConfig,
+    magsac: RobustConfig,
+) -> Matrix3 | None:
+    """F, (3, 3), of a pair's own matches at the focal lengths that the scene knows.
+
+    A focal length is known if the image is registered, or shares its camera with registered images. ``None`` where
+    neither is known or the matches give no F.
+    """
+    images = pair.image0, pair.image1
+    focals = [known_focal(image.digest, models, shared) for image in images]
+    if focals == [None, None]:
+        return None
+    first, second = (
+        FocalPrior.of_image(image.size, focal_config)
+        if focal is None
+        else FocalPrior.of_focal(focal, FOCAL_SIGMA, image.size)
+        for image, focal in zip(images, focals, strict=True)
+    )
+    found = estimate_with_prior(pair.matches, (first, second), magsac, focal_config)
+    return found.matrix if found.ok else None
+
+
+def known_focal(digest: str, models: Sequence[ModelImages], shared: SharedIntrinsics) -> float | None:
+    """The focal length of an image in pixels, by the first model that has it, or of the camera that it shares."""
+    return next((model[digest].focal for model in models if digest in model), shared.get(digest))

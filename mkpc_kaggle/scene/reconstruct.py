@@ -1,156 +1,122 @@
-"""Structure from motion by pycolmap: keypoints and their matches in, cameras and points out.
+"""A batch is reconstructed: pairs in, cameras and the pairs' choices out; plain values that go through a pipe."""
 
-pycolmap can end the process on its own (a failed assertion, memory), the global mapper has no time limit, and once
-it is imported a SIGTERM ends the process with a stack trace on stderr: whoever cannot afford that calls this in a
-process of its own.
-
-The same input gives the same bytes on one machine with ``threads = 1``. With more threads, sums are added in
-another order each time, and the last digits differ.
-
-Sources: Schoenberger and Frahm 2016 (the incremental mapper), Pan et al. 2024 (the global one).
-"""
-
-import tempfile
 from collections.abc import Sequence
-from pathlib import Path
-from typing import Any
+from dataclasses import dataclass, replace
 
-import numpy as np
-import pycolmap
+from mkpc_kaggle.geometry.focal_prior import FocalConfig
+from mkpc_kaggle.geometry.robust import RobustConfig
+from mkpc_kaggle.scene.choose import Choice, Reason, choose, estimate_at_known_focals
+from mkpc_kaggle.scene.config import SceneConfig
+from mkpc_kaggle.scene.reconstruction import (
+    MIN_IMAGES,
+    Reconstruction,
+    RegisteredImage,
+    SfmModel,
+    filter_models,
+)
+from mkpc_kaggle.scene.shared_intrinsics import SharedIntrinsics, shared_intrinsics
+from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair, ViewGraph
 
-from mkpc_kaggle.geometry.cameras import Camera
-from mkpc_kaggle.geometry.coordinates import Size
-from mkpc_kaggle.scene.config import Mapper, SceneConfig
-from mkpc_kaggle.scene.keypoints import SceneKeypoints
-from mkpc_kaggle.scene.model import Model, PlacedImage
-from mkpc_kaggle.scene.one_camera import OneCameras, camera_of
+MIN_PAIRS_PER_IMAGE = 1.35  # connected pairs: with fewer there is little that could contradict the cameras
+MIN_OBSERVATIONS = 0.99  # shared intrinsics stay if images see points at least this many times as often as without
 
-CENTRE = 0.5
-"""In COLMAP the top-left pixel's centre is (0.5, 0.5); here it is (0, 0)."""
+NO_SHARED: SharedIntrinsics = {}
 
 
-def reconstruct(
-    names: Sequence[str],
-    sizes: Sequence[Size],
-    keypoints: SceneKeypoints,
-    config: SceneConfig,
-    known: OneCameras,
-) -> tuple[Model, ...]:
-    """The models that pycolmap makes of connected images, as they come, the largest first; perhaps none.
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """What is known of a batch: the reconstructions of its components, and for each pair, in order, its choice.
 
-    ``names``, ``sizes`` and ``keypoints.points`` are of the same images. Each image has a camera of its own but
-    those of ``known`` cameras, which start at their focal lengths.
+    The reconstructions are those of all matches together; those of single matchers are in the choices alone. An
+    image goes by the name under which it came first.
     """
-    pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
-    pycolmap.set_random_seed(config.seed)
-    with tempfile.TemporaryDirectory(prefix="scene-") as folder:
-        database = Path(folder) / "database.db"
-        _write(database, names, sizes, keypoints, config, known)
-        _verify(database, config)
-        found = _map(database, Path(folder), len(sizes), config)
-        models = [_model(found[number], names, sizes) for number in sorted(found)]
-    return tuple(sorted(models, key=lambda model: (-len(model.images), -len(model.points))))
+
+    reconstructions: tuple[Reconstruction, ...]
+    choices: tuple[Choice, ...]
+
+    def registered(self, image: BatchImage) -> RegisteredImage | None:
+        """The image with its camera in the largest model that has it."""
+        models = models_of(self.reconstructions)
+        same = (found for model in models for found in model.images if found.image.digest == image.digest)
+        return next(same, None)
 
 
-def _write(
-    path: Path,
-    names: Sequence[str],
-    sizes: Sequence[Size],
-    keypoints: SceneKeypoints,
+def reconstruct_batch(
+    pairs: Sequence[BatchPair],
     config: SceneConfig,
-    known: OneCameras,
-) -> None:
-    """Images and frames are numbered by the image's place plus one, cameras and rigs by their first image."""
-    first: dict[Size, int] = {}
-    with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
-        for number, (name, size, points) in enumerate(zip(names, sizes, keypoints.points, strict=True), start=1):
-            camera = camera_of(known, name, size)
-            taken_by = first.setdefault(size, number) if camera else number
-            if taken_by == number:
-                focal = camera.focal if camera else config.prior_focal * max(size)
-                _write_camera(database, number, size, focal, config)
-            image = pycolmap.Image(
-                name=f"{number:06}", camera_id=taken_by, image_id=number, keypoints=np.zeros((0, 2))
-            )
-            database.write_image(image, use_image_id=True)
-            frame = pycolmap.Frame(frame_id=number, rig_id=taken_by)
-            frame.add_data_id(image.data_id)
-            database.write_frame(frame, use_frame_id=True)
-            database.write_keypoints(number, points + np.float32(CENTRE))
-        for edge in keypoints.edges:
-            database.write_matches(edge.first + 1, edge.second + 1, edge.index)
+    focal: FocalConfig | None = None,
+    magsac: RobustConfig | None = None,
+) -> Solution:
+    """Reconstruct every connected component of a batch, and choose an F for each of its pairs.
+
+    With ``focal``, the recipe's prior, and ``magsac`` (default: its defaults), a pair that gets no F from cameras
+    is estimated anew where the scene knows a focal length. Whatever the matches are, the answer is a
+    :class:`Solution`: what is missing has a reason. It takes seconds to minutes and may end the process, see
+    :mod:`mkpc_kaggle.scene.colmap`.
+    """
+    together, shared = reconstruct_sharing(ViewGraph.of_pairs(pairs), config)
+    matchers = sorted({name for pair in pairs for name in pair.tracks or ()})
+    single = matchers if config.each_matcher and len(matchers) > 1 else []
+    alone = [reconstruct_graph(ViewGraph.of_pairs(pairs, name), config, shared) for name in single]
+    by_digest = [
+        [{found.image.digest: found for found in model.images} for model in models_of(found)]
+        for found in (together, *alone)
+    ]
+    models = [model for found in by_digest for model in found]
+    choices = []
+    for pair in pairs:
+        choice = choose(pair, by_digest)
+        if focal is not None and choice.reason not in (Reason.SCENE, Reason.SAME_IMAGE):
+            F = estimate_at_known_focals(pair, models, shared, focal, magsac or RobustConfig())
+            choice = replace(choice, F=F)
+        choices.append(choice)
+    return Solution(together, tuple(choices))
 
 
-def _write_camera(database: Any, number: int, size: Size, focal: float, config: SceneConfig) -> None:
-    """A camera, and a rig of it alone."""
-    camera = pycolmap.Camera.create_from_model_name(number, config.camera_model.value, focal, *size)
-    camera.has_prior_focal_length = True  # a pair that E explains at the prior is used as calibrated
-    database.write_camera(camera, use_camera_id=True)
-    rig = pycolmap.Rig(rig_id=number)
-    rig.add_ref_sensor(camera.sensor_id)
-    database.write_rig(rig, use_rig_id=True)
+def reconstruct_sharing(
+    graph: ViewGraph, config: SceneConfig
+) -> tuple[tuple[Reconstruction, ...], SharedIntrinsics]:
+    """The reconstruction of each component, and the intrinsics that its images share.
+
+    Images that seem to share a camera are reconstructed anew with it. If images see fewer points then, they do
+    not.
+    """
+    found = reconstruct_graph(graph, config, NO_SHARED)
+    shared = shared_intrinsics(graph.images, models_of(found), config.shared_intrinsics)
+    if shared:
+        anew = reconstruct_graph(graph, config, shared)
+        before, after = (sum(one.observations for one in each) for each in (found, anew))
+        if after >= MIN_OBSERVATIONS * before:
+            return anew, shared
+    return found, NO_SHARED
 
 
-def _verify(database: Path, config: SceneConfig) -> None:
-    """Keep the matches of each pair that agree on an epipolar geometry."""
-    options = pycolmap.TwoViewGeometryOptions()
-    options.ransac.max_error = config.verification_error
-    options.ransac.random_seed = config.seed
-    options.min_num_inliers = config.least_inliers
-    options.detect_watermark = (
-        False  # it looks for matches that stand still, of which a pair of near views has many
-    )
-    threads = pycolmap.GeometricVerifierOptions()
-    threads.num_threads = config.threads
-    pycolmap.geometric_verification(database, threads, pycolmap.ExistingMatchedPairingOptions(), options)
+def reconstruct_graph(
+    graph: ViewGraph, config: SceneConfig, shared: SharedIntrinsics
+) -> tuple[Reconstruction, ...]:
+    """The reconstruction of each connected component."""
+    return tuple(reconstruct_component(component, config, shared) for component in graph.components())
 
 
-def _map(database: Path, folder: Path, image_count: int, config: SceneConfig) -> dict[int, Any]:
-    if image_count > config.most_images:
-        hierarchical = pycolmap.HierarchicalPipelineOptions()
-        hierarchical.num_threads = config.threads
-        hierarchical.num_workers = 1
-        hierarchical.clustering_options.leaf_max_num_images = config.most_images
-        hierarchical.incremental_options = _incremental(config)
-        return dict(pycolmap.hierarchical_mapping(database, folder, folder, hierarchical))
-    if config.mapper is Mapper.INCREMENTAL:
-        return dict(pycolmap.incremental_mapping(database, folder, folder, _incremental(config)))
-    return dict(pycolmap.global_mapping(database, folder, folder, _global(config)))
+def reconstruct_component(graph: ViewGraph, config: SceneConfig, shared: SharedIntrinsics) -> Reconstruction:
+    """The reconstruction of a connected graph, or why there is none."""
+    names, pairs = tuple(image.name for image in graph.images), len(graph.edges)
+    if len(names) < MIN_IMAGES:
+        return Reconstruction(names, failure=f"{len(names)} images are connected; a scene needs {MIN_IMAGES}")
+    if pairs < MIN_PAIRS_PER_IMAGE * len(names):
+        few = f"{pairs} pairs connect {len(names)} images; a scene needs {MIN_PAIRS_PER_IMAGE:g} an image"
+        return Reconstruction(names, failure=few)
+    try:
+        from mkpc_kaggle.scene.colmap import structure_from_motion
+
+        found = structure_from_motion(graph, config, shared)
+    except ImportError as error:
+        return Reconstruction(names, failure=f"pycolmap cannot be imported: {error}")
+    except (RuntimeError, ValueError) as error:
+        return Reconstruction(names, failure=f"pycolmap failed: {error}")
+    models, rejections = filter_models(found)
+    return Reconstruction(names, models, rejections, "" if models else "no plausible model came of the matches")
 
 
-def _incremental(config: SceneConfig) -> Any:
-    options = pycolmap.IncrementalPipelineOptions()
-    options.min_model_size = config.least_images
-    options.min_num_matches = config.least_inliers
-    options.extract_colors = False
-    options.num_threads = config.threads
-    for part in (options, options.mapper, options.triangulation):
-        part.random_seed = config.seed
-    return options
-
-
-def _global(config: SceneConfig) -> Any:
-    options = pycolmap.GlobalPipelineOptions()
-    options.min_model_size = config.least_images
-    options.min_num_matches = config.least_inliers
-    mapper = options.mapper
-    options.num_threads = mapper.num_threads = config.threads
-    for part in (options, mapper, mapper.rotation_averaging, mapper.global_positioning, mapper.retriangulation):
-        part.random_seed = config.seed
-    return options
-
-
-def _model(found: Any, names: Sequence[str], sizes: Sequence[Size]) -> Model:
-    images = []
-    for number in sorted(found.reg_image_ids()):
-        image = found.images[number]
-        pose, K = np.asarray(image.cam_from_world().matrix()), np.array(image.camera.calibration_matrix())
-        K[:2, 2] -= CENTRE
-        camera = Camera(K, pose[:, :3].copy(), pose[:, 3].copy())
-        images.append(PlacedImage(names[number - 1], sizes[number - 1], camera, int(image.num_points3D)))
-    points = [found.points3D[number].xyz for number in sorted(found.point3D_ids())]
-    return Model(
-        tuple(images),
-        np.array(points, np.float64).reshape(-1, 3),
-        float(found.compute_mean_reprojection_error()) if points else 0.0,
-    )
+def models_of(reconstructions: Sequence[Reconstruction]) -> list[SfmModel]:
+    return [model for found in reconstructions for model in found.models]

@@ -4,9 +4,8 @@ Importing this package imports no torch.
 """
 
 from mkpc_kaggle.weights.checkpoint import load_into, load_tensors
-from mkpc_kaggle.weights.found import FoundFile, State
-from mkpc_kaggle.weights.manifest import UNVERIFIED, WeightFile, manifest, parse_manifest
-from mkpc_kaggle.weights.store import WeightStore
+from mkpc_kaggle.weights.manifest import UNVERIFIED, WeightFile, manifest
+from mkpc_kaggle.weights.store import FoundFile, State, WeightStore
 
 __all__ = [
     "UNVERIFIED",
@@ -17,5 +16,4 @@ __all__ = [
     "load_into",
     "load_tensors",
     "manifest",
-    "parse_manifest",
 ]

@@ -1,58 +1,48 @@
 """Tensors from a checkpoint file, without running any code in it, and from there into a network."""
 
+import pickletools
 import re
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from pickle import UnpicklingError
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any
 
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.weights.inert import load_inert, load_legacy
-from mkpc_kaggle.weights.unpacked import pack
 
 if TYPE_CHECKING:
     import torch
     from torch import nn
 
+MAX_EXPANSION = 4  # bytes of tensors for each byte of the file: some tensors share their bytes
+MAX_PICKLE_BYTES = 1 << 20  # 1,000 tensors take some 200 kB; a byte of pickle can become 200 in memory
+LEGACY_PICKLES = 5  # before torch 1.6 a file began with: magic number, protocol, system, contents, storage keys
 
-MOST_EXPANSION = 4
-"""How many times a file's bytes its tensors may have: some share theirs."""
+
+class Inert:
+    """Stands for every class and function in a pickle that torch does not know; it does nothing."""
+
+    def __new__(cls, *_: object, **__: object) -> "Inert":
+        return object.__new__(cls)
+
+    def __setstate__(self, _: object) -> None:
+        pass
 
 
 def load_tensors(path: Path) -> "dict[str, torch.Tensor]":
     """Tensors by name, on the CPU, from a safetensors file or a torch checkpoint; nothing in the file is executed.
 
     ``path`` may be the directory into which a torch checkpoint was unpacked (``NAME/NAME`` on Kaggle).
-    A training checkpoint has them under ``state_dict``, DISK's under ``extractor``; its other entries are left
-    out. Raises :class:`UserError` for a file that cannot be read, or whose table of tensors holds anything
-    else: tensors that are sparse, quantised, nested or on no device are none here, nor are those with more
-    elements than the file has.
+    A training checkpoint has its tensors under ``state_dict``, DISK's under ``extractor``; its other entries are
+    left out. Raises :class:`UserError` if the file cannot be read, if an entry is not a dense tensor with a name,
+    or if the tensors have many more bytes than the file.
     """
-    import torch
-
     try:
         table = _load_table(path)
+        _require_plain(table, path)
     except Exception as error:
         raise UserError(f"{path} cannot be read as a checkpoint: {error}") from error
-    odd = [
-        str(name)
-        for name, value in table.items()
-        if not isinstance(name, str) or not isinstance(value, torch.Tensor) or not _is_plain(value)
-    ]
-    if odd:
-        raise UserError(
-            f"{path} cannot be read as a checkpoint: not all of its entries are plain tensors with a name: "
-            f"{', '.join(odd[:5])}. Save the network's state_dict alone."
-        )
-    size = (
-        path.stat().st_size
-        if path.is_file()
-        else sum(record.stat().st_size for record in path.rglob("*") if record.is_file())
-    )
-    if sum(tensor.nbytes for tensor in table.values()) > MOST_EXPANSION * size:
-        raise UserError(f"{path} cannot be read as a checkpoint: its tensors are larger than the file")
     return {name: tensor.detach() for name, tensor in table.items()}
 
 
@@ -62,8 +52,8 @@ def load_into(
     """Load a checkpoint into a network: all names and shapes must agree.
 
     Only entries whose names match the pattern ``unused`` may be missing or surplus. A network made on the device
-    "meta" takes over the tensors themselves, so that a large one is not in memory twice. Raises
-    :class:`UserError` naming some of those that do not fit.
+    "meta" takes over the tensors themselves, so that a large network is not in memory twice. Raises
+    :class:`UserError` that names some of the entries that do not fit.
     """
     own = network.state_dict()
     odd = [name for name in own.keys() ^ tensors.keys() if not re.match(unused, name)]
@@ -74,44 +64,95 @@ def load_into(
     network.load_state_dict({**own, **fitting}, assign=any(tensor.is_meta for tensor in own.values()))
 
 
-def _is_plain(tensor: "torch.Tensor") -> bool:
-    """Whether its elements lie in memory, one by one."""
+def _require_plain(table: Mapping[Any, Any], path: Path) -> None:
+    """Raise ``ValueError`` unless all entries have a name and are tensors whose elements lie in memory."""
     import torch
 
-    return (
-        tensor.layout is torch.strided
-        and tensor.device.type == "cpu"
-        and not (tensor.is_quantized or tensor.is_nested)
-        and tensor.nbytes <= tensor.untyped_storage().nbytes()
-    )
+    odd = [
+        str(name)
+        for name, value in table.items()
+        if not isinstance(name, str)
+        or not isinstance(value, torch.Tensor)
+        or value.layout is not torch.strided
+        or value.device.type != "cpu"
+        or value.is_quantized
+        or value.is_nested
+        or value.nbytes > value.untyped_storage().nbytes()
+    ]
+    if odd:
+        raise ValueError(
+            f"not all of its entries are plain tensors with a name: {', '.join(odd[:5])}. Save the network's "
+            "state_dict alone."
+        )
+    files = [path] if path.is_file() else list(path.rglob("*"))
+    file_bytes = sum(file.stat().st_size for file in files if file.is_file())
+    if sum(tensor.nbytes for tensor in table.values()) > MAX_EXPANSION * file_bytes:
+        raise ValueError("its tensors are larger than the file")
 
 
 def _load_table(path: Path) -> Mapping[Any, Any]:
     if path.is_dir():
         with TemporaryDirectory(prefix="mkpc-") as temporary:
-            return _load_table(pack(path, Path(temporary) / "checkpoint.pt"))
+            return _load_table(_pack(path, Path(temporary) / "checkpoint.pt"))
     if path.exists() and not path.is_file():
-        raise ValueError("no regular file")
+        raise ValueError("not a regular file")
     if path.suffix == ".safetensors":
         from safetensors.torch import load_file
 
         return load_file(path)
     try:
-        if zipfile.is_zipfile(path):
-            return _state_dict(load_inert(path))
-        return _state_dict(load_legacy(path))
+        contents = _unpickle(path)
     except (RuntimeError, EOFError, UnpicklingError, LookupError) as refusal:
-        # torch's message advises to load it unsafely.
+        # torch's message advises to load the file unsafely.
         raise ValueError(
-            "it is none, or holds objects that are not read here; save the network's state_dict alone"
+            "it is not a checkpoint, or holds objects that are not read here; save the network's state_dict alone"
         ) from refusal
-
-
-def _state_dict(contents: object) -> Mapping[Any, Any]:
-    """The table of tensors in what a file holds."""
-    table = contents
     if isinstance(contents, dict):
-        table = contents.get("state_dict", contents.get("extractor", contents))
-    if not isinstance(table, dict):
+        contents = contents.get("state_dict", contents.get("extractor", contents))
+    if not isinstance(contents, dict):
         raise ValueError("it holds no table of tensors by name")
-    return table
+    return contents
+
+
+def _pack(directory: Path, file: Path) -> Path:
+    """Write an unpacked checkpoint as one archive again, ``file``; raises ``OSError``."""
+    # Mounted files may be dated 1970, which is before the format's first year.
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED, strict_timestamps=False) as archive:
+        for path in sorted(path for path in directory.rglob("*") if path.is_file()):
+            archive.write(path, f"archive/{path.relative_to(directory).as_posix()}")
+    return file
+
+
+def _unpickle(path: Path) -> object:
+    """The contents of a torch checkpoint, tensors on the CPU.
+
+    Training frameworks pickle callbacks and settings of classes that are not installed here, which
+    ``weights_only=True`` refuses. In an archive such names are mapped to :class:`Inert`; torch still refuses names
+    of the operating system. The format before archives may hold no unknown names.
+    """
+    import torch
+    from torch.serialization import get_unsafe_globals_in_checkpoint, safe_globals
+
+    if not zipfile.is_zipfile(path):
+        with path.open("rb") as stream:
+            for _ in range(LEGACY_PICKLES):
+                _require_small(stream)
+        return torch.load(path, map_location="cpu", weights_only=True)
+    with zipfile.ZipFile(path) as archive:
+        if sum(record.file_size for record in archive.infolist()) > path.stat().st_size:
+            raise ValueError("its records are compressed or overlap, which torch never writes")
+        for name in archive.namelist():
+            if name.endswith("data.pkl"):
+                with archive.open(name) as stream:
+                    _require_small(stream)
+    with safe_globals([(Inert, name) for name in get_unsafe_globals_in_checkpoint(path)]):
+        return torch.load(path, map_location="cpu", weights_only=True)
+
+
+def _require_small(stream: IO[bytes]) -> None:
+    """Raise ``ValueError`` if the next pickle would take all memory: if it is long, or makes a bytearray."""
+    for opcode, argument, position in pickletools.genops(stream):
+        if (position or 0) > MAX_PICKLE_BYTES:
+            raise ValueError(f"its pickle has more than {MAX_PICKLE_BYTES} bytes")
+        if opcode.name == "GLOBAL" and str(argument).endswith(" bytearray"):
+            raise ValueError("its pickle makes a bytearray, which may have any size")

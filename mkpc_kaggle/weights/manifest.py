@@ -1,32 +1,32 @@
 """The weights manifest: every file that a matcher can use.
 
-``weights_manifest.txt`` has one line a file, columns split by blanks, ``#`` starts a comment::
+``weights_manifest.txt`` has one line for each file, columns split by blanks; ``#`` starts a comment::
 
     name  bytes  digest  licence  slot  source
 
-``bytes`` is a number or ``?``. ``digest`` is ``sha256:<64 hex>``, or ``git-blob:<40 hex>`` (what ``git
-hash-object`` gives), or ``unverified``. A *slot* is what a matcher asks for; lines of one slot are alternatives,
-the first that is found is taken.
+``bytes`` is a number or ``?``. ``digest`` is ``sha256:<64 hex>`` or ``unverified``. A *slot* is what a matcher
+asks for. Lines of one slot are alternatives: the first file that is found is taken.
 """
 
+import errno
+import hashlib
 import re
+import stat
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.weights.digests import file_digests
 
 MANIFEST = "weights_manifest.txt"
-LARGEST = 1 << 20
-"""Bytes."""
+MAX_BYTES = 1 << 20
 UNVERIFIED = "unverified"
-DIGEST = re.compile(rf"sha256:[0-9a-f]{{64}}|git-blob:[0-9a-f]{{40}}|{UNVERIFIED}")
+DIGEST = re.compile(rf"sha256:[0-9a-f]{{64}}|{UNVERIFIED}")
 
 
 @dataclass(frozen=True)
 class WeightFile:
-    """One line of the manifest; ``size`` in bytes, -1 where it is not known."""
+    """A line of the manifest; ``size`` in bytes, -1 if it is not known."""
 
     name: str
     size: int
@@ -43,7 +43,7 @@ class WeightFile:
 
 
 def parse_manifest(text: str, where: str = "the weights manifest") -> tuple[WeightFile, ...]:
-    """All lines of a manifest; raises :class:`UserError` naming the line that cannot be read."""
+    """All lines of a manifest; raises :class:`UserError` that names the line that cannot be read."""
     files = []
     for number, line in enumerate(text.splitlines(), start=1):
         columns = line.partition("#")[0].split(maxsplit=5)
@@ -53,25 +53,55 @@ def parse_manifest(text: str, where: str = "the weights manifest") -> tuple[Weig
 
 
 def read_manifest(path: Path) -> tuple[WeightFile, ...]:
-    """A manifest's file; raises :class:`UserError` where it or one of its lines cannot be read."""
+    """The lines of a manifest's file; raises :class:`UserError` if it cannot be read."""
     try:
-        if not path.is_file() or path.stat().st_size > LARGEST:
-            raise OSError(f"it is no regular file of at most {LARGEST} bytes")
+        if not path.is_file() or path.stat().st_size > MAX_BYTES:
+            raise OSError(f"it is not a regular file of at most {MAX_BYTES} bytes")
         return parse_manifest(path.read_text(encoding="utf-8"), str(path))
     except (OSError, UnicodeError) as error:
         raise UserError(f"{path} cannot be read: {error}") from error
 
 
-def pin(file: WeightFile, path: Path) -> WeightFile:
-    """The line with the size and digest of what lies at ``path``, also added to the manifest in its directory."""
-    digests = file_digests(path)
-    pinned = replace(file, size=digests.size, digest=digests.sha256)
+@cache
+def manifest() -> tuple[WeightFile, ...]:
+    """The manifest that came with the package (in a wheel: inside it; in a checkout: beside it)."""
+    package = Path(__file__).resolve().parents[1]
+    for path in (package / MANIFEST, package.parent / MANIFEST):
+        if path.is_file():
+            return read_manifest(path)
+    raise UserError(f"{MANIFEST} is missing from {package}: install the package again")
+
+
+def pin(file: WeightFile, path: Path) -> None:
+    """Add the line, with the size and digest of the file at ``path``, to the manifest in its directory."""
+    pinned = replace(file, size=path.stat().st_size, digest=digest_of(path))
     own = path.with_name(MANIFEST)
     former = own.read_text(encoding="utf-8") if own.is_file() else ""
     part = own.with_name(f"{MANIFEST}.part")
+    part.unlink(missing_ok=True)  # it may be a link
     part.write_text(f"{former}{pinned.line}\n", encoding="utf-8")
     part.replace(own)
-    return pinned
+
+
+def digest_of(path: Path) -> str:
+    """``sha256:<hex>`` of a file, cached for the process, or of all files in a directory and of their names.
+
+    Raises ``OSError`` if it cannot be read.
+    """
+    if path.is_dir():
+        files = sorted(file for file in path.rglob("*") if file.is_file())
+        lines = (f"{digest_of(file)[7:]} {file.relative_to(path).as_posix()}\n" for file in files)
+        return f"sha256:{hashlib.sha256(''.join(lines).encode()).hexdigest()}"
+    status = path.stat()
+    if not stat.S_ISREG(status.st_mode):
+        raise OSError(errno.EINVAL, "not a regular file", str(path))
+    return _file_digest(path.resolve(), status.st_size, status.st_mtime_ns)
+
+
+@cache
+def _file_digest(path: Path, _size: int, _modified_ns: int) -> str:  # size and time are part of the cache's key
+    with path.open("rb") as stream:
+        return f"sha256:{hashlib.file_digest(stream, 'sha256').hexdigest()}"
 
 
 def _parse_line(columns: list[str], where: str) -> WeightFile:
@@ -84,17 +114,6 @@ def _parse_line(columns: list[str], where: str) -> WeightFile:
         raise UserError(f"{where}: bytes must be a number or '?', not {size!r}")
     if not DIGEST.fullmatch(digest):
         raise UserError(
-            f"{where}: digest must be 'sha256:' with 64 hexadecimal digits, 'git-blob:' with 40, or "
-            f"'{UNVERIFIED}', not {digest!r}"
+            f"{where}: digest must be 'sha256:' with 64 hexadecimal digits or '{UNVERIFIED}', not {digest!r}"
         )
     return WeightFile(name, -1 if size == "?" else int(size), digest, licence, slot, source.strip())
-
-
-@cache
-def manifest() -> tuple[WeightFile, ...]:
-    """The manifest that came with the package (in a wheel: inside it; in a checkout: beside it)."""
-    package = Path(__file__).resolve().parents[1]
-    for path in (package / MANIFEST, package.parent / MANIFEST):
-        if path.is_file():
-            return read_manifest(path)
-    raise UserError(f"{MANIFEST} is missing from {package}: install the package again")

@@ -1,28 +1,60 @@
-"""The weight files of this machine, found by name or by digest."""
+"""The weight files of this machine, found by name or by digest and judged against the manifest."""
 
 import os
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from enum import StrEnum
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.errors import UserError, warn_once
 from mkpc_kaggle.weights.checkpoint import load_tensors
-from mkpc_kaggle.weights.found import FoundFile, examine, examine_unpacked, recognise
-from mkpc_kaggle.weights.manifest import MANIFEST, UNVERIFIED, WeightFile, manifest, read_manifest
-from mkpc_kaggle.weights.notices import warn_once
-from mkpc_kaggle.weights.tree import Tree
+from mkpc_kaggle.weights.manifest import MANIFEST, UNVERIFIED, WeightFile, digest_of, manifest, read_manifest
 
 if TYPE_CHECKING:
     import torch
 
 KAGGLE_INPUT = Path("/kaggle/input")
+IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png"})  # a competition's input has thousands of them
+CHECKPOINT_SUFFIXES = frozenset({".pth", ".pt", ".ckpt", ".safetensors", ".bin", ".pkl", ""})
+MAX_UNKNOWN_SIZE_BYTES = 1 << 28  # the files whose size is not known have some 50 MB; larger files are not read
+UNPACKED = (
+    "this checkpoint was unpacked into a directory, as Kaggle does; it is read from there, but cannot be held "
+    "against the manifest's digest. Upload it as safetensors (python -m mkpc_kaggle weights convert)"
+)
+
+
+class State(StrEnum):
+    """What the comparison with the manifest says of a file."""
+
+    GOOD = "good"  # the bytes of a file of the manifest, whatever the name
+    UNVERIFIED = "unverified"  # the manifest has no digest, or the checkpoint was unpacked into a directory
+    REFUSED = "refused"  # cannot be read, or has other bytes than the manifest says
+
+
+@dataclass(frozen=True)
+class FoundFile:
+    """A file that was compared with its line of the manifest.
+
+    ``path`` is a directory if the checkpoint was unpacked into it. ``digest`` is ``sha256:<hex>`` of the bytes,
+    empty for an unreadable file. ``note`` is the reason for the state.
+    """
+
+    file: WeightFile
+    path: Path
+    state: State
+    digest: str
+    note: str = ""
+
+    @property
+    def usable(self) -> bool:
+        return self.state is not State.REFUSED
 
 
 @dataclass(frozen=True)
 class Search:
-    """What was found, if anything, and files of the right name that were refused."""
+    """The file that was found, if any, and the files of the right name that were refused."""
 
     found: FoundFile | None
     refused: tuple[FoundFile, ...] = ()
@@ -31,8 +63,8 @@ class Search:
 class WeightStore:
     """Weight files in search directories: ``--weights``, then ``$MKPC_WEIGHTS``, then ``/kaggle/input/**``.
 
-    They are compared with ``files``; by default the package's manifest and those in the search directories, which
-    list weights that ``package`` converted.
+    They are compared with ``files``; by default these are the package's manifest and the manifests in the search
+    directories, which list weights that ``package`` converted.
     """
 
     def __init__(self, directories: Iterable[Path] = (), files: Sequence[WeightFile] | None = None) -> None:
@@ -43,50 +75,48 @@ class WeightStore:
         environment = [Path(part) for part in os.environ.get("MKPC_WEIGHTS", "").split(os.pathsep) if part]
         self.directories = given + environment + ([KAGGLE_INPUT] if KAGGLE_INPUT.is_dir() else [])
         self._given_files = None if files is None else tuple(files)
-        self._trees = [Tree(place) for place in dict.fromkeys(self.directories) if place.is_dir()]
         self._searches: dict[tuple[WeightFile, ...], Search] = {}
+
+    @property
+    def searched(self) -> str:
+        """The search directories, for messages."""
+        return ", ".join(map(str, self.directories)) or "nowhere: name a directory with --weights"
 
     @cached_property
     def files(self) -> tuple[WeightFile, ...]:
         """The lines to compare with, one for each name; the package's manifest comes first.
 
-        Where it has no digest, one of a manifest in the search directories counts: what was first fetched there.
+        If it has no digest for a file, the digest of a manifest in the search directories counts: that of the
+        first download.
         """
         if self._given_files is not None:
             return self._given_files
         lines = {file.name: file for file in manifest()}
-        for tree in self._trees:
-            for path in tree.named(MANIFEST):
-                try:
-                    here = read_manifest(path)
-                except UserError as error:
-                    warn_once(f"passed over: {error}")
-                    continue
-                for file in here:
-                    known = lines.setdefault(file.name, file)
-                    if known.digest == UNVERIFIED:
-                        lines[file.name] = replace(known, size=file.size, digest=file.digest)
+        for path in self._named(MANIFEST):
+            try:
+                here = read_manifest(path)
+            except UserError as error:
+                warn_once(f"passed over: {error}")
+                continue
+            for file in here:
+                known = lines.setdefault(file.name, file)
+                if known.digest == UNVERIFIED:
+                    lines[file.name] = replace(known, size=file.size, digest=file.digest)
         return tuple(lines.values())
 
     def alternatives(self, slot: str) -> list[WeightFile]:
-        """The manifest's lines for a slot, in order of preference; raises ``KeyError`` for an unknown slot."""
-        lines = [file for file in self.files if file.slot == slot]
-        if not lines:
-            raise KeyError(f"no file in the manifest is for the slot {slot!r}")
-        return lines
+        """The manifest's lines for a slot, in order of preference."""
+        return [file for file in self.files if file.slot == slot]
 
     def find(self, slot: str) -> FoundFile | None:
-        """The slot's file, its bytes checked against the manifest; ``None`` where there is none.
-
-        A file that is not what the manifest says is skipped with a warning.
-        """
+        """The slot's file; ``None`` if there is none. Warns of files of the right name that are refused."""
         search = self.search(self.alternatives(slot))
-        for one in search.refused:
-            warn_once(f"passed over: {one.path}: {one.note}")
+        for refused in search.refused:
+            warn_once(f"passed over: {refused.path}: {refused.note}")
         return search.found
 
     def load(self, slot: str) -> "dict[str, torch.Tensor]":
-        """The slot's tensors by name, on the CPU; raises :class:`UserError` where the file is missing.
+        """The slot's tensors by name, on the CPU; raises :class:`UserError` if the file is missing.
 
         The first time that an unverified file is loaded, a warning names its digest, so that it can be pinned.
         """
@@ -94,62 +124,104 @@ class WeightStore:
         if found is None:
             names = " or ".join(file.name for file in self.alternatives(slot))
             raise UserError(f"no weights for {slot!r}: {names} not found (searched {self.searched})")
-        if not found.verified:
+        if found.state is State.UNVERIFIED:
             warn_once(f"{found.path} is not verified: {found.note}")
         return load_tensors(found.path)
 
-    @property
-    def searched(self) -> str:
-        """The search directories, for messages."""
-        return ", ".join(map(str, self.directories)) or "nowhere: name a directory with --weights"
-
     def search(self, lines: Sequence[WeightFile]) -> Search:
-        """The first good file of these lines, searched by name and then by digest; cached."""
+        """The first usable file of these lines; cached, also for the processes that the store is sent to."""
         key = tuple(lines)
         if key not in self._searches:
-            self._searches[key] = self._search(lines)
+            judged: dict[Path, FoundFile] = {}  # of two verdicts on a path the last counts: that of its digest
+            for file in self._candidates(lines):
+                judged[file.path] = file
+                if file.usable:
+                    break
+            found = next((file for file in judged.values() if file.usable), None)
+            self._searches[key] = Search(found, tuple(file for file in judged.values() if not file.usable))
         return self._searches[key]
 
     def verify(self) -> list[FoundFile]:
-        """Every file found, by path: those with a name of the manifest, and others with one of its digests."""
-        lines = {file.name: file for file in self.files}
-        found = {
-            path: examine(path, lines[path.name], self.files)
-            for tree in self._trees
-            for path in tree.files
-            if path.name in lines
-        }
-        for one in (*self._unpacked(self.files), *self._by_digest(self.files)):
-            found.setdefault(one.path, one)
-        return sorted(found.values(), key=lambda one: one.path)
+        """Every file found, by path: all with a name of the manifest, and others with one of its digests."""
+        found: dict[Path, FoundFile] = {}
+        for candidate in self._candidates(self.files):
+            found.setdefault(candidate.path, candidate)
+        return sorted(found.values(), key=lambda file: file.path)
 
-    def _search(self, lines: Sequence[WeightFile]) -> Search:
-        refused: list[FoundFile] = []
-        for one in self._by_name(lines):
-            if one.state.usable:
-                return Search(one, tuple(refused))
-            refused.append(one)
-        found = next(self._by_digest(lines), None) or next(self._unpacked(lines), None)
-        return Search(found, tuple(one for one in refused if found is None or one.path != found.path))
-
-    def _by_name(self, lines: Sequence[WeightFile]) -> Iterator[FoundFile]:
+    def _candidates(self, lines: Sequence[WeightFile]) -> Iterator[FoundFile]:
+        """The files for these lines: those of the name, those of the digest, those that were unpacked."""
         for file in lines:
-            for tree in self._trees:
-                for path in tree.named(file.name):
-                    yield examine(path, file, self.files)
-
-    def _unpacked(self, lines: Sequence[WeightFile]) -> Iterator[FoundFile]:
-        for file in lines:
-            for tree in self._trees:
-                for path in tree.unpacked_named(file.name):
-                    yield examine_unpacked(path, file)
-
-    def _by_digest(self, lines: Sequence[WeightFile]) -> Iterator[FoundFile]:
-        for file in lines:
-            if file.digest == UNVERIFIED:
-                continue
-            for tree in self._trees:
-                for path in tree.candidates(file.size):
-                    found = recognise(path, file)
-                    if found is not None:
+            for path in self._named(file.name):
+                yield judge(path, file, self.files)
+        sizes, unpacked = self._walked
+        for file in (line for line in lines if line.digest != UNVERIFIED):
+            for path, size in sizes.items():
+                small = 0 <= size <= MAX_UNKNOWN_SIZE_BYTES and path.suffix.lower() in CHECKPOINT_SUFFIXES
+                if size == file.size or (file.size < 0 and small):
+                    found = judge(path, file)
+                    if found.state is State.GOOD:
                         yield found
+        for file in lines:
+            yield from (judge(directory, file) for directory in unpacked if is_unpacked_from(directory, file))
+
+    def _named(self, name: str) -> list[Path]:
+        return [path for path in self._walked[0] if path.name == name]
+
+    @cached_property
+    def _walked(self) -> tuple[dict[Path, int], list[Path]]:
+        """Bytes of all files but images (-1: not a regular file), by directory and depth; unpacked checkpoints.
+
+        Links are followed, since Kaggle mounts inputs by links; no directory is entered twice, so that cycles end.
+        """
+        sizes: dict[Path, int] = {}
+        unpacked: list[Path] = []
+        entered: set[tuple[int, int]] = set()
+        for root in self.directories:
+            files: list[Path] = []
+            for folder, folders, names in os.walk(root, followlinks=True):
+                status = Path(folder).stat()
+                again = (status.st_dev, status.st_ino) in entered
+                checkpoint = "data" in folders and "data.pkl" in names  # an archive that Kaggle unpacked
+                entered.add((status.st_dev, status.st_ino))
+                if again or checkpoint:
+                    folders.clear()  # os.walk goes no deeper
+                if checkpoint and not again:
+                    unpacked.append(Path(folder))
+                elif not again:
+                    files += [Path(folder, name) for name in names]
+            for path in sorted(files, key=lambda path: (len(path.parts), path)):
+                if path.suffix.lower() not in IMAGE_SUFFIXES:
+                    sizes[path] = path.stat().st_size if os.path.isfile(path) else -1  # noqa: PTH113  never raises
+        return sizes, unpacked
+
+
+def judge(path: Path, file: WeightFile, files: Iterable[WeightFile] = ()) -> FoundFile:
+    """The file at ``path``, or unpacked into it, by the name of ``file``; ``files`` is the whole manifest."""
+    try:
+        digest, size = digest_of(path), path.stat().st_size
+    except OSError as error:
+        return FoundFile(file, path, State.REFUSED, "", f"cannot be read: {error.strerror}")
+    other = next((line.name for line in files if line.digest == digest), "")
+    state, note = State.REFUSED, ""
+    if digest == file.digest:
+        state, note = State.GOOD, "" if path.name == file.name else f"it is {file.name}"
+    elif path.is_dir():
+        state, note = State.UNVERIFIED, UNPACKED
+    elif other:
+        note = f"its bytes are those of {other}"
+    elif 0 <= file.size != size:
+        note = f"{size} bytes, the manifest says {file.size}: truncated, or another file"
+    elif file.digest == UNVERIFIED:
+        state, note = State.UNVERIFIED, f"the manifest has no digest for it; this file's is {digest}"
+    else:
+        note = f"its digest is {digest}, the manifest says {file.digest}: damaged, or another file"
+    return FoundFile(file, path, state, digest, note)
+
+
+def is_unpacked_from(directory: Path, file: WeightFile) -> bool:
+    """Whether ``directory`` has a name that Kaggle gives to the unpacked ``file``.
+
+    Kaggle unpacks uploaded archives, and torch's checkpoints are archives: ``NAME.pth`` becomes
+    ``NAME/NAME/{data.pkl, data/, version, ...}``, with or without the suffix in the outer name.
+    """
+    return bool({directory.name, directory.parent.name} & {file.name, Path(file.name).stem})

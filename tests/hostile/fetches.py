@@ -1,11 +1,10 @@
-"""Servers that lie, wander or dawdle: ``weights fetch`` from a server of the test's own."""
+"""Servers that lie or wander: ``weights fetch`` from a server of the test's own."""
 
 import contextlib
 import hashlib
 import os
 import socket
 import threading
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -67,20 +66,16 @@ PARTS: dict[str, Callable[[Path], object]] = {
     "a directory": Path.mkdir,
     "other bytes": lambda path: path.write_bytes(b"x" * 500),
     "too many bytes": lambda path: path.write_bytes(DATA * 2),
-    "a mark with a line feed": lambda path: [
-        path.write_bytes(DATA[:500]),
-        path.with_name("a.bin.part.mark").write_text("a\r\nHost: b"),
-    ],
 }
 
 
 class Server:
     """Gives each connection the same answer, whatever is asked."""
 
-    def __init__(self, answer: list[bytes], pause: float = 0.0) -> None:
+    def __init__(self, answer: list[bytes]) -> None:
         self._socket = socket.create_server(("127.0.0.1", 0))
         self.port = self._socket.getsockname()[1]
-        self._answer, self._pause = answer, pause
+        self._answer = answer
         threading.Thread(target=self._serve, daemon=True).start()
 
     def _serve(self) -> None:
@@ -93,18 +88,13 @@ class Server:
             connection.recv(65536)
             for part in self._answer:
                 connection.sendall(part)
-            while self._pause:
-                time.sleep(self._pause)
-                connection.sendall(b"x")
 
 
-def served(
-    answer: list[bytes], pause: float = 0.0, size: str = "102400", part: Callable[[Path], object] = nothing
-):
+def served(answer: list[bytes], size: str = "102400", part: Callable[[Path], object] = nothing):
     """A manifest beside weights, with a file from a server that answers so."""
 
     def make(room: Path) -> None:
-        server = Server(answer, pause)
+        server = Server(answer)
         (room / "listed").mkdir()
         line = f"a.bin  {size}  {DIGEST}  MIT  slot  http://127.0.0.1:{server.port}/a.bin\n"
         (room / "listed" / "weights_manifest.txt").write_text(line)
@@ -126,5 +116,4 @@ CASES = [
         Case("fetches", f"{name} for the part", FETCH, served([WHOLE, DATA], part=part), (0, 1), env=ENV)
         for name, part in PARTS.items()
     ),
-    Case("fetches", "a byte now and then", FETCH, served([OK + b"A: "], pause=5.0), (1,), env=ENV, seconds=240),
 ]

@@ -32,7 +32,7 @@ QUICK = (
     "journals: F of NaN, resumed",
     "journals: points of a gigabyte, read",
     "recipes: deep tables",
-    "weights: a tuple in a tuple, a million times",
+    "weights: a bytearray of 6 GB",
     "fetches: a redirection to a file",
     "fetches: a link for the part",
     "arguments: check of a submission of NaN",

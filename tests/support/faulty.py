@@ -23,7 +23,8 @@ from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.pipeline.assembly import Assembly
 from mkpc_kaggle.pipeline.stages import Pipeline
 from mkpc_kaggle.scene.choose import Choice, Reason
-from mkpc_kaggle.scene.model import Model, PlacedImage, Scene
+from mkpc_kaggle.scene.reconstruction import Reconstruction, RegisteredImage, SfmModel
+from mkpc_kaggle.scene.view_graph import BatchImage
 
 
 def pipeline_once(assembly: Assembly, marker: Path) -> Pipeline:
@@ -36,7 +37,7 @@ def pipeline_once(assembly: Assembly, marker: Path) -> Pipeline:
 
 def pipeline_in_batches(assembly: Assembly, batch: int) -> Pipeline:
     """As on a GPU."""
-    return Pipeline(assembly.recipe, assembly.matchers.__getitem__, batch=batch)
+    return Pipeline(assembly.recipe, assembly.matchers.__getitem__, minibatch=batch)
 
 
 def pipeline_telling_its_environment(assembly: Assembly, told: Path) -> Pipeline:
@@ -203,11 +204,12 @@ def choose_scene_for_all_but_the_first(job: SceneJob, answers: Connection) -> No
     """As a reconstruction would, without one; it makes as many points as there are matches."""
     choices = {index: Choice(SCENE_F, Reason.SCENE) for index in job.indices[1:]}
     choices[job.indices[0]] = Choice(None, Reason.CONTRADICTION)
-    names = tuple(sorted({name for pair in job.pairs for name in (pair.image0, pair.image1)}))
+    names = tuple(sorted({name for pair in job.pairs for name in (pair.image0.name, pair.image1.name)}))
     camera = Camera(np.eye(3), np.eye(3), np.zeros(3))
-    placed = tuple(PlacedImage(name, Size(80, 72), camera, 99) for name in names)
+    images = (BatchImage(name, name, Size(80, 72)) for name in names)
+    registered = tuple(RegisteredImage(image, camera, 99) for image in images)
     points = np.zeros((sum(len(pair.matches) for pair in job.pairs), 3))
-    answers.send(((Scene(names, (Model(placed, points, 0.5),)),), choices))
+    answers.send(((Reconstruction(names, (SfmModel(registered, points, 0.5),)),), choices))
 
 
 def die_as_scene(*_: object) -> None:
@@ -235,7 +237,7 @@ def exhaust_memory_as_scene(*_: object) -> None:
 
 def exhaust_memory_within_pycolmap(job: SceneJob, answers: Connection) -> None:
     """Four megabytes are left when it begins."""
-    import mkpc_kaggle.scene.reconstruct  # noqa: F401  # that is not what fails
+    import mkpc_kaggle.scene.colmap  # noqa: F401  # that is not what fails
 
     limit_memory(4 << 20)
     os.close(2)

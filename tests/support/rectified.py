@@ -28,7 +28,7 @@ from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import MatcherSpec, Picture
 from mkpc_kaggle.pipeline.assembly import assemble
 from mkpc_kaggle.pipeline.stages import Pipeline
-from mkpc_kaggle.recipe import Recipe, Unit, UpgradeConfig
+from mkpc_kaggle.recipe import Recipe, Unit
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,8 +71,7 @@ class RectifiedMatcher:
 
 
 SWEEP, SECOND, THIRD = Unit(1, "rectified", 96), Unit(2, "rectified", 128), Unit(1, "rectified", 160)
-EXTRA = Unit(1, "rectified", 192, extra=True)
-THREE_UNITS = Recipe((SWEEP, SECOND, THIRD), upgrade=UpgradeConfig(below_inliers=0))
+THREE_UNITS = Recipe((SWEEP, SECOND, THIRD))
 
 
 def write_pairs(directory: Path, count: int) -> list[Pair]:

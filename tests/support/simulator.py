@@ -5,23 +5,34 @@ drifts, stalls, crashes, hangs and wrong first estimates are thrown in. So are r
 crash, run out of memory and hang as well.
 """
 
-import heapq
 import math
 import threading
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from itertools import starmap
 
 import numpy as np
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.engine import Ending, Engine, RunReport
-from mkpc_kaggle.engine.jobs import Cause, Job, JobFailure, JobResult, Outcome
-from mkpc_kaggle.engine.planner import RESERVE_SHARE
-from mkpc_kaggle.engine.pools.pool import JOBS_A_WORKER
+from mkpc_kaggle.engine.jobs import (
+    Answer,
+    Cause,
+    Failure,
+    Job,
+    Loaded,
+    MatchJob,
+    MatchResult,
+    Outcome,
+    SceneJob,
+    SceneResult,
+)
+from mkpc_kaggle.engine.places import Place
+from mkpc_kaggle.engine.plan import RESERVE_SHARE
 from mkpc_kaggle.engine.records import NOT_REACHED, PairRecord, SceneRecord, UnitRecord
-from mkpc_kaggle.engine.scenes import MARGIN, START_SECONDS, SceneAnswer, SceneJob
+from mkpc_kaggle.engine.scenes import FORECAST_MARGIN, START_S
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
 from mkpc_kaggle.pipeline.pair import UnitResult
@@ -29,7 +40,7 @@ from mkpc_kaggle.recipe import Recipe, Unit
 from mkpc_kaggle.scene.choose import Choice, Reason
 from mkpc_kaggle.scene.config import SceneConfig
 
-RESTART_SECONDS = 8.0
+RESTART_S = 8.0
 STALL = 20.0
 """A unit that stalls takes that many times as long."""
 SWEEP_SHARE = 0.7
@@ -51,7 +62,6 @@ class Scenario:
 
     pairs: int
     costs: tuple[float, ...]
-    extras: int
     workers: int
     limit: float
     spread: float = 0.3
@@ -72,18 +82,14 @@ class Scenario:
     @property
     def recipe(self) -> Recipe:
         count = len(self.costs)
-        units = [
-            Unit(1 if number % 2 == 0 else 2, f"m{number}", 100, extra=number >= count - self.extras)
-            for number in range(count)
-        ]
+        units = [Unit(1 if number % 2 == 0 else 2, f"m{number}", 100) for number in range(count)]
         scene = SceneConfig(pairs_per_image=self.pairs_per_image) if self.batches else None
         return Recipe(tuple(units), scene=scene)
 
     @property
     def work(self) -> float:
-        """Seconds that all regular units take on all pairs and workers, on average and without faults."""
-        regular = self.costs[: len(self.costs) - self.extras]
-        return self.pairs * sum(regular) * self.cached / self.workers
+        """Seconds that all units take on all pairs and workers, on average and without faults."""
+        return self.pairs * sum(self.costs) * self.cached / self.workers
 
     @property
     def cached(self) -> float:
@@ -93,7 +99,7 @@ class Scenario:
     @property
     def longest_scenes(self) -> float:
         """Seconds that all scenes take on average, if all is slow from the first moment on."""
-        return max(1.0, self.drift) * (self.batches * START_SECONDS + self.pairs * self.scene_seconds)
+        return max(1.0, self.drift) * (self.batches * START_S + self.pairs * self.scene_seconds)
 
 
 def random_scenario(seed: int, pairs: int) -> Scenario:
@@ -104,7 +110,6 @@ def random_scenario(seed: int, pairs: int) -> Scenario:
     scenario = Scenario(
         pairs=int(pairs * rng.uniform(0.5, 1.5)),
         costs=costs,
-        extras=int(rng.integers(0, len(costs))),
         workers=int(rng.integers(1, 5)),
         limit=math.inf,
         spread=float(rng.uniform(0.05, 1.0)),
@@ -116,8 +121,7 @@ def random_scenario(seed: int, pairs: int) -> Scenario:
         seed=seed,
     )
     limit = max(600.0, scenario.work * float(rng.uniform(0.3, 1.3)))
-    # Faults a run: some dozens of stalls, a crash or two, now and then a hang. With its extra units a run may do
-    # all units on all pairs, if the time suffices.
+    # Faults a run: some dozens of stalls, a crash or two, now and then a hang.
     seconds = sum(costs) / len(costs) * scenario.cached
     runs = min(scenario.pairs * len(costs), limit * scenario.workers / seconds)
     rates = [float(rng.uniform(0, most)) / runs if troubled else 0.0 for most in (30, 3, 1)]
@@ -142,153 +146,179 @@ class VirtualClock:
         return self.now
 
 
-class SimulatedPool:
-    """Workers that take their time on the virtual clock alone.
+class SimulatedSite:
+    """Workers that take their time on the virtual clock alone; see :class:`mkpc_kaggle.engine.places.Site`.
 
     Of their seconds until ``stop``, ``kept`` went into jobs that came back in time. ``faults`` are what injected
     faults take whatever is planned: the unit that a crash cut short, of a hang as long as a stall might have
     taken, which it cannot be told from sooner, a stall that was taken for a hang, and the new worker's start
-    after any of these. ``scenes`` are those under way and done; ``for_scenes`` are the workers' seconds in which
-    nothing else was under way.
+    after any of these. ``scenes`` are those begun; ``for_scenes`` are the workers' seconds in which nothing else
+    was under way.
     """
+
+    scenes_at_once = 1
 
     def __init__(self, scenario: Scenario, clock: VirtualClock, stop: float) -> None:
         self.scenario = scenario
         self.clock = clock
-        self.kept = self.faults = 0.0
+        self.stop = stop
+        self.kept = self.faults = self.last_job = self.for_scenes = 0.0
         self.scenes: list[SimulatedScene] = []
-        self.last_job = self.for_scenes = 0.0
-        self._rng = np.random.default_rng(scenario.seed)
+        self.rng = np.random.default_rng(scenario.seed)
+        self.costs = {unit.name: cost for unit, cost in zip(scenario.recipe.units, scenario.costs, strict=True)}
+        self.workers: set[SimulatedWorker] = set()
+        self.places = [
+            Place(f"place {number}", lambda: SimulatedWorker(self)) for number in range(scenario.workers)
+        ]
+        self.fallback: list[Place] = []
         self._scene_rng = np.random.default_rng([scenario.seed, 1])
-        self._costs = {unit.name: cost for unit, cost in zip(scenario.recipe.units, scenario.costs, strict=True)}
-        self._stop = stop
-        self._free = [RESTART_SECONDS] * scenario.workers
-        self._warm: set[tuple[int, str]] = set()
-        self._coming: list[tuple[float, int, float, JobResult | JobFailure]] = []
-        self._count = 0
 
-    @property
-    def workers(self) -> int:
-        return self.scenario.workers
-
-    @property
-    def capacity(self) -> int:
-        return JOBS_A_WORKER * self.workers
-
-    def start(self) -> str:
-        return ""
-
-    def submit(self, job: Job) -> None:
-        worker = int(np.argmin(self._free))
-        begun = max(self.clock.now, self._free[worker])
-        ended, back, fault = self._do(job, worker, begun)
-        lost = isinstance(back, JobFailure)
-        self._free[worker] = ended + (RESTART_SECONDS if lost else 0.0)
-        if lost:
-            self.faults += max(0.0, min(fault + RESTART_SECONDS * (fault > 0), self._stop - begun))
-            self._warm = {(who, unit) for who, unit in self._warm if who != worker}
-        self._count += 1
-        kept = 0.0 if lost else min(ended, self._stop) - begun
-        heapq.heappush(self._coming, (ended, self._count, kept, back))
-
-    scenes_at_once = 1
-
-    def reconstruct(self, job: SceneJob) -> "SimulatedScene":
-        scenario, rng = self.scenario, self._scene_rng
-        spread = math.exp(0.3 * rng.normal() - 0.3**2 / 2)
-        seconds = START_SECONDS + spread * scenario.scene_seconds * len(job.pairs)
-        if self.clock.now > scenario.turn * scenario.limit:
-            seconds *= scenario.drift
-        answer: SceneAnswer | str
-        answer = (), {index: Choice(FALLBACK_FUNDAMENTAL, Reason.SCENE) for index in job.indices}
-        if rng.random() < scenario.scene_faults:
-            faults = ((seconds / 2, "signal SIGSEGV"), (seconds / 3, "exit status 1"), (math.inf, "it hangs"))
-            seconds, answer = faults[rng.integers(len(faults))]
-        self.scenes.append(SimulatedScene(self.clock, self.clock.now, seconds, answer, job.batch))
-        return self.scenes[-1]
-
-    def next(self, until: float) -> JobResult | JobFailure | None:
-        if not self._coming or self._coming[0][0] > until:
-            if not self._coming and any(not scene.over for scene in self.scenes):
-                self.for_scenes += self.workers * max(0.0, min(until, self._stop) - self.clock.now)
-            self.clock.now = max(self.clock.now, until)
-            return None
-        ended, _, kept, back = heapq.heappop(self._coming)
-        self.clock.now = self.last_job = max(self.clock.now, ended)
-        self.kept += max(0.0, kept)
-        return back
-
-    def stop(self) -> None:
+    def open(self) -> None:
         pass
 
-    def close(self) -> bool:
-        return True
+    def close(self) -> None:
+        pass
 
-    def _do(self, job: Job, worker: int, begun: float) -> tuple[float, JobResult | JobFailure, float]:
-        """When the job ends, what comes back, and the seconds of it that an injected fault took."""
-        now = begun
-        expected = dict(zip(job.units, job.expected, strict=True))
-        results: list[list[UnitResult]] = [[] for _ in job.indices]
-        for unit in sorted(job.units, key=lambda unit: unit.stage):
-            for known, found in zip(job.known, results, strict=True):
-                if any(result.unit == unit for result in known) or now + expected[unit] >= job.deadline:
-                    continue
-                stalled = self._rng.random() < self.scenario.stalls
-                usual = self._seconds(unit, now) * job.shrink**2
-                warm_up = (worker, unit.name) not in self._warm
-                self._warm.add((worker, unit.name))
-                seconds = usual * (STALL if stalled else 1.0) + self.scenario.warm_up * warm_up
-                fate = self._rng.random()
-                if fate < self.scenario.crashes:
-                    return now + seconds / 2, JobFailure(job, Cause.DIED), seconds / 2
-                if fate < self.scenario.crashes + self.scenario.hangs:
-                    return now + job.timeout, JobFailure(job, Cause.HUNG), min(job.timeout, STALL * usual)
-                if seconds > job.timeout:
-                    return now + job.timeout, JobFailure(job, Cause.HUNG), job.timeout if stalled else 0.0
-                now += seconds
-                found.append(UnitResult(unit, Matches.empty(), 0.0, seconds, warm_up=warm_up))
-        pairs = zip(job.indices, job.known, results, strict=True)
-        return now, JobResult(job, tuple(self._outcome(job, *pair) for pair in pairs)), 0.0
+    def scene_worker(self) -> "SimulatedScene":
+        self.scenes.append(SimulatedScene(self, self._scene_rng))
+        return self.scenes[-1]
 
-    def _seconds(self, unit: Unit, now: float) -> float:
-        scenario, rng = self.scenario, self._rng
-        seconds = self._costs[unit.name] * math.exp(scenario.spread * rng.normal() - scenario.spread**2 / 2)
+    def wait(self, until: float) -> None:
+        scenes = [scene for scene in self.scenes if not scene.is_over]
+        moments = [worker.ready for worker in (*self.workers, *scenes)]
+        moment = min([until, *moments])
+        assert moment < math.inf, "the engine waits for ever"
+        if scenes and not any(worker.job for worker in self.workers):
+            self.for_scenes += len(self.places) * max(0.0, min(moment, self.stop) - self.clock.now)
+        self.clock.now = max(self.clock.now, moment)
+
+    def unit_seconds(self, unit: Unit, now: float) -> float:
+        scenario, rng = self.scenario, self.rng
+        seconds = self.costs[unit.name] * math.exp(scenario.spread * rng.normal() - scenario.spread**2 / 2)
         if rng.random() < scenario.misses:
             seconds *= scenario.miss_factor
         if now > scenario.turn * scenario.limit:
             seconds *= scenario.drift
         return seconds
 
-    def _outcome(self, job: Job, index: int, known: tuple[UnitResult, ...], found: list[UnitResult]) -> Outcome:
-        if not found:
-            return Outcome(PairRecord.untouched(index, NOT_REACHED))
-        units = tuple(
-            UnitRecord(one.unit.name, one.unit.stage, 200, 20 + index % 60, 0.0, one.seconds, job.note)
-            for one in (*known, *found)
-        )
-        return Outcome(PairRecord(index, FALLBACK_FUNDAMENTAL, "", units), tuple(found))
 
+class SimulatedWorker:
+    """A matching worker: its answer is drawn when a job is submitted, and given when its time has come."""
 
-@dataclass
-class SimulatedScene:
-    """A reconstruction that ends by itself; ``seen`` is when somebody asked after that, ``over`` that it ended."""
+    def __init__(self, site: SimulatedSite) -> None:
+        self.job: Job | None = None
+        self.ready = math.inf
+        self._site = site
+        self._warm: set[str] = set()
+        self._answer: Answer | None = None
 
-    clock: VirtualClock
-    begun: float
-    seconds: float
-    found: SceneAnswer | str
-    batch: str
-    seen: float = field(default=0.0, init=False)
-    over: bool = field(default=False, init=False)
+    def start(self) -> None:
+        self._site.workers.add(self)
+        self._answer, self.ready = Loaded(), self._site.clock.now + RESTART_S
 
-    def answer(self) -> SceneAnswer | str | None:
-        if self.clock.now < self.begun + self.seconds:
+    def submit(self, job: Job, seconds: float) -> None:
+        assert isinstance(job, MatchJob) and self._answer is None
+        now = self._site.clock.now
+        self.job = job
+        self.ready, self._answer, fault = self._do(job, now, now + seconds)
+        if isinstance(self._answer, Failure):
+            lost = fault + RESTART_S * (fault > 0)
+            self._site.faults += max(0.0, min(lost, self._site.stop - now))
+            if self._answer.cause is Cause.TIMED_OUT:
+                self._answer, self.ready = None, math.inf  # the engine has to find out
+        else:
+            self._kept = max(0.0, min(self.ready, self._site.stop) - now)
+
+    def answer(self) -> Answer | None:
+        if self._answer is None or self._site.clock.now < self.ready:
             return None
-        self.seen = self.clock.now
-        return self.found
+        answer, self._answer, self.ready = self._answer, None, math.inf
+        if isinstance(answer, MatchResult):
+            self._site.kept += self._kept
+            self._site.last_job = self._site.clock.now
+        self.job = None
+        return answer
 
     def kill(self) -> None:
-        self.over = True
+        self._site.workers.discard(self)
+
+    def _do(self, job: MatchJob, begun: float, deadline: float) -> tuple[float, Answer, float]:
+        """When the job ends, its answer, and the seconds of it that an injected fault took."""
+        site, now, end = self._site, begun, begun + job.time_limit
+        scenario, expected = site.scenario, dict(zip(job.units, job.expected, strict=True))
+        results: list[list[UnitResult]] = [[] for _ in job.indices]
+        hung = Failure(Cause.TIMED_OUT)
+        for unit in sorted(job.units, key=lambda unit: unit.stage):
+            for known, found in zip(job.known, results, strict=True):
+                if any(result.unit == unit for result in known) or now + expected[unit] >= deadline:
+                    continue
+                stalled = site.rng.random() < scenario.stalls
+                usual = site.unit_seconds(unit, now)
+                warm_up = unit.name not in self._warm
+                self._warm.add(unit.name)
+                seconds = usual * (STALL if stalled else 1.0) + scenario.warm_up * warm_up
+                fate = site.rng.random()
+                if fate < scenario.crashes:
+                    return now + seconds / 2, Failure(Cause.DIED), seconds / 2
+                if fate < scenario.crashes + scenario.hangs:
+                    return end, hung, min(end - now, STALL * usual)
+                if now + seconds > end:
+                    return end, hung, end - now if stalled else 0.0
+                now += seconds
+                found.append(UnitResult(unit, Matches.empty(), 0.0, seconds, warm_up=warm_up))
+        pairs = zip(job.indices, job.known, results, strict=True)
+        return now, MatchResult(tuple(starmap(_outcome, pairs))), 0.0
+
+
+def _outcome(index: int, known: tuple[UnitResult, ...], found: list[UnitResult]) -> Outcome:
+    if not found:
+        return Outcome(PairRecord.untouched(index, NOT_REACHED))
+    units = tuple(
+        UnitRecord(result.unit.name, result.unit.stage, 200, 20 + index % 60, 0.0, result.seconds, "")
+        for result in (*known, *found)
+    )
+    return Outcome(PairRecord(index, FALLBACK_FUNDAMENTAL, "", units), tuple(found))
+
+
+class SimulatedScene:
+    """A worker for one batch; ``seen`` is when somebody took its answer, ``is_over`` that it was killed."""
+
+    def __init__(self, site: SimulatedSite, rng: np.random.Generator) -> None:
+        self.batch = ""
+        self.begun = self.seconds = self.seen = 0.0
+        self.is_over = self.is_faulty = False
+        self.ready = math.inf
+        self._site, self._rng = site, rng
+        self._answer: Answer | None = None
+
+    def start(self) -> None:
+        self._answer, self.ready = Loaded(), self._site.clock.now
+
+    def submit(self, job: Job, seconds: float) -> None:
+        assert isinstance(job, SceneJob)
+        scenario, rng, self.begun = self._site.scenario, self._rng, self._site.clock.now
+        spread = math.exp(0.3 * rng.normal() - 0.3**2 / 2)
+        self.batch, self.seconds = job.batch, START_S + spread * scenario.scene_seconds * len(job.pairs)
+        if self.begun > scenario.turn * scenario.limit:
+            self.seconds *= scenario.drift
+        self._answer = SceneResult(
+            (), {index: Choice(FALLBACK_FUNDAMENTAL, Reason.SCENE) for index in job.indices}
+        )
+        if rng.random() < scenario.scene_faults:
+            self.is_faulty = True
+            self._answer = Failure(Cause.DIED, "signal SIGSEGV")
+            self.seconds *= (0.5, 0.3, math.inf)[rng.integers(3)]
+        self.ready = self.begun + self.seconds
+
+    def answer(self) -> Answer | None:
+        if self._answer is None or self._site.clock.now < self.ready:
+            return None
+        answer, self._answer, self.ready = self._answer, None, math.inf
+        self.seen = self._site.clock.now
+        return answer
+
+    def kill(self) -> None:
+        self.is_over = True
 
 
 class MemoryJournal:
@@ -299,6 +329,9 @@ class MemoryJournal:
 
     def forget_changed(self, pairs: Sequence[Pair]) -> int:
         return 0
+
+    def forget_given_up(self) -> None:
+        pass
 
     def records(self) -> dict[int, PairRecord]:
         return {}
@@ -362,14 +395,14 @@ def simulate(scenario: Scenario) -> Ran:
     """Run one scenario through the real engine."""
     clock = VirtualClock()
     budget = Budget(0.0, scenario.limit, clock)
-    pool = SimulatedPool(scenario, clock, budget.stop)
+    site = SimulatedSite(scenario, clock, budget.stop_units)
     share = max(1, scenario.batches) / scenario.pairs
     pairs = [Pair(str(n), f"{int(n * share):03d}", f"{n:07d}", "b") for n in range(scenario.pairs)]
     published: list[int] = []
     engine = Engine(
         pairs,
         scenario.recipe,
-        pool,
+        site,
         MemoryJournal(),
         budget,
         publish=lambda records: published.append(len(records)),
@@ -377,33 +410,34 @@ def simulate(scenario: Scenario) -> Ran:
         progress=False,
     )
     planning, jobs = 0.0, 0
-    plan_next = engine.planner.next
+    plan_next = engine.plan.next
 
-    def timed(now: float) -> Job | None:
+    def timed(now: float, place: str, *, cautious: bool) -> MatchJob | None:
         nonlocal planning, jobs
         start = time.thread_time()  # whatever else the machine does
-        plan = plan_next(now)
+        job = plan_next(now, place, cautious=cautious)
         planning += time.thread_time() - start
-        jobs += plan is not None
-        return plan
+        jobs += job is not None
+        return job
 
-    engine.planner.next = timed  # type: ignore[method-assign]
+    engine.plan.next = timed  # type: ignore[method-assign, assignment]
     report = engine.run()
     swept = sum(record.matches > 0 for record in report.records)
     sweep_fits = sweep_seconds(scenario) < SWEEP_SHARE * scenario.limit
-    given = pool.workers * (min(budget.stop, clock.now) - RESTART_SECONDS) - pool.faults
-    faulty = {scene.batch for scene in pool.scenes if isinstance(scene.found, str)}
+    given = len(site.places) * (min(budget.stop_units, clock.now) - RESTART_S) - site.faults
+    faulty = {scene.batch for scene in site.scenes if scene.is_faulty}
     made = {pairs[record.index].group for record in report.records if record.scene is not None}
     return Ran(
         scenario,
         report,
-        (pool.kept + pool.for_scenes) / given,
+        (site.kept + site.for_scenes) / given,
         max(0.0, clock.now - scenario.limit),
         sum(length != scenario.pairs for length in published) + (scenario.pairs - swept if sweep_fits else 0),
         len(set(engine.scenes.batches) - faulty - made),
-        MARGIN * scenario.longest_scenes < RESERVE_SHARE * scenario.limit and not any(map(_hangs, pool.scenes)),
-        pool.last_job,
-        tuple(pool.scenes),
+        FORECAST_MARGIN * scenario.longest_scenes < RESERVE_SHARE * scenario.limit
+        and not any(map(_hangs, site.scenes)),
+        site.last_job,
+        tuple(site.scenes),
         jobs,
         planning / max(1, jobs),
     )
@@ -420,7 +454,7 @@ def sweep_seconds(scenario: Scenario) -> float:
     takes a worker's start and warm-up, a hang also as long as a stall would.
     """
     unit = scenario.costs[0] * scenario.cached * max(1.0, scenario.drift)
-    start = RESTART_SECONDS + scenario.warm_up
+    start = RESTART_S + scenario.warm_up
     stalls = scenario.stalls * (STALL - 1) * unit
     faults = (scenario.crashes + scenario.hangs) * start + scenario.hangs * STALL * unit
     return start + scenario.pairs * (unit + stalls + faults) / scenario.workers

@@ -34,7 +34,7 @@ class SyntheticMatcher(RectifiedMatcher):
     def _match(self, seen0: Seen, seen1: Seen) -> Matches:
         self.calls.append((max(seen0.view.content), seen0.brightness))
         names = [f"{(seen.brightness - DARKEST) // STEP:04}" for seen in (seen0, seen1)]
-        (found,) = (p.matches for p in self.scene.batch.pairs if [p.image0, p.image1] == names)
+        (found,) = (p.matches for p in self.scene.pairs if [p.image0.name, p.image1.name] == names)
         return Matches(seen0.view.from_image(found.points0), seen1.view.from_image(found.points1), found.scores)
 
 

@@ -2,7 +2,6 @@
 
 import re
 import threading
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
@@ -14,25 +13,13 @@ class Site:
     """What the server does; it may be changed between requests. ``asked`` gets each request's Range header."""
 
     data: bytes
-    tag: str = '"one"'
-    ranges: bool = True
-    """honour Range"""
-    breaks: list[int] = field(default_factory=list)
-    """after how many bytes of the body the connection breaks, for each of the first requests"""
-    statuses: list[int] = field(default_factory=list)
-    """errors that the first requests get"""
-    length: int | None = None
-    """a Content-Length that is not true; 0: none is sent"""
-    shift: int = 0
-    """begins the part that was asked for so many bytes later"""
+    breaks: list[int] = field(default_factory=list)  # bytes after which the first connections break
+    statuses: list[int] = field(default_factory=list)  # errors that the first requests get
+    length: int | None = None  # a Content-Length that is not true; 0: none is sent
+    shift: int = 0  # the part that was asked for begins so many bytes later
     redirect: str = ""
-    chunk_size: bytes | None = None
-    """send the file as one chunk of this size"""
-    drip: bytes = b""
-    """send this, and then a byte now and then until the connection is closed"""
     asked: list[str] = field(default_factory=list)
-    sent: int = 0
-    """bytes of bodies"""
+    sent: int = 0  # bytes of bodies
     url: str = ""
 
 
@@ -42,28 +29,14 @@ class _Handler(BaseHTTPRequestHandler):
     def do_GET(self) -> None:
         site = self.site
         site.asked.append(self.headers.get("Range", ""))
-        if site.drip:
-            self._drip(site.drip)
-        elif site.chunk_size is not None:
-            self.wfile.write(b"HTTP/1.1 200 OK\r\nTransfer-Encoding: chunked\r\n\r\n" + site.chunk_size + b"\r\n")
-            self.wfile.write(site.data)
-        elif site.redirect:
+        if site.redirect:
             self.wfile.write(b"HTTP/1.1 302 Found\r\nLocation: " + site.redirect.encode() + b"\r\n\r\n")
         elif site.statuses:
             self.send_error(site.statuses.pop(0))
         else:
             self._send(site, self._start(site))
 
-    def _drip(self, begin: bytes) -> None:
-        self.wfile.write(begin)
-        with suppress(ConnectionError):
-            for _ in range(100):
-                time.sleep(0.02)
-                self.wfile.write(b"x")
-
     def _start(self, site: Site) -> int:
-        if not site.ranges or self.headers.get("If-Range", site.tag) != site.tag:
-            return 0
         wanted = re.fullmatch(r"bytes=(\d+)-", self.headers.get("Range", ""))
         return int(wanted[1]) + site.shift if wanted else 0
 
@@ -78,8 +51,6 @@ class _Handler(BaseHTTPRequestHandler):
         self.send_response(206 if start else 200)
         if start:
             self.send_header("Content-Range", f"bytes {start}-{len(site.data) - 1}/{len(site.data)}")
-        if site.tag:
-            self.send_header("ETag", site.tag)
         if site.length != 0:
             self.send_header("Content-Length", str(site.length or len(body)))
         self.end_headers()

@@ -1,6 +1,5 @@
-"""Pairs that no row names: which they are, and what a run makes of them."""
+"""Extra pairs: which they are, and what a run makes of them."""
 
-import time
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
@@ -12,12 +11,10 @@ from rectified import run
 from simulator import Scenario, simulate
 from synthetic import RECIPE, SyntheticMatcher, synthetic_pairs
 
-from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.engine import Ending
-from mkpc_kaggle.engine.scenes import pairs_to_add
 from mkpc_kaggle.reporting.run_log import read_log
 from mkpc_kaggle.scene.config import SceneConfig
-from mkpc_kaggle.scene.unasked import unasked_pairs
+from mkpc_kaggle.scene.densify import MAX_IMAGES, extra_pairs
 
 CHAIN = [(0, 1), (1, 2), (2, 3), (3, 4), (4, 5)]
 
@@ -27,7 +24,7 @@ def test_a_batch_gets_as_many_pairs_as_it_lacks_and_none_twice(images: int, want
     rng = np.random.default_rng(seed)
     every = list(combinations(range(images), 2))
     asked = [ends if rng.random() < 0.5 else ends[::-1] for ends in every if rng.random() < 0.4]
-    chosen = unasked_pairs(images, asked, wanted)
+    chosen = extra_pairs(images, asked, wanted)
     known = {(min(ends), max(ends)) for ends in asked}
     assert len(set(chosen)) == len(chosen)
     assert set(chosen) <= set(every) - known
@@ -35,10 +32,10 @@ def test_a_batch_gets_as_many_pairs_as_it_lacks_and_none_twice(images: int, want
 
 
 def test_images_in_few_pairs_come_first_and_get_partners_that_have_the_same_partners() -> None:
-    assert unasked_pairs(6, CHAIN, 1) == [(0, 2)], "0 and 2 have 1 in common"
-    degrees = np.bincount(np.ravel([*CHAIN, *unasked_pairs(6, CHAIN, 1.5)]))
+    assert extra_pairs(6, CHAIN, 1) == [(0, 2)], "0 and 2 have 1 in common"
+    degrees = np.bincount(np.ravel([*CHAIN, *extra_pairs(6, CHAIN, 1.5)]))
     assert degrees.min() >= 2
-    assert unasked_pairs(6, CHAIN, 0) == []
+    assert extra_pairs(6, CHAIN, 0) == []
 
 
 def test_a_sparse_batch_has_a_scene_by_pairs_that_no_row_names(tmp_path: Path) -> None:
@@ -49,7 +46,7 @@ def test_a_sparse_batch_has_a_scene_by_pairs_that_no_row_names(tmp_path: Path) -
     report = run(asked, recipe, matcher, tmp_path / "work", publish=lambda rows: published.append(len(rows)))
     assert report.ending is Ending.COMPLETE
     assert [record.source for record in report.records] == ["scene"] * 5
-    true = [matcher.scene.batch.pairs[list(combinations(range(6), 2)).index(ends)] for ends in CHAIN]
+    true = [matcher.scene.pairs[list(combinations(range(6), 2)).index(ends)] for ends in CHAIN]
     found = zip(report.records, true, strict=True)
     assert max(matcher.scene.median_distance(record.fundamental, pair) for record, pair in found) < 0.5
     assert len(matcher.calls) == 12
@@ -73,14 +70,11 @@ def test_they_take_a_small_share_of_the_time() -> None:
     assert len(ran.report.records) == 400
 
 
-def test_a_batch_of_more_images_than_are_looked_at_together_gets_no_further_pairs() -> None:
-    chain = [Pair(str(n), "batch", f"{n}.png", f"{n + 1}.png") for n in range(6)]
-    assert pairs_to_add(chain, SceneConfig(most_images=7))
-    assert pairs_to_add(chain, SceneConfig(most_images=6)) == []
+def test_more_extra_pairs_go_on_from_fewer() -> None:
+    first = extra_pairs(6, CHAIN, 1.5)
+    assert first + extra_pairs(6, [*CHAIN, *first], 2) == extra_pairs(6, CHAIN, 2)
 
 
-def test_a_batch_of_a_hundred_thousand_images_is_passed_over_at_once() -> None:
-    pairs = [Pair(str(n), "batch", f"a{n}.png", f"b{n}.png") for n in range(50_000)]
-    start = time.process_time()
-    assert pairs_to_add(pairs, SceneConfig()) == []
-    assert time.process_time() - start < 5
+def test_a_batch_of_very_many_images_gets_none() -> None:
+    chain = [(number, number + 1) for number in range(MAX_IMAGES)]
+    assert extra_pairs(MAX_IMAGES + 1, chain, 5) == []

@@ -1,0 +1,170 @@
+"""Where workers are: a place has one worker at a time, and is closed when it loses one after the other."""
+
+import queue
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import partial
+from math import inf
+from typing import Protocol
+
+from mkpc_kaggle.engine.jobs import Answer, Cause, Failure, Job, Loaded, Worker
+from mkpc_kaggle.engine.process import ProcessWorker, ThreadWorker
+from mkpc_kaggle.engine.worker import MatchRunner, SceneRunner
+from mkpc_kaggle.pipeline.assembly import Assembly
+
+START_TIMEOUT_S = 300.0  # for a worker to load its matchers; over a network's disk that is not quick
+RESTART_PAUSE_S = 1.0  # times the workers lost in a row: memory that is short may be free again
+MAX_LOSSES = 3  # workers lost in a row, with no answer between, close a place
+LISTEN_S = 0.2  # how often an interrupt is looked for
+
+
+@dataclass(eq=False)
+class Place:
+    """A place such as "cuda:0": its worker, the job that this has, and until when its answer is waited for.
+
+    ``closed`` says why no worker is started here any more.
+    """
+
+    name: str
+    make: Callable[[], Worker]
+    worker: Worker | None = None
+    job: Job | None = None
+    is_loaded: bool = False
+    losses: int = 0
+    closed: str = ""
+    since: float = 0.0
+    limit: float = inf
+
+    @property
+    def is_idle(self) -> bool:
+        return self.is_loaded and self.job is None
+
+    @property
+    def is_starting(self) -> bool:
+        """Whether a worker is being loaded, or may be after a pause."""
+        return not self.is_loaded and not self.closed and (self.worker is not None or self.losses > 0)
+
+    def may_start(self, now: float) -> bool:
+        return self.worker is None and not self.closed and (now >= self.limit or not self.losses)
+
+    def start(self, now: float) -> None:
+        """Start a worker; it is loaded when it says so."""
+        self.is_loaded, self.since, self.limit = False, now, now + START_TIMEOUT_S
+        self.worker = self.make()
+        self.worker.start()
+
+    def submit(self, job: Job, seconds: float, time_limit: float, now: float) -> None:
+        """Hand a job to the idle worker; its units may begin within ``seconds``."""
+        assert self.worker is not None
+        self.job, self.since, self.limit = job, now, now + time_limit
+        self.worker.submit(job, seconds)
+
+    def poll(self, now: float) -> Answer | None:
+        """What the worker answers, or that it hangs; then it is idle, or killed. ``None`` while it is at work."""
+        if self.worker is None:
+            return None
+        answer = self.worker.answer()
+        if answer is None and now >= self.limit:
+            answer = Failure(Cause.TIMED_OUT, f"no answer for {now - self.since:.0f} s")
+        if answer is None:
+            return None
+        self.limit = inf
+        if isinstance(answer, Loaded):
+            self.is_loaded = True
+        elif not isinstance(answer, Failure):
+            self.losses = 0
+        elif answer.cause is not Cause.RAISED:
+            self._lose(answer, now)
+        return answer
+
+    def kill(self) -> None:
+        worker, self.worker, self.job, self.is_loaded = self.worker, None, None, False
+        if worker is not None:
+            worker.kill()
+
+    def _lose(self, failure: Failure, now: float) -> None:
+        """The worker ends: what ran out of memory has it in pieces, and a device that failed goes on failing."""
+        job = self.job
+        self.kill()
+        self.job, self.limit = job, now
+        if failure.cause.is_of_place:
+            self.losses += 1
+            self.limit = now + RESTART_PAUSE_S * self.losses
+            if self.losses >= MAX_LOSSES or failure.cause is Cause.REFUSED:
+                self.closed = f"{self.name}: {failure}"
+
+
+class Site(Protocol):
+    """A machine or a cluster: the places of its matching workers, and where batches are reconstructed.
+
+    ``fallback`` are the places where the work goes on when ``places`` are closed.
+    """
+
+    places: list[Place]
+    fallback: list[Place]
+
+    def open(self) -> None:
+        """Make the places known; raises :class:`mkpc_kaggle.errors.UserError` where there can be none."""
+        ...
+
+    @property
+    def scenes_at_once(self) -> int: ...
+
+    def scene_worker(self) -> Worker:
+        """A worker for one batch."""
+        ...
+
+    def wait(self, until: float) -> None:
+        """Until an answer may be there, or an interrupt, or the time ``until`` of the engine's clock."""
+        ...
+
+    def close(self) -> None: ...
+
+
+class LocalSite:
+    """A worker process for each device of the machine, or as many as asked for; 0: a thread of this process."""
+
+    scenes_at_once = 1
+
+    def __init__(self, assembly: Assembly, workers: int | None, clock: Callable[[], float]) -> None:
+        self._clock = clock
+        self._bell: queue.SimpleQueue[None] = queue.SimpleQueue()
+        self.fallback: list[Place] = []
+        if workers == 0:
+            make = partial(MatchRunner, assembly.pipeline)
+            self.places = [Place("this process", partial(ThreadWorker, "matching", make, self._ring))]
+            return
+        # On a CPU one process with all threads: two with half of them each do more (recipe light, two cores: the
+        # sweep over after 22 s instead of 31), but need twice the memory, and a network's last bits change.
+        devices = assembly.devices
+        used = [devices[number % len(devices)] for number in range(workers or len(devices))]
+        share = len(used) if devices == ("cpu",) else 1
+        self.places = [
+            self._place(
+                name if used.count(name) == 1 else f"{name} {number}", assembly.on(name, used.count(name)), share
+            )
+            for number, name in enumerate(used)
+        ]
+        if devices != ("cpu",):
+            self.fallback = [self._place("cpu", assembly.on_cpu())]
+
+    def open(self) -> None:
+        """The places are known."""
+
+    def scene_worker(self) -> Worker:
+        return ProcessWorker("scene", SceneRunner, self._ring)
+
+    def wait(self, until: float) -> None:
+        with suppress(queue.Empty):
+            self._bell.get(timeout=max(0.0, min(LISTEN_S, until - self._clock())))
+
+    def close(self) -> None:
+        """Nothing is left open."""
+
+    def _place(self, name: str, assembly: Assembly, share: int = 1) -> Place:
+        make = partial(MatchRunner, assembly.pipeline)
+        return Place(name, partial(ProcessWorker, f"mkpc {name}", make, self._ring, share))
+
+    def _ring(self) -> None:
+        self._bell.put(None)

@@ -1,0 +1,224 @@
+"""Workers on this machine: in a thread of the engine's own process, or in processes of their own.
+
+The engine calls start, submit, answer and kill, none of which blocks: a thread for each worker does the blocking
+calls. No lock is shared with a process, nothing large goes through its start-up pipe, and its end of the other
+pipe is closed here. So it may die, be stopped or be killed at any moment: a write to it, or a read, ends with it.
+
+pebble, which keeps pools of processes, was tried and not taken: it times jobs by the wall clock, which may jump,
+and its workers share one pipe and its lock, so that a worker killed in the middle of an answer blocks all of them.
+"""
+
+import multiprocessing
+import os
+import queue
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from multiprocessing import resource_tracker
+from multiprocessing.connection import Connection
+from multiprocessing.context import SpawnProcess
+
+from mkpc_kaggle.engine.jobs import Answer, Cause, Failure, Job
+from mkpc_kaggle.engine.worker import Runner, failure_of, load, run
+
+# For PyTorch, which reads them once. Threads of OpenMP that wait for each other sleep; by default they spin, and
+# keep the cores from decoding, MAGSAC and other processes (python -m benchmarks.threads). Tensors of 2 MiB and
+# more come in huge pages, on Linux: in small ones a fresh map costs as much time as many convolutions.
+WORKER_ENVIRONMENT = {"OMP_WAIT_POLICY": "PASSIVE", "GOMP_SPINCOUNT": "0", "THP_MEM_ALLOC_ENABLE": "1"}
+EXIT_TIMEOUT_S = 5.0  # a process's pipe closes before the process has ended
+
+Message = Callable[[], Runner] | tuple[Job, float]
+
+
+class ThreadWorker:
+    """Works in a thread of this process, for a user's own matchers and tests.
+
+    A matcher that never returns cannot be stopped here, nor one that brings the process down, and a device that
+    failed does not come back: that takes processes.
+    """
+
+    def __init__(self, name: str, make: Callable[[], Runner], on_answer: Callable[[], None]) -> None:
+        self.name = name
+        self._make = make
+        self._on_answer = on_answer
+        self._orders: queue.SimpleQueue[tuple[Job, float] | None] = queue.SimpleQueue()
+        self._answers: queue.SimpleQueue[Answer] = queue.SimpleQueue()
+        self._killed = False
+        self._thread = threading.Thread(target=self._live, name=name, daemon=True)
+
+    def start(self) -> None:
+        self._thread.start()
+
+    def submit(self, job: Job, seconds: float) -> None:
+        self._orders.put((job, time.monotonic() + seconds))
+
+    def answer(self) -> Answer | None:
+        try:
+            return self._answers.get_nowait()
+        except queue.Empty:
+            return None
+
+    def kill(self) -> None:
+        self._killed = True
+        self._orders.put(None)
+
+    def _live(self) -> None:
+        try:
+            answer = self._load()
+        except Exception as error:  # no memory, or no process more
+            answer = Failure(Cause.NOT_STARTED, str(error))
+        self._put(answer)
+        while not isinstance(answer, Failure) or not answer.cause.is_of_place:
+            order = self._orders.get()
+            if order is None or self._killed:
+                return
+            answer = self._run(order[0], order[1] - time.monotonic())
+            self._put(answer)
+
+    def _load(self) -> Answer:
+        self._runner, answer = load(self._make)
+        return answer
+
+    def _run(self, job: Job, seconds: float) -> Answer:
+        assert self._runner is not None, "only a worker that has loaded gets jobs"
+        return run(self._runner, job, seconds)
+
+    def _put(self, answer: Answer) -> None:
+        self._answers.put(answer)
+        self._on_answer()
+
+
+class ProcessWorker(ThreadWorker):
+    """A worker process, started with ``spawn``. ``make`` and jobs can be pickled.
+
+    ``share`` is the number of processes that share the machine's cores.
+    """
+
+    def __init__(
+        self, name: str, make: Callable[[], Runner], on_answer: Callable[[], None], share: int = 1
+    ) -> None:
+        super().__init__(name, make, on_answer)
+        self._share = share
+        self._process: SpawnProcess | None = None
+
+    def kill(self) -> None:
+        super().kill()
+        self._end()
+
+    def _load(self) -> Answer:
+        context = multiprocessing.get_context("spawn")
+        self._pipe, its_pipe = context.Pipe()
+        process = context.Process(target=serve, args=(its_pipe, self._share), name=self.name, daemon=True)
+        try:
+            with worker_environment(), signals_blocked():
+                process.start()
+        finally:
+            its_pipe.close()
+        self._process = process
+        if self._killed:  # before there was a process to kill
+            self._end()
+        return self._exchange(self._make)
+
+    def _run(self, job: Job, seconds: float) -> Answer:
+        return self._exchange((job, seconds))
+
+    def _exchange(self, message: Message) -> Answer:
+        """The answer to a message, or what became of the process."""
+        assert self._process is not None
+        try:
+            self._pipe.send(message)
+            answer: Answer = self._pipe.recv()
+        except (EOFError, OSError):
+            self._process.join(timeout=EXIT_TIMEOUT_S)
+            self._pipe.close()
+            return Failure(Cause.DIED, how_it_ended(self._process))
+        except Exception as error:  # what cannot be pickled
+            self._end()
+            return failure_of(error)
+        return answer
+
+    def _end(self) -> None:
+        if self._process is not None:
+            self._process.kill()
+
+
+def how_it_ended(process: SpawnProcess) -> str:
+    """The signal that ended a process, or its exit status; for messages."""
+    code = process.exitcode
+    return f"signal {signal.Signals(-code).name}" if code is not None and code < 0 else f"exit status {code}"
+
+
+@contextmanager
+def signals_blocked() -> Iterator[None]:
+    """A process started meanwhile hears neither Ctrl-C, which a terminal sends to all, nor SIGTERM: its parent
+    answers to them, and ends it.
+    """
+    if not hasattr(signal, "pthread_sigmask"):  # Windows
+        yield
+        return
+    resource_tracker.ensure_running()  # started with the first process, it would unblock them
+    former = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, former)
+
+
+_environment = threading.Lock()
+
+
+@contextmanager
+def worker_environment() -> Iterator[None]:
+    """A process started meanwhile has :data:`WORKER_ENVIRONMENT`, but for what the user has set; this one has not
+    (its own OpenMP library is loaded already).
+    """
+    with _environment:
+        ours = {name: value for name, value in WORKER_ENVIRONMENT.items() if name not in os.environ}
+        os.environ.update(ours)
+        try:
+            yield
+        finally:
+            for name in ours:
+                del os.environ[name]
+
+
+def serve(pipe: Connection, share: int) -> None:
+    """The life of a worker process: what to make, then job after job."""
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    with suppress(EOFError, OSError):  # the parent is gone
+        runner, answer = load(_receive_maker(pipe, share))
+        pipe.send(answer)
+        while runner is not None:
+            job, seconds = pipe.recv()
+            pipe.send(run(runner, job, seconds))
+
+
+def _receive_maker(pipe: Connection, share: int) -> Callable[[], Runner]:
+    """Makes the runner that the parent asks for; what cannot be unpickled raises when it is made."""
+
+    def make() -> Runner:
+        maker: Callable[[], Runner] = pipe.recv()
+        _take_share(share)
+        return maker()
+
+    return make
+
+
+def _end_with_parent() -> None:
+    """End this process when its parent has ended, however that ended and whatever is computed here."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
+
+
+def _take_share(share: int) -> None:
+    """Use a part of the cores, where other processes use the rest."""
+    if share > 1:
+        import cv2
+        import torch
+
+        torch.set_num_threads(max(1, torch.get_num_threads() // share))
+        cv2.setNumThreads(max(1, cv2.getNumThreads() // share))

@@ -1,0 +1,134 @@
+"""Which matchers of a recipe cannot run here, and why: their code, their weights, the licence of these."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+from types import MappingProxyType
+from typing import Any
+
+from mkpc_kaggle.config import from_table
+from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.matchers.contract import Matcher, Placement, Unusable
+from mkpc_kaggle.matchers.registry import find_matcher, load_matcher, matcher_names, spec_of
+from mkpc_kaggle.recipe import Recipe
+from mkpc_kaggle.weights import State, WeightStore
+
+PERMISSIVE_TAGS = frozenset({"Apache-2.0", "BSD-3-Clause", "MIT"})
+
+
+class Licence(StrEnum):
+    """Which weights may be used, by their licence."""
+
+    ANY = "any"
+    PERMISSIVE = "permissive"  # those that may be used for any purpose: Apache-2.0, BSD-3-Clause, MIT
+
+
+class Cause(StrEnum):
+    """The kinds of reasons, as a summary tells them."""
+
+    NOT_IMPORTABLE = "cannot be used here"
+    NOT_PERMITTED = "weights not permitted"
+    NO_WEIGHTS = "no weights"
+    UNREADABLE = "weights cannot be loaded"
+
+
+@dataclass(frozen=True)
+class Reason:
+    """Why a matcher is unavailable; ``detail`` are the error, the licences, or the files that would do."""
+
+    cause: Cause
+    detail: str
+
+    def __str__(self) -> str:
+        return f"{self.cause} ({self.detail})"
+
+
+def unavailable(
+    recipe: Recipe,
+    store: WeightStore,
+    licence: Licence = Licence.ANY,
+    own: Mapping[str, Matcher[Any]] = MappingProxyType({}),
+    *,
+    load: bool = False,
+) -> dict[str, Reason]:
+    """Why matchers of the recipe cannot run here, by their names; fallbacks included.
+
+    ``own`` are the user's ready matchers, which bring their weights along. With ``load``, weights whose digest is
+    unknown are loaded, which shows whether they are damaged. Raises :class:`UserError` for an unknown matcher or
+    option.
+    """
+
+    def not_permitted(tags: Iterable[str]) -> Reason | None:
+        others = sorted(set(tags) - PERMISSIVE_TAGS) if licence is Licence.PERMISSIVE else []
+        return Reason(Cause.NOT_PERMITTED, ", ".join(others)) if others else None
+
+    def reason_of(name: str) -> Reason | None:
+        if name in own:
+            return not_permitted(own[name].spec.licences)
+        entry = find_matcher(name) if name in matcher_names() else None
+        if isinstance(entry, Unusable):
+            return Reason(Cause.NOT_IMPORTABLE, entry.reason)
+        options = options_of(recipe, name)
+        spec = spec_of(name, f"recipe {recipe.name!r}")
+        found = {slot: store.find(slot) for slot in spec.slots_for(options)}
+        files = [file for file in found.values() if file is not None]
+        if reason := not_permitted([*spec.licences, *(file.file.licence for file in files)]):
+            return reason
+        if missing := [slot for slot, file in found.items() if file is None]:
+            return Reason(Cause.NO_WEIGHTS, missing_files(missing, store))
+        try:
+            if load and any(file.state is State.UNVERIFIED for file in files):
+                load_matcher(name, store, options, Placement())
+        except UserError as error:
+            return Reason(Cause.UNREADABLE, str(error))
+        return None
+
+    names = [name for unit in recipe.units for name in (unit.matcher, unit.fallback) if name]
+    found = {name: reason_of(name) for name in dict.fromkeys(names)}
+    return {name: reason for name, reason in found.items() if reason is not None}
+
+
+def missing_files(slots: Iterable[str], store: WeightStore) -> str:
+    """The names of the files that would fill the slots, for messages."""
+    return "; ".join(f"{slot}: {' or '.join(file.name for file in store.alternatives(slot))}" for slot in slots)
+
+
+def refusal(recipe: Recipe, reasons: Mapping[str, Reason]) -> UserError:
+    """The error of a recipe that cannot do without these matchers: the first cause, and what to do about it."""
+    cause = next(iter(reasons.values())).cause
+    those = "; ".join(f"{name} ({reason.detail})" for name, reason in reasons.items() if reason.cause is cause)
+    if cause is Cause.NOT_PERMITTED:
+        return UserError(
+            f"--licence permissive refuses recipe {recipe.name!r} for the weights of {those}. Take a recipe "
+            "without them, such as permissive, or --recipe auto, which leaves them out."
+        )
+    if cause is Cause.NO_WEIGHTS:
+        return UserError(
+            f"recipe {recipe.name!r} needs weights that were not found: {those}. Name their directory with "
+            "--weights, or use --recipe auto, which does with what there is."
+        )
+    return UserError(f"recipe {recipe.name!r}: matcher {those} {cause}. `--recipe auto` does without it.")
+
+
+def by_cause(reasons: Mapping[str, Reason]) -> tuple[str, ...]:
+    """The matchers of each cause, for a summary, such as "no weights: loma, superglue"."""
+    names: dict[Cause, list[str]] = {}
+    for name, reason in reasons.items():
+        names.setdefault(reason.cause, []).append(name)
+    return tuple(f"{cause}: {', '.join(matchers)}" for cause, matchers in names.items())
+
+
+def options_of(recipe: Recipe, name: str) -> Any:
+    """The matcher's options with what the recipe's ``[matchers.NAME]`` changes."""
+    spec = spec_of(name, f"recipe {recipe.name!r}")
+    table = recipe.matchers.get(name, {})
+    return from_table(spec.options, table, f"recipe {recipe.name!r}, table [matchers.{name}]")
+
+
+def slots_of(recipe: Recipe, names: Iterable[str] | None = None) -> tuple[str, ...]:
+    """The slots, each once, that these matchers need, or all matchers of the recipe that can be imported here."""
+    if names is None:
+        names = [name for name in recipe.matcher_names if not isinstance(find_matcher(name), Unusable)]
+    where = f"recipe {recipe.name!r}"
+    slots = (slot for name in names for slot in spec_of(name, where).slots_for(options_of(recipe, name)))
+    return tuple(dict.fromkeys(slots))

@@ -1,0 +1,103 @@
+"""Devices: what a user's words for them mean, which GPUs there are, and whether a device computes."""
+
+import json
+import subprocess
+import sys
+from typing import Any
+
+from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.matchers.contract import Placement, Precision
+from mkpc_kaggle.pipeline.failures import DeviceError, Failure, failure_of, reason_of
+
+AUTO = "auto"
+CACHE_SHARE = 0.25  # of a GPU's free memory, for the encodings that all workers on it keep
+TENSOR_CORES = (7, 0)  # the first compute capability that is faster in half precision
+# In a process of its own: a CUDA context takes some hundred MB of a GPU, and the parent of workers needs none.
+ASK_CAPABILITIES = """
+import json, torch
+print(json.dumps([torch.cuda.get_device_capability(gpu) for gpu in range(torch.cuda.device_count())]))
+"""
+
+
+def resolve_placement(device: str, precision: str) -> Placement:
+    """The placement that the user's words mean: ``auto`` are the GPUs, "cuda", or the CPU.
+
+    Raises :class:`UserError` for an unknown word, and for a GPU that is not there.
+    """
+    import torch
+
+    if device == AUTO:
+        device = "cuda" if torch.cuda.is_available() else "cpu"
+    elif device != "cpu":
+        gpus_of(device)
+    if precision == AUTO:
+        return Placement(device, fastest_precision(device))
+    if precision not in list(Precision):
+        raise UserError(f"unknown precision {precision!r}; known: auto, {', '.join(Precision)}")
+    return Placement(device, Precision(precision))
+
+
+def fastest_precision(device: str) -> Precision:
+    """Half precision if the device has units for it; of several GPUs, if each of them has."""
+    import torch
+
+    if device.startswith("cuda"):
+        capabilities = gpu_capabilities()
+        able = all(capabilities[gpu] >= TENSOR_CORES for gpu in gpus_of(device))
+        return Precision.FLOAT16 if able else Precision.FLOAT32
+    # Older versions of PyTorch do not tell; then float32 is safe.
+    flags: dict[str, Any] = getattr(torch.cpu, "get_capabilities", dict)()
+    return Precision.BFLOAT16 if flags.get("avx512_bf16") or flags.get("amx_bf16") else Precision.FLOAT32
+
+
+def gpus_of(device: str) -> list[int]:
+    """The numbers of the GPUs that ``cuda`` or ``cuda:N`` stands for; counting them makes no context."""
+    import torch
+
+    kind, _, number = device.partition(":")
+    count = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    if kind != "cuda" or (device != kind and not number.isdecimal()):
+        raise UserError(f"unknown device {device!r}; known: auto, cpu, cuda, cuda:N")
+    if not count:
+        raise UserError(f"--device {device}: this machine has no GPU that torch can use; try --device cpu")
+    if number and int(number) >= count:
+        known = ", ".join(f"cuda:{index}" for index in range(count))
+        raise UserError(f"--device {device}: this machine has only {known}")
+    return [int(number)] if number else list(range(count))
+
+
+def gpu_capabilities() -> list[tuple[int, int]]:
+    """The compute capability of each GPU, such as (7, 5)."""
+    asked = subprocess.run([sys.executable, "-c", ASK_CAPABILITIES], capture_output=True, text=True, check=False)
+    if asked.returncode:
+        reason = asked.stderr.strip()[-300:]
+        raise UserError(f"PyTorch cannot use this machine's GPUs; try --device cpu. It says: {reason}")
+    return [(major, minor) for major, minor in json.loads(asked.stdout.splitlines()[-1])]
+
+
+def encoding_cache_bytes(device: str, workers: int) -> int:
+    """For each of so many workers on a GPU, asked when little is on it yet."""
+    import torch
+
+    free, _ = torch.cuda.mem_get_info(device)
+    return int(free * CACHE_SHARE / workers)
+
+
+def require_device(device: str) -> None:
+    """Multiply and convolve on a device; raises :class:`DeviceError` if that fails.
+
+    PyTorch counts GPUs for which its build or its cuDNN has no kernels among the available ones, and such a GPU
+    (a P100 with cuDNN 9.19) may multiply and not convolve: only kernels that run are proof.
+    """
+    if device == "cpu":
+        return
+    import torch
+
+    try:
+        image = torch.ones(1, 1, 8, 8, device=device)
+        torch.nn.functional.conv2d(image @ image, image[..., :3, :3]).sum().item()
+    except Exception as error:
+        if failure_of(error) is Failure.OUT_OF_MEMORY:
+            raise
+        reason = reason_of(error).partition("\n")[0]
+        raise DeviceError(f"{device} cannot be used ({reason}); try --device cpu") from error

@@ -1,0 +1,64 @@
+"""What all figures share: colours, an empty figure, plain axes, and the ways to write a figure."""
+
+from io import BytesIO
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mkpc_kaggle.errors import UserError
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+# The Okabe-Ito palette, which colour-blind readers can tell apart.
+INLIER, OUTLIER, REGION, DROPPED = "#009E73", "#D55E00", "#F0E442", "#999999"
+COLOURS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#56B4E9", "#CC79A7")
+DPI = 110
+
+
+def new_figure(width: float, height: float) -> "Figure":
+    """An empty figure of that size in inches; :class:`UserError` without matplotlib."""
+    try:
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise UserError("figures need matplotlib: pip install 'mkpc-kaggle[plots]'") from error
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+def save(figure: "Figure", path: Path) -> None:
+    """Write a figure; the suffix says the format. Raises :class:`UserError` if it cannot be written."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(path, dpi=DPI)
+    except (OSError, ValueError) as error:
+        raise UserError(f"the figure {path} cannot be written: {error}") from error
+
+
+def encode(figure: "Figure", kind: str, dpi: int = DPI) -> bytes:
+    """The figure as "png", for lines and text, or "jpeg", for photographs."""
+    stream = BytesIO()
+    figure.savefig(stream, format=kind, dpi=dpi, pil_kwargs={"quality": 82} if kind == "jpeg" else None)
+    return stream.getvalue()
+
+
+def plain(axes: "Axes", title: str) -> "Axes":
+    """Axes with a title on the left, and without a frame on top and to the right."""
+    axes.set_title(title, loc="left", fontsize=10)
+    axes.tick_params(labelsize=9)
+    axes.spines[["top", "right"]].set_visible(False)
+    return axes
+
+
+def short(name: str, most: int = 18) -> str:
+    return name if len(name) <= most else name[: most - 1] + "…"
+
+
+def sample(mask: NDArray[np.bool_], most: int) -> NDArray[np.intp]:
+    """At most ``most`` indices of a mask, evenly spread."""
+    indices: NDArray[np.intp] = np.flatnonzero(mask)
+    places = np.linspace(0, len(indices) - 1, min(most, len(indices))).round().astype(int)
+    chosen: NDArray[np.intp] = indices[places]
+    return chosen

@@ -1,0 +1,142 @@
+"""Structure from motion by pycolmap: a connected view graph in, cameras and points out.
+
+pycolmap can end the process on its own (a failed assertion, memory), and the global mapper has no time limit. Once
+pycolmap is imported, a SIGTERM ends the process with a stack trace on stderr. So a caller that cannot afford this
+runs it in a process of its own. Nothing is written to disk: the database is in memory.
+
+The same input gives the same bytes on one machine with ``threads = 1``. With more threads, sums are added in
+another order each time, and the last digits differ.
+
+Sources: Schoenberger and Frahm 2016 (the incremental mapper), Pan et al. 2024 (the global one).
+"""
+
+from typing import Any
+
+import numpy as np
+import pycolmap
+
+from mkpc_kaggle.geometry.cameras import Camera
+from mkpc_kaggle.scene.config import CameraModel, Mapper, SceneConfig
+from mkpc_kaggle.scene.keypoints import SceneKeypoints, scene_keypoints
+from mkpc_kaggle.scene.reconstruction import MIN_IMAGES, RegisteredImage, SfmModel
+from mkpc_kaggle.scene.shared_intrinsics import SharedIntrinsics
+from mkpc_kaggle.scene.view_graph import MIN_MATCHES, BatchImage, ViewGraph
+
+CENTRE_PX = 0.5  # in COLMAP the top-left pixel's centre is (0.5, 0.5), here it is (0, 0)
+PRIOR_FOCAL = 1.1  # long sides of the image: the focal length that cameras start with
+SEED = 0
+
+
+def structure_from_motion(graph: ViewGraph, config: SceneConfig, shared: SharedIntrinsics) -> tuple[SfmModel, ...]:
+    """The models that pycolmap makes of connected images, the largest first; perhaps none.
+
+    Each image has a camera of its own, except those with ``shared`` intrinsics, which start at the shared focal
+    length.
+    """
+    pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
+    pycolmap.set_random_seed(SEED)
+    keypoints, manager = scene_keypoints(graph), pycolmap.ReconstructionManager()
+    with pycolmap.Database.open(":memory:") as database:
+        with pycolmap.DatabaseTransaction(database):
+            cameras = _write_images(database, graph, keypoints, config.camera_model, shared)
+            _write_verified(database, graph, keypoints, cameras, config)
+        if config.mapper is Mapper.INCREMENTAL:
+            pycolmap.IncrementalPipeline(_incremental_options(config), database, manager).run()
+        else:
+            pycolmap.GlobalPipeline(_global_options(config), database, manager).run()
+    models = [_sfm_model(manager.get(number), graph) for number in range(manager.size())]
+    return tuple(sorted(models, key=lambda model: (-len(model.images), -len(model.points))))
+
+
+def _write_images(
+    database: Any, graph: ViewGraph, keypoints: SceneKeypoints, model: CameraModel, shared: SharedIntrinsics
+) -> list[Any]:
+    """Write images, frames, cameras and rigs; returns each image's camera.
+
+    Images and frames are numbered by the image's place plus one, cameras and rigs by their first image.
+    """
+    cameras: dict[object, Any] = {}
+    used = []
+    for number, (image, points) in enumerate(zip(graph.images, keypoints.points, strict=True), start=1):
+        focal = shared.get(image.digest)
+        key = number if focal is None else (image.size, focal)
+        if key not in cameras:
+            cameras[key] = _write_camera(database, number, image, model, focal)
+        camera = cameras[key]
+        taken = pycolmap.Image(
+            name=f"{number:06}", camera_id=camera.camera_id, image_id=number, keypoints=np.zeros((0, 2))
+        )
+        database.write_image(taken, use_image_id=True)
+        frame = pycolmap.Frame(frame_id=number, rig_id=camera.camera_id)
+        frame.add_data_id(taken.data_id)
+        database.write_frame(frame, use_frame_id=True)
+        database.write_keypoints(number, points + np.float32(CENTRE_PX))
+        used.append(camera)
+    return used
+
+
+def _write_camera(database: Any, number: int, image: BatchImage, model: CameraModel, focal: float | None) -> Any:
+    """Write a camera, and a rig of it alone."""
+    start = PRIOR_FOCAL * max(image.size) if focal is None else focal
+    camera = pycolmap.Camera.create_from_model_name(number, model.value, start, *image.size)
+    camera.has_prior_focal_length = True  # a pair that E explains at the prior is used as calibrated
+    database.write_camera(camera, use_camera_id=True)
+    rig = pycolmap.Rig(rig_id=number)
+    rig.add_ref_sensor(camera.sensor_id)
+    database.write_rig(rig, use_rig_id=True)
+    return camera
+
+
+def _write_verified(
+    database: Any, graph: ViewGraph, keypoints: SceneKeypoints, cameras: list[Any], config: SceneConfig
+) -> None:
+    """Write the matches of each edge that agree on an epipolar geometry."""
+    options = pycolmap.TwoViewGeometryOptions()
+    options.ransac.max_error = config.verification_error
+    options.ransac.random_seed = SEED
+    options.min_num_inliers = MIN_MATCHES
+    options.detect_watermark = False  # it looks for matches that stand still, of which near views have many
+    points = [found.astype(np.float64) + CENTRE_PX for found in keypoints.points]
+    for edge, matches in zip(graph.edges, keypoints.matches, strict=True):
+        first, second = edge.first, edge.second
+        found = pycolmap.estimate_two_view_geometry(
+            cameras[first], points[first], cameras[second], points[second], matches, options
+        )
+        database.write_two_view_geometry(first + 1, second + 1, found)
+
+
+def _incremental_options(config: SceneConfig) -> Any:
+    options = pycolmap.IncrementalPipelineOptions()
+    options.extract_colors = False
+    return _with_common(options, config, options.mapper, options.triangulation)
+
+
+def _global_options(config: SceneConfig) -> Any:
+    options = pycolmap.GlobalPipelineOptions()
+    mapper = options.mapper
+    mapper.num_threads = config.threads
+    parts = mapper, mapper.rotation_averaging, mapper.global_positioning, mapper.retriangulation
+    return _with_common(options, config, *parts)
+
+
+def _with_common(options: Any, config: SceneConfig, *parts: Any) -> Any:
+    """What both mappers are told; ``parts`` have a seed of their own."""
+    options.min_model_size = MIN_IMAGES
+    options.min_num_matches = MIN_MATCHES
+    options.num_threads = config.threads
+    for part in (options, *parts):
+        part.random_seed = SEED
+    return options
+
+
+def _sfm_model(found: Any, graph: ViewGraph) -> SfmModel:
+    images = []
+    for number in sorted(found.reg_image_ids()):
+        image = found.images[number]
+        pose, K = np.asarray(image.cam_from_world().matrix()), np.array(image.camera.calibration_matrix())
+        K[:2, 2] -= CENTRE_PX
+        camera = Camera(K, pose[:, :3].copy(), pose[:, 3].copy())
+        images.append(RegisteredImage(graph.images[number - 1], camera, int(image.num_points3D)))
+    points = [found.points3D[number].xyz for number in sorted(found.point3D_ids())]
+    error = float(found.compute_mean_reprojection_error()) if points else 0.0
+    return SfmModel(tuple(images), np.array(points, np.float64).reshape(-1, 3), error)

@@ -1,0 +1,44 @@
+"""Images that one camera took at one zoom, recognised by the focal lengths that were found for them one by one.
+
+A reconstruction that gives each image its own focal length trades it for the distance to what the image sees, and
+an image with few points may get any. If most images of one size agree on theirs, one camera took them, and a
+second reconstruction can share its intrinsics from the start.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TypeAlias
+
+import numpy as np
+
+from mkpc_kaggle.scene.reconstruction import RegisteredImage, SfmModel
+from mkpc_kaggle.scene.view_graph import BatchImage
+
+MIN_ALIKE = 5  # registered images of one size
+ZOOM_POINTS = 0.5  # an image that disagrees but sees this share of the median image's points has another zoom
+
+SharedIntrinsics: TypeAlias = Mapping[str, float]
+"""The focal length in pixels of the camera that took an image, by the image's digest; one camera for each size."""
+
+
+def shared_intrinsics(
+    images: Sequence[BatchImage], models: Iterable[SfmModel], tolerance: float
+) -> SharedIntrinsics:
+    """The focal lengths that images of one size share, because more than half of the registered ones agree.
+
+    To agree is to be within a share of ``tolerance`` of their median. All images of the size share it, registered
+    or not, except those that see many points at another focal length: they were taken at another zoom.
+    """
+    registered: dict[str, RegisteredImage] = {}
+    for model in models:
+        for found in model.images:
+            registered.setdefault(found.image.digest, found)
+    shared: dict[str, float] = {}
+    for size in {found.image.size for found in registered.values()}:
+        alike = [found for found in registered.values() if found.image.size == size]
+        focal = float(np.median([found.focal for found in alike]))
+        near = [found for found in alike if abs(found.focal / focal - 1) < tolerance]
+        if len(alike) >= MIN_ALIKE and len(near) > len(alike) / 2:
+            many = ZOOM_POINTS * float(np.median([found.points for found in alike]))
+            zoomed = {found.image for found in alike if found not in near and found.points >= many}
+            shared |= {image.digest: focal for image in images if image.size == size and image not in zoomed}
+    return shared

@@ -1,0 +1,122 @@
+"""The view graph of a batch: its distinct images, and the matches between each two of them."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from mkpc_kaggle.geometry.coordinates import Size
+from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.geometry.robust import Matrix3
+from mkpc_kaggle.pipeline.pair import UnitResult
+
+MIN_MATCHES = 15  # an edge with fewer connects nothing; also the inliers that a verified edge needs
+MIN_TRACK_MATCHES = 50  # a pair with fewer matches from units that make tracks uses those of all its units
+
+
+@dataclass(frozen=True)
+class BatchImage:
+    """An image of a batch: its ``name``, the ``digest`` of its content, its ``size`` in pixels.
+
+    Two names with one digest are one image.
+    """
+
+    name: str
+    digest: str
+    size: Size
+
+
+@dataclass(frozen=True, eq=False)
+class BatchPair:
+    """Two images of a batch and their matches in full-image pixels, which may be empty.
+
+    ``pair_fundamental`` is the F, (3, 3), that the pair's matches alone gave, or ``None``. ``tracks`` are the
+    matches that the scene is made of, by the names of their matchers; ``None``: all matches, as of one matcher.
+    """
+
+    image0: BatchImage
+    image1: BatchImage
+    matches: Matches
+    pair_fundamental: Matrix3 | None = None
+    tracks: Mapping[str, Matches] | None = None
+
+    def tracks_of(self, matcher: str = "") -> Matches:
+        """The matches that the scene is made of; with ``matcher`` only those that it found."""
+        if self.tracks is None:
+            return self.matches
+        return Matches.concatenate(found for name, found in self.tracks.items() if matcher in ("", name))
+
+
+@dataclass(frozen=True, eq=False)
+class Edge:
+    """All matches between two distinct images, given by their places in a list of images, ``first < second``."""
+
+    first: int
+    second: int
+    matches: Matches
+
+
+@dataclass(frozen=True, eq=False)
+class ViewGraph:
+    """Distinct images, and the edges between them in order of their two ends."""
+
+    images: tuple[BatchImage, ...]
+    edges: tuple[Edge, ...]
+
+    @classmethod
+    def of_pairs(cls, pairs: Sequence[BatchPair], matcher: str = "") -> "ViewGraph":
+        """The graph of a batch's pairs, from the matches of all matchers or of one.
+
+        Pairs of the same two images become one edge, whatever their order. A pair of an image with itself and a
+        pair without matches make no edge.
+        """
+        images = {image.digest: image for pair in reversed(pairs) for image in (pair.image1, pair.image0)}
+        order = list(dict.fromkeys(image.digest for pair in pairs for image in (pair.image0, pair.image1)))
+        place = {digest: number for number, digest in enumerate(order)}
+        parts: dict[tuple[int, int], list[Matches]] = {}
+        for pair in pairs:
+            first, second = place[pair.image0.digest], place[pair.image1.digest]
+            tracks = pair.tracks_of(matcher)
+            if first != second and len(tracks):
+                ordered = tracks if first < second else swapped(tracks)
+                parts.setdefault((min(first, second), max(first, second)), []).append(ordered)
+        edges = tuple(Edge(*ends, Matches.concatenate(parts[ends])) for ends in sorted(parts))
+        return cls(tuple(images[digest] for digest in order), edges)
+
+    def components(self) -> tuple["ViewGraph", ...]:
+        """The connected components that have an edge, by their first images.
+
+        An edge with fewer than ``MIN_MATCHES`` matches connects nothing, and is in no component.
+        """
+        strong = [edge for edge in self.edges if len(edge.matches) >= MIN_MATCHES]
+        ends = np.array([(edge.first, edge.second) for edge in strong], np.intp).reshape(-1, 2)
+        shape = (len(self.images), len(self.images))
+        adjacency = coo_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=shape)
+        _, labels = connected_components(adjacency, directed=False)
+        found = []
+        for label in dict.fromkeys(labels[np.sort(ends[:, 0])].tolist()):
+            members = np.flatnonzero(labels == label).tolist()
+            place = {image: number for number, image in enumerate(members)}
+            inside = [edge for edge in strong if labels[edge.first] == label]
+            edges = tuple(Edge(place[edge.first], place[edge.second], edge.matches) for edge in inside)
+            found.append(ViewGraph(tuple(self.images[image] for image in members), edges))
+        return tuple(found)
+
+
+def swapped(matches: Matches) -> Matches:
+    """The same matches with the two images in the other order."""
+    return Matches(matches.points1, matches.points0, matches.scores)
+
+
+def tracks_of(results: Sequence[UnitResult]) -> dict[str, Matches]:
+    """The matches that a scene is made of, by their matchers: of units that make tracks, or all if few are."""
+    chosen = [result for result in results if result.unit.tracks]
+    if sum(len(result.matches) for result in chosen) < MIN_TRACK_MATCHES:
+        chosen = list(results)
+    matchers = dict.fromkeys(result.unit.matcher for result in chosen)
+    return {
+        name: Matches.concatenate(result.matches for result in chosen if result.unit.matcher == name)
+        for name in matchers
+    }

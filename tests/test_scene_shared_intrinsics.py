@@ -1,0 +1,153 @@
+"""Shared intrinsics: recognised by focal lengths, and kept only if they explain the matches."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from benchmarks.synthetic_scene import SyntheticScene, synthetic_scene
+from mkpc_kaggle.geometry.cameras import Camera, relative_pose
+from mkpc_kaggle.geometry.coordinates import Size
+from mkpc_kaggle.geometry.focal_prior import FocalConfig
+from mkpc_kaggle.geometry.robust import RobustConfig
+from mkpc_kaggle.scene import colmap
+from mkpc_kaggle.scene.choose import estimate_at_known_focals, known_focal
+from mkpc_kaggle.scene.config import SceneConfig
+from mkpc_kaggle.scene.reconstruct import Solution, reconstruct_batch
+from mkpc_kaggle.scene.reconstruction import RegisteredImage, SfmModel
+from mkpc_kaggle.scene.shared_intrinsics import shared_intrinsics
+from mkpc_kaggle.scene.view_graph import BatchImage, ViewGraph
+
+WIDE, TALL = Size(800, 600), Size(600, 800)
+FOCAL = 840.0
+CONFIG = SceneConfig()
+OWN = SceneConfig(shared_intrinsics=0)
+
+
+def images(count: int, size: Size = WIDE, prefix: str = "") -> list[BatchImage]:
+    return [BatchImage(f"{prefix}{number}", f"{prefix}{number}", size) for number in range(count)]
+
+
+def model(registered: Sequence[BatchImage], focals: Sequence[float], points: Sequence[int] = ()) -> SfmModel:
+    found = [
+        RegisteredImage(image, Camera(np.diag([focal, focal, 1.0]), np.eye(3), np.zeros(3)), seen)
+        for image, focal, seen in zip(registered, focals, points or [100] * len(focals), strict=True)
+    ]
+    return SfmModel(tuple(found), np.zeros((0, 3)), 0.5)
+
+
+def shared(*focals: float, points: Sequence[int] = (), tolerance: float = 0.02) -> dict[str, float]:
+    """By digest, the shared focal length of as many wide images, each found to have its own."""
+    every = images(len(focals))
+    return dict(shared_intrinsics(every, [model(every, focals, points)], tolerance))
+
+
+def test_most_images_of_a_size_tell_its_focal_length() -> None:
+    assert shared(838, 839, 840, 841, 842) == dict.fromkeys("01234", 840)
+
+
+def test_an_image_with_few_points_shares_the_camera_whatever_its_focal_length() -> None:
+    assert shared(838, 840, 841, 2900, 880, points=(100, 100, 100, 4, 49)) == dict.fromkeys("01234", 841)
+
+
+def test_an_image_with_many_points_and_another_focal_length_was_taken_at_another_zoom() -> None:
+    assert shared(838, 840, 841, 420, 842, points=(100, 100, 100, 90, 100)) == dict.fromkeys("0124", 840)
+
+
+def test_an_image_without_a_camera_shares_that_of_its_size() -> None:
+    every = [*images(6), *images(1, TALL, "tall")]
+    found = shared_intrinsics(every, [model(every[:5], [FOCAL] * 5)], 0.02)
+    assert found == dict.fromkeys("012345", FOCAL)
+
+
+def test_an_image_in_two_models_counts_once() -> None:
+    every = images(4)
+    assert shared_intrinsics(every, [model(every, [FOCAL] * 4)] * 2, 0.02) == {}
+
+
+@pytest.mark.parametrize(
+    "focals",
+    [(), (FOCAL,) * 4, (840, 840, 840, 900, 900, 900), (600, 700, 840, 950, 1100), (-840,) * 3 + (np.nan,) * 3],
+    ids=["none", "few", "half", "strangers", "absurd"],
+)
+def test_where_fewer_agree_nothing_is_shared(focals: tuple[float, ...]) -> None:
+    assert shared(*focals) == {}
+
+
+def test_few_images_of_each_of_two_sizes_are_few() -> None:
+    every = [*images(3), *images(3, TALL, "tall")]
+    assert shared_intrinsics(every, [model(every, [FOCAL] * 6)], 0.02) == {}
+
+
+def test_zero_turns_it_off() -> None:
+    assert shared(838, 839, 840, 841, 842, tolerance=0) == {}
+    assert shared(*[FOCAL] * 5, tolerance=0) == {}, "also where no focal length moved from its prior"
+
+
+def focals_of(solution: Solution) -> list[float]:
+    return [found.focal for each in solution.reconstructions for model in each.models for found in model.images]
+
+
+def mean_angle(solution: Solution, scene: SyntheticScene) -> float:
+    """Between the found and the true direction from one image to the other, in degrees."""
+    angles = []
+    for pair in scene.pairs:
+        ends = (pair.image0, pair.image1)
+        cameras = [solution.registered(image).camera for image in ends], [scene.cameras[e.name] for e in ends]
+        found, wanted = (relative_pose(*both)[1] for both in cameras)
+        angles.append(np.degrees(np.arccos(found @ wanted / np.linalg.norm(found) / np.linalg.norm(wanted))))
+    return float(np.mean(angles))
+
+
+def test_a_scene_with_shared_intrinsics_is_nearer_to_the_truth() -> None:
+    scene = synthetic_scene(7, 12, points=250, noise=1.0, focals=[FOCAL] * 7)
+    own, sharing = reconstruct_batch(scene.pairs, OWN), reconstruct_batch(scene.pairs, CONFIG)
+    assert len(set(focals_of(own))) == 7
+    (focal,) = set(focals_of(sharing))
+    assert focal == pytest.approx(FOCAL, rel=0.01)
+    assert mean_angle(sharing, scene) < 0.6 * mean_angle(own, scene)
+
+
+def test_images_at_another_zoom_keep_a_camera_of_their_own() -> None:
+    scene = synthetic_scene(8, points=400, focals=[FOCAL] * 6 + [0.6 * FOCAL, 1.5 * FOCAL])
+    found = reconstruct_batch(scene.pairs, CONFIG)
+    assert len(set(focals_of(found))) == 3
+    for image in scene.images:
+        assert found.registered(image).focal == pytest.approx(scene.cameras[image.name].K[0, 0], rel=0.02)
+
+
+def test_shared_intrinsics_that_explain_fewer_points_are_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = synthetic_scene(6, points=300)
+    everything = {image.digest: FOCAL for image in scene.images}
+    monkeypatch.setattr("mkpc_kaggle.scene.reconstruct.shared_intrinsics", lambda *_: everything)
+    assert len(set(focals_of(reconstruct_batch(scene.pairs, CONFIG)))) == 6
+    monkeypatch.setattr("mkpc_kaggle.scene.reconstruct.MIN_OBSERVATIONS", 0)
+    assert len(set(focals_of(reconstruct_batch(scene.pairs, CONFIG)))) == 1
+
+
+def test_each_matchers_reconstruction_shares_the_intrinsics_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    sharing: list[bool] = []
+    made = colmap.structure_from_motion
+
+    def note(graph: ViewGraph, config: SceneConfig, known: Any) -> tuple[SfmModel, ...]:
+        sharing.append(bool(known))
+        return made(graph, config, known)
+
+    monkeypatch.setattr(colmap, "structure_from_motion", note)
+    scene = synthetic_scene(6, points=500, focals=[FOCAL] * 6)
+    pairs = [replace(p, tracks={"even": p.matches[::2], "odd": p.matches[1::2]}) for p in scene.pairs]
+    reconstruct_batch(pairs, CONFIG)
+    assert sharing == [False, True, True, True]
+
+
+def test_an_image_that_the_scene_lacks_has_the_shared_focal_length() -> None:
+    (registered,) = model(images(1), [850.0]).images
+    known = {"0": FOCAL, "9": FOCAL}
+    assert [known_focal(digest, [{"0": registered}], known) for digest in "098"] == [850, FOCAL, None]
+    pair = synthetic_scene(2, points=300, focals=[FOCAL] * 2).pairs[0]
+    settings = FocalConfig(), RobustConfig(orders=1, max_iterations=2000)
+    both = {pair.image0.digest: FOCAL, pair.image1.digest: FOCAL}
+    assert estimate_at_known_focals(pair, [], both, *settings) is not None
+    assert estimate_at_known_focals(pair, [], {}, *settings) is None
