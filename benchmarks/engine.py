@@ -85,7 +85,7 @@ def run(pairs: Sequence[Pair], assembly: Assembly, directory: Path) -> TimeSpent
     journal = Journal(directory, {"benchmark": 1}, pairs=pairs)
 
     def publish(records: Sequence[PairRecord]) -> None:
-        matrices = {pair.id: record.F for pair, record in zip(pairs, records, strict=True)}
+        matrices = {pair.id: record.pair_fundamental for pair, record in zip(pairs, records, strict=True)}
         write_submission(directory / "submission.csv", matrices)
 
     try:

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from mkpc_kaggle.engine.planner import units_that_fit
 
 from mkpc_kaggle.engine.budget import Budget, format_duration, monotonic_of, parse_duration
 from mkpc_kaggle.engine.costs import WINDOW, Costs, needs
-from mkpc_kaggle.engine.planner import units_that_fit
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.recipe import Unit
 

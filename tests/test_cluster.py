@@ -4,10 +4,10 @@ import sys
 from pathlib import Path
 
 import pytest
+from mkpc_kaggle.engine.pools.cluster import RayCluster, parse_workers
 from rectified import THREE_UNITS, RectifiedMatcher, run, write_pairs
 
 from mkpc_kaggle.cli import main
-from mkpc_kaggle.engine.pools.cluster import RayCluster, parse_workers
 from mkpc_kaggle.errors import UserError
 
 

@@ -12,6 +12,9 @@ from faulty import (
     pipeline_in_batches,
     pipeline_telling_its_environment,
 )
+from mkpc_kaggle.engine.pools import pool
+from mkpc_kaggle.engine.pools.pool import Pool
+from mkpc_kaggle.engine.pools.process import WORKER_ENVIRONMENT
 from rectified import THREE_UNITS, RectifiedMatcher, process_place, run, write_pairs
 
 from mkpc_kaggle.cli import main
@@ -20,9 +23,6 @@ from mkpc_kaggle.demo import DemoSet
 from mkpc_kaggle.engine import session
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.engine import Ending, RunReport
-from mkpc_kaggle.engine.pools import pool
-from mkpc_kaggle.engine.pools.pool import Pool
-from mkpc_kaggle.engine.pools.process import WORKER_ENVIRONMENT
 from mkpc_kaggle.engine.session import Interrupt, Session, run_pairs
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.pipeline import assembly as assemblies
@@ -45,7 +45,7 @@ def undisturbed(pairs: list[Pair], tmp_path_factory: pytest.TempPathFactory) -> 
 
 
 def matrices(report: RunReport) -> list[bytes]:
-    return [record.F.tobytes() for record in report.records]
+    return [record.pair_fundamental.tobytes() for record in report.records]
 
 
 def assembly_of(matcher: RectifiedMatcher) -> Assembly:

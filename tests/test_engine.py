@@ -20,13 +20,14 @@ from rectified import (
 
 from mkpc_kaggle.engine.engine import Ending
 from mkpc_kaggle.engine.journal import Journal
+from mkpc_kaggle.engine.plan import JOB_PAIRS
 from mkpc_kaggle.engine.records import NOT_REACHED, PairRecord
 from mkpc_kaggle.pipeline.assembly import Assembly
 from mkpc_kaggle.pipeline.stages import Pipeline
 
 
 def matrices(records: tuple[PairRecord, ...]) -> bytes:
-    return b"".join(record.F.tobytes() for record in records)
+    return b"".join(record.pair_fundamental.tobytes() for record in records)
 
 
 def units(record: PairRecord) -> list[str]:
@@ -42,7 +43,9 @@ def test_a_run_without_a_limit_gives_every_pair_every_unit(tmp_path: Path) -> No
         assert record.failure == ""
         # Stage 2 sees the critical region only, so a few points at its border are lost.
         assert 400 < record.inliers == record.matches <= 450
-        np.testing.assert_allclose(np.abs(record.F[1:, 1:]), [[0, 0.5**0.5], [0.5**0.5, 0]], atol=2e-3)
+        np.testing.assert_allclose(
+            np.abs(record.pair_fundamental[1:, 1:]), [[0, 0.5**0.5], [0.5**0.5, 0]], atol=2e-3
+        )
         assert record.regions is not None
 
 
@@ -57,7 +60,7 @@ def test_every_published_version_is_whole_and_the_first_comes_before_any_work(tm
     matcher, published = RectifiedMatcher(), []
 
     def publish(records: list[PairRecord]) -> None:
-        published.append(([record.F.copy() for record in records], len(matcher.calls)))
+        published.append(([record.pair_fundamental.copy() for record in records], len(matcher.calls)))
 
     run(write_pairs(tmp_path, 5), THREE_UNITS, matcher, tmp_path / "work", publish=publish)
     assert published[0][1] == 0
@@ -94,7 +97,10 @@ def test_a_limit_shorter_than_the_sweep_still_gives_every_row(tmp_path: Path) ->
     assert 0 < len(reached) < 30
     assert report.ending is Ending.TIME_IS_UP
     assert {record.failure for record in report.records if not record.units} == {NOT_REACHED}
-    assert all(np.isfinite(record.F).all() and np.linalg.matrix_rank(record.F) == 2 for record in report.records)
+    assert all(
+        np.isfinite(record.pair_fundamental).all() and np.linalg.matrix_rank(record.pair_fundamental) == 2
+        for record in report.records
+    )
 
 
 def test_an_interrupted_run_goes_on_where_it_was_and_ends_with_the_same_bytes(tmp_path: Path) -> None:
@@ -107,7 +113,8 @@ def test_an_interrupted_run_goes_on_where_it_was_and_ends_with_the_same_bytes(tm
     resumed = run(pairs, THREE_UNITS, second, tmp_path / "work")
     assert matrices(resumed.records) == matrices(undisturbed.records)
     assert [units(record) for record in resumed.records] == [units(record) for record in undisturbed.records]
-    assert max(Counter(first.calls + second.calls).values()) == 1, "no unit runs twice on a pair"
+    again = [call for call, count in Counter(first.calls + second.calls).items() if count > 1]
+    assert len(again) <= JOB_PAIRS * 3, "only the job that was under way runs twice"
     assert first.calls
     assert second.calls
 
@@ -126,7 +133,7 @@ def test_an_unreadable_image_costs_its_pair_only(tmp_path: Path) -> None:
     pairs[2].image1.write_bytes(b"")
     report = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
     assert "the file is empty" in report.records[2].failure
-    assert np.linalg.matrix_rank(report.records[2].F) == 2
+    assert np.linalg.matrix_rank(report.records[2].pair_fundamental) == 2
     assert [len(record.units) for record in report.records] == [3, 3, 0, 3]
     assert report.ending is Ending.COMPLETE
 

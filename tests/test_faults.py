@@ -26,6 +26,8 @@ from faulty import (
     hang,
     pipeline_once,
 )
+from mkpc_kaggle.engine.pools.pool import Pool
+from mkpc_kaggle.engine.pools.process import ProcessWorker
 from rectified import (
     SECOND,
     SWEEP,
@@ -45,8 +47,6 @@ from mkpc_kaggle.engine.costs import Timeouts
 from mkpc_kaggle.engine.engine import Ending, RunReport
 from mkpc_kaggle.engine.jobs import Cause, Job, JobFailure, Phase
 from mkpc_kaggle.engine.journal import Journal
-from mkpc_kaggle.engine.pools.pool import Pool
-from mkpc_kaggle.engine.pools.process import ProcessWorker
 from mkpc_kaggle.engine.records import NOT_REACHED, PairRecord
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.pipeline.assembly import Assembly
@@ -68,12 +68,14 @@ def undisturbed(pairs: list[Pair], tmp_path_factory: pytest.TempPathFactory) -> 
 
 
 def matrices(records: tuple[PairRecord, ...] | list[PairRecord]) -> list[bytes]:
-    return [record.F.tobytes() for record in records]
+    return [record.pair_fundamental.tobytes() for record in records]
 
 
 def assert_others_as_good(report: RunReport, undisturbed: RunReport) -> None:
     assert [record.index for record in report.records] == list(range(COUNT))
-    assert all(np.isfinite(record.F).all() and record.F.any() for record in report.records)
+    assert all(
+        np.isfinite(record.pair_fundamental).all() and record.pair_fundamental.any() for record in report.records
+    )
     others = [matrix for index, matrix in enumerate(matrices(report.records)) if index != VICTIM]
     assert others == [matrix for index, matrix in enumerate(matrices(undisturbed.records)) if index != VICTIM]
 

@@ -7,6 +7,8 @@ from statistics import median
 
 import numpy as np
 import pytest
+from mkpc_kaggle.engine.planner import Planner
+from mkpc_kaggle.engine.upgrade import UpgradeConfig, is_weak
 from rectified import SECOND, SWEEP, THREE_UNITS
 from simulator import RESTART_SECONDS, Scenario, random_scenario, simulate, without_records
 
@@ -14,9 +16,7 @@ from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.costs import Timeouts
 from mkpc_kaggle.engine.engine import Ending
 from mkpc_kaggle.engine.jobs import Cause, Job, JobFailure, JobResult, Outcome, Phase
-from mkpc_kaggle.engine.planner import Planner
 from mkpc_kaggle.engine.records import PairRecord, UnitRecord
-from mkpc_kaggle.engine.upgrade import UpgradeConfig, is_weak
 from mkpc_kaggle.geometry.coordinates import Box
 from mkpc_kaggle.geometry.critical_region import CriticalRegion, RegionReason
 from mkpc_kaggle.geometry.matches import Matches

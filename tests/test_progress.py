@@ -3,10 +3,10 @@
 from io import StringIO
 
 import pytest
+from mkpc_kaggle.engine.progress import LINE_SECONDS, Bar, Lines, progress_on
 
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.jobs import Phase
-from mkpc_kaggle.engine.progress import LINE_SECONDS, Bar, Lines, progress_on
 
 
 class Terminal(StringIO):

@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 from faulty import FarMatcher, FaultyMatcher, die, hang, nothing
+from mkpc_kaggle.engine.pools.cluster import RayCluster
 from rectified import THREE_UNITS, RectifiedMatcher, run, write_pairs
 from synthetic import RECIPE as SYNTHETIC
 from synthetic import SyntheticMatcher, synthetic_pairs
@@ -19,7 +20,6 @@ from test_faults import QUICK, matrices
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.engine import Ending, RunReport
-from mkpc_kaggle.engine.pools.cluster import RayCluster
 
 ray = pytest.importorskip("ray", reason="Ray is not installed: pip install 'mkpc-kaggle[ray]'")
 
@@ -148,8 +148,9 @@ def test_images_are_sent_to_machines_that_cannot_read_them(
 
 
 def test_an_image_is_read_here_only_if_it_is_the_same_file(tmp_path: Path) -> None:
-    from mkpc_kaggle.data.images import Image, Unreadable
     from mkpc_kaggle.engine.pools.ray_actor import FileServer, read_or_fetch
+
+    from mkpc_kaggle.data.images import Image, Unreadable
 
     pair, other = write_pairs(tmp_path, 2)
     server, asked = FileServer(), []

@@ -83,7 +83,7 @@ def test_the_json_export_has_each_pair_with_its_units_and_regions(tmp_path: Path
     values = json.loads((tmp_path / "log.json").read_text())
     assert [len(pair["units"]) for pair in values["pairs"]] == [3, 0] + [3] * 10
     assert [len(pair["regions"]) for pair in values["pairs"]] == [2, 0] + [2] * 10
-    assert values["pairs"][4]["F"] == read_log(tmp_path / "work").records[4].fundamental.tolist()
+    assert values["pairs"][4]["F"] == read_log(tmp_path / "work").records[4].chosen_fundamental.tolist()
     assert values["ending"] == "complete"
     assert values["recipe"]["units"][0]["long_side"] == THREE_UNITS.units[0].long_side
 

@@ -8,12 +8,12 @@ from multiprocessing.context import SpawnProcess
 
 import numpy as np
 import pytest
-
 from mkpc_kaggle.engine.pools import scene_process
 from mkpc_kaggle.engine.pools.scene_process import SceneProcess
+from mkpc_kaggle.scene.batch import BatchPair
+
 from mkpc_kaggle.engine.scenes import SceneJob
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.scene.batch import BatchPair
 from mkpc_kaggle.scene.config import SceneConfig
 
 POINTS = np.random.default_rng(1).uniform(0, 500, (50_000, 2)).astype(np.float32)

@@ -8,6 +8,8 @@ import cv2
 import faulty
 import numpy as np
 import pytest
+from mkpc_kaggle.engine.pools import scene_process
+from mkpc_kaggle.engine.pools.pool import Pool
 from rectified import SWEEP, THREE_UNITS, RectifiedMatcher, run
 from synthetic import RECIPE as SYNTHETIC
 from synthetic import SyntheticMatcher, synthetic_pairs
@@ -15,8 +17,6 @@ from synthetic import SyntheticMatcher, synthetic_pairs
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.costs import Timeouts
 from mkpc_kaggle.engine.engine import Ending
-from mkpc_kaggle.engine.pools import scene_process
-from mkpc_kaggle.engine.pools.pool import Pool
 from mkpc_kaggle.engine.scenes import Reconstruction, SceneJob
 from mkpc_kaggle.recipe import Recipe
 from mkpc_kaggle.reporting.report import report_page
@@ -46,7 +46,7 @@ def fault(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
 
 def own_matrices(pairs: list[Pair], directory: Path) -> list[bytes]:
     report = run(pairs, THREE_UNITS, RectifiedMatcher(), directory)
-    return [record.F.tobytes() for record in report.records]
+    return [record.pair_fundamental.tobytes() for record in report.records]
 
 
 def test_pairs_get_the_f_of_their_scene_and_keep_their_own(
@@ -57,8 +57,10 @@ def test_pairs_get_the_f_of_their_scene_and_keep_their_own(
     report = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work", publish=lambda r: published.append(list(r)))
     assert report.ending is Ending.COMPLETE
     assert [record.source for record in report.records] == ["pair"] + ["scene"] * 5
-    assert all(np.array_equal(record.fundamental, SCENE_F) for record in report.records[1:])
-    assert [record.F.tobytes() for record in report.records] == own_matrices(pairs, tmp_path / "alone")
+    assert all(np.array_equal(record.chosen_fundamental, SCENE_F) for record in report.records[1:])
+    assert [record.pair_fundamental.tobytes() for record in report.records] == own_matrices(
+        pairs, tmp_path / "alone"
+    )
     assert published[-1][0].scene.reason is Reason.CONTRADICTION
     log = read_log(tmp_path / "work")
     assert "scenes: 1 of 1 batches reconstructed with 4 of 4 images; F of 5 of 6 pairs is from them" in overview(
@@ -76,7 +78,9 @@ def test_a_run_that_goes_on_does_not_reconstruct_again(tmp_path: Path, monkeypat
     fault(monkeypatch, "die_as_scene")
     again = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
     assert again.faults == ()
-    assert [r.fundamental.tobytes() for r in again.records] == [r.fundamental.tobytes() for r in first.records]
+    assert [r.chosen_fundamental.tobytes() for r in again.records] == [
+        r.chosen_fundamental.tobytes() for r in first.records
+    ]
     assert again.scenes == first.scenes
 
 
@@ -91,7 +95,9 @@ def test_a_reconstruction_that_dies_costs_its_scene_alone(
     pairs = batch_pairs(tmp_path / "images") + batch_pairs(tmp_path / "others", 3, "two")
     report = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
     assert report.ending is Ending.COMPLETE
-    assert [record.F.tobytes() for record in report.records] == own_matrices(pairs, tmp_path / "alone")
+    assert [record.pair_fundamental.tobytes() for record in report.records] == own_matrices(
+        pairs, tmp_path / "alone"
+    )
     assert all(record.source == "pair" for record in report.records)
     assert [fault.partition(": its process ended: ")[0] for fault in report.faults] == [
         f"batch {batch} was not reconstructed" for batch in ("one", "two")
@@ -135,7 +141,7 @@ def test_a_run_reconstructs_the_true_cameras(tmp_path: Path) -> None:
     report = run(synthetic_pairs(tmp_path / "images"), SYNTHETIC, matcher, tmp_path / "work")
     assert [record.source for record in report.records] == ["scene"] * 15
     pairs = zip(report.records, matcher.scene.pairs, strict=True)
-    assert max(matcher.scene.median_distance(record.fundamental, pair) for record, pair in pairs) < 0.5
+    assert max(matcher.scene.median_distance(record.chosen_fundamental, pair) for record, pair in pairs) < 0.5
 
 
 def test_memory_that_ends_within_pycolmap_costs_the_scene_alone(
@@ -193,4 +199,6 @@ def test_an_image_replaced_after_the_run_drops_the_scene_and_its_batch_alone(
         again = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
     assert [record.source for record in again.records] == ["pair"] * 6 + ["pair", "scene", "scene"]
     assert {scene.batch: bool(scene.failure) for scene in again.scenes} == {"one": True, "two": False}
-    assert [record.F.tobytes() for record in again.records] == own_matrices(pairs, tmp_path / "alone")
+    assert [record.pair_fundamental.tobytes() for record in again.records] == own_matrices(
+        pairs, tmp_path / "alone"
+    )

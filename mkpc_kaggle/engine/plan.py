@@ -99,6 +99,10 @@ class ChunkQueue:
                 return chunk
         return None
 
+    def is_busy(self, index: int) -> bool:
+        """Whether a job is under way on a pair, or has to be tried again."""
+        return index in self.under_way or self.has_retry(index)
+
     def has_retry(self, index: int) -> bool:
         """Whether something has to be tried again on a pair."""
         return any(index in chunk.indices for chunk in self._retries)
@@ -287,8 +291,9 @@ class Plan:
             self.explain(now, "the sweep is over; deepening begins")
             self._queue.extend(chunks_of(phase, self._order, size, None))
         elif phase is Phase.FILL:
-            asked = self.records[: len(self._order)]
-            weak = sorted(filter(self.may_gain, asked), key=lambda record: (record.inliers, record.index))
+            lacking = filter(self.may_gain, self.records[: len(self._order)])
+            idle = (record for record in lacking if not self._queue.is_busy(record.index))
+            weak = sorted(idle, key=lambda record: (record.inliers, record.index))
             self._add(phase, [record.index for record in weak], size, self.recipe.units, now)
         elif phase is Phase.DENSIFY:
             further = [index for index in self._extra if self.can_gain(index, self._first)]

@@ -11,11 +11,11 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 
 import numpy as np
+from mkpc_kaggle.engine.pools.process import WORKER_ENVIRONMENT
+from mkpc_kaggle.engine.pools.scene_process import serve_scene
 from rectified import RectifiedMatcher, Seen
 
 from mkpc_kaggle.data.images import Unreadable
-from mkpc_kaggle.engine.pools.process import WORKER_ENVIRONMENT
-from mkpc_kaggle.engine.pools.scene_process import serve_scene
 from mkpc_kaggle.engine.scenes import SceneJob
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Size

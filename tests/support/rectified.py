@@ -16,13 +16,13 @@ import numpy as np
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.budget import Budget
-from mkpc_kaggle.engine.costs import Timeouts
+from mkpc_kaggle.engine.cluster import RayCluster
 from mkpc_kaggle.engine.engine import RunReport
-from mkpc_kaggle.engine.pools.cluster import RayCluster
-from mkpc_kaggle.engine.pools.pool import Place
-from mkpc_kaggle.engine.pools.process import ProcessWorker
+from mkpc_kaggle.engine.places import Place
+from mkpc_kaggle.engine.process import ProcessWorker
 from mkpc_kaggle.engine.records import PairRecord
 from mkpc_kaggle.engine.session import Interrupt, Session, run_pairs
+from mkpc_kaggle.engine.worker import MatchRunner
 from mkpc_kaggle.geometry.coordinates import View
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import MatcherSpec, Picture
@@ -96,15 +96,11 @@ def run(
     interrupt: Interrupt | None = None,
     publish: Callable[[Sequence[PairRecord]], None] = lambda _: None,
     workers: int | RayCluster | None = 0,
-    timeouts: Timeouts | None = None,
 ) -> RunReport:
     assembly = assemble(recipe, matchers={matcher.name: matcher}, device="cpu")
     budget = Budget(time.monotonic(), limit)
-    session = Session(
-        work_dir, budget, interrupt or Interrupt(), progress=False, workers=workers, timeouts=timeouts
-    )
-    report, _ = run_pairs(pairs, assembly, session, publish)
-    return report
+    session = Session(work_dir, budget, interrupt or Interrupt(), progress=False, workers=workers)
+    return run_pairs(pairs, assembly, session, publish)
 
 
 def interrupt_after(seconds: float) -> Interrupt:
@@ -113,6 +109,6 @@ def interrupt_after(seconds: float) -> Interrupt:
     return interrupt
 
 
-def process_place(make_pipeline: Callable[[], Pipeline]) -> Place:
-    """Where a pool starts worker processes with that pipeline."""
-    return Place("cpu", partial(ProcessWorker, "cpu", make_pipeline))
+def process_place(make_pipeline: Callable[[], Pipeline], name: str = "cpu") -> Place:
+    """Where worker processes are started with that pipeline."""
+    return Place(name, partial(ProcessWorker, name, partial(MatchRunner, make_pipeline), lambda: None))
