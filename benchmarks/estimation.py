@@ -43,7 +43,7 @@ def with_prior(found: SavedMatches) -> Estimate:
 
 
 PAIR_ESTIMATES: dict[str, Callable[[SavedMatches], Estimate]] = {
-    "MAGSAC, 8 orders": lambda found: estimate(found.matches, RobustConfig(permutations=8)),
+    "MAGSAC, 8 permutations": lambda found: estimate(found.matches, RobustConfig(permutations=8)),
     "MAGSAC": lambda found: estimate(found.matches, MAGSAC),
     "prior": with_prior,
 }
