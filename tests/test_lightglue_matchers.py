@@ -1,6 +1,7 @@
 """ALIKED and DISK with LightGlue, from checkpoints laid out as the public ones are, with stand-in weights."""
 
 import re
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -47,7 +48,9 @@ def beside_an_optimizer(state: dict[str, Tensor]) -> dict[str, Any]:
 
 
 FILES = (
-    PublicFile("aliked-n16.pth", "aliked_lightglue", "aliked-n16", "aliked", Aliked, published_aliked),
+    PublicFile(
+        "aliked-n16.pth", "aliked_lightglue", "aliked-n16", "aliked", lambda: Aliked(2048), published_aliked
+    ),
     PublicFile("aliked_lightglue.pth", "aliked_lightglue", "aliked-lightglue", "lightglue", glue, old_names),
     PublicFile("depth-save.pth", "disk_lightglue", "disk", "disk", DISK, beside_an_optimizer),
     PublicFile("disk_lightglue.pth", "disk_lightglue", "disk-lightglue", "lightglue", glue, old_names),

@@ -350,16 +350,6 @@ def test_whole_images_are_encoded_once_and_crops_for_each_pair():
     assert sift.seen.total() == 6
 
 
-def test_matchers_of_one_size_get_pictures_of_one_size():
-    matcher = Scripted(same_size=True, multiple=32)
-    tall, wide = np.full((300, 100, 3), 9, np.uint8), np.full((100, 280, 3), 9, np.uint8)
-    own(Unit(1, "own", 256), own=matcher)(tall, wide)
-    assert [picture.pixels.shape for picture in matcher.shown] == [(256, 256, 3)] * 2
-    assert [picture.content for picture in matcher.shown] == [(85, 256), (256, 91)]
-    assert not matcher.shown[0].pixels[:, 85:].any()
-    assert matcher.shown[0].pixels[:, :85].all()
-
-
 def test_matchers_see_gray_or_colour_and_multiples_as_they_ask():
     for colour, depth in ((Colour.GRAY, ()), (Colour.RGB, (3,))):
         matcher = Scripted(colour=colour, multiple=8)

@@ -18,10 +18,9 @@ from mkpc_kaggle.matchers.contract import (
     MatcherSpec,
     NonFiniteError,
     Picture,
-    detached,
     encoding_bytes,
 )
-from mkpc_kaggle.matchers.numbers import check_finite, exact_float32
+from mkpc_kaggle.matchers.dtypes import check_finite, exact_float32
 from mkpc_kaggle.pipeline.failures import Failure, failure_of, reason_of
 from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult
 from mkpc_kaggle.recipe import Unit
@@ -148,8 +147,7 @@ class UnitRunner:
         for (key, (image, view)), encoding in zip(batch.items(), encodings, strict=True):
             encoded[key] = encoding
             if view.crop == Box.whole(image.size):  # a crop is one pair's own: no other will ask for it
-                encoded[key] = detached(encoding)
-                self._encodings.put(key, encoded[key], encoding_bytes(encoded[key]))
+                self._encodings.put(key, encoding, encoding_bytes(encoding))
         return encoded
 
 
@@ -168,9 +166,6 @@ def views_of(unit: Unit, spec: MatcherSpec, pair: PairMatch) -> tuple[View, View
     else:
         boxes = [region.box for region in pair.regions]
     view0, view1 = (unit.view(box, spec.multiple) for box in boxes)
-    if spec.same_size:
-        common = Size(*map(max, view0.padded, view1.padded))
-        view0, view1 = replace(view0, padded=common), replace(view1, padded=common)
     return view0, view1
 
 

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from mkpc_kaggle.matchers.networks.gaussian_process import tokens
 from mkpc_kaggle.matchers.networks.grids import as_grid
 from mkpc_kaggle.matchers.networks.layers import ExactLinear
-from mkpc_kaggle.matchers.networks.transformer_block import Block
+from mkpc_kaggle.matchers.networks.transformer_block import VitBlock
 from mkpc_kaggle.matchers.networks.warp_refiner import Estimate, identity_map
 
 SIDE = 64  # of the grid of anchors, whatever the images' shape
@@ -20,7 +20,9 @@ class AnchorDecoder(nn.Module):
 
     def __init__(self, width: int, blocks: int, heads: int) -> None:
         super().__init__()
-        self.blocks = nn.ModuleList(Block(width, heads, EPSILON, bias=False, scaled=False) for _ in range(blocks))
+        self.blocks = nn.ModuleList(
+            VitBlock(width, heads, EPSILON, bias=False, scaled=False) for _ in range(blocks)
+        )
         self.to_out = ExactLinear(width, SIDE**2 + 1)
 
     def forward(self, posterior: Tensor, features: Tensor) -> Estimate:

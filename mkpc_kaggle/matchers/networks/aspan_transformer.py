@@ -9,12 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mkpc_kaggle.matchers.networks.adaptive_span import (
-    MASKED,
-    adaptive_span,
-    sample_usable,
-    span_attention,
-)
+from mkpc_kaggle.matchers.networks.adaptive_span import MASKED, adaptive_span, sample_usable, span_attention
 from mkpc_kaggle.matchers.networks.grids import (
     Perceptron,
     as_grid,
@@ -31,6 +26,7 @@ from mkpc_kaggle.matchers.networks.resnet_fpn import TOP
 HEADS = 8
 FLOW = 128  # channels of the flow feature, and of the projected positions
 INITIAL_LAYERS, BLOCKS = 2, 4
+RADIUS = 5.0  # of the spans, in deviations of the flow
 SPAN_LEVELS = (2, 1)  # half and full resolution of the coarse map
 
 Factor = tuple[int, int]  # of pooling, (rows, columns)
@@ -162,9 +158,8 @@ class Messages:
 class HierarchicalAttention(nn.Module):
     """Messages of the global level and of the two adaptive-span levels, merged."""
 
-    def __init__(self, radius: float) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        self.radius = radius
         self.temp = nn.Parameter(torch.ones(()))
         self.merge_head = Perceptron(nn.Conv1d(3 * TOP, TOP, 1, bias=False), nn.Conv1d(TOP, TOP, 1, bias=False))
 
@@ -191,7 +186,7 @@ class HierarchicalAttention(nn.Module):
         self, q: Tensor, k: Tensor, v: Tensor, flow: Tensor, factor: int, mask: Tensor | None
     ) -> Tensor:
         q, k, v = mean_pool(q, factor), mean_pool(k, factor), mean_pool(v, factor)
-        samples = adaptive_span(flow, self.radius, factor).samples()
+        samples = adaptive_span(flow, RADIUS, factor).samples()
         usable = None if mask is None else sample_usable(samples, mask, (k.shape[1], k.shape[2]), factor)
         return span_attention(q, k, v, samples, HEADS, usable)
 
@@ -201,17 +196,17 @@ def _repeated(grid: Tensor, height: int, width: int) -> Tensor:
     return as_grid(functional.interpolate(as_map(grid), size=(height, width), mode="nearest"))
 
 
-class Block(nn.Module):
+class AspanBlock(nn.Module):
     """Decodes the flow, and updates both features of an image along it; the last block the visual one alone."""
 
-    def __init__(self, radius: float, last: bool) -> None:
+    def __init__(self, last: bool) -> None:
         super().__init__()
         width = TOP if last else TOP + FLOW
         self.last = last
         self.flow_decoder = Perceptron(
             ExactConv1d(FLOW, FLOW // 2, 1, bias=False), ExactConv1d(FLOW // 2, 4, 1, bias=False)
         )
-        self.attention = HierarchicalAttention(radius)
+        self.attention = HierarchicalAttention()
         self.q_proj = nn.Conv1d(TOP, TOP, 1, bias=False)
         self.k_proj = nn.Conv1d(TOP, TOP, 1, bias=False)
         self.v_proj = nn.Conv1d(TOP + FLOW, TOP, 1, bias=False)
@@ -247,11 +242,11 @@ class Block(nn.Module):
 class AspanTransformer(nn.Module):
     """The coarse transformer; every layer updates both images at once."""
 
-    def __init__(self, radius: float) -> None:
+    def __init__(self) -> None:
         super().__init__()
         self.pos_transform = nn.Conv2d(TOP, FLOW, 1, bias=False)
         self.ini_layer = InitialStage()
-        self.layers = nn.ModuleList(Block(radius, last=index == BLOCKS - 1) for index in range(BLOCKS))
+        self.layers = nn.ModuleList(AspanBlock(last=index == BLOCKS - 1) for index in range(BLOCKS))
         # The 3x3 convolutions lie in memory as the grids they see.
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # missing in torch's stubs
 
