@@ -1,7 +1,6 @@
 """ALIKED and DISK with LightGlue, from checkpoints laid out as the public ones are, with stand-in weights."""
 
 import re
-from functools import partial
 from typing import Any
 
 import numpy as np

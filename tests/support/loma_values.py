@@ -92,7 +92,7 @@ def matcher_values(matcher, image0, image1, threshold):
 
 
 def assignment_values(log_scores, threshold, suffix=""):
-    """By keypoint of either image, as a batch of one: the match above the threshold, the score of any mutual pair."""
+    """By keypoint of either image, as a batch of one: its match, and the score of any mutual pair."""
     found, every, values = mutual_matches(log_scores, threshold), mutual_matches(log_scores, 0), {}
     for side, count in enumerate(log_scores.shape):
         matches, scores = torch.full((1, count), -1), torch.zeros(1, count)

@@ -14,7 +14,6 @@ from mkpc_kaggle.matchers.networks.grids import (
     Perceptron,
     as_grid,
     as_map,
-    linear_of_two,
     mask_valid,
     mean_pool,
     pointwise,
@@ -47,7 +46,7 @@ class Side:
     def values(self, projection: nn.Conv1d) -> Tensor:
         """(N, h, w, 256): the projection of the visual feature and the positions."""
         positions = self.positions.expand(len(self.visual), -1, -1, -1)
-        return linear_of_two(projection.weight.flatten(1), self.visual, positions)
+        return pointwise(projection, torch.cat([self.visual, positions], dim=-1))
 
     @property
     def pooled_mask(self) -> Tensor | None:
@@ -110,7 +109,7 @@ class InitialLayer(nn.Module):
             (own.pooled_mask, other.pooled_mask),
         )
         message = self.norm1(pointwise(self.merge_head, message))
-        update: Tensor = self.norm2(self.merge_f(own.visual, message))
+        update: Tensor = self.norm2(self.merge_f(torch.cat([own.visual, message], dim=-1)))
         return update.add_(own.visual)
 
 
@@ -135,8 +134,7 @@ class InitialStage(nn.Module):
         size = side.visual.shape[1:3]
         large = as_grid(functional.interpolate(decoupled, size=size, mode="bilinear", align_corners=False))
         visual, flow = torch.split(large, [TOP, FLOW], dim=-1)
-        weight, bias = self.up_merge.get_parameter("weight"), self.up_merge.get_parameter("bias")
-        added = linear_of_two(weight.flatten(1), side.visual, visual).add_(bias)
+        added = pointwise(self.up_merge, torch.cat([side.visual, visual], dim=-1))
         return replace(side, visual=added.add_(side.visual), flow=flow)
 
 
@@ -234,7 +232,8 @@ class AspanBlock(nn.Module):
             other,
         )
         both = own.visual if self.last else torch.cat([own.visual, own.flow], dim=-1)
-        updated = self.norm2(self.merge_f(both, self.norm1(message))).add_(both)
+        merged = self.merge_f(torch.cat([both, self.norm1(message)], dim=-1))
+        updated = self.norm2(merged).add_(both)
         flow = own.flow if self.last else updated[..., TOP:]
         return replace(own, visual=updated[..., :TOP], flow=flow)
 

@@ -22,7 +22,6 @@ from mkpc_kaggle.matchers.networks.superpoint import SuperPointKeypoints
 CHANNELS = 256
 HEADS = 4
 LAYERS = 18  # of the graph network: self, cross, self, cross, ...
-ABSORB_EVERY = 4  # Sinkhorn steps between two returns to the log domain, see log_optimal_transport
 
 
 class Pointwise(nn.Conv1d):
@@ -185,25 +184,15 @@ def log_optimal_transport(scores: Tensor, bin_score: Tensor, iterations: int) ->
     Each keypoint has mass 1 and may give it to the other image's dustbin, which can take all of them. An
     iteration scales the rows, then the columns to their masses.
 
-    The first iteration is done in the log domain, after which no entry of the plan exceeds 1 and no row or
-    column sum is below (m + n)^-2. Iterations on the plan itself are then matrix-vector products. Every few of
-    them the scales are absorbed into the potentials u and v and the plan is recomputed, so that they stay in
-    float32's range, and entries that underflow are negligible.
+    Potentials u and v are added to the scores, so that nothing leaves float32's range.
     """
     batch, m, n = scores.shape
     couplings = bin_score.float().expand(batch, m + 1, n + 1).clone()
     couplings[:, :m, :n] = scores
-    rows, columns = couplings.new_ones(m + 1), couplings.new_ones(n + 1)
-    rows[m], columns[n] = n, m
-    # The masses are divided by their sum here, and the plan is multiplied by it at the end.
-    rows, columns = rows / (m + n), columns / (m + n)
-    u = rows.log() - couplings.logsumexp(dim=2)  # (B, m + 1)
-    v = columns.log() - (couplings + u[:, :, None]).logsumexp(dim=1)  # (B, n + 1)
-    for done in range(1, iterations, ABSORB_EVERY):
-        plan = (couplings + u[:, :, None]).add_(v[:, None]).exp_()
-        column_scale = torch.ones_like(v)
-        for _ in range(min(ABSORB_EVERY, iterations - done)):
-            row_scale = rows / (plan @ column_scale[:, :, None])[:, :, 0]
-            column_scale = columns / (row_scale[:, None] @ plan)[:, 0]
-        u, v = u + row_scale.log(), v + column_scale.log()
-    return (couplings + u[:, :, None]).add_(v[:, None]).add_(math.log(m + n))
+    rows, columns = couplings.new_zeros(m + 1), couplings.new_zeros(n + 1)  # logarithms of the masses
+    rows[m], columns[n] = math.log(n), math.log(m)
+    v = torch.zeros_like(couplings[:, 0])
+    for _ in range(iterations):
+        u = rows - (couplings + v[:, None]).logsumexp(dim=2)  # (B, m + 1)
+        v = columns - (couplings + u[:, :, None]).logsumexp(dim=1)  # (B, n + 1)
+    return (couplings + u[:, :, None]).add_(v[:, None])
