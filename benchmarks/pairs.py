@@ -4,7 +4,7 @@ python -m benchmarks.pairs [--rounds 3] [--only loftr,roma] [--precision bfloat1
 
 Both images are encoded and matched, a matcher after the other in each round; medians. kornia's LoFTR and ALIKED
 are measured beside them. The memory is the largest of a process that does nothing else, Python and PyTorch
-included. Weights are the tests' stand-ins, or random ones, and keypoints as many as the options allow. Views are as
+included. Weights are stand-ins, or random ones, and keypoints as many as the options allow. Views are as
 large as in the recipes. To have what a worker has, run it with ``THP_MEM_ALLOC_ENABLE=1``.
 """
 

@@ -37,7 +37,9 @@ def golden_network(options):
 def golden_pairs(golden):
     """The keypoints of both images of each pair of a file, with the file's arrays of that pair."""
     arrays = {
-        name: value for name, value in golden.items() if name != "config" and not name.startswith("image_size")
+        name: value
+        for name, value in golden.items()
+        if isinstance(value, torch.Tensor) and not name.startswith("image_size")
     }
     count = len(arrays["keypoints0"]) if arrays["keypoints0"].ndim == 3 else 1
     if count == 1 and arrays["keypoints0"].ndim == 2:
@@ -213,10 +215,10 @@ def plain_transport(scores, bin_score, iterations):
     return couplings + u[:, :, None] + v[:, None] - norm
 
 
-@pytest.mark.parametrize("spread", [1, 30, 300])
-@pytest.mark.parametrize("bin_score", [-50, 2, 90])
-@pytest.mark.parametrize("iterations", [1, 4, 20, 100])
-@pytest.mark.parametrize(("m", "n"), [(1, 1), (1, 40), (37, 5), (60, 80)])
+@pytest.mark.parametrize("spread", [1, 300])
+@pytest.mark.parametrize("bin_score", [-50, 90])
+@pytest.mark.parametrize("iterations", [1, 20])
+@pytest.mark.parametrize(("m", "n"), [(1, 1), (1, 40), (60, 80)])
 def test_the_transport_is_that_of_the_log_domain(m, n, iterations, bin_score, spread):
     """Also where scores are so far apart that most of the plan is below float32's range."""
     scores = spread * torch.randn(2, m, n, generator=torch.Generator().manual_seed(m + n))
