@@ -23,11 +23,10 @@ from golden import (
 from roma_values import computed
 
 from mkpc_kaggle.matchers.networks import roma
-from mkpc_kaggle.matchers.networks.anchor_decoder import anchor_mean
 from mkpc_kaggle.matchers.networks.dense_sampling import balancing_weights, density, draw, sample_matches
 from mkpc_kaggle.matchers.networks.grids import as_grid, as_map
 from mkpc_kaggle.matchers.networks.pixels import network_input
-from mkpc_kaggle.matchers.networks.roma import RoMa
+from mkpc_kaggle.matchers.networks.roma import RoMa, anchor_mean
 
 
 def standin():

@@ -16,7 +16,6 @@ from torch.nn import functional
 from mkpc_kaggle.matchers.contract import Placement
 from mkpc_kaggle.matchers.networks import (
     aliked,
-    anchor_decoder,
     aspan_transformer,
     coarse_matching,
     dad,
@@ -89,7 +88,7 @@ MISTAKES = [  # in a matcher: the module or class, what is changed there, and ho
     ("roma", roma, "DISPLACEMENT", 1.0),
     ("roma", roma, "TRAINED_SIDE", 600),
     ("roma", roma, "refined", lambda *values: warp_refiner.refined(*values[:2], 14, values[3])),
-    ("roma", anchor_decoder, "anchor_mean", best_anchor),
+    ("roma", roma, "anchor_mean", best_anchor),
     ("roma", vgg, "halved", lambda x: functional.avg_pool2d(x, 2)),
     ("roma", dense_warp, "resize", nearest),
     ("dkm", dense_warp, "resize", nearest),

@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from mkpc_kaggle.matchers.networks.anchor_decoder import anchor_mean
 from mkpc_kaggle.matchers.networks.dinov2 import DinoV2, DinoV2Config
+from mkpc_kaggle.matchers.networks.roma import anchor_mean
 from mkpc_kaggle.matchers.networks.transformer_block import VitBlock
 
 

@@ -116,25 +116,3 @@ def test_points_of_image_0_are_corners_of_cells_in_our_convention(matcher: SemiD
     (matches,) = matcher.match([encoded], [encoded])
     assert len(matches) > 0
     np.testing.assert_array_equal((matches.points0 + 0.5) % 8, 0)
-
-
-def test_pairs_are_matched_in_batches_as_each_is_alone(
-    matcher: SemiDenseMatcher, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    sizes = [(96, 128), (97, 131), (96, 128), (97, 131)]
-    encoded = [matcher.encode([picture(*size, matcher, seed)])[0] for seed, size in enumerate(sizes)]
-    batches, match = [], matcher._network.match
-
-    def noting(maps0: Any, maps1: Any, masks: Any) -> Any:
-        batches.append((len(maps0.coarse), masks is not None))
-        return match(maps0, maps1, masks)
-
-    monkeypatch.setattr(matcher._network, "match", noting)
-    together = matcher.match(encoded, encoded)
-    # At a multiple of 8 every coarse cell begins on content.
-    assert sorted(batches) == [(2, False), (2, matcher.spec.multiple > 8)]
-    for found, one in zip(together, encoded, strict=True):
-        (alone,) = matcher.match([one], [one])
-        common = {tuple(point) for point in alone.points0.tolist()} & {tuple(p) for p in found.points0.tolist()}
-        assert len(alone) > 0
-        assert len(common) >= 0.98 * max(len(alone), len(found))

@@ -81,38 +81,14 @@ class SemiDenseMatcher:
     def match(
         self, encodings0: Sequence[SemiDenseEncoding], encodings1: Sequence[SemiDenseEncoding]
     ) -> list[Matches]:
-        pairs = list(zip(encodings0, encodings1, strict=True))
-        alike: dict[Any, list[int]] = {}
-        for number, pair in enumerate(pairs):
-            # Even a mask that is all True can change rounding, so padded pairs are matched apart from others.
-            padded = any(encoding.padded for encoding in pair)
-            alike.setdefault((padded, *(encoding.maps.coarse.shape for encoding in pair)), []).append(number)
-        found = [Matches.empty()] * len(pairs)
-        for (padded, *_), numbers in alike.items():
-            together = self._match([pairs[number] for number in numbers], padded)
-            for number, matches in zip(numbers, together, strict=True):
-                found[number] = matches
-        return found
+        return [self._match(*pair) for pair in zip(encodings0, encodings1, strict=True)]
 
-    def _match(self, pairs: list[tuple[SemiDenseEncoding, SemiDenseEncoding]], padded: bool) -> list[Matches]:
-        """The matches of pairs of one shape, in view pixels."""
-        side0, side1 = zip(*pairs, strict=True)
-        mask0, mask1 = (torch.cat([encoding.mask for encoding in side]) for side in (side0, side1))
-        found = self._network.match(stacked(side0), stacked(side1), (mask0, mask1) if padded else None)
+    def _match(self, first: SemiDenseEncoding, second: SemiDenseEncoding) -> Matches:
+        # Even a mask that is all True can change rounding.
+        masks = (first.mask, second.mask) if first.padded or second.padded else None
+        found = self._network.match(first.maps, second.maps, masks)
         points0, points1 = (from_corner(points.float().cpu().numpy()) for points in (found.points0, found.points1))
-        matches = Matches(points0, points1, found.coarse.confidence.float().cpu().numpy())
-        pair_of = found.coarse.batch.cpu().numpy()
-        return [matches[pair_of == pair] for pair in range(len(pairs))]
-
-
-def stacked(encodings: Sequence[SemiDenseEncoding]) -> FeatureMaps:
-    """Maps of one shape as one batch."""
-    if len(encodings) == 1:
-        return encodings[0].maps
-    return FeatureMaps(
-        torch.cat([encoding.maps.coarse for encoding in encodings]),
-        torch.cat([encoding.maps.fine for encoding in encodings]),
-    )
+        return Matches(points0, points1, found.coarse.confidence.float().cpu().numpy())
 
 
 def load_network(network: SemiDenseNetwork[Any], weights: WeightStore, slot: str, *, unused: str = "$^") -> None:

@@ -13,12 +13,11 @@ from torch.nn import functional
 
 from mkpc_kaggle.matchers.dtypes import check_finite
 from mkpc_kaggle.matchers.networks.dedode_decoder import DedodeDecoder, resize
+from mkpc_kaggle.matchers.networks.pixels import MEAN, STD
 from mkpc_kaggle.matchers.networks.superpoint import window_maximum
 from mkpc_kaggle.matchers.networks.vgg import VGG11, Vgg
 
-MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
-TEMPERATURE = 0.5
-"""Of the softmax over the nine pixels that place a keypoint between pixels."""
+TEMPERATURE = 0.5  # of the softmax over the nine pixels that place a keypoint between pixels
 
 
 @dataclass(frozen=True, eq=False)
