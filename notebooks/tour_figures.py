@@ -27,7 +27,6 @@ from mkpc_kaggle.reporting.figures.style import (
     sample,
     short,
 )
-from mkpc_kaggle.scene.model import Scene
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -15,19 +15,13 @@ from mkpc_kaggle.engine import session
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.matchers.contract import (
-    MatcherSpec,
-    NonFiniteError,
-    Placement,
-    Precision,
-    detached,
-    encoding_bytes,
-)
+from mkpc_kaggle.matchers.contract import MatcherSpec, NonFiniteError, Placement, Precision, encoding_bytes
+from mkpc_kaggle.matchers.dtypes import check_finite, exact_float32
 from mkpc_kaggle.matchers.lightglue import light_glue
 from mkpc_kaggle.matchers.networks.loftr import Loftr
 from mkpc_kaggle.matchers.networks.placement import placed
-from mkpc_kaggle.matchers.networks.superglue import ImageKeypoints, SuperGlue, SuperGlueConfig
-from mkpc_kaggle.matchers.numbers import check_finite, exact_float32
+from mkpc_kaggle.matchers.networks.superglue import SuperGlue
+from mkpc_kaggle.matchers.networks.superpoint import SuperPointKeypoints
 from mkpc_kaggle.matchers.xfeat_lighterglue import SHAPE
 from mkpc_kaggle.pipeline import devices
 from mkpc_kaggle.pipeline.assembly import assemble
@@ -150,15 +144,6 @@ def test_an_encoding_counts_the_storage_that_it_keeps_alive() -> None:
     assert encoding_bytes(Maps(batch[0], (batch[1], torch.zeros(3)))) == batch.nbytes + 12
 
 
-def test_a_view_of_a_batch_is_copied_as_it_lies() -> None:
-    batch = torch.rand(8, 4, 6, 5).to(memory_format=torch.channels_last)
-    whole = torch.rand(3)
-    kept = detached(Maps(batch[2:3], (whole,)))
-    assert encoding_bytes(kept) == batch.nbytes // 8 + 12
-    assert torch.equal(kept.coarse, batch[2:3]) and kept.coarse.is_contiguous(memory_format=torch.channels_last)
-    assert kept.others[0] is whole
-
-
 def test_the_cache_is_sized_by_the_memory_that_is_free_and_the_workers_on_it() -> None:
     made = assemble("classical", device="cpu")
     assert made.pipeline()._encodings.limit == ENCODING_CACHE_BYTES
@@ -250,15 +235,11 @@ def test_finite_numbers_pass_however_large_their_sum_and_whatever_holds_them() -
 
 @torch.inference_mode()
 def test_superglue_says_so_when_float16_overflows() -> None:
-    network = filled(SuperGlue(SuperGlueConfig(5)), "superglue")
+    network = filled(SuperGlue(5), "superglue")
     network.final_proj.weight.data.mul_(1e6)
     torch.manual_seed(0)
-    found = ImageKeypoints(
-        torch.rand(1, 9, 2) * 60,
-        torch.rand(1, 9),
-        torch.nn.functional.normalize(torch.rand(1, 9, 256)),
-        Size(64, 64),
-    )
+    descriptors = torch.nn.functional.normalize(torch.rand(9, 256))
+    found = SuperPointKeypoints(torch.rand(9, 2) * 60, torch.rand(9), descriptors, Size(64, 64))
     with pytest.raises(NonFiniteError, match="superglue"):
         placed(network, Placement(precision=Precision.FLOAT16))(found, found)
 
