@@ -127,15 +127,11 @@ def test_check_tells_good_from_bad(demo: DemoSet, tmp_path: Path, capsys: pytest
 
 
 def test_match_prints_f_and_draws_the_pair(
-    demo: DemoSet, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    demo: DemoSet, small_recipe: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    recipe = tmp_path / "small.toml"
-    recipe.write_text(
-        'units = [{stage = 1, matcher = "sift", long_side = 320}, {stage = 2, matcher = "sift", long_side = 400}]'
-    )
     images = sorted((demo.train_dir / "courtyard" / "images").iterdir())[:2]
     figure = tmp_path / "new" / "pair.png"
-    assert main(["match", *map(str, images), "--recipe", str(recipe), "--out", str(figure)]) == 0
+    assert main(["match", *map(str, images), "--recipe", str(small_recipe), "--out", str(figure)]) == 0
     out = capsys.readouterr().out.splitlines()
     F = np.array([[float(value) for value in line.split()] for line in out[:3]])
     assert np.linalg.norm(F) == pytest.approx(1)

@@ -29,7 +29,6 @@ from faulty import (
 from mkpc_kaggle.engine.pools.pool import Pool
 from mkpc_kaggle.engine.pools.process import ProcessWorker
 from rectified import (
-    SECOND,
     SWEEP,
     THREE_UNITS,
     RectifiedMatcher,
@@ -111,23 +110,6 @@ def test_a_worker_lost_once_costs_time_alone(
     assert len(report.faults) == 1
     assert told in report.faults[0]
     assert matrices(report.records) == matrices(undisturbed.records)
-
-
-def test_a_unit_too_big_for_the_memory_runs_smaller_on_that_pair_alone(
-    pairs: list[Pair], undisturbed: RunReport, tmp_path: Path
-) -> None:
-    matcher = FaultyMatcher(fault=exhaust_gpu, above=100)
-    report = run(pairs, THREE_UNITS, matcher, tmp_path / "work", workers=1)
-    assert_others_as_good(report, undisturbed)
-    sweep, *others = report.records[VICTIM].units
-    assert sweep.failure == ""
-    assert {unit.unit: unit.failure for unit in others} == {
-        SECOND.name: "ran at 0.7 of its size, the worker failed at more",
-        "1:rectified@160": "ran at 0.49 of its size, the worker failed at more",
-    }
-    assert report.records[VICTIM].inliers > 350
-    assert report.records[VICTIM].regions is not None
-    assert report.ending is Ending.COMPLETE
 
 
 def test_an_image_that_always_kills_the_worker_costs_its_pair_only_and_once(

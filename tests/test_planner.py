@@ -69,28 +69,6 @@ def test_no_pair_is_in_two_jobs_at_a_time() -> None:
     assert len(out) == 4, "every worker tries a unit whose cost is unknown, on one pair"
 
 
-def test_a_lost_job_is_halved_taken_apart_shrunk_and_given_up() -> None:
-    one = planner(9)
-    for job in jobs_of(one):
-        if job.phase is Phase.DEEPEN and len(job.indices) == 8:
-            break
-    seen = []
-    one.lose(JobFailure(job, Cause.DIED), 0.0)
-    while (again := one.next(0.0)) is not None and again.phase is Phase.DEEPEN:
-        seen.append((again.indices, tuple(unit.name for unit in again.units), round(again.shrink, 2)))
-        if 1 in again.indices:
-            one.lose(JobFailure(again, Cause.DIED), 0.0)
-        else:
-            one.take(finished(again, one), 0.0)
-    mine = [(units, shrink) for indices, units, shrink in seen if indices == (1,)]
-    both, second, third = (SWEEP.name, SECOND.name, "1:rectified@160"), (SECOND.name,), ("1:rectified@160",)
-    assert mine == [(both, 1.0), (third, 1.0), (second, 1.0), (third, 0.7), (second, 0.7)]
-    assert [len(indices) for indices, _, _ in seen][:3] == [4, 4, 2]
-    assert one.records[1].units[-1].failure == "given up: the worker died"
-    assert not one.records[1].lacking(THREE_UNITS.units)
-    assert one.complete
-
-
 def test_a_unit_that_workers_always_fail_at_is_given_up_on_all_pairs() -> None:
     one = planner(200)
     lost = 0

@@ -13,12 +13,15 @@ from mkpc_kaggle.engine.pools.scene_process import SceneProcess
 from mkpc_kaggle.scene.batch import BatchPair
 
 from mkpc_kaggle.engine.scenes import SceneJob
+from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.scene.config import SceneConfig
+from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair
 
 POINTS = np.random.default_rng(1).uniform(0, 500, (50_000, 2)).astype(np.float32)
 MATCHES = Matches(POINTS, POINTS, POINTS[:, 0])
-LARGE = SceneJob("one", (0,), (BatchPair("a", "b", MATCHES, None, {"m": MATCHES}),), SceneConfig())
+ENDS = (BatchImage(name, name, Size(500, 500)) for name in "ab")
+LARGE = SceneJob("one", (0,), (BatchPair(*ENDS, MATCHES, None, {"m": MATCHES}),), SceneConfig())
 
 
 def start(seconds: float = 60.0) -> SceneProcess | None:

@@ -198,6 +198,9 @@ class WeightStore:
 def judge(path: Path, file: WeightFile, files: Iterable[WeightFile] = ()) -> FoundFile:
     """The file at ``path``, or unpacked into it, by the name of ``file``; ``files`` is the whole manifest."""
     try:
+        unpacked = (path / "data.pkl").is_file()
+        if path.is_dir() and not unpacked:
+            return FoundFile(file, path, State.REFUSED, "", "it is a directory")
         digest, size = digest_of(path), path.stat().st_size
     except OSError as error:
         return FoundFile(file, path, State.REFUSED, "", f"cannot be read: {error.strerror}")
@@ -205,7 +208,7 @@ def judge(path: Path, file: WeightFile, files: Iterable[WeightFile] = ()) -> Fou
     state, note = State.REFUSED, ""
     if digest == file.digest:
         state, note = State.GOOD, "" if path.name == file.name else f"it is {file.name}"
-    elif path.is_dir():
+    elif unpacked:
         state, note = State.UNVERIFIED, UNPACKED
     elif other:
         note = f"its bytes are those of {other}"

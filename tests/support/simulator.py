@@ -33,6 +33,7 @@ from mkpc_kaggle.engine.places import Place
 from mkpc_kaggle.engine.plan import RESERVE_SHARE
 from mkpc_kaggle.engine.records import NOT_REACHED, PairRecord, SceneRecord, UnitRecord
 from mkpc_kaggle.engine.scenes import FORECAST_MARGIN, START_S
+from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
 from mkpc_kaggle.pipeline.pair import UnitResult
@@ -277,7 +278,8 @@ def _outcome(index: int, known: tuple[UnitResult, ...], found: list[UnitResult])
         UnitRecord(result.unit.name, result.unit.stage, 200, 20 + index % 60, 0.0, result.seconds, "")
         for result in (*known, *found)
     )
-    return Outcome(PairRecord(index, FALLBACK_FUNDAMENTAL, "", units), tuple(found))
+    record = PairRecord(index, FALLBACK_FUNDAMENTAL, "", units, sizes=(Size(1, 1),) * 2, versions=("a 0", "b 0"))
+    return Outcome(record, tuple(found))
 
 
 class SimulatedScene:
