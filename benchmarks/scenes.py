@@ -1,6 +1,6 @@
 """Cost and accuracy of a batch's reconstruction, from matches of known cameras with noise and wrong ones.
 
-python -m benchmarks.scenes [26:304 100:2000] [--world front|street] [--mapper global] [--threads 1]
+python -m benchmarks.scenes [26:304 100:2000] [--world front|street] [--threads 1]
 
 Each size is images:pairs, and runs in a process of its own, as in the engine. The front is seen by all images;
 along the street each image sees what is near. `verify` and `map` are CPU seconds; the errors are medians over
@@ -18,10 +18,10 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.synthetic_scene import SyntheticScene, street, synthetic_scene
+from benchmarks.synthetic_scene import SyntheticScene, registered_images, street, synthetic_scene
 from mkpc_kaggle.geometry.cameras import relative_pose
 from mkpc_kaggle.scene import colmap
-from mkpc_kaggle.scene.config import Mapper, SceneConfig
+from mkpc_kaggle.scene.config import SceneConfig
 from mkpc_kaggle.scene.reconstruct import Solution, reconstruct_batch
 
 
@@ -61,10 +61,10 @@ def timed(function: Callable[..., Any], name: str, seconds: Counter[str]) -> Cal
 def errors(solution: Solution, scene: SyntheticScene) -> list[tuple[float, float]]:
     """Of each pair that has its F from cameras: of its relative rotation and of its direction, in degrees."""
     angles = []
-    registered = {image: found for image in scene.images if (found := solution.registered(image))}
+    registered = registered_images(solution)
     for pair, choice in zip(scene.pairs, solution.choices, strict=True):
         if choice.from_scene:
-            R, t = relative_pose(registered[pair.image0].camera, registered[pair.image1].camera)
+            R, t = relative_pose(registered[pair.image0.digest].camera, registered[pair.image1.digest].camera)
             true_R, true_t = relative_pose(*scene.true_cameras(pair))
             cosines = (np.trace(R @ true_R.T) - 1) / 2, t @ true_t / np.linalg.norm(t) / np.linalg.norm(true_t)
             rotation, direction = np.degrees(np.arccos(np.clip(cosines, -1, 1)))
@@ -76,10 +76,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("sizes", nargs="*", default=["26:304", "100:800"])
     parser.add_argument("--world", choices=["front", "street"], default="street")
-    parser.add_argument("--mapper", type=Mapper, choices=list(Mapper), default=SceneConfig().mapper)
     parser.add_argument("--threads", type=int, default=1)
     arguments = parser.parse_args()
-    config = SceneConfig(mapper=arguments.mapper, threads=arguments.threads)
+    config = SceneConfig(threads=arguments.threads)
     heads = ("matches", "verify", "map", "all s", "MB", "placed")
     print(f"{'images':>7}{'pairs':>7}" + "".join(f"{head:>9}" for head in heads) + "  rotation  direction")
     for size in arguments.sizes:

@@ -10,11 +10,19 @@ from mkpc_kaggle.geometry.cameras import Camera, fundamental_of_cameras
 from mkpc_kaggle.geometry.coordinates import Box, Size
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import Matrix3, sampson_distances
+from mkpc_kaggle.scene.reconstruct import Solution
+from mkpc_kaggle.scene.reconstruction import RegisteredImage
 from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair
 
 SIZE = Size(800, 600)
 Seen = tuple[np.ndarray, np.ndarray]
 """The numbers of the points that an image sees, ascending (N,), and where its detector finds them (N, 2)."""
+
+
+def registered_images(solution: Solution) -> dict[str, RegisteredImage]:
+    """The images that have a camera, by digest, each of the first model that has it."""
+    models = [model for found in solution.reconstructions for model in found.models]
+    return {found.image.digest: found for model in reversed(models) for found in model.images}
 
 
 @dataclass(frozen=True, eq=False)
