@@ -13,8 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
-from mkpc_kaggle.engine.jobs import JOB_PAIRS, Outcome
+from mkpc_kaggle.engine.jobs import Outcome
 from mkpc_kaggle.engine.journal import Journal
+from mkpc_kaggle.engine.plan import JOB_PAIRS
 from mkpc_kaggle.engine.records import PairRecord, UnitRecord
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL

@@ -2,7 +2,7 @@
 
 import sqlite3
 import threading
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import partial
@@ -31,7 +31,6 @@ from mkpc_kaggle.engine.scenes import Scenes, extra_pairs_of
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.pipeline.pair import UnitResult
 from mkpc_kaggle.recipe import Recipe
-from mkpc_kaggle.scene.choose import Choice
 
 PUBLISH_INTERVAL_S, PUBLISH_SHARE = 30.0, 0.05  # how often the submission is written, and its share of the time
 
@@ -97,7 +96,6 @@ class Engine:
         self.faults: list[str] = []
         self.unwritten = ""
         self._units = {unit.name: unit for unit in recipe.units}
-        self._unjournalled: dict[int, tuple[UnitResult, ...]] = {}
         self._explained = self._answers = 0
         self._looked = (-1, -1)
         self._published = budget.clock()
@@ -220,7 +218,6 @@ class Engine:
             self._take_scene(job, answer, seconds)
         elif isinstance(job, MatchJob) and isinstance(answer, MatchResult):
             self._keep(self.plan.on_result(job, answer, seconds, now))
-            self._note(EventKind.BUDGET, job.phase)
             self._note(EventKind.JOB, f"{job.phase} {len(job.indices)} pairs {answer.unit_seconds:.3f} s")
         elif isinstance(answer, Failure):
             self._fault(f"a job was lost on {place.name}: {answer}" if job else f"{place.name}: {answer}")
@@ -245,9 +242,10 @@ class Engine:
             for place in self.site.places:
                 place.kill()
             self.site.places, self.site.fallback = self.site.fallback, []
-            for index, change in self.plan.restart(now, text).items():
+            changes = self.plan.restart(now, text)
+            for index, change in changes.items():
                 self.scenes.note_units(index, change)
-            self._guarded(self.journal.forget_given_up)
+            self._keep([Outcome(self.plan.records[index]) for index in changes])
         elif are_closed and not self._has_loaded:
             raise UserError(f"no worker could be started: {'; '.join(closed)}")
 
@@ -267,29 +265,22 @@ class Engine:
         self.plan.reserve = self.scenes.reserve(at_once)
 
     def _take_scene(self, job: SceneJob, answer: Answer, seconds: float) -> None:
-        choices: Mapping[int, Choice] = {}
         record: SceneRecord | None
         if isinstance(answer, SceneResult):
-            choices = answer.choices
             record = SceneRecord.of(job.batch, answer.reconstructions, job.made_from, seconds)
             self.scenes.on_result(job, record)
-            for index, choice in choices.items():
+            for index, choice in answer.choices.items():
                 self.plan.set_scene(index, choice)
             self._note(EventKind.SCENE, f"{record.batch}: {record.placed} of {record.images} images")
         else:
             self._fault(f"batch {job.batch} was not reconstructed: {answer}")
             record = self.scenes.on_failure(job, str(answer), seconds)
         if record is not None:
-            self._guarded(partial(self._save_scene, record, choices))
-
-    def _save_scene(self, record: SceneRecord, choices: Mapping[int, Choice]) -> None:
-        self.journal.save_scene(record, choices)
-        # A batch is reconstructed from the points of all its pairs: none can go while one of them may change.
-        records = [self.plan.records[index] for index in self.scenes.batches[record.batch]]
-        if not record.failure and not any(
-            self.plan.may_gain(pair) or self.scenes.needs(pair.index) for pair in records
-        ):
-            self.journal.settle(pair for pair in records if pair.units)
+            members = [self.plan.records[index] for index in self.scenes.batches[job.batch]]
+            # A batch is reconstructed from the points of all its pairs: none can go while one of them may change.
+            may_change = any(self.plan.may_gain(pair) or self.scenes.needs(pair.index) for pair in members)
+            settled = [] if record.failure or may_change else [pair for pair in members if pair.units]
+            self._guarded(partial(self.journal.save_scene, record, members, settled))
 
     # The journal and the submission
 
@@ -305,44 +296,27 @@ class Engine:
 
     def _results(self, index: int) -> tuple[UnitResult, ...]:
         """What earlier jobs found on a pair."""
-        if not self.plan.records[index].units:
-            return ()
-        if index in self._unjournalled:
-            return self._unjournalled[index]
         try:
-            return self.journal.results(index, self._units)
-        except (sqlite3.Error, UserError) as error:  # without them a job gains nothing, and the F stays
-            self._fault(f"the journal cannot be read ({error})")
+            return self.journal.results(self.plan.records[index], self._units)
+        except UserError as error:  # without them a job gains nothing, and the F stays
+            self._fault(str(error))
             return ()
 
     def _keep(self, outcomes: Sequence[Outcome]) -> None:
-        """Put outcomes into the journal; into memory those that it cannot take."""
+        """Put outcomes into the journal."""
+        settled = []
         for outcome in outcomes:
             self.scenes.note_units(outcome.record.index, len(outcome.results))
-        settled = [
-            not self.plan.wanted(outcome.record) and not self.scenes.needs(outcome.record.index)
-            for outcome in outcomes
-        ]
-        indices = [outcome.record.index for outcome in outcomes]
-        whole = [
-            Outcome(outcome.record, self._unjournalled.get(index, ()) + outcome.results)
-            for index, outcome in zip(indices, outcomes, strict=True)
-        ]
-        if self._guarded(lambda: self.journal.save(list(zip(whole, settled, strict=True)))):
-            for index in indices:
-                self._unjournalled.pop(index, None)
-            return
-        for index, outcome, is_settled in zip(indices, outcomes, settled, strict=True):
-            self._unjournalled[index] = () if is_settled else self._results(index) + outcome.results
+            is_wanted = self.plan.wanted(outcome.record) or self.scenes.needs(outcome.record.index)
+            settled.append(not is_wanted)
+        self._guarded(partial(self.journal.save, list(zip(outcomes, settled, strict=True))))
 
-    def _guarded(self, save: Callable[[], None]) -> bool:
-        """Whether the journal could take it: a full disk costs what a later run would have had of it."""
+    def _guarded(self, save: Callable[[], None]) -> None:
+        """Write to the journal: a full disk costs what a later run would have had of it."""
         try:
             save()
         except sqlite3.Error as error:
             self._fault(f"the journal cannot be written ({error}): an interrupted run would have to do this again")
-            return False
-        return True
 
     def _note_explanations(self) -> None:
         for explanation in self.plan.explanations[self._explained :]:

@@ -403,6 +403,8 @@ class Plan:
             if former.units:
                 self.explain(now, f"pair {record.index} keeps the F it has: {record.failure}")
         if len(record.units) <= len(former.units) and (former.reached or not record.reached):
+            if outcome.results:  # without what the journal had of it: it cannot be read
+                self._stuck.add(record.index)
             return None
         record = record.after(former)
         self._put(record)

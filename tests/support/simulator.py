@@ -332,14 +332,11 @@ class MemoryJournal:
     def forget_changed(self, pairs: Sequence[Pair]) -> int:
         return 0
 
-    def forget_given_up(self) -> None:
-        pass
-
     def records(self) -> dict[int, PairRecord]:
         return {}
 
-    def results(self, pair: int, units: Mapping[str, Unit]) -> tuple[UnitResult, ...]:
-        return self._results.get(pair, ())
+    def results(self, record: PairRecord, units: Mapping[str, Unit]) -> tuple[UnitResult, ...]:
+        return self._results.get(record.index, ())
 
     def save(self, outcomes: list[tuple[Outcome, bool]]) -> None:
         for outcome, _ in outcomes:
@@ -349,10 +346,9 @@ class MemoryJournal:
     def scenes(self) -> tuple[SceneRecord, ...]:
         return ()
 
-    def save_scene(self, scene: SceneRecord, choices: Mapping[int, Choice]) -> None:
-        pass
-
-    def settle(self, records: Iterable[PairRecord]) -> None:
+    def save_scene(
+        self, scene: SceneRecord, records: Iterable[PairRecord], settled: Iterable[PairRecord] = ()
+    ) -> None:
         pass
 
     def note(self, kind: str, seconds: float, text: str) -> None:
