@@ -186,7 +186,7 @@ class Engine:
 
     def _loop(self) -> None:
         everything = range(len(self.pairs))
-        if any(self.plan.wanted(record) for record in self.records):
+        if self.plan.has_work or self.scenes.due(everything) is not None:
             self.site.open()
         while not self.interrupt.is_set() and (now := self.budget.clock()) < self.budget.stop_waiting:
             for place in (*self.site.places, *self._scene_places):

@@ -195,7 +195,7 @@ class Plan:
 
     def _begin(self) -> None:
         self._queue = ChunkQueue()
-        self._coming = list(Phase)
+        self._coming = list(Phase) if any(map(self.wanted, self.records)) else []
 
     def _pop(self, place: str, now: float, *, cautious: bool) -> Chunk | None:
         while not self._queue.has_fresh and self._coming:
