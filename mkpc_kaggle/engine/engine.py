@@ -2,7 +2,7 @@
 
 import sqlite3
 import threading
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import partial
@@ -185,8 +185,7 @@ class Engine:
     # The loop
 
     def _loop(self) -> None:
-        everything = range(len(self.pairs))
-        if self.plan.has_work or self.scenes.due(everything) is not None:
+        if self.plan.has_work or self.scenes.due(range(len(self.pairs))) is not None:
             self.site.open()
         while not self.interrupt.is_set() and (now := self.budget.clock()) < self.budget.stop_waiting:
             for place in (*self.site.places, *self._scene_places):
@@ -194,7 +193,7 @@ class Engine:
             self._fall_back(now)
             self._hand_out(now)
             is_matching = self._is_matching(now)
-            self._start_scenes(self.plan.done if is_matching else everything, now)
+            self._start_scenes(now, is_matching=is_matching)
             if not is_matching and not self._scene_places:
                 return
             if now - self._published > max(PUBLISH_INTERVAL_S, self.budget.writing / PUBLISH_SHARE):
@@ -276,10 +275,12 @@ class Engine:
 
     # Scenes
 
-    def _start_scenes(self, done: Collection[int], now: float) -> None:
-        """Begin to reconstruct batches whose pairs are all ``done``."""
+    def _start_scenes(self, now: float, *, is_matching: bool) -> None:
+        """Begin to reconstruct batches whose pairs have what fits; all when nothing is matched any more."""
         at_once = self.site.scenes_at_once
-        while len(self._scene_places) < at_once and (batch := self.scenes.due(done)) is not None:
+        plan = self.plan
+        done, filling = (plan.done, plan.filling) if is_matching else (range(len(self.pairs)), ())
+        while len(self._scene_places) < at_once and (batch := self.scenes.due(done, filling)) is not None:
             place = Place(f"scene of batch {batch}", self.site.scene_worker)
             place.job = self.scenes.job(batch, self._results)
             self._scene_places.append(place)

@@ -86,11 +86,15 @@ class Scenes:
         if index in self._batch_of:
             self._unit_counts[self._batch_of[index]] += change
 
-    def due(self, done: Collection[int]) -> str | None:
-        """A batch to reconstruct now: its matches have changed since it was, and all of its pairs are ``done``."""
+    def due(self, done: Collection[int], filling: Collection[int] = ()) -> str | None:
+        """A batch to reconstruct now: its matches have changed since it was, and all of its pairs are ``done``.
+
+        For the first time it is while some of them get further matches (``filling``), for the second afterwards.
+        """
         for name, indices in self.batches.items():
             outdated = name not in self.running and self._made_from(name) != self._unit_counts[name]
-            if outdated and all(index in done for index in indices):
+            waits_for = filling if name in self.made else ()
+            if outdated and all(index in done and index not in waits_for for index in indices):
                 return name
         return None
 
