@@ -115,11 +115,19 @@ def test_the_parent_of_workers_never_initialises_cuda(monkeypatch: pytest.Monkey
 
 
 def test_capabilities_are_asked_of_another_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    gpus.capabilities.cache_clear()
     monkeypatch.setattr(gpus, "ASK", "print('a greeting'); print([[7, 5], [8, 0]])")
     assert gpus.capabilities() == [(7, 5), (8, 0)]
-    monkeypatch.setattr(gpus, "ASK", "raise SystemExit('driver too old')")
-    with pytest.raises(UserError, match="driver too old"):
-        gpus.capabilities()
+    gpus.capabilities.cache_clear()
+
+
+def test_gpus_on_which_nothing_can_be_computed_leave_the_work_to_the_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    gpus.capabilities.cache_clear()
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(gpus, "ASK", "raise SystemExit('no kernel image')")
+    told = r"the CPU does the work: .*\(no kernel image\); on Kaggle choose the accelerator GPU T4 x2"
+    with pytest.warns(UserWarning, match=told):
+        assert str(assemble("classical").placement) == "device cpu in float32"
 
 
 # The cache

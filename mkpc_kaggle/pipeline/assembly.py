@@ -27,14 +27,16 @@ class Assembly:
     """All that a worker needs to build its pipeline.
 
     ``left_out`` are the units of recipe ``auto`` that cannot run here, or not with these weights, and those of any
-    recipe that a fallback replaces; ``matchers`` are ready ones of the user's own. ``device`` is what the user
-    asked for, be it here or elsewhere; ``sharing``: how many workers there are on the placement's device.
+    recipe that a fallback replaces; ``unavailable`` says of each of their matchers why. ``matchers`` are the user's
+    own, ready ones. ``device`` is what the user asked for, be it here or elsewhere; ``sharing``: how many workers
+    share the placement's device.
     """
 
     recipe: Recipe
     weights: WeightStore
     placement: Placement
     left_out: tuple[Unit, ...] = ()
+    unavailable: Mapping[str, str] = field(default_factory=dict)
     matchers: Mapping[str, Matcher[Any]] = field(default_factory=dict)
     device: str = AUTO
     sharing: int = 1
@@ -128,7 +130,7 @@ def assemble(
     own = matchers or {}
     check = Check(WeightStore(weights), licence, own)
     written = load_recipe(recipe) if isinstance(recipe, str) else recipe
-    whole = with_fallbacks(written, check)
+    whole, replaced = with_fallbacks(written, check)
     obstacles = check.obstacles(whole, whole.matcher_names, load=recipe == AUTO)
     if recipe == AUTO:
         warn_of(obstacles)
@@ -139,15 +141,20 @@ def assemble(
         options_of(whole, name)  # those of a matcher that no unit names are checked too
     chosen = whole.only(lambda unit: unit.matcher not in left).with_scenes(scenes)
     left_out = tuple(unit for unit in written.units if replace(unit, fallback="") not in chosen.units)
-    return Assembly(chosen.in_mode(mode), check.store, resolve_placement(device, precision), left_out, own, device)
+    unavailable = {one.matcher: str(one.hindrance) for one in (*replaced, *obstacles)}
+    placement = resolve_placement(device, precision)
+    made = Assembly(chosen.in_mode(mode), check.store, placement, left_out, unavailable, own, device)
+    warn_of_unverified(made.weight_files.values())
+    return made
 
 
-def with_fallbacks(recipe: Recipe, check: Check) -> Recipe:
-    """The recipe with its fallbacks for matchers that cannot run here."""
+def with_fallbacks(recipe: Recipe, check: Check) -> tuple[Recipe, list[Obstacle]]:
+    """The recipe with its fallbacks for matchers that cannot run here, and why these cannot."""
     fallbacks = {unit.matcher: unit.fallback for unit in recipe.units if unit.fallback}
     for name in not_own(fallbacks.values(), check.own):
         options_of(recipe, name)  # an unknown one is an error even where it is not needed
-    return recipe.decided({one.matcher for one in check.obstacles(recipe, not_own(fallbacks, check.own))})
+    replaced = check.obstacles(recipe, not_own(fallbacks, check.own))
+    return recipe.decided({one.matcher for one in replaced}), replaced
 
 
 def warn_of(obstacles: Iterable[Obstacle]) -> None:
@@ -157,6 +164,14 @@ def warn_of(obstacles: Iterable[Obstacle]) -> None:
             warn_once(f"recipe auto does without it: {one.details[0]}")
         elif one.hindrance is Hindrance.UNREADABLE:
             warn_once(f"recipe auto does without {one.matcher}: {one.details[0]}")
+
+
+def warn_of_unverified(files: Iterable[FoundFile]) -> None:
+    """Name the files that nobody can vouch for in one line, before any work."""
+    names = sorted(found.file.name for found in files if not found.verified)
+    if names:
+        listed = ", ".join(names)
+        warn_once(f"weights not verified: {listed}; `python -m mkpc_kaggle weights verify` says why")
 
 
 def not_own(names: Iterable[str], own: Container[str]) -> list[str]:
@@ -186,12 +201,20 @@ def fastest_precision(device: str) -> Precision:
     return Precision.BFLOAT16 if able.get("avx512_bf16") or able.get("amx_bf16") else Precision.FLOAT32
 
 
+def _gpus_compute() -> bool:
+    try:
+        return bool(capabilities())
+    except UserError as error:
+        warn_once(f"the CPU does the work: {error}")
+        return False
+
+
 def resolve_device(device: str) -> str:
-    """``auto`` becomes the GPUs, "cuda", or the CPU; :class:`UserError` for a GPU that is not there."""
+    """``auto`` becomes the GPUs, "cuda", or the CPU where none computes; :class:`UserError` for one not there."""
     import torch
 
     if device == AUTO:
-        return "cuda" if torch.cuda.is_available() else "cpu"
+        return "cuda" if torch.cuda.is_available() and _gpus_compute() else "cpu"
     if device != "cpu":
         gpus_of(device)
     return device

@@ -19,6 +19,7 @@ after one of memory the process can go on.
 from enum import Enum, auto
 
 from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.pipeline.gpus import ADVICE
 
 _OUT_OF_MEMORY = (
     "MemoryError",
@@ -81,8 +82,8 @@ def reason_of(error: BaseException) -> str:
 def require_device(device: str) -> None:
     """Compute something on a device; raises :class:`DeviceError` where that fails.
 
-    PyTorch counts GPUs for which its build has no kernels (a P100, since builds begin at compute capability 7.0)
-    among the available ones: only a kernel that runs is proof.
+    PyTorch counts GPUs for which its build has no kernels among the available ones: only a kernel that runs is
+    proof.
     """
     if device == "cpu":
         return
@@ -95,4 +96,4 @@ def require_device(device: str) -> None:
         if failure_of(error) is Failure.OUT_OF_MEMORY:
             raise
         reason = reason_of(error).partition("\n")[0]
-        raise DeviceError(f"{device} cannot be used ({reason}); try --device cpu") from error
+        raise DeviceError(f"{device} cannot be used ({reason}); {ADVICE}") from error

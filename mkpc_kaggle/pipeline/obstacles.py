@@ -26,10 +26,10 @@ class Licence(StrEnum):
 class Hindrance(StrEnum):
     """Why a matcher cannot run."""
 
-    BROKEN = "it cannot be imported"
-    REFUSED = "its weights are not permitted"
-    MISSING = "its weights were not found"
-    UNREADABLE = "its weights cannot be loaded"
+    BROKEN = "cannot be imported"
+    REFUSED = "licence not permitted"
+    MISSING = "no weights"
+    UNREADABLE = "weights cannot be loaded"
 
 
 @dataclass(frozen=True)

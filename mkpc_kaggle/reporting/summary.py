@@ -117,9 +117,9 @@ def _upgrades(records: Sequence[PairRecord]) -> list[str]:
 def _troubles(tables: RunTables, left_out: Sequence[str], faults: Sequence[str]) -> list[str]:
     """What was left out, and what failed."""
     lines = []
-    if left_out:
-        reasons = "weights missing or not permitted, or matcher unusable"
-        lines.append(f"units left out ({reasons}): {', '.join(left_out)}")
+    if left_out:  # names of units, such as 1:loftr@840
+        matchers = dict.fromkeys(name.partition(":")[2].partition("@")[0] for name in left_out)
+        lines.append(f"left out: {', '.join(matchers)}; `python -m mkpc_kaggle weights list` says why")
     failed, first = tables.failed, tables.failed.head(MOST_LINES)
     lines += _list("pairs with the fallback row", list(first["id"] + ": " + first["failure"]), len(failed))
     lines += _list("units that failed", unit_failures(tables))
