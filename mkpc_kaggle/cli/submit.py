@@ -70,7 +70,7 @@ def run(arguments: argparse.Namespace) -> int:
         watchdog.status = int(bool(report.unwritten or trouble(report)))
         if arguments.explain:
             print("\n".join(["plan:", *map(str, report.explanations)]))
-        print(summary(pairs, report, assembly.left_out))
+        print(summary(pairs, report))
         print(
             f"submission: {output}" + (f" is not the last version: {report.unwritten}" if report.unwritten else "")
         )

@@ -27,9 +27,9 @@ class Assembly:
     """All that a worker needs to build its pipeline.
 
     ``left_out`` are the units of recipe ``auto`` that cannot run here, or not with these weights, and those of any
-    recipe that a fallback replaces; ``unavailable`` says of each of their matchers why. ``matchers`` are the user's
-    own, ready ones. ``device`` is what the user asked for, be it here or elsewhere; ``sharing``: how many workers
-    share the placement's device.
+    recipe that a fallback replaces; ``unavailable`` says of each of their matchers why. ``matchers`` are the
+    user's own. ``device`` is what the user asked for, be it here or elsewhere; ``sharing``: how many workers there
+    are on the placement's device.
     """
 
     recipe: Recipe
