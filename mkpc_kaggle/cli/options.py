@@ -106,12 +106,12 @@ def assembly_of(arguments: argparse.Namespace, choice: "Choice") -> "Assembly":
     )
 
 
-def left_out(assembly: "Assembly") -> list[str]:
+def left_out(assembly: "Assembly", recipe: str) -> list[str]:
     """A line for each reason why matchers of the recipe are left out."""
     by_reason: dict[str, list[str]] = {}
     for matcher, reason in assembly.unavailable.items():
         by_reason.setdefault(reason, []).append(matcher)
-    advice = f" (`python -m mkpc_kaggle weights fetch {assembly.recipe.name} --out DIR` gets them)"
+    advice = f" (`python -m mkpc_kaggle weights fetch {recipe} --out DIR` gets them)"
     return [
         f"left out, {reason}: {', '.join(names)}" + advice * (reason == "no weights")
         for reason, names in by_reason.items()

@@ -62,7 +62,8 @@ def run(arguments: argparse.Namespace) -> int:
         pairs = read_test_side(arguments.test_dir)
         assembly = options.assembly_of(arguments, Choice(arguments.recipe, Mode(arguments.mode)))
         print(f"{len(pairs)} pairs, recipe {assembly.recipe.name}, {assembly.placement}, journal in {work_dir}")
-        print(*options.left_out(assembly), sep="\n", flush=True)
+        for line in options.left_out(assembly, arguments.recipe):
+            print(line, flush=True)
         session = Session(
             work_dir, budget, interrupt, arguments.fresh, workers=arguments.workers, watchdog=watchdog
         )
