@@ -185,6 +185,7 @@ def test_what_pip_says_is_told_and_the_advice_only_where_no_wheel_fits(
 ) -> None:
     kaggle.add_test_side(demo.test_dir, pairs=3)
     kaggle.add_dataset(tmp_path / "package")
+    kaggle.image = make_image(tmp_path / "image")  # other tests have installed into the shared one
     (wheel,) = kaggle.dataset.glob("pycolmap-*.whl")
     if is_missing:
         wheel.rename(wheel.with_name("pycolmap-4.2.1-cp27-cp27m-manylinux_2_28_x86_64.whl"))

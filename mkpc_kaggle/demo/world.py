@@ -13,16 +13,14 @@ from mkpc_kaggle.demo.render import Picture, Surface
 
 Colour = tuple[int, int, int]  # BGR
 
-# Metres in a unit of each world.
-SCENES = MappingProxyType({"courtyard": 2.5, "market": 1.0})
+SCENES = MappingProxyType({"courtyard": 2.5, "market": 1.0})  # metres in a unit of each world
 SCENE_NAMES = tuple(SCENES)
 
 TEXELS = 72  # a metre
 STONE, BRICK, PLASTER, PAVING = (150, 175, 190), (85, 105, 165), (150, 200, 215), (128, 136, 140)
 GLASS, FRAME = (75, 70, 60), (205, 215, 220)
 WINDOW_M, WINDOW_STEP_M = (1.3, 1.9), 3.1
-ROWS_Y_M = (9.0, 12.5, 16.0)  # boxes stand in these rows, from the south to the north
-COLUMNS_X_M = (-9.0, -4.5, 0.0, 4.5, 9.0)
+COLUMNS_X_M, ROWS_Y_M = (-9.0, -4.5, 0.0, 4.5, 9.0), (9.0, 12.5, 16.0)  # where boxes stand
 MIN_BOX_M, MAX_BOX_M = (1.0, 1.0, 1.0), (3.0, 3.0, 5.5)  # width, depth, height
 
 # Position and target in metres, focal length over the long side, size in pixels, roll in degrees.
@@ -123,10 +121,10 @@ def paint(
     lengths = np.sort(3 / np.sqrt(rng.uniform((3 / (max_side_m * scale)) ** 2, 1, count)))[::-1]
     sides = lengths[:, None] * np.column_stack([np.ones(count), rng.uniform(0.3, 0.6 if is_stone else 1, count)])
     centres, angles = rng.uniform((0, 0), (width, height), (count, 2)), rng.uniform(0, 180, count)
-    tones = 1 + contrast * (rng.normal(0, 1, (count, 1)) + 0.2 * rng.normal(0, 1, (count, 3)))
-    for centre, side, angle, tone in zip(
-        centres, sides, angles, np.clip(tones * colour, 8, 250).tolist(), strict=True
-    ):
+    tones = np.array(colour) * (
+        1 + rng.normal(0, contrast, (count, 1)) + rng.normal(0, 0.2 * contrast, (count, 3))
+    )
+    for centre, side, angle, tone in zip(centres, sides, angles, tones.clip(8, 250).tolist(), strict=True):
         if is_stone:
             low, high = (centre - side / 2).astype(int), (centre + side / 2).astype(int)
             cv2.rectangle(picture, low, high, tone, -1)
