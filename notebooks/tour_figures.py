@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from mkpc_kaggle.data.images import Image
 from mkpc_kaggle.engine.records import SceneRecord
 from mkpc_kaggle.geometry.coordinates import Box, Points
-from mkpc_kaggle.geometry.critical_region import Clusters, CriticalRegion, MkpcConfig, Ratio, expand_box
+from mkpc_kaggle.geometry.critical_region import Clusters, CriticalRegion, MkpcConfig, expand_box
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.metrics import PoseError
 from mkpc_kaggle.geometry.robust import Estimate, Matrix3
@@ -104,13 +104,12 @@ def _size_bars(axes: "Axes", clusters: Clusters, config: MkpcConfig) -> None:
         shares = [f"\n{size / sizes[0]:.3f}" if len(sizes) <= 10 else "" for size in sizes]
         labels = [f"{size}{share}" for size, share in zip(sizes[part], shares[part], strict=True)]
         axes.bar_label(bars, labels, padding=3, color=INK, fontsize=9, bbox=_PAPER)
-    if config.ratio is Ratio.LARGEST:
-        axes.axhline(config.share * sizes[0], color=INK, linewidth=1.2, linestyle="--")
+    axes.axhline(config.share * sizes[0], color=INK, linewidth=1.2, linestyle="--")
     axes.set(yscale="log", ylim=(1, 8 * sizes[0]), xticks=ranks)
 
 
 def _limit(clusters: Clusters, config: MkpcConfig) -> str:
-    if config.ratio is not Ratio.LARGEST or not len(clusters.sizes):
+    if not len(clusters.sizes):
         return ""
     return f"\ndashed: {config.share:g} of the largest, {config.share * clusters.sizes.max():.1f} points"
 
@@ -199,12 +198,12 @@ def draw_epipolar(
 
 def draw_plane(images: Images, matches: Matches, homography: Estimate, threshold: float) -> "Figure":
     """Inliers of an F: those that one homography explains, too, and those that lie off its plane."""
-    figure, row = side_by_side(images)
+    figure, row = side_by_side(images, title_lines=2)
     for axes, points in zip(row, (matches.points0, matches.points1), strict=True):
         _dots(axes, points[homography.inliers], CLUSTERS[0])
         _crosses(axes, points[~homography.inliers], OUTLIER)
     explained = f"{homography.inlier_count} of {len(matches)} inliers of F"
-    _title(row[0], f"blue: {explained} fit one plane to {threshold:g} pixels")
+    _title(row[0], f"blue: {explained}\nfit one plane to {threshold:g} pixels")
     _title(row[1], "orange crosses: those off the plane")
     return figure
 
