@@ -63,18 +63,16 @@ def write_demo(
         raise ValueError(f"image_scale must be positive, not {image_scale}")
     worlds = [build_world(name, seed=seed, image_scale=image_scale) for name in names]
     demo = DemoSet(directory, directory / "train", directory / "test", directory / "test_truth.csv")
-    samples, truths = list[str](), list[str]()
+    rows: list[tuple[str, str]] = []
     for world in worlds:
         photographs = take_photographs(world, seed)
         pairs = [_pair(a, b) for a, b in combinations(photographs, 2)]
         _write_train(demo.train_dir / world.name, photographs, pairs)
-        rows = _write_test(demo.test_dir, world.name, _selected(pairs), seed)
-        samples += [sample for sample, _ in rows]
-        truths += [truth for _, truth in rows]
+        rows += _write_test(demo.test_dir, world.name, _selected(pairs), seed)
     factors = (f"{world.name},{world.metres_per_unit:.17g}" for world in worlds)
     _write_rows(demo.train_dir / "scaling_factors.csv", "scene,scaling_factor", factors)
-    _write_rows(demo.test_dir / "test.csv", "sample_id,batch_id,image_1_id,image_2_id", samples)
-    _write_rows(demo.truth_csv, "sample_id,scene,image_1_id,image_2_id", truths)
+    _write_rows(demo.test_dir / "test.csv", "sample_id,batch_id,image_1_id,image_2_id", (row[0] for row in rows))
+    _write_rows(demo.truth_csv, "sample_id,scene,image_1_id,image_2_id", (row[1] for row in rows))
     return demo
 
 
