@@ -181,4 +181,4 @@ def test_demo_writes_what_submit_and_validate_read(tmp_path: Path, monkeypatch: 
         demo, "write_demo", lambda out, seed, _write=demo.write_demo: _write(out, seed=seed, image_scale=0.1)
     )
     assert main(["demo", "--out", str(tmp_path)]) == 0
-    assert len(read_test_side(tmp_path / "test")) == 24
+    assert len(read_test_side(tmp_path / "test")) == 16
