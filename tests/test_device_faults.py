@@ -135,7 +135,7 @@ def test_a_device_without_kernels_leaves_the_work_to_the_cpu_and_a_line(
 
 def test_a_device_is_tried_before_anything_is_loaded() -> None:
     require_device("cpu")
-    with pytest.raises(UserError, match=r"cuda:99 cannot be used \(.*\); try --device cpu"):
+    with pytest.raises(UserError, match=r"cuda:99 cannot be used \(.*\); on Kaggle choose .* T4 x2"):
         assembly_of(RectifiedMatcher()).on("cuda:99").pipeline()
 
 
