@@ -21,8 +21,11 @@ from synthetic import RECIPE, SyntheticMatcher, synthetic_pairs
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.engine import Ending, RunReport
 from mkpc_kaggle.engine.records import GIVEN_UP
+from mkpc_kaggle.geometry.robust import RobustConfig
 
-BATCHES = WORKERS = 4  # in a run so many scene workers and so many matching workers are disturbed
+BATCHES = WORKERS = 3  # in a run so many scene workers and so many matching workers are disturbed
+
+QUICK = replace(RECIPE, magsac=RobustConfig(max_iterations=1000, permutations=1))
 
 
 class DoomedWorker(WatchedWorker):
@@ -51,7 +54,7 @@ class DoomedWorker(WatchedWorker):
             self.spared.remove(self.place)
         elif self.kind in self.lives:
             moment = self.rng.uniform(0.0, self.lives[self.kind])
-            number = self.rng.choice([signal.SIGKILL, signal.SIGSTOP])
+            number = (signal.SIGKILL, signal.SIGSTOP)[len(self.known) % 2]
             threading.Thread(target=self._disturb, args=(os.pidfd_open(pid), number, moment), daemon=True).start()
 
     def is_stuck(self) -> bool:
@@ -110,7 +113,7 @@ def test_a_run_whose_workers_are_killed_and_stopped_at_random_moments_ends_as_th
     budget = patient(monkeypatch, DoomedWorker)
 
     def run_whole(name: str) -> RunReport:
-        report = run(pairs, RECIPE, SyntheticMatcher(), tmp_path / name, budget=budget, workers=WORKERS)
+        report = run(pairs, QUICK, SyntheticMatcher(), tmp_path / name, budget=budget, workers=WORKERS)
         assert report.ending is Ending.COMPLETE, report.faults
         assert all(record.units for record in report.records)
         for process in multiprocessing.active_children():
