@@ -228,10 +228,12 @@ def scene_without_pycolmap(job: SceneJob) -> SceneResult:
 # Places
 
 
-def thread_place(name: str, matcher: RectifiedMatcher, minibatch: int = 1) -> Place:
-    """Where workers are threads of this process, with that matcher."""
+def thread_place(
+    name: str, matcher: RectifiedMatcher, minibatch: int = 1, pipeline: Callable[[], Pipeline] | None = None
+) -> Place:
+    """Where workers are threads of this process, with that matcher, or that pipeline."""
     make = partial(Pipeline, THREE_UNITS, {matcher.name: matcher}.__getitem__, minibatch=minibatch)
-    return Place(name, partial(ThreadWorker, name, partial(MatchRunner, make), lambda: None))
+    return Place(name, partial(ThreadWorker, name, partial(MatchRunner, pipeline or make), lambda: None))
 
 
 def use_places(monkeypatch: pytest.MonkeyPatch, *used: Place, fallback: Sequence[Place] = ()) -> None:
