@@ -6,6 +6,7 @@ It looks at a job's worth of pairs at a time, so that a hundred thousand pairs c
 from collections import Counter, deque
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 from mkpc_kaggle.engine.budget import Budget, format_duration
 from mkpc_kaggle.engine.costs import Costs
@@ -167,6 +168,8 @@ class Plan:
 
         ``cautious``: the place has just lost a worker, and tries one pair and one unit.
         """
+        if cautious and (trial := self._trial(now)) is not None:
+            return trial
         while now < self.stop and (chunk := self._pop(place, now, cautious=cautious)) is not None:
             units = self._units(chunk, now)
             todo = [index for index in chunk.indices if self.can_gain(index, units)]
@@ -197,9 +200,29 @@ class Plan:
         self._queue = ChunkQueue()
         self._coming = list(Phase)
 
-    def _pop(self, place: str, now: float, *, cautious: bool) -> Chunk | None:
+    def _trial(self, now: float) -> MatchJob | None:
+        """The first unit on a pair that has had it, where nothing is left but what workers were lost at.
+
+        A place that answers works: it is not closed for the pairs that kill every worker.
+        """
+        self._open_phases(now)
+        if self._queue.has_fresh or self._queue.is_empty or now >= self.stop:
+            return None
+        for unit, record in product(self._first, self.records):
+            ran = any(found.unit == unit.name and not found.failure for found in record.units)
+            if ran and not self._queue.is_busy(record.index):
+                self._queue.under_way.add(record.index)
+                times = self._time([unit], 1, self.stop - now, exploring=False)
+                expected = (self.costs.p90(unit.name),)
+                return MatchJob(self.phase, (record.index,), (unit,), expected, *times, is_trial=True)
+        return None
+
+    def _open_phases(self, now: float) -> None:
         while not self._queue.has_fresh and self._coming:
             self._open(self._coming.pop(0), now)
+
+    def _pop(self, place: str, now: float, *, cautious: bool) -> Chunk | None:
+        self._open_phases(now)
         return self._queue.pop(place, alone=self.workers < 2, fresh_first=cautious)
 
     def _job(
@@ -340,6 +363,8 @@ class Plan:
         that pair.
         """
         self._queue.under_way.difference_update(job.indices)
+        if job.is_trial:
+            return []
         chunk = Chunk(job.phase, job.indices, job.units, (place,))
         if len(job.indices) > 1:
             half = len(job.indices) // 2
