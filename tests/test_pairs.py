@@ -18,7 +18,7 @@ from mkpc_kaggle.data.competition import TrainScene, read_train_side
 from mkpc_kaggle.data.images import Image, read_image
 from mkpc_kaggle.data.pairs import parse_line, read_pairs
 from mkpc_kaggle.demo import DemoSet
-from mkpc_kaggle.engine.session import digest_of
+from mkpc_kaggle.engine.session import digest_of_pairs
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.evaluation.validate import error_of
 from mkpc_kaggle.geometry.cameras import Camera, fundamental_of_cameras
@@ -188,7 +188,7 @@ def test_a_journal_knows_what_was_estimated_and_with_which_cameras(
     path = write_list(tmp_path / "list.txt", scenes, demo.train_dir)
 
     def digest(model: ModelKind) -> str:
-        return digest_of([true.pair for true in read_pairs(path, demo.train_dir, model, copies=tmp_path).pairs])
+        return digest_of_pairs([true.pair for true in read_pairs(path, demo.train_dir, model, copies=tmp_path).pairs])
 
     before = digest(ModelKind.E), digest(ModelKind.F)
     assert before[0] != before[1]
