@@ -1,4 +1,4 @@
-"""Faults injected into real runs, on real images: a lost worker, image, disk, terminal or parent costs its part alone."""
+"""Faults in real runs, on real images: a lost worker, image, disk, terminal or parent costs its part alone."""
 
 import os
 import pty
@@ -16,7 +16,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from faulty import (
     Fault,
@@ -38,7 +37,7 @@ from mkpc_kaggle.demo import DemoSet
 from mkpc_kaggle.engine import session, worker
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.engine import Ending, RunReport
-from mkpc_kaggle.engine.jobs import Answer, Cause, Failure, MatchResult, Outcome, Phase
+from mkpc_kaggle.engine.jobs import Cause, Failure, MatchResult, Outcome, Phase
 from mkpc_kaggle.engine.journal import Journal
 from mkpc_kaggle.engine.plan import Plan
 from mkpc_kaggle.engine.process import ThreadWorker
@@ -353,7 +352,9 @@ def on_a_closed_terminal(command: list[str]) -> int:
 
 
 def with_stderr_closed(command: list[str]) -> int:
-    return subprocess.run(["sh", "-c", 'exec "$@" 2>&-', "sh", *command], stdout=subprocess.PIPE, check=False).returncode
+    return subprocess.run(
+        ["sh", "-c", 'exec "$@" 2>&-', "sh", *command], stdout=subprocess.PIPE, check=False
+    ).returncode
 
 
 def on_a_full_disk(command: list[str]) -> int:
@@ -385,7 +386,9 @@ def test_the_limit_counts_from_the_start_of_the_process() -> None:
 
 
 def test_a_program_leaves_without_what_an_interpreter_does_at_its_end(tmp_path: Path) -> None:
-    code = "import atexit; from mkpc_kaggle.cli import program; atexit.register(print, 'late'); program(['recipes'])"
+    code = (
+        "import atexit; from mkpc_kaggle.cli import program; atexit.register(print, 'late'); program(['recipes'])"
+    )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "")
     assert "auto: " in done.stdout
