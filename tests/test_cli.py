@@ -55,7 +55,7 @@ def test_ctrl_c_before_a_run_begins_ends_the_program_in_one_line(
 
     monkeypatch.setattr("mkpc_kaggle.cli.import_module", interrupted)
     assert main(["recipes"]) == 130
-    assert capsys.readouterr().err == "interrupted\n"
+    assert capsys.readouterr().err == "error: interrupted\n"
 
 
 @pytest.mark.parametrize("option", ["--test-dir", "--weights", "--output", "--work-dir"])
@@ -178,4 +178,4 @@ def test_demo_writes_what_submit_and_validate_read(tmp_path: Path, monkeypatch: 
         demo, "write_demo", lambda out, seed, _write=demo.write_demo: _write(out, seed=seed, image_scale=0.1)
     )
     assert main(["demo", "--out", str(tmp_path)]) == 0
-    assert len(read_test_side(tmp_path / "test")) == 24
+    assert len(read_test_side(tmp_path / "test")) == 16

@@ -34,7 +34,7 @@ class MatchJob:
 
     ``expected`` are the seconds within which each unit most likely ends on a pair. Units may begin in the first
     ``seconds`` of the job if they are expected to end in them. After ``time_limit`` seconds without an answer the
-    worker hangs.
+    worker hangs. ``is_trial``: it is done again to see whether the place works.
     """
 
     phase: Phase
@@ -43,6 +43,7 @@ class MatchJob:
     expected: tuple[float, ...]
     seconds: float
     time_limit: float
+    is_trial: bool = False
     pairs: tuple[Pair, ...] = ()
     known: tuple[tuple[UnitResult, ...], ...] = ()
 

@@ -6,7 +6,7 @@ It looks at a job's worth of pairs at a time, so that a hundred thousand pairs c
 from collections import Counter, deque
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import islice
+from itertools import islice, product
 
 from mkpc_kaggle.engine.budget import Budget, format_duration
 from mkpc_kaggle.engine.costs import Costs
@@ -160,6 +160,8 @@ class Plan:
 
         ``cautious``: the place has just lost a worker, and tries one pair and one unit.
         """
+        if cautious and (trial := self._trial(now)) is not None:
+            return trial
         while now < self.stop and (chunk := self._pop(place, now, cautious=cautious)) is not None:
             units = self._units(chunk, now)
             todo = [index for index in chunk.indices if self.can_gain(index, units)]
@@ -224,15 +226,30 @@ class Plan:
             self._queue.put_back(replace(chunk, indices=later))
         if further:
             self._queue.put_back(replace(chunk, indices=indices, units=tuple(further)))
-        self._queue.under_way.update(indices)
+        return self._match(chunk.phase, indices, chosen, left)
 
-        p90 = tuple(self.costs.p90(unit.name) for unit in chosen)
+    def _trial(self, now: float) -> MatchJob | None:
+        """The first unit on a pair that has had it, where nothing is left but what workers were lost at.
+
+        A place that answers works: it is not closed for the pairs that kill every worker.
+        """
+        is_needed = self._queue.again and self._peek(now) is None and now < self.stop
+        for unit, record in product(self._first, self.records if is_needed else ()):
+            ran = any(found.unit == unit.name and not found.failure for found in record.units)
+            if ran and not self._queue.is_busy(record.index):
+                return replace(self._match(self.phase, (record.index,), [unit], self.stop - now), is_trial=True)
+        return None
+
+    def _match(self, phase: Phase, indices: tuple[int, ...], units: Sequence[Unit], left: float) -> MatchJob:
+        """The job, with its times by what its units cost."""
+        self._queue.under_way.update(indices)
+        p90 = tuple(self.costs.p90(unit.name) for unit in units)
         allowance = SLOW * len(indices) * (self.costs.overhead + sum(p90)) + self.budget.silence
         minibatch = min(len(indices), self._minibatch)
-        longest = max(self.costs.longest(unit.name, HANGS * minibatch) for unit in chosen)
-        if not all(self.costs.is_known(unit.name) for unit in chosen):
+        longest = max(self.costs.longest(unit.name, HANGS * minibatch) for unit in units)
+        if not all(self.costs.is_known(unit.name) for unit in units):
             longest += min(MAX_EXPLORE_S, EXPLORE_SHARE * left)
-        return MatchJob(chunk.phase, indices, tuple(chosen), p90, min(left, allowance), allowance + longest)
+        return MatchJob(phase, indices, tuple(units), p90, min(left, allowance), allowance + longest)
 
     def _units(self, chunk: Chunk, now: float) -> tuple[Unit, ...]:
         """The units for a chunk whose turn has come."""
@@ -301,6 +318,8 @@ class Plan:
     def on_result(self, job: MatchJob, result: MatchResult, seconds: float, now: float) -> list[Outcome]:
         """Record a job that took so many seconds; what it brought, to be kept."""
         self._queue.under_way.difference_update(job.indices)
+        if job.is_trial:
+            return []
         for found in result.results:
             self.costs.observe(found.unit.name, found.seconds, warm_up=found.warm_up)
         if result.results:
@@ -319,6 +338,8 @@ class Plan:
         that pair.
         """
         self._queue.under_way.difference_update(job.indices)
+        if job.is_trial:
+            return []
         chunk, half = Chunk(job.phase, job.indices, job.units, (place,)), len(job.indices) // 2
         if half:
             parts = job.indices[:half], job.indices[half:]
