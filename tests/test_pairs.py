@@ -188,7 +188,9 @@ def test_a_journal_knows_what_was_estimated_and_with_which_cameras(
     path = write_list(tmp_path / "list.txt", scenes, demo.train_dir)
 
     def digest(model: ModelKind) -> str:
-        return digest_of_pairs([true.pair for true in read_pairs(path, demo.train_dir, model, copies=tmp_path).pairs])
+        return digest_of_pairs(
+            [true.pair for true in read_pairs(path, demo.train_dir, model, copies=tmp_path).pairs]
+        )
 
     before = digest(ModelKind.E), digest(ModelKind.F)
     assert before[0] != before[1]
