@@ -15,13 +15,14 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+from mkpc_kaggle.engine.pools.local import LocalWorker
+from mkpc_kaggle.engine.pools.pool import Place, Pool
+
 from mkpc_kaggle.data.competition import Pair, read_test_side, write_submission
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.engine import Engine
 from mkpc_kaggle.engine.jobs import JobFailure, JobResult
 from mkpc_kaggle.engine.journal import Journal
-from mkpc_kaggle.engine.pools.local import LocalWorker
-from mkpc_kaggle.engine.pools.pool import Place, Pool
 from mkpc_kaggle.engine.records import PairRecord
 from mkpc_kaggle.pipeline.assembly import Assembly, assemble
 

@@ -88,7 +88,7 @@ def run(row: Row, dataset: str, scene: TrainScene, arguments: argparse.Namespace
     work_dir = arguments.out / dataset / row.name.replace(" ", "")
     with interruptible() as interrupt:
         session = Session(work_dir, Budget(time.monotonic()), interrupt, workers=None)
-        validation, _ = validate([scene], assembly, session)
+        validation = validate([scene], assembly, session)
     if interrupt.is_set():
         raise KeyboardInterrupt
     return validation

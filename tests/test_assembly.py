@@ -13,7 +13,7 @@ from mkpc_kaggle.pipeline.assembly import assemble
 from mkpc_kaggle.pipeline.availability import Licence
 from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher
 from mkpc_kaggle.recipe import Mode, Recipe, Unit, load_recipe
-from mkpc_kaggle.weights import WeightFile, manifest
+from mkpc_kaggle.weights import UNVERIFIED, WeightFile, manifest
 from mkpc_kaggle.weights import store as weight_store
 
 pytestmark = pytest.mark.usefixtures("nowhere_else")
@@ -105,7 +105,7 @@ def test_a_permissive_run_leaves_out_of_recipe_auto_what_is_licensed_otherwise(k
     assert set(some.fingerprint()["weights"]) == {"loftr-outdoor", "dkm-outdoor"}
 
 
-@pytest.mark.filterwarnings("ignore:.*is not verified")
+@pytest.mark.filterwarnings("ignore:weights not verified")
 def test_a_fallback_stands_in_for_a_matcher_whose_weights_are_not_permitted_or_not_there(known_files):
     recipe = Recipe((Unit(1, "superglue", 640, fallback="loftr"), Unit(2, "dkm", area="90x120")))
     every = assemble(recipe, weights=[known_files])
@@ -146,7 +146,7 @@ def test_the_permissive_recipe_is_refused_for_nothing_but_missing_weights():
             assemble(recipe, licence=Licence.PERMISSIVE)
 
 
-@pytest.mark.filterwarnings("ignore:.*is not verified")
+@pytest.mark.filterwarnings("ignore:weights not verified")
 @pytest.mark.parametrize("name", ["xfeat_sparse_bnfolded.safetensors", "DKMv3_outdoor.pth"])
 def test_recipe_auto_passes_damaged_weights_over(tmp_path, name):
     """The second has no digest in the manifest: it is found out when it is read."""
@@ -187,3 +187,13 @@ def test_a_mode_changes_the_units_that_run():
 def test_what_another_precision_computes_is_another_run() -> None:
     exact, half = (assemble("classical", precision=precision) for precision in ("float32", "bfloat16"))
     assert exact.fingerprint() != half.fingerprint()
+
+
+def test_weights_that_nobody_vouches_for_are_named_in_one_line_before_any_work(tmp_path, monkeypatch):
+    files = [replace(file, digest=UNVERIFIED) for file in manifest() if file.slot.startswith("xfeat")]
+    monkeypatch.setattr(weight_store, "manifest", lambda: files)
+    for file in files:
+        (tmp_path / file.name).write_bytes(b"anything of that size".ljust(max(file.size, 1)))
+    recipe = Recipe((Unit(1, "xfeat_lighterglue", 640),))
+    with pytest.warns(UserWarning, match=r"weights not verified: xfeat\S*, xfeat\S*; .* weights verify. says why"):
+        assemble(recipe, weights=[tmp_path])

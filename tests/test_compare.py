@@ -13,9 +13,6 @@ from mkpc_kaggle.evaluation.validate import PairScore, SceneScore, Validation
 from mkpc_kaggle.geometry.metrics import PoseError
 
 tenths = st.lists(st.integers(0, 10).map(lambda count: count / 10), min_size=1, max_size=30)
-RECIPE = """
-units = [{ stage = 1, matcher = "sift", long_side = 320 }, { stage = 2, matcher = "sift", long_side = 400 }]
-"""
 
 
 def test_a_gain_that_all_pairs_have_leaves_nothing_to_chance() -> None:
@@ -89,21 +86,21 @@ def compare(demo: DemoSet, *more: str) -> int:
 
 
 def test_a_recipe_against_its_units_on_whole_images(
-    demo: DemoSet, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    demo: DemoSet, small_recipe: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    recipe, out = tmp_path / "small.toml", tmp_path / "scores.json"
-    recipe.write_text(RECIPE)
-    arguments = ["--compare", f"{recipe}:whole-images", str(recipe), "--work-dir", str(tmp_path / "work")]
+    out = tmp_path / "scores.json"
+    compared = f"{small_recipe}:whole-images", str(small_recipe)
+    arguments = ["--compare", *compared, "--work-dir", str(tmp_path / "work")]
     assert compare(demo, *arguments, "--json", str(out)) == 0
     table = capsys.readouterr().out.split("seconds a pair\n")[-1]
     scores = json.loads(out.read_text())
-    assert [one["recipe"] for one in scores["recipes"]] == ["small (whole-images)", "small"]
+    assert [run["recipe"] for run in scores["recipes"]] == ["small (whole-images)", "small"]
     (gain,) = scores["gains"]
-    naive, split = (one["mAA"] for one in scores["recipes"])
+    naive, split = (run["mAA"] for run in scores["recipes"])
     assert gain["mAA"] == pytest.approx(split - naive)
     assert gain["low"] <= gain["mAA"] <= gain["high"]
     assert f"{gain['mAA']:+.4f} [{gain['low']:+.4f}, {gain['high']:+.4f}]" in table
-    assert all(one["work_seconds_per_pair"] > 0 for one in scores["recipes"])
+    assert all(run["work_seconds_per_pair"] > 0 for run in scores["recipes"])
 
     assert compare(demo, *arguments) == 0  # nothing is left to do: the journals tell the same
     again = capsys.readouterr().out

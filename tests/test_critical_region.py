@@ -64,27 +64,27 @@ def test_every_outcome_has_its_reason_and_only_one_is_a_crop(points, reason, clu
 
 @pytest.mark.parametrize("clustered", range(5, 31))
 def test_a_fifth_of_the_points_in_clusters_is_enough_and_less_is_not(clustered):
-    one = block(100, 100, 130, 130, clustered)
-    assert region(one, lone(4 * clustered)).reason is RegionReason.CROPPED
-    assert region(one, lone(4 * clustered + 1)).reason is RegionReason.TOO_SCATTERED
+    cluster = block(100, 100, 130, 130, clustered)
+    assert region(cluster, lone(4 * clustered)).reason is RegionReason.CROPPED
+    assert region(cluster, lone(4 * clustered + 1)).reason is RegionReason.TOO_SCATTERED
 
 
 @pytest.mark.parametrize(("percent", "clustered"), [(7, 7), (14, 7), (28, 7), (55, 11), (56, 14)])
 def test_the_least_share_clustered_is_compared_to_the_letter(percent, clustered):
-    one, noise = block(100, 100, 130, 130, clustered), lone(clustered * 100 // percent - clustered)
-    got = region(one, noise, config=replace(BARE, min_clustered=percent / 100))
+    cluster, noise = block(100, 100, 130, 130, clustered), lone(clustered * 100 // percent - clustered)
+    got = region(cluster, noise, config=replace(BARE, min_clustered=percent / 100))
     assert got.reason is RegionReason.CROPPED
 
 
 @pytest.mark.parametrize("k", [5, 7, 12])
 def test_a_cluster_of_exactly_the_share_is_kept_and_a_point_fewer_is_not(k):
     large, small = block(100, 100, 130, 130, 20 * k), block(400, 300, 420, 320, k)
-    both, one = Box(100, 100, 421, 321), Box(100, 100, 131, 131)
+    both, large_only = Box(100, 100, 421, 321), Box(100, 100, 131, 131)
     kept = region(large, small)
     assert (kept.box, kept.clusters, kept.kept) == (both, 2, 2)
     over = block(100, 100, 130, 130, 20 * k + 1)
     dropped = region(over, small)
-    assert (dropped.box, dropped.clusters, dropped.kept) == (one, 2, 1)
+    assert (dropped.box, dropped.clusters, dropped.kept) == (large_only, 2, 1)
 
 
 def test_the_share_is_compared_to_the_letter():

@@ -353,7 +353,9 @@ def on_a_closed_terminal(command: list[str]) -> int:
 
 
 def with_stderr_closed(command: list[str]) -> int:
-    return subprocess.run(["sh", "-c", 'exec "$@" 2>&-', "sh", *command], stdout=subprocess.PIPE, check=False).returncode
+    return subprocess.run(
+        ["sh", "-c", 'exec "$@" 2>&-', "sh", *command], stdout=subprocess.PIPE, check=False
+    ).returncode
 
 
 def on_a_full_disk(command: list[str]) -> int:
@@ -385,7 +387,9 @@ def test_the_limit_counts_from_the_start_of_the_process() -> None:
 
 
 def test_a_program_leaves_without_what_an_interpreter_does_at_its_end(tmp_path: Path) -> None:
-    code = "import atexit; from mkpc_kaggle.cli import program; atexit.register(print, 'late'); program(['recipes'])"
+    code = (
+        "import atexit; from mkpc_kaggle.cli import program; atexit.register(print, 'late'); program(['recipes'])"
+    )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "")
     assert "auto: " in done.stdout

@@ -165,7 +165,7 @@ def test_a_strip_shows_both_images_at_one_height_with_matches_where_they_are():
         Image.of_array(np.full((300, 300, 3), 5, np.uint8)),
     )
     matches = Matches(np.array([[9.5, 9.5]]), np.array([[149.5, 149.5]]), np.ones(1))
-    found = Estimate(Model.F, np.eye(3), np.array([True]))
+    found = Estimate(ModelKind.F, np.eye(3), np.array([True]))
     figure = draw_strip(images, PairMatch((UnitResult(UNITS[0], matches),), None, found))
     drawn = cv2.imdecode(np.frombuffer(encode(figure, "jpeg"), np.uint8), cv2.IMREAD_COLOR)
     assert drawn.shape[:2] == pytest.approx((480, 960 + 480), abs=1)  # older versions of matplotlib round down

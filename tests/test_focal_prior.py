@@ -38,8 +38,8 @@ def seen(cameras, n=200, noise=0.0, outliers=0, seed=0, depth=(4, 9)):
     rng = np.random.default_rng(seed)
     X = rng.uniform((-1.5, -1.2, depth[0]), (1.5, 1.2, depth[1]), (n, 3))
     points = []
-    for one in cameras:
-        x = (X @ one.R.T + one.t) @ one.K.T
+    for view in cameras:
+        x = (X @ view.R.T + view.t) @ view.K.T
         points.append(x[:, :2] / x[:, 2:] + rng.normal(scale=noise, size=(n, 2)))
     wild = [rng.uniform(0, SIZE, (outliers, 2)) for _ in range(2)]
     return Matches(*(np.vstack(both) for both in zip(points, wild, strict=True)), np.ones(n + outliers))
@@ -103,7 +103,7 @@ def test_a_principal_point_far_off_leaves_magsac_its_matrix():
     cropped = camera(700.0, centre=(-900, 1500)), camera(800.0, 0.3, (-2.0, 0.3, 0.5), centre=(2500, -800))
     rng = np.random.default_rng(0)
     X = rng.uniform((-4, -4, 4), (4, 4, 9), (400, 3))
-    x0, x1 = (((X @ one.R.T + one.t) @ one.K.T) for one in cropped)
+    x0, x1 = (((X @ view.R.T + view.t) @ view.K.T) for view in cropped)
     matches = Matches(x0[:, :2] / x0[:, 2:], x1[:, :2] / x1[:, 2:], np.ones(400))
     result = with_prior(matches)
     assert result.ok
@@ -115,7 +115,9 @@ def test_a_principal_point_far_off_leaves_magsac_its_matrix():
 def test_nothing_costs_more_than_magsacs_own_matrix_and_the_price_of_its_freedom(seed):
     matches = seen(CAMERAS, 60, 0.4, 60, seed)
     alone, result = estimate(matches, MAGSAC), with_prior(matches)
-    ours, theirs = (robust_cost(sampson_distances(one.matrix, matches), CONFIG.scale) for one in (result, alone))
+    ours, theirs = (
+        robust_cost(sampson_distances(found.matrix, matches), CONFIG.scale) for found in (result, alone)
+    )
     assert ours <= theirs + FREE_COST
 
 
@@ -124,7 +126,7 @@ def degenerate():
     turned = seen((camera(1100), camera(1100, 0.1)), 80, 0.1)
     along = np.linspace(0, 700, 40)
     X = np.column_stack([rng.uniform(-1, 1, (80, 2)), np.full(80, 5.0)])
-    plane = [((X @ one.R.T + one.t) @ one.K.T) for one in CAMERAS]
+    plane = [((X @ view.R.T + view.t) @ view.K.T) for view in CAMERAS]
     return {
         "a pure rotation": turned,
         "one plane": Matches(*(x[:, :2] / x[:, 2:] for x in plane), np.ones(80)),

@@ -44,7 +44,7 @@ class DoomedWorker(WatchedWorker):
     def __init__(self, name: str, *arguments: Any) -> None:
         super().__init__(f"{name}, {len(self.known)}", *arguments)
         self.known[self.name] = self
-        self.place, self.kind = name, name.split()[0]
+        self.place, self.kind = name, name.split(maxsplit=1)[0]
         self.signal: signal.Signals | None = None
         self.clock = 0
 
@@ -131,9 +131,7 @@ def test_a_run_whose_workers_are_killed_and_stopped_at_random_moments_ends_as_th
         report = run_whole(f"disturbed {number}")
         print(report.faults, DoomedWorker.sent[number:])
         assert len(report.faults) > 0
-        given_up = [
-            any(unit.failure.startswith(GIVEN_UP) for unit in record.units) for record in report.records
-        ]
+        given_up = [any(unit.failure.startswith(GIVEN_UP) for unit in record.units) for record in report.records]
         intact = set(map(str, range(BATCHES))) - {
             pair.group for pair, is_given_up in zip(pairs, given_up, strict=True) if is_given_up
         }

@@ -18,7 +18,7 @@ def some(n, seed=0):
 
 
 def scored(scores):
-    """The i-th match lies at (i, i): its place tells which one it was."""
+    """The i-th match lies at (i, i): its place tells which match it was."""
     at = np.repeat(np.arange(len(scores))[:, None], 2, axis=1)
     return Matches(at, at, np.asarray(scores))
 

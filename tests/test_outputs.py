@@ -23,7 +23,7 @@ def place(tmp_path):
 
 
 def refuse(place, option, name):
-    require_no_input({option: place / name}, [place / "test.csv", place / "images"], [place / "weights"])
+    require_no_input({option: place / name}, [place / "test.csv", place / "images", place / "weights"])
 
 
 @pytest.mark.parametrize(
@@ -91,7 +91,7 @@ def test_what_a_dead_process_has_left_is_removed_and_what_a_living_one_writes_is
     dead.wait()
     left = tmp_path / f".submission.csv.{dead.pid}-0123abcd.part"
     other = tmp_path / f".submission.csv.{os.getpid()}-0123abcd.part"
-    kept = tmp_path / ".submission.csv.part"  # not one of ours
+    kept = tmp_path / ".submission.csv.part"  # not ours
     for path in (left, other, kept):
         path.touch()
     with replacing(tmp_path / "submission.csv") as stream:

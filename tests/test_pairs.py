@@ -18,7 +18,7 @@ from mkpc_kaggle.data.competition import TrainScene, read_train_side
 from mkpc_kaggle.data.images import Image, read_image
 from mkpc_kaggle.data.pairs import parse_line, read_pairs
 from mkpc_kaggle.demo import DemoSet
-from mkpc_kaggle.engine.session import digest_of
+from mkpc_kaggle.engine.session import digest_of_pairs
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.evaluation.validate import error_of
 from mkpc_kaggle.geometry.cameras import Camera, fundamental_of_cameras
@@ -57,8 +57,8 @@ def test_a_turned_camera_is_a_camera(turns: int) -> None:
     np.testing.assert_array_equal(turned.K[np.tril_indices(3, -1)], 0)
     assert [turned.K[0, 0], turned.K[1, 1]] == ([500, 450] if turns % 2 == 0 else [450, 500])
     back = turned.rotated_90(-turns, Size(64, 40) if turns % 2 == 0 else Size(40, 64))
-    for one, other in ((back.K, K), (back.R, R), (back.t, CAMERA.t)):
-        np.testing.assert_allclose(one, other, atol=1e-12)
+    for found, true in ((back.K, K), (back.R, R), (back.t, CAMERA.t)):
+        np.testing.assert_allclose(found, true, atol=1e-12)
 
 
 def test_a_line_is_what_was_written() -> None:
@@ -188,7 +188,9 @@ def test_a_journal_knows_what_was_estimated_and_with_which_cameras(
     path = write_list(tmp_path / "list.txt", scenes, demo.train_dir)
 
     def digest(model: ModelKind) -> str:
-        return digest_of([true.pair for true in read_pairs(path, demo.train_dir, model, copies=tmp_path).pairs])
+        return digest_of_pairs(
+            [true.pair for true in read_pairs(path, demo.train_dir, model, copies=tmp_path).pairs]
+        )
 
     before = digest(ModelKind.E), digest(ModelKind.F)
     assert before[0] != before[1]
@@ -291,12 +293,12 @@ def test_the_papers_tables_are_made_with_one_command(
     listed = write_list(tmp_path / "list.txt", [replace(scenes[0], pairs=scenes[0].pairs[:1])], demo.train_dir)
     where = ["--scannet", str(listed), str(demo.train_dir), "--out", str(tmp_path / "out"), "--matcher", "sift"]
     paper_tables.main([*where, "--rows", "one", "two + one"])
-    heads, _, one, two, empty = capsys.readouterr().out.splitlines()
+    heads, _, first, second, empty = capsys.readouterr().out.splitlines()
     assert heads.startswith("| scannet: 1 pairs | whole images | critical regions | AUC 5 |")
-    assert one.startswith("| one | 1280 | - | ")
-    assert two.startswith("| two + one | 1024, 1280 | 1280 | ")
-    assert all(0 <= float(area) <= 100 for row in (one, two) for area in row.split("|")[4:7])
-    assert float(one.split("|")[6]) > 10
+    assert first.startswith("| one | 1280 | - | ")
+    assert second.startswith("| two + one | 1024, 1280 | 1280 | ")
+    assert all(0 <= float(area) <= 100 for row in (first, second) for area in row.split("|")[4:7])
+    assert float(first.split("|")[6]) > 10
     assert empty == ""
 
 

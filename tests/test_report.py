@@ -98,8 +98,9 @@ def test_without_options_the_command_shows_one_screen(tmp_path: Path, capsys: py
 
 
 def test_the_screen_names_matchers_that_were_left_out_once(tmp_path: Path) -> None:
-    empty_journal(tmp_path, [], left_out=("1:loma@1024", "2:loma@1024", "1:roma@864x864!")).close()
-    assert "left out: loma, roma; `python -m mkpc_kaggle weights list` says why" in overview(read_log(tmp_path))
+    empty_journal(tmp_path, [], left_out=("no weights: loma, roma", "cannot be used here: dkm")).close()
+    screen = overview(read_log(tmp_path))
+    assert screen.count("left out, no weights: loma, roma; cannot be used here: dkm (`python -m") == 1
 
 
 @pytest.mark.parametrize("option", ["--csv", "--json", "--report"])

@@ -65,7 +65,7 @@ def test_they_take_a_small_share_of_the_time() -> None:
     scenario = Scenario(400, (1.0, 1.0), 0, 1, 900.0, warm_up=1, misses=0, batches=4, pairs_per_image=4)
     ran = simulate(scenario)
     assert ran.late == ran.lost == ran.missed == 0
-    told = next(one.text for one in ran.report.explanations if "for the scenes' sake" in one.text)
+    told = next(each.text for each in ran.report.explanations if "for the scenes' sake" in each.text)
     assert 10 < int(told.split()[0]) < 60
     assert len(ran.report.records) == 400
 

@@ -23,7 +23,7 @@ RECIPE = """
 units = [
     { stage = 1, matcher = "sift", long_side = 320 },
     { stage = 2, matcher = "sift", long_side = 400 },
-    { stage = 1, matcher = "sift", long_side = 280, extra = true },
+    { stage = 1, matcher = "sift", long_side = 280 },
 ]
 """
 

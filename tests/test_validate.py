@@ -24,17 +24,6 @@ from mkpc_kaggle.geometry.metrics import AUC_THRESHOLDS
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
 from mkpc_kaggle.reporting.run_log import read_log
 
-RECIPE = """
-units = [{ stage = 1, matcher = "sift", long_side = 320 }, { stage = 2, matcher = "sift", long_side = 400 }]
-"""
-
-
-@pytest.fixture
-def recipe(tmp_path: Path) -> Path:
-    path = tmp_path / "small.toml"
-    path.write_text(RECIPE)
-    return path
-
 
 def true_matrices(demo: DemoSet) -> dict[str, np.ndarray]:
     """The true F of the test side's samples, in the test side's order of images."""
@@ -92,9 +81,9 @@ def scores_of(demo: DemoSet, recipe: Path, *options: str) -> dict[str, Any]:
 
 
 def test_validate_scores_a_recipe_and_writes_all_figures(
-    demo: DemoSet, recipe: Path, capsys: pytest.CaptureFixture[str]
+    demo: DemoSet, small_recipe: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    scores = scores_of(demo, recipe, "--pairs-per-scene", "5")
+    scores = scores_of(demo, small_recipe, "--pairs-per-scene", "5")
     assert f"{'mean over scenes':<20}{5:>6}{scores['mAA']:>9.4f}" in capsys.readouterr().out
     (scene,) = scores["scenes"]
     assert scene["scene"] == "courtyard"
@@ -108,13 +97,14 @@ def test_validate_scores_a_recipe_and_writes_all_figures(
 
 
 def test_each_step_of_the_estimate_has_a_column(
-    demo: DemoSet, recipe: Path, capsys: pytest.CaptureFixture[str]
+    demo: DemoSet, small_recipe: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    plain = scores_of(demo, recipe)
+    small_recipe.write_text(small_recipe.read_text() + "[magsac]\norders = 1\n")
+    plain = scores_of(demo, small_recipe)
     assert plain["mAA_by_step"] == {"MAGSAC": plain["mAA"]}
     capsys.readouterr()
-    recipe.write_text(RECIPE + "[focal]\n[scene]\n")
-    scores = scores_of(demo, recipe)
+    small_recipe.write_text(small_recipe.read_text() + "[focal]\n[scene]\n")
+    scores = scores_of(demo, small_recipe)
     printed = capsys.readouterr().out
     by_step = scores["mAA_by_step"]
     assert list(by_step) == ["MAGSAC", "+ prior", "+ scene"]
@@ -136,16 +126,24 @@ def test_each_step_of_the_estimate_has_a_column(
     ],
 )
 def test_modes_and_units_change_what_is_run(
-    demo: DemoSet, recipe: Path, options: list[str], units: set[str]
+    demo: DemoSet, small_recipe: Path, options: list[str], units: set[str]
 ) -> None:
-    (pair,) = scores_of(demo, recipe, "--pairs-per-scene", "1", *options)["scenes"][0]["pairs"]
+    (pair,) = scores_of(demo, small_recipe, "--pairs-per-scene", "1", *options)["scenes"][0]["pairs"]
     assert set(pair["matches"]) == units
 
 
 def test_a_work_directory_keeps_the_journal_and_a_report_that_shows_the_pairs(
-    demo: DemoSet, recipe: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    demo: DemoSet, small_recipe: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    arguments = ["validate", "--train-dir", str(demo.train_dir), "--pairs-per-scene", "2", "--recipe", str(recipe)]
+    arguments = [
+        "validate",
+        "--train-dir",
+        str(demo.train_dir),
+        "--pairs-per-scene",
+        "2",
+        "--recipe",
+        str(small_recipe),
+    ]
     assert main([*arguments, "--work-dir", str(tmp_path / "work")]) == 0
     page = tmp_path / "work" / "report.html"
     assert f"report: {page}" in capsys.readouterr().out
@@ -205,7 +203,10 @@ def test_the_table_has_a_row_a_scene_and_their_mean(demo: DemoSet, tmp_path: Pat
 
 
 def test_an_unknown_unit_is_told_with_the_known_ones(
-    demo: DemoSet, recipe: Path, capsys: pytest.CaptureFixture[str]
+    demo: DemoSet, small_recipe: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["validate", "--train-dir", str(demo.train_dir), "--recipe", str(recipe), "--units", "sift"]) == 2
+    assert (
+        main(["validate", "--train-dir", str(demo.train_dir), "--recipe", str(small_recipe), "--units", "sift"])
+        == 2
+    )
     assert "no unit 'sift'; it has 1:sift@320, 2:sift@400" in capsys.readouterr().err

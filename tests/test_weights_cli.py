@@ -215,3 +215,13 @@ def test_every_action_has_a_help(action: str, capsys: pytest.CaptureFixture[str]
         main(["weights", action, "--help"])
     assert left.value.code == 0
     assert len(capsys.readouterr().out.splitlines()) >= 6
+
+
+def test_a_file_is_not_converted_onto_itself(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    put(tmp_path, "x.safetensors", DATA)
+    assert (
+        main(["weights", "convert", str(tmp_path / "x.safetensors"), "--out", str(tmp_path / "x.safetensors")])
+        == 2
+    )
+    assert "would be written over the input" in capsys.readouterr().err
+    assert (tmp_path / "x.safetensors").read_bytes() == DATA

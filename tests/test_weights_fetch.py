@@ -212,6 +212,15 @@ def test_a_directory_that_cannot_be_made_is_told(site: Site, tmp_path: Path) -> 
     assert "cannot be written" in failed.note
 
 
+def test_a_directory_of_the_files_name_is_not_taken_for_the_file(site: Site, tmp_path: Path) -> None:
+    (tmp_path / "a.bin").mkdir()
+    failed = get(site, tmp_path, line(size=-1, digest=UNVERIFIED))
+    assert (failed.outcome, failed.note) == (
+        FetchOutcome.FAILED,
+        f"{tmp_path / 'a.bin'} cannot be written: Is a directory",
+    )
+
+
 @pytest.mark.parametrize(
     "source",
     [

@@ -173,7 +173,7 @@ def require_apart(
         ):
             raise UserError(f"{option} {path} and the work directory {work_dir} are in each other's way")
     environment = (Path(part) for part in os.environ.get("MKPC_WEIGHTS", "").split(os.pathsep) if part)
-    require_no_input(given, inputs, [*weights, *environment])
+    require_no_input(given, [*inputs, *weights, *environment])
     for place in inputs:
         if work_dir is not None and lies_in(work_dir, place):
             raise UserError(f"--work-dir {work_dir} would be written over the input {place}; name another place")

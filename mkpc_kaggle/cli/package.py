@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from mkpc_kaggle.cli import options
 from mkpc_kaggle.cli.tables import print_table
-from mkpc_kaggle.package.metadata import Image
+from mkpc_kaggle.package.metadata import LATEST
 from mkpc_kaggle.package.wheels import PYTHONS
 
 if TYPE_CHECKING:
@@ -41,9 +41,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--image",
-        choices=list(Image),
-        default=Image.LATEST,
-        help="Kaggle's latest image (the default), or for good the one of the kernel's first version",
+        default=LATEST,
+        metavar="latest|original|NAME@sha256:DIGEST",
+        help="Kaggle's latest image (the default), for good that of the kernel's first version, or just this one "
+        "(`kaggle kernels pull NAME/mkpc-submission -m` tells which a version had, as docker_image)",
     )
 
 
@@ -53,7 +54,7 @@ def run(arguments: argparse.Namespace) -> int:
     pythons = tuple(version.strip() for version in arguments.python.split(","))
     weights = tuple(arguments.weights)
     out: Path = arguments.out
-    wheels, private, image = arguments.wheels, arguments.private, Image(arguments.image)
+    wheels, private, image = arguments.wheels, arguments.private, arguments.image
     package = make_package(Request(out, arguments.owner, weights, pythons, wheels, private, image))
     print(f"{out / 'dataset'}")
     _print_files(package.dataset)
@@ -78,6 +79,6 @@ Next, with the `kaggle` command (README, On Kaggle):
 
 
 def _print_files(items: "Iterable[Item]") -> None:
-    rows = [(item.name, str(item.size), item.licence or "-", item.note) for item in items]
+    rows = [(item.name, str(item.source.stat().st_size), item.licence or "-", item.note) for item in items]
     total = sum(int(size) for _, size, _, _ in rows)
     print_table([("file", "bytes", "licence", ""), *rows, (f"{len(rows)} files", str(total), "", "")])

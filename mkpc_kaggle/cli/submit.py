@@ -51,7 +51,7 @@ def run(arguments: argparse.Namespace) -> int:
     from mkpc_kaggle.engine.session import Session, Watchdog, interruptible, submit
     from mkpc_kaggle.recipe import Choice, Mode
     from mkpc_kaggle.reporting.report import report_run
-    from mkpc_kaggle.reporting.summary import summary, trouble
+    from mkpc_kaggle.reporting.summary import left_out_line, summary, trouble
 
     output: Path = arguments.output
     work_dir: Path = arguments.work_dir or output.parent / f"{output.stem}.work"
@@ -63,7 +63,8 @@ def run(arguments: argparse.Namespace) -> int:
     with interruptible() as interrupt, Watchdog(budget, interrupt) as watchdog:
         pairs = read_test_side(arguments.test_dir)
         assembly = options.assembly_of(arguments, Choice(arguments.recipe, Mode(arguments.mode)))
-        say(f"{len(pairs)} pairs, recipe {assembly.recipe.name}, {assembly.placement}, journal in {work_dir}")
+        header = f"{len(pairs)} pairs, recipe {assembly.recipe.name}, {assembly.placement}, journal in {work_dir}"
+        say("\n".join(filter(None, [header, left_out_line(assembly.left_out)])))
         session = Session(
             work_dir, budget, interrupt, arguments.fresh, workers=arguments.workers, watchdog=watchdog
         )
@@ -71,7 +72,7 @@ def run(arguments: argparse.Namespace) -> int:
         watchdog.status = int(bool(report.unwritten or trouble(report)))
         explained = ["plan:", *map(str, report.explanations)] if arguments.explain else []
         unwritten = f" is not the last version: {report.unwritten}" if report.unwritten else ""
-        told = [*explained, summary(pairs, report, assembly.left_out), f"submission: {output}{unwritten}"]
+        told = [*explained, summary(pairs, report), f"submission: {output}{unwritten}"]
         say("\n".join(told))  # the watchdog may end the program while it draws
         if not arguments.no_report:
             say(report_run(work_dir, page, session.must_end(), pairs))

@@ -187,14 +187,15 @@ def _validate(
     from mkpc_kaggle.evaluation.compare import step_gains
     from mkpc_kaggle.evaluation.validate import score_table, validate
     from mkpc_kaggle.reporting.report import report_run
-    from mkpc_kaggle.reporting.summary import summary
+    from mkpc_kaggle.reporting.summary import left_out_line, summary
 
     session = Session(work_dir, options.budget_of(arguments), interrupt, workers=arguments.workers)
     validation = validate(scenes, assembly, session)
     pairs = [true.pair for scene in scenes for true in scene.pairs]
     assert validation.report is not None
     explained = ["plan:", *map(str, validation.report.explanations)] if arguments.explain else []
-    told = [*explained, summary(pairs, validation.report, assembly.left_out), "", f"recipe {validation.recipe}"]
+    left_out = filter(None, [left_out_line(assembly.left_out)])
+    told = [*left_out, *explained, summary(pairs, validation.report), "", f"recipe {validation.recipe}"]
     say("\n".join([*told, *score_table(validation), *step_gains(validation)]))
     # The report's inliers are of F: there is none for a list of pairs, whose E is estimated.
     if arguments.work_dir is not None and arguments.pairs is None:

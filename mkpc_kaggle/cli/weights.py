@@ -114,15 +114,18 @@ def _verify_manifest(arguments: argparse.Namespace) -> int:
     from mkpc_kaggle.weights.manifest import read_manifest
 
     store = WeightStore(arguments.weights, read_manifest(arguments.manifest))
-    rows, absent = [("file", "state", "path", "note")], 0
+    rows, absent = [("file", "bytes", "state", "note")], 0
     for file in store.files:
         search = store.search([file])
         for found in (search.found,) if search.found else search.refused:
-            rows.append((file.name, str(found.state), str(found.path), found.note))
+            beside = found.path == arguments.manifest.parent / file.name
+            note = found.note if beside else f"{found.path} {found.note}"
+            rows.append((file.name, str(file.size), str(found.state), note))
         if not search.found and not search.refused:
-            rows.append((file.name, "missing", "", f"searched {store.searched}"))
+            rows.append((file.name, str(file.size), "missing", f"searched {store.searched}"))
         absent += search.found is None
-    print_table(rows)
+    if store.files:
+        print_table(rows)
     print(f"{len(store.files)} files in {arguments.manifest}, {absent} of them not found or wrong")
     return 1 if absent else 0
 

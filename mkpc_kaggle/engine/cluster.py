@@ -62,8 +62,13 @@ def parse_workers(text: str) -> int | RayCluster:
     return RayCluster(found[1])
 
 
-def ray_site(assembly: Assembly, cluster: RayCluster, clock: Callable[[], float]) -> Site:
-    """The cluster's site; raises :class:`UserError` where Ray is not installed."""
+def ray_site(
+    assembly: Assembly, cluster: RayCluster, clock: Callable[[], float], folders: tuple[Path, ...] = ()
+) -> Site:
+    """The cluster's site; raises :class:`UserError` where Ray is not installed.
+
+    Each machine must have the weights and the ``folders``, which hold the images.
+    """
     # Read when Ray is imported: it must not report usage, and not start a cluster after it was shut down.
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     os.environ.setdefault("RAY_ENABLE_AUTO_CONNECT", "0")
@@ -73,18 +78,21 @@ def ray_site(assembly: Assembly, cluster: RayCluster, clock: Callable[[], float]
         raise UserError(
             '--workers ray needs Ray, which is not installed: pip install "mkpc-kaggle[ray]"'
         ) from error
-    return RaySite(assembly, cluster, clock)
+    return RaySite(assembly, cluster, clock, (*assembly.weight_paths, *folders))
 
 
 class RaySite:
     """The machines of a cluster, which is joined when the site is opened. See :class:`Site`."""
 
-    def __init__(self, assembly: Assembly, cluster: RayCluster, clock: Callable[[], float]) -> None:
+    def __init__(
+        self, assembly: Assembly, cluster: RayCluster, clock: Callable[[], float], needed: tuple[Path, ...]
+    ) -> None:
         self.places: list[Place] = []
         self.fallback: list[Place] = []
         self._assembly = assembly
         self._cluster = cluster
         self._clock = clock
+        self._needed = needed
         self._has_joined = False
         self._machines = 1
         self._coming: set[Any] = set()
@@ -139,8 +147,7 @@ class RaySite:
         return Place(name, partial(self._worker, make, **where))
 
     def _worker(self, make: Callable[[], Runner], **where: Any) -> "RayWorker":
-        paths = self._assembly.weight_paths
-        return RayWorker(make, where, paths, self._coming)
+        return RayWorker(make, where, self._needed, self._coming)
 
 
 class RayWorker:

@@ -108,14 +108,18 @@ class ChunkQueue:
         """Whether something has to be tried again on a pair."""
         return any(index in chunk.indices for chunk in self._retries)
 
-    @property
-    def has_fresh(self) -> bool:
-        return bool(self._waiting)
+    def drop(self) -> None:
+        """Take out the first chunk."""
+        self._waiting.popleft()
 
     @property
-    def is_empty(self) -> bool:
-        """Whether nothing waits; jobs may be under way."""
-        return not self._waiting and not self._retries
+    def first(self) -> Chunk | None:
+        """The next chunk that has not been tried yet."""
+        return self._waiting[0] if self._waiting else None
+
+    @property
+    def has_retries(self) -> bool:
+        return bool(self._retries)
 
 
 class Plan:
@@ -187,10 +191,14 @@ class Plan:
         """When no unit may be running any more."""
         return self.budget.stop_units - min(self.reserve, RESERVE_SHARE * self.budget.time_limit)
 
-    @property
-    def has_work(self) -> bool:
-        """Whether something waits, or a phase is to come; what is under way may come back, too."""
-        return not self._queue.is_empty or self._coming != []
+    def has_work(self, now: float) -> bool:
+        """Whether a pair waits that can gain something; what is under way may come back, too."""
+        while (chunk := self._peek(now)) is not None:
+            if any(self.can_gain(index, self._units(chunk, now)) for index in chunk.indices):
+                return True
+            self._queue.drop()
+            self._mark_done(chunk.phase, chunk.indices)
+        return self._queue.has_retries
 
     def can_gain(self, index: int, units: Iterable[Unit]) -> bool:
         """Whether a pair may have one of the units that it has not had."""
@@ -205,8 +213,7 @@ class Plan:
 
         A place that answers works: it is not closed for the pairs that kill every worker.
         """
-        self._open_phases(now)
-        if self._queue.has_fresh or self._queue.is_empty or now >= self.stop:
+        if self._peek(now) is not None or not self._queue.has_retries or now >= self.stop:
             return None
         for unit, record in product(self._first, self.records):
             ran = any(found.unit == unit.name and not found.failure for found in record.units)
@@ -217,12 +224,14 @@ class Plan:
                 return MatchJob(self.phase, (record.index,), (unit,), expected, *times, is_trial=True)
         return None
 
-    def _open_phases(self, now: float) -> None:
-        while not self._queue.has_fresh and self._coming:
+    def _peek(self, now: float) -> Chunk | None:
+        """The next chunk of the present phase, or of those to come."""
+        while self._queue.first is None and self._coming:
             self._open(self._coming.pop(0), now)
+        return self._queue.first
 
     def _pop(self, place: str, now: float, *, cautious: bool) -> Chunk | None:
-        self._open_phases(now)
+        self._peek(now)
         return self._queue.pop(place, alone=self.workers < 2, fresh_first=cautious)
 
     def _job(
