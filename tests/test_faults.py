@@ -16,7 +16,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from faulty import (
     Fault,
@@ -38,7 +37,7 @@ from mkpc_kaggle.demo import DemoSet
 from mkpc_kaggle.engine import session, worker
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.engine import Ending, RunReport
-from mkpc_kaggle.engine.jobs import Answer, Cause, Failure, MatchResult, Outcome, Phase
+from mkpc_kaggle.engine.jobs import Cause, Failure, MatchResult, Outcome, Phase
 from mkpc_kaggle.engine.journal import Journal
 from mkpc_kaggle.engine.plan import Plan
 from mkpc_kaggle.engine.process import ThreadWorker
