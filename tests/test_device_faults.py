@@ -1,4 +1,4 @@
-"""Devices that fail, memory that is short and workers that are lost: what counts against what, and what takes over."""
+"""Devices that fail, memory that is short, workers that are lost: what counts against what, what takes over."""
 
 import threading
 from collections.abc import Callable

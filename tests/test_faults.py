@@ -1,4 +1,4 @@
-"""Faults injected into real runs, on real images: a lost worker, image, disk, terminal or parent costs its part alone."""
+"""Faults in real runs, on real images: a lost worker, image, disk, terminal or parent costs its part alone."""
 
 import os
 import pty

@@ -6,7 +6,6 @@ It looks at a job's worth of pairs at a time, so that a hundred thousand pairs c
 from collections import Counter, deque
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import product
 
 from mkpc_kaggle.engine.budget import Budget, format_duration
 from mkpc_kaggle.engine.costs import Costs
@@ -172,8 +171,6 @@ class Plan:
 
         ``cautious``: the place has just lost a worker, and tries one pair and one unit.
         """
-        if cautious and (trial := self._trial(now)) is not None:
-            return trial
         while now < self.stop and (chunk := self._pop(place, now, cautious=cautious)) is not None:
             units = self._units(chunk, now)
             todo = [index for index in chunk.indices if self.can_gain(index, units)]
@@ -372,8 +369,6 @@ class Plan:
         that pair.
         """
         self._queue.under_way.difference_update(job.indices)
-        if job.is_trial:
-            return []
         chunk = Chunk(job.phase, job.indices, job.units, (place,))
         if len(job.indices) > 1:
             half = len(job.indices) // 2
