@@ -205,6 +205,22 @@ class Plan:
         self._queue = ChunkQueue()
         self._coming = list(Phase)
 
+    def _trial(self, now: float) -> MatchJob | None:
+        """The first unit on a pair that has had it, where nothing is left but what workers were lost at.
+
+        A place that answers works: it is not closed for the pairs that kill every worker.
+        """
+        if self._peek(now) is not None or not self._queue.has_retries or now >= self.stop:
+            return None
+        for unit, record in product(self._first, self.records):
+            ran = any(found.unit == unit.name and not found.failure for found in record.units)
+            if ran and not self._queue.is_busy(record.index):
+                self._queue.under_way.add(record.index)
+                times = self._time([unit], 1, self.stop - now, exploring=False)
+                expected = (self.costs.p90(unit.name),)
+                return MatchJob(self.phase, (record.index,), (unit,), expected, *times, is_trial=True)
+        return None
+
     def _peek(self, now: float) -> Chunk | None:
         """The next chunk of the present phase, or of those to come."""
         while self._queue.first is None and self._coming:
