@@ -1,6 +1,5 @@
 """Scenes in whole runs: whose F a pair gets, and what a reconstruction that goes wrong costs."""
 
-import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -219,7 +218,7 @@ def test_what_happens_within_pycolmap_costs_the_scene_alone_and_leaves_no_files(
     assert report.ending is Ending.COMPLETE
     assert [record.source for record in report.records] == ["pair"] * 6
     assert report.scenes[0].failure
-    assert os.listdir(tmp_path / "temporary") == []
+    assert list((tmp_path / "temporary").iterdir()) == []
 
 
 def test_the_scene_of_a_run_is_made_of_tracks_and_judged_by_all_matches(

@@ -114,8 +114,12 @@ class RaySite:
         else:
             make = partial(MatchRunner, self._assembly.pipeline)
             self.places = [
-                self._place(node["NodeManagerHostname"], make, num_cpus=int(node["Resources"]["CPU"]))
-                for node in machines
+                self._place(
+                    f"machine {number} ({node['NodeManagerHostname']})",
+                    make,
+                    num_cpus=int(node["Resources"]["CPU"]),
+                )
+                for number, node in enumerate(machines)
             ]
         if not self.places:
             raise UserError("the Ray cluster offers neither a CPU nor a GPU")

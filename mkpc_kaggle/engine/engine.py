@@ -188,7 +188,8 @@ class Engine:
                 self._start(place, now)
             elif place.is_idle and (job := self.plan.next(now, place.name, cautious=place.losses > 0)):
                 pairs = tuple(self.pairs[index] for index in job.indices)
-                job = replace(job, pairs=pairs, known=tuple(map(self._results, job.indices)))
+                known = tuple(() if job.is_trial else self._results(index) for index in job.indices)
+                job = replace(job, pairs=pairs, known=known)
                 place.submit(job, job.seconds, job.time_limit, now)
 
     def _start(self, place: Place, now: float) -> None:
