@@ -19,7 +19,6 @@ from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 
 from mkpc_kaggle.engine.process import worker_environment
-
 from mkpc_kaggle.geometry.coordinates import Size
 
 CONTEXT = multiprocessing.get_context("spawn")
