@@ -177,6 +177,8 @@ class Plan:
 
         ``cautious``: the place has just lost a worker, and tries one pair and one unit.
         """
+        if cautious and (trial := self._trial(now)) is not None:
+            return trial
         while now < self.stop and (chunk := self._pop(place, now, cautious=cautious)) is not None:
             units = self._units(chunk, now)
             todo = [index for index in chunk.indices if self.can_gain(index, units)]
@@ -375,6 +377,8 @@ class Plan:
         that pair.
         """
         self._queue.under_way.difference_update(job.indices)
+        if job.is_trial:
+            return []
         chunk = Chunk(job.phase, job.indices, job.units, (place,))
         if len(job.indices) > 1:
             half = len(job.indices) // 2
