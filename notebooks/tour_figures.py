@@ -27,6 +27,7 @@ from mkpc_kaggle.reporting.figures.style import (
     sample,
     short,
 )
+from mkpc_kaggle.scene.reconstruction import Reconstruction
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -101,8 +102,7 @@ def _size_bars(axes: "Axes", clusters: Clusters, config: MkpcConfig) -> None:
         shares = [f"\n{size / sizes[0]:.3f}" if len(sizes) <= 10 else "" for size in sizes]
         labels = [f"{size}{share}" for size, share in zip(sizes[part], shares[part], strict=True)]
         axes.bar_label(bars, labels, padding=3, fontsize=9, bbox=_PAPER)
-    if config.ratio is Ratio.LARGEST:
-        axes.axhline(config.share * sizes[0], color="black", linewidth=1.2, linestyle="--")
+    axes.axhline(config.share * sizes[0], color="black", linewidth=1.2, linestyle="--")
     axes.set(yscale="log", ylim=(1, 8 * sizes[0]), xticks=ranks)
 
 
