@@ -47,7 +47,7 @@ def main() -> None:
     records = [UnitRecord(unit.name, 1, arguments.matches, 100, 0.1, 0.1, "") for unit in units]
     with tempfile.TemporaryDirectory() as directory:
         journal = Journal(Path(directory), {"benchmark": 1})
-        started, saving = time.perf_counter(), 0.0
+        started = time.perf_counter()
         for first, last in ((0, 1), (1, len(units))):
             for start in range(0, arguments.pairs, JOB_PAIRS):
                 outcomes = [
