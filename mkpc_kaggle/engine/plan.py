@@ -100,11 +100,17 @@ class ChunkQueue:
         return None
 
     def _pop_retry(self, place: str, alone: bool, cautious: bool) -> Chunk | None:
-        for chunk in reversed(self._retries) if cautious else self._retries:
-            if self.under_way.isdisjoint(chunk.indices) and (alone or place not in chunk.lost_at):
-                self._retries.remove(chunk)
-                return chunk
-        return None
+        """Not before what waits of the same pairs: the order of their units decides their regions and F."""
+        ready, earlier = [], set(self.under_way)
+        for chunk in self._retries:
+            if earlier.isdisjoint(chunk.indices) and (alone or place not in chunk.lost_at):
+                ready.append(chunk)
+            earlier.update(chunk.indices)
+        if not ready:
+            return None
+        chunk = ready[-1 if cautious else 0]
+        self._retries.remove(chunk)
+        return chunk
 
     def is_busy(self, index: int) -> bool:
         """Whether a job is under way on a pair, or has to be tried again."""
