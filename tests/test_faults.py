@@ -1,4 +1,4 @@
-"""Faults in real runs, on real images: a lost worker, image, disk, terminal or parent costs its part alone."""
+"""Faults injected into real runs: a worker, an image, a disk, a terminal or a parent that is lost."""
 
 import os
 import pty

@@ -91,11 +91,11 @@ class ChunkQueue:
 
         ``cautious``: one that was not lost, if there is one.
         """
-        again = [
-            chunk
-            for chunk in self.again
-            if self.under_way.isdisjoint(chunk.indices) and (alone or place not in chunk.lost_at)
-        ]
+        again, earlier = [], set(self.under_way)
+        for chunk in self.again:  # not before what waits of the same pairs: the order of units decides regions
+            if earlier.isdisjoint(chunk.indices) and (alone or place not in chunk.lost_at):
+                again.append(chunk)
+            earlier.update(chunk.indices)
         fresh = [chunk for chunk in islice(self.fresh, 1) if not any(map(self.is_busy, chunk.indices))]
         turns = [*fresh, *reversed(again)] if cautious else [*again, *fresh]
         if not turns:
