@@ -92,9 +92,7 @@ def main() -> None:
     )
     print(f"units {spent.units:.1f} s, clusters {spent.clusters:.2f} s, waiting for images {spent.images:.2f} s")
     print(f"engine: {spent.engine:.2f} s, {100 * spent.engine / spent.units:.2f} % of the units' time")
-    print(
-        f"estimates: {spent.estimates:.1f} s; in sequence all would have taken {spent.overlap:.1f} s longer"
-    )
+    print(f"estimates: {spent.estimates:.1f} s; in sequence all would have taken {spent.overlap:.1f} s longer")
 
 
 if __name__ == "__main__":

@@ -1,12 +1,11 @@
 """F by MAGSAC, under a prior on focal lengths, and from the cameras of the batch, on the same matches.
 
-python -m benchmarks.estimation --train-dir DIR --matches DIR --ways sift light xfeat+sift
-    [--scenes NAME ...] [--shares 1 0.3 0.12] [--seeds 1] [--estimates NAME ...] [--every N]
+python -m benchmarks.estimation --train-dir DIR --matches DIR [--recipes classical light] [--scenes NAME ...]
+    [--shares 1 0.3 0.12] [--seeds 1] [--estimates NAME ...]
 
-MATCHES is what `benchmarks.ways` wrote; A+B are the matches of both. Pairs without a file there are left out. For
-each way and share of a scene's pairs, drawn by seed, a row for each estimate: mAA by scene and in the mean, its
-gain over the first estimate with the 95 % interval of resampled pairs, and seconds of this process, a pair or a
-batch.
+MATCHES is what `benchmarks.saved_matches` wrote; pairs without a file are left out. For each recipe and share
+of a scene's pairs, drawn by seed, a row for each estimate: mAA by scene and in the mean, its gain over the first
+estimate with the 95 % interval of resampled pairs, and seconds of this process, a pair or a batch.
 """
 
 import argparse
@@ -43,12 +42,11 @@ def with_prior(found: SavedMatches) -> Estimate:
 
 
 PAIR_ESTIMATES: dict[str, Callable[[SavedMatches], Estimate]] = {
-    "MAGSAC, 8 orders": lambda found: estimate(found.matches, RobustConfig(permutations=8)),
+    "MAGSAC, 8 permutations": lambda found: estimate(found.matches, RobustConfig(permutations=8)),
     "MAGSAC": lambda found: estimate(found.matches, MAGSAC),
     "prior": with_prior,
 }
-SCENE = "scene"
-"""The F of the batch's cameras, or that of the prior where the pair keeps its own."""
+SCENE = "scene"  # the F of the batch's cameras, or that of the prior where the pair keeps its own
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,15 +66,6 @@ class Score:
 
     accuracies: tuple[float, ...]
     seconds: float
-
-
-def read(folder: Path, ways: Sequence[str], true: TruePair) -> SavedMatches | None:
-    """The matches of all these ways together; ``None`` if a file is not there."""
-    files = [saved_matches.file_of(folder / way, true) for way in ways]
-    if not all(file.exists() for file in files):
-        return None
-    found = [saved_matches.read(file) for file in files]
-    return SavedMatches(tuple(result for one in found for result in one.results), found[0].sizes)
 
 
 def accuracy(F: Matrix3 | None, true: TruePair, scene: TrainScene) -> float:
@@ -123,7 +112,7 @@ def drawn(pairs: Sequence[Estimated], share: float, seed: int) -> list[Estimated
     return [pairs[place] for place in places]
 
 
-def scores(pairs: Sequence[Estimated], scene: TrainScene, names: Sequence[str]) -> dict[str, Score]:
+def score_all(pairs: Sequence[Estimated], scene: TrainScene, names: Sequence[str]) -> dict[str, Score]:
     """By estimate."""
     return {
         name: by_scene(pairs, scene)
@@ -136,7 +125,10 @@ def scores(pairs: Sequence[Estimated], scene: TrainScene, names: Sequence[str]) 
 def table(title: str, done: Mapping[str, Sequence[Mapping[str, Score]]], names: Sequence[str]) -> list[str]:
     """Markdown; ``done``: by scene, for each seed the scores by estimate, whose pairs count together."""
     joined = {
-        name: {scene: [value for one in seeds for value in one[name].accuracies] for scene, seeds in done.items()}
+        name: {
+            scene: [value for scores in seeds for value in scores[name].accuracies]
+            for scene, seeds in done.items()
+        }
         for name in names
     }
     counts = [f"{scene} ({len(values)})" for scene, values in joined[names[0]].items()]
@@ -145,9 +137,9 @@ def table(title: str, done: Mapping[str, Sequence[Mapping[str, Score]]], names: 
     for name in names:
         means = [mean(values) for values in joined[name].values()]
         cells = " | ".join(f"{value:.3f}" for value in (*means, mean(means)))
-        spent = [one[name] for seeds in done.values() for one in seeds]
-        runs = len(spent) if name == SCENE else sum(len(one.accuracies) for one in spent)
-        seconds = sum(one.seconds for one in spent) / runs
+        spent = [scores[name] for seeds in done.values() for scores in seeds]
+        runs = len(spent) if name == SCENE else sum(len(score.accuracies) for score in spent)
+        seconds = sum(score.seconds for score in spent) / runs
         gain = str(paired_difference(list(zip(joined[names[0]].values(), joined[name].values(), strict=True))))
         lines.append(f"| {name} | {cells} | {'' if name == names[0] else gain} | {seconds:.2f} |")
         if name != names[0]:
@@ -160,33 +152,29 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--train-dir", type=Path, required=True)
     parser.add_argument("--matches", type=Path, required=True)
-    parser.add_argument("--ways", nargs="+", required=True)
+    parser.add_argument("--recipes", nargs="+", default=["classical"])
     parser.add_argument("--scenes", nargs="*", default=())
     parser.add_argument("--shares", nargs="+", type=float, default=[1.0])
     parser.add_argument("--seeds", type=int, default=1, help="samples of each share below 1")
-    parser.add_argument("--every", type=int, default=1, help="of a scene's pairs; default: all of them")
     names = [*PAIR_ESTIMATES, SCENE]
     parser.add_argument("--estimates", nargs="+", choices=names, default=names)
     arguments = parser.parse_args()
-    for way in arguments.ways:
+    for recipe in arguments.recipes:
         done: dict[float, dict[str, list[dict[str, Score]]]] = defaultdict(lambda: defaultdict(list))
         wanted = [name for name in PAIR_ESTIMATES if name in arguments.estimates or name == "prior"]
         for scene in read_train_side(arguments.train_dir, scenes=arguments.scenes):
             pairs = [
-                estimated(true, found, scene, wanted)
-                for true in tqdm(scene.pairs[:: arguments.every], desc=f"{way}, {scene.name}", smoothing=0.05)
-                if (found := read(arguments.matches, way.split("+"), true)) is not None
+                estimated(true, saved_matches.read(file), scene, wanted)
+                for true in tqdm(scene.pairs, desc=f"{recipe}, {scene.name}", smoothing=0.05)
+                if (file := saved_matches.file_of(arguments.matches / recipe, true)).exists()
             ]
             for share in arguments.shares:
                 for seed in range(arguments.seeds if share < 1 else 1):
                     if chosen := drawn(pairs, share, seed):
-                        done[share][scene.name].append(scores(chosen, scene, arguments.estimates))
+                        done[share][scene.name].append(score_all(chosen, scene, arguments.estimates))
         for share, by_name in done.items():
-            print(
-                "\n".join(table(f"{way}, {share:.0%} of the pairs", by_name, arguments.estimates)),
-                "\n",
-                flush=True,
-            )
+            lines = table(f"{recipe}, {share:.0%} of the pairs", by_name, arguments.estimates)
+            print("\n".join(lines), "\n", flush=True)
 
 
 if __name__ == "__main__":

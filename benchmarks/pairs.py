@@ -1,157 +1,194 @@
 """Seconds that each matcher takes for a pair of new images: the column of the README's table.
 
-python -m benchmarks.pairs [--rounds 3] [--only loftr,roma]
+python -m benchmarks.pairs [--rounds 3] [--only loftr,roma] [--precision bfloat16]
 
-Both images are encoded and matched, one matcher after the other in each round; medians. Weights are the tests'
-stand-ins, or random ones, and keypoints as many as the options allow. Views are as large as in the recipes.
+Both images are encoded and matched, a matcher after the other in each round; medians. kornia's LoFTR and ALIKED
+are measured beside them. The memory is the largest of a process that does nothing else, Python and PyTorch
+included. Weights are stand-ins, or random ones, and keypoints as many as the options allow. Views are as
+large as in the recipes. To have what a worker has, run it with ``THP_MEM_ALLOC_ENABLE=1``.
 """
 
 import argparse
+import re
 import statistics
+import subprocess
+import sys
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import cv2
+import numpy as np
 import torch
-from kornia.feature import DISK, XFeat
+from kornia.feature import ALIKED, LoFTR
+from numpy.typing import NDArray
+from sklearn.datasets import load_sample_images
+from torch import nn
 from tqdm import tqdm
 
-from benchmarks.matchers import Run, loma, photographs, roma_network, seconds_of
 from mkpc_kaggle.geometry.coordinates import Box, Size, View
-from mkpc_kaggle.matchers import (
-    aliked_lightglue,
-    aspanformer,
-    disk_lightglue,
-    loftr,
-    quadtree,
-    xfeat_lighterglue,
-)
-from mkpc_kaggle.matchers.aliked import AlikedEncoder, AlikedMatcher, AlikedOptions
-from mkpc_kaggle.matchers.contract import Colour, Matcher, MatcherSpec, Picture, Placement, Precision
-from mkpc_kaggle.matchers.dkm import DkmMatcher, DkmOptions
-from mkpc_kaggle.matchers.lightglue import Encoder, LightGlueMatcher, LightGlueOptions, light_glue
-from mkpc_kaggle.matchers.networks.aliked import Aliked
-from mkpc_kaggle.matchers.networks.aspanformer import AspanFormer
-from mkpc_kaggle.matchers.networks.dkm import DKM
+from mkpc_kaggle.matchers.contract import Colour, Matcher, Picture, Placement, Precision
+from mkpc_kaggle.matchers.loma import LomaAdapter, LomaOptions
 from mkpc_kaggle.matchers.networks.loftr import Loftr
-from mkpc_kaggle.matchers.networks.loma import Variant
+from mkpc_kaggle.matchers.networks.loma import Loma, Variant
 from mkpc_kaggle.matchers.networks.placement import placed
-from mkpc_kaggle.matchers.networks.quadtree import Quadtree
-from mkpc_kaggle.matchers.networks.superglue import SuperGlue, SuperGlueConfig
-from mkpc_kaggle.matchers.networks.superpoint import SuperPoint, SuperPointConfig
+from mkpc_kaggle.matchers.networks.roma import RoMa
 from mkpc_kaggle.matchers.roma import RomaMatcher, RomaOptions
-from mkpc_kaggle.matchers.semi_dense import SemiDenseMatcher
 from mkpc_kaggle.matchers.sift import SiftMatcher, SiftOptions
-from mkpc_kaggle.matchers.superglue import SuperGlueMatcher
-from mkpc_kaggle.matchers.xfeat_lighterglue import XFeatEncoder
+from mkpc_kaggle.matchers.sparse import image_batch
+from tests.support import light_matchers
+from tests.support.light_matchers import MATCHERS
 from tests.support.standin import filled
 
-CPU = Placement()
 KEYPOINTS = 2048
+Run = Callable[[], int]  # does the work once; the number of matches or keypoints that it found
 
 
 @dataclass(frozen=True)
 class Case:
     """A matcher on views (width, height)."""
 
-    make: Callable[[], Matcher[Any]]
+    make: Callable[[Placement], Matcher[Any]]
     size: Size
 
 
-def semi_dense(spec: MatcherSpec, network: Any) -> SemiDenseMatcher:
-    return SemiDenseMatcher(placed(filled(network, spec.name), CPU), spec, "cpu")
+def random_network(make: Callable[[], nn.Module], placement: Placement) -> Any:
+    """With weights that keep activations of order 1: stand-ins of such large networks take minutes."""
+    with torch.device("meta"):
+        network = make()
+    network.to_empty(device="cpu")
+    generator = torch.Generator().manual_seed(0)
+    for name, tensor in network.state_dict().items():
+        if tensor.ndim > 1:
+            tensor.normal_(std=tensor[0].numel() ** -0.5, generator=generator)
+        else:
+            tensor.fill_(1 if name.endswith(("weight", "running_var", "gamma")) else 0)
+    return placed(network, placement)
 
 
-def aliked_encoder() -> AlikedEncoder:
-    return AlikedEncoder(placed(filled(Aliked(max_keypoints=KEYPOINTS), "aliked"), CPU), "cpu")
+def loma(variant: Variant, placement: Placement) -> LomaAdapter:
+    network = random_network(partial(Loma, variant), placement)
+    return LomaAdapter(network, LomaOptions(variant, max_keypoints=KEYPOINTS), placement.device)
 
 
-def xfeat_encoder() -> XFeatEncoder:
-    network = XFeat(top_k=KEYPOINTS, detection_threshold=0.0)
-    network.net = filled(network.net, "xfeat")
-    return XFeatEncoder(network, KEYPOINTS, CPU)
+def roma(placement: Placement) -> RomaMatcher:
+    return RomaMatcher(random_network(RoMa, placement), RomaOptions(), placement.device)
 
 
-def with_lightglue(spec: MatcherSpec, encoder: Encoder, layers: int, **shape: int) -> LightGlueMatcher:
-    options = LightGlueOptions(KEYPOINTS)
-    glue = filled(light_glue(layers, options.threshold, **shape), "lightglue")
-    return LightGlueMatcher(spec, encoder, glue, options, CPU)
-
-
-def superglue() -> SuperGlueMatcher:
-    superpoint = filled(SuperPoint(SuperPointConfig(max_keypoints=KEYPOINTS)).eval(), "superpoint")
-    return SuperGlueMatcher(
-        placed(superpoint, CPU), placed(filled(SuperGlue(SuperGlueConfig(20)), "superglue"), CPU), "cpu"
-    )
-
-
-def dkm() -> DkmMatcher:
-    return DkmMatcher(placed(filled(DKM(), "dkm"), CPU), DkmOptions(), "cpu")
+def with_lightglue(name: str, layers: int) -> Callable[[Placement], Matcher[Any]]:
+    make = getattr(light_matchers, f"{name}_matcher")
+    return partial(make, keypoints=KEYPOINTS, layers=layers, threshold=0.1)
 
 
 SPARSE, SEMI_DENSE = Size(1024, 768), Size(840, 630)
 CASES = {
-    "sift": Case(lambda: SiftMatcher(SiftOptions(), "cpu"), Size(1280, 960)),
-    "xfeat_lighterglue": Case(
-        lambda: with_lightglue(xfeat_lighterglue.SPEC, xfeat_encoder(), 6, **xfeat_lighterglue.SHAPE), SPARSE
-    ),
-    "aliked": Case(lambda: AlikedMatcher(aliked_encoder(), AlikedOptions()), SPARSE),
-    "aliked_lightglue": Case(
-        lambda: with_lightglue(aliked_lightglue.SPEC, aliked_encoder(), 9, input_dim=128), SPARSE
-    ),
-    "disk_lightglue": Case(
-        lambda: with_lightglue(
-            disk_lightglue.SPEC,
-            disk_lightglue.DiskEncoder(filled(DISK(), "disk"), KEYPOINTS, CPU),
-            9,
-            input_dim=128,
-        ),
-        SPARSE,
-    ),
-    "superglue": Case(superglue, SPARSE),
-    "loma, b128": Case(lambda: loma(Variant.B128, KEYPOINTS, Precision.FLOAT32), SPARSE),
-    "loma, b": Case(lambda: loma(Variant.B, KEYPOINTS, Precision.FLOAT32), SPARSE),
-    "loftr": Case(lambda: semi_dense(loftr.SPEC, Loftr()), SEMI_DENSE),
-    "quadtree": Case(lambda: semi_dense(quadtree.SPEC, Quadtree()), SEMI_DENSE),
-    "aspanformer": Case(lambda: semi_dense(aspanformer.SPEC, AspanFormer()), SEMI_DENSE),
-    "dkm": Case(dkm, Size(720, 540)),
-    "roma": Case(lambda: RomaMatcher(roma_network(Precision.FLOAT32), RomaOptions(), "cpu"), Size(864, 864)),
+    "sift": Case(lambda placement: SiftMatcher(SiftOptions(), "cpu"), Size(1280, 960)),
+    "xfeat_lighterglue": Case(with_lightglue("xfeat_lighterglue", 6), SPARSE),
+    "aliked": Case(partial(light_matchers.aliked_matcher, keypoints=KEYPOINTS), SPARSE),
+    "aliked_lightglue": Case(with_lightglue("aliked_lightglue", 9), SPARSE),
+    "disk_lightglue": Case(with_lightglue("disk_lightglue", 9), SPARSE),
+    "superglue": Case(partial(light_matchers.superglue_matcher, keypoints=KEYPOINTS), SPARSE),
+    "loma, b128": Case(partial(loma, Variant.B128), SPARSE),
+    "loma, b": Case(partial(loma, Variant.B), SPARSE),
+    **{name: Case(MATCHERS[name], SEMI_DENSE) for name in ("loftr", "quadtree", "aspanformer")},
+    "dkm": Case(partial(light_matchers.dkm_matcher, matches=5000), Size(720, 540)),
+    "roma": Case(roma, Size(864, 864)),
 }
 
 
-def prepared(case: Case) -> Run:
-    matcher = case.make()
-    view = View.fit(Box.whole(case.size), long_side=max(case.size), multiple=matcher.spec.multiple)
-    pictures = []
-    for pixels in photographs(case.size):
-        gray = matcher.spec.colour is Colour.GRAY
-        shown = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY) if gray else pixels
-        pictures.append(Picture(view.render(shown), view))
+def photographs(size: Size) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """Two views (H, W, 3) RGB, the second 16 pixels further right and 8 further down."""
+    resized = cv2.resize(load_sample_images().images[0], size, interpolation=cv2.INTER_AREA)
+    return resized, np.roll(resized, (8, 16), axis=(0, 1))
+
+
+def pictures_of(size: Size, colour: Colour, multiple: int) -> list[Picture]:
+    view = View.fit(Box.whole(size), long_side=max(size), multiple=multiple)
+    gray = colour is Colour.GRAY
+    shown = [cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY) if gray else pixels for pixels in photographs(size)]
+    return [Picture(view.render(pixels), view) for pixels in shown]
+
+
+def prepared(case: Case, placement: Placement) -> Run:
+    matcher = case.make(placement)
+    pictures = pictures_of(case.size, matcher.spec.colour, matcher.spec.multiple)
     return lambda: len(
         matcher.match(*([encoded] for picture in pictures for encoded in matcher.encode([picture])))[0]
     )
+
+
+def kornias_loftr(placement: Placement) -> Run:
+    """Always in float32, with the weights of ours."""
+    network = LoFTR(pretrained=None).eval()
+    network.load_state_dict({**network.state_dict(), **filled(Loftr(), "loftr").state_dict()})
+    image0, image1 = (image_batch([each], "cpu") for each in pictures_of(SEMI_DENSE, Colour.GRAY, 8))
+    return lambda: len(network({"image0": image0, "image1": image1})["keypoints0"])
+
+
+def kornias_aliked(placement: Placement) -> Run:
+    """Always in float32; the keypoints of both images."""
+    network = filled(ALIKED("aliked-n16", max_num_keypoints=KEYPOINTS, detection_threshold=0.0).eval(), "aliked")
+    images = [image_batch([each], "cpu") for each in pictures_of(SPARSE, Colour.RGB, 32)]
+    return lambda: sum(int(network(image)[0].n) for image in images)
+
+
+RUNS: dict[str, Callable[[Placement], Run]] = {name: partial(prepared, case) for name, case in CASES.items()}
+RUNS |= {"kornia's loftr": kornias_loftr, "kornia's aliked, keypoints": kornias_aliked}
+SIZES = {name: case.size for name, case in CASES.items()}
+SIZES |= {"kornia's loftr": SEMI_DENSE, "kornia's aliked, keypoints": SPARSE}
+
+
+def seconds_of(run: Run) -> float:
+    start = time.perf_counter()
+    run()
+    return time.perf_counter() - start
+
+
+def high_water() -> int:
+    """The most kilobytes that this process has held; what ``getrusage`` gives may be its parent's."""
+    kilobytes = re.search(r"VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text())
+    assert kilobytes is not None
+    return int(kilobytes[1])
+
+
+def peak_memory(name: str, precision: str) -> float:
+    """GB of a process of its own."""
+    arguments = [sys.executable, "-m", "benchmarks.pairs", "--memory-of", name, "--precision", precision]
+    return int(subprocess.run(arguments, check=True, capture_output=True, text=True).stdout) * 1024 / 1e9
 
 
 @torch.inference_mode()
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--precision", choices=list(Precision), default=Precision.FLOAT32)
     parser.add_argument(
-        "--only", default=",".join(CASES), metavar="NAMES", help="matchers, by parts of their names"
+        "--only", default=",".join(RUNS), metavar="NAMES", help="matchers, by parts of their names"
     )
+    parser.add_argument("--memory-of", metavar="NAME", help="run this matcher once and print the process's peak")
     arguments = parser.parse_args()
+    placement = Placement(precision=Precision(arguments.precision))
+    if arguments.memory_of:
+        RUNS[arguments.memory_of](placement)()
+        print(high_water())
+        return
     wanted = arguments.only.split(",")
-    runs = {name: prepared(case) for name, case in CASES.items() if any(part in name for part in wanted)}
+    runs = {name: make(placement) for name, make in RUNS.items() if any(part in name for part in wanted)}
     found = {name: run() for name, run in tqdm(runs.items(), desc="warming up")}
     times: dict[str, list[float]] = {name: [] for name in runs}
     for _ in tqdm(range(arguments.rounds), desc="rounds"):
         for name, run in runs.items():
             times[name].append(seconds_of(run))
-    print(f"{torch.get_num_threads()} threads\n\n| matcher | view | matches | seconds a pair |\n|---|---|---|---|")
+    print(f"{torch.get_num_threads()} threads, {placement.precision}\n")
+    print("| matcher | view | matches | seconds a pair | memory |\n|---|---|---|---|---|")
     for name, seconds in times.items():
-        width, height = CASES[name].size
-        print(f"| {name} | {width} x {height} | {found[name]} | {statistics.median(seconds):.2f} |")
+        width, height = SIZES[name]
+        memory = peak_memory(name, arguments.precision)
+        row = f"{name} | {width} x {height} | {found[name]} | {statistics.median(seconds):.2f} | {memory:.2f} GB"
+        print(f"| {row} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -1,67 +1,89 @@
-"""Time, memory and accuracy of a batch's reconstruction, from matches of known cameras with noise and wrong ones.
+"""Cost and accuracy of a batch's reconstruction, from matches of known cameras with noise and wrong ones.
 
-python -m benchmarks.scenes [26:304 50:700 100:2000] [--mapper global] [--threads 1] [--points 2500]
+python -m benchmarks.scenes [26:304 100:2000] [--world front|street] [--threads 1]
 
-Each size is images:pairs, and runs in a process of its own, as in the engine. `median px` is the median over pairs
-of the distance of true correspondences from the F that the pair got.
+Each size is images:pairs, and runs in a process of its own, as in the engine. The front is seen by all images;
+along the street each image sees what is near. `verify` and `map` are CPU seconds; the errors are medians over
+pairs, in degrees, of the relative rotation and of the direction of translation.
 """
 
 import argparse
 import resource
 import time
+from collections import Counter
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
+from typing import Any
 
 import numpy as np
 
-from benchmarks.synthetic_scene import SyntheticScene, synthetic_scene
-from mkpc_kaggle.scene.config import Mapper, SceneConfig
+from benchmarks.synthetic_scene import SyntheticScene, registered_images, street, synthetic_scene
+from mkpc_kaggle.geometry.cameras import relative_pose
+from mkpc_kaggle.scene import colmap
+from mkpc_kaggle.scene.config import SceneConfig
 from mkpc_kaggle.scene.reconstruct import Solution, reconstruct_batch
 
 
-def row(size: str, points: int, outliers: float, config: SceneConfig) -> str:
+def row(size: str, world: str, config: SceneConfig) -> str:
     images, pairs = map(int, size.split(":"))
-    scene = synthetic_scene(images, pairs, points=points, outliers=outliers)
-    begin, used = time.perf_counter(), time.process_time()
+    scene = street(images, pairs) if world == "street" else synthetic_scene(images, pairs, points=2500)
+    seconds: Counter[str] = Counter()
+    for name in ("verify", "run_mapper"):
+        setattr(colmap, name, timed(getattr(colmap, name), name, seconds))
+    begin = time.process_time()
     solution = reconstruct_batch(scene.pairs, config)
-    wall, used = time.perf_counter() - begin, time.process_time() - used
+    used = time.process_time() - begin
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     matches = np.mean([len(pair.matches) for pair in scene.pairs])
-    placed = sum(found.registered for found in solution.reconstructions)
-    distances = distances_of(solution, scene)
-    median = f"{np.median(distances):.2f}" if distances else "-"
+    registered = sum(found.registered for found in solution.reconstructions)
+    angles = errors(solution, scene)
+    rotation, direction = np.median(angles, axis=0) if len(angles) else (np.nan, np.nan)
     return (
-        f"{images:7}{len(scene.pairs):7}{matches:9.0f}{wall:9.1f}{used:9.1f}{memory:9.0f}{placed:9}"
-        f"{len(distances) / len(scene.pairs):8.2f}{median:>11}"
+        f"{images:7}{len(scene.pairs):7}{matches:9.0f}{seconds['verify']:9.1f}{seconds['run_mapper']:9.1f}{used:9.1f}"
+        f"{memory:9.0f}{registered:9}{rotation:10.3f}{direction:11.3f}"
     )
 
 
-def distances_of(solution: Solution, scene: SyntheticScene) -> list[float]:
-    answers = zip(solution.choices, scene.pairs, strict=True)
-    return [scene.median_distance(choice.F, pair) for choice, pair in answers if choice.F is not None]
+def timed(function: Callable[..., Any], name: str, seconds: Counter[str]) -> Callable[..., Any]:
+    """The function, with its CPU seconds added up under its name."""
+
+    def call(*arguments: Any) -> Any:
+        begin = time.process_time()
+        try:
+            return function(*arguments)
+        finally:
+            seconds[name] += time.process_time() - begin
+
+    return call
+
+
+def errors(solution: Solution, scene: SyntheticScene) -> list[tuple[float, float]]:
+    """Of each pair that has its F from cameras: of its relative rotation and of its direction, in degrees."""
+    angles = []
+    registered = registered_images(solution)
+    for pair, choice in zip(scene.pairs, solution.choices, strict=True):
+        if choice.from_scene:
+            R, t = relative_pose(registered[pair.image0.digest].camera, registered[pair.image1.digest].camera)
+            true_R, true_t = relative_pose(*scene.true_cameras(pair))
+            cosines = (np.trace(R @ true_R.T) - 1) / 2, t @ true_t / np.linalg.norm(t) / np.linalg.norm(true_t)
+            rotation, direction = np.degrees(np.arccos(np.clip(cosines, -1, 1)))
+            angles.append((float(rotation), float(direction)))
+    return angles
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("sizes", nargs="*", default=["10:45", "26:304", "50:700", "100:2000"])
-    parser.add_argument("--mapper", type=Mapper, choices=list(Mapper), default=SceneConfig().mapper)
+    parser.add_argument("sizes", nargs="*", default=["26:304", "100:800"])
+    parser.add_argument("--world", choices=["front", "street"], default="street")
     parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--outliers", type=float, default=0.2)
-    parser.add_argument(
-        "--points",
-        type=int,
-        default=2500,
-        help="of the front; by default an image has as many as RootSIFT matches",
-    )
     arguments = parser.parse_args()
-    config = SceneConfig(mapper=arguments.mapper, threads=arguments.threads)
-    heads = ("wall s", "cpu s", "MB", "placed", "F from")
-    print(
-        f"{'images':>7}{'pairs':>7}{'matches':>9}" + "".join(f"{h:>9}" for h in heads[:4]) + "  scenes  median px"
-    )
+    config = SceneConfig(threads=arguments.threads)
+    heads = ("matches", "verify", "map", "all s", "MB", "placed")
+    print(f"{'images':>7}{'pairs':>7}" + "".join(f"{head:>9}" for head in heads) + "  rotation  direction")
     for size in arguments.sizes:
         with ProcessPoolExecutor(1, get_context("spawn")) as pool:
-            print(pool.submit(row, size, arguments.points, arguments.outliers, config).result(), flush=True)
+            print(pool.submit(row, size, arguments.world, config).result(), flush=True)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
-"""A batch from known cameras: matches of true points with noise, and wrong ones."""
+"""Batches from known cameras: matches of true points with noise, and wrong matches."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -10,28 +10,40 @@ from mkpc_kaggle.geometry.cameras import Camera, fundamental_of_cameras
 from mkpc_kaggle.geometry.coordinates import Box, Size
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import Matrix3, sampson_distances
+from mkpc_kaggle.scene.reconstruct import Solution
+from mkpc_kaggle.scene.reconstruction import RegisteredImage
 from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair
 
 SIZE = Size(800, 600)
+# The numbers of the points that an image sees, ascending (N,), and where its detector finds them (N, 2).
+Seen = tuple[np.ndarray, np.ndarray]
+
+
+def registered_images(solution: Solution) -> dict[str, RegisteredImage]:
+    """The images that have a camera, by digest, each of the first model that has it."""
+    models = [model for found in solution.reconstructions for model in found.models]
+    return {found.image.digest: found for model in reversed(models) for found in model.images}
 
 
 @dataclass(frozen=True, eq=False)
 class SyntheticScene:
-    """A batch's images and pairs, and the true cameras by image name."""
+    """A batch's images and pairs, the true cameras by image name, and the world's points (P, 3)."""
 
     images: tuple[BatchImage, ...]
     pairs: tuple[BatchPair, ...]
     cameras: dict[str, Camera]
+    world: np.ndarray
+
+    def true_cameras(self, pair: BatchPair) -> tuple[Camera, Camera]:
+        return self.cameras[pair.image0.name], self.cameras[pair.image1.name]
 
     def true_fundamental(self, pair: BatchPair) -> Matrix3:
-        return fundamental_of_cameras(self.cameras[pair.image0.name], self.cameras[pair.image1.name])
+        return fundamental_of_cameras(*self.true_cameras(pair))
 
     def median_distance(self, F: Matrix3, pair: BatchPair) -> float:
         """How far true correspondences of a pair are from an F: the median of Sampson's distance, in pixels."""
-        rng = np.random.default_rng(0)
-        world = front(rng, 400)
-        points = [project(self.cameras[image.name], world) for image in (pair.image0, pair.image1)]
-        return float(np.median(sampson_distances(F, Matches(*points, np.ones(len(world))))))
+        points = [project(camera, self.world[:400]) for camera in self.true_cameras(pair)]
+        return float(np.median(sampson_distances(F, Matches(*points, np.ones(len(points[0]))))))
 
 
 def synthetic_scene(
@@ -56,14 +68,56 @@ def synthetic_scene(
     arc = [arc_camera(rng, number / max(images - 1, 1)) for number in range(images)]
     if focals:
         arc = [zoomed(camera, focal) for camera, focal in zip(arc, focals, strict=True)]
-    cameras = {f"{prefix}{number:04}": camera for number, camera in enumerate(arc)}
-    seen = {name: project(camera, world) + rng.normal(0, noise, (points, 2)) for name, camera in cameras.items()}
-    named = tuple(BatchImage(name, f"digest of {name}", SIZE) for name in cameras)
-    chosen = list(combinations(named, 2))
-    if pairs is not None and pairs < len(chosen):
-        chosen = [chosen[index] for index in np.sort(rng.choice(len(chosen), pairs, replace=False))]
-    made = tuple(match(rng, first, second, seen, outliers) for first, second in chosen)
-    return SyntheticScene(named, made, cameras)
+    ends = list(combinations(range(images), 2))
+    if pairs is not None and pairs < len(ends):
+        ends = [ends[index] for index in np.sort(rng.choice(len(ends), pairs, replace=False))]
+    return batch_of(rng, world, arc, ends, noise, outliers, prefix=prefix)
+
+
+def street(
+    images: int, pairs: int, *, noise: float = 0.4, outliers: float = 0.25, seed: int = 0
+) -> SyntheticScene:
+    """An image a metre along a loop of facades, each matched with its neighbours; at most 290 matches a pair."""
+    rng = np.random.default_rng(seed)
+    radius = images / (2 * np.pi)
+    angles = 2 * np.pi * np.arange(images) / images
+    count = round(2 * np.pi * (radius + 20) * 44)
+    around, height = rng.uniform(0, 2 * np.pi, count), rng.uniform(-7, 7, count)
+    bays = np.where(np.floor(around * (radius + 20) / 3) % 2 == 0, 0.0, 2.0) + rng.uniform(0, 1, count)
+    distance = radius + 20 + bays
+    world = np.column_stack([distance * np.sin(around), height, distance * np.cos(around)])
+    cameras = [
+        looking(
+            np.array([radius * np.sin(angle), rng.normal(0, 0.2), radius * np.cos(angle)]),
+            angle + rng.normal(0, np.radians(4)),
+            max(SIZE) * np.exp(rng.normal(np.log(1.1), 0.1)),
+        )
+        for angle in angles
+    ]
+    near = ((step, first) for step in range(1, images) for first in range(images))
+    ends = [tuple(sorted((first, (first + step) % images))) for step, first in near][:pairs]
+    return batch_of(rng, world, cameras, sorted(set(ends)), noise, outliers, most=290)
+
+
+def batch_of(
+    rng: np.random.Generator,
+    world: np.ndarray,
+    cameras: Sequence[Camera],
+    ends: Iterable[tuple[int, int]],
+    noise: float,
+    outliers: float,
+    *,
+    prefix: str = "",
+    most: int | None = None,
+) -> SyntheticScene:
+    """Images of these cameras, and the pairs at these places among them."""
+    images = tuple(BatchImage(f"{prefix}{n:04}", f"digest of {prefix}{n:04}", SIZE) for n in range(len(cameras)))
+    seen = [see(rng, camera, world, noise) for camera in cameras]
+    pairs = tuple(
+        BatchPair(images[first], images[second], match(rng, seen[first], seen[second], outliers, most))
+        for first, second in ends
+    )
+    return SyntheticScene(images, pairs, dict(zip((i.name for i in images), cameras, strict=True)), world)
 
 
 def front(rng: np.random.Generator, count: int) -> np.ndarray:
@@ -80,10 +134,20 @@ def arc_camera(rng: np.random.Generator, where: float) -> Camera:
     centre = np.array([distance * np.sin(angle), rng.normal(0, 0.5), 1.5 - distance * np.cos(angle)])
     target = np.array([rng.normal(0, 1), rng.normal(0, 0.5), 1.5])
     ahead = (target - centre) / np.linalg.norm(target - centre)
+    return pointed(centre, ahead, max(SIZE) * np.exp(rng.normal(np.log(1.1), 0.2)))
+
+
+def looking(centre: np.ndarray, angle: float, focal: float) -> Camera:
+    """A level camera that looks along an angle about the vertical axis."""
+    return pointed(centre, np.array([np.sin(angle), 0.0, np.cos(angle)]), focal)
+
+
+def pointed(centre: np.ndarray, ahead: np.ndarray, focal: float) -> Camera:
+    """An upright camera at ``centre`` that looks along the unit vector ``ahead``."""
     right = np.cross([0.0, 1, 0], ahead)
     right /= np.linalg.norm(right)
     R = np.stack([right, np.cross(ahead, right), ahead])
-    return zoomed(Camera(np.eye(3), R, -R @ centre), max(SIZE) * np.exp(rng.normal(np.log(1.1), 0.2)))
+    return zoomed(Camera(np.eye(3), R, -R @ centre), focal)
 
 
 def zoomed(camera: Camera, focal: float) -> Camera:
@@ -98,20 +162,21 @@ def project(camera: Camera, world: np.ndarray) -> np.ndarray:
     return np.asarray(seen[:, :2] / seen[:, 2:])
 
 
-def match(
-    rng: np.random.Generator,
-    first: BatchImage,
-    second: BatchImage,
-    seen: dict[str, np.ndarray],
-    outliers: float,
-) -> BatchPair:
+def see(rng: np.random.Generator, camera: Camera, world: np.ndarray, noise: float) -> Seen:
+    """The points within the image, less what is behind the camera."""
+    found = project(camera, world) + rng.normal(0, noise, (len(world), 2))
+    ahead = world @ camera.R[2] + camera.t[2] > 0
+    numbers = np.flatnonzero(Box.whole(SIZE).contains(found) & ahead)
+    return numbers, found[numbers]
+
+
+def match(rng: np.random.Generator, first: Seen, second: Seen, outliers: float, most: int | None) -> Matches:
     """The points that both images see, some of them lost and some mixed up."""
-    whole = Box.whole(SIZE)
-    common = np.flatnonzero(whole.contains(seen[first.name]) & whole.contains(seen[second.name]))
-    common = common[rng.random(len(common)) < 0.5]
-    points0 = seen[first.name][common] + rng.normal(0, 0.05, (len(common), 2))
-    wrong = rng.random(len(common)) < outliers
-    other = common.copy()
-    other[wrong] = rng.permutation(common[wrong])
-    points1 = seen[second.name][other] + rng.normal(0, 0.05, (len(common), 2))
-    return BatchPair(first, second, Matches(points0, points1, np.ones(len(common))))
+    common, places0, places1 = np.intersect1d(first[0], second[0], assume_unique=True, return_indices=True)
+    kept = np.flatnonzero(rng.random(len(common)) < 0.5)[:most]
+    points0 = first[1][places0[kept]] + rng.normal(0, 0.05, (len(kept), 2))
+    wrong = rng.random(len(kept)) < outliers
+    other = kept.copy()
+    other[wrong] = rng.permutation(kept[wrong])
+    points1 = second[1][places1[other]] + rng.normal(0, 0.05, (len(kept), 2))
+    return Matches(points0, points1, np.ones(len(kept)))

@@ -1,4 +1,4 @@
-"""The paper's Table 1 at equal inference count: whole images against two stages; repeated points merged or not.
+"""The paper's Table 1 at equal inference count: whole images against two stages.
 
 python -m benchmarks.table1 --train-dir DIR --weights DIR --out DIR [--pairs-per-scene 6] [--matchers sift,aliked]
 
@@ -21,7 +21,6 @@ from statistics import mean
 
 from tqdm import tqdm
 
-from benchmarks.merging import merged
 from mkpc_kaggle.data.competition import TrainScene, TruePair, read_train_side
 from mkpc_kaggle.data.images import ImageStore, Unreadable
 from mkpc_kaggle.engine.jobs import visiting_order
@@ -59,20 +58,18 @@ CONTRASTS = (("three", "one + two"), ("three", "two + one"), ("six", "three + th
 ENSEMBLE_LAYOUTS = ("three", "two + one")
 COVISIBILITIES = (0.0, 0.3, 0.6, 1.01)
 """Borders of the ranges of covisibility for which gains are printed."""
-MERGED_LAYOUTS = ("three", "two + one", "three + three")
 
 
 @dataclass(frozen=True)
 class Way:
-    """One way to match a pair: some matchers, the layout of each one's units, repeated points merged or not."""
+    """One way to match a pair: some matchers, and the layout of each matcher's units."""
 
     matchers: tuple[str, ...]
     layout: str
-    merged: bool = False
 
     @property
     def name(self) -> str:
-        return f"{' + '.join(self.matchers)}: {self.layout}{', merged' if self.merged else ''}"
+        return f"{' + '.join(self.matchers)}: {self.layout}"
 
     @property
     def units(self) -> tuple[Unit, ...]:
@@ -86,7 +83,7 @@ class Way:
 
 
 def ways_of(matchers: Sequence[str]) -> tuple[Way, ...]:
-    """Every layout of each matcher alone, some of every two and more together, and some with merging."""
+    """Every layout of each matcher alone, and some of every two and more together."""
     alone = [Way((matcher,), layout) for matcher in matchers for layout in LAYOUTS]
     together = [
         Way(some, layout)
@@ -94,8 +91,7 @@ def ways_of(matchers: Sequence[str]) -> tuple[Way, ...]:
         for some in combinations(matchers, count)
         for layout in ENSEMBLE_LAYOUTS
     ]
-    plain = [*alone, *together]
-    return (*plain, *(replace(way, merged=True) for way in plain if way.layout in MERGED_LAYOUTS))
+    return (*alone, *together)
 
 
 def union(ways: Iterable[Way]) -> Recipe:
@@ -115,7 +111,7 @@ class Found:
 
 
 def try_all(
-    ways: Sequence[Way], work: PairMatch, true: TruePair, scene: TrainScene, pipeline: Pipeline, radius: float
+    ways: Sequence[Way], work: PairMatch, true: TruePair, scene: TrainScene, pipeline: Pipeline
 ) -> dict[str, Found]:
     """Every way on one pair: units of stage 1 once, those of stage 2 once for each plain way."""
     (whole,) = pipeline.match([work], [unit for unit in pipeline.recipe.units if unit.stage == 1])
@@ -128,17 +124,14 @@ def try_all(
             done[way.units] = pipeline.match([replace(work, results=stage1)], stage2)[0]
     config = pipeline.recipe.magsac
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        conclude = partial(_conclude, true=true, scene=scene, config=config, radius=radius)
+        conclude = partial(_conclude, true=true, scene=scene, config=config)
         found = pool.map(conclude, ways, [done[way.units] for way in ways])
         return {way.name: one for way, one in zip(ways, found, strict=True)}
 
 
-def _conclude(
-    way: Way, work: PairMatch, *, true: TruePair, scene: TrainScene, config: RobustConfig, radius: float
-) -> Found:
+def _conclude(way: Way, work: PairMatch, *, true: TruePair, scene: TrainScene, config: RobustConfig) -> Found:
     start = time.thread_time()  # several work at once
-    parts = [result.matches for result in work.results]
-    matches = merged(parts, radius) if way.merged else Matches.concatenate(parts)
+    matches = Matches.concatenate(result.matches for result in work.results)
     result = estimate(matches, config)
     seconds = time.thread_time() - start + work.cluster_seconds + _seconds(work.results)
     error = error_of(result.matrix, true, scene) if result.ok else PoseError.failed()
@@ -181,9 +174,7 @@ class ResultsFile:
         self.found[pair] = dict(found)
 
 
-def run_all(
-    scenes: Sequence[TrainScene], ways: Sequence[Way], pipeline: Pipeline, results: ResultsFile, radius: float
-) -> None:
+def run_all(scenes: Sequence[TrainScene], ways: Sequence[Way], pipeline: Pipeline, results: ResultsFile) -> None:
     """Every way on every pair that is not in the file; unreadable images are failures of every way."""
     todo = [(scene, true) for scene in scenes for true in _in_order(scene) if true.pair.id not in results.found]
     images = ImageStore()
@@ -194,9 +185,7 @@ def run_all(
             if isinstance(image0, Unreadable) or isinstance(image1, Unreadable):
                 results.add(true.pair.id, {way.name: Found(PoseError.failed(), 0, 0.0) for way in ways})
                 continue
-            results.add(
-                true.pair.id, try_all(ways, PairMatch(images=(image0, image1)), true, scene, pipeline, radius)
-            )
+            results.add(true.pair.id, try_all(ways, PairMatch(images=(image0, image1)), true, scene, pipeline))
     finally:
         images.close()
 
@@ -224,8 +213,8 @@ class Tables:
     def markdown(self, ways: Sequence[Way]) -> Iterator[str]:
         counts = ", ".join(f"{name} {len(pairs)}" for name, pairs in self.scenes.items())
         yield f"Pairs: {counts}."
-        yield from ("", "### Accuracy", "", *self.accuracy([way for way in ways if not way.merged]))
-        plain = {way.name: way for way in ways if not way.merged}
+        yield from ("", "### Accuracy", "", *self.accuracy(ways))
+        plain = {way.name: way for way in ways}
         contrasts = [
             (replace(way, layout=naive), way)
             for naive, split in CONTRASTS
@@ -236,8 +225,6 @@ class Tables:
         yield from self.gains(contrasts)
         yield from ("", "### The same by covisibility, pairs of all scenes together", "")
         yield from self.gains_by_covisibility(contrasts)
-        yield from ("", "### Repeated points, merged or each counted", "")
-        yield from self.gains((replace(way, merged=False), way) for way in ways if way.merged)
 
     def accuracy(self, ways: Sequence[Way]) -> Iterator[str]:
         """A row a way: mAA by scene and their mean, AUC at 5 and 10 degrees, matches, seconds a pair."""
@@ -306,7 +293,6 @@ def main() -> None:
     parser.add_argument("--scenes", default="", help="default: all")
     parser.add_argument("--pairs-per-scene", type=int, help="evenly spread; default: all")
     parser.add_argument("--min-covisibility", type=float, default=0.1)
-    parser.add_argument("--merge-radius", type=float, default=1.0, help="pixels; default: %(default)s")
     parser.add_argument("--tables", action="store_true", help="match nothing, print what there is")
     arguments = parser.parse_args()
     scenes = read_train_side(
@@ -319,12 +305,11 @@ def main() -> None:
     assembly = assemble(union(ways), weights=arguments.weights, device=arguments.device)
     settings = {
         **assembly.fingerprint(),
-        "merge radius": arguments.merge_radius,
         "ways": [way.name for way in ways],
     }
     results = ResultsFile(arguments.out / "pairs.jsonl", settings)
     if not arguments.tables:
-        run_all(scenes, ways, assembly.pipeline(), results, arguments.merge_radius)
+        run_all(scenes, ways, assembly.pipeline(), results)
     print("\n".join(Tables.of(scenes, results).markdown(ways)))
 
 

@@ -19,6 +19,7 @@ from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 
 from mkpc_kaggle.engine.process import worker_environment
+from mkpc_kaggle.geometry.coordinates import Size
 
 CONTEXT = multiprocessing.get_context("spawn")
 
@@ -87,17 +88,24 @@ def match(threads: int, keypoints: int, connection: Connection) -> None:
     """The worker's loop: one match for each message."""
     import torch
 
-    from benchmarks.matchers import superglue
-    from mkpc_kaggle.matchers.contract import Precision
+    from mkpc_kaggle.matchers.contract import Placement
+    from mkpc_kaggle.matchers.networks.placement import placed
+    from mkpc_kaggle.matchers.networks.superglue import SuperGlue
+    from mkpc_kaggle.matchers.networks.superpoint import SuperPointKeypoints
+    from tests.support.standin import filled
 
     torch.set_num_threads(threads)
+    size = Size(640, 480)
     with torch.inference_mode():
-        run = superglue(keypoints, Precision.FLOAT32)
-        run()
+        network = placed(filled(SuperGlue(20), "superglue"), Placement())
+        descriptors = torch.nn.functional.normalize(torch.randn(keypoints, 256), dim=1)
+        points, scores = torch.rand(keypoints, 2) * torch.tensor(size), torch.rand(keypoints)
+        image = SuperPointKeypoints(points, scores, descriptors, size)
+        network(image, image)
         connection.send(None)
         while True:
             connection.recv()
-            run()
+            network(image, image)
             connection.send(None)
 
 

@@ -27,7 +27,7 @@ from mkpc_kaggle.reporting.figures.style import (
     sample,
     short,
 )
-from mkpc_kaggle.scene.model import Scene
+from mkpc_kaggle.scene.reconstruction import Reconstruction
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -102,8 +102,7 @@ def _size_bars(axes: "Axes", clusters: Clusters, config: MkpcConfig) -> None:
         shares = [f"\n{size / sizes[0]:.3f}" if len(sizes) <= 10 else "" for size in sizes]
         labels = [f"{size}{share}" for size, share in zip(sizes[part], shares[part], strict=True)]
         axes.bar_label(bars, labels, padding=3, fontsize=9, bbox=_PAPER)
-    if config.ratio is Ratio.LARGEST:
-        axes.axhline(config.share * sizes[0], color="black", linewidth=1.2, linestyle="--")
+    axes.axhline(config.share * sizes[0], color="black", linewidth=1.2, linestyle="--")
     axes.set(yscale="log", ylim=(1, 8 * sizes[0]), xticks=ranks)
 
 
@@ -197,12 +196,12 @@ def draw_epipolar(
 
 def draw_plane(images: Images, matches: Matches, homography: Estimate, threshold: float) -> "Figure":
     """Inliers of an F: those that one homography explains, too, and those that lie off its plane."""
-    figure, row = side_by_side(images)
+    figure, row = side_by_side(images, title_lines=2)
     for axes, points in zip(row, (matches.points0, matches.points1), strict=True):
         _dots(axes, points[homography.inliers], COLOURS[0])
         _crosses(axes, points[~homography.inliers], OUTLIER)
     explained = f"{homography.inlier_count} of {len(matches)} inliers of F"
-    _title(row[0], f"blue: {explained} fit one plane to {threshold:g} pixels")
+    _title(row[0], f"blue: {explained}\nfit one plane to {threshold:g} pixels")
     _title(row[1], "orange crosses: those off the plane")
     return figure
 
@@ -321,4 +320,4 @@ def _far_apart(points: Points, count: int) -> NDArray[np.intp]:
 
 def draw_scene(name: str, scenes: Sequence[Reconstruction]) -> "Figure":
     """The cameras and points of the largest model of a batch, from above and from the side."""
-    return draw_cameras(SceneRecord.of(name, scenes, 0.0, ""))
+    return draw_cameras(SceneRecord.of(name, scenes, made_from=0, seconds=0.0))

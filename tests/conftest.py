@@ -37,6 +37,16 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> DemoSet:
 
 
 @pytest.fixture
+def small_recipe(tmp_path: Path) -> Path:
+    """A quick recipe of two stages, in a file of its own."""
+    path = tmp_path / "small.toml"
+    stages = ((1, 320), (2, 400))
+    units = [f'{{ stage = {stage}, matcher = "sift", long_side = {side} }}' for stage, side in stages]
+    path.write_text(f"units = [{', '.join(units)}]\n")
+    return path
+
+
+@pytest.fixture
 def clean_environment(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.delenv("MKPC_WEIGHTS", raising=False)
     monkeypatch.chdir(tmp_path)

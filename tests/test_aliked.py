@@ -9,7 +9,7 @@ from standin import STAND_INS, scene, standin_state
 from torch.nn import functional
 
 from mkpc_kaggle.matchers.contract import Placement, Precision
-from mkpc_kaggle.matchers.networks.aliked import SHAPES, Aliked, own_name, refined_maxima, strict_maxima
+from mkpc_kaggle.matchers.networks.aliked import Aliked, own_name, refined_maxima, strict_maxima
 from mkpc_kaggle.matchers.networks.bilinear import DeformableConv2d, sampled
 from mkpc_kaggle.matchers.networks.placement import placed
 from mkpc_kaggle.weights import load_tensors
@@ -19,40 +19,39 @@ def image_of(pixels):
     return torch.from_numpy(pixels.copy()).permute(2, 0, 1)[None].float() / 255
 
 
-def both(variant, state, features=300):
+def both(state, features=300):
     """Our network as it runs, and kornia's, of which only the grid of a window is no parameter."""
-    theirs = ALIKED(f"aliked-{variant}", max_num_keypoints=features, detection_threshold=0.0).eval()
+    theirs = ALIKED("aliked-n16", max_num_keypoints=features, detection_threshold=0.0).eval()
     grid = {"dkd.hw_grid": theirs.dkd.hw_grid}
     theirs.load_state_dict(state | grid)
-    ours = Aliked(SHAPES[variant], features)
+    ours = Aliked(features)
     ours.load_state_dict({own_name(name): tensor for name, tensor in state.items()})
     return placed(ours, Placement()), theirs
 
 
-def standin(variant):
-    network = ALIKED(f"aliked-{variant}")
-    state = standin_state(network, STAND_INS["aliked"])
+def standin():
+    state = standin_state(ALIKED("aliked-n16"), STAND_INS["aliked"])
     del state["dkd.hw_grid"]
     return state
 
 
 def assert_alike(found, expected):
-    distances = torch.cdist(found.points.double(), expected.keypoints.double())
+    points, descriptors = found
+    distances = torch.cdist(points.double(), expected.keypoints.double())
     nearest = distances.argmin(dim=1)
-    assert len(found.points) == expected.n > 100
+    assert len(points) == expected.n > 100
     assert (distances.amin(dim=1) < 0.01).double().mean() > 0.99
     assert (distances.amin(dim=0) < 0.01).double().mean() > 0.99
     close = distances.amin(dim=1) < 0.01
-    cosines = (found.descriptors * expected.descriptors[nearest]).sum(dim=1)[close]
+    cosines = (descriptors * expected.descriptors[nearest]).sum(dim=1)[close]
     # A coordinate within rounding of a whole pixel may take its offsets from the next pixel.
     assert (cosines > 0.9999).double().mean() > 0.99
     assert cosines.median() > 0.999999
 
 
 @torch.inference_mode()
-@pytest.mark.parametrize("variant", SHAPES)
-def test_it_finds_what_kornias_finds(variant):
-    ours, theirs = both(variant, standin(variant))
+def test_it_finds_what_kornias_finds():
+    ours, theirs = both(standin())
     images = torch.cat([image_of(scene(96, 160, 3)), image_of(scene(96, 160, 3, "another"))])
     for found, expected in zip(ours(images), theirs(images), strict=True):
         assert_alike(found, expected)
@@ -60,9 +59,8 @@ def test_it_finds_what_kornias_finds(variant):
 
 @needs_weights
 @torch.inference_mode()
-@pytest.mark.parametrize("variant", SHAPES)
-def test_it_finds_what_kornias_finds_with_the_published_weights(variant):
-    ours, theirs = both(variant, load_tensors(WEIGHTS / f"aliked-{variant}.safetensors"), 1000)
+def test_it_finds_what_kornias_finds_with_the_published_weights():
+    ours, theirs = both(load_tensors(WEIGHTS / "aliked-n16.safetensors"), 1000)
     photograph = image_of(load_sample_image("china.jpg")[:256, :320])
     assert_alike(ours(photograph)[0], theirs(photograph)[0])
 
@@ -71,28 +69,28 @@ def test_it_finds_what_kornias_finds_with_the_published_weights(variant):
 @pytest.mark.parametrize("precision", [Precision.BFLOAT16, Precision.FLOAT16])
 def test_half_precision_moves_little(precision):
     image = image_of(scene(96, 128, 3))
-    exact, half = (
+    (points, descriptors), (half_points, half_descriptors) = (
         placed(filled_network(), Placement(precision=each))(image)[0] for each in (Precision.FLOAT32, precision)
     )
-    distances = torch.cdist(exact.points, half.points)
+    distances = torch.cdist(points, half_points)
     nearest = distances.argmin(dim=1)
     common = distances.amin(dim=1) < 0.25
     assert common.float().mean() > 0.9
-    assert (exact.descriptors * half.descriptors[nearest]).sum(dim=1)[common].median() > 0.999
-    assert half.points.dtype == half.descriptors.dtype == torch.float32
-    assert not torch.equal(exact.descriptors, half.descriptors)
+    assert (descriptors * half_descriptors[nearest]).sum(dim=1)[common].median() > 0.999
+    assert half_points.dtype == half_descriptors.dtype == torch.float32
+    assert not torch.equal(descriptors, half_descriptors)
 
 
 def filled_network():
     network = Aliked(max_keypoints=200)
-    network.load_state_dict({own_name(name): tensor for name, tensor in standin("n16").items()})
+    network.load_state_dict({own_name(name): tensor for name, tensor in standin().items()})
     return network
 
 
 @torch.inference_mode()
 def test_a_flat_picture_has_no_keypoints():
     found = placed(filled_network(), Placement())(torch.zeros(2, 3, 32, 64))
-    assert all(each.descriptors.shape == (len(each.points), 128) for each in found)
+    assert all(descriptors.shape == (len(points), 128) for points, descriptors in found)
     assert strict_maxima(torch.full((8, 9), 0.5), 10).tolist() == []
 
 

@@ -11,11 +11,10 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Size
-from mkpc_kaggle.geometry.focal_prior import FREE_COST, FocalConfig, FocalPrior, estimate_with_prior
+from mkpc_kaggle.geometry.focal_prior import FocalConfig, FocalPrior, estimate_with_prior
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.metrics import pose_error
 from mkpc_kaggle.geometry.robust import ModelKind, RobustConfig, estimate, sampson_distances
-from mkpc_kaggle.geometry.two_view import robust_cost
 
 SIZE = Size(1024, 768)
 CENTRE = np.array([511.5, 383.5])
@@ -38,8 +37,8 @@ def seen(cameras, n=200, noise=0.0, outliers=0, seed=0, depth=(4, 9)):
     rng = np.random.default_rng(seed)
     X = rng.uniform((-1.5, -1.2, depth[0]), (1.5, 1.2, depth[1]), (n, 3))
     points = []
-    for one in cameras:
-        x = (X @ one.R.T + one.t) @ one.K.T
+    for view in cameras:
+        x = (X @ view.R.T + view.t) @ view.K.T
         points.append(x[:, :2] / x[:, 2:] + rng.normal(scale=noise, size=(n, 2)))
     wild = [rng.uniform(0, SIZE, (outliers, 2)) for _ in range(2)]
     return Matches(*(np.vstack(both) for both in zip(points, wild, strict=True)), np.ones(n + outliers))
@@ -47,10 +46,6 @@ def seen(cameras, n=200, noise=0.0, outliers=0, seed=0, depth=(4, 9)):
 
 def with_prior(matches, priors=WEAK, magsac=MAGSAC, config=CONFIG, model=ModelKind.F):
     return estimate_with_prior(matches, priors, magsac, config, model)
-
-
-def as_bytes(result):
-    return result.matrix.tobytes(), result.inliers.tobytes(), result.magsac.tobytes()
 
 
 def assert_is_a_value(result, count):
@@ -103,7 +98,7 @@ def test_a_principal_point_far_off_leaves_magsac_its_matrix():
     cropped = camera(700.0, centre=(-900, 1500)), camera(800.0, 0.3, (-2.0, 0.3, 0.5), centre=(2500, -800))
     rng = np.random.default_rng(0)
     X = rng.uniform((-4, -4, 4), (4, 4, 9), (400, 3))
-    x0, x1 = (((X @ one.R.T + one.t) @ one.K.T) for one in cropped)
+    x0, x1 = (((X @ view.R.T + view.t) @ view.K.T) for view in cropped)
     matches = Matches(x0[:, :2] / x0[:, 2:], x1[:, :2] / x1[:, 2:], np.ones(400))
     result = with_prior(matches)
     assert result.ok
@@ -111,20 +106,12 @@ def test_a_principal_point_far_off_leaves_magsac_its_matrix():
     assert sampson_distances(result.matrix, matches).max() < 0.1
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_nothing_costs_more_than_magsacs_own_matrix_and_the_price_of_its_freedom(seed):
-    matches = seen(CAMERAS, 60, 0.4, 60, seed)
-    alone, result = estimate(matches, MAGSAC), with_prior(matches)
-    ours, theirs = (robust_cost(sampson_distances(one.matrix, matches), CONFIG.scale) for one in (result, alone))
-    assert ours <= theirs + FREE_COST
-
-
 def degenerate():
     rng = np.random.default_rng(0)
     turned = seen((camera(1100), camera(1100, 0.1)), 80, 0.1)
     along = np.linspace(0, 700, 40)
     X = np.column_stack([rng.uniform(-1, 1, (80, 2)), np.full(80, 5.0)])
-    plane = [((X @ one.R.T + one.t) @ one.K.T) for one in CAMERAS]
+    plane = [((X @ view.R.T + view.t) @ view.K.T) for view in CAMERAS]
     return {
         "a pure rotation": turned,
         "one plane": Matches(*(x[:, :2] / x[:, 2:] for x in plane), np.ones(80)),
@@ -133,9 +120,6 @@ def degenerate():
         "six": seen(CAMERAS, 6),
         "five": seen(CAMERAS, 5),
         "none": Matches.empty(),
-        "repeated": seen(CAMERAS, 5)[np.tile(np.arange(5), 20)],
-        "one point": Matches(np.full((30, 2), 5.5), np.full((30, 2), 9.25), np.ones(30)),
-        "no numbers": Matches(np.full((30, 2), np.nan), np.full((30, 2), 9.25), np.ones(30)),
         "the same points": Matches(*2 * [rng.uniform(0, 700, (50, 2))], np.ones(50)),
         "far points": Matches(*(rng.normal(size=(40, 2)) * 1e18 for _ in range(2)), np.ones(40)),
     }
@@ -147,7 +131,7 @@ def test_degenerate_matches_end_in_a_value(name):
     result = with_prior(matches)
     assert_is_a_value(result, len(matches))
     assert result.ok != bool(result.failure)
-    if name in ("five", "none", "repeated", "one point", "no numbers"):
+    if name in ("five", "none"):
         assert "too few distinct matches" in result.failure
     if name == "six":
         assert result.ok and result.magsac is None
@@ -164,17 +148,11 @@ def test_repetitions_and_what_is_not_finite_change_nothing():
     matches = seen(CAMERAS, 80, 0.1, 20)
     bad = Matches(np.full((9, 2), np.nan), np.full((9, 2), 1.0), np.ones(9))
     more = with_prior(Matches.concatenate([matches, matches, bad]))
-    once = with_prior(matches)
+    with ThreadPoolExecutor(2) as threads:  # the same bytes in threads, too
+        once, again = threads.map(with_prior, [matches, matches])
+    assert_array_equal(again.matrix, once.matrix)
     assert_array_equal(more.matrix, once.matrix)
     assert_array_equal(more.inliers, np.concatenate([once.inliers, once.inliers, np.zeros(9, bool)]))
-
-
-def test_the_same_input_gives_the_same_bytes_in_threads_too():
-    inputs = [seen(CAMERAS, 60, 0.2, 30, seed) for seed in range(2)] * 2
-    alone = [as_bytes(with_prior(matches)) for matches in inputs]
-    assert alone[:2] == alone[2:]
-    with ThreadPoolExecutor(2) as threads:
-        assert list(threads.map(lambda matches: as_bytes(with_prior(matches)), inputs)) == alone
 
 
 def test_what_makes_no_prior_is_an_error():

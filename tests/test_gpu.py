@@ -1,5 +1,6 @@
 """What a run asks of GPUs, shown on machines without: which there are, in which precision, with how much cache."""
 
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -11,23 +12,17 @@ from device_double import DeviceDouble, MixedDevicesError
 from standin import filled
 
 from mkpc_kaggle.data.images import Image
-from mkpc_kaggle.engine import session
+from mkpc_kaggle.engine.places import LocalSite
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.matchers.contract import (
-    MatcherSpec,
-    NonFiniteError,
-    Placement,
-    Precision,
-    detached,
-    encoding_bytes,
-)
+from mkpc_kaggle.matchers.contract import MatcherSpec, NonFiniteError, Placement, Precision, encoding_bytes
+from mkpc_kaggle.matchers.dtypes import check_finite, exact_float32
 from mkpc_kaggle.matchers.lightglue import light_glue
 from mkpc_kaggle.matchers.networks.loftr import Loftr
 from mkpc_kaggle.matchers.networks.placement import placed
-from mkpc_kaggle.matchers.networks.superglue import ImageKeypoints, SuperGlue, SuperGlueConfig
-from mkpc_kaggle.matchers.numbers import check_finite, exact_float32
+from mkpc_kaggle.matchers.networks.superglue import SuperGlue
+from mkpc_kaggle.matchers.networks.superpoint import SuperPointKeypoints
 from mkpc_kaggle.matchers.xfeat_lighterglue import SHAPE
 from mkpc_kaggle.pipeline import devices
 from mkpc_kaggle.pipeline.assembly import assemble
@@ -110,17 +105,25 @@ def test_the_parent_of_workers_never_initialises_cuda(monkeypatch: pytest.Monkey
     gpus_here(monkeypatch, (7, 5), (7, 5))
     made = assemble("classical", device="cuda", precision="auto")
     assert str(made.placement) == "device cuda in float16"
-    pool = session.pool_of(made, None)
-    assert pool.workers == 2
-    pool.close()
+    site = LocalSite(made, None, time.monotonic)
+    site.open()
+    assert [place.name for place in site.places] == ["cuda:0", "cuda:1"]
 
 
 def test_capabilities_are_asked_of_another_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    gpu_capabilities.cache_clear()
     monkeypatch.setattr(devices, "ASK_CAPABILITIES", "print('a greeting'); print([[7, 5], [8, 0]])")
     assert gpu_capabilities() == [(7, 5), (8, 0)]
-    monkeypatch.setattr(devices, "ASK_CAPABILITIES", "raise SystemExit('driver too old')")
-    with pytest.raises(UserError, match="driver too old"):
-        gpu_capabilities()
+    gpu_capabilities.cache_clear()
+
+
+def test_gpus_on_which_nothing_can_be_computed_leave_the_work_to_the_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    gpu_capabilities.cache_clear()
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(devices, "ASK_CAPABILITIES", "raise SystemExit('no kernel image')")
+    told = r"the CPU does the work: .*\(no kernel image\); on Kaggle choose the accelerator GPU T4 x2"
+    with pytest.warns(UserWarning, match=told):
+        assert str(assemble("classical").placement) == "device cpu in float32"
 
 
 def test_a_device_that_multiplies_and_cannot_convolve_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -148,15 +151,6 @@ def test_an_encoding_counts_the_storage_that_it_keeps_alive() -> None:
     batch = torch.zeros(8, 4, 5)
     assert encoding_bytes(Maps(batch[:1])) == batch.nbytes
     assert encoding_bytes(Maps(batch[0], (batch[1], torch.zeros(3)))) == batch.nbytes + 12
-
-
-def test_a_view_of_a_batch_is_copied_as_it_lies() -> None:
-    batch = torch.rand(8, 4, 6, 5).to(memory_format=torch.channels_last)
-    whole = torch.rand(3)
-    kept = detached(Maps(batch[2:3], (whole,)))
-    assert encoding_bytes(kept) == batch.nbytes // 8 + 12
-    assert torch.equal(kept.coarse, batch[2:3]) and kept.coarse.is_contiguous(memory_format=torch.channels_last)
-    assert kept.others[0] is whole
 
 
 def test_the_cache_is_sized_by_the_memory_that_is_free_and_the_workers_on_it() -> None:
@@ -250,15 +244,11 @@ def test_finite_numbers_pass_however_large_their_sum_and_whatever_holds_them() -
 
 @torch.inference_mode()
 def test_superglue_says_so_when_float16_overflows() -> None:
-    network = filled(SuperGlue(SuperGlueConfig(5)), "superglue")
+    network = filled(SuperGlue(5), "superglue")
     network.final_proj.weight.data.mul_(1e6)
     torch.manual_seed(0)
-    found = ImageKeypoints(
-        torch.rand(1, 9, 2) * 60,
-        torch.rand(1, 9),
-        torch.nn.functional.normalize(torch.rand(1, 9, 256)),
-        Size(64, 64),
-    )
+    descriptors = torch.nn.functional.normalize(torch.rand(9, 256))
+    found = SuperPointKeypoints(torch.rand(9, 2) * 60, torch.rand(9), descriptors, Size(64, 64))
     with pytest.raises(NonFiniteError, match="superglue"):
         placed(network, Placement(precision=Precision.FLOAT16))(found, found)
 

@@ -47,7 +47,9 @@ def beside_an_optimizer(state: dict[str, Tensor]) -> dict[str, Any]:
 
 
 FILES = (
-    PublicFile("aliked-n16.pth", "aliked_lightglue", "aliked-n16", "aliked", Aliked, published_aliked),
+    PublicFile(
+        "aliked-n16.pth", "aliked_lightglue", "aliked-n16", "aliked", lambda: Aliked(2048), published_aliked
+    ),
     PublicFile("aliked_lightglue.pth", "aliked_lightglue", "aliked-lightglue", "lightglue", glue, old_names),
     PublicFile("depth-save.pth", "disk_lightglue", "disk", "disk", DISK, beside_an_optimizer),
     PublicFile("disk_lightglue.pth", "disk_lightglue", "disk-lightglue", "lightglue", glue, old_names),

@@ -17,7 +17,7 @@ from mkpc_kaggle.matchers.networks.dad import select_keypoints
 from mkpc_kaggle.matchers.networks.dedode import dedode_g
 from mkpc_kaggle.matchers.networks.dinov2 import DinoV2Config
 from mkpc_kaggle.matchers.networks.loma import Loma, Variant, detector_size
-from mkpc_kaggle.matchers.networks.loma_matcher import LomaKeypoints, LomaMatcher, log_scores
+from mkpc_kaggle.matchers.networks.loma_matcher import LomaKeypoints, log_scores
 from mkpc_kaggle.matchers.networks.placement import placed
 from mkpc_kaggle.weights import WeightStore
 
@@ -75,28 +75,13 @@ def test_a_shifted_picture_is_matched_by_its_shift(store: WeightStore) -> None:
     assert np.abs(np.median(offsets[good], axis=0) - (16, -8)).max() < 0.2
 
 
-@pytest.mark.parametrize("sizes", [((64, 96), (90, 50)), ((33, 47), (131, 40)), ((8, 120), (40, 9))])
-def test_matches_lie_on_the_pictures_whatever_their_sizes(
-    matcher: LomaAdapter, sizes: tuple[tuple[int, int], tuple[int, int]]
-) -> None:
-    pictures = [picture(scene(*size, channels=3, name=f"{size}")) for size in sizes]
-    encodings = matcher.encode(pictures)
-    (matches,) = matcher.match(encodings[:1], encodings[1:])
-    assert 0 < len(matches) <= 200
-    # Half a pixel of the picture that the detector saw is the most that a keypoint leaves the edge.
-    for points, size in zip((matches.points0, matches.points1), sizes, strict=True):
-        reach = 0.5 * max(size) / (max(size) - 7)
-        assert (points > -0.5 - reach).all()
-        assert (points < np.array(size[::-1]) - 0.5 + reach).all()
-
-
 def test_keypoints_are_where_the_detector_saw_them(matcher: LomaAdapter) -> None:
     """A dot stays in its place when the detector's picture has other sides than the view."""
     pixels = np.full((101, 135, 3), 90, np.uint8)
     cv2.circle(pixels, (70, 40), 2, (250, 240, 230), -1)
     (encoded,) = matcher.encode([picture(pixels)])
     assert detector_size(Size(135, 101), 135) == (128, 96)
-    points = loma.from_normalised(encoded.keypoints.points[0].numpy(), Size(135, 101))
+    points = loma.from_normalised(encoded.keypoints.points.numpy(), Size(135, 101))
     assert np.hypot(*(points - (70, 40)).T).min() < 4
 
 
@@ -123,7 +108,7 @@ def test_the_sizes_are_the_releases_on_views_of_1024_pixels(
 
     def encode(to_detect: torch.Tensor, to_describe: torch.Tensor, number: int) -> LomaKeypoints:
         seen.append((to_detect.shape[2:], to_describe.shape[2:], number))
-        return LomaKeypoints(torch.zeros(1, 0, 2), torch.zeros(1, 0, 128))
+        return LomaKeypoints(torch.zeros(0, 2), torch.zeros(0, 128))
 
     monkeypatch.setattr(matcher._network, "encode", encode)
     published = LomaAdapter(matcher._network, LomaOptions(Variant.B128), "cpu")
@@ -222,9 +207,9 @@ def test_no_more_keypoints_than_there_are_maxima() -> None:
 @pytest.fixture(scope="module")
 def pair() -> tuple[LomaKeypoints, LomaKeypoints]:
     generator = torch.Generator().manual_seed(0)
-    points = torch.rand(1, 40, 2, generator=generator) * 2 - 1
-    descriptors = torch.randn(1, 40, 128, generator=generator)
-    return LomaKeypoints(points[:, :30], descriptors[:, :30]), LomaKeypoints(points[:, 5:], descriptors[:, 5:])
+    points = torch.rand(40, 2, generator=generator) * 2 - 1
+    descriptors = torch.randn(40, 128, generator=generator)
+    return LomaKeypoints(points[:30], descriptors[:30]), LomaKeypoints(points[5:], descriptors[5:])
 
 
 @torch.inference_mode()
@@ -233,31 +218,23 @@ def test_the_order_of_images_and_of_keypoints_changes_nothing(
 ) -> None:
     first, second = pair
     there, back = network.matcher(first, second, 0.0), network.matcher(second, first, 0.0)
-    assert (there.matches0 >= 0).sum() >= 10
-    assert torch.equal(there.matches0, back.matches1)
-    torch.testing.assert_close(there.scores1, back.scores0, rtol=0, atol=1e-4)
-    backwards = LomaKeypoints(second.points.flip(1), second.descriptors.flip(1))
-    turned = network.matcher(first, backwards, 0.0).matches0
-    assert torch.equal(torch.where(turned >= 0, 34 - turned, -1), there.matches0)
+    assert len(there.index0) >= 10
+    assert torch.equal(there.index0, back.index1.sort().values)
+    torch.testing.assert_close(there.scores, back.scores[back.index1.argsort()], rtol=0, atol=1e-4)
+    backwards = LomaKeypoints(second.points.flip(0), second.descriptors.flip(0))
+    reversed_ = network.matcher(first, backwards, 0.0)
+    assert torch.equal(reversed_.index0, there.index0)
+    assert torch.equal(34 - reversed_.index1, there.index1)
 
 
 @torch.inference_mode()
 def test_no_keypoints_on_a_side_give_no_matches(network: Loma, pair: tuple[LomaKeypoints, LomaKeypoints]) -> None:
-    nothing = LomaKeypoints(torch.zeros(1, 0, 2), torch.zeros(1, 0, 128))
+    nothing = LomaKeypoints(torch.zeros(0, 2), torch.zeros(0, 128))
     found = network.matcher(pair[0], nothing, 0.0)
-    assert found.matches0.tolist() == [[-1] * 30]
-    assert found.scores0.tolist() == [[0] * 30]
-    assert (found.matches1.shape, found.scores1.shape) == ((1, 0), (1, 0))
+    assert len(found.index0) == len(found.index1) == len(found.scores) == 0
 
 
 def test_the_matrix_of_scores_is_a_product_of_two_softmaxes() -> None:
     similarity = torch.randn(2, 5, 7, generator=torch.Generator().manual_seed(0)) * 10
     expected = similarity.softmax(dim=1) * similarity.softmax(dim=2)
     torch.testing.assert_close(log_scores(similarity).exp(), expected)
-
-
-def test_the_wide_matchers_project_descriptors() -> None:
-    for width in (256, 512):
-        with torch.device("meta"):
-            names = LomaMatcher(256, width).state_dict().keys()
-        assert any(name.startswith("input_proj") for name in names) == (width != 256)

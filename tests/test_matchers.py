@@ -15,9 +15,8 @@ from torch import nn
 
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Box, Size, View
-from mkpc_kaggle.matchers.contract import Colour, Picture, Placement, encoding_bytes
+from mkpc_kaggle.matchers.contract import Colour, Picture, Placement
 from mkpc_kaggle.matchers.lightglue import layer_name
-from mkpc_kaggle.matchers.neighbours import mutual_neighbours
 from mkpc_kaggle.matchers.registry import load_matcher, matcher_names, spec_of
 from mkpc_kaggle.weights import WeightStore, load_into
 
@@ -168,19 +167,6 @@ def test_matches_the_other_way_round_are_the_same_pairs(name):
 
 
 @every_matcher
-def test_the_same_picture_twice_gives_the_same_bytes(name):
-    matcher = matcher_of(name)
-    matches = []
-    for _ in range(2):
-        encodings = matcher.encode([picture(photograph()[:96, :128], matcher)])
-        matches.append(matcher.match(encodings, [photograph_encoding(name)])[0])
-    for part in ("points0", "points1", "scores"):
-        first, second = (getattr(one, part).tobytes() for one in matches)
-        assert first == second
-    assert len(matches[0]) > 20
-
-
-@every_matcher
 def test_pictures_in_a_batch_are_encoded_as_they_are_alone(name):
     matcher = matcher_of(name)
     pictures = [picture(np.ascontiguousarray(cut), matcher) for cut in (photograph()[:96], photograph()[96:])]
@@ -191,14 +177,6 @@ def test_pictures_in_a_batch_are_encoded_as_they_are_alone(name):
         distances = torch.cdist(together.points.double(), alone.points.double())
         assert (distances.amin(dim=1) < 1e-3).double().mean() > 0.99
         assert (distances.amin(dim=0) < 1e-3).double().mean() > 0.99
-
-
-@every_matcher
-def test_no_more_features_are_kept_than_asked_for_and_their_bytes_are_counted(name):
-    matcher = matcher_of(name)
-    assert len(photograph_encoding(name)) <= 1000 + 10  # SIFT keeps ties of the last response
-    assert encoding_bytes(photograph_encoding(name)) >= len(photograph_encoding(name)) * (2 + 64) * 4
-    assert matcher.options.features == 1000
 
 
 # pictures that have nothing, or little
@@ -239,53 +217,6 @@ def test_no_match_lies_on_the_padding_and_padding_costs_no_good_match(name):
     assert Box.whole(padded.content).contains(matches.points0).all()
     errors = np.hypot(*(matches.points1 - matches.points0).T)  # the cut's corner is the photograph's
     assert np.sum(errors < 2) >= 60
-
-
-@every_matcher
-def test_nothing_to_encode_and_nothing_to_match_give_nothing(name):
-    matcher = matcher_of(name)
-    assert list(matcher.match([], [])) == []
-
-
-# neighbours
-
-
-def unit_vectors(count, seed):
-    vectors = torch.randn(count, 16, generator=torch.Generator().manual_seed(seed))
-    return vectors / vectors.norm(dim=1, keepdim=True)
-
-
-def test_mutual_neighbours_are_those_of_the_full_matrix(monkeypatch):
-    monkeypatch.setattr("mkpc_kaggle.matchers.neighbours.BLOCK_ROWS", 7)
-    first, second = unit_vectors(40, 0), unit_vectors(53, 1)
-    similarity = (first @ second.T).double()
-    distance = (2 - 2 * similarity).sqrt()
-    expected = [
-        (i, int(similarity[i].argmax()))
-        for i in range(40)
-        if int(similarity[:, int(similarity[i].argmax())].argmax()) == i
-    ]
-    found = mutual_neighbours(first, second)
-    assert list(zip(found.index0.tolist(), found.index1.tolist(), strict=True)) == expected
-    for (i, j), cosine, ratio in zip(expected, found.similarity, found.ratio, strict=True):
-        row, column = distance[i].sort().values, distance[:, j].sort().values
-        assert cosine == pytest.approx(float(similarity[i, j]), abs=1e-6)
-        assert ratio == pytest.approx(float(max(row[0] / row[1], column[0] / column[1])), abs=1e-4)
-
-
-@pytest.mark.parametrize(("count0", "count1", "pairs"), [(0, 0, 0), (0, 5, 0), (5, 0, 0), (1, 1, 1), (1, 5, 1)])
-def test_few_descriptors_have_few_neighbours(count0, count1, pairs):
-    found = mutual_neighbours(unit_vectors(count0, 0), unit_vectors(count1, 1))
-    assert len(found.index0) == len(found.index1) == len(found.ratio) == pairs
-    assert found.ratio.isfinite().all()
-
-
-def test_a_descriptor_that_is_there_twice_is_ambiguous():
-    descriptors = unit_vectors(6, 0)
-    found = mutual_neighbours(descriptors, torch.cat([descriptors, descriptors[2:3]]))
-    assert found.index0.tolist() == found.index1.tolist() == list(range(6))
-    assert float(found.ratio[2]) > 0.8  # 0 / 0: the ratio test must not take it for the surest of all
-    assert float(found.ratio[3]) < 0.1
 
 
 # checkpoints

@@ -6,7 +6,7 @@ from light_matchers import MATCHERS, SHIFT, picture
 from torch.nn import functional
 
 from mkpc_kaggle.matchers.contract import NonFiniteError, Placement
-from mkpc_kaggle.matchers.numbers import check_finite
+from mkpc_kaggle.matchers.dtypes import check_finite
 
 
 def overflow(monkeypatch: pytest.MonkeyPatch) -> None:

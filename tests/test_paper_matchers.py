@@ -14,9 +14,8 @@ import cv2
 import numpy as np
 import pytest
 from checkpoints import FILES, use_manifest, write_checkpoints
-from roma_values import use_narrow
 from shared import DATA, needs_data
-from standin import scene
+from standin import scene, use_narrow
 
 from mkpc_kaggle.cli import main
 from mkpc_kaggle.data.competition import read_submission, read_test_side, submission_problems

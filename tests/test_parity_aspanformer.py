@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 from functools import cache
 
 import pytest
@@ -17,21 +18,35 @@ from semi_dense import (
 )
 
 from mkpc_kaggle.matchers.networks.adaptive_span import CELLS_AT_ONCE, adaptive_span, sample_usable, span_attention
-from mkpc_kaggle.matchers.networks.aspanformer import (
-    AspanFormer,
-    AspanFormerConfig,
-    pooling_factor,
-)
+from mkpc_kaggle.matchers.networks.aspan_transformer import RADIUS
+from mkpc_kaggle.matchers.networks.aspanformer import AspanFormer
 from mkpc_kaggle.matchers.networks.fine_matching import cell_points
 from mkpc_kaggle.matchers.networks.grids import to_2x2_blocks
 from mkpc_kaggle.matchers.networks.position import FIXED_DECAY, sine_positions
 
 MEGADEPTH = (832 / 1152, 832 / 1152)
+
+
+class Evaluated(AspanFormer):
+    """As in a published evaluation: one scale (y, x) for positions, the global level of a size (rows, columns)."""
+
+    def __init__(self, scale, coarsest, border=2):
+        super().__init__(1e-3, border)
+        self.scale, self.coarsest = scale, coarsest
+
+    def side(self, coarse, mask):
+        rows, columns = (side // of for side, of in zip(coarse.shape[2:], self.coarsest, strict=True))
+        return replace(super().side(coarse, mask), factor=(rows, columns))
+
+    def position_scale(self, height, width):
+        return self.scale
+
+
 CASES = {
-    "outdoor_online": AspanFormerConfig(1e-3),
-    "outdoor_online_resize": AspanFormerConfig(1e-3),
-    "outdoor_padded_batch": AspanFormerConfig(1e-3, position_scale=MEGADEPTH, coarsest=(7, 7)),
-    "indoor_direct": AspanFormerConfig(1e-3, border=0, position_scale=(1.0, 1.0), coarsest=(4, 3)),
+    "outdoor_online": lambda: AspanFormer(1e-3),
+    "outdoor_online_resize": lambda: AspanFormer(1e-3),
+    "outdoor_padded_batch": lambda: Evaluated(MEGADEPTH, (7, 7)),
+    "indoor_direct": lambda: Evaluated((1.0, 1.0), (4, 3), border=0),
 }
 CONFIDENCE = (2e-3, 1e-6)  # relative and absolute
 POINTS = 1e-2  # pixels
@@ -72,7 +87,7 @@ def rounded_down(image):
 
 def stages_of(case):
     golden = golden_arrays("aspanformer", case)
-    network = ready(AspanFormer(CASES[case]), standin())
+    network = ready(CASES[case](), standin())
     images = [rounded_down(golden[f"image{side}"]) for side in (0, 1)]
     masks = (golden["mask0"], golden["mask1"]) if "mask0" in golden else None
     trace = traced(network, images, masks, RECORDED)
@@ -81,7 +96,7 @@ def stages_of(case):
     got |= {"b_ids": coarse.batch, "i_ids": coarse.cell0, "j_ids": coarse.cell1, "mconf": coarse.confidence}
     got |= {"expec_f": matches.expectation}
     for side in (0, 1):
-        got |= inputs_of(side, images[side], trace.maps[side], network.config, golden)
+        got |= inputs_of(side, images[side], trace.maps[side], network, golden)
         got |= transformer_of(side, network.loftr_coarse, trace)
         got |= levels_of(side, network.loftr_coarse.layers[0].attention, trace.calls)
         factor = golden[f"scale{side}"][coarse.batch] if masks else got[f"kpt_scale{side}"]
@@ -99,10 +114,10 @@ def stages_of(case):
     return [stage_of(name, got, golden[name]) for name in names]
 
 
-def inputs_of(side, image, maps, config, golden):
+def inputs_of(side, image, maps, network, golden):
     """What depends on one image alone."""
     original, (height, width) = golden[f"image{side}"].shape, image.shape[2:]
-    scale = config.position_scale or (832 / height, 832 / width)
+    scale = network.position_scale(height // 8, width // 8)
     got = {f"resized{side}": image, f"pos_scale{side}": torch.tensor(scale)}
     got |= {f"kpt_scale{side}": torch.tensor([[original[3] / width, original[2] / height]])}
     got |= {f"backbone_coarse{side}": maps.coarse, f"backbone_fine{side}": maps.fine}
@@ -136,12 +151,12 @@ def transformer_of(side, transformer, trace):
 def levels_of(side, attention, calls):
     """Inside the attention of the first block: messages, spans and samples of its levels."""
     inputs, merged = calls[ATTENTION][side]
-    found = attention.messages(*inputs)
-    messages = {"global": found.coarse, "half": found.half, "full": found.full, "merged": merged}
+    coarse, half, full = attention.messages(*inputs)
+    messages = {"global": coarse, "half": half, "full": full, "merged": merged}
     got = {f"b0_q{side}_msg_{level}": as_map(message) for level, message in messages.items()}
     q, k, _, flow, own, _ = inputs
     for level, factor in (("half", 2), ("full", 1)):
-        span = adaptive_span(flow, attention.radius, factor)
+        span = adaptive_span(flow, RADIUS, factor)
         cells = (q.shape[1] // (2 * factor), q.shape[2] // (2 * factor))
         got[f"b0_q{side}_centre_{level}"] = span.centre.unflatten(1, cells)
         got[f"b0_q{side}_span_{level}"] = span.step.unflatten(1, cells)
@@ -181,9 +196,8 @@ def test_stages(case):
     assert_stages(stages_of(case))
 
 
-def network(**changes):
-    settings = {"threshold": 0.0} | changes
-    return random_network(lambda: AspanFormer(AspanFormerConfig(**settings)))
+def network(border=2):
+    return random_network(lambda: AspanFormer(0.0, border))
 
 
 def test_batch_equals_single():
@@ -203,14 +217,6 @@ def test_tiny_pictures_match_nothing():
 def test_sides_must_fit():
     with pytest.raises(ValueError, match="multiples of 32"):
         network().encode(torch.zeros(1, 1, 32, 40))
-
-
-def test_pooling_must_divide_the_map():
-    assert pooling_factor(24, 32, None) == (4, 4)
-    assert pooling_factor(28, 36, (7, 4)) == (4, 9)
-    for coarsest in ((7, 40), (5, 4)):
-        with pytest.raises(ValueError, match="cannot be pooled"):
-            pooling_factor(28, 36, coarsest)
 
 
 def test_span_attention_is_that_of_sampled_keys(monkeypatch):

@@ -12,14 +12,8 @@ import torch
 from dense import MODES, batch_of, computed, grey_levels, pixels_of, resized_by_pil
 from golden import GOLDEN, Stage, assert_stages, golden_arrays, needs_golden, print_table, ready, seeded_tensor
 
-from mkpc_kaggle.matchers.networks.dense_sampling import (
-    SamplingConfig,
-    balancing_weights,
-    density,
-    draw,
-    sample,
-)
-from mkpc_kaggle.matchers.networks.dkm import DKM, DkmConfig
+from mkpc_kaggle.matchers.networks.dense_sampling import balancing_weights, density, draw, sample_matches
+from mkpc_kaggle.matchers.networks.dkm import DKM
 from mkpc_kaggle.matchers.networks.pixels import network_input
 
 UNUSED_MODES = ("pow", "naive")  # of the published sampling; the golden file has them too
@@ -37,8 +31,8 @@ def standin():
 
 
 @cache
-def golden_network(*, symmetric=True):
-    return ready(DKM(DkmConfig(symmetric)), standin())
+def golden_network():
+    return ready(DKM(), standin())
 
 
 def within(name, got, expected):
@@ -104,15 +98,15 @@ def odd_one_way_stages():
         [input_of(resized_by_pil(images[name], size)) for name in ("imA", "imB")]
         for size in ((90, 118), (130, 170))
     )
-    network = golden_network(symmetric=False)
-    values = computed(network, coarse) | computed(network, coarse, fine)
+    network = golden_network()
+    values = computed(network, coarse, symmetric=False) | computed(network, coarse, fine, symmetric=False)
     yield from exhausted(compared(one_pair(values, symmetric=False), golden), golden)
 
 
 def batched_stages():
     golden = golden_arrays("dkm", "batched")
     pair = golden["query"], golden["support"]
-    one_way = computed(golden_network(symmetric=False), pair)
+    one_way = computed(golden_network(), pair, symmetric=False)
     values = computed(golden_network(), pair)
     values |= {"one_way_warp": one_way["warp"], "one_way_certainty": one_way["certainty"][:, None]}
     yield from exhausted(compared(values, golden), golden)
@@ -130,20 +124,17 @@ def exhausted(stages, golden):
 def sampling_stages():
     golden, dense = golden_arrays("dkm", "sampling"), golden_arrays("dkm", "main")
     number = int(golden["num"])
-    warp, certainty = dense["warp"], dense["certainty"]
+    warp, certainty = dense["warp"].reshape(-1, 4), dense["certainty"].flatten()
     for mode, (threshold, balanced) in MODES.items():
-        found = sample(
-            warp,
-            certainty,
-            SamplingConfig(number, threshold, balanced),
-            torch.Generator().manual_seed(int(golden["seed"])),
-        )
+        generator = torch.Generator().manual_seed(int(golden["seed"]))
+        found = sample_matches(warp, certainty, number, threshold, balanced=balanced, generator=generator)
+        weights = certainty.masked_fill(certainty > threshold, 1)
         yield Stage(f"{mode}__matches", found.matches, golden[f"{mode}__matches"])
-        yield within(f"{mode}__certainty", found.certainty, golden[f"{mode}__certainty"])
-    weights = certainty.flatten().masked_fill(certainty.flatten() > 0.05, 1)
+        yield within(f"{mode}__certainty", weights[found.index], golden[f"{mode}__certainty"])
+    weights = certainty.masked_fill(certainty > 0.05, 1)
     good = draw(weights, golden["noise1"], 4 * number)
     yield Stage("good_index", good, golden["good_index"])
-    yield Stage("good_matches", warp.reshape(-1, 4)[good], golden["good_matches"])
+    yield Stage("good_matches", warp[good], golden["good_matches"])
     yield within("good_certainty", weights[good], golden["good_certainty"])
     neighbours = density(golden["good_matches"])
     yield within("density", neighbours, golden["density"])

@@ -13,7 +13,7 @@ import pytest
 import torch
 from dense import batch_of, resized_by_pil
 from golden import GOLDEN, Stage, assert_stages, golden_arrays, needs_golden, print_table, standin_state
-from loma_values import descriptor_values, detector_values, keypoints_of, matcher_values
+from loma_values import assignment_values, descriptor_values, detector_values, matcher_values
 from semi_dense import tolerance_of
 
 from mkpc_kaggle.geometry.coordinates import Size
@@ -185,21 +185,18 @@ INPUTS = ("keypoints0", "keypoints1", "descriptors0", "descriptors1", "threshold
 
 def matcher_stages(case):
     golden = golden_arrays("loma", f"matcher_{case}")
-    if golden["keypoints0"].ndim == 3:
-        sides = [LomaKeypoints(golden[f"keypoints{side}"], golden[f"descriptors{side}"]) for side in (0, 1)]
-        golden["image"] = torch.zeros(1, 1, 1, 1)  # says that there is a batch axis
-    else:
-        sides = [keypoints_of(golden, side) for side in (0, 1)]
-    network = matcher(case.split("_")[0].upper())
+    batched = golden["keypoints0"].ndim == 3
     first, *others = (round(threshold, 3) for threshold in golden["thresholds"].tolist())
-    values = matcher_values(network, *sides, first)
-    for threshold in others:
-        found = network(*sides, threshold)
-        values |= {f"matches{side}_threshold{threshold}": getattr(found, f"matches{side}") for side in (0, 1)}
-    golden_matches = {name for name in golden if name.startswith("matches")}
-    stages = exhausted(compared(values, golden, MATCHER, {}), golden, *INPUTS, *{"image"} & golden.keys())
-    assert golden_matches <= {stage.name for stage in stages}
-    yield from stages
+    for pair in range(len(golden["keypoints0"]) if batched else 1):
+        arrays = {n: value[pair] if batched and n != "thresholds" else value for n, value in golden.items()}
+        sides = [LomaKeypoints(arrays[f"keypoints{side}"], arrays[f"descriptors{side}"]) for side in (0, 1)]
+        values = matcher_values(matcher(case.split("_")[0].upper()), *sides, first)
+        log_plan = values["scores"][0].log()
+        for threshold in others:
+            values |= assignment_values(log_plan, threshold, f"_threshold{threshold}")
+        stages = exhausted(compared(values, arrays, MATCHER, {}), arrays, *INPUTS)
+        assert {name for name in golden if name.startswith("matches")} <= {stage.name for stage in stages}
+        yield from stages
 
 
 def pipeline_stages(case, network):
@@ -217,8 +214,8 @@ def pipeline_stages(case, network):
         keypoints = network.encode(*seen, number)
         (detected,) = network.detector(seen[0], number)
         found.append(keypoints)
-        mine = {"keypoints": keypoints.points[0], "keypoint_probs": detected.scores}
-        mine["descriptors"] = keypoints.descriptors[0][:, ::32] if as_sets else keypoints.descriptors[0]
+        mine = {"keypoints": keypoints.points, "keypoint_probs": detected.scores}
+        mine["descriptors"] = keypoints.descriptors[:, ::32] if as_sets else keypoints.descriptors
         theirs = {name: golden[f"{name}{index}"] for name in mine}
         if as_sets:
             distance = torch.cdist(mine["keypoints"].double(), theirs["keypoints"].double())
@@ -231,18 +228,16 @@ def pipeline_stages(case, network):
         theirs["keypoint_probs"] = torch.ones_like(theirs["keypoint_probs"])
         for name, tolerance in (("keypoints", 1e-6), ("keypoint_probs", 1e-4), ("descriptors", 2e-4)):
             yield Stage(f"{name}{index}", mine[name], theirs[name], tolerance)
-    matches = network.matcher(*found, float(golden["threshold"]))
+    threshold = float(golden["threshold"])
     if not as_sets:
-        for index in (0, 1):
-            yield Stage(f"matches{index}", getattr(matches, f"matches{index}")[0], golden[f"matches{index}"])
-            scores = getattr(matches, f"scores{index}")[0]
-            yield Stage(f"matching_scores{index}", scores, golden[f"matching_scores{index}"], 4e-4)
-    index0 = torch.nonzero(matches.matches0[0] >= 0)[:, 0]
-    both = index0, matches.matches0[0, index0]
+        for name, value in matcher_values(network.matcher, *found, threshold).items():
+            if name.startswith(("matches", "matching")):
+                yield Stage(name, value[0], golden[name], 4e-4 if "scores" in name else 0)
+    matches = network.matcher(*found, threshold)
     points = []
-    for index, of in enumerate(both):
+    for index, of in enumerate((matches.index0, matches.index1)):
         pixels = images[f"image{index}"]
-        points.append((found[index].points[0, of] + 1) / 2 * torch.tensor([pixels.shape[1], pixels.shape[0]]))
+        points.append((found[index].points[of] + 1) / 2 * torch.tensor([pixels.shape[1], pixels.shape[0]]))
     mine, theirs = torch.cat(points, dim=1), torch.cat([golden["points0"], golden["points1"]], dim=1)
     if as_sets:
         mine, theirs = (torch.tensor(sorted(of.tolist())) for of in (mine, theirs))

@@ -15,7 +15,7 @@ from semi_dense import (
 )
 
 from mkpc_kaggle.matchers.networks.grids import from_2x2_blocks, mean_pool, to_2x2_blocks
-from mkpc_kaggle.matchers.networks.quadtree import Quadtree, QuadtreeConfig, attend, quadtree_attention
+from mkpc_kaggle.matchers.networks.quadtree import Quadtree, attend, quadtree_attention
 
 CASES = ("same_size", "diff_size_extension", "masked_batch")
 OPERATORS = ("attention_op", "attention_op_unequal")
@@ -74,14 +74,17 @@ def test_operator(case):
 @needs_golden
 @torch.inference_mode()
 def test_no_match_at_threshold_one():
-    network = ready(Quadtree(QuadtreeConfig(threshold=1.0)), standin_state("quadtree"))
+    network = ready(Quadtree(threshold=1.0), standin_state("quadtree"))
     golden = golden_arrays("quadtree", "same_size")
     check_empty(network.match(*(network.encode(golden[f"image{s}_u8"].float()[:, None] / 255) for s in (0, 1))))
 
 
-def network(**changes):
-    settings = {"threshold": 0.0, "temperature": 0.03, "topks": (3, 2)} | changes
-    return random_network(lambda: Quadtree(QuadtreeConfig(**settings)))
+class SharpQuadtree(Quadtree):
+    similarity_scale = 1 / (256 * 0.03)
+
+
+def network(border=2, topks=(3, 2)):
+    return random_network(lambda: SharpQuadtree(0.0, border, topks))
 
 
 def test_batch_equals_single():

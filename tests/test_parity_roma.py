@@ -5,8 +5,6 @@
 
 import json
 import re
-from contextlib import contextmanager
-from dataclasses import replace
 from functools import cache
 
 import pytest
@@ -25,17 +23,10 @@ from golden import (
 from roma_values import computed
 
 from mkpc_kaggle.matchers.networks import roma
-from mkpc_kaggle.matchers.networks.anchor_decoder import anchor_mean
-from mkpc_kaggle.matchers.networks.dense_sampling import (
-    SamplingConfig,
-    balancing_weights,
-    density,
-    draw,
-    sample,
-)
+from mkpc_kaggle.matchers.networks.dense_sampling import balancing_weights, density, draw, sample_matches
 from mkpc_kaggle.matchers.networks.grids import as_grid, as_map
 from mkpc_kaggle.matchers.networks.pixels import network_input
-from mkpc_kaggle.matchers.networks.roma import RoMa
+from mkpc_kaggle.matchers.networks.roma import RoMa, anchor_mean
 
 
 def standin():
@@ -56,17 +47,6 @@ def standin():
 @cache
 def golden_network():
     return ready(RoMa(), standin())
-
-
-@contextmanager
-def one_way(network):
-    """The network as it is, matching from the first image to the second only."""
-    both = network.config
-    network.config = replace(both, symmetric=False)
-    try:
-        yield network
-    finally:
-        network.config = both
 
 
 def within(name, got, expected):
@@ -125,8 +105,8 @@ def second_pass(values, *plain):
 def unequal_one_way_stages():
     golden = golden_arrays("roma", "unequal_one_way")
     images = resized_images((112, 140))
-    with one_way(golden_network()) as network:
-        values = computed(network, images) | second_pass(computed(network, images, resized_images((150, 202))))
+    values = computed(golden_network(), images, symmetric=False)
+    values |= second_pass(computed(golden_network(), images, resized_images((150, 202)), symmetric=False))
     yield from exhausted(compared(values, golden), golden)
 
 
@@ -135,8 +115,7 @@ def batched_stages():
     pair, high = ([golden[f"{side}{name}"] for side in ("query", "support")] for name in ("", "_high"))
     network = golden_network()
     values = computed(network, pair) | second_pass(computed(network, pair, high))
-    with one_way(network):
-        forward = computed(network, pair)
+    forward = computed(network, pair, symmetric=False)
     values |= {f"one_way_{name}": forward[name] for name in ("warp", "certainty")}
     with pytest.MonkeyPatch.context() as patch:  # the release's displacements follow its settings' size
         patch.setattr(roma, "stretch", lambda size: 1.25 * 112 / 560)
@@ -171,19 +150,20 @@ def exhausted(stages, golden):
 
 def sampling_stages():
     golden, dense = golden_arrays("roma", "sampling"), golden_arrays("roma", "main")
-    warp, certainty = dense["warp"], dense["certainty"]
+    warp, certainty = dense["warp"].reshape(-1, 4), dense["certainty"].flatten()
     modes = {"threshold": "threshold", "raw": "raw"}
     modes |= {f"{mode}_float32": mode for mode in ("threshold_balanced", "balanced")}
     for name, mode in modes.items():
         threshold, balanced = MODES[mode]
         generator = torch.Generator().manual_seed(1234)
-        found = sample(warp, certainty, SamplingConfig(1000, threshold, balanced), generator)
+        found = sample_matches(warp, certainty, 1000, threshold, balanced=balanced, generator=generator)
+        weights = certainty.masked_fill(certainty > threshold, 1)
         yield Stage(f"{name}__matches", found.matches, golden[f"{name}__matches"])
-        yield within(f"{name}__certainty", found.certainty, golden[f"{name}__certainty"])
-    weights = certainty.flatten().masked_fill(certainty.flatten() > 0.05, 1)
+        yield within(f"{name}__certainty", weights[found.index], golden[f"{name}__certainty"])
+    weights = certainty.masked_fill(certainty > 0.05, 1)
     good = draw(weights, golden["noise1"], 4000)
     yield Stage("good_index", good, golden["good_index"])
-    neighbours = density(warp.reshape(-1, 4)[golden["good_index"]])
+    neighbours = density(warp[golden["good_index"]])
     for key in ("density", "density_exact"):
         yield within(key, neighbours, golden[key])
     evenness = balancing_weights(golden["density"])

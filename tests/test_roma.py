@@ -3,9 +3,9 @@
 import pytest
 import torch
 
-from mkpc_kaggle.matchers.networks.anchor_decoder import anchor_mean
 from mkpc_kaggle.matchers.networks.dinov2 import DinoV2, DinoV2Config
-from mkpc_kaggle.matchers.networks.transformer_block import Block
+from mkpc_kaggle.matchers.networks.roma import anchor_mean
+from mkpc_kaggle.matchers.networks.transformer_block import VitBlock
 
 
 def centre(anchor):
@@ -37,7 +37,7 @@ def test_the_mean_of_the_best_anchor_and_its_neighbours(best, near):
 def test_a_block_is_its_definition(scaled, size):
     """Tokens so small that the norms' epsilon matters, too."""
     torch.manual_seed(0)
-    block = Block(12, heads=3, epsilon=1e-6, bias=scaled, scaled=scaled).requires_grad_(False)
+    block = VitBlock(12, heads=3, epsilon=1e-6, bias=scaled, scaled=scaled).requires_grad_(False)
     for parameter in block.parameters():
         parameter.normal_(std=0.5 if size == 1 else 0.01)
     tokens = size * torch.randn(2, 5, 12)

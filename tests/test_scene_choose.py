@@ -12,7 +12,7 @@ from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.scene.choose import MAX_DISAGREEMENT_DEG, Choice, Reason, choose
-from mkpc_kaggle.scene.config import Mapper, SceneConfig
+from mkpc_kaggle.scene.config import CameraModel, SceneConfig
 from mkpc_kaggle.scene.reconstruction import MIN_POINTS, RegisteredImage, SfmModel, filter_models
 from mkpc_kaggle.scene.view_graph import BatchImage
 
@@ -160,12 +160,12 @@ def test_models_are_in_order_of_what_is_left_of_them(scene: SyntheticScene) -> N
 
 
 def test_settings_come_from_a_table() -> None:
-    config = from_table(SceneConfig, {"mapper": "incremental", "verification_error": 2}, "[scene]")
-    assert (config.mapper, config.verification_error) == (Mapper.INCREMENTAL, 2.0)
-    with pytest.raises(UserError, match=r"unknown key 'cells'.*mapper"):
+    config = from_table(SceneConfig, {"camera_model": "SIMPLE_RADIAL", "pairs_per_image": 2}, "[scene]")
+    assert (config.camera_model, config.pairs_per_image) == (CameraModel.RADIAL, 2.0)
+    with pytest.raises(UserError, match=r"unknown key 'cells'.*camera_model"):
         from_table(SceneConfig, {"cells": 1.0}, "[scene]")
-    with pytest.raises(UserError, match=r"\[scene\]: verification_error must be in"):
-        from_table(SceneConfig, {"verification_error": 0}, "[scene]")
+    with pytest.raises(UserError, match=r"\[scene\]: shared_intrinsics must be in"):
+        from_table(SceneConfig, {"shared_intrinsics": -1}, "[scene]")
     with pytest.raises(UserError, match=r"'one_camera' is now called 'shared_intrinsics'"):
         from_table(SceneConfig, {"one_camera": 0}, "[scene]")
     with pytest.raises(UserError, match=r"'most_images' was removed"):

@@ -39,7 +39,7 @@ def test_gains_stand_at_their_differences_with_intervals_around_them() -> None:
     assert points.get_xdata() == pytest.approx([0.5, 0, 0.25])
     shown = [(segment[0][0], segment[1][0]) for segment in spans.get_segments()]
     found = [comparison.difference(1, "a"), comparison.difference(1, "b"), comparison.difference(1)]
-    assert np.array(shown) == pytest.approx(np.array([(one.low, one.high) for one in found]))
+    assert np.array(shown) == pytest.approx(np.array([(gain.low, gain.high) for gain in found]))
 
 
 def share_below(line, x: float) -> float:

@@ -1,49 +1,19 @@
-"""The benchmark of the paper's Table 1: the same units whole and split, repeated points merged or not."""
+"""The benchmark of the paper's Table 1: the same units whole and split."""
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from benchmarks import table1
-from benchmarks.merging import merged
 from benchmarks.table1 import CONTRASTS, Found, ResultsFile, Tables, Way, run_all, union, ways_of
 from mkpc_kaggle.data.competition import read_train_side
 from mkpc_kaggle.demo import DemoSet
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.session import Interrupt, Session
 from mkpc_kaggle.evaluation.validate import validate
-from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.metrics import PoseError
 from mkpc_kaggle.pipeline.assembly import assemble
 from mkpc_kaggle.recipe import Mode
-
-
-def matches(*points: tuple[float, float]) -> Matches:
-    """The point (x, y) in both images."""
-    return Matches(points, points, np.ones(len(points)))
-
-
-def test_what_another_part_finds_again_is_left_out() -> None:
-    together = merged([matches((0, 0), (0.5, 0), (9, 9)), matches((0.9, 0), (20, 20)), matches((20.5, 19.5))], 1)
-    np.testing.assert_array_equal(together.points0, [(0, 0), (0.5, 0), (9, 9), (20, 20)])
-
-
-def test_both_points_must_be_near() -> None:
-    first, second = Matches([(0, 0)], [(0, 0)], [1]), Matches([(0, 0)], [(0, 3)], [1])
-    assert len(merged([first, second], 1)) == 2
-    assert len(merged([first, second], 3)) == 1
-
-
-def test_a_chain_keeps_every_second() -> None:
-    """What was left out leaves nothing out itself."""
-    together = merged([matches((number, 0)) for number in range(5)], 1)
-    np.testing.assert_array_equal(together.points0[:, 0], [0, 2, 4])
-
-
-@pytest.mark.parametrize("parts", [[], [matches()], [matches((1, 1), (1, 1))]])
-def test_one_part_or_none_stays_as_it_is(parts: list[Matches]) -> None:
-    assert len(merged(parts, 1)) == len(Matches.concatenate(parts))
 
 
 @pytest.mark.parametrize(("naive", "split"), CONTRASTS)
@@ -71,7 +41,7 @@ def test_it_gives_what_the_engine_gives_and_goes_on_where_it_was(
     (scene,) = read_train_side(demo.train_dir, pairs_per_scene=3)
     assembly = assemble(union(small))
     path = tmp_path / "out" / "pairs.jsonl"
-    run_all([scene], small, assembly.pipeline(), ResultsFile(path, {"a": 1}), 1.0)
+    run_all([scene], small, assembly.pipeline(), ResultsFile(path, {"a": 1}))
     results = ResultsFile(path, {"a": 1})
     assert set(results.found) == {true.pair.id for true in scene.pairs}
 
@@ -84,18 +54,13 @@ def test_it_gives_what_the_engine_gives_and_goes_on_where_it_was(
         found = results.found[score.id][way.name]
         assert found.matches == score.record.matches
         assert found.error == score.error
-        assert (
-            0
-            < results.found[score.id]["sift: three, merged"].matches
-            < results.found[score.id]["sift: three"].matches
-        )
 
     whole = path.read_bytes()
     last = whole.splitlines(keepends=True)[-1]
     path.write_bytes(whole[: -len(last) // 2])  # the last line was cut off
     again = ResultsFile(path, {"a": 1})
     assert len(again.found) == len(scene.pairs) - 1
-    run_all([scene], small, assembly.pipeline(), again, 1.0)
+    run_all([scene], small, assembly.pipeline(), again)
     assert ResultsFile(path, {"a": 1}).found.keys() == results.found.keys()
     with pytest.raises(SystemExit, match="other settings"):
         ResultsFile(path, {"a": 2})
@@ -109,7 +74,6 @@ def test_it_gives_what_the_engine_gives_and_goes_on_where_it_was(
         "| sift: one + two",
         "| sift: one + two",
         "| sift: one + two",
-        "| sift: three, merged",
     ]
 
 

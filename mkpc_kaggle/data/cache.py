@@ -13,8 +13,7 @@ class ByteCache(Generic[Key, Value]):
     """Keeps the most recently used values, ``limit`` bytes at most; a larger value is not kept."""
 
     def __init__(self, limit: int) -> None:
-        self.limit = limit
-        self.bytes = 0
+        self.limit, self.bytes = limit, 0
         self._entries: OrderedDict[Key, tuple[Value, int]] = OrderedDict()
         self._lock = threading.Lock()
 
@@ -27,15 +26,9 @@ class ByteCache(Generic[Key, Value]):
 
     def put(self, key: Key, value: Value, size: int) -> None:
         with self._lock:
-            if key in self._entries:
-                self.bytes -= self._entries.pop(key)[1]
+            self.bytes += size - self._entries.pop(key, (value, 0))[1]
+            self._entries[key] = value, size
             if size > self.limit:
-                return
-            self._entries[key] = (value, size)
-            self.bytes += size
+                self.bytes -= self._entries.pop(key)[1]
             while self.bytes > self.limit:
-                _, (_, oldest) = self._entries.popitem(last=False)
-                self.bytes -= oldest
-
-    def __len__(self) -> int:
-        return len(self._entries)
+                self.bytes -= self._entries.popitem(last=False)[1][1]

@@ -143,8 +143,10 @@ def read_train_side(
     :class:`UserError` for missing files, columns or scenes, and for cells that cannot be read.
     """
     path = directory / "scaling_factors.csv"
-    rows = read_rows(path, ("scene", "scaling_factor"))
-    metres = {scene: float(_numbers(cell, f"{path}, line {line}", 1)[0]) for line, (scene, cell) in rows}
+    metres = {
+        scene: float(_numbers(cell, f"{path}, line {line}", 1)[0])
+        for line, (scene, cell) in read_rows(path, ("scene", "scaling_factor"))
+    }
     wanted = list(scenes) or sorted(name for name in metres if (directory / name).is_dir())
     for name in wanted:
         if name not in metres:

@@ -3,7 +3,7 @@
 import hashlib
 import stat
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
@@ -65,7 +65,7 @@ def read_image(path: Path) -> Image | Unreadable:
     """Decode a file (png, jpg; 8 or 16 bit; gray, colour, with alpha) to 8-bit RGB; never raises.
 
     16-bit values are divided by 256, alpha is dropped, an EXIF orientation is applied. OpenCV decides whether
-    a damaged file is readable: version 5 refuses a truncated one.
+    a damaged file is readable: version 5 refuses a truncated file.
     """
     name = str(path)
     try:
@@ -73,31 +73,19 @@ def read_image(path: Path) -> Image | Unreadable:
         if not stat.S_ISREG(status.st_mode):  # a pipe or a device may never end
             return Unreadable(name, "cannot be read: not a regular file")
         data = np.fromfile(path, np.uint8)
+        bgr = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
     except FileNotFoundError:
         return Unreadable(name, "no such file")
-    except (OSError, ValueError, MemoryError) as error:
+    except (OSError, ValueError, MemoryError, cv2.error) as error:
         return Unreadable(name, f"cannot be read: {error}")
-    return decode_image(name, data, status.st_ctime_ns)
-
-
-def decode_image(name: str, data: Pixels, changed_ns: int = 0) -> Image | Unreadable:
-    """Decode the (N,) uint8 bytes of a file, as :func:`read_image` does; never raises.
-
-    ``changed_ns`` is the file's time of change before it was read.
-    """
-    if data.size == 0:
-        return Unreadable(name, "the file is empty")
-    try:
-        bgr = cv2.imdecode(data, cv2.IMREAD_COLOR)
-    except (cv2.error, MemoryError) as error:
-        return Unreadable(name, f"cannot be decoded: {error}")
     if bgr is None:
-        return Unreadable(name, "not a picture, or cut off: it cannot be decoded")
+        reason = "not a picture, or cut off: it cannot be decoded" if data.size else "the file is empty"
+        return Unreadable(name, reason)
     height, width = bgr.shape[:2]
     if max(height, width) > MAX_ASPECT * min(height, width):
         return Unreadable(name, f"{width} x {height} pixels: one side is more than {MAX_ASPECT} times the other")
     pixels = np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)
-    return Image(name, pixels, f"{_content_digest(data)} {changed_ns}")
+    return Image(name, pixels, f"{_content_digest(data)} {status.st_ctime_ns}")
 
 
 def is_unchanged(path: Path, version: str) -> bool:
@@ -125,21 +113,9 @@ def printable(text: str) -> str:
 
 
 class ImageStore:
-    """Images by path, decoded in the background by :meth:`prefetch`; the most recently used are kept.
+    """Images by path, decoded in the background by :meth:`prefetch`; the most recently used are kept."""
 
-    ``read`` replaces :func:`read_image`; it never raises.
-    """
-
-    read: Callable[[Path], Image | Unreadable] = staticmethod(read_image)
-
-    def __init__(
-        self,
-        limit_bytes: int = 512 << 20,
-        threads: int = 1,
-        read: Callable[[Path], Image | Unreadable] | None = None,
-    ) -> None:
-        if read is not None:
-            self.read = read
+    def __init__(self, limit_bytes: int = 512 << 20, threads: int = 1) -> None:
         self._images: ByteCache[Path, Image] = ByteCache(limit_bytes)
         self._pending: dict[Path, Future[Image | Unreadable]] = {}
         self._lock = threading.Lock()
@@ -172,5 +148,5 @@ class ImageStore:
 
     def _decoding(self, path: Path) -> "Future[Image | Unreadable]":
         if path not in self._pending:
-            self._pending[path] = self._decoders.submit(self.read, path)
+            self._pending[path] = self._decoders.submit(read_image, path)
         return self._pending[path]

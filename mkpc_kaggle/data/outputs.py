@@ -1,4 +1,4 @@
-"""Files that a command writes: an input is never overwritten, and a file is replaced only by a whole one."""
+"""Files that a command writes: an input is never overwritten, and a file is replaced only by a whole file."""
 
 import os
 import re
@@ -10,41 +10,54 @@ from typing import TextIO
 
 from mkpc_kaggle.errors import UserError
 
-# Suffixes by the option that writes the file: an existing file of another suffix is not an earlier result.
-RESULTS = {"--json": (".json",), "--report": (".html", ".htm")}
-NO_WEIGHTS = (
-    ".csv",
-    ".html",
-    ".json",
-    ".jpg",
-    ".pdf",
-    ".png",
-    ".svg",
-)  # in a directory of weights, not weights
+# By option, the suffixes of what it writes: such a file in an input directory is the result of an earlier run.
+RESULTS = {
+    "--output": (".csv",),
+    "--json": (".json",),
+    "--report": (".html", ".htm"),
+    "--out": (".png", ".jpg", ".pdf", ".svg"),
+}
 
 _parts: set[Path] = set()  # files that this process is writing
 
 
-def require_no_input(
-    outputs: Mapping[str, Path | None], inputs: Iterable[Path], weights: Iterable[Path] = ()
+def require_apart(
+    outputs: Mapping[str, Path | None],
+    inputs: Iterable[Path],
+    work_dir: Path | None = None,
+    weights: Iterable[Path] = (),
 ) -> None:
-    """Refuse to overwrite an existing file that is an input; a new file is fine, wherever it is.
+    """Refuse outputs that would overwrite an existing input, or that are in each other's or the journal's way.
 
-    ``outputs`` are files to write, by option. In a directory among ``inputs`` all files are inputs, except the
-    results of an earlier run; in directories of ``weights``, all files except tables, pages and pictures. Raises
-    :class:`UserError`.
+    ``outputs`` are files to write, by option; ``inputs`` and ``weights`` are files and directories, ``work_dir``
+    is the journal's. A new file is fine, wherever it is. ``--json`` and ``--report`` overwrite nothing but their
+    own kind. Raises :class:`UserError`.
     """
-    inputs, weights = list(inputs), list(weights)
-    for option, path in outputs.items():
-        if path is None or not os.path.lexists(path):
+    named = [Path(part) for part in os.environ.get("MKPC_WEIGHTS", "").split(os.pathsep) if part]
+    inputs, weights = list(inputs), [*weights, *named]
+    files = {option: path for option, path in outputs.items() if path is not None}
+    for option, path in files.items():
+        if not path.name or os.path.isdir(path):  # noqa: PTH112  Path raises for a name that is too long
+            raise UserError(f"{option} {str(path)!r} is a directory; name a file")
+        for other in (other for other in files if other != option and same_file(path, files[other])):
+            raise UserError(
+                f"{option} {path} and {other} {files[other]} are one file; name another for one of them"
+            )
+        if work_dir is not None and (
+            lies_in(work_dir, path) or (same_file(path.parent, work_dir) and path.name.startswith("journal."))
+        ):
+            raise UserError(f"{option} {path} and the work directory {work_dir} are in each other's way")
+        if not os.path.lexists(path):
             continue
         is_result = path.suffix.lower() in RESULTS.get(option, ())
-        places = inputs + weights * (path.suffix.lower() not in NO_WEIGHTS)
-        for place in places:
+        for place in (*inputs, *weights):
             if same_file(path, place) or (lies_in(path, place) and not is_result):
                 raise UserError(f"{option} {path} would be written over the input {place}; name another file")
-        if option in RESULTS and not is_result and path.is_file():
+        if option in ("--json", "--report") and not is_result:
             raise UserError(f"{option} {path} exists and is not a {RESULTS[option][0]} file; name another file")
+    for place in inputs:
+        if work_dir is not None and lies_in(work_dir, place):
+            raise UserError(f"--work-dir {work_dir} would be written over the input {place}; name another place")
 
 
 def lies_in(path: Path, directory: Path) -> bool:

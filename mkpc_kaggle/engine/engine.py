@@ -2,12 +2,11 @@
 
 import sqlite3
 import threading
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import partial
 from math import inf
-from typing import Protocol
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine import console
@@ -23,6 +22,7 @@ from mkpc_kaggle.engine.jobs import (
     SceneResult,
     visiting_order,
 )
+from mkpc_kaggle.engine.journal import Journal
 from mkpc_kaggle.engine.journal_tables import EventKind
 from mkpc_kaggle.engine.places import Place, Site
 from mkpc_kaggle.engine.plan import Explanation, Plan
@@ -30,7 +30,7 @@ from mkpc_kaggle.engine.records import PairRecord, SceneRecord
 from mkpc_kaggle.engine.scenes import Scenes, extra_pairs_of
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.pipeline.pair import UnitResult
-from mkpc_kaggle.recipe import Recipe, Unit
+from mkpc_kaggle.recipe import Recipe
 from mkpc_kaggle.scene.choose import Choice
 
 PUBLISH_INTERVAL_S, PUBLISH_SHARE = 30.0, 0.05  # how often the submission is written, and its share of the time
@@ -65,28 +65,6 @@ class RunReport:
     scenes: tuple[SceneRecord, ...] = ()
 
 
-class RunJournal(Protocol):
-    """What the engine wants of a journal."""
-
-    def forget_changed(self, pairs: Sequence[Pair]) -> int: ...
-
-    def forget_given_up(self) -> None: ...
-
-    def records(self) -> dict[int, PairRecord]: ...
-
-    def results(self, pair: int, units: Mapping[str, Unit]) -> tuple[UnitResult, ...]: ...
-
-    def save(self, outcomes: list[tuple[Outcome, bool]]) -> None: ...
-
-    def scenes(self) -> tuple[SceneRecord, ...]: ...
-
-    def save_scene(self, scene: SceneRecord, choices: Mapping[int, Choice]) -> None: ...
-
-    def settle(self, records: Iterable[PairRecord]) -> None: ...
-
-    def note(self, kind: str, seconds: float, text: str) -> None: ...
-
-
 class Engine:
     """One run over ``pairs``.
 
@@ -99,7 +77,7 @@ class Engine:
         pairs: Sequence[Pair],
         recipe: Recipe,
         site: Site,
-        journal: RunJournal,
+        journal: Journal,
         budget: Budget,
         *,
         publish: Callable[[Sequence[PairRecord]], None],
@@ -120,7 +98,8 @@ class Engine:
         self.unwritten = ""
         self._units = {unit.name: unit for unit in recipe.units}
         self._unjournalled: dict[int, tuple[UnitResult, ...]] = {}
-        self._explained = 0
+        self._explained = self._answers = 0
+        self._looked = (-1, -1, -1)
         self._published = budget.clock()
         self._progress = console.Progress(budget) if progress else None
         self._publishing = threading.Lock()
@@ -185,7 +164,7 @@ class Engine:
     # The loop
 
     def _loop(self) -> None:
-        if self.plan.has_work or self.scenes.due(range(len(self.pairs))) is not None:
+        if self.plan.has_work(self.budget.clock()):
             self.site.open()
         while not self.interrupt.is_set() and (now := self.budget.clock()) < self.budget.stop_waiting:
             for place in (*self.site.places, *self._scene_places):
@@ -193,7 +172,7 @@ class Engine:
             self._fall_back(now)
             self._hand_out(now)
             is_matching = self._is_matching(now)
-            self._start_scenes(now, is_matching=is_matching and now < self.plan.stop)
+            self._start_scenes(now, is_matching=is_matching)
             if not is_matching and not self._scene_places:
                 return
             if now - self._published > max(PUBLISH_INTERVAL_S, self.budget.writing / PUBLISH_SHARE):
@@ -205,13 +184,12 @@ class Engine:
         """A worker for each place that lacks one, and a job for each worker that is idle."""
         self.plan.workers = max(1, sum(not place.closed for place in self.site.places))
         for place in self.site.places:
-            if now >= self.plan.stop or not self.plan.has_work:
-                return
-            if place.may_start(now):
+            if place.may_start(now) and now < self.plan.stop and self.plan.has_work(now):
                 self._start(place, now)
             elif place.is_idle and (job := self.plan.next(now, place.name, cautious=place.losses > 0)):
                 pairs = tuple(self.pairs[index] for index in job.indices)
-                job = replace(job, pairs=pairs, known=tuple(map(self._results, job.indices)))
+                known = tuple(() if job.is_trial else self._results(index) for index in job.indices)
+                job = replace(job, pairs=pairs, known=known)
                 place.submit(job, job.seconds, job.time_limit, now)
 
     def _start(self, place: Place, now: float) -> None:
@@ -222,13 +200,14 @@ class Engine:
 
     def _is_matching(self, now: float) -> bool:
         """Whether a job is under way, or will be when a worker has started."""
-        may_begin = now < self.plan.stop and self.plan.has_work
+        may_begin = now < self.plan.stop and self.plan.has_work(now)
         return any(place.job is not None or (place.is_starting and may_begin) for place in self.site.places)
 
     def _take_answer(self, place: Place, now: float) -> None:
         answer, job, seconds = place.poll(now), place.job, now - place.since
         if answer is None:
             return
+        self._answers += 1
         if isinstance(answer, Loaded):
             self._has_loaded = True
             if isinstance(job, SceneJob):
@@ -280,6 +259,9 @@ class Engine:
         at_once = self.site.scenes_at_once
         plan = self.plan
         done, filling = (plan.done, plan.filling) if is_matching else (range(len(self.pairs)), ())
+        if (moment := (len(done), len(filling), self._answers)) == self._looked:
+            return  # nothing has changed since
+        self._looked = moment
         while len(self._scene_places) < at_once and (batch := self.scenes.due(done, filling)) is not None:
             place = Place(f"scene of batch {batch}", self.site.scene_worker)
             place.job = self.scenes.job(batch, self._results)

@@ -6,6 +6,7 @@ It looks at a job's worth of pairs at a time, so that a hundred thousand pairs c
 from collections import Counter, deque
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 from mkpc_kaggle.engine.budget import Budget, format_duration
 from mkpc_kaggle.engine.costs import Costs
@@ -113,14 +114,18 @@ class ChunkQueue:
         """Whether something has to be tried again on a pair."""
         return any(index in chunk.indices for chunk in self._retries)
 
-    @property
-    def has_fresh(self) -> bool:
-        return bool(self._waiting)
+    def drop(self) -> None:
+        """Take out the first chunk."""
+        self._waiting.popleft()
 
     @property
-    def is_empty(self) -> bool:
-        """Whether nothing waits; jobs may be under way."""
-        return not self._waiting and not self._retries
+    def first(self) -> Chunk | None:
+        """The next chunk that has not been tried yet."""
+        return self._waiting[0] if self._waiting else None
+
+    @property
+    def has_retries(self) -> bool:
+        return bool(self._retries)
 
 
 class Plan:
@@ -172,6 +177,8 @@ class Plan:
 
         ``cautious``: the place has just lost a worker, and tries one pair and one unit.
         """
+        if cautious and (trial := self._trial(now)) is not None:
+            return trial
         while now < self.stop and (chunk := self._pop(place, now, cautious=cautious)) is not None:
             units = self._units(chunk, now)
             todo = [index for index in chunk.indices if self.can_gain(index, units)]
@@ -189,10 +196,14 @@ class Plan:
         """When no unit may be running any more."""
         return self.budget.stop_units - min(self.reserve, RESERVE_SHARE * self.budget.time_limit)
 
-    @property
-    def has_work(self) -> bool:
-        """Whether something waits, or a phase is to come; what is under way may come back, too."""
-        return not self._queue.is_empty or self._coming != []
+    def has_work(self, now: float) -> bool:
+        """Whether a pair waits that can gain something; what is under way may come back, too."""
+        while (chunk := self._peek(now)) is not None:
+            if any(self.can_gain(index, self._units(chunk, now)) for index in chunk.indices):
+                return True
+            self._queue.drop()
+            self._mark_done(chunk.phase, chunk.indices)
+        return self._queue.has_retries
 
     def can_gain(self, index: int, units: Iterable[Unit]) -> bool:
         """Whether a pair may have one of the units that it has not had."""
@@ -201,11 +212,32 @@ class Plan:
     def _begin(self) -> None:
         self._queue = ChunkQueue()
         self.done, self.filling = set(self._extra), set[int]()
-        self._coming = list(Phase) if any(map(self.wanted, self.records)) else []
+        self._coming = list(Phase)
+
+    def _trial(self, now: float) -> MatchJob | None:
+        """The first unit on a pair that has had it, where nothing is left but what workers were lost at.
+
+        A place that answers works: it is not closed for the pairs that kill every worker.
+        """
+        if self._peek(now) is not None or not self._queue.has_retries or now >= self.stop:
+            return None
+        for unit, record in product(self._first, self.records):
+            ran = any(found.unit == unit.name and not found.failure for found in record.units)
+            if ran and not self._queue.is_busy(record.index):
+                self._queue.under_way.add(record.index)
+                times = self._time([unit], 1, self.stop - now, exploring=False)
+                expected = (self.costs.p90(unit.name),)
+                return MatchJob(self.phase, (record.index,), (unit,), expected, *times, is_trial=True)
+        return None
+
+    def _peek(self, now: float) -> Chunk | None:
+        """The next chunk of the present phase, or of those to come."""
+        while self._queue.first is None and self._coming:
+            self._open(self._coming.pop(0), now)
+        return self._queue.first
 
     def _pop(self, place: str, now: float, *, cautious: bool) -> Chunk | None:
-        while not self._queue.has_fresh and self._coming:
-            self._open(self._coming.pop(0), now)
+        self._peek(now)
         return self._queue.pop(place, alone=self.workers < 2, cautious=cautious)
 
     def _job(
@@ -345,6 +377,8 @@ class Plan:
         that pair.
         """
         self._queue.under_way.difference_update(job.indices)
+        if job.is_trial:
+            return []
         chunk = Chunk(job.phase, job.indices, job.units, (place,))
         if len(job.indices) > 1:
             half = len(job.indices) // 2

@@ -4,6 +4,7 @@ A batch is due when all of its pairs are matched as far as time allows, and agai
 since. Pairs have the F of their own matches all the while.
 """
 
+from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import replace
 from math import ceil
@@ -72,37 +73,37 @@ class Scenes:
     ) -> None:
         self.made = {scene.batch: scene for scene in made}
         self.batches = batches_of(pairs) if recipe.scene is not None else {}
-        self.running: set[str] = set()
         self._pairs, self._recipe, self._records = pairs, recipe, records
         self._batch_of = {index: name for name, indices in self.batches.items() for index in indices}
-        self._unit_counts = {
-            name: sum(len(records[index].units) for index in indices) for name, indices in self.batches.items()
-        }
-        self._losses: dict[tuple[str, int], int] = {}
+        self._unit_counts = dict.fromkeys(self.batches, 0)
+        self._open: set[str] = set()  # to be reconstructed, for the first time or anew
+        self._running: set[str] = set()
+        self._losses: Counter[tuple[str, int]] = Counter()
         self._spent_s = self._spent_pairs = 0.0
+        for index in self._batch_of:
+            self.note_units(index, len(records[index].units))
 
     def note_units(self, index: int, change: int) -> None:
         """Record that a pair has got so many more units, or lost them."""
-        if index in self._batch_of:
-            self._unit_counts[self._batch_of[index]] += change
+        if (batch := self._batch_of.get(index)) is not None:
+            self._unit_counts[batch] += change
+            self._update(batch)
 
     def due(self, done: Collection[int], filling: Collection[int] = ()) -> str | None:
         """A batch to reconstruct now: its matches have changed since it was, and all of its pairs are ``done``.
 
-        For the first time it is while some of them get further matches (``filling``), for the second afterwards:
-        first those that were never reconstructed.
+        For the first time it is while some of them get further matches (``filling``), for the second afterwards.
         """
-        for name, indices in sorted(self.batches.items(), key=lambda batch: batch[0] in self.made):
-            outdated = name not in self.running and self._made_from(name) != self._unit_counts[name]
+        for name, indices in self.batches.items() if self._open else ():
+            is_waiting = name in self._open and name not in self._running and self._unit_counts[name] > 0
             waits_for = filling if name in self.made else ()
-            if outdated and all(index in done and index not in waits_for for index in indices):
+            if is_waiting and all(index in done and index not in waits_for for index in indices):
                 return name
         return None
 
     def needs(self, index: int) -> bool:
         """Whether a reconstruction to come wants the pair's matches."""
-        batch = self._batch_of.get(index)
-        return batch is not None and self._is_open(batch)
+        return self._batch_of.get(index) in self._open
 
     def job(self, batch: str, results_of: Callable[[int], tuple[UnitResult, ...]]) -> SceneJob:
         """The job that reconstructs a batch; ``results_of`` gives what was found on a pair."""
@@ -110,30 +111,29 @@ class Scenes:
         assert config is not None
         found = tuple(index for index in self.batches[batch] if self._records[index].sizes)
         pairs = tuple(self._batch_pair(index, results_of(index)) for index in found)
-        self.running.add(batch)
+        self._running.add(batch)
         return SceneJob(batch, found, pairs, config, recipe.focal, recipe.magsac, self._unit_counts[batch])
 
     def on_result(self, job: SceneJob, record: SceneRecord) -> None:
-        self.running.discard(job.batch)
-        self.made[job.batch] = record
         self._spent_s += max(0.0, record.seconds - START_S)
         self._spent_pairs += len(self.batches[job.batch])
+        self._settle(record)
 
     def on_failure(self, job: SceneJob, failure: str, seconds: float) -> SceneRecord | None:
         """Record a reconstruction that was lost; what to keep if it is not tried again.
 
         What was found before its pairs got further matches still stands.
         """
-        self.running.discard(job.batch)
-        losses = self._losses[job.batch, job.made_from] = self._losses.get((job.batch, job.made_from), 0) + 1
-        if losses < MAX_TRIES:
+        self._running.discard(job.batch)
+        self._losses[job.batch, job.made_from] += 1
+        if self._losses[job.batch, job.made_from] < MAX_TRIES:
             return None
         former = self.made.get(job.batch)
         if former is None or former.failure:
-            self.made[job.batch] = SceneRecord.of(job.batch, (), job.made_from, seconds, failure)
-        else:
-            self.made[job.batch] = replace(former, made_from=job.made_from)
-        return self.made[job.batch]
+            former = SceneRecord.of(job.batch, (), job.made_from, seconds, failure)
+        record = replace(former, made_from=job.made_from)
+        self._settle(record)
+        return record
 
     def time_limit(self, batch: str, limit: float) -> float:
         """Seconds after which a reconstruction hangs, in a run of ``limit`` seconds."""
@@ -142,19 +142,24 @@ class Scenes:
 
     def reserve(self, at_once: int) -> float:
         """The seconds that what is left to reconstruct will most likely take, ``at_once`` at a time."""
-        left = [self._forecast(name) for name in self.batches if self._is_open(name)]
+        left = [self._forecast(name) for name in self._open]
         return max([*left, sum(left) / at_once], default=0.0)
 
     def _forecast(self, batch: str) -> float:
         rate = FORECAST_MARGIN * self._spent_s / self._spent_pairs if self._spent_pairs else PAIR_S
         return START_S + rate * len(self.batches[batch])
 
-    def _is_open(self, batch: str) -> bool:
-        """Whether it is to be reconstructed, for the first time or anew."""
-        return batch not in self.made or self._made_from(batch) != self._unit_counts[batch]
+    def _settle(self, record: SceneRecord) -> None:
+        self._running.discard(record.batch)
+        self.made[record.batch] = record
+        self._update(record.batch)
 
-    def _made_from(self, batch: str) -> int:
-        return self.made[batch].made_from if batch in self.made else 0
+    def _update(self, batch: str) -> None:
+        made = self.made.get(batch)
+        if made is None or made.made_from != self._unit_counts[batch]:
+            self._open.add(batch)
+        else:
+            self._open.discard(batch)
 
     def _batch_pair(self, index: int, results: Sequence[UnitResult]) -> BatchPair:
         record = self._records[index]

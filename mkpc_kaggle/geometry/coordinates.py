@@ -1,11 +1,11 @@
-"""Boxes and views: the one place where pixels are converted.
+"""Boxes and views: the only place where pixels are converted.
 
 Pixel centres are at integers: the centre of the top-left pixel is (0, 0), x runs right, y runs down, and an
-image of width w covers [-0.5, w - 0.5). A resize by s maps ``x_view = (x + 0.5) * s - 0.5``, with one s for
+image of width w covers [-0.5, w - 0.5). A resize by s maps ``x_view = (x + 0.5) * s - 0.5``, with an s for
 each axis from the *actual* sizes. A crop subtracts an integer offset. Padding goes to the right and the
 bottom, so it moves nothing. A flip mirrors the resized content: ``x_view = w - 1 - x``.
 
-Networks use other conventions: :func:`from_corner` and :func:`from_normalised` convert to this one.
+Networks use other conventions: :func:`from_corner` and :func:`from_normalised` convert to this convention.
 """
 
 from dataclasses import dataclass

@@ -48,7 +48,7 @@ class RegionReason(StrEnum):
 
 @dataclass(frozen=True)
 class CriticalRegion:
-    """The box of one image that stage 2 looks at, in image pixels, and the reason for it.
+    """The box of an image that stage 2 looks at, in image pixels, and the reason for it.
 
     ``clusters`` counts the clusters found, ``kept`` those whose points span the box.
     """

@@ -1,4 +1,4 @@
-"""F of one pair under a prior on the focal lengths of its two cameras.
+"""F of a pair under a prior on the focal lengths of its two cameras.
 
 The seven degrees of freedom of F are a relative pose and two focal lengths, once the principal points are known,
 and cameras have plausible focal lengths. What is minimised over the pose and log f0, log f1 is the negative
@@ -7,7 +7,7 @@ logarithm of a posterior density,
     sum_n rho(r_n / scale) + sum_i (log f_i - log g_i)^2 / (2 sigma_i^2),     rho(x) = x^2 / (2 (1 + x^2)),
 
 r being the Sampson distance in pixels (:mod:`mkpc_kaggle.geometry.two_view`), g the focal lengths that are
-expected, and rho the loss of Geman and McClure (1985): an outlier costs a half, as much as a focal length one
+expected, and rho the loss of Geman and McClure (1985): an outlier costs a half, as much as a focal length that is
 sigma off. Where the matches determine the focal lengths they decide, elsewhere the prior does.
 
 A match whose point would lie behind a camera is an outlier, too.
@@ -63,14 +63,8 @@ class FocalConfig:
     """Settings of :func:`estimate_with_prior`, table ``[focal]`` of a recipe; without it MAGSAC is alone."""
 
     REMOVED: ClassVar = (
-        "essential_threshold",
-        "essential_iterations",
-        "essential_starts",
-        "essential_share",
-        "rough_matches",
-        "refined",
-        "most_matches",
-        "free_cost",
+        *("essential_threshold", "essential_iterations", "essential_starts", "essential_share"),
+        *("rough_matches", "refined", "most_matches", "free_cost"),
     )
 
     ratio: float = 1.1  # of an unknown focal length to the image's long side

@@ -1,4 +1,4 @@
-"""Corresponding points of one pair: always in full-image pixels outside a matcher; empty is a legal value."""
+"""Corresponding points of a pair: always in full-image pixels outside a matcher; empty is a legal value."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass

@@ -19,7 +19,7 @@ AUC_THRESHOLDS = (5.0, 10.0, 20.0)  # degrees
 
 @dataclass(frozen=True)
 class PoseError:
-    """How far an F's pose is from the truth; infinite where there is no F.
+    """How far an F's pose is from the truth; infinite where F is missing.
 
     ``rotation`` and ``translation_angle`` in degrees (the latter at most 90, as the sign is unknown),
     ``translation`` in metres after scaling to the true length; NaN where the scale of the world is unknown.
@@ -49,7 +49,7 @@ class PoseError:
 def pose_error(F: Matrix3, camera0: Camera, camera1: Camera, metres_per_unit: float) -> PoseError:
     """The error of the pose that F stands for.
 
-    The competition gets F alone, without points to tell its two rotations apart: the one nearer to the truth
+    The competition gets F alone, without points to tell its two rotations apart: the rotation nearer to the truth
     counts, and the translation's sign is free.
     """
     R, t = relative_pose(camera0, camera1)
@@ -71,7 +71,7 @@ def rotation_angle(R: Matrix3) -> float:
 
 
 def mean_average_accuracy(errors: Sequence[PoseError]) -> float:
-    """The mAA of one scene: the share of pairs within both thresholds, averaged over the ten threshold pairs.
+    """The mAA of a scene: the share of pairs within both thresholds, averaged over the ten threshold pairs.
 
     NaN without pairs. Source: evaluation page of the Image Matching Challenge 2022.
     """
@@ -81,7 +81,7 @@ def mean_average_accuracy(errors: Sequence[PoseError]) -> float:
 
 
 def pair_accuracy(error: PoseError) -> float:
-    """The share of the ten threshold pairs that one pair's error meets: its part of the mAA."""
+    """The share of the ten threshold pairs that a pair's error meets: its part of the mAA."""
     meets = (error.rotation < ROTATION_THRESHOLDS) & (error.translation < TRANSLATION_THRESHOLDS)
     return float(np.mean(meets))
 
@@ -89,7 +89,7 @@ def pair_accuracy(error: PoseError) -> float:
 def pose_auc(errors: Sequence[PoseError], threshold: float) -> float:
     """Area under the recall curve of the angular error up to ``threshold`` degrees, 0 to 1; NaN without pairs.
 
-    The curve is the piecewise linear one through (error_i, i / n), sorted, as is usual since SuperGlue.
+    The curve is piecewise linear through (error_i, i / n), sorted, as is usual since SuperGlue.
     """
     if not errors:
         return float("nan")

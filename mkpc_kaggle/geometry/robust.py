@@ -146,33 +146,28 @@ def consensus(
 
 @dataclass(frozen=True, eq=False)
 class DistinctMatches:
-    """The (M, 2) finite distinct matches among N, in order of first appearance.
+    """The finite distinct matches, (M, 2) points in order of first appearance, among N.
 
-    ``finite`` are the indices of the finite matches, ``place`` the row in ``points0`` and ``points1`` of each.
+    ``place`` (N,) is the row of each match in ``points0`` and ``points1``, -1 for a match that is not finite.
     """
 
     points0: Vectors
     points1: Vectors
-    count: int
-    finite: NDArray[np.intp]
     place: NDArray[np.intp]
 
     @classmethod
     def of(cls, matches: Matches) -> "DistinctMatches":
         pairs = np.hstack([matches.points0, matches.points1]).astype(np.float64)
-        finite = np.flatnonzero(np.isfinite(pairs).all(axis=1))
+        finite = np.isfinite(pairs).all(axis=1)
         _, first, inverse = np.unique(pairs[finite], axis=0, return_index=True, return_inverse=True)
-        order = np.argsort(first)
-        place = np.empty_like(order)
-        place[order] = np.arange(len(order))
-        pairs = pairs[finite][first[order]]
-        return cls(pairs[:, :2], pairs[:, 2:], len(matches), finite, place[inverse.ravel()])
+        place = np.full(len(pairs), -1)
+        place[finite] = np.argsort(np.argsort(first))[inverse.ravel()]
+        pairs = pairs[finite][np.sort(first)]
+        return cls(pairs[:, :2], pairs[:, 2:], place)
 
     def mask_of_all(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """An (M,) mask of the distinct matches as an (N,) mask of all: duplicates are like the first."""
-        whole = np.zeros(self.count, bool)
-        whole[self.finite] = mask[self.place]
-        return whole
+        return np.append(mask, False)[self.place]
 
 
 def unit_norm(matrix: Matrix3) -> Matrix3:

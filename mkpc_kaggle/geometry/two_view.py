@@ -39,10 +39,10 @@ class TwoView:
 
     @classmethod
     def nearest(cls, F: Matrix3, log0: float = 0.0, log1: float = 0.0) -> "TwoView":
-        """The views of these focal lengths whose E is nearest to the one that F gives with them.
+        """The views of these focal lengths whose E is nearest to the E that F gives with them.
 
-        This is one of two rotations and two signs of t; all four stand for the same F. Raises ``LinAlgError`` for
-        an F that is not finite.
+        Two rotations and two signs of t stand for the same F; this is one of the four. Raises ``LinAlgError`` if F
+        is not finite.
         """
         U, _, Vt = np.linalg.svd(F / _focal_factors(np.array([log0, log1])))
         quarter = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, np.linalg.det(U) * np.linalg.det(Vt)]])

@@ -7,11 +7,11 @@ import torch
 
 from mkpc_kaggle.config import AT_LEAST_1, SHARE, check_ranges
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.matchers.contract import MatcherSpec, Picture, Placement
+from mkpc_kaggle.matchers.contract import MatcherSpec, Placement
 from mkpc_kaggle.matchers.neighbours import mutual_neighbours
 from mkpc_kaggle.matchers.networks.aliked import Aliked, own_name
 from mkpc_kaggle.matchers.networks.placement import placed
-from mkpc_kaggle.matchers.sparse import Keypoints, image_batch, matches_of
+from mkpc_kaggle.matchers.sparse import KeypointEncoder, Keypoints, matches_of
 from mkpc_kaggle.weights import WeightStore, load_into
 
 SLOT = "aliked-n16"
@@ -19,10 +19,8 @@ SLOT = "aliked-n16"
 
 @dataclass(frozen=True)
 class AlikedOptions:
-    """``features``: the strongest kept in each picture. ``ratio`` of 1 leaves the mutual test alone."""
-
-    features: int = 2048
-    ratio: float = 1.0
+    features: int = 2048  # the strongest kept in each picture
+    ratio: float = 1.0  # of the distances to the nearest and second nearest descriptor, at most; 1: no ratio test
 
     def __post_init__(self) -> None:
         check_ranges(self, features=AT_LEAST_1, ratio=SHARE)
@@ -38,30 +36,12 @@ SPEC = MatcherSpec(
 )
 
 
-class AlikedEncoder:
-    """Keypoints of one picture, for every matcher of ALIKED's keypoints."""
-
-    def __init__(self, network: Aliked, device: str) -> None:
-        self.device = device
-        self._network = network
-
-    @torch.inference_mode()
-    def encode(self, pictures: Sequence[Picture]) -> list[Keypoints]:
-        if not pictures:
-            return []
-        found = self._network(image_batch(list(pictures), self.device))
-        return [
-            Keypoints.on_content(keypoints.points, keypoints.descriptors, picture.content)
-            for keypoints, picture in zip(found, pictures, strict=True)
-        ]
-
-
 class AlikedMatcher:
     """A match's score is the cosine of its descriptors."""
 
     spec = SPEC
 
-    def __init__(self, encoder: AlikedEncoder, options: AlikedOptions) -> None:
+    def __init__(self, encoder: KeypointEncoder, options: AlikedOptions) -> None:
         self.options = options
         self.encode = encoder.encode
 
@@ -77,11 +57,11 @@ class AlikedMatcher:
         )
 
 
-def load_encoder(weights: WeightStore, features: int, placement: Placement) -> AlikedEncoder:
-    network = Aliked(max_keypoints=features)
-    tensors = {own_name(name): tensor for name, tensor in weights.load(SLOT).items()}
-    load_into(network, tensors, what=SLOT)
-    return AlikedEncoder(placed(network, placement), placement.device)
+def load_encoder(weights: WeightStore, features: int, placement: Placement) -> KeypointEncoder:
+    """ALIKED's, for every matcher of its keypoints."""
+    network = Aliked(features)
+    load_into(network, {own_name(name): tensor for name, tensor in weights.load(SLOT).items()}, what=SLOT)
+    return KeypointEncoder(placed(network, placement), placement.device)
 
 
 def load(weights: WeightStore, options: AlikedOptions, placement: Placement) -> AlikedMatcher:

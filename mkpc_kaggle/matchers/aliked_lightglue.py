@@ -20,4 +20,4 @@ SPEC = MatcherSpec(
 def load(weights: WeightStore, options: LightGlueOptions, placement: Placement) -> LightGlueMatcher:
     encoder = load_encoder(weights, options.features, placement)
     glue = load_glue(weights, LIGHTGLUE, options.threshold, input_dim=128)
-    return LightGlueMatcher(SPEC, encoder, glue, options, placement)
+    return LightGlueMatcher(SPEC, encoder, glue, placement)

@@ -1,7 +1,7 @@
 """ASpanFormer (Chen et al. 2022). Its weights are for noncommercial use."""
 
 from mkpc_kaggle.matchers.contract import Colour, MatcherSpec, Placement, Training
-from mkpc_kaggle.matchers.networks.aspanformer import AspanFormer, AspanFormerConfig
+from mkpc_kaggle.matchers.networks.aspanformer import AspanFormer
 from mkpc_kaggle.matchers.networks.placement import placed
 from mkpc_kaggle.matchers.semi_dense import SemiDenseMatcher, SemiDenseOptions, load_network
 from mkpc_kaggle.weights import WeightStore
@@ -18,15 +18,12 @@ SPEC = MatcherSpec(
 
 
 def load(weights: WeightStore, options: SemiDenseOptions, placement: Placement) -> SemiDenseMatcher:
-    network = AspanFormer(config_of(options))
+    if options.training is Training.OUTDOOR:
+        network = AspanFormer(options.threshold)
+    else:
+        # Published for 480 x 640 only, with unscaled positions and a global level of 15 x 20 cells. At that size
+        # positions scaled to it and pooling by four are the same.
+        network = AspanFormer(options.threshold, border=0, train_size=(480, 640))
     # Checkpoints also have offsets that the published network never reads.
     load_network(network, weights, *SPEC.slots_for(options), unused=r".*\.sample_offset$")
     return SemiDenseMatcher(placed(network, placement), SPEC, placement.device)
-
-
-def config_of(options: SemiDenseOptions) -> AspanFormerConfig:
-    if options.training is Training.OUTDOOR:
-        return AspanFormerConfig(threshold=options.threshold)
-    # Published for 480 x 640 only, with unscaled positions and a global level of 15 x 20 cells. At that size our
-    # defaults, positions scaled to the training size and pooling by four, are the same.
-    return AspanFormerConfig(threshold=options.threshold, border=0, train_size=(480, 640))

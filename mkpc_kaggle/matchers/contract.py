@@ -1,12 +1,12 @@
 """The interface of matchers: each picture is encoded alone, then encodings are matched in pairs.
 
 One contract serves sparse, semi-dense and dense networks. ``encode`` does what depends on one picture
-(keypoints and descriptors, or a backbone's feature maps); its results are cached, because views of whole
+(keypoints and descriptors, or a backbone's feature maps). Its results are cached, because views of whole
 images are used in many pairs. ``match`` does the rest.
 """
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields, is_dataclass, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, fields, is_dataclass
 from enum import StrEnum
 from itertools import product
 from string import Formatter
@@ -38,9 +38,9 @@ class Precision(StrEnum):
 
 @dataclass(frozen=True)
 class Placement:
-    """Where a matcher computes, "cpu" or "cuda:0", and in which precision.
+    """The device of a matcher, "cpu" or "cuda:0", and its precision.
 
-    Softmax, transport, least squares and coordinates are float32 in any.
+    Softmax, transport, least squares and coordinates are float32 in any precision.
     """
 
     device: str = "cpu"
@@ -64,22 +64,15 @@ class NoOptions:
 
 @dataclass(frozen=True)
 class MatcherSpec:
-    """The description of a matcher, known before it is loaded.
-
-    ``multiple``: both sides of its pictures are padded to a multiple of it. ``same_size``: both pictures of a
-    pair must have one size. ``licences``: tags of its weights. ``slots``: the manifest's slots that it needs, with
-    the value of an option in place of its ``{name}``. ``options``: a frozen dataclass of its settings, which a
-    recipe's table ``[matchers.NAME]`` may change.
-    """
+    """The description of a matcher, known before it is loaded."""
 
     name: str
     summary: str
-    options: type = NoOptions
+    options: type = NoOptions  # a frozen dataclass of settings, which a recipe's table [matchers.NAME] may change
     colour: Colour = Colour.RGB
-    multiple: int = 1
-    same_size: bool = False
-    licences: tuple[str, ...] = ()
-    slots: tuple[str, ...] = ()
+    multiple: int = 1  # both sides of a picture are padded to a multiple of it
+    licences: tuple[str, ...] = ()  # tags of the weights
+    slots: tuple[str, ...] = ()  # the manifest's slots that it needs; ``{name}`` stands for that option's value
 
     def slots_for(self, options: Any) -> tuple[str, ...]:
         """The slots of the manifest that a matcher with these options is loaded from."""
@@ -87,14 +80,14 @@ class MatcherSpec:
 
     @property
     def every_slot(self) -> tuple[str, ...]:
-        """The slots of all trainings and variants: of every choice that the options name."""
-        kinds = get_type_hints(self.options)
-        found: list[str] = []
+        """The slots of all trainings and variants: of every value of the options that slots name."""
+        values = get_type_hints(self.options)
+        found: dict[str, None] = {}
         for slot in self.slots:
             names = [name for _, name, _, _ in Formatter().parse(slot) if name]
-            for choice in product(*(kinds[name] for name in names)):
-                found.append(slot.format_map(dict(zip(names, choice, strict=True))))
-        return tuple(dict.fromkeys(found))
+            for chosen in product(*(values[name] for name in names)):
+                found[slot.format_map(dict(zip(names, chosen, strict=True)))] = None
+        return tuple(found)
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +115,11 @@ class Matcher(Protocol[Encoding]):
     def spec(self) -> MatcherSpec: ...
 
     def encode(self, pictures: Sequence[Picture]) -> Sequence[Encoding]:
-        """Encodings of pictures that have one shape; dataclasses, so that their bytes can be counted."""
+        """Encodings of pictures that have one shape.
+
+        Their arrays are counted in dataclasses, tuples and lists. They should not share memory with each other,
+        because each may be cached alone.
+        """
         ...
 
     def match(self, encodings0: Sequence[Encoding], encodings1: Sequence[Encoding]) -> Sequence[Matches]:
@@ -130,18 +127,12 @@ class Matcher(Protocol[Encoding]):
         ...
 
 
-class Loader(Protocol):
-    """Builds a matcher from its weights and its options."""
-
-    def __call__(self, weights: WeightStore, options: Any, placement: Placement) -> Matcher[Any]: ...
-
-
 @dataclass(frozen=True)
 class MatcherEntry:
-    """A matcher that the registry knows."""
+    """A matcher that the registry knows; ``load`` builds it from its weights and its options."""
 
     spec: MatcherSpec
-    load: Loader
+    load: Callable[[WeightStore, Any, Placement], Matcher[Any]]
 
 
 @dataclass(frozen=True)
@@ -155,39 +146,28 @@ class Unusable:
         return f"matcher {self.name} cannot be used here ({self.reason})"
 
 
+def arrays_of(value: Any) -> Iterator[Any]:
+    """The arrays and tensors in a value: in nested dataclasses, tuples and lists."""
+    if hasattr(value, "nbytes"):
+        yield value
+    elif is_dataclass(value):
+        for field in fields(value):
+            yield from arrays_of(getattr(value, field.name))
+    elif isinstance(value, tuple | list):
+        for item in value:
+            yield from arrays_of(item)
+
+
 def encoding_bytes(encoding: Any) -> int:
-    """The bytes that an encoding keeps alive, nested dataclasses and tuples included.
+    """The bytes that an encoding keeps alive.
 
     A tensor counts with all of its storage, of which it may show a part; a storage counts once.
     """
-    return sum(dict(_allocations(encoding)).values())
-
-
-def _allocations(encoding: Any) -> Iterator[tuple[int, int]]:
-    """Address and bytes of the memory of each array and tensor."""
-    if hasattr(encoding, "untyped_storage"):
-        storage = encoding.untyped_storage()
-        yield storage.data_ptr(), storage.nbytes()
-    elif hasattr(encoding, "nbytes"):
-        yield id(encoding), int(encoding.nbytes)
-    elif is_dataclass(encoding):
-        for field in fields(encoding):
-            yield from _allocations(getattr(encoding, field.name))
-    elif isinstance(encoding, tuple | list):
-        for one in encoding:
-            yield from _allocations(one)
-
-
-def detached(encoding: Any) -> Any:
-    """The encoding, with copies of tensors that are views of a larger storage.
-
-    A view of one item would keep the whole batch in memory.
-    """
-    if hasattr(encoding, "untyped_storage"):
-        return encoding.clone() if encoding.untyped_storage().nbytes() > encoding.nbytes else encoding
-    if is_dataclass(encoding) and not isinstance(encoding, type):
-        parts = {field.name: detached(getattr(encoding, field.name)) for field in fields(encoding) if field.init}
-        return replace(encoding, **parts)
-    if type(encoding) in (tuple, list):
-        return type(encoding)(map(detached, encoding))
-    return encoding
+    memory = {}
+    for array in arrays_of(encoding):
+        if hasattr(array, "untyped_storage"):
+            storage = array.untyped_storage()
+            memory[storage.data_ptr()] = storage.nbytes()
+        else:
+            memory[id(array)] = int(array.nbytes)
+    return sum(memory.values())

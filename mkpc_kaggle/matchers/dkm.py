@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from mkpc_kaggle.matchers.contract import MatcherSpec, Placement
 from mkpc_kaggle.matchers.dense import DenseMatcher, DenseOptions
-from mkpc_kaggle.matchers.networks.dkm import DKM, DkmConfig
+from mkpc_kaggle.matchers.networks.dkm import DKM
 from mkpc_kaggle.matchers.networks.placement import placed
 from mkpc_kaggle.weights import WeightStore, load_into
 
@@ -23,7 +23,7 @@ class DkmMatcher(DenseMatcher):
 
 
 def load(weights: WeightStore, options: DkmOptions, placement: Placement) -> DkmMatcher:
-    network = DKM(DkmConfig(options.symmetric))
+    network = DKM()
     (slot,) = SPEC.slots_for(options)
     load_into(network, weights.load(slot), what=slot)
     return DkmMatcher(placed(network, placement), options, placement.device)

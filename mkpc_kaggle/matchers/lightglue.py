@@ -3,7 +3,7 @@
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from kornia.feature import LightGlue
@@ -11,40 +11,31 @@ from torch import Tensor, nn
 
 from mkpc_kaggle.config import AT_LEAST_1, SHARE, check_ranges
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.matchers.contract import MatcherSpec, Picture, Placement
+from mkpc_kaggle.matchers.contract import MatcherSpec, Placement
+from mkpc_kaggle.matchers.dtypes import check_finite
 from mkpc_kaggle.matchers.networks.placement import autocast
-from mkpc_kaggle.matchers.numbers import check_finite
-from mkpc_kaggle.matchers.sparse import Keypoints, matches_of
+from mkpc_kaggle.matchers.sparse import KeypointEncoder, Keypoints, matches_of
 from mkpc_kaggle.weights import WeightStore, load_into
 
 
 @dataclass(frozen=True)
 class LightGlueOptions:
-    """``features``: the strongest kept in each picture. ``threshold``: matches must score above it."""
-
-    features: int = 2048
-    threshold: float = 0.1
+    features: int = 2048  # the strongest kept in each picture
+    threshold: float = 0.1  # scores of matches are above it
 
     def __post_init__(self) -> None:
         check_ranges(self, features=AT_LEAST_1, threshold=SHARE)
 
 
-class Encoder(Protocol):
-    def encode(self, pictures: Sequence[Picture]) -> list[Keypoints]: ...
-
-
 class LightGlueMatcher:
     """A match's score is LightGlue's."""
 
-    def __init__(
-        self, spec: MatcherSpec, encoder: Encoder, glue: LightGlue, options: LightGlueOptions, placement: Placement
-    ) -> None:
+    def __init__(self, spec: MatcherSpec, encoder: KeypointEncoder, glue: LightGlue, placement: Placement) -> None:
         self.spec = spec
-        self.options = options
         self.placement = placement
         self.encode = encoder.encode
         self._glue = glue.eval().to(placement.device)
-        glue.transformers = nn.ModuleList(Cast(layer, placement) for layer in glue.transformers)
+        glue.transformers = nn.ModuleList(CastLayer(layer, placement) for layer in glue.transformers)
 
     @torch.inference_mode()
     def match(self, encodings0: Sequence[Keypoints], encodings1: Sequence[Keypoints]) -> list[Matches]:
@@ -55,14 +46,14 @@ class LightGlueMatcher:
             return Matches.empty()
         found = self._glue({"image0": _glue_input(keypoints0), "image1": _glue_input(keypoints1)})
         check_finite(f"scores of {self.spec.name}", found["log_assignment"])
-        pairs, scores = found["matches"][0], found["scores"][0]  # (M, 2), (M,)
-        return matches_of(keypoints0, keypoints1, pairs[:, 0], pairs[:, 1], scores)
+        index0, index1 = found["matches"][0].T
+        return matches_of(keypoints0, keypoints1, index0, index1, found["scores"][0])
 
 
-class Cast(nn.Module):
+class CastLayer(nn.Module):
     """A layer of LightGlue's in the placement's precision: float32 goes in and, as a sum with it, comes out.
 
-    Where keypoints lie, and the scores, stay float32. LightGlue itself turns off the autocast around it.
+    Positions of keypoints and scores stay float32. LightGlue itself turns off the autocast around it.
     """
 
     def __init__(self, layer: nn.Module, placement: Placement) -> None:

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from mkpc_kaggle.config import Range, check_ranges
 from mkpc_kaggle.matchers.contract import Colour, MatcherSpec, Placement, Training
-from mkpc_kaggle.matchers.networks.loftr import Loftr, LoftrConfig
+from mkpc_kaggle.matchers.networks.loftr import Loftr
 from mkpc_kaggle.matchers.networks.placement import placed
 from mkpc_kaggle.matchers.semi_dense import SemiDenseMatcher, SemiDenseOptions, load_network
 from mkpc_kaggle.weights import WeightStore
@@ -15,9 +15,7 @@ AS_PUBLISHED = -1
 
 @dataclass(frozen=True)
 class LoftrOptions(SemiDenseOptions):
-    """``border``: coarse cells along a picture's border that get no match; -1: as published, 2, indoors 0."""
-
-    border: int = AS_PUBLISHED
+    border: int = AS_PUBLISHED  # coarse cells along a picture's border that get no match; -1: 2, indoors 0
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -36,13 +34,13 @@ SPEC = MatcherSpec(
 
 
 def load(weights: WeightStore, options: LoftrOptions, placement: Placement) -> SemiDenseMatcher:
-    network = Loftr(config_of(options))
+    network = network_of(options)
     load_network(network, weights, *SPEC.slots_for(options))
     return SemiDenseMatcher(placed(network, placement), SPEC, placement.device)
 
 
-def config_of(options: LoftrOptions) -> LoftrConfig:
+def network_of(options: LoftrOptions) -> Loftr:
+    """Without weights."""
     border = BORDERS[options.training] if options.border == AS_PUBLISHED else options.border
     # The indoor weights are the later ones, trained with the corrected position encoding.
-    fixed_positions = options.training is Training.INDOOR
-    return LoftrConfig(options.threshold, border, fixed_positions=fixed_positions)
+    return Loftr(options.threshold, border, fixed_positions=options.training is Training.INDOOR)

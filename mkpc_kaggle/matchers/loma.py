@@ -15,21 +15,18 @@ from mkpc_kaggle.matchers.networks.pixels import resized
 from mkpc_kaggle.matchers.networks.placement import placed
 from mkpc_kaggle.weights import WeightStore, load_into
 
-PATCH = 14
-"""The side of the descriptor's input is a multiple of this."""
+PATCH = 14  # pixels: the side of the descriptor's input is a multiple of this
 
 
 @dataclass(frozen=True)
 class LomaOptions:
-    """The release's settings for views with a long side of 1024.
-
-    ``descriptor_scale``: the side of the descriptor's square input relative to the view's longer side, which is
-    the detector's; 784 of 1024 pixels.
-    """
+    """The release's settings for views with a long side of 1024."""
 
     variant: Variant = Variant.B
     max_keypoints: int = 2048
-    descriptor_scale: float = 0.765625
+    descriptor_scale: float = (
+        0.765625  # side of the descriptor's square input by the view's longer side: 784 / 1024
+    )
     match_threshold: float = 0.1
 
     def __post_init__(self) -> None:
@@ -46,8 +43,8 @@ SPEC = MatcherSpec(
 
 
 @dataclass(frozen=True, eq=False)
-class Encoded:
-    """The keypoints of one picture, a batch of one, and the size of its content."""
+class LomaEncoding:
+    """The keypoints of one picture, and the size of its content."""
 
     keypoints: LomaKeypoints
     content: Size
@@ -56,7 +53,7 @@ class Encoded:
 class LomaAdapter:
     """A match's score is the product of the softmax over either picture's keypoints.
 
-    Pictures and pairs are processed one by one, so that results do not depend on the batch.
+    Pictures and pairs are processed separately, so that results do not depend on the batch.
     """
 
     spec = SPEC
@@ -67,36 +64,33 @@ class LomaAdapter:
         self._network = network
 
     @torch.inference_mode()
-    def encode(self, pictures: Sequence[Picture]) -> list[Encoded]:
-        return [Encoded(self._keypoints(picture), picture.content) for picture in pictures]
+    def encode(self, pictures: Sequence[Picture]) -> list[LomaEncoding]:
+        return [LomaEncoding(self._keypoints(picture), picture.content) for picture in pictures]
 
     @torch.inference_mode()
-    def match(self, encodings0: Sequence[Encoded], encodings1: Sequence[Encoded]) -> list[Matches]:
+    def match(self, encodings0: Sequence[LomaEncoding], encodings1: Sequence[LomaEncoding]) -> list[Matches]:
         return [self._match(*pair) for pair in zip(encodings0, encodings1, strict=True)]
 
     def _keypoints(self, picture: Picture) -> LomaKeypoints:
-        content, longest = picture.content, max(picture.content)
-        detected = detector_size(content, longest)
+        content, long_side = picture.content, max(picture.content)
+        detected = detector_size(content, long_side)
         if min(detected) == 0:
-            channels = WIDTHS[self.options.variant].descriptor
-            return LomaKeypoints(torch.zeros(1, 0, 2), torch.zeros(1, 0, channels))
-        side = PATCH * max(1, round(self.options.descriptor_scale * longest / PATCH))
+            descriptor, _ = WIDTHS[self.options.variant]
+            return LomaKeypoints(*(torch.zeros(0, width, device=self.device) for width in (2, descriptor)))
+        side = PATCH * max(1, round(self.options.descriptor_scale * long_side / PATCH))
         # Without padding, which would affect the descriptors.
         pixels = torch.from_numpy(picture.pixels[: content.height, : content.width].copy()).permute(2, 0, 1)[None]
         to_detect = resized(pixels, (detected.height, detected.width)).to(self.device)
         to_describe = resized(pixels, (side, side)).to(self.device)
         return self._network.encode(to_detect, to_describe, self.options.max_keypoints)
 
-    def _match(self, encoded0: Encoded, encoded1: Encoded) -> Matches:
-        keypoints = encoded0.keypoints, encoded1.keypoints
-        found = self._network.matcher(*keypoints, self.options.match_threshold)
-        index0 = torch.nonzero(found.matches0[0] >= 0)[:, 0]
-        indices = index0, found.matches0[0, index0]
+    def _match(self, first: LomaEncoding, second: LomaEncoding) -> Matches:
+        found = self._network.matcher(first.keypoints, second.keypoints, self.options.match_threshold)
         points0, points1 = (
-            from_normalised(one.points[0, index].cpu().numpy(), encoded.content)
-            for one, index, encoded in zip(keypoints, indices, (encoded0, encoded1), strict=True)
+            from_normalised(encoding.keypoints.points[index].cpu().numpy(), encoding.content)
+            for encoding, index in ((first, found.index0), (second, found.index1))
         )
-        return Matches(points0, points1, found.scores0[0, index0].cpu().numpy())
+        return Matches(points0, points1, found.scores.cpu().numpy())
 
 
 def load(weights: WeightStore, options: LomaOptions, placement: Placement) -> LomaAdapter:

@@ -2,7 +2,7 @@
 
 from mkpc_kaggle.matchers.contract import Colour, MatcherSpec, Placement, Training
 from mkpc_kaggle.matchers.networks.placement import placed
-from mkpc_kaggle.matchers.networks.quadtree import Quadtree, QuadtreeConfig
+from mkpc_kaggle.matchers.networks.quadtree import Quadtree
 from mkpc_kaggle.matchers.semi_dense import SemiDenseMatcher, SemiDenseOptions, load_network
 from mkpc_kaggle.weights import WeightStore
 
@@ -19,6 +19,6 @@ TOPKS = {Training.OUTDOOR: (16, 8), Training.INDOOR: (32, 16)}  # as published
 
 
 def load(weights: WeightStore, options: SemiDenseOptions, placement: Placement) -> SemiDenseMatcher:
-    network = Quadtree(QuadtreeConfig(threshold=options.threshold, topks=TOPKS[options.training]))
+    network = Quadtree(options.threshold, topks=TOPKS[options.training])
     load_network(network, weights, *SPEC.slots_for(options))
     return SemiDenseMatcher(placed(network, placement), SPEC, placement.device)

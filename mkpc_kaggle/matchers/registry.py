@@ -1,11 +1,8 @@
-"""Finds the matchers: every file of this folder that defines a ``SPEC`` and a ``load``, named as the matcher."""
+"""Finds matchers by name: a file of this folder is a matcher, with a ``SPEC`` of its name and a ``load``."""
 
 import pkgutil
-import re
 from functools import cache
 from importlib import import_module
-from importlib.util import find_spec
-from pathlib import Path
 from typing import Any
 
 from mkpc_kaggle import matchers
@@ -13,12 +10,17 @@ from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.matchers.contract import Matcher, MatcherEntry, MatcherSpec, Placement, Unusable
 from mkpc_kaggle.weights import WeightStore
 
+# What matchers share.
+NOT_MATCHERS = frozenset(
+    {"contract", "dense", "dtypes", "lightglue", "neighbours", "registry", "semi_dense", "sparse", "vismatch"}
+)
+
 
 @cache
 def matcher_names() -> tuple[str, ...]:
-    """The names of all matchers, read from the files without importing one. A new matcher is a new file."""
-    modules = [info.name for info in pkgutil.iter_modules(matchers.__path__) if not info.ispkg]
-    return tuple(name for name in modules if _defines_spec(name))
+    """The names of all matchers; imports none of them. A new matcher is a new file."""
+    modules = pkgutil.iter_modules(matchers.__path__)
+    return tuple(info.name for info in modules if not info.ispkg and info.name not in NOT_MATCHERS)
 
 
 @cache
@@ -30,7 +32,7 @@ def find_matcher(name: str) -> MatcherEntry | Unusable:
     if name not in matcher_names():
         raise KeyError(name)
     try:
-        module = import_module(_module(name))
+        module = import_module(f"{matchers.__name__}.{name}")
         return MatcherEntry(module.SPEC, module.load)
     except Exception as error:  # any error at import affects this matcher only
         return Unusable(name, f"{type(error).__name__}: {error}")
@@ -49,19 +51,7 @@ def load_matcher(name: str, weights: WeightStore, options: Any, placement: Place
 def _entry(name: str, where: str) -> MatcherEntry:
     if name not in matcher_names():
         raise UserError(f"{where}: unknown matcher {name!r}; known: {', '.join(matcher_names())}")
-    found = find_matcher(name)
-    if isinstance(found, Unusable):
-        raise UserError(f"{where}: {found}. `--recipe auto` does without it.")
-    return found
-
-
-def _defines_spec(name: str) -> bool:
-    spec = find_spec(_module(name))
-    assert spec is not None
-    assert spec.origin is not None
-    source = Path(spec.origin).read_text(encoding="utf-8")
-    return re.search(r"^SPEC\b", source, re.MULTILINE) is not None
-
-
-def _module(name: str) -> str:
-    return f"{matchers.__name__}.{name}"
+    entry = find_matcher(name)
+    if isinstance(entry, Unusable):
+        raise UserError(f"{where}: {entry}. `--recipe auto` does without it.")
+    return entry

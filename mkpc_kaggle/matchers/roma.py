@@ -8,7 +8,7 @@ from mkpc_kaggle.matchers.contract import MatcherSpec, Placement
 from mkpc_kaggle.matchers.dense import DenseMatcher, DenseOptions
 from mkpc_kaggle.matchers.networks.dinov2 import PATCH
 from mkpc_kaggle.matchers.networks.placement import placed
-from mkpc_kaggle.matchers.networks.roma import RoMa, RomaConfig
+from mkpc_kaggle.matchers.networks.roma import RoMa
 from mkpc_kaggle.weights import WeightStore, load_into
 
 
@@ -34,13 +34,13 @@ SPEC = MatcherSpec(
 
 class RomaMatcher(DenseMatcher):
     spec = SPEC
-    multiple, least = PATCH, 8
+    multiple, min_side_px = PATCH, 8
 
 
 def load(weights: WeightStore, options: RomaOptions, placement: Placement) -> RomaMatcher:
     own, backbone = SPEC.slots_for(options)
     with torch.device("meta"):
-        network = RoMa(RomaConfig(options.symmetric))
+        network = RoMa()
     tensors = {f"dinov2.{name}": tensor for name, tensor in weights.load(backbone).items()}
     load_into(network, tensors | weights.load(own), what=f"{own} with {backbone}")
     return RomaMatcher(placed(network, placement), options, placement.device)

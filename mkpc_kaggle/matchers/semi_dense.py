@@ -13,23 +13,19 @@ from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Size, from_corner
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import MatcherSpec, Picture, Training
-from mkpc_kaggle.matchers.networks.fine_matching import COARSE_STRIDE, SemiDenseMatches
+from mkpc_kaggle.matchers.networks.fine_matching import COARSE_STRIDE
 from mkpc_kaggle.matchers.networks.resnet_fpn import FeatureMaps
 from mkpc_kaggle.matchers.networks.semi_dense import SemiDenseNetwork
 from mkpc_kaggle.matchers.sparse import image_batch
 from mkpc_kaggle.weights import WeightStore, load_into
 
-PREFIX = "matcher."
-"""The prefix of parameter names in the published training checkpoints."""
-TRANSPORT = "coarse_matching.bin_score"
-"""Only in checkpoints of networks with optimal transport."""
+PREFIX = "matcher."  # of parameter names in the published training checkpoints
+TRANSPORT = "coarse_matching.bin_score"  # only in checkpoints of networks with optimal transport
 
 
 @dataclass(frozen=True)
 class SemiDenseOptions:
-    """``threshold``: a match's confidence is above it."""
-
-    threshold: float = 0.2
+    threshold: float = 0.2  # a match's confidence is above it
     training: Training = Training.OUTDOOR
 
     def __post_init__(self) -> None:
@@ -37,7 +33,7 @@ class SemiDenseOptions:
 
 
 @dataclass(frozen=True, eq=False)
-class Encoded:
+class SemiDenseEncoding:
     """A picture's feature maps, a batch of one, and the size of its content."""
 
     maps: FeatureMaps
@@ -47,8 +43,16 @@ class Encoded:
     def padded(self) -> bool:
         """Whether there are coarse cells without content."""
         height, width = self.maps.coarse.shape[2:]
-        filled = (ceil(side / COARSE_STRIDE) for side in self.content)
-        return (width, height) != tuple(filled)
+        return (width, height) != tuple(ceil(side / COARSE_STRIDE) for side in self.content)
+
+    @property
+    def mask(self) -> Tensor:
+        """(1, h, w) bool, True for the coarse cells whose top-left pixel is content."""
+        height, width = (
+            torch.arange(count, device=self.maps.coarse.device) * COARSE_STRIDE < side
+            for count, side in zip(self.maps.coarse.shape[2:], reversed(self.content), strict=True)
+        )
+        return (height[:, None] & width)[None]
 
 
 class SemiDenseMatcher:
@@ -60,63 +64,31 @@ class SemiDenseMatcher:
         self._network = network
 
     @torch.inference_mode()
-    def encode(self, pictures: Sequence[Picture]) -> list[Encoded]:
+    def encode(self, pictures: Sequence[Picture]) -> list[SemiDenseEncoding]:
         if not pictures:
             return []
-        maps = self._network.encode(image_batch(list(pictures), self.device))
+        maps = self._network.encode(image_batch(pictures, self.device))
+        if len(pictures) == 1:
+            return [SemiDenseEncoding(maps, pictures[0].content)]
+        # Copies: a part of a map would keep all of it in memory.
         singles = zip(torch.split(maps.coarse, 1), torch.split(maps.fine, 1), strict=True)
         return [
-            Encoded(FeatureMaps(*single), picture.content)
-            for single, picture in zip(singles, pictures, strict=True)
+            SemiDenseEncoding(FeatureMaps(coarse.clone(), fine.clone()), picture.content)
+            for (coarse, fine), picture in zip(singles, pictures, strict=True)
         ]
 
     @torch.inference_mode()
-    def match(self, encodings0: Sequence[Encoded], encodings1: Sequence[Encoded]) -> list[Matches]:
-        pairs = list(zip(encodings0, encodings1, strict=True))
-        alike: dict[tuple[Any, ...], list[int]] = {}
-        for number, pair in enumerate(pairs):
-            # Even a mask that is all True can change rounding, so padded pairs get batches of their own.
-            padded = any(encoded.padded for encoded in pair)
-            alike.setdefault((padded, *(encoded.maps.coarse.shape for encoded in pair)), []).append(number)
-        found = {
-            number: matches
-            for (padded, *_), numbers in alike.items()
-            for number, matches in zip(numbers, self._match([pairs[n] for n in numbers], padded), strict=True)
-        }
-        return [found[number] for number in range(len(pairs))]
+    def match(
+        self, encodings0: Sequence[SemiDenseEncoding], encodings1: Sequence[SemiDenseEncoding]
+    ) -> list[Matches]:
+        return [self._match(*pair) for pair in zip(encodings0, encodings1, strict=True)]
 
-    def _match(self, pairs: list[tuple[Encoded, Encoded]], padded: bool) -> list[Matches]:
-        """Pairs of one shape, in one batch."""
-        side0, side1 = zip(*pairs, strict=True)
-        masks = torch.cat([*map(content_mask, side0)]), torch.cat([*map(content_mask, side1)])
-        found = self._network.match(stacked(side0), stacked(side1), masks if padded else None)
-        return to_matches(found, len(pairs))
-
-
-def stacked(encodings: Sequence[Encoded]) -> FeatureMaps:
-    """Maps of one shape as one batch."""
-    if len(encodings) == 1:
-        return encodings[0].maps
-    coarse, fine = ([getattr(one.maps, name) for one in encodings] for name in ("coarse", "fine"))
-    return FeatureMaps(torch.cat(coarse), torch.cat(fine))
-
-
-def content_mask(encoded: Encoded) -> Tensor:
-    """(1, h, w) bool, True for the coarse cells whose top-left pixel is content."""
-    height, width = encoded.maps.coarse.shape[2:]
-    rows, columns = (
-        torch.arange(count, device=encoded.maps.coarse.device) * COARSE_STRIDE < side
-        for count, side in ((height, encoded.content.height), (width, encoded.content.width))
-    )
-    return (rows[:, None] & columns)[None]
-
-
-def to_matches(found: SemiDenseMatches, pairs: int) -> list[Matches]:
-    """The matches of each pair of the batch, in view pixels."""
-    points0, points1 = (from_corner(points.float().cpu().numpy()) for points in (found.points0, found.points1))
-    matches = Matches(points0, points1, found.coarse.confidence.float().cpu().numpy())
-    batch = found.coarse.batch.cpu().numpy()
-    return [matches[batch == pair] for pair in range(pairs)]
+    def _match(self, first: SemiDenseEncoding, second: SemiDenseEncoding) -> Matches:
+        # Even a mask that is all True can change rounding.
+        masks = (first.mask, second.mask) if first.padded or second.padded else None
+        found = self._network.match(first.maps, second.maps, masks)
+        points0, points1 = (from_corner(points.float().cpu().numpy()) for points in (found.points0, found.points1))
+        return Matches(points0, points1, found.coarse.confidence.float().cpu().numpy())
 
 
 def load_network(network: SemiDenseNetwork[Any], weights: WeightStore, slot: str, *, unused: str = "$^") -> None:

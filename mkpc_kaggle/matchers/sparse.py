@@ -1,5 +1,6 @@
-"""Shared by keypoint matchers: the encoding of a picture, and matches from pairs of indices."""
+"""Shared by keypoint matchers: the keypoints of a picture, an encoder, matches from pairs of indices."""
 
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,6 +10,9 @@ from torch import Tensor
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import Picture
+
+# Images (B, 3, H, W) -> the points (K, 2) in pixels and unit descriptors (K, D) of each.
+Detector = Callable[[Tensor], Iterable[tuple[Tensor, Tensor]]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,6 +34,24 @@ class Keypoints:
         return len(self.points)
 
 
+class KeypointEncoder:
+    """The keypoints that a detector on this device finds in the content of pictures."""
+
+    def __init__(self, detect: Detector, device: str) -> None:
+        self._detect = detect
+        self._device = device
+
+    @torch.inference_mode()
+    def encode(self, pictures: Sequence[Picture]) -> list[Keypoints]:
+        if not pictures:
+            return []
+        found = self._detect(image_batch(pictures, self._device))
+        return [
+            Keypoints.on_content(points.float(), descriptors.float(), picture.content)
+            for (points, descriptors), picture in zip(found, pictures, strict=True)
+        ]
+
+
 def matches_of(
     keypoints0: Keypoints, keypoints1: Keypoints, index0: Tensor, index1: Tensor, scores: Tensor
 ) -> Matches:
@@ -39,7 +61,7 @@ def matches_of(
     )
 
 
-def image_batch(pictures: list[Picture], device: str) -> Tensor:
+def image_batch(pictures: Sequence[Picture], device: str) -> Tensor:
     """Pictures of one shape as float32 in [0, 1]: (B, 3, H, W) from RGB, (B, 1, H, W) from gray."""
     stacked = np.stack([picture.pixels for picture in pictures])
     batch = torch.from_numpy(stacked).to(device)

@@ -6,12 +6,11 @@ from dataclasses import dataclass
 import torch
 
 from mkpc_kaggle.config import AT_LEAST_0, AT_LEAST_1, SHARE, check_ranges
-from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import Colour, MatcherSpec, Picture, Placement, Training
 from mkpc_kaggle.matchers.networks.placement import placed
-from mkpc_kaggle.matchers.networks.superglue import ImageKeypoints, SuperGlue, SuperGlueConfig
-from mkpc_kaggle.matchers.networks.superpoint import SuperPoint, SuperPointConfig, SuperPointKeypoints
+from mkpc_kaggle.matchers.networks.superglue import SuperGlue
+from mkpc_kaggle.matchers.networks.superpoint import SuperPoint, SuperPointKeypoints
 from mkpc_kaggle.matchers.sparse import image_batch
 from mkpc_kaggle.weights import WeightStore, load_into
 
@@ -44,16 +43,6 @@ SPEC = MatcherSpec(
     licences=("Magic-Leap-noncommercial",),
     slots=("superpoint", "superglue-{training}"),
 )
-LEAST_SIDE = 8
-"""Pixels: SuperPoint needs at least one cell."""
-
-
-@dataclass(frozen=True, eq=False)
-class Encoded:
-    """The keypoints of one picture, and the size of the picture that they were found on."""
-
-    keypoints: SuperPointKeypoints
-    size: Size
 
 
 class SuperGlueMatcher:
@@ -66,40 +55,28 @@ class SuperGlueMatcher:
         self._superpoint = superpoint
         self._superglue = superglue
 
-    def encode(self, pictures: Sequence[Picture]) -> list[Encoded]:
-        if any(min(picture.content) < LEAST_SIDE for picture in pictures):
-            nothing = SuperPointKeypoints(torch.zeros(0, 2), torch.zeros(0), torch.zeros(0, 256))
-            return [Encoded(nothing, picture.content) for picture in pictures]
+    @torch.inference_mode()
+    def encode(self, pictures: Sequence[Picture]) -> list[SuperPointKeypoints]:
         if not pictures:
             return []
-        found = self._superpoint(image_batch(list(pictures), self.device))
-        return [Encoded(keypoints, picture.content) for keypoints, picture in zip(found, pictures, strict=True)]
+        found: list[SuperPointKeypoints] = self._superpoint(image_batch(pictures, self.device))
+        return found
 
-    def match(self, encodings0: Sequence[Encoded], encodings1: Sequence[Encoded]) -> list[Matches]:
+    @torch.inference_mode()
+    def match(
+        self, encodings0: Sequence[SuperPointKeypoints], encodings1: Sequence[SuperPointKeypoints]
+    ) -> list[Matches]:
         return [self._match(*pair) for pair in zip(encodings0, encodings1, strict=True)]
 
-    def _match(self, encoded0: Encoded, encoded1: Encoded) -> Matches:
-        if len(encoded0.keypoints.points) == 0 or len(encoded1.keypoints.points) == 0:
-            return Matches.empty()
-        found = self._superglue(_as_pair(encoded0), _as_pair(encoded1))
-        index0 = torch.nonzero(found.matches0[0] >= 0)[:, 0]
-        points = encoded0.keypoints.points[index0], encoded1.keypoints.points[found.matches0[0, index0]]
-        return Matches(points[0].cpu().numpy(), points[1].cpu().numpy(), found.scores0[0, index0].cpu().numpy())
-
-
-def _as_pair(encoded: Encoded) -> ImageKeypoints:
-    """The keypoints as a batch of one."""
-    keypoints = encoded.keypoints
-    return ImageKeypoints(
-        keypoints.points[None], keypoints.scores[None], keypoints.descriptors[None], encoded.size
-    )
+    def _match(self, keypoints0: SuperPointKeypoints, keypoints1: SuperPointKeypoints) -> Matches:
+        found = self._superglue(keypoints0, keypoints1)
+        points0, points1 = keypoints0.points[found.index0], keypoints1.points[found.index1]
+        return Matches(points0.cpu().numpy(), points1.cpu().numpy(), found.scores.cpu().numpy())
 
 
 def load(weights: WeightStore, options: SuperGlueOptions, placement: Placement) -> SuperGlueMatcher:
-    superpoint = SuperPoint(
-        SuperPointConfig(options.nms_radius, options.keypoint_threshold, options.max_keypoints)
-    )
-    superglue = SuperGlue(SuperGlueConfig(options.sinkhorn_iterations, options.match_threshold))
+    superpoint = SuperPoint(options.nms_radius, options.keypoint_threshold, options.max_keypoints)
+    superglue = SuperGlue(options.sinkhorn_iterations, options.match_threshold)
     for network, slot in zip((superpoint, superglue), SPEC.slots_for(options), strict=True):
         load_into(network, weights.load(slot), what=slot)
-    return SuperGlueMatcher(placed(superpoint.eval(), placement), placed(superglue, placement), placement.device)
+    return SuperGlueMatcher(placed(superpoint, placement), placed(superglue, placement), placement.device)

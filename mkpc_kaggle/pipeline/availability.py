@@ -23,7 +23,7 @@ class Licence(StrEnum):
     PERMISSIVE = "permissive"  # those that may be used for any purpose: Apache-2.0, BSD-3-Clause, MIT
 
 
-class Cause(StrEnum):
+class UnavailableKind(StrEnum):
     """The kinds of reasons, as a summary tells them."""
 
     NOT_IMPORTABLE = "cannot be used here"
@@ -33,14 +33,14 @@ class Cause(StrEnum):
 
 
 @dataclass(frozen=True)
-class Reason:
+class UnavailableReason:
     """Why a matcher is unavailable; ``detail`` are the error, the licences, or the files that would do."""
 
-    cause: Cause
+    kind: UnavailableKind
     detail: str
 
     def __str__(self) -> str:
-        return f"{self.cause} ({self.detail})"
+        return f"{self.kind} ({self.detail})"
 
 
 def unavailable(
@@ -50,7 +50,7 @@ def unavailable(
     own: Mapping[str, Matcher[Any]] = MappingProxyType({}),
     *,
     load: bool = False,
-) -> dict[str, Reason]:
+) -> dict[str, UnavailableReason]:
     """Why matchers of the recipe cannot run here, by their names; fallbacks included.
 
     ``own`` are the user's ready matchers, which bring their weights along. With ``load``, weights whose digest is
@@ -58,16 +58,16 @@ def unavailable(
     option.
     """
 
-    def not_permitted(tags: Iterable[str]) -> Reason | None:
+    def not_permitted(tags: Iterable[str]) -> UnavailableReason | None:
         others = sorted(set(tags) - PERMISSIVE_TAGS) if licence is Licence.PERMISSIVE else []
-        return Reason(Cause.NOT_PERMITTED, ", ".join(others)) if others else None
+        return UnavailableReason(UnavailableKind.NOT_PERMITTED, ", ".join(others)) if others else None
 
-    def reason_of(name: str) -> Reason | None:
+    def reason_for(name: str) -> UnavailableReason | None:
         if name in own:
             return not_permitted(own[name].spec.licences)
         entry = find_matcher(name) if name in matcher_names() else None
         if isinstance(entry, Unusable):
-            return Reason(Cause.NOT_IMPORTABLE, entry.reason)
+            return UnavailableReason(UnavailableKind.NOT_IMPORTABLE, entry.reason)
         options = options_of(recipe, name)
         spec = spec_of(name, f"recipe {recipe.name!r}")
         found = {slot: store.find(slot) for slot in spec.slots_for(options)}
@@ -75,16 +75,16 @@ def unavailable(
         if reason := not_permitted([*spec.licences, *(file.file.licence for file in files)]):
             return reason
         if missing := [slot for slot, file in found.items() if file is None]:
-            return Reason(Cause.NO_WEIGHTS, missing_files(missing, store))
+            return UnavailableReason(UnavailableKind.NO_WEIGHTS, missing_files(missing, store))
         try:
             if load and any(file.state is State.UNVERIFIED for file in files):
                 load_matcher(name, store, options, Placement())
         except UserError as error:
-            return Reason(Cause.UNREADABLE, str(error))
+            return UnavailableReason(UnavailableKind.UNREADABLE, str(error))
         return None
 
     names = [name for unit in recipe.units for name in (unit.matcher, unit.fallback) if name]
-    found = {name: reason_of(name) for name in dict.fromkeys(names)}
+    found = {name: reason_for(name) for name in dict.fromkeys(names)}
     return {name: reason for name, reason in found.items() if reason is not None}
 
 
@@ -93,29 +93,29 @@ def missing_files(slots: Iterable[str], store: WeightStore) -> str:
     return "; ".join(f"{slot}: {' or '.join(file.name for file in store.alternatives(slot))}" for slot in slots)
 
 
-def refusal(recipe: Recipe, reasons: Mapping[str, Reason]) -> UserError:
-    """The error of a recipe that cannot do without these matchers: the first cause, and what to do about it."""
-    cause = next(iter(reasons.values())).cause
-    those = "; ".join(f"{name} ({reason.detail})" for name, reason in reasons.items() if reason.cause is cause)
-    if cause is Cause.NOT_PERMITTED:
+def refusal(recipe: Recipe, reasons: Mapping[str, UnavailableReason]) -> UserError:
+    """The error of a recipe that cannot do without these matchers: the first kind, and what to do about it."""
+    first, kind = next((name, reason.kind) for name, reason in reasons.items())
+    those = "; ".join(f"{name} ({reason.detail})" for name, reason in reasons.items() if reason.kind is kind)
+    if kind is UnavailableKind.NOT_PERMITTED:
         return UserError(
             f"--licence permissive refuses recipe {recipe.name!r} for the weights of {those}. Take a recipe "
             "without them, such as permissive, or --recipe auto, which leaves them out."
         )
-    if cause is Cause.NO_WEIGHTS:
+    if kind is UnavailableKind.NO_WEIGHTS:
         return UserError(
             f"recipe {recipe.name!r} needs weights that were not found: {those}. Name their directory with "
             "--weights, or use --recipe auto, which does with what there is."
         )
-    return UserError(f"recipe {recipe.name!r}: matcher {those} {cause}. `--recipe auto` does without it.")
+    return UserError(f"recipe {recipe.name!r}: matcher {first} {reasons[first]}. `--recipe auto` does without it.")
 
 
-def by_cause(reasons: Mapping[str, Reason]) -> tuple[str, ...]:
-    """The matchers of each cause, for a summary, such as "no weights: loma, superglue"."""
-    names: dict[Cause, list[str]] = {}
+def by_kind(reasons: Mapping[str, UnavailableReason]) -> tuple[str, ...]:
+    """The matchers of each kind, for a summary, such as "no weights: loma, superglue"."""
+    names: dict[UnavailableKind, list[str]] = {}
     for name, reason in reasons.items():
-        names.setdefault(reason.cause, []).append(name)
-    return tuple(f"{cause}: {', '.join(matchers)}" for cause, matchers in names.items())
+        names.setdefault(reason.kind, []).append(name)
+    return tuple(f"{kind}: {', '.join(matchers)}" for kind, matchers in names.items())
 
 
 def options_of(recipe: Recipe, name: str) -> Any:

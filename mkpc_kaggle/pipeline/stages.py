@@ -18,8 +18,8 @@ from mkpc_kaggle.data.images import Image
 from mkpc_kaggle.geometry.coordinates import Box, Size, View
 from mkpc_kaggle.geometry.critical_region import critical_region
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.matchers.contract import Colour, Matcher, NonFiniteError, Picture, detached, encoding_bytes
-from mkpc_kaggle.matchers.numbers import check_finite, exact_float32
+from mkpc_kaggle.matchers.contract import Colour, Matcher, NonFiniteError, Picture, encoding_bytes
+from mkpc_kaggle.matchers.dtypes import check_finite, exact_float32
 from mkpc_kaggle.pipeline.failures import Failure, failure_of, reason_of
 from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult
 from mkpc_kaggle.recipe import Recipe, Unit
@@ -172,8 +172,7 @@ class Pipeline:
         for (key, (image, view)), encoding in zip(items.items(), encodings, strict=True):
             encoded[key] = encoding
             if view.crop == Box.whole(image.size):  # a crop is one pair's own: no other will ask for it
-                encoded[key] = detached(encoding)
-                self._encodings.put(key, encoded[key], encoding_bytes(encoded[key]))
+                self._encodings.put(key, encoding, encoding_bytes(encoding))
         return encoded
 
     def _matcher(self, name: str) -> Matcher[Any]:

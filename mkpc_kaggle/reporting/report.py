@@ -78,8 +78,7 @@ def report_page(log: RunLog, pairs: Sequence[Pair] = (), *, undrawn: str = "") -
     if not undrawn and find_spec("matplotlib") is None:
         undrawn = "matplotlib is not installed: pip install 'mkpc-kaggle[plots]'"
     sources = {} if undrawn else {pair.id: pair for pair in pairs}
-    placed = [scene for scene in log.scenes if scene.placed]
-    largest = sorted(placed, key=lambda scene: -scene.placed)[:MAX_SCENES]
+    largest = sorted((s for s in log.scenes if s.placed), key=lambda scene: -scene.placed)[:MAX_SCENES]
     has_jobs = any(event.kind == EventKind.JOB for event in log.session)
     pages = Environment(loader=PackageLoader("mkpc_kaggle.reporting"), autoescape=True, undefined=StrictUndefined)
     return pages.get_template("report.html").render(

@@ -15,13 +15,12 @@ from mkpc_kaggle.scene.shared_intrinsics import SharedIntrinsics
 from mkpc_kaggle.scene.view_graph import BatchPair
 
 MAX_DISAGREEMENT_DEG = 5.0  # between the rotations that are averaged over reconstructions
-CONTRADICTION_ERROR_PX = 2.0
-CONTRADICTION_MATCHES = 30
-CONTRADICTION_SHARE = 0.05
+CONTRADICTION_ERROR_PX = 2.0  # Sampson's distance within which a match agrees with an F
+CONTRADICTION_MATCHES = 30  # that agree with the pair's own F
+CONTRADICTION_SHARE = 0.05  # as many of them have to agree with the scene's F
 FOCAL_SIGMA = 0.1  # standard deviation of the logarithm of a focal length that the scene found
 
-ModelImages: TypeAlias = Mapping[str, RegisteredImage]
-"""The registered images of one model, by digest."""
+ModelImages: TypeAlias = Mapping[str, RegisteredImage]  # the registered images of a model, by digest
 
 
 class Reason(StrEnum):
@@ -61,10 +60,8 @@ def choose(pair: BatchPair, reconstructions: Sequence[Sequence[ModelImages]]) ->
     holding = [[model for model in models if model.keys() >= set(digests)] for models in reconstructions]
     cameras = [(models[0][digests[0]].camera, models[0][digests[1]].camera) for models in holding if models]
     if not cameras:
-        registered = {
-            digest for models in reconstructions for model in models for digest in digests if digest in model
-        }
-        return Choice(None, Reason.APART if len(registered) == 2 else Reason.UNREGISTERED)
+        registered = {digest for models in reconstructions for model in models for digest in model}
+        return Choice(None, Reason.APART if registered >= set(digests) else Reason.UNREGISTERED)
     try:
         both = cameras[0] if len(cameras) == 1 else mean_cameras(cameras, MAX_DISAGREEMENT_DEG)
         F = fundamental_of_cameras(*both)
@@ -76,9 +73,8 @@ def choose(pair: BatchPair, reconstructions: Sequence[Sequence[ModelImages]]) ->
 def contradicts(F: Matrix3, pair: BatchPair) -> bool:
     """Whether far fewer of the pair's matches agree with the scene's F than with its own.
 
-    To agree is to be within ``CONTRADICTION_ERROR_PX`` by Sampson's distance. A pair's own F always has more of
-    its own matches. On a facade that repeats itself it may have many times as many and be wrong: only a share of
-    next to nothing counts against the scene.
+    A pair's own F always has more of its matches. On a facade that repeats itself it may have many times as many
+    and be wrong: only a share of next to nothing counts against the scene.
     """
     if pair.pair_fundamental is None:
         return False

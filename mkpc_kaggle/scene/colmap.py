@@ -10,42 +10,51 @@ another order each time, and the last digits differ.
 Sources: Schoenberger and Frahm 2016 (the incremental mapper), Pan et al. 2024 (the global one).
 """
 
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
 import pycolmap
+from numpy.typing import NDArray
 
 from mkpc_kaggle.geometry.cameras import Camera
-from mkpc_kaggle.scene.config import CameraModel, Mapper, SceneConfig
+from mkpc_kaggle.scene.config import CameraModel, SceneConfig
 from mkpc_kaggle.scene.keypoints import SceneKeypoints, scene_keypoints
-from mkpc_kaggle.scene.reconstruction import MIN_IMAGES, RegisteredImage, SfmModel
+from mkpc_kaggle.scene.reconstruction import MIN_IMAGES, Reconstruction, RegisteredImage, SfmModel, filter_models
 from mkpc_kaggle.scene.shared_intrinsics import SharedIntrinsics
-from mkpc_kaggle.scene.view_graph import MIN_MATCHES, BatchImage, ViewGraph
+from mkpc_kaggle.scene.view_graph import MIN_MATCHES, BatchImage, Edge, ViewGraph
 
 CENTRE_PX = 0.5  # in COLMAP the top-left pixel's centre is (0.5, 0.5), here it is (0, 0)
 PRIOR_FOCAL = 1.1  # long sides of the image: the focal length that cameras start with
+MAX_ERROR_PX = 1.0  # of a verified match
+MAX_TRIALS = 300  # of RANSAC for an edge: more find the same inliers at five times the cost
+LARGE = 100  # images; a larger scene has the cost of all its tracks, a smaller one their accuracy
+TRACKS_PER_IMAGE = 200  # that the global mapper keeps at first in a large scene, the longest
+MIN_REGISTERED = 0.85  # share of a small scene's images below which the other mapper is asked
 SEED = 0
 
 
-def structure_from_motion(graph: ViewGraph, config: SceneConfig, shared: SharedIntrinsics) -> tuple[SfmModel, ...]:
-    """The models that pycolmap makes of connected images, the largest first; perhaps none.
+def structure_from_motion(graph: ViewGraph, config: SceneConfig, shared: SharedIntrinsics) -> Reconstruction:
+    """What pycolmap makes of connected images; perhaps no model.
 
     Each image has a camera of its own, except those with ``shared`` intrinsics, which start at the shared focal
-    length.
+    length. The global mapper goes first. Where it leaves many images of a small scene without a camera, the
+    incremental one is asked too, and the reconstruction in which images see points more often stays.
     """
     pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
     pycolmap.set_random_seed(SEED)
-    keypoints, manager = scene_keypoints(graph), pycolmap.ReconstructionManager()
+    keypoints = scene_keypoints(graph)
     with pycolmap.Database.open(":memory:") as database:
         with pycolmap.DatabaseTransaction(database):
             cameras = _write_images(database, graph, keypoints, config.camera_model, shared)
-            _write_verified(database, graph, keypoints, cameras, config)
-        if config.mapper is Mapper.INCREMENTAL:
-            pycolmap.IncrementalPipeline(_incremental_options(config), database, manager).run()
-        else:
-            pycolmap.GlobalPipeline(_global_options(config), database, manager).run()
-    models = [_sfm_model(manager.get(number), graph) for number in range(manager.size())]
-    return tuple(sorted(models, key=lambda model: (-len(model.images), -len(model.points))))
+            for edge, geometry in zip(graph.edges, verify(graph, keypoints, cameras, config), strict=True):
+                database.write_two_view_geometry(edge.first + 1, edge.second + 1, geometry)
+        images = len(graph.images)
+        found = run_mapper(pycolmap.GlobalPipeline, _global_options(images, config), database, graph)
+        if images > LARGE or found.registered >= MIN_REGISTERED * images:
+            return found
+        other = run_mapper(pycolmap.IncrementalPipeline, _incremental_options(config), database, graph)
+        return max(found, other, key=lambda each: each.observations)
 
 
 def _write_images(
@@ -87,22 +96,34 @@ def _write_camera(database: Any, number: int, image: BatchImage, model: CameraMo
     return camera
 
 
-def _write_verified(
-    database: Any, graph: ViewGraph, keypoints: SceneKeypoints, cameras: list[Any], config: SceneConfig
-) -> None:
-    """Write the matches of each edge that agree on an epipolar geometry."""
+def verify(graph: ViewGraph, keypoints: SceneKeypoints, cameras: list[Any], config: SceneConfig) -> list[Any]:
+    """The epipolar geometry of each edge, with the matches that agree on it."""
     options = pycolmap.TwoViewGeometryOptions()
-    options.ransac.max_error = config.verification_error
+    options.ransac.max_error = MAX_ERROR_PX
+    options.ransac.max_num_trials = MAX_TRIALS
     options.ransac.random_seed = SEED
     options.min_num_inliers = MIN_MATCHES
     options.detect_watermark = False  # it looks for matches that stand still, of which near views have many
     points = [found.astype(np.float64) + CENTRE_PX for found in keypoints.points]
-    for edge, matches in zip(graph.edges, keypoints.matches, strict=True):
+
+    def of_edge(edge: Edge, matches: NDArray[np.uint32]) -> Any:
         first, second = edge.first, edge.second
-        found = pycolmap.estimate_two_view_geometry(
-            cameras[first], points[first], cameras[second], points[second], matches, options
-        )
-        database.write_two_view_geometry(first + 1, second + 1, found)
+        ends = cameras[first], points[first], cameras[second], points[second]
+        return pycolmap.estimate_two_view_geometry(*ends, matches, options)
+
+    with ThreadPoolExecutor(config.threads) as pool:
+        return list(pool.map(of_edge, graph.edges, keypoints.matches))
+
+
+def run_mapper(pipeline: Any, options: Any, database: Any, graph: ViewGraph) -> Reconstruction:
+    """The plausible models that a mapper makes of what the database holds."""
+    manager = pycolmap.ReconstructionManager()
+    pipeline(options, database, manager).run()
+    models, rejections = filter_models(
+        [_sfm_model(manager.get(number), graph) for number in range(manager.size())]
+    )
+    failure = "" if models else "no plausible model came of the matches"
+    return Reconstruction(tuple(image.name for image in graph.images), models, rejections, failure)
 
 
 def _incremental_options(config: SceneConfig) -> Any:
@@ -111,10 +132,12 @@ def _incremental_options(config: SceneConfig) -> Any:
     return _with_common(options, config, options.mapper, options.triangulation)
 
 
-def _global_options(config: SceneConfig) -> Any:
+def _global_options(images: int, config: SceneConfig) -> Any:
     options = pycolmap.GlobalPipelineOptions()
     mapper = options.mapper
     mapper.num_threads = config.threads
+    if images > LARGE:
+        mapper.track_required_tracks_per_view = TRACKS_PER_IMAGE
     parts = mapper, mapper.rotation_averaging, mapper.global_positioning, mapper.retriangulation
     return _with_common(options, config, *parts)
 

@@ -4,14 +4,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import ClassVar
 
-from mkpc_kaggle.config import AT_LEAST_0, AT_LEAST_1, POSITIVE, check_ranges
-
-
-class Mapper(StrEnum):
-    """The two mappers of pycolmap: image by image, or all rotations and then all positions at once."""
-
-    INCREMENTAL = "incremental"
-    GLOBAL = "global"
+from mkpc_kaggle.config import AT_LEAST_0, AT_LEAST_1, check_ranges
 
 
 class CameraModel(StrEnum):
@@ -25,9 +18,7 @@ class CameraModel(StrEnum):
 class SceneConfig:
     """Settings of :func:`mkpc_kaggle.scene.reconstruct.reconstruct_batch` and the batch's view graph."""
 
-    mapper: Mapper = Mapper.GLOBAL
     camera_model: CameraModel = CameraModel.PINHOLE
-    verification_error: float = 1.0  # pixels: the largest error of a verified match
     each_matcher: bool = True  # also reconstruct each matcher's matches alone; a pair gets the mean of its cameras
     shared_intrinsics: float = 0.02  # images of one size share a camera if most focals are this close; 0: never
     pairs_per_image: float = 5.0  # a batch with fewer pairs gets extra pairs, for its scene alone; 0: none
@@ -35,17 +26,11 @@ class SceneConfig:
 
     RENAMED: ClassVar = {"one_camera": "shared_intrinsics"}
     REMOVED: ClassVar = frozenset((
-        "cell", "least_tracks", "agreement", "one_camera_images", "one_camera_weak", "one_camera_points",
+        "mapper", "cell", "least_tracks", "agreement", "one_camera_images", "one_camera_weak", "one_camera_points",
         "least_inliers", "prior_focal", "least_images", "least_pairs_per_image", "most_images", "lowest_focal",
         "highest_focal", "least_points", "contradiction_error", "contradiction_matches", "contradiction_share",
-        "focal_sigma", "seed",
+        "verification_error", "focal_sigma", "seed",
     ))  # fmt: skip
 
     def __post_init__(self) -> None:
-        check_ranges(
-            self,
-            verification_error=POSITIVE,
-            shared_intrinsics=AT_LEAST_0,
-            pairs_per_image=AT_LEAST_0,
-            threads=AT_LEAST_1,
-        )
+        check_ranges(self, shared_intrinsics=AT_LEAST_0, pairs_per_image=AT_LEAST_0, threads=AT_LEAST_1)

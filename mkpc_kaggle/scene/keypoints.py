@@ -2,10 +2,9 @@
 
 Matchers find a point again to within a fraction of a pixel only, when they see it in another pair, at another
 resolution, or when another matcher finds it. Structure from motion follows points through images, so points of an
-image that are less than a pixel apart have to become one.
+image that are less than a pixel apart have to become a single keypoint.
 """
 
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,20 +29,17 @@ class SceneKeypoints:
 
 def scene_keypoints(graph: ViewGraph, cell: float = CELL_PX) -> SceneKeypoints:
     """The keypoints of a graph's images and, for each of its edges, the matches between them."""
-    parts: list[list[Points]] = [[np.zeros((0, 2), np.float32)] for _ in graph.images]
+    parts: list[list[Points]] = [[] for _ in graph.images]
     for edge in graph.edges:
         parts[edge.first].append(edge.matches.points0)
         parts[edge.second].append(edge.matches.points1)
-    merged = [merge_points(np.concatenate(part), cell) for part in parts]
-    places = [split_like(place, part) for (_, place), part in zip(merged, parts, strict=True)]
+    merged = [merge_points(np.concatenate([np.zeros((0, 2), np.float32), *part]), cell) for part in parts]
+    places = [
+        iter(np.split(place, np.cumsum([len(points) for points in part])[:-1]))
+        for (_, place), part in zip(merged, parts, strict=True)
+    ]
     matches = [np.stack([next(places[edge.first]), next(places[edge.second])], axis=1) for edge in graph.edges]
     return SceneKeypoints(tuple(points for points, _ in merged), tuple(map(one_to_one, matches)))
-
-
-def split_like(place: NDArray[np.intp], parts: Sequence[Points]) -> Iterator[NDArray[np.intp]]:
-    """``place`` split into the lengths of ``parts``, without the empty part that they begin with."""
-    ends = np.cumsum([len(part) for part in parts])
-    return iter(np.split(place, ends[:-1])[1:])
 
 
 def merge_points(points: Points, cell: float) -> tuple[Points, NDArray[np.intp]]:
@@ -59,16 +55,10 @@ def merge_points(points: Points, cell: float) -> tuple[Points, NDArray[np.intp]]
         cells = np.floor(total / weight[:, None] / cell + shift).astype(np.int64)
         distinct, inverse = np.unique(cells, axis=0, return_inverse=True)
         inverse = inverse.ravel()
-        total, weight = sum_groups(total, inverse, len(distinct)), sum_groups(weight, inverse, len(distinct))
+        total = np.column_stack([np.bincount(inverse, column, len(distinct)) for column in total.T])
+        weight = np.bincount(inverse, weight, len(distinct)).astype(np.float64)
         place = inverse[place]
     return (total / weight[:, None]).astype(np.float32), place
-
-
-def sum_groups(values: NDArray[np.float64], group: NDArray[np.intp], count: int) -> NDArray[np.float64]:
-    """The sum of the values (N, ...) of each of ``count`` groups, (count, ...)."""
-    total = np.zeros((count, *values.shape[1:]))
-    np.add.at(total, group, values)
-    return total
 
 
 def one_to_one(index: NDArray[np.intp]) -> NDArray[np.uint32]:

@@ -7,38 +7,24 @@ from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.geometry.robust import RobustConfig
 from mkpc_kaggle.scene.choose import Choice, Reason, choose, estimate_at_known_focals
 from mkpc_kaggle.scene.config import SceneConfig
-from mkpc_kaggle.scene.reconstruction import (
-    MIN_IMAGES,
-    Reconstruction,
-    RegisteredImage,
-    SfmModel,
-    filter_models,
-)
+from mkpc_kaggle.scene.reconstruction import MIN_IMAGES, Reconstruction, SfmModel
 from mkpc_kaggle.scene.shared_intrinsics import SharedIntrinsics, shared_intrinsics
-from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair, ViewGraph
+from mkpc_kaggle.scene.view_graph import BatchPair, ViewGraph
 
 MIN_PAIRS_PER_IMAGE = 1.35  # connected pairs: with fewer there is little that could contradict the cameras
 MIN_OBSERVATIONS = 0.99  # shared intrinsics stay if images see points at least this many times as often as without
 
-NO_SHARED: SharedIntrinsics = {}
-
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """What is known of a batch: the reconstructions of its components, and for each pair, in order, its choice.
+    """What is known of a batch: for each pair, in order, its choice, and the reconstructions of its components.
 
-    The reconstructions are those of all matches together; those of single matchers are in the choices alone. An
-    image goes by the name under which it came first.
+    They are of all matches together; those of single matchers are in the choices alone. An image goes by the name
+    under which it came first.
     """
 
     reconstructions: tuple[Reconstruction, ...]
     choices: tuple[Choice, ...]
-
-    def registered(self, image: BatchImage) -> RegisteredImage | None:
-        """The image with its camera in the largest model that has it."""
-        models = models_of(self.reconstructions)
-        same = (found for model in models for found in model.images if found.image.digest == image.digest)
-        return next(same, None)
 
 
 def reconstruct_batch(
@@ -78,17 +64,16 @@ def reconstruct_sharing(
 ) -> tuple[tuple[Reconstruction, ...], SharedIntrinsics]:
     """The reconstruction of each component, and the intrinsics that its images share.
 
-    Images that seem to share a camera are reconstructed anew with it. If images see fewer points then, they do
-    not.
+    Images that seem to share a camera are reconstructed anew with it, unless they see fewer points then.
     """
-    found = reconstruct_graph(graph, config, NO_SHARED)
+    found = reconstruct_graph(graph, config, {})
     shared = shared_intrinsics(graph.images, models_of(found), config.shared_intrinsics)
     if shared:
         anew = reconstruct_graph(graph, config, shared)
-        before, after = (sum(one.observations for one in each) for each in (found, anew))
+        before, after = (sum(each.observations for each in made) for made in (found, anew))
         if after >= MIN_OBSERVATIONS * before:
             return anew, shared
-    return found, NO_SHARED
+    return found, {}
 
 
 def reconstruct_graph(
@@ -109,13 +94,11 @@ def reconstruct_component(graph: ViewGraph, config: SceneConfig, shared: SharedI
     try:
         from mkpc_kaggle.scene.colmap import structure_from_motion
 
-        found = structure_from_motion(graph, config, shared)
+        return structure_from_motion(graph, config, shared)
     except ImportError as error:
         return Reconstruction(names, failure=f"pycolmap cannot be imported: {error}")
     except (RuntimeError, ValueError) as error:
         return Reconstruction(names, failure=f"pycolmap failed: {error}")
-    models, rejections = filter_models(found)
-    return Reconstruction(names, models, rejections, "" if models else "no plausible model came of the matches")
 
 
 def models_of(reconstructions: Sequence[Reconstruction]) -> list[SfmModel]:

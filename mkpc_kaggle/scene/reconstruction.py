@@ -73,7 +73,7 @@ def filter_models(models: Sequence[SfmModel]) -> tuple[tuple[SfmModel, ...], tup
             rejections.append(f"a model of {len(images)} images is too small")
         else:
             kept.append(replace(model, images=images))
-    return tuple(sorted(kept, key=lambda model: -len(model.images))), tuple(rejections)
+    return tuple(sorted(kept, key=lambda model: (-len(model.images), -len(model.points)))), tuple(rejections)
 
 
 def rejection_reason(found: RegisteredImage) -> str:

@@ -115,8 +115,7 @@ def tracks_of(results: Sequence[UnitResult]) -> dict[str, Matches]:
     chosen = [result for result in results if result.unit.tracks]
     if sum(len(result.matches) for result in chosen) < MIN_TRACK_MATCHES:
         chosen = list(results)
-    matchers = dict.fromkeys(result.unit.matcher for result in chosen)
-    return {
-        name: Matches.concatenate(result.matches for result in chosen if result.unit.matcher == name)
-        for name in matchers
-    }
+    parts: dict[str, list[Matches]] = {}
+    for result in chosen:
+        parts.setdefault(result.unit.matcher, []).append(result.matches)
+    return {name: Matches.concatenate(found) for name, found in parts.items()}

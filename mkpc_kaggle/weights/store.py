@@ -116,16 +116,11 @@ class WeightStore:
         return search.found
 
     def load(self, slot: str) -> "dict[str, torch.Tensor]":
-        """The slot's tensors by name, on the CPU; raises :class:`UserError` if the file is missing.
-
-        The first time that an unverified file is loaded, a warning names its digest, so that it can be pinned.
-        """
+        """The slot's tensors by name, on the CPU; raises :class:`UserError` if the file is missing."""
         found = self.find(slot)
         if found is None:
             names = " or ".join(file.name for file in self.alternatives(slot))
             raise UserError(f"no weights for {slot!r}: {names} not found (searched {self.searched})")
-        if found.state is State.UNVERIFIED:
-            warn_once(f"{found.path} is not verified: {found.note}")
         return load_tensors(found.path)
 
     def search(self, lines: Sequence[WeightFile]) -> Search:
@@ -198,6 +193,9 @@ class WeightStore:
 def judge(path: Path, file: WeightFile, files: Iterable[WeightFile] = ()) -> FoundFile:
     """The file at ``path``, or unpacked into it, by the name of ``file``; ``files`` is the whole manifest."""
     try:
+        unpacked = (path / "data.pkl").is_file()
+        if path.is_dir() and not unpacked:
+            return FoundFile(file, path, State.REFUSED, "", "it is a directory")
         digest, size = digest_of(path), path.stat().st_size
     except OSError as error:
         return FoundFile(file, path, State.REFUSED, "", f"cannot be read: {error.strerror}")
@@ -205,7 +203,7 @@ def judge(path: Path, file: WeightFile, files: Iterable[WeightFile] = ()) -> Fou
     state, note = State.REFUSED, ""
     if digest == file.digest:
         state, note = State.GOOD, "" if path.name == file.name else f"it is {file.name}"
-    elif path.is_dir():
+    elif unpacked:
         state, note = State.UNVERIFIED, UNPACKED
     elif other:
         note = f"its bytes are those of {other}"

@@ -8,8 +8,7 @@ from typing import Any
 
 import pytest
 import torch
-from roma_values import NARROW
-from standin import STAND_INS, standin_state
+from standin import STAND_INS, narrow_roma, standin_state
 from torch import Tensor, nn
 
 from mkpc_kaggle.matchers.networks.aspanformer import AspanFormer
@@ -17,9 +16,8 @@ from mkpc_kaggle.matchers.networks.dkm import DKM
 from mkpc_kaggle.matchers.networks.loftr import Loftr
 from mkpc_kaggle.matchers.networks.loma import Loma, Variant
 from mkpc_kaggle.matchers.networks.quadtree import Quadtree
-from mkpc_kaggle.matchers.networks.roma import RoMa
-from mkpc_kaggle.matchers.networks.superglue import SuperGlue, SuperGlueConfig
-from mkpc_kaggle.matchers.networks.superpoint import SuperPoint, SuperPointConfig
+from mkpc_kaggle.matchers.networks.superglue import SuperGlue
+from mkpc_kaggle.matchers.networks.superpoint import SuperPoint
 from mkpc_kaggle.pipeline import assembly
 from mkpc_kaggle.weights import WeightFile, WeightStore
 
@@ -73,16 +71,8 @@ class PublicFile:
 
 
 FILES = (
-    PublicFile(
-        "superpoint_v1.pth", "superglue", "superpoint", "superpoint", lambda: SuperPoint(SuperPointConfig())
-    ),
-    PublicFile(
-        "superglue_outdoor.pth",
-        "superglue",
-        "superglue-outdoor",
-        "superglue",
-        lambda: SuperGlue(SuperGlueConfig()),
-    ),
+    PublicFile("superpoint_v1.pth", "superglue", "superpoint", "superpoint", SuperPoint),
+    PublicFile("superglue_outdoor.pth", "superglue", "superglue-outdoor", "superglue", SuperGlue),
     PublicFile("outdoor_ds.ckpt", "loftr", "loftr-outdoor", "loftr", Loftr, wrapped),
     PublicFile("quadtree_outdoor.ckpt", "quadtree", "quadtree-outdoor", "quadtree", Quadtree, wrapped),
     PublicFile(
@@ -94,9 +84,9 @@ FILES = (
         wrapped_aspanformer,
     ),
     PublicFile("DKMv3_outdoor.pth", "dkm", "dkm-outdoor", "dkm", DKM),
-    # Narrow ones, which load where ``roma_values.use_narrow`` was called.
-    PublicFile("roma_outdoor.pth", "roma", "roma-outdoor", "roma", lambda: RoMa(NARROW), roma_alone),
-    PublicFile("dinov2_vitl14_pretrain.pth", "roma", "dinov2-vitl14", "roma", lambda: RoMa(NARROW), dinov2_alone),
+    # Narrow ones, which load where ``standin.use_narrow`` was called.
+    PublicFile("roma_outdoor.pth", "roma", "roma-outdoor", "roma", narrow_roma, roma_alone),
+    PublicFile("dinov2_vitl14_pretrain.pth", "roma", "dinov2-vitl14", "roma", narrow_roma, dinov2_alone),
     PublicFile("loma_B128.pth", "loma", "loma-b128", "loma", lambda: Loma(Variant.B128), published_loma),
 )
 

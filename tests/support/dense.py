@@ -8,7 +8,7 @@ import torch
 from golden import recorded
 
 from mkpc_kaggle.geometry.coordinates import Size, from_normalised
-from mkpc_kaggle.matchers.networks.dense_warp import side_by_side
+from mkpc_kaggle.matchers.networks.dense_warp import DenseWarp
 from mkpc_kaggle.matchers.networks.gaussian_process import kernel
 from mkpc_kaggle.matchers.networks.pixels import MEAN, STD
 from mkpc_kaggle.matchers.networks.warp_refiner import local_correlation
@@ -57,14 +57,14 @@ def recorded_refinement(decoder):
 
 @one_thread()
 @torch.inference_mode()
-def computed(network, images, fine_images=(None, None)):
+def computed(network, images, fine_images=(None, None), *, symmetric=True):
     """All values on the way to a pair's match, in order: names of the golden files, "up_" in the second pass.
 
     The directions are run one after the other; here they are one batch, as in the golden files.
     """
     features = [network.encode(*versions) for versions in zip(images, fine_images, strict=True)]
     with recorded_refinement(network.decoder) as calls:
-        dense = side_by_side(network.match(*features))
+        dense = side_by_side(network.match(*features, symmetric=symmetric))
     values = encoded(network, images, 32) | coarse_values(network.decoder, calls)
     passes = 1 if fine_images[0] is None else 2
     values |= refiner_values(network.decoder, calls, 0, passes)
@@ -85,7 +85,7 @@ def coarse_values(decoder, calls):
     """Projections, kernels, posteriors and first estimates at strides 32 and 16."""
     values = {}
     for s in (32, 16):
-        query, support = joined(got for got, _ in calls[f"gps.{s}"])
+        query, support = joined(got[:2] for got, _ in calls[f"gps.{s}"])
         flow, certainty, context = joined(
             (e.flow, e.certainty, z) for (at, *_), (e, z) in calls["embedding_decoder"] if at == s
         )
@@ -119,6 +119,11 @@ def refiner_values(decoder, calls, number, passes, certainty=0):
         values |= {f"ref{s}_dcert": corrections[:, :1], f"ref{s}_disp": corrections[:, 1:]}
         values |= {f"flow{s}": flow, f"cert{s}": logits}
     return values
+
+
+def side_by_side(warps):
+    """The published layout (B, H, 2 W, 4) of both directions, for images of one size."""
+    return DenseWarp(*(torch.cat([getattr(dense, part) for dense in warps], 2) for part in ("warp", "certainty")))
 
 
 def joined(calls):

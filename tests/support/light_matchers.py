@@ -1,17 +1,15 @@
-"""All matchers of learned features in light configurations, with stand-in weights and no files.
+"""All matchers of learned features with stand-in weights and no files; in light configurations by default.
 
 A new matcher is one line in ``MATCHERS``.
 """
 
 import copy
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
 from kornia.feature import DISK, XFeat
-from roma_values import NARROW
-from standin import filled, scene
 from torch import nn
 
 from mkpc_kaggle.geometry.coordinates import Box, Size, View
@@ -19,15 +17,15 @@ from mkpc_kaggle.matchers import (
     aliked_lightglue,
     aspanformer,
     disk_lightglue,
-    dkm,
     loftr,
     quadtree,
     xfeat_lighterglue,
 )
-from mkpc_kaggle.matchers.aliked import AlikedEncoder, AlikedMatcher, AlikedOptions
-from mkpc_kaggle.matchers.contract import Colour, Picture, Placement
+from mkpc_kaggle.matchers.aliked import AlikedMatcher, AlikedOptions
+from mkpc_kaggle.matchers.contract import Colour, MatcherSpec, Picture, Placement
+from mkpc_kaggle.matchers.disk_lightglue import disk_encoder
 from mkpc_kaggle.matchers.dkm import DkmMatcher, DkmOptions
-from mkpc_kaggle.matchers.lightglue import LightGlueMatcher, LightGlueOptions, light_glue
+from mkpc_kaggle.matchers.lightglue import LightGlueMatcher, light_glue
 from mkpc_kaggle.matchers.loma import LomaAdapter, LomaOptions
 from mkpc_kaggle.matchers.networks.aliked import Aliked
 from mkpc_kaggle.matchers.networks.aspanformer import AspanFormer
@@ -36,123 +34,112 @@ from mkpc_kaggle.matchers.networks.loftr import Loftr
 from mkpc_kaggle.matchers.networks.loma import Loma, Variant
 from mkpc_kaggle.matchers.networks.placement import placed
 from mkpc_kaggle.matchers.networks.quadtree import Quadtree
-from mkpc_kaggle.matchers.networks.roma import RoMa
-from mkpc_kaggle.matchers.networks.superglue import SuperGlue, SuperGlueConfig
-from mkpc_kaggle.matchers.networks.superpoint import SuperPoint, SuperPointConfig
+from mkpc_kaggle.matchers.networks.superglue import SuperGlue
+from mkpc_kaggle.matchers.networks.superpoint import SuperPoint
 from mkpc_kaggle.matchers.roma import RomaMatcher, RomaOptions
 from mkpc_kaggle.matchers.semi_dense import SemiDenseMatcher
+from mkpc_kaggle.matchers.sparse import KeypointEncoder
 from mkpc_kaggle.matchers.superglue import SuperGlueMatcher
+from mkpc_kaggle.matchers.xfeat_lighterglue import xfeat_encoder
+from tests.support.standin import filled, narrow_roma, scene
 
 SIZE = Size(96, 64)
 SHIFT = 8  # pixels between the two pictures of a pair
-KEYPOINTS = LightGlueOptions(features=200, threshold=0.0)
+Make = Callable[[], nn.Module]
 
 
 @cache
-def standin(name: str, make: Callable[[], nn.Module]) -> nn.Module:
+def standin(name: str, make: Make) -> nn.Module:
     return filled(make(), name)
 
 
-def ours(name: str, make: Callable[[], nn.Module], placement: Placement) -> Any:
-    """One of our networks, made ready to run there."""
+def ours(name: str, make: Make, placement: Placement) -> Any:
+    """A network of ours, ready to run there."""
     return placed(copy.deepcopy(standin(name, make)), placement)
 
 
-def kornias(name: str, make: Callable[[], nn.Module]) -> Any:
-    """One of kornia's, which its matcher will move."""
+def kornias(name: str, make: Make) -> Any:
+    """A network of kornia's, which its matcher will move."""
     return copy.deepcopy(standin(name, make))
 
 
-def make_superpoint() -> SuperPoint:
-    return SuperPoint(SuperPointConfig(max_keypoints=200)).eval()
+@cache
+def making(make: Callable[..., nn.Module], *settings: Any, **named: Any) -> Make:
+    """The same function for the same settings, so that a stand-in is filled once."""
+    return partial(make, *settings, **named)
 
 
-def make_superglue() -> SuperGlue:
-    return SuperGlue(SuperGlueConfig(20))
+def superglue_matcher(placement: Placement, keypoints: int = 200) -> SuperGlueMatcher:
+    superpoint = ours("superpoint", making(SuperPoint, max_keypoints=keypoints), placement)
+    return SuperGlueMatcher(superpoint, ours("superglue", making(SuperGlue, 20), placement), placement.device)
 
 
-def superglue_matcher(placement: Placement) -> SuperGlueMatcher:
-    superpoint = ours("superpoint", make_superpoint, placement)
-    return SuperGlueMatcher(superpoint, ours("superglue", make_superglue, placement), placement.device)
+def semi_dense_matcher(spec: MatcherSpec, make: Make, placement: Placement) -> SemiDenseMatcher:
+    return SemiDenseMatcher(ours(spec.name, make, placement), spec, placement.device)
 
 
-def semi_dense_matcher(module: Any, make: Callable[[], nn.Module]) -> Callable[[Placement], SemiDenseMatcher]:
-    spec = module.SPEC
-    return lambda placement: SemiDenseMatcher(ours(spec.name, make, placement), spec, placement.device)
-
-
-def dkm_matcher(passes: int) -> Callable[[Placement], DkmMatcher]:
-    options = DkmOptions(passes=passes, matches=300)
-    return lambda placement: DkmMatcher(ours("dkm", DKM, placement), options, placement.device)
-
-
-def make_roma() -> RoMa:
-    return RoMa(NARROW)
+def dkm_matcher(placement: Placement, passes: int = 1, matches: int = 300) -> DkmMatcher:
+    return DkmMatcher(ours("dkm", DKM, placement), DkmOptions(passes, matches=matches), placement.device)
 
 
 def roma_matcher(placement: Placement) -> RomaMatcher:
-    return RomaMatcher(ours("roma", make_roma, placement), RomaOptions(matches=300), placement.device)
-
-
-def make_loma() -> Loma:
-    return Loma(Variant.B128)
+    return RomaMatcher(ours("roma", narrow_roma, placement), RomaOptions(matches=300), placement.device)
 
 
 def loma_matcher(placement: Placement) -> LomaAdapter:
     options = LomaOptions(Variant.B128, max_keypoints=200, match_threshold=0.0)
-    return LomaAdapter(ours("loma", make_loma, placement), options, placement.device)
+    return LomaAdapter(ours("loma", making(Loma, Variant.B128), placement), options, placement.device)
 
 
-def make_aliked() -> Aliked:
-    return Aliked(max_keypoints=KEYPOINTS.features)
+def aliked_encoder(placement: Placement, keypoints: int = 200) -> KeypointEncoder:
+    return KeypointEncoder(ours("aliked", making(Aliked, keypoints), placement), placement.device)
 
 
-def aliked_encoder(placement: Placement) -> AlikedEncoder:
-    return AlikedEncoder(ours("aliked", make_aliked, placement), placement.device)
+def aliked_matcher(placement: Placement, keypoints: int = 200) -> AlikedMatcher:
+    return AlikedMatcher(aliked_encoder(placement, keypoints), AlikedOptions())
 
 
-def aliked_matcher(placement: Placement) -> AlikedMatcher:
-    return AlikedMatcher(aliked_encoder(placement), AlikedOptions())
+def with_lightglue(
+    spec: MatcherSpec, encoder: KeypointEncoder, placement: Placement, layers: int, threshold: float, **shape: int
+) -> LightGlueMatcher:
+    glue = kornias("lightglue", making(light_glue, layers, threshold, **shape))
+    return LightGlueMatcher(spec, encoder, glue, placement)
 
 
-def make_glue() -> nn.Module:
-    return light_glue(2, KEYPOINTS.threshold, input_dim=128)
+def aliked_lightglue_matcher(
+    placement: Placement, keypoints: int = 200, layers: int = 2, threshold: float = 0.0
+) -> LightGlueMatcher:
+    encoder = aliked_encoder(placement, keypoints)
+    return with_lightglue(aliked_lightglue.SPEC, encoder, placement, layers, threshold, input_dim=128)
 
 
-def aliked_lightglue_matcher(placement: Placement) -> LightGlueMatcher:
-    glue = kornias("lightglue", make_glue)
-    return LightGlueMatcher(aliked_lightglue.SPEC, aliked_encoder(placement), glue, KEYPOINTS, placement)
-
-
-def disk_lightglue_matcher(placement: Placement) -> LightGlueMatcher:
-    encoder = disk_lightglue.DiskEncoder(kornias("disk", DISK), KEYPOINTS.features, placement)
-    glue = kornias("lightglue", make_glue)
-    return LightGlueMatcher(disk_lightglue.SPEC, encoder, glue, KEYPOINTS, placement)
+def disk_lightglue_matcher(
+    placement: Placement, keypoints: int = 200, layers: int = 2, threshold: float = 0.0
+) -> LightGlueMatcher:
+    encoder = disk_encoder(kornias("disk", DISK), keypoints, placement)
+    return with_lightglue(disk_lightglue.SPEC, encoder, placement, layers, threshold, input_dim=128)
 
 
 def make_xfeat() -> nn.Module:
     return XFeat().net
 
 
-def make_lighter_glue() -> nn.Module:
-    return light_glue(2, KEYPOINTS.threshold, **xfeat_lighterglue.SHAPE)
-
-
-def xfeat_lighterglue_matcher(placement: Placement) -> LightGlueMatcher:
-    network = XFeat(detection_threshold=0.0)
+def xfeat_lighterglue_matcher(
+    placement: Placement, keypoints: int = 200, layers: int = 2, threshold: float = 0.0
+) -> LightGlueMatcher:
+    network = XFeat(top_k=keypoints, detection_threshold=0.0)
     network.net = kornias("xfeat", make_xfeat)
-    encoder = xfeat_lighterglue.XFeatEncoder(network, KEYPOINTS.features, placement)
-    glue = kornias("lightglue", make_lighter_glue)
-    return LightGlueMatcher(xfeat_lighterglue.SPEC, encoder, glue, KEYPOINTS, placement)
+    encoder, shape = xfeat_encoder(network, keypoints, placement), xfeat_lighterglue.SHAPE
+    return with_lightglue(xfeat_lighterglue.SPEC, encoder, placement, layers, threshold, **shape)
 
 
 MATCHERS: dict[str, Callable[[Placement], Any]] = {
     "superglue": superglue_matcher,
-    "loftr": semi_dense_matcher(loftr, Loftr),
-    "quadtree": semi_dense_matcher(quadtree, Quadtree),
-    "aspanformer": semi_dense_matcher(aspanformer, AspanFormer),
-    dkm.SPEC.name: dkm_matcher(1),
-    "dkm, two passes": dkm_matcher(2),
+    "loftr": partial(semi_dense_matcher, loftr.SPEC, Loftr),
+    "quadtree": partial(semi_dense_matcher, quadtree.SPEC, Quadtree),
+    "aspanformer": partial(semi_dense_matcher, aspanformer.SPEC, AspanFormer),
+    "dkm": dkm_matcher,
+    "dkm, two passes": partial(dkm_matcher, passes=2),
     "roma": roma_matcher,
     "loma": loma_matcher,
     "aliked": aliked_matcher,

@@ -3,7 +3,8 @@
 import torch
 from golden import recorded
 
-from mkpc_kaggle.matchers.networks.loma_matcher import LAYERS, LomaKeypoints, log_scores
+from mkpc_kaggle.matchers.networks.assignment import mutual_matches
+from mkpc_kaggle.matchers.networks.loma_matcher import LAYERS, log_scores
 
 
 def refined(decoder, levels):
@@ -35,8 +36,8 @@ def detector_values(detector, images, number):
     return values | {
         "score_map": logits,
         "dense_probs": logits.flatten(1).softmax(dim=1).view_as(logits),
-        "keypoints": torch.stack([one.points for one in found]),
-        "keypoint_probs": torch.stack([one.scores for one in found]),
+        "keypoints": torch.stack([each.points for each in found]),
+        "keypoint_probs": torch.stack([each.scores for each in found]),
     }
 
 
@@ -72,11 +73,12 @@ def descriptor_values(descriptor, images, points):
 
 @torch.inference_mode()
 def matcher_values(matcher, image0, image1, threshold):
+    """Of a single pair, as a batch of one."""
     names = ["input_proj", "transformers.0.self_attn", *(f"transformers.{index}" for index in (0, 4, 8))]
     assignment = f"log_assignment.{LAYERS - 1}.final_proj"
     with recorded(matcher, ["posenc", *names, assignment]) as calls:
-        found = matcher(image0, image1, threshold)
-    n0 = image0.points.shape[1]
+        matcher(image0, image1, threshold)
+    n0 = len(image0.points)
     rotation = calls["posenc"][0][1][:, 0, :n0].repeat_interleave(2, dim=2)
     values = {"rotary_cos0": rotation.real, "rotary_sin0": rotation.imag}
     files = ["input_proj", "layer1_self", "layer1", "layer5", "layer9", "final_proj"]
@@ -84,16 +86,17 @@ def matcher_values(matcher, image0, image1, threshold):
         output = calls[call][0][1]
         values |= {f"{name}_0": output[:, :n0], f"{name}_1": output[:, n0:]}
     similarity = matcher.similarity(calls[f"transformers.{LAYERS - 1}"][0][1], n0)
-    return values | {
-        "similarity": similarity,
-        "scores": log_scores(similarity).exp(),
-        "matches0": found.matches0,
-        "matches1": found.matches1,
-        "matching_scores0": found.scores0,
-        "matching_scores1": found.scores1,
-    }
+    scores = log_scores(similarity)
+    values |= {"similarity": similarity, "scores": scores.exp()}
+    return values | assignment_values(scores[0], threshold)
 
 
-def keypoints_of(arrays, side):
-    """Those of a golden file without a batch axis."""
-    return LomaKeypoints(arrays[f"keypoints{side}"][None], arrays[f"descriptors{side}"][None])
+def assignment_values(log_scores, threshold, suffix=""):
+    """By keypoint of either image, as a batch of one: its match, and the score of any mutual pair."""
+    found, every, values = mutual_matches(log_scores, threshold), mutual_matches(log_scores, 0), {}
+    for side, count in enumerate(log_scores.shape):
+        matches, scores = torch.full((1, count), -1), torch.zeros(1, count)
+        matches[0, (found.index0, found.index1)[side]] = (found.index1, found.index0)[side]
+        scores[0, (every.index0, every.index1)[side]] = every.scores
+        values |= {f"matches{side}{suffix}": matches, f"matching_scores{side}": scores}
+    return values

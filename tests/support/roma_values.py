@@ -1,44 +1,18 @@
 """All intermediate values of RoMa on the way to a pair's match, by the names of the golden files."""
 
-from dataclasses import replace
-
 import torch
-from dense import joined, one_thread, recorded_refinement, refiner_values
+from dense import joined, one_thread, recorded_refinement, refiner_values, side_by_side
 from golden import recorded
 
-from mkpc_kaggle.matchers import roma as adapter
-from mkpc_kaggle.matchers.networks.dense_warp import side_by_side
-from mkpc_kaggle.matchers.networks.dinov2 import DinoV2Config
 from mkpc_kaggle.matchers.networks.gaussian_process import kernel, tokens
 from mkpc_kaggle.matchers.networks.grids import as_map
-from mkpc_kaggle.matchers.networks.roma import RomaConfig
-from mkpc_kaggle.matchers.networks.warp_refiner import RefinerShape
 
 DINOV2_BLOCKS, DECODER_BLOCKS = (1, 12, 24), (1, 5)
-
-NARROW = RomaConfig(
-    dinov2=DinoV2Config(width=64, blocks=2, heads=2, positions=5),
-    refiners={
-        16: RefinerShape(64, 16, 7, 369),
-        8: RefinerShape(48, 8, 3, 153),
-        4: RefinerShape(32, 8, 2, 97),
-        2: RefinerShape(16, 4, None, 36),
-        1: RefinerShape(9, 6, None, 24),
-    },
-    blocks=2,
-    heads=2,
-)
-"""The same network with fewer channels, a thirtieth of its size: most of what is left is VGG."""
-
-
-def use_narrow(monkeypatch):
-    """RoMas that are loaded from now on are narrow ones, and so must their files be."""
-    monkeypatch.setattr(adapter, "RomaConfig", lambda symmetric: replace(NARROW, symmetric=symmetric))
 
 
 @one_thread()
 @torch.inference_mode()
-def computed(network, images, fine_images=(None, None)):
+def computed(network, images, fine_images=(None, None), *, symmetric=True):
     """In the network's order; "up_" in the second pass.
 
     The images and the directions are run one after the other; here they are one batch, as in the golden files.
@@ -53,18 +27,18 @@ def computed(network, images, fine_images=(None, None)):
     )
     with (
         recorded(network.dinov2, ["patch_embed", *dinov2_blocks, "norm"]) as seen,
-        recorded(network.encoder, ["cnn"]) as convolved,
+        recorded(network, ["encoder.cnn"]) as convolved,
     ):
         features = [network.encode(*versions) for versions in zip(images, fine_images, strict=True)]
     with (
         recorded_refinement(decoder) as calls,
         recorded(decoder.embedding_decoder, [*decoder_blocks, "to_out"]) as decoded,
     ):
-        dense = side_by_side(network.match(*features))
+        dense = side_by_side(network.match(*features, symmetric=symmetric))
     passes = 1 if fine_images[0] is None else 2
 
     values = dinov2_values(network.dinov2, seen, dinov2_blocks)
-    values |= encoded([gave for _, gave in convolved["cnn"][::passes]], [each.coarse for each in features])
+    values |= encoded([gave for _, gave in convolved["encoder.cnn"][::passes]], [each.coarse for each in features])
     values |= coarse_values(decoder, features, calls)
     values |= {f"dec_block{number}": outputs(decoded[name]) for name, number in decoder_blocks.items()}
     values |= anchor_values(outputs(decoded["to_out"]), features[0].coarse.at(16).shape[2:])
@@ -72,7 +46,7 @@ def computed(network, images, fine_images=(None, None)):
     final = ""
     if passes == 2:
         final = "up_"
-        second = encoded([gave for _, gave in convolved["cnn"][1::2]], [each.fine for each in features])
+        second = encoded([gave for _, gave in convolved["encoder.cnn"][1::2]], [each.fine for each in features])
         second |= refiner_values(decoder, calls, 1, passes, certainty=2)
         values |= {f"up_{name}": value for name, value in second.items()}
     return values | {f"{final}warp": dense.warp, f"{final}certainty": dense.certainty}

@@ -277,7 +277,7 @@ def _outcome(index: int, known: tuple[UnitResult, ...], found: list[UnitResult])
         UnitRecord(result.unit.name, result.unit.stage, 200, 20 + index % 60, 0.0, result.seconds, "")
         for result in (*known, *found)
     )
-    record = PairRecord(index, FALLBACK_FUNDAMENTAL, "", units, sizes=SIZES, versions=("first", "second"))
+    record = PairRecord(index, FALLBACK_FUNDAMENTAL, "", units, sizes=(Size(1, 1),) * 2, versions=("a 0", "b 0"))
     return Outcome(record, tuple(found))
 
 

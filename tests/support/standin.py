@@ -12,6 +12,11 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from mkpc_kaggle.matchers import roma as adapter
+from mkpc_kaggle.matchers.networks.dinov2 import DinoV2Config
+from mkpc_kaggle.matchers.networks.roma import RoMa, RomaConfig
+from mkpc_kaggle.matchers.networks.warp_refiner import WarpRefinerShape
+
 
 @dataclass(frozen=True)
 class StandIn:
@@ -87,6 +92,30 @@ STAND_INS = {
         },
     ),
 }
+
+
+# RoMa with fewer channels, a thirtieth of its size: most of what is left is VGG.
+NARROW = RomaConfig(
+    DinoV2Config(width=64, blocks=2, heads=2, positions=5),
+    refiners={
+        16: WarpRefinerShape(64, 16, 7, 369),
+        8: WarpRefinerShape(48, 8, 3, 153),
+        4: WarpRefinerShape(32, 8, 2, 97),
+        2: WarpRefinerShape(16, 4, None, 36),
+        1: WarpRefinerShape(9, 6, None, 24),
+    },
+    blocks=2,
+    heads=2,
+)
+
+
+def narrow_roma() -> RoMa:
+    return RoMa(NARROW)
+
+
+def use_narrow(monkeypatch) -> None:
+    """RoMas that are loaded from now on are narrow ones, and so must their files be."""
+    monkeypatch.setattr(adapter, "RoMa", narrow_roma)
 
 
 def uniform(name: str, shape: Sequence[int] = ()) -> np.ndarray:

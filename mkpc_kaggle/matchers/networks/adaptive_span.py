@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from mkpc_kaggle.matchers.networks.bilinear import corners, weighted_rows
 from mkpc_kaggle.matchers.networks.grids import mask_valid, mean_pool, softmax_attention, to_2x2_blocks
 
 SIDE = 8  # samples on each axis
@@ -70,42 +71,18 @@ def span_attention(
     published networks were trained with this permutation within each two rows.
     """
     table = torch.cat([k, v], dim=-1)  # (N, h_key, w_key, 2 C)
-    index, weight = bilinear_taps(samples.flatten(0, 1), len(samples), table.shape[1], table.shape[2])
+    image = torch.arange(len(q), device=q.device).repeat_interleave(samples[0, ..., 0].numel())
+    index, weight = corners(samples.flatten(0, 2) - 0.5, image, table.shape[1:3])  # (N P 64, 4)
     cells = to_2x2_blocks(q).flatten(0, 1) * (q.shape[3] // heads) ** -0.5  # (N P, 4, C)
     rows = table.flatten(0, 2)
     messages = []
     at_once = CELLS_AT_ONCE.get(q.device.type, 256)
     for start in range(0, len(cells), at_once):
-        part = slice(start, start + at_once)
-        taps, shares = index[part].flatten(0, 1), weight[part].flatten(0, 1)
-        # A bag of four weighted rows is bilinear sampling, all channels of keys and values at once.
-        read = functional.embedding_bag(taps, rows, per_sample_weights=shares, mode="sum")  # (p 64, 2 C)
+        part, taps = slice(start, start + at_once), slice(start * SAMPLES, (start + at_once) * SAMPLES)
+        read = weighted_rows(rows, index[taps], weight[taps])  # (p 64, 2 C)
         out = None if usable is None else ~usable.flatten(0, 1)[part]
         messages.append(_attend_cells(cells[part], read.view(-1, SAMPLES, read.shape[1]), heads, out))
     return torch.cat(messages).view_as(q)
-
-
-def bilinear_taps(samples: Tensor, batch: int, height: int, width: int) -> tuple[Tensor, Tensor]:
-    """Samples (N P, 64, 2) of N maps -> the rows (N P, 64, 4) int64 of the flattened maps, and their weights.
-
-    Rows outside the map have weight 0.
-    """
-    corner = (samples - 0.5).floor()
-    part = samples - 0.5 - corner  # (N P, 64, 2)
-    # Far outside, any index does; clamping keeps it in the range of integers.
-    left, top = corner[..., 0].clamp(-2, width).long(), corner[..., 1].clamp(-2, height).long()
-    weight_x, x = _axis_taps(left, part[..., 0], width)
-    weight_y, y = _axis_taps(top, part[..., 1], height)
-    first = torch.arange(batch, device=samples.device).repeat_interleave(len(samples) // batch) * (height * width)
-    index = first[:, None, None, None] + y[..., :, None] * width + x[..., None, :]  # (N P, 64, 2, 2)
-    return index.flatten(2), (weight_y[..., :, None] * weight_x[..., None, :]).flatten(2)
-
-
-def _axis_taps(low: Tensor, part: Tensor, length: int) -> tuple[Tensor, Tensor]:
-    """Weights and indices (..., 2) of the neighbours ``low`` and ``low + 1`` on an axis."""
-    index = torch.stack([low, low + 1], dim=-1)
-    weight = torch.stack([1 - part, part], dim=-1)
-    return weight * ((index >= 0) & (index < length)), index.clamp(0, length - 1)
 
 
 def _attend_cells(queries: Tensor, read: Tensor, heads: int, excluded: Tensor | None) -> Tensor:

@@ -7,65 +7,39 @@ Parameter names are those of the public checkpoints, apart from ``regular_conv``
 For inference only.
 """
 
-from dataclasses import dataclass
+from collections.abc import Callable
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from mkpc_kaggle.matchers.dtypes import check_finite
 from mkpc_kaggle.matchers.networks.bilinear import DeformableConv2d, corners, table_of, weighted_rows
 from mkpc_kaggle.matchers.networks.grids import as_grid, pointwise
 from mkpc_kaggle.matchers.networks.layers import ExactConv2d, linear
-from mkpc_kaggle.matchers.numbers import check_finite
 
-STRIDES = (1, 2, 8, 32)
+# Of the published n16: channels of the four scales, the last also that of descriptors; positions read for each.
+CHANNELS = (16, 32, 64, 128)
+POSITIONS = 16
 RADIUS = 2  # of non-maximum suppression and of the window that refines a keypoint
 TEMPERATURE = 0.1  # of that refinement's softmax
 PATCH = 3  # pixels that a keypoint's offsets are computed from, each way
 ROWS_AT_ONCE, POSITIONS_AT_ONCE = 16, 1024  # intermediate maps fit a CPU's cache
 
 
-@dataclass(frozen=True)
-class AlikedShape:
-    """``channels`` of the four scales, the last also that of descriptors; ``positions`` read for each."""
-
-    channels: tuple[int, int, int, int]
-    positions: int
-
-
-SHAPES = {
-    "t16": AlikedShape((8, 16, 32, 64), 16),
-    "n16": AlikedShape((16, 32, 64, 128), 16),
-    "n32": AlikedShape((16, 32, 64, 128), 32),
-}
-
-
-@dataclass(frozen=True, eq=False)
-class AlikedKeypoints:
-    """K keypoints of one image, best first: ``points`` (K, 2) float32, x and y in pixels with centres at integers;
-    unit ``descriptors`` (K, D) float32.
-    """
-
-    points: Tensor
-    descriptors: Tensor
-
-
 class Aliked(nn.Module):
     """``max_keypoints``: the strongest kept in each image."""
 
-    multiple = 32
-
-    def __init__(self, shape: AlikedShape = SHAPES["n16"], max_keypoints: int = 2048) -> None:
+    def __init__(self, max_keypoints: int) -> None:
         super().__init__()
         self.max_keypoints = max_keypoints
-        c1, c2, c3, c4 = shape.channels
-        part = c4 // 4
-        self.block1 = Block(nn.Conv2d, 3, c1)
-        self.block2 = ResidualBlock(nn.Conv2d, c1, c2)
-        self.block3 = ResidualBlock(DeformableConv2d, c2, c3)
-        self.block4 = ResidualBlock(DeformableConv2d, c3, c4)
+        c1, c2, c3, c4 = CHANNELS
+        self.block1 = AlikedBlock(conv3x3, 3, c1)
+        self.block2 = AlikedResidualBlock(conv3x3, c1, c2)
+        self.block3 = AlikedResidualBlock(DeformableConv2d, c2, c3)
+        self.block4 = AlikedResidualBlock(DeformableConv2d, c3, c4)
         self.conv1, self.conv2, self.conv3, self.conv4 = (
-            nn.Conv2d(channels, part, 1, bias=False) for channels in shape.channels
+            nn.Conv2d(channels, c4 // 4, 1, bias=False) for channels in CHANNELS
         )
         self.score_head = nn.Sequential(
             ExactConv2d(c4, 8, 1, bias=False),
@@ -76,12 +50,16 @@ class Aliked(nn.Module):
             nn.SELU(inplace=True),
             ExactConv2d(4, 1, 3, padding=1, bias=False),
         )
-        self.desc_head = DescriptorHead(c4, shape.positions)
+        self.desc_head = DescriptorHead()
         self.eval().requires_grad_(False)
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # missing in torch's stubs
 
-    def forward(self, images: Tensor) -> list[AlikedKeypoints]:
-        """Images (B, 3, H, W) float32 RGB in [0, 1], sides multiples of 32."""
+    def forward(self, images: Tensor) -> list[tuple[Tensor, Tensor]]:
+        """Of each image the K keypoints, best first: points (K, 2) float32, x and y in pixels with centres at
+        integers, and unit descriptors (K, 128) float32.
+
+        Images (B, 3, H, W) float32 RGB in [0, 1], sides multiples of 32.
+        """
         maps = self.maps(images)
         points = [
             refined_maxima(scores, strict_maxima(scores, self.max_keypoints)) for scores in self.score_map(maps)
@@ -91,7 +69,7 @@ class Aliked(nn.Module):
             torch.tensor(counts, device=images.device)
         )
         descriptors = self.desc_head(JoinedMap(self, maps), torch.cat(points), image)
-        return [AlikedKeypoints(*each) for each in zip(points, torch.split(descriptors, counts), strict=True)]
+        return list(zip(points, torch.split(descriptors, counts), strict=True))
 
     def maps(self, images: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """(B, c1, H, W) at stride 1, the input of its part; and the parts themselves at strides 2, 8 and 32."""
@@ -123,34 +101,35 @@ class Aliked(nn.Module):
         return logits[:, 0].sigmoid_()
 
 
-class Block(nn.Module):
+Convolution = Callable[[int, int], nn.Conv2d]  # of that many channels to that many
+
+
+def conv3x3(channels: int, out_channels: int) -> nn.Conv2d:
+    return nn.Conv2d(channels, out_channels, 3, padding=1, bias=False)
+
+
+class AlikedBlock(nn.Module):
     """Two 3x3 convolutions, each with a batch norm and a SELU."""
 
-    def __init__(self, conv: type[nn.Conv2d], channels: int, out_channels: int) -> None:
+    def __init__(self, conv: Convolution, channels: int, out_channels: int) -> None:
         super().__init__()
-        self.conv1 = conv3x3(conv, channels, out_channels)
+        self.conv1 = conv(channels, out_channels)
         self.bn1 = nn.BatchNorm2d(out_channels)
-        self.conv2 = conv3x3(conv, out_channels, out_channels)
+        self.conv2 = conv(out_channels, out_channels)
         self.bn2 = nn.BatchNorm2d(out_channels)
 
     def forward(self, x: Tensor) -> Tensor:
         return torch.selu_(self.bn2(self.conv2(torch.selu_(self.bn1(self.conv1(x))))))
 
 
-class ResidualBlock(Block):
-    def __init__(self, conv: type[nn.Conv2d], channels: int, out_channels: int) -> None:
+class AlikedResidualBlock(AlikedBlock):
+    def __init__(self, conv: Convolution, channels: int, out_channels: int) -> None:
         super().__init__(conv, channels, out_channels)
         self.downsample = nn.Conv2d(channels, out_channels, 1)
 
     def forward(self, x: Tensor) -> Tensor:
         out = self.bn2(self.conv2(torch.selu_(self.bn1(self.conv1(x)))))
         return torch.selu_(out + self.downsample(x))
-
-
-def conv3x3(conv: type[nn.Conv2d], channels: int, out_channels: int) -> nn.Conv2d:
-    if conv is DeformableConv2d:
-        return DeformableConv2d(channels, out_channels)
-    return nn.Conv2d(channels, out_channels, 3, padding=1, bias=False)
 
 
 class JoinedMap:
@@ -191,15 +170,16 @@ class JoinedMap:
 class DescriptorHead(nn.Module):
     """Features at positions around each keypoint, weighted by learned maps."""
 
-    def __init__(self, channels: int, positions: int) -> None:
+    def __init__(self) -> None:
         super().__init__()
+        channels = CHANNELS[-1]
         self.offset_conv = nn.Sequential(
-            ExactConv2d(channels, 2 * positions, PATCH),
+            ExactConv2d(channels, 2 * POSITIONS, PATCH),
             nn.SELU(inplace=True),
-            ExactConv2d(2 * positions, 2 * positions, 1),
+            ExactConv2d(2 * POSITIONS, 2 * POSITIONS, 1),
         )
         self.sf_conv = ExactConv2d(channels, channels, 1, bias=False)
-        self.agg_weights = nn.Parameter(torch.zeros(positions, channels, channels))
+        self.agg_weights = nn.Parameter(torch.zeros(POSITIONS, channels, channels))
 
     def forward(self, joined: JoinedMap, points: Tensor, image: Tensor) -> Tensor:
         """Descriptors (K, C) at points (K, 2) of the images ``image`` (K,)."""
@@ -240,9 +220,7 @@ def _step(length: int, full: int) -> float:
 
 def strict_maxima(scores: Tensor, count: int) -> Tensor:
     """The best pixels of a map (H, W) that exceed all others around them, best first: (K,) int64, row by row."""
-    width = 2 * RADIUS + 1
-    along = functional.max_pool2d(scores[None], (1, width), 1, (0, RADIUS))
-    peaks = scores == functional.max_pool2d(along, (width, 1), 1, (RADIUS, 0))[0]
+    peaks = scores == functional.max_pool2d(scores[None], 2 * RADIUS + 1, 1, RADIUS)[0]
     inner = torch.zeros_like(peaks)
     inner[RADIUS:-RADIUS, RADIUS:-RADIUS] = True
     index = (peaks & inner).flatten().nonzero()[:, 0]

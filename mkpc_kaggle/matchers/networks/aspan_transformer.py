@@ -9,17 +9,11 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mkpc_kaggle.matchers.networks.adaptive_span import (
-    MASKED,
-    adaptive_span,
-    sample_usable,
-    span_attention,
-)
+from mkpc_kaggle.matchers.networks.adaptive_span import MASKED, adaptive_span, sample_usable, span_attention
 from mkpc_kaggle.matchers.networks.grids import (
     Perceptron,
     as_grid,
     as_map,
-    linear_of_two,
     mask_valid,
     mean_pool,
     pointwise,
@@ -31,6 +25,7 @@ from mkpc_kaggle.matchers.networks.resnet_fpn import TOP
 HEADS = 8
 FLOW = 128  # channels of the flow feature, and of the projected positions
 INITIAL_LAYERS, BLOCKS = 2, 4
+RADIUS = 5.0  # of the spans, in deviations of the flow
 SPAN_LEVELS = (2, 1)  # half and full resolution of the coarse map
 
 Factor = tuple[int, int]  # of pooling, (rows, columns)
@@ -51,7 +46,7 @@ class Side:
     def values(self, projection: nn.Conv1d) -> Tensor:
         """(N, h, w, 256): the projection of the visual feature and the positions."""
         positions = self.positions.expand(len(self.visual), -1, -1, -1)
-        return linear_of_two(projection.weight.flatten(1), self.visual, positions)
+        return pointwise(projection, torch.cat([self.visual, positions], dim=-1))
 
     @property
     def pooled_mask(self) -> Tensor | None:
@@ -114,7 +109,7 @@ class InitialLayer(nn.Module):
             (own.pooled_mask, other.pooled_mask),
         )
         message = self.norm1(pointwise(self.merge_head, message))
-        update: Tensor = self.norm2(self.merge_f(own.visual, message))
+        update: Tensor = self.norm2(self.merge_f(torch.cat([own.visual, message], dim=-1)))
         return update.add_(own.visual)
 
 
@@ -139,8 +134,7 @@ class InitialStage(nn.Module):
         size = side.visual.shape[1:3]
         large = as_grid(functional.interpolate(decoupled, size=size, mode="bilinear", align_corners=False))
         visual, flow = torch.split(large, [TOP, FLOW], dim=-1)
-        weight, bias = self.up_merge.get_parameter("weight"), self.up_merge.get_parameter("bias")
-        added = linear_of_two(weight.flatten(1), side.visual, visual).add_(bias)
+        added = pointwise(self.up_merge, torch.cat([side.visual, visual], dim=-1))
         return replace(side, visual=added.add_(side.visual), flow=flow)
 
 
@@ -150,33 +144,26 @@ def _pooled(side: Side) -> Side:
     return replace(side, visual=visual, positions=positions)
 
 
-@dataclass(frozen=True, eq=False)
-class Messages:
-    """Of three levels: ``coarse`` (N, h / rows, w / columns, 256), ``half`` (N, h/2, w/2, 256), ``full``."""
-
-    coarse: Tensor
-    half: Tensor
-    full: Tensor
-
-
 class HierarchicalAttention(nn.Module):
     """Messages of the global level and of the two adaptive-span levels, merged."""
 
-    def __init__(self, radius: float) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        self.radius = radius
         self.temp = nn.Parameter(torch.ones(()))
         self.merge_head = Perceptron(nn.Conv1d(3 * TOP, TOP, 1, bias=False), nn.Conv1d(TOP, TOP, 1, bias=False))
 
     def forward(self, q: Tensor, k: Tensor, v: Tensor, flow: Tensor, own: Side, other: Side) -> Tensor:
         """Queries of ``own``, keys and values of ``other``, and the flow of ``own`` -> message (N, h, w, 256)."""
-        found = self.messages(q, k, v, flow, own, other)
+        coarse, half, full = self.messages(q, k, v, flow, own, other)
         h, w = q.shape[1:3]
-        stacked = torch.cat([_repeated(found.coarse, h, w), _repeated(found.half, h, w), found.full], dim=-1)
+        stacked = torch.cat([_repeated(coarse, h, w), _repeated(half, h, w), full], dim=-1)
         merged: Tensor = self.merge_head(stacked)
         return merged
 
-    def messages(self, q: Tensor, k: Tensor, v: Tensor, flow: Tensor, own: Side, other: Side) -> Messages:
+    def messages(
+        self, q: Tensor, k: Tensor, v: Tensor, flow: Tensor, own: Side, other: Side
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Of the global level (N, h / rows, w / columns, 256), of half (N, h/2, w/2, 256) and of full size."""
         coarse = global_attention(
             mean_pool(q, own.factor),
             mean_pool(k, other.factor),
@@ -185,13 +172,13 @@ class HierarchicalAttention(nn.Module):
             (own.pooled_mask, other.pooled_mask),
         )
         half, full = (self._span_level(q, k, v, flow, factor, own.mask) for factor in SPAN_LEVELS)
-        return Messages(coarse, half, full)
+        return coarse, half, full
 
     def _span_level(
         self, q: Tensor, k: Tensor, v: Tensor, flow: Tensor, factor: int, mask: Tensor | None
     ) -> Tensor:
         q, k, v = mean_pool(q, factor), mean_pool(k, factor), mean_pool(v, factor)
-        samples = adaptive_span(flow, self.radius, factor).samples()
+        samples = adaptive_span(flow, RADIUS, factor).samples()
         usable = None if mask is None else sample_usable(samples, mask, (k.shape[1], k.shape[2]), factor)
         return span_attention(q, k, v, samples, HEADS, usable)
 
@@ -201,17 +188,17 @@ def _repeated(grid: Tensor, height: int, width: int) -> Tensor:
     return as_grid(functional.interpolate(as_map(grid), size=(height, width), mode="nearest"))
 
 
-class Block(nn.Module):
+class AspanBlock(nn.Module):
     """Decodes the flow, and updates both features of an image along it; the last block the visual one alone."""
 
-    def __init__(self, radius: float, last: bool) -> None:
+    def __init__(self, last: bool) -> None:
         super().__init__()
         width = TOP if last else TOP + FLOW
         self.last = last
         self.flow_decoder = Perceptron(
             ExactConv1d(FLOW, FLOW // 2, 1, bias=False), ExactConv1d(FLOW // 2, 4, 1, bias=False)
         )
-        self.attention = HierarchicalAttention(radius)
+        self.attention = HierarchicalAttention()
         self.q_proj = nn.Conv1d(TOP, TOP, 1, bias=False)
         self.k_proj = nn.Conv1d(TOP, TOP, 1, bias=False)
         self.v_proj = nn.Conv1d(TOP + FLOW, TOP, 1, bias=False)
@@ -239,7 +226,8 @@ class Block(nn.Module):
             other,
         )
         both = own.visual if self.last else torch.cat([own.visual, own.flow], dim=-1)
-        updated = self.norm2(self.merge_f(both, self.norm1(message))).add_(both)
+        merged = self.merge_f(torch.cat([both, self.norm1(message)], dim=-1))
+        updated = self.norm2(merged).add_(both)
         flow = own.flow if self.last else updated[..., TOP:]
         return replace(own, visual=updated[..., :TOP], flow=flow)
 
@@ -247,11 +235,11 @@ class Block(nn.Module):
 class AspanTransformer(nn.Module):
     """The coarse transformer; every layer updates both images at once."""
 
-    def __init__(self, radius: float) -> None:
+    def __init__(self) -> None:
         super().__init__()
         self.pos_transform = nn.Conv2d(TOP, FLOW, 1, bias=False)
         self.ini_layer = InitialStage()
-        self.layers = nn.ModuleList(Block(radius, last=index == BLOCKS - 1) for index in range(BLOCKS))
+        self.layers = nn.ModuleList(AspanBlock(last=index == BLOCKS - 1) for index in range(BLOCKS))
         # The 3x3 convolutions lie in memory as the grids they see.
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # missing in torch's stubs
 

@@ -11,14 +11,13 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mkpc_kaggle.matchers.networks.dedode_decoder import Decoder, resize
+from mkpc_kaggle.matchers.dtypes import check_finite
+from mkpc_kaggle.matchers.networks.dedode_decoder import DedodeDecoder, resize
+from mkpc_kaggle.matchers.networks.pixels import MEAN, STD
 from mkpc_kaggle.matchers.networks.superpoint import window_maximum
 from mkpc_kaggle.matchers.networks.vgg import VGG11, Vgg
-from mkpc_kaggle.matchers.numbers import check_finite
 
-MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
-TEMPERATURE = 0.5
-"""Of the softmax over the nine pixels that place a keypoint between pixels."""
+TEMPERATURE = 0.5  # of the softmax over the nine pixels that place a keypoint between pixels
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +34,7 @@ class Dad(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.encoder = Vgg(VGG11)
-        self.decoder = Decoder((8, 4, 2, 1), prediction=1, blocks=3, mode="bicubic")
+        self.decoder = DedodeDecoder((8, 4, 2, 1), prediction=1, blocks=3, mode="bicubic")
         self.eval().requires_grad_(False)
 
     def forward(self, image: Tensor, number: int) -> list[DadKeypoints]:

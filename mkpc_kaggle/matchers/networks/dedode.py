@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mkpc_kaggle.matchers.networks.dedode_decoder import Decoder
+from mkpc_kaggle.matchers.networks.dedode_decoder import DedodeDecoder
 from mkpc_kaggle.matchers.networks.dinov2 import DinoV2, DinoV2Config
 from mkpc_kaggle.matchers.networks.vgg import VGG19, Vgg
 
@@ -23,7 +23,7 @@ class Dedode(nn.Module):
     def __init__(self, encoder: "Vgg | VggAndVit", strides: tuple[int, ...], channels: int) -> None:
         super().__init__()
         self.encoder = encoder
-        self.decoder = Decoder(strides, channels, BLOCKS, "bilinear")
+        self.decoder = DedodeDecoder(strides, channels, BLOCKS, "bilinear")
         self.eval().requires_grad_(False)
 
     def forward(self, image: Tensor, points: Tensor) -> Tensor:

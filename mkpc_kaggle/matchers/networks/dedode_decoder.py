@@ -19,7 +19,7 @@ CHANNELS = 32  # of a prediction that are enlarged at a time
 
 
 @dataclass(frozen=True)
-class RefinerShape:
+class DedodeRefinerShape:
     """Channels: of the ``features`` looked at, inside, and of the ``context`` passed on."""
 
     features: int
@@ -28,18 +28,18 @@ class RefinerShape:
 
 
 SHAPES = {  # by stride
-    14: RefinerShape(1024, 768, 512),
-    8: RefinerShape(512, 512, 256),
-    4: RefinerShape(256, 256, 128),
-    2: RefinerShape(128, 64, 32),
-    1: RefinerShape(64, 32, 1),
+    14: DedodeRefinerShape(1024, 768, 512),
+    8: DedodeRefinerShape(512, 512, 256),
+    4: DedodeRefinerShape(256, 256, 128),
+    2: DedodeRefinerShape(128, 64, 32),
+    1: DedodeRefinerShape(64, 32, 1),
 }
 
 
-class Refiner(nn.Module):
+class DedodeRefiner(nn.Module):
     """1x1 convolutions of features and context, then alternating depthwise 5x5 and 1x1 convolutions."""
 
-    def __init__(self, shape: RefinerShape, context: int, prediction: int, blocks: int) -> None:
+    def __init__(self, shape: DedodeRefinerShape, context: int, prediction: int, blocks: int) -> None:
         super().__init__()
         width = shape.hidden
         self.features = shape.features
@@ -79,7 +79,7 @@ class Refiner(nn.Module):
         return blocks.add_(mixed).div_(1.4)
 
 
-class Decoder(nn.Module):
+class DedodeDecoder(nn.Module):
     """``prediction`` channels, ``blocks`` in each refiner; it is upsampled in interpolate's ``mode``."""
 
     def __init__(self, strides: Sequence[int], prediction: int, blocks: int, mode: str) -> None:
@@ -88,16 +88,16 @@ class Decoder(nn.Module):
         self.layers = nn.ModuleDict()
         context = 0
         for stride in strides:
-            self.layers[str(stride)] = Refiner(SHAPES[stride], context, prediction, blocks)
+            self.layers[str(stride)] = DedodeRefiner(SHAPES[stride], context, prediction, blocks)
             context = SHAPES[stride].context
 
     @property
-    def last(self) -> Refiner:
+    def last(self) -> DedodeRefiner:
         return self.at(1)
 
-    def at(self, stride: int) -> Refiner:
+    def at(self, stride: int) -> DedodeRefiner:
         refiner = self.layers[str(stride)]
-        assert isinstance(refiner, Refiner)
+        assert isinstance(refiner, DedodeRefiner)
         return refiner
 
     def forward(self, levels: Iterable[Tensor]) -> tuple[Tensor, Tensor]:

@@ -12,55 +12,38 @@ BLOCK_FLOATS = 2**20
 LEAST_EXPONENT = -80  # exp of less is denormal: ten times slower, and adds nothing
 
 
-@dataclass(frozen=True)
-class SamplingConfig:
-    """As published. ``number``: how many matches at most. Certainties above ``threshold`` count as 1.
-
-    ``balanced``: matches are spread evenly over the images.
-    """
-
-    number: int = 5000
-    threshold: float = 0.05
-    balanced: bool = True
-
-    def __post_init__(self) -> None:
-        if self.number < 1:
-            raise ValueError(f"number must be at least 1, not {self.number}")
-
-
 @dataclass(frozen=True, eq=False)
 class SampledMatches:
-    """``matches`` (M, 4) float32, normalised (x, y) in either image; ``certainty`` (M,), see :func:`weights_of`;
-    ``index`` (M,) int64 into the flattened warp.
-    """
+    """``matches`` (M, 4) float32, normalised (x, y) in either image; ``index`` (M,) int64 into the flat warp."""
 
     matches: Tensor
-    certainty: Tensor
     index: Tensor
 
 
-def sample(
-    warp: Tensor, certainty: Tensor, config: SamplingConfig, generator: Generator | None = None
+def sample_matches(
+    warp: Tensor,
+    certainty: Tensor,
+    number: int,
+    threshold: float = 0.05,
+    *,
+    balanced: bool = True,
+    generator: Generator | None = None,
 ) -> SampledMatches:
-    """Draws from a warp (..., 4) with its certainty (...); a batch of pairs is drawn from as one.
+    """Draws at most ``number`` matches from a warp (N, 4) with its certainty (N,).
 
-    Fewer than ``config.number`` where fewer have any weight, none at all being legal; ValueError where a
-    certainty is not finite. ``generator`` (on the tensors' device; default: PyTorch's) fixes the result, which is
-    also that of ``torch.multinomial`` for the same draws.
+    Certainties above ``threshold`` count as 1. ``balanced``: matches are spread evenly over the images.
+    Fewer than ``number`` where fewer have any weight, none at all being legal; ValueError where a certainty is not
+    finite. ``generator`` (on the tensors' device; default: PyTorch's) fixes the result, which is also that of
+    ``torch.multinomial`` for the same draws.
     """
-    matches, weights = warp.reshape(-1, 4), weights_of(certainty.reshape(-1), config)
+    weights = certainty.masked_fill(certainty > threshold, 1)
     if not weights.isfinite().all():
         raise ValueError("certainties must be finite")
-    index = draw(weights, noise_like(weights, generator), config.number * (OVERSAMPLING if config.balanced else 1))
-    if config.balanced:
-        evenness = balancing_weights(density(matches[index]))
-        index = index[draw(evenness, noise_like(evenness, generator), config.number)]
-    return SampledMatches(matches[index], weights[index], index)
-
-
-def weights_of(certainty: Tensor, config: SamplingConfig) -> Tensor:
-    """The certainty, 1 where it is above the threshold."""
-    return certainty.masked_fill(certainty > config.threshold, 1)
+    index = draw(weights, noise_like(weights, generator), number * (OVERSAMPLING if balanced else 1))
+    if balanced:
+        evenness = balancing_weights(density(warp[index]))
+        index = index[draw(evenness, noise_like(evenness, generator), number)]
+    return SampledMatches(warp[index], index)
 
 
 def noise_like(weights: Tensor, generator: Generator | None) -> Tensor:

@@ -1,12 +1,10 @@
-"""Dense warps: for every pixel its position in the other image and a certainty.
+"""Dense warps: for every pixel its position in the other image and a certainty; what DKM and RoMa share.
 
 Normalised coordinates as in warp_refiner. Source: Edstedt et al. 2023, "DKM", section 3.4, and its published code.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Generic, Protocol, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -26,6 +24,18 @@ class Pyramid:
 
 
 @dataclass(frozen=True, eq=False)
+class DenseFeatures:
+    """Features of B images for the first pass and, of larger versions of them, for the second.
+
+    ``coefficients`` (B, n, C): of each of the network's Gaussian processes, with the images as supports.
+    """
+
+    coarse: Pyramid
+    coefficients: tuple[Tensor, ...]
+    fine: Pyramid | None = None
+
+
+@dataclass(frozen=True, eq=False)
 class DenseWarp:
     """Of B pairs, float32: ``warp`` (B, H, W, 4), (x, y) in the first image and (x, y) in the second, in [-1, 1];
     ``certainty`` (B, H, W) in [0, 1], 0 where the target is outside. The grid is that of one of the images.
@@ -34,24 +44,15 @@ class DenseWarp:
     warp: Tensor
     certainty: Tensor
 
-
-class Features(Protocol):
-    """Of one image; ``fine`` where there is to be a second pass."""
-
-    @property
-    def coarse(self) -> Pyramid: ...
-
-    @property
-    def fine(self) -> Pyramid | None: ...
+    def swapped(self) -> "DenseWarp":
+        """The same pairs of points, the other image's coordinates first."""
+        return DenseWarp(torch.cat([self.warp[..., 2:], self.warp[..., :2]], dim=3), self.certainty)
 
 
-SomeFeatures = TypeVar("SomeFeatures", bound=Features)
-
-
-class WarpDecoder(nn.Module, ABC, Generic[SomeFeatures]):
+class WarpDecoder(nn.Module, ABC):
     """From the features of two images to the flow from the one to the other."""
 
-    def forward(self, query: SomeFeatures, support: SomeFeatures) -> tuple[Estimate, Tensor]:
+    def forward(self, query: DenseFeatures, support: DenseFeatures) -> tuple[Estimate, Tensor]:
         """The flow from query to support at stride 1 of the last pass, and the first pass's logits at 16."""
         estimate = self.coarse_estimate(query, support)
         logits = estimate.certainty
@@ -67,28 +68,38 @@ class WarpDecoder(nn.Module, ABC, Generic[SomeFeatures]):
         return estimate
 
     @abstractmethod
-    def coarse_estimate(self, query: SomeFeatures, support: SomeFeatures) -> Estimate:
+    def coarse_estimate(self, query: DenseFeatures, support: DenseFeatures) -> Estimate:
         """At stride 16, refined."""
 
     @abstractmethod
     def correct(self, estimate: Estimate, query: Pyramid, support: Pyramid, stride: int) -> Estimate:
-        """What the refiner of a stride makes of an estimate of that size."""
+        """The estimate, of the size of a stride's features, corrected by that stride's refiner."""
 
 
-def warps_of(
-    decoder: WarpDecoder[SomeFeatures], first: SomeFeatures, second: SomeFeatures, *, symmetric: bool
-) -> tuple[DenseWarp, ...]:
-    """The warp on the first image's grid and, if ``symmetric``, that on the second's.
+class DenseNetwork(nn.Module, ABC):
+    """Features of images, and the warps between two images; for inference only."""
 
-    ValueError where only one of them has features for a second pass.
-    """
-    if (first.fine is None) != (second.fine is None):
-        raise ValueError("of a pair either both images or neither must have features for a second pass")
-    forward = dense_warp(*decoder(first, second))
-    if not symmetric:
-        return (forward,)
-    # Sequential: one batch of both directions would take twice the memory and as much time.
-    return forward, swapped(dense_warp(*decoder(second, first)))
+    decoder: WarpDecoder
+
+    @abstractmethod
+    def encode(self, image: Tensor, fine: Tensor | None = None) -> DenseFeatures:
+        """Images (B, 3, H, W) as :func:`pixels.network_input` makes them; larger ones for a second pass."""
+
+    def match(
+        self, first: DenseFeatures, second: DenseFeatures, *, symmetric: bool = True
+    ) -> tuple[DenseWarp, ...]:
+        """B pairs, whose images may differ in size: the warp on the first image's grid and, if ``symmetric``, that
+        on the second's.
+
+        ValueError where only one of them has features for a second pass.
+        """
+        if (first.fine is None) != (second.fine is None):
+            raise ValueError("of a pair either both images or neither must have features for a second pass")
+        forward = dense_warp(*self.decoder(first, second))
+        if not symmetric:
+            return (forward,)
+        # Sequential: one batch of both directions would take twice the memory and as much time.
+        return forward, dense_warp(*self.decoder(second, first)).swapped()
 
 
 def dense_warp(estimate: Estimate, coarse_logits: Tensor) -> DenseWarp:
@@ -101,15 +112,3 @@ def dense_warp(estimate: Estimate, coarse_logits: Tensor) -> DenseWarp:
     pixels = identity_map(flow).expand_as(flow)
     warp = torch.cat([as_grid(pixels), as_grid(flow.clamp(-1, 1))], dim=3)  # (B, H, W, 4)
     return DenseWarp(warp, certainty.masked_fill_(outside, 0))
-
-
-def swapped(dense: DenseWarp) -> DenseWarp:
-    """The same pairs of points, the other image's coordinates first."""
-    return DenseWarp(torch.cat([dense.warp[..., 2:], dense.warp[..., :2]], dim=3), dense.certainty)
-
-
-def side_by_side(warps: Sequence[DenseWarp]) -> DenseWarp:
-    """The published layout (B, H, 2 W, 4) of both directions, for images of one size."""
-    return DenseWarp(
-        torch.cat([dense.warp for dense in warps], dim=2), torch.cat([dense.certainty for dense in warps], dim=2)
-    )

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mkpc_kaggle.matchers.networks.grids import as_grid, as_map
-from mkpc_kaggle.matchers.networks.transformer_block import Block
+from mkpc_kaggle.matchers.networks.transformer_block import VitBlock
 
 PATCH = 14  # pixels a side: the stride of the features
 EPSILON = 1e-6  # of the norms
@@ -38,7 +38,7 @@ class DinoV2(nn.Module):
         self.mask_token = nn.Parameter(torch.zeros(1, config.width))  # used in training; checkpoints have it
         self.patch_embed = PatchEmbedding(config.width)
         self.blocks = nn.ModuleList(
-            Block(config.width, config.heads, EPSILON, bias=True, scaled=True) for _ in range(config.blocks)
+            VitBlock(config.width, config.heads, EPSILON, bias=True, scaled=True) for _ in range(config.blocks)
         )
         self.norm = nn.LayerNorm(config.width, EPSILON)
         self.eval().requires_grad_(False)

@@ -6,62 +6,39 @@ Coordinates are normalised: (x, y) in [-1, 1], where +-1 are the outer edges of 
 Parameter names are those of the public checkpoints. For inference only.
 """
 
-from dataclasses import dataclass
-
 import torch
 from torch import Tensor, nn
 
-from mkpc_kaggle.matchers.networks.dense_warp import DenseWarp, Pyramid, WarpDecoder, warps_of
-from mkpc_kaggle.matchers.networks.dkm_coarse import FEATURES, POSTERIOR, STRIDES, WIDTH, EmbeddingDecoder
+from mkpc_kaggle.matchers.networks.dense_warp import DenseFeatures, DenseNetwork, Pyramid, WarpDecoder
 from mkpc_kaggle.matchers.networks.gaussian_process import GaussianProcess
+from mkpc_kaggle.matchers.networks.layers import ExactConv2d
 from mkpc_kaggle.matchers.networks.resnet50 import ResNet50
-from mkpc_kaggle.matchers.networks.warp_refiner import SHAPES, Estimate, Refiner, refined, resize
+from mkpc_kaggle.matchers.networks.warp_refiner import SHAPES, Estimate, WarpRefiner, refined, resize
 
+STRIDES = (32, 16)  # of the coarse decoder
+FEATURES, POSTERIOR, WIDTH = 512, 256, 384  # its channels
 FINE_COARSEST = 8  # the coarsest stride that the second pass looks at
 
 
-@dataclass(frozen=True)
-class DkmConfig:
-    """``symmetric``: match both ways; else from the query to the support only."""
-
-    symmetric: bool = True
-
-
-@dataclass(frozen=True, eq=False)
-class DkmFeatures:
-    """Features of one image: for the first pass and, from a larger version of it, for the second."""
-
-    coarse: Pyramid
-    fine: Pyramid | None = None
-
-
-class DKM(nn.Module):
+class DKM(DenseNetwork):
     """Trained at 540 x 720 (outdoor; second pass 864 x 1152) and 480 x 640 (indoor); worse far from it."""
 
-    def __init__(self, config: DkmConfig | None = None) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        self.config = config or DkmConfig()
-        self.encoder = Encoder()
-        self.decoder = Decoder()
+        self.encoder = DkmEncoder()
+        self.decoder: DkmDecoder = DkmDecoder()
         # Weights that lie channels last make every map so; loading a checkpoint keeps it.
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # missing in torch's stubs
         self.eval().requires_grad_(False)
 
-    def encode(self, image: Tensor, fine: Tensor | None = None) -> DkmFeatures:
-        """Images (B, 3, H, W) as :func:`pixels.network_input` makes them, of any size; larger for a second one."""
+    def encode(self, image: Tensor, fine: Tensor | None = None) -> DenseFeatures:
+        """Images of any size."""
         coarse = self.decoder.projected(self.encoder(image))
-        return DkmFeatures(coarse, None if fine is None else self.encoder(fine, FINE_COARSEST))
-
-    def match(self, first: DkmFeatures, second: DkmFeatures) -> tuple[DenseWarp, ...]:
-        """B pairs, whose images may differ in size: the warp on the first image's grid, then that on the second's.
-
-        One way there is the former alone. With a second pass where both images have features for it; ValueError
-        where only one has.
-        """
-        return warps_of(self.decoder, first, second, symmetric=self.config.symmetric)
+        second = None if fine is None else self.encoder(fine, FINE_COARSEST)
+        return DenseFeatures(coarse, self.decoder.regress(coarse), second)
 
 
-class Encoder(nn.Module):
+class DkmEncoder(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.net = ResNet50()
@@ -73,27 +50,32 @@ class Encoder(nn.Module):
         return Pyramid((image, *features))
 
 
-class Decoder(WarpDecoder[DkmFeatures]):
+class DkmDecoder(WarpDecoder):
     def __init__(self) -> None:
         super().__init__()
         self.embedding_decoder = EmbeddingDecoder()
         self.gps = nn.ModuleDict({str(s): GaussianProcess(POSTERIOR) for s in STRIDES})
         self.proj = nn.ModuleDict({"16": nn.Conv2d(1024, FEATURES, 1), "32": nn.Conv2d(2048, FEATURES, 1)})
-        self.conv_refiner = nn.ModuleDict({str(s): Refiner(shape) for s, shape in SHAPES.items()})
+        self.conv_refiner = nn.ModuleDict({str(s): WarpRefiner(shape) for s, shape in SHAPES.items()})
 
     def projected(self, pyramid: Pyramid) -> Pyramid:
         """The pyramid of all six strides, with 512 channels at 16 and 32."""
         *finer, at16, at32 = pyramid.levels
         return Pyramid((*finer, self.proj["16"](at16), self.proj["32"](at32)))
 
-    def coarse_estimate(self, query: DkmFeatures, support: DkmFeatures) -> Estimate:
+    def regress(self, support: Pyramid) -> tuple[Tensor, ...]:
+        """The coefficients of the Gaussian processes, by :data:`STRIDES`."""
+        processes = zip(self.gps.values(), STRIDES, strict=True)
+        return tuple(process.regress(support.at(stride)) for process, stride in processes)  # type: ignore[operator]
+
+    def coarse_estimate(self, query: DenseFeatures, support: DenseFeatures) -> Estimate:
         """Of what stride 32 found only the context is used."""
         first, second = query.coarse, support.coarse
         batch, _, height, width = first.at(32).shape
         context = first.at(32).new_zeros(batch, WIDTH, height, width)
-        for stride in STRIDES:
+        for stride, coefficients in zip(STRIDES, support.coefficients, strict=True):
             features = first.at(stride)
-            posterior = self.gps[str(stride)](features, second.at(stride))
+            posterior = self.gps[str(stride)](features, second.at(stride), coefficients)
             context = resize(context, features.shape[2:])
             estimate, context = self.embedding_decoder(stride, posterior, features, context)
         return self.correct(estimate, first, second, STRIDES[-1])
@@ -101,3 +83,58 @@ class Decoder(WarpDecoder[DkmFeatures]):
     def correct(self, estimate: Estimate, query: Pyramid, support: Pyramid, stride: int) -> Estimate:
         corrections = self.conv_refiner[str(stride)](query.at(stride), support.at(stride), estimate.flow)
         return refined(estimate, corrections, stride, query.at(1).shape[2:])
+
+
+class EmbeddingDecoder(nn.Module):
+    """Turns the posterior into a first estimate, scale by scale, with a context passed to the next."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.feat_input_modules = nn.ModuleDict({str(s): nn.Conv2d(FEATURES, 256, 1) for s in STRIDES})
+        self.rrb_d = nn.ModuleDict({str(s): ResidualRefinement(256 + POSTERIOR) for s in STRIDES})
+        self.cab = nn.ModuleDict({str(s): ChannelAttention() for s in STRIDES})
+        self.rrb_u = nn.ModuleDict({str(s): ResidualRefinement(WIDTH) for s in STRIDES})
+        self.terminal_module = nn.ModuleDict({str(s): ExactConv2d(WIDTH, 3, 1) for s in STRIDES})
+
+    def forward(
+        self, stride: int, posterior: Tensor, features: Tensor, context: Tensor
+    ) -> tuple[Estimate, Tensor]:
+        """Maps (B, 256, h, w), (B, 512, h, w) and (B, 384, h, w) -> the estimate and the next context."""
+        at = str(stride)
+        own = self.feat_input_modules[at](features)
+        embedded = torch.cat([own, posterior.to(own.dtype)], dim=1)  # (B, 512, h, w)
+        context = self.rrb_u[at](self.cab[at](context, self.rrb_d[at](embedded)))
+        found = self.terminal_module[at](context.float())  # (B, 3, h, w)
+        return Estimate(found[:, 1:], found[:, :1]), context
+
+
+class ResidualRefinement(nn.Module):
+    """Two 3x3 convolutions beside a shortcut, after a 1x1 one that sets the width."""
+
+    def __init__(self, inputs: int) -> None:
+        super().__init__()
+        self.conv1 = nn.Conv2d(inputs, WIDTH, 1)
+        self.conv2 = nn.Conv2d(WIDTH, WIDTH, 3, padding=1)
+        self.bn = nn.BatchNorm2d(WIDTH)
+        self.conv3 = nn.Conv2d(WIDTH, WIDTH, 3, padding=1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, inputs, h, w) -> (B, 384, h, w)."""
+        x = self.conv1(x)
+        y = self.conv3(torch.relu_(self.bn(self.conv2(x))))
+        return torch.relu_(y.add_(x))
+
+
+class ChannelAttention(nn.Module):
+    """Adds the new embedding to the context, with a weight per channel from the means of both."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.conv1 = nn.Conv2d(2 * WIDTH, WIDTH, 1)
+        self.conv2 = nn.Conv2d(WIDTH, WIDTH, 1)
+
+    def forward(self, context: Tensor, embedded: Tensor) -> Tensor:
+        """(B, 384, h, w) each -> (B, 384, h, w)."""
+        means = torch.cat([context, embedded], dim=1).mean(dim=(2, 3), keepdim=True)  # (B, 768, 1, 1)
+        weights = self.conv2(self.conv1(means).relu_()).sigmoid_()
+        return torch.addcmul(context, weights, embedded)

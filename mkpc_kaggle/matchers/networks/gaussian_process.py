@@ -8,9 +8,9 @@ import math
 import torch
 from torch import Tensor, nn
 
+from mkpc_kaggle.matchers.dtypes import check_finite
 from mkpc_kaggle.matchers.networks.layers import ExactConv2d
 from mkpc_kaggle.matchers.networks.warp_refiner import identity_map
-from mkpc_kaggle.matchers.numbers import check_finite
 
 TEMPERATURE, NOISE_VARIANCE = 0.2, 0.1
 
@@ -22,16 +22,12 @@ class GaussianProcess(nn.Module):
         super().__init__()
         self.pos_conv = ExactConv2d(2, width, 1)
 
-    def forward(self, query: Tensor, support: Tensor) -> Tensor:
-        """Posterior mean (B, width, h, w) of features (B, C, h, w) and (B, C, h', w')."""
-        return self.predict(query, support, self.regress(support))
-
     def regress(self, support: Tensor) -> Tensor:
         """Features (B, C, h', w') -> the coefficients (B, n', width) of their kernels, float32."""
         return coefficients(tokens(support), tokens(self.embed_coordinates(support)))
 
-    def predict(self, query: Tensor, support: Tensor, coefficients: Tensor) -> Tensor:
-        """As :meth:`forward`, with what :meth:`regress` makes of the support."""
+    def forward(self, query: Tensor, support: Tensor, coefficients: Tensor) -> Tensor:
+        """Posterior mean (B, width, h, w) of features (B, C, h, w) and (B, C, h', w'), regressed before."""
         mean = kernel(tokens(query), tokens(support)) @ coefficients  # (B, n, width)
         return mean.mT.reshape(len(query), -1, *query.shape[2:])
 
@@ -59,9 +55,7 @@ def kernel(x: Tensor, y: Tensor) -> Tensor:
     """exp((cosine - 1) / T) of all pairs: (B, n, C) and (B, m, C) -> (B, n, m), float32.
 
     Computed in float64: the inverse of a covariance amplifies rounding errors some fifteen times, and the
-    refiners do again, up to the tolerance of the golden vectors on some processors. It takes a tenth of a
-    second on a CPU. For DKM on a pair of 540 x 720, both ways, these products are 10.2 GFLOP (1530 cells at stride
-    16, 391 at 32): 40 ms at the peak of a T4, whose float64 has 1/32 of its float32's rate.
+    refiners do again. It takes a tenth of a second on a CPU, and 40 ms on a T4 for a pair of 540 x 720.
     """
     x, y = x.double(), y.double()
     norms = (x.norm(dim=2)[:, :, None] * y.norm(dim=2)[:, None]).add_(1e-6)

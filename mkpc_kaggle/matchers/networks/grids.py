@@ -46,12 +46,6 @@ def pointwise(layer: nn.Conv1d | nn.Conv2d, x: Tensor) -> Tensor:
     return linear(x, layer.weight.flatten(1), layer.bias)
 
 
-def linear_of_two(weight: Tensor, x: Tensor, y: Tensor) -> Tensor:
-    """``weight`` (out, C_x + C_y) on the concatenation of (..., C_x) and (..., C_y), without building it."""
-    of_x, of_y = torch.split(weight, [x.shape[-1], y.shape[-1]], dim=1)
-    return linear(x, of_x).add_(linear(y, of_y))
-
-
 class Perceptron(nn.Module):
     """Two layers without biases and a ReLU between them, with their names in an ``nn.Sequential``.
 
@@ -63,12 +57,10 @@ class Perceptron(nn.Module):
         self.add_module("0", first)
         self.add_module("2", second)
 
-    def forward(self, x: Tensor, y: Tensor | None = None) -> Tensor:
-        """(..., C), or two inputs (..., C_x) and (..., C_y) in place of their concatenation -> (..., C_out)."""
+    def forward(self, x: Tensor) -> Tensor:
+        """(..., C) -> (..., C_out)."""
         first, second = self.get_parameter("0.weight"), self.get_parameter("2.weight")
-        weight, seen = first.flatten(1), x.to(first.dtype)
-        hidden = linear(seen, weight) if y is None else linear_of_two(weight, seen, y.to(first.dtype))
-        functional.relu_(hidden)
+        hidden = functional.relu_(linear(x.to(first.dtype), first.flatten(1)))
         if second.shape[2:] == (3, 3):
             return as_grid(functional.conv2d(as_map(hidden), second, padding=1)).to(x.dtype)
         return linear(hidden, second.flatten(1)).to(x.dtype)

@@ -24,11 +24,9 @@ def linear_attention(q: Tensor, k: Tensor, v: Tensor, heads: int, masks: Masks |
         q, k = q.mul_(masks[0][..., None]), k.mul_(masks[1][..., None])
     width = q.shape[2] // heads
     q, k, v = (x.view(*x.shape[:2], heads, width).transpose(1, 2) for x in (q, k, v))  # (N, heads, L or S, D)
-    # The sum of the keys is one more column of values: alone it would take as long as all others.
-    both = torch.cat([k.transpose(2, 3) @ v, k.sum(dim=2)[..., None]], dim=3)  # (N, heads, D, D + 1)
-    attended, total = torch.split(q @ both, [width, 1], dim=3)  # (N, heads, L, D) and (N, heads, L, 1)
-    normed: Tensor = attended / (total + 1e-6)
-    return normed.transpose(1, 2).flatten(2)
+    total = q @ k.sum(dim=2)[..., None]  # (N, heads, L, 1)
+    attended: Tensor = q @ (k.transpose(2, 3) @ v) / (total + 1e-6)  # (N, heads, L, D)
+    return attended.transpose(1, 2).flatten(2)
 
 
 class EncoderLayer(nn.Module):
@@ -52,7 +50,8 @@ class EncoderLayer(nn.Module):
         other = seen if source is x else source.to(seen.dtype)
         q, k, v = self.q_proj(seen).float(), self.k_proj(other).float(), self.v_proj(other).float()
         message = self.norm1(self.merge(linear_attention(q, k, v, self.heads, masks)))  # (N, L, C)
-        update: Tensor = self.norm2(self.mlp(seen, message).float())
+        both = torch.cat([seen, message.to(seen.dtype)], dim=2)
+        update: Tensor = self.norm2(self.mlp(both).float())
         return update.add_(x)
 
 

@@ -1,7 +1,5 @@
 """LoFTR with dual softmax (Sun et al., "LoFTR: Detector-Free Local Feature Matching with Transformers", 2021)."""
 
-from dataclasses import dataclass
-
 from torch import Tensor
 
 from mkpc_kaggle.matchers.networks.linear_attention import LinearTransformer, Masks
@@ -10,32 +8,20 @@ from mkpc_kaggle.matchers.networks.resnet_fpn import TOP
 from mkpc_kaggle.matchers.networks.semi_dense import HEADS, SemiDenseNetwork
 
 
-@dataclass(frozen=True)
-class LoftrConfig:
-    """As published for ``outdoor_ds``. ``fixed_positions``: True for ``indoor_ds_new`` alone."""
-
-    threshold: float = 0.2
-    border: int = 2
-    temperature: float = 0.1
-    fixed_positions: bool = False
-
-
 class Loftr(SemiDenseNetwork[LinearTransformer]):
-    """Sides are multiples of 8; the two images may differ in size."""
+    """Sides are multiples of 8; the two images may differ in size.
+
+    The defaults are those published for ``outdoor_ds``. ``fixed_positions``: True for ``indoor_ds_new`` alone.
+    """
 
     multiple = 8
 
-    def __init__(self, config: LoftrConfig | None = None) -> None:
-        self.config = config or LoftrConfig()
-        super().__init__(LinearTransformer(TOP, HEADS, cycles=4), self.config.threshold, self.config.border)
-
-    @property
-    def similarity_scale(self) -> float:
-        return 1 / (TOP * self.config.temperature)
+    def __init__(self, threshold: float = 0.2, border: int = 2, *, fixed_positions: bool = False) -> None:
+        super().__init__(LinearTransformer(TOP, HEADS, cycles=4), threshold, border)
+        self.decay = FIXED_DECAY if fixed_positions else ORIGINAL_DECAY
 
     def transform(self, coarse0: Tensor, coarse1: Tensor, masks: Masks | None = None) -> tuple[Tensor, Tensor]:
-        decay = FIXED_DECAY if self.config.fixed_positions else ORIGINAL_DECAY
-        grid0, grid1 = with_positions(coarse0, decay), with_positions(coarse1, decay)
+        grid0, grid1 = with_positions(coarse0, self.decay), with_positions(coarse1, self.decay)
         flat_masks = None if masks is None else (masks[0].flatten(1), masks[1].flatten(1))
         tokens0, tokens1 = self.loftr_coarse(grid0.flatten(1, 2), grid1.flatten(1, 2), flat_masks)
         return tokens0.view_as(grid0), tokens1.view_as(grid1)

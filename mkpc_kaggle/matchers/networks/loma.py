@@ -4,7 +4,6 @@ One public checkpoint has all three; its variants differ in the descriptor and i
 inference only.
 """
 
-from dataclasses import dataclass
 from enum import StrEnum
 
 from torch import Tensor, nn
@@ -27,33 +26,20 @@ class Variant(StrEnum):
     G = "g"
 
 
-@dataclass(frozen=True)
-class Widths:
-    """Channels of descriptors and of the matcher."""
-
-    descriptor: int
-    matcher: int
-
-
-WIDTHS = {
-    Variant.B128: Widths(128, 256),
-    Variant.B: Widths(256, 256),
-    Variant.R: Widths(256, 256),
-    Variant.L: Widths(256, 512),
-    Variant.G: Widths(256, 1024),
-}
+# Channels of descriptors and of the matcher.
+WIDTHS = {Variant.B128: (128, 256), Variant.B: (256, 256), Variant.R: (256, 256)}
+WIDTHS |= {Variant.L: (256, 512), Variant.G: (256, 1024)}
+# In checkpoints for training alone: assignments of other layers, matchability, further layers.
 UNUSED = rf"matcher\.(log_assignment\.(?!{LAYERS - 1}\.final_proj\.)|transformers\.(?![0-{LAYERS - 1}]\.))"
-"""What checkpoints hold for training alone: assignments of other layers, matchability, further layers."""
 
 
 class Loma(nn.Module):
     def __init__(self, variant: Variant) -> None:
         super().__init__()
-        widths = WIDTHS[variant]
+        descriptor, width = WIDTHS[variant]
         self.detector = Dad()
-        describe = dedode_b if variant is Variant.B128 else dedode_g
-        self.descriptor = describe(widths.descriptor)
-        self.matcher = LomaMatcher(widths.descriptor, widths.matcher)
+        self.descriptor = (dedode_b if variant is Variant.B128 else dedode_g)(descriptor)
+        self.matcher = LomaMatcher(descriptor, width)
         self.eval().requires_grad_(False)
 
     def encode(self, detected: Tensor, described: Tensor, number: int) -> LomaKeypoints:
@@ -62,12 +48,11 @@ class Loma(nn.Module):
         It comes in two sizes, (1, 3, H, W) each, RGB in 0..1: as the detector and as the descriptor see it.
         """
         (found,) = self.detector(detected, number)
-        points = found.points[None]
-        return LomaKeypoints(points, self.descriptor(described, points))
+        return LomaKeypoints(found.points, self.descriptor(described, found.points[None])[0])
 
 
 def parameter_name(published: str) -> str:
-    """Ours for a checkpoint's: ``_detector.*``, ``_descriptor.*``; all else is the matcher's."""
+    """Our name of a checkpoint's parameter: ``_detector.*``, ``_descriptor.*``; all else is the matcher's."""
     return published[1:] if published.startswith("_") else f"matcher.{published}"
 
 

@@ -1,6 +1,6 @@
 """LoMa's matcher (Nordström et al. 2026, arXiv 2604.04931): LightGlue (Lindenberger et al. 2023), all layers.
 
-Inside, the keypoints of both images stand in one tensor (B, N0 + N1, d): only attention tells the images apart.
+Inside, the keypoints of both images are in one tensor (1, N, d), N = N0 + N1: only attention tells them apart.
 Parameter names are those of the public checkpoints. For inference only.
 """
 
@@ -9,46 +9,44 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from mkpc_kaggle.matchers.networks.assignment import Assignment, mutual_matches, no_assignment
+from mkpc_kaggle.matchers.dtypes import check_finite
+from mkpc_kaggle.matchers.networks.assignment import Assignment, mutual_matches
 from mkpc_kaggle.matchers.networks.layers import Linear, attention
-from mkpc_kaggle.matchers.numbers import check_finite
 
-HEAD = 64
-"""Channels of an attention head."""
-
+HEAD = 64  # channels of an attention head
 LAYERS = 9
 
 
 @dataclass(frozen=True, eq=False)
 class LomaKeypoints:
-    """N keypoints of one image in each of B pairs, float32: ``points`` (B, N, 2), (x, y) in [-1, 1] from edge to
-    edge of the image; ``descriptors`` (B, N, D), of any length.
+    """N keypoints of one image, float32: ``points`` (N, 2), (x, y) in [-1, 1] from edge to edge of the image;
+    ``descriptors`` (N, D), of any length.
     """
 
     points: Tensor
     descriptors: Tensor
 
 
-class Rotation(nn.Module):
-    """Turns neighbouring channels by angles that depend linearly on where a keypoint lies."""
+class RotaryEmbedding(nn.Module):
+    """The rotations of pairs of channels, by angles that are linear in the place of a keypoint."""
 
     def __init__(self) -> None:
         super().__init__()
         self.Wr = nn.Linear(2, HEAD // 2, bias=False)
 
     def forward(self, points: Tensor) -> Tensor:
-        """exp(i angle), (B, 1, N, 32) complex64, for points (B, N, 2)."""
+        """exp(i angle), (1, 1, N, 32) complex64, for points (1, N, 2)."""
         angles = points @ self.Wr.weight.float().T
         return torch.polar(torch.ones_like(angles), angles)[:, None]
 
 
-def turned(x: Tensor, rotation: Tensor) -> Tensor:
-    """(B, heads, N, 64), channels in pairs, by (B, 1, N, 32)."""
+def apply_rotary(x: Tensor, rotation: Tensor) -> Tensor:
+    """Pairs of channels of (1, heads, N, 64) rotated by (1, 1, N, 32)."""
     pairs = torch.view_as_complex(x.view(*x.shape[:3], -1, 2))
     return torch.view_as_real(pairs * rotation).flatten(3)
 
 
-class Update(nn.Sequential):
+class LomaUpdate(nn.Sequential):
     """The update of a keypoint's features by a message."""
 
     def __init__(self, width: int) -> None:
@@ -57,27 +55,27 @@ class Update(nn.Sequential):
         )
 
 
-class SelfAttention(nn.Module):
+class LomaSelfAttention(nn.Module):
     """Messages between the keypoints of one image. ``Wqkv`` orders its outputs by head, channel, then q, k, v."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
         self.Wqkv = Linear(width, 3 * width)
         self.out_proj = Linear(width, width)
-        self.ffn = Update(width)
+        self.ffn = LomaUpdate(width)
 
     def forward(self, x: Tensor, n0: int, rotation: Tensor) -> Tensor:
-        """(B, N, d) -> (B, N, d); the first ``n0`` of the N keypoints are image 0's."""
-        projected = self.Wqkv(x).view(*x.shape[:2], -1, HEAD, 3).transpose(1, 2)  # (B, heads, N, 64, 3)
+        """(1, N, d) -> (1, N, d); the first ``n0`` of the N keypoints are image 0's."""
+        projected = self.Wqkv(x).view(*x.shape[:2], -1, HEAD, 3).transpose(1, 2)  # (1, heads, N, 64, 3)
         q, k, v = (part.contiguous() for part in projected.unbind(4))
-        q, k = turned(q, rotation), turned(k, rotation)
+        q, k = apply_rotary(q, rotation), apply_rotary(k, rotation)
         precision = self.out_proj.weight.dtype
         images = slice(None, n0), slice(n0, None)
         outputs = [attention(q[:, :, of], k[:, :, of], v[:, :, of], precision) for of in images]
         return updated(x, outputs, self.out_proj, self.ffn)
 
 
-class CrossAttention(nn.Module):
+class LomaCrossAttention(nn.Module):
     """Messages from the keypoints of the other image, both ways from the features before it."""
 
     def __init__(self, width: int) -> None:
@@ -85,10 +83,10 @@ class CrossAttention(nn.Module):
         self.to_qk = Linear(width, width)
         self.to_v = Linear(width, width)
         self.to_out = Linear(width, width)
-        self.ffn = Update(width)
+        self.ffn = LomaUpdate(width)
 
     def forward(self, x: Tensor, n0: int) -> Tensor:
-        """As :class:`SelfAttention`'s."""
+        """As :class:`LomaSelfAttention`'s."""
         qk, v = (layer(x).view(*x.shape[:2], -1, HEAD).transpose(1, 2) for layer in (self.to_qk, self.to_v))
         (qk0, qk1), (v0, v1) = ((part[:, :, :n0], part[:, :, n0:]) for part in (qk, v))
         precision = self.to_out.weight.dtype
@@ -96,18 +94,18 @@ class CrossAttention(nn.Module):
         return updated(x, outputs, self.to_out, self.ffn)
 
 
-def updated(x: Tensor, outputs: list[Tensor], out: Linear, ffn: Update) -> Tensor:
-    """Features (B, N, d) updated by the attention outputs (B, heads, Ni, 64) of both images."""
-    output = torch.cat([one.transpose(1, 2) for one in outputs], dim=1).flatten(2)  # (B, N, d)
+def updated(x: Tensor, outputs: list[Tensor], out: Linear, ffn: LomaUpdate) -> Tensor:
+    """Features (1, N, d) updated by the attention outputs (1, heads, Ni, 64) of both images."""
+    output = torch.cat([each.transpose(1, 2) for each in outputs], dim=1).flatten(2)  # (1, N, d)
     change: Tensor = ffn(torch.cat([x, out(output)], dim=2))
     return x + change
 
 
-class Layer(nn.Module):
+class LomaLayer(nn.Module):
     def __init__(self, width: int) -> None:
         super().__init__()
-        self.self_attn = SelfAttention(width)
-        self.cross_attn = CrossAttention(width)
+        self.self_attn = LomaSelfAttention(width)
+        self.cross_attn = LomaCrossAttention(width)
 
     def forward(self, x: Tensor, n0: int, rotation: Tensor) -> Tensor:
         x = self.self_attn(x, n0, rotation)
@@ -122,31 +120,30 @@ class LomaMatcher(nn.Module):
     def __init__(self, descriptor: int, width: int) -> None:
         super().__init__()
         self.input_proj = nn.Identity() if descriptor == width else Linear(descriptor, width)
-        self.posenc = Rotation()
-        self.transformers = nn.ModuleList(Layer(width) for _ in range(LAYERS))
+        self.posenc = RotaryEmbedding()
+        self.transformers = nn.ModuleList(LomaLayer(width) for _ in range(LAYERS))
         self.log_assignment = nn.ModuleDict({str(LAYERS - 1): nn.ModuleDict({"final_proj": Linear(width, width)})})
         self.eval().requires_grad_(False)
 
     def forward(self, image0: LomaKeypoints, image1: LomaKeypoints, threshold: float) -> Assignment:
-        """Mutual matches scored above the threshold in each of B pairs; no keypoints give no matches."""
-        n0, n1 = image0.points.shape[1], image1.points.shape[1]
+        """Mutual matches scored above the threshold; no keypoints give no matches."""
+        n0, n1 = len(image0.points), len(image1.points)
         if n0 == 0 or n1 == 0:
-            return no_assignment(image0.points[..., 0], image1.points[..., 0])
+            return Assignment.empty(image0.points.device)
         similarity = self.similarity(self.features(image0, image1), n0)
         check_finite("scores of loma", similarity)
-        return mutual_matches(log_scores(similarity), threshold)
+        return mutual_matches(log_scores(similarity)[0], threshold)
 
     def features(self, image0: LomaKeypoints, image1: LomaKeypoints) -> Tensor:
-        """(B, N0 + N1, d) after all layers."""
-        n0 = image0.points.shape[1]
-        rotation = self.posenc(torch.cat([image0.points, image1.points], dim=1))
-        x: Tensor = self.input_proj(torch.cat([image0.descriptors, image1.descriptors], dim=1))
+        """(1, N0 + N1, d) after all layers."""
+        rotation = self.posenc(torch.cat([image0.points, image1.points])[None])
+        x: Tensor = self.input_proj(torch.cat([image0.descriptors, image1.descriptors])[None])
         for layer in self.transformers:
-            x = layer(x, n0, rotation)
+            x = layer(x, len(image0.points), rotation)
         return x
 
     def similarity(self, features: Tensor, n0: int) -> Tensor:
-        """(B, N0, N1)."""
+        """(1, N0, N1)."""
         projected = self.log_assignment.get_submodule(f"{LAYERS - 1}.final_proj")(features)
         scaled = projected / features.shape[2] ** 0.25
         similarity: Tensor = scaled[:, :n0] @ scaled[:, n0:].mT
@@ -154,5 +151,5 @@ class LomaMatcher(nn.Module):
 
 
 def log_scores(similarity: Tensor) -> Tensor:
-    """Logarithm of the product of the softmax over either image's keypoints, (B, N0, N1)."""
+    """Logarithm of the product of the softmax over either image's keypoints, (1, N0, N1)."""
     return similarity.log_softmax(dim=1).add_(similarity.log_softmax(dim=2))

@@ -29,16 +29,6 @@ LAYERS = 8
 HIDDEN = 4 * TOP
 
 
-@dataclass(frozen=True)
-class QuadtreeConfig:
-    """As published for outdoors. ``topks``: how many key cells each level keeps for the next, coarsest first."""
-
-    threshold: float = 0.2
-    border: int = 2
-    temperature: float = 0.1
-    topks: tuple[int, int] = (16, 8)
-
-
 @dataclass(frozen=True, eq=False)
 class Attended:
     """One level's answer for P query cells of G queries each: ``message`` (B, P, G, D), and ``kept`` (B, P, G, K)
@@ -203,21 +193,16 @@ class QuadtreeTransformer(nn.Module):
 class Quadtree(SemiDenseNetwork[QuadtreeTransformer]):
     """Sides are multiples of 32. The published code needs two images of one size; the weights do not.
 
-    Masks act in the matching of coarse cells alone, as published: attention sees the padding.
+    ``topks``: how many key cells each level keeps for the next, coarsest first. The defaults are those published
+    for outdoors. Masks act in the matching of coarse cells alone, as published: attention sees the padding.
     """
 
     multiple = 32
 
-    def __init__(self, config: QuadtreeConfig | None = None) -> None:
-        self.config = config or QuadtreeConfig()
-        super().__init__(QuadtreeTransformer(self.config.topks), self.config.threshold, self.config.border)
-
-    @property
-    def similarity_scale(self) -> float:
-        return 1 / (TOP * self.config.temperature)
+    def __init__(self, threshold: float = 0.2, border: int = 2, topks: tuple[int, int] = (16, 8)) -> None:
+        super().__init__(QuadtreeTransformer(topks), threshold, border)
 
     def transform(self, coarse0: Tensor, coarse1: Tensor, masks: Masks | None = None) -> tuple[Tensor, Tensor]:
-        grid0, grid1 = self.loftr_coarse(
-            with_positions(coarse0, FIXED_DECAY), with_positions(coarse1, FIXED_DECAY)
-        )
+        grids = with_positions(coarse0, FIXED_DECAY), with_positions(coarse1, FIXED_DECAY)
+        grid0, grid1 = self.loftr_coarse(*grids)
         return grid0, grid1

@@ -1,6 +1,7 @@
 """ResNet-50 as a pyramid of features: He et al., "Deep Residual Learning for Image Recognition", 2016.
 
-The stride of a bottleneck sits in its 3x3 convolution. Parameter names are the usual ones. For inference in
+Written here because offline installs have no torchvision. The stride of a bottleneck sits in its 3x3 convolution.
+Parameter names are the usual ones. For inference in
 evaluation mode only.
 """
 

@@ -13,91 +13,61 @@ from math import sqrt
 import torch
 from torch import Tensor, nn
 
-from mkpc_kaggle.matchers.networks.anchor_decoder import AnchorDecoder
-from mkpc_kaggle.matchers.networks.dense_warp import DenseWarp, Pyramid, WarpDecoder, warps_of
+from mkpc_kaggle.matchers.networks.dense_warp import DenseFeatures, DenseNetwork, Pyramid, WarpDecoder
 from mkpc_kaggle.matchers.networks.dinov2 import DinoV2, DinoV2Config
-from mkpc_kaggle.matchers.networks.gaussian_process import GaussianProcess
+from mkpc_kaggle.matchers.networks.gaussian_process import GaussianProcess, tokens
+from mkpc_kaggle.matchers.networks.grids import as_grid
+from mkpc_kaggle.matchers.networks.layers import ExactLinear
+from mkpc_kaggle.matchers.networks.transformer_block import VitBlock
 from mkpc_kaggle.matchers.networks.vgg import VGG19, WIDTHS, Vgg
 from mkpc_kaggle.matchers.networks.warp_refiner import (
     SHAPES,
     Estimate,
-    Refiner,
-    RefinerShape,
+    WarpRefiner,
+    WarpRefinerShape,
     by_rows,
+    identity_map,
     refined,
 )
 
 COARSEST = 16
-REFINERS = SHAPES | {1: RefinerShape(9, 6, None, 24)}
+REFINERS = SHAPES | {1: WarpRefinerShape(9, 6, None, 24)}
 DISPLACEMENT, TRAINED_SIDE = 1.25, 560  # the factor of displacements in a square of this side
+
+SIDE = 64  # of the grid of anchors, whatever the images' shape
+EPSILON = 1e-5  # of the norms
 
 
 @dataclass(frozen=True)
 class RomaConfig:
-    """``symmetric``: match both ways; else from the query to the support only. The rest is the published one's:
-    the shapes of the refiners by their stride, and the coarse decoder's blocks and heads.
-    """
+    """The published sizes. ``refiners``: shapes by stride; ``blocks`` and ``heads``: of the coarse decoder."""
 
-    symmetric: bool = True
     dinov2: DinoV2Config = field(default_factory=DinoV2Config)
-    refiners: Mapping[int, RefinerShape] = field(default_factory=lambda: REFINERS)
+    refiners: Mapping[int, WarpRefinerShape] = field(default_factory=lambda: REFINERS)
     blocks: int = 5
     heads: int = 8
 
 
-@dataclass(frozen=True, eq=False)
-class RomaFeatures:
-    """Features of one image: for the first pass, strides 1 to 16, and from a larger version of it for the second;
-    ``coefficients`` (B, n, C): those of the Gaussian process with it as the support.
-    """
-
-    coarse: Pyramid
-    coefficients: Tensor
-    fine: Pyramid | None = None
-
-
-class RoMa(nn.Module):
+class RoMa(DenseNetwork):
     """Trained at 560 x 560, with a second pass at 864 x 864."""
 
     def __init__(self, config: RomaConfig | None = None) -> None:
         super().__init__()
-        self.config = config = config or RomaConfig()
+        config = config or RomaConfig()
         self.dinov2 = DinoV2(config.dinov2)
-        self.encoder = Encoder()
-        self.decoder = Decoder(config)
+        self.encoder = nn.ModuleDict({"cnn": Vgg(VGG19)})
+        self.decoder: RomaDecoder = RomaDecoder(config)
         self.eval().requires_grad_(False)
 
-    def encode(self, image: Tensor, fine: Tensor | None = None) -> RomaFeatures:
-        """Images (B, 3, H, W) as :func:`pixels.network_input` makes them, sides multiples of 14; for a second pass
-        larger ones, of any size of at least 8.
-        """
-        coarse = self.decoder.projected([*self.encoder(image), self.dinov2(image)])
+    def encode(self, image: Tensor, fine: Tensor | None = None) -> DenseFeatures:
+        """Sides of images are multiples of 14, those of larger ones for a second pass at least 8."""
+        vgg = self.encoder["cnn"]
+        coarse = self.decoder.projected([*vgg(image), self.dinov2(image)])
         coefficients = self.decoder.process.regress(coarse.at(COARSEST))
-        return RomaFeatures(
-            coarse, coefficients, None if fine is None else self.decoder.projected(self.encoder(fine))
-        )
-
-    def match(self, first: RomaFeatures, second: RomaFeatures) -> tuple[DenseWarp, ...]:
-        """B pairs, whose images may differ in size: the warp on the first image's grid, then that on the second's.
-
-        One way there is the former alone. With a second pass where both images have features for it; ValueError
-        where only one has.
-        """
-        return warps_of(self.decoder, first, second, symmetric=self.config.symmetric)
+        return DenseFeatures(coarse, (coefficients,), None if fine is None else self.decoder.projected(vgg(fine)))
 
 
-class Encoder(nn.Module):
-    def __init__(self) -> None:
-        super().__init__()
-        self.cnn = Vgg(VGG19)
-
-    def forward(self, image: Tensor) -> list[Tensor]:
-        """Features at strides 1, 2, 4 and 8 of an image (B, 3, H, W)."""
-        levels: list[Tensor] = self.cnn(image)
-        return levels
-
-
-class Decoder(WarpDecoder[RomaFeatures]):
+class RomaDecoder(WarpDecoder):
     def __init__(self, config: RomaConfig) -> None:
         super().__init__()
         width = config.refiners[COARSEST].features
@@ -107,7 +77,7 @@ class Decoder(WarpDecoder[RomaFeatures]):
         self.proj = nn.ModuleDict(
             {str(s): Projection(inputs[s], shape.features) for s, shape in config.refiners.items()}
         )
-        self.conv_refiner = nn.ModuleDict({str(s): Refiner(shape) for s, shape in config.refiners.items()})
+        self.conv_refiner = nn.ModuleDict({str(s): WarpRefiner(shape) for s, shape in config.refiners.items()})
 
     def projected(self, levels: Sequence[Tensor]) -> Pyramid:
         """Features at strides 1, 2, 4, ... as all that follows looks at them."""
@@ -119,9 +89,9 @@ class Decoder(WarpDecoder[RomaFeatures]):
         assert isinstance(process, GaussianProcess)
         return process
 
-    def coarse_estimate(self, query: RomaFeatures, support: RomaFeatures) -> Estimate:
+    def coarse_estimate(self, query: DenseFeatures, support: DenseFeatures) -> Estimate:
         features = query.coarse.at(COARSEST)
-        posterior = self.process.predict(features, support.coarse.at(COARSEST), support.coefficients)
+        posterior = self.process(features, support.coarse.at(COARSEST), *support.coefficients)
         return self.correct(self.embedding_decoder(posterior, features), query.coarse, support.coarse, COARSEST)
 
     def correct(self, estimate: Estimate, query: Pyramid, support: Pyramid, stride: int) -> Estimate:
@@ -149,3 +119,38 @@ class Projection(nn.Sequential):
 def stretch(size: torch.Size) -> float:
     """The factor of displacements in an image (H, W): their scale in pixels is about the same at any size."""
     return DISPLACEMENT * sqrt(size.numel()) / TRAINED_SIDE
+
+
+class AnchorDecoder(nn.Module):
+    """A transformer without positions; those are in the posterior."""
+
+    def __init__(self, width: int, blocks: int, heads: int) -> None:
+        super().__init__()
+        self.blocks = nn.ModuleList(
+            VitBlock(width, heads, EPSILON, bias=False, scaled=False) for _ in range(blocks)
+        )
+        self.to_out = ExactLinear(width, SIDE**2 + 1)
+
+    def forward(self, posterior: Tensor, features: Tensor) -> Estimate:
+        """Maps (B, C, h, w) and (B, C', h, w) of the query, C + C' the width -> the first estimate."""
+        x = torch.cat([tokens(posterior), tokens(features)], dim=2)  # (B, h w, C + C')
+        for block in self.blocks:
+            x = block(x)
+        logits = self.to_out(x)  # (B, h w, 4097)
+        size = posterior.shape[2:]
+        flow, certainty = anchor_mean(logits[..., :-1]), logits[..., -1:]
+        return Estimate(*(each.mT.reshape(len(x), -1, *size) for each in (flow, certainty)))
+
+
+def anchor_mean(logits: Tensor) -> Tensor:
+    """The mean place (..., 2) of the most likely anchor of (..., 4096) and its four neighbours, by probability.
+
+    As in training, neighbours are next in a row or 64 away, also across the ends of rows; those before the first
+    anchor or after the last count as that one.
+    """
+    best = logits.argmax(dim=-1, keepdim=True)
+    offsets = torch.tensor([-1, 0, 1, -SIDE, SIDE], device=logits.device)
+    near = (best + offsets).clamp(0, SIDE**2 - 1)  # (..., 5)
+    places = as_grid(identity_map(logits.new_empty(SIDE, SIDE))).reshape(-1, 2)  # (4096, 2)
+    shares = logits.gather(-1, near).softmax(dim=-1)
+    return (shares[..., None] * places[near]).sum(dim=-2)

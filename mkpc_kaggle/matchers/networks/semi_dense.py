@@ -9,6 +9,7 @@ from typing import Generic, TypeVar
 import torch
 from torch import Tensor, nn
 
+from mkpc_kaggle.matchers.dtypes import check_finite
 from mkpc_kaggle.matchers.networks.coarse_matching import CoarseMatches, coarse_matches
 from mkpc_kaggle.matchers.networks.fine_matching import (
     FinePreprocess,
@@ -20,9 +21,9 @@ from mkpc_kaggle.matchers.networks.fine_matching import (
 )
 from mkpc_kaggle.matchers.networks.linear_attention import LinearTransformer, Masks
 from mkpc_kaggle.matchers.networks.resnet_fpn import FINE, TOP, FeatureMaps, ResNetFpn
-from mkpc_kaggle.matchers.numbers import check_finite
 
 HEADS = 8
+TEMPERATURE = 0.1  # of the dual softmax
 WINDOWS_AT_ONCE = 1024
 
 Transformer = TypeVar("Transformer", bound=nn.Module)
@@ -48,9 +49,9 @@ class SemiDenseNetwork(nn.Module, ABC, Generic[Transformer]):
         self.eval().requires_grad_(False)
 
     @property
-    @abstractmethod
     def similarity_scale(self) -> float | Tensor:
-        """What the dot product of two coarse features is multiplied by before the dual softmax."""
+        """The factor of the dot product of two coarse features before the dual softmax."""
+        return 1 / (TOP * TEMPERATURE)
 
     @abstractmethod
     def transform(self, coarse0: Tensor, coarse1: Tensor, masks: Masks | None = None) -> tuple[Tensor, Tensor]:

@@ -2,12 +2,11 @@
 
 Parameter names are those of ``superglue_outdoor.pth`` and ``superglue_indoor.pth``, which load strictly; their
 terms (noncommercial research) apply to every use. Inside, the keypoints of both images are in one tensor
-(B, N0 + N1, 256), keypoints before channels: all layers act on rows, and only attention separates the images.
+(1, N, 256), N = N0 + N1: all layers act on rows, and only attention separates the images.
 """
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import cast
 
@@ -15,43 +14,14 @@ import torch
 from torch import Tensor, nn
 
 from mkpc_kaggle.geometry.coordinates import Size
-from mkpc_kaggle.matchers.networks.assignment import Assignment, mutual_matches, no_assignment
+from mkpc_kaggle.matchers.dtypes import check_finite
+from mkpc_kaggle.matchers.networks.assignment import Assignment, mutual_matches
 from mkpc_kaggle.matchers.networks.layers import attention, linear
-from mkpc_kaggle.matchers.numbers import check_finite
+from mkpc_kaggle.matchers.networks.superpoint import SuperPointKeypoints
 
 CHANNELS = 256
 HEADS = 4
-LAYERS = 18
-"""Of the graph network: self, cross, self, cross, ..."""
-
-ABSORB_EVERY = 4
-"""Sinkhorn steps between two returns to the log domain; see ``log_optimal_transport``."""
-
-
-@dataclass(frozen=True)
-class SuperGlueConfig:
-    """``sinkhorn_iterations``: the published numbers have 20. ``match_threshold``: scores must be above it."""
-
-    sinkhorn_iterations: int = 100
-    match_threshold: float = 0.2
-
-    def __post_init__(self) -> None:
-        if self.sinkhorn_iterations < 1:
-            raise ValueError(f"the transport takes at least one iteration, not {self.sinkhorn_iterations}")
-
-
-@dataclass(frozen=True, eq=False)
-class ImageKeypoints:
-    """N keypoints of one image in each of B pairs, as SuperPoint finds them.
-
-    ``points`` (B, N, 2) float32, (x, y) in pixels of the image that the detector saw, whose size is ``size``;
-    ``scores`` (B, N) in 0..1; ``descriptors`` (B, N, 256), unit vectors.
-    """
-
-    points: Tensor
-    scores: Tensor
-    descriptors: Tensor
-    size: Size
+LAYERS = 18  # of the graph network: self, cross, self, cross, ...
 
 
 class Pointwise(nn.Conv1d):
@@ -72,8 +42,8 @@ def pointwise_network(*channels: int) -> nn.Sequential:
     return nn.Sequential(*steps, Pointwise(*channels[-2:]))
 
 
-class KeypointEncoder(nn.Module):
-    """(B, N, 256) from where the keypoints lie, (B, N, 3): normalised x and y, score."""
+class PositionEncoder(nn.Module):
+    """(1, N, 256) from the places of keypoints, (1, N, 3): normalised x and y, score."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -83,7 +53,7 @@ class KeypointEncoder(nn.Module):
         return _on_rows(self.encoder, placed)
 
 
-class Attention(nn.Module):
+class SuperGlueAttention(nn.Module):
     """Four heads of 64 channels. In the checkpoint channel c belongs to head ``c mod 4``."""
 
     def __init__(self) -> None:
@@ -92,7 +62,7 @@ class Attention(nn.Module):
         self.merge = Pointwise(CHANNELS, CHANNELS)
 
     def forward(self, x: Tensor, n0: int, *, cross: bool) -> Tensor:
-        """Messages (B, N, 256) to the keypoints ``x`` (B, N, 256), of which the first ``n0`` are image 0's.
+        """Messages (1, N, 256) to the keypoints ``x`` (1, N, 256), of which the first ``n0`` are image 0's.
 
         They come from the keypoints of the same image, or of the other one with ``cross``.
         """
@@ -100,29 +70,29 @@ class Attention(nn.Module):
         maps = cast("Iterable[nn.Conv1d]", self.proj)
         weight = torch.cat([_by_head(each.weight[:, :, 0]) for each in maps])  # (768, 256)
         bias = torch.cat([_by_head(each.get_parameter("bias")) for each in maps])
-        projected = linear(x, weight, bias)  # (B, N, 768)
-        heads = projected.view(*x.shape[:2], 3, HEADS, -1).permute(2, 0, 3, 1, 4)  # (3, B, 4, N, 64)
+        projected = linear(x, weight, bias)  # (1, N, 768)
+        heads = projected.view(*x.shape[:2], 3, HEADS, -1).permute(2, 0, 3, 1, 4)  # (3, 1, 4, N, 64)
         (query0, key0, value0), (query1, key1, value1) = heads[..., :n0, :], heads[..., n0:, :]
         if cross:
             key0, key1, value0, value1 = key1, key0, value1, value0
         precision = self.merge.weight.dtype
-        output0 = attention(query0, key0, value0, precision)  # (B, 4, N0, 64)
-        output1 = attention(query1, key1, value1, precision)  # (B, 4, N1, 64)
-        output = torch.cat([output0.transpose(1, 2), output1.transpose(1, 2)], dim=1).flatten(2)  # (B, N, 256)
+        output0 = attention(query0, key0, value0, precision)  # (1, 4, N0, 64)
+        output1 = attention(query1, key1, value1, precision)  # (1, 4, N1, 64)
+        output = torch.cat([output0.transpose(1, 2), output1.transpose(1, 2)], dim=1).flatten(2)  # (1, N, 256)
         return linear(output, _by_head(self.merge.weight[:, :, 0].T).T, self.merge.bias)
 
 
-class Layer(nn.Module):
+class SuperGlueLayer(nn.Module):
     """One layer of the graph network: messages from other keypoints update a keypoint's features."""
 
     def __init__(self, *, cross: bool) -> None:
         super().__init__()
         self.cross = cross
-        self.attn = Attention()
+        self.attn = SuperGlueAttention()
         self.mlp = pointwise_network(2 * CHANNELS, 2 * CHANNELS, CHANNELS)
 
     def message(self, x: Tensor, n0: int) -> Tensor:
-        """The messages (B, N, 256) to the keypoints ``x`` (B, N, 256), the first ``n0`` of them image 0's."""
+        """The messages (1, N, 256) to the keypoints ``x`` (1, N, 256), the first ``n0`` of them image 0's."""
         message: Tensor = self.attn(x, n0, cross=self.cross)
         return message
 
@@ -133,57 +103,49 @@ class Layer(nn.Module):
         return self.update(x, self.message(x, n0))
 
 
-class GraphNetwork(nn.Module):
-    """Layers that look alternately at the keypoints of the same and of the other image."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.layers = nn.ModuleList(Layer(cross=index % 2 == 1) for index in range(LAYERS))
-
-    def forward(self, x: Tensor, n0: int) -> Tensor:
-        for layer in self.layers:
-            x = layer(x, n0)
-        return x
-
-
 class SuperGlue(nn.Module):
-    """Keypoint encoder, graph network, optimal transport; for inference only, hence made in evaluation mode."""
+    """Keypoint encoder, graph network, optimal transport; for inference only.
 
-    def __init__(self, config: SuperGlueConfig) -> None:
+    The published numbers have 20 ``sinkhorn_iterations``. Scores of matches are above ``match_threshold``.
+    """
+
+    def __init__(self, sinkhorn_iterations: int = 100, match_threshold: float = 0.2) -> None:
         super().__init__()
-        self.config = config
-        self.kenc = KeypointEncoder()
-        self.gnn = GraphNetwork()
+        self.sinkhorn_iterations = sinkhorn_iterations
+        self.match_threshold = match_threshold
+        self.kenc = PositionEncoder()
+        layers = nn.ModuleList(SuperGlueLayer(cross=index % 2 == 1) for index in range(LAYERS))
+        self.gnn = nn.ModuleDict({"layers": layers})
         self.final_proj = Pointwise(CHANNELS, CHANNELS)
         self.bin_score = nn.Parameter(torch.tensor(1.0))  # the score of being unmatched
-        self.eval()
+        self.eval().requires_grad_(False)
 
-    @torch.inference_mode()
-    def forward(self, image0: ImageKeypoints, image1: ImageKeypoints) -> Assignment:
-        """The matches of the keypoints of both images, in each of B pairs; no keypoints give no matches."""
-        n0, n1 = image0.points.shape[1], image1.points.shape[1]
+    def forward(self, image0: SuperPointKeypoints, image1: SuperPointKeypoints) -> Assignment:
+        """The matches of the keypoints of both images; no keypoints give no matches."""
+        n0, n1 = len(image0.points), len(image1.points)
         if n0 == 0 or n1 == 0:
-            return no_assignment(image0.scores, image1.scores)
+            return Assignment.empty(image0.points.device)
         x = torch.cat([self.encoded(image0), self.encoded(image1)], dim=1)
-        scores = self.score_matrix(self.final_proj(self.gnn(x, n0)), n0)
+        for layer in self.gnn.get_submodule("layers").children():
+            x = layer(x, n0)
+        scores = self.score_matrix(self.final_proj(x), n0)
         check_finite("scores of superglue", scores)
-        log_plan = log_optimal_transport(scores, self.bin_score, self.config.sinkhorn_iterations)
-        return mutual_matches(log_plan[:, :-1, :-1], self.config.match_threshold)
+        log_plan = log_optimal_transport(scores, self.bin_score, self.sinkhorn_iterations)
+        return mutual_matches(log_plan[0, :-1, :-1], self.match_threshold)
 
-    def encoded(self, image: ImageKeypoints) -> Tensor:
-        """The input features (B, N, 256) of the graph network: descriptor and encoded position."""
-        return image.descriptors.float() + self.position(image)
+    def encoded(self, image: SuperPointKeypoints) -> Tensor:
+        """The input features (1, N, 256) of the graph network: descriptor and encoded position."""
+        return image.descriptors[None].float() + self.position(image)
 
-    def position(self, image: ImageKeypoints) -> Tensor:
-        """The keypoint encoder's output for an image, (B, N, 256)."""
+    def position(self, image: SuperPointKeypoints) -> Tensor:
+        """The position encoder's output for an image, (1, N, 256)."""
         points = normalise_points(image.points, image.size)
-        placed = torch.cat([points, image.scores.float()[..., None]], dim=2)  # (B, N, 3)
-        encoded: Tensor = self.kenc(placed)
+        encoded: Tensor = self.kenc(torch.cat([points, image.scores.float()[:, None]], dim=1)[None])
         return encoded
 
     @staticmethod
     def score_matrix(projected: Tensor, n0: int) -> Tensor:
-        """Scaled inner products (B, N0, N1) float32 of projected features (B, N0 + N1, 256)."""
+        """Scaled inner products (1, N0, N1) float32 of projected features (1, N0 + N1, 256)."""
         first, second = projected[:, :n0].float(), projected[:, n0:].float()
         return (first @ second.mT) / math.sqrt(CHANNELS)
 
@@ -194,7 +156,7 @@ def _by_head(rows: Tensor) -> Tensor:
 
 
 def _on_rows(network: nn.Module, x: Tensor) -> Tensor:
-    """A network of (rows, C) on (B, N, C): there batch norm takes the last axis for the channels."""
+    """A network of (rows, C) on (1, N, C): there batch norm takes the last axis for the channels."""
     precision = next(network.parameters()).dtype
     rows: Tensor = network(x.flatten(0, 1).to(precision))
     return rows.to(x.dtype).view(*x.shape[:2], -1)
@@ -212,25 +174,15 @@ def log_optimal_transport(scores: Tensor, bin_score: Tensor, iterations: int) ->
     Each keypoint has mass 1 and may give it to the other image's dustbin, which can take all of them. An
     iteration scales the rows, then the columns to their masses.
 
-    The first iteration is done in the log domain, after which no entry of the plan exceeds 1 and no row or
-    column sum is below (m + n)^-2. Iterations on the plan itself are then matrix-vector products. Every few of
-    them the scales are absorbed into the potentials u and v and the plan is recomputed, so that they stay in
-    float32's range, and entries that underflow are negligible.
+    Potentials u and v are added to the scores, so that nothing leaves float32's range.
     """
     batch, m, n = scores.shape
     couplings = bin_score.float().expand(batch, m + 1, n + 1).clone()
     couplings[:, :m, :n] = scores
-    rows, columns = couplings.new_ones(m + 1), couplings.new_ones(n + 1)
-    rows[m], columns[n] = n, m
-    # The masses are divided by their sum here, and the plan is multiplied by it at the end.
-    rows, columns = rows / (m + n), columns / (m + n)
-    u = rows.log() - couplings.logsumexp(dim=2)  # (B, m + 1)
-    v = columns.log() - (couplings + u[:, :, None]).logsumexp(dim=1)  # (B, n + 1)
-    for done in range(1, iterations, ABSORB_EVERY):
-        plan = (couplings + u[:, :, None]).add_(v[:, None]).exp_()
-        column_scale = torch.ones_like(v)
-        for _ in range(min(ABSORB_EVERY, iterations - done)):
-            row_scale = rows / (plan @ column_scale[:, :, None])[:, :, 0]
-            column_scale = columns / (row_scale[:, None] @ plan)[:, 0]
-        u, v = u + row_scale.log(), v + column_scale.log()
-    return (couplings + u[:, :, None]).add_(v[:, None]).add_(math.log(m + n))
+    rows, columns = couplings.new_zeros(m + 1), couplings.new_zeros(n + 1)  # logarithms of the masses
+    rows[m], columns[n] = math.log(n), math.log(m)
+    v = torch.zeros_like(couplings[:, 0])
+    for _ in range(iterations):
+        u = rows - (couplings + v[:, None]).logsumexp(dim=2)  # (B, m + 1)
+        v = columns - (couplings + u[:, :, None]).logsumexp(dim=1)  # (B, n + 1)
+    return (couplings + u[:, :, None]).add_(v[:, None])

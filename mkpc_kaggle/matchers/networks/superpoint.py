@@ -6,46 +6,22 @@ in the sampling of descriptors. Pixel centres are at integers, as everywhere in 
 """
 
 from dataclasses import dataclass
-from itertools import starmap
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mkpc_kaggle.matchers.numbers import check_finite
+from mkpc_kaggle.geometry.coordinates import Size
+from mkpc_kaggle.matchers.dtypes import check_finite
 
-CELL = 8
-"""The stride of the features: a cell of the maps stands for 8 x 8 pixels."""
-
-SUPPRESSION_ROUNDS = 2
-"""Rounds of recovering points that only a suppressed point exceeded."""
-
-
-@dataclass(frozen=True)
-class SuperPointConfig:
-    """``nms_radius``: half the suppression window, in pixels. ``keypoint_threshold``: scores must be above it.
-
-    ``max_keypoints``: the strongest to keep, -1 for all. ``remove_borders``: the width in pixels of the strip
-    along the border without keypoints. SuperGlue's published numbers have 3, 0.005, 2048, 4 outdoors and
-    4, 0.005, 1024, 4 indoors.
-    """
-
-    nms_radius: int = 4
-    keypoint_threshold: float = 0.005
-    max_keypoints: int = -1
-    remove_borders: int = 4
-
-    def __post_init__(self) -> None:
-        if self.max_keypoints < -1 or self.max_keypoints == 0:
-            raise ValueError(f"max_keypoints is a positive number, or -1 for all; not {self.max_keypoints}")
-        if self.nms_radius < 0 or self.remove_borders < 0:
-            raise ValueError(f"neither nms_radius nor remove_borders may be negative: {self}")
+CELL = 8  # pixels: the stride of the features
+SUPPRESSION_ROUNDS = 2  # that recover points which only a suppressed point exceeded
 
 
 @dataclass(frozen=True, eq=False)
 class SuperPointKeypoints:
     """K keypoints of one image, all float32: ``points`` (K, 2), whole pixels (x, y); ``scores`` (K,) in 0..1;
-    ``descriptors`` (K, 256), unit vectors, one a row.
+    ``descriptors`` (K, 256), unit vectors, one a row; ``size`` of the image.
 
     By descending score if ``max_keypoints`` cut some off, else by row and column.
     """
@@ -53,14 +29,26 @@ class SuperPointKeypoints:
     points: Tensor
     scores: Tensor
     descriptors: Tensor
+    size: Size
 
 
 class SuperPoint(nn.Module):
-    """A shared trunk of eight convolutions, a detector head (Pa, Pb) and a descriptor head (Da, Db)."""
+    """A shared trunk of eight convolutions, a detector head (Pa, Pb) and a descriptor head (Da, Db).
 
-    def __init__(self, config: SuperPointConfig) -> None:
+    ``nms_radius``: half the suppression window, in pixels. Scores are above ``keypoint_threshold``.
+    ``max_keypoints``: the strongest to keep, -1 for all. ``border``: the width in pixels of the strip along the
+    border without keypoints. SuperGlue's published numbers have 3, 0.005, 2048, 4 outdoors and 4, 0.005, 1024, 4
+    indoors. For inference only.
+    """
+
+    def __init__(
+        self, nms_radius: int = 4, keypoint_threshold: float = 0.005, max_keypoints: int = -1, border: int = 4
+    ) -> None:
         super().__init__()
-        self.config = config
+        self.nms_radius = nms_radius
+        self.keypoint_threshold = keypoint_threshold
+        self.max_keypoints = max_keypoints
+        self.border = border
         self.conv1a = nn.Conv2d(1, 64, 3, padding=1)
         self.conv1b = nn.Conv2d(64, 64, 3, padding=1)
         self.conv2a = nn.Conv2d(64, 64, 3, padding=1)
@@ -73,29 +61,36 @@ class SuperPoint(nn.Module):
         self.convPb = nn.Conv2d(256, CELL * CELL + 1, 1)
         self.convDa = nn.Conv2d(128, 256, 3, padding=1)
         self.convDb = nn.Conv2d(256, 256, 1)
+        self.eval().requires_grad_(False)
         # The weights' layout decides that of the activations, since a one-channel image's is ambiguous.
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # missing in torch's stubs
 
-    @torch.inference_mode()
     def forward(self, image: Tensor) -> list[SuperPointKeypoints]:
-        """The keypoints of each ``image`` of a batch (B, 1, H, W), gray in 0..1, with sides of at least 8.
+        """The keypoints of each ``image`` of a batch (B, 1, H, W), gray in 0..1; none where a side is below 8.
 
         Sides need not be multiples of 8; the at most 7 last rows and columns beyond carry no keypoint.
         """
+        batch, _, height, width = image.shape
+        size = Size(width, height)
+        if min(size) < CELL:
+            none = image.new_zeros(0)
+            return [SuperPointKeypoints(none.view(0, 2), none, none.view(0, 256), size)] * batch
         features = self.features(image)
         logits = self.logits(features)
         check_finite("keypoint scores of superpoint", logits)
-        scores = suppress_non_maxima(score_map(logits), self.config.nms_radius)
-        return list(starmap(self._describe, zip(scores, self.descriptor_field(features), strict=True)))
+        scores = suppress_non_maxima(score_map(logits), self.nms_radius)
+        found = []
+        for of_image, field in zip(scores, self.descriptor_field(features), strict=True):
+            points, kept = self.select_keypoints(of_image)
+            found.append(SuperPointKeypoints(points, kept, sample_descriptors(field, points), size))
+        return found
 
     def features(self, image: Tensor) -> Tensor:
         """The trunk: (B, 128, h, w) from (B, 1, H, W), with h = floor(H / 8) and w = floor(W / 8)."""
-        if min(image.shape[-2:]) < CELL:
-            raise ValueError(f"an image has at least {CELL} pixels a side, not {tuple(image.shape[-2:])}")
         x = image.to(self.conv1a.weight.dtype)
-        x = _relu_of_pool(self.conv1b(torch.relu_(self.conv1a(x))))
-        x = _relu_of_pool(self.conv2b(torch.relu_(self.conv2a(x))))
-        x = _relu_of_pool(self.conv3b(torch.relu_(self.conv3a(x))))
+        for first, second in ((self.conv1a, self.conv1b), (self.conv2a, self.conv2b), (self.conv3a, self.conv3b)):
+            # Pooling first leaves the ReLU a quarter of the values.
+            x = torch.relu_(functional.max_pool2d(second(torch.relu_(first(x))), 2))
         return torch.relu_(self.conv4b(torch.relu_(self.conv4a(x))))
 
     def logits(self, features: Tensor) -> Tensor:
@@ -108,15 +103,17 @@ class SuperPoint(nn.Module):
         field: Tensor = self.convDb(torch.relu_(self.convDa(features)))
         return field
 
-    def _describe(self, scores: Tensor, field: Tensor) -> SuperPointKeypoints:
-        """The keypoints of one image, from its suppressed score map (8h, 8w) and descriptor field (256, h, w)."""
-        points, kept = select_keypoints(scores, self.config)
-        return SuperPointKeypoints(points, kept, sample_descriptors(field, points))
-
-
-def _relu_of_pool(x: Tensor) -> Tensor:
-    """The same as pooling after the ReLU, on a quarter of the values."""
-    return torch.relu_(functional.max_pool2d(x, 2))
+    def select_keypoints(self, scores: Tensor) -> tuple[Tensor, Tensor]:
+        """Points (K, 2) float32, (x, y) in pixels, and scores (K,) of one suppressed score map (8h, 8w)."""
+        border, (height, width) = self.border, scores.shape
+        inner = scores[border : max(height - border, 0), border : max(width - border, 0)]
+        rows, columns = torch.nonzero(inner > self.keypoint_threshold, as_tuple=True)
+        kept = inner[rows, columns]
+        points = torch.stack([columns + border, rows + border], dim=1).float()
+        if 0 <= self.max_keypoints < len(kept):
+            kept, strongest = kept.topk(self.max_keypoints)
+            points = points[strongest]
+        return points, kept
 
 
 def score_map(logits: Tensor) -> Tensor:
@@ -157,19 +154,6 @@ def window_maximum(values: Tensor, radius: int) -> Tensor:
             padded = torch.maximum(padded.narrow(axis, 0, length), padded.narrow(axis, step, length))
             width += step
     return padded
-
-
-def select_keypoints(scores: Tensor, config: SuperPointConfig) -> tuple[Tensor, Tensor]:
-    """Points (K, 2) float32, (x, y) in pixels, and scores (K,) of one suppressed score map (8h, 8w)."""
-    border, (height, width) = config.remove_borders, scores.shape
-    inner = scores[border : max(height - border, 0), border : max(width - border, 0)]
-    rows, columns = torch.nonzero(inner > config.keypoint_threshold, as_tuple=True)
-    kept = inner[rows, columns]
-    points = torch.stack([columns + border, rows + border], dim=1).float()
-    if 0 <= config.max_keypoints < len(kept):
-        kept, strongest = kept.topk(config.max_keypoints)
-        points = points[strongest]
-    return points, kept
 
 
 def sample_descriptors(field: Tensor, points: Tensor) -> Tensor:

@@ -13,7 +13,7 @@ from mkpc_kaggle.matchers.networks.layers import Linear
 EXPANSION = 4  # of the perceptron's hidden layer
 
 
-class Block(nn.Module):
+class VitBlock(nn.Module):
     """Self-attention, then a perceptron, each on normed tokens and added to them.
 
     ``epsilon`` of the norms; ``scaled``: each addition has a factor of its own per channel.
@@ -22,10 +22,10 @@ class Block(nn.Module):
     def __init__(self, width: int, heads: int, epsilon: float, *, bias: bool, scaled: bool) -> None:
         super().__init__()
         self.norm1 = nn.LayerNorm(width, epsilon)
-        self.attn = SelfAttention(width, heads, bias)
+        self.attn = VitAttention(width, heads, bias)
         self.ls1 = Scale(width) if scaled else nn.Identity()
         self.norm2 = nn.LayerNorm(width, epsilon)
-        self.mlp = Perceptron(width)
+        self.mlp = VitPerceptron(width)
         self.ls2 = Scale(width) if scaled else nn.Identity()
 
     def forward(self, tokens: Tensor) -> Tensor:
@@ -34,7 +34,7 @@ class Block(nn.Module):
         return tokens.add_(self.ls2(self.mlp(self.norm2(tokens))))
 
 
-class SelfAttention(nn.Module):
+class VitAttention(nn.Module):
     """Every token looks at all of them; ``bias`` of queries, keys and values."""
 
     def __init__(self, width: int, heads: int, bias: bool) -> None:
@@ -54,7 +54,7 @@ class SelfAttention(nn.Module):
         return mixed
 
 
-class Perceptron(nn.Module):
+class VitPerceptron(nn.Module):
     def __init__(self, width: int) -> None:
         super().__init__()
         self.fc1 = Linear(width, EXPANSION * width)

@@ -1,7 +1,7 @@
 """VGG with batch norms as a pyramid of features: Simonyan and Zisserman, "Very Deep Convolutional Networks", 2015.
 
-Layers are numbered as in the usual classifiers, so that ``layers.N`` are the usual parameter names. For inference
-in evaluation mode only.
+Written here because offline installs have no torchvision. Layers are numbered as in the usual classifiers, so that
+``layers.N`` are the usual parameter names. For inference in evaluation mode only.
 """
 
 from collections.abc import Iterator, Sequence
@@ -12,11 +12,8 @@ from torch import Tensor, nn
 
 from mkpc_kaggle.matchers.networks.strips import in_strips
 
-WIDTHS = (64, 128, 256, 512)
-"""Channels at strides 1, 2, 4 and 8."""
-
-VGG11, VGG19 = (1, 1, 2, 2), (2, 2, 4, 4)
-"""Convolutions at each of these strides."""
+WIDTHS = (64, 128, 256, 512)  # channels at strides 1, 2, 4 and 8
+VGG11, VGG19 = (1, 1, 2, 2), (2, 2, 4, 4)  # convolutions at each of these strides
 
 
 class Vgg(nn.Module):

@@ -18,7 +18,7 @@ HIDDEN_BLOCKS = 8
 
 
 @dataclass(frozen=True)
-class RefinerShape:
+class WarpRefinerShape:
     """``features`` of either image, ``embedding`` of the displacement, correlation ``radius`` (None: none)."""
 
     features: int
@@ -33,11 +33,11 @@ class RefinerShape:
 
 
 SHAPES = {  # by stride
-    16: RefinerShape(512, 128, 7, 1377),
-    8: RefinerShape(512, 64, 3, 1137),
-    4: RefinerShape(256, 32, 2, 569),
-    2: RefinerShape(64, 16, None, 144),
-    1: RefinerShape(3, 6, None, 24),
+    16: WarpRefinerShape(512, 128, 7, 1377),
+    8: WarpRefinerShape(512, 64, 3, 1137),
+    4: WarpRefinerShape(256, 32, 2, 569),
+    2: WarpRefinerShape(64, 16, None, 144),
+    1: WarpRefinerShape(3, 6, None, 24),
 }
 
 
@@ -54,10 +54,10 @@ class Estimate:
         return Estimate(resize(self.flow, size), resize(self.certainty, size))
 
 
-class Refiner(nn.Module):
+class WarpRefiner(nn.Module):
     """Alternating depthwise 5x5 and 1x1 convolutions of both images' features, aligned by the flow."""
 
-    def __init__(self, shape: RefinerShape) -> None:
+    def __init__(self, shape: WarpRefinerShape) -> None:
         super().__init__()
         self.radius = shape.radius
         self.block1 = block(shape.inputs, shape.hidden)

@@ -65,6 +65,7 @@ def draw_matches(axes: "Axes", images: tuple[Image, Image], match: PairMatch) ->
         _show(axes, images[side], match.regions and match.regions[side], 1 / height, left)
         ends.append((points + 0.5) / height + (left, 0))
         left += width / height
+        axes.axvline(left, color="white", linewidth=4, zorder=0.5)
     axes.set(xlim=(0, left), ylim=(1, 0))
     axes.axis("off")
     lines, inliers = np.stack(ends, axis=1), match.estimate.inliers
