@@ -15,7 +15,6 @@ from mkpc_kaggle.data.competition import (
     read_submission,
     read_test_side,
     read_train_side,
-    read_true_pair,
     submission_problems,
     write_submission,
 )
@@ -83,8 +82,8 @@ def test_the_directory_and_test_images_itself_read_the_same(side):
 @pytest.mark.parametrize("file", ["1.png", "1.jpg", "1.jpeg", "1.PNG", "1.Jpg", "1.JPEG"])
 def test_an_image_is_found_whatever_its_suffix(side, file):
     (pair,) = read_test_side(side("s,b,1,2", images=[f"b/{file}", "b/10.png", "b/1.txt"]))
-    assert pair.image0.name == file
-    assert pair.image0.is_file()
+    assert pair.images[0].name == file
+    assert pair.images[0].is_file()
 
 
 def test_a_missing_image_or_batch_is_a_path_that_does_not_exist(side):
@@ -101,7 +100,7 @@ def test_ids_stay_the_text_that_they_are(side):
 
 def test_columns_may_come_in_any_order_and_with_others(side):
     (pair,) = read_test_side(side("2,x,b,1,s", header="image_2_id,more,batch_id,image_1_id,sample_id"))
-    assert (pair.id, pair.group, pair.image0.stem, pair.image1.stem) == ("s", "b", "1", "2")
+    assert (pair.id, pair.group, pair.images[0].stem, pair.images[1].stem) == ("s", "b", "1", "2")
 
 
 def test_no_table_is_named(tmp_path):
@@ -183,25 +182,6 @@ def test_pairs_below_the_covisibility_are_left_out_and_those_at_it_are_not(train
 )
 def test_pairs_per_scene_are_spread_over_the_table(train, most, chosen):
     assert keys(*read_train_side(train, pairs_per_scene=most)) == chosen
-
-
-def test_a_pair_is_found_by_its_id_whatever_its_covisibility(train):
-    scenes = read_train_side(train, min_covisibility=0)
-    scarce = min(scenes[0].pairs, key=lambda true: true.covisibility)
-    assert scarce.covisibility < 0.1
-    scene, true = read_true_pair(train, scarce.pair.id)
-    assert (scene.name, scene.metres_per_unit, true.pair) == ("s", 2.5, scarce.pair)
-
-
-@pytest.mark.parametrize("pair", ["s;a-b", "s;", "s;b-a-c"])
-def test_an_unknown_pair_is_refused_with_known_ones(train, pair):
-    with pytest.raises(UserError, match=rf"unknown pair '{pair}'; known: s;b-a, "):
-        read_true_pair(train, pair)
-
-
-def test_a_pair_of_an_unknown_scene_is_refused_with_the_known_ones(train):
-    with pytest.raises(UserError, match=r"unknown scene 'b-a'; known: absent, s"):
-        read_true_pair(train, "b-a")
 
 
 def test_an_unknown_scene_is_refused_with_the_known_ones(train):
@@ -363,9 +343,9 @@ def test_a_batch_or_image_with_a_name_that_no_file_can_have_is_missing(side):
 
 def test_images_that_are_added_later_are_found(side):
     home = side("s,b,1,2", images=["b/2.png"])
-    assert not read_test_side(home)[0].image0.is_file()
+    assert not read_test_side(home)[0].images[0].is_file()
     (home / "test_images" / "b" / "1.jpg").write_bytes(b"")
-    assert read_test_side(home)[0].image0.name == "1.jpg"
+    assert read_test_side(home)[0].images[0].name == "1.jpg"
 
 
 def test_a_table_that_is_a_pipe_is_refused(tmp_path):
@@ -403,7 +383,7 @@ def test_a_batch_that_the_file_systems_encoding_lacks_has_no_images(tmp_path):
         "from mkpc_kaggle.data.competition import read_test_side\n"
         "from mkpc_kaggle.data.images import read_image\n"
         "assert sys.getfilesystemencoding() == 'ascii'\n"
-        "print([read_image(pair.image0).reason[:20] for pair in read_test_side(Path(sys.argv[1]))])"
+        "print([read_image(pair.images[0]).reason[:20] for pair in read_test_side(Path(sys.argv[1]))])"
     )
     environment = {**os.environ, "LC_ALL": "C", "PYTHONUTF8": "0"}
     command = [sys.executable, "-c", code, str(tmp_path)]

@@ -249,8 +249,8 @@ def test_an_image_replaced_after_the_run_is_matched_anew(
 ) -> None:
     pairs = write_pairs(tmp_path / "pairs", 5)
     first = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
-    shutil.copy(pairs[4].image0, pairs[VICTIM].image0)
-    os.utime(pairs[0].image0)
+    shutil.copy(pairs[4].images[0], pairs[VICTIM].images[0])
+    os.utime(pairs[0].images[0])
     again = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
     assert "images have changed since they were matched: 1 pairs are matched anew" in capsys.readouterr().err
     anew = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "anew")

@@ -30,7 +30,7 @@ def true_matrices(demo: DemoSet) -> dict[str, np.ndarray]:
     cameras: dict[str, tuple[Camera, Camera]] = {}
     for scene in read_train_side(demo.train_dir, min_covisibility=0):
         for true in scene.pairs:
-            first, second = true.pair.image0.stem, true.pair.image1.stem
+            first, second = true.pair.images[0].stem, true.pair.images[1].stem
             cameras[first, second] = true.camera0, true.camera1
             cameras[second, first] = true.camera1, true.camera0
     rows = (line.split(",") for line in demo.truth_csv.read_text().splitlines()[1:])
@@ -99,7 +99,7 @@ def test_validate_scores_a_recipe_and_writes_all_figures(
 def test_each_step_of_the_estimate_has_a_column(
     demo: DemoSet, small_recipe: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    small_recipe.write_text(small_recipe.read_text() + "[magsac]\norders = 1\n")
+    small_recipe.write_text(small_recipe.read_text() + "[magsac]\npermutations = 1\n")
     plain = scores_of(demo, small_recipe)
     assert plain["mAA_by_step"] == {"MAGSAC": plain["mAA"]}
     capsys.readouterr()

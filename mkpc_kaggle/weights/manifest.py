@@ -16,10 +16,9 @@ from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
-from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.errors import UserError, read_text
 
 MANIFEST = "weights_manifest.txt"
-MAX_BYTES = 1 << 20
 UNVERIFIED = "unverified"
 DIGEST = re.compile(rf"sha256:[0-9a-f]{{64}}|{UNVERIFIED}")
 
@@ -54,12 +53,7 @@ def parse_manifest(text: str, where: str = "the weights manifest") -> tuple[Weig
 
 def read_manifest(path: Path) -> tuple[WeightFile, ...]:
     """The lines of a manifest's file; raises :class:`UserError` if it cannot be read."""
-    try:
-        if not path.is_file() or path.stat().st_size > MAX_BYTES:
-            raise OSError(f"it is not a regular file of at most {MAX_BYTES} bytes")
-        return parse_manifest(path.read_text(encoding="utf-8"), str(path))
-    except (OSError, UnicodeError) as error:
-        raise UserError(f"{path} cannot be read: {error}") from error
+    return parse_manifest(read_text(path), str(path))
 
 
 @cache
