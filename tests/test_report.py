@@ -47,7 +47,7 @@ def sections(page: str) -> list[str]:
 def a_run(directory: Path, count: int = 12) -> list[Pair]:
     """A run over pairs of which the second cannot be read; its work directory is ``directory``/work."""
     pairs = write_pairs(directory / "images", count)
-    pairs[1].image1.write_bytes(b"")
+    pairs[1].images[1].write_bytes(b"")
     run(pairs, THREE_UNITS, RectifiedMatcher(), directory / "work")
     return pairs
 
