@@ -8,17 +8,6 @@ from mkpc_kaggle.data.cache import ByteCache
 KEYS = "abcde"
 
 
-def test_an_asked_for_value_stays_longer_and_a_value_above_the_limit_is_not_kept():
-    cache: ByteCache[str, str] = ByteCache(10)
-    for key in "ab":
-        cache.put(key, key.upper(), 5)
-    assert cache.get("a") == "A"
-    cache.put("c", "C", 5)
-    cache.put("d", "D", 11)
-    assert [cache.get(key) for key in "abcd"] == ["A", None, "C", None]
-    assert cache.bytes == 10
-
-
 @given(
     st.integers(0, 20),
     st.lists(st.tuples(st.sampled_from(KEYS), st.one_of(st.none(), st.integers(0, 25))), max_size=40),

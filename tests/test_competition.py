@@ -2,8 +2,6 @@
 
 import os
 import re
-import subprocess
-import sys
 import tracemalloc
 
 import numpy as np
@@ -69,19 +67,22 @@ def keys(scene):
 # the test side
 
 
-def test_pairs_come_in_the_order_of_the_table(side):
-    home = side("z,b,1,2", "a,b,2,1", "m,c,3,4")
-    assert [(pair.id, pair.group) for pair in read_test_side(home)] == [("z", "b"), ("a", "b"), ("m", "c")]
-
-
-def test_the_directory_and_test_images_itself_read_the_same(side):
-    home = side("s,b,1,2", images=["b/1.png", "b/2.png"])
-    assert read_test_side(home / "test_images") == read_test_side(home)
+def test_pairs_and_columns_come_in_any_order_and_ids_stay_the_text_that_they_are(side):
+    rows = ["0010,more,1e3,NA,007", "2,x,b,1,a", "1,x,b,2,z"]
+    images = ["1e3/NA.png", "1e3/0010.png"]
+    home = side(*rows, header="image_2_id,more,batch_id,image_1_id,sample_id", images=images)
+    pairs = read_test_side(home)
+    assert [(pair.id, pair.group) for pair in pairs] == [("007", "1e3"), ("a", "b"), ("z", "b")]
+    assert [image.name for image in pairs[0].images] == ["NA.png", "0010.png"]
+    assert read_test_side(home / "test_images") == pairs
 
 
 @pytest.mark.parametrize("file", ["1.png", "1.jpg", "1.jpeg", "1.PNG", "1.Jpg", "1.JPEG"])
 def test_an_image_is_found_whatever_its_suffix(side, file):
-    (pair,) = read_test_side(side("s,b,1,2", images=[f"b/{file}", "b/10.png", "b/1.txt"]))
+    home = side("s,b,1,2", images=["b/10.png", "b/1.txt"])
+    assert not read_test_side(home)[0].images[0].is_file()
+    (home / "test_images" / "b" / file).touch()  # an image that is added later is found
+    (pair,) = read_test_side(home)
     assert pair.images[0].name == file
     assert pair.images[0].is_file()
 
@@ -89,31 +90,6 @@ def test_an_image_is_found_whatever_its_suffix(side, file):
 def test_a_missing_image_or_batch_is_a_path_that_does_not_exist(side):
     pairs = read_test_side(side("s,b,1,2", "t,nowhere,1,2", images=["b/1.png"]))
     assert [[image.is_file() for image in pair.images] for pair in pairs] == [[True, False], [False, False]]
-
-
-def test_ids_stay_the_text_that_they_are(side):
-    (pair,) = read_test_side(side("007,1e3,NA,0010", images=["1e3/NA.png", "1e3/0010.png"]))
-    assert (pair.id, pair.group) == ("007", "1e3")
-    assert [image.name for image in pair.images] == ["NA.png", "0010.png"]
-    assert all(image.is_file() for image in pair.images)
-
-
-def test_columns_may_come_in_any_order_and_with_others(side):
-    (pair,) = read_test_side(side("2,x,b,1,s", header="image_2_id,more,batch_id,image_1_id,sample_id"))
-    assert (pair.id, pair.group, pair.images[0].stem, pair.images[1].stem) == ("s", "b", "1", "2")
-
-
-def test_no_table_is_named(tmp_path):
-    (tmp_path / "test_images").mkdir()
-    with pytest.raises(UserError, match=r"test\.csv: no such file"):
-        read_test_side(tmp_path)
-
-
-def test_no_test_images_is_named(side):
-    home = side("s,b,1,2")
-    (home / "test_images").rmdir()
-    with pytest.raises(UserError, match=r"test_images: no such directory"):
-        read_test_side(home)
 
 
 @pytest.mark.parametrize(
@@ -126,8 +102,11 @@ def test_no_test_images_is_named(side):
         (b"\x89PNG\r\n\x1a\n\xff\xfe\x00", "cannot be read as a table"),
         (HEADER.encode() + b"\ns,b,1,2\n\nt,b,1,2,3,4\n", "line 4: 6 cells, the header has 4"),
         (HEADER.encode() + b"\ns,b,1\n", "line 2: 3 cells, the header has 4"),
+        (HEADER.encode() + b"\ns,b,1,2\nt,b,1,3\ns,b,2,3\n", "line 4: the sample_id 's' is not unique"),
+        (HEADER.encode() + b'\n"a\nb",b,1,2\n', "has control characters"),
+        (HEADER.encode() + b"\na\x1bb,b,1,2\n", "has control characters"),
+        (HEADER.encode() + "\na\u2028b,b,1,2\n".encode(), "has control characters"),
     ],
-    ids=["empty", "blank", "no rows", "columns", "binary", "ragged", "short"],
 )
 def test_a_table_that_cannot_be_used_is_refused_by_name(side, content, says):
     home = side()
@@ -136,25 +115,26 @@ def test_a_table_that_cannot_be_used_is_refused_by_name(side, content, says):
         read_test_side(home)
 
 
-def test_a_repeated_sample_id_is_refused_with_its_line(side):
-    home = side("s,b,1,2", "t,b,1,3", "s,b,2,3", "t,b,3,1")
-    with pytest.raises(UserError, match=r"test\.csv, line 4: the sample_id 's' is not unique"):
+def test_a_directory_without_its_table_or_images_is_refused(side, tmp_path):
+    home = side("s,b,1,2")
+    (home / "test_images").rmdir()
+    with pytest.raises(UserError, match=r"test_images: no such directory"):
+        read_test_side(home)
+    (home / "test_images").mkdir()
+    (home / "test.csv").unlink()
+    with pytest.raises(UserError, match=r"test\.csv: no such file"):
+        read_test_side(home)
+    os.mkfifo(home / "test.csv")
+    with pytest.raises(UserError, match="is not a regular file"):
         read_test_side(home)
 
 
 @pytest.mark.parametrize("row", ["s,{},1,2", "s,b,{},2", "s,b,1,{}"], ids=["batch", "image 1", "image 2"])
-@pytest.mark.parametrize("name", ["", ".", "..", "../x", "x/y", "/etc", "x\\y", "..\\x"])
+@pytest.mark.parametrize("name", ["", ".", "..", "../x", "x/y", "/etc", "x\\y", "C:x", "c:", "a\x1bb", "a\x7f"])
 def test_an_id_that_is_no_plain_name_is_refused(side, row, name):
     home = side("ok,b,1,2", row.format(name))
-    with pytest.raises(UserError, match=rf"test\.csv.*{re.escape(repr(name))} is not a plain name"):
+    with pytest.raises(UserError, match=r"test\.csv.* is not a plain name"):
         read_test_side(home)
-
-
-@needs_data
-def test_every_image_of_the_shared_test_side_is_there():
-    pairs = read_test_side(DATA / "test")
-    assert len(pairs) == 29
-    assert all(image.is_file() for pair in pairs for image in pair.images)
 
 
 # the train side
@@ -184,17 +164,20 @@ def test_pairs_per_scene_are_spread_over_the_table(train, most, chosen):
     assert keys(*read_train_side(train, pairs_per_scene=most)) == chosen
 
 
-def test_an_unknown_scene_is_refused_with_the_known_ones(train):
-    with pytest.raises(UserError, match=r"unknown scene 'x'; known: absent, s"):
-        read_train_side(train, scenes=["s", "x"])
-
-
-def test_a_scene_that_is_asked_for_and_has_no_directory_is_named(train):
-    with pytest.raises(UserError, match=r"absent.*calibration\.csv: no such file"):
-        read_train_side(train, scenes=["absent"])
-
-
-def test_a_train_side_without_any_scene_is_refused(train):
+@pytest.mark.parametrize(
+    ("read", "says"),
+    [
+        (lambda train: read_train_side(train, scenes=["s", "x"]), r"unknown scene 'x'; known: absent, s"),
+        (lambda train: read_train_side(train, scenes=["absent"]), r"absent.*calibration\.csv: no such file"),
+        (
+            lambda train: read_train_side(train, min_covisibility=1.1),
+            r"covisibility\.csv has no pair with .*1\.1",
+        ),
+    ],
+)
+def test_what_a_train_side_lacks_is_told_with_what_it_has(train, read, says):
+    with pytest.raises(UserError, match=says):
+        read(train)
     replace_in(train / "scaling_factors.csv", "s,2.5\n", "")
     with pytest.raises(UserError, match=r"has none of the scenes"):
         read_train_side(train)
@@ -232,37 +215,22 @@ def test_cameras_of_the_shared_train_side_give_its_fundamental_matrices():
         assert_allclose(F * np.sign(np.sum(F * expected)), expected, rtol=0, atol=1e-9)
 
 
-@needs_data
-def test_the_shared_train_side_has_five_scenes():
-    names = sorted(path.name for path in (DATA / "train").iterdir() if path.is_dir())
-    assert [scene.name for scene in read_train_side(DATA / "train", pairs_per_scene=1)] == names
-
-
 # submissions
 
 
 def test_a_submission_keeps_its_numbers_and_their_order(tmp_path):
     rng = np.random.default_rng(0)
-    rows = {f"s;{i}-x": rng.normal(size=(3, 3)) * 10.0 ** rng.integers(-12, 12, (3, 3)) for i in (5, 3, 9)}
+    names = ["s;5-x", "s;3-x", "a,b", 'a"b', "NA", "a b"]
+    rows = {name: rng.normal(size=(3, 3)) * 10.0 ** rng.integers(-12, 12, (3, 3)) for name in names}
     write_submission(tmp_path / "submission.csv", rows)
     read = read_submission(tmp_path / "submission.csv")
     assert list(read) == list(rows)
     for name, F in rows.items():
         assert_allclose(read[name], F, rtol=1e-11, atol=0)
     assert submission_problems(tmp_path / "submission.csv", list(rows)) == []
-
-
-def test_a_submission_is_plain_lines_under_the_header(tmp_path):
     write_submission(tmp_path / "x.csv", {"b": EYE, "a": -EYE / 2})
     expected = b"sample_id,fundamental_matrix\nb,1 0 0 0 1 0 0 0 1\na,-0.5 -0 -0 -0 -0.5 -0 -0 -0 -0.5\n"
     assert (tmp_path / "x.csv").read_bytes() == expected
-
-
-@pytest.mark.parametrize("sample", ["a,b", 'a"b', "NA", "a b"])
-def test_a_sample_id_of_any_text_survives_the_submission(tmp_path, sample):
-    write_submission(tmp_path / "x.csv", {sample: EYE})
-    assert list(read_submission(tmp_path / "x.csv")) == [sample]
-    assert submission_problems(tmp_path / "x.csv", [sample]) == []
 
 
 def test_the_former_submission_stays_when_writing_fails(tmp_path, monkeypatch):
@@ -287,17 +255,13 @@ def test_the_former_submission_stays_when_writing_fails(tmp_path, monkeypatch):
     [
         ("id,F\na,1\n", "lacks the columns sample_id, fundamental_matrix"),
         ("sample_id,fundamental_matrix,x\na,{F},1\nb,{F},1\n", "the header is"),
-        ("fundamental_matrix,sample_id\n{F},a\n{F},b\n", "the header is"),
         ("sample_id,fundamental_matrix\na,{F}\n", "1 samples are missing, the first is b"),
         ("sample_id,fundamental_matrix\na,{F}\nb,{F}\nc,{F}\n", "not in test.csv, the first is c"),
         ("sample_id,fundamental_matrix\nb,{F}\na,{F}\n", "not in the order of test.csv"),
         ("sample_id,fundamental_matrix\na,{F}\nb,{F}\nb,{F}\n", "twice"),
         ("sample_id,fundamental_matrix\na,{F}\nb,1 2 3 4 5 6 7 8\n", "b: .*expected 9 numbers, found 8"),
-        ("sample_id,fundamental_matrix\na,{F}\nb,{F} 1\n", "b: .*expected 9 numbers, found 10"),
-        ("sample_id,fundamental_matrix\na,{F}\nb,\n", "b: .*expected 9 numbers, found 0"),
         ("sample_id,fundamental_matrix\na,{F}\nb,1 2 3 4 5 6 7 8 x\n", "b: .*not a list of numbers"),
         ("sample_id,fundamental_matrix\na,{F}\nb,1 2 3 4 5 6 7 8 nan\n", "b: a number is not finite"),
-        ("sample_id,fundamental_matrix\na,{F}\nb,1 2 3 4 5 6 7 8 -inf\n", "b: a number is not finite"),
         ("sample_id,fundamental_matrix\na,{F}\nb,0 0 0 0 0 0 0 0 0\n", "b: the matrix is zero"),
         ("", "lacks the columns"),
         ("\0\0\0", "lacks the columns|cannot be read"),
@@ -307,59 +271,16 @@ def test_each_problem_of_a_submission_is_the_only_one_found(tmp_path, content, s
     (tmp_path / "x.csv").write_text(content.replace("{F}", "1 2 3 4 5 6 7 8 9"))
     (problem,) = submission_problems(tmp_path / "x.csv", ["a", "b"])
     assert re.search(says, problem)
-
-
-def test_all_problems_of_a_submission_are_told_at_once(tmp_path):
     (tmp_path / "x.csv").write_text("sample_id,fundamental_matrix\nb,1\na,0 0 0 0 0 0 0 0 0\n")
-    assert len(submission_problems(tmp_path / "x.csv", ["a", "b"])) == 3
-
-
-def test_a_submission_that_is_not_there_is_a_problem(tmp_path):
-    (problem,) = submission_problems(tmp_path / "x.csv", ["a"])
+    assert len(submission_problems(tmp_path / "x.csv", ["a", "b"])) == 3, "all are told at once"
+    (problem,) = submission_problems(tmp_path / "y.csv", ["a"])
     assert "no such file" in problem
-
-
-# hostile tables and places
-
-
-@pytest.mark.parametrize("character", ["\r", "\n", "\x00", "\x1b", "\x85", "\u2028"])
-def test_a_sample_id_with_a_control_character_is_refused(side, character):
-    home = side(f'"a{character}b",b,1,2')
-    with pytest.raises(UserError, match=r"test\.csv.* has control characters|cannot be read as a table"):
-        read_test_side(home)
-
-
-@pytest.mark.parametrize("name", ["C:x", "c:", "a\x1bb", "a\x7f"])
-def test_drives_and_control_characters_are_no_plain_names(side, name):
-    with pytest.raises(UserError, match="is not a plain name"):
-        read_test_side(side(f"s,{name},1,2"))
 
 
 def test_a_batch_or_image_with_a_name_that_no_file_can_have_is_missing(side):
     pairs = read_test_side(side(f"s,{'b' * 5000},1,2", f"t,b,{'i' * 5000},2", images=["b/2.png"]))
     answers = [read_image(path) for pair in pairs for path in pair.images]
     assert [isinstance(answer, Unreadable) for answer in answers[:3]] == [True] * 3
-
-
-def test_images_that_are_added_later_are_found(side):
-    home = side("s,b,1,2", images=["b/2.png"])
-    assert not read_test_side(home)[0].images[0].is_file()
-    (home / "test_images" / "b" / "1.jpg").write_bytes(b"")
-    assert read_test_side(home)[0].images[0].name == "1.jpg"
-
-
-def test_a_table_that_is_a_pipe_is_refused(tmp_path):
-    (tmp_path / "test_images").mkdir()
-    os.mkfifo(tmp_path / "test.csv")
-    with pytest.raises(UserError, match="is not a regular file"):
-        read_test_side(tmp_path)
-
-
-def test_a_scene_without_a_pair_of_that_covisibility_is_told(train):
-    with pytest.raises(
-        UserError, match=r"pair_covisibility\.csv has no pair with a covisibility of at least 1\.1"
-    ):
-        read_train_side(train, min_covisibility=1.1)
 
 
 def test_a_large_table_is_read_and_written_in_little_memory(side):
@@ -372,21 +293,3 @@ def test_a_large_table_is_read_and_written_in_little_memory(side):
     tracemalloc.stop()
     assert len(pairs) == count
     assert most / count < 700  # bytes a row, strings of the ids among them
-
-
-def test_a_batch_that_the_file_systems_encoding_lacks_has_no_images(tmp_path):
-    (tmp_path / "test_images" / "b").mkdir(parents=True)
-    (tmp_path / "test_images" / "b" / "1.png").touch()
-    (tmp_path / "test.csv").write_text(f"{HEADER}\ns,\u00e9,1,2\nt,b,1,1\n", encoding="utf-8")
-    code = (
-        "import sys; from pathlib import Path\n"
-        "from mkpc_kaggle.data.competition import read_test_side\n"
-        "from mkpc_kaggle.data.images import read_image\n"
-        "assert sys.getfilesystemencoding() == 'ascii'\n"
-        "print([read_image(pair.images[0]).reason[:20] for pair in read_test_side(Path(sys.argv[1]))])"
-    )
-    environment = {**os.environ, "LC_ALL": "C", "PYTHONUTF8": "0"}
-    command = [sys.executable, "-c", code, str(tmp_path)]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
-    assert done.stdout.split(", ")[1:] == ["'the file is empty']\n"], done.stderr
-    assert "cannot be read" in done.stdout

@@ -2,8 +2,8 @@
 
 import os
 import threading
-import time
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from pathlib import Path
 
 import cv2
@@ -48,17 +48,13 @@ def test_a_colour_png_is_read_as_it_is(tmp_path):
     assert (image.name, image.size, image.pixels.dtype) == (str(tmp_path / "a.png"), (7, 5), np.uint8)
 
 
-@pytest.mark.parametrize("suffix", [".png", ".jpg", ".jpeg"])
-def test_red_comes_first(tmp_path, suffix):
-    image = read_image(write(tmp_path / f"a{suffix}", np.full((16, 24, 3), RED, np.uint8)))
-    assert np.abs(image.pixels.astype(int) - RED).max() <= 3
-
-
-def test_a_gray_file_has_three_equal_channels(tmp_path):
-    pixels = noise(5, 7)
-    image = read_image(write(tmp_path / "a.png", pixels))
-    assert_array_equal(image.pixels, np.stack([pixels] * 3, axis=2))
-    assert_array_equal(image.gray, pixels)
+@pytest.mark.parametrize("shape", [(1, 1), (5, 7), (5, 7, 4), (2500, 3000)])
+def test_gray_has_three_equal_channels_and_alpha_is_dropped(tmp_path, shape):
+    pixels = noise(*shape)
+    image = read_image(write(tmp_path / "a.png", pixels, cv2.IMWRITE_PNG_COMPRESSION, 1))
+    expected = pixels[..., :3] if len(shape) == 3 else np.stack([pixels] * 3, axis=2)
+    assert_array_equal(image.pixels, expected)
+    assert len(shape) == 3 or (image.gray == pixels).all()
 
 
 @pytest.mark.parametrize("shape", [(16, 16), (16, 16, 3)])
@@ -68,9 +64,9 @@ def test_sixteen_bits_are_divided_by_256(tmp_path, shape):
     assert_array_equal(image.pixels, np.broadcast_to((pixels // 256).reshape(16, 16, -1), (16, 16, 3)))
 
 
-def test_alpha_is_dropped_and_mixes_with_nothing(tmp_path):
-    pixels = noise(5, 7, 4)
-    assert_array_equal(read_image(write(tmp_path / "a.png", pixels)).pixels, pixels[..., :3])
+def test_red_comes_first_and_the_suffix_does_not_decide_the_format(tmp_path):
+    path = write(tmp_path / "a.jpg", np.full((16, 24, 3), RED, np.uint8)).rename(tmp_path / "a.png")
+    assert np.abs(read_image(path).pixels.astype(int) - RED).max() <= 3
 
 
 def test_an_exif_orientation_is_applied(tmp_path):
@@ -87,38 +83,19 @@ def test_an_exif_orientation_is_applied(tmp_path):
     assert image.pixels[-8:, :, 0].mean() < 50
 
 
-def test_one_pixel_is_a_picture(tmp_path):
-    image = read_image(write(tmp_path / "a.png", np.full((1, 1, 3), RED, np.uint8)))
-    assert_array_equal(image.pixels, [[RED]])
-
-
-def test_thirty_megapixels_are_read(tmp_path):
-    pixels = np.zeros((5000, 6000), np.uint8)
-    pixels[4999, 5999] = 255
-    image = read_image(write(tmp_path / "a.png", pixels, cv2.IMWRITE_PNG_COMPRESSION, 1))
-    assert image.size == (6000, 5000)
-    assert image.pixels[-1, -1, 0] == 255
-
-
-def test_the_suffix_does_not_decide_the_format(tmp_path):
-    path = write(tmp_path / "a.jpg", noise(9, 9, 3)).rename(tmp_path / "a.png")
-    assert isinstance(read_image(path), Image)
-
-
-def test_an_empty_file_is_unreadable(tmp_path):
-    (tmp_path / "a.png").touch()
-    assert reason(tmp_path / "a.png") == "the file is empty"
-
-
-def test_text_is_unreadable(tmp_path):
-    (tmp_path / "a.png").write_text("no picture at all\n" * 100)
-    assert "not a picture" in reason(tmp_path / "a.png")
-
-
-def test_a_directory_and_a_missing_file_are_unreadable(tmp_path):
-    (tmp_path / "a.png").mkdir()
-    assert "cannot be read" in reason(tmp_path / "a.png")
-    assert reason(tmp_path / "b.png") == "no such file"
+def test_what_is_no_picture_has_its_reason(tmp_path):
+    (tmp_path / "empty.png").touch()
+    (tmp_path / "text.png").write_text("no picture at all\n" * 100)
+    (tmp_path / "directory.png").mkdir()
+    os.mkfifo(tmp_path / "pipe.png")
+    (tmp_path / "device.png").symlink_to("/dev/zero")
+    assert reason(tmp_path / "empty.png") == "the file is empty"
+    assert "not a picture" in reason(tmp_path / "text.png")
+    assert "cannot be read" in reason(tmp_path / "directory.png")
+    assert reason(tmp_path / "none.png") == "no such file"
+    assert str(read_image(tmp_path / os.fsdecode(b"\xff.png"))) == f"{tmp_path}/\\udcff.png: no such file"
+    for name in ("pipe.png", "device.png"):
+        assert reason(tmp_path / name) == "cannot be read: not a regular file"
 
 
 @pytest.mark.skipif(os.name != "posix" or os.geteuid() == 0, reason="root may read everything")
@@ -127,30 +104,22 @@ def test_a_file_without_permission_is_unreadable(tmp_path):
     assert "ermission denied" in reason(tmp_path / "a.png")
 
 
-@pytest.mark.parametrize("share", [0.001, 0.1, 0.5, 0.99])
+@pytest.mark.parametrize("share", [0.001, 0.5, 0.99])
 def test_a_png_that_is_cut_off_is_unreadable(tmp_path, share):
     path = write(tmp_path / "a.png", noise(64, 64, 3))
     path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
     assert "cut off" in reason(path)
 
 
-@pytest.mark.parametrize("share", [0.01, 0.1, 0.5, 0.99])
-def test_a_jpg_that_is_cut_off_is_read_as_far_as_it_goes_or_unreadable(tmp_path, share):
-    path = write(tmp_path / "a.jpg", noise(64, 64, 3))
-    path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
-    answer = read_image(path)
-    assert isinstance(answer, Unreadable) or answer.pixels.shape == (64, 64, 3)
-
-
 @pytest.mark.parametrize("suffix", [".png", ".jpg"])
-def test_damaged_bytes_never_raise(tmp_path, suffix):
+def test_damaged_or_missing_bytes_never_raise(tmp_path, suffix):
     whole = write(tmp_path / f"a{suffix}", noise(48, 48, 3)).read_bytes()
     rng = np.random.default_rng(1)
     for number in range(30):
         data = bytearray(whole)
         for place in rng.integers(len(data), size=1 + number):
             data[place] = rng.integers(256)
-        (tmp_path / f"b{suffix}").write_bytes(data)
+        (tmp_path / f"b{suffix}").write_bytes(data[: int(rng.choice([0.01, 0.5, 1]) * len(data))])
         assert isinstance(read_image(tmp_path / f"b{suffix}"), Image | Unreadable)
 
 
@@ -175,10 +144,8 @@ def test_a_gray_array_and_a_view_of_an_array_are_images():
     "array",
     [
         np.zeros((4, 4, 3), np.float32),
-        np.zeros((4, 4, 3), np.uint16),
         np.zeros((4, 4, 4), np.uint8),
         np.zeros((4, 4, 1), np.uint8),
-        np.zeros(4, np.uint8),
         np.zeros((2, 4, 4, 3), np.uint8),
         np.zeros((0, 4, 3), np.uint8),
     ],
@@ -199,7 +166,6 @@ def decoded(monkeypatch):
 
     def fake(path):
         seen.append(path)
-        time.sleep(0.01)
         if path.name == "bad":
             return Unreadable(str(path), "bad")
         return Image(str(path), np.zeros((10, 10, 3), np.uint8))
@@ -241,24 +207,13 @@ def test_a_file_is_decoded_once_however_often_it_is_asked_for(store, decoded):
     assert decoded == paths
 
 
-def test_a_store_reads_real_files_unless_told_otherwise(tmp_path):
-    store, pixels = ImageStore(), noise(5, 7, 3)
-    assert_array_equal(store.get(write(tmp_path / "a.png", pixels)).pixels, pixels)
-    assert store.get(tmp_path / "b.png") == Unreadable(str(tmp_path / "b.png"), "no such file")
-    store.close()
-
-
 def test_the_image_used_longest_ago_makes_room_and_an_unreadable_file_is_tried_again(store, decoded):
     for name in ("a", "b", "c", "a", "d", "a", "b", "bad", "bad"):
         store.get(Path(name))
     assert [path.name for path in decoded] == ["a", "b", "c", "d", "b", "bad", "bad"]
-
-
-def test_an_image_above_the_limit_is_handed_out_all_the_same(decoded):
-    small = ImageStore(limit_bytes=299)
-    assert [small.get(Path("a")).name for _ in range(2)] == ["a", "a"]
-    assert len(decoded) == 2
-    small.close()
+    with closing(ImageStore(limit_bytes=299)) as small:  # an image above the limit is handed out all the same
+        assert [small.get(Path("a")).name for _ in range(2)] == ["a", "a"]
+    assert len(decoded) == 9
 
 
 def test_threads_may_ask_for_the_same_file_at_once(store, decoded):
@@ -271,24 +226,6 @@ def test_threads_may_ask_for_the_same_file_at_once(store, decoded):
     with ThreadPoolExecutor(6) as pool:
         assert list(pool.map(ask, range(6))) == ["a"] * 6
     assert len(decoded) == 1
-
-
-def test_threads_that_press_on_a_small_store_get_what_they_ask_for(decoded):
-    store = ImageStore(limit_bytes=600, threads=2)
-    names = [str(number % 5) for number in range(60)]
-    with ThreadPoolExecutor(4) as pool:
-        assert list(pool.map(lambda name: store.get(Path(name)).name, names)) == names
-    store.close()
-
-
-# what is no picture, and what has become another
-
-
-def test_a_pipe_and_a_device_are_not_read(tmp_path):
-    os.mkfifo(tmp_path / "pipe.png")
-    (tmp_path / "device.png").symlink_to("/dev/zero")
-    for name in ("pipe.png", "device.png"):
-        assert reason(tmp_path / name) == "cannot be read: not a regular file"
 
 
 @pytest.mark.parametrize(("shape", "told"), [((3, 300), "300 x 3 pixels"), ((300, 3), "3 x 300 pixels")])
@@ -307,8 +244,3 @@ def test_a_file_with_the_same_bytes_is_unchanged_and_one_with_others_is_not(tmp_
     assert not is_unchanged(path, version)
     path.unlink()
     assert is_unchanged(path, version), "what is gone has no other content"
-
-
-def test_a_path_that_is_no_utf8_is_told_in_letters(tmp_path):
-    path = tmp_path / os.fsdecode(b"\xff.png")
-    assert str(read_image(path)) == f"{tmp_path}/\\udcff.png: no such file"

@@ -48,10 +48,6 @@ def errors(*angles):
     return [PoseError(angle, 0.0, 0.0) for angle in angles]
 
 
-def turned(camera, R):
-    return Camera(camera.K, R @ camera.R, R @ camera.t)
-
-
 def test_the_thresholds_are_those_of_the_competition():
     assert_allclose(ROTATION_THRESHOLDS, [1, 2, 3, 4, 5, 6, 7, 8, 9, 10])
     ratio = 25 ** (1 / 9)
@@ -114,15 +110,6 @@ def test_the_fundamental_matrix_of_two_cameras_meets_the_epipolar_constraint(see
     assert np.linalg.svd(F, compute_uv=False)[2] < 1e-12
 
 
-@given(seed=SEEDS)
-@settings(max_examples=40, deadline=None)
-def test_the_relative_pose_takes_one_camera_to_the_other(seed):
-    first, second = random_cameras(seed)
-    R, t = relative_pose(first, second)
-    X = np.random.default_rng(seed).normal(size=(9, 3))
-    assert_allclose((X @ first.R.T + first.t) @ R.T + t, X @ second.R.T + second.t, atol=1e-9)
-
-
 @given(
     seed=SEEDS, sign=st.sampled_from([1, -1]), metres=st.floats(0.01, 100), scale=st.sampled_from([1e-6, 1, 1e4])
 )
@@ -175,24 +162,6 @@ def test_the_rotation_nearer_to_the_truth_counts():
         assert pose_error(F, camera, second, 1.0).rotation < 1e-4
 
 
-def test_a_turn_of_the_world_changes_no_error():
-    first, second = random_cameras(11)
-    F = fundamental_of_cameras(first, turned(second, rotation((1, 2, 3), 4)))
-    error = pose_error(F, first, second, 1.0)
-    moved = [Camera(c.K, c.R @ rotation((3, 1, 1), 70).T, c.t + 0) for c in (first, second)]
-    again = pose_error(F, *moved, 1.0)
-    assert 0 < error.rotation < 5
-    assert_allclose([again.rotation, again.translation], [error.rotation, error.translation], rtol=1e-6)
-
-
-@pytest.mark.parametrize("threshold", AUC_THRESHOLDS)
-def test_the_pose_auc_has_its_extremes(threshold):
-    assert pose_auc(errors(0, 0, 0), threshold) == pytest.approx(1)
-    assert pose_auc(errors(threshold + 1, 60, inf), threshold) == 0
-    assert pose_auc([PoseError.failed()], threshold) == 0
-    assert isnan(pose_auc([], threshold))
-
-
 @pytest.mark.parametrize(
     ("angles", "threshold", "area"),
     [
@@ -202,16 +171,14 @@ def test_the_pose_auc_has_its_extremes(threshold):
         ((4, 1, 4), 5, (1 / 6 + 3 * 0.5 + 1) / 5),  # two of one size: the curve steps to 2/3, then to 1
         ((0, 10), 5, 0.5),
         ((0, 3), 5, (3 * 0.75 + 2) / 5),
+        ((0, 0, 0), 20, 1),
+        ((6, 60, inf), 5, 0),
     ],
 )
 def test_the_pose_auc_is_the_area_computed_by_hand(angles, threshold, area):
     assert pose_auc(errors(*angles), threshold) == pytest.approx(area)
-
-
-def test_the_pose_auc_counts_the_larger_angle_of_a_pair():
-    assert (
-        pose_auc([PoseError(1.0, 5.0, 0.0)], 10) == pose_auc([PoseError(5.0, 1.0, 9.0)], 10) == pytest.approx(0.75)
-    )
+    assert pose_auc([PoseError(1e-9, angle, 9.0) for angle in angles], threshold) == pytest.approx(area)
+    assert isnan(pose_auc([], threshold))
 
 
 def test_an_error_reads_as_a_sentence_whatever_is_known() -> None:

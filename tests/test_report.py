@@ -2,10 +2,8 @@
 
 import json
 import re
-import sqlite3
 import sys
 import time
-from contextlib import closing
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -16,8 +14,7 @@ from rectified import THREE_UNITS, RectifiedMatcher, run, write_pairs
 from mkpc_kaggle.cli import main
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.journal import Journal
-from mkpc_kaggle.engine.journal_tables import DRAWN, FORMAT, About, EventKind, JournalReader
-from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.engine.journal_tables import DRAWN, About, EventKind, JournalReader
 from mkpc_kaggle.reporting.report import DRAWING_S, report_page, report_run
 from mkpc_kaggle.reporting.run_log import NOT_ENDED, read_log
 from mkpc_kaggle.reporting.summary import overview
@@ -75,26 +72,23 @@ def test_a_run_exports_tables_that_pandas_reads_as_they_are(
     assert len(table["units"]) == 3 * 11
     assert len(table["regions"]) == 2 * 11
     assert set(table["events"]["kind"]) >= {"start", "end"}
-
-
-def test_the_json_export_has_each_pair_with_its_units_and_regions(tmp_path: Path) -> None:
-    a_run(tmp_path)
     assert main(["journal", str(tmp_path / "work"), "--json", str(tmp_path / "log.json")]) == 0
     values = json.loads((tmp_path / "log.json").read_text())
     assert [len(pair["units"]) for pair in values["pairs"]] == [3, 0] + [3] * 10
     assert [len(pair["regions"]) for pair in values["pairs"]] == [2, 0] + [2] * 10
-    assert values["pairs"][4]["F"] == read_log(tmp_path / "work").records[4].chosen_fundamental.tolist()
+    assert values["pairs"][4]["F"] == log.records[4].chosen_fundamental.tolist()
     assert values["ending"] == "complete"
     assert values["recipe"]["units"][0]["long_side"] == THREE_UNITS.units[0].long_side
-
-
-def test_without_options_the_command_shows_one_screen(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    a_run(tmp_path)
+    capsys.readouterr()
     assert main(["journal", str(tmp_path / "work")]) == 0
     out = capsys.readouterr().out
     assert re.search("complete after .*: 11 of 12 pairs have an F", out)
     assert "the file is empty" in out
     assert len(out.splitlines()) < 20
+    run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")  # a resumed run is a second session
+    log = read_log(tmp_path / "work")
+    assert [event.kind for event in log.events if event.kind in ("start", "end")] == ["start", "end"] * 2
+    assert [event.kind for event in log.session if event.kind in ("start", "end")] == ["start", "end"]
 
 
 def test_the_screen_names_matchers_that_were_left_out_once(tmp_path: Path) -> None:
@@ -111,10 +105,7 @@ def test_an_export_that_cannot_be_written_is_told(
     (tmp_path / "file").touch()
     assert main(["journal", str(tmp_path), option, str(tmp_path / "file" / "x")]) == 2
     assert "cannot be written" in capsys.readouterr().err
-
-
-def test_a_directory_without_a_journal_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["journal", str(tmp_path)]) == 2
+    assert main(["journal", str(tmp_path / "none"), option, str(tmp_path / "x")]) == 2
     assert "has no journal.sqlite" in capsys.readouterr().err
 
 
@@ -128,47 +119,6 @@ def test_a_journal_can_be_read_while_its_run_writes_it(tmp_path: Path) -> None:
     assert [event.text for event in read_log(tmp_path).events] == ["", "no more"]
     assert read_log(tmp_path).ending == NOT_ENDED
     journal.close()
-
-
-def test_a_fresh_run_cannot_take_the_journal_of_a_run_at_work(tmp_path: Path) -> None:
-    journal = empty_journal(tmp_path, write_pairs(tmp_path / "images", 2))
-    with pytest.raises(UserError, match="is another run at work there"):
-        Journal(tmp_path, BELONGS_TO, fresh=True)
-    assert len(read_log(tmp_path).pairs) == 2
-    journal.close()
-
-
-def test_a_note_that_cannot_be_written_is_lost_and_no_more(tmp_path: Path) -> None:
-    journal = empty_journal(tmp_path, [])
-    journal._db.execute("PRAGMA query_only = 1")
-    journal.note(EventKind.FAULT, 1.0, "lost")
-    journal._db.execute("PRAGMA query_only = 0")
-    journal.note(EventKind.FAULT, 2.0, "kept")
-    journal.close()
-    assert read_log(tmp_path).faults == ["kept"]
-
-
-def test_a_journal_of_an_older_format_is_refused_and_left_as_it_was(tmp_path: Path) -> None:
-    path = tmp_path / "journal.sqlite"
-    with closing(sqlite3.connect(path)) as db:
-        db.execute("CREATE TABLE run (key TEXT PRIMARY KEY, value TEXT NOT NULL)")
-        db.execute("INSERT INTO run VALUES ('format', '1')")
-        db.commit()
-    before = path.read_bytes()
-    with pytest.raises(UserError, match=rf"journal format 1, this version has {FORMAT}.*--fresh"):
-        Journal(tmp_path, BELONGS_TO)
-    with pytest.raises(UserError, match="journal format 1"):
-        read_log(tmp_path)
-    assert path.read_bytes() == before
-    Journal(tmp_path, BELONGS_TO, fresh=True).close()
-
-
-def test_a_resumed_run_is_a_second_session(tmp_path: Path) -> None:
-    pairs = a_run(tmp_path, 3)
-    run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
-    log = read_log(tmp_path / "work")
-    assert [event.kind for event in log.events if event.kind in ("start", "end")] == ["start", "end"] * 2
-    assert [event.kind for event in log.session if event.kind in ("start", "end")] == ["start", "end"]
 
 
 def test_the_page_begins_with_the_verdict_has_pictures_inside_and_asks_for_nothing(tmp_path: Path) -> None:
@@ -214,6 +164,10 @@ def test_without_matplotlib_the_page_has_tables_and_says_so(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pairs = a_run(tmp_path, 4)
+    kept = {image for pair in pairs[1:] for image in pair.images}
+    for path in set(pairs[0].images) - kept:
+        path.unlink()
+    assert "an image cannot be read any more" in report_page(read_log(tmp_path / "work"), pairs)
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     text = report_page(read_log(tmp_path / "work"), pairs)
     assert "matplotlib is not installed" in text
@@ -227,15 +181,6 @@ def test_a_run_of_no_pairs_has_a_page_without_empty_sections(tmp_path: Path) -> 
     assert sections(report_page(log)) == ["What made this"]
     assert all(table.empty for name, table in log.tables.named().items() if name != "events")
     assert overview(log)
-
-
-def test_images_that_are_gone_are_told(tmp_path: Path) -> None:
-    pairs = a_run(tmp_path, 3)
-    for path in pairs[0].images:
-        path.unlink()
-    text = report_page(read_log(tmp_path / "work"), pairs)
-    assert text.count("an image cannot be read any more") == 1
-    assert Tags(text).names.count("img") == 1 + 1
 
 
 def test_a_late_report_leaves_out_drawings_then_itself(tmp_path: Path) -> None:

@@ -17,7 +17,6 @@ from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.metrics import rotation_angle
 from mkpc_kaggle.geometry.robust import (
     FALLBACK_FUNDAMENTAL,
-    Estimate,
     Method,
     ModelKind,
     RobustConfig,
@@ -111,23 +110,18 @@ def test_the_fundamental_matrix_is_found_among_outliers(seed, method):
     assert distances.max() < 0.35
 
 
-@pytest.mark.parametrize("seed", SEEDS)
-def test_the_essential_matrix_is_found_among_outliers(seed):
-    matches, truth = scene(seed)
-    result = estimate(matches, DEFAULT, ModelKind.E, intrinsics(seed))
+def test_the_essential_matrix_and_the_homography_of_a_plane_are_found_among_outliers():
+    matches, truth = scene(0)
+    result = estimated(ModelKind.E, matches)
     assert_agrees(result, truth)
-    first, second = cameras(seed)
+    first, second = cameras(0)
     E = second.K.T @ fundamental_of_cameras(first, second) @ first.K
     E /= np.linalg.norm(E)
     assert min(np.linalg.norm(result.matrix - E), np.linalg.norm(result.matrix + E)) < 1e-3
-
-
-@pytest.mark.parametrize("seed", SEEDS)
-def test_the_homography_of_a_plane_is_found_among_outliers(seed):
-    matches, truth = scene(seed, plane=True)
-    result = estimate(matches, DEFAULT, ModelKind.H)
+    matches, truth = scene(0, plane=True)
+    result = estimated(ModelKind.H, matches)
     assert_agrees(result, truth)
-    fresh = seen(seed, 500, plane=True)[180:]
+    fresh = seen(0, 500, plane=True)[180:]
     moved = cv2.perspectiveTransform(fresh.points0[:, None], result.matrix)[:, 0]
     assert np.hypot(*(moved - fresh.points1).T).max() < 0.05
 
@@ -163,21 +157,15 @@ def test_sampson_distance_is_in_pixels_and_the_same_in_either_order():
     assert sampson_distances(twice, Matches.empty()).shape == (0,)
 
 
-@pytest.mark.parametrize("count", range(8))
 @pytest.mark.parametrize("model", ModelKind)
-def test_a_few_points_give_a_value(model, count):
-    result = estimated(model, seen(0, count))
-    if count < model.min_matches:
-        assert_fallback(result, model, count)
-        assert f"too few distinct matches for {model}: {count}" in result.failure
-    assert np.isfinite(result.matrix).all()
-    assert np.linalg.norm(result.matrix) == UNIT
-
-
-def test_eight_points_are_enough_for_a_fundamental_matrix():
-    result = estimate(seen(0, 8), DEFAULT)
-    assert result.ok
-    assert sampson_distances(result.matrix, seen(0, 8)).max() < 0.14
+def test_fewer_matches_than_a_model_needs_give_the_fallback_and_so_many_give_the_model(model):
+    fewest = {ModelKind.F: 8, ModelKind.E: 6, ModelKind.H: 5}[model]
+    few = estimated(model, seen(0, fewest - 1))
+    assert_fallback(few, model, fewest - 1)
+    assert f"too few distinct matches for {model}: {fewest - 1}" in few.failure
+    few.matrix[:] = 7  # each fallback has a matrix of its own
+    assert_fallback(estimated(model, Matches.empty()), model, 0)
+    assert estimated(model, seen(0, fewest, plane=model is ModelKind.H)).ok
 
 
 @pytest.mark.parametrize("model", ModelKind)
@@ -188,61 +176,19 @@ def test_points_that_say_nothing_give_the_fallback(model):
     assert_fallback(estimated(model, nothing), model, 30)
     repeated = seen(0, 4)[np.tile(np.arange(4), 25)]
     assert_fallback(estimated(model, repeated), model, 100)
-    assert_fallback(estimated(model, Matches.empty()), model, 0)
 
 
 @pytest.mark.parametrize("model", ModelKind)
-def test_collinear_points_give_a_value(model):
-    along = np.linspace(0, 700, 40)
-    line = Matches(np.column_stack([along, along]), np.column_stack([along, 2 * along]), np.ones(40))
-    result = estimated(model, line)
-    assert np.isfinite(result.matrix).all()
-    assert np.linalg.norm(result.matrix) == UNIT
-    assert result.inliers.shape == (40,)
-    assert result.ok == result.inliers.any()
-
-
-@pytest.mark.parametrize("model", ModelKind)
-def test_the_fallback_is_finite_of_unit_norm_and_of_the_right_rank(model):
-    result = Estimate.failed(model, 3, "because")
-    assert result.failure == "because"
-    assert np.linalg.norm(result.matrix) == UNIT
-    assert np.linalg.matrix_rank(result.matrix) == (3 if model is ModelKind.H else 2)
-    result.matrix[:] = 7  # each is its own
-    assert_fallback(Estimate.failed(model, 3, "because"), model, 3)
-
-
-@pytest.mark.parametrize("model", ModelKind)
-def test_matches_that_are_not_finite_are_set_aside(model):
-    matches, truth = scene(0, plane=model is ModelKind.H)
-    clean = estimated(model, matches)
-    bad = [Matches(np.full((50, 2), a), np.full((50, 2), b), np.ones(50)) for a, b in [(np.nan, 5), (5, np.inf)]]
-    order = np.argsort(np.random.default_rng(3).random(400), kind="stable")
-    order[np.flatnonzero(order < 300)] = np.arange(300)  # the good ones keep their order among themselves
-    mixed = estimated(model, Matches.concatenate([matches, *bad])[order])
-    assert_agrees(clean, truth)
-    assert_array_equal(mixed.matrix, clean.matrix)
-    assert_array_equal(mixed.inliers[order < 300], clean.inliers)
-    assert not mixed.inliers[order >= 300].any()
-
-
-@pytest.mark.parametrize("model", ModelKind)
-def test_exact_repetitions_change_nothing_and_are_inliers_like_the_first(model):
+def test_repetitions_are_inliers_like_the_first_and_what_is_not_finite_is_set_aside(model):
     matches, truth = scene(1, plane=model is ModelKind.H)
     clean = estimated(model, matches, seed=1)
     assert_agrees(clean, truth)
     again = np.random.default_rng(4).integers(0, 300, 900)
-    repeated = estimated(model, Matches.concatenate([matches, matches[again]]), seed=1)
-    assert_array_equal(repeated.matrix, clean.matrix)
-    assert_array_equal(repeated.inliers, np.concatenate([clean.inliers, clean.inliers[again]]))
-
-
-@pytest.mark.parametrize("seed", SEEDS)
-def test_the_mask_is_in_the_order_of_the_matches(seed):
-    matches = Matches.concatenate([wild(seed, 60), seen(seed, 100)])
-    result = estimate(matches[np.repeat(np.arange(160), 2)], DEFAULT)
-    assert_array_equal(result.inliers[::2], result.inliers[1::2])
-    assert_agrees(result, np.repeat(np.arange(160) >= 60, 2))
+    bad = [Matches(np.full((50, 2), a), np.full((50, 2), b), np.ones(50)) for a, b in [(np.nan, 5), (5, np.inf)]]
+    more = estimated(model, Matches.concatenate([bad[0], matches, bad[1], matches[again]]), seed=1)
+    assert_array_equal(more.matrix, clean.matrix)
+    none = np.zeros(50, bool)
+    assert_array_equal(more.inliers, np.concatenate([none, clean.inliers, none, clean.inliers[again]]))
 
 
 @pytest.mark.parametrize("method", Method)
@@ -278,13 +224,8 @@ def test_an_essential_matrix_without_intrinsics_is_an_error_even_without_points(
             estimate(matches, DEFAULT, ModelKind.E)
 
 
-def test_intrinsics_change_nothing_but_an_essential_matrix():
-    matches, _ = scene(0)
-    assert as_bytes(estimate(matches, DEFAULT, ModelKind.F, intrinsics(0))) == as_bytes(estimate(matches, DEFAULT))
-
-
 ANY_FLOAT = st.floats(width=32)
-CORNERS = st.sampled_from(np.array([0, 1, -1, 2, 100, 1e-20, 1e20, 3e38], np.float32).tolist())
+CORNERS = st.sampled_from(np.array([0, 1, -1, 2, 100, 1e-20, 1e10, 1e18, 1e20, 3e38], np.float32).tolist())
 PIXELS = st.integers(0, 5).map(float)
 
 
@@ -293,6 +234,8 @@ PIXELS = st.integers(0, 5).map(float)
 def test_whatever_the_points_are_the_answer_is_an_estimate(data, n, model, method):
     elements = data.draw(st.sampled_from([ANY_FLOAT, CORNERS, PIXELS]))
     rows = data.draw(arrays(np.float32, (n, 4), elements=elements))
+    if data.draw(st.booleans()):
+        rows[:, 1], rows[:, 3] = rows[:, 0], 2 * rows[:, 2]  # collinear
     matches = Matches(rows[:, :2], rows[:, 2:], np.ones(n))
     result = estimated(model, matches, RobustConfig(method=method, max_iterations=100))
     assert result.matrix.shape == (3, 3)
@@ -303,45 +246,21 @@ def test_whatever_the_points_are_the_answer_is_an_estimate(data, n, model, metho
     assert not result.inliers[~np.isfinite(rows).all(axis=1)].any()
 
 
-@pytest.mark.parametrize("model", ModelKind)
-@pytest.mark.parametrize("exponent", [-30, -10, 10, 18, 30, 37])
-def test_points_of_any_magnitude_give_an_estimate(model, exponent):
-    rng = np.random.default_rng(5)
-    scale = 10.0**exponent
-    matches = Matches(rng.normal(size=(40, 2)) * scale, rng.normal(size=(40, 2)) * scale, np.ones(40))
-    for method in Method:
-        result = estimated(model, matches, RobustConfig(method=method, max_iterations=200))
-        assert np.isfinite(result.matrix).all()
-        assert np.linalg.norm(result.matrix) == UNIT
-
-
-def answers_with(monkeypatch, find):
-    monkeypatch.setitem(robust._SOLVERS, ModelKind.F, robust._SOLVERS[ModelKind.F]._replace(find=find))
-
-
-def test_a_permutation_that_opencv_refuses_costs_that_permutation_alone(monkeypatch):
+@pytest.mark.parametrize("refused", [1, 3])
+def test_what_opencv_refuses_costs_that_permutation_alone_and_is_the_reason_where_it_refuses_all(
+    refused, monkeypatch
+):
     calls = []
 
-    def refusing_first(*points, **settings):
+    def find(*points, **settings):
         calls.append(points)
-        if len(calls) == 1:
-            raise cv2.error("sample_size <= points_size_")
+        if len(calls) <= refused:
+            error = cv2.error("no")
+            error.err = "sample_size <= points_size_"
+            raise error
         return cv2.findFundamentalMat(*points, **settings)
 
-    answers_with(monkeypatch, refusing_first)
-    points = np.random.default_rng(0).uniform(0, 500, (60, 2)).astype(np.float32)
-    found = estimate(Matches(points, points + np.float32([7, 3]), np.ones(60)), RobustConfig(permutations=3))
+    monkeypatch.setitem(robust._SOLVERS, ModelKind.F, robust._SOLVERS[ModelKind.F]._replace(find=find))
+    found = estimate(seen(0, 60), RobustConfig(permutations=3))
     assert len(calls) == 3
-    assert not found.failure and found.inlier_count == 60
-
-
-def test_points_that_opencv_refuses_in_every_permutation_have_its_reason(monkeypatch):
-    def refusing(*_, **__):
-        error = cv2.error("no")
-        error.err = "sample_size <= points_size_"
-        raise error
-
-    answers_with(monkeypatch, refusing)
-    points = np.random.default_rng(0).uniform(0, 500, (60, 2)).astype(np.float32)
-    found = estimate(Matches(points, points, np.ones(60)), RobustConfig())
-    assert "OpenCV refused the points: sample_size" in found.failure
+    assert found.failure == ("" if refused == 1 else "OpenCV refused the points: sample_size <= points_size_")

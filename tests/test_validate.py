@@ -45,11 +45,10 @@ def test_the_true_matrices_score_one_whatever_the_order_of_the_images(demo: Demo
     assert scored.maa == 1
     assert [scored.auc(threshold) for threshold in AUC_THRESHOLDS] == pytest.approx([1, 1, 1], abs=1e-3)
     assert sum(len(scene.pairs) for scene in scored.scenes) == 8
-
-
-def test_the_fallback_scores_next_to_nothing(demo: DemoSet, tmp_path: Path) -> None:
-    rows = dict.fromkeys(true_matrices(demo), FALLBACK_FUNDAMENTAL)
-    write_submission(tmp_path / "fallback.csv", rows)
+    lines = score_table(scored)
+    assert [line.split()[0] for line in lines] == ["scene", "courtyard", "mean"]
+    assert lines[1].split()[1:3] == ["8", "1.0000"]
+    write_submission(tmp_path / "fallback.csv", dict.fromkeys(truth, FALLBACK_FUNDAMENTAL))
     scored = score_submission(tmp_path / "fallback.csv", demo.truth_csv, read_train_side(demo.train_dir))
     assert scored.maa < 0.2
 
@@ -118,42 +117,16 @@ def test_each_step_of_the_estimate_has_a_column(
         assert pair["accuracy_by_step"]["MAGSAC"] == former["accuracy_by_step"]["MAGSAC"]
 
 
-@pytest.mark.parametrize(
-    ("options", "units"),
-    [
-        (["--mode", "stage-1"], {"1:sift@320"}),
-        (["--mode", "whole-images", "--units", "1:sift@400"], {"1:sift@400"}),
-    ],
-)
-def test_modes_and_units_change_what_is_run(
-    demo: DemoSet, small_recipe: Path, options: list[str], units: set[str]
-) -> None:
-    (pair,) = scores_of(demo, small_recipe, "--pairs-per-scene", "1", *options)["scenes"][0]["pairs"]
-    assert set(pair["matches"]) == units
-
-
 def test_a_work_directory_keeps_the_journal_and_a_report_that_shows_the_pairs(
     demo: DemoSet, small_recipe: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    arguments = [
-        "validate",
-        "--train-dir",
-        str(demo.train_dir),
-        "--pairs-per-scene",
-        "2",
-        "--recipe",
-        str(small_recipe),
-    ]
-    assert main([*arguments, "--work-dir", str(tmp_path / "work")]) == 0
+    options = ["--pairs-per-scene", "2", "--mode", "whole-images", "--units", "1:sift@400"]
+    scores = scores_of(demo, small_recipe, *options, "--work-dir", str(tmp_path / "work"))
+    assert [set(pair["matches"]) for pair in scores["scenes"][0]["pairs"]] == [{"1:sift@400"}] * 2
     page = tmp_path / "work" / "report.html"
     assert f"report: {page}" in capsys.readouterr().out
     assert page.read_text(encoding="utf-8").count("<img ") == 2 + 1
     assert len(read_log(tmp_path / "work").pairs) == 2
-
-
-def test_scoring_a_file_needs_to_know_its_pairs(demo: DemoSet, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["validate", "--train-dir", str(demo.train_dir), "--submission", "x.csv"]) == 2
-    assert "go together" in capsys.readouterr().err
 
 
 @needs_data
@@ -194,19 +167,23 @@ def test_the_classical_recipe_reaches_plain_root_sift_scene_by_scene(tmp_path: P
         assert scores[scene] >= baseline - 0.01, scene
 
 
-def test_the_table_has_a_row_a_scene_and_their_mean(demo: DemoSet, tmp_path: Path) -> None:
-    write_submission(tmp_path / "true.csv", true_matrices(demo))
-    scored = score_submission(tmp_path / "true.csv", demo.truth_csv, read_train_side(demo.train_dir))
-    lines = score_table(scored)
-    assert [line.split()[0] for line in lines] == ["scene", "courtyard", "mean"]
-    assert lines[1].split()[1:3] == ["8", "1.0000"]
-
-
-def test_an_unknown_unit_is_told_with_the_known_ones(
-    demo: DemoSet, small_recipe: Path, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        (["--train-dir", "T", "--submission", "x.csv"], "go together"),
+        (
+            ["--train-dir", "T", "--recipe", "R", "--units", "sift"],
+            "no unit 'sift'; it has 1:sift@320, 2:",
+        ),
+        (["--train-dir", "T", "--recipe", "classical", "--threshold", "0"], "threshold must be in"),
+        (["--pairs", "a.txt"], "go together"),
+        (["--pairs", "a.txt", "--image-root", ".", "--compare", "a", "b"], "need a --train-dir"),
+        (["--train-dir", ".", "--image-root", "."], "go together"),
+    ],
+)
+def test_options_that_make_no_validation_are_refused(
+    demo: DemoSet, small_recipe: Path, options: list[str], told: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert (
-        main(["validate", "--train-dir", str(demo.train_dir), "--recipe", str(small_recipe), "--units", "sift"])
-        == 2
-    )
-    assert "no unit 'sift'; it has 1:sift@320, 2:sift@400" in capsys.readouterr().err
+    places = {"T": str(demo.train_dir), "R": str(small_recipe)}
+    assert main(["validate", *(places.get(option, option) for option in options)]) == 2
+    assert told in capsys.readouterr().err

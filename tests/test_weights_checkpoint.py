@@ -4,15 +4,12 @@ import contextlib
 import operator
 import os
 import pickle
-import pickletools
 import sys
 import types
-import warnings
 import zipfile
 from argparse import Namespace
 from collections import Counter, OrderedDict
 from collections.abc import Callable, Iterator
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -55,15 +52,35 @@ def assert_same(loaded: dict[str, torch.Tensor], wanted: dict[str, torch.Tensor]
 # formats
 
 
+@pytest.mark.parametrize("wrapped", [False, True])
 @pytest.mark.parametrize("save", [save_zip, save_legacy, save_file])
-@pytest.mark.parametrize("wrap", [False, True])
-def test_every_file_format_gives_the_same_tensors(tmp_path: Path, save: Save, wrap: bool) -> None:
-    safetensors = save is save_file
-    path = tmp_path / ("x.safetensors" if safetensors else "x.pt")
-    save({"state_dict": TENSORS, "epoch": 3} if wrap and not safetensors else TENSORS, path)
+def test_every_file_format_gives_the_same_plain_tensors(tmp_path: Path, save: Save, wrapped: bool) -> None:
+    path, tensors = tmp_path / ("x.safetensors" if save is save_file else "x.pt"), TENSORS
+    if save is not save_file:
+        tensors = TENSORS | {"c": nn.Parameter(torch.ones(2)), "d": torch.ones(3, requires_grad=True)}
+        save({"state_dict": tensors, "epoch": 3} if wrapped else tensors, path)
+    else:
+        save(tensors, path)
     loaded = load_tensors(path)
-    assert loaded.keys() == TENSORS.keys()
-    assert_same({name: loaded[name] for name in TENSORS}, TENSORS)
+    assert loaded.keys() == tensors.keys()
+    expected = {name: tensor.detach() for name, tensor in tensors.items()}
+    assert_same({name: loaded[name] for name in expected}, expected)
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")  # of torch, on prototypes
+@pytest.mark.parametrize("save", [save_zip, save_legacy])
+def test_what_is_no_table_of_plain_tensors_is_refused(tmp_path: Path, save: Save) -> None:
+    ones, base = torch.ones(2, 3), torch.zeros(10_000)
+    odd: list[object] = [ones, [ones], {"state_dict": 3}, {3: ones}, {"x": ones.to_sparse()}]
+    odd += [{"x": ones.to_sparse_csr()}, {"x": ones.to("meta")}]
+    odd += [{"x": torch.quantize_per_tensor(ones, 0.1, 0, torch.quint8)}, {"x": torch.zeros(1).expand(1_000_000)}]
+    odd += [{"x": torch.nested.nested_tensor([ones[0], ones[1, :2]])}, {str(n): base for n in range(100)}]
+    for value in odd:
+        save(value, tmp_path / "x.pt")
+        with pytest.raises(UserError, match=r"x\.pt cannot be read as a checkpoint: .*"):
+            load_tensors(tmp_path / "x.pt")
+    save({str(number): base for number in range(3)}, tmp_path / "x.pt")
+    assert len(load_tensors(tmp_path / "x.pt")) == 3, "tensors may share their bytes"
 
 
 @pytest.mark.parametrize("name", ["x.pt", "x.safetensors"])
@@ -72,20 +89,6 @@ def test_a_file_that_is_no_checkpoint_is_refused_by_name(tmp_path: Path, name: s
     put(tmp_path, name, data)
     with pytest.raises(UserError, match=rf"{name} cannot be read as a checkpoint"):
         load_tensors(tmp_path / name)
-
-
-@pytest.mark.parametrize("save", [save_zip, save_legacy])
-@pytest.mark.parametrize("value", [torch.zeros(3), [torch.zeros(3)], {"state_dict": 3}])
-def test_a_checkpoint_without_a_table_of_tensors_is_refused(tmp_path: Path, value: object, save: Save) -> None:
-    save(value, tmp_path / "x.pt")
-    with pytest.raises(UserError, match=r"x\.pt cannot be read as a checkpoint: .*"):
-        load_tensors(tmp_path / "x.pt")
-
-
-@pytest.mark.parametrize("save", [save_zip, save_legacy])
-def test_parameters_come_as_plain_tensors(tmp_path: Path, save: Save) -> None:
-    save({"a": nn.Parameter(torch.ones(2)), "b": torch.ones(3, requires_grad=True)}, tmp_path / "x.pt")
-    assert_same(load_tensors(tmp_path / "x.pt"), {"a": torch.ones(2), "b": torch.ones(3)})
 
 
 # training checkpoints
@@ -183,52 +186,34 @@ class Call:
 def nasty(sentinel: Path) -> dict[str, object]:
     """Calls that would make the sentinel file, by what they go through."""
     command = f"touch {sentinel}"
-    python = f"__import__('pathlib').Path({str(sentinel)!r}).touch()"
     hidden = sentinel.with_name("hidden.pt")
     hidden.write_bytes(pickle.dumps(Call(os.system, command), protocol=2))
-    sentinel.with_name("hubconf.py").write_text(python)
     return {
         "os.system": Call(os.system, command),
-        "builtins.eval": Call(eval, python),
-        "builtins.exec": Call(exec, python),
+        "builtins.eval": Call(eval, f"__import__('pathlib').Path({str(sentinel)!r}).touch()"),
         "os.mkdir": Call(os.mkdir, str(sentinel)),
         "builtins.getattr": Call(operator.call, Call(getattr, Call(__import__, "os"), "system"), command),
         "torch.load": Call(torch.load, str(hidden), "cpu", Call(__import__, "pickle")),
-        "torch.hub": Call(torch.hub._load_local, str(sentinel.parent), "f"),
         "torch.save": Call(torch.save, 1, str(sentinel)),
-        "pickle.loads": Call(pickle.loads, pickle.dumps(Call(os.system, command))),
         "state": Call(types.SimpleNamespace, state={"x": Call(os.system, command)}),
-        "OrderedDict": Call(OrderedDict, [("x", Call(os.system, command))]),
         "rebuild": Call(torch._utils._rebuild_parameter, Call(os.system, command), False, OrderedDict()),
     }
 
 
-PLACES: dict[str, Callable[[object], object]] = {
-    "top": lambda bomb: bomb,
-    "state_dict": lambda bomb: {"state_dict": {**TENSORS, "bomb": bomb}},
-    "hyper_parameters": lambda bomb: {"state_dict": TENSORS, "hyper_parameters": {"x": [bomb]}},
-    "key": lambda bomb: {"state_dict": TENSORS, "callbacks": [{(1, 2): bomb}]},
-}
-
-
-@pytest.mark.parametrize("place", PLACES)
 @pytest.mark.parametrize("save", [save_zip, save_legacy, save_pickle])
-def test_a_malicious_pickle_runs_nothing(tmp_path: Path, place: str, save: Save) -> None:
+def test_a_malicious_pickle_runs_nothing(tmp_path: Path, save: Save) -> None:
     sentinel = tmp_path / "sentinel"
     for name, bomb in nasty(sentinel).items():
         path = tmp_path / f"{name}.pt"
-        save(PLACES[place](bomb), path)
-        try:
-            assert_same(load_tensors(path), TENSORS)
-        except UserError as refusal:
-            assert path.name in str(refusal)
-        assert not sentinel.exists(), name
-
-
-def test_the_bombs_of_these_tests_would_go_off(tmp_path: Path) -> None:
-    sentinel = tmp_path / "sentinel"
-    for name, bomb in nasty(sentinel).items():
-        with contextlib.suppress(Exception):  # some fail after they have run
+        beside = {"state_dict": TENSORS, "callbacks": [{(1, 2): bomb}]}
+        for value in (bomb, {"state_dict": {**TENSORS, "x": bomb}}, beside):
+            save(value, path)
+            try:
+                assert_same(load_tensors(path), TENSORS)
+            except UserError as refusal:
+                assert path.name in str(refusal)
+            assert not sentinel.exists(), name
+        with contextlib.suppress(Exception):  # the bombs would go off; some fail after they have run
             pickle.loads(pickle.dumps(bomb, protocol=2))
         assert sentinel.exists(), name
         sentinel.rmdir() if sentinel.is_dir() else sentinel.unlink()
@@ -255,87 +240,20 @@ def tensor_pickle(items: int, shape: int, stride: int, offset: int) -> bytes:
     )
 
 
-def test_records_that_unpack_to_more_than_the_file_are_refused(tmp_path: Path) -> None:
+def test_records_that_unpack_to_more_than_the_file_or_overlap_are_refused(tmp_path: Path) -> None:
     path = with_pickle(tmp_path / "x.pt", tensor_pickle(6, 2, 3, 1))
     with zipfile.ZipFile(path, "a", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("x/big", bytes(1_000_000))
     with pytest.raises(UserError, match=r"x\.pt cannot be read .* records are compressed or overlap"):
         load_tensors(path)
-
-
-def legacy_with_pickle(path: Path, data: bytes) -> Path:
-    """The same in the format before zip archives: the fourth of its pickles is the table."""
-    whole = BytesIO()
-    torch.save(TENSORS, whole, _use_new_zipfile_serialization=False)
-    whole.seek(0)
-    ends = []
-    for _ in range(4):
-        list(pickletools.genops(whole))
-        ends.append(whole.tell())
-    path.write_bytes(whole.getvalue()[: ends[2]] + data + whole.getvalue()[ends[3] :])
-    return path
-
-
-TOO_LARGE = {
-    "a bytearray of 6 GB": b"\x80\x02cbuiltins\nbytearray\n\x8a\x08"
-    + (6 * 10**9).to_bytes(8, "little")
-    + b"\x85R.",
-    "many sets": b"\x80\x02(" + b"\x8f" * 2_000_000 + b"t.",
-    "a string that is not there": b"\x80\x02}X\xff\xff\xff\xffa.",
-}
-
-
-@pytest.mark.parametrize("write", [with_pickle, legacy_with_pickle])
-@pytest.mark.parametrize("data", TOO_LARGE)
-def test_a_pickle_of_too_large_objects_is_refused(
-    tmp_path: Path, data: str, write: Callable[[Path, bytes], Path]
-) -> None:
-    with pytest.raises(UserError, match=r"x\.pt cannot be read as a checkpoint"):
-        load_tensors(write(tmp_path / "x.pt", TOO_LARGE[data]))
-
-
-def test_records_that_overlap_are_refused(tmp_path: Path) -> None:
-    path = with_pickle(tmp_path / "x.pt", tensor_pickle(6, 2, 3, 1))
+    with_pickle(path, tensor_pickle(6, 2, 3, 1))
     with zipfile.ZipFile(path, "a") as archive:
-        same = next(one for one in archive.infolist() if one.filename.endswith("/data/0"))
         archive.writestr("x/big", bytes(20_000))
-        big = archive.getinfo("x/big")
-        same.header_offset, same.file_size, same.compress_size = big.header_offset, 20_000, 20_000
-        same.CRC = big.CRC
+        same, big = archive.infolist()[0], archive.getinfo("x/big")
+        same.header_offset, same.CRC = big.header_offset, big.CRC
+        same.file_size = same.compress_size = 20_000
     with pytest.raises(UserError, match="compressed or overlap"):
         load_tensors(path)
-
-
-def odd_tensors() -> dict[str, torch.Tensor]:
-    ones = torch.ones(2, 3)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # prototypes, says torch
-        return {
-            "sparse": ones.to_sparse(),
-            "compressed sparse": ones.to_sparse_csr(),
-            "on no device": ones.to("meta"),
-            "quantised": torch.quantize_per_tensor(ones, 0.1, 0, torch.quint8),
-            "nested": torch.nested.nested_tensor([ones[0], ones[1, :2]]),
-            "one element many times": torch.zeros(1).expand(1_000_000),
-        }
-
-
-@pytest.mark.filterwarnings("ignore:.*quantized storage|.*[Ss]parse|.*nested")
-@pytest.mark.parametrize("save", [save_zip, save_legacy])
-@pytest.mark.parametrize("kind", odd_tensors())
-def test_tensors_that_are_not_plain_are_refused(tmp_path: Path, kind: str, save: Save) -> None:
-    save({"a": torch.ones(1), "odd": odd_tensors()[kind]}, tmp_path / "x.pt")
-    with pytest.raises(UserError, match=r"x\.pt cannot be read as a checkpoint"):
-        load_tensors(tmp_path / "x.pt")
-
-
-def test_tensors_that_share_their_bytes_are_not_many_times_the_file(tmp_path: Path) -> None:
-    base = torch.zeros(10_000)
-    torch.save({str(number): base for number in range(3)}, tmp_path / "x.pt")
-    assert len(load_tensors(tmp_path / "x.pt")) == 3
-    torch.save({str(number): base for number in range(100)}, tmp_path / "x.pt")
-    with pytest.raises(UserError, match="its tensors are larger than the file"):
-        load_tensors(tmp_path / "x.pt")
 
 
 @settings(max_examples=200, deadline=None)

@@ -22,42 +22,24 @@ def redirect(target: str) -> bytes:
 
 
 ANSWERS: dict[str, list[bytes]] = {
-    "nothing": [b""],
     "noise": [os.urandom(10_000)],
     "another protocol": [b"SSH-2.0-OpenSSH_9.6\r\n"],
     "a status of text": [b"HTTP/1.1 fine OK\r\n\r\n"],
-    "a status of 999": [b"HTTP/1.1 999 OK\r\n\r\n"],
     "a head of 10 MB": [OK, b"A: " + b"x" * 10_000_000],
     "a million heads": [OK, b"A: x\r\n" * 1_000_000],
-    "heads without end": [OK + b"A: b"],
     "a length of text": [OK + b"Content-Length: many\r\n\r\n", DATA],
     "a length below none": [OK + b"Content-Length: -5\r\n\r\n", DATA],
     "a length of 10^30": [OK + b"Content-Length: 1" + b"0" * 30 + b"\r\n\r\n", DATA],
-    "two lengths": [OK + b"Content-Length: 1\r\nContent-Length: 102400\r\n\r\n", DATA],
     "too many bytes": [OK + b"\r\n", DATA, DATA],
-    "bytes without end": [OK + b"\r\n", b"x" * 1_000_000] * 1,
-    "too few bytes": [WHOLE, DATA[:1000]],
-    "other bytes": [WHOLE, DATA[::-1]],
-    "a page": [OK + b"Content-Type: text/html\r\n\r\n<html>sign in</html>"],
-    "a chunk of less than nothing": [CHUNKED, b"-5\r\n", DATA],
-    "a chunk of text": [CHUNKED, b"zz\r\n", DATA],
+    "bytes without end": [OK + b"\r\n", b"x" * 1_000_000],
     "a chunk of 2^100": [CHUNKED, b"1" + b"0" * 25 + b"\r\n", DATA],
     "a chunk size of 10 MB": [CHUNKED, b"1" * 10_000_000],
     "chunks of one byte": [CHUNKED, b"1\r\nx\r\n" * 150_000],
-    "compressed": [OK + b"Content-Encoding: gzip\r\n\r\n", DATA],
-    "a part that nobody asked for": [b"HTTP/1.1 206 Partial\r\nContent-Range: bytes 5-9/102400\r\n\r\n", DATA],
     "a redirection to a file": [redirect("file:///etc/hostname")],
     "a redirection to a broken address": [redirect("http://[bad/")],
-    "a redirection to an empty label": [redirect("http://a..b/")],
-    "a redirection to a long label": [redirect(f"http://{'a' * 64}.org/")],
-    "a redirection to a port of text": [redirect("http://127.0.0.1:port/")],
     "a redirection to port 99999": [redirect("http://127.0.0.1:99999/")],
-    "a redirection to no host": [redirect("http:///")],
     "a redirection to itself": [redirect("/a.bin")],
-    "a redirection with a blank": [redirect("http://127.0.0.1:9/a b")],
     "a redirection to 1 MB": [redirect("http://127.0.0.1:9/" + "a" * 60_000)],
-    "a redirection without a place": [b"HTTP/1.1 302 Found\r\n\r\n"],
-    "only errors": [b"HTTP/1.1 404 Not Found\r\nContent-Length: 5\r\n\r\nsorry"],
     "cookies and more": [OK + b'Set-Cookie: a=b\r\nETag: "x\r\n y"\r\nContent-Length: 5\r\n\r\nhello'],
 }
 PARTS: dict[str, Callable[[Path], object]] = {
@@ -109,8 +91,8 @@ ENV = {"MKPC_WEIGHTS": "listed"}
 CASES = [
     *(Case("fetches", name, FETCH, served(answer), (0, 1), env=ENV) for name, answer in ANSWERS.items()),
     *(
-        Case("fetches", f"{name}, of unknown size", FETCH, served(answer, size="?"), (1,), env=ENV)
-        for name, answer in list(ANSWERS.items())[12:17]
+        Case("fetches", f"{name}, of unknown size", FETCH, served(ANSWERS[name], size="?"), (1,), env=ENV)
+        for name in ("too many bytes", "bytes without end")
     ),
     *(
         Case("fetches", f"{name} for the part", FETCH, served([WHOLE, DATA], part=part), (0, 1), env=ENV)

@@ -16,7 +16,6 @@ from room import SUBMIT
 CONVERT = "weights convert a.pt --out out/a.safetensors"
 LENGTH = (6 * 10**9).to_bytes(8, "little")
 PICKLES = {
-    "nothing": b"",
     "lists of lists": b"\x80\x02" + b"]" * 500_000 + b"a" * 499_999 + b".",
     "a place for 400 million objects": b"\x80\x02}r\x00\x84\xd7\x17.",
     "a bytearray of 6 GB": b"\x80\x02cbuiltins\nbytearray\n\x8a\x08" + LENGTH + b"\x85R.",
@@ -26,23 +25,9 @@ PICKLES = {
     "a million sets": b"\x80\x04(" + b"\x8f" * 1_000_000 + b"t.",
     "a tensor of 6 GB": b"\x80\x02ctorch\nFloatTensor\n\x8a\x08" + LENGTH + b"\x85R.",
     "a call of the system": b"\x80\x02cposix\nsystem\nX\x10\x00\x00\x00touch out/called\x85R.",
-    "a call of eval": b"\x80\x02cbuiltins\neval\nX\x01\x00\x00\x001\x85R.",
-    "a foreign class": b"\x80\x02}X\x01\x00\x00\x00acnowhere\nThing\n)Rs.",
-    "a stack that is empty": b"\x80\x02000.",
-    "a mark that is missing": b"\x80\x02tu.",
-    "no end": b"\x80\x02}",
-    "an unknown protocol": b"\x80\xff}.",
-    "numbers for names": b"\x80\x02}K\x01K\x02s.",
-    "nothing for a table": b"\x80\x02N.",
 }
 TENSORS = {
-    "sparse": "t.to_sparse()",
-    "compressed sparse": "t.to_sparse_csr()",
-    "on no device": "t.to('meta')",
-    "quantised": "torch.quantize_per_tensor(t, 0.1, 0, torch.quint8)",
-    "nested": "torch.nested.nested_tensor([t[0], t[1, :2]])",
     "of half complex numbers": "t.to(torch.complex32)",
-    "one element a billion times": "torch.zeros(1).expand(1_000_000_000)",
     "of eight bits": "t.to(torch.float8_e4m3fn)",
     "of no elements": "torch.zeros(0, 1 << 40)",
     "of NaN": "t * float('nan')",
@@ -58,20 +43,13 @@ def unpacked(path: Path) -> None:
 
 FILES: dict[str, Callable[[Path], object]] = {
     "a pipe": os.mkfifo,
-    "a directory": Path.mkdir,
     "a link to /dev/zero": lambda path: path.symlink_to("/dev/zero"),
-    "a link to itself": lambda path: path.symlink_to(path),
-    "nothing there": lambda path: None,
-    "an empty file": lambda path: path.touch(),
-    "text": lambda path: path.write_text("no checkpoint"),
     "an empty archive": lambda path: path.write_bytes(b"PK\x05\x06" + bytes(18)),
     "an archive cut off": lambda path: path.write_bytes(b"PK\x03\x04" + bytes(100)),
     "a compressed gigabyte": lambda path: archive(path, zipfile.ZIP_DEFLATED, bytes(1_000_000_000)),
-    "other records": lambda path: archive(path, zipfile.ZIP_STORED, b"x"),
     "an unpacked directory of a pipe": unpacked,
 }
 SAFETENSORS = {
-    "empty": b"",
     "a head of 2^63 bytes": (2**63).to_bytes(8, "little") + b"{}",
     "a head that is longer than the file": (10**6).to_bytes(8, "little") + b"{}",
     "deep JSON": (200_000).to_bytes(8, "little") + b"[" * 200_000,
@@ -79,9 +57,8 @@ SAFETENSORS = {
     + b'{"a":{"dtype":"F32","shape":[99],"data_offsets":[0,396]}}'.ljust(80),
     "a shape of 2^62": (80).to_bytes(8, "little")
     + b'{"a":{"dtype":"F32","shape":[4611686018427387904,4],"data_offsets":[0,0]}}'.ljust(80),
-    "no tensors": (2).to_bytes(8, "little") + b"{}",
 }
-LISTED = ("xfeat_sparse_bnfolded.safetensors", "superpoint_v1.pth", "quadtree_outdoor.ckpt", "loma_B128.pth")
+LISTED = ("xfeat_sparse_bnfolded.safetensors", "superpoint_v1.pth")
 
 
 def archive(path: Path, method: int, data: bytes) -> None:
@@ -188,7 +165,7 @@ CASES = [
             (0, 1),
         )
         for command in ("list", "verify", "locate superpoint")
-        for file in LISTED[:2]
+        for file in LISTED
         for name, make in SEARCHED.items()
     ),
     *(

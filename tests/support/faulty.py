@@ -241,7 +241,7 @@ def thread_place(
 def use_places(monkeypatch: pytest.MonkeyPatch, *used: Place, fallback: Sequence[Place] = ()) -> None:
     """Let runs match at these places, and look every hundredth of a second for answers, without a pause."""
 
-    def site_of(assembly: Assembly, plan: session.Session) -> LocalSite:
+    def site_of(pairs: Any, assembly: Assembly, plan: session.Session) -> LocalSite:
         site = LocalSite(assembly, 0, plan.budget.clock)
         site.places, site.fallback = list(used), list(fallback)
         return site
@@ -317,5 +317,5 @@ def patient(monkeypatch: pytest.MonkeyPatch, kind: type[WatchedWorker]) -> Budge
     monkeypatch.setattr(WatchedWorker, "all", [])
     monkeypatch.setattr(places, "ProcessWorker", kind)
     monkeypatch.setattr(places, "RESTART_PAUSE_S", 0.0)
-    monkeypatch.setattr(session, "site_of", lambda assembly, plan: PatientSite(assembly, plan.workers, clock))
+    monkeypatch.setattr(session, "site_of", lambda _, assembly, plan: PatientSite(assembly, plan.workers, clock))
     return clock.budget
