@@ -177,10 +177,8 @@ def recipe_of(table: Mapping[str, Any], name: str) -> Recipe:
     known = ("description", "units", "mkpc", "magsac", "focal", "matchers", "scene")
     check_keys(table, known, where, removed=("upgrade",))
     units, matchers = table.get("units", []), table.get("matchers", {})
-    if not isinstance(units, list):
-        raise UserError(f"{where}: units must be a list of tables, not {units!r}")
-    if not isinstance(matchers, dict):
-        raise UserError(f"{where}: matchers must be a table, not {matchers!r}")
+    if not isinstance(units, list) or not isinstance(matchers, dict):
+        raise UserError(f"{where}: units must be a list of tables, and matchers a table")
 
     def settings(cls: type[Config], key: str) -> Config | None:
         value = table.get(key)  # a fingerprint has None for a table that the recipe lacks
