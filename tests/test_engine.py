@@ -147,7 +147,7 @@ def test_a_journal_that_cannot_be_written_does_not_stop_the_run(
     def full(*_: object) -> None:
         raise sqlite3.OperationalError("database or disk is full")
 
-    monkeypatch.setattr(Journal, "save", full)
+    monkeypatch.setattr(Journal, "_write", full)
     report = run(write_pairs(tmp_path, 10), THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
     assert all(record.inliers > 400 for record in report.records)
     assert "disk is full" in report.faults[0]

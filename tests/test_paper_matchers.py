@@ -6,7 +6,6 @@ The weights are stand-ins: what is matched has no worth, but it is matched by al
 import csv
 import runpy
 import shutil
-import sqlite3
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -20,7 +19,7 @@ from shared import DATA, needs_data
 from standin import scene, use_narrow
 
 from mkpc_kaggle.data.competition import read_submission, read_test_side, submission_problems
-from mkpc_kaggle.engine.journal_tables import FILE_NAME, JournalReader
+from mkpc_kaggle.engine.journal_tables import JournalReader
 from mkpc_kaggle.geometry.coordinates import View
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import MatcherSpec, Picture
@@ -137,11 +136,10 @@ def make_submission(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> None
 
 def matches_found(work_dir: Path) -> dict[tuple[int, int], int]:
     """The matches of each pair's unit by (pair, stage); none of the units may have failed."""
-    with sqlite3.connect(work_dir / FILE_NAME) as journal:
-        rows = journal.execute("SELECT pair, stage, matches, failure FROM unit").fetchall()
-    journal.close()
-    assert [failure for *_, failure in rows] == [""] * len(rows)
-    return {(pair, stage): matches for pair, stage, matches, _ in rows}
+    with JournalReader(work_dir) as journal:
+        found = [(index, unit) for index, record in journal.records().items() for unit in record.units]
+    assert [unit.failure for _, unit in found] == [""] * len(found)
+    return {(index, unit.stage): unit.matches for index, unit in found}
 
 
 def assert_good(output: Path, test_dir: Path) -> None:
