@@ -113,7 +113,6 @@ ARGUMENTS = {
     "a submission without truth": "--submission out/sub.csv",
     "truth without a submission": "--truth truth.csv",
     "pairs beside the train side": "--pairs truth.csv",
-    "a model nobody knows": "--estimate H",
     "figures in a directory": "--json out --pairs-per-scene 1",
     "figures in the table": "--json T/scaling_factors.csv --pairs-per-scene 1",
     "a file for the work directory": "--work-dir truth.csv",
