@@ -1,4 +1,4 @@
-"""What the engine costs beside the matchers, and how much of MAGSAC's time hides behind matching.
+"""What the engine costs beside the matchers, and how much of the estimates' time hides behind matching.
 
 python -m benchmarks.engine --test-dir DIR [--recipe classical] [--weights DIR] [--pairs 100]
 
@@ -8,44 +8,25 @@ loads and warms up, is left out. Time that is not a unit's, clustering or waitin
 
 import argparse
 import tempfile
-import threading
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
+from unittest.mock import patch
 
-from mkpc_kaggle.engine.pools.local import LocalWorker
-from mkpc_kaggle.engine.pools.pool import Place, Pool
-
-from mkpc_kaggle.data.competition import Pair, read_test_side, write_submission
+from mkpc_kaggle.data.competition import Pair, read_test_side
 from mkpc_kaggle.engine.budget import Budget
-from mkpc_kaggle.engine.engine import Engine
-from mkpc_kaggle.engine.jobs import JobFailure, JobResult
-from mkpc_kaggle.engine.journal import Journal
-from mkpc_kaggle.engine.records import PairRecord
+from mkpc_kaggle.engine.jobs import MatchJob, MatchResult, Outcome
+from mkpc_kaggle.engine.plan import Plan
+from mkpc_kaggle.engine.session import Interrupt, Session, submit
 from mkpc_kaggle.pipeline.assembly import Assembly, assemble
-
-
-class RecordingPool(Pool):
-    """Keeps the results of jobs, and when they came."""
-
-    def __init__(self, assembly: Assembly) -> None:
-        super().__init__([Place("this process", partial(LocalWorker, assembly.pipeline))], assembly.recipe)
-        self.results: list[tuple[float, JobResult]] = []
-
-    def next(self, until: float) -> JobResult | JobFailure | None:
-        result = super().next(until)
-        if isinstance(result, JobResult):
-            self.results.append((time.monotonic(), result))
-        return result
 
 
 @dataclass(frozen=True)
 class TimeSpent:
     """Seconds by what they went into, the first job's left out; ``wall`` is from its end to the last one's.
 
-    ``tail`` are MAGSAC's on the last job, which nothing can hide.
+    ``tail`` are the estimates' of the last job, which nothing can hide.
     """
 
     jobs: int
@@ -53,11 +34,11 @@ class TimeSpent:
     units: float
     clusters: float
     images: float
-    magsac: float
+    estimates: float
     tail: float
 
     @classmethod
-    def of(cls, results: Sequence[tuple[float, JobResult]]) -> "TimeSpent":
+    def of(cls, results: Sequence[tuple[float, MatchResult]]) -> "TimeSpent":
         rest = [result for _, result in results[1:]]
         records = [outcome.record for result in rest for outcome in result.outcomes]
         return cls(
@@ -77,28 +58,22 @@ class TimeSpent:
     @property
     def overlap(self) -> float:
         """How much longer it would have taken sequentially."""
-        return self.units + self.clusters + self.images + self.magsac - self.wall
+        return self.units + self.clusters + self.images + self.estimates - self.wall
 
 
 def run(pairs: Sequence[Pair], assembly: Assembly, directory: Path) -> TimeSpent:
     """A run from start to end in ``directory``."""
-    pool = RecordingPool(assembly)
-    journal = Journal(directory, {"benchmark": 1}, pairs=pairs)
+    results: list[tuple[float, MatchResult]] = []
+    whole = Plan.on_result
 
-    def publish(records: Sequence[PairRecord]) -> None:
-        matrices = {pair.id: record.pair_fundamental for pair, record in zip(pairs, records, strict=True)}
-        write_submission(directory / "submission.csv", matrices)
+    def on_result(plan: Plan, job: MatchJob, result: MatchResult, seconds: float, now: float) -> list[Outcome]:
+        results.append((now, result))
+        return whole(plan, job, result, seconds, now)
 
-    try:
-        budget = Budget(time.monotonic())
-        engine = Engine(
-            pairs, assembly.recipe, pool, journal, budget, publish=publish, interrupt=threading.Event()
-        )
-        engine.run()
-    finally:
-        pool.close()
-        journal.close()
-    return TimeSpent.of(pool.results)
+    session = Session(directory, Budget(time.monotonic()), Interrupt(), progress=False)
+    with patch.object(Plan, "on_result", on_result):
+        submit(pairs, assembly, session, directory / "submission.csv")
+    return TimeSpent.of(results)
 
 
 def main() -> None:
@@ -117,7 +92,7 @@ def main() -> None:
     )
     print(f"units {spent.units:.1f} s, clusters {spent.clusters:.2f} s, waiting for images {spent.images:.2f} s")
     print(f"engine: {spent.engine:.2f} s, {100 * spent.engine / spent.units:.2f} % of the units' time")
-    print(f"MAGSAC: {spent.magsac:.1f} s; one after the other all would have taken {spent.overlap:.1f} s longer")
+    print(f"estimates: {spent.estimates:.1f} s; in sequence all would have taken {spent.overlap:.1f} s longer")
 
 
 if __name__ == "__main__":

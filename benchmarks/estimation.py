@@ -46,8 +46,7 @@ PAIR_ESTIMATES: dict[str, Callable[[SavedMatches], Estimate]] = {
     "MAGSAC": lambda found: estimate(found.matches, MAGSAC),
     "prior": with_prior,
 }
-SCENE = "scene"
-"""The F of the batch's cameras, or that of the prior where the pair keeps its own."""
+SCENE = "scene"  # the F of the batch's cameras, or that of the prior where the pair keeps its own
 
 
 @dataclass(frozen=True, eq=False)

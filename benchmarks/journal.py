@@ -13,8 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
-from mkpc_kaggle.engine.jobs import JOB_PAIRS, Outcome
+from mkpc_kaggle.engine.jobs import Outcome
 from mkpc_kaggle.engine.journal import Journal
+from mkpc_kaggle.engine.plan import JOB_PAIRS
 from mkpc_kaggle.engine.records import PairRecord, UnitRecord
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
@@ -46,7 +47,7 @@ def main() -> None:
     records = [UnitRecord(unit.name, 1, arguments.matches, 100, 0.1, 0.1, "") for unit in units]
     with tempfile.TemporaryDirectory() as directory:
         journal = Journal(Path(directory), {"benchmark": 1})
-        started, saving = time.perf_counter(), 0.0
+        started = time.perf_counter()
         for first, last in ((0, 1), (1, len(units))):
             for start in range(0, arguments.pairs, JOB_PAIRS):
                 outcomes = [

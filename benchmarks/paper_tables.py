@@ -21,7 +21,7 @@ from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.session import Session, interruptible
 from mkpc_kaggle.evaluation.validate import Validation, validate
 from mkpc_kaggle.geometry.metrics import AUC_THRESHOLDS
-from mkpc_kaggle.geometry.robust import Method, ModelKind
+from mkpc_kaggle.geometry.robust import Method
 from mkpc_kaggle.pipeline.assembly import assemble
 from mkpc_kaggle.recipe import Recipe, load_recipe
 
@@ -110,7 +110,7 @@ def main(arguments: list[str] | None = None) -> None:
     given = parser.parse_args(arguments)
     for dataset in TABLES:
         if (paths := vars(given)[dataset]) is not None:
-            scene = read_pairs(*paths, ModelKind.E, copies=given.out / dataset / "turned", most=given.pairs)
+            scene = read_pairs(*paths, copies=given.out / dataset / "turned", most=given.pairs)
             print("\n".join([*table(dataset, scene, given), ""]))
 
 

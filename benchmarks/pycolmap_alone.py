@@ -20,8 +20,7 @@ from mkpc_kaggle.data.competition import TrainScene, TruePair, read_train_side
 from mkpc_kaggle.geometry.cameras import Camera, fundamental_of_cameras
 from mkpc_kaggle.geometry.metrics import PoseError, mean_average_accuracy, pose_error
 
-CENTRE = 0.5
-"""In COLMAP the top-left pixel's centre is (0.5, 0.5); in the tables it is (0, 0)."""
+CENTRE_PX = 0.5  # in COLMAP the top-left pixel's centre is (0.5, 0.5), in the tables it is (0, 0)
 
 Cameras = dict[str, Camera]
 
@@ -52,7 +51,7 @@ def cameras_of(model: pycolmap.Reconstruction) -> Cameras:
     for number in model.reg_image_ids():
         image = model.images[number]
         pose, K = image.cam_from_world().matrix(), image.camera.calibration_matrix()
-        K[:2, 2] -= CENTRE
+        K[:2, 2] -= CENTRE_PX
         cameras[Path(image.name).stem] = Camera(K, pose[:, :3], pose[:, 3])
     return cameras
 

@@ -15,8 +15,8 @@ from mkpc_kaggle.scene.reconstruction import RegisteredImage
 from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair
 
 SIZE = Size(800, 600)
+# The numbers of the points that an image sees, ascending (N,), and where its detector finds them (N, 2).
 Seen = tuple[np.ndarray, np.ndarray]
-"""The numbers of the points that an image sees, ascending (N,), and where its detector finds them (N, 2)."""
 
 
 def registered_images(solution: Solution) -> dict[str, RegisteredImage]:

@@ -18,8 +18,7 @@ from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 
-from mkpc_kaggle.engine.pools.process import worker_environment
-
+from mkpc_kaggle.engine.process import worker_environment
 from mkpc_kaggle.geometry.coordinates import Size
 
 CONTEXT = multiprocessing.get_context("spawn")

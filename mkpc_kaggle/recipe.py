@@ -16,7 +16,7 @@ from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Box, Size, View
 from mkpc_kaggle.geometry.critical_region import MkpcConfig
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
-from mkpc_kaggle.geometry.robust import Method, RobustConfig
+from mkpc_kaggle.geometry.robust import RobustConfig
 from mkpc_kaggle.scene.config import SceneConfig
 
 DIRECTORY = Path(__file__).resolve().parent / "recipes"
@@ -126,11 +126,6 @@ class Recipe:
                 raise UserError(f"{where} has the unit {name} twice")
 
     @property
-    def regular(self) -> tuple[Unit, ...]:
-        """All units."""
-        return self.units
-
-    @property
     def matcher_names(self) -> tuple[str, ...]:
         """Each matcher once, in order of first use."""
         return tuple(dict.fromkeys(unit.matcher for unit in self.units))
@@ -143,15 +138,6 @@ class Recipe:
         """The recipe that is run: fallbacks are in the places of ``unavailable`` matchers, or are forgotten."""
         units = (u.with_fallback if u.matcher in unavailable else replace(u, fallback="") for u in self.units)
         return replace(self, units=tuple(units))
-
-    def with_magsac(self, method: str | None = None, threshold: float | None = None) -> "Recipe":
-        """The recipe with another robust method and threshold in pixels, if they are given.
-
-        Raises ``ValueError`` for values that :class:`RobustConfig` refuses.
-        """
-        given = {"method": method and Method(method), "threshold": threshold}
-        changes: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
-        return replace(self, magsac=replace(self.magsac, **changes))
 
     def in_mode(self, mode: Mode) -> "Recipe":
         """The recipe run another way, see :class:`Mode`."""

@@ -196,12 +196,12 @@ def draw_epipolar(
 
 def draw_plane(images: Images, matches: Matches, homography: Estimate, threshold: float) -> "Figure":
     """Inliers of an F: those that one homography explains, too, and those that lie off its plane."""
-    figure, row = side_by_side(images)
+    figure, row = side_by_side(images, title_lines=2)
     for axes, points in zip(row, (matches.points0, matches.points1), strict=True):
         _dots(axes, points[homography.inliers], COLOURS[0])
         _crosses(axes, points[~homography.inliers], OUTLIER)
     explained = f"{homography.inlier_count} of {len(matches)} inliers of F"
-    _title(row[0], f"blue: {explained} fit one plane to {threshold:g} pixels")
+    _title(row[0], f"blue: {explained}\nfit one plane to {threshold:g} pixels")
     _title(row[1], "orange crosses: those off the plane")
     return figure
 

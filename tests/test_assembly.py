@@ -94,7 +94,7 @@ def test_a_permissive_run_leaves_out_of_recipe_auto_what_is_licensed_otherwise(k
     assert set(some.fingerprint()["weights"]) == {"loftr-outdoor", "dkm-outdoor"}
 
 
-@pytest.mark.filterwarnings("ignore:.*is not verified")
+@pytest.mark.filterwarnings("ignore:weights not verified")
 def test_a_fallback_stands_in_for_a_matcher_whose_weights_are_not_permitted_or_not_there(known_files):
     recipe = Recipe((Unit(1, "superglue", 640, fallback="loftr"), Unit(2, "dkm", area="90x120")))
     every = assemble(recipe, weights=[known_files])
@@ -129,7 +129,7 @@ def test_the_licence_of_a_matcher_of_ones_own_counts():
         assemble(recipe, matchers=own("GPL", "MIT"), licence=Licence.PERMISSIVE)
 
 
-@pytest.mark.filterwarnings("ignore:.*is not verified")
+@pytest.mark.filterwarnings("ignore:weights not verified")
 @pytest.mark.parametrize("name", ["xfeat_sparse_bnfolded.safetensors", "DKMv3_outdoor.pth"])
 def test_recipe_auto_passes_damaged_weights_over(tmp_path, name):
     """The second has no digest in the manifest: it is found out when it is read."""

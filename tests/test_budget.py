@@ -1,13 +1,13 @@
+import math
+import subprocess
+import sys
 import time
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from mkpc_kaggle.engine.planner import units_that_fit
 
-from mkpc_kaggle.engine.budget import Budget, format_duration, monotonic_of, parse_duration
-from mkpc_kaggle.engine.costs import WINDOW, Costs, needs
+from mkpc_kaggle.engine.budget import Budget, format_duration, monotonic_of, parse_duration, process_started
+from mkpc_kaggle.engine.costs import WINDOW, Costs
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.recipe import Unit
 
@@ -22,8 +22,8 @@ def test_durations_are_read(text: str, seconds: float) -> None:
     assert parse_duration(text) == seconds
 
 
-@pytest.mark.parametrize("text", ["", "h", "8 hours", "-5s", "1m1h", "0", "0s", "nan", "9:00"])
-def test_what_is_no_duration_is_refused(text: str) -> None:
+@pytest.mark.parametrize("text", ["", "h", "8 hours", "-5s", "1m1h", "0", "0s", "nan", "9:00", "8h45", "5m5"])
+def test_what_is_not_a_duration_is_refused(text: str) -> None:
     with pytest.raises(UserError):
         parse_duration(text)
 
@@ -38,44 +38,63 @@ def test_durations_are_shown_short() -> None:
     ]
 
 
-def test_a_budget_stops_before_it_ends_and_ends_before_its_limit() -> None:
+def test_the_four_moments_of_a_budget_follow_each_other() -> None:
     for limit in (10.0, 60.0, 31500.0):
-        budget = Budget(time.monotonic(), limit)
-        assert budget.started < budget.stop < budget.end < budget.started + limit
-        assert budget.left() <= limit
+        budget = Budget(0.0, limit, lambda: 0.0)
+        moments = [0.0, budget.stop_units, budget.stop_waiting, budget.final_write, budget.limit]
+        assert moments == sorted(set(moments))
+        assert budget.left() == budget.stop_units
 
 
 def test_a_spent_budget_has_nothing_left() -> None:
-    assert Budget(time.monotonic() - 100, 60).left() == 0
+    assert Budget(0.0, 60, lambda: 100.0).left() == 0
+
+
+def test_a_single_slow_write_is_forgotten_and_slow_writes_are_not() -> None:
+    budget = Budget(0.0, 32400.0, lambda: 0.0)
+    assert budget.writing == 0
+    for seconds in (2.0, 200.0, 2.0):
+        budget.note_write(seconds)
+    assert budget.writing == 3.0
+    for _ in range(3):
+        budget.note_write(40.0)
+    assert budget.writing == 60.0
+
+
+def test_writing_is_never_given_more_than_a_small_share_of_the_limit() -> None:
+    budget = Budget(0.0, 100.0, lambda: 0.0)
+    budget.note_write(90.0)
+    assert budget.writing == 5.0
+    assert budget.stop_units > 50
 
 
 def test_the_warm_up_counts_only_until_there_is_another_measurement() -> None:
     costs = Costs()
-    assert not costs.known("a")
+    assert not costs.is_known("a")
     costs.observe("a", 10.0, warm_up=True)
-    assert not costs.known("a")
-    assert costs.of("a") == 10.0
+    assert not costs.is_known("a")
+    assert costs.mean("a") == 10.0
     costs.observe("a", 1.0)
     costs.observe("a", 9.0, warm_up=True)  # another worker's
     costs.observe("a", 2.0)
-    assert costs.known("a")
-    assert costs.of("a") == 1.5
+    assert costs.is_known("a")
+    assert costs.mean("a") == 1.5
 
 
 def test_costs_follow_a_machine_that_slows_down() -> None:
     costs = Costs()
     for seconds in [1.0] * (WINDOW + 1) + [10.0] * WINDOW:
         costs.observe("a", seconds)
-    assert costs.of("a") == 10.0
+    assert costs.mean("a") == 10.0
 
 
-def test_a_supposed_cost_holds_only_for_a_unit_that_was_never_measured() -> None:
+def test_an_assumed_cost_holds_only_for_a_unit_that_was_never_measured() -> None:
     costs = Costs()
     costs.observe("a", 1.0)
-    costs.suppose("a", 99.0)
-    costs.suppose("b", 99.0)
-    assert costs.of("a") == 1.0
-    assert costs.of("b") == 99.0
+    costs.assume("a", 99.0)
+    costs.assume("b", 99.0)
+    assert costs.mean("a") == 1.0
+    assert costs.mean("b") == 99.0
 
 
 def known_costs(*seconds: float) -> Costs:
@@ -85,42 +104,12 @@ def known_costs(*seconds: float) -> Costs:
     return costs
 
 
-def test_the_longest_prefix_that_fits_is_chosen() -> None:
-    costs = known_costs(1.0, 2.0, 4.0)
-    lacking = {unit.name: 10 for unit in UNITS}
-    assert [units_that_fit(needs(UNITS, lacking, costs), s)[0] for s in (13, 15, 43, 99)] == [0, 1, 2, 3]
-
-
-def test_units_that_pairs_have_already_cost_nothing() -> None:
+def test_pairs_need_the_units_that_they_lack_and_the_time_between_them() -> None:
     costs = known_costs(1.0, 2.0, 4.0)
     lacking = {UNITS[0].name: 0, UNITS[1].name: 10, UNITS[2].name: 1}
-    assert units_that_fit(needs(UNITS, lacking, costs), 34)[0] == 3
-
-
-def test_waiting_counts_against_the_time_too() -> None:
-    costs = known_costs(1.0, 2.0, 4.0)
-    lacking = {unit.name: 10 for unit in UNITS}
-    before = units_that_fit(needs(UNITS, lacking, costs), 45)[0]
+    assert list(costs.cumulative(UNITS, lacking)) == pytest.approx([0, 28, 33.6])
     costs.observe_overhead(1.0)
-    assert before == 2
-    assert units_that_fit(needs(UNITS, lacking, costs), 45)[0] == 1
-
-
-@given(
-    st.lists(st.floats(0, 100), min_size=3, max_size=3),
-    st.lists(st.integers(0, 1000), min_size=3, max_size=3),
-    st.floats(0, 1e6),
-    st.floats(1, 10),
-)
-def test_more_time_never_chooses_fewer_units(
-    seconds: list[float], pairs: list[int], time_left: float, factor: float
-) -> None:
-    costs = known_costs(*seconds)
-    lacking = {unit.name: count for unit, count in zip(UNITS, pairs, strict=True)}
-    count = units_that_fit(needs(UNITS, lacking, costs), time_left)[0]
-    assert count <= units_that_fit(needs(UNITS, lacking, costs), time_left * factor)[0]
-    needed = sum(costs.of(unit.name) * lacking[unit.name] for unit in UNITS[:count])
-    assert needed <= time_left
+    assert list(costs.cumulative(UNITS, lacking)) == pytest.approx([10, 38, 43.6])
 
 
 def test_forecasts_grow_surer_with_every_measurement() -> None:
@@ -139,10 +128,10 @@ def test_a_stall_is_cut_and_cached_encodings_are_not() -> None:
     for number in range(WINDOW + 1):
         costs.observe("cached", 5.0 if number % 4 == 0 else 1.0)
         costs.observe("stalled", 1000.0 if number == 20 else 1.0)
-    assert costs.of("cached") == pytest.approx(2.0, rel=0.02)
-    assert costs.most("cached") == 5.0
-    assert costs.of("stalled") < 1.2
-    assert costs.most("stalled") == 1.0
+    assert costs.mean("cached") == pytest.approx(2.0, rel=0.02)
+    assert costs.p90("cached") == 5.0
+    assert costs.mean("stalled") < 1.2
+    assert costs.p90("stalled") == 1.0
 
 
 def test_forecasts_of_heavy_tailed_costs_are_not_too_low() -> None:
@@ -152,12 +141,21 @@ def test_forecasts_of_heavy_tailed_costs_are_not_too_low() -> None:
         costs = Costs()
         for seconds in np.exp(rng.normal(size=WINDOW + 1)):
             costs.observe("a", float(seconds))
-        shares.append(costs.of("a") / np.exp(0.5))
+        shares.append(costs.mean("a") / np.exp(0.5))
     assert np.mean(shares) == pytest.approx(1, abs=0.04)
 
 
 def test_a_limit_may_count_from_an_earlier_moment(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert time.monotonic() - monotonic_of(time.time() - 90) == pytest.approx(90, abs=0.1)
-    for nonsense in (time.time() + 3600, float("nan"), float("-inf")):
-        with pytest.raises(UserError, match="no moment of the past"):
+    monkeypatch.setattr(time, "time", lambda: 1000.0)
+    monkeypatch.setattr(time, "monotonic", lambda: 70.0)
+    assert monotonic_of(910.0) == -20.0
+    for nonsense in (1001.0, math.nan, -math.inf):
+        with pytest.raises(UserError, match="not a moment of the past"):
             monotonic_of(nonsense)
+
+
+def test_a_limit_counts_from_when_the_process_began() -> None:
+    assert process_started() <= time.monotonic()
+    code = "import time; a = time.monotonic(); from mkpc_kaggle.engine.budget import process_started"
+    before = f"{code}; assert process_started() < a"
+    assert subprocess.run([sys.executable, "-c", before], check=False).returncode == 0

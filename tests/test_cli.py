@@ -62,12 +62,10 @@ def test_recipes_are_listed_with_what_they_lack(
     assert "    1:aliked_lightglue@1024  at most 4096  (or aliked, where its weights are missing)\n" in light
 
 
-@pytest.mark.parametrize("count", ["0", "-1", "x", "9" * 5000])
+@pytest.mark.parametrize("count", ["0", "-1"])
 def test_a_number_of_pairs_below_one_is_refused(count: str, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as left:
-        main(["validate", "--train-dir", ".", "--pairs-per-scene", count])
-    assert left.value.code == 2
-    assert "--pairs-per-scene: " in capsys.readouterr().err
+    assert main(["validate", "--train-dir", ".", "--pairs-per-scene", count]) == 2
+    assert "--pairs-per-scene: give 1 or more" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("text", "meant"), [("8h45", "8h45m"), ("1h30m20", "1h30m20s"), ("5m30", "5m30s")])

@@ -4,10 +4,10 @@ import sys
 from pathlib import Path
 
 import pytest
-from mkpc_kaggle.engine.pools.cluster import RayCluster, parse_workers
 from rectified import THREE_UNITS, RectifiedMatcher, run, write_pairs
 
 from mkpc_kaggle.cli import main
+from mkpc_kaggle.engine.cluster import RayCluster, parse_workers
 from mkpc_kaggle.errors import UserError
 
 
@@ -31,7 +31,6 @@ def test_other_forms_are_refused_with_those_that_there_are(text: str, capsys: py
 
 def test_without_ray_it_says_how_to_install_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
-    monkeypatch.delitem(sys.modules, "mkpc_kaggle.engine.pools.ray_pool", raising=False)
     with pytest.raises(UserError, match=r'pip install "mkpc-kaggle\[ray\]"'):
         run(write_pairs(tmp_path, 1), THREE_UNITS, RectifiedMatcher(), tmp_path / "w", workers=RayCluster())
 

@@ -1,37 +1,35 @@
-"""Devices that fail and memory that is short, injected into real runs."""
+"""Devices that fail, memory that is short, workers that are lost: what counts against what, what takes over."""
 
-import os
-from functools import partial
+import threading
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from faulty import (
+    BROKEN,
     BrokenDeviceMatcher,
+    FaultyMatcher,
     NarrowMatcher,
-    RefusingMatcher,
-    pipeline_in_batches,
-    pipeline_telling_its_environment,
+    break_device,
+    exhaust_gpu,
+    thread_place,
+    use_places,
 )
-from mkpc_kaggle.engine.pools import pool
-from mkpc_kaggle.engine.pools.pool import Pool
-from mkpc_kaggle.engine.pools.process import WORKER_ENVIRONMENT
-from rectified import THREE_UNITS, RectifiedMatcher, process_place, run, write_pairs
+from rectified import SECOND, SWEEP, THIRD, THREE_UNITS, RectifiedMatcher, run, write_pairs
 
 from mkpc_kaggle.cli import main
 from mkpc_kaggle.data.competition import Pair, read_test_side, submission_problems
 from mkpc_kaggle.demo import DemoSet
-from mkpc_kaggle.engine import session
-from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.engine import Ending, RunReport
-from mkpc_kaggle.engine.session import Interrupt, Session, run_pairs
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.pipeline import assembly as assemblies
-from mkpc_kaggle.pipeline.assembly import Assembly, assemble
-from mkpc_kaggle.pipeline.devices import require_device
-from mkpc_kaggle.pipeline.failures import Failure, failure_of, reason_of
+from mkpc_kaggle.pipeline.assembly import assemble
+from mkpc_kaggle.pipeline.failures import DeviceError, Failure, failure_of, reason_of
 from mkpc_kaggle.reporting.summary import trouble
 
 COUNT = 12
+VICTIM = 3  # brightness 13
 
 
 @pytest.fixture(scope="module")
@@ -48,8 +46,8 @@ def matrices(report: RunReport) -> list[bytes]:
     return [record.pair_fundamental.tobytes() for record in report.records]
 
 
-def assembly_of(matcher: RectifiedMatcher) -> Assembly:
-    return assemble(THREE_UNITS, matchers={matcher.name: matcher}, device="cpu")
+def unit_failures(report: RunReport) -> list[str]:
+    return [unit.failure for record in report.records for unit in record.units if unit.failure]
 
 
 def test_what_errors_mean() -> None:
@@ -83,83 +81,162 @@ def test_what_errors_mean() -> None:
         assert [failure_of(error) for error in errors] == [failure] * len(errors)
     illegal = told[Failure.DEVICE][0]
     illegal.add_note("in 1:loftr@840")
-    assert reason_of(illegal) == (
-        "RuntimeError: CUDA error: an illegal memory access was encountered, in 1:loftr@840"
-    )
+    assert reason_of(illegal) == f"RuntimeError: {BROKEN}, in 1:loftr@840"
+
+
+# Devices
 
 
 def test_a_device_that_fails_once_costs_a_worker_and_no_unit(
-    pairs: list[Pair], undisturbed: RunReport, tmp_path: Path
+    pairs: list[Pair], undisturbed: RunReport, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    matcher = BrokenDeviceMatcher(marker=tmp_path / "broken")
-    report = run(pairs, THREE_UNITS, matcher, tmp_path / "work", workers=1)
+    matcher = FaultyMatcher(fault=break_device, once=tmp_path / "broken")
+    use_places(monkeypatch, thread_place("cuda:0", matcher))
+    report = run(pairs, THREE_UNITS, matcher, tmp_path / "work")
     assert report.ending is Ending.COMPLETE
-    assert [fault.partition(" (")[0] for fault in report.faults] == [
-        "a job was lost: the device failed: RuntimeError: CUDA error: an illegal memory access was encountered, "
-        "in 1:rectified@96"
-    ]
+    assert report.faults == (
+        f"a job was lost on cuda:0: the device failed: RuntimeError: {BROKEN}, in 1:rectified@96",
+    )
     assert matrices(report) == matrices(undisturbed)
-    assert not any(unit.failure for record in report.records for unit in record.units)
+    assert unit_failures(report) == []
     assert trouble(report) == ""
 
 
-@pytest.mark.parametrize("workers", [0, 1])
-def test_a_device_that_fails_for_good_ends_the_run_and_a_healthy_one_goes_on(
-    pairs: list[Pair], undisturbed: RunReport, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, workers: int
+def test_the_cpu_takes_over_when_the_last_gpu_fails_in_the_middle_of_a_run(
+    pairs: list[Pair], undisturbed: RunReport, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(pool, "MOST_DEVICE_FAILURES", 2)
-    matcher = BrokenDeviceMatcher(marker=tmp_path / "broken", for_good=True)
-    report = run(pairs, THREE_UNITS, matcher, tmp_path / "work", workers=workers)
+    matcher = RectifiedMatcher()
+    gpus = [thread_place(f"cuda:{number}", BrokenDeviceMatcher(good=number)) for number in (2, 3)]
+    use_places(monkeypatch, *gpus, fallback=[thread_place("cpu", matcher)])
+    report = run(pairs, THREE_UNITS, matcher, tmp_path / "work")
+    assert report.ending is Ending.COMPLETE
+    assert matrices(report) == matrices(undisturbed)
+    assert unit_failures(report) == []
+
+
+def test_a_pair_at_which_a_device_fails_is_done_by_a_healthy_one(
+    pairs: list[Pair], undisturbed: RunReport, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    broken, healthy = BrokenDeviceMatcher(good=2), RectifiedMatcher(seconds=0.02)
+    use_places(monkeypatch, thread_place("cuda:0", broken), thread_place("cuda:1", healthy))
+    report = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
+    assert report.ending is Ending.COMPLETE
+    assert all("a job was lost on cuda:0: the device failed" in fault for fault in report.faults)
+    assert report.faults
+    assert unit_failures(report) == []
+    assert matrices(report) == matrices(undisturbed)
+
+
+def test_a_device_that_fails_for_good_ends_the_run_and_a_healthy_one_goes_on(
+    pairs: list[Pair], undisturbed: RunReport, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    use_places(monkeypatch, thread_place("cuda:0", BrokenDeviceMatcher(good=5)))
+    report = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
     assert report.ending is Ending.NO_WORKER
     assert "the run failed: no worker left" in trouble(report)
     assert 0 < sum(bool(record.units) for record in report.records) < COUNT
-    assert not any(unit.failure for record in report.records for unit in record.units)
+    use_places(monkeypatch, thread_place("cpu", RectifiedMatcher()))
     resumed = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
     assert resumed.ending is Ending.COMPLETE
     assert matrices(resumed) == matrices(undisturbed)
 
 
 def test_a_device_without_kernels_leaves_the_work_to_the_cpu_and_a_line(
-    pairs: list[Pair], undisturbed: RunReport, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    pairs: list[Pair],
+    undisturbed: RunReport,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr(pool, "MOST_STARTS", 1)
-    assembly = assembly_of(RectifiedMatcher()).on("cuda:99")
-    plan = Session(tmp_path / "work", Budget(0.0), Interrupt(), progress=False, workers=None)
-    told = "no worker could be started but on the CPU: cuda:99 cannot be used"
-    with pytest.warns(UserWarning, match=told):
-        report, _ = run_pairs(pairs, assembly, plan)
+    gpu = thread_place("cuda:99", RectifiedMatcher(), pipeline=assembled().on("cuda:99").pipeline)
+    use_places(monkeypatch, gpu, fallback=[thread_place("cpu", RectifiedMatcher())])
+    report = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
     assert report.ending is Ending.COMPLETE
-    assert [told in fault for fault in report.faults] == [True]
+    assert "cuda:99 cannot be used" in capsys.readouterr().err
     assert matrices(report) == matrices(undisturbed)
 
 
-def test_a_device_is_tried_before_anything_is_loaded() -> None:
-    require_device("cpu")
-    with pytest.raises(UserError, match=r"cuda:99 cannot be used \(.*\); try --device cpu"):
-        assembly_of(RectifiedMatcher()).on("cuda:99").pipeline()
+def assembled() -> assemblies.Assembly:
+    return assemble(THREE_UNITS, matchers={"rectified": RectifiedMatcher()}, device="cpu")
 
 
-def test_a_batch_that_memory_is_too_short_for_is_halved_once_and_no_worker_lost(
+def test_a_worker_that_hangs_keeps_no_job_from_the_others(
     pairs: list[Pair], undisturbed: RunReport, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def in_batches(assembly: Assembly, _: object) -> Pool:
-        return Pool([process_place(partial(pipeline_in_batches, assembly, 8))], assembly.recipe)
+    swept, others_done = set(), threading.Event()
 
-    monkeypatch.setattr(session, "pool_of", in_batches)
-    matcher = NarrowMatcher(most=2, sizes=tmp_path / "sizes")
-    report = run(pairs, THREE_UNITS, matcher, tmp_path / "work", workers=1)
+    def wait_for_others(brightness: int) -> int:
+        assert others_done.wait(120), f"only {sorted(swept)} had a turn"
+        return 150
+
+    def note(brightness: int) -> int:
+        swept.add(brightness)
+        if len(swept) == COUNT - 1:
+            others_done.set()
+        return 150
+
+    hanging = thread_place("cuda:0", RectifiedMatcher(matches=wait_for_others))
+    use_places(monkeypatch, hanging, thread_place("cuda:1", RectifiedMatcher(matches=note)))
+    report = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
+    assert unit_failures(report) == []
+    assert matrices(report) == matrices(undisturbed)
+
+
+# Memory
+
+
+def test_a_unit_too_large_for_the_memory_is_given_up_on_that_pair_alone(
+    pairs: list[Pair], undisturbed: RunReport, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    use_places(monkeypatch, thread_place("cuda:0", FaultyMatcher(fault=exhaust_gpu, above=100)))
+    report = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
+    assert report.ending is Ending.COMPLETE
+    sweep, *others = report.records[VICTIM].units
+    assert sweep.failure == ""
+    given_up = "given up: out of memory: RuntimeError: CUDA out of memory. Tried to allocate 20.00 GiB, in {}"
+    assert {unit.unit: unit.failure for unit in others} == {
+        unit.name: given_up.format(unit.name) for unit in (SECOND, THIRD)
+    }
+    assert report.records[VICTIM].inliers > 100, "it keeps the F that it has"
+    assert matrices(report)[:VICTIM] == matrices(undisturbed)[:VICTIM]
+    assert matrices(report)[VICTIM + 1 :] == matrices(undisturbed)[VICTIM + 1 :]
+
+
+def test_a_minibatch_that_memory_is_too_short_for_is_halved_once_and_no_worker_lost(
+    pairs: list[Pair], undisturbed: RunReport, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    matcher = NarrowMatcher(most=2)
+    use_places(monkeypatch, thread_place("cuda:0", matcher, minibatch=8))
+    report = run(pairs, THREE_UNITS, matcher, tmp_path / "work")
     assert report.faults == ()
     assert matrices(report) == matrices(undisturbed)
-    sizes = (tmp_path / "sizes").read_text().split()
-    # Of the job of eight pairs one runs alone: the first measures a unit's warm-up, the second its cost.
-    assert sorted(size for size in sizes if int(size) > 2) == ["3", "3", "3", "7", "7", "7"], "once a unit"
+    too_large = [size for size in matcher.sizes if size > 2]
+    assert len(too_large) == 2 * len(THREE_UNITS.units), "seven or eight, and three or four: once a unit"
+
+
+def test_the_cpu_takes_over_when_a_gpu_has_no_memory_for_any_unit(
+    pairs: list[Pair], undisturbed: RunReport, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gpu = thread_place("cuda:0", RectifiedMatcher(matches=lambda _: exhaust_gpu()))
+    use_places(monkeypatch, gpu, fallback=[thread_place("cpu", RectifiedMatcher())])
+    report = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
+    assert report.ending is Ending.COMPLETE
+    assert matrices(report) == matrices(undisturbed)
+
+
+# Exit status
+
+
+def refuse(_: int) -> int:
+    raise ValueError("no such layer")
 
 
 @pytest.mark.parametrize(
-    ("broken", "told"),
+    ("fault", "told"),
     [
-        (False, "errors left 8 of 8 pairs without an F, 8 of them with this one: ValueError: no such layer"),
-        (True, "no worker left, the faults say why; the same command goes on"),
+        (refuse, "errors left 8 of 8 pairs without an F, 8 of them with this one: ValueError: no such layer"),
+        (lambda _: break_device(), "no worker left, the faults say why; the same command goes on"),
+        (lambda _: exhaust_gpu(), "every unit was given up, the faults say why; the same command goes on"),
     ],
 )
 def test_a_run_that_failed_has_exit_status_one_and_a_line(
@@ -167,36 +244,56 @@ def test_a_run_that_failed_has_exit_status_one_and_a_line(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
-    broken: bool,
+    fault: Callable[[int], Any],
     told: str,
 ) -> None:
-    matcher = BrokenDeviceMatcher(marker=tmp_path / "broken", for_good=True) if broken else RefusingMatcher()
-    monkeypatch.setattr(assemblies, "assemble", lambda *_, **__: assembly_of(matcher))
+    matcher = RectifiedMatcher(matches=fault)
+    use_places(monkeypatch, thread_place("this process", matcher))
+    made = assemble(THREE_UNITS, matchers={matcher.name: matcher}, device="cpu")
+    monkeypatch.setattr(assemblies, "assemble", lambda *_, **__: made)
     output = tmp_path / "submission.csv"
-    command = [
-        "submit",
-        "--test-dir",
-        str(demo.test_dir),
-        "--output",
-        str(output),
-        "--workers",
-        "0",
-        "--no-report",
-    ]
-    assert main(command) == 1
+    assert main(["submit", "--test-dir", str(demo.test_dir), "--output", str(output), "--no-report"]) == 1
     assert f"the run failed: {told}" in capsys.readouterr().out
     assert submission_problems(output, [pair.id for pair in read_test_side(demo.test_dir)]) == []
 
 
-def test_workers_are_told_not_to_spin_and_to_use_huge_pages_and_nobody_else_is(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+# Starts
+
+
+@pytest.mark.parametrize(
+    ("error", "told"),
+    [
+        (DeviceError("cuda:0 cannot be used"), "the device failed: cuda:0 cannot be used"),
+        (UserError("weights of another network"), "the matchers cannot be loaded: weights of another network"),
+        (ValueError("no such layer"), "the worker failed: ValueError: no such layer"),
+        (MemoryError("weights"), "out of memory: MemoryError: weights"),
+    ],
+)
+def test_workers_that_cannot_be_loaded_end_the_run_before_any_work(
+    pairs: list[Pair], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception, told: str
 ) -> None:
-    for name in WORKER_ENVIRONMENT:
-        monkeypatch.delenv(name, raising=False)
-    monkeypatch.setenv("GOMP_SPINCOUNT", "7")
-    make = partial(pipeline_telling_its_environment, assembly_of(RectifiedMatcher()), tmp_path / "told")
-    pool = Pool([process_place(make)], THREE_UNITS)
-    assert pool.start() == ""
-    assert pool.close()
-    assert (tmp_path / "told").read_text() == "PASSIVE, 7, 1"
-    assert {name: os.environ[name] for name in WORKER_ENVIRONMENT if name in os.environ} == {"GOMP_SPINCOUNT": "7"}
+    def fail() -> Any:
+        raise error
+
+    use_places(monkeypatch, thread_place("cpu", RectifiedMatcher(), pipeline=fail))
+    with pytest.raises(UserError, match=f"no worker could be started: cpu: {told}"):
+        run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
+
+
+def test_a_worker_that_cannot_be_started_again_ends_the_run_with_every_row_there(
+    pairs: list[Pair], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    broken, made = BrokenDeviceMatcher(good=5), []
+
+    def once() -> Any:
+        made.append(broken)
+        if len(made) > 1:
+            raise UserError("the weights are gone")
+        return assemble(THREE_UNITS, matchers={broken.name: broken}, device="cpu").pipeline()
+
+    use_places(monkeypatch, thread_place("cpu", broken, pipeline=once))
+    report = run(pairs, THREE_UNITS, broken, tmp_path / "work")
+    assert report.ending is Ending.NO_WORKER
+    assert "cpu: the matchers cannot be loaded: the weights are gone" in report.faults
+    assert report.records[0].has(SWEEP)
+    assert len(report.records) == COUNT

@@ -1,5 +1,6 @@
 """What a run asks of GPUs, shown on machines without: which there are, in which precision, with how much cache."""
 
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -11,7 +12,7 @@ from device_double import DeviceDouble, MixedDevicesError
 from standin import filled
 
 from mkpc_kaggle.data.images import Image
-from mkpc_kaggle.engine import session
+from mkpc_kaggle.engine.places import LocalSite
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.matches import Matches
@@ -104,17 +105,25 @@ def test_the_parent_of_workers_never_initialises_cuda(monkeypatch: pytest.Monkey
     gpus_here(monkeypatch, (7, 5), (7, 5))
     made = assemble("classical", device="cuda", precision="auto")
     assert str(made.placement) == "device cuda in float16"
-    pool = session.pool_of(made, None)
-    assert pool.workers == 2
-    pool.close()
+    site = LocalSite(made, None, time.monotonic)
+    site.open()
+    assert [place.name for place in site.places] == ["cuda:0", "cuda:1"]
 
 
 def test_capabilities_are_asked_of_another_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    gpu_capabilities.cache_clear()
     monkeypatch.setattr(devices, "ASK_CAPABILITIES", "print('a greeting'); print([[7, 5], [8, 0]])")
     assert gpu_capabilities() == [(7, 5), (8, 0)]
-    monkeypatch.setattr(devices, "ASK_CAPABILITIES", "raise SystemExit('driver too old')")
-    with pytest.raises(UserError, match="driver too old"):
-        gpu_capabilities()
+    gpu_capabilities.cache_clear()
+
+
+def test_gpus_on_which_nothing_can_be_computed_leave_the_work_to_the_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    gpu_capabilities.cache_clear()
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(devices, "ASK_CAPABILITIES", "raise SystemExit('no kernel image')")
+    told = r"the CPU does the work: .*\(no kernel image\); on Kaggle choose the accelerator GPU T4 x2"
+    with pytest.warns(UserWarning, match=told):
+        assert str(assemble("classical").placement) == "device cpu in float32"
 
 
 def test_a_device_that_multiplies_and_cannot_convolve_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from rectified import SECOND, SWEEP, THREE_UNITS
+from rectified import SECOND, SWEEP, THIRD, THREE_UNITS
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.jobs import Outcome
 from mkpc_kaggle.engine.journal import Journal
 from mkpc_kaggle.engine.journal_tables import DRAWN
-from mkpc_kaggle.engine.records import CameraRecord, PairRecord, SceneRecord
+from mkpc_kaggle.engine.records import GIVEN_UP, CameraRecord, PairRecord, SceneRecord, UnitRecord
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Box
 from mkpc_kaggle.geometry.critical_region import CriticalRegion, RegionReason
@@ -45,9 +45,10 @@ def outcome(index: int = 7, seed: int = 0) -> Outcome:
 
 
 def assert_same(one: PairRecord, other: PairRecord) -> None:
-    assert one.F.tobytes() == other.F.tobytes()
-    assert (one.magsac is None) == (other.magsac is None)
-    assert one.magsac is None or one.magsac.tobytes() == other.magsac.tobytes()
+    assert one.pair_fundamental.tobytes() == other.pair_fundamental.tobytes()
+    ours, others = one.magsac_fundamental, other.magsac_fundamental
+    assert (ours is None) == (others is None)
+    assert ours is None or ours.tobytes() == others.tobytes()
     assert one.units == other.units
     assert one.regions == other.regions
     assert (one.index, one.failure, one.decode_seconds) == (other.index, other.failure, other.decode_seconds)
@@ -70,14 +71,6 @@ def test_what_is_saved_is_there_after_opening_again(tmp_path: Path) -> None:
     again.close()
 
 
-def test_a_later_outcome_replaces_the_former(tmp_path: Path) -> None:
-    journal = Journal(tmp_path, OURS)
-    journal.save([(outcome(seed=1), False)])
-    journal.save([(outcome(seed=2), False)])
-    assert_same(journal.records()[7], outcome(seed=2).record)
-    journal.close()
-
-
 def points_of(journal: Journal, pair: int) -> int:
     return sum(len(result.matches) for result in journal.results(pair, UNITS))
 
@@ -94,14 +87,6 @@ def test_the_points_of_settled_pairs_are_kept_of_the_weakest_only(tmp_path: Path
     assert {record.units[0].matches for record in journal.records().values()} == {30}
     journal.save([(outcome(count, seed=1), False)])
     assert points_of(journal, count) == 30, "what a later job builds on is kept"
-    journal.close()
-
-
-def test_a_settled_pair_saved_again_is_counted_once_among_the_weakest(tmp_path: Path) -> None:
-    journal = Journal(tmp_path, OURS)
-    journal.save([(outcome(index, seed=index), True) for index in range(DRAWN)])
-    journal.save([(outcome(3, seed=3), True)])
-    assert all(points_of(journal, index) for index in range(DRAWN))
     journal.close()
 
 
@@ -132,24 +117,23 @@ def test_fresh_forgets_what_was_there(tmp_path: Path) -> None:
     journal.close()
 
 
-def test_two_runs_cannot_share_a_work_directory(tmp_path: Path) -> None:
-    first = Journal(tmp_path, OURS)
-    with pytest.raises(UserError, match="is another run at work there"):
-        Journal(tmp_path, OURS)
-    first.close()
+def test_what_was_given_up_is_forgotten_and_a_pair_without_anything_else_is_new(tmp_path: Path) -> None:
+    with Journal(tmp_path, OURS) as journal:
+        kept = outcome(3)
+        reason = f"{GIVEN_UP}the device failed"
+        lost = UnitRecord(THIRD.name, THIRD.stage, 0, 0, 0.0, 0.0, reason)
+        also = Outcome(replace(kept.record, units=(*kept.record.units, lost)), kept.results)
+        journal.save([(also, False), (Outcome(PairRecord(5, np.eye(3), reason, (lost,))), False)])
+        journal.forget_given_up()
+        assert {index: record.units for index, record in journal.records().items()} == {3: kept.record.units}
 
 
-def test_a_damaged_journal_is_refused(tmp_path: Path) -> None:
-    Journal(tmp_path, OURS).close()
-    (tmp_path / "journal.sqlite").write_bytes(b"this is no database" * 100)
-    with pytest.raises(UserError, match=r"damaged.*--fresh"):
-        Journal(tmp_path, OURS)
-
-
-def test_a_work_directory_that_cannot_be_made_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    with pytest.raises(UserError, match="cannot be written"):
-        Journal(tmp_path / "file" / "work", OURS)
+def test_it_is_known_of_how_many_results_a_scene_was_made(tmp_path: Path) -> None:
+    damaged_journal(tmp_path, "SELECT 1")
+    with Journal(tmp_path, OURS) as journal:
+        (scene,) = journal.scenes()
+        assert scene.made_from == 3
+        assert journal.records()[3].source == "scene"
 
 
 def test_a_failed_save_leaves_the_journal_usable(tmp_path: Path) -> None:
@@ -171,7 +155,7 @@ def damaged_journal(directory: Path, damage: str) -> Path:
     journal = Journal(directory, OURS, pairs=pairs)
     journal.save([(outcome(3, seed=1), False), (outcome(7, seed=2), False)])
     camera = CameraRecord("a", 0, [0.0, 0.0, 1.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0], 500.0, [640, 480], 9)
-    scene = SceneRecord("batch", 2, 2, 1, 9, 1.5, "", (camera,), ([0.0, 0.0, 5.0],))
+    scene = SceneRecord("batch", 2, 2, 1, 9, 3, 1.5, "", (camera,), ([0.0, 0.0, 5.0],))
     journal.save_scene(scene, {3: Choice(np.eye(3), Reason.SCENE), 7: Choice(None, Reason.UNREGISTERED)})
     journal.close()
     with closing(sqlite3.connect(directory / "journal.sqlite")) as db:
@@ -190,18 +174,11 @@ def read_all(journal: Journal) -> None:
 DAMAGES = [
     "UPDATE pair SET fundamental = x'{nan}'",
     "UPDATE pair SET fundamental = x'{zero}'",
-    "UPDATE pair SET fundamental = x'00'",
-    "UPDATE pair SET fundamental = 'text'",
-    "UPDATE pair SET failure = x'ff'",
     "UPDATE pair SET failure = cast(x'ff' AS TEXT)",
     "UPDATE pair SET decode_seconds = 'x'",
-    "UPDATE pair SET before = 'x'",
-    "UPDATE pair SET version0 = x'00'",
     "UPDATE pair SET magsac = x'{nan}'",
     "UPDATE unit SET matches = 'x'",
-    "UPDATE unit SET failure = NULL",
     "UPDATE unit SET unit = 'another' WHERE place = 0",
-    "UPDATE unit SET points = x'00'",
     "UPDATE unit SET points = zeroblob(1000)",
     f"UPDATE unit SET points = x'{zlib.compress(bytes(100_000_000)).hex()}'",
     "UPDATE unit SET encode_seconds = 9e999",
@@ -209,19 +186,15 @@ DAMAGES = [
     'UPDATE region SET "left" = "right"',
     "DELETE FROM region WHERE image = 1",
     "UPDATE choice SET fundamental = x'{nan}'",
-    "UPDATE choice SET fundamental = x'00'",
     "UPDATE choice SET reason = 'x'",
     "UPDATE scene SET cameras = '['",
-    "UPDATE scene SET cameras = '[1]'",
     "UPDATE scene SET cameras = '[{{}}]'",
     "UPDATE scene SET cameras = replace(cameras, '1.0', 'null')",
-    "UPDATE scene SET images = 'x'",
     "UPDATE scene SET cloud = '[[0.0, 1.0]]'",
     "UPDATE run SET value = '{{'",
     f"UPDATE run SET value = '{'[' * 100_000}'",
     "DROP TABLE unit",
-    "DROP TABLE scene",
-    "ALTER TABLE pair DROP COLUMN before",
+    "ALTER TABLE scene DROP COLUMN made_from",
 ]
 
 
@@ -261,7 +234,7 @@ def test_bytes_damaged_at_random_never_end_in_a_traceback(tmp_path: Path) -> Non
     assert 10 < refused < 60
 
 
-def test_a_lock_that_is_none_is_named(tmp_path: Path) -> None:
+def test_a_file_in_the_place_of_the_lock_is_named(tmp_path: Path) -> None:
     (tmp_path / "journal.lock").write_bytes(b"this is no database" * 100)
     with pytest.raises(UserError, match=r"journal\.lock is no lock of this program .*remove it"):
         Journal(tmp_path, OURS)
@@ -290,7 +263,7 @@ def test_a_refused_journal_holds_no_lock_and_no_file(tmp_path: Path) -> None:
     Journal(tmp_path, OURS, fresh=True).close()
 
 
-def test_text_that_is_no_utf8_is_kept_in_letters(tmp_path: Path) -> None:
+def test_text_that_is_not_utf8_is_kept_in_letters(tmp_path: Path) -> None:
     with Journal(tmp_path, OURS) as journal:
         record = PairRecord.untouched(3, os.fsdecode(b"\xff: no such file"))
         journal.save([(Outcome(record), False)])

@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from mkpc_kaggle.data.outputs import discard_parts, replacing, require_no_input
+from mkpc_kaggle.data.outputs import discard_parts, replacing, require_apart
 from mkpc_kaggle.errors import UserError
 
 
@@ -23,7 +23,7 @@ def place(tmp_path):
 
 
 def refuse(place, option, name):
-    require_no_input({option: place / name}, [place / "test.csv", place / "images", place / "weights"])
+    require_apart({option: place / name}, [place / "test.csv", place / "images", place / "weights"])
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,6 @@ import io
 import json
 import subprocess
 import sys
-import time
 import venv
 from dataclasses import replace
 from pathlib import Path
@@ -17,10 +16,7 @@ from weight_files import digest_of, line, put
 
 from mkpc_kaggle.cli import main
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.package import Request, make_package
-from mkpc_kaggle.package.checkout import find_checkout
-from mkpc_kaggle.package.folder import Item, write_files
-from mkpc_kaggle.package.metadata import Image
+from mkpc_kaggle.package import Request, find_checkout, make_package
 from mkpc_kaggle.package.wheels import BUNDLED, PYTHONS, build_wheel, install_lines, pins
 from mkpc_kaggle.weights import WeightStore, load_tensors, store
 from mkpc_kaggle.weights.manifest import read_manifest
@@ -68,7 +64,14 @@ def test_the_dataset_holds_wheels_weights_and_their_licences(wanted: Request) ->
     package = make_package(wanted)
     dataset = wanted.out / "dataset"
     names = {path.name for path in dataset.iterdir()}
-    assert {"LICENSE", "MIT.txt", "weights_manifest.txt", "requirements.txt", "dataset-metadata.json"} <= names
+    assert {
+        "LICENSE",
+        "README.md",
+        "MIT.txt",
+        "weights_manifest.txt",
+        "requirements.txt",
+        "dataset-metadata.json",
+    } <= names
     assert {name.partition("-")[0] for name in names if name.endswith(".whl")} == {
         "mkpc_kaggle",
         "kornia",
@@ -121,9 +124,15 @@ def test_the_folders_keep_the_limits_of_the_kaggle_command(wanted: Request) -> N
     assert all(path.is_file() for folder in ("dataset", "kernel") for path in (wanted.out / folder).iterdir())
     assert kernel["machine_shape"] == "NvidiaTeslaT4"
     assert kernel["docker_image_pinning_type"] == "latest"
-    make_package(replace(wanted, image=Image.ORIGINAL))
+
+
+@pytest.mark.parametrize("image", ["latest", "original", f"gcr.io/kaggle/python@sha256:{'0a' * 32}"])
+def test_the_image_is_the_latest_the_first_or_one_by_its_digest(wanted: Request, image: str) -> None:
+    make_package(replace(wanted, image=image))
     kernel = json.loads((wanted.out / "kernel" / "kernel-metadata.json").read_text())
-    assert kernel["docker_image_pinning_type"] == "original"
+    is_pinned = "@" in image
+    assert kernel["docker_image_pinning_type"] == ("original" if is_pinned else image)
+    assert kernel.get("docker_image", "") == (image if is_pinned else "")
 
 
 def test_what_the_image_has_is_used_where_it_satisfies_even_without_a_wheel_for_its_python(
@@ -154,7 +163,9 @@ def test_the_kernel_runs_on_a_gpu_without_internet_on_the_competition_and_the_da
     assert metadata["competition_sources"] == ["image-matching-challenge-2022"]
     assert metadata["dataset_sources"] == [dataset["id"]] == ["someone/mkpc-kaggle"]
     assert metadata["id"] == "someone/" + metadata["title"].lower().replace(" ", "-")
-    assert (kernel / metadata["code_file"]).read_bytes() == find_checkout().submission_notebook.read_bytes()
+    assert (kernel / metadata["code_file"]).read_bytes() == (
+        find_checkout() / "notebooks" / "submission.ipynb"
+    ).read_bytes()
 
 
 def test_the_same_request_gives_the_same_bytes_and_leaves_files_alone(wanted: Request, tmp_path: Path) -> None:
@@ -170,6 +181,16 @@ def test_the_same_request_gives_the_same_bytes_and_leaves_files_alone(wanted: Re
     assert contents(tmp_path / "again") == contents(wanted.out)
 
 
+def test_a_link_planted_at_the_name_of_an_unfinished_file_is_not_followed(wanted: Request, tmp_path: Path) -> None:
+    outside = put(tmp_path / "outside", "precious", b"precious") / "precious"
+    (wanted.out / "dataset").mkdir(parents=True)
+    (wanted.out / "dataset" / ".LICENSE.part").symlink_to(outside)
+    make_package(wanted)
+    assert outside.read_bytes() == b"precious"
+    assert not (wanted.out / "dataset" / ".LICENSE.part").is_symlink()
+    assert not (wanted.out / "dataset" / "LICENSE").is_symlink()
+
+
 def test_a_private_package_has_all_weights_and_a_public_one_refuses_to_be_laid_over_it(
     wanted: Request, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -183,7 +204,7 @@ def test_a_private_package_has_all_weights_and_a_public_one_refuses_to_be_laid_o
     kept = wanted.out / "dataset" / "kept.pt.safetensors"
     assert torch.equal(load_tensors(kept)["a"], torch.full((3,), 2.0))
     assert main(arguments) == 2
-    assert "kept.pt.safetensors. Remove it" in capsys.readouterr().err
+    assert "kept.pt.safetensors. Remove them" in capsys.readouterr().err
     kept.unlink()
     assert main(arguments) == 0
     assert "Left out" in capsys.readouterr().out
@@ -193,7 +214,8 @@ def test_bad_requests_are_refused_before_anything_is_written(wanted: Request, tm
     empty = tmp_path / "empty"
     empty.mkdir()
     bad = {
-        "no Kaggle user name": replace(wanted, owner="some one"),
+        "cannot be a Kaggle user name": replace(wanted, owner="some one"),
+        "give latest, original, or an image as NAME@sha256:DIGEST": replace(wanted, image="python@sha256:12"),
         "no such directory": replace(wanted, wheels=tmp_path / "nowhere"),
         f"for Python {python_version()}": replace(wanted, wheels=empty),
         "for Python 2.7": replace(wanted, pythons=("2.7",)),
@@ -208,16 +230,16 @@ def test_bad_requests_are_refused_before_anything_is_written(wanted: Request, tm
 def test_without_sources_it_says_that_a_checkout_is_needed(
     wanted: Request, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    from mkpc_kaggle.package import checkout
+    from mkpc_kaggle.package import package
 
-    monkeypatch.setattr(checkout, "__file__", str(tmp_path / "site-packages/mkpc_kaggle/package/checkout.py"))
+    monkeypatch.setattr(package, "__file__", str(tmp_path / "site-packages/mkpc_kaggle/package/package.py"))
     with pytest.raises(UserError, match="clone the repository"):
         make_package(wanted)
 
 
 def test_a_bundled_package_is_pinned_and_is_one_that_the_wheel_needs() -> None:
     pinned = pins(find_checkout())
-    assert [pin.partition("==")[0] for pin in pinned] == list(BUNDLED)
+    assert [pin.partition("==")[0].replace("_", "-") for pin in pinned] == list(BUNDLED)
     assert all(pin.partition("==")[2] for pin in pinned)
 
 
@@ -227,22 +249,17 @@ def test_what_is_installed_is_what_our_wheel_and_the_bundled_ones_ask_for(tmp_pa
     assert sorted(names[1:]) == sorted(BUNDLED)
 
 
-def test_the_wheel_installs_in_a_bare_environment_and_is_imported_at_once(tmp_path: Path) -> None:
+def test_the_wheel_installs_in_a_bare_environment_and_imports_no_torch(tmp_path: Path) -> None:
     wheel = build_wheel(find_checkout(), tmp_path)
     venv.create(tmp_path / "bare", symlinks=True)
     python = tmp_path / "bare" / "bin" / "python"
     pip = [sys.executable, "-m", "pip", "--python", str(python), "install", "--quiet", "--no-index", "--no-deps"]
     subprocess.run([*pip, str(wheel)], check=True, env=environment())
     code = "import mkpc_kaggle, sys; print(mkpc_kaggle.__version__, 'torch' in sys.modules)"
-    seconds = []
-    for _ in range(3):  # the fastest of them: other work on the machine only adds
-        start = time.perf_counter()
-        done = subprocess.run(
-            [python, "-c", code], check=True, capture_output=True, text=True, cwd=tmp_path, env=environment()
-        )
-        seconds.append(time.perf_counter() - start)
-        assert done.stdout.split()[1] == "False"
-    assert min(seconds) < 0.3
+    done = subprocess.run(
+        [python, "-c", code], check=True, capture_output=True, text=True, cwd=tmp_path, env=environment()
+    )
+    assert done.stdout.split()[1] == "False"
 
 
 def test_the_wheel_holds_what_a_run_needs_and_not_the_tests(tmp_path: Path) -> None:
@@ -264,13 +281,3 @@ def test_wheels_come_from_the_index_for_all_pythons(wanted: Request, tmp_path: P
     written = contents(request.out)
     make_package(request)
     assert contents(request.out) == written
-
-
-def test_a_link_in_the_place_of_a_partial_file_is_not_followed(tmp_path: Path) -> None:
-    (tmp_path / "source").write_bytes(b"ours")
-    (tmp_path / "mine").write_bytes(b"mine")
-    (tmp_path / "out").mkdir()
-    (tmp_path / "out" / ".a.part").symlink_to(tmp_path / "mine")
-    write_files(tmp_path / "out", [Item("a", tmp_path / "source")])
-    assert (tmp_path / "mine").read_bytes() == b"mine"
-    assert [(path.name, path.is_symlink()) for path in (tmp_path / "out").iterdir()] == [("a", False)]

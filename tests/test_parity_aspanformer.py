@@ -146,8 +146,8 @@ def transformer_of(side, transformer, trace):
 def levels_of(side, attention, calls):
     """Inside the attention of the first block: messages, spans and samples of its levels."""
     inputs, merged = calls[ATTENTION][side]
-    found = attention.messages(*inputs)
-    messages = {"global": found.coarse, "half": found.half, "full": found.full, "merged": merged}
+    coarse, half, full = attention.messages(*inputs)
+    messages = {"global": coarse, "half": half, "full": full, "merged": merged}
     got = {f"b0_q{side}_msg_{level}": as_map(message) for level, message in messages.items()}
     q, k, _, flow, own, _ = inputs
     for level, factor in (("half", 2), ("full", 1)):

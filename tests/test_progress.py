@@ -3,9 +3,9 @@
 from io import StringIO
 
 import pytest
-from mkpc_kaggle.engine.progress import LINE_SECONDS, Bar, Lines, progress_on
 
 from mkpc_kaggle.engine.budget import Budget
+from mkpc_kaggle.engine.console import LINE_INTERVAL_S, Progress, redraws
 from mkpc_kaggle.engine.jobs import Phase
 
 
@@ -28,8 +28,7 @@ class Clock:
 
 def test_a_terminal_has_a_bar_that_is_drawn_anew() -> None:
     stream = Terminal()
-    progress = progress_on(stream, Budget(0.0, 100.0, Clock()))
-    assert isinstance(progress, Bar)
+    progress = Progress(Budget(0.0, 100.0, Clock()), stream)
     progress.show(Phase.SWEEP, 8, 8)
     progress.show(Phase.DEEPEN, 2, 8)
     progress.close()
@@ -37,36 +36,34 @@ def test_a_terminal_has_a_bar_that_is_drawn_anew() -> None:
     assert "budget left 1m38s" in stream.getvalue()
 
 
-def test_what_is_no_terminal_has_lines() -> None:
-    assert isinstance(progress_on(StringIO(), Budget(0.0)), Lines)
-
-
 def test_the_terminal_that_a_notebook_gives_its_commands_has_lines(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert redraws(Terminal())
+    assert not redraws(StringIO())
     monkeypatch.setenv("JPY_PARENT_PID", "1")
-    assert isinstance(progress_on(Terminal(), Budget(0.0)), Lines)
+    assert not redraws(Terminal())
 
 
-def test_lines_come_when_a_pass_begins_now_and_then_and_in_the_end() -> None:
+def test_lines_come_when_a_phase_begins_now_and_then_and_in_the_end() -> None:
     stream, clock = StringIO(), Clock()
-    lines = Lines(stream, Budget(0.0, clock=clock))
+    progress = Progress(Budget(0.0, clock=clock), stream)
     for done in range(1, 101):  # 100 seconds
         clock.now += 1
-        lines.show(Phase.SWEEP, done, 100)
-    lines.show(Phase.DEEPEN, 1, 2)
-    clock.now += LINE_SECONDS - 1
-    lines.show(Phase.DEEPEN, 2, 2)
-    lines.close()
-    lines.close()
+        progress.show(Phase.SWEEP, done, 100)
+    progress.show(Phase.DEEPEN, 1, 2)
+    clock.now += LINE_INTERVAL_S - 1
+    progress.show(Phase.DEEPEN, 2, 2)
+    progress.close()
+    progress.close()
     sweep = ["sweep: 100 pairs", *(f"sweep: {done} of 100 pairs" for done in (31, 61, 91))]
     assert stream.getvalue().splitlines() == [*sweep, "deepen: 2 pairs", "deepen: 2 of 2 pairs"]
 
 
 def test_a_line_says_how_much_of_the_budget_is_left() -> None:
     stream = StringIO()
-    lines = Lines(stream, Budget(0.0, 10.0, Clock()))
-    lines.show(Phase.SWEEP, 1, 5)
-    lines.show(Phase.SWEEP, 3, 5)
-    lines.close()
+    progress = Progress(Budget(0.0, 10.0, Clock()), stream)
+    progress.show(Phase.SWEEP, 1, 5)
+    progress.show(Phase.SWEEP, 3, 5)
+    progress.close()
     assert stream.getvalue() == "sweep: 5 pairs, budget left 8.5s\nsweep: 3 of 5 pairs, budget left 8.5s\n"
 
 
@@ -75,7 +72,7 @@ def test_a_log_whose_reader_has_left_does_not_end_the_run() -> None:
         def write(self, text: str) -> int:
             raise BrokenPipeError
 
-    lines = Lines(Left(), Budget(0.0, clock=Clock()))
-    lines.show(Phase.SWEEP, 1, 5)
-    lines.show(Phase.SWEEP, 5, 5)
-    lines.close()
+    progress = Progress(Budget(0.0, clock=Clock()), Left())
+    progress.show(Phase.SWEEP, 1, 5)
+    progress.show(Phase.SWEEP, 5, 5)
+    progress.close()

@@ -7,27 +7,60 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pytest
-from faulty import FarMatcher, FaultyMatcher, die, hang, nothing
-from mkpc_kaggle.engine.pools.cluster import RayCluster
-from rectified import THREE_UNITS, RectifiedMatcher, run, write_pairs
+from rectified import THREE_UNITS, RectifiedMatcher, Seen, run, write_pairs
 from synthetic import RECIPE as SYNTHETIC
 from synthetic import SyntheticMatcher, synthetic_pairs
-from test_faults import QUICK, matrices
 
 from mkpc_kaggle.data.competition import Pair
+from mkpc_kaggle.engine.cluster import RayCluster
 from mkpc_kaggle.engine.engine import Ending, RunReport
+from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.pipeline.assembly import Assembly
 
 ray = pytest.importorskip("ray", reason="Ray is not installed: pip install 'mkpc-kaggle[ray]'")
 
 TESTS = Path(__file__).parent
-IMPORTED = [str(TESTS.parent), str(TESTS / "support")]
-"""What machines can import."""
+IMPORTED = [str(TESTS.parent), str(TESTS), str(TESTS / "support")]  # what machines can import
 COUNT = 12
-MEGABYTE = 1 << 20
+STORE_BYTES = 80 << 20
+
+
+@dataclass
+class MarkingMatcher(RectifiedMatcher):
+    """Marks with a file that it has come to the pair of brightness ``at``; the first time its process may die."""
+
+    at: int = 13
+    mark: Path = Path()
+    dies: bool = False
+
+    def _match(self, seen0: Seen, seen1: Seen) -> Matches:
+        if seen0.brightness == self.at and not self.mark.exists():
+            self.mark.touch()
+            if self.dies:
+                os.kill(os.getpid(), signal.SIGKILL)
+        return super()._match(seen0, seen1)
+
+
+@dataclass
+class DoomedMatcher(RectifiedMatcher):
+    """Marks that it has begun on the machine ``node``, where it never ends; elsewhere it waits for that."""
+
+    node: str = ""
+    mark: Path = Path()
+
+    def _match(self, seen0: Seen, seen1: Seen) -> Matches:
+        if ray.get_runtime_context().get_node_id() == self.node:
+            self.mark.touch()
+            threading.Event().wait()
+        while not self.mark.exists():
+            time.sleep(0.05)
+        return super()._match(seen0, seen1)
 
 
 @pytest.fixture(scope="module")
@@ -36,10 +69,10 @@ def cluster() -> Iterator[Any]:
     from ray.cluster_utils import Cluster
 
     patch = pytest.MonkeyPatch()
-    patch.setenv("PYTHONPATH", os.pathsep.join(IMPORTED))
-    small = {"num_cpus": 1, "object_store_memory": 80 * MEGABYTE, "include_dashboard": False}
+    patch.setenv("PYTHONPATH", os.pathsep.join([*IMPORTED, os.environ.get("PYTHONPATH", "")]))
+    small = {"num_cpus": 1, "object_store_memory": STORE_BYTES, "include_dashboard": False}
     cluster = Cluster(initialize_head=True, head_node_args=small)
-    cluster.add_node(num_cpus=1, object_store_memory=80 * MEGABYTE)
+    cluster.add_node(num_cpus=1, object_store_memory=STORE_BYTES)
     yield cluster
     cluster.shutdown()
     patch.undo()
@@ -55,59 +88,61 @@ def undisturbed(pairs: list[Pair], tmp_path_factory: pytest.TempPathFactory) -> 
     return run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path_factory.mktemp("undisturbed"))
 
 
+def matrices(report: RunReport) -> list[bytes]:
+    return [record.chosen_fundamental.tobytes() for record in report.records]
+
+
 def test_actors_give_the_bytes_of_a_run_in_one_process(
     cluster: Any, pairs: list[Pair], undisturbed: RunReport, tmp_path: Path
 ) -> None:
     report = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "w", workers=RayCluster(cluster.address))
     assert report.faults == ()
     assert report.ending is Ending.COMPLETE
-    assert matrices(report.records) == matrices(undisturbed.records)
+    assert matrices(report) == matrices(undisturbed)
     assert not ray.is_initialized(), "the run lets go of the cluster"
 
 
-@pytest.mark.parametrize(("fault", "told"), [(die, "the worker died: on "), (hang, "the worker hung: nothing")])
-def test_an_actor_that_is_lost_is_replaced(
-    cluster: Any, pairs: list[Pair], undisturbed: RunReport, tmp_path: Path, fault: Any, told: str
+def test_an_actor_that_dies_is_replaced(
+    cluster: Any, pairs: list[Pair], undisturbed: RunReport, tmp_path: Path
 ) -> None:
-    matcher = FaultyMatcher(fault=fault, once=tmp_path / "once")
-    report = run(pairs, THREE_UNITS, matcher, tmp_path / "w", workers=RayCluster(cluster.address), timeouts=QUICK)
+    matcher = MarkingMatcher(mark=tmp_path / "died", dies=True)
+    report = run(pairs, THREE_UNITS, matcher, tmp_path / "w", workers=RayCluster(cluster.address))
     assert report.ending is Ending.COMPLETE
-    assert [told in fault for fault in report.faults] == [True], report.faults
-    assert matrices(report.records) == matrices(undisturbed.records)
+    assert ["the worker died" in fault for fault in report.faults] == [True], report.faults
+    assert matrices(report) == matrices(undisturbed)
 
 
-def test_a_machine_lost_during_the_run_costs_time_alone(cluster: Any, tmp_path: Path) -> None:
-    pairs = write_pairs(tmp_path / "pairs", 40)
-    undisturbed = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "undisturbed")
-    lost = cluster.add_node(num_cpus=1, object_store_memory=80 * MEGABYTE)
-    matcher = FaultyMatcher(fault=nothing, at=20, seconds=0.1, once=tmp_path / "begun")
+def test_a_machine_lost_during_the_run_costs_its_job_alone(
+    cluster: Any, pairs: list[Pair], undisturbed: RunReport, tmp_path: Path
+) -> None:
+    lost = cluster.add_node(num_cpus=1, object_store_memory=STORE_BYTES)
+    matcher = DoomedMatcher(node=lost.node_id, mark=tmp_path / "begun")
 
     def lose() -> None:
-        while not (tmp_path / "begun").exists():
+        while not matcher.mark.exists():
             time.sleep(0.05)
-        cluster.remove_node(lost)
+        cluster.remove_node(lost, allow_graceful=False)
 
     threading.Thread(target=lose, daemon=True).start()
     report = run(pairs, THREE_UNITS, matcher, tmp_path / "w", workers=RayCluster(cluster.address))
     assert report.ending is Ending.COMPLETE
-    assert "the machine was lost: on " in report.faults[0]
-    assert all("the machine was lost" in fault or "could be started" in fault for fault in report.faults)
-    assert matrices(report.records) == matrices(undisturbed.records)
+    assert "a job was lost on machine " in report.faults[0]
+    assert matrices(report) == matrices(undisturbed)
 
 
-def kill_the_first_scene_actor(cluster: Any, report: list[str]) -> None:
-    """Wait until it is there, and note where it was."""
-    while not report:
-        for process in Path("/proc").glob("[0-9]*/cmdline"):
-            try:
-                told = process.read_text()
-            except OSError:
-                continue
-            if "SceneActor" in told:
-                os.kill(int(process.parent.name), signal.SIGKILL)
-                report.append(told)
-                return
-        time.sleep(0.02)
+def test_a_machine_that_lacks_the_weights_is_named_when_the_run_starts(
+    cluster: Any, pairs: list[Pair], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    missing = tmp_path / "weights.safetensors"
+    monkeypatch.setattr(Assembly, "weight_paths", (missing,))
+    with pytest.raises(UserError, match=rf"lacks {missing}: test set and weights must have the same paths"):
+        run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "w", workers=RayCluster(cluster.address))
+
+
+def test_a_machine_that_lacks_the_test_set_is_named_when_the_run_starts(cluster: Any, tmp_path: Path) -> None:
+    pairs = [Pair("a", "a", str(tmp_path / "nowhere" / "a.png"), str(tmp_path / "nowhere" / "b.png"))]
+    with pytest.raises(UserError, match=rf"lacks {tmp_path / 'nowhere'}: test set and weights"):
+        run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "w", workers=RayCluster(cluster.address))
 
 
 @pytest.fixture(scope="module")
@@ -122,107 +157,37 @@ def test_batches_are_reconstructed_on_the_cluster_to_the_same_bytes(
     report = run(batch, SYNTHETIC, SyntheticMatcher(), tmp_path / "w", workers=RayCluster(cluster.address))
     assert report.faults == ()
     assert [record.source for record in report.records] == ["scene"] * len(batch)
-    assert [one.fundamental.tobytes() for one in report.records] == [
-        one.fundamental.tobytes() for one in here.records
-    ]
-
-
-def test_a_reconstruction_that_dies_on_the_cluster_costs_its_scene_alone(
-    cluster: Any, batch: list[Pair], tmp_path: Path
-) -> None:
-    killed: list[str] = []
-    threading.Thread(target=kill_the_first_scene_actor, args=(cluster, killed), daemon=True).start()
-    report = run(batch, SYNTHETIC, SyntheticMatcher(), tmp_path / "w", workers=RayCluster(cluster.address))
-    killed.append("the run is over")
-    assert report.ending is Ending.COMPLETE
-    assert [record.source for record in report.records] == ["pair"] * len(batch)
-    assert "batch batch was not reconstructed: on " in report.faults[0]
-
-
-def test_images_are_sent_to_machines_that_cannot_read_them(
-    cluster: Any, pairs: list[Pair], undisturbed: RunReport, tmp_path: Path
-) -> None:
-    report = run(pairs, THREE_UNITS, FarMatcher(), tmp_path / "w", workers=RayCluster(cluster.address))
-    assert report.faults == ()
-    assert matrices(report.records) == matrices(undisturbed.records)
-
-
-def test_an_image_is_read_here_only_if_it_is_the_same_file(tmp_path: Path) -> None:
-    from mkpc_kaggle.engine.pools.ray_actor import FileServer, read_or_fetch
-
-    from mkpc_kaggle.data.images import Image, Unreadable
-
-    pair, other = write_pairs(tmp_path, 2)
-    server, asked = FileServer(), []
-
-    def fetch(path: Path, stamp: tuple[int, int] | None) -> bytes | None:
-        asked.append(server.fetch(path, stamp))
-        return asked[-1]
-
-    def fetch_another(_: Path, stamp: tuple[int, int] | None) -> bytes | None:
-        return server.fetch(other.image0, stamp)
-
-    os.utime(other.image0, (1, 1))
-    here = read_or_fetch(pair.image0, fetch)
-    sent = read_or_fetch(pair.image0, fetch_another)
-    assert asked == [None], "nothing is sent"
-    assert isinstance(here, Image)
-    assert isinstance(sent, Image)
-    assert (int(here.pixels.max()), int(sent.pixels.max())) == (10, 11)
-    nowhere = read_or_fetch(tmp_path / "no.png", fetch)
-    assert nowhere == Unreadable(str(tmp_path / "no.png"), "no such file")
-
-
-def node(name: str, alive: bool = True, **offer: float) -> dict[str, Any]:
-    return {"NodeID": name, "NodeManagerHostname": name, "Alive": alive, "Resources": offer}
-
-
-@pytest.mark.parametrize(
-    ("device", "expected"),
-    [
-        ("auto", [("gpus", 0, 4, True), ("gpus", 1, 4, True)]),
-        ("cpu", [("cpus", 0, 6, False), ("gpus", 0, 8, False)]),
-    ],
-)
-def test_places_are_the_gpus_or_else_the_machines(device: str, expected: list[tuple[str, int, int, bool]]) -> None:
-    from mkpc_kaggle.engine.pools.ray_pool import slots_of
-
-    nodes = [
-        node("cpus", CPU=6),
-        node("gone", alive=False, CPU=6, GPU=1),
-        node("gpus", CPU=8, GPU=2),
-        node("head"),
-    ]
-    slots = slots_of(nodes, device)
-    assert [(slot.node, slot.number, slot.threads, slot.gpu) for slot in slots] == expected
+    assert matrices(report) == matrices(here)
 
 
 LOCAL = """
 import sys, time
 sys.path[:0] = {path!r}
 from pathlib import Path
-from rectified import THREE_UNITS, RectifiedMatcher, write_pairs
+from rectified import THREE_UNITS, write_pairs
+from test_ray import MarkingMatcher
 from mkpc_kaggle.pipeline.assembly import assemble
 from mkpc_kaggle.engine.budget import Budget
-from mkpc_kaggle.engine.pools.cluster import RayCluster
+from mkpc_kaggle.engine.cluster import RayCluster
 from mkpc_kaggle.engine.session import Session, interruptible, run_pairs
 
-home = Path(sys.argv[1])
-pairs = write_pairs(home / "pairs", 200)
-assembly = assemble(THREE_UNITS, matchers={{"rectified": RectifiedMatcher(seconds=0.1)}}, device="cpu")
-
-def publish(records):
-    (home / "begun").touch()
-
-with interruptible() as interrupt:
-    session = Session(home / "work", Budget(time.monotonic()), interrupt, progress=False, workers=RayCluster())
-    report, _ = run_pairs(pairs, assembly, session, publish)
-print(report.ending)
+if __name__ == "__main__":
+    home = Path(sys.argv[1])
+    pairs = write_pairs(home / "pairs", 200)
+    matcher = MarkingMatcher(seconds=0.1, mark=home / "begun")
+    assembly = assemble(THREE_UNITS, matchers={{"rectified": matcher}}, device="cpu")
+    with interruptible() as interrupt:
+        session = Session(home / "work", Budget(time.monotonic()), interrupt, progress=False, workers=RayCluster())
+        report = run_pairs(pairs, assembly, session)
+    print(report.ending)
 """
 
 
-def processes_of(mark: str) -> list[str]:
-    """Processes that were started with that in their environment."""
+def at_work(mark: str) -> list[str]:
+    """Processes that were started with that in their environment.
+
+    Ray's agents, which take a minute or two to find that their node is gone, are left out.
+    """
     found = []
     for environment in Path("/proc").glob("[0-9]*/environ"):
         try:
@@ -230,33 +195,25 @@ def processes_of(mark: str) -> list[str]:
                 found.append((environment.parent / "cmdline").read_text().replace("\0", " ")[:80])
         except OSError:
             continue
-    return found
-
-
-def at_work(mark: str) -> list[str]:
-    """Those processes but for Ray's agents, which take a minute or two to find that their node is gone."""
-    return [line for line in processes_of(mark) if "Agent" not in line]
+    return [line for line in found if "Agent" not in line]
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
 def test_a_cluster_of_its_own_ends_with_the_run(tmp_path: Path, number: signal.Signals) -> None:
     mark = f"MKPC_TEST={tmp_path}"
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(IMPORTED), "MKPC_TEST": str(tmp_path)}
-    environment["RAY_ADDRESS"] = "local"
+    environment = {**os.environ, "MKPC_TEST": str(tmp_path), "RAY_ADDRESS": "local"}
+    environment["PYTHONPATH"] = os.pathsep.join([*IMPORTED, os.environ.get("PYTHONPATH", "")])
     running = subprocess.Popen(
         [sys.executable, "-c", LOCAL.format(path=IMPORTED), str(tmp_path)],
         env=environment,
         stdout=subprocess.PIPE,
         text=True,
     )
-    deadline = time.monotonic() + 60
-    while not any("WorkerActor" in line for line in processes_of(mark)) and time.monotonic() < deadline:
-        time.sleep(0.2)
-    time.sleep(2.0)
-    running.send_signal(number)
-    told, _ = running.communicate(timeout=60)
-    assert told == ("interrupted\n" if number is signal.SIGTERM else "")
-    deadline = time.monotonic() + 60
-    while at_work(mark) and time.monotonic() < deadline:
+    while not (tmp_path / "begun").exists():
+        assert running.poll() is None
         time.sleep(0.1)
-    assert at_work(mark) == []
+    running.send_signal(number)
+    told, _ = running.communicate()
+    assert told == ("interrupted\n" if number is signal.SIGTERM else "")
+    while at_work(mark):  # or the test's own limit
+        time.sleep(0.2)

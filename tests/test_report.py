@@ -92,10 +92,9 @@ def test_a_run_exports_tables_that_pandas_reads_as_they_are(
 
 
 def test_the_screen_names_matchers_that_were_left_out_once(tmp_path: Path) -> None:
-    empty_journal(tmp_path, [], left_out=("no weights: loma, roma",)).close()
-    assert "left out, no weights: loma, roma (get weights: python -m mkpc_kaggle weights fetch)" in overview(
-        read_log(tmp_path)
-    )
+    empty_journal(tmp_path, [], left_out=("no weights: loma, roma", "cannot be used here: dkm")).close()
+    screen = overview(read_log(tmp_path))
+    assert screen.count("left out, no weights: loma, roma; cannot be used here: dkm (`python -m") == 1
 
 
 @pytest.mark.parametrize("option", ["--csv", "--json", "--report"])

@@ -1,23 +1,36 @@
 """Scenes in whole runs: whose F a pair gets, and what a reconstruction that goes wrong costs."""
 
-import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
-import faulty
 import numpy as np
 import pytest
-from mkpc_kaggle.engine.pools import scene_process
-from mkpc_kaggle.engine.pools.pool import Pool
+from faulty import (
+    SCENE_F,
+    WatchedWorker,
+    choose_scene_for_all_but_the_first,
+    die_as_scene,
+    die_within_pycolmap,
+    exhaust_memory_as_scene,
+    exhaust_memory_within_pycolmap,
+    hang_as_scene,
+    patient,
+    raise_as_scene,
+    scene_in_a_gigabyte,
+    scene_without_pycolmap,
+    scenes_by,
+)
 from rectified import SWEEP, THREE_UNITS, RectifiedMatcher, run
 from synthetic import RECIPE as SYNTHETIC
 from synthetic import SyntheticMatcher, synthetic_pairs
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine.costs import Timeouts
-from mkpc_kaggle.engine.engine import Ending
-from mkpc_kaggle.engine.scenes import Reconstruction, SceneJob
+from mkpc_kaggle.engine.engine import Ending, RunReport
+from mkpc_kaggle.engine.jobs import SceneJob, SceneResult
+from mkpc_kaggle.engine.scenes import Scenes
+from mkpc_kaggle.engine.session import Interrupt
 from mkpc_kaggle.recipe import Recipe
 from mkpc_kaggle.reporting.report import report_page
 from mkpc_kaggle.reporting.run_log import read_log
@@ -27,7 +40,6 @@ from mkpc_kaggle.scene.config import SceneConfig
 from mkpc_kaggle.scene.view_graph import BatchPair
 
 RECIPE = replace(THREE_UNITS, scene=SceneConfig())
-SCENE_F = faulty.SCENE_F
 
 
 def batch_pairs(directory: Path, images: int = 4, batch: str = "one") -> list[Pair]:
@@ -40,139 +52,185 @@ def batch_pairs(directory: Path, images: int = 4, batch: str = "one") -> list[Pa
     return [Pair(f"{batch};{i}-{j}", batch, str(paths[i]), str(paths[j])) for i, j in chosen]
 
 
-def fault(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
-    monkeypatch.setattr(scene_process, "serve_scene", getattr(faulty, name))
+def two_batches(directory: Path) -> list[Pair]:
+    """Batch "one" of six pairs, and batch "two" of three."""
+    return batch_pairs(directory / "images") + batch_pairs(directory / "others", 3, "two")
+
+
+def own(report: RunReport) -> list[bytes]:
+    return [record.pair_fundamental.tobytes() for record in report.records]
 
 
 def own_matrices(pairs: list[Pair], directory: Path) -> list[bytes]:
-    report = run(pairs, THREE_UNITS, RectifiedMatcher(), directory)
-    return [record.pair_fundamental.tobytes() for record in report.records]
+    return own(run(pairs, THREE_UNITS, RectifiedMatcher(), directory))
 
 
 def test_pairs_get_the_f_of_their_scene_and_keep_their_own(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    fault(monkeypatch, "choose_scene_for_all_but_the_first")
+    scenes_by(monkeypatch, choose_scene_for_all_but_the_first, process=True)
     pairs, published = batch_pairs(tmp_path / "images"), []
     report = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work", publish=lambda r: published.append(list(r)))
     assert report.ending is Ending.COMPLETE
     assert [record.source for record in report.records] == ["pair"] + ["scene"] * 5
     assert all(np.array_equal(record.chosen_fundamental, SCENE_F) for record in report.records[1:])
-    assert [record.pair_fundamental.tobytes() for record in report.records] == own_matrices(
-        pairs, tmp_path / "alone"
-    )
+    assert own(report) == own_matrices(pairs, tmp_path / "alone")
     assert published[-1][0].scene.reason is Reason.CONTRADICTION
     log = read_log(tmp_path / "work")
-    assert "scenes: 1 of 1 batches reconstructed with 4 of 4 images; F of 5 of 6 pairs is from them" in overview(
-        log
-    )
-    page = report_page(log)
-    assert "both cameras are known" in page
+    told = "scenes: 1 of 1 batches reconstructed with 4 of 4 images; F of 5 of 6 pairs is from them"
+    assert told in overview(log)
+    assert "both cameras are known" in report_page(log)
     assert all(len(weak.results[0].matches) for weak in log.weakest), "what is drawn keeps its points"
 
 
 def test_a_run_that_goes_on_does_not_reconstruct_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    fault(monkeypatch, "choose_scene_for_all_but_the_first")
+    scenes_by(monkeypatch, choose_scene_for_all_but_the_first)
     pairs = batch_pairs(tmp_path / "images")
     first = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
-    fault(monkeypatch, "die_as_scene")
+    scenes_by(monkeypatch, raise_as_scene)
     again = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
     assert again.faults == ()
-    assert [r.chosen_fundamental.tobytes() for r in again.records] == [
-        r.chosen_fundamental.tobytes() for r in first.records
+    assert [record.chosen_fundamental.tobytes() for record in again.records] == [
+        record.chosen_fundamental.tobytes() for record in first.records
     ]
     assert again.scenes == first.scenes
 
 
-@pytest.mark.parametrize(
-    ("name", "reason"),
-    [("die_as_scene", "signal SIGKILL"), ("exhaust_memory_as_scene", "exit status 1"), ("raise_as_scene", "exit")],
-)
-def test_a_reconstruction_that_dies_costs_its_scene_alone(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, reason: str
-) -> None:
-    fault(monkeypatch, name)
-    pairs = batch_pairs(tmp_path / "images") + batch_pairs(tmp_path / "others", 3, "two")
-    report = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
-    assert report.ending is Ending.COMPLETE
-    assert [record.pair_fundamental.tobytes() for record in report.records] == own_matrices(
-        pairs, tmp_path / "alone"
-    )
-    assert all(record.source == "pair" for record in report.records)
-    assert [fault.partition(": its process ended: ")[0] for fault in report.faults] == [
-        f"batch {batch} was not reconstructed" for batch in ("one", "two")
-    ]
-    assert all(reason in scene.failure for scene in report.scenes)
-    assert len(report.scenes) == 2
-
-
-def test_a_reconstruction_that_hangs_ends_with_the_limit_and_every_row_is_there(
+def test_a_run_cut_off_before_a_scene_is_made_anew_makes_it_when_it_goes_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    fault(monkeypatch, "hang_as_scene")
+    scenes_by(monkeypatch, choose_scene_for_all_but_the_first)
+    few = [pair for pair in batch_pairs(tmp_path / "images") if pair.id in ("one;0-1", "one;1-2", "one;2-3")]
+    asked = few + batch_pairs(tmp_path / "others", 6, "two")  # further pairs of batch one come after these
+    recipe = replace(RECIPE, scene=SceneConfig(pairs_per_image=1.0))
+    undisturbed = run(asked, recipe, RectifiedMatcher(), tmp_path / "undisturbed")
+    job, interrupt, begun = Scenes.job, Interrupt(), []
+
+    def cut_off(scenes: Scenes, batch: str, results_of: Any) -> SceneJob:
+        begun.append(batch)
+        if begun.count("one") == 2:
+            interrupt.set()
+        return job(scenes, batch, results_of)
+
+    monkeypatch.setattr(Scenes, "job", cut_off)
+    cut = run(asked, recipe, RectifiedMatcher(), tmp_path / "work", interrupt=interrupt)
+    assert cut.scenes[0].points < undisturbed.scenes[0].points
+    monkeypatch.undo()
+    scenes_by(monkeypatch, choose_scene_for_all_but_the_first)
+    resumed = run(asked, recipe, RectifiedMatcher(), tmp_path / "work")
+    assert resumed.ending is Ending.COMPLETE
+    assert [scene.points for scene in resumed.scenes] == [scene.points for scene in undisturbed.scenes]
+
+
+@pytest.mark.parametrize(
+    ("make", "reason"),
+    [
+        (die_as_scene, "the worker died: signal SIGKILL"),
+        (raise_as_scene, "the worker failed: KeyError: 'image 7'"),
+        (exhaust_memory_as_scene, "out of memory: MemoryError: Unable to allocate 2.00 GiB"),
+    ],
+)
+def test_a_reconstruction_that_is_lost_costs_its_scene_alone_and_the_reason_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, make: Any, reason: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    scenes_by(monkeypatch, make, process=True)
     pairs = batch_pairs(tmp_path / "images")
-    started = time.monotonic()
-    report = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work", limit=8.0)
-    assert time.monotonic() - started < 8.0
-    assert [len(record.units) for record in report.records] == [3] * 6
-    assert all(record.source == "pair" for record in report.records)
+    report = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
+    assert report.ending is Ending.COMPLETE
+    assert own(report) == own_matrices(pairs, tmp_path / "alone")
+    assert [record.source for record in report.records] == ["pair"] * 6
+    assert [fault.startswith(f"batch one was not reconstructed: {reason}") for fault in report.faults] == [True]
+    assert report.scenes[0].failure.startswith(reason)
+    assert capfd.readouterr() == ("", "")
 
 
-def test_without_pycolmap_a_line_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    fault(monkeypatch, "scene_without_pycolmap")
+def test_a_scene_process_that_cannot_be_started_costs_its_scene_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def no_memory(_: Any) -> None:
+        raise OSError(12, "Cannot allocate memory")
+
+    monkeypatch.setattr("multiprocessing.context.SpawnProcess.start", no_memory)
     report = run(batch_pairs(tmp_path / "images"), RECIPE, RectifiedMatcher(), tmp_path / "work")
-    assert all(record.source == "pair" for record in report.records)
-    assert "pycolmap cannot be imported" in overview(read_log(tmp_path / "work"))
+    assert report.ending is Ending.COMPLETE
+    assert "the worker could not be started: [Errno 12] Cannot allocate memory" in report.faults[0]
+
+
+def hang_as_scene_of_batch_one(job: SceneJob) -> SceneResult:
+    return hang_as_scene(job) if job.batch == "one" else choose_scene_for_all_but_the_first(job)
 
 
 def test_a_reconstruction_that_hangs_costs_its_scene_and_the_next_batch_has_its_turn(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    fault(monkeypatch, "hang_as_scene_of_batch_one")
-    pairs = batch_pairs(tmp_path / "images") + batch_pairs(tmp_path / "others", 3, "two")
-    quick = Timeouts(floor=4.0, factor=2.0)
-    report = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work", timeouts=quick)
+    class Hanging(WatchedWorker):
+        def is_stuck(self) -> bool:
+            mark = tmp_path / "hangs"
+            return mark.exists() and mark.read_text() == str(self._process and self._process.pid)
+
+    monkeypatch.setenv("MKPC_TEST_HOME", str(tmp_path))
+    budget = patient(monkeypatch, Hanging)
+    scenes_by(monkeypatch, hang_as_scene_of_batch_one, process=True)
+    pairs = two_batches(tmp_path)
+    report = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work", budget=budget)
+    assert report.ending is Ending.COMPLETE
     assert [record.source for record in report.records] == ["pair"] * 7 + ["scene"] * 2
-    assert [fault[:50] for fault in report.faults] == ["batch one was not reconstructed: it hung: no answe"]
+    assert [fault[:48] for fault in report.faults] == ["batch one was not reconstructed: the worker hung"]
 
 
-def test_a_run_reconstructs_the_true_cameras(tmp_path: Path) -> None:
+def test_a_reconstruction_that_hangs_ends_with_the_limit_and_every_row_is_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MKPC_TEST_HOME", str(tmp_path))
+    scenes_by(monkeypatch, hang_as_scene, process=True)
+    report = run(batch_pairs(tmp_path / "images"), RECIPE, RectifiedMatcher(), tmp_path / "work", limit=10.0)
+    assert report.ending in (Ending.COMPLETE, Ending.TIME_IS_UP)
+    assert [record.source for record in report.records] == ["pair"] * 6
+
+
+def test_without_pycolmap_a_line_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    scenes_by(monkeypatch, scene_without_pycolmap, process=True)
+    report = run(batch_pairs(tmp_path / "images"), RECIPE, RectifiedMatcher(), tmp_path / "work")
+    assert all(record.source == "pair" for record in report.records)
+    assert "pycolmap" in overview(read_log(tmp_path / "work"))
+
+
+def test_a_run_reconstructs_the_true_cameras_and_a_gigabyte_is_enough(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scenes_by(monkeypatch, scene_in_a_gigabyte, process=True)
     matcher = SyntheticMatcher()
     report = run(synthetic_pairs(tmp_path / "images"), SYNTHETIC, matcher, tmp_path / "work")
+    assert report.faults == ()
     assert [record.source for record in report.records] == ["scene"] * 15
     pairs = zip(report.records, matcher.scene.pairs, strict=True)
     assert max(matcher.scene.median_distance(record.chosen_fundamental, pair) for record, pair in pairs) < 0.5
 
 
-def test_memory_that_ends_within_pycolmap_costs_the_scene_alone(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("make", [exhaust_memory_within_pycolmap, die_within_pycolmap])
+def test_what_happens_within_pycolmap_costs_the_scene_alone_and_leaves_no_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, make: Any
 ) -> None:
-    fault(monkeypatch, "exhaust_memory_within_pycolmap")
-    report = run(synthetic_pairs(tmp_path / "images"), SYNTHETIC, SyntheticMatcher(), tmp_path / "work")
+    (tmp_path / "temporary").mkdir()
+    monkeypatch.setenv("TMPDIR", str(tmp_path / "temporary"))
+    scenes_by(monkeypatch, make, process=True)
+    report = run(synthetic_pairs(tmp_path / "images", 4), SYNTHETIC, SyntheticMatcher(images=4), tmp_path / "work")
     assert report.ending is Ending.COMPLETE
-    assert [record.source for record in report.records] == ["pair"] * 15
+    assert [record.source for record in report.records] == ["pair"] * 6
     assert report.scenes[0].failure
-
-
-def test_a_gigabyte_is_enough_for_a_small_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    fault(monkeypatch, "scene_in_a_gigabyte")
-    report = run(synthetic_pairs(tmp_path / "images"), SYNTHETIC, SyntheticMatcher(), tmp_path / "work")
-    assert report.ending is Ending.COMPLETE
-    assert report.faults == ()
-    assert [record.source for record in report.records] == ["scene"] * 15
+    assert list((tmp_path / "temporary").iterdir()) == []
 
 
 def test_the_scene_of_a_run_is_made_of_tracks_and_judged_by_all_matches(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     given: list[BatchPair] = []
-    made = Pool.reconstruct
 
-    def note(pool: Pool, job: SceneJob) -> Reconstruction:
+    def note(job: SceneJob) -> SceneResult:
         given.extend(job.pairs)
-        return made(pool, job)
+        return choose_scene_for_all_but_the_first(job)
 
-    monkeypatch.setattr(Pool, "reconstruct", note)
+    scenes_by(monkeypatch, note)
     first, *others = THREE_UNITS.units
     recipe = replace(RECIPE, units=(replace(first, tracks=False), *others))
     run(batch_pairs(tmp_path / "images"), recipe, RectifiedMatcher(), tmp_path / "work")
@@ -181,24 +239,22 @@ def test_the_scene_of_a_run_is_made_of_tracks_and_judged_by_all_matches(
 
 
 def test_a_recipe_without_scenes_starts_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    fault(monkeypatch, "die_as_scene")
+    scenes_by(monkeypatch, raise_as_scene)
     report = run(batch_pairs(tmp_path / "images"), Recipe((SWEEP,)), RectifiedMatcher(), tmp_path / "work")
     assert report.scenes == ()
     assert report.faults == ()
 
 
 def test_an_image_replaced_after_the_run_drops_the_scene_and_its_batch_alone(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    fault(monkeypatch, "choose_scene_for_all_but_the_first")
-    pairs = batch_pairs(tmp_path / "images") + batch_pairs(tmp_path / "others", 3, "two")
+    scenes_by(monkeypatch, choose_scene_for_all_but_the_first)
+    pairs = two_batches(tmp_path)
     run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
     cv2.imwrite(str(pairs[0].image0), np.full((72, 80, 3), 200, np.uint8))
-    fault(monkeypatch, "die_as_scene")
-    with pytest.warns(UserWarning, match="6 pairs are matched anew"):
-        again = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
+    scenes_by(monkeypatch, raise_as_scene)
+    again = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
+    assert "6 pairs are matched anew" in capsys.readouterr().err
     assert [record.source for record in again.records] == ["pair"] * 6 + ["pair", "scene", "scene"]
     assert {scene.batch: bool(scene.failure) for scene in again.scenes} == {"one": True, "two": False}
-    assert [record.pair_fundamental.tobytes() for record in again.records] == own_matrices(
-        pairs, tmp_path / "alone"
-    )
+    assert own(again) == own_matrices(pairs, tmp_path / "alone")

@@ -117,7 +117,14 @@ def test_a_commit_run_without_network_leaves_a_submission_and_shows_pairs(
     mounted = tmp_path / "mounted"
     kaggle.dataset.rename(mounted)
     kaggle.dataset.symlink_to(mounted)
+    other = kaggle.root / "input" / "datasets" / "zz" / "older"
+    other.mkdir(parents=True)
+    (other / "mkpc_kaggle-0.0.9-py3-none-any.whl").touch()
     printed = kaggle.run()
+    assert f"not taken    {other} (version 0.0.9)" in printed
+    assert "left out, no weights: loma, superglue, loftr" in printed
+    before, _, _ = printed.partition("sweep: ")
+    assert len(before.splitlines()) <= 45 - 24, "one screen, were there all 27 weights"
     assert kaggle.problems() == []
     assert "good: 3 rows" in printed
     assert "recipe auto" in printed
@@ -147,9 +154,50 @@ def test_the_notebook_stops_where_a_packaged_weight_did_not_arrive(
     kaggle.add_test_side(demo.test_dir, pairs=3)
     kaggle.add_dataset(tmp_path / "package", (WEIGHTS,))
     (kaggle.dataset / "aliked-n16.safetensors").unlink()
-    with pytest.raises(AssertionError, match="not all weights of the dataset arrived"):
+    with pytest.raises(AssertionError, match="weights of the dataset are missing or damaged"):
         kaggle.run()
     assert "missing" in printed(nbformat.read(kaggle.executed, as_version=4))
+
+
+@needs_namespaces
+def test_a_failed_run_fails_the_notebook_after_its_figures_but_not_the_hidden_rerun(
+    kaggle: Kaggle, demo: DemoSet, tmp_path: Path
+) -> None:
+    kaggle.add_test_side(demo.test_dir, pairs=3)
+    (kaggle.test_dir / "test_images").unlink()
+    for path in (demo.test_dir / "test_images").rglob("*.png"):
+        broken = kaggle.test_dir / path.relative_to(demo.test_dir)
+        broken.parent.mkdir(parents=True, exist_ok=True)
+        broken.write_bytes(b"no picture")
+    kaggle.add_dataset(tmp_path / "package")
+    with pytest.raises(AssertionError, match=r"THE RUN FAILED \(exit status 1\)"):
+        kaggle.run()
+    assert kaggle.figures() >= 1
+    assert "THE RUN FAILED" in kaggle.run(KAGGLE_IS_COMPETITION_RERUN="1")
+    assert kaggle.figures() == 0
+    assert kaggle.problems() == []
+
+
+@needs_namespaces
+@pytest.mark.parametrize("is_missing", [True, False])
+def test_what_pip_says_is_told_and_the_advice_only_where_no_wheel_fits(
+    kaggle: Kaggle, demo: DemoSet, tmp_path: Path, is_missing: bool
+) -> None:
+    kaggle.add_test_side(demo.test_dir, pairs=3)
+    kaggle.add_dataset(tmp_path / "package")
+    kaggle.image = make_image(tmp_path / "image")  # other tests have installed into the shared one
+    (wheel,) = kaggle.dataset.glob("pycolmap-*.whl")
+    if is_missing:
+        wheel.rename(wheel.with_name("pycolmap-4.2.1-cp27-cp27m-manylinux_2_28_x86_64.whl"))
+    else:
+        wheel.write_bytes(b"cut off")
+    with pytest.raises(AssertionError) as stopped:
+        kaggle.run()
+    assert "ERROR: " in str(stopped.value)
+    advice = (
+        f"no wheel of pycolmap is for Python {python_version()}: package again with --python {python_version()}"
+    )
+    assert (advice in str(stopped.value)) == is_missing
 
 
 @needs_namespaces
@@ -159,7 +207,7 @@ def test_the_notebook_stops_where_a_packaged_weight_did_not_arrive(
 def test_the_hidden_rerun_uses_the_weights_and_the_time_and_shows_nothing(kaggle: Kaggle, tmp_path: Path) -> None:
     kaggle.add_test_side(DATA / "test")
     kaggle.add_dataset(tmp_path / "package", (WEIGHTS,))
-    kaggle.set("TIME_LIMIT = 8.75 * 3600", "TIME_LIMIT = 90")
+    kaggle.set("TIME_LIMIT_HOURS = 8.75", "TIME_LIMIT_HOURS = 0.025")
     printed = kaggle.run(KAGGLE_IS_COMPETITION_RERUN="1")
     assert kaggle.problems() == []
     assert "good: 29 rows" in printed

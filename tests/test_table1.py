@@ -48,7 +48,7 @@ def test_it_gives_what_the_engine_gives_and_goes_on_where_it_was(
     way = next(way for way in small if way.name == "sift: one + two")
     recipe = assemble(union([way]))
     session = Session(tmp_path / "work", Budget(0.0), Interrupt(), progress=False)
-    validation, _ = validate([scene], recipe, session)
+    validation = validate([scene], recipe, session)
     for score in validation.scenes[0].pairs:
         assert score.record is not None
         found = results.found[score.id][way.name]

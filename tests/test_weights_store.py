@@ -1,7 +1,6 @@
 """Where weight files are searched, and that they are what they should be."""
 
 import os
-import warnings
 from pathlib import Path
 from zipfile import ZipFile
 
@@ -127,8 +126,7 @@ def test_an_unpacked_checkpoint_is_found_and_read(tmp_path: Path, outer: str) ->
     found = weights.find("slot")
     assert found is not None
     assert (found.state, found.path) == (State.UNVERIFIED, tmp_path / "input" / "someones" / outer / "x")
-    with pytest.warns(UserWarning, match=r"x is not verified: this checkpoint was unpacked"):
-        loaded = weights.load("slot")
+    loaded = weights.load("slot")
     assert loaded.keys() == tensors.keys()
     assert all(torch.equal(loaded[name], tensor) for name, tensor in tensors.items())
     assert [file.state for file in weights.verify()] == [State.UNVERIFIED]
@@ -220,21 +218,6 @@ def test_a_manifest_that_cannot_be_read_is_passed_over(tmp_path: Path, kind: str
         path.write_bytes(b"no manifest" if kind == "garbage" else b"#" * (1 << 21))
     with pytest.warns(UserWarning, match=r"passed over: .*weights_manifest\.txt"):
         assert WeightStore([tmp_path]).files
-
-
-def test_an_unverified_file_warns_when_it_is_loaded_once_in_a_process(tmp_path: Path) -> None:
-    torch.save({"a": torch.zeros(1)}, tmp_path / "a.pt")
-    digest = digest_of((tmp_path / "a.pt").read_bytes())
-    file = line("a.pt", size=-1, digest=UNVERIFIED)
-    with pytest.warns(UserWarning, match=rf"a\.pt is not verified.*{digest}"):
-        WeightStore([tmp_path], [file]).load("slot")
-    with warnings.catch_warnings(record=True) as more:
-        warnings.simplefilter("always")
-        WeightStore([tmp_path], [file]).load("slot")
-    assert more == []
-
-
-# verifying all
 
 
 def test_verify_tells_good_truncated_swapped_renamed_and_unverified_files_apart(tmp_path: Path) -> None:

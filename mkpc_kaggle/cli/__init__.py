@@ -21,21 +21,7 @@ EXIT_BAD_INPUT = 2
 EXIT_BROKEN_PIPE = 128 + 13  # a shell's status for SIGPIPE, which Windows lacks
 EXIT_INTERRUPTED = 128 + signal.SIGINT
 
-_DESCRIPTION = """\
-Two-stage image matching with Matching Key-Points Crop, offline, inside a time budget.
-
-  submit    a test directory -> submission.csv
-  match     two images -> F, counts, a figure
-  validate  a directory with known poses -> mAA and pose AUC of a recipe
-  recipes   the recipes, their units, and the weights that each lacks
-  weights   the weight files: list, verify, locate, fetch, convert
-  check     is this submission.csv what the competition takes?
-  journal   what a run did: overview, tables for pandas, report.html
-  package   the folders that you upload to Kaggle
-  demo      render a small test set with known poses
-
-COMMAND --help tells more.
-"""
+_DESCRIPTION = "Two-stage image matching with Matching Key-Points Crop, offline, inside a time budget."
 
 
 def program(arguments: Sequence[str] | None = None) -> NoReturn:
@@ -74,9 +60,7 @@ def main(arguments: Sequence[str] | None = None, *, started: float | None = None
 
 def make_parser() -> argparse.ArgumentParser:
     """The parser of all commands."""
-    parser = argparse.ArgumentParser(
-        "mkpc_kaggle", description=_DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser("mkpc_kaggle", description=_DESCRIPTION, epilog="COMMAND --help tells more.")
     parser.add_argument("--version", action="version", version=__version__)
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name in COMMANDS:

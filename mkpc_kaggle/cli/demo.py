@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 
 HELP = """\
-Render scenes with known cameras, textured with scikit-learn's sample photographs, in the competition's layout:
+Render scenes of stone walls and painted boxes with known cameras, in the competition's layout:
 DIR/train with poses, DIR/test without, DIR/test_truth.csv to score a submission for the test side:
 
   python -m mkpc_kaggle demo --out demo

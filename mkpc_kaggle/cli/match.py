@@ -19,12 +19,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
+    from mkpc_kaggle.data.outputs import require_apart
     from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher, to_image
     from mkpc_kaggle.reporting.figures.pair import draw_pair
     from mkpc_kaggle.reporting.figures.style import save
 
     inputs = [arguments.image0, arguments.image1, Path(arguments.recipe)]
-    options.require_apart({"--out": arguments.out}, None, inputs, arguments.weights)
+    require_apart({"--out": arguments.out}, inputs, weights=arguments.weights)
     images = to_image(arguments.image0), to_image(arguments.image1)
     matcher = TwoStageMatcher(
         arguments.recipe,

@@ -14,56 +14,52 @@ version is better. Killed at any point, the same command goes on where it was (i
 directory). Ctrl-C and SIGTERM end the run early with a valid file.
 
 Exit status: 0 done, or the time was up; 1 the run failed (no worker was left, or errors left most pairs without
-an F), or the last version of the file could not be written (a full disk, say, or a limit too short for the table):
-an earlier version, if there was time for it, is whole; 2 bad input; 130 or 143 ended by a signal (the file is
-whole).
+an F), or the last version of the file could not be written: an earlier version is whole; 2 bad input; 130 or 143
+ended by a signal (the file is whole).
 """
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--test-dir",
-        type=Path,
-        required=True,
-        metavar="DIR",
-        help="holds test.csv and test_images/; or test_images",
-    )
-    parser.add_argument("--output", type=Path, default=Path("submission.csv"), help="default: submission.csv")
+    add = parser.add_argument
+    add("--test-dir", type=Path, required=True, metavar="DIR", help="holds test.csv and test_images/")
+    add("--output", type=Path, default=Path("submission.csv"), help="default: submission.csv")
     options.add_matching(parser)
-    options.add_mode(parser)
-    options.add_scenes(parser)
-    options.add_time_limit(parser, default="8h45m")
-    options.add_engine(parser)
-    parser.add_argument(
-        "--work-dir", type=Path, metavar="DIR", help="for the journal; default: beside the output, NAME.work"
+    add(
+        "--scenes",
+        dest="reconstruct",
+        action=argparse.BooleanOptionalAction,
+        help="reconstruct the pairs of a batch together and take F from the cameras, or not (default: as the "
+        "recipe has it; the paper's recipes have not). A pair's F then comes from other pairs, too: read your "
+        "competition's rules on that, and compare published stereo scores with --no-scenes",
     )
-    parser.add_argument(
-        "--fresh", action="store_true", help="forget what an earlier run left in the work directory"
-    )
-    parser.add_argument(
+    options.add_run(parser, time_limit="8h45m")
+    add("--work-dir", type=Path, metavar="DIR", help="for the journal; default: beside the output, NAME.work")
+    add("--fresh", action="store_true", help="forget what an earlier run left in the work directory")
+    add(
         "--report", type=Path, metavar="FILE.html", help="a page on the run; default: beside the output, NAME.html"
     )
-    parser.add_argument("--no-report", action="store_true", help="write none")
+    add("--no-report", action="store_true", help="write none")
 
 
 def run(arguments: argparse.Namespace) -> int:
     from mkpc_kaggle.data.competition import read_test_side, test_side
+    from mkpc_kaggle.data.outputs import require_apart
     from mkpc_kaggle.engine.session import Session, Watchdog, interruptible, submit
     from mkpc_kaggle.recipe import Choice, Mode
     from mkpc_kaggle.reporting.report import report_run
-    from mkpc_kaggle.reporting.summary import summary, trouble
+    from mkpc_kaggle.reporting.summary import left_out_line, summary, trouble
 
     output: Path = arguments.output
     work_dir: Path = arguments.work_dir or output.parent / f"{output.stem}.work"
     page: Path = arguments.report or output.parent / f"{output.stem}.html"
     files = {"--output": output, "--report": None if arguments.no_report else page}
-    inputs = [*test_side(arguments.test_dir), Path(arguments.recipe)]
-    options.require_apart(files, work_dir, inputs, arguments.weights)
+    require_apart(files, [*test_side(arguments.test_dir), Path(arguments.recipe)], work_dir, arguments.weights)
     budget = options.budget_of(arguments)
     with interruptible() as interrupt, Watchdog(budget, interrupt) as watchdog:
         pairs = read_test_side(arguments.test_dir)
         assembly = options.assembly_of(arguments, Choice(arguments.recipe, Mode(arguments.mode)))
-        say(f"{len(pairs)} pairs, recipe {assembly.recipe.name}, {assembly.placement}, journal in {work_dir}")
+        header = f"{len(pairs)} pairs, recipe {assembly.recipe.name}, {assembly.placement}, journal in {work_dir}"
+        say("\n".join(filter(None, [header, left_out_line(assembly.left_out)])))
         session = Session(
             work_dir, budget, interrupt, arguments.fresh, workers=arguments.workers, watchdog=watchdog
         )
@@ -71,7 +67,7 @@ def run(arguments: argparse.Namespace) -> int:
         watchdog.status = int(bool(report.unwritten or trouble(report)))
         explained = ["plan:", *map(str, report.explanations)] if arguments.explain else []
         unwritten = f" is not the last version: {report.unwritten}" if report.unwritten else ""
-        told = [*explained, summary(pairs, report, assembly.left_out), f"submission: {output}{unwritten}"]
+        told = [*explained, summary(pairs, report), f"submission: {output}{unwritten}"]
         say("\n".join(told))  # the watchdog may end the program while it draws
         if not arguments.no_report:
             say(report_run(work_dir, page, session.must_end(), pairs))

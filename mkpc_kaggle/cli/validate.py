@@ -3,7 +3,7 @@
 import argparse
 import json
 import tempfile
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,8 +12,8 @@ from mkpc_kaggle.engine.console import say
 from mkpc_kaggle.errors import UserError, writing
 
 if TYPE_CHECKING:
-    from mkpc_kaggle.data.competition import TrainScene
-    from mkpc_kaggle.engine.session import Interrupt
+    from mkpc_kaggle.data.competition import Pair, TrainScene
+    from mkpc_kaggle.engine.session import Session
     from mkpc_kaggle.evaluation.validate import Validation
     from mkpc_kaggle.pipeline.assembly import Assembly
     from mkpc_kaggle.recipe import Choice, Recipe
@@ -35,66 +35,52 @@ With --submission and --truth nothing is matched: the files are scored.
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
     source = parser.add_mutually_exclusive_group(required=True)
     source.add_argument("--train-dir", type=Path, metavar="DIR")
     source.add_argument("--pairs", type=Path, metavar="FILE", help="a list of pairs with K and poses")
-    parser.add_argument("--image-root", type=Path, metavar="DIR", help="where the images of --pairs lie")
-    parser.add_argument("--scenes", default="", metavar="A,B", help="of --train-dir; default: all")
-    parser.add_argument(
-        "--pairs-per-scene", type=options.at_least_1, metavar="N", help="evenly spread; default: all"
-    )
-    parser.add_argument(
-        "--min-covisibility", type=float, default=0.1, help="of --train-dir; default: 0.1, as in the competition"
-    )
+    add("--image-root", type=Path, metavar="DIR", help="where the images of --pairs lie")
+    add("--scenes", default="", metavar="A,B", help="of --train-dir; default: all")
+    add("--pairs-per-scene", type=int, metavar="N", help="evenly spread; default: all")
+    add("--min-covisibility", type=float, default=0.1, help="of --train-dir; default: 0.1, as in the competition")
     options.add_matching(parser)
-    options.add_mode(parser)
-    options.add_no_scenes(parser)
-    parser.add_argument(
-        "--units",
-        metavar="A,B",
-        help="only these of the recipe's units, in this order, such as 1:sift@1536; default: all",
+    add(
+        "--no-scenes",
+        dest="reconstruct",
+        action="store_const",
+        const=False,
+        help="F from each pair's own matches alone, whatever the recipe has",
     )
-    parser.add_argument(
+    add("--units", metavar="A,B", help="only these, in this order, such as 1:sift@1536; default: the recipe's")
+    add(
         "--compare",
         nargs="+",
         metavar="RECIPE[:MODE]",
         help="run these instead of --recipe and --mode, and give the gain of each over the first with its 95 %% "
         "interval; such as classical:whole-images classical",
     )
-    parser.add_argument(
-        "--estimate", choices=["E", "F"], default="E", help="what to estimate on --pairs (default: E)"
-    )
-    parser.add_argument("--method", choices=["magsac", "ransac"], help="default: the recipe's")
-    parser.add_argument(
-        "--threshold", type=float, metavar="PIXELS", help="of the method; for E divided by the mean focal length"
-    )
-    options.add_time_limit(parser, default=None)
-    options.add_engine(parser)
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write all figures, per pair too")
-    parser.add_argument(
+    add("--method", choices=["magsac", "ransac"], help="default: the recipe's")
+    add("--threshold", type=float, metavar="PIXELS", help="of the method; for E divided by the mean focal length")
+    options.add_run(parser, time_limit=None)
+    add("--json", type=Path, metavar="FILE", help="write all figures, per pair too")
+    add(
         "--work-dir",
         type=Path,
         metavar="DIR",
         help="keep the journal there (with --compare, a journal for each recipe) and go on from it; report.html "
         "beside it shows the run (not with --pairs); default: a temporary directory",
     )
-    parser.add_argument(
-        "--submission",
-        action="append",
-        type=Path,
-        metavar="CSV",
-        help="score it and match nothing; may be repeated",
-    )
-    parser.add_argument(
-        "--truth", type=Path, metavar="CSV", help="which pairs its samples are (`demo` writes such a table)"
-    )
+    add("--submission", action="append", type=Path, metavar="CSV", help="score it, match nothing; may be repeated")
+    add("--truth", type=Path, metavar="CSV", help="which pairs its samples are (`demo` writes such a table)")
 
 
 def run(arguments: argparse.Namespace) -> int:
+    from mkpc_kaggle.data.outputs import require_apart
+
     _require_a_whole(arguments)
     sides = [arguments.train_dir, arguments.image_root]
     inputs = [*sides, arguments.pairs, arguments.truth, *(arguments.submission or ())]
-    options.require_apart({"--json": arguments.json}, arguments.work_dir, [path for path in inputs if path])
+    require_apart({"--json": arguments.json}, filter(None, inputs), arguments.work_dir)
     with tempfile.TemporaryDirectory(prefix="mkpc-") as temporary:
         work_dir = arguments.work_dir or Path(temporary)
         scenes = _read_scenes(arguments, work_dir)
@@ -103,32 +89,35 @@ def run(arguments: argparse.Namespace) -> int:
         return _match_and_score(arguments, scenes, work_dir)
 
 
-def _require_a_whole(arguments: argparse.Namespace) -> None:
+def _require_a_whole(given: argparse.Namespace) -> None:
     """Raise :class:`UserError` for options that do not go together."""
-    if (arguments.submission is None) != (arguments.truth is None):
-        raise UserError("--submission and --truth go together")
-    if (arguments.pairs is None) != (arguments.image_root is None):
-        raise UserError("--pairs and --image-root go together")
-    if arguments.pairs is not None and (arguments.submission or arguments.compare):
-        raise UserError("--submission and --compare need a --train-dir: they score in metres, which --pairs lacks")
-    if arguments.compare is not None and arguments.units is not None:
-        raise UserError("--units chooses from one recipe; --compare takes recipes as they are")
-    if arguments.compare is not None and len(arguments.compare) < 2:
-        raise UserError(f"--compare needs two recipes or more, not only {arguments.compare[0]}")
+    for is_wrong, told in (
+        ((given.submission is None) != (given.truth is None), "--submission and --truth go together"),
+        ((given.pairs is None) != (given.image_root is None), "--pairs and --image-root go together"),
+        (
+            given.pairs is not None and (given.submission or given.compare),
+            "--submission and --compare need a --train-dir: they score in metres, which --pairs lacks",
+        ),
+        (given.compare and given.units, "--units chooses from one recipe; --compare takes recipes as they are"),
+        (given.compare and len(given.compare) < 2, "--compare needs two recipes or more"),
+        (given.pairs_per_scene is not None and given.pairs_per_scene < 1, "--pairs-per-scene: give 1 or more"),
+    ):
+        if is_wrong:
+            raise UserError(told)
 
 
 def _read_scenes(arguments: argparse.Namespace, work_dir: Path) -> "tuple[TrainScene, ...]":
     from mkpc_kaggle.data.competition import read_train_side
     from mkpc_kaggle.data.pairs import read_pairs
 
+    most: int | None = arguments.pairs_per_scene
     if arguments.pairs is not None:
-        copies, most = work_dir / "turned", arguments.pairs_per_scene
-        return (read_pairs(arguments.pairs, arguments.image_root, arguments.estimate, copies=copies, most=most),)
+        return (read_pairs(arguments.pairs, arguments.image_root, copies=work_dir / "turned", most=most),)
     return read_train_side(
         arguments.train_dir,
         scenes=filter(None, arguments.scenes.split(",")),
         min_covisibility=arguments.min_covisibility,
-        pairs_per_scene=arguments.pairs_per_scene,
+        pairs_per_scene=most,
     )
 
 
@@ -143,23 +132,25 @@ def _score_submissions(arguments: argparse.Namespace, scenes: "tuple[TrainScene,
 def _match_and_score(arguments: argparse.Namespace, scenes: "tuple[TrainScene, ...]", work_dir: Path) -> int:
     """Run a recipe, or several to compare, each then with a journal in a directory of its own."""
     from mkpc_kaggle.engine.engine import Ending
-    from mkpc_kaggle.engine.session import interruptible
+    from mkpc_kaggle.engine.session import Session, interruptible
     from mkpc_kaggle.evaluation.compare import Comparison, comparison_json, comparison_table
-    from mkpc_kaggle.evaluation.validate import to_json
+    from mkpc_kaggle.evaluation.validate import to_json, validate
     from mkpc_kaggle.recipe import Choice, Mode
-    from mkpc_kaggle.reporting.summary import trouble
+    from mkpc_kaggle.reporting.summary import left_out_line, trouble
 
-    compared = arguments.compare is not None
-    choices = [Choice.parse(text) for text in arguments.compare or ()]
-    choices = choices or [Choice(arguments.recipe, Mode(arguments.mode))]
+    compared = [Choice.parse(text) for text in arguments.compare or ()]
+    choices = compared or [Choice(arguments.recipe, Mode(arguments.mode))]
+    pairs = [true.pair for scene in scenes for true in scene.pairs]
     validations = []
     with interruptible() as interrupt:
         assemblies = [_assemble(arguments, choice) for choice in choices]
         for choice, assembly in zip(choices, assemblies, strict=True):
             place = work_dir / choice.folder if compared else work_dir
-            validation = _validate(arguments, scenes, assembly, place, interrupt)
+            session = Session(place, options.budget_of(arguments), interrupt, workers=arguments.workers)
+            validation = validate(scenes, assembly, session)
             validations.append(validation)
             assert validation.report is not None
+            _tell(arguments, pairs, left_out_line(assembly.left_out), session, validation)
             status = 128 + interrupt.signal if interrupt.signal else int(bool(trouble(validation.report)))
             if compared and validation.report.ending != Ending.COMPLETE:
                 say("nothing is compared before all is done; with a --work-dir, the same command goes on")
@@ -175,41 +166,36 @@ def _match_and_score(arguments: argparse.Namespace, scenes: "tuple[TrainScene, .
     return status
 
 
-def _validate(
-    arguments: argparse.Namespace,
-    scenes: "tuple[TrainScene, ...]",
-    assembly: "Assembly",
-    work_dir: Path,
-    interrupt: "Interrupt",
-) -> "Validation":
-    """Run a recipe and print its summary and its scores."""
-    from mkpc_kaggle.engine.session import Session
+def _tell(
+    arguments: argparse.Namespace, pairs: "list[Pair]", left_out: str, session: "Session", validation: "Validation"
+) -> None:
+    """Print the run's summary and its scores."""
     from mkpc_kaggle.evaluation.compare import step_gains
-    from mkpc_kaggle.evaluation.validate import score_table, validate
+    from mkpc_kaggle.evaluation.validate import score_table
     from mkpc_kaggle.reporting.report import report_run
     from mkpc_kaggle.reporting.summary import summary
 
-    session = Session(work_dir, options.budget_of(arguments), interrupt, workers=arguments.workers)
-    validation = validate(scenes, assembly, session)
-    pairs = [true.pair for scene in scenes for true in scene.pairs]
     assert validation.report is not None
-    explained = ["plan:", *map(str, validation.report.explanations)] if arguments.explain else []
-    told = [*explained, summary(pairs, validation.report, assembly.left_out), "", f"recipe {validation.recipe}"]
+    told = [left_out] if left_out else []
+    told += ["plan:", *map(str, validation.report.explanations)] if arguments.explain else []
+    told += [summary(pairs, validation.report), "", f"recipe {validation.recipe}"]
     say("\n".join([*told, *score_table(validation), *step_gains(validation)]))
     # The report's inliers are of F: there is none for a list of pairs, whose E is estimated.
     if arguments.work_dir is not None and arguments.pairs is None:
-        say(report_run(work_dir, work_dir / "report.html", session.must_end(), pairs))
-    return validation
+        say(report_run(session.work_dir, session.work_dir / "report.html", session.must_end(), pairs))
 
 
 def _assemble(arguments: argparse.Namespace, choice: "Choice") -> "Assembly":
     """The parts of a run of a recipe, with the units and the robust method that the command names."""
+    from mkpc_kaggle.config import from_table
+    from mkpc_kaggle.geometry.robust import RobustConfig
+
     assembly = options.assembly_of(arguments, choice)
     recipe = with_units(assembly.recipe, arguments.units)
-    try:
-        return replace(assembly, recipe=recipe.with_magsac(arguments.method, arguments.threshold))
-    except ValueError as error:
-        raise UserError(f"--threshold: {error}") from error
+    given = {"method": arguments.method, "threshold": arguments.threshold}
+    changes = {key: value for key, value in given.items() if value is not None}
+    magsac = from_table(RobustConfig, asdict(recipe.magsac) | changes, "--method and --threshold")
+    return replace(assembly, recipe=replace(recipe, magsac=magsac))
 
 
 def with_units(recipe: "Recipe", wanted: str | None) -> "Recipe":

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mkpc_kaggle.cli import options
-from mkpc_kaggle.cli.tables import print_table
+from mkpc_kaggle.cli.options import print_table
 from mkpc_kaggle.errors import UserError
 
 if TYPE_CHECKING:
@@ -24,44 +24,36 @@ The files that the matchers load their weights from; none comes with the package
 Exit status: 0 done, 1 a file is not there, is wrong or could not be fetched, 2 bad input.
 ACTION --help tells more.
 """
-_LIST = """\
-A line for each slot of the manifest, which is what a matcher asks for: the licence of its weights, the matchers
-that use it, and the file, or the names of the files that would do. Matchers that cannot be imported come last."""
-_VERIFY = """\
-Compare every file found with the manifest: it is good (also under another name), unverified (the manifest has no
-digest for it, or Kaggle unpacked it into a directory) or refused, with the reason."""
-_LOCATE = "Print the path of the file that would be taken; exit status 1 if there is none."
 _FETCH = """\
-Download files. A file gets its name when its digest is right; an interrupted download is resumed. If no digest is
-published, a download is begun anew, and its digest is kept in DIR/weights_manifest.txt: the file must have it from
-then on. Each licence is printed first; check it."""
-_CONVERT = "Write a checkpoint's tensors as safetensors with the same names; print the manifest's line for it."
+Download files; an interrupted download is resumed. If no digest is published, that of the first download is kept
+in DIR/weights_manifest.txt and must be met from then on. Each licence is printed first; check it."""
+_VERIFY = """\
+Compare every file found with the manifest: it is good (also under another name), unverified (no digest is known,
+or Kaggle unpacked it into a directory) or refused, with the reason."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     actions = parser.add_subparsers(required=True, metavar="ACTION")
-    searching = argparse.ArgumentParser(add_help=False)
-    options.add_weights(searching)
-    actions.add_parser("list", parents=[searching], description=_LIST).set_defaults(act=_list)
-    verify = actions.add_parser("verify", parents=[searching], description=_VERIFY)
-    verify.add_argument("--manifest", type=Path, metavar="FILE", help="is every file of this manifest there?")
-    verify.set_defaults(act=_verify)
-
-    locate = actions.add_parser("locate", parents=[searching], description=_LOCATE)
-    locate.add_argument("name", metavar="NAME|SLOT", help="a file or a slot that `list` names")
-    locate.set_defaults(act=_locate)
-
-    fetch = actions.add_parser("fetch", description=_FETCH)
-    fetch.add_argument(
+    parsers = {}
+    for name, act, description in (
+        ("list", _list, "Each slot, which is what a matcher asks for: its licence, its matchers and its files."),
+        ("verify", _verify, _VERIFY),
+        ("locate", _locate, "Print the path of the file that would be taken; exit status 1 if there is none."),
+        ("fetch", _fetch, _FETCH),
+        ("convert", _convert, "Write a checkpoint's tensors as safetensors; print the manifest's line for it."),
+    ):
+        parsers[name] = actions.add_parser(name, description=description)
+        parsers[name].set_defaults(act=act)
+    for name in ("list", "verify", "locate"):
+        options.add_weights(parsers[name])
+    parsers["verify"].add_argument("--manifest", type=Path, metavar="FILE", help="is every file of it there?")
+    parsers["locate"].add_argument("name", metavar="NAME|SLOT", help="a file or a slot that `list` names")
+    parsers["fetch"].add_argument(
         "names", nargs="*", default=["auto"], metavar="NAME|SLOT|RECIPE", help="default: what recipe auto can use"
     )
-    fetch.add_argument("--out", type=Path, required=True, metavar="DIR", help="where the files go")
-    fetch.set_defaults(act=_fetch)
-
-    convert = actions.add_parser("convert", description=_CONVERT)
-    convert.add_argument("file", type=Path, metavar="FILE")
-    convert.add_argument("--out", type=Path, required=True, metavar="X.safetensors")
-    convert.set_defaults(act=_convert)
+    parsers["fetch"].add_argument("--out", type=Path, required=True, metavar="DIR", help="where the files go")
+    parsers["convert"].add_argument("file", type=Path, metavar="FILE")
+    parsers["convert"].add_argument("--out", type=Path, required=True, metavar="X.safetensors")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -94,52 +86,54 @@ def _list(arguments: argparse.Namespace) -> int:
 
 def _verify(arguments: argparse.Namespace) -> int:
     from mkpc_kaggle.weights import WeightStore
-
-    if arguments.manifest:
-        return _verify_manifest(arguments)
-    store = WeightStore(arguments.weights)
-    found = store.verify()
-    if not found:
-        print(f"no weight files found (searched {store.searched})")
-        return 0
-    rows = [(file.file.name, str(file.state), str(file.path), file.note) for file in found]
-    print_table([("file", "state", "path", "note"), *rows])
-    refused = sum(not file.usable for file in found)
-    print(f"{len(found)} files, {refused} refused")
-    return 1 if refused else 0
-
-
-def _verify_manifest(arguments: argparse.Namespace) -> int:
-    from mkpc_kaggle.weights import WeightStore
     from mkpc_kaggle.weights.manifest import read_manifest
 
-    store = WeightStore(arguments.weights, read_manifest(arguments.manifest))
-    rows, absent = [("file", "state", "path", "note")], 0
+    if arguments.manifest:
+        return _verify_manifest(
+            WeightStore(arguments.weights, read_manifest(arguments.manifest)), arguments.manifest
+        )
+    store = WeightStore(arguments.weights)
+    files = store.verify()
+    if not files:
+        print(f"no weight files found (searched {store.searched})")
+        return 0
+    rows = [(found.file.name, str(found.state), str(found.path), found.note) for found in files]
+    print_table([("file", "state", "path", "note"), *rows])
+    refused = sum(not found.usable for found in files)
+    print(f"{len(files)} files, {refused} refused")
+    return int(refused > 0)
+
+
+def _verify_manifest(store: "WeightStore", manifest: Path) -> int:
+    rows, absent = [("file", "bytes", "state", "note")], 0
     for file in store.files:
         search = store.search([file])
-        for found in (search.found,) if search.found else search.refused:
-            rows.append((file.name, str(found.state), str(found.path), found.note))
-        if not search.found and not search.refused:
-            rows.append((file.name, "missing", "", f"searched {store.searched}"))
         absent += search.found is None
-    print_table(rows)
-    print(f"{len(store.files)} files in {arguments.manifest}, {absent} of them not found or wrong")
-    return 1 if absent else 0
+        for found in (search.found,) if search.found else search.refused:
+            where = "" if found.path.parent == manifest.parent else f"{found.path} "
+            rows.append((file.name, str(file.size), str(found.state), where + found.note))
+        if not search.found and not search.refused:
+            rows.append((file.name, str(file.size), "missing", f"searched {store.searched}"))
+    if store.files:
+        print_table(rows)
+    print(f"{len(store.files)} files in {manifest}, {absent} of them not found or wrong")
+    return int(absent > 0)
 
 
 def _locate(arguments: argparse.Namespace) -> int:
     from mkpc_kaggle.weights import WeightStore
 
     store = WeightStore(arguments.weights)
-    searches = [store.search(lines) for lines in files_of(arguments.name, store)]
-    for search in searches:
+    status = 0
+    for search in (store.search(lines) for lines in files_of(arguments.name, store)):
         for refused in search.refused:
             print(f"refused: {refused.path}: {refused.note}", file=sys.stderr)
         if search.found:
             print(search.found.path)
         else:
             print(f"{arguments.name}: not found (searched {store.searched})", file=sys.stderr)
-    return 0 if all(search.found for search in searches) else 1
+            status = 1
+    return status
 
 
 def _fetch(arguments: argparse.Namespace) -> int:
@@ -163,7 +157,6 @@ def _fetch(arguments: argparse.Namespace) -> int:
 def _convert(arguments: argparse.Namespace) -> int:
     from mkpc_kaggle.weights.convert import convert
 
-    options.require_apart({"--out": arguments.out}, None, [arguments.file])
     print(convert(arguments.file, arguments.out).line)
     return 0
 

@@ -21,22 +21,43 @@ RESULTS = {
 _parts: set[Path] = set()  # files that this process is writing
 
 
-def require_no_input(outputs: Mapping[str, Path | None], inputs: Iterable[Path]) -> None:
-    """Refuse to overwrite an existing input file, by name or in a directory; a new file is fine, wherever it is.
+def require_apart(
+    outputs: Mapping[str, Path | None],
+    inputs: Iterable[Path],
+    work_dir: Path | None = None,
+    weights: Iterable[Path] = (),
+) -> None:
+    """Refuse outputs that would overwrite an existing input, or that are in each other's or the journal's way.
 
-    ``outputs`` are files to write, by option. ``--json`` and ``--report`` overwrite nothing but their own kind.
-    Raises :class:`UserError`.
+    ``outputs`` are files to write, by option; ``inputs`` and ``weights`` are files and directories, ``work_dir``
+    is the journal's. A new file is fine, wherever it is. ``--json`` and ``--report`` overwrite nothing but their
+    own kind. Raises :class:`UserError`.
     """
-    inputs = list(inputs)
-    for option, path in outputs.items():
-        if path is None or not os.path.lexists(path):
+    named = [Path(part) for part in os.environ.get("MKPC_WEIGHTS", "").split(os.pathsep) if part]
+    inputs, weights = list(inputs), [*weights, *named]
+    files = {option: path for option, path in outputs.items() if path is not None}
+    for option, path in files.items():
+        if not path.name or os.path.isdir(path):  # noqa: PTH112  Path raises for a name that is too long
+            raise UserError(f"{option} {str(path)!r} is a directory; name a file")
+        for other in (other for other in files if other != option and same_file(path, files[other])):
+            raise UserError(
+                f"{option} {path} and {other} {files[other]} are one file; name another for one of them"
+            )
+        if work_dir is not None and (
+            lies_in(work_dir, path) or (same_file(path.parent, work_dir) and path.name.startswith("journal."))
+        ):
+            raise UserError(f"{option} {path} and the work directory {work_dir} are in each other's way")
+        if not os.path.lexists(path):
             continue
         is_result = path.suffix.lower() in RESULTS.get(option, ())
-        for place in inputs:
+        for place in (*inputs, *weights):
             if same_file(path, place) or (lies_in(path, place) and not is_result):
                 raise UserError(f"{option} {path} would be written over the input {place}; name another file")
-        if option in ("--json", "--report") and not is_result and path.is_file():
+        if option in ("--json", "--report") and not is_result:
             raise UserError(f"{option} {path} exists and is not a {RESULTS[option][0]} file; name another file")
+    for place in inputs:
+        if work_dir is not None and lies_in(work_dir, place):
+            raise UserError(f"--work-dir {work_dir} would be written over the input {place}; name another place")
 
 
 def lies_in(path: Path, directory: Path) -> bool:

@@ -20,7 +20,6 @@ from mkpc_kaggle.data.images import Unreadable, read_image
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Size
-from mkpc_kaggle.geometry.robust import ModelKind
 
 FIELDS = 2 + 2 + 9 + 9 + 16
 EXPECTED = "name0 name1 turns0 turns1 K0 (9 numbers) K1 (9) T_0to1 (16)"
@@ -39,10 +38,8 @@ class ListedImage:
         return self.name + (f" turned {self.turns}" if self.turns else "")
 
 
-def read_pairs(
-    file: Path, image_root: Path, model: ModelKind | str, *, copies: Path, most: int | None = None
-) -> TrainScene:
-    """The pairs of a list as a scene of unknown scale, to estimate ``model``, E or F, on.
+def read_pairs(file: Path, image_root: Path, *, copies: Path, most: int | None = None) -> TrainScene:
+    """The pairs of a list as a scene of unknown scale, to estimate E on.
 
     ``most`` takes that many pairs, evenly spread over the list. A turned copy of every image that has to be turned
     is written to the directory ``copies``, and the cameras are those of the copies. An image that cannot be read
@@ -72,8 +69,8 @@ def read_pairs(
             for image in images
             for path, size in [upright(image.name, image.turns)]
         )
-        intrinsics = (camera0.K, camera1.K) if ModelKind(model) is ModelKind.E else None
-        pair = Pair(f"{number}: {images[0]} {images[1]}", file.stem, str(path0), str(path1), intrinsics)
+        name, intrinsics = f"{number}: {images[0]} {images[1]}", (camera0.K, camera1.K)
+        pair = Pair(name, file.stem, str(path0), str(path1), intrinsics)
         pairs.append(TruePair(pair, camera0, camera1, nan))
     return TrainScene(file.stem, nan, tuple(pairs))
 

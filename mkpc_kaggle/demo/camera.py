@@ -1,4 +1,4 @@
-"""Pinhole cameras, and projection between world points and pixels.
+"""Pinhole cameras with the size of their image, and projection between world points and pixels.
 
 Pixel centres are at integer coordinates: (0, 0) is the centre of the top-left pixel, x to the right, y down.
 The world has z up; a camera looks along its +z. `X_cam = R X + t`.
@@ -9,14 +9,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mkpc_kaggle.geometry import cameras
+from mkpc_kaggle.geometry.cameras import Camera
 
 Floats = NDArray[np.float64]
+FloatImage = NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)
-class Camera(cameras.Camera):
-    """A camera with the size of its image: width and height in pixels; t in world units."""
+class SizedCamera(Camera):
+    """A camera and its image's width and height in pixels; t in world units."""
 
     width: int
     height: int
@@ -28,9 +29,9 @@ class Camera(cameras.Camera):
 
 
 def look_at(
-    position: ArrayLike, target: ArrayLike, *, focal: float, width: int, height: int, roll: float = 0.0
-) -> Camera:
-    """A camera at `position` with `target` in the middle of its image.
+    position: ArrayLike, target: ArrayLike, focal: float, size: tuple[int, int], roll: float = 0.0
+) -> SizedCamera:
+    """A camera at `position` with `target` in the middle of its image of `size`, (width, height).
 
     `focal` is in pixels; `roll` turns the camera clockwise about its axis, in degrees. Position and target
     are (3,) world points, not above one another.
@@ -41,33 +42,29 @@ def look_at(
     down = np.cross(forward, right)
     cos, sin = np.cos(np.radians(roll)), np.sin(np.radians(roll))
     R = np.stack([cos * right + sin * down, cos * down - sin * right, forward])
-    K = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]], dtype=np.float64)
-    return Camera(K, R, -R @ centre, width, height)
+    K = np.array([[focal, 0, (size[0] - 1) / 2], [0, focal, (size[1] - 1) / 2], [0, 0, 1]], dtype=np.float64)
+    return SizedCamera(K, R, -R @ centre, *size)
 
 
-def resized(camera: Camera, scale: float) -> Camera:
+def resized(camera: SizedCamera, scale: float) -> SizedCamera:
     """The camera of the image made `scale` times as large: `x' = (x + 0.5) * scale - 0.5`.
 
     Sides are rounded to whole pixels while K keeps the exact scale, so at most half a pixel is cut or added
     on the right and at the bottom.
     """
     to_resized = np.array([[scale, 0, (scale - 1) / 2], [0, scale, (scale - 1) / 2], [0, 0, 1]])
-    return replace(
-        camera,
-        K=to_resized @ camera.K,
-        width=max(1, round(camera.width * scale)),
-        height=max(1, round(camera.height * scale)),
-    )
+    width, height = (max(1, round(side * scale)) for side in (camera.width, camera.height))
+    return replace(camera, K=to_resized @ camera.K, width=width, height=height)
 
 
-def project(camera: Camera, points: Floats) -> tuple[Floats, Floats]:
+def project(camera: SizedCamera, points: Floats) -> tuple[Floats, Floats]:
     """World points (N, 3) to pixels (N, 2) and depths (N,); pixels mean nothing where depth <= 0."""
     image = (points @ camera.R.T + camera.t) @ camera.K.T
     depth = image[:, 2]
     return image[:, :2] / np.where(depth == 0, np.finfo(np.float64).tiny, depth)[:, None], depth
 
 
-def unproject(camera: Camera, pixels: Floats, depth: Floats) -> Floats:
+def unproject(camera: SizedCamera, pixels: Floats, depth: Floats) -> Floats:
     """Pixels (N, 2) and their depths (N,), measured along the camera's axis, to world points (N, 3)."""
     rays = np.column_stack([pixels, np.ones(len(pixels))]) @ np.linalg.inv(camera.K).T
     return np.asarray((rays * depth[:, None] - camera.t) @ camera.R, dtype=np.float64)

@@ -1,49 +1,39 @@
-"""How much of one view the other one sees, from exact depth."""
+"""How much of one view the other sees, from exact depth."""
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mkpc_kaggle.demo.camera import Camera, project, unproject
-from mkpc_kaggle.demo.texture import FloatImage
+from mkpc_kaggle.demo.camera import FloatImage, SizedCamera, project, unproject
 
-_DEPTH_TOLERANCE = 0.01  # relative; inverse depth interpolated between pixels is exact on a plane
-_STEP = 3  # every third pixel of every third row is enough for a share
+DEPTH_TOLERANCE = 0.01  # relative; inverse depth interpolated between pixels is exact on a plane
+STEP_PX = 3  # every third pixel of every third row is enough for a share
 
 
 def visible_mask(
-    first: Camera, first_depth: FloatImage, second: Camera, second_depth: FloatImage, step: int = 1
+    first: SizedCamera, first_depth: FloatImage, second: SizedCamera, second_depth: FloatImage, step: int = 1
 ) -> NDArray[np.bool_]:
     """Which pixels of `first`, every `step`-th of them, show a point that `second` sees too: bool.
 
-    The depths are (H, W) float32 in world units, inf for the sky, which is no surface and never shared. A
+    The depths are (H, W) float32 in world units, inf for the sky, which has no surface and is never shared. A
     point outside the second image, behind its camera or hidden by something nearer there is not seen.
     """
     y, x = np.mgrid[0 : first.height : step, 0 : first.width : step]
     depth = first_depth[::step, ::step].astype(np.float64)
     is_surface = np.isfinite(depth)
-    points = unproject(
-        first,
-        np.column_stack([x.ravel(), y.ravel()]).astype(np.float64),
-        np.where(is_surface, depth, 1.0).ravel(),
-    )
-    pixels, expected = project(second, points)
+    corners = np.column_stack([x.ravel(), y.ravel()]).astype(np.float64)
+    pixels, expected = project(second, unproject(first, corners, np.where(is_surface, depth, 1.0).ravel()))
     inside = (pixels >= 0).all(axis=1) & (pixels <= (second.width - 1, second.height - 1)).all(axis=1)
     inside &= expected > 0
     maps = np.where(inside[:, None], pixels, 0).astype(np.float32).reshape(*x.shape, 2)
     found = cv2.remap(np.float32(1) / second_depth, maps[..., 0], maps[..., 1], cv2.INTER_LINEAR)
-    agrees = np.abs(found * expected.reshape(x.shape) - 1) < _DEPTH_TOLERANCE
+    agrees = np.abs(found * expected.reshape(x.shape) - 1) < DEPTH_TOLERANCE
     return np.asarray(is_surface & inside.reshape(x.shape) & agrees, dtype=np.bool_)
 
 
-def visible_share(first: Camera, first_depth: FloatImage, second: Camera, second_depth: FloatImage) -> float:
-    """The share in [0, 1] of the pixels of `first` that `second` sees too."""
-    return float(visible_mask(first, first_depth, second, second_depth, _STEP).mean())
-
-
-def covisibility(first: Camera, first_depth: FloatImage, second: Camera, second_depth: FloatImage) -> float:
-    """The smaller of the two visible shares: symmetric, in [0, 1]."""
-    return min(
-        visible_share(first, first_depth, second, second_depth),
-        visible_share(second, second_depth, first, first_depth),
-    )
+def covisibility(
+    first: SizedCamera, first_depth: FloatImage, second: SizedCamera, second_depth: FloatImage
+) -> float:
+    """The share of each view that the other sees, the smaller of the two: symmetric, in [0, 1]."""
+    ways = ((first, first_depth, second, second_depth), (second, second_depth, first, first_depth))
+    return min(float(visible_mask(*way, STEP_PX).mean()) for way in ways)

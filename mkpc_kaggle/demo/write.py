@@ -9,20 +9,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from mkpc_kaggle.demo.camera import Camera, Floats
+from mkpc_kaggle.demo.camera import FloatImage, Floats, SizedCamera
 from mkpc_kaggle.demo.covisibility import covisibility
-from mkpc_kaggle.demo.photo import develop
-from mkpc_kaggle.demo.photographs import load_photographs
-from mkpc_kaggle.demo.scene import Scene
-from mkpc_kaggle.demo.scenes import SCENE_NAMES, build_scene
-from mkpc_kaggle.demo.texture import FloatImage, Picture
+from mkpc_kaggle.demo.render import Picture, render
+from mkpc_kaggle.demo.world import SCENE_NAMES, World, build_world
 from mkpc_kaggle.geometry.cameras import fundamental_of_cameras
 
-LEAST_COVISIBILITY = 0.1  # what the competition scores
+MIN_COVISIBILITY = 0.1  # what the competition scores
 TEST_PAIRS = 8  # a scene
-
-_TEST_HEADER = "sample_id,batch_id,image_1_id,image_2_id"
-_TRUTH_HEADER = "sample_id,scene,image_1_id,image_2_id"
 
 
 @dataclass(frozen=True)
@@ -36,21 +30,21 @@ class DemoSet:
 
 
 @dataclass(frozen=True, eq=False)
-class Shown:
-    """A photograph with its truth: picture (H, W, 3) uint8 BGR, depth (H, W) float32 in world units."""
+class Photograph:
+    """A picture (H, W, 3) uint8 BGR with its camera and its depth, (H, W) float32 in world units."""
 
     image_id: str
-    camera: Camera
+    camera: SizedCamera
     picture: Picture
     depth: FloatImage
 
 
 @dataclass(frozen=True)
-class Pair:
+class TruePair:
     """Two images of a scene; `first.image_id > second.image_id`."""
 
-    first: Shown
-    second: Shown
+    first: Photograph
+    second: Photograph
     covisibility: float
 
 
@@ -67,54 +61,61 @@ def write_demo(
         raise ValueError(f"a scene is given twice: {', '.join(names)}")
     if not image_scale > 0:
         raise ValueError(f"image_scale must be positive, not {image_scale}")
+    worlds = [build_world(name, seed=seed, image_scale=image_scale) for name in names]
     demo = DemoSet(directory, directory / "train", directory / "test", directory / "test_truth.csv")
-    photographs = load_photographs()
-    factors, samples, truths = [], [], []
-    for name in names:
-        scene = build_scene(name, photographs, seed=seed, image_scale=image_scale)
-        shown = _photograph(scene, seed)
-        pairs = [_pair(a, b) for a, b in combinations(shown, 2)]
-        _write_train(demo.train_dir / name, shown, pairs)
-        scene_samples, scene_truths = _write_test(demo.test_dir, name, _selected(pairs), seed)
-        factors.append(f"{name},{scene.metres_per_unit:.17g}")
-        samples += scene_samples
-        truths += scene_truths
+    rows: list[tuple[str, str]] = []
+    for world in worlds:
+        photographs = take_photographs(world, seed)
+        pairs = [_pair(a, b) for a, b in combinations(photographs, 2)]
+        _write_train(demo.train_dir / world.name, photographs, pairs)
+        rows += _write_test(demo.test_dir, world.name, _selected(pairs), seed)
+    factors = (f"{world.name},{world.metres_per_unit:.17g}" for world in worlds)
     _write_rows(demo.train_dir / "scaling_factors.csv", "scene,scaling_factor", factors)
-    _write_rows(demo.test_dir / "test.csv", _TEST_HEADER, samples)
-    _write_rows(demo.truth_csv, _TRUTH_HEADER, truths)
+    _write_rows(demo.test_dir / "test.csv", "sample_id,batch_id,image_1_id,image_2_id", (row[0] for row in rows))
+    _write_rows(demo.truth_csv, "sample_id,scene,image_1_id,image_2_id", (row[1] for row in rows))
     return demo
 
 
-def _photograph(scene: Scene, seed: int) -> list[Shown]:
-    shown = []
-    for i, view in enumerate(scene.views):
-        image, depth = scene.render(view)
-        rng = np.random.default_rng([seed, i, *scene.name.encode()])
-        shown.append(Shown(f"{scene.name}_{i:04d}", view.camera, develop(image, rng), depth))
-    return shown
+def take_photographs(world: World, seed: int) -> list[Photograph]:
+    """What the world's cameras see, each with its own exposure, tint and noise."""
+    photographs = []
+    for number, camera in enumerate(world.cameras):
+        image, depth = render(world.surfaces, camera)
+        rng = np.random.default_rng([seed, number, *world.name.encode()])
+        photographs.append(Photograph(f"{world.name}_{number:04d}", camera, _developed(image, rng), depth))
+    return photographs
 
 
-def _pair(a: Shown, b: Shown) -> Pair:
+def _developed(image: FloatImage, rng: np.random.Generator) -> Picture:
+    """(H, W, 3) float32 in 0..255 to uint8; the geometry of the picture does not change."""
+    gain, gamma, balance = rng.uniform(0.75, 1.25), rng.uniform(0.85, 1.2), rng.uniform(0.93, 1.07, 3)
+    light = np.clip(image * (balance * gain / 255).astype(np.float32), 0, 1) ** np.float32(gamma)
+    blurred = cv2.GaussianBlur(light, (5, 5), float(rng.uniform(0.3, 0.7)))
+    noise = np.float32(rng.uniform(0.006, 0.016)) * rng.standard_normal(light.shape, dtype=np.float32)
+    return np.asarray(np.clip((blurred + noise) * 255, 0, 255).round(), dtype=np.uint8)
+
+
+def _pair(a: Photograph, b: Photograph) -> TruePair:
     first, second = (a, b) if a.image_id > b.image_id else (b, a)
-    return Pair(first, second, covisibility(a.camera, a.depth, b.camera, b.depth))
+    return TruePair(first, second, covisibility(a.camera, a.depth, b.camera, b.depth))
 
 
-def _selected(pairs: Sequence[Pair]) -> list[Pair]:
+def _selected(pairs: Sequence[TruePair]) -> list[TruePair]:
     """The pairs of the test side: scored ones, spread evenly from the least covisible to the most."""
-    scored = sorted((p for p in pairs if p.covisibility >= LEAST_COVISIBILITY), key=lambda p: p.covisibility)
+    scored = sorted((p for p in pairs if p.covisibility >= MIN_COVISIBILITY), key=lambda p: p.covisibility)
     if len(scored) <= TEST_PAIRS:
         return scored
     return [scored[i] for i in np.linspace(0, len(scored) - 1, TEST_PAIRS).round().astype(int)]
 
 
-def _write_train(directory: Path, shown: Sequence[Shown], pairs: Sequence[Pair]) -> None:
-    (directory / "images").mkdir(parents=True, exist_ok=True)
-    for each in shown:
+def _write_train(directory: Path, photographs: Sequence[Photograph], pairs: Sequence[TruePair]) -> None:
+    for each in photographs:
         _write_image(directory / "images" / f"{each.image_id}.jpg", each.picture, cv2.IMWRITE_JPEG_QUALITY, 95)
+    cameras = ((each.image_id, each.camera) for each in photographs)
     _write_rows(
         directory / "calibration.csv",
         "image_id,camera_intrinsics,rotation_matrix,translation_vector",
-        (f"{s.image_id},{_numbers(s.camera.K)},{_numbers(s.camera.R)},{_numbers(s.camera.t)}" for s in shown),
+        (f"{name},{_numbers(camera.K)},{_numbers(camera.R)},{_numbers(camera.t)}" for name, camera in cameras),
     )
     _write_rows(
         directory / "pair_covisibility.csv",
@@ -127,25 +128,25 @@ def _write_train(directory: Path, shown: Sequence[Shown], pairs: Sequence[Pair])
     )
 
 
-def _write_test(directory: Path, scene: str, pairs: Sequence[Pair], seed: int) -> tuple[list[str], list[str]]:
-    """Write the images of one batch; the rows of test.csv and of test_truth.csv."""
+def _write_test(directory: Path, scene: str, pairs: Sequence[TruePair], seed: int) -> list[tuple[str, str]]:
+    """Write the images of one batch; for each pair its rows of test.csv and of test_truth.csv."""
     batch = _digest(f"{seed}/{scene}")[:8]
-    folder = directory / "test_images" / batch
-    folder.mkdir(parents=True, exist_ok=True)
-    shown = {s.image_id: s for pair in pairs for s in (pair.first, pair.second)}
-    hidden = {name: _digest(f"{seed}/{scene}/{name}")[:32] for name in shown}
-    for name, each in shown.items():
-        _write_image(folder / f"{hidden[name]}.png", each.picture, cv2.IMWRITE_PNG_COMPRESSION, 1)
-    samples, truths = [], []
+    photographs = {each.image_id: each for pair in pairs for each in (pair.first, pair.second)}
+    hidden = {name: _digest(f"{seed}/{scene}/{name}")[:32] for name in photographs}
+    for name, each in photographs.items():
+        path = directory / "test_images" / batch / f"{hidden[name]}.png"
+        _write_image(path, each.picture, cv2.IMWRITE_PNG_COMPRESSION, 1)
+    rows = []
     for pair in pairs:
-        one, two = sorted((pair.first.image_id, pair.second.image_id), key=hidden.__getitem__, reverse=True)
-        sample = f"{scene};{batch};{hidden[one]}-{hidden[two]}"
-        samples.append(f"{sample},{batch},{hidden[one]},{hidden[two]}")
-        truths.append(f"{sample},{scene},{one},{two}")
-    return samples, truths
+        names = sorted((pair.first.image_id, pair.second.image_id), key=hidden.__getitem__, reverse=True)
+        ids = [hidden[name] for name in names]
+        sample = f"{scene};{batch};{'-'.join(ids)}"
+        rows.append((f"{sample},{batch},{','.join(ids)}", f"{sample},{scene},{','.join(names)}"))
+    return rows
 
 
 def _write_image(path: Path, picture: Picture, option: int, value: int) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
     done, data = cv2.imencode(path.suffix, picture, [option, value])
     if not done:
         raise OSError(f"OpenCV could not encode {path}")

@@ -10,6 +10,7 @@ import signal
 import socket
 import textwrap
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -62,31 +63,38 @@ def parse_workers(text: str) -> int | RayCluster:
     return RayCluster(found[1])
 
 
-def ray_site(assembly: Assembly, cluster: RayCluster, clock: Callable[[], float]) -> Site:
-    """The cluster's site; raises :class:`UserError` where Ray is not installed."""
+def ray_site(
+    assembly: Assembly, cluster: RayCluster, clock: Callable[[], float], folders: tuple[Path, ...] = ()
+) -> Site:
+    """The cluster's site; raises :class:`UserError` where Ray is not installed.
+
+    Each machine must have the weights and the ``folders``, which hold the images.
+    """
     # Read when Ray is imported: it must not report usage, and not start a cluster after it was shut down.
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     os.environ.setdefault("RAY_ENABLE_AUTO_CONNECT", "0")
     try:
         import ray  # noqa: F401
     except ModuleNotFoundError as error:
-        raise UserError(
-            '--workers ray needs Ray, which is not installed: pip install "mkpc-kaggle[ray]"'
-        ) from error
-    return RaySite(assembly, cluster, clock)
+        told = '--workers ray needs Ray, which is not installed: pip install "mkpc-kaggle[ray]"'
+        raise UserError(told) from error
+    return RaySite(assembly, cluster, clock, (*assembly.weight_paths, *folders))
 
 
 class RaySite:
     """The machines of a cluster, which is joined when the site is opened. See :class:`Site`."""
 
-    def __init__(self, assembly: Assembly, cluster: RayCluster, clock: Callable[[], float]) -> None:
+    def __init__(
+        self, assembly: Assembly, cluster: RayCluster, clock: Callable[[], float], needed: tuple[Path, ...]
+    ) -> None:
         self.places: list[Place] = []
         self.fallback: list[Place] = []
         self._assembly = assembly
         self._cluster = cluster
         self._clock = clock
+        self._needed = needed
+        self.scenes_at_once = 1  # one on each machine
         self._has_joined = False
-        self._machines = 1
         self._coming: set[Any] = set()
 
     def open(self) -> None:
@@ -96,38 +104,31 @@ class RaySite:
         if self._has_joined:
             join(self._cluster)
         machines = [node for node in ray.nodes() if node["Alive"] and node["Resources"].get("CPU", 0) >= 1]
-        gpus = (
-            0 if self._assembly.device == "cpu" else sum(int(node["Resources"].get("GPU", 0)) for node in machines)
-        )
-        self._machines = max(1, len(machines))
-        if gpus:
+        self.scenes_at_once = max(1, len(machines))
+        gpus = sum(int(node["Resources"].get("GPU", 0)) for node in machines)
+        if gpus and self._assembly.device != "cpu":
             make = partial(MatchRunner, self._assembly.on("cuda:0").pipeline)
             self.places = [self._place(f"gpu {number}", make, num_cpus=0, num_gpus=1) for number in range(gpus)]
         else:
             make = partial(MatchRunner, self._assembly.pipeline)
-            self.places = [
-                self._place(node["NodeManagerHostname"], make, num_cpus=int(node["Resources"]["CPU"]))
-                for node in machines
-            ]
+            for number, node in enumerate(machines):  # of which several may have one name
+                name = f"machine {number} ({node['NodeManagerHostname']})"
+                self.places.append(self._place(name, make, num_cpus=int(node["Resources"]["CPU"])))
         if not self.places:
             raise UserError("the Ray cluster offers neither a CPU nor a GPU")
 
-    @property
-    def scenes_at_once(self) -> int:
-        """One on each machine."""
-        return self._machines
-
     def scene_worker(self) -> "RayWorker":
-        return self._worker(SceneRunner, num_cpus=0, scheduling_strategy="SPREAD")
+        anywhere = {"num_cpus": 0, "scheduling_strategy": "SPREAD"}
+        return RayWorker(SceneRunner, anywhere, self._needed, self._coming)
 
     def wait(self, until: float) -> None:
-        import ray
-
         seconds = max(0.0, min(LISTEN_S, until - self._clock()))
         if self._coming:
+            import ray
+
             ray.wait(list(self._coming), timeout=seconds)
         else:
-            threading.Event().wait(seconds)
+            time.sleep(seconds)
 
     def close(self) -> None:
         import ray
@@ -136,11 +137,7 @@ class RaySite:
             ray.shutdown()
 
     def _place(self, name: str, make: Callable[[], Runner], **where: Any) -> Place:
-        return Place(name, partial(self._worker, make, **where))
-
-    def _worker(self, make: Callable[[], Runner], **where: Any) -> "RayWorker":
-        paths = self._assembly.weight_paths
-        return RayWorker(make, where, paths, self._coming)
+        return Place(name, partial(RayWorker, make, where, self._needed, self._coming))
 
 
 class RayWorker:
@@ -172,10 +169,9 @@ class RayWorker:
         self._all_coming.discard(coming)
         try:
             answer: Answer = ray.get(coming)
-        except ray.exceptions.OutOfMemoryError as error:
-            return Failure(Cause.OUT_OF_MEMORY, message_of(error))
         except ray.exceptions.RayError as error:
-            return Failure(Cause.DIED, message_of(error))
+            is_memory = isinstance(error, ray.exceptions.OutOfMemoryError)
+            return Failure(Cause.OUT_OF_MEMORY if is_memory else Cause.DIED, message_of(error))
         return answer
 
     def kill(self) -> None:
@@ -201,32 +197,24 @@ class Actor:
         """Load the matchers where version and paths are those of the parent's machine."""
         host = socket.gethostname()
         if version != __version__:
-            return Failure(
-                Cause.REFUSED,
-                f"mkpc-kaggle is {__version__} on {host} and {version} here: install the same on both",
-            )
-        missing = [str(path) for path in paths if not path.exists()]
-        if missing:
-            return Failure(
-                Cause.REFUSED,
-                f"{host} lacks {missing[0]}: test set and weights must have the same paths on every machine",
-            )
+            told = f"mkpc-kaggle is {__version__} on {host} and {version} here: install the same on both"
+            return Failure(Cause.REFUSED, told)
+        missing = next((path for path in paths if not path.exists()), None)
+        if missing is not None:
+            told = f"{host} lacks {missing}: test set and weights must have the same paths on every machine"
+            return Failure(Cause.REFUSED, told)
         if threads:
-            use_threads(threads)
+            import cv2
+            import torch
+
+            torch.set_num_threads(threads)
+            cv2.setNumThreads(threads)
         self._runner, answer = load(make)
         return answer
 
     def run(self, job: Job, seconds: float) -> Answer:
         assert self._runner is not None, "only a worker that has loaded gets jobs"
         return run(self._runner, job, seconds)
-
-
-def use_threads(count: int) -> None:
-    import cv2
-    import torch
-
-    torch.set_num_threads(count)
-    cv2.setNumThreads(count)
 
 
 def join(cluster: RayCluster) -> None:
@@ -247,8 +235,7 @@ def join(cluster: RayCluster) -> None:
 @contextmanager
 def own_signals() -> Iterator[None]:
     """Keep this process's answers to signals, which Ray replaces by its own when it starts."""
-    numbers = (signal.SIGINT, signal.SIGTERM)
-    former = {number: signal.getsignal(number) for number in numbers}
+    former = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield
     finally:

@@ -2,7 +2,7 @@
 
 import sqlite3
 import threading
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import partial
@@ -99,7 +99,7 @@ class Engine:
         self._units = {unit.name: unit for unit in recipe.units}
         self._unjournalled: dict[int, tuple[UnitResult, ...]] = {}
         self._explained = self._answers = 0
-        self._looked = (-1, -1)
+        self._looked = (-1, -1, -1)
         self._published = budget.clock()
         self._progress = console.Progress(budget) if progress else None
         self._publishing = threading.Lock()
@@ -172,7 +172,7 @@ class Engine:
             self._fall_back(now)
             self._hand_out(now)
             is_matching = self._is_matching(now)
-            self._start_scenes(self.plan.done if is_matching else range(len(self.pairs)), now)
+            self._start_scenes(now, is_matching=is_matching)
             if not is_matching and not self._scene_places:
                 return
             if now - self._published > max(PUBLISH_INTERVAL_S, self.budget.writing / PUBLISH_SHARE):
@@ -188,7 +188,8 @@ class Engine:
                 self._start(place, now)
             elif place.is_idle and (job := self.plan.next(now, place.name, cautious=place.losses > 0)):
                 pairs = tuple(self.pairs[index] for index in job.indices)
-                job = replace(job, pairs=pairs, known=tuple(map(self._results, job.indices)))
+                known = tuple(() if job.is_trial else self._results(index) for index in job.indices)
+                job = replace(job, pairs=pairs, known=known)
                 place.submit(job, job.seconds, job.time_limit, now)
 
     def _start(self, place: Place, now: float) -> None:
@@ -253,13 +254,15 @@ class Engine:
 
     # Scenes
 
-    def _start_scenes(self, done: Collection[int], now: float) -> None:
-        """Begin to reconstruct batches whose pairs are all ``done``."""
+    def _start_scenes(self, now: float, *, is_matching: bool) -> None:
+        """Begin to reconstruct batches whose pairs have what fits; all when nothing is matched any more."""
         at_once = self.site.scenes_at_once
-        if (moment := (len(done), self._answers)) == self._looked:
+        plan = self.plan
+        done, filling = (plan.done, plan.filling) if is_matching else (range(len(self.pairs)), ())
+        if (moment := (len(done), len(filling), self._answers)) == self._looked:
             return  # nothing has changed since
         self._looked = moment
-        while len(self._scene_places) < at_once and (batch := self.scenes.due(done)) is not None:
+        while len(self._scene_places) < at_once and (batch := self.scenes.due(done, filling)) is not None:
             place = Place(f"scene of batch {batch}", self.site.scene_worker)
             place.job = self.scenes.job(batch, self._results)
             self._scene_places.append(place)

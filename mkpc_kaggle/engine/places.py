@@ -74,7 +74,7 @@ class Place:
             self.is_loaded = True
         elif not isinstance(answer, Failure):
             self.losses = 0
-        elif answer.cause is not Cause.RAISED:
+        elif answer.cause is not Cause.RAISED or not self.is_loaded:
             self._lose(answer, now)
         return answer
 
@@ -85,10 +85,10 @@ class Place:
 
     def _lose(self, failure: Failure, now: float) -> None:
         """The worker ends: what ran out of memory has it in pieces, and a device that failed goes on failing."""
-        job = self.job
+        job, was_loaded = self.job, self.is_loaded
         self.kill()
         self.job, self.limit = job, now
-        if failure.cause.is_of_place:
+        if failure.cause.is_of_place or not was_loaded:
             self.losses += 1
             self.limit = now + RESTART_PAUSE_S * self.losses
             if self.losses >= MAX_LOSSES or failure.cause is Cause.REFUSED:

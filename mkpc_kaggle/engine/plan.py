@@ -6,6 +6,7 @@ It looks at a job's worth of pairs at a time, so that a hundred thousand pairs c
 from collections import Counter, deque
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 from mkpc_kaggle.engine.budget import Budget, format_duration
 from mkpc_kaggle.engine.costs import Costs
@@ -64,7 +65,9 @@ def chunks_of(phase: Phase, indices: Iterable[int], size: int, units: tuple[Unit
 
 
 class ChunkQueue:
-    """Chunks in the order of their turn. A pair's turn comes when no job is under way on it."""
+    """Chunks in the order of their turn. A pair's turn comes when no job is under way on it, nor waits to be
+    tried again: that may be for another place.
+    """
 
     def __init__(self) -> None:
         self.under_way: set[int] = set()
@@ -75,25 +78,29 @@ class ChunkQueue:
         self._waiting.extend(chunks)
 
     def put_first(self, chunk: Chunk) -> None:
-        """Give a chunk back, or what is left of it."""
-        self._retries.appendleft(chunk)
+        """Give a chunk back, or what is left of it; its turn is after those that were lost."""
+        place = 0 if chunk.lost_at else sum(bool(waiting.lost_at) for waiting in self._retries)
+        self._retries.insert(place, chunk)
 
     def retry(self, chunks: Iterable[Chunk]) -> None:
-        """Try these again, after what waits for that already."""
-        self._retries.extend(chunks)
+        """Try these again, before all others: so a unit that kills its worker is given up on few pairs."""
+        self._retries.extendleft(reversed(list(chunks)))
 
-    def pop(self, place: str, *, alone: bool, fresh_first: bool) -> Chunk | None:
-        """The next chunk for a place; not one that was lost there, unless the place is ``alone``."""
-        chunk = (self._pop_fresh() if fresh_first else None) or self._pop_retry(place, alone=alone)
+    def pop(self, place: str, *, alone: bool, cautious: bool) -> Chunk | None:
+        """The next chunk for a place; not one that was lost there, unless the place is ``alone``.
+
+        ``cautious``: one that was not lost, if there is one.
+        """
+        chunk = (self._pop_fresh() if cautious else None) or self._pop_retry(place, alone, cautious)
         return chunk or self._pop_fresh()
 
     def _pop_fresh(self) -> Chunk | None:
-        if self._waiting and self.under_way.isdisjoint(self._waiting[0].indices):
+        if self._waiting and not any(map(self.is_busy, self._waiting[0].indices)):
             return self._waiting.popleft()
         return None
 
-    def _pop_retry(self, place: str, *, alone: bool) -> Chunk | None:
-        for chunk in self._retries:
+    def _pop_retry(self, place: str, alone: bool, cautious: bool) -> Chunk | None:
+        for chunk in reversed(self._retries) if cautious else self._retries:
             if self.under_way.isdisjoint(chunk.indices) and (alone or place not in chunk.lost_at):
                 self._retries.remove(chunk)
                 return chunk
@@ -126,7 +133,8 @@ class Plan:
 
     ``records``, one a pair by index, asked pairs first, change through it. The first ``connecting`` of the extra
     pairs are for the connect phase. ``workers`` work at a time; ``reserve`` seconds of the end are left to scenes.
-    ``done`` are the pairs that get nothing more for now; ``unusable`` names the units that no worker can run.
+    ``done`` are the pairs that have what fits for all, and ``filling`` those that get more in the time left;
+    ``unusable`` names the units that no worker can run.
     """
 
     def __init__(
@@ -149,7 +157,6 @@ class Plan:
         self.costs = Costs()
         self.explanations: list[Explanation] = []
         self.unusable: set[str] = set()
-        self.done: set[int] = set(extra)
         self.phase = Phase.SWEEP
         self._order, self._extra, self._connecting = order, extra, connecting
         self._stuck: set[int] = set()
@@ -161,7 +168,6 @@ class Plan:
         self._reached = sum(record.reached for record in records[: len(order)])
         self._matched = sum(record.reached for record in records[len(order) :])
         self._total = 0
-        self._undone: set[int] = set()
         self._begin()
 
     # What to do next
@@ -171,6 +177,8 @@ class Plan:
 
         ``cautious``: the place has just lost a worker, and tries one pair and one unit.
         """
+        if cautious and (trial := self._trial(now)) is not None:
+            return trial
         while now < self.stop and (chunk := self._pop(place, now, cautious=cautious)) is not None:
             units = self._units(chunk, now)
             todo = [index for index in chunk.indices if self.can_gain(index, units)]
@@ -203,7 +211,24 @@ class Plan:
 
     def _begin(self) -> None:
         self._queue = ChunkQueue()
+        self.done, self.filling = set(self._extra), set[int]()
         self._coming = list(Phase)
+
+    def _trial(self, now: float) -> MatchJob | None:
+        """The first unit on a pair that has had it, where nothing is left but what workers were lost at.
+
+        A place that answers works: it is not closed for the pairs that kill every worker.
+        """
+        if self._peek(now) is not None or not self._queue.has_retries or now >= self.stop:
+            return None
+        for unit, record in product(self._first, self.records):
+            ran = any(found.unit == unit.name and not found.failure for found in record.units)
+            if ran and not self._queue.is_busy(record.index):
+                self._queue.under_way.add(record.index)
+                times = self._time([unit], 1, self.stop - now, exploring=False)
+                expected = (self.costs.p90(unit.name),)
+                return MatchJob(self.phase, (record.index,), (unit,), expected, *times, is_trial=True)
+        return None
 
     def _peek(self, now: float) -> Chunk | None:
         """The next chunk of the present phase, or of those to come."""
@@ -213,7 +238,7 @@ class Plan:
 
     def _pop(self, place: str, now: float, *, cautious: bool) -> Chunk | None:
         self._peek(now)
-        return self._queue.pop(place, alone=self.workers < 2, fresh_first=cautious)
+        return self._queue.pop(place, alone=self.workers < 2, cautious=cautious)
 
     def _job(
         self, chunk: Chunk, todo: list[int], units: tuple[Unit, ...], now: float, *, cautious: bool
@@ -315,13 +340,12 @@ class Plan:
 
     def _add(self, phase: Phase, indices: list[int], size: int, units: tuple[Unit, ...], now: float) -> None:
         """Give pairs that were done more units in the time that is left."""
-        self._total, self._undone = len(indices), set(indices)
+        self._total, self.filling = len(indices), set(indices)
         if indices:
             what = (
                 "pairs that lack units, the weakest first" if phase is Phase.FILL else "pairs for the scenes alone"
             )
             self.explain(now, f"in the time left: {len(indices)} {what}")
-            self.done.difference_update(indices)
             self._queue.extend(chunks_of(phase, indices, size, units))
 
     def _pairs_that_fit(self, share: float, count: int, now: float) -> int:
@@ -353,6 +377,8 @@ class Plan:
         that pair.
         """
         self._queue.under_way.difference_update(job.indices)
+        if job.is_trial:
+            return []
         chunk = Chunk(job.phase, job.indices, job.units, (place,))
         if len(job.indices) > 1:
             half = len(job.indices) // 2
@@ -361,7 +387,7 @@ class Plan:
         (index,) = job.indices
         lacking = self.records[index].lacking(job.units)
         if len(lacking) > 1:
-            self._queue.retry(replace(chunk, units=(unit,), lost_at=()) for unit in lacking)
+            self._queue.retry(replace(chunk, units=(unit,)) for unit in lacking)
             return []
         (unit,) = lacking
         if job.exploring and failure.cause is Cause.TIMED_OUT:
@@ -425,7 +451,9 @@ class Plan:
 
     def _mark_done(self, phase: Phase, indices: Iterable[int]) -> None:
         if phase not in (Phase.SWEEP, Phase.CONNECT):
-            self.done.update(index for index in indices if not self._queue.has_retry(index))
+            finished = [index for index in indices if not self._queue.has_retry(index)]
+            self.done.update(finished)
+            self.filling.difference_update(finished)
 
     # What is left
 
@@ -433,7 +461,7 @@ class Plan:
         """The units that a pair still gets if there is time."""
         if record.index < len(self._order):
             return record.lacking(self.usable(self.recipe.units))
-        is_over = self.phase is Phase.DENSIFY and record.index in self.done
+        is_over = self.phase is Phase.DENSIFY and record.index not in self.filling
         return [] if is_over else record.lacking(self._first)
 
     def may_gain(self, record: PairRecord) -> bool:
@@ -461,7 +489,7 @@ class Plan:
             return self.phase, len(self.done) - len(self._extra), asked
         if self.phase is Phase.CONNECT:
             return self.phase, self._matched, self._total
-        return self.phase, len(self._undone & self.done), self._total
+        return self.phase, self._total - len(self.filling), self._total
 
     def explain(self, now: float, text: str) -> None:
         """Note a decision, and why."""

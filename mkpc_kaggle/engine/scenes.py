@@ -89,11 +89,15 @@ class Scenes:
             self._unit_counts[batch] += change
             self._update(batch)
 
-    def due(self, done: Collection[int]) -> str | None:
-        """A batch to reconstruct now: its matches have changed since it was, and all of its pairs are ``done``."""
+    def due(self, done: Collection[int], filling: Collection[int] = ()) -> str | None:
+        """A batch to reconstruct now: its matches have changed since it was, and all of its pairs are ``done``.
+
+        For the first time it is while some of them get further matches (``filling``), for the second afterwards.
+        """
         for name, indices in self.batches.items() if self._open else ():
             is_waiting = name in self._open and name not in self._running and self._unit_counts[name] > 0
-            if is_waiting and all(index in done for index in indices):
+            waits_for = filling if name in self.made else ()
+            if is_waiting and all(index in done and index not in waits_for for index in indices):
                 return name
         return None
 

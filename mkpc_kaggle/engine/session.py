@@ -105,7 +105,7 @@ def run_pairs(
         engine = Engine(
             pairs,
             assembly.recipe,
-            site_of(assembly, session),
+            site_of(pairs, assembly, session),
             journal,
             session.budget,
             publish=publish,
@@ -120,10 +120,11 @@ def run_pairs(
     return report
 
 
-def site_of(assembly: Assembly, session: Session) -> Site:
+def site_of(pairs: Sequence[Pair], assembly: Assembly, session: Session) -> Site:
     """Where the workers are that the session asks for."""
     if isinstance(session.workers, RayCluster):
-        return ray_site(assembly, session.workers, session.budget.clock)
+        folders = tuple(dict.fromkeys(path.parent for pair in pairs for path in pair.images))
+        return ray_site(assembly, session.workers, session.budget.clock, folders)
     return LocalSite(assembly, session.workers, session.budget.clock)
 
 

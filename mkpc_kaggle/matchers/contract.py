@@ -5,7 +5,7 @@ One contract serves sparse, semi-dense and dense networks. ``encode`` does what 
 images are used in many pairs. ``match`` does the rest.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from enum import StrEnum
 from itertools import product
@@ -127,18 +127,12 @@ class Matcher(Protocol[Encoding]):
         ...
 
 
-class Loader(Protocol):
-    """Builds a matcher from its weights and its options."""
-
-    def __call__(self, weights: WeightStore, options: Any, placement: Placement) -> Matcher[Any]: ...
-
-
 @dataclass(frozen=True)
 class MatcherEntry:
-    """A matcher that the registry knows."""
+    """A matcher that the registry knows; ``load`` builds it from its weights and its options."""
 
     spec: MatcherSpec
-    load: Loader
+    load: Callable[[WeightStore, Any, Placement], Matcher[Any]]
 
 
 @dataclass(frozen=True)

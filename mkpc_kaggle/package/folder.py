@@ -3,7 +3,7 @@
 import filecmp
 import shutil
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from mkpc_kaggle.errors import UserError
@@ -11,48 +11,40 @@ from mkpc_kaggle.errors import UserError
 
 @dataclass(frozen=True)
 class Item:
-    """A file to write: its name in the folder, its source, and its licence if it has one of its own."""
+    """A file to write: its name in the folder, its source, and its licence if it has its own."""
 
     name: str
     source: Path
     licence: str = ""
     note: str = ""
 
-    @property
-    def size(self) -> int:
-        """Bytes."""
-        return self.source.stat().st_size
-
 
 def refuse_other_files(directory: Path, items: Sequence[Item]) -> None:
     """Raise :class:`UserError` where the folder has other files: they would be uploaded too."""
-    names = {item.name for item in items} | {_part(item.name) for item in items}
-    others = (
-        sorted(path.name for path in directory.iterdir() if path.name not in names) if directory.is_dir() else []
-    )
+    names = {name for item in items for name in (item.name, f".{item.name}.part")}
+    others = sorted({path.name for path in directory.glob("*")} - names)
     if others:
         raise UserError(
-            f"{directory} holds what this run would not put there, and what would be uploaded all the same: "
-            f"{', '.join(others)}. Remove it, or choose another --out."
+            f"{directory} holds files that would be uploaded too: {', '.join(others)}. Remove them, or choose "
+            "another --out."
         )
 
 
-def write_files(directory: Path, items: Sequence[Item]) -> None:
-    """Write these files into the folder, but for those that are there with the same bytes.
+def write_files(directory: Path, items: Sequence[Item]) -> tuple[Item, ...]:
+    """Write these files into the folder, except those that are there with the same bytes; the files as written.
 
-    Raises :class:`UserError` where one cannot be written; the same call continues there.
+    Raises :class:`UserError` where a file cannot be written; the same call continues there.
     """
     try:
         directory.mkdir(parents=True, exist_ok=True)
         for item in items:
-            target, part = directory / item.name, directory / _part(item.name)
-            part.unlink(missing_ok=True)  # it may be a link
-            if not (target.is_file() and filecmp.cmp(item.source, target, shallow=False)):
-                shutil.copyfile(item.source, part)
-                part.replace(target)
+            target, part = directory / item.name, directory / f".{item.name}.part"
+            part.unlink(missing_ok=True)
+            if target.is_file() and filecmp.cmp(item.source, target, shallow=False):
+                continue
+            with item.source.open("rb") as source, part.open("xb") as copy:  # "x" follows no link
+                shutil.copyfileobj(source, copy)
+            part.replace(target)
     except OSError as error:
         raise UserError(f"{directory} cannot be written: {error}") from error
-
-
-def _part(name: str) -> str:
-    return f".{name}.part"
+    return tuple(replace(item, source=directory / item.name) for item in items)

@@ -3,31 +3,21 @@
 import json
 import re
 from collections.abc import Iterable
-from enum import StrEnum
 
 from mkpc_kaggle.errors import UserError
-
-
-class Image(StrEnum):
-    """Which of Kaggle's images the kernel runs on, as values of ``docker_image_pinning_type``."""
-
-    LATEST = "latest"
-    ORIGINAL = "original"
-    """the one of the kernel's first version, in later versions too"""
-
 
 COMPETITION = "image-matching-challenge-2022"
 DATASET_SLUG = "mkpc-kaggle"
 KERNEL_TITLE = "MKPC submission"
-KERNEL_SLUG = KERNEL_TITLE.lower().replace(" ", "-")
-"""Kaggle derives the slug from the title like this, and requires that both agree."""
+KERNEL_SLUG = KERNEL_TITLE.lower().replace(" ", "-")  # Kaggle derives it like this, and requires that both agree
+LATEST, ORIGINAL = "latest", "original"
 
 
 def check_owner(owner: str) -> None:
     """Raise :class:`UserError` unless it can be the name of a Kaggle user."""
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9-]*", owner):
         raise UserError(
-            f"--owner {owner!r} is no Kaggle user name: give the last part of your profile's address, "
+            f"--owner {owner!r} cannot be a Kaggle user name: give the last part of your profile's address, "
             "letters, digits and dashes"
         )
 
@@ -47,11 +37,15 @@ def dataset_metadata(owner: str, licences: Iterable[str]) -> str:
     )
 
 
-def kernel_metadata(owner: str, notebook: str, image: Image) -> str:
-    """``kernel-metadata.json``: GPU on, internet off, the competition and our dataset attached.
+def kernel_metadata(owner: str, notebook: str, image: str) -> str:
+    """``kernel-metadata.json``: two T4, internet off, the competition and our dataset attached.
 
-    The machine is named: current torch builds have no kernels for the P100.
+    ``image`` is ``latest``, ``original`` (the image of the kernel's first version, in later ones too), or an image
+    by its digest, as ``kaggle kernels pull -m`` tells it. Raises :class:`UserError` for anything else.
     """
+    if image not in (LATEST, ORIGINAL) and not re.fullmatch(r"[\w./:-]+@sha256:[0-9a-f]{64}", image):
+        raise UserError(f"--image {image}: give {LATEST}, {ORIGINAL}, or an image as NAME@sha256:DIGEST")
+    pinned = {"docker_image": image} if "@" in image else {}
     return _json(
         {
             "id": f"{owner}/{KERNEL_SLUG}",
@@ -62,7 +56,8 @@ def kernel_metadata(owner: str, notebook: str, image: Image) -> str:
             "is_private": True,
             "enable_gpu": True,
             "machine_shape": "NvidiaTeslaT4",
-            "docker_image_pinning_type": image,
+            "docker_image_pinning_type": ORIGINAL if pinned else image,
+            **pinned,
             "enable_internet": False,
             "competition_sources": [COMPETITION],
             "dataset_sources": [f"{owner}/{DATASET_SLUG}"],

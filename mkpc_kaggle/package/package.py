@@ -5,35 +5,32 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.package.checkout import Checkout, find_checkout
 from mkpc_kaggle.package.folder import Item, refuse_other_files, write_files
-from mkpc_kaggle.package.metadata import Image, check_owner, dataset_metadata, kernel_metadata
-from mkpc_kaggle.package.weights import ChosenWeights, choose_weights
+from mkpc_kaggle.package.metadata import LATEST, check_owner, dataset_metadata, kernel_metadata
+from mkpc_kaggle.package.weights import choose_weights
 from mkpc_kaggle.package.wheels import PYTHONS, build_wheel, collect_wheels, install_lines, licence_of, pins
 from mkpc_kaggle.weights import WeightStore
 from mkpc_kaggle.weights.manifest import MANIFEST
 
+NOTEBOOK = Path("notebooks", "submission.ipynb")
+
 
 @dataclass(frozen=True)
 class Request:
-    """``owner`` is a user of Kaggle; ``pythons`` are versions such as ``3.11``.
-
-    ``wheels`` is a directory to take wheels from, instead of pip's index. ``private`` includes weights that must
-    not be redistributed. ``image`` says which of its images Kaggle should run the kernel on.
-    """
+    """What to package, and where to."""
 
     out: Path
-    owner: str
-    weights: tuple[Path, ...] = ()
+    owner: str  # a user of Kaggle
+    weights: tuple[Path, ...] = ()  # directories
     pythons: tuple[str, ...] = PYTHONS
-    wheels: Path | None = None
-    private: bool = False
-    image: Image = Image.LATEST
+    wheels: Path | None = None  # a directory to take wheels from, instead of pip's index
+    private: bool = False  # include weights that must not be redistributed
+    image: str = LATEST  # of Kaggle's, see :func:`kernel_metadata`
 
 
 @dataclass(frozen=True)
 class Package:
-    """What was written: the files of both folders, and the weights whose licences do not allow redistribution."""
+    """The files of both folders, and the weights whose licences do not allow redistribution."""
 
     dataset: tuple[Item, ...]
     kernel: tuple[Item, ...]
@@ -53,47 +50,41 @@ def make_package(request: Request) -> Package:
     dataset, kernel = request.out / "dataset", request.out / "kernel"
     with TemporaryDirectory(prefix="mkpc-") as temporary:
         staging = Path(temporary)
+
+        def text(name: str, content: str) -> Item:
+            (staging / name).write_text(content, encoding="utf-8", newline="\n")
+            return Item(name, staging / name)
+
+        kernel_items = (
+            text("kernel-metadata.json", kernel_metadata(request.owner, NOTEBOOK.name, request.image)),
+            Item(NOTEBOOK.name, checkout / NOTEBOOK),
+        )
         chosen = choose_weights(WeightStore(request.weights), checkout, staging, private=request.private)
-        dataset_items = _dataset_items(request, checkout, chosen, staging)
-        kernel_items = _kernel_items(request, checkout, staging)
+        licences = [item.licence for item in chosen.items]
+        own = build_wheel(checkout, staging / "own")
+        others = collect_wheels(
+            pins(checkout), request.pythons, staging / "others", kept=dataset, wheels=request.wheels
+        )
+        dataset_items = (
+            text("dataset-metadata.json", dataset_metadata(request.owner, licences)),
+            *(Item(path.name, path, licence_of(path)) for path in (own, *others)),
+            text("requirements.txt", "\n".join(install_lines(own, others)) + "\n"),
+            *(Item(name, checkout / name) for name in ("README.md", "LICENSE")),
+            text(MANIFEST, chosen.manifest),
+            *chosen.licence_texts,
+            *chosen.items,
+        )
         refuse_other_files(dataset, dataset_items)
         refuse_other_files(kernel, kernel_items)
-        write_files(dataset, dataset_items)
-        write_files(kernel, kernel_items)
-    return Package(_written(dataset, dataset_items), _written(kernel, kernel_items), chosen.restricted)
+        return Package(write_files(dataset, dataset_items), write_files(kernel, kernel_items), chosen.restricted)
 
 
-def _dataset_items(request: Request, checkout: Checkout, chosen: ChosenWeights, staging: Path) -> tuple[Item, ...]:
-    own, others = staging / "own", staging / "others"
-    wheel = build_wheel(checkout, own)
-    wheels = collect_wheels(
-        pins(checkout), request.pythons, others, kept=request.out / "dataset", wheels=request.wheels
-    )
-    licences = [item.licence for item in chosen.items]
-    return (
-        _text(staging, "dataset-metadata.json", dataset_metadata(request.owner, licences)),
-        *(Item(path.name, path, licence_of(path)) for path in (wheel, *wheels)),
-        _text(staging, "requirements.txt", "\n".join(install_lines(wheel, wheels)) + "\n"),
-        Item("LICENSE", checkout.licence),
-        _text(staging, MANIFEST, chosen.manifest),
-        *chosen.licence_texts,
-        *chosen.items,
-    )
-
-
-def _kernel_items(request: Request, checkout: Checkout, staging: Path) -> tuple[Item, ...]:
-    notebook = checkout.submission_notebook
-    return (
-        _text(staging, "kernel-metadata.json", kernel_metadata(request.owner, notebook.name, request.image)),
-        Item(notebook.name, notebook),
-    )
-
-
-def _text(staging: Path, name: str, text: str) -> Item:
-    path = staging / name
-    path.write_text(text, encoding="utf-8", newline="\n")
-    return Item(name, path)
-
-
-def _written(directory: Path, items: tuple[Item, ...]) -> tuple[Item, ...]:
-    return tuple(Item(item.name, directory / item.name, item.licence, item.note) for item in items)
+def find_checkout() -> Path:
+    """The source checkout that this package runs from; :class:`UserError` where it was installed from a wheel."""
+    root = Path(__file__).resolve().parents[2]
+    if not (root / NOTEBOOK).is_file():
+        raise UserError(
+            f"mkpc_kaggle was installed in {root} without its sources, which `package` builds the wheel from: "
+            "clone the repository and run `python -m mkpc_kaggle package` in the clone"
+        )
+    return root

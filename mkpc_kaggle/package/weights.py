@@ -4,7 +4,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.package.checkout import Checkout
 from mkpc_kaggle.package.folder import Item
 from mkpc_kaggle.weights import FoundFile, State, WeightFile, WeightStore
 from mkpc_kaggle.weights.convert import convert
@@ -14,19 +13,15 @@ HEADER = "# The weights of this dataset; the columns are name, bytes, digest, li
 
 @dataclass(frozen=True)
 class ChosenWeights:
-    """The files to include, with the texts of their licences, and those that must not be redistributed.
-
-    ``manifest`` has a line for each of the ``items``. ``restricted`` are left out, or, in a private package, are
-    among the ``items``.
-    """
+    """The files to include, with the texts of their licences, and those that must not be redistributed."""
 
     items: tuple[Item, ...]
-    manifest: str
+    manifest: str  # a line for each of the items
     licence_texts: tuple[Item, ...]
-    restricted: tuple[Item, ...]
+    restricted: tuple[Item, ...]  # left out; in a private package they are among the items too
 
 
-def choose_weights(store: WeightStore, checkout: Checkout, staging: Path, *, private: bool) -> ChosenWeights:
+def choose_weights(store: WeightStore, checkout: Path, staging: Path, *, private: bool) -> ChosenWeights:
     """The file of each slot that the store has, as safetensors: Kaggle would unpack a torch checkpoint.
 
     Conversions go into ``staging``. Licences whose text the checkout has allow redistribution.
@@ -34,26 +29,34 @@ def choose_weights(store: WeightStore, checkout: Checkout, staging: Path, *, pri
     checkpoint that cannot be read.
     """
     slots = dict.fromkeys(file.slot for file in store.files)
-    found = [one for one in (_good_file(store, slot) for slot in slots) if one is not None]
-    restricted = [one for one in found if checkout.licence_text(one.file.licence) is None]
-    shipped = [one for one in found if private or one not in restricted]
-    texts = {checkout.licence_text(one.file.licence) for one in shipped} - {None, checkout.licence}
-    files = [_as_safetensors(one, staging) for one in shipped]
+    every = [found for found in (_good_file(store, slot) for slot in slots) if found is not None]
+    restricted = [found for found in every if licence_text(checkout, found.file.licence) is None]
+    shipped = [found for found in every if private or found not in restricted]
+    texts = {text for found in shipped if (text := licence_text(checkout, found.file.licence))}
+    files = [_as_safetensors(found, staging) for found in shipped]
     return ChosenWeights(
         tuple(
-            Item(file.name, path, file.licence, _note(one))
-            for (file, path), one in zip(files, shipped, strict=True)
+            Item(
+                file.name, path, file.licence, "" if found.state is State.GOOD else "its original is not verified"
+            )
+            for (file, path), found in zip(files, shipped, strict=True)
         ),
         HEADER + "".join(f"{file.line}\n" for file, _ in files),
-        tuple(Item(path.name, path) for path in sorted(filter(None, texts))),
-        tuple(Item(one.file.name, one.path, one.file.licence) for one in restricted),
+        tuple(Item(path.name, path) for path in sorted(texts) if path.name != "LICENSE"),
+        tuple(Item(found.file.name, found.path, found.file.licence) for found in restricted),
     )
+
+
+def licence_text(checkout: Path, tag: str) -> Path | None:
+    """The text of a licence that the manifest names, if the checkout has it."""
+    path = checkout / ("LICENSE" if tag == "Apache-2.0" else f"licences/{tag}.txt")
+    return path if path.is_file() else None
 
 
 def _good_file(store: WeightStore, slot: str) -> FoundFile | None:
     search = store.search(store.alternatives(slot))
     if search.found is None and search.refused:
-        refusals = "; ".join(f"{one.path}: {one.note}" for one in search.refused)
+        refusals = "; ".join(f"{refused.path}: {refused.note}" for refused in search.refused)
         raise UserError(
             f"no good file for {slot!r}. Found {refusals}. Fetch it again "
             f"(python -m mkpc_kaggle weights fetch {slot} --out DIR), or take it out of the directory."
@@ -70,7 +73,3 @@ def _as_safetensors(found: FoundFile, staging: Path) -> tuple[WeightFile, Path]:
     made = convert(found.path, path)
     source = f"{found.file.name} ({found.digest}) with the same tensor names"
     return replace(made, licence=found.file.licence, slot=found.file.slot, source=source), path
-
-
-def _note(found: FoundFile) -> str:
-    return "" if found.state is State.GOOD else "its original is not verified"

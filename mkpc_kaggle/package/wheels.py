@@ -1,6 +1,5 @@
 """Wheels: our own, built from the checkout, and those of the dependencies that Kaggle's image may lack."""
 
-import re
 import subprocess
 import sys
 import zipfile
@@ -10,27 +9,22 @@ from email.parser import Parser
 from importlib.util import find_spec
 from pathlib import Path
 
-from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.package.checkout import Checkout
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
-BUNDLED = (
-    "kornia",
-    "kornia-rs",
-    "pycolmap",
-    "safetensors",
-)
-"""Direct and indirect dependencies that Kaggle's image may lack or have in a version that is too old.
-The others (torch, numpy, scipy, pandas, scikit-learn, OpenCV, matplotlib, tqdm) are in the image."""
-PYTHONS = ("3.11", "3.12", "3.13", "3.14")
-"""Versions in Kaggle's images, pinned older ones included, and likely next ones."""
+from mkpc_kaggle.errors import UserError
+
+# Dependencies, direct or not, that Kaggle's image may lack or have in a version that is too old.
+BUNDLED = ("kornia", "kornia-rs", "pycolmap", "safetensors")
+PYTHONS = ("3.11", "3.12", "3.13", "3.14")  # of Kaggle's images, pinned older ones included, and likely next ones
 PLATFORMS = ("manylinux_2_28_x86_64", "manylinux_2_17_x86_64", "manylinux2014_x86_64")
 
 
-def pins(checkout: Checkout) -> tuple[str, ...]:
+def pins(checkout: Path) -> tuple[str, ...]:
     """``name==version`` of each bundled package, the version being the one that the tests run with."""
-    lines = checkout.pins.read_text(encoding="utf-8").splitlines()
-    pinned = dict(_pin(line) for line in lines if line and not line.startswith("#"))
-    return tuple(f"{name}=={pinned[name]}" for name in BUNDLED)
+    lines = (checkout / "requirements-dev.txt").read_text(encoding="utf-8").splitlines()
+    pinned = {canonicalize_name(line.partition("==")[0]): line for line in lines}
+    return tuple(pinned[canonicalize_name(name)] for name in BUNDLED)
 
 
 def install_lines(own: Path, wheels: Iterable[Path]) -> tuple[str, ...]:
@@ -38,22 +32,22 @@ def install_lines(own: Path, wheels: Iterable[Path]) -> tuple[str, ...]:
 
     A version of the image within the range stays, whether there is a wheel for its Python or not.
     """
-    version = _metadata(own)["Version"]
-    asked = (line for wheel in (own, *wheels) for line in _metadata(wheel).get_all("Requires-Dist", []))
-    plain = (line.partition(";")[0].strip() for line in asked if "extra ==" not in line)
-    bundled = (
-        line for line in plain if _canonical_name(re.split(r"[^A-Za-z0-9._-]", line, maxsplit=1)[0]) in BUNDLED
-    )
-    return (f"mkpc-kaggle=={version}", *sorted(set(bundled)))
+    lines = (line for wheel in (own, *wheels) for line in _metadata(wheel).get_all("Requires-Dist", []))
+    bundled = {
+        f"{canonicalize_name(need.name)}{need.specifier}"
+        for need in map(Requirement, lines)
+        if canonicalize_name(need.name) in BUNDLED and "extra" not in str(need.marker)
+    }
+    return (f"mkpc-kaggle=={_metadata(own)['Version']}", *sorted(bundled))
 
 
-def build_wheel(checkout: Checkout, directory: Path) -> Path:
+def build_wheel(checkout: Path, directory: Path) -> Path:
     """Build our wheel into the directory; the same sources give the same bytes. Raises :class:`UserError`."""
     # If hatchling is not installed, pip downloads it for the build.
     isolation = ["--no-build-isolation"] if find_spec("hatchling") else []
-    failure = _pip("wheel", "--no-deps", *isolation, "--wheel-dir", directory, checkout.root)
+    failure = _pip("wheel", "--no-deps", *isolation, "--wheel-dir", directory, checkout)
     if failure:
-        raise UserError(f"the wheel could not be built from {checkout.root}: {failure}")
+        raise UserError(f"the wheel could not be built from {checkout}: {failure}")
     return next(directory.glob("mkpc_kaggle-*.whl"))
 
 
@@ -63,15 +57,23 @@ def collect_wheels(
     """The wheels of these requirements for these Python versions (``3.11``), in order of their names.
 
     They come from the directory ``wheels`` if given; else from ``kept``, the output of an earlier run, or, if one
-    is missing there, from pip's index. Raises :class:`UserError` where one is not found.
+    is missing there, from pip's index. Raises :class:`UserError` where a wheel is not found.
     """
-    local = ("--no-index", "--find-links")
-    sources: list[tuple[str | Path, ...]] = [(*local, wheels)] if wheels else [(*local, kept), ()]
+    local = ("--no-index", "--find-links", str(wheels or kept))
+    sources = [local] if wheels else [local, ()]
+    platforms = [option for platform in PLATFORMS for option in ("--platform", platform)]
     for python in pythons:
-        failure = ""
+        options = [
+            "--only-binary=:all:",
+            "--no-deps",
+            "--python-version",
+            python,
+            *platforms,
+            "--dest",
+            f"{directory}",
+        ]
         for source in sources:
-            failure = _download(requirements, python, directory, source)
-            if not failure:
+            if not (failure := _pip("download", *options, *source, *requirements)):
                 break
         else:
             raise UserError(
@@ -91,15 +93,9 @@ def licence_of(wheel: Path) -> str:
 
 
 def _metadata(wheel: Path) -> Message:
+    name, version = wheel.name.split("-")[:2]
     with zipfile.ZipFile(wheel) as archive:
-        (name,) = (name for name in archive.namelist() if re.fullmatch(r"[^/]+\.dist-info/METADATA", name))
-        return Parser().parsestr(archive.read(name).decode())
-
-
-def _download(requirements: Sequence[str], python: str, directory: Path, source: Sequence[str | Path]) -> str:
-    platforms = [option for platform in PLATFORMS for option in ("--platform", platform)]
-    only_these = ("--only-binary=:all:", "--no-deps", "--python-version", python)
-    return _pip("download", *only_these, *platforms, "--dest", directory, *source, *requirements)
+        return Parser().parsestr(archive.read(f"{name}-{version}.dist-info/METADATA").decode())
 
 
 def _pip(*arguments: str | Path) -> str:
@@ -108,15 +104,5 @@ def _pip(*arguments: str | Path) -> str:
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode == 0:
         return ""
-    lines = [line.removeprefix("ERROR: ") for line in done.stderr.splitlines() if line.strip()]
-    return lines[-1] if lines else f"pip ended with status {done.returncode}"
-
-
-def _pin(line: str) -> tuple[str, str]:
-    name, _, version = line.strip().partition("==")
-    return _canonical_name(name), version
-
-
-def _canonical_name(name: str) -> str:
-    """A package's name as the index compares it."""
-    return re.sub(r"[-_.]+", "-", name).lower()
+    *_, last = ["", *filter(str.strip, done.stderr.splitlines())]
+    return last.removeprefix("ERROR: ") or f"pip ended with status {done.returncode}"

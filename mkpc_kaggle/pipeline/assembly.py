@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from mkpc_kaggle.pipeline.availability import (
 from mkpc_kaggle.pipeline.devices import AUTO, encoding_cache_bytes, gpus_of, require_device, resolve_placement
 from mkpc_kaggle.pipeline.stages import ENCODING_CACHE_BYTES, Pipeline
 from mkpc_kaggle.recipe import Mode, Recipe, load_recipe
-from mkpc_kaggle.weights import FoundFile, WeightStore
+from mkpc_kaggle.weights import FoundFile, State, WeightStore
 
 CUDA_MINIBATCH = 8
 
@@ -78,15 +79,17 @@ class Assembly:
         return {
             "recipe": self.recipe.fingerprint(),
             "precision": self.placement.precision,
-            "weights": {slot: file.digest for slot, file in self._weight_files().items()},
+            "weights": {slot: file.digest for slot, file in self.weight_files.items()},
         }
 
     @property
     def weight_paths(self) -> tuple[Path, ...]:
         """The files that the matchers load."""
-        return tuple(file.path for file in self._weight_files().values())
+        return tuple(file.path for file in self.weight_files.values())
 
-    def _weight_files(self) -> dict[str, FoundFile]:
+    @cached_property
+    def weight_files(self) -> dict[str, FoundFile]:
+        """The files that the matchers load, by slot."""
         names = [name for name in self.recipe.matcher_names if name not in self.matchers]
         found = {slot: self.weights.find(slot) for slot in slots_of(self.recipe, names)}
         return {slot: file for slot, file in found.items() if file is not None}
@@ -131,4 +134,9 @@ def assemble(
         options_of(chosen, name)  # those of a matcher that no unit names are checked too
     left_out = by_kind({name: reasons[name] for name in written.matcher_names if name in reasons})
     chosen = chosen.only(lambda unit: unit.matcher not in lacking).with_scenes(scenes).in_mode(mode)
-    return Assembly(chosen, store, resolve_placement(device, precision), left_out, own, device)
+    made = Assembly(chosen, store, resolve_placement(device, precision), left_out, own, device)
+    unverified = sorted(file.path.name for file in made.weight_files.values() if file.state is State.UNVERIFIED)
+    if unverified:
+        listed = ", ".join(unverified)
+        warn_once(f"weights not verified: {listed}; `python -m mkpc_kaggle weights verify` says why")
+    return made

@@ -3,31 +3,42 @@
 import json
 import subprocess
 import sys
+from functools import cache
 from typing import Any
 
-from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.errors import UserError, warn_once
 from mkpc_kaggle.matchers.contract import Placement, Precision
 from mkpc_kaggle.pipeline.failures import DeviceError, Failure, failure_of, reason_of
 
 AUTO = "auto"
+ADVICE = "on Kaggle choose the accelerator GPU T4 x2, elsewhere try --device cpu"
 CACHE_SHARE = 0.25  # of a GPU's free memory, for the encodings that all workers on it keep
 TENSOR_CORES = (7, 0)  # the first compute capability that is faster in half precision
 # In a process of its own: a CUDA context takes some hundred MB of a GPU, and the parent of workers needs none.
 ASK_CAPABILITIES = """
 import json, torch
-print(json.dumps([torch.cuda.get_device_capability(gpu) for gpu in range(torch.cuda.device_count())]))
+gpus, errors = range(torch.cuda.device_count()), []
+for gpu in gpus:
+    try:
+        image = torch.ones(1, 1, 8, 8, device=gpu)
+        torch.nn.functional.conv2d(image @ image, image[..., :3, :3]).sum().item()
+    except RuntimeError as error:
+        errors.append(str(error).partition("\\n")[0])
+if errors and len(errors) == len(gpus):
+    raise SystemExit(errors[-1])
+print(json.dumps([torch.cuda.get_device_capability(gpu) for gpu in gpus]))
 """
 
 
 def resolve_placement(device: str, precision: str) -> Placement:
-    """The placement that the user's words mean: ``auto`` are the GPUs, "cuda", or the CPU.
+    """The placement that the user's words mean: ``auto`` are the GPUs, "cuda", or the CPU if none computes.
 
     Raises :class:`UserError` for an unknown word, and for a GPU that is not there.
     """
     import torch
 
     if device == AUTO:
-        device = "cuda" if torch.cuda.is_available() else "cpu"
+        device = "cuda" if torch.cuda.is_available() and _gpus_compute() else "cpu"
     elif device != "cpu":
         gpus_of(device)
     if precision == AUTO:
@@ -50,6 +61,14 @@ def fastest_precision(device: str) -> Precision:
     return Precision.BFLOAT16 if flags.get("avx512_bf16") or flags.get("amx_bf16") else Precision.FLOAT32
 
 
+def _gpus_compute() -> bool:
+    try:
+        return bool(gpu_capabilities())
+    except UserError as error:
+        warn_once(f"the CPU does the work: {error}")
+        return False
+
+
 def gpus_of(device: str) -> list[int]:
     """The numbers of the GPUs that ``cuda`` or ``cuda:N`` stands for; counting them makes no context."""
     import torch
@@ -59,19 +78,20 @@ def gpus_of(device: str) -> list[int]:
     if kind != "cuda" or (device != kind and not number.isdecimal()):
         raise UserError(f"unknown device {device!r}; known: auto, cpu, cuda, cuda:N")
     if not count:
-        raise UserError(f"--device {device}: this machine has no GPU that torch can use; try --device cpu")
+        raise UserError(f"--device {device}: this machine has no GPU that PyTorch can use; {ADVICE}")
     if number and int(number) >= count:
         known = ", ".join(f"cuda:{index}" for index in range(count))
         raise UserError(f"--device {device}: this machine has only {known}")
     return [int(number)] if number else list(range(count))
 
 
+@cache
 def gpu_capabilities() -> list[tuple[int, int]]:
-    """The compute capability of each GPU, such as (7, 5)."""
+    """The compute capability of each GPU, such as (7, 5); raises :class:`UserError` if none of them computes."""
     asked = subprocess.run([sys.executable, "-c", ASK_CAPABILITIES], capture_output=True, text=True, check=False)
     if asked.returncode:
         reason = asked.stderr.strip()[-300:]
-        raise UserError(f"PyTorch cannot use this machine's GPUs; try --device cpu. It says: {reason}")
+        raise UserError(f"PyTorch cannot compute on this machine's GPUs ({reason}); {ADVICE}")
     return [(major, minor) for major, minor in json.loads(asked.stdout.splitlines()[-1])]
 
 
@@ -87,7 +107,7 @@ def require_device(device: str) -> None:
     """Multiply and convolve on a device; raises :class:`DeviceError` if that fails.
 
     PyTorch counts GPUs for which its build or its cuDNN has no kernels among the available ones, and such a GPU
-    (a P100 with cuDNN 9.19) may multiply and not convolve: only kernels that run are proof.
+    may multiply and not convolve: only kernels that run are proof.
     """
     if device == "cpu":
         return
@@ -100,4 +120,4 @@ def require_device(device: str) -> None:
         if failure_of(error) is Failure.OUT_OF_MEMORY:
             raise
         reason = reason_of(error).partition("\n")[0]
-        raise DeviceError(f"{device} cannot be used ({reason}); try --device cpu") from error
+        raise DeviceError(f"{device} cannot be used ({reason}); {ADVICE}") from error

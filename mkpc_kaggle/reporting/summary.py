@@ -13,18 +13,19 @@ from mkpc_kaggle.reporting.tables import RunTables, run_tables, seconds_by_part,
 MAX_LINES = 8  # of each list
 
 
-def summary(pairs: Sequence[Pair], report: RunReport, left_out: Sequence[str] = ()) -> str:
+def summary(pairs: Sequence[Pair], report: RunReport) -> str:
     """The screen that ends a run."""
     tables = run_tables(pairs, report.records)
     resumed = f", {report.resumed} of them from earlier runs" if report.resumed else ""
     failed = filter(None, [trouble(report)])
-    return "\n".join([headline(tables, report) + resumed, *_lines(tables, report, left_out), *failed])
+    return "\n".join([headline(tables, report) + resumed, *_lines(tables, report), *failed])
 
 
 def overview(log: RunLog) -> str:
     """The same screen from a journal."""
     about = f"recipe {log.about.recipe}, {log.about.device}, {len(log.events)} events"
-    return "\n".join([headline(log.tables, log), about, *_lines(log.tables, log, log.about.left_out)])
+    left_out = filter(None, [left_out_line(log.about.left_out)])
+    return "\n".join([headline(log.tables, log), about, *left_out, *_lines(log.tables, log)])
 
 
 def headline(tables: RunTables, run: RunReport | RunLog) -> str:
@@ -60,18 +61,18 @@ def _error(record: PairRecord) -> str:
 
 def left_out_line(left_out: Sequence[str]) -> str:
     """Which matchers did not run, by cause, and how to get weights; empty if all ran."""
-    return (
-        f"left out, {'; '.join(left_out)} (get weights: python -m mkpc_kaggle weights fetch)" if left_out else ""
-    )
+    if not left_out:
+        return ""
+    advice = " (`python -m mkpc_kaggle weights fetch --out DIR` gets weights)"
+    return f"left out, {'; '.join(left_out)}" + advice * any(cause.startswith("no weights") for cause in left_out)
 
 
-def _lines(tables: RunTables, run: RunReport | RunLog, left_out: Sequence[str]) -> list[str]:
+def _lines(tables: RunTables, run: RunReport | RunLog) -> list[str]:
     failed = tables.failed
     reasons = list(failed["id"][:MAX_LINES] + ": " + failed["failure"][:MAX_LINES])
     return [
         *_found(tables),
         *_scenes(tables, run.scenes),
-        *filter(None, [left_out_line(left_out)]),
         *_list("pairs with the fallback row", reasons, len(failed)),
         *_list("units that failed", unit_failures(tables)),
         *_list("faults", run.faults),

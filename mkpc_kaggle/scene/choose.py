@@ -20,8 +20,7 @@ CONTRADICTION_MATCHES = 30  # that agree with the pair's own F
 CONTRADICTION_SHARE = 0.05  # as many of them have to agree with the scene's F
 FOCAL_SIGMA = 0.1  # standard deviation of the logarithm of a focal length that the scene found
 
-ModelImages: TypeAlias = Mapping[str, RegisteredImage]
-"""The registered images of one model, by digest."""
+ModelImages: TypeAlias = Mapping[str, RegisteredImage]  # the registered images of a model, by digest
 
 
 class Reason(StrEnum):

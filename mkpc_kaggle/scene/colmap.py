@@ -30,7 +30,7 @@ MAX_ERROR_PX = 1.0  # of a verified match
 MAX_TRIALS = 300  # of RANSAC for an edge: more find the same inliers at five times the cost
 LARGE = 100  # images; a larger scene has the cost of all its tracks, a smaller one their accuracy
 TRACKS_PER_IMAGE = 200  # that the global mapper keeps at first in a large scene, the longest
-MIN_REGISTERED = 0.9  # share of a small scene's images below which the other mapper is asked
+MIN_REGISTERED = 0.85  # share of a small scene's images below which the other mapper is asked
 SEED = 0
 
 

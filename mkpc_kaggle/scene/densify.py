@@ -6,15 +6,14 @@ from typing import TypeAlias
 
 MAX_IMAGES = 2000  # the search takes the square of their number
 
-Ends: TypeAlias = tuple[int, int]
-"""The two images of a pair by their places, the smaller first."""
+Ends: TypeAlias = tuple[int, int]  # the two images of a pair by their places, the smaller first
 
 
 def extra_pairs(image_count: int, pairs: Sequence[Ends], per_image: float) -> list[Ends]:
     """The pairs that a batch lacks to have ``per_image`` pairs for each of its images, the most wanted first.
 
     ``pairs`` are those that it has, in any order; a call with these and the extra pairs, and a larger number, goes
-    on from there. One after the other, the image in the fewest pairs gets a partner: the image that has most
+    on from there. In each step the image in the fewest pairs gets a partner: the image that has most
     partners in common with it, since they are likely to show the same, and among these the one in the fewest
     pairs. Nothing for a batch of more than ``MAX_IMAGES``.
     """

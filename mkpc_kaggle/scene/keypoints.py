@@ -2,7 +2,7 @@
 
 Matchers find a point again to within a fraction of a pixel only, when they see it in another pair, at another
 resolution, or when another matcher finds it. Structure from motion follows points through images, so points of an
-image that are less than a pixel apart have to become one.
+image that are less than a pixel apart have to become a single keypoint.
 """
 
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Images that one camera took at one zoom, recognised by the focal lengths that were found for them one by one.
+"""Images that one camera took at one zoom, recognised by the focal lengths that were found for each.
 
 A reconstruction that gives each image its own focal length trades it for the distance to what the image sees, and
 an image with few points may get any. If most images of one size agree on theirs, one camera took them, and a
@@ -16,8 +16,8 @@ from mkpc_kaggle.scene.view_graph import BatchImage
 MIN_ALIKE = 5  # registered images of one size
 ZOOM_POINTS = 0.5  # an image that disagrees but sees this share of the median image's points has another zoom
 
+# By the digest of an image, the focal length in pixels of the camera that it shares with others of its size.
 SharedIntrinsics: TypeAlias = Mapping[str, float]
-"""The focal length in pixels of the camera that took an image, by the image's digest; one camera for each size."""
 
 
 def shared_intrinsics(

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from mkpc_kaggle.data.outputs import require_no_input
+from mkpc_kaggle.data.outputs import require_apart
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.weights.checkpoint import load_tensors
 from mkpc_kaggle.weights.manifest import UNVERIFIED, WeightFile, digest_of, manifest
@@ -17,7 +17,7 @@ def convert(source: Path, target: Path) -> WeightFile:
     """
     if target.suffix != ".safetensors":
         raise UserError(f"--out {target}: the name must end in .safetensors")
-    require_no_input({"--out": target}, [source])
+    require_apart({"--out": target}, [source])
     tensors = load_tensors(source)
     from safetensors import SafetensorError
     from safetensors.torch import save_file

@@ -116,16 +116,11 @@ class WeightStore:
         return search.found
 
     def load(self, slot: str) -> "dict[str, torch.Tensor]":
-        """The slot's tensors by name, on the CPU; raises :class:`UserError` if the file is missing.
-
-        The first time that an unverified file is loaded, a warning names its digest, so that it can be pinned.
-        """
+        """The slot's tensors by name, on the CPU; raises :class:`UserError` if the file is missing."""
         found = self.find(slot)
         if found is None:
             names = " or ".join(file.name for file in self.alternatives(slot))
             raise UserError(f"no weights for {slot!r}: {names} not found (searched {self.searched})")
-        if found.state is State.UNVERIFIED:
-            warn_once(f"{found.path} is not verified: {found.note}")
         return load_tensors(found.path)
 
     def search(self, lines: Sequence[WeightFile]) -> Search:

@@ -1,4 +1,4 @@
-"""Matchers that go wrong on purpose, importable by worker processes."""
+"""Matchers, scenes and places that go wrong on purpose, importable by worker processes."""
 
 import os
 import resource
@@ -7,16 +7,21 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from multiprocessing.connection import Connection
+from functools import partial
+from math import inf
 from pathlib import Path
+from typing import Any, ClassVar
 
 import numpy as np
-from mkpc_kaggle.engine.pools.process import WORKER_ENVIRONMENT
-from mkpc_kaggle.engine.pools.scene_process import serve_scene
-from rectified import RectifiedMatcher, Seen
+import pytest
+from rectified import THREE_UNITS, RectifiedMatcher, Seen
 
-from mkpc_kaggle.data.images import Unreadable
-from mkpc_kaggle.engine.scenes import SceneJob
+from mkpc_kaggle.engine import places, session
+from mkpc_kaggle.engine.budget import Budget
+from mkpc_kaggle.engine.jobs import SceneJob, SceneResult
+from mkpc_kaggle.engine.places import LocalSite, Place
+from mkpc_kaggle.engine.process import ProcessWorker, ThreadWorker
+from mkpc_kaggle.engine.worker import MatchRunner, SceneRunner
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.matches import Matches
@@ -26,28 +31,9 @@ from mkpc_kaggle.scene.choose import Choice, Reason
 from mkpc_kaggle.scene.reconstruction import Reconstruction, RegisteredImage, SfmModel
 from mkpc_kaggle.scene.view_graph import BatchImage
 
+BROKEN = "CUDA error: an illegal memory access was encountered"
 
-def pipeline_once(assembly: Assembly, marker: Path) -> Pipeline:
-    """For the first worker; later ones die while they load."""
-    if marker.exists():
-        die()
-    marker.touch()
-    return assembly.pipeline()
-
-
-def pipeline_in_batches(assembly: Assembly, batch: int) -> Pipeline:
-    """As on a GPU."""
-    return Pipeline(assembly.recipe, assembly.matchers.__getitem__, minibatch=batch)
-
-
-def pipeline_telling_its_environment(assembly: Assembly, told: Path) -> Pipeline:
-    """What a worker's PyTorch is told, as the process was started with it."""
-    started_with = dict(
-        entry.split("=", 1) for entry in Path("/proc/self/environ").read_text().split("\0") if "=" in entry
-    )
-    told.write_text(", ".join(started_with.get(name, "") for name in WORKER_ENVIRONMENT))
-    return assembly.pipeline()
-
+# Faults
 
 Fault = Callable[[], None]
 
@@ -80,6 +66,13 @@ def exhaust_gpu() -> None:
     raise RuntimeError("CUDA out of memory. Tried to allocate 20.00 GiB")
 
 
+def break_device() -> None:
+    raise RuntimeError(f"{BROKEN}\nCUDA kernel errors might be asynchronously reported at some other API call")
+
+
+# Matchers
+
+
 @dataclass
 class FaultyMatcher(RectifiedMatcher):
     """``fault`` befalls the pair of brightness ``at`` on views longer than ``above``; only once, with ``once``,
@@ -92,75 +85,44 @@ class FaultyMatcher(RectifiedMatcher):
     once: Path | None = None
 
     def _match(self, seen0: Seen, seen1: Seen) -> Matches:
-        if seen0.brightness == self.at and max(seen0.view.content) > self.above and self._due():
+        if seen0.brightness == self.at and max(seen0.view.content) > self.above and self._is_due():
             self.fault()
         return super()._match(seen0, seen1)
 
-    def _due(self) -> bool:
+    def _is_due(self) -> bool:
         if self.once is None:
             return True
-        due = not self.once.exists()
+        is_due = not self.once.exists()
         self.once.touch()
-        return due
+        return is_due
 
 
 @dataclass
 class BrokenDeviceMatcher(RectifiedMatcher):
-    """A device that fails after ``good`` pairs, and from then on at everything in this process, as CUDA does; in
-    later ones too if it is broken ``for_good``. ``marker`` is a file that tells them that it has happened.
-    """
+    """A device that fails after ``good`` pairs, and from then on at everything in this process, as CUDA does."""
 
-    marker: Path = Path()
     good: int = 5
-    for_good: bool = False
-    failed: bool = False
 
     def _match(self, seen0: Seen, seen1: Seen) -> Matches:
-        happened = self.marker.exists()
-        if self.for_good if happened else len(self.calls) >= self.good:
-            self.marker.touch()
-            self.failed = True
-        if self.failed:
-            raise RuntimeError(
-                "CUDA error: an illegal memory access was encountered\n"
-                "CUDA kernel errors might be asynchronously reported at some other API call"
-            )
+        if len(self.calls) >= self.good:
+            break_device()
         return super()._match(seen0, seen1)
 
 
 @dataclass
 class NarrowMatcher(RectifiedMatcher):
-    """Has no memory for more than ``most`` pairs at a time; writes how many it was given to the file ``sizes``."""
+    """Has no memory for more than ``most`` pairs at a time; notes how many it was given each time."""
 
-    most: int = 1
-    sizes: Path = Path()
+    most: int = 2
+
+    def __post_init__(self) -> None:
+        self.sizes: list[int] = []
 
     def match(self, encodings0: Sequence[Seen], encodings1: Sequence[Seen]) -> list[Matches]:
-        with self.sizes.open("a") as log:
-            log.write(f"{len(encodings0)} ")
+        self.sizes.append(len(encodings0))
         if len(encodings0) > self.most:
             raise RuntimeError("cuDNN error: CUDNN_STATUS_ALLOC_FAILED")
         return super().match(encodings0, encodings1)
-
-
-@dataclass
-class RefusingMatcher(RectifiedMatcher):
-    """Raises at every pair."""
-
-    def _match(self, seen0: Seen, seen1: Seen) -> Matches:
-        raise ValueError("no such layer")
-
-
-@dataclass
-class SlowingMatcher(RectifiedMatcher):
-    """Ten times slower from the call of that number on."""
-
-    turn: int = 0
-
-    def _match(self, seen0: Seen, seen1: Seen) -> Matches:
-        if len(self.calls) == self.turn:
-            self.seconds *= 10
-        return super()._match(seen0, seen1)
 
 
 @dataclass
@@ -173,83 +135,187 @@ class NonsenseMatcher(RectifiedMatcher):
         return Matches.concatenate([bad, matches]) if seen0.brightness % 2 == 0 else bad
 
 
-@dataclass
-class VanishingMatcher(RectifiedMatcher):
-    """Takes a file away at its first call."""
+# Scenes
 
-    victim: Path = Path()
-
-    def _match(self, seen0: Seen, seen1: Seen) -> Matches:
-        self.victim.unlink(missing_ok=True)
-        return super()._match(seen0, seen1)
+SCENE_F = np.array(
+    [[0.0, 0, 0.2], [0, 0, -0.5], [-0.3, 0.6, 0.5]]
+)  # the scenes of these tests give it to all pairs
 
 
-@dataclass
-class FarMatcher(RectifiedMatcher):
-    """Where it is sent to, the paths of the machine it comes from lead nowhere."""
+class ScenesBy(SceneRunner):
+    """What a function makes of a job, in place of a reconstruction."""
 
-    def __setstate__(self, state: dict[str, object]) -> None:
-        from mkpc_kaggle.engine.pools import ray_actor
+    def __init__(self, make: Callable[[SceneJob], SceneResult]) -> None:
+        self._make = make
 
-        vars(self).update(state)
-        ray_actor.stamp_of = lambda _: None
-        ray_actor.read_image = lambda path: Unreadable(str(path), "not on this machine")
+    def run(self, job: Any, seconds: float) -> SceneResult:
+        return self._make(job)
 
 
-SCENE_F = np.array([[0.0, 0, 0.2], [0, 0, -0.5], [-0.3, 0.6, 0.5]])
-"""What the scene of these tests says of every pair."""
+def scenes_by(
+    monkeypatch: pytest.MonkeyPatch, make: Callable[[SceneJob], SceneResult], *, process: bool = False
+) -> None:
+    """Let ``make`` reconstruct batches, in a thread of this process or, as real runs do, in a process."""
+    if process:
+        monkeypatch.setattr(places, "SceneRunner", partial(ScenesBy, make))
+    else:
+        worker = partial(ThreadWorker, "scene", partial(ScenesBy, make))
+        monkeypatch.setattr(LocalSite, "scene_worker", lambda site: worker(site._ring))
 
 
-def choose_scene_for_all_but_the_first(job: SceneJob, answers: Connection) -> None:
-    """As a reconstruction would, without one; it makes as many points as there are matches."""
+def choose_scene_for_all_but_the_first(job: SceneJob) -> SceneResult:
+    """As a reconstruction would, without cameras; it makes as many points as there are matches."""
     choices = {index: Choice(SCENE_F, Reason.SCENE) for index in job.indices[1:]}
     choices[job.indices[0]] = Choice(None, Reason.CONTRADICTION)
-    names = tuple(sorted({name for pair in job.pairs for name in (pair.image0.name, pair.image1.name)}))
+    names = tuple(sorted({image.name for pair in job.pairs for image in (pair.image0, pair.image1)}))
     camera = Camera(np.eye(3), np.eye(3), np.zeros(3))
     images = (BatchImage(name, name, Size(80, 72)) for name in names)
     registered = tuple(RegisteredImage(image, camera, 99) for image in images)
     points = np.zeros((sum(len(pair.matches) for pair in job.pairs), 3))
-    answers.send(((Reconstruction(names, (SfmModel(registered, points, 0.5),)),), choices))
+    return SceneResult((Reconstruction(names, (SfmModel(registered, points, 0.5),)),), choices)
 
 
-def die_as_scene(*_: object) -> None:
+def die_as_scene(job: SceneJob) -> SceneResult:
     die()
+    raise AssertionError
 
 
-def raise_as_scene(*_: object) -> None:
-    raise SystemExit(3)
-
-
-def hang_as_scene(*_: object) -> None:
+def hang_as_scene(job: SceneJob) -> SceneResult:
+    (Path(os.environ["MKPC_TEST_HOME"]) / "hangs").write_text(str(os.getpid()))
     hang()
+    raise AssertionError
 
 
-def hang_as_scene_of_batch_one(job: SceneJob, answers: Connection) -> None:
-    if job.batch == "one":
-        hang()
-    choose_scene_for_all_but_the_first(job, answers)
+def raise_as_scene(job: SceneJob) -> SceneResult:
+    raise KeyError("image 7")
 
 
-def exhaust_memory_as_scene(*_: object) -> None:
-    sys.stderr = open(os.devnull, "w")  # noqa: PTH123, SIM115  # its traceback is no part of the test's output
+def exhaust_memory_as_scene(job: SceneJob) -> SceneResult:
     exhaust_memory()
+    raise AssertionError
 
 
-def exhaust_memory_within_pycolmap(job: SceneJob, answers: Connection) -> None:
+def reconstruct(job: SceneJob) -> SceneResult:
+    return SceneRunner().run(job, inf)
+
+
+def die_within_pycolmap(job: SceneJob) -> SceneResult:
+    """When its database is written, and cameras are to be found."""
+    import pycolmap
+
+    pycolmap.GlobalPipeline = lambda *_: die()
+    return reconstruct(job)
+
+
+def exhaust_memory_within_pycolmap(job: SceneJob) -> SceneResult:
     """Four megabytes are left when it begins."""
     import mkpc_kaggle.scene.colmap  # noqa: F401  # that is not what fails
 
     limit_memory(4 << 20)
     os.close(2)
-    serve_scene(job, answers)
+    return reconstruct(job)
 
 
-def scene_in_a_gigabyte(job: SceneJob, answers: Connection) -> None:
+def scene_in_a_gigabyte(job: SceneJob) -> SceneResult:
     """All that it may have; libraries that are only mapped are not counted."""
     resource.setrlimit(resource.RLIMIT_DATA, (1 << 30, 1 << 30))
-    serve_scene(job, answers)
+    return reconstruct(job)
 
 
-def scene_without_pycolmap(job: SceneJob, answers: Connection) -> None:
+def scene_without_pycolmap(job: SceneJob) -> SceneResult:
     sys.modules["pycolmap"] = None  # type: ignore[assignment]  # an import of it fails now
-    serve_scene(job, answers)
+    return reconstruct(job)
+
+
+# Places
+
+
+def thread_place(
+    name: str, matcher: RectifiedMatcher, minibatch: int = 1, pipeline: Callable[[], Pipeline] | None = None
+) -> Place:
+    """Where workers are threads of this process, with that matcher, or that pipeline."""
+    make = partial(Pipeline, THREE_UNITS, {matcher.name: matcher}.__getitem__, minibatch=minibatch)
+    return Place(name, partial(ThreadWorker, name, partial(MatchRunner, pipeline or make), lambda: None))
+
+
+def use_places(monkeypatch: pytest.MonkeyPatch, *used: Place, fallback: Sequence[Place] = ()) -> None:
+    """Let runs match at these places, and look every hundredth of a second for answers, without a pause."""
+
+    def site_of(pairs: Any, assembly: Assembly, plan: session.Session) -> LocalSite:
+        site = LocalSite(assembly, 0, plan.budget.clock)
+        site.places, site.fallback = list(used), list(fallback)
+        return site
+
+    monkeypatch.setattr(session, "site_of", site_of)
+    monkeypatch.setattr(places, "LISTEN_S", 0.01)
+    monkeypatch.setattr(places, "RESTART_PAUSE_S", 0.0)
+
+
+@dataclass
+class StandingClock:
+    """A clock that stands still, however long workers take, until :class:`PatientSite` moves it."""
+
+    now: float = 0.0
+
+    def __call__(self) -> float:
+        return self.now
+
+    @property
+    def budget(self) -> Budget:
+        return Budget(0.0, inf, self)
+
+
+class PatientSite(LocalSite):
+    """Its workers' time limits are over only when nothing else can happen: when all that are at work are stuck.
+
+    So no limit is over early on a busy machine, and none is waited for. Use :func:`patient`.
+    """
+
+    def __init__(self, assembly: Assembly, workers: int, clock: StandingClock) -> None:
+        super().__init__(assembly, workers, clock)
+        self._standing = clock
+
+    def wait(self, until: float) -> None:
+        super().wait(inf)
+        busy = [worker for worker in WatchedWorker.all if worker.is_busy]
+        if busy and until < inf and all(worker.is_stuck() for worker in busy):
+            self._standing.now = until
+
+
+class WatchedWorker(ProcessWorker):
+    """A worker process that is busy from its start to its answer, and from a job to its answer."""
+
+    all: ClassVar[list["WatchedWorker"]] = []
+    is_busy = False
+
+    def is_stuck(self) -> bool:
+        """Whether it will never answer, as the test knows."""
+        raise NotImplementedError
+
+    def start(self) -> None:
+        self.all.append(self)
+        self.is_busy = True
+        super().start()
+
+    def submit(self, job: Any, seconds: float) -> None:
+        self.is_busy = True
+        super().submit(job, seconds)
+
+    def answer(self) -> Any:
+        answer = super().answer()
+        self.is_busy = self.is_busy and answer is None
+        return answer
+
+    def kill(self) -> None:
+        self.is_busy = False
+        super().kill()
+
+
+def patient(monkeypatch: pytest.MonkeyPatch, kind: type[WatchedWorker]) -> Budget:
+    """Let runs have a :class:`PatientSite` with processes of that kind; the budget to give them."""
+    clock = StandingClock()
+    monkeypatch.setattr(WatchedWorker, "all", [])
+    monkeypatch.setattr(places, "ProcessWorker", kind)
+    monkeypatch.setattr(places, "RESTART_PAUSE_S", 0.0)
+    monkeypatch.setattr(session, "site_of", lambda _, assembly, plan: PatientSite(assembly, plan.workers, clock))
+    return clock.budget

@@ -24,7 +24,7 @@ class Image:
     versions: tuple[str, ...]
 
     def __str__(self) -> str:
-        return f"{self.python}-{self.versions[0]}"
+        return "-".join([self.python, *self.versions[:1], *self.versions[2:3]])
 
 
 NEWER = ("opencv-python-headless==4.13.0.92", "scikit-learn==1.6.1", "pandas==2.2.3", "scipy==1.15.3")
@@ -33,12 +33,12 @@ OPENCV_5 = ("opencv-python-headless==5.0.0.93", *NEWER[1:])
 IMAGES = (
     Image("3.11", ("torch==2.6.0", "numpy==1.26.4", *OLDER)),
     Image("3.12", ("torch==2.10.0", "numpy==2.0.2", *NEWER)),
+    Image("3.12", ("torch==2.11.0", "numpy==2.0.2", *NEWER)),
     Image("3.13", ("torch==2.11.0", "numpy==2.1.3", *NEWER)),
     Image("3.13", ("torch==2.11.0", "numpy==2.1.3", *OPENCV_5)),
 )
 BESIDE = ("matplotlib", "tqdm", "ipykernel", "nbclient", "nbformat")
-UNPACKED = (".zip", ".tar", ".gz", ".pt", ".pth", ".ckpt")
-"""Suffixes of the archives that Kaggle unpacks; torch's checkpoints are zip files."""
+UNPACKED = (".zip", ".tar", ".gz", ".pt", ".pth", ".ckpt")  # Kaggle unpacks archives, as torch's checkpoints are
 PACKAGES = (
     "numpy",
     "pandas",

@@ -8,7 +8,6 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 
 import cv2
@@ -18,16 +17,12 @@ from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.cluster import RayCluster
 from mkpc_kaggle.engine.engine import RunReport
-from mkpc_kaggle.engine.places import Place
-from mkpc_kaggle.engine.process import ProcessWorker
 from mkpc_kaggle.engine.records import PairRecord
 from mkpc_kaggle.engine.session import Interrupt, Session, run_pairs
-from mkpc_kaggle.engine.worker import MatchRunner
 from mkpc_kaggle.geometry.coordinates import View
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import MatcherSpec, Picture
 from mkpc_kaggle.pipeline.assembly import assemble
-from mkpc_kaggle.pipeline.stages import Pipeline
 from mkpc_kaggle.recipe import Recipe, Unit
 
 
@@ -93,12 +88,13 @@ def run(
     work_dir: Path,
     *,
     limit: float = float("inf"),
+    budget: Budget | None = None,
     interrupt: Interrupt | None = None,
     publish: Callable[[Sequence[PairRecord]], None] = lambda _: None,
     workers: int | RayCluster | None = 0,
 ) -> RunReport:
     assembly = assemble(recipe, matchers={matcher.name: matcher}, device="cpu")
-    budget = Budget(time.monotonic(), limit)
+    budget = budget or Budget(time.monotonic(), limit)
     session = Session(work_dir, budget, interrupt or Interrupt(), progress=False, workers=workers)
     return run_pairs(pairs, assembly, session, publish)
 
@@ -107,8 +103,3 @@ def interrupt_after(seconds: float) -> Interrupt:
     interrupt = Interrupt()
     threading.Timer(seconds, interrupt.set).start()
     return interrupt
-
-
-def process_place(make_pipeline: Callable[[], Pipeline], name: str = "cpu") -> Place:
-    """Where worker processes are started with that pipeline."""
-    return Place(name, partial(ProcessWorker, name, partial(MatchRunner, make_pipeline), lambda: None))

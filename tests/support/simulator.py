@@ -1,6 +1,6 @@
 """The engine on a virtual clock: random runs without images, and how well each used its time.
 
-The planner and the engine are the real ones. Workers are simulated: what a unit costs is drawn at random, and
+The plan and the engine are the real ones. Workers are simulated: what a unit costs is drawn at random, and
 drifts, stalls, crashes, hangs and wrong first estimates are thrown in. So are reconstructions of batches, which
 crash, run out of memory and hang as well.
 """
@@ -42,10 +42,9 @@ from mkpc_kaggle.scene.choose import Choice, Reason
 from mkpc_kaggle.scene.config import SceneConfig
 
 RESTART_S = 8.0
-STALL = 20.0
-"""A unit that stalls takes that many times as long."""
-SWEEP_SHARE = 0.7
-"""The share of the limit within which the sweep is said to fit."""
+STALL = 20.0  # a unit that stalls takes so many times as long
+SIZES = (Size(640, 480), Size(640, 480))
+SWEEP_SHARE = 0.7  # of the limit, within which the sweep is said to fit
 
 
 @dataclass(frozen=True)
@@ -324,10 +323,12 @@ class SimulatedScene:
 
 
 class MemoryJournal:
-    """A journal that forgets with the process."""
+    """A journal that forgets with the process, not with the run."""
 
     def __init__(self) -> None:
+        self._records: dict[int, PairRecord] = {}
         self._results: dict[int, tuple[UnitResult, ...]] = {}
+        self._scenes: dict[str, SceneRecord] = {}
 
     def forget_changed(self, pairs: Sequence[Pair]) -> int:
         return 0
@@ -336,7 +337,7 @@ class MemoryJournal:
         pass
 
     def records(self) -> dict[int, PairRecord]:
-        return {}
+        return dict(self._records)
 
     def results(self, pair: int, units: Mapping[str, Unit]) -> tuple[UnitResult, ...]:
         return self._results.get(pair, ())
@@ -344,13 +345,16 @@ class MemoryJournal:
     def save(self, outcomes: list[tuple[Outcome, bool]]) -> None:
         for outcome, _ in outcomes:
             index = outcome.record.index
+            self._records[index] = outcome.record
             self._results[index] = self._results.get(index, ()) + outcome.results
 
     def scenes(self) -> tuple[SceneRecord, ...]:
-        return ()
+        return tuple(self._scenes.values())
 
     def save_scene(self, scene: SceneRecord, choices: Mapping[int, Choice]) -> None:
-        pass
+        self._scenes[scene.batch] = scene
+        for index, choice in choices.items():
+            self._records[index] = replace(self._records[index], scene=choice)
 
     def settle(self, records: Iterable[PairRecord]) -> None:
         pass
@@ -364,7 +368,7 @@ class Ran:
     """What became of a scenario; ``late`` and ``lost`` must be 0.
 
     ``utilisation`` is what was used of what was given. Given are the workers' seconds from their start to the
-    budget's stop, without those that injected faults take from any planner (see :class:`SimulatedPool`). Used are
+    budget's stop, without those that injected faults take from any planner (see :class:`SimulatedSite`). Used are
     the seconds of jobs whose results came back in time, warm-ups and stalls included. So idle workers, the end of
     a phase, what a lost job had done before, silence longer than a stall's, a slow unit taken to hang, and what
     is still under way at the end all count against the engine. Workers' time while nothing but scenes is under way
@@ -373,7 +377,7 @@ class Ran:
     ``lost`` counts pairs without the sweep's F where the sweep fits (see :func:`sweep_seconds`), and versions of
     the submission that lack a row. ``missed`` are batches without a scene that no fault befell; ``scenes_fit``
     says that what is left to scenes at most suffices for all, and that none hung while others waited. ``last_job``
-    is when the last job came back.
+    is when the last job came back. ``scene_units`` counts the unit results of each batch.
     """
 
     scenario: Scenario
@@ -385,6 +389,7 @@ class Ran:
     scenes_fit: bool
     last_job: float
     scenes: tuple[SimulatedScene, ...]
+    scene_units: Mapping[str, int]
     jobs: int
     planning: float
 
@@ -393,22 +398,23 @@ class Ran:
         return self.report.ending is not Ending.COMPLETE
 
 
-def simulate(scenario: Scenario) -> Ran:
-    """Run one scenario through the real engine."""
+def simulate(scenario: Scenario, journal: MemoryJournal | None = None, until: float = math.inf) -> Ran:
+    """Run one scenario through the real engine, as long as nobody interrupts it."""
     clock = VirtualClock()
     budget = Budget(0.0, scenario.limit, clock)
     site = SimulatedSite(scenario, clock, budget.stop_units)
     share = max(1, scenario.batches) / scenario.pairs
     pairs = [Pair(str(n), f"{int(n * share):03d}", f"{n:07d}", "b") for n in range(scenario.pairs)]
     published: list[int] = []
+    interrupt = threading.Event()
     engine = Engine(
         pairs,
         scenario.recipe,
         site,
-        MemoryJournal(),
+        journal or MemoryJournal(),
         budget,
         publish=lambda records: published.append(len(records)),
-        interrupt=threading.Event(),
+        interrupt=interrupt,
         progress=False,
     )
     planning, jobs = 0.0, 0
@@ -422,6 +428,12 @@ def simulate(scenario: Scenario) -> Ran:
         jobs += job is not None
         return job
 
+    def wait(moment: float) -> None:
+        whole_wait(min(moment, until))
+        if clock.now >= until:
+            interrupt.set()
+
+    whole_wait, site.wait = site.wait, wait  # type: ignore[method-assign]
     engine.plan.next = timed  # type: ignore[method-assign, assignment]
     report = engine.run()
     swept = sum(record.matches > 0 for record in report.records)
@@ -440,6 +452,10 @@ def simulate(scenario: Scenario) -> Ran:
         and not any(map(_hangs, site.scenes)),
         site.last_job,
         tuple(site.scenes),
+        {
+            name: sum(len(engine.plan.records[index].units) for index in indices)
+            for name, indices in engine.scenes.batches.items()
+        },
         jobs,
         planning / max(1, jobs),
     )

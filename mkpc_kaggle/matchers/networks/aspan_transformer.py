@@ -144,15 +144,6 @@ def _pooled(side: Side) -> Side:
     return replace(side, visual=visual, positions=positions)
 
 
-@dataclass(frozen=True, eq=False)
-class Messages:
-    """Of three levels: ``coarse`` (N, h / rows, w / columns, 256), ``half`` (N, h/2, w/2, 256), ``full``."""
-
-    coarse: Tensor
-    half: Tensor
-    full: Tensor
-
-
 class HierarchicalAttention(nn.Module):
     """Messages of the global level and of the two adaptive-span levels, merged."""
 
@@ -163,13 +154,16 @@ class HierarchicalAttention(nn.Module):
 
     def forward(self, q: Tensor, k: Tensor, v: Tensor, flow: Tensor, own: Side, other: Side) -> Tensor:
         """Queries of ``own``, keys and values of ``other``, and the flow of ``own`` -> message (N, h, w, 256)."""
-        found = self.messages(q, k, v, flow, own, other)
+        coarse, half, full = self.messages(q, k, v, flow, own, other)
         h, w = q.shape[1:3]
-        stacked = torch.cat([_repeated(found.coarse, h, w), _repeated(found.half, h, w), found.full], dim=-1)
+        stacked = torch.cat([_repeated(coarse, h, w), _repeated(half, h, w), full], dim=-1)
         merged: Tensor = self.merge_head(stacked)
         return merged
 
-    def messages(self, q: Tensor, k: Tensor, v: Tensor, flow: Tensor, own: Side, other: Side) -> Messages:
+    def messages(
+        self, q: Tensor, k: Tensor, v: Tensor, flow: Tensor, own: Side, other: Side
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Of the global level (N, h / rows, w / columns, 256), of half (N, h/2, w/2, 256) and of full size."""
         coarse = global_attention(
             mean_pool(q, own.factor),
             mean_pool(k, other.factor),
@@ -178,7 +172,7 @@ class HierarchicalAttention(nn.Module):
             (own.pooled_mask, other.pooled_mask),
         )
         half, full = (self._span_level(q, k, v, flow, factor, own.mask) for factor in SPAN_LEVELS)
-        return Messages(coarse, half, full)
+        return coarse, half, full
 
     def _span_level(
         self, q: Tensor, k: Tensor, v: Tensor, flow: Tensor, factor: int, mask: Tensor | None

@@ -103,19 +103,6 @@ class SuperGlueLayer(nn.Module):
         return self.update(x, self.message(x, n0))
 
 
-class GraphNetwork(nn.Module):
-    """Layers that look alternately at the keypoints of the same and of the other image."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.layers = nn.ModuleList(SuperGlueLayer(cross=index % 2 == 1) for index in range(LAYERS))
-
-    def forward(self, x: Tensor, n0: int) -> Tensor:
-        for layer in self.layers:
-            x = layer(x, n0)
-        return x
-
-
 class SuperGlue(nn.Module):
     """Keypoint encoder, graph network, optimal transport; for inference only.
 
@@ -127,7 +114,8 @@ class SuperGlue(nn.Module):
         self.sinkhorn_iterations = sinkhorn_iterations
         self.match_threshold = match_threshold
         self.kenc = PositionEncoder()
-        self.gnn = GraphNetwork()
+        layers = nn.ModuleList(SuperGlueLayer(cross=index % 2 == 1) for index in range(LAYERS))
+        self.gnn = nn.ModuleDict({"layers": layers})
         self.final_proj = Pointwise(CHANNELS, CHANNELS)
         self.bin_score = nn.Parameter(torch.tensor(1.0))  # the score of being unmatched
         self.eval().requires_grad_(False)
@@ -138,7 +126,9 @@ class SuperGlue(nn.Module):
         if n0 == 0 or n1 == 0:
             return Assignment.empty(image0.points.device)
         x = torch.cat([self.encoded(image0), self.encoded(image1)], dim=1)
-        scores = self.score_matrix(self.final_proj(self.gnn(x, n0)), n0)
+        for layer in self.gnn.get_submodule("layers").children():
+            x = layer(x, n0)
+        scores = self.score_matrix(self.final_proj(x), n0)
         check_finite("scores of superglue", scores)
         log_plan = log_optimal_transport(scores, self.bin_score, self.sinkhorn_iterations)
         return mutual_matches(log_plan[0, :-1, :-1], self.match_threshold)

@@ -1,0 +1,324 @@
+"""The plan's decisions, and the engine on a virtual clock."""
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from statistics import median
+
+import numpy as np
+import pytest
+from rectified import SECOND, SWEEP, THIRD, THREE_UNITS
+from simulator import MemoryJournal, Scenario, random_scenario, simulate, without_records
+
+from mkpc_kaggle.engine.budget import Budget
+from mkpc_kaggle.engine.engine import Ending
+from mkpc_kaggle.engine.jobs import Cause, Failure, MatchJob, MatchResult, Outcome, Phase
+from mkpc_kaggle.engine.plan import HANGS, JOB_PAIRS, Plan
+from mkpc_kaggle.engine.records import PairRecord, UnitRecord
+from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
+from mkpc_kaggle.pipeline.pair import UnitResult
+from mkpc_kaggle.recipe import Unit
+
+DIED = Failure(Cause.DIED, "signal SIGKILL")
+
+
+def plan_of(count: int = 40, limit: float = math.inf, extra: int = 0, connecting: int = 0) -> Plan:
+    records = [PairRecord.untouched(index) for index in range(count + extra)]
+    budget = Budget(0.0, limit, lambda: 0.0)
+    return Plan(
+        range(count), THREE_UNITS, records, budget, extra=range(count, count + extra), connecting=connecting
+    )
+
+
+def finished(job: MatchJob, plan: Plan, inliers: Callable[[int], int] = lambda _: 50) -> MatchResult:
+    """Every unit of a job took a second and found some inliers."""
+    outcomes = []
+    for index in job.indices:
+        former = plan.records[index]
+        new = former.lacking(job.units)
+        found = (UnitRecord(unit.name, unit.stage, 100, inliers(index), 0.0, 1.0, "") for unit in new)
+        results = tuple(UnitResult(unit, Matches.empty(), 0.0, 1.0) for unit in new)
+        outcomes.append(Outcome(PairRecord(index, FALLBACK_FUNDAMENTAL, "", (*former.units, *found)), results))
+    return MatchResult(tuple(outcomes))
+
+
+def jobs_of(
+    plan: Plan,
+    fails: Callable[[MatchJob], Failure | None] = lambda _: None,
+    inliers: Callable[[int], int] = lambda _: 50,
+) -> Iterator[MatchJob]:
+    """All jobs of one place, each of which comes back, or is lost, before the next is planned."""
+    now, failure = 0.0, None
+    while (job := plan.next(now, "here", cautious=failure is not None)) is not None:
+        yield job
+        result, failure = finished(job, plan, inliers), fails(job)
+        now += result.unit_seconds
+        if failure is None:
+            plan.on_result(job, result, result.unit_seconds, now)
+        else:
+            plan.on_failure(job, failure, "here", now)
+
+
+def learnt(plan: Plan, unit: Unit) -> Plan:
+    """What a unit costs is known, a second."""
+    plan.costs.observe(unit.name, 1.0)
+    return plan
+
+
+def explained(plan: Plan, text: str) -> bool:
+    return any(text in explanation.text for explanation in plan.explanations)
+
+
+def test_the_phases_follow_each_other_and_every_pair_has_every_unit() -> None:
+    plan = plan_of(extra=3, connecting=2)
+    phases = [job.phase for job in jobs_of(plan)]
+    assert phases == sorted(phases, key=list(Phase).index)
+    assert plan.is_complete
+    assert all(not record.lacking(THREE_UNITS.units) for record in plan.records[:40])
+    assert [len(record.units) for record in plan.records[40:]] == [1, 1, 1]
+
+
+def test_no_pair_is_in_two_jobs_at_a_time() -> None:
+    plan = plan_of(9)
+    jobs = []
+    while (job := plan.next(0.0)) is not None:
+        jobs.append(job)
+    indices = [index for job in jobs for index in job.indices]
+    assert sorted(indices) == list(range(9))
+    assert {len(job.indices) for job in jobs} == {1}, "the cost of the unit is unknown"
+
+
+def test_a_lost_job_is_halved_then_split_by_units_and_given_up_for_its_pair() -> None:
+    plan = plan_of(9)
+    seen = []
+
+    def fails(job: MatchJob) -> Failure | None:
+        seen.append((job.indices, job.units))
+        return DIED if job.phase is Phase.DEEPEN and 1 in job.indices and THIRD in job.units else None
+
+    list(jobs_of(plan, fails))
+    deepened = [(indices, units) for indices, units in seen if SWEEP not in units and 1 in indices]
+    assert [len(indices) for indices, _ in deepened] == [8, 4, 2, 1, 1, 1, 1]
+    assert [units for _, units in deepened[3:]] == [(THIRD, SECOND), (SECOND,), (THIRD,), (THIRD,)]
+    given_up = {(index, unit.unit) for index in range(9) for unit in plan.records[index].units if unit.failure}
+    assert given_up == {(1, THIRD.name)}
+    assert plan.records[1].units[-1].failure == "given up: the worker died: signal SIGKILL"
+    assert plan.records[1].failure == "", "it keeps the F that it has"
+    assert plan.is_complete
+
+
+def test_a_unit_that_never_ran_is_given_up_on_all_pairs_after_some() -> None:
+    plan, lost = plan_of(200), []
+
+    def fails(job: MatchJob) -> Failure | None:
+        if SECOND not in job.units:
+            return None
+        lost.append(job)
+        return DIED
+
+    list(jobs_of(plan, fails))
+    assert len(lost) <= JOB_PAIRS
+    assert plan.unusable == {SECOND.name}
+    assert plan.is_complete
+    assert explained(plan, f"{SECOND.name} is given up on all pairs: it never ran")
+
+
+def test_a_lost_job_is_tried_again_in_another_place_where_there_is_one() -> None:
+    plan = learnt(plan_of(1), SWEEP)
+    plan.workers = 2
+    job = plan.next(0.0, "first")
+    assert job is not None
+    plan.on_failure(job, DIED, "first", 1.0)
+    assert plan.next(1.0, "first") is None
+    again = plan.next(1.0, "second")
+    assert again is not None
+    assert again.indices == job.indices
+
+
+def test_the_only_place_that_is_left_tries_again_what_was_lost_there() -> None:
+    plan = learnt(plan_of(1), SWEEP)
+    plan.on_failure(plan.next(0.0, "here"), DIED, "here", 1.0)  # type: ignore[arg-type]
+    assert plan.next(1.0, "here") is not None
+
+
+def test_a_place_that_lost_a_worker_tries_one_pair_and_one_unit_that_was_not_lost() -> None:
+    plan = plan_of(40)
+    deepening = next(job for job in jobs_of(plan) if job.phase is Phase.DEEPEN and len(job.indices) == 8)
+    plan.on_failure(deepening, DIED, "here", 0.0)
+    careful = plan.next(0.0, "here", cautious=True)
+    assert careful is not None
+    assert (len(careful.indices), len(careful.units)) == (1, 1)
+    assert not set(careful.indices) & set(deepening.indices)
+
+
+def test_what_a_jobs_own_deadline_cut_off_is_planned_again() -> None:
+    plan = learnt(plan_of(17, limit=1000.0), SWEEP)
+    first = plan.next(0.0)
+    job = plan.next(0.0)
+    assert first is not None
+    assert job is not None
+    whole = finished(job, plan)
+    nothing = Outcome(PairRecord.untouched(job.indices[-1]))
+    plan.on_result(job, MatchResult((*whole.outcomes[:-1], nothing)), 7.0, 7.0)
+    again = plan.next(7.0)
+    assert again is not None
+    assert (again.phase, again.indices) == (job.phase, job.indices[-1:])
+
+
+def test_a_worker_hangs_after_many_times_what_its_units_take() -> None:
+    job = learnt(plan_of(limit=32400.0), SWEEP).next(0.0)
+    assert job is not None
+    assert job.seconds > 1.0
+    assert job.time_limit == job.seconds + HANGS
+
+
+@pytest.mark.parametrize("limit", [20.0, 600.0, 32400.0])
+def test_a_short_run_waits_less_for_a_silent_worker(limit: float) -> None:
+    job = learnt(plan_of(limit=limit), SWEEP).next(0.0)
+    assert job is not None
+    assert job.time_limit < max(0.05 * limit + 20, 20)
+
+
+def test_where_no_unit_ends_in_time_there_is_no_job_until_scenes_need_less() -> None:
+    plan = learnt(plan_of(3, limit=100.0), SWEEP)
+    plan.reserve = 10.0
+    now = plan.stop - 0.5
+    assert plan.next(now) is None
+    assert plan.has_work
+    plan.reserve = 0.0
+    assert plan.next(now) is not None
+
+
+def test_units_that_do_not_fit_for_all_go_to_the_weakest_pairs_in_the_time_left() -> None:
+    plan = plan_of(60, limit=100.0)
+    jobs = list(jobs_of(plan, inliers=lambda index: index))
+    filled = [index for job in jobs if job.phase is Phase.FILL for index in job.indices]
+    assert explained(plan, "1 of 3 units fit")
+    assert explained(plan, "pairs that lack units, the weakest first"), plan.explanations
+    assert filled
+    assert filled == sorted(filled)
+    assert filled[0] < 4
+    assert not plan.is_complete
+
+
+def test_further_pairs_of_scenes_are_matched_when_all_units_have_run() -> None:
+    plan = plan_of(6, limit=100.0, extra=80)
+    jobs = list(jobs_of(plan))
+    assert all(not record.lacking(THREE_UNITS.units) for record in plan.records[:6])
+    further = [job for job in jobs if job.phase is Phase.DENSIFY]
+    assert {job.units for job in further} == {(SWEEP,)}
+    had = [record.index for record in plan.records[6:] if record.units]
+    assert had == list(range(6, 6 + len(had))), "in their order"
+    assert 15 < len(had) < 45, "half of the time left is kept for their scenes"
+    assert plan.is_complete
+
+
+def test_other_devices_try_what_was_given_up_and_pairs_keep_what_they_have() -> None:
+    plan = plan_of(4)
+    list(jobs_of(plan, lambda job: DIED if SECOND in job.units else None))
+    given_up = [record.index for record in plan.records if record.has(SECOND)]
+    assert plan.unusable == {SECOND.name}
+    assert plan.restart(0.0, "the work goes on on the cpu") == dict.fromkeys(given_up, -1)
+    assert all(units == (SECOND,) for units in (job.units for job in jobs_of(plan)))
+    assert plan.is_complete
+    assert not any(unit.failure for record in plan.records for unit in record.units)
+
+
+def test_a_pairs_seconds_are_those_of_all_its_jobs() -> None:
+    plan, jobs = plan_of(1), 0
+    while (job := plan.next(0.0)) is not None:
+        (outcome,) = finished(job, plan).outcomes
+        timed = replace(outcome.record, cluster_seconds=1.0, estimate_seconds=2.0)
+        plan.on_result(job, MatchResult((replace(outcome, record=timed),)), 1.0, 0.0)
+        jobs += 1
+    assert jobs > 1
+    assert (plan.records[0].cluster_seconds, plan.records[0].estimate_seconds) == (jobs, 2 * jobs)
+
+
+# The engine on a virtual clock
+
+
+def test_costs_that_change_are_planned_for_and_explained() -> None:
+    ran = simulate(Scenario(400, (0.5, 1.0, 1.0), 1, 1100.0, warm_up=1, misses=0, drift=10, turn=0.5))
+    assert ran.late == ran.lost == 0
+    assert ran.report.ending is Ending.TIME_IS_UP
+    assert any("of 3 units fit" in explanation.text for explanation in ran.report.explanations)
+
+
+def test_more_time_never_means_fewer_units() -> None:
+    runs = [simulate(Scenario(40, (1.0, 1.0, 1.0), 1, limit, misses=0)) for limit in (40.0, 80.0, 120.0, 999.0)]
+    units = [sum(len(record.units) for record in ran.report.records) for ran in runs]
+    assert units == sorted(units)
+    assert 0 < units[0] < 40 < units[1] < units[-1] == 120
+    assert all(ran.late == ran.lost == 0 for ran in runs)
+
+
+@pytest.mark.parametrize(
+    ("scenarios", "pairs", "middle", "low"),
+    [
+        (150, 300, 0.98, 0.8),
+        pytest.param(1000, 10_000, 0.99, 0.95, marks=[pytest.mark.slow, pytest.mark.timeout(3 * 3600)]),
+    ],
+)
+def test_random_runs_are_never_late_never_lose_a_row_and_use_their_time(
+    scenarios: int, pairs: int, middle: float, low: float
+) -> None:
+    runs = [without_records(simulate(random_scenario(seed, pairs))) for seed in range(scenarios)]
+    assert max(run.late for run in runs) == 0
+    assert sum(run.lost for run in runs) == 0
+    assert sum(run.missed for run in runs if run.scenes_fit) == 0
+    used = [run.utilisation for run in runs if run.work_left]
+    assert median(used) > middle
+    assert np.percentile(used, 5) > low
+
+
+def test_undisturbed_runs_use_all_their_time() -> None:
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        workers = int(rng.integers(1, 5))
+        scenario = Scenario(600 * workers, tuple(rng.uniform(0.2, 2, 5).tolist()), workers, 2400.0, seed=seed)
+        ran = simulate(replace(scenario, limit=0.8 * scenario.work + 60))
+        assert ran.work_left
+        assert ran.utilisation > 0.97, scenario
+
+
+def test_planning_a_job_does_not_take_longer_for_many_pairs() -> None:
+    few, many = (simulate(Scenario(count, (0.1, 0.5, 0.5), 2, count)) for count in (1000, 20_000))
+    assert many.jobs > 2500
+    assert many.planning < 5 * few.planning
+
+
+def test_scenes_are_done_beside_matching_and_the_last_in_the_time_kept_for_it() -> None:
+    ran = simulate(Scenario(600, (0.5, 1.0, 1.0), 1, 1200.0, warm_up=1, batches=6, scene_seconds=0.3))
+    assert ran.late == ran.lost == ran.missed == 0
+    assert ran.work_left
+    assert len({scene.batch for scene in ran.scenes}) == 6
+    assert sum(scene.begun + scene.seconds < ran.last_job for scene in ran.scenes) >= 5
+    assert max(scene.seen for scene in ran.scenes) < 1200.0
+    assert ran.utilisation > 0.95
+
+
+def test_a_scene_that_hangs_is_ended_and_the_others_have_their_turn() -> None:
+    ran = simulate(Scenario(900, (0.5, 1.0), 1, 3600.0, batches=9, scene_faults=0.4, seed=3))
+    assert any(scene.seconds == math.inf for scene in ran.scenes)
+    assert ran.late == ran.lost == ran.missed == 0
+    assert any("the worker hung" in fault for fault in ran.report.faults)
+
+
+def test_scenes_are_made_anew_of_the_further_pairs_that_the_time_left_allows() -> None:
+    ran = simulate(Scenario(300, (0.5, 1.0), 1, 3600.0, batches=3, pairs_per_image=1.0, misses=0))
+    assert ran.late == ran.lost == ran.missed == 0
+    assert any("pairs for the scenes alone" in explanation.text for explanation in ran.report.explanations)
+    assert len(ran.scenes) == 6, "each batch twice"
+    assert ran.report.ending is Ending.COMPLETE
+
+
+@pytest.mark.parametrize("moment", range(50, 1050, 100))
+def test_a_run_killed_at_any_moment_leaves_no_scene_out_of_date_when_it_goes_on(moment: float) -> None:
+    scenario = Scenario(300, (0.5, 1.0), 1, 3600.0, batches=3, pairs_per_image=1.0, misses=0)
+    journal = MemoryJournal()
+    simulate(scenario, journal, until=moment)
+    ran = simulate(scenario, journal)
+    assert ran.report.ending is Ending.COMPLETE
+    assert {scene.batch: scene.made_from for scene in ran.report.scenes} == ran.scene_units
