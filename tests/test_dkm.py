@@ -15,7 +15,7 @@ from mkpc_kaggle.matchers.networks.dense_warp import dense_warp
 from mkpc_kaggle.matchers.networks.dkm import DKM
 from mkpc_kaggle.matchers.networks.gaussian_process import coefficients, kernel
 from mkpc_kaggle.matchers.networks.pixels import network_input
-from mkpc_kaggle.matchers.networks.warp_refiner import Estimate, local_correlation
+from mkpc_kaggle.matchers.networks.warp_refiner import WarpEstimate, local_correlation
 
 
 @cache
@@ -109,7 +109,7 @@ def test_corrections_are_in_pixels_of_the_query_however_large_the_support_is(mon
     decoder = network().decoder
     monkeypatch.setattr(decoder.conv_refiner["8"], "forward", lambda query, support, flow: torch.ones(1, 3, 6, 8))
     query, support = (network().encode(images(1, *size)).coarse for size in ((48, 64), (72, 40)))
-    estimate = Estimate(torch.zeros(1, 2, 6, 8), torch.zeros(1, 1, 6, 8))
+    estimate = WarpEstimate(torch.zeros(1, 2, 6, 8), torch.zeros(1, 1, 6, 8))
     for other in (query, support):
         flow = decoder.correct(estimate, query, other, 8).flow
         torch.testing.assert_close(flow[0, :, 0, 0], torch.tensor([2 / 8, 2 / 6]) / 8)
@@ -154,12 +154,12 @@ def test_the_posterior_is_that_of_the_textbook():
 def test_targets_outside_have_no_certainty_and_coarse_doubts_count_half():
     flow = torch.zeros(1, 2, 2, 2)
     flow[0, 0, 0, 1], flow[0, 1, 1, 0], flow[0, :, 1, 1] = 1.001, -2, 1
-    found = dense_warp(Estimate(flow, torch.full((1, 1, 2, 2), -1.0)), torch.full((1, 1, 1, 1), -3.0))
+    found = dense_warp(WarpEstimate(flow, torch.full((1, 1, 2, 2), -1.0)), torch.full((1, 1, 1, 1), -3.0))
     raised = torch.tensor(0.5).sigmoid()
     torch.testing.assert_close(found.certainty[0], raised * torch.tensor([[1, 0], [0, 1]]))
     assert found.warp[0, ..., 2:].tolist() == [[[0, 0], [1, 0]], [[0, -1], [1, 1]]]
     assert found.warp[0, ..., :2].tolist() == [[[-0.5, -0.5], [0.5, -0.5]], [[-0.5, 0.5], [0.5, 0.5]]]
-    sure = dense_warp(Estimate(flow, torch.full((1, 1, 2, 2), -1.0)), torch.full((1, 1, 1, 1), 3.0))
+    sure = dense_warp(WarpEstimate(flow, torch.full((1, 1, 2, 2), -1.0)), torch.full((1, 1, 1, 1), 3.0))
     torch.testing.assert_close(sure.certainty[0, 0, 0], torch.tensor(-1.0).sigmoid())
     both = side_by_side((found, sure.swapped()))
     assert torch.equal(both.warp[0, 0, 3], torch.tensor([1, 0, 0.5, -0.5]))
