@@ -172,7 +172,7 @@ class Engine:
             self._fall_back(now)
             self._hand_out(now)
             is_matching = self._is_matching(now)
-            self._start_scenes(now, is_matching=is_matching)
+            self._start_scenes(now, is_matching=is_matching and now < self.plan.stop)
             if not is_matching and not self._scene_places:
                 return
             if now - self._published > max(PUBLISH_INTERVAL_S, self.budget.writing / PUBLISH_SHARE):

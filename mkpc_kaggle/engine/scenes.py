@@ -92,9 +92,12 @@ class Scenes:
     def due(self, done: Collection[int], filling: Collection[int] = ()) -> str | None:
         """A batch to reconstruct now: its matches have changed since it was, and all of its pairs are ``done``.
 
-        For the first time it is while some of them get further matches (``filling``), for the second afterwards.
+        For the first time it is while some of them get further matches (``filling``), for the second afterwards:
+        first those that were never reconstructed.
         """
-        for name, indices in self.batches.items() if self._open else ():
+        if not self._open:
+            return None
+        for name, indices in sorted(self.batches.items(), key=lambda batch: batch[0] in self.made):
             is_waiting = name in self._open and name not in self._running and self._unit_counts[name] > 0
             waits_for = filling if name in self.made else ()
             if is_waiting and all(index in done and index not in waits_for for index in indices):

@@ -90,7 +90,7 @@ FINE = {
     "another table for one": "DROP TABLE unit; CREATE TABLE unit (a, b)",
     "a view for a table": "ALTER TABLE pair RENAME TO was; CREATE VIEW pair AS SELECT * FROM was",
     "a trigger": "CREATE TRIGGER t AFTER INSERT ON event BEGIN DELETE FROM pair; END",
-    "a scene that is none": "INSERT INTO scene VALUES ('b1', 1, 1, 1, 1, 1, '', 'no cameras', '[]')",
+    "a scene that is none": "INSERT INTO scene VALUES ('b1', 1, 1, 1, 1, 1, 1, '', 'no cameras', '[]')",
 }
 BESIDE: dict[str, Callable[[Path], object]] = {
     "noise for its lock": lambda work: (work / "journal.lock").write_bytes(b"garbage" * 500),
