@@ -4,10 +4,7 @@ The weights are stand-ins: what is matched has no worth, but it is matched by al
 """
 
 import csv
-import runpy
 import shutil
-import sqlite3
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,8 +16,9 @@ from checkpoints import FILES, use_manifest, write_checkpoints
 from shared import DATA, needs_data
 from standin import scene, use_narrow
 
+from mkpc_kaggle.cli import main
 from mkpc_kaggle.data.competition import read_submission, read_test_side, submission_problems
-from mkpc_kaggle.engine.journal_tables import FILE_NAME, JournalReader
+from mkpc_kaggle.engine.journal_tables import JournalReader
 from mkpc_kaggle.geometry.coordinates import View
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import MatcherSpec, Picture
@@ -28,7 +26,6 @@ from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher
 from mkpc_kaggle.recipe import load_recipe
 from mkpc_kaggle.weights import WeightFile
 
-ROOT = Path(__file__).resolve().parents[1]
 COLUMNS = ("sample_id", "batch_id", "image_1_id", "image_2_id")
 
 
@@ -126,22 +123,17 @@ def write_recipe(directory: Path, matcher: str, *, easy: bool, tables: str = "")
     return path
 
 
-def make_submission(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> None:
-    """The front door, in this process, so that it meets the manifest that was put in its way."""
-    script = str(ROOT / "make_submission.py")
-    monkeypatch.setattr(sys, "argv", [script, *map(str, arguments)])
-    with pytest.raises(SystemExit) as left:
-        runpy.run_path(script, run_name="__main__")
-    assert left.value.code == 0
+def make_submission(*arguments: object) -> None:
+    """In this process, so that it meets the manifest that was put in its way."""
+    assert main(["submit", *map(str, arguments)]) == 0
 
 
 def matches_found(work_dir: Path) -> dict[tuple[int, int], int]:
     """The matches of each pair's unit by (pair, stage); none of the units may have failed."""
-    with sqlite3.connect(work_dir / FILE_NAME) as journal:
-        rows = journal.execute("SELECT pair, stage, matches, failure FROM unit").fetchall()
-    journal.close()
-    assert [failure for *_, failure in rows] == [""] * len(rows)
-    return {(pair, stage): matches for pair, stage, matches, _ in rows}
+    with JournalReader(work_dir) as journal:
+        found = [(index, unit) for index, record in journal.records().items() for unit in record.units]
+    assert [unit.failure for _, unit in found] == [""] * len(found)
+    return {(index, unit.stage): unit.matches for index, unit in found}
 
 
 def assert_good(output: Path, test_dir: Path) -> None:
@@ -179,19 +171,9 @@ def run(
         use_narrow(monkeypatch)
         output, recipe = tmp_path / f"{name}.csv", write_recipe(tmp_path, matcher, easy=easy, tables=tables)
         make_submission(
-            monkeypatch,
             *("--test-dir", test_dir, "--output", output, "--recipe", recipe),
-            *(
-                "--weights",
-                checkpoints.directory,
-                "--time-limit",
-                "10m",
-                "--device",
-                "cpu",
-                "--no-report",
-                "--workers",
-                workers,
-            ),
+            *("--weights", checkpoints.directory, "--time-limit", "10m", "--device", "cpu"),
+            *("--no-report", "--workers", workers),
         )
         assert_good(output, test_dir)
         return Made(output, matches_found(tmp_path / f"{name}.work"))
@@ -223,7 +205,7 @@ def test_a_batch_is_reconstructed_from_their_matches(
     run: Callable[..., Made], matcher: str, made_side: Path
 ) -> None:
     """All it can come to is a reason: the pictures are pieces of one, which no two cameras have seen."""
-    made = run(matcher, made_side, easy=True, tables="[focal]\n[scene]\nleast_pairs_per_image = 0")
+    made = run(matcher, made_side, easy=True, tables="[focal]\n[scene]\npairs_per_image = 0")
     work_dir = made.output.with_suffix(".work")
     with JournalReader(work_dir) as journal:
         (scene,) = journal.scenes()
