@@ -357,13 +357,23 @@ def with_stderr_closed(command: list[str]) -> int:
     ).returncode
 
 
-def on_a_full_disk(command: list[str]) -> int:
+def without_a_reader(command: list[str]) -> int:
+    reader, writer = os.pipe()
+    os.close(reader)
     environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
-    with Path("/dev/full").open("w") as full:
-        return subprocess.run(command, stdout=full, stderr=full, env=environment, check=False).returncode
+    with os.fdopen(writer, "wb") as gone:
+        return subprocess.run(command, stdout=gone, stderr=gone, env=environment, check=False).returncode
 
 
-@pytest.mark.parametrize("run_without", [on_a_closed_terminal, with_stderr_closed, on_a_full_disk])
+def on_a_disk_that_takes_nothing(command: list[str]) -> int:
+    environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
+    with Path(os.devnull).open() as refusing:  # not opened for writing; not each machine has a /dev/full
+        return subprocess.run(command, stdout=refusing, stderr=refusing, env=environment, check=False).returncode
+
+
+@pytest.mark.parametrize(
+    "run_without", [on_a_closed_terminal, with_stderr_closed, without_a_reader, on_a_disk_that_takes_nothing]
+)
 def test_a_run_that_cannot_print_makes_the_whole_submission(
     demo: DemoSet, recipe: Path, tmp_path: Path, run_without: Callable[[list[str]], int]
 ) -> None:
