@@ -20,11 +20,6 @@ from standin import scene, use_narrow
 
 from mkpc_kaggle.data.competition import read_submission, read_test_side, submission_problems
 from mkpc_kaggle.engine.journal_tables import FILE_NAME
-from mkpc_kaggle.geometry.coordinates import View
-from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.matchers.contract import MatcherSpec, Picture
-from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher
-from mkpc_kaggle.recipe import load_recipe
 from mkpc_kaggle.weights import WeightFile
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -176,54 +171,3 @@ def test_odd_small_and_blank_pictures_go_through(run: Callable[..., Made], match
     if matcher not in {"dkm", "roma", "loma"}:  # which have answers for all pixels, and keypoints on any picture
         assert made.matches[2, 1] == made.matches[2, 2] == 0
     assert run(matcher, made_side, "again").output.read_bytes() == made.output.read_bytes()
-
-
-class Clump:
-    """Sees the same 33 x 47 pixels matched in every pair, so that stage 2 looks at no more than those."""
-
-    spec = MatcherSpec("clump", "for tests")
-    corner = np.array([90, 61])
-
-    def encode(self, pictures: Sequence[Picture]) -> list[View]:
-        return [picture.view for picture in pictures]
-
-    def match(self, encodings0: Sequence[View], encodings1: Sequence[View]) -> list[Matches]:
-        points = np.stack(np.meshgrid(np.arange(0, 33, 4), np.arange(0, 47, 2)), axis=-1).reshape(-1, 2)
-        points = points + self.corner
-        return [
-            Matches(first.from_image(points), second.from_image(points), np.ones(len(points)))
-            for first, second in zip(encodings0, encodings1, strict=True)
-        ]
-
-
-@pytest.mark.parametrize("size", ["long_side = 47", ""])
-@pytest.mark.parametrize("matcher", TRIALS)
-def test_a_tiny_crop_goes_through(
-    clean_environment: None,
-    checkpoints: Checkpoints,
-    monkeypatch: pytest.MonkeyPatch,
-    tmp_path: Path,
-    matcher: str,
-    size: str,
-) -> None:
-    """At its own size, and enlarged; points lie on the crop, whatever it was padded to."""
-    use_manifest(monkeypatch, checkpoints.of(matcher))
-    use_narrow(monkeypatch)
-    path = tmp_path / "crop.toml"
-    path.write_text(
-        'units = [{ stage = 1, matcher = "clump", long_side = 300 },'
-        f'{{ stage = 2, matcher = "{matcher}", {size or TRIALS[matcher].sizes[1]} }}]\n[mkpc]\nexpand_x = 1.0\n'
-        f"[matchers.{matcher}]\n{TRIALS[matcher].options}"
-    )
-    match = TwoStageMatcher(
-        load_recipe(str(path)), weights=[checkpoints.directory], device="cpu", matchers={"clump": Clump()}
-    )
-    picture = scene(207, 313, channels=3)
-    found = match(picture, picture)
-    assert found.regions is not None
-    assert [region.box.size for region in found.regions] == [(33, 47)] * 2
-    _, result = found.results
-    assert result.failure == ""
-    assert size or len(result.matches) > 0
-    for region, points in zip(found.regions, (result.matches.points0, result.matches.points1), strict=True):
-        assert region.box.contains(points).all()
