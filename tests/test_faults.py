@@ -1,4 +1,4 @@
-"""Faults in real runs, on real images: a lost worker, image, disk, terminal or parent costs its part alone."""
+"""Faults injected into real runs: a worker, an image, a disk, a terminal or a parent that is lost."""
 
 import os
 import pty
@@ -216,7 +216,7 @@ def test_an_image_that_vanishes_before_it_is_reached_costs_its_pair_only(tmp_pat
     pairs = write_pairs(tmp_path, 40)
 
     def remove(_: int) -> int:
-        pairs[39].image1.unlink(missing_ok=True)
+        pairs[39].images[1].unlink(missing_ok=True)
         return 150
 
     report = run(pairs, THREE_UNITS, RectifiedMatcher(matches=remove), tmp_path / "work")
@@ -236,7 +236,7 @@ def test_an_image_that_vanishes_after_the_sweep_leaves_its_pair_the_f_it_has(tmp
     matcher = RectifiedMatcher(matches=interrupt_after_the_sweep)
     swept = run(pairs, THREE_UNITS, matcher, tmp_path / "work", interrupt=interrupt)
     assert swept.ending is Ending.INTERRUPTED
-    pairs[VICTIM].image1.unlink()
+    pairs[VICTIM].images[1].unlink()
     report = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
     assert report.ending is Ending.COMPLETE
     assert matrices(report)[VICTIM] == matrices(swept)[VICTIM]
@@ -249,8 +249,8 @@ def test_an_image_replaced_after_the_run_is_matched_anew(
 ) -> None:
     pairs = write_pairs(tmp_path / "pairs", 5)
     first = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
-    shutil.copy(pairs[4].image0, pairs[VICTIM].image0)
-    os.utime(pairs[0].image0)
+    shutil.copy(pairs[4].images[0], pairs[VICTIM].images[0])
+    os.utime(pairs[0].images[0])
     again = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
     assert "images have changed since they were matched: 1 pairs are matched anew" in capsys.readouterr().err
     anew = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "anew")

@@ -5,7 +5,6 @@ The weights are stand-ins: what is matched has no worth, but it is matched by al
 
 import csv
 import runpy
-import sqlite3
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -19,7 +18,7 @@ from checkpoints import FILES, use_manifest, write_checkpoints
 from standin import scene, use_narrow
 
 from mkpc_kaggle.data.competition import read_submission, read_test_side, submission_problems
-from mkpc_kaggle.engine.journal_tables import FILE_NAME
+from mkpc_kaggle.engine.journal_tables import JournalReader
 from mkpc_kaggle.weights import WeightFile
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -112,11 +111,10 @@ def make_submission(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> None
 
 def matches_found(work_dir: Path) -> dict[tuple[int, int], int]:
     """The matches of each pair's unit by (pair, stage); none of the units may have failed."""
-    with sqlite3.connect(work_dir / FILE_NAME) as journal:
-        rows = journal.execute("SELECT pair, stage, matches, failure FROM unit").fetchall()
-    journal.close()
-    assert [failure for *_, failure in rows] == [""] * len(rows)
-    return {(pair, stage): matches for pair, stage, matches, _ in rows}
+    with JournalReader(work_dir) as journal:
+        found = [(index, unit) for index, record in journal.records().items() for unit in record.units]
+    assert [unit.failure for _, unit in found] == [""] * len(found)
+    return {(index, unit.stage): unit.matches for index, unit in found}
 
 
 def assert_good(output: Path, test_dir: Path) -> None:

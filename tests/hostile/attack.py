@@ -82,7 +82,7 @@ def attack(case: Case, room: Path) -> None:
         status, seconds, output = _wait(process, room, allowed)
         faults += _faults(case, status, seconds, allowed, output, room)
         faults += [f"left running: {line}" for line in _orphans(mark)]
-        nothing = (status == 1 and TOO_LATE in output) or output.strip() == "interrupted"  # before it began
+        nothing = (status == 1 and TOO_LATE in output) or output.strip() == "error: interrupted"  # before it began
         if (
             case.submission
             and not nothing
