@@ -53,7 +53,7 @@ def require_apart(
         for place in (*inputs, *weights):
             if same_file(path, place) or (lies_in(path, place) and not is_result):
                 raise UserError(f"{option} {path} would be written over the input {place}; name another file")
-        if option in ("--json", "--report") and not is_result:
+        if option in ("--json", "--report") and not is_result and path.is_file():
             raise UserError(f"{option} {path} exists and is not a {RESULTS[option][0]} file; name another file")
     for place in inputs:
         if work_dir is not None and lies_in(work_dir, place):
