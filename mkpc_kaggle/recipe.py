@@ -33,14 +33,14 @@ class Mode(StrEnum):
 
 
 @dataclass(frozen=True)
-class Choice:
+class RecipeChoice:
     """A recipe's name or file, and the mode to run it in."""
 
     recipe: str
     mode: Mode = Mode.TWO_STAGE
 
     @classmethod
-    def parse(cls, text: str) -> "Choice":
+    def parse(cls, text: str) -> "RecipeChoice":
         """``NAME:MODE``; without a mode, the recipe as it is written."""
         name, _, mode = text.rpartition(":")
         return cls(name, Mode(mode)) if name and mode in list(Mode) else cls(text)

@@ -14,7 +14,6 @@ from mkpc_kaggle.matchers import loma
 from mkpc_kaggle.matchers.contract import Placement, encoding_bytes
 from mkpc_kaggle.matchers.loma import LomaAdapter, LomaOptions
 from mkpc_kaggle.matchers.networks import strips
-from mkpc_kaggle.matchers.networks.dad import select_keypoints
 from mkpc_kaggle.matchers.networks.dedode import dedode_g
 from mkpc_kaggle.matchers.networks.dinov2 import DinoV2Config
 from mkpc_kaggle.matchers.networks.loma import Loma, Variant, detector_size
@@ -162,18 +161,6 @@ def test_descriptors_are_read_from_a_map_that_is_never_made(network: Loma, kind:
     torch.testing.assert_close(descriptor(image, points), expected, rtol=0, atol=1e-5)
     assert (expected[0, 4] == 0).all()
     assert expected[0, 0].abs().max() > 0
-
-
-def test_no_more_keypoints_than_there_are_maxima() -> None:
-    logits = torch.full((6, 9), -1.0)
-    logits[2, 3], logits[5, 8] = 4, 3
-    found = select_keypoints(logits, 100)
-    assert len(found.points) == 2 + (
-        6 * 9 - 9 - 4
-    )  # all pixels of the plain are equal, but for the maxima's windows
-    assert found.scores[:2].tolist() == pytest.approx(logits.flatten().softmax(dim=0)[[21, 53]].tolist())
-    assert len(select_keypoints(logits * 1000, 100).points) == 1  # the other is less likely than any float32
-    assert len(select_keypoints(logits, 1).points) == 1
 
 
 @pytest.fixture(scope="module")

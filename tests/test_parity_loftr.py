@@ -66,14 +66,5 @@ def test_matches_are_the_mutual_maxima_of_both_softmaxes(monkeypatch, held):
     torch.testing.assert_close(matches.confidence.double(), confidence[tuple(expected.T)], rtol=1e-5, atol=0)
 
 
-def test_a_border_cell_suppresses_its_partner():
-    grid = torch.eye(25).view(1, 5, 5, 25)
-    other = grid.clone()
-    other[0, 2, 2] = 0  # cell 12 has no partner but a border cell that likes it, too
-    other[0, 0, 0] = 0.9 * grid[0, 2, 2]
-    cells = coarse_matches(grid, other, 50.0, 0.0, 1, None).cell0.tolist()
-    assert cells == [6, 7, 8, 11, 13, 16, 17, 18]
-
-
 if __name__ == "__main__":
     print_table("loftr", [*((case, stages_of(case)) for case in CASES), ("pos_encoding", position_stages())])

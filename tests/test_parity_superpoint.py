@@ -124,26 +124,6 @@ def network(**options):
     return network
 
 
-def test_equal_maxima_and_plateaus_survive():
-    scores = torch.zeros(1, 7, 9)
-    scores[0, 3, 2:6] = 0.5
-    assert torch.equal(suppress_non_maxima(scores, 4), scores)
-
-
-def test_of_a_ramp_the_first_three_points_of_the_chain_survive():
-    scores = torch.arange(1, 31).float().flip(0)[None, None]  # descending along one row
-    found = suppress_non_maxima(scores, 2)[0, 0].nonzero()[:, 0].tolist()
-    assert found == [0, 3, 6]
-
-
-def test_a_point_of_the_border_suppresses_before_it_is_removed():
-    scores = torch.zeros(1, 24, 24)
-    scores[0, 10, 3], scores[0, 10, 5], scores[0, 16, 16] = 0.9, 0.5, 0.4
-    points, kept = SuperPoint(border=4).select_keypoints(suppress_non_maxima(scores, 3)[0])
-    assert points.tolist() == [[16, 16]]
-    assert kept.tolist() == pytest.approx([0.4])
-
-
 def test_the_threshold_is_strict_and_the_limit_keeps_the_strongest_in_order():
     scores = torch.zeros(16, 24)
     for (y, x), score in {

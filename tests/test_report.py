@@ -199,11 +199,11 @@ def test_a_report_that_fails_is_a_line_and_leaves_the_page_without_drawings(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "report.html"
-    line = report_run(tmp_path / "nowhere", path, time.monotonic() + 60)
+    line = report_run(tmp_path / "nowhere", path, time.monotonic() + 600)
     assert line.startswith("warning: no report, or a report without drawings (")
     pairs = a_run(tmp_path, 3)
     monkeypatch.setattr("mkpc_kaggle.reporting.report.draw_strip", None)
-    assert report_run(tmp_path / "work", path, time.monotonic() + 60, pairs).startswith("warning: no report, or")
+    assert report_run(tmp_path / "work", path, time.monotonic() + 600, pairs).startswith("warning: no report, or")
     assert "Drawings are missing" in path.read_text()
 
 

@@ -182,7 +182,8 @@ class Plan:
     def has_work(self, now: float) -> bool:
         """Whether a pair waits that can gain something; what is under way may come back, too."""
         while now < self.stop and (chunk := self._peek(now)) is not None:
-            if any(self.can_gain(index, self._units(chunk, now)) for index in chunk.indices):
+            units = self._units(chunk, now)
+            if any(self.can_gain(index, units) for index in chunk.indices):
                 return True
             self._mark_done(chunk.phase, self._queue.fresh.popleft().indices)
         return now < self.stop and bool(self._queue.again)
