@@ -11,7 +11,6 @@ import threading
 from collections.abc import Callable
 from functools import partial
 from multiprocessing import resource_tracker, util
-from multiprocessing.context import SpawnProcess
 from pathlib import Path
 from typing import Any
 
@@ -130,16 +129,6 @@ def test_what_became_of_a_job_is_told_and_nothing_is_printed(
     assert failure.message in answer.message, "what cannot be pickled says so"
     worker.end()
     assert capfd.readouterr() == ("", "")
-
-
-def test_a_process_that_cannot_be_started_is_a_failure_with_its_reason(monkeypatch: pytest.MonkeyPatch) -> None:
-    def no_memory(_: SpawnProcess) -> None:
-        raise OSError(12, "Cannot allocate memory")
-
-    monkeypatch.setattr(SpawnProcess, "start", no_memory)
-    worker = Worker()
-    worker.worker.start()
-    assert worker.next_answer() == Failure(Cause.NOT_STARTED, "[Errno 12] Cannot allocate memory")
 
 
 def test_an_answer_that_is_there_counts_though_its_time_is_over() -> None:

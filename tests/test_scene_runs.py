@@ -178,16 +178,6 @@ def test_a_reconstruction_that_hangs_costs_its_scene_and_the_next_batch_has_its_
     assert [fault[:48] for fault in report.faults] == ["batch one was not reconstructed: the worker hung"]
 
 
-def test_a_reconstruction_that_hangs_ends_with_the_limit_and_every_row_is_there(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("MKPC_TEST_HOME", str(tmp_path))
-    scenes_by(monkeypatch, hang_as_scene, process=True)
-    report = run(batch_pairs(tmp_path / "images"), RECIPE, RectifiedMatcher(), tmp_path / "work", limit=10.0)
-    assert report.ending in (Ending.COMPLETE, Ending.TIME_IS_UP)
-    assert [record.source for record in report.records] == ["pair"] * 6
-
-
 def test_without_pycolmap_a_line_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     scenes_by(monkeypatch, scene_without_pycolmap, process=True)
     report = run(batch_pairs(tmp_path / "images"), RECIPE, RectifiedMatcher(), tmp_path / "work")
@@ -251,7 +241,7 @@ def test_an_image_replaced_after_the_run_drops_the_scene_and_its_batch_alone(
     scenes_by(monkeypatch, choose_scene_for_all_but_the_first)
     pairs = two_batches(tmp_path)
     run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
-    cv2.imwrite(str(pairs[0].image0), np.full((72, 80, 3), 200, np.uint8))
+    cv2.imwrite(str(pairs[0].images[0]), np.full((72, 80, 3), 200, np.uint8))
     scenes_by(monkeypatch, raise_as_scene)
     again = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
     assert "6 pairs are matched anew" in capsys.readouterr().err
