@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -92,3 +93,14 @@ def test_what_a_dead_process_has_left_is_removed_and_what_a_living_one_writes_is
     with replacing(tmp_path / "submission.csv") as stream:
         stream.write("whole")
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted([other.name, kept.name, "submission.csv"])
+
+
+def test_a_device_is_written_to_and_not_replaced():
+    ours, terminal = os.openpty()
+    try:
+        with replacing(Path(os.ttyname(terminal))) as stream:
+            stream.write("all of it")
+        assert os.read(ours, 100) == b"all of it"
+    finally:
+        os.close(ours)
+        os.close(terminal)

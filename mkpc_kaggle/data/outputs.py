@@ -76,9 +76,14 @@ def same_file(path: Path, other: Path) -> bool:
 def replacing(path: Path) -> Iterator[TextIO]:
     """A file to write that takes the place of ``path`` when all of it is on the disk.
 
-    Until then it lies beside ``path`` under a name of its own; such files of dead processes are removed. Raises
-    ``OSError`` where it cannot be written; nothing is left of it then.
+    Until then it lies beside ``path`` under a name of its own; such files of dead processes are removed. A device
+    such as ``/dev/stdout`` is written to and not replaced. Raises ``OSError`` where it cannot be written; nothing
+    is left of it then.
     """
+    if path.is_char_device():
+        with path.open("w", encoding="utf-8", newline="") as stream:
+            yield stream
+        return
     _remove_abandoned(path)
     part = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.part")
     _parts.add(part)
