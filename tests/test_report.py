@@ -129,7 +129,7 @@ def test_the_page_begins_with_the_verdict_has_pictures_inside_and_asks_for_nothi
     assert re.search("<h1>Complete after .*: 11 of 12 pairs have an F</h1>", text)
     assert sections(text) == ["Faults", "The weakest pairs", "Where the time went", "What made this"]
     tags = Tags(text)
-    assert tags.names.count("img") == DRAWN + 1, "the weakest pairs, and jobs over time"
+    assert tags.names.count("img") == 11 + 1, "the pairs with an F, and jobs over time"
     assert "script" not in tags.names
     assert all(source.startswith("data:image/") for source in tags.sources)
     assert not re.search(r"url\(|@import", text)
@@ -140,7 +140,7 @@ def test_the_page_begins_with_the_verdict_has_pictures_inside_and_asks_for_nothi
 def test_the_weakest_pairs_are_drawn_with_the_inliers_that_magsac_found(tmp_path: Path) -> None:
     a_run(tmp_path)
     log = read_log(tmp_path / "work")
-    assert len(log.weakest) == DRAWN
+    assert len(log.weakest) == 11 <= DRAWN
     for weak in log.weakest:
         match = weak.match(THREE_UNITS.magsac.threshold)
         assert len(match.matches) == weak.record.matches
