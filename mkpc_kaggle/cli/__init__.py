@@ -16,7 +16,9 @@ from mkpc_kaggle.engine.budget import process_started
 from mkpc_kaggle.engine.console import complain, leave, warn
 from mkpc_kaggle.errors import UserError
 
-COMMANDS = ("submit", "match", "validate", "recipes", "weights", "check", "journal", "package", "demo")
+COMMANDS = (
+    "submit", "match", "reconstruct", "validate", "recipes", "weights", "check", "journal", "package", "demo",
+)  # fmt: skip
 EXIT_BAD_INPUT = 2
 EXIT_BROKEN_PIPE = 128 + 13  # a shell's status for SIGPIPE, which Windows lacks
 EXIT_INTERRUPTED = 128 + signal.SIGINT

@@ -30,7 +30,8 @@ With --compare, several recipes run on the same pairs; each is compared with the
 With --pairs and --image-root the pairs come from a list in the format of SuperGlue's evaluation (a line a pair:
 name0 name1 turns0 turns1 K0 K1 T_0to1), E is estimated, and the AUC is what counts: see docs/benchmarks.md.
 
-With --submission and --truth nothing is matched: the files are scored.
+With --submission and --truth nothing is matched: the files are scored. So they are with --submission and
+--imc2025, by the rules of 2025: mAA of the camera centres, and the share of right images in the clusters.
 """
 
 
@@ -39,6 +40,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     source = parser.add_mutually_exclusive_group(required=True)
     source.add_argument("--train-dir", type=Path, metavar="DIR")
     source.add_argument("--pairs", type=Path, metavar="FILE", help="a list of pairs with K and poses")
+    source.add_argument(
+        "--imc2025",
+        type=Path,
+        metavar="DIR",
+        help="score files of `reconstruct --format imc2025`: DIR has train_labels.csv and train_thresholds.csv",
+    )
     add("--image-root", type=Path, metavar="DIR", help="where the images of --pairs lie")
     add("--scenes", default="", metavar="A,B", help="of --train-dir; default: all")
     add("--pairs-per-scene", type=int, metavar="N", help="evenly spread; default: all")
@@ -78,6 +85,8 @@ def run(arguments: argparse.Namespace) -> int:
     from mkpc_kaggle.data.outputs import require_apart
 
     _require_a_whole(arguments)
+    if arguments.imc2025 is not None:
+        return _score_imc2025(arguments)
     sides = [arguments.train_dir, arguments.image_root]
     inputs = [*sides, arguments.pairs, arguments.truth, *(arguments.submission or ())]
     require_apart({"--json": arguments.json}, filter(None, inputs), arguments.work_dir)
@@ -92,7 +101,14 @@ def run(arguments: argparse.Namespace) -> int:
 def _require_a_whole(given: argparse.Namespace) -> None:
     """Raise :class:`UserError` for options that do not go together."""
     for is_wrong, told in (
-        ((given.submission is None) != (given.truth is None), "--submission and --truth go together"),
+        (
+            given.imc2025 is not None and (given.submission is None or given.truth is not None),
+            "--imc2025 needs --submission, and no --truth",
+        ),
+        (
+            given.imc2025 is None and (given.submission is None) != (given.truth is None),
+            "--submission and --truth go together",
+        ),
         ((given.pairs is None) != (given.image_root is None), "--pairs and --image-root go together"),
         (
             given.pairs is not None and (given.submission or given.compare),
@@ -126,6 +142,14 @@ def _score_submissions(arguments: argparse.Namespace, scenes: "tuple[TrainScene,
 
     for submission in arguments.submission:
         say("\n".join([str(submission), *score_table(score_submission(submission, arguments.truth, scenes))]))
+    return 0
+
+
+def _score_imc2025(arguments: argparse.Namespace) -> int:
+    from mkpc_kaggle.evaluation.imc2025 import score_imc2025, score_lines
+
+    for submission in arguments.submission:
+        say("\n".join([str(submission), *score_lines(score_imc2025(arguments.imc2025, submission))]))
     return 0
 
 

@@ -31,7 +31,7 @@ from mkpc_kaggle.geometry.robust import Matrix3
 from mkpc_kaggle.pipeline.pair import UnitResult
 from mkpc_kaggle.recipe import Unit
 
-FORMAT = 6
+FORMAT = 7
 FILE_NAME = "journal.sqlite"
 LOCK_NAME = "journal.lock"
 MAX_POINT_BYTES = 1 << 26  # of a unit on a pair: three million matches; a damaged journal may promise more

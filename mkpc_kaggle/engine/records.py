@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL, Matrix3
 from mkpc_kaggle.pipeline.pair import PairMatch, Regions
@@ -171,13 +172,21 @@ class CameraRecord:
     size: Size
     seen: int
 
+    @property
+    def camera(self) -> Camera:
+        """The principal point is the image's centre."""
+        (width, height), down, forward = self.size, np.array(self.down), np.array(self.forward)
+        K = np.array([[self.focal, 0, (width - 1) / 2], [0, self.focal, (height - 1) / 2], [0, 0, 1]])
+        R = np.stack([np.cross(down, forward), down, forward])
+        return Camera(K, R, -R @ np.array(self.centre))
+
 
 @dataclass(frozen=True)
 class SceneRecord:
     """What came of a batch: how many of its images have a camera, in how many models, with how many points.
 
-    It was made from so many unit results on its pairs: if these have more now, the scene is out of date. ``cloud``
-    are some points of the largest model, evenly chosen, in its units.
+    It was made from so many unit results on its pairs: if these have more now, the scene is out of date.
+    ``clouds`` are some points of each model, evenly chosen, in its units.
     """
 
     batch: str
@@ -189,7 +198,7 @@ class SceneRecord:
     seconds: float
     failure: str
     cameras: tuple[CameraRecord, ...] = ()
-    cloud: tuple[Point, ...] = ()
+    clouds: tuple[tuple[Point, ...], ...] = ()
 
     @classmethod
     def of(
@@ -227,7 +236,7 @@ class SceneRecord:
             seconds,
             failure or "; ".join(dict.fromkeys(reasons)) or ("" if models else "no matches connect its images"),
             cameras,
-            tuple(map(tuple, evenly(models[0].points, MAX_DRAWN_POINTS).round(4).tolist())) if models else (),
+            tuple(tuple(map(tuple, evenly(each.points, MAX_DRAWN_POINTS).round(4).tolist())) for each in models),
         )
 
 

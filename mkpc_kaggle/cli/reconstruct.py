@@ -1,0 +1,114 @@
+"""a folder of images -> cameras, a COLMAP database, models"""
+
+import argparse
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from mkpc_kaggle.cli import options
+from mkpc_kaggle.engine.console import say
+from mkpc_kaggle.errors import UserError, writing
+
+if TYPE_CHECKING:
+    from mkpc_kaggle.reconstruction.run import FolderResult
+
+HELP = """\
+Match the images of a folder with the engine that makes submissions, and reconstruct their cameras. Each folder
+in DIR that has images is a dataset of its own, the images directly in DIR are another. Images of several places
+may be mixed: each place becomes a model, and an image that belongs to none has no camera.
+
+OUT gets, for a folder in DIR in a folder of its name:
+  database.db     COLMAP's: cameras, images, keypoints, matches, verified two-view geometries
+  models/0, 1...  COLMAP's binary models, the largest first
+and for all together:
+  cameras.csv     image, model, K, R, t: X_cam = R X + t, (0, 0) is the first pixel's centre; numbers joined by ;
+  submission.csv  with --format
+  report.html     the run, with the cameras and points of each model
+  work/           the journal: killed at any point, the same command goes on, and ends with the same files
+
+All pairs of up to 100 images are matched, and in larger datasets each image with the 20 most like it.
+
+Exit status: 0 done; 1 there is no model, or the run failed; 2 bad input; 130 or 143 ended by a signal.
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add("images", type=Path, metavar="DIR", help="png, jpg or jpeg files, or folders of them")
+    add("--out", type=Path, required=True, metavar="OUT", help="the directory for the results")
+    options.add_matching(parser)
+    options.add_run(parser, time_limit=None)
+    add("--pairs", type=Path, metavar="FILE", help="match these alone: two paths below DIR a line, as of hloc")
+    add("--format", choices=["imc2025", "imc2023"], help="also write submission.csv; imc2023: of 2024, too")
+    add(
+        "--rotations", action="store_true", help="try to turn images that match nothing by 90, 180 and 270 degrees"
+    )
+    add("--fresh", action="store_true", help="forget what an earlier run left in OUT/work")
+    parser.set_defaults(reconstruct=True)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    from dataclasses import replace
+
+    from mkpc_kaggle.data.outputs import lies_in
+    from mkpc_kaggle.engine.session import Session, Watchdog, interruptible
+    from mkpc_kaggle.recipe import Mode, RecipeChoice
+    from mkpc_kaggle.reconstruction.folder import read_folder, read_pair_list
+    from mkpc_kaggle.reconstruction.outputs import (
+        CAMERA_COLUMNS,
+        IMC2023_COLUMNS,
+        IMC2025_COLUMNS,
+        Form,
+        camera_rows,
+        submission_rows,
+        write_table,
+    )
+    from mkpc_kaggle.reconstruction.run import for_cameras, reconstruct_folder
+    from mkpc_kaggle.reporting.report import report_run
+    from mkpc_kaggle.reporting.summary import left_out_line, trouble
+
+    root, out, work_dir = arguments.images, arguments.out, arguments.out / "work"
+    datasets = read_folder(root)
+    if lies_in(out, root) or lies_in(root, out):
+        raise UserError(f"--out {out} and the images in {root} are in each other's way; name another place")
+    listed = None if arguments.pairs is None else read_pair_list(arguments.pairs, root, datasets)
+    budget = options.budget_of(arguments)
+    with interruptible() as interrupt, Watchdog(budget, interrupt) as watchdog, writing(f"--out {out}"):
+        assembly = options.assembly_of(arguments, RecipeChoice(arguments.recipe, Mode(arguments.mode)))
+        assembly = replace(assembly, recipe=for_cameras(assembly.recipe))
+        images = sum(len(dataset.files) for dataset in datasets)
+        header = f"{images} images, recipe {assembly.recipe.name}, {assembly.placement}, journal in {work_dir}"
+        say("\n".join(filter(None, [header, left_out_line(assembly.left_out)])))
+        session = Session(
+            work_dir, budget, interrupt, arguments.fresh, workers=arguments.workers, watchdog=watchdog
+        )
+        result = reconstruct_folder(datasets, assembly, session, out, listed=listed, rotations=arguments.rotations)
+        write_table(out / "cameras.csv", CAMERA_COLUMNS, camera_rows(result.found))
+        if arguments.format is not None:
+            form = Form(arguments.format)
+            columns = IMC2025_COLUMNS if form is Form.IMC2025 else IMC2023_COLUMNS
+            write_table(out / "submission.csv", columns, submission_rows(form, result.found, root))
+        failed = trouble(result.report)
+        watchdog.status = int(bool(failed) or not any(each.cameras for each in result.found))
+        explained = ["plan:", *map(str, result.report.explanations)] if arguments.explain else []
+        say("\n".join(filter(None, [*explained, *_told(result), failed, f"results: {out}"])))
+        say(report_run(work_dir, out / "report.html", session.must_end(), result.pairs))
+        return 128 + interrupt.signal if interrupt.signal else watchdog.status
+
+
+def _told(result: "FolderResult") -> Iterator[str]:
+    """A line for each dataset, and what went wrong."""
+    yield f"{len(result.pairs)} pairs: {result.report.ending} after {result.report.seconds:.0f} s"
+    scenes = {scene.batch: scene for scene in result.report.scenes}
+    for each in result.found:
+        name, scene = each.dataset.name, scenes.get(each.dataset.name)
+        sizes = (
+            [sum(camera.model == number for camera in scene.cameras) for number in range(scene.models)]
+            if scene
+            else []
+        )
+        models = f"models of {', '.join(map(str, sizes))} images" if sizes else "no model"
+        why = "" if sizes else f": {scene.failure if scene else 'too few pairs, or too little time'}"
+        yield f"{name}: {len(each.cameras)} of {len(each.dataset.files)} images have a camera, {models}{why}"
+    for kind, items in (("cannot be read", result.unreadable), ("fault", result.report.faults)):
+        yield from (f"{kind}: {item}" for item in items[:20])
