@@ -1,11 +1,14 @@
 """a folder of images -> cameras, a COLMAP database, models"""
 
 import argparse
+from collections import Counter
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mkpc_kaggle.cli import options
+from mkpc_kaggle.engine.budget import format_duration
 from mkpc_kaggle.engine.console import say
 from mkpc_kaggle.errors import UserError, writing
 
@@ -30,6 +33,7 @@ All pairs of up to 100 images are matched, and in larger datasets each image wit
 
 Exit status: 0 done; 1 there is no model, or the run failed; 2 bad input; 130 or 143 ended by a signal.
 """
+MAX_LINES = 20  # of each list
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -48,21 +52,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    from dataclasses import replace
-
     from mkpc_kaggle.data.outputs import lies_in
     from mkpc_kaggle.engine.session import Session, Watchdog, interruptible
     from mkpc_kaggle.recipe import Mode, RecipeChoice
     from mkpc_kaggle.reconstruction.folder import read_folder, read_pair_list
-    from mkpc_kaggle.reconstruction.outputs import (
-        CAMERA_COLUMNS,
-        IMC2023_COLUMNS,
-        IMC2025_COLUMNS,
-        Form,
-        camera_rows,
-        submission_rows,
-        write_table,
-    )
+    from mkpc_kaggle.reconstruction.outputs import Form, write_tables
     from mkpc_kaggle.reconstruction.run import for_cameras, reconstruct_folder
     from mkpc_kaggle.reporting.report import report_run
     from mkpc_kaggle.reporting.summary import left_out_line, trouble
@@ -83,13 +77,9 @@ def run(arguments: argparse.Namespace) -> int:
             work_dir, budget, interrupt, arguments.fresh, workers=arguments.workers, watchdog=watchdog
         )
         result = reconstruct_folder(datasets, assembly, session, out, listed=listed, rotations=arguments.rotations)
-        write_table(out / "cameras.csv", CAMERA_COLUMNS, camera_rows(result.found))
-        if arguments.format is not None:
-            form = Form(arguments.format)
-            columns = IMC2025_COLUMNS if form is Form.IMC2025 else IMC2023_COLUMNS
-            write_table(out / "submission.csv", columns, submission_rows(form, result.found, root))
+        write_tables(out, result.cameras, root, arguments.format and Form(arguments.format))
         failed = trouble(result.report)
-        watchdog.status = int(bool(failed) or not any(each.cameras for each in result.found))
+        watchdog.status = int(bool(failed) or not any(result.cameras.values()))
         explained = ["plan:", *map(str, result.report.explanations)] if arguments.explain else []
         say("\n".join(filter(None, [*explained, *_told(result), failed, f"results: {out}"])))
         say(report_run(work_dir, out / "report.html", session.must_end(), result.pairs))
@@ -98,17 +88,12 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _told(result: "FolderResult") -> Iterator[str]:
     """A line for each dataset, and what went wrong."""
-    yield f"{len(result.pairs)} pairs: {result.report.ending} after {result.report.seconds:.0f} s"
-    scenes = {scene.batch: scene for scene in result.report.scenes}
-    for each in result.found:
-        name, scene = each.dataset.name, scenes.get(each.dataset.name)
-        sizes = (
-            [sum(camera.model == number for camera in scene.cameras) for number in range(scene.models)]
-            if scene
-            else []
-        )
-        models = f"models of {', '.join(map(str, sizes))} images" if sizes else "no model"
-        why = "" if sizes else f": {scene.failure if scene else 'too few pairs, or too little time'}"
-        yield f"{name}: {len(each.cameras)} of {len(each.dataset.files)} images have a camera, {models}{why}"
-    for kind, items in (("cannot be read", result.unreadable), ("fault", result.report.faults)):
-        yield from (f"{kind}: {item}" for item in items[:20])
+    yield f"{len(result.pairs)} pairs: {result.report.ending} after {format_duration(result.report.seconds)}"
+    reasons = {scene.batch: scene.failure for scene in result.report.scenes}
+    for dataset, cameras in result.cameras.items():
+        models = Counter(camera.model for camera in cameras.values())
+        sizes = ", ".join(str(models[number]) for number in sorted(models))
+        why = f"models of {sizes}" if models else reasons.get(dataset.name, "too few pairs, or too little time")
+        yield f"{dataset.name}: {len(cameras)} of {len(dataset.files)} images have a camera: {why}"
+    yield from (f"cannot be read: {failure}" for failure in result.unreadable[:MAX_LINES])
+    yield from (f"fault: {fault}" for fault in result.report.faults[:MAX_LINES])

@@ -23,7 +23,6 @@ FREE = 3  # images that any similarity can be made to fit
 MAX_TRIPLETS = 20_000  # tried for a scene and a cluster; of more, so many are drawn
 REFINEMENTS = 10
 MIN_SPREAD = 1e-12  # sum of squares; centres with less stand at one point
-SEED = 0
 
 Points = NDArray[np.float64]  # (N, 3)
 Centres = Mapping[str, Points]  # of the cameras of a scene or cluster by image, (3,); NaN without a camera
@@ -44,62 +43,59 @@ class DatasetScore:
         return 2 * self.maa * self.clusterness / total if total else 0.0
 
 
-def score_imc2025(directory: Path, submission: Path) -> tuple[DatasetScore, ...]:
+def score_imc2025(directory: Path, submission: Path) -> list[DatasetScore]:
     """The score of each dataset of a train side.
 
     Raises :class:`UserError` for files that cannot be read, and if an image is missing, unknown or there twice.
     """
-    truth, found = read_poses(directory / "train_labels.csv"), read_poses(submission)
-    thresholds: dict[tuple[str, str], list[float]] = {}
-    path = directory / "train_thresholds.csv"
-    for line, (dataset, scene, cell) in read_rows(path, ("dataset", "scene", "thresholds")):
-        thresholds[dataset, scene] = _numbers(cell, f"{path}, line {line}").tolist()
-    expected, given = (
-        {(name, image) for name, scenes in table.items() for images in scenes.values() for image in images}
-        for table in (truth, found)
+    truth, found, path = (
+        _poses(directory / "train_labels.csv"),
+        _poses(submission),
+        directory / "train_thresholds.csv",
     )
-    if different := sorted(expected ^ given):
-        what = "lacks" if different[0] in expected else "has the unknown"
-        raise UserError(f"{submission} {what} image {'/'.join(different[0])}; {len(different)} images differ")
-    for dataset, scenes in truth.items():
-        for scene in scenes.keys() - {OUTLIERS}:
-            if len(thresholds.get((dataset, scene), ())) <= SKIPPED_THRESHOLDS:
-                raise UserError(f"{path} has no thresholds of {dataset}/{scene}")
-    return tuple(
-        score_dataset(name, scenes, found[name], {scene: thresholds.get((name, scene), []) for scene in scenes})
+    rows = read_rows(path, ("dataset", "scene", "thresholds"))
+    limits = {tuple(names): _numbers(cell, f"{path}, line {line}") for line, (*names, cell) in rows}
+    for name, scenes in truth.items():
+        given = [image for cluster in found.get(name, {}).values() for image in cluster]
+        if wrong := {image for scene in scenes.values() for image in scene} ^ set(given):
+            raise UserError(
+                f"{submission}: {len(wrong)} images of {name} are missing or unknown, one is {min(wrong)}"
+            )
+        if lacking := [scene for scene in scenes if scene != OUTLIERS and (name, scene) not in limits]:
+            raise UserError(f"{path} has no thresholds of {name}/{lacking[0]}")
+    return [
+        score_dataset(
+            name, scenes, found[name], {scene: limits.get((name, scene), np.zeros(0)) for scene in scenes}
+        )
         for name, scenes in truth.items()
-    )
+    ]
 
 
 def score_dataset(
     name: str,
     scenes: Mapping[str, Centres],
     clusters: Mapping[str, Centres],
-    thresholds: Mapping[str, Sequence[float]],
+    thresholds: Mapping[str, Sequence[float] | Points],
 ) -> DatasetScore:
     """Each scene takes the cluster that has most of its images, of several the one with the best mAA.
 
     The mAA's numerators and denominators are summed over the scenes before they are divided.
     """
     accurate = possible = common = taken = 0
-    for scene, centres in scenes.items():
-        if scene == OUTLIERS:
-            continue
-        limits = np.array(thresholds[scene][SKIPPED_THRESHOLDS:])
-        ranked = [
+    for scene, centres in ((scene, centres) for scene, centres in scenes.items() if scene != OUTLIERS):
+        limits = thresholds[scene][SKIPPED_THRESHOLDS:]
+        choices = [
             (len(centres.keys() & cluster.keys()), accurate_images(centres, cluster, limits), len(cluster))
             for label, cluster in clusters.items()
-            if label != OUTLIERS
+            if label != OUTLIERS and centres.keys() & cluster.keys()
         ]
-        overlap, count, size = max(ranked, key=lambda each: each[:2], default=(0, 0, 0))
-        accurate += count
-        possible += len(limits) * max(len(centres) - FREE, 0)
-        common += overlap
-        taken += size if overlap else 0
+        overlap, count, size = max(choices, key=lambda each: each[:2], default=(0, 0, 0))
+        accurate, possible = accurate + count, possible + len(limits) * max(len(centres) - FREE, 0)
+        common, taken = common + overlap, taken + size
     return DatasetScore(name, accurate / possible if possible else 0.0, common / taken if taken else 0.0)
 
 
-def accurate_images(truth: Centres, cluster: Centres, thresholds: NDArray[np.float64]) -> int:
+def accurate_images(truth: Centres, cluster: Centres, thresholds: Sequence[float] | Points) -> int:
     """How many images more than ``FREE`` have a centre less than a threshold off, summed over thresholds.
 
     The similarity that takes the cluster to the scene is found for each threshold on its own.
@@ -121,13 +117,11 @@ def fitting(source: Points, target: Points, threshold: float) -> int:
         inside = _distances(*similarities(source[part], target[part]), source, target) < threshold
         agreeing = inside[inside.sum(axis=1).argmax()]
         for _ in range(REFINEMENTS):
-            best, former = max(best, int(agreeing.sum())), agreeing
+            best = max(best, int(agreeing.sum()))
             if agreeing.sum() < FREE:
                 break
             refined = similarities(source[None, agreeing], target[None, agreeing])
             agreeing = _distances(*refined, source, target)[0] < threshold
-            if (agreeing == former).all():
-                break
     return best
 
 
@@ -158,11 +152,11 @@ def _distances(A: Points, t: Points, source: Points, target: Points) -> NDArray[
 def _triplets(count: int) -> NDArray[np.intp]:
     if count * (count - 1) * (count - 2) // 6 <= MAX_TRIPLETS:
         return np.array(list(combinations(range(count), 3)), np.intp)
-    drawn = np.random.default_rng(SEED).random((MAX_TRIPLETS, count))
+    drawn = np.random.default_rng(0).random((MAX_TRIPLETS, count))
     return np.argpartition(drawn, 3, axis=1)[:, :3]
 
 
-def read_poses(path: Path) -> dict[str, dict[str, Centres]]:
+def _poses(path: Path) -> dict[str, dict[str, dict[str, Points]]]:
     """The camera centres of a table of poses: by dataset, scene or cluster, and image."""
     found: dict[str, dict[str, dict[str, Points]]] = {}
     seen: set[tuple[str, str]] = set()
@@ -175,10 +169,10 @@ def read_poses(path: Path) -> dict[str, dict[str, Centres]]:
         if (len(R), len(t)) != (9, 3):
             raise UserError(f"{where}: expected 9 and 3 numbers joined by ';', found {len(R)} and {len(t)}")
         found.setdefault(dataset, {}).setdefault(scene, {})[image] = -R.reshape(3, 3).T @ t
-    return {name: dict(scenes) for name, scenes in found.items()}
+    return found
 
 
-def _numbers(cell: str, where: str) -> NDArray[np.float64]:
+def _numbers(cell: str, where: str) -> Points:
     try:
         return np.array([float(part) for part in cell.split(";")])
     except ValueError as error:

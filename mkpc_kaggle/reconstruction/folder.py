@@ -1,11 +1,11 @@
 """A folder of images: its datasets, and the pairs of each that are to be matched."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
 
-from mkpc_kaggle.data.competition import CONTROL, IMAGE_SUFFIXES, Pair
+from mkpc_kaggle.data.competition import CONTROL, IMAGE_SUFFIXES
 from mkpc_kaggle.errors import UserError, read_text
 from mkpc_kaggle.reconstruction.shortlist import shortlist
 
@@ -73,10 +73,3 @@ def read_pair_list(path: Path, root: Path, datasets: Iterable[Dataset]) -> dict[
     if not found:
         raise UserError(f"{path} has no pairs")
     return {name: list(pairs) for name, pairs in found.items()}
-
-
-def engine_pairs(dataset: str, ends: Sequence[Ends], shown: Mapping[Path, Path]) -> list[Pair]:
-    """The pairs as the engine matches them; ``shown`` has the files in the places of images that are turned."""
-    return [
-        Pair(f"{dataset}/{a.stem}/{b.stem}", dataset, str(shown.get(a, a)), str(shown.get(b, b))) for a, b in ends
-    ]

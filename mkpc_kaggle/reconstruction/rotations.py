@@ -9,10 +9,11 @@ from mkpc_kaggle.data.images import Image, Unreadable, read_image
 from mkpc_kaggle.geometry.robust import estimate
 from mkpc_kaggle.pipeline.assembly import Assembly
 from mkpc_kaggle.pipeline.pair import PairMatch
-from mkpc_kaggle.reconstruction.shortlist import similarities
+from mkpc_kaggle.reconstruction.shortlist import most_alike
 
 PARTNERS = 4  # that an image is matched with: those most like it, however it is turned
 MIN_INLIERS = 30  # with one of them: the image matches
+MIN_GAIN = 2.0  # times the inliers that it has as it is
 
 
 def find_turns(files: Sequence[Path], assembly: Assembly) -> dict[Path, int]:
@@ -21,31 +22,30 @@ def find_turns(files: Sequence[Path], assembly: Assembly) -> dict[Path, int]:
     The recipe's first unit matches each image with the few that are most like it. An image that matches none of
     them is tried in the three other orientations, and the one with most inliers is taken if they are enough.
     """
-    pipeline = assembly.pipeline()
-    similarity = similarities(files)
-    np.fill_diagonal(similarity, -np.inf)
-    near = np.argsort(-similarity, axis=1, kind="stable")[:, :PARTNERS]
-    turns: dict[Path, int] = {}
+    pipeline, turns = assembly.pipeline(), dict[Path, int]()
 
-    def inliers(place: int, times: int) -> int:
-        image = _turned(files[place], times)
-        partners = [_turned(files[other], turns.get(files[other], 0)) for other in near[place] if other != place]
-        pairs = [PairMatch(images=(image, other)) for other in partners if image is not None and other is not None]
+    def inliers(path: Path, times: int, partners: Sequence[Path]) -> int:
+        shown = [turned(path, times), *(turned(other, turns.get(other, 0)) for other in partners)]
+        pairs = [
+            PairMatch(images=(shown[0], other))
+            for other in shown[1:]
+            if shown[0].pixels.size and other.pixels.size
+        ]
         matched = pipeline.match(pairs, assembly.recipe.units[:1])
-        found = [estimate(pair.matches, assembly.recipe.magsac) for pair in matched]
-        return max((each.inlier_count for each in found if not each.failure), default=0)
+        return max((estimate(pair.matches, assembly.recipe.magsac).inlier_count for pair in matched), default=0)
 
-    for place, path in enumerate(files):
-        if inliers(place, 0) < MIN_INLIERS:
-            counts = {times: inliers(place, times) for times in (1, 2, 3)}
+    for path, near in zip(files, most_alike(files, PARTNERS), strict=True):
+        partners = [files[place] for place in near]
+        if (upright := inliers(path, 0, partners)) < MIN_INLIERS:
+            counts = {times: inliers(path, times, partners) for times in (1, 2, 3)}
             best = max(counts, key=counts.__getitem__)
-            if counts[best] >= MIN_INLIERS:
+            if counts[best] >= max(MIN_INLIERS, MIN_GAIN * upright):
                 turns[path] = best
     return turns
 
 
-def _turned(path: Path, times: int) -> Image | None:
+def turned(path: Path, times: int) -> Image:
+    """An image turned by so many quarters; without pixels if it cannot be read."""
     image = read_image(path)
-    if isinstance(image, Unreadable):
-        return None
-    return Image(f"{path} {times}", np.ascontiguousarray(np.rot90(image.pixels, times)))
+    pixels = np.zeros((0, 0, 3), np.uint8) if isinstance(image, Unreadable) else np.rot90(image.pixels, times)
+    return Image(f"{path} {times}", np.ascontiguousarray(pixels))

@@ -1,6 +1,6 @@
 """Images in, cameras out: a folder by the engine, or a few images in this process."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -8,15 +8,15 @@ from typing import Any
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.data.pairs import turned_copy
 from mkpc_kaggle.engine.engine import RunReport
-from mkpc_kaggle.engine.records import SceneRecord
+from mkpc_kaggle.engine.records import CameraRecord, SceneRecord
 from mkpc_kaggle.engine.session import Session, run_pairs
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.matchers.contract import Matcher
 from mkpc_kaggle.pipeline.assembly import Assembly
 from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher, to_image
 from mkpc_kaggle.recipe import Recipe, load_recipe
-from mkpc_kaggle.reconstruction.folder import Dataset, Ends, engine_pairs, pairs_of
-from mkpc_kaggle.reconstruction.outputs import DatasetCameras
+from mkpc_kaggle.reconstruction.folder import Dataset, Ends, pairs_of
+from mkpc_kaggle.reconstruction.outputs import Cameras
 from mkpc_kaggle.reconstruction.rotations import find_turns
 from mkpc_kaggle.scene.config import SceneConfig
 from mkpc_kaggle.scene.export import MODELS, Export
@@ -27,19 +27,16 @@ from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair, ViewGraph, track
 
 @dataclass(frozen=True)
 class FolderResult:
-    """What came of a folder: how the run went, its pairs, the cameras by dataset, and the files that have no part.
-
-    ``unreadable`` says of each image that cannot be read why.
-    """
+    """What came of a folder: how the run went, its pairs, and the cameras."""
 
     report: RunReport
     pairs: tuple[Pair, ...]
-    found: tuple[DatasetCameras, ...]
-    unreadable: tuple[str, ...]
+    cameras: Cameras
 
     @property
-    def scenes(self) -> tuple[SceneRecord, ...]:
-        return self.report.scenes
+    def unreadable(self) -> list[str]:
+        """Which images cannot be read, and why."""
+        return sorted({record.failure for record in self.report.records if record.reached and not record.sizes})
 
 
 def for_cameras(recipe: Recipe) -> Recipe:
@@ -49,7 +46,7 @@ def for_cameras(recipe: Recipe) -> Recipe:
 
 
 def reconstruct_folder(
-    datasets: Iterable[Dataset],
+    datasets: Sequence[Dataset],
     assembly: Assembly,
     session: Session,
     out: Path,
@@ -60,47 +57,40 @@ def reconstruct_folder(
     """Match the pairs of each dataset, those ``listed`` or by :func:`pairs_of`, and reconstruct it.
 
     COLMAP's files of a dataset are in the folder of its name in ``out``. With ``rotations``, images that match
-    nothing are turned. ``assembly`` is of a recipe :func:`for_cameras`. The scene's own process writes the files
+    nothing are turned. ``assembly`` is of a recipe :func:`for_cameras`. A scene's own process writes its files
     before the journal says that the scene is done, so a run that was killed makes what is lacking.
     """
-    datasets, pairs, exports = list(datasets), [], {}
+    pairs, exports = [], {}
     for dataset in datasets:
         ends = pairs_of(dataset) if listed is None else listed.get(dataset.name, [])
         turns = find_turns(dataset.files, assembly) if rotations and ends else {}
-        copies = session.work_dir / "turned"
-        shown = {file: turned_copy(file, times, copies)[0] for file, times in turns.items()}
-        names = {shown.get(file, file).stem: (file.name, turns.get(file, 0)) for file in dataset.files}
-        pairs += engine_pairs(dataset.name, ends, shown)
-        exports[dataset.name] = Export(out / dataset.name, names)
+        shown = {file: turned_copy(file, count, session.work_dir / "turned")[0] for file, count in turns.items()}
+        files = {shown.get(file, file).stem: (file.name, turns.get(file, 0)) for file in dataset.files}
+        exports[dataset.name] = Export(out / dataset.name, files)
+        pairs += [
+            Pair(f"{dataset.name}/{a.stem}/{b.stem}", dataset.name, str(shown.get(a, a)), str(shown.get(b, b)))
+            for a, b in ends
+        ]
     report = run_pairs(pairs, assembly, replace(session, exports=exports))
-    for scene in report.scenes:
-        if scene.models and not (out / scene.batch / MODELS).is_dir():
-            raise UserError(f"{out / scene.batch / MODELS} was removed after it was made; start anew with --fresh")
-    return FolderResult(report, tuple(pairs), cameras_of(datasets, exports, pairs, report), _unreadable(report))
-
-
-def cameras_of(
-    datasets: Iterable[Dataset], exports: Mapping[str, Export], pairs: Iterable[Pair], report: RunReport
-) -> tuple[DatasetCameras, ...]:
-    """The camera of each image in the largest model that has it; files of one content have one camera."""
     digests: dict[tuple[str, str], str] = {}
     for pair, record in zip(pairs, report.records, strict=True):
         for path, version in zip(pair.images, record.versions, strict=False):
             digests[pair.group, exports[pair.group].files[path.stem][0]] = version.split()[0]
     scenes = {scene.batch: scene for scene in report.scenes}
-    found = []
-    for dataset in datasets:
-        scene = scenes.get(dataset.name)
-        by_digest = {digests[dataset.name, c.image]: c for c in reversed(scene.cameras if scene else ())}
-        names = (file.name for file in dataset.files)
-        cameras = {name: by_digest.get(digests.get((dataset.name, name), "")) for name in names}
-        found.append(DatasetCameras(dataset, {name: each for name, each in cameras.items() if each is not None}))
-    return tuple(found)
+    cameras = {dataset: cameras_of(dataset, scenes.get(dataset.name), digests) for dataset in datasets}
+    for dataset, found in cameras.items():
+        if found and not (models := out / dataset.name / MODELS).is_dir():
+            raise UserError(f"{models} was removed after it was made; start anew with --fresh")
+    return FolderResult(report, tuple(pairs), cameras)
 
 
-def _unreadable(report: RunReport) -> tuple[str, ...]:
-    failures = (record.failure for record in report.records if record.reached and not record.sizes)
-    return tuple(sorted(set(failures)))
+def cameras_of(
+    dataset: Dataset, scene: SceneRecord | None, digests: Mapping[tuple[str, str], str]
+) -> dict[str, CameraRecord]:
+    """The camera of each image in the largest model that has it; files of one content have one camera."""
+    known = {digests[dataset.name, found.image]: found for found in reversed(scene.cameras if scene else ())}
+    names = ((file.name, digests.get((dataset.name, file.name))) for file in dataset.files)
+    return {name: known[digest] for name, digest in names if digest in known}
 
 
 def reconstruct(

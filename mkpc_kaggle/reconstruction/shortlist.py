@@ -23,42 +23,43 @@ SIDE_PX = 640
 FEATURES = 1000
 MAX_TRAINING = 50_000  # descriptors that the words are made of
 THREADS = 4  # OpenCV releases the interpreter's lock
-SEED = 0
+NO_FEATURES = np.zeros((0, 128), np.float32)
 
 
 def shortlist(files: Sequence[Path], partners: int = PARTNERS) -> list[tuple[int, int]]:
     """Pairs of places in ``files``, the smaller first, in order: each image with the ``partners`` most like it."""
-    similarity = similarities(files)
-    np.fill_diagonal(similarity, -np.inf)
-    near = np.argsort(-similarity, axis=1, kind="stable")[:, : min(partners, len(files) - 1)]
-    return sorted({(min(i, j), max(i, j)) for i, row in enumerate(near.tolist()) for j in row})
+    near = enumerate(most_alike(files, partners))
+    return sorted({(min(i, j), max(i, j)) for i, others in near for j in others})
 
 
-def similarities(files: Sequence[Path]) -> NDArray[np.float32]:
-    """(N, N): how alike the images are, -1 to 1; an image that cannot be read is like no other."""
+def most_alike(files: Sequence[Path], count: int) -> list[list[int]]:
+    """For each image the places of the others that are most like it; one that cannot be read is like no other."""
     with ThreadPoolExecutor(THREADS) as pool:
         descriptors = list(pool.map(local_features, files))
-    rng = np.random.default_rng(SEED)
     every = np.concatenate(descriptors)
-    training = every[np.sort(rng.permutation(len(every))[:MAX_TRAINING])]
-    if len(training) < WORDS:
-        return np.zeros((len(files), len(files)), np.float32)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # a word that nothing is near to any more
-        words, _ = kmeans2(training, training[:: len(training) // WORDS][:WORDS], iter=10, minit="matrix")
+    training = every[np.sort(np.random.default_rng(0).permutation(len(every))[:MAX_TRAINING])]
+    words = training[:: max(1, len(training) // WORDS)][:WORDS]
+    if len(words):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # a word that nothing is near to any more
+            words, _ = kmeans2(training, words, iter=10, minit="matrix")
     table = np.stack([vlad(found, words) for found in descriptors])
-    return np.asarray(table @ table.T, np.float32)
+    similarity = table @ table.T
+    np.fill_diagonal(similarity, -np.inf)
+    order = np.argsort(-similarity, axis=1, kind="stable")[:, : len(files) - 1]
+    near: list[list[int]] = order[:, :count].tolist()
+    return near
 
 
 def local_features(path: Path) -> NDArray[np.float32]:
     """(K, 128) RootSIFT of an image; none of an image that cannot be read."""
     image = read_image(path)
     if isinstance(image, Unreadable):
-        return np.zeros((0, 128), np.float32)
+        return NO_FEATURES
     scale = SIDE_PX / max(image.size)
     gray = cv2.resize(image.gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     _, found = cv2.SIFT_create(FEATURES).detectAndCompute(gray, None)  # type: ignore[attr-defined]
-    return np.zeros((0, 128), np.float32) if found is None else root_sift(found)
+    return NO_FEATURES if found is None else root_sift(found)
 
 
 def vlad(descriptors: NDArray[np.float32], words: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -10,6 +10,7 @@ another order each time, and the last digits differ.
 Sources: Schoenberger and Frahm 2016 (the incremental mapper), Pan et al. 2024 (the global one).
 """
 
+import shutil
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -45,11 +46,15 @@ def structure_from_motion(
     Each image has a camera of its own, except those with ``shared`` intrinsics, which start at the shared focal
     length. The global mapper goes first. Where it leaves many images of a small scene without a camera, the
     incremental one is asked too, and the reconstruction in which images see points more often stays. In
-    ``directory``, which must be new, COLMAP's files are left: the database, and a folder of each model.
+    ``directory`` COLMAP's files are left, in the place of earlier ones: the database, and a folder of each model.
     """
     pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
     pycolmap.set_random_seed(SEED)
     keypoints = scene_keypoints(graph)
+    if directory is not None:
+        shutil.rmtree(directory / MODELS, ignore_errors=True)
+        directory.mkdir(parents=True, exist_ok=True)
+        (directory / DATABASE).unlink(missing_ok=True)
     with pycolmap.Database.open(":memory:" if directory is None else str(directory / DATABASE)) as database:
         with pycolmap.DatabaseTransaction(database):
             cameras = _write_images(database, graph, keypoints, config.camera_model, shared)

@@ -1,6 +1,5 @@
 """COLMAP's files of a batch: where they go, what its images are called there, and which way up these are."""
 
-import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,43 +26,24 @@ class Export:
 
     def original(self, pair: BatchPair) -> BatchPair:
         """The pair with its images under their files' names, and its points in these files' pixels."""
-        names, turns = zip(*(self.files[image.name] for image in (pair.image0, pair.image1)), strict=True)
-        sizes = pair.image0.size, pair.image1.size
+        (image0, turns0), (image1, turns1) = (self._file(image) for image in (pair.image0, pair.image1))
 
-        def upright(matches: Matches) -> Matches:
-            points0, points1 = (
-                turned_back(*each) for each in zip((matches.points0, matches.points1), turns, sizes, strict=True)
-            )
-            return Matches(points0, points1, matches.scores)
+        def upright(found: Matches) -> Matches:
+            points0 = turned_back(found.points0, turns0, pair.image0.size)
+            return Matches(points0, turned_back(found.points1, turns1, pair.image1.size), found.scores)
 
-        image0, image1 = (
-            BatchImage(name, image.digest, Size(*image.size[:: -1 if times % 2 else 1]))
-            for name, times, image in zip(names, turns, (pair.image0, pair.image1), strict=True)
-        )
         tracks = pair.tracks and {name: upright(found) for name, found in pair.tracks.items()}
-        own = None if any(turns) else pair.pair_fundamental
-        return BatchPair(image0, image1, upright(pair.matches), own, tracks)
+        return BatchPair(image0, image1, upright(pair.matches), None, tracks)
 
-    def stage(self) -> Path:
-        """A new folder beside the files, to write them in."""
-        stage = self.directory / ".colmap"
-        shutil.rmtree(stage, ignore_errors=True)
-        stage.mkdir(parents=True)
-        return stage
-
-    def install(self, made: Path) -> None:
-        """Put the files of a folder in the :meth:`stage` into the place of earlier ones."""
-        shutil.rmtree(self.directory / MODELS, ignore_errors=True)
-        for name in (DATABASE, MODELS):
-            if (made / name).exists():
-                (made / name).replace(self.directory / name)
-        shutil.rmtree(self.directory / ".colmap")
+    def _file(self, image: BatchImage) -> tuple[BatchImage, int]:
+        name, turns = self.files[image.name]
+        width, height = image.size
+        return BatchImage(name, image.digest, Size(height, width) if turns % 2 else image.size), turns
 
 
 def turned_back(points: Points, times: int, size: Size) -> Points:
     """Points, (N, 2), of ``np.rot90(picture, times)``, which has this size, in pixels of the picture."""
-    width, height = size
-    for _ in range(times):
+    for turn in range(times):
+        height = size[1 - turn % 2]
         points = np.column_stack([height - 1 - points[:, 1], points[:, 0]])
-        width, height = height, width
     return points

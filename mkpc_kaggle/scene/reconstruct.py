@@ -44,12 +44,10 @@ def reconstruct_batch(
     is a :class:`Solution`: what is missing has a reason. It takes seconds to minutes and may end the process, see
     :mod:`mkpc_kaggle.scene.colmap`.
     """
-    stage = None
+    directory = None
     if export is not None:
-        pairs, stage = [export.original(pair) for pair in pairs], export.stage()
-    together, shared = reconstruct_sharing(ViewGraph.of_pairs(pairs), config, stage)
-    if export is not None and stage is not None:
-        export.install(stage / ("shared" if shared else "own"))
+        pairs, directory = [export.original(pair) for pair in pairs], export.directory
+    together, shared = reconstruct_sharing(ViewGraph.of_pairs(pairs), config, directory)
     matchers = sorted({name for pair in pairs for name in pair.tracks or ()})
     single = matchers if config.each_matcher and len(matchers) > 1 else []
     alone = [reconstruct_graph(ViewGraph.of_pairs(pairs, name), config, shared) for name in single]
@@ -69,31 +67,32 @@ def reconstruct_batch(
 
 
 def reconstruct_sharing(
-    graph: ViewGraph, config: SceneConfig, stage: Path | None = None
+    graph: ViewGraph, config: SceneConfig, directory: Path | None = None
 ) -> tuple[tuple[Reconstruction, ...], SharedIntrinsics]:
     """The reconstruction of each component, and the intrinsics that its images share.
 
     Images that seem to share a camera are reconstructed anew with it, unless they see fewer points then. COLMAP's
-    files are left in the folders ``own`` and ``shared`` of the ``stage``.
+    files are written to ``directory``.
     """
-    found = reconstruct_graph(graph, config, {}, stage and stage / "own")
+    found = reconstruct_graph(graph, config, {}, directory)
     shared = shared_intrinsics(graph.images, models_of(found), config.shared_intrinsics)
     if shared:
-        anew = reconstruct_graph(graph, config, shared, stage and stage / "shared")
+        anew = reconstruct_graph(graph, config, shared, directory)
         before, after = (sum(each.observations for each in made) for made in (found, anew))
         if after >= MIN_OBSERVATIONS * before:
             return anew, shared
+        if directory is not None:  # which has the files of the other
+            reconstruct_graph(graph, config, {}, directory)
     return found, {}
 
 
 def reconstruct_graph(
     graph: ViewGraph, config: SceneConfig, shared: SharedIntrinsics, directory: Path | None = None
 ) -> tuple[Reconstruction, ...]:
-    """The reconstruction of each component; of the whole graph, if COLMAP's files go to a new ``directory``."""
+    """The reconstruction of each component; of the whole graph, if COLMAP's files go to a ``directory``."""
     if directory is not None:
-        directory.mkdir()
         strong = tuple(edge for edge in graph.edges if len(edge.matches) >= MIN_MATCHES)
-        return (reconstruct_whole(replace(graph, edges=strong), config, shared, directory),)
+        return (reconstruct_connected(replace(graph, edges=strong), config, shared, directory),)
     return tuple(reconstruct_component(component, config, shared) for component in graph.components())
 
 
@@ -105,10 +104,10 @@ def reconstruct_component(graph: ViewGraph, config: SceneConfig, shared: SharedI
     if pairs < MIN_PAIRS_PER_IMAGE * len(names):
         few = f"{pairs} pairs connect {len(names)} images; a scene needs {MIN_PAIRS_PER_IMAGE:g} an image"
         return Reconstruction(names, failure=few)
-    return reconstruct_whole(graph, config, shared)
+    return reconstruct_connected(graph, config, shared)
 
 
-def reconstruct_whole(
+def reconstruct_connected(
     graph: ViewGraph, config: SceneConfig, shared: SharedIntrinsics, directory: Path | None = None
 ) -> Reconstruction:
     """What pycolmap makes of a graph, or why there is nothing."""
