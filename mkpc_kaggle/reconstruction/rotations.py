@@ -12,15 +12,16 @@ from mkpc_kaggle.pipeline.pair import PairMatch
 from mkpc_kaggle.reconstruction.shortlist import most_alike
 
 PARTNERS = 4  # that an image is matched with: those most like it, however it is turned
-MIN_INLIERS = 30  # with one of them: the image matches
+MANY_INLIERS = 100  # with one of them: the image is the right way up
+MIN_INLIERS = 30  # of an image that is turned
 MIN_GAIN = 2.0  # times the inliers that it has as it is
 
 
 def find_turns(files: Sequence[Path], assembly: Assembly) -> dict[Path, int]:
-    """By how many quarters, counter-clockwise, images have to be turned that match nothing as they are.
+    """By how many quarters, counter-clockwise, images have to be turned that match little as they are.
 
-    The recipe's first unit matches each image with the few that are most like it. An image that matches none of
-    them is tried in the three other orientations, and the one with most inliers is taken if they are enough.
+    The recipe's first unit matches each image with the few that are most like it. An image that has few inliers
+    with all of them is tried in the three other orientations, and the one with most is taken if it gains enough.
     """
     pipeline, turns = assembly.pipeline(), dict[Path, int]()
 
@@ -36,7 +37,7 @@ def find_turns(files: Sequence[Path], assembly: Assembly) -> dict[Path, int]:
 
     for path, near in zip(files, most_alike(files, PARTNERS), strict=True):
         partners = [files[place] for place in near]
-        if (upright := inliers(path, 0, partners)) < MIN_INLIERS:
+        if (upright := inliers(path, 0, partners)) < MANY_INLIERS:
             counts = {times: inliers(path, times, partners) for times in (1, 2, 3)}
             best = max(counts, key=counts.__getitem__)
             if counts[best] >= max(MIN_INLIERS, MIN_GAIN * upright):
