@@ -92,7 +92,7 @@ class MatchRunner:
         def may_start(unit: Unit) -> bool:
             return time.monotonic() + expected[unit] < deadline
 
-        self._images.prefetch(job.images)
+        self._images.prefetch(path for pair in job.pairs for path in pair.images)
         pairs = [self._open(pair, known) for pair, known in zip(job.pairs, job.known, strict=True)]
         readable = [number for number, pair in enumerate(pairs) if not pair.failure]
         units = sorted(job.units, key=lambda unit: unit.stage)
@@ -116,7 +116,7 @@ class MatchRunner:
     def _open(self, pair: Pair, known: tuple[UnitResult, ...]) -> PairMatch:
         """The pair with its images; ``failure`` says which of them cannot be read."""
         start = time.perf_counter()
-        images = tuple(self._images.get(path) for path in pair.images)
+        images = [self._images.get(path) for path in pair.images]
         seconds = time.perf_counter() - start
         readable = tuple(image for image in images if isinstance(image, Image))
         failure = next((str(image) for image in images if not isinstance(image, Image)), "")
