@@ -5,7 +5,6 @@ import pty
 import random
 import shutil
 import signal
-import sqlite3
 import subprocess
 import sys
 import threading
@@ -39,6 +38,7 @@ from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.engine import Ending, RunReport
 from mkpc_kaggle.engine.jobs import Cause, Failure, MatchResult, Outcome, Phase
 from mkpc_kaggle.engine.journal import Journal
+from mkpc_kaggle.engine.journal_tables import JournalReader
 from mkpc_kaggle.engine.plan import Plan
 from mkpc_kaggle.engine.process import ThreadWorker
 from mkpc_kaggle.engine.records import NOT_REACHED, PairRecord
@@ -481,9 +481,8 @@ def test_a_parent_killed_at_any_moment_leaves_a_whole_file_no_orphans_and_a_run_
             time.sleep(0.05)
     assert subprocess.run([sys.executable, str(script), str(tmp_path)], check=False).returncode == 0
     assert list(tmp_path.glob(".*.part")) == []
-    db = sqlite3.connect(tmp_path / "work" / "journal.sqlite")
-    stored = [row[0] for row in db.execute("SELECT fundamental FROM pair ORDER BY pair")]
-    db.close()
+    with JournalReader(tmp_path / "work") as journal:
+        stored = [record.pair_fundamental.tobytes() for record in journal.records().values()]
     assert stored == matrices(undisturbed)
 
 
