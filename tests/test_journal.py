@@ -268,3 +268,11 @@ def test_text_that_is_not_utf8_is_kept_in_letters(tmp_path: Path) -> None:
         journal.save([(Outcome(record), False)])
         journal.note("fault", 0.0, os.fsdecode(b"\xff"))
         assert journal.records()[3].failure == "\\udcff: no such file"
+
+
+def test_pairs_that_no_row_names_take_no_place_among_those_that_are_drawn(tmp_path: Path) -> None:
+    asked = [Pair(f"one;{index}", "one", "a.png", "b.png") for index in range(2)]
+    journal = Journal(tmp_path, OURS, pairs=asked)
+    journal.save([(outcome(index, seed=index), True) for index in reversed(range(DRAWN + 2))])
+    assert [index for index in range(DRAWN + 2) if points_of(journal, index)] == [0, 1]
+    journal.close()

@@ -101,9 +101,13 @@ def test_a_lost_job_is_halved_then_split_by_units_and_given_up_for_its_pair() ->
     deepened = [(indices, units) for indices, units in seen if SWEEP not in units and 1 in indices]
     assert [len(indices) for indices, _ in deepened] == [8, 4, 2, 1, 1, 1, 1]
     assert [units for _, units in deepened[3:]] == [(THIRD, SECOND), (THIRD,), (THIRD,), (SECOND,)]
-    given_up = {(index, unit.unit) for index in range(9) for unit in plan.records[index].units if unit.failure}
-    assert given_up == {(1, THIRD.name)}
-    assert plan.records[1].units[-1].failure == "given up: the worker died: signal SIGKILL"
+    failures = {
+        (index, unit.unit): unit.failure
+        for index in range(9)
+        for unit in plan.records[index].units
+        if unit.failure
+    }
+    assert failures == {(1, THIRD.name): "given up: the worker died: signal SIGKILL"}
     assert plan.records[1].failure == "", "it keeps the F that it has"
     assert plan.is_complete
 

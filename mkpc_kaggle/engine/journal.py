@@ -50,6 +50,7 @@ class Journal(JournalTables):
         self._unsaved_records: dict[int, str] = {}
         self._unsaved_points: dict[tuple[int, str], bytes] = {}
         self._unsaved_drops: set[int] = set()
+        self._asked = len(pairs)
         self._drawn: dict[int, int] = {}  # the inliers of the settled pairs that keep their points
         with ExitStack() as opened, writing(f"the work directory {directory}"):  # left open where all is well
             directory.mkdir(parents=True, exist_ok=True)
@@ -127,6 +128,9 @@ class Journal(JournalTables):
 
     def _settle(self, record: PairRecord) -> None:
         """Enter a pair among the weakest so far; the strongest of them gives up its place and its points."""
+        if self._asked and record.index >= self._asked:  # no row names it, so the report does not draw it
+            self._unsaved_drops.add(record.index)
+            return
         self._drawn[record.index] = record.inliers
         if len(self._drawn) > DRAWN:
             strongest = max(self._drawn, key=lambda index: (self._drawn[index], index))

@@ -35,7 +35,7 @@ FORMAT = 6
 FILE_NAME = "journal.sqlite"
 LOCK_NAME = "journal.lock"
 MAX_POINT_BYTES = 1 << 26  # of a unit on a pair: three million matches; a damaged journal may promise more
-DRAWN = 10  # how many of the weakest pairs keep their points when no later job needs them: the report draws them
+DRAWN = 20  # how many of the weakest pairs keep their points when no later job needs them: the report draws them
 
 SCHEMA = """
 CREATE TABLE run (key TEXT PRIMARY KEY, value TEXT NOT NULL);

@@ -91,11 +91,11 @@ class ChunkQueue:
 
         ``cautious``: one that was not lost, if there is one.
         """
-        again = [
-            chunk
-            for chunk in self.again
-            if self.under_way.isdisjoint(chunk.indices) and (alone or place not in chunk.lost_at)
-        ]
+        again, earlier = [], set(self.under_way)
+        for chunk in self.again:  # not before what waits of the same pairs: the order of units decides regions
+            if earlier.isdisjoint(chunk.indices) and (alone or place not in chunk.lost_at):
+                again.append(chunk)
+            earlier.update(chunk.indices)
         fresh = [chunk for chunk in islice(self.fresh, 1) if not any(map(self.is_busy, chunk.indices))]
         turns = [*fresh, *reversed(again)] if cautious else [*again, *fresh]
         if not turns:
@@ -182,7 +182,8 @@ class Plan:
     def has_work(self, now: float) -> bool:
         """Whether a pair waits that can gain something; what is under way may come back, too."""
         while now < self.stop and (chunk := self._peek(now)) is not None:
-            if any(self.can_gain(index, self._units(chunk, now)) for index in chunk.indices):
+            units = self._units(chunk, now)
+            if any(self.can_gain(index, units) for index in chunk.indices):
                 return True
             self._mark_done(chunk.phase, self._queue.fresh.popleft().indices)
         return now < self.stop and bool(self._queue.again)

@@ -17,12 +17,11 @@ import pytest
 from mkpc_kaggle.data.competition import read_test_side, submission_problems
 
 ROOT = Path(__file__).resolve().parents[2]
+# Of data, for each process; not of address space, of which CUDA builds of PyTorch reserve more.
 MEMORY_KIB = 4 << 20
-"""Of data, for each process; not of address space, of which CUDA builds of PyTorch reserve more."""
 REFUSED = (2,)
 DONE = (0,)
-EITHER = (0, 1, 2)
-"""A valid result, one that says what is missing of it, or a clear refusal."""
+EITHER = (0, 1, 2)  # a valid result, a result that says what it lacks, or a clear refusal
 CRASHES = ("Traceback (most recent call last)", "Fatal Python error", "Segmentation fault", "core dumped")
 TOO_LATE = "the time was up before a first version"
 MARK = "MKPC_HOSTILE_CASE"
@@ -83,7 +82,7 @@ def attack(case: Case, room: Path) -> None:
         status, seconds, output = _wait(process, room, allowed)
         faults += _faults(case, status, seconds, allowed, output, room)
         faults += [f"left running: {line}" for line in _orphans(mark)]
-        nothing = (status == 1 and TOO_LATE in output) or output.strip() == "interrupted"  # before it began
+        nothing = (status == 1 and TOO_LATE in output) or output.strip() == "error: interrupted"  # before it began
         if (
             case.submission
             and not nothing
