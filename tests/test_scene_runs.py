@@ -251,7 +251,7 @@ def test_an_image_replaced_after_the_run_drops_the_scene_and_its_batch_alone(
     scenes_by(monkeypatch, choose_scene_for_all_but_the_first)
     pairs = two_batches(tmp_path)
     run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
-    cv2.imwrite(str(pairs[0].image0), np.full((72, 80, 3), 200, np.uint8))
+    cv2.imwrite(str(pairs[0].images[0]), np.full((72, 80, 3), 200, np.uint8))
     scenes_by(monkeypatch, raise_as_scene)
     again = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
     assert "6 pairs are matched anew" in capsys.readouterr().err
