@@ -7,7 +7,6 @@ goes on, and its files tell what happened.
 import multiprocessing
 import os
 import sys
-from collections.abc import Callable
 from contextlib import suppress
 from math import isfinite
 from typing import Any, NoReturn, TextIO
@@ -75,40 +74,29 @@ class Progress:
 
     def show(self, phase: str, done: int, total: int) -> None:
         """Called after every job."""
-        self._guarded(lambda: self._show(phase, done, total))
-
-    def close(self) -> None:
-        """End the bar, or write the line that waits."""
-        self._guarded(self._close)
-
-    def _show(self, phase: str, done: int, total: int) -> None:
-        left = f"budget left {format_duration(self._budget.left())}" if isfinite(self._budget.time_limit) else ""
         began, self._phase = phase != self._phase, phase
-        if redraws(self._stream):
-            if began:
-                self._close()
-                self._bar = tqdm(total=total, desc=phase, unit="pair", file=self._stream)
-            assert self._bar is not None
-            self._bar.set_postfix_str(left, refresh=False)
-            self._bar.update(done - self._bar.n)
-            return
+        left = f"budget left {format_duration(self._budget.left())}" if isfinite(self._budget.time_limit) else ""
+        with suppress(OSError, ValueError):  # as for _print
+            if self._stream is not None and redraws(self._stream):
+                self._draw(phase, done, total, left)
+                return
         count = f"{total} pairs" if began else f"{done} of {total} pairs"
         self._waiting = ", ".join(filter(None, [f"{phase}: {count}", left]))
         if began or self._budget.clock() - self._written >= LINE_INTERVAL_S:
-            self._close()
+            self.close()
 
-    def _close(self) -> None:
-        if self._bar is not None:
-            self._bar.close()
+    def close(self) -> None:
+        """End the bar, or write the line that waits."""
+        with suppress(OSError, ValueError):
+            if self._bar is not None:
+                self._bar.close()
         if self._waiting:
-            line, self._waiting, self._written = self._waiting, "", self._budget.clock()
-            print(line, file=self._stream, flush=True)
+            _print(self._waiting, self._stream)
+            self._waiting, self._written = "", self._budget.clock()
 
-    def _guarded(self, draw: Callable[[], None]) -> None:
-        """Draw, or never again if that fails."""
-        if self._stream is None:
-            return
-        try:
-            draw()
-        except (OSError, ValueError):
-            self._stream = self._bar = None
+    def _draw(self, phase: str, done: int, total: int, left: str) -> None:
+        if self._bar is None or self._bar.desc != phase:
+            self.close()
+            self._bar = tqdm(total=total, desc=phase, unit="pair", file=self._stream)
+        self._bar.set_postfix_str(left, refresh=False)
+        self._bar.update(done - self._bar.n)

@@ -1,9 +1,8 @@
 """What crosses between the engine and a worker: two kinds of job, and their answers. Plain values."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from pathlib import Path
 from typing import Protocol
 
 from mkpc_kaggle.data.competition import Pair
@@ -46,11 +45,6 @@ class MatchJob:
     is_trial: bool = False
     pairs: tuple[Pair, ...] = ()
     known: tuple[tuple[UnitResult, ...], ...] = ()
-
-    @property
-    def images(self) -> Iterator[Path]:
-        """The files that it needs."""
-        return (path for pair in self.pairs for path in pair.images)
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,6 +156,5 @@ class Worker(Protocol):
 
 def visiting_order(pairs: Sequence[Pair]) -> list[int]:
     """Indices of pairs such that views of one image follow each other, and the encoding cache hits."""
-    return sorted(
-        range(len(pairs)), key=lambda index: (pairs[index].group, pairs[index].file0, pairs[index].file1)
-    )
+    keys = [(pair.group, pair.file0, pair.file1) for pair in pairs]
+    return sorted(range(len(pairs)), key=keys.__getitem__)

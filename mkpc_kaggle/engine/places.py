@@ -109,7 +109,7 @@ class Site(Protocol):
 
     def open(self) -> None:
         """Make the places known; raises :class:`mkpc_kaggle.errors.UserError` where there can be none."""
-        ...
+        return
 
     @property
     def scenes_at_once(self) -> int: ...
@@ -122,10 +122,12 @@ class Site(Protocol):
         """Until an answer may be there, or an interrupt, or the time ``until`` of the engine's clock."""
         ...
 
-    def close(self) -> None: ...
+    def close(self) -> None:
+        """Nothing of it is needed any more."""
+        return
 
 
-class LocalSite:
+class LocalSite(Site):
     """A worker process for each device of the machine, or as many as asked for; 0: a thread of this process."""
 
     scenes_at_once = 1
@@ -133,27 +135,22 @@ class LocalSite:
     def __init__(self, assembly: Assembly, workers: int | None, clock: Callable[[], float]) -> None:
         self._clock = clock
         self._bell: queue.SimpleQueue[None] = queue.SimpleQueue()
-        self.fallback: list[Place] = []
+        self.places, self.fallback = [], []
         if workers == 0:
             make = partial(MatchRunner, assembly.pipeline)
-            self.places = [Place("this process", partial(ThreadWorker, "matching", make, self._ring))]
+            self.places.append(Place("this process", partial(ThreadWorker, "matching", make, self._ring)))
             return
         # On a CPU one process with all threads: two with half of them each do more (recipe light, two cores: the
         # sweep over after 22 s instead of 31), but need twice the memory, and a network's last bits change.
         devices = assembly.devices
         used = [devices[number % len(devices)] for number in range(workers or len(devices))]
         share = len(used) if devices == ("cpu",) else 1
-        self.places = [
-            self._place(
-                name if used.count(name) == 1 else f"{name} {number}", assembly.on(name, used.count(name)), share
-            )
-            for number, name in enumerate(used)
-        ]
+        for number, device in enumerate(used):
+            count = used.count(device)
+            name = device if count == 1 else f"{device} {number}"
+            self.places.append(self._place(name, assembly.on(device, count), share))
         if devices != ("cpu",):
             self.fallback = [self._place("cpu", assembly.on_cpu())]
-
-    def open(self) -> None:
-        """The places are known."""
 
     def scene_worker(self) -> Worker:
         return ProcessWorker("scene", SceneRunner, self._ring)
@@ -161,9 +158,6 @@ class LocalSite:
     def wait(self, until: float) -> None:
         with suppress(queue.Empty):
             self._bell.get(timeout=max(0.0, min(LISTEN_S, until - self._clock())))
-
-    def close(self) -> None:
-        """Nothing is left open."""
 
     def _place(self, name: str, assembly: Assembly, share: int = 1) -> Place:
         make = partial(MatchRunner, assembly.pipeline)

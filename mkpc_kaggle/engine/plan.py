@@ -343,8 +343,7 @@ class Plan:
             return []
         chunk, half = Chunk(job.phase, job.indices, job.units, (place,)), len(job.indices) // 2
         if half:
-            parts = job.indices[:half], job.indices[half:]
-            self._queue.retry([replace(chunk, indices=part) for part in parts])
+            self._queue.retry([replace(chunk, indices=part) for part in (job.indices[:half], job.indices[half:])])
             return []
         (index,) = job.indices
         lacking = self.records[index].lacking(job.units)
@@ -358,9 +357,8 @@ class Plan:
         if self._tries[index, unit.name] < MAX_TRIES:
             self._queue.retry([chunk])
             return []
-        outcome = self._give_up(index, unit, failure, now)
         self._mark_done(job.phase, [index])
-        return [outcome]
+        return [self._give_up(index, unit, failure, now)]
 
     def restart(self, now: float, reason: str) -> list[Outcome]:
         """Begin anew on other devices: no unit is given up, and pairs keep what they have; what has changed."""

@@ -15,7 +15,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
@@ -69,13 +69,15 @@ class ThreadWorker:
             answer = self._load()
         except Exception as error:  # no memory, or no process more
             answer = Failure(Cause.NOT_STARTED, str(error))
-        self._put(answer)
-        while not isinstance(answer, Failure) or not answer.cause.is_of_place:
+        while True:
+            self._answers.put(answer)
+            self._on_answer()
+            if isinstance(answer, Failure) and answer.cause.is_of_place:
+                return
             order = self._orders.get()
             if order is None or self._killed:
                 return
             answer = self._run(order[0], order[1] - time.monotonic())
-            self._put(answer)
 
     def _load(self) -> Answer:
         self._runner, answer = load(self._make)
@@ -84,10 +86,6 @@ class ThreadWorker:
     def _run(self, job: Job, seconds: float) -> Answer:
         assert self._runner is not None, "only a worker that has loaded gets jobs"
         return run(self._runner, job, seconds)
-
-    def _put(self, answer: Answer) -> None:
-        self._answers.put(answer)
-        self._on_answer()
 
 
 class ProcessWorker(ThreadWorker):
@@ -112,7 +110,7 @@ class ProcessWorker(ThreadWorker):
         self._pipe, its_pipe = context.Pipe()
         process = context.Process(target=serve, args=(its_pipe, self._share), name=self.name, daemon=True)
         try:
-            with worker_environment(), signals_blocked():
+            with worker_environment():
                 process.start()
         finally:
             its_pipe.close()
@@ -150,60 +148,42 @@ def how_it_ended(process: SpawnProcess) -> str:
     return f"signal {signal.Signals(-code).name}" if code is not None and code < 0 else f"exit status {code}"
 
 
-@contextmanager
-def signals_blocked() -> Iterator[None]:
-    """A process started meanwhile hears neither Ctrl-C, which a terminal sends to all, nor SIGTERM: its parent
-    answers to them, and ends it.
-    """
-    if not hasattr(signal, "pthread_sigmask"):  # Windows
-        yield
-        return
-    resource_tracker.ensure_running()  # started with the first process, it would unblock them
-    former = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, former)
-
-
 _environment = threading.Lock()
 
 
 @contextmanager
 def worker_environment() -> Iterator[None]:
     """A process started meanwhile has :data:`WORKER_ENVIRONMENT`, but for what the user has set; this one has not
-    (its own OpenMP library is loaded already).
+    (its own OpenMP library is loaded already). It hears neither Ctrl-C, which a terminal sends to all, nor
+    SIGTERM: its parent answers to them, and ends it.
     """
-    with _environment:
+    resource_tracker.ensure_running()  # started with the first process, it would unblock them
+    with _environment, ExitStack() as restored:
         ours = {name: value for name, value in WORKER_ENVIRONMENT.items() if name not in os.environ}
         os.environ.update(ours)
-        try:
-            yield
-        finally:
-            for name in ours:
-                del os.environ[name]
+        for name in ours:
+            restored.callback(os.environ.pop, name)
+        if hasattr(signal, "pthread_sigmask"):  # not on Windows
+            former = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
+            restored.callback(signal.pthread_sigmask, signal.SIG_SETMASK, former)
+        yield
 
 
 def serve(pipe: Connection, share: int) -> None:
     """The life of a worker process: what to make, then job after job."""
+
+    def make() -> Runner:
+        maker: Callable[[], Runner] = pipe.recv()  # what cannot be unpickled is an answer, too
+        return maker()
+
     threading.Thread(target=_end_with_parent, daemon=True).start()
     with suppress(EOFError, OSError):  # the parent is gone
-        runner, answer = load(_receive_maker(pipe, share))
+        _take_share(share)
+        runner, answer = load(make)
         pipe.send(answer)
         while runner is not None:
             job, seconds = pipe.recv()
             pipe.send(run(runner, job, seconds))
-
-
-def _receive_maker(pipe: Connection, share: int) -> Callable[[], Runner]:
-    """Makes the runner that the parent asks for; what cannot be unpickled raises when it is made."""
-
-    def make() -> Runner:
-        maker: Callable[[], Runner] = pipe.recv()
-        _take_share(share)
-        return maker()
-
-    return make
 
 
 def _end_with_parent() -> None:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from importlib import metadata
 from math import isfinite
 from pathlib import Path
-from types import FrameType, TracebackType
+from types import FrameType
 from typing import Self
 
 import cv2
@@ -28,7 +28,7 @@ from mkpc_kaggle.engine.journal import Journal
 from mkpc_kaggle.engine.journal_tables import About, EventKind
 from mkpc_kaggle.engine.places import LISTEN_S, LocalSite, Site
 from mkpc_kaggle.engine.records import PairRecord
-from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.errors import writing
 from mkpc_kaggle.pipeline.assembly import Assembly
 
 EXIT_S = 0.2  # that the system takes to end a process
@@ -79,12 +79,10 @@ def submit(pairs: Sequence[Pair], assembly: Assembly, session: Session, output: 
 def require_writable(output: Path) -> None:
     """Make the file's directory if need be; :class:`UserError` where the file cannot be written."""
     probe = output.with_name(f".{output.name}.probe")
-    try:
+    with writing(f"--output {output}"):
         output.parent.mkdir(parents=True, exist_ok=True)
         probe.touch()
         probe.unlink()
-    except OSError as error:
-        raise UserError(f"--output {output} cannot be written: {error.strerror}") from error
 
 
 def run_pairs(
@@ -99,15 +97,17 @@ def run_pairs(
     matcher cannot be loaded.
     """
     belongs_to = {"test set": digest_of_pairs(pairs), **assembly.fingerprint()}
-    about = about_run(assembly, session.budget)
+    budget, recipe = session.budget, assembly.recipe
+    limit = budget.time_limit if isfinite(budget.time_limit) else None
+    about = About(recipe.name, str(assembly.placement), limit, assembly.left_out, versions())
     with Journal(session.work_dir, belongs_to, pairs=pairs, about=about, fresh=session.fresh) as journal:
-        journal.note(EventKind.START, session.budget.spent(), "")
+        journal.note(EventKind.START, budget.spent(), "")
         engine = Engine(
             pairs,
-            assembly.recipe,
+            recipe,
             site_of(pairs, assembly, session),
             journal,
-            session.budget,
+            budget,
             publish=publish,
             interrupt=session.interrupt,
             progress=session.progress,
@@ -126,17 +126,6 @@ def site_of(pairs: Sequence[Pair], assembly: Assembly, session: Session) -> Site
         folders = tuple(dict.fromkeys(path.parent for pair in pairs for path in pair.images))
         return ray_site(assembly, session.workers, session.budget.clock, folders)
     return LocalSite(assembly, session.workers, session.budget.clock)
-
-
-def about_run(assembly: Assembly, budget: Budget) -> About:
-    """What a report says of a run, besides what its journal is compared with."""
-    return About(
-        assembly.recipe.name,
-        str(assembly.placement),
-        budget.time_limit if isfinite(budget.time_limit) else None,
-        assembly.left_out,
-        versions(),
-    )
 
 
 def versions() -> dict[str, str]:
@@ -169,9 +158,8 @@ class Watchdog:
     """
 
     def __init__(self, budget: Budget, interrupt: Interrupt) -> None:
-        self.save: Callable[[], str] = lambda: (
-            "the time was up before a first version of the submission was written"
-        )
+        too_late = "the time was up before a first version of the submission was written"
+        self.save: Callable[[], str] = lambda: too_late
         self.status = 0
         self._budget = budget
         self._interrupt = interrupt
@@ -182,9 +170,7 @@ class Watchdog:
             threading.Thread(target=self._watch, name="watchdog", daemon=True).start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._over.set()
 
     def _watch(self) -> None:

@@ -49,10 +49,9 @@ def load(make: Callable[[], Runner]) -> tuple[Runner | None, Answer]:
     try:
         runner = make()
         runner.load()
-    except failures.DeviceError as error:
-        return None, Failure(Cause.DEVICE, str(error))
     except UserError as error:
-        return None, Failure(Cause.REFUSED, str(error))
+        is_device = isinstance(error, failures.DeviceError)
+        return None, Failure(Cause.DEVICE if is_device else Cause.REFUSED, str(error))
     except Exception as error:
         return None, failure_of(error)
     return runner, Loaded()
@@ -92,31 +91,28 @@ class MatchRunner:
         def may_start(unit: Unit) -> bool:
             return time.monotonic() + expected[unit] < deadline
 
-        self._images.prefetch(job.images)
+        self._images.prefetch(path for pair in job.pairs for path in pair.images)
         pairs = [self._open(pair, known) for pair, known in zip(job.pairs, job.known, strict=True)]
         readable = [number for number, pair in enumerate(pairs) if not pair.failure]
         units = sorted(job.units, key=lambda unit: unit.stage)
         matched = self._pipeline.match([pairs[number] for number in readable], units[:-1], may_start)
-        estimates: dict[int, Future[Outcome]] = {}
+        estimates: list[Future[Outcome]] = []
         for start in range(0, len(matched), self._pipeline.minibatch):
             part = slice(start, start + self._pipeline.minibatch)
-            for number, pair in zip(
-                readable[part], self._pipeline.match(matched[part], units[-1:], may_start), strict=True
-            ):
-                estimates[number] = self._estimators.submit(self._estimate, job, number, pair)
-        return MatchResult(
-            tuple(
-                estimates[number].result()
-                if number in estimates
-                else Outcome(PairRecord.untouched(job.indices[number], pair.failure))
-                for number, pair in enumerate(pairs)
-            )
-        )
+            found = self._pipeline.match(matched[part], units[-1:], may_start)
+            estimates += [
+                self._estimators.submit(self._estimate, job, number, pair)
+                for number, pair in zip(readable[part], found, strict=True)
+            ]
+        outcomes = [Outcome(PairRecord.untouched(i, p.failure)) for i, p in zip(job.indices, pairs, strict=True)]
+        for number, estimate in zip(readable, estimates, strict=True):
+            outcomes[number] = estimate.result()
+        return MatchResult(tuple(outcomes))
 
     def _open(self, pair: Pair, known: tuple[UnitResult, ...]) -> PairMatch:
         """The pair with its images; ``failure`` says which of them cannot be read."""
         start = time.perf_counter()
-        images = tuple(self._images.get(path) for path in pair.images)
+        images = [self._images.get(path) for path in pair.images]
         seconds = time.perf_counter() - start
         readable = tuple(image for image in images if isinstance(image, Image))
         failure = next((str(image) for image in images if not isinstance(image, Image)), "")
