@@ -307,13 +307,14 @@ class Engine:
         return records
 
     def _results(self, index: int) -> tuple[UnitResult, ...]:
-        """What earlier jobs found on a pair."""
-        if not self.plan.records[index].units:
+        """What earlier jobs found on a pair, by the units that its record has."""
+        record = self.plan.records[index]
+        if not record.units:
             return ()
         if index in self._unjournalled:
             return self._unjournalled[index]
         try:
-            return self.journal.results(index, self._units)
+            return tuple(found for found in self.journal.results(index, self._units) if record.has(found.unit))
         except (sqlite3.Error, UserError) as error:  # without them a job gains nothing, and the F stays
             self._fault(f"the journal cannot be read ({error})")
             return ()
