@@ -46,7 +46,7 @@ class SavedMatches:
 
 
 def file_of(folder: Path, true: TruePair) -> Path:
-    return folder / true.pair.group / f"{true.pair.image0.stem}-{true.pair.image1.stem}.npz"
+    return folder / true.pair.group / f"{'-'.join(image.stem for image in true.pair.images)}.npz"
 
 
 def write(path: Path, pair: PairMatch) -> None:

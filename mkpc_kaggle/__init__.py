@@ -15,14 +15,10 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 __all__ = ["PairMatch", "Recipe", "TwoStageMatcher", "__version__"]
 
-_HOME = {
-    "PairMatch": "mkpc_kaggle.pipeline.pair",
-    "TwoStageMatcher": "mkpc_kaggle.pipeline.two_stage",
-    "Recipe": "mkpc_kaggle.recipe",
-}
+_MODULES = {"PairMatch": "pipeline.pair", "TwoStageMatcher": "pipeline.two_stage", "Recipe": "recipe"}
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _HOME:
+    if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(_HOME[name]), name)
+    return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)

@@ -4,6 +4,9 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
+from pathlib import Path
+
+MAX_TEXT_BYTES = 1 << 24
 
 
 class UserError(Exception):
@@ -14,6 +17,18 @@ class UserError(Exception):
 def warn_once(message: str) -> None:
     """Warn, unless this process has given the same warning before."""
     warnings.warn(message, stacklevel=3)
+
+
+def read_text(path: Path) -> str:
+    """The text of a UTF-8 file of at most 16 MiB; :class:`UserError` if it cannot be read."""
+    try:
+        if path.exists() and (not path.is_file() or path.stat().st_size > MAX_TEXT_BYTES):
+            raise UserError(f"{path} cannot be read: not a regular file of at most {MAX_TEXT_BYTES} bytes")
+        return path.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise UserError(f"{path} cannot be read: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise UserError(f"{path} is not UTF-8 text") from error
 
 
 @contextmanager

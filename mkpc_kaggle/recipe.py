@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from mkpc_kaggle.config import AT_LEAST_1, Config, Range, check_keys, check_ranges, from_table
-from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.errors import UserError, read_text
 from mkpc_kaggle.geometry.coordinates import Box, Size, View
 from mkpc_kaggle.geometry.critical_region import MkpcConfig
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
@@ -20,7 +20,6 @@ from mkpc_kaggle.geometry.robust import RobustConfig
 from mkpc_kaggle.scene.config import SceneConfig
 
 DIRECTORY = Path(__file__).resolve().parent / "recipes"
-MAX_FILE_BYTES = 1 << 24
 MAX_SIDE_PX = 99_999
 AREA = re.compile(r"[1-9]\d{0,4}x[1-9]\d{0,4}", re.ASCII)
 
@@ -34,14 +33,14 @@ class Mode(StrEnum):
 
 
 @dataclass(frozen=True)
-class Choice:
+class RecipeChoice:
     """A recipe's name or file, and the mode to run it in."""
 
     recipe: str
     mode: Mode = Mode.TWO_STAGE
 
     @classmethod
-    def parse(cls, text: str) -> "Choice":
+    def parse(cls, text: str) -> "RecipeChoice":
         """``NAME:MODE``; without a mode, the recipe as it is written."""
         name, _, mode = text.rpartition(":")
         return cls(name, Mode(mode)) if name and mode in list(Mode) else cls(text)
@@ -178,10 +177,8 @@ def recipe_of(table: Mapping[str, Any], name: str) -> Recipe:
     known = ("description", "units", "mkpc", "magsac", "focal", "matchers", "scene")
     check_keys(table, known, where, removed=("upgrade",))
     units, matchers = table.get("units", []), table.get("matchers", {})
-    if not isinstance(units, list):
-        raise UserError(f"{where}: units must be a list of tables, not {units!r}")
-    if not isinstance(matchers, dict):
-        raise UserError(f"{where}: matchers must be a table, not {matchers!r}")
+    if not isinstance(units, list) or not isinstance(matchers, dict):
+        raise UserError(f"{where}: units must be a list of tables, and matchers a table")
 
     def settings(cls: type[Config], key: str) -> Config | None:
         value = table.get(key)  # a fingerprint has None for a table that the recipe lacks
@@ -213,13 +210,4 @@ def load_recipe(name: str) -> Recipe:
         raise UserError(
             f"unknown recipe {name!r}; known: {', '.join(recipe_names())}, or a path that ends in .toml"
         )
-    try:
-        if path.exists() and (not path.is_file() or path.stat().st_size > MAX_FILE_BYTES):
-            raise UserError(
-                f"recipe file {path} cannot be read: not a regular file of at most {MAX_FILE_BYTES} bytes"
-            )
-        return parse_recipe(path.read_text(encoding="utf-8-sig"), path.stem)
-    except OSError as error:
-        raise UserError(f"recipe file {path} cannot be read: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise UserError(f"recipe file {path} is not UTF-8 text") from error
+    return parse_recipe(read_text(path), path.stem)

@@ -1,13 +1,16 @@
 """The method step by step, each step a figure: what one pair looks like on its way through the two stages."""
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mkpc_kaggle.data.competition import TrainScene, TruePair, read_train_side
 from mkpc_kaggle.data.images import Image
 from mkpc_kaggle.engine.records import SceneRecord
+from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Box, Points
 from mkpc_kaggle.geometry.critical_region import Clusters, CriticalRegion, MkpcConfig, expand_box
 from mkpc_kaggle.geometry.matches import Matches
@@ -37,6 +40,18 @@ Images = tuple[Image, Image]
 WIDTH = 10.0  # inches, across a notebook
 MAX_INLIERS, MAX_OUTLIERS = 150, 30  # lines that an eye can follow
 _PAPER = {"boxstyle": "round,pad=0.15", "facecolor": "white", "alpha": 0.8, "linewidth": 0}
+
+
+def read_true_pair(directory: Path, pair: str) -> tuple[TrainScene, TruePair]:
+    """The pair ``SCENE;IMAGE-IMAGE`` of a train side, whatever its covisibility, and its scene.
+
+    Raises :class:`UserError` for an unknown pair, besides what :func:`read_train_side` raises.
+    """
+    (scene,) = read_train_side(directory, scenes=[pair.partition(";")[0]], min_covisibility=0.0)
+    known = {true.pair.id: true for true in scene.pairs}
+    if pair not in known:
+        raise UserError(f"{directory}: unknown pair {pair!r}; known: {', '.join(list(known)[:3])}, ...")
+    return scene, known[pair]
 
 
 def draw_images(images: Images) -> "Figure":

@@ -6,11 +6,9 @@ from kornia.feature import ALIKED
 from shared import WEIGHTS, needs_weights
 from sklearn.datasets import load_sample_image
 from standin import STAND_INS, scene, standin_state
-from torch.nn import functional
 
 from mkpc_kaggle.matchers.contract import Placement, Precision
 from mkpc_kaggle.matchers.networks.aliked import Aliked, own_name, refined_maxima, strict_maxima
-from mkpc_kaggle.matchers.networks.bilinear import DeformableConv2d, sampled
 from mkpc_kaggle.matchers.networks.placement import placed
 from mkpc_kaggle.weights import load_tensors
 
@@ -106,23 +104,3 @@ def test_maxima_are_strict_inner_and_the_best_come_first():
     weights = torch.exp((scores[6:11, 7:12] - 0.9) / 0.1)
     torch.testing.assert_close(x, 9 + (weights.sum(0) * torch.arange(-2.0, 3)).sum() / weights.sum())
     torch.testing.assert_close(y, torch.tensor(8.0), rtol=0, atol=1e-5)
-
-
-def test_samples_are_bilinear_and_zero_outside():
-    generator = torch.Generator().manual_seed(0)
-    maps = torch.randn(2, 5, 6, 7, generator=generator)
-    positions = torch.rand(2, 40, 2, generator=generator) * 12 - 3
-    grid = 2 * positions[:, None] / torch.tensor([6, 5]) - 1
-    expected = functional.grid_sample(maps, grid, align_corners=True)[:, :, 0].mT.flatten(0, 1)
-    found = sampled(maps, positions.flatten(0, 1), torch.arange(2).repeat_interleave(40))
-    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
-
-
-@torch.inference_mode()
-def test_a_deformable_convolution_moved_by_whole_pixels_is_one_of_the_moved_map():
-    torch.manual_seed(0)
-    conv, x = DeformableConv2d(4, 6), torch.randn(1, 4, 10, 12)
-    conv.offset_conv.weight.zero_()
-    conv.offset_conv.bias.copy_(torch.tensor([1.0, -2.0]).repeat(9))  # y, x of each tap
-    moved = functional.conv2d(functional.pad(x, (8, 8, 8, 8)), conv.weight)
-    torch.testing.assert_close(conv(x), moved[:, :, 8:18, 5:17], rtol=1e-4, atol=1e-5)

@@ -13,7 +13,6 @@ from mkpc_kaggle.data.competition import (
     read_submission,
     read_test_side,
     read_train_side,
-    read_true_pair,
     submission_problems,
     write_submission,
 )
@@ -81,11 +80,11 @@ def test_pairs_and_columns_come_in_any_order_and_ids_stay_the_text_that_they_are
 @pytest.mark.parametrize("file", ["1.png", "1.jpg", "1.jpeg", "1.PNG", "1.Jpg", "1.JPEG"])
 def test_an_image_is_found_whatever_its_suffix(side, file):
     home = side("s,b,1,2", images=["b/10.png", "b/1.txt"])
-    assert not read_test_side(home)[0].image0.is_file()
+    assert not read_test_side(home)[0].images[0].is_file()
     (home / "test_images" / "b" / file).touch()  # an image that is added later is found
     (pair,) = read_test_side(home)
-    assert pair.image0.name == file
-    assert pair.image0.is_file()
+    assert pair.images[0].name == file
+    assert pair.images[0].is_file()
 
 
 def test_a_missing_image_or_batch_is_a_path_that_does_not_exist(side):
@@ -165,20 +164,9 @@ def test_pairs_per_scene_are_spread_over_the_table(train, most, chosen):
     assert keys(*read_train_side(train, pairs_per_scene=most)) == chosen
 
 
-def test_a_pair_is_found_by_its_id_whatever_its_covisibility(train):
-    scenes = read_train_side(train, min_covisibility=0)
-    scarce = min(scenes[0].pairs, key=lambda true: true.covisibility)
-    assert scarce.covisibility < 0.1
-    scene, true = read_true_pair(train, scarce.pair.id)
-    assert (scene.name, scene.metres_per_unit, true.pair) == ("s", 2.5, scarce.pair)
-
-
 @pytest.mark.parametrize(
     ("read", "says"),
     [
-        (lambda train: read_true_pair(train, "s;a-b"), r"unknown pair 's;a-b'; known: s;b-a, "),
-        (lambda train: read_true_pair(train, "s;b-a-c"), r"unknown pair 's;b-a-c'; known: s;b-a, "),
-        (lambda train: read_true_pair(train, "b-a"), r"unknown scene 'b-a'; known: absent, s"),
         (lambda train: read_train_side(train, scenes=["s", "x"]), r"unknown scene 'x'; known: absent, s"),
         (lambda train: read_train_side(train, scenes=["absent"]), r"absent.*calibration\.csv: no such file"),
         (

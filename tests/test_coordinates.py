@@ -21,7 +21,7 @@ def boxes(draw):
 def views(draw):
     content = Size(draw(SIDES), draw(SIDES))
     padded = Size(content.width + draw(st.integers(0, 40)), content.height + draw(st.integers(0, 40)))
-    return View(draw(boxes()), content, padded, draw(st.booleans()))
+    return View(draw(boxes()), content, padded)
 
 
 def spot(size, centre, sigma):
@@ -45,15 +45,13 @@ def ramp(size):
 IMAGE = Size(107, 71)
 RENDERED = {
     "enlarged": View.fit(Box.whole(IMAGE), long_side=250),
-    "enlarged and flipped": View.fit(Box.whole(IMAGE), long_side=250, flip=True),
     "shrunk": View.fit(Box.whole(IMAGE), long_side=46),
-    "shrunk and flipped": View.fit(Box.whole(IMAGE), long_side=46, flip=True),
-    "of the same size": View.fit(Box.whole(IMAGE), long_side=107, flip=True),
+    "of the same size": View.fit(Box.whole(IMAGE), long_side=107),
     "cropped and enlarged": View.fit(Box(13, 8, 90, 65), long_side=200, multiple=32),
-    "cropped, shrunk and flipped": View.fit(Box(13, 8, 90, 65), long_side=51, multiple=32, flip=True),
-    "with an axis that rounding changes": View(Box.whole(IMAGE), Size(80, 48), Size(80, 48), flip=True),
+    "cropped and shrunk": View.fit(Box(13, 8, 90, 65), long_side=51, multiple=32),
+    "with an axis that rounding changes": View(Box.whole(IMAGE), Size(80, 48), Size(80, 48)),
     "enlarged along x, shrunk along y": View(Box.whole(IMAGE), Size(240, 40), Size(240, 40)),
-    "shrunk along x, enlarged along y": View(Box.whole(IMAGE), Size(60, 170), Size(64, 192), flip=True),
+    "shrunk along x, enlarged along y": View(Box.whole(IMAGE), Size(60, 170), Size(64, 192)),
 }
 
 
@@ -70,50 +68,45 @@ def test_there_and_back_is_the_identity(view, seed):
 def test_the_edges_of_the_crop_are_the_edges_of_the_content(view):
     edges = np.array([[view.crop.left, view.crop.top], [view.crop.right, view.crop.bottom]]) - 0.5
     (x0, y0), (x1, y1) = view.from_image(edges)
-    left, right = (x1, x0) if view.flip else (x0, x1)
     expected = [-0.5, -0.5, view.content.width - 0.5, view.content.height - 0.5]
-    assert_allclose([left, y0, right, y1], expected, rtol=0, atol=1e-9)
+    assert_allclose([x0, y0, x1, y1], expected, rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize("flip", [False, True])
-def test_known_points_map_to_known_points(flip):
-    view = View(Box(10, 20, 14, 26), Size(8, 3), Size(16, 16), flip)
+def test_known_points_map_to_known_points():
+    view = View(Box(10, 20, 14, 26), Size(8, 3), Size(16, 16))
     points = np.array([[10, 20], [13, 25], [11.5, 22.5]])
-    x = np.array([0.5, 6.5, 3.5])
-    expected = np.column_stack([7 - x if flip else x, [-0.25, 2.25, 1.0]])
+    expected = np.column_stack([[0.5, 6.5, 3.5], [-0.25, 2.25, 1.0]])
     assert_allclose(view.from_image(points), expected, rtol=0, atol=1e-12)
     assert_allclose(view.to_image(expected), points, rtol=0, atol=1e-12)
 
 
-@given(crop=boxes(), long_side=SIDES, multiple=st.sampled_from([1, 8, 14, 16, 32]), flip=st.booleans())
+@given(crop=boxes(), long_side=SIDES, multiple=st.sampled_from([1, 8, 14, 16, 32]))
 @settings(max_examples=150, deadline=None)
-def test_a_fitted_view_keeps_the_aspect_to_the_nearest_pixel_and_pads_to_the_multiple(
-    crop, long_side, multiple, flip
-):
-    view = View.fit(crop, long_side=long_side, multiple=multiple, flip=flip)
+def test_a_fitted_view_keeps_the_aspect_to_the_nearest_pixel_and_pads_to_the_multiple(crop, long_side, multiple):
+    view = View.fit(crop, long_side=long_side, multiple=multiple)
     assert max(view.content) == long_side
     exact = min(crop.size) * long_side / max(crop.size)
     assert abs(min(view.content) - max(1, exact)) <= 0.5
-    assert (view.crop, view.flip) == (crop, flip)
+    assert view.crop == crop
     for side, padded in zip(view.content, view.padded, strict=True):
         assert padded % multiple == 0
         assert 0 <= padded - side < multiple
 
 
-@given(crop=boxes(), area=st.integers(1, 2_000_000), flip=st.booleans())
+@given(crop=boxes(), area=st.integers(1, 2_000_000))
 @settings(max_examples=150, deadline=None)
-def test_a_view_of_an_area_keeps_the_aspect_and_has_that_many_pixels(crop, area, flip):
-    view = View.of_area(crop, area=area, flip=flip)
+def test_a_view_of_an_area_keeps_the_aspect_and_has_that_many_pixels(crop, area):
+    view = View.of_area(crop, area=area)
     width, height = (side * (area / crop.area) ** 0.5 for side in crop.size)
     assert width * height == pytest.approx(area)
     for side, exact in zip(view.content, (width, height), strict=True):
         assert abs(side - max(1, exact)) <= 0.5 + 1e-9 * exact
-    assert (view.crop, view.flip) == (crop, flip)
+    assert view.crop == crop
 
 
 def test_a_stretched_view_has_the_size_whatever_the_crop_and_is_padded():
-    view = View.stretched(Box(3, 4, 103, 24), size=Size(72, 54), multiple=16, flip=True)
-    assert (view.content, view.padded, view.flip) == ((72, 54), (80, 64), True)
+    view = View.stretched(Box(3, 4, 103, 24), size=Size(72, 54), multiple=16)
+    assert (view.content, view.padded) == ((72, 54), (80, 64))
     assert view.scale == (0.72, 2.7)
 
 
@@ -150,16 +143,15 @@ def test_a_ramp_is_rendered_without_a_shift(name):
     assert abs(difference).max() < 1.5
 
 
-@pytest.mark.parametrize("flip", [False, True])
 @pytest.mark.parametrize("shape", [(71, 107), (71, 107, 3)])
-def test_a_crop_that_is_not_resized_is_copied_and_padded_with_black_right_and_bottom(shape, flip):
+def test_a_crop_that_is_not_resized_is_copied_and_padded_with_black_right_and_bottom(shape):
     image = np.random.default_rng(0).integers(1, 256, shape, dtype=np.uint8)
-    view = View.fit(Box(5, 7, 55, 37), long_side=50, multiple=32, flip=flip)
+    view = View.fit(Box(5, 7, 55, 37), long_side=50, multiple=32)
     picture = view.render(image)
     cut = image[7:37, 5:55]
     assert picture.shape == (32, 64, *shape[2:])
     assert picture.dtype == np.uint8
-    assert_array_equal(picture[:30, :50], cut[:, ::-1] if flip else cut)
+    assert_array_equal(picture[:30, :50], cut)
     assert not picture[30:].any()
     assert not picture[:, 50:].any()
 
@@ -175,9 +167,8 @@ def test_a_box_holds_the_points_on_its_pixels_half_open_and_never_nan():
     assert (box.size, box.area) == (Size(8, 4), 32)
 
 
-@pytest.mark.parametrize("flip", [False, True])
-def test_a_view_holds_points_on_content_but_not_on_padding(flip):
-    view = View(Box(100, 100, 140, 120), Size(20, 10), Size(32, 16), flip)
+def test_a_view_holds_points_on_content_but_not_on_padding():
+    view = View(Box(100, 100, 140, 120), Size(20, 10), Size(32, 16))
     inside = [(-0.5, -0.5), (0, 0), (19, 9), (19.4, 9.4)]
     outside = [(19.5, 5), (5, 9.5), (25, 5), (5, 14), (-0.6, 5), (5, -0.6), (np.nan, 5), (5, np.inf)]
     assert view.holds(np.array(inside)).all()

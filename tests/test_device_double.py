@@ -47,7 +47,7 @@ def tensors_of(value: Any) -> list[torch.Tensor]:
         return [value]
     if is_dataclass(value):
         return tensors_of([getattr(value, field.name) for field in fields(value)])
-    return [tensor for one in value for tensor in tensors_of(one)] if isinstance(value, list | tuple) else []
+    return [tensor for part in value for tensor in tensors_of(part)] if isinstance(value, list | tuple) else []
 
 
 @cache
@@ -66,7 +66,7 @@ def on_double(name: str, precision: Precision, devices: tuple[str, ...], batch: 
 
 
 def agreement(first: Any, second: Any, within: float = 0.05) -> float:
-    """The share of the matches of either that lie within so many pixels, in both images, of one of the other."""
+    """The share of either's matches that lie within so many pixels, in both images, of a match of the other."""
     rows = [torch.from_numpy(np.hstack([matches.points0, matches.points1])) for matches in (first, second)]
     if not len(rows[0]) or not len(rows[1]):
         return float(len(rows[0]) == len(rows[1]))
@@ -92,8 +92,8 @@ CASES = [
 HALVED = ("superglue", "aliked_lightglue", "xfeat_lighterglue")
 QUICK = {(name, Precision.FLOAT32, 2, 1) for name in MATCHERS if name != "dkm, two passes"}
 QUICK |= {(name, Precision.FLOAT16, 1, 3) for name in HALVED}
+# Of the matches, at least. In half precision the order of sums tells.
 SAME = {Precision.FLOAT32: 0.98, Precision.FLOAT16: 0.7, Precision.BFLOAT16: 0.5}
-"""Of the matches, at least. In half precision the order of sums tells."""
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,7 @@ from mkpc_kaggle.engine.engine import Ending, RunReport
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.pipeline import assembly as assemblies
 from mkpc_kaggle.pipeline.assembly import assemble
-from mkpc_kaggle.pipeline.failures import DeviceError, Failure, failure_of, reason_of
+from mkpc_kaggle.pipeline.failures import DeviceError, FailureKind, failure_of, reason_of
 from mkpc_kaggle.reporting.summary import trouble
 
 COUNT = 12
@@ -55,7 +55,7 @@ def test_what_errors_mean() -> None:
 
     cuda = "CUDA error: {}\nCUDA kernel errors might be asynchronously reported at some other API call"
     told = {
-        Failure.OUT_OF_MEMORY: [
+        FailureKind.OUT_OF_MEMORY: [
             MemoryError(),
             torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB."),
             RuntimeError(
@@ -68,18 +68,18 @@ def test_what_errors_mean() -> None:
             RuntimeError("FIND was unable to find an engine to execute this computation"),
             RuntimeError("GET was unable to find an engine to execute this computation"),
         ],
-        Failure.DEVICE: [
+        FailureKind.DEVICE: [
             RuntimeError(cuda.format("an illegal memory access was encountered")),
             RuntimeError(cuda.format("no kernel image is available for execution on the device")),
             RuntimeError(cuda.format("CUBLAS_STATUS_EXECUTION_FAILED when calling `cublasSgemm( handle )`")),
             RuntimeError("cuDNN error: CUDNN_STATUS_EXECUTION_FAILED"),
             RuntimeError("No CUDA GPUs are available"),
         ],
-        Failure.ORDINARY: [RuntimeError("shapes differ"), ValueError("no points"), AssertionError()],
+        FailureKind.ORDINARY: [RuntimeError("shapes differ"), ValueError("no points"), AssertionError()],
     }
     for failure, errors in told.items():
         assert [failure_of(error) for error in errors] == [failure] * len(errors)
-    illegal = told[Failure.DEVICE][0]
+    illegal = told[FailureKind.DEVICE][0]
     illegal.add_note("in 1:loftr@840")
     assert reason_of(illegal) == f"RuntimeError: {BROKEN}, in 1:loftr@840"
 

@@ -22,7 +22,7 @@ PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 
 
 def texts_of(source: str) -> Iterator[str]:
-    """The texts of a program, with {} for what is put into them; adjoining ones are one."""
+    """The texts of a program, with {} for what is put into them; adjoining texts are joined."""
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.JoinedStr):
             parts = [part.value if isinstance(part, ast.Constant) else "{}" for part in node.values]
@@ -55,7 +55,7 @@ def test_every_message_of_the_troubleshooting_page_is_one_of_the_programs() -> N
     said = everything_said()
     known = messages()
     assert len(known) > 25
-    unknown = [one for one in known if not re.search(pattern_of(one), said)]
+    unknown = [message for message in known if not re.search(pattern_of(message), said)]
     assert unknown == []
 
 
@@ -64,7 +64,7 @@ def options_of(parser: argparse.ArgumentParser) -> set[str]:
 
 
 def subcommands() -> dict[str, argparse.ArgumentParser]:
-    (action,) = [one for one in make_parser()._actions if isinstance(one, argparse._SubParsersAction)]
+    (action,) = [action for action in make_parser()._actions if isinstance(action, argparse._SubParsersAction)]
     return dict(action.choices)
 
 
@@ -81,8 +81,8 @@ def test_pages_name_commands_and_options_that_there_are(page: Path) -> None:
     known = subcommands()
     for name, options in commands(page):
         assert name in known, name
-        inner = [one for one in known[name]._actions if isinstance(one, argparse._SubParsersAction)]
-        parsers = [known[name], *(parser for one in inner for parser in one.choices.values())]
+        inner = [action for action in known[name]._actions if isinstance(action, argparse._SubParsersAction)]
+        parsers = [known[name], *(parser for action in inner for parser in action.choices.values())]
         have = set().union(*map(options_of, parsers))
         assert set(options) <= have, (name, set(options) - have)
 

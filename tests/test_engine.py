@@ -103,7 +103,7 @@ def test_a_finished_run_loads_no_matcher_again(tmp_path: Path, monkeypatch: pyte
 
 def test_an_unreadable_image_costs_its_pair_only(tmp_path: Path) -> None:
     pairs = write_pairs(tmp_path, 4)
-    pairs[2].image1.write_bytes(b"")
+    pairs[2].images[1].write_bytes(b"")
     report = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
     assert "the file is empty" in report.records[2].failure
     assert np.linalg.matrix_rank(report.records[2].pair_fundamental) == 2
@@ -147,7 +147,7 @@ def test_a_journal_that_cannot_be_written_does_not_stop_the_run(
     def full(*_: object) -> None:
         raise sqlite3.OperationalError("database or disk is full")
 
-    monkeypatch.setattr(Journal, "save", full)
+    monkeypatch.setattr(Journal, "_write", full)
     report = run(write_pairs(tmp_path, 10), THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
     assert all(record.inliers > 400 for record in report.records)
     assert "disk is full" in report.faults[0]

@@ -1,4 +1,4 @@
-"""Faults in real runs, on real images: a lost worker, image, disk, terminal or parent costs its part alone."""
+"""Faults injected into real runs: a worker, an image, a disk, a terminal or a parent that is lost."""
 
 import os
 import pty
@@ -216,7 +216,7 @@ def test_an_image_that_vanishes_before_it_is_reached_costs_its_pair_only(tmp_pat
     pairs = write_pairs(tmp_path, 40)
 
     def remove(_: int) -> int:
-        pairs[39].image1.unlink(missing_ok=True)
+        pairs[39].images[1].unlink(missing_ok=True)
         return 150
 
     report = run(pairs, THREE_UNITS, RectifiedMatcher(matches=remove), tmp_path / "work")
@@ -236,7 +236,7 @@ def test_an_image_that_vanishes_after_the_sweep_leaves_its_pair_the_f_it_has(tmp
     matcher = RectifiedMatcher(matches=interrupt_after_the_sweep)
     swept = run(pairs, THREE_UNITS, matcher, tmp_path / "work", interrupt=interrupt)
     assert swept.ending is Ending.INTERRUPTED
-    pairs[VICTIM].image1.unlink()
+    pairs[VICTIM].images[1].unlink()
     report = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
     assert report.ending is Ending.COMPLETE
     assert matrices(report)[VICTIM] == matrices(swept)[VICTIM]
@@ -249,8 +249,8 @@ def test_an_image_replaced_after_the_run_is_matched_anew(
 ) -> None:
     pairs = write_pairs(tmp_path / "pairs", 5)
     first = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
-    shutil.copy(pairs[4].image0, pairs[VICTIM].image0)
-    os.utime(pairs[0].image0)
+    shutil.copy(pairs[4].images[0], pairs[VICTIM].images[0])
+    os.utime(pairs[0].images[0])
     again = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
     assert "images have changed since they were matched: 1 pairs are matched anew" in capsys.readouterr().err
     anew = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "anew")
@@ -357,13 +357,23 @@ def with_stderr_closed(command: list[str]) -> int:
     ).returncode
 
 
-def on_a_full_disk(command: list[str]) -> int:
+def without_a_reader(command: list[str]) -> int:
+    reader, writer = os.pipe()
+    os.close(reader)
     environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
-    with Path("/dev/full").open("w") as full:
-        return subprocess.run(command, stdout=full, stderr=full, env=environment, check=False).returncode
+    with os.fdopen(writer, "wb") as gone:
+        return subprocess.run(command, stdout=gone, stderr=gone, env=environment, check=False).returncode
 
 
-@pytest.mark.parametrize("run_without", [on_a_closed_terminal, with_stderr_closed, on_a_full_disk])
+def on_a_disk_that_takes_nothing(command: list[str]) -> int:
+    environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
+    with Path(os.devnull).open() as refusing:  # not opened for writing; not each machine has a /dev/full
+        return subprocess.run(command, stdout=refusing, stderr=refusing, env=environment, check=False).returncode
+
+
+@pytest.mark.parametrize(
+    "run_without", [on_a_closed_terminal, with_stderr_closed, without_a_reader, on_a_disk_that_takes_nothing]
+)
 def test_a_run_that_cannot_print_makes_the_whole_submission(
     demo: DemoSet, recipe: Path, tmp_path: Path, run_without: Callable[[list[str]], int]
 ) -> None:

@@ -18,7 +18,7 @@ from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL, Estimate, ModelKin
 from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult
 from mkpc_kaggle.recipe import Unit
 from mkpc_kaggle.reporting.figures.pair import draw_pair, draw_strip
-from mkpc_kaggle.reporting.figures.run import draw_budget, draw_cameras
+from mkpc_kaggle.reporting.figures.run import draw_cameras
 from mkpc_kaggle.reporting.figures.style import encode
 
 SIZES = Size(120, 80), Size(60, 90)
@@ -152,10 +152,3 @@ def test_a_strip_shows_both_images_at_one_height_with_matches_where_they_are():
         [dots.get_offsets() for dots in figure.axes[0].collections if len(dots.get_offsets()) > 1]
     )
     np.testing.assert_allclose(ends, [[0.1, 0.1], [2 + 0.5, 0.5]])
-
-
-@pytest.mark.parametrize(("limit", "drawn"), [(60.0, True), (8.75 * 3600, False), (None, False)])
-def test_a_time_limit_is_drawn_if_the_run_came_near_it(limit, drawn):
-    axes = draw_budget({"sweep": [5.0, 9.0], "deepen": [30.0]}, limit).axes[0]
-    assert ("time limit" in axes.get_legend_handles_labels()[1]) == drawn
-    assert axes.get_title("left").startswith("3 jobs ended")

@@ -6,9 +6,9 @@ import random
 import signal
 import threading
 import time
-from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
+from itertools import cycle
 from multiprocessing import resource_tracker, util
 from pathlib import Path
 from typing import Any, ClassVar
@@ -36,6 +36,7 @@ class DoomedWorker(WatchedWorker):
     """
 
     rng: ClassVar = random.Random(0)
+    signals: ClassVar = cycle([signal.SIGKILL, signal.SIGSTOP])
     lives: ClassVar[dict[str, float]] = {}
     spared: ClassVar[set[str]] = set()
     sent: ClassVar[list[tuple[str, signal.Signals, float]]] = []
@@ -54,7 +55,7 @@ class DoomedWorker(WatchedWorker):
             self.spared.remove(self.place)
         elif self.kind in self.lives:
             moment = self.rng.uniform(0.0, self.lives[self.kind])
-            number = (signal.SIGKILL, signal.SIGSTOP)[len(self.known) % 2]
+            number = next(self.signals)
             threading.Thread(target=self._disturb, args=(os.pidfd_open(pid), number, moment), daemon=True).start()
 
     def is_stuck(self) -> bool:
@@ -77,8 +78,10 @@ class DoomedWorker(WatchedWorker):
 
 
 @pytest.fixture
-def forks(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def forks(monkeypatch: pytest.MonkeyPatch) -> None:
     """Tell workers of their processes as soon as these are forked."""
+    for name, empty in {"lives": {}, "spared": set(), "sent": [], "known": {}}.items():
+        monkeypatch.setattr(DoomedWorker, name, empty)
     resource_tracker.ensure_running()  # a process, too
     spawn = util.spawnv_passfds
 
@@ -88,7 +91,6 @@ def forks(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         return pid
 
     monkeypatch.setattr(util, "spawnv_passfds", spawned)
-    yield
 
 
 def scene_batches(directory: Path) -> list[Pair]:
@@ -127,14 +129,15 @@ def test_a_run_whose_workers_are_killed_and_stopped_at_random_moments_ends_as_th
         DoomedWorker.lives[worker.kind] = max(DoomedWorker.lives.get(worker.kind, 0.0), worker.computed)
     compared = 0
     while len(DoomedWorker.sent) < moments:
-        number = len(DoomedWorker.sent)
-        report = run_whole(f"disturbed {number}")
-        print(report.faults, DoomedWorker.sent[number:])
-        assert len(report.faults) > 0
-        given_up = [any(unit.failure.startswith(GIVEN_UP) for unit in record.units) for record in report.records]
-        intact = set(map(str, range(BATCHES))) - {
-            pair.group for pair, is_given_up in zip(pairs, given_up, strict=True) if is_given_up
+        report = run_whole(f"disturbed {len(DoomedWorker.sent)}")
+        given_up = {
+            pair.group
+            for pair, record in zip(pairs, report.records, strict=True)
+            if any(unit.failure.startswith(GIVEN_UP) for unit in record.units)
         }
-        assert matrices(report, intact, pairs) == matrices(undisturbed, intact, pairs)
+        intact = {pair.group for pair in pairs} - given_up
+        assert matrices(report, intact, pairs) == matrices(undisturbed, intact, pairs), report.faults
         compared += len(intact)
+    assert {number for _, number, _ in DoomedWorker.sent} == {signal.SIGKILL, signal.SIGSTOP}
+    assert {kind for kind, _, _ in DoomedWorker.sent} == {"mkpc", "scene"}
     assert compared > 0

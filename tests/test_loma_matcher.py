@@ -5,19 +5,19 @@ import numpy as np
 import pytest
 import torch
 from checkpoints import FILES, write_checkpoints
+from pictures import as_picture
 from standin import filled, scene
 
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.geometry.coordinates import Box, Size, View
+from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.matchers import loma
-from mkpc_kaggle.matchers.contract import Picture, Placement, encoding_bytes
+from mkpc_kaggle.matchers.contract import Placement, encoding_bytes
 from mkpc_kaggle.matchers.loma import LomaAdapter, LomaOptions
 from mkpc_kaggle.matchers.networks import strips
-from mkpc_kaggle.matchers.networks.dad import select_keypoints
 from mkpc_kaggle.matchers.networks.dedode import dedode_g
 from mkpc_kaggle.matchers.networks.dinov2 import DinoV2Config
 from mkpc_kaggle.matchers.networks.loma import Loma, Variant, detector_size
-from mkpc_kaggle.matchers.networks.loma_matcher import LomaKeypoints, log_scores
+from mkpc_kaggle.matchers.networks.loma_matcher import LomaKeypoints
 from mkpc_kaggle.matchers.networks.placement import placed
 from mkpc_kaggle.weights import WeightStore
 
@@ -51,12 +51,6 @@ class Holding(WeightStore):
         return self.tensors
 
 
-def picture(pixels: np.ndarray, padding: int = 0) -> Picture:
-    size = Size(pixels.shape[1], pixels.shape[0])
-    view = View(Box.whole(size), size, Size(size.width + padding, size.height + 2 * padding))
-    return Picture(view.render(pixels), view)
-
-
 def image_of(pixels: np.ndarray) -> torch.Tensor:
     return torch.from_numpy(pixels.copy()).permute(2, 0, 1)[None].float() / 255
 
@@ -66,7 +60,7 @@ def test_a_shifted_picture_is_matched_by_its_shift(store: WeightStore) -> None:
     options = LomaOptions(Variant.B128, max_keypoints=300, descriptor_scale=1.0)
     matcher = loma.load(store, options, Placement())
     whole = scene(176, 184, channels=3)
-    first, second = matcher.encode([picture(whole[:168, 16:]), picture(whole[8:, :168])])
+    first, second = matcher.encode([as_picture(whole[:168, 16:]), as_picture(whole[8:, :168])])
     (matches,) = matcher.match([first], [second])
     offsets = matches.points1 - matches.points0
     good = np.abs(offsets - (16, -8)).max(axis=1) < 1.5
@@ -79,26 +73,22 @@ def test_keypoints_are_where_the_detector_saw_them(matcher: LomaAdapter) -> None
     """A dot stays in its place when the detector's picture has other sides than the view."""
     pixels = np.full((101, 135, 3), 90, np.uint8)
     cv2.circle(pixels, (70, 40), 2, (250, 240, 230), -1)
-    (encoded,) = matcher.encode([picture(pixels)])
+    (encoded,) = matcher.encode([as_picture(pixels)])
     assert detector_size(Size(135, 101), 135) == (128, 96)
     points = loma.from_normalised(encoded.keypoints.points.numpy(), Size(135, 101))
     assert np.hypot(*(points - (70, 40)).T).min() < 4
 
 
-def test_padding_changes_nothing(matcher: LomaAdapter) -> None:
+def test_padding_changes_nothing_and_tiny_pictures_have_no_matches(
+    matcher: LomaAdapter,
+) -> None:
     pixels = scene(75, 101, channels=3)
-    plain, padded = matcher.encode([picture(pixels), picture(pixels, padding=13)])
+    plain, padded = matcher.encode([as_picture(pixels), as_picture(pixels, padding=(13, 26))])
     assert torch.equal(plain.keypoints.points, padded.keypoints.points)
     assert torch.equal(plain.keypoints.descriptors, padded.keypoints.descriptors)
     assert encoding_bytes(plain) == 200 * (2 + 128) * 4
-
-
-@pytest.mark.parametrize("size", [(7, 90), (1, 1), (90, 5)])
-def test_pictures_too_small_for_the_detector_have_no_matches(matcher: LomaAdapter, size: tuple[int, int]) -> None:
-    tiny, plain = matcher.encode([picture(scene(*size, channels=3)), picture(scene(64, 64, channels=3))])
-    assert [len(matches) for matches in matcher.match([tiny, plain, tiny], [plain, tiny, tiny])] == [0, 0, 0]
-    assert matcher.encode([]) == []
-    assert matcher.match([], []) == []
+    tiny = [matcher.encode([as_picture(scene(*size, channels=3))])[0] for size in ((7, 90), (1, 1), (90, 5))]
+    assert [len(matches) for matches in matcher.match([*tiny, plain, tiny[0]], [plain] * 3 + tiny[:2])] == [0] * 5
 
 
 def test_the_sizes_are_the_releases_on_views_of_1024_pixels(
@@ -113,14 +103,8 @@ def test_the_sizes_are_the_releases_on_views_of_1024_pixels(
     monkeypatch.setattr(matcher._network, "encode", encode)
     published = LomaAdapter(matcher._network, LomaOptions(Variant.B128), "cpu")
     for size in ((683, 1024), (512, 384), (6, 3)):
-        published.encode([picture(np.zeros((*size, 3), np.uint8))])
+        published.encode([as_picture(np.zeros((*size, 3), np.uint8))])
     assert seen == [((680, 1024), (784, 784), 2048), ((512, 384), (392, 392), 2048)]
-
-
-def test_variants_are_slots_of_their_own(store: WeightStore) -> None:
-    assert set(loma.SPEC.every_slot) == {"loma-b128", "loma-b", "loma-r", "loma-l", "loma-g"}
-    with pytest.raises(KeyError, match="loma-g"):
-        loma.load(store, LomaOptions(Variant.G), Placement())
 
 
 def test_checkpoints_that_lack_or_add_something_are_refused(store: WeightStore) -> None:
@@ -132,6 +116,9 @@ def test_checkpoints_that_lack_or_add_something_are_refused(store: WeightStore) 
     ):
         with pytest.raises(UserError, match="'loma-b128' do not fit the network"):
             loma.load(Holding(good | change), OPTIONS, Placement())
+    assert set(loma.SPEC.every_slot) == {"loma-b128", "loma-b", "loma-r", "loma-l", "loma-g"}
+    with pytest.raises(UserError, match="loma-g"):
+        loma.load(store, LomaOptions(Variant.G), Placement())
 
 
 def test_weights_in_half_precision_and_of_deeper_training_load(store: WeightStore, network: Loma) -> None:
@@ -157,22 +144,6 @@ def test_strips_of_rows_give_what_the_whole_gives(network: Loma, monkeypatch: py
     torch.testing.assert_close(network.descriptor(image, points), descriptors, rtol=0, atol=1e-3)
 
 
-@pytest.mark.parametrize("rows", [1, 8, 13, 200])
-def test_every_row_of_a_strip_has_its_neighbours(rows: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    heights = []
-
-    def blurred(x: torch.Tensor) -> torch.Tensor:
-        heights.append(x.shape[2])
-        return torch.nn.functional.avg_pool2d(x, (5, 1), stride=1, padding=(2, 0))
-
-    x = torch.rand(2, 3, 50, 7, generator=torch.Generator().manual_seed(0))
-    expected = blurred(x)
-    monkeypatch.setattr(strips, "FLOATS", 2 * 3 * 7 * rows)
-    torch.testing.assert_close(strips.in_strips(blurred, x, reach=2, channels=3), expected)
-    assert max(heights[1:]) <= max(rows, 8) + 4
-    assert len(heights) > 2 or rows == 200
-
-
 @torch.inference_mode()
 @pytest.mark.parametrize("kind", ["b", "g"])
 def test_descriptors_are_read_from_a_map_that_is_never_made(network: Loma, kind: str) -> None:
@@ -190,18 +161,6 @@ def test_descriptors_are_read_from_a_map_that_is_never_made(network: Loma, kind:
     torch.testing.assert_close(descriptor(image, points), expected, rtol=0, atol=1e-5)
     assert (expected[0, 4] == 0).all()
     assert expected[0, 0].abs().max() > 0
-
-
-def test_no_more_keypoints_than_there_are_maxima() -> None:
-    logits = torch.full((6, 9), -1.0)
-    logits[2, 3], logits[5, 8] = 4, 3
-    found = select_keypoints(logits, 100)
-    assert len(found.points) == 2 + (
-        6 * 9 - 9 - 4
-    )  # all pixels of the plain are equal, but for the maxima's windows
-    assert found.scores[:2].tolist() == pytest.approx(logits.flatten().softmax(dim=0)[[21, 53]].tolist())
-    assert len(select_keypoints(logits * 1000, 100).points) == 1  # the other is less likely than any float32
-    assert len(select_keypoints(logits, 1).points) == 1
 
 
 @pytest.fixture(scope="module")
@@ -225,16 +184,3 @@ def test_the_order_of_images_and_of_keypoints_changes_nothing(
     reversed_ = network.matcher(first, backwards, 0.0)
     assert torch.equal(reversed_.index0, there.index0)
     assert torch.equal(34 - reversed_.index1, there.index1)
-
-
-@torch.inference_mode()
-def test_no_keypoints_on_a_side_give_no_matches(network: Loma, pair: tuple[LomaKeypoints, LomaKeypoints]) -> None:
-    nothing = LomaKeypoints(torch.zeros(0, 2), torch.zeros(0, 128))
-    found = network.matcher(pair[0], nothing, 0.0)
-    assert len(found.index0) == len(found.index1) == len(found.scores) == 0
-
-
-def test_the_matrix_of_scores_is_a_product_of_two_softmaxes() -> None:
-    similarity = torch.randn(2, 5, 7, generator=torch.Generator().manual_seed(0)) * 10
-    expected = similarity.softmax(dim=1) * similarity.softmax(dim=2)
-    torch.testing.assert_close(log_scores(similarity).exp(), expected)

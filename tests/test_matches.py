@@ -60,7 +60,7 @@ def test_shapes_that_disagree_are_an_error(shape0, shape1, shape_scores):
 
 def test_empty_is_legal_everywhere():
     empty, size = Matches.empty(), Size(40, 30)
-    view = View.fit(Box.whole(size), long_side=64, flip=True)
+    view = View.fit(Box.whole(size), long_side=64)
     results = [empty, Matches([], [], []), Matches.concatenate([]), Matches.concatenate([empty, empty])]
     results += [empty.best(0), some(5).best(0), empty.inside(size, size), empty.to_image(view, view), empty[:]]
     for result in results:
@@ -106,19 +106,19 @@ def test_inside_drops_what_is_off_either_image_or_not_finite():
 
 def test_the_way_out_of_a_matcher_drops_padding_outside_and_not_finite_and_maps_the_rest():
     view0 = View(Box(10, 20, 50, 40), Size(80, 40), Size(96, 64))
-    view1 = View(Box(0, 0, 60, 60), Size(30, 30), Size(32, 32), flip=True)
+    view1 = View(Box(0, 0, 60, 60), Size(30, 30), Size(32, 32))
     rows = [
-        ((0.5, 0.5), (29, 0), 0.9),  # kept
+        ((0.5, 0.5), (0, 0), 0.9),  # kept
         ((85, 10), (5, 5), 1),  # on the padding of view 0
         ((10, 50), (5, 5), 1),
         ((10, 10), (31, 5), 1),  # on the padding of view 1
-        ((79.25, 39.25), (0, 29), 0.1),  # kept
+        ((79.25, 39.25), (29, 29), 0.1),  # kept
         ((-0.75, 3), (5, 5), 1),  # outside
         ((NAN, 3), (5, 5), 1),
         ((3, 3), (5, INF), 1),
         ((3, 3), (5, 5), NAN),
         ((3, 3), (5, 5), INF),
-        ((40, 20), (15, 10), -3),  # kept: a low score is a score
+        ((40, 20), (14, 10), -3),  # kept: a low score is a score
     ]
     out = Matches(*(np.array(column, np.float32) for column in zip(*rows, strict=True))).to_image(view0, view1)
     assert_allclose(out.points0, [(10, 20), (49.375, 39.375), (29.75, 29.75)], atol=1e-5)

@@ -105,7 +105,7 @@ def test_a_list_without_pairs_is_refused(tmp_path: Path, content: bytes | None, 
     if content is not None:
         (tmp_path / "list.txt").write_bytes(content)
     with pytest.raises(UserError, match=told):
-        read_pairs(tmp_path / "list.txt", tmp_path / root, ModelKind.E, copies=tmp_path)
+        read_pairs(tmp_path / "list.txt", tmp_path / root, copies=tmp_path)
 
 
 @pytest.fixture

@@ -9,11 +9,6 @@ import pytest
 import torch
 from golden import GOLDEN, Stage, assert_stages, golden_arrays, needs_golden, print_table, ready, seeded_tensor
 from semi_dense import (
-    check_batch_equals_single,
-    check_empty,
-    check_nothing_matches_padding,
-    random_network,
-    textured,
     traced,
 )
 
@@ -194,29 +189,6 @@ def as_map(grid):
 @pytest.mark.parametrize("case", CASES)
 def test_stages(case):
     assert_stages(stages_of(case))
-
-
-def network(border=2):
-    return random_network(lambda: AspanFormer(0.0, border))
-
-
-def test_batch_equals_single():
-    check_batch_equals_single(network(border=0), (64, 96), (96, 64))
-
-
-def test_nothing_matches_padding():
-    check_nothing_matches_padding(network(border=1), (96, 64))
-
-
-@torch.inference_mode()
-def test_tiny_pictures_match_nothing():
-    small = network()
-    check_empty(small.match(small.encode(textured(1, 1, 32, 32)), small.encode(textured(1, 1, 32, 64))))
-
-
-def test_sides_must_fit():
-    with pytest.raises(ValueError, match="multiples of 32"):
-        network().encode(torch.zeros(1, 1, 32, 40))
 
 
 def test_span_attention_is_that_of_sampled_keys(monkeypatch):

@@ -4,12 +4,11 @@
 """
 
 import json
-import re
 from functools import cache
 
 import pytest
 import torch
-from dense import MODES, batch_of, computed, grey_levels, pixels_of, resized_by_pil
+from dense import MODES, batch_of, compared, computed, grey_levels, input_of, pixels_of, resized_by_pil, within
 from golden import GOLDEN, Stage, assert_stages, golden_arrays, needs_golden, print_table, ready, seeded_tensor
 
 from mkpc_kaggle.matchers.networks.dense_sampling import balancing_weights, density, draw, sample_matches
@@ -35,23 +34,6 @@ def golden_network():
     return ready(DKM(), standin())
 
 
-def within(name, got, expected):
-    """The tolerance of the golden files: a share of the array's largest value."""
-    return Stage(name, got, expected, 1e-4 * expected.abs().max().item())
-
-
-def compared(values, golden):
-    """Stages in the order of the network for all arrays of a golden file that ``values`` has."""
-    for name, value in values.items():
-        for key in golden:
-            reduced = re.fullmatch(rf"{name}(?:_ch(\d+))?", key)
-            if reduced:
-                got = value[:, :: int(reduced[1])] if reduced[1] else value
-                if key in {"up_enc2_ch8", "up_ref1_dcert", "up_ref1_disp", "K16_yy", "K16_xy"}:
-                    got = got[:1]
-                yield within(key, got, golden[key])
-
-
 def one_pair(values, *, symmetric=True):
     """The final values shaped as in the golden files of one pair."""
     return values | {
@@ -59,11 +41,6 @@ def one_pair(values, *, symmetric=True):
         for name, value in values.items()
         if name.endswith(("warp", "certainty"))
     }
-
-
-def input_of(pixels):
-    """(H, W, 3) uint8 that has its size already."""
-    return network_input(batch_of(pixels), tuple(pixels.shape[:2]))
 
 
 def input_stages():
@@ -80,7 +57,7 @@ def input_stages():
 def main_stages():
     golden = golden_arrays("dkm", "main")
     values = computed(golden_network(), [input_of(golden[f"{name}_96x128"]) for name in ("imA", "imB")])
-    yield from exhausted(compared(one_pair(values), golden), golden)
+    yield from exhausted(compared(one_pair(values), golden, within), golden)
 
 
 def upsample_stages():
@@ -89,7 +66,7 @@ def upsample_stages():
         [input_of(images[f"{name}_{size}"]) for name in ("imA", "imB")] for size in ("96x128", "144x192")
     )
     values = computed(golden_network(), coarse, fine)
-    yield from exhausted(compared(one_pair(values), golden), golden)
+    yield from exhausted(compared(one_pair(values), golden, within), golden)
 
 
 def odd_one_way_stages():
@@ -100,7 +77,7 @@ def odd_one_way_stages():
     )
     network = golden_network()
     values = computed(network, coarse, symmetric=False) | computed(network, coarse, fine, symmetric=False)
-    yield from exhausted(compared(one_pair(values, symmetric=False), golden), golden)
+    yield from exhausted(compared(one_pair(values, symmetric=False), golden, within), golden)
 
 
 def batched_stages():
@@ -109,7 +86,7 @@ def batched_stages():
     one_way = computed(golden_network(), pair, symmetric=False)
     values = computed(golden_network(), pair)
     values |= {"one_way_warp": one_way["warp"], "one_way_certainty": one_way["certainty"][:, None]}
-    yield from exhausted(compared(values, golden), golden)
+    yield from exhausted(compared(values, golden, within), golden)
 
 
 def exhausted(stages, golden):

@@ -49,7 +49,6 @@ MATCHER = {
     "scores": 1e-4,
     "matching_scores": 1e-4,
 }
-PIPELINE = {"keypoints": 1e-6, "descriptors": 2e-4, "matching_scores": 4e-4, "points": 1e-3}
 
 
 @cache

@@ -6,15 +6,10 @@ import pytest
 import torch
 from golden import Stage, assert_stages, golden_arrays, needs_golden, print_table, ready, standin_state
 from semi_dense import (
-    check_batch_equals_single,
-    check_empty,
-    check_nothing_matches_padding,
     loftr_stages,
-    random_network,
-    textured,
 )
 
-from mkpc_kaggle.matchers.networks.grids import from_2x2_blocks, mean_pool, to_2x2_blocks
+from mkpc_kaggle.matchers.networks.grids import mean_pool
 from mkpc_kaggle.matchers.networks.quadtree import Quadtree, attend, quadtree_attention
 
 CASES = ("same_size", "diff_size_extension", "masked_batch")
@@ -69,48 +64,6 @@ def test_stages(case):
 @pytest.mark.parametrize("case", OPERATORS)
 def test_operator(case):
     assert_stages(operator_stages(case))
-
-
-@needs_golden
-@torch.inference_mode()
-def test_no_match_at_threshold_one():
-    network = ready(Quadtree(threshold=1.0), standin_state("quadtree"))
-    golden = golden_arrays("quadtree", "same_size")
-    check_empty(network.match(*(network.encode(golden[f"image{s}_u8"].float()[:, None] / 255) for s in (0, 1))))
-
-
-class SharpQuadtree(Quadtree):
-    similarity_scale = 1 / (256 * 0.03)
-
-
-def network(border=2, topks=(3, 2)):
-    return random_network(lambda: SharpQuadtree(0.0, border, topks))
-
-
-def test_batch_equals_single():
-    check_batch_equals_single(network(border=0), (64, 96), (96, 64))
-
-
-def test_nothing_matches_padding():
-    check_nothing_matches_padding(network(border=1), (96, 64))
-
-
-@torch.inference_mode()
-def test_fewer_cells_than_are_kept():
-    small = network(topks=(16, 8))
-    check_empty(small.match(small.encode(textured(1, 1, 32, 32)), small.encode(textured(1, 1, 32, 64))))
-
-
-def test_sides_must_fit():
-    with pytest.raises(ValueError, match="multiples of 32"):
-        network().encode(torch.zeros(1, 1, 32, 40))
-
-
-def test_quads_and_back():
-    grid = torch.arange(2 * 4 * 6 * 3).view(2, 4, 6, 3)
-    cells = to_2x2_blocks(grid)
-    assert cells[1, 4].tolist() == grid[1, 2:4, 2:4].flatten(0, 1).tolist()
-    assert torch.equal(from_2x2_blocks(cells, 4, 6), grid)
 
 
 def test_attention_with_all_cells_kept_is_that_of_each_level():

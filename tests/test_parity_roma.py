@@ -7,25 +7,16 @@ import json
 import re
 from functools import cache
 
+import dense
 import pytest
 import torch
-from dense import MODES, batch_of, pixels_of, resized_by_pil
-from golden import (
-    GOLDEN,
-    Stage,
-    assert_stages,
-    golden_arrays,
-    needs_golden,
-    print_table,
-    ready,
-    seeded_tensor,
-)
+from dense import MODES, compared, input_of, pixels_of, resized_by_pil
+from golden import GOLDEN, Stage, assert_stages, golden_arrays, needs_golden, print_table, ready, seeded_tensor
 from roma_values import computed
 
 from mkpc_kaggle.matchers.networks import roma
 from mkpc_kaggle.matchers.networks.dense_sampling import balancing_weights, density, draw, sample_matches
 from mkpc_kaggle.matchers.networks.grids import as_grid, as_map
-from mkpc_kaggle.matchers.networks.pixels import network_input
 from mkpc_kaggle.matchers.networks.roma import RoMa, anchor_mean
 
 
@@ -50,28 +41,8 @@ def golden_network():
 
 
 def within(name, got, expected):
-    """The tolerance of the golden files: a share of the array's largest value."""
-    share = 3e-4 if re.fullmatch("(.*_)?certainty", name) and "__" not in name else 1e-4
-    return Stage(name, got, expected, share * expected.abs().max().item())
-
-
-def compared(values, golden):
-    """Stages in the order of the network for all arrays of a golden file that ``values`` has.
-
-    Of some batches the file has the first item only.
-    """
-    for name, value in values.items():
-        for key in golden:
-            reduced = re.fullmatch(rf"{name}(?:_ch(\d+))?", key)
-            if reduced:
-                step = int(reduced[1] or 1)
-                got = value[..., ::step] if value.ndim == 3 else value[:, ::step]
-                yield within(key, got[: len(golden[key])], golden[key])
-
-
-def input_of(pixels):
-    """(H, W, 3) uint8 that has its size already."""
-    return network_input(batch_of(pixels), tuple(pixels.shape[:2]))
+    looser = re.fullmatch("(.*_)?certainty", name) and "__" not in name
+    return dense.within(name, got, expected, 3e-4 if looser else 1e-4)
 
 
 def main_images():
@@ -87,13 +58,13 @@ def resized_images(size):
 def main_stages():
     golden = golden_arrays("roma", "main")
     values = computed(golden_network(), main_images())
-    yield from exhausted(compared(values, golden), golden)
+    yield from exhausted(compared(values, golden, within), golden)
 
 
 def upsample_stages():
     golden = golden_arrays("roma", "upsample")
     values = computed(golden_network(), main_images(), resized_images((168, 168)))
-    yield from exhausted(compared(second_pass(values, "warp", "certainty"), golden), golden)
+    yield from exhausted(compared(second_pass(values, "warp", "certainty"), golden, within), golden)
 
 
 def second_pass(values, *plain):
@@ -107,7 +78,7 @@ def unequal_one_way_stages():
     images = resized_images((112, 140))
     values = computed(golden_network(), images, symmetric=False)
     values |= second_pass(computed(golden_network(), images, resized_images((150, 202)), symmetric=False))
-    yield from exhausted(compared(values, golden), golden)
+    yield from exhausted(compared(values, golden, within), golden)
 
 
 def batched_stages():
@@ -121,7 +92,7 @@ def batched_stages():
         patch.setattr(roma, "stretch", lambda size: 1.25 * 112 / 560)
         other = computed(network, pair)
     values |= {f"other_setting_{name}": other[name] for name in ("warp", "certainty")}
-    yield from exhausted(compared(values, golden), golden)
+    yield from exhausted(compared(values, golden, within), golden)
 
 
 @torch.inference_mode()
@@ -136,7 +107,7 @@ def parts_stages():
     for position, anchor in enumerate(golden["cls_boost_index"].tolist()):
         logits[:, anchor, position // 6, position % 6] += 3
     values |= {"cls_mode": logits.argmax(dim=1), "cls_flow": as_map(anchor_mean(as_grid(logits)))}
-    yield from exhausted(compared(values, golden), golden)
+    yield from exhausted(compared(values, golden, within), golden)
 
 
 def exhausted(stages, golden):
@@ -149,8 +120,8 @@ def exhausted(stages, golden):
 
 
 def sampling_stages():
-    golden, dense = golden_arrays("roma", "sampling"), golden_arrays("roma", "main")
-    warp, certainty = dense["warp"].reshape(-1, 4), dense["certainty"].flatten()
+    golden, main = golden_arrays("roma", "sampling"), golden_arrays("roma", "main")
+    warp, certainty = main["warp"].reshape(-1, 4), main["certainty"].flatten()
     modes = {"threshold": "threshold", "raw": "raw"}
     modes |= {f"{mode}_float32": mode for mode in ("threshold_balanced", "balanced")}
     for name, mode in modes.items():

@@ -17,7 +17,7 @@ from torch.nn import functional
 
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.matchers.networks.assignment import mutual_matches
-from mkpc_kaggle.matchers.networks.superglue import SuperGlue, log_optimal_transport, normalise_points
+from mkpc_kaggle.matchers.networks.superglue import SuperGlue, log_optimal_transport
 from mkpc_kaggle.matchers.networks.superpoint import SuperPointKeypoints
 
 CASES = ["full_60x47", "eval20_33x71", "batch2_20x26", "tiny_1x3"]
@@ -226,30 +226,6 @@ def test_the_transport_is_that_of_the_log_domain(m, n, iterations, bin_score, sp
     expected = plain_transport(scores, bin_score, iterations)
     torch.testing.assert_close(got.double(), expected, rtol=1e-5, atol=1e-3)
     torch.testing.assert_close(got.double().exp(), expected.exp(), rtol=0, atol=5e-4)
-
-
-def test_the_plans_rows_and_columns_hold_their_masses():
-    m, n = 30, 45
-    scores = 3 * torch.randn(2, m, n, generator=torch.Generator().manual_seed(0))
-    plan = log_optimal_transport(scores, torch.tensor(1.0), 100).exp()
-    rows, columns = torch.ones(2, m + 1), torch.ones(2, n + 1)
-    rows[:, m], columns[:, n] = n, m
-    torch.testing.assert_close(plan.sum(dim=1), columns, rtol=1e-5, atol=0)  # the last to be scaled
-    torch.testing.assert_close(plan.sum(dim=2), rows, rtol=1e-3, atol=0)
-
-
-def test_mutual_pairs_above_the_threshold_match():
-    scores = torch.tensor([[0.6, 0.3, 0.0], [0.7, 0.1, 0.1], [0.1, 0.2, 0.4]])
-    for threshold, pairs in ((0.5, [[1, 0]]), (0.0, [[1, 0], [2, 2]])):
-        found = mutual_matches(scores.log(), threshold)
-        assert torch.stack([found.index0, found.index1], dim=1).tolist() == pairs
-    assert found.scores.tolist() == pytest.approx([0.7, 0.4])
-
-
-def test_points_are_normalised_by_one_scale_for_both_axes():
-    points = torch.tensor([[[320.0, 240.0], [0, 0], [640, 480]]])
-    expected = torch.tensor([[[0, 0], [-320, -240], [320, 240]]]) / (0.7 * 640)
-    torch.testing.assert_close(normalise_points(points, Size(640, 480)), expected)
 
 
 if __name__ == "__main__":

@@ -124,52 +124,6 @@ def network(**options):
     return network
 
 
-def reference_suppression(scores, radius):
-    """The definition with loops over pixels; sets instead of maps."""
-    height, width = scores.shape
-
-    def window(y, x):
-        rows, columns = (range(max(at - radius, 0), at + radius + 1) for at in (y, x))
-        return [(i, j) for i in rows for j in columns if i < height and j < width]
-
-    pixels = list(np.ndindex(height, width))
-    kept = {p for p in pixels if scores[p] == max(scores[q] for q in window(*p))}
-    for _ in range(2):
-        near = {q for p in kept for q in window(*p)}
-        rest = {p: 0.0 if p in near else scores[p] for p in pixels}
-        kept |= {p for p in pixels if p not in near and rest[p] == max(rest[q] for q in window(*p))}
-    return np.array([[scores[y, x] if (y, x) in kept else 0 for x in range(width)] for y in range(height)])
-
-
-@pytest.mark.parametrize("radius", range(5))
-@pytest.mark.parametrize("seed", range(3))
-def test_suppression_is_its_definition(seed, radius):
-    rng = np.random.default_rng(seed)
-    maps = rng.integers(0, 12, (2, 13, 17)) / 8  # few values, many ties
-    got = suppress_non_maxima(torch.tensor(maps), radius).numpy()
-    np.testing.assert_array_equal(got, [reference_suppression(scores, radius) for scores in maps])
-
-
-def test_equal_maxima_and_plateaus_survive():
-    scores = torch.zeros(1, 7, 9)
-    scores[0, 3, 2:6] = 0.5
-    assert torch.equal(suppress_non_maxima(scores, 4), scores)
-
-
-def test_of_a_ramp_the_first_three_points_of_the_chain_survive():
-    scores = torch.arange(1, 31).float().flip(0)[None, None]  # descending along one row
-    found = suppress_non_maxima(scores, 2)[0, 0].nonzero()[:, 0].tolist()
-    assert found == [0, 3, 6]
-
-
-def test_a_point_of_the_border_suppresses_before_it_is_removed():
-    scores = torch.zeros(1, 24, 24)
-    scores[0, 10, 3], scores[0, 10, 5], scores[0, 16, 16] = 0.9, 0.5, 0.4
-    points, kept = SuperPoint(border=4).select_keypoints(suppress_non_maxima(scores, 3)[0])
-    assert points.tolist() == [[16, 16]]
-    assert kept.tolist() == pytest.approx([0.4])
-
-
 def test_the_threshold_is_strict_and_the_limit_keeps_the_strongest_in_order():
     scores = torch.zeros(16, 24)
     for (y, x), score in {
@@ -193,26 +147,6 @@ def test_the_threshold_is_strict_and_the_limit_keeps_the_strongest_in_order():
     assert [20, 9] in selected(border=3)
 
 
-def test_a_cells_scores_are_its_pixels_row_by_row():
-    logits = torch.full((1, 65, 2, 3), -100.0)
-    logits[0, 13, 1, 2] = 100  # row 1, column 5 of the cell
-    logits[0, 64, 0, 0] = 100  # no keypoint
-    scores = score_map(logits)
-    assert scores.shape == (1, 16, 24)
-    assert scores[0, 9, 21] == 1
-    assert scores[0, :8, :8].sum() == 0
-
-
-def test_descriptors_are_unit_vectors_and_those_of_the_outermost_cells_at_the_ends():
-    torch.manual_seed(1)
-    field = torch.randn(5, 4, 6)
-    ends = torch.tensor([[3.5, 3.5], [47, 31]])  # the first cell's centre; what the slip takes for the last one's
-    got = sample_descriptors(field, ends)
-    torch.testing.assert_close(got, functional.normalize(torch.stack([field[:, 0, 0], field[:, 3, 5]]), dim=1))
-    inside = sample_descriptors(field, torch.rand(50, 2) * torch.tensor([47, 31]))
-    torch.testing.assert_close(inside.norm(dim=1), torch.ones(50))
-
-
 @pytest.mark.parametrize(("height", "width"), [(7, 64), (8, 8), (9, 15), (16, 16), (8, 200)])
 def test_small_images_have_no_keypoints_and_that_is_no_error(height, width):
     (found,) = network(border=8)(torch.rand(1, 1, height, width))
@@ -223,8 +157,8 @@ def test_small_images_have_no_keypoints_and_that_is_no_error(height, width):
 def test_a_batch_equals_its_images_with_any_weights():
     net = network(max_keypoints=20)
     batch = torch.rand(3, 1, 45, 62)
-    for found, one in zip(net(batch), batch, strict=True):
-        (alone,) = net(one[None])
+    for found, image in zip(net(batch), batch, strict=True):
+        (alone,) = net(image[None])
         torch.testing.assert_close(found.scores, alone.scores, rtol=1e-4, atol=1e-7)
         assert torch.equal(found.points, alone.points)
         assert len(alone.points) == 20

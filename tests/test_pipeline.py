@@ -15,7 +15,7 @@ from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Box, Size
 from mkpc_kaggle.geometry.focal_prior import FocalConfig, FocalPrior, estimate_with_prior
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL, ModelKind
+from mkpc_kaggle.geometry.robust import ModelKind
 from mkpc_kaggle.matchers.contract import Colour, MatcherSpec
 from mkpc_kaggle.matchers.sift import SiftMatcher, SiftOptions
 from mkpc_kaggle.pipeline import stages
@@ -202,15 +202,6 @@ def test_paths_arrays_and_images_give_the_same(tmp_path):
         matcher(pair()[0] / 255, pair()[1])
     with pytest.raises(UserError, match=r"none\.png: no such file"):
         matcher(tmp_path / "none.png", pair()[1])
-
-
-@pytest.mark.parametrize("shape", [(1, 1), (1, 300), (300, 1), (33, 47), (200, 200)])
-def test_a_picture_with_nothing_in_it_is_a_result_with_a_reason(shape):
-    match = TwoStageMatcher(TWO_STAGES)(np.full(shape, 99, np.uint8), pair()[1])
-    assert not match.estimate.ok
-    assert "too few" in match.estimate.failure
-    assert_allclose(match.estimate.matrix, FALLBACK_FUNDAMENTAL / np.sqrt(2))
-    assert [region.cropped for region in match.regions] == [False, False]
 
 
 def test_at_most_so_many_matches_are_kept_and_they_are_the_surest():

@@ -8,7 +8,6 @@ from mkpc_kaggle.matchers.contract import Placement, Precision
 from mkpc_kaggle.matchers.networks.layers import Linear, attention, linear
 from mkpc_kaggle.matchers.networks.placement import fold_norms, placed
 from mkpc_kaggle.matchers.networks.resnet_fpn import ResNetFpn
-from mkpc_kaggle.matchers.networks.superglue import pointwise_network
 
 
 def with_random_norms(network):
@@ -31,17 +30,6 @@ def test_a_norm_goes_into_the_convolution_before_it(bias):
     fold_norms(network)
     assert not any(isinstance(module, nn.BatchNorm2d) for module in network.modules())
     torch.testing.assert_close(network(x), expected, rtol=1e-5, atol=1e-5)
-
-
-@torch.inference_mode()
-def test_a_norm_of_rows_goes_into_the_map_before_it():
-    torch.manual_seed(1)
-    network = with_random_norms(pointwise_network(3, 8, 5))
-    rows = torch.randn(7, 3)
-    expected = network(rows)
-    fold_norms(network)
-    assert [type(step) for step in network][1] is nn.Identity
-    torch.testing.assert_close(network(rows), expected, rtol=1e-5, atol=1e-5)
 
 
 @torch.inference_mode()

@@ -17,8 +17,6 @@ from mkpc_kaggle.matchers.networks.loftr import Loftr
 from mkpc_kaggle.matchers.networks.pixels import network_input
 from mkpc_kaggle.matchers.networks.placement import placed
 from mkpc_kaggle.matchers.networks.quadtree import Quadtree
-from mkpc_kaggle.matchers.networks.superglue import SuperGlue
-from mkpc_kaggle.matchers.networks.superpoint import SuperPoint
 from mkpc_kaggle.pipeline import devices
 from mkpc_kaggle.pipeline.devices import fastest_precision, resolve_placement
 
@@ -27,8 +25,6 @@ MAKERS = {
     "loftr": Loftr,
     "quadtree": Quadtree,
     "aspanformer": AspanFormer,
-    "superpoint": lambda: SuperPoint(max_keypoints=400),
-    "superglue": lambda: SuperGlue(20),
     "dkm": DKM,
 }
 half_precisions = pytest.mark.parametrize("precision", [Precision.BFLOAT16, Precision.FLOAT16])
@@ -76,32 +72,6 @@ def test_semi_dense_matches_move_less_than_by_noise(name, precision):
     assert agreement(exact, half, within=0.25) > agreement(exact, disturbed, within=0.25)
     assert agreement(exact, half, within=1.0) > 0.9
     assert not torch.equal(exact, half)
-
-
-@half_precisions
-@torch.inference_mode()
-def test_superpoint_finds_the_same_keypoints(precision):
-    image = pictures(SIZE, 1)[0].float() / 255
-    exact, half = (network("superpoint", each)(image)[0] for each in (Precision.FLOAT32, precision))
-    assert len(exact.points) == 400
-    assert agreement(exact.points, half.points, within=0) > 0.85
-    index, partner = (torch.cdist(exact.points, half.points) == 0).nonzero().unbind(1)
-    assert (exact.descriptors[index] * half.descriptors[partner]).sum(1).min() > 0.99
-    assert half.descriptors.dtype == half.scores.dtype == torch.float32
-
-
-@half_precisions
-@torch.inference_mode()
-def test_superglue_finds_the_same_partners(precision):
-    superpoint = network("superpoint")
-    keypoints = [superpoint(view.float() / 255)[0] for view in pictures(SIZE, 1)]
-    exact, half = (network("superglue", each)(*keypoints) for each in (Precision.FLOAT32, precision))
-    pairs, half_pairs = (
-        set(zip(found.index0.tolist(), found.index1.tolist(), strict=True)) for found in (exact, half)
-    )
-    assert len(pairs) > 200
-    assert len(pairs & half_pairs) > 0.85 * len(pairs)
-    assert half.scores.dtype == torch.float32
 
 
 @half_precisions

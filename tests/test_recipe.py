@@ -17,7 +17,7 @@ from mkpc_kaggle.geometry.robust import Method, RobustConfig
 from mkpc_kaggle.matchers.contract import Training
 from mkpc_kaggle.matchers.registry import matcher_names, spec_of
 from mkpc_kaggle.pipeline.availability import options_of, slots_of
-from mkpc_kaggle.recipe import Choice, Mode, Recipe, Unit, load_recipe, parse_recipe, recipe_names
+from mkpc_kaggle.recipe import Mode, Recipe, RecipeChoice, Unit, load_recipe, parse_recipe, recipe_names
 
 SIFT = 'units = [{ stage = 1, matcher = "sift", long_side = 640 }]\n'
 
@@ -312,13 +312,13 @@ def test_the_fingerprint_changes_with_whatever_decides_the_numbers(other):
 @pytest.mark.parametrize(
     ("text", "choice", "folder"),
     [
-        ("classical", Choice("classical"), "classical"),
-        ("classical:two-stage", Choice("classical"), "classical"),
-        ("my/own.toml:stage-1", Choice("my/own.toml", Mode.STAGE_1), "my_own.toml_stage-1"),
-        ("C:own.toml", Choice("C:own.toml"), "C_own.toml"),
-        (":stage-1", Choice(":stage-1"), "_stage-1"),
+        ("classical", RecipeChoice("classical"), "classical"),
+        ("classical:two-stage", RecipeChoice("classical"), "classical"),
+        ("my/own.toml:stage-1", RecipeChoice("my/own.toml", Mode.STAGE_1), "my_own.toml_stage-1"),
+        ("C:own.toml", RecipeChoice("C:own.toml"), "C_own.toml"),
+        (":stage-1", RecipeChoice(":stage-1"), "_stage-1"),
     ],
 )
-def test_a_choice_is_a_recipe_and_perhaps_a_mode(text: str, choice: Choice, folder: str) -> None:
-    assert Choice.parse(text) == choice
+def test_a_choice_is_a_recipe_and_perhaps_a_mode(text: str, choice: RecipeChoice, folder: str) -> None:
+    assert RecipeChoice.parse(text) == choice
     assert choice.folder == folder

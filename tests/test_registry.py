@@ -69,12 +69,6 @@ def test_files_without_a_spec_are_no_matchers() -> None:
         spec_of("sparse", "test")
 
 
-def test_a_matcher_is_imported_when_it_is_asked_for() -> None:
-    code = "import sys; from mkpc_kaggle.matchers.registry import spec_of; spec_of('sift', 'test')"
-    done = run(f"{code}; print('kornia' in sys.modules, 'mkpc_kaggle.matchers.dkm' in sys.modules)")
-    assert done.stdout.split() == ["False", "False"], done.stderr
-
-
 def test_without_kornia_its_matchers_alone_are_lost(clean_environment: None) -> None:
     done = run(WITHOUT_KORNIA)
     assert "superglue_outdoor.pth" in done.stdout, done.stderr

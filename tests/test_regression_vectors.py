@@ -43,7 +43,7 @@ def found(name):
     """The matches (M, 6) of two pairs: number of the pair, points, score."""
     matcher = MATCHERS[name](Placement())
     sides = [[picture(matcher.spec.colour, number, shift) for number in (0, 1)] for shift in (SHIFT, 0)]
-    encodings = [[matcher.encode([one])[0] for one in side] for side in sides]
+    encodings = [[matcher.encode([shown])[0] for shown in side] for side in sides]
     return np.concatenate(
         [
             np.column_stack([np.full(len(matches), pair), matches.points0, matches.points1, matches.scores])

@@ -44,7 +44,7 @@ def sections(page: str) -> list[str]:
 def a_run(directory: Path, count: int = 12) -> list[Pair]:
     """A run over pairs of which the second cannot be read; its work directory is ``directory``/work."""
     pairs = write_pairs(directory / "images", count)
-    pairs[1].image1.write_bytes(b"")
+    pairs[1].images[1].write_bytes(b"")
     run(pairs, THREE_UNITS, RectifiedMatcher(), directory / "work")
     return pairs
 
@@ -199,17 +199,17 @@ def test_a_report_that_fails_is_a_line_and_leaves_the_page_without_drawings(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "report.html"
-    line = report_run(tmp_path / "nowhere", path, time.monotonic() + 60)
+    line = report_run(tmp_path / "nowhere", path, time.monotonic() + 600)
     assert line.startswith("warning: no report, or a report without drawings (")
     pairs = a_run(tmp_path, 3)
     monkeypatch.setattr("mkpc_kaggle.reporting.report.draw_strip", None)
-    assert report_run(tmp_path / "work", path, time.monotonic() + 60, pairs).startswith("warning: no report, or")
+    assert report_run(tmp_path / "work", path, time.monotonic() + 600, pairs).startswith("warning: no report, or")
     assert "Drawings are missing" in path.read_text()
 
 
 def test_the_command_draws_a_page_with_the_images_of_a_test_side(tmp_path: Path) -> None:
     pairs = write_pairs(tmp_path / "test" / "test_images" / "set", 2)
-    rows = [f"{pair.id},set,{pair.image0.stem},{pair.image1.stem}" for pair in pairs]
+    rows = [f"{pair.id},set,{pair.images[0].stem},{pair.images[1].stem}" for pair in pairs]
     (tmp_path / "test" / "test.csv").write_text("\n".join(["sample_id,batch_id,image_1_id,image_2_id", *rows]))
     run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
     page = tmp_path / "report.html"

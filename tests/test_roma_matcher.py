@@ -2,21 +2,20 @@
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from checkpoints import dinov2_alone, roma_alone
+from pictures import as_picture, picture, write_store
 from standin import filled, narrow_roma, scene, use_narrow
 
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.geometry.coordinates import Box, Size, View
-from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.matchers import roma
-from mkpc_kaggle.matchers.contract import Picture, Placement, Precision, Training
+from mkpc_kaggle.matchers.contract import Placement, Precision, Training
 from mkpc_kaggle.matchers.networks.dinov2 import DinoV2, DinoV2Config
 from mkpc_kaggle.matchers.networks.roma import stretch
 from mkpc_kaggle.matchers.roma import RomaMatcher, RomaOptions
-from mkpc_kaggle.weights import UNVERIFIED, WeightFile, WeightStore
+from mkpc_kaggle.weights import WeightStore
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*is not verified")
 
@@ -30,30 +29,13 @@ def narrow(monkeypatch: pytest.MonkeyPatch) -> None:
 def store(tmp_path_factory: pytest.TempPathFactory) -> WeightStore:
     """Both files, RoMa's own for outdoors alone."""
     state = filled(narrow_roma(), "roma").state_dict()
-    directory = tmp_path_factory.mktemp("weights")
-    lines = []
-    for layout, name, slot in (
-        (roma_alone, "roma.pth", "roma-outdoor"),
-        (dinov2_alone, "dinov2.pth", "dinov2-vitl14"),
-    ):
-        torch.save(layout(state), directory / name)
-        lines.append(WeightFile(name, -1, UNVERIFIED, "none", slot, "made here"))
-    return WeightStore([directory], lines)
+    states = {"roma.pth": roma_alone(state), "dinov2.pth": dinov2_alone(state)}
+    slots = [("roma.pth", "roma-outdoor"), ("dinov2.pth", "dinov2-vitl14")]
+    return write_store(tmp_path_factory.mktemp("weights"), states, slots)
 
 
 def loaded(store: WeightStore, precision: Precision = Precision.FLOAT32, **options: object) -> RomaMatcher:
     return roma.load(store, RomaOptions(**options), Placement(precision=precision))  # type: ignore[arg-type]
-
-
-def picture(height: int, width: int, shift: int = 0, padding: int = 0) -> Picture:
-    content = Size(width, height)
-    view = View(Box.whole(content), content, Size(width + padding, height + padding))
-    return Picture(view.render(scene(height, width + shift, 3)[:, shift:]), view)
-
-
-def match_one(matcher: RomaMatcher, first: Picture, second: Picture) -> Matches:
-    (matches,) = matcher.match(matcher.encode([first]), matcher.encode([second]))
-    return matches
 
 
 def test_sides_of_the_first_pass_are_multiples_of_14(store: WeightStore) -> None:
@@ -76,12 +58,6 @@ def test_the_published_sizes_are_a_stretched_unit_of_864() -> None:
     assert stretch(torch.Size([864, 864])) == pytest.approx(1.25 * 1.542857, rel=1e-6)
 
 
-def test_one_way_is_from_the_first_to_the_second(store: WeightStore) -> None:
-    matches = match_one(loaded(store, symmetric=False, matches=200), picture(40, 56), picture(50, 36))
-    assert len(matches) == 200
-    np.testing.assert_allclose(matches.points0, np.rint(matches.points0), atol=1e-4)
-
-
 def test_a_pair_needs_as_many_passes_of_both(store: WeightStore) -> None:
     (first,), (second,) = (loaded(store, passes=passes).encode([picture(40, 56)]) for passes in (1, 2))
     with pytest.raises(ValueError, match="second pass"):
@@ -93,12 +69,9 @@ def test_an_image_of_other_sides_is_refused() -> None:
         DinoV2(DinoV2Config(8, 1, 1, 2))(torch.zeros(1, 3, 28, 30))
 
 
-def test_the_training_says_which_weights(store: WeightStore) -> None:
-    with pytest.raises(KeyError, match="roma-indoor"):
+def test_other_weights_or_another_networks_checkpoint_are_refused(store: WeightStore, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="roma-indoor"):
         loaded(store, training=Training.INDOOR)
-
-
-def test_another_networks_checkpoint_is_refused(store: WeightStore, tmp_path: Path) -> None:
     for name in ("roma.pth", "dinov2.pth"):
         torch.save({"weight": torch.ones(3)}, tmp_path / name)
     with pytest.raises(UserError, match="'roma-outdoor with dinov2-vitl14' do not fit the network"):
@@ -108,7 +81,8 @@ def test_another_networks_checkpoint_is_refused(store: WeightStore, tmp_path: Pa
 @pytest.mark.parametrize("precision", [Precision.BFLOAT16, Precision.FLOAT16])
 def test_half_precision_moves_most_targets_little(store: WeightStore, precision: Precision) -> None:
     """Where the best anchor changes they move by much: few, as these weights have no sure ones."""
-    pictures = picture(56, 70), picture(56, 70, 8)
+    whole = scene(56, 78, 3)
+    pictures = as_picture(whole[:, :70]), as_picture(whole[:, 8:])
     warps = []
     for each in (Precision.FLOAT32, precision):
         matcher = loaded(store, each, passes=1, symmetric=False)

@@ -84,19 +84,6 @@ def test_a_reconstruction_that_says_something_else_is_not_averaged(scene: Synthe
     np.testing.assert_allclose(both.F, scene.true_fundamental(pair), atol=1e-9)
 
 
-def test_an_image_that_one_reconstruction_lacks_is_taken_from_another(scene: SyntheticScene) -> None:
-    pair = scene.pairs[0]
-    rest = model({name: camera for name, camera in scene.cameras.items() if name != "0000"})
-    found = choice_of(scene, [rest], [model(scene.cameras)])
-    np.testing.assert_allclose(found.F, scene.true_fundamental(pair))
-
-
-def test_the_first_model_that_has_both_images_counts(scene: SyntheticScene) -> None:
-    other = {name: replace(camera, t=camera.t + 1) for name, camera in scene.cameras.items()}
-    first = choice([model({"0000": scene.cameras["0000"]}), model(scene.cameras), model(other)], scene)
-    np.testing.assert_allclose(first.F, scene.true_fundamental(scene.pairs[0]))
-
-
 def test_a_picture_and_itself_have_no_fundamental(scene: SyntheticScene) -> None:
     assert choice_of(scene, [model(scene.cameras)], image1=scene.images[0]).reason is Reason.SAME_IMAGE
 
@@ -151,12 +138,6 @@ def test_a_model_that_is_too_small_is_left_out(scene: SyntheticScene) -> None:
     kept, reasons = filter_models((small, model(scene.cameras)))
     assert [len(each.images) for each in kept] == [4]
     assert reasons == ("a model of 2 images is too small",)
-
-
-def test_models_are_in_order_of_what_is_left_of_them(scene: SyntheticScene) -> None:
-    three = model({name: scene.cameras[name] for name in ("0001", "0002", "0003")})
-    kept, _ = filter_models((three, model(scene.cameras)))
-    assert [len(each.images) for each in kept] == [4, 3]
 
 
 def test_settings_come_from_a_table() -> None:

@@ -52,21 +52,6 @@ def test_points_on_both_sides_of_a_cells_border_are_one_keypoint() -> None:
     np.testing.assert_allclose(keypoints[place[0]], [0.75, 1.5], atol=1e-6)
 
 
-def test_points_further_apart_than_three_cells_are_never_merged() -> None:
-    grid = np.stack(np.meshgrid(np.arange(9), np.arange(9)), axis=-1).reshape(-1, 2).astype(np.float32) * 3.1
-    keypoints, _ = merge_points(grid, 1.0)
-    assert len(keypoints) == len(grid)
-
-
-def test_keypoints_do_not_depend_on_the_order_of_the_points() -> None:
-    points = np.random.default_rng(0).uniform(0, 40, (500, 2)).astype(np.float32)
-    order = np.random.default_rng(1).permutation(500)
-    keypoints, place = merge_points(points, 0.75)
-    again, moved = merge_points(points[order], 0.75)
-    np.testing.assert_allclose(again, keypoints, atol=1e-5)
-    np.testing.assert_array_equal(moved, place[order])
-
-
 def test_a_match_that_two_matchers_found_is_one_and_outvotes_another() -> None:
     edge = Edge(0, 1, matches((10, 10, 60, 60), (10, 10, 20, 20), (10.1, 10, 20, 20.1)))
     keypoints = keypoints_of(2, edge)
@@ -95,11 +80,6 @@ def test_a_point_seen_in_two_pairs_is_one_keypoint() -> None:
     np.testing.assert_allclose(keypoints.points[0][a], [10.05, 9.95], atol=1e-5)
 
 
-def test_an_image_without_matches_has_no_keypoints() -> None:
-    keypoints = keypoints_of(3, Edge(0, 2, matches((1, 1, 2, 2))))
-    assert [points.shape for points in keypoints.points] == [(1, 2), (0, 2), (1, 2)]
-
-
 def test_the_same_picture_under_two_names_is_one_image() -> None:
     there, back, same = matches((1, 1, 2, 2)), matches((4, 4, 3, 3)), matches((1,) * 4)
     graph = ViewGraph.of_pairs([pair("AB", there), pair("Ba", back), pair("Aa", same)])
@@ -119,12 +99,6 @@ def test_a_graph_is_made_of_a_pairs_tracks_where_it_has_some() -> None:
     (edge,) = ViewGraph.of_pairs(pairs, "finer").edges
     assert edge.matches.points0.tolist() == [[5, 5]]
     assert edge.matches.points1.tolist() == [[4, 4]]
-
-
-def test_a_pair_without_matches_makes_no_edge() -> None:
-    graph = ViewGraph.of_pairs([pair("AB", Matches.empty())])
-    assert len(graph.images) == 2
-    assert graph.edges == ()
 
 
 def test_components_are_connected_by_pairs_with_enough_matches() -> None:

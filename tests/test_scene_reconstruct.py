@@ -188,15 +188,6 @@ def test_degenerate_matches_give_a_reason(kind: str) -> None:
         assert choice.F is None or np.isfinite(choice.F).all()
 
 
-def test_a_chain_of_images_is_a_legal_graph() -> None:
-    """Every image is in two pairs only: no point need be in three images."""
-    scene = synthetic_scene(6, points=500)
-    chain = tuple(p for p in scene.pairs if int(p.image1.name) - int(p.image0.name) == 1)
-    solution = reconstruct_batch(chain, SceneConfig())
-    assert len(solution.choices) == 5
-    assert solution.reconstructions[0].models or solution.reconstructions[0].failure
-
-
 @pytest.mark.parametrize(("share", "fewer", "asked"), [(1.0, 0, 1), (0.5, 0, 2), (0.5, 9, 2)])
 def test_the_incremental_mapper_is_asked_where_the_global_one_leaves_images_out(
     scene: SyntheticScene, monkeypatch: pytest.MonkeyPatch, share: float, fewer: int, asked: int

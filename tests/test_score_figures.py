@@ -56,11 +56,6 @@ def test_an_error_curve_has_the_share_of_pairs_below_and_leaves_failures_out() -
     assert translation.get_xlabel() == "translation error in metres"
 
 
-def test_errors_smaller_than_can_be_shown_count_from_the_left_edge() -> None:
-    exact = Validation("exact", (scene("a", 0.0, 1e-9),))
-    assert share_below(figures.draw_errors([exact]).axes[0].lines[0], 0.05) == 1
-
-
 def test_many_recipes_are_told_apart_and_drawn(tmp_path: Path) -> None:
     validations = [Validation(f"recipe {number}", FIRST.scenes) for number in range(8)]
     for number, figure in enumerate((figures.draw_scores(validations), figures.draw_errors(validations))):

@@ -4,15 +4,14 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 import torch
+from pictures import picture, write_store
 from torch import nn
 
 from mkpc_kaggle.config import from_table
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.geometry.coordinates import Box, Size, View
 from mkpc_kaggle.matchers import aspanformer, loftr, quadtree
 from mkpc_kaggle.matchers.contract import Picture, Placement, Training
 from mkpc_kaggle.matchers.networks.aspanformer import AspanFormer
@@ -20,7 +19,6 @@ from mkpc_kaggle.matchers.networks.loftr import Loftr
 from mkpc_kaggle.matchers.networks.position import FIXED_DECAY
 from mkpc_kaggle.matchers.networks.quadtree import Quadtree
 from mkpc_kaggle.matchers.semi_dense import PREFIX, SemiDenseMatcher
-from mkpc_kaggle.weights import UNVERIFIED, WeightFile, WeightStore
 
 MODULES: list[tuple[ModuleType, type[nn.Module]]] = [
     (loftr, Loftr),
@@ -37,9 +35,8 @@ def load_standin(
     torch.manual_seed(0)
     state = network().state_dict() | options.pop("surplus", {})
     wrapped = {PREFIX + name: tensor for name, tensor in state.items()}
-    torch.save({"state_dict": wrapped, "epoch": 3}, directory / "network.ckpt")
-    slot = f"{module.SPEC.name}-{training}"
-    store = WeightStore([directory], [WeightFile("network.ckpt", -1, UNVERIFIED, "none", slot, "made here")])
+    slots = [("network.ckpt", f"{module.SPEC.name}-{training}")]
+    store = write_store(directory, {"network.ckpt": {"state_dict": wrapped, "epoch": 3}}, slots)
     return module.load(store, module.SPEC.options(threshold=0.0, training=training, **options), Placement())
 
 
@@ -50,15 +47,8 @@ def matcher(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
     return matcher
 
 
-def textured(height: int, width: int, seed: int = 0) -> np.ndarray:
-    noise = np.random.default_rng(seed).integers(0, 255, (height // 4 + 1, width // 4 + 1), np.uint8)
-    return cv2.resize(noise, (width, height), interpolation=cv2.INTER_CUBIC)
-
-
-def picture(height: int, width: int, matcher: SemiDenseMatcher, seed: int = 0) -> Picture:
-    box = Box.whole(Size(width, height))
-    view = View.fit(box, long_side=max(width, height), multiple=matcher.spec.multiple)
-    return Picture(view.render(textured(height, width, seed)), view)
+def shown(height: int, width: int, matcher: SemiDenseMatcher) -> Picture:
+    return picture(height, width, channels=1, multiple=matcher.spec.multiple)
 
 
 def test_indoor_weights_come_with_their_settings(tmp_path: Path) -> None:
@@ -79,23 +69,20 @@ def test_loftrs_border_is_the_published_one_or_the_recipes(training: Training, b
     table = {} if border < 0 else {"border": border}
     options = from_table(loftr.SPEC.options, {"training": training, **table}, "recipe")
     assert loftr.network_of(options).border == expected
+    for wrong in (-2, 1.5):
+        with pytest.raises(UserError, match="border"):
+            from_table(loftr.SPEC.options, {"border": wrong}, "recipe")
 
 
 def test_loftr_finds_matches_along_the_border_where_it_is_told_to(tmp_path: Path) -> None:
     found = {}
     for border in (0, 2):
         matcher = load_standin(loftr, Loftr, tmp_path, Training.INDOOR, border=border)
-        (encoded,) = matcher.encode([picture(96, 128, matcher)])
+        (encoded,) = matcher.encode([shown(96, 128, matcher)])
         found[border] = matcher.match([encoded], [encoded])[0].points0
     assert found[0].min() < 8
     assert found[2].min() >= 15.5
     assert len(found[2]) < len(found[0])
-
-
-@pytest.mark.parametrize("border", [-2, 1.5])
-def test_a_border_that_makes_no_sense_is_refused(border: float) -> None:
-    with pytest.raises(UserError, match="border"):
-        from_table(loftr.SPEC.options, {"border": border}, "recipe")
 
 
 def test_weights_with_optimal_transport_are_refused_with_what_to_take_instead(tmp_path: Path) -> None:
@@ -104,15 +91,11 @@ def test_weights_with_optimal_transport_are_refused_with_what_to_take_instead(tm
         load_standin(loftr, Loftr, tmp_path, Training.OUTDOOR, surplus=surplus)
 
 
-def test_the_mask_is_true_where_a_cell_begins_on_content(matcher: SemiDenseMatcher) -> None:
-    (encoded,) = matcher.encode([picture(97, 131, matcher)])
+def test_cells_on_padding_are_masked_and_points_of_image_0_are_corners_of_cells(matcher: SemiDenseMatcher) -> None:
+    (encoded,) = matcher.encode([shown(97, 131, matcher)])
     mask = encoded.mask
     assert mask.shape[1:] == encoded.maps.coarse.shape[2:]
     assert mask.sum() == 13 * 17
-
-
-def test_points_of_image_0_are_corners_of_cells_in_our_convention(matcher: SemiDenseMatcher) -> None:
-    (encoded,) = matcher.encode([picture(128, 160, matcher)])
     (matches,) = matcher.match([encoded], [encoded])
     assert len(matches) > 0
     np.testing.assert_array_equal((matches.points0 + 0.5) % 8, 0)

@@ -30,7 +30,7 @@ def true_matrices(demo: DemoSet) -> dict[str, np.ndarray]:
     cameras: dict[str, tuple[Camera, Camera]] = {}
     for scene in read_train_side(demo.train_dir, min_covisibility=0):
         for true in scene.pairs:
-            first, second = true.pair.image0.stem, true.pair.image1.stem
+            first, second = true.pair.images[0].stem, true.pair.images[1].stem
             cameras[first, second] = true.camera0, true.camera1
             cameras[second, first] = true.camera1, true.camera0
     rows = (line.split(",") for line in demo.truth_csv.read_text().splitlines()[1:])

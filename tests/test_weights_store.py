@@ -215,7 +215,7 @@ def test_a_manifest_that_cannot_be_read_is_passed_over(tmp_path: Path, kind: str
     if kind == "pipe":
         os.mkfifo(path)
     else:
-        path.write_bytes(b"no manifest" if kind == "garbage" else b"#" * (1 << 21))
+        path.write_bytes(b"no manifest" if kind == "garbage" else b"#" * (1 << 25))
     with pytest.warns(UserWarning, match=r"passed over: .*weights_manifest\.txt"):
         assert WeightStore([tmp_path]).files
 

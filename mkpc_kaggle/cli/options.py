@@ -11,7 +11,7 @@ from mkpc_kaggle.engine.budget import Budget, monotonic_of, parse_duration
 if TYPE_CHECKING:
     from mkpc_kaggle.engine.cluster import RayCluster
     from mkpc_kaggle.pipeline.assembly import Assembly
-    from mkpc_kaggle.recipe import Choice
+    from mkpc_kaggle.recipe import RecipeChoice
 
 
 def add_matching(parser: argparse.ArgumentParser) -> None:
@@ -82,7 +82,7 @@ def workers(text: str) -> "int | RayCluster":
         raise argparse.ArgumentTypeError(str(error)) from error
 
 
-def assembly_of(arguments: argparse.Namespace, choice: "Choice") -> "Assembly":
+def assembly_of(arguments: argparse.Namespace, choice: "RecipeChoice") -> "Assembly":
     """The parts of a run, as the options say, but for the choice of the recipe."""
     from mkpc_kaggle.pipeline.assembly import assemble
     from mkpc_kaggle.pipeline.availability import Licence

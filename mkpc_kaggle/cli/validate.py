@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from mkpc_kaggle.engine.session import Session
     from mkpc_kaggle.evaluation.validate import Validation
     from mkpc_kaggle.pipeline.assembly import Assembly
-    from mkpc_kaggle.recipe import Choice, Recipe
+    from mkpc_kaggle.recipe import Recipe, RecipeChoice
 
 HELP = """\
 Run a recipe, with the engine that makes submissions, on a train side (calibration.csv, pair_covisibility.csv
@@ -135,11 +135,11 @@ def _match_and_score(arguments: argparse.Namespace, scenes: "tuple[TrainScene, .
     from mkpc_kaggle.engine.session import Session, interruptible
     from mkpc_kaggle.evaluation.compare import Comparison, comparison_json, comparison_table
     from mkpc_kaggle.evaluation.validate import to_json, validate
-    from mkpc_kaggle.recipe import Choice, Mode
+    from mkpc_kaggle.recipe import Mode, RecipeChoice
     from mkpc_kaggle.reporting.summary import left_out_line, trouble
 
-    compared = [Choice.parse(text) for text in arguments.compare or ()]
-    choices = compared or [Choice(arguments.recipe, Mode(arguments.mode))]
+    compared = [RecipeChoice.parse(text) for text in arguments.compare or ()]
+    choices = compared or [RecipeChoice(arguments.recipe, Mode(arguments.mode))]
     pairs = [true.pair for scene in scenes for true in scene.pairs]
     validations = []
     with interruptible() as interrupt:
@@ -185,7 +185,7 @@ def _tell(
         say(report_run(session.work_dir, session.work_dir / "report.html", session.must_end(), pairs))
 
 
-def _assemble(arguments: argparse.Namespace, choice: "Choice") -> "Assembly":
+def _assemble(arguments: argparse.Namespace, choice: "RecipeChoice") -> "Assembly":
     """The parts of a run of a recipe, with the units and the robust method that the command names."""
     from mkpc_kaggle.config import from_table
     from mkpc_kaggle.geometry.robust import RobustConfig

@@ -49,16 +49,8 @@ class Pair:
     intrinsics: tuple[Matrix3, Matrix3] | None = field(default=None, compare=False)
 
     @property
-    def image0(self) -> Path:
-        return Path(self.file0)
-
-    @property
-    def image1(self) -> Path:
-        return Path(self.file1)
-
-    @property
     def images(self) -> tuple[Path, Path]:
-        return self.image0, self.image1
+        return Path(self.file0), Path(self.file1)
 
     @property
     def names(self) -> tuple[str, str]:
@@ -178,18 +170,6 @@ def _read_scene(directory: Path, metres: float, min_covisibility: float, most: i
     return TrainScene(directory.name, metres, tuple(evenly_spread(pairs, most)))
 
 
-def read_true_pair(directory: Path, pair: str) -> tuple[TrainScene, TruePair]:
-    """The pair ``SCENE;IMAGE-IMAGE`` of a train side, whatever its covisibility, and its scene.
-
-    Raises :class:`UserError` for an unknown pair, besides what :func:`read_train_side` raises.
-    """
-    (scene,) = read_train_side(directory, scenes=[pair.partition(";")[0]], min_covisibility=0.0)
-    known = {true.pair.id: true for true in scene.pairs}
-    if pair not in known:
-        raise UserError(f"{directory}: unknown pair {pair!r}; known: {', '.join(list(known)[:3])}, ...")
-    return scene, known[pair]
-
-
 def read_cameras(path: Path) -> dict[str, Camera]:
     """The cameras of a ``calibration.csv`` by image id."""
     cameras = {}
@@ -230,7 +210,8 @@ def read_submission(path: Path) -> dict[str, Matrix3]:
 
 def submission_problems(path: Path, sample_ids: Sequence[str]) -> list[str]:
     """What is wrong with a submission, a sentence each; empty if the competition accepts it."""
-    problems, found = [], []
+    found: list[str] = []
+    problems: list[str] = []
     try:
         for _, (sample, cell) in read_rows(path, SUBMISSION_COLUMNS, only=True):
             found.append(sample)
@@ -245,24 +226,16 @@ def submission_problems(path: Path, sample_ids: Sequence[str]) -> list[str]:
                 problems.append(f"{sample}: the matrix is zero")
     except UserError as error:
         return [str(error)]
-    if found != list(sample_ids):
-        problems.insert(0, _difference(found, sample_ids))
+    present, wanted = set(found), set(sample_ids)
+    if missing := [sample for sample in sample_ids if sample not in present]:
+        problems.insert(0, f"{len(missing)} samples are missing, the first is {missing[0]}")
+    elif surplus := [sample for sample in found if sample not in wanted]:
+        problems.insert(0, f"{len(surplus)} samples are not in test.csv, the first is {surplus[0]}")
+    elif len(found) != len(sample_ids):
+        problems.insert(0, "a sample is there twice")
+    elif found != list(sample_ids):
+        problems.insert(0, "the samples are not in the order of test.csv")
     return problems
-
-
-def _difference(found: Sequence[str], expected: Sequence[str]) -> str:
-    present, wanted = set(found), set(expected)
-    missing = [sample for sample in expected if sample not in present]
-    surplus = [sample for sample in found if sample not in wanted]
-    if missing:
-        return f"{len(missing)} samples are missing, the first is {missing[0]}"
-    if surplus:
-        return f"{len(surplus)} samples are not in test.csv, the first is {surplus[0]}"
-    return (
-        "a sample is there twice"
-        if len(found) != len(expected)
-        else "the samples are not in the order of test.csv"
-    )
 
 
 def read_rows(path: Path, columns: Sequence[str], *, only: bool = False) -> Iterator[tuple[int, list[str]]]:
@@ -321,10 +294,7 @@ class ImageFiles(dict[str, str]):
         self.directory = str(directory)
         try:
             images = sorted(path for path in directory.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES)
-        except (
-            OSError,
-            ValueError,
-        ):  # it is not there, or its name is too long or not of the file system's encoding
+        except (OSError, ValueError):  # missing, too long, or not of the file system's encoding
             images = []
         super().__init__((path.stem, str(path)) for path in reversed(images))
 

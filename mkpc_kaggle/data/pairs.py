@@ -17,7 +17,7 @@ import numpy as np
 
 from mkpc_kaggle.data.competition import Pair, TrainScene, TruePair, evenly_spread
 from mkpc_kaggle.data.images import Unreadable, read_image
-from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.errors import UserError, read_text
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Size
 
@@ -48,12 +48,7 @@ def read_pairs(file: Path, image_root: Path, *, copies: Path, most: int | None =
     """
     if not image_root.is_dir():
         raise UserError(f"--image-root {image_root}: no such directory")
-    try:
-        lines = list(enumerate(file.read_text(encoding="utf-8").splitlines(), start=1))
-    except OSError as error:
-        raise UserError(f"{file} cannot be read: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise UserError(f"{file} is not UTF-8 text") from error
+    lines = enumerate(read_text(file).splitlines(), start=1)
     listed = [(number, parse_line(line, f"{file}, line {number}")) for number, line in lines if line.split()]
     if not listed:
         raise UserError(f"{file} has no pairs; expected lines {EXPECTED}")

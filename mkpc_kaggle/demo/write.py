@@ -40,7 +40,7 @@ class Photograph:
 
 
 @dataclass(frozen=True)
-class TruePair:
+class DemoPair:
     """Two images of a scene; `first.image_id > second.image_id`."""
 
     first: Photograph
@@ -95,12 +95,12 @@ def _developed(image: FloatImage, rng: np.random.Generator) -> Picture:
     return np.asarray(np.clip((blurred + noise) * 255, 0, 255).round(), dtype=np.uint8)
 
 
-def _pair(a: Photograph, b: Photograph) -> TruePair:
+def _pair(a: Photograph, b: Photograph) -> DemoPair:
     first, second = (a, b) if a.image_id > b.image_id else (b, a)
-    return TruePair(first, second, covisibility(a.camera, a.depth, b.camera, b.depth))
+    return DemoPair(first, second, covisibility(a.camera, a.depth, b.camera, b.depth))
 
 
-def _selected(pairs: Sequence[TruePair]) -> list[TruePair]:
+def _selected(pairs: Sequence[DemoPair]) -> list[DemoPair]:
     """The pairs of the test side: scored ones, spread evenly from the least covisible to the most."""
     scored = sorted((p for p in pairs if p.covisibility >= MIN_COVISIBILITY), key=lambda p: p.covisibility)
     if len(scored) <= TEST_PAIRS:
@@ -108,7 +108,7 @@ def _selected(pairs: Sequence[TruePair]) -> list[TruePair]:
     return [scored[i] for i in np.linspace(0, len(scored) - 1, TEST_PAIRS).round().astype(int)]
 
 
-def _write_train(directory: Path, photographs: Sequence[Photograph], pairs: Sequence[TruePair]) -> None:
+def _write_train(directory: Path, photographs: Sequence[Photograph], pairs: Sequence[DemoPair]) -> None:
     for each in photographs:
         _write_image(directory / "images" / f"{each.image_id}.jpg", each.picture, cv2.IMWRITE_JPEG_QUALITY, 95)
     cameras = ((each.image_id, each.camera) for each in photographs)
@@ -128,7 +128,7 @@ def _write_train(directory: Path, photographs: Sequence[Photograph], pairs: Sequ
     )
 
 
-def _write_test(directory: Path, scene: str, pairs: Sequence[TruePair], seed: int) -> list[tuple[str, str]]:
+def _write_test(directory: Path, scene: str, pairs: Sequence[DemoPair], seed: int) -> list[tuple[str, str]]:
     """Write the images of one batch; for each pair its rows of test.csv and of test_truth.csv."""
     batch = _digest(f"{seed}/{scene}")[:8]
     photographs = {each.image_id: each for pair in pairs for each in (pair.first, pair.second)}

@@ -14,6 +14,7 @@ from mkpc_kaggle.errors import UserError
 SUMMARY_FACTOR = 5  # telling what a run did takes at most this many times what writing its submission takes
 WRITE_MARGIN = 1.5  # the next write may take this many times what the latest took
 MAX_WRITE_SHARE = 0.05  # of the limit, which writing is expected to take at most
+MAX_SILENCE_S, MIN_SILENCE_S, SILENCE_SHARE = 60.0, 5.0, 0.02  # of a worker, by the share of the limit
 MAX_PROCESS_AGE_S = 60.0  # a process that claims to be older when it begins to work does not tell its age
 
 
@@ -68,6 +69,11 @@ class Budget:
     def reserve(self) -> float:
         """Seconds at the end in which no unit runs."""
         return min(max(1.5, 0.005 * self.time_limit), 60.0)
+
+    @property
+    def silence(self) -> float:
+        """Seconds more than expected that an answer may take before its worker is thought to hang."""
+        return min(MAX_SILENCE_S, max(MIN_SILENCE_S, SILENCE_SHARE * self.time_limit))
 
     @property
     def stop_units(self) -> float:

@@ -14,10 +14,12 @@ STALL = 10.0  # a measurement this many times the upper quartile is a stall, and
 class Measurements:
     """The latest measurements of one quantity, in seconds: their ``mean``, stalls cut, and 90th percentile."""
 
-    def __init__(self) -> None:
+    def __init__(self, *seconds: float) -> None:
         self.count = 0
         self.mean = self.p90 = 0.0
         self._latest: deque[float] = deque(maxlen=WINDOW)
+        for value in seconds:
+            self.add(value)
 
     def add(self, seconds: float) -> None:
         self._latest.append(seconds)
@@ -30,6 +32,9 @@ class Measurements:
         self.p90 = ranked[9 * len(ranked) // 10]
 
 
+UNKNOWN = Measurements()
+
+
 class Costs:
     """What units cost on a pair, in seconds.
 
@@ -39,16 +44,14 @@ class Costs:
 
     def __init__(self) -> None:
         self._measured: dict[str, Measurements] = {}
-        self._warm_up: dict[str, float] = {}
-        self._assumed: set[str] = set()
+        self._assumed: dict[str, Measurements] = {}
+        self._warm_up: dict[str, Measurements] = {}
         self._overhead = Measurements()
 
     def observe(self, unit: str, seconds: float, *, warm_up: bool = False) -> None:
-        if unit in self._assumed:
-            self._assumed.remove(unit)
-            del self._measured[unit]
+        self._assumed.pop(unit, None)
         if warm_up:
-            self._warm_up[unit] = seconds
+            self._warm_up[unit] = Measurements(seconds)
         else:
             self._measured.setdefault(unit, Measurements()).add(seconds)
 
@@ -58,32 +61,32 @@ class Costs:
 
     def assume(self, unit: str, seconds: float) -> None:
         """A unit that did not end within these seconds costs at least as much, until it is measured."""
-        if unit not in self._warm_up and unit not in self._measured:
-            self._assumed.add(unit)
-            self._measured.setdefault(unit, Measurements()).add(seconds)
+        if not self.has_run(unit):
+            self._assumed.setdefault(unit, Measurements(seconds))
+
+    def has_run(self, unit: str) -> bool:
+        return unit in self._measured or unit in self._warm_up
 
     def is_known(self, unit: str) -> bool:
         """Whether more than its warm-up is known."""
-        return unit in self._measured
+        return unit in self._measured or unit in self._assumed
 
     def mean(self, unit: str) -> float:
         """Expected seconds on a pair; 0 for a unit of which nothing is known."""
-        return self._measured[unit].mean if unit in self._measured else self._warm_up.get(unit, 0.0)
+        return (self._steady(unit) or self._warm_up.get(unit, UNKNOWN)).mean
 
     def p90(self, unit: str) -> float:
         """Seconds within which the unit ends on nine of ten pairs."""
-        return self._measured[unit].p90 if unit in self._measured else self._warm_up.get(unit, 0.0)
+        return (self._steady(unit) or self._warm_up.get(unit, UNKNOWN)).p90
 
     def longest(self, unit: str, factor: float) -> float:
         """Seconds after which the unit hangs: its warm-up, as on a new worker, and ``factor`` times its cost."""
-        steady = self._measured[unit].p90 if unit in self._measured else 0.0
-        return self._warm_up.get(unit, 0.0) + factor * steady
+        return self._warm_up.get(unit, UNKNOWN).p90 + factor * (self._steady(unit) or UNKNOWN).p90
 
     def forecast(self, unit: str) -> float:
         """Expected seconds with a margin that shrinks as more is known; 0 as long as nothing is."""
-        if unit not in self._measured:
-            return 0.0
-        return self.mean(unit) * (1 + max(MIN_MARGIN, MARGIN / sqrt(self._measured[unit].count)))
+        known = self._steady(unit)
+        return known.mean * (1 + max(MIN_MARGIN, MARGIN / sqrt(known.count))) if known else 0.0
 
     @property
     def overhead(self) -> float:
@@ -98,3 +101,6 @@ class Costs:
         for unit in units:
             needed += self.forecast(unit.name) * lacking[unit.name]
             yield needed
+
+    def _steady(self, unit: str) -> Measurements | None:
+        return self._measured.get(unit) or self._assumed.get(unit)

@@ -2,7 +2,7 @@
 
 import sqlite3
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import partial
@@ -15,7 +15,6 @@ from mkpc_kaggle.engine.jobs import (
     Answer,
     Failure,
     Loaded,
-    MatchJob,
     MatchResult,
     Outcome,
     SceneJob,
@@ -31,7 +30,6 @@ from mkpc_kaggle.engine.scenes import Scenes, extra_pairs_of
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.pipeline.pair import UnitResult
 from mkpc_kaggle.recipe import Recipe
-from mkpc_kaggle.scene.choose import Choice
 
 PUBLISH_INTERVAL_S, PUBLISH_SHARE = 30.0, 0.05  # how often the submission is written, and its share of the time
 
@@ -97,9 +95,7 @@ class Engine:
         self.faults: list[str] = []
         self.unwritten = ""
         self._units = {unit.name: unit for unit in recipe.units}
-        self._unjournalled: dict[int, tuple[UnitResult, ...]] = {}
-        self._explained = self._answers = 0
-        self._looked = (-1, -1, -1)
+        self._explained = 0
         self._published = budget.clock()
         self._progress = console.Progress(budget) if progress else None
         self._publishing = threading.Lock()
@@ -152,19 +148,20 @@ class Engine:
         return self.plan.records[: self.asked]
 
     def save_what_there_is(self) -> str:
-        """Write the submission from another thread, unless the run has ended by itself; why it could not be.
-
-        Waits for the engine's own thread where that is writing.
-        """
+        """Write the submission, unless the run has ended; why it cannot be written. For any thread."""
         with self._publishing:
             if not self._has_ended:
-                self._write()
+                try:
+                    self.publish(self.records)
+                    self.unwritten = ""
+                except OSError as error:
+                    self.unwritten = f"the submission cannot be written: {error}"
         return self.unwritten
 
     # The loop
 
     def _loop(self) -> None:
-        if self.plan.has_work(self.budget.clock()):
+        if self.plan.has_work(self.budget.clock()) or self.scenes.due(range(len(self.pairs))) is not None:
             self.site.open()
         while not self.interrupt.is_set() and (now := self.budget.clock()) < self.budget.stop_waiting:
             for place in (*self.site.places, *self._scene_places):
@@ -184,71 +181,56 @@ class Engine:
         """A worker for each place that lacks one, and a job for each worker that is idle."""
         self.plan.workers = max(1, sum(not place.closed for place in self.site.places))
         for place in self.site.places:
-            if place.may_start(now) and now < self.plan.stop and self.plan.has_work(now):
-                self._start(place, now)
+            if place.may_start(now) and self.plan.has_work(now):
+                place.start(now)
             elif place.is_idle and (job := self.plan.next(now, place.name, cautious=place.losses > 0)):
                 pairs = tuple(self.pairs[index] for index in job.indices)
                 known = tuple(() if job.is_trial else self._results(index) for index in job.indices)
                 job = replace(job, pairs=pairs, known=known)
                 place.submit(job, job.seconds, job.time_limit, now)
 
-    def _start(self, place: Place, now: float) -> None:
-        try:
-            place.start(now)
-        except (RuntimeError, OSError) as error:  # no thread more
-            place.closed = f"{place.name}: {error}"
-
     def _is_matching(self, now: float) -> bool:
         """Whether a job is under way, or will be when a worker has started."""
-        may_begin = now < self.plan.stop and self.plan.has_work(now)
-        return any(place.job is not None or (place.is_starting and may_begin) for place in self.site.places)
+        places, may_begin = self.site.places, self.plan.has_work(now)
+        return any(place.job is not None or (place.is_starting and may_begin) for place in places)
 
     def _take_answer(self, place: Place, now: float) -> None:
         answer, job, seconds = place.poll(now), place.job, now - place.since
-        if answer is None:
-            return
-        self._answers += 1
         if isinstance(answer, Loaded):
             self._has_loaded = True
             if isinstance(job, SceneJob):
-                limit = self.scenes.time_limit(job.batch, self.budget.time_limit)
-                place.submit(job, inf, limit, now)
-            return
-        place.job = None
-        if isinstance(job, SceneJob):
-            self._scene_places.remove(place)
-            place.kill()
-            self._take_scene(job, answer, seconds)
-        elif isinstance(job, MatchJob) and isinstance(answer, MatchResult):
-            self._keep(self.plan.on_result(job, answer, seconds, now))
-            self._note(EventKind.BUDGET, job.phase)
-            self._note(EventKind.JOB, f"{job.phase} {len(job.indices)} pairs {answer.unit_seconds:.3f} s")
-        elif isinstance(answer, Failure):
-            self._fault(f"a job was lost on {place.name}: {answer}" if job else f"{place.name}: {answer}")
-            if isinstance(job, MatchJob):
-                self._keep(self.plan.on_failure(job, answer, place.name, now))
-            if place.closed:
-                self.plan.explain(now, f"no worker is started any more on {place.closed}")
-        self._note_explanations()
-        if self._progress is not None:
-            self._progress.show(*self.plan.progress)
+                place.submit(job, inf, self.scenes.time_limit(job.batch, self.budget.silence), now)
+        elif answer is not None:
+            place.job = None
+            if isinstance(job, SceneJob):
+                self._scene_places.remove(place)
+                place.kill()
+                self._take_scene(job, answer, seconds)
+            elif isinstance(answer, Failure):
+                self._fault(f"a job was lost on {place.name}: {answer}" if job else f"{place.name}: {answer}")
+                if job is not None:
+                    self._keep(self.plan.on_failure(job, answer, place.name, now))
+                if place.closed:
+                    self.plan.explain(now, f"no worker is started any more on {place.closed}")
+            elif job is not None and isinstance(answer, MatchResult):
+                self._keep(self.plan.on_result(job, answer, seconds, now))
+                self._note(EventKind.JOB, f"{job.phase} {len(job.indices)} pairs {answer.unit_seconds:.3f} s")
+            self._note_explanations()
+            if self._progress is not None:
+                self._progress.show(*self.plan.progress)
 
     def _fall_back(self, now: float) -> None:
         """Go on elsewhere when the last place is closed, or had to give up every unit."""
         closed = [place.closed for place in self.site.places if place.closed]
         are_closed = len(closed) == len(self.site.places) > 0
-        if not are_closed and not self.plan.nothing_runs:
-            return
-        if self.site.fallback:
+        if self.site.fallback and (are_closed or self.plan.nothing_runs):
             reason = "; ".join(closed) if are_closed else "every unit was given up"
             self._fault(text := f"the work goes on on the {self.site.fallback[0].name}: {reason}")
             console.warn(text)
             for place in self.site.places:
                 place.kill()
             self.site.places, self.site.fallback = self.site.fallback, []
-            for index, change in self.plan.restart(now, text).items():
-                self.scenes.note_units(index, change)
-            self._guarded(self.journal.forget_given_up)
+            self._keep(self.plan.restart(now, text))
         elif are_closed and not self._has_loaded:
             raise UserError(f"no worker could be started: {'; '.join(closed)}")
 
@@ -256,43 +238,32 @@ class Engine:
 
     def _start_scenes(self, now: float, *, is_matching: bool) -> None:
         """Begin to reconstruct batches whose pairs have what fits; all when nothing is matched any more."""
-        at_once = self.site.scenes_at_once
-        plan = self.plan
+        at_once, plan = self.site.scenes_at_once, self.plan
         done, filling = (plan.done, plan.filling) if is_matching else (range(len(self.pairs)), ())
-        if (moment := (len(done), len(filling), self._answers)) == self._looked:
-            return  # nothing has changed since
-        self._looked = moment
         while len(self._scene_places) < at_once and (batch := self.scenes.due(done, filling)) is not None:
             place = Place(f"scene of batch {batch}", self.site.scene_worker)
             place.job = self.scenes.job(batch, self._results)
             self._scene_places.append(place)
-            self._start(place, now)
-        self.plan.reserve = self.scenes.reserve(at_once)
+            place.start(now)
+        plan.reserve = self.scenes.reserve(at_once)
 
     def _take_scene(self, job: SceneJob, answer: Answer, seconds: float) -> None:
-        choices: Mapping[int, Choice] = {}
-        record: SceneRecord | None
+        """Record what came of a batch; if nothing can change it any more, the points of its pairs can go."""
+        records, record = self.plan.records, None
         if isinstance(answer, SceneResult):
-            choices = answer.choices
             record = SceneRecord.of(job.batch, answer.reconstructions, job.made_from, seconds)
             self.scenes.on_result(job, record)
-            for index, choice in choices.items():
-                self.plan.set_scene(index, choice)
+            for index, choice in answer.choices.items():
+                records[index] = replace(records[index], scene=choice)
             self._note(EventKind.SCENE, f"{record.batch}: {record.placed} of {record.images} images")
         else:
             self._fault(f"batch {job.batch} was not reconstructed: {answer}")
             record = self.scenes.on_failure(job, str(answer), seconds)
         if record is not None:
-            self._guarded(partial(self._save_scene, record, choices))
-
-    def _save_scene(self, record: SceneRecord, choices: Mapping[int, Choice]) -> None:
-        self.journal.save_scene(record, choices)
-        # A batch is reconstructed from the points of all its pairs: none can go while one of them may change.
-        records = [self.plan.records[index] for index in self.scenes.batches[record.batch]]
-        if not record.failure and not any(
-            self.plan.may_gain(pair) or self.scenes.needs(pair.index) for pair in records
-        ):
-            self.journal.settle(pair for pair in records if pair.units)
+            members = [records[index] for index in self.scenes.batches[job.batch]]
+            may_change = any(self.plan.may_gain(pair) or self.scenes.needs(pair.index) for pair in members)
+            settled = [] if record.failure or may_change else [pair for pair in members if pair.units]
+            self._save(partial(self.journal.save_scene, record, members, settled))
 
     # The journal and the submission
 
@@ -301,52 +272,30 @@ class Engine:
             text = f"images have changed since they were matched: {forgotten} pairs are matched anew"
             console.warn(text)
             self._fault(text)
-        records = [PairRecord.untouched(index) for index in range(len(self.pairs))]
-        for index, record in self.journal.records().items():
-            records[index] = record
-        return records
+        records = self.journal.records()
+        return [records.get(index) or PairRecord.untouched(index) for index in range(len(self.pairs))]
 
     def _results(self, index: int) -> tuple[UnitResult, ...]:
-        """What earlier jobs found on a pair, by the units that its record has."""
-        record = self.plan.records[index]
-        if not record.units:
-            return ()
-        if index in self._unjournalled:
-            return self._unjournalled[index]
+        """What earlier jobs found on a pair."""
         try:
-            return tuple(found for found in self.journal.results(index, self._units) if record.has(found.unit))
-        except (sqlite3.Error, UserError) as error:  # without them a job gains nothing, and the F stays
-            self._fault(f"the journal cannot be read ({error})")
+            return self.journal.results(self.plan.records[index], self._units)
+        except UserError as error:  # without them a job gains nothing, and the F stays
+            self._fault(str(error))
             return ()
 
     def _keep(self, outcomes: Sequence[Outcome]) -> None:
-        """Put outcomes into the journal; into memory those that it cannot take."""
+        """Put outcomes into the journal, without points where nothing builds on them."""
         for outcome in outcomes:
-            self.scenes.note_units(outcome.record.index, len(outcome.results))
-        settled = [
-            not self.plan.wanted(outcome.record) and not self.scenes.needs(outcome.record.index)
-            for outcome in outcomes
-        ]
-        indices = [outcome.record.index for outcome in outcomes]
-        whole = [
-            Outcome(outcome.record, self._unjournalled.get(index, ()) + outcome.results)
-            for index, outcome in zip(indices, outcomes, strict=True)
-        ]
-        if self._guarded(lambda: self.journal.save(list(zip(whole, settled, strict=True)))):
-            for index in indices:
-                self._unjournalled.pop(index, None)
-            return
-        for index, outcome, is_settled in zip(indices, outcomes, settled, strict=True):
-            self._unjournalled[index] = () if is_settled else self._results(index) + outcome.results
+            self.scenes.note_change(outcome.record.index)
+        wanted = (self.plan.wanted(o.record) or self.scenes.needs(o.record.index) for o in outcomes)
+        self._save(partial(self.journal.save, [(o, not more) for o, more in zip(outcomes, wanted, strict=True)]))
 
-    def _guarded(self, save: Callable[[], None]) -> bool:
-        """Whether the journal could take it: a full disk costs what a later run would have had of it."""
+    def _save(self, write: Callable[[], None]) -> None:
+        """Write to the journal: a full disk costs what a later run would have had of it."""
         try:
-            save()
+            write()
         except sqlite3.Error as error:
             self._fault(f"the journal cannot be written ({error}): an interrupted run would have to do this again")
-            return False
-        return True
 
     def _note_explanations(self) -> None:
         for explanation in self.plan.explanations[self._explained :]:
@@ -363,19 +312,10 @@ class Engine:
 
     def _publish(self) -> None:
         start = self.budget.clock()
-        with self._publishing:
-            self._write()
+        if trouble := self.save_what_there_is():
+            self._fault(trouble)
         self._published = self.budget.clock()
         self.budget.note_write(self._published - start)
-        if self.unwritten:
-            self._fault(self.unwritten)
-
-    def _write(self) -> None:
-        try:
-            self.publish(self.records)
-            self.unwritten = ""
-        except OSError as error:
-            self.unwritten = f"the submission cannot be written: {error}"
 
     def _ending(self) -> Ending:
         if self.interrupt.is_set():

@@ -34,8 +34,7 @@ class MatchJob:
 
     ``expected`` are the seconds within which each unit most likely ends on a pair. Units may begin in the first
     ``seconds`` of the job if they are expected to end in them. After ``time_limit`` seconds without an answer the
-    worker hangs. ``exploring``: its unit has never run, and nobody knows what it costs. ``is_trial``: it is done
-    again to see whether the place works.
+    worker hangs. ``is_trial``: it is done again to see whether the place works.
     """
 
     phase: Phase
@@ -44,7 +43,6 @@ class MatchJob:
     expected: tuple[float, ...]
     seconds: float
     time_limit: float
-    exploring: bool = False
     is_trial: bool = False
     pairs: tuple[Pair, ...] = ()
     known: tuple[tuple[UnitResult, ...], ...] = ()

@@ -51,8 +51,11 @@ class Place:
     def start(self, now: float) -> None:
         """Start a worker; it is loaded when it says so."""
         self.is_loaded, self.since, self.limit = False, now, now + START_TIMEOUT_S
-        self.worker = self.make()
-        self.worker.start()
+        try:
+            self.worker = self.make()
+            self.worker.start()
+        except (RuntimeError, OSError) as error:  # no thread more
+            self.closed = f"{self.name}: {error}"
 
     def submit(self, job: Job, seconds: float, time_limit: float, now: float) -> None:
         """Hand a job to the idle worker; its units may begin within ``seconds``."""

@@ -4,9 +4,9 @@ It looks at a job's worth of pairs at a time, so that a hundred thousand pairs c
 """
 
 from collections import Counter, deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import product
+from itertools import islice, product
 
 from mkpc_kaggle.engine.budget import Budget, format_duration
 from mkpc_kaggle.engine.costs import Costs
@@ -15,7 +15,6 @@ from mkpc_kaggle.engine.records import GIVEN_UP, PairRecord, UnitRecord
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.pipeline.pair import UnitResult
 from mkpc_kaggle.recipe import Recipe, Unit
-from mkpc_kaggle.scene.choose import Choice
 
 JOB_PAIRS = 8  # in a job: few enough to plan anew every some seconds
 JOB_MINIBATCHES = 3  # on a GPU: F of the pairs of the first is estimated while the others are matched
@@ -29,7 +28,11 @@ MAX_TRIES = 2  # of a unit on a single pair, before it is given up there
 MAX_FAILED_PAIRS = 2  # a unit that was given up on so many pairs and never ran is given up on all
 SLOW = 3.0  # a job that takes this many times what was expected begins no further unit
 HANGS = 10.0  # a unit that takes this many times what it takes on nine of ten pairs hangs
-MAX_SILENCE_S, MIN_SILENCE_S, SILENCE_SHARE = 60.0, 5.0, 0.02  # besides, by the share of the limit
+# What the pairs of the last phases are.
+IN_THE_TIME_LEFT = {
+    Phase.FILL: "pairs that lack units, the weakest first",
+    Phase.DENSIFY: "pairs for the scenes alone",
+}
 
 
 @dataclass(frozen=True)
@@ -45,7 +48,7 @@ class Explanation:
 
 @dataclass(frozen=True)
 class Chunk:
-    """Pairs that wait for their turn; ``units`` ``None``: as many as fit then. ``lost_at`` names places."""
+    """Pairs that wait for their turn; ``units`` ``None``: those of the phase. ``lost_at`` names places."""
 
     phase: Phase
     indices: tuple[int, ...]
@@ -53,79 +56,60 @@ class Chunk:
     lost_at: tuple[str, ...] = ()
 
 
-def chunks_of(phase: Phase, indices: Iterable[int], size: int, units: tuple[Unit, ...] | None) -> Iterator[Chunk]:
+def chunks_of(phase: Phase, indices: Sequence[int], size: int) -> Iterator[Chunk]:
     """One pair alone, so that costs are known early, then ``size`` at a time.
 
     The same for every run of the same pairs, whatever was done before: a minibatch's composition can move the last
     bits of a network's output.
     """
-    indices = tuple(indices)
     for start in (0, *range(1, len(indices), size)) if indices else ():
-        yield Chunk(phase, indices[start : start + size if start else 1], units)
+        yield Chunk(phase, tuple(indices[start : start + size if start else 1]))
 
 
 class ChunkQueue:
-    """Chunks in the order of their turn. A pair's turn comes when no job is under way on it, nor waits to be
-    tried again: that may be for another place.
+    """Chunks in the order of their turn: first those that have had one.
+
+    A pair's turn comes when no job is under way on it; in a fresh chunk, when it does not wait to be tried again
+    either: that may be for another place.
     """
 
     def __init__(self) -> None:
         self.under_way: set[int] = set()
-        self._waiting: deque[Chunk] = deque()
-        self._retries: deque[Chunk] = deque()
+        self.fresh: deque[Chunk] = deque()
+        self.again: deque[Chunk] = deque()
 
-    def extend(self, chunks: Iterable[Chunk]) -> None:
-        self._waiting.extend(chunks)
+    def put_back(self, chunk: Chunk) -> None:
+        """Give back what is left of a chunk; its turn is after those that were lost."""
+        self.again.insert(0 if chunk.lost_at else sum(bool(other.lost_at) for other in self.again), chunk)
 
-    def put_first(self, chunk: Chunk) -> None:
-        """Give a chunk back, or what is left of it; its turn is after those that were lost."""
-        place = 0 if chunk.lost_at else sum(bool(waiting.lost_at) for waiting in self._retries)
-        self._retries.insert(place, chunk)
-
-    def retry(self, chunks: Iterable[Chunk]) -> None:
+    def retry(self, chunks: Sequence[Chunk]) -> None:
         """Try these again, before all others: so a unit that kills its worker is given up on few pairs."""
-        self._retries.extendleft(reversed(list(chunks)))
+        self.again.extendleft(reversed(chunks))
 
     def pop(self, place: str, *, alone: bool, cautious: bool) -> Chunk | None:
         """The next chunk for a place; not one that was lost there, unless the place is ``alone``.
 
         ``cautious``: one that was not lost, if there is one.
         """
-        chunk = (self._pop_fresh() if cautious else None) or self._pop_retry(place, alone, cautious)
-        return chunk or self._pop_fresh()
+        again, earlier = [], set(self.under_way)
+        for chunk in self.again:  # not before what waits of the same pairs: the order of units decides regions
+            if earlier.isdisjoint(chunk.indices) and (alone or place not in chunk.lost_at):
+                again.append(chunk)
+            earlier.update(chunk.indices)
+        fresh = [chunk for chunk in islice(self.fresh, 1) if not any(map(self.is_busy, chunk.indices))]
+        turns = [*fresh, *reversed(again)] if cautious else [*again, *fresh]
+        if not turns:
+            return None
+        (self.fresh if turns[0] in fresh else self.again).remove(turns[0])
+        return turns[0]
 
-    def _pop_fresh(self) -> Chunk | None:
-        if self._waiting and not any(map(self.is_busy, self._waiting[0].indices)):
-            return self._waiting.popleft()
-        return None
-
-    def _pop_retry(self, place: str, alone: bool, cautious: bool) -> Chunk | None:
-        for chunk in reversed(self._retries) if cautious else self._retries:
-            if self.under_way.isdisjoint(chunk.indices) and (alone or place not in chunk.lost_at):
-                self._retries.remove(chunk)
-                return chunk
-        return None
+    def has_retry(self, index: int) -> bool:
+        """Whether something has to be tried again on a pair."""
+        return any(index in chunk.indices for chunk in self.again)
 
     def is_busy(self, index: int) -> bool:
         """Whether a job is under way on a pair, or has to be tried again."""
         return index in self.under_way or self.has_retry(index)
-
-    def has_retry(self, index: int) -> bool:
-        """Whether something has to be tried again on a pair."""
-        return any(index in chunk.indices for chunk in self._retries)
-
-    def drop(self) -> None:
-        """Take out the first chunk."""
-        self._waiting.popleft()
-
-    @property
-    def first(self) -> Chunk | None:
-        """The next chunk that has not been tried yet."""
-        return self._waiting[0] if self._waiting else None
-
-    @property
-    def has_retries(self) -> bool:
-        return bool(self._retries)
 
 
 class Plan:
@@ -133,8 +117,7 @@ class Plan:
 
     ``records``, one a pair by index, asked pairs first, change through it. The first ``connecting`` of the extra
     pairs are for the connect phase. ``workers`` work at a time; ``reserve`` seconds of the end are left to scenes.
-    ``done`` are the pairs that have what fits for all, and ``filling`` those that get more in the time left;
-    ``unusable`` names the units that no worker can run.
+    ``done`` are the pairs that have what fits for all; ``unusable`` names the units that no worker can run.
     """
 
     def __init__(
@@ -148,27 +131,27 @@ class Plan:
         connecting: int = 0,
         minibatch: int = 1,
     ) -> None:
-        self.recipe = recipe
-        self.records = records
-        self.budget = budget
-        self.minibatch = minibatch
+        self.recipe, self.records, self.budget = recipe, records, budget
         self.workers = 1
         self.reserve = 0.0
-        self.costs = Costs()
         self.explanations: list[Explanation] = []
-        self.unusable: set[str] = set()
-        self.phase = Phase.SWEEP
-        self._order, self._extra, self._connecting = order, extra, connecting
-        self._stuck: set[int] = set()
-        self._proven: set[str] = set()
-        self._tries: Counter[tuple[int, str]] = Counter()
-        self._failed_pairs: dict[str, set[int]] = {}
-        self._fitting = -1
+        self._order, self._extra, self._connecting, self._minibatch = order, extra, connecting, minibatch
+        self._stuck: set[int] = set()  # an image cannot be read, or what was found before
         self._lacking = Counter(unit for record in records for unit in self._lacks(record))
-        self._reached = sum(record.reached for record in records[: len(order)])
-        self._matched = sum(record.reached for record in records[len(order) :])
-        self._total = 0
         self._begin()
+
+    def _begin(self) -> None:
+        """Everything is to come, and nothing is known of the devices."""
+        self.costs = Costs()
+        self.unusable: set[str] = set()
+        self.done = set(self._extra)
+        self.phase = Phase.SWEEP
+        self._coming = list(Phase)
+        self._queue = ChunkQueue()
+        self._total, self._left = 0, set[int]()  # pairs of the present phase, and those whose turn is not over
+        self._fitting = -1
+        self._tries: Counter[tuple[int, str]] = Counter()
+        self._failed_pairs: Counter[str] = Counter()
 
     # What to do next
 
@@ -185,7 +168,7 @@ class Plan:
             self._mark_done(chunk.phase, set(chunk.indices) - set(todo))
             in_time = tuple(unit for unit in units if self.costs.p90(unit.name) < self.stop - now)
             if todo and not in_time:  # unless scenes need less time than is kept for them
-                self._queue.put_first(replace(chunk, indices=tuple(todo)))
+                self._queue.put_back(replace(chunk, indices=tuple(todo)))
                 return None
             if todo := [index for index in todo if self.can_gain(index, in_time)]:
                 return self._job(chunk, todo, in_time, now, cautious=cautious)
@@ -198,43 +181,22 @@ class Plan:
 
     def has_work(self, now: float) -> bool:
         """Whether a pair waits that can gain something; what is under way may come back, too."""
-        while (chunk := self._peek(now)) is not None:
-            if any(self.can_gain(index, self._units(chunk, now)) for index in chunk.indices):
+        while now < self.stop and (chunk := self._peek(now)) is not None:
+            units = self._units(chunk, now)
+            if any(self.can_gain(index, units) for index in chunk.indices):
                 return True
-            self._queue.drop()
-            self._mark_done(chunk.phase, chunk.indices)
-        return self._queue.has_retries
+            self._mark_done(chunk.phase, self._queue.fresh.popleft().indices)
+        return now < self.stop and bool(self._queue.again)
 
     def can_gain(self, index: int, units: Iterable[Unit]) -> bool:
         """Whether a pair may have one of the units that it has not had."""
         return index not in self._stuck and bool(self.records[index].lacking(units))
 
-    def _begin(self) -> None:
-        self._queue = ChunkQueue()
-        self.done, self.filling = set(self._extra), set[int]()
-        self._coming = list(Phase)
-
-    def _trial(self, now: float) -> MatchJob | None:
-        """The first unit on a pair that has had it, where nothing is left but what workers were lost at.
-
-        A place that answers works: it is not closed for the pairs that kill every worker.
-        """
-        if self._peek(now) is not None or not self._queue.has_retries or now >= self.stop:
-            return None
-        for unit, record in product(self._first, self.records):
-            ran = any(found.unit == unit.name and not found.failure for found in record.units)
-            if ran and not self._queue.is_busy(record.index):
-                self._queue.under_way.add(record.index)
-                times = self._time([unit], 1, self.stop - now, exploring=False)
-                expected = (self.costs.p90(unit.name),)
-                return MatchJob(self.phase, (record.index,), (unit,), expected, *times, is_trial=True)
-        return None
-
     def _peek(self, now: float) -> Chunk | None:
-        """The next chunk of the present phase, or of those to come."""
-        while self._queue.first is None and self._coming:
+        """The next fresh chunk of the present phase, or of those to come."""
+        while not self._queue.fresh and self._coming:
             self._open(self._coming.pop(0), now)
-        return self._queue.first
+        return self._queue.fresh[0] if self._queue.fresh else None
 
     def _pop(self, place: str, now: float, *, cautious: bool) -> Chunk | None:
         self._peek(now)
@@ -249,45 +211,55 @@ class Plan:
         gets late, and in the end one unit, since what one job does comes back, or is lost, at once.
         """
         left = self.stop - now
-        lacking = sorted(self._lacking_units(todo, units), key=lambda unit: unit.stage)
-        unknown = [number for number, unit in enumerate(lacking) if not self.costs.is_known(unit.name)]
-        seconds = self.costs.overhead + sum(self.costs.mean(unit.name) for unit in lacking)
+        lacking = dict.fromkeys(unit for index in todo for unit in self.records[index].lacking(units))
+        chosen = sorted(lacking, key=lambda unit: unit.stage)
+        unknown = [number for number, unit in enumerate(chosen) if not self.costs.is_known(unit.name)]
+        seconds = self.costs.overhead + sum(self.costs.mean(unit.name) for unit in chosen)
         pair_count = len(todo) if len(todo) * seconds <= JOB_SHARE * left else int(JOB_SHARE * left / seconds)
-        unit_count = len(lacking) if seconds <= JOB_SHARE * left else 1
+        unit_count = len(chosen) if seconds <= JOB_SHARE * left else 1
         if unknown:
             pair_count, unit_count = 1, min(unit_count, unknown[0] + 1)
         if cautious:
             pair_count = unit_count = 1
-        indices = tuple(todo[: max(1, pair_count)])
-        if len(indices) < len(todo):
-            self._queue.put_first(replace(chunk, indices=tuple(todo[len(indices) :])))
-        if unit_count < len(lacking):
-            self._queue.put_first(replace(chunk, indices=indices, units=tuple(lacking[unit_count:])))
-        self._queue.under_way.update(indices)
-        chosen = lacking[:unit_count]
-        exploring = any(not self.costs.is_known(unit.name) for unit in chosen)
-        allowance, time_limit = self._time(chosen, len(indices), left, exploring=exploring)
-        expected = tuple(self.costs.p90(unit.name) for unit in chosen)
-        return MatchJob(chunk.phase, indices, tuple(chosen), expected, allowance, time_limit, exploring)
+        indices, later = tuple(todo[: max(1, pair_count)]), tuple(todo[max(1, pair_count) :])
+        chosen, further = chosen[:unit_count], chosen[unit_count:]
+        if later:
+            self._queue.put_back(replace(chunk, indices=later))
+        if further:
+            self._queue.put_back(replace(chunk, indices=indices, units=tuple(further)))
+        return self._match(chunk.phase, indices, chosen, left)
 
-    def _time(self, units: Sequence[Unit], pairs: int, left: float, *, exploring: bool) -> tuple[float, float]:
-        """The seconds in which a job may begin units, and those after which its worker hangs."""
-        silence = min(MAX_SILENCE_S, max(MIN_SILENCE_S, SILENCE_SHARE * self.budget.time_limit))
-        expected = pairs * (self.costs.overhead + sum(self.costs.p90(unit.name) for unit in units))
-        longest = max(self.costs.longest(unit.name, HANGS * min(pairs, self.minibatch)) for unit in units)
-        allowance = SLOW * expected + silence
-        if exploring:
+    def _trial(self, now: float) -> MatchJob | None:
+        """The first unit on a pair that has had it, where nothing is left but what workers were lost at.
+
+        A place that answers works: it is not closed for the pairs that kill every worker.
+        """
+        is_needed = self._queue.again and self._peek(now) is None and now < self.stop
+        for unit, record in product(self._first, self.records if is_needed else ()):
+            ran = any(found.unit == unit.name and not found.failure for found in record.units)
+            if ran and not self._queue.is_busy(record.index):
+                return replace(self._match(self.phase, (record.index,), [unit], self.stop - now), is_trial=True)
+        return None
+
+    def _match(self, phase: Phase, indices: tuple[int, ...], units: Sequence[Unit], left: float) -> MatchJob:
+        """The job, with its times by what its units cost."""
+        self._queue.under_way.update(indices)
+        p90 = tuple(self.costs.p90(unit.name) for unit in units)
+        allowance = SLOW * len(indices) * (self.costs.overhead + sum(p90)) + self.budget.silence
+        minibatch = min(len(indices), self._minibatch)
+        longest = max(self.costs.longest(unit.name, HANGS * minibatch) for unit in units)
+        if not all(self.costs.is_known(unit.name) for unit in units):
             longest += min(MAX_EXPLORE_S, EXPLORE_SHARE * left)
-        return min(left, allowance), allowance + longest
+        return MatchJob(phase, indices, tuple(units), p90, min(left, allowance), allowance + longest)
 
     def _units(self, chunk: Chunk, now: float) -> tuple[Unit, ...]:
         """The units for a chunk whose turn has come."""
-        if chunk.units is None:
-            usable = self.usable(self.recipe.units)
-            units = usable[: self._fit(usable, now)]
-        else:
-            units = self.usable(chunk.units)
-        return units if chunk.phase in (Phase.DEEPEN, Phase.FILL) else units[:1]
+        if chunk.units is not None:
+            return self.usable(chunk.units)
+        units = self.usable(self.recipe.units)
+        if chunk.phase is Phase.DEEPEN:
+            return units[: self._fit(units, now)]
+        return units if chunk.phase is Phase.FILL else self._first
 
     def usable(self, units: Iterable[Unit]) -> tuple[Unit, ...]:
         """The units but those that were given up on all pairs."""
@@ -316,37 +288,25 @@ class Plan:
 
     def _open(self, phase: Phase, now: float) -> None:
         """Begin a phase."""
-        first = tuple(unit for unit in self.recipe.units if unit.stage == 1)
-        size = max(JOB_PAIRS, JOB_MINIBATCHES * self.minibatch if self.minibatch > 1 else 0)
-        self.phase = phase
-        if phase is Phase.SWEEP:
-            self._queue.extend(chunks_of(phase, self._order, size, first))
-        elif phase is Phase.CONNECT and self._connecting:
-            count = self._total = self._pairs_that_fit(CONNECT_SHARE, self._connecting, now)
-            self.explain(now, f"{count} of {self._connecting} pairs are matched for the scenes alone")
-            self._queue.extend(chunks_of(phase, self._extra[:count], size, first))
+        self.phase, indices = phase, self._order
+        if phase is Phase.CONNECT:
+            indices = self._extra[: self._pairs_that_fit(CONNECT_SHARE, self._connecting, now)]
+            if self._connecting:
+                self.explain(now, f"{len(indices)} of {self._connecting} pairs are matched for the scenes alone")
         elif phase is Phase.DEEPEN:
             self.explain(now, "the sweep is over; deepening begins")
-            self._queue.extend(chunks_of(phase, self._order, size, None))
         elif phase is Phase.FILL:
             lacking = filter(self.may_gain, self.records[: len(self._order)])
-            idle = (record for record in lacking if not self._queue.is_busy(record.index))
-            weak = sorted(idle, key=lambda record: (record.inliers, record.index))
-            self._add(phase, [record.index for record in weak], size, self.recipe.units, now)
+            weakest = sorted(lacking, key=lambda record: (record.inliers, record.index))
+            indices = [record.index for record in weakest if not self._queue.is_busy(record.index)]
         elif phase is Phase.DENSIFY:
-            further = [index for index in self._extra if self.can_gain(index, self._first)]
-            further = further[: self._pairs_that_fit(DENSIFY_SHARE, len(further), now)]
-            self._add(phase, further, size, first, now)
-
-    def _add(self, phase: Phase, indices: list[int], size: int, units: tuple[Unit, ...], now: float) -> None:
-        """Give pairs that were done more units in the time that is left."""
-        self._total, self.filling = len(indices), set(indices)
-        if indices:
-            what = (
-                "pairs that lack units, the weakest first" if phase is Phase.FILL else "pairs for the scenes alone"
-            )
-            self.explain(now, f"in the time left: {len(indices)} {what}")
-            self._queue.extend(chunks_of(phase, indices, size, units))
+            indices = [index for index in self._extra if self.can_gain(index, self._first)]
+            indices = indices[: self._pairs_that_fit(DENSIFY_SHARE, len(indices), now)]
+        if indices and phase in IN_THE_TIME_LEFT:
+            self.explain(now, f"in the time left: {len(indices)} {IN_THE_TIME_LEFT[phase]}")
+        self._total, self._left = len(indices), set(indices)
+        size = max(JOB_PAIRS, JOB_MINIBATCHES * self._minibatch if self._minibatch > 1 else 0)
+        self._queue.fresh.extend(chunks_of(phase, indices, size))
 
     def _pairs_that_fit(self, share: float, count: int, now: float) -> int:
         """How many of so many pairs can have the first unit in a share of the time left."""
@@ -359,11 +319,13 @@ class Plan:
     def on_result(self, job: MatchJob, result: MatchResult, seconds: float, now: float) -> list[Outcome]:
         """Record a job that took so many seconds; what it brought, to be kept."""
         self._queue.under_way.difference_update(job.indices)
+        if job.is_trial:
+            return []
         for found in result.results:
             self.costs.observe(found.unit.name, found.seconds, warm_up=found.warm_up)
         if result.results:
             self.costs.observe_overhead((seconds - result.unit_seconds) / len(result.outcomes))
-        kept = [changed for outcome in result.outcomes if (changed := self._merge(outcome, now)) is not None]
+        kept = [outcome for outcome in result.outcomes if self._merge(outcome, now)]
         ran = {outcome.record.index for outcome in result.outcomes if outcome.results}
         for index in ran - {outcome.record.index for outcome in kept}:
             if self.can_gain(index, job.units):
@@ -373,7 +335,7 @@ class Plan:
         if rest:  # the job's own deadline cut it off
             self._queue.retry([Chunk(job.phase, rest, job.units)])
         self._mark_done(job.phase, set(job.indices) - set(rest))
-        return kept
+        return [replace(outcome, record=self.records[outcome.record.index]) for outcome in kept]
 
     def on_failure(self, job: MatchJob, failure: Failure, place: str, now: float) -> list[Outcome]:
         """Record a job that came to nothing, and plan it anew: halved, then unit by unit; what to keep.
@@ -384,18 +346,18 @@ class Plan:
         self._queue.under_way.difference_update(job.indices)
         if job.is_trial:
             return []
-        chunk = Chunk(job.phase, job.indices, job.units, (place,))
-        if len(job.indices) > 1:
-            half = len(job.indices) // 2
-            self._queue.retry(replace(chunk, indices=part) for part in (job.indices[:half], job.indices[half:]))
+        chunk, half = Chunk(job.phase, job.indices, job.units, (place,)), len(job.indices) // 2
+        if half:
+            parts = job.indices[:half], job.indices[half:]
+            self._queue.retry([replace(chunk, indices=part) for part in parts])
             return []
         (index,) = job.indices
         lacking = self.records[index].lacking(job.units)
         if len(lacking) > 1:
-            self._queue.retry(replace(chunk, units=(unit,)) for unit in lacking)
+            self._queue.retry([replace(chunk, units=(unit,)) for unit in lacking])
             return []
         (unit,) = lacking
-        if job.exploring and failure.cause is Cause.TIMED_OUT:
+        if failure.cause is Cause.TIMED_OUT:
             self.costs.assume(unit.name, job.time_limit)
         self._tries[index, unit.name] += 1
         if self._tries[index, unit.name] < MAX_TRIES:
@@ -405,40 +367,29 @@ class Plan:
         self._mark_done(job.phase, [index])
         return [outcome]
 
-    def set_scene(self, index: int, choice: Choice) -> None:
-        """Record which F the reconstruction of its batch gives a pair."""
-        self.records[index] = replace(self.records[index], scene=choice)
-
-    def restart(self, now: float, reason: str) -> dict[int, int]:
-        """Begin anew on other devices: costs are unknown, and no unit is given up. Pairs keep what they have.
-
-        Returns by pair how many units it has got more: it is less where some had been given up.
-        """
+    def restart(self, now: float, reason: str) -> list[Outcome]:
+        """Begin anew on other devices: no unit is given up, and pairs keep what they have; what has changed."""
         self.explain(now, reason)
-        self.costs, self.unusable, self._fitting = Costs(), set(), -1
-        self._proven, self._tries, self._failed_pairs = set(), Counter(), {}
-        changes = {}
-        for record in self.records:
-            whole = record.without_given_up()
-            if whole is not record:
-                self._put(whole)
-                changes[record.index] = len(whole.units) - len(record.units)
+        whole = [record.without_given_up() for record in self.records]
+        changed = [record for record in whole if record is not self.records[record.index]]
+        for record in changed:
+            self._put(record)
         self._begin()
-        return changes
+        return list(map(Outcome, changed))
 
-    def _merge(self, outcome: Outcome, now: float) -> Outcome | None:
-        """The outcome to keep, if the job brought anything: a unit more, or the reason why there can be none."""
+    def _merge(self, outcome: Outcome, now: float) -> bool:
+        """Whether a job has brought a pair something: a unit more, or the reason why there can be none."""
         record, former = outcome.record, self.records[outcome.record.index]
         if not outcome.results and record.failure and record.reached:
             self._stuck.add(record.index)  # an image cannot be read
             if former.units:
                 self.explain(now, f"pair {record.index} keeps the F it has: {record.failure}")
         if len(record.units) <= len(former.units) and (former.reached or not record.reached):
-            return None
-        record = record.after(former)
-        self._put(record)
-        self._proven.update(found.unit.name for found in outcome.results)
-        return Outcome(record, outcome.results)
+            if outcome.results:  # what was found before cannot be read, and a worse F is no gain
+                self._stuck.add(record.index)
+            return False
+        self._put(record.after(former))
+        return True
 
     def _give_up(self, index: int, unit: Unit, failure: Failure, now: float) -> Outcome:
         """The pair keeps the F that it has; the unit is marked as had, with the reason."""
@@ -447,26 +398,32 @@ class Plan:
         empty = UnitRecord(unit.name, unit.stage, 0, 0, 0.0, 0.0, reason)
         message = record.failure if record.reached else reason
         self._put(replace(record, units=(*record.units, empty), failure=message))
-        failed = self._failed_pairs.setdefault(unit.name, set())
-        failed.add(index)
-        if len(failed) >= MAX_FAILED_PAIRS and unit.name not in self._proven:
+        self._failed_pairs[unit.name] += 1
+        if self._failed_pairs[unit.name] >= MAX_FAILED_PAIRS and not self.costs.has_run(unit.name):
             self.unusable.add(unit.name)
             self.explain(now, f"{unit.name} is given up on all pairs: it never ran ({failure})")
         return Outcome(self.records[index], (UnitResult(unit, Matches.empty(), failure=reason),))
 
     def _mark_done(self, phase: Phase, indices: Iterable[int]) -> None:
+        """The turn of these pairs is over in a phase, but for those that are to be tried again."""
+        over = {index for index in indices if not self._queue.has_retry(index)}
+        if phase is self.phase:
+            self._left -= over
         if phase not in (Phase.SWEEP, Phase.CONNECT):
-            finished = [index for index in indices if not self._queue.has_retry(index)]
-            self.done.update(finished)
-            self.filling.difference_update(finished)
+            self.done |= over
 
     # What is left
+
+    @property
+    def filling(self) -> Collection[int]:
+        """Pairs that get more than what fits for all, in the time left."""
+        return self._left if self.phase in IN_THE_TIME_LEFT else ()
 
     def wanted(self, record: PairRecord) -> list[Unit]:
         """The units that a pair still gets if there is time."""
         if record.index < len(self._order):
             return record.lacking(self.usable(self.recipe.units))
-        is_over = self.phase is Phase.DENSIFY and record.index not in self.filling
+        is_over = self.phase is Phase.DENSIFY and record.index not in self._left
         return [] if is_over else record.lacking(self._first)
 
     def may_gain(self, record: PairRecord) -> bool:
@@ -487,36 +444,18 @@ class Plan:
     @property
     def progress(self) -> tuple[Phase, int, int]:
         """The present phase, how many of its pairs are done, and how many it has."""
-        asked = len(self._order)
-        if self.phase is Phase.SWEEP:
-            return self.phase, self._reached, asked
-        if self.phase is Phase.DEEPEN:
-            return self.phase, len(self.done) - len(self._extra), asked
-        if self.phase is Phase.CONNECT:
-            return self.phase, self._matched, self._total
-        return self.phase, self._total - len(self.filling), self._total
+        return self.phase, self._total - len(self._left), self._total
 
     def explain(self, now: float, text: str) -> None:
         """Note a decision, and why."""
         self.explanations.append(Explanation(now - self.budget.started, text))
 
-    def _lacking_units(self, indices: Iterable[int], units: Sequence[Unit]) -> list[Unit]:
-        """Each of the units that some of the pairs have not had, once."""
-        return list(dict.fromkeys(unit for index in indices for unit in self.records[index].lacking(units)))
-
     def _put(self, record: PairRecord) -> None:
-        former = self.records[record.index]
-        had, lacks = self._lacks(former), self._lacks(record)
-        self._lacking.subtract(had - lacks)
-        self._lacking.update(lacks - had)
-        if record.index < len(self._order):
-            self._reached += record.reached - former.reached
-        else:
-            self._matched += record.reached - former.reached
+        self._lacking.subtract(self._lacks(self.records[record.index]))
+        self._lacking.update(self._lacks(record))
         self.records[record.index] = record
 
-    def _lacks(self, record: PairRecord) -> set[str]:
+    def _lacks(self, record: PairRecord) -> list[str]:
         """The units that a pair is to get yet, if it has an F and a row."""
-        if not record.units or record.index >= len(self._order):
-            return set()
-        return {unit.name for unit in record.lacking(self.recipe.units)}
+        has_row = record.index < len(self._order)
+        return [unit.name for unit in record.lacking(self.recipe.units)] if record.units and has_row else []

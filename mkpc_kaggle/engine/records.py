@@ -14,6 +14,7 @@ from mkpc_kaggle.scene.choose import Choice
 from mkpc_kaggle.scene.reconstruction import Reconstruction
 
 NOT_REACHED = "not reached in time"
+Point = tuple[float, float, float]
 GIVEN_UP = "given up: "  # how the failure of a unit begins that workers were lost at
 MAX_DRAWN_POINTS = 300  # of a scene, which are kept to be drawn
 
@@ -163,11 +164,11 @@ class CameraRecord:
 
     image: str
     model: int
-    centre: list[float]
-    forward: list[float]
-    down: list[float]
+    centre: Point
+    forward: Point
+    down: Point
     focal: float
-    size: list[int]
+    size: Size
     seen: int
 
 
@@ -188,7 +189,7 @@ class SceneRecord:
     seconds: float
     failure: str
     cameras: tuple[CameraRecord, ...] = ()
-    cloud: tuple[list[float], ...] = ()
+    cloud: tuple[Point, ...] = ()
 
     @classmethod
     def of(
@@ -205,11 +206,11 @@ class SceneRecord:
             CameraRecord(
                 found.image.name,
                 number,
-                (-found.camera.R.T @ found.camera.t).tolist(),
-                found.camera.R[2].tolist(),
-                found.camera.R[1].tolist(),
+                tuple((-found.camera.R.T @ found.camera.t).tolist()),
+                tuple(found.camera.R[2].tolist()),
+                tuple(found.camera.R[1].tolist()),
                 found.focal,
-                list(found.image.size),
+                found.image.size,
                 found.points,
             )
             for number, model in enumerate(models)
@@ -226,7 +227,7 @@ class SceneRecord:
             seconds,
             failure or "; ".join(dict.fromkeys(reasons)) or ("" if models else "no matches connect its images"),
             cameras,
-            tuple(evenly(models[0].points, MAX_DRAWN_POINTS).round(4).tolist()) if models else (),
+            tuple(map(tuple, evenly(models[0].points, MAX_DRAWN_POINTS).round(4).tolist())) if models else (),
         )
 
 

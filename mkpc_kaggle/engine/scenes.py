@@ -26,8 +26,7 @@ DENSIFY_PAIRS_PER_IMAGE = 15.0  # of a batch, once all units have run: above, pa
 START_S = 3.0  # that a process takes to begin
 PAIR_S = 0.2  # that a pair adds to a reconstruction, as long as nothing is known
 FORECAST_MARGIN = 1.5  # a reconstruction may take this many times what its pairs took in earlier ones
-HANGS = 10.0  # one that takes this many times its forecast hangs,
-SILENCE_SHARE, MIN_SILENCE_S, MAX_SILENCE_S = 0.02, 5.0, 60.0  # besides a share of the limit
+HANGS = 10.0  # one that takes this many times its forecast hangs
 
 
 def batches_of(pairs: Iterable[Pair]) -> dict[str, list[int]]:
@@ -75,19 +74,15 @@ class Scenes:
         self.batches = batches_of(pairs) if recipe.scene is not None else {}
         self._pairs, self._recipe, self._records = pairs, recipe, records
         self._batch_of = {index: name for name, indices in self.batches.items() for index in indices}
-        self._unit_counts = dict.fromkeys(self.batches, 0)
-        self._open: set[str] = set()  # to be reconstructed, for the first time or anew
+        self._outdated = {name for name in self.batches if self._is_outdated(name)}
         self._running: set[str] = set()
         self._losses: Counter[tuple[str, int]] = Counter()
         self._spent_s = self._spent_pairs = 0.0
-        for index in self._batch_of:
-            self.note_units(index, len(records[index].units))
 
-    def note_units(self, index: int, change: int) -> None:
-        """Record that a pair has got so many more units, or lost them."""
+    def note_change(self, index: int) -> None:
+        """Record that a pair has got units, or lost them."""
         if (batch := self._batch_of.get(index)) is not None:
-            self._unit_counts[batch] += change
-            self._update(batch)
+            self._outdated.add(batch)
 
     def due(self, done: Collection[int], filling: Collection[int] = ()) -> str | None:
         """A batch to reconstruct now: its matches have changed since it was, and all of its pairs are ``done``.
@@ -95,18 +90,17 @@ class Scenes:
         For the first time it is while some of them get further matches (``filling``), for the second afterwards:
         first those that were never reconstructed.
         """
-        if not self._open:
-            return None
-        for name, indices in sorted(self.batches.items(), key=lambda batch: batch[0] in self.made):
-            is_waiting = name in self._open and name not in self._running and self._unit_counts[name] > 0
-            waits_for = filling if name in self.made else ()
-            if is_waiting and all(index in done and index not in waits_for for index in indices):
+        waiting = [name for name in self.batches if name in self._outdated and name not in self._running]
+        for name in sorted(waiting, key=self.made.__contains__):
+            indices, waits_for = self.batches[name], filling if name in self.made else ()
+            is_ready = all(index in done and index not in waits_for for index in indices)
+            if is_ready and any(self._records[index].units for index in indices):
                 return name
         return None
 
     def needs(self, index: int) -> bool:
         """Whether a reconstruction to come wants the pair's matches."""
-        return self._batch_of.get(index) in self._open
+        return self._batch_of.get(index) in self._outdated
 
     def job(self, batch: str, results_of: Callable[[int], tuple[UnitResult, ...]]) -> SceneJob:
         """The job that reconstructs a batch; ``results_of`` gives what was found on a pair."""
@@ -115,7 +109,7 @@ class Scenes:
         found = tuple(index for index in self.batches[batch] if self._records[index].sizes)
         pairs = tuple(self._batch_pair(index, results_of(index)) for index in found)
         self._running.add(batch)
-        return SceneJob(batch, found, pairs, config, recipe.focal, recipe.magsac, self._unit_counts[batch])
+        return SceneJob(batch, found, pairs, config, recipe.focal, recipe.magsac, self._unit_count(batch))
 
     def on_result(self, job: SceneJob, record: SceneRecord) -> None:
         self._spent_s += max(0.0, record.seconds - START_S)
@@ -131,21 +125,19 @@ class Scenes:
         self._losses[job.batch, job.made_from] += 1
         if self._losses[job.batch, job.made_from] < MAX_TRIES:
             return None
-        former = self.made.get(job.batch)
-        if former is None or former.failure:
-            former = SceneRecord.of(job.batch, (), job.made_from, seconds, failure)
-        record = replace(former, made_from=job.made_from)
-        self._settle(record)
-        return record
+        record = self.made.get(job.batch)
+        if record is None or record.failure:
+            record = SceneRecord.of(job.batch, (), job.made_from, seconds, failure)
+        self._settle(replace(record, made_from=job.made_from))
+        return self.made[job.batch]
 
-    def time_limit(self, batch: str, limit: float) -> float:
-        """Seconds after which a reconstruction hangs, in a run of ``limit`` seconds."""
-        silence = min(MAX_SILENCE_S, max(MIN_SILENCE_S, SILENCE_SHARE * limit))
+    def time_limit(self, batch: str, silence: float) -> float:
+        """Seconds after which a reconstruction hangs, with what :attr:`Budget.silence` allows."""
         return silence + HANGS * self._forecast(batch)
 
     def reserve(self, at_once: int) -> float:
         """The seconds that what is left to reconstruct will most likely take, ``at_once`` at a time."""
-        left = [self._forecast(name) for name in self._open]
+        left = [self._forecast(name) for name in self._outdated]
         return max([*left, sum(left) / at_once], default=0.0)
 
     def _forecast(self, batch: str) -> float:
@@ -155,14 +147,14 @@ class Scenes:
     def _settle(self, record: SceneRecord) -> None:
         self._running.discard(record.batch)
         self.made[record.batch] = record
-        self._update(record.batch)
+        if not self._is_outdated(record.batch):
+            self._outdated.discard(record.batch)
 
-    def _update(self, batch: str) -> None:
-        made = self.made.get(batch)
-        if made is None or made.made_from != self._unit_counts[batch]:
-            self._open.add(batch)
-        else:
-            self._open.discard(batch)
+    def _is_outdated(self, batch: str) -> bool:
+        return batch not in self.made or self.made[batch].made_from != self._unit_count(batch)
+
+    def _unit_count(self, batch: str) -> int:
+        return sum(len(self._records[index].units) for index in self.batches[batch])
 
     def _batch_pair(self, index: int, results: Sequence[UnitResult]) -> BatchPair:
         record = self._records[index]

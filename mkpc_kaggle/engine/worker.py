@@ -30,9 +30,9 @@ from mkpc_kaggle.recipe import Unit
 ESTIMATE_THREADS = 2  # OpenCV releases the interpreter's lock: F of pairs is estimated while the next are matched
 
 CAUSES = {
-    failures.Failure.OUT_OF_MEMORY: Cause.OUT_OF_MEMORY,
-    failures.Failure.DEVICE: Cause.DEVICE,
-    failures.Failure.ORDINARY: Cause.RAISED,
+    failures.FailureKind.OUT_OF_MEMORY: Cause.OUT_OF_MEMORY,
+    failures.FailureKind.DEVICE: Cause.DEVICE,
+    failures.FailureKind.ORDINARY: Cause.RAISED,
 }
 
 

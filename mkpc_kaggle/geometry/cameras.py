@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from mkpc_kaggle.geometry.coordinates import Matrix3, Size
+from mkpc_kaggle.geometry.two_view import cross_matrix
 
 # A quarter turn of a picture, counter-clockwise: (x, y) goes to (y, -x), y being down.
 QUARTER: Matrix3 = np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])
@@ -56,8 +57,7 @@ def fundamental_of_cameras(camera0: Camera, camera1: Camera) -> Matrix3:
     R, t = relative_pose(camera0, camera1)
     if np.linalg.norm(t) < MIN_BASELINE * max(1.0, float(np.linalg.norm(camera0.t))):
         raise ValueError("the two cameras have one centre: F is not defined")
-    cross = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
-    F = np.linalg.inv(camera1.K).T @ cross @ R @ np.linalg.inv(camera0.K)
+    F = np.linalg.inv(camera1.K).T @ cross_matrix(t) @ R @ np.linalg.inv(camera0.K)
     return np.asarray(F / np.linalg.norm(F))
 
 

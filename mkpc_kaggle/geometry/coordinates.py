@@ -3,7 +3,7 @@
 Pixel centres are at integers: the centre of the top-left pixel is (0, 0), x runs right, y runs down, and an
 image of width w covers [-0.5, w - 0.5). A resize by s maps ``x_view = (x + 0.5) * s - 0.5``, with an s for
 each axis from the *actual* sizes. A crop subtracts an integer offset. Padding goes to the right and the
-bottom, so it moves nothing. A flip mirrors the resized content: ``x_view = w - 1 - x``.
+bottom, so it moves nothing.
 
 Networks use other conventions: :func:`from_corner` and :func:`from_normalised` convert to this convention.
 """
@@ -61,7 +61,7 @@ class Box:
 
 @dataclass(frozen=True)
 class View:
-    """What a matcher is shown: a crop of an image, resized, perhaps mirrored, padded right and bottom.
+    """What a matcher is shown: a crop of an image, resized, padded right and bottom.
 
     ``crop`` is in image pixels, ``content`` the size of the resized crop, ``padded`` the size of the picture
     with its padding.
@@ -70,7 +70,6 @@ class View:
     crop: Box
     content: Size
     padded: Size
-    flip: bool = False
 
     def __post_init__(self) -> None:
         if min(self.content) < 1:
@@ -79,33 +78,33 @@ class View:
             raise ValueError(f"padding cannot shrink: content {self.content}, padded {self.padded}")
 
     @classmethod
-    def fit(cls, crop: Box, *, long_side: int, multiple: int = 1, flip: bool = False) -> "View":
+    def fit(cls, crop: Box, *, long_side: int, multiple: int = 1) -> "View":
         """The view of ``crop`` whose longer side is ``long_side`` pixels, its aspect kept to the nearest pixel.
 
         As for all views made here, both sides are then padded up to a multiple of ``multiple``, and a size that
         is not positive raises ``ValueError``.
         """
-        return cls._scaled(crop, long_side / max(crop.size), multiple, flip)
+        return cls._scaled(crop, long_side / max(crop.size), multiple)
 
     @classmethod
-    def of_area(cls, crop: Box, *, area: int, multiple: int = 1, flip: bool = False) -> "View":
+    def of_area(cls, crop: Box, *, area: int, multiple: int = 1) -> "View":
         """The view of ``crop`` that has about ``area`` pixels, its aspect kept to the nearest pixel."""
-        return cls._scaled(crop, sqrt(max(0, area) / crop.area), multiple, flip)
+        return cls._scaled(crop, sqrt(max(0, area) / crop.area), multiple)
 
     @classmethod
-    def stretched(cls, crop: Box, *, size: Size, multiple: int = 1, flip: bool = False) -> "View":
+    def stretched(cls, crop: Box, *, size: Size, multiple: int = 1) -> "View":
         """The view of ``crop`` resized to exactly ``size``, whatever its aspect."""
         if multiple < 1:
             raise ValueError(f"multiple must be positive, not {multiple}")
         padded = Size(*(ceil(side / multiple) * multiple for side in size))
-        return cls(crop, size, padded, flip)
+        return cls(crop, size, padded)
 
     @classmethod
-    def _scaled(cls, crop: Box, scale: float, multiple: int, flip: bool) -> "View":
+    def _scaled(cls, crop: Box, scale: float, multiple: int) -> "View":
         if scale <= 0:
             raise ValueError(f"the size of a view must be positive: {crop.size} times {scale}")
         width, height = (max(1, round(side * scale)) for side in crop.size)
-        return cls.stretched(crop, size=Size(width, height), multiple=multiple, flip=flip)
+        return cls.stretched(crop, size=Size(width, height), multiple=multiple)
 
     @property
     def scale(self) -> tuple[float, float]:
@@ -115,14 +114,12 @@ class View:
     def from_image(self, points: NDArray[np.floating]) -> NDArray[np.float64]:
         """(N, 2) image pixels -> (N, 2) view pixels."""
         offset = np.array([self.crop.left, self.crop.top])
-        resized = (np.asarray(points, np.float64) - offset + 0.5) * self.scale - 0.5
-        return self._mirror(np.asarray(resized, np.float64))
+        return np.asarray((np.asarray(points, np.float64) - offset + 0.5) * self.scale - 0.5, np.float64)
 
     def to_image(self, points: NDArray[np.floating]) -> NDArray[np.float64]:
         """(N, 2) view pixels -> (N, 2) image pixels: the inverse of :meth:`from_image`."""
         offset = np.array([self.crop.left, self.crop.top])
-        resized = self._mirror(np.asarray(points, np.float64))
-        return np.asarray((resized + 0.5) / self.scale - 0.5 + offset, np.float64)
+        return np.asarray((np.asarray(points, np.float64) + 0.5) / self.scale - 0.5 + offset, np.float64)
 
     def holds(self, points: NDArray[np.floating]) -> NDArray[np.bool_]:
         """Which (N, 2) view points lie on content rather than on padding or outside; never for NaN."""
@@ -143,16 +140,9 @@ class View:
         picture = cv2.resize(cut, shrunk, interpolation=cv2.INTER_AREA) if shrunk != crop.size else cut
         if shrunk != self.content:
             picture = cv2.resize(picture, self.content, interpolation=cv2.INTER_LINEAR)
-        if self.flip:
-            picture = picture[:, ::-1]
         right = self.padded.width - self.content.width
         bottom = self.padded.height - self.content.height
         return np.pad(picture, ((0, bottom), (0, right)) + ((0, 0),) * (image.ndim - 2))
-
-    def _mirror(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        if not self.flip:
-            return points
-        return np.column_stack([self.content.width - 1 - points[:, 0], points[:, 1]])
 
 
 def from_corner(points: NDArray[np.floating]) -> NDArray[np.floating]:

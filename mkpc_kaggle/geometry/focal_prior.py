@@ -37,6 +37,7 @@ from mkpc_kaggle.geometry.robust import (
     ModelKind,
     RobustConfig,
     consensus,
+    homogeneous,
     permutation,
     unit_norm,
 )
@@ -49,13 +50,7 @@ ROUGH_SCALES, FINE_SCALES = (4.0,), (2.0, 1.0)  # times the scale, in turn: a wi
 ROUGH_MATCHES, FINE_MATCHES = 300, 1000  # at most, evenly spread; the results are scored on all
 FINE_STARTS = 2  # how many of the rough results are refined
 FREE_COST = 10.0  # what MAGSAC's own F pays for being free of plausible focal lengths
-LOG_FOCAL_GRID = (
-    -0.7,
-    -0.35,
-    0.0,
-    0.35,
-    0.7,
-)  # log f / g to read MAGSAC's F with; the search starts from the best
+LOG_FOCAL_GRID = (-0.7, -0.35, 0.0, 0.35, 0.7)  # log f / g to read MAGSAC's F with; the best is a start
 
 
 @dataclass(frozen=True)
@@ -105,14 +100,9 @@ class FocalPrior:
         return cls(np.array([[focal, 0, centre[0]], [0, focal, centre[1]], [0, 0, 1]]), sigma)
 
     @property
-    def focal(self) -> float:
-        """Pixels, the mean of both axes."""
-        return float(self.K[0, 0] + self.K[1, 1]) / 2
-
-    @property
     def to_ray(self) -> Matrix3:
-        """Homogeneous pixels -> rays (u, v, g)."""
-        return np.asarray(self.focal * np.linalg.inv(self.K))
+        """Homogeneous pixels -> rays (u, v, g), g being the mean focal length of both axes in pixels."""
+        return np.asarray(float(self.K[0, 0] + self.K[1, 1]) / 2 * np.linalg.inv(self.K))
 
     def scaled(self, factor: float) -> Matrix3:
         """The camera matrix of a focal length that is ``factor`` times as long."""
@@ -120,7 +110,7 @@ class FocalPrior:
 
     def rays(self, points: Vectors) -> Vectors:
         """(N, 2) pixels -> (N, 3)."""
-        return np.column_stack([points, np.ones(len(points))]) @ self.to_ray.T
+        return homogeneous(points) @ self.to_ray.T
 
 
 Priors = tuple[FocalPrior, FocalPrior]
@@ -149,16 +139,13 @@ def estimate_with_prior(
         if not candidates:
             reasons = "; ".join(dict.fromkeys(failures)) or "no candidate has a finite cost"
             return Estimate.failed(model, len(matches), reasons)
-        best = min(candidates, key=_cost_of)
+        best = min(candidates, key=lambda found: found.cost)
         inliers = np.abs(sampson(best.fundamental, *search.rays)) < magsac.threshold
         matrix = best.fundamental if model is ModelKind.E else search.for_pixels(best.fundamental)
-        plain = min((found for found in free if np.isfinite(found.cost)), key=_cost_of, default=None)
-    return Estimate(
-        model,
-        unit_norm(matrix),
-        distinct.mask_of_all(inliers),
-        magsac=unit_norm(search.for_pixels(plain.fundamental)) if plain else None,
-    )
+        finite = [found for found in free if np.isfinite(found.cost)]
+        plain = min(finite, key=lambda found: found.cost, default=None)
+    magsac_fundamental = unit_norm(search.for_pixels(plain.fundamental)) if plain else None
+    return Estimate(model, unit_norm(matrix), distinct.mask_of_all(inliers), magsac=magsac_fundamental)
 
 
 class _Candidate(NamedTuple):
@@ -166,10 +153,6 @@ class _Candidate(NamedTuple):
 
     fundamental: Matrix3
     cost: float
-
-
-def _cost_of(candidate: _Candidate) -> float:
-    return candidate.cost
 
 
 class _Search:
@@ -194,7 +177,8 @@ class _Search:
         for number in range(magsac.permutations):
             plain = self._consensus(permutation(number, count), magsac)
             if plain.ok:
-                F = self._for_rays(plain.matrix)
+                to_pixels = [np.linalg.inv(prior.to_ray) for prior in self._priors]
+                F = unit_norm(to_pixels[1].T @ plain.matrix @ to_pixels[0])
                 starts.append(self._decomposed(F))
                 free.append(_Candidate(F, self._cost(F, starts[-1]) + FREE_COST))
             else:
@@ -222,10 +206,6 @@ class _Search:
     def for_pixels(self, F: Matrix3) -> Matrix3:
         """The F for homogeneous pixels, from an F for rays."""
         return self._priors[1].to_ray.T @ F @ self._priors[0].to_ray
-
-    def _for_rays(self, F: Matrix3) -> Matrix3:
-        """The F for rays, of unit norm, from an F for pixels."""
-        return unit_norm(np.linalg.inv(self._priors[1].to_ray).T @ F @ np.linalg.inv(self._priors[0].to_ray))
 
     def _consensus(
         self, chosen: NDArray[np.intp], config: RobustConfig, intrinsics: tuple[Matrix3, Matrix3] | None = None

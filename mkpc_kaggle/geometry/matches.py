@@ -41,11 +41,8 @@ class Matches:
         parts = list(parts)
         if not parts:
             return cls.empty()
-        return cls(
-            np.concatenate([part.points0 for part in parts]),
-            np.concatenate([part.points1 for part in parts]),
-            np.concatenate([part.scores for part in parts]),
-        )
+        columns = zip(*((part.points0, part.points1, part.scores) for part in parts), strict=True)
+        return cls(*map(np.concatenate, columns))
 
     def __len__(self) -> int:
         return len(self.scores)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from mkpc_kaggle.config import POSITIVE, Range, check_ranges
 from mkpc_kaggle.geometry.coordinates import Matrix3 as Matrix3  # noqa: PLC0414  importers find it here
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.geometry.two_view import Vectors, robust_cost, sampson
+from mkpc_kaggle.geometry.two_view import Vectors, robust_costs, sampson
 
 # The F of a pure sideways motion, [e_x]_x: finite, rank 2; epipolar lines are the image rows.
 FALLBACK_FUNDAMENTAL: Matrix3 = np.array([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]])
@@ -176,8 +176,8 @@ def unit_norm(matrix: Matrix3) -> Matrix3:
 
 def calibrate(points: Vectors, K: Matrix3) -> Vectors:
     """(N, 2) pixels -> (N, 2) coordinates in the plane z = 1 of the camera with matrix K."""
-    homogeneous = _homogeneous(points) @ np.linalg.inv(K).T
-    return np.asarray(homogeneous[:, :2] / homogeneous[:, 2:])
+    mapped = homogeneous(points) @ np.linalg.inv(K).T
+    return np.asarray(mapped[:, :2] / mapped[:, 2:])
 
 
 def poses_of_fundamental(F: Matrix3, K0: Matrix3, K1: Matrix3) -> tuple[tuple[Matrix3, Matrix3], Vectors]:
@@ -224,7 +224,7 @@ def _best_of_permutations(
         if matrix is None or matrix.shape != (3, 3) or not np.isfinite(matrix).all() or not matrix.any():
             continue
         with np.errstate(over="ignore", invalid="ignore"):  # points may be anything
-            cost = robust_cost(solver.distances(matrix, points0, points1), 2 * threshold)
+            cost = float(np.sum(robust_costs(solver.distances(matrix, points0, points1), 2 * threshold)))
         if best is None or cost < lowest:
             best, best_mask[order], lowest = matrix, mask.ravel().astype(bool), cost
     if best is None and refusal is not None:
@@ -232,18 +232,19 @@ def _best_of_permutations(
     return best, best_mask
 
 
-def _homogeneous(points: Vectors) -> Vectors:
+def homogeneous(points: Vectors) -> Vectors:
+    """(N, 2) -> (N, 3), the third 1."""
     return np.column_stack([points, np.ones(len(points))])
 
 
 def _epipolar_distances(matrix: Matrix3, points0: Vectors, points1: Vectors) -> Vectors:
     """(N,) Sampson distances to an F or E."""
-    return np.abs(sampson(matrix, _homogeneous(points0), _homogeneous(points1)))
+    return np.abs(sampson(matrix, homogeneous(points0), homogeneous(points1)))
 
 
 def _transfer_distances(matrix: Matrix3, points0: Vectors, points1: Vectors) -> Vectors:
     """(N,) distances in the second image to where an H takes the points of the first."""
-    mapped = _homogeneous(points0) @ matrix.T
+    mapped = homogeneous(points0) @ matrix.T
     tiny = np.finfo(np.float64).tiny
     depth = np.where(np.abs(mapped[:, 2:]) > tiny, mapped[:, 2:], tiny)
     return np.asarray(np.hypot(*(mapped[:, :2] / depth - points1).T))

@@ -50,7 +50,7 @@ class TwoView:
 
     @property
     def fundamental(self) -> Matrix3:
-        return self._with_focals(_cross(self.t) @ self.R)
+        return np.asarray(cross_matrix(self.t) @ self.R * _focal_factors(self.logs))
 
     @property
     def twisted(self) -> "TwoView":
@@ -72,9 +72,9 @@ class TwoView:
 
     def tangent(self) -> NDArray[np.float64]:
         """(9, 7): F's elements by a turn of R (3), a shift of t on the sphere (2) and the logs (2)."""
-        F, cross = self.fundamental, _cross(self.t)
-        turns = self._with_focals(cross @ CROSS @ self.R)
-        shifts = self._with_focals(np.tensordot(self._tangent_basis().T, CROSS, 1) @ self.R)
+        F, factors = self.fundamental, _focal_factors(self.logs)
+        turns = cross_matrix(self.t) @ CROSS @ self.R * factors
+        shifts = np.tensordot(self._tangent_basis().T, CROSS, 1) @ self.R * factors
         by_log0, by_log1 = np.zeros((3, 3)), np.zeros((3, 3))
         by_log0[:, 2], by_log1[2] = F[:, 2], F[2]
         return np.concatenate([turns, shifts, [by_log0, by_log1]]).reshape(7, 9).T
@@ -84,14 +84,11 @@ class TwoView:
         t = self.t + self._tangent_basis() @ step[3:5]
         return TwoView(_rotation(step[:3]) @ self.R, t / np.linalg.norm(t), self.logs + step[5:])
 
-    def _with_focals(self, E: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.asarray(E * _focal_factors(self.logs))
-
     def _tangent_basis(self) -> NDArray[np.float64]:
         """(3, 2) unit vectors at right angles to t and to each other."""
-        first = _cross(self.t)[np.argmin(np.abs(self.t))]
+        first = cross_matrix(self.t)[np.argmin(np.abs(self.t))]
         first = first / np.linalg.norm(first)
-        return np.column_stack([first, _cross(self.t) @ first])
+        return np.column_stack([first, cross_matrix(self.t) @ first])
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +106,7 @@ class Problem:
     def cost(self, view: TwoView, scale: float) -> float:
         """The robust cost of the Sampson distances and :meth:`prior_cost`."""
         distances = sampson(view.fundamental, self.rays0, self.rays1)
-        return self.weight * robust_cost(distances, scale) + self.prior_cost(view)
+        return self.weight * float(np.sum(robust_costs(distances, scale))) + self.prior_cost(view)
 
     def prior_cost(self, view: TwoView) -> float:
         """Half the squares of the logs over their deviations."""
@@ -171,11 +168,6 @@ class Problem:
         return gradient, curvature
 
 
-def robust_cost(distances: Vectors, scale: float) -> float:
-    """The sum of :func:`robust_costs`."""
-    return float(np.sum(robust_costs(distances, scale)))
-
-
 def robust_costs(distances: Vectors, scale: float) -> Vectors:
     """x^2 / (2 (1 + x^2)), x = distance / scale: Geman and McClure, 1985. An outlier costs a half."""
     return np.asarray(0.5 - 0.5 / (1 + np.square(distances / scale)))
@@ -205,12 +197,12 @@ def _focal_factors(logs: Vectors) -> Matrix3:
     return np.array([[1, 1, ratio0], [1, 1, ratio0], [ratio1, ratio1, ratio0 * ratio1]])
 
 
-def _cross(t: Vectors) -> Matrix3:
+def cross_matrix(t: Vectors) -> Matrix3:
     return np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
 
 
 def _rotation(turn: Vectors) -> Matrix3:
     """The rotation about ``turn`` by its length in radians: Rodrigues' formula."""
     angle = float(np.linalg.norm(turn))
-    K = _cross(turn)
+    K = cross_matrix(turn)
     return np.asarray(np.eye(3) + np.sinc(angle / np.pi) * K + 0.5 * np.sinc(angle / (2 * np.pi)) ** 2 * K @ K)

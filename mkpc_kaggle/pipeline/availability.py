@@ -31,6 +31,10 @@ class UnavailableKind(StrEnum):
     NO_WEIGHTS = "no weights"
     UNREADABLE = "weights cannot be loaded"
 
+    @property
+    def is_fault(self) -> bool:
+        return self in (UnavailableKind.NOT_IMPORTABLE, UnavailableKind.UNREADABLE)
+
 
 @dataclass(frozen=True)
 class UnavailableReason:

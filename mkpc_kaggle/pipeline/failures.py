@@ -43,7 +43,7 @@ _DEVICE = (
 )
 
 
-class Failure(Enum):
+class FailureKind(Enum):
     """What an error means for what comes after it."""
 
     OUT_OF_MEMORY = auto()  # fewer pairs at a time may do
@@ -55,14 +55,14 @@ class DeviceError(UserError):
     """A device that cannot compute."""
 
 
-def failure_of(error: BaseException) -> Failure:
+def failure_of(error: BaseException) -> FailureKind:
     """What the error means, by its type's name and its text."""
     reason = reason_of(error)
     if isinstance(error, MemoryError) or any(sign in reason for sign in _OUT_OF_MEMORY):
-        return Failure.OUT_OF_MEMORY
+        return FailureKind.OUT_OF_MEMORY
     if any(sign in reason for sign in _DEVICE):
-        return Failure.DEVICE
-    return Failure.ORDINARY
+        return FailureKind.DEVICE
+    return FailureKind.ORDINARY
 
 
 def reason_of(error: BaseException) -> str:

@@ -20,7 +20,7 @@ from mkpc_kaggle.geometry.critical_region import critical_region
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import Colour, Matcher, NonFiniteError, Picture, encoding_bytes
 from mkpc_kaggle.matchers.dtypes import check_finite, exact_float32
-from mkpc_kaggle.pipeline.failures import Failure, failure_of, reason_of
+from mkpc_kaggle.pipeline.failures import FailureKind, failure_of, reason_of
 from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult
 from mkpc_kaggle.recipe import Recipe, Unit
 
@@ -99,9 +99,9 @@ class Pipeline:
             failure = failure_of(error)
             if isinstance(error, NonFiniteError) and self._fall_back_to_float32(unit.matcher, error):
                 return []
-            if failure is Failure.ORDINARY:
+            if failure is FailureKind.ORDINARY:
                 return [UnitResult(unit, Matches.empty(), failure=reason_of(error))] * len(pairs)
-            if failure is Failure.DEVICE or len(pairs) == 1:
+            if failure is FailureKind.DEVICE or len(pairs) == 1:
                 error.add_note(f"in {unit.name}")
                 raise
         # Not in the handler: until it is left, the error's traceback holds the tensors of the minibatch.

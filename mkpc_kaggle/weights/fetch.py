@@ -152,15 +152,7 @@ def _receive(url: str, part: Path, file: WeightFile) -> None:
             raise ConnectionError("the server sent another part than was asked for")
         total = None if response.length is None else have + response.length
         every = 0.1 if sys.stderr.isatty() else 30  # seconds; a log file gets a line for each update
-        progress = tqdm(
-            desc=file.name,
-            initial=have,
-            total=total,
-            unit="B",
-            unit_scale=True,
-            unit_divisor=1024,
-            mininterval=every,
-        )
+        progress = tqdm(desc=file.name, initial=have, total=total, unit="B", unit_scale=True, mininterval=every)
         with progress, part.open("ab" if have else "wb") as out:
             while block := response.read1(BLOCK_BYTES):
                 have += len(block)

@@ -16,10 +16,10 @@ from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
-from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.data.outputs import replacing
+from mkpc_kaggle.errors import UserError, read_text
 
 MANIFEST = "weights_manifest.txt"
-MAX_BYTES = 1 << 20
 UNVERIFIED = "unverified"
 DIGEST = re.compile(rf"sha256:[0-9a-f]{{64}}|{UNVERIFIED}")
 
@@ -44,22 +44,15 @@ class WeightFile:
 
 def parse_manifest(text: str, where: str = "the weights manifest") -> tuple[WeightFile, ...]:
     """All lines of a manifest; raises :class:`UserError` that names the line that cannot be read."""
-    files = []
-    for number, line in enumerate(text.splitlines(), start=1):
-        columns = line.partition("#")[0].split(maxsplit=5)
-        if columns:
-            files.append(_parse_line(columns, f"{where}, line {number}"))
-    return tuple(files)
+    lines = (
+        (number, line.partition("#")[0].split(maxsplit=5)) for number, line in enumerate(text.splitlines(), 1)
+    )
+    return tuple(_parse_line(columns, f"{where}, line {number}") for number, columns in lines if columns)
 
 
 def read_manifest(path: Path) -> tuple[WeightFile, ...]:
     """The lines of a manifest's file; raises :class:`UserError` if it cannot be read."""
-    try:
-        if not path.is_file() or path.stat().st_size > MAX_BYTES:
-            raise OSError(f"it is not a regular file of at most {MAX_BYTES} bytes")
-        return parse_manifest(path.read_text(encoding="utf-8"), str(path))
-    except (OSError, UnicodeError) as error:
-        raise UserError(f"{path} cannot be read: {error}") from error
+    return parse_manifest(read_text(path), str(path))
 
 
 @cache
@@ -77,10 +70,8 @@ def pin(file: WeightFile, path: Path) -> None:
     pinned = replace(file, size=path.stat().st_size, digest=digest_of(path))
     own = path.with_name(MANIFEST)
     former = own.read_text(encoding="utf-8") if own.is_file() else ""
-    part = own.with_name(f"{MANIFEST}.part")
-    part.unlink(missing_ok=True)  # it may be a link
-    part.write_text(f"{former}{pinned.line}\n", encoding="utf-8")
-    part.replace(own)
+    with replacing(own) as stream:
+        stream.write(f"{former}{pinned.line}\n")
 
 
 def digest_of(path: Path) -> str:

@@ -74,7 +74,7 @@ class WeightStore:
                 raise UserError(f"--weights {directory}: no such directory")
         environment = [Path(part) for part in os.environ.get("MKPC_WEIGHTS", "").split(os.pathsep) if part]
         self.directories = given + environment + ([KAGGLE_INPUT] if KAGGLE_INPUT.is_dir() else [])
-        self._given_files = None if files is None else tuple(files)
+        self._given_files = files
         self._searches: dict[tuple[WeightFile, ...], Search] = {}
 
     @property
@@ -90,7 +90,7 @@ class WeightStore:
         first download.
         """
         if self._given_files is not None:
-            return self._given_files
+            return tuple(self._given_files)
         lines = {file.name: file for file in manifest()}
         for path in self._named(MANIFEST):
             try:

@@ -17,12 +17,11 @@ import pytest
 from mkpc_kaggle.data.competition import read_test_side, submission_problems
 
 ROOT = Path(__file__).resolve().parents[2]
-MEMORY_KIB = (
-    4 << 20
-)  # of data, for each process; not of address space, of which CUDA builds of PyTorch reserve more
+# Of data, for each process; not of address space, of which CUDA builds of PyTorch reserve more.
+MEMORY_KIB = 4 << 20
 REFUSED = (2,)
 DONE = (0,)
-EITHER = (0, 1, 2)  # a valid result, one that says what is missing of it, or a clear refusal
+EITHER = (0, 1, 2)  # a valid result, a result that says what it lacks, or a clear refusal
 CRASHES = ("Traceback (most recent call last)", "Fatal Python error", "Segmentation fault", "core dumped")
 TOO_LATE = "the time was up before a first version"
 MARK = "MKPC_HOSTILE_CASE"

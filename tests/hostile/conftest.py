@@ -14,7 +14,7 @@ def pytest_terminal_summary(terminalreporter: TerminalReporter) -> None:
             if group and report.when == "call":
                 done[group[1]].append((outcome == "passed", report.duration))
     if done:
-        done["all"] = [one for cases in done.values() for one in cases]
+        done["all"] = [case for cases in done.values() for case in cases]
         terminalreporter.section("hostile cases")
         terminalreporter.write_line(f"{'group':<12}{'cases':>7}{'passed':>8}{'failed':>8}{'seconds':>9}")
         for group, cases in done.items():

@@ -41,42 +41,44 @@ ROUGH: dict[str, Callable[[bytes], bytes]] = {
         for place in (0, 8, 2000)
     },
 }
-OTHER_PAIR = (
-    "CREATE TEMP TABLE other AS SELECT * FROM pair LIMIT 1; UPDATE other SET pair = {};"
-    "INSERT INTO pair SELECT * FROM other"
-)
+
+
+def pairs_with(path: str, value: str) -> str:
+    """All records of pairs with another JSON value at a place: a pair's fields are in their order."""
+    return f"UPDATE pair SET value = json_replace(value, '$[{path}]', json('{value}'))"
+
+
 FINE = {
-    "F of NaN": "UPDATE pair SET fundamental = zeroblob(72); UPDATE choice SET fundamental = NULL;"
-    "UPDATE pair SET fundamental = X'" + np.full(9, np.nan).tobytes().hex() + "'",
-    "F of zeros": "UPDATE pair SET fundamental = zeroblob(72)",
-    "F of infinity": "UPDATE pair SET fundamental = X'" + np.full(9, np.inf).tobytes().hex() + "'",
-    "a short F": "UPDATE pair SET fundamental = X'00'",
-    "an F that is text": "UPDATE pair SET fundamental = 'F'",
-    "a chosen F of NaN": "REPLACE INTO choice VALUES (0, X'" + np.full(9, np.nan).tobytes().hex() + "', 'scene')",
-    "a reason nobody knows": "REPLACE INTO choice VALUES (0, NULL, 'because')",
-    "a pair that is not there": OTHER_PAIR.format(99),
-    "a pair before the first": OTHER_PAIR.format(-1),
-    "a pair of 2^62": OTHER_PAIR.format(2**62),
+    "F of NaN": "UPDATE pair SET value = replace(value, '0.', 'NaN, 0.')",
+    "F of zeros": pairs_with("1", "[[0, 0, 0], [0, 0, 0], [0, 0, 0]]"),
+    "F of infinity": pairs_with("1", "[[1e999, 0, 0], [0, 0, 1], [0, 1, 0]]"),
+    "a short F": pairs_with("1", "[1.0]"),
+    "an F that is text": pairs_with("1", '"F"'),
+    "a chosen F of NaN": pairs_with("8", '[[[1e999, 0, 0], [0, 0, 1], [0, 1, 0]], "both cameras are known"]'),
+    "a reason nobody knows": pairs_with("8", '[null, "because"]'),
+    "a pair that is not there": pairs_with("0", "99"),
+    "a pair before the first": pairs_with("0", "-1"),
+    "a pair of 2^62": pairs_with("0", str(2**62)),
     "no pairs": "DELETE FROM pair",
-    "no units": "DELETE FROM unit",
+    "no points": "DELETE FROM points",
     "no samples": "DELETE FROM sample",
     "no run": "DELETE FROM run",
-    "one region a pair": "DELETE FROM region WHERE image = 0",
-    "a region upside down": 'UPDATE region SET "left" = "right", "right" = -5',
-    "a region of text": "UPDATE region SET \"left\" = 'left'",
-    "a region nobody knows": "UPDATE region SET reason = 'because'",
-    "a region of 10^18 pixels": 'UPDATE region SET "right" = 1000000000000000000',
-    "points that are no points": "UPDATE unit SET points = X'00112233'",
-    "points of one byte": "UPDATE unit SET points = X'789c636000000002000100010000'",
-    "points of a gigabyte": "UPDATE unit SET points = :bomb",
-    "counts below none": "UPDATE unit SET matches = -5, inliers = -5",
-    "counts of text": "UPDATE unit SET matches = 'many', inliers = 'all'",
-    "seconds of text": "UPDATE unit SET encode_seconds = 'long'; UPDATE pair SET decode_seconds = 'long'",
-    "seconds of infinity": "UPDATE unit SET encode_seconds = 9e999, match_seconds = -9e999",
-    "units nobody knows": "UPDATE unit SET unit = 'x' || unit",
-    "a failure of 10 MB": "UPDATE pair SET failure = printf('%.*c', 10000000, 'x')",
-    "a failure with markup": "UPDATE pair SET failure = '<script>alert(1)</script>\x1b[31m'",
-    "an event of text": "UPDATE event SET seconds = 'never', kind = 'x'",
+    "one region a pair": "UPDATE pair SET value = json_remove(value, '$[4][0]')",
+    "a region upside down": pairs_with("4][0][0", "[9, 9, 1, 1]"),
+    "a region of text": pairs_with("4][0][0", '["left", 9, 1, 1]'),
+    "a region nobody knows": pairs_with("4][0][1", '"because"'),
+    "a region of 10^18 pixels": pairs_with("4][0][0", "[0, 0, 1000000000000000000, 9]"),
+    "points that are no points": "UPDATE points SET points = X'00112233'",
+    "points of one byte": "UPDATE points SET points = X'789c636000000002000100010000'",
+    "points of a gigabyte": "UPDATE points SET points = :bomb",
+    "counts below none": pairs_with("3][0][2", "-5"),
+    "counts of text": pairs_with("3][0][2", '"many"'),
+    "seconds of text": pairs_with("5", '"long"'),
+    "seconds of infinity": pairs_with("3][0][4", "1e999"),
+    "units nobody knows": pairs_with("3][0][0", '"x"'),
+    "a failure of 10 MB": "UPDATE pair SET value = json_replace(value, '$[2]', printf('%.*c', 10000000, 'x'))",
+    "a failure with markup": pairs_with("2", '"<script>alert(1)</script>\\u001b[31m"'),
+    "an event of text": 'UPDATE event SET value = \'["x", "never", ""]\'',
     "JSON cut off": "UPDATE run SET value = substr(value, 1, 3)",
     "JSON of another kind": "UPDATE run SET value = '[1, 2]'",
     "deep JSON": "UPDATE run SET value = replace(printf('%.*c', 100000, 'x'), 'x', '[')",
@@ -84,13 +86,13 @@ FINE = {
     "another format": "UPDATE run SET value = '99' WHERE key = 'format'",
     "a format of text": "UPDATE run SET value = '\"x\"' WHERE key = 'format'",
     "what it is about of another kind": "UPDATE run SET value = '{\"x\": 1}' WHERE key = 'about'",
-    "other images": "UPDATE sample SET image0 = 'q.png'",
-    "ids that are blobs": "UPDATE sample SET id = X'ff00'",
+    "other images": 'UPDATE sample SET value = \'["a", "b", "q.png", "r.png"]\'',
+    "samples that are blobs": "UPDATE sample SET value = X'ff00'",
     "a table missing": "DROP TABLE pair",
-    "another table for one": "DROP TABLE unit; CREATE TABLE unit (a, b)",
+    "another table for one": "DROP TABLE points; CREATE TABLE points (a, b)",
     "a view for a table": "ALTER TABLE pair RENAME TO was; CREATE VIEW pair AS SELECT * FROM was",
     "a trigger": "CREATE TRIGGER t AFTER INSERT ON event BEGIN DELETE FROM pair; END",
-    "a scene that is none": "INSERT INTO scene VALUES ('b1', 1, 1, 1, 1, 1, 1, '', 'no cameras', '[]')",
+    "a scene that is none": "INSERT INTO scene VALUES ('b1', '[\"b1\", 1, 1]')",
 }
 BESIDE: dict[str, Callable[[Path], object]] = {
     "noise for its lock": lambda work: (work / "journal.lock").write_bytes(b"garbage" * 500),

@@ -19,10 +19,9 @@ ALL: list[Case] = [
     for group in (tables, images, outputs, ends, journals, weight_bombs, settings, fetches)
     for case in group.CASES
 ]
-QUICK = (
+QUICK = (  # these run with the other tests
     "images: png: its first half",
     "images: a pipe",
-    "tables: an id twice",
     "tables: a batch further above",
     "tables: bytes that are no UTF-8",
     "limits: --time-limit nan",
@@ -38,7 +37,6 @@ QUICK = (
     "arguments: check of a submission of NaN",
     "packages: an owner that is a path",
 )
-"""These run with the other tests."""
 
 
 @pytest.fixture(scope="session")

@@ -1,16 +1,17 @@
 """What tests of DKM and RoMa share: all intermediate values of a match, and pictures as the network wants them."""
 
+import re
 from contextlib import contextmanager
 
 import numpy as np
 import pytest
 import torch
-from golden import recorded
+from golden import Stage, recorded
 
 from mkpc_kaggle.geometry.coordinates import Size, from_normalised
 from mkpc_kaggle.matchers.networks.dense_warp import DenseWarp
 from mkpc_kaggle.matchers.networks.gaussian_process import kernel
-from mkpc_kaggle.matchers.networks.pixels import MEAN, STD
+from mkpc_kaggle.matchers.networks.pixels import MEAN, STD, network_input
 from mkpc_kaggle.matchers.networks.warp_refiner import local_correlation
 
 MODES = {  # of sampling, by the golden files' names: threshold, balanced
@@ -128,6 +129,30 @@ def side_by_side(warps):
 
 def joined(calls):
     return [torch.cat(parts) for parts in zip(*calls, strict=True)]
+
+
+def compared(values, golden, within):
+    """Stages in the order of the network for all arrays of a golden file that ``values`` has.
+
+    Of some batches the file has the first item only, of some maps each k-th channel: ``_chK``.
+    """
+    for name, value in values.items():
+        for key in golden:
+            reduced = re.fullmatch(rf"{name}(?:_ch(\d+))?", key)
+            if reduced:
+                step = int(reduced[1] or 1)
+                got = value[..., ::step] if value.ndim == 3 else value[:, ::step]
+                yield within(key, got[: len(golden[key])], golden[key])
+
+
+def within(name, got, expected, share=1e-4):
+    """The tolerance of the golden files: a share of the array's largest value."""
+    return Stage(name, got, expected, share * expected.abs().max().item())
+
+
+def input_of(pixels):
+    """(H, W, 3) uint8 that has its size already."""
+    return network_input(batch_of(pixels), tuple(pixels.shape[:2]))
 
 
 def batch_of(pixels):

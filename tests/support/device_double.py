@@ -32,7 +32,7 @@ INDEXING = {"index", "index_put", "index_put_", "_index_put_impl_", "_unsafe_ind
 
 
 class MixedDevicesError(RuntimeError):
-    """Tensors, or a tensor and a generator, of different devices met in one operator."""
+    """Tensors, or a tensor and a generator, of different devices met in an operator."""
 
 
 class Tagged(torch.Tensor):
@@ -96,10 +96,8 @@ class DeviceDouble(TorchDispatchMode):
     def __init__(self, count=1, capability=(7, 5), memory=15 << 30):
         super().__init__()
         self.count, self.capability, self.memory = count, capability, memory
-        self.operators = 0
-        """run on tagged tensors so far"""
-        self.dtypes = set()
-        """of the tagged tensors that operators have met"""
+        self.operators = 0  # run on tagged tensors so far
+        self.dtypes = set()  # of the tagged tensors that operators have met
         self._generators = {}
         self._autocast = Autocast()
         self._undo = []
@@ -171,27 +169,27 @@ class DeviceDouble(TorchDispatchMode):
 
     def run(self, func, args, kwargs):
         """One operator: on CPU tensors as it is, on tagged ones with their values, its results tagged anew."""
-        tensors = [one for one in tree_flatten((args, kwargs))[0] if isinstance(one, torch.Tensor)]
-        tagged = [one for one in tensors if isinstance(one, Tagged)]
+        tensors = [each for each in tree_flatten((args, kwargs))[0] if isinstance(each, torch.Tensor)]
+        tagged = [each for each in tensors if isinstance(each, Tagged)]
         wanted = None if kwargs.get("device") is None else self.known(torch.device(kwargs["device"]))
         if not tagged and (wanted is None or wanted.type == "cpu"):
             return func(*args, **kwargs)
         name = func._schema.name.removeprefix("aten::")
         self.operators += 1
-        self.dtypes |= {one.dtype for one in tagged}
+        self.dtypes |= {each.dtype for each in tagged}
         if name == "_has_compatible_shallow_copy_type":
             return False
         if name == "_fused_sdp_choice":
             return 0  # by its definition, whatever kernel a GPU would take
         where = self._device_of_result(name, args, tensors, tagged, wanted)
         self._check_generator(name, kwargs.get("generator"), where)
-        held = {id(one.held): one for one in tagged}
+        held = {id(each.held): each for each in tagged}
         if wanted is not None:
             kwargs = {**kwargs, "device": torch.device("cpu")}
         inner_args, inner_kwargs = tree_map(untagged, (args, kwargs))
         out = func(*inner_args, **inner_kwargs)
-        for one in tagged:
-            assert one.held.shape == one.shape, f"{name} changed a shape in place, which the double cannot follow"
+        for each in tagged:
+            assert each.held.shape == each.shape, f"{name} changed a shape in place: the double cannot follow"
         if name in ("copy_", "set_"):
             return args[0]
 
@@ -216,10 +214,10 @@ class DeviceDouble(TorchDispatchMode):
             return args[0].device
         if name == "_to_copy":
             return wanted or tagged[0].device
-        free = [one for one in tensors if not isinstance(one, Tagged) and one.dim() == 0]
+        free = [each for each in tensors if not isinstance(each, Tagged) and each.dim() == 0]
         if name in INDEXING and isinstance(args[0], Tagged):
             free += [index for index in args[1] if index is not None and not isinstance(index, Tagged)]
-        met = {one.device for one in tensors if not any(one is other for other in free)}
+        met = {each.device for each in tensors if not any(each is other for other in free)}
         if len(met) > 1:
             found = ", ".join(sorted(map(str, met)))
             raise MixedDevicesError(f"{name}: expected all tensors to be on the same device, but found {found}")

@@ -23,7 +23,7 @@ def confidence_of(network, grid0, grid1, masks=None):
 
 
 def tolerance_of(name, tolerances):
-    """That of the entry's prefix; nothing, so that it must agree exactly, without one."""
+    """That of the entry's prefix; 0 where it has none: then it must agree exactly."""
     return next((tolerance for prefix, tolerance in tolerances.items() if name.startswith(prefix)), 0.0)
 
 
@@ -112,41 +112,6 @@ def assert_same_matches(first, second):
     assert len(first[0]) > 0
     for got, expected in zip(first, second, strict=True):
         torch.testing.assert_close(got, expected, rtol=1e-4, atol=1e-3)
-
-
-def item_of(maps, item):
-    return FeatureMaps(maps.coarse[item : item + 1], maps.fine[item : item + 1])
-
-
-@torch.inference_mode()
-def check_batch_equals_single(network, size0, size1):
-    """Two pairs in a batch match as each does alone, masks included."""
-    images = textured(2, 1, *size0), textured(2, 1, *size1, seed=2)
-    maps = [network.encode(image) for image in images]
-    masks = [torch.ones(2, *(side // 8 for side in size), dtype=torch.bool) for size in (size0, size1)]
-    masks[0][1, :, -4:], masks[1][0, -4:] = False, False
-    both = network.match(*maps, tuple(masks))
-    for item in (0, 1):
-        alone = [network.encode(image[item : item + 1]) for image in images]
-        single = network.match(*alone, tuple(mask[item : item + 1] for mask in masks))
-        assert_same_matches(items_of(both, item), items_of(single, 0))
-
-
-@torch.inference_mode()
-def check_nothing_matches_padding(network, size):
-    """No point on padding, nor within the border of the content, even at threshold zero."""
-    maps = [network.encode(textured(1, 1, *size))] * 2
-    h, w = size[0] // 8, size[1] // 8
-    masks = [torch.zeros(1, h, w, dtype=torch.bool) for _ in maps]
-    masks[0][:, : h - 3, : w - 2], masks[1][:, : h - 1, : w - 4] = True, True
-    matches = network.match(*maps, tuple(masks))
-    assert len(matches.points0) > 0
-    for cells, mask in zip((matches.coarse.cell0, matches.coarse.cell1), masks, strict=True):
-        extent = mask[0].any(1).sum(), mask[0].any(0).sum()
-        for position, length in zip((cells // w, cells % w), extent, strict=True):
-            assert network.border <= position.min() and position.max() < length - network.border
-    empty = network.match(*maps, (masks[0], torch.zeros_like(masks[1])))
-    check_empty(empty)
 
 
 def check_empty(matches):

@@ -277,7 +277,7 @@ def _outcome(index: int, known: tuple[UnitResult, ...], found: list[UnitResult])
         UnitRecord(result.unit.name, result.unit.stage, 200, 20 + index % 60, 0.0, result.seconds, "")
         for result in (*known, *found)
     )
-    record = PairRecord(index, FALLBACK_FUNDAMENTAL, "", units, sizes=(Size(1, 1),) * 2, versions=("a 0", "b 0"))
+    record = PairRecord(index, FALLBACK_FUNDAMENTAL, "", units, sizes=SIZES, versions=("first", "second"))
     return Outcome(record, tuple(found))
 
 
@@ -333,14 +333,11 @@ class MemoryJournal:
     def forget_changed(self, pairs: Sequence[Pair]) -> int:
         return 0
 
-    def forget_given_up(self) -> None:
-        pass
-
     def records(self) -> dict[int, PairRecord]:
         return dict(self._records)
 
-    def results(self, pair: int, units: Mapping[str, Unit]) -> tuple[UnitResult, ...]:
-        return self._results.get(pair, ())
+    def results(self, record: PairRecord, units: Mapping[str, Unit]) -> tuple[UnitResult, ...]:
+        return self._results.get(record.index, ())
 
     def save(self, outcomes: list[tuple[Outcome, bool]]) -> None:
         for outcome, _ in outcomes:
@@ -351,13 +348,11 @@ class MemoryJournal:
     def scenes(self) -> tuple[SceneRecord, ...]:
         return tuple(self._scenes.values())
 
-    def save_scene(self, scene: SceneRecord, choices: Mapping[int, Choice]) -> None:
+    def save_scene(
+        self, scene: SceneRecord, records: Iterable[PairRecord], settled: Iterable[PairRecord] = ()
+    ) -> None:
         self._scenes[scene.batch] = scene
-        for index, choice in choices.items():
-            self._records[index] = replace(self._records[index], scene=choice)
-
-    def settle(self, records: Iterable[PairRecord]) -> None:
-        pass
+        self._records |= {record.index: record for record in records}
 
     def note(self, kind: str, seconds: float, text: str) -> None:
         pass

@@ -14,8 +14,7 @@ from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.recipe import Recipe, Unit
 from mkpc_kaggle.scene.config import SceneConfig
 
-DARKEST, STEP = 10, 10
-"""The brightness of the first image, and by how much each next one is brighter."""
+DARKEST, STEP = 10, 10  # the brightness of the first image, and by how much each next image is brighter
 RECIPE = Recipe((Unit(1, "synthetic", SIZE.width),), scene=SceneConfig())
 
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from mkpc_kaggle.matchers.networks.grids import as_grid
-from mkpc_kaggle.matchers.networks.warp_refiner import Estimate, identity_map, resize
+from mkpc_kaggle.matchers.networks.warp_refiner import WarpEstimate, identity_map, resize
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +52,7 @@ class DenseWarp:
 class WarpDecoder(nn.Module, ABC):
     """From the features of two images to the flow from the one to the other."""
 
-    def forward(self, query: DenseFeatures, support: DenseFeatures) -> tuple[Estimate, Tensor]:
+    def forward(self, query: DenseFeatures, support: DenseFeatures) -> tuple[WarpEstimate, Tensor]:
         """The flow from query to support at stride 1 of the last pass, and the first pass's logits at 16."""
         estimate = self.coarse_estimate(query, support)
         logits = estimate.certainty
@@ -61,18 +61,18 @@ class WarpDecoder(nn.Module, ABC):
             estimate = self.refine(estimate, query.fine, support.fine)
         return estimate, logits
 
-    def refine(self, estimate: Estimate, query: Pyramid, support: Pyramid) -> Estimate:
+    def refine(self, estimate: WarpEstimate, query: Pyramid, support: Pyramid) -> WarpEstimate:
         """Down to stride 1 from an estimate of any size."""
         for stride in (8, 4, 2, 1):
             estimate = self.correct(estimate.resized(query.at(stride).shape[2:]), query, support, stride)
         return estimate
 
     @abstractmethod
-    def coarse_estimate(self, query: DenseFeatures, support: DenseFeatures) -> Estimate:
+    def coarse_estimate(self, query: DenseFeatures, support: DenseFeatures) -> WarpEstimate:
         """At stride 16, refined."""
 
     @abstractmethod
-    def correct(self, estimate: Estimate, query: Pyramid, support: Pyramid, stride: int) -> Estimate:
+    def correct(self, estimate: WarpEstimate, query: Pyramid, support: Pyramid, stride: int) -> WarpEstimate:
         """The estimate, of the size of a stride's features, corrected by that stride's refiner."""
 
 
@@ -102,7 +102,7 @@ class DenseNetwork(nn.Module, ABC):
         return forward, dense_warp(*self.decoder(second, first)).swapped()
 
 
-def dense_warp(estimate: Estimate, coarse_logits: Tensor) -> DenseWarp:
+def dense_warp(estimate: WarpEstimate, coarse_logits: Tensor) -> DenseWarp:
     """One direction on the query's grid; ``coarse_logits`` (B, 1, h, w): those of stride 16, first pass."""
     flow, logits = estimate.flow, estimate.certainty
     # Half of the coarse logits that speak against a match is subtracted again.

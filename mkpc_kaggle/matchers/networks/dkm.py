@@ -13,7 +13,7 @@ from mkpc_kaggle.matchers.networks.dense_warp import DenseFeatures, DenseNetwork
 from mkpc_kaggle.matchers.networks.gaussian_process import GaussianProcess
 from mkpc_kaggle.matchers.networks.layers import ExactConv2d
 from mkpc_kaggle.matchers.networks.resnet50 import ResNet50
-from mkpc_kaggle.matchers.networks.warp_refiner import SHAPES, Estimate, WarpRefiner, refined, resize
+from mkpc_kaggle.matchers.networks.warp_refiner import SHAPES, WarpEstimate, WarpRefiner, refined, resize
 
 STRIDES = (32, 16)  # of the coarse decoder
 FEATURES, POSTERIOR, WIDTH = 512, 256, 384  # its channels
@@ -68,7 +68,7 @@ class DkmDecoder(WarpDecoder):
         processes = zip(self.gps.values(), STRIDES, strict=True)
         return tuple(process.regress(support.at(stride)) for process, stride in processes)  # type: ignore[operator]
 
-    def coarse_estimate(self, query: DenseFeatures, support: DenseFeatures) -> Estimate:
+    def coarse_estimate(self, query: DenseFeatures, support: DenseFeatures) -> WarpEstimate:
         """Of what stride 32 found only the context is used."""
         first, second = query.coarse, support.coarse
         batch, _, height, width = first.at(32).shape
@@ -80,7 +80,7 @@ class DkmDecoder(WarpDecoder):
             estimate, context = self.embedding_decoder(stride, posterior, features, context)
         return self.correct(estimate, first, second, STRIDES[-1])
 
-    def correct(self, estimate: Estimate, query: Pyramid, support: Pyramid, stride: int) -> Estimate:
+    def correct(self, estimate: WarpEstimate, query: Pyramid, support: Pyramid, stride: int) -> WarpEstimate:
         corrections = self.conv_refiner[str(stride)](query.at(stride), support.at(stride), estimate.flow)
         return refined(estimate, corrections, stride, query.at(1).shape[2:])
 
@@ -98,14 +98,14 @@ class EmbeddingDecoder(nn.Module):
 
     def forward(
         self, stride: int, posterior: Tensor, features: Tensor, context: Tensor
-    ) -> tuple[Estimate, Tensor]:
+    ) -> tuple[WarpEstimate, Tensor]:
         """Maps (B, 256, h, w), (B, 512, h, w) and (B, 384, h, w) -> the estimate and the next context."""
         at = str(stride)
         own = self.feat_input_modules[at](features)
         embedded = torch.cat([own, posterior.to(own.dtype)], dim=1)  # (B, 512, h, w)
         context = self.rrb_u[at](self.cab[at](context, self.rrb_d[at](embedded)))
         found = self.terminal_module[at](context.float())  # (B, 3, h, w)
-        return Estimate(found[:, 1:], found[:, :1]), context
+        return WarpEstimate(found[:, 1:], found[:, :1]), context
 
 
 class ResidualRefinement(nn.Module):

@@ -22,7 +22,7 @@ from mkpc_kaggle.matchers.networks.transformer_block import VitBlock
 from mkpc_kaggle.matchers.networks.vgg import VGG19, WIDTHS, Vgg
 from mkpc_kaggle.matchers.networks.warp_refiner import (
     SHAPES,
-    Estimate,
+    WarpEstimate,
     WarpRefiner,
     WarpRefinerShape,
     by_rows,
@@ -89,12 +89,12 @@ class RomaDecoder(WarpDecoder):
         assert isinstance(process, GaussianProcess)
         return process
 
-    def coarse_estimate(self, query: DenseFeatures, support: DenseFeatures) -> Estimate:
+    def coarse_estimate(self, query: DenseFeatures, support: DenseFeatures) -> WarpEstimate:
         features = query.coarse.at(COARSEST)
         posterior = self.process(features, support.coarse.at(COARSEST), *support.coefficients)
         return self.correct(self.embedding_decoder(posterior, features), query.coarse, support.coarse, COARSEST)
 
-    def correct(self, estimate: Estimate, query: Pyramid, support: Pyramid, stride: int) -> Estimate:
+    def correct(self, estimate: WarpEstimate, query: Pyramid, support: Pyramid, stride: int) -> WarpEstimate:
         size = query.at(1).shape[2:]
         refiner = self.conv_refiner[str(stride)]
         corrections = refiner(query.at(stride), support.at(stride), estimate.flow, stretch(size))
@@ -131,7 +131,7 @@ class AnchorDecoder(nn.Module):
         )
         self.to_out = ExactLinear(width, SIDE**2 + 1)
 
-    def forward(self, posterior: Tensor, features: Tensor) -> Estimate:
+    def forward(self, posterior: Tensor, features: Tensor) -> WarpEstimate:
         """Maps (B, C, h, w) and (B, C', h, w) of the query, C + C' the width -> the first estimate."""
         x = torch.cat([tokens(posterior), tokens(features)], dim=2)  # (B, h w, C + C')
         for block in self.blocks:
@@ -139,7 +139,7 @@ class AnchorDecoder(nn.Module):
         logits = self.to_out(x)  # (B, h w, 4097)
         size = posterior.shape[2:]
         flow, certainty = anchor_mean(logits[..., :-1]), logits[..., -1:]
-        return Estimate(*(each.mT.reshape(len(x), -1, *size) for each in (flow, certainty)))
+        return WarpEstimate(*(each.mT.reshape(len(x), -1, *size) for each in (flow, certainty)))
 
 
 def anchor_mean(logits: Tensor) -> Tensor:

@@ -42,7 +42,7 @@ SHAPES = {  # by stride
 
 
 @dataclass(frozen=True, eq=False)
-class Estimate:
+class WarpEstimate:
     """``flow`` (B, 2, h, w): where each pixel lies in the other image, absolute and normalised, unclamped;
     ``certainty`` (B, 1, h, w): logits. Both float32.
     """
@@ -50,8 +50,8 @@ class Estimate:
     flow: Tensor
     certainty: Tensor
 
-    def resized(self, size: torch.Size) -> "Estimate":
-        return Estimate(resize(self.flow, size), resize(self.certainty, size))
+    def resized(self, size: torch.Size) -> "WarpEstimate":
+        return WarpEstimate(resize(self.flow, size), resize(self.certainty, size))
 
 
 class WarpRefiner(nn.Module):
@@ -110,12 +110,12 @@ def by_rows(pointwise: nn.Conv2d, x: Tensor) -> Tensor:
     return as_map(as_grid(mixed).reshape(len(x), x.shape[2], x.shape[3], -1))
 
 
-def refined(estimate: Estimate, corrections: Tensor, stride: int, full: torch.Size) -> Estimate:
+def refined(estimate: WarpEstimate, corrections: Tensor, stride: int, full: torch.Size) -> WarpEstimate:
     """The estimate after a refiner's corrections; ``full`` (H, W): the query's size in the same pass."""
     height, width = full
     unit = corrections.new_tensor([stride / (4 * width), stride / (4 * height)])  # an eighth of a pixel
     flow = estimate.flow + corrections[:, 1:] * unit[:, None, None]
-    return Estimate(flow, estimate.certainty + corrections[:, :1])
+    return WarpEstimate(flow, estimate.certainty + corrections[:, :1])
 
 
 def local_correlation(query: Tensor, support: Tensor, flow: Tensor, radius: int) -> Tensor:

@@ -1,0 +1,53 @@
+"""Pictures as a matcher is shown them, stores of stand-in weights, and how matches are compared."""
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from standin import scene
+
+from mkpc_kaggle.geometry.coordinates import Box, Size, View
+from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.matchers.contract import Picture
+from mkpc_kaggle.weights import UNVERIFIED, WeightFile, WeightStore
+
+
+def picture(
+    height: int,
+    width: int,
+    name: str = "scene",
+    *,
+    channels: int = 3,
+    multiple: int = 1,
+    padding: tuple[int, int] = (0, 0),
+) -> Picture:
+    """The scene of that name, one to one, with at least that padding on the right and at the bottom."""
+    pixels = scene(height, width, channels, name)
+    return as_picture(pixels if channels == 3 else pixels[..., 0], multiple, padding)
+
+
+def as_picture(pixels: np.ndarray, multiple: int = 1, padding: tuple[int, int] = (0, 0)) -> Picture:
+    content = Size(pixels.shape[1], pixels.shape[0])
+    sides = [-(-(side + more) // multiple) * multiple for side, more in zip(content, padding, strict=True)]
+    view = View(Box.whole(content), content, Size(*sides))
+    return Picture(view.render(np.ascontiguousarray(pixels)), view)
+
+
+def match_one(matcher: Any, first: Picture, second: Picture) -> Matches:
+    (matches,) = matcher.match(matcher.encode([first]), matcher.encode([second]))
+    return matches
+
+
+def same(first: Matches, second: Matches) -> bool:
+    parts = ("points0", "points1", "scores")
+    return all(getattr(first, part).tobytes() == getattr(second, part).tobytes() for part in parts)
+
+
+def write_store(directory: Path, states: Mapping[str, Any], slots: Iterable[tuple[str, str]]) -> WeightStore:
+    """A store of checkpoints by file name; ``slots`` has (file, slot)."""
+    for name, state in states.items():
+        torch.save(state, directory / name)
+    files = [WeightFile(name, -1, UNVERIFIED, "none", slot, "made here") for name, slot in slots]
+    return WeightStore([directory], files)
