@@ -181,7 +181,6 @@ def test_a_pair_whose_earlier_results_cannot_be_read_is_left_as_it_is() -> None:
     assert plan.on_result(deepening, MatchResult((alone,)), 1.0, 1.0) == []
     assert plan.records[0] is former
     assert plan.next(1.0) is None
-    assert explained(plan, "pair 0 keeps the F it has")
 
 
 def test_a_worker_hangs_after_many_times_what_its_units_take() -> None:

@@ -326,11 +326,6 @@ class Plan:
         if result.results:
             self.costs.observe_overhead((seconds - result.unit_seconds) / len(result.outcomes))
         kept = [outcome for outcome in result.outcomes if self._merge(outcome, now)]
-        ran = {outcome.record.index for outcome in result.outcomes if outcome.results}
-        for index in ran - {outcome.record.index for outcome in kept}:
-            if self.can_gain(index, job.units):
-                self._stuck.add(index)
-                self.explain(now, f"pair {index} keeps the F it has: what earlier jobs found cannot be read")
         rest = tuple(index for index in job.indices if self.can_gain(index, job.units))
         if rest:  # the job's own deadline cut it off
             self._queue.retry([Chunk(job.phase, rest, job.units)])
