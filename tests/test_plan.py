@@ -170,6 +170,19 @@ def test_what_a_jobs_own_deadline_cut_off_is_planned_again() -> None:
     assert (again.phase, again.indices) == (job.phase, job.indices[-1:])
 
 
+def test_a_pair_whose_earlier_results_cannot_be_read_is_left_as_it_is() -> None:
+    plan = plan_of(1)
+    deepening = next(job for job in jobs_of(plan) if job.phase is Phase.DEEPEN)
+    former = plan.records[0]
+    again = UnitRecord(THIRD.name, THIRD.stage, 9, 9, 0.0, 1.0, "")
+    alone = Outcome(
+        PairRecord(0, FALLBACK_FUNDAMENTAL, "", (again,)), (UnitResult(THIRD, Matches.empty(), 0.0, 1.0),)
+    )
+    assert plan.on_result(deepening, MatchResult((alone,)), 1.0, 1.0) == []
+    assert plan.records[0] is former
+    assert plan.next(1.0) is None
+
+
 def test_a_worker_hangs_after_many_times_what_its_units_take() -> None:
     job = learnt(plan_of(limit=32400.0), SWEEP).next(0.0)
     assert job is not None
