@@ -1,6 +1,5 @@
 """The engine with a matcher whose answers are known, in threads of this process."""
 
-import sqlite3
 import threading
 from collections import Counter
 from collections.abc import Callable
@@ -11,7 +10,6 @@ import pytest
 from rectified import SECOND, SWEEP, THIRD, THREE_UNITS, RectifiedMatcher, run, write_pairs
 
 from mkpc_kaggle.engine.engine import Ending
-from mkpc_kaggle.engine.journal import Journal
 from mkpc_kaggle.engine.plan import JOB_PAIRS
 from mkpc_kaggle.engine.records import PairRecord
 from mkpc_kaggle.engine.session import Interrupt
@@ -139,18 +137,6 @@ def test_a_lost_job_is_a_fault_in_the_report_and_the_others_go_on(
     assert report.records[0].failure == "given up: out of memory: MemoryError: gone"
     assert all(record.inliers > 400 for record in report.records[1:])
     assert report.ending is Ending.COMPLETE
-
-
-def test_a_journal_that_cannot_be_written_does_not_stop_the_run(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def full(*_: object) -> None:
-        raise sqlite3.OperationalError("database or disk is full")
-
-    monkeypatch.setattr(Journal, "_write", full)
-    report = run(write_pairs(tmp_path, 10), THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
-    assert all(record.inliers > 400 for record in report.records)
-    assert "disk is full" in report.faults[0]
 
 
 def test_a_submission_that_cannot_be_written_is_a_fault_not_the_end(tmp_path: Path) -> None:

@@ -12,8 +12,7 @@ from rectified import SECOND, SWEEP, THREE_UNITS
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.jobs import Outcome
-from mkpc_kaggle.engine.journal import Journal
-from mkpc_kaggle.engine.journal_tables import DRAWN
+from mkpc_kaggle.engine.journal import DRAWN, Journal
 from mkpc_kaggle.engine.records import CameraRecord, PairRecord, SceneRecord
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Box, Size

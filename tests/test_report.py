@@ -13,8 +13,7 @@ from rectified import THREE_UNITS, RectifiedMatcher, run, write_pairs
 
 from mkpc_kaggle.cli import main
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine.journal import Journal
-from mkpc_kaggle.engine.journal_tables import DRAWN, About, EventKind, JournalReader
+from mkpc_kaggle.engine.journal import DRAWN, About, EventKind, Journal, JournalReader
 from mkpc_kaggle.reporting.report import DRAWING_S, report_page, report_run
 from mkpc_kaggle.reporting.run_log import NOT_ENDED, read_log
 from mkpc_kaggle.reporting.summary import overview

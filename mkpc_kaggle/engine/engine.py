@@ -21,8 +21,7 @@ from mkpc_kaggle.engine.jobs import (
     SceneResult,
     visiting_order,
 )
-from mkpc_kaggle.engine.journal import Journal
-from mkpc_kaggle.engine.journal_tables import EventKind
+from mkpc_kaggle.engine.journal import EventKind, Journal
 from mkpc_kaggle.engine.places import Place, Site
 from mkpc_kaggle.engine.plan import Explanation, Plan
 from mkpc_kaggle.engine.records import PairRecord, SceneRecord

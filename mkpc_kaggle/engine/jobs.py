@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Protocol
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.records import PairRecord
@@ -132,26 +131,6 @@ class Failure:
 
 
 Answer = Loaded | MatchResult | SceneResult | Failure
-
-
-class Worker(Protocol):
-    """What does jobs, one at a time, somewhere. No call blocks, whatever became of it.
-
-    After ``start`` it answers once, :class:`Loaded` or :class:`Failure`; after each ``submit`` once more. It is
-    not used again after a failure of its place, nor after ``kill``.
-    """
-
-    def start(self) -> None: ...
-
-    def submit(self, job: Job, seconds: float) -> None:
-        """Hand over a job; units may begin within ``seconds``."""
-        ...
-
-    def answer(self) -> Answer | None:
-        """Its answer, once; ``None`` as long as there is none."""
-        ...
-
-    def kill(self) -> None: ...
 
 
 def visiting_order(pairs: Sequence[Pair]) -> list[int]:

@@ -22,10 +22,9 @@ from mkpc_kaggle import __version__
 from mkpc_kaggle.data.competition import Pair, write_submission
 from mkpc_kaggle.engine import console
 from mkpc_kaggle.engine.budget import Budget
-from mkpc_kaggle.engine.cluster import RayCluster, ray_site
+from mkpc_kaggle.engine.cluster import RayCluster, RaySite
 from mkpc_kaggle.engine.engine import Engine, RunReport
-from mkpc_kaggle.engine.journal import Journal
-from mkpc_kaggle.engine.journal_tables import About, EventKind
+from mkpc_kaggle.engine.journal import About, EventKind, Journal
 from mkpc_kaggle.engine.places import LISTEN_S, LocalSite, Site
 from mkpc_kaggle.engine.records import PairRecord
 from mkpc_kaggle.errors import writing
@@ -123,8 +122,8 @@ def run_pairs(
 def site_of(pairs: Sequence[Pair], assembly: Assembly, session: Session) -> Site:
     """Where the workers are that the session asks for."""
     if isinstance(session.workers, RayCluster):
-        folders = tuple(dict.fromkeys(path.parent for pair in pairs for path in pair.images))
-        return ray_site(assembly, session.workers, session.budget.clock, folders)
+        folders = dict.fromkeys(path.parent for pair in pairs for path in pair.images)
+        return RaySite(assembly, session.workers, session.budget.clock, folders)
     return LocalSite(assembly, session.workers, session.budget.clock)
 
 

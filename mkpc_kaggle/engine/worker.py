@@ -37,32 +37,31 @@ CAUSES = {
 
 
 class Runner(Protocol):
-    """Does jobs of one kind. Both calls may raise anything, never return, or end the process."""
-
-    def load(self) -> None: ...
+    """Does jobs of one kind. It may raise anything, never return, or end the process."""
 
     def run(self, job: Job, seconds: float) -> Answer: ...
 
 
-def load(make: Callable[[], Runner]) -> tuple[Runner | None, Answer]:
-    """The runner that ``make`` makes, ready for jobs, or why there is none. Never raises."""
-    try:
-        runner = make()
-        runner.load()
-    except UserError as error:
-        is_device = isinstance(error, failures.DeviceError)
-        return None, Failure(Cause.DEVICE if is_device else Cause.REFUSED, str(error))
-    except Exception as error:
-        return None, failure_of(error)
-    return runner, Loaded()
+class Executor:
+    """A worker's own side, in whatever process it is: it makes its runner, then does jobs. Neither raises."""
 
+    runner: Runner
 
-def run(runner: Runner, job: Job, seconds: float) -> Answer:
-    """What the runner makes of a job. Never raises."""
-    try:
-        return runner.run(job, seconds)
-    except Exception as error:
-        return failure_of(error)
+    def load(self, make: Callable[[], Runner]) -> Answer:
+        try:
+            self.runner = make()
+        except UserError as error:
+            is_device = isinstance(error, failures.DeviceError)
+            return Failure(Cause.DEVICE if is_device else Cause.REFUSED, str(error))
+        except Exception as error:
+            return failure_of(error)
+        return Loaded()
+
+    def run(self, job: Job, seconds: float) -> Answer:
+        try:
+            return self.runner.run(job, seconds)
+        except Exception as error:
+            return failure_of(error)
 
 
 def failure_of(error: Exception) -> Failure:
@@ -70,17 +69,26 @@ def failure_of(error: Exception) -> Failure:
     return Failure(CAUSES[failures.failure_of(error)], failures.reason_of(error))
 
 
+def use_threads(count: int) -> None:
+    """Let this process compute in so many threads at a time."""
+    import cv2
+    import torch
+
+    torch.set_num_threads(count)
+    cv2.setNumThreads(count)
+
+
 class MatchRunner:
-    """Matches the pairs of jobs and estimates their F, in threads, while the next minibatch is matched."""
+    """Matches the pairs of jobs and estimates their F, in threads, while the next minibatch is matched.
+
+    Loads all matchers; raises :class:`mkpc_kaggle.errors.UserError` where one cannot be.
+    """
 
     def __init__(self, make_pipeline: Callable[[], Pipeline]) -> None:
         self._pipeline = make_pipeline()
+        self._pipeline.load()
         self._images = ImageStore()
         self._estimators = ThreadPoolExecutor(ESTIMATE_THREADS, thread_name_prefix="estimate")
-
-    def load(self) -> None:
-        """Load all matchers; raises :class:`mkpc_kaggle.errors.UserError` where one cannot be."""
-        self._pipeline.load()
 
     def run(self, job: Job, seconds: float) -> MatchResult:
         """Match the pairs of a job; no unit begins that is expected to end later than ``seconds`` from now."""
@@ -135,9 +143,6 @@ class MatchRunner:
 
 class SceneRunner:
     """Reconstructs batches. pycolmap may end the process: see :mod:`mkpc_kaggle.scene.colmap`."""
-
-    def load(self) -> None:
-        """Nothing is needed before the job."""
 
     def run(self, job: Job, seconds: float) -> SceneResult:
         """The cameras of a batch, and which F each of its pairs gets; ``seconds`` are not looked at."""

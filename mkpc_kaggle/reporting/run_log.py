@@ -6,7 +6,7 @@ from functools import cached_property
 from pathlib import Path
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine.journal_tables import DRAWN, About, Event, EventKind, JournalReader, undamaged
+from mkpc_kaggle.engine.journal import DRAWN, About, Event, EventKind, JournalReader, undamaged
 from mkpc_kaggle.engine.records import PairRecord, SceneRecord
 from mkpc_kaggle.errors import writing
 from mkpc_kaggle.geometry.matches import Matches
