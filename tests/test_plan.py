@@ -47,10 +47,12 @@ def jobs_of(
     plan: Plan,
     fails: Callable[[MatchJob], Failure | None] = lambda _: None,
     inliers: Callable[[int], int] = lambda _: 50,
+    *,
+    cautious: bool = True,
 ) -> Iterator[MatchJob]:
     """All jobs of one place, each of which comes back, or is lost, before the next is planned."""
     now, failure = 0.0, None
-    while (job := plan.next(now, "here", cautious=failure is not None)) is not None:
+    while (job := plan.next(now, "here", cautious=cautious and failure is not None)) is not None:
         yield job
         result, failure = finished(job, plan, inliers), fails(job)
         now += result.unit_seconds
@@ -89,7 +91,16 @@ def test_no_pair_is_in_two_jobs_at_a_time() -> None:
     assert {len(job.indices) for job in jobs} == {1}, "the cost of the unit is unknown"
 
 
-def test_a_lost_job_is_halved_then_split_by_units_and_given_up_for_its_pair() -> None:
+@pytest.mark.parametrize(
+    ("cautious", "pairs", "units"),
+    [
+        (False, [8, 4, 2, 1, 1, 1, 1], [(THIRD, SECOND), (THIRD,), (THIRD,), (SECOND,)]),
+        (True, [8, 1, 1, 1], [(THIRD,), (THIRD,), (SECOND,)]),
+    ],
+)
+def test_a_lost_job_is_tried_by_fewer_pairs_then_by_units_and_given_up_for_its_pair(
+    cautious: bool, pairs: list[int], units: list[tuple[Unit, ...]]
+) -> None:
     plan = plan_of(9)
     seen = []
 
@@ -97,10 +108,10 @@ def test_a_lost_job_is_halved_then_split_by_units_and_given_up_for_its_pair() ->
         seen.append((job.indices, job.units))
         return DIED if job.phase is Phase.DEEPEN and 1 in job.indices and THIRD in job.units else None
 
-    list(jobs_of(plan, fails))
+    list(jobs_of(plan, fails, cautious=cautious))
     deepened = [(indices, units) for indices, units in seen if SWEEP not in units and 1 in indices]
-    assert [len(indices) for indices, _ in deepened] == [8, 4, 2, 1, 1, 1, 1]
-    assert [units for _, units in deepened[3:]] == [(THIRD, SECOND), (THIRD,), (THIRD,), (SECOND,)]
+    assert [len(indices) for indices, _ in deepened] == pairs
+    assert [tried for _, tried in deepened[-len(units) :]] == units
     failures = {
         (index, unit.unit): unit.failure
         for index in range(9)
@@ -202,7 +213,7 @@ def test_where_no_unit_ends_in_time_there_is_no_job_until_scenes_need_less() -> 
     plan.reserve = 10.0
     now = plan.stop - 0.5
     assert plan.next(now) is None
-    assert plan.has_work
+    assert plan.has_work(now)
     plan.reserve = 0.0
     assert plan.next(now) is not None
 

@@ -1,4 +1,4 @@
-"""How the journal writes values: dataclasses as JSON, whose types are checked when they are read, points as bytes."""
+"""Values in the journal: dataclasses as JSON, checked against their types when read, and points as bytes."""
 
 import json
 import zlib

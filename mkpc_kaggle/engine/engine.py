@@ -184,9 +184,8 @@ class Engine:
                 place.start(now)
             elif place.is_idle and (job := self.plan.next(now, place.name, cautious=place.losses > 0)):
                 pairs = tuple(self.pairs[index] for index in job.indices)
-                known = tuple(() if job.is_trial else self._results(index) for index in job.indices)
-                job = replace(job, pairs=pairs, known=known)
-                place.submit(job, job.seconds, job.time_limit, now)
+                known = tuple(map(self._results, job.indices))
+                place.submit(replace(job, pairs=pairs, known=known), job.seconds, job.time_limit, now)
 
     def _is_matching(self, now: float) -> bool:
         """Whether a job is under way, or will be when a worker has started."""

@@ -32,7 +32,7 @@ class MatchJob:
 
     ``expected`` are the seconds within which each unit most likely ends on a pair. Units may begin in the first
     ``seconds`` of the job if they are expected to end in them. After ``time_limit`` seconds without an answer the
-    worker hangs. ``is_trial``: it is done again to see whether the place works.
+    worker hangs. ``is_retry``: a worker was lost at it before.
     """
 
     phase: Phase
@@ -41,7 +41,7 @@ class MatchJob:
     expected: tuple[float, ...]
     seconds: float
     time_limit: float
-    is_trial: bool = False
+    is_retry: bool = False
     pairs: tuple[Pair, ...] = ()
     known: tuple[tuple[UnitResult, ...], ...] = ()
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import partial
 from math import inf
 
-from mkpc_kaggle.engine.jobs import Answer, Cause, Failure, Job, Loaded
+from mkpc_kaggle.engine.jobs import Answer, Cause, Failure, Job, Loaded, MatchJob
 from mkpc_kaggle.engine.process import ProcessWorker, ThreadWorker
 from mkpc_kaggle.engine.worker import MatchRunner, SceneRunner
 from mkpc_kaggle.pipeline.assembly import Assembly
@@ -86,11 +86,15 @@ class Place:
             worker.kill()
 
     def _lose(self, failure: Failure, now: float) -> None:
-        """The worker ends: what ran out of memory has it in pieces, and a device that failed goes on failing."""
+        """The worker ends: what ran out of memory has it in pieces, and a device that failed goes on failing.
+
+        That it died, or hung, of what another worker was lost at says nothing of the place.
+        """
         job, was_loaded = self.job, self.is_loaded
         self.kill()
         self.job, self.limit = job, now
-        if failure.cause.is_of_place or not was_loaded:
+        is_retry = isinstance(job, MatchJob) and job.is_retry and failure.cause in (Cause.DIED, Cause.TIMED_OUT)
+        if not was_loaded or (failure.cause.is_of_place and not is_retry):
             self.losses += 1
             self.limit = now + RESTART_PAUSE_S * self.losses
             if self.losses >= MAX_LOSSES or failure.cause is Cause.REFUSED:
