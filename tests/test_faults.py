@@ -393,6 +393,28 @@ def test_a_program_leaves_without_what_an_interpreter_does_at_its_end(tmp_path: 
     assert "late" not in done.stdout
 
 
+INTERRUPTED = """
+import sys
+
+class Interrupting:
+    def find_spec(name, *_):
+        if name == "mkpc_kaggle.{module}":
+            raise KeyboardInterrupt
+
+sys.meta_path.insert(0, Interrupting)
+from mkpc_kaggle.cli import program
+program(["recipes"])
+"""
+
+
+@pytest.mark.parametrize("module", ["engine.console", "cli.submit"])
+def test_ctrl_c_while_the_program_imports_its_modules_prints_no_traceback(module: str) -> None:
+    code = INTERRUPTED.format(module=module)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 130
+    assert "Traceback" not in done.stderr
+
+
 WATCHED = """
 import sys, time
 sys.path[:0] = {path!r}

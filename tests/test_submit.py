@@ -175,6 +175,7 @@ def test_odd_pictures_get_an_f_or_the_fallback_row_and_a_line_in_the_summary(
         (["--time-limit", "soon"], "'soon' is not a duration"),
         (["--device", "abacus"], "unknown device 'abacus'"),
         (["--output", "/dev/null/submission.csv"], "cannot be written"),
+        (["--output", "/dev/null"], "--output /dev/null is a device; name a file"),
         (["--work-dir", "/dev/null/work"], "cannot be written"),
     ],
 )

@@ -27,7 +27,7 @@ from mkpc_kaggle.engine.engine import Engine, RunReport
 from mkpc_kaggle.engine.journal import About, EventKind, Journal
 from mkpc_kaggle.engine.places import LISTEN_S, LocalSite, Site
 from mkpc_kaggle.engine.records import PairRecord
-from mkpc_kaggle.errors import writing
+from mkpc_kaggle.errors import UserError, writing
 from mkpc_kaggle.pipeline.assembly import Assembly
 
 EXIT_S = 0.2  # that the system takes to end a process
@@ -76,7 +76,9 @@ def submit(pairs: Sequence[Pair], assembly: Assembly, session: Session, output: 
 
 
 def require_writable(output: Path) -> None:
-    """Make the file's directory if need be; :class:`UserError` where the file cannot be written."""
+    """Make the file's directory if need be; :class:`UserError` where the file cannot be written, or replaced."""
+    if output.is_char_device() or output.is_block_device():
+        raise UserError(f"--output {output} is a device; name a file")
     probe = output.with_name(f".{output.name}.probe")
     with writing(f"--output {output}"):
         output.parent.mkdir(parents=True, exist_ok=True)
