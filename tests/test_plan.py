@@ -151,12 +151,6 @@ def test_a_lost_job_is_tried_again_in_another_place_where_there_is_one() -> None
     assert again.indices == job.indices
 
 
-def test_the_only_place_that_is_left_tries_again_what_was_lost_there() -> None:
-    plan = learnt(plan_of(1), SWEEP)
-    plan.on_failure(plan.next(0.0, "here"), DIED, "here", 1.0)  # type: ignore[arg-type]
-    assert plan.next(1.0, "here") is not None
-
-
 def test_a_place_that_lost_a_worker_tries_one_pair_and_one_unit_that_was_not_lost() -> None:
     plan = plan_of(40)
     deepening = next(job for job in jobs_of(plan) if job.phase is Phase.DEEPEN and len(job.indices) == 8)
