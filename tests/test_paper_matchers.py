@@ -98,11 +98,6 @@ def write_recipe(directory: Path, matcher: str) -> Path:
     return path
 
 
-def make_submission(*arguments: object) -> None:
-    """Make it in this process, so that it meets the manifest that was put in its way."""
-    assert main(["submit", *map(str, arguments)]) == 0
-
-
 def matches_found(work_dir: Path) -> dict[tuple[int, int], int]:
     """The matches of each pair's unit by (pair, stage); none of the units may have failed."""
     with JournalReader(work_dir) as journal:
@@ -143,10 +138,10 @@ def run(
         use_manifest(monkeypatch, checkpoints.of(matcher))
         use_narrow(monkeypatch)
         output, recipe = tmp_path / f"{name}.csv", write_recipe(tmp_path, matcher)
-        make_submission(
-            *("--test-dir", test_dir, "--output", output, "--recipe", recipe, "--weights", checkpoints.directory),
-            *("--time-limit", "10m", "--device", "cpu", "--no-report", "--workers", workers),
-        )
+        arguments = ("--test-dir", test_dir, "--output", output, "--recipe", recipe)
+        options = ("--weights", checkpoints.directory, "--time-limit", "10m", "--device", "cpu", "--no-report")
+        # In this process, so that it meets the manifest that was put in its way.
+        assert main(["submit", *map(str, (*arguments, *options, "--workers", workers))]) == 0
         assert_good(output, test_dir)
         return Made(output, matches_found(tmp_path / f"{name}.work"))
 
