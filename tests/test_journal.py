@@ -13,7 +13,7 @@ from rectified import SECOND, SWEEP, THREE_UNITS
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.codec import encode
 from mkpc_kaggle.engine.jobs import Outcome
-from mkpc_kaggle.engine.journal import DRAWN, Journal
+from mkpc_kaggle.engine.journal import MAX_DRAWN_PAIRS, Journal
 from mkpc_kaggle.engine.records import CameraRecord, PairRecord, SceneRecord
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Box, Size
@@ -67,12 +67,12 @@ def points_of(journal: Journal, pair: int) -> int:
 
 def test_the_points_of_settled_pairs_are_kept_of_the_weakest_only(tmp_path: Path) -> None:
     journal = Journal(tmp_path, OURS)
-    count = 3 * DRAWN
+    count = 3 * MAX_DRAWN_PAIRS
     saved = [outcome(index, seed=index) for index in range(count)]
     for start in range(0, count, 7):
         journal.save([(one, True) for one in saved[start : start + 7]])
     by_strength = sorted(saved, key=lambda one: (one.record.inliers, one.record.index))
-    weakest = {one.record.index for one in by_strength[:DRAWN]}
+    weakest = {one.record.index for one in by_strength[:MAX_DRAWN_PAIRS]}
     assert {index for index in range(count) if points_of(journal, index)} == weakest
     assert {record.units[0].matches for record in journal.records().values()} == {30}
     journal.save([(outcome(count, seed=1), False)])
@@ -269,6 +269,6 @@ def test_text_that_is_not_utf8_is_kept_in_letters(tmp_path: Path) -> None:
 def test_pairs_that_no_row_names_take_no_place_among_those_that_are_drawn(tmp_path: Path) -> None:
     asked = [Pair(f"one;{index}", "one", "a.png", "b.png") for index in range(2)]
     journal = Journal(tmp_path, OURS, pairs=asked)
-    journal.save([(outcome(index, seed=index), True) for index in reversed(range(DRAWN + 2))])
-    assert [index for index in range(DRAWN + 2) if points_of(journal, index)] == [0, 1]
+    journal.save([(outcome(index, seed=index), True) for index in reversed(range(MAX_DRAWN_PAIRS + 2))])
+    assert [index for index in range(MAX_DRAWN_PAIRS + 2) if points_of(journal, index)] == [0, 1]
     journal.close()

@@ -13,7 +13,7 @@ from simulator import MemoryJournal, Scenario, random_scenario, simulate, withou
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.engine import Ending
 from mkpc_kaggle.engine.jobs import Cause, Failure, MatchJob, MatchResult, Outcome, Phase
-from mkpc_kaggle.engine.plan import HANGS, JOB_PAIRS, Plan
+from mkpc_kaggle.engine.plan import HANG_FACTOR, JOB_PAIRS, Plan
 from mkpc_kaggle.engine.records import PairRecord, UnitRecord
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
@@ -192,7 +192,7 @@ def test_a_worker_hangs_after_many_times_what_its_units_take() -> None:
     job = learnt(plan_of(limit=32400.0), SWEEP).next(0.0)
     assert job is not None
     assert job.seconds > 1.0
-    assert job.time_limit == job.seconds + HANGS
+    assert job.time_limit == job.seconds + HANG_FACTOR
 
 
 @pytest.mark.parametrize("limit", [20.0, 600.0, 32400.0])

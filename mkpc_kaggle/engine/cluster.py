@@ -25,7 +25,7 @@ from mkpc_kaggle.engine.worker import Executor, MatchRunner, Runner, SceneRunner
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.pipeline.assembly import Assembly
 
-FORMS = "a number of processes, ray (this machine's cluster, or one for this run), ray://HOST:PORT"
+FORMS = "a number of processes, ray (this machine's cluster, or a new one for this run), ray://HOST:PORT"
 REACH_TIMEOUT_S = 5.0
 
 
@@ -33,8 +33,8 @@ REACH_TIMEOUT_S = 5.0
 class RayCluster:
     """The Ray cluster to work on.
 
-    ``address``, HOST:PORT, is the one that ``ray start --head`` prints; this machine must be one of the cluster's.
-    Empty: the cluster that runs on this machine, or else one that is started for the run and ends with it.
+    ``address``, HOST:PORT, is what ``ray start --head`` prints; this machine must belong to the cluster.
+    Empty: the cluster that runs on this machine, or else a new cluster, which ends with the run.
     """
 
     address: str = ""
@@ -101,7 +101,7 @@ class RaySite(Site):
             self.places = [Place(name, partial(self._worker, name, make, num_gpus=1)) for name in names]
         else:
             make = partial(MatchRunner, self._assembly.pipeline)
-            for number, node in enumerate(machines):  # of which several may have one name
+            for number, node in enumerate(machines):  # several may have the same name
                 name, cores = f"machine {number} ({node['NodeManagerHostname']})", int(node["Resources"]["CPU"])
                 self.places.append(Place(name, partial(self._worker, name, make, cores, num_cpus=cores)))
         if not self.places:

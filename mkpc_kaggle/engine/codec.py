@@ -57,7 +57,7 @@ def scalar(kind: type, value: Any) -> Any:
 
 
 def matrix_of(rows: Any) -> Matrix3:
-    """F from its rows; ``ValueError`` for one that no submission may have."""
+    """F from its rows; ``ValueError`` where a submission may not have it."""
     matrix = np.array(rows, np.float64)
     if matrix.shape != (3, 3) or not np.isfinite(matrix).all() or not matrix.any():
         raise ValueError("a matrix is zero, not finite, or not of 3 x 3 numbers")

@@ -63,7 +63,7 @@ class RunReport:
 
 
 class Engine:
-    """One run over ``pairs``.
+    """A run over ``pairs``.
 
     ``publish`` is called with all records, in the order of ``pairs``, when the run starts, every half minute (less
     often where it takes long), and when it ends, in whatever way. Setting ``interrupt`` ends the run early.

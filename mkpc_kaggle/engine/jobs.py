@@ -17,7 +17,7 @@ from mkpc_kaggle.scene.view_graph import BatchPair
 
 
 class Phase(StrEnum):
-    """The passes of a run, in order."""
+    """The phases of a run, in order."""
 
     SWEEP = "sweep"  # the first unit on all pairs
     CONNECT = "connect"  # the first unit on pairs that no row names, where a batch has few
@@ -72,7 +72,7 @@ class Loaded:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a job made of one pair: its record, and the new results that later jobs may build on."""
+    """What a job made of a pair: its record, and the new results that later jobs may build on."""
 
     record: PairRecord
     results: tuple[UnitResult, ...] = ()
@@ -80,7 +80,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class MatchResult:
-    """The outcomes of a match job, one a pair, in order."""
+    """The outcomes of a match job, in the order of its pairs."""
 
     outcomes: tuple[Outcome, ...]
 

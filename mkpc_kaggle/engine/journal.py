@@ -30,7 +30,9 @@ from mkpc_kaggle.recipe import Unit
 FORMAT = 6
 FILE_NAME = "journal.sqlite"
 LOCK_NAME = "journal.lock"
-DRAWN = 20  # how many of the weakest pairs keep their points when no later job needs them: the report draws them
+MAX_DRAWN_PAIRS = (
+    20  # how many of the weakest pairs keep their points when no later job needs them: the report draws them
+)
 
 SCHEMA = """
 CREATE TABLE run (key TEXT PRIMARY KEY, value TEXT NOT NULL);
@@ -258,8 +260,8 @@ class Journal(JournalTables):
     def save(self, outcomes: Sequence[tuple[Outcome, bool]]) -> None:
         """Put down a job's outcomes, all or none; the points of those marked True no later job needs.
 
-        Of these, the weakest keep them for the report: at most :data:`DRAWN` of one run. An outcome's results
-        may be the new ones alone: what was put down of others stays.
+        Of these, the weakest keep them for the report: at most :data:`MAX_DRAWN_PAIRS` of a run. An outcome may
+        have the new results alone: what was put down of others stays.
         """
         statements: list[Statement] = []
         for outcome, is_settled in outcomes:
@@ -289,7 +291,7 @@ class Journal(JournalTables):
 
     def close(self) -> None:
         with suppress(sqlite3.Error):  # a reader may be at it: then it stays as it is
-            self._db.execute("PRAGMA journal_mode = DELETE")  # one file again, which can be copied
+            self._db.execute("PRAGMA journal_mode = DELETE")  # a single file again, which can be copied
         super().close()
         self._lock.close()
 
@@ -298,11 +300,11 @@ class Journal(JournalTables):
         return super()._points(index) | {unit: blob for pair, unit, blob in unsaved if pair == index}
 
     def _settle(self, record: PairRecord) -> int | None:
-        """Enter a pair among the weakest so far; which one is not among them any more, perhaps itself."""
+        """Enter a pair among the weakest so far; the pair that is not among them any more, perhaps itself."""
         if self._asked and record.index >= self._asked:
             return record.index  # no row names it, so the report does not draw it
         self._drawn[record.index] = record.inliers
-        if len(self._drawn) <= DRAWN:
+        if len(self._drawn) <= MAX_DRAWN_PAIRS:
             return None
         strongest = max(self._drawn, key=lambda index: (self._drawn[index], index))
         del self._drawn[strongest]

@@ -1,4 +1,4 @@
-"""Where workers are: a place has one worker at a time, and is closed when it loses one after the other."""
+"""Where workers are: a place has one worker at a time, and is closed when it loses three in a row."""
 
 import queue
 from collections.abc import Callable

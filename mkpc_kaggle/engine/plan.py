@@ -26,8 +26,8 @@ DENSIFY_SHARE = 0.5  # of the time left when all units have run, for further suc
 RESERVE_SHARE = 0.2  # of the limit that is left to reconstruction at most
 MAX_TRIES = 2  # of a unit on a single pair, before it is given up there
 MAX_FAILED_PAIRS = 2  # a unit that was given up on so many pairs and never ran is given up on all
-SLOW = 3.0  # a job that takes this many times what was expected begins no further unit
-HANGS = 10.0  # a unit that takes this many times what it takes on nine of ten pairs hangs
+SLOW_FACTOR = 3.0  # a job that takes this many times what was expected begins no further unit
+HANG_FACTOR = 10.0  # a unit that takes this many times what it takes on nine of ten pairs hangs
 # What the pairs of the last phases are.
 IN_THE_TIME_LEFT = {
     Phase.FILL: "pairs that lack units, the weakest first",
@@ -57,7 +57,7 @@ class Chunk:
 
 
 def chunks_of(phase: Phase, indices: Sequence[int], size: int) -> Iterator[Chunk]:
-    """One pair alone, so that costs are known early, then ``size`` at a time.
+    """The first pair alone, so that costs are known early, then ``size`` at a time.
 
     The same for every run of the same pairs, whatever was done before: a minibatch's composition can move the last
     bits of a network's output.
@@ -67,7 +67,7 @@ def chunks_of(phase: Phase, indices: Sequence[int], size: int) -> Iterator[Chunk
 
 
 class ChunkQueue:
-    """Chunks in the order of their turn: first those that have had one.
+    """Chunks in the order of their turn: first what was tried before.
 
     A pair's turn comes when no job is under way on it, and nothing earlier waits for it: what has to be tried
     again may be for another place, and the order of units decides regions.
@@ -83,9 +83,9 @@ class ChunkQueue:
         self.again = sorted([*chunks, *self.again], key=lambda chunk: not chunk.lost_at)
 
     def pop(self, place: str, *, alone: bool, cautious: bool) -> Chunk | None:
-        """The next chunk for a place; not one that was lost there, unless the place is ``alone``.
+        """The next chunk for a place, lost elsewhere if at all, unless the place is ``alone``.
 
-        ``cautious``: one that was not lost, if there is one.
+        ``cautious``: a chunk that was not lost, if there is any.
         """
         free, earlier = [], set(self.under_way)
         for chunk in (*self.again, *islice(self.fresh, 1)):
@@ -109,7 +109,7 @@ class ChunkQueue:
 class Plan:
     """The phases of a run over the pairs of ``order`` and, for the scenes alone, of ``extra``, which no row names.
 
-    ``records``, one a pair by index, asked pairs first, change through it. The first ``connecting`` of the extra
+    ``records``, of all pairs by index, asked pairs first, change through it. The first ``connecting`` of the extra
     pairs are for the connect phase. ``workers`` work at a time; ``reserve`` seconds of the end are left to scenes.
     ``done`` are the pairs that have what fits for all; ``unusable`` names the units that no worker can run.
     """
@@ -185,7 +185,7 @@ class Plan:
         return now < self.stop and bool(self._queue.again)
 
     def can_gain(self, index: int, units: Iterable[Unit]) -> bool:
-        """Whether a pair may have one of the units that it has not had."""
+        """Whether a pair may get any of the units that it has not had."""
         return index not in self._stuck and bool(self.records[index].lacking(units))
 
     def _job(
@@ -217,9 +217,9 @@ class Plan:
             self._queue.put_back(replace(chunk, indices=indices, units=tuple(further)))
         self._queue.under_way.update(indices)
         p90 = tuple(costs.p90(unit.name) for unit in chosen)
-        allowance = SLOW * len(indices) * (costs.overhead + sum(p90)) + self.budget.silence
+        allowance = SLOW_FACTOR * len(indices) * (costs.overhead + sum(p90)) + self.budget.silence
         minibatch = min(len(indices), self._minibatch)
-        longest = max(costs.longest(unit.name, HANGS * minibatch) for unit in chosen)
+        longest = max(costs.longest(unit.name, HANG_FACTOR * minibatch) for unit in chosen)
         if not all(costs.is_known(unit.name) for unit in chosen):
             longest += min(MAX_EXPLORE_S, EXPLORE_SHARE * left)
         limits = min(left, allowance), allowance + longest
@@ -390,7 +390,7 @@ class Plan:
         return [] if is_over else record.lacking(self._first)
 
     def may_gain(self, record: PairRecord) -> bool:
-        """Whether a pair can get units that it wants; one with a row only after it got its first."""
+        """Whether a pair can get units that it wants; a pair with a row only after it got its first."""
         is_ready = record.units or record.index >= len(self._order)
         return bool(is_ready and record.index not in self._stuck and self.wanted(record))
 

@@ -21,7 +21,7 @@ MAX_DRAWN_POINTS = 300  # of a scene, which are kept to be drawn
 
 @dataclass(frozen=True)
 class UnitRecord:
-    """What one unit found on one pair: counts of matches and of inliers among them, and seconds."""
+    """What a unit found on a pair: counts of matches and of inliers among them, and seconds."""
 
     unit: str
     stage: int
@@ -40,7 +40,7 @@ class UnitRecord:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PairRecord:
-    """What is known of one pair: its F (its E, where the pair has intrinsics) and how it came about.
+    """What is known of a pair: its F (its E, where the pair has intrinsics) and how it came about.
 
     ``pair_fundamental`` is from the pair's own matches, and the fallback where ``failure`` says why there is none;
     ``magsac_fundamental`` is MAGSAC's alone, where the former comes from more than that. The seconds are those of

@@ -44,8 +44,8 @@ class Interrupt(threading.Event):
 class Session:
     """What a run needs besides its pairs and its recipe.
 
-    ``workers`` is the number of worker processes, or the cluster to work on; 0: none, the work is done in this
-    one; ``None``: one a device. ``watchdog`` is told how to write the submission in the end.
+    ``workers`` is the number of worker processes, or the cluster to work on; 0: the work is done in this process;
+    ``None``: a process for each device. ``watchdog`` is told how to write the submission in the end.
     """
 
     work_dir: Path
@@ -62,7 +62,7 @@ class Session:
 
 
 def submit(pairs: Sequence[Pair], assembly: Assembly, session: Session, output: Path) -> RunReport:
-    """Match all pairs and keep ``output`` whole from the start: one row a pair, the fallback where no F is known.
+    """Match all pairs and keep ``output`` whole from the start: each pair has a row, of the fallback if need be.
 
     Raises :class:`mkpc_kaggle.errors.UserError` where ``output`` cannot be written, before any work.
     """
@@ -142,7 +142,7 @@ def versions() -> dict[str, str]:
 
 
 def digest_of_pairs(pairs: Sequence[Pair]) -> str:
-    """Tells one test set from another: the keys of its pairs with the ids of their images, in order."""
+    """Tells test sets apart: the keys of its pairs with the ids of their images, in order."""
     ids = ((pair.key, pair.group, *(name.rpartition(".")[0] for name in pair.names)) for pair in pairs)
     rows = map("\t".join, ids)
     return hashlib.sha256("\n".join(rows).encode()).hexdigest()
@@ -191,7 +191,7 @@ class Watchdog:
 
 @contextmanager
 def interruptible() -> Iterator[Interrupt]:
-    """SIGTERM and Ctrl-C set the interrupt; a second one acts as if nobody listened."""
+    """SIGTERM and Ctrl-C set the interrupt; a second signal acts as if nobody listened."""
     interrupt = Interrupt()
     former = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
 

@@ -81,7 +81,7 @@ def use_threads(count: int) -> None:
 class MatchRunner:
     """Matches the pairs of jobs and estimates their F, in threads, while the next minibatch is matched.
 
-    Loads all matchers; raises :class:`mkpc_kaggle.errors.UserError` where one cannot be.
+    Loads all matchers; raises :class:`mkpc_kaggle.errors.UserError` where this fails.
     """
 
     def __init__(self, make_pipeline: Callable[[], Pipeline]) -> None:
