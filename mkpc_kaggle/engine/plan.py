@@ -179,7 +179,8 @@ class Plan:
                 self._open(self._coming.pop(0), now)
                 continue
             chunk = self._queue.fresh[0]
-            if any(self.can_gain(index, self._units(chunk, now)) for index in chunk.indices):
+            units = self._units(chunk, now)
+            if any(self.can_gain(index, units) for index in chunk.indices):
                 return True
             self._mark_done(chunk.phase, self._queue.fresh.popleft().indices)
         return now < self.stop and bool(self._queue.again)
