@@ -5,8 +5,10 @@ from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, settings
+from kaggle_image import pack_wheel
 
 from mkpc_kaggle.demo import DemoSet, write_demo
+from mkpc_kaggle.package.wheels import BUNDLED
 from mkpc_kaggle.weights import store as weight_store
 
 # Before torch is imported, here and in the processes of the tests: their tensors are small, and on a busy machine
@@ -34,6 +36,15 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 def demo(tmp_path_factory: pytest.TempPathFactory) -> DemoSet:
     """One scene of the demo at 40 % of its size: 7 images, 8 test pairs."""
     return write_demo(tmp_path_factory.mktemp("demo"), scenes=["courtyard"], image_scale=0.4)
+
+
+@pytest.fixture(scope="session")
+def wheels(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The wheels that a package for Kaggle bundles."""
+    directory = tmp_path_factory.mktemp("wheels")
+    for name in BUNDLED:
+        pack_wheel(name, directory)
+    return directory
 
 
 @pytest.fixture

@@ -85,13 +85,6 @@ def filled_network():
     return network
 
 
-@torch.inference_mode()
-def test_a_flat_picture_has_no_keypoints():
-    found = placed(filled_network(), Placement())(torch.zeros(2, 3, 32, 64))
-    assert all(descriptors.shape == (len(points), 128) for points, descriptors in found)
-    assert strict_maxima(torch.full((8, 9), 0.5), 10).tolist() == []
-
-
 def test_maxima_are_strict_inner_and_the_best_come_first():
     scores = torch.zeros(12, 15)
     scores[3, 4], scores[8, 9], scores[1, 12] = 0.5, 0.9, 0.95  # the last lies in the border

@@ -139,12 +139,6 @@ def test_recipe_auto_passes_damaged_weights_over(tmp_path, name):
     assert not {"dkm", "xfeat_lighterglue"} & set(assembly.recipe.matcher_names)
 
 
-@pytest.mark.parametrize("device", ["", "CPU", "mps"])
-def test_an_unknown_device_is_refused_with_the_known_ones(device):
-    with pytest.raises(UserError, match=r"unknown device.*auto, cpu, cuda, cuda:N"):
-        assemble("classical", device=device)
-
-
 @pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a GPU")
 def test_a_gpu_that_is_not_there_is_refused_and_auto_takes_the_cpu():
     with pytest.raises(UserError, match=r"cuda:0.*no GPU.*--device cpu"):

@@ -16,7 +16,6 @@ from mkpc_kaggle.data.competition import (
     submission_problems,
     write_submission,
 )
-from mkpc_kaggle.data.images import Unreadable, read_image
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.cameras import fundamental_of_cameras
 
@@ -85,11 +84,6 @@ def test_an_image_is_found_whatever_its_suffix(side, file):
     (pair,) = read_test_side(home)
     assert pair.images[0].name == file
     assert pair.images[0].is_file()
-
-
-def test_a_missing_image_or_batch_is_a_path_that_does_not_exist(side):
-    pairs = read_test_side(side("s,b,1,2", "t,nowhere,1,2", images=["b/1.png"]))
-    assert [[image.is_file() for image in pair.images] for pair in pairs] == [[True, False], [False, False]]
 
 
 @pytest.mark.parametrize(
@@ -275,12 +269,6 @@ def test_each_problem_of_a_submission_is_the_only_one_found(tmp_path, content, s
     assert len(submission_problems(tmp_path / "x.csv", ["a", "b"])) == 3, "all are told at once"
     (problem,) = submission_problems(tmp_path / "y.csv", ["a"])
     assert "no such file" in problem
-
-
-def test_a_batch_or_image_with_a_name_that_no_file_can_have_is_missing(side):
-    pairs = read_test_side(side(f"s,{'b' * 5000},1,2", f"t,b,{'i' * 5000},2", images=["b/2.png"]))
-    answers = [read_image(path) for pair in pairs for path in pair.images]
-    assert [isinstance(answer, Unreadable) for answer in answers[:3]] == [True] * 3
 
 
 def test_a_large_table_is_read_and_written_in_little_memory(side):

@@ -98,12 +98,6 @@ def test_what_is_no_picture_has_its_reason(tmp_path):
         assert reason(tmp_path / name) == "cannot be read: not a regular file"
 
 
-@pytest.mark.skipif(os.name != "posix" or os.geteuid() == 0, reason="root may read everything")
-def test_a_file_without_permission_is_unreadable(tmp_path):
-    write(tmp_path / "a.png", noise(5, 5, 3)).chmod(0)
-    assert "ermission denied" in reason(tmp_path / "a.png")
-
-
 @pytest.mark.parametrize("share", [0.001, 0.5, 0.99])
 def test_a_png_that_is_cut_off_is_unreadable(tmp_path, share):
     path = write(tmp_path / "a.png", noise(64, 64, 3))

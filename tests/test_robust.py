@@ -195,9 +195,9 @@ def test_repetitions_are_inliers_like_the_first_and_what_is_not_finite_is_set_as
 @pytest.mark.parametrize("model", ModelKind)
 def test_the_same_input_gives_the_same_bytes_whatever_else_goes_on(model, method):
     plane, config = model is ModelKind.H, RobustConfig(method=method, max_iterations=2000)
-    inputs = [scene(seed, plane)[0] for seed in SEEDS] * 4
+    inputs = [scene(seed, plane)[0] for seed in SEEDS] * 2
     alone = [as_bytes(estimated(model, matches, config)) for matches in inputs]
-    assert alone[:3] == alone[3:6] == alone[6:9]
+    assert alone[:3] == alone[3:]
     assert len(set(alone)) == 3
     for rng_seed in (0, 12345):
         cv2.setRNGSeed(rng_seed)
@@ -205,17 +205,6 @@ def test_the_same_input_gives_the_same_bytes_whatever_else_goes_on(model, method
     with ThreadPoolExecutor(4) as threads:
         together = list(threads.map(lambda matches: as_bytes(estimated(model, matches, config)), inputs))
     assert together == alone
-
-
-@pytest.mark.parametrize("seed", SEEDS)
-def test_opencv_is_handed_the_distinct_matches_in_their_order(seed):
-    matches, _ = scene(seed)
-    plain, mask = cv2.findFundamentalMat(
-        matches.points0, matches.points1, cv2.USAC_MAGSAC, DEFAULT.threshold, DEFAULT.confidence, 50_000
-    )
-    result = estimate(Matches.concatenate([matches, matches[::-1]]), RobustConfig(permutations=1))
-    assert_array_equal(result.matrix, plain / np.linalg.norm(plain))
-    assert_array_equal(result.inliers[:300], mask.ravel() > 0)
 
 
 def test_an_essential_matrix_without_intrinsics_is_an_error_even_without_points():

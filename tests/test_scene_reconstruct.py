@@ -107,23 +107,6 @@ def test_a_pair_that_the_scene_lacks_is_estimated_at_its_focal_lengths(scene: Sy
     assert reconstruct_batch(pairs, SceneConfig()).choices[0].F is None
 
 
-def test_a_swapped_pair_gets_the_transposed_fundamental(scene: SyntheticScene) -> None:
-    pair = scene.pairs[0]
-    back = BatchPair(pair.image1, pair.image0, Matches.empty())
-    solution = reconstruct_batch((*scene.pairs, back), SceneConfig())
-    there, back_again = solution.choices[0].F, solution.choices[-1].F
-    assert abs(np.sum(there * back_again.T)) == pytest.approx(1)
-
-
-def test_a_picture_under_two_names_is_one_camera(scene: SyntheticScene) -> None:
-    pair, again = scene.pairs[0], replace(scene.images[0], name="again")
-    pairs = (*scene.pairs, replace(pair, image0=again), BatchPair(again, pair.image0, pair.matches))
-    solution = reconstruct_batch(pairs, SceneConfig())
-    assert len(solution.reconstructions[0].names) == 6
-    np.testing.assert_array_equal(solution.choices[-2].F, solution.choices[0].F)
-    assert solution.choices[-1].reason is Reason.SAME_IMAGE
-
-
 def test_two_places_in_a_batch_are_two_scenes(scene: SyntheticScene) -> None:
     other = synthetic_scene(4, points=500, seed=7, prefix="b")
     across = BatchPair(scene.images[0], other.images[0], Matches.empty())

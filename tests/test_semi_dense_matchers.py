@@ -74,17 +74,6 @@ def test_loftrs_border_is_the_published_one_or_the_recipes(training: Training, b
             from_table(loftr.SPEC.options, {"border": wrong}, "recipe")
 
 
-def test_loftr_finds_matches_along_the_border_where_it_is_told_to(tmp_path: Path) -> None:
-    found = {}
-    for border in (0, 2):
-        matcher = load_standin(loftr, Loftr, tmp_path, Training.INDOOR, border=border)
-        (encoded,) = matcher.encode([shown(96, 128, matcher)])
-        found[border] = matcher.match([encoded], [encoded])[0].points0
-    assert found[0].min() < 8
-    assert found[2].min() >= 15.5
-    assert len(found[2]) < len(found[0])
-
-
 def test_weights_with_optimal_transport_are_refused_with_what_to_take_instead(tmp_path: Path) -> None:
     surplus = {"coarse_matching.bin_score": torch.ones(())}
     with pytest.raises(UserError, match=r"'loftr-outdoor' match by optimal transport.*outdoor_ds"):

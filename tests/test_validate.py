@@ -17,7 +17,6 @@ from mkpc_kaggle.data.competition import (
 )
 from mkpc_kaggle.demo import DemoSet
 from mkpc_kaggle.engine.records import PairRecord
-from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.evaluation.validate import score_record, score_submission, score_table
 from mkpc_kaggle.geometry.cameras import Camera, fundamental_of_cameras
 from mkpc_kaggle.geometry.metrics import AUC_THRESHOLDS
@@ -51,12 +50,6 @@ def test_the_true_matrices_score_one_whatever_the_order_of_the_images(demo: Demo
     write_submission(tmp_path / "fallback.csv", dict.fromkeys(truth, FALLBACK_FUNDAMENTAL))
     scored = score_submission(tmp_path / "fallback.csv", demo.truth_csv, read_train_side(demo.train_dir))
     assert scored.maa < 0.2
-
-
-def test_a_submission_for_another_set_is_refused(demo: DemoSet, tmp_path: Path) -> None:
-    write_submission(tmp_path / "other.csv", {"other;sample": FALLBACK_FUNDAMENTAL})
-    with pytest.raises(UserError, match="names no pair"):
-        score_submission(tmp_path / "other.csv", demo.truth_csv, read_train_side(demo.train_dir))
 
 
 def test_a_failed_pair_counts_as_failed_even_where_the_fallback_happens_to_be_right() -> None:
@@ -157,7 +150,7 @@ BASELINE = {"castle_p19": 0.4319, "fountain_p11": 0.9018, "herz_jesus_p8": 0.885
 
 @needs_data
 @pytest.mark.slow
-@pytest.mark.timeout(3600)
+@pytest.mark.timeout(7200)
 def test_the_classical_recipe_reaches_plain_root_sift_scene_by_scene(tmp_path: Path) -> None:
     out = tmp_path / "scores.json"
     train = str(DATA / "train")

@@ -126,15 +126,6 @@ def test_the_first_download_of_a_file_without_a_digest_is_the_one_that_is_accept
         assert store.WeightStore([out]).find("aliked-n16") is None
 
 
-def test_a_manifest_beside_the_weights_does_not_change_what_the_packages_says(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(store, "manifest", lambda: FILES)
-    put(tmp_path, "a.pt", DATA)
-    pin(replace(FILES[1], licence="anything"), tmp_path / "a.pt")
-    assert store.WeightStore([tmp_path]).files == FILES
-
-
 def test_a_link_in_the_place_of_the_partial_manifest_is_not_followed(tmp_path: Path) -> None:
     put(tmp_path, "a.pt", DATA)
     put(tmp_path, "mine", b"mine")

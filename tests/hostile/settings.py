@@ -151,7 +151,7 @@ def train_side(name: str = "", text: str = "", submission: str = "") -> Callable
 
 CASES = [
     *(
-        Case("recipes", name, SUBMIT, recipe(text), EITHER if name in VALID else REFUSED, seconds=120)
+        Case("recipes", name, SUBMIT, recipe(text), EITHER if name in VALID else REFUSED)
         for name, text in RECIPES.items()
     ),
     *(Case("recipes", name, SUBMIT, replaced(make), REFUSED) for name, make in PLACES.items()),
@@ -179,7 +179,7 @@ CASES = [
         for name, text in SUBMISSIONS.items()
     ),
     *(
-        Case("packages", name, f"package --out out/p {options}", statuses=REFUSED, seconds=180)
+        Case("packages", name, f"package --out out/p {options}", statuses=REFUSED)
         for name, options in PACKAGES.items()
     ),
 ]
