@@ -48,7 +48,7 @@ def test_a_colour_png_is_read_as_it_is(tmp_path):
     assert (image.name, image.size, image.pixels.dtype) == (str(tmp_path / "a.png"), (7, 5), np.uint8)
 
 
-@pytest.mark.parametrize("shape", [(1, 1), (5, 7), (5, 7, 4), (2500, 3000)])
+@pytest.mark.parametrize("shape", [(1, 1), (5, 7), (5, 7, 4)])
 def test_gray_has_three_equal_channels_and_alpha_is_dropped(tmp_path, shape):
     pixels = noise(*shape)
     image = read_image(write(tmp_path / "a.png", pixels, cv2.IMWRITE_PNG_COMPRESSION, 1))
@@ -125,13 +125,6 @@ def test_an_array_is_named_by_its_content_and_its_shape():
     assert Image.of_array(pixels).name == Image.of_array(pixels.copy()).name
     assert Image.of_array(pixels).name != Image.of_array(pixels.reshape(4, 6, 3)).name
     assert Image.of_array(pixels).name != Image.of_array(255 - pixels).name
-
-
-def test_a_gray_array_and_a_view_of_an_array_are_images():
-    gray = noise(6, 4)
-    assert_array_equal(Image.of_array(gray).pixels[..., 2], gray)
-    mirrored = noise(6, 4, 3)[:, ::-1]
-    assert_array_equal(Image.of_array(mirrored).pixels, mirrored)
 
 
 @pytest.mark.parametrize(

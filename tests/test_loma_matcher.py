@@ -76,9 +76,7 @@ def test_keypoints_are_where_the_detector_saw_them(matcher: LomaAdapter) -> None
     assert np.hypot(*(points - (70, 40)).T).min() < 4
 
 
-def test_padding_changes_nothing_and_tiny_pictures_have_no_matches(
-    matcher: LomaAdapter,
-) -> None:
+def test_padding_changes_nothing_and_tiny_pictures_have_no_matches(matcher: LomaAdapter) -> None:
     pixels = scene(75, 101, channels=3)
     plain, padded = matcher.encode([as_picture(pixels), as_picture(pixels, padding=(13, 26))])
     assert torch.equal(plain.keypoints.points, padded.keypoints.points)

@@ -42,13 +42,13 @@ CASES = {
 CONFIDENCE = (2e-3, 1e-6)  # relative and absolute
 POINTS = 1e-2  # pixels
 FEATURES = 1e-4
-EXPECTATION = 5e-4  # half a window, which is four pixels, is one
+EXPECTATION = 5e-4  # in half windows, of four pixels
 EXACT = ("b_ids", "i_ids", "j_ids")
 
 
 @cache
 def standin():
-    """The recipe of the golden vectors' README; there is no ``standin.py``."""
+    """The recipe of the golden vectors' README; the folder has no ``standin.py``."""
     shapes = json.loads((GOLDEN / "aspanformer" / "shapes.json").read_text())["parameters"]
     state = {}
     for name, shape in shapes.items():

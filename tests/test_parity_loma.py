@@ -104,7 +104,6 @@ def resize_stages():
             if name.startswith("detector"):
                 wanted = detector_size(Size(source.shape[1], source.shape[0]), by_name)
             yield Stage(f"{name} size", torch.tensor(wanted[::-1]), torch.tensor(size))
-            yield Stage(f"{name} by PIL", resized_by_pil(source, size), expected)
             got = (resized(batch_of(source), size) * 255).round()
             yield Stage(name, got, batch_of(expected).float(), 1)
             yield Stage(f"{name}, share", (got != batch_of(expected)).float().mean(), torch.tensor(0.0), 0.02)

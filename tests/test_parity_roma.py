@@ -17,7 +17,7 @@ from mkpc_kaggle.matchers.networks.roma import RoMa, anchor_mean
 
 
 def standin():
-    """The checkpoints of RoMa and of DINOv2 as one."""
+    """The checkpoints of RoMa and of DINOv2, joined."""
     shapes, gains = (json.loads((GOLDEN / "roma" / f"{name}.json").read_text()) for name in ("shapes", "gains"))
 
     def gain(part, name):

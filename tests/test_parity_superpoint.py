@@ -3,19 +3,12 @@
 import json
 from functools import cache
 
-import cv2
-import numpy as np
 import pytest
 import torch
 from golden import Stage, assert_stages, golden_arrays, needs_golden, ready, standin_state
 from torch.nn import functional
 
-from mkpc_kaggle.matchers.networks.superpoint import (
-    SuperPoint,
-    sample_descriptors,
-    score_map,
-    suppress_non_maxima,
-)
+from mkpc_kaggle.matchers.networks.superpoint import SuperPoint, sample_descriptors, score_map, suppress_non_maxima
 
 CASES = ["default_160x216", "outdoor_160x216", "odd_171x229", "noborder_64x72"]
 
@@ -77,27 +70,6 @@ def sampling_stages():
     yield Stage("descriptors", got.T, golden["descriptors"], 1e-5)
 
 
-def resized_by_opencv(source, size, *, rounded):
-    """As the reference prepares an image; the package itself resizes in views (see its coordinates)."""
-    pixels = cv2.resize(source.numpy() if rounded else source.numpy().astype(np.float32), size)
-    return torch.from_numpy(pixels).float()
-
-
-def resize_stages():
-    """The input's preparation: OpenCV's bilinear resize and the rule of sizes, as the specification has them."""
-    golden = golden_arrays("superpoint", "resize_cases")
-    for name, size in {"max50": (37, 50), "max120": (88, 120), "exact64x48": (64, 48)}.items():
-        for kind in ("float", "uint8"):
-            got = resized_by_opencv(golden["source"], size, rounded=kind == "uint8")
-            yield Stage(f"{name}_{kind}", got, golden[f"{name}_{kind}"], 1e-4 if kind == "float" else 1)
-    table = golden["size_table"]
-    sizes = [
-        [side if longest == -1 else round(side * (longest / max(width, height))) for side in (width, height)]
-        for width, height, longest in table[:, :3].tolist()
-    ]
-    yield Stage("size_table", torch.tensor(sizes), table[:, 3:])
-
-
 @needs_golden
 @pytest.mark.parametrize("case", CASES)
 def test_every_stage_of_the_network_is_the_golden_one(case):
@@ -105,7 +77,7 @@ def test_every_stage_of_the_network_is_the_golden_one(case):
 
 
 @needs_golden
-@pytest.mark.parametrize("stages", [nms_stages, sampling_stages, resize_stages])
+@pytest.mark.parametrize("stages", [nms_stages, sampling_stages])
 def test_steps_without_weights_are_the_golden_ones(stages):
     assert_stages(stages())
 

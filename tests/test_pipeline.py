@@ -1,4 +1,4 @@
-"""The two stages on pictures whose correspondence is known, with real matchers and with those that misbehave."""
+"""The two stages on pictures whose correspondence is known, with real and with misbehaving matchers."""
 
 from collections import Counter
 from dataclasses import dataclass, replace
@@ -17,7 +17,7 @@ from mkpc_kaggle.geometry.coordinates import Box, Size
 from mkpc_kaggle.geometry.focal_prior import FocalConfig, FocalPrior, estimate_with_prior
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import ModelKind
-from mkpc_kaggle.matchers.contract import Colour, MatcherSpec
+from mkpc_kaggle.matchers.contract import MatcherSpec
 from mkpc_kaggle.matchers.sift import SiftMatcher, SiftOptions
 from mkpc_kaggle.pipeline import stages
 from mkpc_kaggle.pipeline.pair import PairMatch, with_estimate
@@ -65,7 +65,7 @@ def errors(matches):
     return np.hypot(*(matches.points1 - true).T)
 
 
-# matchers of one's own
+# matchers of the user's
 
 
 @dataclass(frozen=True)
@@ -252,14 +252,7 @@ def test_whole_images_are_encoded_once_and_crops_for_each_pair():
     assert sift.seen.total() == 6
 
 
-def test_matchers_see_gray_or_colour_and_multiples_as_they_ask():
-    for colour, depth in ((Colour.GRAY, ()), (Colour.RGB, (3,))):
-        matcher = Scripted(colour=colour, multiple=8)
-        own(Unit(1, "own", 100), own=matcher)(*pair())
-        assert [picture.pixels.shape for picture in matcher.shown] == [(80, 104, *depth)] * 2
-
-
-# matchers of one's own, good and bad
+# matchers of the user's, good and bad
 
 
 def test_two_matchers_of_one_class_do_not_share_encodings_and_each_has_its_options():
@@ -292,8 +285,7 @@ def test_a_matcher_that_raises_costs_its_unit_and_the_run_goes_on(error):
 
 
 @pytest.mark.parametrize(
-    "error",
-    [MemoryError("full"), RuntimeError("CUDA error: unspecified launch failure"), KeyboardInterrupt("x")],
+    "error", [MemoryError("full"), RuntimeError("CUDA error: unspecified launch failure"), KeyboardInterrupt("x")]
 )
 def test_memory_devices_and_interrupts_are_no_failure_of_a_matcher(error):
     with pytest.raises(type(error), match=str(error)):

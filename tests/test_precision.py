@@ -19,12 +19,7 @@ from mkpc_kaggle.matchers.networks.quadtree import Quadtree
 from mkpc_kaggle.pipeline.devices import fastest_precision, resolve_placement
 
 SIZE = Size(224, 160)
-MAKERS = {
-    "loftr": Loftr,
-    "quadtree": Quadtree,
-    "aspanformer": AspanFormer,
-    "dkm": DKM,
-}
+MAKERS = {"loftr": Loftr, "quadtree": Quadtree, "aspanformer": AspanFormer, "dkm": DKM}
 half_precisions = pytest.mark.parametrize("precision", [Precision.BFLOAT16, Precision.FLOAT16])
 
 

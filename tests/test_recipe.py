@@ -1,14 +1,12 @@
-"""Recipes: those that come with the package work, and a wrong one is refused in words that help."""
+"""Recipes: the package's work, and a wrong recipe is refused in words that help."""
 
 import json
 import os
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import combinations
-from typing import ClassVar
 
 import pytest
 
-from mkpc_kaggle.config import from_table
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Box, Size, View
 from mkpc_kaggle.geometry.critical_region import MkpcConfig
@@ -190,10 +188,7 @@ def test_a_recipe_that_makes_no_run_is_refused_in_words_that_help(text, says):
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        (
-            "[matchers.sift]\nkeypoints = 1\n",
-            r"\[matchers.sift\].*'keypoints'.*features, ratio, contrast",
-        ),
+        ("[matchers.sift]\nkeypoints = 1\n", r"\[matchers.sift\].*'keypoints'.*features, ratio, contrast"),
         ("matchers = 3\n", "matchers"),
         ("[matchers]\nsift = 3\n", "matchers"),
     ],
@@ -203,21 +198,6 @@ def test_options_that_a_matcher_does_not_have_are_refused(text, says):
         options_of(parse(SIFT + text), "sift")
     with pytest.raises(UserError, match=r"unknown matcher 'sitf'; known: .*aliked.*sift"):
         options_of(parse(SIFT), "sitf")
-
-
-@dataclass(frozen=True)
-class Settings:
-    RENAMED: ClassVar = {"old": "new"}
-    REMOVED: ClassVar = ("gone",)
-    new: int = 1
-
-
-@pytest.mark.parametrize(
-    ("key", "says"), [("old", "'old' is now called 'new'"), ("gone", "'gone' was removed"), ("x", "keys: new$")]
-)
-def test_a_former_key_is_refused_with_what_became_of_it(key, says):
-    with pytest.raises(UserError, match=f"table t.*{says}"):
-        from_table(Settings, {key: 1}, "table t")
 
 
 def test_a_recipe_is_found_by_its_name_or_path_and_nowhere_else(tmp_path):

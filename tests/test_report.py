@@ -170,14 +170,6 @@ def test_without_matplotlib_the_page_has_tables_and_says_so(
     assert pairs[0].id in text
 
 
-def test_a_run_of_no_pairs_has_a_page_without_empty_sections(tmp_path: Path) -> None:
-    empty_journal(tmp_path, []).close()
-    log = read_log(tmp_path)
-    assert sections(report_page(log)) == ["What made this"]
-    assert all(table.empty for name, table in log.tables.named().items() if name != "events")
-    assert overview(log)
-
-
 def test_a_late_report_leaves_out_drawings_then_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("mkpc_kaggle.reporting.report.time", SimpleNamespace(monotonic=lambda: 0.0))
     pairs = a_run(tmp_path, 3)

@@ -32,7 +32,7 @@ def pair_of(names: str, matches: Matches) -> BatchPair:
 
 
 def distances(solution: Solution, scene: SyntheticScene) -> list[float]:
-    """How far true correspondences are from the F that each pair got, in pixels; infinite without one."""
+    """How far true correspondences are from the F that each pair got, in pixels; infinite without an F."""
     return [
         np.inf if choice.F is None else scene.median_distance(choice.F, pair)
         for choice, pair in zip(solution.choices, scene.pairs, strict=True)
@@ -127,12 +127,6 @@ def test_a_pair_whose_matches_agree_on_something_else_keeps_its_own(scene: Synth
     assert all(choice.from_scene for choice in solution.choices[:-1])
 
 
-def test_two_images_are_no_scene(scene: SyntheticScene) -> None:
-    solution = reconstruct_batch(scene.pairs[:1], SceneConfig())
-    assert [found.failure for found in solution.reconstructions] == ["2 images are connected; a scene needs 3"]
-    assert solution.choices[0].reason is Reason.UNREGISTERED
-
-
 def test_a_scene_of_too_few_pairs_is_none(scene: SyntheticScene) -> None:
     two = tuple(pair for pair in scene.pairs if pair.image0 == scene.pairs[0].image0)[:2]
     (found,) = reconstruct_batch(two, SceneConfig()).reconstructions
@@ -175,7 +169,7 @@ def test_degenerate_matches_give_a_reason(kind: str) -> None:
 def test_the_incremental_mapper_is_asked_where_the_global_one_leaves_images_out(
     scene: SyntheticScene, monkeypatch: pytest.MonkeyPatch, share: float, fewer: int, asked: int
 ) -> None:
-    """The global mapper is made to find a share of the images, the incremental one to see points less often."""
+    """The global mapper is made to find a share of the images, the incremental mapper to see points less often."""
     made, found = colmap.run_mapper, []
 
     def run(pipeline: type, *rest: Any) -> Reconstruction:

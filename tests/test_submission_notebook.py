@@ -1,15 +1,11 @@
 """``submission.ipynb`` as Kaggle runs it: the dataset folder, an image without our package, and no network."""
 
-import json
-import subprocess
 import tomllib
-from dataclasses import replace
 from pathlib import Path
 
 import nbformat
 import pandas as pd
 import pytest
-from checkpoints import FILES, write_checkpoints
 from kaggle_image import IMAGES, Image, environment, install_image, make_image, python_version, upload
 from offline_notebook import execute, needs_namespaces, pictures, printed
 from packaging.requirements import Requirement
@@ -17,7 +13,6 @@ from shared import DATA, WEIGHTS, needs_data, needs_weights
 
 from mkpc_kaggle.data.competition import read_test_side, submission_problems
 from mkpc_kaggle.demo import DemoSet
-from mkpc_kaggle.matchers.networks.roma import RoMa
 from mkpc_kaggle.package import Request, make_package
 from mkpc_kaggle.package.metadata import COMPETITION
 from mkpc_kaggle.package.wheels import PYTHONS
@@ -76,17 +71,6 @@ class Kaggle:
 @pytest.fixture
 def kaggle(tmp_path: Path, image: Path, wheels: Path) -> Kaggle:
     return Kaggle(tmp_path / "kaggle", image, wheels)
-
-
-def test_the_image_has_none_of_what_the_dataset_brings(image: Path) -> None:
-    code = "import numpy, pandas, scipy, sklearn, cv2, matplotlib, tqdm, importlib.util as u, json\n"
-    code += (
-        "print(json.dumps([n for n in ('mkpc_kaggle', 'kornia', 'kornia_rs', 'safetensors') if u.find_spec(n)]))"
-    )
-    out = subprocess.run(
-        [image, "-c", code], capture_output=True, text=True, check=True, env=environment(), cwd=image.parent
-    ).stdout
-    assert json.loads(out) == []
 
 
 @pytest.mark.parametrize("image", IMAGES, ids=str)
@@ -176,7 +160,7 @@ def test_what_pip_says_is_told_and_the_advice_only_where_no_wheel_fits(
 ) -> None:
     kaggle.add_test_side(demo.test_dir, pairs=1)
     kaggle.add_dataset(tmp_path / "package")
-    kaggle.image = make_image(tmp_path / "image")  # other tests have installed into the shared one
+    kaggle.image = make_image(tmp_path / "image")  # other tests have installed into the shared image
     (wheel,) = kaggle.dataset.glob("pycolmap-*.whl")
     if is_missing:
         wheel.rename(wheel.with_name("pycolmap-4.2.1-cp27-cp27m-manylinux_2_28_x86_64.whl"))
@@ -189,48 +173,6 @@ def test_what_pip_says_is_told_and_the_advice_only_where_no_wheel_fits(
         f"no wheel of pycolmap is for Python {python_version()}: package again with --python {python_version()}"
     )
     assert (advice in str(stopped.value)) == is_missing
-
-
-@needs_namespaces
-@needs_data
-@needs_weights
-@pytest.mark.slow
-def test_the_hidden_rerun_uses_the_weights_and_the_time_and_shows_nothing(kaggle: Kaggle, tmp_path: Path) -> None:
-    kaggle.add_test_side(DATA / "test")
-    kaggle.add_dataset(tmp_path / "package", (WEIGHTS,))
-    kaggle.set("TIME_LIMIT_HOURS = 8.75", "TIME_LIMIT_HOURS = 0.025")
-    printed = kaggle.run(KAGGLE_IS_COMPETITION_RERUN="1")
-    assert kaggle.problems() == []
-    assert "good: 29 rows" in printed
-    assert "1:xfeat_lighterglue@1024 " in printed
-    assert kaggle.figures() == 0
-
-
-@needs_namespaces
-@pytest.mark.slow
-@pytest.mark.timeout(7200)
-@pytest.mark.parametrize("matcher", ["loma", "roma"])
-def test_matchers_run_offline_from_packaged_stand_ins_of_their_full_size(
-    kaggle: Kaggle, demo: DemoSet, tmp_path: Path, matcher: str
-) -> None:
-    weights = tmp_path / "weights"
-    weights.mkdir()
-    whole = [replace(file, name=f"standin_{file.name}") for file in FILES if file.matcher == matcher]
-    if matcher == "roma":
-        whole = [replace(file, network=RoMa) for file in whole]
-    lines = [replace(line, licence="MIT").line for line in write_checkpoints(weights, whole)]
-    (weights / "weights_manifest.txt").write_text("\n".join(lines))
-    kaggle.add_test_side(demo.test_dir, pairs=3)
-    kaggle.add_dataset(tmp_path / "package", (weights,))
-    recipe = tmp_path / "small.toml"
-    units = [f'{{ stage = {stage}, matcher = "{matcher}", area = "112x140" }}' for stage in (1, 2)]
-    recipe.write_text(f'units = [{", ".join(units)}]\n[matchers.loma]\nvariant = "b128"')
-    kaggle.set(r"RECIPE = \"auto\"", rf"RECIPE = \"{recipe}\"")
-    printed = kaggle.run()
-    assert kaggle.problems() == []
-    assert f"{len(lines)} files in" in printed
-    assert "0 of them not found or wrong" in printed
-    assert f"2:{matcher}@112x140 " in printed
 
 
 @needs_namespaces

@@ -3,12 +3,12 @@
 import numpy as np
 import torch
 from numpy.testing import assert_allclose
+from pictures import as_picture
 from standin import scene
 from vismatch_standin import OrbLikeVismatch
 
-from mkpc_kaggle.geometry.coordinates import Box, Size, View
+from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.matchers.contract import Picture
 from mkpc_kaggle.matchers.vismatch import VismatchMatcher
 from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher
 from mkpc_kaggle.recipe import Recipe, Unit
@@ -18,14 +18,9 @@ WHOLE = scene(SIZE.height, SIZE.width + SHIFT, 3)
 LEFT, RIGHT = (np.ascontiguousarray(WHOLE[:, shift:][:, : SIZE.width]) for shift in (0, SHIFT))
 
 
-def picture(pixels: np.ndarray, multiple: int = 1) -> Picture:
-    view = View.fit(Box.whole(SIZE), long_side=max(SIZE), multiple=multiple)
-    return Picture(view.render(pixels), view)
-
-
 def matched(matcher: VismatchMatcher) -> Matches:
     multiple = matcher.spec.multiple
-    encoded = [matcher.encode([picture(pixels, multiple)]) for pixels in (LEFT, RIGHT)]
+    encoded = [matcher.encode([as_picture(pixels, multiple)]) for pixels in (LEFT, RIGHT)]
     (matches,) = matcher.match(*encoded)
     return matches
 

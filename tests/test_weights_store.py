@@ -162,13 +162,6 @@ def test_other_bytes_of_the_same_size_are_refused_with_both_digests(tmp_path: Pa
         WeightStore([tmp_path], [line()]).load("slot")
 
 
-def test_an_alternative_under_the_name_of_another_is_taken_without_complaint(tmp_path: Path) -> None:
-    put(tmp_path, "a.bin", OTHER)
-    found = WeightStore([tmp_path], [line("a.bin"), line("b.bin", OTHER)]).find("slot")
-    assert found is not None
-    assert (found.file.name, found.path.name, found.state) == ("b.bin", "a.bin", State.GOOD)
-
-
 def test_after_a_bad_file_the_search_goes_on(tmp_path: Path) -> None:
     put(tmp_path / "one", "a.bin", DATA[:-1])
     path = put(tmp_path / "two", "renamed.bin", DATA) / "renamed.bin"
@@ -176,18 +169,6 @@ def test_after_a_bad_file_the_search_goes_on(tmp_path: Path) -> None:
     with pytest.warns(UserWarning, match=r"passed over: .*one/a\.bin: 20 bytes, the manifest says 21"):
         assert found_by(weights) == path
     assert found_by(weights) == path  # told once
-
-
-def test_a_file_that_cannot_be_read_is_passed_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def read(path: Path) -> str:
-        if path.name == "locked.bin":
-            raise PermissionError(13, "Permission denied", str(path))
-        return file_digest(path)
-
-    monkeypatch.setattr(store, "digest_of", read)
-    put(tmp_path, "locked.bin")
-    put(tmp_path, "renamed.bin")
-    assert found_by(WeightStore([tmp_path], [line()])).name == "renamed.bin"
 
 
 @pytest.mark.parametrize("kind", ["pipe", "link"])

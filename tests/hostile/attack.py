@@ -179,7 +179,7 @@ def _marked(mark: str) -> list[int]:
 
 
 def _snapshot(room: Path) -> dict[str, tuple[object, ...]]:
-    """What identifies the state of each file of the room but those that a command may write."""
+    """What identifies the state of each file of the room, except what a command may write."""
     states: dict[str, tuple[object, ...]] = {}
     for folder, folders, names in os.walk(os.fsencode(room)):
         if folder == os.fsencode(room):

@@ -1,4 +1,4 @@
-"""Limits that are none, and runs that are ended in every way."""
+"""Time limits without sense, and runs that are ended in every way."""
 
 import os
 import signal
