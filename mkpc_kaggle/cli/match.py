@@ -24,8 +24,8 @@ def run(arguments: argparse.Namespace) -> int:
     from mkpc_kaggle.reporting.figures.pair import draw_pair
     from mkpc_kaggle.reporting.figures.style import save
 
-    inputs = [arguments.image0, arguments.image1, Path(arguments.recipe)]
-    require_apart({"--out": arguments.out}, inputs, weights=arguments.weights)
+    inputs = [arguments.image0, arguments.image1, Path(arguments.recipe), *arguments.weights]
+    require_apart({"--out": arguments.out}, inputs)
     images = to_image(arguments.image0), to_image(arguments.image1)
     matcher = TwoStageMatcher(
         arguments.recipe,

@@ -14,7 +14,6 @@ from typing import Any, NoReturn, TextIO
 
 from tqdm import tqdm
 
-from mkpc_kaggle.data.outputs import discard_parts
 from mkpc_kaggle.engine.budget import Budget, format_duration
 
 LINE_INTERVAL_S = 30.0  # between lines of progress where a line cannot be drawn again
@@ -43,7 +42,6 @@ def _print(text: str, stream: TextIO | None) -> None:
 
 def leave(status: int) -> NoReturn:
     """End the process at once, and its children, one that was stopped (SIGSTOP) among them."""
-    discard_parts()
     for stream in (sys.stdout, sys.stderr):
         with suppress(OSError, ValueError):
             if stream is not None:

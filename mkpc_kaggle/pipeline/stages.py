@@ -13,8 +13,7 @@ from dataclasses import replace
 from itertools import chain
 from typing import Any
 
-from mkpc_kaggle.data.cache import ByteCache
-from mkpc_kaggle.data.images import Image
+from mkpc_kaggle.data.images import ByteCache, Image
 from mkpc_kaggle.geometry.coordinates import Box, Size, View
 from mkpc_kaggle.geometry.critical_region import critical_region
 from mkpc_kaggle.geometry.matches import Matches
