@@ -112,28 +112,13 @@ def warp_and_certainty(count=3000, seed=5):
     return torch.rand(count, 4, generator=generator) * 2 - 1, torch.rand(count, generator=generator) ** 4
 
 
-def test_without_balance_it_is_pytorchs_multinomial_without_repetition():
-    warp, certainty = warp_and_certainty()
-    drawn = torch.multinomial(certainty, 50, generator=torch.Generator().manual_seed(6))
-    generator = torch.Generator().manual_seed(6)
-    found = sample_matches(warp, certainty, 50, threshold=1, balanced=False, generator=generator)
-    assert torch.equal(found.index, drawn)
-
-
 def test_balancing_spreads_the_matches():
     generator = torch.Generator().manual_seed(7)
     crowd = torch.rand(9000, 4, generator=generator) * 0.1
     thin = torch.rand(1000, 4, generator=generator) * 0.1 - 0.9
     warp, certainty = torch.cat([crowd, thin]), torch.ones(10000)
-    shares = [
-        (sample_matches(warp, certainty, 500, balanced=balanced, generator=generator).matches[:, 0] < 0)
-        .float()
-        .mean()
-        .item()
-        for balanced in (False, True)
-    ]
-    assert shares[0] == pytest.approx(0.1, abs=0.06)
-    assert shares[1] > 0.3
+    matches = sample_matches(warp, certainty, 500, generator=generator).matches
+    assert (matches[:, 0] < 0).float().mean() > 0.3
 
 
 def test_what_has_no_weight_is_not_drawn():

@@ -82,7 +82,7 @@ class Given:
     def encode(self, image: torch.Tensor, fine: torch.Tensor | None = None) -> DenseFeatures:
         return None  # type: ignore[return-value]
 
-    def match(self, first: DenseFeatures, second: DenseFeatures, *, symmetric: bool) -> tuple[DenseWarp, ...]:
+    def match(self, first: DenseFeatures, second: DenseFeatures) -> tuple[DenseWarp, ...]:
         return self.warps
 
 
@@ -94,7 +94,7 @@ def identity_warp(height: int, width: int, certainty: float) -> DenseWarp:
 def test_points_of_either_picture_are_in_its_own_pixels() -> None:
     """Both show the same, at another size: places relative to the edges agree."""
     warps = identity_warp(40, 60, 0.3), identity_warp(80, 30, 0.9)
-    matcher = DkmMatcher(Given(*warps), DkmOptions(matches=9999, balanced=False), "cpu")  # type: ignore[arg-type]
+    matcher = DkmMatcher(Given(*warps), DkmOptions(matches=9999), "cpu")  # type: ignore[arg-type]
     matches = match_one(matcher, picture(40, 60), picture(80, 30))
     assert len(matches) == 40 * 60 + 80 * 30
     expected = (matches.points0 + 0.5) * (30 / 60, 80 / 40) - 0.5
@@ -107,13 +107,6 @@ def test_points_of_either_picture_are_in_its_own_pixels() -> None:
     unsure = identity_warp(9, 9, 0.0), identity_warp(9, 9, 0.0)
     matcher = DkmMatcher(Given(*unsure), DkmOptions(), "cpu")  # type: ignore[arg-type]
     assert len(match_one(matcher, picture(9, 9), picture(9, 9))) == 0
-
-
-def test_one_way_is_from_the_first_to_the_second(store: WeightStore) -> None:
-    matcher = dkm.load(store, DkmOptions(symmetric=False, matches=200), Placement())
-    matches = match_one(matcher, picture(40, 56), picture(50, 36, "another"))
-    assert len(matches) == 200
-    np.testing.assert_allclose(matches.points0, np.rint(matches.points0), atol=1e-4)
 
 
 def test_other_weights_or_another_networks_checkpoint_are_refused(store: WeightStore, tmp_path: Path) -> None:

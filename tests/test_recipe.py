@@ -79,8 +79,8 @@ def test_scannet_has_indoor_weights_and_their_settings():
     outdoor, indoor = load_recipe("yfcc"), load_recipe("scannet")
     options = options_of(indoor, "superglue")
     assert (options.training, options.max_keypoints, options.nms_radius) == (Training.INDOOR, 1024, 4)
-    assert slots_of(indoor, ["superglue"]) == ("superpoint", "superglue-indoor")
-    assert slots_of(outdoor, ["superglue"]) == ("superpoint", "superglue-outdoor")
+    assert slots_of(indoor) == ("superpoint", "superglue-indoor")
+    assert slots_of(outdoor) == ("superpoint", "superglue-outdoor")
 
 
 @pytest.mark.parametrize("name", recipe_names())
@@ -232,8 +232,7 @@ def test_options_that_a_matcher_does_not_have_are_refused(text, says):
 
 @dataclass(frozen=True)
 class Settings:
-    RENAMED: ClassVar = {"old": "new"}
-    REMOVED: ClassVar = ("gone",)
+    FORMER: ClassVar = {"old": "new", "gone": ""}
     new: int = 1
 
 

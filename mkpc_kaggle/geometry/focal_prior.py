@@ -57,10 +57,10 @@ LOG_FOCAL_GRID = (-0.7, -0.35, 0.0, 0.35, 0.7)  # log f / g to read MAGSAC's F w
 class FocalConfig:
     """Settings of :func:`estimate_with_prior`, table ``[focal]`` of a recipe; without it MAGSAC is alone."""
 
-    REMOVED: ClassVar = (
-        *("essential_threshold", "essential_iterations", "essential_starts", "essential_share"),
-        *("rough_matches", "refined", "most_matches", "free_cost"),
-    )
+    FORMER: ClassVar = dict.fromkeys((
+        "essential_threshold", "essential_iterations", "essential_starts", "essential_share", "rough_matches",
+        "refined", "most_matches", "free_cost",
+    ), "")  # fmt: skip
 
     ratio: float = 1.1  # of an unknown focal length to the image's long side
     sigma: float = 0.4  # standard deviation of the focal length's logarithm

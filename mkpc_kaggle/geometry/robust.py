@@ -47,7 +47,7 @@ class RobustConfig:
     it runs on several permutations, and the model of the lowest robust cost at twice the threshold is kept.
     """
 
-    RENAMED: ClassVar = {"orders": "permutations"}
+    FORMER: ClassVar = {"orders": "permutations"}
 
     method: Method = Method.MAGSAC
     threshold: float = 0.2  # image pixels

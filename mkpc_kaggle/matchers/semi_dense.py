@@ -12,7 +12,7 @@ from mkpc_kaggle.config import SHARE, check_ranges
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Size, from_corner
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.matchers.contract import MatcherSpec, Picture, Training
+from mkpc_kaggle.matchers.contract import MatcherSpec, PairwiseMatcher, Picture, Training
 from mkpc_kaggle.matchers.networks.fine_matching import COARSE_STRIDE
 from mkpc_kaggle.matchers.networks.resnet_fpn import FeatureMaps
 from mkpc_kaggle.matchers.networks.semi_dense import SemiDenseNetwork
@@ -55,7 +55,7 @@ class SemiDenseEncoding:
         return (height[:, None] & width)[None]
 
 
-class SemiDenseMatcher:
+class SemiDenseMatcher(PairwiseMatcher[SemiDenseEncoding]):
     """A match's score is the confidence of its coarse cells."""
 
     def __init__(self, network: SemiDenseNetwork[Any], spec: MatcherSpec, device: str) -> None:
@@ -76,12 +76,6 @@ class SemiDenseMatcher:
             SemiDenseEncoding(FeatureMaps(coarse.clone(), fine.clone()), picture.content)
             for (coarse, fine), picture in zip(singles, pictures, strict=True)
         ]
-
-    @torch.inference_mode()
-    def match(
-        self, encodings0: Sequence[SemiDenseEncoding], encodings1: Sequence[SemiDenseEncoding]
-    ) -> list[Matches]:
-        return [self._match(*pair) for pair in zip(encodings0, encodings1, strict=True)]
 
     def _match(self, first: SemiDenseEncoding, second: SemiDenseEncoding) -> Matches:
         # Even a mask that is all True can change rounding.

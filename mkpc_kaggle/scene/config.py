@@ -24,13 +24,12 @@ class SceneConfig:
     pairs_per_image: float = 5.0  # a batch with fewer pairs gets extra pairs, for its scene alone; 0: none
     threads: int = 1  # more than one: the last digits differ from run to run
 
-    RENAMED: ClassVar = {"one_camera": "shared_intrinsics"}
-    REMOVED: ClassVar = frozenset((
+    FORMER: ClassVar = {"one_camera": "shared_intrinsics"} | dict.fromkeys((
         "mapper", "cell", "least_tracks", "agreement", "one_camera_images", "one_camera_weak", "one_camera_points",
         "least_inliers", "prior_focal", "least_images", "least_pairs_per_image", "most_images", "lowest_focal",
         "highest_focal", "least_points", "contradiction_error", "contradiction_matches", "contradiction_share",
         "verification_error", "focal_sigma", "seed",
-    ))  # fmt: skip
+    ), "")  # fmt: skip
 
     def __post_init__(self) -> None:
         check_ranges(self, shared_intrinsics=AT_LEAST_0, pairs_per_image=AT_LEAST_0, threads=AT_LEAST_1)

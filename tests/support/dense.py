@@ -9,7 +9,7 @@ import torch
 from golden import Stage, recorded
 
 from mkpc_kaggle.geometry.coordinates import Size, from_normalised
-from mkpc_kaggle.matchers.networks.dense_warp import DenseWarp
+from mkpc_kaggle.matchers.networks.dense_warp import DenseWarp, dense_warp
 from mkpc_kaggle.matchers.networks.gaussian_process import kernel
 from mkpc_kaggle.matchers.networks.pixels import MEAN, STD, network_input
 from mkpc_kaggle.matchers.networks.warp_refiner import local_correlation
@@ -65,7 +65,7 @@ def computed(network, images, fine_images=(None, None), *, symmetric=True):
     """
     features = [network.encode(*versions) for versions in zip(images, fine_images, strict=True)]
     with recorded_refinement(network.decoder) as calls:
-        dense = side_by_side(network.match(*features, symmetric=symmetric))
+        dense = side_by_side(network.match(*features) if symmetric else [dense_warp(*network.decoder(*features))])
     values = encoded(network, images, 32) | coarse_values(network.decoder, calls)
     passes = 1 if fine_images[0] is None else 2
     values |= refiner_values(network.decoder, calls, 0, passes)

@@ -4,6 +4,7 @@ import torch
 from dense import joined, one_thread, recorded_refinement, refiner_values, side_by_side
 from golden import recorded
 
+from mkpc_kaggle.matchers.networks.dense_warp import dense_warp
 from mkpc_kaggle.matchers.networks.gaussian_process import kernel, tokens
 from mkpc_kaggle.matchers.networks.grids import as_map
 
@@ -34,7 +35,7 @@ def computed(network, images, fine_images=(None, None), *, symmetric=True):
         recorded_refinement(decoder) as calls,
         recorded(decoder.embedding_decoder, [*decoder_blocks, "to_out"]) as decoded,
     ):
-        dense = side_by_side(network.match(*features, symmetric=symmetric))
+        dense = side_by_side(network.match(*features) if symmetric else [dense_warp(*network.decoder(*features))])
     passes = 1 if fine_images[0] is None else 2
 
     values = dinov2_values(network.dinov2, seen, dinov2_blocks)

@@ -11,8 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mkpc_kaggle.matchers.networks.layers import ExactConv2d
-from mkpc_kaggle.matchers.networks.strips import in_strips
+from mkpc_kaggle.matchers.networks.layers import ExactConv2d, in_strips
 
 KERNEL = 5
 CHANNELS = 32  # of a prediction that are enlarged at a time

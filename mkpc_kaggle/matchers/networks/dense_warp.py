@@ -85,21 +85,16 @@ class DenseNetwork(nn.Module, ABC):
     def encode(self, image: Tensor, fine: Tensor | None = None) -> DenseFeatures:
         """Images (B, 3, H, W) as :func:`pixels.network_input` makes them; larger ones for a second pass."""
 
-    def match(
-        self, first: DenseFeatures, second: DenseFeatures, *, symmetric: bool = True
-    ) -> tuple[DenseWarp, ...]:
-        """B pairs, whose images may differ in size: the warp on the first image's grid and, if ``symmetric``, that
-        on the second's.
+    def match(self, first: DenseFeatures, second: DenseFeatures) -> tuple[DenseWarp, DenseWarp]:
+        """B pairs, whose images may differ in size: the warps on the first image's grid and on the second's.
 
         ValueError where only one of them has features for a second pass.
         """
         if (first.fine is None) != (second.fine is None):
             raise ValueError("of a pair either both images or neither must have features for a second pass")
-        forward = dense_warp(*self.decoder(first, second))
-        if not symmetric:
-            return (forward,)
         # Sequential: one batch of both directions would take twice the memory and as much time.
-        return forward, dense_warp(*self.decoder(second, first)).swapped()
+        forward, backward = (dense_warp(*self.decoder(*both)) for both in ((first, second), (second, first)))
+        return forward, backward.swapped()
 
 
 def dense_warp(estimate: WarpEstimate, coarse_logits: Tensor) -> DenseWarp:
