@@ -21,7 +21,6 @@ from mkpc_kaggle.geometry.two_view import Vectors, robust_costs, sampson
 # The F of a pure sideways motion, [e_x]_x: finite, rank 2; epipolar lines are the image rows.
 FALLBACK_FUNDAMENTAL: Matrix3 = np.array([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 FALLBACK_FUNDAMENTAL.setflags(write=False)
-NEEDS_INTRINSICS = "an essential matrix needs the intrinsics, the camera matrix K of both images"
 
 
 class ModelKind(StrEnum):
@@ -104,7 +103,7 @@ def estimate(
     points. The same input gives the same bytes.
     """
     if model is ModelKind.E and intrinsics is None:
-        raise ValueError(NEEDS_INTRINSICS)
+        raise ValueError("an essential matrix needs the intrinsics, the camera matrix K of both images")
     distinct = DistinctMatches.of(matches)
     found = consensus(distinct.points0, distinct.points1, config, model, intrinsics)
     return replace(found, inliers=distinct.mask_of_all(found.inliers))
