@@ -33,26 +33,6 @@ class Mode(StrEnum):
 
 
 @dataclass(frozen=True)
-class RecipeChoice:
-    """A recipe's name or file, and the mode to run it in."""
-
-    recipe: str
-    mode: Mode = Mode.TWO_STAGE
-
-    @classmethod
-    def parse(cls, text: str) -> "RecipeChoice":
-        """``NAME:MODE``; without a mode, the recipe as it is written."""
-        name, _, mode = text.rpartition(":")
-        return cls(name, Mode(mode)) if name and mode in list(Mode) else cls(text)
-
-    @property
-    def folder(self) -> str:
-        """A name for the directory of its run."""
-        text = self.recipe if self.mode is Mode.TWO_STAGE else f"{self.recipe}_{self.mode}"
-        return re.sub(r"[^\w.-]+", "_", text)
-
-
-@dataclass(frozen=True)
 class Unit:
     """One piece of work on one pair; raises ``ValueError`` for values that contradict each other."""
 
@@ -64,13 +44,13 @@ class Unit:
     max_matches: int = 4096  # so many of the highest scores are kept
     area: str = ""  # height x width, such as "540x720": a view gets as many pixels, at its own aspect
     stretch: bool = False  # a view gets just that height and width
-    fallback: str = ""  # the matcher that takes the place of one that is unavailable
+    fallback: str = ""  # the matcher that runs where this matcher is unavailable
     tracks: bool = True  # False: a scene is made of its matches only where a pair has few others
 
     def __post_init__(self) -> None:
         check_ranges(self, stage=Range(1, 2), long_side=Range(0, MAX_SIDE_PX), max_matches=AT_LEAST_1)
         if bool(self.long_side) == bool(self.area):
-            raise ValueError("one of long_side and area must be given, and not both")
+            raise ValueError("either long_side or area must be given")
         if self.area and not AREA.fullmatch(self.area):
             raise ValueError(f'area must be height x width such as "540x720", not {self.area!r}')
         if self.stretch and not self.area:
@@ -161,6 +141,12 @@ class Recipe:
         values = asdict(self)
         del values["name"], values["description"]
         return values
+
+
+def split_mode(text: str) -> tuple[str, Mode]:
+    """The recipe's name or file and the mode of ``RECIPE:MODE``; without a mode, as it is written."""
+    name, _, mode = text.rpartition(":")
+    return (name, Mode(mode)) if name and mode in list(Mode) else (text, Mode.TWO_STAGE)
 
 
 def parse_recipe(text: str, name: str) -> Recipe:

@@ -118,7 +118,7 @@ def test_balancing_spreads_the_matches():
     thin = torch.rand(1000, 4, generator=generator) * 0.1 - 0.9
     warp, certainty = torch.cat([crowd, thin]), torch.ones(10000)
     matches = sample_matches(warp, certainty, 500, generator=generator).matches
-    assert (matches[:, 0] < 0).float().mean() > 0.3
+    assert (matches[:, 0] < 0).float().mean() > 0.2
 
 
 def test_what_has_no_weight_is_not_drawn():

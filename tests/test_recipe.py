@@ -17,7 +17,7 @@ from mkpc_kaggle.geometry.robust import Method, RobustConfig
 from mkpc_kaggle.matchers.contract import Training
 from mkpc_kaggle.matchers.registry import matcher_names, spec_of
 from mkpc_kaggle.pipeline.availability import options_of, slots_of
-from mkpc_kaggle.recipe import Mode, Recipe, RecipeChoice, Unit, load_recipe, parse_recipe, recipe_names
+from mkpc_kaggle.recipe import Mode, Recipe, Unit, load_recipe, parse_recipe, recipe_names, split_mode
 
 SIFT = 'units = [{ stage = 1, matcher = "sift", long_side = 640 }]\n'
 
@@ -309,15 +309,14 @@ def test_the_fingerprint_changes_with_whatever_decides_the_numbers(other):
 
 
 @pytest.mark.parametrize(
-    ("text", "choice", "folder"),
+    ("text", "recipe", "mode"),
     [
-        ("classical", RecipeChoice("classical"), "classical"),
-        ("classical:two-stage", RecipeChoice("classical"), "classical"),
-        ("my/own.toml:stage-1", RecipeChoice("my/own.toml", Mode.STAGE_1), "my_own.toml_stage-1"),
-        ("C:own.toml", RecipeChoice("C:own.toml"), "C_own.toml"),
-        (":stage-1", RecipeChoice(":stage-1"), "_stage-1"),
+        ("classical", "classical", Mode.TWO_STAGE),
+        ("classical:two-stage", "classical", Mode.TWO_STAGE),
+        ("my/own.toml:stage-1", "my/own.toml", Mode.STAGE_1),
+        ("C:own.toml", "C:own.toml", Mode.TWO_STAGE),
+        (":stage-1", ":stage-1", Mode.TWO_STAGE),
     ],
 )
-def test_a_choice_is_a_recipe_and_perhaps_a_mode(text: str, choice: RecipeChoice, folder: str) -> None:
-    assert RecipeChoice.parse(text) == choice
-    assert choice.folder == folder
+def test_a_choice_is_a_recipe_and_perhaps_a_mode(text: str, recipe: str, mode: Mode) -> None:
+    assert split_mode(text) == (recipe, mode)

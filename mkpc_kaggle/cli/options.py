@@ -9,7 +9,7 @@ from mkpc_kaggle.engine.budget import Budget, monotonic_of, parse_duration
 from mkpc_kaggle.engine.cluster import parse_workers
 from mkpc_kaggle.pipeline.assembly import Assembly, assemble
 from mkpc_kaggle.pipeline.availability import Licence
-from mkpc_kaggle.recipe import Mode, RecipeChoice
+from mkpc_kaggle.recipe import Mode
 
 
 def add_matching(parser: argparse.ArgumentParser) -> None:
@@ -49,14 +49,14 @@ def add_run(parser: argparse.ArgumentParser, time_limit: str | None) -> None:
     add("--explain", action="store_true", help="say at the end what was planned when, and why")
 
 
-def assembly_of(arguments: argparse.Namespace, choice: RecipeChoice) -> Assembly:
-    """The parts of a run, as the options say, but for the choice of the recipe."""
+def assembly_of(arguments: argparse.Namespace, recipe: str, mode: Mode) -> Assembly:
+    """The parts of a run of this recipe, as the other options say."""
     return assemble(
-        choice.recipe,
+        recipe,
         weights=arguments.weights,
         device=arguments.device,
         precision=arguments.precision,
-        mode=choice.mode,
+        mode=mode,
         licence=Licence(arguments.licence),
         scenes=arguments.reconstruct,
     )

@@ -8,7 +8,7 @@ from mkpc_kaggle.data.competition import read_test_side, test_side
 from mkpc_kaggle.data.outputs import require_apart
 from mkpc_kaggle.engine.console import say
 from mkpc_kaggle.engine.session import Session, Watchdog, interruptible, submit
-from mkpc_kaggle.recipe import Mode, RecipeChoice
+from mkpc_kaggle.recipe import Mode
 from mkpc_kaggle.reporting.report import report_run
 from mkpc_kaggle.reporting.summary import left_out_line, summary, trouble
 
@@ -52,7 +52,7 @@ def run(arguments: argparse.Namespace) -> int:
     budget = options.budget_of(arguments)
     with interruptible() as interrupt, Watchdog(budget, interrupt) as watchdog:
         pairs = read_test_side(arguments.test_dir)
-        assembly = options.assembly_of(arguments, RecipeChoice(arguments.recipe, Mode(arguments.mode)))
+        assembly = options.assembly_of(arguments, arguments.recipe, Mode(arguments.mode))
         header = f"{len(pairs)} pairs, recipe {assembly.recipe.name}, {assembly.placement}, journal in {work_dir}"
         say("\n".join(filter(None, [header, left_out_line(assembly.left_out)])))
         session = Session(

@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import re
 import tempfile
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -19,7 +20,7 @@ from mkpc_kaggle.evaluation.compare import Comparison, comparison_json, comparis
 from mkpc_kaggle.evaluation.validate import Validation, score_submission, score_table, to_json, validate
 from mkpc_kaggle.geometry.robust import Method, RobustConfig
 from mkpc_kaggle.pipeline.assembly import Assembly
-from mkpc_kaggle.recipe import Mode, Recipe, RecipeChoice
+from mkpc_kaggle.recipe import Mode, Recipe, split_mode
 from mkpc_kaggle.reporting.report import report_run
 from mkpc_kaggle.reporting.summary import left_out_line, summary, trouble
 
@@ -108,14 +109,14 @@ def _read_scenes(arguments: argparse.Namespace, work_dir: Path) -> tuple[TrainSc
 
 def _match_and_score(arguments: argparse.Namespace, scenes: tuple[TrainScene, ...], work_dir: Path) -> int:
     """Run a recipe, or several to compare, each then with a journal in a directory of its own."""
-    compared = [RecipeChoice.parse(text) for text in arguments.compare or ()]
-    choices = compared or [RecipeChoice(arguments.recipe, Mode(arguments.mode))]
+    compared: list[str] = arguments.compare or []
+    choices = [split_mode(text) for text in compared] or [(arguments.recipe, Mode(arguments.mode))]
     pairs = [true.pair for scene in scenes for true in scene.pairs]
     validations, status = [], 0
     with interruptible() as interrupt:
-        assemblies = [_assemble(arguments, choice) for choice in choices]
-        for choice, assembly in zip(choices, assemblies, strict=True):
-            place = work_dir / choice.folder if compared else work_dir
+        assemblies = [_assemble(arguments, *choice) for choice in choices]
+        for text, assembly in zip(compared or [""], assemblies, strict=True):
+            place = work_dir / re.sub(r"[^\w.-]+", "_", text)
             session = Session(place, options.budget_of(arguments), interrupt, workers=arguments.workers)
             validation = validate(scenes, assembly, session)
             validations.append(validation)
@@ -150,9 +151,9 @@ def _tell(
         say(report_run(session.work_dir, session.work_dir / "report.html", session.must_end(), pairs))
 
 
-def _assemble(arguments: argparse.Namespace, choice: RecipeChoice) -> Assembly:
+def _assemble(arguments: argparse.Namespace, name: str, mode: Mode) -> Assembly:
     """The parts of a run of a recipe, with the units and the robust method that the command names."""
-    assembly = options.assembly_of(arguments, choice)
+    assembly = options.assembly_of(arguments, name, mode)
     recipe = with_units(assembly.recipe, arguments.units)
     given = {"method": arguments.method, "threshold": arguments.threshold}
     changes = {key: value for key, value in given.items() if value is not None}
