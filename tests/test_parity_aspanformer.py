@@ -13,8 +13,7 @@ from semi_dense import (
 )
 
 from mkpc_kaggle.matchers.networks.adaptive_span import CELLS_AT_ONCE, adaptive_span, sample_usable, span_attention
-from mkpc_kaggle.matchers.networks.aspan_transformer import RADIUS
-from mkpc_kaggle.matchers.networks.aspanformer import AspanFormer
+from mkpc_kaggle.matchers.networks.aspanformer import RADIUS, AspanFormer
 from mkpc_kaggle.matchers.networks.fine_matching import cell_points
 from mkpc_kaggle.matchers.networks.grids import to_2x2_blocks
 from mkpc_kaggle.matchers.networks.position import FIXED_DECAY, sine_positions

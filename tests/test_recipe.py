@@ -186,7 +186,7 @@ def unit(**changes):
         (units(unit(), unit(matcher='"a"', fallback='"sift"')), "1:sift@640 twice"),
         (units(unit(), unit(stage=3)), r"unit 2: stage must be in \[1, 2\], not 3"),
         (units(unit(long_side=-9)), r"unit 1: long_side must be in \[0, 99999\]"),
-        (units(unit(long_side=None)), "one of long_side and area must be given"),
+        (units(unit(long_side=None)), "either long_side or area must be given"),
         (units(unit(area='"9x9"')), "and not both"),
         (units(unit(max_matches=0)), r"max_matches must be in \[1, inf\), not 0"),
         (units(unit(stretch="true")), "stretch needs an area"),

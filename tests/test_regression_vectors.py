@@ -16,7 +16,7 @@ from torch.nn import functional
 from mkpc_kaggle.matchers.contract import Placement
 from mkpc_kaggle.matchers.networks import (
     aliked,
-    aspan_transformer,
+    aspanformer,
     coarse_matching,
     dad,
     dedode_decoder,
@@ -107,7 +107,7 @@ MISTAKES = [  # in a matcher: the module or class, what is changed there, and ho
     ("loftr", fine_matching, "CENTRE", 11),
     ("loftr", linear_attention.functional, "elu", lambda x, inplace: x.relu_()),
     ("quadtree", coarse_matching, "inner_cells", lambda mask, border: mask.flatten()),
-    ("aspanformer", aspan_transformer, "RADIUS", 4.0),
+    ("aspanformer", aspanformer, "RADIUS", 4.0),
     ("dkm", gaussian_process, "TEMPERATURE", 0.25),
 ]
 

@@ -12,7 +12,6 @@ from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.matchers import roma
 from mkpc_kaggle.matchers.contract import Placement, Precision, Training
-from mkpc_kaggle.matchers.networks.dinov2 import DinoV2, DinoV2Config
 from mkpc_kaggle.matchers.networks.roma import stretch
 from mkpc_kaggle.matchers.roma import RomaMatcher, RomaOptions
 from mkpc_kaggle.weights import WeightStore
@@ -56,17 +55,6 @@ def test_the_published_sizes_are_a_stretched_unit_of_864() -> None:
     assert RomaMatcher(None, RomaOptions(), "cpu")._first_size(Size(864, 864)) == (560, 560)  # type: ignore[arg-type]
     assert stretch(torch.Size([560, 560])) == 1.25
     assert stretch(torch.Size([864, 864])) == pytest.approx(1.25 * 1.542857, rel=1e-6)
-
-
-def test_a_pair_needs_as_many_passes_of_both(store: WeightStore) -> None:
-    (first,), (second,) = (loaded(store, passes=passes).encode([picture(40, 56)]) for passes in (1, 2))
-    with pytest.raises(ValueError, match="second pass"):
-        loaded(store).match([first], [second])
-
-
-def test_an_image_of_other_sides_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"multiples of 14, not \(28, 30\)"):
-        DinoV2(DinoV2Config(8, 1, 1, 2))(torch.zeros(1, 3, 28, 30))
 
 
 def test_other_weights_or_another_networks_checkpoint_are_refused(store: WeightStore, tmp_path: Path) -> None:

@@ -9,8 +9,7 @@ import torch
 from golden import Stage, recorded
 
 from mkpc_kaggle.geometry.coordinates import Size, from_normalised
-from mkpc_kaggle.matchers.networks.dense_warp import DenseWarp, dense_warp
-from mkpc_kaggle.matchers.networks.gaussian_process import kernel
+from mkpc_kaggle.matchers.networks.dense_warp import DenseWarp, dense_warp, kernel
 from mkpc_kaggle.matchers.networks.pixels import MEAN, STD, network_input
 from mkpc_kaggle.matchers.networks.warp_refiner import local_correlation
 

@@ -4,8 +4,7 @@ import torch
 from dense import joined, one_thread, recorded_refinement, refiner_values, side_by_side
 from golden import recorded
 
-from mkpc_kaggle.matchers.networks.dense_warp import dense_warp
-from mkpc_kaggle.matchers.networks.gaussian_process import kernel, tokens
+from mkpc_kaggle.matchers.networks.dense_warp import dense_warp, kernel, tokens
 from mkpc_kaggle.matchers.networks.grids import as_map
 
 DINOV2_BLOCKS, DECODER_BLOCKS = (1, 12, 24), (1, 5)
