@@ -4,8 +4,6 @@ The weights are stand-ins: what is matched has no worth, but it is matched by al
 """
 
 import csv
-import runpy
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -17,11 +15,11 @@ import pytest
 from checkpoints import FILES, use_manifest, write_checkpoints
 from standin import scene, use_narrow
 
+from mkpc_kaggle.cli import main
 from mkpc_kaggle.data.competition import read_submission, read_test_side, submission_problems
 from mkpc_kaggle.engine.journal_tables import JournalReader
 from mkpc_kaggle.weights import WeightFile
 
-ROOT = Path(__file__).resolve().parents[1]
 COLUMNS = ("sample_id", "batch_id", "image_1_id", "image_2_id")
 
 
@@ -100,15 +98,6 @@ def write_recipe(directory: Path, matcher: str) -> Path:
     return path
 
 
-def make_submission(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> None:
-    """The front door, in this process, so that it meets the manifest that was put in its way."""
-    script = str(ROOT / "make_submission.py")
-    monkeypatch.setattr(sys, "argv", [script, *map(str, arguments)])
-    with pytest.raises(SystemExit) as left:
-        runpy.run_path(script, run_name="__main__")
-    assert left.value.code == 0
-
-
 def matches_found(work_dir: Path) -> dict[tuple[int, int], int]:
     """The matches of each pair's unit by (pair, stage); none of the units may have failed."""
     with JournalReader(work_dir) as journal:
@@ -149,11 +138,10 @@ def run(
         use_manifest(monkeypatch, checkpoints.of(matcher))
         use_narrow(monkeypatch)
         output, recipe = tmp_path / f"{name}.csv", write_recipe(tmp_path, matcher)
-        make_submission(
-            monkeypatch,
-            *("--test-dir", test_dir, "--output", output, "--recipe", recipe, "--weights", checkpoints.directory),
-            *("--time-limit", "10m", "--device", "cpu", "--no-report", "--workers", workers),
-        )
+        arguments = ("--test-dir", test_dir, "--output", output, "--recipe", recipe)
+        options = ("--weights", checkpoints.directory, "--time-limit", "10m", "--device", "cpu", "--no-report")
+        # In this process, so that it meets the manifest that was put in its way.
+        assert main(["submit", *map(str, (*arguments, *options, "--workers", workers))]) == 0
         assert_good(output, test_dir)
         return Made(output, matches_found(tmp_path / f"{name}.work"))
 

@@ -4,6 +4,8 @@ from collections.abc import Sequence
 from math import ceil
 from typing import TypeAlias
 
+import numpy as np
+
 MAX_IMAGES = 2000  # the search takes the square of their number
 
 Ends: TypeAlias = tuple[int, int]  # the two images of a pair by their places, the smaller first
@@ -19,22 +21,22 @@ def extra_pairs(image_count: int, pairs: Sequence[Ends], per_image: float) -> li
     """
     if image_count > MAX_IMAGES:
         return []
-    partners: list[set[int]] = [set() for _ in range(image_count)]
+    linked = np.eye(image_count, dtype=bool)  # (N, N): an image is linked with its partners and with itself
     for first, second in pairs:
-        partners[first].add(second)
-        partners[second].add(first)
-    known = {(min(ends), max(ends)) for ends in pairs}
+        linked[first, second] = linked[second, first] = True
+    common = linked.astype(np.float32) @ linked.astype(np.float32)  # (N, N): partners in common; exact below 2**24
+    degrees = linked.sum(1)
     wanted = min(ceil(per_image * image_count), image_count * (image_count - 1) // 2)
     extra: list[Ends] = []
-    while len(known) + len(extra) < wanted:
-        incomplete = (image for image in range(image_count) if len(partners[image]) < image_count - 1)
-        image = min(incomplete, key=lambda each: len(partners[each]))
-        near = set().union(*(partners[partner] for partner in partners[image])) - partners[image] - {image}
-        strangers = near or set(range(image_count)) - partners[image] - {image}
-        partner = min(
-            strangers, key=lambda each: (-len(partners[image] & partners[each]), len(partners[each]), each)
-        )
-        partners[image].add(partner)
-        partners[partner].add(image)
+    while (degrees.sum() - image_count) // 2 < wanted:
+        image = int(np.where(degrees < image_count, degrees, image_count).argmin())
+        likeness = np.where(linked[image], -np.inf, common[image] * image_count - degrees)
+        partner = int(likeness.argmax())
+        for here, there in ((image, partner), (partner, image)):
+            theirs = linked[there].nonzero()[0]
+            common[here, theirs] += 1
+            common[theirs, here] += 1
+        linked[image, partner] = linked[partner, image] = True
+        degrees[[image, partner]] += 1
         extra.append((min(image, partner), max(image, partner)))
     return extra
