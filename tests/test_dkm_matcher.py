@@ -10,8 +10,8 @@ from pictures import match_one, picture, same, write_store
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.matchers import dkm
 from mkpc_kaggle.matchers.contract import Placement, Training
-from mkpc_kaggle.matchers.dense import DenseEncoding
-from mkpc_kaggle.matchers.dkm import DkmMatcher, DkmOptions
+from mkpc_kaggle.matchers.dense import DenseEncoding, DenseOptions
+from mkpc_kaggle.matchers.dkm import DkmMatcher
 from mkpc_kaggle.matchers.networks.dense_warp import DenseFeatures, DenseWarp
 from mkpc_kaggle.matchers.networks.dkm import DKM
 from mkpc_kaggle.matchers.networks.grids import as_grid
@@ -35,12 +35,12 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> WeightStore:
 
 @pytest.fixture(scope="module")
 def network(store: WeightStore) -> DKM:
-    return dkm.load(store, DkmOptions(), Placement())._network
+    return dkm.load(store, DenseOptions(), Placement())._network
 
 
 @pytest.fixture
 def matcher(network: DKM) -> DkmMatcher:
-    return DkmMatcher(network, DkmOptions(matches=300), "cpu")
+    return DkmMatcher(network, DenseOptions(matches=300), "cpu")
 
 
 def test_which_matches_are_drawn_depends_on_both_pictures(matcher: DkmMatcher) -> None:
@@ -62,7 +62,7 @@ def test_padding_changes_nothing(matcher: DkmMatcher) -> None:
 
 
 def test_two_passes_look_at_the_picture_shrunk_and_whole(network: DKM) -> None:
-    matcher = DkmMatcher(network, DkmOptions(passes=2), "cpu")
+    matcher = DkmMatcher(network, DenseOptions(passes=2), "cpu")
     (encoded,) = matcher.encode([picture(48, 80)])
     assert encoded.features.coarse.at(1).shape == (1, 3, 30, 50)
     assert encoded.features.fine is not None
@@ -94,7 +94,7 @@ def identity_warp(height: int, width: int, certainty: float) -> DenseWarp:
 def test_points_of_either_picture_are_in_its_own_pixels() -> None:
     """Both show the same, at another size: places relative to the edges agree."""
     warps = identity_warp(40, 60, 0.3), identity_warp(80, 30, 0.9)
-    matcher = DkmMatcher(Given(*warps), DkmOptions(matches=9999), "cpu")  # type: ignore[arg-type]
+    matcher = DkmMatcher(Given(*warps), DenseOptions(matches=9999), "cpu")  # type: ignore[arg-type]
     matches = match_one(matcher, picture(40, 60), picture(80, 30))
     assert len(matches) == 40 * 60 + 80 * 30
     expected = (matches.points0 + 0.5) * (30 / 60, 80 / 40) - 0.5
@@ -105,13 +105,13 @@ def test_points_of_either_picture_are_in_its_own_pixels() -> None:
     np.testing.assert_array_equal(matches.scores == np.float32(0.3), whole0)
     assert set(matches.scores.tolist()) == {float(np.float32(0.3)), float(np.float32(0.9))}
     unsure = identity_warp(9, 9, 0.0), identity_warp(9, 9, 0.0)
-    matcher = DkmMatcher(Given(*unsure), DkmOptions(), "cpu")  # type: ignore[arg-type]
+    matcher = DkmMatcher(Given(*unsure), DenseOptions(), "cpu")  # type: ignore[arg-type]
     assert len(match_one(matcher, picture(9, 9), picture(9, 9))) == 0
 
 
 def test_other_weights_or_another_networks_checkpoint_are_refused(store: WeightStore, tmp_path: Path) -> None:
     with pytest.raises(UserError, match="dkm-indoor"):
-        dkm.load(store, DkmOptions(training=Training.INDOOR), Placement())
+        dkm.load(store, DenseOptions(training=Training.INDOOR), Placement())
     torch.save({"weight": torch.ones(3)}, tmp_path / "DKMv3_outdoor.pth")
     with pytest.raises(UserError, match="'dkm-outdoor' do not fit the network"):
-        dkm.load(WeightStore([tmp_path], store.files), DkmOptions(), Placement())
+        dkm.load(WeightStore([tmp_path], store.files), DenseOptions(), Placement())

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import ceil
 from typing import Any
 
 import torch
@@ -40,12 +39,6 @@ class SemiDenseEncoding:
     content: Size
 
     @property
-    def padded(self) -> bool:
-        """Whether there are coarse cells without content."""
-        height, width = self.maps.coarse.shape[2:]
-        return (width, height) != tuple(ceil(side / COARSE_STRIDE) for side in self.content)
-
-    @property
     def mask(self) -> Tensor:
         """(1, h, w) bool, True for the coarse cells whose top-left pixel is content."""
         height, width = (
@@ -68,8 +61,6 @@ class SemiDenseMatcher(PairwiseMatcher[SemiDenseEncoding]):
         if not pictures:
             return []
         maps = self._network.encode(image_batch(pictures, self.device))
-        if len(pictures) == 1:
-            return [SemiDenseEncoding(maps, pictures[0].content)]
         # Copies: a part of a map would keep all of it in memory.
         singles = zip(torch.split(maps.coarse, 1), torch.split(maps.fine, 1), strict=True)
         return [
@@ -78,9 +69,9 @@ class SemiDenseMatcher(PairwiseMatcher[SemiDenseEncoding]):
         ]
 
     def _match(self, first: SemiDenseEncoding, second: SemiDenseEncoding) -> Matches:
+        masks = first.mask, second.mask
         # Even a mask that is all True can change rounding.
-        masks = (first.mask, second.mask) if first.padded or second.padded else None
-        found = self._network.match(first.maps, second.maps, masks)
+        found = self._network.match(first.maps, second.maps, None if all(mask.all() for mask in masks) else masks)
         points0, points1 = (from_corner(points.float().cpu().numpy()) for points in (found.points0, found.points1))
         return Matches(points0, points1, found.coarse.confidence.float().cpu().numpy())
 
