@@ -11,13 +11,12 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any, ClassVar
 
-from mkpc_kaggle.config import AT_LEAST_1, Config, Range, check_keys, check_ranges, from_table
+from mkpc_kaggle.config import AT_LEAST_0, AT_LEAST_1, Config, Range, check_keys, check_ranges, from_table
 from mkpc_kaggle.errors import UserError, read_text
 from mkpc_kaggle.geometry.coordinates import Box, Size, View
 from mkpc_kaggle.geometry.critical_region import MkpcConfig
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.geometry.robust import RobustConfig
-from mkpc_kaggle.scene.config import SceneConfig
 
 DIRECTORY = Path(__file__).resolve().parent / "recipes"
 MAX_SIDE_PX = 99_999
@@ -74,6 +73,34 @@ class Unit:
         if self.stretch:
             return View.stretched(crop, size=Size(width, height), multiple=multiple)
         return View.of_area(crop, area=width * height, multiple=multiple)
+
+
+class CameraModel(StrEnum):
+    """COLMAP's models of one focal length, the principal point at the centre; RADIAL has a distortion too."""
+
+    PINHOLE = "SIMPLE_PINHOLE"
+    RADIAL = "SIMPLE_RADIAL"
+
+
+@dataclass(frozen=True)
+class SceneConfig:
+    """Settings of :mod:`mkpc_kaggle.scene`, table ``[scene]`` of a recipe."""
+
+    camera_model: CameraModel = CameraModel.PINHOLE
+    each_matcher: bool = True  # also reconstruct each matcher's matches alone; a pair gets the mean of its cameras
+    shared_intrinsics: float = 0.02  # images of one size share a camera if most focals are this close; 0: never
+    pairs_per_image: float = 5.0  # a batch with fewer pairs gets extra pairs, for its scene alone; 0: none
+    threads: int = 1  # more than one: the last digits differ from run to run
+
+    FORMER: ClassVar = {"one_camera": "shared_intrinsics"} | dict.fromkeys((
+        "mapper", "cell", "least_tracks", "agreement", "one_camera_images", "one_camera_weak", "one_camera_points",
+        "least_inliers", "prior_focal", "least_images", "least_pairs_per_image", "most_images", "lowest_focal",
+        "highest_focal", "least_points", "contradiction_error", "contradiction_matches", "contradiction_share",
+        "verification_error", "focal_sigma", "seed",
+    ), "")  # fmt: skip
+
+    def __post_init__(self) -> None:
+        check_ranges(self, shared_intrinsics=AT_LEAST_0, pairs_per_image=AT_LEAST_0, threads=AT_LEAST_1)
 
 
 @dataclass(frozen=True)
