@@ -65,8 +65,8 @@ def main(arguments: Sequence[str] | None = None, *, started: float | None = None
             return EXIT_BAD_INPUT
 
 
-def make_parser(arguments: Sequence[str]) -> argparse.ArgumentParser:
-    """The parser of these arguments; only the module of their command is imported, since imports take time."""
+def make_parser(arguments: Sequence[str] = tuple(COMMANDS)) -> argparse.ArgumentParser:
+    """The parser of these arguments; only the commands among them are imported, since imports take time."""
     told = "Two-stage image matching with Matching Key-Points Crop, offline, inside a time budget."
     parser = argparse.ArgumentParser("mkpc_kaggle", description=told, epilog="COMMAND --help tells more.")
     parser.add_argument("--version", action="version", version=__version__)
