@@ -137,13 +137,6 @@ def test_degenerate_matches_end_in_a_value(name):
         assert result.ok and result.magsac is None
 
 
-def test_the_search_looks_at_a_sample_of_many_matches_and_inliers_are_of_all():
-    matches = seen(CAMERAS, 3000, 0.05)
-    result = with_prior(matches)
-    assert result.inliers.mean() > 0.9
-    assert_array_equal(result.inliers, sampson_distances(result.matrix, matches) < MAGSAC.threshold)
-
-
 def test_repetitions_and_what_is_not_finite_change_nothing():
     matches = seen(CAMERAS, 80, 0.1, 20)
     bad = Matches(np.full((9, 2), np.nan), np.full((9, 2), 1.0), np.ones(9))

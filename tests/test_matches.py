@@ -46,12 +46,7 @@ def test_any_dtype_is_cast_to_contiguous_float32(dtype):
 
 @pytest.mark.parametrize(
     ("shape0", "shape1", "shape_scores"),
-    [
-        ((2, 2), (3, 2), (3,)),
-        ((3, 3), (3, 2), (3,)),
-        ((3, 2), (3, 2), (3, 1)),
-        ((3, 2), (6,), (3,)),
-    ],
+    [((2, 2), (3, 2), (3,)), ((3, 3), (3, 2), (3,)), ((3, 2), (3, 2), (3, 1)), ((3, 2), (6,), (3,))],
 )
 def test_shapes_that_disagree_are_an_error(shape0, shape1, shape_scores):
     with pytest.raises(ValueError, match="shape"):
@@ -75,13 +70,6 @@ def test_concatenation_keeps_every_match_in_order_duplicates_too():
     assert_same(together[:4], a)
     assert_same(together[4:7], b)
     assert_same(together[7:], a)
-
-
-def test_a_mask_indices_and_a_slice_choose_matches():
-    matches = scored([5, 6, 7, 8])
-    assert places(matches[np.array([True, False, False, True])]) == [0, 3]
-    assert places(matches[np.array([2, 0])]) == [2, 0]
-    assert places(matches[1:3]) == [1, 2]
 
 
 @given(scores=st.lists(st.integers(0, 5), max_size=40), most=st.integers(0, 45))

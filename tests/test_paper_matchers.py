@@ -17,7 +17,7 @@ from standin import scene, use_narrow
 
 from mkpc_kaggle.cli import main
 from mkpc_kaggle.data.competition import read_submission, read_test_side, submission_problems
-from mkpc_kaggle.engine.journal_tables import JournalReader
+from mkpc_kaggle.engine.journal import JournalReader
 from mkpc_kaggle.weights import WeightFile
 
 COLUMNS = ("sample_id", "batch_id", "image_1_id", "image_2_id")
@@ -128,13 +128,7 @@ def run(
 ) -> Callable[..., Made]:
     """A function that makes a submission of a test side with one of the matchers."""
 
-    def made(
-        matcher: str,
-        test_dir: Path,
-        name: str = "submission",
-        *,
-        workers: int = 0,
-    ) -> Made:
+    def made(matcher: str, test_dir: Path, name: str = "submission", *, workers: int = 0) -> Made:
         use_manifest(monkeypatch, checkpoints.of(matcher))
         use_narrow(monkeypatch)
         output, recipe = tmp_path / f"{name}.csv", write_recipe(tmp_path, matcher)

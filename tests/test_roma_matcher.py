@@ -1,17 +1,14 @@
 """RoMa as a matcher, from checkpoints in the public files' format, with fewer channels and stand-in weights."""
 
-from pathlib import Path
-
 import pytest
 import torch
 from checkpoints import dinov2_alone, roma_alone
 from pictures import as_picture, picture, write_store
 from standin import filled, narrow_roma, scene, use_narrow
 
-from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.matchers import roma
-from mkpc_kaggle.matchers.contract import Placement, Precision, Training
+from mkpc_kaggle.matchers.contract import Placement, Precision
 from mkpc_kaggle.matchers.networks.roma import stretch
 from mkpc_kaggle.matchers.roma import RomaMatcher, RomaOptions
 from mkpc_kaggle.weights import WeightStore
@@ -57,13 +54,10 @@ def test_the_published_sizes_are_a_stretched_unit_of_864() -> None:
     assert stretch(torch.Size([864, 864])) == pytest.approx(1.25 * 1.542857, rel=1e-6)
 
 
-def test_other_weights_or_another_networks_checkpoint_are_refused(store: WeightStore, tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="roma-indoor"):
-        loaded(store, training=Training.INDOOR)
-    for name in ("roma.pth", "dinov2.pth"):
-        torch.save({"weight": torch.ones(3)}, tmp_path / name)
-    with pytest.raises(UserError, match="'roma-outdoor with dinov2-vitl14' do not fit the network"):
-        roma.load(WeightStore([tmp_path], store.files), RomaOptions(), Placement())
+def test_a_pair_needs_as_many_passes_of_both(store: WeightStore) -> None:
+    (first,), (second,) = (loaded(store, passes=passes).encode([picture(40, 56)]) for passes in (1, 2))
+    with pytest.raises(ValueError, match="second pass"):
+        loaded(store).match([first], [second])
 
 
 @pytest.mark.parametrize("precision", [Precision.BFLOAT16, Precision.FLOAT16])

@@ -68,11 +68,6 @@ def test_where_fewer_agree_nothing_is_shared(focals: tuple[float, ...]) -> None:
     assert shared(*focals) == {}
 
 
-def test_zero_turns_it_off() -> None:
-    assert shared(838, 839, 840, 841, 842, tolerance=0) == {}
-    assert shared(*[FOCAL] * 5, tolerance=0) == {}, "also where no focal length moved from its prior"
-
-
 def focals_of(solution: Solution) -> list[float]:
     return [found.focal for each in solution.reconstructions for model in each.models for found in model.images]
 

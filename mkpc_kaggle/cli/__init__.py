@@ -1,20 +1,12 @@
 """The command line: ``python -m mkpc_kaggle COMMAND`` and ``make_submission.py``."""
 
-import argparse
-import errno
-import signal
+import os
 import sys
-import time
-import warnings
 from collections.abc import Sequence
-from importlib import import_module
-from io import TextIOWrapper
-from typing import NoReturn
+from typing import TYPE_CHECKING, NoReturn
 
-from mkpc_kaggle import __version__
-from mkpc_kaggle.engine.budget import process_started
-from mkpc_kaggle.engine.console import complain, leave, warn
-from mkpc_kaggle.errors import UserError
+if TYPE_CHECKING:
+    import argparse
 
 COMMANDS = {
     "submit": "a test directory -> submission.csv",
@@ -28,11 +20,20 @@ COMMANDS = {
     "demo": "render a small test set with known poses",
 }
 EXIT_BAD_INPUT = 2
+EXIT_BROKEN_PIPE = 128 + 13  # a shell's status for SIGPIPE, which Windows lacks
+EXIT_INTERRUPTED = 128 + 2  # and for SIGINT
 
 
 def program(arguments: Sequence[str] | None = None) -> NoReturn:
     """Run a command and end the process, without what an interpreter would still do for a second or longer."""
-    leave(main(arguments, started=process_started()))
+    try:  # imports take a while, and Ctrl-C is no error
+        from mkpc_kaggle.engine.budget import process_started
+        from mkpc_kaggle.engine.console import leave
+
+        status = main(arguments, started=process_started())
+    except KeyboardInterrupt:
+        os._exit(EXIT_INTERRUPTED)
+    leave(status)
 
 
 def main(arguments: Sequence[str] | None = None, *, started: float | None = None) -> int:
@@ -40,6 +41,14 @@ def main(arguments: Sequence[str] | None = None, *, started: float | None = None
 
     141: the reader of the output closed the pipe. The time limit counts from ``started``; default: now.
     """
+    import errno
+    import time
+    import warnings
+    from io import TextIOWrapper
+
+    from mkpc_kaggle.engine.console import complain, warn
+    from mkpc_kaggle.errors import UserError
+
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):  # paths and ids may have letters that the terminal lacks
             stream.reconfigure(errors="backslashreplace")
@@ -55,9 +64,9 @@ def main(arguments: Sequence[str] | None = None, *, started: float | None = None
             return EXIT_BAD_INPUT
         except KeyboardInterrupt:
             complain("interrupted")
-            return 128 + signal.SIGINT
+            return EXIT_INTERRUPTED
         except BrokenPipeError:  # the reader closed the pipe, as head does
-            return 128 + 13  # a shell's status for SIGPIPE, which Windows lacks
+            return EXIT_BROKEN_PIPE
         except OSError as error:
             if error.errno != errno.ENAMETOOLONG:
                 raise
@@ -65,8 +74,13 @@ def main(arguments: Sequence[str] | None = None, *, started: float | None = None
             return EXIT_BAD_INPUT
 
 
-def make_parser(arguments: Sequence[str] = tuple(COMMANDS)) -> argparse.ArgumentParser:
+def make_parser(arguments: Sequence[str] = tuple(COMMANDS)) -> "argparse.ArgumentParser":
     """The parser of these arguments; only the commands among them are imported, since imports take time."""
+    import argparse
+    from importlib import import_module
+
+    from mkpc_kaggle import __version__
+
     told = "Two-stage image matching with Matching Key-Points Crop, offline, inside a time budget."
     parser = argparse.ArgumentParser("mkpc_kaggle", description=told, epilog="COMMAND --help tells more.")
     parser.add_argument("--version", action="version", version=__version__)

@@ -18,7 +18,7 @@ from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.data.images import Unreadable, printable, read_image
 from mkpc_kaggle.data.outputs import replacing
 from mkpc_kaggle.engine.budget import format_duration
-from mkpc_kaggle.engine.journal_tables import EventKind
+from mkpc_kaggle.engine.journal import EventKind
 from mkpc_kaggle.engine.records import SceneRecord
 from mkpc_kaggle.errors import writing
 from mkpc_kaggle.pipeline.two_stage import to_image

@@ -13,14 +13,7 @@ from kornia.feature import DISK, XFeat
 from torch import nn
 
 from mkpc_kaggle.geometry.coordinates import Box, Size, View
-from mkpc_kaggle.matchers import (
-    aliked_lightglue,
-    aspanformer,
-    disk_lightglue,
-    loftr,
-    quadtree,
-    xfeat_lighterglue,
-)
+from mkpc_kaggle.matchers import aliked_lightglue, aspanformer, disk_lightglue, loftr, quadtree, xfeat_lighterglue
 from mkpc_kaggle.matchers.aliked import AlikedMatcher, AlikedOptions
 from mkpc_kaggle.matchers.contract import Colour, MatcherSpec, Picture, Placement
 from mkpc_kaggle.matchers.dense import DenseOptions
