@@ -11,12 +11,7 @@ from mkpc_kaggle.geometry.coordinates import Size, from_normalised
 from mkpc_kaggle.matchers.networks.dense_warp import DenseWarp, dense_warp
 from mkpc_kaggle.matchers.networks.pixels import MEAN, STD, network_input
 
-MODES = {  # of sampling, by the golden files' names: threshold, balanced
-    "threshold": (0.05, False),
-    "threshold_balanced": (0.05, True),
-    "raw": (1.0, False),
-    "balanced": (1.0, True),
-}
+MODES = {"threshold_balanced": 0.05, "balanced": 1.0}  # of sampling, by the golden files' names: the threshold
 
 
 @contextmanager
