@@ -232,7 +232,7 @@ class Journal(JournalReader):
     def forget_changed(self, pairs: Sequence[Pair]) -> int:
         """Forget the pairs of which an image has not the content any more that was matched; how many these are.
 
-        Where such an image was in a scene, all pairs of its batch are forgotten, and the scene: those that had all
+        Where such an image was in a scene, all pairs of its batch are forgotten, and the scene: pairs that had all
         they wanted have no points any more to reconstruct it from.
         """
         same, batches = cache(is_unchanged), {scene.batch for scene in self.scenes()}
