@@ -6,8 +6,10 @@ from typing import TYPE_CHECKING
 
 import pytest
 from hypothesis import HealthCheck, settings
+from kaggle_image import pack_wheel
 
 from mkpc_kaggle.demo import DemoSet, write_demo
+from mkpc_kaggle.package.wheels import BUNDLED
 from mkpc_kaggle.weights import store as weight_store
 
 if TYPE_CHECKING:
@@ -55,6 +57,15 @@ def undisturbed(pairs: "list[Pair]", tmp_path_factory: pytest.TempPathFactory) -
     from rectified import THREE_UNITS, RectifiedMatcher, run
 
     return run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path_factory.mktemp("undisturbed"))
+
+
+@pytest.fixture(scope="session")
+def wheels(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The wheels that a package for Kaggle bundles."""
+    directory = tmp_path_factory.mktemp("wheels")
+    for name in BUNDLED:
+        pack_wheel(name, directory)
+    return directory
 
 
 @pytest.fixture

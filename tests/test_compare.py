@@ -53,12 +53,6 @@ def test_nineteen_intervals_of_twenty_hold_the_truth() -> None:
     assert 0.90 <= held / trials <= 0.985
 
 
-@pytest.mark.parametrize("scenes", [[], [([], [])], [([0.1], [0.1, 0.2])]])
-def test_what_cannot_be_compared_is_refused(scenes: list[tuple[list[float], list[float]]]) -> None:
-    with pytest.raises(ValueError, match=r"pairs|scenes"):
-        paired_difference(scenes)
-
-
 def validation(name: str, *ids: str) -> Validation:
     scores = tuple(PairScore(pair, 0.5, PoseError(0, 0, 0)) for pair in ids)
     return Validation(name, (SceneScore("s", scores),))

@@ -48,7 +48,7 @@ def test_a_colour_png_is_read_as_it_is(tmp_path):
     assert (image.name, image.size, image.pixels.dtype) == (str(tmp_path / "a.png"), (7, 5), np.uint8)
 
 
-@pytest.mark.parametrize("shape", [(1, 1), (5, 7), (5, 7, 4), (2500, 3000)])
+@pytest.mark.parametrize("shape", [(1, 1), (5, 7), (5, 7, 4)])
 def test_gray_has_three_equal_channels_and_alpha_is_dropped(tmp_path, shape):
     pixels = noise(*shape)
     image = read_image(write(tmp_path / "a.png", pixels, cv2.IMWRITE_PNG_COMPRESSION, 1))
@@ -98,12 +98,6 @@ def test_what_is_no_picture_has_its_reason(tmp_path):
         assert reason(tmp_path / name) == "cannot be read: not a regular file"
 
 
-@pytest.mark.skipif(os.name != "posix" or os.geteuid() == 0, reason="root may read everything")
-def test_a_file_without_permission_is_unreadable(tmp_path):
-    write(tmp_path / "a.png", noise(5, 5, 3)).chmod(0)
-    assert "ermission denied" in reason(tmp_path / "a.png")
-
-
 @pytest.mark.parametrize("share", [0.001, 0.5, 0.99])
 def test_a_png_that_is_cut_off_is_unreadable(tmp_path, share):
     path = write(tmp_path / "a.png", noise(64, 64, 3))
@@ -131,13 +125,6 @@ def test_an_array_is_named_by_its_content_and_its_shape():
     assert Image.of_array(pixels).name == Image.of_array(pixels.copy()).name
     assert Image.of_array(pixels).name != Image.of_array(pixels.reshape(4, 6, 3)).name
     assert Image.of_array(pixels).name != Image.of_array(255 - pixels).name
-
-
-def test_a_gray_array_and_a_view_of_an_array_are_images():
-    gray = noise(6, 4)
-    assert_array_equal(Image.of_array(gray).pixels[..., 2], gray)
-    mirrored = noise(6, 4, 3)[:, ::-1]
-    assert_array_equal(Image.of_array(mirrored).pixels, mirrored)
 
 
 @pytest.mark.parametrize(

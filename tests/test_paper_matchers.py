@@ -128,13 +128,7 @@ def run(
 ) -> Callable[..., Made]:
     """A function that makes a submission of a test side with one of the matchers."""
 
-    def made(
-        matcher: str,
-        test_dir: Path,
-        name: str = "submission",
-        *,
-        workers: int = 0,
-    ) -> Made:
+    def made(matcher: str, test_dir: Path, name: str = "submission", *, workers: int = 0) -> Made:
         use_manifest(monkeypatch, checkpoints.of(matcher))
         use_narrow(monkeypatch)
         output, recipe = tmp_path / f"{name}.csv", write_recipe(tmp_path, matcher)

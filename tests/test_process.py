@@ -23,7 +23,7 @@ from mkpc_kaggle.engine.places import Place
 from mkpc_kaggle.engine.process import WORKER_ENVIRONMENT, ProcessWorker
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.scene.config import SceneConfig
+from mkpc_kaggle.recipe import SceneConfig
 from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -31,12 +31,11 @@ from mkpc_kaggle.engine.engine import Ending
 from mkpc_kaggle.engine.jobs import SceneJob, SceneResult
 from mkpc_kaggle.engine.scenes import Scenes
 from mkpc_kaggle.engine.session import Interrupt
-from mkpc_kaggle.recipe import Recipe
+from mkpc_kaggle.recipe import Recipe, SceneConfig
 from mkpc_kaggle.reporting.report import report_page
 from mkpc_kaggle.reporting.run_log import read_log
 from mkpc_kaggle.reporting.summary import overview
 from mkpc_kaggle.scene.choose import Reason
-from mkpc_kaggle.scene.config import SceneConfig
 from mkpc_kaggle.scene.view_graph import BatchPair
 
 RECIPE = replace(THREE_UNITS, scene=SceneConfig())

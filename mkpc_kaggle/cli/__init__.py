@@ -8,12 +8,20 @@ from typing import TYPE_CHECKING, NoReturn
 if TYPE_CHECKING:
     import argparse
 
-COMMANDS = ("submit", "match", "validate", "recipes", "weights", "check", "journal", "package", "demo")
+COMMANDS = {
+    "submit": "a test directory -> submission.csv",
+    "match": "two images -> F, counts, a figure",
+    "validate": "a directory with known poses -> mAA and pose AUC of a recipe",
+    "recipes": "the recipes, their units, and the weights that each lacks",
+    "weights": "the weight files: which are there, are they whole, fetch them",
+    "check": "is this submission.csv what the competition takes?",
+    "journal": "what a run did: overview, tables for pandas, report.html",
+    "package": "the folders that you upload to Kaggle: a dataset and a notebook",
+    "demo": "render a small test set with known poses",
+}
 EXIT_BAD_INPUT = 2
 EXIT_BROKEN_PIPE = 128 + 13  # a shell's status for SIGPIPE, which Windows lacks
 EXIT_INTERRUPTED = 128 + 2  # and for SIGINT
-
-_DESCRIPTION = "Two-stage image matching with Matching Key-Points Crop, offline, inside a time budget."
 
 
 def program(arguments: Sequence[str] | None = None) -> NoReturn:
@@ -47,7 +55,8 @@ def main(arguments: Sequence[str] | None = None, *, started: float | None = None
     with warnings.catch_warnings():
         warnings.showwarning = lambda message, *_, **__: warn(str(message))
         try:
-            parsed = make_parser().parse_args(arguments)
+            given = sys.argv[1:] if arguments is None else list(arguments)
+            parsed = make_parser(given).parse_args(given)
             parsed.started = time.monotonic() if started is None else started
             return int(parsed.run(parsed))
         except UserError as error:
@@ -65,24 +74,22 @@ def main(arguments: Sequence[str] | None = None, *, started: float | None = None
             return EXIT_BAD_INPUT
 
 
-def make_parser() -> "argparse.ArgumentParser":
-    """The parser of all commands."""
+def make_parser(arguments: Sequence[str]) -> "argparse.ArgumentParser":
+    """The parser of these arguments; only the module of their command is imported, since imports take time."""
     import argparse
     from importlib import import_module
 
     from mkpc_kaggle import __version__
 
-    parser = argparse.ArgumentParser("mkpc_kaggle", description=_DESCRIPTION, epilog="COMMAND --help tells more.")
+    told = "Two-stage image matching with Matching Key-Points Crop, offline, inside a time budget."
+    parser = argparse.ArgumentParser("mkpc_kaggle", description=told, epilog="COMMAND --help tells more.")
     parser.add_argument("--version", action="version", version=__version__)
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for name in COMMANDS:
-        command = import_module(f"mkpc_kaggle.cli.{name}")
-        sub = commands.add_parser(
-            name,
-            help=command.__doc__,
-            description=command.HELP,
-            formatter_class=argparse.RawDescriptionHelpFormatter,
-        )
-        command.add_arguments(sub)
-        sub.set_defaults(run=command.run)
+    for name, summary in COMMANDS.items():
+        sub = commands.add_parser(name, help=summary, formatter_class=argparse.RawDescriptionHelpFormatter)
+        if name in arguments:
+            command = import_module(f"mkpc_kaggle.cli.{name}")
+            sub.description = command.HELP
+            sub.set_defaults(run=command.run)
+            command.add_arguments(sub)
     return parser

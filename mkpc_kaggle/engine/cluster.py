@@ -53,14 +53,14 @@ class RayCluster:
 
 
 def parse_workers(text: str) -> int | RayCluster:
-    """What the user wrote; ``ValueError`` that lists the forms for anything else."""
+    """What the user wrote; raises :class:`UserError` that lists the forms for anything else."""
     if re.fullmatch(r"\d{1,3}", text):
         return int(text)
     if text == "ray":
         return RayCluster()
     found = re.fullmatch(r"ray://([^/\s]+:\d{1,5})", text)
     if found is None:
-        raise ValueError(f"{text!r} is none of: {FORMS}")
+        raise UserError(f"--workers: {text!r} is none of: {FORMS}")
     return RayCluster(found[1])
 
 

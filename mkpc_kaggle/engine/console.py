@@ -11,7 +11,6 @@ from contextlib import suppress
 from math import isfinite
 from typing import NoReturn, TextIO
 
-from mkpc_kaggle.data.outputs import discard_parts
 from mkpc_kaggle.engine.budget import Budget, format_duration
 
 LINE_INTERVAL_S = 30.0  # between lines of progress where a line cannot be drawn again
@@ -40,7 +39,6 @@ def _print(text: str, stream: TextIO | None, end: str = "\n") -> None:
 
 def leave(status: int) -> NoReturn:
     """End the process at once, and its children, stopped ones (SIGSTOP) too."""
-    discard_parts()
     for stream in (sys.stdout, sys.stderr):
         with suppress(OSError, ValueError):
             if stream is not None:

@@ -9,9 +9,8 @@ from mkpc_kaggle.engine.records import PairRecord
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.geometry.robust import RobustConfig
 from mkpc_kaggle.pipeline.pair import UnitResult
-from mkpc_kaggle.recipe import Unit
+from mkpc_kaggle.recipe import SceneConfig, Unit
 from mkpc_kaggle.scene.choose import Choice
-from mkpc_kaggle.scene.config import SceneConfig
 from mkpc_kaggle.scene.reconstruction import Reconstruction
 from mkpc_kaggle.scene.view_graph import BatchPair
 

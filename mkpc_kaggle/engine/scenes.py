@@ -15,8 +15,7 @@ from mkpc_kaggle.engine.jobs import SceneJob
 from mkpc_kaggle.engine.records import PairRecord, SceneRecord
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.pipeline.pair import UnitResult
-from mkpc_kaggle.recipe import Recipe
-from mkpc_kaggle.scene.config import SceneConfig
+from mkpc_kaggle.recipe import Recipe, SceneConfig
 from mkpc_kaggle.scene.densify import extra_pairs
 from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair, tracks_of
 

@@ -54,11 +54,6 @@ class RunLog:
         return run_tables(self.pairs, self.records, self.events)
 
     @property
-    def sessions(self) -> int:
-        """How often the run was started."""
-        return sum(event.kind == EventKind.START for event in self.events)
-
-    @property
     def session(self) -> tuple[Event, ...]:
         """The events since the run was last started."""
         starts = [place for place, event in enumerate(self.events) if event.kind == EventKind.START]

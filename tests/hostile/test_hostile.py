@@ -44,7 +44,6 @@ def template(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_template(tmp_path_factory.mktemp("template") / "room")
 
 
-@pytest.mark.timeout(900)
 @pytest.mark.parametrize(
     "case", [pytest.param(case, id=case.id, marks=() if case.id in QUICK else pytest.mark.slow) for case in ALL]
 )

@@ -169,7 +169,7 @@ CASES = [
         for name, make in SEARCHED.items()
     ),
     *(
-        Case("weights", f"{file}, {name}: recipe auto", AUTO, listed(file, make), says=file, seconds=120)
+        Case("weights", f"{file}, {name}: recipe auto", AUTO, listed(file, make), says=file)
         for file in LISTED
         for name, make in SEARCHED.items()
     ),

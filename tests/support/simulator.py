@@ -37,9 +37,8 @@ from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
 from mkpc_kaggle.pipeline.pair import UnitResult
-from mkpc_kaggle.recipe import Recipe, Unit
+from mkpc_kaggle.recipe import Recipe, SceneConfig, Unit
 from mkpc_kaggle.scene.choose import Choice, Reason
-from mkpc_kaggle.scene.config import SceneConfig
 
 RESTART_S = 8.0
 STALL = 20.0  # a unit that stalls takes so many times as long
