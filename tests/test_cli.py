@@ -47,7 +47,7 @@ def test_recipes_are_listed_with_what_they_lack(
     assert main(["recipes"]) == 0
     out = capsys.readouterr().out
     light = out[out.index("light: ") :]
-    assert "missing: xfeat: xfeat.pt or xfeat_sparse_bnfolded.safetensors" in light
+    assert "xfeat_lighterglue: no weights (xfeat: xfeat.pt or xfeat_sparse_bnfolded.safetensors" in light
     classical = out[out.index("classical: ") : out.index("light: ")]
     assert "all weights are there" in classical
     assert "    2:dkm@630x840  at most 4096\n" in out

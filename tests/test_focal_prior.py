@@ -148,19 +148,6 @@ def test_repetitions_and_what_is_not_finite_change_nothing():
     assert_array_equal(more.inliers, np.concatenate([once.inliers, once.inliers, np.zeros(9, bool)]))
 
 
-def test_what_makes_no_prior_is_an_error():
-    with pytest.raises(ValueError, match="homography"):
-        with_prior(Matches.empty(), model=ModelKind.H)
-    with pytest.raises(ValueError, match="needs the intrinsics"):
-        with_prior(Matches.empty(), model=ModelKind.E)
-    with pytest.raises(ValueError, match="sigma"):
-        FocalPrior(np.eye(3), -1)
-    with pytest.raises(ValueError, match="camera matrix"):
-        FocalPrior(np.diag([0.0, 1, 1]), 1)
-    with pytest.raises(ValueError, match="scale"):
-        FocalConfig(scale=0)
-
-
 @given(data=st.data(), n=st.integers(0, 24))
 @settings(max_examples=40, deadline=None)
 def test_whatever_the_points_are_the_answer_is_an_estimate(data, n):

@@ -13,7 +13,7 @@ from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.matchers import loma
 from mkpc_kaggle.matchers.contract import Placement, encoding_bytes
 from mkpc_kaggle.matchers.loma import LomaAdapter, LomaOptions
-from mkpc_kaggle.matchers.networks import strips
+from mkpc_kaggle.matchers.networks import layers
 from mkpc_kaggle.matchers.networks.loma import Loma, Variant, detector_size
 from mkpc_kaggle.matchers.networks.loma_matcher import LomaKeypoints
 from mkpc_kaggle.weights import WeightStore
@@ -134,6 +134,6 @@ def test_strips_of_rows_give_what_the_whole_gives(network: Loma, monkeypatch: py
     image = image_of(scene(157, 83, channels=3))
     points = torch.rand(1, 50, 2, generator=torch.Generator().manual_seed(0)) * 2 - 1
     logits, descriptors = network.detector.logits(image), network.descriptor(image, points)
-    monkeypatch.setattr(strips, "FLOATS", 83 * 32 * 50)
+    monkeypatch.setattr(layers, "STRIP_FLOATS", 83 * 32 * 50)
     torch.testing.assert_close(network.detector.logits(image), logits, rtol=0, atol=1e-3)
     torch.testing.assert_close(network.descriptor(image, points), descriptors, rtol=0, atol=1e-3)

@@ -17,7 +17,7 @@ from standin import scene, use_narrow
 
 from mkpc_kaggle.cli import main
 from mkpc_kaggle.data.competition import read_submission, read_test_side, submission_problems
-from mkpc_kaggle.engine.journal_tables import JournalReader
+from mkpc_kaggle.engine.journal import JournalReader
 from mkpc_kaggle.weights import WeightFile
 
 COLUMNS = ("sample_id", "batch_id", "image_1_id", "image_2_id")

@@ -12,7 +12,7 @@ from test_parity_superpoint import image_of
 from torch.nn import functional
 
 from mkpc_kaggle.geometry.coordinates import Size
-from mkpc_kaggle.matchers.networks.assignment import mutual_matches
+from mkpc_kaggle.matchers.networks.layers import mutual_matches
 from mkpc_kaggle.matchers.networks.superglue import SuperGlue, log_optimal_transport
 from mkpc_kaggle.matchers.networks.superpoint import SuperPointKeypoints
 

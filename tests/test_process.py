@@ -23,7 +23,7 @@ from mkpc_kaggle.engine.places import Place
 from mkpc_kaggle.engine.process import WORKER_ENVIRONMENT, ProcessWorker
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.scene.config import SceneConfig
+from mkpc_kaggle.recipe import SceneConfig
 from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -188,7 +188,7 @@ def test_a_worker_at_work_ends_with_its_parent_and_prints_nothing(tmp_path: Path
 
 BLOCKED = """
 import multiprocessing, signal
-from mkpc_kaggle.engine.process import signals_blocked
+from mkpc_kaggle.engine.process import worker_environment
 
 def tell(pipe):
     pipe.send(signal.pthread_sigmask(signal.SIG_BLOCK, ()))
@@ -197,7 +197,7 @@ if __name__ == "__main__":
     context = multiprocessing.get_context("spawn")
     ours, its = context.Pipe()
     process = context.Process(target=tell, args=(its,))
-    with signals_blocked():
+    with worker_environment():
         process.start()
     blocked = ours.recv()
     process.join()

@@ -1,4 +1,4 @@
-"""Progress: a bar on a terminal, few lines where every line stays."""
+"""Progress: a line drawn again on a terminal, few lines where every line stays."""
 
 from io import StringIO
 
@@ -26,7 +26,7 @@ class Clock:
         return self.now
 
 
-def test_a_terminal_has_a_bar_that_is_drawn_anew() -> None:
+def test_a_terminal_has_a_line_a_phase_that_is_drawn_again() -> None:
     stream = Terminal()
     progress = Progress(Budget(0.0, 100.0, Clock()), stream)
     progress.show(Phase.SWEEP, 8, 8)

@@ -2,11 +2,13 @@
 
 import json
 import os
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import combinations
+from typing import ClassVar
 
 import pytest
 
+from mkpc_kaggle.config import from_table
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Box, Size, View
 from mkpc_kaggle.geometry.critical_region import MkpcConfig
@@ -14,7 +16,7 @@ from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.geometry.robust import Method, RobustConfig
 from mkpc_kaggle.matchers.registry import matcher_names, spec_of
 from mkpc_kaggle.pipeline.availability import options_of
-from mkpc_kaggle.recipe import Mode, Recipe, RecipeChoice, Unit, load_recipe, parse_recipe, recipe_names
+from mkpc_kaggle.recipe import Mode, Recipe, Unit, load_recipe, parse_recipe, recipe_names, split_mode
 
 SIFT = 'units = [{ stage = 1, matcher = "sift", long_side = 640 }]\n'
 
@@ -166,7 +168,7 @@ def unit(**changes):
         (units(unit(), unit(matcher='"a"', fallback='"sift"')), "1:sift@640 twice"),
         (units(unit(), unit(stage=3)), r"unit 2: stage must be in \[1, 2\], not 3"),
         (units(unit(long_side=-9)), r"unit 1: long_side must be in \[0, 99999\]"),
-        (units(unit(long_side=None)), "one of long_side and area must be given"),
+        (units(unit(long_side=None)), "either long_side or area must be given"),
         (units(unit(area='"9x9"')), "and not both"),
         (units(unit(max_matches=0)), r"max_matches must be in \[1, inf\), not 0"),
         (units(unit(stretch="true")), "stretch needs an area"),
@@ -199,6 +201,20 @@ def test_options_that_a_matcher_does_not_have_are_refused(text, says):
         options_of(parse(SIFT + text), "sift")
     with pytest.raises(UserError, match=r"unknown matcher 'sitf'; known: .*aliked.*sift"):
         options_of(parse(SIFT), "sitf")
+
+
+@dataclass(frozen=True)
+class Settings:
+    FORMER: ClassVar = {"old": "new", "gone": ""}
+    new: int = 1
+
+
+@pytest.mark.parametrize(
+    ("key", "says"), [("old", "'old' is now called 'new'"), ("gone", "'gone' was removed"), ("x", "keys: new$")]
+)
+def test_a_former_key_is_refused_with_what_became_of_it(key, says):
+    with pytest.raises(UserError, match=f"table t.*{says}"):
+        from_table(Settings, {key: 1}, "table t")
 
 
 def test_a_recipe_is_found_by_its_name_or_path_and_nowhere_else(tmp_path):
@@ -264,15 +280,14 @@ def test_the_fingerprint_changes_with_whatever_decides_the_numbers(other):
 
 
 @pytest.mark.parametrize(
-    ("text", "choice", "folder"),
+    ("text", "recipe", "mode"),
     [
-        ("classical", RecipeChoice("classical"), "classical"),
-        ("classical:two-stage", RecipeChoice("classical"), "classical"),
-        ("my/own.toml:stage-1", RecipeChoice("my/own.toml", Mode.STAGE_1), "my_own.toml_stage-1"),
-        ("C:own.toml", RecipeChoice("C:own.toml"), "C_own.toml"),
-        (":stage-1", RecipeChoice(":stage-1"), "_stage-1"),
+        ("classical", "classical", Mode.TWO_STAGE),
+        ("classical:two-stage", "classical", Mode.TWO_STAGE),
+        ("my/own.toml:stage-1", "my/own.toml", Mode.STAGE_1),
+        ("C:own.toml", "C:own.toml", Mode.TWO_STAGE),
+        (":stage-1", ":stage-1", Mode.TWO_STAGE),
     ],
 )
-def test_a_choice_is_a_recipe_and_perhaps_a_mode(text: str, choice: RecipeChoice, folder: str) -> None:
-    assert RecipeChoice.parse(text) == choice
-    assert choice.folder == folder
+def test_a_choice_is_a_recipe_and_perhaps_a_mode(text: str, recipe: str, mode: Mode) -> None:
+    assert split_mode(text) == (recipe, mode)

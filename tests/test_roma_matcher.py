@@ -67,9 +67,9 @@ def test_half_precision_moves_most_targets_little(store: WeightStore, precision:
     pictures = as_picture(whole[:, :70]), as_picture(whole[:, 8:])
     warps = []
     for each in (Precision.FLOAT32, precision):
-        matcher = loaded(store, each, passes=1, symmetric=False)
+        matcher = loaded(store, each, passes=1)
         first, second = (encoded.features for encoded in matcher.encode(pictures))
-        (dense,) = matcher._network.match(first, second, symmetric=False)
+        dense, _ = matcher._network.match(first, second)
         assert dense.warp.dtype == dense.certainty.dtype == torch.float32
         warps.append(dense.warp[..., 2:])
     moved = (warps[0] - warps[1]).norm(dim=-1)

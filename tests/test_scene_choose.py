@@ -10,8 +10,8 @@ from benchmarks.synthetic_scene import SIZE, SyntheticScene, synthetic_scene
 from mkpc_kaggle.config import from_table
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.cameras import Camera
+from mkpc_kaggle.recipe import CameraModel, SceneConfig
 from mkpc_kaggle.scene.choose import MAX_DISAGREEMENT_DEG, Choice, Reason, choose
-from mkpc_kaggle.scene.config import CameraModel, SceneConfig
 from mkpc_kaggle.scene.reconstruction import RegisteredImage, SfmModel, filter_models
 from mkpc_kaggle.scene.view_graph import BatchImage
 

@@ -11,8 +11,8 @@ from rectified import run
 from synthetic import RECIPE, SyntheticMatcher, synthetic_pairs
 
 from mkpc_kaggle.engine.engine import Ending
+from mkpc_kaggle.recipe import SceneConfig
 from mkpc_kaggle.reporting.run_log import read_log
-from mkpc_kaggle.scene.config import SceneConfig
 from mkpc_kaggle.scene.densify import extra_pairs
 
 CHAIN = [(0, 1), (1, 2), (2, 3), (3, 4), (4, 5)]

@@ -14,9 +14,9 @@ from benchmarks.synthetic_scene import SIZE, SyntheticScene, registered_images, 
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import RobustConfig
+from mkpc_kaggle.recipe import CameraModel, SceneConfig
 from mkpc_kaggle.scene import colmap
 from mkpc_kaggle.scene.choose import Reason
-from mkpc_kaggle.scene.config import CameraModel, SceneConfig
 from mkpc_kaggle.scene.reconstruct import Solution, reconstruct_batch
 from mkpc_kaggle.scene.reconstruction import Reconstruction
 from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair, ViewGraph

@@ -10,8 +10,8 @@ from mkpc_kaggle.geometry.cameras import Camera, relative_pose
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.geometry.robust import RobustConfig
+from mkpc_kaggle.recipe import SceneConfig
 from mkpc_kaggle.scene.choose import estimate_at_known_focals, known_focal
-from mkpc_kaggle.scene.config import SceneConfig
 from mkpc_kaggle.scene.reconstruct import Solution, reconstruct_batch
 from mkpc_kaggle.scene.reconstruction import RegisteredImage, SfmModel
 from mkpc_kaggle.scene.shared_intrinsics import shared_intrinsics

@@ -159,6 +159,7 @@ def test_odd_pictures_get_an_f_or_the_fallback_row_and_a_line_in_the_summary(
         (["--time-limit", "soon"], "'soon' is not a duration"),
         (["--device", "abacus"], "unknown device 'abacus'"),
         (["--output", "/dev/null/submission.csv"], "cannot be written"),
+        (["--output", "/dev/null"], "--output /dev/null is a device; name a file"),
         (["--work-dir", "/dev/null/work"], "cannot be written"),
     ],
 )
@@ -182,6 +183,8 @@ def test_bad_input_is_told_in_one_line_before_any_work(
         (["--output", "test/test.csv"], "would be written over the input test/test.csv"),
         (["--output", "test/test_images/b/x.png"], "would be written over the input test/test_images"),
         (["--output", "w/m.pth", "--weights", "w"], "would be written over the input w"),
+        (["--report", "r.toml"], "exists and is not a .html file"),
+        (["--report", "test/test.csv"], "would be written over the input test/test.csv"),
         (["--work-dir", "test/test_images"], "would be written over the input test/test_images"),
         (["--recipe", "r.toml", "--output", "r.toml"], "would be written over the input r.toml"),
         (["--output", "s.html"], "are one file"),

@@ -145,7 +145,7 @@ def test_the_classical_recipe_reaches_plain_root_sift_scene_by_scene(tmp_path: P
         (["--train-dir", "T", "--recipe", "R", "--units", "sift"], "no unit 'sift'; it has 1:sift@320, 2:"),
         (["--train-dir", "T", "--recipe", "classical", "--threshold", "0"], "threshold must be in"),
         (["--pairs", "a.txt"], "go together"),
-        (["--pairs", "a.txt", "--image-root", ".", "--compare", "a", "b"], "need a --train-dir"),
+        (["--pairs", "a.txt", "--image-root", ".", "--compare", "a", "b"], "needs a --train-dir"),
         (["--train-dir", ".", "--image-root", "."], "go together"),
     ],
 )

@@ -1,9 +1,13 @@
-"""two images -> F, counts, a figure"""
+"""The command ``match``."""
 
 import argparse
 from pathlib import Path
 
 from mkpc_kaggle.cli import options
+from mkpc_kaggle.data.outputs import require_apart
+from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher, to_image
+from mkpc_kaggle.reporting.figures.pair import draw_pair
+from mkpc_kaggle.reporting.figures.style import save
 
 HELP = """\
 Match two images and print the fundamental matrix (x1^T F x0 = 0, pixel centres at integers), how many matches
@@ -19,13 +23,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    from mkpc_kaggle.data.outputs import require_apart
-    from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher, to_image
-    from mkpc_kaggle.reporting.figures.pair import draw_pair
-    from mkpc_kaggle.reporting.figures.style import save
-
-    inputs = [arguments.image0, arguments.image1, Path(arguments.recipe)]
-    require_apart({"--out": arguments.out}, inputs, weights=arguments.weights)
+    inputs = [arguments.image0, arguments.image1, Path(arguments.recipe), *arguments.weights]
+    require_apart({"--out": arguments.out}, inputs)
     images = to_image(arguments.image0), to_image(arguments.image1)
     matcher = TwoStageMatcher(
         arguments.recipe,

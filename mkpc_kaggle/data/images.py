@@ -3,17 +3,21 @@
 import hashlib
 import stat
 import threading
-from collections.abc import Iterable
+from collections import OrderedDict
+from collections.abc import Hashable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Generic, TypeVar
 
 import cv2
 import numpy as np
 
-from mkpc_kaggle.data.cache import ByteCache
 from mkpc_kaggle.geometry.coordinates import Pixels, Size
+
+Key = TypeVar("Key", bound=Hashable)
+Value = TypeVar("Value")
 
 # Of the longer side to the shorter. Beyond it an image counts as damaged: its views would be a few pixels high, or
 # would not fit into memory.
@@ -110,6 +114,31 @@ def _content_digest(data: Pixels) -> str:
 def printable(text: str) -> str:
     """``text`` with escapes for characters that UTF-8 cannot encode, which paths may have."""
     return text.encode("utf-8", "backslashreplace").decode()
+
+
+class ByteCache(Generic[Key, Value]):
+    """The most recently used values, ``limit`` bytes at most, shared by threads; a larger value is not kept."""
+
+    def __init__(self, limit: int) -> None:
+        self.limit, self.bytes = limit, 0
+        self._entries: OrderedDict[Key, tuple[Value, int]] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def get(self, key: Key) -> Value | None:
+        with self._lock:
+            if key not in self._entries:
+                return None
+            self._entries.move_to_end(key)
+            return self._entries[key][0]
+
+    def put(self, key: Key, value: Value, size: int) -> None:
+        with self._lock:
+            self.bytes += size - self._entries.pop(key, (value, 0))[1]
+            self._entries[key] = value, size
+            if size > self.limit:
+                self.bytes -= self._entries.pop(key)[1]
+            while self.bytes > self.limit:
+                self.bytes -= self._entries.popitem(last=False)[1][1]
 
 
 class ImageStore:

@@ -3,7 +3,7 @@
 import torch
 from golden import recorded
 
-from mkpc_kaggle.matchers.networks.assignment import mutual_matches
+from mkpc_kaggle.matchers.networks.layers import mutual_matches
 from mkpc_kaggle.matchers.networks.loma_matcher import LAYERS, log_scores
 
 

@@ -96,3 +96,8 @@ def run(
     budget = budget or Budget(time.monotonic(), limit)
     session = Session(work_dir, budget, interrupt or Interrupt(), progress=False, workers=workers)
     return run_pairs(pairs, assembly, session, publish)
+
+
+def matrices(report: RunReport) -> list[bytes]:
+    """Each pair's own F."""
+    return [record.pair_fundamental.tobytes() for record in report.records]
