@@ -24,7 +24,7 @@ from mkpc_kaggle.pipeline.assembly import Assembly, assemble
 
 @dataclass(frozen=True)
 class TimeSpent:
-    """Seconds by what they went into, the first job's left out; ``wall`` is from its end to the last one's.
+    """Seconds by what they went into, the first job's left out; ``wall`` is from its end to the last job's.
 
     ``tail`` are the estimates' of the last job, which nothing can hide.
     """

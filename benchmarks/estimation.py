@@ -27,7 +27,7 @@ from mkpc_kaggle.evaluation.validate import error_of
 from mkpc_kaggle.geometry.focal_prior import FocalConfig, FocalPrior, estimate_with_prior
 from mkpc_kaggle.geometry.metrics import PoseError, pair_accuracy
 from mkpc_kaggle.geometry.robust import Estimate, Matrix3, RobustConfig, estimate
-from mkpc_kaggle.scene.config import SceneConfig
+from mkpc_kaggle.recipe import SceneConfig
 from mkpc_kaggle.scene.reconstruct import reconstruct_batch
 from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair
 

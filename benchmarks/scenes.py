@@ -20,8 +20,8 @@ import numpy as np
 
 from benchmarks.synthetic_scene import SyntheticScene, registered_images, street, synthetic_scene
 from mkpc_kaggle.geometry.cameras import relative_pose
+from mkpc_kaggle.recipe import SceneConfig
 from mkpc_kaggle.scene import colmap
-from mkpc_kaggle.scene.config import SceneConfig
 from mkpc_kaggle.scene.reconstruct import Solution, reconstruct_batch
 
 

@@ -40,7 +40,7 @@ LONG_SIDES = {
     "xfeat_lighterglue": (1024, 1280, 800, 1152, 896, 1408),
 }
 """In the order in which recipes use them; all differ, since the same size would give the same matches."""
-MOST_MATCHES = {"sift": 8000}
+MAX_MATCHES = {"sift": 8000}
 OPTIONS: Mapping[str, Mapping[str, float]] = {"sift": {"features": 8000, "ratio": 0.8}}
 
 LAYOUTS = {
@@ -76,7 +76,7 @@ class Way:
         """Those of stage 1 first; a size of every matcher, then the next."""
         whole, crops = LAYOUTS[self.layout]
         return tuple(
-            Unit(1 if place < whole else 2, matcher, LONG_SIDES[matcher][place], MOST_MATCHES.get(matcher, 4096))
+            Unit(1 if place < whole else 2, matcher, LONG_SIDES[matcher][place], MAX_MATCHES.get(matcher, 4096))
             for place in range(whole + crops)
             for matcher in self.matchers
         )
@@ -103,7 +103,7 @@ def union(ways: Iterable[Way]) -> Recipe:
 
 @dataclass(frozen=True)
 class Found:
-    """What one way made of one pair; ``matches`` are those that MAGSAC was given, ``seconds`` are of work."""
+    """What one way made of one pair; ``matches`` were given to MAGSAC, ``seconds`` are of work."""
 
     error: PoseError
     matches: int
@@ -113,7 +113,7 @@ class Found:
 def try_all(
     ways: Sequence[Way], work: PairMatch, true: TruePair, scene: TrainScene, pipeline: Pipeline
 ) -> dict[str, Found]:
-    """Every way on one pair: units of stage 1 once, those of stage 2 once for each plain way."""
+    """Every way on one pair: units of stage 1 once, units of stage 2 once for each plain way."""
     (whole,) = pipeline.match([work], [unit for unit in pipeline.recipe.units if unit.stage == 1])
     known = {result.unit: result for result in whole.results}
     done: dict[tuple[Unit, ...], PairMatch] = {}
@@ -126,7 +126,7 @@ def try_all(
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         conclude = partial(_conclude, true=true, scene=scene, config=config)
         found = pool.map(conclude, ways, [done[way.units] for way in ways])
-        return {way.name: one for way, one in zip(ways, found, strict=True)}
+        return {way.name: result for way, result in zip(ways, found, strict=True)}
 
 
 def _conclude(way: Way, work: PairMatch, *, true: TruePair, scene: TrainScene, config: RobustConfig) -> Found:
@@ -163,11 +163,11 @@ class ResultsFile:
     def add(self, pair: str, found: Mapping[str, Found]) -> None:
         values = {
             way: [
-                [one.error.rotation, one.error.translation_angle, one.error.translation],
-                one.matches,
-                one.seconds,
+                [result.error.rotation, result.error.translation_angle, result.error.translation],
+                result.matches,
+                result.seconds,
             ]
-            for way, one in found.items()
+            for way, result in found.items()
         }
         with self.path.open("a", encoding="utf-8") as stream:
             stream.write(json.dumps([pair, values]) + "\n")
@@ -231,12 +231,12 @@ class Tables:
         yield from _head(["way", *self.scenes, "mAA", "AUC 5", "AUC 10", "matches", "seconds"])
         for way in ways:
             found = {name: [pair[way.name] for pair in pairs] for name, pairs in self.scenes.items()}
-            errors = {name: [one.error for one in ones] for name, ones in found.items()}
-            maas = [mean(map(pair_accuracy, ones)) for ones in errors.values()]
-            aucs = [mean(pose_auc(ones, threshold) for ones in errors.values()) for threshold in (5, 10)]
-            every = [one for ones in found.values() for one in ones]
+            errors = {name: [result.error for result in results] for name, results in found.items()}
+            maas = [mean(map(pair_accuracy, of_scene)) for of_scene in errors.values()]
+            aucs = [mean(pose_auc(of_scene, threshold) for of_scene in errors.values()) for threshold in (5, 10)]
+            every = [result for results in found.values() for result in results]
             cells = [f"{value:.4f}" for value in (*maas, mean(maas), *aucs)]
-            cells += [f"{mean(one.matches for one in every):.0f}", f"{mean(one.seconds for one in every):.2f}"]
+            cells += [f"{mean(each.matches for each in every):.0f}", f"{mean(each.seconds for each in every):.2f}"]
             yield _row([way.name, *cells])
 
     def gains(self, contrasts: Iterable[tuple[Way, Way]]) -> Iterator[str]:
@@ -271,8 +271,8 @@ class Tables:
 
 def _accuracies(pairs: Sequence[Mapping[str, Found]], first: Way, second: Way) -> tuple[list[float], list[float]]:
     """The accuracies of the same pairs in two ways."""
-    one, other = ([pair_accuracy(pair[way.name].error) for pair in pairs] for way in (first, second))
-    return one, other
+    accuracies, others = ([pair_accuracy(pair[way.name].error) for pair in pairs] for way in (first, second))
+    return accuracies, others
 
 
 def _head(cells: Sequence[str]) -> list[str]:

@@ -4,7 +4,7 @@ python -m benchmarks.threads [--cores 4] [--rounds 5] [--keypoints 1024]
 
 Each round measures every setting once: threads that spin while they wait (OpenMP's default) or sleep, as in the
 engine's workers, and fewer threads. The processes of one setting match at the same time, and their joint matches a
-second are printed. Medians of the rounds. The cores are those that this process may run on, or the first of them.
+second are printed. Medians of the rounds. Its cores are all that this process may run on, or the first of them.
 """
 
 import argparse

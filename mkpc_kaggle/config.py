@@ -1,10 +1,9 @@
 """Settings: frozen dataclasses from TOML tables, with every key known and every value in its range."""
 
-from collections.abc import Container, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import MISSING, Field, dataclass, fields
 from enum import StrEnum
 from math import inf, isfinite
-from types import MappingProxyType
 from typing import Any, TypeVar, get_type_hints
 
 from mkpc_kaggle.errors import UserError
@@ -20,11 +19,10 @@ def from_table(cls: type[Config], table: Mapping[str, Any], where: str) -> Confi
     ``where`` names the table in messages. Raises :class:`UserError` for an unknown key (listing the known
     keys), a missing key, a value of another type, or a value that the dataclass refuses with a ``ValueError``.
 
-    A dataclass names its former keys in two class variables: ``RENAMED``, a mapping of old to new key, and
-    ``REMOVED``, a collection of keys.
+    A dataclass names its former keys in a class variable ``FORMER``, see :func:`check_keys`.
     """
     known: dict[str, Field[Any]] = {field.name: field for field in fields(cls)}  # type: ignore[arg-type]
-    check_keys(table, known, where, getattr(cls, "RENAMED", {}), getattr(cls, "REMOVED", ()))
+    check_keys(table, known, where, getattr(cls, "FORMER", {}))
     missing = [
         name
         for name, field in known.items()
@@ -40,21 +38,17 @@ def from_table(cls: type[Config], table: Mapping[str, Any], where: str) -> Confi
         raise UserError(f"{where}: {error}") from error
 
 
-def check_keys(
-    table: Mapping[str, Any],
-    known: Iterable[str],
-    where: str,
-    renamed: Mapping[str, str] = MappingProxyType({}),
-    removed: Container[str] = (),
-) -> None:
-    """Raise :class:`UserError` if ``table`` is not a table, or for its first key that is not among ``known``."""
+def check_keys(table: Mapping[str, Any], known: Iterable[str], where: str, former: Mapping[str, str]) -> None:
+    """Raise :class:`UserError` if ``table`` is not a table, or for its first key that is not among ``known``.
+
+    ``former`` has the keys of earlier versions with their present names, empty where a key was removed.
+    """
     if not isinstance(table, Mapping):
         raise UserError(f"{where} must be a table, not {table!r}")
-    known = list(known)
     for key in table:
-        if key in renamed:
-            raise UserError(f"{where}: the key {key!r} is now called {renamed[key]!r}")
-        if key in removed:
+        if former.get(key):
+            raise UserError(f"{where}: the key {key!r} is now called {former[key]!r}")
+        if key in former:
             raise UserError(f"{where}: the key {key!r} was removed and has no successor; delete it")
         if key not in known:
             raise UserError(f"{where} has the unknown key {key!r}; known keys: {', '.join(known)}")

@@ -11,13 +11,12 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any, ClassVar
 
-from mkpc_kaggle.config import AT_LEAST_1, Config, Range, check_keys, check_ranges, from_table
+from mkpc_kaggle.config import AT_LEAST_0, AT_LEAST_1, Config, Range, check_keys, check_ranges, from_table
 from mkpc_kaggle.errors import UserError, read_text
 from mkpc_kaggle.geometry.coordinates import Box, Size, View
 from mkpc_kaggle.geometry.critical_region import MkpcConfig
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.geometry.robust import RobustConfig
-from mkpc_kaggle.scene.config import SceneConfig
 
 DIRECTORY = Path(__file__).resolve().parent / "recipes"
 MAX_SIDE_PX = 99_999
@@ -33,30 +32,10 @@ class Mode(StrEnum):
 
 
 @dataclass(frozen=True)
-class RecipeChoice:
-    """A recipe's name or file, and the mode to run it in."""
-
-    recipe: str
-    mode: Mode = Mode.TWO_STAGE
-
-    @classmethod
-    def parse(cls, text: str) -> "RecipeChoice":
-        """``NAME:MODE``; without a mode, the recipe as it is written."""
-        name, _, mode = text.rpartition(":")
-        return cls(name, Mode(mode)) if name and mode in list(Mode) else cls(text)
-
-    @property
-    def folder(self) -> str:
-        """A name for the directory of its run."""
-        text = self.recipe if self.mode is Mode.TWO_STAGE else f"{self.recipe}_{self.mode}"
-        return re.sub(r"[^\w.-]+", "_", text)
-
-
-@dataclass(frozen=True)
 class Unit:
     """One piece of work on one pair; raises ``ValueError`` for values that contradict each other."""
 
-    REMOVED: ClassVar = ("flip", "extra")
+    FORMER: ClassVar = {"flip": "", "extra": ""}
 
     stage: int  # 1: on whole images, 2: on the critical regions
     matcher: str
@@ -64,13 +43,13 @@ class Unit:
     max_matches: int = 4096  # so many of the highest scores are kept
     area: str = ""  # height x width, such as "540x720": a view gets as many pixels, at its own aspect
     stretch: bool = False  # a view gets just that height and width
-    fallback: str = ""  # the matcher that takes the place of one that is unavailable
+    fallback: str = ""  # the matcher that runs where this matcher is unavailable
     tracks: bool = True  # False: a scene is made of its matches only where a pair has few others
 
     def __post_init__(self) -> None:
         check_ranges(self, stage=Range(1, 2), long_side=Range(0, MAX_SIDE_PX), max_matches=AT_LEAST_1)
         if bool(self.long_side) == bool(self.area):
-            raise ValueError("one of long_side and area must be given, and not both")
+            raise ValueError("either long_side or area must be given, and not both")
         if self.area and not AREA.fullmatch(self.area):
             raise ValueError(f'area must be height x width such as "540x720", not {self.area!r}')
         if self.stretch and not self.area:
@@ -94,6 +73,34 @@ class Unit:
         if self.stretch:
             return View.stretched(crop, size=Size(width, height), multiple=multiple)
         return View.of_area(crop, area=width * height, multiple=multiple)
+
+
+class CameraModel(StrEnum):
+    """COLMAP's models of one focal length, the principal point at the centre; RADIAL has a distortion too."""
+
+    PINHOLE = "SIMPLE_PINHOLE"
+    RADIAL = "SIMPLE_RADIAL"
+
+
+@dataclass(frozen=True)
+class SceneConfig:
+    """Settings of :mod:`mkpc_kaggle.scene`, table ``[scene]`` of a recipe."""
+
+    camera_model: CameraModel = CameraModel.PINHOLE
+    each_matcher: bool = True  # also reconstruct each matcher's matches alone; a pair gets the mean of its cameras
+    shared_intrinsics: float = 0.02  # images of one size share a camera if most focals are this close; 0: never
+    pairs_per_image: float = 5.0  # a batch with fewer pairs gets extra pairs, for its scene alone; 0: none
+    threads: int = 1  # more than one: the last digits differ from run to run
+
+    FORMER: ClassVar = {"one_camera": "shared_intrinsics"} | dict.fromkeys((
+        "mapper", "cell", "least_tracks", "agreement", "one_camera_images", "one_camera_weak", "one_camera_points",
+        "least_inliers", "prior_focal", "least_images", "least_pairs_per_image", "most_images", "lowest_focal",
+        "highest_focal", "least_points", "contradiction_error", "contradiction_matches", "contradiction_share",
+        "verification_error", "focal_sigma", "seed",
+    ), "")  # fmt: skip
+
+    def __post_init__(self) -> None:
+        check_ranges(self, shared_intrinsics=AT_LEAST_0, pairs_per_image=AT_LEAST_0, threads=AT_LEAST_1)
 
 
 @dataclass(frozen=True)
@@ -163,6 +170,12 @@ class Recipe:
         return values
 
 
+def split_mode(text: str) -> tuple[str, Mode]:
+    """The recipe's name or file and the mode of ``RECIPE:MODE``; without a mode, as it is written."""
+    name, _, mode = text.rpartition(":")
+    return (name, Mode(mode)) if name and mode in list(Mode) else (text, Mode.TWO_STAGE)
+
+
 def parse_recipe(text: str, name: str) -> Recipe:
     """A recipe from TOML text; raises :class:`UserError` if it cannot be accepted."""
     try:
@@ -175,7 +188,7 @@ def recipe_of(table: Mapping[str, Any], name: str) -> Recipe:
     """A recipe from a TOML file's table, or from a fingerprint; raises :class:`UserError`."""
     where = f"recipe {name!r}"
     known = ("description", "units", "mkpc", "magsac", "focal", "matchers", "scene")
-    check_keys(table, known, where, removed=("upgrade",))
+    check_keys(table, known, where, {"upgrade": ""})
     units, matchers = table.get("units", []), table.get("matchers", {})
     if not isinstance(units, list) or not isinstance(matchers, dict):
         raise UserError(f"{where}: units must be a list of tables, and matchers a table")

@@ -2,12 +2,19 @@
 
 import os
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 from hypothesis import HealthCheck, settings
+from kaggle_image import pack_wheel
 
 from mkpc_kaggle.demo import DemoSet, write_demo
+from mkpc_kaggle.package.wheels import BUNDLED
 from mkpc_kaggle.weights import store as weight_store
+
+if TYPE_CHECKING:
+    from mkpc_kaggle.data.competition import Pair
+    from mkpc_kaggle.engine.engine import RunReport
 
 # Before torch is imported, here and in the processes of the tests: their tensors are small, and on a busy machine
 # threads wait for each other more than they work.
@@ -34,6 +41,31 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 def demo(tmp_path_factory: pytest.TempPathFactory) -> DemoSet:
     """One scene of the demo at 40 % of its size: 7 images, 8 test pairs."""
     return write_demo(tmp_path_factory.mktemp("demo"), scenes=["courtyard"], image_scale=0.4)
+
+
+@pytest.fixture(scope="session")
+def pairs(tmp_path_factory: pytest.TempPathFactory) -> "list[Pair]":
+    """Twelve pairs of flat images, which the matcher of :mod:`rectified` tells apart by their brightness."""
+    from rectified import write_pairs
+
+    return write_pairs(tmp_path_factory.mktemp("pairs"), 12)
+
+
+@pytest.fixture(scope="session")
+def undisturbed(pairs: "list[Pair]", tmp_path_factory: pytest.TempPathFactory) -> "RunReport":
+    """A run over these pairs in which nothing goes wrong."""
+    from rectified import THREE_UNITS, RectifiedMatcher, run
+
+    return run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path_factory.mktemp("undisturbed"))
+
+
+@pytest.fixture(scope="session")
+def wheels(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The wheels that a package for Kaggle bundles."""
+    directory = tmp_path_factory.mktemp("wheels")
+    for name in BUNDLED:
+        pack_wheel(name, directory)
+    return directory
 
 
 @pytest.fixture

@@ -18,7 +18,7 @@ def image_of(pixels):
 
 
 def both(state, features=300):
-    """Our network as it runs, and kornia's, of which only the grid of a window is no parameter."""
+    """Our network as it runs, and kornia's, where only the grid of a window is not a parameter."""
     theirs = ALIKED("aliked-n16", max_num_keypoints=features, detection_threshold=0.0).eval()
     grid = {"dkd.hw_grid": theirs.dkd.hw_grid}
     theirs.load_state_dict(state | grid)
@@ -85,18 +85,11 @@ def filled_network():
     return network
 
 
-@torch.inference_mode()
-def test_a_flat_picture_has_no_keypoints():
-    found = placed(filled_network(), Placement())(torch.zeros(2, 3, 32, 64))
-    assert all(descriptors.shape == (len(points), 128) for points, descriptors in found)
-    assert strict_maxima(torch.full((8, 9), 0.5), 10).tolist() == []
-
-
 def test_maxima_are_strict_inner_and_the_best_come_first():
     scores = torch.zeros(12, 15)
     scores[3, 4], scores[8, 9], scores[1, 12] = 0.5, 0.9, 0.95  # the last lies in the border
     scores[8, 2], scores[8, 3] = 0.7, 0.7  # a tie
-    scores[5, 4] = 0.4  # beside a stronger one
+    scores[5, 4] = 0.4  # beside a stronger maximum
     assert strict_maxima(scores, 10).tolist() == [8 * 15 + 9, 3 * 15 + 4]
     assert strict_maxima(scores, 1).tolist() == [8 * 15 + 9]
     scores[8, 10] = 0.9 - 0.1 * torch.log(torch.tensor(2.0))  # half its weight

@@ -1,12 +1,10 @@
 import math
-import subprocess
-import sys
 import time
 
 import numpy as np
 import pytest
 
-from mkpc_kaggle.engine.budget import Budget, format_duration, monotonic_of, parse_duration, process_started
+from mkpc_kaggle.engine.budget import Budget, format_duration, monotonic_of, parse_duration
 from mkpc_kaggle.engine.costs import WINDOW, Costs
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.recipe import Unit
@@ -22,9 +20,15 @@ def test_durations_are_read(text: str, seconds: float) -> None:
     assert parse_duration(text) == seconds
 
 
-@pytest.mark.parametrize("text", ["", "h", "8 hours", "-5s", "1m1h", "0", "0s", "nan", "9:00", "8h45", "5m5"])
+@pytest.mark.parametrize("text", ["", "h", "8 hours", "-5s", "1m1h", "0", "0s", "nan", "9:00"])
 def test_what_is_not_a_duration_is_refused(text: str) -> None:
     with pytest.raises(UserError):
+        parse_duration(text)
+
+
+@pytest.mark.parametrize(("text", "meant"), [("8h45", "8h45m"), ("1h30m20", "1h30m20s"), ("5m30", "5m30s")])
+def test_a_duration_whose_last_number_has_no_unit_is_refused_with_what_to_write(text: str, meant: str) -> None:
+    with pytest.raises(UserError, match=f"write {meant}$"):
         parse_duration(text)
 
 
@@ -152,10 +156,3 @@ def test_a_limit_may_count_from_an_earlier_moment(monkeypatch: pytest.MonkeyPatc
     for nonsense in (1001.0, math.nan, -math.inf):
         with pytest.raises(UserError, match="not a moment of the past"):
             monotonic_of(nonsense)
-
-
-def test_a_limit_counts_from_when_the_process_began() -> None:
-    assert process_started() <= time.monotonic()
-    code = "import time; a = time.monotonic(); from mkpc_kaggle.engine.budget import process_started"
-    before = f"{code}; assert process_started() < a"
-    assert subprocess.run([sys.executable, "-c", before], check=False).returncode == 0

@@ -3,7 +3,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mkpc_kaggle.data.cache import ByteCache
+from mkpc_kaggle.data.images import ByteCache
 
 KEYS = "abcde"
 

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from mkpc_kaggle.cli import COMMANDS, main
+from mkpc_kaggle.cli import main
 from mkpc_kaggle.data.competition import read_test_side, write_submission
 from mkpc_kaggle.demo import DemoSet
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
@@ -25,15 +25,7 @@ def test_importing_the_package_is_cheap_and_geometry_and_weights_bring_no_torch(
     assert out.split() == ["[]", "False"]
 
 
-@pytest.mark.parametrize("command", COMMANDS)
-def test_every_command_has_a_help_that_teaches(command: str, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as left:
-        main([command, "--help"])
-    assert left.value.code == 0
-    assert len(capsys.readouterr().out.splitlines()) >= 8
-
-
-def test_a_reader_that_leaves_is_no_error_to_tell() -> None:
+def test_a_reader_that_leaves_ends_the_command_quietly() -> None:
     reader, writer = os.pipe()
     os.close(reader)
     with os.fdopen(writer, "wb") as out:
@@ -55,25 +47,11 @@ def test_recipes_are_listed_with_what_they_lack(
     assert main(["recipes"]) == 0
     out = capsys.readouterr().out
     light = out[out.index("light: ") :]
-    assert "missing: xfeat: xfeat.pt or xfeat_sparse_bnfolded.safetensors" in light
+    assert "xfeat_lighterglue: no weights (xfeat: xfeat.pt or xfeat_sparse_bnfolded.safetensors" in light
     classical = out[out.index("classical: ") : out.index("light: ")]
     assert "all weights are there" in classical
     assert "    2:dkm@630x840  at most 4096\n" in out
     assert "    1:aliked_lightglue@1024  at most 4096  (or aliked, where its weights are missing)\n" in light
-
-
-@pytest.mark.parametrize("count", ["0", "-1"])
-def test_a_number_of_pairs_below_one_is_refused(count: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["validate", "--train-dir", ".", "--pairs-per-scene", count]) == 2
-    assert "--pairs-per-scene: give 1 or more" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(("text", "meant"), [("8h45", "8h45m"), ("1h30m20", "1h30m20s"), ("5m30", "5m30s")])
-def test_a_time_limit_whose_last_number_has_no_unit_is_refused(
-    text: str, meant: str, demo: DemoSet, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["submit", "--test-dir", str(demo.test_dir), "--time-limit", text]) == 2
-    assert f"write {meant}\n" in capsys.readouterr().err
 
 
 def test_results_are_not_written_over_inputs_nor_an_export_over_the_journal(

@@ -6,7 +6,6 @@ from pathlib import Path
 import pytest
 from rectified import THREE_UNITS, RectifiedMatcher, run, write_pairs
 
-from mkpc_kaggle.cli import main
 from mkpc_kaggle.engine.cluster import RayCluster, parse_workers
 from mkpc_kaggle.errors import UserError
 
@@ -22,10 +21,10 @@ def test_forms_of_workers(text: str, meant: int | RayCluster) -> None:
 @pytest.mark.parametrize(
     "text", ["-1", "1000", "two", "ray:", "ray://", "ray://host", "ray://host:port", "ssh://host:1"]
 )
-def test_other_forms_are_refused_with_those_that_there_are(text: str, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        main(["submit", "--test-dir", ".", f"--workers={text}"])
-    told = capsys.readouterr().err
+def test_other_forms_are_refused_with_those_that_there_are(text: str) -> None:
+    with pytest.raises(UserError) as refusal:
+        parse_workers(text)
+    told = str(refusal.value)
     assert all(form in told for form in ("a number of processes", "ray (", "ray://HOST:PORT")), told
 
 

@@ -89,7 +89,7 @@ def test_a_distance_of_exactly_eps_counts(offset):
 
 @pytest.mark.parametrize("at", [2300, 2400, 2500, 2610])
 def test_one_touching_pair_joins_crowded_cells(at):
-    # Parallel lines 0.0503 apart: a cell has hundreds of their points, and the one that moves is no extreme of it.
+    # Parallel lines 0.0503 apart: a cell has hundreds of points, and the point that moves is not an extreme.
     x = np.linspace(0, 1, 5000)
     points = np.concatenate([np.stack([x, 0.3 * x], axis=1), np.stack([x, 0.3 * x + 0.0525], axis=1)])
     assert dbscan(points, eps=0.05, min_samples=5).max() == 1

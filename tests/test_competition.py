@@ -16,7 +16,6 @@ from mkpc_kaggle.data.competition import (
     submission_problems,
     write_submission,
 )
-from mkpc_kaggle.data.images import Unreadable, read_image
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.cameras import fundamental_of_cameras
 
@@ -77,7 +76,7 @@ def test_pairs_and_columns_come_in_any_order_and_ids_stay_the_text_that_they_are
     assert read_test_side(home / "test_images") == pairs
 
 
-@pytest.mark.parametrize("file", ["1.png", "1.jpg", "1.jpeg", "1.PNG", "1.Jpg", "1.JPEG"])
+@pytest.mark.parametrize("file", ["1.png", "1.jpeg", "1.Jpg"])
 def test_an_image_is_found_whatever_its_suffix(side, file):
     home = side("s,b,1,2", images=["b/10.png", "b/1.txt"])
     assert not read_test_side(home)[0].images[0].is_file()
@@ -87,23 +86,16 @@ def test_an_image_is_found_whatever_its_suffix(side, file):
     assert pair.images[0].is_file()
 
 
-def test_a_missing_image_or_batch_is_a_path_that_does_not_exist(side):
-    pairs = read_test_side(side("s,b,1,2", "t,nowhere,1,2", images=["b/1.png"]))
-    assert [[image.is_file() for image in pair.images] for pair in pairs] == [[True, False], [False, False]]
-
-
 @pytest.mark.parametrize(
     ("content", "says"),
     [
         (b"", "lacks the columns .*; it has nothing"),
-        (b"\n\n", "lacks the columns .*; it has nothing"),
         (HEADER.encode() + b"\n", "has no rows"),
         (b"sample_id,image_1_id\ns,1\n", "lacks the columns batch_id, image_2_id"),
         (b"\x89PNG\r\n\x1a\n\xff\xfe\x00", "cannot be read as a table"),
         (HEADER.encode() + b"\ns,b,1,2\n\nt,b,1,2,3,4\n", "line 4: 6 cells, the header has 4"),
         (HEADER.encode() + b"\ns,b,1\n", "line 2: 3 cells, the header has 4"),
         (HEADER.encode() + b"\ns,b,1,2\nt,b,1,3\ns,b,2,3\n", "line 4: the sample_id 's' is not unique"),
-        (HEADER.encode() + b'\n"a\nb",b,1,2\n', "has control characters"),
         (HEADER.encode() + b"\na\x1bb,b,1,2\n", "has control characters"),
         (HEADER.encode() + "\na\u2028b,b,1,2\n".encode(), "has control characters"),
     ],
@@ -131,7 +123,7 @@ def test_a_directory_without_its_table_or_images_is_refused(side, tmp_path):
 
 @pytest.mark.parametrize("row", ["s,{},1,2", "s,b,{},2", "s,b,1,{}"], ids=["batch", "image 1", "image 2"])
 @pytest.mark.parametrize("name", ["", ".", "..", "../x", "x/y", "/etc", "x\\y", "C:x", "c:", "a\x1bb", "a\x7f"])
-def test_an_id_that_is_no_plain_name_is_refused(side, row, name):
+def test_an_id_that_is_not_a_plain_name_is_refused(side, row, name):
     home = side("ok,b,1,2", row.format(name))
     with pytest.raises(UserError, match=r"test\.csv.* is not a plain name"):
         read_test_side(home)
@@ -169,10 +161,7 @@ def test_pairs_per_scene_are_spread_over_the_table(train, most, chosen):
     [
         (lambda train: read_train_side(train, scenes=["s", "x"]), r"unknown scene 'x'; known: absent, s"),
         (lambda train: read_train_side(train, scenes=["absent"]), r"absent.*calibration\.csv: no such file"),
-        (
-            lambda train: read_train_side(train, min_covisibility=1.1),
-            r"covisibility\.csv has no pair with .*1\.1",
-        ),
+        (lambda train: read_train_side(train, min_covisibility=1.1), r"covisibility\.csv has no pair with .*1\.1"),
     ],
 )
 def test_what_a_train_side_lacks_is_told_with_what_it_has(train, read, says):
@@ -260,10 +249,8 @@ def test_the_former_submission_stays_when_writing_fails(tmp_path, monkeypatch):
         ("sample_id,fundamental_matrix\nb,{F}\na,{F}\n", "not in the order of test.csv"),
         ("sample_id,fundamental_matrix\na,{F}\nb,{F}\nb,{F}\n", "twice"),
         ("sample_id,fundamental_matrix\na,{F}\nb,1 2 3 4 5 6 7 8\n", "b: .*expected 9 numbers, found 8"),
-        ("sample_id,fundamental_matrix\na,{F}\nb,1 2 3 4 5 6 7 8 x\n", "b: .*not a list of numbers"),
         ("sample_id,fundamental_matrix\na,{F}\nb,1 2 3 4 5 6 7 8 nan\n", "b: a number is not finite"),
         ("sample_id,fundamental_matrix\na,{F}\nb,0 0 0 0 0 0 0 0 0\n", "b: the matrix is zero"),
-        ("", "lacks the columns"),
         ("\0\0\0", "lacks the columns|cannot be read"),
     ],
 )
@@ -275,12 +262,6 @@ def test_each_problem_of_a_submission_is_the_only_one_found(tmp_path, content, s
     assert len(submission_problems(tmp_path / "x.csv", ["a", "b"])) == 3, "all are told at once"
     (problem,) = submission_problems(tmp_path / "y.csv", ["a"])
     assert "no such file" in problem
-
-
-def test_a_batch_or_image_with_a_name_that_no_file_can_have_is_missing(side):
-    pairs = read_test_side(side(f"s,{'b' * 5000},1,2", f"t,b,{'i' * 5000},2", images=["b/2.png"]))
-    answers = [read_image(path) for pair in pairs for path in pair.images]
-    assert [isinstance(answer, Unreadable) for answer in answers[:3]] == [True] * 3
 
 
 def test_a_large_table_is_read_and_written_in_little_memory(side):

@@ -16,7 +16,7 @@ from faulty import (
     thread_place,
     use_places,
 )
-from rectified import SECOND, SWEEP, THIRD, THREE_UNITS, RectifiedMatcher, run, write_pairs
+from rectified import SECOND, SWEEP, THIRD, THREE_UNITS, RectifiedMatcher, matrices, run
 
 from mkpc_kaggle.cli import main
 from mkpc_kaggle.data.competition import Pair, read_test_side, submission_problems
@@ -30,20 +30,6 @@ from mkpc_kaggle.reporting.summary import trouble
 
 COUNT = 12
 VICTIM = 3  # brightness 13
-
-
-@pytest.fixture(scope="module")
-def pairs(tmp_path_factory: pytest.TempPathFactory) -> list[Pair]:
-    return write_pairs(tmp_path_factory.mktemp("pairs"), COUNT)
-
-
-@pytest.fixture(scope="module")
-def undisturbed(pairs: list[Pair], tmp_path_factory: pytest.TempPathFactory) -> RunReport:
-    return run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path_factory.mktemp("undisturbed"))
-
-
-def matrices(report: RunReport) -> list[bytes]:
-    return [record.pair_fundamental.tobytes() for record in report.records]
 
 
 def unit_failures(report: RunReport) -> list[str]:
@@ -125,20 +111,6 @@ def test_a_pair_at_which_a_device_fails_is_done_by_a_healthy_one(
     assert report.faults
     assert unit_failures(report) == []
     assert matrices(report) == matrices(undisturbed)
-
-
-def test_a_device_that_fails_for_good_ends_the_run_and_a_healthy_one_goes_on(
-    pairs: list[Pair], undisturbed: RunReport, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    use_places(monkeypatch, thread_place("cuda:0", BrokenDeviceMatcher(good=5)))
-    report = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
-    assert report.ending is Ending.NO_WORKER
-    assert "the run failed: no worker left" in trouble(report)
-    assert 0 < sum(bool(record.units) for record in report.records) < COUNT
-    use_places(monkeypatch, thread_place("cpu", RectifiedMatcher()))
-    resumed = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
-    assert resumed.ending is Ending.COMPLETE
-    assert matrices(resumed) == matrices(undisturbed)
 
 
 def test_a_device_without_kernels_leaves_the_work_to_the_cpu_and_a_line(

@@ -1,17 +1,14 @@
 """DKM as a matcher, from a checkpoint in the public file's own format, with random weights."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
 from pictures import match_one, picture, same, write_store
 
-from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.matchers import dkm
-from mkpc_kaggle.matchers.contract import Placement, Training
-from mkpc_kaggle.matchers.dense import DenseEncoding
-from mkpc_kaggle.matchers.dkm import DkmMatcher, DkmOptions
+from mkpc_kaggle.matchers.contract import Placement
+from mkpc_kaggle.matchers.dense import DenseEncoding, DenseOptions
+from mkpc_kaggle.matchers.dkm import DkmMatcher
 from mkpc_kaggle.matchers.networks.dense_warp import DenseFeatures, DenseWarp
 from mkpc_kaggle.matchers.networks.dkm import DKM
 from mkpc_kaggle.matchers.networks.grids import as_grid
@@ -35,12 +32,12 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> WeightStore:
 
 @pytest.fixture(scope="module")
 def network(store: WeightStore) -> DKM:
-    return dkm.load(store, DkmOptions(), Placement())._network
+    return dkm.load(store, DenseOptions(), Placement())._network
 
 
 @pytest.fixture
 def matcher(network: DKM) -> DkmMatcher:
-    return DkmMatcher(network, DkmOptions(matches=300), "cpu")
+    return DkmMatcher(network, DenseOptions(matches=300), "cpu")
 
 
 def test_which_matches_are_drawn_depends_on_both_pictures(matcher: DkmMatcher) -> None:
@@ -61,15 +58,6 @@ def test_padding_changes_nothing(matcher: DkmMatcher) -> None:
     assert same(match_one(matcher, *plain), match_one(matcher, *padded))
 
 
-def test_two_passes_look_at_the_picture_shrunk_and_whole(network: DKM) -> None:
-    matcher = DkmMatcher(network, DkmOptions(passes=2), "cpu")
-    (encoded,) = matcher.encode([picture(48, 80)])
-    assert encoded.features.coarse.at(1).shape == (1, 3, 30, 50)
-    assert encoded.features.fine is not None
-    assert encoded.features.fine.at(1).shape == (1, 3, 48, 80)
-    assert len(encoded.features.fine.levels) == 4
-
-
 class Given:
     """A network that answers with these warps."""
 
@@ -82,7 +70,7 @@ class Given:
     def encode(self, image: torch.Tensor, fine: torch.Tensor | None = None) -> DenseFeatures:
         return None  # type: ignore[return-value]
 
-    def match(self, first: DenseFeatures, second: DenseFeatures, *, symmetric: bool) -> tuple[DenseWarp, ...]:
+    def match(self, first: DenseFeatures, second: DenseFeatures) -> tuple[DenseWarp, ...]:
         return self.warps
 
 
@@ -94,7 +82,7 @@ def identity_warp(height: int, width: int, certainty: float) -> DenseWarp:
 def test_points_of_either_picture_are_in_its_own_pixels() -> None:
     """Both show the same, at another size: places relative to the edges agree."""
     warps = identity_warp(40, 60, 0.3), identity_warp(80, 30, 0.9)
-    matcher = DkmMatcher(Given(*warps), DkmOptions(matches=9999, balanced=False), "cpu")  # type: ignore[arg-type]
+    matcher = DkmMatcher(Given(*warps), DenseOptions(matches=9999), "cpu")  # type: ignore[arg-type]
     matches = match_one(matcher, picture(40, 60), picture(80, 30))
     assert len(matches) == 40 * 60 + 80 * 30
     expected = (matches.points0 + 0.5) * (30 / 60, 80 / 40) - 0.5
@@ -105,20 +93,5 @@ def test_points_of_either_picture_are_in_its_own_pixels() -> None:
     np.testing.assert_array_equal(matches.scores == np.float32(0.3), whole0)
     assert set(matches.scores.tolist()) == {float(np.float32(0.3)), float(np.float32(0.9))}
     unsure = identity_warp(9, 9, 0.0), identity_warp(9, 9, 0.0)
-    matcher = DkmMatcher(Given(*unsure), DkmOptions(), "cpu")  # type: ignore[arg-type]
+    matcher = DkmMatcher(Given(*unsure), DenseOptions(), "cpu")  # type: ignore[arg-type]
     assert len(match_one(matcher, picture(9, 9), picture(9, 9))) == 0
-
-
-def test_one_way_is_from_the_first_to_the_second(store: WeightStore) -> None:
-    matcher = dkm.load(store, DkmOptions(symmetric=False, matches=200), Placement())
-    matches = match_one(matcher, picture(40, 56), picture(50, 36, "another"))
-    assert len(matches) == 200
-    np.testing.assert_allclose(matches.points0, np.rint(matches.points0), atol=1e-4)
-
-
-def test_other_weights_or_another_networks_checkpoint_are_refused(store: WeightStore, tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="dkm-indoor"):
-        dkm.load(store, DkmOptions(training=Training.INDOOR), Placement())
-    torch.save({"weight": torch.ones(3)}, tmp_path / "DKMv3_outdoor.pth")
-    with pytest.raises(UserError, match="'dkm-outdoor' do not fit the network"):
-        dkm.load(WeightStore([tmp_path], store.files), DkmOptions(), Placement())

@@ -1,6 +1,5 @@
 """The engine with a matcher whose answers are known, in threads of this process."""
 
-import sqlite3
 import threading
 from collections import Counter
 from collections.abc import Callable
@@ -8,18 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from rectified import SECOND, SWEEP, THIRD, THREE_UNITS, RectifiedMatcher, run, write_pairs
+from rectified import SECOND, SWEEP, THIRD, THREE_UNITS, RectifiedMatcher, matrices, run, write_pairs
 
 from mkpc_kaggle.engine.engine import Ending
-from mkpc_kaggle.engine.journal import Journal
 from mkpc_kaggle.engine.plan import JOB_PAIRS
 from mkpc_kaggle.engine.records import PairRecord
 from mkpc_kaggle.engine.session import Interrupt
 from mkpc_kaggle.pipeline.stages import Pipeline
-
-
-def matrices(records: tuple[PairRecord, ...]) -> bytes:
-    return b"".join(record.pair_fundamental.tobytes() for record in records)
 
 
 def units(record: PairRecord) -> list[str]:
@@ -83,7 +77,7 @@ def test_an_interrupted_run_goes_on_where_it_was_and_ends_with_the_same_bytes(tm
     assert any(record.units for record in cut.records), "what was found is kept"
     second = RectifiedMatcher()
     resumed = run(pairs, THREE_UNITS, second, tmp_path / "work")
-    assert matrices(resumed.records) == matrices(undisturbed.records)
+    assert matrices(resumed) == matrices(undisturbed)
     assert [units(record) for record in resumed.records] == [units(record) for record in undisturbed.records]
     again = [call for call, count in Counter(first.calls[:25] + second.calls).items() if count > 1]
     assert len(again) <= JOB_PAIRS * 3, "only the job that was under way runs twice"
@@ -97,7 +91,7 @@ def test_a_finished_run_loads_no_matcher_again(tmp_path: Path, monkeypatch: pyte
     monkeypatch.setattr(Pipeline, "load", loaded.append)
     twice = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
     assert not loaded
-    assert matrices(once.records) == matrices(twice.records)
+    assert matrices(once) == matrices(twice)
     assert twice.resumed == 3
 
 
@@ -123,45 +117,6 @@ def test_a_matcher_that_raises_costs_its_pair_that_unit_only(tmp_path: Path) -> 
     assert "too few distinct matches" in report.records[2].failure
 
 
-def test_a_lost_job_is_a_fault_in_the_report_and_the_others_go_on(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    whole = Pipeline.match
-
-    def lose_one(self: Pipeline, works: list, *rest: object) -> list:
-        if any(np.median(work.images[0].pixels) == 10 for work in works):
-            raise MemoryError("gone")
-        return whole(self, works, *rest)
-
-    monkeypatch.setattr(Pipeline, "match", lose_one)
-    report = run(write_pairs(tmp_path, 12), THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
-    assert report.faults == ("a job was lost on this process: out of memory: MemoryError: gone",)
-    assert report.records[0].failure == "given up: out of memory: MemoryError: gone"
-    assert all(record.inliers > 400 for record in report.records[1:])
-    assert report.ending is Ending.COMPLETE
-
-
-def test_a_journal_that_cannot_be_written_does_not_stop_the_run(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def full(*_: object) -> None:
-        raise sqlite3.OperationalError("database or disk is full")
-
-    monkeypatch.setattr(Journal, "_write", full)
-    report = run(write_pairs(tmp_path, 10), THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
-    assert all(record.inliers > 400 for record in report.records)
-    assert "disk is full" in report.faults[0]
-
-
-def test_a_submission_that_cannot_be_written_is_a_fault_not_the_end(tmp_path: Path) -> None:
-    def full(_: object) -> None:
-        raise OSError(28, "No space left on device")
-
-    report = run(write_pairs(tmp_path, 3), THREE_UNITS, RectifiedMatcher(), tmp_path / "work", publish=full)
-    assert all(record.inliers for record in report.records)
-    assert "No space left" in report.faults[0]
-
-
 def test_a_unit_that_never_returns_does_not_hold_the_run_past_its_limit(tmp_path: Path) -> None:
     released = threading.Event()
     matcher = RectifiedMatcher(matches=after_calls(5, released.wait))
@@ -173,9 +128,3 @@ def test_a_unit_that_never_returns_does_not_hold_the_run_past_its_limit(tmp_path
         assert report.records[0].units
     finally:
         released.set()
-
-
-def test_the_same_run_twice_gives_the_same_bytes(tmp_path: Path) -> None:
-    pairs = write_pairs(tmp_path, 9)
-    runs = [run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / f"work{n}") for n in range(2)]
-    assert matrices(runs[0].records) == matrices(runs[1].records)

@@ -78,30 +78,6 @@ def test_every_step_is_drawn_whatever_was_found(count):
     assert all(any(titles(figure)) for figure in drawn)
 
 
-def test_titles_count_what_is_seen():
-    match = pair(40, 20, 45)
-    points, clusters = clustered(pair(40, 0, 0))
-    assert titles(figures.draw_stage(IMAGES, match, 1))[0].startswith(
-        "stage 1, on the whole images: 40 matches, 40 inliers; 40 inliers (green) and 0 outliers"
-    )
-    assert titles(figures.draw_stage(IMAGES, match, 2))[0].startswith(
-        "stage 2, on the crops: 20 matches, 5 inliers; 5 inliers (green) and 15 outliers"
-    )
-    assert titles(figures.draw_clusters(IMAGES, points, clusters))[0].startswith("image 0, clusters found: 1\n")
-    assert "0.05 of the largest, 2.0 points" in titles(figures.draw_sizes(clusters, CONFIG))[0]
-    assert "together: 60 points, 45 inliers" in titles(figures.draw_both(IMAGES, match))[1]
-    uncropped = replace(match, regions=(REGIONS[1], REGIONS[1]))
-    assert titles(figures.draw_stage((IMAGES[1], IMAGES[1]), uncropped, 2))[0].startswith(
-        "stage 2, on the whole images"
-    )
-    assert titles(figures.draw_views(IMAGES, REGIONS, UNITS[1])) == [
-        "image 0, whole\n0.83 times enlarged",
-        "image 0, crop\n2.50 times enlarged",
-        "image 1, whole\n1.12 times enlarged",
-        "image 1, crop (no cluster)\n1.12 times enlarged",
-    ]
-
-
 def test_points_of_stage_2_are_drawn_where_they_are_on_the_crop():
     left, right = figures.draw_stage(IMAGES, pair(0, 20, 20), 2).axes
     assert left.images[0].get_array().shape[:2] == (20, 40)

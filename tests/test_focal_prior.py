@@ -137,13 +137,6 @@ def test_degenerate_matches_end_in_a_value(name):
         assert result.ok and result.magsac is None
 
 
-def test_the_search_looks_at_a_sample_of_many_matches_and_inliers_are_of_all():
-    matches = seen(CAMERAS, 3000, 0.05)
-    result = with_prior(matches)
-    assert result.inliers.mean() > 0.9
-    assert_array_equal(result.inliers, sampson_distances(result.matrix, matches) < MAGSAC.threshold)
-
-
 def test_repetitions_and_what_is_not_finite_change_nothing():
     matches = seen(CAMERAS, 80, 0.1, 20)
     bad = Matches(np.full((9, 2), np.nan), np.full((9, 2), 1.0), np.ones(9))
@@ -153,19 +146,6 @@ def test_repetitions_and_what_is_not_finite_change_nothing():
     assert_array_equal(again.matrix, once.matrix)
     assert_array_equal(more.matrix, once.matrix)
     assert_array_equal(more.inliers, np.concatenate([once.inliers, once.inliers, np.zeros(9, bool)]))
-
-
-def test_what_makes_no_prior_is_an_error():
-    with pytest.raises(ValueError, match="homography"):
-        with_prior(Matches.empty(), model=ModelKind.H)
-    with pytest.raises(ValueError, match="needs the intrinsics"):
-        with_prior(Matches.empty(), model=ModelKind.E)
-    with pytest.raises(ValueError, match="sigma"):
-        FocalPrior(np.eye(3), -1)
-    with pytest.raises(ValueError, match="camera matrix"):
-        FocalPrior(np.diag([0.0, 1, 1]), 1)
-    with pytest.raises(ValueError, match="scale"):
-        FocalConfig(scale=0)
 
 
 @given(data=st.data(), n=st.integers(0, 24))

@@ -9,21 +9,13 @@ import numpy as np
 import pytest
 import torch
 from device_double import DeviceDouble, MixedDevicesError
-from standin import filled
 
 from mkpc_kaggle.data.images import Image
 from mkpc_kaggle.engine.places import LocalSite
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.matchers.contract import MatcherSpec, NonFiniteError, Placement, Precision, encoding_bytes
+from mkpc_kaggle.matchers.contract import MatcherSpec, NonFiniteError, Precision, encoding_bytes
 from mkpc_kaggle.matchers.dtypes import check_finite, exact_float32
-from mkpc_kaggle.matchers.lightglue import light_glue
-from mkpc_kaggle.matchers.networks.loftr import Loftr
-from mkpc_kaggle.matchers.networks.placement import placed
-from mkpc_kaggle.matchers.networks.superglue import SuperGlue
-from mkpc_kaggle.matchers.networks.superpoint import SuperPointKeypoints
-from mkpc_kaggle.matchers.xfeat_lighterglue import SHAPE
 from mkpc_kaggle.pipeline import devices
 from mkpc_kaggle.pipeline.assembly import assemble
 from mkpc_kaggle.pipeline.devices import fastest_precision, gpu_capabilities, require_device, resolve_placement
@@ -83,13 +75,6 @@ def test_a_gpu_that_is_not_there_is_refused(monkeypatch: pytest.MonkeyPatch, dev
         resolve_placement(device, "float32")
 
 
-@pytest.mark.parametrize("device", ["cuda:", "cuda:x", "cudas", "cuda:-1", "gpu"])
-def test_a_device_of_no_known_name_is_refused(monkeypatch: pytest.MonkeyPatch, device: str) -> None:
-    gpus_here(monkeypatch, (7, 5))
-    with pytest.raises(UserError, match="unknown device"):
-        resolve_placement(device, "float32")
-
-
 def test_half_precision_asks_every_gpu_that_the_run_uses(monkeypatch: pytest.MonkeyPatch) -> None:
     gpus_here(monkeypatch, (7, 5), (6, 0))
     assert fastest_precision("cuda") is Precision.FLOAT32
@@ -108,13 +93,6 @@ def test_the_parent_of_workers_never_initialises_cuda(monkeypatch: pytest.Monkey
     site = LocalSite(made, None, time.monotonic)
     site.open()
     assert [place.name for place in site.places] == ["cuda:0", "cuda:1"]
-
-
-def test_capabilities_are_asked_of_another_process(monkeypatch: pytest.MonkeyPatch) -> None:
-    gpu_capabilities.cache_clear()
-    monkeypatch.setattr(devices, "ASK_CAPABILITIES", "print('a greeting'); print([[7, 5], [8, 0]])")
-    assert gpu_capabilities() == [(7, 5), (8, 0)]
-    gpu_capabilities.cache_clear()
 
 
 def test_gpus_on_which_nothing_can_be_computed_leave_the_work_to_the_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -162,20 +140,6 @@ def test_the_cache_is_sized_by_the_memory_that_is_free_and_the_workers_on_it() -
 
 
 # Numbers
-
-
-def test_lighterglue_stays_in_float32_on_a_gpu_and_leaves_the_process_alone() -> None:
-    before = torch.backends.cuda.flash_sdp_enabled()
-    torch.manual_seed(0)
-    glue = light_glue(2, 0.0, **SHAPE).eval()
-    assert torch.backends.cuda.flash_sdp_enabled() is before is True
-    side = {"keypoints": torch.rand(1, 9, 2) * 50, "descriptors": torch.rand(1, 9, 64)}
-    side["image_size"] = torch.tensor([[64.0, 48.0]])
-    with DeviceDouble() as double, torch.no_grad():
-        there = {name: tensor.to("cuda:0") for name, tensor in side.items()}
-        glue.to("cuda:0")({"image0": there, "image1": there})
-    assert torch.float32 in double.dtypes
-    assert double.dtypes.isdisjoint({torch.float16, torch.bfloat16})
 
 
 def settings() -> tuple[str, str]:
@@ -240,23 +204,3 @@ def test_finite_numbers_pass_however_large_their_sum_and_whatever_holds_them() -
     check_finite("maps", Maps(torch.full((9, 9), 65504.0, dtype=torch.float16), (torch.arange(3),)), [])
     with pytest.raises(NonFiniteError, match="maps are not finite"):
         check_finite("maps", [Maps(torch.zeros(2), (torch.tensor([0.0, -torch.inf]),))])
-
-
-@torch.inference_mode()
-def test_superglue_says_so_when_float16_overflows() -> None:
-    network = filled(SuperGlue(5), "superglue")
-    network.final_proj.weight.data.mul_(1e6)
-    torch.manual_seed(0)
-    descriptors = torch.nn.functional.normalize(torch.rand(9, 256))
-    found = SuperPointKeypoints(torch.rand(9, 2) * 60, torch.rand(9), descriptors, Size(64, 64))
-    with pytest.raises(NonFiniteError, match="superglue"):
-        placed(network, Placement(precision=Precision.FLOAT16))(found, found)
-
-
-@torch.inference_mode()
-def test_a_semi_dense_network_says_so_when_its_transformer_overflows() -> None:
-    network = placed(filled(Loftr(), "loftr"), Placement(precision=Precision.FLOAT16))
-    maps = network.encode(torch.rand(1, 1, 64, 64))
-    network.loftr_coarse.layers[0].norm2.weight.data.fill_(torch.inf)
-    with pytest.raises(NonFiniteError, match="coarse features"):
-        network.match(maps, maps)

@@ -11,9 +11,9 @@ import pytest
 from rectified import SECOND, SWEEP, THREE_UNITS
 
 from mkpc_kaggle.data.competition import Pair
+from mkpc_kaggle.engine.codec import encode
 from mkpc_kaggle.engine.jobs import Outcome
-from mkpc_kaggle.engine.journal import Journal
-from mkpc_kaggle.engine.journal_tables import DRAWN
+from mkpc_kaggle.engine.journal import MAX_DRAWN_PAIRS, Journal
 from mkpc_kaggle.engine.records import CameraRecord, PairRecord, SceneRecord
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Box, Size
@@ -44,16 +44,6 @@ def outcome(index: int = 7, seed: int = 0) -> Outcome:
     return Outcome(PairRecord.of(index, match), results)
 
 
-def assert_same(one: PairRecord, other: PairRecord) -> None:
-    assert one.pair_fundamental.tobytes() == other.pair_fundamental.tobytes()
-    ours, others = one.magsac_fundamental, other.magsac_fundamental
-    assert (ours is None) == (others is None)
-    assert ours is None or ours.tobytes() == others.tobytes()
-    assert one.units == other.units
-    assert one.regions == other.regions
-    assert (one.index, one.failure, one.decode_seconds) == (other.index, other.failure, other.decode_seconds)
-
-
 def test_what_is_saved_is_there_after_opening_again(tmp_path: Path) -> None:
     saved = [outcome(3, seed=0), outcome(7, seed=2)]
     journal = Journal(tmp_path, OURS)
@@ -63,7 +53,7 @@ def test_what_is_saved_is_there_after_opening_again(tmp_path: Path) -> None:
     records = again.records()
     assert list(records) == [3, 7]
     for one in saved:
-        assert_same(records[one.record.index], one.record)
+        assert encode(records[one.record.index]) == encode(one.record)
         for before, after in zip(one.results, again.results(one.record, UNITS), strict=True):
             assert after.unit == before.unit
             assert after.matches.points0.tobytes() == before.matches.points0.tobytes()
@@ -77,12 +67,12 @@ def points_of(journal: Journal, pair: int) -> int:
 
 def test_the_points_of_settled_pairs_are_kept_of_the_weakest_only(tmp_path: Path) -> None:
     journal = Journal(tmp_path, OURS)
-    count = 3 * DRAWN
+    count = 3 * MAX_DRAWN_PAIRS
     saved = [outcome(index, seed=index) for index in range(count)]
     for start in range(0, count, 7):
         journal.save([(one, True) for one in saved[start : start + 7]])
     by_strength = sorted(saved, key=lambda one: (one.record.inliers, one.record.index))
-    weakest = {one.record.index for one in by_strength[:DRAWN]}
+    weakest = {one.record.index for one in by_strength[:MAX_DRAWN_PAIRS]}
     assert {index for index in range(count) if points_of(journal, index)} == weakest
     assert {record.units[0].matches for record in journal.records().values()} == {30}
     journal.save([(outcome(count, seed=1), False)])
@@ -98,6 +88,10 @@ def test_a_job_is_saved_whole_or_not_at_all(tmp_path: Path) -> None:
     assert journal.records() == {}
     journal.save([(outcome(3), False)])
     assert list(journal.records()) == [3]
+    journal._db.execute("CREATE TEMP TRIGGER t BEFORE INSERT ON points BEGIN SELECT RAISE(ABORT, 'no room'); END")
+    with pytest.raises(sqlite3.IntegrityError, match="no room"):
+        journal.save([(outcome(5), False)])
+    assert list(journal.records()) == [3], "what was written before is taken back"
     journal.close()
 
 
@@ -145,6 +139,7 @@ def damaged_journal(directory: Path, damage: str) -> Path:
     """A journal of two pairs and a scene, after a statement that no run makes."""
     pairs = [Pair(str(number), "batch", "a.png", "b.png") for number in range(8)]
     journal = Journal(directory, OURS, pairs=pairs)
+    journal.note("start", 0.0, "")
     journal.save([(outcome(3, seed=1), False), (outcome(7, seed=2), False)])
     camera = CameraRecord("a", 0, (0.0, 0.0, 1.0), (0.0, 0.0, 1.0), (0.0, 1.0, 0.0), 500.0, Size(640, 480), 9)
     scene = SceneRecord("batch", 2, 2, 1, 9, 3, 1.5, "", (camera,), ((0.0, 0.0, 5.0),))
@@ -159,8 +154,8 @@ def damaged_journal(directory: Path, damage: str) -> Path:
 
 
 def read_all(journal: Journal) -> None:
-    journal.records()
-    journal.scenes()
+    for read in (journal.records, journal.scenes, journal.pairs, journal.events):
+        read()
     for record in journal.records().values():
         journal.results(record, UNITS)
 
@@ -186,6 +181,11 @@ DAMAGES = [
     "UPDATE pair SET value = json_remove(value, '$[4][1]')",
     pairs_with("8", '[[1, 2], "both cameras are known"]'),
     pairs_with("8", '[null, "x"]'),
+    pairs_with("8", '[[[1e999, 0, 0], [0, 0, 1], [0, 1, 0]], "both cameras are known"]'),
+    'UPDATE event SET value = \'["x", "never", ""]\'',
+    "UPDATE sample SET value = cast(x'ff00' AS BLOB)",
+    "UPDATE run SET value = printf('%.*c', 5000, '9')",
+    "INSERT INTO scene VALUES ('other', '[\"other\", 1, 1]')",
     "UPDATE scene SET value = '['",
     "UPDATE scene SET value = json_replace(value, '$[8][0]', json('{{}}'))",
     "UPDATE scene SET value = json_replace(value, '$[8][0][2]', json('[0, null, 1]'))",
@@ -273,6 +273,6 @@ def test_text_that_is_not_utf8_is_kept_in_letters(tmp_path: Path) -> None:
 def test_pairs_that_no_row_names_take_no_place_among_those_that_are_drawn(tmp_path: Path) -> None:
     asked = [Pair(f"one;{index}", "one", "a.png", "b.png") for index in range(2)]
     journal = Journal(tmp_path, OURS, pairs=asked)
-    journal.save([(outcome(index, seed=index), True) for index in reversed(range(DRAWN + 2))])
-    assert [index for index in range(DRAWN + 2) if points_of(journal, index)] == [0, 1]
+    journal.save([(outcome(index, seed=index), True) for index in reversed(range(MAX_DRAWN_PAIRS + 2))])
+    assert [index for index in range(MAX_DRAWN_PAIRS + 2) if points_of(journal, index)] == [0, 1]
     journal.close()

@@ -17,7 +17,7 @@ from mkpc_kaggle.matchers.lightglue import LightGlueOptions, light_glue
 from mkpc_kaggle.matchers.networks.aliked import Aliked
 from mkpc_kaggle.matchers.registry import load_matcher
 from mkpc_kaggle.matchers.sparse import Keypoints
-from mkpc_kaggle.weights import WeightStore, manifest
+from mkpc_kaggle.weights import WeightStore
 
 NAMES = ["aliked_lightglue", "disk_lightglue"]
 
@@ -100,14 +100,3 @@ def test_layers_compute_in_the_precision_that_is_asked_for(precision: Precision,
     matcher.match(encodings, encodings)
     exact = torch.float32
     assert seen == [exact, exact, *2 * [getattr(torch, precision)], exact, exact]
-
-
-def test_kornia_leaves_the_process_as_it_was(store: WeightStore) -> None:
-    before = torch.backends.cuda.flash_sdp_enabled()
-    load("aliked_lightglue", store)
-    assert torch.backends.cuda.flash_sdp_enabled() == before
-
-
-def test_the_manifest_knows_every_file() -> None:
-    listed = {(file.name, file.slot) for file in manifest() if file.digest.startswith("sha256:")}
-    assert {(file.name, file.slot) for file in FILES} <= listed

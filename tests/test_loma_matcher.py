@@ -6,19 +6,16 @@ import pytest
 import torch
 from checkpoints import FILES, write_checkpoints
 from pictures import as_picture
-from standin import filled, scene
+from standin import scene
 
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.matchers import loma
 from mkpc_kaggle.matchers.contract import Placement, encoding_bytes
 from mkpc_kaggle.matchers.loma import LomaAdapter, LomaOptions
-from mkpc_kaggle.matchers.networks import strips
-from mkpc_kaggle.matchers.networks.dedode import dedode_g
-from mkpc_kaggle.matchers.networks.dinov2 import DinoV2Config
+from mkpc_kaggle.matchers.networks import layers
 from mkpc_kaggle.matchers.networks.loma import Loma, Variant, detector_size
 from mkpc_kaggle.matchers.networks.loma_matcher import LomaKeypoints
-from mkpc_kaggle.matchers.networks.placement import placed
 from mkpc_kaggle.weights import WeightStore
 
 OPTIONS = LomaOptions(Variant.B128, max_keypoints=200, match_threshold=0.0)
@@ -79,9 +76,7 @@ def test_keypoints_are_where_the_detector_saw_them(matcher: LomaAdapter) -> None
     assert np.hypot(*(points - (70, 40)).T).min() < 4
 
 
-def test_padding_changes_nothing_and_tiny_pictures_have_no_matches(
-    matcher: LomaAdapter,
-) -> None:
+def test_padding_changes_nothing_and_tiny_pictures_have_no_matches(matcher: LomaAdapter) -> None:
     pixels = scene(75, 101, channels=3)
     plain, padded = matcher.encode([as_picture(pixels), as_picture(pixels, padding=(13, 26))])
     assert torch.equal(plain.keypoints.points, padded.keypoints.points)
@@ -139,48 +134,6 @@ def test_strips_of_rows_give_what_the_whole_gives(network: Loma, monkeypatch: py
     image = image_of(scene(157, 83, channels=3))
     points = torch.rand(1, 50, 2, generator=torch.Generator().manual_seed(0)) * 2 - 1
     logits, descriptors = network.detector.logits(image), network.descriptor(image, points)
-    monkeypatch.setattr(strips, "FLOATS", 83 * 32 * 50)
+    monkeypatch.setattr(layers, "STRIP_FLOATS", 83 * 32 * 50)
     torch.testing.assert_close(network.detector.logits(image), logits, rtol=0, atol=1e-3)
     torch.testing.assert_close(network.descriptor(image, points), descriptors, rtol=0, atol=1e-3)
-
-
-@torch.inference_mode()
-@pytest.mark.parametrize("kind", ["b", "g"])
-def test_descriptors_are_read_from_a_map_that_is_never_made(network: Loma, kind: str) -> None:
-    descriptor = network.descriptor
-    if kind == "g":
-        small = dedode_g(32, DinoV2Config(blocks=1))
-        descriptor = placed(filled(small, "loma"), Placement())
-    image = image_of(scene(42, 70, channels=3))
-    edges = torch.tensor([[-1.0, -1], [1, 1], [-1.02, 0.3], [0.2, 1.03], [3, 0], [-0.99, 0.995]])
-    points = torch.cat([edges, torch.rand(40, 2, generator=torch.Generator().manual_seed(0)) * 2 - 1])[None]
-    prediction, hidden = descriptor.decoder(descriptor.encoder.levels(image))
-    part = descriptor.decoder.last.outputs(hidden)[:, :-1]
-    dense = torch.nn.functional.interpolate(prediction, image.shape[2:], mode="bilinear") + part
-    expected = torch.nn.functional.grid_sample(dense, points[:, None], align_corners=False)[:, :, 0].mT
-    torch.testing.assert_close(descriptor(image, points), expected, rtol=0, atol=1e-5)
-    assert (expected[0, 4] == 0).all()
-    assert expected[0, 0].abs().max() > 0
-
-
-@pytest.fixture(scope="module")
-def pair() -> tuple[LomaKeypoints, LomaKeypoints]:
-    generator = torch.Generator().manual_seed(0)
-    points = torch.rand(40, 2, generator=generator) * 2 - 1
-    descriptors = torch.randn(40, 128, generator=generator)
-    return LomaKeypoints(points[:30], descriptors[:30]), LomaKeypoints(points[5:], descriptors[5:])
-
-
-@torch.inference_mode()
-def test_the_order_of_images_and_of_keypoints_changes_nothing(
-    network: Loma, pair: tuple[LomaKeypoints, LomaKeypoints]
-) -> None:
-    first, second = pair
-    there, back = network.matcher(first, second, 0.0), network.matcher(second, first, 0.0)
-    assert len(there.index0) >= 10
-    assert torch.equal(there.index0, back.index1.sort().values)
-    torch.testing.assert_close(there.scores, back.scores[back.index1.argsort()], rtol=0, atol=1e-4)
-    backwards = LomaKeypoints(second.points.flip(0), second.descriptors.flip(0))
-    reversed_ = network.matcher(first, backwards, 0.0)
-    assert torch.equal(reversed_.index0, there.index0)
-    assert torch.equal(34 - reversed_.index1, there.index1)

@@ -1,7 +1,5 @@
 """Every matcher against pictures whose correspondence is known, and against pictures that have none."""
 
-from dataclasses import fields, is_dataclass
-from enum import StrEnum
 from functools import cache
 
 import cv2
@@ -17,8 +15,7 @@ from torch import nn
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Box, Size
 from mkpc_kaggle.matchers.contract import Colour, Placement
-from mkpc_kaggle.matchers.lightglue import layer_name
-from mkpc_kaggle.matchers.registry import load_matcher, matcher_names, spec_of
+from mkpc_kaggle.matchers.registry import load_matcher, spec_of
 from mkpc_kaggle.weights import WeightStore, load_into
 
 SIZE = Size(256, 192)
@@ -82,17 +79,6 @@ def offsets(matches, H):
     return matches.points1 - true
 
 
-def test_every_spec_makes_sense():
-    for name in matcher_names():
-        spec = spec_of(name, "test")
-        assert (spec.name, bool(spec.summary), spec.multiple >= 1) == (name, True, True)
-        assert is_dataclass(spec.options)
-        spec.options()  # every option has a default
-        assert bool(spec.slots) == bool(spec.licences)
-        kinds = {field.type for field in fields(spec.options)} - {int, float, bool, str}
-        assert all(issubclass(kind, StrEnum) for kind in kinds)
-
-
 @every_matcher
 @pytest.mark.parametrize("kind", MAPS)
 def test_matches_follow_the_known_map(name, kind):
@@ -151,16 +137,3 @@ def test_all_names_and_shapes_of_a_checkpoint_must_fit_but_those_that_are_not_us
     load_into(network, {**part, "2.x": torch.ones(9)}, unused=r"1\.bias|2\.", what="w")
     assert torch.equal(network[1].bias, before)
     assert (network[0].weight == 1).all()
-
-
-@pytest.mark.parametrize(
-    ("old", "new"),
-    [
-        ("self_attn.3.Wqkv.weight", "transformers.3.self_attn.Wqkv.weight"),
-        ("matcher.cross_attn.0.to_qk.bias", "transformers.0.cross_attn.to_qk.bias"),
-        ("transformers.1.self_attn.Wqkv.weight", "transformers.1.self_attn.Wqkv.weight"),
-        ("posenc.Wr.weight", "posenc.Wr.weight"),
-    ],
-)
-def test_older_names_of_layers_are_translated(old, new):
-    assert layer_name(old) == new

@@ -46,12 +46,7 @@ def test_any_dtype_is_cast_to_contiguous_float32(dtype):
 
 @pytest.mark.parametrize(
     ("shape0", "shape1", "shape_scores"),
-    [
-        ((2, 2), (3, 2), (3,)),
-        ((3, 3), (3, 2), (3,)),
-        ((3, 2), (3, 2), (3, 1)),
-        ((3, 2), (6,), (3,)),
-    ],
+    [((2, 2), (3, 2), (3,)), ((3, 3), (3, 2), (3,)), ((3, 2), (3, 2), (3, 1)), ((3, 2), (6,), (3,))],
 )
 def test_shapes_that_disagree_are_an_error(shape0, shape1, shape_scores):
     with pytest.raises(ValueError, match="shape"):
@@ -62,7 +57,7 @@ def test_empty_is_legal_everywhere():
     empty, size = Matches.empty(), Size(40, 30)
     view = View.fit(Box.whole(size), long_side=64)
     results = [empty, Matches([], [], []), Matches.concatenate([]), Matches.concatenate([empty, empty])]
-    results += [empty.best(0), some(5).best(0), empty.inside(size, size), empty.to_image(view, view), empty[:]]
+    results += [empty.best(0), some(5).best(0), empty.to_image(view, view), empty[:]]
     for result in results:
         assert result.points0.shape == result.points1.shape == (0, 2)
         assert result.scores.shape == (0,)
@@ -77,31 +72,12 @@ def test_concatenation_keeps_every_match_in_order_duplicates_too():
     assert_same(together[7:], a)
 
 
-def test_a_mask_indices_and_a_slice_choose_matches():
-    matches = scored([5, 6, 7, 8])
-    assert places(matches[np.array([True, False, False, True])]) == [0, 3]
-    assert places(matches[np.array([2, 0])]) == [2, 0]
-    assert places(matches[1:3]) == [1, 2]
-
-
 @given(scores=st.lists(st.integers(0, 5), max_size=40), most=st.integers(0, 45))
 @settings(max_examples=100, deadline=None)
 def test_the_best_are_those_of_a_stable_sort(scores, most):
     by_score = sorted(range(len(scores)), key=lambda i: -scores[i])
     assert places(scored(scores).best(most)) == sorted(by_score[:most])
     assert places(scored([NAN, 0.2, NAN, 0.1]).best(2)) == [1, 3]
-
-
-def test_inside_drops_what_is_off_either_image_or_not_finite():
-    good = [(0, 0), (-0.5, -0.5), (39.25, 29.25)]
-    bad = [(39.5, 3), (3, 29.5), (-0.75, 3), (NAN, 3), (3, INF)]
-    points = np.array([*good, *bad], np.float32)
-    zeros, ones = np.zeros_like(points), np.ones(len(points))
-    small, large = Size(40, 30), Size(1000, 1000)
-    first, second = Matches(points, zeros, ones), Matches(zeros, points, ones)
-    assert_same(first.inside(small, large), first[:3])
-    assert_same(second.inside(large, small), second[:3])
-    assert places(scored([1, NAN, 2, INF, -INF, 0]).inside(large, large)) == [0, 2, 5]
 
 
 def test_the_way_out_of_a_matcher_drops_padding_outside_and_not_finite_and_maps_the_rest():

@@ -179,9 +179,3 @@ def test_the_pose_auc_is_the_area_computed_by_hand(angles, threshold, area):
     assert pose_auc(errors(*angles), threshold) == pytest.approx(area)
     assert pose_auc([PoseError(1e-9, angle, 9.0) for angle in angles], threshold) == pytest.approx(area)
     assert isnan(pose_auc([], threshold))
-
-
-def test_an_error_reads_as_a_sentence_whatever_is_known() -> None:
-    assert str(PoseError(1.26, 4.0, 0.333)) == "rotation 1.3 degrees off, translation 0.33 m"
-    assert str(PoseError(1.26, 4.0, float("nan"))) == "rotation 1.3 degrees off, translation 4.0 degrees"
-    assert str(PoseError.failed()) == "no pose"

@@ -92,13 +92,6 @@ def test_no_descriptors_give_no_pairs(n, m, dtype):
         assert (value.shape, value.dtype) == ((0,), dtype)
 
 
-def test_of_equal_neighbours_the_one_of_lower_index_counts():
-    x, y = [1.0, 0.0], [0.0, 1.0]
-    index0, index1, _, _ = found(np.array([x, y, x]), np.array([y, x, x, y]))
-    assert_array_equal(index0, [0, 1])
-    assert_array_equal(index1, [1, 0])
-
-
 def test_a_pair_with_an_equal_rival_is_ambiguous():
     x, y = [1.0, 0.0], [0.0, 1.0]
     assert_allclose(found(np.array([x, y]), np.array([x, x, y]))[3], [1, 0], atol=1e-5)

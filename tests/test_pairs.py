@@ -81,8 +81,7 @@ def test_a_malformed_line_is_named_with_what_was_expected(line: str, expected: s
 
 
 @pytest.mark.parametrize(
-    "name",
-    ["/etc/passwd", "../a.jpg", "a/../../b.jpg", "..", "//host/a", "..\\a", "a\\..\\b", "\\a", "C:\\a"],
+    "name", ["/etc/passwd", "../a.jpg", "a/../../b.jpg", "..", "//host/a", "..\\a", "a\\..\\b", "\\a", "C:\\a"]
 )
 def test_no_name_leads_out_of_the_image_root(name: str) -> None:
     for names in (f"{name} ok.jpg", f"ok.jpg {name}"):

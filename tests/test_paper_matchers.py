@@ -17,7 +17,7 @@ from standin import scene, use_narrow
 
 from mkpc_kaggle.cli import main
 from mkpc_kaggle.data.competition import read_submission, read_test_side, submission_problems
-from mkpc_kaggle.engine.journal_tables import JournalReader
+from mkpc_kaggle.engine.journal import JournalReader
 from mkpc_kaggle.weights import WeightFile
 
 COLUMNS = ("sample_id", "batch_id", "image_1_id", "image_2_id")
@@ -128,13 +128,7 @@ def run(
 ) -> Callable[..., Made]:
     """A function that makes a submission of a test side with one of the matchers."""
 
-    def made(
-        matcher: str,
-        test_dir: Path,
-        name: str = "submission",
-        *,
-        workers: int = 0,
-    ) -> Made:
+    def made(matcher: str, test_dir: Path, name: str = "submission", *, workers: int = 0) -> Made:
         use_manifest(monkeypatch, checkpoints.of(matcher))
         use_narrow(monkeypatch)
         output, recipe = tmp_path / f"{name}.csv", write_recipe(tmp_path, matcher)
@@ -150,10 +144,13 @@ def run(
 
 @pytest.mark.parametrize("matcher", TRIALS)
 def test_odd_small_and_blank_pictures_go_through(run: Callable[..., Made], matcher: str, made_side: Path) -> None:
-    processes = matcher != "roma"  # other processes know no narrow network
-    made = run(matcher, made_side, workers=int(processes))
+    made = run(matcher, made_side)
     assert made.matches.keys() == {(pair, stage) for pair in range(3) for stage in (1, 2)}
     assert made.matches[0, 1] >= 8
     if matcher not in {"dkm", "roma", "loma"}:  # which have answers for all pixels, and keypoints on any picture
         assert made.matches[2, 1] == made.matches[2, 2] == 0
-    assert run(matcher, made_side, "again").output.read_bytes() == made.output.read_bytes()
+
+
+def test_a_worker_process_gives_the_same_bytes(run: Callable[..., Made], made_side: Path) -> None:
+    here, there = (run("superglue", made_side, f"with {workers}", workers=workers) for workers in (0, 1))
+    assert here.output.read_bytes() == there.output.read_bytes()

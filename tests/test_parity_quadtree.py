@@ -1,21 +1,18 @@
-"""QuadTree against the golden vectors of its reference; run as a script it prints the table of differences."""
+"""QuadTree against the golden vectors of its reference."""
 
 from functools import cache
 
 import pytest
 import torch
-from golden import Stage, assert_stages, golden_arrays, needs_golden, print_table, ready, standin_state
-from semi_dense import (
-    loftr_stages,
-)
+from golden import Stage, assert_stages, golden_arrays, needs_golden, ready, standin_state
+from semi_dense import loftr_stages
 
 from mkpc_kaggle.matchers.networks.grids import mean_pool
 from mkpc_kaggle.matchers.networks.quadtree import Quadtree, attend, quadtree_attention
 
 CASES = ("same_size", "diff_size_extension", "masked_batch")
 OPERATORS = ("attention_op", "attention_op_unequal")
-TOLERANCES = dict.fromkeys(("feat_", "layer", "coarse"), 1e-4)
-TOLERANCES |= {"conf": 2e-4, "mconf": 2e-4, "win": 2e-4, "fine": 2e-4, "expec_f": 5e-4, "mkpts1_f": 2e-3}
+TOLERANCES = {"coarse": 1e-4, "conf": 2e-4, "mconf": 2e-4, "expec_f": 5e-4, "mkpts1_f": 2e-3}
 HEADS = 2  # of the operator's golden vectors
 
 
@@ -64,21 +61,3 @@ def test_stages(case):
 @pytest.mark.parametrize("case", OPERATORS)
 def test_operator(case):
     assert_stages(operator_stages(case))
-
-
-def test_attention_with_all_cells_kept_is_that_of_each_level():
-    generator = torch.Generator().manual_seed(0)
-    q, k, v = (torch.randn(3, 8, width, 16, generator=generator) for width in (12, 4, 4))
-    shares = torch.tensor([0.2, 0.3, 0.5])
-    expected = torch.zeros(3, 8, 12, 16)
-    for share, factor in zip(shares, (4, 2, 1), strict=True):
-        pooled = [mean_pool(x, factor) for x in (q, k, v)]
-        flat = [x.flatten(1, 2) for x in pooled]
-        message = torch.nn.functional.scaled_dot_product_attention(*flat).view_as(pooled[0])
-        expected += share * message.repeat_interleave(factor, 1).repeat_interleave(factor, 2)
-    torch.testing.assert_close(quadtree_attention(q, k, v, shares, (99, 99)), expected)
-
-
-if __name__ == "__main__":
-    stages = [*((case, stages_of(case)) for case in CASES), *((case, operator_stages(case)) for case in OPERATORS)]
-    print_table("quadtree", stages)

@@ -1,22 +1,18 @@
-"""SuperGlue stage by stage against its golden vectors; what must hold of any weights; the transport by hand.
-
-``python tests/test_parity_superglue.py`` prints how far every stage of every case is off.
-"""
+"""SuperGlue against its golden vectors; what must hold of any weights; the transport by hand."""
 
 import json
-from dataclasses import replace
 from functools import cache
 
 import pytest
 import torch
-from golden import Stage, assert_stages, golden_arrays, needs_golden, print_table, ready, standin_state
+from golden import Stage, assert_stages, golden_arrays, needs_golden, ready, recorded, standin_state
 from loma_values import assignment_values
 from test_parity_superpoint import golden_network as golden_superpoint
 from test_parity_superpoint import image_of
 from torch.nn import functional
 
 from mkpc_kaggle.geometry.coordinates import Size
-from mkpc_kaggle.matchers.networks.assignment import mutual_matches
+from mkpc_kaggle.matchers.networks.layers import mutual_matches
 from mkpc_kaggle.matchers.networks.superglue import SuperGlue, log_optimal_transport
 from mkpc_kaggle.matchers.networks.superpoint import SuperPointKeypoints
 
@@ -63,23 +59,13 @@ def assignment_stages(log_plan, threshold, golden, suffix=""):
         yield Stage(name, value[0], golden[name], 1e-4 if "scores" in name else 0)
 
 
-def feature_stages(network, image0, image1):
-    """The features of both images at every stage up to the score matrix, with the tolerance of each."""
+def plan_of(network, image0, image1):
+    """The score matrix of a pair, and the logarithm of its transport plan with the dustbins."""
     n0 = len(image0.points)
-    yield "kenc", torch.cat([network.position(image0), network.position(image1)], dim=1), 2e-6
-    x = torch.cat([network.encoded(image0), network.encoded(image1)], dim=1)
-    for number, layer in enumerate(network.gnn.layers, start=1):
-        tolerance = 2e-6 if number <= 2 else 5e-5
-        message = layer.message(x, n0)
-        yield f"gnn{number}_message", message, tolerance
-        x = layer.update(x, message)
-        yield f"gnn{number}_desc", x, tolerance
-    yield "mdesc", network.final_proj(x), 2e-4
-
-
-def plan_of(network, scores):
-    """Without the dustbins, (N0, N1)."""
-    return log_optimal_transport(scores, network.bin_score, network.sinkhorn_iterations)[0, :-1, :-1]
+    with recorded(network, ["final_proj"]) as calls:
+        network(image0, image1)
+    scores = network.score_matrix(calls["final_proj"][0][1], n0)
+    return scores, log_optimal_transport(scores, network.bin_score, network.sinkhorn_iterations)[0]
 
 
 @torch.inference_mode()
@@ -87,14 +73,7 @@ def network_stages(case):
     golden = golden_arrays("superglue", case)
     network = golden_network(json.loads(golden["config"]))
     for image0, image1, arrays in golden_pairs(golden):
-        n0 = len(image0.points)
-        for name, features, tolerance in feature_stages(network, image0, image1):
-            for index, part in enumerate((features[0, :n0], features[0, n0:])):
-                if f"{name}{index}" in arrays:
-                    expected = arrays[f"{name}{index}"]
-                    yield Stage(f"{name}{index}", part.mT.reshape(expected.shape), expected, tolerance)
-        scores = network.score_matrix(features, n0)  # of the last stage
-        log_plan = log_optimal_transport(scores, network.bin_score, network.sinkhorn_iterations)[0]
+        scores, log_plan = plan_of(network, image0, image1)
         for name, got in (("score_matrix", scores), ("log_assignment", log_plan)):
             yield Stage(name, got.view_as(arrays[name]), arrays[name], 1e-3)
         found, plan = network(image0, image1), log_plan[:-1, :-1]
@@ -125,9 +104,8 @@ def pipeline_stages():
         yield Stage(f"scores{index}", found.scores, golden[f"scores{index}"], 2e-5)
         images.append(found)
     network = golden_network(config["superglue"])
-    *_, (_, features, _) = feature_stages(network, *images)
-    scores = network.score_matrix(features, len(images[0].points))
-    yield from assignment_stages(plan_of(network, scores), network.match_threshold, golden)
+    _, log_plan = plan_of(network, *images)
+    yield from assignment_stages(log_plan[:-1, :-1], network.match_threshold, golden)
 
 
 @needs_golden
@@ -165,38 +143,10 @@ def keypoints(seed, n):
     return SuperPointKeypoints(points, scores, descriptors, VGA)
 
 
-def taken(image, index):
-    """The keypoints ``index`` of an image, in that order."""
-    parts = {name: getattr(image, name)[index] for name in ("points", "scores", "descriptors")}
-    return replace(image, **parts)
-
-
-def alike(n):
-    """Two images with ``n`` keypoints in common and some of their own."""
-    image0, image1 = keypoints(1, n + 9), keypoints(2, n + 4)
-    shared = image0.descriptors[:n] + 0.02 * image1.descriptors[:n]
-    return image0, replace(
-        image1, descriptors=torch.cat([functional.normalize(shared, dim=1), image1.descriptors[n:]])
-    )
-
-
 @pytest.mark.parametrize(("n0", "n1"), [(0, 0), (0, 5), (5, 0)])
 def test_no_keypoints_give_no_matches(n0, n1):
     found = network()(keypoints(0, n0), keypoints(1, n1))
     assert [each.shape for each in (found.index0, found.index1, found.scores)] == [(0,)] * 3
-
-
-def test_the_order_of_keypoints_does_not_matter():
-    image0, image1 = alike(20)
-    order0 = torch.randperm(29, generator=torch.Generator().manual_seed(5))
-    order1 = torch.randperm(24, generator=torch.Generator().manual_seed(6))
-    expected = network()(image0, image1)
-    found = network()(taken(image0, order0), taken(image1, order1))
-    assert len(expected.index0) >= 5
-    pairs = torch.stack([order0[found.index0], order1[found.index1]], dim=1)
-    by_first = pairs[:, 0].argsort()
-    assert torch.equal(pairs[by_first], torch.stack([expected.index0, expected.index1], dim=1))
-    torch.testing.assert_close(found.scores[by_first], expected.scores, rtol=0, atol=1e-4)
 
 
 def plain_transport(scores, bin_score, iterations):
@@ -226,8 +176,3 @@ def test_the_transport_is_that_of_the_log_domain(m, n, iterations, bin_score, sp
     expected = plain_transport(scores, bin_score, iterations)
     torch.testing.assert_close(got.double(), expected, rtol=1e-5, atol=1e-3)
     torch.testing.assert_close(got.double().exp(), expected.exp(), rtol=0, atol=5e-4)
-
-
-if __name__ == "__main__":
-    tables = [(case, network_stages(case)) for case in CASES]
-    print_table("superglue", [*tables, ("sinkhorn", sinkhorn_stages()), ("pipeline_pair", pipeline_stages())])

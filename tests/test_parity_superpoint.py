@@ -1,24 +1,14 @@
-"""SuperPoint stage by stage against its golden vectors; what must hold of any weights; by hand on small maps.
-
-``python tests/test_parity_superpoint.py`` prints how far every stage of every case is off.
-"""
+"""SuperPoint stage by stage against its golden vectors; what must hold of any weights; by hand on small maps."""
 
 import json
 from functools import cache
 
-import cv2
-import numpy as np
 import pytest
 import torch
-from golden import Stage, assert_stages, golden_arrays, needs_golden, print_table, ready, standin_state
+from golden import Stage, assert_stages, golden_arrays, needs_golden, ready, standin_state
 from torch.nn import functional
 
-from mkpc_kaggle.matchers.networks.superpoint import (
-    SuperPoint,
-    sample_descriptors,
-    score_map,
-    suppress_non_maxima,
-)
+from mkpc_kaggle.matchers.networks.superpoint import SuperPoint, sample_descriptors, score_map, suppress_non_maxima
 
 CASES = ["default_160x216", "outdoor_160x216", "odd_171x229", "noborder_64x72"]
 
@@ -80,27 +70,6 @@ def sampling_stages():
     yield Stage("descriptors", got.T, golden["descriptors"], 1e-5)
 
 
-def resized_by_opencv(source, size, *, rounded):
-    """As the reference prepares an image; the package itself resizes in views (see its coordinates)."""
-    pixels = cv2.resize(source.numpy() if rounded else source.numpy().astype(np.float32), size)
-    return torch.from_numpy(pixels).float()
-
-
-def resize_stages():
-    """The input's preparation: OpenCV's bilinear resize and the rule of sizes, as the specification has them."""
-    golden = golden_arrays("superpoint", "resize_cases")
-    for name, size in {"max50": (37, 50), "max120": (88, 120), "exact64x48": (64, 48)}.items():
-        for kind in ("float", "uint8"):
-            got = resized_by_opencv(golden["source"], size, rounded=kind == "uint8")
-            yield Stage(f"{name}_{kind}", got, golden[f"{name}_{kind}"], 1e-4 if kind == "float" else 1)
-    table = golden["size_table"]
-    sizes = [
-        [side if longest == -1 else round(side * (longest / max(width, height))) for side in (width, height)]
-        for width, height, longest in table[:, :3].tolist()
-    ]
-    yield Stage("size_table", torch.tensor(sizes), table[:, 3:])
-
-
 @needs_golden
 @pytest.mark.parametrize("case", CASES)
 def test_every_stage_of_the_network_is_the_golden_one(case):
@@ -108,7 +77,7 @@ def test_every_stage_of_the_network_is_the_golden_one(case):
 
 
 @needs_golden
-@pytest.mark.parametrize("stages", [nms_stages, sampling_stages, resize_stages])
+@pytest.mark.parametrize("stages", [nms_stages, sampling_stages])
 def test_steps_without_weights_are_the_golden_ones(stages):
     assert_stages(stages())
 
@@ -147,13 +116,6 @@ def test_the_threshold_is_strict_and_the_limit_keeps_the_strongest_in_order():
     assert [20, 9] in selected(border=3)
 
 
-@pytest.mark.parametrize(("height", "width"), [(7, 64), (8, 8), (9, 15), (16, 16), (8, 200)])
-def test_small_images_have_no_keypoints_and_that_is_no_error(height, width):
-    (found,) = network(border=8)(torch.rand(1, 1, height, width))
-    assert (found.points.shape, found.scores.shape, found.descriptors.shape) == ((0, 2), (0,), (0, 256))
-    assert found.points.dtype == found.scores.dtype == found.descriptors.dtype == torch.float32
-
-
 def test_a_batch_equals_its_images_with_any_weights():
     net = network(max_keypoints=20)
     batch = torch.rand(3, 1, 45, 62)
@@ -165,9 +127,3 @@ def test_a_batch_equals_its_images_with_any_weights():
         assert (alone.scores.diff() <= 0).all()
         assert ((alone.points >= 4) & (alone.points < torch.tensor([56 - 4, 40 - 4]))).all()
     assert net(batch[:0]) == []
-
-
-if __name__ == "__main__":
-    steps = {"nms_cases": nms_stages, "descriptor_sampling": sampling_stages, "resize_cases": resize_stages}
-    tables = [(case, network_stages(case)) for case in CASES]
-    print_table("superpoint", tables + [(case, stages()) for case, stages in steps.items()])

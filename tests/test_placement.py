@@ -5,7 +5,7 @@ import torch
 from torch import nn
 
 from mkpc_kaggle.matchers.contract import Placement, Precision
-from mkpc_kaggle.matchers.networks.layers import Linear, attention, linear
+from mkpc_kaggle.matchers.networks.layers import Linear
 from mkpc_kaggle.matchers.networks.placement import fold_norms, placed
 from mkpc_kaggle.matchers.networks.resnet_fpn import ResNetFpn
 
@@ -54,30 +54,3 @@ def test_half_precision_is_that_of_the_weights():
     assert network[0].weight.dtype == torch.bfloat16 and network[1].weight.dtype == torch.float32
     assert found.dtype == torch.float32
     assert 0 < (found - expected).abs().max() < 0.1
-
-
-@pytest.mark.parametrize("shape", [(4, 3), (32, 3), (2, 5, 3), (2, 8, 4, 3), (0, 3), (1, 3)])
-@pytest.mark.parametrize("threads", [1, 2])
-@torch.inference_mode()
-def test_a_linear_map_is_its_definition(shape, threads):
-    former = torch.get_num_threads()
-    torch.set_num_threads(threads)
-    try:
-        torch.manual_seed(4)
-        x, weight, bias = torch.randn(*shape), torch.randn(7, 3), torch.randn(7)
-        torch.testing.assert_close(linear(x, weight, bias), x @ weight.T + bias)
-        torch.testing.assert_close(linear(x.mT.contiguous().mT, weight), x @ weight.T)
-    finally:
-        torch.set_num_threads(former)
-
-
-@pytest.mark.parametrize("queries", [1, 300])
-@torch.inference_mode()
-def test_attention_is_its_definition(queries):
-    torch.manual_seed(5)
-    q, k, v = torch.randn(2, 3, queries, 16), torch.randn(2, 3, 40, 16), torch.randn(2, 3, 40, 16)
-    expected = (q @ k.mT / 4).softmax(dim=-1) @ v
-    torch.testing.assert_close(attention(q, k, v, torch.float32), expected)
-    half = attention(q, k, v, torch.bfloat16)
-    assert half.dtype == torch.float32
-    assert 0 < (half - expected).abs().max() < 0.05

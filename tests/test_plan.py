@@ -13,7 +13,7 @@ from simulator import MemoryJournal, Scenario, random_scenario, simulate, withou
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.engine import Ending
 from mkpc_kaggle.engine.jobs import Cause, Failure, MatchJob, MatchResult, Outcome, Phase
-from mkpc_kaggle.engine.plan import HANGS, JOB_PAIRS, Plan
+from mkpc_kaggle.engine.plan import HANG_FACTOR, JOB_PAIRS, Plan
 from mkpc_kaggle.engine.records import PairRecord, UnitRecord
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
@@ -47,10 +47,12 @@ def jobs_of(
     plan: Plan,
     fails: Callable[[MatchJob], Failure | None] = lambda _: None,
     inliers: Callable[[int], int] = lambda _: 50,
+    *,
+    cautious: bool = True,
 ) -> Iterator[MatchJob]:
     """All jobs of one place, each of which comes back, or is lost, before the next is planned."""
     now, failure = 0.0, None
-    while (job := plan.next(now, "here", cautious=failure is not None)) is not None:
+    while (job := plan.next(now, "here", cautious=cautious and failure is not None)) is not None:
         yield job
         result, failure = finished(job, plan, inliers), fails(job)
         now += result.unit_seconds
@@ -89,7 +91,16 @@ def test_no_pair_is_in_two_jobs_at_a_time() -> None:
     assert {len(job.indices) for job in jobs} == {1}, "the cost of the unit is unknown"
 
 
-def test_a_lost_job_is_halved_then_split_by_units_and_given_up_for_its_pair() -> None:
+@pytest.mark.parametrize(
+    ("cautious", "pairs", "units"),
+    [
+        (False, [8, 4, 2, 1, 1, 1, 1], [(THIRD, SECOND), (THIRD,), (THIRD,), (SECOND,)]),
+        (True, [8, 1, 1, 1], [(THIRD,), (THIRD,), (SECOND,)]),
+    ],
+)
+def test_a_lost_job_is_tried_by_fewer_pairs_then_by_units_and_given_up_for_its_pair(
+    cautious: bool, pairs: list[int], units: list[tuple[Unit, ...]]
+) -> None:
     plan = plan_of(9)
     seen = []
 
@@ -97,10 +108,10 @@ def test_a_lost_job_is_halved_then_split_by_units_and_given_up_for_its_pair() ->
         seen.append((job.indices, job.units))
         return DIED if job.phase is Phase.DEEPEN and 1 in job.indices and THIRD in job.units else None
 
-    list(jobs_of(plan, fails))
+    list(jobs_of(plan, fails, cautious=cautious))
     deepened = [(indices, units) for indices, units in seen if SWEEP not in units and 1 in indices]
-    assert [len(indices) for indices, _ in deepened] == [8, 4, 2, 1, 1, 1, 1]
-    assert [units for _, units in deepened[3:]] == [(THIRD, SECOND), (THIRD,), (THIRD,), (SECOND,)]
+    assert [len(indices) for indices, _ in deepened] == pairs
+    assert [tried for _, tried in deepened[-len(units) :]] == units
     failures = {
         (index, unit.unit): unit.failure
         for index in range(9)
@@ -140,12 +151,6 @@ def test_a_lost_job_is_tried_again_in_another_place_where_there_is_one() -> None
     assert again.indices == job.indices
 
 
-def test_the_only_place_that_is_left_tries_again_what_was_lost_there() -> None:
-    plan = learnt(plan_of(1), SWEEP)
-    plan.on_failure(plan.next(0.0, "here"), DIED, "here", 1.0)  # type: ignore[arg-type]
-    assert plan.next(1.0, "here") is not None
-
-
 def test_a_place_that_lost_a_worker_tries_one_pair_and_one_unit_that_was_not_lost() -> None:
     plan = plan_of(40)
     deepening = next(job for job in jobs_of(plan) if job.phase is Phase.DEEPEN and len(job.indices) == 8)
@@ -170,11 +175,24 @@ def test_what_a_jobs_own_deadline_cut_off_is_planned_again() -> None:
     assert (again.phase, again.indices) == (job.phase, job.indices[-1:])
 
 
+def test_a_pair_whose_earlier_results_cannot_be_read_is_left_as_it_is() -> None:
+    plan = plan_of(1)
+    deepening = next(job for job in jobs_of(plan) if job.phase is Phase.DEEPEN)
+    former = plan.records[0]
+    again = UnitRecord(THIRD.name, THIRD.stage, 9, 9, 0.0, 1.0, "")
+    alone = Outcome(
+        PairRecord(0, FALLBACK_FUNDAMENTAL, "", (again,)), (UnitResult(THIRD, Matches.empty(), 0.0, 1.0),)
+    )
+    assert plan.on_result(deepening, MatchResult((alone,)), 1.0, 1.0) == []
+    assert plan.records[0] is former
+    assert plan.next(1.0) is None
+
+
 def test_a_worker_hangs_after_many_times_what_its_units_take() -> None:
     job = learnt(plan_of(limit=32400.0), SWEEP).next(0.0)
     assert job is not None
     assert job.seconds > 1.0
-    assert job.time_limit == job.seconds + HANGS
+    assert job.time_limit == job.seconds + HANG_FACTOR
 
 
 @pytest.mark.parametrize("limit", [20.0, 600.0, 32400.0])
@@ -189,7 +207,7 @@ def test_where_no_unit_ends_in_time_there_is_no_job_until_scenes_need_less() -> 
     plan.reserve = 10.0
     now = plan.stop - 0.5
     assert plan.next(now) is None
-    assert plan.has_work
+    assert plan.has_work(now)
     plan.reserve = 0.0
     assert plan.next(now) is not None
 

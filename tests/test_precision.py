@@ -8,7 +8,6 @@ import pytest
 import torch
 from standin import filled, scene
 
-from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.matchers.contract import Placement, Precision
 from mkpc_kaggle.matchers.networks.aspanformer import AspanFormer
@@ -17,16 +16,10 @@ from mkpc_kaggle.matchers.networks.loftr import Loftr
 from mkpc_kaggle.matchers.networks.pixels import network_input
 from mkpc_kaggle.matchers.networks.placement import placed
 from mkpc_kaggle.matchers.networks.quadtree import Quadtree
-from mkpc_kaggle.pipeline import devices
 from mkpc_kaggle.pipeline.devices import fastest_precision, resolve_placement
 
 SIZE = Size(224, 160)
-MAKERS = {
-    "loftr": Loftr,
-    "quadtree": Quadtree,
-    "aspanformer": AspanFormer,
-    "dkm": DKM,
-}
+MAKERS = {"loftr": Loftr, "quadtree": Quadtree, "aspanformer": AspanFormer, "dkm": DKM}
 half_precisions = pytest.mark.parametrize("precision", [Precision.BFLOAT16, Precision.FLOAT16])
 
 
@@ -103,15 +96,3 @@ def test_auto_takes_half_precision_where_the_processor_has_it(monkeypatch):
         assert resolve_placement("cpu", "auto") == Placement("cpu", expected)
     monkeypatch.delattr(torch.cpu, "get_capabilities")
     assert fastest_precision("cpu") is Precision.FLOAT32
-
-
-@pytest.mark.parametrize(("capability", "expected"), [((7, 5), Precision.FLOAT16), ((6, 1), Precision.FLOAT32)])
-def test_auto_takes_half_precision_on_a_gpu_with_tensor_cores(monkeypatch, capability, expected):
-    monkeypatch.setattr(devices, "gpu_capabilities", lambda: [(5, 2), capability])
-    monkeypatch.setattr(devices, "gpus_of", lambda device: [1])
-    assert fastest_precision("cuda:1") is expected
-
-
-def test_an_unknown_precision_is_refused():
-    with pytest.raises(UserError, match=r"'half'; known: auto, float32, bfloat16, float16"):
-        resolve_placement("cpu", "half")

@@ -1,4 +1,4 @@
-"""Progress: a bar on a terminal, few lines where every line stays."""
+"""Progress: a line drawn again on a terminal, few lines where every line stays."""
 
 from io import StringIO
 
@@ -26,7 +26,7 @@ class Clock:
         return self.now
 
 
-def test_a_terminal_has_a_bar_that_is_drawn_anew() -> None:
+def test_a_terminal_has_a_line_a_phase_that_is_drawn_again() -> None:
     stream = Terminal()
     progress = Progress(Budget(0.0, 100.0, Clock()), stream)
     progress.show(Phase.SWEEP, 8, 8)
@@ -56,15 +56,6 @@ def test_lines_come_when_a_phase_begins_now_and_then_and_in_the_end() -> None:
     progress.close()
     sweep = ["sweep: 100 pairs", *(f"sweep: {done} of 100 pairs" for done in (31, 61, 91))]
     assert stream.getvalue().splitlines() == [*sweep, "deepen: 2 pairs", "deepen: 2 of 2 pairs"]
-
-
-def test_a_line_says_how_much_of_the_budget_is_left() -> None:
-    stream = StringIO()
-    progress = Progress(Budget(0.0, 10.0, Clock()), stream)
-    progress.show(Phase.SWEEP, 1, 5)
-    progress.show(Phase.SWEEP, 3, 5)
-    progress.close()
-    assert stream.getvalue() == "sweep: 5 pairs, budget left 8.5s\nsweep: 3 of 5 pairs, budget left 8.5s\n"
 
 
 def test_a_log_whose_reader_has_left_does_not_end_the_run() -> None:

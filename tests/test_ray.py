@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from rectified import THREE_UNITS, RectifiedMatcher, Seen, run, write_pairs
+from rectified import THREE_UNITS, RectifiedMatcher, Seen, matrices, run
 from synthetic import RECIPE as SYNTHETIC
 from synthetic import SyntheticMatcher, synthetic_pairs
 
@@ -27,7 +27,6 @@ ray = pytest.importorskip("ray", reason="Ray is not installed: pip install 'mkpc
 
 TESTS = Path(__file__).parent
 IMPORTED = [str(TESTS.parent), str(TESTS), str(TESTS / "support")]  # what machines can import
-COUNT = 12
 STORE_BYTES = 80 << 20
 
 
@@ -76,20 +75,6 @@ def cluster() -> Iterator[Any]:
     yield cluster
     cluster.shutdown()
     patch.undo()
-
-
-@pytest.fixture(scope="module")
-def pairs(tmp_path_factory: pytest.TempPathFactory) -> list[Pair]:
-    return write_pairs(tmp_path_factory.mktemp("pairs"), COUNT)
-
-
-@pytest.fixture(scope="module")
-def undisturbed(pairs: list[Pair], tmp_path_factory: pytest.TempPathFactory) -> RunReport:
-    return run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path_factory.mktemp("undisturbed"))
-
-
-def matrices(report: RunReport) -> list[bytes]:
-    return [record.chosen_fundamental.tobytes() for record in report.records]
 
 
 def test_actors_give_the_bytes_of_a_run_in_one_process(
@@ -157,7 +142,9 @@ def test_batches_are_reconstructed_on_the_cluster_to_the_same_bytes(
     report = run(batch, SYNTHETIC, SyntheticMatcher(), tmp_path / "w", workers=RayCluster(cluster.address))
     assert report.faults == ()
     assert [record.source for record in report.records] == ["scene"] * len(batch)
-    assert matrices(report) == matrices(here)
+    assert [record.chosen_fundamental.tobytes() for record in report.records] == [
+        record.chosen_fundamental.tobytes() for record in here.records
+    ]
 
 
 LOCAL = """

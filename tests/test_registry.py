@@ -9,8 +9,7 @@ import pytest
 
 from mkpc_kaggle import matchers
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.matchers.contract import Unusable
-from mkpc_kaggle.matchers.registry import find_matcher, matcher_names, spec_of
+from mkpc_kaggle.matchers.registry import matcher_names, spec_of
 
 WITHOUT_KORNIA = """
 import sys
@@ -31,10 +30,8 @@ def more_matchers(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[P
     """A folder whose files are matchers too."""
     monkeypatch.setattr(matchers, "__path__", [*matchers.__path__, str(tmp_path)])
     matcher_names.cache_clear()
-    find_matcher.cache_clear()
     yield tmp_path
     matcher_names.cache_clear()
-    find_matcher.cache_clear()
     for name in ("new", "broken"):
         sys.modules.pop(f"{matchers.__name__}.{name}", None)
 
@@ -55,15 +52,12 @@ def test_a_new_matcher_is_a_new_file(more_matchers: Path) -> None:
 
 def test_a_broken_matcher_is_told_with_its_reason_and_costs_no_other(more_matchers: Path) -> None:
     (more_matchers / "broken.py").write_text("from json import no_such_thing\nSPEC = None\n")
-    found = find_matcher("broken")
-    assert isinstance(found, Unusable)
-    assert "no_such_thing" in found.reason
-    with pytest.raises(UserError, match=r"my recipe: matcher broken cannot be used here \(ImportError: .*"):
+    with pytest.raises(UserError, match=r"my recipe: matcher broken cannot be used here \(ImportError: .*no_such"):
         spec_of("broken", "my recipe")
     assert spec_of("sift", "test").name == "sift"
 
 
-def test_files_without_a_spec_are_no_matchers() -> None:
+def test_files_without_a_spec_are_not_matchers() -> None:
     assert not {"contract", "registry", "sparse", "neighbours"} & set(matcher_names())
     with pytest.raises(UserError, match="unknown matcher 'sparse'; known: aliked, "):
         spec_of("sparse", "test")
@@ -72,8 +66,8 @@ def test_files_without_a_spec_are_no_matchers() -> None:
 def test_without_kornia_its_matchers_alone_are_lost(clean_environment: None) -> None:
     done = run(WITHOUT_KORNIA)
     assert "superglue_outdoor.pth" in done.stdout, done.stderr
-    assert "\nmatcher xfeat_lighterglue cannot be used here (ModuleNotFoundError" in done.stdout
-    assert "    matcher xfeat_lighterglue cannot be used here (ModuleNotFoundError" in done.stdout
+    assert "\nweights: matcher xfeat_lighterglue cannot be used here (ModuleNotFoundError" in done.stdout
+    assert "    xfeat_lighterglue: cannot be used here (ModuleNotFoundError" in done.stdout
     assert "('sift',) True" in done.stdout
     assert "recipe auto does without xfeat_lighterglue: cannot be used here (ModuleNotFoundError" in done.stderr
     assert "recipe 'light': matcher xfeat_lighterglue cannot be used here" in done.stderr

@@ -16,14 +16,13 @@ from torch.nn import functional
 from mkpc_kaggle.matchers.contract import Placement
 from mkpc_kaggle.matchers.networks import (
     aliked,
-    aspan_transformer,
+    aspanformer,
     coarse_matching,
     dad,
-    dedode_decoder,
+    dedode,
     dense_warp,
     dinov2,
     fine_matching,
-    gaussian_process,
     linear_attention,
     loma_matcher,
     roma,
@@ -94,8 +93,8 @@ MISTAKES = [  # in a matcher: the module or class, what is changed there, and ho
     ("dkm", dense_warp, "resize", nearest),
     ("loma", dad, "TEMPERATURE", 1.0),
     ("loma", dad, "MEAN", (0.5, 0.5, 0.5)),
-    ("loma", dad, "resize", lambda x, size, mode: dedode_decoder.resize(x, size, "bilinear")),
-    ("loma", dedode_decoder.DedodeRefiner, "_hidden", lambda self, mixed: self.hidden_blocks(mixed)),
+    ("loma", dad, "resize", lambda x, size, mode: dedode.resize(x, size, "bilinear")),
+    ("loma", dedode.DedodeRefiner, "_hidden", lambda self, mixed: self.hidden_blocks(mixed)),
     ("loma", loma_matcher, "apply_rotary", lambda x, rotation: x),
     ("loma", loma_matcher, "log_scores", lambda similarity: similarity.log_softmax(dim=2)),
     ("aliked", aliked, "TEMPERATURE", 0.2),
@@ -107,8 +106,8 @@ MISTAKES = [  # in a matcher: the module or class, what is changed there, and ho
     ("loftr", fine_matching, "CENTRE", 11),
     ("loftr", linear_attention.functional, "elu", lambda x, inplace: x.relu_()),
     ("quadtree", coarse_matching, "inner_cells", lambda mask, border: mask.flatten()),
-    ("aspanformer", aspan_transformer, "RADIUS", 4.0),
-    ("dkm", gaussian_process, "TEMPERATURE", 0.25),
+    ("aspanformer", aspanformer, "RADIUS", 4.0),
+    ("dkm", dense_warp, "TEMPERATURE", 0.25),
 ]
 
 

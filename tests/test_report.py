@@ -3,9 +3,10 @@
 import json
 import re
 import sys
-import time
 from html.parser import HTMLParser
+from math import inf
 from pathlib import Path
+from types import SimpleNamespace
 
 import pandas as pd
 import pytest
@@ -13,8 +14,7 @@ from rectified import THREE_UNITS, RectifiedMatcher, run, write_pairs
 
 from mkpc_kaggle.cli import main
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine.journal import Journal
-from mkpc_kaggle.engine.journal_tables import DRAWN, About, EventKind, JournalReader
+from mkpc_kaggle.engine.journal import MAX_DRAWN_PAIRS, About, EventKind, Journal, JournalReader
 from mkpc_kaggle.reporting.report import DRAWING_S, report_page, report_run
 from mkpc_kaggle.reporting.run_log import NOT_ENDED, read_log
 from mkpc_kaggle.reporting.summary import overview
@@ -91,12 +91,6 @@ def test_a_run_exports_tables_that_pandas_reads_as_they_are(
     assert [event.kind for event in log.session if event.kind in ("start", "end")] == ["start", "end"]
 
 
-def test_the_screen_names_matchers_that_were_left_out_once(tmp_path: Path) -> None:
-    empty_journal(tmp_path, [], left_out=("no weights: loma, roma", "cannot be used here: dkm")).close()
-    screen = overview(read_log(tmp_path))
-    assert screen.count("left out, no weights: loma, roma; cannot be used here: dkm (`python -m") == 1
-
-
 @pytest.mark.parametrize("option", ["--csv", "--json", "--report"])
 def test_an_export_that_cannot_be_written_is_told(
     tmp_path: Path, option: str, capsys: pytest.CaptureFixture[str]
@@ -124,7 +118,7 @@ def test_a_journal_can_be_read_while_its_run_writes_it(tmp_path: Path) -> None:
 def test_the_page_begins_with_the_verdict_has_pictures_inside_and_asks_for_nothing(tmp_path: Path) -> None:
     pairs = a_run(tmp_path)
     page = tmp_path / "new" / "report.html"
-    assert report_run(tmp_path / "work", page, time.monotonic() + 600, pairs) == f"report: {page}"
+    assert report_run(tmp_path / "work", page, inf, pairs) == f"report: {page}"
     text = page.read_text(encoding="utf-8")
     assert re.search("<h1>Complete after .*: 11 of 12 pairs have an F</h1>", text)
     assert sections(text) == ["Faults", "The weakest pairs", "Where the time went", "What made this"]
@@ -140,7 +134,7 @@ def test_the_page_begins_with_the_verdict_has_pictures_inside_and_asks_for_nothi
 def test_the_weakest_pairs_are_drawn_with_the_inliers_that_magsac_found(tmp_path: Path) -> None:
     a_run(tmp_path)
     log = read_log(tmp_path / "work")
-    assert len(log.weakest) == 11 <= DRAWN
+    assert len(log.weakest) == 11 <= MAX_DRAWN_PAIRS
     for weak in log.weakest:
         match = weak.match(THREE_UNITS.magsac.threshold)
         assert len(match.matches) == weak.record.matches
@@ -175,21 +169,14 @@ def test_without_matplotlib_the_page_has_tables_and_says_so(
     assert pairs[0].id in text
 
 
-def test_a_run_of_no_pairs_has_a_page_without_empty_sections(tmp_path: Path) -> None:
-    empty_journal(tmp_path, []).close()
-    log = read_log(tmp_path)
-    assert sections(report_page(log)) == ["What made this"]
-    assert all(table.empty for name, table in log.tables.named().items() if name != "events")
-    assert overview(log)
-
-
-def test_a_late_report_leaves_out_drawings_then_itself(tmp_path: Path) -> None:
+def test_a_late_report_leaves_out_drawings_then_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mkpc_kaggle.reporting.report.time", SimpleNamespace(monotonic=lambda: 0.0))
     pairs = a_run(tmp_path, 3)
     path = tmp_path / "report.html"
-    line = report_run(tmp_path / "work", path, time.monotonic() + 0.1, pairs)
+    line = report_run(tmp_path / "work", path, -0.1, pairs)
     assert line.startswith("no report, the time is up")
     assert not path.exists()
-    assert report_run(tmp_path / "work", path, time.monotonic() + DRAWING_S - 1, pairs) == f"report: {path}"
+    assert report_run(tmp_path / "work", path, DRAWING_S - 1, pairs) == f"report: {path}"
     text = path.read_text()
     assert "little time was left" in text
     assert "<img" not in text
@@ -199,11 +186,11 @@ def test_a_report_that_fails_is_a_line_and_leaves_the_page_without_drawings(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "report.html"
-    line = report_run(tmp_path / "nowhere", path, time.monotonic() + 600)
+    line = report_run(tmp_path / "nowhere", path, inf)
     assert line.startswith("warning: no report, or a report without drawings (")
     pairs = a_run(tmp_path, 3)
     monkeypatch.setattr("mkpc_kaggle.reporting.report.draw_strip", None)
-    assert report_run(tmp_path / "work", path, time.monotonic() + 600, pairs).startswith("warning: no report, or")
+    assert report_run(tmp_path / "work", path, inf, pairs).startswith("warning: no report, or")
     assert "Drawings are missing" in path.read_text()
 
 

@@ -1,4 +1,4 @@
-"""Two-view estimates: the truth where there is one, else a value with its reason, and always the same bytes."""
+"""Two-view estimates: the truth where it can be found, else a value with its reason, and always the same bytes."""
 
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
@@ -12,16 +12,14 @@ from hypothesis.extra.numpy import arrays
 from numpy.testing import assert_allclose, assert_array_equal
 
 from mkpc_kaggle.geometry import robust
-from mkpc_kaggle.geometry.cameras import Camera, fundamental_of_cameras, relative_pose
+from mkpc_kaggle.geometry.cameras import Camera, fundamental_of_cameras
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.geometry.metrics import rotation_angle
 from mkpc_kaggle.geometry.robust import (
     FALLBACK_FUNDAMENTAL,
     Method,
     ModelKind,
     RobustConfig,
     estimate,
-    poses_of_fundamental,
     sampson_distances,
 )
 
@@ -126,25 +124,6 @@ def test_the_essential_matrix_and_the_homography_of_a_plane_are_found_among_outl
     assert np.hypot(*(moved - fresh.points1).T).max() < 0.05
 
 
-@pytest.mark.parametrize("seed", SEEDS)
-def test_the_pose_of_the_estimate_is_the_true_one(seed):
-    first, second = cameras(seed)
-    R, t = relative_pose(first, second)
-    for F, degrees in [
-        (fundamental_of_cameras(first, second), 1e-6),
-        (estimate(scene(seed)[0], DEFAULT).matrix, 1.0),
-    ]:
-        rotations, direction = poses_of_fundamental(F, first.K, second.K)
-        angles = [rotation_angle(rotation @ R.T) for rotation in rotations]
-        assert min(angles) < degrees
-        assert max(angles) > 30
-        assert np.linalg.norm(direction) == UNIT
-        assert np.degrees(np.linalg.norm(np.cross(direction, t / np.linalg.norm(t)))) < degrees
-        for rotation in rotations:
-            assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-9)
-            assert np.linalg.det(rotation) == UNIT
-
-
 def test_sampson_distance_is_in_pixels_and_the_same_in_either_order():
     matches = Matches(np.array([(10, 20), (30, 40)]), np.array([(500, 20), (7, 43)]), np.ones(2))
     assert_allclose(sampson_distances(FALLBACK_FUNDAMENTAL, matches), [0, 3 / np.sqrt(2)])
@@ -195,9 +174,9 @@ def test_repetitions_are_inliers_like_the_first_and_what_is_not_finite_is_set_as
 @pytest.mark.parametrize("model", ModelKind)
 def test_the_same_input_gives_the_same_bytes_whatever_else_goes_on(model, method):
     plane, config = model is ModelKind.H, RobustConfig(method=method, max_iterations=2000)
-    inputs = [scene(seed, plane)[0] for seed in SEEDS] * 4
+    inputs = [scene(seed, plane)[0] for seed in SEEDS] * 2
     alone = [as_bytes(estimated(model, matches, config)) for matches in inputs]
-    assert alone[:3] == alone[3:6] == alone[6:9]
+    assert alone[:3] == alone[3:]
     assert len(set(alone)) == 3
     for rng_seed in (0, 12345):
         cv2.setRNGSeed(rng_seed)
@@ -205,23 +184,6 @@ def test_the_same_input_gives_the_same_bytes_whatever_else_goes_on(model, method
     with ThreadPoolExecutor(4) as threads:
         together = list(threads.map(lambda matches: as_bytes(estimated(model, matches, config)), inputs))
     assert together == alone
-
-
-@pytest.mark.parametrize("seed", SEEDS)
-def test_opencv_is_handed_the_distinct_matches_in_their_order(seed):
-    matches, _ = scene(seed)
-    plain, mask = cv2.findFundamentalMat(
-        matches.points0, matches.points1, cv2.USAC_MAGSAC, DEFAULT.threshold, DEFAULT.confidence, 50_000
-    )
-    result = estimate(Matches.concatenate([matches, matches[::-1]]), RobustConfig(permutations=1))
-    assert_array_equal(result.matrix, plain / np.linalg.norm(plain))
-    assert_array_equal(result.inliers[:300], mask.ravel() > 0)
-
-
-def test_an_essential_matrix_without_intrinsics_is_an_error_even_without_points():
-    for matches in (scene(0)[0], Matches.empty()):
-        with pytest.raises(ValueError, match="needs the intrinsics"):
-            estimate(matches, DEFAULT, ModelKind.E)
 
 
 ANY_FLOAT = st.floats(width=32)

@@ -11,9 +11,9 @@ from rectified import run
 from synthetic import RECIPE, SyntheticMatcher, synthetic_pairs
 
 from mkpc_kaggle.engine.engine import Ending
+from mkpc_kaggle.recipe import SceneConfig
 from mkpc_kaggle.reporting.run_log import read_log
-from mkpc_kaggle.scene.config import SceneConfig
-from mkpc_kaggle.scene.densify import MAX_IMAGES, extra_pairs
+from mkpc_kaggle.scene.densify import extra_pairs
 
 CHAIN = [(0, 1), (1, 2), (2, 3), (3, 4), (4, 5)]
 
@@ -54,17 +54,6 @@ def test_a_sparse_batch_has_a_scene_by_pairs_that_no_row_names(tmp_path: Path) -
     assert run(asked, recipe, SyntheticMatcher(), tmp_path / "work").scenes == report.scenes
 
 
-def test_a_sparse_batch_without_them_has_none(tmp_path: Path) -> None:
-    asked = synthetic_pairs(tmp_path / "images")[:5]
-    report = run(asked, replace(RECIPE, scene=SceneConfig(pairs_per_image=0)), SyntheticMatcher(), tmp_path / "w")
-    assert [record.source for record in report.records] == ["pair"] * 5
-
-
 def test_more_extra_pairs_go_on_from_fewer() -> None:
     first = extra_pairs(6, CHAIN, 1.5)
     assert first + extra_pairs(6, [*CHAIN, *first], 2) == extra_pairs(6, CHAIN, 2)
-
-
-def test_a_batch_of_very_many_images_gets_none() -> None:
-    chain = [(number, number + 1) for number in range(MAX_IMAGES)]
-    assert extra_pairs(MAX_IMAGES + 1, chain, 5) == []

@@ -22,21 +22,20 @@ from faulty import (
     scene_without_pycolmap,
     scenes_by,
 )
-from rectified import SWEEP, THREE_UNITS, RectifiedMatcher, run
+from rectified import SWEEP, THREE_UNITS, RectifiedMatcher, matrices, run
 from synthetic import RECIPE as SYNTHETIC
 from synthetic import SyntheticMatcher, synthetic_pairs
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine.engine import Ending, RunReport
+from mkpc_kaggle.engine.engine import Ending
 from mkpc_kaggle.engine.jobs import SceneJob, SceneResult
 from mkpc_kaggle.engine.scenes import Scenes
 from mkpc_kaggle.engine.session import Interrupt
-from mkpc_kaggle.recipe import Recipe
+from mkpc_kaggle.recipe import Recipe, SceneConfig
 from mkpc_kaggle.reporting.report import report_page
 from mkpc_kaggle.reporting.run_log import read_log
 from mkpc_kaggle.reporting.summary import overview
 from mkpc_kaggle.scene.choose import Reason
-from mkpc_kaggle.scene.config import SceneConfig
 from mkpc_kaggle.scene.view_graph import BatchPair
 
 RECIPE = replace(THREE_UNITS, scene=SceneConfig())
@@ -57,12 +56,8 @@ def two_batches(directory: Path) -> list[Pair]:
     return batch_pairs(directory / "images") + batch_pairs(directory / "others", 3, "two")
 
 
-def own(report: RunReport) -> list[bytes]:
-    return [record.pair_fundamental.tobytes() for record in report.records]
-
-
 def own_matrices(pairs: list[Pair], directory: Path) -> list[bytes]:
-    return own(run(pairs, THREE_UNITS, RectifiedMatcher(), directory))
+    return matrices(run(pairs, THREE_UNITS, RectifiedMatcher(), directory))
 
 
 def test_pairs_get_the_f_of_their_scene_and_keep_their_own(
@@ -74,7 +69,7 @@ def test_pairs_get_the_f_of_their_scene_and_keep_their_own(
     assert report.ending is Ending.COMPLETE
     assert [record.source for record in report.records] == ["pair"] + ["scene"] * 5
     assert all(np.array_equal(record.chosen_fundamental, SCENE_F) for record in report.records[1:])
-    assert own(report) == own_matrices(pairs, tmp_path / "alone")
+    assert matrices(report) == own_matrices(pairs, tmp_path / "alone")
     assert published[-1][0].scene.reason is Reason.CONTRADICTION
     log = read_log(tmp_path / "work")
     told = "scenes: 1 of 1 batches reconstructed with 4 of 4 images; F of 5 of 6 pairs is from them"
@@ -137,7 +132,7 @@ def test_a_reconstruction_that_is_lost_costs_its_scene_alone_and_the_reason_is_t
     pairs = batch_pairs(tmp_path / "images")
     report = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
     assert report.ending is Ending.COMPLETE
-    assert own(report) == own_matrices(pairs, tmp_path / "alone")
+    assert matrices(report) == own_matrices(pairs, tmp_path / "alone")
     assert [record.source for record in report.records] == ["pair"] * 6
     assert [fault.startswith(f"batch one was not reconstructed: {reason}") for fault in report.faults] == [True]
     assert report.scenes[0].failure.startswith(reason)
@@ -247,4 +242,4 @@ def test_an_image_replaced_after_the_run_drops_the_scene_and_its_batch_alone(
     assert "6 pairs are matched anew" in capsys.readouterr().err
     assert [record.source for record in again.records] == ["pair"] * 6 + ["pair", "scene", "scene"]
     assert {scene.batch: bool(scene.failure) for scene in again.scenes} == {"one": True, "two": False}
-    assert own(again) == own_matrices(pairs, tmp_path / "alone")
+    assert matrices(again) == own_matrices(pairs, tmp_path / "alone")

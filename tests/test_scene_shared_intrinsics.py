@@ -10,8 +10,8 @@ from mkpc_kaggle.geometry.cameras import Camera, relative_pose
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.geometry.robust import RobustConfig
+from mkpc_kaggle.recipe import SceneConfig
 from mkpc_kaggle.scene.choose import estimate_at_known_focals, known_focal
-from mkpc_kaggle.scene.config import SceneConfig
 from mkpc_kaggle.scene.reconstruct import Solution, reconstruct_batch
 from mkpc_kaggle.scene.reconstruction import RegisteredImage, SfmModel
 from mkpc_kaggle.scene.shared_intrinsics import shared_intrinsics
@@ -66,11 +66,6 @@ def test_an_image_without_a_camera_shares_that_of_its_size() -> None:
 )
 def test_where_fewer_agree_nothing_is_shared(focals: tuple[float, ...]) -> None:
     assert shared(*focals) == {}
-
-
-def test_zero_turns_it_off() -> None:
-    assert shared(838, 839, 840, 841, 842, tolerance=0) == {}
-    assert shared(*[FOCAL] * 5, tolerance=0) == {}, "also where no focal length moved from its prior"
 
 
 def focals_of(solution: Solution) -> list[float]:

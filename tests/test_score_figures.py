@@ -1,7 +1,6 @@
 """The figures of scores, gains and errors show the numbers that they are given."""
 
 from math import inf
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,7 +9,6 @@ from mkpc_kaggle.evaluation.compare import Comparison
 from mkpc_kaggle.evaluation.validate import PairScore, SceneScore, Validation
 from mkpc_kaggle.geometry.metrics import PoseError
 from mkpc_kaggle.reporting.figures import scores as figures
-from mkpc_kaggle.reporting.figures.style import save
 
 
 def scene(name: str, *rotations: float) -> SceneScore:
@@ -54,12 +52,3 @@ def test_an_error_curve_has_the_share_of_pairs_below_and_leaves_failures_out() -
     shares = [share_below(curve, x) for x in (0.4, 0.5, 2.5, 20, 180)]
     assert shares == pytest.approx([0, 2 / 6, 4 / 6, 5 / 6, 5 / 6])
     assert translation.get_xlabel() == "translation error in metres"
-
-
-def test_many_recipes_are_told_apart_and_drawn(tmp_path: Path) -> None:
-    validations = [Validation(f"recipe {number}", FIRST.scenes) for number in range(8)]
-    for number, figure in enumerate((figures.draw_scores(validations), figures.draw_errors(validations))):
-        drawn = [line for line in figure.axes[0].lines if line.get_label().startswith("recipe")]
-        assert len(drawn) == 8
-        assert len({(line.get_color(), line.get_linestyle(), line.get_marker()) for line in drawn}) == 8
-        save(figure, tmp_path / f"{number}.png")

@@ -10,7 +10,6 @@ import torch
 from pictures import picture, write_store
 from torch import nn
 
-from mkpc_kaggle.config import from_table
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.matchers import aspanformer, loftr, quadtree
 from mkpc_kaggle.matchers.contract import Picture, Placement, Training
@@ -59,30 +58,6 @@ def test_indoor_weights_come_with_their_settings(tmp_path: Path) -> None:
     assert of_quadtree.loftr_coarse.layers[0].attn.topks == (32, 16)
     # Of the published size, so that positions are neither stretched nor shrunk.
     assert (of_aspanformer.border, of_aspanformer.position_scale(60, 80)) == (0, (1, 1))
-
-
-@pytest.mark.parametrize(
-    ("training", "border", "expected"),
-    [(Training.OUTDOOR, -1, 2), (Training.INDOOR, -1, 0), (Training.OUTDOOR, 0, 0), (Training.INDOOR, 3, 3)],
-)
-def test_loftrs_border_is_the_published_one_or_the_recipes(training: Training, border: int, expected: int) -> None:
-    table = {} if border < 0 else {"border": border}
-    options = from_table(loftr.SPEC.options, {"training": training, **table}, "recipe")
-    assert loftr.network_of(options).border == expected
-    for wrong in (-2, 1.5):
-        with pytest.raises(UserError, match="border"):
-            from_table(loftr.SPEC.options, {"border": wrong}, "recipe")
-
-
-def test_loftr_finds_matches_along_the_border_where_it_is_told_to(tmp_path: Path) -> None:
-    found = {}
-    for border in (0, 2):
-        matcher = load_standin(loftr, Loftr, tmp_path, Training.INDOOR, border=border)
-        (encoded,) = matcher.encode([shown(96, 128, matcher)])
-        found[border] = matcher.match([encoded], [encoded])[0].points0
-    assert found[0].min() < 8
-    assert found[2].min() >= 15.5
-    assert len(found[2]) < len(found[0])
 
 
 def test_weights_with_optimal_transport_are_refused_with_what_to_take_instead(tmp_path: Path) -> None:

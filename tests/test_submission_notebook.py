@@ -1,26 +1,21 @@
 """``submission.ipynb`` as Kaggle runs it: the dataset folder, an image without our package, and no network."""
 
-import json
-import subprocess
 import tomllib
-from dataclasses import replace
 from pathlib import Path
 
 import nbformat
 import pandas as pd
 import pytest
-from checkpoints import FILES, write_checkpoints
-from kaggle_image import IMAGES, Image, environment, install_image, make_image, pack_wheel, python_version, upload
+from kaggle_image import IMAGES, Image, environment, install_image, make_image, python_version, upload
 from offline_notebook import execute, needs_namespaces, pictures, printed
 from packaging.requirements import Requirement
 from shared import DATA, WEIGHTS, needs_data, needs_weights
 
 from mkpc_kaggle.data.competition import read_test_side, submission_problems
 from mkpc_kaggle.demo import DemoSet
-from mkpc_kaggle.matchers.networks.roma import RoMa
 from mkpc_kaggle.package import Request, make_package
 from mkpc_kaggle.package.metadata import COMPETITION
-from mkpc_kaggle.package.wheels import BUNDLED, PYTHONS
+from mkpc_kaggle.package.wheels import PYTHONS
 
 NOTEBOOKS = sorted((Path(__file__).resolve().parents[1] / "notebooks").glob("*.ipynb"))
 
@@ -28,14 +23,6 @@ NOTEBOOKS = sorted((Path(__file__).resolve().parents[1] / "notebooks").glob("*.i
 @pytest.fixture(scope="module")
 def image(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return make_image(tmp_path_factory.mktemp("image"))
-
-
-@pytest.fixture(scope="module")
-def wheels(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    directory = tmp_path_factory.mktemp("wheels")
-    for name in BUNDLED:
-        pack_wheel(name, directory)
-    return directory
 
 
 class Kaggle:
@@ -86,17 +73,6 @@ def kaggle(tmp_path: Path, image: Path, wheels: Path) -> Kaggle:
     return Kaggle(tmp_path / "kaggle", image, wheels)
 
 
-def test_the_image_has_none_of_what_the_dataset_brings(image: Path) -> None:
-    code = "import numpy, pandas, scipy, sklearn, cv2, matplotlib, tqdm, importlib.util as u, json\n"
-    code += (
-        "print(json.dumps([n for n in ('mkpc_kaggle', 'kornia', 'kornia_rs', 'safetensors') if u.find_spec(n)]))"
-    )
-    out = subprocess.run(
-        [image, "-c", code], capture_output=True, text=True, check=True, env=environment(), cwd=image.parent
-    ).stdout
-    assert json.loads(out) == []
-
-
 @pytest.mark.parametrize("image", IMAGES, ids=str)
 def test_every_image_has_what_the_package_takes_from_it(image: Image) -> None:
     project = tomllib.loads((NOTEBOOKS[0].parents[1] / "pyproject.toml").read_text(encoding="utf-8"))["project"]
@@ -107,12 +83,11 @@ def test_every_image_has_what_the_package_takes_from_it(image: Image) -> None:
 
 
 @needs_namespaces
-@pytest.mark.timeout(900)  # every weight is in use: five minutes beside much other work
 def test_a_commit_run_without_network_leaves_a_submission_and_shows_pairs(
     kaggle: Kaggle, demo: DemoSet, tmp_path: Path
 ) -> None:
-    """As many pairs as Kaggle shows: photographs where there are some, else rendered ones."""
-    kaggle.add_test_side(DATA / "test" if DATA.is_dir() else demo.test_dir, pairs=3)
+    """On photographs where there are some, else on rendered pictures."""
+    kaggle.add_test_side(DATA / "test" if DATA.is_dir() else demo.test_dir, pairs=2)
     kaggle.add_dataset(tmp_path / "package", (WEIGHTS,) if WEIGHTS.is_dir() else ())
     mounted = tmp_path / "mounted"
     kaggle.dataset.rename(mounted)
@@ -126,7 +101,7 @@ def test_a_commit_run_without_network_leaves_a_submission_and_shows_pairs(
     before, _, _ = printed.partition("sweep: ")
     assert len(before.splitlines()) <= 45 - 24, "one screen, were there all 27 weights"
     assert kaggle.problems() == []
-    assert "good: 3 rows" in printed
+    assert "good: 2 rows" in printed
     assert "recipe auto" in printed
     assert "of 525 minutes used" in printed
     assert printed.count("sweep: ") == 1, "a notebook keeps every line, so progress is few of them"
@@ -134,14 +109,13 @@ def test_a_commit_run_without_network_leaves_a_submission_and_shows_pairs(
     assert (kaggle.working / "submission.html").is_file()
     assert (kaggle.root / "temp" / "submission.work" / "journal.sqlite").is_file()
     assert not list(kaggle.working.rglob("journal*")), "what lies here is published"
-    assert kaggle.figures() == 1 + 3, "the budget and the pairs"
+    assert kaggle.figures() == 1 + 2, "the budget and the pairs"
     if WEIGHTS.is_dir():
         assert_all_weights_are_used(printed)
 
 
 def assert_all_weights_are_used(printed: str) -> None:
-    assert "3 files in" in printed
-    assert "0 of them not found or wrong" in printed
+    assert "3 files, 0 refused, 0 missing" in printed
     assert "1:xfeat_lighterglue@1024 " in printed
     assert "1:aliked@1024 " in printed
 
@@ -151,7 +125,7 @@ def assert_all_weights_are_used(printed: str) -> None:
 def test_the_notebook_stops_where_a_packaged_weight_did_not_arrive(
     kaggle: Kaggle, demo: DemoSet, tmp_path: Path
 ) -> None:
-    kaggle.add_test_side(demo.test_dir, pairs=3)
+    kaggle.add_test_side(demo.test_dir, pairs=1)
     kaggle.add_dataset(tmp_path / "package", (WEIGHTS,))
     (kaggle.dataset / "aliked-n16.safetensors").unlink()
     with pytest.raises(AssertionError, match="weights of the dataset are missing or damaged"):
@@ -163,7 +137,7 @@ def test_the_notebook_stops_where_a_packaged_weight_did_not_arrive(
 def test_a_failed_run_fails_the_notebook_after_its_figures_but_not_the_hidden_rerun(
     kaggle: Kaggle, demo: DemoSet, tmp_path: Path
 ) -> None:
-    kaggle.add_test_side(demo.test_dir, pairs=3)
+    kaggle.add_test_side(demo.test_dir, pairs=1)
     (kaggle.test_dir / "test_images").unlink()
     for path in (demo.test_dir / "test_images").rglob("*.png"):
         broken = kaggle.test_dir / path.relative_to(demo.test_dir)
@@ -183,9 +157,9 @@ def test_a_failed_run_fails_the_notebook_after_its_figures_but_not_the_hidden_re
 def test_what_pip_says_is_told_and_the_advice_only_where_no_wheel_fits(
     kaggle: Kaggle, demo: DemoSet, tmp_path: Path, is_missing: bool
 ) -> None:
-    kaggle.add_test_side(demo.test_dir, pairs=3)
+    kaggle.add_test_side(demo.test_dir, pairs=1)
     kaggle.add_dataset(tmp_path / "package")
-    kaggle.image = make_image(tmp_path / "image")  # other tests have installed into the shared one
+    kaggle.image = make_image(tmp_path / "image")  # other tests have installed into the shared image
     (wheel,) = kaggle.dataset.glob("pycolmap-*.whl")
     if is_missing:
         wheel.rename(wheel.with_name("pycolmap-4.2.1-cp27-cp27m-manylinux_2_28_x86_64.whl"))
@@ -204,49 +178,7 @@ def test_what_pip_says_is_told_and_the_advice_only_where_no_wheel_fits(
 @needs_data
 @needs_weights
 @pytest.mark.slow
-def test_the_hidden_rerun_uses_the_weights_and_the_time_and_shows_nothing(kaggle: Kaggle, tmp_path: Path) -> None:
-    kaggle.add_test_side(DATA / "test")
-    kaggle.add_dataset(tmp_path / "package", (WEIGHTS,))
-    kaggle.set("TIME_LIMIT_HOURS = 8.75", "TIME_LIMIT_HOURS = 0.025")
-    printed = kaggle.run(KAGGLE_IS_COMPETITION_RERUN="1")
-    assert kaggle.problems() == []
-    assert "good: 29 rows" in printed
-    assert "1:xfeat_lighterglue@1024 " in printed
-    assert kaggle.figures() == 0
-
-
-@needs_namespaces
-@pytest.mark.slow
-@pytest.mark.timeout(3600)
-@pytest.mark.parametrize("matcher", ["loma", "roma"])
-def test_matchers_run_offline_from_packaged_stand_ins_of_their_full_size(
-    kaggle: Kaggle, demo: DemoSet, tmp_path: Path, matcher: str
-) -> None:
-    weights = tmp_path / "weights"
-    weights.mkdir()
-    whole = [replace(file, name=f"standin_{file.name}") for file in FILES if file.matcher == matcher]
-    if matcher == "roma":
-        whole = [replace(file, network=RoMa) for file in whole]
-    lines = [replace(line, licence="MIT").line for line in write_checkpoints(weights, whole)]
-    (weights / "weights_manifest.txt").write_text("\n".join(lines))
-    kaggle.add_test_side(demo.test_dir, pairs=3)
-    kaggle.add_dataset(tmp_path / "package", (weights,))
-    recipe = tmp_path / "small.toml"
-    units = [f'{{ stage = {stage}, matcher = "{matcher}", area = "112x140" }}' for stage in (1, 2)]
-    recipe.write_text(f'units = [{", ".join(units)}]\n[matchers.loma]\nvariant = "b128"')
-    kaggle.set(r"RECIPE = \"auto\"", rf"RECIPE = \"{recipe}\"")
-    printed = kaggle.run()
-    assert kaggle.problems() == []
-    assert f"{len(lines)} files in" in printed
-    assert "0 of them not found or wrong" in printed
-    assert f"2:{matcher}@112x140 " in printed
-
-
-@needs_namespaces
-@needs_data
-@needs_weights
-@pytest.mark.slow
-@pytest.mark.timeout(3600)
+@pytest.mark.timeout(7200)
 @pytest.mark.parametrize("image", IMAGES, ids=str)
 def test_the_notebook_runs_on_an_image_of_kaggles_versions(
     image: Image, tmp_path: Path, request: pytest.FixtureRequest

@@ -2,10 +2,9 @@
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
-from pictures import as_picture, picture, write_store
+from pictures import picture, write_store
 
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.matchers import superglue
@@ -33,13 +32,6 @@ def test_the_other_way_round_the_same_keypoints_are_paired(store: WeightStore) -
     pairs = {(*a, *b) for a, b in zip(there.points0.tolist(), there.points1.tolist(), strict=True)}
     assert pairs
     assert pairs == {(*a, *b) for a, b in zip(back.points1.tolist(), back.points0.tolist(), strict=True)}
-
-
-@pytest.mark.parametrize("pixels", [np.full((60, 80), 128, np.uint8), np.zeros((5, 300), np.uint8)])
-def test_pictures_without_keypoints_have_no_matches(store: WeightStore, pixels: np.ndarray) -> None:
-    picky = superglue.load(store, superglue.SuperGlueOptions(keypoint_threshold=0.9), Placement())
-    encodings = picky.encode([as_picture(pixels)] * 2)
-    assert [len(matches) for matches in picky.match(encodings[:1], encodings[1:])] == [0]
 
 
 def test_indoor_weights_are_another_slot_and_another_networks_checkpoint_is_refused(

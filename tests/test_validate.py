@@ -17,8 +17,7 @@ from mkpc_kaggle.data.competition import (
 )
 from mkpc_kaggle.demo import DemoSet
 from mkpc_kaggle.engine.records import PairRecord
-from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.evaluation.validate import score_record, score_submission, score_table
+from mkpc_kaggle.evaluation.validate import Step, score_record, score_submission, score_table
 from mkpc_kaggle.geometry.cameras import Camera, fundamental_of_cameras
 from mkpc_kaggle.geometry.metrics import AUC_THRESHOLDS
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
@@ -53,20 +52,15 @@ def test_the_true_matrices_score_one_whatever_the_order_of_the_images(demo: Demo
     assert scored.maa < 0.2
 
 
-def test_a_submission_for_another_set_is_refused(demo: DemoSet, tmp_path: Path) -> None:
-    write_submission(tmp_path / "other.csv", {"other;sample": FALLBACK_FUNDAMENTAL})
-    with pytest.raises(UserError, match="names no pair"):
-        score_submission(tmp_path / "other.csv", demo.truth_csv, read_train_side(demo.train_dir))
-
-
 def test_a_failed_pair_counts_as_failed_even_where_the_fallback_happens_to_be_right() -> None:
     eye = np.eye(3)
     camera0, camera1 = Camera(eye, eye, np.zeros(3)), Camera(eye, eye, np.array([1.0, 0, 0]))
     true = TruePair(Pair("p", "s", Path("a"), Path("b")), camera0, camera1, 0.5)
     scene = TrainScene("s", 1.0, (true,))
-    failed = score_record(true, PairRecord(0, FALLBACK_FUNDAMENTAL.copy(), "too few matches"), scene)
+    record = PairRecord(0, FALLBACK_FUNDAMENTAL.copy(), "too few matches")
+    failed = score_record(true, record, scene, [Step.MAGSAC])
     right = score_record(true, PairRecord(0, FALLBACK_FUNDAMENTAL.copy(), ""), scene)
-    assert failed.error.rotation == np.inf
+    assert failed.error.rotation == failed.steps[Step.MAGSAC].rotation == np.inf
     assert right.error.angle < 1e-6
 
 
@@ -129,35 +123,12 @@ def test_a_work_directory_keeps_the_journal_and_a_report_that_shows_the_pairs(
     assert len(read_log(tmp_path / "work").pairs) == 2
 
 
-@needs_data
-def test_the_tables_of_real_scenes_agree_with_their_cameras() -> None:
-    scenes = read_train_side(DATA / "train", min_covisibility=0.1)
-    assert {scene.name: len(scene.pairs) for scene in scenes} == {
-        "castle_p19": 91,
-        "fountain_p11": 55,
-        "herz_jesus_p8": 28,
-        "reichstag_26": 304,
-        "scannet_samples": 15,
-    }
-    records = [
-        [
-            PairRecord(i, fundamental_of_cameras(true.camera0, true.camera1), "")
-            for i, true in enumerate(scene.pairs)
-        ]
-        for scene in scenes
-    ]
-    for scene, found in zip(scenes, records, strict=True):
-        errors = [score_record(true, record, scene).error for true, record in zip(scene.pairs, found, strict=True)]
-        assert max(error.rotation for error in errors) < 1e-3
-        assert max(error.translation for error in errors) < 1e-2
-
-
 BASELINE = {"castle_p19": 0.4319, "fountain_p11": 0.9018, "herz_jesus_p8": 0.8857, "reichstag_26": 0.2313}
 
 
 @needs_data
 @pytest.mark.slow
-@pytest.mark.timeout(3600)
+@pytest.mark.timeout(7200)
 def test_the_classical_recipe_reaches_plain_root_sift_scene_by_scene(tmp_path: Path) -> None:
     out = tmp_path / "scores.json"
     train = str(DATA / "train")
@@ -171,13 +142,10 @@ def test_the_classical_recipe_reaches_plain_root_sift_scene_by_scene(tmp_path: P
     ("options", "told"),
     [
         (["--train-dir", "T", "--submission", "x.csv"], "go together"),
-        (
-            ["--train-dir", "T", "--recipe", "R", "--units", "sift"],
-            "no unit 'sift'; it has 1:sift@320, 2:",
-        ),
+        (["--train-dir", "T", "--recipe", "R", "--units", "sift"], "no unit 'sift'; it has 1:sift@320, 2:"),
         (["--train-dir", "T", "--recipe", "classical", "--threshold", "0"], "threshold must be in"),
         (["--pairs", "a.txt"], "go together"),
-        (["--pairs", "a.txt", "--image-root", ".", "--compare", "a", "b"], "need a --train-dir"),
+        (["--pairs", "a.txt", "--image-root", ".", "--compare", "a", "b"], "needs a --train-dir"),
         (["--train-dir", ".", "--image-root", "."], "go together"),
     ],
 )

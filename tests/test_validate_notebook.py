@@ -1,13 +1,11 @@
-"""``validate.ipynb`` from a clean kernel without network: on the demo set, and on a train side of one's own."""
+"""``validate.ipynb`` from a clean kernel without network, on the demo set."""
 
 import sys
 from pathlib import Path
 
 import nbformat
-import pytest
 from kaggle_image import environment
 from offline_notebook import execute, needs_namespaces, pictures, printed
-from shared import DATA, needs_data
 
 ROOT = Path(__file__).resolve().parents[1]
 SETTINGS = {'"classical:whole-images", "classical"': '"small.toml:stage-1", "small.toml"'}
@@ -42,14 +40,3 @@ def test_without_a_train_side_recipes_are_compared_on_the_demo_set(tmp_path: Pat
     assert text.count("mean over scenes         4") == 3
     assert text.count(": covisibility 0.") == 3
     assert figures == 3 + 3, "scores, gains, errors; the hardest pairs"
-
-
-@needs_namespaces
-@needs_data
-@pytest.mark.slow
-def test_a_train_side_is_named_by_the_environment(tmp_path: Path) -> None:
-    settings = SETTINGS | {"PAIRS_PER_SCENE = 12": "PAIRS_PER_SCENE = 3"}
-    text, figures = run(tmp_path, settings, MKPC_TRAIN_DIR=str(DATA / "train"))
-    assert "fountain_p11           3 pairs" in text
-    assert text.count("mean over scenes        15") == 3
-    assert figures == 3 + 3

@@ -1,15 +1,14 @@
 """vismatch's matchers as ours, by a stand-in of the same interface."""
 
 import numpy as np
-import pytest
 import torch
 from numpy.testing import assert_allclose
+from pictures import as_picture
 from standin import scene
 from vismatch_standin import OrbLikeVismatch
 
-from mkpc_kaggle.geometry.coordinates import Box, Size, View
+from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.matchers.contract import Picture, encoding_bytes
 from mkpc_kaggle.matchers.vismatch import VismatchMatcher
 from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher
 from mkpc_kaggle.recipe import Recipe, Unit
@@ -19,14 +18,9 @@ WHOLE = scene(SIZE.height, SIZE.width + SHIFT, 3)
 LEFT, RIGHT = (np.ascontiguousarray(WHOLE[:, shift:][:, : SIZE.width]) for shift in (0, SHIFT))
 
 
-def picture(pixels: np.ndarray, multiple: int = 1) -> Picture:
-    view = View.fit(Box.whole(SIZE), long_side=max(SIZE), multiple=multiple)
-    return Picture(view.render(pixels), view)
-
-
 def matched(matcher: VismatchMatcher) -> Matches:
     multiple = matcher.spec.multiple
-    encoded = [matcher.encode([picture(pixels, multiple)]) for pixels in (LEFT, RIGHT)]
+    encoded = [matcher.encode([as_picture(pixels, multiple)]) for pixels in (LEFT, RIGHT)]
     (matches,) = matcher.match(*encoded)
     return matches
 
@@ -47,31 +41,12 @@ def test_points_counted_from_the_corner_become_points_counted_from_the_first_pix
     assert_allclose(corner.points1, plain.points1, atol=1e-4)
 
 
-def test_without_confidences_every_match_has_the_same_score() -> None:
-    matches = matched(VismatchMatcher(OrbLikeVismatch(confident=False)))
-    assert len(matches) > 50
-    assert set(matches.scores) == {1}
-
-
 def test_images_are_rgb_in_0_to_1_and_padded_to_the_multiple() -> None:
     standin = OrbLikeVismatch()
     matched(VismatchMatcher(standin, multiple=64))
     assert [tuple(image.shape) for image in standin.seen] == [(3, 192, 256)] * 2
     content = standin.seen[0][:, : SIZE.height, : SIZE.width]
     assert torch.equal(content, torch.from_numpy(LEFT).permute(2, 0, 1) / 255)
-
-
-@pytest.mark.parametrize("flat", ["first", "both"])
-def test_no_keypoints_are_no_matches(flat: str) -> None:
-    matcher = VismatchMatcher(OrbLikeVismatch())
-    gray = np.full_like(LEFT, 128)
-    first, second = matcher.encode([picture(gray), picture(gray if flat == "both" else LEFT)])
-    assert [len(matches) for matches in matcher.match([first, second], [second, first])] == [0, 0]
-
-
-def test_nothing_but_pixels_is_kept() -> None:
-    (encoded,) = VismatchMatcher(OrbLikeVismatch()).encode([picture(LEFT)])
-    assert encoding_bytes(encoded) == LEFT.nbytes
 
 
 def test_both_stages_run_with_it() -> None:

@@ -69,7 +69,7 @@ def test_every_file_format_gives_the_same_plain_tensors(tmp_path: Path, save: Sa
 
 @pytest.mark.filterwarnings("ignore::UserWarning")  # of torch, on prototypes
 @pytest.mark.parametrize("save", [save_zip, save_legacy])
-def test_what_is_no_table_of_plain_tensors_is_refused(tmp_path: Path, save: Save) -> None:
+def test_anything_but_a_table_of_plain_tensors_is_refused(tmp_path: Path, save: Save) -> None:
     ones, base = torch.ones(2, 3), torch.zeros(10_000)
     odd: list[object] = [ones, [ones], {"state_dict": 3}, {3: ones}, {"x": ones.to_sparse()}]
     odd += [{"x": ones.to_sparse_csr()}, {"x": ones.to("meta")}]
@@ -85,7 +85,7 @@ def test_what_is_no_table_of_plain_tensors_is_refused(tmp_path: Path, save: Save
 
 @pytest.mark.parametrize("name", ["x.pt", "x.safetensors"])
 @pytest.mark.parametrize("data", [b"", b"no checkpoint", b"\0" * 100])
-def test_a_file_that_is_no_checkpoint_is_refused_by_name(tmp_path: Path, name: str, data: bytes) -> None:
+def test_a_file_that_is_not_a_checkpoint_is_refused_by_name(tmp_path: Path, name: str, data: bytes) -> None:
     put(tmp_path, name, data)
     with pytest.raises(UserError, match=rf"{name} cannot be read as a checkpoint"):
         load_tensors(tmp_path / name)
@@ -133,24 +133,19 @@ def training_checkpoint(framework: types.ModuleType, state: dict[str, torch.Tens
 def test_a_training_checkpoint_with_unknown_classes_gives_its_tensors(
     tmp_path: Path, framework: types.ModuleType
 ) -> None:
-    torch.manual_seed(0)
-    base = torch.randn(4, 6)
+    base = torch.arange(24.0).reshape(4, 6)
     network = nn.Sequential(nn.Linear(3, 2), nn.BatchNorm1d(2))
-    state: dict[str, torch.Tensor] = OrderedDict(
-        {f"matcher.{name}": tensor for name, tensor in network.state_dict().items()}
-    )
+    state: dict[str, torch.Tensor] = OrderedDict(network.state_dict())
     state |= {
-        "matcher.shared": base,
-        "matcher.rows": base[1:3],
-        "matcher.columns": base.t(),
-        "matcher.strided": base[::2, 1::3],
-        "matcher.parameter": nn.Parameter(torch.randn(3)),
-        "matcher.scalar": torch.tensor(3.5, dtype=torch.float64),
-        "matcher.empty": torch.zeros(0, 3),
-        "matcher.complex": torch.tensor([1 + 2j]),
+        "shared": base,
+        "columns": base.t(),
+        "strided": base[::2, 1::3],
+        "parameter": nn.Parameter(torch.ones(3)),
+        "empty": torch.zeros(0, 3),
+        "complex": torch.tensor([1 + 2j]),
     }
-    for dtype in (torch.bfloat16, torch.float16, torch.int64, torch.int32, torch.uint8, torch.bool):
-        state[f"matcher.{dtype}"] = torch.tensor([[0, 1, 1], [1, 0, 0]]).to(dtype)
+    for dtype in (torch.bfloat16, torch.float16, torch.int64, torch.uint8, torch.bool):
+        state[f"{dtype}"] = torch.tensor([[0, 1, 1], [1, 0, 0]]).to(dtype)
     assert hasattr(network.state_dict(), "_metadata")
     torch.save(training_checkpoint(framework, state), tmp_path / "x.ckpt")
     sys.modules.pop("training_framework")
@@ -158,9 +153,8 @@ def test_a_training_checkpoint_with_unknown_classes_gives_its_tensors(
         torch.load(tmp_path / "x.ckpt", weights_only=True)
     loaded = load_tensors(tmp_path / "x.ckpt")
     assert_same(loaded, {name: tensor.detach() for name, tensor in state.items()})
-    assert loaded["matcher.shared"].untyped_storage().data_ptr() == (
-        loaded["matcher.columns"].untyped_storage().data_ptr()
-    )
+    shared, columns = (loaded[name].untyped_storage().data_ptr() for name in ("shared", "columns"))
+    assert shared == columns
 
 
 def test_the_old_format_with_unknown_classes_is_refused(tmp_path: Path, framework: types.ModuleType) -> None:
@@ -219,34 +213,25 @@ def test_a_malicious_pickle_runs_nothing(tmp_path: Path, save: Save) -> None:
         sentinel.rmdir() if sentinel.is_dir() else sentinel.unlink()
 
 
-def with_pickle(path: Path, data: bytes, compression: int = zipfile.ZIP_STORED) -> Path:
-    """A checkpoint as torch writes it, its pickle replaced."""
-    torch.save(TENSORS, path)
+def with_pickle(path: Path, change: Callable[[bytes], bytes]) -> Path:
+    """A checkpoint with an unknown object beside its tensors, as torch writes it, its pickle changed."""
+    torch.save({"state_dict": TENSORS, "options": Namespace()}, path)
     with zipfile.ZipFile(path) as archive:
         records = {name: archive.read(name) for name in archive.namelist()}
-    with zipfile.ZipFile(path, "w", compression) as archive:
+    with zipfile.ZipFile(path, "w") as archive:
         for name, record in records.items():
-            archive.writestr(name, data if name.endswith("/data.pkl") else record)
+            archive.writestr(name, change(record) if name.endswith("/data.pkl") else record)
     return path
 
 
-def tensor_pickle(items: int, shape: int, stride: int, offset: int) -> bytes:
-    """A state dict of one float32 tensor on the first storage, with an unknown object beside it."""
-    numbers = [b"J" + number.to_bytes(4, "little", signed=True) for number in (items, offset, shape, stride)]
-    return (
-        b"\x80\x02}(X\x0a\0\0\0state_dict}X\x01\0\0\0actorch._utils\n_rebuild_tensor_v2\n("
-        b"(X\x07\0\0\0storagectorch\nFloatStorage\nX\x01\0\0\x000X\x03\0\0\0cpu" + numbers[0] + b"tQ"
-        b"" + numbers[1] + numbers[2] + b"\x85" + numbers[3] + b"\x85\x89NtRsX\x01\0\0\0xcunknown\nThing\nu."
-    )
-
-
 def test_records_that_unpack_to_more_than_the_file_or_overlap_are_refused(tmp_path: Path) -> None:
-    path = with_pickle(tmp_path / "x.pt", tensor_pickle(6, 2, 3, 1))
+    path = with_pickle(tmp_path / "x.pt", bytes)
+    assert load_tensors(path).keys() == TENSORS.keys()
     with zipfile.ZipFile(path, "a", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("x/big", bytes(1_000_000))
     with pytest.raises(UserError, match=r"x\.pt cannot be read .* records are compressed or overlap"):
         load_tensors(path)
-    with_pickle(path, tensor_pickle(6, 2, 3, 1))
+    with_pickle(path, bytes)
     with zipfile.ZipFile(path, "a") as archive:
         archive.writestr("x/big", bytes(20_000))
         same, big = archive.infolist()[0], archive.getinfo("x/big")
@@ -256,15 +241,18 @@ def test_records_that_unpack_to_more_than_the_file_or_overlap_are_refused(tmp_pa
         load_tensors(path)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=100)
 @given(st.lists(st.tuples(st.integers(0, 10_000), st.integers(0, 255)), min_size=1, max_size=3))
 def test_a_damaged_pickle_gives_tensors_or_a_refusal(
     tmp_path_factory: pytest.TempPathFactory, changes: list[tuple[int, int]]
 ) -> None:
-    data = bytearray(tensor_pickle(6, 2, 3, 1))
-    for place, byte in changes:
-        data[place % len(data)] = byte
-    path = with_pickle(tmp_path_factory.mktemp("fuzz") / "x.pt", bytes(data))
+    def damaged(data: bytes) -> bytes:
+        changed = bytearray(data)
+        for place, byte in changes:
+            changed[place % len(data)] = byte
+        return bytes(changed)
+
+    path = with_pickle(tmp_path_factory.mktemp("fuzz") / "x.pt", damaged)
     try:
         loaded = load_tensors(path)
     except UserError as refusal:

@@ -10,10 +10,7 @@ from web import Site, serve
 from weight_files import DATA, OTHER, digest_of, line, put
 
 from mkpc_kaggle.cli import main
-from mkpc_kaggle.cli.weights import files_of
 from mkpc_kaggle.weights import UNVERIFIED, WeightFile, manifest, store
-from mkpc_kaggle.weights.fetch import url_of
-from mkpc_kaggle.weights.manifest import pin
 
 FILES = (
     line("sift.pt", slot="sift"),
@@ -126,44 +123,7 @@ def test_the_first_download_of_a_file_without_a_digest_is_the_one_that_is_accept
         assert store.WeightStore([out]).find("aliked-n16") is None
 
 
-def test_a_manifest_beside_the_weights_does_not_change_what_the_packages_says(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(store, "manifest", lambda: FILES)
-    put(tmp_path, "a.pt", DATA)
-    pin(replace(FILES[1], licence="anything"), tmp_path / "a.pt")
-    assert store.WeightStore([tmp_path]).files == FILES
-
-
-def test_a_link_in_the_place_of_the_partial_manifest_is_not_followed(tmp_path: Path) -> None:
-    put(tmp_path, "a.pt", DATA)
-    put(tmp_path, "mine", b"mine")
-    (tmp_path / "weights_manifest.txt.part").symlink_to(tmp_path / "mine")
-    pin(FILES[1], tmp_path / "a.pt")
-    assert (tmp_path / "mine").read_bytes() == b"mine"
-    assert not (tmp_path / "weights_manifest.txt").is_symlink()
-
-
 # the files of LoMa, RoMa and LightGlue
-
-FILE_NAMES = {
-    *("roma_outdoor.pth", "roma_indoor.pth", "dinov2_vitl14_pretrain.pth"),
-    *("loma_B128.pth", "loma_B.pt", "loma_R.pth", "loma_L.pth", "loma_G.pth"),
-    *("aliked-n16.pth", "aliked_lightglue.pth", "depth-save.pth", "disk_lightglue.pth"),
-}
-
-
-def test_the_recipes_want_these_files_and_they_can_be_fetched(monkeypatch: pytest.MonkeyPatch) -> None:
-    files = {file.name: file for file in manifest()}
-    assert all(url_of(files[name]) == files[name].source for name in FILE_NAMES)
-    monkeypatch.setattr(store, "manifest", manifest)
-    wanted = {
-        file.name
-        for recipe in ("best", "permissive", "light", "auto")
-        for lines in files_of(recipe, store.WeightStore())
-        for file in lines
-    }
-    assert FILE_NAMES - wanted == {"roma_indoor.pth", "loma_R.pth", "loma_G.pth"}
 
 
 def test_convert_prints_the_line_for_the_manifest(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -77,13 +77,6 @@ def test_a_part_of_another_version_is_found_out_and_removed(site: Site, tmp_path
     assert (tmp_path / "a.bin").read_bytes() == BIG
 
 
-def test_another_part_than_was_asked_for_is_not_taken(site: Site, tmp_path: Path) -> None:
-    site.breaks, site.shift = [CUT], 7
-    assert get(site, tmp_path).outcome is FetchOutcome.FETCHED
-    assert site.asked == ["", f"bytes={CUT}-", ""]
-    assert (tmp_path / "a.bin").read_bytes() == BIG
-
-
 def test_a_file_without_a_digest_is_begun_anew_and_comes_with_its_digest(site: Site, tmp_path: Path) -> None:
     site.breaks = [CUT]
     fetched = get(site, tmp_path, line(size=-1, digest=UNVERIFIED))

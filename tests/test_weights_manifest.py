@@ -23,12 +23,6 @@ def test_the_manifest_has_every_slot_of_every_matcher_with_its_licence() -> None
             assert licences[slot] & set(spec.licences), slot
 
 
-def test_every_name_of_the_manifest_is_there_once_and_its_slots_have_one_licence() -> None:
-    names = [file.name for file in manifest()]
-    assert len(set(names)) == len(names)
-    assert len({(file.slot, file.licence) for file in manifest()}) == len({file.slot for file in manifest()})
-
-
 def test_a_manifest_reads_as_written() -> None:
     text = f"# head\n\na.pt 12 {SHA256} MIT one  https://x/a.pt (a copy)  # why\n  b.pt ? unverified BSD two y\n"
     files = parse_manifest(text)

@@ -2,7 +2,7 @@
 
 import argparse
 import errno
-import signal
+import os
 import sys
 import time
 import warnings
@@ -12,23 +12,34 @@ from io import TextIOWrapper
 from typing import NoReturn
 
 from mkpc_kaggle import __version__
-from mkpc_kaggle.engine.budget import process_started
-from mkpc_kaggle.engine.console import complain, leave, warn
-from mkpc_kaggle.errors import UserError
 
-COMMANDS = (
-    "submit", "match", "reconstruct", "validate", "recipes", "weights", "check", "journal", "package", "demo",
-)  # fmt: skip
+COMMANDS = {
+    "submit": "a test directory -> submission.csv",
+    "match": "two images -> F, counts, a figure",
+    "reconstruct": "a folder of images -> cameras, a COLMAP database, models",
+    "validate": "a directory with known poses -> mAA and pose AUC of a recipe",
+    "recipes": "the recipes, their units, and the weights that each lacks",
+    "weights": "the weight files: which are there, are they whole, fetch them",
+    "check": "is this submission.csv what the competition takes?",
+    "journal": "what a run did: overview, tables for pandas, report.html",
+    "package": "the folders that you upload to Kaggle: a dataset and a notebook",
+    "demo": "render a small test set with known poses",
+}
 EXIT_BAD_INPUT = 2
 EXIT_BROKEN_PIPE = 128 + 13  # a shell's status for SIGPIPE, which Windows lacks
-EXIT_INTERRUPTED = 128 + signal.SIGINT
-
-_DESCRIPTION = "Two-stage image matching with Matching Key-Points Crop, offline, inside a time budget."
+EXIT_INTERRUPTED = 128 + 2  # and for SIGINT
 
 
 def program(arguments: Sequence[str] | None = None) -> NoReturn:
     """Run a command and end the process, without what an interpreter would still do for a second or longer."""
-    leave(main(arguments, started=process_started()))
+    try:  # imports take a while, and Ctrl-C is no error
+        from mkpc_kaggle.engine.budget import process_started
+        from mkpc_kaggle.engine.console import leave
+
+        status = main(arguments, started=process_started())
+    except KeyboardInterrupt:
+        os._exit(EXIT_INTERRUPTED)
+    leave(status)
 
 
 def main(arguments: Sequence[str] | None = None, *, started: float | None = None) -> int:
@@ -36,13 +47,17 @@ def main(arguments: Sequence[str] | None = None, *, started: float | None = None
 
     141: the reader of the output closed the pipe. The time limit counts from ``started``; default: now.
     """
+    from mkpc_kaggle.engine.console import complain, warn
+    from mkpc_kaggle.errors import UserError
+
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):  # paths and ids may have letters that the terminal lacks
             stream.reconfigure(errors="backslashreplace")
     with warnings.catch_warnings():
         warnings.showwarning = lambda message, *_, **__: warn(str(message))
         try:
-            parsed = make_parser().parse_args(arguments)
+            given = sys.argv[1:] if arguments is None else list(arguments)
+            parsed = make_parser(given).parse_args(given)
             parsed.started = time.monotonic() if started is None else started
             return int(parsed.run(parsed))
         except UserError as error:
@@ -60,19 +75,17 @@ def main(arguments: Sequence[str] | None = None, *, started: float | None = None
             return EXIT_BAD_INPUT
 
 
-def make_parser() -> argparse.ArgumentParser:
-    """The parser of all commands."""
-    parser = argparse.ArgumentParser("mkpc_kaggle", description=_DESCRIPTION, epilog="COMMAND --help tells more.")
+def make_parser(arguments: Sequence[str] = tuple(COMMANDS)) -> argparse.ArgumentParser:
+    """The parser of these arguments; only the commands among them are imported, since imports take time."""
+    told = "Two-stage image matching with Matching Key-Points Crop, offline, inside a time budget."
+    parser = argparse.ArgumentParser("mkpc_kaggle", description=told, epilog="COMMAND --help tells more.")
     parser.add_argument("--version", action="version", version=__version__)
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for name in COMMANDS:
-        command = import_module(f"mkpc_kaggle.cli.{name}")
-        sub = commands.add_parser(
-            name,
-            help=command.__doc__,
-            description=command.HELP,
-            formatter_class=argparse.RawDescriptionHelpFormatter,
-        )
-        command.add_arguments(sub)
-        sub.set_defaults(run=command.run)
+    for name, summary in COMMANDS.items():
+        sub = commands.add_parser(name, help=summary, formatter_class=argparse.RawDescriptionHelpFormatter)
+        if name in arguments:
+            command = import_module(f"mkpc_kaggle.cli.{name}")
+            sub.description = command.HELP
+            sub.set_defaults(run=command.run)
+            command.add_arguments(sub)
     return parser

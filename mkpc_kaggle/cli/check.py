@@ -1,7 +1,9 @@
-"""is this submission.csv what the competition takes?"""
+"""The command ``check``."""
 
 import argparse
 from pathlib import Path
+
+from mkpc_kaggle.data.competition import read_test_side, submission_problems
 
 HELP = """\
 Compare a submission with test.csv: header, ids and their order, nine finite numbers a row.
@@ -16,8 +18,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    from mkpc_kaggle.data.competition import read_test_side, submission_problems
-
     pairs = read_test_side(arguments.test_dir)
     problems = submission_problems(arguments.submission, [pair.id for pair in pairs])
     more = [f"... and {len(problems) - MAX_LINES} more"] if len(problems) > MAX_LINES else []

@@ -1,7 +1,9 @@
-"""render a small test set with known poses"""
+"""The command ``demo``."""
 
 import argparse
 from pathlib import Path
+
+from mkpc_kaggle.demo import write_demo
 
 HELP = """\
 Render scenes of stone walls and painted boxes with known cameras, in the competition's layout:
@@ -19,8 +21,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    from mkpc_kaggle.demo import write_demo
-
     demo = write_demo(arguments.out, seed=arguments.seed)
     print(f"train side: {demo.train_dir}\ntest side: {demo.test_dir}\ntruth of the test side: {demo.truth_csv}")
     return 0

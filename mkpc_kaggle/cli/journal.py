@@ -1,7 +1,13 @@
-"""what a run did: overview, tables for pandas, report.html"""
+"""The command ``journal``."""
 
 import argparse
 from pathlib import Path
+
+from mkpc_kaggle.data.competition import read_test_side, test_side
+from mkpc_kaggle.data.outputs import require_apart
+from mkpc_kaggle.reporting.report import write_report
+from mkpc_kaggle.reporting.run_log import read_log, write_csv, write_json
+from mkpc_kaggle.reporting.summary import overview
 
 HELP = """\
 Read the journal of a run, running or ended, and show what it did. DIR is the run's work directory, NAME.work
@@ -27,21 +33,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    from mkpc_kaggle.data.competition import read_test_side, test_side
-    from mkpc_kaggle.data.outputs import require_apart
-    from mkpc_kaggle.reporting.report import write_report
-    from mkpc_kaggle.reporting.run_log import read_log, write_csv, write_json
-    from mkpc_kaggle.reporting.summary import overview
-
     files = {"--json": arguments.json, "--report": arguments.report}
     require_apart(files, test_side(arguments.test_dir) if arguments.test_dir else [], arguments.work_dir)
     log = read_log(arguments.work_dir)
-    written = write_csv(log, arguments.csv) if arguments.csv is not None else []
-    if arguments.json is not None:
+    written = write_csv(log, arguments.csv) if arguments.csv else []
+    if arguments.json:
         write_json(log, arguments.json)
         written.append(arguments.json)
-    if arguments.report is not None:
-        pairs = read_test_side(arguments.test_dir) if arguments.test_dir is not None else ()
+    if arguments.report:
+        pairs = read_test_side(arguments.test_dir) if arguments.test_dir else ()
         write_report(log, arguments.report, pairs)
         written.append(arguments.report)
     print("\n".join(map(str, written)) or overview(log))

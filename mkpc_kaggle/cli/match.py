@@ -1,9 +1,13 @@
-"""two images -> F, counts, a figure"""
+"""The command ``match``."""
 
 import argparse
 from pathlib import Path
 
 from mkpc_kaggle.cli import options
+from mkpc_kaggle.data.outputs import require_apart
+from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher, to_image
+from mkpc_kaggle.reporting.figures.pair import draw_pair
+from mkpc_kaggle.reporting.figures.style import save
 
 HELP = """\
 Match two images and print the fundamental matrix (x1^T F x0 = 0, pixel centres at integers), how many matches
@@ -19,21 +23,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    from mkpc_kaggle.data.outputs import require_apart
-    from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher, to_image
-    from mkpc_kaggle.reporting.figures.pair import draw_pair
-    from mkpc_kaggle.reporting.figures.style import save
-
-    inputs = [arguments.image0, arguments.image1, Path(arguments.recipe)]
-    require_apart({"--out": arguments.out}, inputs, weights=arguments.weights)
+    inputs = [arguments.image0, arguments.image1, Path(arguments.recipe), *arguments.weights]
+    require_apart({"--out": arguments.out}, inputs)
     images = to_image(arguments.image0), to_image(arguments.image1)
-    matcher = TwoStageMatcher(
-        arguments.recipe,
-        weights=arguments.weights,
-        device=arguments.device,
-        precision=arguments.precision,
-        licence=arguments.licence,
-    )
+    given = {name: getattr(arguments, name) for name in ("weights", "device", "precision", "licence")}
+    matcher = TwoStageMatcher(arguments.recipe, **given)
     match = matcher(*images)
     told = [" ".join(f"{value: .9e}" for value in row) for row in match.estimate.matrix]
     if match.estimate.failure:
@@ -44,9 +38,8 @@ def run(arguments: argparse.Namespace) -> int:
         told.append(f"  {result.unit.name:<30}{counts}")
     for number, region in enumerate(match.regions or ()):
         box = region.box
-        told.append(
-            f"image {number}: {region.reason}, x {box.left}..{box.right - 1}, y {box.top}..{box.bottom - 1}"
-        )
+        where = f"x {box.left}..{box.right - 1}, y {box.top}..{box.bottom - 1}"
+        told.append(f"image {number}: {region.reason}, {where}")
     print("\n".join(told))
     if arguments.out is not None:
         save(draw_pair(*images, match, matcher.recipe.mkpc), arguments.out)

@@ -4,37 +4,26 @@ import argparse
 from collections.abc import Sequence
 from math import inf
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from mkpc_kaggle.engine.budget import Budget, monotonic_of, parse_duration
-
-if TYPE_CHECKING:
-    from mkpc_kaggle.engine.cluster import RayCluster
-    from mkpc_kaggle.pipeline.assembly import Assembly
-    from mkpc_kaggle.recipe import RecipeChoice
+from mkpc_kaggle.engine.cluster import parse_workers
+from mkpc_kaggle.pipeline.assembly import Assembly, assemble
+from mkpc_kaggle.pipeline.availability import Licence
+from mkpc_kaggle.recipe import Mode
 
 
 def add_matching(parser: argparse.ArgumentParser) -> None:
     """What decides how pairs are matched."""
     add = parser.add_argument
-    add(
-        "--recipe", default="auto", metavar="NAME|FILE.toml", help="default: auto, the best that the weights allow"
-    )
+    told = "default: auto, the best that the weights allow"
+    add("--recipe", default="auto", metavar="NAME|FILE.toml", help=told)
     add_weights(parser)
-    add(
-        "--licence",
-        choices=["any", "permissive"],
-        default="any",
-        help="permissive: only weights under Apache-2.0, BSD-3-Clause or MIT. Recipe auto leaves the others out, "
-        "units with a fallback take it, any other recipe that has them is refused (default: any)",
-    )
+    told = """permissive: only weights under Apache-2.0, BSD-3-Clause or MIT. Recipe auto leaves the others out,
+        units with a fallback take it, any other recipe that has them is refused (default: any)"""
+    add("--licence", choices=list(map(str, Licence)), default="any", help=told)
     add("--device", default="auto", help="cpu, cuda, cuda:N, or auto (the default): the GPUs if there are any")
-    add(
-        "--precision",
-        default="float32",
-        choices=["float32", "auto", "bfloat16", "float16"],
-        help="of the networks; auto: half precision where the device is faster in it (default: float32)",
-    )
+    told = "of the networks; auto: half precision where the device is faster in it (default: float32)"
+    add("--precision", default="float32", choices=["float32", "auto", "bfloat16", "float16"], help=told)
 
 
 def add_weights(parser: argparse.ArgumentParser) -> None:
@@ -45,54 +34,29 @@ def add_weights(parser: argparse.ArgumentParser) -> None:
 def add_run(parser: argparse.ArgumentParser, time_limit: str | None) -> None:
     """How the engine runs a recipe."""
     add = parser.add_argument
-    add(
-        "--mode",
-        choices=["two-stage", "stage-1", "whole-images"],
-        default="two-stage",
-        help="two-stage (the default): the recipe as written; stage-1: its units of stage 1 alone; whole-images: "
-        "all its units on whole images, the naive ensemble of equal inference count",
-    )
-    add(
-        "--time-limit",
-        default=time_limit,
-        metavar="TIME",
-        help="such as 8h45m, 90m or 60s, from the start of the program; the run ends before it is over, with as "
-        f"many units as fit (default: {time_limit or 'none'})",
-    )
+    told = """two-stage (the default): the recipe as written; stage-1: its units of stage 1 alone; whole-images:
+        all its units on whole images, the naive ensemble of equal inference count"""
+    add("--mode", choices=list(map(str, Mode)), default="two-stage", help=told)
+    told = f"""such as 8h45m, 90m or 60s, from the start of the program; the run ends before it is over, with as
+        many units as fit (default: {time_limit or "none"})"""
+    add("--time-limit", default=time_limit, metavar="TIME", help=told)
     told = "count the limit from this moment instead, in seconds since 1970: time.time(), or $(date +%%s)"
     add("--started-at", type=float, metavar="SECONDS", help=told)
-    add(
-        "--workers",
-        type=workers,
-        metavar="N|ray[://HOST:PORT]",
-        help="worker processes (default: one for each GPU, or one for the CPU); 0: none, this process does all. "
-        "ray: on the Ray cluster that this machine belongs to, one worker for each GPU, or for each machine if it "
-        "has none; HOST:PORT as `ray start --head` tells it",
-    )
+    told = """worker processes (default: one for each GPU, or one for the CPU); 0: none, this process does all.
+        ray: on the Ray cluster that this machine belongs to, one worker for each GPU, or for each machine if it
+        has none; HOST:PORT as `ray start --head` tells it"""
+    add("--workers", type=parse_workers, metavar="N|ray[://HOST:PORT]", help=told)
     add("--explain", action="store_true", help="say at the end what was planned when, and why")
 
 
-def workers(text: str) -> "int | RayCluster":
-    """A number of worker processes, or the cluster to work on."""
-    from mkpc_kaggle.engine.cluster import parse_workers
-
-    try:
-        return parse_workers(text)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error)) from error
-
-
-def assembly_of(arguments: argparse.Namespace, choice: "RecipeChoice") -> "Assembly":
-    """The parts of a run, as the options say, but for the choice of the recipe."""
-    from mkpc_kaggle.pipeline.assembly import assemble
-    from mkpc_kaggle.pipeline.availability import Licence
-
+def assembly_of(arguments: argparse.Namespace, recipe: str, mode: Mode) -> Assembly:
+    """The parts of a run of this recipe, as the other options say."""
     return assemble(
-        choice.recipe,
+        recipe,
         weights=arguments.weights,
         device=arguments.device,
         precision=arguments.precision,
-        mode=choice.mode,
+        mode=mode,
         licence=Licence(arguments.licence),
         scenes=arguments.reconstruct,
     )

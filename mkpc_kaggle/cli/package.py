@@ -1,9 +1,10 @@
-"""the folders that you upload to Kaggle: a dataset and a notebook"""
+"""The command ``package``."""
 
 import argparse
 from pathlib import Path
 
 from mkpc_kaggle.cli import options
+from mkpc_kaggle.package import Request, make_package
 from mkpc_kaggle.package.metadata import LATEST
 from mkpc_kaggle.package.wheels import PYTHONS
 
@@ -27,18 +28,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--wheels", type=Path, metavar="DIR", help="take wheels from there and use no network")
     told = "include weights that must not be redistributed: the dataset must stay private then"
     add("--private", action="store_true", help=told)
-    add(
-        "--image",
-        default=LATEST,
-        metavar="latest|original|NAME@sha256:DIGEST",
-        help="Kaggle's latest image (the default), for good that of the kernel's first version, or just this one "
-        "(`kaggle kernels pull NAME/mkpc-submission -m` tells which a version had, as docker_image)",
-    )
+    told = """Kaggle's latest image (the default), for good that of the kernel's first version, or just this one
+        (`kaggle kernels pull NAME/mkpc-submission -m` tells which a version had, as docker_image)"""
+    add("--image", default=LATEST, metavar="latest|original|NAME@sha256:DIGEST", help=told)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    from mkpc_kaggle.package import Request, make_package
-
     out, private, image = arguments.out, arguments.private, arguments.image
     pythons = tuple(version.strip() for version in arguments.python.split(","))
     weights = tuple(arguments.weights)
@@ -47,9 +42,8 @@ def run(arguments: argparse.Namespace) -> int:
         sizes = [item.source.stat().st_size for item in items]
         rows = [(i.name, str(size), i.licence or "-", i.note) for i, size in zip(items, sizes, strict=True)]
         print(out / folder)
-        options.print_table(
-            [("file", "bytes", "licence", ""), *rows, (f"{len(rows)} files", str(sum(sizes)), "", "")]
-        )
+        rows = [("file", "bytes", "licence", ""), *rows, (f"{len(rows)} files", str(sum(sizes)), "", "")]
+        options.print_table(rows)
         print()
     if package.restricted:
         names = ", ".join(f"{item.name} ({item.licence})" for item in package.restricted)
@@ -58,8 +52,7 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-_LEFT_OUT = """\
-Left out, because their licences do not clearly allow redistribution (--private includes them)"""
+_LEFT_OUT = "Left out, because their licences do not clearly allow redistribution (--private includes them)"
 _PRIVATE = """\
 In this dataset, though their licences do not clearly allow redistribution. Keep the dataset private on Kaggle,
 do not share it, and check what the licences say of competitions. These are"""

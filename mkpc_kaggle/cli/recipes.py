@@ -1,8 +1,11 @@
-"""the recipes, their units, and the weights that each lacks"""
+"""The command ``recipes``."""
 
 import argparse
 
 from mkpc_kaggle.cli import options
+from mkpc_kaggle.pipeline.availability import unavailable
+from mkpc_kaggle.recipe import load_recipe, recipe_names
+from mkpc_kaggle.weights import WeightStore
 
 HELP = """\
 List the recipes: their units in order of importance, and which weight files are missing. A unit reads
@@ -17,12 +20,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    from mkpc_kaggle.matchers.contract import Unusable
-    from mkpc_kaggle.matchers.registry import find_matcher
-    from mkpc_kaggle.pipeline.availability import missing_files, slots_of
-    from mkpc_kaggle.recipe import load_recipe, recipe_names
-    from mkpc_kaggle.weights import WeightStore
-
     store = WeightStore(arguments.weights)
     for name in recipe_names():
         recipe = load_recipe(name)
@@ -30,9 +27,6 @@ def run(arguments: argparse.Namespace) -> int:
         for unit in recipe.units:
             fallback = f"  (or {unit.fallback}, where its weights are missing)" if unit.fallback else ""
             print(f"    {unit.name}  at most {unit.max_matches}{fallback}")
-        for matcher in map(find_matcher, recipe.matcher_names):
-            if isinstance(matcher, Unusable):
-                print(f"    {matcher}")
-        missing = [slot for slot in slots_of(recipe) if store.find(slot) is None]
-        print(f"    missing: {missing_files(missing, store)}" if missing else "    all weights are there")
+        reasons = [f"    {matcher}: {reason}" for matcher, reason in unavailable(recipe, store).items()]
+        print("\n".join(reasons or ["    all weights are there"]))
     return 0

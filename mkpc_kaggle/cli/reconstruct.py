@@ -1,19 +1,23 @@
-"""a folder of images -> cameras, a COLMAP database, models"""
+"""The command ``reconstruct``."""
 
 import argparse
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from mkpc_kaggle.cli import options
+from mkpc_kaggle.data.outputs import lies_in
 from mkpc_kaggle.engine.budget import format_duration
 from mkpc_kaggle.engine.console import say
+from mkpc_kaggle.engine.session import Session, Watchdog, interruptible
 from mkpc_kaggle.errors import UserError, writing
-
-if TYPE_CHECKING:
-    from mkpc_kaggle.reconstruction.run import FolderResult
+from mkpc_kaggle.recipe import Mode
+from mkpc_kaggle.reconstruction.folder import read_folder, read_pair_list
+from mkpc_kaggle.reconstruction.outputs import Form, write_tables
+from mkpc_kaggle.reconstruction.run import FolderResult, for_cameras, reconstruct_folder
+from mkpc_kaggle.reporting.report import report_run
+from mkpc_kaggle.reporting.summary import left_out_line, trouble
 
 HELP = """\
 Match the images of a folder with the engine that makes submissions, and reconstruct their cameras. Each folder
@@ -43,7 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     options.add_matching(parser)
     options.add_run(parser, time_limit=None)
     add("--pairs", type=Path, metavar="FILE", help="match these alone: two paths below DIR a line, as of hloc")
-    add("--format", choices=["imc2025", "imc2023"], help="also write submission.csv; imc2023: of 2024, too")
+    add("--format", choices=list(map(str, Form)), help="also write submission.csv; imc2023: of 2024, too")
     add(
         "--rotations", action="store_true", help="try to turn images that match nothing by 90, 180 and 270 degrees"
     )
@@ -52,15 +56,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    from mkpc_kaggle.data.outputs import lies_in
-    from mkpc_kaggle.engine.session import Session, Watchdog, interruptible
-    from mkpc_kaggle.recipe import Mode, RecipeChoice
-    from mkpc_kaggle.reconstruction.folder import read_folder, read_pair_list
-    from mkpc_kaggle.reconstruction.outputs import Form, write_tables
-    from mkpc_kaggle.reconstruction.run import for_cameras, reconstruct_folder
-    from mkpc_kaggle.reporting.report import report_run
-    from mkpc_kaggle.reporting.summary import left_out_line, trouble
-
     root, out, work_dir = arguments.images, arguments.out, arguments.out / "work"
     datasets = read_folder(root)
     if lies_in(out, root) or lies_in(root, out):
@@ -68,7 +63,7 @@ def run(arguments: argparse.Namespace) -> int:
     listed = None if arguments.pairs is None else read_pair_list(arguments.pairs, root, datasets)
     budget = options.budget_of(arguments)
     with interruptible() as interrupt, Watchdog(budget, interrupt) as watchdog, writing(f"--out {out}"):
-        assembly = options.assembly_of(arguments, RecipeChoice(arguments.recipe, Mode(arguments.mode)))
+        assembly = options.assembly_of(arguments, arguments.recipe, Mode(arguments.mode))
         assembly = replace(assembly, recipe=for_cameras(assembly.recipe))
         images = sum(len(dataset.files) for dataset in datasets)
         header = f"{images} images, recipe {assembly.recipe.name}, {assembly.placement}, journal in {work_dir}"
@@ -86,7 +81,7 @@ def run(arguments: argparse.Namespace) -> int:
         return 128 + interrupt.signal if interrupt.signal else watchdog.status
 
 
-def _told(result: "FolderResult") -> Iterator[str]:
+def _told(result: FolderResult) -> Iterator[str]:
     """A line for each dataset, and what went wrong."""
     yield f"{len(result.pairs)} pairs: {result.report.ending} after {format_duration(result.report.seconds)}"
     reasons = {scene.batch: scene.failure for scene in result.report.scenes}

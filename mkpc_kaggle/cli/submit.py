@@ -1,10 +1,16 @@
-"""a test directory -> submission.csv"""
+"""The command ``submit``."""
 
 import argparse
 from pathlib import Path
 
 from mkpc_kaggle.cli import options
+from mkpc_kaggle.data.competition import read_test_side, test_side
+from mkpc_kaggle.data.outputs import require_apart
 from mkpc_kaggle.engine.console import say
+from mkpc_kaggle.engine.session import Session, Watchdog, interruptible, submit
+from mkpc_kaggle.recipe import Mode
+from mkpc_kaggle.reporting.report import report_run
+from mkpc_kaggle.reporting.summary import left_out_line, summary, trouble
 
 HELP = """\
 Match every pair of test.csv and write its fundamental matrix, a row for each pair.
@@ -24,40 +30,29 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--test-dir", type=Path, required=True, metavar="DIR", help="holds test.csv and test_images/")
     add("--output", type=Path, default=Path("submission.csv"), help="default: submission.csv")
     options.add_matching(parser)
-    add(
-        "--scenes",
-        dest="reconstruct",
-        action=argparse.BooleanOptionalAction,
-        help="reconstruct the pairs of a batch together and take F from the cameras, or not (default: as the "
-        "recipe has it; the paper's recipes have not). A pair's F then comes from other pairs, too: read your "
-        "competition's rules on that, and compare published stereo scores with --no-scenes",
-    )
+    told = """reconstruct the pairs of a batch together and take F from the cameras, or not (default: as the recipe
+        has it; the paper's recipes have not). A pair's F then comes from other pairs, too: read your competition's
+        rules on that, and compare published stereo scores with --no-scenes"""
+    add("--scenes", dest="reconstruct", action=argparse.BooleanOptionalAction, help=told)
     options.add_run(parser, time_limit="8h45m")
     add("--work-dir", type=Path, metavar="DIR", help="for the journal; default: beside the output, NAME.work")
     add("--fresh", action="store_true", help="forget what an earlier run left in the work directory")
-    add(
-        "--report", type=Path, metavar="FILE.html", help="a page on the run; default: beside the output, NAME.html"
-    )
+    told = "a page on the run; default: beside the output, NAME.html"
+    add("--report", type=Path, metavar="FILE.html", help=told)
     add("--no-report", action="store_true", help="write none")
 
 
 def run(arguments: argparse.Namespace) -> int:
-    from mkpc_kaggle.data.competition import read_test_side, test_side
-    from mkpc_kaggle.data.outputs import require_apart
-    from mkpc_kaggle.engine.session import Session, Watchdog, interruptible, submit
-    from mkpc_kaggle.recipe import Mode, RecipeChoice
-    from mkpc_kaggle.reporting.report import report_run
-    from mkpc_kaggle.reporting.summary import left_out_line, summary, trouble
-
     output: Path = arguments.output
     work_dir: Path = arguments.work_dir or output.parent / f"{output.stem}.work"
     page: Path = arguments.report or output.parent / f"{output.stem}.html"
     files = {"--output": output, "--report": None if arguments.no_report else page}
-    require_apart(files, [*test_side(arguments.test_dir), Path(arguments.recipe)], work_dir, arguments.weights)
+    inputs = [*test_side(arguments.test_dir), Path(arguments.recipe), *arguments.weights]
+    require_apart(files, inputs, work_dir)
     budget = options.budget_of(arguments)
     with interruptible() as interrupt, Watchdog(budget, interrupt) as watchdog:
         pairs = read_test_side(arguments.test_dir)
-        assembly = options.assembly_of(arguments, RecipeChoice(arguments.recipe, Mode(arguments.mode)))
+        assembly = options.assembly_of(arguments, arguments.recipe, Mode(arguments.mode))
         header = f"{len(pairs)} pairs, recipe {assembly.recipe.name}, {assembly.placement}, journal in {work_dir}"
         say("\n".join(filter(None, [header, left_out_line(assembly.left_out)])))
         session = Session(

@@ -1,22 +1,29 @@
-"""a directory with known poses -> mAA and pose AUC of a recipe"""
+"""The command ``validate``."""
 
 import argparse
 import json
+import re
 import tempfile
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from mkpc_kaggle.cli import options
+from mkpc_kaggle.config import from_table
+from mkpc_kaggle.data.competition import Pair, TrainScene, read_train_side
+from mkpc_kaggle.data.outputs import require_apart
+from mkpc_kaggle.data.pairs import read_pairs
 from mkpc_kaggle.engine.console import say
+from mkpc_kaggle.engine.engine import Ending
+from mkpc_kaggle.engine.session import Session, interruptible
 from mkpc_kaggle.errors import UserError, writing
-
-if TYPE_CHECKING:
-    from mkpc_kaggle.data.competition import Pair, TrainScene
-    from mkpc_kaggle.engine.session import Session
-    from mkpc_kaggle.evaluation.validate import Validation
-    from mkpc_kaggle.pipeline.assembly import Assembly
-    from mkpc_kaggle.recipe import Recipe, RecipeChoice
+from mkpc_kaggle.evaluation.compare import Comparison, comparison_json, comparison_table, step_gains
+from mkpc_kaggle.evaluation.imc2025 import score_imc2025, score_lines
+from mkpc_kaggle.evaluation.validate import Validation, score_submission, score_table, to_json, validate
+from mkpc_kaggle.geometry.robust import Method, RobustConfig
+from mkpc_kaggle.pipeline.assembly import Assembly
+from mkpc_kaggle.recipe import Mode, Recipe, split_mode
+from mkpc_kaggle.reporting.report import report_run
+from mkpc_kaggle.reporting.summary import left_out_line, summary, trouble
 
 HELP = """\
 Run a recipe, with the engine that makes submissions, on a train side (calibration.csv, pair_covisibility.csv
@@ -40,50 +47,31 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     source = parser.add_mutually_exclusive_group(required=True)
     source.add_argument("--train-dir", type=Path, metavar="DIR")
     source.add_argument("--pairs", type=Path, metavar="FILE", help="a list of pairs with K and poses")
-    source.add_argument(
-        "--imc2025",
-        type=Path,
-        metavar="DIR",
-        help="score files of `reconstruct --format imc2025`: DIR has train_labels.csv and train_thresholds.csv",
-    )
+    told = "score files of `reconstruct --format imc2025`; DIR has train_labels.csv and train_thresholds.csv"
+    source.add_argument("--imc2025", type=Path, metavar="DIR", help=told)
     add("--image-root", type=Path, metavar="DIR", help="where the images of --pairs lie")
     add("--scenes", default="", metavar="A,B", help="of --train-dir; default: all")
     add("--pairs-per-scene", type=int, metavar="N", help="evenly spread; default: all")
     add("--min-covisibility", type=float, default=0.1, help="of --train-dir; default: 0.1, as in the competition")
     options.add_matching(parser)
-    add(
-        "--no-scenes",
-        dest="reconstruct",
-        action="store_const",
-        const=False,
-        help="F from each pair's own matches alone, whatever the recipe has",
-    )
+    told = "F from each pair's own matches alone, whatever the recipe has"
+    add("--no-scenes", dest="reconstruct", action="store_const", const=False, help=told)
     add("--units", metavar="A,B", help="only these, in this order, such as 1:sift@1536; default: the recipe's")
-    add(
-        "--compare",
-        nargs="+",
-        metavar="RECIPE[:MODE]",
-        help="run these instead of --recipe and --mode, and give the gain of each over the first with its 95 %% "
-        "interval; such as classical:whole-images classical",
-    )
-    add("--method", choices=["magsac", "ransac"], help="default: the recipe's")
+    told = """run these instead of --recipe and --mode, and give the gain of each over the first with its 95 %%
+        interval; such as classical:whole-images classical"""
+    add("--compare", nargs="+", metavar="RECIPE[:MODE]", help=told)
+    add("--method", choices=list(map(str, Method)), help="default: the recipe's")
     add("--threshold", type=float, metavar="PIXELS", help="of the method; for E divided by the mean focal length")
     options.add_run(parser, time_limit=None)
     add("--json", type=Path, metavar="FILE", help="write all figures, per pair too")
-    add(
-        "--work-dir",
-        type=Path,
-        metavar="DIR",
-        help="keep the journal there (with --compare, a journal for each recipe) and go on from it; report.html "
-        "beside it shows the run (not with --pairs); default: a temporary directory",
-    )
+    told = """keep the journal there (with --compare, a journal for each recipe) and go on from it; report.html
+        beside it shows the run (not with --pairs); default: a temporary directory"""
+    add("--work-dir", type=Path, metavar="DIR", help=told)
     add("--submission", action="append", type=Path, metavar="CSV", help="score it, match nothing; may be repeated")
     add("--truth", type=Path, metavar="CSV", help="which pairs its samples are (`demo` writes such a table)")
 
 
 def run(arguments: argparse.Namespace) -> int:
-    from mkpc_kaggle.data.outputs import require_apart
-
     _require_a_whole(arguments)
     if arguments.imc2025 is not None:
         return _score_imc2025(arguments)
@@ -93,27 +81,27 @@ def run(arguments: argparse.Namespace) -> int:
     with tempfile.TemporaryDirectory(prefix="mkpc-") as temporary:
         work_dir = arguments.work_dir or Path(temporary)
         scenes = _read_scenes(arguments, work_dir)
-        if arguments.submission is not None:
-            return _score_submissions(arguments, scenes)
-        return _match_and_score(arguments, scenes, work_dir)
+        if arguments.submission is None:
+            return _match_and_score(arguments, scenes, work_dir)
+        for submission in arguments.submission:
+            say("\n".join([str(submission), *score_table(score_submission(submission, arguments.truth, scenes))]))
+        return 0
 
 
 def _require_a_whole(given: argparse.Namespace) -> None:
     """Raise :class:`UserError` for options that do not go together."""
     for is_wrong, told in (
         (
-            given.imc2025 is not None and (given.submission is None or given.truth is not None),
+            given.imc2025 and not (given.submission and not given.truth),
             "--imc2025 needs --submission, and no --truth",
         ),
         (
-            given.imc2025 is None and (given.submission is None) != (given.truth is None),
+            not given.imc2025 and (given.submission is None) != (given.truth is None),
             "--submission and --truth go together",
         ),
         ((given.pairs is None) != (given.image_root is None), "--pairs and --image-root go together"),
-        (
-            given.pairs is not None and (given.submission or given.compare),
-            "--submission and --compare need a --train-dir: they score in metres, which --pairs lacks",
-        ),
+        (given.pairs and given.submission, "--submission needs a --train-dir: it scores in metres"),
+        (given.pairs and given.compare, "--compare needs a --train-dir: it scores in metres"),
         (given.compare and given.units, "--units chooses from one recipe; --compare takes recipes as they are"),
         (given.compare and len(given.compare) < 2, "--compare needs two recipes or more"),
         (given.pairs_per_scene is not None and given.pairs_per_scene < 1, "--pairs-per-scene: give 1 or more"),
@@ -122,54 +110,32 @@ def _require_a_whole(given: argparse.Namespace) -> None:
             raise UserError(told)
 
 
-def _read_scenes(arguments: argparse.Namespace, work_dir: Path) -> "tuple[TrainScene, ...]":
-    from mkpc_kaggle.data.competition import read_train_side
-    from mkpc_kaggle.data.pairs import read_pairs
-
+def _read_scenes(arguments: argparse.Namespace, work_dir: Path) -> tuple[TrainScene, ...]:
     most: int | None = arguments.pairs_per_scene
     if arguments.pairs is not None:
         return (read_pairs(arguments.pairs, arguments.image_root, copies=work_dir / "turned", most=most),)
+    scenes = filter(None, arguments.scenes.split(","))
     return read_train_side(
-        arguments.train_dir,
-        scenes=filter(None, arguments.scenes.split(",")),
-        min_covisibility=arguments.min_covisibility,
-        pairs_per_scene=most,
+        arguments.train_dir, scenes=scenes, min_covisibility=arguments.min_covisibility, pairs_per_scene=most
     )
 
 
-def _score_submissions(arguments: argparse.Namespace, scenes: "tuple[TrainScene, ...]") -> int:
-    from mkpc_kaggle.evaluation.validate import score_submission, score_table
-
-    for submission in arguments.submission:
-        say("\n".join([str(submission), *score_table(score_submission(submission, arguments.truth, scenes))]))
-    return 0
-
-
 def _score_imc2025(arguments: argparse.Namespace) -> int:
-    from mkpc_kaggle.evaluation.imc2025 import score_imc2025, score_lines
-
     for submission in arguments.submission:
         say("\n".join([str(submission), *score_lines(score_imc2025(arguments.imc2025, submission))]))
     return 0
 
 
-def _match_and_score(arguments: argparse.Namespace, scenes: "tuple[TrainScene, ...]", work_dir: Path) -> int:
+def _match_and_score(arguments: argparse.Namespace, scenes: tuple[TrainScene, ...], work_dir: Path) -> int:
     """Run a recipe, or several to compare, each then with a journal in a directory of its own."""
-    from mkpc_kaggle.engine.engine import Ending
-    from mkpc_kaggle.engine.session import Session, interruptible
-    from mkpc_kaggle.evaluation.compare import Comparison, comparison_json, comparison_table
-    from mkpc_kaggle.evaluation.validate import to_json, validate
-    from mkpc_kaggle.recipe import Mode, RecipeChoice
-    from mkpc_kaggle.reporting.summary import left_out_line, trouble
-
-    compared = [RecipeChoice.parse(text) for text in arguments.compare or ()]
-    choices = compared or [RecipeChoice(arguments.recipe, Mode(arguments.mode))]
+    compared: list[str] = arguments.compare or []
+    choices = [split_mode(text) for text in compared] or [(arguments.recipe, Mode(arguments.mode))]
     pairs = [true.pair for scene in scenes for true in scene.pairs]
-    validations = []
+    validations, status = [], 0
     with interruptible() as interrupt:
-        assemblies = [_assemble(arguments, choice) for choice in choices]
-        for choice, assembly in zip(choices, assemblies, strict=True):
-            place = work_dir / choice.folder if compared else work_dir
+        assemblies = [_assemble(arguments, *choice) for choice in choices]
+        for text, assembly in zip(compared or [""], assemblies, strict=True):
+            place = work_dir / re.sub(r"[^\w.-]+", "_", text)
             session = Session(place, options.budget_of(arguments), interrupt, workers=arguments.workers)
             validation = validate(scenes, assembly, session)
             validations.append(validation)
@@ -191,14 +157,9 @@ def _match_and_score(arguments: argparse.Namespace, scenes: "tuple[TrainScene, .
 
 
 def _tell(
-    arguments: argparse.Namespace, pairs: "list[Pair]", left_out: str, session: "Session", validation: "Validation"
+    arguments: argparse.Namespace, pairs: list[Pair], left_out: str, session: Session, validation: Validation
 ) -> None:
     """Print the run's summary and its scores."""
-    from mkpc_kaggle.evaluation.compare import step_gains
-    from mkpc_kaggle.evaluation.validate import score_table
-    from mkpc_kaggle.reporting.report import report_run
-    from mkpc_kaggle.reporting.summary import summary
-
     assert validation.report is not None
     told = [left_out] if left_out else []
     told += ["plan:", *map(str, validation.report.explanations)] if arguments.explain else []
@@ -209,12 +170,9 @@ def _tell(
         say(report_run(session.work_dir, session.work_dir / "report.html", session.must_end(), pairs))
 
 
-def _assemble(arguments: argparse.Namespace, choice: "RecipeChoice") -> "Assembly":
+def _assemble(arguments: argparse.Namespace, name: str, mode: Mode) -> Assembly:
     """The parts of a run of a recipe, with the units and the robust method that the command names."""
-    from mkpc_kaggle.config import from_table
-    from mkpc_kaggle.geometry.robust import RobustConfig
-
-    assembly = options.assembly_of(arguments, choice)
+    assembly = options.assembly_of(arguments, name, mode)
     recipe = with_units(assembly.recipe, arguments.units)
     given = {"method": arguments.method, "threshold": arguments.threshold}
     changes = {key: value for key, value in given.items() if value is not None}
@@ -222,7 +180,7 @@ def _assemble(arguments: argparse.Namespace, choice: "RecipeChoice") -> "Assembl
     return replace(assembly, recipe=replace(recipe, magsac=magsac))
 
 
-def with_units(recipe: "Recipe", wanted: str | None) -> "Recipe":
+def with_units(recipe: Recipe, wanted: str | None) -> Recipe:
     """The recipe with the units of these names alone, in this order; all of them if none are named."""
     known, names = {unit.name: unit for unit in recipe.units}, wanted.split(",") if wanted is not None else []
     for name in names:

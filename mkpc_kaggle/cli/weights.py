@@ -1,16 +1,18 @@
-"""the weight files: which are there, are they whole, fetch them"""
+"""The command ``weights``."""
 
 import argparse
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from mkpc_kaggle.cli import options
-from mkpc_kaggle.cli.options import print_table
 from mkpc_kaggle.errors import UserError
-
-if TYPE_CHECKING:
-    from mkpc_kaggle.weights import WeightFile, WeightStore
+from mkpc_kaggle.matchers.registry import UnusableError, matcher_names, spec_of
+from mkpc_kaggle.pipeline.availability import slots_of
+from mkpc_kaggle.recipe import load_recipe, recipe_names
+from mkpc_kaggle.weights import WeightFile, WeightStore
+from mkpc_kaggle.weights.convert import convert
+from mkpc_kaggle.weights.fetch import FetchOutcome, choose, fetch
+from mkpc_kaggle.weights.manifest import UNVERIFIED, pin, read_manifest
 
 HELP = """\
 The files that the matchers load their weights from; none comes with the package.
@@ -48,9 +50,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         options.add_weights(parsers[name])
     parsers["verify"].add_argument("--manifest", type=Path, metavar="FILE", help="is every file of it there?")
     parsers["locate"].add_argument("name", metavar="NAME|SLOT", help="a file or a slot that `list` names")
-    parsers["fetch"].add_argument(
-        "names", nargs="*", default=["auto"], metavar="NAME|SLOT|RECIPE", help="default: what recipe auto can use"
-    )
+    told = "default: what recipe auto can use"
+    parsers["fetch"].add_argument("names", nargs="*", default=["auto"], metavar="NAME|SLOT|RECIPE", help=told)
     parsers["fetch"].add_argument("--out", type=Path, required=True, metavar="DIR", help="where the files go")
     parsers["convert"].add_argument("file", type=Path, metavar="FILE")
     parsers["convert"].add_argument("--out", type=Path, required=True, metavar="X.safetensors")
@@ -61,13 +62,13 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _list(arguments: argparse.Namespace) -> int:
-    from mkpc_kaggle.matchers.contract import MatcherEntry, Unusable
-    from mkpc_kaggle.matchers.registry import find_matcher, matcher_names
-    from mkpc_kaggle.weights import WeightStore
-
     store = WeightStore(arguments.weights)
-    matchers = {name: find_matcher(name) for name in matcher_names()}
-    specs = [matcher.spec for matcher in matchers.values() if isinstance(matcher, MatcherEntry)]
+    specs, unusable = [], []
+    for name in matcher_names():
+        try:
+            specs.append(spec_of(name, "weights"))
+        except UnusableError as error:
+            unusable.append(str(error))
     rows = [("slot", "licence", "matchers", "file")]
     for slot in dict.fromkeys(file.slot for file in store.files):
         files = store.alternatives(slot)
@@ -77,52 +78,33 @@ def _list(arguments: argparse.Namespace) -> int:
         where += [f"refused: {file.path}: {file.note}" for file in search.refused if not search.found]
         users = [spec.name for spec in specs if slot in spec.every_slot]
         rows.append((slot, files[0].licence, ", ".join(users) or "-", "; ".join(where)))
-    print_table(rows)
-    for matcher in matchers.values():
-        if isinstance(matcher, Unusable):
-            print(matcher)
+    options.print_table(rows)
+    print("".join(f"{told}\n" for told in unusable), end="")
     return 0
 
 
 def _verify(arguments: argparse.Namespace) -> int:
-    from mkpc_kaggle.weights import WeightStore
-    from mkpc_kaggle.weights.manifest import read_manifest
-
-    if arguments.manifest:
-        return _verify_manifest(
-            WeightStore(arguments.weights, read_manifest(arguments.manifest)), arguments.manifest
-        )
-    store = WeightStore(arguments.weights)
-    files = store.verify()
-    if not files:
+    wanted = read_manifest(arguments.manifest) if arguments.manifest else None
+    store = WeightStore(arguments.weights, wanted)
+    if wanted is None:
+        files = store.verify()
+    else:
+        searches = map(store.search, ([file] for file in wanted))
+        files = [file for search in searches for file in ([search.found] if search.found else search.refused)]
+    there = {found.file for found in files}
+    missing = [file.name for file in wanted or () if file not in there]
+    rows = [(found.file.name, str(found.state), str(found.path), found.note) for found in files]
+    rows += [(name, "missing", "", f"searched {store.searched}") for name in missing]
+    if not rows:
         print(f"no weight files found (searched {store.searched})")
         return 0
-    rows = [(found.file.name, str(found.state), str(found.path), found.note) for found in files]
-    print_table([("file", "state", "path", "note"), *rows])
+    options.print_table([("file", "state", "path", "note"), *rows])
     refused = sum(not found.usable for found in files)
-    print(f"{len(files)} files, {refused} refused")
-    return int(refused > 0)
-
-
-def _verify_manifest(store: "WeightStore", manifest: Path) -> int:
-    rows, absent = [("file", "bytes", "state", "note")], 0
-    for file in store.files:
-        search = store.search([file])
-        absent += search.found is None
-        for found in (search.found,) if search.found else search.refused:
-            where = "" if found.path.parent == manifest.parent else f"{found.path} "
-            rows.append((file.name, str(file.size), str(found.state), where + found.note))
-        if not search.found and not search.refused:
-            rows.append((file.name, str(file.size), "missing", f"searched {store.searched}"))
-    if store.files:
-        print_table(rows)
-    print(f"{len(store.files)} files in {manifest}, {absent} of them not found or wrong")
-    return int(absent > 0)
+    print(f"{len(rows)} files, {refused} refused, {len(missing)} missing")
+    return int(bool(refused or missing))
 
 
 def _locate(arguments: argparse.Namespace) -> int:
-    from mkpc_kaggle.weights import WeightStore
-
     store = WeightStore(arguments.weights)
     status = 0
     for search in (store.search(lines) for lines in files_of(arguments.name, store)):
@@ -137,10 +119,6 @@ def _locate(arguments: argparse.Namespace) -> int:
 
 
 def _fetch(arguments: argparse.Namespace) -> int:
-    from mkpc_kaggle.weights import WeightStore
-    from mkpc_kaggle.weights.fetch import FetchOutcome, choose, fetch
-    from mkpc_kaggle.weights.manifest import UNVERIFIED, pin
-
     store = WeightStore([arguments.out] if arguments.out.is_dir() else [])
     wanted = [lines for name in arguments.names for lines in files_of(name, store)]
     outcomes = []
@@ -155,20 +133,15 @@ def _fetch(arguments: argparse.Namespace) -> int:
 
 
 def _convert(arguments: argparse.Namespace) -> int:
-    from mkpc_kaggle.weights.convert import convert
-
     print(convert(arguments.file, arguments.out).line)
     return 0
 
 
-def files_of(name: str, store: "WeightStore") -> "list[list[WeightFile]]":
+def files_of(name: str, store: WeightStore) -> list[list[WeightFile]]:
     """The files that the name of a file, a slot or a recipe stands for: a list of alternatives for each slot.
 
     Raises :class:`UserError` with the known names for an unknown name.
     """
-    from mkpc_kaggle.pipeline.availability import slots_of
-    from mkpc_kaggle.recipe import load_recipe, recipe_names
-
     if named := [file for file in store.files if file.name == name]:
         return [named]
     slots = list(dict.fromkeys(file.slot for file in store.files))

@@ -10,6 +10,7 @@ import os
 import re
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
@@ -53,13 +54,13 @@ class Pair:
         return Path(self.file0), Path(self.file1)
 
     @property
+    def model(self) -> ModelKind:
+        return ModelKind.F if self.intrinsics is None else ModelKind.E
+
+    @property
     def names(self) -> tuple[str, str]:
         """The names of the images' files."""
         return self.file0.rpartition(os.sep)[2], self.file1.rpartition(os.sep)[2]
-
-    @property
-    def model(self) -> ModelKind:
-        return ModelKind.F if self.intrinsics is None else ModelKind.E
 
     @property
     def key(self) -> str:
@@ -103,8 +104,7 @@ def read_test_side(directory: Path) -> tuple[Pair, ...]:
     path, images = test_side(directory)
     pairs: dict[str, Pair] = {}
     batches: dict[str, dict[str, str]] = {}
-    for line, (sample, batch, *names) in read_rows(path, TEST_COLUMNS):
-        where = f"{path}, line {line}"
+    for where, (sample, batch, *names) in read_rows(path, TEST_COLUMNS):
         if sample in pairs:
             raise UserError(f"{where}: the sample_id {sample!r} is not unique")
         if CONTROL.search(sample):
@@ -135,51 +135,35 @@ def read_train_side(
     :class:`UserError` for missing files, columns or scenes, and for cells that cannot be read.
     """
     path = directory / "scaling_factors.csv"
-    metres = {
-        scene: float(_numbers(cell, f"{path}, line {line}", 1)[0])
-        for line, (scene, cell) in read_rows(path, ("scene", "scaling_factor"))
-    }
+    rows = read_rows(path, ("scene", "scaling_factor"))
+    metres = {plain_name(scene, where): float(_numbers(cell, where, 1)[0]) for where, (scene, cell) in rows}
     wanted = list(scenes) or sorted(name for name in metres if (directory / name).is_dir())
-    for name in wanted:
-        if name not in metres:
-            raise UserError(f"{directory}: unknown scene {name!r}; known: {', '.join(sorted(metres))}")
     if not wanted:
         raise UserError(f"{directory} has none of the scenes of its scaling_factors.csv")
-    return tuple(
-        _read_scene(directory / plain_name(name, path), metres[name], min_covisibility, pairs_per_scene)
-        for name in wanted
-    )
+    if unknown := [name for name in wanted if name not in metres]:
+        raise UserError(f"{directory}: unknown scene {unknown[0]!r}; known: {', '.join(sorted(metres))}")
+    return tuple(_read_scene(directory / name, metres[name], min_covisibility, pairs_per_scene) for name in wanted)
 
 
 def _read_scene(directory: Path, metres: float, min_covisibility: float, most: int | None) -> TrainScene:
-    cameras = read_cameras(directory / "calibration.csv")
+    cameras: dict[str, Camera] = {}
+    columns = ("image_id", "camera_intrinsics", "rotation_matrix", "translation_vector")
+    for where, (image, *cells) in read_rows(directory / "calibration.csv", columns):
+        K, R, t = (_numbers(cell, where, count) for cell, count in zip(cells, (9, 9, 3), strict=True))
+        cameras[plain_name(image, where)] = Camera(K.reshape(3, 3), R.reshape(3, 3), t)
     path = directory / "pair_covisibility.csv"
     images, pairs = ImageFiles(directory / "images"), []
-    for line, (key, cell) in read_rows(path, ("pair", "covisibility")):
-        where = f"{path}, line {line}"
+    for where, (key, cell) in read_rows(path, ("pair", "covisibility")):
         covisibility = float(_numbers(cell, where, 1)[0])
-        first, dash, second = key.partition("-")
-        if not dash or first not in cameras or second not in cameras:
+        first, _, second = key.partition("-")
+        if first not in cameras or second not in cameras:
             raise UserError(f"{where}: the pair {key!r} is not two images of calibration.csv")
         if covisibility >= min_covisibility:
-            image0, image1 = (images[plain_name(name, where)] for name in (first, second))
-            pair = Pair(pair_id(directory.name, first, second), directory.name, image0, image1)
+            pair = Pair(pair_id(directory.name, first, second), directory.name, images[first], images[second])
             pairs.append(TruePair(pair, cameras[first], cameras[second], covisibility))
     if not pairs:
         raise UserError(f"{path} has no pair with a covisibility of at least {min_covisibility:g}")
     return TrainScene(directory.name, metres, tuple(evenly_spread(pairs, most)))
-
-
-def read_cameras(path: Path) -> dict[str, Camera]:
-    """The cameras of a ``calibration.csv`` by image id."""
-    cameras = {}
-    columns = ("image_id", "camera_intrinsics", "rotation_matrix", "translation_vector")
-    for line, (image, *cells) in read_rows(path, columns):
-        K, R, t = (
-            _numbers(cell, f"{path}, line {line}", count) for cell, count in zip(cells, (9, 9, 3), strict=True)
-        )
-        cameras[image] = Camera(K.reshape(3, 3), R.reshape(3, 3), t)
-    return cameras
 
 
 def write_submission(path: Path, rows: Mapping[str, Matrix3]) -> None:
@@ -190,22 +174,14 @@ def write_submission(path: Path, rows: Mapping[str, Matrix3]) -> None:
     with replacing(path) as stream:
         table = csv.writer(stream, lineterminator="\n")
         table.writerow(SUBMISSION_COLUMNS)
-        table.writerows(zip(rows, _cells(rows.values()), strict=True))
-
-
-def _cells(matrices: Iterable[Matrix3]) -> Iterator[str]:
-    """Each matrix as text; a matrix that follows itself, as the fallback does, is not formatted again."""
-    last, text = None, ""
-    for F in matrices:
-        if F is not last:
-            last, text = F, " ".join(f"{value:.12g}" for value in F.ravel())
-        yield text
+        for sample, F in rows.items():
+            table.writerow((sample, " ".join(f"{value:.12g}" for value in F.ravel().tolist())))
 
 
 def read_submission(path: Path) -> dict[str, Matrix3]:
     """F by sample id; raises :class:`UserError` for a file that is not a submission."""
     rows = read_rows(path, SUBMISSION_COLUMNS)
-    return {sample: _numbers(cell, f"{path}, line {line}", 9).reshape(3, 3) for line, (sample, cell) in rows}
+    return {sample: _numbers(cell, where, 9).reshape(3, 3) for where, (sample, cell) in rows}
 
 
 def submission_problems(path: Path, sample_ids: Sequence[str]) -> list[str]:
@@ -220,10 +196,8 @@ def submission_problems(path: Path, sample_ids: Sequence[str]) -> list[str]:
             except UserError as error:
                 problems.append(str(error))
                 continue
-            if not np.isfinite(F).all():
-                problems.append(f"{sample}: a number is not finite")
-            elif not F.any():
-                problems.append(f"{sample}: the matrix is zero")
+            if not np.isfinite(F).all() or not F.any():
+                problems.append(f"{sample}: {'the matrix is zero' if not F.any() else 'a number is not finite'}")
     except UserError as error:
         return [str(error)]
     present, wanted = set(found), set(sample_ids)
@@ -238,8 +212,8 @@ def submission_problems(path: Path, sample_ids: Sequence[str]) -> list[str]:
     return problems
 
 
-def read_rows(path: Path, columns: Sequence[str], *, only: bool = False) -> Iterator[tuple[int, list[str]]]:
-    """Line number and cells of these columns of each row of a CSV file, all as text.
+def read_rows(path: Path, columns: Sequence[str], *, only: bool = False) -> Iterator[tuple[str, list[str]]]:
+    """Where each row of a CSV file is, for messages, and its cells in these columns, all as text.
 
     Raises :class:`UserError` for a file that cannot be read, for missing columns (with ``only`` for other columns,
     too), and for a row that has not as many cells as the header.
@@ -257,11 +231,10 @@ def read_rows(path: Path, columns: Sequence[str], *, only: bool = False) -> Iter
                 raise UserError(f"{path}: the header is {','.join(header)[:200]}, not {','.join(columns)}")
             places = [header.index(column) for column in columns]
             for row in filter(None, table):
+                where = f"{path}, line {table.line_num}"
                 if len(row) != len(header):
-                    raise UserError(
-                        f"{path}, line {table.line_num}: {len(row)} cells, the header has {len(header)}"
-                    )
-                yield table.line_num, [row[place] for place in places]
+                    raise UserError(f"{where}: {len(row)} cells, the header has {len(header)}")
+                yield where, [row[place] for place in places]
     except FileNotFoundError as error:
         raise UserError(f"{path}: no such file") from error
     except (OSError, ValueError, csv.Error) as error:
@@ -291,12 +264,10 @@ class ImageFiles(dict[str, str]):
     """Paths of the images of a directory, as it is now, by id; for any other id a png that does not exist."""
 
     def __init__(self, directory: Path) -> None:
-        self.directory = str(directory)
-        try:
+        self.directory = directory
+        with suppress(OSError, ValueError):  # missing, too long, or not of the file system's encoding
             images = sorted(path for path in directory.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES)
-        except (OSError, ValueError):  # missing, too long, or not of the file system's encoding
-            images = []
-        super().__init__((path.stem, str(path)) for path in reversed(images))
+            self.update((path.stem, str(path)) for path in reversed(images))
 
     def __missing__(self, image_id: str) -> str:
         return f"{self.directory}{os.sep}{image_id}.png"

@@ -3,17 +3,21 @@
 import hashlib
 import stat
 import threading
-from collections.abc import Iterable
+from collections import OrderedDict
+from collections.abc import Hashable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Generic, TypeVar
 
 import cv2
 import numpy as np
 
-from mkpc_kaggle.data.cache import ByteCache
 from mkpc_kaggle.geometry.coordinates import Pixels, Size
+
+Key = TypeVar("Key", bound=Hashable)
+Value = TypeVar("Value")
 
 # Of the longer side to the shorter. Beyond it an image counts as damaged: its views would be a few pixels high, or
 # would not fit into memory.
@@ -24,7 +28,7 @@ MAX_ASPECT = 32
 class Image:
     """A decoded image: ``pixels`` is (H, W, 3) uint8 RGB; ``name`` is unique in a run.
 
-    ``version`` identifies the content of its file for :func:`is_unchanged`; empty where it has no file.
+    ``version`` is the digest of its file for :func:`is_unchanged`; empty where it has no file.
     """
 
     name: str
@@ -69,8 +73,7 @@ def read_image(path: Path) -> Image | Unreadable:
     """
     name = str(path)
     try:
-        status = path.stat()
-        if not stat.S_ISREG(status.st_mode):  # a pipe or a device may never end
+        if not stat.S_ISREG(path.stat().st_mode):  # a pipe or a device may never end
             return Unreadable(name, "cannot be read: not a regular file")
         data = np.fromfile(path, np.uint8)
         bgr = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
@@ -85,20 +88,16 @@ def read_image(path: Path) -> Image | Unreadable:
     if max(height, width) > MAX_ASPECT * min(height, width):
         return Unreadable(name, f"{width} x {height} pixels: one side is more than {MAX_ASPECT} times the other")
     pixels = np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)
-    return Image(name, pixels, f"{_content_digest(data)} {status.st_ctime_ns}")
+    return Image(name, pixels, _content_digest(data))
 
 
 def is_unchanged(path: Path, version: str) -> bool:
     """Whether a file still has the content that it had when an image of that ``version`` was read from it.
 
-    A file that has not been written to since is not read. A file that cannot be read counts as unchanged.
+    A file that cannot be read counts as unchanged.
     """
-    digest, changed_ns = version.split()
     try:
-        status = path.stat()
-        if not stat.S_ISREG(status.st_mode) or str(status.st_ctime_ns) == changed_ns:
-            return True
-        return _content_digest(np.fromfile(path, np.uint8)) == digest
+        return not path.is_file() or _content_digest(np.fromfile(path, np.uint8)) == version
     except (OSError, ValueError):
         return True
 
@@ -110,6 +109,31 @@ def _content_digest(data: Pixels) -> str:
 def printable(text: str) -> str:
     """``text`` with escapes for characters that UTF-8 cannot encode, which paths may have."""
     return text.encode("utf-8", "backslashreplace").decode()
+
+
+class ByteCache(Generic[Key, Value]):
+    """The most recently used values, ``limit`` bytes at most, shared by threads; a larger value is not kept."""
+
+    def __init__(self, limit: int) -> None:
+        self.limit, self.bytes = limit, 0
+        self._entries: OrderedDict[Key, tuple[Value, int]] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def get(self, key: Key) -> Value | None:
+        with self._lock:
+            if key not in self._entries:
+                return None
+            self._entries.move_to_end(key)
+            return self._entries[key][0]
+
+    def put(self, key: Key, value: Value, size: int) -> None:
+        with self._lock:
+            self.bytes += size - self._entries.pop(key, (value, 0))[1]
+            self._entries[key] = value, size
+            if size > self.limit:
+                self.bytes -= self._entries.pop(key)[1]
+            while self.bytes > self.limit:
+                self.bytes -= self._entries.popitem(last=False)[1][1]
 
 
 class ImageStore:

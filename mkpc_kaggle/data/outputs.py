@@ -1,10 +1,10 @@
 """Files that a command writes: an input is never overwritten, and a file is replaced only by a whole file."""
 
 import os
-import re
 import secrets
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from glob import escape
 from pathlib import Path
 from typing import TextIO
 
@@ -18,46 +18,35 @@ RESULTS = {
     "--out": (".png", ".jpg", ".pdf", ".svg"),
 }
 
-_parts: set[Path] = set()  # files that this process is writing
-
 
 def require_apart(
-    outputs: Mapping[str, Path | None],
-    inputs: Iterable[Path],
-    work_dir: Path | None = None,
-    weights: Iterable[Path] = (),
+    outputs: Mapping[str, Path | None], inputs: Iterable[Path], work_dir: Path | None = None
 ) -> None:
     """Refuse outputs that would overwrite an existing input, or that are in each other's or the journal's way.
 
-    ``outputs`` are files to write, by option; ``inputs`` and ``weights`` are files and directories, ``work_dir``
-    is the journal's. A new file is fine, wherever it is. ``--json`` and ``--report`` overwrite nothing but their
-    own kind. Raises :class:`UserError`.
+    ``outputs`` are files to write, by option; ``inputs`` are files and directories, to which ``$MKPC_WEIGHTS`` is
+    added; ``work_dir`` is the journal's. A new file is fine, wherever it is. ``--json`` and ``--report`` overwrite
+    nothing but their own kind. Raises :class:`UserError`.
     """
-    named = [Path(part) for part in os.environ.get("MKPC_WEIGHTS", "").split(os.pathsep) if part]
-    inputs, weights = list(inputs), [*weights, *named]
+    environment = [Path(part) for part in os.environ.get("MKPC_WEIGHTS", "").split(os.pathsep) if part]
+    inputs = [*inputs, *environment]
     files = {option: path for option, path in outputs.items() if path is not None}
     for option, path in files.items():
         if not path.name or os.path.isdir(path):  # noqa: PTH112  Path raises for a name that is too long
             raise UserError(f"{option} {str(path)!r} is a directory; name a file")
-        for other in (other for other in files if other != option and same_file(path, files[other])):
-            raise UserError(
-                f"{option} {path} and {other} {files[other]} are one file; name another for one of them"
-            )
+        for other, there in files.items():
+            if other != option and same_file(path, there):
+                raise UserError(f"{option} {path} and {other} {there} are one file; name another for one of them")
         if work_dir is not None and (
             lies_in(work_dir, path) or (same_file(path.parent, work_dir) and path.name.startswith("journal."))
         ):
             raise UserError(f"{option} {path} and the work directory {work_dir} are in each other's way")
-        if not os.path.lexists(path):
-            continue
         is_result = path.suffix.lower() in RESULTS.get(option, ())
-        for place in (*inputs, *weights):
+        for place in inputs if os.path.lexists(path) else ():
             if same_file(path, place) or (lies_in(path, place) and not is_result):
                 raise UserError(f"{option} {path} would be written over the input {place}; name another file")
-        if option in ("--json", "--report") and not is_result and path.is_file():
+        if option in ("--json", "--report") and not is_result and os.path.isfile(path):  # noqa: PTH113
             raise UserError(f"{option} {path} exists and is not a {RESULTS[option][0]} file; name another file")
-    for place in inputs:
-        if work_dir is not None and lies_in(work_dir, place):
-            raise UserError(f"--work-dir {work_dir} would be written over the input {place}; name another place")
 
 
 def lies_in(path: Path, directory: Path) -> bool:
@@ -76,17 +65,18 @@ def same_file(path: Path, other: Path) -> bool:
 def replacing(path: Path) -> Iterator[TextIO]:
     """A file to write that takes the place of ``path`` when all of it is on the disk.
 
-    Until then it lies beside ``path`` under a name of its own; such files of dead processes are removed. A device
-    such as ``/dev/stdout`` is written to and not replaced. Raises ``OSError`` where it cannot be written; nothing
-    is left of it then.
+    Until then it lies beside ``path`` under a name of its own; what a killed process has left there is removed. A
+    device such as ``/dev/stdout`` is written to and not replaced. Raises ``OSError`` where it cannot be written;
+    nothing is left of it then.
     """
     if path.is_char_device():
         with path.open("w", encoding="utf-8", newline="") as stream:
             yield stream
         return
-    _remove_abandoned(path)
-    part = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.part")
-    _parts.add(part)
+    for left in path.parent.glob(f".{escape(path.name)}.*.part"):
+        with suppress(OSError):
+            left.unlink()
+    part = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
     try:
         with part.open("x", encoding="utf-8", newline="") as stream:  # "x" follows no link
             yield stream
@@ -95,23 +85,3 @@ def replacing(path: Path) -> Iterator[TextIO]:
         part.replace(path)
     finally:
         part.unlink(missing_ok=True)
-        _parts.discard(part)
-
-
-def _remove_abandoned(path: Path) -> None:
-    name = re.compile(rf"\.{re.escape(path.name)}\.(\d+)-[0-9a-f]{{8}}\.part")
-    for part in path.parent.iterdir():
-        if found := name.fullmatch(part.name):
-            try:
-                os.kill(int(found[1]), 0)
-            except (ProcessLookupError, OverflowError):
-                part.unlink(missing_ok=True)
-            except PermissionError:
-                continue  # another user's process is alive
-
-
-def discard_parts() -> None:
-    """Remove what this process has begun to write and not finished, before it is left at once."""
-    for part in tuple(_parts):
-        with suppress(OSError):
-            part.unlink(missing_ok=True)

@@ -8,11 +8,11 @@ from mkpc_kaggle.recipe import Unit
 
 WINDOW = 64  # how many of the latest measurements count
 MARGIN, MIN_MARGIN = 0.4, 0.01  # of a forecast from one measurement; from n, sqrt(n) times smaller
-STALL = 10.0  # a measurement this many times the upper quartile is a stall, and counts as no more
+STALL_FACTOR = 10.0  # a measurement this many times the upper quartile is a stall, and counts as no more
 
 
 class Measurements:
-    """The latest measurements of one quantity, in seconds: their ``mean``, stalls cut, and 90th percentile."""
+    """The latest measurements of a quantity, in seconds: their ``mean``, stalls cut, and 90th percentile."""
 
     def __init__(self, *seconds: float) -> None:
         self.count = 0
@@ -27,7 +27,7 @@ class Measurements:
         ranked = sorted(self._latest)
         # Encodings are cached, so a unit costs much on some pairs and little on others: a median would forecast
         # too little. Only what no cache explains is cut.
-        stall = STALL * ranked[3 * len(ranked) // 4]
+        stall = STALL_FACTOR * ranked[3 * len(ranked) // 4]
         self.mean = sum(min(value, stall) for value in ranked) / len(ranked) if stall > 0 else ranked[-1]
         self.p90 = ranked[9 * len(ranked) // 10]
 
@@ -39,7 +39,7 @@ class Costs:
     """What units cost on a pair, in seconds.
 
     A worker's first run of a unit is its warm-up, which says nothing of the pairs to come: it counts only as long
-    as there is no other measurement, and in no forecast.
+    as nothing else was measured, and in no forecast.
     """
 
     def __init__(self) -> None:

@@ -22,8 +22,7 @@ from mkpc_kaggle.engine.jobs import (
     SceneResult,
     visiting_order,
 )
-from mkpc_kaggle.engine.journal import Journal
-from mkpc_kaggle.engine.journal_tables import EventKind
+from mkpc_kaggle.engine.journal import EventKind, Journal
 from mkpc_kaggle.engine.places import Place, Site
 from mkpc_kaggle.engine.plan import Explanation, Plan
 from mkpc_kaggle.engine.records import PairRecord, SceneRecord
@@ -66,7 +65,7 @@ class RunReport:
 
 
 class Engine:
-    """One run over ``pairs``.
+    """A run over ``pairs``.
 
     ``publish`` is called with all records, in the order of ``pairs``, when the run starts, every half minute (less
     often where it takes long), and when it ends, in whatever way. Setting ``interrupt`` ends the run early.
@@ -89,12 +88,8 @@ class Engine:
         extra, connecting = extra_pairs_of(pairs, recipe.scene)
         self.asked = len(pairs)
         self.pairs = [*pairs, *extra]
-        self.recipe = recipe
-        self.site = site
-        self.journal = journal
-        self.budget = budget
-        self.publish = publish
-        self.interrupt = interrupt
+        self.recipe, self.site, self.journal, self.budget = recipe, site, journal, budget
+        self.publish, self.interrupt = publish, interrupt
         self.faults: list[str] = []
         self.unwritten = ""
         self._units = {unit.name: unit for unit in recipe.units}
@@ -103,13 +98,13 @@ class Engine:
         self._progress = console.Progress(budget) if progress else None
         self._publishing = threading.Lock()
         self._has_ended = self._has_loaded = False
+        further = range(self.asked + connecting, len(self.pairs))
         self.plan = Plan(
             visiting_order(pairs),
             recipe,
             self._read_records(),
             budget,
-            extra=[self.asked + place for place in visiting_order(extra[:connecting])]
-            + list(range(self.asked + connecting, len(self.pairs))),
+            extra=[*(self.asked + place for place in visiting_order(extra[:connecting])), *further],
             connecting=connecting,
             minibatch=minibatch,
         )
@@ -126,7 +121,7 @@ class Engine:
             self._publish()
             self._loop()
         finally:
-            for place in (*self.site.places, *self._scene_places):
+            for place in self._places:
                 place.kill()
             self.site.close()
             if self._progress is not None:
@@ -150,6 +145,15 @@ class Engine:
         """Of the pairs that were asked for, in their order."""
         return self.plan.records[: self.asked]
 
+    @property
+    def _places(self) -> list[Place]:
+        return [*self.site.places, *self._scene_places]
+
+    @property
+    def _is_closed(self) -> bool:
+        """Whether no worker is started at any place any more."""
+        return bool(self.site.places) and all(place.closed for place in self.site.places)
+
     def save_what_there_is(self) -> str:
         """Write the submission, unless the run has ended; why it cannot be written. For any thread."""
         with self._publishing:
@@ -167,7 +171,7 @@ class Engine:
         if self.plan.has_work(self.budget.clock()) or self.scenes.due(range(len(self.pairs))) is not None:
             self.site.open()
         while not self.interrupt.is_set() and (now := self.budget.clock()) < self.budget.stop_waiting:
-            for place in (*self.site.places, *self._scene_places):
+            for place in self._places:
                 self._take_answer(place, now)
             self._fall_back(now)
             self._hand_out(now)
@@ -177,7 +181,7 @@ class Engine:
                 return
             if now - self._published > max(PUBLISH_INTERVAL_S, self.budget.writing / PUBLISH_SHARE):
                 self._publish()
-            limits = (place.limit for place in (*self.site.places, *self._scene_places))
+            limits = (place.limit for place in self._places)
             self.site.wait(min(self.budget.stop_waiting, *(limit for limit in limits if limit > now), inf))
 
     def _hand_out(self, now: float) -> None:
@@ -188,9 +192,8 @@ class Engine:
                 place.start(now)
             elif place.is_idle and (job := self.plan.next(now, place.name, cautious=place.losses > 0)):
                 pairs = tuple(self.pairs[index] for index in job.indices)
-                known = tuple(() if job.is_trial else self._results(index) for index in job.indices)
-                job = replace(job, pairs=pairs, known=known)
-                place.submit(job, job.seconds, job.time_limit, now)
+                known = tuple(map(self._results, job.indices))
+                place.submit(replace(job, pairs=pairs, known=known), job.seconds, job.time_limit, now)
 
     def _is_matching(self, now: float) -> bool:
         """Whether a job is under way, or will be when a worker has started."""
@@ -224,18 +227,18 @@ class Engine:
 
     def _fall_back(self, now: float) -> None:
         """Go on elsewhere when the last place is closed, or had to give up every unit."""
-        closed = [place.closed for place in self.site.places if place.closed]
-        are_closed = len(closed) == len(self.site.places) > 0
-        if self.site.fallback and (are_closed or self.plan.nothing_runs):
-            reason = "; ".join(closed) if are_closed else "every unit was given up"
-            self._fault(text := f"the work goes on on the {self.site.fallback[0].name}: {reason}")
+        reason = "; ".join(place.closed for place in self.site.places if place.closed)
+        if self.site.fallback and (self._is_closed or self.plan.nothing_runs):
+            why = reason if self._is_closed else Ending.NOTHING_RUNS
+            text = f"the work goes on on the {self.site.fallback[0].name}: {why}"
+            self._fault(text)
             console.warn(text)
             for place in self.site.places:
                 place.kill()
             self.site.places, self.site.fallback = self.site.fallback, []
             self._keep(self.plan.restart(now, text))
-        elif are_closed and not self._has_loaded:
-            raise UserError(f"no worker could be started: {'; '.join(closed)}")
+        elif self._is_closed and not self._has_loaded:
+            raise UserError(f"no worker could be started: {reason}")
 
     # Scenes
 
@@ -327,5 +330,4 @@ class Engine:
             return Ending.NOTHING_RUNS
         if self.plan.is_complete:
             return Ending.COMPLETE
-        are_closed = self.site.places and all(place.closed for place in self.site.places)
-        return Ending.NO_WORKER if are_closed else Ending.TIME_IS_UP
+        return Ending.NO_WORKER if self._is_closed else Ending.TIME_IS_UP

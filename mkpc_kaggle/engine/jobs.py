@@ -1,26 +1,23 @@
 """What crosses between the engine and a worker: two kinds of job, and their answers. Plain values."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from pathlib import Path
-from typing import Protocol
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.records import PairRecord
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.geometry.robust import RobustConfig
 from mkpc_kaggle.pipeline.pair import UnitResult
-from mkpc_kaggle.recipe import Unit
+from mkpc_kaggle.recipe import SceneConfig, Unit
 from mkpc_kaggle.scene.choose import Choice
-from mkpc_kaggle.scene.config import SceneConfig
 from mkpc_kaggle.scene.export import Export
 from mkpc_kaggle.scene.reconstruction import Reconstruction
 from mkpc_kaggle.scene.view_graph import BatchPair
 
 
 class Phase(StrEnum):
-    """The passes of a run, in order."""
+    """The phases of a run, in order."""
 
     SWEEP = "sweep"  # the first unit on all pairs
     CONNECT = "connect"  # the first unit on pairs that no row names, where a batch has few
@@ -35,7 +32,7 @@ class MatchJob:
 
     ``expected`` are the seconds within which each unit most likely ends on a pair. Units may begin in the first
     ``seconds`` of the job if they are expected to end in them. After ``time_limit`` seconds without an answer the
-    worker hangs. ``is_trial``: it is done again to see whether the place works.
+    worker hangs. ``is_retry``: a worker was lost at it before.
     """
 
     phase: Phase
@@ -44,14 +41,9 @@ class MatchJob:
     expected: tuple[float, ...]
     seconds: float
     time_limit: float
-    is_trial: bool = False
+    is_retry: bool = False
     pairs: tuple[Pair, ...] = ()
     known: tuple[tuple[UnitResult, ...], ...] = ()
-
-    @property
-    def images(self) -> Iterator[Path]:
-        """The files that it needs."""
-        return (path for pair in self.pairs for path in pair.images)
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +74,7 @@ class Loaded:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a job made of one pair: its record, and the new results that later jobs may build on."""
+    """What a job made of a pair: its record, and the new results that later jobs may build on."""
 
     record: PairRecord
     results: tuple[UnitResult, ...] = ()
@@ -90,7 +82,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class MatchResult:
-    """The outcomes of a match job, one a pair, in order."""
+    """The outcomes of a match job, in the order of its pairs."""
 
     outcomes: tuple[Outcome, ...]
 
@@ -143,28 +135,7 @@ class Failure:
 Answer = Loaded | MatchResult | SceneResult | Failure
 
 
-class Worker(Protocol):
-    """What does jobs, one at a time, somewhere. No call blocks, whatever became of it.
-
-    After ``start`` it answers once, :class:`Loaded` or :class:`Failure`; after each ``submit`` once more. It is
-    not used again after a failure of its place, nor after ``kill``.
-    """
-
-    def start(self) -> None: ...
-
-    def submit(self, job: Job, seconds: float) -> None:
-        """Hand over a job; units may begin within ``seconds``."""
-        ...
-
-    def answer(self) -> Answer | None:
-        """Its answer, once; ``None`` as long as there is none."""
-        ...
-
-    def kill(self) -> None: ...
-
-
 def visiting_order(pairs: Sequence[Pair]) -> list[int]:
     """Indices of pairs such that views of one image follow each other, and the encoding cache hits."""
-    return sorted(
-        range(len(pairs)), key=lambda index: (pairs[index].group, pairs[index].file0, pairs[index].file1)
-    )
+    keys = [(pair.group, pair.file0, pair.file1) for pair in pairs]
+    return sorted(range(len(pairs)), key=keys.__getitem__)

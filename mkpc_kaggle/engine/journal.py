@@ -1,34 +1,200 @@
-"""The durable record of a run: an SQLite file that only the parent writes, one transaction a job."""
+"""The durable record of a run: an SQLite file that only the parent writes, a transaction for each job.
+
+A value is a JSON text (see :mod:`mkpc_kaggle.engine.codec`). Tables: ``run`` (what the journal belongs to and who
+wrote it), ``sample`` (ids and images of the pairs), ``pair`` (a :class:`PairRecord` for each pair that was
+reached), ``points`` (of a unit on a pair, while a later job may build on them or the report may draw them),
+``scene`` (a :class:`SceneRecord` for each batch), ``event`` (what happened when).
+"""
 
 import json
+import os
 import sqlite3
-from collections.abc import Iterable, Mapping, Sequence
-from contextlib import ExitStack, closing, suppress
+import zlib
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing, contextmanager, suppress
+from dataclasses import dataclass, field
+from enum import StrEnum
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.data.images import is_unchanged
+from mkpc_kaggle.engine.codec import decoder, encode, from_blob, to_blob
 from mkpc_kaggle.engine.jobs import Outcome
-from mkpc_kaggle.engine.journal_tables import (
-    DRAWN,
-    FILE_NAME,
-    FORMAT,
-    LOCK_NAME,
-    SCHEMA,
-    About,
-    Event,
-    JournalTables,
-    encode,
-    to_blob,
-    undamaged,
-)
 from mkpc_kaggle.engine.records import PairRecord, SceneRecord
 from mkpc_kaggle.errors import UserError, writing
+from mkpc_kaggle.pipeline.pair import UnitResult
+from mkpc_kaggle.recipe import Unit
+
+FORMAT = 7
+FILE_NAME = "journal.sqlite"
+LOCK_NAME = "journal.lock"
+MAX_DRAWN_PAIRS = (
+    20  # how many of the weakest pairs keep their points when no later job needs them: the report draws them
+)
+
+SCHEMA = """
+CREATE TABLE run (key TEXT PRIMARY KEY, value TEXT NOT NULL);
+CREATE TABLE sample (key INTEGER PRIMARY KEY, value TEXT NOT NULL);
+CREATE TABLE pair (key INTEGER PRIMARY KEY, value TEXT NOT NULL);
+CREATE TABLE points (pair INTEGER, unit TEXT, points BLOB NOT NULL, PRIMARY KEY (pair, unit));
+CREATE TABLE scene (key TEXT PRIMARY KEY, value TEXT NOT NULL);
+CREATE TABLE event (key INTEGER PRIMARY KEY, value TEXT NOT NULL);
+"""
+SAVE_PAIR = "REPLACE INTO pair VALUES (?, ?)"
+SAVE_POINTS = "REPLACE INTO points VALUES (?, ?, ?)"
+SAVE_SCENE = "REPLACE INTO scene VALUES (?, ?)"
+DROP_POINTS = "DELETE FROM points WHERE pair = ?"
+
+Statement = tuple[str, tuple[Any, ...]]  # and its values
+
+# SQLite's primary result codes that say nothing against a file: no permission, busy, locked, read only, input or
+# output failed, full, cannot be opened.
+UNUSABLE = {3, 5, 6, 8, 10, 13, 14}
+# What reading raises where something stands that no run writes.
+DAMAGE = (
+    *(sqlite3.Error, zlib.error, ValueError, TypeError),
+    *(LookupError, AttributeError, ArithmeticError, RecursionError),
+)
 
 
-class Journal(JournalTables):
+class EventKind(StrEnum):
+    """What is noted during a run."""
+
+    START = "start"  # the program began to work on the run, anew or once more
+    PLAN = "plan"  # a decision, and why
+    JOB = "job"  # a job has ended; the text begins with its phase
+    SCENE = "scene"  # a batch was reconstructed; the text says how much of it
+    FAULT = "fault"
+    END = "end"  # the run ended; the text says how
+
+
+@dataclass(frozen=True)
+class Event:
+    """Something that happened ``seconds`` after the start of the program; ``kind`` is an :class:`EventKind`."""
+
+    kind: str
+    seconds: float
+    text: str
+
+
+@dataclass(frozen=True)
+class About:
+    """Who wrote a journal last: for reports, and compared with nothing."""
+
+    recipe: str = "unnamed"
+    device: str = ""
+    limit: float | None = None  # in seconds; None: there was none
+    left_out: tuple[str, ...] = ()  # which matchers did not run, by cause
+    versions: Mapping[str, str] = field(default_factory=dict)  # of the package and what it stands on
+
+
+@contextmanager
+def undamaged(path: Path, advice: str = "start anew with --fresh") -> Iterator[None]:
+    """Raises :class:`UserError` where what is read of a journal is not what was written, or cannot be read now."""
+    try:
+        yield
+    except DAMAGE as error:
+        if getattr(error, "sqlite_errorcode", sqlite3.SQLITE_ERROR) & 0xFF in UNUSABLE:
+            raise UserError(f"{path} cannot be used: {error}; is another run at work there?") from error
+        raise UserError(f"{path} is damaged ({error}); {advice}") from error
+
+
+class JournalReader:
+    """The journal of a work directory as it is now, unchanged while it is read; a run may be at work on it.
+
+    Raises :class:`UserError` where there is none, none that this version can read, or something is damaged.
+    """
+
+    path: Path
+    _db: sqlite3.Connection
+
+    def __init__(self, directory: Path) -> None:
+        path = directory / FILE_NAME
+        if not path.is_file():
+            raise UserError(f"{directory} has no {FILE_NAME}: name the work directory of a run (NAME.work)")
+        # A directory that cannot be written has no room for SQLite's locks, and needs none.
+        mode = "mode=ro" if os.access(directory, os.W_OK) else "mode=ro&immutable=1"
+        with ExitStack() as opened, undamaged(path):
+            uri = f"{path.resolve().as_uri()}?{mode}"
+            db = opened.enter_context(closing(sqlite3.connect(uri, uri=True, timeout=5.0, isolation_level=None)))
+            db.execute("BEGIN")
+            self.path, self._db = path, db
+            self._header()
+            opened.pop_all()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        self._db.close()
+
+    def records(self) -> dict[int, PairRecord]:
+        """All records by pair index."""
+        return {record.index: record for record in self._read("pair", PairRecord)}
+
+    def scenes(self) -> tuple[SceneRecord, ...]:
+        """What came of each batch that was reconstructed, by name."""
+        return tuple(self._read("scene", SceneRecord))
+
+    def pairs(self) -> tuple[Pair, ...]:
+        """All pairs of the run, in order; of the images the journal knows the names of the files alone."""
+        return tuple(Pair(*names) for names in self._read("sample", tuple[str, str, str, str]))
+
+    def events(self) -> tuple[Event, ...]:
+        """All events of all sessions of the run, in order."""
+        return tuple(self._read("event", Event))
+
+    def about(self) -> About:
+        with undamaged(self.path):
+            about: About = decoder(About)(self._header()["about"])
+            return about
+
+    def belongs_to(self) -> dict[str, Any]:
+        """What the run computes, by name: the recipe's fingerprint, digests of the test set and the weights."""
+        return {key: value for key, value in self._header().items() if key not in ("format", "about")}
+
+    def results(self, record: PairRecord, units: Mapping[str, Unit]) -> tuple[UnitResult, ...]:
+        """What the units of a record found, for a later job to build on; ``units`` by name."""
+        with undamaged(self.path):
+            points = self._points(record.index)
+            return tuple(
+                UnitResult(
+                    units[found.unit],
+                    from_blob(points.get(found.unit)),
+                    found.encode_seconds,
+                    found.match_seconds,
+                    found.failure,
+                )
+                for found in record.units
+            )
+
+    def _points(self, index: int) -> dict[str, bytes]:
+        return dict(self._db.execute("SELECT unit, points FROM points WHERE pair = ?", [index]))
+
+    def _read(self, table: str, kind: Any) -> list[Any]:
+        with undamaged(self.path):
+            decode = decoder(kind)
+            rows = self._db.execute(f"SELECT value FROM {table} ORDER BY key")
+            return [decode(json.loads(value)) for (value,) in rows]
+
+    def _header(self) -> dict[str, Any]:
+        """The table ``run``; raises :class:`UserError` where another version wrote it."""
+        with undamaged(self.path):
+            header = {key: json.loads(value) for key, value in self._db.execute("SELECT key, value FROM run")}
+        if (written := header.get("format")) != FORMAT:
+            raise UserError(
+                f"{self.path} was written by another version of this program (journal format {written}, this "
+                f"version has {FORMAT}). Use that version, or start anew with --fresh or another --work-dir."
+            )
+        return header
+
+
+class Journal(JournalReader):
     """The journal of a work directory, made if it is not there; no other run can open it while this one has it.
 
     ``belongs_to`` says by name what the run computes (recipe, test set, weights). Raises :class:`UserError`
@@ -47,9 +213,7 @@ class Journal(JournalTables):
         fresh: bool = False,
     ) -> None:
         path, lock = directory / FILE_NAME, directory / LOCK_NAME
-        self._unsaved_records: dict[int, str] = {}
-        self._unsaved_points: dict[tuple[int, str], bytes] = {}
-        self._unsaved_drops: set[int] = set()
+        self._unsaved: list[Statement] = []
         self._asked = len(pairs)
         self._drawn: dict[int, int] = {}  # the inliers of the settled pairs that keep their points
         with ExitStack() as opened, writing(f"the work directory {directory}"):  # left open where all is well
@@ -60,7 +224,7 @@ class Journal(JournalTables):
             if fresh:
                 for ending in ("", "-journal", "-wal", "-shm"):
                     path.with_name(FILE_NAME + ending).unlink(missing_ok=True)
-            super().__init__(path, opened.enter_context(closing(connect(path))))
+            self.path, self._db = path, opened.enter_context(closing(connect(path)))
             with undamaged(path):
                 self._claim(belongs_to, pairs, about or About())
             opened.pop_all()
@@ -68,7 +232,7 @@ class Journal(JournalTables):
     def forget_changed(self, pairs: Sequence[Pair]) -> int:
         """Forget the pairs of which an image has not the content any more that was matched; how many these are.
 
-        Where such an image was in a scene, all pairs of its batch are forgotten, and the scene: those that had all
+        Where such an image was in a scene, all pairs of its batch are forgotten, and the scene: pairs that had all
         they wanted have no points any more to reconstruct it from.
         """
         same, batches = cache(is_unchanged), {scene.batch for scene in self.scenes()}
@@ -80,33 +244,37 @@ class Journal(JournalTables):
             changed = {r.index for r in records if not all(map(same, pairs[r.index].images, r.versions))}
             outdated = {pairs[index].group for index in changed} & batches
             forgotten = changed | {index for index, pair in enumerate(pairs) if pair.group in outdated}
-            self._db.executemany("DELETE FROM pair WHERE key = ?", [[index] for index in forgotten])
-            self._db.executemany("DELETE FROM points WHERE pair = ?", [[index] for index in forgotten])
-            self._db.executemany("DELETE FROM scene WHERE key = ?", [[batch] for batch in outdated])
+            for statement, keys in (
+                ("DELETE FROM pair WHERE key = ?", forgotten),
+                (DROP_POINTS, forgotten),
+                ("DELETE FROM scene WHERE key = ?", outdated),
+            ):
+                self._db.executemany(statement, [(key,) for key in keys])
         return len(forgotten)
 
     def save(self, outcomes: Sequence[tuple[Outcome, bool]]) -> None:
         """Put down a job's outcomes, all or none; the points of those marked True no later job needs.
 
-        Of these, the weakest keep them for the report: at most :data:`DRAWN` of one run. An outcome's results
-        may be the new ones alone: what was put down of others stays.
+        Of these, the weakest keep them for the report: at most :data:`MAX_DRAWN_PAIRS` of a run. An outcome may
+        have the new results alone: what was put down of others stays.
         """
-        self._unsaved_records |= {outcome.record.index: encode(outcome.record) for outcome, _ in outcomes}
-        for outcome, settled in outcomes:
-            if settled:
-                self._settle(outcome.record)
-            for result in outcome.results if not settled or outcome.record.index in self._drawn else ():
-                self._unsaved_points[outcome.record.index, result.unit.name] = to_blob(result.matches)
-        self._write()
+        statements: list[Statement] = []
+        for outcome, is_settled in outcomes:
+            index = outcome.record.index
+            statements.append((SAVE_PAIR, (index, encode(outcome.record))))
+            dropped = self._settle(outcome.record) if is_settled else None
+            for result in outcome.results if dropped != index else ():
+                statements.append((SAVE_POINTS, (index, result.unit.name, to_blob(result.matches))))
+            statements.append((DROP_POINTS, (dropped,)))
+        self._write(statements)
 
     def save_scene(
         self, scene: SceneRecord, records: Iterable[PairRecord], settled: Iterable[PairRecord] = ()
     ) -> None:
         """Put down what came of a batch, and its pairs' records; those ``settled`` need no points any more."""
-        self._unsaved_records |= {record.index: encode(record) for record in records}
-        for record in settled:
-            self._settle(record)
-        self._write("REPLACE INTO scene VALUES (?, ?)", [scene.batch, encode(scene)])
+        pairs = [(SAVE_PAIR, (record.index, encode(record))) for record in records]
+        drops = [(DROP_POINTS, (self._settle(record),)) for record in settled]
+        self._write([*pairs, *drops, (SAVE_SCENE, (scene.batch, encode(scene)))])
 
     def note(self, kind: str, seconds: float, text: str) -> None:
         """Put down what happened, ``seconds`` after the start; ``kind`` is an :class:`EventKind`.
@@ -118,40 +286,37 @@ class Journal(JournalTables):
 
     def close(self) -> None:
         with suppress(sqlite3.Error):  # a reader may be at it: then it stays as it is
-            self._db.execute("PRAGMA journal_mode = DELETE")  # one file again, which can be copied
+            self._db.execute("PRAGMA journal_mode = DELETE")  # a single file again, which can be copied
         super().close()
         self._lock.close()
 
     def _points(self, index: int) -> dict[str, bytes]:
-        unsaved = {unit: points for (pair, unit), points in self._unsaved_points.items() if pair == index}
-        return super()._points(index) | unsaved
+        unsaved = (values for statement, values in self._unsaved if statement == SAVE_POINTS)
+        return super()._points(index) | {unit: blob for pair, unit, blob in unsaved if pair == index}
 
-    def _settle(self, record: PairRecord) -> None:
-        """Enter a pair among the weakest so far; the strongest of them gives up its place and its points."""
-        if self._asked and record.index >= self._asked:  # no row names it, so the report does not draw it
-            self._unsaved_drops.add(record.index)
-            return
+    def _settle(self, record: PairRecord) -> int | None:
+        """Enter a pair among the weakest so far; the pair that is not among them any more, perhaps itself."""
+        if self._asked and record.index >= self._asked:
+            return record.index  # no row names it, so the report does not draw it
         self._drawn[record.index] = record.inliers
-        if len(self._drawn) > DRAWN:
-            strongest = max(self._drawn, key=lambda index: (self._drawn[index], index))
-            del self._drawn[strongest]
-            self._unsaved_drops.add(strongest)
+        if len(self._drawn) <= MAX_DRAWN_PAIRS:
+            return None
+        strongest = max(self._drawn, key=lambda index: (self._drawn[index], index))
+        del self._drawn[strongest]
+        return strongest
 
-    def _write(self, statement: str = "", values: Sequence[str] = ()) -> None:
-        """Write what is not saved yet, and execute a statement, in one transaction."""
-        points = [(*key, blob) for key, blob in self._unsaved_points.items() if key[0] not in self._unsaved_drops]
+    def _write(self, statements: Sequence[Statement]) -> None:
+        """Execute what has not been yet, in one transaction."""
+        self._unsaved += statements
         with self._db:
             self._db.execute("BEGIN")
-            self._db.executemany("REPLACE INTO pair VALUES (?, ?)", self._unsaved_records.items())
-            self._db.executemany("REPLACE INTO points VALUES (?, ?, ?)", points)
-            self._db.executemany("DELETE FROM points WHERE pair = ?", [[index] for index in self._unsaved_drops])
-            self._db.execute(statement, values)
-        self._unsaved_records, self._unsaved_points, self._unsaved_drops = {}, {}, set()
+            for statement, values in self._unsaved:
+                self._db.execute(statement, values)
+        self._unsaved.clear()
 
     def _claim(self, belongs_to: Mapping[str, Any], pairs: Sequence[Pair], about: About) -> None:
         """Write down what the journal belongs to, or compare it with what stands there."""
         is_new = self._db.execute("SELECT 1 FROM sqlite_master WHERE name = 'run'").fetchone() is None
-        header = {"format": FORMAT, **belongs_to, "about": about}
         if not is_new:
             stored, wanted = self._header(), json.loads(json.dumps(belongs_to))
             if other := [key for key in wanted if stored.get(key) != wanted[key]]:
@@ -164,13 +329,14 @@ class Journal(JournalTables):
         self._db.execute("PRAGMA synchronous = NORMAL")
         with self._db:
             self._db.execute("BEGIN")
-            for statement in SCHEMA.split(";")[:-1] if is_new else ():
-                self._db.execute(statement)
-            rows = ((key, encode(value)) for key, value in header.items())
-            self._db.executemany("REPLACE INTO run VALUES (?, ?)", rows)
             if is_new:
+                for statement in SCHEMA.split(";")[:-1]:
+                    self._db.execute(statement)
                 names = ((index, encode((p.id, p.group, *p.names))) for index, p in enumerate(pairs))
                 self._db.executemany("INSERT INTO sample VALUES (?, ?)", names)
+            header = {"format": FORMAT, **belongs_to, "about": about}
+            rows = ((key, encode(value)) for key, value in header.items())
+            self._db.executemany("REPLACE INTO run VALUES (?, ?)", rows)
 
 
 def connect(path: Path) -> sqlite3.Connection:

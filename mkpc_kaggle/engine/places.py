@@ -1,4 +1,4 @@
-"""Where workers are: a place has one worker at a time, and is closed when it loses one after the other."""
+"""Where workers are: a place has one worker at a time, and is closed when it loses three in a row."""
 
 import queue
 from collections.abc import Callable
@@ -6,9 +6,8 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from math import inf
-from typing import Protocol
 
-from mkpc_kaggle.engine.jobs import Answer, Cause, Failure, Job, Loaded, Worker
+from mkpc_kaggle.engine.jobs import Answer, Cause, Failure, Job, Loaded, MatchJob
 from mkpc_kaggle.engine.process import ProcessWorker, ThreadWorker
 from mkpc_kaggle.engine.worker import MatchRunner, SceneRunner
 from mkpc_kaggle.pipeline.assembly import Assembly
@@ -27,8 +26,8 @@ class Place:
     """
 
     name: str
-    make: Callable[[], Worker]
-    worker: Worker | None = None
+    make: Callable[[], ThreadWorker]
+    worker: ThreadWorker | None = None
     job: Job | None = None
     is_loaded: bool = False
     losses: int = 0
@@ -87,87 +86,76 @@ class Place:
             worker.kill()
 
     def _lose(self, failure: Failure, now: float) -> None:
-        """The worker ends: what ran out of memory has it in pieces, and a device that failed goes on failing."""
+        """The worker ends: what ran out of memory has it in pieces, and a device that failed goes on failing.
+
+        That it died, or hung, of what another worker was lost at says nothing of the place.
+        """
         job, was_loaded = self.job, self.is_loaded
         self.kill()
         self.job, self.limit = job, now
-        if failure.cause.is_of_place or not was_loaded:
+        is_retry = isinstance(job, MatchJob) and job.is_retry and failure.cause in (Cause.DIED, Cause.TIMED_OUT)
+        if not was_loaded or (failure.cause.is_of_place and not is_retry):
             self.losses += 1
             self.limit = now + RESTART_PAUSE_S * self.losses
             if self.losses >= MAX_LOSSES or failure.cause is Cause.REFUSED:
                 self.closed = f"{self.name}: {failure}"
 
 
-class Site(Protocol):
+class Site:
     """A machine or a cluster: the places of its matching workers, and where batches are reconstructed.
 
-    ``fallback`` are the places where the work goes on when ``places`` are closed.
+    ``fallback`` are the places where the work goes on when ``places`` are closed. Workers call ``ring`` when an
+    answer is there.
     """
-
-    places: list[Place]
-    fallback: list[Place]
-
-    def open(self) -> None:
-        """Make the places known; raises :class:`mkpc_kaggle.errors.UserError` where there can be none."""
-        ...
-
-    @property
-    def scenes_at_once(self) -> int: ...
-
-    def scene_worker(self) -> Worker:
-        """A worker for one batch."""
-        ...
-
-    def wait(self, until: float) -> None:
-        """Until an answer may be there, or an interrupt, or the time ``until`` of the engine's clock."""
-        ...
-
-    def close(self) -> None: ...
-
-
-class LocalSite:
-    """A worker process for each device of the machine, or as many as asked for; 0: a thread of this process."""
 
     scenes_at_once = 1
 
-    def __init__(self, assembly: Assembly, workers: int | None, clock: Callable[[], float]) -> None:
+    def __init__(self, clock: Callable[[], float]) -> None:
+        self.places: list[Place] = []
+        self.fallback: list[Place] = []
         self._clock = clock
         self._bell: queue.SimpleQueue[None] = queue.SimpleQueue()
-        self.fallback: list[Place] = []
+
+    def open(self) -> None:
+        """Make the places known; raises :class:`mkpc_kaggle.errors.UserError` where there can be none."""
+
+    def scene_worker(self) -> ThreadWorker:
+        """A worker for one batch."""
+        return ProcessWorker("scene", SceneRunner, self.ring)
+
+    def ring(self) -> None:
+        self._bell.put(None)
+
+    def wait(self, until: float) -> None:
+        """Until an answer may be there, or an interrupt, or the time ``until`` of the engine's clock."""
+        with suppress(queue.Empty):
+            self._bell.get(timeout=max(0.0, min(LISTEN_S, until - self._clock())))
+
+    def close(self) -> None:
+        """Let go of the site; its workers have been killed."""
+
+
+class LocalSite(Site):
+    """A worker process for each device of the machine, or as many as asked for; 0: a thread of this process."""
+
+    def __init__(self, assembly: Assembly, workers: int | None, clock: Callable[[], float]) -> None:
+        super().__init__(clock)
         if workers == 0:
-            make = partial(MatchRunner, assembly.pipeline)
-            self.places = [Place("this process", partial(ThreadWorker, "matching", make, self._ring))]
+            make = partial(ThreadWorker, "matching", partial(MatchRunner, assembly.pipeline), self.ring)
+            self.places = [Place("this process", make)]
             return
         # On a CPU one process with all threads: two with half of them each do more (recipe light, two cores: the
         # sweep over after 22 s instead of 31), but need twice the memory, and a network's last bits change.
         devices = assembly.devices
         used = [devices[number % len(devices)] for number in range(workers or len(devices))]
         share = len(used) if devices == ("cpu",) else 1
-        self.places = [
-            self._place(
-                name if used.count(name) == 1 else f"{name} {number}", assembly.on(name, used.count(name)), share
-            )
-            for number, name in enumerate(used)
-        ]
+        for number, device in enumerate(used):
+            count = used.count(device)
+            name = device if count == 1 else f"{device} {number}"
+            self.places.append(self._place(name, assembly.on(device, count), share))
         if devices != ("cpu",):
             self.fallback = [self._place("cpu", assembly.on_cpu())]
 
-    def open(self) -> None:
-        """The places are known."""
-
-    def scene_worker(self) -> Worker:
-        return ProcessWorker("scene", SceneRunner, self._ring)
-
-    def wait(self, until: float) -> None:
-        with suppress(queue.Empty):
-            self._bell.get(timeout=max(0.0, min(LISTEN_S, until - self._clock())))
-
-    def close(self) -> None:
-        """Nothing is left open."""
-
     def _place(self, name: str, assembly: Assembly, share: int = 1) -> Place:
         make = partial(MatchRunner, assembly.pipeline)
-        return Place(name, partial(ProcessWorker, f"mkpc {name}", make, self._ring, share))
-
-    def _ring(self) -> None:
-        self._bell.put(None)
+        return Place(name, partial(ProcessWorker, f"mkpc {name}", make, self.ring, share))

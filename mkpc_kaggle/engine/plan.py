@@ -6,7 +6,7 @@ It looks at a job's worth of pairs at a time, so that a hundred thousand pairs c
 from collections import Counter, deque
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import islice, product
+from itertools import islice
 
 from mkpc_kaggle.engine.budget import Budget, format_duration
 from mkpc_kaggle.engine.costs import Costs
@@ -26,8 +26,8 @@ DENSIFY_SHARE = 0.5  # of the time left when all units have run, for further suc
 RESERVE_SHARE = 0.2  # of the limit that is left to reconstruction at most
 MAX_TRIES = 2  # of a unit on a single pair, before it is given up there
 MAX_FAILED_PAIRS = 2  # a unit that was given up on so many pairs and never ran is given up on all
-SLOW = 3.0  # a job that takes this many times what was expected begins no further unit
-HANGS = 10.0  # a unit that takes this many times what it takes on nine of ten pairs hangs
+SLOW_FACTOR = 3.0  # a job that takes this many times what was expected begins no further unit
+HANG_FACTOR = 10.0  # a unit that takes this many times what it takes on nine of ten pairs hangs
 # What the pairs of the last phases are.
 IN_THE_TIME_LEFT = {
     Phase.FILL: "pairs that lack units, the weakest first",
@@ -57,7 +57,7 @@ class Chunk:
 
 
 def chunks_of(phase: Phase, indices: Sequence[int], size: int) -> Iterator[Chunk]:
-    """One pair alone, so that costs are known early, then ``size`` at a time.
+    """The first pair alone, so that costs are known early, then ``size`` at a time.
 
     The same for every run of the same pairs, whatever was done before: a minibatch's composition can move the last
     bits of a network's output.
@@ -67,55 +67,49 @@ def chunks_of(phase: Phase, indices: Sequence[int], size: int) -> Iterator[Chunk
 
 
 class ChunkQueue:
-    """Chunks in the order of their turn: first those that have had one.
+    """Chunks in the order of their turn: first what was tried before.
 
-    A pair's turn comes when no job is under way on it; in a fresh chunk, when it does not wait to be tried again
-    either: that may be for another place.
+    A pair's turn comes when no job is under way on it, and nothing earlier waits for it: what has to be tried
+    again may be for another place, and the order of units decides regions.
     """
 
     def __init__(self) -> None:
         self.under_way: set[int] = set()
         self.fresh: deque[Chunk] = deque()
-        self.again: deque[Chunk] = deque()
+        self.again: list[Chunk] = []
 
-    def put_back(self, chunk: Chunk) -> None:
-        """Give back what is left of a chunk; its turn is after those that were lost."""
-        self.again.insert(0 if chunk.lost_at else sum(bool(other.lost_at) for other in self.again), chunk)
-
-    def retry(self, chunks: Sequence[Chunk]) -> None:
-        """Try these again, before all others: so a unit that kills its worker is given up on few pairs."""
-        self.again.extendleft(reversed(chunks))
+    def put_back(self, *chunks: Chunk) -> None:
+        """Put these first, but for what was lost: so a unit that kills its worker is given up on few pairs."""
+        self.again = sorted([*chunks, *self.again], key=lambda chunk: not chunk.lost_at)
 
     def pop(self, place: str, *, alone: bool, cautious: bool) -> Chunk | None:
-        """The next chunk for a place; not one that was lost there, unless the place is ``alone``.
+        """The next chunk for a place, lost elsewhere if at all, unless the place is ``alone``.
 
-        ``cautious``: one that was not lost, if there is one.
+        ``cautious``: a chunk that was not lost, if there is any.
         """
-        again, earlier = [], set(self.under_way)
-        for chunk in self.again:  # not before what waits of the same pairs: the order of units decides regions
+        free, earlier = [], set(self.under_way)
+        for chunk in (*self.again, *islice(self.fresh, 1)):
             if earlier.isdisjoint(chunk.indices) and (alone or place not in chunk.lost_at):
-                again.append(chunk)
+                free.append(chunk)
             earlier.update(chunk.indices)
-        fresh = [chunk for chunk in islice(self.fresh, 1) if not any(map(self.is_busy, chunk.indices))]
-        turns = [*fresh, *reversed(again)] if cautious else [*again, *fresh]
-        if not turns:
+        if not free:
             return None
-        (self.fresh if turns[0] in fresh else self.again).remove(turns[0])
-        return turns[0]
+        chosen = min(free, key=lambda chunk: bool(chunk.lost_at)) if cautious else free[0]
+        if chosen in self.again:
+            self.again.remove(chosen)
+        else:
+            self.fresh.popleft()
+        return chosen
 
-    def has_retry(self, index: int) -> bool:
+    def waits(self, index: int) -> bool:
         """Whether something has to be tried again on a pair."""
         return any(index in chunk.indices for chunk in self.again)
-
-    def is_busy(self, index: int) -> bool:
-        """Whether a job is under way on a pair, or has to be tried again."""
-        return index in self.under_way or self.has_retry(index)
 
 
 class Plan:
     """The phases of a run over the pairs of ``order`` and, for the scenes alone, of ``extra``, which no row names.
 
-    ``records``, one a pair by index, asked pairs first, change through it. The first ``connecting`` of the extra
+    ``records``, of all pairs by index, asked pairs first, change through it. The first ``connecting`` of the extra
     pairs are for the connect phase. ``workers`` work at a time; ``reserve`` seconds of the end are left to scenes.
     ``done`` are the pairs that have what fits for all; ``unusable`` names the units that no worker can run.
     """
@@ -160,15 +154,14 @@ class Plan:
 
         ``cautious``: the place has just lost a worker, and tries one pair and one unit.
         """
-        if cautious and (trial := self._trial(now)) is not None:
-            return trial
-        while now < self.stop and (chunk := self._pop(place, now, cautious=cautious)) is not None:
+        queue = self._queue
+        while self.has_work(now) and (chunk := queue.pop(place, alone=self.workers < 2, cautious=cautious)):
             units = self._units(chunk, now)
             todo = [index for index in chunk.indices if self.can_gain(index, units)]
             self._mark_done(chunk.phase, set(chunk.indices) - set(todo))
             in_time = tuple(unit for unit in units if self.costs.p90(unit.name) < self.stop - now)
             if todo and not in_time:  # unless scenes need less time than is kept for them
-                self._queue.put_back(replace(chunk, indices=tuple(todo)))
+                queue.put_back(replace(chunk, indices=tuple(todo)))
                 return None
             if todo := [index for index in todo if self.can_gain(index, in_time)]:
                 return self._job(chunk, todo, in_time, now, cautious=cautious)
@@ -180,8 +173,12 @@ class Plan:
         return self.budget.stop_units - min(self.reserve, RESERVE_SHARE * self.budget.time_limit)
 
     def has_work(self, now: float) -> bool:
-        """Whether a pair waits that can gain something; what is under way may come back, too."""
-        while now < self.stop and (chunk := self._peek(now)) is not None:
+        """Whether a pair waits that can gain something; phases in which none does are passed over."""
+        while now < self.stop and (self._queue.fresh or self._coming):
+            if not self._queue.fresh:
+                self._open(self._coming.pop(0), now)
+                continue
+            chunk = self._queue.fresh[0]
             units = self._units(chunk, now)
             if any(self.can_gain(index, units) for index in chunk.indices):
                 return True
@@ -189,18 +186,8 @@ class Plan:
         return now < self.stop and bool(self._queue.again)
 
     def can_gain(self, index: int, units: Iterable[Unit]) -> bool:
-        """Whether a pair may have one of the units that it has not had."""
+        """Whether a pair may get any of the units that it has not had."""
         return index not in self._stuck and bool(self.records[index].lacking(units))
-
-    def _peek(self, now: float) -> Chunk | None:
-        """The next fresh chunk of the present phase, or of those to come."""
-        while not self._queue.fresh and self._coming:
-            self._open(self._coming.pop(0), now)
-        return self._queue.fresh[0] if self._queue.fresh else None
-
-    def _pop(self, place: str, now: float, *, cautious: bool) -> Chunk | None:
-        self._peek(now)
-        return self._queue.pop(place, alone=self.workers < 2, cautious=cautious)
 
     def _job(
         self, chunk: Chunk, todo: list[int], units: tuple[Unit, ...], now: float, *, cautious: bool
@@ -210,47 +197,34 @@ class Plan:
         It is one pair and one unit more where a unit's cost is unknown and cannot be planned, few pairs where it
         gets late, and in the end one unit, since what one job does comes back, or is lost, at once.
         """
-        left = self.stop - now
+        left, costs = self.stop - now, self.costs
         lacking = dict.fromkeys(unit for index in todo for unit in self.records[index].lacking(units))
         chosen = sorted(lacking, key=lambda unit: unit.stage)
-        unknown = [number for number, unit in enumerate(chosen) if not self.costs.is_known(unit.name)]
-        seconds = self.costs.overhead + sum(self.costs.mean(unit.name) for unit in chosen)
-        pair_count = len(todo) if len(todo) * seconds <= JOB_SHARE * left else int(JOB_SHARE * left / seconds)
+        unknown = [number for number, unit in enumerate(chosen) if not costs.is_known(unit.name)]
+        seconds = costs.overhead + sum(costs.mean(unit.name) for unit in chosen)
+        pair_count = (
+            len(todo) if len(todo) * seconds <= JOB_SHARE * left else max(1, int(JOB_SHARE * left / seconds))
+        )
         unit_count = len(chosen) if seconds <= JOB_SHARE * left else 1
         if unknown:
             pair_count, unit_count = 1, min(unit_count, unknown[0] + 1)
         if cautious:
             pair_count = unit_count = 1
-        indices, later = tuple(todo[: max(1, pair_count)]), tuple(todo[max(1, pair_count) :])
+        indices, later = tuple(todo[:pair_count]), tuple(todo[pair_count:])
         chosen, further = chosen[:unit_count], chosen[unit_count:]
         if later:
             self._queue.put_back(replace(chunk, indices=later))
         if further:
             self._queue.put_back(replace(chunk, indices=indices, units=tuple(further)))
-        return self._match(chunk.phase, indices, chosen, left)
-
-    def _trial(self, now: float) -> MatchJob | None:
-        """The first unit on a pair that has had it, where nothing is left but what workers were lost at.
-
-        A place that answers works: it is not closed for the pairs that kill every worker.
-        """
-        is_needed = self._queue.again and self._peek(now) is None and now < self.stop
-        for unit, record in product(self._first, self.records if is_needed else ()):
-            ran = any(found.unit == unit.name and not found.failure for found in record.units)
-            if ran and not self._queue.is_busy(record.index):
-                return replace(self._match(self.phase, (record.index,), [unit], self.stop - now), is_trial=True)
-        return None
-
-    def _match(self, phase: Phase, indices: tuple[int, ...], units: Sequence[Unit], left: float) -> MatchJob:
-        """The job, with its times by what its units cost."""
         self._queue.under_way.update(indices)
-        p90 = tuple(self.costs.p90(unit.name) for unit in units)
-        allowance = SLOW * len(indices) * (self.costs.overhead + sum(p90)) + self.budget.silence
+        p90 = tuple(costs.p90(unit.name) for unit in chosen)
+        allowance = SLOW_FACTOR * len(indices) * (costs.overhead + sum(p90)) + self.budget.silence
         minibatch = min(len(indices), self._minibatch)
-        longest = max(self.costs.longest(unit.name, HANGS * minibatch) for unit in units)
-        if not all(self.costs.is_known(unit.name) for unit in units):
+        longest = max(costs.longest(unit.name, HANG_FACTOR * minibatch) for unit in chosen)
+        if not all(costs.is_known(unit.name) for unit in chosen):
             longest += min(MAX_EXPLORE_S, EXPLORE_SHARE * left)
-        return MatchJob(phase, indices, tuple(units), p90, min(left, allowance), allowance + longest)
+        limits = min(left, allowance), allowance + longest
+        return MatchJob(chunk.phase, indices, tuple(chosen), p90, *limits, is_retry=bool(chunk.lost_at))
 
     def _units(self, chunk: Chunk, now: float) -> tuple[Unit, ...]:
         """The units for a chunk whose turn has come."""
@@ -262,7 +236,7 @@ class Plan:
         return units if chunk.phase is Phase.FILL else self._first
 
     def usable(self, units: Iterable[Unit]) -> tuple[Unit, ...]:
-        """The units but those that were given up on all pairs."""
+        """The units that were not given up on all pairs."""
         return tuple(unit for unit in units if unit.name not in self.unusable)
 
     @property
@@ -298,7 +272,8 @@ class Plan:
         elif phase is Phase.FILL:
             lacking = filter(self.may_gain, self.records[: len(self._order)])
             weakest = sorted(lacking, key=lambda record: (record.inliers, record.index))
-            indices = [record.index for record in weakest if not self._queue.is_busy(record.index)]
+            busy = self._queue.under_way | {index for chunk in self._queue.again for index in chunk.indices}
+            indices = [record.index for record in weakest if record.index not in busy]
         elif phase is Phase.DENSIFY:
             indices = [index for index in self._extra if self.can_gain(index, self._first)]
             indices = indices[: self._pairs_that_fit(DENSIFY_SHARE, len(indices), now)]
@@ -319,8 +294,6 @@ class Plan:
     def on_result(self, job: MatchJob, result: MatchResult, seconds: float, now: float) -> list[Outcome]:
         """Record a job that took so many seconds; what it brought, to be kept."""
         self._queue.under_way.difference_update(job.indices)
-        if job.is_trial:
-            return []
         for found in result.results:
             self.costs.observe(found.unit.name, found.seconds, warm_up=found.warm_up)
         if result.results:
@@ -328,7 +301,7 @@ class Plan:
         kept = [outcome for outcome in result.outcomes if self._merge(outcome, now)]
         rest = tuple(index for index in job.indices if self.can_gain(index, job.units))
         if rest:  # the job's own deadline cut it off
-            self._queue.retry([Chunk(job.phase, rest, job.units)])
+            self._queue.put_back(Chunk(job.phase, rest, job.units))
         self._mark_done(job.phase, set(job.indices) - set(rest))
         return [replace(outcome, record=self.records[outcome.record.index]) for outcome in kept]
 
@@ -339,28 +312,24 @@ class Plan:
         that pair.
         """
         self._queue.under_way.difference_update(job.indices)
-        if job.is_trial:
-            return []
         chunk, half = Chunk(job.phase, job.indices, job.units, (place,)), len(job.indices) // 2
         if half:
-            parts = job.indices[:half], job.indices[half:]
-            self._queue.retry([replace(chunk, indices=part) for part in parts])
+            halves = job.indices[:half], job.indices[half:]
+            self._queue.put_back(*(replace(chunk, indices=part) for part in halves))
             return []
         (index,) = job.indices
-        lacking = self.records[index].lacking(job.units)
-        if len(lacking) > 1:
-            self._queue.retry([replace(chunk, units=(unit,)) for unit in lacking])
+        unit, *others = self.records[index].lacking(job.units)
+        if others:
+            self._queue.put_back(*(replace(chunk, units=(each,)) for each in (unit, *others)))
             return []
-        (unit,) = lacking
         if failure.cause is Cause.TIMED_OUT:
             self.costs.assume(unit.name, job.time_limit)
         self._tries[index, unit.name] += 1
         if self._tries[index, unit.name] < MAX_TRIES:
-            self._queue.retry([chunk])
+            self._queue.put_back(chunk)
             return []
-        outcome = self._give_up(index, unit, failure, now)
         self._mark_done(job.phase, [index])
-        return [outcome]
+        return [self._give_up(index, unit, failure, now)]
 
     def restart(self, now: float, reason: str) -> list[Outcome]:
         """Begin anew on other devices: no unit is given up, and pairs keep what they have; what has changed."""
@@ -380,7 +349,7 @@ class Plan:
             if former.units:
                 self.explain(now, f"pair {record.index} keeps the F it has: {record.failure}")
         if len(record.units) <= len(former.units) and (former.reached or not record.reached):
-            if outcome.results:  # what was found before cannot be read, and a worse F is no gain
+            if outcome.results:  # what was found before cannot be read, and a worse F gains nothing
                 self._stuck.add(record.index)
             return False
         self._put(record.after(former))
@@ -400,8 +369,8 @@ class Plan:
         return Outcome(self.records[index], (UnitResult(unit, Matches.empty(), failure=reason),))
 
     def _mark_done(self, phase: Phase, indices: Iterable[int]) -> None:
-        """The turn of these pairs is over in a phase, but for those that are to be tried again."""
-        over = {index for index in indices if not self._queue.has_retry(index)}
+        """The turn of these pairs is over in a phase, unless they are to be tried again."""
+        over = {index for index in indices if not self._queue.waits(index)}
         if phase is self.phase:
             self._left -= over
         if phase not in (Phase.SWEEP, Phase.CONNECT):
@@ -422,13 +391,13 @@ class Plan:
         return [] if is_over else record.lacking(self._first)
 
     def may_gain(self, record: PairRecord) -> bool:
-        """Whether a pair can get units that it wants; one with a row only after it got its first."""
+        """Whether a pair can get units that it wants; a pair with a row only after it got its first."""
         is_ready = record.units or record.index >= len(self._order)
         return bool(is_ready and record.index not in self._stuck and self.wanted(record))
 
     @property
     def is_complete(self) -> bool:
-        """Whether every pair has been reached and nothing is wanted for those that can be worked on."""
+        """Whether every pair has been reached, and none can gain what it wants."""
         return all(record.reached and not self.may_gain(record) for record in self.records[: len(self._order)])
 
     @property

@@ -1,8 +1,8 @@
 """Workers on this machine: in a thread of the engine's own process, or in processes of their own.
 
-The engine calls start, submit, answer and kill, none of which blocks: a thread for each worker does the blocking
-calls. No lock is shared with a process, nothing large goes through its start-up pipe, and its end of the other
-pipe is closed here. So it may die, be stopped or be killed at any moment: a write to it, or a read, ends with it.
+No call of the engine blocks: a thread for each worker does the blocking calls. No lock is shared with a process,
+nothing large goes through its start-up pipe, and its end of the other pipe is closed here. So it may die, be
+stopped or be killed at any moment: a write to it, or a read, ends with it.
 
 pebble, which keeps pools of processes, was tried and not taken: it times jobs by the wall clock, which may jump,
 and its workers share one pipe and its lock, so that a worker killed in the middle of an answer blocks all of them.
@@ -15,13 +15,13 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
 
-from mkpc_kaggle.engine.jobs import Answer, Cause, Failure, Job
-from mkpc_kaggle.engine.worker import Runner, failure_of, load, run
+from mkpc_kaggle.engine.jobs import Answer, Cause, Failure, Job, Loaded
+from mkpc_kaggle.engine.worker import Executor, Runner, failure_of, use_threads
 
 # For PyTorch, which reads them once. Threads of OpenMP that wait for each other sleep; by default they spin, and
 # keep the cores from decoding, MAGSAC and other processes (python -m benchmarks.threads). Tensors of 2 MiB and
@@ -29,11 +29,13 @@ from mkpc_kaggle.engine.worker import Runner, failure_of, load, run
 WORKER_ENVIRONMENT = {"OMP_WAIT_POLICY": "PASSIVE", "GOMP_SPINCOUNT": "0", "THP_MEM_ALLOC_ENABLE": "1"}
 EXIT_TIMEOUT_S = 5.0  # a process's pipe closes before the process has ended
 
-Message = Callable[[], Runner] | tuple[Job, float]
-
 
 class ThreadWorker:
-    """Works in a thread of this process, for a user's own matchers and tests.
+    """Does jobs, one at a time, in a thread of this process. No call blocks, whatever became of it.
+
+    After ``start`` it answers once, :class:`Loaded` or :class:`Failure`; after each ``submit`` once more.
+    ``on_answer`` is called in its thread when an answer is there. It is not used again after a failure of its
+    place, nor after ``kill``.
 
     A matcher that never returns cannot be stopped here, nor one that brings the process down, and a device that
     failed does not come back: that takes processes.
@@ -43,6 +45,7 @@ class ThreadWorker:
         self.name = name
         self._make = make
         self._on_answer = on_answer
+        self._executor = Executor()
         self._orders: queue.SimpleQueue[tuple[Job, float] | None] = queue.SimpleQueue()
         self._answers: queue.SimpleQueue[Answer] = queue.SimpleQueue()
         self._killed = False
@@ -52,13 +55,14 @@ class ThreadWorker:
         self._thread.start()
 
     def submit(self, job: Job, seconds: float) -> None:
+        """Hand over a job; units may begin within ``seconds``."""
         self._orders.put((job, time.monotonic() + seconds))
 
     def answer(self) -> Answer | None:
-        try:
+        """Its answer, once; ``None`` as long as there is none."""
+        with suppress(queue.Empty):
             return self._answers.get_nowait()
-        except queue.Empty:
-            return None
+        return None
 
     def kill(self) -> None:
         self._killed = True
@@ -69,25 +73,21 @@ class ThreadWorker:
             answer = self._load()
         except Exception as error:  # no memory, or no process more
             answer = Failure(Cause.NOT_STARTED, str(error))
-        self._put(answer)
-        while not isinstance(answer, Failure) or not answer.cause.is_of_place:
+        while True:
+            self._answers.put(answer)
+            self._on_answer()
+            if isinstance(answer, Failure) and answer.cause.is_of_place:
+                return
             order = self._orders.get()
             if order is None or self._killed:
                 return
             answer = self._run(order[0], order[1] - time.monotonic())
-            self._put(answer)
 
     def _load(self) -> Answer:
-        self._runner, answer = load(self._make)
-        return answer
+        return self._executor.load(self._make)
 
     def _run(self, job: Job, seconds: float) -> Answer:
-        assert self._runner is not None, "only a worker that has loaded gets jobs"
-        return run(self._runner, job, seconds)
-
-    def _put(self, answer: Answer) -> None:
-        self._answers.put(answer)
-        self._on_answer()
+        return self._executor.run(job, seconds)
 
 
 class ProcessWorker(ThreadWorker):
@@ -105,43 +105,40 @@ class ProcessWorker(ThreadWorker):
 
     def kill(self) -> None:
         super().kill()
-        self._end()
+        if self._process is not None:
+            self._process.kill()
 
     def _load(self) -> Answer:
         context = multiprocessing.get_context("spawn")
         self._pipe, its_pipe = context.Pipe()
         process = context.Process(target=serve, args=(its_pipe, self._share), name=self.name, daemon=True)
         try:
-            with worker_environment(), signals_blocked():
+            with worker_environment():
                 process.start()
         finally:
             its_pipe.close()
         self._process = process
         if self._killed:  # before there was a process to kill
-            self._end()
-        return self._exchange(self._make)
+            process.kill()
+        return self._exchange(process, self._make)
 
     def _run(self, job: Job, seconds: float) -> Answer:
-        return self._exchange((job, seconds))
+        assert self._process is not None, "only a worker that has loaded gets jobs"
+        return self._exchange(self._process, (job, seconds))
 
-    def _exchange(self, message: Message) -> Answer:
+    def _exchange(self, process: SpawnProcess, message: Callable[[], Runner] | tuple[Job, float]) -> Answer:
         """The answer to a message, or what became of the process."""
-        assert self._process is not None
         try:
             self._pipe.send(message)
             answer: Answer = self._pipe.recv()
         except (EOFError, OSError):
-            self._process.join(timeout=EXIT_TIMEOUT_S)
+            process.join(timeout=EXIT_TIMEOUT_S)
             self._pipe.close()
-            return Failure(Cause.DIED, how_it_ended(self._process))
+            return Failure(Cause.DIED, how_it_ended(process))
         except Exception as error:  # what cannot be pickled
-            self._end()
+            process.kill()
             return failure_of(error)
         return answer
-
-    def _end(self) -> None:
-        if self._process is not None:
-            self._process.kill()
 
 
 def how_it_ended(process: SpawnProcess) -> str:
@@ -150,60 +147,45 @@ def how_it_ended(process: SpawnProcess) -> str:
     return f"signal {signal.Signals(-code).name}" if code is not None and code < 0 else f"exit status {code}"
 
 
-@contextmanager
-def signals_blocked() -> Iterator[None]:
-    """A process started meanwhile hears neither Ctrl-C, which a terminal sends to all, nor SIGTERM: its parent
-    answers to them, and ends it.
-    """
-    if not hasattr(signal, "pthread_sigmask"):  # Windows
-        yield
-        return
-    resource_tracker.ensure_running()  # started with the first process, it would unblock them
-    former = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, former)
-
-
 _environment = threading.Lock()
 
 
 @contextmanager
 def worker_environment() -> Iterator[None]:
     """A process started meanwhile has :data:`WORKER_ENVIRONMENT`, but for what the user has set; this one has not
-    (its own OpenMP library is loaded already).
+    (its own OpenMP library is loaded already). It hears neither Ctrl-C, which a terminal sends to all, nor
+    SIGTERM: its parent answers to them, and ends it.
     """
-    with _environment:
+    resource_tracker.ensure_running()  # started with the first process, it would unblock them
+    with _environment, ExitStack() as restored:
         ours = {name: value for name, value in WORKER_ENVIRONMENT.items() if name not in os.environ}
         os.environ.update(ours)
-        try:
-            yield
-        finally:
-            for name in ours:
-                del os.environ[name]
+        for name in ours:
+            restored.callback(os.environ.pop, name)
+        if hasattr(signal, "pthread_sigmask"):  # not on Windows
+            former = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
+            restored.callback(signal.pthread_sigmask, signal.SIG_SETMASK, former)
+        yield
 
 
 def serve(pipe: Connection, share: int) -> None:
     """The life of a worker process: what to make, then job after job."""
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-    with suppress(EOFError, OSError):  # the parent is gone
-        runner, answer = load(_receive_maker(pipe, share))
-        pipe.send(answer)
-        while runner is not None:
-            job, seconds = pipe.recv()
-            pipe.send(run(runner, job, seconds))
-
-
-def _receive_maker(pipe: Connection, share: int) -> Callable[[], Runner]:
-    """Makes the runner that the parent asks for; what cannot be unpickled raises when it is made."""
 
     def make() -> Runner:
-        maker: Callable[[], Runner] = pipe.recv()
-        _take_share(share)
+        maker: Callable[[], Runner] = pipe.recv()  # what cannot be unpickled is an answer, too
+        if share > 1:
+            import torch
+
+            use_threads(max(1, torch.get_num_threads() // share))
         return maker()
 
-    return make
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    executor = Executor()
+    with suppress(EOFError, OSError):  # the parent is gone
+        answer = executor.load(make)
+        pipe.send(answer)
+        while isinstance(answer, Loaded):
+            pipe.send(executor.run(*pipe.recv()))
 
 
 def _end_with_parent() -> None:
@@ -212,13 +194,3 @@ def _end_with_parent() -> None:
     if parent is not None:
         parent.join()
         os._exit(1)
-
-
-def _take_share(share: int) -> None:
-    """Use a part of the cores, where other processes use the rest."""
-    if share > 1:
-        import cv2
-        import torch
-
-        torch.set_num_threads(max(1, torch.get_num_threads() // share))
-        cv2.setNumThreads(max(1, cv2.getNumThreads() // share))

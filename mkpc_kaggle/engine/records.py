@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL, Matrix3
-from mkpc_kaggle.pipeline.pair import PairMatch, Regions
+from mkpc_kaggle.pipeline.pair import PairMatch, Regions, UnitResult
 from mkpc_kaggle.recipe import Unit
 from mkpc_kaggle.scene.choose import Choice
-from mkpc_kaggle.scene.reconstruction import Reconstruction
+from mkpc_kaggle.scene.reconstruction import Reconstruction, RegisteredImage
 
 NOT_REACHED = "not reached in time"
 Point = tuple[float, float, float]
@@ -22,7 +22,7 @@ MAX_DRAWN_POINTS = 300  # of a scene, which are kept to be drawn
 
 @dataclass(frozen=True)
 class UnitRecord:
-    """What one unit found on one pair: counts of matches and of inliers among them, and seconds."""
+    """What a unit found on a pair: counts of matches and of inliers among them, and seconds."""
 
     unit: str
     stage: int
@@ -32,16 +32,21 @@ class UnitRecord:
     match_seconds: float
     failure: str
 
+    @classmethod
+    def of(cls, found: UnitResult, inliers: NDArray[np.bool_]) -> "UnitRecord":
+        """``inliers`` is a mask over the matches that were found."""
+        unit, counts = found.unit, (len(found.matches), int(inliers.sum()))
+        return cls(unit.name, unit.stage, *counts, found.encode_seconds, found.match_seconds, found.failure)
+
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PairRecord:
-    """What is known of one pair: its F (its E, where the pair has intrinsics) and how it came about.
+    """What is known of a pair: its F (its E, where the pair has intrinsics) and how it came about.
 
     ``pair_fundamental`` is from the pair's own matches, and the fallback where ``failure`` says why there is none;
     ``magsac_fundamental`` is MAGSAC's alone, where the former comes from more than that. The seconds are those of
     all jobs on the pair. ``scene`` is what its batch's reconstruction says of it, ``None`` if there was none.
-    ``sizes`` and ``versions`` are of
-    the two images that were matched; a version tells the content of a file.
+    ``sizes`` and ``versions`` are of the two images that were matched; a version tells the content of a file.
     """
 
     index: int
@@ -65,19 +70,8 @@ class PairRecord:
     def of(cls, index: int, match: PairMatch) -> "PairRecord":
         """The record of an estimated pair."""
         ends = np.cumsum([len(result.matches) for result in match.results])
-        inliers = np.split(match.estimate.inliers, ends[:-1])
-        units = tuple(
-            UnitRecord(
-                result.unit.name,
-                result.unit.stage,
-                len(result.matches),
-                int(mask.sum()),
-                result.encode_seconds,
-                result.match_seconds,
-                result.failure,
-            )
-            for result, mask in zip(match.results, inliers, strict=True)
-        )
+        masks = np.split(match.estimate.inliers, ends[:-1])
+        units = tuple(UnitRecord.of(*found) for found in zip(match.results, masks, strict=True))
         return cls(
             index,
             match.estimate.matrix,
@@ -94,14 +88,9 @@ class PairRecord:
 
     def after(self, former: "PairRecord") -> "PairRecord":
         """The record of a later job on a pair: with the seconds of the ``former`` ones, and their regions."""
-        return replace(
-            self,
-            regions=self.regions or former.regions,
-            decode_seconds=former.decode_seconds + self.decode_seconds,
-            cluster_seconds=former.cluster_seconds + self.cluster_seconds,
-            estimate_seconds=former.estimate_seconds + self.estimate_seconds,
-            scene=former.scene,
-        )
+        parts = ("decode_seconds", "cluster_seconds", "estimate_seconds")
+        seconds = {part: getattr(former, part) + getattr(self, part) for part in parts}
+        return replace(self, regions=self.regions or former.regions, scene=former.scene, **seconds)
 
     def without_given_up(self) -> "PairRecord":
         """The record without the units that were given up: they may be tried again."""
@@ -111,20 +100,16 @@ class PairRecord:
         return replace(self, units=units) if units else PairRecord.untouched(self.index)
 
     @property
-    def scene_fundamental(self) -> Matrix3 | None:
-        return None if self.scene is None else self.scene.F
-
-    @property
     def chosen_fundamental(self) -> Matrix3:
         """The F that is written: what its batch's reconstruction gives the pair, else its own."""
-        return self.pair_fundamental if self.scene_fundamental is None else self.scene_fundamental
+        return self.pair_fundamental if self.scene is None or self.scene.F is None else self.scene.F
 
     @property
     def source(self) -> str:
         """Where :attr:`chosen_fundamental` comes from: "scene", "pair" or "fallback"."""
-        if self.scene is not None and self.scene.F is not None:
-            return "scene" if self.scene.from_scene else "pair"
-        return "fallback" if self.failure else "pair"
+        if self.scene is None or self.scene.F is None:
+            return "fallback" if self.failure else "pair"
+        return "scene" if self.scene.from_scene else "pair"
 
     @property
     def reached(self) -> bool:
@@ -180,6 +165,12 @@ class CameraRecord:
         R = np.stack([np.cross(down, forward), down, forward])
         return Camera(K, R, -R @ np.array(self.centre))
 
+    @classmethod
+    def of(cls, found: RegisteredImage, model: int) -> "CameraRecord":
+        R, t = found.camera.R, found.camera.t
+        centre, forward, down = (tuple(vector.tolist()) for vector in (-R.T @ t, R[2], R[1]))
+        return cls(found.image.name, model, centre, forward, down, found.focal, found.image.size, found.points)
+
 
 @dataclass(frozen=True)
 class SceneRecord:
@@ -202,46 +193,25 @@ class SceneRecord:
 
     @classmethod
     def of(
-        cls,
-        batch: str,
-        reconstructions: Sequence[Reconstruction],
-        made_from: int,
-        seconds: float,
-        failure: str = "",
+        cls, batch: str, found: Sequence[Reconstruction], made_from: int, seconds: float, failure: str = ""
     ) -> "SceneRecord":
-        found = (model for reconstruction in reconstructions for model in reconstruction.models)
-        models = sorted(found, key=lambda model: -len(model.images))
-        cameras = tuple(
-            CameraRecord(
-                found.image.name,
-                number,
-                tuple((-found.camera.R.T @ found.camera.t).tolist()),
-                tuple(found.camera.R[2].tolist()),
-                tuple(found.camera.R[1].tolist()),
-                found.focal,
-                found.image.size,
-                found.points,
-            )
-            for number, model in enumerate(models)
-            for found in model.images
-        )
-        reasons = [each.failure for each in reconstructions if each.failure and not models]
+        models = sorted((model for each in found for model in each.models), key=lambda model: -len(model.images))
+        cameras = tuple(CameraRecord.of(image, n) for n, model in enumerate(models) for image in model.images)
+        reasons = dict.fromkeys(each.failure for each in found if each.failure and not models)
         return cls(
             batch,
-            sum(len(each.names) for each in reconstructions),
-            sum(each.registered for each in reconstructions),
+            sum(len(each.names) for each in found),
+            sum(each.registered for each in found),
             len(models),
             sum(len(model.points) for model in models),
             made_from,
             seconds,
-            failure or "; ".join(dict.fromkeys(reasons)) or ("" if models else "no matches connect its images"),
+            failure or "; ".join(reasons) or ("" if models else "no matches connect its images"),
             cameras,
-            tuple(tuple(map(tuple, evenly(each.points, MAX_DRAWN_POINTS).round(4).tolist())) for each in models),
+            tuple(_evenly(model.points) for model in models),
         )
 
 
-def evenly(points: NDArray[np.float64], count: int) -> NDArray[np.float64]:
-    """At most that many of the rows, evenly chosen."""
-    places = np.linspace(0, len(points) - 1, min(count, len(points))).round().astype(int)
-    chosen: NDArray[np.float64] = points[places]
-    return chosen
+def _evenly(points: NDArray[np.float64]) -> tuple[Point, ...]:
+    chosen = np.linspace(0, len(points) - 1, min(MAX_DRAWN_POINTS, len(points))).round().astype(int)
+    return tuple((x, y, z) for x, y, z in points[chosen].round(4).tolist())

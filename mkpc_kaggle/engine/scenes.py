@@ -16,8 +16,7 @@ from mkpc_kaggle.engine.jobs import SceneJob
 from mkpc_kaggle.engine.records import PairRecord, SceneRecord
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.pipeline.pair import UnitResult
-from mkpc_kaggle.recipe import Recipe
-from mkpc_kaggle.scene.config import SceneConfig
+from mkpc_kaggle.recipe import Recipe, SceneConfig
 from mkpc_kaggle.scene.densify import extra_pairs
 from mkpc_kaggle.scene.export import Export
 from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair, tracks_of
@@ -28,7 +27,7 @@ DENSIFY_PAIRS_PER_IMAGE = 15.0  # of a batch, once all units have run: above, pa
 START_S = 3.0  # that a process takes to begin
 PAIR_S = 0.2  # that a pair adds to a reconstruction, as long as nothing is known
 FORECAST_MARGIN = 1.5  # a reconstruction may take this many times what its pairs took in earlier ones
-HANGS = 10.0  # one that takes this many times its forecast hangs
+HANG_FACTOR = 10.0  # a reconstruction that takes this many times its forecast hangs
 
 
 def batches_of(pairs: Iterable[Pair]) -> dict[str, list[int]]:
@@ -99,7 +98,7 @@ class Scenes:
         """A batch to reconstruct now: its matches have changed since it was, and all of its pairs are ``done``.
 
         For the first time it is while some of them get further matches (``filling``), for the second afterwards:
-        first those that were never reconstructed.
+        first batches that were never reconstructed.
         """
         waiting = [name for name in self.batches if name in self._outdated and name not in self._running]
         for name in sorted(waiting, key=self.made.__contains__):
@@ -145,7 +144,7 @@ class Scenes:
 
     def time_limit(self, batch: str, silence: float) -> float:
         """Seconds after which a reconstruction hangs, with what :attr:`Budget.silence` allows."""
-        return silence + HANGS * self._forecast(batch)
+        return silence + HANG_FACTOR * self._forecast(batch)
 
     def reserve(self, at_once: int) -> float:
         """The seconds that what is left to reconstruct will most likely take, ``at_once`` at a time."""

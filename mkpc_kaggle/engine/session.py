@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from importlib import metadata
 from math import isfinite
 from pathlib import Path
-from types import FrameType, TracebackType
+from types import FrameType
 from typing import Self
 
 import cv2
@@ -22,13 +22,12 @@ from mkpc_kaggle import __version__
 from mkpc_kaggle.data.competition import Pair, write_submission
 from mkpc_kaggle.engine import console
 from mkpc_kaggle.engine.budget import Budget
-from mkpc_kaggle.engine.cluster import RayCluster, ray_site
+from mkpc_kaggle.engine.cluster import RayCluster, RaySite
 from mkpc_kaggle.engine.engine import Engine, RunReport
-from mkpc_kaggle.engine.journal import Journal
-from mkpc_kaggle.engine.journal_tables import About, EventKind
+from mkpc_kaggle.engine.journal import About, EventKind, Journal
 from mkpc_kaggle.engine.places import LISTEN_S, LocalSite, Site
 from mkpc_kaggle.engine.records import PairRecord
-from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.errors import UserError, writing
 from mkpc_kaggle.pipeline.assembly import Assembly
 from mkpc_kaggle.scene.export import Export
 
@@ -46,9 +45,9 @@ class Interrupt(threading.Event):
 class Session:
     """What a run needs besides its pairs and its recipe.
 
-    ``workers`` is the number of worker processes, or the cluster to work on; 0: none, the work is done in this
-    one; ``None``: one a device. ``watchdog`` is told how to write the submission in the end. ``exports`` says of
-    which batches COLMAP's files are written.
+    ``workers`` is the number of worker processes, or the cluster to work on; 0: the work is done in this process;
+    ``None``: a process for each device. ``watchdog`` is told how to write the submission in the end.
+    ``exports``: of which batches COLMAP's files are written.
     """
 
     work_dir: Path
@@ -66,7 +65,7 @@ class Session:
 
 
 def submit(pairs: Sequence[Pair], assembly: Assembly, session: Session, output: Path) -> RunReport:
-    """Match all pairs and keep ``output`` whole from the start: one row a pair, the fallback where no F is known.
+    """Match all pairs and keep ``output`` whole from the start: each pair has a row, of the fallback if need be.
 
     Raises :class:`mkpc_kaggle.errors.UserError` where ``output`` cannot be written, before any work.
     """
@@ -80,14 +79,14 @@ def submit(pairs: Sequence[Pair], assembly: Assembly, session: Session, output: 
 
 
 def require_writable(output: Path) -> None:
-    """Make the file's directory if need be; :class:`UserError` where the file cannot be written."""
+    """Make the file's directory if need be; :class:`UserError` where the file cannot be written, or replaced."""
+    if output.is_char_device() or output.is_block_device():
+        raise UserError(f"--output {output} is a device; name a file")
     probe = output.with_name(f".{output.name}.probe")
-    try:
+    with writing(f"--output {output}"):
         output.parent.mkdir(parents=True, exist_ok=True)
         probe.touch()
         probe.unlink()
-    except OSError as error:
-        raise UserError(f"--output {output} cannot be written: {error.strerror}") from error
 
 
 def run_pairs(
@@ -102,15 +101,17 @@ def run_pairs(
     matcher cannot be loaded.
     """
     belongs_to = {"test set": digest_of_pairs(pairs), **assembly.fingerprint()}
-    about = about_run(assembly, session.budget)
+    budget, recipe = session.budget, assembly.recipe
+    limit = budget.time_limit if isfinite(budget.time_limit) else None
+    about = About(recipe.name, str(assembly.placement), limit, assembly.left_out, versions())
     with Journal(session.work_dir, belongs_to, pairs=pairs, about=about, fresh=session.fresh) as journal:
-        journal.note(EventKind.START, session.budget.spent(), "")
+        journal.note(EventKind.START, budget.spent(), "")
         engine = Engine(
             pairs,
-            assembly.recipe,
+            recipe,
             site_of(pairs, assembly, session),
             journal,
-            session.budget,
+            budget,
             publish=publish,
             interrupt=session.interrupt,
             progress=session.progress,
@@ -127,20 +128,9 @@ def run_pairs(
 def site_of(pairs: Sequence[Pair], assembly: Assembly, session: Session) -> Site:
     """Where the workers are that the session asks for."""
     if isinstance(session.workers, RayCluster):
-        folders = tuple(dict.fromkeys(path.parent for pair in pairs for path in pair.images))
-        return ray_site(assembly, session.workers, session.budget.clock, folders)
+        folders = dict.fromkeys(path.parent for pair in pairs for path in pair.images)
+        return RaySite(assembly, session.workers, session.budget.clock, folders)
     return LocalSite(assembly, session.workers, session.budget.clock)
-
-
-def about_run(assembly: Assembly, budget: Budget) -> About:
-    """What a report says of a run, besides what its journal is compared with."""
-    return About(
-        assembly.recipe.name,
-        str(assembly.placement),
-        budget.time_limit if isfinite(budget.time_limit) else None,
-        assembly.left_out,
-        versions(),
-    )
 
 
 def versions() -> dict[str, str]:
@@ -156,7 +146,7 @@ def versions() -> dict[str, str]:
 
 
 def digest_of_pairs(pairs: Sequence[Pair]) -> str:
-    """Tells one test set from another: the keys of its pairs with the ids of their images, in order."""
+    """Tells test sets apart: the keys of its pairs with the ids of their images, in order."""
     ids = ((pair.key, pair.group, *(name.rpartition(".")[0] for name in pair.names)) for pair in pairs)
     rows = map("\t".join, ids)
     return hashlib.sha256("\n".join(rows).encode()).hexdigest()
@@ -173,9 +163,8 @@ class Watchdog:
     """
 
     def __init__(self, budget: Budget, interrupt: Interrupt) -> None:
-        self.save: Callable[[], str] = lambda: (
-            "the time was up before a first version of the submission was written"
-        )
+        too_late = "the time was up before a first version of the submission was written"
+        self.save: Callable[[], str] = lambda: too_late
         self.status = 0
         self._budget = budget
         self._interrupt = interrupt
@@ -186,9 +175,7 @@ class Watchdog:
             threading.Thread(target=self._watch, name="watchdog", daemon=True).start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._over.set()
 
     def _watch(self) -> None:
@@ -208,7 +195,7 @@ class Watchdog:
 
 @contextmanager
 def interruptible() -> Iterator[Interrupt]:
-    """SIGTERM and Ctrl-C set the interrupt; a second one acts as if nobody listened."""
+    """SIGTERM and Ctrl-C set the interrupt; a second signal acts as if nobody listened."""
     interrupt = Interrupt()
     former = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
 

@@ -37,33 +37,31 @@ CAUSES = {
 
 
 class Runner(Protocol):
-    """Does jobs of one kind. Both calls may raise anything, never return, or end the process."""
-
-    def load(self) -> None: ...
+    """Does jobs of one kind. It may raise anything, never return, or end the process."""
 
     def run(self, job: Job, seconds: float) -> Answer: ...
 
 
-def load(make: Callable[[], Runner]) -> tuple[Runner | None, Answer]:
-    """The runner that ``make`` makes, ready for jobs, or why there is none. Never raises."""
-    try:
-        runner = make()
-        runner.load()
-    except failures.DeviceError as error:
-        return None, Failure(Cause.DEVICE, str(error))
-    except UserError as error:
-        return None, Failure(Cause.REFUSED, str(error))
-    except Exception as error:
-        return None, failure_of(error)
-    return runner, Loaded()
+class Executor:
+    """A worker's own side, in whatever process it is: it makes its runner, then does jobs. Neither raises."""
 
+    runner: Runner
 
-def run(runner: Runner, job: Job, seconds: float) -> Answer:
-    """What the runner makes of a job. Never raises."""
-    try:
-        return runner.run(job, seconds)
-    except Exception as error:
-        return failure_of(error)
+    def load(self, make: Callable[[], Runner]) -> Answer:
+        try:
+            self.runner = make()
+        except UserError as error:
+            is_device = isinstance(error, failures.DeviceError)
+            return Failure(Cause.DEVICE if is_device else Cause.REFUSED, str(error))
+        except Exception as error:
+            return failure_of(error)
+        return Loaded()
+
+    def run(self, job: Job, seconds: float) -> Answer:
+        try:
+            return self.runner.run(job, seconds)
+        except Exception as error:
+            return failure_of(error)
 
 
 def failure_of(error: Exception) -> Failure:
@@ -71,17 +69,26 @@ def failure_of(error: Exception) -> Failure:
     return Failure(CAUSES[failures.failure_of(error)], failures.reason_of(error))
 
 
+def use_threads(count: int) -> None:
+    """Let this process compute in so many threads at a time."""
+    import cv2
+    import torch
+
+    torch.set_num_threads(count)
+    cv2.setNumThreads(count)
+
+
 class MatchRunner:
-    """Matches the pairs of jobs and estimates their F, in threads, while the next minibatch is matched."""
+    """Matches the pairs of jobs and estimates their F, in threads, while the next minibatch is matched.
+
+    Loads all matchers; raises :class:`mkpc_kaggle.errors.UserError` where this fails.
+    """
 
     def __init__(self, make_pipeline: Callable[[], Pipeline]) -> None:
         self._pipeline = make_pipeline()
+        self._pipeline.load()
         self._images = ImageStore()
         self._estimators = ThreadPoolExecutor(ESTIMATE_THREADS, thread_name_prefix="estimate")
-
-    def load(self) -> None:
-        """Load all matchers; raises :class:`mkpc_kaggle.errors.UserError` where one cannot be."""
-        self._pipeline.load()
 
     def run(self, job: Job, seconds: float) -> MatchResult:
         """Match the pairs of a job; no unit begins that is expected to end later than ``seconds`` from now."""
@@ -92,31 +99,28 @@ class MatchRunner:
         def may_start(unit: Unit) -> bool:
             return time.monotonic() + expected[unit] < deadline
 
-        self._images.prefetch(job.images)
+        self._images.prefetch(path for pair in job.pairs for path in pair.images)
         pairs = [self._open(pair, known) for pair, known in zip(job.pairs, job.known, strict=True)]
         readable = [number for number, pair in enumerate(pairs) if not pair.failure]
         units = sorted(job.units, key=lambda unit: unit.stage)
         matched = self._pipeline.match([pairs[number] for number in readable], units[:-1], may_start)
-        estimates: dict[int, Future[Outcome]] = {}
+        estimates: list[Future[Outcome]] = []
         for start in range(0, len(matched), self._pipeline.minibatch):
             part = slice(start, start + self._pipeline.minibatch)
-            for number, pair in zip(
-                readable[part], self._pipeline.match(matched[part], units[-1:], may_start), strict=True
-            ):
-                estimates[number] = self._estimators.submit(self._estimate, job, number, pair)
-        return MatchResult(
-            tuple(
-                estimates[number].result()
-                if number in estimates
-                else Outcome(PairRecord.untouched(job.indices[number], pair.failure))
-                for number, pair in enumerate(pairs)
-            )
-        )
+            found = self._pipeline.match(matched[part], units[-1:], may_start)
+            estimates += [
+                self._estimators.submit(self._estimate, job, number, pair)
+                for number, pair in zip(readable[part], found, strict=True)
+            ]
+        outcomes = [Outcome(PairRecord.untouched(i, p.failure)) for i, p in zip(job.indices, pairs, strict=True)]
+        for number, estimate in zip(readable, estimates, strict=True):
+            outcomes[number] = estimate.result()
+        return MatchResult(tuple(outcomes))
 
     def _open(self, pair: Pair, known: tuple[UnitResult, ...]) -> PairMatch:
         """The pair with its images; ``failure`` says which of them cannot be read."""
         start = time.perf_counter()
-        images = tuple(self._images.get(path) for path in pair.images)
+        images = [self._images.get(path) for path in pair.images]
         seconds = time.perf_counter() - start
         readable = tuple(image for image in images if isinstance(image, Image))
         failure = next((str(image) for image in images if not isinstance(image, Image)), "")
@@ -139,9 +143,6 @@ class MatchRunner:
 
 class SceneRunner:
     """Reconstructs batches. pycolmap may end the process: see :mod:`mkpc_kaggle.scene.colmap`."""
-
-    def load(self) -> None:
-        """Nothing is needed before the job."""
 
     def run(self, job: Job, seconds: float) -> SceneResult:
         """The cameras of a batch, and which F each of its pairs gets; ``seconds`` are not looked at."""

@@ -153,9 +153,7 @@ def _facing(p: Owned, q: Owned, count: int, eps: float) -> Owned:
     low, high = np.full((2, count, 2), np.inf)  # nothing is near a pair without points
     start = np.flatnonzero(np.diff(pairs, prepend=-1))
     if len(start):
-        low[pairs[start]], high[pairs[start]] = (
-            np.minimum.reduceat(there, start),
-            np.maximum.reduceat(there, start),
-        )
+        low[pairs[start]] = np.minimum.reduceat(there, start)
+        high[pairs[start]] = np.maximum.reduceat(there, start)
     facing = _within(np.maximum(np.maximum(low[pair] - xy, xy - high[pair]), 0), eps)
     return xy[facing], pair[facing]

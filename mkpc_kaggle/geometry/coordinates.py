@@ -71,38 +71,27 @@ class View:
     content: Size
     padded: Size
 
-    def __post_init__(self) -> None:
-        if min(self.content) < 1:
-            raise ValueError(f"a view without pixels: {self.content}")
-        if self.padded.width < self.content.width or self.padded.height < self.content.height:
-            raise ValueError(f"padding cannot shrink: content {self.content}, padded {self.padded}")
-
     @classmethod
     def fit(cls, crop: Box, *, long_side: int, multiple: int = 1) -> "View":
         """The view of ``crop`` whose longer side is ``long_side`` pixels, its aspect kept to the nearest pixel.
 
-        As for all views made here, both sides are then padded up to a multiple of ``multiple``, and a size that
-        is not positive raises ``ValueError``.
+        As for all views made here, both sides are then padded up to a multiple of ``multiple``.
         """
         return cls._scaled(crop, long_side / max(crop.size), multiple)
 
     @classmethod
     def of_area(cls, crop: Box, *, area: int, multiple: int = 1) -> "View":
         """The view of ``crop`` that has about ``area`` pixels, its aspect kept to the nearest pixel."""
-        return cls._scaled(crop, sqrt(max(0, area) / crop.area), multiple)
+        return cls._scaled(crop, sqrt(area / crop.area), multiple)
 
     @classmethod
     def stretched(cls, crop: Box, *, size: Size, multiple: int = 1) -> "View":
         """The view of ``crop`` resized to exactly ``size``, whatever its aspect."""
-        if multiple < 1:
-            raise ValueError(f"multiple must be positive, not {multiple}")
         padded = Size(*(ceil(side / multiple) * multiple for side in size))
         return cls(crop, size, padded)
 
     @classmethod
     def _scaled(cls, crop: Box, scale: float, multiple: int) -> "View":
-        if scale <= 0:
-            raise ValueError(f"the size of a view must be positive: {crop.size} times {scale}")
         width, height = (max(1, round(side * scale)) for side in crop.size)
         return cls.stretched(crop, size=Size(width, height), multiple=multiple)
 

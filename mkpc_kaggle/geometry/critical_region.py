@@ -21,7 +21,7 @@ from mkpc_kaggle.geometry.coordinates import Box, Points, Size
 class MkpcConfig:
     """Settings of :func:`critical_region`, table ``[mkpc]`` of a recipe."""
 
-    REMOVED: ClassVar = ("ratio",)
+    FORMER: ClassVar = {"ratio": ""}
 
     eps: float = 0.05  # of DBSCAN, in units of the image's width and height
     min_samples: int = 5  # of DBSCAN
@@ -57,10 +57,6 @@ class CriticalRegion:
     reason: RegionReason
     clusters: int = 0
     kept: int = 0
-
-    @property
-    def cropped(self) -> bool:
-        return self.reason is RegionReason.CROPPED
 
 
 @dataclass(frozen=True, eq=False)

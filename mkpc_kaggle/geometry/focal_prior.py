@@ -31,7 +31,6 @@ from mkpc_kaggle.config import POSITIVE, check_ranges
 from mkpc_kaggle.geometry.coordinates import Matrix3, Size
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import (
-    NEEDS_INTRINSICS,
     DistinctMatches,
     Estimate,
     ModelKind,
@@ -57,10 +56,10 @@ LOG_FOCAL_GRID = (-0.7, -0.35, 0.0, 0.35, 0.7)  # log f / g to read MAGSAC's F w
 class FocalConfig:
     """Settings of :func:`estimate_with_prior`, table ``[focal]`` of a recipe; without it MAGSAC is alone."""
 
-    REMOVED: ClassVar = (
-        *("essential_threshold", "essential_iterations", "essential_starts", "essential_share"),
-        *("rough_matches", "refined", "most_matches", "free_cost"),
-    )
+    FORMER: ClassVar = dict.fromkeys((
+        "essential_threshold", "essential_iterations", "essential_starts", "essential_share", "rough_matches",
+        "refined", "most_matches", "free_cost",
+    ), "")  # fmt: skip
 
     ratio: float = 1.1  # of an unknown focal length to the image's long side
     sigma: float = 0.4  # standard deviation of the focal length's logarithm
@@ -74,19 +73,11 @@ class FocalConfig:
 class FocalPrior:
     """What is known of a camera: ``K`` (3, 3) in pixels, and the standard deviation of its log focal length.
 
-    With ``sigma`` 0 the camera is known. Raises ``ValueError`` for a negative ``sigma``, and for a K that is not a
-    camera matrix.
+    With ``sigma`` 0 the camera is known.
     """
 
     K: Matrix3
     sigma: float
-
-    def __post_init__(self) -> None:
-        if not self.sigma >= 0:
-            raise ValueError(f"sigma must be at least 0, not {self.sigma}")
-        focals = np.diag(self.K)[:2]
-        if self.K.shape != (3, 3) or not np.isfinite(self.K).all() or not (focals > 0).all():
-            raise ValueError(f"K must be a camera matrix with positive focal lengths, not {self.K.tolist()}")
 
     @classmethod
     def of_image(cls, size: Size, config: FocalConfig) -> "FocalPrior":
@@ -122,13 +113,8 @@ def estimate_with_prior(
     """F of ``matches`` (image pixels), or E where both K are known: of all candidates that of lowest cost.
 
     Inliers are nearer than MAGSAC's threshold by their Sampson distance. MAGSAC's own F is a candidate, so the
-    winner never costs more. Six distinct matches are enough. The same input gives the same bytes. Raises
-    ``ValueError`` for H, which has no focal lengths, and for E with a camera that is not known.
+    winner never costs more. Six distinct matches are enough. The same input gives the same bytes.
     """
-    if model is ModelKind.H:
-        raise ValueError("a homography has no focal lengths")
-    if model is ModelKind.E and any(prior.sigma for prior in priors):
-        raise ValueError(NEEDS_INTRINSICS)
     distinct = DistinctMatches.of(matches)
     with np.errstate(all="ignore"):  # points need not be pixels; a candidate that overflows loses
         search = _Search(distinct, priors, config.scale)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mkpc_kaggle.geometry.coordinates import Box, Points, Size, View
+from mkpc_kaggle.geometry.coordinates import Points, View
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,11 +57,6 @@ class Matches:
             return self
         chosen = np.argsort(-self.scores, kind="stable")[:most]
         return self[np.sort(chosen)]
-
-    def inside(self, size0: Size, size1: Size) -> "Matches":
-        """Those with finite scores and both points on the pixels of images of these sizes."""
-        on_images = Box.whole(size0).contains(self.points0) & Box.whole(size1).contains(self.points1)
-        return self[on_images & np.isfinite(self.scores)]
 
     def to_image(self, view0: View, view1: View) -> "Matches":
         """Matches in view pixels -> image pixels.

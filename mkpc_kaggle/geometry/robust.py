@@ -21,7 +21,6 @@ from mkpc_kaggle.geometry.two_view import Vectors, robust_costs, sampson
 # The F of a pure sideways motion, [e_x]_x: finite, rank 2; epipolar lines are the image rows.
 FALLBACK_FUNDAMENTAL: Matrix3 = np.array([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 FALLBACK_FUNDAMENTAL.setflags(write=False)
-NEEDS_INTRINSICS = "an essential matrix needs the intrinsics, the camera matrix K of both images"
 
 
 class ModelKind(StrEnum):
@@ -31,21 +30,12 @@ class ModelKind(StrEnum):
     E = "E"
     H = "H"
 
-    @property
-    def min_matches(self) -> int:
-        """How many distinct matches an estimate needs here (more than the minimal F, to tell a model)."""
-        return _SOLVERS[self].min_matches
-
 
 class Method(StrEnum):
     """The robust estimator of OpenCV."""
 
     MAGSAC = "magsac"
     RANSAC = "ransac"
-
-    @property
-    def flag(self) -> int:
-        return cv2.USAC_MAGSAC if self is Method.MAGSAC else cv2.RANSAC
 
 
 @dataclass(frozen=True)
@@ -56,7 +46,7 @@ class RobustConfig:
     it runs on several permutations, and the model of the lowest robust cost at twice the threshold is kept.
     """
 
-    RENAMED: ClassVar = {"orders": "permutations"}
+    FORMER: ClassVar = {"orders": "permutations"}
 
     method: Method = Method.MAGSAC
     threshold: float = 0.2  # image pixels
@@ -113,7 +103,7 @@ def estimate(
     points. The same input gives the same bytes.
     """
     if model is ModelKind.E and intrinsics is None:
-        raise ValueError(NEEDS_INTRINSICS)
+        raise ValueError("an essential matrix needs the intrinsics, the camera matrix K of both images")
     distinct = DistinctMatches.of(matches)
     found = consensus(distinct.points0, distinct.points1, config, model, intrinsics)
     return replace(found, inliers=distinct.mask_of_all(found.inliers))
@@ -127,14 +117,14 @@ def consensus(
     intrinsics: tuple[Matrix3, Matrix3] | None = None,
 ) -> Estimate:
     """:func:`estimate` for (N, 2) finite points without duplicates."""
-    count, threshold = len(points0), config.threshold
-    if count < model.min_matches:
+    count, threshold, solver = len(points0), config.threshold, _SOLVERS[model]
+    if count < solver.min_matches:
         return Estimate.failed(model, count, f"too few distinct matches for {model}: {count}")
     if intrinsics is not None and model is ModelKind.E:
         points0, points1 = calibrate(points0, intrinsics[0]), calibrate(points1, intrinsics[1])
         threshold /= float(np.mean([K[axis, axis] for K in intrinsics for axis in (0, 1)]))
     try:
-        matrix, mask = _best_of_permutations(_SOLVERS[model], points0, points1, threshold, config)
+        matrix, mask = _best_of_permutations(solver, points0, points1, threshold, config)
     except cv2.error as error:
         return Estimate.failed(model, count, f"OpenCV refused the points: {error.err}")
     if matrix is None:
@@ -212,7 +202,8 @@ def _best_of_permutations(
     Most inliers do not decide: MAGSAC's score depends on distances up to several times the threshold. OpenCV
     sometimes rejects points in one order and not in another; its error is raised if no order gave a model.
     """
-    settings = {"method": config.method.flag, "confidence": config.confidence, "maxIters": config.max_iterations}
+    method = cv2.USAC_MAGSAC if config.method is Method.MAGSAC else cv2.RANSAC
+    settings = {"method": method, "confidence": config.confidence, "maxIters": config.max_iterations}
     best, best_mask, lowest, refusal = None, np.zeros(len(points0), bool), np.inf, None
     for number in range(config.permutations):
         order = permutation(number, len(points0))
@@ -251,7 +242,10 @@ def _transfer_distances(matrix: Matrix3, points0: Vectors, points1: Vectors) -> 
 
 
 class _Solver(NamedTuple):
-    """What a kind of model needs. ``find`` gives OpenCV's matrix and mask, ``None`` where no model is found."""
+    """What a kind of model needs: more matches than the minimal solver takes, so that they tell a model.
+
+    ``find`` gives OpenCV's matrix and mask, ``None`` where no model is found.
+    """
 
     min_matches: int
     fallback: Matrix3

@@ -1,17 +1,13 @@
 """ALIKED keypoints (Zhao et al. 2023) with mutual nearest neighbours."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
-import torch
-
 from mkpc_kaggle.config import AT_LEAST_1, SHARE, check_ranges
-from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import MatcherSpec, Placement
-from mkpc_kaggle.matchers.neighbours import mutual_neighbours
+from mkpc_kaggle.matchers.neighbours import NeighbourMatcher
 from mkpc_kaggle.matchers.networks.aliked import Aliked, own_name
 from mkpc_kaggle.matchers.networks.placement import placed
-from mkpc_kaggle.matchers.sparse import KeypointEncoder, Keypoints, matches_of
+from mkpc_kaggle.matchers.sparse import KeypointEncoder
 from mkpc_kaggle.weights import WeightStore, load_into
 
 SLOT = "aliked-n16"
@@ -36,25 +32,14 @@ SPEC = MatcherSpec(
 )
 
 
-class AlikedMatcher:
+class AlikedMatcher(NeighbourMatcher):
     """A match's score is the cosine of its descriptors."""
 
     spec = SPEC
 
     def __init__(self, encoder: KeypointEncoder, options: AlikedOptions) -> None:
-        self.options = options
+        self.ratio = options.ratio
         self.encode = encoder.encode
-
-    @torch.inference_mode()
-    def match(self, encodings0: Sequence[Keypoints], encodings1: Sequence[Keypoints]) -> list[Matches]:
-        return [self._match(*pair) for pair in zip(encodings0, encodings1, strict=True)]
-
-    def _match(self, keypoints0: Keypoints, keypoints1: Keypoints) -> Matches:
-        pairs = mutual_neighbours(keypoints0.descriptors, keypoints1.descriptors)
-        passed = pairs.ratio <= self.options.ratio
-        return matches_of(
-            keypoints0, keypoints1, pairs.index0[passed], pairs.index1[passed], pairs.similarity[passed]
-        )
 
 
 def load_encoder(weights: WeightStore, features: int, placement: Placement) -> KeypointEncoder:

@@ -5,16 +5,15 @@ One contract serves sparse, semi-dense and dense networks. ``encode`` does what 
 images are used in many pairs. ``match`` does the rest.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from enum import StrEnum
 from itertools import product
 from string import Formatter
-from typing import Any, Protocol, TypeVar, get_type_hints
+from typing import Any, Generic, Protocol, TypeVar, get_type_hints
 
 from mkpc_kaggle.geometry.coordinates import Pixels, Size, View
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.weights import WeightStore
 
 
 class NonFiniteError(ArithmeticError):
@@ -127,23 +126,17 @@ class Matcher(Protocol[Encoding]):
         ...
 
 
-@dataclass(frozen=True)
-class MatcherEntry:
-    """A matcher that the registry knows; ``load`` builds it from its weights and its options."""
+class PairwiseMatcher(Generic[Encoding]):
+    """A matcher that matches its pairs one after the other, so that results do not depend on the minibatch."""
 
-    spec: MatcherSpec
-    load: Callable[[WeightStore, Any, Placement], Matcher[Any]]
+    def match(self, encodings0: Sequence[Encoding], encodings1: Sequence[Encoding]) -> list[Matches]:
+        import torch  # here, since it takes seconds and those who read specs need none
 
+        with torch.inference_mode():
+            return [self._match(*pair) for pair in zip(encodings0, encodings1, strict=True)]
 
-@dataclass(frozen=True)
-class Unusable:
-    """A matcher that cannot be imported on this machine, and why."""
-
-    name: str
-    reason: str
-
-    def __str__(self) -> str:
-        return f"matcher {self.name} cannot be used here ({self.reason})"
+    def _match(self, first: Encoding, second: Encoding) -> Matches:
+        raise NotImplementedError
 
 
 def arrays_of(value: Any) -> Iterator[Any]:

@@ -10,7 +10,7 @@ import torch
 from mkpc_kaggle.config import AT_LEAST_1, SHARE, Range, check_ranges
 from mkpc_kaggle.geometry.coordinates import Size, from_normalised
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.matchers.contract import MatcherSpec, Picture, Training
+from mkpc_kaggle.matchers.contract import MatcherSpec, PairwiseMatcher, Picture, Training
 from mkpc_kaggle.matchers.dtypes import check_finite
 from mkpc_kaggle.matchers.networks.dense_sampling import sample_matches
 from mkpc_kaggle.matchers.networks.dense_warp import DenseFeatures, DenseNetwork
@@ -19,12 +19,12 @@ from mkpc_kaggle.matchers.networks.pixels import network_input
 
 @dataclass(frozen=True)
 class DenseOptions:
+    FORMER: ClassVar = {"symmetric": "", "balanced": ""}
+
     passes: int = 1  # 2: first on pictures whose sides are scaled by ``first_pass``, then on the full ones
     first_pass: float = 0.625
-    symmetric: bool = True  # match both ways; else from the first to the second only, in half the time
     matches: int = 5000  # at most
     threshold: float = 0.05  # certainties above it count as 1
-    balanced: bool = True  # spread the matches evenly over the pictures
     training: Training = Training.OUTDOOR
 
     def __post_init__(self) -> None:
@@ -40,7 +40,7 @@ class DenseEncoding:
     checksum: int
 
 
-class DenseMatcher:
+class DenseMatcher(PairwiseMatcher[DenseEncoding]):
     """A match's score is its certainty. The matches that are sampled depend on the two pictures alone.
 
     Pictures and pairs are processed separately, so that results do not depend on the batch. ``multiple``: sides of
@@ -59,10 +59,6 @@ class DenseMatcher:
     @torch.inference_mode()
     def encode(self, pictures: Sequence[Picture]) -> list[DenseEncoding]:
         return [self._encode(picture) for picture in pictures]
-
-    @torch.inference_mode()
-    def match(self, encodings0: Sequence[DenseEncoding], encodings1: Sequence[DenseEncoding]) -> list[Matches]:
-        return [self._match(*pair) for pair in zip(encodings0, encodings1, strict=True)]
 
     def _encode(self, picture: Picture) -> DenseEncoding:
         width, height = picture.content
@@ -84,16 +80,14 @@ class DenseMatcher:
 
     def _match(self, first: DenseEncoding, second: DenseEncoding) -> Matches:
         options = self.options
-        warps = self._network.match(first.features, second.features, symmetric=options.symmetric)
+        warps = self._network.match(first.features, second.features)
         warp = torch.cat([dense.warp.reshape(-1, 4) for dense in warps])
         certainty = torch.cat([dense.certainty.flatten() for dense in warps])
         check_finite(f"certainties of {self.spec.name}", certainty, warp)
         # PyTorch's CPU generator uses 32 bits of a seed, so both checksums are combined into 32.
         seed = zlib.crc32(second.checksum.to_bytes(4), first.checksum)
         generator = torch.Generator(warp.device).manual_seed(seed)
-        found = sample_matches(
-            warp, certainty, options.matches, options.threshold, balanced=options.balanced, generator=generator
-        )
+        found = sample_matches(warp, certainty, options.matches, options.threshold, generator=generator)
         points = found.matches.cpu().numpy()
         return Matches(
             from_normalised(points[:, :2], first.content),

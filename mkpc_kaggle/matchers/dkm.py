@@ -1,28 +1,21 @@
 """DKM v3 (Edstedt et al. 2023): dense warps between two views; matches are sampled from them."""
 
-from dataclasses import dataclass
-
 from mkpc_kaggle.matchers.contract import MatcherSpec, Placement
 from mkpc_kaggle.matchers.dense import DenseMatcher, DenseOptions
 from mkpc_kaggle.matchers.networks.dkm import DKM
 from mkpc_kaggle.matchers.networks.placement import placed
 from mkpc_kaggle.weights import WeightStore, load_into
 
-
-@dataclass(frozen=True)
-class DkmOptions(DenseOptions):
-    """Published are one pass of 540 x 720 or 480 x 640 (indoors), and two of 864 x 1152."""
-
-
-# The licence is that of the outdoor weights; the terms of the indoor ones are unclear, as the manifest says.
-SPEC = MatcherSpec("dkm", "DKM v3", DkmOptions, licences=("MIT",), slots=("dkm-{training}",))
+# Published are one pass of 540 x 720 or 480 x 640 (indoors), and two of 864 x 1152. The licence is that of the
+# outdoor weights; the terms of the indoor ones are unclear, as the manifest says.
+SPEC = MatcherSpec("dkm", "DKM v3", DenseOptions, licences=("MIT",), slots=("dkm-{training}",))
 
 
 class DkmMatcher(DenseMatcher):
     spec = SPEC
 
 
-def load(weights: WeightStore, options: DkmOptions, placement: Placement) -> DkmMatcher:
+def load(weights: WeightStore, options: DenseOptions, placement: Placement) -> DkmMatcher:
     network = DKM()
     (slot,) = SPEC.slots_for(options)
     load_into(network, weights.load(slot), what=slot)

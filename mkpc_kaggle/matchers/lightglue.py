@@ -1,7 +1,6 @@
 """LightGlue (Lindenberger et al. 2023, kornia's network): shared by all matchers that use it."""
 
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,7 +10,7 @@ from torch import Tensor, nn
 
 from mkpc_kaggle.config import AT_LEAST_1, SHARE, check_ranges
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.matchers.contract import MatcherSpec, Placement
+from mkpc_kaggle.matchers.contract import MatcherSpec, PairwiseMatcher, Placement
 from mkpc_kaggle.matchers.dtypes import check_finite
 from mkpc_kaggle.matchers.networks.placement import autocast
 from mkpc_kaggle.matchers.sparse import KeypointEncoder, Keypoints, matches_of
@@ -27,7 +26,7 @@ class LightGlueOptions:
         check_ranges(self, features=AT_LEAST_1, threshold=SHARE)
 
 
-class LightGlueMatcher:
+class LightGlueMatcher(PairwiseMatcher[Keypoints]):
     """A match's score is LightGlue's."""
 
     def __init__(self, spec: MatcherSpec, encoder: KeypointEncoder, glue: LightGlue, placement: Placement) -> None:
@@ -36,10 +35,6 @@ class LightGlueMatcher:
         self.encode = encoder.encode
         self._glue = glue.eval().to(placement.device)
         glue.transformers = nn.ModuleList(CastLayer(layer, placement) for layer in glue.transformers)
-
-    @torch.inference_mode()
-    def match(self, encodings0: Sequence[Keypoints], encodings1: Sequence[Keypoints]) -> list[Matches]:
-        return [self._match(*pair) for pair in zip(encodings0, encodings1, strict=True)]
 
     def _match(self, keypoints0: Keypoints, keypoints1: Keypoints) -> Matches:
         if len(keypoints0) == 0 or len(keypoints1) == 0:

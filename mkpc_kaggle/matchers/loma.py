@@ -8,7 +8,7 @@ import torch
 from mkpc_kaggle.config import AT_LEAST_1, POSITIVE, SHARE, check_ranges
 from mkpc_kaggle.geometry.coordinates import Size, from_normalised
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.matchers.contract import MatcherSpec, Picture, Placement
+from mkpc_kaggle.matchers.contract import MatcherSpec, PairwiseMatcher, Picture, Placement
 from mkpc_kaggle.matchers.networks.loma import UNUSED, WIDTHS, Loma, Variant, detector_size, parameter_name
 from mkpc_kaggle.matchers.networks.loma_matcher import LomaKeypoints
 from mkpc_kaggle.matchers.networks.pixels import resized
@@ -50,7 +50,7 @@ class LomaEncoding:
     content: Size
 
 
-class LomaAdapter:
+class LomaAdapter(PairwiseMatcher[LomaEncoding]):
     """A match's score is the product of the softmax over either picture's keypoints.
 
     Pictures and pairs are processed separately, so that results do not depend on the batch.
@@ -66,10 +66,6 @@ class LomaAdapter:
     @torch.inference_mode()
     def encode(self, pictures: Sequence[Picture]) -> list[LomaEncoding]:
         return [LomaEncoding(self._keypoints(picture), picture.content) for picture in pictures]
-
-    @torch.inference_mode()
-    def match(self, encodings0: Sequence[LomaEncoding], encodings1: Sequence[LomaEncoding]) -> list[Matches]:
-        return [self._match(*pair) for pair in zip(encodings0, encodings1, strict=True)]
 
     def _keypoints(self, picture: Picture) -> LomaKeypoints:
         content, long_side = picture.content, max(picture.content)

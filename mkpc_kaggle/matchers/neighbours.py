@@ -5,6 +5,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.matchers.contract import PairwiseMatcher
+from mkpc_kaggle.matchers.sparse import Keypoints, matches_of
+
 BLOCK_ROWS = 2048
 
 
@@ -18,6 +22,21 @@ class Neighbours:
     index1: Tensor
     similarity: Tensor
     ratio: Tensor
+
+
+class NeighbourMatcher(PairwiseMatcher[Keypoints]):
+    """Mutual nearest neighbours whose distance ratio is at most ``ratio``."""
+
+    ratio: float
+
+    def _match(self, first: Keypoints, second: Keypoints) -> Matches:
+        pairs = mutual_neighbours(first.descriptors, second.descriptors)
+        passed = pairs.ratio <= self.ratio
+        return matches_of(first, second, pairs.index0[passed], pairs.index1[passed], self._scores(pairs)[passed])
+
+    def _scores(self, pairs: Neighbours) -> Tensor:
+        """(M,) scores of the pairs: the cosine of their descriptors."""
+        return pairs.similarity
 
 
 def mutual_neighbours(descriptors0: Tensor, descriptors1: Tensor) -> Neighbours:

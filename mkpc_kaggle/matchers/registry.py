@@ -7,13 +7,23 @@ from typing import Any
 
 from mkpc_kaggle import matchers
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.matchers.contract import Matcher, MatcherEntry, MatcherSpec, Placement, Unusable
+from mkpc_kaggle.matchers.contract import Matcher, MatcherSpec, Placement
 from mkpc_kaggle.weights import WeightStore
 
 # What matchers share.
 NOT_MATCHERS = frozenset(
     {"contract", "dense", "dtypes", "lightglue", "neighbours", "registry", "semi_dense", "sparse", "vismatch"}
 )
+
+
+class UnusableError(UserError):
+    """A matcher that cannot be imported on this machine, and the ``reason``."""
+
+    def __init__(self, where: str, name: str, reason: str) -> None:
+        super().__init__(
+            f"{where}: matcher {name} cannot be used here ({reason}). `--recipe auto` does without it."
+        )
+        self.reason = reason
 
 
 @cache
@@ -23,35 +33,25 @@ def matcher_names() -> tuple[str, ...]:
     return tuple(info.name for info in modules if not info.ispkg and info.name not in NOT_MATCHERS)
 
 
-@cache
-def find_matcher(name: str) -> MatcherEntry | Unusable:
-    """The matcher of this name, imported now; why it cannot be used, where its import fails.
-
-    Raises ``KeyError`` for a name that is not among :func:`matcher_names`.
-    """
-    if name not in matcher_names():
-        raise KeyError(name)
-    try:
-        module = import_module(f"{matchers.__name__}.{name}")
-        return MatcherEntry(module.SPEC, module.load)
-    except Exception as error:  # any error at import affects this matcher only
-        return Unusable(name, f"{type(error).__name__}: {error}")
-
-
 def spec_of(name: str, where: str) -> MatcherSpec:
-    """The spec of a matcher; :class:`UserError`, with ``where`` it was asked for, if it is unknown or broken."""
-    return _entry(name, where).spec
+    """The spec of a matcher, imported now; ``where`` it was asked for is said by the errors.
+
+    Raises :class:`UserError` for an unknown name, :class:`UnusableError` where the import fails.
+    """
+    spec: MatcherSpec = _imported(name, where).SPEC
+    return spec
 
 
 def load_matcher(name: str, weights: WeightStore, options: Any, placement: Placement) -> Matcher[Any]:
     """The matcher, ready to run; raises :class:`UserError` where its weights are missing or damaged."""
-    return _entry(name, "load").load(weights, options, placement)
+    matcher: Matcher[Any] = _imported(name, "load").load(weights, options, placement)
+    return matcher
 
 
-def _entry(name: str, where: str) -> MatcherEntry:
+def _imported(name: str, where: str) -> Any:
     if name not in matcher_names():
         raise UserError(f"{where}: unknown matcher {name!r}; known: {', '.join(matcher_names())}")
-    entry = find_matcher(name)
-    if isinstance(entry, Unusable):
-        raise UserError(f"{where}: {entry}. `--recipe auto` does without it.")
-    return entry
+    try:
+        return import_module(f"{matchers.__name__}.{name}")
+    except Exception as error:  # any error at import affects this matcher only
+        raise UnusableError(where, name, f"{type(error).__name__}: {error}") from error

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import ceil
 from typing import Any
 
 import torch
@@ -12,7 +11,7 @@ from mkpc_kaggle.config import SHARE, check_ranges
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Size, from_corner
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.matchers.contract import MatcherSpec, Picture, Training
+from mkpc_kaggle.matchers.contract import MatcherSpec, PairwiseMatcher, Picture, Training
 from mkpc_kaggle.matchers.networks.fine_matching import COARSE_STRIDE
 from mkpc_kaggle.matchers.networks.resnet_fpn import FeatureMaps
 from mkpc_kaggle.matchers.networks.semi_dense import SemiDenseNetwork
@@ -40,12 +39,6 @@ class SemiDenseEncoding:
     content: Size
 
     @property
-    def padded(self) -> bool:
-        """Whether there are coarse cells without content."""
-        height, width = self.maps.coarse.shape[2:]
-        return (width, height) != tuple(ceil(side / COARSE_STRIDE) for side in self.content)
-
-    @property
     def mask(self) -> Tensor:
         """(1, h, w) bool, True for the coarse cells whose top-left pixel is content."""
         height, width = (
@@ -55,7 +48,7 @@ class SemiDenseEncoding:
         return (height[:, None] & width)[None]
 
 
-class SemiDenseMatcher:
+class SemiDenseMatcher(PairwiseMatcher[SemiDenseEncoding]):
     """A match's score is the confidence of its coarse cells."""
 
     def __init__(self, network: SemiDenseNetwork[Any], spec: MatcherSpec, device: str) -> None:
@@ -68,8 +61,6 @@ class SemiDenseMatcher:
         if not pictures:
             return []
         maps = self._network.encode(image_batch(pictures, self.device))
-        if len(pictures) == 1:
-            return [SemiDenseEncoding(maps, pictures[0].content)]
         # Copies: a part of a map would keep all of it in memory.
         singles = zip(torch.split(maps.coarse, 1), torch.split(maps.fine, 1), strict=True)
         return [
@@ -77,16 +68,10 @@ class SemiDenseMatcher:
             for (coarse, fine), picture in zip(singles, pictures, strict=True)
         ]
 
-    @torch.inference_mode()
-    def match(
-        self, encodings0: Sequence[SemiDenseEncoding], encodings1: Sequence[SemiDenseEncoding]
-    ) -> list[Matches]:
-        return [self._match(*pair) for pair in zip(encodings0, encodings1, strict=True)]
-
     def _match(self, first: SemiDenseEncoding, second: SemiDenseEncoding) -> Matches:
+        masks = first.mask, second.mask
         # Even a mask that is all True can change rounding.
-        masks = (first.mask, second.mask) if first.padded or second.padded else None
-        found = self._network.match(first.maps, second.maps, masks)
+        found = self._network.match(first.maps, second.maps, None if all(mask.all() for mask in masks) else masks)
         points0, points1 = (from_corner(points.float().cpu().numpy()) for points in (found.points0, found.points1))
         return Matches(points0, points1, found.coarse.confidence.float().cpu().numpy())
 

@@ -10,18 +10,18 @@ import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from mkpc_kaggle.config import AT_LEAST_0, AT_LEAST_1, SHARE, check_ranges
-from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import Colour, MatcherSpec, Picture, Placement
-from mkpc_kaggle.matchers.neighbours import mutual_neighbours
-from mkpc_kaggle.matchers.sparse import Keypoints, matches_of
+from mkpc_kaggle.matchers.neighbours import NeighbourMatcher, Neighbours
+from mkpc_kaggle.matchers.sparse import Keypoints
 from mkpc_kaggle.weights import WeightStore
 
 
 @dataclass(frozen=True)
 class SiftOptions:
-    """``features``: the strongest kept in each picture. ``ratio``: matches must be below it both ways."""
+    """``features``: the strongest kept in each picture. ``ratio``: at most, both ways."""
 
     features: int = 8000
     ratio: float = 0.8
@@ -34,13 +34,13 @@ class SiftOptions:
 SPEC = MatcherSpec("sift", "RootSIFT, mutual nearest neighbours, ratio test", SiftOptions, Colour.GRAY)
 
 
-class SiftMatcher:
+class SiftMatcher(NeighbourMatcher):
     """OpenCV's SIFT; a match's score is one minus its distance ratio."""
 
     spec = SPEC
 
     def __init__(self, options: SiftOptions, device: str) -> None:
-        self.options = options
+        self.ratio = options.ratio
         self.device = device
         # Without precise upscaling OpenCV's first octave moves every point by a quarter of a pixel.
         self._sift = cv2.SIFT_create(  # type: ignore[attr-defined]  # missing in OpenCV's stubs
@@ -49,9 +49,6 @@ class SiftMatcher:
 
     def encode(self, pictures: Sequence[Picture]) -> list[Keypoints]:
         return [self._encode(picture) for picture in pictures]
-
-    def match(self, encodings0: Sequence[Keypoints], encodings1: Sequence[Keypoints]) -> list[Matches]:
-        return [self._match(*pair) for pair in zip(encodings0, encodings1, strict=True)]
 
     def _encode(self, picture: Picture) -> Keypoints:
         found, descriptors = self._sift.detectAndCompute(picture.pixels, None)
@@ -63,12 +60,8 @@ class SiftMatcher:
             picture.content,
         )
 
-    def _match(self, keypoints0: Keypoints, keypoints1: Keypoints) -> Matches:
-        pairs = mutual_neighbours(keypoints0.descriptors, keypoints1.descriptors)
-        passed = pairs.ratio < self.options.ratio
-        return matches_of(
-            keypoints0, keypoints1, pairs.index0[passed], pairs.index1[passed], 1 - pairs.ratio[passed]
-        )
+    def _scores(self, pairs: Neighbours) -> Tensor:
+        return 1 - pairs.ratio
 
 
 def root_sift(descriptors: NDArray[np.float32]) -> NDArray[np.float32]:

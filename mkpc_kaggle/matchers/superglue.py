@@ -7,7 +7,7 @@ import torch
 
 from mkpc_kaggle.config import AT_LEAST_0, AT_LEAST_1, SHARE, check_ranges
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.matchers.contract import Colour, MatcherSpec, Picture, Placement, Training
+from mkpc_kaggle.matchers.contract import Colour, MatcherSpec, PairwiseMatcher, Picture, Placement, Training
 from mkpc_kaggle.matchers.networks.placement import placed
 from mkpc_kaggle.matchers.networks.superglue import SuperGlue
 from mkpc_kaggle.matchers.networks.superpoint import SuperPoint, SuperPointKeypoints
@@ -45,7 +45,7 @@ SPEC = MatcherSpec(
 )
 
 
-class SuperGlueMatcher:
+class SuperGlueMatcher(PairwiseMatcher[SuperPointKeypoints]):
     """A match's score is the keypoint's mass that the optimal transport assigns to it."""
 
     spec = SPEC
@@ -61,12 +61,6 @@ class SuperGlueMatcher:
             return []
         found: list[SuperPointKeypoints] = self._superpoint(image_batch(pictures, self.device))
         return found
-
-    @torch.inference_mode()
-    def match(
-        self, encodings0: Sequence[SuperPointKeypoints], encodings1: Sequence[SuperPointKeypoints]
-    ) -> list[Matches]:
-        return [self._match(*pair) for pair in zip(encodings0, encodings1, strict=True)]
 
     def _match(self, keypoints0: SuperPointKeypoints, keypoints1: SuperPointKeypoints) -> Matches:
         found = self._superglue(keypoints0, keypoints1)

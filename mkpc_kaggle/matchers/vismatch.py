@@ -13,7 +13,7 @@ from torch import Tensor
 
 from mkpc_kaggle.geometry.coordinates import from_corner
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.matchers.contract import MatcherSpec, Picture
+from mkpc_kaggle.matchers.contract import MatcherSpec, PairwiseMatcher, Picture
 
 
 class ImageMatcher(Protocol):
@@ -26,7 +26,7 @@ class ImageMatcher(Protocol):
     def __call__(self, img0: Tensor, img1: Tensor) -> Mapping[str, Any]: ...
 
 
-class VismatchMatcher:
+class VismatchMatcher(PairwiseMatcher[Picture]):
     """Give it to :class:`mkpc_kaggle.TwoStageMatcher` under the name that the recipe's units have.
 
     ``corner``: the matcher counts pixels from the image's top-left corner, as RoMa, DKM and LoMa do; else from the
@@ -51,9 +51,6 @@ class VismatchMatcher:
 
     def encode(self, pictures: Sequence[Picture]) -> list[Picture]:
         return list(pictures)
-
-    def match(self, encodings0: Sequence[Picture], encodings1: Sequence[Picture]) -> list[Matches]:
-        return [self._match(*pair) for pair in zip(encodings0, encodings1, strict=True)]
 
     def _match(self, picture0: Picture, picture1: Picture) -> Matches:
         found = self._matcher(image_of(picture0), image_of(picture1))

@@ -82,8 +82,7 @@ class Assembly:
     @cached_property
     def weight_files(self) -> dict[str, FoundFile]:
         """The files that the matchers load, by slot."""
-        names = [name for name in self.recipe.matcher_names if name not in self.matchers]
-        found = {slot: self.weights.find(slot) for slot in slots_of(self.recipe, names)}
+        found = {slot: self.weights.find(slot) for slot in slots_of(self.recipe, self.matchers)}
         return {slot: file for slot, file in found.items() if file is not None}
 
     def _load(self, name: str, placement: Placement) -> Matcher[Any]:

@@ -1,6 +1,7 @@
 """Which matchers of a recipe cannot run here, and why: their code, their weights, the licence of these."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Container, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from enum import StrEnum
 from types import MappingProxyType
@@ -8,8 +9,8 @@ from typing import Any
 
 from mkpc_kaggle.config import from_table
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.matchers.contract import Matcher, Placement, Unusable
-from mkpc_kaggle.matchers.registry import find_matcher, load_matcher, matcher_names, spec_of
+from mkpc_kaggle.matchers.contract import Matcher, Placement
+from mkpc_kaggle.matchers.registry import UnusableError, load_matcher, spec_of
 from mkpc_kaggle.recipe import Recipe
 from mkpc_kaggle.weights import State, WeightStore
 
@@ -69,11 +70,10 @@ def unavailable(
     def reason_for(name: str) -> UnavailableReason | None:
         if name in own:
             return not_permitted(own[name].spec.licences)
-        entry = find_matcher(name) if name in matcher_names() else None
-        if isinstance(entry, Unusable):
-            return UnavailableReason(UnavailableKind.NOT_IMPORTABLE, entry.reason)
-        options = options_of(recipe, name)
-        spec = spec_of(name, f"recipe {recipe.name!r}")
+        try:
+            spec, options = spec_of(name, f"recipe {recipe.name!r}"), options_of(recipe, name)
+        except UnusableError as error:
+            return UnavailableReason(UnavailableKind.NOT_IMPORTABLE, error.reason)
         found = {slot: store.find(slot) for slot in spec.slots_for(options)}
         files = [file for file in found.values() if file is not None]
         if reason := not_permitted([*spec.licences, *(file.file.licence for file in files)]):
@@ -129,10 +129,11 @@ def options_of(recipe: Recipe, name: str) -> Any:
     return from_table(spec.options, table, f"recipe {recipe.name!r}, table [matchers.{name}]")
 
 
-def slots_of(recipe: Recipe, names: Iterable[str] | None = None) -> tuple[str, ...]:
-    """The slots, each once, that these matchers need, or all matchers of the recipe that can be imported here."""
-    if names is None:
-        names = [name for name in recipe.matcher_names if not isinstance(find_matcher(name), Unusable)]
-    where = f"recipe {recipe.name!r}"
-    slots = (slot for name in names for slot in spec_of(name, where).slots_for(options_of(recipe, name)))
+def slots_of(recipe: Recipe, own: Container[str] = ()) -> tuple[str, ...]:
+    """The slots, each once, of the recipe's matchers that can be imported here; the user's ``own`` need none."""
+    slots: list[str] = []
+    for name in recipe.matcher_names:
+        with suppress(UnusableError):
+            if name not in own:
+                slots += spec_of(name, f"recipe {recipe.name!r}").slots_for(options_of(recipe, name))
     return tuple(dict.fromkeys(slots))

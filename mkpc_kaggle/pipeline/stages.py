@@ -13,9 +13,8 @@ from dataclasses import replace
 from itertools import chain
 from typing import Any
 
-from mkpc_kaggle.data.cache import ByteCache
-from mkpc_kaggle.data.images import Image
-from mkpc_kaggle.geometry.coordinates import Box, Size, View
+from mkpc_kaggle.data.images import ByteCache, Image
+from mkpc_kaggle.geometry.coordinates import Box, View
 from mkpc_kaggle.geometry.critical_region import critical_region
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import Colour, Matcher, NonFiniteError, Picture, encoding_bytes
@@ -151,11 +150,9 @@ class Pipeline:
         keys = [(unit.matcher, image.name, view) for image, view in wanted]
         known = {key: self._encodings.get(key) for key in keys}
         missing = {key: item for key, item in zip(keys, wanted, strict=True) if known[key] is None}
-        by_shape: dict[Size, list[ViewKey]] = {}
-        for key in missing:
-            by_shape.setdefault(key[2].padded, []).append(key)
         size = self._minibatches.get(unit, self.minibatch)
-        for alike in by_shape.values():
+        for shape in dict.fromkeys(view.padded for _, _, view in missing):
+            alike = [key for key in missing if key[2].padded == shape]
             for start in range(0, len(alike), size):
                 known |= self._encode_minibatch(unit, {key: missing[key] for key in alike[start : start + size]})
         return [known[key] for key in keys]

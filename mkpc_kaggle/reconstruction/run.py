@@ -14,11 +14,10 @@ from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.matchers.contract import Matcher
 from mkpc_kaggle.pipeline.assembly import Assembly
 from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher, to_image
-from mkpc_kaggle.recipe import Recipe, load_recipe
+from mkpc_kaggle.recipe import Recipe, SceneConfig, load_recipe
 from mkpc_kaggle.reconstruction.folder import Dataset, Ends, pairs_of
 from mkpc_kaggle.reconstruction.outputs import Cameras
 from mkpc_kaggle.reconstruction.rotations import find_turns
-from mkpc_kaggle.scene.config import SceneConfig
 from mkpc_kaggle.scene.export import MODELS, Export
 from mkpc_kaggle.scene.reconstruct import models_of, reconstruct_sharing
 from mkpc_kaggle.scene.reconstruction import SfmModel

@@ -18,7 +18,7 @@ from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.data.images import Unreadable, printable, read_image
 from mkpc_kaggle.data.outputs import replacing
 from mkpc_kaggle.engine.budget import format_duration
-from mkpc_kaggle.engine.journal_tables import EventKind
+from mkpc_kaggle.engine.journal import EventKind
 from mkpc_kaggle.engine.records import SceneRecord
 from mkpc_kaggle.errors import writing
 from mkpc_kaggle.pipeline.two_stage import to_image
@@ -115,7 +115,8 @@ def _facts(log: RunLog) -> Iterator[tuple[str, str, str]]:
         least = f"median of a pair, at least {solved['inliers'].min()}"
         yield "inliers", f"{solved['inliers'].median():.0f}", least
     limit = f"of {format_duration(log.about.limit)}" if log.about.limit is not None else "no time limit"
-    yield "time", format_duration(log.seconds), limit + (f", session {log.sessions}" if log.sessions > 1 else "")
+    sessions = sum(event.kind == EventKind.START for event in log.events)
+    yield "time", format_duration(log.seconds), limit + (f", session {sessions}" if sessions > 1 else "")
     reasons = log.tables.regions["reason"].value_counts()
     if len(reasons):
         others = ", ".join(f"{count} {reason}" for reason, count in reasons.items())

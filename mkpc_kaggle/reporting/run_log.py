@@ -6,7 +6,7 @@ from functools import cached_property
 from pathlib import Path
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine.journal_tables import DRAWN, About, Event, EventKind, JournalReader, undamaged
+from mkpc_kaggle.engine.journal import MAX_DRAWN_PAIRS, About, Event, EventKind, JournalReader, undamaged
 from mkpc_kaggle.engine.records import PairRecord, SceneRecord
 from mkpc_kaggle.errors import writing
 from mkpc_kaggle.geometry.matches import Matches
@@ -54,11 +54,6 @@ class RunLog:
         return run_tables(self.pairs, self.records, self.events)
 
     @property
-    def sessions(self) -> int:
-        """How often the run was started."""
-        return sum(event.kind == EventKind.START for event in self.events)
-
-    @property
     def session(self) -> tuple[Event, ...]:
         """The events since the run was last started."""
         starts = [place for place, event in enumerate(self.events) if event.kind == EventKind.START]
@@ -91,7 +86,7 @@ def read_log(directory: Path) -> RunLog:
         records = tuple(known.get(index) or PairRecord.untouched(index) for index in range(len(pairs)))
         touched = sorted((record for record in records if record.units), key=lambda r: (r.inliers, r.index))
         units = {unit.name: unit for unit in recipe.units}
-        weakest = tuple(WeakPair(record, journal.results(record, units)) for record in touched[:DRAWN])
+        weakest = tuple(WeakPair(record, journal.results(record, units)) for record in touched[:MAX_DRAWN_PAIRS])
         digests = {"test set": str(belongs_to.get("test set", "")), **belongs_to.get("weights", {})}
         events, scenes = journal.events(), journal.scenes()
         return RunLog(journal.path, about, recipe, digests, pairs, records, events, weakest, scenes)

@@ -21,7 +21,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from mkpc_kaggle.geometry.cameras import Camera
-from mkpc_kaggle.scene.config import CameraModel, SceneConfig
+from mkpc_kaggle.recipe import CameraModel, SceneConfig
 from mkpc_kaggle.scene.export import DATABASE, MODELS
 from mkpc_kaggle.scene.keypoints import SceneKeypoints, scene_keypoints
 from mkpc_kaggle.scene.reconstruction import MIN_IMAGES, Reconstruction, RegisteredImage, SfmModel, filter_models

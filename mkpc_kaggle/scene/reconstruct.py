@@ -6,8 +6,8 @@ from pathlib import Path
 
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.geometry.robust import RobustConfig
+from mkpc_kaggle.recipe import SceneConfig
 from mkpc_kaggle.scene.choose import Choice, Reason, choose, estimate_at_known_focals
-from mkpc_kaggle.scene.config import SceneConfig
 from mkpc_kaggle.scene.export import Export
 from mkpc_kaggle.scene.reconstruction import MIN_IMAGES, Reconstruction, SfmModel
 from mkpc_kaggle.scene.shared_intrinsics import SharedIntrinsics, shared_intrinsics

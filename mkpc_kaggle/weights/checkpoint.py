@@ -1,13 +1,12 @@
 """Tensors from a checkpoint file, without running any code in it, and from there into a network."""
 
-import pickletools
 import re
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from pickle import UnpicklingError
 from tempfile import TemporaryDirectory
-from typing import IO, TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any
 
 from mkpc_kaggle.errors import UserError
 
@@ -16,8 +15,6 @@ if TYPE_CHECKING:
     from torch import nn
 
 MAX_EXPANSION = 4  # bytes of tensors for each byte of the file: some tensors share their bytes
-MAX_PICKLE_BYTES = 1 << 20  # 1,000 tensors take some 200 kB; a byte of pickle can become 200 in memory
-LEGACY_PICKLES = 5  # before torch 1.6 a file began with: magic number, protocol, system, contents, storage keys
 
 
 class Inert:
@@ -134,25 +131,9 @@ def _unpickle(path: Path) -> object:
     from torch.serialization import get_unsafe_globals_in_checkpoint, safe_globals
 
     if not zipfile.is_zipfile(path):
-        with path.open("rb") as stream:
-            for _ in range(LEGACY_PICKLES):
-                _require_small(stream)
         return torch.load(path, map_location="cpu", weights_only=True)
     with zipfile.ZipFile(path) as archive:
         if sum(record.file_size for record in archive.infolist()) > path.stat().st_size:
             raise ValueError("its records are compressed or overlap, which torch never writes")
-        for name in archive.namelist():
-            if name.endswith("data.pkl"):
-                with archive.open(name) as stream:
-                    _require_small(stream)
     with safe_globals([(Inert, name) for name in get_unsafe_globals_in_checkpoint(path)]):
         return torch.load(path, map_location="cpu", weights_only=True)
-
-
-def _require_small(stream: IO[bytes]) -> None:
-    """Raise ``ValueError`` if the next pickle would take all memory: if it is long, or makes a bytearray."""
-    for opcode, argument, position in pickletools.genops(stream):
-        if (position or 0) > MAX_PICKLE_BYTES:
-            raise ValueError(f"its pickle has more than {MAX_PICKLE_BYTES} bytes")
-        if opcode.name == "GLOBAL" and str(argument).endswith(" bytearray"):
-            raise ValueError("its pickle makes a bytearray, which may have any size")

@@ -1,4 +1,4 @@
-"""Images that are none, or are too much: the other pair must still have its F."""
+"""Images that cannot be read, or are too much: the other pair must still have its F."""
 
 import os
 import socket
@@ -70,7 +70,7 @@ ODD: dict[str, tuple[str, Callable[[], bytes]]] = {
     ),
     "wrong sums in a PNG": (".png", lambda: encoded(".png").replace(b"IDAT", b"IDAt")),
     "a palette without colours": (".png", lambda: png(64, 64, rows(64, 64), colour=3)),
-    "a TIFF of numbers that are none": (".png", lambda: encoded(".tiff", np.full((64, 64), np.nan, np.float32))),
+    "a TIFF of NaN": (".png", lambda: encoded(".tiff", np.full((64, 64), np.nan, np.float32))),
     "an HDR image by another name": (".png", lambda: encoded(".hdr", picture(0).astype(np.float32) * 1e30)),
     "a GIF of one pixel": (".jpg", lambda: b"GIF89a\1\0\1\0\0\0\0,\0\0\0\0\1\0\1\0\0\2\2D\1\0;"),
 }

@@ -1,4 +1,4 @@
-"""Places for the results that are none, or that hold what must not be lost."""
+"""Places where no result can be written, or that hold what must not be lost."""
 
 import os
 from collections.abc import Callable

@@ -17,7 +17,7 @@ RECIPES = {
     "a size of 10^9": UNIT.replace("200", "1000000000"),
     "a matcher nobody knows": UNIT.replace("sift", "foo"),
     "a matcher that is a path": UNIT.replace("sift", "../sift"),
-    "a matcher that is no matcher": UNIT.replace("sift", "registry"),
+    "a module that is not a matcher": UNIT.replace("sift", "registry"),
     "a key twice": UNIT + UNIT,
     "no features": UNIT + "[matchers.sift]\nfeatures = 0",
     "a ratio of NaN": UNIT + "[matchers.sift]\nratio = nan",
@@ -52,7 +52,7 @@ PLACES: dict[str, Callable[[Path], object]] = {
     "a directory": Path.mkdir,
     "a pipe": os.mkfifo,
     "a link to /dev/zero": lambda path: path.symlink_to("/dev/zero"),
-    "bytes that are no text": lambda path: path.write_bytes(b"\xff\xfe\x00"),
+    "bytes that are not text": lambda path: path.write_bytes(b"\xff\xfe\x00"),
     "a sparse file of 1 TB": sparse,
 }
 
@@ -64,24 +64,14 @@ FACTORS = "scene,scaling_factor\ns,1.5\n"
 VALIDATE = "validate --train-dir T --recipe quick.toml --workers 0 --no-scenes"
 SCORE = "validate --train-dir T --submission out/sub.csv --truth truth.csv"
 ARGUMENTS = {
-    "covisibility above one": "--min-covisibility 1.1",
     "covisibility of NaN": "--min-covisibility nan",
-    "no pairs a scene": "--pairs-per-scene 0",
-    "a scene nobody knows": "--scenes foo",
     "a scene above": "--scenes ../T",
-    "a unit nobody knows": "--units foo",
-    "no threshold": "--threshold 0",
     "a threshold of NaN": "--threshold nan",
-    "a method nobody knows": "--method foo",
     "a comparison with nothing": "--compare quick.toml foo",
-    "a comparison of units": "--compare quick.toml quick.toml --units 1:sift@200",
     "a submission without truth": "--submission out/sub.csv",
-    "truth without a submission": "--truth truth.csv",
-    "pairs beside the train side": "--pairs truth.csv",
     "figures in a directory": "--json out --pairs-per-scene 1",
     "figures in the table": "--json T/scaling_factors.csv --pairs-per-scene 1",
     "a file for the work directory": "--work-dir truth.csv",
-    "no time": "--time-limit 0",
 }
 TRAIN = {
     "scaling_factors.csv": {
@@ -111,8 +101,6 @@ PACKAGES = {
     "wheels that are a file": "--owner me --wheels quick.toml",
     "an empty directory of wheels": "--owner me --wheels home",
     "no Python": "--owner me --wheels home --python ''",
-    "an image nobody knows": "--owner me --wheels home --image foo",
-    "weights that are not there": "--owner me --wheels home --weights foo",
 }
 
 
@@ -151,7 +139,7 @@ def train_side(name: str = "", text: str = "", submission: str = "") -> Callable
 
 CASES = [
     *(
-        Case("recipes", name, SUBMIT, recipe(text), EITHER if name in VALID else REFUSED, seconds=120)
+        Case("recipes", name, SUBMIT, recipe(text), EITHER if name in VALID else REFUSED)
         for name, text in RECIPES.items()
     ),
     *(Case("recipes", name, SUBMIT, replaced(make), REFUSED) for name, make in PLACES.items()),
@@ -179,7 +167,7 @@ CASES = [
         for name, text in SUBMISSIONS.items()
     ),
     *(
-        Case("packages", name, f"package --out out/p {options}", statuses=REFUSED, seconds=180)
+        Case("packages", name, f"package --out out/p {options}", statuses=REFUSED)
         for name, options in PACKAGES.items()
     ),
 ]

@@ -1,4 +1,4 @@
-"""Weight files that would run code, take all memory, or are no tensors; and directories with them."""
+"""Weight files that would run code, take all memory, or hold no tensors; and directories with them."""
 
 import io
 import os
@@ -169,7 +169,7 @@ CASES = [
         for name, make in SEARCHED.items()
     ),
     *(
-        Case("weights", f"{file}, {name}: recipe auto", AUTO, listed(file, make), says=file, seconds=120)
+        Case("weights", f"{file}, {name}: recipe auto", AUTO, listed(file, make), says=file)
         for file in LISTED
         for name, make in SEARCHED.items()
     ),

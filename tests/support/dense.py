@@ -1,25 +1,17 @@
-"""What tests of DKM and RoMa share: all intermediate values of a match, and pictures as the network wants them."""
+"""What tests of DKM and RoMa share: the estimates of a match, and pictures as the network wants them."""
 
-import re
 from contextlib import contextmanager
 
 import numpy as np
 import pytest
 import torch
-from golden import Stage, recorded
+from golden import Stage
 
 from mkpc_kaggle.geometry.coordinates import Size, from_normalised
-from mkpc_kaggle.matchers.networks.dense_warp import DenseWarp
-from mkpc_kaggle.matchers.networks.gaussian_process import kernel
+from mkpc_kaggle.matchers.networks.dense_warp import DenseWarp, dense_warp
 from mkpc_kaggle.matchers.networks.pixels import MEAN, STD, network_input
-from mkpc_kaggle.matchers.networks.warp_refiner import local_correlation
 
-MODES = {  # of sampling, by the golden files' names: threshold, balanced
-    "threshold": (0.05, False),
-    "threshold_balanced": (0.05, True),
-    "raw": (1.0, False),
-    "balanced": (1.0, True),
-}
+MODES = {"threshold_balanced": 0.05, "balanced": 1.0}  # of sampling, by the golden files' names: the threshold
 
 
 @contextmanager
@@ -36,22 +28,17 @@ def one_thread():
 
 
 @contextmanager
-def recorded_refinement(decoder):
-    """What modules of the decoder got and gave, by name, and the estimate after each refiner."""
-    strides = decoder.conv_refiner.keys()
-    correct = decoder.correct
-    estimates = {f"estimate.{stride}": [] for stride in strides}
+def recorded_estimates(decoder):
+    """The estimates after each refiner, by stride, in the order of the calls."""
+    correct, estimates = decoder.correct, {stride: [] for stride in decoder.conv_refiner}
 
     def recording(estimate, query, support, stride):
-        estimates[f"estimate.{stride}"].append(correct(estimate, query, support, stride))
-        return estimates[f"estimate.{stride}"][-1]
+        estimates[str(stride)].append(correct(estimate, query, support, stride))
+        return estimates[str(stride)][-1]
 
     decoder.correct = recording
-    names = [f"gps.{stride}" for stride in decoder.gps]
-    names += ["embedding_decoder", *(f"conv_refiner.{stride}" for stride in strides)]
     try:
-        with recorded(decoder, names) as calls:
-            yield calls | estimates
+        yield estimates
     finally:
         del decoder.correct
 
@@ -59,67 +46,23 @@ def recorded_refinement(decoder):
 @one_thread()
 @torch.inference_mode()
 def computed(network, images, fine_images=(None, None), *, symmetric=True):
-    """All values on the way to a pair's match, in order: names of the golden files, "up_" in the second pass.
+    """Estimates at all strides and the final warp, by the names of the golden files; "up_" in the second pass.
 
     The directions are run one after the other; here they are one batch, as in the golden files.
     """
     features = [network.encode(*versions) for versions in zip(images, fine_images, strict=True)]
-    with recorded_refinement(network.decoder) as calls:
-        dense = side_by_side(network.match(*features, symmetric=symmetric))
-    values = encoded(network, images, 32) | coarse_values(network.decoder, calls)
-    passes = 1 if fine_images[0] is None else 2
-    values |= refiner_values(network.decoder, calls, 0, passes)
-    final = ""
-    if passes == 2:
-        final = "up_"
-        second = encoded(network, fine_images, 8) | refiner_values(network.decoder, calls, 1, passes)
-        values |= {f"up_{name}": value for name, value in second.items()}
-    return values | {f"{final}warp": dense.warp, f"{final}certainty": dense.certainty}
-
-
-def encoded(network, images, coarsest):
-    pyramids = [network.encoder(image, coarsest).levels for image in images]
-    return {f"enc{2**i}": torch.cat(levels) for i, levels in enumerate(zip(*pyramids, strict=True))}
-
-
-def coarse_values(decoder, calls):
-    """Projections, kernels, posteriors and first estimates at strides 32 and 16."""
+    with recorded_estimates(network.decoder) as estimates:
+        dense = side_by_side(network.match(*features) if symmetric else [dense_warp(*network.decoder(*features))])
+    passes = ("",) if fine_images[0] is None else ("", "up_")
     values = {}
-    for s in (32, 16):
-        query, support = joined(got[:2] for got, _ in calls[f"gps.{s}"])
-        flow, certainty, context = joined(
-            (e.flow, e.certainty, z) for (at, *_), (e, z) in calls["embedding_decoder"] if at == s
-        )
-        x, y = query.flatten(2).mT, support.flatten(2).mT
-        values |= {f"proj{s}_q": query, f"proj{s}_s": support}
-        values |= {f"pos{s}": decoder.gps[str(s)].embed_coordinates(support)[:, ::8]}
-        values |= {f"K{s}_yy": kernel(y, y), f"K{s}_xy": kernel(x, y)}
-        values |= {f"gp{s}": torch.cat([gave for _, gave in calls[f"gps.{s}"]])}
-        values |= {f"dfn{s}_flow": flow, f"dfn{s}_cert": certainty, f"dfn{s}_ctx": context}
-        if s == 32:
-            values |= {"flow32": flow, "cert32": certainty}
-    return values
-
-
-def refiner_values(decoder, calls, number, passes, certainty=0):
-    """Correlations, corrections and estimates of one of the passes; the second has no stride 16.
-
-    ``certainty``: its channel in the corrections.
-    """
-    values = {}
-    for s, refiner in decoder.conv_refiner.items():
-        if number and s == "16":
-            continue
-        every = 1 if s == "16" else passes
-        calls_of_pass = calls[f"conv_refiner.{s}"][number::every]
-        if refiner.radius is not None:
-            seen = [local_correlation(*got[:3], refiner.radius) for got, _ in calls_of_pass]
-            values[f"corr_r{refiner.radius}"] = torch.cat(seen)
-        corrections = torch.cat([gave for _, gave in calls_of_pass]).roll(-certainty, dims=1)
-        flow, logits = joined((e.flow, e.certainty) for e in calls[f"estimate.{s}"][number::every])
-        values |= {f"ref{s}_dcert": corrections[:, :1], f"ref{s}_disp": corrections[:, 1:]}
-        values |= {f"flow{s}": flow, f"cert{s}": logits}
-    return values
+    for number, prefix in enumerate(passes):
+        for stride, found in estimates.items():
+            if stride == "16" and prefix:
+                continue  # the second pass begins at stride 8
+            of_pass = found if stride == "16" else found[number :: len(passes)]
+            values[f"{prefix}flow{stride}"] = torch.cat([estimate.flow for estimate in of_pass])
+            values[f"{prefix}cert{stride}"] = torch.cat([estimate.certainty for estimate in of_pass])
+    return values | {f"{passes[-1]}warp": dense.warp, f"{passes[-1]}certainty": dense.certainty}
 
 
 def side_by_side(warps):
@@ -127,22 +70,11 @@ def side_by_side(warps):
     return DenseWarp(*(torch.cat([getattr(dense, part) for dense in warps], 2) for part in ("warp", "certainty")))
 
 
-def joined(calls):
-    return [torch.cat(parts) for parts in zip(*calls, strict=True)]
-
-
 def compared(values, golden, within):
-    """Stages in the order of the network for all arrays of a golden file that ``values`` has.
-
-    Of some batches the file has the first item only, of some maps each k-th channel: ``_chK``.
-    """
-    for name, value in values.items():
-        for key in golden:
-            reduced = re.fullmatch(rf"{name}(?:_ch(\d+))?", key)
-            if reduced:
-                step = int(reduced[1] or 1)
-                got = value[..., ::step] if value.ndim == 3 else value[:, ::step]
-                yield within(key, got[: len(golden[key])], golden[key])
+    """Stages for all values that the golden file has; of some batches it has the first item only."""
+    names = [name for name in values if name in golden]
+    assert any(name.endswith("warp") for name in names) and any(name.endswith("certainty") for name in names)
+    return [within(name, values[name][: len(golden[name])], golden[name]) for name in names]
 
 
 def within(name, got, expected, share=1e-4):

@@ -1,4 +1,4 @@
-"""A GPU that is none: tensors say ``cuda:N`` and are computed on the CPU; devices that meet raise, as on a GPU.
+"""A simulated GPU: tensors say ``cuda:N`` and are computed on the CPU; devices that meet raise, as on a GPU.
 
     with DeviceDouble(count=2):
         network.to("cuda:1")(image.to("cuda:1"))
@@ -126,7 +126,7 @@ class DeviceDouble(TorchDispatchMode):
         double = self
 
         class Generator(torch.Generator):
-            """One of a CPU, of which the double knows for which device it was made."""
+            """A generator of the CPU; the double knows for which device it was made."""
 
             def __new__(cls, device="cpu"):
                 made = super().__new__(cls, "cpu")

@@ -160,7 +160,7 @@ def scenes_by(
         monkeypatch.setattr(places, "SceneRunner", partial(ScenesBy, make))
     else:
         worker = partial(ThreadWorker, "scene", partial(ScenesBy, make))
-        monkeypatch.setattr(LocalSite, "scene_worker", lambda site: worker(site._ring))
+        monkeypatch.setattr(LocalSite, "scene_worker", lambda site: worker(site.ring))
 
 
 def choose_scene_for_all_but_the_first(job: SceneJob) -> SceneResult:

@@ -95,14 +95,6 @@ class Stage(NamedTuple):
 
 
 def assert_stages(stages: Iterable[Stage]):
-    """All stages within their tolerances; the message starts with the first one that is off."""
+    """All stages within their tolerances; the message starts with the first stage that is off."""
     off = [stage for stage in stages if stage.difference > stage.tolerance]
     assert not off, "; ".join(f"{stage.name} is off by {stage.difference:.2g}" for stage in off)
-
-
-def print_table(network, stages_of_cases):
-    """A markdown table of ``(case, stages)``."""
-    print("| network | case | stage | largest difference | tolerance |\n|---|---|---|---|---|")
-    for case, stages in stages_of_cases:
-        for stage in stages:
-            print(f"| {network} | {case} | {stage.name} | {stage.difference:.1e} | {stage.tolerance:.0e} |")

@@ -1,6 +1,6 @@
 """Stand-ins for Kaggle's images, environments with the packages that they have and none of ours; and its uploads.
 
-The quick one is made of this interpreter's packages; those of the table are installed from pip's index.
+The quick environment links this interpreter's packages; the table's are installed from pip's index.
 """
 
 import os

@@ -13,18 +13,12 @@ from kornia.feature import DISK, XFeat
 from torch import nn
 
 from mkpc_kaggle.geometry.coordinates import Box, Size, View
-from mkpc_kaggle.matchers import (
-    aliked_lightglue,
-    aspanformer,
-    disk_lightglue,
-    loftr,
-    quadtree,
-    xfeat_lighterglue,
-)
+from mkpc_kaggle.matchers import aliked_lightglue, aspanformer, disk_lightglue, loftr, quadtree, xfeat_lighterglue
 from mkpc_kaggle.matchers.aliked import AlikedMatcher, AlikedOptions
 from mkpc_kaggle.matchers.contract import Colour, MatcherSpec, Picture, Placement
+from mkpc_kaggle.matchers.dense import DenseOptions
 from mkpc_kaggle.matchers.disk_lightglue import disk_encoder
-from mkpc_kaggle.matchers.dkm import DkmMatcher, DkmOptions
+from mkpc_kaggle.matchers.dkm import DkmMatcher
 from mkpc_kaggle.matchers.lightglue import LightGlueMatcher, light_glue
 from mkpc_kaggle.matchers.loma import LomaAdapter, LomaOptions
 from mkpc_kaggle.matchers.networks.aliked import Aliked
@@ -79,7 +73,7 @@ def semi_dense_matcher(spec: MatcherSpec, make: Make, placement: Placement) -> S
 
 
 def dkm_matcher(placement: Placement, passes: int = 1, matches: int = 300) -> DkmMatcher:
-    return DkmMatcher(ours("dkm", DKM, placement), DkmOptions(passes, matches=matches), placement.device)
+    return DkmMatcher(ours("dkm", DKM, placement), DenseOptions(passes, matches=matches), placement.device)
 
 
 def roma_matcher(placement: Placement) -> RomaMatcher:

@@ -1,39 +1,16 @@
-"""What tests of LoMa share: all intermediate values of its networks, batched, by the golden files' names."""
+"""What tests of LoMa share: the results of its networks, batched, by the golden files' names."""
 
 import torch
 from golden import recorded
 
-from mkpc_kaggle.matchers.networks.assignment import mutual_matches
+from mkpc_kaggle.matchers.networks.layers import mutual_matches
 from mkpc_kaggle.matchers.networks.loma_matcher import LAYERS, log_scores
-
-
-def refined(decoder, levels):
-    """The values of every refiner, and the prediction after each but the last."""
-    values, prediction, context = {}, None, None
-    for stride in decoder.layers:
-        refiner, features = decoder.at(stride), levels.pop()
-        mixed = refiner.mixed(refiner.entry(features), context)
-        outputs = refiner.outputs(refiner.hidden(mixed))
-        values[f"block1_{stride}"] = mixed
-        values[f"delta_{stride}"] = outputs[:, : decoder.prediction]
-        values[f"context_{stride}"] = outputs[:, decoder.prediction :]
-        if stride != "1":
-            prediction, context = decoder.refined(int(stride), refiner.entry(features), prediction, context)
-            values[f"answer_{stride}"] = prediction
-    return values
-
-
-def encoded(levels, strides):
-    return {f"encoder_{stride}": level for stride, level in zip(strides, levels, strict=True)}
 
 
 @torch.inference_mode()
 def detector_values(detector, images, number):
-    logits = detector.logits(images)
-    levels = list(detector.levels(images))
-    values = encoded(levels, (1, 2, 4, 8)) | refined(detector.decoder, levels)
-    found = detector(images, number)
-    return values | {
+    logits, found = detector.logits(images), detector(images, number)
+    return {
         "score_map": logits,
         "dense_probs": logits.flatten(1).softmax(dim=1).view_as(logits),
         "keypoints": torch.stack([each.points for each in found]),
@@ -41,32 +18,15 @@ def detector_values(detector, images, number):
     }
 
 
-def features_of(encoder, images):
-    """The encoder's values, those of its vision transformer included if it has one, and its levels."""
-    if not hasattr(encoder, "frozen_dinov2"):
-        levels = list(encoder.levels(images))
-        return encoded(levels, (1, 2, 4, 8)), levels
-    last = len(encoder.frozen_dinov2["dinov2_vitl14"].blocks)
-    blocks = {
-        number: f"frozen_dinov2.dinov2_vitl14.blocks.{number - 1}" for number in (1, 2, 12, 24) if number <= last
-    }
-    with recorded(encoder, blocks.values()) as calls:
-        levels = list(encoder.levels(images))
-    values = {"vit_tokens": calls[blocks[1]][0][0][0]}
-    values |= {f"vit_block{number}": calls[block][0][1] for number, block in blocks.items()}
-    return values | encoded(levels, (1, 2, 4, 8, 14)), levels
-
-
 @torch.inference_mode()
 def descriptor_values(descriptor, images, points):
-    values, levels = features_of(descriptor.encoder, images)
-    values |= refined(descriptor.decoder, levels)
+    """At the points, and at every third pixel of the images."""
     height, width = images.shape[2:]
     rows, columns = ((2 * torch.arange(side) + 1) / side - 1 for side in (height, width))
-    pixels = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), dim=2).view(1, -1, 2)
-    dense = descriptor(images, pixels.expand(len(images), -1, -1))
-    return values | {
-        "dense_descriptors": dense.mT.unflatten(2, (height, width)),
+    pixels = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), dim=2)[::3, ::3]
+    dense = descriptor(images, pixels.reshape(1, -1, 2).expand(len(images), -1, -1))
+    return {
+        "dense_descriptors": dense.mT.unflatten(2, pixels.shape[:2])[:, ::32],
         "descriptors": descriptor(images, points),
     }
 
@@ -74,21 +34,12 @@ def descriptor_values(descriptor, images, points):
 @torch.inference_mode()
 def matcher_values(matcher, image0, image1, threshold):
     """Of a single pair, as a batch of one."""
-    names = ["input_proj", "transformers.0.self_attn", *(f"transformers.{index}" for index in (0, 4, 8))]
-    assignment = f"log_assignment.{LAYERS - 1}.final_proj"
-    with recorded(matcher, ["posenc", *names, assignment]) as calls:
+    last = f"transformers.{LAYERS - 1}"
+    with recorded(matcher, [last]) as calls:
         matcher(image0, image1, threshold)
-    n0 = len(image0.points)
-    rotation = calls["posenc"][0][1][:, 0, :n0].repeat_interleave(2, dim=2)
-    values = {"rotary_cos0": rotation.real, "rotary_sin0": rotation.imag}
-    files = ["input_proj", "layer1_self", "layer1", "layer5", "layer9", "final_proj"]
-    for name, call in zip(files, [*names, assignment], strict=True):
-        output = calls[call][0][1]
-        values |= {f"{name}_0": output[:, :n0], f"{name}_1": output[:, n0:]}
-    similarity = matcher.similarity(calls[f"transformers.{LAYERS - 1}"][0][1], n0)
+    similarity = matcher.similarity(calls[last][0][1], len(image0.points))
     scores = log_scores(similarity)
-    values |= {"similarity": similarity, "scores": scores.exp()}
-    return values | assignment_values(scores[0], threshold)
+    return {"similarity": similarity, "scores": scores.exp()} | assignment_values(scores[0], threshold)
 
 
 def assignment_values(log_scores, threshold, suffix=""):

@@ -32,7 +32,7 @@ OFFLINE = ("unshare", "--map-root-user", "--net")
 
 
 def no_namespaces() -> bool:
-    """Is there no way to a network namespace without interfaces?"""
+    """Whether this machine allows no network namespace without interfaces."""
     return shutil.which("unshare") is None or subprocess.run([*OFFLINE, "true"], check=False).returncode != 0
 
 
@@ -42,7 +42,7 @@ needs_namespaces = pytest.mark.skipif(no_namespaces(), reason="unshare --net is 
 def execute(
     notebook: Path, executed: Path, python: str | Path, working: Path, variables: Mapping[str, str]
 ) -> nbformat.NotebookNode:
-    """Run ``notebook`` in ``working`` under that interpreter; the executed one, which ``executed`` has too."""
+    """Run ``notebook`` in ``working`` under that interpreter; the executed notebook, also in ``executed``."""
     command = [*OFFLINE, str(python), "-c", EXECUTE, str(notebook), str(executed)]
     # Not under pytest's own directory: the path of a socket may have no more than 107 characters.
     with TemporaryDirectory(prefix="mkpc-") as runtime:

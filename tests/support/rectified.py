@@ -4,7 +4,6 @@ It sees every pair as rectified: a point of image 1 is the point of image 0 move
 [e_x]_x, and each match that it gives is an inlier.
 """
 
-import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -99,7 +98,6 @@ def run(
     return run_pairs(pairs, assembly, session, publish)
 
 
-def interrupt_after(seconds: float) -> Interrupt:
-    interrupt = Interrupt()
-    threading.Timer(seconds, interrupt.set).start()
-    return interrupt
+def matrices(report: RunReport) -> list[bytes]:
+    """Each pair's own F."""
+    return [record.pair_fundamental.tobytes() for record in report.records]

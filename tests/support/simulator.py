@@ -29,7 +29,7 @@ from mkpc_kaggle.engine.jobs import (
     SceneJob,
     SceneResult,
 )
-from mkpc_kaggle.engine.places import Place
+from mkpc_kaggle.engine.places import Place, Site
 from mkpc_kaggle.engine.plan import RESERVE_SHARE
 from mkpc_kaggle.engine.records import NOT_REACHED, PairRecord, SceneRecord, UnitRecord
 from mkpc_kaggle.engine.scenes import FORECAST_MARGIN, START_S
@@ -37,9 +37,8 @@ from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
 from mkpc_kaggle.pipeline.pair import UnitResult
-from mkpc_kaggle.recipe import Recipe, Unit
+from mkpc_kaggle.recipe import Recipe, SceneConfig, Unit
 from mkpc_kaggle.scene.choose import Choice, Reason
-from mkpc_kaggle.scene.config import SceneConfig
 
 RESTART_S = 8.0
 STALL = 20.0  # a unit that stalls takes so many times as long
@@ -146,8 +145,8 @@ class VirtualClock:
         return self.now
 
 
-class SimulatedSite:
-    """Workers that take their time on the virtual clock alone; see :class:`mkpc_kaggle.engine.places.Site`.
+class SimulatedSite(Site):
+    """Workers that take their time on the virtual clock alone.
 
     Of their seconds until ``stop``, ``kept`` went into jobs that came back in time. ``faults`` are what injected
     faults take whatever is planned: the unit that a crash cut short, of a hang as long as a stall might have
@@ -156,9 +155,8 @@ class SimulatedSite:
     was under way.
     """
 
-    scenes_at_once = 1
-
     def __init__(self, scenario: Scenario, clock: VirtualClock, stop: float) -> None:
+        super().__init__(clock)
         self.scenario = scenario
         self.clock = clock
         self.stop = stop
@@ -170,14 +168,7 @@ class SimulatedSite:
         self.places = [
             Place(f"place {number}", lambda: SimulatedWorker(self)) for number in range(scenario.workers)
         ]
-        self.fallback: list[Place] = []
         self._scene_rng = np.random.default_rng([scenario.seed, 1])
-
-    def open(self) -> None:
-        pass
-
-    def close(self) -> None:
-        pass
 
     def scene_worker(self) -> "SimulatedScene":
         self.scenes.append(SimulatedScene(self, self._scene_rng))
@@ -202,15 +193,29 @@ class SimulatedSite:
         return seconds
 
 
-class SimulatedWorker:
-    """A matching worker: its answer is drawn when a job is submitted, and given when its time has come."""
+class Simulated:
+    """A worker whose answer is drawn when a job is submitted, and given when its time has come."""
 
     def __init__(self, site: SimulatedSite) -> None:
-        self.job: Job | None = None
         self.ready = math.inf
         self._site = site
-        self._warm: set[str] = set()
         self._answer: Answer | None = None
+
+    def answer(self) -> Answer | None:
+        if self._answer is None or self._site.clock.now < self.ready:
+            return None
+        answer, self._answer, self.ready = self._answer, None, math.inf
+        self.on_taken(answer)
+        return answer
+
+
+class SimulatedWorker(Simulated):
+    """A matching worker."""
+
+    def __init__(self, site: SimulatedSite) -> None:
+        super().__init__(site)
+        self.job: Job | None = None
+        self._warm: set[str] = set()
 
     def start(self) -> None:
         self._site.workers.add(self)
@@ -229,15 +234,11 @@ class SimulatedWorker:
         else:
             self._kept = max(0.0, min(self.ready, self._site.stop) - now)
 
-    def answer(self) -> Answer | None:
-        if self._answer is None or self._site.clock.now < self.ready:
-            return None
-        answer, self._answer, self.ready = self._answer, None, math.inf
+    def on_taken(self, answer: Answer) -> None:
         if isinstance(answer, MatchResult):
             self._site.kept += self._kept
             self._site.last_job = self._site.clock.now
         self.job = None
-        return answer
 
     def kill(self) -> None:
         self._site.workers.discard(self)
@@ -281,16 +282,15 @@ def _outcome(index: int, known: tuple[UnitResult, ...], found: list[UnitResult])
     return Outcome(record, tuple(found))
 
 
-class SimulatedScene:
+class SimulatedScene(Simulated):
     """A worker for one batch; ``seen`` is when somebody took its answer, ``is_over`` that it was killed."""
 
     def __init__(self, site: SimulatedSite, rng: np.random.Generator) -> None:
+        super().__init__(site)
         self.batch = ""
         self.begun = self.seconds = self.seen = 0.0
         self.is_over = self.is_faulty = False
-        self.ready = math.inf
-        self._site, self._rng = site, rng
-        self._answer: Answer | None = None
+        self._rng = rng
 
     def start(self) -> None:
         self._answer, self.ready = Loaded(), self._site.clock.now
@@ -311,12 +311,8 @@ class SimulatedScene:
             self.seconds *= (0.5, 0.3, math.inf)[rng.integers(3)]
         self.ready = self.begun + self.seconds
 
-    def answer(self) -> Answer | None:
-        if self._answer is None or self._site.clock.now < self.ready:
-            return None
-        answer, self._answer, self.ready = self._answer, None, math.inf
+    def on_taken(self, answer: Answer) -> None:
         self.seen = self._site.clock.now
-        return answer
 
     def kill(self) -> None:
         self.is_over = True

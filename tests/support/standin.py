@@ -60,8 +60,7 @@ STAND_INS = {
     "disk": StandIn(2.0),
     "xfeat": StandIn(2.0),
     "lightglue": StandIn(
-        1.0,
-        {"input_proj.weight": 16.0, "transformers.*.ffn.3.*": 0.1, "log_assignment.*.final_proj.weight": 4.0},
+        1.0, {"input_proj.weight": 16.0, "transformers.*.ffn.3.*": 0.1, "log_assignment.*.final_proj.weight": 4.0}
     ),
     "roma": StandIn(
         1.5,
@@ -75,10 +74,7 @@ STAND_INS = {
     ),
     "dkm": StandIn(
         1.5,
-        {
-            "decoder.embedding_decoder.terminal_module.*.weight": 2.0,
-            "decoder.conv_refiner.*.out_conv.weight": 2.0,
-        },
+        {"decoder.embedding_decoder.terminal_module.*.weight": 2.0, "decoder.conv_refiner.*.out_conv.weight": 2.0},
     ),
     "loma": StandIn(
         2.0,

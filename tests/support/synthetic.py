@@ -11,8 +11,7 @@ from rectified import RectifiedMatcher, Seen
 from benchmarks.synthetic_scene import SIZE, SyntheticScene, synthetic_scene
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.recipe import Recipe, Unit
-from mkpc_kaggle.scene.config import SceneConfig
+from mkpc_kaggle.recipe import Recipe, SceneConfig, Unit
 
 DARKEST, STEP = 10, 10  # the brightness of the first image, and by how much each next image is brighter
 RECIPE = Recipe((Unit(1, "synthetic", SIZE.width),), scene=SceneConfig())

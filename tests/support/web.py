@@ -1,4 +1,4 @@
-"""A local HTTP server that serves one file as a good server does, or as bad ones do."""
+"""A local HTTP server that serves one file as a good server does, or as bad servers do."""
 
 import re
 import threading

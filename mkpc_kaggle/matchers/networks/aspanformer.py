@@ -1,15 +1,260 @@
 """ASpanFormer (Chen et al., "Detector-Free Image Matching with Adaptive Span Transformer", 2022)."""
 
+from dataclasses import dataclass, replace
+
 import torch
 from torch import Tensor, nn
+from torch.nn import functional
 
-from mkpc_kaggle.matchers.networks.aspan_transformer import AspanTransformer, Side
+from mkpc_kaggle.matchers.networks.adaptive_span import MASKED, adaptive_span, sample_usable, span_attention
 from mkpc_kaggle.matchers.networks.fine_matching import COARSE_STRIDE
-from mkpc_kaggle.matchers.networks.grids import as_grid
+from mkpc_kaggle.matchers.networks.grids import (
+    Perceptron,
+    as_grid,
+    as_map,
+    mask_valid,
+    mean_pool,
+    pointwise,
+    softmax_attention,
+)
+from mkpc_kaggle.matchers.networks.layers import ExactConv1d
 from mkpc_kaggle.matchers.networks.linear_attention import Masks
 from mkpc_kaggle.matchers.networks.position import FIXED_DECAY, sine_positions
 from mkpc_kaggle.matchers.networks.resnet_fpn import TOP
 from mkpc_kaggle.matchers.networks.semi_dense import SemiDenseNetwork
+
+HEADS = 8
+FLOW = 128  # channels of the flow feature, and of the projected positions
+INITIAL_LAYERS, BLOCKS = 2, 4
+RADIUS = 5.0  # of the spans, in deviations of the flow
+SPAN_LEVELS = (2, 1)  # half and full resolution of the coarse map
+
+Factor = tuple[int, int]  # of pooling, (rows, columns)
+
+
+@dataclass(frozen=True, eq=False)
+class Side:
+    """One image in the coarse transformer: ``visual`` (N, h, w, 256), ``flow`` (N, h, w, 128), its projected
+    ``positions`` (1, h, w, 128), the pooling ``factor`` of its global level, ``mask`` (N, h, w) bool or None.
+    """
+
+    visual: Tensor
+    flow: Tensor
+    positions: Tensor
+    factor: Factor
+    mask: Tensor | None
+
+    def values(self, projection: nn.Conv1d) -> Tensor:
+        """(N, h, w, 256): the projection of the visual feature and the positions."""
+        positions = self.positions.expand(len(self.visual), -1, -1, -1)
+        return pointwise(projection, torch.cat([self.visual, positions], dim=-1))
+
+    @property
+    def pooled_mask(self) -> Tensor | None:
+        """(N, cells of the global level)."""
+        return None if self.mask is None else mask_valid(self.mask, self.factor).flatten(1)
+
+
+class ChannelNorm(nn.Module):
+    """Layer norm with the unbiased deviation, and the epsilon added to it rather than to the variance."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.affine = nn.Parameter(torch.ones(width))
+        self.bias = nn.Parameter(torch.zeros(width))
+
+    def forward(self, x: Tensor) -> Tensor:
+        deviation, mean = torch.std_mean(x, dim=-1, keepdim=True)
+        return torch.addcmul(self.bias, (x - mean).div_(deviation.add_(1e-6)), self.affine)
+
+
+def global_attention(
+    q: Tensor, k: Tensor, v: Tensor, temperature: Tensor | float, masks: tuple[Tensor | None, Tensor | None]
+) -> Tensor:
+    """Grids (N, h, w, C) of queries, (N, h_key, w_key, C) of keys and values -> (N, h, w, C).
+
+    A masked query gets the mean of all values, as published.
+    """
+    queries, keys, values = (
+        x.flatten(1, 2).view(len(x), -1, HEADS, x.shape[3] // HEADS).transpose(1, 2) for x in (q, k, v)
+    )  # (N, heads, cells, D)
+    logits = queries @ keys.transpose(2, 3) * (temperature * queries.shape[3] ** -0.5)  # (N, heads, L, S)
+    if masks[0] is not None and masks[1] is not None:
+        valid = masks[0][:, None, :, None] & masks[1][:, None, None, :]
+        logits.masked_fill_(~valid, MASKED)
+    return softmax_attention(logits, values).transpose(1, 2).reshape(q.shape)
+
+
+class InitialLayer(nn.Module):
+    """Updates the pooled features of an image from those of the other one."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.q_proj = nn.Conv1d(TOP, TOP, 1, bias=False)
+        self.k_proj = nn.Conv1d(TOP, TOP, 1, bias=False)
+        self.v_proj = nn.Conv1d(TOP + FLOW, TOP, 1, bias=False)
+        self.merge_head = nn.Conv1d(TOP, TOP, 1, bias=False)
+        self.merge_f = Perceptron(
+            nn.Conv2d(2 * TOP, 2 * TOP, 1, bias=False), nn.Conv2d(2 * TOP, TOP, 1, bias=False)
+        )
+        self.norm1 = ChannelNorm(TOP)
+        self.norm2 = ChannelNorm(TOP)
+
+    def forward(self, own: Side, other: Side) -> Tensor:
+        """The new visual feature of ``own`` (N, rows, columns, 256); both sides are pooled to the global level."""
+        message = global_attention(
+            pointwise(self.q_proj, own.visual),
+            pointwise(self.k_proj, other.visual),
+            other.values(self.v_proj),
+            1.0,
+            (own.pooled_mask, other.pooled_mask),
+        )
+        message = self.norm1(pointwise(self.merge_head, message))
+        update: Tensor = self.norm2(self.merge_f(torch.cat([own.visual, message], dim=-1)))
+        return update.add_(own.visual)
+
+
+class InitialStage(nn.Module):
+    """Cross attention at the global level, which starts the flow feature."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.layers_coarse = nn.ModuleList(InitialLayer() for _ in range(INITIAL_LAYERS))
+        self.decoupler = nn.Conv2d(TOP, TOP + FLOW, 1)
+        self.up_merge = nn.Conv2d(2 * TOP, TOP, 1)
+
+    def forward(self, side0: Side, side1: Side) -> tuple[Side, Side]:
+        pooled0, pooled1 = _pooled(side0), _pooled(side1)
+        for layer in self.layers_coarse:
+            visual0, visual1 = layer(pooled0, pooled1), layer(pooled1, pooled0)
+            pooled0, pooled1 = replace(pooled0, visual=visual0), replace(pooled1, visual=visual1)
+        return self._enlarged(side0, pooled0.visual), self._enlarged(side1, pooled1.visual)
+
+    def _enlarged(self, side: Side, pooled: Tensor) -> Side:
+        decoupled = as_map(pointwise(self.decoupler, pooled))
+        size = side.visual.shape[1:3]
+        large = as_grid(functional.interpolate(decoupled, size=size, mode="bilinear", align_corners=False))
+        visual, flow = torch.split(large, [TOP, FLOW], dim=-1)
+        added = pointwise(self.up_merge, torch.cat([side.visual, visual], dim=-1))
+        return replace(side, visual=added.add_(side.visual), flow=flow)
+
+
+def _pooled(side: Side) -> Side:
+    """At the global level; the mask stays, for it is pooled where it is used."""
+    visual, positions = mean_pool(side.visual, side.factor), mean_pool(side.positions, side.factor)
+    return replace(side, visual=visual, positions=positions)
+
+
+class HierarchicalAttention(nn.Module):
+    """Messages of the global level and of the two adaptive-span levels, merged."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.temp = nn.Parameter(torch.ones(()))
+        self.merge_head = Perceptron(nn.Conv1d(3 * TOP, TOP, 1, bias=False), nn.Conv1d(TOP, TOP, 1, bias=False))
+
+    def forward(self, q: Tensor, k: Tensor, v: Tensor, flow: Tensor, own: Side, other: Side) -> Tensor:
+        """Queries of ``own``, keys and values of ``other``, and the flow of ``own`` -> message (N, h, w, 256)."""
+        coarse, half, full = self.messages(q, k, v, flow, own, other)
+        h, w = q.shape[1:3]
+        stacked = torch.cat([_repeated(coarse, h, w), _repeated(half, h, w), full], dim=-1)
+        merged: Tensor = self.merge_head(stacked)
+        return merged
+
+    def messages(
+        self, q: Tensor, k: Tensor, v: Tensor, flow: Tensor, own: Side, other: Side
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Of the global level (N, h / rows, w / columns, 256), of half (N, h/2, w/2, 256) and of full size."""
+        coarse = global_attention(
+            mean_pool(q, own.factor),
+            mean_pool(k, other.factor),
+            mean_pool(v, other.factor),
+            self.temp,
+            (own.pooled_mask, other.pooled_mask),
+        )
+        half, full = (self._span_level(q, k, v, flow, factor, own.mask) for factor in SPAN_LEVELS)
+        return coarse, half, full
+
+    def _span_level(
+        self, q: Tensor, k: Tensor, v: Tensor, flow: Tensor, factor: int, mask: Tensor | None
+    ) -> Tensor:
+        q, k, v = mean_pool(q, factor), mean_pool(k, factor), mean_pool(v, factor)
+        samples = adaptive_span(flow, RADIUS, factor).samples()
+        usable = None if mask is None else sample_usable(samples, mask, (k.shape[1], k.shape[2]), factor)
+        return span_attention(q, k, v, samples, HEADS, usable)
+
+
+def _repeated(grid: Tensor, height: int, width: int) -> Tensor:
+    """Nearest neighbours at a whole multiple of the size."""
+    return as_grid(functional.interpolate(as_map(grid), size=(height, width), mode="nearest"))
+
+
+class AspanBlock(nn.Module):
+    """Decodes the flow, and updates both features of an image along it; the last block the visual one alone."""
+
+    def __init__(self, last: bool) -> None:
+        super().__init__()
+        width = TOP if last else TOP + FLOW
+        self.last = last
+        self.flow_decoder = Perceptron(
+            ExactConv1d(FLOW, FLOW // 2, 1, bias=False), ExactConv1d(FLOW // 2, 4, 1, bias=False)
+        )
+        self.attention = HierarchicalAttention()
+        self.q_proj = nn.Conv1d(TOP, TOP, 1, bias=False)
+        self.k_proj = nn.Conv1d(TOP, TOP, 1, bias=False)
+        self.v_proj = nn.Conv1d(TOP + FLOW, TOP, 1, bias=False)
+        self.merge_f = Perceptron(
+            nn.Conv2d(width + TOP, TOP + FLOW, 1, bias=False),
+            nn.Conv2d(TOP + FLOW, width, 3, padding=1, bias=False),
+        )
+        self.norm1 = ChannelNorm(TOP)
+        self.norm2 = ChannelNorm(width)
+
+    def decode_flow(self, own: Side, other: Side) -> Tensor:
+        """(N, h, w, 4): target (x, y) in coarse cells of ``other`` from its corner, log-variances (x, y)."""
+        raw = self.flow_decoder(own.flow)
+        size = raw.new_tensor([other.visual.shape[2], other.visual.shape[1]])
+        return torch.cat([raw[..., :2].sigmoid() * size, raw[..., 2:]], dim=-1)
+
+    def forward(self, own: Side, other: Side) -> Side:
+        """``own``, updated."""
+        message = self.attention(
+            pointwise(self.q_proj, own.visual),
+            pointwise(self.k_proj, other.visual),
+            other.values(self.v_proj),
+            self.decode_flow(own, other),
+            own,
+            other,
+        )
+        both = own.visual if self.last else torch.cat([own.visual, own.flow], dim=-1)
+        merged = self.merge_f(torch.cat([both, self.norm1(message)], dim=-1))
+        updated = self.norm2(merged).add_(both)
+        flow = own.flow if self.last else updated[..., TOP:]
+        return replace(own, visual=updated[..., :TOP], flow=flow)
+
+
+class AspanTransformer(nn.Module):
+    """The coarse transformer; every layer updates both images at once."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.pos_transform = nn.Conv2d(TOP, FLOW, 1, bias=False)
+        self.ini_layer = InitialStage()
+        self.layers = nn.ModuleList(AspanBlock(last=index == BLOCKS - 1) for index in range(BLOCKS))
+        # The 3x3 convolutions lie in memory as the grids they see.
+        self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # missing in torch's stubs
+
+    def project(self, positions: Tensor) -> Tensor:
+        """Encoded positions (1, h, w, 256) -> (1, h, w, 128), as values need them."""
+        return pointwise(self.pos_transform, positions)
+
+    def forward(self, side0: Side, side1: Side) -> tuple[Tensor, Tensor]:
+        """-> the visual features of both, (N, h, w, 256)."""
+        side0, side1 = self.ini_layer(side0, side1)
+        for block in self.layers:
+            side0, side1 = block(side0, side1), block(side1, side0)
+        return side0.visual, side1.visual
+
 
 POOLING = (4, 4)  # rows and columns of the coarse map that are a cell of the global level
 

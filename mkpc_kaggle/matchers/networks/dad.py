@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mkpc_kaggle.matchers.dtypes import check_finite
-from mkpc_kaggle.matchers.networks.dedode_decoder import DedodeDecoder, resize
+from mkpc_kaggle.matchers.networks.dedode import DedodeDecoder, resize
 from mkpc_kaggle.matchers.networks.pixels import MEAN, STD
 from mkpc_kaggle.matchers.networks.superpoint import window_maximum
 from mkpc_kaggle.matchers.networks.vgg import VGG11, Vgg

@@ -26,23 +26,20 @@ def sample_matches(
     number: int,
     threshold: float = 0.05,
     *,
-    balanced: bool = True,
     generator: Generator | None = None,
 ) -> SampledMatches:
     """Draws at most ``number`` matches from a warp (N, 4) with its certainty (N,).
 
-    Certainties above ``threshold`` count as 1. ``balanced``: matches are spread evenly over the images.
-    Fewer than ``number`` where fewer have any weight, none at all being legal; ValueError where a certainty is not
-    finite. ``generator`` (on the tensors' device; default: PyTorch's) fixes the result, which is also that of
-    ``torch.multinomial`` for the same draws.
+    Certainties above ``threshold`` count as 1. Fewer than ``number`` where fewer have any weight, or none.
+    ``generator`` (on the tensors' device; default: PyTorch's) fixes the result. ValueError unless certainties are
+    finite.
     """
     weights = certainty.masked_fill(certainty > threshold, 1)
     if not weights.isfinite().all():
         raise ValueError("certainties must be finite")
-    index = draw(weights, noise_like(weights, generator), number * (OVERSAMPLING if balanced else 1))
-    if balanced:
-        evenness = balancing_weights(density(warp[index]))
-        index = index[draw(evenness, noise_like(evenness, generator), number)]
+    index = draw(weights, noise_like(weights, generator), number * OVERSAMPLING)
+    evenness = balancing_weights(density(warp[index]))
+    index = index[draw(evenness, noise_like(evenness, generator), number)]
     return SampledMatches(warp[index], index)
 
 

@@ -1,13 +1,17 @@
-"""Linear maps and attention, fast on CPUs; for inference only.
+"""Linear maps, attention, convolutions in strips and mutual matches, fast on CPUs; for inference only.
 
 A weight may be kept in half precision (see ``placement``): the product is then taken in it, and a linear map's
 result has its input's precision again.
 """
 
+from collections.abc import Callable
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+STRIP_FLOATS = 2**21  # of a strip of :func:`in_strips`, where it has most channels
 IMAGES = 16  # on one thread PyTorch takes oneDNN's convolution from this batch size on
 
 
@@ -55,3 +59,48 @@ def attention(q: Tensor, k: Tensor, v: Tensor, precision: torch.dtype) -> Tensor
     """
     queries, keys, values = (x.to(precision) for x in (q, k, v))
     return functional.scaled_dot_product_attention(queries, keys, values).to(q.dtype)
+
+
+def in_strips(function: Callable[[Tensor], Tensor], x: Tensor, *, reach: int, channels: int) -> Tensor:
+    """``function(x)``, a map (B, C', H, W) from (B, C, H, W), on a CPU by strips of rows that fit its cache.
+
+    A row of the result depends on ``reach`` rows above and below it; ``channels`` are the most that maps inside
+    the function have. The function must not change its argument. Strips overlap by the reach, and the zeros that
+    convolutions add at a strip's edges do not get further.
+    """
+    batch, _, height, width = x.shape
+    rows = max(4 * reach, STRIP_FLOATS // (batch * channels * width))
+    if x.is_cuda or rows >= height:
+        return function(x)
+    result = None
+    for top in range(0, height, rows):
+        bottom, first = min(top + rows, height), max(0, top - reach)
+        strip = function(x[:, :, first : bottom + reach])[:, :, top - first : bottom - first]
+        if result is None:
+            shape = (batch, strip.shape[1], height, width)
+            result = strip.new_empty(shape).contiguous(memory_format=torch.channels_last)
+        result[:, :, top:bottom] = strip
+    assert result is not None
+    return result
+
+
+@dataclass(frozen=True, eq=False)
+class Assignment:
+    """M matches by ascending ``index0``: keypoints ``index0``, ``index1`` (M,) int64, ``scores`` (M,) in 0..1."""
+
+    index0: Tensor
+    index1: Tensor
+    scores: Tensor
+
+    @classmethod
+    def empty(cls, device: torch.device) -> "Assignment":
+        index = torch.zeros(0, dtype=torch.int64, device=device)
+        return cls(index, index, torch.zeros(0, device=device))
+
+
+def mutual_matches(log_scores: Tensor, threshold: float) -> Assignment:
+    """Pairs of keypoints that are each other's best in (N0, N1) logarithms, scored above the threshold."""
+    (best0, partner0), partner1 = log_scores.max(dim=1), log_scores.argmax(dim=0)  # (N0,) twice, (N1,)
+    index0, scores = torch.arange(len(partner0), device=log_scores.device), best0.exp()
+    kept = (partner1[partner0] == index0) & (scores > threshold)
+    return Assignment(index0[kept], partner0[kept], scores[kept])

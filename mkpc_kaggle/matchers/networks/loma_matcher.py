@@ -10,8 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from mkpc_kaggle.matchers.dtypes import check_finite
-from mkpc_kaggle.matchers.networks.assignment import Assignment, mutual_matches
-from mkpc_kaggle.matchers.networks.layers import Linear, attention
+from mkpc_kaggle.matchers.networks.layers import Assignment, Linear, attention, mutual_matches
 
 HEAD = 64  # channels of an attention head
 LAYERS = 9

@@ -13,12 +13,17 @@ from math import sqrt
 import torch
 from torch import Tensor, nn
 
-from mkpc_kaggle.matchers.networks.dense_warp import DenseFeatures, DenseNetwork, Pyramid, WarpDecoder
-from mkpc_kaggle.matchers.networks.dinov2 import DinoV2, DinoV2Config
-from mkpc_kaggle.matchers.networks.gaussian_process import GaussianProcess, tokens
+from mkpc_kaggle.matchers.networks.dense_warp import (
+    DenseFeatures,
+    DenseNetwork,
+    GaussianProcess,
+    Pyramid,
+    WarpDecoder,
+    tokens,
+)
+from mkpc_kaggle.matchers.networks.dinov2 import DinoV2, DinoV2Config, VitBlock
 from mkpc_kaggle.matchers.networks.grids import as_grid
 from mkpc_kaggle.matchers.networks.layers import ExactLinear
-from mkpc_kaggle.matchers.networks.transformer_block import VitBlock
 from mkpc_kaggle.matchers.networks.vgg import VGG19, WIDTHS, Vgg
 from mkpc_kaggle.matchers.networks.warp_refiner import (
     SHAPES,

@@ -15,8 +15,7 @@ from torch import Tensor, nn
 
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.matchers.dtypes import check_finite
-from mkpc_kaggle.matchers.networks.assignment import Assignment, mutual_matches
-from mkpc_kaggle.matchers.networks.layers import attention, linear
+from mkpc_kaggle.matchers.networks.layers import Assignment, attention, linear, mutual_matches
 from mkpc_kaggle.matchers.networks.superpoint import SuperPointKeypoints
 
 CHANNELS = 256

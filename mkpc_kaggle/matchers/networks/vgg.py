@@ -10,7 +10,7 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
-from mkpc_kaggle.matchers.networks.strips import in_strips
+from mkpc_kaggle.matchers.networks.layers import in_strips
 
 WIDTHS = (64, 128, 256, 512)  # channels at strides 1, 2, 4 and 8
 VGG11, VGG19 = (1, 1, 2, 2), (2, 2, 4, 4)  # convolutions at each of these strides
