@@ -112,16 +112,15 @@ def fitting(source: Points, target: Points, threshold: float) -> int:
 
     Similarities are those of triplets; the best of them is fitted anew to the points that agree with it.
     """
-    best = 0
-    for part in np.array_split(triplets := _triplets(len(source)), max(1, len(triplets) // 2000)):
-        inside = _distances(*similarities(source[part], target[part]), source, target) < threshold
-        agreeing = inside[inside.sum(axis=1).argmax()]
-        for _ in range(REFINEMENTS):
-            best = max(best, int(agreeing.sum()))
-            if agreeing.sum() < FREE:
-                break
-            refined = similarities(source[None, agreeing], target[None, agreeing])
-            agreeing = _distances(*refined, source, target)[0] < threshold
+    triplets, best = _triplets(len(source)), 0
+    inside = _distances(*similarities(source[triplets], target[triplets]), source, target) < threshold
+    agreeing = inside[inside.sum(axis=1).argmax()]
+    for _ in range(REFINEMENTS):
+        best = max(best, int(agreeing.sum()))
+        if agreeing.sum() < FREE:
+            break
+        refined = similarities(source[None, agreeing], target[None, agreeing])
+        agreeing = _distances(*refined, source, target)[0] < threshold
     return best
 
 
