@@ -49,7 +49,7 @@ class Unit:
     def __post_init__(self) -> None:
         check_ranges(self, stage=Range(1, 2), long_side=Range(0, MAX_SIDE_PX), max_matches=AT_LEAST_1)
         if bool(self.long_side) == bool(self.area):
-            raise ValueError("either long_side or area must be given")
+            raise ValueError("either long_side or area must be given, and not both")
         if self.area and not AREA.fullmatch(self.area):
             raise ValueError(f'area must be height x width such as "540x720", not {self.area!r}')
         if self.stretch and not self.area:

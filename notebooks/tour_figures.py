@@ -73,7 +73,7 @@ def draw_stage(images: Images, match: PairMatch, stage: int) -> "Figure":
     shift0, shift1 = (np.array([box.left, box.top], np.float32) for box in boxes)
     found = match.matches[mask]
     drawn = connect(row, Matches(found.points0 - shift0, found.points1 - shift1, found.scores), inliers)
-    what = "on the crops" if any(region.cropped for region in regions or ()) else "on the whole images"
+    what = "on the crops" if any(region.reason == "cropped" for region in regions or ()) else "on the whole images"
     counts = f"{len(found)} matches, {np.count_nonzero(inliers)} inliers"
     _title(row[0], f"stage {stage}, {what}: {counts}; {drawn}")
     return figure
@@ -155,7 +155,7 @@ def draw_views(images: Images, regions: tuple[CriticalRegion, CriticalRegion], u
     views = [unit.view(box, 1) for box in boxes]
     pictures = [Image("", view.render(images[place // 2].pixels)) for place, view in enumerate(views)]
     figure, row = side_by_side(pictures, title_lines=2)
-    names = [("whole", f"crop ({region.reason})" if not region.cropped else "crop") for region in regions]
+    names = [("whole", f"crop ({region.reason})" if region.reason != "cropped" else "crop") for region in regions]
     for place, (axes, view, what) in enumerate(zip(row, views, [*names[0], *names[1]], strict=True)):
         _title(axes, f"image {place // 2}, {what}\n{view.scale[0]:.2f} times enlarged")
     return figure

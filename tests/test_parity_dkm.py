@@ -1,4 +1,4 @@
-"""DKM stage by stage against its golden vectors."""
+"""DKM against its golden vectors: the estimates at every stride, and the warp."""
 
 import json
 from functools import cache
@@ -88,9 +88,9 @@ def sampling_stages():
     golden, dense = golden_arrays("dkm", "sampling"), golden_arrays("dkm", "main")
     number = int(golden["num"])
     warp, certainty = dense["warp"].reshape(-1, 4), dense["certainty"].flatten()
-    for mode, (threshold, balanced) in MODES.items():
+    for mode, threshold in MODES.items():
         generator = torch.Generator().manual_seed(int(golden["seed"]))
-        found = sample_matches(warp, certainty, number, threshold, balanced=balanced, generator=generator)
+        found = sample_matches(warp, certainty, number, threshold, generator=generator)
         weights = certainty.masked_fill(certainty > threshold, 1)
         yield Stage(f"{mode}__matches", found.matches, golden[f"{mode}__matches"])
         yield within(f"{mode}__certainty", weights[found.index], golden[f"{mode}__certainty"])

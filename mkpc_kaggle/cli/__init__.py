@@ -1,12 +1,17 @@
 """The command line: ``python -m mkpc_kaggle COMMAND`` and ``make_submission.py``."""
 
+import argparse
+import errno
 import os
 import sys
+import time
+import warnings
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NoReturn
+from importlib import import_module
+from io import TextIOWrapper
+from typing import NoReturn
 
-if TYPE_CHECKING:
-    import argparse
+from mkpc_kaggle import __version__
 
 COMMANDS = {
     "submit": "a test directory -> submission.csv",
@@ -41,11 +46,6 @@ def main(arguments: Sequence[str] | None = None, *, started: float | None = None
 
     141: the reader of the output closed the pipe. The time limit counts from ``started``; default: now.
     """
-    import errno
-    import time
-    import warnings
-    from io import TextIOWrapper
-
     from mkpc_kaggle.engine.console import complain, warn
     from mkpc_kaggle.errors import UserError
 
@@ -74,13 +74,8 @@ def main(arguments: Sequence[str] | None = None, *, started: float | None = None
             return EXIT_BAD_INPUT
 
 
-def make_parser(arguments: Sequence[str]) -> "argparse.ArgumentParser":
-    """The parser of these arguments; only the module of their command is imported, since imports take time."""
-    import argparse
-    from importlib import import_module
-
-    from mkpc_kaggle import __version__
-
+def make_parser(arguments: Sequence[str] = tuple(COMMANDS)) -> argparse.ArgumentParser:
+    """The parser of these arguments; only the commands among them are imported, since imports take time."""
     told = "Two-stage image matching with Matching Key-Points Crop, offline, inside a time budget."
     parser = argparse.ArgumentParser("mkpc_kaggle", description=told, epilog="COMMAND --help tells more.")
     parser.add_argument("--version", action="version", version=__version__)

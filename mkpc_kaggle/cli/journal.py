@@ -36,12 +36,12 @@ def run(arguments: argparse.Namespace) -> int:
     files = {"--json": arguments.json, "--report": arguments.report}
     require_apart(files, test_side(arguments.test_dir) if arguments.test_dir else [], arguments.work_dir)
     log = read_log(arguments.work_dir)
-    written = write_csv(log, arguments.csv) if arguments.csv is not None else []
-    if arguments.json is not None:
+    written = write_csv(log, arguments.csv) if arguments.csv else []
+    if arguments.json:
         write_json(log, arguments.json)
         written.append(arguments.json)
-    if arguments.report is not None:
-        pairs = read_test_side(arguments.test_dir) if arguments.test_dir is not None else ()
+    if arguments.report:
+        pairs = read_test_side(arguments.test_dir) if arguments.test_dir else ()
         write_report(log, arguments.report, pairs)
         written.append(arguments.report)
     print("\n".join(map(str, written)) or overview(log))

@@ -26,13 +26,8 @@ def run(arguments: argparse.Namespace) -> int:
     inputs = [arguments.image0, arguments.image1, Path(arguments.recipe), *arguments.weights]
     require_apart({"--out": arguments.out}, inputs)
     images = to_image(arguments.image0), to_image(arguments.image1)
-    matcher = TwoStageMatcher(
-        arguments.recipe,
-        weights=arguments.weights,
-        device=arguments.device,
-        precision=arguments.precision,
-        licence=arguments.licence,
-    )
+    given = {name: getattr(arguments, name) for name in ("weights", "device", "precision", "licence")}
+    matcher = TwoStageMatcher(arguments.recipe, **given)
     match = matcher(*images)
     told = [" ".join(f"{value: .9e}" for value in row) for row in match.estimate.matrix]
     if match.estimate.failure:
@@ -43,9 +38,8 @@ def run(arguments: argparse.Namespace) -> int:
         told.append(f"  {result.unit.name:<30}{counts}")
     for number, region in enumerate(match.regions or ()):
         box = region.box
-        told.append(
-            f"image {number}: {region.reason}, x {box.left}..{box.right - 1}, y {box.top}..{box.bottom - 1}"
-        )
+        where = f"x {box.left}..{box.right - 1}, y {box.top}..{box.bottom - 1}"
+        told.append(f"image {number}: {region.reason}, {where}")
     print("\n".join(told))
     if arguments.out is not None:
         save(draw_pair(*images, match, matcher.recipe.mkpc), arguments.out)

@@ -27,9 +27,6 @@ def run(arguments: argparse.Namespace) -> int:
         for unit in recipe.units:
             fallback = f"  (or {unit.fallback}, where its weights are missing)" if unit.fallback else ""
             print(f"    {unit.name}  at most {unit.max_matches}{fallback}")
-        reasons = unavailable(recipe, store)
-        for matcher, reason in reasons.items():
-            print(f"    {matcher}: {reason}")
-        if not reasons:
-            print("    all weights are there")
+        reasons = [f"    {matcher}: {reason}" for matcher, reason in unavailable(recipe, store).items()]
+        print("\n".join(reasons or ["    all weights are there"]))
     return 0

@@ -28,7 +28,7 @@ MAX_ASPECT = 32
 class Image:
     """A decoded image: ``pixels`` is (H, W, 3) uint8 RGB; ``name`` is unique in a run.
 
-    ``version`` identifies the content of its file for :func:`is_unchanged`; empty where it has no file.
+    ``version`` is the digest of its file for :func:`is_unchanged`; empty where it has no file.
     """
 
     name: str
@@ -73,8 +73,7 @@ def read_image(path: Path) -> Image | Unreadable:
     """
     name = str(path)
     try:
-        status = path.stat()
-        if not stat.S_ISREG(status.st_mode):  # a pipe or a device may never end
+        if not stat.S_ISREG(path.stat().st_mode):  # a pipe or a device may never end
             return Unreadable(name, "cannot be read: not a regular file")
         data = np.fromfile(path, np.uint8)
         bgr = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
@@ -89,20 +88,16 @@ def read_image(path: Path) -> Image | Unreadable:
     if max(height, width) > MAX_ASPECT * min(height, width):
         return Unreadable(name, f"{width} x {height} pixels: one side is more than {MAX_ASPECT} times the other")
     pixels = np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)
-    return Image(name, pixels, f"{_content_digest(data)} {status.st_ctime_ns}")
+    return Image(name, pixels, _content_digest(data))
 
 
 def is_unchanged(path: Path, version: str) -> bool:
     """Whether a file still has the content that it had when an image of that ``version`` was read from it.
 
-    A file that has not been written to since is not read. A file that cannot be read counts as unchanged.
+    A file that cannot be read counts as unchanged.
     """
-    digest, changed_ns = version.split()
     try:
-        status = path.stat()
-        if not stat.S_ISREG(status.st_mode) or str(status.st_ctime_ns) == changed_ns:
-            return True
-        return _content_digest(np.fromfile(path, np.uint8)) == digest
+        return not path.is_file() or _content_digest(np.fromfile(path, np.uint8)) == version
     except (OSError, ValueError):
         return True
 

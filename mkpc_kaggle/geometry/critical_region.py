@@ -58,10 +58,6 @@ class CriticalRegion:
     clusters: int = 0
     kept: int = 0
 
-    @property
-    def cropped(self) -> bool:
-        return self.reason is RegionReason.CROPPED
-
 
 @dataclass(frozen=True, eq=False)
 class Clusters:

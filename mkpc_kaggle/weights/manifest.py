@@ -104,7 +104,5 @@ def _parse_line(columns: list[str], where: str) -> WeightFile:
     if size != "?" and not (size.isascii() and size.isdigit()):
         raise UserError(f"{where}: bytes must be a number or '?', not {size!r}")
     if not DIGEST.fullmatch(digest):
-        raise UserError(
-            f"{where}: digest must be 'sha256:' with 64 hexadecimal digits or '{UNVERIFIED}', not {digest!r}"
-        )
+        raise UserError(f"{where}: digest must be 'sha256:' with 64 hex digits or '{UNVERIFIED}', not {digest!r}")
     return WeightFile(name, -1 if size == "?" else int(size), digest, licence, slot, source.strip())

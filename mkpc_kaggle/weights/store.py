@@ -138,10 +138,8 @@ class WeightStore:
 
     def verify(self) -> list[FoundFile]:
         """Every file found, by path: all with a name of the manifest, and others with one of its digests."""
-        found: dict[Path, FoundFile] = {}
-        for candidate in self._candidates(self.files):
-            found.setdefault(candidate.path, candidate)
-        return sorted(found.values(), key=lambda file: file.path)
+        found = {file.path: file for file in reversed([*self._candidates(self.files)])}  # the first of a path
+        return [found[path] for path in sorted(found)]
 
     def _candidates(self, lines: Sequence[WeightFile]) -> Iterator[FoundFile]:
         """The files for these lines: those of the name, those of the digest, those that were unpacked."""
