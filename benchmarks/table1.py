@@ -40,7 +40,7 @@ LONG_SIDES = {
     "xfeat_lighterglue": (1024, 1280, 800, 1152, 896, 1408),
 }
 """In the order in which recipes use them; all differ, since the same size would give the same matches."""
-MOST_MATCHES = {"sift": 8000}
+MAX_MATCHES = {"sift": 8000}
 OPTIONS: Mapping[str, Mapping[str, float]] = {"sift": {"features": 8000, "ratio": 0.8}}
 
 LAYOUTS = {
@@ -76,7 +76,7 @@ class Way:
         """Those of stage 1 first; a size of every matcher, then the next."""
         whole, crops = LAYOUTS[self.layout]
         return tuple(
-            Unit(1 if place < whole else 2, matcher, LONG_SIDES[matcher][place], MOST_MATCHES.get(matcher, 4096))
+            Unit(1 if place < whole else 2, matcher, LONG_SIDES[matcher][place], MAX_MATCHES.get(matcher, 4096))
             for place in range(whole + crops)
             for matcher in self.matchers
         )

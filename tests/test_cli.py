@@ -25,7 +25,7 @@ def test_importing_the_package_is_cheap_and_geometry_and_weights_bring_no_torch(
     assert out.split() == ["[]", "False"]
 
 
-def test_a_reader_that_leaves_is_no_error_to_tell() -> None:
+def test_a_reader_that_leaves_ends_the_command_quietly() -> None:
     reader, writer = os.pipe()
     os.close(reader)
     with os.fdopen(writer, "wb") as out:

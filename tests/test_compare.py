@@ -21,9 +21,9 @@ def test_scenes_count_alike_however_many_pairs_they_have() -> None:
 
 
 def test_one_pair_in_two_gives_the_interval_of_the_coin() -> None:
-    """Of 4 pairs 2 gain 1: the mean of a resample is binomial(4, 1/2) / 4, 0 and 1 with 6.25 % each."""
-    difference = paired_difference([([0, 0, 0, 0], [1, 0, 1, 0])])
-    assert (difference.gain, difference.low, difference.high) == (0.5, 0, 1)
+    """Of 8 pairs 4 gain 1: the mean of a resample is binomial(8, 1/2) / 8, at most 1/8 with 3.5 %."""
+    difference = paired_difference([([0] * 8, [1, 0] * 4)])
+    assert (difference.gain, difference.low, difference.high) == (0.5, 0.125, 0.875)
 
 
 @settings(max_examples=30, deadline=None)

@@ -123,7 +123,7 @@ def test_a_directory_without_its_table_or_images_is_refused(side, tmp_path):
 
 @pytest.mark.parametrize("row", ["s,{},1,2", "s,b,{},2", "s,b,1,{}"], ids=["batch", "image 1", "image 2"])
 @pytest.mark.parametrize("name", ["", ".", "..", "../x", "x/y", "/etc", "x\\y", "C:x", "c:", "a\x1bb", "a\x7f"])
-def test_an_id_that_is_no_plain_name_is_refused(side, row, name):
+def test_an_id_that_is_not_a_plain_name_is_refused(side, row, name):
     home = side("ok,b,1,2", row.format(name))
     with pytest.raises(UserError, match=r"test\.csv.* is not a plain name"):
         read_test_side(home)

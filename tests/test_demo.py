@@ -78,9 +78,6 @@ def upright(left: tuple[float, float], right: tuple[float, float], low: float, h
     return quad((*left, high), (*right, high), (*left, low), texture)
 
 
-# Cameras
-
-
 # Rendering
 
 

@@ -95,10 +95,3 @@ def test_points_of_either_picture_are_in_its_own_pixels() -> None:
     unsure = identity_warp(9, 9, 0.0), identity_warp(9, 9, 0.0)
     matcher = DkmMatcher(Given(*unsure), DenseOptions(), "cpu")  # type: ignore[arg-type]
     assert len(match_one(matcher, picture(9, 9), picture(9, 9))) == 0
-
-
-def test_one_way_is_from_the_first_to_the_second(store: WeightStore) -> None:
-    matcher = dkm.load(store, DenseOptions(symmetric=False, matches=200), Placement())
-    matches = match_one(matcher, picture(40, 56), picture(50, 36, "another"))
-    assert len(matches) == 200
-    np.testing.assert_allclose(matches.points0, np.rint(matches.points0), atol=1e-4)

@@ -15,7 +15,7 @@ from IPython.core.inputtransformer2 import TransformerManager
 from sklearn.datasets import load_sample_image
 from vismatch_standin import OrbLikeVismatch
 
-from mkpc_kaggle.cli import make_parser
+from mkpc_kaggle.cli import COMMANDS, make_parser
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -64,7 +64,9 @@ def options_of(parser: argparse.ArgumentParser) -> set[str]:
 
 
 def subcommands() -> dict[str, argparse.ArgumentParser]:
-    (action,) = [action for action in make_parser()._actions if isinstance(action, argparse._SubParsersAction)]
+    (action,) = [
+        action for action in make_parser(list(COMMANDS))._actions if isinstance(action, argparse._SubParsersAction)
+    ]
     return dict(action.choices)
 
 

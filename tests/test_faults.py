@@ -361,7 +361,7 @@ program(["recipes"])
 """
 
 
-@pytest.mark.parametrize("module", ["engine.console", "cli.submit"])
+@pytest.mark.parametrize("module", ["engine.console", "cli.recipes"])
 def test_ctrl_c_while_the_program_imports_its_modules_prints_no_traceback(module: str) -> None:
     code = INTERRUPTED.format(module=module)
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)

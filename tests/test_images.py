@@ -83,7 +83,7 @@ def test_an_exif_orientation_is_applied(tmp_path):
     assert image.pixels[-8:, :, 0].mean() < 50
 
 
-def test_what_is_no_picture_has_its_reason(tmp_path):
+def test_a_file_that_is_not_a_picture_has_its_reason(tmp_path):
     (tmp_path / "empty.png").touch()
     (tmp_path / "text.png").write_text("no picture at all\n" * 100)
     (tmp_path / "directory.png").mkdir()
@@ -138,7 +138,7 @@ def test_an_array_is_named_by_its_content_and_its_shape():
     ],
     ids=lambda array: f"{array.dtype} {array.shape}",
 )
-def test_an_array_that_is_no_image_is_refused_by_type_and_shape(array):
+def test_an_array_that_is_not_an_image_is_refused_by_type_and_shape(array):
     with pytest.raises(ValueError, match=rf"not {array.dtype} \({array.shape[0]},"):
         Image.of_array(array)
 

@@ -88,6 +88,10 @@ def test_a_job_is_saved_whole_or_not_at_all(tmp_path: Path) -> None:
     assert journal.records() == {}
     journal.save([(outcome(3), False)])
     assert list(journal.records()) == [3]
+    journal._db.execute("CREATE TEMP TRIGGER t BEFORE INSERT ON points BEGIN SELECT RAISE(ABORT, 'no room'); END")
+    with pytest.raises(sqlite3.IntegrityError, match="no room"):
+        journal.save([(outcome(5), False)])
+    assert list(journal.records()) == [3], "what was written before is taken back"
     journal.close()
 
 

@@ -12,6 +12,7 @@ from pair_lists import line_of, line_of_pair, write_list
 from benchmarks import paper_tables
 from mkpc_kaggle import TwoStageMatcher
 from mkpc_kaggle.cli import main
+from mkpc_kaggle.cli.validate import with_units
 from mkpc_kaggle.data.competition import TrainScene, read_train_side
 from mkpc_kaggle.data.images import Image, read_image
 from mkpc_kaggle.data.pairs import parse_line, read_pairs
@@ -246,3 +247,8 @@ def test_every_row_of_the_papers_tables_is_a_part_of_its_recipe() -> None:
                 f" + {', '.join(map(str, row.stage2))}" if row.stage2 else ""
             )
             assert f"| {told} |" in text
+
+
+def test_units_are_taken_in_the_order_in_which_they_are_named() -> None:
+    recipe = with_units(load_recipe("yfcc"), "1:superglue@1600,2:superglue@1400")
+    assert [unit.name for unit in recipe.units] == ["1:superglue@1600", "2:superglue@1400"]

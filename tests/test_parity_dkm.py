@@ -1,4 +1,4 @@
-"""DKM stage by stage against its golden vectors."""
+"""DKM against its golden vectors: the estimates at every stride, and the warp."""
 
 import json
 from functools import cache

@@ -1,4 +1,4 @@
-"""LoMa against golden vectors of the reference, with its stand-in weights, stage by stage, norms folded."""
+"""LoMa against golden vectors of the reference, with its stand-in weights, network by network, norms folded."""
 
 import json
 import re

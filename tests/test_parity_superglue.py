@@ -1,4 +1,4 @@
-"""SuperGlue stage by stage against its golden vectors; what must hold of any weights; the transport by hand."""
+"""SuperGlue against its golden vectors; what must hold of any weights; the transport by hand."""
 
 import json
 from functools import cache

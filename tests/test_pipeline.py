@@ -226,7 +226,7 @@ def test_results_are_in_the_order_of_the_recipe_whatever_was_run_first():
     assert at_once.estimate.matrix.tobytes() == piecemeal.estimate.matrix.tobytes()
 
 
-def test_what_was_found_is_returned_when_there_is_no_going_on():
+def test_what_was_found_is_returned_when_no_unit_may_start():
     (work,) = pipeline(TWO_STAGES).match(works(), TWO_STAGES.units, lambda unit: unit.stage == 1)
     assert [result.unit.stage for result in work.results] == [1]
     none = pipeline(TWO_STAGES).match(works(3), TWO_STAGES.units, lambda unit: False)
@@ -287,7 +287,7 @@ def test_a_matcher_that_raises_costs_its_unit_and_the_run_goes_on(error):
 @pytest.mark.parametrize(
     "error", [MemoryError("full"), RuntimeError("CUDA error: unspecified launch failure"), KeyboardInterrupt("x")]
 )
-def test_memory_devices_and_interrupts_are_no_failure_of_a_matcher(error):
+def test_memory_devices_and_interrupts_are_not_failures_of_a_matcher(error):
     with pytest.raises(type(error), match=str(error)):
         own(Unit(1, "bad", 480), bad=Scripted(error))(*pair())
 

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from faulty import ScenesBy, choose_scene_for_all_but_the_first, die_as_scene, raise_as_scene
 
-from mkpc_kaggle.engine.jobs import Cause, Failure, Loaded, SceneJob, SceneResult
+from mkpc_kaggle.engine.jobs import Cause, Failure, Loaded, MatchJob, Phase, SceneJob, SceneResult
 from mkpc_kaggle.engine.places import Place
 from mkpc_kaggle.engine.process import WORKER_ENVIRONMENT, ProcessWorker
 from mkpc_kaggle.geometry.coordinates import Size
@@ -131,25 +131,38 @@ def test_what_became_of_a_job_is_told_and_nothing_is_printed(
     assert capfd.readouterr() == ("", "")
 
 
+class Answering:
+    """A worker that always has the same answer."""
+
+    def __init__(self, answer: Any) -> None:
+        self.answer = lambda: answer
+        self.is_killed = False
+
+    def start(self) -> None: ...
+
+    def submit(self, job: Any, seconds: float) -> None: ...
+
+    def kill(self) -> None:
+        self.is_killed = True
+
+
 def test_an_answer_that_is_there_counts_though_its_time_is_over() -> None:
-    class Punctual:
-        is_killed = False
-
-        def start(self) -> None: ...
-
-        def submit(self, job: Any, seconds: float) -> None: ...
-
-        def answer(self) -> SceneResult:
-            return SceneResult((), {})
-
-        def kill(self) -> None:
-            self.is_killed = True
-
-    worker = Punctual()
+    worker = Answering(SceneResult((), {}))
     place = Place("cpu", lambda: worker, worker, is_loaded=True)
     place.submit(LARGE, 1.0, 10.0, now=0.0)
     assert isinstance(place.poll(now=99.0), SceneResult)
     assert not worker.is_killed
+
+
+@pytest.mark.parametrize("is_retry", [False, True])
+def test_a_place_is_not_closed_for_what_other_workers_were_lost_at(is_retry: bool) -> None:
+    place = Place("cpu", lambda: Answering(Failure(Cause.DIED)))
+    for now in range(3):
+        place.start(now)
+        place.is_loaded = True
+        place.submit(MatchJob(Phase.DEEPEN, (0,), (), (), 1.0, 1.0, is_retry), 1.0, 1.0, now)
+        place.poll(now)
+    assert bool(place.closed) is not is_retry
 
 
 ORPHAN = """

@@ -157,6 +157,7 @@ def unit(**changes):
         # types
         (SIFT + "[mkpc]\nmin_samples = 5.0\n", r"\[mkpc\], key 'min_samples': expected int, got 5.0"),
         (SIFT + '[magsac]\nmethod = "MAGSAC"\n', r"'MAGSAC' is none of 'magsac', 'ransac'"),
+        (units(unit(stage="true")), r"key 'stage': expected int, got True"),
         (units(unit(matcher=7)), r"key 'matcher': expected str, got 7"),
         (units(unit(tracks=1)), r"expected bool, got 1"),
         ('units = "sift"\n', "units|unit 1"),

@@ -57,7 +57,7 @@ def test_a_broken_matcher_is_told_with_its_reason_and_costs_no_other(more_matche
     assert spec_of("sift", "test").name == "sift"
 
 
-def test_files_without_a_spec_are_no_matchers() -> None:
+def test_files_without_a_spec_are_not_matchers() -> None:
     assert not {"contract", "registry", "sparse", "neighbours"} & set(matcher_names())
     with pytest.raises(UserError, match="unknown matcher 'sparse'; known: aliked, "):
         spec_of("sparse", "test")

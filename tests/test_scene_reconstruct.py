@@ -127,7 +127,7 @@ def test_a_pair_whose_matches_agree_on_something_else_keeps_its_own(scene: Synth
     assert all(choice.from_scene for choice in solution.choices[:-1])
 
 
-def test_a_scene_of_too_few_pairs_is_none(scene: SyntheticScene) -> None:
+def test_too_few_pairs_make_no_scene(scene: SyntheticScene) -> None:
     two = tuple(pair for pair in scene.pairs if pair.image0 == scene.pairs[0].image0)[:2]
     (found,) = reconstruct_batch(two, SceneConfig()).reconstructions
     assert found.failure == "2 pairs connect 3 images; a scene needs 1.35 an image"

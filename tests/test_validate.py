@@ -17,7 +17,7 @@ from mkpc_kaggle.data.competition import (
 )
 from mkpc_kaggle.demo import DemoSet
 from mkpc_kaggle.engine.records import PairRecord
-from mkpc_kaggle.evaluation.validate import score_record, score_submission, score_table
+from mkpc_kaggle.evaluation.validate import Step, score_record, score_submission, score_table
 from mkpc_kaggle.geometry.cameras import Camera, fundamental_of_cameras
 from mkpc_kaggle.geometry.metrics import AUC_THRESHOLDS
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
@@ -57,9 +57,10 @@ def test_a_failed_pair_counts_as_failed_even_where_the_fallback_happens_to_be_ri
     camera0, camera1 = Camera(eye, eye, np.zeros(3)), Camera(eye, eye, np.array([1.0, 0, 0]))
     true = TruePair(Pair("p", "s", Path("a"), Path("b")), camera0, camera1, 0.5)
     scene = TrainScene("s", 1.0, (true,))
-    failed = score_record(true, PairRecord(0, FALLBACK_FUNDAMENTAL.copy(), "too few matches"), scene)
+    record = PairRecord(0, FALLBACK_FUNDAMENTAL.copy(), "too few matches")
+    failed = score_record(true, record, scene, [Step.MAGSAC])
     right = score_record(true, PairRecord(0, FALLBACK_FUNDAMENTAL.copy(), ""), scene)
-    assert failed.error.rotation == np.inf
+    assert failed.error.rotation == failed.steps[Step.MAGSAC].rotation == np.inf
     assert right.error.angle < 1e-6
 
 

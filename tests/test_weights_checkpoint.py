@@ -69,7 +69,7 @@ def test_every_file_format_gives_the_same_plain_tensors(tmp_path: Path, save: Sa
 
 @pytest.mark.filterwarnings("ignore::UserWarning")  # of torch, on prototypes
 @pytest.mark.parametrize("save", [save_zip, save_legacy])
-def test_what_is_no_table_of_plain_tensors_is_refused(tmp_path: Path, save: Save) -> None:
+def test_anything_but_a_table_of_plain_tensors_is_refused(tmp_path: Path, save: Save) -> None:
     ones, base = torch.ones(2, 3), torch.zeros(10_000)
     odd: list[object] = [ones, [ones], {"state_dict": 3}, {3: ones}, {"x": ones.to_sparse()}]
     odd += [{"x": ones.to_sparse_csr()}, {"x": ones.to("meta")}]
@@ -85,7 +85,7 @@ def test_what_is_no_table_of_plain_tensors_is_refused(tmp_path: Path, save: Save
 
 @pytest.mark.parametrize("name", ["x.pt", "x.safetensors"])
 @pytest.mark.parametrize("data", [b"", b"no checkpoint", b"\0" * 100])
-def test_a_file_that_is_no_checkpoint_is_refused_by_name(tmp_path: Path, name: str, data: bytes) -> None:
+def test_a_file_that_is_not_a_checkpoint_is_refused_by_name(tmp_path: Path, name: str, data: bytes) -> None:
     put(tmp_path, name, data)
     with pytest.raises(UserError, match=rf"{name} cannot be read as a checkpoint"):
         load_tensors(tmp_path / name)

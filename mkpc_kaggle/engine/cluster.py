@@ -10,6 +10,7 @@ import signal
 import socket
 import textwrap
 import threading
+import time
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass
@@ -114,8 +115,9 @@ class RaySite(Site):
         import ray
 
         if self._has_joined and ray.is_initialized():
+            until = time.monotonic() + EXIT_TIMEOUT_S
             for worker in self._workers:
-                worker.join()
+                worker.join(until)
             ray.shutdown()
 
     def _worker(self, name: str, make: Callable[[], Runner], threads: int = 0, **where: Any) -> "RayWorker":
@@ -142,9 +144,10 @@ class RayWorker(ThreadWorker):
             if self._actor is not None:
                 ray.kill(self._actor)
 
-    def join(self) -> None:
-        """Wait until the killed worker's thread asks Ray for nothing more."""
-        self._thread.join(EXIT_TIMEOUT_S)
+    def join(self, until: float) -> None:
+        """Wait until the killed worker's thread asks Ray for nothing more, or a moment of the monotonic clock."""
+        if self._thread.is_alive():
+            self._thread.join(max(0.0, until - time.monotonic()))
 
     def _load(self) -> Answer:
         import ray

@@ -39,7 +39,7 @@ class Costs:
     """What units cost on a pair, in seconds.
 
     A worker's first run of a unit is its warm-up, which says nothing of the pairs to come: it counts only as long
-    as there is no other measurement, and in no forecast.
+    as nothing else was measured, and in no forecast.
     """
 
     def __init__(self) -> None:

@@ -101,12 +101,28 @@ def undamaged(path: Path, advice: str = "start anew with --fresh") -> Iterator[N
         raise UserError(f"{path} is damaged ({error}); {advice}") from error
 
 
-class JournalTables:
-    """The reading side of an open journal; what is damaged raises :class:`UserError`."""
+class JournalReader:
+    """The journal of a work directory as it is now, unchanged while it is read; a run may be at work on it.
 
-    def __init__(self, path: Path, db: sqlite3.Connection) -> None:
-        self.path = path
-        self._db = db
+    Raises :class:`UserError` where there is none, none that this version can read, or something is damaged.
+    """
+
+    path: Path
+    _db: sqlite3.Connection
+
+    def __init__(self, directory: Path) -> None:
+        path = directory / FILE_NAME
+        if not path.is_file():
+            raise UserError(f"{directory} has no {FILE_NAME}: name the work directory of a run (NAME.work)")
+        # A directory that cannot be written has no room for SQLite's locks, and needs none.
+        mode = "mode=ro" if os.access(directory, os.W_OK) else "mode=ro&immutable=1"
+        with ExitStack() as opened, undamaged(path):
+            uri = f"{path.resolve().as_uri()}?{mode}"
+            db = opened.enter_context(closing(sqlite3.connect(uri, uri=True, timeout=5.0, isolation_level=None)))
+            db.execute("BEGIN")
+            self.path, self._db = path, db
+            self._header()
+            opened.pop_all()
 
     def __enter__(self) -> Self:
         return self
@@ -178,28 +194,7 @@ class JournalTables:
         return header
 
 
-class JournalReader(JournalTables):
-    """The journal of a work directory as it is now, unchanged while it is read; a run may be at work on it.
-
-    Raises :class:`UserError` where there is none, or none that this version can read.
-    """
-
-    def __init__(self, directory: Path) -> None:
-        path = directory / FILE_NAME
-        if not path.is_file():
-            raise UserError(f"{directory} has no {FILE_NAME}: name the work directory of a run (NAME.work)")
-        # A directory that cannot be written has no room for SQLite's locks, and needs none.
-        mode = "mode=ro" if os.access(directory, os.W_OK) else "mode=ro&immutable=1"
-        with ExitStack() as opened, undamaged(path):
-            uri = f"{path.resolve().as_uri()}?{mode}"
-            db = opened.enter_context(closing(sqlite3.connect(uri, uri=True, timeout=5.0, isolation_level=None)))
-            db.execute("BEGIN")
-            super().__init__(path, db)
-            self._header()
-            opened.pop_all()
-
-
-class Journal(JournalTables):
+class Journal(JournalReader):
     """The journal of a work directory, made if it is not there; no other run can open it while this one has it.
 
     ``belongs_to`` says by name what the run computes (recipe, test set, weights). Raises :class:`UserError`
@@ -229,7 +224,7 @@ class Journal(JournalTables):
             if fresh:
                 for ending in ("", "-journal", "-wal", "-shm"):
                     path.with_name(FILE_NAME + ending).unlink(missing_ok=True)
-            super().__init__(path, opened.enter_context(closing(connect(path))))
+            self.path, self._db = path, opened.enter_context(closing(connect(path)))
             with undamaged(path):
                 self._claim(belongs_to, pairs, about or About())
             opened.pop_all()
@@ -237,7 +232,7 @@ class Journal(JournalTables):
     def forget_changed(self, pairs: Sequence[Pair]) -> int:
         """Forget the pairs of which an image has not the content any more that was matched; how many these are.
 
-        Where such an image was in a scene, all pairs of its batch are forgotten, and the scene: those that had all
+        Where such an image was in a scene, all pairs of its batch are forgotten, and the scene: pairs that had all
         they wanted have no points any more to reconstruct it from.
         """
         same, batches = cache(is_unchanged), {scene.batch for scene in self.scenes()}

@@ -236,7 +236,7 @@ class Plan:
         return units if chunk.phase is Phase.FILL else self._first
 
     def usable(self, units: Iterable[Unit]) -> tuple[Unit, ...]:
-        """The units but those that were given up on all pairs."""
+        """The units that were not given up on all pairs."""
         return tuple(unit for unit in units if unit.name not in self.unusable)
 
     @property
@@ -349,7 +349,7 @@ class Plan:
             if former.units:
                 self.explain(now, f"pair {record.index} keeps the F it has: {record.failure}")
         if len(record.units) <= len(former.units) and (former.reached or not record.reached):
-            if outcome.results:  # what was found before cannot be read, and a worse F is no gain
+            if outcome.results:  # what was found before cannot be read, and a worse F gains nothing
                 self._stuck.add(record.index)
             return False
         self._put(record.after(former))
@@ -369,7 +369,7 @@ class Plan:
         return Outcome(self.records[index], (UnitResult(unit, Matches.empty(), failure=reason),))
 
     def _mark_done(self, phase: Phase, indices: Iterable[int]) -> None:
-        """The turn of these pairs is over in a phase, but for those that are to be tried again."""
+        """The turn of these pairs is over in a phase, unless they are to be tried again."""
         over = {index for index in indices if not self._queue.waits(index)}
         if phase is self.phase:
             self._left -= over
@@ -397,7 +397,7 @@ class Plan:
 
     @property
     def is_complete(self) -> bool:
-        """Whether every pair has been reached and nothing is wanted for those that can be worked on."""
+        """Whether every pair has been reached, and none can gain what it wants."""
         return all(record.reached and not self.may_gain(record) for record in self.records[: len(self._order)])
 
     @property

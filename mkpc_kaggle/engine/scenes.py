@@ -87,7 +87,7 @@ class Scenes:
         """A batch to reconstruct now: its matches have changed since it was, and all of its pairs are ``done``.
 
         For the first time it is while some of them get further matches (``filling``), for the second afterwards:
-        first those that were never reconstructed.
+        first batches that were never reconstructed.
         """
         waiting = [name for name in self.batches if name in self._outdated and name not in self._running]
         for name in sorted(waiting, key=self.made.__contains__):

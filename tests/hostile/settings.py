@@ -52,7 +52,7 @@ PLACES: dict[str, Callable[[Path], object]] = {
     "a directory": Path.mkdir,
     "a pipe": os.mkfifo,
     "a link to /dev/zero": lambda path: path.symlink_to("/dev/zero"),
-    "bytes that are no text": lambda path: path.write_bytes(b"\xff\xfe\x00"),
+    "bytes that are not text": lambda path: path.write_bytes(b"\xff\xfe\x00"),
     "a sparse file of 1 TB": sparse,
 }
 

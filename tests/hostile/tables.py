@@ -30,7 +30,7 @@ REFUSALS = {
     "a batch further above": (HEADER + "1,../../etc,x,y\n").encode(),
     "UTF-16": TABLE.encode("utf-16"),
     "compressed": gzip.compress(TABLE.encode()),
-    "bytes that are no UTF-8": TABLE.encode().replace(b"x-y", b"\xff\xfe"),
+    "bytes that are not UTF-8": TABLE.encode().replace(b"x-y", b"\xff\xfe"),
 }
 EITHERS = {
     "a byte order mark": b"\xef\xbb\xbf" + TABLE.encode(),

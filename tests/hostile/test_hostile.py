@@ -23,7 +23,7 @@ QUICK = (  # these run with the other tests
     "images: png: its first half",
     "images: a pipe",
     "tables: a batch further above",
-    "tables: bytes that are no UTF-8",
+    "tables: bytes that are not UTF-8",
     "limits: --time-limit nan",
     "outputs: the table",
     "signals: SIGTERM after 1.0 s",

@@ -1,4 +1,4 @@
-"""Weight files that would run code, take all memory, or are no tensors; and directories with them."""
+"""Weight files that would run code, take all memory, or hold no tensors; and directories with them."""
 
 import io
 import os

@@ -8,7 +8,7 @@ import torch
 from golden import Stage
 
 from mkpc_kaggle.geometry.coordinates import Size, from_normalised
-from mkpc_kaggle.matchers.networks.dense_warp import DenseWarp
+from mkpc_kaggle.matchers.networks.dense_warp import DenseWarp, dense_warp
 from mkpc_kaggle.matchers.networks.pixels import MEAN, STD, network_input
 
 MODES = {"threshold_balanced": 0.05, "balanced": 1.0}  # of sampling, by the golden files' names: the threshold
@@ -52,7 +52,7 @@ def computed(network, images, fine_images=(None, None), *, symmetric=True):
     """
     features = [network.encode(*versions) for versions in zip(images, fine_images, strict=True)]
     with recorded_estimates(network.decoder) as estimates:
-        dense = side_by_side(network.match(*features, symmetric=symmetric))
+        dense = side_by_side(network.match(*features) if symmetric else [dense_warp(*network.decoder(*features))])
     passes = ("",) if fine_images[0] is None else ("", "up_")
     values = {}
     for number, prefix in enumerate(passes):
