@@ -18,13 +18,12 @@ from faulty import (
 )
 from rectified import SECOND, SWEEP, THIRD, THREE_UNITS, RectifiedMatcher, matrices, run
 
-from mkpc_kaggle.cli import main
+from mkpc_kaggle.cli import main, options
 from mkpc_kaggle.data.competition import Pair, read_test_side, submission_problems
 from mkpc_kaggle.demo import DemoSet
 from mkpc_kaggle.engine.engine import Ending, RunReport
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.pipeline import assembly as assemblies
-from mkpc_kaggle.pipeline.assembly import assemble
+from mkpc_kaggle.pipeline.assembly import Assembly, assemble
 from mkpc_kaggle.pipeline.failures import DeviceError, FailureKind, failure_of, reason_of
 from mkpc_kaggle.reporting.summary import trouble
 
@@ -128,7 +127,7 @@ def test_a_device_without_kernels_leaves_the_work_to_the_cpu_and_a_line(
     assert matrices(report) == matrices(undisturbed)
 
 
-def assembled() -> assemblies.Assembly:
+def assembled() -> Assembly:
     return assemble(THREE_UNITS, matchers={"rectified": RectifiedMatcher()}, device="cpu")
 
 
@@ -222,7 +221,7 @@ def test_a_run_that_failed_has_exit_status_one_and_a_line(
     matcher = RectifiedMatcher(matches=fault)
     use_places(monkeypatch, thread_place("this process", matcher))
     made = assemble(THREE_UNITS, matchers={matcher.name: matcher}, device="cpu")
-    monkeypatch.setattr(assemblies, "assemble", lambda *_, **__: made)
+    monkeypatch.setattr(options, "assemble", lambda *_, **__: made)
     output = tmp_path / "submission.csv"
     assert main(["submit", "--test-dir", str(demo.test_dir), "--output", str(output), "--no-report"]) == 1
     assert f"the run failed: {told}" in capsys.readouterr().out

@@ -11,12 +11,11 @@ from kornia.feature import DISK
 from pictures import picture
 from torch import Tensor, nn
 
-from mkpc_kaggle.geometry.coordinates import Box, Size
+from mkpc_kaggle.geometry.coordinates import Box
 from mkpc_kaggle.matchers.contract import Placement, Precision, encoding_bytes
 from mkpc_kaggle.matchers.lightglue import LightGlueOptions, light_glue
 from mkpc_kaggle.matchers.networks.aliked import Aliked
 from mkpc_kaggle.matchers.registry import load_matcher
-from mkpc_kaggle.matchers.sparse import Keypoints
 from mkpc_kaggle.weights import WeightStore
 
 NAMES = ["aliked_lightglue", "disk_lightglue"]
@@ -77,15 +76,6 @@ def test_a_picture_matches_itself_point_by_point(name: str, precision: Precision
     assert Box.whole(first.content).contains(matches.points0).all()
     assert matches.scores.dtype == encodings[0].descriptors.numpy().dtype == np.float32
     assert encoding_bytes(encodings[0]) == len(encodings[0]) * (2 + 128) * 4
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_pictures_without_keypoints_have_no_matches(name: str, store: WeightStore) -> None:
-    matcher = load(name, store)
-    full = matcher.encode([picture(64, 96, multiple=32)])
-    nothing = [Keypoints(torch.zeros(0, 2), torch.zeros(0, 128), Size(9, 5))]
-    for pair in ((nothing, full), (full, nothing), (nothing, nothing)):
-        assert [len(matches) for matches in matcher.match(*pair)] == [0]
 
 
 @pytest.mark.parametrize("precision", Precision)

@@ -54,12 +54,6 @@ def test_the_published_sizes_are_a_stretched_unit_of_864() -> None:
     assert stretch(torch.Size([864, 864])) == pytest.approx(1.25 * 1.542857, rel=1e-6)
 
 
-def test_a_pair_needs_as_many_passes_of_both(store: WeightStore) -> None:
-    (first,), (second,) = (loaded(store, passes=passes).encode([picture(40, 56)]) for passes in (1, 2))
-    with pytest.raises(ValueError, match="second pass"):
-        loaded(store).match([first], [second])
-
-
 @pytest.mark.parametrize("precision", [Precision.BFLOAT16, Precision.FLOAT16])
 def test_half_precision_moves_most_targets_little(store: WeightStore, precision: Precision) -> None:
     """Where the best anchor changes they move by much: few, as these weights have no sure ones."""

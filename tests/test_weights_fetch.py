@@ -85,19 +85,6 @@ def test_a_file_without_a_digest_is_begun_anew_and_comes_with_its_digest(site: S
     assert (tmp_path / "a.bin").read_bytes() == BIG
 
 
-@pytest.mark.parametrize("size", [-1, len(BIG)])
-def test_a_part_that_is_whole_only_lacks_its_name_and_a_longer_part_is_dropped(
-    site: Site, tmp_path: Path, size: int
-) -> None:
-    put(tmp_path, "a.bin.part", BIG)
-    assert get(site, tmp_path, line(data=BIG, size=size)).outcome is FetchOutcome.FETCHED
-    assert (site.sent, names_in(tmp_path)) == (0, ["a.bin"])
-    (tmp_path / "a.bin").unlink()
-    put(tmp_path, "a.bin.part", BIG + b"!")
-    assert get(site, tmp_path, line(data=BIG, size=size)).outcome is FetchOutcome.FETCHED
-    assert (tmp_path / "a.bin").read_bytes() == BIG
-
-
 def test_a_wrong_digest_gives_no_name_and_leaves_nothing(site: Site, tmp_path: Path) -> None:
     wanted = bytes(len(BIG))
     failed = get(site, tmp_path, line(data=wanted))
