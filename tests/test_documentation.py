@@ -75,7 +75,7 @@ def commands(page: Path) -> Iterator[tuple[str, list[str]]]:
     text = page.read_text(encoding="utf-8").replace("\\\n", " ")
     for line in re.findall(r"(?:python -m mkpc_kaggle [a-z]|make_submission\.py )[^`\n#;]*", text):
         name = "submit" if line.startswith("make") else line.split()[3]
-        yield name, re.findall(r"(?<= )--[a-z-]+", line)
+        yield name, re.findall(r"(?<= )--[a-z0-9-]+", line)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
