@@ -184,6 +184,7 @@ def test_bad_input_is_told_in_one_line_before_any_work(
         (["--output", "test/test_images/b/x.png"], "would be written over the input test/test_images"),
         (["--output", "w/m.pth", "--weights", "w"], "would be written over the input w"),
         (["--report", "r.toml"], "exists and is not a .html file"),
+        (["--work-dir", "test/test_images"], "would be written over the input test/test_images"),
         (["--report", "test/test.csv"], "would be written over the input test/test.csv"),
         (["--recipe", "r.toml", "--output", "r.toml"], "would be written over the input r.toml"),
         (["--output", "s.html"], "are one file"),

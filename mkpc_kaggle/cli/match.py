@@ -23,8 +23,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    inputs = [arguments.image0, arguments.image1, Path(arguments.recipe), *arguments.weights]
-    require_apart({"--out": arguments.out}, inputs)
+    inputs = [arguments.image0, arguments.image1, Path(arguments.recipe)]
+    require_apart({"--out": arguments.out}, inputs, weights=arguments.weights)
     images = to_image(arguments.image0), to_image(arguments.image1)
     given = {name: getattr(arguments, name) for name in ("weights", "device", "precision", "licence")}
     matcher = TwoStageMatcher(arguments.recipe, **given)

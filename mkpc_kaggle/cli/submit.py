@@ -47,8 +47,7 @@ def run(arguments: argparse.Namespace) -> int:
     work_dir: Path = arguments.work_dir or output.parent / f"{output.stem}.work"
     page: Path = arguments.report or output.parent / f"{output.stem}.html"
     files = {"--output": output, "--report": None if arguments.no_report else page}
-    inputs = [*test_side(arguments.test_dir), Path(arguments.recipe), *arguments.weights]
-    require_apart(files, inputs, work_dir)
+    require_apart(files, [*test_side(arguments.test_dir), Path(arguments.recipe)], work_dir, arguments.weights)
     budget = options.budget_of(arguments)
     with interruptible() as interrupt, Watchdog(budget, interrupt) as watchdog:
         pairs = read_test_side(arguments.test_dir)

@@ -20,16 +20,19 @@ RESULTS = {
 
 
 def require_apart(
-    outputs: Mapping[str, Path | None], inputs: Iterable[Path], work_dir: Path | None = None
+    outputs: Mapping[str, Path | None],
+    inputs: Iterable[Path],
+    work_dir: Path | None = None,
+    weights: Iterable[Path] = (),
 ) -> None:
     """Refuse outputs that would overwrite an existing input, or that are in each other's or the journal's way.
 
-    ``outputs`` are files to write, by option; ``inputs`` are files and directories, to which ``$MKPC_WEIGHTS`` is
-    added; ``work_dir`` is the journal's. A new file is fine, wherever it is. ``--json`` and ``--report`` overwrite
-    nothing but their own kind. Raises :class:`UserError`.
+    ``outputs`` are files to write, by option; ``inputs`` and ``weights`` are files and directories, ``work_dir``
+    is the journal's. A new file is fine, wherever it is. ``--json`` and ``--report`` overwrite nothing but their
+    own kind. Raises :class:`UserError`.
     """
     environment = [Path(part) for part in os.environ.get("MKPC_WEIGHTS", "").split(os.pathsep) if part]
-    inputs = [*inputs, *environment]
+    inputs, weights = list(inputs), [*weights, *environment]
     files = {option: path for option, path in outputs.items() if path is not None}
     for option, path in files.items():
         if not path.name or os.path.isdir(path):  # noqa: PTH112  Path raises for a name that is too long
@@ -42,11 +45,14 @@ def require_apart(
         ):
             raise UserError(f"{option} {path} and the work directory {work_dir} are in each other's way")
         is_result = path.suffix.lower() in RESULTS.get(option, ())
-        for place in inputs if os.path.lexists(path) else ():
+        for place in (*inputs, *weights) if os.path.lexists(path) else ():
             if same_file(path, place) or (lies_in(path, place) and not is_result):
                 raise UserError(f"{option} {path} would be written over the input {place}; name another file")
         if option in ("--json", "--report") and not is_result and os.path.isfile(path):  # noqa: PTH113
             raise UserError(f"{option} {path} exists and is not a {RESULTS[option][0]} file; name another file")
+    for place in inputs:
+        if work_dir is not None and lies_in(work_dir, place):
+            raise UserError(f"--work-dir {work_dir} would be written over the input {place}; name another place")
 
 
 def lies_in(path: Path, directory: Path) -> bool:

@@ -68,7 +68,9 @@ class Progress:
         self._written = budget.clock()
 
     def show(self, phase: str, done: int, total: int) -> None:
-        """Called after every job."""
+        """Called after every job; a phase without pairs is not told."""
+        if not total:
+            return
         began, self._phase = phase != self._phase, phase
         if began and self._redraws:
             self.close()

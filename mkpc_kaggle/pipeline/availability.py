@@ -32,10 +32,6 @@ class UnavailableKind(StrEnum):
     NO_WEIGHTS = "no weights"
     UNREADABLE = "weights cannot be loaded"
 
-    @property
-    def is_fault(self) -> bool:
-        return self in (UnavailableKind.NOT_IMPORTABLE, UnavailableKind.UNREADABLE)
-
 
 @dataclass(frozen=True)
 class UnavailableReason:
@@ -79,7 +75,8 @@ def unavailable(
         if reason := not_permitted([*spec.licences, *(file.file.licence for file in files)]):
             return reason
         if missing := [slot for slot, file in found.items() if file is None]:
-            return UnavailableReason(UnavailableKind.NO_WEIGHTS, missing_files(missing, store))
+            names = (f"{slot}: {' or '.join(file.name for file in store.alternatives(slot))}" for slot in missing)
+            return UnavailableReason(UnavailableKind.NO_WEIGHTS, "; ".join(names))
         try:
             if load and any(file.state is State.UNVERIFIED for file in files):
                 load_matcher(name, store, options, Placement())
@@ -90,11 +87,6 @@ def unavailable(
     names = [name for unit in recipe.units for name in (unit.matcher, unit.fallback) if name]
     found = {name: reason_for(name) for name in dict.fromkeys(names)}
     return {name: reason for name, reason in found.items() if reason is not None}
-
-
-def missing_files(slots: Iterable[str], store: WeightStore) -> str:
-    """The names of the files that would fill the slots, for messages."""
-    return "; ".join(f"{slot}: {' or '.join(file.name for file in store.alternatives(slot))}" for slot in slots)
 
 
 def refusal(recipe: Recipe, reasons: Mapping[str, UnavailableReason]) -> UserError:

@@ -38,7 +38,11 @@ def resolve_placement(device: str, precision: str) -> Placement:
     import torch
 
     if device == AUTO:
-        device = "cuda" if torch.cuda.is_available() and _gpus_compute() else "cpu"
+        try:
+            device = "cuda" if torch.cuda.is_available() and gpu_capabilities() else "cpu"
+        except UserError as error:
+            warn_once(f"the CPU does the work: {error}")
+            device = "cpu"
     elif device != "cpu":
         gpus_of(device)
     if precision == AUTO:
@@ -59,14 +63,6 @@ def fastest_precision(device: str) -> Precision:
     # Older versions of PyTorch do not tell; then float32 is safe.
     flags: dict[str, Any] = getattr(torch.cpu, "get_capabilities", dict)()
     return Precision.BFLOAT16 if flags.get("avx512_bf16") or flags.get("amx_bf16") else Precision.FLOAT32
-
-
-def _gpus_compute() -> bool:
-    try:
-        return bool(gpu_capabilities())
-    except UserError as error:
-        warn_once(f"the CPU does the work: {error}")
-        return False
 
 
 def gpus_of(device: str) -> list[int]:
