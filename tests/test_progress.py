@@ -1,4 +1,4 @@
-"""Progress: a line drawn again on a terminal, few lines where every line stays."""
+"""Progress: a bar on a terminal, few lines where every line stays."""
 
 from io import StringIO
 
@@ -26,14 +26,14 @@ class Clock:
         return self.now
 
 
-def test_a_terminal_has_a_line_a_phase_that_is_drawn_again() -> None:
+def test_a_terminal_has_a_bar_with_rate_and_time_left() -> None:
     stream = Terminal()
     progress = Progress(Budget(0.0, 100.0, Clock()), stream)
     progress.show(Phase.SWEEP, 8, 8)
     progress.show(Phase.DEEPEN, 2, 8)
     progress.close()
     assert stream.getvalue().count("\n") == 2
-    assert "budget left 1m38s" in stream.getvalue()
+    assert all(part in stream.getvalue() for part in ("budget left 1m38s", "pair/s", "100%"))
 
 
 def test_the_terminal_that_a_notebook_gives_its_commands_has_lines(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -58,8 +58,9 @@ def test_lines_come_when_a_phase_begins_now_and_then_and_in_the_end() -> None:
     assert stream.getvalue().splitlines() == [*sweep, "deepen: 2 pairs", "deepen: 2 of 2 pairs"]
 
 
-def test_a_log_whose_reader_has_left_does_not_end_the_run() -> None:
-    class Left(StringIO):
+@pytest.mark.parametrize("stream", [StringIO, Terminal])
+def test_a_log_whose_reader_has_left_does_not_end_the_run(stream: type[StringIO]) -> None:
+    class Left(stream):
         def write(self, text: str) -> int:
             raise BrokenPipeError
 

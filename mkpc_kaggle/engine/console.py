@@ -9,11 +9,13 @@ import os
 import sys
 from contextlib import suppress
 from math import isfinite
-from typing import NoReturn, TextIO
+from typing import Any, NoReturn, TextIO
+
+from tqdm import tqdm
 
 from mkpc_kaggle.engine.budget import Budget, format_duration
 
-LINE_INTERVAL_S = 30.0  # between lines of progress where a line cannot be drawn again
+LINE_INTERVAL_S = 30.0  # between lines of progress where a bar cannot be drawn again
 
 
 def say(text: str) -> None:
@@ -31,10 +33,10 @@ def complain(text: str) -> None:
     _print(f"error: {text}", sys.stderr)
 
 
-def _print(text: str, stream: TextIO | None, end: str = "\n") -> None:
+def _print(text: str, stream: TextIO | None) -> None:
     with suppress(OSError, ValueError):  # gone, full, or closed
         if stream is not None:
-            print(text, file=stream, flush=True, end=end)
+            print(text, file=stream, flush=True)
 
 
 def leave(status: int) -> NoReturn:
@@ -49,41 +51,53 @@ def leave(status: int) -> NoReturn:
 
 
 def redraws(stream: TextIO) -> bool:
-    """Whether a line on the stream can be drawn again.
+    """Whether a bar on the stream can be drawn again.
 
     The children of a notebook's kernel (``!command``) are given a terminal, but what they write is kept: every
-    state of a line would be stored and, in Kaggle's log, printed. Jupyter marks them with JPY_PARENT_PID.
+    state of a bar would be stored and, in Kaggle's log, printed. Jupyter marks them with JPY_PARENT_PID.
     """
     return stream.isatty() and "JPY_PARENT_PID" not in os.environ
 
 
 class Progress:
-    """How many pairs of a phase are done: a line drawn again on a terminal, printed now and then anywhere else."""
+    """How many pairs of a phase are done: a bar on a terminal, a line now and then anywhere else."""
 
     def __init__(self, budget: Budget, stream: TextIO | None = None) -> None:
         self._budget = budget
         self._stream = stream or sys.stderr
-        self._redraws = self._stream is not None and redraws(self._stream)
+        self._bar: tqdm[Any] | None = None
         self._phase = self._waiting = ""
         self._written = budget.clock()
 
     def show(self, phase: str, done: int, total: int) -> None:
         """Called after every job; a phase without pairs is not told."""
-        if not total:
+        if self._stream is None or not total:
             return
         began, self._phase = phase != self._phase, phase
-        if began and self._redraws:
-            self.close()
-        self._waiting = f"{phase}: {total} pairs" if began else f"{phase}: {done} of {total} pairs"
-        if isfinite(self._budget.time_limit):
-            self._waiting += f", budget left {format_duration(self._budget.left())}"
-        if self._redraws:
-            _print(f"\r{self._waiting}\x1b[K", self._stream, end="")
-        elif began or self._budget.clock() - self._written >= LINE_INTERVAL_S:
+        left = f"budget left {format_duration(self._budget.left())}" if isfinite(self._budget.time_limit) else ""
+        if redraws(self._stream):
+            with suppress(OSError, ValueError):
+                self._draw(phase if began else "", done, total, left)
+            return
+        count = f"{total} pairs" if began else f"{done} of {total} pairs"
+        self._waiting = ", ".join(filter(None, [f"{phase}: {count}", left]))
+        if began or self._budget.clock() - self._written >= LINE_INTERVAL_S:
             self.close()
 
     def close(self) -> None:
-        """End the line on a terminal, or print the line that waits."""
+        """End the bar, or print the line that waits."""
+        with suppress(OSError, ValueError):
+            if self._bar is not None:
+                self._bar.close()
+        self._bar = None
         if self._waiting:
-            _print("" if self._redraws else self._waiting, self._stream)
+            _print(self._waiting, self._stream)
             self._waiting, self._written = "", self._budget.clock()
+
+    def _draw(self, began: str, done: int, total: int, left: str) -> None:
+        if began:
+            self.close()
+            self._bar = tqdm(total=total, desc=began, unit="pair", file=self._stream)
+        if self._bar is not None:
+            self._bar.set_postfix_str(left, refresh=False)
+            self._bar.update(done - self._bar.n)
