@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mkpc_kaggle.data.competition import read_cameras, read_rows
+from mkpc_kaggle.data.competition import read_train_side
 from mkpc_kaggle.evaluation.imc2025 import OUTLIERS, POSE_COLUMNS
 from mkpc_kaggle.reconstruction.outputs import joined
 
@@ -29,16 +29,15 @@ def main() -> None:
     arguments = parser.parse_args()
     folder = arguments.out / "images" / "mixed"
     folder.mkdir(parents=True)
-    scales = dict(
-        cells for _, cells in read_rows(arguments.train_dir / "scaling_factors.csv", ("scene", "scaling_factor"))
-    )
     rows = []
-    for scene in SCENES:
-        cameras = read_cameras(arguments.train_dir / scene / "calibration.csv")
-        for path in sorted((arguments.train_dir / scene / "images").iterdir()):
-            shutil.copy(path, folder)
-            camera = cameras[path.stem]
-            rows.append(("mixed", scene, path.name, joined(camera.R), joined(camera.t * float(scales[scene]))))
+    for scene in read_train_side(arguments.train_dir, scenes=SCENES, min_covisibility=0):
+        ends = [
+            end for true in scene.pairs for end in zip(true.pair.images, (true.camera0, true.camera1), strict=True)
+        ]
+        for file, camera in sorted(dict(ends).items()):
+            shutil.copy(file, folder)
+            pose = joined(camera.R), joined(camera.t * scene.metres_per_unit)
+            rows.append(("mixed", scene.name, Path(file).name, *pose))
     for path in arguments.unrelated:
         shutil.copy(path, folder)
         rows.append(("mixed", OUTLIERS, path.name, joined(np.full(9, np.nan)), joined(np.full(3, np.nan))))
