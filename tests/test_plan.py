@@ -279,7 +279,7 @@ def test_more_time_never_means_fewer_units() -> None:
 @pytest.mark.parametrize(
     ("scenarios", "pairs", "middle", "low"),
     [
-        (150, 300, 0.98, 0.8),
+        (60, 300, 0.98, 0.8),
         pytest.param(1000, 10_000, 0.99, 0.95, marks=[pytest.mark.slow, pytest.mark.timeout(3 * 3600)]),
     ],
 )
@@ -296,7 +296,7 @@ def test_random_runs_are_never_late_never_lose_a_row_and_use_their_time(
 
 
 def test_undisturbed_runs_use_all_their_time() -> None:
-    for seed in range(10):
+    for seed in range(5):
         rng = np.random.default_rng(seed)
         workers = int(rng.integers(1, 5))
         scenario = Scenario(600 * workers, tuple(rng.uniform(0.2, 2, 5).tolist()), workers, 2400.0, seed=seed)
@@ -306,8 +306,8 @@ def test_undisturbed_runs_use_all_their_time() -> None:
 
 
 def test_planning_a_job_does_not_take_longer_for_many_pairs() -> None:
-    few, many = (simulate(Scenario(count, (0.1, 0.5, 0.5), 2, count)) for count in (1000, 20_000))
-    assert many.jobs > 2500
+    few, many = (simulate(Scenario(count, (0.1, 0.5, 0.5), 2, count)) for count in (500, 10_000))
+    assert many.jobs > 1250
     assert many.planning < 5 * few.planning
 
 

@@ -43,6 +43,7 @@ from mkpc_kaggle.scene.choose import Choice, Reason
 RESTART_S = 8.0
 STALL = 20.0  # a unit that stalls takes so many times as long
 SIZES = (Size(640, 480), Size(640, 480))
+NO_MATCHES = Matches.empty()
 SWEEP_SHARE = 0.7  # of the limit, within which the sweep is said to fit
 
 
@@ -266,7 +267,7 @@ class SimulatedWorker(Simulated):
                 if now + seconds > end:
                     return end, hung, end - now if stalled else 0.0
                 now += seconds
-                found.append(UnitResult(unit, Matches.empty(), 0.0, seconds, warm_up=warm_up))
+                found.append(UnitResult(unit, NO_MATCHES, 0.0, seconds, warm_up=warm_up))
         pairs = zip(job.indices, job.known, results, strict=True)
         return now, MatchResult(tuple(starmap(_outcome, pairs))), 0.0
 
