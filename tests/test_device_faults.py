@@ -23,9 +23,8 @@ from mkpc_kaggle.data.competition import Pair, read_test_side, submission_proble
 from mkpc_kaggle.demo import DemoSet
 from mkpc_kaggle.engine.engine import Ending, RunReport
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.pipeline.assembly import Assembly, assemble
+from mkpc_kaggle.pipeline.assembly import assemble
 from mkpc_kaggle.pipeline.failures import DeviceError, FailureKind, failure_of, reason_of
-from mkpc_kaggle.reporting.summary import trouble
 
 COUNT = 12
 VICTIM = 3  # brightness 13
@@ -72,6 +71,28 @@ def test_what_errors_mean() -> None:
 # Devices
 
 
+@pytest.mark.parametrize(
+    "gpus",
+    [
+        [BrokenDeviceMatcher(good=2), BrokenDeviceMatcher(good=3)],
+        [RectifiedMatcher(matches=lambda _: exhaust_gpu())],
+    ],
+)
+def test_the_cpu_takes_over_when_the_last_gpu_fails_or_has_no_memory_for_any_unit(
+    pairs: list[Pair],
+    undisturbed: RunReport,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    gpus: list[RectifiedMatcher],
+) -> None:
+    places = [thread_place(f"cuda:{number}", matcher) for number, matcher in enumerate(gpus)]
+    use_places(monkeypatch, *places, fallback=[thread_place("cpu", RectifiedMatcher())])
+    report = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
+    assert report.ending is Ending.COMPLETE
+    assert matrices(report) == matrices(undisturbed)
+    assert unit_failures(report) == []
+
+
 def test_a_device_that_fails_once_costs_a_worker_and_no_unit(
     pairs: list[Pair], undisturbed: RunReport, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -82,19 +103,6 @@ def test_a_device_that_fails_once_costs_a_worker_and_no_unit(
     assert report.faults == (
         f"a job was lost on cuda:0: the device failed: RuntimeError: {BROKEN}, in 1:rectified@96",
     )
-    assert matrices(report) == matrices(undisturbed)
-    assert unit_failures(report) == []
-    assert trouble(report) == ""
-
-
-def test_the_cpu_takes_over_when_the_last_gpu_fails_in_the_middle_of_a_run(
-    pairs: list[Pair], undisturbed: RunReport, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    matcher = RectifiedMatcher()
-    gpus = [thread_place(f"cuda:{number}", BrokenDeviceMatcher(good=number)) for number in (2, 3)]
-    use_places(monkeypatch, *gpus, fallback=[thread_place("cpu", matcher)])
-    report = run(pairs, THREE_UNITS, matcher, tmp_path / "work")
-    assert report.ending is Ending.COMPLETE
     assert matrices(report) == matrices(undisturbed)
     assert unit_failures(report) == []
 
@@ -119,16 +127,13 @@ def test_a_device_without_kernels_leaves_the_work_to_the_cpu_and_a_line(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    gpu = thread_place("cuda:99", RectifiedMatcher(), pipeline=assembled().on("cuda:99").pipeline)
+    assembly = assemble(THREE_UNITS, matchers={"rectified": RectifiedMatcher()}, device="cpu")
+    gpu = thread_place("cuda:99", RectifiedMatcher(), pipeline=assembly.on("cuda:99").pipeline)
     use_places(monkeypatch, gpu, fallback=[thread_place("cpu", RectifiedMatcher())])
     report = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
     assert report.ending is Ending.COMPLETE
     assert "cuda:99 cannot be used" in capsys.readouterr().err
     assert matrices(report) == matrices(undisturbed)
-
-
-def assembled() -> Assembly:
-    return assemble(THREE_UNITS, matchers={"rectified": RectifiedMatcher()}, device="cpu")
 
 
 def test_a_worker_that_hangs_keeps_no_job_from_the_others(
@@ -171,6 +176,8 @@ def test_a_unit_too_large_for_the_memory_is_given_up_on_that_pair_alone(
     assert report.records[VICTIM].inliers > 100, "it keeps the F that it has"
     assert matrices(report)[:VICTIM] == matrices(undisturbed)[:VICTIM]
     assert matrices(report)[VICTIM + 1 :] == matrices(undisturbed)[VICTIM + 1 :]
+    again = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
+    assert matrices(again) == matrices(report), "what was given up is not tried again"
 
 
 def test_a_minibatch_that_memory_is_too_short_for_is_halved_once_and_no_worker_lost(
@@ -183,16 +190,6 @@ def test_a_minibatch_that_memory_is_too_short_for_is_halved_once_and_no_worker_l
     assert matrices(report) == matrices(undisturbed)
     too_large = [size for size in matcher.sizes if size > 2]
     assert len(too_large) == 2 * len(THREE_UNITS.units), "seven or eight, and three or four: once a unit"
-
-
-def test_the_cpu_takes_over_when_a_gpu_has_no_memory_for_any_unit(
-    pairs: list[Pair], undisturbed: RunReport, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    gpu = thread_place("cuda:0", RectifiedMatcher(matches=lambda _: exhaust_gpu()))
-    use_places(monkeypatch, gpu, fallback=[thread_place("cpu", RectifiedMatcher())])
-    report = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
-    assert report.ending is Ending.COMPLETE
-    assert matrices(report) == matrices(undisturbed)
 
 
 # Exit status

@@ -1,5 +1,6 @@
 """The engine with a matcher whose answers are known, in threads of this process."""
 
+import math
 import threading
 from collections import Counter
 from collections.abc import Callable
@@ -117,13 +118,22 @@ def test_a_matcher_that_raises_costs_its_pair_that_unit_only(tmp_path: Path) -> 
     assert "too few distinct matches" in report.records[2].failure
 
 
-def test_a_unit_that_never_returns_does_not_hold_the_run_past_its_limit(tmp_path: Path) -> None:
-    released = threading.Event()
-    matcher = RectifiedMatcher(matches=after_calls(5, released.wait))
+@pytest.mark.parametrize(("limit", "ending"), [(5.0, Ending.TIME_IS_UP), (math.inf, Ending.INTERRUPTED)])
+def test_a_unit_that_never_returns_holds_the_run_neither_past_its_limit_nor_after_an_interrupt(
+    tmp_path: Path, limit: float, ending: Ending
+) -> None:
+    released, interrupt = threading.Event(), Interrupt()
+
+    def hang() -> None:
+        if ending is Ending.INTERRUPTED:
+            interrupt.set()
+        released.wait()
+
+    matcher, pairs = RectifiedMatcher(matches=after_calls(5, hang)), write_pairs(tmp_path, 12)
     try:
-        report = run(write_pairs(tmp_path, 12), THREE_UNITS, matcher, tmp_path / "work", limit=5.0)
+        report = run(pairs, THREE_UNITS, matcher, tmp_path / "work", limit=limit, interrupt=interrupt)
         assert not released.is_set(), "the run ends while the unit is under way"
-        assert report.ending is Ending.TIME_IS_UP
+        assert report.ending is ending
         assert len(report.records) == 12
         assert report.records[0].units
     finally:

@@ -175,17 +175,35 @@ def test_what_a_jobs_own_deadline_cut_off_is_planned_again() -> None:
     assert (again.phase, again.indices) == (job.phase, job.indices[-1:])
 
 
-def test_a_pair_whose_earlier_results_cannot_be_read_is_left_as_it_is() -> None:
+THIRD_ALONE = UnitRecord(THIRD.name, THIRD.stage, 9, 9, 0.0, 1.0, "")
+
+
+@pytest.mark.parametrize(
+    ("record", "results"),
+    [
+        (PairRecord.untouched(0, "the file is empty"), ()),
+        (PairRecord(0, FALLBACK_FUNDAMENTAL, "", (THIRD_ALONE,)), (UnitResult(THIRD, Matches.empty(), 0.0, 1.0),)),
+    ],
+)
+def test_a_pair_whose_image_or_earlier_results_cannot_be_read_any_more_keeps_the_f_that_it_has(
+    record: PairRecord, results: tuple[UnitResult, ...]
+) -> None:
     plan = plan_of(1)
     deepening = next(job for job in jobs_of(plan) if job.phase is Phase.DEEPEN)
     former = plan.records[0]
-    again = UnitRecord(THIRD.name, THIRD.stage, 9, 9, 0.0, 1.0, "")
-    alone = Outcome(
-        PairRecord(0, FALLBACK_FUNDAMENTAL, "", (again,)), (UnitResult(THIRD, Matches.empty(), 0.0, 1.0),)
-    )
-    assert plan.on_result(deepening, MatchResult((alone,)), 1.0, 1.0) == []
+    assert plan.on_result(deepening, MatchResult((Outcome(record, results),)), 1.0, 1.0) == []
+    assert explained(plan, "pair 0 keeps the F it has: the file is empty") is not bool(results)
     assert plan.records[0] is former
     assert plan.next(1.0) is None
+
+
+def test_progress_counts_the_pairs_that_have_an_f() -> None:
+    plan = plan_of(12)
+    job = plan.next(0.0)
+    assert job is not None
+    not_begun = MatchResult(tuple(Outcome(PairRecord.untouched(index)) for index in job.indices))
+    plan.on_result(job, not_begun, 1.0, 0.0)
+    assert plan.progress == (Phase.SWEEP, 0, 12)
 
 
 def test_a_worker_hangs_after_many_times_what_its_units_take() -> None:

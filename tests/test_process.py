@@ -16,10 +16,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from faulty import ScenesBy, choose_scene_for_all_but_the_first, die_as_scene, raise_as_scene
+from faulty import ScenesBy, choose_scene_for_all_but_the_first
 
-from mkpc_kaggle.engine.jobs import Cause, Failure, Loaded, MatchJob, Phase, SceneJob, SceneResult
-from mkpc_kaggle.engine.places import Place
+from mkpc_kaggle.engine.jobs import Cause, Failure, Loaded, SceneJob, SceneResult
 from mkpc_kaggle.engine.process import WORKER_ENVIRONMENT, ProcessWorker
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.matches import Matches
@@ -71,6 +70,13 @@ def at_birth(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[int], None]
     return set_action
 
 
+def test_a_worker_that_cannot_be_sent_to_its_process_says_so() -> None:
+    worker = Worker(lambda job: None)  # which cannot be pickled
+    worker.worker.start()
+    assert worker.next_answer().cause is Cause.RAISED
+    worker.end()
+
+
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
 def test_a_process_that_dies_or_stops_at_its_birth_blocks_nothing(
     at_birth: Callable[..., None], number: signal.Signals
@@ -108,74 +114,17 @@ def test_a_large_job_goes_to_a_stopped_process_without_blocking(at_birth: Callab
     stopped.end()
 
 
-@pytest.mark.parametrize(
-    ("make", "failure"),
-    [
-        (die_as_scene, Failure(Cause.DIED, "signal SIGKILL")),
-        (raise_as_scene, Failure(Cause.RAISED, "KeyError: 'image 7'")),
-        (lambda job: None, Failure(Cause.RAISED, "")),
-    ],
-)
-def test_what_became_of_a_job_is_told_and_nothing_is_printed(
-    make: Any, failure: Failure, capfd: pytest.CaptureFixture[str]
-) -> None:
-    worker = Worker(make)
-    worker.worker.start()
-    answer = worker.next_answer()
-    if answer == Loaded():
-        worker.worker.submit(LARGE, 1.0)
-        answer = worker.next_answer()
-    assert answer.cause is failure.cause
-    assert failure.message in answer.message, "what cannot be pickled says so"
-    worker.end()
-    assert capfd.readouterr() == ("", "")
-
-
-class Answering:
-    """A worker that always has the same answer."""
-
-    def __init__(self, answer: Any) -> None:
-        self.answer = lambda: answer
-        self.is_killed = False
-
-    def start(self) -> None: ...
-
-    def submit(self, job: Any, seconds: float) -> None: ...
-
-    def kill(self) -> None:
-        self.is_killed = True
-
-
-def test_an_answer_that_is_there_counts_though_its_time_is_over() -> None:
-    worker = Answering(SceneResult((), {}))
-    place = Place("cpu", lambda: worker, worker, is_loaded=True)
-    place.submit(LARGE, 1.0, 10.0, now=0.0)
-    assert isinstance(place.poll(now=99.0), SceneResult)
-    assert not worker.is_killed
-
-
-@pytest.mark.parametrize("is_retry", [False, True])
-def test_a_place_is_not_closed_for_what_other_workers_were_lost_at(is_retry: bool) -> None:
-    place = Place("cpu", lambda: Answering(Failure(Cause.DIED)))
-    for now in range(3):
-        place.start(now)
-        place.is_loaded = True
-        place.submit(MatchJob(Phase.DEEPEN, (0,), (), (), 1.0, 1.0, is_retry), 1.0, 1.0, now)
-        place.poll(now)
-    assert bool(place.closed) is not is_retry
-
-
 ORPHAN = """
 import os, signal, sys
 sys.path[:0] = {path!r}
 from functools import partial
-from faulty import ScenesBy, hang_as_scene
+from faulty import ScenesBy, befall, hang
 from mkpc_kaggle.engine.process import ProcessWorker
 from test_process import LARGE
 
 if __name__ == "__main__":
     answers, told = os.pipe()
-    worker = ProcessWorker("scene", partial(ScenesBy, hang_as_scene), lambda: os.write(told, b"."))
+    worker = ProcessWorker("scene", partial(ScenesBy, partial(befall, hang)), lambda: os.write(told, b"."))
     worker.start()
     os.read(answers, 1)
     worker.answer()
@@ -199,50 +148,37 @@ def test_a_worker_at_work_ends_with_its_parent_and_prints_nothing(tmp_path: Path
     assert parent.communicate()[1] == b""
 
 
-BLOCKED = """
-import multiprocessing, signal
-from mkpc_kaggle.engine.process import worker_environment
+STARTS = """
+import os, signal, threading
+from functools import partial
+from pathlib import Path
+from mkpc_kaggle.engine.jobs import Loaded
+from mkpc_kaggle.engine.process import WORKER_ENVIRONMENT, ProcessWorker
 
-def tell(pipe):
-    pipe.send(signal.pthread_sigmask(signal.SIG_BLOCK, ()))
+def check():
+    entries = Path("/proc/self/environ").read_text().split(chr(0))
+    told = dict(entry.split("=", 1) for entry in entries if "=" in entry)
+    assert [told[name] for name in WORKER_ENVIRONMENT] == ["PASSIVE", "7", "1"], told
+    blocked = signal.pthread_sigmask(signal.SIG_BLOCK, ())
+    assert blocked >= {signal.SIGINT, signal.SIGTERM}, blocked
 
 if __name__ == "__main__":
-    context = multiprocessing.get_context("spawn")
-    ours, its = context.Pipe()
-    process = context.Process(target=tell, args=(its,))
-    with worker_environment():
-        process.start()
-    blocked = ours.recv()
-    process.join()
-    assert blocked >= {signal.SIGINT, signal.SIGTERM}, blocked
+    answers = threading.Semaphore(0)
+    worker = ProcessWorker("scene", check, answers.release)
+    worker.start()
+    answers.acquire()
+    assert worker.answer() == Loaded()
+    worker.kill()
     assert not signal.pthread_sigmask(signal.SIG_BLOCK, ())
+    assert [name for name in WORKER_ENVIRONMENT if name in os.environ] == ["GOMP_SPINCOUNT"]
 """
 
 
-def test_the_first_process_of_a_program_hears_no_ctrl_c_from_its_start(tmp_path: Path) -> None:
-    script = tmp_path / "blocked.py"
-    script.write_text(BLOCKED)
-    subprocess.run([sys.executable, script], timeout=120, check=True)
-
-
-def tell_environment(path: Path) -> ScenesBy:
-    """Write down what the process was started with."""
-    entries = Path("/proc/self/environ").read_text().split("\0")
-    started_with = dict(entry.split("=", 1) for entry in entries if "=" in entry)
-    path.write_text(", ".join(started_with.get(name, "") for name in WORKER_ENVIRONMENT))
-    return ScenesBy(choose_scene_for_all_but_the_first)
-
-
-def test_workers_are_told_not_to_spin_and_to_use_huge_pages_and_nobody_else_is(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_the_first_worker_of_a_program_hears_no_ctrl_c_and_is_told_not_to_spin_and_to_use_huge_pages(
+    tmp_path: Path,
 ) -> None:
-    for name in WORKER_ENVIRONMENT:
-        monkeypatch.delenv(name, raising=False)
-    monkeypatch.setenv("GOMP_SPINCOUNT", "7")
-    worker = Worker()
-    worker.worker._make = partial(tell_environment, tmp_path / "told")
-    worker.worker.start()
-    assert worker.next_answer() == Loaded()
-    worker.end()
-    assert (tmp_path / "told").read_text() == "PASSIVE, 7, 1"
-    assert {name: os.environ[name] for name in WORKER_ENVIRONMENT if name in os.environ} == {"GOMP_SPINCOUNT": "7"}
+    script = tmp_path / "starts.py"
+    script.write_text(STARTS)
+    environment = {name: value for name, value in os.environ.items() if name not in WORKER_ENVIRONMENT}
+    environment |= {"GOMP_SPINCOUNT": "7", "PYTHONPATH": str(ROOT)}
+    subprocess.run([sys.executable, script], env=environment, check=True)

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from faulty import FaultyMatcher, die
 from rectified import THREE_UNITS, RectifiedMatcher, Seen, matrices, run
 from synthetic import RECIPE as SYNTHETIC
 from synthetic import SyntheticMatcher, synthetic_pairs
@@ -28,22 +29,6 @@ ray = pytest.importorskip("ray", reason="Ray is not installed: pip install 'mkpc
 TESTS = Path(__file__).parent
 IMPORTED = [str(TESTS.parent), str(TESTS), str(TESTS / "support")]  # what machines can import
 STORE_BYTES = 80 << 20
-
-
-@dataclass
-class MarkingMatcher(RectifiedMatcher):
-    """Marks with a file that it has come to the pair of brightness ``at``; the first time its process may die."""
-
-    at: int = 13
-    mark: Path = Path()
-    dies: bool = False
-
-    def _match(self, seen0: Seen, seen1: Seen) -> Matches:
-        if seen0.brightness == self.at and not self.mark.exists():
-            self.mark.touch()
-            if self.dies:
-                os.kill(os.getpid(), signal.SIGKILL)
-        return super()._match(seen0, seen1)
 
 
 @dataclass
@@ -90,7 +75,7 @@ def test_actors_give_the_bytes_of_a_run_in_one_process(
 def test_an_actor_that_dies_is_replaced(
     cluster: Any, pairs: list[Pair], undisturbed: RunReport, tmp_path: Path
 ) -> None:
-    matcher = MarkingMatcher(mark=tmp_path / "died", dies=True)
+    matcher = FaultyMatcher(fault=die, once=tmp_path / "died")
     report = run(pairs, THREE_UNITS, matcher, tmp_path / "w", workers=RayCluster(cluster.address))
     assert report.ending is Ending.COMPLETE
     assert ["the worker died" in fault for fault in report.faults] == [True], report.faults
@@ -115,19 +100,15 @@ def test_a_machine_lost_during_the_run_costs_its_job_alone(
     assert matrices(report) == matrices(undisturbed)
 
 
-def test_a_machine_that_lacks_the_weights_is_named_when_the_run_starts(
+def test_a_machine_that_lacks_the_weights_or_the_test_set_is_named_when_the_run_starts(
     cluster: Any, pairs: list[Pair], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    missing = tmp_path / "weights.safetensors"
-    monkeypatch.setattr(Assembly, "weight_paths", (missing,))
-    with pytest.raises(UserError, match=rf"lacks {missing}: test set and weights must have the same paths"):
-        run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "w", workers=RayCluster(cluster.address))
-
-
-def test_a_machine_that_lacks_the_test_set_is_named_when_the_run_starts(cluster: Any, tmp_path: Path) -> None:
-    pairs = [Pair("a", "a", str(tmp_path / "nowhere" / "a.png"), str(tmp_path / "nowhere" / "b.png"))]
-    with pytest.raises(UserError, match=rf"lacks {tmp_path / 'nowhere'}: test set and weights"):
-        run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "w", workers=RayCluster(cluster.address))
+    missing = tmp_path / "nowhere"
+    lacking = [Pair("a", "a", str(missing / "a.png"), str(missing / "b.png"))]
+    for asked, weights in ((lacking, ()), (pairs, (missing,))):
+        monkeypatch.setattr(Assembly, "weight_paths", weights)
+        with pytest.raises(UserError, match=rf"lacks {missing}: test set and weights must have the same paths"):
+            run(asked, THREE_UNITS, RectifiedMatcher(), tmp_path / "w", workers=RayCluster(cluster.address))
 
 
 @pytest.fixture(scope="module")
@@ -148,24 +129,20 @@ def test_batches_are_reconstructed_on_the_cluster_to_the_same_bytes(
 
 
 LOCAL = """
-import sys, time
+import sys
 sys.path[:0] = {path!r}
 from pathlib import Path
-from rectified import THREE_UNITS, write_pairs
-from test_ray import MarkingMatcher
-from mkpc_kaggle.pipeline.assembly import assemble
-from mkpc_kaggle.engine.budget import Budget
+from faulty import FaultyMatcher
+from rectified import THREE_UNITS, run, write_pairs
 from mkpc_kaggle.engine.cluster import RayCluster
-from mkpc_kaggle.engine.session import Session, interruptible, run_pairs
+from mkpc_kaggle.engine.session import interruptible
 
 if __name__ == "__main__":
     home = Path(sys.argv[1])
     pairs = write_pairs(home / "pairs", 200)
-    matcher = MarkingMatcher(seconds=0.1, mark=home / "begun")
-    assembly = assemble(THREE_UNITS, matchers={{"rectified": matcher}}, device="cpu")
+    matcher = FaultyMatcher(seconds=0.1, fault=lambda: None, once=home / "begun")
     with interruptible() as interrupt:
-        session = Session(home / "work", Budget(time.monotonic()), interrupt, progress=False, workers=RayCluster())
-        report = run_pairs(pairs, assembly, session)
+        report = run(pairs, THREE_UNITS, matcher, home / "work", interrupt=interrupt, workers=RayCluster())
     print(report.ending)
 """
 

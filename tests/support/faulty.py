@@ -42,12 +42,14 @@ def die() -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-def nothing() -> None:
-    """Only the mark is left that it was there."""
-
-
 def hang() -> None:
+    """Until it is killed; a file tells which process hangs."""
+    (Path(os.environ["MKPC_TEST_HOME"]) / "hangs").write_text(str(os.getpid()))
     time.sleep(1000)
+
+
+def lack_an_image() -> None:
+    raise KeyError("image 7")
 
 
 def exhaust_memory() -> None:
@@ -125,21 +127,10 @@ class NarrowMatcher(RectifiedMatcher):
         return super().match(encodings0, encodings1)
 
 
-@dataclass
-class NonsenseMatcher(RectifiedMatcher):
-    """Points that are not finite or not on the image on every second pair, besides good ones on the others."""
-
-    def _match(self, seen0: Seen, seen1: Seen) -> Matches:
-        matches = super()._match(seen0, seen1)
-        bad = Matches([[np.nan, 1], [np.inf, 2], [-50, 3], [1e6, 4]], [[1, 1]] * 4, [1, np.nan, 1, 1])
-        return Matches.concatenate([bad, matches]) if seen0.brightness % 2 == 0 else bad
-
-
 # Scenes
 
-SCENE_F = np.array(
-    [[0.0, 0, 0.2], [0, 0, -0.5], [-0.3, 0.6, 0.5]]
-)  # the scenes of these tests give it to all pairs
+# The scenes of these tests give it to all pairs.
+SCENE_F = np.array([[0.0, 0, 0.2], [0, 0, -0.5], [-0.3, 0.6, 0.5]])
 
 
 class ScenesBy(SceneRunner):
@@ -175,23 +166,9 @@ def choose_scene_for_all_but_the_first(job: SceneJob) -> SceneResult:
     return SceneResult((Reconstruction(names, (SfmModel(registered, points, 0.5),)),), choices)
 
 
-def die_as_scene(job: SceneJob) -> SceneResult:
-    die()
-    raise AssertionError
-
-
-def hang_as_scene(job: SceneJob) -> SceneResult:
-    (Path(os.environ["MKPC_TEST_HOME"]) / "hangs").write_text(str(os.getpid()))
-    hang()
-    raise AssertionError
-
-
-def raise_as_scene(job: SceneJob) -> SceneResult:
-    raise KeyError("image 7")
-
-
-def exhaust_memory_as_scene(job: SceneJob) -> SceneResult:
-    exhaust_memory()
+def befall(fault: Fault, job: SceneJob) -> SceneResult:
+    """A fault in the place of a reconstruction."""
+    fault()
     raise AssertionError
 
 

@@ -6,6 +6,7 @@ It sees every pair as rectified: a point of image 1 is the point of image 0 move
 
 import time
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.cluster import RayCluster
 from mkpc_kaggle.engine.engine import RunReport
 from mkpc_kaggle.engine.records import PairRecord
-from mkpc_kaggle.engine.session import Interrupt, Session, run_pairs
+from mkpc_kaggle.engine.session import Interrupt, Session, Watchdog, run_pairs, submit
 from mkpc_kaggle.geometry.coordinates import View
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import MatcherSpec, Picture
@@ -90,12 +91,19 @@ def run(
     budget: Budget | None = None,
     interrupt: Interrupt | None = None,
     publish: Callable[[Sequence[PairRecord]], None] = lambda _: None,
+    output: Path | None = None,
     workers: int | RayCluster | None = 0,
+    is_watched: bool = False,
 ) -> RunReport:
+    """Run the recipe with that matcher; the submission is written to ``output``, or given to ``publish``."""
     assembly = assemble(recipe, matchers={matcher.name: matcher}, device="cpu")
     budget = budget or Budget(time.monotonic(), limit)
-    session = Session(work_dir, budget, interrupt or Interrupt(), progress=False, workers=workers)
-    return run_pairs(pairs, assembly, session, publish)
+    interrupt = interrupt or Interrupt()
+    with Watchdog(budget, interrupt) if is_watched else nullcontext() as watchdog:
+        session = Session(work_dir, budget, interrupt, progress=False, workers=workers, watchdog=watchdog)
+        if output is not None:
+            return submit(pairs, assembly, session, output)
+        return run_pairs(pairs, assembly, session, publish)
 
 
 def matrices(report: RunReport) -> list[bytes]:
