@@ -1,8 +1,6 @@
 """Devices that fail, memory that is short, workers that are lost: what counts against what, what takes over."""
 
 import threading
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -19,8 +17,7 @@ from faulty import (
 from rectified import SECOND, SWEEP, THIRD, THREE_UNITS, RectifiedMatcher, matrices, run
 
 from mkpc_kaggle.cli import main, options
-from mkpc_kaggle.data.competition import Pair, read_test_side, submission_problems
-from mkpc_kaggle.demo import DemoSet
+from mkpc_kaggle.data.competition import read_test_side, submission_problems
 from mkpc_kaggle.engine.engine import Ending, RunReport
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.pipeline.assembly import assemble
@@ -34,7 +31,7 @@ def unit_failures(report: RunReport) -> list[str]:
     return [unit.failure for record in report.records for unit in record.units if unit.failure]
 
 
-def test_what_errors_mean() -> None:
+def test_what_errors_mean():
     import torch
 
     cuda = "CUDA error: {}\nCUDA kernel errors might be asynchronously reported at some other API call"
@@ -79,12 +76,8 @@ def test_what_errors_mean() -> None:
     ],
 )
 def test_the_cpu_takes_over_when_the_last_gpu_fails_or_has_no_memory_for_any_unit(
-    pairs: list[Pair],
-    undisturbed: RunReport,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    gpus: list[RectifiedMatcher],
-) -> None:
+    pairs, undisturbed, tmp_path, monkeypatch, gpus
+):
     places = [thread_place(f"cuda:{number}", matcher) for number, matcher in enumerate(gpus)]
     use_places(monkeypatch, *places, fallback=[thread_place("cpu", RectifiedMatcher())])
     report = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
@@ -93,9 +86,7 @@ def test_the_cpu_takes_over_when_the_last_gpu_fails_or_has_no_memory_for_any_uni
     assert unit_failures(report) == []
 
 
-def test_a_device_that_fails_once_costs_a_worker_and_no_unit(
-    pairs: list[Pair], undisturbed: RunReport, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_device_that_fails_once_costs_a_worker_and_no_unit(pairs, undisturbed, tmp_path, monkeypatch):
     matcher = FaultyMatcher(fault=break_device, once=tmp_path / "broken")
     use_places(monkeypatch, thread_place("cuda:0", matcher))
     report = run(pairs, THREE_UNITS, matcher, tmp_path / "work")
@@ -107,9 +98,7 @@ def test_a_device_that_fails_once_costs_a_worker_and_no_unit(
     assert unit_failures(report) == []
 
 
-def test_a_pair_at_which_a_device_fails_is_done_by_a_healthy_one(
-    pairs: list[Pair], undisturbed: RunReport, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_pair_at_which_a_device_fails_is_done_by_a_healthy_one(pairs, undisturbed, tmp_path, monkeypatch):
     broken, healthy = BrokenDeviceMatcher(good=2), RectifiedMatcher(seconds=0.02)
     use_places(monkeypatch, thread_place("cuda:0", broken), thread_place("cuda:1", healthy))
     report = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
@@ -121,12 +110,8 @@ def test_a_pair_at_which_a_device_fails_is_done_by_a_healthy_one(
 
 
 def test_a_device_without_kernels_leaves_the_work_to_the_cpu_and_a_line(
-    pairs: list[Pair],
-    undisturbed: RunReport,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+    pairs, undisturbed, tmp_path, monkeypatch, capsys
+):
     assembly = assemble(THREE_UNITS, matchers={"rectified": RectifiedMatcher()}, device="cpu")
     gpu = thread_place("cuda:99", RectifiedMatcher(), pipeline=assembly.on("cuda:99").pipeline)
     use_places(monkeypatch, gpu, fallback=[thread_place("cpu", RectifiedMatcher())])
@@ -136,9 +121,7 @@ def test_a_device_without_kernels_leaves_the_work_to_the_cpu_and_a_line(
     assert matrices(report) == matrices(undisturbed)
 
 
-def test_a_worker_that_hangs_keeps_no_job_from_the_others(
-    pairs: list[Pair], undisturbed: RunReport, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_worker_that_hangs_keeps_no_job_from_the_others(pairs, undisturbed, tmp_path, monkeypatch):
     swept, others_done = set(), threading.Event()
 
     def wait_for_others(brightness: int) -> int:
@@ -161,9 +144,7 @@ def test_a_worker_that_hangs_keeps_no_job_from_the_others(
 # Memory
 
 
-def test_a_unit_too_large_for_the_memory_is_given_up_on_that_pair_alone(
-    pairs: list[Pair], undisturbed: RunReport, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_unit_too_large_for_the_memory_is_given_up_on_that_pair_alone(pairs, undisturbed, tmp_path, monkeypatch):
     use_places(monkeypatch, thread_place("cuda:0", FaultyMatcher(fault=exhaust_gpu, above=100)))
     report = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
     assert report.ending is Ending.COMPLETE
@@ -181,8 +162,8 @@ def test_a_unit_too_large_for_the_memory_is_given_up_on_that_pair_alone(
 
 
 def test_a_minibatch_that_memory_is_too_short_for_is_halved_once_and_no_worker_lost(
-    pairs: list[Pair], undisturbed: RunReport, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    pairs, undisturbed, tmp_path, monkeypatch
+):
     matcher = NarrowMatcher(most=2)
     use_places(monkeypatch, thread_place("cuda:0", matcher, minibatch=8))
     report = run(pairs, THREE_UNITS, matcher, tmp_path / "work")
@@ -207,14 +188,7 @@ def refuse(_: int) -> int:
         (lambda _: exhaust_gpu(), "every unit was given up, the faults say why; the same command goes on"),
     ],
 )
-def test_a_run_that_failed_has_exit_status_one_and_a_line(
-    demo: DemoSet,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    fault: Callable[[int], Any],
-    told: str,
-) -> None:
+def test_a_run_that_failed_has_exit_status_one_and_a_line(demo, tmp_path, monkeypatch, capsys, fault, told):
     matcher = RectifiedMatcher(matches=fault)
     use_places(monkeypatch, thread_place("this process", matcher))
     made = assemble(THREE_UNITS, matchers={matcher.name: matcher}, device="cpu")
@@ -237,9 +211,7 @@ def test_a_run_that_failed_has_exit_status_one_and_a_line(
         (MemoryError("weights"), "out of memory: MemoryError: weights"),
     ],
 )
-def test_workers_that_cannot_be_loaded_end_the_run_before_any_work(
-    pairs: list[Pair], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception, told: str
-) -> None:
+def test_workers_that_cannot_be_loaded_end_the_run_before_any_work(pairs, tmp_path, monkeypatch, error, told):
     def fail() -> Any:
         raise error
 
@@ -248,9 +220,7 @@ def test_workers_that_cannot_be_loaded_end_the_run_before_any_work(
         run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
 
 
-def test_a_worker_that_cannot_be_started_again_ends_the_run_with_every_row_there(
-    pairs: list[Pair], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_worker_that_cannot_be_started_again_ends_the_run_with_every_row_there(pairs, tmp_path, monkeypatch):
     broken, made = BrokenDeviceMatcher(good=5), []
 
     def once() -> Any:

@@ -8,25 +8,20 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
-from faulty import (
-    Fault,
-    FaultyMatcher,
-    die,
-    exhaust_memory,
-)
+from faulty import FaultyMatcher, die, exhaust_memory
+from processes import started_with
 from rectified import THREE_UNITS, RectifiedMatcher, matrices, run, write_pairs
 
 from mkpc_kaggle.cli import main
-from mkpc_kaggle.data.competition import Pair, read_test_side, submission_problems
+from mkpc_kaggle.data.competition import read_test_side, submission_problems
 from mkpc_kaggle.demo import DemoSet
 from mkpc_kaggle.engine import session, worker
-from mkpc_kaggle.engine.engine import Ending, RunReport
+from mkpc_kaggle.engine.engine import Ending
 from mkpc_kaggle.engine.jobs import Outcome
 from mkpc_kaggle.engine.journal import Journal
 from mkpc_kaggle.engine.plan import Plan
@@ -35,16 +30,14 @@ from mkpc_kaggle.reporting.run_log import read_log
 
 ROOT = Path(__file__).resolve().parents[1]
 PATHS = [str(ROOT), str(ROOT / "tests" / "support")]
-COUNT = 12
-VICTIM = 3  # brightness 13
 
 
 # Workers
 
 
 def test_worker_processes_give_the_bytes_of_a_run_in_this_process_and_estimate_f_themselves(
-    pairs: list[Pair], undisturbed: RunReport, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    pairs, undisturbed, tmp_path, monkeypatch
+):
     monkeypatch.setattr(worker, "with_estimate", lambda *_: pytest.fail("F is estimated in the parent"))
     report = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work", workers=2)
     assert report.ending is Ending.COMPLETE
@@ -59,9 +52,7 @@ def test_worker_processes_give_the_bytes_of_a_run_in_this_process_and_estimate_f
         (exhaust_memory, "out of memory: MemoryError: Unable to allocate 2.00 GiB"),
     ],
 )
-def test_a_worker_lost_once_costs_time_alone(
-    pairs: list[Pair], undisturbed: RunReport, tmp_path: Path, fault: Fault, reason: str
-) -> None:
+def test_a_worker_lost_once_costs_time_alone(pairs, undisturbed, tmp_path, fault, reason):
     matcher = FaultyMatcher(fault=fault, once=tmp_path / "once")
     report = run(pairs, THREE_UNITS, matcher, tmp_path / "work", workers=1)
     assert report.ending is Ending.COMPLETE
@@ -69,9 +60,7 @@ def test_a_worker_lost_once_costs_time_alone(
     assert matrices(report) == matrices(undisturbed)
 
 
-def test_an_error_of_the_engine_itself_leaves_the_latest_version_behind(
-    pairs: list[Pair], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_error_of_the_engine_itself_leaves_the_latest_version_behind(pairs, tmp_path, monkeypatch):
     on_result, taken, published = Plan.on_result, [], []
 
     def fail_later(plan: Plan, *arguments: Any) -> list[Outcome]:
@@ -83,18 +72,16 @@ def test_an_error_of_the_engine_itself_leaves_the_latest_version_behind(
     monkeypatch.setattr(Plan, "on_result", fail_later)
     with pytest.raises(KeyError, match="a bug"):
         run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work", publish=lambda r: published.append(list(r)))
-    assert [bool(record.units) for record in published[-1]] == [True] + [False] * (COUNT - 1)
+    assert [bool(record.units) for record in published[-1]] == [True] + [False] * 11
 
 
 # Images
 
 
-def test_an_image_replaced_after_the_run_is_matched_anew(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_image_replaced_after_the_run_is_matched_anew(tmp_path, capsys):
     pairs = write_pairs(tmp_path / "pairs", 5)
     first = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
-    shutil.copy(pairs[4].images[0], pairs[VICTIM].images[0])
+    shutil.copy(pairs[4].images[0], pairs[3].images[0])
     os.utime(pairs[0].images[0])
     again = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
     assert "images have changed since they were matched: 1 pairs are matched anew" in capsys.readouterr().err
@@ -105,7 +92,7 @@ def test_an_image_replaced_after_the_run_is_matched_anew(
     assert again.resumed == 4
 
 
-def test_a_table_whose_rows_name_other_images_is_another_test_set(tmp_path: Path) -> None:
+def test_a_table_whose_rows_name_other_images_is_another_test_set(tmp_path):
     pairs = write_pairs(tmp_path / "pairs", 3)
     run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
     pairs[1] = replace(pairs[1], file0=pairs[1].file1, file1=pairs[1].file0)
@@ -116,9 +103,7 @@ def test_a_table_whose_rows_name_other_images_is_another_test_set(tmp_path: Path
 # Disks
 
 
-def test_a_run_whose_journal_is_full_keeps_its_results_in_memory(
-    pairs: list[Pair], undisturbed: RunReport, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_whose_journal_is_full_keeps_its_results_in_memory(pairs, undisturbed, tmp_path, monkeypatch):
     make = Journal.__init__
 
     def small(self: Journal, *rest: Any, **more: Any) -> None:
@@ -136,12 +121,8 @@ def test_a_run_whose_journal_is_full_keeps_its_results_in_memory(
 
 
 def test_a_submission_that_the_disk_does_not_take_is_told_and_the_exit_status_is_one(
-    demo: DemoSet,
-    small_recipe: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+    demo, small_recipe, tmp_path, monkeypatch, capsys
+):
     whole, versions = session.write_submission, []
 
     def full(path: Path, rows: dict[str, Any]) -> None:
@@ -195,9 +176,7 @@ def on_a_disk_that_takes_nothing(command: list[str]) -> int:
 @pytest.mark.parametrize(
     "run_without", [on_a_closed_terminal, with_stderr_closed, without_a_reader, on_a_disk_that_takes_nothing]
 )
-def test_a_run_that_cannot_print_makes_the_whole_submission(
-    demo: DemoSet, small_recipe: Path, tmp_path: Path, run_without: Callable[[list[str]], int]
-) -> None:
+def test_a_run_that_cannot_print_makes_the_whole_submission(demo, small_recipe, tmp_path, run_without):
     told, alone = tmp_path / "told.csv", tmp_path / "alone.csv"
     assert main(["submit", *arguments_of(demo, small_recipe, told), "--workers", "0"]) == 0
     script = [sys.executable, str(ROOT / "make_submission.py")]
@@ -205,7 +184,7 @@ def test_a_run_that_cannot_print_makes_the_whole_submission(
     assert alone.read_bytes() == told.read_bytes()
 
 
-def test_the_limit_counts_from_the_start_of_the_process() -> None:
+def test_the_limit_counts_from_the_start_of_the_process():
     code = "import time; began = time.monotonic(); from mkpc_kaggle.engine.budget import process_started; "
     code += "import numpy, pandas; print(process_started(), began)"
     before = time.monotonic()
@@ -214,7 +193,7 @@ def test_the_limit_counts_from_the_start_of_the_process() -> None:
     assert before - 0.02 < started < began, "the kernel counts hundredths of a second"
 
 
-def test_a_program_leaves_without_what_an_interpreter_does_at_its_end(tmp_path: Path) -> None:
+def test_a_program_leaves_without_what_an_interpreter_does_at_its_end(tmp_path):
     code = (
         "import atexit; from mkpc_kaggle.cli import program; atexit.register(print, 'late'); program(['recipes'])"
     )
@@ -239,7 +218,7 @@ program(["recipes"])
 
 
 @pytest.mark.parametrize("module", ["engine.console", "cli.recipes"])
-def test_ctrl_c_while_the_program_imports_its_modules_prints_no_traceback(module: str) -> None:
+def test_ctrl_c_while_the_program_imports_its_modules_prints_no_traceback(module):
     code = INTERRUPTED.format(module=module)
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 130
@@ -251,9 +230,7 @@ import sys, time
 sys.path[:0] = {path!r}
 from pathlib import Path
 from rectified import THREE_UNITS, RectifiedMatcher, run, write_pairs
-from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.places import LocalSite
-from mkpc_kaggle.engine.session import Watchdog
 
 wait, waits = LocalSite.wait, []
 def stuck(self, until):
@@ -268,7 +245,7 @@ run(pairs, THREE_UNITS, RectifiedMatcher(), home / "work", limit=4.0, publish=pu
 """
 
 
-def test_the_watchdog_writes_and_leaves_where_the_engine_is_stuck(tmp_path: Path) -> None:
+def test_the_watchdog_writes_and_leaves_where_the_engine_is_stuck(tmp_path):
     code = STUCK.format(path=PATHS)
     made = subprocess.run([sys.executable, "-c", code, str(tmp_path)], check=False)
     assert made.returncode == 0
@@ -288,34 +265,22 @@ if __name__ == "__main__":
 """
 
 
-def orphans(of: int) -> list[str]:
-    """Worker processes that were started by the process of that id, by what they were told at their start."""
-    found = []
-    for told in Path("/proc").glob("[0-9]*/cmdline"):
-        try:
-            line = told.read_bytes().decode(errors="replace")
-        except OSError:
-            continue
-        if "spawn_main" in line and f"parent_pid={of}," in line:
-            found.append(told.parent.name)
-    return found
-
-
 @pytest.mark.parametrize("moments", [3, pytest.param(20, marks=[pytest.mark.slow, pytest.mark.timeout(1200)])])
 def test_a_parent_killed_at_any_moment_leaves_a_whole_file_no_orphans_and_a_run_to_resume(
-    pairs: list[Pair], undisturbed: RunReport, tmp_path: Path, moments: int
-) -> None:
+    pairs, undisturbed, tmp_path, moments
+):
     script = tmp_path / "run.py"
     script.write_text(KILLED.format(path=PATHS))
-    rng = random.Random(moments)
+    mark, rng = f"MKPC_TEST={tmp_path}", random.Random(moments)
+    environment = {**os.environ, "MKPC_TEST": str(tmp_path)}
     for _ in range(moments):
-        running = subprocess.Popen([sys.executable, str(script), str(tmp_path)])
+        running = subprocess.Popen([sys.executable, str(script), str(tmp_path)], env=environment)
         time.sleep(rng.uniform(0.5, 5.0))
         running.send_signal(signal.SIGKILL)
         running.wait()
         if (tmp_path / "submission.csv").exists():
             assert submission_problems(tmp_path / "submission.csv", [pair.id for pair in pairs]) == []
-        while orphans(running.pid):  # they end soon, or the test's own time is over
+        while started_with(mark):  # they end soon
             time.sleep(0.05)
     assert subprocess.run([sys.executable, str(script), str(tmp_path)], check=False).returncode == 0
     assert list(tmp_path.glob(".*.part")) == []
@@ -339,7 +304,7 @@ def guarded(body: str, limit: str = "2") -> subprocess.CompletedProcess[str]:
     return subprocess.run([sys.executable, "-c", code, limit], capture_output=True, text=True, check=False)
 
 
-def test_a_child_that_was_stopped_does_not_outlive_the_watchdog() -> None:
+def test_a_child_that_was_stopped_does_not_outlive_the_watchdog():
     child = "multiprocessing.get_context('fork').Process(target=time.sleep, args=[600], daemon=True)"
     stop = "os.kill(child.pid, signal.SIGSTOP); print(child.pid, flush=True)"
     done = guarded(f"child = {child}; child.start(); {stop}; time.sleep(600)")
@@ -358,10 +323,10 @@ def test_a_child_that_was_stopped_does_not_outlive_the_watchdog() -> None:
         ("watchdog.save = lambda: ''", 0),
     ],
 )
-def test_the_watchdog_leaves_though_writing_hangs_and_keeps_the_status_of_the_run(body: str, status: int) -> None:
+def test_the_watchdog_leaves_though_writing_hangs_and_keeps_the_status_of_the_run(body, status):
     assert guarded(f"{body}; time.sleep(600)").returncode == status
 
 
-def test_a_limit_of_ten_million_years_is_none() -> None:
+def test_a_limit_of_ten_million_years_is_none():
     done = guarded("time.sleep(0.5); print('ended by itself')", "359999999996400")
     assert (done.returncode, done.stdout, done.stderr) == (0, "ended by itself\n", "")

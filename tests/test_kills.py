@@ -78,7 +78,7 @@ class DoomedWorker(WatchedWorker):
 
 
 @pytest.fixture
-def forks(monkeypatch: pytest.MonkeyPatch) -> None:
+def forks(monkeypatch) -> None:
     """Tell workers of their processes as soon as these are forked."""
     for name, empty in {"lives": {}, "spared": set(), "sent": [], "known": {}}.items():
         monkeypatch.setattr(DoomedWorker, name, empty)
@@ -109,8 +109,8 @@ def matrices(report: RunReport, batches: set[str], pairs: list[Pair]) -> list[by
 
 @pytest.mark.parametrize("moments", [6, pytest.param(40, marks=[pytest.mark.slow, pytest.mark.timeout(1200)])])
 def test_a_run_whose_workers_are_killed_and_stopped_at_random_moments_ends_as_the_undisturbed_one(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, forks: None, moments: int
-) -> None:
+    tmp_path, monkeypatch, forks, moments
+):
     pairs = scene_batches(tmp_path / "images")
     budget = patient(monkeypatch, DoomedWorker)
 

@@ -54,7 +54,7 @@ class Worker:
 
 
 @pytest.fixture
-def at_birth(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[int], None]], None]:
+def at_birth(monkeypatch) -> Callable[[Callable[[int], None]], None]:
     """What is done with the id of a process as soon as it is forked."""
     resource_tracker.ensure_running()  # a process, too
     spawn = util.spawnv_passfds
@@ -70,7 +70,7 @@ def at_birth(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[int], None]
     return set_action
 
 
-def test_a_worker_that_cannot_be_sent_to_its_process_says_so() -> None:
+def test_a_worker_that_cannot_be_sent_to_its_process_says_so():
     worker = Worker(lambda job: None)  # which cannot be pickled
     worker.worker.start()
     assert worker.next_answer().cause is Cause.RAISED
@@ -78,9 +78,7 @@ def test_a_worker_that_cannot_be_sent_to_its_process_says_so() -> None:
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
-def test_a_process_that_dies_or_stops_at_its_birth_blocks_nothing(
-    at_birth: Callable[..., None], number: signal.Signals
-) -> None:
+def test_a_process_that_dies_or_stops_at_its_birth_blocks_nothing(at_birth, number):
     at_birth(lambda pid: os.kill(pid, number))
     born = Worker()
     born.worker.start()
@@ -91,7 +89,7 @@ def test_a_process_that_dies_or_stops_at_its_birth_blocks_nothing(
     born.end()
 
 
-def test_a_start_returns_before_there_is_a_process(at_birth: Callable[..., None]) -> None:
+def test_a_start_returns_before_there_is_a_process(at_birth):
     has_returned = threading.Event()
     at_birth(lambda _: has_returned.wait())
     born = Worker()
@@ -102,7 +100,7 @@ def test_a_start_returns_before_there_is_a_process(at_birth: Callable[..., None]
     born.end()
 
 
-def test_a_large_job_goes_to_a_stopped_process_without_blocking(at_birth: Callable[..., None]) -> None:
+def test_a_large_job_goes_to_a_stopped_process_without_blocking(at_birth):
     born: list[int] = []
     at_birth(born.append)
     stopped = Worker()
@@ -133,7 +131,7 @@ if __name__ == "__main__":
 """
 
 
-def test_a_worker_at_work_ends_with_its_parent_and_prints_nothing(tmp_path: Path) -> None:
+def test_a_worker_at_work_ends_with_its_parent_and_prints_nothing(tmp_path):
     script = tmp_path / "orphan.py"  # a file, since its children import it
     script.write_text(ORPHAN.format(path=[str(ROOT), str(ROOT / "tests"), str(ROOT / "tests" / "support")]))
     mark, home = tmp_path / "hangs", {**os.environ, "MKPC_TEST_HOME": str(tmp_path)}
@@ -174,9 +172,7 @@ if __name__ == "__main__":
 """
 
 
-def test_the_first_worker_of_a_program_hears_no_ctrl_c_and_is_told_not_to_spin_and_to_use_huge_pages(
-    tmp_path: Path,
-) -> None:
+def test_the_first_worker_of_a_program_hears_no_ctrl_c_and_is_told_not_to_spin_and_to_use_huge_pages(tmp_path):
     script = tmp_path / "starts.py"
     script.write_text(STARTS)
     environment = {name: value for name, value in os.environ.items() if name not in WORKER_ENVIRONMENT}

@@ -13,13 +13,14 @@ from typing import Any
 
 import pytest
 from faulty import FaultyMatcher, die
+from processes import started_with
 from rectified import THREE_UNITS, RectifiedMatcher, Seen, matrices, run
 from synthetic import RECIPE as SYNTHETIC
 from synthetic import SyntheticMatcher, synthetic_pairs
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.cluster import RayCluster
-from mkpc_kaggle.engine.engine import Ending, RunReport
+from mkpc_kaggle.engine.engine import Ending
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.pipeline.assembly import Assembly
@@ -62,9 +63,7 @@ def cluster() -> Iterator[Any]:
     patch.undo()
 
 
-def test_actors_give_the_bytes_of_a_run_in_one_process(
-    cluster: Any, pairs: list[Pair], undisturbed: RunReport, tmp_path: Path
-) -> None:
+def test_actors_give_the_bytes_of_a_run_in_one_process(cluster, pairs, undisturbed, tmp_path):
     report = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "w", workers=RayCluster(cluster.address))
     assert report.faults == ()
     assert report.ending is Ending.COMPLETE
@@ -72,9 +71,7 @@ def test_actors_give_the_bytes_of_a_run_in_one_process(
     assert not ray.is_initialized(), "the run lets go of the cluster"
 
 
-def test_an_actor_that_dies_is_replaced(
-    cluster: Any, pairs: list[Pair], undisturbed: RunReport, tmp_path: Path
-) -> None:
+def test_an_actor_that_dies_is_replaced(cluster, pairs, undisturbed, tmp_path):
     matcher = FaultyMatcher(fault=die, once=tmp_path / "died")
     report = run(pairs, THREE_UNITS, matcher, tmp_path / "w", workers=RayCluster(cluster.address))
     assert report.ending is Ending.COMPLETE
@@ -82,9 +79,7 @@ def test_an_actor_that_dies_is_replaced(
     assert matrices(report) == matrices(undisturbed)
 
 
-def test_a_machine_lost_during_the_run_costs_its_job_alone(
-    cluster: Any, pairs: list[Pair], undisturbed: RunReport, tmp_path: Path
-) -> None:
+def test_a_machine_lost_during_the_run_costs_its_job_alone(cluster, pairs, undisturbed, tmp_path):
     lost = cluster.add_node(num_cpus=1, object_store_memory=STORE_BYTES)
     matcher = DoomedMatcher(node=lost.node_id, mark=tmp_path / "begun")
 
@@ -101,8 +96,8 @@ def test_a_machine_lost_during_the_run_costs_its_job_alone(
 
 
 def test_a_machine_that_lacks_the_weights_or_the_test_set_is_named_when_the_run_starts(
-    cluster: Any, pairs: list[Pair], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    cluster, pairs, tmp_path, monkeypatch
+):
     missing = tmp_path / "nowhere"
     lacking = [Pair("a", "a", str(missing / "a.png"), str(missing / "b.png"))]
     for asked, weights in ((lacking, ()), (pairs, (missing,))):
@@ -112,13 +107,11 @@ def test_a_machine_that_lacks_the_weights_or_the_test_set_is_named_when_the_run_
 
 
 @pytest.fixture(scope="module")
-def batch(tmp_path_factory: pytest.TempPathFactory) -> list[Pair]:
+def batch(tmp_path_factory) -> list[Pair]:
     return synthetic_pairs(tmp_path_factory.mktemp("batch"))
 
 
-def test_batches_are_reconstructed_on_the_cluster_to_the_same_bytes(
-    cluster: Any, batch: list[Pair], tmp_path: Path
-) -> None:
+def test_batches_are_reconstructed_on_the_cluster_to_the_same_bytes(cluster, batch, tmp_path):
     here = run(batch, SYNTHETIC, SyntheticMatcher(), tmp_path / "here")
     report = run(batch, SYNTHETIC, SyntheticMatcher(), tmp_path / "w", workers=RayCluster(cluster.address))
     assert report.faults == ()
@@ -147,23 +140,8 @@ if __name__ == "__main__":
 """
 
 
-def at_work(mark: str) -> list[str]:
-    """Processes that were started with that in their environment.
-
-    Ray's agents, which take a minute or two to find that their node is gone, are left out.
-    """
-    found = []
-    for environment in Path("/proc").glob("[0-9]*/environ"):
-        try:
-            if mark.encode() in environment.read_bytes():
-                found.append((environment.parent / "cmdline").read_text().replace("\0", " ")[:80])
-        except OSError:
-            continue
-    return [line for line in found if "Agent" not in line]
-
-
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
-def test_a_cluster_of_its_own_ends_with_the_run(tmp_path: Path, number: signal.Signals) -> None:
+def test_a_cluster_of_its_own_ends_with_the_run(tmp_path, number):
     mark = f"MKPC_TEST={tmp_path}"
     environment = {**os.environ, "MKPC_TEST": str(tmp_path), "RAY_ADDRESS": "local"}
     environment["PYTHONPATH"] = os.pathsep.join([*IMPORTED, os.environ.get("PYTHONPATH", "")])
@@ -179,5 +157,6 @@ def test_a_cluster_of_its_own_ends_with_the_run(tmp_path: Path, number: signal.S
     running.send_signal(number)
     told, _ = running.communicate()
     assert told == ("interrupted\n" if number is signal.SIGTERM else "")
-    while at_work(mark):  # or the test's own limit
+    # Ray's agents take a minute or two to find that their node is gone.
+    while [command for command in started_with(mark).values() if "Agent" not in command]:
         time.sleep(0.2)

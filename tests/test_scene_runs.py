@@ -57,9 +57,7 @@ def own_matrices(pairs: list[Pair], directory: Path) -> list[bytes]:
     return matrices(run(pairs, THREE_UNITS, RectifiedMatcher(), directory))
 
 
-def test_pairs_get_the_f_of_their_scene_and_keep_their_own(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_pairs_get_the_f_of_their_scene_and_keep_their_own(tmp_path, monkeypatch):
     scenes_by(monkeypatch, choose_scene_for_all_but_the_first, process=True)
     pairs, published = batch_pairs(tmp_path / "images"), []
     report = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work", publish=lambda r: published.append(list(r)))
@@ -75,7 +73,7 @@ def test_pairs_get_the_f_of_their_scene_and_keep_their_own(
     assert all(len(weak.results[0].matches) for weak in log.weakest), "what is drawn keeps its points"
 
 
-def test_a_run_that_goes_on_does_not_reconstruct_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_that_goes_on_does_not_reconstruct_again(tmp_path, monkeypatch):
     scenes_by(monkeypatch, choose_scene_for_all_but_the_first)
     pairs = batch_pairs(tmp_path / "images")
     first = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
@@ -97,8 +95,8 @@ def test_a_run_that_goes_on_does_not_reconstruct_again(tmp_path: Path, monkeypat
     ],
 )
 def test_a_reconstruction_that_is_lost_costs_its_scene_alone_and_the_reason_is_told(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, make: Any, reason: str, capfd: pytest.CaptureFixture[str]
-) -> None:
+    tmp_path, monkeypatch, make, reason, capfd
+):
     scenes_by(monkeypatch, make, process=True)
     pairs = batch_pairs(tmp_path / "images")
     report = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
@@ -110,9 +108,7 @@ def test_a_reconstruction_that_is_lost_costs_its_scene_alone_and_the_reason_is_t
     assert capfd.readouterr() == ("", "")
 
 
-def test_a_scene_process_that_cannot_be_started_costs_its_scene_alone(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_scene_process_that_cannot_be_started_costs_its_scene_alone(tmp_path, monkeypatch):
     def no_memory(_: Any) -> None:
         raise OSError(12, "Cannot allocate memory")
 
@@ -122,16 +118,14 @@ def test_a_scene_process_that_cannot_be_started_costs_its_scene_alone(
     assert "the worker could not be started: [Errno 12] Cannot allocate memory" in report.faults[0]
 
 
-def test_without_pycolmap_a_line_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_pycolmap_a_line_says_so(tmp_path, monkeypatch):
     scenes_by(monkeypatch, scene_without_pycolmap, process=True)
     report = run(batch_pairs(tmp_path / "images"), RECIPE, RectifiedMatcher(), tmp_path / "work")
     assert all(record.source == "pair" for record in report.records)
     assert "pycolmap" in overview(read_log(tmp_path / "work"))
 
 
-def test_a_run_reconstructs_the_true_cameras_and_a_gigabyte_is_enough(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_reconstructs_the_true_cameras_and_a_gigabyte_is_enough(tmp_path, monkeypatch):
     scenes_by(monkeypatch, scene_in_a_gigabyte, process=True)
     matcher = SyntheticMatcher()
     report = run(synthetic_pairs(tmp_path / "images"), SYNTHETIC, matcher, tmp_path / "work")
@@ -142,9 +136,7 @@ def test_a_run_reconstructs_the_true_cameras_and_a_gigabyte_is_enough(
 
 
 @pytest.mark.parametrize("make", [exhaust_memory_within_pycolmap, die_within_pycolmap])
-def test_what_happens_within_pycolmap_costs_the_scene_alone_and_leaves_no_files(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, make: Any
-) -> None:
+def test_what_happens_within_pycolmap_costs_the_scene_alone_and_leaves_no_files(tmp_path, monkeypatch, make):
     (tmp_path / "temporary").mkdir()
     monkeypatch.setenv("TMPDIR", str(tmp_path / "temporary"))
     scenes_by(monkeypatch, make, process=True)
@@ -155,9 +147,7 @@ def test_what_happens_within_pycolmap_costs_the_scene_alone_and_leaves_no_files(
     assert list((tmp_path / "temporary").iterdir()) == []
 
 
-def test_the_scene_of_a_run_is_made_of_tracks_and_judged_by_all_matches(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_scene_of_a_run_is_made_of_tracks_and_judged_by_all_matches(tmp_path, monkeypatch):
     given: list[BatchPair] = []
 
     def note(job: SceneJob) -> SceneResult:
@@ -172,16 +162,14 @@ def test_the_scene_of_a_run_is_made_of_tracks_and_judged_by_all_matches(
     assert all(0 < sum(map(len, pair.tracks.values())) < len(pair.matches) for pair in given)
 
 
-def test_a_recipe_without_scenes_starts_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_recipe_without_scenes_starts_none(tmp_path, monkeypatch):
     scenes_by(monkeypatch, partial(befall, lack_an_image))
     report = run(batch_pairs(tmp_path / "images"), Recipe((SWEEP,)), RectifiedMatcher(), tmp_path / "work")
     assert report.scenes == ()
     assert report.faults == ()
 
 
-def test_an_image_replaced_after_the_run_drops_the_scene_and_its_batch_alone(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_image_replaced_after_the_run_drops_the_scene_and_its_batch_alone(tmp_path, monkeypatch, capsys):
     scenes_by(monkeypatch, choose_scene_for_all_but_the_first)
     pairs = two_batches(tmp_path)
     run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")

@@ -9,10 +9,12 @@ import tempfile
 import time
 import uuid
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import pytest
+from processes import started_with
 
 from mkpc_kaggle.data.competition import read_test_side, submission_problems
 
@@ -62,8 +64,6 @@ class Case:
 
 def attack(case: Case, room: Path) -> None:
     """Run the case in the room; the test fails with all that was wrong."""
-    for folder in ("out", "tmp", "home"):
-        (room / folder).mkdir(exist_ok=True)
     case.make(room)
     before = _snapshot(room)
     mark = uuid.uuid4().hex
@@ -90,8 +90,6 @@ def attack(case: Case, room: Path) -> None:
 
 def prepared(command: str, room: Path) -> int:
     """The exit status of a command that nobody disturbs."""
-    for folder in ("out", "tmp", "home"):
-        (room / folder).mkdir(exist_ok=True)
     return _start(command, room, {}).wait()
 
 
@@ -154,28 +152,13 @@ def _submission_faults(room: Path) -> list[str]:
 def _orphans(mark: str) -> list[str]:
     """Command lines of processes of the case that are still there; they are killed."""
     for _ in range(600):
-        if not (left := _marked(mark)):
+        if not (left := started_with(mark)):
             break
         time.sleep(0.1)
-    lines = []
     for process in left:
-        try:
-            lines.append(f"{process} {Path(f'/proc/{process}/cmdline').read_bytes()[:200]!r}")
+        with suppress(OSError):  # it has ended meanwhile
             os.kill(process, signal.SIGKILL)
-        except OSError:
-            continue  # it ended meanwhile
-    return lines
-
-
-def _marked(mark: str) -> list[int]:
-    found = []
-    for process in Path("/proc").glob("[0-9]*"):
-        try:
-            if mark.encode() in (process / "environ").read_bytes():
-                found.append(int(process.name))
-        except OSError:
-            continue  # another user's, or it ended meanwhile
-    return found
+    return [f"{process} {command[:200]}" for process, command in left.items()]
 
 
 def _snapshot(room: Path) -> dict[str, tuple[object, ...]]:

@@ -1,5 +1,6 @@
 """The standing attack: the real command on hostile inputs, each case in a process of its own (see ``attack``)."""
 
+import shutil
 from pathlib import Path
 
 import ends
@@ -12,7 +13,7 @@ import settings
 import tables
 import weight_bombs
 from attack import Case, attack
-from room import furnish, write_template
+from room import write_template
 
 ALL: list[Case] = [
     case
@@ -48,7 +49,7 @@ def template(tmp_path_factory: pytest.TempPathFactory) -> Path:
     "case", [pytest.param(case, id=case.id, marks=() if case.id in QUICK else pytest.mark.slow) for case in ALL]
 )
 def test_a_hostile_input_is_survived(case: Case, template: Path, tmp_path: Path) -> None:
-    attack(case, furnish(tmp_path / "room", template))
+    attack(case, shutil.copytree(template, tmp_path / "room"))
 
 
 def test_the_names_of_cases_are_unique_and_the_quick_ones_are_among_them() -> None:
