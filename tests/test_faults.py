@@ -184,20 +184,22 @@ def test_a_run_that_cannot_print_makes_the_whole_submission(demo, small_recipe, 
     assert alone.read_bytes() == told.read_bytes()
 
 
+def python(code: str, *arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-c", code, *arguments]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
 def test_the_limit_counts_from_the_start_of_the_process():
     code = "import time; began = time.monotonic(); from mkpc_kaggle.engine.budget import process_started; "
     code += "import numpy, pandas; print(process_started(), began)"
     before = time.monotonic()
-    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    started, began = map(float, out.split())
+    started, began = map(float, python(code).stdout.split())
     assert before - 0.02 < started < began, "the kernel counts hundredths of a second"
 
 
-def test_a_program_leaves_without_what_an_interpreter_does_at_its_end(tmp_path):
-    code = (
-        "import atexit; from mkpc_kaggle.cli import program; atexit.register(print, 'late'); program(['recipes'])"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+def test_a_program_leaves_without_what_an_interpreter_does_at_its_end():
+    late = "import atexit; atexit.register(print, 'late'); "
+    done = python(late + "from mkpc_kaggle.cli import program; program(['recipes'])")
     assert (done.returncode, done.stderr) == (0, "")
     assert "auto: " in done.stdout
     assert "late" not in done.stdout
@@ -219,8 +221,7 @@ program(["recipes"])
 
 @pytest.mark.parametrize("module", ["engine.console", "cli.recipes"])
 def test_ctrl_c_while_the_program_imports_its_modules_prints_no_traceback(module):
-    code = INTERRUPTED.format(module=module)
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    done = python(INTERRUPTED.format(module=module))
     assert done.returncode == 130
     assert "Traceback" not in done.stderr
 
@@ -246,9 +247,7 @@ run(pairs, THREE_UNITS, RectifiedMatcher(), home / "work", limit=4.0, publish=pu
 
 
 def test_the_watchdog_writes_and_leaves_where_the_engine_is_stuck(tmp_path):
-    code = STUCK.format(path=PATHS)
-    made = subprocess.run([sys.executable, "-c", code, str(tmp_path)], check=False)
-    assert made.returncode == 0
+    assert python(STUCK.format(path=PATHS), str(tmp_path)).returncode == 0
     assert int((tmp_path / "out").read_text()) > 0
 
 
@@ -300,8 +299,7 @@ if __name__ == "__main__":
 
 
 def guarded(body: str, limit: str = "2") -> subprocess.CompletedProcess[str]:
-    code = GUARDED.format(body=body)
-    return subprocess.run([sys.executable, "-c", code, limit], capture_output=True, text=True, check=False)
+    return python(GUARDED.format(body=body), limit)
 
 
 def test_a_child_that_was_stopped_does_not_outlive_the_watchdog():

@@ -21,14 +21,14 @@ from faulty import (
     scene_without_pycolmap,
     scenes_by,
 )
-from rectified import SWEEP, THREE_UNITS, RectifiedMatcher, matrices, run
+from rectified import THREE_UNITS, RectifiedMatcher, batch_pairs, matrices, run
 from synthetic import RECIPE as SYNTHETIC
 from synthetic import SyntheticMatcher, synthetic_pairs
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.engine import Ending
 from mkpc_kaggle.engine.jobs import SceneJob, SceneResult
-from mkpc_kaggle.recipe import Recipe, SceneConfig
+from mkpc_kaggle.recipe import SceneConfig
 from mkpc_kaggle.reporting.report import report_page
 from mkpc_kaggle.reporting.run_log import read_log
 from mkpc_kaggle.reporting.summary import overview
@@ -36,21 +36,6 @@ from mkpc_kaggle.scene.choose import Reason
 from mkpc_kaggle.scene.view_graph import BatchPair
 
 RECIPE = replace(THREE_UNITS, scene=SceneConfig())
-
-
-def batch_pairs(directory: Path, images: int = 4, batch: str = "one") -> list[Pair]:
-    """All pairs of flat images, each with a brightness of its own: 10, 20, ..."""
-    directory.mkdir(parents=True, exist_ok=True)
-    paths = [directory / f"{number}.png" for number in range(images)]
-    for number, path in enumerate(paths):
-        cv2.imwrite(str(path), np.full((72, 80, 3), 10 + 10 * number, np.uint8))
-    chosen = [(i, j) for i in range(images) for j in range(i + 1, images)]
-    return [Pair(f"{batch};{i}-{j}", batch, str(paths[i]), str(paths[j])) for i, j in chosen]
-
-
-def two_batches(directory: Path) -> list[Pair]:
-    """Batch "one" of six pairs, and batch "two" of three."""
-    return batch_pairs(directory / "images") + batch_pairs(directory / "others", 3, "two")
 
 
 def own_matrices(pairs: list[Pair], directory: Path) -> list[bytes]:
@@ -71,19 +56,6 @@ def test_pairs_get_the_f_of_their_scene_and_keep_their_own(tmp_path, monkeypatch
     assert told in overview(log)
     assert "both cameras are known" in report_page(log)
     assert all(len(weak.results[0].matches) for weak in log.weakest), "what is drawn keeps its points"
-
-
-def test_a_run_that_goes_on_does_not_reconstruct_again(tmp_path, monkeypatch):
-    scenes_by(monkeypatch, choose_scene_for_all_but_the_first)
-    pairs = batch_pairs(tmp_path / "images")
-    first = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
-    scenes_by(monkeypatch, partial(befall, lack_an_image))
-    again = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
-    assert again.faults == ()
-    assert [record.chosen_fundamental.tobytes() for record in again.records] == [
-        record.chosen_fundamental.tobytes() for record in first.records
-    ]
-    assert again.scenes == first.scenes
 
 
 @pytest.mark.parametrize(
@@ -162,16 +134,9 @@ def test_the_scene_of_a_run_is_made_of_tracks_and_judged_by_all_matches(tmp_path
     assert all(0 < sum(map(len, pair.tracks.values())) < len(pair.matches) for pair in given)
 
 
-def test_a_recipe_without_scenes_starts_none(tmp_path, monkeypatch):
-    scenes_by(monkeypatch, partial(befall, lack_an_image))
-    report = run(batch_pairs(tmp_path / "images"), Recipe((SWEEP,)), RectifiedMatcher(), tmp_path / "work")
-    assert report.scenes == ()
-    assert report.faults == ()
-
-
-def test_an_image_replaced_after_the_run_drops_the_scene_and_its_batch_alone(tmp_path, monkeypatch, capsys):
+def test_a_run_that_goes_on_reconstructs_only_the_batch_whose_image_was_replaced(tmp_path, monkeypatch, capsys):
     scenes_by(monkeypatch, choose_scene_for_all_but_the_first)
-    pairs = two_batches(tmp_path)
+    pairs = batch_pairs(tmp_path / "images") + batch_pairs(tmp_path / "others", 3, "two")
     run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
     cv2.imwrite(str(pairs[0].images[0]), np.full((72, 80, 3), 200, np.uint8))
     scenes_by(monkeypatch, partial(befall, lack_an_image))

@@ -10,17 +10,16 @@ from dataclasses import dataclass
 from functools import partial
 from math import inf
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import pytest
 from rectified import THREE_UNITS, RectifiedMatcher, Seen
 
 from mkpc_kaggle.engine import places, session
-from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.jobs import SceneJob, SceneResult
 from mkpc_kaggle.engine.places import LocalSite, Place
-from mkpc_kaggle.engine.process import ProcessWorker, ThreadWorker
+from mkpc_kaggle.engine.process import ThreadWorker
 from mkpc_kaggle.engine.worker import MatchRunner, SceneRunner
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Size
@@ -226,73 +225,3 @@ def use_places(monkeypatch: pytest.MonkeyPatch, *used: Place, fallback: Sequence
     monkeypatch.setattr(session, "site_of", site_of)
     monkeypatch.setattr(places, "LISTEN_S", 0.01)
     monkeypatch.setattr(places, "RESTART_PAUSE_S", 0.0)
-
-
-@dataclass
-class StandingClock:
-    """A clock that stands still, however long workers take, until :class:`PatientSite` moves it."""
-
-    now: float = 0.0
-
-    def __call__(self) -> float:
-        return self.now
-
-    @property
-    def budget(self) -> Budget:
-        return Budget(0.0, inf, self)
-
-
-class PatientSite(LocalSite):
-    """Its workers' time limits are over only when nothing else can happen: when all that are at work are stuck.
-
-    So no limit is over early on a busy machine, and none is waited for. Use :func:`patient`.
-    """
-
-    def __init__(self, assembly: Assembly, workers: int, clock: StandingClock) -> None:
-        super().__init__(assembly, workers, clock)
-        self._standing = clock
-
-    def wait(self, until: float) -> None:
-        super().wait(inf)
-        busy = [worker for worker in WatchedWorker.all if worker.is_busy]
-        if busy and until < inf and all(worker.is_stuck() for worker in busy):
-            self._standing.now = until
-
-
-class WatchedWorker(ProcessWorker):
-    """A worker process that is busy from its start to its answer, and from a job to its answer."""
-
-    all: ClassVar[list["WatchedWorker"]] = []
-    is_busy = False
-
-    def is_stuck(self) -> bool:
-        """Whether it will never answer, as the test knows."""
-        raise NotImplementedError
-
-    def start(self) -> None:
-        self.all.append(self)
-        self.is_busy = True
-        super().start()
-
-    def submit(self, job: Any, seconds: float) -> None:
-        self.is_busy = True
-        super().submit(job, seconds)
-
-    def answer(self) -> Any:
-        answer = super().answer()
-        self.is_busy = self.is_busy and answer is None
-        return answer
-
-    def kill(self) -> None:
-        self.is_busy = False
-        super().kill()
-
-
-def patient(monkeypatch: pytest.MonkeyPatch, kind: type[WatchedWorker]) -> Budget:
-    """Let runs have a :class:`PatientSite` with processes of that kind; the budget to give them."""
-    clock = StandingClock()
-    monkeypatch.setattr(WatchedWorker, "all", [])
-    monkeypatch.setattr(places, "ProcessWorker", kind)
-    monkeypatch.setattr(places, "RESTART_PAUSE_S", 0.0)
-    monkeypatch.setattr(session, "site_of", lambda _, assembly, plan: PatientSite(assembly, plan.workers, clock))
-    return clock.budget

@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field
+from itertools import combinations
 from pathlib import Path
 
 import cv2
@@ -19,7 +20,7 @@ from mkpc_kaggle.engine.cluster import RayCluster
 from mkpc_kaggle.engine.engine import RunReport
 from mkpc_kaggle.engine.records import PairRecord
 from mkpc_kaggle.engine.session import Interrupt, Session, Watchdog, run_pairs, submit
-from mkpc_kaggle.geometry.coordinates import View
+from mkpc_kaggle.geometry.coordinates import Size, View
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import MatcherSpec, Picture
 from mkpc_kaggle.pipeline.assembly import assemble
@@ -67,6 +68,7 @@ class RectifiedMatcher:
 
 SWEEP, SECOND, THIRD = Unit(1, "rectified", 96), Unit(2, "rectified", 128), Unit(1, "rectified", 160)
 THREE_UNITS = Recipe((SWEEP, SECOND, THIRD))
+SIZE = Size(80, 72)
 
 
 def write_pairs(directory: Path, count: int) -> list[Pair]:
@@ -79,6 +81,16 @@ def write_pairs(directory: Path, count: int) -> list[Pair]:
             cv2.imwrite(str(path), np.full((72, 80, 3), 10 + index, np.uint8))
         pairs.append(Pair(f"set;{index:03d}", "set", *map(str, paths)))
     return pairs
+
+
+def batch_pairs(directory: Path, images: int = 4, batch: str = "one", size: Size = SIZE) -> list[Pair]:
+    """All pairs of flat images, each with a brightness of its own: 10, 20, ..."""
+    directory.mkdir(parents=True, exist_ok=True)
+    paths = [directory / f"{number}.png" for number in range(images)]
+    for number, path in enumerate(paths):
+        cv2.imwrite(str(path), np.full((size.height, size.width, 3), 10 + 10 * number, np.uint8))
+    chosen = combinations(range(images), 2)
+    return [Pair(f"{batch};{i}-{j}", batch, str(paths[i]), str(paths[j])) for i, j in chosen]
 
 
 def run(
