@@ -90,15 +90,10 @@ def test_an_assumed_cost_holds_only_for_a_unit_that_was_never_measured() -> None
     assert costs.mean("b") == 99.0
 
 
-def known_costs(*seconds: float) -> Costs:
-    costs = Costs()
-    for unit, cost in zip(UNITS, seconds, strict=True):
-        costs.observe(unit.name, cost)
-    return costs
-
-
 def test_pairs_need_the_units_that_they_lack_and_the_time_between_them() -> None:
-    costs = known_costs(1.0, 2.0, 4.0)
+    costs = Costs()
+    for unit, seconds in zip(UNITS, (1.0, 2.0, 4.0), strict=True):
+        costs.observe(unit.name, seconds)
     lacking = {UNITS[0].name: 0, UNITS[1].name: 10, UNITS[2].name: 1}
     assert list(costs.cumulative(UNITS, lacking)) == pytest.approx([0, 28, 33.6])
     costs.observe_overhead(1.0)

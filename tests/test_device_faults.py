@@ -33,32 +33,31 @@ def test_what_errors_mean():
     import torch
 
     cuda = "CUDA error: {}\nCUDA kernel errors might be asynchronously reported at some other API call"
-    told = {
+    messages = {
         FailureKind.OUT_OF_MEMORY: [
-            MemoryError(),
-            torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB."),
-            RuntimeError(
-                "[enforce fail at alloc_cpu.cpp:117] err == 0. DefaultCPUAllocator: can't allocate memory"
-            ),
-            RuntimeError(cuda.format("out of memory")),
-            RuntimeError(cuda.format("CUBLAS_STATUS_ALLOC_FAILED when calling `cublasCreate(handle)`")),
-            RuntimeError("cuDNN error: CUDNN_STATUS_ALLOC_FAILED"),
-            RuntimeError("cuDNN error: CUDNN_STATUS_INTERNAL_ERROR_DEVICE_ALLOCATION_FAILED"),
-            RuntimeError("FIND was unable to find an engine to execute this computation"),
-            RuntimeError("GET was unable to find an engine to execute this computation"),
+            "[enforce fail at alloc_cpu.cpp:117] err == 0. DefaultCPUAllocator: can't allocate memory",
+            cuda.format("out of memory"),
+            cuda.format("CUBLAS_STATUS_ALLOC_FAILED when calling `cublasCreate(handle)`"),
+            "cuDNN error: CUDNN_STATUS_ALLOC_FAILED",
+            "cuDNN error: CUDNN_STATUS_INTERNAL_ERROR_DEVICE_ALLOCATION_FAILED",
+            "FIND was unable to find an engine to execute this computation",
+            "GET was unable to find an engine to execute this computation",
         ],
         FailureKind.DEVICE: [
-            RuntimeError(cuda.format("an illegal memory access was encountered")),
-            RuntimeError(cuda.format("no kernel image is available for execution on the device")),
-            RuntimeError(cuda.format("CUBLAS_STATUS_EXECUTION_FAILED when calling `cublasSgemm( handle )`")),
-            RuntimeError("cuDNN error: CUDNN_STATUS_EXECUTION_FAILED"),
-            RuntimeError("No CUDA GPUs are available"),
+            cuda.format("an illegal memory access was encountered"),
+            cuda.format("no kernel image is available for execution on the device"),
+            cuda.format("CUBLAS_STATUS_EXECUTION_FAILED when calling `cublasSgemm( handle )`"),
+            "cuDNN error: CUDNN_STATUS_EXECUTION_FAILED",
+            "No CUDA GPUs are available",
         ],
-        FailureKind.ORDINARY: [RuntimeError("shapes differ"), ValueError("no points"), AssertionError()],
+        FailureKind.ORDINARY: ["shapes differ"],
     }
-    for failure, errors in told.items():
-        assert [failure_of(error) for error in errors] == [failure] * len(errors)
-    illegal = told[FailureKind.DEVICE][0]
+    for kind, texts in messages.items():
+        assert {failure_of(RuntimeError(text)) for text in texts} == {kind}
+    for error in (MemoryError(), torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB.")):
+        assert failure_of(error) is FailureKind.OUT_OF_MEMORY
+    assert failure_of(ValueError("no points")) is failure_of(AssertionError()) is FailureKind.ORDINARY
+    illegal = RuntimeError(cuda.format("an illegal memory access was encountered"))
     illegal.add_note("in 1:loftr@840")
     assert reason_of(illegal) == f"RuntimeError: {BROKEN}, in 1:loftr@840"
 

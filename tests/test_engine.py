@@ -47,13 +47,6 @@ def test_a_run_without_a_limit_gives_every_pair_every_unit(tmp_path):
         assert record.regions is not None
 
 
-def test_the_sweep_reaches_all_pairs_before_any_pair_is_deepened(tmp_path):
-    matcher = RectifiedMatcher()
-    run(write_pairs(tmp_path, 9), THREE_UNITS, matcher, tmp_path / "work")
-    assert {side for side, _ in matcher.calls[:9]} == {SWEEP.long_side}
-    assert SWEEP.long_side not in {side for side, _ in matcher.calls[9:]}
-
-
 def test_every_published_version_is_whole_and_the_first_comes_before_any_work(tmp_path):
     matcher, published = RectifiedMatcher(), []
 

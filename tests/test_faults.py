@@ -153,30 +153,29 @@ def on_a_closed_terminal(command: list[str]) -> int:
     return running.wait()
 
 
-def with_stderr_closed(command: list[str]) -> int:
-    return subprocess.run(
-        ["sh", "-c", 'exec "$@" 2>&-', "sh", *command], stdout=subprocess.PIPE, check=False
-    ).returncode
-
-
 def without_a_reader(command: list[str]) -> int:
     reader, writer = os.pipe()
     os.close(reader)
-    environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
     with os.fdopen(writer, "wb") as gone:
-        return subprocess.run(command, stdout=gone, stderr=gone, env=environment, check=False).returncode
+        return subprocess.run(command, stdout=gone, stderr=gone, check=False).returncode
+
+
+def with_stderr_closed(command: list[str]) -> int:
+    return subprocess.run(["sh", "-c", 'exec "$@" 2>&-', "sh", *command], check=False).returncode
 
 
 def on_a_disk_that_takes_nothing(command: list[str]) -> int:
-    environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
     with Path(os.devnull).open() as refusing:  # not opened for writing; not each machine has a /dev/full
-        return subprocess.run(command, stdout=refusing, stderr=refusing, env=environment, check=False).returncode
+        return subprocess.run(command, stdout=refusing, stderr=refusing, check=False).returncode
 
 
 @pytest.mark.parametrize(
     "run_without", [on_a_closed_terminal, with_stderr_closed, without_a_reader, on_a_disk_that_takes_nothing]
 )
-def test_a_run_that_cannot_print_makes_the_whole_submission(demo, small_recipe, tmp_path, run_without):
+def test_a_run_that_cannot_print_makes_the_whole_submission(
+    demo, small_recipe, tmp_path, monkeypatch, run_without
+):
+    monkeypatch.setenv("PYTHONUNBUFFERED", "1")
     told, alone = tmp_path / "told.csv", tmp_path / "alone.csv"
     assert main(["submit", *arguments_of(demo, small_recipe, told), "--workers", "0"]) == 0
     script = [sys.executable, str(ROOT / "make_submission.py")]
@@ -203,27 +202,6 @@ def test_a_program_leaves_without_what_an_interpreter_does_at_its_end():
     assert (done.returncode, done.stderr) == (0, "")
     assert "auto: " in done.stdout
     assert "late" not in done.stdout
-
-
-INTERRUPTED = """
-import sys
-
-class Interrupting:
-    def find_spec(name, *_):
-        if name == "mkpc_kaggle.{module}":
-            raise KeyboardInterrupt
-
-sys.meta_path.insert(0, Interrupting)
-from mkpc_kaggle.cli import program
-program(["recipes"])
-"""
-
-
-@pytest.mark.parametrize("module", ["engine.console", "cli.recipes"])
-def test_ctrl_c_while_the_program_imports_its_modules_prints_no_traceback(module):
-    done = python(INTERRUPTED.format(module=module))
-    assert done.returncode == 130
-    assert "Traceback" not in done.stderr
 
 
 STUCK = """

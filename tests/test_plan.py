@@ -267,13 +267,6 @@ def test_a_pairs_seconds_are_those_of_all_its_jobs():
 # The engine on a virtual clock
 
 
-def test_costs_that_change_are_planned_for_and_explained():
-    ran = simulate(Scenario(400, (0.5, 1.0, 1.0), 1, 1100.0, warm_up=1, misses=0, drift=10, turn=0.5))
-    assert ran.late == ran.lost == 0
-    assert ran.report.ending is Ending.TIME_IS_UP
-    assert any("of 3 units fit" in explanation.text for explanation in ran.report.explanations)
-
-
 def test_more_time_never_means_fewer_units():
     runs = [simulate(Scenario(40, (1.0, 1.0, 1.0), 1, limit, misses=0)) for limit in (40.0, 80.0, 120.0, 999.0)]
     units = [sum(len(record.units) for record in ran.report.records) for ran in runs]

@@ -2,13 +2,12 @@
 
 import multiprocessing
 import os
-import queue
 import select
 import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from multiprocessing import resource_tracker, util
 from pathlib import Path
@@ -32,25 +31,36 @@ MATCHES = Matches(POINTS, POINTS, POINTS[:, 0])
 LARGE = SceneJob("one", (0,), (BatchPair(*IMAGES, MATCHES, None, {"m": MATCHES}),), SceneConfig())
 
 
-class Worker:
+class Worker(ProcessWorker):
     """A worker process with the scenes of ``make``, whose answers the test waits for."""
 
-    def __init__(self, make: Callable[[SceneJob], SceneResult] = choose_scene_for_all_but_the_first) -> None:
-        self.bell: queue.SimpleQueue[None] = queue.SimpleQueue()
-        self.worker = ProcessWorker("scene", partial(ScenesBy, make), lambda: self.bell.put(None))
+    def __init__(self, make: Callable[[SceneJob], SceneResult]) -> None:
+        self._bell = threading.Semaphore(0)
+        super().__init__("scene", partial(ScenesBy, make), self._bell.release)
 
     def next_answer(self) -> Any:
-        self.bell.get(timeout=120)
-        return self.worker.answer()
+        assert self._bell.acquire(timeout=120)
+        return self.answer()
 
-    def end(self) -> None:
-        """Kill it; neither its thread nor its process is left."""
-        self.worker.kill()
-        self.worker._thread.join(timeout=120)
-        assert not self.worker._thread.is_alive()
-        for process in multiprocessing.active_children():
-            process.join(timeout=120)
-            assert not process.is_alive()
+
+@pytest.fixture
+def start() -> Iterator[Callable[..., Worker]]:
+    """Starts a worker. In the end it is killed, and neither its thread nor its process is left."""
+    workers = []
+
+    def start(make: Callable[[SceneJob], SceneResult] = choose_scene_for_all_but_the_first) -> Worker:
+        workers.append(Worker(make))
+        workers[-1].start()
+        return workers[-1]
+
+    yield start
+    for worker in workers:
+        worker.kill()
+        worker._thread.join(timeout=120)
+        assert not worker._thread.is_alive()
+    for process in multiprocessing.active_children():
+        process.join(timeout=120)
+        assert not process.is_alive()
 
 
 @pytest.fixture
@@ -70,46 +80,37 @@ def at_birth(monkeypatch) -> Callable[[Callable[[int], None]], None]:
     return set_action
 
 
-def test_a_worker_that_cannot_be_sent_to_its_process_says_so():
-    worker = Worker(lambda job: None)  # which cannot be pickled
-    worker.worker.start()
-    assert worker.next_answer().cause is Cause.RAISED
-    worker.end()
+def test_a_worker_that_cannot_be_sent_to_its_process_says_so(start):
+    assert start(lambda job: None).next_answer().cause is Cause.RAISED
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
-def test_a_process_that_dies_or_stops_at_its_birth_blocks_nothing(at_birth, number):
-    at_birth(lambda pid: os.kill(pid, number))
-    born = Worker()
-    born.worker.start()
-    if number is signal.SIGKILL:
-        assert born.next_answer() == Failure(Cause.DIED, "signal SIGKILL")
-    else:
-        assert born.worker.answer() is None
-    born.end()
+def test_a_process_that_dies_at_its_birth_is_told(at_birth, start):
+    at_birth(lambda pid: os.kill(pid, signal.SIGKILL))
+    assert start().next_answer() == Failure(Cause.DIED, "signal SIGKILL")
 
 
-def test_a_start_returns_before_there_is_a_process(at_birth):
+def test_a_process_that_stops_at_its_birth_blocks_nothing(at_birth, start):
+    at_birth(lambda pid: os.kill(pid, signal.SIGSTOP))
+    assert start().answer() is None
+
+
+def test_a_start_returns_before_there_is_a_process(at_birth, start):
     has_returned = threading.Event()
     at_birth(lambda _: has_returned.wait())
-    born = Worker()
-    born.worker.start()
-    assert born.worker.answer() is None
+    worker = start()
+    assert worker.answer() is None
     has_returned.set()
-    assert born.next_answer() == Loaded()
-    born.end()
+    assert worker.next_answer() == Loaded()
 
 
-def test_a_large_job_goes_to_a_stopped_process_without_blocking(at_birth):
+def test_a_large_job_goes_to_a_stopped_process_without_blocking(at_birth, start):
     born: list[int] = []
     at_birth(born.append)
-    stopped = Worker()
-    stopped.worker.start()
-    assert stopped.next_answer() == Loaded()
+    worker = start()
+    assert worker.next_answer() == Loaded()
     os.kill(born[0], signal.SIGSTOP)
-    stopped.worker.submit(LARGE, 1.0)
-    assert stopped.worker.answer() is None
-    stopped.end()
+    worker.submit(LARGE, 1.0)
+    assert worker.answer() is None
 
 
 ORPHAN = """
@@ -148,7 +149,6 @@ def test_a_worker_at_work_ends_with_its_parent_and_prints_nothing(tmp_path):
 
 STARTS = """
 import os, signal, threading
-from functools import partial
 from pathlib import Path
 from mkpc_kaggle.engine.jobs import Loaded
 from mkpc_kaggle.engine.process import WORKER_ENVIRONMENT, ProcessWorker

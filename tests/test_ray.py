@@ -63,20 +63,13 @@ def cluster() -> Iterator[Any]:
     patch.undo()
 
 
-def test_actors_give_the_bytes_of_a_run_in_one_process(cluster, pairs, undisturbed, tmp_path):
-    report = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "w", workers=RayCluster(cluster.address))
-    assert report.faults == ()
-    assert report.ending is Ending.COMPLETE
-    assert matrices(report) == matrices(undisturbed)
-    assert not ray.is_initialized(), "the run lets go of the cluster"
-
-
-def test_an_actor_that_dies_is_replaced(cluster, pairs, undisturbed, tmp_path):
+def test_actors_give_the_bytes_of_a_run_in_one_process_though_an_actor_dies(cluster, pairs, undisturbed, tmp_path):
     matcher = FaultyMatcher(fault=die, once=tmp_path / "died")
     report = run(pairs, THREE_UNITS, matcher, tmp_path / "w", workers=RayCluster(cluster.address))
     assert report.ending is Ending.COMPLETE
     assert ["the worker died" in fault for fault in report.faults] == [True], report.faults
     assert matrices(report) == matrices(undisturbed)
+    assert not ray.is_initialized(), "the run lets go of the cluster"
 
 
 def test_a_machine_lost_during_the_run_costs_its_job_alone(cluster, pairs, undisturbed, tmp_path):
@@ -106,12 +99,8 @@ def test_a_machine_that_lacks_the_weights_or_the_test_set_is_named_when_the_run_
             run(asked, THREE_UNITS, RectifiedMatcher(), tmp_path / "w", workers=RayCluster(cluster.address))
 
 
-@pytest.fixture(scope="module")
-def batch(tmp_path_factory) -> list[Pair]:
-    return synthetic_pairs(tmp_path_factory.mktemp("batch"))
-
-
-def test_batches_are_reconstructed_on_the_cluster_to_the_same_bytes(cluster, batch, tmp_path):
+def test_batches_are_reconstructed_on_the_cluster_to_the_same_bytes(cluster, tmp_path):
+    batch = synthetic_pairs(tmp_path / "images")
     here = run(batch, SYNTHETIC, SyntheticMatcher(), tmp_path / "here")
     report = run(batch, SYNTHETIC, SyntheticMatcher(), tmp_path / "w", workers=RayCluster(cluster.address))
     assert report.faults == ()

@@ -15,10 +15,8 @@ from faulty import (
     die,
     die_within_pycolmap,
     exhaust_memory,
-    exhaust_memory_within_pycolmap,
     lack_an_image,
     scene_in_a_gigabyte,
-    scene_without_pycolmap,
     scenes_by,
 )
 from rectified import THREE_UNITS, RectifiedMatcher, batch_pairs, matrices, run
@@ -90,13 +88,6 @@ def test_a_scene_process_that_cannot_be_started_costs_its_scene_alone(tmp_path, 
     assert "the worker could not be started: [Errno 12] Cannot allocate memory" in report.faults[0]
 
 
-def test_without_pycolmap_a_line_says_so(tmp_path, monkeypatch):
-    scenes_by(monkeypatch, scene_without_pycolmap, process=True)
-    report = run(batch_pairs(tmp_path / "images"), RECIPE, RectifiedMatcher(), tmp_path / "work")
-    assert all(record.source == "pair" for record in report.records)
-    assert "pycolmap" in overview(read_log(tmp_path / "work"))
-
-
 def test_a_run_reconstructs_the_true_cameras_and_a_gigabyte_is_enough(tmp_path, monkeypatch):
     scenes_by(monkeypatch, scene_in_a_gigabyte, process=True)
     matcher = SyntheticMatcher()
@@ -107,11 +98,10 @@ def test_a_run_reconstructs_the_true_cameras_and_a_gigabyte_is_enough(tmp_path, 
     assert max(matcher.scene.median_distance(record.chosen_fundamental, pair) for record, pair in pairs) < 0.5
 
 
-@pytest.mark.parametrize("make", [exhaust_memory_within_pycolmap, die_within_pycolmap])
-def test_what_happens_within_pycolmap_costs_the_scene_alone_and_leaves_no_files(tmp_path, monkeypatch, make):
+def test_a_death_within_pycolmap_costs_the_scene_alone_and_leaves_no_files(tmp_path, monkeypatch):
     (tmp_path / "temporary").mkdir()
     monkeypatch.setenv("TMPDIR", str(tmp_path / "temporary"))
-    scenes_by(monkeypatch, make, process=True)
+    scenes_by(monkeypatch, die_within_pycolmap, process=True)
     report = run(synthetic_pairs(tmp_path / "images", 4), SYNTHETIC, SyntheticMatcher(images=4), tmp_path / "work")
     assert report.ending is Ending.COMPLETE
     assert [record.source for record in report.records] == ["pair"] * 6

@@ -3,7 +3,6 @@
 import os
 import resource
 import signal
-import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -52,15 +51,10 @@ def lack_an_image() -> None:
 
 
 def exhaust_memory() -> None:
-    """Ask for more than a limit allows."""
-    limit_memory(64 << 20)
-    np.ones(1 << 28)
-
-
-def limit_memory(bytes_left: int) -> None:
-    """Let this process have so much more than it has now."""
+    """Ask for more than a limit allows, 64 MiB above what there is now."""
     used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-    resource.setrlimit(resource.RLIMIT_AS, (used + bytes_left, resource.RLIM_INFINITY))
+    resource.setrlimit(resource.RLIMIT_AS, (used + (64 << 20), resource.RLIM_INFINITY))
+    np.ones(1 << 28)
 
 
 def exhaust_gpu() -> None:
@@ -183,23 +177,9 @@ def die_within_pycolmap(job: SceneJob) -> SceneResult:
     return reconstruct(job)
 
 
-def exhaust_memory_within_pycolmap(job: SceneJob) -> SceneResult:
-    """Four megabytes are left when it begins."""
-    import mkpc_kaggle.scene.colmap  # noqa: F401  # that is not what fails
-
-    limit_memory(4 << 20)
-    os.close(2)
-    return reconstruct(job)
-
-
 def scene_in_a_gigabyte(job: SceneJob) -> SceneResult:
     """All that it may have; libraries that are only mapped are not counted."""
     resource.setrlimit(resource.RLIMIT_DATA, (1 << 30, 1 << 30))
-    return reconstruct(job)
-
-
-def scene_without_pycolmap(job: SceneJob) -> SceneResult:
-    sys.modules["pycolmap"] = None  # type: ignore[assignment]  # an import of it fails now
     return reconstruct(job)
 
 
