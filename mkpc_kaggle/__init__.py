@@ -11,11 +11,17 @@ if TYPE_CHECKING:
     from mkpc_kaggle.pipeline.pair import PairMatch
     from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher
     from mkpc_kaggle.recipe import Recipe
+    from mkpc_kaggle.reconstruction.run import reconstruct
 
 __version__ = "0.1.0"
-__all__ = ["PairMatch", "Recipe", "TwoStageMatcher", "__version__"]
+__all__ = ["PairMatch", "Recipe", "TwoStageMatcher", "__version__", "reconstruct"]
 
-_MODULES = {"PairMatch": "pipeline.pair", "TwoStageMatcher": "pipeline.two_stage", "Recipe": "recipe"}
+_MODULES = {
+    "PairMatch": "pipeline.pair",
+    "TwoStageMatcher": "pipeline.two_stage",
+    "Recipe": "recipe",
+    "reconstruct": "reconstruction.run",
+}
 
 
 def __getattr__(name: str) -> Any:

@@ -139,7 +139,7 @@ def damaged_journal(directory: Path, damage: str) -> Path:
     journal.note("start", 0.0, "")
     journal.save([(outcome(3, seed=1), False), (outcome(7, seed=2), False)])
     camera = CameraRecord("a", 0, (0.0, 0.0, 1.0), (0.0, 0.0, 1.0), (0.0, 1.0, 0.0), 500.0, Size(640, 480), 9)
-    scene = SceneRecord("batch", 2, 2, 1, 9, 3, 1.5, "", (camera,), ((0.0, 0.0, 5.0),))
+    scene = SceneRecord("batch", 2, 2, 1, 9, 3, 1.5, "", (camera,), (((0.0, 0.0, 5.0),),))
     chosen = {3: Choice(np.eye(3), Reason.SCENE), 7: Choice(None, Reason.UNREGISTERED)}
     records = journal.records()
     journal.save_scene(scene, [replace(records[index], scene=choice) for index, choice in chosen.items()])

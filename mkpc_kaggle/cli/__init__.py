@@ -16,6 +16,7 @@ from mkpc_kaggle import __version__
 COMMANDS = {
     "submit": "a test directory -> submission.csv",
     "match": "two images -> F, counts, a figure",
+    "reconstruct": "a folder of images -> cameras, a COLMAP database, models",
     "validate": "a directory with known poses -> mAA and pose AUC of a recipe",
     "recipes": "the recipes, their units, and the weights that each lacks",
     "weights": "the weight files: which are there, are they whole, fetch them",

@@ -17,6 +17,7 @@ from mkpc_kaggle.engine.engine import Ending
 from mkpc_kaggle.engine.session import Session, interruptible
 from mkpc_kaggle.errors import UserError, writing
 from mkpc_kaggle.evaluation.compare import Comparison, comparison_json, comparison_table, step_gains
+from mkpc_kaggle.evaluation.imc2025 import score_imc2025, score_lines
 from mkpc_kaggle.evaluation.validate import Validation, score_submission, score_table, to_json, validate
 from mkpc_kaggle.geometry.robust import Method, RobustConfig
 from mkpc_kaggle.pipeline.assembly import Assembly
@@ -36,7 +37,8 @@ With --compare, several recipes run on the same pairs; each is compared with the
 With --pairs and --image-root the pairs come from a list in the format of SuperGlue's evaluation (a line a pair:
 name0 name1 turns0 turns1 K0 K1 T_0to1), E is estimated, and the AUC is what counts: see docs/benchmarks.md.
 
-With --submission and --truth nothing is matched: the files are scored.
+With --submission and --truth nothing is matched: the files are scored. So they are with --submission and
+--imc2025, by the rules of 2025: mAA of the camera centres, and the share of right images in the clusters.
 """
 
 
@@ -45,6 +47,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     source = parser.add_mutually_exclusive_group(required=True)
     source.add_argument("--train-dir", type=Path, metavar="DIR")
     source.add_argument("--pairs", type=Path, metavar="FILE", help="a list of pairs with K and poses")
+    told = "score files of `reconstruct --format imc2025`; DIR has train_labels.csv and train_thresholds.csv"
+    source.add_argument("--imc2025", type=Path, metavar="DIR", help=told)
     add("--image-root", type=Path, metavar="DIR", help="where the images of --pairs lie")
     add("--scenes", default="", metavar="A,B", help="of --train-dir; default: all")
     add("--pairs-per-scene", type=int, metavar="N", help="evenly spread; default: all")
@@ -69,6 +73,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     _require_a_whole(arguments)
+    if arguments.imc2025 is not None:
+        return _score_imc2025(arguments)
     sides = [arguments.train_dir, arguments.image_root]
     inputs = [*sides, arguments.pairs, arguments.truth, *(arguments.submission or ())]
     require_apart({"--json": arguments.json}, filter(None, inputs), arguments.work_dir)
@@ -85,7 +91,14 @@ def run(arguments: argparse.Namespace) -> int:
 def _require_a_whole(given: argparse.Namespace) -> None:
     """Raise :class:`UserError` for options that do not go together."""
     for is_wrong, told in (
-        ((given.submission is None) != (given.truth is None), "--submission and --truth go together"),
+        (
+            given.imc2025 and not (given.submission and not given.truth),
+            "--imc2025 needs --submission, and no --truth",
+        ),
+        (
+            not given.imc2025 and (given.submission is None) != (given.truth is None),
+            "--submission and --truth go together",
+        ),
         ((given.pairs is None) != (given.image_root is None), "--pairs and --image-root go together"),
         (given.pairs and given.submission, "--submission needs a --train-dir: it scores in metres"),
         (given.pairs and given.compare, "--compare needs a --train-dir: it scores in metres"),
@@ -105,6 +118,12 @@ def _read_scenes(arguments: argparse.Namespace, work_dir: Path) -> tuple[TrainSc
     return read_train_side(
         arguments.train_dir, scenes=scenes, min_covisibility=arguments.min_covisibility, pairs_per_scene=most
     )
+
+
+def _score_imc2025(arguments: argparse.Namespace) -> int:
+    for submission in arguments.submission:
+        say("\n".join([str(submission), *score_lines(score_imc2025(arguments.imc2025, submission))]))
+    return 0
 
 
 def _match_and_score(arguments: argparse.Namespace, scenes: tuple[TrainScene, ...], work_dir: Path) -> int:

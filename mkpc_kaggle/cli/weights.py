@@ -93,7 +93,11 @@ def _verify(arguments: argparse.Namespace) -> int:
         files = [file for search in searches for file in ([search.found] if search.found else search.refused)]
     there = {found.file for found in files}
     missing = [file.name for file in wanted or () if file not in there]
-    rows = [(found.file.name, str(found.state), str(found.path), found.note) for found in files]
+    beside = arguments.manifest and arguments.manifest.parent  # where a file needs no path
+    paths = ["" if found.path.parent == beside else str(found.path) for found in files]
+    rows = [
+        (found.file.name, str(found.state), path, found.note) for found, path in zip(files, paths, strict=True)
+    ]
     rows += [(name, "missing", "", f"searched {store.searched}") for name in missing]
     if not rows:
         print(f"no weight files found (searched {store.searched})")

@@ -2,11 +2,12 @@
 
 import sqlite3
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import partial
 from math import inf
+from types import MappingProxyType
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine import console
@@ -29,6 +30,7 @@ from mkpc_kaggle.engine.scenes import Scenes, extra_pairs_of
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.pipeline.pair import UnitResult
 from mkpc_kaggle.recipe import Recipe
+from mkpc_kaggle.scene.export import Export
 
 PUBLISH_INTERVAL_S, PUBLISH_SHARE = 30.0, 0.05  # how often the submission is written, and its share of the time
 
@@ -81,6 +83,7 @@ class Engine:
         interrupt: threading.Event,
         progress: bool = True,
         minibatch: int = 1,
+        exports: Mapping[str, Export] = MappingProxyType({}),
     ) -> None:
         extra, connecting = extra_pairs_of(pairs, recipe.scene)
         self.asked = len(pairs)
@@ -105,7 +108,7 @@ class Engine:
             connecting=connecting,
             minibatch=minibatch,
         )
-        self.scenes = Scenes(self.pairs, recipe, self.plan.records, journal.scenes())
+        self.scenes = Scenes(self.pairs, recipe, self.plan.records, journal.scenes(), exports)
         self._scene_places: list[Place] = []
 
     def run(self) -> RunReport:

@@ -11,6 +11,7 @@ from mkpc_kaggle.geometry.robust import RobustConfig
 from mkpc_kaggle.pipeline.pair import UnitResult
 from mkpc_kaggle.recipe import SceneConfig, Unit
 from mkpc_kaggle.scene.choose import Choice
+from mkpc_kaggle.scene.export import Export
 from mkpc_kaggle.scene.reconstruction import Reconstruction
 from mkpc_kaggle.scene.view_graph import BatchPair
 
@@ -49,7 +50,8 @@ class MatchJob:
 class SceneJob:
     """Reconstruct a batch: ``indices`` are the places of its ``pairs`` in the run; images go by their digests.
 
-    ``made_from`` counts the unit results that its matches are of; see :class:`SceneRecord`.
+    ``made_from`` counts the unit results that its matches are of; see :class:`SceneRecord`. ``export``: write
+    COLMAP's files, too.
     """
 
     batch: str
@@ -59,6 +61,7 @@ class SceneJob:
     focal: FocalConfig | None = None
     magsac: RobustConfig | None = None
     made_from: int = 0
+    export: Export | None = None
 
 
 Job = MatchJob | SceneJob

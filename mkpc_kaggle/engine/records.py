@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL, Matrix3
 from mkpc_kaggle.pipeline.pair import PairMatch, Regions, UnitResult
@@ -156,6 +157,14 @@ class CameraRecord:
     size: Size
     seen: int
 
+    @property
+    def camera(self) -> Camera:
+        """The principal point is the image's centre."""
+        (width, height), down, forward = self.size, np.array(self.down), np.array(self.forward)
+        K = np.array([[self.focal, 0, (width - 1) / 2], [0, self.focal, (height - 1) / 2], [0, 0, 1]])
+        R = np.stack([np.cross(down, forward), down, forward])
+        return Camera(K, R, -R @ np.array(self.centre))
+
     @classmethod
     def of(cls, found: RegisteredImage, model: int) -> "CameraRecord":
         R, t = found.camera.R, found.camera.t
@@ -167,8 +176,8 @@ class CameraRecord:
 class SceneRecord:
     """What came of a batch: how many of its images have a camera, in how many models, with how many points.
 
-    It was made from so many unit results on its pairs: if these have more now, the scene is out of date. ``cloud``
-    are some points of the largest model, evenly chosen, in its units.
+    It was made from so many unit results on its pairs: if these have more now, the scene is out of date.
+    ``clouds`` are some points of each model, evenly chosen, in its units.
     """
 
     batch: str
@@ -180,7 +189,7 @@ class SceneRecord:
     seconds: float
     failure: str
     cameras: tuple[CameraRecord, ...] = ()
-    cloud: tuple[Point, ...] = ()
+    clouds: tuple[tuple[Point, ...], ...] = ()
 
     @classmethod
     def of(
@@ -188,8 +197,6 @@ class SceneRecord:
     ) -> "SceneRecord":
         models = sorted((model for each in found for model in each.models), key=lambda model: -len(model.images))
         cameras = tuple(CameraRecord.of(image, n) for n, model in enumerate(models) for image in model.images)
-        points = models[0].points if models else np.empty((0, 3))
-        drawn = np.linspace(0, len(points) - 1, min(MAX_DRAWN_POINTS, len(points))).round().astype(int)
         reasons = dict.fromkeys(each.failure for each in found if each.failure and not models)
         return cls(
             batch,
@@ -201,5 +208,10 @@ class SceneRecord:
             seconds,
             failure or "; ".join(reasons) or ("" if models else "no matches connect its images"),
             cameras,
-            tuple((x, y, z) for x, y, z in points[drawn].round(4).tolist()),
+            tuple(_evenly(model.points) for model in models),
         )
+
+
+def _evenly(points: NDArray[np.float64]) -> tuple[Point, ...]:
+    chosen = np.linspace(0, len(points) - 1, min(MAX_DRAWN_POINTS, len(points))).round().astype(int)
+    return tuple((x, y, z) for x, y, z in points[chosen].round(4).tolist())

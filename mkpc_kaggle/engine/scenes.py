@@ -5,10 +5,11 @@ since. Pairs have the F of their own matches all the while.
 """
 
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from math import ceil
 from pathlib import Path
+from types import MappingProxyType
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.jobs import SceneJob
@@ -17,6 +18,7 @@ from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.pipeline.pair import UnitResult
 from mkpc_kaggle.recipe import Recipe, SceneConfig
 from mkpc_kaggle.scene.densify import extra_pairs
+from mkpc_kaggle.scene.export import Export
 from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair, tracks_of
 
 MIN_PAIRS = 2  # they can connect three images
@@ -64,11 +66,20 @@ def extra_pairs_of(pairs: Sequence[Pair], config: SceneConfig | None) -> tuple[l
 
 
 class Scenes:
-    """What came of each batch of a run so far, and which is due; ``records`` are those of all pairs, by index."""
+    """What came of each batch of a run so far, and which is due; ``records`` are those of all pairs, by index.
+
+    ``exports`` says of which batches COLMAP's files are written.
+    """
 
     def __init__(
-        self, pairs: Sequence[Pair], recipe: Recipe, records: Sequence[PairRecord], made: Iterable[SceneRecord]
+        self,
+        pairs: Sequence[Pair],
+        recipe: Recipe,
+        records: Sequence[PairRecord],
+        made: Iterable[SceneRecord],
+        exports: Mapping[str, Export] = MappingProxyType({}),
     ) -> None:
+        self._exports = exports
         self.made = {scene.batch: scene for scene in made}
         self.batches = batches_of(pairs) if recipe.scene is not None else {}
         self._pairs, self._recipe, self._records = pairs, recipe, records
@@ -108,7 +119,8 @@ class Scenes:
         found = tuple(index for index in self.batches[batch] if self._records[index].sizes)
         pairs = tuple(self._batch_pair(index, results_of(index)) for index in found)
         self._running.add(batch)
-        return SceneJob(batch, found, pairs, config, recipe.focal, recipe.magsac, self._unit_count(batch))
+        made_from, export = self._unit_count(batch), self._exports.get(batch)
+        return SceneJob(batch, found, pairs, config, recipe.focal, recipe.magsac, made_from, export)
 
     def on_result(self, job: SceneJob, record: SceneRecord) -> None:
         self._spent_s += max(0.0, record.seconds - START_S)

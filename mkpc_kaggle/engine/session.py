@@ -6,9 +6,9 @@ import signal
 import sqlite3
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib import metadata
 from math import isfinite
 from pathlib import Path
@@ -29,6 +29,7 @@ from mkpc_kaggle.engine.places import LISTEN_S, LocalSite, Site
 from mkpc_kaggle.engine.records import PairRecord
 from mkpc_kaggle.errors import UserError, writing
 from mkpc_kaggle.pipeline.assembly import Assembly
+from mkpc_kaggle.scene.export import Export
 
 EXIT_S = 0.2  # that the system takes to end a process
 REPORT_S = 2.0  # that an interrupted program may take for its report: enough for the tables
@@ -46,6 +47,7 @@ class Session:
 
     ``workers`` is the number of worker processes, or the cluster to work on; 0: the work is done in this process;
     ``None``: a process for each device. ``watchdog`` is told how to write the submission in the end.
+    ``exports``: of which batches COLMAP's files are written.
     """
 
     work_dir: Path
@@ -55,6 +57,7 @@ class Session:
     progress: bool = True
     workers: int | RayCluster | None = 0
     watchdog: "Watchdog | None" = None
+    exports: Mapping[str, Export] = field(default_factory=dict)
 
     def must_end(self) -> float:
         """When the program must have ended, by the monotonic clock: with its budget, or soon after a signal."""
@@ -113,6 +116,7 @@ def run_pairs(
             interrupt=session.interrupt,
             progress=session.progress,
             minibatch=assembly.minibatch,
+            exports=session.exports,
         )
         if session.watchdog is not None:
             session.watchdog.save = engine.save_what_there_is

@@ -149,5 +149,5 @@ class SceneRunner:
         from mkpc_kaggle.scene.reconstruct import reconstruct_batch
 
         assert isinstance(job, SceneJob)
-        solution = reconstruct_batch(job.pairs, job.config, job.focal, job.magsac)
+        solution = reconstruct_batch(job.pairs, job.config, job.focal, job.magsac, job.export)
         return SceneResult(solution.reconstructions, dict(zip(job.indices, solution.choices, strict=True)))

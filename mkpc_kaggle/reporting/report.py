@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 WRITING_S, WRITING_S_PER_PAIR = 0.6, 0.0002  # what a page without drawings takes
 DRAWING_S = 5.0  # drawings are not begun with less time left
 MAX_ROWS = 100  # of a table; the exports of the journal command have all
-MAX_SCENES = 12  # drawn
+MAX_SCENES, MAX_MODELS = 12, 8  # drawn, and of a scene
 
 
 def report_run(work_dir: Path, path: Path, ends: float, pairs: Sequence[Pair] = ()) -> str:
@@ -92,7 +92,11 @@ def report_page(log: RunLog, pairs: Sequence[Pair] = (), *, undrawn: str = "") -
         unit_failures=pd.DataFrame({"units that failed": unit_failures(log.tables)}),
         weakest=[_weak(log, weak, sources) for weak in log.weakest],
         scenes=_scenes(log),
-        cameras=[] if undrawn else [(scene.batch, _data_uri(draw_cameras(scene), "png")) for scene in largest],
+        cameras=[
+            (f"{scene.batch}, model {number}", _data_uri(draw_cameras(scene, number), "png"))
+            for scene in ([] if undrawn else largest)
+            for number in range(min(scene.models, MAX_MODELS))
+        ],
         jobs=_data_uri(budget_figure(log), "png") if has_jobs and not undrawn else "",
         costs=_costs(log),
         plans=_events(log, EventKind.PLAN),

@@ -2,7 +2,7 @@
 
 pycolmap can end the process on its own (a failed assertion, memory), and the global mapper has no time limit. Once
 pycolmap is imported, a SIGTERM ends the process with a stack trace on stderr. So a caller that cannot afford this
-runs it in a process of its own. Nothing is written to disk: the database is in memory.
+runs it in a process of its own. Nothing is written to disk, unless COLMAP's files are asked for.
 
 The same input gives the same bytes on one machine with ``threads = 1``. With more threads, sums are added in
 another order each time, and the last digits differ.
@@ -10,7 +10,10 @@ another order each time, and the last digits differ.
 Sources: Schoenberger and Frahm 2016 (the incremental mapper), Pan et al. 2024 (the global one).
 """
 
+import shutil
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,6 +22,7 @@ from numpy.typing import NDArray
 
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.recipe import CameraModel, SceneConfig
+from mkpc_kaggle.scene.export import DATABASE, MODELS
 from mkpc_kaggle.scene.keypoints import SceneKeypoints, scene_keypoints
 from mkpc_kaggle.scene.reconstruction import MIN_IMAGES, Reconstruction, RegisteredImage, SfmModel, filter_models
 from mkpc_kaggle.scene.shared_intrinsics import SharedIntrinsics
@@ -34,27 +38,50 @@ MIN_REGISTERED = 0.85  # share of a small scene's images below which the other m
 SEED = 0
 
 
-def structure_from_motion(graph: ViewGraph, config: SceneConfig, shared: SharedIntrinsics) -> Reconstruction:
-    """What pycolmap makes of connected images; perhaps no model.
+def structure_from_motion(
+    graph: ViewGraph, config: SceneConfig, shared: SharedIntrinsics, directory: Path | None = None
+) -> Reconstruction:
+    """What pycolmap makes of a view graph; perhaps no model, perhaps several.
 
     Each image has a camera of its own, except those with ``shared`` intrinsics, which start at the shared focal
     length. The global mapper goes first. Where it leaves many images of a small scene without a camera, the
-    incremental one is asked too, and the reconstruction in which images see points more often stays.
+    incremental one is asked too, and the reconstruction in which images see points more often stays. In
+    ``directory`` COLMAP's files are left, in the place of earlier ones: the database, and a folder of each model.
     """
     pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
     pycolmap.set_random_seed(SEED)
     keypoints = scene_keypoints(graph)
-    with pycolmap.Database.open(":memory:") as database:
+    if directory is not None:
+        shutil.rmtree(directory / MODELS, ignore_errors=True)
+        directory.mkdir(parents=True, exist_ok=True)
+        (directory / DATABASE).unlink(missing_ok=True)
+    with pycolmap.Database.open(":memory:" if directory is None else str(directory / DATABASE)) as database:
         with pycolmap.DatabaseTransaction(database):
             cameras = _write_images(database, graph, keypoints, config.camera_model, shared)
-            for edge, geometry in zip(graph.edges, verify(graph, keypoints, cameras, config), strict=True):
+            geometries = verify(graph, keypoints, cameras, config)
+            for edge, matches, geometry in zip(graph.edges, keypoints.matches, geometries, strict=True):
+                if directory is not None:
+                    database.write_matches(edge.first + 1, edge.second + 1, matches)
                 database.write_two_view_geometry(edge.first + 1, edge.second + 1, geometry)
         images = len(graph.images)
         found = run_mapper(pycolmap.GlobalPipeline, _global_options(images, config), database, graph)
-        if images > LARGE or found.registered >= MIN_REGISTERED * images:
-            return found
-        other = run_mapper(pycolmap.IncrementalPipeline, _incremental_options(config), database, graph)
-        return max(found, other, key=lambda each: each.observations)
+        if images <= LARGE and found.registered < MIN_REGISTERED * images:
+            other = run_mapper(pycolmap.IncrementalPipeline, _incremental_options(config), database, graph)
+            found = max(found, other, key=lambda each: each.observations)
+    if directory is not None:
+        write_models(found, directory / MODELS)
+    return replace(found, models=tuple(replace(model, colmap=None) for model in found.models))
+
+
+def write_models(found: Reconstruction, directory: Path) -> None:
+    """Write each model in COLMAP's binary format to a folder 0, 1, ..., without the images that were left out."""
+    for number, model in enumerate(found.models):
+        kept = {each.image.name for each in model.images}
+        for frame in [frame for frame in model.colmap.frames.values() if frame.has_pose()]:
+            if model.colmap.images[frame.frame_id].name not in kept:
+                model.colmap.deregister_frame(frame.frame_id)
+        (directory / str(number)).mkdir(parents=True)
+        model.colmap.write(directory / str(number))
 
 
 def _write_images(
@@ -73,7 +100,7 @@ def _write_images(
             cameras[key] = _write_camera(database, number, image, model, focal)
         camera = cameras[key]
         taken = pycolmap.Image(
-            name=f"{number:06}", camera_id=camera.camera_id, image_id=number, keypoints=np.zeros((0, 2))
+            name=image.name, camera_id=camera.camera_id, image_id=number, keypoints=np.zeros((0, 2))
         )
         database.write_image(taken, use_image_id=True)
         frame = pycolmap.Frame(frame_id=number, rig_id=camera.camera_id)
@@ -162,4 +189,4 @@ def _sfm_model(found: Any, graph: ViewGraph) -> SfmModel:
         images.append(RegisteredImage(graph.images[number - 1], camera, int(image.num_points3D)))
     points = [found.points3D[number].xyz for number in sorted(found.point3D_ids())]
     error = float(found.compute_mean_reprojection_error()) if points else 0.0
-    return SfmModel(tuple(images), np.array(points, np.float64).reshape(-1, 3), error)
+    return SfmModel(tuple(images), np.array(points, np.float64).reshape(-1, 3), error, found)

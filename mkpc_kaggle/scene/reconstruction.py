@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,11 +32,15 @@ class RegisteredImage:
 
 @dataclass(frozen=True, eq=False)
 class SfmModel:
-    """Cameras in one world, and points in it, (P, 3) float64; ``reprojection_error`` is the mean in pixels."""
+    """Cameras in one world, and points in it, (P, 3) float64; ``reprojection_error`` is the mean in pixels.
+
+    ``colmap`` is pycolmap's own value of it, as long as it may have to be written.
+    """
 
     images: tuple[RegisteredImage, ...]
     points: NDArray[np.float64]
     reprojection_error: float
+    colmap: Any = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -36,21 +36,21 @@ def draw_budget(ended: Mapping[str, Sequence[float]], limit: float | None) -> "F
     return figure
 
 
-def draw_cameras(scene: "SceneRecord") -> "Figure":
-    """The cameras and points of a batch's largest model from above and from the side, in its own units.
+def draw_cameras(scene: "SceneRecord", number: int = 0) -> "Figure":
+    """The cameras and points of a model of a batch, 0 the largest, from above and the side, in its own units.
 
     An arrow points the way a camera looks. Up is the mean direction of the images' upper borders, and the cameras
     look ahead. Points far away from nearly all others are cut off. A batch without cameras has a line instead.
     """
     figure = new_figure(8.4, 4.0)
-    cameras = [camera for camera in scene.cameras if camera.model == 0]
+    cameras = [camera for camera in scene.cameras if camera.model == number]
     if not cameras:
         figure.text(0.5, 0.5, f"no cameras: {scene.failure}", ha="center", wrap=True)
         return figure
     right, ahead, up = _axes_of(cameras)
     centres = np.array([camera.centre for camera in cameras])
     looks = np.array([camera.forward for camera in cameras])
-    cloud = np.array(scene.cloud).reshape(-1, 3)
+    cloud = np.array(scene.clouds[number] if scene.clouds else ()).reshape(-1, 3)
     arrow = 0.12 * (np.ptp(centres, axis=0).max() or 1.0)
     sides = (("above", right, ahead), ("the side", ahead, up))
     for panel, (name, across, upward) in zip(figure.subplots(1, 2), sides, strict=True):

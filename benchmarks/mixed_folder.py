@@ -1,0 +1,57 @@
+"""A folder of mixed photographs with the truth that the score of 2025 asks for.
+
+    python -m benchmarks.mixed_folder --train-dir DIR --unrelated IMAGE... --out DIR
+
+OUT/images/mixed has the images of all scenes, and others that belong to none; OUT has ``train_labels.csv`` and
+``train_thresholds.csv``, 0.025 to 1 m.
+"""
+
+import argparse
+import csv
+import shutil
+from pathlib import Path
+
+import numpy as np
+
+from mkpc_kaggle.data.competition import read_train_side
+from mkpc_kaggle.evaluation.imc2025 import OUTLIERS, POSE_COLUMNS
+from mkpc_kaggle.reconstruction.outputs import joined
+
+SCENES = ("castle_p19", "fountain_p11", "herz_jesus_p8", "reichstag_26")
+THRESHOLDS = "0.025;0.05;0.1;0.2;0.5;1.0"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--train-dir", type=Path, required=True)
+    parser.add_argument("--unrelated", type=Path, nargs="*", default=[])
+    parser.add_argument("--out", type=Path, required=True)
+    arguments = parser.parse_args()
+    folder = arguments.out / "images" / "mixed"
+    folder.mkdir(parents=True)
+    rows = []
+    for scene in read_train_side(arguments.train_dir, scenes=SCENES, min_covisibility=0):
+        ends = [
+            end for true in scene.pairs for end in zip(true.pair.images, (true.camera0, true.camera1), strict=True)
+        ]
+        for file, camera in sorted(dict(ends).items()):
+            shutil.copy(file, folder)
+            pose = joined(camera.R), joined(camera.t * scene.metres_per_unit)
+            rows.append(("mixed", scene.name, Path(file).name, *pose))
+    for path in arguments.unrelated:
+        shutil.copy(path, folder)
+        rows.append(("mixed", OUTLIERS, path.name, joined(np.full(9, np.nan)), joined(np.full(3, np.nan))))
+    tables = (
+        ("train_labels.csv", [POSE_COLUMNS, *rows]),
+        (
+            "train_thresholds.csv",
+            [("dataset", "scene", "thresholds"), *(("mixed", s, THRESHOLDS) for s in SCENES)],
+        ),
+    )
+    for name, table in tables:
+        with (arguments.out / name).open("w", newline="") as stream:
+            csv.writer(stream).writerows(table)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,94 @@
+"""The command ``reconstruct``."""
+
+import argparse
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+from mkpc_kaggle.cli import options
+from mkpc_kaggle.data.outputs import lies_in
+from mkpc_kaggle.engine.budget import format_duration
+from mkpc_kaggle.engine.console import say
+from mkpc_kaggle.engine.session import Session, Watchdog, interruptible
+from mkpc_kaggle.errors import UserError, writing
+from mkpc_kaggle.recipe import Mode
+from mkpc_kaggle.reconstruction.folder import read_folder, read_pair_list
+from mkpc_kaggle.reconstruction.outputs import Form, write_tables
+from mkpc_kaggle.reconstruction.run import FolderResult, for_cameras, reconstruct_folder
+from mkpc_kaggle.reporting.report import report_run
+from mkpc_kaggle.reporting.summary import left_out_line, trouble
+
+HELP = """\
+Match the images of a folder with the engine that makes submissions, and reconstruct their cameras. Each folder
+in DIR that has images is a dataset of its own, the images directly in DIR are another. Images of several places
+may be mixed: each place becomes a model, and an image that belongs to none has no camera.
+
+OUT gets, for a folder in DIR in a folder of its name:
+  database.db     COLMAP's: cameras, images, keypoints, matches, verified two-view geometries
+  models/0, 1...  COLMAP's binary models, the largest first
+and for all together:
+  cameras.csv     image, model, K, R, t: X_cam = R X + t, (0, 0) is the first pixel's centre; numbers joined by ;
+  submission.csv  with --format
+  report.html     the run, with the cameras and points of each model
+  work/           the journal: killed at any point, the same command goes on, and ends with the same files
+
+All pairs of up to 100 images are matched, and in larger datasets each image with the 20 most like it.
+
+Exit status: 0 done; 1 there is no model, or the run failed; 2 bad input; 130 or 143 ended by a signal.
+"""
+MAX_LINES = 20  # of each list
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add("images", type=Path, metavar="DIR", help="png, jpg or jpeg files, or folders of them")
+    add("--out", type=Path, required=True, metavar="OUT", help="the directory for the results")
+    options.add_matching(parser)
+    options.add_run(parser, time_limit=None)
+    add("--pairs", type=Path, metavar="FILE", help="match these alone: two paths below DIR a line, as of hloc")
+    add("--format", choices=list(map(str, Form)), help="also write submission.csv; imc2023: of 2024, too")
+    add(
+        "--rotations", action="store_true", help="try to turn images that match nothing by 90, 180 and 270 degrees"
+    )
+    add("--fresh", action="store_true", help="forget what an earlier run left in OUT/work")
+    parser.set_defaults(reconstruct=True)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    root, out, work_dir = arguments.images, arguments.out, arguments.out / "work"
+    datasets = read_folder(root)
+    if lies_in(out, root) or lies_in(root, out):
+        raise UserError(f"--out {out} and the images in {root} are in each other's way; name another place")
+    listed = None if arguments.pairs is None else read_pair_list(arguments.pairs, root, datasets)
+    budget = options.budget_of(arguments)
+    with interruptible() as interrupt, Watchdog(budget, interrupt) as watchdog, writing(f"--out {out}"):
+        assembly = options.assembly_of(arguments, arguments.recipe, Mode(arguments.mode))
+        assembly = replace(assembly, recipe=for_cameras(assembly.recipe))
+        images = sum(len(dataset.files) for dataset in datasets)
+        header = f"{images} images, recipe {assembly.recipe.name}, {assembly.placement}, journal in {work_dir}"
+        say("\n".join(filter(None, [header, left_out_line(assembly.left_out)])))
+        session = Session(
+            work_dir, budget, interrupt, arguments.fresh, workers=arguments.workers, watchdog=watchdog
+        )
+        result = reconstruct_folder(datasets, assembly, session, out, listed=listed, rotations=arguments.rotations)
+        write_tables(out, result.cameras, root, arguments.format and Form(arguments.format))
+        failed = trouble(result.report)
+        watchdog.status = int(bool(failed) or not any(result.cameras.values()))
+        explained = ["plan:", *map(str, result.report.explanations)] if arguments.explain else []
+        say("\n".join(filter(None, [*explained, *_told(result), failed, f"results: {out}"])))
+        say(report_run(work_dir, out / "report.html", session.must_end(), result.pairs))
+        return 128 + interrupt.signal if interrupt.signal else watchdog.status
+
+
+def _told(result: FolderResult) -> Iterator[str]:
+    """A line for each dataset, and what went wrong."""
+    yield f"{len(result.pairs)} pairs: {result.report.ending} after {format_duration(result.report.seconds)}"
+    reasons = {scene.batch: scene.failure for scene in result.report.scenes}
+    for dataset, cameras in result.cameras.items():
+        models = Counter(camera.model for camera in cameras.values())
+        sizes = ", ".join(str(models[number]) for number in sorted(models))
+        why = f"models of {sizes}" if models else reasons.get(dataset.name, "too few pairs, or too little time")
+        yield f"{dataset.name}: {len(cameras)} of {len(dataset.files)} images have a camera: {why}"
+    yield from (f"cannot be read: {failure}" for failure in result.unreadable[:MAX_LINES])
+    yield from (f"fault: {fault}" for fault in result.report.faults[:MAX_LINES])

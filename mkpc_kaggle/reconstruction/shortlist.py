@@ -1,0 +1,73 @@
+"""The partners of each image of a large folder: those most like it by a VLAD of RootSIFT.
+
+RootSIFT whatever the recipe is: it needs no weights, is there for dense matchers, too, and does not care how an
+image is turned. Source: Jegou et al. 2010; normalisation by Arandjelovic and Zisserman 2013.
+"""
+
+import warnings
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.cluster.vq import kmeans2, vq
+
+from mkpc_kaggle.data.images import Unreadable, read_image
+from mkpc_kaggle.matchers.sift import root_sift
+
+PARTNERS = 20  # of an image
+WORDS = 64
+SIDE_PX = 640
+FEATURES = 1000
+MAX_TRAINING = 50_000  # descriptors that the words are made of
+THREADS = 4  # OpenCV releases the interpreter's lock
+NO_FEATURES = np.zeros((0, 128), np.float32)
+
+
+def shortlist(files: Sequence[Path], partners: int = PARTNERS) -> list[tuple[int, int]]:
+    """Pairs of places in ``files``, the smaller first, in order: each image with the ``partners`` most like it."""
+    near = enumerate(most_alike(files, partners))
+    return sorted({(min(i, j), max(i, j)) for i, others in near for j in others})
+
+
+def most_alike(files: Sequence[Path], count: int) -> list[list[int]]:
+    """For each image the places of the others that are most like it; one that cannot be read is like no other."""
+    with ThreadPoolExecutor(THREADS) as pool:
+        descriptors = list(pool.map(local_features, files))
+    every = np.concatenate(descriptors)
+    training = every[np.sort(np.random.default_rng(0).permutation(len(every))[:MAX_TRAINING])]
+    words = training[:: max(1, len(training) // WORDS)][:WORDS]
+    if len(words):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # a word that nothing is near to any more
+            words, _ = kmeans2(training, words, iter=10, minit="matrix")
+    table = np.stack([vlad(found, words) for found in descriptors])
+    similarity = table @ table.T
+    np.fill_diagonal(similarity, -np.inf)
+    order = np.argsort(-similarity, axis=1, kind="stable")[:, : len(files) - 1]
+    near: list[list[int]] = order[:, :count].tolist()
+    return near
+
+
+def local_features(path: Path) -> NDArray[np.float32]:
+    """(K, 128) RootSIFT of an image; none of an image that cannot be read."""
+    image = read_image(path)
+    if isinstance(image, Unreadable):
+        return NO_FEATURES
+    scale = SIDE_PX / max(image.size)
+    gray = cv2.resize(image.gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    _, found = cv2.SIFT_create(FEATURES).detectAndCompute(gray, None)  # type: ignore[attr-defined]
+    return NO_FEATURES if found is None else root_sift(found)
+
+
+def vlad(descriptors: NDArray[np.float32], words: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(K, D) descriptors and (W, D) words -> (W * D,) of unit length, or zero without descriptors."""
+    sums = np.zeros_like(words)
+    if len(descriptors):
+        nearest, _ = vq(descriptors, words)
+        np.add.at(sums, nearest, descriptors - words[nearest])
+    sums /= np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), np.finfo(np.float32).tiny)
+    flat = np.sign(sums) * np.sqrt(np.abs(sums))
+    return np.asarray(flat.ravel() / max(float(np.linalg.norm(flat)), 1e-12), np.float32)

@@ -1,0 +1,410 @@
+"""Folders of images in, cameras out: COLMAP's files, tables, several models, images that lie on a side."""
+
+import csv
+import hashlib
+import sqlite3
+import subprocess
+import sys
+import time
+from collections.abc import Mapping
+from contextlib import closing
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import combinations
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+from rectified import Seen
+from sklearn.datasets import load_sample_image
+from synthetic import DARKEST, STEP, SyntheticMatcher
+
+from benchmarks.synthetic_scene import SIZE, SyntheticScene, synthetic_scene
+from mkpc_kaggle import reconstruct
+from mkpc_kaggle.cli import main
+from mkpc_kaggle.data.competition import Pair
+from mkpc_kaggle.demo import DemoSet
+from mkpc_kaggle.engine.budget import Budget
+from mkpc_kaggle.engine.engine import Ending
+from mkpc_kaggle.engine.records import CameraRecord
+from mkpc_kaggle.engine.session import Interrupt, Session
+from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.geometry.cameras import Camera
+from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.pipeline.assembly import assemble
+from mkpc_kaggle.recipe import Recipe, Unit
+from mkpc_kaggle.reconstruction.folder import MAX_IMAGES, Dataset, pairs_of, read_folder, read_pair_list
+from mkpc_kaggle.reconstruction.outputs import Form, camera_rows, submission_rows
+from mkpc_kaggle.reconstruction.rotations import find_turns
+from mkpc_kaggle.reconstruction.run import FolderResult, for_cameras, reconstruct_folder
+from mkpc_kaggle.reconstruction.shortlist import shortlist
+from mkpc_kaggle.reporting.report import report_page
+from mkpc_kaggle.reporting.run_log import read_log
+from mkpc_kaggle.scene.export import turned_back
+
+RECIPE = for_cameras(Recipe((Unit(1, "synthetic", SIZE.width),)))
+FIRST, SECOND, OTHERS = 6, 4, 1  # images of two scenes, and of none
+
+
+@dataclass
+class MixedMatcher(SyntheticMatcher):
+    """Two scenes, and images of neither; between what has nothing in common it finds a few wrong matches."""
+
+    interrupt: Interrupt | None = None
+    after: int = 0
+
+    @cached_property
+    def scenes(self) -> tuple[SyntheticScene, SyntheticScene]:
+        return synthetic_scene(FIRST, points=500), synthetic_scene(SECOND, points=500, seed=7)
+
+    def _match(self, seen0: Seen, seen1: Seen) -> Matches:
+        first, second = ((seen.brightness - DARKEST) // STEP for seen in (seen0, seen1))
+        self.calls.append((first, second))
+        if self.interrupt is not None and len(self.calls) == self.after:
+            self.interrupt.set()
+        for scene, start, count in ((self.scenes[0], 0, FIRST), (self.scenes[1], FIRST, SECOND)):
+            if start <= first < second < start + count:
+                names = [f"{first - start:04}", f"{second - start:04}"]
+                (found,) = (p.matches for p in scene.pairs if [p.image0.name, p.image1.name] == names)
+                return Matches(
+                    seen0.view.from_image(found.points0), seen1.view.from_image(found.points1), found.scores
+                )
+        rng = np.random.default_rng([first, second])
+        return Matches(rng.uniform(10, 500, (25, 2)), rng.uniform(10, 500, (25, 2)), np.ones(25))
+
+
+def write_flat(folder: Path, count: int = FIRST + SECOND + OTHERS) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    for number in range(count):
+        grey = np.full((SIZE.height, SIZE.width, 3), DARKEST + STEP * number, np.uint8)
+        cv2.imwrite(str(folder / f"{number:02}.png"), grey)
+    return folder
+
+
+def run(root: Path, out: Path, matcher: SyntheticMatcher | None = None, **options: object) -> FolderResult:
+    matcher = matcher or MixedMatcher()
+    interrupt = getattr(matcher, "interrupt", None) or Interrupt()
+    budget = Budget(time.monotonic(), float("inf"))
+    session = Session(out / "work", budget, interrupt, progress=False, workers=0)
+    assembly = assemble(RECIPE, matchers={"synthetic": matcher}, device="cpu")
+    return reconstruct_folder(read_folder(root), assembly, session, out, **options)  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def mixed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, FolderResult]:
+    """A folder of two scenes and other images, reconstructed."""
+    home = tmp_path_factory.mktemp("mixed")
+    return home / "out", run(write_flat(home / "images"), home / "out")
+
+
+def cameras(result: FolderResult) -> Mapping[str, CameraRecord]:
+    (found,) = result.cameras.values()
+    return found
+
+
+def contents(out: Path) -> dict[str, str]:
+    """What a run left, but for its journal; of a database its rows, since SQLite counts who has opened it."""
+
+    def data(path: Path) -> bytes:
+        if path.suffix != ".db":
+            return path.read_bytes()
+        with closing(sqlite3.connect(path)) as database:
+            return "".join(database.iterdump()).encode()
+
+    files = [path for path in sorted(out.rglob("*")) if path.is_file() and "work" not in path.parts]
+    return {str(path.relative_to(out)): hashlib.sha256(data(path)).hexdigest() for path in files}
+
+
+def test_mixed_scenes_are_a_model_each_and_foreign_images_are_in_none(mixed: tuple[Path, FolderResult]) -> None:
+    out, result = mixed
+    models = [pycolmap.Reconstruction(out / "models" / str(number)) for number in range(2)]
+    names = [sorted(image.name for image in model.images.values() if image.has_pose) for model in models]
+    assert names == [[f"{n:02}.png" for n in range(6)], [f"{n:02}.png" for n in range(6, 10)]]
+    assert not (out / "models" / "2").exists()
+    assert sorted(cameras(result)) == sorted(names[0] + names[1])
+    assert [model.num_points3D() > 100 for model in models] == [True, True]
+
+
+def test_the_cameras_are_those_of_the_models_and_right(mixed: tuple[Path, FolderResult]) -> None:
+    out, result = mixed
+    truth = MixedMatcher().scenes[0].cameras
+    model = pycolmap.Reconstruction(out / "models" / "0")
+    rows = {row[0]: row for row in camera_rows(result.cameras)}
+    for image in model.images.values():
+        K, R, t = (np.array([float(x) for x in cell.split(";")]) for cell in rows[image.name][2:])
+        np.testing.assert_allclose(R.reshape(3, 3), image.cam_from_world().matrix()[:, :3], atol=1e-9)
+        np.testing.assert_allclose(t, image.cam_from_world().matrix()[:, 3], atol=1e-9)
+        np.testing.assert_allclose(K.reshape(3, 3)[:2, 2] + 0.5, image.camera.calibration_matrix()[:2, 2])
+        assert K[0] == pytest.approx(truth["00" + image.name[:2]].K[0, 0], rel=0.03)
+
+
+def test_colmap_goes_on_from_the_database(mixed: tuple[Path, FolderResult], tmp_path: Path) -> None:
+    out, _ = mixed
+    with pycolmap.Database.open(str(out / "database.db")) as database:
+        assert [image.name for image in database.read_all_images()] == [f"{n:02}.png" for n in range(11)]
+        assert database.num_keypoints() > 1000
+        assert database.num_matched_image_pairs() == 11 * 10 / 2
+        verified = database.read_two_view_geometries()[1]
+        assert sum(len(geometry.inlier_matches) > 0 for geometry in verified) == 15 + 6
+    options = pycolmap.IncrementalPipelineOptions()
+    options.min_model_size, options.random_seed, options.extract_colors = 3, 0, False
+    options.num_threads = 1
+    models = pycolmap.incremental_mapping(out / "database.db", tmp_path, tmp_path, options)
+    assert sorted(model.num_reg_images() for model in models.values()) == [4, 6]
+
+
+def test_a_run_that_was_cut_off_ends_with_the_same_files(mixed: tuple[Path, FolderResult], tmp_path: Path) -> None:
+    out, _ = mixed
+    root = write_flat(tmp_path / "images")
+    interrupt = Interrupt()
+    cut = run(root, tmp_path / "out", MixedMatcher(interrupt=interrupt, after=30))
+    assert cut.report.ending is Ending.INTERRUPTED
+    assert contents(tmp_path / "out") == {}
+    again = MixedMatcher()
+    run(root, tmp_path / "out", again)
+    assert 0 < len(again.calls) < 55
+    assert contents(tmp_path / "out") == contents(out)
+    third = MixedMatcher()
+    assert cameras(run(root, tmp_path / "out", third)).keys() == cameras(mixed[1]).keys()
+    assert third.calls == []
+    assert contents(tmp_path / "out") == contents(out)
+
+
+def test_models_that_were_removed_are_not_passed_over(tmp_path: Path) -> None:
+    root = write_flat(tmp_path / "images", 4)
+    run(root, tmp_path / "out")
+    subprocess.run(["rm", "-r", str(tmp_path / "out" / "models")], check=True)
+    with pytest.raises(UserError, match="was removed after it was made; start anew with --fresh"):
+        run(root, tmp_path / "out")
+
+
+def test_each_model_is_drawn(mixed: tuple[Path, FolderResult]) -> None:
+    page = report_page(read_log(mixed[0] / "work"))
+    assert [f"., model {number}" in page for number in range(3)] == [True, True, False]
+
+
+def test_a_folder_in_the_folder_is_a_dataset_and_files_of_one_content_share_a_camera(tmp_path: Path) -> None:
+    write_flat(tmp_path / "images" / "a", 5)
+    (tmp_path / "images" / "a" / "copy.png").write_bytes((tmp_path / "images" / "a" / "00.png").read_bytes())
+    write_flat(tmp_path / "images" / "b", 1)
+    (tmp_path / "images" / "a" / "broken.jpg").write_bytes(b"no picture")
+    (tmp_path / "images" / "notes.txt").write_text("not an image")
+    result = run(tmp_path / "images", tmp_path / "out")
+    assert (tmp_path / "out" / "a" / "models" / "0").is_dir()
+    _, *rows = submission_rows(Form.IMC2025, result.cameras, tmp_path / "images")
+    assert [(row[0], row[1], row[2], row[3]) for row in rows] == [
+        *((f"a_{n:02}.png", "a", "cluster0", f"{n:02}.png") for n in range(5)),
+        ("a_broken.jpg", "a", "outliers", "broken.jpg"),
+        ("a_copy.png", "a", "cluster0", "copy.png"),
+        ("b_00.png", "b", "outliers", "00.png"),
+    ]
+    assert rows[0][4:] == rows[6][4:]
+    assert rows[-1][4:] == (";".join(["nan"] * 9), "nan;nan;nan")
+    assert [
+        text.endswith("broken.jpg: not a picture, or cut off: it cannot be decoded") for text in result.unreadable
+    ]
+    earlier = {row[0]: row for row in submission_rows(Form.IMC2023, result.cameras, tmp_path / "images")}
+    assert earlier["a/00.png"][1:3] == ("a", "a")
+    assert earlier["b/00.png"][3:] == ("1;0;0;0;1;0;0;0;1", "0;0;0")
+
+
+def test_only_listed_pairs_are_matched(tmp_path: Path) -> None:
+    root = write_flat(tmp_path / "images" / "set", 4).parent
+    wanted = list(combinations(range(4), 2))[:5]
+    (tmp_path / "pairs.txt").write_text("".join(f"set/{j:02}.png set/{i:02}.png\n\n" for i, j in wanted))
+    matcher = MixedMatcher()
+    listed = read_pair_list(tmp_path / "pairs.txt", root, read_folder(root))
+    run(root, tmp_path / "out", matcher, listed=listed)
+    assert sorted(matcher.calls) == wanted
+
+
+@pytest.mark.parametrize("line", ["a/0.png", "a/0.png b/0.png", "a/0.png a/0.png", "a/0.png a/9.png", "x y z", ""])
+def test_a_line_that_names_no_pair_is_refused(tmp_path: Path, line: str) -> None:
+    datasets = [Dataset(name, tuple(tmp_path / name / f"{n}.png" for n in range(2))) for name in "ab"]
+    (tmp_path / "pairs.txt").write_text(line)
+    with pytest.raises(UserError, match=r"expected two images of one dataset" if line else "has no pairs"):
+        read_pair_list(tmp_path / "pairs.txt", tmp_path, datasets)
+
+
+def refused(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+    assert main(["reconstruct", *arguments]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    return line
+
+
+def test_folders_that_cannot_be_reconstructed_get_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root, out = tmp_path / "images", ["--out", str(tmp_path / "out"), "--recipe", "classical"]
+    assert "no such directory" in refused([str(root), *out], capsys)
+    root.mkdir()
+    assert "has no images" in refused([str(root), *out], capsys)
+    (root / "a.png").write_bytes(b"")
+    assert "has a single image, a.png: there is nothing to match" in refused([str(root), *out], capsys)
+    (root / "a.jpg").write_bytes(b"")
+    assert "has both a.jpg and a.png; rename one of them" in refused([str(root), *out], capsys)
+    (root / "a.jpg").rename(root / "b.jpg")
+    assert "are in each other's way" in refused([str(root), "--out", str(root / "out")], capsys)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_without_a_readable_image_says_so_and_fails(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("a.png", "b.png", "c.png"):
+        (tmp_path / name).write_bytes(b"")
+    arguments = [str(tmp_path), "--out", f"{tmp_path}-out", "--recipe", "classical", "--workers", "0"]
+    assert main(["reconstruct", *arguments]) == 1
+    said = capsys.readouterr().out
+    assert f"cannot be read: {tmp_path / 'a.png'}: the file is empty" in said
+    assert "the run failed" in said
+
+
+def test_the_command_ends_with_the_same_files_after_a_kill(
+    demo: DemoSet, small_recipe: Path, tmp_path: Path
+) -> None:
+    """On rendered images: killed as soon as something is in the journal, then given again."""
+    images = demo.train_dir / "courtyard" / "images"
+
+    def command(out: Path) -> list[str]:
+        options = ["--out", str(out), "--recipe", str(small_recipe), "--format", "imc2025", "--workers", "0"]
+        return [sys.executable, "-m", "mkpc_kaggle", "reconstruct", str(images), *options]
+
+    killed = subprocess.Popen(command(tmp_path / "out"), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    while killed.poll() is None and not matched(tmp_path / "out" / "work"):
+        time.sleep(0.05)
+    killed.kill()
+    killed.wait()
+    for out in ("out", "undisturbed"):
+        subprocess.run(command(tmp_path / out), check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    found, expected = contents(tmp_path / "out"), contents(tmp_path / "undisturbed")
+    assert {"cameras.csv", "submission.csv", "database.db", "models/0/images.bin", "report.html"} <= found.keys()
+    del found["report.html"], expected["report.html"]  # it tells of times
+    assert found == expected
+    with (tmp_path / "out" / "submission.csv").open() as stream:
+        assert [row["image"] for row in csv.DictReader(stream)] == sorted(path.name for path in images.iterdir())
+
+
+def matched(work_dir: Path) -> bool:
+    try:
+        return any(event.kind == "job" for event in read_log(work_dir).events)
+    except UserError:  # nothing is there yet
+        return False
+
+
+def test_python_gives_the_models_of_images(tmp_path: Path) -> None:
+    folder = write_flat(tmp_path / "images", FIRST)
+    (first,) = reconstruct(folder.iterdir(), RECIPE, device="cpu", matchers={"synthetic": MixedMatcher()})
+    assert len(first.images) == FIRST
+    truth = MixedMatcher().scenes[0].cameras
+    for found in first.images:
+        assert isinstance(found.camera, Camera)
+        assert found.focal == pytest.approx(truth["00" + Path(found.image.name).stem].K[0, 0], rel=0.03)
+
+
+def photographs(folder: Path, count: int) -> list[Path]:
+    """Overlapping parts of two photographs, one after the other."""
+    folder.mkdir()
+    paths = []
+    for name in ("china.jpg", "flower.jpg"):
+        picture = load_sample_image(name)[..., ::-1]
+        for number in range(count):
+            paths.append(folder / f"{name[:-4]}{number}.png")
+            cv2.imwrite(str(paths[-1]), picture[20 + number : 360 + number, 12 * number : 12 * number + 420])
+    return paths
+
+
+def test_a_shortlist_has_images_that_are_alike(tmp_path: Path) -> None:
+    paths = photographs(tmp_path / "images", 6)
+    pairs = shortlist(paths, partners=3)
+    assert pairs == sorted(set(pairs)) == shortlist(paths, partners=3)
+    assert all((i < 6) == (j < 6) and i < j for i, j in pairs)
+    assert {place for pair in pairs for place in pair} == set(range(12))
+
+
+def test_large_folders_get_a_shortlist_and_others_all_pairs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mkpc_kaggle.reconstruction.folder.shortlist", lambda files: [(0, 1)])
+    files = tuple(tmp_path / f"{number:03}.png" for number in range(MAX_IMAGES + 1))
+    assert len(pairs_of(Dataset(".", files[:-1]))) == MAX_IMAGES * (MAX_IMAGES - 1) // 2
+    assert pairs_of(Dataset(".", files)) == [files[:2]]
+
+
+def test_unreadable_images_have_no_part_in_a_shortlist(tmp_path: Path) -> None:
+    paths = [tmp_path / f"{number}.png" for number in range(3)]
+    assert shortlist(paths, partners=1) == [(0, 1), (0, 2)]
+
+
+@dataclass
+class UprightSift(SyntheticMatcher):
+    """SIFT that takes every keypoint for upright, so that it knows no turned image again."""
+
+    name: str = "synthetic"
+
+    def encode(self, pictures):  # type: ignore[no-untyped-def,override]
+        sift, found = cv2.SIFT_create(3000), []
+        for picture in pictures:
+            gray = cv2.cvtColor(picture.pixels, cv2.COLOR_RGB2GRAY)
+            keypoints = sift.detect(gray, None)
+            for keypoint in keypoints:
+                keypoint.angle = 0
+            found.append(sift.compute(gray, keypoints))
+        return found
+
+    def match(self, encodings0, encodings1):  # type: ignore[no-untyped-def,override]
+        matches = []
+        for (points0, found0), (points1, found1) in zip(encodings0, encodings1, strict=True):
+            near = cv2.BFMatcher().knnMatch(found0, found1, k=2)
+            good = [first for first, second in near if first.distance < 0.75 * second.distance]
+            ends = [points0[m.queryIdx].pt for m in good], [points1[m.trainIdx].pt for m in good]
+            matches.append(Matches(*ends, np.ones(len(good))))
+        return matches
+
+
+def test_images_that_lie_on_a_side_are_found(tmp_path: Path) -> None:
+    paths = photographs(tmp_path / "images", 4)
+    turned = {paths[1]: 1, paths[3]: 2, paths[6]: 3}
+    for path, times in turned.items():
+        cv2.imwrite(str(path), np.rot90(cv2.imread(str(path)), -times))
+    (tmp_path / "images" / "broken.png").write_bytes(b"no picture")
+    assembly = assemble(RECIPE, matchers={"synthetic": UprightSift()}, device="cpu")
+    assert find_turns([*paths, tmp_path / "images" / "broken.png"], assembly) == turned
+
+
+def test_what_was_turned_comes_back_in_the_pixels_of_its_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root = write_flat(tmp_path / "images", FIRST)
+    lying = root / "02.png"
+    cv2.imwrite(str(lying), np.rot90(cv2.imread(str(lying)), -1))
+    monkeypatch.setattr("mkpc_kaggle.reconstruction.run.find_turns", lambda *_: {lying: 1})
+    result = run(root, tmp_path / "out", rotations=True)
+    found = {name: record.camera for name, record in cameras(result).items()}
+    downs = np.array([found[f"{number:02}.png"].R[1] for number in range(FIRST)])
+    np.testing.assert_allclose(downs @ downs[0] > 0.9, [number != 2 for number in range(FIRST)])
+    assert found["02.png"].R[0] @ downs[0] < -0.9  # the right border of the file is up
+    truth = MixedMatcher().scenes[0].cameras["0002"]
+    assert found["02.png"].K[0, 0] == pytest.approx(truth.K[0, 0], rel=0.03)
+    image = pycolmap.Reconstruction(tmp_path / "out" / "models" / "0").find_image_with_name("02.png")
+    assert (image.camera.width, image.camera.height) == (SIZE.height, SIZE.width)
+
+
+@pytest.mark.parametrize("times", range(4))
+def test_points_of_a_turned_picture_go_back(times: int) -> None:
+    picture = np.arange(6 * 4, dtype=np.uint8).reshape(6, 4)
+    shown = np.rot90(picture, times)
+    y, x = np.indices(shown.shape).reshape(2, -1)
+    points = turned_back(np.column_stack([x, y]).astype(np.float32), times, shown.shape[::-1])  # type: ignore[arg-type]
+    x0, y0 = points.astype(int).T
+    np.testing.assert_array_equal(picture[y0, x0], shown.ravel())
+
+
+def test_a_recipe_for_cameras_matches_no_pair_that_was_not_asked_for() -> None:
+    recipe = for_cameras(replace(RECIPE, scene=None))
+    assert recipe.scene is not None
+    assert recipe.scene.pairs_per_image == 0
+    assert recipe.focal is None
+    assert Pair("a/0/1", "a", "0", "1").model is not None
