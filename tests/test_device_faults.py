@@ -7,10 +7,10 @@ from typing import Any
 import pytest
 from faulty import (
     BROKEN,
-    BrokenDeviceMatcher,
     FaultyMatcher,
     NarrowMatcher,
     break_device,
+    breaks_after,
     exhaust_gpu,
     thread_place,
     use_places,
@@ -85,7 +85,7 @@ def assert_as_if_nothing_had_failed(report: RunReport, undisturbed: RunReport) -
 @pytest.mark.parametrize(
     "gpus",
     [
-        [BrokenDeviceMatcher(good=2), BrokenDeviceMatcher(good=3)],
+        [RectifiedMatcher(matches=breaks_after(2)), RectifiedMatcher(matches=breaks_after(3))],
         [RectifiedMatcher(matches=lambda _: exhaust_gpu())],
     ],
 )
@@ -104,7 +104,7 @@ def test_a_device_that_fails_once_costs_a_worker_and_no_unit(run_at, undisturbed
 
 
 def test_a_pair_at_which_a_device_fails_is_done_by_a_healthy_one(run_at, undisturbed):
-    broken, healthy = BrokenDeviceMatcher(good=2), RectifiedMatcher(seconds=0.02)
+    broken, healthy = RectifiedMatcher(matches=breaks_after(2)), RectifiedMatcher(seconds=0.02)
     report = run_at(thread_place("cuda:0", broken), thread_place("cuda:1", healthy))
     assert report.faults
     assert all("a job was lost on cuda:0: the device failed" in fault for fault in report.faults)
@@ -209,7 +209,7 @@ def test_workers_that_cannot_be_loaded_end_the_run_before_any_work(run_at, error
 
 
 def test_a_worker_that_cannot_be_started_again_ends_the_run_with_every_row_there(run_at):
-    broken, made = BrokenDeviceMatcher(good=5), []
+    broken, made = RectifiedMatcher(matches=breaks_after(5)), []
 
     def once() -> Any:
         made.append(broken)

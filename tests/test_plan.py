@@ -196,16 +196,12 @@ def test_progress_counts_the_pairs_that_have_an_f():
     assert plan.progress == (Phase.SWEEP, 0, 12)
 
 
-def test_a_worker_hangs_after_many_times_what_its_units_take():
-    job = learnt(plan_of(limit=32400.0), SWEEP).next(0.0)
-    assert job.seconds > 1.0
-    assert job.time_limit == job.seconds + HANG_FACTOR
-
-
 @pytest.mark.parametrize("limit", [20.0, 600.0, 32400.0])
-def test_a_short_run_waits_less_for_a_silent_worker(limit):
+def test_a_worker_hangs_after_many_times_what_its_units_take_and_sooner_in_a_short_run(limit):
     job = learnt(plan_of(limit=limit), SWEEP).next(0.0)
+    assert job.seconds > 1.0
     assert job.time_limit < max(0.05 * limit + 20, 20)
+    assert limit < 32400.0 or job.time_limit == job.seconds + HANG_FACTOR
 
 
 def test_where_no_unit_ends_in_time_there_is_no_job_until_scenes_need_less():
@@ -275,21 +271,14 @@ def test_more_time_never_means_fewer_units():
     assert all(ran.late == ran.lost == 0 for ran in runs)
 
 
-@pytest.mark.parametrize(
-    ("scenarios", "pairs", "middle", "low"),
-    [
-        (60, 300, 0.98, 0.8),
-        pytest.param(1000, 10_000, 0.99, 0.95, marks=[pytest.mark.slow, pytest.mark.timeout(3 * 3600)]),
-    ],
-)
-def test_random_runs_are_never_late_never_lose_a_row_and_use_their_time(scenarios, pairs, middle, low):
-    runs = [without_records(simulate(random_scenario(seed, pairs))) for seed in range(scenarios)]
+def test_random_runs_are_never_late_never_lose_a_row_and_use_their_time():
+    runs = [without_records(simulate(random_scenario(seed, pairs=300))) for seed in range(60)]
     assert max(run.late for run in runs) == 0
     assert sum(run.lost for run in runs) == 0
     assert sum(run.missed for run in runs if run.scenes_fit) == 0
     used = [run.utilisation for run in runs if run.work_left]
-    assert median(used) > middle
-    assert np.percentile(used, 5) > low
+    assert median(used) > 0.98
+    assert np.percentile(used, 5) > 0.8
 
 
 def test_undisturbed_runs_use_all_their_time():

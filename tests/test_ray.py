@@ -96,7 +96,9 @@ def test_a_machine_that_lacks_the_weights_or_the_test_set_is_named_when_the_run_
     for asked, weights in ((lacking, ()), (pairs, (missing,))):
         monkeypatch.setattr(Assembly, "weight_paths", weights)
         with pytest.raises(UserError, match=rf"lacks {missing}: test set and weights must have the same paths"):
-            run(asked, THREE_UNITS, RectifiedMatcher(), tmp_path / "w", workers=RayCluster(cluster.address))
+            run(
+                asked, THREE_UNITS, RectifiedMatcher(), tmp_path / asked[0].id, workers=RayCluster(cluster.address)
+            )
 
 
 def test_batches_are_reconstructed_on_the_cluster_to_the_same_bytes(cluster, tmp_path):

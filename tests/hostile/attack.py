@@ -26,6 +26,7 @@ REFUSED = (2,)
 DONE = (0,)
 EITHER = (0, 1, 2)  # a valid result, a result that says what it lacks, or a clear refusal
 CRASHES = ("Traceback (most recent call last)", "Fatal Python error", "Segmentation fault", "core dumped")
+LEFT_BY_ITSELF = (0, 1, 128 + signal.SIGINT, 128 + signal.SIGTERM)
 TOO_LATE = "the time was up before a first version"
 MARK = "MKPC_HOSTILE_CASE"
 
@@ -76,12 +77,7 @@ def attack(case: Case, room: Path) -> None:
         faults += _faults(case, status, output, room)
         faults += [f"left running: {line}" for line in _orphans(mark)]
         nothing = (status == 1 and TOO_LATE in output) or output.strip() == "error: interrupted"  # before it began
-        if (
-            case.submission
-            and not nothing
-            and "submit" in command
-            and status in (0, 1, 128 + signal.SIGINT, 128 + signal.SIGTERM)
-        ):
+        if case.submission and not nothing and "submit" in command and status in LEFT_BY_ITSELF:
             faults += _submission_faults(room)
     faults += [f"changed: {name}" for name in _changed(before, _snapshot(room))]
     if faults:

@@ -7,9 +7,10 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import count
 from math import inf
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 import pytest
@@ -61,8 +62,14 @@ def exhaust_gpu() -> None:
     raise RuntimeError("CUDA out of memory. Tried to allocate 20.00 GiB")
 
 
-def break_device() -> None:
+def break_device() -> NoReturn:
     raise RuntimeError(f"{BROKEN}\nCUDA kernel errors might be asynchronously reported at some other API call")
+
+
+def breaks_after(pairs: int) -> Callable[[int], int]:
+    """Answers of a matcher whose device fails after so many pairs, and then at everything in this process."""
+    calls = count()
+    return lambda _: 150 if next(calls) < pairs else break_device()
 
 
 # Matchers
@@ -90,18 +97,6 @@ class FaultyMatcher(RectifiedMatcher):
         is_due = not self.once.exists()
         self.once.touch()
         return is_due
-
-
-@dataclass
-class BrokenDeviceMatcher(RectifiedMatcher):
-    """A device that fails after ``good`` pairs, and from then on at everything in this process, as CUDA does."""
-
-    good: int = 5
-
-    def _match(self, seen0: Seen, seen1: Seen) -> Matches:
-        if len(self.calls) >= self.good:
-            break_device()
-        return super()._match(seen0, seen1)
 
 
 @dataclass
