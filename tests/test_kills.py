@@ -7,14 +7,15 @@ import signal
 import threading
 import time
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import cycle
 from math import inf
-from multiprocessing import resource_tracker, util
 from typing import Any, ClassVar
 
 import pytest
+from faulty import on_fork
 from rectified import run
+from simulator import VirtualClock
 from synthetic import RECIPE, SyntheticMatcher, synthetic_pairs
 
 from mkpc_kaggle.data.competition import Pair
@@ -51,10 +52,6 @@ class DoomedWorker(ProcessWorker):
         self.signal: signal.Signals | None = None
         self.is_busy = False  # from its start to its answer, and from a job to its answer
         self.clock = 0
-
-    @property
-    def is_stopped(self) -> bool:
-        return self.signal is signal.SIGSTOP
 
     def start(self) -> None:
         self.is_busy = True
@@ -104,16 +101,8 @@ class PatientSite(LocalSite):
     def wait(self, until: float) -> None:
         super().wait(inf)
         busy = [worker for worker in DoomedWorker.known.values() if worker.is_busy]
-        if busy and until < inf and all(worker.is_stopped for worker in busy):
+        if busy and until < inf and all(worker.signal is signal.SIGSTOP for worker in busy):
             self._clock.now = until
-
-
-@dataclass
-class StandingClock:
-    now: float = 0.0
-
-    def __call__(self) -> float:
-        return self.now
 
 
 @pytest.fixture
@@ -121,15 +110,11 @@ def forks(monkeypatch) -> None:
     """Tell workers of their processes as soon as these are forked."""
     for name, empty in {"lives": {}, "spared": set(), "sent": [], "known": {}}.items():
         monkeypatch.setattr(DoomedWorker, name, empty)
-    resource_tracker.ensure_running()  # a process, too
-    spawn = util.spawnv_passfds
 
-    def spawned(*arguments: Any) -> int:
-        pid: int = spawn(*arguments)
+    def tell_worker(pid: int) -> None:
         DoomedWorker.known[threading.current_thread().name].on_fork(pid)
-        return pid
 
-    monkeypatch.setattr(util, "spawnv_passfds", spawned)
+    on_fork(monkeypatch, tell_worker)
 
 
 def matrices(report: RunReport, batches: set[str], pairs: list[Pair]) -> list[bytes]:
@@ -147,7 +132,7 @@ def test_a_run_whose_workers_are_killed_and_stopped_at_random_moments_ends_as_th
 ):
     names = map(str, range(BATCHES))
     pairs = [pair for name in names for pair in synthetic_pairs(tmp_path / "images" / name, batch=name)]
-    budget = Budget(0.0, inf, StandingClock())
+    budget = Budget(0.0, inf, VirtualClock())
     monkeypatch.setattr(places, "ProcessWorker", DoomedWorker)
     monkeypatch.setattr(places, "RESTART_PAUSE_S", 0.0)
     monkeypatch.setattr(session, "LocalSite", PatientSite)

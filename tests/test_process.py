@@ -9,13 +9,12 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from functools import partial
-from multiprocessing import resource_tracker, util
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from faulty import ScenesBy, choose_scene_for_all_but_the_first
+from faulty import ScenesBy, choose_scene_for_all_but_the_first, on_fork
 
 from mkpc_kaggle.engine.jobs import Cause, Failure, Loaded, SceneJob, SceneResult
 from mkpc_kaggle.engine.process import WORKER_ENVIRONMENT, ProcessWorker
@@ -65,19 +64,7 @@ def start() -> Iterator[Callable[..., Worker]]:
 
 @pytest.fixture
 def at_birth(monkeypatch) -> Callable[[Callable[[int], None]], None]:
-    """What is done with the id of a process as soon as it is forked."""
-    resource_tracker.ensure_running()  # a process, too
-    spawn = util.spawnv_passfds
-
-    def set_action(action: Callable[[int], None]) -> None:
-        def spawned(*arguments: Any) -> int:
-            pid: int = spawn(*arguments)
-            action(pid)
-            return pid
-
-        monkeypatch.setattr(util, "spawnv_passfds", spawned)
-
-    return set_action
+    return partial(on_fork, monkeypatch)
 
 
 def test_a_worker_that_cannot_be_sent_to_its_process_says_so(start):

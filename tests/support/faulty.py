@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import count
 from math import inf
+from multiprocessing import resource_tracker, util
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -200,3 +201,16 @@ def use_places(monkeypatch: pytest.MonkeyPatch, *used: Place, fallback: Sequence
     monkeypatch.setattr(session, "site_of", site_of)
     monkeypatch.setattr(places, "LISTEN_S", 0.01)
     monkeypatch.setattr(places, "RESTART_PAUSE_S", 0.0)
+
+
+def on_fork(monkeypatch: pytest.MonkeyPatch, act: Callable[[int], None]) -> None:
+    """Let something be done with the id of each worker process as soon as it is forked."""
+    resource_tracker.ensure_running()  # a process, too
+    spawn = util.spawnv_passfds
+
+    def spawned(*arguments: Any) -> int:
+        pid: int = spawn(*arguments)
+        act(pid)
+        return pid
+
+    monkeypatch.setattr(util, "spawnv_passfds", spawned)
