@@ -51,7 +51,7 @@ def jobs_of(
     *,
     cautious: bool = True,
 ) -> Iterator[MatchJob]:
-    """All jobs of one place, each of which comes back, or is lost, before the next is planned."""
+    """All jobs of a place, each of which comes back, or is lost, before the next is planned."""
     now, failure = 0.0, None
     while (job := plan.next(now, "here", cautious=cautious and failure is not None)) is not None:
         yield job

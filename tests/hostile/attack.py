@@ -23,7 +23,6 @@ ROOT = Path(__file__).resolve().parents[2]
 MEMORY_KIB = 4 << 20
 HANGS_S = 600
 REFUSED = (2,)
-DONE = (0,)
 EITHER = (0, 1, 2)  # a valid result, a result that says what it lacks, or a clear refusal
 CRASHES = ("Traceback (most recent call last)", "Fatal Python error", "Segmentation fault", "core dumped")
 LEFT_BY_ITSELF = (0, 1, 128 + signal.SIGINT, 128 + signal.SIGTERM)
@@ -51,7 +50,7 @@ class Case:
     name: str
     command: str
     make: Make = nothing
-    statuses: tuple[int, ...] = DONE
+    statuses: tuple[int, ...] = (0,)
     says: str = ""
     act: Act | None = None
     then: str = ""

@@ -96,7 +96,6 @@ CASES = [
         for limit in ("5s", "15s")
         for count in (0, 1, 2)
     ),
-    Case("limits", "begun an hour ago", f"{PLAIN} --time-limit 60s --started-at 1000000000", statuses=EITHER),
     *(to_program(name, f"after {after} s", sends(name, after)) for name in ENDS for after in SOON),
     *(
         to_program(name, f"to all after {after} s", sends(name, after, group=True))

@@ -46,7 +46,7 @@ FINE = {
     "another format": "UPDATE run SET value = '99' WHERE key = 'format'",
     "what it is about of another kind": "UPDATE run SET value = '{\"x\": 1}' WHERE key = 'about'",
     "other images": 'UPDATE sample SET value = \'["a", "b", "q.png", "r.png"]\'',
-    "another table for one": "DROP TABLE points; CREATE TABLE points (a, b)",
+    "another table of points": "DROP TABLE points; CREATE TABLE points (a, b)",
     "a view for a table": "ALTER TABLE pair RENAME TO was; CREATE VIEW pair AS SELECT * FROM was",
     "a trigger": "CREATE TRIGGER t AFTER INSERT ON event BEGIN DELETE FROM pair; END",
 }
@@ -59,7 +59,6 @@ BESIDE: dict[str, Callable[[Path], object]] = {
         (work / "journal.sqlite").unlink(),
         (work / "journal.sqlite").symlink_to("/dev/zero"),
     ],
-    "many files beside it": lambda work: [(work / f"file{number}").touch() for number in range(1000)],
 }
 
 
@@ -67,8 +66,7 @@ BESIDE: dict[str, Callable[[Path], object]] = {
 def finished() -> Path:
     """The room of a run that has ended, made once a process."""
     room = write_template(Path(tempfile.mkdtemp(prefix="hostile-")) / "room")
-    done = prepared(SUBMIT, room)
-    assert done == 0, "the undisturbed run failed"
+    assert prepared(SUBMIT, room) == 0, "the undisturbed run failed"
     return room
 
 

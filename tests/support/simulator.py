@@ -102,7 +102,7 @@ class Scenario:
 
 
 def random_scenario(seed: int, pairs: int) -> Scenario:
-    """Anything that happens: from an ample limit to one that the sweep alone fills."""
+    """Anything that happens: from an ample limit to a limit that the sweep alone fills."""
     rng = np.random.default_rng(seed)
     costs = tuple(np.exp(rng.normal(-0.5, 0.8, rng.integers(1, 13))).tolist())
     troubled = rng.random() < 0.5
@@ -386,7 +386,7 @@ class Ran:
 
 
 def simulate(scenario: Scenario, journal: MemoryJournal | None = None, until: float = math.inf) -> Ran:
-    """Run one scenario through the real engine, as long as nobody interrupts it."""
+    """Run a scenario through the real engine, as long as nobody interrupts it."""
     clock = VirtualClock()
     budget = Budget(0.0, scenario.limit, clock)
     site = SimulatedSite(scenario, clock, budget.stop_units)
