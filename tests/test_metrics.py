@@ -179,3 +179,8 @@ def test_the_pose_auc_is_the_area_computed_by_hand(angles, threshold, area):
     assert pose_auc(errors(*angles), threshold) == pytest.approx(area)
     assert pose_auc([PoseError(1e-9, angle, 9.0) for angle in angles], threshold) == pytest.approx(area)
     assert isnan(pose_auc([], threshold))
+
+
+@pytest.mark.parametrize("R", [np.zeros((3, 3)), np.full((3, 3), np.nan), -1e100 * np.eye(3)])
+def test_a_matrix_of_a_file_that_does_not_rotate_raises_nothing(R):
+    assert isinstance(rotation_angle(R), float)

@@ -6,7 +6,6 @@ from math import inf, isfinite
 
 import numpy as np
 from scipy.integrate import trapezoid
-from scipy.spatial.transform import Rotation
 
 from mkpc_kaggle.geometry.cameras import Camera, relative_pose
 from mkpc_kaggle.geometry.coordinates import Matrix3
@@ -67,7 +66,9 @@ def pose_error(F: Matrix3, camera0: Camera, camera1: Camera, metres_per_unit: fl
 
 def rotation_angle(R: Matrix3) -> float:
     """The angle of a rotation matrix in degrees, 0 to 180; precise at both ends."""
-    return float(np.degrees(Rotation.from_matrix(R).magnitude()))
+    # Not SciPy's Rotation, which raises for cameras of a file that are no rotations.
+    skew = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+    return float(np.degrees(np.arctan2(np.linalg.norm(skew), np.trace(R) - 1)))
 
 
 def mean_average_accuracy(errors: Sequence[PoseError]) -> float:

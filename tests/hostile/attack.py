@@ -75,7 +75,8 @@ def attack(case: Case, room: Path) -> None:
         status, output = _wait(process, room)
         faults += _faults(case, status, output, room)
         faults += [f"left running: {line}" for line in _orphans(mark)]
-        nothing = (status == 1 and TOO_LATE in output) or output.strip() == "error: interrupted"  # before it began
+        interrupted = status not in (0, 1) and output.strip() in ("", "error: interrupted")
+        nothing = interrupted or (status == 1 and TOO_LATE in output)  # before it began
         if case.submission and not nothing and "submit" in command and status in LEFT_BY_ITSELF:
             faults += _submission_faults(room)
     faults += [f"changed: {name}" for name in _changed(before, _snapshot(room))]
