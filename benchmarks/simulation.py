@@ -67,8 +67,6 @@ def main() -> None:
     print(f"scenes: {len(fit)} scenarios in which they fit, {missed} of {batches} batches missed")
     low, middle = np.percentile(busy, [5, 50]) if busy else (math.nan, math.nan)
     print(f"utilisation: median {middle:.4f}, 5th percentile {low:.4f}, least {min(busy, default=math.nan):.4f}")
-    worst = max(runs, key=lambda run: run.planning)
-    print(f"planning: {1e3 * worst.planning:.3f} ms a job at most, {worst.jobs} jobs")
     for run in sorted((run for run in runs if run.work_left), key=lambda run: run.utilisation)[:5]:
         print(f"  {run.utilisation:.4f} {run.scenario}")
 

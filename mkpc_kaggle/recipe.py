@@ -8,6 +8,7 @@ import tomllib
 from collections.abc import Callable, Container, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from enum import StrEnum
+from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -55,7 +56,7 @@ class Unit:
         if self.stretch and not self.area:
             raise ValueError("stretch needs an area, the height and width to stretch views to")
 
-    @property
+    @cached_property  # plans ask for it often
     def name(self) -> str:
         """Such as ``2:sift@1280`` or ``1:dkm@540x720``; "!" means stretched. Unique in a recipe."""
         return f"{self.stage}:{self.matcher}@{self.long_side or self.area}{'!' if self.stretch else ''}"

@@ -33,13 +33,8 @@ def test_a_duration_whose_last_number_has_no_unit_is_refused_with_what_to_write(
 
 
 def test_durations_are_shown_short() -> None:
-    assert [format_duration(s) for s in (4.24, 59.9, 61, 3599.9, 31500)] == [
-        "4.2s",
-        "59.9s",
-        "1m01s",
-        "1h00m",
-        "8h45m",
-    ]
+    shown = [format_duration(seconds) for seconds in (4.24, 59.9, 61, 3599.9, 31500)]
+    assert shown == ["4.2s", "59.9s", "1m01s", "1h00m", "8h45m"]
 
 
 def test_the_four_moments_of_a_budget_follow_each_other() -> None:
@@ -48,9 +43,6 @@ def test_the_four_moments_of_a_budget_follow_each_other() -> None:
         moments = [0.0, budget.stop_units, budget.stop_waiting, budget.final_write, budget.limit]
         assert moments == sorted(set(moments))
         assert budget.left() == budget.stop_units
-
-
-def test_a_spent_budget_has_nothing_left() -> None:
     assert Budget(0.0, 60, lambda: 100.0).left() == 0
 
 
@@ -63,13 +55,10 @@ def test_a_single_slow_write_is_forgotten_and_slow_writes_are_not() -> None:
     for _ in range(3):
         budget.note_write(40.0)
     assert budget.writing == 60.0
-
-
-def test_writing_is_never_given_more_than_a_small_share_of_the_limit() -> None:
-    budget = Budget(0.0, 100.0, lambda: 0.0)
-    budget.note_write(90.0)
-    assert budget.writing == 5.0
-    assert budget.stop_units > 50
+    short = Budget(0.0, 100.0, lambda: 0.0)
+    short.note_write(90.0)
+    assert short.writing == 5.0, "a small share of the limit at most"
+    assert short.stop_units > 50
 
 
 def test_the_warm_up_counts_only_until_there_is_another_measurement() -> None:
@@ -101,15 +90,10 @@ def test_an_assumed_cost_holds_only_for_a_unit_that_was_never_measured() -> None
     assert costs.mean("b") == 99.0
 
 
-def known_costs(*seconds: float) -> Costs:
-    costs = Costs()
-    for unit, cost in zip(UNITS, seconds, strict=True):
-        costs.observe(unit.name, cost)
-    return costs
-
-
 def test_pairs_need_the_units_that_they_lack_and_the_time_between_them() -> None:
-    costs = known_costs(1.0, 2.0, 4.0)
+    costs = Costs()
+    for unit, seconds in zip(UNITS, (1.0, 2.0, 4.0), strict=True):
+        costs.observe(unit.name, seconds)
     lacking = {UNITS[0].name: 0, UNITS[1].name: 10, UNITS[2].name: 1}
     assert list(costs.cumulative(UNITS, lacking)) == pytest.approx([0, 28, 33.6])
     costs.observe_overhead(1.0)

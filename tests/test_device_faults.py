@@ -1,17 +1,16 @@
 """Devices that fail, memory that is short, workers that are lost: what counts against what, what takes over."""
 
 import threading
-from collections.abc import Callable
-from pathlib import Path
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import pytest
 from faulty import (
     BROKEN,
-    BrokenDeviceMatcher,
     FaultyMatcher,
     NarrowMatcher,
     break_device,
+    breaks_after,
     exhaust_gpu,
     thread_place,
     use_places,
@@ -19,121 +18,108 @@ from faulty import (
 from rectified import SECOND, SWEEP, THIRD, THREE_UNITS, RectifiedMatcher, matrices, run
 
 from mkpc_kaggle.cli import main, options
-from mkpc_kaggle.data.competition import Pair, read_test_side, submission_problems
-from mkpc_kaggle.demo import DemoSet
+from mkpc_kaggle.data.competition import read_test_side, submission_problems
 from mkpc_kaggle.engine.engine import Ending, RunReport
+from mkpc_kaggle.engine.places import Place
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.pipeline.assembly import Assembly, assemble
+from mkpc_kaggle.pipeline.assembly import assemble
 from mkpc_kaggle.pipeline.failures import DeviceError, FailureKind, failure_of, reason_of
-from mkpc_kaggle.reporting.summary import trouble
 
 COUNT = 12
 VICTIM = 3  # brightness 13
 
 
-def unit_failures(report: RunReport) -> list[str]:
-    return [unit.failure for record in report.records for unit in record.units if unit.failure]
-
-
-def test_what_errors_mean() -> None:
+def test_what_errors_mean():
     import torch
 
     cuda = "CUDA error: {}\nCUDA kernel errors might be asynchronously reported at some other API call"
-    told = {
+    messages = {
         FailureKind.OUT_OF_MEMORY: [
-            MemoryError(),
-            torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB."),
-            RuntimeError(
-                "[enforce fail at alloc_cpu.cpp:117] err == 0. DefaultCPUAllocator: can't allocate memory"
-            ),
-            RuntimeError(cuda.format("out of memory")),
-            RuntimeError(cuda.format("CUBLAS_STATUS_ALLOC_FAILED when calling `cublasCreate(handle)`")),
-            RuntimeError("cuDNN error: CUDNN_STATUS_ALLOC_FAILED"),
-            RuntimeError("cuDNN error: CUDNN_STATUS_INTERNAL_ERROR_DEVICE_ALLOCATION_FAILED"),
-            RuntimeError("FIND was unable to find an engine to execute this computation"),
-            RuntimeError("GET was unable to find an engine to execute this computation"),
+            "[enforce fail at alloc_cpu.cpp:117] err == 0. DefaultCPUAllocator: can't allocate memory",
+            cuda.format("out of memory"),
+            cuda.format("CUBLAS_STATUS_ALLOC_FAILED when calling `cublasCreate(handle)`"),
+            "cuDNN error: CUDNN_STATUS_ALLOC_FAILED",
+            "cuDNN error: CUDNN_STATUS_INTERNAL_ERROR_DEVICE_ALLOCATION_FAILED",
+            "FIND was unable to find an engine to execute this computation",
+            "GET was unable to find an engine to execute this computation",
         ],
         FailureKind.DEVICE: [
-            RuntimeError(cuda.format("an illegal memory access was encountered")),
-            RuntimeError(cuda.format("no kernel image is available for execution on the device")),
-            RuntimeError(cuda.format("CUBLAS_STATUS_EXECUTION_FAILED when calling `cublasSgemm( handle )`")),
-            RuntimeError("cuDNN error: CUDNN_STATUS_EXECUTION_FAILED"),
-            RuntimeError("No CUDA GPUs are available"),
+            cuda.format("an illegal memory access was encountered"),
+            cuda.format("no kernel image is available for execution on the device"),
+            cuda.format("CUBLAS_STATUS_EXECUTION_FAILED when calling `cublasSgemm( handle )`"),
+            "cuDNN error: CUDNN_STATUS_EXECUTION_FAILED",
+            "No CUDA GPUs are available",
         ],
-        FailureKind.ORDINARY: [RuntimeError("shapes differ"), ValueError("no points"), AssertionError()],
+        FailureKind.ORDINARY: ["shapes differ"],
     }
-    for failure, errors in told.items():
-        assert [failure_of(error) for error in errors] == [failure] * len(errors)
-    illegal = told[FailureKind.DEVICE][0]
+    for kind, texts in messages.items():
+        assert {failure_of(RuntimeError(text)) for text in texts} == {kind}
+    for error in (MemoryError(), torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB.")):
+        assert failure_of(error) is FailureKind.OUT_OF_MEMORY
+    assert failure_of(ValueError("no points")) is failure_of(AssertionError()) is FailureKind.ORDINARY
+    illegal = RuntimeError(cuda.format("an illegal memory access was encountered"))
     illegal.add_note("in 1:loftr@840")
     assert reason_of(illegal) == f"RuntimeError: {BROKEN}, in 1:loftr@840"
+
+
+@pytest.fixture
+def run_at(pairs, tmp_path, monkeypatch) -> Callable[..., RunReport]:
+    """A run whose workers are at these places."""
+
+    def run_there(*places: Place, fallback: Sequence[Place] = ()) -> RunReport:
+        use_places(monkeypatch, *places, fallback=fallback)
+        return run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
+
+    return run_there
+
+
+def assert_as_if_nothing_had_failed(report: RunReport, undisturbed: RunReport) -> None:
+    assert report.ending is Ending.COMPLETE
+    assert matrices(report) == matrices(undisturbed)
+    assert not [unit.failure for record in report.records for unit in record.units if unit.failure]
 
 
 # Devices
 
 
-def test_a_device_that_fails_once_costs_a_worker_and_no_unit(
-    pairs: list[Pair], undisturbed: RunReport, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    matcher = FaultyMatcher(fault=break_device, once=tmp_path / "broken")
-    use_places(monkeypatch, thread_place("cuda:0", matcher))
-    report = run(pairs, THREE_UNITS, matcher, tmp_path / "work")
-    assert report.ending is Ending.COMPLETE
+@pytest.mark.parametrize(
+    "gpus",
+    [
+        [RectifiedMatcher(matches=breaks_after(2)), RectifiedMatcher(matches=breaks_after(3))],
+        [RectifiedMatcher(matches=lambda _: exhaust_gpu())],
+    ],
+)
+def test_the_cpu_takes_over_when_the_last_gpu_fails_or_has_no_memory_for_any_unit(run_at, undisturbed, gpus):
+    places = [thread_place(f"cuda:{number}", matcher) for number, matcher in enumerate(gpus)]
+    report = run_at(*places, fallback=[thread_place("cpu", RectifiedMatcher())])
+    assert_as_if_nothing_had_failed(report, undisturbed)
+
+
+def test_a_device_that_fails_once_costs_a_worker_and_no_unit(run_at, undisturbed, tmp_path):
+    report = run_at(thread_place("cuda:0", FaultyMatcher(fault=break_device, once=tmp_path / "broken")))
     assert report.faults == (
         f"a job was lost on cuda:0: the device failed: RuntimeError: {BROKEN}, in 1:rectified@96",
     )
-    assert matrices(report) == matrices(undisturbed)
-    assert unit_failures(report) == []
-    assert trouble(report) == ""
+    assert_as_if_nothing_had_failed(report, undisturbed)
 
 
-def test_the_cpu_takes_over_when_the_last_gpu_fails_in_the_middle_of_a_run(
-    pairs: list[Pair], undisturbed: RunReport, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    matcher = RectifiedMatcher()
-    gpus = [thread_place(f"cuda:{number}", BrokenDeviceMatcher(good=number)) for number in (2, 3)]
-    use_places(monkeypatch, *gpus, fallback=[thread_place("cpu", matcher)])
-    report = run(pairs, THREE_UNITS, matcher, tmp_path / "work")
-    assert report.ending is Ending.COMPLETE
-    assert matrices(report) == matrices(undisturbed)
-    assert unit_failures(report) == []
-
-
-def test_a_pair_at_which_a_device_fails_is_done_by_a_healthy_one(
-    pairs: list[Pair], undisturbed: RunReport, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    broken, healthy = BrokenDeviceMatcher(good=2), RectifiedMatcher(seconds=0.02)
-    use_places(monkeypatch, thread_place("cuda:0", broken), thread_place("cuda:1", healthy))
-    report = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
-    assert report.ending is Ending.COMPLETE
-    assert all("a job was lost on cuda:0: the device failed" in fault for fault in report.faults)
+def test_a_pair_at_which_a_device_fails_is_done_by_a_healthy_one(run_at, undisturbed):
+    broken, healthy = RectifiedMatcher(matches=breaks_after(2)), RectifiedMatcher(seconds=0.02)
+    report = run_at(thread_place("cuda:0", broken), thread_place("cuda:1", healthy))
     assert report.faults
-    assert unit_failures(report) == []
-    assert matrices(report) == matrices(undisturbed)
+    assert all("a job was lost on cuda:0: the device failed" in fault for fault in report.faults)
+    assert_as_if_nothing_had_failed(report, undisturbed)
 
 
-def test_a_device_without_kernels_leaves_the_work_to_the_cpu_and_a_line(
-    pairs: list[Pair],
-    undisturbed: RunReport,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    gpu = thread_place("cuda:99", RectifiedMatcher(), pipeline=assembled().on("cuda:99").pipeline)
-    use_places(monkeypatch, gpu, fallback=[thread_place("cpu", RectifiedMatcher())])
-    report = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
-    assert report.ending is Ending.COMPLETE
+def test_a_device_without_kernels_leaves_the_work_to_the_cpu_and_a_line(run_at, undisturbed, capsys):
+    assembly = assemble(THREE_UNITS, matchers={"rectified": RectifiedMatcher()}, device="cpu")
+    gpu = thread_place("cuda:99", RectifiedMatcher(), pipeline=assembly.on("cuda:99").pipeline)
+    report = run_at(gpu, fallback=[thread_place("cpu", RectifiedMatcher())])
     assert "cuda:99 cannot be used" in capsys.readouterr().err
-    assert matrices(report) == matrices(undisturbed)
+    assert_as_if_nothing_had_failed(report, undisturbed)
 
 
-def assembled() -> Assembly:
-    return assemble(THREE_UNITS, matchers={"rectified": RectifiedMatcher()}, device="cpu")
-
-
-def test_a_worker_that_hangs_keeps_no_job_from_the_others(
-    pairs: list[Pair], undisturbed: RunReport, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_worker_that_hangs_keeps_no_job_from_the_others(run_at, undisturbed):
     swept, others_done = set(), threading.Event()
 
     def wait_for_others(brightness: int) -> int:
@@ -146,53 +132,34 @@ def test_a_worker_that_hangs_keeps_no_job_from_the_others(
             others_done.set()
         return 150
 
-    hanging = thread_place("cuda:0", RectifiedMatcher(matches=wait_for_others))
-    use_places(monkeypatch, hanging, thread_place("cuda:1", RectifiedMatcher(matches=note)))
-    report = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
-    assert unit_failures(report) == []
-    assert matrices(report) == matrices(undisturbed)
+    matchers = [RectifiedMatcher(matches=answer) for answer in (wait_for_others, note)]
+    report = run_at(*(thread_place(f"cuda:{number}", matcher) for number, matcher in enumerate(matchers)))
+    assert_as_if_nothing_had_failed(report, undisturbed)
 
 
 # Memory
 
 
-def test_a_unit_too_large_for_the_memory_is_given_up_on_that_pair_alone(
-    pairs: list[Pair], undisturbed: RunReport, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    use_places(monkeypatch, thread_place("cuda:0", FaultyMatcher(fault=exhaust_gpu, above=100)))
-    report = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
+def test_a_unit_too_large_for_the_memory_is_given_up_on_that_pair_alone(run_at, undisturbed):
+    report = run_at(thread_place("cuda:0", FaultyMatcher(fault=exhaust_gpu, above=100)))
     assert report.ending is Ending.COMPLETE
-    sweep, *others = report.records[VICTIM].units
-    assert sweep.failure == ""
     given_up = "given up: out of memory: RuntimeError: CUDA out of memory. Tried to allocate 20.00 GiB, in {}"
-    assert {unit.unit: unit.failure for unit in others} == {
-        unit.name: given_up.format(unit.name) for unit in (SECOND, THIRD)
-    }
+    failures = {unit.unit: unit.failure for unit in report.records[VICTIM].units}
+    assert failures == {SWEEP.name: "", **{unit.name: given_up.format(unit.name) for unit in (SECOND, THIRD)}}
     assert report.records[VICTIM].inliers > 100, "it keeps the F that it has"
     assert matrices(report)[:VICTIM] == matrices(undisturbed)[:VICTIM]
     assert matrices(report)[VICTIM + 1 :] == matrices(undisturbed)[VICTIM + 1 :]
+    again = run_at(thread_place("cuda:0", RectifiedMatcher()))
+    assert matrices(again) == matrices(report), "what was given up is not tried again"
 
 
-def test_a_minibatch_that_memory_is_too_short_for_is_halved_once_and_no_worker_lost(
-    pairs: list[Pair], undisturbed: RunReport, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_minibatch_that_memory_is_too_short_for_is_halved_once_and_no_worker_lost(run_at, undisturbed):
     matcher = NarrowMatcher(most=2)
-    use_places(monkeypatch, thread_place("cuda:0", matcher, minibatch=8))
-    report = run(pairs, THREE_UNITS, matcher, tmp_path / "work")
+    report = run_at(thread_place("cuda:0", matcher, minibatch=8))
     assert report.faults == ()
-    assert matrices(report) == matrices(undisturbed)
+    assert_as_if_nothing_had_failed(report, undisturbed)
     too_large = [size for size in matcher.sizes if size > 2]
     assert len(too_large) == 2 * len(THREE_UNITS.units), "seven or eight, and three or four: once a unit"
-
-
-def test_the_cpu_takes_over_when_a_gpu_has_no_memory_for_any_unit(
-    pairs: list[Pair], undisturbed: RunReport, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    gpu = thread_place("cuda:0", RectifiedMatcher(matches=lambda _: exhaust_gpu()))
-    use_places(monkeypatch, gpu, fallback=[thread_place("cpu", RectifiedMatcher())])
-    report = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
-    assert report.ending is Ending.COMPLETE
-    assert matrices(report) == matrices(undisturbed)
 
 
 # Exit status
@@ -210,14 +177,7 @@ def refuse(_: int) -> int:
         (lambda _: exhaust_gpu(), "every unit was given up, the faults say why; the same command goes on"),
     ],
 )
-def test_a_run_that_failed_has_exit_status_one_and_a_line(
-    demo: DemoSet,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    fault: Callable[[int], Any],
-    told: str,
-) -> None:
+def test_a_run_that_failed_has_exit_status_one_and_a_line(demo, tmp_path, monkeypatch, capsys, fault, told):
     matcher = RectifiedMatcher(matches=fault)
     use_places(monkeypatch, thread_place("this process", matcher))
     made = assemble(THREE_UNITS, matchers={matcher.name: matcher}, device="cpu")
@@ -240,21 +200,16 @@ def test_a_run_that_failed_has_exit_status_one_and_a_line(
         (MemoryError("weights"), "out of memory: MemoryError: weights"),
     ],
 )
-def test_workers_that_cannot_be_loaded_end_the_run_before_any_work(
-    pairs: list[Pair], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception, told: str
-) -> None:
+def test_workers_that_cannot_be_loaded_end_the_run_before_any_work(run_at, error, told):
     def fail() -> Any:
         raise error
 
-    use_places(monkeypatch, thread_place("cpu", RectifiedMatcher(), pipeline=fail))
     with pytest.raises(UserError, match=f"no worker could be started: cpu: {told}"):
-        run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
+        run_at(thread_place("cpu", RectifiedMatcher(), pipeline=fail))
 
 
-def test_a_worker_that_cannot_be_started_again_ends_the_run_with_every_row_there(
-    pairs: list[Pair], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    broken, made = BrokenDeviceMatcher(good=5), []
+def test_a_worker_that_cannot_be_started_again_ends_the_run_with_every_row_there(run_at):
+    broken, made = RectifiedMatcher(matches=breaks_after(5)), []
 
     def once() -> Any:
         made.append(broken)
@@ -262,8 +217,7 @@ def test_a_worker_that_cannot_be_started_again_ends_the_run_with_every_row_there
             raise UserError("the weights are gone")
         return assemble(THREE_UNITS, matchers={broken.name: broken}, device="cpu").pipeline()
 
-    use_places(monkeypatch, thread_place("cpu", broken, pipeline=once))
-    report = run(pairs, THREE_UNITS, broken, tmp_path / "work")
+    report = run_at(thread_place("cpu", broken, pipeline=once))
     assert report.ending is Ending.NO_WORKER
     assert "cpu: the matchers cannot be loaded: the weights are gone" in report.faults
     assert report.records[0].has(SWEEP)

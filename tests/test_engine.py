@@ -1,9 +1,9 @@
 """The engine with a matcher whose answers are known, in threads of this process."""
 
+import math
 import threading
 from collections import Counter
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -32,7 +32,7 @@ def after_calls(count: int, act: Callable[[], None]) -> Callable[[int], int]:
     return matches
 
 
-def test_a_run_without_a_limit_gives_every_pair_every_unit(tmp_path: Path) -> None:
+def test_a_run_without_a_limit_gives_every_pair_every_unit(tmp_path):
     report = run(write_pairs(tmp_path, 11), THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
     assert report.ending is Ending.COMPLETE
     assert [record.index for record in report.records] == list(range(11))
@@ -47,14 +47,7 @@ def test_a_run_without_a_limit_gives_every_pair_every_unit(tmp_path: Path) -> No
         assert record.regions is not None
 
 
-def test_the_sweep_reaches_all_pairs_before_any_pair_is_deepened(tmp_path: Path) -> None:
-    matcher = RectifiedMatcher()
-    run(write_pairs(tmp_path, 9), THREE_UNITS, matcher, tmp_path / "work")
-    assert {side for side, _ in matcher.calls[:9]} == {SWEEP.long_side}
-    assert SWEEP.long_side not in {side for side, _ in matcher.calls[9:]}
-
-
-def test_every_published_version_is_whole_and_the_first_comes_before_any_work(tmp_path: Path) -> None:
+def test_every_published_version_is_whole_and_the_first_comes_before_any_work(tmp_path):
     matcher, published = RectifiedMatcher(), []
 
     def publish(records: list[PairRecord]) -> None:
@@ -68,7 +61,7 @@ def test_every_published_version_is_whole_and_the_first_comes_before_any_work(tm
         assert all(np.isfinite(F).all() and F.any() for F in version)
 
 
-def test_an_interrupted_run_goes_on_where_it_was_and_ends_with_the_same_bytes(tmp_path: Path) -> None:
+def test_an_interrupted_run_goes_on_where_it_was_and_ends_with_the_same_bytes(tmp_path):
     pairs, interrupt = write_pairs(tmp_path, 20), Interrupt()
     undisturbed = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "undisturbed")
     first = RectifiedMatcher(matches=after_calls(25, interrupt.set))
@@ -84,7 +77,7 @@ def test_an_interrupted_run_goes_on_where_it_was_and_ends_with_the_same_bytes(tm
     assert second.calls
 
 
-def test_a_finished_run_loads_no_matcher_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_finished_run_loads_no_matcher_again(tmp_path, monkeypatch):
     pairs = write_pairs(tmp_path, 3)
     once = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
     loaded = []
@@ -95,7 +88,7 @@ def test_a_finished_run_loads_no_matcher_again(tmp_path: Path, monkeypatch: pyte
     assert twice.resumed == 3
 
 
-def test_an_unreadable_image_costs_its_pair_only(tmp_path: Path) -> None:
+def test_an_unreadable_image_costs_its_pair_only(tmp_path):
     pairs = write_pairs(tmp_path, 4)
     pairs[2].images[1].write_bytes(b"")
     report = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
@@ -105,7 +98,7 @@ def test_an_unreadable_image_costs_its_pair_only(tmp_path: Path) -> None:
     assert report.ending is Ending.COMPLETE
 
 
-def test_a_matcher_that_raises_costs_its_pair_that_unit_only(tmp_path: Path) -> None:
+def test_a_matcher_that_raises_costs_its_pair_that_unit_only(tmp_path):
     def moody(brightness: int) -> int:
         if brightness == 12:
             raise RuntimeError("no mood")
@@ -117,13 +110,22 @@ def test_a_matcher_that_raises_costs_its_pair_that_unit_only(tmp_path: Path) -> 
     assert "too few distinct matches" in report.records[2].failure
 
 
-def test_a_unit_that_never_returns_does_not_hold_the_run_past_its_limit(tmp_path: Path) -> None:
-    released = threading.Event()
-    matcher = RectifiedMatcher(matches=after_calls(5, released.wait))
+@pytest.mark.parametrize(("limit", "ending"), [(5.0, Ending.TIME_IS_UP), (math.inf, Ending.INTERRUPTED)])
+def test_a_unit_that_never_returns_holds_the_run_neither_past_its_limit_nor_after_an_interrupt(
+    tmp_path, limit, ending
+):
+    released, interrupt = threading.Event(), Interrupt()
+
+    def hang() -> None:
+        if ending is Ending.INTERRUPTED:
+            interrupt.set()
+        released.wait()
+
+    matcher, pairs = RectifiedMatcher(matches=after_calls(5, hang)), write_pairs(tmp_path, 12)
     try:
-        report = run(write_pairs(tmp_path, 12), THREE_UNITS, matcher, tmp_path / "work", limit=5.0)
+        report = run(pairs, THREE_UNITS, matcher, tmp_path / "work", limit=limit, interrupt=interrupt)
         assert not released.is_set(), "the run ends while the unit is under way"
-        assert report.ending is Ending.TIME_IS_UP
+        assert report.ending is ending
         assert len(report.records) == 12
         assert report.records[0].units
     finally:

@@ -2,6 +2,7 @@ import os
 import re
 import sqlite3
 import zlib
+from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -24,6 +25,7 @@ from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult
 from mkpc_kaggle.scene.choose import Choice, Reason
 
 OURS = {"recipe": {"a": 1}, "test set": "x"}
+PAIRS = [Pair(str(number), "batch", "a.png", "b.png") for number in range(8)]
 UNITS = {unit.name: unit for unit in THREE_UNITS.units}
 
 
@@ -44,44 +46,45 @@ def outcome(index: int = 7, seed: int = 0) -> Outcome:
     return Outcome(PairRecord.of(index, match), results)
 
 
+@pytest.fixture
+def journal(tmp_path: Path) -> Iterator[Journal]:
+    with Journal(tmp_path, OURS) as journal:
+        yield journal
+
+
 def test_what_is_saved_is_there_after_opening_again(tmp_path: Path) -> None:
     saved = [outcome(3, seed=0), outcome(7, seed=2)]
-    journal = Journal(tmp_path, OURS)
-    journal.save([(one, False) for one in saved])
-    journal.close()
-    again = Journal(tmp_path, OURS)
-    records = again.records()
-    assert list(records) == [3, 7]
-    for one in saved:
-        assert encode(records[one.record.index]) == encode(one.record)
-        for before, after in zip(one.results, again.results(one.record, UNITS), strict=True):
-            assert after.unit == before.unit
-            assert after.matches.points0.tobytes() == before.matches.points0.tobytes()
-            assert after.matches.scores.tobytes() == before.matches.scores.tobytes()
-    again.close()
+    with Journal(tmp_path, OURS) as journal:
+        journal.save([(pair, False) for pair in saved])
+    with Journal(tmp_path, OURS) as again:
+        records = again.records()
+        assert list(records) == [3, 7]
+        for pair in saved:
+            assert encode(records[pair.record.index]) == encode(pair.record)
+            for before, after in zip(pair.results, again.results(pair.record, UNITS), strict=True):
+                assert after.unit == before.unit
+                assert after.matches.points0.tobytes() == before.matches.points0.tobytes()
+                assert after.matches.scores.tobytes() == before.matches.scores.tobytes()
 
 
 def points_of(journal: Journal, pair: int) -> int:
     return sum(len(result.matches) for result in journal.results(journal.records()[pair], UNITS))
 
 
-def test_the_points_of_settled_pairs_are_kept_of_the_weakest_only(tmp_path: Path) -> None:
-    journal = Journal(tmp_path, OURS)
+def test_the_points_of_settled_pairs_are_kept_of_the_weakest_only(journal: Journal) -> None:
     count = 3 * MAX_DRAWN_PAIRS
     saved = [outcome(index, seed=index) for index in range(count)]
     for start in range(0, count, 7):
-        journal.save([(one, True) for one in saved[start : start + 7]])
-    by_strength = sorted(saved, key=lambda one: (one.record.inliers, one.record.index))
-    weakest = {one.record.index for one in by_strength[:MAX_DRAWN_PAIRS]}
+        journal.save([(pair, True) for pair in saved[start : start + 7]])
+    by_strength = sorted((pair.record.inliers, pair.record.index) for pair in saved)
+    weakest = {index for _, index in by_strength[:MAX_DRAWN_PAIRS]}
     assert {index for index in range(count) if points_of(journal, index)} == weakest
     assert {record.units[0].matches for record in journal.records().values()} == {30}
     journal.save([(outcome(count, seed=1), False)])
     assert points_of(journal, count) == 30, "what a later job builds on is kept"
-    journal.close()
 
 
-def test_a_job_is_saved_whole_or_not_at_all(tmp_path: Path) -> None:
-    journal = Journal(tmp_path, OURS)
+def test_a_job_is_saved_whole_or_not_at_all(journal: Journal) -> None:
     broken = Outcome(PairRecord(8, object(), ""))  # type: ignore[arg-type]
     with pytest.raises(AttributeError):
         journal.save([(outcome(3), False), (broken, False)])
@@ -92,7 +95,6 @@ def test_a_job_is_saved_whole_or_not_at_all(tmp_path: Path) -> None:
     with pytest.raises(sqlite3.IntegrityError, match="no room"):
         journal.save([(outcome(5), False)])
     assert list(journal.records()) == [3], "what was written before is taken back"
-    journal.close()
 
 
 def test_a_journal_of_another_run_is_refused_and_says_what_differs(tmp_path: Path) -> None:
@@ -103,12 +105,10 @@ def test_a_journal_of_another_run_is_refused_and_says_what_differs(tmp_path: Pat
 
 
 def test_fresh_forgets_what_was_there(tmp_path: Path) -> None:
-    journal = Journal(tmp_path, OURS)
-    journal.save([(outcome(), False)])
-    journal.close()
-    journal = Journal(tmp_path, {**OURS, "recipe": {}}, fresh=True)
-    assert journal.records() == {}
-    journal.close()
+    with Journal(tmp_path, OURS) as journal:
+        journal.save([(outcome(), False)])
+    with Journal(tmp_path, {**OURS, "recipe": {}}, fresh=True) as journal:
+        assert journal.records() == {}
 
 
 def test_it_is_known_of_how_many_results_a_scene_was_made(tmp_path: Path) -> None:
@@ -119,8 +119,7 @@ def test_it_is_known_of_how_many_results_a_scene_was_made(tmp_path: Path) -> Non
         assert journal.records()[3].source == "scene"
 
 
-def test_what_a_full_disk_refuses_is_known_and_written_when_there_is_room(tmp_path: Path) -> None:
-    journal = Journal(tmp_path, OURS)
+def test_what_a_full_disk_refuses_is_known_and_written_when_there_is_room(journal: Journal) -> None:
     journal._db.execute("PRAGMA max_page_count = 12")
     index = 0
     with pytest.raises(sqlite3.OperationalError, match="full"):
@@ -132,13 +131,11 @@ def test_what_a_full_disk_refuses_is_known_and_written_when_there_is_room(tmp_pa
     journal.save([(outcome(999), False)])
     assert set(journal.records()) == {*range(index + 1), 999}
     assert points_of(journal, index) == 30
-    journal.close()
 
 
 def damaged_journal(directory: Path, damage: str) -> Path:
     """A journal of two pairs and a scene, after a statement that no run makes."""
-    pairs = [Pair(str(number), "batch", "a.png", "b.png") for number in range(8)]
-    journal = Journal(directory, OURS, pairs=pairs)
+    journal = Journal(directory, OURS, pairs=PAIRS)
     journal.note("start", 0.0, "")
     journal.save([(outcome(3, seed=1), False), (outcome(7, seed=2), False)])
     camera = CameraRecord("a", 0, (0.0, 0.0, 1.0), (0.0, 0.0, 1.0), (0.0, 1.0, 0.0), 500.0, Size(640, 480), 9)
@@ -209,9 +206,8 @@ def test_damage_anywhere_is_told_as_such(tmp_path: Path, damage: str) -> None:
 
 def test_pairs_that_the_test_set_has_not_are_damage(tmp_path: Path) -> None:
     damaged_journal(tmp_path, pairs_with("0", "1000"))
-    pairs = [Pair(str(number), "batch", "a.png", "b.png") for number in range(8)]
     with Journal(tmp_path, OURS) as journal, pytest.raises(UserError, match="damaged"):
-        journal.forget_changed(pairs)
+        journal.forget_changed(PAIRS)
 
 
 def test_bytes_damaged_at_random_never_end_in_a_traceback(tmp_path: Path) -> None:
@@ -234,7 +230,7 @@ def test_bytes_damaged_at_random_never_end_in_a_traceback(tmp_path: Path) -> Non
 
 
 def test_a_file_in_the_place_of_the_lock_is_named(tmp_path: Path) -> None:
-    (tmp_path / "journal.lock").write_bytes(b"this is no database" * 100)
+    (tmp_path / "journal.lock").write_bytes(b"not a database" * 100)
     with pytest.raises(UserError, match=r"journal\.lock is damaged .*remove it"):
         Journal(tmp_path, OURS)
 
@@ -253,7 +249,7 @@ def test_a_refused_journal_holds_no_lock_and_no_file(tmp_path: Path) -> None:
     kept = []
     for belongs_to, damage in (({**OURS, "recipe": {}}, False), (OURS, True)):
         if damage:
-            (tmp_path / "journal.sqlite").write_bytes(b"this is no database" * 100)
+            (tmp_path / "journal.sqlite").write_bytes(b"not a database" * 100)
         with pytest.raises(UserError) as caught:
             Journal(tmp_path, belongs_to)
         kept.append(caught)  # as a notebook keeps the last traceback
@@ -262,17 +258,15 @@ def test_a_refused_journal_holds_no_lock_and_no_file(tmp_path: Path) -> None:
     Journal(tmp_path, OURS, fresh=True).close()
 
 
-def test_text_that_is_not_utf8_is_kept_in_letters(tmp_path: Path) -> None:
-    with Journal(tmp_path, OURS) as journal:
-        record = PairRecord.untouched(3, os.fsdecode(b"\xff: no such file"))
-        journal.save([(Outcome(record), False)])
-        journal.note("fault", 0.0, os.fsdecode(b"\xff"))
-        assert journal.records()[3].failure == "\\udcff: no such file"
+def test_text_that_is_not_utf8_is_kept_in_letters(journal: Journal) -> None:
+    record = PairRecord.untouched(3, os.fsdecode(b"\xff: no such file"))
+    journal.save([(Outcome(record), False)])
+    journal.note("fault", 0.0, os.fsdecode(b"\xff"))
+    assert journal.records()[3].failure == "\\udcff: no such file"
 
 
 def test_pairs_that_no_row_names_take_no_place_among_those_that_are_drawn(tmp_path: Path) -> None:
     asked = [Pair(f"one;{index}", "one", "a.png", "b.png") for index in range(2)]
-    journal = Journal(tmp_path, OURS, pairs=asked)
-    journal.save([(outcome(index, seed=index), True) for index in reversed(range(MAX_DRAWN_PAIRS + 2))])
-    assert [index for index in range(MAX_DRAWN_PAIRS + 2) if points_of(journal, index)] == [0, 1]
-    journal.close()
+    with Journal(tmp_path, OURS, pairs=asked) as journal:
+        journal.save([(outcome(index, seed=index), True) for index in reversed(range(MAX_DRAWN_PAIRS + 2))])
+        assert [index for index in range(MAX_DRAWN_PAIRS + 2) if points_of(journal, index)] == [0, 1]

@@ -9,26 +9,29 @@ import time
 from contextlib import suppress
 from dataclasses import replace
 from itertools import cycle
-from multiprocessing import resource_tracker, util
-from pathlib import Path
+from math import inf
 from typing import Any, ClassVar
 
 import pytest
-from faulty import WatchedWorker, patient
+from faulty import on_fork
 from rectified import run
+from simulator import VirtualClock
 from synthetic import RECIPE, SyntheticMatcher, synthetic_pairs
 
 from mkpc_kaggle.data.competition import Pair
+from mkpc_kaggle.engine import places, session
+from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.engine import Ending, RunReport
+from mkpc_kaggle.engine.places import LocalSite
+from mkpc_kaggle.engine.process import ProcessWorker
 from mkpc_kaggle.engine.records import GIVEN_UP
 from mkpc_kaggle.geometry.robust import RobustConfig
 
 BATCHES = WORKERS = 3  # in a run so many scene workers and so many matching workers are disturbed
-
 QUICK = replace(RECIPE, magsac=RobustConfig(max_iterations=1000, permutations=1))
 
 
-class DoomedWorker(WatchedWorker):
+class DoomedWorker(ProcessWorker):
     """Gets a signal when its process has computed for so long: the machine's other load does not move that moment.
 
     The moments are drawn from the ``lives``, in seconds, of the workers of an undisturbed run. What comes after a
@@ -39,7 +42,7 @@ class DoomedWorker(WatchedWorker):
     signals: ClassVar = cycle([signal.SIGKILL, signal.SIGSTOP])
     lives: ClassVar[dict[str, float]] = {}
     spared: ClassVar[set[str]] = set()
-    sent: ClassVar[list[tuple[str, signal.Signals, float]]] = []
+    sent: ClassVar[list[tuple[str, signal.Signals]]] = []
     known: ClassVar[dict[str, "DoomedWorker"]] = {}
 
     def __init__(self, name: str, *arguments: Any) -> None:
@@ -47,7 +50,27 @@ class DoomedWorker(WatchedWorker):
         self.known[self.name] = self
         self.place, self.kind = name, name.split(maxsplit=1)[0]
         self.signal: signal.Signals | None = None
+        self.is_busy = False  # from its start to its answer, and from a job to its answer
         self.clock = 0
+
+    def start(self) -> None:
+        self.is_busy = True
+        super().start()
+
+    def submit(self, job: Any, seconds: float) -> None:
+        self.is_busy = True
+        super().submit(job, seconds)
+
+    def answer(self) -> Any:
+        answer = super().answer()
+        self.is_busy = self.is_busy and answer is None
+        return answer
+
+    def kill(self) -> None:
+        self.is_busy = False
+        with suppress(OSError):
+            self.computed = time.clock_gettime(self.clock)
+        super().kill()
 
     def on_fork(self, pid: int) -> None:
         self.clock = (~pid << 3) | 2  # of the processor time of another process, as clock_getcpuclockid has it
@@ -55,47 +78,43 @@ class DoomedWorker(WatchedWorker):
             self.spared.remove(self.place)
         elif self.kind in self.lives:
             moment = self.rng.uniform(0.0, self.lives[self.kind])
-            number = next(self.signals)
-            threading.Thread(target=self._disturb, args=(os.pidfd_open(pid), number, moment), daemon=True).start()
+            threading.Thread(target=self._disturb, args=(os.pidfd_open(pid), moment), daemon=True).start()
 
-    def is_stuck(self) -> bool:
-        return self.signal is signal.SIGSTOP
-
-    def kill(self) -> None:
-        with suppress(OSError):
-            self.computed = time.clock_gettime(self.clock)
-        super().kill()
-
-    def _disturb(self, process: int, number: signal.Signals, moment: float) -> None:
+    def _disturb(self, process: int, moment: float) -> None:
+        number = next(self.signals)
         with suppress(OSError):  # it has ended before
             while time.clock_gettime(self.clock) < moment:
                 time.sleep(0.001)
             self.spared.add(self.place)
             signal.pidfd_send_signal(process, number)
             self.signal = number
-            self.sent.append((self.kind, number, moment))
+            self.sent.append((self.kind, number))
         os.close(process)
 
 
+class PatientSite(LocalSite):
+    """Its clock stands still, until nothing else can happen since all that are at work are stopped.
+
+    So no time limit of a worker is over early on a busy machine, and none is waited for.
+    """
+
+    def wait(self, until: float) -> None:
+        super().wait(inf)
+        busy = [worker for worker in DoomedWorker.known.values() if worker.is_busy]
+        if busy and until < inf and all(worker.signal is signal.SIGSTOP for worker in busy):
+            self._clock.now = until
+
+
 @pytest.fixture
-def forks(monkeypatch: pytest.MonkeyPatch) -> None:
+def forks(monkeypatch) -> None:
     """Tell workers of their processes as soon as these are forked."""
     for name, empty in {"lives": {}, "spared": set(), "sent": [], "known": {}}.items():
         monkeypatch.setattr(DoomedWorker, name, empty)
-    resource_tracker.ensure_running()  # a process, too
-    spawn = util.spawnv_passfds
 
-    def spawned(*arguments: Any) -> int:
-        pid: int = spawn(*arguments)
+    def tell_worker(pid: int) -> None:
         DoomedWorker.known[threading.current_thread().name].on_fork(pid)
-        return pid
 
-    monkeypatch.setattr(util, "spawnv_passfds", spawned)
-
-
-def scene_batches(directory: Path) -> list[Pair]:
-    batches = [(name, synthetic_pairs(directory / name)) for name in map(str, range(BATCHES))]
-    return [replace(pair, id=f"{name};{pair.id}", group=name) for name, pairs in batches for pair in pairs]
+    on_fork(monkeypatch, tell_worker)
 
 
 def matrices(report: RunReport, batches: set[str], pairs: list[Pair]) -> list[bytes]:
@@ -109,10 +128,14 @@ def matrices(report: RunReport, batches: set[str], pairs: list[Pair]) -> list[by
 
 @pytest.mark.parametrize("moments", [6, pytest.param(40, marks=[pytest.mark.slow, pytest.mark.timeout(1200)])])
 def test_a_run_whose_workers_are_killed_and_stopped_at_random_moments_ends_as_the_undisturbed_one(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, forks: None, moments: int
-) -> None:
-    pairs = scene_batches(tmp_path / "images")
-    budget = patient(monkeypatch, DoomedWorker)
+    tmp_path, monkeypatch, forks, moments
+):
+    names = map(str, range(BATCHES))
+    pairs = [pair for name in names for pair in synthetic_pairs(tmp_path / "images" / name, batch=name)]
+    budget = Budget(0.0, inf, VirtualClock())
+    monkeypatch.setattr(places, "ProcessWorker", DoomedWorker)
+    monkeypatch.setattr(places, "RESTART_PAUSE_S", 0.0)
+    monkeypatch.setattr(session, "LocalSite", PatientSite)
 
     def run_whole(name: str) -> RunReport:
         report = run(pairs, QUICK, SyntheticMatcher(), tmp_path / name, budget=budget, workers=WORKERS)
@@ -138,6 +161,6 @@ def test_a_run_whose_workers_are_killed_and_stopped_at_random_moments_ends_as_th
         intact = {pair.group for pair in pairs} - given_up
         assert matrices(report, intact, pairs) == matrices(undisturbed, intact, pairs), report.faults
         compared += len(intact)
-    assert {number for _, number, _ in DoomedWorker.sent} == {signal.SIGKILL, signal.SIGSTOP}
-    assert {kind for kind, _, _ in DoomedWorker.sent} == {"mkpc", "scene"}
+    assert {number for _, number in DoomedWorker.sent} == {signal.SIGKILL, signal.SIGSTOP}
+    assert {kind for kind, _ in DoomedWorker.sent} == {"mkpc", "scene"}
     assert compared > 0

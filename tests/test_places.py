@@ -4,30 +4,52 @@ from types import SimpleNamespace
 
 import pytest
 
-from mkpc_kaggle.engine.jobs import Cause, Failure, Loaded
+from mkpc_kaggle.engine.jobs import Cause, Failure, Loaded, MatchJob, MatchResult, Phase
 from mkpc_kaggle.engine.places import Place
 
-LOST, DONE = Failure(Cause.DIED), "an answer"
+LOST, DONE = Failure(Cause.DIED), MatchResult(())
+
+
+def job(*, is_retry=False):
+    return MatchJob(Phase.DEEPEN, (0,), (), (), 1.0, 1.0, is_retry)
+
+
+def place_of(waiting):
+    """A place whose workers give these answers."""
+    worker = SimpleNamespace(
+        start=lambda: None, submit=lambda *_: None, kill=lambda: None, answer=lambda: waiting.pop(0)
+    )
+    return Place("cpu", lambda: worker)
 
 
 @pytest.mark.parametrize(
-    ("answers", "is_closed"),
+    ("answers", "is_retry", "is_closed"),
     [
-        ([LOST] * 2, False),
-        ([LOST] * 3, True),
-        ([LOST, LOST, DONE, LOST, LOST], False),
-        ([DONE] + [LOST] * 3, True),
+        ([LOST] * 2, False, False),
+        ([LOST] * 3, False, True),
+        ([LOST, LOST, DONE, LOST, LOST], False, False),
+        ([DONE] + [LOST] * 3, False, True),
+        ([LOST] * 3, True, False),  # it is the job that other workers were lost at
     ],
 )
-def test_three_workers_lost_in_a_row_with_no_answer_between_close_a_place(answers, is_closed):
+def test_three_workers_lost_in_a_row_with_no_answer_between_close_a_place(answers, is_retry, is_closed):
     waiting = []
-    worker = SimpleNamespace(start=lambda: None, kill=lambda: None, answer=lambda: waiting.pop(0))
-    place = Place("cpu", lambda: worker)
+    place = place_of(waiting)
     for answer in answers:
         if place.worker is None:
             place.start(0.0)
             waiting.append(Loaded())
             place.poll(0.0)
         waiting.append(answer)
+        place.submit(job(is_retry=is_retry), 1.0, 1.0, now=0.0)
         place.poll(0.0)
     assert bool(place.closed) == is_closed
+
+
+def test_an_answer_that_is_there_counts_though_its_time_is_over():
+    place = place_of([Loaded(), DONE])
+    place.start(0.0)
+    place.poll(0.0)
+    place.submit(job(), 1.0, 10.0, now=0.0)
+    assert place.poll(now=99.0) is DONE
+    assert place.worker is not None, "it is not killed"

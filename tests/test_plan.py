@@ -1,6 +1,7 @@
 """The plan's decisions, and the engine on a virtual clock."""
 
 import math
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from statistics import median
@@ -50,7 +51,7 @@ def jobs_of(
     *,
     cautious: bool = True,
 ) -> Iterator[MatchJob]:
-    """All jobs of one place, each of which comes back, or is lost, before the next is planned."""
+    """All jobs of a place, each of which comes back, or is lost, before the next is planned."""
     now, failure = 0.0, None
     while (job := plan.next(now, "here", cautious=cautious and failure is not None)) is not None:
         yield job
@@ -72,7 +73,7 @@ def explained(plan: Plan, text: str) -> bool:
     return any(text in explanation.text for explanation in plan.explanations)
 
 
-def test_the_phases_follow_each_other_and_every_pair_has_every_unit() -> None:
+def test_the_phases_follow_each_other_and_every_pair_has_every_unit():
     plan = plan_of(extra=3, connecting=2)
     phases = [job.phase for job in jobs_of(plan)]
     assert phases == sorted(phases, key=list(Phase).index)
@@ -81,7 +82,7 @@ def test_the_phases_follow_each_other_and_every_pair_has_every_unit() -> None:
     assert [len(record.units) for record in plan.records[40:]] == [1, 1, 1]
 
 
-def test_no_pair_is_in_two_jobs_at_a_time() -> None:
+def test_no_pair_is_in_two_jobs_at_a_time():
     plan = plan_of(9)
     jobs = []
     while (job := plan.next(0.0)) is not None:
@@ -98,9 +99,7 @@ def test_no_pair_is_in_two_jobs_at_a_time() -> None:
         (True, [8, 1, 1, 1], [(THIRD,), (THIRD,), (SECOND,)]),
     ],
 )
-def test_a_lost_job_is_tried_by_fewer_pairs_then_by_units_and_given_up_for_its_pair(
-    cautious: bool, pairs: list[int], units: list[tuple[Unit, ...]]
-) -> None:
+def test_a_lost_job_is_tried_by_fewer_pairs_then_by_units_and_given_up_for_its_pair(cautious, pairs, units):
     plan = plan_of(9)
     seen = []
 
@@ -123,7 +122,7 @@ def test_a_lost_job_is_tried_by_fewer_pairs_then_by_units_and_given_up_for_its_p
     assert plan.is_complete
 
 
-def test_a_unit_that_never_ran_is_given_up_on_all_pairs_after_some() -> None:
+def test_a_unit_that_never_ran_is_given_up_on_all_pairs_after_some():
     plan, lost = plan_of(200), []
 
     def fails(job: MatchJob) -> Failure | None:
@@ -139,70 +138,73 @@ def test_a_unit_that_never_ran_is_given_up_on_all_pairs_after_some() -> None:
     assert explained(plan, f"{SECOND.name} is given up on all pairs: it never ran")
 
 
-def test_a_lost_job_is_tried_again_in_another_place_where_there_is_one() -> None:
+def test_a_lost_job_is_tried_again_in_another_place_where_there_is_one():
     plan = learnt(plan_of(1), SWEEP)
     plan.workers = 2
     job = plan.next(0.0, "first")
-    assert job is not None
     plan.on_failure(job, DIED, "first", 1.0)
     assert plan.next(1.0, "first") is None
     again = plan.next(1.0, "second")
-    assert again is not None
     assert again.indices == job.indices
 
 
-def test_a_place_that_lost_a_worker_tries_one_pair_and_one_unit_that_was_not_lost() -> None:
+def test_a_place_that_lost_a_worker_tries_one_pair_and_one_unit_that_was_not_lost():
     plan = plan_of(40)
     deepening = next(job for job in jobs_of(plan) if job.phase is Phase.DEEPEN and len(job.indices) == 8)
     plan.on_failure(deepening, DIED, "here", 0.0)
     careful = plan.next(0.0, "here", cautious=True)
-    assert careful is not None
     assert (len(careful.indices), len(careful.units)) == (1, 1)
     assert not set(careful.indices) & set(deepening.indices)
 
 
-def test_what_a_jobs_own_deadline_cut_off_is_planned_again() -> None:
+def test_what_a_jobs_own_deadline_cut_off_is_planned_again():
     plan = learnt(plan_of(17, limit=1000.0), SWEEP)
-    first = plan.next(0.0)
+    plan.next(0.0)  # the first pair, alone
     job = plan.next(0.0)
-    assert first is not None
-    assert job is not None
     whole = finished(job, plan)
     nothing = Outcome(PairRecord.untouched(job.indices[-1]))
     plan.on_result(job, MatchResult((*whole.outcomes[:-1], nothing)), 7.0, 7.0)
     again = plan.next(7.0)
-    assert again is not None
     assert (again.phase, again.indices) == (job.phase, job.indices[-1:])
 
 
-def test_a_pair_whose_earlier_results_cannot_be_read_is_left_as_it_is() -> None:
+THIRD_ALONE = UnitRecord(THIRD.name, THIRD.stage, 9, 9, 0.0, 1.0, "")
+
+
+@pytest.mark.parametrize(
+    ("record", "results"),
+    [
+        (PairRecord.untouched(0, "the file is empty"), ()),
+        (PairRecord(0, FALLBACK_FUNDAMENTAL, "", (THIRD_ALONE,)), (UnitResult(THIRD, Matches.empty(), 0.0, 1.0),)),
+    ],
+)
+def test_a_pair_whose_image_or_earlier_results_cannot_be_read_any_more_keeps_the_f_that_it_has(record, results):
     plan = plan_of(1)
     deepening = next(job for job in jobs_of(plan) if job.phase is Phase.DEEPEN)
     former = plan.records[0]
-    again = UnitRecord(THIRD.name, THIRD.stage, 9, 9, 0.0, 1.0, "")
-    alone = Outcome(
-        PairRecord(0, FALLBACK_FUNDAMENTAL, "", (again,)), (UnitResult(THIRD, Matches.empty(), 0.0, 1.0),)
-    )
-    assert plan.on_result(deepening, MatchResult((alone,)), 1.0, 1.0) == []
+    assert plan.on_result(deepening, MatchResult((Outcome(record, results),)), 1.0, 1.0) == []
+    assert explained(plan, "pair 0 keeps the F it has: the file is empty") is not bool(results)
     assert plan.records[0] is former
     assert plan.next(1.0) is None
 
 
-def test_a_worker_hangs_after_many_times_what_its_units_take() -> None:
-    job = learnt(plan_of(limit=32400.0), SWEEP).next(0.0)
-    assert job is not None
-    assert job.seconds > 1.0
-    assert job.time_limit == job.seconds + HANG_FACTOR
+def test_progress_counts_the_pairs_that_have_an_f():
+    plan = plan_of(12)
+    job = plan.next(0.0)
+    not_begun = MatchResult(tuple(Outcome(PairRecord.untouched(index)) for index in job.indices))
+    plan.on_result(job, not_begun, 1.0, 0.0)
+    assert plan.progress == (Phase.SWEEP, 0, 12)
 
 
 @pytest.mark.parametrize("limit", [20.0, 600.0, 32400.0])
-def test_a_short_run_waits_less_for_a_silent_worker(limit: float) -> None:
+def test_a_worker_hangs_after_many_times_what_its_units_take_and_sooner_in_a_short_run(limit):
     job = learnt(plan_of(limit=limit), SWEEP).next(0.0)
-    assert job is not None
+    assert job.seconds > 1.0
     assert job.time_limit < max(0.05 * limit + 20, 20)
+    assert limit < 32400.0 or job.time_limit == job.seconds + HANG_FACTOR
 
 
-def test_where_no_unit_ends_in_time_there_is_no_job_until_scenes_need_less() -> None:
+def test_where_no_unit_ends_in_time_there_is_no_job_until_scenes_need_less():
     plan = learnt(plan_of(3, limit=100.0), SWEEP)
     plan.reserve = 10.0
     now = plan.stop - 0.5
@@ -212,7 +214,7 @@ def test_where_no_unit_ends_in_time_there_is_no_job_until_scenes_need_less() -> 
     assert plan.next(now) is not None
 
 
-def test_units_that_do_not_fit_for_all_go_to_the_weakest_pairs_in_the_time_left() -> None:
+def test_units_that_do_not_fit_for_all_go_to_the_weakest_pairs_in_the_time_left():
     plan = plan_of(60, limit=100.0)
     jobs = list(jobs_of(plan, inliers=lambda index: index))
     filled = [index for job in jobs if job.phase is Phase.FILL for index in job.indices]
@@ -224,7 +226,7 @@ def test_units_that_do_not_fit_for_all_go_to_the_weakest_pairs_in_the_time_left(
     assert not plan.is_complete
 
 
-def test_further_pairs_of_scenes_are_matched_when_all_units_have_run() -> None:
+def test_further_pairs_of_scenes_are_matched_when_all_units_have_run():
     plan = plan_of(6, limit=100.0, extra=80)
     jobs = list(jobs_of(plan))
     assert all(not record.lacking(THREE_UNITS.units) for record in plan.records[:6])
@@ -236,7 +238,7 @@ def test_further_pairs_of_scenes_are_matched_when_all_units_have_run() -> None:
     assert plan.is_complete
 
 
-def test_other_devices_try_what_was_given_up_and_pairs_keep_what_they_have() -> None:
+def test_other_devices_try_what_was_given_up_and_pairs_keep_what_they_have():
     plan = plan_of(4)
     list(jobs_of(plan, lambda job: DIED if SECOND in job.units else None))
     given_up = [record.index for record in plan.records if record.has(SECOND)]
@@ -247,7 +249,7 @@ def test_other_devices_try_what_was_given_up_and_pairs_keep_what_they_have() -> 
     assert not any(unit.failure for record in plan.records for unit in record.units)
 
 
-def test_a_pairs_seconds_are_those_of_all_its_jobs() -> None:
+def test_a_pairs_seconds_are_those_of_all_its_jobs():
     plan, jobs = plan_of(1), 0
     while (job := plan.next(0.0)) is not None:
         (outcome,) = finished(job, plan).outcomes
@@ -261,14 +263,7 @@ def test_a_pairs_seconds_are_those_of_all_its_jobs() -> None:
 # The engine on a virtual clock
 
 
-def test_costs_that_change_are_planned_for_and_explained() -> None:
-    ran = simulate(Scenario(400, (0.5, 1.0, 1.0), 1, 1100.0, warm_up=1, misses=0, drift=10, turn=0.5))
-    assert ran.late == ran.lost == 0
-    assert ran.report.ending is Ending.TIME_IS_UP
-    assert any("of 3 units fit" in explanation.text for explanation in ran.report.explanations)
-
-
-def test_more_time_never_means_fewer_units() -> None:
+def test_more_time_never_means_fewer_units():
     runs = [simulate(Scenario(40, (1.0, 1.0, 1.0), 1, limit, misses=0)) for limit in (40.0, 80.0, 120.0, 999.0)]
     units = [sum(len(record.units) for record in ran.report.records) for ran in runs]
     assert units == sorted(units)
@@ -276,27 +271,18 @@ def test_more_time_never_means_fewer_units() -> None:
     assert all(ran.late == ran.lost == 0 for ran in runs)
 
 
-@pytest.mark.parametrize(
-    ("scenarios", "pairs", "middle", "low"),
-    [
-        (150, 300, 0.98, 0.8),
-        pytest.param(1000, 10_000, 0.99, 0.95, marks=[pytest.mark.slow, pytest.mark.timeout(3 * 3600)]),
-    ],
-)
-def test_random_runs_are_never_late_never_lose_a_row_and_use_their_time(
-    scenarios: int, pairs: int, middle: float, low: float
-) -> None:
-    runs = [without_records(simulate(random_scenario(seed, pairs))) for seed in range(scenarios)]
+def test_random_runs_are_never_late_never_lose_a_row_and_use_their_time():
+    runs = [without_records(simulate(random_scenario(seed, pairs=300))) for seed in range(60)]
     assert max(run.late for run in runs) == 0
     assert sum(run.lost for run in runs) == 0
     assert sum(run.missed for run in runs if run.scenes_fit) == 0
     used = [run.utilisation for run in runs if run.work_left]
-    assert median(used) > middle
-    assert np.percentile(used, 5) > low
+    assert median(used) > 0.98
+    assert np.percentile(used, 5) > 0.8
 
 
-def test_undisturbed_runs_use_all_their_time() -> None:
-    for seed in range(10):
+def test_undisturbed_runs_use_all_their_time():
+    for seed in range(5):
         rng = np.random.default_rng(seed)
         workers = int(rng.integers(1, 5))
         scenario = Scenario(600 * workers, tuple(rng.uniform(0.2, 2, 5).tolist()), workers, 2400.0, seed=seed)
@@ -305,30 +291,33 @@ def test_undisturbed_runs_use_all_their_time() -> None:
         assert ran.utilisation > 0.97, scenario
 
 
-def test_planning_a_job_does_not_take_longer_for_many_pairs() -> None:
-    few, many = (simulate(Scenario(count, (0.1, 0.5, 0.5), 2, count)) for count in (1000, 20_000))
-    assert many.jobs > 2500
-    assert many.planning < 5 * few.planning
+def test_planning_a_job_does_not_take_longer_for_many_pairs():
+    seconds_per_pair = []
+    for count in (500, 10_000):
+        start = time.thread_time()  # whatever else the machine does
+        simulate(Scenario(count, (0.1, 0.5, 0.5), 2, count))
+        seconds_per_pair.append((time.thread_time() - start) / count)
+    few, many = seconds_per_pair
+    assert many < 5 * few
 
 
-def test_scenes_are_done_beside_matching_and_the_last_in_the_time_kept_for_it() -> None:
+def test_scenes_are_done_beside_matching_and_the_last_in_the_time_kept_for_it():
     ran = simulate(Scenario(600, (0.5, 1.0, 1.0), 1, 1200.0, warm_up=1, batches=6, scene_seconds=0.3))
     assert ran.late == ran.lost == ran.missed == 0
     assert ran.work_left
     assert len({scene.batch for scene in ran.scenes}) == 6
     assert sum(scene.begun + scene.seconds < ran.last_job for scene in ran.scenes) >= 5
-    assert max(scene.seen for scene in ran.scenes) < 1200.0
     assert ran.utilisation > 0.95
 
 
-def test_a_scene_that_hangs_is_ended_and_the_others_have_their_turn() -> None:
+def test_a_scene_that_hangs_is_ended_and_the_others_have_their_turn():
     ran = simulate(Scenario(900, (0.5, 1.0), 1, 3600.0, batches=9, scene_faults=0.4, seed=3))
     assert any(scene.seconds == math.inf for scene in ran.scenes)
     assert ran.late == ran.lost == ran.missed == 0
     assert any("the worker hung" in fault for fault in ran.report.faults)
 
 
-def test_scenes_are_made_anew_of_the_further_pairs_that_the_time_left_allows() -> None:
+def test_scenes_are_made_anew_of_the_further_pairs_that_the_time_left_allows():
     ran = simulate(Scenario(300, (0.5, 1.0), 1, 3600.0, batches=3, pairs_per_image=1.0, misses=0))
     assert ran.late == ran.lost == ran.missed == 0
     assert any("pairs for the scenes alone" in explanation.text for explanation in ran.report.explanations)
@@ -337,7 +326,7 @@ def test_scenes_are_made_anew_of_the_further_pairs_that_the_time_left_allows() -
 
 
 @pytest.mark.parametrize("moment", range(50, 1050, 100))
-def test_a_run_killed_at_any_moment_leaves_no_scene_out_of_date_when_it_goes_on(moment: float) -> None:
+def test_a_run_killed_at_any_moment_leaves_no_scene_out_of_date_when_it_goes_on(moment):
     scenario = Scenario(300, (0.5, 1.0), 1, 3600.0, batches=3, pairs_per_image=1.0, misses=0)
     journal = MemoryJournal()
     simulate(scenario, journal, until=moment)

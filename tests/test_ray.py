@@ -12,13 +12,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from faulty import FaultyMatcher, die
+from processes import started_with
 from rectified import THREE_UNITS, RectifiedMatcher, Seen, matrices, run
 from synthetic import RECIPE as SYNTHETIC
 from synthetic import SyntheticMatcher, synthetic_pairs
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.cluster import RayCluster
-from mkpc_kaggle.engine.engine import Ending, RunReport
+from mkpc_kaggle.engine.engine import Ending
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.pipeline.assembly import Assembly
@@ -28,22 +30,6 @@ ray = pytest.importorskip("ray", reason="Ray is not installed: pip install 'mkpc
 TESTS = Path(__file__).parent
 IMPORTED = [str(TESTS.parent), str(TESTS), str(TESTS / "support")]  # what machines can import
 STORE_BYTES = 80 << 20
-
-
-@dataclass
-class MarkingMatcher(RectifiedMatcher):
-    """Marks with a file that it has come to the pair of brightness ``at``; the first time its process may die."""
-
-    at: int = 13
-    mark: Path = Path()
-    dies: bool = False
-
-    def _match(self, seen0: Seen, seen1: Seen) -> Matches:
-        if seen0.brightness == self.at and not self.mark.exists():
-            self.mark.touch()
-            if self.dies:
-                os.kill(os.getpid(), signal.SIGKILL)
-        return super()._match(seen0, seen1)
 
 
 @dataclass
@@ -77,29 +63,16 @@ def cluster() -> Iterator[Any]:
     patch.undo()
 
 
-def test_actors_give_the_bytes_of_a_run_in_one_process(
-    cluster: Any, pairs: list[Pair], undisturbed: RunReport, tmp_path: Path
-) -> None:
-    report = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "w", workers=RayCluster(cluster.address))
-    assert report.faults == ()
-    assert report.ending is Ending.COMPLETE
-    assert matrices(report) == matrices(undisturbed)
-    assert not ray.is_initialized(), "the run lets go of the cluster"
-
-
-def test_an_actor_that_dies_is_replaced(
-    cluster: Any, pairs: list[Pair], undisturbed: RunReport, tmp_path: Path
-) -> None:
-    matcher = MarkingMatcher(mark=tmp_path / "died", dies=True)
+def test_actors_give_the_bytes_of_a_run_in_one_process_though_an_actor_dies(cluster, pairs, undisturbed, tmp_path):
+    matcher = FaultyMatcher(fault=die, once=tmp_path / "died")
     report = run(pairs, THREE_UNITS, matcher, tmp_path / "w", workers=RayCluster(cluster.address))
     assert report.ending is Ending.COMPLETE
     assert ["the worker died" in fault for fault in report.faults] == [True], report.faults
     assert matrices(report) == matrices(undisturbed)
+    assert not ray.is_initialized(), "the run lets go of the cluster"
 
 
-def test_a_machine_lost_during_the_run_costs_its_job_alone(
-    cluster: Any, pairs: list[Pair], undisturbed: RunReport, tmp_path: Path
-) -> None:
+def test_a_machine_lost_during_the_run_costs_its_job_alone(cluster, pairs, undisturbed, tmp_path):
     lost = cluster.add_node(num_cpus=1, object_store_memory=STORE_BYTES)
     matcher = DoomedMatcher(node=lost.node_id, mark=tmp_path / "begun")
 
@@ -115,29 +88,21 @@ def test_a_machine_lost_during_the_run_costs_its_job_alone(
     assert matrices(report) == matrices(undisturbed)
 
 
-def test_a_machine_that_lacks_the_weights_is_named_when_the_run_starts(
-    cluster: Any, pairs: list[Pair], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    missing = tmp_path / "weights.safetensors"
-    monkeypatch.setattr(Assembly, "weight_paths", (missing,))
-    with pytest.raises(UserError, match=rf"lacks {missing}: test set and weights must have the same paths"):
-        run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "w", workers=RayCluster(cluster.address))
+def test_a_machine_that_lacks_the_weights_or_the_test_set_is_named_when_the_run_starts(
+    cluster, pairs, tmp_path, monkeypatch
+):
+    missing = tmp_path / "nowhere"
+    lacking = [Pair("a", "a", str(missing / "a.png"), str(missing / "b.png"))]
+    for asked, weights in ((lacking, ()), (pairs, (missing,))):
+        monkeypatch.setattr(Assembly, "weight_paths", weights)
+        with pytest.raises(UserError, match=rf"lacks {missing}: test set and weights must have the same paths"):
+            run(
+                asked, THREE_UNITS, RectifiedMatcher(), tmp_path / asked[0].id, workers=RayCluster(cluster.address)
+            )
 
 
-def test_a_machine_that_lacks_the_test_set_is_named_when_the_run_starts(cluster: Any, tmp_path: Path) -> None:
-    pairs = [Pair("a", "a", str(tmp_path / "nowhere" / "a.png"), str(tmp_path / "nowhere" / "b.png"))]
-    with pytest.raises(UserError, match=rf"lacks {tmp_path / 'nowhere'}: test set and weights"):
-        run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "w", workers=RayCluster(cluster.address))
-
-
-@pytest.fixture(scope="module")
-def batch(tmp_path_factory: pytest.TempPathFactory) -> list[Pair]:
-    return synthetic_pairs(tmp_path_factory.mktemp("batch"))
-
-
-def test_batches_are_reconstructed_on_the_cluster_to_the_same_bytes(
-    cluster: Any, batch: list[Pair], tmp_path: Path
-) -> None:
+def test_batches_are_reconstructed_on_the_cluster_to_the_same_bytes(cluster, tmp_path):
+    batch = synthetic_pairs(tmp_path / "images")
     here = run(batch, SYNTHETIC, SyntheticMatcher(), tmp_path / "here")
     report = run(batch, SYNTHETIC, SyntheticMatcher(), tmp_path / "w", workers=RayCluster(cluster.address))
     assert report.faults == ()
@@ -148,45 +113,26 @@ def test_batches_are_reconstructed_on_the_cluster_to_the_same_bytes(
 
 
 LOCAL = """
-import sys, time
+import sys
 sys.path[:0] = {path!r}
 from pathlib import Path
-from rectified import THREE_UNITS, write_pairs
-from test_ray import MarkingMatcher
-from mkpc_kaggle.pipeline.assembly import assemble
-from mkpc_kaggle.engine.budget import Budget
+from faulty import FaultyMatcher
+from rectified import THREE_UNITS, run, write_pairs
 from mkpc_kaggle.engine.cluster import RayCluster
-from mkpc_kaggle.engine.session import Session, interruptible, run_pairs
+from mkpc_kaggle.engine.session import interruptible
 
 if __name__ == "__main__":
     home = Path(sys.argv[1])
     pairs = write_pairs(home / "pairs", 200)
-    matcher = MarkingMatcher(seconds=0.1, mark=home / "begun")
-    assembly = assemble(THREE_UNITS, matchers={{"rectified": matcher}}, device="cpu")
+    matcher = FaultyMatcher(seconds=0.1, fault=lambda: None, once=home / "begun")
     with interruptible() as interrupt:
-        session = Session(home / "work", Budget(time.monotonic()), interrupt, progress=False, workers=RayCluster())
-        report = run_pairs(pairs, assembly, session)
+        report = run(pairs, THREE_UNITS, matcher, home / "work", interrupt=interrupt, workers=RayCluster())
     print(report.ending)
 """
 
 
-def at_work(mark: str) -> list[str]:
-    """Processes that were started with that in their environment.
-
-    Ray's agents, which take a minute or two to find that their node is gone, are left out.
-    """
-    found = []
-    for environment in Path("/proc").glob("[0-9]*/environ"):
-        try:
-            if mark.encode() in environment.read_bytes():
-                found.append((environment.parent / "cmdline").read_text().replace("\0", " ")[:80])
-        except OSError:
-            continue
-    return [line for line in found if "Agent" not in line]
-
-
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
-def test_a_cluster_of_its_own_ends_with_the_run(tmp_path: Path, number: signal.Signals) -> None:
+def test_a_cluster_of_its_own_ends_with_the_run(tmp_path, number):
     mark = f"MKPC_TEST={tmp_path}"
     environment = {**os.environ, "MKPC_TEST": str(tmp_path), "RAY_ADDRESS": "local"}
     environment["PYTHONPATH"] = os.pathsep.join([*IMPORTED, os.environ.get("PYTHONPATH", "")])
@@ -202,5 +148,6 @@ def test_a_cluster_of_its_own_ends_with_the_run(tmp_path: Path, number: signal.S
     running.send_signal(number)
     told, _ = running.communicate()
     assert told == ("interrupted\n" if number is signal.SIGTERM else "")
-    while at_work(mark):  # or the test's own limit
+    # Ray's agents take a minute or two to find that their node is gone.
+    while [command for command in started_with(mark).values() if "Agent" not in command]:
         time.sleep(0.2)

@@ -1,6 +1,7 @@
 """Scenes in whole runs: whose F a pair gets, and what a reconstruction that goes wrong costs."""
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -9,29 +10,23 @@ import numpy as np
 import pytest
 from faulty import (
     SCENE_F,
-    WatchedWorker,
+    befall,
     choose_scene_for_all_but_the_first,
-    die_as_scene,
+    die,
     die_within_pycolmap,
-    exhaust_memory_as_scene,
-    exhaust_memory_within_pycolmap,
-    hang_as_scene,
-    patient,
-    raise_as_scene,
+    exhaust_memory,
+    lack_an_image,
     scene_in_a_gigabyte,
-    scene_without_pycolmap,
     scenes_by,
 )
-from rectified import SWEEP, THREE_UNITS, RectifiedMatcher, matrices, run
+from rectified import THREE_UNITS, RectifiedMatcher, batch_pairs, matrices, run
 from synthetic import RECIPE as SYNTHETIC
 from synthetic import SyntheticMatcher, synthetic_pairs
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.engine import Ending
 from mkpc_kaggle.engine.jobs import SceneJob, SceneResult
-from mkpc_kaggle.engine.scenes import Scenes
-from mkpc_kaggle.engine.session import Interrupt
-from mkpc_kaggle.recipe import Recipe, SceneConfig
+from mkpc_kaggle.recipe import SceneConfig
 from mkpc_kaggle.reporting.report import report_page
 from mkpc_kaggle.reporting.run_log import read_log
 from mkpc_kaggle.reporting.summary import overview
@@ -41,28 +36,11 @@ from mkpc_kaggle.scene.view_graph import BatchPair
 RECIPE = replace(THREE_UNITS, scene=SceneConfig())
 
 
-def batch_pairs(directory: Path, images: int = 4, batch: str = "one") -> list[Pair]:
-    """All pairs of flat images, each with a brightness of its own: 10, 20, ..."""
-    directory.mkdir(parents=True, exist_ok=True)
-    paths = [directory / f"{number}.png" for number in range(images)]
-    for number, path in enumerate(paths):
-        cv2.imwrite(str(path), np.full((72, 80, 3), 10 + 10 * number, np.uint8))
-    chosen = [(i, j) for i in range(images) for j in range(i + 1, images)]
-    return [Pair(f"{batch};{i}-{j}", batch, str(paths[i]), str(paths[j])) for i, j in chosen]
-
-
-def two_batches(directory: Path) -> list[Pair]:
-    """Batch "one" of six pairs, and batch "two" of three."""
-    return batch_pairs(directory / "images") + batch_pairs(directory / "others", 3, "two")
-
-
 def own_matrices(pairs: list[Pair], directory: Path) -> list[bytes]:
     return matrices(run(pairs, THREE_UNITS, RectifiedMatcher(), directory))
 
 
-def test_pairs_get_the_f_of_their_scene_and_keep_their_own(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_pairs_get_the_f_of_their_scene_and_keep_their_own(tmp_path, monkeypatch):
     scenes_by(monkeypatch, choose_scene_for_all_but_the_first, process=True)
     pairs, published = batch_pairs(tmp_path / "images"), []
     report = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work", publish=lambda r: published.append(list(r)))
@@ -78,56 +56,17 @@ def test_pairs_get_the_f_of_their_scene_and_keep_their_own(
     assert all(len(weak.results[0].matches) for weak in log.weakest), "what is drawn keeps its points"
 
 
-def test_a_run_that_goes_on_does_not_reconstruct_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    scenes_by(monkeypatch, choose_scene_for_all_but_the_first)
-    pairs = batch_pairs(tmp_path / "images")
-    first = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
-    scenes_by(monkeypatch, raise_as_scene)
-    again = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
-    assert again.faults == ()
-    assert [record.chosen_fundamental.tobytes() for record in again.records] == [
-        record.chosen_fundamental.tobytes() for record in first.records
-    ]
-    assert again.scenes == first.scenes
-
-
-def test_a_run_cut_off_before_a_scene_is_made_anew_makes_it_when_it_goes_on(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    scenes_by(monkeypatch, choose_scene_for_all_but_the_first)
-    few = [pair for pair in batch_pairs(tmp_path / "images") if pair.id in ("one;0-1", "one;1-2", "one;2-3")]
-    asked = few + batch_pairs(tmp_path / "others", 6, "two")  # further pairs of batch one come after these
-    recipe = replace(RECIPE, scene=SceneConfig(pairs_per_image=1.0))
-    undisturbed = run(asked, recipe, RectifiedMatcher(), tmp_path / "undisturbed")
-    job, interrupt, begun = Scenes.job, Interrupt(), []
-
-    def cut_off(scenes: Scenes, batch: str, results_of: Any) -> SceneJob:
-        begun.append(batch)
-        if begun.count("one") == 2:
-            interrupt.set()
-        return job(scenes, batch, results_of)
-
-    monkeypatch.setattr(Scenes, "job", cut_off)
-    cut = run(asked, recipe, RectifiedMatcher(), tmp_path / "work", interrupt=interrupt)
-    assert cut.scenes[0].points < undisturbed.scenes[0].points
-    monkeypatch.undo()
-    scenes_by(monkeypatch, choose_scene_for_all_but_the_first)
-    resumed = run(asked, recipe, RectifiedMatcher(), tmp_path / "work")
-    assert resumed.ending is Ending.COMPLETE
-    assert [scene.points for scene in resumed.scenes] == [scene.points for scene in undisturbed.scenes]
-
-
 @pytest.mark.parametrize(
     ("make", "reason"),
     [
-        (die_as_scene, "the worker died: signal SIGKILL"),
-        (raise_as_scene, "the worker failed: KeyError: 'image 7'"),
-        (exhaust_memory_as_scene, "out of memory: MemoryError: Unable to allocate 2.00 GiB"),
+        (partial(befall, die), "the worker died: signal SIGKILL"),
+        (partial(befall, lack_an_image), "the worker failed: KeyError: 'image 7'"),
+        (partial(befall, exhaust_memory), "out of memory: MemoryError: Unable to allocate 2.00 GiB"),
     ],
 )
 def test_a_reconstruction_that_is_lost_costs_its_scene_alone_and_the_reason_is_told(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, make: Any, reason: str, capfd: pytest.CaptureFixture[str]
-) -> None:
+    tmp_path, monkeypatch, make, reason, capfd
+):
     scenes_by(monkeypatch, make, process=True)
     pairs = batch_pairs(tmp_path / "images")
     report = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
@@ -139,9 +78,7 @@ def test_a_reconstruction_that_is_lost_costs_its_scene_alone_and_the_reason_is_t
     assert capfd.readouterr() == ("", "")
 
 
-def test_a_scene_process_that_cannot_be_started_costs_its_scene_alone(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_scene_process_that_cannot_be_started_costs_its_scene_alone(tmp_path, monkeypatch):
     def no_memory(_: Any) -> None:
         raise OSError(12, "Cannot allocate memory")
 
@@ -151,38 +88,7 @@ def test_a_scene_process_that_cannot_be_started_costs_its_scene_alone(
     assert "the worker could not be started: [Errno 12] Cannot allocate memory" in report.faults[0]
 
 
-def hang_as_scene_of_batch_one(job: SceneJob) -> SceneResult:
-    return hang_as_scene(job) if job.batch == "one" else choose_scene_for_all_but_the_first(job)
-
-
-def test_a_reconstruction_that_hangs_costs_its_scene_and_the_next_batch_has_its_turn(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    class Hanging(WatchedWorker):
-        def is_stuck(self) -> bool:
-            mark = tmp_path / "hangs"
-            return mark.exists() and mark.read_text() == str(self._process and self._process.pid)
-
-    monkeypatch.setenv("MKPC_TEST_HOME", str(tmp_path))
-    budget = patient(monkeypatch, Hanging)
-    scenes_by(monkeypatch, hang_as_scene_of_batch_one, process=True)
-    pairs = two_batches(tmp_path)
-    report = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work", budget=budget)
-    assert report.ending is Ending.COMPLETE
-    assert [record.source for record in report.records] == ["pair"] * 7 + ["scene"] * 2
-    assert [fault[:48] for fault in report.faults] == ["batch one was not reconstructed: the worker hung"]
-
-
-def test_without_pycolmap_a_line_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    scenes_by(monkeypatch, scene_without_pycolmap, process=True)
-    report = run(batch_pairs(tmp_path / "images"), RECIPE, RectifiedMatcher(), tmp_path / "work")
-    assert all(record.source == "pair" for record in report.records)
-    assert "pycolmap" in overview(read_log(tmp_path / "work"))
-
-
-def test_a_run_reconstructs_the_true_cameras_and_a_gigabyte_is_enough(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_reconstructs_the_true_cameras_and_a_gigabyte_is_enough(tmp_path, monkeypatch):
     scenes_by(monkeypatch, scene_in_a_gigabyte, process=True)
     matcher = SyntheticMatcher()
     report = run(synthetic_pairs(tmp_path / "images"), SYNTHETIC, matcher, tmp_path / "work")
@@ -192,13 +98,10 @@ def test_a_run_reconstructs_the_true_cameras_and_a_gigabyte_is_enough(
     assert max(matcher.scene.median_distance(record.chosen_fundamental, pair) for record, pair in pairs) < 0.5
 
 
-@pytest.mark.parametrize("make", [exhaust_memory_within_pycolmap, die_within_pycolmap])
-def test_what_happens_within_pycolmap_costs_the_scene_alone_and_leaves_no_files(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, make: Any
-) -> None:
+def test_a_death_within_pycolmap_costs_the_scene_alone_and_leaves_no_files(tmp_path, monkeypatch):
     (tmp_path / "temporary").mkdir()
     monkeypatch.setenv("TMPDIR", str(tmp_path / "temporary"))
-    scenes_by(monkeypatch, make, process=True)
+    scenes_by(monkeypatch, die_within_pycolmap, process=True)
     report = run(synthetic_pairs(tmp_path / "images", 4), SYNTHETIC, SyntheticMatcher(images=4), tmp_path / "work")
     assert report.ending is Ending.COMPLETE
     assert [record.source for record in report.records] == ["pair"] * 6
@@ -206,9 +109,7 @@ def test_what_happens_within_pycolmap_costs_the_scene_alone_and_leaves_no_files(
     assert list((tmp_path / "temporary").iterdir()) == []
 
 
-def test_the_scene_of_a_run_is_made_of_tracks_and_judged_by_all_matches(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_scene_of_a_run_is_made_of_tracks_and_judged_by_all_matches(tmp_path, monkeypatch):
     given: list[BatchPair] = []
 
     def note(job: SceneJob) -> SceneResult:
@@ -223,21 +124,12 @@ def test_the_scene_of_a_run_is_made_of_tracks_and_judged_by_all_matches(
     assert all(0 < sum(map(len, pair.tracks.values())) < len(pair.matches) for pair in given)
 
 
-def test_a_recipe_without_scenes_starts_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    scenes_by(monkeypatch, raise_as_scene)
-    report = run(batch_pairs(tmp_path / "images"), Recipe((SWEEP,)), RectifiedMatcher(), tmp_path / "work")
-    assert report.scenes == ()
-    assert report.faults == ()
-
-
-def test_an_image_replaced_after_the_run_drops_the_scene_and_its_batch_alone(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_that_goes_on_reconstructs_only_the_batch_whose_image_was_replaced(tmp_path, monkeypatch, capsys):
     scenes_by(monkeypatch, choose_scene_for_all_but_the_first)
-    pairs = two_batches(tmp_path)
+    pairs = batch_pairs(tmp_path / "images") + batch_pairs(tmp_path / "others", 3, "two")
     run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
     cv2.imwrite(str(pairs[0].images[0]), np.full((72, 80, 3), 200, np.uint8))
-    scenes_by(monkeypatch, raise_as_scene)
+    scenes_by(monkeypatch, partial(befall, lack_an_image))
     again = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
     assert "6 pairs are matched anew" in capsys.readouterr().err
     assert [record.source for record in again.records] == ["pair"] * 6 + ["pair", "scene", "scene"]

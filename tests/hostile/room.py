@@ -1,6 +1,5 @@
 """The room of a case before anything hostile is in it: a test set of three small images, a quick recipe."""
 
-import shutil
 from functools import cache
 from pathlib import Path
 
@@ -40,15 +39,10 @@ def encoded(suffix: str, image: NDArray[np.uint8] | None = None, *options: int) 
 
 def write_template(room: Path) -> Path:
     images = room / "D" / "test_images" / "b1"
-    images.mkdir(parents=True)
+    for folder in (images, room / "out", room / "tmp", room / "home"):
+        folder.mkdir(parents=True)
     for number, name in enumerate("xyz"):
         (images / f"{name}.png").write_bytes(encoded(".png", picture(12 * number)))
     (room / "D" / "test.csv").write_text(TABLE)
     (room / "quick.toml").write_text(RECIPE)
-    return room
-
-
-def furnish(room: Path, template: Path) -> Path:
-    """A copy of the template."""
-    shutil.copytree(template, room)
     return room

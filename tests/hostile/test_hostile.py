@@ -1,5 +1,6 @@
 """The standing attack: the real command on hostile inputs, each case in a process of its own (see ``attack``)."""
 
+import shutil
 from pathlib import Path
 
 import ends
@@ -12,7 +13,7 @@ import settings
 import tables
 import weight_bombs
 from attack import Case, attack
-from room import furnish, write_template
+from room import write_template
 
 ALL: list[Case] = [
     case
@@ -26,6 +27,7 @@ QUICK = (  # these run with the other tests
     "tables: bytes that are not UTF-8",
     "limits: --time-limit nan",
     "outputs: the table",
+    "signals: SIGINT after 0.3 s",  # while modules are imported
     "signals: SIGTERM after 1.0 s",
     "signals: SIGINT to all after 3.0 s",
     "journals: no points, resumed",
@@ -48,10 +50,10 @@ def template(tmp_path_factory: pytest.TempPathFactory) -> Path:
     "case", [pytest.param(case, id=case.id, marks=() if case.id in QUICK else pytest.mark.slow) for case in ALL]
 )
 def test_a_hostile_input_is_survived(case: Case, template: Path, tmp_path: Path) -> None:
-    attack(case, furnish(tmp_path / "room", template))
+    attack(case, shutil.copytree(template, tmp_path / "room"))
 
 
 def test_the_names_of_cases_are_unique_and_the_quick_ones_are_among_them() -> None:
-    names = [case.id for case in ALL]
-    assert len(set(names)) == len(names) >= 300
-    assert set(QUICK) <= set(names)
+    names = {case.id for case in ALL}
+    assert len(names) == len(ALL) >= 300
+    assert set(QUICK) <= names

@@ -3,24 +3,24 @@
 import os
 import resource
 import signal
-import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import count
 from math import inf
+from multiprocessing import resource_tracker, util
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, NoReturn
 
 import numpy as np
 import pytest
 from rectified import THREE_UNITS, RectifiedMatcher, Seen
 
 from mkpc_kaggle.engine import places, session
-from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.jobs import SceneJob, SceneResult
 from mkpc_kaggle.engine.places import LocalSite, Place
-from mkpc_kaggle.engine.process import ProcessWorker, ThreadWorker
+from mkpc_kaggle.engine.process import ThreadWorker
 from mkpc_kaggle.engine.worker import MatchRunner, SceneRunner
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Size
@@ -42,32 +42,35 @@ def die() -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-def nothing() -> None:
-    """Only the mark is left that it was there."""
-
-
 def hang() -> None:
+    """Until it is killed; a file tells which process hangs."""
+    (Path(os.environ["MKPC_TEST_HOME"]) / "hangs").write_text(str(os.getpid()))
     time.sleep(1000)
 
 
+def lack_an_image() -> None:
+    raise KeyError("image 7")
+
+
 def exhaust_memory() -> None:
-    """Ask for more than a limit allows."""
-    limit_memory(64 << 20)
-    np.ones(1 << 28)
-
-
-def limit_memory(bytes_left: int) -> None:
-    """Let this process have so much more than it has now."""
+    """Ask for more than a limit allows, 64 MiB above what there is now."""
     used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-    resource.setrlimit(resource.RLIMIT_AS, (used + bytes_left, resource.RLIM_INFINITY))
+    resource.setrlimit(resource.RLIMIT_AS, (used + (64 << 20), resource.RLIM_INFINITY))
+    np.ones(1 << 28)
 
 
 def exhaust_gpu() -> None:
     raise RuntimeError("CUDA out of memory. Tried to allocate 20.00 GiB")
 
 
-def break_device() -> None:
+def break_device() -> NoReturn:
     raise RuntimeError(f"{BROKEN}\nCUDA kernel errors might be asynchronously reported at some other API call")
+
+
+def breaks_after(pairs: int) -> Callable[[int], int]:
+    """Answers of a matcher whose device fails after so many pairs, and then at everything in this process."""
+    calls = count()
+    return lambda _: 150 if next(calls) < pairs else break_device()
 
 
 # Matchers
@@ -98,18 +101,6 @@ class FaultyMatcher(RectifiedMatcher):
 
 
 @dataclass
-class BrokenDeviceMatcher(RectifiedMatcher):
-    """A device that fails after ``good`` pairs, and from then on at everything in this process, as CUDA does."""
-
-    good: int = 5
-
-    def _match(self, seen0: Seen, seen1: Seen) -> Matches:
-        if len(self.calls) >= self.good:
-            break_device()
-        return super()._match(seen0, seen1)
-
-
-@dataclass
 class NarrowMatcher(RectifiedMatcher):
     """Has no memory for more than ``most`` pairs at a time; notes how many it was given each time."""
 
@@ -125,21 +116,10 @@ class NarrowMatcher(RectifiedMatcher):
         return super().match(encodings0, encodings1)
 
 
-@dataclass
-class NonsenseMatcher(RectifiedMatcher):
-    """Points that are not finite or not on the image on every second pair, besides good ones on the others."""
-
-    def _match(self, seen0: Seen, seen1: Seen) -> Matches:
-        matches = super()._match(seen0, seen1)
-        bad = Matches([[np.nan, 1], [np.inf, 2], [-50, 3], [1e6, 4]], [[1, 1]] * 4, [1, np.nan, 1, 1])
-        return Matches.concatenate([bad, matches]) if seen0.brightness % 2 == 0 else bad
-
-
 # Scenes
 
-SCENE_F = np.array(
-    [[0.0, 0, 0.2], [0, 0, -0.5], [-0.3, 0.6, 0.5]]
-)  # the scenes of these tests give it to all pairs
+# The scenes of these tests give it to all pairs.
+SCENE_F = np.array([[0.0, 0, 0.2], [0, 0, -0.5], [-0.3, 0.6, 0.5]])
 
 
 class ScenesBy(SceneRunner):
@@ -175,23 +155,9 @@ def choose_scene_for_all_but_the_first(job: SceneJob) -> SceneResult:
     return SceneResult((Reconstruction(names, (SfmModel(registered, points, 0.5),)),), choices)
 
 
-def die_as_scene(job: SceneJob) -> SceneResult:
-    die()
-    raise AssertionError
-
-
-def hang_as_scene(job: SceneJob) -> SceneResult:
-    (Path(os.environ["MKPC_TEST_HOME"]) / "hangs").write_text(str(os.getpid()))
-    hang()
-    raise AssertionError
-
-
-def raise_as_scene(job: SceneJob) -> SceneResult:
-    raise KeyError("image 7")
-
-
-def exhaust_memory_as_scene(job: SceneJob) -> SceneResult:
-    exhaust_memory()
+def befall(fault: Fault, job: SceneJob) -> SceneResult:
+    """A fault in the place of a reconstruction."""
+    fault()
     raise AssertionError
 
 
@@ -207,23 +173,9 @@ def die_within_pycolmap(job: SceneJob) -> SceneResult:
     return reconstruct(job)
 
 
-def exhaust_memory_within_pycolmap(job: SceneJob) -> SceneResult:
-    """Four megabytes are left when it begins."""
-    import mkpc_kaggle.scene.colmap  # noqa: F401  # that is not what fails
-
-    limit_memory(4 << 20)
-    os.close(2)
-    return reconstruct(job)
-
-
 def scene_in_a_gigabyte(job: SceneJob) -> SceneResult:
     """All that it may have; libraries that are only mapped are not counted."""
     resource.setrlimit(resource.RLIMIT_DATA, (1 << 30, 1 << 30))
-    return reconstruct(job)
-
-
-def scene_without_pycolmap(job: SceneJob) -> SceneResult:
-    sys.modules["pycolmap"] = None  # type: ignore[assignment]  # an import of it fails now
     return reconstruct(job)
 
 
@@ -251,71 +203,14 @@ def use_places(monkeypatch: pytest.MonkeyPatch, *used: Place, fallback: Sequence
     monkeypatch.setattr(places, "RESTART_PAUSE_S", 0.0)
 
 
-@dataclass
-class StandingClock:
-    """A clock that stands still, however long workers take, until :class:`PatientSite` moves it."""
+def on_fork(monkeypatch: pytest.MonkeyPatch, act: Callable[[int], None]) -> None:
+    """Let something be done with the id of each worker process as soon as it is forked."""
+    resource_tracker.ensure_running()  # a process, too
+    spawn = util.spawnv_passfds
 
-    now: float = 0.0
+    def spawned(*arguments: Any) -> int:
+        pid: int = spawn(*arguments)
+        act(pid)
+        return pid
 
-    def __call__(self) -> float:
-        return self.now
-
-    @property
-    def budget(self) -> Budget:
-        return Budget(0.0, inf, self)
-
-
-class PatientSite(LocalSite):
-    """Its workers' time limits are over only when nothing else can happen: when all that are at work are stuck.
-
-    So no limit is over early on a busy machine, and none is waited for. Use :func:`patient`.
-    """
-
-    def __init__(self, assembly: Assembly, workers: int, clock: StandingClock) -> None:
-        super().__init__(assembly, workers, clock)
-        self._standing = clock
-
-    def wait(self, until: float) -> None:
-        super().wait(inf)
-        busy = [worker for worker in WatchedWorker.all if worker.is_busy]
-        if busy and until < inf and all(worker.is_stuck() for worker in busy):
-            self._standing.now = until
-
-
-class WatchedWorker(ProcessWorker):
-    """A worker process that is busy from its start to its answer, and from a job to its answer."""
-
-    all: ClassVar[list["WatchedWorker"]] = []
-    is_busy = False
-
-    def is_stuck(self) -> bool:
-        """Whether it will never answer, as the test knows."""
-        raise NotImplementedError
-
-    def start(self) -> None:
-        self.all.append(self)
-        self.is_busy = True
-        super().start()
-
-    def submit(self, job: Any, seconds: float) -> None:
-        self.is_busy = True
-        super().submit(job, seconds)
-
-    def answer(self) -> Any:
-        answer = super().answer()
-        self.is_busy = self.is_busy and answer is None
-        return answer
-
-    def kill(self) -> None:
-        self.is_busy = False
-        super().kill()
-
-
-def patient(monkeypatch: pytest.MonkeyPatch, kind: type[WatchedWorker]) -> Budget:
-    """Let runs have a :class:`PatientSite` with processes of that kind; the budget to give them."""
-    clock = StandingClock()
-    monkeypatch.setattr(WatchedWorker, "all", [])
-    monkeypatch.setattr(places, "ProcessWorker", kind)
-    monkeypatch.setattr(places, "RESTART_PAUSE_S", 0.0)
-    monkeypatch.setattr(session, "site_of", lambda _, assembly, plan: PatientSite(assembly, plan.workers, clock))
-    return clock.budget
+    monkeypatch.setattr(util, "spawnv_passfds", spawned)

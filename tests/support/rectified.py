@@ -6,7 +6,9 @@ It sees every pair as rectified: a point of image 1 is the point of image 0 move
 
 import time
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field
+from itertools import combinations
 from pathlib import Path
 
 import cv2
@@ -17,8 +19,8 @@ from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.cluster import RayCluster
 from mkpc_kaggle.engine.engine import RunReport
 from mkpc_kaggle.engine.records import PairRecord
-from mkpc_kaggle.engine.session import Interrupt, Session, run_pairs
-from mkpc_kaggle.geometry.coordinates import View
+from mkpc_kaggle.engine.session import Interrupt, Session, Watchdog, run_pairs, submit
+from mkpc_kaggle.geometry.coordinates import Size, View
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import MatcherSpec, Picture
 from mkpc_kaggle.pipeline.assembly import assemble
@@ -66,6 +68,7 @@ class RectifiedMatcher:
 
 SWEEP, SECOND, THIRD = Unit(1, "rectified", 96), Unit(2, "rectified", 128), Unit(1, "rectified", 160)
 THREE_UNITS = Recipe((SWEEP, SECOND, THIRD))
+SIZE = Size(80, 72)
 
 
 def write_pairs(directory: Path, count: int) -> list[Pair]:
@@ -80,6 +83,16 @@ def write_pairs(directory: Path, count: int) -> list[Pair]:
     return pairs
 
 
+def batch_pairs(directory: Path, images: int = 4, batch: str = "one", size: Size = SIZE) -> list[Pair]:
+    """All pairs of flat images, each with a brightness of its own: 10, 20, ..."""
+    directory.mkdir(parents=True, exist_ok=True)
+    paths = [directory / f"{number}.png" for number in range(images)]
+    for number, path in enumerate(paths):
+        cv2.imwrite(str(path), np.full((size.height, size.width, 3), 10 + 10 * number, np.uint8))
+    chosen = combinations(range(images), 2)
+    return [Pair(f"{batch};{i}-{j}", batch, str(paths[i]), str(paths[j])) for i, j in chosen]
+
+
 def run(
     pairs: Sequence[Pair],
     recipe: Recipe,
@@ -90,12 +103,19 @@ def run(
     budget: Budget | None = None,
     interrupt: Interrupt | None = None,
     publish: Callable[[Sequence[PairRecord]], None] = lambda _: None,
+    output: Path | None = None,
     workers: int | RayCluster | None = 0,
+    is_watched: bool = False,
 ) -> RunReport:
+    """Run the recipe with that matcher; the submission is written to ``output``, or given to ``publish``."""
     assembly = assemble(recipe, matchers={matcher.name: matcher}, device="cpu")
     budget = budget or Budget(time.monotonic(), limit)
-    session = Session(work_dir, budget, interrupt or Interrupt(), progress=False, workers=workers)
-    return run_pairs(pairs, assembly, session, publish)
+    interrupt = interrupt or Interrupt()
+    with Watchdog(budget, interrupt) if is_watched else nullcontext() as watchdog:
+        session = Session(work_dir, budget, interrupt, progress=False, workers=workers, watchdog=watchdog)
+        if output is not None:
+            return submit(pairs, assembly, session, output)
+        return run_pairs(pairs, assembly, session, publish)
 
 
 def matrices(report: RunReport) -> list[bytes]:

@@ -7,7 +7,6 @@ crash, run out of memory and hang as well.
 
 import math
 import threading
-import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import starmap
@@ -43,6 +42,7 @@ from mkpc_kaggle.scene.choose import Choice, Reason
 RESTART_S = 8.0
 STALL = 20.0  # a unit that stalls takes so many times as long
 SIZES = (Size(640, 480), Size(640, 480))
+NO_MATCHES = Matches.empty()
 SWEEP_SHARE = 0.7  # of the limit, within which the sweep is said to fit
 
 
@@ -92,7 +92,7 @@ class Scenario:
 
     @property
     def cached(self) -> float:
-        """What a unit costs on average, in terms of one on a cached view."""
+        """What a unit costs on average, times its cost on a cached view."""
         return 1 + self.misses * (self.miss_factor - 1)
 
     @property
@@ -102,7 +102,7 @@ class Scenario:
 
 
 def random_scenario(seed: int, pairs: int) -> Scenario:
-    """Anything that happens: from an ample limit to one that the sweep alone fills."""
+    """Anything that happens: from an ample limit to a limit that the sweep alone fills."""
     rng = np.random.default_rng(seed)
     costs = tuple(np.exp(rng.normal(-0.5, 0.8, rng.integers(1, 13))).tolist())
     troubled = rng.random() < 0.5
@@ -205,7 +205,6 @@ class Simulated:
         if self._answer is None or self._site.clock.now < self.ready:
             return None
         answer, self._answer, self.ready = self._answer, None, math.inf
-        self.on_taken(answer)
         return answer
 
 
@@ -234,11 +233,13 @@ class SimulatedWorker(Simulated):
         else:
             self._kept = max(0.0, min(self.ready, self._site.stop) - now)
 
-    def on_taken(self, answer: Answer) -> None:
+    def answer(self) -> Answer | None:
+        if (answer := super().answer()) is not None:
+            self.job = None
         if isinstance(answer, MatchResult):
             self._site.kept += self._kept
             self._site.last_job = self._site.clock.now
-        self.job = None
+        return answer
 
     def kill(self) -> None:
         self._site.workers.discard(self)
@@ -266,7 +267,7 @@ class SimulatedWorker(Simulated):
                 if now + seconds > end:
                     return end, hung, end - now if stalled else 0.0
                 now += seconds
-                found.append(UnitResult(unit, Matches.empty(), 0.0, seconds, warm_up=warm_up))
+                found.append(UnitResult(unit, NO_MATCHES, 0.0, seconds, warm_up=warm_up))
         pairs = zip(job.indices, job.known, results, strict=True)
         return now, MatchResult(tuple(starmap(_outcome, pairs))), 0.0
 
@@ -283,12 +284,12 @@ def _outcome(index: int, known: tuple[UnitResult, ...], found: list[UnitResult])
 
 
 class SimulatedScene(Simulated):
-    """A worker for one batch; ``seen`` is when somebody took its answer, ``is_over`` that it was killed."""
+    """A worker for a batch; ``is_over`` when it was killed."""
 
     def __init__(self, site: SimulatedSite, rng: np.random.Generator) -> None:
         super().__init__(site)
         self.batch = ""
-        self.begun = self.seconds = self.seen = 0.0
+        self.begun = self.seconds = 0.0
         self.is_over = self.is_faulty = False
         self._rng = rng
 
@@ -310,9 +311,6 @@ class SimulatedScene(Simulated):
             self._answer = Failure(Cause.DIED, "signal SIGSEGV")
             self.seconds *= (0.5, 0.3, math.inf)[rng.integers(3)]
         self.ready = self.begun + self.seconds
-
-    def on_taken(self, answer: Answer) -> None:
-        self.seen = self._site.clock.now
 
     def kill(self) -> None:
         self.is_over = True
@@ -381,8 +379,6 @@ class Ran:
     last_job: float
     scenes: tuple[SimulatedScene, ...]
     scene_units: Mapping[str, int]
-    jobs: int
-    planning: float
 
     @property
     def work_left(self) -> bool:
@@ -390,7 +386,7 @@ class Ran:
 
 
 def simulate(scenario: Scenario, journal: MemoryJournal | None = None, until: float = math.inf) -> Ran:
-    """Run one scenario through the real engine, as long as nobody interrupts it."""
+    """Run a scenario through the real engine, as long as nobody interrupts it."""
     clock = VirtualClock()
     budget = Budget(0.0, scenario.limit, clock)
     site = SimulatedSite(scenario, clock, budget.stop_units)
@@ -408,24 +404,13 @@ def simulate(scenario: Scenario, journal: MemoryJournal | None = None, until: fl
         interrupt=interrupt,
         progress=False,
     )
-    planning, jobs = 0.0, 0
-    plan_next = engine.plan.next
-
-    def timed(now: float, place: str, *, cautious: bool) -> MatchJob | None:
-        nonlocal planning, jobs
-        start = time.thread_time()  # whatever else the machine does
-        job = plan_next(now, place, cautious=cautious)
-        planning += time.thread_time() - start
-        jobs += job is not None
-        return job
 
     def wait(moment: float) -> None:
         whole_wait(min(moment, until))
         if clock.now >= until:
             interrupt.set()
 
-    whole_wait, site.wait = site.wait, wait  # type: ignore[method-assign]
-    engine.plan.next = timed  # type: ignore[method-assign, assignment]
+    whole_wait, site.wait = site.wait, wait
     report = engine.run()
     swept = sum(record.matches > 0 for record in report.records)
     sweep_fits = sweep_seconds(scenario) < SWEEP_SHARE * scenario.limit
@@ -440,20 +425,14 @@ def simulate(scenario: Scenario, journal: MemoryJournal | None = None, until: fl
         sum(length != scenario.pairs for length in published) + (scenario.pairs - swept if sweep_fits else 0),
         len(set(engine.scenes.batches) - faulty - made),
         FORECAST_MARGIN * scenario.longest_scenes < RESERVE_SHARE * scenario.limit
-        and not any(map(_hangs, site.scenes)),
+        and not any(math.isinf(scene.seconds) for scene in site.scenes),
         site.last_job,
         tuple(site.scenes),
         {
             name: sum(len(engine.plan.records[index].units) for index in indices)
             for name, indices in engine.scenes.batches.items()
         },
-        jobs,
-        planning / max(1, jobs),
     )
-
-
-def _hangs(scene: SimulatedScene) -> bool:
-    return math.isinf(scene.seconds)
 
 
 def sweep_seconds(scenario: Scenario) -> float:

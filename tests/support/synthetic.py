@@ -4,16 +4,13 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
-import cv2
-import numpy as np
-from rectified import RectifiedMatcher, Seen
+from rectified import RectifiedMatcher, Seen, batch_pairs
 
 from benchmarks.synthetic_scene import SIZE, SyntheticScene, synthetic_scene
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.recipe import Recipe, SceneConfig, Unit
 
-DARKEST, STEP = 10, 10  # the brightness of the first image, and by how much each next image is brighter
 RECIPE = Recipe((Unit(1, "synthetic", SIZE.width),), scene=SceneConfig())
 
 
@@ -31,16 +28,11 @@ class SyntheticMatcher(RectifiedMatcher):
 
     def _match(self, seen0: Seen, seen1: Seen) -> Matches:
         self.calls.append((max(seen0.view.content), seen0.brightness))
-        names = [f"{(seen.brightness - DARKEST) // STEP:04}" for seen in (seen0, seen1)]
+        names = [f"{seen.brightness // 10 - 1:04}" for seen in (seen0, seen1)]
         (found,) = (p.matches for p in self.scene.pairs if [p.image0.name, p.image1.name] == names)
         return Matches(seen0.view.from_image(found.points0), seen1.view.from_image(found.points1), found.scores)
 
 
-def synthetic_pairs(directory: Path, images: int = 6) -> list[Pair]:
+def synthetic_pairs(directory: Path, images: int = 6, batch: str = "batch") -> list[Pair]:
     """All pairs of the flat images, in one batch."""
-    directory.mkdir(parents=True, exist_ok=True)
-    paths = [directory / f"{number}.png" for number in range(images)]
-    for number, path in enumerate(paths):
-        cv2.imwrite(str(path), np.full((SIZE.height, SIZE.width, 3), DARKEST + STEP * number, np.uint8))
-    chosen = [(i, j) for i in range(images) for j in range(i + 1, images)]
-    return [Pair(f"batch;{i}-{j}", "batch", str(paths[i]), str(paths[j])) for i, j in chosen]
+    return batch_pairs(directory, images, batch, SIZE)
