@@ -17,9 +17,9 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
-from rectified import Seen
+from rectified import Seen, flat, number_of
 from sklearn.datasets import load_sample_image
-from synthetic import DARKEST, STEP, SyntheticMatcher
+from synthetic import SyntheticMatcher
 
 from benchmarks.synthetic_scene import SIZE, SyntheticScene, synthetic_scene
 from mkpc_kaggle import reconstruct
@@ -60,7 +60,7 @@ class MixedMatcher(SyntheticMatcher):
         return synthetic_scene(FIRST, points=500), synthetic_scene(SECOND, points=500, seed=7)
 
     def _match(self, seen0: Seen, seen1: Seen) -> Matches:
-        first, second = ((seen.brightness - DARKEST) // STEP for seen in (seen0, seen1))
+        first, second = number_of(seen0), number_of(seen1)
         self.calls.append((first, second))
         if self.interrupt is not None and len(self.calls) == self.after:
             self.interrupt.set()
@@ -78,8 +78,7 @@ class MixedMatcher(SyntheticMatcher):
 def write_flat(folder: Path, count: int = FIRST + SECOND + OTHERS) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     for number in range(count):
-        grey = np.full((SIZE.height, SIZE.width, 3), DARKEST + STEP * number, np.uint8)
-        cv2.imwrite(str(folder / f"{number:02}.png"), grey)
+        cv2.imwrite(str(folder / f"{number:02}.png"), flat(number, SIZE))
     return folder
 
 

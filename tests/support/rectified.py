@@ -83,12 +83,22 @@ def write_pairs(directory: Path, count: int) -> list[Pair]:
     return pairs
 
 
+def flat(number: int, size: Size = SIZE) -> np.ndarray:
+    """An image with a brightness of its own."""
+    return np.full((size.height, size.width, 3), 10 + 10 * number, np.uint8)
+
+
+def number_of(seen: Seen) -> int:
+    """Which :func:`flat` image it is."""
+    return seen.brightness // 10 - 1
+
+
 def batch_pairs(directory: Path, images: int = 4, batch: str = "one", size: Size = SIZE) -> list[Pair]:
-    """All pairs of flat images, each with a brightness of its own: 10, 20, ..."""
+    """All pairs of :func:`flat` images."""
     directory.mkdir(parents=True, exist_ok=True)
     paths = [directory / f"{number}.png" for number in range(images)]
     for number, path in enumerate(paths):
-        cv2.imwrite(str(path), np.full((size.height, size.width, 3), 10 + 10 * number, np.uint8))
+        cv2.imwrite(str(path), flat(number, size))
     chosen = combinations(range(images), 2)
     return [Pair(f"{batch};{i}-{j}", batch, str(paths[i]), str(paths[j])) for i, j in chosen]
 

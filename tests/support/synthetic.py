@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
-from rectified import RectifiedMatcher, Seen, batch_pairs
+from rectified import RectifiedMatcher, Seen, batch_pairs, number_of
 
 from benchmarks.synthetic_scene import SIZE, SyntheticScene, synthetic_scene
 from mkpc_kaggle.data.competition import Pair
@@ -28,7 +28,7 @@ class SyntheticMatcher(RectifiedMatcher):
 
     def _match(self, seen0: Seen, seen1: Seen) -> Matches:
         self.calls.append((max(seen0.view.content), seen0.brightness))
-        names = [f"{seen.brightness // 10 - 1:04}" for seen in (seen0, seen1)]
+        names = [f"{number_of(seen):04}" for seen in (seen0, seen1)]
         (found,) = (p.matches for p in self.scene.pairs if [p.image0.name, p.image1.name] == names)
         return Matches(seen0.view.from_image(found.points0), seen1.view.from_image(found.points1), found.scores)
 
