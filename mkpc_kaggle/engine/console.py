@@ -97,7 +97,8 @@ class Progress:
     def _draw(self, began: str, done: int, total: int, left: str) -> None:
         if began:
             self.close()
-            self._bar = tqdm(total=total, desc=began, unit="pair", file=self._stream)
+            # With a delay, nothing is drawn before the bar is whole: a dead terminal left half of one.
+            self._bar = tqdm(total=total, desc=began, unit="pair", file=self._stream, delay=1e-9)
         if self._bar is not None:
             self._bar.set_postfix_str(left, refresh=False)
             self._bar.update(done - self._bar.n)
