@@ -63,7 +63,7 @@ class Unit:
 
     @property
     def with_fallback(self) -> "Unit":
-        """The same unit with its fallback in its matcher's place, if it has one."""
+        """The same unit, its fallback, if any, in its matcher's place."""
         return replace(self, matcher=self.fallback or self.matcher, fallback="")
 
     def view(self, crop: Box, multiple: int) -> View:

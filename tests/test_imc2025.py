@@ -134,7 +134,7 @@ def test_the_command_scores_a_file(tmp_path: Path, capsys: pytest.CaptureFixture
 @pytest.mark.parametrize(
     ("before", "after", "told"),
     [
-        ("set,outliers,x.png", "set,outliers,y.png", "2 images of set are missing or unknown, one is x.png"),
+        ("set,outliers,x.png", "set,outliers,y.png", "2 images of set are missing or unknown, such as x.png"),
         ("set,a,a0.png", "set,a,a1.png", "the image set/a1.png is there twice"),
         (POSE, "1;0;0", "expected 9 and 3 numbers joined by ';', found 3 and 3"),
         (POSE, "north", "'north' is not a list of numbers joined by ';'"),

@@ -40,7 +40,7 @@ def _print(text: str, stream: TextIO | None) -> None:
 
 
 def leave(status: int) -> NoReturn:
-    """End the process at once, and its children, stopped ones (SIGSTOP) too."""
+    """End the process at once, and its children, even if stopped (SIGSTOP)."""
     for stream in (sys.stdout, sys.stderr):
         with suppress(OSError, ValueError):
             if stream is not None:
@@ -97,7 +97,7 @@ class Progress:
     def _draw(self, began: str, done: int, total: int, left: str) -> None:
         if began:
             self.close()
-            # With a delay, nothing is drawn before the bar is whole: a dead terminal left half of one.
+            # With a delay, nothing is drawn before the bar is whole: a dead terminal left half a bar.
             self._bar = tqdm(total=total, desc=began, unit="pair", file=self._stream, delay=1e-9)
         if self._bar is not None:
             self._bar.set_postfix_str(left, refresh=False)

@@ -185,7 +185,7 @@ class Engine:
             self.site.wait(min(self.budget.stop_waiting, *(limit for limit in limits if limit > now), inf))
 
     def _hand_out(self, now: float) -> None:
-        """A worker for each place that lacks one, and a job for each worker that is idle."""
+        """A worker for each place that has none, and a job for each worker that is idle."""
         self.plan.workers = max(1, sum(not place.closed for place in self.site.places))
         for place in self.site.places:
             if place.may_start(now) and self.plan.has_work(now):

@@ -195,7 +195,7 @@ class JournalReader:
 
 
 class Journal(JournalReader):
-    """The journal of a work directory, made if it is not there; no other run can open it while this one has it.
+    """The journal of a work directory, made if it is not there; no other run can open it while this run has it.
 
     ``belongs_to`` says by name what the run computes (recipe, test set, weights). Raises :class:`UserError`
     where the directory cannot be written, another run holds it, or it belongs to something else.
@@ -324,7 +324,7 @@ class Journal(JournalReader):
                     f"{self.path} belongs to another run: its {' and '.join(other)} differ. "
                     "Start anew with --fresh, or name another --work-dir."
                 )
-        # Readers do not hold up the writer then. Killed, no result is lost; with the power, the last ones.
+        # Readers do not hold up the writer then. Killed, no result is lost; with the power, the last results.
         self._db.execute("PRAGMA journal_mode = WAL")
         self._db.execute("PRAGMA synchronous = NORMAL")
         with self._db:

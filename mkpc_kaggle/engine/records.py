@@ -87,7 +87,7 @@ class PairRecord:
         )
 
     def after(self, former: "PairRecord") -> "PairRecord":
-        """The record of a later job on a pair: with the seconds of the ``former`` ones, and their regions."""
+        """The record of a later job on a pair: with the seconds of the ``former`` jobs, and their regions."""
         parts = ("decode_seconds", "cluster_seconds", "estimate_seconds")
         seconds = {part: getattr(former, part) + getattr(self, part) for part in parts}
         return replace(self, regions=self.regions or former.regions, scene=former.scene, **seconds)

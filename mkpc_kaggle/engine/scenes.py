@@ -26,7 +26,7 @@ MAX_TRIES = 2  # of a reconstruction that is lost
 DENSIFY_PAIRS_PER_IMAGE = 15.0  # of a batch, once all units have run: above, pairs add time alone
 START_S = 3.0  # that a process takes to begin
 PAIR_S = 0.2  # that a pair adds to a reconstruction, as long as nothing is known
-FORECAST_MARGIN = 1.5  # a reconstruction may take this many times what its pairs took in earlier ones
+FORECAST_MARGIN = 1.5  # a reconstruction may take this many times what its pairs took in earlier scenes
 HANG_FACTOR = 10.0  # a reconstruction that takes this many times its forecast hangs
 
 

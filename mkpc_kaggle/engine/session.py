@@ -156,7 +156,7 @@ class Watchdog:
     """Leaves the process before the limit, the submission written, if the program has not ended by itself.
 
     A thread does it, so that it helps wherever the others are stuck, short of holding the interpreter's lock:
-    that only a matcher in the program's own process can do. Worker processes are ended with this one.
+    that only a matcher in the program's own process can do. Worker processes are ended with it.
 
     ``save`` writes the submission, or says why it is not the last version; ``status`` is the exit status of a
     program that is left while it tells what it has done.

@@ -105,7 +105,7 @@ def comparison_table(comparison: Comparison) -> list[str]:
 
 
 def step_gains(validation: Validation) -> list[str]:
-    """Lines: the gain of mAA, as the mean over scenes, of each step over the one before; none without metres."""
+    """Lines: the gain of mAA, as the mean over scenes, of each step over the step before; none without metres."""
     scenes = [scene for scene in validation.scenes if scene.pairs and scene.in_metres]
     after = {
         step: [_accuracies(pair.steps[step] for pair in scene.pairs) for scene in scenes]
@@ -120,7 +120,7 @@ def step_gains(validation: Validation) -> list[str]:
 
 
 def comparison_json(comparison: Comparison) -> dict[str, Any]:
-    """All figures as JSON values: each validation, and each later one's gain over the first."""
+    """All figures as JSON values: each validation, and the gain of each later validation over the first."""
 
     def gain(number: int, name: str | None = None) -> dict[str, float]:
         difference = comparison.difference(number, name)

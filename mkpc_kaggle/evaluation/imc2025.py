@@ -59,7 +59,7 @@ def score_imc2025(directory: Path, submission: Path) -> list[DatasetScore]:
         given = [image for cluster in found.get(name, {}).values() for image in cluster]
         if wrong := {image for scene in scenes.values() for image in scene} ^ set(given):
             raise UserError(
-                f"{submission}: {len(wrong)} images of {name} are missing or unknown, one is {min(wrong)}"
+                f"{submission}: {len(wrong)} images of {name} are missing or unknown, such as {min(wrong)}"
             )
         if lacking := [scene for scene in scenes if scene != OUTLIERS and (name, scene) not in limits]:
             raise UserError(f"{path} has no thresholds of {name}/{lacking[0]}")
@@ -77,7 +77,7 @@ def score_dataset(
     clusters: Mapping[str, Centres],
     thresholds: Mapping[str, Sequence[float] | Points],
 ) -> DatasetScore:
-    """Each scene takes the cluster that has most of its images, of several the one with the best mAA.
+    """Each scene takes the cluster that has most of its images, of several the cluster with the best mAA.
 
     The mAA's numerators and denominators are summed over the scenes before they are divided.
     """

@@ -36,7 +36,7 @@ class Step(StrEnum):
 
 @dataclass(frozen=True)
 class PairScore:
-    """One pair's error, infinite for a failed pair, and its record if the engine made one.
+    """One pair's error, infinite for a failed pair, and its record if the engine made it.
 
     ``steps`` are the errors after each :class:`Step` that was made; the last is ``error``.
     """

@@ -78,7 +78,7 @@ def with_estimate(
 ) -> PairMatch:
     """The pair with its two-view model from all matches, in the recipe's order: MAGSAC's result depends on it.
 
-    The recipe's prior on focal lengths, if it has one, goes by the images' sizes unless ``intrinsics`` are given.
+    The recipe's prior on focal lengths, if any, goes by the images' sizes unless ``intrinsics`` are given.
     """
     order = {unit: number for number, unit in enumerate(recipe.units)}
     results = tuple(sorted(pair.results, key=lambda result: order[result.unit]))

@@ -48,7 +48,7 @@ def read_folder(root: Path) -> tuple[Dataset, ...]:
 
 
 def pairs_of(dataset: Dataset) -> list[Ends]:
-    """All pairs of a dataset of up to ``MAX_IMAGES`` images; of a larger one, those of its shortlist."""
+    """All pairs of a dataset of up to ``MAX_IMAGES`` images; of a larger dataset, those of its shortlist."""
     if len(dataset.files) <= MAX_IMAGES:
         return list(combinations(dataset.files, 2))
     return [(dataset.files[first], dataset.files[second]) for first, second in shortlist(dataset.files)]

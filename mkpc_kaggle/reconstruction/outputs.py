@@ -13,7 +13,7 @@ from mkpc_kaggle.engine.records import CameraRecord
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.reconstruction.folder import Dataset
 
-Cameras = Mapping[Dataset, Mapping[str, CameraRecord]]  # of the images that have one, by the names of their files
+Cameras = Mapping[Dataset, Mapping[str, CameraRecord]]  # of images with a camera, by the names of their files
 
 ORIGIN = Camera(np.eye(3), np.eye(3), np.zeros(3))
 NO_CAMERA = Camera(np.eye(3), np.full((3, 3), np.nan), np.full(3, np.nan))

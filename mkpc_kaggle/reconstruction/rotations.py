@@ -21,7 +21,7 @@ def find_turns(files: Sequence[Path], assembly: Assembly) -> dict[Path, int]:
     """By how many quarters, counter-clockwise, images have to be turned that match little as they are.
 
     The recipe's first unit matches each image with the few that are most like it. An image that has few inliers
-    with all of them is tried in the three other orientations, and the one with most is taken if it gains enough.
+    with all of them is tried in the three other orientations, of which the best is taken if it gains enough.
     """
     pipeline, turns = assembly.pipeline(), dict[Path, int]()
 

@@ -33,7 +33,7 @@ def shortlist(files: Sequence[Path], partners: int = PARTNERS) -> list[tuple[int
 
 
 def most_alike(files: Sequence[Path], count: int) -> list[list[int]]:
-    """For each image the places of the others that are most like it; one that cannot be read is like no other."""
+    """For each image the places of the others that are most like it; unreadable images are like no other."""
     with ThreadPoolExecutor(THREADS) as pool:
         descriptors = list(pool.map(local_features, files))
     every = np.concatenate(descriptors)

@@ -7,7 +7,7 @@ runs it in a process of its own. Nothing is written to disk, unless COLMAP's fil
 The same input gives the same bytes on one machine with ``threads = 1``. With more threads, sums are added in
 another order each time, and the last digits differ.
 
-Sources: Schoenberger and Frahm 2016 (the incremental mapper), Pan et al. 2024 (the global one).
+Sources: Schoenberger and Frahm 2016 (the incremental mapper), Pan et al. 2024 (the global mapper).
 """
 
 import shutil
@@ -32,7 +32,7 @@ CENTRE_PX = 0.5  # in COLMAP the top-left pixel's centre is (0.5, 0.5), here it 
 PRIOR_FOCAL = 1.1  # long sides of the image: the focal length that cameras start with
 MAX_ERROR_PX = 1.0  # of a verified match
 MAX_TRIALS = 300  # of RANSAC for an edge: more find the same inliers at five times the cost
-LARGE = 100  # images; a larger scene has the cost of all its tracks, a smaller one their accuracy
+LARGE = 100  # images; a larger scene has the cost of all its tracks, a smaller scene their accuracy
 TRACKS_PER_IMAGE = 200  # that the global mapper keeps at first in a large scene, the longest
 MIN_REGISTERED = 0.85  # share of a small scene's images below which the other mapper is asked
 SEED = 0
@@ -45,8 +45,8 @@ def structure_from_motion(
 
     Each image has a camera of its own, except those with ``shared`` intrinsics, which start at the shared focal
     length. The global mapper goes first. Where it leaves many images of a small scene without a camera, the
-    incremental one is asked too, and the reconstruction in which images see points more often stays. In
-    ``directory`` COLMAP's files are left, in the place of earlier ones: the database, and a folder of each model.
+    incremental mapper is asked too, and the reconstruction in which images see points more often stays. In
+    ``directory`` COLMAP's files are left, in the place of earlier files: the database, and a folder of each model.
     """
     pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
     pycolmap.set_random_seed(SEED)

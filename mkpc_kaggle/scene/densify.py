@@ -16,7 +16,7 @@ def extra_pairs(image_count: int, pairs: Sequence[Ends], per_image: float) -> li
 
     ``pairs`` are those that it has, in any order; a call with these and the extra pairs, and a larger number, goes
     on from there. In each step the image in the fewest pairs gets a partner: the image that has most
-    partners in common with it, since they are likely to show the same, and among these the one in the fewest
+    partners in common with it, since they are likely to show the same, and among these the image in the fewest
     pairs. Nothing for a batch of more than ``MAX_IMAGES``.
     """
     if image_count > MAX_IMAGES:

@@ -23,7 +23,7 @@ SharedIntrinsics: TypeAlias = Mapping[str, float]
 def shared_intrinsics(
     images: Sequence[BatchImage], models: Iterable[SfmModel], tolerance: float
 ) -> SharedIntrinsics:
-    """The focal lengths that images of one size share, because more than half of the registered ones agree.
+    """The focal lengths that images of one size share, because more than half of the registered images agree.
 
     To agree is to be within a share of ``tolerance`` of their median. All images of the size share it, registered
     or not, except those that see many points at another focal length: they were taken at another zoom.
