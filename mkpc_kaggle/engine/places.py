@@ -86,9 +86,9 @@ class Place:
             worker.kill()
 
     def _lose(self, failure: Failure, now: float) -> None:
-        """The worker ends: what ran out of memory has it in pieces, and a device that failed goes on failing.
+        """End the worker: memory that ran out is fragmented, and a device that failed goes on failing.
 
-        That it died, or hung, of what another worker was lost at says nothing of the place.
+        A death or a hang at a job that another worker was lost at does not count against the place.
         """
         job, was_loaded = self.job, self.is_loaded
         self.kill()

@@ -71,7 +71,7 @@ class ThreadWorker:
     def _live(self) -> None:
         try:
             answer = self._load()
-        except Exception as error:  # no memory, or no process more
+        except Exception as error:  # out of memory, or of processes
             answer = Failure(Cause.NOT_STARTED, str(error))
         while True:
             self._answers.put(answer)
@@ -152,9 +152,10 @@ _environment = threading.Lock()
 
 @contextmanager
 def worker_environment() -> Iterator[None]:
-    """A process started meanwhile has :data:`WORKER_ENVIRONMENT`, but for what the user has set; this one has not
-    (its own OpenMP library is loaded already). It hears neither Ctrl-C, which a terminal sends to all, nor
-    SIGTERM: its parent answers to them, and ends it.
+    """Processes started meanwhile have :data:`WORKER_ENVIRONMENT`, except what the user has set.
+
+    It is removed again here, where the OpenMP library is loaded already. These processes ignore Ctrl-C, which a
+    terminal sends to all, and SIGTERM: their parent handles both, and ends them.
     """
     resource_tracker.ensure_running()  # started with the first process, it would unblock them
     with _environment, ExitStack() as restored:

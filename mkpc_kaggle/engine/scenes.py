@@ -170,7 +170,7 @@ class Scenes:
     def _batch_pair(self, index: int, results: Sequence[UnitResult]) -> BatchPair:
         record = self._records[index]
         image0, image1 = (
-            BatchImage(path.stem, version.split()[0], size)
+            BatchImage(path.stem, version, size)
             for path, version, size in zip(self._pairs[index].images, record.versions, record.sizes, strict=True)
         )
         matches = Matches.concatenate(result.matches for result in results)

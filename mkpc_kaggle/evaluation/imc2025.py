@@ -159,8 +159,7 @@ def _poses(path: Path) -> dict[str, dict[str, dict[str, Points]]]:
     """The camera centres of a table of poses: by dataset, scene or cluster, and image."""
     found: dict[str, dict[str, dict[str, Points]]] = {}
     seen: set[tuple[str, str]] = set()
-    for line, (dataset, scene, image, *cells) in read_rows(path, POSE_COLUMNS):
-        where = f"{path}, line {line}"
+    for where, (dataset, scene, image, *cells) in read_rows(path, POSE_COLUMNS):
         if (dataset, image) in seen:
             raise UserError(f"{where}: the image {dataset}/{image} is there twice")
         seen.add((dataset, image))

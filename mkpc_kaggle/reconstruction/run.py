@@ -39,7 +39,7 @@ class FolderResult:
 
 
 def for_cameras(recipe: Recipe) -> Recipe:
-    """The recipe without what only the F of single pairs gains by, and with no pair that was not asked for."""
+    """The recipe without steps that only improve the F of single pairs, and without extra pairs."""
     scene = replace(recipe.scene or SceneConfig(), each_matcher=False, pairs_per_image=0.0)
     return replace(recipe, focal=None, scene=scene)
 
@@ -73,8 +73,9 @@ def reconstruct_folder(
     report = run_pairs(pairs, assembly, replace(session, exports=exports))
     digests: dict[tuple[str, str], str] = {}
     for pair, record in zip(pairs, report.records, strict=True):
-        for path, version in zip(pair.images, record.versions, strict=False):
-            digests[pair.group, exports[pair.group].files[path.stem][0]] = version.split()[0]
+        # A pair that was not reached, or of which an image cannot be read, has no versions.
+        for path, version in zip(pair.images if record.versions else (), record.versions, strict=True):
+            digests[pair.group, exports[pair.group].files[path.stem][0]] = version
     scenes = {scene.batch: scene for scene in report.scenes}
     cameras = {dataset: cameras_of(dataset, scenes.get(dataset.name), digests) for dataset in datasets}
     for dataset, found in cameras.items():
