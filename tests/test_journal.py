@@ -14,7 +14,7 @@ from rectified import SECOND, SWEEP, THREE_UNITS
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.codec import encode
 from mkpc_kaggle.engine.jobs import Outcome
-from mkpc_kaggle.engine.journal import MAX_DRAWN_PAIRS, Journal
+from mkpc_kaggle.engine.journal import Journal
 from mkpc_kaggle.engine.records import CameraRecord, PairRecord, SceneRecord
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Box, Size
@@ -55,7 +55,7 @@ def journal(tmp_path: Path) -> Iterator[Journal]:
 def test_what_is_saved_is_there_after_opening_again(tmp_path: Path) -> None:
     saved = [outcome(3, seed=0), outcome(7, seed=2)]
     with Journal(tmp_path, OURS) as journal:
-        journal.save([(pair, False) for pair in saved])
+        journal.save(saved)
     with Journal(tmp_path, OURS) as again:
         records = again.records()
         assert list(records) == [3, 7]
@@ -71,29 +71,16 @@ def points_of(journal: Journal, pair: int) -> int:
     return sum(len(result.matches) for result in journal.results(journal.records()[pair], UNITS))
 
 
-def test_the_points_of_settled_pairs_are_kept_of_the_weakest_only(journal: Journal) -> None:
-    count = 3 * MAX_DRAWN_PAIRS
-    saved = [outcome(index, seed=index) for index in range(count)]
-    for start in range(0, count, 7):
-        journal.save([(pair, True) for pair in saved[start : start + 7]])
-    by_strength = sorted((pair.record.inliers, pair.record.index) for pair in saved)
-    weakest = {index for _, index in by_strength[:MAX_DRAWN_PAIRS]}
-    assert {index for index in range(count) if points_of(journal, index)} == weakest
-    assert {record.units[0].matches for record in journal.records().values()} == {30}
-    journal.save([(outcome(count, seed=1), False)])
-    assert points_of(journal, count) == 30, "what a later job builds on is kept"
-
-
 def test_a_job_is_saved_whole_or_not_at_all(journal: Journal) -> None:
     broken = Outcome(PairRecord(8, object(), ""))  # type: ignore[arg-type]
     with pytest.raises(AttributeError):
-        journal.save([(outcome(3), False), (broken, False)])
+        journal.save([outcome(3), broken])
     assert journal.records() == {}
-    journal.save([(outcome(3), False)])
+    journal.save([outcome(3)])
     assert list(journal.records()) == [3]
     journal._db.execute("CREATE TEMP TRIGGER t BEFORE INSERT ON points BEGIN SELECT RAISE(ABORT, 'no room'); END")
     with pytest.raises(sqlite3.IntegrityError, match="no room"):
-        journal.save([(outcome(5), False)])
+        journal.save([outcome(5)])
     assert list(journal.records()) == [3], "what was written before is taken back"
 
 
@@ -106,7 +93,7 @@ def test_a_journal_of_another_run_is_refused_and_says_what_differs(tmp_path: Pat
 
 def test_fresh_forgets_what_was_there(tmp_path: Path) -> None:
     with Journal(tmp_path, OURS) as journal:
-        journal.save([(outcome(), False)])
+        journal.save([outcome()])
     with Journal(tmp_path, {**OURS, "recipe": {}}, fresh=True) as journal:
         assert journal.records() == {}
 
@@ -124,11 +111,11 @@ def test_what_a_full_disk_refuses_is_known_and_written_when_there_is_room(journa
     index = 0
     with pytest.raises(sqlite3.OperationalError, match="full"):
         for index in range(200):
-            journal.save([(outcome(index, seed=index), False)])
+            journal.save([outcome(index, seed=index)])
     assert index not in journal.records()
     assert sum(len(result.matches) for result in journal.results(outcome(index).record, UNITS)) == 30
     journal._db.execute("PRAGMA max_page_count = 100000")
-    journal.save([(outcome(999), False)])
+    journal.save([outcome(999)])
     assert set(journal.records()) == {*range(index + 1), 999}
     assert points_of(journal, index) == 30
 
@@ -137,7 +124,7 @@ def damaged_journal(directory: Path, damage: str) -> Path:
     """A journal of two pairs and a scene, after a statement that no run makes."""
     journal = Journal(directory, OURS, pairs=PAIRS)
     journal.note("start", 0.0, "")
-    journal.save([(outcome(3, seed=1), False), (outcome(7, seed=2), False)])
+    journal.save([outcome(3, seed=1), outcome(7, seed=2)])
     camera = CameraRecord("a", 0, (0.0, 0.0, 1.0), (0.0, 0.0, 1.0), (0.0, 1.0, 0.0), 500.0, Size(640, 480), 9)
     scene = SceneRecord("batch", 2, 2, 1, 9, 3, 1.5, "", (camera,), (((0.0, 0.0, 5.0),),))
     chosen = {3: Choice(np.eye(3), Reason.SCENE), 7: Choice(None, Reason.UNREGISTERED)}
@@ -260,13 +247,6 @@ def test_a_refused_journal_holds_no_lock_and_no_file(tmp_path: Path) -> None:
 
 def test_text_that_is_not_utf8_is_kept_in_letters(journal: Journal) -> None:
     record = PairRecord.untouched(3, os.fsdecode(b"\xff: no such file"))
-    journal.save([(Outcome(record), False)])
+    journal.save([Outcome(record)])
     journal.note("fault", 0.0, os.fsdecode(b"\xff"))
     assert journal.records()[3].failure == "\\udcff: no such file"
-
-
-def test_pairs_that_no_row_names_take_no_place_among_those_that_are_drawn(tmp_path: Path) -> None:
-    asked = [Pair(f"one;{index}", "one", "a.png", "b.png") for index in range(2)]
-    with Journal(tmp_path, OURS, pairs=asked) as journal:
-        journal.save([(outcome(index, seed=index), True) for index in reversed(range(MAX_DRAWN_PAIRS + 2))])
-        assert [index for index in range(MAX_DRAWN_PAIRS + 2) if points_of(journal, index)] == [0, 1]

@@ -24,12 +24,9 @@ from mkpc_kaggle.recipe import Unit
 DIED = Failure(Cause.DIED, "signal SIGKILL")
 
 
-def plan_of(count: int = 40, limit: float = math.inf, extra: int = 0, connecting: int = 0) -> Plan:
+def plan_of(count: int = 40, limit: float = math.inf, extra: int = 0) -> Plan:
     records = [PairRecord.untouched(index) for index in range(count + extra)]
-    budget = Budget(0.0, limit, lambda: 0.0)
-    return Plan(
-        range(count), THREE_UNITS, records, budget, extra=range(count, count + extra), connecting=connecting
-    )
+    return Plan(range(count + extra), count, THREE_UNITS, records, Budget(0.0, limit, lambda: 0.0))
 
 
 def finished(job: MatchJob, plan: Plan, inliers: Callable[[int], int] = lambda _: 50) -> MatchResult:
@@ -74,7 +71,7 @@ def explained(plan: Plan, text: str) -> bool:
 
 
 def test_the_phases_follow_each_other_and_every_pair_has_every_unit():
-    plan = plan_of(extra=3, connecting=2)
+    plan = plan_of(extra=3)
     phases = [job.phase for job in jobs_of(plan)]
     assert phases == sorted(phases, key=list(Phase).index)
     assert plan.is_complete
@@ -226,15 +223,15 @@ def test_units_that_do_not_fit_for_all_go_to_the_weakest_pairs_in_the_time_left(
     assert not plan.is_complete
 
 
-def test_further_pairs_of_scenes_are_matched_when_all_units_have_run():
+def test_pairs_for_the_scenes_alone_take_a_tenth_of_the_time_left_at_most():
     plan = plan_of(6, limit=100.0, extra=80)
     jobs = list(jobs_of(plan))
     assert all(not record.lacking(THREE_UNITS.units) for record in plan.records[:6])
-    further = [job for job in jobs if job.phase is Phase.DENSIFY]
-    assert {job.units for job in further} == {(SWEEP,)}
+    extra = [job for job in jobs if job.phase is Phase.CONNECT]
+    assert {job.units for job in extra} == {(SWEEP,)}
     had = [record.index for record in plan.records[6:] if record.units]
-    assert had == list(range(6, 6 + len(had))), "in their order"
-    assert 15 < len(had) < 45, "half of the time left is kept for their scenes"
+    assert had == list(range(6, 6 + len(had))), "the most wanted"
+    assert 5 < len(had) < 10
     assert plan.is_complete
 
 
@@ -315,14 +312,6 @@ def test_a_scene_that_hangs_is_ended_and_the_others_have_their_turn():
     assert any(scene.seconds == math.inf for scene in ran.scenes)
     assert ran.late == ran.lost == ran.missed == 0
     assert any("the worker hung" in fault for fault in ran.report.faults)
-
-
-def test_scenes_are_made_anew_of_the_further_pairs_that_the_time_left_allows():
-    ran = simulate(Scenario(300, (0.5, 1.0), 1, 3600.0, batches=3, pairs_per_image=1.0, misses=0))
-    assert ran.late == ran.lost == ran.missed == 0
-    assert any("pairs for the scenes alone" in explanation.text for explanation in ran.report.explanations)
-    assert len(ran.scenes) == 6, "each batch twice"
-    assert ran.report.ending is Ending.COMPLETE
 
 
 @pytest.mark.parametrize("moment", range(50, 1050, 100))

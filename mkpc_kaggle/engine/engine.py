@@ -85,9 +85,8 @@ class Engine:
         minibatch: int = 1,
         exports: Mapping[str, Export] = MappingProxyType({}),
     ) -> None:
-        extra, connecting = extra_pairs_of(pairs, recipe.scene)
         self.asked = len(pairs)
-        self.pairs = [*pairs, *extra]
+        self.pairs = [*pairs, *extra_pairs_of(pairs, recipe.scene)]
         self.recipe, self.site, self.journal, self.budget = recipe, site, journal, budget
         self.publish, self.interrupt = publish, interrupt
         self.faults: list[str] = []
@@ -98,16 +97,8 @@ class Engine:
         self._progress = console.Progress(budget) if progress else None
         self._publishing = threading.Lock()
         self._has_ended = self._has_loaded = False
-        further = range(self.asked + connecting, len(self.pairs))
-        self.plan = Plan(
-            visiting_order(pairs),
-            recipe,
-            self._read_records(),
-            budget,
-            extra=[*(self.asked + place for place in visiting_order(extra[:connecting])), *further],
-            connecting=connecting,
-            minibatch=minibatch,
-        )
+        order, records = visiting_order(self.pairs), self._read_records()
+        self.plan = Plan(order, self.asked, recipe, records, budget, minibatch)
         self.scenes = Scenes(self.pairs, recipe, self.plan.records, journal.scenes(), exports)
         self._scene_places: list[Place] = []
 
@@ -254,7 +245,7 @@ class Engine:
         plan.reserve = self.scenes.reserve(at_once)
 
     def _take_scene(self, job: SceneJob, answer: Answer, seconds: float) -> None:
-        """Record what came of a batch; if nothing can change it any more, the points of its pairs can go."""
+        """Record what came of a batch."""
         records, record = self.plan.records, None
         if isinstance(answer, SceneResult):
             record = SceneRecord.of(job.batch, answer.reconstructions, job.made_from, seconds)
@@ -267,9 +258,7 @@ class Engine:
             record = self.scenes.on_failure(job, str(answer), seconds)
         if record is not None:
             members = [records[index] for index in self.scenes.batches[job.batch]]
-            may_change = any(self.plan.may_gain(pair) or self.scenes.needs(pair.index) for pair in members)
-            settled = [] if record.failure or may_change else [pair for pair in members if pair.units]
-            self._save(partial(self.journal.save_scene, record, members, settled))
+            self._save(partial(self.journal.save_scene, record, members))
 
     # The journal and the submission
 
@@ -290,11 +279,10 @@ class Engine:
             return ()
 
     def _keep(self, outcomes: Sequence[Outcome]) -> None:
-        """Put outcomes into the journal, without points where nothing builds on them."""
+        """Put outcomes into the journal; the scenes of their batches are out of date."""
         for outcome in outcomes:
             self.scenes.note_change(outcome.record.index)
-        wanted = (self.plan.wanted(o.record) or self.scenes.needs(o.record.index) for o in outcomes)
-        self._save(partial(self.journal.save, [(o, not more) for o, more in zip(outcomes, wanted, strict=True)]))
+        self._save(partial(self.journal.save, outcomes))
 
     def _save(self, write: Callable[[], None]) -> None:
         """Write to the journal: a full disk costs what a later run would have had of it."""

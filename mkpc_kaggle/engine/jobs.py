@@ -23,7 +23,6 @@ class Phase(StrEnum):
     CONNECT = "connect"  # the first unit on pairs that no row names, where a batch has few
     DEEPEN = "deepen"  # the other units, as many as fit
     FILL = "fill"  # units that did not fit for all, on the weakest pairs first, in the time that is left
-    DENSIFY = "densify"  # the first unit on further pairs that no row names, in the time left after that
 
 
 @dataclass(frozen=True)

@@ -2,8 +2,8 @@
 
 A value is a JSON text (see :mod:`mkpc_kaggle.engine.codec`). Tables: ``run`` (what the journal belongs to and who
 wrote it), ``sample`` (ids and images of the pairs), ``pair`` (a :class:`PairRecord` for each pair that was
-reached), ``points`` (of a unit on a pair, while a later job may build on them or the report may draw them),
-``scene`` (a :class:`SceneRecord` for each batch), ``event`` (what happened when).
+reached), ``points`` (of a unit on a pair: later jobs, scenes and the report need them), ``scene`` (a
+:class:`SceneRecord` for each batch), ``event`` (what happened when).
 """
 
 import json
@@ -12,7 +12,7 @@ import sqlite3
 import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from functools import cache
 from pathlib import Path
@@ -27,12 +27,9 @@ from mkpc_kaggle.errors import UserError, writing
 from mkpc_kaggle.pipeline.pair import UnitResult
 from mkpc_kaggle.recipe import Unit
 
-FORMAT = 7
+FORMAT = 8
 FILE_NAME = "journal.sqlite"
 LOCK_NAME = "journal.lock"
-MAX_DRAWN_PAIRS = (
-    20  # how many of the weakest pairs keep their points when no later job needs them: the report draws them
-)
 
 SCHEMA = """
 CREATE TABLE run (key TEXT PRIMARY KEY, value TEXT NOT NULL);
@@ -45,7 +42,6 @@ CREATE TABLE event (key INTEGER PRIMARY KEY, value TEXT NOT NULL);
 SAVE_PAIR = "REPLACE INTO pair VALUES (?, ?)"
 SAVE_POINTS = "REPLACE INTO points VALUES (?, ?, ?)"
 SAVE_SCENE = "REPLACE INTO scene VALUES (?, ?)"
-DROP_POINTS = "DELETE FROM points WHERE pair = ?"
 
 Statement = tuple[str, tuple[Any, ...]]  # and its values
 
@@ -214,8 +210,6 @@ class Journal(JournalReader):
     ) -> None:
         path, lock = directory / FILE_NAME, directory / LOCK_NAME
         self._unsaved: list[Statement] = []
-        self._asked = len(pairs)
-        self._drawn: dict[int, int] = {}  # the inliers of the settled pairs that keep their points
         with ExitStack() as opened, writing(f"the work directory {directory}"):  # left open where all is well
             directory.mkdir(parents=True, exist_ok=True)
             self._lock = opened.enter_context(closing(connect(lock)))
@@ -232,49 +226,43 @@ class Journal(JournalReader):
     def forget_changed(self, pairs: Sequence[Pair]) -> int:
         """Forget the pairs of which an image has not the content any more that was matched; how many these are.
 
-        Where such an image was in a scene, all pairs of its batch are forgotten, and the scene: pairs that had all
-        they wanted have no points any more to reconstruct it from.
+        Where such an image was in a scene, the scene is forgotten, too.
         """
-        same, batches = cache(is_unchanged), {scene.batch for scene in self.scenes()}
+        same = cache(is_unchanged)
         with undamaged(self.path), self._db:
             self._db.execute("BEGIN")
             records = self.records().values()
             if any(not 0 <= record.index < len(pairs) for record in records):
                 raise LookupError("it has pairs that the test set has not")
             changed = {r.index for r in records if not all(map(same, pairs[r.index].images, r.versions))}
-            outdated = {pairs[index].group for index in changed} & batches
-            forgotten = changed | {index for index, pair in enumerate(pairs) if pair.group in outdated}
+            outdated = {pairs[index].group for index in changed}
+            without = [replace(record, scene=None) for record in records if pairs[record.index].group in outdated]
+            self._db.executemany(SAVE_PAIR, [(record.index, encode(record)) for record in without])
             for statement, keys in (
-                ("DELETE FROM pair WHERE key = ?", forgotten),
-                (DROP_POINTS, forgotten),
+                ("DELETE FROM pair WHERE key = ?", changed),
+                ("DELETE FROM points WHERE pair = ?", changed),
                 ("DELETE FROM scene WHERE key = ?", outdated),
             ):
                 self._db.executemany(statement, [(key,) for key in keys])
-        return len(forgotten)
+        return len(changed)
 
-    def save(self, outcomes: Sequence[tuple[Outcome, bool]]) -> None:
-        """Put down a job's outcomes, all or none; the points of those marked True no later job needs.
+    def save(self, outcomes: Iterable[Outcome]) -> None:
+        """Put down a job's outcomes, all or none.
 
-        Of these, the weakest keep them for the report: at most :data:`MAX_DRAWN_PAIRS` of a run. An outcome may
-        have the new results alone: what was put down of others stays.
+        An outcome may have the new results alone: what was put down of others stays.
         """
         statements: list[Statement] = []
-        for outcome, is_settled in outcomes:
+        for outcome in outcomes:
             index = outcome.record.index
             statements.append((SAVE_PAIR, (index, encode(outcome.record))))
-            dropped = self._settle(outcome.record) if is_settled else None
-            for result in outcome.results if dropped != index else ():
+            for result in outcome.results:
                 statements.append((SAVE_POINTS, (index, result.unit.name, to_blob(result.matches))))
-            statements.append((DROP_POINTS, (dropped,)))
         self._write(statements)
 
-    def save_scene(
-        self, scene: SceneRecord, records: Iterable[PairRecord], settled: Iterable[PairRecord] = ()
-    ) -> None:
-        """Put down what came of a batch, and its pairs' records; those ``settled`` need no points any more."""
+    def save_scene(self, scene: SceneRecord, records: Iterable[PairRecord]) -> None:
+        """Put down what came of a batch, and its pairs' records."""
         pairs = [(SAVE_PAIR, (record.index, encode(record))) for record in records]
-        drops = [(DROP_POINTS, (self._settle(record),)) for record in settled]
-        self._write([*pairs, *drops, (SAVE_SCENE, (scene.batch, encode(scene)))])
+        self._write([*pairs, (SAVE_SCENE, (scene.batch, encode(scene)))])
 
     def note(self, kind: str, seconds: float, text: str) -> None:
         """Put down what happened, ``seconds`` after the start; ``kind`` is an :class:`EventKind`.
@@ -293,17 +281,6 @@ class Journal(JournalReader):
     def _points(self, index: int) -> dict[str, bytes]:
         unsaved = (values for statement, values in self._unsaved if statement == SAVE_POINTS)
         return super()._points(index) | {unit: blob for pair, unit, blob in unsaved if pair == index}
-
-    def _settle(self, record: PairRecord) -> int | None:
-        """Enter a pair among the weakest so far; the pair that is not among them any more, perhaps itself."""
-        if self._asked and record.index >= self._asked:
-            return record.index  # no row names it, so the report does not draw it
-        self._drawn[record.index] = record.inliers
-        if len(self._drawn) <= MAX_DRAWN_PAIRS:
-            return None
-        strongest = max(self._drawn, key=lambda index: (self._drawn[index], index))
-        del self._drawn[strongest]
-        return strongest
 
     def _write(self, statements: Sequence[Statement]) -> None:
         """Execute what has not been yet, in one transaction."""

@@ -22,17 +22,11 @@ JOB_SHARE = 0.05  # of the time left that a job may be expected to take: what a 
 EXPLORE_SHARE = 0.25  # of the time left that may be spent to learn what a unit costs that never ran
 MAX_EXPLORE_S = 600.0
 CONNECT_SHARE = 0.1  # of the time left after the sweep, for pairs that no row names
-DENSIFY_SHARE = 0.5  # of the time left when all units have run, for further such pairs; the rest is for scenes
 RESERVE_SHARE = 0.2  # of the limit that is left to reconstruction at most
 MAX_TRIES = 2  # of a unit on a single pair, before it is given up there
 MAX_FAILED_PAIRS = 2  # a unit that was given up on so many pairs and never ran is given up on all
 SLOW_FACTOR = 3.0  # a job that takes this many times what was expected begins no further unit
 HANG_FACTOR = 10.0  # a unit that takes this many times what it takes on nine of ten pairs hangs
-# What the pairs of the last phases are.
-IN_THE_TIME_LEFT = {
-    Phase.FILL: "pairs that lack units, the weakest first",
-    Phase.DENSIFY: "pairs for the scenes alone",
-}
 
 
 @dataclass(frozen=True)
@@ -107,29 +101,27 @@ class ChunkQueue:
 
 
 class Plan:
-    """The phases of a run over the pairs of ``order`` and, for the scenes alone, of ``extra``, which no row names.
+    """The phases of a run over the pairs of ``order``; indices from ``asked`` on are those that no row names.
 
-    ``records``, of all pairs by index, asked pairs first, change through it. The first ``connecting`` of the extra
-    pairs are for the connect phase. ``workers`` work at a time; ``reserve`` seconds of the end are left to scenes.
+    ``records``, of all pairs by index, change through it. Of the pairs for the scenes alone, those of lower index
+    are wanted more. ``workers`` work at a time; ``reserve`` seconds of the end are left to scenes.
     ``done`` are the pairs that have what fits for all; ``unusable`` names the units that no worker can run.
     """
 
     def __init__(
         self,
         order: Sequence[int],
+        asked: int,
         recipe: Recipe,
         records: list[PairRecord],
         budget: Budget,
-        *,
-        extra: Sequence[int] = (),
-        connecting: int = 0,
         minibatch: int = 1,
     ) -> None:
         self.recipe, self.records, self.budget = recipe, records, budget
         self.workers = 1
         self.reserve = 0.0
         self.explanations: list[Explanation] = []
-        self._order, self._extra, self._connecting, self._minibatch = order, extra, connecting, minibatch
+        self._order, self._asked, self._minibatch = order, asked, minibatch
         self._stuck: set[int] = set()  # an image cannot be read, or what was found before
         self._lacking = Counter(unit for record in records for unit in self._lacks(record))
         self._begin()
@@ -138,7 +130,7 @@ class Plan:
         """Everything is to come, and nothing is known of the devices."""
         self.costs = Costs()
         self.unusable: set[str] = set()
-        self.done = set(self._extra)
+        self.done = set(range(self._asked, len(self.records)))
         self.phase = Phase.SWEEP
         self._coming = list(Phase)
         self._queue = ChunkQueue()
@@ -262,23 +254,22 @@ class Plan:
 
     def _open(self, phase: Phase, now: float) -> None:
         """Begin a phase."""
-        self.phase, indices = phase, self._order
+        self.phase, indices = phase, [index for index in self._order if index < self._asked]
         if phase is Phase.CONNECT:
-            indices = self._extra[: self._pairs_that_fit(CONNECT_SHARE, self._connecting, now)]
-            if self._connecting:
-                self.explain(now, f"{len(indices)} of {self._connecting} pairs are matched for the scenes alone")
+            extra = len(self.records) - self._asked
+            count = self._pairs_that_fit(CONNECT_SHARE, extra, now)
+            indices = [index for index in self._order if self._asked <= index < self._asked + count]
+            if extra:
+                self.explain(now, f"{count} of {extra} pairs are matched for the scenes alone")
         elif phase is Phase.DEEPEN:
             self.explain(now, "the sweep is over; deepening begins")
         elif phase is Phase.FILL:
-            lacking = filter(self.may_gain, self.records[: len(self._order)])
+            lacking = filter(self.may_gain, self.records[: self._asked])
             weakest = sorted(lacking, key=lambda record: (record.inliers, record.index))
             busy = self._queue.under_way | {index for chunk in self._queue.again for index in chunk.indices}
             indices = [record.index for record in weakest if record.index not in busy]
-        elif phase is Phase.DENSIFY:
-            indices = [index for index in self._extra if self.can_gain(index, self._first)]
-            indices = indices[: self._pairs_that_fit(DENSIFY_SHARE, len(indices), now)]
-        if indices and phase in IN_THE_TIME_LEFT:
-            self.explain(now, f"in the time left: {len(indices)} {IN_THE_TIME_LEFT[phase]}")
+            if indices:
+                self.explain(now, f"in the time left: {len(indices)} pairs that lack units, the weakest first")
         self._total, self._left = len(indices), set(indices)
         size = max(JOB_PAIRS, JOB_MINIBATCHES * self._minibatch if self._minibatch > 1 else 0)
         self._queue.fresh.extend(chunks_of(phase, indices, size))
@@ -381,24 +372,16 @@ class Plan:
     @property
     def filling(self) -> Collection[int]:
         """Pairs that get more than what fits for all, in the time left."""
-        return self._left if self.phase in IN_THE_TIME_LEFT else ()
-
-    def wanted(self, record: PairRecord) -> list[Unit]:
-        """The units that a pair still gets if there is time."""
-        if record.index < len(self._order):
-            return record.lacking(self.usable(self.recipe.units))
-        is_over = self.phase is Phase.DENSIFY and record.index not in self._left
-        return [] if is_over else record.lacking(self._first)
+        return self._left if self.phase is Phase.FILL else ()
 
     def may_gain(self, record: PairRecord) -> bool:
-        """Whether a pair can get units that it wants; a pair with a row only after it got its first."""
-        is_ready = record.units or record.index >= len(self._order)
-        return bool(is_ready and record.index not in self._stuck and self.wanted(record))
+        """Whether a pair that has its first unit can get further units."""
+        return bool(record.units) and self.can_gain(record.index, self.usable(self.recipe.units))
 
     @property
     def is_complete(self) -> bool:
         """Whether every pair has been reached, and none can gain what it wants."""
-        return all(record.reached and not self.may_gain(record) for record in self.records[: len(self._order)])
+        return all(record.reached and not self.may_gain(record) for record in self.records[: self._asked])
 
     @property
     def nothing_runs(self) -> bool:
@@ -421,5 +404,5 @@ class Plan:
 
     def _lacks(self, record: PairRecord) -> list[str]:
         """The units that a pair is to get yet, if it has an F and a row."""
-        has_row = record.index < len(self._order)
+        has_row = record.index < self._asked
         return [unit.name for unit in record.lacking(self.recipe.units)] if record.units and has_row else []

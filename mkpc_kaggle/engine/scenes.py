@@ -7,7 +7,6 @@ since. Pairs have the F of their own matches all the while.
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
-from math import ceil
 from pathlib import Path
 from types import MappingProxyType
 
@@ -23,7 +22,6 @@ from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair, tracks_of
 
 MIN_PAIRS = 2  # they can connect three images
 MAX_TRIES = 2  # of a reconstruction that is lost
-DENSIFY_PAIRS_PER_IMAGE = 15.0  # of a batch, once all units have run: above, pairs add time alone
 START_S = 3.0  # that a process takes to begin
 PAIR_S = 0.2  # that a pair adds to a reconstruction, as long as nothing is known
 FORECAST_MARGIN = 1.5  # a reconstruction may take this many times what its pairs took in earlier scenes
@@ -39,30 +37,24 @@ def batches_of(pairs: Iterable[Pair]) -> dict[str, list[int]]:
     return {name: members for name, members in batches.items() if len(members) >= MIN_PAIRS}
 
 
-def extra_pairs_of(pairs: Sequence[Pair], config: SceneConfig | None) -> tuple[list[Pair], int]:
-    """Pairs of images of a batch that no row names, to be matched for its scene alone, in order of their use.
+def extra_pairs_of(pairs: Sequence[Pair], config: SceneConfig | None) -> list[Pair]:
+    """Pairs of images of a batch that no row names, to be matched for its scene alone; the most wanted first.
 
-    The second value is how many of them connect batches that have less than ``pairs_per_image``; the others add to
-    those with the fewest first, in the time that is left.
+    Each batch gets as many as it lacks to have ``pairs_per_image``, a batch with the fewest an image first.
     """
     if config is None or not config.pairs_per_image:
-        return [], 0
-    connecting: list[Pair] = []
-    further: list[tuple[float, list[Pair]]] = []
+        return []
+    extra: list[tuple[float, Pair]] = []
     for batch, places in batches_of(pairs).items():
         asked = [pairs[place] for place in places]
         files = list(dict.fromkeys(file for pair in asked for file in (pair.file0, pair.file1)))
         number = {file: place for place, file in enumerate(files)}
         ends = [(number[pair.file0], number[pair.file1]) for pair in asked]
-        found = extra_pairs(len(files), ends, max(config.pairs_per_image, DENSIFY_PAIRS_PER_IMAGE))
-        named = [(files[i], files[j]) for i, j in found]
-        extra = [Pair(f"{batch};{Path(a).stem}-{Path(b).stem}", batch, a, b) for a, b in named]
         distinct = len({tuple(sorted(pair)) for pair in ends})
-        count = max(0, ceil(config.pairs_per_image * len(files)) - distinct)
-        connecting += extra[:count]
-        further.append((distinct / len(files), extra[count:]))
-    further.sort(key=lambda batch: batch[0])
-    return connecting + [pair for _, extra in further for pair in extra], len(connecting)
+        for count, (i, j) in enumerate(extra_pairs(len(files), ends, config.pairs_per_image), start=distinct):
+            key = f"{batch};{Path(files[i]).stem}-{Path(files[j]).stem}"
+            extra.append((count / len(files), Pair(key, batch, files[i], files[j])))
+    return [pair for _, pair in sorted(extra, key=lambda each: each[0])]
 
 
 class Scenes:
@@ -107,10 +99,6 @@ class Scenes:
             if is_ready and any(self._records[index].units for index in indices):
                 return name
         return None
-
-    def needs(self, index: int) -> bool:
-        """Whether a reconstruction to come wants the pair's matches."""
-        return self._batch_of.get(index) in self._outdated
 
     def job(self, batch: str, results_of: Callable[[int], tuple[UnitResult, ...]]) -> SceneJob:
         """The job that reconstructs a batch; ``results_of`` gives what was found on a pair."""

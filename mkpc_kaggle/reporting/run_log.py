@@ -6,7 +6,7 @@ from functools import cached_property
 from pathlib import Path
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine.journal import MAX_DRAWN_PAIRS, About, Event, EventKind, JournalReader, undamaged
+from mkpc_kaggle.engine.journal import About, Event, EventKind, JournalReader, undamaged
 from mkpc_kaggle.engine.records import PairRecord, SceneRecord
 from mkpc_kaggle.errors import writing
 from mkpc_kaggle.geometry.matches import Matches
@@ -15,6 +15,7 @@ from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult
 from mkpc_kaggle.recipe import Recipe, recipe_of
 from mkpc_kaggle.reporting.tables import RunTables, run_tables, to_json
 
+MAX_DRAWN_PAIRS = 20  # the weakest, which the report draws
 NOT_ENDED = "not ended (at work, or killed)"
 
 

@@ -14,10 +14,9 @@ Ends: TypeAlias = tuple[int, int]  # the two images of a pair by their places, t
 def extra_pairs(image_count: int, pairs: Sequence[Ends], per_image: float) -> list[Ends]:
     """The pairs that a batch lacks to have ``per_image`` pairs for each of its images, the most wanted first.
 
-    ``pairs`` are those that it has, in any order; a call with these and the extra pairs, and a larger number, goes
-    on from there. In each step the image in the fewest pairs gets a partner: the image that has most
-    partners in common with it, since they are likely to show the same, and among these the image in the fewest
-    pairs. Nothing for a batch of more than ``MAX_IMAGES``.
+    ``pairs`` are those that it has, in any order. In each step the image in the fewest pairs gets a partner: the
+    image that has most partners in common with it, since they are likely to show the same, and among these the
+    image in the fewest pairs. Nothing for a batch of more than ``MAX_IMAGES``.
     """
     if image_count > MAX_IMAGES:
         return []

@@ -333,8 +333,8 @@ class MemoryJournal:
     def results(self, record: PairRecord, units: Mapping[str, Unit]) -> tuple[UnitResult, ...]:
         return self._results.get(record.index, ())
 
-    def save(self, outcomes: list[tuple[Outcome, bool]]) -> None:
-        for outcome, _ in outcomes:
+    def save(self, outcomes: Iterable[Outcome]) -> None:
+        for outcome in outcomes:
             index = outcome.record.index
             self._records[index] = outcome.record
             self._results[index] = self._results.get(index, ()) + outcome.results
@@ -342,9 +342,7 @@ class MemoryJournal:
     def scenes(self) -> tuple[SceneRecord, ...]:
         return tuple(self._scenes.values())
 
-    def save_scene(
-        self, scene: SceneRecord, records: Iterable[PairRecord], settled: Iterable[PairRecord] = ()
-    ) -> None:
+    def save_scene(self, scene: SceneRecord, records: Iterable[PairRecord]) -> None:
         self._scenes[scene.batch] = scene
         self._records |= {record.index: record for record in records}
 
