@@ -1,9 +1,8 @@
 """Size of the journal of a long run, and the time to go on from it.
 
-python -m benchmarks.journal [--pairs 10000] [--units 5] [--matches 2000] [--settled 0.5]
+python -m benchmarks.journal [--pairs 10000] [--units 5] [--matches 2000]
 
-All pairs are swept, then given their units; the share ``--settled`` of them needs no more work after that. The
-size of the file is the largest: SQLite reuses the pages of deleted points and does not shrink the file.
+All pairs are swept, then given their other units.
 """
 
 import argparse
@@ -39,7 +38,6 @@ def main() -> None:
     parser.add_argument("--pairs", type=int, default=10_000)
     parser.add_argument("--units", type=int, default=5)
     parser.add_argument("--matches", type=int, default=2000)
-    parser.add_argument("--settled", type=float, default=0.5)
     arguments = parser.parse_args()
     units = [Unit(1, f"m{number}", 1024) for number in range(arguments.units)]
     rng = np.random.default_rng(0)
@@ -50,16 +48,10 @@ def main() -> None:
         started = time.perf_counter()
         for first, last in ((0, 1), (1, len(units))):
             for start in range(0, arguments.pairs, JOB_PAIRS):
-                outcomes = [
-                    (
-                        Outcome(
-                            PairRecord(index, FALLBACK_FUNDAMENTAL, "", tuple(records[:last])), found[first:last]
-                        ),
-                        last == len(units) and rng.random() < arguments.settled,
-                    )
-                    for index in range(start, min(start + JOB_PAIRS, arguments.pairs))
-                ]
-                journal.save(outcomes)
+                indices = range(start, min(start + JOB_PAIRS, arguments.pairs))
+                had = tuple(records[:last])
+                made = (PairRecord(index, FALLBACK_FUNDAMENTAL, "", had) for index in indices)
+                journal.save([Outcome(record, found[first:last]) for record in made])
         saving = time.perf_counter() - started
         journal.close()
         size = journal.path.stat().st_size
@@ -68,9 +60,7 @@ def main() -> None:
         count = len(again.records())
         resuming = time.perf_counter() - started
         again.close()
-    print(
-        f"{count} pairs, {arguments.units} units of {arguments.matches} matches, {arguments.settled:.0%} settled"
-    )
+    print(f"{count} pairs, {arguments.units} units of {arguments.matches} matches")
     print(
         f"journal: {size / 1e6:.0f} MB; saving: {1e3 * saving / count:.1f} ms a pair; resuming: {resuming:.1f} s"
     )

@@ -90,7 +90,7 @@ class SceneConfig:
     camera_model: CameraModel = CameraModel.PINHOLE
     each_matcher: bool = True  # also reconstruct each matcher's matches alone; a pair gets the mean of its cameras
     shared_intrinsics: float = 0.02  # images of one size share a camera if most focals are this close; 0: never
-    pairs_per_image: float = 5.0  # a batch with fewer pairs gets extra pairs, for its scene alone; 0: none
+    pairs_per_image: float = 10.0  # a batch with fewer pairs gets extra pairs, for its scene alone; 0: none
     threads: int = 1  # more than one: the last digits differ from run to run
 
     FORMER: ClassVar = {"one_camera": "shared_intrinsics"} | dict.fromkeys((
