@@ -55,7 +55,7 @@ def url_of(file: WeightFile) -> str | None:
 
 
 def choose(alternatives: Sequence[WeightFile], directory: Path) -> WeightFile:
-    """Of the lines of a slot: one whose file is there, else one that can be downloaded, else the first."""
+    """Of the lines of a slot: the first whose file is there, else that can be downloaded, else the first."""
     there = [file for file in alternatives if judge(directory / file.name, file).usable]
     return next(iter(there + [file for file in alternatives if url_of(file)] + list(alternatives)))
 

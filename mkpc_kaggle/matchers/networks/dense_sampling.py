@@ -9,7 +9,7 @@ OVERSAMPLING = 4  # before matches are balanced
 BANDWIDTH = 0.1  # of the density's kernel, in normalised coordinates
 MIN_DENSITY, LAST_RESORT = 10, 1e-7  # isolated matches are drawn only when no others are left
 BLOCK_FLOATS = 2**20
-LEAST_EXPONENT = -80  # exp of less is denormal: ten times slower, and adds nothing
+MIN_EXPONENT = -80  # exp of less is denormal: ten times slower, and adds nothing
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +62,7 @@ def density(points: Tensor) -> Tensor:
     rows = max(1, BLOCK_FLOATS // max(1, len(points)))
     for some, out in zip(torch.split(points, rows), torch.split(density, rows), strict=True):
         exponents = torch.cdist(some, points).square_().div_(-2 * BANDWIDTH**2)
-        torch.sum(exponents.clamp_(min=LEAST_EXPONENT).exp_(), dim=1, out=out)
+        torch.sum(exponents.clamp_(min=MIN_EXPONENT).exp_(), dim=1, out=out)
     return density
 
 
