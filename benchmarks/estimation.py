@@ -1,11 +1,12 @@
 """F by MAGSAC, under a prior on focal lengths, and from the cameras of the batch, on the same matches.
 
 python -m benchmarks.estimation --train-dir DIR --matches DIR [--recipes classical light] [--scenes NAME ...]
-    [--shares 1 0.3 0.12] [--seeds 1] [--estimates NAME ...]
+    [--shares 1 0.3 0.12] [--seeds 1] [--estimates NAME ...] [--pairs-per-image 0 5 10]
 
 MATCHES is what `benchmarks.saved_matches` wrote; pairs without a file are left out. For each recipe and share
 of a scene's pairs, drawn by seed, a row for each estimate: mAA by scene and in the mean, its gain over the first
-estimate with the 95 % interval of resampled pairs, and seconds of this process, a pair or a batch.
+estimate with the 95 % interval of resampled pairs, and seconds of this process, a pair or a batch. With a number
+of pairs for each image, the scene also has what the first unit found on extra pairs.
 """
 
 import argparse
@@ -28,6 +29,7 @@ from mkpc_kaggle.geometry.focal_prior import FocalConfig, FocalPrior, estimate_w
 from mkpc_kaggle.geometry.metrics import PoseError, pair_accuracy
 from mkpc_kaggle.geometry.robust import Estimate, Matrix3, RobustConfig, estimate
 from mkpc_kaggle.recipe import SceneConfig
+from mkpc_kaggle.scene.densify import extra_pairs
 from mkpc_kaggle.scene.reconstruct import reconstruct_batch
 from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair
 
@@ -92,17 +94,28 @@ def batch_pair(true: TruePair, found: SavedMatches, F: Matrix3 | None) -> BatchP
     return BatchPair(image0, image1, found.matches, F, found.tracks)
 
 
-def by_scene(pairs: Sequence[Estimated], scene: TrainScene) -> Score:
-    """The accuracy of the pairs as one batch."""
+def by_scene(pairs: Sequence[Estimated], scene: TrainScene, extra: Sequence[Estimated] = ()) -> Score:
+    """The accuracy of the pairs as one batch; of the ``extra`` pairs the first unit's matches join it."""
     batch = [batch_pair(pair.true, pair.found, pair.matrices["prior"]) for pair in pairs]
+    swept = [(pair.true, SavedMatches(pair.found.results[:1], pair.found.sizes)) for pair in extra]
+    batch += [batch_pair(true, found, None) for true, found in swept]
     start = time.process_time()
-    choices = reconstruct_batch(batch, SceneConfig()).choices
+    choices = reconstruct_batch(batch, SceneConfig()).choices[: len(pairs)]
     seconds = time.process_time() - start
     matrices = [
         pair.matrices["prior"] if choice.F is None else choice.F
         for pair, choice in zip(pairs, choices, strict=True)
     ]
     return Score(tuple(accuracy(F, pair.true, scene) for F, pair in zip(matrices, pairs, strict=True)), seconds)
+
+
+def extra_of(pairs: Sequence[Estimated], every: Sequence[Estimated], per_image: float) -> list[Estimated]:
+    """The pairs that these lack to have ``per_image`` for each of their images, as the engine chooses them."""
+    ends = [[path.stem for path in pair.true.pair.images] for pair in pairs]
+    names = list(dict.fromkeys(name for pair in ends for name in pair))
+    chosen = extra_pairs(len(names), [(names.index(a), names.index(b)) for a, b in ends], per_image)
+    wanted = {frozenset((names[first], names[second])) for first, second in chosen}
+    return [pair for pair in every if {path.stem for path in pair.true.pair.images} in wanted]
 
 
 def drawn(pairs: Sequence[Estimated], share: float, seed: int) -> list[Estimated]:
@@ -112,13 +125,15 @@ def drawn(pairs: Sequence[Estimated], share: float, seed: int) -> list[Estimated
     return [pairs[place] for place in places]
 
 
-def score_all(pairs: Sequence[Estimated], scene: TrainScene, names: Sequence[str]) -> dict[str, Score]:
-    """By estimate."""
+def score_all(
+    pairs: Sequence[Estimated], every: Sequence[Estimated], scene: TrainScene, names: Mapping[str, float]
+) -> dict[str, Score]:
+    """By estimate; ``names`` has the pairs for each image that a scene gets."""
     return {
-        name: by_scene(pairs, scene)
-        if name == SCENE
+        name: by_scene(pairs, scene, extra_of(pairs, every, per_image))
+        if name.startswith(SCENE)
         else Score(tuple(pair.accuracies[name] for pair in pairs), sum(pair.seconds[name] for pair in pairs))
-        for name in names
+        for name, per_image in names.items()
     }
 
 
@@ -138,7 +153,7 @@ def table(title: str, done: Mapping[str, Sequence[Mapping[str, Score]]], names: 
         means = [mean(values) for values in joined[name].values()]
         cells = " | ".join(f"{value:.3f}" for value in (*means, mean(means)))
         spent = [scores[name] for seeds in done.values() for scores in seeds]
-        runs = len(spent) if name == SCENE else sum(len(score.accuracies) for score in spent)
+        runs = len(spent) if name.startswith(SCENE) else sum(len(score.accuracies) for score in spent)
         seconds = sum(score.seconds for score in spent) / runs
         gain = str(paired_difference(list(zip(joined[names[0]].values(), joined[name].values(), strict=True))))
         lines.append(f"| {name} | {cells} | {'' if name == names[0] else gain} | {seconds:.2f} |")
@@ -158,7 +173,12 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=1, help="samples of each share below 1")
     names = [*PAIR_ESTIMATES, SCENE]
     parser.add_argument("--estimates", nargs="+", choices=names, default=names)
+    parser.add_argument("--pairs-per-image", nargs="+", type=float, default=[0.0])
     arguments = parser.parse_args()
+    chosen_names = {name: 0.0 for name in arguments.estimates if name != SCENE}
+    if SCENE in arguments.estimates:
+        counts = arguments.pairs_per_image
+        chosen_names |= {f"{SCENE}, {count:g} pairs an image" if count else SCENE: count for count in counts}
     for recipe in arguments.recipes:
         done: dict[float, dict[str, list[dict[str, Score]]]] = defaultdict(lambda: defaultdict(list))
         wanted = [name for name in PAIR_ESTIMATES if name in arguments.estimates or name == "prior"]
@@ -171,9 +191,9 @@ def main() -> None:
             for share in arguments.shares:
                 for seed in range(arguments.seeds if share < 1 else 1):
                     if chosen := drawn(pairs, share, seed):
-                        done[share][scene.name].append(score_all(chosen, scene, arguments.estimates))
+                        done[share][scene.name].append(score_all(chosen, pairs, scene, chosen_names))
         for share, by_name in done.items():
-            lines = table(f"{recipe}, {share:.0%} of the pairs", by_name, arguments.estimates)
+            lines = table(f"{recipe}, {share:.0%} of the pairs", by_name, list(chosen_names))
             print("\n".join(lines), "\n", flush=True)
 
 
