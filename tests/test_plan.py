@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from statistics import median
 
@@ -14,7 +14,7 @@ from simulator import MemoryJournal, Scenario, random_scenario, simulate, withou
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.engine import Ending
 from mkpc_kaggle.engine.jobs import Cause, Failure, MatchJob, MatchResult, Outcome, Phase
-from mkpc_kaggle.engine.plan import HANG_FACTOR, JOB_PAIRS, Plan
+from mkpc_kaggle.engine.plan import HANG_FACTOR, JOB_PAIRS, Explanation, Plan
 from mkpc_kaggle.engine.records import PairRecord, UnitRecord
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
@@ -67,7 +67,11 @@ def learnt(plan: Plan, unit: Unit) -> Plan:
 
 
 def explained(plan: Plan, text: str) -> bool:
-    return any(text in explanation.text for explanation in plan.explanations)
+    return explained_in(plan.explanations, text)
+
+
+def explained_in(explanations: Iterable[Explanation], text: str) -> bool:
+    return any(text in explanation.text for explanation in explanations)
 
 
 def test_the_phases_follow_each_other_and_every_pair_has_every_unit():
@@ -219,8 +223,14 @@ def test_units_that_do_not_fit_for_all_go_to_the_weakest_pairs_in_the_time_left(
     assert explained(plan, "pairs that lack units, the weakest first"), plan.explanations
     assert filled
     assert filled == sorted(filled)
-    assert filled[0] < 4
+    assert filled[0] < 2 + JOB_PAIRS
     assert not plan.is_complete
+
+
+def test_pairs_that_are_at_work_when_the_filling_begins_are_filled_too():
+    ran = simulate(Scenario(300, (0.5, 1.0, 1.0), 2, 500, drift=0.05, turn=0.6))
+    assert explained_in(ran.report.explanations, "pairs that lack units, the weakest first")
+    assert ran.report.ending is Ending.COMPLETE
 
 
 def test_pairs_for_the_scenes_alone_take_a_tenth_of_the_time_left_at_most():

@@ -265,9 +265,9 @@ class Plan:
             self.explain(now, "the sweep is over; deepening begins")
         elif phase is Phase.FILL:
             lacking = filter(self.may_gain, self.records[: self._asked])
-            weakest = sorted(lacking, key=lambda record: (record.inliers, record.index))
             busy = self._queue.under_way | {index for chunk in self._queue.again for index in chunk.indices}
-            indices = [record.index for record in weakest if record.index not in busy]
+            weakest = sorted(lacking, key=lambda record: (record.index in busy, record.inliers, record.index))
+            indices = [record.index for record in weakest]
             if indices:
                 self.explain(now, f"in the time left: {len(indices)} pairs that lack units, the weakest first")
         self._total, self._left = len(indices), set(indices)
