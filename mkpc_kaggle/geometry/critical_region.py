@@ -7,7 +7,6 @@ Where that cannot be trusted, the region is the whole image, with the reason.
 
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,8 +19,6 @@ from mkpc_kaggle.geometry.coordinates import Box, Points, Size
 @dataclass(frozen=True)
 class MkpcConfig:
     """Settings of :func:`critical_region`, table ``[mkpc]`` of a recipe."""
-
-    FORMER: ClassVar = {"ratio": ""}
 
     eps: float = 0.05  # of DBSCAN, in units of the image's width and height
     min_samples: int = 5  # of DBSCAN

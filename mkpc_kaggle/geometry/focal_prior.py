@@ -22,7 +22,7 @@ same F and the same derivatives of it.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from statistics import NormalDist
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,11 +55,6 @@ LOG_FOCAL_GRID = (-0.7, -0.35, 0.0, 0.35, 0.7)  # log f / g to read MAGSAC's F w
 @dataclass(frozen=True)
 class FocalConfig:
     """Settings of :func:`estimate_with_prior`, table ``[focal]`` of a recipe; without it MAGSAC is alone."""
-
-    FORMER: ClassVar = dict.fromkeys((
-        "essential_threshold", "essential_iterations", "essential_starts", "essential_share", "rough_matches",
-        "refined", "most_matches", "free_cost",
-    ), "")  # fmt: skip
 
     ratio: float = 1.1  # of an unknown focal length to the image's long side
     sigma: float = 0.4  # standard deviation of the focal length's logarithm

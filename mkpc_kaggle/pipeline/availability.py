@@ -11,6 +11,7 @@ from mkpc_kaggle.config import from_table
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.matchers.contract import Matcher, Placement
 from mkpc_kaggle.matchers.registry import UnusableError, load_matcher, spec_of
+from mkpc_kaggle.pipeline.failures import reason_of
 from mkpc_kaggle.recipe import Recipe
 from mkpc_kaggle.weights import State, WeightStore
 
@@ -18,8 +19,6 @@ PERMISSIVE_TAGS = frozenset({"Apache-2.0", "BSD-3-Clause", "MIT"})
 
 
 class Licence(StrEnum):
-    """Which weights may be used, by their licence."""
-
     ANY = "any"
     PERMISSIVE = "permissive"  # those that may be used for any purpose: Apache-2.0, BSD-3-Clause, MIT
 
@@ -40,6 +39,10 @@ class UnavailableReason:
     kind: UnavailableKind
     detail: str
 
+    @property
+    def is_fault(self) -> bool:
+        return self.kind in (UnavailableKind.NOT_IMPORTABLE, UnavailableKind.UNREADABLE)
+
     def __str__(self) -> str:
         return f"{self.kind} ({self.detail})"
 
@@ -52,11 +55,10 @@ def unavailable(
     *,
     load: bool = False,
 ) -> dict[str, UnavailableReason]:
-    """Why matchers of the recipe cannot run here, by their names; fallbacks included.
+    """Why matchers of the recipe, fallbacks included, cannot run here, by their names.
 
-    ``own`` are the user's ready matchers, which bring their weights along. With ``load``, weights whose digest is
-    unknown are loaded, which shows whether they are damaged. Raises :class:`UserError` for an unknown matcher or
-    option.
+    ``own`` are the user's ready matchers. With ``load``, weights whose digest is unknown are loaded, which shows
+    whether they are damaged. Raises :class:`UserError` for an unknown matcher or option.
     """
 
     def not_permitted(tags: Iterable[str]) -> UnavailableReason | None:
@@ -69,7 +71,7 @@ def unavailable(
         try:
             spec, options = spec_of(name, f"recipe {recipe.name!r}"), options_of(recipe, name)
         except UnusableError as error:
-            return UnavailableReason(UnavailableKind.NOT_IMPORTABLE, error.reason)
+            return UnavailableReason(UnavailableKind.NOT_IMPORTABLE, reason_of(error.__cause__ or error))
         found = {slot: store.find(slot) for slot in spec.slots_for(options)}
         files = [file for file in found.values() if file is not None]
         if reason := not_permitted([*spec.licences, *(file.file.licence for file in files)]):
@@ -94,24 +96,18 @@ def refusal(recipe: Recipe, reasons: Mapping[str, UnavailableReason]) -> UserErr
     first, kind = next((name, reason.kind) for name, reason in reasons.items())
     those = "; ".join(f"{name} ({reason.detail})" for name, reason in reasons.items() if reason.kind is kind)
     if kind is UnavailableKind.NOT_PERMITTED:
-        return UserError(
-            f"--licence permissive refuses recipe {recipe.name!r} for the weights of {those}. Take a recipe "
-            "without them, such as permissive, or --recipe auto, which leaves them out."
-        )
+        what = f"--licence permissive refuses recipe {recipe.name!r} for the weights of {those}"
+        return UserError(f"{what}. Take a recipe without them, such as permissive, or --recipe auto.")
     if kind is UnavailableKind.NO_WEIGHTS:
-        return UserError(
-            f"recipe {recipe.name!r} needs weights that were not found: {those}. Name their directory with "
-            "--weights, or use --recipe auto, which does with what there is."
-        )
+        what = f"recipe {recipe.name!r} needs weights that were not found: {those}"
+        return UserError(f"{what}. Name their directory with --weights, or take what is there with --recipe auto.")
     return UserError(f"recipe {recipe.name!r}: matcher {first} {reasons[first]}. `--recipe auto` does without it.")
 
 
 def by_kind(reasons: Mapping[str, UnavailableReason]) -> tuple[str, ...]:
     """The matchers of each kind, for a summary, such as "no weights: loma, superglue"."""
-    names: dict[UnavailableKind, list[str]] = {}
-    for name, reason in reasons.items():
-        names.setdefault(reason.kind, []).append(name)
-    return tuple(f"{kind}: {', '.join(matchers)}" for kind, matchers in names.items())
+    kinds = dict.fromkeys(reason.kind for reason in reasons.values())
+    return tuple(f"{kind}: {', '.join(name for name in reasons if reasons[name].kind is kind)}" for kind in kinds)
 
 
 def options_of(recipe: Recipe, name: str) -> Any:

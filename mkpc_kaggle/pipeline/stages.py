@@ -147,30 +147,25 @@ class Pipeline:
 
     def _encode(self, unit: Unit, wanted: Sequence[tuple[Image, View]]) -> list[Any]:
         """The encodings of views by the unit's matcher, from the cache or made now, one shape at a time."""
+        matcher = self._matcher(unit.matcher)
+        is_gray = matcher.spec.colour is Colour.GRAY
         keys = [(unit.matcher, image.name, view) for image, view in wanted]
         known = {key: self._encodings.get(key) for key in keys}
-        missing = {key: item for key, item in zip(keys, wanted, strict=True) if known[key] is None}
+        missing = {key: image for key, (image, _) in zip(keys, wanted, strict=True) if known[key] is None}
         size = self._minibatches.get(unit, self.minibatch)
         for shape in dict.fromkeys(view.padded for _, _, view in missing):
             alike = [key for key in missing if key[2].padded == shape]
-            for start in range(0, len(alike), size):
-                known |= self._encode_minibatch(unit, {key: missing[key] for key in alike[start : start + size]})
+            for part in (alike[start : start + size] for start in range(0, len(alike), size)):
+                pixels = [missing[key].gray if is_gray else missing[key].pixels for key in part]
+                pictures = [Picture(key[2].render(shown), key[2]) for key, shown in zip(part, pixels, strict=True)]
+                with exact_float32():
+                    encodings = matcher.encode(pictures)
+                check_finite(f"features of {unit.matcher}", list(encodings))
+                known |= zip(part, encodings, strict=True)
+        for key, image in missing.items():
+            if key[2].crop == Box.whole(image.size):  # a crop is one pair's own: no other will ask for it
+                self._encodings.put(key, known[key], encoding_bytes(known[key]))
         return [known[key] for key in keys]
-
-    def _encode_minibatch(self, unit: Unit, items: dict[ViewKey, tuple[Image, View]]) -> dict[ViewKey, Any]:
-        matcher, encoded = self._matcher(unit.matcher), {}
-        gray = matcher.spec.colour is Colour.GRAY
-        pictures = [
-            Picture(view.render(image.gray if gray else image.pixels), view) for image, view in items.values()
-        ]
-        with exact_float32():
-            encodings = matcher.encode(pictures)
-        check_finite(f"features of {unit.matcher}", list(encodings))
-        for (key, (image, view)), encoding in zip(items.items(), encodings, strict=True):
-            encoded[key] = encoding
-            if view.crop == Box.whole(image.size):  # a crop is one pair's own: no other will ask for it
-                self._encodings.put(key, encoding, encoding_bytes(encoding))
-        return encoded
 
     def _matcher(self, name: str) -> Matcher[Any]:
         if name not in self._matchers:
