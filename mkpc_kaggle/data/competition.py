@@ -59,7 +59,7 @@ class Pair:
 
     @property
     def key(self) -> str:
-        """What identifies it in a journal: the id, and the intrinsics that E depends on."""
+        """What identifies the pair in a journal: E depends on the intrinsics."""
         return self.id if self.intrinsics is None else f"{self.id} {[K.tolist() for K in self.intrinsics]}"
 
 
@@ -83,16 +83,15 @@ class TrainScene:
 
 
 def test_side(directory: Path) -> tuple[Path, Path]:
-    """The table and the directory of the images of a test side."""
+    """The table, and the directory of the images."""
     home = directory.parent if directory.name == "test_images" else directory
     return home / "test.csv", home / "test_images"
 
 
 def read_test_side(directory: Path) -> tuple[Pair, ...]:
-    """The pairs of ``test.csv``, in its order.
+    """The pairs of ``test.csv``, in its order; a missing image is no error here: its path does not exist.
 
-    ``directory`` holds ``test.csv`` and ``test_images/``, or is ``test_images`` itself with ``test.csv``
-    beside it. A missing image is no error here: its path does not exist. Raises :class:`UserError` for a table
+    ``directory`` holds ``test.csv`` and ``test_images/``, or is the latter. Raises :class:`UserError` for a table
     that cannot be read or has no rows, and for ids that are repeated or that no file can have.
     """
     path, images = test_side(directory)
@@ -119,10 +118,9 @@ def read_train_side(
     min_covisibility: float = 0.1,
     pairs_per_scene: int | None = None,
 ) -> tuple[TrainScene, ...]:
-    """The scenes of a train side (all, or those named), with the pairs of at least that covisibility.
+    """The scenes of a train side (all, or those named), with so many pairs each, evenly spread over its table.
 
-    Of a scene's pairs ``pairs_per_scene`` are taken, evenly spread. Raises :class:`UserError` for what is missing,
-    and for cells that cannot be read.
+    Raises :class:`UserError` for what is missing, and for cells that cannot be read.
     """
     path = directory / "scaling_factors.csv"
     rows = read_rows(path, ("scene", "scaling_factor"))
@@ -157,10 +155,7 @@ def _read_scene(directory: Path, metres: float, min_covisibility: float, most: i
 
 
 def write_submission(path: Path, rows: Mapping[str, Matrix3]) -> None:
-    """Write ``sample_id,fundamental_matrix`` in the order of ``rows``; the file is replaced atomically.
-
-    Raises ``OSError`` where it cannot be written; an earlier file is then unchanged.
-    """
+    """Write a row for each sample. If that raises ``OSError``, an earlier file is unchanged."""
     with replacing(path) as stream:
         table = csv.writer(stream, lineterminator="\n")
         table.writerow(SUBMISSION_COLUMNS)
@@ -169,7 +164,6 @@ def write_submission(path: Path, rows: Mapping[str, Matrix3]) -> None:
 
 
 def read_submission(path: Path) -> dict[str, Matrix3]:
-    """F by sample id; raises :class:`UserError` for a file that is not a submission."""
     rows = read_rows(path, SUBMISSION_COLUMNS)
     return {sample: _numbers(cell, where, 9).reshape(3, 3) for where, (sample, cell) in rows}
 
@@ -186,10 +180,8 @@ def submission_problems(path: Path, sample_ids: Sequence[str]) -> list[str]:
         problems.append(f"{len(missing)} samples are missing, the first is {missing[0]}")
     elif surplus := [sample for sample in found if sample not in wanted]:
         problems.append(f"{len(surplus)} samples are not in test.csv, the first is {surplus[0]}")
-    elif len(found) != len(sample_ids):
-        problems.append("a sample is there twice")
     elif found != list(sample_ids):
-        problems.append("the samples are not in the order of test.csv")
+        problems.append("the samples are not in the order of test.csv, or one is there twice")
     for sample, cell in rows:
         try:
             F = _numbers(cell, sample, 9)
@@ -204,9 +196,9 @@ def submission_problems(path: Path, sample_ids: Sequence[str]) -> list[str]:
 
 
 def read_rows(path: Path, columns: Sequence[str], *, only: bool = False) -> Iterator[tuple[str, list[str]]]:
-    """Where each row of a CSV file is, for messages, and its cells in these columns, all as text.
+    """Where each row of a CSV file is, for messages, and its cells in these columns (``only``: it has no others).
 
-    With ``only`` there may be no other columns. Raises :class:`UserError` for a file that cannot be used.
+    Raises :class:`UserError` for a file that cannot be used.
     """
     try:
         if path.exists() and not path.is_file():
@@ -239,15 +231,12 @@ def plain_name(name: str, where: object) -> str:
 
 
 def pair_id(scene: str, first: str, second: str) -> str:
-    """The id under which a pair of the train side runs."""
     return f"{scene};{first}-{second}"
 
 
 def evenly_spread(items: Sequence[Item], most: int | None) -> list[Item]:
-    """At most that many of the items."""
-    if most is None or most >= len(items):
-        return list(items)
-    return [items[index] for index in np.linspace(0, len(items) - 1, most).round().astype(int)]
+    count = len(items) if most is None else min(most, len(items))
+    return [items[index] for index in np.linspace(0, len(items) - 1, count).round().astype(int)]
 
 
 class ImageFiles(dict[str, str]):

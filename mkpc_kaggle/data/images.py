@@ -59,10 +59,9 @@ class Unreadable:
 
 
 def read_image(path: Path) -> Image | Unreadable:
-    """Decode a file (png, jpg; 8 or 16 bit; gray, colour, with alpha) to 8-bit RGB; never raises.
+    """Decode a file to RGB; never raises. 16-bit values are divided by 256, EXIF's orientation is applied.
 
-    16-bit values are divided by 256, alpha is dropped, an EXIF orientation is applied. OpenCV decides whether
-    a damaged file is readable: version 5 refuses a truncated file.
+    OpenCV decides whether a damaged file is readable: version 5 refuses a truncated file.
     """
     name = str(path)
     try:
@@ -85,10 +84,7 @@ def read_image(path: Path) -> Image | Unreadable:
 
 
 def is_unchanged(path: Path, version: str) -> bool:
-    """Whether a file still has the content that it had when an image of that ``version`` was read from it.
-
-    A file that cannot be read counts as unchanged.
-    """
+    """Whether a file is still of that ``version``; a file that cannot be read counts as unchanged."""
     try:
         return not path.is_file() or _content_digest(np.fromfile(path, np.uint8)) == version
     except (OSError, ValueError):

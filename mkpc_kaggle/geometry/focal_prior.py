@@ -66,13 +66,10 @@ class FocalConfig:
 
 @dataclass(frozen=True, eq=False)
 class FocalPrior:
-    """What is known of a camera: ``K`` (3, 3) in pixels, and the standard deviation of its log focal length.
+    """What is known of a camera."""
 
-    With ``sigma`` 0 the camera is known.
-    """
-
-    K: Matrix3
-    sigma: float
+    K: Matrix3  # in pixels
+    sigma: float  # standard deviation of the log focal length; 0: it is known
 
     @classmethod
     def of_image(cls, size: Size, config: FocalConfig) -> "FocalPrior":

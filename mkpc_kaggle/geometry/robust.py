@@ -1,4 +1,4 @@
-"""Two-view models from matches: F, E or H by MAGSAC++, and the poses that an F stands for.
+"""Two-view models from matches: F, E or H by MAGSAC++.
 
 An estimate is always a value: where no model is found, it has the reason and the fallback matrix, which is
 finite and of the right rank, so that a submission is always complete.
@@ -61,19 +61,13 @@ class RobustConfig:
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """A two-view model of a pair.
-
-    ``matrix`` is (3, 3) float64, finite, of unit Frobenius norm; for F, x1^T F x0 = 0 in homogeneous image
-    pixels. ``inliers`` is an (N,) mask over the matches that were given: those nearer than the threshold.
-    ``failure`` is empty, or says why ``matrix`` is only the fallback. ``magsac`` is the (3, 3) F of MAGSAC alone,
-    ``None`` without a prior on focal lengths and where MAGSAC finds none.
-    """
+    """A two-view model of a pair."""
 
     model: ModelKind
-    matrix: Matrix3
-    inliers: NDArray[np.bool_]
-    failure: str = ""
-    magsac: Matrix3 | None = None
+    matrix: Matrix3  # finite, of unit Frobenius norm; for F, x1^T F x0 = 0 in homogeneous image pixels
+    inliers: NDArray[np.bool_]  # (N,) mask over the matches that were given: those nearer than the threshold
+    failure: str = ""  # why ``matrix`` is only the fallback
+    magsac: Matrix3 | None = None  # under a prior on focal lengths, the F of MAGSAC alone if it finds one
 
     @property
     def ok(self) -> bool:
@@ -136,14 +130,11 @@ def consensus(
 
 @dataclass(frozen=True, eq=False)
 class DistinctMatches:
-    """The finite distinct matches, (M, 2) points in order of first appearance, among N.
+    """The finite distinct matches among N, in order of first appearance."""
 
-    ``place`` (N,) is the row of each match in ``points0`` and ``points1``, -1 for a match that is not finite.
-    """
-
-    points0: Vectors
+    points0: Vectors  # (M, 2)
     points1: Vectors
-    place: NDArray[np.intp]
+    place: NDArray[np.intp]  # (N,) the row of each match in them, -1 for a match that is not finite
 
     @classmethod
     def of(cls, matches: Matches) -> "DistinctMatches":
@@ -168,17 +159,6 @@ def calibrate(points: Vectors, K: Matrix3) -> Vectors:
     """(N, 2) pixels -> (N, 2) coordinates in the plane z = 1 of the camera with matrix K."""
     mapped = homogeneous(points) @ np.linalg.inv(K).T
     return np.asarray(mapped[:, :2] / mapped[:, 2:])
-
-
-def poses_of_fundamental(F: Matrix3, K0: Matrix3, K1: Matrix3) -> tuple[tuple[Matrix3, Matrix3], Vectors]:
-    """The two rotations, and the translation (3,) of unit length and unknown sign, that an F stands for.
-
-    X_1 = R X_0 + t takes camera 0 to camera 1. Which rotation and sign hold, only points in front of both
-    cameras can tell. Source: Hartley and Zisserman, Multiple View Geometry, 9.6.2.
-    """
-    rotation_a, rotation_b, translation = cv2.decomposeEssentialMat(K1.T @ F @ K0)
-    rotations = np.asarray(rotation_a, np.float64), np.asarray(rotation_b, np.float64)
-    return rotations, np.asarray(translation, np.float64).ravel()
 
 
 def sampson_distances(F: Matrix3, matches: Matches) -> Vectors:
@@ -242,14 +222,9 @@ def _transfer_distances(matrix: Matrix3, points0: Vectors, points1: Vectors) -> 
 
 
 class _Solver(NamedTuple):
-    """What a kind of model needs: more matches than the minimal solver takes, so that they tell a model.
-
-    ``find`` gives OpenCV's matrix and mask, ``None`` where no model is found.
-    """
-
-    min_matches: int
+    min_matches: int  # more than the minimal solver takes, so that they tell a model
     fallback: Matrix3
-    find: Callable[..., Any]
+    find: Callable[..., Any]  # OpenCV's matrix and mask, ``None`` where no model is found
     distances: Callable[[Matrix3, Vectors, Vectors], Vectors]
 
 

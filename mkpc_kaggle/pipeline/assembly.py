@@ -33,10 +33,9 @@ class Assembly:
 
     @property
     def devices(self) -> tuple[str, ...]:
-        """The devices to work on: every GPU if the placement names none of them."""
-        if self.placement.device != "cuda":
-            return (self.placement.device,)
-        return tuple(f"cuda:{number}" for number in gpus_of("cuda"))
+        """The devices to work on."""
+        device = self.placement.device
+        return ("cpu",) if device == "cpu" else tuple(f"cuda:{number}" for number in gpus_of(device))
 
     @property
     def minibatch(self) -> int:
@@ -47,7 +46,6 @@ class Assembly:
         return replace(self, placement=replace(self.placement, device=device), sharing=sharing)
 
     def on_cpu(self) -> "Assembly":
-        """The same on the CPU, in float32."""
         return replace(self, placement=Placement(), sharing=1)
 
     def pipeline(self) -> Pipeline:
@@ -81,7 +79,6 @@ class Assembly:
 
     @property
     def weight_paths(self) -> tuple[Path, ...]:
-        """The files that the matchers load."""
         return tuple(file.path for file in self.weight_files.values())
 
     @cached_property
