@@ -117,15 +117,29 @@ def consensus(
     if intrinsics is not None and model is ModelKind.E:
         points0, points1 = calibrate(points0, intrinsics[0]), calibrate(points1, intrinsics[1])
         threshold /= float(np.mean([K[axis, axis] for K in intrinsics for axis in (0, 1)]))
-    try:
-        matrix, mask = _best_of_permutations(solver, points0, points1, threshold, config)
-    except cv2.error as error:
-        return Estimate.failed(model, count, f"OpenCV refused the points: {error.err}")
-    if matrix is None:
-        return Estimate.failed(model, count, f"no {model} fits {count} distinct matches")
-    if not mask.any():
+    method = cv2.USAC_MAGSAC if config.method is Method.MAGSAC else cv2.RANSAC
+    settings = {"method": method, "confidence": config.confidence, "maxIters": config.max_iterations}
+    best, inliers, lowest = None, np.zeros(count, bool), np.inf
+    failure = f"no {model} fits {count} distinct matches"
+    for number in range(config.permutations):
+        order = permutation(number, count)
+        try:
+            matrix, mask = solver.find(points0[order], points1[order], ransacReprojThreshold=threshold, **settings)
+        except cv2.error as error:  # it sometimes rejects points in one order and not in another
+            failure = f"OpenCV refused the points: {error.err}"
+            continue
+        if matrix is None or matrix.shape != (3, 3) or not np.isfinite(matrix).all() or not matrix.any():
+            continue
+        with np.errstate(over="ignore", invalid="ignore"):  # points may be anything
+            cost = float(np.sum(robust_costs(solver.distances(matrix, points0, points1), 2 * threshold)))
+        # Most inliers do not decide: MAGSAC's score depends on distances up to several times the threshold.
+        if best is None or cost < lowest:
+            best, inliers[order], lowest = matrix, mask.ravel().astype(bool), cost
+    if best is None:
+        return Estimate.failed(model, count, failure)
+    if not inliers.any():
         return Estimate.failed(model, count, f"no {model} has inliers among {count} distinct matches")
-    return Estimate(model, unit_norm(matrix), mask)
+    return Estimate(model, unit_norm(best), inliers)
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,35 +186,6 @@ def sampson_distances(F: Matrix3, matches: Matches) -> Vectors:
 def permutation(number: int, count: int) -> NDArray[np.intp]:
     """A fixed permutation of ``count`` matches; number 0 is their own order."""
     return np.random.default_rng(number).permutation(count) if number else np.arange(count)
-
-
-def _best_of_permutations(
-    solver: "_Solver", points0: Vectors, points1: Vectors, threshold: float, config: RobustConfig
-) -> tuple[Matrix3 | None, NDArray[np.bool_]]:
-    """The model of the lowest robust cost over fixed permutations, and its mask (N,).
-
-    Most inliers do not decide: MAGSAC's score depends on distances up to several times the threshold. OpenCV
-    sometimes rejects points in one order and not in another; its error is raised if no order gave a model.
-    """
-    method = cv2.USAC_MAGSAC if config.method is Method.MAGSAC else cv2.RANSAC
-    settings = {"method": method, "confidence": config.confidence, "maxIters": config.max_iterations}
-    best, best_mask, lowest, refusal = None, np.zeros(len(points0), bool), np.inf, None
-    for number in range(config.permutations):
-        order = permutation(number, len(points0))
-        try:
-            matrix, mask = solver.find(points0[order], points1[order], ransacReprojThreshold=threshold, **settings)
-        except cv2.error as error:
-            refusal = error
-            continue
-        if matrix is None or matrix.shape != (3, 3) or not np.isfinite(matrix).all() or not matrix.any():
-            continue
-        with np.errstate(over="ignore", invalid="ignore"):  # points may be anything
-            cost = float(np.sum(robust_costs(solver.distances(matrix, points0, points1), 2 * threshold)))
-        if best is None or cost < lowest:
-            best, best_mask[order], lowest = matrix, mask.ravel().astype(bool), cost
-    if best is None and refusal is not None:
-        raise refusal
-    return best, best_mask
 
 
 def homogeneous(points: Vectors) -> Vectors:
