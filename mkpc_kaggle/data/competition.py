@@ -196,7 +196,7 @@ def submission_problems(path: Path, sample_ids: Sequence[str]) -> list[str]:
 
 
 def read_rows(path: Path, columns: Sequence[str], *, only: bool = False) -> Iterator[tuple[str, list[str]]]:
-    """Where each row of a CSV file is, for messages, and its cells in these columns (``only``: it has no others).
+    """Where each row of a CSV file is, for messages, and its cells in these columns; ``only``: it has no others.
 
     Raises :class:`UserError` for a file that cannot be used.
     """

@@ -9,7 +9,7 @@ from typing import Any
 from mkpc_kaggle.errors import warn_once
 from mkpc_kaggle.matchers.contract import Matcher, Placement, Precision
 from mkpc_kaggle.matchers.registry import load_matcher
-from mkpc_kaggle.pipeline.availability import Licence, by_kind, options_of, refusal, slots_of, unavailable
+from mkpc_kaggle.pipeline.availability import FAULTS, Licence, by_kind, options_of, refusal, slots_of, unavailable
 from mkpc_kaggle.pipeline.devices import AUTO, gpus_of, require_device, resolve_placement
 from mkpc_kaggle.pipeline.stages import ENCODING_CACHE_BYTES, Pipeline
 from mkpc_kaggle.recipe import Mode, Recipe, load_recipe
@@ -117,7 +117,7 @@ def assemble(
     if lacking and recipe != AUTO:
         raise refusal(chosen, lacking)
     for name, reason in lacking.items():
-        if reason.is_fault:
+        if reason.kind in FAULTS:
             warn_once(f"recipe auto does without {name}: {reason}")
     for name in sorted(chosen.matchers.keys() - own.keys() - reasons.keys()):
         options_of(chosen, name)  # those of a matcher that no unit names are checked too

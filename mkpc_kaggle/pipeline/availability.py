@@ -32,16 +32,15 @@ class UnavailableKind(StrEnum):
     UNREADABLE = "weights cannot be loaded"
 
 
+FAULTS = (UnavailableKind.NOT_IMPORTABLE, UnavailableKind.UNREADABLE)  # the others are a user's choices
+
+
 @dataclass(frozen=True)
 class UnavailableReason:
     """Why a matcher is unavailable; ``detail`` are the error, the licences, or the files that would do."""
 
     kind: UnavailableKind
     detail: str
-
-    @property
-    def is_fault(self) -> bool:
-        return self.kind in (UnavailableKind.NOT_IMPORTABLE, UnavailableKind.UNREADABLE)
 
     def __str__(self) -> str:
         return f"{self.kind} ({self.detail})"
@@ -86,9 +85,8 @@ def unavailable(
             return UnavailableReason(UnavailableKind.UNREADABLE, str(error))
         return None
 
-    names = [name for unit in recipe.units for name in (unit.matcher, unit.fallback) if name]
-    found = {name: reason_for(name) for name in dict.fromkeys(names)}
-    return {name: reason for name, reason in found.items() if reason is not None}
+    names = dict.fromkeys(name for unit in recipe.units for name in (unit.matcher, unit.fallback) if name)
+    return {name: reason for name in names if (reason := reason_for(name)) is not None}
 
 
 def refusal(recipe: Recipe, reasons: Mapping[str, UnavailableReason]) -> UserError:
@@ -112,9 +110,8 @@ def by_kind(reasons: Mapping[str, UnavailableReason]) -> tuple[str, ...]:
 
 def options_of(recipe: Recipe, name: str) -> Any:
     """The matcher's options with what the recipe's ``[matchers.NAME]`` changes."""
-    spec = spec_of(name, f"recipe {recipe.name!r}")
-    table = recipe.matchers.get(name, {})
-    return from_table(spec.options, table, f"recipe {recipe.name!r}, table [matchers.{name}]")
+    where, table = f"recipe {recipe.name!r}", recipe.matchers.get(name, {})
+    return from_table(spec_of(name, where).options, table, f"{where}, table [matchers.{name}]")
 
 
 def slots_of(recipe: Recipe, own: Container[str] = ()) -> tuple[str, ...]:

@@ -44,11 +44,9 @@ def resolve_placement(device: str, precision: str) -> Placement:
             device = "cpu"
     elif device != "cpu":
         gpus_of(device)
-    if precision == AUTO:
-        return Placement(device, fastest_precision(device))
-    if precision not in list(Precision):
+    if precision not in (AUTO, *Precision):
         raise UserError(f"unknown precision {precision!r}; known: auto, {', '.join(Precision)}")
-    return Placement(device, Precision(precision))
+    return Placement(device, fastest_precision(device) if precision == AUTO else Precision(precision))
 
 
 def fastest_precision(device: str) -> Precision:
