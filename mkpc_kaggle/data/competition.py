@@ -124,7 +124,7 @@ def read_train_side(
     """
     path = directory / "scaling_factors.csv"
     rows = read_rows(path, ("scene", "scaling_factor"))
-    metres = {plain_name(scene, where): float(_numbers(cell, where, 1)[0]) for where, (scene, cell) in rows}
+    metres = {plain_name(scene, where): float(*_numbers(cell, where, 1)) for where, (scene, cell) in rows}
     wanted = list(scenes) or sorted(name for name in metres if (directory / name).is_dir())
     if not wanted:
         raise UserError(f"{directory} has none of the scenes of its scaling_factors.csv")
@@ -142,7 +142,7 @@ def _read_scene(directory: Path, metres: float, min_covisibility: float, most: i
     path = directory / "pair_covisibility.csv"
     images, pairs = ImageFiles(directory / "images"), []
     for where, (key, cell) in read_rows(path, ("pair", "covisibility")):
-        covisibility = float(_numbers(cell, where, 1)[0])
+        covisibility = float(*_numbers(cell, where, 1))
         first, _, second = key.partition("-")
         if first not in cameras or second not in cameras:
             raise UserError(f"{where}: the pair {key!r} is not two images of calibration.csv")
