@@ -8,7 +8,6 @@ jpeg are accepted on both sides. F of a pair satisfies x2^T F x1 = 0, image 1 be
 import csv
 import os
 import re
-import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -103,7 +102,7 @@ def read_test_side(directory: Path) -> tuple[Pair, ...]:
         if CONTROL.search(sample):
             raise UserError(f"{where}: the sample_id {sample!r} has control characters: no submission can hold it")
         batch, first, second = (plain_name(name, where) for name in ids)
-        pairs[sample] = Pair(sample, sys.intern(batch), files(batch)[first], files(batch)[second])
+        pairs[sample] = Pair(sample, batch, files(batch)[first], files(batch)[second])
     if not images.is_dir():
         raise UserError(f"{images}: no such directory; --test-dir must hold test.csv and test_images/")
     if not pairs:
@@ -249,7 +248,7 @@ class ImageFiles(dict[str, str]):
             self.update((path.stem, str(path)) for path in reversed(images))
 
     def __missing__(self, image_id: str) -> str:
-        return f"{self.directory}{os.sep}{image_id}.png"
+        return str(self.directory / f"{image_id}.png")
 
 
 def _numbers(cell: str, where: str, count: int) -> NDArray[np.float64]:

@@ -92,9 +92,8 @@ def pose_auc(errors: Sequence[PoseError], threshold: float) -> float:
     """
     if not errors:
         return float("nan")
-    angles = np.sort([error.angle for error in errors])
-    recall = np.arange(1, len(angles) + 1) / len(angles)
-    angles, recall = np.concatenate([[0.0], angles]), np.concatenate([[0.0], recall])
+    angles = np.sort([0.0, *(error.angle for error in errors)])
+    recall = np.arange(len(angles)) / len(errors)
     last = int(np.searchsorted(angles, threshold))
     x = np.append(angles[:last], threshold)
     y = np.append(recall[:last], recall[last - 1])

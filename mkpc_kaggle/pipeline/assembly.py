@@ -85,7 +85,7 @@ class Assembly:
     def weight_files(self) -> dict[str, FoundFile]:
         """The files that the matchers load, by slot."""
         slots = slots_of(self.recipe, self.matchers)
-        return {slot: file for slot in slots if (file := self.weights.find(slot)) is not None}
+        return {slot: file for slot in slots if (file := self.weights.find(slot))}
 
     def _load(self, name: str, placement: Placement) -> Matcher[Any]:
         own = self.matchers.get(name)
@@ -124,8 +124,8 @@ def assemble(
     left_out = by_kind({name: reasons[name] for name in written.matcher_names if name in reasons})
     chosen = chosen.only(lambda unit: unit.matcher not in lacking).with_scenes(scenes).in_mode(mode)
     made = Assembly(chosen, store, resolve_placement(device, precision), left_out, own, device)
-    unverified = sorted(file.path.name for file in made.weight_files.values() if file.state is State.UNVERIFIED)
-    if unverified:
+    files = made.weight_files.values()
+    if unverified := sorted(file.path.name for file in files if file.state is State.UNVERIFIED):
         listed = ", ".join(unverified)
         warn_once(f"weights not verified: {listed}; `python -m mkpc_kaggle weights verify` says why")
     return made
