@@ -180,7 +180,7 @@ def submission_problems(path: Path, sample_ids: Sequence[str]) -> list[str]:
     elif surplus := [sample for sample in found if sample not in wanted]:
         problems.append(f"{len(surplus)} samples are not in test.csv, the first is {surplus[0]}")
     elif found != list(sample_ids):
-        problems.append("the samples are not in the order of test.csv, or one is there twice")
+        problems.append("the samples are not in the order of test.csv, or a sample is there twice")
     for sample, cell in rows:
         try:
             F = _numbers(cell, sample, 9)

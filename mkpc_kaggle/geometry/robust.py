@@ -67,7 +67,7 @@ class Estimate:
     matrix: Matrix3  # finite, of unit Frobenius norm; for F, x1^T F x0 = 0 in homogeneous image pixels
     inliers: NDArray[np.bool_]  # (N,) mask over the matches that were given: those nearer than the threshold
     failure: str = ""  # why ``matrix`` is only the fallback
-    magsac: Matrix3 | None = None  # under a prior on focal lengths, the F of MAGSAC alone if it finds one
+    magsac: Matrix3 | None = None  # under a prior on focal lengths, the F of MAGSAC alone, if it finds any
 
     @property
     def ok(self) -> bool:
