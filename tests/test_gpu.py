@@ -14,7 +14,7 @@ from mkpc_kaggle.data.images import Image
 from mkpc_kaggle.engine.places import LocalSite
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.matchers.contract import MatcherSpec, NonFiniteError, Precision, encoding_bytes
+from mkpc_kaggle.matchers.contract import MatcherSpec, NonFiniteError, Precision
 from mkpc_kaggle.matchers.dtypes import check_finite, exact_float32
 from mkpc_kaggle.pipeline import devices
 from mkpc_kaggle.pipeline.assembly import assemble
@@ -123,12 +123,6 @@ def test_a_device_that_multiplies_and_cannot_convolve_is_refused(monkeypatch: py
 class Maps:
     coarse: torch.Tensor
     others: tuple[torch.Tensor, ...] = ()
-
-
-def test_an_encoding_counts_the_storage_that_it_keeps_alive() -> None:
-    batch = torch.zeros(8, 4, 5)
-    assert encoding_bytes(Maps(batch[:1])) == batch.nbytes
-    assert encoding_bytes(Maps(batch[0], (batch[1], torch.zeros(3)))) == batch.nbytes + 12
 
 
 def test_the_cache_is_sized_by_the_memory_that_is_free_and_the_workers_on_it() -> None:

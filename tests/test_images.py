@@ -2,7 +2,6 @@
 
 import os
 import threading
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from pathlib import Path
 
@@ -201,18 +200,6 @@ def test_the_image_used_longest_ago_makes_room_and_an_unreadable_file_is_tried_a
     with closing(ImageStore(limit_bytes=299)) as small:  # an image above the limit is handed out all the same
         assert [small.get(Path("a")).name for _ in range(2)] == ["a", "a"]
     assert len(decoded) == 9
-
-
-def test_threads_may_ask_for_the_same_file_at_once(store, decoded):
-    together = threading.Barrier(6)
-
-    def ask(_):
-        together.wait(60)
-        return store.get(Path("a")).name
-
-    with ThreadPoolExecutor(6) as pool:
-        assert list(pool.map(ask, range(6))) == ["a"] * 6
-    assert len(decoded) == 1
 
 
 @pytest.mark.parametrize(("shape", "told"), [((3, 300), "300 x 3 pixels"), ((300, 3), "3 x 300 pixels")])

@@ -111,7 +111,7 @@ def test_checkpoints_that_lack_or_add_something_are_refused(store: WeightStore) 
     ):
         with pytest.raises(UserError, match="'loma-b128' do not fit the network"):
             loma.load(Holding(good | change), OPTIONS, Placement())
-    assert set(loma.SPEC.every_slot) == {"loma-b128", "loma-b", "loma-r", "loma-l", "loma-g"}
+    assert all(map(loma.SPEC.uses, ("loma-b128", "loma-b", "loma-r", "loma-l", "loma-g")))
     with pytest.raises(UserError, match="loma-g"):
         loma.load(store, LomaOptions(Variant.G), Placement())
 

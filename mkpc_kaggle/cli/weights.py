@@ -76,7 +76,7 @@ def _list(arguments: argparse.Namespace) -> int:
         names = " or ".join(file.name for file in files)
         where = [str(search.found.path)] if search.found else [f"missing: {names}"]
         where += [f"refused: {file.path}: {file.note}" for file in search.refused if not search.found]
-        users = [spec.name for spec in specs if slot in spec.every_slot]
+        users = [spec.name for spec in specs if spec.uses(slot)]
         rows.append((slot, files[0].licence, ", ".join(users) or "-", "; ".join(where)))
     options.print_table(rows)
     print("".join(f"{told}\n" for told in unusable), end="")

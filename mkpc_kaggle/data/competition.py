@@ -8,10 +8,10 @@ jpeg are accepted on both sides. F of a pair satisfies x2^T F x1 = 0, image 1 be
 import csv
 import os
 import re
-import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import TypeVar
 
@@ -24,7 +24,6 @@ from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Matrix3
 from mkpc_kaggle.geometry.robust import ModelKind
 
-TEST_COLUMNS = ("sample_id", "batch_id", "image_1_id", "image_2_id")
 SUBMISSION_COLUMNS = ("sample_id", "fundamental_matrix")
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 
@@ -37,17 +36,13 @@ Item = TypeVar("Item")
 
 @dataclass(frozen=True, slots=True)
 class Pair:
-    """Two images to match: ``id`` is unique in a run, ``group`` the batch or scene they belong to.
+    """Two images to match."""
 
-    ``file0`` and ``file1`` are the images' paths; as text, since a table may have a million rows. With
-    ``intrinsics``, the camera matrices, E is estimated instead of F.
-    """
-
-    id: str
-    group: str
-    file0: str
+    id: str  # unique in a run
+    group: str  # the batch or scene that they belong to
+    file0: str  # the images' paths; as text, since a table may have a million rows
     file1: str
-    intrinsics: tuple[Matrix3, Matrix3] | None = field(default=None, compare=False)
+    intrinsics: tuple[Matrix3, Matrix3] | None = field(default=None, compare=False)  # with them E is estimated
 
     @property
     def images(self) -> tuple[Path, Path]:
@@ -59,18 +54,17 @@ class Pair:
 
     @property
     def names(self) -> tuple[str, str]:
-        """The names of the images' files."""
         return self.file0.rpartition(os.sep)[2], self.file1.rpartition(os.sep)[2]
 
     @property
     def key(self) -> str:
-        """What identifies it in a journal: the id, and the intrinsics that E depends on."""
+        """What identifies the pair in a journal: E depends on the intrinsics."""
         return self.id if self.intrinsics is None else f"{self.id} {[K.tolist() for K in self.intrinsics]}"
 
 
 @dataclass(frozen=True, eq=False)
 class TruePair:
-    """A pair of the train side with its cameras."""
+    """A pair with its cameras."""
 
     pair: Pair
     camera0: Camera
@@ -80,41 +74,35 @@ class TruePair:
 
 @dataclass(frozen=True, eq=False)
 class TrainScene:
-    """Pairs with cameras, and the metres that a unit of their world is long, NaN where that is unknown."""
+    """Pairs with cameras in one world."""
 
     name: str
-    metres_per_unit: float
+    metres_per_unit: float  # NaN where that is unknown
     pairs: tuple[TruePair, ...]
 
 
 def test_side(directory: Path) -> tuple[Path, Path]:
-    """The table and the directory of the images of a test side."""
+    """The table, and the directory of the images."""
     home = directory.parent if directory.name == "test_images" else directory
     return home / "test.csv", home / "test_images"
 
 
 def read_test_side(directory: Path) -> tuple[Pair, ...]:
-    """The pairs of ``test.csv``, in its order.
+    """The pairs of ``test.csv``, in its order; a missing image is no error here: its path does not exist.
 
-    ``directory`` holds ``test.csv`` and ``test_images/``, or is ``test_images`` itself with ``test.csv``
-    beside it. A missing image is no error here: its path does not exist. Raises :class:`UserError` for a table
-    that cannot be read or has no rows, for sample ids that are repeated or have control characters, and for other
-    ids that are not plain names.
+    ``directory`` holds ``test.csv`` and ``test_images/``, or is the latter. Raises :class:`UserError` for a table
+    that cannot be read or has no rows, and for ids that are repeated or that no file can have.
     """
     path, images = test_side(directory)
     pairs: dict[str, Pair] = {}
-    batches: dict[str, dict[str, str]] = {}
-    for where, (sample, batch, *names) in read_rows(path, TEST_COLUMNS):
+    files = cache(lambda batch: ImageFiles(images / batch))
+    for where, (sample, *ids) in read_rows(path, ("sample_id", "batch_id", "image_1_id", "image_2_id")):
         if sample in pairs:
             raise UserError(f"{where}: the sample_id {sample!r} is not unique")
         if CONTROL.search(sample):
             raise UserError(f"{where}: the sample_id {sample!r} has control characters: no submission can hold it")
-        for name in (batch, *names):
-            plain_name(name, where)
-        if batch not in batches:
-            batches[batch] = ImageFiles(images / batch)
-        first, second = (batches[batch][name] for name in names)
-        pairs[sample] = Pair(sample, sys.intern(batch), first, second)
+        batch, first, second = (plain_name(name, where) for name in ids)
+        pairs[sample] = Pair(sample, batch, files(batch)[first], files(batch)[second])
     if not images.is_dir():
         raise UserError(f"{images}: no such directory; --test-dir must hold test.csv and test_images/")
     if not pairs:
@@ -129,14 +117,13 @@ def read_train_side(
     min_covisibility: float = 0.1,
     pairs_per_scene: int | None = None,
 ) -> tuple[TrainScene, ...]:
-    """The scenes of a train side (all, or those named), with the pairs of at least that covisibility.
+    """The scenes of a train side (all, or those named), with so many pairs each, evenly spread over its table.
 
-    ``pairs_per_scene`` takes that many of a scene's pairs, evenly spread over its table. Raises
-    :class:`UserError` for missing files, columns or scenes, and for cells that cannot be read.
+    Raises :class:`UserError` for what is missing, and for cells that cannot be read.
     """
     path = directory / "scaling_factors.csv"
     rows = read_rows(path, ("scene", "scaling_factor"))
-    metres = {plain_name(scene, where): float(_numbers(cell, where, 1)[0]) for where, (scene, cell) in rows}
+    metres = {plain_name(scene, where): float(*_numbers(cell, where, 1)) for where, (scene, cell) in rows}
     wanted = list(scenes) or sorted(name for name in metres if (directory / name).is_dir())
     if not wanted:
         raise UserError(f"{directory} has none of the scenes of its scaling_factors.csv")
@@ -154,7 +141,7 @@ def _read_scene(directory: Path, metres: float, min_covisibility: float, most: i
     path = directory / "pair_covisibility.csv"
     images, pairs = ImageFiles(directory / "images"), []
     for where, (key, cell) in read_rows(path, ("pair", "covisibility")):
-        covisibility = float(_numbers(cell, where, 1)[0])
+        covisibility = float(*_numbers(cell, where, 1))
         first, _, second = key.partition("-")
         if first not in cameras or second not in cameras:
             raise UserError(f"{where}: the pair {key!r} is not two images of calibration.csv")
@@ -167,10 +154,7 @@ def _read_scene(directory: Path, metres: float, min_covisibility: float, most: i
 
 
 def write_submission(path: Path, rows: Mapping[str, Matrix3]) -> None:
-    """Write ``sample_id,fundamental_matrix`` in the order of ``rows``; the file is replaced atomically.
-
-    Raises ``OSError`` where it cannot be written; an earlier file is then unchanged.
-    """
+    """Write a row for each sample. If that raises ``OSError``, an earlier file is unchanged."""
     with replacing(path) as stream:
         table = csv.writer(stream, lineterminator="\n")
         table.writerow(SUBMISSION_COLUMNS)
@@ -179,44 +163,41 @@ def write_submission(path: Path, rows: Mapping[str, Matrix3]) -> None:
 
 
 def read_submission(path: Path) -> dict[str, Matrix3]:
-    """F by sample id; raises :class:`UserError` for a file that is not a submission."""
     rows = read_rows(path, SUBMISSION_COLUMNS)
     return {sample: _numbers(cell, where, 9).reshape(3, 3) for where, (sample, cell) in rows}
 
 
 def submission_problems(path: Path, sample_ids: Sequence[str]) -> list[str]:
     """What is wrong with a submission, a sentence each; empty if the competition accepts it."""
-    found: list[str] = []
-    problems: list[str] = []
     try:
-        for _, (sample, cell) in read_rows(path, SUBMISSION_COLUMNS, only=True):
-            found.append(sample)
-            try:
-                F = _numbers(cell, sample, 9)
-            except UserError as error:
-                problems.append(str(error))
-                continue
-            if not np.isfinite(F).all() or not F.any():
-                problems.append(f"{sample}: {'the matrix is zero' if not F.any() else 'a number is not finite'}")
+        rows = [cells for _, cells in read_rows(path, SUBMISSION_COLUMNS, only=True)]
     except UserError as error:
         return [str(error)]
+    found, problems = [sample for sample, _ in rows], []
     present, wanted = set(found), set(sample_ids)
     if missing := [sample for sample in sample_ids if sample not in present]:
-        problems.insert(0, f"{len(missing)} samples are missing, the first is {missing[0]}")
+        problems.append(f"{len(missing)} samples are missing, the first is {missing[0]}")
     elif surplus := [sample for sample in found if sample not in wanted]:
-        problems.insert(0, f"{len(surplus)} samples are not in test.csv, the first is {surplus[0]}")
-    elif len(found) != len(sample_ids):
-        problems.insert(0, "a sample is there twice")
+        problems.append(f"{len(surplus)} samples are not in test.csv, the first is {surplus[0]}")
     elif found != list(sample_ids):
-        problems.insert(0, "the samples are not in the order of test.csv")
+        problems.append("the samples are not in the order of test.csv, or a sample is there twice")
+    for sample, cell in rows:
+        try:
+            F = _numbers(cell, sample, 9)
+        except UserError as error:
+            problems.append(str(error))
+        else:
+            if not F.any():
+                problems.append(f"{sample}: the matrix is zero")
+            elif not np.isfinite(F).all():
+                problems.append(f"{sample}: a number is not finite")
     return problems
 
 
 def read_rows(path: Path, columns: Sequence[str], *, only: bool = False) -> Iterator[tuple[str, list[str]]]:
-    """Where each row of a CSV file is, for messages, and its cells in these columns, all as text.
+    """Where each row of a CSV file is, for messages, and its cells in these columns; ``only``: it has no others.
 
-    Raises :class:`UserError` for a file that cannot be read, for missing columns (with ``only`` for other columns,
-    too), and for a row that has not as many cells as the header.
+    Raises :class:`UserError` for a file that cannot be used.
     """
     try:
         if path.exists() and not path.is_file():
@@ -224,11 +205,11 @@ def read_rows(path: Path, columns: Sequence[str], *, only: bool = False) -> Iter
         with path.open(encoding="utf-8-sig", newline="") as stream:
             table = csv.reader(stream)
             header = next(filter(None, table), [])
+            told = ", ".join(header)[:200] or "nothing"
             if missing := [column for column in columns if column not in header]:
-                found = ", ".join(header)[:200] or "nothing"
-                raise UserError(f"{path} lacks the columns {', '.join(missing)}; it has {found}")
+                raise UserError(f"{path} lacks the columns {', '.join(missing)}; it has {told}")
             if only and header != list(columns):
-                raise UserError(f"{path}: the header is {','.join(header)[:200]}, not {','.join(columns)}")
+                raise UserError(f"{path}: the header is {told}, not {', '.join(columns)}")
             places = [header.index(column) for column in columns]
             for row in filter(None, table):
                 where = f"{path}, line {table.line_num}"
@@ -249,15 +230,12 @@ def plain_name(name: str, where: object) -> str:
 
 
 def pair_id(scene: str, first: str, second: str) -> str:
-    """The id under which a pair of the train side runs."""
     return f"{scene};{first}-{second}"
 
 
 def evenly_spread(items: Sequence[Item], most: int | None) -> list[Item]:
-    """At most that many of the items, the first and the last among them."""
-    if most is None or most >= len(items):
-        return list(items)
-    return [items[index] for index in np.linspace(0, len(items) - 1, most).round().astype(int)]
+    count = len(items) if most is None else min(most, len(items))
+    return [items[index] for index in np.linspace(0, len(items) - 1, count).round().astype(int)]
 
 
 class ImageFiles(dict[str, str]):
@@ -270,14 +248,12 @@ class ImageFiles(dict[str, str]):
             self.update((path.stem, str(path)) for path in reversed(images))
 
     def __missing__(self, image_id: str) -> str:
-        return f"{self.directory}{os.sep}{image_id}.png"
+        return str(self.directory / f"{image_id}.png")
 
 
 def _numbers(cell: str, where: str, count: int) -> NDArray[np.float64]:
-    try:
-        numbers = np.array([float(part) for part in cell.split()])
-    except ValueError as error:
-        raise UserError(f"{where}: {cell!r} is not a list of numbers") from error
-    if numbers.size != count:
-        raise UserError(f"{where}: expected {count} numbers, found {numbers.size}: {cell!r}")
-    return numbers
+    parts = cell.split()
+    with suppress(ValueError):
+        if len(parts) == count:
+            return np.array([float(part) for part in parts])
+    raise UserError(f"{where}: expected {count} numbers, found {len(parts)} words: {cell!r}")

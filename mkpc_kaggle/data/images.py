@@ -1,10 +1,8 @@
 """Images: decoded in the background and once. An unreadable file is a value with a reason, not an exception."""
 
 import hashlib
-import stat
-import threading
 from collections import OrderedDict
-from collections.abc import Hashable, Iterable
+from collections.abc import Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
@@ -16,24 +14,19 @@ import numpy as np
 
 from mkpc_kaggle.geometry.coordinates import Pixels, Size
 
-Key = TypeVar("Key", bound=Hashable)
+Key = TypeVar("Key")
 Value = TypeVar("Value")
 
-# Of the longer side to the shorter. Beyond it an image counts as damaged: its views would be a few pixels high, or
-# would not fit into memory.
-MAX_ASPECT = 32
+MAX_ASPECT = 32  # of the sides; beyond it views would be a few pixels high, or would not fit into memory
 
 
 @dataclass(frozen=True, eq=False)
 class Image:
-    """A decoded image: ``pixels`` is (H, W, 3) uint8 RGB; ``name`` is unique in a run.
+    """A decoded image."""
 
-    ``version`` is the digest of its file for :func:`is_unchanged`; empty where it has no file.
-    """
-
-    name: str
-    pixels: Pixels
-    version: str = ""
+    name: str  # unique in a run
+    pixels: Pixels  # (H, W, 3) uint8 RGB
+    version: str = ""  # the digest of its file, for :func:`is_unchanged`
 
     @classmethod
     def of_array(cls, array: Pixels) -> "Image":
@@ -66,14 +59,13 @@ class Unreadable:
 
 
 def read_image(path: Path) -> Image | Unreadable:
-    """Decode a file (png, jpg; 8 or 16 bit; gray, colour, with alpha) to 8-bit RGB; never raises.
+    """Decode a file to RGB; never raises. 16-bit values are divided by 256, EXIF's orientation is applied.
 
-    16-bit values are divided by 256, alpha is dropped, an EXIF orientation is applied. OpenCV decides whether
-    a damaged file is readable: version 5 refuses a truncated file.
+    OpenCV decides whether a damaged file is readable: version 5 refuses a truncated file.
     """
     name = str(path)
     try:
-        if not stat.S_ISREG(path.stat().st_mode):  # a pipe or a device may never end
+        if path.exists() and not path.is_file():  # a pipe or a device may never end
             return Unreadable(name, "cannot be read: not a regular file")
         data = np.fromfile(path, np.uint8)
         bgr = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
@@ -92,10 +84,7 @@ def read_image(path: Path) -> Image | Unreadable:
 
 
 def is_unchanged(path: Path, version: str) -> bool:
-    """Whether a file still has the content that it had when an image of that ``version`` was read from it.
-
-    A file that cannot be read counts as unchanged.
-    """
+    """Whether a file is still of that ``version``; a file that cannot be read counts as unchanged."""
     try:
         return not path.is_file() or _content_digest(np.fromfile(path, np.uint8)) == version
     except (OSError, ValueError):
@@ -112,65 +101,50 @@ def printable(text: str) -> str:
 
 
 class ByteCache(Generic[Key, Value]):
-    """The most recently used values, ``limit`` bytes at most, shared by threads; a larger value is not kept."""
+    """The most recently used values, ``limit`` bytes at most; a larger value is not kept. For one thread."""
 
     def __init__(self, limit: int) -> None:
         self.limit, self.bytes = limit, 0
         self._entries: OrderedDict[Key, tuple[Value, int]] = OrderedDict()
-        self._lock = threading.Lock()
 
     def get(self, key: Key) -> Value | None:
-        with self._lock:
-            if key not in self._entries:
-                return None
-            self._entries.move_to_end(key)
-            return self._entries[key][0]
+        if key not in self._entries:
+            return None
+        self._entries.move_to_end(key)
+        return self._entries[key][0]
 
     def put(self, key: Key, value: Value, size: int) -> None:
-        with self._lock:
-            self.bytes += size - self._entries.pop(key, (value, 0))[1]
-            self._entries[key] = value, size
-            if size > self.limit:
-                self.bytes -= self._entries.pop(key)[1]
-            while self.bytes > self.limit:
-                self.bytes -= self._entries.popitem(last=False)[1][1]
+        self.bytes += size - self._entries.pop(key, (value, 0))[1]
+        self._entries[key] = value, size
+        if size > self.limit:
+            self.bytes -= self._entries.pop(key)[1]
+        while self.bytes > self.limit:
+            self.bytes -= self._entries.popitem(last=False)[1][1]
 
 
 class ImageStore:
-    """Images by path, decoded in the background by :meth:`prefetch`; the most recently used are kept."""
+    """Images by path, decoded in the background; the most recently used are kept. For one thread."""
 
-    def __init__(self, limit_bytes: int = 512 << 20, threads: int = 1) -> None:
+    def __init__(self, limit_bytes: int = 512 << 20) -> None:
         self._images: ByteCache[Path, Image] = ByteCache(limit_bytes)
         self._pending: dict[Path, Future[Image | Unreadable]] = {}
-        self._lock = threading.Lock()
-        self._decoders = ThreadPoolExecutor(threads, thread_name_prefix="decode")
+        self._decoder = ThreadPoolExecutor(1, thread_name_prefix="decode")
 
     def prefetch(self, paths: Iterable[Path]) -> None:
         """Start decoding the images that are neither cached nor being decoded."""
-        with self._lock:
-            for path in paths:
-                if self._images.get(path) is None:
-                    self._decoding(path)
+        for path in paths:
+            if self._images.get(path) is None and path not in self._pending:
+                self._pending[path] = self._decoder.submit(read_image, path)
 
     def get(self, path: Path) -> Image | Unreadable:
         """The image; waits until it is decoded."""
-        with self._lock:
-            known = self._images.get(path)
-            if known is not None:
-                return known
-            pending = self._decoding(path)
-        image = pending.result()
-        with self._lock:
-            if isinstance(image, Image):
-                self._images.put(path, image, image.pixels.nbytes)
-            if self._pending.get(path) is pending:
-                del self._pending[path]
+        if (known := self._images.get(path)) is not None:
+            return known
+        self.prefetch([path])
+        image = self._pending.pop(path).result()
+        if isinstance(image, Image):
+            self._images.put(path, image, image.pixels.nbytes)
         return image
 
     def close(self) -> None:
-        self._decoders.shutdown(wait=False, cancel_futures=True)
-
-    def _decoding(self, path: Path) -> "Future[Image | Unreadable]":
-        if path not in self._pending:
-            self._pending[path] = self._decoders.submit(read_image, path)
-        return self._pending[path]
+        self._decoder.shutdown(wait=False, cancel_futures=True)

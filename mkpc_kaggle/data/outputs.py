@@ -25,15 +25,14 @@ def require_apart(
     work_dir: Path | None = None,
     weights: Iterable[Path] = (),
 ) -> None:
-    """Refuse outputs that would overwrite an existing input, or that are in each other's or the journal's way.
+    """Refuse outputs that would overwrite an input, or that are in each other's or the journal's way.
 
-    ``outputs`` are files to write, by option; ``inputs`` and ``weights`` are files and directories, ``work_dir``
-    is the journal's. A new file is fine, wherever it is. ``--json`` and ``--report`` overwrite nothing but their
-    own kind. Raises :class:`UserError`.
+    ``outputs`` are files, by option; ``inputs`` and ``weights`` files and directories. A new file is fine.
+    ``--json`` and ``--report`` overwrite nothing but their own kind. Raises :class:`UserError`.
     """
-    environment = [Path(part) for part in os.environ.get("MKPC_WEIGHTS", "").split(os.pathsep) if part]
-    inputs, weights = list(inputs), [*weights, *environment]
     files = {option: path for option, path in outputs.items() if path is not None}
+    inputs, environment = list(inputs), os.environ.get("MKPC_WEIGHTS", "").split(os.pathsep)
+    precious = [*inputs, *weights, *map(Path, filter(None, environment))]
     for option, path in files.items():
         if not path.name or os.path.isdir(path):  # noqa: PTH112  Path raises for a name that is too long
             raise UserError(f"{option} {str(path)!r} is a directory; name a file")
@@ -45,7 +44,7 @@ def require_apart(
         ):
             raise UserError(f"{option} {path} and the work directory {work_dir} are in each other's way")
         is_result = path.suffix.lower() in RESULTS.get(option, ())
-        for place in (*inputs, *weights) if os.path.lexists(path) else ():
+        for place in precious if os.path.lexists(path) else ():
             if same_file(path, place) or (lies_in(path, place) and not is_result):
                 raise UserError(f"{option} {path} would be written over the input {place}; name another file")
         if option in ("--json", "--report") and not is_result and os.path.isfile(path):  # noqa: PTH113
@@ -71,9 +70,8 @@ def same_file(path: Path, other: Path) -> bool:
 def replacing(path: Path) -> Iterator[TextIO]:
     """A file to write that takes the place of ``path`` when all of it is on the disk.
 
-    Until then it lies beside ``path`` under a name of its own; what a killed process has left there is removed. A
-    device such as ``/dev/stdout`` is written to and not replaced. Raises ``OSError`` where it cannot be written;
-    nothing is left of it then.
+    Until then it lies beside ``path``; what a killed process has left there is removed. A device such as
+    ``/dev/stdout`` is written to and not replaced. Raises ``OSError`` where it cannot be written; nothing is left.
     """
     if path.is_char_device():
         with path.open("w", encoding="utf-8", newline="") as stream:

@@ -28,11 +28,9 @@ MAX_SKEWNESS = 1e-3  # of R R^T of a pose from the identity: files have few digi
 
 @dataclass(frozen=True, eq=False)
 class ListedImage:
-    """An image of a line: its path under the image root, its quarter turns, its camera before turning."""
-
-    name: str
-    turns: int
-    camera: Camera
+    name: str  # its path under the image root
+    turns: int  # quarters
+    camera: Camera  # before turning
 
     def __str__(self) -> str:
         return self.name + (f" turned {self.turns}" if self.turns else "")
@@ -41,10 +39,9 @@ class ListedImage:
 def read_pairs(file: Path, image_root: Path, *, copies: Path, most: int | None = None) -> TrainScene:
     """The pairs of a list as a scene of unknown scale, to estimate E on.
 
-    ``most`` takes that many pairs, evenly spread over the list. A turned copy of every image that has to be turned
-    is written to the directory ``copies``, and the cameras are those of the copies. An image that cannot be read
-    is no error here: the run reports it. Raises :class:`UserError` for a missing or empty file, a malformed line,
-    and a name that points outside ``image_root``.
+    ``most`` takes that many pairs, evenly spread. Images that have to be turned are copied to the directory
+    ``copies``, and the cameras are those of the copies. An image that cannot be read is no error here: the run
+    reports it. Raises :class:`UserError` for a list without pairs and for a malformed line.
     """
     if not image_root.is_dir():
         raise UserError(f"--image-root {image_root}: no such directory")
@@ -54,18 +51,17 @@ def read_pairs(file: Path, image_root: Path, *, copies: Path, most: int | None =
         raise UserError(f"{file} has no pairs; expected lines {EXPECTED}")
 
     @cache
-    def upright(name: str, turns: int) -> tuple[Path, Size | None]:
+    def copy_of(name: str, turns: int) -> tuple[Path, Size | None]:
         return turned_copy(image_root / name, turns, copies)
+
+    def upright(image: ListedImage) -> tuple[str, Camera]:
+        path, size = copy_of(image.name, image.turns)
+        return str(path), image.camera.rotated_90(image.turns, size) if size else image.camera
 
     pairs = []
     for number, images in evenly_spread(listed, most):
-        (path0, camera0), (path1, camera1) = (
-            (path, image.camera.rotated_90(image.turns, size) if size else image.camera)
-            for image in images
-            for path, size in [upright(image.name, image.turns)]
-        )
-        name, intrinsics = f"{number}: {images[0]} {images[1]}", (camera0.K, camera1.K)
-        pair = Pair(name, file.stem, str(path0), str(path1), intrinsics)
+        (file0, camera0), (file1, camera1) = map(upright, images)
+        pair = Pair(f"{number}: {images[0]} {images[1]}", file.stem, file0, file1, (camera0.K, camera1.K))
         pairs.append(TruePair(pair, camera0, camera1, nan))
     return TrainScene(file.stem, nan, tuple(pairs))
 
@@ -76,30 +72,29 @@ def parse_line(line: str, where: str) -> tuple[ListedImage, ListedImage]:
     if len(cells) != FIELDS:
         raise UserError(f"{where}: expected {FIELDS} fields, {EXPECTED}, found {len(cells)}")
     for name in cells[:2]:
-        # Windows' rules are the strictest: drives and backslashes, besides what is absolute elsewhere.
-        path = PureWindowsPath(name)
+        path = PureWindowsPath(name)  # the strictest rules: drives and backslashes count, too
         if path.anchor or ".." in path.parts or "\0" in name:
             raise UserError(
                 f"{where}: {name!r} points outside the image root; expected a relative path without .."
             )
-    for turns in cells[2:4]:
-        if turns not in ("0", "1", "2", "3"):
-            raise UserError(f"{where}: expected 0, 1, 2 or 3 quarter turns, found {turns!r}")
     try:
-        numbers = np.array([float(cell) for cell in cells[4:]])
+        turns, numbers = [int(cell) for cell in cells[2:4]], np.array([float(cell) for cell in cells[4:]])
     except ValueError as error:
-        raise UserError(f"{where}: expected numbers for K0, K1 and T_0to1: {error}") from error
-    if not np.isfinite(numbers).all():
-        raise UserError(f"{where}: expected finite numbers for K0, K1 and T_0to1")
+        raise UserError(f"{where}: expected numbers for turns, K0, K1 and T_0to1: {error}") from error
     K0, K1, T = numbers[:9].reshape(3, 3), numbers[9:18].reshape(3, 3), numbers[18:].reshape(4, 4)
-    for name, K in (("K0", K0), ("K1", K1)):
-        if K[0, 0] <= 0 or K[1, 1] <= 0 or K[1, 0] or tuple(K[2]) != (0, 0, 1):
-            raise UserError(f"{where}: expected {name} = fx s cx 0 fy cy 0 0 1 with positive fx and fy")
     R, t = T[:3, :3], T[:3, 3]
-    if tuple(T[3]) != (0, 0, 0, 1) or np.abs(R @ R.T - np.eye(3)).max() > MAX_SKEWNESS or np.linalg.det(R) < 0:
-        raise UserError(f"{where}: expected T_0to1 = [R t; 0 0 0 1] with R a rotation")
-    cameras = Camera(K0, np.eye(3), np.zeros(3)), Camera(K1, R, t)
-    return ListedImage(cells[0], int(cells[2]), cameras[0]), ListedImage(cells[1], int(cells[3]), cameras[1])
+    has_focals = all(min(K[0, 0], K[1, 1]) > 0 and (K[1, 0], *K[2]) == (0, 0, 0, 1) for K in (K0, K1))
+    is_rotation = np.abs(R @ R.T - np.eye(3)).max() < MAX_SKEWNESS and np.linalg.det(R) > 0
+    for holds, expected in (
+        (set(turns) <= {0, 1, 2, 3}, f"0, 1, 2 or 3 quarter turns, found {cells[2]} and {cells[3]}"),
+        (np.isfinite(numbers).all(), "finite numbers for K0, K1 and T_0to1"),
+        (has_focals, "K0 and K1 = fx s cx 0 fy cy 0 0 1 with positive fx and fy"),
+        (is_rotation and tuple(T[3]) == (0, 0, 0, 1), "T_0to1 = [R t; 0 0 0 1] with R a rotation"),
+    ):
+        if not holds:
+            raise UserError(f"{where}: expected {expected}")
+    first, second = Camera(K0, np.eye(3), np.zeros(3)), Camera(K1, R, t)
+    return ListedImage(cells[0], turns[0], first), ListedImage(cells[1], turns[1], second)
 
 
 def turned_copy(path: Path, turns: int, copies: Path) -> tuple[Path, Size | None]:

@@ -61,15 +61,11 @@ class Box:
 
 @dataclass(frozen=True)
 class View:
-    """What a matcher is shown: a crop of an image, resized, padded right and bottom.
+    """What a matcher is shown: a crop of an image, resized, padded right and bottom."""
 
-    ``crop`` is in image pixels, ``content`` the size of the resized crop, ``padded`` the size of the picture
-    with its padding.
-    """
-
-    crop: Box
-    content: Size
-    padded: Size
+    crop: Box  # in image pixels
+    content: Size  # of the resized crop
+    padded: Size  # of the picture with its padding
 
     @classmethod
     def fit(cls, crop: Box, *, long_side: int, multiple: int = 1) -> "View":

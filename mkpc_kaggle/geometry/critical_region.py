@@ -7,7 +7,6 @@ Where that cannot be trusted, the region is the whole image, with the reason.
 
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,8 +19,6 @@ from mkpc_kaggle.geometry.coordinates import Box, Points, Size
 @dataclass(frozen=True)
 class MkpcConfig:
     """Settings of :func:`critical_region`, table ``[mkpc]`` of a recipe."""
-
-    FORMER: ClassVar = {"ratio": ""}
 
     eps: float = 0.05  # of DBSCAN, in units of the image's width and height
     min_samples: int = 5  # of DBSCAN
@@ -48,28 +45,21 @@ class RegionReason(StrEnum):
 
 @dataclass(frozen=True)
 class CriticalRegion:
-    """The box of an image that stage 2 looks at, in image pixels, and the reason for it.
-
-    ``clusters`` counts the clusters found, ``kept`` those whose points span the box.
-    """
+    """The box of an image that stage 2 looks at, in image pixels, and the reason for it."""
 
     box: Box
     reason: RegionReason
-    clusters: int = 0
-    kept: int = 0
+    clusters: int = 0  # found
+    kept: int = 0  # those whose points span the box
 
 
 @dataclass(frozen=True, eq=False)
 class Clusters:
-    """Clusters of an image's N matched points.
+    """Clusters of an image's N matched points."""
 
-    ``labels`` is (N,), the cluster of each point, -1 for noise; ``sizes`` is (K,), the points of each cluster;
-    ``kept`` are the labels of those that span the critical region, largest first.
-    """
-
-    labels: NDArray[np.intp]
-    sizes: NDArray[np.intp]
-    kept: NDArray[np.intp]
+    labels: NDArray[np.intp]  # (N,) the cluster of each point, -1 for noise
+    sizes: NDArray[np.intp]  # (K,) the points of each cluster
+    kept: NDArray[np.intp]  # labels of those that span the critical region, largest first
 
     @property
     def in_kept(self) -> NDArray[np.bool_]:

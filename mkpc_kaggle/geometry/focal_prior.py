@@ -22,7 +22,7 @@ same F and the same derivatives of it.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from statistics import NormalDist
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,11 +56,6 @@ LOG_FOCAL_GRID = (-0.7, -0.35, 0.0, 0.35, 0.7)  # log f / g to read MAGSAC's F w
 class FocalConfig:
     """Settings of :func:`estimate_with_prior`, table ``[focal]`` of a recipe; without it MAGSAC is alone."""
 
-    FORMER: ClassVar = dict.fromkeys((
-        "essential_threshold", "essential_iterations", "essential_starts", "essential_share", "rough_matches",
-        "refined", "most_matches", "free_cost",
-    ), "")  # fmt: skip
-
     ratio: float = 1.1  # of an unknown focal length to the image's long side
     sigma: float = 0.4  # standard deviation of the focal length's logarithm
     scale: float = 0.35  # of the loss, in pixels
@@ -71,13 +66,10 @@ class FocalConfig:
 
 @dataclass(frozen=True, eq=False)
 class FocalPrior:
-    """What is known of a camera: ``K`` (3, 3) in pixels, and the standard deviation of its log focal length.
+    """What is known of a camera."""
 
-    With ``sigma`` 0 the camera is known.
-    """
-
-    K: Matrix3
-    sigma: float
+    K: Matrix3  # in pixels
+    sigma: float  # standard deviation of the log focal length; 0: it is known
 
     @classmethod
     def of_image(cls, size: Size, config: FocalConfig) -> "FocalPrior":

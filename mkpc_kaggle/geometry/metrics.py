@@ -4,12 +4,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from math import inf, isfinite
 
+import cv2
 import numpy as np
 from scipy.integrate import trapezoid
 
 from mkpc_kaggle.geometry.cameras import Camera, relative_pose
 from mkpc_kaggle.geometry.coordinates import Matrix3
-from mkpc_kaggle.geometry.robust import poses_of_fundamental
 
 # The competition's rules: the i-th threshold in degrees goes with the i-th in metres.
 ROTATION_THRESHOLDS = np.linspace(1, 10, 10)
@@ -19,15 +19,11 @@ AUC_THRESHOLDS = (5.0, 10.0, 20.0)  # degrees
 
 @dataclass(frozen=True)
 class PoseError:
-    """How far an F's pose is from the truth; infinite where F is missing.
+    """How far an F's pose is from the truth; infinite where F is missing."""
 
-    ``rotation`` and ``translation_angle`` in degrees (the latter at most 90, as the sign is unknown),
-    ``translation`` in metres after scaling to the true length; NaN where the scale of the world is unknown.
-    """
-
-    rotation: float
-    translation_angle: float
-    translation: float
+    rotation: float  # degrees
+    translation_angle: float  # degrees, at most 90: the sign is unknown
+    translation: float  # metres, after scaling to the true length; NaN where the scale of the world is unknown
 
     @classmethod
     def failed(cls) -> "PoseError":
@@ -53,12 +49,14 @@ def pose_error(F: Matrix3, camera0: Camera, camera1: Camera, metres_per_unit: fl
     counts, and the translation's sign is free.
     """
     R, t = relative_pose(camera0, camera1)
-    rotations, direction = poses_of_fundamental(F, camera0.K, camera1.K)
+    # Hartley and Zisserman, Multiple View Geometry, 9.6.2: two rotations, a direction (3, 1) of unknown sign.
+    *rotations, column = cv2.decomposeEssentialMat(camera1.K.T @ F @ camera0.K)
+    direction = np.ravel(column).astype(np.float64)
     length = float(np.linalg.norm(t))
     cosine = abs(float(direction @ t)) / max(length, np.finfo(float).tiny)
     apart = min(float(np.linalg.norm(direction * length - t)), float(np.linalg.norm(direction * length + t)))
     return PoseError(
-        rotation=min(rotation_angle(candidate @ R.T) for candidate in rotations),
+        rotation=min(rotation_angle(np.asarray(candidate) @ R.T) for candidate in rotations),
         translation_angle=float(np.degrees(np.arccos(min(cosine, 1.0)))),
         translation=apart * metres_per_unit,
     )
@@ -94,9 +92,8 @@ def pose_auc(errors: Sequence[PoseError], threshold: float) -> float:
     """
     if not errors:
         return float("nan")
-    angles = np.sort([error.angle for error in errors])
-    recall = np.arange(1, len(angles) + 1) / len(angles)
-    angles, recall = np.concatenate([[0.0], angles]), np.concatenate([[0.0], recall])
+    angles = np.sort([0.0, *(error.angle for error in errors)])
+    recall = np.arange(len(angles)) / len(errors)
     last = int(np.searchsorted(angles, threshold))
     x = np.append(angles[:last], threshold)
     y = np.append(recall[:last], recall[last - 1])

@@ -1,4 +1,4 @@
-"""Two-view models from matches: F, E or H by MAGSAC++, and the poses that an F stands for.
+"""Two-view models from matches: F, E or H by MAGSAC++.
 
 An estimate is always a value: where no model is found, it has the reason and the fallback matrix, which is
 finite and of the right rank, so that a submission is always complete.
@@ -61,19 +61,13 @@ class RobustConfig:
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """A two-view model of a pair.
-
-    ``matrix`` is (3, 3) float64, finite, of unit Frobenius norm; for F, x1^T F x0 = 0 in homogeneous image
-    pixels. ``inliers`` is an (N,) mask over the matches that were given: those nearer than the threshold.
-    ``failure`` is empty, or says why ``matrix`` is only the fallback. ``magsac`` is the (3, 3) F of MAGSAC alone,
-    ``None`` without a prior on focal lengths and where MAGSAC finds none.
-    """
+    """A two-view model of a pair."""
 
     model: ModelKind
-    matrix: Matrix3
-    inliers: NDArray[np.bool_]
-    failure: str = ""
-    magsac: Matrix3 | None = None
+    matrix: Matrix3  # finite, of unit Frobenius norm; for F, x1^T F x0 = 0 in homogeneous image pixels
+    inliers: NDArray[np.bool_]  # (N,) mask over the matches that were given: those nearer than the threshold
+    failure: str = ""  # why ``matrix`` is only the fallback
+    magsac: Matrix3 | None = None  # under a prior on focal lengths, the F of MAGSAC alone, if it finds any
 
     @property
     def ok(self) -> bool:
@@ -123,27 +117,38 @@ def consensus(
     if intrinsics is not None and model is ModelKind.E:
         points0, points1 = calibrate(points0, intrinsics[0]), calibrate(points1, intrinsics[1])
         threshold /= float(np.mean([K[axis, axis] for K in intrinsics for axis in (0, 1)]))
-    try:
-        matrix, mask = _best_of_permutations(solver, points0, points1, threshold, config)
-    except cv2.error as error:
-        return Estimate.failed(model, count, f"OpenCV refused the points: {error.err}")
-    if matrix is None:
-        return Estimate.failed(model, count, f"no {model} fits {count} distinct matches")
-    if not mask.any():
+    method = cv2.USAC_MAGSAC if config.method is Method.MAGSAC else cv2.RANSAC
+    settings = {"method": method, "confidence": config.confidence, "maxIters": config.max_iterations}
+    best, inliers, lowest = None, np.zeros(count, bool), np.inf
+    failure = f"no {model} fits {count} distinct matches"
+    for number in range(config.permutations):
+        order = permutation(number, count)
+        try:
+            matrix, mask = solver.find(points0[order], points1[order], ransacReprojThreshold=threshold, **settings)
+        except cv2.error as error:  # it sometimes rejects points in one order and not in another
+            failure = f"OpenCV refused the points: {error.err}"
+            continue
+        if matrix is None or matrix.shape != (3, 3) or not np.isfinite(matrix).all() or not matrix.any():
+            continue
+        with np.errstate(over="ignore", invalid="ignore"):  # points may be anything
+            cost = float(np.sum(robust_costs(solver.distances(matrix, points0, points1), 2 * threshold)))
+        # Most inliers do not decide: MAGSAC's score depends on distances up to several times the threshold.
+        if best is None or cost < lowest:
+            best, inliers[order], lowest = matrix, mask.ravel().astype(bool), cost
+    if best is None:
+        return Estimate.failed(model, count, failure)
+    if not inliers.any():
         return Estimate.failed(model, count, f"no {model} has inliers among {count} distinct matches")
-    return Estimate(model, unit_norm(matrix), mask)
+    return Estimate(model, unit_norm(best), inliers)
 
 
 @dataclass(frozen=True, eq=False)
 class DistinctMatches:
-    """The finite distinct matches, (M, 2) points in order of first appearance, among N.
+    """The finite distinct matches among N, in order of first appearance."""
 
-    ``place`` (N,) is the row of each match in ``points0`` and ``points1``, -1 for a match that is not finite.
-    """
-
-    points0: Vectors
+    points0: Vectors  # (M, 2)
     points1: Vectors
-    place: NDArray[np.intp]
+    place: NDArray[np.intp]  # (N,) the row of each match in them, -1 for a match that is not finite
 
     @classmethod
     def of(cls, matches: Matches) -> "DistinctMatches":
@@ -170,17 +175,6 @@ def calibrate(points: Vectors, K: Matrix3) -> Vectors:
     return np.asarray(mapped[:, :2] / mapped[:, 2:])
 
 
-def poses_of_fundamental(F: Matrix3, K0: Matrix3, K1: Matrix3) -> tuple[tuple[Matrix3, Matrix3], Vectors]:
-    """The two rotations, and the translation (3,) of unit length and unknown sign, that an F stands for.
-
-    X_1 = R X_0 + t takes camera 0 to camera 1. Which rotation and sign hold, only points in front of both
-    cameras can tell. Source: Hartley and Zisserman, Multiple View Geometry, 9.6.2.
-    """
-    rotation_a, rotation_b, translation = cv2.decomposeEssentialMat(K1.T @ F @ K0)
-    rotations = np.asarray(rotation_a, np.float64), np.asarray(rotation_b, np.float64)
-    return rotations, np.asarray(translation, np.float64).ravel()
-
-
 def sampson_distances(F: Matrix3, matches: Matches) -> Vectors:
     """(N,) Sampson distance in pixels; OpenCV's inliers of an F have it below the threshold.
 
@@ -192,35 +186,6 @@ def sampson_distances(F: Matrix3, matches: Matches) -> Vectors:
 def permutation(number: int, count: int) -> NDArray[np.intp]:
     """A fixed permutation of ``count`` matches; number 0 is their own order."""
     return np.random.default_rng(number).permutation(count) if number else np.arange(count)
-
-
-def _best_of_permutations(
-    solver: "_Solver", points0: Vectors, points1: Vectors, threshold: float, config: RobustConfig
-) -> tuple[Matrix3 | None, NDArray[np.bool_]]:
-    """The model of the lowest robust cost over fixed permutations, and its mask (N,).
-
-    Most inliers do not decide: MAGSAC's score depends on distances up to several times the threshold. OpenCV
-    sometimes rejects points in one order and not in another; its error is raised if no order gave a model.
-    """
-    method = cv2.USAC_MAGSAC if config.method is Method.MAGSAC else cv2.RANSAC
-    settings = {"method": method, "confidence": config.confidence, "maxIters": config.max_iterations}
-    best, best_mask, lowest, refusal = None, np.zeros(len(points0), bool), np.inf, None
-    for number in range(config.permutations):
-        order = permutation(number, len(points0))
-        try:
-            matrix, mask = solver.find(points0[order], points1[order], ransacReprojThreshold=threshold, **settings)
-        except cv2.error as error:
-            refusal = error
-            continue
-        if matrix is None or matrix.shape != (3, 3) or not np.isfinite(matrix).all() or not matrix.any():
-            continue
-        with np.errstate(over="ignore", invalid="ignore"):  # points may be anything
-            cost = float(np.sum(robust_costs(solver.distances(matrix, points0, points1), 2 * threshold)))
-        if best is None or cost < lowest:
-            best, best_mask[order], lowest = matrix, mask.ravel().astype(bool), cost
-    if best is None and refusal is not None:
-        raise refusal
-    return best, best_mask
 
 
 def homogeneous(points: Vectors) -> Vectors:
@@ -242,14 +207,9 @@ def _transfer_distances(matrix: Matrix3, points0: Vectors, points1: Vectors) -> 
 
 
 class _Solver(NamedTuple):
-    """What a kind of model needs: more matches than the minimal solver takes, so that they tell a model.
-
-    ``find`` gives OpenCV's matrix and mask, ``None`` where no model is found.
-    """
-
-    min_matches: int
+    min_matches: int  # more than the minimal solver takes, so that they tell a model
     fallback: Matrix3
-    find: Callable[..., Any]
+    find: Callable[..., Any]  # OpenCV's matrix and mask, ``None`` where no model is found
     distances: Callable[[Matrix3, Vectors, Vectors], Vectors]
 
 

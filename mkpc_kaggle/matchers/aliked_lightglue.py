@@ -1,23 +1,21 @@
 """ALIKED keypoints (Zhao et al. 2023) matched by LightGlue (Lindenberger et al. 2023)."""
 
-from mkpc_kaggle.matchers.aliked import SLOT as ALIKED
-from mkpc_kaggle.matchers.aliked import load_encoder
+from mkpc_kaggle.matchers.aliked import SLOT, load_encoder
 from mkpc_kaggle.matchers.contract import MatcherSpec, Placement
 from mkpc_kaggle.matchers.lightglue import LightGlueMatcher, LightGlueOptions, load_glue
 from mkpc_kaggle.weights import WeightStore
 
-LIGHTGLUE = "aliked-lightglue"
 SPEC = MatcherSpec(
     "aliked_lightglue",
     "ALIKED n16 with LightGlue",
     LightGlueOptions,
     multiple=32,
     licences=("BSD-3-Clause", "Apache-2.0"),
-    slots=(ALIKED, LIGHTGLUE),
+    slots=(SLOT, "aliked-lightglue"),
 )
 
 
 def load(weights: WeightStore, options: LightGlueOptions, placement: Placement) -> LightGlueMatcher:
     encoder = load_encoder(weights, options.features, placement)
-    glue = load_glue(weights, LIGHTGLUE, options.threshold, input_dim=128)
+    glue = load_glue(weights, "aliked-lightglue", options.threshold, input_dim=128)
     return LightGlueMatcher(SPEC, encoder, glue, placement)

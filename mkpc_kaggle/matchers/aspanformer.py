@@ -15,15 +15,13 @@ SPEC = MatcherSpec(
     licences=("Apple-noncommercial",),
     slots=("aspanformer-{training}",),
 )
+# The border, and the size that positions are scaled to. The indoor weights were published for 480 x 640 only, with
+# unscaled positions and a global level of 15 x 20 cells: there our scaling and pooling are the same.
+GRIDS = {Training.OUTDOOR: (2, (832, 832)), Training.INDOOR: (0, (480, 640))}
 
 
 def load(weights: WeightStore, options: SemiDenseOptions, placement: Placement) -> SemiDenseMatcher:
-    if options.training is Training.OUTDOOR:
-        network = AspanFormer(options.threshold)
-    else:
-        # Published for 480 x 640 only, with unscaled positions and a global level of 15 x 20 cells. At that size
-        # positions scaled to it and pooling by four are the same.
-        network = AspanFormer(options.threshold, border=0, train_size=(480, 640))
+    network = AspanFormer(options.threshold, *GRIDS[options.training])
     # Checkpoints also have offsets that the published network never reads.
     load_network(network, weights, *SPEC.slots_for(options), unused=r".*\.sample_offset$")
     return SemiDenseMatcher(placed(network, placement), SPEC, placement.device)

@@ -5,12 +5,12 @@ One contract serves sparse, semi-dense and dense networks. ``encode`` does what 
 images are used in many pairs. ``match`` does the rest.
 """
 
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from enum import StrEnum
-from itertools import product
-from string import Formatter
-from typing import Any, Generic, Protocol, TypeVar, get_type_hints
+from fnmatch import fnmatch
+from typing import Any, Generic, Protocol, TypeVar
 
 from mkpc_kaggle.geometry.coordinates import Pixels, Size, View
 from mkpc_kaggle.geometry.matches import Matches
@@ -77,16 +77,9 @@ class MatcherSpec:
         """The slots of the manifest that a matcher with these options is loaded from."""
         return tuple(slot.format_map(vars(options)) for slot in self.slots)
 
-    @property
-    def every_slot(self) -> tuple[str, ...]:
-        """The slots of all trainings and variants: of every value of the options that slots name."""
-        values = get_type_hints(self.options)
-        found: dict[str, None] = {}
-        for slot in self.slots:
-            names = [name for _, name, _, _ in Formatter().parse(slot) if name]
-            for chosen in product(*(values[name] for name in names)):
-                found[slot.format_map(dict(zip(names, chosen, strict=True)))] = None
-        return tuple(found)
+    def uses(self, slot: str) -> bool:
+        """Whether some training or variant needs the slot."""
+        return any(fnmatch(slot, re.sub(r"{\w+}", "*", own)) for own in self.slots)
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,8 +109,8 @@ class Matcher(Protocol[Encoding]):
     def encode(self, pictures: Sequence[Picture]) -> Sequence[Encoding]:
         """Encodings of pictures that have one shape.
 
-        Their arrays are counted in dataclasses, tuples and lists. They should not share memory with each other,
-        because each may be cached alone.
+        Their arrays are counted in dataclasses, tuples and lists. They should not be views of larger arrays: each
+        encoding may be cached alone.
         """
         ...
 
@@ -152,15 +145,4 @@ def arrays_of(value: Any) -> Iterator[Any]:
 
 
 def encoding_bytes(encoding: Any) -> int:
-    """The bytes that an encoding keeps alive.
-
-    A tensor counts with all of its storage, of which it may show a part; a storage counts once.
-    """
-    memory = {}
-    for array in arrays_of(encoding):
-        if hasattr(array, "untyped_storage"):
-            storage = array.untyped_storage()
-            memory[storage.data_ptr()] = storage.nbytes()
-        else:
-            memory[id(array)] = int(array.nbytes)
-    return sum(memory.values())
+    return sum(array.nbytes for array in arrays_of(encoding))

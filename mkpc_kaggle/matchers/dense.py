@@ -19,8 +19,6 @@ from mkpc_kaggle.matchers.networks.pixels import network_input
 
 @dataclass(frozen=True)
 class DenseOptions:
-    FORMER: ClassVar = {"symmetric": "", "balanced": ""}
-
     passes: int = 1  # 2: first on pictures whose sides are scaled by ``first_pass``, then on the full ones
     first_pass: float = 0.625
     matches: int = 5000  # at most

@@ -3,12 +3,9 @@
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from mkpc_kaggle.matchers.contract import NonFiniteError, arrays_of
-
-if TYPE_CHECKING:
-    from torch.nn import Module
 
 
 @contextmanager
@@ -23,26 +20,18 @@ def exact_float32() -> Iterator[None]:
         return
     import torch
 
-    backends = torch.backends
-    if not hasattr(backends.cudnn, "conv"):  # before PyTorch 2.9
-        precision = torch.get_float32_matmul_precision()
-        torch.set_float32_matmul_precision("highest")
-        cudnn = backends.cudnn
-        try:
-            with cudnn.flags(cudnn.enabled, cudnn.benchmark, deterministic=cudnn.deterministic, allow_tf32=False):
-                yield
-        finally:
-            torch.set_float32_matmul_precision(precision)
-        return
-    settings: tuple[Any, ...] = (backends.cudnn.conv, backends.cuda.matmul)
-    precisions = [setting.fp32_precision for setting in settings]
+    cudnn, product = torch.backends.cudnn, torch.backends.cuda.matmul
+    settings: tuple[Any, ...] = (cudnn.conv, product) if hasattr(cudnn, "conv") else (cudnn, product)
+    # By the names that PyTorch has for it since 2.9, and before.
+    name, exact = ("fp32_precision", "ieee") if hasattr(cudnn, "conv") else ("allow_tf32", False)
+    former = [getattr(setting, name) for setting in settings]
     try:
         for setting in settings:
-            setting.fp32_precision = "ieee"
+            setattr(setting, name, exact)
         yield
     finally:
-        for setting, precision in zip(settings, precisions, strict=True):
-            setting.fp32_precision = precision
+        for setting, value in zip(settings, former, strict=True):
+            setattr(setting, name, value)
 
 
 def check_finite(what: str, *values: Any) -> None:
@@ -61,8 +50,3 @@ def check_finite(what: str, *values: Any) -> None:
     sums = [tensor.sum(dtype=torch.float32) for tensor in tensors]
     if not bool(torch.stack(sums).isfinite().all()):
         raise NonFiniteError(f"{what} are not finite")
-
-
-def check_results(what: str, network: "Module") -> None:
-    """Make a library's network check what it returns from now on."""
-    network.register_forward_hook(lambda network, inputs, found: check_finite(what, found))

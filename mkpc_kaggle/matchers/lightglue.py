@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 from kornia.feature import LightGlue
-from torch import Tensor, nn
+from torch import Tensor
 
 from mkpc_kaggle.config import AT_LEAST_1, SHARE, check_ranges
 from mkpc_kaggle.geometry.matches import Matches
@@ -34,7 +34,10 @@ class LightGlueMatcher(PairwiseMatcher[Keypoints]):
         self.placement = placement
         self.encode = encoder.encode
         self._glue = glue.eval().to(placement.device)
-        glue.transformers = nn.ModuleList(CastLayer(layer, placement) for layer in glue.transformers)
+        # Only its layers, into which float32 goes and of which, as a sum with it, float32 comes. Positions of
+        # keypoints and scores stay float32: LightGlue itself turns off the autocast around it.
+        for layer in glue.transformers:
+            layer.forward = autocast(placement)(layer.forward)
 
     def _match(self, keypoints0: Keypoints, keypoints1: Keypoints) -> Matches:
         if len(keypoints0) == 0 or len(keypoints1) == 0:
@@ -42,24 +45,7 @@ class LightGlueMatcher(PairwiseMatcher[Keypoints]):
         found = self._glue({"image0": _glue_input(keypoints0), "image1": _glue_input(keypoints1)})
         check_finite(f"scores of {self.spec.name}", found["log_assignment"])
         index0, index1 = found["matches"][0].T
-        return matches_of(keypoints0, keypoints1, index0, index1, found["scores"][0])
-
-
-class CastLayer(nn.Module):
-    """A layer of LightGlue's in the placement's precision: float32 goes in and, as a sum with it, comes out.
-
-    Positions of keypoints and scores stay float32. LightGlue itself turns off the autocast around it.
-    """
-
-    def __init__(self, layer: nn.Module, placement: Placement) -> None:
-        super().__init__()
-        self._layer = layer
-        self._placement = placement
-
-    def forward(self, *values: Tensor, **masks: Tensor | None) -> tuple[Tensor, Tensor]:
-        with autocast(self._placement):
-            features: tuple[Tensor, Tensor] = self._layer(*values, **masks)
-        return features
+        return matches_of(keypoints0.points, keypoints1.points, index0, index1, found["scores"][0])
 
 
 def _glue_input(keypoints: Keypoints) -> dict[str, Tensor]:
@@ -70,7 +56,7 @@ def _glue_input(keypoints: Keypoints) -> dict[str, Tensor]:
     }
 
 
-def load_glue(weights: WeightStore, slot: str, threshold: float, **shape: Any) -> LightGlue:
+def load_glue(weights: WeightStore, slot: str, threshold: float, **shape: int) -> LightGlue:
     """With as many layers as the checkpoint has; ``shape``: kornia's ``input_dim`` and so on."""
     tensors = {layer_name(name): tensor for name, tensor in weights.load(slot).items()}
     numbers = (int(name.split(".")[1]) for name in tensors if name.startswith("transformers."))

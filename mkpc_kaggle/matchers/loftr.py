@@ -1,8 +1,5 @@
 """LoFTR (Sun et al. 2021), weights with dual softmax: ``outdoor_ds`` and ``indoor_ds_new``."""
 
-from dataclasses import dataclass
-from typing import ClassVar
-
 from mkpc_kaggle.matchers.contract import Colour, MatcherSpec, Placement, Training
 from mkpc_kaggle.matchers.networks.loftr import Loftr
 from mkpc_kaggle.matchers.networks.placement import placed
@@ -13,15 +10,10 @@ from mkpc_kaggle.weights import WeightStore
 BORDERS = {Training.OUTDOOR: 2, Training.INDOOR: 0}
 
 
-@dataclass(frozen=True)
-class LoftrOptions(SemiDenseOptions):
-    FORMER: ClassVar = {"border": ""}
-
-
 SPEC = MatcherSpec(
     "loftr",
     "LoFTR",
-    LoftrOptions,
+    SemiDenseOptions,
     Colour.GRAY,
     multiple=Loftr.multiple,
     licences=("Apache-2.0",),
@@ -29,7 +21,7 @@ SPEC = MatcherSpec(
 )
 
 
-def load(weights: WeightStore, options: LoftrOptions, placement: Placement) -> SemiDenseMatcher:
+def load(weights: WeightStore, options: SemiDenseOptions, placement: Placement) -> SemiDenseMatcher:
     # The indoor weights are the later ones, trained with the corrected position encoding.
     is_indoor = options.training is Training.INDOOR
     network = Loftr(options.threshold, BORDERS[options.training], fixed_positions=is_indoor)

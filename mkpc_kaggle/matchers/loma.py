@@ -24,9 +24,7 @@ class LomaOptions:
 
     variant: Variant = Variant.B
     max_keypoints: int = 2048
-    descriptor_scale: float = (
-        0.765625  # side of the descriptor's square input by the view's longer side: 784 / 1024
-    )
+    descriptor_scale: float = 784 / 1024  # side of the descriptor's square input by the view's longer side
     match_threshold: float = 0.1
 
     def __post_init__(self) -> None:
@@ -34,20 +32,14 @@ class LomaOptions:
 
 
 SPEC = MatcherSpec(
-    "loma",
-    "LoMa: DaD keypoints, DeDoDe descriptors",
-    LomaOptions,
-    licences=("MIT",),
-    slots=("loma-{variant}",),
+    "loma", "LoMa: DaD keypoints, DeDoDe descriptors", LomaOptions, licences=("MIT",), slots=("loma-{variant}",)
 )
 
 
 @dataclass(frozen=True, eq=False)
 class LomaEncoding:
-    """The keypoints of one picture, and the size of its content."""
-
     keypoints: LomaKeypoints
-    content: Size
+    content: Size  # of the picture
 
 
 class LomaAdapter(PairwiseMatcher[LomaEncoding]):

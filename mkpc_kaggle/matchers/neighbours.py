@@ -25,17 +25,17 @@ class Neighbours:
 
 
 class NeighbourMatcher(PairwiseMatcher[Keypoints]):
-    """Mutual nearest neighbours whose distance ratio is at most ``ratio``."""
+    """Mutual nearest neighbours whose distance ratio is at most ``ratio``, scored by their cosine."""
 
     ratio: float
 
     def _match(self, first: Keypoints, second: Keypoints) -> Matches:
         pairs = mutual_neighbours(first.descriptors, second.descriptors)
         passed = pairs.ratio <= self.ratio
-        return matches_of(first, second, pairs.index0[passed], pairs.index1[passed], self._scores(pairs)[passed])
+        index0, index1, scores = pairs.index0[passed], pairs.index1[passed], self._scores(pairs)[passed]
+        return matches_of(first.points, second.points, index0, index1, scores)
 
     def _scores(self, pairs: Neighbours) -> Tensor:
-        """(M,) scores of the pairs: the cosine of their descriptors."""
         return pairs.similarity
 
 

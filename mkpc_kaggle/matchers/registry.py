@@ -17,13 +17,7 @@ NOT_MATCHERS = frozenset(
 
 
 class UnusableError(UserError):
-    """A matcher that cannot be imported on this machine, and the ``reason``."""
-
-    def __init__(self, where: str, name: str, reason: str) -> None:
-        super().__init__(
-            f"{where}: matcher {name} cannot be used here ({reason}). `--recipe auto` does without it."
-        )
-        self.reason = reason
+    """A matcher that cannot be imported on this machine; its cause is the error of the import."""
 
 
 @cache
@@ -54,4 +48,5 @@ def _imported(name: str, where: str) -> Any:
     try:
         return import_module(f"{matchers.__name__}.{name}")
     except Exception as error:  # any error at import affects this matcher only
-        raise UnusableError(where, name, f"{type(error).__name__}: {error}") from error
+        told = f"matcher {name} cannot be used here ({type(error).__name__}: {error})"
+        raise UnusableError(f"{where}: {told}. `--recipe auto` does without it.") from error

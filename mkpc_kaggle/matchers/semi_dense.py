@@ -58,8 +58,6 @@ class SemiDenseMatcher(PairwiseMatcher[SemiDenseEncoding]):
 
     @torch.inference_mode()
     def encode(self, pictures: Sequence[Picture]) -> list[SemiDenseEncoding]:
-        if not pictures:
-            return []
         maps = self._network.encode(image_batch(pictures, self.device))
         # Copies: a part of a map would keep all of it in memory.
         singles = zip(torch.split(maps.coarse, 1), torch.split(maps.fine, 1), strict=True)

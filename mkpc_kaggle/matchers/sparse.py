@@ -5,11 +5,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.matchers.contract import Picture
+from mkpc_kaggle.matchers.contract import Picture, Placement
+from mkpc_kaggle.matchers.dtypes import check_finite
+from mkpc_kaggle.matchers.networks.placement import autocast
 
 # Images (B, 3, H, W) -> the points (K, 2) in pixels and unit descriptors (K, D) of each.
 Detector = Callable[[Tensor], Iterable[tuple[Tensor, Tensor]]]
@@ -43,8 +45,6 @@ class KeypointEncoder:
 
     @torch.inference_mode()
     def encode(self, pictures: Sequence[Picture]) -> list[Keypoints]:
-        if not pictures:
-            return []
         found = self._detect(image_batch(pictures, self._device))
         return [
             Keypoints.on_content(points.float(), descriptors.float(), picture.content)
@@ -52,13 +52,19 @@ class KeypointEncoder:
         ]
 
 
-def matches_of(
-    keypoints0: Keypoints, keypoints1: Keypoints, index0: Tensor, index1: Tensor, scores: Tensor
-) -> Matches:
-    """The matches that pair keypoint ``index0[i]`` of one picture with ``index1[i]`` of the other."""
-    return Matches(
-        keypoints0.points[index0].cpu().numpy(), keypoints1.points[index1].cpu().numpy(), scores.cpu().numpy()
-    )
+def library_encoder(
+    network: nn.Module, features: nn.Module, detect: Detector, placement: Placement
+) -> KeypointEncoder:
+    """The encoder of a network that is not ours; what its part ``features`` returns must be finite."""
+    network.eval().to(placement.device)
+    what = f"features of {type(network).__name__.lower()}"
+    features.register_forward_hook(lambda _, inputs, found: check_finite(what, found))
+    return KeypointEncoder(autocast(placement)(detect), placement.device)
+
+
+def matches_of(points0: Tensor, points1: Tensor, index0: Tensor, index1: Tensor, scores: Tensor) -> Matches:
+    """The matches that pair point ``index0[i]`` of one picture with ``index1[i]`` of the other."""
+    return Matches(points0[index0].cpu().numpy(), points1[index1].cpu().numpy(), scores.cpu().numpy())
 
 
 def image_batch(pictures: Sequence[Picture], device: str) -> Tensor:

@@ -11,7 +11,7 @@ from mkpc_kaggle.matchers.contract import Colour, MatcherSpec, PairwiseMatcher, 
 from mkpc_kaggle.matchers.networks.placement import placed
 from mkpc_kaggle.matchers.networks.superglue import SuperGlue
 from mkpc_kaggle.matchers.networks.superpoint import SuperPoint, SuperPointKeypoints
-from mkpc_kaggle.matchers.sparse import image_batch
+from mkpc_kaggle.matchers.sparse import image_batch, matches_of
 from mkpc_kaggle.weights import WeightStore, load_into
 
 
@@ -57,15 +57,11 @@ class SuperGlueMatcher(PairwiseMatcher[SuperPointKeypoints]):
 
     @torch.inference_mode()
     def encode(self, pictures: Sequence[Picture]) -> list[SuperPointKeypoints]:
-        if not pictures:
-            return []
-        found: list[SuperPointKeypoints] = self._superpoint(image_batch(pictures, self.device))
-        return found
+        return list(self._superpoint(image_batch(pictures, self.device)))
 
     def _match(self, keypoints0: SuperPointKeypoints, keypoints1: SuperPointKeypoints) -> Matches:
         found = self._superglue(keypoints0, keypoints1)
-        points0, points1 = keypoints0.points[found.index0], keypoints1.points[found.index1]
-        return Matches(points0.cpu().numpy(), points1.cpu().numpy(), found.scores.cpu().numpy())
+        return matches_of(keypoints0.points, keypoints1.points, found.index0, found.index1, found.scores)
 
 
 def load(weights: WeightStore, options: SuperGlueOptions, placement: Placement) -> SuperGlueMatcher:

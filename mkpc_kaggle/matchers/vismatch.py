@@ -1,29 +1,19 @@
 """Matchers of vismatch (https://github.com/gmberton/vismatch, version 1.4) as matchers of ours.
 
-Its ``get_matcher(NAME)`` returns an object that is called with two images and answers with a dict; of that
-``matched_kpts0``, ``matched_kpts1`` and ``matched_confidences`` are read. vismatch itself is not needed here.
+Its ``get_matcher(NAME)`` returns an object that is called with two images and answers with a dict.
+Of that we read ``matched_kpts0`` and ``matched_kpts1``, (N, 2) pixels (x, y) before its own RANSAC, and
+``matched_confidences``, (N,) or ``None``. vismatch itself is not needed here.
 """
 
-from collections.abc import Mapping, Sequence
-from typing import Any, Protocol
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from mkpc_kaggle.geometry.coordinates import from_corner
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import MatcherSpec, PairwiseMatcher, Picture
-
-
-class ImageMatcher(Protocol):
-    """Of two images (3, H, W), RGB in 0..1: (N, 2) matched points of each, pixels (x, y), before its own RANSAC;
-    and N confidences or ``None``.
-    """
-
-    skip_ransac: bool
-
-    def __call__(self, img0: Tensor, img1: Tensor) -> Mapping[str, Any]: ...
 
 
 class VismatchMatcher(PairwiseMatcher[Picture]):
@@ -37,7 +27,7 @@ class VismatchMatcher(PairwiseMatcher[Picture]):
 
     def __init__(
         self,
-        matcher: ImageMatcher,
+        matcher: Any,
         name: str = "vismatch",
         *,
         corner: bool = False,
@@ -53,14 +43,11 @@ class VismatchMatcher(PairwiseMatcher[Picture]):
         return list(pictures)
 
     def _match(self, picture0: Picture, picture1: Picture) -> Matches:
-        found = self._matcher(image_of(picture0), image_of(picture1))
+        # (3, H, W) float32 in 0..1, padding included: it keeps the sides multiples of what they have to be.
+        both = (torch.from_numpy(each.pixels).permute(2, 0, 1).float() / 255 for each in (picture0, picture1))
+        found = self._matcher(*both)
         points = [np.asarray(found[f"matched_kpts{number}"], np.float32).reshape(-1, 2) for number in (0, 1)]
         points0, points1 = map(from_corner, points) if self._corner else points
         confidences = found.get("matched_confidences")
         scores = np.ones(len(points0), np.float32) if confidences is None else np.asarray(confidences, np.float32)
         return Matches(points0, points1, scores)
-
-
-def image_of(picture: Picture) -> Tensor:
-    """(3, H, W) float32 in 0..1, padding included: it keeps the sides multiples of what they have to be."""
-    return torch.from_numpy(picture.pixels).permute(2, 0, 1).float() / 255

@@ -9,21 +9,14 @@ from typing import Any
 from mkpc_kaggle.errors import warn_once
 from mkpc_kaggle.matchers.contract import Matcher, Placement, Precision
 from mkpc_kaggle.matchers.registry import load_matcher
-from mkpc_kaggle.pipeline.availability import (
-    Licence,
-    UnavailableKind,
-    by_kind,
-    options_of,
-    refusal,
-    slots_of,
-    unavailable,
-)
-from mkpc_kaggle.pipeline.devices import AUTO, encoding_cache_bytes, gpus_of, require_device, resolve_placement
+from mkpc_kaggle.pipeline.availability import FAULTS, Licence, by_kind, options_of, refusal, slots_of, unavailable
+from mkpc_kaggle.pipeline.devices import AUTO, gpus_of, require_device, resolve_placement
 from mkpc_kaggle.pipeline.stages import ENCODING_CACHE_BYTES, Pipeline
 from mkpc_kaggle.recipe import Mode, Recipe, load_recipe
 from mkpc_kaggle.weights import FoundFile, State, WeightStore
 
-CUDA_MINIBATCH = 8
+CACHE_SHARE = 0.25  # of a GPU's free memory, for the encodings that all workers on it keep
+CUDA_MINIBATCH = 8  # pairs at a time; on a CPU more than one only costs memory
 
 
 @dataclass(frozen=True)
@@ -40,14 +33,12 @@ class Assembly:
 
     @property
     def devices(self) -> tuple[str, ...]:
-        """The devices to work on: every GPU if the placement names none of them."""
-        if self.placement.device != "cuda":
-            return (self.placement.device,)
-        return tuple(f"cuda:{number}" for number in gpus_of("cuda"))
+        """The devices to work on."""
+        device = self.placement.device
+        return ("cpu",) if device == "cpu" else tuple(f"cuda:{number}" for number in gpus_of(device))
 
     @property
     def minibatch(self) -> int:
-        """How many pairs a unit takes at a time: more than one pays on a GPU; on a CPU it only costs memory."""
         return CUDA_MINIBATCH if self.placement.device.startswith("cuda") else 1
 
     def on(self, device: str, sharing: int = 1) -> "Assembly":
@@ -55,7 +46,6 @@ class Assembly:
         return replace(self, placement=replace(self.placement, device=device), sharing=sharing)
 
     def on_cpu(self) -> "Assembly":
-        """The same on the CPU, in float32."""
         return replace(self, placement=Placement(), sharing=1)
 
     def pipeline(self) -> Pipeline:
@@ -65,12 +55,17 @@ class Assembly:
         """
         device = self.placement.device
         require_device(device)
-        exact = replace(self.placement, precision=Precision.FLOAT32)
+        exact, cache_bytes = replace(self.placement, precision=Precision.FLOAT32), ENCODING_CACHE_BYTES
+        if device != "cpu":
+            import torch
+
+            free, _ = torch.cuda.mem_get_info(device)  # little is on it yet
+            cache_bytes = int(free * CACHE_SHARE / self.sharing)
         return Pipeline(
             self.recipe,
             lambda name: self._load(name, self.placement),
             minibatch=self.minibatch,
-            cache_bytes=ENCODING_CACHE_BYTES if device == "cpu" else encoding_cache_bytes(device, self.sharing),
+            cache_bytes=cache_bytes,
             load_float32=None if exact == self.placement else lambda name: self._load(name, exact),
         )
 
@@ -84,14 +79,13 @@ class Assembly:
 
     @property
     def weight_paths(self) -> tuple[Path, ...]:
-        """The files that the matchers load."""
         return tuple(file.path for file in self.weight_files.values())
 
     @cached_property
     def weight_files(self) -> dict[str, FoundFile]:
         """The files that the matchers load, by slot."""
-        found = {slot: self.weights.find(slot) for slot in slots_of(self.recipe, self.matchers)}
-        return {slot: file for slot, file in found.items() if file is not None}
+        slots = slots_of(self.recipe, self.matchers)
+        return {slot: file for slot in slots if (file := self.weights.find(slot))}
 
     def _load(self, name: str, placement: Placement) -> Matcher[Any]:
         own = self.matchers.get(name)
@@ -111,9 +105,8 @@ def assemble(
 ) -> Assembly:
     """Everything checked before any work: recipe, options, licences, weights and their digests, device, precision.
 
-    Of an unavailable matcher recipe ``auto`` drops the units; in any other recipe its fallback takes its place.
-    ``scenes`` switches the reconstruction of batches on or off; ``None``: as the recipe has it. Raises
-    :class:`UserError` for an unavailable matcher without a fallback, and for unknown names and options.
+    An unavailable matcher's fallback takes its place, or else recipe ``auto`` drops its units. ``scenes`` switches
+    the reconstruction of batches on or off; ``None``: as the recipe has it. Raises :class:`UserError`.
     """
     own = matchers or {}
     store = WeightStore(weights)
@@ -124,15 +117,15 @@ def assemble(
     if lacking and recipe != AUTO:
         raise refusal(chosen, lacking)
     for name, reason in lacking.items():
-        if reason.kind in (UnavailableKind.NOT_IMPORTABLE, UnavailableKind.UNREADABLE):  # faults, not choices
+        if reason.kind in FAULTS:
             warn_once(f"recipe auto does without {name}: {reason}")
     for name in sorted(chosen.matchers.keys() - own.keys() - reasons.keys()):
         options_of(chosen, name)  # those of a matcher that no unit names are checked too
     left_out = by_kind({name: reasons[name] for name in written.matcher_names if name in reasons})
     chosen = chosen.only(lambda unit: unit.matcher not in lacking).with_scenes(scenes).in_mode(mode)
     made = Assembly(chosen, store, resolve_placement(device, precision), left_out, own, device)
-    unverified = sorted(file.path.name for file in made.weight_files.values() if file.state is State.UNVERIFIED)
-    if unverified:
+    files = made.weight_files.values()
+    if unverified := sorted(file.path.name for file in files if file.state is State.UNVERIFIED):
         listed = ", ".join(unverified)
         warn_once(f"weights not verified: {listed}; `python -m mkpc_kaggle weights verify` says why")
     return made

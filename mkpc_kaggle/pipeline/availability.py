@@ -11,6 +11,7 @@ from mkpc_kaggle.config import from_table
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.matchers.contract import Matcher, Placement
 from mkpc_kaggle.matchers.registry import UnusableError, load_matcher, spec_of
+from mkpc_kaggle.pipeline.failures import reason_of
 from mkpc_kaggle.recipe import Recipe
 from mkpc_kaggle.weights import State, WeightStore
 
@@ -18,8 +19,6 @@ PERMISSIVE_TAGS = frozenset({"Apache-2.0", "BSD-3-Clause", "MIT"})
 
 
 class Licence(StrEnum):
-    """Which weights may be used, by their licence."""
-
     ANY = "any"
     PERMISSIVE = "permissive"  # those that may be used for any purpose: Apache-2.0, BSD-3-Clause, MIT
 
@@ -31,6 +30,9 @@ class UnavailableKind(StrEnum):
     NOT_PERMITTED = "weights not permitted"
     NO_WEIGHTS = "no weights"
     UNREADABLE = "weights cannot be loaded"
+
+
+FAULTS = (UnavailableKind.NOT_IMPORTABLE, UnavailableKind.UNREADABLE)  # the others are a user's choices
 
 
 @dataclass(frozen=True)
@@ -52,11 +54,10 @@ def unavailable(
     *,
     load: bool = False,
 ) -> dict[str, UnavailableReason]:
-    """Why matchers of the recipe cannot run here, by their names; fallbacks included.
+    """Why matchers of the recipe, fallbacks included, cannot run here, by their names.
 
-    ``own`` are the user's ready matchers, which bring their weights along. With ``load``, weights whose digest is
-    unknown are loaded, which shows whether they are damaged. Raises :class:`UserError` for an unknown matcher or
-    option.
+    ``own`` are the user's ready matchers. With ``load``, weights whose digest is unknown are loaded, which shows
+    whether they are damaged. Raises :class:`UserError` for an unknown matcher or option.
     """
 
     def not_permitted(tags: Iterable[str]) -> UnavailableReason | None:
@@ -69,7 +70,7 @@ def unavailable(
         try:
             spec, options = spec_of(name, f"recipe {recipe.name!r}"), options_of(recipe, name)
         except UnusableError as error:
-            return UnavailableReason(UnavailableKind.NOT_IMPORTABLE, error.reason)
+            return UnavailableReason(UnavailableKind.NOT_IMPORTABLE, reason_of(error.__cause__ or error))
         found = {slot: store.find(slot) for slot in spec.slots_for(options)}
         files = [file for file in found.values() if file is not None]
         if reason := not_permitted([*spec.licences, *(file.file.licence for file in files)]):
@@ -84,9 +85,8 @@ def unavailable(
             return UnavailableReason(UnavailableKind.UNREADABLE, str(error))
         return None
 
-    names = [name for unit in recipe.units for name in (unit.matcher, unit.fallback) if name]
-    found = {name: reason_for(name) for name in dict.fromkeys(names)}
-    return {name: reason for name, reason in found.items() if reason is not None}
+    names = dict.fromkeys(name for unit in recipe.units for name in (unit.matcher, unit.fallback) if name)
+    return {name: reason for name in names if (reason := reason_for(name)) is not None}
 
 
 def refusal(recipe: Recipe, reasons: Mapping[str, UnavailableReason]) -> UserError:
@@ -94,31 +94,24 @@ def refusal(recipe: Recipe, reasons: Mapping[str, UnavailableReason]) -> UserErr
     first, kind = next((name, reason.kind) for name, reason in reasons.items())
     those = "; ".join(f"{name} ({reason.detail})" for name, reason in reasons.items() if reason.kind is kind)
     if kind is UnavailableKind.NOT_PERMITTED:
-        return UserError(
-            f"--licence permissive refuses recipe {recipe.name!r} for the weights of {those}. Take a recipe "
-            "without them, such as permissive, or --recipe auto, which leaves them out."
-        )
+        what = f"--licence permissive refuses recipe {recipe.name!r} for the weights of {those}"
+        return UserError(f"{what}. Take a recipe without them, such as permissive, or --recipe auto.")
     if kind is UnavailableKind.NO_WEIGHTS:
-        return UserError(
-            f"recipe {recipe.name!r} needs weights that were not found: {those}. Name their directory with "
-            "--weights, or use --recipe auto, which does with what there is."
-        )
+        what = f"recipe {recipe.name!r} needs weights that were not found: {those}"
+        return UserError(f"{what}. Name their directory with --weights, or take what is there with --recipe auto.")
     return UserError(f"recipe {recipe.name!r}: matcher {first} {reasons[first]}. `--recipe auto` does without it.")
 
 
 def by_kind(reasons: Mapping[str, UnavailableReason]) -> tuple[str, ...]:
     """The matchers of each kind, for a summary, such as "no weights: loma, superglue"."""
-    names: dict[UnavailableKind, list[str]] = {}
-    for name, reason in reasons.items():
-        names.setdefault(reason.kind, []).append(name)
-    return tuple(f"{kind}: {', '.join(matchers)}" for kind, matchers in names.items())
+    kinds = dict.fromkeys(reason.kind for reason in reasons.values())
+    return tuple(f"{kind}: {', '.join(name for name in reasons if reasons[name].kind is kind)}" for kind in kinds)
 
 
 def options_of(recipe: Recipe, name: str) -> Any:
     """The matcher's options with what the recipe's ``[matchers.NAME]`` changes."""
-    spec = spec_of(name, f"recipe {recipe.name!r}")
-    table = recipe.matchers.get(name, {})
-    return from_table(spec.options, table, f"recipe {recipe.name!r}, table [matchers.{name}]")
+    where, table = f"recipe {recipe.name!r}", recipe.matchers.get(name, {})
+    return from_table(spec_of(name, where).options, table, f"{where}, table [matchers.{name}]")
 
 
 def slots_of(recipe: Recipe, own: Container[str] = ()) -> tuple[str, ...]:

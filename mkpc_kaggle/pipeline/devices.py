@@ -12,7 +12,6 @@ from mkpc_kaggle.pipeline.failures import DeviceError, FailureKind, failure_of, 
 
 AUTO = "auto"
 ADVICE = "on Kaggle choose the accelerator GPU T4 x2, elsewhere try --device cpu"
-CACHE_SHARE = 0.25  # of a GPU's free memory, for the encodings that all workers on it keep
 TENSOR_CORES = (7, 0)  # the first compute capability that is faster in half precision
 # In a process of its own: a CUDA context takes some hundred MB of a GPU, and the parent of workers needs none.
 ASK_CAPABILITIES = """
@@ -45,11 +44,9 @@ def resolve_placement(device: str, precision: str) -> Placement:
             device = "cpu"
     elif device != "cpu":
         gpus_of(device)
-    if precision == AUTO:
-        return Placement(device, fastest_precision(device))
-    if precision not in list(Precision):
+    if precision not in (AUTO, *Precision):
         raise UserError(f"unknown precision {precision!r}; known: auto, {', '.join(Precision)}")
-    return Placement(device, Precision(precision))
+    return Placement(device, fastest_precision(device) if precision == AUTO else Precision(precision))
 
 
 def fastest_precision(device: str) -> Precision:
@@ -91,19 +88,10 @@ def gpu_capabilities() -> list[tuple[int, int]]:
     return [(major, minor) for major, minor in json.loads(asked.stdout.splitlines()[-1])]
 
 
-def encoding_cache_bytes(device: str, workers: int) -> int:
-    """For each of so many workers on a GPU, asked when little is on it yet."""
-    import torch
-
-    free, _ = torch.cuda.mem_get_info(device)
-    return int(free * CACHE_SHARE / workers)
-
-
 def require_device(device: str) -> None:
     """Multiply and convolve on a device; raises :class:`DeviceError` if that fails.
 
-    PyTorch counts GPUs for which its build or its cuDNN has no kernels among the available ones, and such a GPU
-    may multiply and not convolve: only kernels that run are proof.
+    A GPU for which PyTorch's build or cuDNN has no kernels counts as available: only kernels that run are proof.
     """
     if device == "cpu":
         return

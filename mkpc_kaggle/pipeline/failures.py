@@ -23,8 +23,6 @@ _DEVICE = re.compile(
 
 
 class FailureKind(Enum):
-    """What an error means for what comes after it."""
-
     OUT_OF_MEMORY = auto()  # fewer pairs at a time may do
     DEVICE = auto()  # this process can compute nothing more; the pair is not to blame
     ORDINARY = auto()  # the matcher cannot do this pair
@@ -35,7 +33,6 @@ class DeviceError(UserError):
 
 
 def failure_of(error: BaseException) -> FailureKind:
-    """What the error means, by its type's name and its text."""
     reason = reason_of(error)
     if isinstance(error, MemoryError) or _OUT_OF_MEMORY.search(reason):
         return FailureKind.OUT_OF_MEMORY

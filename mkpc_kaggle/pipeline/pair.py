@@ -14,7 +14,6 @@ from mkpc_kaggle.geometry.robust import Estimate, Matrix3, ModelKind, estimate
 from mkpc_kaggle.recipe import Recipe, Unit
 
 Regions = tuple[CriticalRegion, CriticalRegion]
-
 NOT_ESTIMATED = Estimate.failed(ModelKind.F, 0, "not estimated yet")
 
 
@@ -36,13 +35,9 @@ class UnitResult:
 
 @dataclass(frozen=True, eq=False)
 class PairMatch:
-    """All that is known of a pair: each unit's matches, the critical regions, the two-view model.
+    """All that is known of a pair."""
 
-    ``matches`` are those of all units, and ``estimate.inliers`` is a mask over them. They are in the order in
-    which units ran, and with the estimate in the recipe's order.
-    """
-
-    results: tuple[UnitResult, ...] = ()
+    results: tuple[UnitResult, ...] = ()  # as the units ran; with the estimate in the recipe's order
     regions: Regions | None = None  # None until a unit of stage 2 needs them
     estimate: Estimate = NOT_ESTIMATED
     images: tuple[Image, ...] = ()  # both, while units run
@@ -55,6 +50,7 @@ class PairMatch:
 
     @property
     def matches(self) -> Matches:
+        """Those of all units; ``estimate.inliers`` is a mask over them."""
         return Matches.concatenate(result.matches for result in self.results)
 
     @property
@@ -80,8 +76,7 @@ def with_estimate(
 
     The recipe's prior on focal lengths, if any, goes by the images' sizes unless ``intrinsics`` are given.
     """
-    order = {unit: number for number, unit in enumerate(recipe.units)}
-    results = tuple(sorted(pair.results, key=lambda result: order[result.unit]))
+    results = tuple(sorted(pair.results, key=lambda result: recipe.units.index(result.unit)))
     matches = Matches.concatenate(result.matches for result in results)
     if recipe.focal is None or model is ModelKind.H:
         found = estimate(matches, recipe.magsac, model, intrinsics)

@@ -1,8 +1,6 @@
 """The two-stage pipeline on a chunk of pairs.
 
-Stage 1 matches whole images, MKPC finds the critical region of each, stage 2 matches the crops. The points of both
-stages, in image pixels, are concatenated in the recipe's order, and MAGSAC does the rest, alone or under the
-recipe's prior on focal lengths.
+Stage 1 matches whole images, MKPC finds the critical region of each, stage 2 matches the crops.
 """
 
 import sys
@@ -31,10 +29,10 @@ ViewKey = tuple[str, str, View]  # matcher, image and view: what an encoding is 
 class Pipeline:
     """A recipe's units, run on chunks of pairs with matchers that are loaded when first needed.
 
-    ``load(name)`` gives the matcher of that name, ``load_float32(name)`` the same in float32, if that is another:
-    it takes over for good if half precision does not hold a matcher's numbers. Pairs are matched, and views of one
-    shape encoded, ``minibatch`` at a time; fewer by a unit for which memory was short, from then on. Encodings of
-    whole images, which come back in many pairs, are kept in ``cache_bytes``.
+    ``load(name)`` gives a matcher, ``load_float32(name)`` the same in float32: it takes over for good if half
+    precision does not hold a matcher's numbers. Pairs are matched, and views of one shape encoded, ``minibatch``
+    at a time; fewer by a unit for which memory was short, from then on. Encodings of whole images, which come back
+    in many pairs, are kept in ``cache_bytes``.
     """
 
     def __init__(
@@ -46,10 +44,8 @@ class Pipeline:
         cache_bytes: int = ENCODING_CACHE_BYTES,
         load_float32: Callable[[str], Matcher[Any]] | None = None,
     ) -> None:
-        self.recipe = recipe
-        self.minibatch = minibatch
-        self._load = load
-        self._load_float32 = load_float32
+        self.recipe, self.minibatch = recipe, minibatch
+        self._load, self._load_float32 = load, load_float32
         self._minibatches: dict[Unit, int] = {}
         self._ran: set[Unit] = set()
         self._matchers: dict[str, Matcher[Any]] = {}
@@ -66,10 +62,9 @@ class Pipeline:
     ) -> list[PairMatch]:
         """Run ``units`` on every pair that has not had them: stage 1, the critical regions, stage 2.
 
-        ``may_start(unit)`` is asked before each unit on each minibatch of pairs; once it is false, the results so
-        far are returned. If a matcher raises, the error is the failure of this unit's results on the minibatch.
-        Errors of the device, and of memory that does not suffice for a single pair, are raised: see
-        :mod:`mkpc_kaggle.pipeline.failures`.
+        ``may_start(unit)`` is asked before each unit on each minibatch of pairs. An error of a matcher is the
+        failure of this unit's results on the minibatch. Errors of the device, and of memory that does not suffice
+        for a single pair, are raised: see :mod:`mkpc_kaggle.pipeline.failures`.
         """
         pairs, units = list(pairs), list(units)
         for unit in (unit for unit in units if unit.stage == 1):
@@ -147,30 +142,25 @@ class Pipeline:
 
     def _encode(self, unit: Unit, wanted: Sequence[tuple[Image, View]]) -> list[Any]:
         """The encodings of views by the unit's matcher, from the cache or made now, one shape at a time."""
+        matcher = self._matcher(unit.matcher)
+        is_gray = matcher.spec.colour is Colour.GRAY
         keys = [(unit.matcher, image.name, view) for image, view in wanted]
         known = {key: self._encodings.get(key) for key in keys}
-        missing = {key: item for key, item in zip(keys, wanted, strict=True) if known[key] is None}
+        missing = {key: image for key, (image, _) in zip(keys, wanted, strict=True) if known[key] is None}
         size = self._minibatches.get(unit, self.minibatch)
         for shape in dict.fromkeys(view.padded for _, _, view in missing):
             alike = [key for key in missing if key[2].padded == shape]
-            for start in range(0, len(alike), size):
-                known |= self._encode_minibatch(unit, {key: missing[key] for key in alike[start : start + size]})
+            for part in (alike[start : start + size] for start in range(0, len(alike), size)):
+                pixels = [missing[key].gray if is_gray else missing[key].pixels for key in part]
+                pictures = [Picture(key[2].render(shown), key[2]) for key, shown in zip(part, pixels, strict=True)]
+                with exact_float32():
+                    encodings = matcher.encode(pictures)
+                check_finite(f"features of {unit.matcher}", list(encodings))
+                known |= zip(part, encodings, strict=True)
+        for key, image in missing.items():
+            if key[2].crop == Box.whole(image.size):  # a crop is one pair's own: no other will ask for it
+                self._encodings.put(key, known[key], encoding_bytes(known[key]))
         return [known[key] for key in keys]
-
-    def _encode_minibatch(self, unit: Unit, items: dict[ViewKey, tuple[Image, View]]) -> dict[ViewKey, Any]:
-        matcher, encoded = self._matcher(unit.matcher), {}
-        gray = matcher.spec.colour is Colour.GRAY
-        pictures = [
-            Picture(view.render(image.gray if gray else image.pixels), view) for image, view in items.values()
-        ]
-        with exact_float32():
-            encodings = matcher.encode(pictures)
-        check_finite(f"features of {unit.matcher}", list(encodings))
-        for (key, (image, view)), encoding in zip(items.items(), encodings, strict=True):
-            encoded[key] = encoding
-            if view.crop == Box.whole(image.size):  # a crop is one pair's own: no other will ask for it
-                self._encodings.put(key, encoding, encoding_bytes(encoding))
-        return encoded
 
     def _matcher(self, name: str) -> Matcher[Any]:
         if name not in self._matchers:
@@ -180,12 +170,9 @@ class Pipeline:
 
 def views_of(unit: Unit, multiple: int, pair: PairMatch) -> tuple[View, View]:
     """What a unit looks at: whole images in stage 1, critical regions in stage 2."""
-    if unit.stage == 1 or pair.regions is None:
-        boxes = [Box.whole(image.size) for image in pair.images]
-    else:
-        boxes = [region.box for region in pair.regions]
-    view0, view1 = (unit.view(box, multiple) for box in boxes)
-    return view0, view1
+    crops = [region.box for region in pair.regions or ()] if unit.stage == 2 else []
+    boxes = crops or [Box.whole(image.size) for image in pair.images]
+    return unit.view(boxes[0], multiple), unit.view(boxes[1], multiple)
 
 
 def with_regions(pair: PairMatch, recipe: Recipe) -> PairMatch:

@@ -24,9 +24,8 @@ class TwoStageMatcher:
         F, points0 = match.estimate.matrix, match.inliers.points0
 
     ``recipe`` is a :class:`Recipe`, a recipe's name, or a path to a TOML file; ``weights`` are directories to
-    search; with ``licence`` "permissive" weights that forbid some uses are refused. ``matchers`` are matchers of
-    your own, by the names under which the recipe's units call them.
-    Raises :class:`mkpc_kaggle.errors.UserError` for an unknown recipe, key or matcher, and for missing weights.
+    search; with ``licence`` "permissive" weights that forbid some uses are refused; ``matchers`` are your own, by
+    the names that the recipe's units have. Raises :class:`UserError` for what is unknown or missing.
     """
 
     def __init__(
@@ -39,16 +38,11 @@ class TwoStageMatcher:
         licence: Licence | str = Licence.ANY,
         matchers: Mapping[str, Matcher[Any]] | None = None,
     ) -> None:
+        where, allowed = map(Path, weights), Licence(licence)
         assembly = assemble(
-            recipe,
-            weights=map(Path, weights),
-            device=device,
-            precision=precision,
-            licence=Licence(licence),
-            matchers=matchers,
+            recipe, weights=where, device=device, precision=precision, licence=allowed, matchers=matchers
         )
-        self.recipe = assembly.recipe
-        self._pipeline = assembly.pipeline()
+        self.recipe, self._pipeline = assembly.recipe, assembly.pipeline()
 
     def __call__(
         self,
