@@ -163,6 +163,7 @@ def write_submission(path: Path, rows: Mapping[str, Matrix3]) -> None:
 
 
 def read_submission(path: Path) -> dict[str, Matrix3]:
+    """F by sample id; raises :class:`UserError` for a file that is not a submission."""
     rows = read_rows(path, SUBMISSION_COLUMNS)
     return {sample: _numbers(cell, where, 9).reshape(3, 3) for where, (sample, cell) in rows}
 
@@ -230,10 +231,12 @@ def plain_name(name: str, where: object) -> str:
 
 
 def pair_id(scene: str, first: str, second: str) -> str:
+    """The id under which a pair of the train side runs."""
     return f"{scene};{first}-{second}"
 
 
 def evenly_spread(items: Sequence[Item], most: int | None) -> list[Item]:
+    """At most that many of the items, the first and the last among them."""
     count = len(items) if most is None else min(most, len(items))
     return [items[index] for index in np.linspace(0, len(items) - 1, count).round().astype(int)]
 

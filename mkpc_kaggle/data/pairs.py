@@ -84,7 +84,8 @@ def parse_line(line: str, where: str) -> tuple[ListedImage, ListedImage]:
     K0, K1, T = numbers[:9].reshape(3, 3), numbers[9:18].reshape(3, 3), numbers[18:].reshape(4, 4)
     R, t = T[:3, :3], T[:3, 3]
     has_focals = all(min(K[0, 0], K[1, 1]) > 0 and (K[1, 0], *K[2]) == (0, 0, 0, 1) for K in (K0, K1))
-    is_rotation = np.abs(R @ R.T - np.eye(3)).max() < MAX_SKEWNESS and np.linalg.det(R) > 0
+    with np.errstate(over="ignore", invalid="ignore"):  # whether they are finite is asked below
+        is_rotation = np.abs(R @ R.T - np.eye(3)).max() < MAX_SKEWNESS and np.linalg.det(R) > 0
     for holds, expected in (
         (set(turns) <= {0, 1, 2, 3}, f"0, 1, 2 or 3 quarter turns, found {cells[2]} and {cells[3]}"),
         (np.isfinite(numbers).all(), "finite numbers for K0, K1 and T_0to1"),
