@@ -128,11 +128,8 @@ def comparison_json(comparison: Comparison) -> dict[str, Any]:
 
     first, *others = comparison.validations
     runs = [{**to_json(run), "work_seconds_per_pair": seconds_per_pair(run)} for run in comparison.validations]
-    gains = [
-        {
-            **{"recipe": other.recipe, "against": first.recipe, **gain(number)},
-            "scenes": [{"scene": name, **gain(number, name)} for name in comparison.scenes],
-        }
-        for number, other in enumerate(others, start=1)
-    ]
+    gains = []
+    for number, other in enumerate(others, start=1):
+        scenes = [{"scene": name, **gain(number, name)} for name in comparison.scenes]
+        gains.append({"recipe": other.recipe, "against": first.recipe, **gain(number), "scenes": scenes})
     return {"recipes": runs, "level": LEVEL, "gains": gains}

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from mkpc_kaggle.data.competition import CONTROL, IMAGE_SUFFIXES
 from mkpc_kaggle.errors import UserError, read_text
-from mkpc_kaggle.reconstruction.shortlist import shortlist
+from mkpc_kaggle.reconstruction.likeness import shortlist
 
 MAX_IMAGES = 100  # of which all pairs are matched; above, each image has a shortlist
 
@@ -54,22 +54,20 @@ def pairs_of(dataset: Dataset) -> list[Ends]:
     return [(dataset.files[first], dataset.files[second]) for first, second in shortlist(dataset.files)]
 
 
-def read_pair_list(path: Path, root: Path, datasets: Iterable[Dataset]) -> dict[str, list[Ends]]:
-    """By dataset, the pairs of a list: a line each, two images by their paths below ``root``, as of hloc.
+def read_pair_list(path: Path, root: Path, datasets: Iterable[Dataset]) -> list[Ends]:
+    """The pairs of a list: a line each, two images by their paths below ``root``, as of hloc.
 
     Raises :class:`UserError` for a line that does not name two images of one dataset.
     """
-    known = {file.relative_to(root).as_posix(): (data.name, file) for data in datasets for file in data.files}
-    found: dict[str, dict[Ends, None]] = {}
+    known = {file for dataset in datasets for file in dataset.files}
+    found = []
     for number, line in enumerate(read_text(path).splitlines(), start=1):
-        names = line.split()
-        if not names:
+        ends = sorted(root / name for name in line.split())
+        if not ends:
             continue
-        ends = [known[name] for name in names if name in known]
-        if len(names) != 2 or len(ends) != 2 or ends[0][0] != ends[1][0] or ends[0] == ends[1]:
+        if len(ends) != 2 or ends[0] == ends[1] or ends[0].parent != ends[1].parent or not known.issuperset(ends):
             raise UserError(f"{path}, line {number}: expected two images of one dataset of {root}, found {line!r}")
-        first, second = sorted(file for _, file in ends)
-        found.setdefault(ends[0][0], {})[first, second] = None
+        found.append((ends[0], ends[1]))
     if not found:
         raise UserError(f"{path} has no pairs")
-    return {name: list(pairs) for name, pairs in found.items()}
+    return list(dict.fromkeys(found))

@@ -50,23 +50,21 @@ def camera_rows(cameras: Cameras) -> Iterator[Sequence[str]]:
 
 def submission_rows(form: Form, cameras: Cameras, root: Path) -> Iterator[Sequence[str]]:
     """A row for each image, in the order of the folder."""
-    first = (
-        ("image_id", "dataset", "scene", "image") if form is Form.IMC2025 else ("image_path", "dataset", "scene")
-    )
-    yield *first, "rotation_matrix", "translation_vector"
+    of_2025 = form is Form.IMC2025
+    heads = ["image_id", "dataset", "scene", "image"] if of_2025 else ["image_path", "dataset", "scene"]
+    yield [*heads, "rotation_matrix", "translation_vector"]
     for dataset, found in cameras.items():
         folder = root.resolve().name if dataset.name == "." else dataset.name
+        parts = folder.split("/")  # of 2023 dataset/scene/images, of 2024 dataset/images
         for name in (file.name for file in dataset.files):
             record = found.get(name)
-            columns: tuple[str, ...]
-            if form is Form.IMC2025:
-                columns = f"{folder}_{name}", folder, f"cluster{record.model}" if record else "outliers", name
+            if of_2025:
+                cells = [f"{folder}_{name}", folder, f"cluster{record.model}" if record else "outliers", name]
+                camera = record.camera if record else NO_CAMERA
             else:
-                parts = folder.split("/")  # dataset/scene/images; of 2024 dataset/images
-                columns = f"{folder}/{name}", parts[0], parts[1 if len(parts) > 2 else 0]
-                record = record if record and record.model == 0 else None
-            camera = record.camera if record else NO_CAMERA if form is Form.IMC2025 else ORIGIN
-            yield *columns, joined(camera.R), joined(camera.t)
+                cells = [f"{folder}/{name}", parts[0], parts[1 if len(parts) > 2 else 0]]
+                camera = record.camera if record and record.model == 0 else ORIGIN
+            yield [*cells, joined(camera.R), joined(camera.t)]
 
 
 def joined(numbers: NDArray[np.float64]) -> str:

@@ -11,8 +11,8 @@ Sources: Schoenberger and Frahm 2016 (the incremental mapper), Pan et al. 2024 (
 """
 
 import shutil
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -38,50 +38,56 @@ MIN_REGISTERED = 0.85  # share of a small scene's images below which the other m
 SEED = 0
 
 
-def structure_from_motion(
-    graph: ViewGraph, config: SceneConfig, shared: SharedIntrinsics, directory: Path | None = None
-) -> Reconstruction:
+def structure_from_motion(graph: ViewGraph, config: SceneConfig, shared: SharedIntrinsics) -> Reconstruction:
     """What pycolmap makes of a view graph; perhaps no model, perhaps several.
 
     Each image has a camera of its own, except those with ``shared`` intrinsics, which start at the shared focal
     length. The global mapper goes first. Where it leaves many images of a small scene without a camera, the
-    incremental mapper is asked too, and the reconstruction in which images see points more often stays. In
-    ``directory`` COLMAP's files are left, in the place of earlier files: the database, and a folder of each model.
+    incremental mapper is asked too, and the reconstruction in which images see points more often stays.
     """
     pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
     pycolmap.set_random_seed(SEED)
-    keypoints = scene_keypoints(graph)
-    if directory is not None:
-        shutil.rmtree(directory / MODELS, ignore_errors=True)
-        directory.mkdir(parents=True, exist_ok=True)
-        (directory / DATABASE).unlink(missing_ok=True)
-    with pycolmap.Database.open(":memory:" if directory is None else str(directory / DATABASE)) as database:
-        with pycolmap.DatabaseTransaction(database):
-            cameras = _write_images(database, graph, keypoints, config.camera_model, shared)
-            geometries = verify(graph, keypoints, cameras, config)
-            for edge, matches, geometry in zip(graph.edges, keypoints.matches, geometries, strict=True):
-                if directory is not None:
-                    database.write_matches(edge.first + 1, edge.second + 1, matches)
-                database.write_two_view_geometry(edge.first + 1, edge.second + 1, geometry)
+    with pycolmap.Database.open(":memory:") as database:
+        _fill(database, graph, config, shared)
         images = len(graph.images)
         found = run_mapper(pycolmap.GlobalPipeline, _global_options(images, config), database, graph)
         if images <= LARGE and found.registered < MIN_REGISTERED * images:
             other = run_mapper(pycolmap.IncrementalPipeline, _incremental_options(config), database, graph)
             found = max(found, other, key=lambda each: each.observations)
-    if directory is not None:
-        write_models(found, directory / MODELS)
-    return replace(found, models=tuple(replace(model, colmap=None) for model in found.models))
+        return found
 
 
-def write_models(found: Reconstruction, directory: Path) -> None:
-    """Write each model in COLMAP's binary format to a folder 0, 1, ..., without the images that were left out."""
-    for number, model in enumerate(found.models):
+def write_files(
+    directory: Path, graph: ViewGraph, config: SceneConfig, shared: SharedIntrinsics, models: Sequence[SfmModel]
+) -> None:
+    """Write COLMAP's files in the place of earlier files: the database, and a folder of each of its models.
+
+    The images that were left out of a model are not in its files.
+    """
+    shutil.rmtree(directory / MODELS, ignore_errors=True)
+    directory.mkdir(parents=True, exist_ok=True)
+    (directory / DATABASE).unlink(missing_ok=True)
+    with pycolmap.Database.open(str(directory / DATABASE)) as database:
+        _fill(database, graph, config, shared)
+    for number, model in enumerate(models):
         kept = {each.image.name for each in model.images}
         for frame in [frame for frame in model.colmap.frames.values() if frame.has_pose()]:
             if model.colmap.images[frame.frame_id].name not in kept:
                 model.colmap.deregister_frame(frame.frame_id)
-        (directory / str(number)).mkdir(parents=True)
-        model.colmap.write(directory / str(number))
+        folder = directory / MODELS / str(number)
+        folder.mkdir(parents=True)
+        model.colmap.write(folder)
+
+
+def _fill(database: Any, graph: ViewGraph, config: SceneConfig, shared: SharedIntrinsics) -> None:
+    """Write images with their cameras and keypoints, and the matches and verified geometry of each edge."""
+    keypoints = scene_keypoints(graph)
+    with pycolmap.DatabaseTransaction(database):
+        cameras = _write_images(database, graph, keypoints, config.camera_model, shared)
+        geometries = verify(graph, keypoints, cameras, config)
+        for edge, matches, geometry in zip(graph.edges, keypoints.matches, geometries, strict=True):
+            database.write_matches(edge.first + 1, edge.second + 1, matches)
+            database.write_two_view_geometry(edge.first + 1, edge.second + 1, geometry)
 
 
 def _write_images(
@@ -146,11 +152,10 @@ def run_mapper(pipeline: Any, options: Any, database: Any, graph: ViewGraph) -> 
     """The plausible models that a mapper makes of what the database holds."""
     manager = pycolmap.ReconstructionManager()
     pipeline(options, database, manager).run()
-    models, rejections = filter_models(
-        [_sfm_model(manager.get(number), graph) for number in range(manager.size())]
-    )
+    made = [_sfm_model(manager.get(number), graph) for number in range(manager.size())]
+    models, rejections = filter_models(made)
     failure = "" if models else "no plausible model came of the matches"
-    return Reconstruction(tuple(image.name for image in graph.images), models, rejections, failure)
+    return Reconstruction(graph.names, models, rejections, failure)
 
 
 def _incremental_options(config: SceneConfig) -> Any:

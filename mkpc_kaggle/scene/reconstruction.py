@@ -34,13 +34,16 @@ class RegisteredImage:
 class SfmModel:
     """Cameras in one world, and points in it, (P, 3) float64; ``reprojection_error`` is the mean in pixels.
 
-    ``colmap`` is pycolmap's own value of it, as long as it may have to be written.
+    ``colmap`` is pycolmap's own value of it, which cannot leave its process.
     """
 
     images: tuple[RegisteredImage, ...]
     points: NDArray[np.float64]
     reprojection_error: float
     colmap: Any = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "colmap": None}
 
 
 @dataclass(frozen=True, eq=False)

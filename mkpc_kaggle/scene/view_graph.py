@@ -65,6 +65,15 @@ class ViewGraph:
     images: tuple[BatchImage, ...]
     edges: tuple[Edge, ...]
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(image.name for image in self.images)
+
+    @property
+    def strong(self) -> "ViewGraph":
+        """The same images, and the edges with at least ``MIN_MATCHES`` matches: fewer connect nothing."""
+        return ViewGraph(self.images, tuple(edge for edge in self.edges if len(edge.matches) >= MIN_MATCHES))
+
     @classmethod
     def of_pairs(cls, pairs: Sequence[BatchPair], matcher: str = "") -> "ViewGraph":
         """The graph of a batch's pairs, from the matches of all matchers or of one.
@@ -86,11 +95,8 @@ class ViewGraph:
         return cls(tuple(images[digest] for digest in order), edges)
 
     def components(self) -> tuple["ViewGraph", ...]:
-        """The connected components that have an edge, by their first images.
-
-        An edge with fewer than ``MIN_MATCHES`` matches connects nothing, and is in no component.
-        """
-        strong = [edge for edge in self.edges if len(edge.matches) >= MIN_MATCHES]
+        """The connected components that have a strong edge, by their first images; weak edges are in none."""
+        strong = self.strong.edges
         ends = np.array([(edge.first, edge.second) for edge in strong], np.intp).reshape(-1, 2)
         shape = (len(self.images), len(self.images))
         adjacency = coo_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=shape)
