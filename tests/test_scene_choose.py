@@ -133,5 +133,3 @@ def test_settings_come_from_a_table() -> None:
         from_table(SceneConfig, {"shared_intrinsics": -1}, "[scene]")
     with pytest.raises(UserError, match=r"'one_camera' is now called 'shared_intrinsics'"):
         from_table(SceneConfig, {"one_camera": 0}, "[scene]")
-    with pytest.raises(UserError, match=r"'most_images' was removed"):
-        from_table(SceneConfig, {"most_images": 9}, "[scene]")

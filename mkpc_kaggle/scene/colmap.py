@@ -50,9 +50,10 @@ def structure_from_motion(graph: ViewGraph, config: SceneConfig, shared: SharedI
     with pycolmap.Database.open(":memory:") as database:
         _fill(database, graph, config, shared)
         images = len(graph.images)
-        found = run_mapper(pycolmap.GlobalPipeline, _global_options(images, config), database, graph)
+        for_global, for_incremental = _mapper_options(images, config)
+        found = run_mapper(pycolmap.GlobalPipeline, for_global, database, graph)
         if images <= LARGE and found.registered < MIN_REGISTERED * images:
-            other = run_mapper(pycolmap.IncrementalPipeline, _incremental_options(config), database, graph)
+            other = run_mapper(pycolmap.IncrementalPipeline, for_incremental, database, graph)
             found = max(found, other, key=lambda each: each.observations)
         return found
 
@@ -131,12 +132,10 @@ def _write_camera(database: Any, number: int, image: BatchImage, model: CameraMo
 
 def verify(graph: ViewGraph, keypoints: SceneKeypoints, cameras: list[Any], config: SceneConfig) -> list[Any]:
     """The epipolar geometry of each edge, with the matches that agree on it."""
-    options = pycolmap.TwoViewGeometryOptions()
-    options.ransac.max_error = MAX_ERROR_PX
-    options.ransac.max_num_trials = MAX_TRIALS
-    options.ransac.random_seed = SEED
-    options.min_num_inliers = MIN_MATCHES
-    options.detect_watermark = False  # it looks for matches that stand still, of which near views have many
+    ransac = {"max_error": MAX_ERROR_PX, "max_num_trials": MAX_TRIALS, "random_seed": SEED}
+    # A watermark is what matches stand still on, of which near views have many.
+    settings = {"ransac": ransac, "min_num_inliers": MIN_MATCHES, "detect_watermark": False}
+    options = pycolmap.TwoViewGeometryOptions(settings)
     points = [found.astype(np.float64) + CENTRE_PX for found in keypoints.points]
 
     def of_edge(edge: Edge, matches: NDArray[np.uint32]) -> Any:
@@ -158,30 +157,18 @@ def run_mapper(pipeline: Any, options: Any, database: Any, graph: ViewGraph) -> 
     return Reconstruction(graph.names, models, rejections, failure)
 
 
-def _incremental_options(config: SceneConfig) -> Any:
-    options = pycolmap.IncrementalPipelineOptions()
-    options.extract_colors = False
-    return _with_common(options, config, options.mapper, options.triangulation)
-
-
-def _global_options(images: int, config: SceneConfig) -> Any:
-    options = pycolmap.GlobalPipelineOptions()
-    mapper = options.mapper
-    mapper.num_threads = config.threads
-    if images > LARGE:
-        mapper.track_required_tracks_per_view = TRACKS_PER_IMAGE
-    parts = mapper, mapper.rotation_averaging, mapper.global_positioning, mapper.retriangulation
-    return _with_common(options, config, *parts)
-
-
-def _with_common(options: Any, config: SceneConfig, *parts: Any) -> Any:
-    """What both mappers are told; ``parts`` have a seed of their own."""
-    options.min_model_size = MIN_IMAGES
-    options.min_num_matches = MIN_MATCHES
-    options.num_threads = config.threads
-    for part in (options, *parts):
-        part.random_seed = SEED
-    return options
+def _mapper_options(images: int, config: SceneConfig) -> tuple[Any, Any]:
+    """Those of the global and of the incremental mapper for a scene of so many images."""
+    seed, threads = {"random_seed": SEED}, {"num_threads": config.threads}
+    common = {**seed, **threads, "min_model_size": MIN_IMAGES, "min_num_matches": MIN_MATCHES}
+    parts = dict.fromkeys(("rotation_averaging", "global_positioning", "retriangulation"), seed)
+    required = {"track_required_tracks_per_view": TRACKS_PER_IMAGE} if images > LARGE else {}
+    return (
+        pycolmap.GlobalPipelineOptions({**common, "mapper": {**seed, **threads, **parts, **required}}),
+        pycolmap.IncrementalPipelineOptions(
+            {**common, "extract_colors": False, "mapper": seed, "triangulation": seed}
+        ),
+    )
 
 
 def _sfm_model(found: Any, graph: ViewGraph) -> SfmModel:
