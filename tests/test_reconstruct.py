@@ -35,7 +35,7 @@ from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.pipeline.assembly import assemble
 from mkpc_kaggle.recipe import Recipe, Unit
-from mkpc_kaggle.reconstruction.folder import MAX_IMAGES, Dataset, pairs_of, read_folder, read_pair_list
+from mkpc_kaggle.reconstruction.folder import MAX_IMAGES, pairs_of, read_folder, read_pair_list
 from mkpc_kaggle.reconstruction.likeness import find_turns, shortlist
 from mkpc_kaggle.reconstruction.outputs import Form, camera_rows, submission_rows
 from mkpc_kaggle.reconstruction.run import FolderResult, for_cameras, reconstruct_folder
@@ -99,7 +99,7 @@ def mixed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, FolderResult]
 
 def cameras(result: FolderResult) -> Mapping[str, CameraRecord]:
     (found,) = result.cameras.values()
-    return found
+    return {file.name: record for file, record in found.items() if record}
 
 
 def contents(out: Path) -> dict[str, str]:
@@ -129,7 +129,7 @@ def test_the_cameras_are_those_of_the_models_and_right(mixed: tuple[Path, Folder
     out, result = mixed
     truth = MixedMatcher().scenes[0].cameras
     model = pycolmap.Reconstruction(out / "models" / "0")
-    rows = {row[0]: row for row in camera_rows(result.cameras)}
+    rows = {row[0]: row for row in camera_rows(result.cameras, out.parent / "images")}
     for image in model.images.values():
         K, R, t = (np.array([float(x) for x in cell.split(";")]) for cell in rows[image.name][2:])
         np.testing.assert_allclose(R.reshape(3, 3), image.cam_from_world().matrix()[:, :3], atol=1e-9)
@@ -217,7 +217,7 @@ def test_only_listed_pairs_are_matched(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("line", ["a/0.png", "a/0.png b/0.png", "a/0.png a/0.png", "a/0.png a/9.png", "x y z", ""])
 def test_a_line_that_names_no_pair_is_refused(tmp_path: Path, line: str) -> None:
-    datasets = [Dataset(name, tuple(tmp_path / name / f"{n}.png" for n in range(2))) for name in "ab"]
+    datasets = {name: [tmp_path / name / f"{n}.png" for n in range(2)] for name in "ab"}
     (tmp_path / "pairs.txt").write_text(line)
     with pytest.raises(UserError, match=r"expected two images of one dataset" if line else "has no pairs"):
         read_pair_list(tmp_path / "pairs.txt", tmp_path, datasets)
@@ -323,9 +323,9 @@ def test_large_folders_get_a_shortlist_and_others_all_pairs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("mkpc_kaggle.reconstruction.folder.shortlist", lambda files: [(0, 1)])
-    files = tuple(tmp_path / f"{number:03}.png" for number in range(MAX_IMAGES + 1))
-    assert len(pairs_of(Dataset(".", files[:-1]))) == MAX_IMAGES * (MAX_IMAGES - 1) // 2
-    assert pairs_of(Dataset(".", files)) == [files[:2]]
+    files = [tmp_path / f"{number:03}.png" for number in range(MAX_IMAGES + 1)]
+    assert len(pairs_of(files[:-1])) == MAX_IMAGES * (MAX_IMAGES - 1) // 2
+    assert pairs_of(files) == [(files[0], files[1])]
 
 
 def test_unreadable_images_have_no_part_in_a_shortlist(tmp_path: Path) -> None:

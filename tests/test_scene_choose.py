@@ -105,23 +105,16 @@ def with_camera(scene: SyntheticScene, **changes: object) -> SfmModel:
     return replace(cameras, images=(replace(cameras.images[0], **changes), *cameras.images[1:]))
 
 
-@pytest.mark.parametrize(
-    ("focal", "told"), [(-900.0, "-1.12"), (0.0, "0 long"), (1e5, "125"), (np.nan, "not finite")]
-)
-def test_an_absurd_focal_length_is_left_out(scene: SyntheticScene, focal: float, told: str) -> None:
-    camera = scene.cameras["0000"]
-    bad = replace(camera, K=np.diag([focal, focal, 1.0]))
-    (kept,), (reason,) = filter_models((with_camera(scene, camera=bad),))
+@pytest.mark.parametrize("focal", [-900.0, 0.0, 1e5, np.nan])
+def test_an_absurd_focal_length_is_left_out(scene: SyntheticScene, focal: float) -> None:
+    bad = replace(scene.cameras["0000"], K=np.diag([focal, focal, 1.0]))
+    (kept,) = filter_models((with_camera(scene, camera=bad),))
     assert [found.image.name for found in kept.images] == ["0001", "0002", "0003"]
-    assert "0000" in reason
-    assert told in reason
 
 
 def test_a_model_that_is_too_small_is_left_out(scene: SyntheticScene) -> None:
     small = model({name: scene.cameras[name] for name in ("0000", "0001")})
-    kept, reasons = filter_models((small, model(scene.cameras)))
-    assert [len(each.images) for each in kept] == [4]
-    assert reasons == ("a model of 2 images is too small",)
+    assert [len(each.images) for each in filter_models((small, model(scene.cameras)))] == [4]
 
 
 def test_settings_come_from_a_table() -> None:

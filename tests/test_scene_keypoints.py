@@ -10,7 +10,7 @@ from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.pipeline.pair import UnitResult
 from mkpc_kaggle.recipe import Unit
-from mkpc_kaggle.scene.keypoints import SceneKeypoints, merge_points, one_to_one, scene_keypoints
+from mkpc_kaggle.scene.keypoints import merge_points, one_to_one, scene_keypoints
 from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair, Edge, ViewGraph, tracks_of
 
 SIZE = Size(100, 80)
@@ -30,7 +30,7 @@ def pair(names: str, found: Matches) -> BatchPair:
     return BatchPair(image(names[0]), image(names[1]), found)
 
 
-def keypoints_of(count: int, *edges: Edge) -> SceneKeypoints:
+def keypoints_of(count: int, *edges: Edge) -> tuple[list[np.ndarray], list[np.ndarray]]:
     return scene_keypoints(ViewGraph(tuple(map(image, "ABC"[:count])), edges))
 
 
@@ -54,9 +54,8 @@ def test_points_on_both_sides_of_a_cells_border_are_one_keypoint() -> None:
 
 def test_a_match_that_two_matchers_found_is_one_and_outvotes_another() -> None:
     edge = Edge(0, 1, matches((10, 10, 60, 60), (10, 10, 20, 20), (10.1, 10, 20, 20.1)))
-    keypoints = keypoints_of(2, edge)
-    ((index,),) = [index.tolist() for index in keypoints.matches]
-    np.testing.assert_allclose(keypoints.points[1][index[1]], [20, 20.05], atol=1e-5)
+    keypoints, (index,) = keypoints_of(2, edge)
+    np.testing.assert_allclose(keypoints[1][index[0, 1]], [20, 20.05], atol=1e-5)
 
 
 def test_a_keypoint_is_matched_once_and_to_what_was_found_most_often() -> None:
@@ -71,13 +70,13 @@ def test_a_point_seen_in_two_pairs_is_one_keypoint() -> None:
         Edge(0, 2, matches((10.1, 9.9, 50, 50))),
         Edge(1, 2, matches((20.05, 20, 50.1, 50))),
     ]
-    keypoints = keypoints_of(3, *edges)
-    assert [len(points) for points in keypoints.points] == [2, 2, 1]
-    first, second, third = (index.tolist() for index in keypoints.matches)
+    keypoints, found = keypoints_of(3, *edges)
+    assert list(map(len, keypoints)) == [2, 2, 1]
+    first, second, third = (index.tolist() for index in found)
     (a, b), (a2, c) = first[0], second[0]
     assert a == a2
     assert third == [[b, c]]
-    np.testing.assert_allclose(keypoints.points[0][a], [10.05, 9.95], atol=1e-5)
+    np.testing.assert_allclose(keypoints[0][a], [10.05, 9.95], atol=1e-5)
 
 
 def test_the_same_picture_under_two_names_is_one_image() -> None:

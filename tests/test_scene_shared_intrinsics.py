@@ -11,7 +11,7 @@ from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.geometry.robust import RobustConfig
 from mkpc_kaggle.recipe import SceneConfig
-from mkpc_kaggle.scene.choose import estimate_at_known_focals, known_focal
+from mkpc_kaggle.scene.choose import estimate_at_known_focals
 from mkpc_kaggle.scene.reconstruct import Solution, reconstruct_batch
 from mkpc_kaggle.scene.reconstruction import RegisteredImage, SfmModel
 from mkpc_kaggle.scene.shared_intrinsics import shared_intrinsics
@@ -112,11 +112,8 @@ def test_shared_intrinsics_that_explain_fewer_points_are_dropped(monkeypatch: py
 
 
 def test_an_image_that_the_scene_lacks_has_the_shared_focal_length() -> None:
-    (registered,) = model(images(1), [850.0]).images
-    known = {"0": FOCAL, "9": FOCAL}
-    assert [known_focal(digest, [{"0": registered}], known) for digest in "098"] == [850, FOCAL, None]
     pair = synthetic_scene(2, points=300, focals=[FOCAL] * 2).pairs[0]
     settings = FocalConfig(), RobustConfig(permutations=1, max_iterations=2000)
     both = {pair.image0.digest: FOCAL, pair.image1.digest: FOCAL}
-    assert estimate_at_known_focals(pair, [], both, *settings) is not None
-    assert estimate_at_known_focals(pair, [], {}, *settings) is None
+    assert estimate_at_known_focals(pair, both, *settings) is not None
+    assert estimate_at_known_focals(pair, {}, *settings) is None

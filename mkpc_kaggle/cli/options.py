@@ -55,15 +55,9 @@ def add_run(parser: argparse.ArgumentParser, time_limit: str | None) -> None:
 
 def assembly_of(arguments: argparse.Namespace, recipe: str, mode: str) -> Assembly:
     """The parts of a run of this recipe, as the other options say."""
-    return assemble(
-        recipe,
-        weights=arguments.weights,
-        device=arguments.device,
-        precision=arguments.precision,
-        mode=Mode(mode),
-        licence=Licence(arguments.licence),
-        scenes=arguments.reconstruct,
-    )
+    given = {name: getattr(arguments, name) for name in ("weights", "device", "precision")}
+    licence, scenes = Licence(arguments.licence), arguments.reconstruct
+    return assemble(recipe, **given, mode=Mode(mode), licence=licence, scenes=scenes)
 
 
 def budget_of(arguments: argparse.Namespace) -> Budget:

@@ -60,11 +60,11 @@ def run(arguments: argparse.Namespace) -> int:
     listed = None if arguments.pairs is None else read_pair_list(arguments.pairs, root, datasets)
     with options.watched_session(arguments, work_dir) as (session, watchdog), writing(f"--out {out}"):
         assembly = options.assembly_of(arguments, arguments.recipe, arguments.mode)
-        options.say_start(f"{sum(len(dataset.files) for dataset in datasets)} images", assembly, work_dir)
+        options.say_start(f"{sum(map(len, datasets.values()))} images", assembly, work_dir)
         result = reconstruct_folder(datasets, assembly, session, out, listed=listed, rotations=arguments.rotations)
         write_tables(out, result.cameras, root, arguments.format and Form(arguments.format))
         failed = trouble(result.report)
-        watchdog.status = int(bool(failed) or not any(result.cameras.values()))
+        watchdog.status = int(bool(failed) or not any(any(found.values()) for found in result.cameras.values()))
         told = [*options.plan_lines(arguments, result.report), *_told(result), failed, f"results: {out}"]
         say("\n".join(filter(None, told)))
         say(report_run(work_dir, out / "report.html", session.must_end(), result.pairs))
@@ -77,11 +77,11 @@ def _told(result: FolderResult) -> Iterator[str]:
     report = result.report
     yield f"{len(result.pairs)} pairs: {report.ending} after {format_duration(report.seconds)}"
     reasons = {scene.batch: scene.failure for scene in report.scenes}
-    for dataset, cameras in result.cameras.items():
-        models = Counter(camera.model for camera in cameras.values())
+    for name, found in result.cameras.items():
+        models = Counter(camera.model for camera in found.values() if camera)
         sizes = ", ".join(str(models[number]) for number in sorted(models))
-        why = f"models of {sizes}" if models else reasons.get(dataset.name, "too few pairs, or too little time")
-        yield f"{dataset.name}: {len(cameras)} of {len(dataset.files)} images have a camera: {why}"
+        why = f"models of {sizes}" if models else reasons.get(name, "too few pairs, or too little time")
+        yield f"{name}: {models.total()} of {len(found)} images have a camera: {why}"
     unreadable = {record.failure for record in report.records if record.reached and not record.sizes}
     yield from (f"cannot be read: {failure}" for failure in sorted(unreadable)[:MAX_LINES])
     yield from (f"fault: {fault}" for fault in report.faults[:MAX_LINES])

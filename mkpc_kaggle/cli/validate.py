@@ -113,10 +113,8 @@ def _read_scenes(arguments: argparse.Namespace, work_dir: Path) -> tuple[TrainSc
     most: int | None = arguments.pairs_per_scene
     if arguments.pairs is not None:
         return (read_pairs(arguments.pairs, arguments.image_root, copies=work_dir / "turned", most=most),)
-    scenes = filter(None, arguments.scenes.split(","))
-    return read_train_side(
-        arguments.train_dir, scenes=scenes, min_covisibility=arguments.min_covisibility, pairs_per_scene=most
-    )
+    scenes, least = filter(None, arguments.scenes.split(",")), arguments.min_covisibility
+    return read_train_side(arguments.train_dir, scenes=scenes, min_covisibility=least, pairs_per_scene=most)
 
 
 def _match_and_score(arguments: argparse.Namespace, scenes: tuple[TrainScene, ...], work_dir: Path) -> int:

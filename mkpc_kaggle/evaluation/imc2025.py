@@ -26,6 +26,7 @@ MIN_SPREAD = 1e-12  # sum of squares; centres with less stand at one point
 
 Points = NDArray[np.float64]  # (N, 3)
 Centres = Mapping[str, Points]  # of the cameras of a scene or cluster by image, (3,); NaN without a camera
+Parts = Mapping[str, Centres]  # the scenes of a dataset, or its clusters
 
 
 @dataclass(frozen=True)
@@ -66,10 +67,7 @@ def score_imc2025(directory: Path, submission: Path) -> list[DatasetScore]:
 
 
 def score_dataset(
-    name: str,
-    scenes: Mapping[str, Centres],
-    clusters: Mapping[str, Centres],
-    thresholds: Mapping[str, Sequence[float] | Points],
+    name: str, scenes: Parts, clusters: Parts, thresholds: Mapping[str, Sequence[float] | Points]
 ) -> DatasetScore:
     """Each scene takes the cluster that has most of its images, of several the cluster with the best mAA.
 

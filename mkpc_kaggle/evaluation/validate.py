@@ -54,6 +54,10 @@ class SceneScore:
     def errors(self) -> list[PoseError]:
         return [pair.error for pair in self.pairs]
 
+    def accuracies(self, step: Step | None = None) -> list[float]:
+        """The accuracy of each pair after a step, by default the last."""
+        return [metrics.pair_accuracy(pair.steps[step] if step else pair.error) for pair in self.pairs]
+
     @property
     def maa(self) -> float:
         return mean_average_accuracy(self.errors) if self.in_metres else nan

@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 from mkpc_kaggle.data.outputs import replacing
 from mkpc_kaggle.engine.records import CameraRecord
 from mkpc_kaggle.geometry.cameras import Camera
-from mkpc_kaggle.reconstruction.folder import Dataset
 
-Cameras = Mapping[Dataset, Mapping[str, CameraRecord]]  # of images with a camera, by the names of their files
+Cameras = Mapping[str, Mapping[Path, CameraRecord | None]]  # of each file of a dataset, None without a camera
 
 ORIGIN = Camera(np.eye(3), np.eye(3), np.zeros(3))
 NO_CAMERA = Camera(np.eye(3), np.full((3, 3), np.nan), np.full(3, np.nan))
@@ -28,7 +27,7 @@ class Form(StrEnum):
 
 def write_tables(out: Path, cameras: Cameras, root: Path, form: Form | None) -> None:
     """Write ``cameras.csv`` and, in a ``form``, ``submission.csv``; raises ``OSError`` if that cannot be."""
-    tables = {"cameras.csv": camera_rows(cameras)}
+    tables = {"cameras.csv": camera_rows(cameras, root)}
     if form is not None:
         tables["submission.csv"] = submission_rows(form, cameras, root)
     for name, rows in tables.items():
@@ -36,16 +35,16 @@ def write_tables(out: Path, cameras: Cameras, root: Path, form: Form | None) -> 
             csv.writer(stream, lineterminator="\n").writerows(rows)
 
 
-def camera_rows(cameras: Cameras) -> Iterator[Sequence[str]]:
+def camera_rows(cameras: Cameras, root: Path) -> Iterator[Sequence[str]]:
     """A row for each image with a camera: its path below the folder, its model, K, R and t.
 
     The centre of an image's first pixel is (0, 0); X_cam = R X + t.
     """
     yield "image", "model", "K", "R", "t"
-    for dataset, found in cameras.items():
-        for name, record in found.items():
+    for file, record in (item for found in cameras.values() for item in found.items()):
+        if record is not None:
             parts = record.camera.K, record.camera.R, record.camera.t
-            yield (Path(dataset.name) / name).as_posix(), str(record.model), *map(joined, parts)
+            yield file.relative_to(root).as_posix(), str(record.model), *map(joined, parts)
 
 
 def submission_rows(form: Form, cameras: Cameras, root: Path) -> Iterator[Sequence[str]]:
@@ -54,10 +53,9 @@ def submission_rows(form: Form, cameras: Cameras, root: Path) -> Iterator[Sequen
     heads = ["image_id", "dataset", "scene", "image"] if of_2025 else ["image_path", "dataset", "scene"]
     yield [*heads, "rotation_matrix", "translation_vector"]
     for dataset, found in cameras.items():
-        folder = root.resolve().name if dataset.name == "." else dataset.name
+        folder = root.resolve().name if dataset == "." else dataset
         parts = folder.split("/")  # of 2023 dataset/scene/images, of 2024 dataset/images
-        for name in (file.name for file in dataset.files):
-            record = found.get(name)
+        for name, record in ((file.name, record) for file, record in found.items()):
             if of_2025:
                 cells = [f"{folder}_{name}", folder, f"cluster{record.model}" if record else "outliers", name]
                 camera = record.camera if record else NO_CAMERA

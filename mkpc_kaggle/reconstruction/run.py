@@ -15,7 +15,7 @@ from mkpc_kaggle.matchers.contract import Matcher
 from mkpc_kaggle.pipeline.assembly import Assembly
 from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher, to_image
 from mkpc_kaggle.recipe import Recipe, SceneConfig, load_recipe
-from mkpc_kaggle.reconstruction.folder import Dataset, Ends, pairs_of
+from mkpc_kaggle.reconstruction.folder import Datasets, Ends, pairs_of
 from mkpc_kaggle.reconstruction.likeness import find_turns
 from mkpc_kaggle.reconstruction.outputs import Cameras
 from mkpc_kaggle.scene.export import MODELS, Export
@@ -40,7 +40,7 @@ def for_cameras(recipe: Recipe) -> Recipe:
 
 
 def reconstruct_folder(
-    datasets: Sequence[Dataset],
+    datasets: Datasets,
     assembly: Assembly,
     session: Session,
     out: Path,
@@ -56,34 +56,35 @@ def reconstruct_folder(
     """
     assembly = replace(assembly, recipe=for_cameras(assembly.recipe))
     pairs, exports = [], {}
-    for dataset in datasets:
-        name, files = dataset.name, dataset.files
-        ends = pairs_of(dataset) if listed is None else [pair for pair in listed if pair[0] in files]
+    for name, files in datasets.items():
+        ends = pairs_of(files) if listed is None else [pair for pair in listed if pair[0] in files]
         turns = dict.fromkeys(files, 0) | (find_turns(files, assembly) if rotations and ends else {})
         shown = {file: turned_copy(file, turns[file], session.work_dir / "turned")[0] for file in files}
         exports[name] = Export(out / name, {shown[file].stem: (file.name, turns[file]) for file in files})
         pairs += [Pair(f"{name}/{a.stem}/{b.stem}", name, str(shown[a]), str(shown[b])) for a, b in ends]
     report = run_pairs(pairs, assembly, replace(session, exports=exports))
-    versions: dict[str, dict[str, str]] = {dataset.name: {} for dataset in datasets}
+    versions: dict[str, dict[str, str]] = {name: {} for name in datasets}
     for pair, record in zip(pairs, report.records, strict=True):
         # A pair that was not reached, or of which an image cannot be read, has no versions.
         for path, version in zip(pair.images if record.versions else (), record.versions, strict=True):
             versions[pair.group][exports[pair.group].files[path.stem][0]] = version
     scenes = {scene.batch: scene for scene in report.scenes}
-    cameras = {dataset: cameras_of(scenes.get(dataset.name), versions[dataset.name]) for dataset in datasets}
-    for dataset, placed in cameras.items():
-        if placed and not (models := out / dataset.name / MODELS).is_dir():
+    cameras = {name: cameras_of(files, scenes.get(name), versions[name]) for name, files in datasets.items()}
+    for name, placed in cameras.items():
+        if any(placed.values()) and not (models := out / name / MODELS).is_dir():
             raise UserError(f"{models} was removed after it was made; start anew with --fresh")
     return FolderResult(report, tuple(pairs), cameras)
 
 
-def cameras_of(scene: SceneRecord | None, versions: Mapping[str, str]) -> dict[str, CameraRecord]:
-    """The camera of each image, by its file's name, in the largest model that has it.
+def cameras_of(
+    files: Sequence[Path], scene: SceneRecord | None, versions: Mapping[str, str]
+) -> dict[Path, CameraRecord | None]:
+    """The camera of each image in the largest model that has it; ``None`` without a camera.
 
-    ``versions`` are the digests of the files: files of one content have one camera.
+    ``versions`` are the digests of files, by name: files of one content have one camera.
     """
     known = {versions[found.image]: found for found in reversed(scene.cameras if scene else ())}
-    return {name: known[digest] for name, digest in sorted(versions.items()) if digest in known}
+    return {file: known.get(versions.get(file.name, "")) for file in files}
 
 
 def reconstruct(
@@ -99,13 +100,13 @@ def reconstruct(
     What the command ``reconstruct`` does, in this process and without its budget and journal. Raises
     :class:`UserError` for a recipe that cannot run here, and for an image that cannot be read.
     """
-    dataset = Dataset(".", tuple(sorted(map(Path, images))))
+    files = sorted(map(Path, images))
     chosen = for_cameras(load_recipe(recipe) if isinstance(recipe, str) else recipe)
     matcher = TwoStageMatcher(chosen, weights=weights, device=device, matchers=matchers)
-    decoded = ((path, to_image(path)) for path in dataset.files)
+    decoded = ((path, to_image(path)) for path in files)
     known = {path: BatchImage(str(path), image.name, image.size) for path, image in decoded}
     pairs = []
-    for path0, path1 in pairs_of(dataset):
+    for path0, path1 in pairs_of(files):
         match = matcher(path0, path1)
         pairs.append(BatchPair(known[path0], known[path1], match.matches, None, tracks_of(match.results)))
     found, _ = reconstruct_sharing(ViewGraph.of_pairs(pairs), chosen.scene or SceneConfig())

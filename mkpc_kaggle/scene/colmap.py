@@ -18,12 +18,12 @@ from typing import Any
 
 import numpy as np
 import pycolmap
-from numpy.typing import NDArray
 
 from mkpc_kaggle.geometry.cameras import Camera
+from mkpc_kaggle.geometry.coordinates import Points
 from mkpc_kaggle.recipe import CameraModel, SceneConfig
 from mkpc_kaggle.scene.export import DATABASE, MODELS
-from mkpc_kaggle.scene.keypoints import SceneKeypoints, scene_keypoints
+from mkpc_kaggle.scene.keypoints import Index, scene_keypoints
 from mkpc_kaggle.scene.reconstruction import MIN_IMAGES, Reconstruction, RegisteredImage, SfmModel, filter_models
 from mkpc_kaggle.scene.shared_intrinsics import SharedIntrinsics
 from mkpc_kaggle.scene.view_graph import MIN_MATCHES, BatchImage, Edge, ViewGraph
@@ -82,17 +82,17 @@ def write_files(
 
 def _fill(database: Any, graph: ViewGraph, config: SceneConfig, shared: SharedIntrinsics) -> None:
     """Write images with their cameras and keypoints, and the matches and verified geometry of each edge."""
-    keypoints = scene_keypoints(graph)
+    keypoints, found = scene_keypoints(graph)
     with pycolmap.DatabaseTransaction(database):
         cameras = _write_images(database, graph, keypoints, config.camera_model, shared)
-        geometries = verify(graph, keypoints, cameras, config)
-        for edge, matches, geometry in zip(graph.edges, keypoints.matches, geometries, strict=True):
+        geometries = verify(graph.edges, keypoints, found, cameras, config.threads)
+        for edge, matches, geometry in zip(graph.edges, found, geometries, strict=True):
             database.write_matches(edge.first + 1, edge.second + 1, matches)
             database.write_two_view_geometry(edge.first + 1, edge.second + 1, geometry)
 
 
 def _write_images(
-    database: Any, graph: ViewGraph, keypoints: SceneKeypoints, model: CameraModel, shared: SharedIntrinsics
+    database: Any, graph: ViewGraph, keypoints: Sequence[Points], model: CameraModel, shared: SharedIntrinsics
 ) -> list[Any]:
     """Write images, frames, cameras and rigs; returns each image's camera.
 
@@ -100,7 +100,7 @@ def _write_images(
     """
     cameras: dict[object, Any] = {}
     used = []
-    for number, (image, points) in enumerate(zip(graph.images, keypoints.points, strict=True), start=1):
+    for number, (image, points) in enumerate(zip(graph.images, keypoints, strict=True), start=1):
         focal = shared.get(image.digest)
         key = number if focal is None else (image.size, focal)
         if key not in cameras:
@@ -130,31 +130,31 @@ def _write_camera(database: Any, number: int, image: BatchImage, model: CameraMo
     return camera
 
 
-def verify(graph: ViewGraph, keypoints: SceneKeypoints, cameras: list[Any], config: SceneConfig) -> list[Any]:
+def verify(
+    edges: Sequence[Edge], keypoints: Sequence[Points], matches: Sequence[Index], cameras: list[Any], threads: int
+) -> list[Any]:
     """The epipolar geometry of each edge, with the matches that agree on it."""
     ransac = {"max_error": MAX_ERROR_PX, "max_num_trials": MAX_TRIALS, "random_seed": SEED}
-    # A watermark is what matches stand still on, of which near views have many.
+    # A watermark is seen in matches that stand still, of which near views have many.
     settings = {"ransac": ransac, "min_num_inliers": MIN_MATCHES, "detect_watermark": False}
     options = pycolmap.TwoViewGeometryOptions(settings)
-    points = [found.astype(np.float64) + CENTRE_PX for found in keypoints.points]
+    points = [found.astype(np.float64) + CENTRE_PX for found in keypoints]
 
-    def of_edge(edge: Edge, matches: NDArray[np.uint32]) -> Any:
+    def of_edge(edge: Edge, index: Index) -> Any:
         first, second = edge.first, edge.second
         ends = cameras[first], points[first], cameras[second], points[second]
-        return pycolmap.estimate_two_view_geometry(*ends, matches, options)
+        return pycolmap.estimate_two_view_geometry(*ends, index, options)
 
-    with ThreadPoolExecutor(config.threads) as pool:
-        return list(pool.map(of_edge, graph.edges, keypoints.matches))
+    with ThreadPoolExecutor(threads) as pool:
+        return list(pool.map(of_edge, edges, matches))
 
 
 def run_mapper(pipeline: Any, options: Any, database: Any, graph: ViewGraph) -> Reconstruction:
     """The plausible models that a mapper makes of what the database holds."""
     manager = pycolmap.ReconstructionManager()
     pipeline(options, database, manager).run()
-    made = [_sfm_model(manager.get(number), graph) for number in range(manager.size())]
-    models, rejections = filter_models(made)
-    failure = "" if models else "no plausible model came of the matches"
-    return Reconstruction(graph.names, models, rejections, failure)
+    models = filter_models([_sfm_model(manager.get(number), graph) for number in range(manager.size())])
+    return Reconstruction(graph.names, models, "" if models else "no plausible model came of the matches")
 
 
 def _mapper_options(images: int, config: SceneConfig) -> tuple[Any, Any]:

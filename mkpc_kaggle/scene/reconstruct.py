@@ -58,12 +58,14 @@ def reconstruct_batch(
         [{found.image.digest: found for found in model.images} for model in models_of(found)]
         for found in (together, *alone)
     ]
-    models = [model for found in by_digest for model in found]
+    focals = dict(shared)  # an image's is that of the first model that has it, else of the camera that it shares
+    for model in reversed([model for found in by_digest for model in found]):
+        focals |= {digest: found.focal for digest, found in model.items()}
     choices = []
     for pair in pairs:
         choice = choose(pair, by_digest)
         if focal is not None and choice.reason not in (Reason.SCENE, Reason.SAME_IMAGE):
-            F = estimate_at_known_focals(pair, models, shared, focal, magsac or RobustConfig())
+            F = estimate_at_known_focals(pair, focals, focal, magsac or RobustConfig())
             choice = replace(choice, F=F)
         choices.append(choice)
     return Solution(tuple(together), tuple(choices))
