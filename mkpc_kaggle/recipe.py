@@ -91,7 +91,7 @@ class SceneConfig:
     each_matcher: bool = True  # also reconstruct each matcher's matches alone; a pair gets the mean of its cameras
     shared_intrinsics: float = 0.02  # images of one size share a camera if most focals are this close; 0: never
     pairs_per_image: float = 5.0  # a batch with fewer pairs gets extra pairs, for its scene alone; 0: none
-    threads: int = 1  # more than one: the last digits differ from run to run
+    threads: int = 1  # more than one: sums are added in another order each time, and the last digits differ
 
     FORMER: ClassVar = {"one_camera": "shared_intrinsics"}
 

@@ -81,7 +81,7 @@ def upright(left: tuple[float, float], right: tuple[float, float], low: float, h
 # Rendering
 
 
-def test_a_wall_seen_head_on_is_the_picture_itself() -> None:
+def test_a_wall_seen_head_on_is_the_picture_itself():
     """One texel a pixel, no rotation: any shift by half a pixel shows."""
     picture = smooth_texture()
     # Seen from the north, where the sun does not shine.
@@ -96,7 +96,7 @@ def test_a_wall_seen_head_on_is_the_picture_itself() -> None:
     assert np.allclose(depth, 10, atol=1e-4)
 
 
-def test_a_view_warped_by_depth_falls_on_the_other() -> None:
+def test_a_view_warped_by_depth_falls_on_the_other():
     """Image, depth and camera agree to a small part of a pixel; half a pixel would show."""
     texture = smooth_texture()
     surfaces = [
@@ -125,7 +125,7 @@ def test_a_view_warped_by_depth_falls_on_the_other() -> None:
 # Covisibility
 
 
-def test_covisibility_of_two_halves_of_a_wall() -> None:
+def test_covisibility_of_two_halves_of_a_wall():
     surfaces = [upright((-50, 10), (50, 10), -50, 50, smooth_texture())]
     # A view is 10 m wide at the wall; half of that is a baseline of 5 m.
     a, b = (look_at((x, 0, 0), (x, 10, 0), 200, (200, 150)) for x in (0.0, 5.0))
@@ -135,7 +135,7 @@ def test_covisibility_of_two_halves_of_a_wall() -> None:
     assert covisibility(a, depth_a, a, depth_a) == 1
 
 
-def test_what_is_hidden_or_sky_is_not_shared() -> None:
+def test_what_is_hidden_or_sky_is_not_shared():
     texture = smooth_texture()
     surfaces = [upright((-5, 10), (5, 10), -5, 5, texture), upright((3, 2), (7, 2), -5, 5, texture)]
     a, b = (look_at((x, 0, 0), (x, 10, 0), 200, (200, 150)) for x in (0.0, 5.0))
@@ -149,7 +149,7 @@ def test_what_is_hidden_or_sky_is_not_shared() -> None:
 # The set on disk
 
 
-def test_layout_of_the_train_side(small_demo: DemoSet) -> None:
+def test_layout_of_the_train_side(small_demo):
     factors = {
         row["scene"]: float(row["scaling_factor"]) for row in rows(small_demo.train_dir / "scaling_factors.csv")
     }
@@ -165,7 +165,7 @@ def test_layout_of_the_train_side(small_demo: DemoSet) -> None:
         assert len(pairs) == len(expected)
 
 
-def test_image_scale_scales_the_intrinsics(worlds: dict[str, World], small_demo: DemoSet) -> None:
+def test_image_scale_scales_the_intrinsics(worlds, small_demo):
     written = cameras_of(small_demo, "market").values()
     for camera, here, whole in zip(worlds["market"].cameras, written, build_world("market").cameras, strict=True):
         for name in ("K", "R", "t"):
@@ -175,9 +175,7 @@ def test_image_scale_scales_the_intrinsics(worlds: dict[str, World], small_demo:
 
 
 @pytest.mark.parametrize("scene_name", SCENE_NAMES)
-def test_fundamental_matrices_fit_points_of_the_rendered_depth(
-    small_demo: DemoSet, depths: dict[str, list[tuple[SizedCamera, np.ndarray]]], scene_name: str
-) -> None:
+def test_fundamental_matrices_fit_points_of_the_rendered_depth(small_demo, depths, scene_name):
     cameras = cameras_of(small_demo, scene_name)
     depth_of = dict(zip(sorted(cameras), (depth for _, depth in depths[scene_name]), strict=True))
     for row in rows(small_demo.train_dir / scene_name / "pair_covisibility.csv"):
@@ -202,7 +200,7 @@ def test_fundamental_matrices_fit_points_of_the_rendered_depth(
         assert np.median(wrong / np.hypot(swapped[:, 0], swapped[:, 1])) > 0.5
 
 
-def test_the_test_side_has_covisible_pairs_of_renamed_train_images(small_demo: DemoSet) -> None:
+def test_the_test_side_has_covisible_pairs_of_renamed_train_images(small_demo):
     samples, truths = rows(small_demo.test_dir / "test.csv"), rows(small_demo.truth_csv)
     assert [row["sample_id"] for row in samples] == [row["sample_id"] for row in truths]
     assert len({row["sample_id"] for row in samples}) == len(samples) == 8 * len(SCENE_NAMES)
@@ -228,7 +226,7 @@ def test_the_test_side_has_covisible_pairs_of_renamed_train_images(small_demo: D
     assert on_disk == used
 
 
-def test_same_seed_same_bytes_whatever_the_other_scenes(tmp_path: Path, small_demo: DemoSet) -> None:
+def test_same_seed_same_bytes_whatever_the_other_scenes(tmp_path, small_demo):
     alone = write_demo(tmp_path, scenes=["market"], image_scale=SCALE)
     assert [path.name for path in alone.train_dir.iterdir() if path.is_dir()] == ["market"]
     assert bytes_of(alone.train_dir / "market") == bytes_of(small_demo.train_dir / "market")
@@ -244,6 +242,6 @@ def test_same_seed_same_bytes_whatever_the_other_scenes(tmp_path: Path, small_de
         ({"image_scale": 0.0}, "positive"),
     ],
 )
-def test_bad_arguments_are_refused(tmp_path: Path, arguments: dict[str, object], message: str) -> None:
+def test_bad_arguments_are_refused(tmp_path, arguments, message):
     with pytest.raises(ValueError, match=message):
         write_demo(tmp_path, **arguments)  # type: ignore[arg-type]

@@ -10,12 +10,11 @@ from numpy.typing import NDArray
 
 from mkpc_kaggle.data.outputs import replacing
 from mkpc_kaggle.engine.records import CameraRecord
-from mkpc_kaggle.geometry.cameras import Camera
 
 Cameras = Mapping[str, Mapping[Path, CameraRecord | None]]  # of each file of a dataset, None without a camera
 
-ORIGIN = Camera(np.eye(3), np.eye(3), np.zeros(3))
-NO_CAMERA = Camera(np.eye(3), np.full((3, 3), np.nan), np.full(3, np.nan))
+NO_POSE = ";".join(["nan"] * 9), "nan;nan;nan"
+ORIGIN = "1;0;0;0;1;0;0;0;1", "0;0;0"
 
 
 class Form(StrEnum):
@@ -50,19 +49,18 @@ def camera_rows(cameras: Cameras, root: Path) -> Iterator[Sequence[str]]:
 def submission_rows(form: Form, cameras: Cameras, root: Path) -> Iterator[Sequence[str]]:
     """A row for each image, in the order of the folder."""
     of_2025 = form is Form.IMC2025
-    heads = ["image_id", "dataset", "scene", "image"] if of_2025 else ["image_path", "dataset", "scene"]
-    yield [*heads, "rotation_matrix", "translation_vector"]
+    heads = ("image_id", "dataset", "scene", "image") if of_2025 else ("image_path", "dataset", "scene")
+    yield *heads, "rotation_matrix", "translation_vector"
     for dataset, found in cameras.items():
         folder = root.resolve().name if dataset == "." else dataset
         parts = folder.split("/")  # of 2023 dataset/scene/images, of 2024 dataset/images
         for name, record in ((file.name, record) for file, record in found.items()):
+            pose = (joined(record.camera.R), joined(record.camera.t)) if record else NO_POSE
             if of_2025:
-                cells = [f"{folder}_{name}", folder, f"cluster{record.model}" if record else "outliers", name]
-                camera = record.camera if record else NO_CAMERA
+                yield f"{folder}_{name}", folder, f"cluster{record.model}" if record else "outliers", name, *pose
             else:
-                cells = [f"{folder}/{name}", parts[0], parts[1 if len(parts) > 2 else 0]]
-                camera = record.camera if record and record.model == 0 else ORIGIN
-            yield [*cells, joined(camera.R), joined(camera.t)]
+                place = f"{folder}/{name}", parts[0], parts[1 if len(parts) > 2 else 0]
+                yield *place, *(pose if record and record.model == 0 else ORIGIN)
 
 
 def joined(numbers: NDArray[np.float64]) -> str:

@@ -4,9 +4,6 @@ pycolmap can end the process on its own (a failed assertion, memory), and the gl
 pycolmap is imported, a SIGTERM ends the process with a stack trace on stderr. So a caller that cannot afford this
 runs it in a process of its own. Nothing is written to disk, unless COLMAP's files are asked for.
 
-The same input gives the same bytes on one machine with ``threads = 1``. With more threads, sums are added in
-another order each time, and the last digits differ.
-
 Sources: Schoenberger and Frahm 2016 (the incremental mapper), Pan et al. 2024 (the global mapper).
 """
 
