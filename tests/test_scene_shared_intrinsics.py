@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 import numpy as np
+import pycolmap
 import pytest
 
 from benchmarks.synthetic_scene import SyntheticScene, registered_images, synthetic_scene
@@ -12,10 +13,10 @@ from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.geometry.robust import RobustConfig
 from mkpc_kaggle.recipe import SceneConfig
 from mkpc_kaggle.scene.choose import estimate_at_known_focals
-from mkpc_kaggle.scene.reconstruct import Solution, reconstruct_batch
+from mkpc_kaggle.scene.reconstruct import Solution, reconstruct_batch, reconstruct_sharing
 from mkpc_kaggle.scene.reconstruction import RegisteredImage, SfmModel
 from mkpc_kaggle.scene.shared_intrinsics import shared_intrinsics
-from mkpc_kaggle.scene.view_graph import BatchImage
+from mkpc_kaggle.scene.view_graph import BatchImage, ViewGraph
 
 WIDE, TALL = Size(800, 600), Size(600, 800)
 FOCAL = 840.0
@@ -102,13 +103,20 @@ def test_images_at_another_zoom_keep_a_camera_of_their_own():
         assert registered[image.digest].focal == pytest.approx(scene.cameras[image.name].K[0, 0], rel=0.02)
 
 
-def test_shared_intrinsics_that_explain_fewer_points_are_dropped(monkeypatch):
+@pytest.mark.parametrize(("least", "cameras"), [(0.99, 6), (0.0, 1)])
+def test_shared_intrinsics_stay_unless_they_explain_fewer_points_and_the_files_are_of_what_stays(
+    tmp_path, monkeypatch, least, cameras
+):
     scene = synthetic_scene(6, points=300)
     everything = {image.digest: FOCAL for image in scene.images}
     monkeypatch.setattr("mkpc_kaggle.scene.reconstruct.shared_intrinsics", lambda *_: everything)
-    assert len(set(focals_of(reconstruct_batch(scene.pairs, CONFIG)))) == 6
-    monkeypatch.setattr("mkpc_kaggle.scene.reconstruct.MIN_OBSERVATIONS", 0)
-    assert len(set(focals_of(reconstruct_batch(scene.pairs, CONFIG)))) == 1
+    monkeypatch.setattr("mkpc_kaggle.scene.reconstruct.MIN_OBSERVATIONS", least)
+    assert len(set(focals_of(reconstruct_batch(scene.pairs, CONFIG)))) == cameras
+    (found,), _ = reconstruct_sharing(ViewGraph.of_pairs(scene.pairs), CONFIG, tmp_path)
+    written = pycolmap.Reconstruction(tmp_path / "models" / "0").cameras.values()
+    assert {camera.focal_length for camera in written} == {image.focal for image in found.models[0].images}
+    with pycolmap.Database.open(str(tmp_path / "database.db")) as database:
+        assert (len(written), database.num_cameras()) == (cameras, cameras)
 
 
 def test_an_image_that_the_scene_lacks_has_the_shared_focal_length():

@@ -95,7 +95,7 @@ def _require_a_whole(given: argparse.Namespace) -> None:
     for is_wrong, told in (
         (given.imc2025 and (given.truth or not given.submission), "--imc2025 needs --submission, and no --truth"),
         (
-            not given.imc2025 and (given.submission is None) != (given.truth is None),
+            not given.imc2025 and (not given.submission) != (not given.truth),
             "--submission and --truth go together",
         ),
         ((given.pairs is None) != (given.image_root is None), "--pairs and --image-root go together"),
