@@ -1,13 +1,13 @@
 """The demo data set: its cameras, pixels and files agree with one another."""
 
 import csv
-import hashlib
 from itertools import combinations
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from shared import contents
 
 from mkpc_kaggle.demo import SCENE_NAMES, DemoSet, write_demo
 from mkpc_kaggle.demo.camera import SizedCamera, look_at, project, unproject
@@ -28,15 +28,6 @@ def worlds() -> dict[str, World]:
     return {name: build_world(name, image_scale=SCALE) for name in SCENE_NAMES}
 
 
-@pytest.fixture(scope="module")
-def depths(worlds: dict[str, World]) -> dict[str, list[tuple[SizedCamera, np.ndarray]]]:
-    """Of each scene the cameras and the depth maps, rendered anew."""
-    return {
-        name: [(camera, render(world.surfaces, camera)[1]) for camera in world.cameras]
-        for name, world in worlds.items()
-    }
-
-
 def rows(path: Path) -> list[dict[str, str]]:
     with path.open(newline="") as file:
         return list(csv.DictReader(file))
@@ -50,22 +41,9 @@ def cameras_of(demo: DemoSet, scene: str) -> dict[str, SizedCamera]:
     cameras = {}
     for row in rows(demo.train_dir / scene / "calibration.csv"):
         picture = cv2.imread(str(demo.train_dir / scene / "images" / f"{row['image_id']}.jpg"))
-        cameras[row["image_id"]] = SizedCamera(
-            numbers(row["camera_intrinsics"], 3, 3),
-            numbers(row["rotation_matrix"], 3, 3),
-            numbers(row["translation_vector"], 3),
-            picture.shape[1],
-            picture.shape[0],
-        )
+        K, R = (numbers(row[name], 3, 3) for name in ("camera_intrinsics", "rotation_matrix"))
+        cameras[row["image_id"]] = SizedCamera(K, R, numbers(row["translation_vector"], 3), *picture.shape[1::-1])
     return cameras
-
-
-def bytes_of(root: Path) -> dict[str, str]:
-    return {
-        str(path.relative_to(root)): hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in sorted(root.rglob("*"))
-        if path.is_file()
-    }
 
 
 def smooth_texture() -> np.ndarray:
@@ -76,9 +54,6 @@ def smooth_texture() -> np.ndarray:
 
 def upright(left: tuple[float, float], right: tuple[float, float], low: float, high: float, texture: np.ndarray):
     return quad((*left, high), (*right, high), (*left, low), texture)
-
-
-# Rendering
 
 
 def test_a_wall_seen_head_on_is_the_picture_itself():
@@ -122,9 +97,6 @@ def test_a_view_warped_by_depth_falls_on_the_other():
     assert min(difference(shift) for shift in ((0.5, 0), (-0.5, 0), (0, 0.5), (0, -0.5))) > 3 * difference((0, 0))
 
 
-# Covisibility
-
-
 def test_covisibility_of_two_halves_of_a_wall():
     surfaces = [upright((-50, 10), (50, 10), -50, 50, smooth_texture())]
     # A view is 10 m wide at the wall; half of that is a baseline of 5 m.
@@ -144,9 +116,6 @@ def test_what_is_hidden_or_sky_is_not_shared():
     assert covisibility(a, depth_a, b, depth_b) == 0
     sky = np.full((150, 200), np.inf, dtype=np.float32)
     assert covisibility(a, sky, b, sky) == 0
-
-
-# The set on disk
 
 
 def test_layout_of_the_train_side(small_demo):
@@ -175,9 +144,11 @@ def test_image_scale_scales_the_intrinsics(worlds, small_demo):
 
 
 @pytest.mark.parametrize("scene_name", SCENE_NAMES)
-def test_fundamental_matrices_fit_points_of_the_rendered_depth(small_demo, depths, scene_name):
+def test_fundamental_matrices_fit_points_of_the_rendered_depth(small_demo, worlds, scene_name):
     cameras = cameras_of(small_demo, scene_name)
-    depth_of = dict(zip(sorted(cameras), (depth for _, depth in depths[scene_name]), strict=True))
+    world = worlds[scene_name]
+    depths = (render(world.surfaces, camera)[1] for camera in world.cameras)
+    depth_of = dict(zip(sorted(cameras), depths, strict=True))
     for row in rows(small_demo.train_dir / scene_name / "pair_covisibility.csv"):
         F = numbers(row["fundamental_matrix"], 3, 3)
         assert np.linalg.norm(F) == pytest.approx(1)
@@ -229,9 +200,9 @@ def test_the_test_side_has_covisible_pairs_of_renamed_train_images(small_demo):
 def test_same_seed_same_bytes_whatever_the_other_scenes(tmp_path, small_demo):
     alone = write_demo(tmp_path, scenes=["market"], image_scale=SCALE)
     assert [path.name for path in alone.train_dir.iterdir() if path.is_dir()] == ["market"]
-    assert bytes_of(alone.train_dir / "market") == bytes_of(small_demo.train_dir / "market")
-    of_all = bytes_of(small_demo.test_dir / "test_images")
-    assert bytes_of(alone.test_dir / "test_images").items() <= of_all.items()
+    assert contents(alone.train_dir / "market") == contents(small_demo.train_dir / "market")
+    of_all = contents(small_demo.test_dir / "test_images")
+    assert contents(alone.test_dir / "test_images").items() <= of_all.items()
 
 
 @pytest.mark.parametrize(

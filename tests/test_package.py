@@ -13,6 +13,7 @@ from zipfile import ZipFile
 import pytest
 import torch
 from kaggle_image import UNPACKED, environment, python_version, upload
+from shared import contents
 from weight_files import digest_of, line, put
 
 from mkpc_kaggle.cli import main
@@ -74,10 +75,6 @@ def metadata_of(out: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     """The dataset's and the kernel's."""
     dataset, kernel = ((out / name / f"{name}-metadata.json").read_text() for name in ("dataset", "kernel"))
     return json.loads(dataset), json.loads(kernel)
-
-
-def contents(directory: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(directory)): path.read_bytes() for path in directory.rglob("*") if path.is_file()}
 
 
 def test_the_dataset_holds_wheels_weights_and_their_licences(made):

@@ -27,9 +27,6 @@ def units(*texts):
     return f"units = [{', '.join(texts)}]\n"
 
 
-# those of the package
-
-
 @pytest.mark.parametrize("name", recipe_names())
 def test_a_recipe_of_the_package_loads_with_options_for_every_matcher(name):
     recipe = load_recipe(name)
@@ -87,9 +84,6 @@ def test_fallbacks_take_the_places_of_matchers_that_are_unfit_and_are_forgotten_
     assert recipe.with_fallbacks({"c"}).units == (Unit(1, "a", 640), Unit(1, "b", 640), Unit(2, "b", 800, 9))
 
 
-# reading
-
-
 def test_a_recipe_reads_as_written():
     recipe = parse(
         'description = "two"\n'
@@ -129,9 +123,6 @@ def test_a_unit_shows_a_crop_at_its_size():
     assert Unit(1, "a", 640).view(crop, 32) == View.fit(crop, long_side=640, multiple=32)
     assert Unit(1, "a", area="54x72").view(crop, 8) == View.of_area(crop, area=54 * 72, multiple=8)
     assert Unit(1, "a", area="54x72", stretch=True).view(crop, 1).content == Size(72, 54)
-
-
-# refusing
 
 
 def unit(**changes):
@@ -217,9 +208,6 @@ def test_a_recipe_is_found_by_its_name_or_path_and_nowhere_else(tmp_path):
     ):
         with pytest.raises(UserError, match=says):
             load_recipe(str(name))
-
-
-# modes
 
 
 NAMES = ((1, "sift", 640), (2, "sift", 640), (2, "aliked", 800), (1, "aliked", 640), (2, "sift", 320))

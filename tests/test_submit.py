@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import pandas as pd
 import pytest
+from shared import contents
 
 from mkpc_kaggle.cli import main
 from mkpc_kaggle.data.competition import read_submission, read_test_side, submission_problems
@@ -187,10 +188,10 @@ def test_what_would_be_written_over_an_input_or_a_result_is_refused_before_any_w
     shutil.copyfile(small_recipe, "r.toml")
     Path("w").mkdir()
     Path("w/m.pth").touch()
-    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    before = contents(tmp_path)
     assert main(["submit", "--test-dir", "test", *arguments]) == 2
     assert told in capsys.readouterr().err
-    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+    assert contents(tmp_path) == before
 
 
 def test_a_limit_that_ends_before_the_first_version_is_told(demo, tmp_path):

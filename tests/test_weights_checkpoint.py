@@ -49,9 +49,6 @@ def assert_same(loaded: dict[str, torch.Tensor], wanted: dict[str, torch.Tensor]
         assert torch.equal(loaded[name], tensor)
 
 
-# formats
-
-
 @pytest.mark.parametrize("wrapped", [False, True])
 @pytest.mark.parametrize("save", [save_zip, save_legacy, save_file])
 def test_every_file_format_gives_the_same_plain_tensors(tmp_path, save, wrapped):
@@ -89,9 +86,6 @@ def test_a_file_that_is_not_a_checkpoint_is_refused_by_name(tmp_path, name, data
     put(tmp_path, name, data)
     with pytest.raises(UserError, match=rf"{name} cannot be read as a checkpoint"):
         load_tensors(tmp_path / name)
-
-
-# training checkpoints
 
 
 @pytest.fixture
@@ -160,9 +154,6 @@ def test_the_old_format_with_unknown_classes_is_refused(tmp_path, framework):
     sys.modules.pop("training_framework")
     with pytest.raises(UserError, match=r"x\.ckpt .* holds objects that are not read here"):
         load_tensors(tmp_path / "x.ckpt")
-
-
-# malice
 
 
 class Call:

@@ -119,9 +119,6 @@ def test_the_first_download_of_a_file_without_a_digest_is_the_one_that_is_accept
         assert store.WeightStore([out]).find("aliked-n16") is None
 
 
-# the files of LoMa, RoMa and LightGlue
-
-
 def test_convert_prints_the_line_for_the_manifest(tmp_path, capsys):
     torch.save({"a": torch.zeros(2)}, tmp_path / "x.pt")
     source, made = str(tmp_path / "x.pt"), str(tmp_path / "x.safetensors")

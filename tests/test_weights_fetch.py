@@ -138,9 +138,6 @@ def test_a_good_file_is_not_asked_for_and_a_bad_one_is_replaced(site, tmp_path):
     assert (tmp_path / "a.bin").read_bytes() == BIG
 
 
-# malice
-
-
 def test_no_more_bytes_are_taken_than_the_manifest_has(site, tmp_path):
     site.data, site.length = BIG + bytes(10 * BLOCK_BYTES), 0
     failed = get(site, tmp_path)

@@ -22,9 +22,6 @@ def found_by(weights: WeightStore, slot: str = "slot") -> Path:
     return found.path
 
 
-# by name
-
-
 def test_a_file_is_found_in_the_directory_and_below_it(tmp_path):
     assert found_by(WeightStore([put(tmp_path / "a")], [line()])) == tmp_path / "a" / "a.bin"
     put(tmp_path / "b" / "deep" / "deeper")
@@ -65,9 +62,6 @@ def test_missing_weights_are_named_with_all_alternatives_and_where_they_were_sea
         WeightStore([], [line()]).load("slot")
 
 
-# by digest
-
-
 def test_a_renamed_file_is_found_by_its_size_and_digest(tmp_path, monkeypatch):
     read: list[Path] = []
     monkeypatch.setattr(store, "digest_of", lambda path: read.append(path) or file_digest(path))
@@ -98,9 +92,6 @@ def test_links_to_directories_are_followed_once(tmp_path):
     (inside / "file.pth").symlink_to(tmp_path / "outside" / "b.pth")
     found = WeightStore([tmp_path / "inside"], [line("a.pth"), line("b.pth"), line("file.pth")]).verify()
     assert [file.path.name for file in found] == ["a.pth", "file.pth", "b.pth"]
-
-
-# checkpoints that were unpacked
 
 
 @pytest.mark.parametrize("outer", ["x.pth", "x"])
@@ -142,9 +133,6 @@ def test_a_manifest_beside_weights_adds_lines_and_overrides_none(tmp_path, monke
     weights = WeightStore([tmp_path])
     assert weights.files == (line("a.bin"), line("b.bin", OTHER))
     assert found_by(weights).name == "b.bin"
-
-
-# what is not what it should be
 
 
 def test_other_bytes_of_the_same_size_are_refused_with_both_digests(tmp_path):

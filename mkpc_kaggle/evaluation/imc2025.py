@@ -90,28 +90,24 @@ def score_dataset(
 def accurate_images(truth: Centres, cluster: Centres, thresholds: Sequence[float] | Points) -> int:
     """How many images more than ``FREE`` have a centre less than a threshold off, summed over thresholds.
 
-    The similarity that takes the cluster to the scene is found for each threshold on its own.
+    For each threshold on its own, the similarity of three images that takes most of the cluster's centres to the
+    scene's is fitted anew to these.
     """
     common = sorted(name for name in truth.keys() & cluster.keys() if np.isfinite(cluster[name]).all())
     if len(common) < FREE:
         return 0
     source, target = (np.array([centres[name] for name in common]) for centres in (cluster, truth))
-    tried = residuals(source, target, _triplets(len(common)))
-    return sum(max(_fitting(source, target, tried < threshold, threshold) - FREE, 0) for threshold in thresholds)
-
-
-def _fitting(source: Points, target: Points, inside: NDArray[np.bool_], threshold: float) -> int:
-    """The most points, (N, 3), that a similarity takes from ``source`` to less than ``threshold`` from ``target``.
-
-    ``inside`` are those that the similarities of triplets take there; the best is fitted anew to its points.
-    """
-    agreeing, best = inside[inside.sum(axis=1).argmax()], 0
-    for _ in range(REFINEMENTS):
-        best = max(best, int(agreeing.sum()))
-        if agreeing.sum() < FREE:
-            break
-        agreeing = residuals(source, target, agreeing.nonzero()[0][None])[0] < threshold
-    return best
+    tried, total = residuals(source, target, _triplets(len(common))), 0
+    for threshold in thresholds:
+        near = tried[(tried < threshold).sum(axis=1).argmax()] < threshold
+        best = FREE
+        for _ in range(REFINEMENTS):
+            best = max(best, int(near.sum()))
+            if near.sum() < FREE:
+                break
+            near = residuals(source, target, near.nonzero()[0][None])[0] < threshold
+        total += best - FREE
+    return total
 
 
 def residuals(source: Points, target: Points, fitted: NDArray[np.intp]) -> NDArray[np.float64]:

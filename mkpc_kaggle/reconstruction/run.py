@@ -8,7 +8,7 @@ from typing import Any
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.data.pairs import turned_copy
 from mkpc_kaggle.engine.engine import RunReport
-from mkpc_kaggle.engine.records import CameraRecord, SceneRecord
+from mkpc_kaggle.engine.records import CameraRecord
 from mkpc_kaggle.engine.session import Session, run_pairs
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.matchers.contract import Matcher
@@ -57,7 +57,7 @@ def reconstruct_folder(
     assembly = replace(assembly, recipe=for_cameras(assembly.recipe))
     pairs, exports = [], {}
     for name, files in datasets.items():
-        ends = pairs_of(files) if listed is None else [pair for pair in listed if pair[0] in files]
+        ends = pairs_of(files) if listed is None else [two for two in listed if two[0].parent == files[0].parent]
         turns = dict.fromkeys(files, 0) | (find_turns(files, assembly) if rotations and ends else {})
         shown = {file: turned_copy(file, turns[file], session.work_dir / "turned")[0] for file in files}
         exports[name] = Export(out / name, {shown[file].stem: (file.name, turns[file]) for file in files})
@@ -68,23 +68,16 @@ def reconstruct_folder(
         # A pair that was not reached, or of which an image cannot be read, has no versions.
         for path, version in zip(pair.images if record.versions else (), record.versions, strict=True):
             versions[pair.group][exports[pair.group].files[path.stem][0]] = version
-    scenes = {scene.batch: scene for scene in report.scenes}
-    cameras = {name: cameras_of(files, scenes.get(name), versions[name]) for name, files in datasets.items()}
-    for name, placed in cameras.items():
-        if any(placed.values()) and not (models := out / name / MODELS).is_dir():
+    placed = {scene.batch: scene.cameras for scene in report.scenes}
+    cameras: dict[str, Mapping[Path, CameraRecord | None]] = {}
+    for name, files in datasets.items():
+        found = placed.get(name, ())
+        if found and not (models := out / name / MODELS).is_dir():
             raise UserError(f"{models} was removed after it was made; start anew with --fresh")
+        # Files of one content have one camera, that of the largest model that has it.
+        known = {versions[name][camera.image]: camera for camera in reversed(found)}
+        cameras[name] = {file: known.get(versions[name].get(file.name, "")) for file in files}
     return FolderResult(report, tuple(pairs), cameras)
-
-
-def cameras_of(
-    files: Sequence[Path], scene: SceneRecord | None, versions: Mapping[str, str]
-) -> dict[Path, CameraRecord | None]:
-    """The camera of each image in the largest model that has it; ``None`` without a camera.
-
-    ``versions`` are the digests of files, by name: files of one content have one camera.
-    """
-    known = {versions[found.image]: found for found in reversed(scene.cameras if scene else ())}
-    return {file: known.get(versions.get(file.name, "")) for file in files}
 
 
 def reconstruct(
