@@ -322,14 +322,20 @@ def test_unreadable_images_have_no_part_in_a_shortlist(tmp_path):
 
 
 @dataclass
-class UprightKaze(SyntheticMatcher):
-    """KAZE that takes every keypoint for upright, so that it knows no turned image again."""
+class UprightSift(SyntheticMatcher):
+    """SIFT that takes every keypoint for upright, so that it knows no turned image again."""
 
     name: str = "synthetic"
 
     def encode(self, pictures):  # type: ignore[no-untyped-def,override]
-        grays = (cv2.cvtColor(picture.pixels, cv2.COLOR_RGB2GRAY) for picture in pictures)
-        return [cv2.KAZE_create(upright=True).detectAndCompute(gray, None) for gray in grays]
+        sift, found = cv2.SIFT_create(3000), []
+        for picture in pictures:
+            gray = cv2.cvtColor(picture.pixels, cv2.COLOR_RGB2GRAY)
+            keypoints = sift.detect(gray, None)
+            for keypoint in keypoints:
+                keypoint.angle = 0
+            found.append(sift.compute(gray, keypoints))
+        return found
 
     def match(self, encodings0, encodings1):  # type: ignore[no-untyped-def,override]
         matches = []
@@ -347,7 +353,7 @@ def test_images_that_lie_on_a_side_are_found(tmp_path):
     for path, times in turned.items():
         cv2.imwrite(str(path), np.rot90(cv2.imread(str(path)), -times))
     (tmp_path / "images" / "broken.png").write_bytes(b"no picture")
-    assembly = assemble(RECIPE, matchers={"synthetic": UprightKaze()}, device="cpu")
+    assembly = assemble(RECIPE, matchers={"synthetic": UprightSift()}, device="cpu")
     assert find_turns([*paths, tmp_path / "images" / "broken.png"], assembly) == turned
 
 
