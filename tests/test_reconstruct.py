@@ -35,7 +35,7 @@ from mkpc_kaggle.pipeline.assembly import assemble
 from mkpc_kaggle.recipe import Recipe, Unit
 from mkpc_kaggle.reconstruction.folder import MAX_IMAGES, pairs_of, read_folder, read_pair_list
 from mkpc_kaggle.reconstruction.likeness import find_turns, shortlist
-from mkpc_kaggle.reconstruction.outputs import Form, camera_rows, submission_rows
+from mkpc_kaggle.reconstruction.outputs import camera_rows, submission_rows
 from mkpc_kaggle.reconstruction.run import FolderResult, for_cameras, reconstruct_folder
 from mkpc_kaggle.reporting.report import report_page
 from mkpc_kaggle.reporting.run_log import read_log
@@ -187,7 +187,7 @@ def test_a_folder_in_the_folder_is_a_dataset_and_files_of_one_content_share_a_ca
     (tmp_path / "images" / "notes.txt").write_text("not an image")
     result = run(tmp_path / "images", tmp_path / "out")
     assert (tmp_path / "out" / "a" / "models" / "0").is_dir()
-    _, *rows = submission_rows(Form.IMC2025, result.cameras, tmp_path / "images")
+    _, *rows = submission_rows("imc2025", result.cameras, tmp_path / "images")
     assert [(row[0], row[1], row[2], row[3]) for row in rows] == [
         *((f"a_{n:02}.png", "a", "cluster0", f"{n:02}.png") for n in range(5)),
         ("a_broken.jpg", "a", "outliers", "broken.jpg"),
@@ -196,7 +196,7 @@ def test_a_folder_in_the_folder_is_a_dataset_and_files_of_one_content_share_a_ca
     ]
     assert rows[0][4:] == rows[6][4:]
     assert rows[-1][4:] == (";".join(["nan"] * 9), "nan;nan;nan")
-    earlier = {row[0]: row for row in submission_rows(Form.IMC2023, result.cameras, tmp_path / "images")}
+    earlier = {row[0]: row for row in submission_rows("imc2023", result.cameras, tmp_path / "images")}
     assert earlier["a/00.png"][1:3] == ("a", "a")
     assert earlier["b/00.png"][3:] == ("1;0;0;0;1;0;0;0;1", "0;0;0")
 

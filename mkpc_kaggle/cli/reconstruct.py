@@ -11,7 +11,7 @@ from mkpc_kaggle.engine.budget import format_duration
 from mkpc_kaggle.engine.console import say
 from mkpc_kaggle.errors import UserError, writing
 from mkpc_kaggle.reconstruction.folder import read_folder, read_pair_list
-from mkpc_kaggle.reconstruction.outputs import Form, write_tables
+from mkpc_kaggle.reconstruction.outputs import FORMS, write_tables
 from mkpc_kaggle.reconstruction.run import FolderResult, reconstruct_folder
 from mkpc_kaggle.reporting.report import report_run
 from mkpc_kaggle.reporting.summary import trouble
@@ -44,7 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     options.add_matching(parser)
     options.add_run(parser, time_limit=None)
     add("--pairs", type=Path, metavar="FILE", help="match these alone: two paths below DIR a line, as of hloc")
-    add("--format", choices=list(map(str, Form)), help="also write submission.csv; imc2023: of 2024, too")
+    add("--format", choices=FORMS, help="also write submission.csv; imc2023: of 2024, too")
     add(
         "--rotations", action="store_true", help="try to turn images that match nothing by 90, 180 and 270 degrees"
     )
@@ -62,7 +62,7 @@ def run(arguments: argparse.Namespace) -> int:
         assembly = options.assembly_of(arguments, arguments.recipe, arguments.mode)
         options.say_start(f"{sum(map(len, datasets.values()))} images", assembly, work_dir)
         result = reconstruct_folder(datasets, assembly, session, out, listed=listed, rotations=arguments.rotations)
-        write_tables(out, result.cameras, root, arguments.format and Form(arguments.format))
+        write_tables(out, result.cameras, root, arguments.format)
         failed = trouble(result.report)
         watchdog.status = int(bool(failed) or not any(any(found.values()) for found in result.cameras.values()))
         told = [*options.plan_lines(arguments, result.report), *_told(result), failed, f"results: {out}"]

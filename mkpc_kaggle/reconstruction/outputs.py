@@ -2,7 +2,6 @@
 
 import csv
 from collections.abc import Iterator, Mapping, Sequence
-from enum import StrEnum
 from pathlib import Path
 
 import numpy as np
@@ -15,17 +14,14 @@ Cameras = Mapping[str, Mapping[Path, CameraRecord | None]]  # of each file of a 
 
 NO_POSE = ";".join(["nan"] * 9), "nan;nan;nan"
 ORIGIN = "1;0;0;0;1;0;0;0;1", "0;0;0"
+FORMS = (  # of a submission
+    "imc2025",  # a cluster for each model; an image without a camera is an outlier, its pose nan
+    "imc2023",  # also of 2024: the cameras of the largest model, the other images at the origin
+)
 
 
-class Form(StrEnum):
-    """The forms of a submission."""
-
-    IMC2025 = "imc2025"  # a cluster for each model; an image without a camera is an outlier, its pose nan
-    IMC2023 = "imc2023"  # also of 2024: the cameras of the largest model, the other images at the origin
-
-
-def write_tables(out: Path, cameras: Cameras, root: Path, form: Form | None) -> None:
-    """Write ``cameras.csv`` and, in a ``form``, ``submission.csv``; raises ``OSError`` if that cannot be."""
+def write_tables(out: Path, cameras: Cameras, root: Path, form: str | None) -> None:
+    """Write ``cameras.csv`` and, in one of ``FORMS``, ``submission.csv``; raises ``OSError`` if that cannot be."""
     tables = {"cameras.csv": camera_rows(cameras, root)}
     if form is not None:
         tables["submission.csv"] = submission_rows(form, cameras, root)
@@ -46,9 +42,9 @@ def camera_rows(cameras: Cameras, root: Path) -> Iterator[Sequence[str]]:
             yield file.relative_to(root).as_posix(), str(record.model), *map(joined, parts)
 
 
-def submission_rows(form: Form, cameras: Cameras, root: Path) -> Iterator[Sequence[str]]:
+def submission_rows(form: str, cameras: Cameras, root: Path) -> Iterator[Sequence[str]]:
     """A row for each image, in the order of the folder."""
-    of_2025 = form is Form.IMC2025
+    of_2025 = form == "imc2025"
     heads = ("image_id", "dataset", "scene", "image") if of_2025 else ("image_path", "dataset", "scene")
     yield *heads, "rotation_matrix", "translation_vector"
     for dataset, found in cameras.items():
