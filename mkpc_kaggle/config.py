@@ -23,12 +23,8 @@ def from_table(cls: type[Config], table: Mapping[str, Any], where: str) -> Confi
     """
     known: dict[str, Field[Any]] = {field.name: field for field in fields(cls)}  # type: ignore[arg-type]
     check_keys(table, known, where, getattr(cls, "FORMER", {}))
-    missing = [
-        name
-        for name, field in known.items()
-        if name not in table and field.default is MISSING and field.default_factory is MISSING
-    ]
-    if missing:
+    required = [name for name, field in known.items() if field.default is field.default_factory is MISSING]
+    if missing := [name for name in required if name not in table]:
         raise UserError(f"{where} lacks {', '.join(map(repr, missing))}")
     hints = get_type_hints(cls)
     values = {key: convert(value, hints[key], f"{where}, key {key!r}") for key, value in table.items()}

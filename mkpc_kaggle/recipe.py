@@ -93,12 +93,7 @@ class SceneConfig:
     pairs_per_image: float = 10.0  # a batch with fewer pairs gets extra pairs, for its scene alone; 0: none
     threads: int = 1  # more than one: the last digits differ from run to run
 
-    FORMER: ClassVar = {"one_camera": "shared_intrinsics"} | dict.fromkeys((
-        "mapper", "cell", "least_tracks", "agreement", "one_camera_images", "one_camera_weak", "one_camera_points",
-        "least_inliers", "prior_focal", "least_images", "least_pairs_per_image", "most_images", "lowest_focal",
-        "highest_focal", "least_points", "contradiction_error", "contradiction_matches", "contradiction_share",
-        "verification_error", "focal_sigma", "seed",
-    ), "")  # fmt: skip
+    FORMER: ClassVar = {"one_camera": "shared_intrinsics"}
 
     def __post_init__(self) -> None:
         check_ranges(self, shared_intrinsics=AT_LEAST_0, pairs_per_image=AT_LEAST_0, threads=AT_LEAST_1)
@@ -199,10 +194,8 @@ def recipe_of(table: Mapping[str, Any], name: str) -> Recipe:
         return None if value is None else from_table(cls, value, f"{where}, table [{key}]")
 
     return Recipe(
-        units=tuple(
-            from_table(Unit, unit, f"{where}, unit {number}") for number, unit in enumerate(units, start=1)
-        ),
-        name=name,
+        tuple(from_table(Unit, unit, f"{where}, unit {number}") for number, unit in enumerate(units, start=1)),
+        name,
         description=str(table.get("description", "")),
         mkpc=settings(MkpcConfig, "mkpc") or MkpcConfig(),
         magsac=settings(RobustConfig, "magsac") or RobustConfig(),
@@ -219,9 +212,8 @@ def recipe_names() -> list[str]:
 
 def load_recipe(name: str) -> Recipe:
     """The recipe of that name, or in that ``.toml`` file; raises :class:`UserError` if there is none."""
-    path = Path(name) if name.endswith(".toml") else DIRECTORY / f"{name}.toml"
-    if not name.endswith(".toml") and name not in recipe_names():
-        raise UserError(
-            f"unknown recipe {name!r}; known: {', '.join(recipe_names())}, or a path that ends in .toml"
-        )
+    known = recipe_names()
+    if name not in known and not name.endswith(".toml"):
+        raise UserError(f"unknown recipe {name!r}; known: {', '.join(known)}, or a path that ends in .toml")
+    path = DIRECTORY / f"{name}.toml" if name in known else Path(name)
     return parse_recipe(read_text(path), path.stem)

@@ -1,7 +1,6 @@
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -9,11 +8,10 @@ import pytest
 
 from mkpc_kaggle.cli import main
 from mkpc_kaggle.data.competition import read_test_side, write_submission
-from mkpc_kaggle.demo import DemoSet
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
 
 
-def test_importing_the_package_is_cheap_and_geometry_and_weights_bring_no_torch() -> None:
+def test_importing_the_package_is_cheap_and_geometry_and_weights_bring_no_torch():
     code = (
         "import sys, pkgutil, importlib, mkpc_kaggle\n"
         "print([m for m in ('torch', 'cv2', 'pandas', 'numpy') if m in sys.modules])\n"
@@ -25,7 +23,7 @@ def test_importing_the_package_is_cheap_and_geometry_and_weights_bring_no_torch(
     assert out.split() == ["[]", "False"]
 
 
-def test_a_reader_that_leaves_ends_the_command_quietly() -> None:
+def test_a_reader_that_leaves_ends_the_command_quietly():
     reader, writer = os.pipe()
     os.close(reader)
     with os.fdopen(writer, "wb") as out:
@@ -36,14 +34,12 @@ def test_a_reader_that_leaves_ends_the_command_quietly() -> None:
 
 
 @pytest.mark.parametrize("option", ["--test-dir", "--weights", "--output", "--work-dir"])
-def test_a_name_that_is_too_long_is_told(option: str, demo: DemoSet, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_name_that_is_too_long_is_told(option, demo, capsys):
     assert main(["submit", "--test-dir", str(demo.test_dir), option, "d" * 5000]) == 2
     assert "File name too long" in capsys.readouterr().err
 
 
-def test_recipes_are_listed_with_what_they_lack(
-    clean_environment: None, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_recipes_are_listed_with_what_they_lack(clean_environment, capsys):
     assert main(["recipes"]) == 0
     out = capsys.readouterr().out
     light = out[out.index("light: ") :]
@@ -54,9 +50,7 @@ def test_recipes_are_listed_with_what_they_lack(
     assert "    1:aliked_lightglue@1024  at most 4096  (or aliked, where its weights are missing)\n" in light
 
 
-def test_results_are_not_written_over_inputs_nor_an_export_over_the_journal(
-    demo: DemoSet, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_results_are_not_written_over_inputs_nor_an_export_over_the_journal(demo, tmp_path, capsys):
     first, second, *_ = sorted(map(str, demo.train_dir.rglob("*.jpg")))
     table = demo.train_dir / "scaling_factors.csv"
     assert main(["validate", "--train-dir", str(demo.train_dir), "--json", str(table)]) == 2
@@ -69,7 +63,7 @@ def test_results_are_not_written_over_inputs_nor_an_export_over_the_journal(
     assert "are in each other's way" in told[2]
 
 
-def test_check_tells_good_from_bad(demo: DemoSet, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_tells_good_from_bad(demo, tmp_path, capsys):
     ids = [pair.id for pair in read_test_side(demo.test_dir)]
     path = tmp_path / "submission.csv"
     write_submission(path, dict.fromkeys(ids, FALLBACK_FUNDAMENTAL))
@@ -81,9 +75,7 @@ def test_check_tells_good_from_bad(demo: DemoSet, tmp_path: Path, capsys: pytest
     assert main(["check", str(path), "--test-dir", str(tmp_path)]) == 2
 
 
-def test_match_prints_f_and_draws_the_pair(
-    demo: DemoSet, small_recipe: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_match_prints_f_and_draws_the_pair(demo, small_recipe, tmp_path, capsys):
     images = sorted((demo.train_dir / "courtyard" / "images").iterdir())[:2]
     figure = tmp_path / "new" / "pair.png"
     assert main(["match", *map(str, images), "--recipe", str(small_recipe), "--out", str(figure)]) == 0
@@ -94,9 +86,7 @@ def test_match_prints_f_and_draws_the_pair(
     assert cv2.imread(str(figure)).shape[1] > 1000
 
 
-def test_match_says_what_it_lacks_and_draws_a_pair_that_has_nothing_in_common(
-    clean_environment: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_match_says_what_it_lacks_and_draws_a_pair_that_has_nothing_in_common(clean_environment, tmp_path, capsys):
     cv2.imwrite(str(tmp_path / "a.png"), np.full((60, 90, 3), 127, np.uint8))
     match, figure = ["match", *[str(tmp_path / "a.png")] * 2], tmp_path / "pair.png"
     assert main([*match, "--licence", "permissive", "--out", str(figure)]) == 0

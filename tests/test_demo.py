@@ -1,13 +1,13 @@
 """The demo data set: its cameras, pixels and files agree with one another."""
 
 import csv
-import hashlib
 from itertools import combinations
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from shared import contents
 
 from mkpc_kaggle.demo import SCENE_NAMES, DemoSet, write_demo
 from mkpc_kaggle.demo.camera import SizedCamera, look_at, project, unproject
@@ -28,15 +28,6 @@ def worlds() -> dict[str, World]:
     return {name: build_world(name, image_scale=SCALE) for name in SCENE_NAMES}
 
 
-@pytest.fixture(scope="module")
-def depths(worlds: dict[str, World]) -> dict[str, list[tuple[SizedCamera, np.ndarray]]]:
-    """Of each scene the cameras and the depth maps, rendered anew."""
-    return {
-        name: [(camera, render(world.surfaces, camera)[1]) for camera in world.cameras]
-        for name, world in worlds.items()
-    }
-
-
 def rows(path: Path) -> list[dict[str, str]]:
     with path.open(newline="") as file:
         return list(csv.DictReader(file))
@@ -50,22 +41,9 @@ def cameras_of(demo: DemoSet, scene: str) -> dict[str, SizedCamera]:
     cameras = {}
     for row in rows(demo.train_dir / scene / "calibration.csv"):
         picture = cv2.imread(str(demo.train_dir / scene / "images" / f"{row['image_id']}.jpg"))
-        cameras[row["image_id"]] = SizedCamera(
-            numbers(row["camera_intrinsics"], 3, 3),
-            numbers(row["rotation_matrix"], 3, 3),
-            numbers(row["translation_vector"], 3),
-            picture.shape[1],
-            picture.shape[0],
-        )
+        K, R = (numbers(row[name], 3, 3) for name in ("camera_intrinsics", "rotation_matrix"))
+        cameras[row["image_id"]] = SizedCamera(K, R, numbers(row["translation_vector"], 3), *picture.shape[1::-1])
     return cameras
-
-
-def bytes_of(root: Path) -> dict[str, str]:
-    return {
-        str(path.relative_to(root)): hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in sorted(root.rglob("*"))
-        if path.is_file()
-    }
 
 
 def smooth_texture() -> np.ndarray:
@@ -78,10 +56,7 @@ def upright(left: tuple[float, float], right: tuple[float, float], low: float, h
     return quad((*left, high), (*right, high), (*left, low), texture)
 
 
-# Rendering
-
-
-def test_a_wall_seen_head_on_is_the_picture_itself() -> None:
+def test_a_wall_seen_head_on_is_the_picture_itself():
     """One texel a pixel, no rotation: any shift by half a pixel shows."""
     picture = smooth_texture()
     # Seen from the north, where the sun does not shine.
@@ -96,7 +71,7 @@ def test_a_wall_seen_head_on_is_the_picture_itself() -> None:
     assert np.allclose(depth, 10, atol=1e-4)
 
 
-def test_a_view_warped_by_depth_falls_on_the_other() -> None:
+def test_a_view_warped_by_depth_falls_on_the_other():
     """Image, depth and camera agree to a small part of a pixel; half a pixel would show."""
     texture = smooth_texture()
     surfaces = [
@@ -122,10 +97,7 @@ def test_a_view_warped_by_depth_falls_on_the_other() -> None:
     assert min(difference(shift) for shift in ((0.5, 0), (-0.5, 0), (0, 0.5), (0, -0.5))) > 3 * difference((0, 0))
 
 
-# Covisibility
-
-
-def test_covisibility_of_two_halves_of_a_wall() -> None:
+def test_covisibility_of_two_halves_of_a_wall():
     surfaces = [upright((-50, 10), (50, 10), -50, 50, smooth_texture())]
     # A view is 10 m wide at the wall; half of that is a baseline of 5 m.
     a, b = (look_at((x, 0, 0), (x, 10, 0), 200, (200, 150)) for x in (0.0, 5.0))
@@ -135,7 +107,7 @@ def test_covisibility_of_two_halves_of_a_wall() -> None:
     assert covisibility(a, depth_a, a, depth_a) == 1
 
 
-def test_what_is_hidden_or_sky_is_not_shared() -> None:
+def test_what_is_hidden_or_sky_is_not_shared():
     texture = smooth_texture()
     surfaces = [upright((-5, 10), (5, 10), -5, 5, texture), upright((3, 2), (7, 2), -5, 5, texture)]
     a, b = (look_at((x, 0, 0), (x, 10, 0), 200, (200, 150)) for x in (0.0, 5.0))
@@ -146,10 +118,7 @@ def test_what_is_hidden_or_sky_is_not_shared() -> None:
     assert covisibility(a, sky, b, sky) == 0
 
 
-# The set on disk
-
-
-def test_layout_of_the_train_side(small_demo: DemoSet) -> None:
+def test_layout_of_the_train_side(small_demo):
     factors = {
         row["scene"]: float(row["scaling_factor"]) for row in rows(small_demo.train_dir / "scaling_factors.csv")
     }
@@ -165,7 +134,7 @@ def test_layout_of_the_train_side(small_demo: DemoSet) -> None:
         assert len(pairs) == len(expected)
 
 
-def test_image_scale_scales_the_intrinsics(worlds: dict[str, World], small_demo: DemoSet) -> None:
+def test_image_scale_scales_the_intrinsics(worlds, small_demo):
     written = cameras_of(small_demo, "market").values()
     for camera, here, whole in zip(worlds["market"].cameras, written, build_world("market").cameras, strict=True):
         for name in ("K", "R", "t"):
@@ -175,11 +144,11 @@ def test_image_scale_scales_the_intrinsics(worlds: dict[str, World], small_demo:
 
 
 @pytest.mark.parametrize("scene_name", SCENE_NAMES)
-def test_fundamental_matrices_fit_points_of_the_rendered_depth(
-    small_demo: DemoSet, depths: dict[str, list[tuple[SizedCamera, np.ndarray]]], scene_name: str
-) -> None:
+def test_fundamental_matrices_fit_points_of_the_rendered_depth(small_demo, worlds, scene_name):
     cameras = cameras_of(small_demo, scene_name)
-    depth_of = dict(zip(sorted(cameras), (depth for _, depth in depths[scene_name]), strict=True))
+    world = worlds[scene_name]
+    depths = (render(world.surfaces, camera)[1] for camera in world.cameras)
+    depth_of = dict(zip(sorted(cameras), depths, strict=True))
     for row in rows(small_demo.train_dir / scene_name / "pair_covisibility.csv"):
         F = numbers(row["fundamental_matrix"], 3, 3)
         assert np.linalg.norm(F) == pytest.approx(1)
@@ -202,7 +171,7 @@ def test_fundamental_matrices_fit_points_of_the_rendered_depth(
         assert np.median(wrong / np.hypot(swapped[:, 0], swapped[:, 1])) > 0.5
 
 
-def test_the_test_side_has_covisible_pairs_of_renamed_train_images(small_demo: DemoSet) -> None:
+def test_the_test_side_has_covisible_pairs_of_renamed_train_images(small_demo):
     samples, truths = rows(small_demo.test_dir / "test.csv"), rows(small_demo.truth_csv)
     assert [row["sample_id"] for row in samples] == [row["sample_id"] for row in truths]
     assert len({row["sample_id"] for row in samples}) == len(samples) == 8 * len(SCENE_NAMES)
@@ -228,12 +197,12 @@ def test_the_test_side_has_covisible_pairs_of_renamed_train_images(small_demo: D
     assert on_disk == used
 
 
-def test_same_seed_same_bytes_whatever_the_other_scenes(tmp_path: Path, small_demo: DemoSet) -> None:
+def test_same_seed_same_bytes_whatever_the_other_scenes(tmp_path, small_demo):
     alone = write_demo(tmp_path, scenes=["market"], image_scale=SCALE)
     assert [path.name for path in alone.train_dir.iterdir() if path.is_dir()] == ["market"]
-    assert bytes_of(alone.train_dir / "market") == bytes_of(small_demo.train_dir / "market")
-    of_all = bytes_of(small_demo.test_dir / "test_images")
-    assert bytes_of(alone.test_dir / "test_images").items() <= of_all.items()
+    assert contents(alone.train_dir / "market") == contents(small_demo.train_dir / "market")
+    of_all = contents(small_demo.test_dir / "test_images")
+    assert contents(alone.test_dir / "test_images").items() <= of_all.items()
 
 
 @pytest.mark.parametrize(
@@ -244,6 +213,6 @@ def test_same_seed_same_bytes_whatever_the_other_scenes(tmp_path: Path, small_de
         ({"image_scale": 0.0}, "positive"),
     ],
 )
-def test_bad_arguments_are_refused(tmp_path: Path, arguments: dict[str, object], message: str) -> None:
+def test_bad_arguments_are_refused(tmp_path, arguments, message):
     with pytest.raises(ValueError, match=message):
         write_demo(tmp_path, **arguments)  # type: ignore[arg-type]

@@ -51,7 +51,7 @@ def pattern_of(message: str) -> str:
     return re.sub(r"\bF\b", r"\\{\\}", literal)
 
 
-def test_every_message_of_the_troubleshooting_page_is_one_of_the_programs() -> None:
+def test_every_message_of_the_troubleshooting_page_is_one_of_the_programs():
     said = everything_said()
     known = messages()
     assert len(known) > 25
@@ -79,7 +79,7 @@ def commands(page: Path) -> Iterator[tuple[str, list[str]]]:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
-def test_pages_name_commands_and_options_that_there_are(page: Path) -> None:
+def test_pages_name_commands_and_options_that_there_are(page):
     known = subcommands()
     for name, options in commands(page):
         assert name in known, name
@@ -93,7 +93,7 @@ BLOCKS = re.findall(r"^```python\n(.*?)^```", PAGES[0].read_text(encoding="utf-8
 
 
 @pytest.mark.parametrize("block", BLOCKS, ids=range(len(BLOCKS)))
-def test_the_python_of_the_readme_runs(block: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_python_of_the_readme_runs(block, tmp_path, monkeypatch):
     """On two parts of a photograph, with a stand-in for vismatch."""
     photograph = load_sample_image("china.jpg")
     for name, shift in (("a.jpg", 0), ("b.jpg", 40)):

@@ -19,7 +19,7 @@ def overflow(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("name", MATCHERS)
-def test_overflow_in_a_picture_is_an_error(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_overflow_in_a_picture_is_an_error(name, monkeypatch):
     matcher = MATCHERS[name](Placement())
     overflow(monkeypatch)
     with pytest.raises(NonFiniteError):
@@ -27,7 +27,7 @@ def test_overflow_in_a_picture_is_an_error(name: str, monkeypatch: pytest.Monkey
 
 
 @pytest.mark.parametrize("name", [name for name in MATCHERS if name != "aliked"])
-def test_overflow_between_two_pictures_is_an_error(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_overflow_between_two_pictures_is_an_error(name, monkeypatch):
     """Nearest neighbours need no network."""
     matcher = MATCHERS[name](Placement())
     encodings = [list(matcher.encode([picture(matcher.spec.colour, 0, shift)])) for shift in (SHIFT, 0)]

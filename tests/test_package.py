@@ -13,6 +13,7 @@ from zipfile import ZipFile
 import pytest
 import torch
 from kaggle_image import UNPACKED, environment, python_version, upload
+from shared import contents
 from weight_files import digest_of, line, put
 
 from mkpc_kaggle.cli import main
@@ -76,11 +77,7 @@ def metadata_of(out: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     return json.loads(dataset), json.loads(kernel)
 
 
-def contents(directory: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(directory)): path.read_bytes() for path in directory.rglob("*") if path.is_file()}
-
-
-def test_the_dataset_holds_wheels_weights_and_their_licences(made: tuple[Path, Package]) -> None:
+def test_the_dataset_holds_wheels_weights_and_their_licences(made):
     (out, package), dataset = made, made[0] / "dataset"
     names = {path.name for path in dataset.iterdir()}
     assert {"LICENSE", "README.md", "MIT.txt", "weights_manifest.txt", "requirements.txt"} <= names
@@ -93,9 +90,7 @@ def test_the_dataset_holds_wheels_weights_and_their_licences(made: tuple[Path, P
     assert {item.name: item.licence for item in package.dataset}["free.pt.safetensors"] == "MIT"
 
 
-def test_weights_survive_the_upload_and_are_held_against_the_datasets_manifest(
-    out: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_weights_survive_the_upload_and_are_held_against_the_datasets_manifest(out, tmp_path, capsys):
     dataset = out / "dataset"
     assert not [path for path in dataset.iterdir() if path.suffix in UNPACKED]
     mount = tmp_path / "input" / "datasets" / "someone" / "mkpc-kaggle"
@@ -119,7 +114,7 @@ def test_weights_survive_the_upload_and_are_held_against_the_datasets_manifest(
     assert "missing" in capsys.readouterr().out
 
 
-def test_the_folders_keep_the_limits_of_the_kaggle_command(out: Path) -> None:
+def test_the_folders_keep_the_limits_of_the_kaggle_command(out):
     dataset, kernel = metadata_of(out)
     assert 6 <= len(dataset["title"]) <= 50
     assert 20 <= len(dataset["subtitle"]) <= 80
@@ -129,16 +124,14 @@ def test_the_folders_keep_the_limits_of_the_kaggle_command(out: Path) -> None:
 
 
 @pytest.mark.parametrize("image", ["original", f"gcr.io/kaggle/python@sha256:{'0a' * 32}"])
-def test_the_image_is_the_first_or_one_by_its_digest(wanted: Request, image: str) -> None:
+def test_the_image_is_the_first_or_one_by_its_digest(wanted, image):
     make_package(replace(wanted, image=image))
     _, kernel = metadata_of(wanted.out)
     assert kernel["docker_image_pinning_type"] == "original"
     assert kernel.get("docker_image", "") == (image if "@" in image else "")
 
 
-def test_what_the_image_has_is_used_where_it_satisfies_even_without_a_wheel_for_its_python(
-    out: Path, tmp_path: Path
-) -> None:
+def test_what_the_image_has_is_used_where_it_satisfies_even_without_a_wheel_for_its_python(out, tmp_path):
     dataset = out / "dataset"
     lines = (dataset / "requirements.txt").read_text().splitlines()
     assert lines[0].startswith("mkpc-kaggle==")
@@ -153,7 +146,7 @@ def test_what_the_image_has_is_used_where_it_satisfies_even_without_a_wheel_for_
     assert done.returncode == 0, done.stderr
 
 
-def test_the_kernel_runs_on_a_gpu_without_internet_on_the_competition_and_the_dataset(out: Path) -> None:
+def test_the_kernel_runs_on_a_gpu_without_internet_on_the_competition_and_the_dataset(out):
     dataset, kernel = metadata_of(out)
     assert (kernel["enable_gpu"], kernel["machine_shape"]) == (True, "NvidiaTeslaT4")
     assert (kernel["enable_internet"], kernel["docker_image_pinning_type"]) == (False, "latest")
@@ -164,7 +157,7 @@ def test_the_kernel_runs_on_a_gpu_without_internet_on_the_competition_and_the_da
     assert code == (find_checkout() / "notebooks" / "submission.ipynb").read_bytes()
 
 
-def test_the_same_request_gives_the_same_bytes_and_leaves_files_alone(wanted: Request, tmp_path: Path) -> None:
+def test_the_same_request_gives_the_same_bytes_and_leaves_files_alone(wanted, tmp_path):
     make_package(wanted)
     former = {path: path.stat().st_mtime_ns for path in wanted.out.rglob("*")}
     (wanted.out / "dataset" / "free.pt.safetensors").write_bytes(b"broken off")
@@ -177,7 +170,7 @@ def test_the_same_request_gives_the_same_bytes_and_leaves_files_alone(wanted: Re
     assert contents(tmp_path / "again") == contents(wanted.out)
 
 
-def test_a_link_planted_at_the_name_of_an_unfinished_file_is_not_followed(wanted: Request, tmp_path: Path) -> None:
+def test_a_link_planted_at_the_name_of_an_unfinished_file_is_not_followed(wanted, tmp_path):
     outside = put(tmp_path / "outside", "precious", b"precious") / "precious"
     (wanted.out / "dataset").mkdir(parents=True)
     (wanted.out / "dataset" / ".LICENSE.part").symlink_to(outside)
@@ -187,9 +180,7 @@ def test_a_link_planted_at_the_name_of_an_unfinished_file_is_not_followed(wanted
     assert not (wanted.out / "dataset" / "LICENSE").is_symlink()
 
 
-def test_a_private_package_has_all_weights_and_a_public_one_refuses_to_be_laid_over_it(
-    wanted: Request, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_private_package_has_all_weights_and_a_public_one_refuses_to_be_laid_over_it(wanted, capsys):
     assert wanted.wheels is not None
     arguments = ["package", "--owner", "someone", "--out", str(wanted.out), "--python", python_version()]
     arguments += ["--wheels", str(wanted.wheels), "--weights", str(wanted.weights[0])]
@@ -206,7 +197,7 @@ def test_a_private_package_has_all_weights_and_a_public_one_refuses_to_be_laid_o
     assert "Left out" in capsys.readouterr().out
 
 
-def test_bad_requests_are_refused_before_anything_is_written(wanted: Request, tmp_path: Path) -> None:
+def test_bad_requests_are_refused_before_anything_is_written(wanted, tmp_path):
     empty = tmp_path / "empty"
     empty.mkdir()
     bad = {
@@ -223,21 +214,19 @@ def test_bad_requests_are_refused_before_anything_is_written(wanted: Request, tm
     assert not wanted.out.exists()
 
 
-def test_without_sources_it_says_that_a_checkout_is_needed(
-    wanted: Request, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_without_sources_it_says_that_a_checkout_is_needed(wanted, monkeypatch, tmp_path):
     monkeypatch.setattr(module, "__file__", str(tmp_path / "site-packages/mkpc_kaggle/package/package.py"))
     with pytest.raises(UserError, match="clone the repository"):
         make_package(wanted)
 
 
-def test_a_bundled_package_is_pinned_and_is_one_that_the_wheel_needs() -> None:
+def test_a_bundled_package_is_pinned_and_is_one_that_the_wheel_needs():
     pinned = pins(find_checkout())
     assert [pin.partition("==")[0].replace("_", "-") for pin in pinned] == list(BUNDLED)
     assert all(pin.partition("==")[2] for pin in pinned)
 
 
-def test_the_wheel_holds_what_a_run_needs_and_asks_for_what_is_bundled(tmp_path: Path, wheels: Path) -> None:
+def test_the_wheel_holds_what_a_run_needs_and_asks_for_what_is_bundled(tmp_path, wheels):
     wheel = build_wheel(find_checkout(), tmp_path)
     asked = [line.replace("_", "-").partition(">=")[0] for line in install_lines(wheel, wheels.iterdir())]
     assert sorted(asked[1:]) == sorted(BUNDLED)
@@ -247,7 +236,7 @@ def test_the_wheel_holds_what_a_run_needs_and_asks_for_what_is_bundled(tmp_path:
 
 
 @pytest.mark.slow
-def test_wheels_come_from_the_index_for_all_pythons(wanted: Request, tmp_path: Path) -> None:
+def test_wheels_come_from_the_index_for_all_pythons(wanted, tmp_path):
     probe = [sys.executable, "-m", "pip", "download", "--quiet", "--no-deps", "--dest", str(tmp_path / "probe")]
     if subprocess.run([*probe, pins(find_checkout())[0]], check=False, capture_output=True).returncode != 0:
         pytest.skip("pip reaches no index from here")

@@ -2,13 +2,11 @@
 
 import json
 import os
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import combinations
-from typing import ClassVar
 
 import pytest
 
-from mkpc_kaggle.config import from_table
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Box, Size, View
 from mkpc_kaggle.geometry.critical_region import MkpcConfig
@@ -27,9 +25,6 @@ def parse(text):
 
 def units(*texts):
     return f"units = [{', '.join(texts)}]\n"
-
-
-# those of the package
 
 
 @pytest.mark.parametrize("name", recipe_names())
@@ -89,16 +84,13 @@ def test_fallbacks_take_the_places_of_matchers_that_are_unfit_and_are_forgotten_
     assert recipe.with_fallbacks({"c"}).units == (Unit(1, "a", 640), Unit(1, "b", 640), Unit(2, "b", 800, 9))
 
 
-# reading
-
-
 def test_a_recipe_reads_as_written():
     recipe = parse(
         'description = "two"\n'
         + units(
-            '{ stage = 1, matcher = "sift", long_side = 640 }',
-            '{ stage = 2, matcher = "x", long_side = 800, max_matches = 5 }',
-            '{ stage = 2, matcher = "dkm", area = "540x720", stretch = true }',
+            unit(),
+            unit(stage=2, matcher='"x"', long_side=800, max_matches=5),
+            unit(stage=2, matcher='"dkm"', long_side=None, area='"540x720"', stretch="true"),
         )
         + "[mkpc]\neps = 0.1\nmin_samples = 7\nexpand_x = 2\n"
         + '[magsac]\nmethod = "ransac"\nthreshold = 1.5\n[focal]\nsigma = 0.2\n'
@@ -131,9 +123,6 @@ def test_a_unit_shows_a_crop_at_its_size():
     assert Unit(1, "a", 640).view(crop, 32) == View.fit(crop, long_side=640, multiple=32)
     assert Unit(1, "a", area="54x72").view(crop, 8) == View.of_area(crop, area=54 * 72, multiple=8)
     assert Unit(1, "a", area="54x72", stretch=True).view(crop, 1).content == Size(72, 54)
-
-
-# refusing
 
 
 def unit(**changes):
@@ -203,20 +192,6 @@ def test_options_that_a_matcher_does_not_have_are_refused(text, says):
         options_of(parse(SIFT), "sitf")
 
 
-@dataclass(frozen=True)
-class Settings:
-    FORMER: ClassVar = {"old": "new", "gone": ""}
-    new: int = 1
-
-
-@pytest.mark.parametrize(
-    ("key", "says"), [("old", "'old' is now called 'new'"), ("gone", "'gone' was removed"), ("x", "keys: new$")]
-)
-def test_a_former_key_is_refused_with_what_became_of_it(key, says):
-    with pytest.raises(UserError, match=f"table t.*{says}"):
-        from_table(Settings, {key: 1}, "table t")
-
-
 def test_a_recipe_is_found_by_its_name_or_path_and_nowhere_else(tmp_path):
     (tmp_path / "my own.toml").write_bytes(b"\xef\xbb\xbf" + SIFT.encode())
     assert load_recipe(str(tmp_path / "my own.toml")) == Recipe((Unit(1, "sift", 640),), name="my own")
@@ -235,20 +210,8 @@ def test_a_recipe_is_found_by_its_name_or_path_and_nowhere_else(tmp_path):
             load_recipe(str(name))
 
 
-# modes
-
-
-ALL = Recipe(
-    units=(
-        Unit(1, "sift", 640),
-        Unit(2, "sift", 640),
-        Unit(2, "aliked", 800),
-        Unit(1, "aliked", 640),
-        Unit(2, "sift", 320),
-    ),
-    name="all",
-    mkpc=MkpcConfig(eps=0.1),
-)
+NAMES = ((1, "sift", 640), (2, "sift", 640), (2, "aliked", 800), (1, "aliked", 640), (2, "sift", 320))
+ALL = Recipe(tuple(Unit(*name) for name in NAMES), name="all", mkpc=MkpcConfig(eps=0.1))
 
 
 def test_the_stage_1_mode_keeps_the_units_of_stage_1():
@@ -289,5 +252,5 @@ def test_the_fingerprint_changes_with_whatever_decides_the_numbers(other):
         (":stage-1", ":stage-1", Mode.TWO_STAGE),
     ],
 )
-def test_a_choice_is_a_recipe_and_perhaps_a_mode(text: str, recipe: str, mode: Mode) -> None:
+def test_a_choice_is_a_recipe_and_perhaps_a_mode(text, recipe, mode):
     assert split_mode(text) == (recipe, mode)

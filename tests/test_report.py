@@ -37,10 +37,6 @@ class Tags(HTMLParser):
         self.sources += [value or "" for name, value in attrs if name in ("src", "href")]
 
 
-def sections(page: str) -> list[str]:
-    return re.findall("<h2>(.*?)</h2>", page)
-
-
 def a_run(directory: Path, count: int = 12) -> list[Pair]:
     """A run over pairs of which the second cannot be read; its work directory is ``directory``/work."""
     pairs = write_pairs(directory / "images", count)
@@ -53,9 +49,7 @@ def empty_journal(work_dir: Path, pairs: list[Pair], **about: object) -> Journal
     return Journal(work_dir, BELONGS_TO, pairs=pairs, about=About("three", **about))  # type: ignore[arg-type]
 
 
-def test_a_run_exports_tables_that_pandas_reads_as_they_are(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_exports_tables_that_pandas_reads_as_they_are(tmp_path, capsys):
     pairs = a_run(tmp_path)
     assert main(["journal", str(tmp_path / "work"), "--csv", str(tmp_path / "csv")]) == 0
     assert len(capsys.readouterr().out.splitlines()) == 4
@@ -92,9 +86,7 @@ def test_a_run_exports_tables_that_pandas_reads_as_they_are(
 
 
 @pytest.mark.parametrize("option", ["--csv", "--json", "--report"])
-def test_an_export_that_cannot_be_written_is_told(
-    tmp_path: Path, option: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_export_that_cannot_be_written_is_told(tmp_path, option, capsys):
     empty_journal(tmp_path, []).close()
     (tmp_path / "file").touch()
     assert main(["journal", str(tmp_path), option, str(tmp_path / "file" / "x")]) == 2
@@ -103,7 +95,7 @@ def test_an_export_that_cannot_be_written_is_told(
     assert "has no journal.sqlite" in capsys.readouterr().err
 
 
-def test_a_journal_can_be_read_while_its_run_writes_it(tmp_path: Path) -> None:
+def test_a_journal_can_be_read_while_its_run_writes_it(tmp_path):
     journal = empty_journal(tmp_path, write_pairs(tmp_path / "images", 2))
     journal.note(EventKind.START, 0.5, "")
     with JournalReader(tmp_path) as reader:
@@ -115,13 +107,18 @@ def test_a_journal_can_be_read_while_its_run_writes_it(tmp_path: Path) -> None:
     journal.close()
 
 
-def test_the_page_begins_with_the_verdict_has_pictures_inside_and_asks_for_nothing(tmp_path: Path) -> None:
+def test_the_page_begins_with_the_verdict_has_pictures_inside_and_asks_for_nothing(tmp_path):
     pairs = a_run(tmp_path)
     page = tmp_path / "new" / "report.html"
     assert report_run(tmp_path / "work", page, inf, pairs) == f"report: {page}"
     text = page.read_text(encoding="utf-8")
     assert re.search("<h1>Complete after .*: 11 of 12 pairs have an F</h1>", text)
-    assert sections(text) == ["Faults", "The weakest pairs", "Where the time went", "What made this"]
+    assert re.findall("<h2>(.*?)</h2>", text) == [
+        "Faults",
+        "The weakest pairs",
+        "Where the time went",
+        "What made this",
+    ]
     tags = Tags(text)
     assert tags.names.count("img") == 11 + 1, "the pairs with an F, and jobs over time"
     assert "script" not in tags.names
@@ -131,7 +128,7 @@ def test_the_page_begins_with_the_verdict_has_pictures_inside_and_asks_for_nothi
     assert "Drawings are missing" not in text
 
 
-def test_the_weakest_pairs_are_drawn_with_the_inliers_that_magsac_found(tmp_path: Path) -> None:
+def test_the_weakest_pairs_are_drawn_with_the_inliers_that_magsac_found(tmp_path):
     a_run(tmp_path)
     log = read_log(tmp_path / "work")
     assert len(log.weakest) == 11
@@ -141,7 +138,7 @@ def test_the_weakest_pairs_are_drawn_with_the_inliers_that_magsac_found(tmp_path
         assert match.estimate.inlier_count == weak.record.inliers
 
 
-def test_what_comes_from_files_is_escaped(tmp_path: Path) -> None:
+def test_what_comes_from_files_is_escaped(tmp_path):
     pairs = [Pair(EVIL, EVIL, f"{EVIL.replace('/', '')}.png", "b.png")]
     with empty_journal(tmp_path, pairs, device=EVIL, left_out=(EVIL,), versions={EVIL: EVIL}) as journal:
         for kind in EventKind:
@@ -154,9 +151,7 @@ def test_what_comes_from_files_is_escaped(tmp_path: Path) -> None:
     assert EVIL in overview(log)
 
 
-def test_without_matplotlib_the_page_has_tables_and_says_so(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_matplotlib_the_page_has_tables_and_says_so(tmp_path, monkeypatch):
     pairs = a_run(tmp_path, 4)
     kept = {image for pair in pairs[1:] for image in pair.images}
     for path in set(pairs[0].images) - kept:
@@ -169,7 +164,7 @@ def test_without_matplotlib_the_page_has_tables_and_says_so(
     assert pairs[0].id in text
 
 
-def test_a_late_report_leaves_out_drawings_then_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_late_report_leaves_out_drawings_then_itself(tmp_path, monkeypatch):
     monkeypatch.setattr("mkpc_kaggle.reporting.report.time", SimpleNamespace(monotonic=lambda: 0.0))
     pairs = a_run(tmp_path, 3)
     path = tmp_path / "report.html"
@@ -182,9 +177,7 @@ def test_a_late_report_leaves_out_drawings_then_itself(tmp_path: Path, monkeypat
     assert "<img" not in text
 
 
-def test_a_report_that_fails_is_a_line_and_leaves_the_page_without_drawings(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_report_that_fails_is_a_line_and_leaves_the_page_without_drawings(tmp_path, monkeypatch):
     path = tmp_path / "report.html"
     line = report_run(tmp_path / "nowhere", path, inf)
     assert line.startswith("warning: no report, or a report without drawings (")
@@ -194,7 +187,7 @@ def test_a_report_that_fails_is_a_line_and_leaves_the_page_without_drawings(
     assert "Drawings are missing" in path.read_text()
 
 
-def test_the_command_draws_a_page_with_the_images_of_a_test_side(tmp_path: Path) -> None:
+def test_the_command_draws_a_page_with_the_images_of_a_test_side(tmp_path):
     pairs = write_pairs(tmp_path / "test" / "test_images" / "set", 2)
     rows = [f"{pair.id},set,{pair.images[0].stem},{pair.images[1].stem}" for pair in pairs]
     (tmp_path / "test" / "test.csv").write_text("\n".join(["sample_id,batch_id,image_1_id,image_2_id", *rows]))

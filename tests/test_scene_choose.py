@@ -39,20 +39,20 @@ def choice(models: list[SfmModel], scene: SyntheticScene, own: np.ndarray | None
     return choice_of(scene, models, pair_fundamental=own)
 
 
-def test_the_scenes_fundamental_is_that_of_the_cameras(scene: SyntheticScene) -> None:
+def test_the_scenes_fundamental_is_that_of_the_cameras(scene):
     chosen = choice([model(scene.cameras)], scene)
     assert chosen.from_scene
     assert chosen.reason is Reason.SCENE
     np.testing.assert_allclose(chosen.F, scene.true_fundamental(scene.pairs[0]))
 
 
-def test_an_image_without_a_camera_leaves_the_pair_its_own(scene: SyntheticScene) -> None:
+def test_an_image_without_a_camera_leaves_the_pair_its_own(scene):
     rest = {name: camera for name, camera in scene.cameras.items() if name != "0000"}
     assert choice([model(rest)], scene).reason is Reason.UNREGISTERED
     assert choice([], scene).reason is Reason.UNREGISTERED
 
 
-def test_cameras_of_two_models_make_no_fundamental(scene: SyntheticScene) -> None:
+def test_cameras_of_two_models_make_no_fundamental(scene):
     apart = [model({name: scene.cameras[name]}) for name in ("0000", "0001")]
     assert choice(apart, scene).reason is Reason.APART
 
@@ -67,7 +67,7 @@ def moved(scene: SyntheticScene, degrees: float, zoom: float = 1.0) -> SfmModel:
     return model({**cameras, "0001": Camera(K, turn @ second.R, turn @ second.t)})
 
 
-def test_what_several_reconstructions_say_is_averaged(scene: SyntheticScene) -> None:
+def test_what_several_reconstructions_say_is_averaged(scene):
     pair = scene.pairs[0]
     left, right = moved(scene, 1.0, 1.25), moved(scene, -1.0, 0.8)
     both = choice_of(scene, [left], [right])
@@ -76,23 +76,23 @@ def test_what_several_reconstructions_say_is_averaged(scene: SyntheticScene) -> 
     assert scene.median_distance(choice([left], scene).F, pair) > 2
 
 
-def test_a_reconstruction_that_says_something_else_is_not_averaged(scene: SyntheticScene) -> None:
+def test_a_reconstruction_that_says_something_else_is_not_averaged(scene):
     pair = scene.pairs[0]
     first, other = moved(scene, 0.0), moved(scene, MAX_DISAGREEMENT_DEG + 1)
     both = choice_of(scene, [first], [], [other])
     np.testing.assert_allclose(both.F, scene.true_fundamental(pair), atol=1e-9)
 
 
-def test_a_picture_and_itself_have_no_fundamental(scene: SyntheticScene) -> None:
+def test_a_picture_and_itself_have_no_fundamental(scene):
     assert choice_of(scene, [model(scene.cameras)], image1=scene.images[0]).reason is Reason.SAME_IMAGE
 
 
-def test_two_cameras_at_one_point_have_no_fundamental(scene: SyntheticScene) -> None:
+def test_two_cameras_at_one_point_have_no_fundamental(scene):
     cameras = scene.cameras | {"0001": scene.cameras["0000"]}
     assert choice([model(cameras)], scene).reason is Reason.SAME_CENTRE
 
 
-def test_a_wrong_camera_is_contradicted_by_the_pairs_matches(scene: SyntheticScene) -> None:
+def test_a_wrong_camera_is_contradicted_by_the_pairs_matches(scene):
     camera, tilt = scene.cameras["0001"], cv2.Rodrigues(np.array([np.radians(15), 0, 0]))[0]
     wrong = scene.cameras | {"0001": Camera(camera.K, tilt @ camera.R, tilt @ camera.t)}
     own = scene.true_fundamental(scene.pairs[0])
@@ -105,26 +105,19 @@ def with_camera(scene: SyntheticScene, **changes: object) -> SfmModel:
     return replace(cameras, images=(replace(cameras.images[0], **changes), *cameras.images[1:]))
 
 
-@pytest.mark.parametrize(
-    ("focal", "told"), [(-900.0, "-1.12"), (0.0, "0 long"), (1e5, "125"), (np.nan, "not finite")]
-)
-def test_an_absurd_focal_length_is_left_out(scene: SyntheticScene, focal: float, told: str) -> None:
-    camera = scene.cameras["0000"]
-    bad = replace(camera, K=np.diag([focal, focal, 1.0]))
-    (kept,), (reason,) = filter_models((with_camera(scene, camera=bad),))
+@pytest.mark.parametrize("focal", [-900.0, 0.0, 1e5, np.nan])
+def test_an_absurd_focal_length_is_left_out(scene, focal):
+    bad = replace(scene.cameras["0000"], K=np.diag([focal, focal, 1.0]))
+    (kept,) = filter_models((with_camera(scene, camera=bad),))
     assert [found.image.name for found in kept.images] == ["0001", "0002", "0003"]
-    assert "0000" in reason
-    assert told in reason
 
 
-def test_a_model_that_is_too_small_is_left_out(scene: SyntheticScene) -> None:
+def test_a_model_that_is_too_small_is_left_out(scene):
     small = model({name: scene.cameras[name] for name in ("0000", "0001")})
-    kept, reasons = filter_models((small, model(scene.cameras)))
-    assert [len(each.images) for each in kept] == [4]
-    assert reasons == ("a model of 2 images is too small",)
+    assert [len(each.images) for each in filter_models((small, model(scene.cameras)))] == [4]
 
 
-def test_settings_come_from_a_table() -> None:
+def test_settings_come_from_a_table():
     config = from_table(SceneConfig, {"camera_model": "SIMPLE_RADIAL", "pairs_per_image": 2}, "[scene]")
     assert (config.camera_model, config.pairs_per_image) == (CameraModel.RADIAL, 2.0)
     with pytest.raises(UserError, match=r"unknown key 'cells'.*camera_model"):
@@ -133,5 +126,3 @@ def test_settings_come_from_a_table() -> None:
         from_table(SceneConfig, {"shared_intrinsics": -1}, "[scene]")
     with pytest.raises(UserError, match=r"'one_camera' is now called 'shared_intrinsics'"):
         from_table(SceneConfig, {"one_camera": 0}, "[scene]")
-    with pytest.raises(UserError, match=r"'most_images' was removed"):
-        from_table(SceneConfig, {"most_images": 9}, "[scene]")

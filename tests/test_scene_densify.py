@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 from itertools import combinations
-from pathlib import Path
 
 import numpy as np
 from hypothesis import given
@@ -19,7 +18,7 @@ CHAIN = [(0, 1), (1, 2), (2, 3), (3, 4), (4, 5)]
 
 
 @given(st.integers(2, 12), st.floats(0, 8), st.integers(0, 2**32 - 1))
-def test_a_batch_gets_as_many_pairs_as_it_lacks_and_none_twice(images: int, wanted: float, seed: int) -> None:
+def test_a_batch_gets_as_many_pairs_as_it_lacks_and_none_twice(images, wanted, seed):
     rng = np.random.default_rng(seed)
     every = list(combinations(range(images), 2))
     asked = [ends if rng.random() < 0.5 else ends[::-1] for ends in every if rng.random() < 0.4]
@@ -30,14 +29,14 @@ def test_a_batch_gets_as_many_pairs_as_it_lacks_and_none_twice(images: int, want
     assert len(chosen) == max(0, min(int(np.ceil(wanted * images)), len(every)) - len(known))
 
 
-def test_images_in_few_pairs_come_first_and_get_partners_that_have_the_same_partners() -> None:
+def test_images_in_few_pairs_come_first_and_get_partners_that_have_the_same_partners():
     assert extra_pairs(6, CHAIN, 1) == [(0, 2)], "0 and 2 have 1 in common"
     degrees = np.bincount(np.ravel([*CHAIN, *extra_pairs(6, CHAIN, 1.5)]))
     assert degrees.min() >= 2
     assert extra_pairs(6, CHAIN, 0) == []
 
 
-def test_a_sparse_batch_has_a_scene_by_pairs_that_no_row_names(tmp_path: Path) -> None:
+def test_a_sparse_batch_has_a_scene_by_pairs_that_no_row_names(tmp_path):
     every, matcher = synthetic_pairs(tmp_path / "images"), SyntheticMatcher()
     asked = [every[list(combinations(range(6), 2)).index(ends)] for ends in CHAIN]
     published: list[int] = []

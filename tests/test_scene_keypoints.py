@@ -10,7 +10,7 @@ from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.pipeline.pair import UnitResult
 from mkpc_kaggle.recipe import Unit
-from mkpc_kaggle.scene.keypoints import SceneKeypoints, merge_points, one_to_one, scene_keypoints
+from mkpc_kaggle.scene.keypoints import merge_points, one_to_one, scene_keypoints
 from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair, Edge, ViewGraph, tracks_of
 
 SIZE = Size(100, 80)
@@ -30,12 +30,12 @@ def pair(names: str, found: Matches) -> BatchPair:
     return BatchPair(image(names[0]), image(names[1]), found)
 
 
-def keypoints_of(count: int, *edges: Edge) -> SceneKeypoints:
+def keypoints_of(count: int, *edges: Edge) -> tuple[list[np.ndarray], list[np.ndarray]]:
     return scene_keypoints(ViewGraph(tuple(map(image, "ABC"[:count])), edges))
 
 
 @given(arrays(np.float32, st.tuples(st.integers(0, 60), st.just(2)), elements=st.floats(-5, 5, width=32)))
-def test_a_keypoint_is_the_mean_of_its_points_and_near_each_of_them(points: np.ndarray) -> None:
+def test_a_keypoint_is_the_mean_of_its_points_and_near_each_of_them(points):
     keypoints, place = merge_points(points, 0.75)
     assert len(place) == len(points)
     assert set(place.tolist()) == set(range(len(keypoints)))
@@ -45,42 +45,41 @@ def test_a_keypoint_is_the_mean_of_its_points_and_near_each_of_them(points: np.n
         assert np.abs(points - keypoints[place]).max() <= 1.5 * 0.75 + 1e-5
 
 
-def test_points_on_both_sides_of_a_cells_border_are_one_keypoint() -> None:
+def test_points_on_both_sides_of_a_cells_border_are_one_keypoint():
     keypoints, place = merge_points(np.array([[0.74, 1.49], [0.76, 1.51], [9, 9]], np.float32), 0.75)
     assert len(keypoints) == 2
     assert place[0] == place[1] != place[2]
     np.testing.assert_allclose(keypoints[place[0]], [0.75, 1.5], atol=1e-6)
 
 
-def test_a_match_that_two_matchers_found_is_one_and_outvotes_another() -> None:
+def test_a_match_that_two_matchers_found_is_one_and_outvotes_another():
     edge = Edge(0, 1, matches((10, 10, 60, 60), (10, 10, 20, 20), (10.1, 10, 20, 20.1)))
-    keypoints = keypoints_of(2, edge)
-    ((index,),) = [index.tolist() for index in keypoints.matches]
-    np.testing.assert_allclose(keypoints.points[1][index[1]], [20, 20.05], atol=1e-5)
+    keypoints, (index,) = keypoints_of(2, edge)
+    np.testing.assert_allclose(keypoints[1][index[0, 1]], [20, 20.05], atol=1e-5)
 
 
-def test_a_keypoint_is_matched_once_and_to_what_was_found_most_often() -> None:
+def test_a_keypoint_is_matched_once_and_to_what_was_found_most_often():
     index = np.array([[0, 5], [0, 6], [0, 6], [1, 6], [2, 7], [2, 8]])
     assert one_to_one(index).tolist() == [[0, 6], [2, 7]]
     assert one_to_one(np.zeros((0, 2), np.intp)).shape == (0, 2)
 
 
-def test_a_point_seen_in_two_pairs_is_one_keypoint() -> None:
+def test_a_point_seen_in_two_pairs_is_one_keypoint():
     edges = [
         Edge(0, 1, matches((10, 10, 20, 20), (30, 30, 40, 40))),
         Edge(0, 2, matches((10.1, 9.9, 50, 50))),
         Edge(1, 2, matches((20.05, 20, 50.1, 50))),
     ]
-    keypoints = keypoints_of(3, *edges)
-    assert [len(points) for points in keypoints.points] == [2, 2, 1]
-    first, second, third = (index.tolist() for index in keypoints.matches)
+    keypoints, found = keypoints_of(3, *edges)
+    assert list(map(len, keypoints)) == [2, 2, 1]
+    first, second, third = (index.tolist() for index in found)
     (a, b), (a2, c) = first[0], second[0]
     assert a == a2
     assert third == [[b, c]]
-    np.testing.assert_allclose(keypoints.points[0][a], [10.05, 9.95], atol=1e-5)
+    np.testing.assert_allclose(keypoints[0][a], [10.05, 9.95], atol=1e-5)
 
 
-def test_the_same_picture_under_two_names_is_one_image() -> None:
+def test_the_same_picture_under_two_names_is_one_image():
     there, back, same = matches((1, 1, 2, 2)), matches((4, 4, 3, 3)), matches((1,) * 4)
     graph = ViewGraph.of_pairs([pair("AB", there), pair("Ba", back), pair("Aa", same)])
     assert [found.name for found in graph.images] == ["A", "B"]
@@ -89,7 +88,7 @@ def test_the_same_picture_under_two_names_is_one_image() -> None:
     assert graph.edges[0].matches.points1.tolist() == [[2, 2], [4, 4]]
 
 
-def test_a_graph_is_made_of_a_pairs_tracks_where_it_has_some() -> None:
+def test_a_graph_is_made_of_a_pairs_tracks_where_it_has_some():
     tracks = {"fine": matches((2, 2, 3, 3)), "finer": matches((4, 4, 5, 5))}
     pairs = [
         pair("AB", Matches.empty()),
@@ -101,7 +100,7 @@ def test_a_graph_is_made_of_a_pairs_tracks_where_it_has_some() -> None:
     assert edge.matches.points1.tolist() == [[4, 4]]
 
 
-def test_components_are_connected_by_pairs_with_enough_matches() -> None:
+def test_components_are_connected_by_pairs_with_enough_matches():
     def edge(first: int, second: int, count: int) -> Edge:
         return Edge(first, second, Matches(np.zeros((count, 2)), np.zeros((count, 2)), np.zeros(count)))
 
@@ -121,5 +120,5 @@ def results_of(*counts: int) -> list[UnitResult]:
 
 
 @pytest.mark.parametrize(("fine", "used"), [(50, 50), (49, 79), (0, 30)])
-def test_matches_without_tracks_are_for_pairs_with_few_others(fine: int, used: int) -> None:
+def test_matches_without_tracks_are_for_pairs_with_few_others(fine, used):
     assert sum(map(len, tracks_of(results_of(30, fine)).values())) == used

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 import numpy as np
+import pycolmap
 import pytest
 
 from benchmarks.synthetic_scene import SyntheticScene, registered_images, synthetic_scene
@@ -11,11 +12,11 @@ from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.geometry.robust import RobustConfig
 from mkpc_kaggle.recipe import SceneConfig
-from mkpc_kaggle.scene.choose import estimate_at_known_focals, known_focal
-from mkpc_kaggle.scene.reconstruct import Solution, reconstruct_batch
+from mkpc_kaggle.scene.choose import estimate_at_known_focals
+from mkpc_kaggle.scene.reconstruct import Solution, reconstruct_batch, reconstruct_sharing
 from mkpc_kaggle.scene.reconstruction import RegisteredImage, SfmModel
 from mkpc_kaggle.scene.shared_intrinsics import shared_intrinsics
-from mkpc_kaggle.scene.view_graph import BatchImage
+from mkpc_kaggle.scene.view_graph import BatchImage, ViewGraph
 
 WIDE, TALL = Size(800, 600), Size(600, 800)
 FOCAL = 840.0
@@ -41,19 +42,19 @@ def shared(*focals: float, points: Sequence[int] = (), tolerance: float = 0.02) 
     return dict(shared_intrinsics(every, [model(every, focals, points)], tolerance))
 
 
-def test_most_images_of_a_size_tell_its_focal_length() -> None:
+def test_most_images_of_a_size_tell_its_focal_length():
     assert shared(838, 839, 840, 841, 842) == dict.fromkeys("01234", 840)
 
 
-def test_an_image_with_few_points_shares_the_camera_whatever_its_focal_length() -> None:
+def test_an_image_with_few_points_shares_the_camera_whatever_its_focal_length():
     assert shared(838, 840, 841, 2900, 880, points=(100, 100, 100, 4, 49)) == dict.fromkeys("01234", 841)
 
 
-def test_an_image_with_many_points_and_another_focal_length_was_taken_at_another_zoom() -> None:
+def test_an_image_with_many_points_and_another_focal_length_was_taken_at_another_zoom():
     assert shared(838, 840, 841, 420, 842, points=(100, 100, 100, 90, 100)) == dict.fromkeys("0124", 840)
 
 
-def test_an_image_without_a_camera_shares_that_of_its_size() -> None:
+def test_an_image_without_a_camera_shares_that_of_its_size():
     every = [*images(6), *images(1, TALL, "tall")]
     found = shared_intrinsics(every, [model(every[:5], [FOCAL] * 5)], 0.02)
     assert found == dict.fromkeys("012345", FOCAL)
@@ -64,7 +65,7 @@ def test_an_image_without_a_camera_shares_that_of_its_size() -> None:
     [(), (FOCAL,) * 4, (840, 840, 840, 900, 900, 900), (600, 700, 840, 950, 1100), (-840,) * 3 + (np.nan,) * 3],
     ids=["none", "few", "half", "strangers", "absurd"],
 )
-def test_where_fewer_agree_nothing_is_shared(focals: tuple[float, ...]) -> None:
+def test_where_fewer_agree_nothing_is_shared(focals):
     assert shared(*focals) == {}
 
 
@@ -84,7 +85,7 @@ def mean_angle(solution: Solution, scene: SyntheticScene) -> float:
     return float(np.mean(angles))
 
 
-def test_a_scene_with_shared_intrinsics_is_nearer_to_the_truth() -> None:
+def test_a_scene_with_shared_intrinsics_is_nearer_to_the_truth():
     scene = synthetic_scene(7, 12, points=250, noise=1.0, focals=[FOCAL] * 7, seed=1)
     own, sharing = reconstruct_batch(scene.pairs, OWN), reconstruct_batch(scene.pairs, CONFIG)
     assert len(set(focals_of(own))) == 7
@@ -93,7 +94,7 @@ def test_a_scene_with_shared_intrinsics_is_nearer_to_the_truth() -> None:
     assert mean_angle(sharing, scene) < 0.6 * mean_angle(own, scene)
 
 
-def test_images_at_another_zoom_keep_a_camera_of_their_own() -> None:
+def test_images_at_another_zoom_keep_a_camera_of_their_own():
     scene = synthetic_scene(8, points=400, focals=[FOCAL] * 6 + [0.6 * FOCAL, 1.5 * FOCAL])
     found = reconstruct_batch(scene.pairs, CONFIG)
     assert len(set(focals_of(found))) == 3
@@ -102,21 +103,25 @@ def test_images_at_another_zoom_keep_a_camera_of_their_own() -> None:
         assert registered[image.digest].focal == pytest.approx(scene.cameras[image.name].K[0, 0], rel=0.02)
 
 
-def test_shared_intrinsics_that_explain_fewer_points_are_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("least", "cameras"), [(0.99, 6), (0.0, 1)])
+def test_shared_intrinsics_stay_unless_they_explain_fewer_points_and_the_files_are_of_what_stays(
+    tmp_path, monkeypatch, least, cameras
+):
     scene = synthetic_scene(6, points=300)
     everything = {image.digest: FOCAL for image in scene.images}
     monkeypatch.setattr("mkpc_kaggle.scene.reconstruct.shared_intrinsics", lambda *_: everything)
-    assert len(set(focals_of(reconstruct_batch(scene.pairs, CONFIG)))) == 6
-    monkeypatch.setattr("mkpc_kaggle.scene.reconstruct.MIN_OBSERVATIONS", 0)
-    assert len(set(focals_of(reconstruct_batch(scene.pairs, CONFIG)))) == 1
+    monkeypatch.setattr("mkpc_kaggle.scene.reconstruct.MIN_OBSERVATIONS", least)
+    assert len(set(focals_of(reconstruct_batch(scene.pairs, CONFIG)))) == cameras
+    (found,), _ = reconstruct_sharing(ViewGraph.of_pairs(scene.pairs), CONFIG, tmp_path)
+    written = pycolmap.Reconstruction(tmp_path / "models" / "0").cameras.values()
+    assert {camera.focal_length for camera in written} == {image.focal for image in found.models[0].images}
+    with pycolmap.Database.open(str(tmp_path / "database.db")) as database:
+        assert (len(written), database.num_cameras()) == (cameras, cameras)
 
 
-def test_an_image_that_the_scene_lacks_has_the_shared_focal_length() -> None:
-    (registered,) = model(images(1), [850.0]).images
-    known = {"0": FOCAL, "9": FOCAL}
-    assert [known_focal(digest, [{"0": registered}], known) for digest in "098"] == [850, FOCAL, None]
+def test_an_image_that_the_scene_lacks_has_the_shared_focal_length():
     pair = synthetic_scene(2, points=300, focals=[FOCAL] * 2).pairs[0]
     settings = FocalConfig(), RobustConfig(permutations=1, max_iterations=2000)
     both = {pair.image0.digest: FOCAL, pair.image1.digest: FOCAL}
-    assert estimate_at_known_focals(pair, [], both, *settings) is not None
-    assert estimate_at_known_focals(pair, [], {}, *settings) is None
+    assert estimate_at_known_focals(pair, both, *settings) is not None
+    assert estimate_at_known_focals(pair, {}, *settings) is None

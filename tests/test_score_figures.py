@@ -21,7 +21,7 @@ FIRST = Validation("first", (scene("a", 0.5, 0.5, 20.0, inf), scene("b", 2.5, 2.
 SECOND = Validation("second", (scene("a", 0.5, 0.5, 0.5, 0.5), scene("b", 2.5, 2.5)))
 
 
-def test_scores_stand_at_their_mean_average_accuracy() -> None:
+def test_scores_stand_at_their_mean_average_accuracy():
     axes = figures.draw_scores([FIRST, SECOND]).axes[0]
     shown = {line.get_label(): list(line.get_xdata()) for line in axes.lines}
     assert shown["first"] == pytest.approx([0.5, 0.8, 0.65])
@@ -29,7 +29,7 @@ def test_scores_stand_at_their_mean_average_accuracy() -> None:
     assert [label.get_text() for label in axes.get_yticklabels()] == ["a", "b", "mean over scenes"]
 
 
-def test_gains_stand_at_their_differences_with_intervals_around_them() -> None:
+def test_gains_stand_at_their_differences_with_intervals_around_them():
     comparison = Comparison((FIRST, SECOND))
     axes = figures.draw_gains(comparison).axes[0]
     (bar,) = axes.containers
@@ -46,7 +46,7 @@ def share_below(line, x: float) -> float:
     return max((y for at, y in zip(xs, ys, strict=True) if at <= x), default=0)
 
 
-def test_an_error_curve_has_the_share_of_pairs_below_and_leaves_failures_out() -> None:
+def test_an_error_curve_has_the_share_of_pairs_below_and_leaves_failures_out():
     rotation, translation = figures.draw_errors([FIRST, SECOND]).axes
     curve = next(line for line in rotation.lines if line.get_label() == "first")
     shares = [share_below(curve, x) for x in (0.4, 0.5, 2.5, 20, 180)]

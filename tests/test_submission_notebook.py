@@ -6,13 +6,12 @@ from pathlib import Path
 import nbformat
 import pandas as pd
 import pytest
-from kaggle_image import IMAGES, Image, environment, install_image, make_image, python_version, upload
+from kaggle_image import IMAGES, environment, install_image, make_image, python_version, upload
 from offline_notebook import execute, needs_namespaces, pictures, printed
 from packaging.requirements import Requirement
 from shared import DATA, WEIGHTS, needs_data, needs_weights
 
 from mkpc_kaggle.data.competition import read_test_side, submission_problems
-from mkpc_kaggle.demo import DemoSet
 from mkpc_kaggle.package import Request, make_package
 from mkpc_kaggle.package.metadata import COMPETITION
 from mkpc_kaggle.package.wheels import PYTHONS
@@ -74,7 +73,7 @@ def kaggle(tmp_path: Path, image: Path, wheels: Path) -> Kaggle:
 
 
 @pytest.mark.parametrize("image", IMAGES, ids=str)
-def test_every_image_has_what_the_package_takes_from_it(image: Image) -> None:
+def test_every_image_has_what_the_package_takes_from_it(image):
     project = tomllib.loads((NOTEBOOKS[0].parents[1] / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     taken = {need.name: need for need in map(Requirement, project["dependencies"])}
     for name, _, version in (pin.partition("==") for pin in image.versions):
@@ -83,9 +82,7 @@ def test_every_image_has_what_the_package_takes_from_it(image: Image) -> None:
 
 
 @needs_namespaces
-def test_a_commit_run_without_network_leaves_a_submission_and_shows_pairs(
-    kaggle: Kaggle, demo: DemoSet, tmp_path: Path
-) -> None:
+def test_a_commit_run_without_network_leaves_a_submission_and_shows_pairs(kaggle, demo, tmp_path):
     """On photographs where there are some, else on rendered pictures."""
     kaggle.add_test_side(DATA / "test" if DATA.is_dir() else demo.test_dir, pairs=2)
     kaggle.add_dataset(tmp_path / "package", (WEIGHTS,) if WEIGHTS.is_dir() else ())
@@ -122,9 +119,7 @@ def assert_all_weights_are_used(printed: str) -> None:
 
 @needs_namespaces
 @needs_weights
-def test_the_notebook_stops_where_a_packaged_weight_did_not_arrive(
-    kaggle: Kaggle, demo: DemoSet, tmp_path: Path
-) -> None:
+def test_the_notebook_stops_where_a_packaged_weight_did_not_arrive(kaggle, demo, tmp_path):
     kaggle.add_test_side(demo.test_dir, pairs=1)
     kaggle.add_dataset(tmp_path / "package", (WEIGHTS,))
     (kaggle.dataset / "aliked-n16.safetensors").unlink()
@@ -134,9 +129,7 @@ def test_the_notebook_stops_where_a_packaged_weight_did_not_arrive(
 
 
 @needs_namespaces
-def test_a_failed_run_fails_the_notebook_after_its_figures_but_not_the_hidden_rerun(
-    kaggle: Kaggle, demo: DemoSet, tmp_path: Path
-) -> None:
+def test_a_failed_run_fails_the_notebook_after_its_figures_but_not_the_hidden_rerun(kaggle, demo, tmp_path):
     kaggle.add_test_side(demo.test_dir, pairs=1)
     (kaggle.test_dir / "test_images").unlink()
     for path in (demo.test_dir / "test_images").rglob("*.png"):
@@ -154,9 +147,7 @@ def test_a_failed_run_fails_the_notebook_after_its_figures_but_not_the_hidden_re
 
 @needs_namespaces
 @pytest.mark.parametrize("is_missing", [True, False])
-def test_what_pip_says_is_told_and_the_advice_only_where_no_wheel_fits(
-    kaggle: Kaggle, demo: DemoSet, tmp_path: Path, is_missing: bool
-) -> None:
+def test_what_pip_says_is_told_and_the_advice_only_where_no_wheel_fits(kaggle, demo, tmp_path, is_missing):
     kaggle.add_test_side(demo.test_dir, pairs=1)
     kaggle.add_dataset(tmp_path / "package")
     kaggle.image = make_image(tmp_path / "image")  # other tests have installed into the shared image
@@ -180,9 +171,7 @@ def test_what_pip_says_is_told_and_the_advice_only_where_no_wheel_fits(
 @pytest.mark.slow
 @pytest.mark.timeout(7200)
 @pytest.mark.parametrize("image", IMAGES, ids=str)
-def test_the_notebook_runs_on_an_image_of_kaggles_versions(
-    image: Image, tmp_path: Path, request: pytest.FixtureRequest
-) -> None:
+def test_the_notebook_runs_on_an_image_of_kaggles_versions(image, tmp_path, request):
     """As the README's commands make it, wheels from the index included."""
     directory = request.config.cache.mkdir("kaggle_images") / str(image)
     python = install_image(image, directory)
@@ -198,7 +187,7 @@ def test_the_notebook_runs_on_an_image_of_kaggles_versions(
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_notebooks_are_committed_in_one_form_with_pictures_at_most(path: Path) -> None:
+def test_notebooks_are_committed_in_one_form_with_pictures_at_most(path):
     text = path.read_text(encoding="utf-8")
     notebook = nbformat.reads(text, as_version=4)
     nbformat.validate(notebook)

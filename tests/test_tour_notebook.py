@@ -8,8 +8,6 @@ import nbformat
 from kaggle_image import environment
 from offline_notebook import execute, needs_namespaces, outputs, pictures, printed, with_pictures_alone
 
-from mkpc_kaggle.demo import DemoSet
-
 ROOT = Path(__file__).resolve().parents[1]
 TOUR = ROOT / "notebooks" / "mkpc_tour.ipynb"
 PATHS = os.pathsep.join([str(ROOT), str(TOUR.parent)])  # Jupyter starts a kernel beside its notebook
@@ -22,7 +20,7 @@ def figures_of(notebook: nbformat.NotebookNode) -> int:
 
 
 @needs_namespaces
-def test_the_tour_runs_on_a_train_side_without_a_network(demo: DemoSet, tmp_path: Path) -> None:
+def test_the_tour_runs_on_a_train_side_without_a_network(demo, tmp_path):
     variables = environment(
         PYTHONPATH=PATHS,
         MKPC_TRAIN_DIR=str(demo.train_dir),
@@ -34,7 +32,7 @@ def test_the_tour_runs_on_a_train_side_without_a_network(demo: DemoSet, tmp_path
     assert printed(executed) == ""
 
 
-def test_the_tour_is_committed_with_all_its_pictures_and_nothing_else() -> None:
+def test_the_tour_is_committed_with_all_its_pictures_and_nothing_else():
     tour = nbformat.read(TOUR, as_version=4)
     assert with_pictures_alone(tour) == tour
     assert pictures(tour) == figures_of(tour) == len(outputs(tour))

@@ -36,7 +36,7 @@ def true_matrices(demo: DemoSet) -> dict[str, np.ndarray]:
     return {sample: fundamental_of_cameras(*cameras[first, second]) for sample, _, first, second in rows}
 
 
-def test_the_true_matrices_score_one_whatever_the_order_of_the_images(demo: DemoSet, tmp_path: Path) -> None:
+def test_the_true_matrices_score_one_whatever_the_order_of_the_images(demo, tmp_path):
     truth = true_matrices(demo)
     assert list(truth) == [pair.id for pair in read_test_side(demo.test_dir)]
     write_submission(tmp_path / "true.csv", truth)
@@ -52,7 +52,7 @@ def test_the_true_matrices_score_one_whatever_the_order_of_the_images(demo: Demo
     assert scored.maa < 0.2
 
 
-def test_a_failed_pair_counts_as_failed_even_where_the_fallback_happens_to_be_right() -> None:
+def test_a_failed_pair_counts_as_failed_even_where_the_fallback_happens_to_be_right():
     eye = np.eye(3)
     camera0, camera1 = Camera(eye, eye, np.zeros(3)), Camera(eye, eye, np.array([1.0, 0, 0]))
     true = TruePair(Pair("p", "s", Path("a"), Path("b")), camera0, camera1, 0.5)
@@ -73,9 +73,7 @@ def scores_of(demo: DemoSet, recipe: Path, *options: str) -> dict[str, Any]:
     return scores
 
 
-def test_validate_scores_a_recipe_and_writes_all_figures(
-    demo: DemoSet, small_recipe: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_validate_scores_a_recipe_and_writes_all_figures(demo, small_recipe, capsys):
     scores = scores_of(demo, small_recipe, "--pairs-per-scene", "5")
     assert f"{'mean over scenes':<20}{5:>6}{scores['mAA']:>9.4f}" in capsys.readouterr().out
     (scene,) = scores["scenes"]
@@ -89,9 +87,7 @@ def test_validate_scores_a_recipe_and_writes_all_figures(
         assert set(pair["matches"]) == {"1:sift@320", "2:sift@400"}
 
 
-def test_each_step_of_the_estimate_has_a_column(
-    demo: DemoSet, small_recipe: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_each_step_of_the_estimate_has_a_column(demo, small_recipe, capsys):
     small_recipe.write_text(small_recipe.read_text() + "[magsac]\npermutations = 1\n")
     plain = scores_of(demo, small_recipe)
     assert plain["mAA_by_step"] == {"MAGSAC": plain["mAA"]}
@@ -112,8 +108,8 @@ def test_each_step_of_the_estimate_has_a_column(
 
 
 def test_a_work_directory_keeps_the_journal_and_a_report_that_shows_the_pairs(
-    demo: DemoSet, small_recipe: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+    demo, small_recipe, tmp_path, capsys
+):
     options = ["--pairs-per-scene", "2", "--mode", "whole-images", "--units", "1:sift@400"]
     scores = scores_of(demo, small_recipe, *options, "--work-dir", str(tmp_path / "work"))
     assert [set(pair["matches"]) for pair in scores["scenes"][0]["pairs"]] == [{"1:sift@400"}] * 2
@@ -129,7 +125,7 @@ BASELINE = {"castle_p19": 0.4319, "fountain_p11": 0.9018, "herz_jesus_p8": 0.885
 @needs_data
 @pytest.mark.slow
 @pytest.mark.timeout(7200)
-def test_the_classical_recipe_reaches_plain_root_sift_scene_by_scene(tmp_path: Path) -> None:
+def test_the_classical_recipe_reaches_plain_root_sift_scene_by_scene(tmp_path):
     out = tmp_path / "scores.json"
     train = str(DATA / "train")
     assert main(["validate", "--train-dir", train, "--recipe", "classical", "--json", str(out)]) == 0
@@ -147,11 +143,14 @@ def test_the_classical_recipe_reaches_plain_root_sift_scene_by_scene(tmp_path: P
         (["--pairs", "a.txt"], "go together"),
         (["--pairs", "a.txt", "--image-root", ".", "--compare", "a", "b"], "needs a --train-dir"),
         (["--train-dir", ".", "--image-root", "."], "go together"),
+        (["--imc2025", "."], "--imc2025 needs --submission, and no --truth"),
+        (["--imc2025", ".", "--submission", "a.csv", "--truth", "b.csv"], "--imc2025 needs --submission, and no"),
+        (["--train-dir", "T", "--compare", "classical", "clasical:stage-1"], "unknown recipe 'clasical'"),
+        (["--train-dir", "T", "--compare", "classical"], "two recipes"),
     ],
 )
-def test_options_that_make_no_validation_are_refused(
-    demo: DemoSet, small_recipe: Path, options: list[str], told: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_options_that_make_no_validation_are_refused(demo, small_recipe, options, told, capsys):
     places = {"T": str(demo.train_dir), "R": str(small_recipe)}
     assert main(["validate", *(places.get(option, option) for option in options)]) == 2
-    assert told in capsys.readouterr().err
+    captured = capsys.readouterr()
+    assert (told in captured.err, captured.out) == (True, "")

@@ -32,7 +32,7 @@ def run(directory: Path, settings: dict[str, str], **variables: str) -> tuple[st
 
 
 @needs_namespaces
-def test_without_a_train_side_recipes_are_compared_on_the_demo_set(tmp_path: Path) -> None:
+def test_without_a_train_side_recipes_are_compared_on_the_demo_set(tmp_path):
     settings = {"SCENES = []": 'SCENES = ["courtyard"]', "PAIRS_PER_SCENE = 12": "PAIRS_PER_SCENE = 4"}
     text, figures = run(tmp_path, SETTINGS | settings)
     assert "courtyard              4 pairs" in text

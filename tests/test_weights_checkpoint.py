@@ -49,12 +49,9 @@ def assert_same(loaded: dict[str, torch.Tensor], wanted: dict[str, torch.Tensor]
         assert torch.equal(loaded[name], tensor)
 
 
-# formats
-
-
 @pytest.mark.parametrize("wrapped", [False, True])
 @pytest.mark.parametrize("save", [save_zip, save_legacy, save_file])
-def test_every_file_format_gives_the_same_plain_tensors(tmp_path: Path, save: Save, wrapped: bool) -> None:
+def test_every_file_format_gives_the_same_plain_tensors(tmp_path, save, wrapped):
     path, tensors = tmp_path / ("x.safetensors" if save is save_file else "x.pt"), TENSORS
     if save is not save_file:
         tensors = TENSORS | {"c": nn.Parameter(torch.ones(2)), "d": torch.ones(3, requires_grad=True)}
@@ -69,7 +66,7 @@ def test_every_file_format_gives_the_same_plain_tensors(tmp_path: Path, save: Sa
 
 @pytest.mark.filterwarnings("ignore::UserWarning")  # of torch, on prototypes
 @pytest.mark.parametrize("save", [save_zip, save_legacy])
-def test_anything_but_a_table_of_plain_tensors_is_refused(tmp_path: Path, save: Save) -> None:
+def test_anything_but_a_table_of_plain_tensors_is_refused(tmp_path, save):
     ones, base = torch.ones(2, 3), torch.zeros(10_000)
     odd: list[object] = [ones, [ones], {"state_dict": 3}, {3: ones}, {"x": ones.to_sparse()}]
     odd += [{"x": ones.to_sparse_csr()}, {"x": ones.to("meta")}]
@@ -85,13 +82,10 @@ def test_anything_but_a_table_of_plain_tensors_is_refused(tmp_path: Path, save: 
 
 @pytest.mark.parametrize("name", ["x.pt", "x.safetensors"])
 @pytest.mark.parametrize("data", [b"", b"no checkpoint", b"\0" * 100])
-def test_a_file_that_is_not_a_checkpoint_is_refused_by_name(tmp_path: Path, name: str, data: bytes) -> None:
+def test_a_file_that_is_not_a_checkpoint_is_refused_by_name(tmp_path, name, data):
     put(tmp_path, name, data)
     with pytest.raises(UserError, match=rf"{name} cannot be read as a checkpoint"):
         load_tensors(tmp_path / name)
-
-
-# training checkpoints
 
 
 @pytest.fixture
@@ -130,9 +124,7 @@ def training_checkpoint(framework: types.ModuleType, state: dict[str, torch.Tens
     }
 
 
-def test_a_training_checkpoint_with_unknown_classes_gives_its_tensors(
-    tmp_path: Path, framework: types.ModuleType
-) -> None:
+def test_a_training_checkpoint_with_unknown_classes_gives_its_tensors(tmp_path, framework):
     base = torch.arange(24.0).reshape(4, 6)
     network = nn.Sequential(nn.Linear(3, 2), nn.BatchNorm1d(2))
     state: dict[str, torch.Tensor] = OrderedDict(network.state_dict())
@@ -157,14 +149,11 @@ def test_a_training_checkpoint_with_unknown_classes_gives_its_tensors(
     assert shared == columns
 
 
-def test_the_old_format_with_unknown_classes_is_refused(tmp_path: Path, framework: types.ModuleType) -> None:
+def test_the_old_format_with_unknown_classes_is_refused(tmp_path, framework):
     save_legacy(training_checkpoint(framework, TENSORS), tmp_path / "x.ckpt")
     sys.modules.pop("training_framework")
     with pytest.raises(UserError, match=r"x\.ckpt .* holds objects that are not read here"):
         load_tensors(tmp_path / "x.ckpt")
-
-
-# malice
 
 
 class Call:
@@ -195,7 +184,7 @@ def nasty(sentinel: Path) -> dict[str, object]:
 
 
 @pytest.mark.parametrize("save", [save_zip, save_legacy, save_pickle])
-def test_a_malicious_pickle_runs_nothing(tmp_path: Path, save: Save) -> None:
+def test_a_malicious_pickle_runs_nothing(tmp_path, save):
     sentinel = tmp_path / "sentinel"
     for name, bomb in nasty(sentinel).items():
         path = tmp_path / f"{name}.pt"
@@ -224,7 +213,7 @@ def with_pickle(path: Path, change: Callable[[bytes], bytes]) -> Path:
     return path
 
 
-def test_records_that_unpack_to_more_than_the_file_or_overlap_are_refused(tmp_path: Path) -> None:
+def test_records_that_unpack_to_more_than_the_file_or_overlap_are_refused(tmp_path):
     path = with_pickle(tmp_path / "x.pt", bytes)
     assert load_tensors(path).keys() == TENSORS.keys()
     with zipfile.ZipFile(path, "a", zipfile.ZIP_DEFLATED) as archive:
@@ -243,9 +232,7 @@ def test_records_that_unpack_to_more_than_the_file_or_overlap_are_refused(tmp_pa
 
 @settings(max_examples=100)
 @given(st.lists(st.tuples(st.integers(0, 10_000), st.integers(0, 255)), min_size=1, max_size=3))
-def test_a_damaged_pickle_gives_tensors_or_a_refusal(
-    tmp_path_factory: pytest.TempPathFactory, changes: list[tuple[int, int]]
-) -> None:
+def test_a_damaged_pickle_gives_tensors_or_a_refusal(tmp_path_factory, changes):
     def damaged(data: bytes) -> bytes:
         changed = bytearray(data)
         for place, byte in changes:

@@ -30,9 +30,7 @@ def weights(tmp_path: Path) -> Path:
     return put(put(tmp_path / "weights", "sift.pt"), "renamed.pt", OTHER)
 
 
-def test_list_says_what_is_there_and_what_the_missing_would_enable(
-    weights: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_list_says_what_is_there_and_what_the_missing_would_enable(weights, capsys):
     assert main(["weights", "list", "--weights", str(weights)]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[1].split() == ["sift", "MIT", "-", str(weights / "sift.pt")]
@@ -42,7 +40,7 @@ def test_list_says_what_is_there_and_what_the_missing_would_enable(
     assert len(lines) == 4
 
 
-def test_verify_finds_truncated_and_swapped_files(weights: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_verify_finds_truncated_and_swapped_files(weights, capsys):
     assert main(["weights", "verify", "--weights", str(put(weights, "b.pt", b"what may be it"))]) == 0
     assert "3 files, 0 refused" in capsys.readouterr().out
     (weights / "b.pt").unlink()
@@ -56,7 +54,7 @@ def test_verify_finds_truncated_and_swapped_files(weights: Path, capsys: pytest.
     assert rows["a.pt"].endswith("its bytes are those of sift.pt")
 
 
-def test_locate_prints_the_path_alone(weights: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_locate_prints_the_path_alone(weights, capsys):
     put(weights, "a.pt", DATA)
     for name in ("aliked-n16", "a.pt"):
         assert main(["weights", "locate", name, "--weights", str(weights)]) == 0
@@ -70,9 +68,7 @@ def test_locate_prints_the_path_alone(weights: Path, capsys: pytest.CaptureFixtu
     assert "slot (sift, aliked-n16, superpoint)" in capsys.readouterr().err
 
 
-def test_fetch_takes_files_slots_and_recipes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_fetch_takes_files_slots_and_recipes(tmp_path, monkeypatch, capsys):
     recipe = tmp_path / "own.toml"
     recipe.write_text('units = [{stage = 1, matcher = "aliked", long_side = 320}]')
     monkeypatch.setenv("no_proxy", "127.0.0.1")
@@ -98,8 +94,8 @@ def test_fetch_takes_files_slots_and_recipes(
 
 
 def test_the_first_download_of_a_file_without_a_digest_is_the_one_that_is_accepted_from_then_on(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+    tmp_path, monkeypatch, capsys
+):
     monkeypatch.setenv("no_proxy", "127.0.0.1")
     out = tmp_path / "out"
     fetch = ["weights", "fetch", "b.pt", "--out", str(out)]
@@ -123,10 +119,7 @@ def test_the_first_download_of_a_file_without_a_digest_is_the_one_that_is_accept
         assert store.WeightStore([out]).find("aliked-n16") is None
 
 
-# the files of LoMa, RoMa and LightGlue
-
-
-def test_convert_prints_the_line_for_the_manifest(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_convert_prints_the_line_for_the_manifest(tmp_path, capsys):
     torch.save({"a": torch.zeros(2)}, tmp_path / "x.pt")
     source, made = str(tmp_path / "x.pt"), str(tmp_path / "x.safetensors")
     assert main(["weights", "convert", source, "--out", made]) == 0
@@ -138,9 +131,7 @@ def test_convert_prints_the_line_for_the_manifest(tmp_path: Path, capsys: pytest
 
 
 @needs_weights
-def test_the_shared_checkpoints_are_good(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_shared_checkpoints_are_good(monkeypatch, capsys):
     monkeypatch.setattr(store, "manifest", manifest)
     assert main(["weights", "verify", "--weights", str(WEIGHTS)]) == 0
     assert "3 files, 0 refused" in capsys.readouterr().out

@@ -1,7 +1,6 @@
 """Checkpoints as safetensors."""
 
 import os
-from pathlib import Path
 
 import pytest
 import torch
@@ -14,7 +13,7 @@ from mkpc_kaggle.weights.convert import convert
 from mkpc_kaggle.weights.manifest import UNVERIFIED, WeightFile
 
 
-def test_every_tensor_comes_through_whatever_it_shares(tmp_path: Path) -> None:
+def test_every_tensor_comes_through_whatever_it_shares(tmp_path):
     base = torch.arange(12.0).reshape(3, 4)
     tensors = {
         "net.base": base,
@@ -38,7 +37,7 @@ def test_every_tensor_comes_through_whatever_it_shares(tmp_path: Path) -> None:
     assert [path.name for path in (tmp_path / "new").iterdir()] == ["x.safetensors"]
 
 
-def test_the_line_takes_over_what_the_manifest_knows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_line_takes_over_what_the_manifest_knows(tmp_path, monkeypatch):
     torch.save({"a": torch.zeros(1)}, tmp_path / "x.pt")
     digest = digest_of((tmp_path / "x.pt").read_bytes())
     by_digest = WeightFile("known.pt", -1, digest, "MIT", "slot", "web")
@@ -53,7 +52,7 @@ def test_the_line_takes_over_what_the_manifest_knows(tmp_path: Path, monkeypatch
 
 
 @pytest.mark.filterwarnings("ignore:ComplexHalf")
-def test_what_cannot_be_converted_is_told(tmp_path: Path) -> None:
+def test_what_cannot_be_converted_is_told(tmp_path):
     torch.save({"a": torch.zeros(1)}, tmp_path / "x.pt")
     with pytest.raises(UserError, match=r"x\.bin: the name must end in \.safetensors"):
         convert(tmp_path / "x.pt", tmp_path / "x.bin")
@@ -69,7 +68,7 @@ def test_what_cannot_be_converted_is_told(tmp_path: Path) -> None:
         convert(tmp_path / "x.pt", tmp_path / "x.pt" / "x.safetensors")
 
 
-def test_a_link_in_the_place_of_the_partial_file_is_not_followed(tmp_path: Path) -> None:
+def test_a_link_in_the_place_of_the_partial_file_is_not_followed(tmp_path):
     torch.save({"a": torch.zeros(1)}, tmp_path / "x.pt")
     (tmp_path / "other").write_bytes(b"mine")
     (tmp_path / "x.safetensors.part").symlink_to(tmp_path / "other")

@@ -40,7 +40,7 @@ def names_in(directory: Path) -> list[str]:
     return sorted(path.name for path in directory.iterdir())
 
 
-def test_a_broken_connection_is_taken_up_where_it_broke(site: Site, tmp_path: Path) -> None:
+def test_a_broken_connection_is_taken_up_where_it_broke(site, tmp_path):
     site.breaks = [CUT, 5]
     pauses = Pauses()
     fetched = get(site, tmp_path / "new" / "weights", pauses=pauses)
@@ -52,7 +52,7 @@ def test_a_broken_connection_is_taken_up_where_it_broke(site: Site, tmp_path: Pa
     assert pauses == [1, 2]
 
 
-def test_another_call_goes_on_where_the_last_one_gave_up(site: Site, tmp_path: Path) -> None:
+def test_another_call_goes_on_where_the_last_one_gave_up(site, tmp_path):
     site.breaks = [CUT] + [0] * (ATTEMPTS - 1)
     pauses = Pauses()
     failed = get(site, tmp_path, pauses=pauses)
@@ -68,7 +68,7 @@ def test_another_call_goes_on_where_the_last_one_gave_up(site: Site, tmp_path: P
     assert names_in(tmp_path) == ["a.bin"]
 
 
-def test_a_part_of_another_version_is_found_out_and_removed(site: Site, tmp_path: Path) -> None:
+def test_a_part_of_another_version_is_found_out_and_removed(site, tmp_path):
     put(tmp_path, "a.bin.part", bytes(CUT))
     failed = get(site, tmp_path)
     assert (failed.outcome, site.asked) == (FetchOutcome.FAILED, [f"bytes={CUT}-"])
@@ -77,7 +77,7 @@ def test_a_part_of_another_version_is_found_out_and_removed(site: Site, tmp_path
     assert (tmp_path / "a.bin").read_bytes() == BIG
 
 
-def test_a_file_without_a_digest_is_begun_anew_and_comes_with_its_digest(site: Site, tmp_path: Path) -> None:
+def test_a_file_without_a_digest_is_begun_anew_and_comes_with_its_digest(site, tmp_path):
     site.breaks = [CUT]
     fetched = get(site, tmp_path, line(size=-1, digest=UNVERIFIED))
     assert (fetched.outcome, site.asked) == (FetchOutcome.FETCHED, ["", ""])
@@ -85,7 +85,7 @@ def test_a_file_without_a_digest_is_begun_anew_and_comes_with_its_digest(site: S
     assert (tmp_path / "a.bin").read_bytes() == BIG
 
 
-def test_a_wrong_digest_gives_no_name_and_leaves_nothing(site: Site, tmp_path: Path) -> None:
+def test_a_wrong_digest_gives_no_name_and_leaves_nothing(site, tmp_path):
     wanted = bytes(len(BIG))
     failed = get(site, tmp_path, line(data=wanted))
     assert failed.outcome is FetchOutcome.FAILED
@@ -95,9 +95,7 @@ def test_a_wrong_digest_gives_no_name_and_leaves_nothing(site: Site, tmp_path: P
 
 
 @pytest.mark.parametrize(("status", "requests"), [(404, 1), (403, 1), (503, 2), (429, 2)])
-def test_errors_that_pass_are_waited_for_and_others_are_told(
-    site: Site, tmp_path: Path, status: int, requests: int
-) -> None:
+def test_errors_that_pass_are_waited_for_and_others_are_told(site, tmp_path, status, requests):
     site.statuses = [status]
     fetched = get(site, tmp_path)
     assert len(site.asked) == requests
@@ -108,7 +106,7 @@ def test_errors_that_pass_are_waited_for_and_others_are_told(
         assert fetched.outcome is FetchOutcome.FETCHED
 
 
-def test_what_cannot_be_reached_or_written_is_told(site: Site, tmp_path: Path) -> None:
+def test_what_cannot_be_reached_or_written_is_told(site, tmp_path):
     pauses = Pauses()
     gone = fetch.fetch(replace(line(), source="http://127.0.0.1:9/a.bin"), tmp_path, wait=pauses)
     assert (gone.outcome, len(pauses)) == (FetchOutcome.FAILED, ATTEMPTS - 1)
@@ -123,7 +121,7 @@ def test_what_cannot_be_reached_or_written_is_told(site: Site, tmp_path: Path) -
     assert failed.note == f"{tmp_path / 'a.bin'} cannot be written: Is a directory"
 
 
-def test_no_download_leaves_https(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_download_leaves_https(tmp_path, monkeypatch):
     answer = closing(SimpleNamespace(url="http://x.org/a.bin", close=lambda: None))
     monkeypatch.setattr(fetch, "urlopen", lambda *_, **__: answer)
     failed = fetch.fetch(line(source="https://x.org/a.bin"), tmp_path)
@@ -131,7 +129,7 @@ def test_no_download_leaves_https(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert failed.note == "https://x.org/a.bin redirects to http://x.org/a.bin, which is not followed"
 
 
-def test_a_good_file_is_not_asked_for_and_a_bad_one_is_replaced(site: Site, tmp_path: Path) -> None:
+def test_a_good_file_is_not_asked_for_and_a_bad_one_is_replaced(site, tmp_path):
     put(tmp_path, data=BIG)
     assert get(site, tmp_path).outcome is FetchOutcome.ALREADY_THERE
     assert site.asked == []
@@ -140,10 +138,7 @@ def test_a_good_file_is_not_asked_for_and_a_bad_one_is_replaced(site: Site, tmp_
     assert (tmp_path / "a.bin").read_bytes() == BIG
 
 
-# malice
-
-
-def test_no_more_bytes_are_taken_than_the_manifest_has(site: Site, tmp_path: Path) -> None:
+def test_no_more_bytes_are_taken_than_the_manifest_has(site, tmp_path):
     site.data, site.length = BIG + bytes(10 * BLOCK_BYTES), 0
     failed = get(site, tmp_path)
     assert failed.outcome is FetchOutcome.FAILED
@@ -160,7 +155,7 @@ def test_no_more_bytes_are_taken_than_the_manifest_has(site: Site, tmp_path: Pat
         "file:///a",
     ],
 )
-def test_what_cannot_be_downloaded_as_it_is_is_for_the_user(tmp_path: Path, source: str) -> None:
+def test_what_cannot_be_downloaded_as_it_is_is_for_the_user(tmp_path, source):
     file = line(source=source)
     assert url_of(file) is None
     by_hand = fetch.fetch(file, tmp_path)
@@ -168,7 +163,7 @@ def test_what_cannot_be_downloaded_as_it_is_is_for_the_user(tmp_path: Path, sour
     assert by_hand.note == f"get it from {source} and save it as {tmp_path / 'a.bin'}"
 
 
-def test_of_alternatives_the_one_that_is_there_is_chosen_then_one_from_the_web(tmp_path: Path) -> None:
+def test_of_alternatives_the_one_that_is_there_is_chosen_then_one_from_the_web(tmp_path):
     files = [line("a", source="by hand"), line("b", source="https://x.org/b"), line("c", source="by hand")]
     assert choose(files, tmp_path).name == "b"
     assert choose(files[::2], tmp_path).name == "a"

@@ -11,7 +11,7 @@ from mkpc_kaggle.weights.manifest import UNVERIFIED, WeightFile, manifest, parse
 SHA256 = "sha256:" + "0f" * 32
 
 
-def test_the_manifest_has_every_slot_of_every_matcher_with_its_licence() -> None:
+def test_the_manifest_has_every_slot_of_every_matcher_with_its_licence():
     licences: dict[str, set[str]] = {}
     for file in manifest():
         licences.setdefault(file.slot, set()).add(file.licence)
@@ -23,7 +23,7 @@ def test_the_manifest_has_every_slot_of_every_matcher_with_its_licence() -> None
             assert licences[slot] & set(spec.licences), slot
 
 
-def test_a_manifest_reads_as_written() -> None:
+def test_a_manifest_reads_as_written():
     text = f"# head\n\na.pt 12 {SHA256} MIT one  https://x/a.pt (a copy)  # why\n  b.pt ? unverified BSD two y\n"
     files = parse_manifest(text)
     assert files == (
@@ -46,6 +46,6 @@ def test_a_manifest_reads_as_written() -> None:
         (f"a.pt 12 git-blob:{'a1' * 20} MIT one x", "digest must be 'sha256:'"),
     ],
 )
-def test_a_line_that_cannot_be_read_is_named_by_its_number(wrong: str, says: str) -> None:
+def test_a_line_that_cannot_be_read_is_named_by_its_number(wrong, says):
     with pytest.raises(UserError, match=f"list.txt, line 3: {re.escape(says)}"):
         parse_manifest(f"# head\nok.pt 12 unverified MIT one x\n{wrong}\n", "list.txt")

@@ -22,10 +22,7 @@ def found_by(weights: WeightStore, slot: str = "slot") -> Path:
     return found.path
 
 
-# by name
-
-
-def test_a_file_is_found_in_the_directory_and_below_it(tmp_path: Path) -> None:
+def test_a_file_is_found_in_the_directory_and_below_it(tmp_path):
     assert found_by(WeightStore([put(tmp_path / "a")], [line()])) == tmp_path / "a" / "a.bin"
     put(tmp_path / "b" / "deep" / "deeper")
     found = WeightStore([tmp_path / "b"], [line()]).find("slot")
@@ -37,9 +34,7 @@ def test_a_file_is_found_in_the_directory_and_below_it(tmp_path: Path) -> None:
         WeightStore([tmp_path / "gone"])
 
 
-def test_directories_are_searched_in_order_then_the_environment_then_kaggle(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_directories_are_searched_in_order_then_the_environment_then_kaggle(tmp_path, monkeypatch):
     homes = [put(tmp_path / name) for name in ("one", "two", "three", "four", "kaggle")]
     monkeypatch.setenv("MKPC_WEIGHTS", os.pathsep.join(map(str, [tmp_path / "gone", *homes[2:4]])))
     monkeypatch.setattr(store, "KAGGLE_INPUT", homes[4])
@@ -49,7 +44,7 @@ def test_directories_are_searched_in_order_then_the_environment_then_kaggle(
     assert WeightStore(homes[:2], [line()]).find("slot") is None
 
 
-def test_the_first_alternative_that_is_there_is_taken(tmp_path: Path) -> None:
+def test_the_first_alternative_that_is_there_is_taken(tmp_path):
     files = [line("a.bin"), line("b.bin", OTHER), line("c.bin", slot="other")]
     put(tmp_path, "renamed.bin", DATA)
     put(tmp_path, "b.bin", OTHER)
@@ -58,7 +53,7 @@ def test_the_first_alternative_that_is_there_is_taken(tmp_path: Path) -> None:
     assert found_by(WeightStore([tmp_path], files)).name == "a.bin"
 
 
-def test_missing_weights_are_named_with_all_alternatives_and_where_they_were_searched(tmp_path: Path) -> None:
+def test_missing_weights_are_named_with_all_alternatives_and_where_they_were_searched(tmp_path):
     weights = WeightStore([tmp_path], [line("a.bin"), line("b.bin")])
     assert weights.find("slot") is None
     with pytest.raises(UserError, match=rf"'slot': a\.bin or b\.bin not found \(searched {tmp_path}\)"):
@@ -67,10 +62,7 @@ def test_missing_weights_are_named_with_all_alternatives_and_where_they_were_sea
         WeightStore([], [line()]).load("slot")
 
 
-# by digest
-
-
-def test_a_renamed_file_is_found_by_its_size_and_digest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_renamed_file_is_found_by_its_size_and_digest(tmp_path, monkeypatch):
     read: list[Path] = []
     monkeypatch.setattr(store, "digest_of", lambda path: read.append(path) or file_digest(path))
     put(tmp_path / "data set" / "v1", "model")
@@ -82,9 +74,7 @@ def test_a_renamed_file_is_found_by_its_size_and_digest(tmp_path: Path, monkeypa
     assert "long.pth" not in {path.name for path in read}
 
 
-def test_without_a_size_only_small_checkpoints_are_read_for_their_digest(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_a_size_only_small_checkpoints_are_read_for_their_digest(tmp_path, monkeypatch):
     monkeypatch.setattr(store, "MAX_UNKNOWN_SIZE_BYTES", len(DATA))
     put(tmp_path, "table.csv")
     put(tmp_path, "picture.png")
@@ -94,7 +84,7 @@ def test_without_a_size_only_small_checkpoints_are_read_for_their_digest(
     assert found_by(WeightStore([tmp_path], [line(size=-1)])).name == "renamed.ckpt"
 
 
-def test_links_to_directories_are_followed_once(tmp_path: Path) -> None:
+def test_links_to_directories_are_followed_once(tmp_path):
     put(tmp_path / "outside", "b.pth")
     inside = put(tmp_path / "inside" / "deep", "a.pth")
     (inside / "loop").symlink_to(tmp_path / "inside")
@@ -104,11 +94,8 @@ def test_links_to_directories_are_followed_once(tmp_path: Path) -> None:
     assert [file.path.name for file in found] == ["a.pth", "file.pth", "b.pth"]
 
 
-# checkpoints that were unpacked
-
-
 @pytest.mark.parametrize("outer", ["x.pth", "x"])
-def test_an_unpacked_checkpoint_is_found_and_read(tmp_path: Path, outer: str) -> None:
+def test_an_unpacked_checkpoint_is_found_and_read(tmp_path, outer):
     tensors = {"a": torch.arange(6.0).reshape(2, 3), "b": torch.tensor([1, 2])}
     torch.save({"state_dict": tensors, "epoch": 3}, tmp_path / "x.pth")
     file = line("x.pth", (tmp_path / "x.pth").read_bytes())
@@ -128,7 +115,7 @@ def test_an_unpacked_checkpoint_is_found_and_read(tmp_path: Path, outer: str) ->
     assert load_tensors(tmp_path / "x.safetensors").keys() == tensors.keys()
 
 
-def test_an_unpacked_checkpoint_whose_record_is_cut_off_is_refused_when_it_is_read(tmp_path: Path) -> None:
+def test_an_unpacked_checkpoint_whose_record_is_cut_off_is_refused_when_it_is_read(tmp_path):
     torch.save({"a": torch.arange(6.0)}, tmp_path / "x.pth")
     with ZipFile(tmp_path / "x.pth") as archive:
         archive.extractall(tmp_path / "input" / "x.pth")
@@ -138,9 +125,7 @@ def test_an_unpacked_checkpoint_whose_record_is_cut_off_is_refused_when_it_is_re
         load_tensors(record.parents[1])
 
 
-def test_a_manifest_beside_weights_adds_lines_and_overrides_none(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_manifest_beside_weights_adds_lines_and_overrides_none(tmp_path, monkeypatch):
     monkeypatch.setattr(store, "manifest", lambda: (line("a.bin"),))
     put(tmp_path / "deep", "b.bin", OTHER)
     lines = (line("a.bin", OTHER), line("b.bin", OTHER))
@@ -150,10 +135,7 @@ def test_a_manifest_beside_weights_adds_lines_and_overrides_none(
     assert found_by(weights).name == "b.bin"
 
 
-# what is not what it should be
-
-
-def test_other_bytes_of_the_same_size_are_refused_with_both_digests(tmp_path: Path) -> None:
+def test_other_bytes_of_the_same_size_are_refused_with_both_digests(tmp_path):
     put(tmp_path, data=OTHER)
     with (
         pytest.warns(UserWarning, match=f"a.bin: .*{digest_of(OTHER)}.*{digest_of(DATA)}"),
@@ -162,7 +144,7 @@ def test_other_bytes_of_the_same_size_are_refused_with_both_digests(tmp_path: Pa
         WeightStore([tmp_path], [line()]).load("slot")
 
 
-def test_after_a_bad_file_the_search_goes_on(tmp_path: Path) -> None:
+def test_after_a_bad_file_the_search_goes_on(tmp_path):
     put(tmp_path / "one", "a.bin", DATA[:-1])
     path = put(tmp_path / "two", "renamed.bin", DATA) / "renamed.bin"
     weights = WeightStore([tmp_path / "one", tmp_path / "two"], [line("a.bin"), line("b.bin", OTHER)])
@@ -172,7 +154,7 @@ def test_after_a_bad_file_the_search_goes_on(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["pipe", "link"])
-def test_what_cannot_be_read_is_passed_over(tmp_path: Path, kind: str) -> None:
+def test_what_cannot_be_read_is_passed_over(tmp_path, kind):
     path = tmp_path / "a.bin"
     os.mkfifo(path) if kind == "pipe" else path.symlink_to(tmp_path / "nothing")
     weights = WeightStore([tmp_path], [line()])
@@ -182,7 +164,7 @@ def test_what_cannot_be_read_is_passed_over(tmp_path: Path, kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", ["pipe", "garbage", "too large"])
-def test_a_manifest_that_cannot_be_read_is_passed_over(tmp_path: Path, kind: str) -> None:
+def test_a_manifest_that_cannot_be_read_is_passed_over(tmp_path, kind):
     path = put(tmp_path) / "weights_manifest.txt"
     if kind == "pipe":
         os.mkfifo(path)
@@ -192,7 +174,7 @@ def test_a_manifest_that_cannot_be_read_is_passed_over(tmp_path: Path, kind: str
         assert WeightStore([tmp_path]).files
 
 
-def test_verify_tells_good_truncated_swapped_renamed_and_unverified_files_apart(tmp_path: Path) -> None:
+def test_verify_tells_good_truncated_swapped_renamed_and_unverified_files_apart(tmp_path):
     contents = {name: name.encode() * 9 for name in ("good", "cut", "swapped", "lost", "damaged", "free")}
     files = [line(f"{name}.pt", data) for name, data in contents.items() if name != "free"]
     files.append(line("free.pt", size=-1, digest=UNVERIFIED))

@@ -1,12 +1,16 @@
 """Options that several commands share, and tables on the screen."""
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from math import inf
 from pathlib import Path
 
 from mkpc_kaggle.engine.budget import Budget, monotonic_of, parse_duration
 from mkpc_kaggle.engine.cluster import parse_workers
+from mkpc_kaggle.engine.console import say
+from mkpc_kaggle.engine.engine import RunReport
+from mkpc_kaggle.engine.session import Session, Watchdog, interruptible
 from mkpc_kaggle.pipeline.assembly import Assembly, assemble
 from mkpc_kaggle.pipeline.availability import Licence
 from mkpc_kaggle.recipe import Mode
@@ -49,22 +53,37 @@ def add_run(parser: argparse.ArgumentParser, time_limit: str | None) -> None:
     add("--explain", action="store_true", help="say at the end what was planned when, and why")
 
 
-def assembly_of(arguments: argparse.Namespace, recipe: str, mode: Mode) -> Assembly:
+def assembly_of(arguments: argparse.Namespace, recipe: str, mode: str) -> Assembly:
     """The parts of a run of this recipe, as the other options say."""
-    return assemble(
-        recipe,
-        weights=arguments.weights,
-        device=arguments.device,
-        precision=arguments.precision,
-        mode=mode,
-        licence=Licence(arguments.licence),
-        scenes=arguments.reconstruct,
-    )
+    given = {name: getattr(arguments, name) for name in ("weights", "device", "precision")}
+    licence, scenes = Licence(arguments.licence), arguments.reconstruct
+    return assemble(recipe, **given, mode=Mode(mode), licence=licence, scenes=scenes)
 
 
 def budget_of(arguments: argparse.Namespace) -> Budget:
     started = arguments.started if arguments.started_at is None else monotonic_of(arguments.started_at)
     return Budget(started, inf if arguments.time_limit is None else parse_duration(arguments.time_limit))
+
+
+@contextmanager
+def watched_session(arguments: argparse.Namespace, work_dir: Path) -> Iterator[tuple[Session, Watchdog]]:
+    """A session as the options say, and the watchdog that ends the program in time whatever happens."""
+    budget, fresh, workers = budget_of(arguments), arguments.fresh, arguments.workers
+    with interruptible() as interrupt, Watchdog(budget, interrupt) as watchdog:
+        yield Session(work_dir, budget, interrupt, fresh, workers=workers, watchdog=watchdog), watchdog
+
+
+def say_start(what: str, assembly: Assembly, work_dir: Path) -> None:
+    """Say what is matched by what, and which matchers are left out."""
+    from mkpc_kaggle.reporting.summary import left_out_line  # pandas takes a while
+
+    header = f"{what}, recipe {assembly.recipe.name}, {assembly.placement}, journal in {work_dir}"
+    say("\n".join(filter(None, [header, left_out_line(assembly.left_out)])))
+
+
+def plan_lines(arguments: argparse.Namespace, report: RunReport) -> list[str]:
+    """What was planned when, and why, if ``--explain`` asks for it."""
+    return ["plan:", *map(str, report.explanations)] if arguments.explain else []
 
 
 def print_table(rows: Sequence[tuple[str, ...]]) -> None:

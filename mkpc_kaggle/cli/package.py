@@ -41,9 +41,9 @@ def run(arguments: argparse.Namespace) -> int:
     for folder, items in (("dataset", package.dataset), ("kernel", package.kernel)):
         sizes = [item.source.stat().st_size for item in items]
         rows = [(i.name, str(size), i.licence or "-", i.note) for i, size in zip(items, sizes, strict=True)]
+        total = f"{len(rows)} files", str(sum(sizes)), "", ""
         print(out / folder)
-        rows = [("file", "bytes", "licence", ""), *rows, (f"{len(rows)} files", str(sum(sizes)), "", "")]
-        options.print_table(rows)
+        options.print_table([("file", "bytes", "licence", ""), *rows, total])
         print()
     if package.restricted:
         names = ", ".join(f"{item.name} ({item.licence})" for item in package.restricted)

@@ -3,21 +3,18 @@
 import argparse
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 from mkpc_kaggle.cli import options
 from mkpc_kaggle.data.outputs import lies_in
 from mkpc_kaggle.engine.budget import format_duration
 from mkpc_kaggle.engine.console import say
-from mkpc_kaggle.engine.session import Session, Watchdog, interruptible
 from mkpc_kaggle.errors import UserError, writing
-from mkpc_kaggle.recipe import Mode
 from mkpc_kaggle.reconstruction.folder import read_folder, read_pair_list
-from mkpc_kaggle.reconstruction.outputs import Form, write_tables
-from mkpc_kaggle.reconstruction.run import FolderResult, for_cameras, reconstruct_folder
+from mkpc_kaggle.reconstruction.outputs import FORMS, write_tables
+from mkpc_kaggle.reconstruction.run import FolderResult, reconstruct_folder
 from mkpc_kaggle.reporting.report import report_run
-from mkpc_kaggle.reporting.summary import left_out_line, trouble
+from mkpc_kaggle.reporting.summary import trouble
 
 HELP = """\
 Match the images of a folder with the engine that makes submissions, and reconstruct their cameras. Each folder
@@ -47,7 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     options.add_matching(parser)
     options.add_run(parser, time_limit=None)
     add("--pairs", type=Path, metavar="FILE", help="match these alone: two paths below DIR a line, as of hloc")
-    add("--format", choices=list(map(str, Form)), help="also write submission.csv; imc2023: of 2024, too")
+    add("--format", choices=FORMS, help="also write submission.csv; imc2023: of 2024, too")
     add(
         "--rotations", action="store_true", help="try to turn images that match nothing by 90, 180 and 270 degrees"
     )
@@ -61,34 +58,30 @@ def run(arguments: argparse.Namespace) -> int:
     if lies_in(out, root) or lies_in(root, out):
         raise UserError(f"--out {out} and the images in {root} are in each other's way; name another place")
     listed = None if arguments.pairs is None else read_pair_list(arguments.pairs, root, datasets)
-    budget = options.budget_of(arguments)
-    with interruptible() as interrupt, Watchdog(budget, interrupt) as watchdog, writing(f"--out {out}"):
-        assembly = options.assembly_of(arguments, arguments.recipe, Mode(arguments.mode))
-        assembly = replace(assembly, recipe=for_cameras(assembly.recipe))
-        images = sum(len(dataset.files) for dataset in datasets)
-        header = f"{images} images, recipe {assembly.recipe.name}, {assembly.placement}, journal in {work_dir}"
-        say("\n".join(filter(None, [header, left_out_line(assembly.left_out)])))
-        session = Session(
-            work_dir, budget, interrupt, arguments.fresh, workers=arguments.workers, watchdog=watchdog
-        )
+    with options.watched_session(arguments, work_dir) as (session, watchdog), writing(f"--out {out}"):
+        assembly = options.assembly_of(arguments, arguments.recipe, arguments.mode)
+        options.say_start(f"{sum(map(len, datasets.values()))} images", assembly, work_dir)
         result = reconstruct_folder(datasets, assembly, session, out, listed=listed, rotations=arguments.rotations)
-        write_tables(out, result.cameras, root, arguments.format and Form(arguments.format))
+        write_tables(out, result.cameras, root, arguments.format)
         failed = trouble(result.report)
-        watchdog.status = int(bool(failed) or not any(result.cameras.values()))
-        explained = ["plan:", *map(str, result.report.explanations)] if arguments.explain else []
-        say("\n".join(filter(None, [*explained, *_told(result), failed, f"results: {out}"])))
+        watchdog.status = int(bool(failed) or not any(any(found.values()) for found in result.cameras.values()))
+        told = [*options.plan_lines(arguments, result.report), *_told(result), failed, f"results: {out}"]
+        say("\n".join(filter(None, told)))
         say(report_run(work_dir, out / "report.html", session.must_end(), result.pairs))
-        return 128 + interrupt.signal if interrupt.signal else watchdog.status
+        signal = session.interrupt.signal
+        return 128 + signal if signal else watchdog.status
 
 
 def _told(result: FolderResult) -> Iterator[str]:
     """A line for each dataset, and what went wrong."""
-    yield f"{len(result.pairs)} pairs: {result.report.ending} after {format_duration(result.report.seconds)}"
-    reasons = {scene.batch: scene.failure for scene in result.report.scenes}
-    for dataset, cameras in result.cameras.items():
-        models = Counter(camera.model for camera in cameras.values())
+    report = result.report
+    yield f"{len(result.pairs)} pairs: {report.ending} after {format_duration(report.seconds)}"
+    reasons = {scene.batch: scene.failure for scene in report.scenes}
+    for name, found in result.cameras.items():
+        models = Counter(camera.model for camera in found.values() if camera)
         sizes = ", ".join(str(models[number]) for number in sorted(models))
-        why = f"models of {sizes}" if models else reasons.get(dataset.name, "too few pairs, or too little time")
-        yield f"{dataset.name}: {len(cameras)} of {len(dataset.files)} images have a camera: {why}"
-    yield from (f"cannot be read: {failure}" for failure in result.unreadable[:MAX_LINES])
-    yield from (f"fault: {fault}" for fault in result.report.faults[:MAX_LINES])
+        why = f"models of {sizes}" if models else reasons.get(name, "too few pairs, or too little time")
+        yield f"{name}: {models.total()} of {len(found)} images have a camera: {why}"
+    unreadable = {record.failure for record in report.records if record.reached and not record.sizes}
+    yield from (f"cannot be read: {failure}" for failure in sorted(unreadable)[:MAX_LINES])
+    yield from (f"fault: {fault}" for fault in report.faults[:MAX_LINES])

@@ -7,10 +7,9 @@ from mkpc_kaggle.cli import options
 from mkpc_kaggle.data.competition import read_test_side, test_side
 from mkpc_kaggle.data.outputs import require_apart
 from mkpc_kaggle.engine.console import say
-from mkpc_kaggle.engine.session import Session, Watchdog, interruptible, submit
-from mkpc_kaggle.recipe import Mode
+from mkpc_kaggle.engine.session import submit
 from mkpc_kaggle.reporting.report import report_run
-from mkpc_kaggle.reporting.summary import left_out_line, summary, trouble
+from mkpc_kaggle.reporting.summary import summary, trouble
 
 HELP = """\
 Match every pair of test.csv and write its fundamental matrix, a row for each pair.
@@ -48,21 +47,16 @@ def run(arguments: argparse.Namespace) -> int:
     page: Path = arguments.report or output.parent / f"{output.stem}.html"
     files = {"--output": output, "--report": None if arguments.no_report else page}
     require_apart(files, [*test_side(arguments.test_dir), Path(arguments.recipe)], work_dir, arguments.weights)
-    budget = options.budget_of(arguments)
-    with interruptible() as interrupt, Watchdog(budget, interrupt) as watchdog:
+    with options.watched_session(arguments, work_dir) as (session, watchdog):
         pairs = read_test_side(arguments.test_dir)
-        assembly = options.assembly_of(arguments, arguments.recipe, Mode(arguments.mode))
-        header = f"{len(pairs)} pairs, recipe {assembly.recipe.name}, {assembly.placement}, journal in {work_dir}"
-        say("\n".join(filter(None, [header, left_out_line(assembly.left_out)])))
-        session = Session(
-            work_dir, budget, interrupt, arguments.fresh, workers=arguments.workers, watchdog=watchdog
-        )
+        assembly = options.assembly_of(arguments, arguments.recipe, arguments.mode)
+        options.say_start(f"{len(pairs)} pairs", assembly, work_dir)
         report = submit(pairs, assembly, session, output)
         watchdog.status = int(bool(report.unwritten or trouble(report)))
-        explained = ["plan:", *map(str, report.explanations)] if arguments.explain else []
         unwritten = f" is not the last version: {report.unwritten}" if report.unwritten else ""
-        told = [*explained, summary(pairs, report), f"submission: {output}{unwritten}"]
+        told = [*options.plan_lines(arguments, report), summary(pairs, report), f"submission: {output}{unwritten}"]
         say("\n".join(told))  # the watchdog may end the program while it draws
         if not arguments.no_report:
             say(report_run(work_dir, page, session.must_end(), pairs))
-        return 128 + interrupt.signal if interrupt.signal else watchdog.status
+        signal = session.interrupt.signal
+        return 128 + signal if signal else watchdog.status

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from mkpc_kaggle.cli import options
 from mkpc_kaggle.config import from_table
-from mkpc_kaggle.data.competition import Pair, TrainScene, read_train_side
+from mkpc_kaggle.data.competition import TrainScene, read_train_side
 from mkpc_kaggle.data.outputs import require_apart
 from mkpc_kaggle.data.pairs import read_pairs
 from mkpc_kaggle.engine.console import say
@@ -18,10 +18,10 @@ from mkpc_kaggle.engine.session import Session, interruptible
 from mkpc_kaggle.errors import UserError, writing
 from mkpc_kaggle.evaluation.compare import Comparison, comparison_json, comparison_table, step_gains
 from mkpc_kaggle.evaluation.imc2025 import score_imc2025, score_lines
-from mkpc_kaggle.evaluation.validate import Validation, score_submission, score_table, to_json, validate
+from mkpc_kaggle.evaluation.validate import score_submission, score_table, to_json, validate
 from mkpc_kaggle.geometry.robust import Method, RobustConfig
 from mkpc_kaggle.pipeline.assembly import Assembly
-from mkpc_kaggle.recipe import Mode, Recipe, split_mode
+from mkpc_kaggle.recipe import Recipe, split_mode
 from mkpc_kaggle.reporting.report import report_run
 from mkpc_kaggle.reporting.summary import left_out_line, summary, trouble
 
@@ -74,7 +74,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     _require_a_whole(arguments)
     if arguments.imc2025 is not None:
-        return _score_imc2025(arguments)
+        for submission in arguments.submission:
+            say("\n".join([str(submission), *score_lines(score_imc2025(arguments.imc2025, submission))]))
+        return 0
     sides = [arguments.train_dir, arguments.image_root]
     inputs = [*sides, arguments.pairs, arguments.truth, *(arguments.submission or ())]
     require_apart({"--json": arguments.json}, filter(None, inputs), arguments.work_dir)
@@ -91,12 +93,9 @@ def run(arguments: argparse.Namespace) -> int:
 def _require_a_whole(given: argparse.Namespace) -> None:
     """Raise :class:`UserError` for options that do not go together."""
     for is_wrong, told in (
+        (given.imc2025 and (given.truth or not given.submission), "--imc2025 needs --submission, and no --truth"),
         (
-            given.imc2025 and not (given.submission and not given.truth),
-            "--imc2025 needs --submission, and no --truth",
-        ),
-        (
-            not given.imc2025 and (given.submission is None) != (given.truth is None),
+            not given.imc2025 and (not given.submission) != (not given.truth),
             "--submission and --truth go together",
         ),
         ((given.pairs is None) != (given.image_root is None), "--pairs and --image-root go together"),
@@ -114,22 +113,14 @@ def _read_scenes(arguments: argparse.Namespace, work_dir: Path) -> tuple[TrainSc
     most: int | None = arguments.pairs_per_scene
     if arguments.pairs is not None:
         return (read_pairs(arguments.pairs, arguments.image_root, copies=work_dir / "turned", most=most),)
-    scenes = filter(None, arguments.scenes.split(","))
-    return read_train_side(
-        arguments.train_dir, scenes=scenes, min_covisibility=arguments.min_covisibility, pairs_per_scene=most
-    )
-
-
-def _score_imc2025(arguments: argparse.Namespace) -> int:
-    for submission in arguments.submission:
-        say("\n".join([str(submission), *score_lines(score_imc2025(arguments.imc2025, submission))]))
-    return 0
+    scenes, least = filter(None, arguments.scenes.split(",")), arguments.min_covisibility
+    return read_train_side(arguments.train_dir, scenes=scenes, min_covisibility=least, pairs_per_scene=most)
 
 
 def _match_and_score(arguments: argparse.Namespace, scenes: tuple[TrainScene, ...], work_dir: Path) -> int:
     """Run a recipe, or several to compare, each then with a journal in a directory of its own."""
     compared: list[str] = arguments.compare or []
-    choices = [split_mode(text) for text in compared] or [(arguments.recipe, Mode(arguments.mode))]
+    choices = [split_mode(text) for text in compared] or [(arguments.recipe, arguments.mode)]
     pairs = [true.pair for scene in scenes for true in scene.pairs]
     validations, status = [], 0
     with interruptible() as interrupt:
@@ -139,10 +130,16 @@ def _match_and_score(arguments: argparse.Namespace, scenes: tuple[TrainScene, ..
             session = Session(place, options.budget_of(arguments), interrupt, workers=arguments.workers)
             validation = validate(scenes, assembly, session)
             validations.append(validation)
-            assert validation.report is not None
-            _tell(arguments, pairs, left_out_line(assembly.left_out), session, validation)
-            status = 128 + interrupt.signal if interrupt.signal else int(bool(trouble(validation.report)))
-            if compared and validation.report.ending != Ending.COMPLETE:
+            report = validation.report
+            assert report is not None
+            told = [*filter(None, [left_out_line(assembly.left_out)]), *options.plan_lines(arguments, report)]
+            told += [summary(pairs, report), "", f"recipe {validation.recipe}"]
+            say("\n".join([*told, *score_table(validation), *step_gains(validation)]))
+            # The report's inliers are of F: there is none for a list of pairs, whose E is estimated.
+            if arguments.work_dir is not None and arguments.pairs is None:
+                say(report_run(place, place / "report.html", session.must_end(), pairs))
+            status = 128 + interrupt.signal if interrupt.signal else int(bool(trouble(report)))
+            if compared and report.ending != Ending.COMPLETE:
                 say("nothing is compared before all is done; with a --work-dir, the same command goes on")
                 return status or 1
     figures = to_json(validations[0])
@@ -156,21 +153,7 @@ def _match_and_score(arguments: argparse.Namespace, scenes: tuple[TrainScene, ..
     return status
 
 
-def _tell(
-    arguments: argparse.Namespace, pairs: list[Pair], left_out: str, session: Session, validation: Validation
-) -> None:
-    """Print the run's summary and its scores."""
-    assert validation.report is not None
-    told = [left_out] if left_out else []
-    told += ["plan:", *map(str, validation.report.explanations)] if arguments.explain else []
-    told += [summary(pairs, validation.report), "", f"recipe {validation.recipe}"]
-    say("\n".join([*told, *score_table(validation), *step_gains(validation)]))
-    # The report's inliers are of F: there is none for a list of pairs, whose E is estimated.
-    if arguments.work_dir is not None and arguments.pairs is None:
-        say(report_run(session.work_dir, session.work_dir / "report.html", session.must_end(), pairs))
-
-
-def _assemble(arguments: argparse.Namespace, name: str, mode: Mode) -> Assembly:
+def _assemble(arguments: argparse.Namespace, name: str, mode: str) -> Assembly:
     """The parts of a run of a recipe, with the units and the robust method that the command names."""
     assembly = options.assembly_of(arguments, name, mode)
     recipe = with_units(assembly.recipe, arguments.units)
@@ -182,8 +165,10 @@ def _assemble(arguments: argparse.Namespace, name: str, mode: Mode) -> Assembly:
 
 def with_units(recipe: Recipe, wanted: str | None) -> Recipe:
     """The recipe with the units of these names alone, in this order; all of them if none are named."""
-    known, names = {unit.name: unit for unit in recipe.units}, wanted.split(",") if wanted is not None else []
+    if wanted is None:
+        return recipe
+    known, names = {unit.name: unit for unit in recipe.units}, wanted.split(",")
     for name in names:
         if name not in known:
             raise UserError(f"--units: recipe {recipe.name!r} has no unit {name!r}; it has {', '.join(known)}")
-    return replace(recipe, units=tuple(known[name] for name in names)) if names else recipe
+    return replace(recipe, units=tuple(known[name] for name in names))

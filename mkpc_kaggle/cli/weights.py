@@ -73,8 +73,8 @@ def _list(arguments: argparse.Namespace) -> int:
     for slot in dict.fromkeys(file.slot for file in store.files):
         files = store.alternatives(slot)
         search = store.search(files)
-        names = " or ".join(file.name for file in files)
-        where = [str(search.found.path)] if search.found else [f"missing: {names}"]
+        missing = f"missing: {' or '.join(file.name for file in files)}"
+        where = [str(search.found.path) if search.found else missing]
         where += [f"refused: {file.path}: {file.note}" for file in search.refused if not search.found]
         users = [spec.name for spec in specs if spec.uses(slot)]
         rows.append((slot, files[0].licence, ", ".join(users) or "-", "; ".join(where)))
@@ -86,32 +86,30 @@ def _list(arguments: argparse.Namespace) -> int:
 def _verify(arguments: argparse.Namespace) -> int:
     wanted = read_manifest(arguments.manifest) if arguments.manifest else None
     store = WeightStore(arguments.weights, wanted)
-    if wanted is None:
-        files = store.verify()
-    else:
-        searches = map(store.search, ([file] for file in wanted))
-        files = [file for search in searches for file in ([search.found] if search.found else search.refused)]
+    searches = [store.search([file]) for file in wanted or ()]
+    looked_for = [file for search in searches for file in ([search.found] if search.found else search.refused)]
+    files = store.verify() if wanted is None else looked_for
     there = {found.file for found in files}
     missing = [file.name for file in wanted or () if file not in there]
     beside = arguments.manifest and arguments.manifest.parent  # where a file needs no path
-    paths = ["" if found.path.parent == beside else str(found.path) for found in files]
-    rows = [
-        (found.file.name, str(found.state), path, found.note) for found, path in zip(files, paths, strict=True)
-    ]
+    rows = [("file", "state", "path", "note")]
+    for found in files:
+        path = "" if found.path.parent == beside else str(found.path)
+        rows.append((found.file.name, str(found.state), path, found.note))
     rows += [(name, "missing", "", f"searched {store.searched}") for name in missing]
-    if not rows:
+    if len(rows) == 1:
         print(f"no weight files found (searched {store.searched})")
         return 0
-    options.print_table([("file", "state", "path", "note"), *rows])
+    options.print_table(rows)
     refused = sum(not found.usable for found in files)
-    print(f"{len(rows)} files, {refused} refused, {len(missing)} missing")
+    print(f"{len(rows) - 1} files, {refused} refused, {len(missing)} missing")
     return int(bool(refused or missing))
 
 
 def _locate(arguments: argparse.Namespace) -> int:
     store = WeightStore(arguments.weights)
     status = 0
-    for search in (store.search(lines) for lines in files_of(arguments.name, store)):
+    for search in map(store.search, files_of(arguments.name, store)):
         for refused in search.refused:
             print(f"refused: {refused.path}: {refused.note}", file=sys.stderr)
         if search.found:

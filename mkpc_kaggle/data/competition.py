@@ -8,6 +8,7 @@ jpeg are accepted on both sides. F of a pair satisfies x2^T F x1 = 0, image 1 be
 import csv
 import os
 import re
+import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -102,7 +103,8 @@ def read_test_side(directory: Path) -> tuple[Pair, ...]:
         if CONTROL.search(sample):
             raise UserError(f"{where}: the sample_id {sample!r} has control characters: no submission can hold it")
         batch, first, second = (plain_name(name, where) for name in ids)
-        pairs[sample] = Pair(sample, batch, files(batch)[first], files(batch)[second])
+        # A large table names a batch in thousands of rows: they share its string.
+        pairs[sample] = Pair(sample, sys.intern(batch), files(batch)[first], files(batch)[second])
     if not images.is_dir():
         raise UserError(f"{images}: no such directory; --test-dir must hold test.csv and test_images/")
     if not pairs:

@@ -1,6 +1,6 @@
 """Recipes compared on the same pairs: differences of mAA with bootstrap intervals."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from math import nan
@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mkpc_kaggle.evaluation.validate import Validation, to_json
-from mkpc_kaggle.geometry.metrics import PoseError, pair_accuracy
 
 LEVEL = 0.95
 RESAMPLES = 10_000
@@ -75,12 +74,8 @@ class Comparison:
         """MAA of the validation of that number less the first's, in a scene or as the mean over scenes."""
         wanted = self.scenes if scene is None else (scene,)
         runs = self.validations[0], self.validations[number]
-        values = [[_accuracies(part.errors) for part in run.scenes if part.scene in wanted] for run in runs]
+        values = [[part.accuracies() for part in run.scenes if part.scene in wanted] for run in runs]
         return paired_difference([*zip(*values, strict=True)])
-
-
-def _accuracies(errors: Iterable[PoseError]) -> list[float]:
-    return [pair_accuracy(error) for error in errors]
 
 
 def seconds_per_pair(validation: Validation) -> float:
@@ -99,7 +94,7 @@ def comparison_table(comparison: Comparison) -> list[str]:
     for number, other in enumerate(others, start=1):
         lines += ["", f"{other.recipe} against {first.recipe}: gain of mAA, {LEVEL:.0%} interval"]
         for name in (*comparison.scenes, None):
-            count = sum(counts.values()) if name is None else counts[name]
+            count = counts[name] if name else sum(counts.values())
             lines.append(f"{name or 'mean over scenes':<20}{count:>6}  {comparison.difference(number, name)}")
     return lines
 
@@ -107,16 +102,12 @@ def comparison_table(comparison: Comparison) -> list[str]:
 def step_gains(validation: Validation) -> list[str]:
     """Lines: the gain of mAA, as the mean over scenes, of each step over the step before; none without metres."""
     scenes = [scene for scene in validation.scenes if scene.pairs and scene.in_metres]
-    after = {
-        step: [_accuracies(pair.steps[step] for pair in scene.pairs) for scene in scenes]
-        for step in validation.steps
-    }
-    return [
-        f"gain of {step} over the step before, {LEVEL:.0%} interval: "
-        f"{paired_difference([*zip(after[former], after[step], strict=True)])}"
-        for former, step in pairwise(validation.steps)
-        if scenes
-    ]
+    lines = []
+    for steps in pairwise(validation.steps if scenes else ()):
+        before, after = ([scene.accuracies(step) for scene in scenes] for step in steps)
+        difference = paired_difference([*zip(before, after, strict=True)])
+        lines.append(f"gain of {steps[1]} over the step before, {LEVEL:.0%} interval: {difference}")
+    return lines
 
 
 def comparison_json(comparison: Comparison) -> dict[str, Any]:
@@ -128,11 +119,8 @@ def comparison_json(comparison: Comparison) -> dict[str, Any]:
 
     first, *others = comparison.validations
     runs = [{**to_json(run), "work_seconds_per_pair": seconds_per_pair(run)} for run in comparison.validations]
-    gains = [
-        {
-            **{"recipe": other.recipe, "against": first.recipe, **gain(number)},
-            "scenes": [{"scene": name, **gain(number, name)} for name in comparison.scenes],
-        }
-        for number, other in enumerate(others, start=1)
-    ]
+    gains = []
+    for number, other in enumerate(others, start=1):
+        scenes = [{"scene": name, **gain(number, name)} for name in comparison.scenes]
+        gains.append({"recipe": other.recipe, "against": first.recipe, **gain(number), "scenes": scenes})
     return {"recipes": runs, "level": LEVEL, "gains": gains}

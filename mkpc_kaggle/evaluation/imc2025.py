@@ -26,6 +26,7 @@ MIN_SPREAD = 1e-12  # sum of squares; centres with less stand at one point
 
 Points = NDArray[np.float64]  # (N, 3)
 Centres = Mapping[str, Points]  # of the cameras of a scene or cluster by image, (3,); NaN without a camera
+Parts = Mapping[str, Centres]  # the scenes of a dataset, or its clusters
 
 
 @dataclass(frozen=True)
@@ -48,46 +49,37 @@ def score_imc2025(directory: Path, submission: Path) -> list[DatasetScore]:
 
     Raises :class:`UserError` for files that cannot be read, and if an image is missing, unknown or there twice.
     """
-    truth, found, path = (
-        _poses(directory / "train_labels.csv"),
-        _poses(submission),
-        directory / "train_thresholds.csv",
-    )
-    rows = read_rows(path, ("dataset", "scene", "thresholds"))
-    limits = {tuple(names): _numbers(cell, f"{path}, line {line}") for line, (*names, cell) in rows}
+    truth, found = _centres(directory / "train_labels.csv"), _centres(submission)
+    path = directory / "train_thresholds.csv"
+    thresholds: dict[str, dict[str, Points]] = {name: {} for name in truth}
+    for where, (name, scene, cell) in read_rows(path, ("dataset", "scene", "thresholds")):
+        thresholds.setdefault(name, {})[scene] = _numbers(cell, where)
     for name, scenes in truth.items():
-        given = [image for cluster in found.get(name, {}).values() for image in cluster]
-        if wrong := {image for scene in scenes.values() for image in scene} ^ set(given):
-            raise UserError(
-                f"{submission}: {len(wrong)} images of {name} are missing or unknown, such as {min(wrong)}"
-            )
-        if lacking := [scene for scene in scenes if scene != OUTLIERS and (name, scene) not in limits]:
-            raise UserError(f"{path} has no thresholds of {name}/{lacking[0]}")
-    return [
-        score_dataset(
-            name, scenes, found[name], {scene: limits.get((name, scene), np.zeros(0)) for scene in scenes}
+        images, given = (
+            {image for part in parts.values() for image in part} for parts in (scenes, found.get(name, {}))
         )
-        for name, scenes in truth.items()
-    ]
+        if wrong := images ^ given:
+            told = f"{len(wrong)} images of {name} are missing or unknown, such as {min(wrong)}"
+            raise UserError(f"{submission}: {told}")
+        if lacking := [scene for scene in scenes if scene not in (OUTLIERS, *thresholds[name])]:
+            raise UserError(f"{path} has no thresholds of {name}/{lacking[0]}")
+    return [score_dataset(name, scenes, found[name], thresholds[name]) for name, scenes in truth.items()]
 
 
 def score_dataset(
-    name: str,
-    scenes: Mapping[str, Centres],
-    clusters: Mapping[str, Centres],
-    thresholds: Mapping[str, Sequence[float] | Points],
+    name: str, scenes: Parts, clusters: Parts, thresholds: Mapping[str, Sequence[float] | Points]
 ) -> DatasetScore:
     """Each scene takes the cluster that has most of its images, of several the cluster with the best mAA.
 
     The mAA's numerators and denominators are summed over the scenes before they are divided.
     """
     accurate = possible = common = taken = 0
-    for scene, centres in ((scene, centres) for scene, centres in scenes.items() if scene != OUTLIERS):
-        limits = thresholds[scene][SKIPPED_THRESHOLDS:]
+    for scene in scenes.keys() - {OUTLIERS}:
+        centres, limits = scenes[scene], thresholds[scene][SKIPPED_THRESHOLDS:]
         choices = [
-            (len(centres.keys() & cluster.keys()), accurate_images(centres, cluster, limits), len(cluster))
+            (len(shared), accurate_images(centres, cluster, limits), len(cluster))
             for label, cluster in clusters.items()
-            if label != OUTLIERS and centres.keys() & cluster.keys()
+            if label != OUTLIERS and (shared := centres.keys() & cluster.keys())
         ]
         overlap, count, size = max(choices, key=lambda each: each[:2], default=(0, 0, 0))
         accurate, possible = accurate + count, possible + len(limits) * max(len(centres) - FREE, 0)
@@ -98,53 +90,42 @@ def score_dataset(
 def accurate_images(truth: Centres, cluster: Centres, thresholds: Sequence[float] | Points) -> int:
     """How many images more than ``FREE`` have a centre less than a threshold off, summed over thresholds.
 
-    The similarity that takes the cluster to the scene is found for each threshold on its own.
+    For each threshold on its own, the similarity of three images that takes most of the cluster's centres to the
+    scene's is fitted anew to these.
     """
     common = sorted(name for name in truth.keys() & cluster.keys() if np.isfinite(cluster[name]).all())
     if len(common) < FREE:
         return 0
     source, target = (np.array([centres[name] for name in common]) for centres in (cluster, truth))
-    return sum(max(fitting(source, target, threshold) - FREE, 0) for threshold in thresholds)
+    tried, total = residuals(source, target, _triplets(len(common))), 0
+    for threshold in thresholds:
+        near = tried[(tried < threshold).sum(axis=1).argmax()] < threshold
+        best = FREE
+        for _ in range(REFINEMENTS):
+            best = max(best, int(near.sum()))
+            if near.sum() < FREE:
+                break
+            near = residuals(source, target, near.nonzero()[0][None])[0] < threshold
+        total += best - FREE
+    return total
 
 
-def fitting(source: Points, target: Points, threshold: float) -> int:
-    """The most points, (N, 3), that a similarity from ``source`` takes to less than ``threshold`` from ``target``.
+def residuals(source: Points, target: Points, fitted: NDArray[np.intp]) -> NDArray[np.float64]:
+    """(B, N): how far from its target each point is, moved by the similarity of the points ``fitted``, (B, K).
 
-    Similarities are those of triplets; the best of them is fitted anew to the points that agree with it.
-    """
-    triplets, best = _triplets(len(source)), 0
-    inside = _distances(*similarities(source[triplets], target[triplets]), source, target) < threshold
-    agreeing = inside[inside.sum(axis=1).argmax()]
-    for _ in range(REFINEMENTS):
-        best = max(best, int(agreeing.sum()))
-        if agreeing.sum() < FREE:
-            break
-        refined = similarities(source[None, agreeing], target[None, agreeing])
-        agreeing = _distances(*refined, source, target)[0] < threshold
-    return best
-
-
-def similarities(source: Points, target: Points) -> tuple[Points, Points]:
-    """A (B, 3, 3), a rotation times a scale, and t (B, 3) with A x + t nearest to the targets, from (B, N, 3).
-
-    NaN where all sources are one point.
+    It is NaN where the fitted sources are one point.
 
     Source: Umeyama 1991, the solution of Horn's problem by a singular value decomposition.
     """
-    means = source.mean(axis=1), target.mean(axis=1)
-    x, y = source - means[0][:, None], target - means[1][:, None]
-    U, S, Vt = np.linalg.svd(np.swapaxes(y, 1, 2) @ x)
-    signs = np.ones_like(S)
-    signs[:, 2] = np.sign(np.linalg.det(U) * np.linalg.det(Vt))
-    spread = (x**2).sum(axis=(1, 2))
-    scale = np.where(spread < MIN_SPREAD, np.nan, (S * signs).sum(axis=1) / np.maximum(spread, MIN_SPREAD))
-    A = scale[:, None, None] * (U * signs[:, None]) @ Vt
-    return A, means[1] - np.einsum("bij,bj->bi", A, means[0])
-
-
-def _distances(A: Points, t: Points, source: Points, target: Points) -> NDArray[np.float64]:
-    """(B, N): how far each similarity takes each point from its target."""
-    moved = np.einsum("bij,nj->bni", A, source) + t[:, None]
+    x, y = source[fitted], target[fitted]
+    x_mean, y_mean = x.mean(axis=1, keepdims=True), y.mean(axis=1, keepdims=True)
+    U, S, Vt = np.linalg.svd(np.swapaxes(y - y_mean, 1, 2) @ (x - x_mean))
+    sign = np.sign(np.linalg.det(U @ Vt))
+    U[:, :, 2] *= sign[:, None]
+    S[:, 2] *= sign
+    spread = ((x - x_mean) ** 2).sum(axis=(1, 2))
+    scale = S.sum(axis=1) / np.where(spread < MIN_SPREAD, np.nan, spread)
+    moved = scale[:, None, None] * (source - x_mean) @ np.swapaxes(U @ Vt, 1, 2) + y_mean
     return np.asarray(np.linalg.norm(moved - target, axis=2))
 
 
@@ -155,7 +136,7 @@ def _triplets(count: int) -> NDArray[np.intp]:
     return np.argpartition(drawn, 3, axis=1)[:, :3]
 
 
-def _poses(path: Path) -> dict[str, dict[str, dict[str, Points]]]:
+def _centres(path: Path) -> dict[str, dict[str, dict[str, Points]]]:
     """The camera centres of a table of poses: by dataset, scene or cluster, and image."""
     found: dict[str, dict[str, dict[str, Points]]] = {}
     seen: set[tuple[str, str]] = set()

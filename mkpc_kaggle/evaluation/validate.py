@@ -14,14 +14,8 @@ from mkpc_kaggle.engine.engine import RunReport
 from mkpc_kaggle.engine.records import PairRecord
 from mkpc_kaggle.engine.session import Session, run_pairs
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.geometry.metrics import (
-    AUC_THRESHOLDS,
-    PoseError,
-    mean_average_accuracy,
-    pair_accuracy,
-    pose_auc,
-    pose_error,
-)
+from mkpc_kaggle.geometry import metrics
+from mkpc_kaggle.geometry.metrics import AUC_THRESHOLDS, PoseError, mean_average_accuracy
 from mkpc_kaggle.geometry.robust import Matrix3, ModelKind
 from mkpc_kaggle.pipeline.assembly import Assembly
 
@@ -60,6 +54,10 @@ class SceneScore:
     def errors(self) -> list[PoseError]:
         return [pair.error for pair in self.pairs]
 
+    def accuracies(self, step: Step | None = None) -> list[float]:
+        """The accuracy of each pair after a step, by default the last."""
+        return [metrics.pair_accuracy(pair.steps[step] if step else pair.error) for pair in self.pairs]
+
     @property
     def maa(self) -> float:
         return mean_average_accuracy(self.errors) if self.in_metres else nan
@@ -68,7 +66,7 @@ class SceneScore:
         return mean_average_accuracy([pair.steps[step] for pair in self.pairs]) if self.in_metres else nan
 
     def auc(self, threshold: float) -> float:
-        return pose_auc(self.errors, threshold)
+        return metrics.pose_auc(self.errors, threshold)
 
 
 @dataclass(frozen=True)
@@ -103,22 +101,18 @@ class Validation:
 def validate(scenes: Sequence[TrainScene], assembly: Assembly, session: Session) -> Validation:
     """Match all pairs of the scenes and score them."""
     report = run_pairs([true.pair for scene in scenes for true in scene.pairs], assembly, session)
-    steps = _steps_of(report.records, prior=assembly.recipe.focal is not None)
+    prior = assembly.recipe.focal is not None
+    made = {  # if E is sought at known focal lengths, there is no MAGSAC alone
+        Step.MAGSAC: not prior or any(record.magsac_fundamental is not None for record in report.records),
+        Step.PRIOR: prior,
+        Step.SCENE: any(record.scene is not None for record in report.records),
+    }
+    steps = tuple(step for step in Step if made[step])
     records, scored = iter(report.records), []
     for scene in scenes:
         pairs = tuple(score_record(true, next(records), scene, steps) for true in scene.pairs)
         scored.append(SceneScore(scene.name, pairs, isfinite(scene.metres_per_unit)))
     return Validation(assembly.recipe.name, tuple(scored), report, steps)
-
-
-def _steps_of(records: Sequence[PairRecord], *, prior: bool) -> tuple[Step, ...]:
-    """The steps that a run made; if E is sought at known focal lengths, there is no MAGSAC alone."""
-    made = {
-        Step.MAGSAC: not prior or any(record.magsac_fundamental is not None for record in records),
-        Step.PRIOR: prior,
-        Step.SCENE: any(record.scene is not None for record in records),
-    }
-    return tuple(step for step in Step if made[step])
 
 
 def score_record(true: TruePair, record: PairRecord, scene: TrainScene, steps: Sequence[Step] = ()) -> PairScore:
@@ -130,9 +124,8 @@ def score_record(true: TruePair, record: PairRecord, scene: TrainScene, steps: S
         Step.SCENE: None if record.source == "fallback" else record.chosen_fundamental,
     }
     errors = {step: error_of(matrix, true, scene) for step, matrix in matrices.items()}
-    return PairScore(
-        true.pair.id, true.covisibility, errors[Step.SCENE], record, {step: errors[step] for step in steps}
-    )
+    made = {step: errors[step] for step in steps}
+    return PairScore(true.pair.id, true.covisibility, errors[Step.SCENE], record, made)
 
 
 def error_of(matrix: Matrix3 | None, true: TruePair, scene: TrainScene) -> PoseError:
@@ -142,7 +135,7 @@ def error_of(matrix: Matrix3 | None, true: TruePair, scene: TrainScene) -> PoseE
     camera0, camera1 = true.camera0, true.camera1
     if true.pair.model is ModelKind.E:
         camera0, camera1 = camera0.calibrated, camera1.calibrated
-    return pose_error(matrix, camera0, camera1, scene.metres_per_unit)
+    return metrics.pose_error(matrix, camera0, camera1, scene.metres_per_unit)
 
 
 def score_submission(submission: Path, truth: Path, scenes: Sequence[TrainScene]) -> Validation:
@@ -228,7 +221,7 @@ def _pair_json(pair: PairScore) -> dict[str, Any]:
         "rotation_error_degrees": _finite(pair.error.rotation),
         "translation_error_metres": _finite(pair.error.translation),
         "translation_error_degrees": _finite(pair.error.translation_angle),
-        "accuracy_by_step": {step: pair_accuracy(error) for step, error in pair.steps.items()},
+        "accuracy_by_step": {step: metrics.pair_accuracy(error) for step, error in pair.steps.items()},
     }
     if (record := pair.record) is not None:
         values |= {"failure": record.failure, "inliers": record.inliers}

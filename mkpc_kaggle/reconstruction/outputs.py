@@ -2,7 +2,6 @@
 
 import csv
 from collections.abc import Iterator, Mapping, Sequence
-from enum import StrEnum
 from pathlib import Path
 
 import numpy as np
@@ -10,25 +9,20 @@ from numpy.typing import NDArray
 
 from mkpc_kaggle.data.outputs import replacing
 from mkpc_kaggle.engine.records import CameraRecord
-from mkpc_kaggle.geometry.cameras import Camera
-from mkpc_kaggle.reconstruction.folder import Dataset
 
-Cameras = Mapping[Dataset, Mapping[str, CameraRecord]]  # of images with a camera, by the names of their files
+Cameras = Mapping[str, Mapping[Path, CameraRecord | None]]  # of each file of a dataset, None without a camera
 
-ORIGIN = Camera(np.eye(3), np.eye(3), np.zeros(3))
-NO_CAMERA = Camera(np.eye(3), np.full((3, 3), np.nan), np.full(3, np.nan))
-
-
-class Form(StrEnum):
-    """The forms of a submission."""
-
-    IMC2025 = "imc2025"  # a cluster for each model; an image without a camera is an outlier, its pose nan
-    IMC2023 = "imc2023"  # also of 2024: the cameras of the largest model, the other images at the origin
+NO_POSE = ";".join(["nan"] * 9), "nan;nan;nan"
+ORIGIN = "1;0;0;0;1;0;0;0;1", "0;0;0"
+FORMS = (  # of a submission
+    "imc2025",  # a cluster for each model; an image without a camera is an outlier, its pose nan
+    "imc2023",  # also of 2024: the cameras of the largest model, the other images at the origin
+)
 
 
-def write_tables(out: Path, cameras: Cameras, root: Path, form: Form | None) -> None:
-    """Write ``cameras.csv`` and, in a ``form``, ``submission.csv``; raises ``OSError`` if that cannot be."""
-    tables = {"cameras.csv": camera_rows(cameras)}
+def write_tables(out: Path, cameras: Cameras, root: Path, form: str | None) -> None:
+    """Write ``cameras.csv`` and, in one of ``FORMS``, ``submission.csv``; raises ``OSError`` if that cannot be."""
+    tables = {"cameras.csv": camera_rows(cameras, root)}
     if form is not None:
         tables["submission.csv"] = submission_rows(form, cameras, root)
     for name, rows in tables.items():
@@ -36,37 +30,33 @@ def write_tables(out: Path, cameras: Cameras, root: Path, form: Form | None) -> 
             csv.writer(stream, lineterminator="\n").writerows(rows)
 
 
-def camera_rows(cameras: Cameras) -> Iterator[Sequence[str]]:
+def camera_rows(cameras: Cameras, root: Path) -> Iterator[Sequence[str]]:
     """A row for each image with a camera: its path below the folder, its model, K, R and t.
 
     The centre of an image's first pixel is (0, 0); X_cam = R X + t.
     """
     yield "image", "model", "K", "R", "t"
-    for dataset, found in cameras.items():
-        for name, record in found.items():
+    for file, record in (item for found in cameras.values() for item in found.items()):
+        if record is not None:
             parts = record.camera.K, record.camera.R, record.camera.t
-            yield (Path(dataset.name) / name).as_posix(), str(record.model), *map(joined, parts)
+            yield file.relative_to(root).as_posix(), str(record.model), *map(joined, parts)
 
 
-def submission_rows(form: Form, cameras: Cameras, root: Path) -> Iterator[Sequence[str]]:
+def submission_rows(form: str, cameras: Cameras, root: Path) -> Iterator[Sequence[str]]:
     """A row for each image, in the order of the folder."""
-    first = (
-        ("image_id", "dataset", "scene", "image") if form is Form.IMC2025 else ("image_path", "dataset", "scene")
-    )
-    yield *first, "rotation_matrix", "translation_vector"
+    of_2025 = form == "imc2025"
+    heads = ("image_id", "dataset", "scene", "image") if of_2025 else ("image_path", "dataset", "scene")
+    yield *heads, "rotation_matrix", "translation_vector"
     for dataset, found in cameras.items():
-        folder = root.resolve().name if dataset.name == "." else dataset.name
-        for name in (file.name for file in dataset.files):
-            record = found.get(name)
-            columns: tuple[str, ...]
-            if form is Form.IMC2025:
-                columns = f"{folder}_{name}", folder, f"cluster{record.model}" if record else "outliers", name
+        folder = root.resolve().name if dataset == "." else dataset
+        parts = folder.split("/")  # of 2023 dataset/scene/images, of 2024 dataset/images
+        for name, record in ((file.name, record) for file, record in found.items()):
+            pose = (joined(record.camera.R), joined(record.camera.t)) if record else NO_POSE
+            if of_2025:
+                yield f"{folder}_{name}", folder, f"cluster{record.model}" if record else "outliers", name, *pose
             else:
-                parts = folder.split("/")  # dataset/scene/images; of 2024 dataset/images
-                columns = f"{folder}/{name}", parts[0], parts[1 if len(parts) > 2 else 0]
-                record = record if record and record.model == 0 else None
-            camera = record.camera if record else NO_CAMERA if form is Form.IMC2025 else ORIGIN
-            yield *columns, joined(camera.R), joined(camera.t)
+                place = f"{folder}/{name}", parts[0], parts[1 if len(parts) > 2 else 0]
+                yield *place, *(pose if record and record.model == 0 else ORIGIN)
 
 
 def joined(numbers: NDArray[np.float64]) -> str:

@@ -8,16 +8,16 @@ from typing import Any
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.data.pairs import turned_copy
 from mkpc_kaggle.engine.engine import RunReport
-from mkpc_kaggle.engine.records import CameraRecord, SceneRecord
+from mkpc_kaggle.engine.records import CameraRecord
 from mkpc_kaggle.engine.session import Session, run_pairs
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.matchers.contract import Matcher
 from mkpc_kaggle.pipeline.assembly import Assembly
 from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher, to_image
 from mkpc_kaggle.recipe import Recipe, SceneConfig, load_recipe
-from mkpc_kaggle.reconstruction.folder import Dataset, Ends, pairs_of
+from mkpc_kaggle.reconstruction.folder import Datasets, Ends, pairs_of
+from mkpc_kaggle.reconstruction.likeness import find_turns
 from mkpc_kaggle.reconstruction.outputs import Cameras
-from mkpc_kaggle.reconstruction.rotations import find_turns
 from mkpc_kaggle.scene.export import MODELS, Export
 from mkpc_kaggle.scene.reconstruct import models_of, reconstruct_sharing
 from mkpc_kaggle.scene.reconstruction import SfmModel
@@ -32,11 +32,6 @@ class FolderResult:
     pairs: tuple[Pair, ...]
     cameras: Cameras
 
-    @property
-    def unreadable(self) -> list[str]:
-        """Which images cannot be read, and why."""
-        return sorted({record.failure for record in self.report.records if record.reached and not record.sizes})
-
 
 def for_cameras(recipe: Recipe) -> Recipe:
     """The recipe without steps that only improve the F of single pairs, and without extra pairs."""
@@ -45,52 +40,44 @@ def for_cameras(recipe: Recipe) -> Recipe:
 
 
 def reconstruct_folder(
-    datasets: Sequence[Dataset],
+    datasets: Datasets,
     assembly: Assembly,
     session: Session,
     out: Path,
     *,
-    listed: Mapping[str, list[Ends]] | None = None,
+    listed: Sequence[Ends] | None = None,
     rotations: bool = False,
 ) -> FolderResult:
     """Match the pairs of each dataset, those ``listed`` or by :func:`pairs_of`, and reconstruct it.
 
     COLMAP's files of a dataset are in the folder of its name in ``out``. With ``rotations``, images that match
-    nothing are turned. ``assembly`` is of a recipe :func:`for_cameras`. A scene's own process writes its files
-    before the journal says that the scene is done, so a run that was killed makes what is lacking.
+    nothing are turned. A scene's own process writes its files before the journal says that the scene is done, so
+    a run that was killed makes what is lacking.
     """
+    assembly = replace(assembly, recipe=for_cameras(assembly.recipe))
     pairs, exports = [], {}
-    for dataset in datasets:
-        ends = pairs_of(dataset) if listed is None else listed.get(dataset.name, [])
-        turns = find_turns(dataset.files, assembly) if rotations and ends else {}
-        shown = {file: turned_copy(file, count, session.work_dir / "turned")[0] for file, count in turns.items()}
-        files = {shown.get(file, file).stem: (file.name, turns.get(file, 0)) for file in dataset.files}
-        exports[dataset.name] = Export(out / dataset.name, files)
-        pairs += [
-            Pair(f"{dataset.name}/{a.stem}/{b.stem}", dataset.name, str(shown.get(a, a)), str(shown.get(b, b)))
-            for a, b in ends
-        ]
+    for name, files in datasets.items():
+        ends = pairs_of(files) if listed is None else [two for two in listed if two[0].parent == files[0].parent]
+        turns = dict.fromkeys(files, 0) | (find_turns(files, assembly) if rotations and ends else {})
+        shown = {file: turned_copy(file, turns[file], session.work_dir / "turned")[0] for file in files}
+        exports[name] = Export(out / name, {shown[file].stem: (file.name, turns[file]) for file in files})
+        pairs += [Pair(f"{name}/{a.stem}/{b.stem}", name, str(shown[a]), str(shown[b])) for a, b in ends]
     report = run_pairs(pairs, assembly, replace(session, exports=exports))
-    digests: dict[tuple[str, str], str] = {}
+    versions: dict[str, dict[str, str]] = {name: {} for name in datasets}
     for pair, record in zip(pairs, report.records, strict=True):
         # A pair that was not reached, or of which an image cannot be read, has no versions.
         for path, version in zip(pair.images if record.versions else (), record.versions, strict=True):
-            digests[pair.group, exports[pair.group].files[path.stem][0]] = version
-    scenes = {scene.batch: scene for scene in report.scenes}
-    cameras = {dataset: cameras_of(dataset, scenes.get(dataset.name), digests) for dataset in datasets}
-    for dataset, found in cameras.items():
-        if found and not (models := out / dataset.name / MODELS).is_dir():
+            versions[pair.group][exports[pair.group].files[path.stem][0]] = version
+    placed = {scene.batch: scene.cameras for scene in report.scenes}
+    cameras: dict[str, Mapping[Path, CameraRecord | None]] = {}
+    for name, files in datasets.items():
+        found = placed.get(name, ())
+        if found and not (models := out / name / MODELS).is_dir():
             raise UserError(f"{models} was removed after it was made; start anew with --fresh")
+        # Files of one content have one camera, that of the largest model that has it.
+        known = {versions[name][camera.image]: camera for camera in reversed(found)}
+        cameras[name] = {file: known.get(versions[name].get(file.name, "")) for file in files}
     return FolderResult(report, tuple(pairs), cameras)
-
-
-def cameras_of(
-    dataset: Dataset, scene: SceneRecord | None, digests: Mapping[tuple[str, str], str]
-) -> dict[str, CameraRecord]:
-    """The camera of each image in the largest model that has it; files of one content have one camera."""
-    known = {digests[dataset.name, found.image]: found for found in reversed(scene.cameras if scene else ())}
-    names = ((file.name, digests.get((dataset.name, file.name))) for file in dataset.files)
-    return {name: known[digest] for name, digest in names if digest in known}
 
 
 def reconstruct(
@@ -106,15 +93,13 @@ def reconstruct(
     What the command ``reconstruct`` does, in this process and without its budget and journal. Raises
     :class:`UserError` for a recipe that cannot run here, and for an image that cannot be read.
     """
-    dataset = Dataset(".", tuple(sorted(map(Path, images))))
+    files = sorted(map(Path, images))
     chosen = for_cameras(load_recipe(recipe) if isinstance(recipe, str) else recipe)
     matcher = TwoStageMatcher(chosen, weights=weights, device=device, matchers=matchers)
-    known: dict[Path, BatchImage] = {}
-    for path in dataset.files:
-        image = to_image(path)
-        known[path] = BatchImage(str(path), image.name, image.size)
+    decoded = ((path, to_image(path)) for path in files)
+    known = {path: BatchImage(str(path), image.name, image.size) for path, image in decoded}
     pairs = []
-    for path0, path1 in pairs_of(dataset):
+    for path0, path1 in pairs_of(files):
         match = matcher(path0, path1)
         pairs.append(BatchPair(known[path0], known[path1], match.matches, None, tracks_of(match.results)))
     found, _ = reconstruct_sharing(ViewGraph.of_pairs(pairs), chosen.scene or SceneConfig())

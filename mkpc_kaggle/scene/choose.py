@@ -11,7 +11,6 @@ from mkpc_kaggle.geometry.cameras import fundamental_of_cameras, mean_cameras
 from mkpc_kaggle.geometry.focal_prior import FocalConfig, FocalPrior, estimate_with_prior
 from mkpc_kaggle.geometry.robust import Matrix3, RobustConfig, sampson_distances
 from mkpc_kaggle.scene.reconstruction import RegisteredImage
-from mkpc_kaggle.scene.shared_intrinsics import SharedIntrinsics
 from mkpc_kaggle.scene.view_graph import BatchPair
 
 MAX_DISAGREEMENT_DEG = 5.0  # between the rotations that are averaged over reconstructions
@@ -86,31 +85,20 @@ def contradicts(F: Matrix3, pair: BatchPair) -> bool:
 
 
 def estimate_at_known_focals(
-    pair: BatchPair,
-    models: Sequence[ModelImages],
-    shared: SharedIntrinsics,
-    focal_config: FocalConfig,
-    magsac: RobustConfig,
+    pair: BatchPair, focals: Mapping[str, float], config: FocalConfig, magsac: RobustConfig
 ) -> Matrix3 | None:
-    """F, (3, 3), of a pair's own matches at the focal lengths that the scene knows.
+    """F, (3, 3), of a pair's own matches where the scene knows focal lengths, ``focals`` in pixels by digest.
 
-    A focal length is known if the image is registered, or shares its camera with registered images. ``None`` where
-    neither is known or the matches give no F.
+    ``None`` where neither image's is known or the matches give no F.
     """
     images = pair.image0, pair.image1
-    focals = [known_focal(image.digest, models, shared) for image in images]
-    if focals == [None, None]:
+    if not any(image.digest in focals for image in images):
         return None
     first, second = (
-        FocalPrior.of_image(image.size, focal_config)
-        if focal is None
-        else FocalPrior.of_focal(focal, FOCAL_SIGMA, image.size)
-        for image, focal in zip(images, focals, strict=True)
+        FocalPrior.of_focal(focals[image.digest], FOCAL_SIGMA, image.size)
+        if image.digest in focals
+        else FocalPrior.of_image(image.size, config)
+        for image in images
     )
-    found = estimate_with_prior(pair.matches, (first, second), magsac, focal_config)
+    found = estimate_with_prior(pair.matches, (first, second), magsac, config)
     return found.matrix if found.ok else None
-
-
-def known_focal(digest: str, models: Sequence[ModelImages], shared: SharedIntrinsics) -> float | None:
-    """The focal length of an image in pixels, by the first model that has it, or of the camera that it shares."""
-    return next((model[digest].focal for model in models if digest in model), shared.get(digest))

@@ -4,26 +4,23 @@ pycolmap can end the process on its own (a failed assertion, memory), and the gl
 pycolmap is imported, a SIGTERM ends the process with a stack trace on stderr. So a caller that cannot afford this
 runs it in a process of its own. Nothing is written to disk, unless COLMAP's files are asked for.
 
-The same input gives the same bytes on one machine with ``threads = 1``. With more threads, sums are added in
-another order each time, and the last digits differ.
-
 Sources: Schoenberger and Frahm 2016 (the incremental mapper), Pan et al. 2024 (the global mapper).
 """
 
 import shutil
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pycolmap
-from numpy.typing import NDArray
 
 from mkpc_kaggle.geometry.cameras import Camera
+from mkpc_kaggle.geometry.coordinates import Points
 from mkpc_kaggle.recipe import CameraModel, SceneConfig
 from mkpc_kaggle.scene.export import DATABASE, MODELS
-from mkpc_kaggle.scene.keypoints import SceneKeypoints, scene_keypoints
+from mkpc_kaggle.scene.keypoints import Index, scene_keypoints
 from mkpc_kaggle.scene.reconstruction import MIN_IMAGES, Reconstruction, RegisteredImage, SfmModel, filter_models
 from mkpc_kaggle.scene.shared_intrinsics import SharedIntrinsics
 from mkpc_kaggle.scene.view_graph import MIN_MATCHES, BatchImage, Edge, ViewGraph
@@ -38,54 +35,61 @@ MIN_REGISTERED = 0.85  # share of a small scene's images below which the other m
 SEED = 0
 
 
-def structure_from_motion(
-    graph: ViewGraph, config: SceneConfig, shared: SharedIntrinsics, directory: Path | None = None
-) -> Reconstruction:
+def structure_from_motion(graph: ViewGraph, config: SceneConfig, shared: SharedIntrinsics) -> Reconstruction:
     """What pycolmap makes of a view graph; perhaps no model, perhaps several.
 
     Each image has a camera of its own, except those with ``shared`` intrinsics, which start at the shared focal
     length. The global mapper goes first. Where it leaves many images of a small scene without a camera, the
-    incremental mapper is asked too, and the reconstruction in which images see points more often stays. In
-    ``directory`` COLMAP's files are left, in the place of earlier files: the database, and a folder of each model.
+    incremental mapper is asked too, and the reconstruction in which images see points more often stays.
     """
     pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
     pycolmap.set_random_seed(SEED)
-    keypoints = scene_keypoints(graph)
-    if directory is not None:
-        shutil.rmtree(directory / MODELS, ignore_errors=True)
-        directory.mkdir(parents=True, exist_ok=True)
-        (directory / DATABASE).unlink(missing_ok=True)
-    with pycolmap.Database.open(":memory:" if directory is None else str(directory / DATABASE)) as database:
-        with pycolmap.DatabaseTransaction(database):
-            cameras = _write_images(database, graph, keypoints, config.camera_model, shared)
-            geometries = verify(graph, keypoints, cameras, config)
-            for edge, matches, geometry in zip(graph.edges, keypoints.matches, geometries, strict=True):
-                if directory is not None:
-                    database.write_matches(edge.first + 1, edge.second + 1, matches)
-                database.write_two_view_geometry(edge.first + 1, edge.second + 1, geometry)
+    with pycolmap.Database.open(":memory:") as database:
+        _fill(database, graph, config, shared)
         images = len(graph.images)
-        found = run_mapper(pycolmap.GlobalPipeline, _global_options(images, config), database, graph)
+        for_global, for_incremental = _mapper_options(images, config)
+        found = run_mapper(pycolmap.GlobalPipeline, for_global, database, graph)
         if images <= LARGE and found.registered < MIN_REGISTERED * images:
-            other = run_mapper(pycolmap.IncrementalPipeline, _incremental_options(config), database, graph)
+            other = run_mapper(pycolmap.IncrementalPipeline, for_incremental, database, graph)
             found = max(found, other, key=lambda each: each.observations)
-    if directory is not None:
-        write_models(found, directory / MODELS)
-    return replace(found, models=tuple(replace(model, colmap=None) for model in found.models))
+        return found
 
 
-def write_models(found: Reconstruction, directory: Path) -> None:
-    """Write each model in COLMAP's binary format to a folder 0, 1, ..., without the images that were left out."""
-    for number, model in enumerate(found.models):
+def write_files(
+    directory: Path, graph: ViewGraph, config: SceneConfig, shared: SharedIntrinsics, models: Sequence[SfmModel]
+) -> None:
+    """Write COLMAP's files in the place of earlier files: the database, and a folder of each of its models.
+
+    The images that were left out of a model are not in its files.
+    """
+    shutil.rmtree(directory / MODELS, ignore_errors=True)
+    directory.mkdir(parents=True, exist_ok=True)
+    (directory / DATABASE).unlink(missing_ok=True)
+    with pycolmap.Database.open(str(directory / DATABASE)) as database:
+        _fill(database, graph, config, shared)
+    for number, model in enumerate(models):
         kept = {each.image.name for each in model.images}
         for frame in [frame for frame in model.colmap.frames.values() if frame.has_pose()]:
             if model.colmap.images[frame.frame_id].name not in kept:
                 model.colmap.deregister_frame(frame.frame_id)
-        (directory / str(number)).mkdir(parents=True)
-        model.colmap.write(directory / str(number))
+        folder = directory / MODELS / str(number)
+        folder.mkdir(parents=True)
+        model.colmap.write(folder)
+
+
+def _fill(database: Any, graph: ViewGraph, config: SceneConfig, shared: SharedIntrinsics) -> None:
+    """Write images with their cameras and keypoints, and the matches and verified geometry of each edge."""
+    keypoints, found = scene_keypoints(graph)
+    with pycolmap.DatabaseTransaction(database):
+        cameras = _write_images(database, graph, keypoints, config.camera_model, shared)
+        geometries = verify(graph.edges, keypoints, found, cameras, config.threads)
+        for edge, matches, geometry in zip(graph.edges, found, geometries, strict=True):
+            database.write_matches(edge.first + 1, edge.second + 1, matches)
+            database.write_two_view_geometry(edge.first + 1, edge.second + 1, geometry)
 
 
 def _write_images(
-    database: Any, graph: ViewGraph, keypoints: SceneKeypoints, model: CameraModel, shared: SharedIntrinsics
+    database: Any, graph: ViewGraph, keypoints: Sequence[Points], model: CameraModel, shared: SharedIntrinsics
 ) -> list[Any]:
     """Write images, frames, cameras and rigs; returns each image's camera.
 
@@ -93,7 +97,7 @@ def _write_images(
     """
     cameras: dict[object, Any] = {}
     used = []
-    for number, (image, points) in enumerate(zip(graph.images, keypoints.points, strict=True), start=1):
+    for number, (image, points) in enumerate(zip(graph.images, keypoints, strict=True), start=1):
         focal = shared.get(image.digest)
         key = number if focal is None else (image.size, focal)
         if key not in cameras:
@@ -123,60 +127,45 @@ def _write_camera(database: Any, number: int, image: BatchImage, model: CameraMo
     return camera
 
 
-def verify(graph: ViewGraph, keypoints: SceneKeypoints, cameras: list[Any], config: SceneConfig) -> list[Any]:
+def verify(
+    edges: Sequence[Edge], keypoints: Sequence[Points], matches: Sequence[Index], cameras: list[Any], threads: int
+) -> list[Any]:
     """The epipolar geometry of each edge, with the matches that agree on it."""
-    options = pycolmap.TwoViewGeometryOptions()
-    options.ransac.max_error = MAX_ERROR_PX
-    options.ransac.max_num_trials = MAX_TRIALS
-    options.ransac.random_seed = SEED
-    options.min_num_inliers = MIN_MATCHES
-    options.detect_watermark = False  # it looks for matches that stand still, of which near views have many
-    points = [found.astype(np.float64) + CENTRE_PX for found in keypoints.points]
+    ransac = {"max_error": MAX_ERROR_PX, "max_num_trials": MAX_TRIALS, "random_seed": SEED}
+    # A watermark is seen in matches that stand still, of which near views have many.
+    settings = {"ransac": ransac, "min_num_inliers": MIN_MATCHES, "detect_watermark": False}
+    options = pycolmap.TwoViewGeometryOptions(settings)
+    points = [found.astype(np.float64) + CENTRE_PX for found in keypoints]
 
-    def of_edge(edge: Edge, matches: NDArray[np.uint32]) -> Any:
+    def of_edge(edge: Edge, index: Index) -> Any:
         first, second = edge.first, edge.second
         ends = cameras[first], points[first], cameras[second], points[second]
-        return pycolmap.estimate_two_view_geometry(*ends, matches, options)
+        return pycolmap.estimate_two_view_geometry(*ends, index, options)
 
-    with ThreadPoolExecutor(config.threads) as pool:
-        return list(pool.map(of_edge, graph.edges, keypoints.matches))
+    with ThreadPoolExecutor(threads) as pool:
+        return list(pool.map(of_edge, edges, matches))
 
 
 def run_mapper(pipeline: Any, options: Any, database: Any, graph: ViewGraph) -> Reconstruction:
     """The plausible models that a mapper makes of what the database holds."""
     manager = pycolmap.ReconstructionManager()
     pipeline(options, database, manager).run()
-    models, rejections = filter_models(
-        [_sfm_model(manager.get(number), graph) for number in range(manager.size())]
+    models = filter_models([_sfm_model(manager.get(number), graph) for number in range(manager.size())])
+    return Reconstruction(graph.names, models, "" if models else "no plausible model came of the matches")
+
+
+def _mapper_options(images: int, config: SceneConfig) -> tuple[Any, Any]:
+    """Those of the global and of the incremental mapper for a scene of so many images."""
+    seed, threads = {"random_seed": SEED}, {"num_threads": config.threads}
+    common = {**seed, **threads, "min_model_size": MIN_IMAGES, "min_num_matches": MIN_MATCHES}
+    parts = dict.fromkeys(("rotation_averaging", "global_positioning", "retriangulation"), seed)
+    required = {"track_required_tracks_per_view": TRACKS_PER_IMAGE} if images > LARGE else {}
+    return (
+        pycolmap.GlobalPipelineOptions({**common, "mapper": {**seed, **threads, **parts, **required}}),
+        pycolmap.IncrementalPipelineOptions(
+            {**common, "extract_colors": False, "mapper": seed, "triangulation": seed}
+        ),
     )
-    failure = "" if models else "no plausible model came of the matches"
-    return Reconstruction(tuple(image.name for image in graph.images), models, rejections, failure)
-
-
-def _incremental_options(config: SceneConfig) -> Any:
-    options = pycolmap.IncrementalPipelineOptions()
-    options.extract_colors = False
-    return _with_common(options, config, options.mapper, options.triangulation)
-
-
-def _global_options(images: int, config: SceneConfig) -> Any:
-    options = pycolmap.GlobalPipelineOptions()
-    mapper = options.mapper
-    mapper.num_threads = config.threads
-    if images > LARGE:
-        mapper.track_required_tracks_per_view = TRACKS_PER_IMAGE
-    parts = mapper, mapper.rotation_averaging, mapper.global_positioning, mapper.retriangulation
-    return _with_common(options, config, *parts)
-
-
-def _with_common(options: Any, config: SceneConfig, *parts: Any) -> Any:
-    """What both mappers are told; ``parts`` have a seed of their own."""
-    options.min_model_size = MIN_IMAGES
-    options.min_num_matches = MIN_MATCHES
-    options.num_threads = config.threads
-    for part in (options, *parts):
-        part.random_seed = SEED
-    return options
 
 
 def _sfm_model(found: Any, graph: ViewGraph) -> SfmModel:

@@ -5,8 +5,6 @@ resolution, or when another matcher finds it. Structure from motion follows poin
 image that are less than a pixel apart have to become a single keypoint.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,30 +14,22 @@ from mkpc_kaggle.scene.view_graph import ViewGraph
 CELL_PX = 0.75  # points of an image in one cell of this size are one keypoint
 
 
-@dataclass(frozen=True, eq=False)
-class SceneKeypoints:
-    """``points``: of each image, (K, 2) float32 in image pixels.
-
-    ``matches``: of each edge, (M, 2) uint32, the places of the matched keypoints in its two images.
-    """
-
-    points: tuple[Points, ...]
-    matches: tuple[NDArray[np.uint32], ...]
+Index = NDArray[np.uint32]  # (M, 2): the places of the matched keypoints in the two images of an edge
 
 
-def scene_keypoints(graph: ViewGraph, cell: float = CELL_PX) -> SceneKeypoints:
-    """The keypoints of a graph's images and, for each of its edges, the matches between them."""
+def scene_keypoints(graph: ViewGraph) -> tuple[list[Points], list[Index]]:
+    """The keypoints of each image, (K, 2) float32 in image pixels, and the matches of each edge."""
     parts: list[list[Points]] = [[] for _ in graph.images]
     for edge in graph.edges:
         parts[edge.first].append(edge.matches.points0)
         parts[edge.second].append(edge.matches.points1)
-    merged = [merge_points(np.concatenate([np.zeros((0, 2), np.float32), *part]), cell) for part in parts]
+    merged = [merge_points(np.concatenate([np.zeros((0, 2), np.float32), *part]), CELL_PX) for part in parts]
     places = [
         iter(np.split(place, np.cumsum([len(points) for points in part])[:-1]))
         for (_, place), part in zip(merged, parts, strict=True)
     ]
     matches = [np.stack([next(places[edge.first]), next(places[edge.second])], axis=1) for edge in graph.edges]
-    return SceneKeypoints(tuple(points for points, _ in merged), tuple(map(one_to_one, matches)))
+    return [points for points, _ in merged], list(map(one_to_one, matches))
 
 
 def merge_points(points: Points, cell: float) -> tuple[Points, NDArray[np.intp]]:
@@ -61,7 +51,7 @@ def merge_points(points: Points, cell: float) -> tuple[Points, NDArray[np.intp]]
     return (total / weight[:, None]).astype(np.float32), place
 
 
-def one_to_one(index: NDArray[np.intp]) -> NDArray[np.uint32]:
+def one_to_one(index: NDArray[np.intp]) -> Index:
     """(N, 2) pairs of keypoints -> (M, 2) in which no keypoint is twice.
 
     Pairs that were found more often go first, then earlier pairs: matchers that disagree about a keypoint cannot

@@ -11,7 +11,7 @@ from mkpc_kaggle.scene.choose import Choice, Reason, choose, estimate_at_known_f
 from mkpc_kaggle.scene.export import Export
 from mkpc_kaggle.scene.reconstruction import MIN_IMAGES, Reconstruction, SfmModel
 from mkpc_kaggle.scene.shared_intrinsics import SharedIntrinsics, shared_intrinsics
-from mkpc_kaggle.scene.view_graph import MIN_MATCHES, BatchPair, ViewGraph
+from mkpc_kaggle.scene.view_graph import BatchPair, ViewGraph
 
 MIN_PAIRS_PER_IMAGE = 1.35  # connected pairs: with fewer there is little that could contradict the cameras
 MIN_OBSERVATIONS = 0.99  # shared intrinsics stay if images see points at least this many times as often as without
@@ -39,9 +39,9 @@ def reconstruct_batch(
     """Reconstruct every connected component of a batch, and choose an F for each of its pairs.
 
     With ``focal``, the recipe's prior, and ``magsac`` (default: its defaults), a pair that gets no F from cameras
-    is estimated anew where the scene knows a focal length. With ``export``, all components are reconstructed as
-    one view graph, under the names of files, and COLMAP's files are written. Whatever the matches are, the answer
-    is a :class:`Solution`: what is missing has a reason. It takes seconds to minutes and may end the process, see
+    is estimated anew where the scene knows a focal length. With ``export``, the batch is reconstructed as a whole,
+    under the names of files, and COLMAP's files are written. Whatever the matches are, the answer is a
+    :class:`Solution`: what is missing has a reason. It takes seconds to minutes and may end the process, see
     :mod:`mkpc_kaggle.scene.colmap`.
     """
     directory = None
@@ -50,76 +50,74 @@ def reconstruct_batch(
     together, shared = reconstruct_sharing(ViewGraph.of_pairs(pairs), config, directory)
     matchers = sorted({name for pair in pairs for name in pair.tracks or ()})
     single = matchers if config.each_matcher and len(matchers) > 1 else []
-    alone = [reconstruct_graph(ViewGraph.of_pairs(pairs, name), config, shared) for name in single]
+    alone = [
+        [reconstruct_component(part, config, shared) for part in ViewGraph.of_pairs(pairs, name).components()]
+        for name in single
+    ]
     by_digest = [
         [{found.image.digest: found for found in model.images} for model in models_of(found)]
         for found in (together, *alone)
     ]
-    models = [model for found in by_digest for model in found]
+    focals = dict(shared)  # an image's is that of the first model that has it, else of the camera that it shares
+    for model in reversed([model for found in by_digest for model in found]):
+        focals |= {digest: found.focal for digest, found in model.items()}
     choices = []
     for pair in pairs:
         choice = choose(pair, by_digest)
         if focal is not None and choice.reason not in (Reason.SCENE, Reason.SAME_IMAGE):
-            F = estimate_at_known_focals(pair, models, shared, focal, magsac or RobustConfig())
+            F = estimate_at_known_focals(pair, focals, focal, magsac or RobustConfig())
             choice = replace(choice, F=F)
         choices.append(choice)
-    return Solution(together, tuple(choices))
+    return Solution(tuple(together), tuple(choices))
 
 
 def reconstruct_sharing(
     graph: ViewGraph, config: SceneConfig, directory: Path | None = None
-) -> tuple[tuple[Reconstruction, ...], SharedIntrinsics]:
+) -> tuple[list[Reconstruction], SharedIntrinsics]:
     """The reconstruction of each component, and the intrinsics that its images share.
 
-    Images that seem to share a camera are reconstructed anew with it, unless they see fewer points then. COLMAP's
-    files are written to ``directory``.
+    Images that seem to share a camera are reconstructed anew with it, unless they see fewer points then. With a
+    ``directory`` the graph is reconstructed as a whole, and COLMAP's files are written there.
     """
-    found = reconstruct_graph(graph, config, {}, directory)
-    shared = shared_intrinsics(graph.images, models_of(found), config.shared_intrinsics)
-    if shared:
-        anew = reconstruct_graph(graph, config, shared, directory)
+    if directory is None:
+        parts, make = graph.components(), reconstruct_component
+    else:
+        parts, make = (graph.strong,), reconstruct_connected
+    shared: SharedIntrinsics = {}
+    found = [make(part, config, shared) for part in parts]
+    if alike := shared_intrinsics(graph.images, models_of(found), config.shared_intrinsics):
+        anew = [make(part, config, alike) for part in parts]
         before, after = (sum(each.observations for each in made) for made in (found, anew))
         if after >= MIN_OBSERVATIONS * before:
-            return anew, shared
-        if directory is not None:  # which has the files of the other
-            reconstruct_graph(graph, config, {}, directory)
-    return found, {}
-
-
-def reconstruct_graph(
-    graph: ViewGraph, config: SceneConfig, shared: SharedIntrinsics, directory: Path | None = None
-) -> tuple[Reconstruction, ...]:
-    """The reconstruction of each component; of the whole graph, if COLMAP's files go to a ``directory``."""
+            found, shared = anew, alike
     if directory is not None:
-        strong = tuple(edge for edge in graph.edges if len(edge.matches) >= MIN_MATCHES)
-        return (reconstruct_connected(replace(graph, edges=strong), config, shared, directory),)
-    return tuple(reconstruct_component(component, config, shared) for component in graph.components())
+        from mkpc_kaggle.scene.colmap import write_files
+
+        write_files(directory, graph.strong, config, shared, models_of(found))
+    return found, shared
 
 
 def reconstruct_component(graph: ViewGraph, config: SceneConfig, shared: SharedIntrinsics) -> Reconstruction:
     """The reconstruction of a connected graph, or why there is none."""
-    names, pairs = tuple(image.name for image in graph.images), len(graph.edges)
-    if len(names) < MIN_IMAGES:
-        return Reconstruction(names, failure=f"{len(names)} images are connected; a scene needs {MIN_IMAGES}")
-    if pairs < MIN_PAIRS_PER_IMAGE * len(names):
-        few = f"{pairs} pairs connect {len(names)} images; a scene needs {MIN_PAIRS_PER_IMAGE:g} an image"
-        return Reconstruction(names, failure=few)
+    images, pairs = len(graph.images), len(graph.edges)
+    if images < MIN_IMAGES:
+        return Reconstruction(graph.names, failure=f"{images} images are connected; a scene needs {MIN_IMAGES}")
+    if pairs < MIN_PAIRS_PER_IMAGE * images:
+        few = f"{pairs} pairs connect {images} images; a scene needs {MIN_PAIRS_PER_IMAGE:g} an image"
+        return Reconstruction(graph.names, failure=few)
     return reconstruct_connected(graph, config, shared)
 
 
-def reconstruct_connected(
-    graph: ViewGraph, config: SceneConfig, shared: SharedIntrinsics, directory: Path | None = None
-) -> Reconstruction:
+def reconstruct_connected(graph: ViewGraph, config: SceneConfig, shared: SharedIntrinsics) -> Reconstruction:
     """What pycolmap makes of a graph, or why there is nothing."""
-    names = tuple(image.name for image in graph.images)
     try:
         from mkpc_kaggle.scene.colmap import structure_from_motion
 
-        return structure_from_motion(graph, config, shared, directory)
+        return structure_from_motion(graph, config, shared)
     except ImportError as error:
-        return Reconstruction(names, failure=f"pycolmap cannot be imported: {error}")
+        return Reconstruction(graph.names, failure=f"pycolmap cannot be imported: {error}")
     except (RuntimeError, ValueError) as error:
-        return Reconstruction(names, failure=f"pycolmap failed: {error}")
+        return Reconstruction(graph.names, failure=f"pycolmap failed: {error}")
 
 
 def models_of(reconstructions: Sequence[Reconstruction]) -> list[SfmModel]:

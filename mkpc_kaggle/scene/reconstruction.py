@@ -34,7 +34,7 @@ class RegisteredImage:
 class SfmModel:
     """Cameras in one world, and points in it, (P, 3) float64; ``reprojection_error`` is the mean in pixels.
 
-    ``colmap`` is pycolmap's own value of it, as long as it may have to be written.
+    ``colmap`` is pycolmap's own value of it, which cannot leave its process.
     """
 
     images: tuple[RegisteredImage, ...]
@@ -42,18 +42,20 @@ class SfmModel:
     reprojection_error: float
     colmap: Any = None
 
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "colmap": None}
+
 
 @dataclass(frozen=True, eq=False)
 class Reconstruction:
     """A connected component of a batch: the names of its images, and the models that were made of them.
 
-    Models are in order of size, the largest first, and an image may be in several. ``rejections`` say what was
-    left out of them, one sentence each. ``failure`` is empty, or says why there is no model.
+    Models are in order of size, the largest first, and an image may be in several. ``failure`` is empty, or says
+    why there is no model.
     """
 
     names: tuple[str, ...]
     models: tuple[SfmModel, ...] = ()
-    rejections: tuple[str, ...] = ()
     failure: str = ""
 
     @property
@@ -67,28 +69,14 @@ class Reconstruction:
         return sum(found.points for model in self.models for found in model.images)
 
 
-def filter_models(models: Sequence[SfmModel]) -> tuple[tuple[SfmModel, ...], tuple[str, ...]]:
-    """The models without the images that cannot be right, the largest first, and what was left out and why."""
-    kept, rejections = [], []
-    for model in models:
-        reasons = [(found, rejection_reason(found)) for found in model.images]
-        rejections += [f"image {found.image.name}: {reason}" for found, reason in reasons if reason]
-        images = tuple(found for found, reason in reasons if not reason)
-        if len(images) < MIN_IMAGES:
-            rejections.append(f"a model of {len(images)} images is too small")
-        else:
-            kept.append(replace(model, images=images))
-    return tuple(sorted(kept, key=lambda model: (-len(model.images), -len(model.points)))), tuple(rejections)
+def filter_models(models: Sequence[SfmModel]) -> tuple[SfmModel, ...]:
+    """The models without the images whose cameras cannot be right, if enough are left; the largest first."""
+    cleaned = [replace(model, images=tuple(filter(is_plausible, model.images))) for model in models]
+    kept = [model for model in cleaned if len(model.images) >= MIN_IMAGES]
+    return tuple(sorted(kept, key=lambda model: (-len(model.images), -len(model.points))))
 
 
-def rejection_reason(found: RegisteredImage) -> str:
-    """Why an image's camera cannot be right, or an empty string."""
+def is_plausible(found: RegisteredImage) -> bool:
     camera = found.camera
-    if not all(np.isfinite(part).all() for part in (camera.K, camera.R, camera.t)):
-        return "its camera is not finite"
-    relative_focal = found.focal / max(found.image.size)
-    if relative_focal not in FOCALS:
-        return f"its focal length is {relative_focal:.3g} long sides, outside of {FOCALS}"
-    if found.points < MIN_POINTS:
-        return f"it sees {found.points} points, fewer than {MIN_POINTS}"
-    return ""
+    is_finite = all(np.isfinite(part).all() for part in (camera.K, camera.R, camera.t))
+    return is_finite and found.focal / max(found.image.size) in FOCALS and found.points >= MIN_POINTS

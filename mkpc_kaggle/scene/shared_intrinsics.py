@@ -5,12 +5,12 @@ an image with few points may get any. If most images of one size agree on theirs
 second reconstruction can share its intrinsics from the start.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import TypeAlias
 
 import numpy as np
 
-from mkpc_kaggle.scene.reconstruction import RegisteredImage, SfmModel
+from mkpc_kaggle.scene.reconstruction import SfmModel
 from mkpc_kaggle.scene.view_graph import BatchImage
 
 MIN_ALIKE = 5  # registered images of one size
@@ -21,17 +21,14 @@ SharedIntrinsics: TypeAlias = Mapping[str, float]
 
 
 def shared_intrinsics(
-    images: Sequence[BatchImage], models: Iterable[SfmModel], tolerance: float
+    images: Sequence[BatchImage], models: Sequence[SfmModel], tolerance: float
 ) -> SharedIntrinsics:
     """The focal lengths that images of one size share, because more than half of the registered images agree.
 
     To agree is to be within a share of ``tolerance`` of their median. All images of the size share it, registered
     or not, except those that see many points at another focal length: they were taken at another zoom.
     """
-    registered: dict[str, RegisteredImage] = {}
-    for model in models:
-        for found in model.images:
-            registered.setdefault(found.image.digest, found)
+    registered = {found.image.digest: found for model in reversed(models) for found in model.images}
     shared: dict[str, float] = {}
     for size in {found.image.size for found in registered.values()}:
         alike = [found for found in registered.values() if found.image.size == size]

@@ -65,6 +65,15 @@ class ViewGraph:
     images: tuple[BatchImage, ...]
     edges: tuple[Edge, ...]
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(image.name for image in self.images)
+
+    @property
+    def strong(self) -> "ViewGraph":
+        """The same images, and the edges with at least ``MIN_MATCHES`` matches: fewer connect nothing."""
+        return ViewGraph(self.images, tuple(edge for edge in self.edges if len(edge.matches) >= MIN_MATCHES))
+
     @classmethod
     def of_pairs(cls, pairs: Sequence[BatchPair], matcher: str = "") -> "ViewGraph":
         """The graph of a batch's pairs, from the matches of all matchers or of one.
@@ -72,25 +81,25 @@ class ViewGraph:
         Pairs of the same two images become one edge, whatever their order. A pair of an image with itself and a
         pair without matches make no edge.
         """
-        images = {image.digest: image for pair in reversed(pairs) for image in (pair.image1, pair.image0)}
-        order = list(dict.fromkeys(image.digest for pair in pairs for image in (pair.image0, pair.image1)))
-        place = {digest: number for number, digest in enumerate(order)}
+        images: dict[str, BatchImage] = {}
+        for image in (image for pair in pairs for image in (pair.image0, pair.image1)):
+            images.setdefault(image.digest, image)
+        place = {digest: number for number, digest in enumerate(images)}
         parts: dict[tuple[int, int], list[Matches]] = {}
         for pair in pairs:
             first, second = place[pair.image0.digest], place[pair.image1.digest]
             tracks = pair.tracks_of(matcher)
-            if first != second and len(tracks):
-                ordered = tracks if first < second else swapped(tracks)
-                parts.setdefault((min(first, second), max(first, second)), []).append(ordered)
+            if first > second:
+                first, second = second, first
+                tracks = Matches(tracks.points1, tracks.points0, tracks.scores)
+            if first < second and len(tracks):
+                parts.setdefault((first, second), []).append(tracks)
         edges = tuple(Edge(*ends, Matches.concatenate(parts[ends])) for ends in sorted(parts))
-        return cls(tuple(images[digest] for digest in order), edges)
+        return cls(tuple(images.values()), edges)
 
     def components(self) -> tuple["ViewGraph", ...]:
-        """The connected components that have an edge, by their first images.
-
-        An edge with fewer than ``MIN_MATCHES`` matches connects nothing, and is in no component.
-        """
-        strong = [edge for edge in self.edges if len(edge.matches) >= MIN_MATCHES]
+        """The connected components that have a strong edge, by their first images; weak edges are in none."""
+        strong = self.strong.edges
         ends = np.array([(edge.first, edge.second) for edge in strong], np.intp).reshape(-1, 2)
         shape = (len(self.images), len(self.images))
         adjacency = coo_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=shape)
@@ -103,11 +112,6 @@ class ViewGraph:
             edges = tuple(Edge(place[edge.first], place[edge.second], edge.matches) for edge in inside)
             found.append(ViewGraph(tuple(self.images[image] for image in members), edges))
         return tuple(found)
-
-
-def swapped(matches: Matches) -> Matches:
-    """The same matches with the two images in the other order."""
-    return Matches(matches.points1, matches.points0, matches.scores)
 
 
 def tracks_of(results: Sequence[UnitResult]) -> dict[str, Matches]:

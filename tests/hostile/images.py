@@ -10,7 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from attack import Case
-from room import SUBMIT, encoded, picture
+from room import SUBMIT, encoded, picture, write_sparse
 
 KINDS = (".png", ".jpg")
 DAMAGES: dict[str, Callable[[bytes], bytes]] = {
@@ -92,15 +92,10 @@ PLACES: dict[str, Callable[[Path], object]] = {
     "a link to /dev/zero": lambda path: path.symlink_to("/dev/zero"),
     "a link to nothing": lambda path: path.symlink_to("nothing"),
     "a link to another image": lambda path: path.symlink_to(path.with_name("z.png")),
-    "a sparse file of 1 TB": lambda path: sparse(path, 1 << 40),
+    "a sparse file of 1 TB": write_sparse,
     "a name in another case": lambda path: path.with_name("X.PNG").write_bytes(encoded(".png")),
     "two files of the id": lambda path: [path.with_suffix(end).write_bytes(encoded(".png")) for end in KINDS],
 }
-
-
-def sparse(path: Path, size: int) -> None:
-    with path.open("wb") as stream:
-        stream.truncate(size)
 
 
 def instead_of_x(suffix: str, make: Callable[[Path], object]) -> Callable[[Path], None]:

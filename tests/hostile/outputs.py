@@ -80,6 +80,9 @@ def weights(room: Path) -> None:
 PLAIN = SUBMIT.replace("--output out/s.csv --no-report ", "")
 
 
+ASCII, C = {"PYTHONIOENCODING": "ascii"}, {"LC_ALL": "C"}
+
+
 def placed(make: Callable[[Path], object]) -> Callable[[Path], None]:
     return lambda room: nothing(make(room / "out" / "s.csv"))
 
@@ -95,18 +98,6 @@ CASES = [
         for name, make in THERE.items()
     ),
     *(Case("outputs", name, command, weights, REFUSED, "name another") for name, command in OVER.items()),
-    Case(
-        "outputs",
-        "text that the terminal has not",
-        PLAIN + " --output out/s.csv",
-        env={"PYTHONIOENCODING": "ascii"},
-    ),
-    Case(
-        "outputs",
-        "the C locale",
-        PLAIN + " --output out/\u00e9.csv",
-        statuses=EITHER,
-        env={"LC_ALL": "C"},
-        submission=False,
-    ),
+    Case("outputs", "text that the terminal has not", f"{PLAIN} --output out/s.csv", env=ASCII),
+    Case("outputs", "the C locale", f"{PLAIN} --output out/\u00e9.csv", statuses=EITHER, env=C, submission=False),
 ]

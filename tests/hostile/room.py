@@ -37,6 +37,11 @@ def encoded(suffix: str, image: NDArray[np.uint8] | None = None, *options: int) 
     return data.tobytes()
 
 
+def write_sparse(path: Path) -> None:
+    with path.open("wb") as stream:
+        stream.truncate(1 << 40)
+
+
 def write_template(room: Path) -> Path:
     images = room / "D" / "test_images" / "b1"
     for folder in (images, room / "out", room / "tmp", room / "home"):

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from attack import EITHER, REFUSED, Case
-from room import RECIPE, SUBMIT, encoded, picture
+from room import RECIPE, SUBMIT, encoded, picture, write_sparse
 
 UNIT = 'units = [{ stage = 1, matcher = "sift", long_side = 200 }]\n'
 RECIPES = {
@@ -34,26 +34,15 @@ RECIPES = {
     "a million comments": "# nothing\n" * 1_000_000 + RECIPE,
     "10,000 units": "units = [" + 10_000 * '{ stage = 1, matcher = "sift", long_side = 200 },' + "]",
 }
-VALID = (
-    "lines of another system",
-    "a description of a list",
-    "a million comments",
-    "a size of 10^9",
-    "a byte order mark",
-)
-
-
-def sparse(path: Path) -> None:
-    with path.open("wb") as stream:
-        stream.truncate(1 << 40)
-
+VALID = ("lines of another system", "a description of a list", "a million comments")
+VALID += ("a size of 10^9", "a byte order mark")
 
 PLACES: dict[str, Callable[[Path], object]] = {
     "a directory": Path.mkdir,
     "a pipe": os.mkfifo,
     "a link to /dev/zero": lambda path: path.symlink_to("/dev/zero"),
     "bytes that are not text": lambda path: path.write_bytes(b"\xff\xfe\x00"),
-    "a sparse file of 1 TB": sparse,
+    "a sparse file of 1 TB": write_sparse,
 }
 
 CALIBRATION = "image_id,camera_intrinsics,rotation_matrix,translation_vector\n" + "".join(
@@ -62,6 +51,7 @@ CALIBRATION = "image_id,camera_intrinsics,rotation_matrix,translation_vector\n" 
 COVISIBILITY = "pair,covisibility\nx-y,0.9\ny-z,0.8\nx-z,0.05\n"
 FACTORS = "scene,scaling_factor\ns,1.5\n"
 VALIDATE = "validate --train-dir T --recipe quick.toml --workers 0 --no-scenes"
+CHECK = "check out/sub.csv --test-dir D"
 SCORE = "validate --train-dir T --submission out/sub.csv --truth truth.csv"
 ARGUMENTS = {
     "covisibility of NaN": "--min-covisibility nan",
@@ -124,11 +114,8 @@ def train_side(name: str = "", text: str = "", submission: str = "") -> Callable
         images.mkdir(parents=True)
         for number, image in enumerate("xyz"):
             (images / f"{image}.jpg").write_bytes(encoded(".jpg", picture(12 * number)))
-        files = {
-            "scaling_factors.csv": FACTORS,
-            "s/calibration.csv": CALIBRATION,
-            "s/pair_covisibility.csv": COVISIBILITY,
-        }
+        files = {"scaling_factors.csv": FACTORS, "s/calibration.csv": CALIBRATION}
+        files["s/pair_covisibility.csv"] = COVISIBILITY
         for file, contents in {**files, **({name: text} if name else {})}.items():
             (room / "T" / file).write_text(contents)
         (room / "truth.csv").write_text("sample_id,scene,image_1_id,image_2_id\n1,s,x,y\n")
@@ -157,13 +144,7 @@ CASES = [
         for name, text in SUBMISSIONS.items()
     ),
     *(
-        Case(
-            "arguments",
-            f"check of a submission {name}",
-            "check out/sub.csv --test-dir D",
-            train_side(submission=text),
-            (1,),
-        )
+        Case("arguments", f"check of a submission {name}", CHECK, train_side(submission=text), (1,))
         for name, text in SUBMISSIONS.items()
     ),
     *(

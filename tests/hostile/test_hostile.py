@@ -49,11 +49,11 @@ def template(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize(
     "case", [pytest.param(case, id=case.id, marks=() if case.id in QUICK else pytest.mark.slow) for case in ALL]
 )
-def test_a_hostile_input_is_survived(case: Case, template: Path, tmp_path: Path) -> None:
+def test_a_hostile_input_is_survived(case, template, tmp_path):
     attack(case, shutil.copytree(template, tmp_path / "room"))
 
 
-def test_the_names_of_cases_are_unique_and_the_quick_ones_are_among_them() -> None:
+def test_the_names_of_cases_are_unique_and_the_quick_ones_are_among_them():
     names = {case.id for case in ALL}
     assert len(names) == len(ALL) >= 300
     assert set(QUICK) <= names

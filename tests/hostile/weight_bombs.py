@@ -128,7 +128,9 @@ SEARCHED = {
     "a link to nothing": lambda path: path.symlink_to("nothing"),
     "a bomb": lambda path: path.write_bytes(with_pickle(PICKLES["a bytearray of 6 GB"])),
 }
-AUTO = SUBMIT.replace("quick.toml", "auto") + " --weights weights --mode stage-1"
+SEARCH = "--weights weights"
+AUTO = SUBMIT.replace("quick.toml", "auto") + f" {SEARCH} --mode stage-1"
+CONVERT_SAFETENSORS = CONVERT.replace("a.pt", "a.safetensors")
 CASES = [
     *(
         Case("weights", name, CONVERT, at("a.pt", lambda d=data: with_pickle(d)), EITHER)
@@ -147,23 +149,11 @@ CASES = [
         for name, make in FILES.items()
     ),
     *(
-        Case(
-            "weights",
-            f"safetensors: {name}",
-            CONVERT.replace("a.pt", "a.safetensors"),
-            at("a.safetensors", lambda d=data: d),
-            EITHER,
-        )
+        Case("weights", f"safetensors: {name}", CONVERT_SAFETENSORS, at("a.safetensors", lambda d=data: d), EITHER)
         for name, data in SAFETENSORS.items()
     ),
     *(
-        Case(
-            "weights",
-            f"{file}, {name}: {command}",
-            f"weights {command} --weights weights",
-            listed(file, make),
-            (0, 1),
-        )
+        Case("weights", f"{file}, {name}: {command}", f"weights {command} {SEARCH}", listed(file, make), (0, 1))
         for command in ("list", "verify", "locate superpoint")
         for file in LISTED
         for name, make in SEARCHED.items()
@@ -174,13 +164,7 @@ CASES = [
         for name, make in SEARCHED.items()
     ),
     *(
-        Case(
-            "weights",
-            f"a manifest, {name}",
-            "weights list --weights weights",
-            listed("weights_manifest.txt", make),
-            (0,),
-        )
+        Case("weights", f"a manifest, {name}", f"weights list {SEARCH}", listed("weights_manifest.txt", make))
         for name, make in {**SEARCHED, "a directory": Path.mkdir}.items()
     ),
 ]

@@ -9,16 +9,8 @@ from numpy.typing import NDArray
 from mkpc_kaggle.data.images import Image
 from mkpc_kaggle.geometry.critical_region import CriticalRegion, MkpcConfig, find_clusters
 from mkpc_kaggle.pipeline.pair import PairMatch
-from mkpc_kaggle.reporting.figures.style import (
-    COLOURS,
-    DPI,
-    DROPPED,
-    INLIER,
-    OUTLIER,
-    REGION,
-    new_figure,
-    sample,
-)
+from mkpc_kaggle.reporting.figures import style
+from mkpc_kaggle.reporting.figures.style import COLOURS, DROPPED, INLIER, OUTLIER, new_figure, sample
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -33,9 +25,9 @@ def draw_pair(image0: Image, image1: Image, match: PairMatch, config: MkpcConfig
     figure = new_figure(12, 9)
     panels = figure.subplot_mosaic([["matches", "matches"], ["0", "1"]])
     counts = f"{len(match.matches)} matches, {match.estimate.inlier_count} inliers"
-    why = f"; {match.estimate.failure}" if match.estimate.failure else ""
     drawn = draw_matches(panels["matches"], (image0, image1), match)
-    panels["matches"].set_title(f"{counts}{why}; {drawn}", loc="left")
+    title = "; ".join(filter(None, [counts, match.estimate.failure, drawn]))
+    panels["matches"].set_title(title, loc="left")
     for side, image in enumerate((image0, image1)):
         _draw_clusters(panels[str(side)], image, match, config, side)
     return figure
@@ -44,7 +36,7 @@ def draw_pair(image0: Image, image1: Image, match: PairMatch, config: MkpcConfig
 def draw_strip(images: tuple[Image, Image], match: PairMatch) -> "Figure":
     """The matches and the critical regions without text, on at most :data:`MAX_STRIP_PX` pixels."""
     aspect = sum(image.size.width / image.size.height for image in images)
-    height = min(STRIP_HEIGHT_PX, sqrt(MAX_STRIP_PX / aspect)) / DPI
+    height = min(STRIP_HEIGHT_PX, sqrt(MAX_STRIP_PX / aspect)) / style.DPI
     figure = new_figure(aspect * height, height)
     figure.set_layout_engine("none")
     draw_matches(figure.add_axes((0, 0, 1, 1)), images, match)
@@ -112,4 +104,4 @@ def _show(
     if region is not None:
         corner = left + scale * region.box.left, scale * region.box.top
         sides = (scale * side for side in region.box.size)
-        axes.add_patch(Rectangle(corner, *sides, fill=False, edgecolor=REGION, linewidth=2.5))
+        axes.add_patch(Rectangle(corner, *sides, fill=False, edgecolor=style.REGION, linewidth=2.5))
