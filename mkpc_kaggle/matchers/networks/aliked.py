@@ -219,10 +219,7 @@ def _step(length: int, full: int) -> float:
 
 
 def strict_maxima(scores: Tensor, count: int) -> Tensor:
-    """The best pixels of a map (H, W) that exceed all others around them, best first: (K,) int64, row by row.
-
-    As in kornia; the published code suppresses in several rounds and keeps more.
-    """
+    """The best strict maxima of a map (H, W), best first: (K,) int64, row by row; the published code keeps more."""
     peaks = scores == functional.max_pool2d(scores[None], 2 * RADIUS + 1, 1, RADIUS)[0]
     inner = torch.zeros_like(peaks)
     inner[RADIUS:-RADIUS, RADIUS:-RADIUS] = True
