@@ -219,7 +219,7 @@ def _step(length: int, full: int) -> float:
 
 
 def strict_maxima(scores: Tensor, count: int) -> Tensor:
-    """The best strict maxima of a map (H, W), best first: (K,) int64, row by row; the published code keeps more."""
+    """The best strict maxima of a map (H, W), best first: (K,) int64, row by row. Published code keeps more."""
     peaks = scores == functional.max_pool2d(scores[None], 2 * RADIUS + 1, 1, RADIUS)[0]
     inner = torch.zeros_like(peaks)
     inner[RADIUS:-RADIUS, RADIUS:-RADIUS] = True
