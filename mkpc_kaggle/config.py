@@ -37,15 +37,13 @@ def from_table(cls: type[Config], table: Mapping[str, Any], where: str) -> Confi
 def check_keys(table: Mapping[str, Any], known: Iterable[str], where: str, former: Mapping[str, str]) -> None:
     """Raise :class:`UserError` if ``table`` is not a table, or for its first key that is not among ``known``.
 
-    ``former`` has the keys of earlier versions with their present names, empty where a key was removed.
+    ``former`` has the keys of earlier versions with their present names.
     """
     if not isinstance(table, Mapping):
         raise UserError(f"{where} must be a table, not {table!r}")
     for key in table:
-        if former.get(key):
-            raise UserError(f"{where}: the key {key!r} is now called {former[key]!r}")
         if key in former:
-            raise UserError(f"{where}: the key {key!r} was removed and has no successor; delete it")
+            raise UserError(f"{where}: the key {key!r} is now called {former[key]!r}")
         if key not in known:
             raise UserError(f"{where} has the unknown key {key!r}; known keys: {', '.join(known)}")
 

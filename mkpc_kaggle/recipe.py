@@ -36,8 +36,6 @@ class Mode(StrEnum):
 class Unit:
     """One piece of work on one pair; raises ``ValueError`` for values that contradict each other."""
 
-    FORMER: ClassVar = {"flip": "", "extra": ""}
-
     stage: int  # 1: on whole images, 2: on the critical regions
     matcher: str
     long_side: int = 0  # pixels of a view's longer side; or
@@ -184,7 +182,7 @@ def recipe_of(table: Mapping[str, Any], name: str) -> Recipe:
     """A recipe from a TOML file's table, or from a fingerprint; raises :class:`UserError`."""
     where = f"recipe {name!r}"
     known = ("description", "units", "mkpc", "magsac", "focal", "matchers", "scene")
-    check_keys(table, known, where, {"upgrade": ""})
+    check_keys(table, known, where, {})
     units, matchers = table.get("units", []), table.get("matchers", {})
     if not isinstance(units, list) or not isinstance(matchers, dict):
         raise UserError(f"{where}: units must be a list of tables, and matchers a table")

@@ -147,8 +147,6 @@ def _weak(log: RunLog, weak: WeakPair, sources: dict[str, Pair]) -> tuple[str, s
     told = [f"{record.inliers} inliers of {record.matches} matches", record.failure]
     if record.source == "scene":
         told.append("F is the scene's")
-    if len(match.matches) < record.matches:
-        told.append("the points are no longer known")
     if pair.id in sources:
         image0, image1 = map(read_image, sources[pair.id].images)
         if isinstance(image0, Unreadable) or isinstance(image1, Unreadable):

@@ -21,7 +21,7 @@ NOT_ENDED = "not ended (at work, or killed)"
 
 @dataclass(frozen=True, eq=False)
 class WeakPair:
-    """A pair with few inliers, with its matches by unit if the journal still has them."""
+    """A pair with few inliers, with its matches by unit."""
 
     record: PairRecord
     results: tuple[UnitResult, ...]
