@@ -63,9 +63,6 @@ def keys(scene):
     return [true.pair.id.partition(";")[2] for true in scene.pairs]
 
 
-# the test side
-
-
 def test_pairs_and_columns_come_in_any_order_and_ids_stay_the_text_that_they_are(side):
     rows = ["0010,more,1e3,NA,007", "2,x,b,1,a", "1,x,b,2,z"]
     images = ["1e3/NA.png", "1e3/0010.png"]
@@ -127,9 +124,6 @@ def test_an_id_that_is_not_a_plain_name_is_refused(side, row, name):
     home = side("ok,b,1,2", row.format(name))
     with pytest.raises(UserError, match=r"test\.csv.* is not a plain name"):
         read_test_side(home)
-
-
-# the train side
 
 
 def test_a_train_side_by_hand_reads_as_written(train):
@@ -207,9 +201,6 @@ def test_cameras_of_the_shared_train_side_give_its_fundamental_matrices():
         F = fundamental_of_cameras(true.camera0, true.camera1)
         expected = np.array(truth[true.pair.id.partition(";")[2]].split(), float).reshape(3, 3)
         assert_allclose(F * np.sign(np.sum(F * expected)), expected, rtol=0, atol=1e-9)
-
-
-# submissions
 
 
 def test_a_submission_keeps_its_numbers_and_their_order(tmp_path):

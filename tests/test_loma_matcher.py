@@ -126,9 +126,6 @@ def test_weights_in_half_precision_and_of_deeper_training_load(store: WeightStor
     assert {parameter.dtype for parameter in loaded.parameters()} == {torch.float32}
 
 
-# the networks
-
-
 @torch.inference_mode()
 def test_strips_of_rows_give_what_the_whole_gives(network: Loma, monkeypatch: pytest.MonkeyPatch) -> None:
     image = image_of(scene(157, 83, channels=3))

@@ -66,9 +66,6 @@ def test_matches_are_those_of_the_vectors(name):
     assert agreement(name) >= SAME
 
 
-# Mistakes
-
-
 def best_anchor(logits):
     grid = as_grid(warp_refiner.identity_map(logits.new_empty(64, 64))).reshape(-1, 2)
     return grid[logits.argmax(dim=-1)]
