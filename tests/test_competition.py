@@ -150,17 +150,14 @@ def test_pairs_per_scene_are_spread_over_the_table(train, most, chosen):
     assert keys(*read_train_side(train, pairs_per_scene=most)) == chosen
 
 
-@pytest.mark.parametrize(
-    ("read", "says"),
-    [
-        (lambda train: read_train_side(train, scenes=["s", "x"]), r"unknown scene 'x'; known: absent, s"),
-        (lambda train: read_train_side(train, scenes=["absent"]), r"absent.*calibration\.csv: no such file"),
-        (lambda train: read_train_side(train, min_covisibility=1.1), r"covisibility\.csv has no pair with .*1\.1"),
-    ],
-)
-def test_what_a_train_side_lacks_is_told_with_what_it_has(train, read, says):
-    with pytest.raises(UserError, match=says):
-        read(train)
+def test_what_a_train_side_lacks_is_told_with_what_it_has(train):
+    for asked, says in (
+        ({"scenes": ["s", "x"]}, r"unknown scene 'x'; known: absent, s"),
+        ({"scenes": ["absent"]}, r"absent.*calibration\.csv: no such file"),
+        ({"min_covisibility": 1.1}, r"covisibility\.csv has no pair with .*1\.1"),
+    ):
+        with pytest.raises(UserError, match=says):
+            read_train_side(train, **asked)
     replace_in(train / "scaling_factors.csv", "s,2.5\n", "")
     with pytest.raises(UserError, match=r"has none of the scenes"):
         read_train_side(train)
@@ -170,12 +167,7 @@ def test_what_a_train_side_lacks_is_told_with_what_it_has(train, read, says):
     ("file", "old", "new", "says"),
     [
         ("s/calibration.csv", "2 0 1 0 2 1 0 0 1", "2 0 1 0 2 1 0 0", "expected 9 numbers, found 8 words"),
-        (
-            "s/calibration.csv",
-            "2 0 1 0 2 1 0 0 1",
-            "2 0 1 0 x 1 0 0 1",
-            "expected 9 numbers, found 9 words: '2 0 1 0 x",
-        ),
+        ("s/calibration.csv", "2 0 1 0 2 1 0 0 1", "2 0 1 0 x 1 0 0 1", "found 9 words: '2 0 1 0 x"),
         ("s/calibration.csv", ",rotation_matrix", ",rotation", "lacks the columns rotation_matrix"),
         ("s/pair_covisibility.csv", "c-b", "cb", "'cb'"),
         ("s/pair_covisibility.csv", "c-b", "c-x", "'c-x'"),
