@@ -3,6 +3,7 @@
 import pytest
 import torch
 from kornia.feature import ALIKED
+from pictures import image_of
 from shared import WEIGHTS, needs_weights
 from sklearn.datasets import load_sample_image
 from standin import STAND_INS, scene, standin_state
@@ -11,10 +12,6 @@ from mkpc_kaggle.matchers.contract import Placement, Precision
 from mkpc_kaggle.matchers.networks.aliked import Aliked, own_name, refined_maxima, strict_maxima
 from mkpc_kaggle.matchers.networks.placement import placed
 from mkpc_kaggle.weights import load_tensors
-
-
-def image_of(pixels):
-    return torch.from_numpy(pixels.copy()).permute(2, 0, 1)[None].float() / 255
 
 
 def both(state, features=300):

@@ -63,9 +63,6 @@ def keys(scene):
     return [true.pair.id.partition(";")[2] for true in scene.pairs]
 
 
-# the test side
-
-
 def test_pairs_and_columns_come_in_any_order_and_ids_stay_the_text_that_they_are(side):
     rows = ["0010,more,1e3,NA,007", "2,x,b,1,a", "1,x,b,2,z"]
     images = ["1e3/NA.png", "1e3/0010.png"]
@@ -129,9 +126,6 @@ def test_an_id_that_is_not_a_plain_name_is_refused(side, row, name):
         read_test_side(home)
 
 
-# the train side
-
-
 def test_a_train_side_by_hand_reads_as_written(train):
     (scene,) = read_train_side(train)
     assert (scene.name, scene.metres_per_unit) == ("s", 2.5)
@@ -156,17 +150,14 @@ def test_pairs_per_scene_are_spread_over_the_table(train, most, chosen):
     assert keys(*read_train_side(train, pairs_per_scene=most)) == chosen
 
 
-@pytest.mark.parametrize(
-    ("read", "says"),
-    [
-        (lambda train: read_train_side(train, scenes=["s", "x"]), r"unknown scene 'x'; known: absent, s"),
-        (lambda train: read_train_side(train, scenes=["absent"]), r"absent.*calibration\.csv: no such file"),
-        (lambda train: read_train_side(train, min_covisibility=1.1), r"covisibility\.csv has no pair with .*1\.1"),
-    ],
-)
-def test_what_a_train_side_lacks_is_told_with_what_it_has(train, read, says):
-    with pytest.raises(UserError, match=says):
-        read(train)
+def test_what_a_train_side_lacks_is_told_with_what_it_has(train):
+    for asked, says in (
+        ({"scenes": ["s", "x"]}, r"unknown scene 'x'; known: absent, s"),
+        ({"scenes": ["absent"]}, r"absent.*calibration\.csv: no such file"),
+        ({"min_covisibility": 1.1}, r"covisibility\.csv has no pair with .*1\.1"),
+    ):
+        with pytest.raises(UserError, match=says):
+            read_train_side(train, **asked)
     replace_in(train / "scaling_factors.csv", "s,2.5\n", "")
     with pytest.raises(UserError, match=r"has none of the scenes"):
         read_train_side(train)
@@ -176,12 +167,7 @@ def test_what_a_train_side_lacks_is_told_with_what_it_has(train, read, says):
     ("file", "old", "new", "says"),
     [
         ("s/calibration.csv", "2 0 1 0 2 1 0 0 1", "2 0 1 0 2 1 0 0", "expected 9 numbers, found 8 words"),
-        (
-            "s/calibration.csv",
-            "2 0 1 0 2 1 0 0 1",
-            "2 0 1 0 x 1 0 0 1",
-            "expected 9 numbers, found 9 words: '2 0 1 0 x",
-        ),
+        ("s/calibration.csv", "2 0 1 0 2 1 0 0 1", "2 0 1 0 x 1 0 0 1", "found 9 words: '2 0 1 0 x"),
         ("s/calibration.csv", ",rotation_matrix", ",rotation", "lacks the columns rotation_matrix"),
         ("s/pair_covisibility.csv", "c-b", "cb", "'cb'"),
         ("s/pair_covisibility.csv", "c-b", "c-x", "'c-x'"),
@@ -207,9 +193,6 @@ def test_cameras_of_the_shared_train_side_give_its_fundamental_matrices():
         F = fundamental_of_cameras(true.camera0, true.camera1)
         expected = np.array(truth[true.pair.id.partition(";")[2]].split(), float).reshape(3, 3)
         assert_allclose(F * np.sign(np.sum(F * expected)), expected, rtol=0, atol=1e-9)
-
-
-# submissions
 
 
 def test_a_submission_keeps_its_numbers_and_their_order(tmp_path):

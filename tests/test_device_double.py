@@ -8,6 +8,7 @@ import pytest
 import torch
 from device_double import DeviceDouble
 from light_matchers import MATCHERS, SHIFT, picture
+from pictures import agreement
 from torch.nn.attention import SDPBackend, sdpa_kernel
 
 from mkpc_kaggle.matchers.contract import Placement, Precision
@@ -32,13 +33,9 @@ def tensors_of(value: Any) -> list[torch.Tensor]:
     return [tensor for part in value for tensor in tensors_of(part)] if isinstance(value, list | tuple) else []
 
 
-def agreement(first: Any, second: Any, within: float = 0.05) -> float:
-    """The share of either's matches that lie within so many pixels, in both images, of a match of the other."""
-    rows = [torch.from_numpy(np.hstack([matches.points0, matches.points1])) for matches in (first, second)]
-    if not len(rows[0]) or not len(rows[1]):
-        return float(len(rows[0]) == len(rows[1]))
-    near = torch.cdist(*rows, p=torch.inf, compute_mode="donot_use_mm_for_euclid_dist") <= within
-    return ((near.any(1).sum() + near.any(0).sum()) / sum(map(len, rows))).item()
+def rows(matches: Any) -> torch.Tensor:
+    """(M, 4): the points in both pictures."""
+    return torch.from_numpy(np.hstack([matches.points0, matches.points1]))
 
 
 CASES = [(name, Precision.FLOAT32, ("cuda:0", "cuda:1"), 1) for name in MATCHERS if name != "dkm, two passes"]
@@ -57,4 +54,5 @@ def test_a_matcher_finds_on_a_gpu_what_it_finds_on_the_cpu(name, precision, devi
         assert double.operators > 0
     assert sum(map(len, expected)) > 0
     for each in found:
-        assert min(agreement(*pair) for pair in zip(each, expected, strict=True)) >= SAME[precision]
+        shares = [agreement(rows(a), rows(b), 0.05, torch.inf) for a, b in zip(each, expected, strict=True)]
+        assert min(shares) >= SAME[precision]

@@ -79,9 +79,6 @@ def assert_as_if_nothing_had_failed(report: RunReport, undisturbed: RunReport) -
     assert not [unit.failure for record in report.records for unit in record.units if unit.failure]
 
 
-# Devices
-
-
 @pytest.mark.parametrize(
     "gpus",
     [
@@ -137,9 +134,6 @@ def test_a_worker_that_hangs_keeps_no_job_from_the_others(run_at, undisturbed):
     assert_as_if_nothing_had_failed(report, undisturbed)
 
 
-# Memory
-
-
 def test_a_unit_too_large_for_the_memory_is_given_up_on_that_pair_alone(run_at, undisturbed):
     report = run_at(thread_place("cuda:0", FaultyMatcher(fault=exhaust_gpu, above=100)))
     assert report.ending is Ending.COMPLETE
@@ -160,9 +154,6 @@ def test_a_minibatch_that_memory_is_too_short_for_is_halved_once_and_no_worker_l
     assert_as_if_nothing_had_failed(report, undisturbed)
     too_large = [size for size in matcher.sizes if size > 2]
     assert len(too_large) == 2 * len(THREE_UNITS.units), "seven or eight, and three or four: once a unit"
-
-
-# Exit status
 
 
 def refuse(_: int) -> int:
@@ -186,9 +177,6 @@ def test_a_run_that_failed_has_exit_status_one_and_a_line(demo, tmp_path, monkey
     assert main(["submit", "--test-dir", str(demo.test_dir), "--output", str(output), "--no-report"]) == 1
     assert f"the run failed: {told}" in capsys.readouterr().out
     assert submission_problems(output, [pair.id for pair in read_test_side(demo.test_dir)]) == []
-
-
-# Starts
 
 
 @pytest.mark.parametrize(

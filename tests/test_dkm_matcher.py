@@ -68,7 +68,7 @@ class Given:
         return self
 
     def encode(self, image: torch.Tensor, fine: torch.Tensor | None = None) -> DenseFeatures:
-        return None  # type: ignore[return-value]
+        return None
 
     def match(self, first: DenseFeatures, second: DenseFeatures) -> tuple[DenseWarp, ...]:
         return self.warps
@@ -82,7 +82,7 @@ def identity_warp(height: int, width: int, certainty: float) -> DenseWarp:
 def test_points_of_either_picture_are_in_its_own_pixels() -> None:
     """Both show the same, at another size: places relative to the edges agree."""
     warps = identity_warp(40, 60, 0.3), identity_warp(80, 30, 0.9)
-    matcher = DkmMatcher(Given(*warps), DenseOptions(matches=9999), "cpu")  # type: ignore[arg-type]
+    matcher = DkmMatcher(Given(*warps), DenseOptions(matches=9999), "cpu")
     matches = match_one(matcher, picture(40, 60), picture(80, 30))
     assert len(matches) == 40 * 60 + 80 * 30
     expected = (matches.points0 + 0.5) * (30 / 60, 80 / 40) - 0.5
@@ -93,5 +93,5 @@ def test_points_of_either_picture_are_in_its_own_pixels() -> None:
     np.testing.assert_array_equal(matches.scores == np.float32(0.3), whole0)
     assert set(matches.scores.tolist()) == {float(np.float32(0.3)), float(np.float32(0.9))}
     unsure = identity_warp(9, 9, 0.0), identity_warp(9, 9, 0.0)
-    matcher = DkmMatcher(Given(*unsure), DenseOptions(), "cpu")  # type: ignore[arg-type]
+    matcher = DkmMatcher(Given(*unsure), DenseOptions(), "cpu")
     assert len(match_one(matcher, picture(9, 9), picture(9, 9))) == 0

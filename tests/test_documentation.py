@@ -4,16 +4,13 @@ import argparse
 import ast
 import json
 import re
-import sys
 from collections.abc import Iterator
 from pathlib import Path
-from types import SimpleNamespace
 
 import cv2
 import pytest
 from IPython.core.inputtransformer2 import TransformerManager
 from sklearn.datasets import load_sample_image
-from vismatch_standin import OrbLikeVismatch
 
 from mkpc_kaggle.cli import COMMANDS, make_parser
 
@@ -94,16 +91,14 @@ BLOCKS = re.findall(r"^```python\n(.*?)^```", PAGES[0].read_text(encoding="utf-8
 
 @pytest.mark.parametrize("block", BLOCKS, ids=range(len(BLOCKS)))
 def test_the_python_of_the_readme_runs(block, tmp_path, monkeypatch):
-    """On two parts of a photograph, with a stand-in for vismatch."""
+    """On two parts of a photograph."""
     photograph = load_sample_image("china.jpg")
     for name, shift in (("a.jpg", 0), ("b.jpg", 40)):
         assert cv2.imwrite(str(tmp_path / name), photograph[:, shift : shift + 560, ::-1])
     monkeypatch.chdir(tmp_path)
-    vismatch = SimpleNamespace(get_matcher=lambda name, device: OrbLikeVismatch())
-    monkeypatch.setitem(sys.modules, "vismatch", vismatch)  # type: ignore[arg-type]  # has what is imported
-    names: dict[str, object] = {}
+    names = {}
     exec(compile(block, "README.md", "exec"), names)
     if "models" in names:
         assert names["models"] == (), "two images make no model"
     else:
-        assert names["match"].estimate.inlier_count > 50  # type: ignore[attr-defined]  # a PairMatch
+        assert names["match"].estimate.inlier_count > 50

@@ -32,9 +32,6 @@ ROOT = Path(__file__).resolve().parents[1]
 PATHS = [str(ROOT), str(ROOT / "tests" / "support")]
 
 
-# Workers
-
-
 def test_worker_processes_give_the_bytes_of_a_run_in_this_process_and_estimate_f_themselves(
     pairs, undisturbed, tmp_path, monkeypatch
 ):
@@ -75,9 +72,6 @@ def test_an_error_of_the_engine_itself_leaves_the_latest_version_behind(pairs, t
     assert [bool(record.units) for record in published[-1]] == [True] + [False] * 11
 
 
-# Images
-
-
 def test_an_image_replaced_after_the_run_is_matched_anew(tmp_path, capsys):
     pairs = write_pairs(tmp_path / "pairs", 5)
     first = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
@@ -98,9 +92,6 @@ def test_a_table_whose_rows_name_other_images_is_another_test_set(tmp_path):
     pairs[1] = replace(pairs[1], file0=pairs[1].file1, file1=pairs[1].file0)
     with pytest.raises(UserError, match="belongs to another run: its test set differ"):
         run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
-
-
-# Disks
 
 
 def test_a_run_whose_journal_is_full_keeps_its_results_in_memory(pairs, undisturbed, tmp_path, monkeypatch):
@@ -136,9 +127,6 @@ def test_a_submission_that_the_disk_does_not_take_is_told_and_the_exit_status_is
     assert main(["submit", *arguments_of(demo, small_recipe, output), "--workers", "0"]) == 1
     assert "is not the last version" in capsys.readouterr().out
     assert submission_problems(output, [pair.id for pair in read_test_side(demo.test_dir)]) == []
-
-
-# The terminal and the process
 
 
 def arguments_of(demo: DemoSet, recipe: Path, output: Path) -> list[str]:

@@ -32,14 +32,16 @@ def camera(focal, turn=0.0, t=(0, 0, 0), centre=CENTRE):
 CAMERAS = camera(900.0), camera(1300.0, 0.15, (-1.0, 0.1, 0.2))
 
 
+def project(cameras, X):
+    """The points (N, 3) in the pixels of each camera."""
+    return [x[:, :2] / x[:, 2:] for x in ((X @ view.R.T + view.t) @ view.K.T for view in cameras)]
+
+
 def seen(cameras, n=200, noise=0.0, outliers=0, seed=0, depth=(4, 9)):
     """n matches of random points, then wild ones."""
     rng = np.random.default_rng(seed)
     X = rng.uniform((-1.5, -1.2, depth[0]), (1.5, 1.2, depth[1]), (n, 3))
-    points = []
-    for view in cameras:
-        x = (X @ view.R.T + view.t) @ view.K.T
-        points.append(x[:, :2] / x[:, 2:] + rng.normal(scale=noise, size=(n, 2)))
+    points = [x + rng.normal(scale=noise, size=(n, 2)) for x in project(cameras, X)]
     wild = [rng.uniform(0, SIZE, (outliers, 2)) for _ in range(2)]
     return Matches(*(np.vstack(both) for both in zip(points, wild, strict=True)), np.ones(n + outliers))
 
@@ -98,8 +100,7 @@ def test_a_principal_point_far_off_leaves_magsac_its_matrix():
     cropped = camera(700.0, centre=(-900, 1500)), camera(800.0, 0.3, (-2.0, 0.3, 0.5), centre=(2500, -800))
     rng = np.random.default_rng(0)
     X = rng.uniform((-4, -4, 4), (4, 4, 9), (400, 3))
-    x0, x1 = (((X @ view.R.T + view.t) @ view.K.T) for view in cropped)
-    matches = Matches(x0[:, :2] / x0[:, 2:], x1[:, :2] / x1[:, 2:], np.ones(400))
+    matches = Matches(*project(cropped, X), np.ones(400))
     result = with_prior(matches)
     assert result.ok
     assert_array_equal(result.matrix, result.magsac)
@@ -111,10 +112,9 @@ def degenerate():
     turned = seen((camera(1100), camera(1100, 0.1)), 80, 0.1)
     along = np.linspace(0, 700, 40)
     X = np.column_stack([rng.uniform(-1, 1, (80, 2)), np.full(80, 5.0)])
-    plane = [((X @ view.R.T + view.t) @ view.K.T) for view in CAMERAS]
     return {
         "a pure rotation": turned,
-        "one plane": Matches(*(x[:, :2] / x[:, 2:] for x in plane), np.ones(80)),
+        "one plane": Matches(*project(CAMERAS, X), np.ones(80)),
         "a line": Matches(np.column_stack([along, along]), np.column_stack([along, 2 * along]), np.ones(40)),
         "eight": seen(CAMERAS, 8),
         "six": seen(CAMERAS, 6),
@@ -151,14 +151,10 @@ def test_repetitions_and_what_is_not_finite_change_nothing():
 @given(data=st.data(), n=st.integers(0, 24))
 @settings(max_examples=40, deadline=None)
 def test_whatever_the_points_are_the_answer_is_an_estimate(data, n):
-    some = [
-        st.floats(width=32),
-        st.sampled_from(np.array([0, 1, -1, 1e-20, 1e20, 3e38], np.float32).tolist()),
-        st.integers(0, 5).map(float),
-    ]
+    corners = st.sampled_from(np.array([0, 1, -1, 1e-20, 1e20, 3e38], np.float32).tolist())
+    some = [st.floats(width=32), corners, st.integers(0, 5).map(float)]
     rows = data.draw(arrays(np.float32, (n, 4), elements=data.draw(st.sampled_from(some))))
-    result = with_prior(
-        Matches(rows[:, :2], rows[:, 2:], np.ones(n)), magsac=RobustConfig(max_iterations=100, permutations=1)
-    )
+    quick = RobustConfig(max_iterations=100, permutations=1)
+    result = with_prior(Matches(rows[:, :2], rows[:, 2:], np.ones(n)), magsac=quick)
     assert_is_a_value(result, n)
     assert not result.inliers[~np.isfinite(rows).all(axis=1)].any()

@@ -34,9 +34,6 @@ def gpus_here(monkeypatch: pytest.MonkeyPatch, *capabilities: tuple[int, int]) -
     monkeypatch.setattr(devices, "gpu_capabilities", lambda: list(capabilities))
 
 
-# The double itself
-
-
 @pytest.mark.parametrize(
     "meet",
     [
@@ -62,9 +59,6 @@ def test_the_double_refuses_numpy_and_lets_scalars_and_copies_pass() -> None:
         assert ((x * torch.tensor(2.0)).device, x.is_cuda) == (torch.device("cuda:1"), True)
         assert (2 * x).cpu().numpy().tolist() == [2, 2, 2]
     assert not torch.cuda.is_available() or torch.version.cuda
-
-
-# Which GPUs
 
 
 @pytest.mark.parametrize("device", ["cuda:2", "cuda:9"])
@@ -116,9 +110,6 @@ def test_a_device_that_multiplies_and_cannot_convolve_is_refused(monkeypatch: py
             require_device("cuda:0")
 
 
-# The cache
-
-
 @dataclass(frozen=True, eq=False)
 class Maps:
     coarse: torch.Tensor
@@ -131,9 +122,6 @@ def test_the_cache_is_sized_by_the_memory_that_is_free_and_the_workers_on_it() -
     with DeviceDouble(2, memory=12 << 30):
         assert made.on("cuda:1").pipeline()._encodings.limit == 3 << 30
         assert made.on("cuda:1", 3).pipeline()._encodings.limit == 1 << 30
-
-
-# Numbers
 
 
 def settings() -> tuple[str, str]:

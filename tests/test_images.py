@@ -37,9 +37,6 @@ def reason(path):
     return answer.reason
 
 
-# a file
-
-
 def test_a_colour_png_is_read_as_it_is(tmp_path):
     pixels = noise(5, 7, 3)
     image = read_image(write(tmp_path / "a.png", pixels))
@@ -116,9 +113,6 @@ def test_damaged_or_missing_bytes_never_raise(tmp_path, suffix):
         assert isinstance(read_image(tmp_path / f"b{suffix}"), Image | Unreadable)
 
 
-# arrays
-
-
 def test_an_array_is_named_by_its_content_and_its_shape():
     pixels = noise(6, 4, 3)
     assert Image.of_array(pixels).name == Image.of_array(pixels.copy()).name
@@ -140,9 +134,6 @@ def test_an_array_is_named_by_its_content_and_its_shape():
 def test_an_array_that_is_not_an_image_is_refused_by_type_and_shape(array):
     with pytest.raises(ValueError, match=rf"not {array.dtype} \({array.shape[0]},"):
         Image.of_array(array)
-
-
-# the store
 
 
 @pytest.fixture

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 from checkpoints import FILES, write_checkpoints
-from pictures import as_picture
+from pictures import as_picture, image_of
 from standin import scene
 
 from mkpc_kaggle.errors import UserError
@@ -48,11 +48,7 @@ class Holding(WeightStore):
         return self.tensors
 
 
-def image_of(pixels: np.ndarray) -> torch.Tensor:
-    return torch.from_numpy(pixels.copy()).permute(2, 0, 1)[None].float() / 255
-
-
-def test_a_shifted_picture_is_matched_by_its_shift(store: WeightStore) -> None:
+def test_a_shifted_picture_is_matched_by_its_shift(store):
     """A square, so that the descriptor sees the same shift: stand-in weights know only shifts of whole cells."""
     options = LomaOptions(Variant.B128, max_keypoints=300, descriptor_scale=1.0)
     matcher = loma.load(store, options, Placement())
@@ -66,7 +62,7 @@ def test_a_shifted_picture_is_matched_by_its_shift(store: WeightStore) -> None:
     assert np.abs(np.median(offsets[good], axis=0) - (16, -8)).max() < 0.2
 
 
-def test_keypoints_are_where_the_detector_saw_them(matcher: LomaAdapter) -> None:
+def test_keypoints_are_where_the_detector_saw_them(matcher):
     """A dot stays in its place when the detector's picture has other sides than the view."""
     pixels = np.full((101, 135, 3), 90, np.uint8)
     cv2.circle(pixels, (70, 40), 2, (250, 240, 230), -1)
@@ -76,7 +72,7 @@ def test_keypoints_are_where_the_detector_saw_them(matcher: LomaAdapter) -> None
     assert np.hypot(*(points - (70, 40)).T).min() < 4
 
 
-def test_padding_changes_nothing_and_tiny_pictures_have_no_matches(matcher: LomaAdapter) -> None:
+def test_padding_changes_nothing_and_tiny_pictures_have_no_matches(matcher):
     pixels = scene(75, 101, channels=3)
     plain, padded = matcher.encode([as_picture(pixels), as_picture(pixels, padding=(13, 26))])
     assert torch.equal(plain.keypoints.points, padded.keypoints.points)
@@ -86,12 +82,10 @@ def test_padding_changes_nothing_and_tiny_pictures_have_no_matches(matcher: Loma
     assert [len(matches) for matches in matcher.match([*tiny, plain, tiny[0]], [plain] * 3 + tiny[:2])] == [0] * 5
 
 
-def test_the_sizes_are_the_releases_on_views_of_1024_pixels(
-    matcher: LomaAdapter, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_sizes_are_the_releases_on_views_of_1024_pixels(matcher, monkeypatch):
     seen = []
 
-    def encode(to_detect: torch.Tensor, to_describe: torch.Tensor, number: int) -> LomaKeypoints:
+    def encode(to_detect, to_describe, number):
         seen.append((to_detect.shape[2:], to_describe.shape[2:], number))
         return LomaKeypoints(torch.zeros(0, 2), torch.zeros(0, 128))
 
@@ -102,7 +96,7 @@ def test_the_sizes_are_the_releases_on_views_of_1024_pixels(
     assert seen == [((680, 1024), (784, 784), 2048), ((512, 384), (392, 392), 2048)]
 
 
-def test_checkpoints_that_lack_or_add_something_are_refused(store: WeightStore) -> None:
+def test_checkpoints_that_lack_or_add_something_are_refused(store):
     good = store.load("loma-b128")
     for change in (
         {"_detector.encoder.layers.0.weight": torch.ones(64, 3, 3, 1)},
@@ -116,7 +110,7 @@ def test_checkpoints_that_lack_or_add_something_are_refused(store: WeightStore) 
         loma.load(store, LomaOptions(Variant.G), Placement())
 
 
-def test_weights_in_half_precision_and_of_deeper_training_load(store: WeightStore, network: Loma) -> None:
+def test_weights_in_half_precision_and_of_deeper_training_load(store, network):
     good = store.load("loma-b128")
     stored = {name: tensor.bfloat16() if name.endswith("Wqkv.weight") else tensor for name, tensor in good.items()}
     deeper = {"transformers.9.self_attn.out_proj.bias": torch.ones(256), "transformers.10.x": torch.ones(1)}
@@ -126,11 +120,8 @@ def test_weights_in_half_precision_and_of_deeper_training_load(store: WeightStor
     assert {parameter.dtype for parameter in loaded.parameters()} == {torch.float32}
 
 
-# the networks
-
-
 @torch.inference_mode()
-def test_strips_of_rows_give_what_the_whole_gives(network: Loma, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_strips_of_rows_give_what_the_whole_gives(network, monkeypatch):
     image = image_of(scene(157, 83, channels=3))
     points = torch.rand(1, 50, 2, generator=torch.Generator().manual_seed(0)) * 2 - 1
     logits, descriptors = network.detector.logits(image), network.descriptor(image, points)

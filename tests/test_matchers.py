@@ -119,9 +119,6 @@ def test_no_match_lies_on_the_padding_and_padding_costs_no_good_match(name):
     assert np.sum(errors < 2) >= 60
 
 
-# checkpoints
-
-
 def test_all_names_and_shapes_of_a_checkpoint_must_fit_but_those_that_are_not_used():
     network = nn.Sequential(nn.Linear(2, 2), nn.Linear(2, 2))
     before = network[1].bias.detach().clone()

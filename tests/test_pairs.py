@@ -13,10 +13,9 @@ from benchmarks import paper_tables
 from mkpc_kaggle import TwoStageMatcher
 from mkpc_kaggle.cli import main
 from mkpc_kaggle.cli.validate import with_units
-from mkpc_kaggle.data.competition import TrainScene, read_train_side
-from mkpc_kaggle.data.images import Image, read_image
+from mkpc_kaggle.data.competition import read_train_side
+from mkpc_kaggle.data.images import read_image
 from mkpc_kaggle.data.pairs import parse_line, read_pairs
-from mkpc_kaggle.demo import DemoSet
 from mkpc_kaggle.engine.session import digest_of_pairs
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.evaluation.validate import error_of
@@ -33,7 +32,7 @@ CAMERA = Camera(K, R, np.array([0.2, -0.1, 0.5]))
 
 
 @given(st.integers(0, 3), st.integers(0, 63), st.integers(0, 39), st.floats(0.5, 20))
-def test_a_turned_camera_sees_what_the_turned_picture_shows(turns: int, x: int, y: int, depth: float) -> None:
+def test_a_turned_camera_sees_what_the_turned_picture_shows(turns, x, y, depth):
     size = Size(64, 40)
     picture = np.zeros((size.height, size.width))
     picture[y, x] = 1
@@ -47,7 +46,7 @@ def test_a_turned_camera_sees_what_the_turned_picture_shows(turns: int, x: int, 
     np.testing.assert_allclose(projected[:2] / projected[2], [shown_x, shown_y], atol=1e-9)
 
 
-def test_a_line_is_what_was_written() -> None:
+def test_a_line_is_what_was_written():
     first = Camera(K, R, np.array([1.0, 2, 3]))
     images = parse_line(line_of(("a/b.jpg", "c.png"), (first, CAMERA), (3, 1)), WHERE)
     assert [(image.name, image.turns) for image in images] == [("a/b.jpg", 3), ("c.png", 1)]
@@ -75,7 +74,7 @@ def test_a_line_is_what_was_written() -> None:
         (f"a b 0 0 {EYE}".replace("1 0 0 1 0 1 0 0", "-1 0 0 1 0 1 0 0"), "with R a rotation"),
     ],
 )
-def test_a_malformed_line_is_named_with_what_was_expected(line: str, expected: str) -> None:
+def test_a_malformed_line_is_named_with_what_was_expected(line, expected):
     with pytest.raises(UserError, match=rf"^list.txt, line 7: .*({expected})"):
         parse_line(line, WHERE)
 
@@ -83,7 +82,7 @@ def test_a_malformed_line_is_named_with_what_was_expected(line: str, expected: s
 @pytest.mark.parametrize(
     "name", ["/etc/passwd", "../a.jpg", "a/../../b.jpg", "..", "//host/a", "..\\a", "a\\..\\b", "\\a", "C:\\a"]
 )
-def test_no_name_leads_out_of_the_image_root(name: str) -> None:
+def test_no_name_leads_out_of_the_image_root(name):
     for names in (f"{name} ok.jpg", f"ok.jpg {name}"):
         with pytest.raises(UserError, match=r"list.txt, line 7: .* points outside the image root"):
             parse_line(f"{names} 0 0 {EYE}", WHERE)
@@ -100,7 +99,7 @@ def test_no_name_leads_out_of_the_image_root(name: str) -> None:
         (None, "images", r"--image-root .*: no such directory"),
     ],
 )
-def test_a_list_without_pairs_is_refused(tmp_path: Path, content: bytes | None, root: str, told: str) -> None:
+def test_a_list_without_pairs_is_refused(tmp_path, content, root, told):
     if content is not None:
         (tmp_path / "list.txt").write_bytes(content)
     with pytest.raises(UserError, match=told):
@@ -108,11 +107,11 @@ def test_a_list_without_pairs_is_refused(tmp_path: Path, content: bytes | None, 
 
 
 @pytest.fixture
-def scenes(demo: DemoSet) -> tuple[TrainScene, ...]:
+def scenes(demo):
     return read_train_side(demo.train_dir, pairs_per_scene=3)
 
 
-def test_the_true_matrix_has_no_error(demo: DemoSet, scenes: tuple[TrainScene, ...], tmp_path: Path) -> None:
+def test_the_true_matrix_has_no_error(demo, scenes, tmp_path):
     read = read_pairs(write_list(tmp_path / "list.txt", scenes, demo.train_dir), demo.train_dir, copies=tmp_path)
     some = read_pairs(tmp_path / "list.txt", demo.train_dir, copies=tmp_path, most=2)
     assert [true.pair.id for true in some.pairs] == [read.pairs[0].pair.id, read.pairs[2].pair.id]
@@ -124,16 +123,13 @@ def test_the_true_matrix_has_no_error(demo: DemoSet, scenes: tuple[TrainScene, .
         assert all(path.is_file() for path in true.pair.images)
 
 
-def test_images_are_set_upright_and_their_cameras_with_them(
-    demo: DemoSet, scenes: tuple[TrainScene, ...], tmp_path: Path
-) -> None:
+def test_images_are_set_upright_and_their_cameras_with_them(demo, scenes, tmp_path):
     """Images that lie on their sides, with cameras to match, come back as what they were."""
     lines, originals = [], [true for scene in scenes for true in scene.pairs]
     for number, true in enumerate(originals):
         turns, names, cameras = (number + 1, 3 - number), [], []
         for quarters, path, camera in zip(turns, true.pair.images, (true.camera0, true.camera1), strict=True):
             image = read_image(path)
-            assert isinstance(image, Image)
             names.append(f"{number}-{path.stem}.png")
             lying = cv2.cvtColor(np.ascontiguousarray(np.rot90(image.pixels, -quarters)), cv2.COLOR_RGB2BGR)
             cv2.imwrite(str(tmp_path / names[-1]), lying)
@@ -144,8 +140,6 @@ def test_images_are_set_upright_and_their_cameras_with_them(
     for true, original in zip(read.pairs, originals, strict=True):
         for path, former in zip(true.pair.images, original.pair.images, strict=True):
             image, upright = read_image(path), read_image(former)
-            assert isinstance(image, Image)
-            assert isinstance(upright, Image)
             np.testing.assert_array_equal(image.pixels, upright.pixels)
         for camera, former_camera in ((true.camera0, original.camera0), (true.camera1, original.camera1)):
             np.testing.assert_allclose(camera.K, former_camera.K, atol=1e-9)
@@ -156,12 +150,10 @@ def test_images_are_set_upright_and_their_cameras_with_them(
         )
 
 
-def test_a_journal_knows_with_which_cameras_a_pair_was_estimated(
-    scenes: tuple[TrainScene, ...], demo: DemoSet, tmp_path: Path
-) -> None:
+def test_a_journal_knows_with_which_cameras_a_pair_was_estimated(scenes, demo, tmp_path):
     path = write_list(tmp_path / "list.txt", scenes, demo.train_dir)
 
-    def digest() -> str:
+    def digest():
         return digest_of_pairs([true.pair for true in read_pairs(path, demo.train_dir, copies=tmp_path).pairs])
 
     before = digest()
@@ -171,12 +163,7 @@ def test_a_journal_knows_with_which_cameras_a_pair_was_estimated(
     assert digest() != before
 
 
-def errors_of(out: Path) -> list[tuple[float | None, float | None]]:
-    (scene,) = json.loads(out.read_text())["scenes"]
-    return [(pair["rotation_error_degrees"], pair["translation_error_degrees"]) for pair in scene["pairs"]]
-
-
-def test_a_list_scores_as_the_train_side_does(demo: DemoSet, small_recipe: Path, tmp_path: Path) -> None:
+def test_a_list_scores_as_the_train_side_does(demo, small_recipe, tmp_path):
     """F on a list has the errors of F on the train side; E those of the library's E."""
     train_dir, scene, recipe, out = demo.train_dir, "courtyard", small_recipe, tmp_path / "scores.json"
     scenes = read_train_side(train_dir, scenes=[scene], pairs_per_scene=2)
@@ -190,13 +177,13 @@ def test_a_list_scores_as_the_train_side_does(demo: DemoSet, small_recipe: Path,
     ]
     errors = [error_of(match.estimate.matrix, true, read) for match, true in zip(matches, read.pairs, strict=True)]
     expected = [(error.rotation, error.translation_angle) for error in errors]
-    np.testing.assert_allclose(errors_of(out), expected, atol=1e-9)
+    (scored,) = json.loads(out.read_text())["scenes"]
+    found = [(pair["rotation_error_degrees"], pair["translation_error_degrees"]) for pair in scored["pairs"]]
+    np.testing.assert_allclose(found, expected, atol=1e-9)
     assert min(error.angle for error in errors) < 5
 
 
-def test_failures_count_as_such(
-    demo: DemoSet, scenes: tuple[TrainScene, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_failures_count_as_such(demo, scenes, tmp_path, capsys):
     """One pair of two cannot be read: half of what the other reaches is left."""
     true = max(scenes[0].pairs, key=lambda true: true.covisibility)
     out = tmp_path / "scores.json"
@@ -219,9 +206,7 @@ def test_failures_count_as_such(
     assert row.split()[3:5] == ["2", "-"]
 
 
-def test_the_papers_tables_are_made_with_one_command(
-    demo: DemoSet, scenes: tuple[TrainScene, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_papers_tables_are_made_with_one_command(demo, scenes, tmp_path, capsys):
     listed = write_list(tmp_path / "list.txt", [replace(scenes[0], pairs=scenes[0].pairs[:1])], demo.train_dir)
     where = ["--scannet", str(listed), str(demo.train_dir), "--out", str(tmp_path / "out"), "--matcher", "sift"]
     paper_tables.main([*where, "--rows", "one", "two + one"])
@@ -234,7 +219,7 @@ def test_the_papers_tables_are_made_with_one_command(
     assert empty == ""
 
 
-def test_every_row_of_the_papers_tables_is_a_part_of_its_recipe() -> None:
+def test_every_row_of_the_papers_tables_is_a_part_of_its_recipe():
     text = (Path(__file__).resolve().parents[1] / "docs" / "benchmarks.md").read_text()
     for dataset, rows in paper_tables.TABLES.items():
         assert {unit.name for unit in rows[-1].of(dataset, "superglue").units} == {
@@ -249,6 +234,6 @@ def test_every_row_of_the_papers_tables_is_a_part_of_its_recipe() -> None:
             assert f"| {told} |" in text
 
 
-def test_units_are_taken_in_the_order_in_which_they_are_named() -> None:
+def test_units_are_taken_in_the_order_in_which_they_are_named():
     recipe = with_units(load_recipe("yfcc"), "1:superglue@1600,2:superglue@1400")
     assert [unit.name for unit in recipe.units] == ["1:superglue@1600", "2:superglue@1400"]

@@ -3,9 +3,7 @@
 The weights are stand-ins: what is matched has no worth, but it is matched by all of the real code.
 """
 
-import csv
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 
@@ -20,49 +18,27 @@ from mkpc_kaggle.data.competition import read_submission, read_test_side, submis
 from mkpc_kaggle.engine.journal import JournalReader
 from mkpc_kaggle.weights import WeightFile
 
-COLUMNS = ("sample_id", "batch_id", "image_1_id", "image_2_id")
-
-
-@dataclass(frozen=True)
-class Trial:
-    """``sizes``: what the units of stage 1 and of stage 2 look at; none fits the networks' multiples.
-
-    ``options`` are the matcher's.
-    """
-
-    sizes: tuple[str, str]
-    options: str = ""
-
-
-SEMI_DENSE = Trial(("long_side = 209", "long_side = 150"))
+# What the units of stages 1 and 2 look at, which fits no network's multiple, and the matcher's options.
 TRIALS = {
-    "superglue": Trial(("long_side = 209", "long_side = 190")),
-    "loftr": SEMI_DENSE,
-    "quadtree": SEMI_DENSE,
-    "aspanformer": SEMI_DENSE,
-    "loma": Trial(
-        ("long_side = 209", "long_side = 150"),
-        options='variant = "b128"\nmax_keypoints = 300\nmatch_threshold = 0.0',
-    ),
-    "dkm": Trial(('area = "96x128"', 'area = "70x90"'), options="matches = 300"),
-    "roma": Trial(('area = "96x128"', 'area = "70x90"'), options="matches = 300"),
+    "superglue": ("long_side = 209", "long_side = 190", ""),
+    "loftr": ("long_side = 209", "long_side = 150", ""),
+    "quadtree": ("long_side = 209", "long_side = 150", ""),
+    "aspanformer": ("long_side = 209", "long_side = 150", ""),
+    "loma": ("long_side = 209", "long_side = 150", 'variant = "b128"\nmax_keypoints = 300\nmatch_threshold = 0.0'),
+    "dkm": ('area = "96x128"', 'area = "70x90"', "matches = 300"),
+    "roma": ('area = "96x128"', 'area = "70x90"', "matches = 300"),
 }
 
 
-class Checkpoints:
-    """A directory of stand-in checkpoints, each written when it is first wanted."""
-
-    def __init__(self, directory: Path) -> None:
-        self.directory = directory
-
-    @cache  # noqa: B019  there is only the module's
-    def of(self, matcher: str) -> tuple[WeightFile, ...]:
-        return write_checkpoints(self.directory, [file for file in FILES if file.matcher == matcher])
-
-
 @pytest.fixture(scope="module")
-def checkpoints(tmp_path_factory: pytest.TempPathFactory) -> Checkpoints:
-    return Checkpoints(tmp_path_factory.mktemp("weights"))
+def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("weights")
+
+
+@cache
+def checkpoints(directory: Path, matcher: str) -> tuple[WeightFile, ...]:
+    """The matcher's stand-in checkpoints, written when they are first wanted."""
+    return write_checkpoints(directory, [file for file in FILES if file.matcher == matcher])
 
 
 @pytest.fixture(scope="module")
@@ -81,20 +57,15 @@ def made_side(tmp_path_factory: pytest.TempPathFactory) -> Path:
         path.parent.mkdir(parents=True, exist_ok=True)
         cv2.imwrite(str(path), pixels)
     pairs = [("landscape", "portrait"), ("small", "landscape"), ("portrait", "blank")]
-    write_pairs(directory, [(f"made;{first}-{second}", "made", first, second) for first, second in pairs])
+    rows = [f"made;{first}-{second},made,{first},{second}" for first, second in pairs]
+    (directory / "test.csv").write_text("\n".join(["sample_id,batch_id,image_1_id,image_2_id", *rows]))
     return directory
 
 
-def write_pairs(directory: Path, rows: Sequence[tuple[str, ...]]) -> None:
-    with (directory / "test.csv").open("w", encoding="utf-8", newline="") as file:
-        csv.writer(file).writerows([COLUMNS, *rows])
-
-
 def write_recipe(directory: Path, matcher: str) -> Path:
-    path, trial = directory / "small.toml", TRIALS[matcher]
-    units = [f'{{ stage = {n}, matcher = "{matcher}", {size} }}' for n, size in enumerate(trial.sizes, start=1)]
-    options = [f"[matchers.{matcher}]", trial.options]
-    path.write_text("\n".join([f"units = [{', '.join(units)}]", *options]), encoding="utf-8")
+    path, (*sizes, options) = directory / "small.toml", TRIALS[matcher]
+    units = [f'{{ stage = {n}, matcher = "{matcher}", {size} }}' for n, size in enumerate(sizes, start=1)]
+    path.write_text(f"units = [{', '.join(units)}]\n[matchers.{matcher}]\n{options}", encoding="utf-8")
     return path
 
 
@@ -114,43 +85,38 @@ def assert_good(output: Path, test_dir: Path) -> None:
         assert strengths[2] < 1e-6 * strengths[0] < 1e6 * strengths[1]
 
 
-@dataclass(frozen=True)
-class Made:
-    """A submission, and how many matches its units found by (pair, stage)."""
-
-    output: Path
-    matches: dict[tuple[int, int], int]
-
-
 @pytest.fixture
 def run(
-    clean_environment: None, checkpoints: Checkpoints, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> Callable[..., Made]:
-    """A function that makes a submission of a test side with one of the matchers."""
+    clean_environment, weights, monkeypatch, tmp_path
+) -> Callable[..., tuple[bytes, dict[tuple[int, int], int]]]:
+    """A function that makes a submission of a test side with one of the matchers.
 
-    def made(matcher: str, test_dir: Path, name: str = "submission", *, workers: int = 0) -> Made:
-        use_manifest(monkeypatch, checkpoints.of(matcher))
+    It returns the file, and how many matches its units found by (pair, stage).
+    """
+
+    def made(matcher, test_dir, *, workers=0):
+        use_manifest(monkeypatch, checkpoints(weights, matcher))
         use_narrow(monkeypatch)
-        output, recipe = tmp_path / f"{name}.csv", write_recipe(tmp_path, matcher)
+        output, recipe = tmp_path / f"{workers}.csv", write_recipe(tmp_path, matcher)
         arguments = ("--test-dir", test_dir, "--output", output, "--recipe", recipe)
-        options = ("--weights", checkpoints.directory, "--time-limit", "10m", "--device", "cpu", "--no-report")
+        options = ("--weights", weights, "--time-limit", "10m", "--device", "cpu", "--no-report")
         # In this process, so that it meets the manifest that was put in its way.
         assert main(["submit", *map(str, (*arguments, *options, "--workers", workers))]) == 0
         assert_good(output, test_dir)
-        return Made(output, matches_found(tmp_path / f"{name}.work"))
+        return output.read_bytes(), matches_found(tmp_path / f"{workers}.work")
 
     return made
 
 
 @pytest.mark.parametrize("matcher", TRIALS)
-def test_odd_small_and_blank_pictures_go_through(run: Callable[..., Made], matcher: str, made_side: Path) -> None:
-    made = run(matcher, made_side)
-    assert made.matches.keys() == {(pair, stage) for pair in range(3) for stage in (1, 2)}
-    assert made.matches[0, 1] >= 8
+def test_odd_small_and_blank_pictures_go_through(run, matcher, made_side):
+    _, matches = run(matcher, made_side)
+    assert matches.keys() == {(pair, stage) for pair in range(3) for stage in (1, 2)}
+    assert matches[0, 1] >= 8
     if matcher not in {"dkm", "roma", "loma"}:  # which have answers for all pixels, and keypoints on any picture
-        assert made.matches[2, 1] == made.matches[2, 2] == 0
+        assert matches[2, 1] == matches[2, 2] == 0
 
 
-def test_a_worker_process_gives_the_same_bytes(run: Callable[..., Made], made_side: Path) -> None:
-    here, there = (run("superglue", made_side, f"with {workers}", workers=workers) for workers in (0, 1))
-    assert here.output.read_bytes() == there.output.read_bytes()
+def test_a_worker_process_gives_the_same_bytes(run, made_side):
+    here, there = (run("superglue", made_side, workers=workers) for workers in (0, 1))
+    assert here == there

@@ -9,7 +9,6 @@ from golden import Stage, assert_stages, golden_arrays, needs_golden, ready, rec
 from loma_values import assignment_values
 from test_parity_superpoint import golden_network as golden_superpoint
 from test_parity_superpoint import image_of
-from torch.nn import functional
 
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.matchers.networks.layers import mutual_matches
@@ -115,37 +114,15 @@ def test_every_stage_of_the_network_is_the_golden_one(case):
 
 
 @needs_golden
-def test_the_transport_alone_is_the_golden_one():
-    assert_stages(sinkhorn_stages())
-
-
-@needs_golden
-def test_from_two_images_to_the_golden_matches():
-    assert_stages(pipeline_stages())
-
-
-@cache
-def network():
-    """Random weights whose attention and scores are far from uniform."""
-    torch.manual_seed(0)
-    network = SuperGlue(sinkhorn_iterations=20, match_threshold=0.0)
-    for layer in network.gnn.layers:
-        layer.attn.proj[0].weight.mul_(8)
-        layer.attn.proj[1].weight.mul_(8)
-    network.final_proj.weight.mul_(8)
-    return network
-
-
-def keypoints(seed, n):
-    generator = torch.Generator().manual_seed(seed)
-    points, scores = torch.rand(n, 2, generator=generator) * torch.tensor(VGA), torch.rand(n, generator=generator)
-    descriptors = functional.normalize(torch.randn(n, 256, generator=generator), dim=1)
-    return SuperPointKeypoints(points, scores, descriptors, VGA)
+@pytest.mark.parametrize("stages", [sinkhorn_stages, pipeline_stages])
+def test_the_transport_alone_and_the_way_from_two_images_are_the_golden_ones(stages):
+    assert_stages(stages())
 
 
 @pytest.mark.parametrize(("n0", "n1"), [(0, 0), (0, 5), (5, 0)])
 def test_no_keypoints_give_no_matches(n0, n1):
-    found = network()(keypoints(0, n0), keypoints(1, n1))
+    keypoints = [SuperPointKeypoints(torch.rand(n, 2), torch.rand(n), torch.rand(n, 256), VGA) for n in (n0, n1)]
+    found = SuperGlue(match_threshold=0.0)(*keypoints)
     assert [each.shape for each in (found.index0, found.index1, found.scores)] == [(0,)] * 3
 
 

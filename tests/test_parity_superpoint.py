@@ -6,6 +6,7 @@ from functools import cache
 import pytest
 import torch
 from golden import Stage, assert_stages, golden_arrays, needs_golden, ready, standin_state
+from standin import filled
 from torch.nn import functional
 
 from mkpc_kaggle.matchers.networks.superpoint import SuperPoint, sample_descriptors, score_map, suppress_non_maxima
@@ -82,28 +83,10 @@ def test_steps_without_weights_are_the_golden_ones(stages):
     assert_stages(stages())
 
 
-def network(**options):
-    """Random weights that respond to texture and find keypoints in noise."""
-    torch.manual_seed(0)
-    network = SuperPoint(**options)
-    for name, weight in network.named_parameters():
-        if name.endswith("weight"):
-            torch.nn.init.kaiming_normal_(weight)
-            weight.sub_(weight.mean(dim=(1, 2, 3), keepdim=True))
-    return network
-
-
 def test_the_threshold_is_strict_and_the_limit_keeps_the_strongest_in_order():
     scores = torch.zeros(16, 24)
-    for (y, x), score in {
-        (4, 4): 0.25,
-        (4, 19): 0.5,
-        (11, 4): 0.75,
-        (11, 19): 0.125,
-        (12, 9): 1,
-        (9, 20): 1,
-    }.items():
-        scores[y, x] = score
+    scores[4, 4], scores[4, 19], scores[11, 4], scores[11, 19] = 0.25, 0.5, 0.75, 0.125
+    scores[12, 9], scores[9, 20] = 1, 1
 
     def selected(**options):
         points, kept = SuperPoint(keypoint_threshold=0.125, **options).select_keypoints(scores)
@@ -116,14 +99,14 @@ def test_the_threshold_is_strict_and_the_limit_keeps_the_strongest_in_order():
     assert [20, 9] in selected(border=3)
 
 
-def test_a_batch_equals_its_images_with_any_weights():
-    net = network(max_keypoints=20)
+def test_a_batch_equals_its_images():
+    network = filled(SuperPoint(max_keypoints=20), "superpoint")
     batch = torch.rand(3, 1, 45, 62)
-    for found, image in zip(net(batch), batch, strict=True):
-        (alone,) = net(image[None])
+    for found, image in zip(network(batch), batch, strict=True):
+        (alone,) = network(image[None])
         torch.testing.assert_close(found.scores, alone.scores, rtol=1e-4, atol=1e-7)
         assert torch.equal(found.points, alone.points)
         assert len(alone.points) == 20
         assert (alone.scores.diff() <= 0).all()
         assert ((alone.points >= 4) & (alone.points < torch.tensor([56 - 4, 40 - 4]))).all()
-    assert net(batch[:0]) == []
+    assert network(batch[:0]) == []

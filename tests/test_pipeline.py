@@ -65,9 +65,6 @@ def errors(matches):
     return np.hypot(*(matches.points1 - true).T)
 
 
-# matchers of the user's
-
-
 @dataclass(frozen=True)
 class Nothing:
     """No options."""
@@ -109,9 +106,6 @@ class CountingSift(SiftMatcher):
 
 def own(*units, **matchers):
     return TwoStageMatcher(Recipe(units), matchers=matchers)
-
-
-# from two pictures to a model
 
 
 def test_both_stages_give_matches_in_full_image_pixels():
@@ -199,9 +193,6 @@ def test_at_most_so_many_matches_are_kept_and_they_are_the_surest():
     assert some.scores.min() >= np.sort(every.scores)[-50]
 
 
-# the order of things
-
-
 def works(count=1):
     image0, image1 = map(Image.of_array, pair())
     smaller = Image.of_array(np.ascontiguousarray(pair()[1][:300, 100:]))
@@ -250,9 +241,6 @@ def test_whole_images_are_encoded_once_and_crops_for_each_pair():
     assert sift.seen.pop(Box.whole(SIZE)) == 2
     assert len(sift.seen) >= 2
     assert sift.seen.total() == 6
-
-
-# matchers of the user's, good and bad
 
 
 def test_two_matchers_of_one_class_do_not_share_encodings_and_each_has_its_options():

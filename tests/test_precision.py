@@ -6,6 +6,7 @@ The weights are stand-ins, so that the bounds are of the arithmetic, not of the 
 import numpy as np
 import pytest
 import torch
+from pictures import agreement
 from standin import filled, scene
 
 from mkpc_kaggle.geometry.coordinates import Size
@@ -37,12 +38,6 @@ def noisy(picture):
     """Each value a grey level darker or lighter, or as it was."""
     noise = torch.from_numpy(np.random.default_rng(0).integers(-1, 2, picture.shape))
     return (picture + noise).clamp(0, 255).to(torch.uint8)
-
-
-def agreement(first, second, within):
-    """The share of the rows of either that lie within so many pixels of a row of the other."""
-    near = torch.cdist(first, second) <= within
-    return ((near.any(1).sum() + near.any(0).sum()) / (len(first) + len(second))).item()
 
 
 @torch.inference_mode()

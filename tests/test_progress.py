@@ -3,6 +3,7 @@
 from io import StringIO
 
 import pytest
+from simulator import VirtualClock
 
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.console import LINE_INTERVAL_S, Progress, redraws
@@ -19,16 +20,9 @@ def no_notebook(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("JPY_PARENT_PID", raising=False)
 
 
-class Clock:
-    now = 0.0
-
-    def __call__(self) -> float:
-        return self.now
-
-
 def test_a_terminal_has_a_bar_with_rate_and_time_left() -> None:
     stream = Terminal()
-    progress = Progress(Budget(0.0, 100.0, Clock()), stream)
+    progress = Progress(Budget(0.0, 100.0, VirtualClock()), stream)
     progress.show(Phase.SWEEP, 8, 8)
     progress.show(Phase.DEEPEN, 2, 8)
     progress.close()
@@ -44,7 +38,7 @@ def test_the_terminal_that_a_notebook_gives_its_commands_has_lines(monkeypatch: 
 
 
 def test_lines_come_when_a_phase_begins_now_and_then_and_in_the_end() -> None:
-    stream, clock = StringIO(), Clock()
+    stream, clock = StringIO(), VirtualClock()
     progress = Progress(Budget(0.0, clock=clock), stream)
     for done in range(1, 101):  # 100 seconds
         clock.now += 1
@@ -64,7 +58,7 @@ def test_a_log_whose_reader_has_left_does_not_end_the_run(stream: type[StringIO]
         def write(self, text: str) -> int:
             raise BrokenPipeError
 
-    progress = Progress(Budget(0.0, clock=Clock()), Left())
+    progress = Progress(Budget(0.0, clock=VirtualClock()), Left())
     progress.show(Phase.SWEEP, 1, 5)
     progress.show(Phase.SWEEP, 5, 5)
     progress.close()

@@ -66,12 +66,9 @@ def scene(seed, plane=False):
     return matches[order], order < 180
 
 
-def intrinsics(seed):
-    return tuple(camera.K for camera in cameras(seed))
-
-
 def estimated(model, matches, config=DEFAULT, seed=0):
-    return estimate(matches, config, model, intrinsics(seed) if model is ModelKind.E else None)
+    intrinsics = tuple(camera.K for camera in cameras(seed)) if model is ModelKind.E else None
+    return estimate(matches, config, model, intrinsics)
 
 
 def assert_agrees(result, truth):

@@ -31,7 +31,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> WeightStore:
 
 
 def loaded(store: WeightStore, precision: Precision = Precision.FLOAT32, **options: object) -> RomaMatcher:
-    return roma.load(store, RomaOptions(**options), Placement(precision=precision))  # type: ignore[arg-type]
+    return roma.load(store, RomaOptions(**options), Placement(precision=precision))
 
 
 def test_sides_of_the_first_pass_are_multiples_of_14(store: WeightStore) -> None:
@@ -49,7 +49,7 @@ def test_sides_of_the_first_pass_are_multiples_of_14(store: WeightStore) -> None
 
 
 def test_the_published_sizes_are_a_stretched_unit_of_864() -> None:
-    assert RomaMatcher(None, RomaOptions(), "cpu")._first_size(Size(864, 864)) == (560, 560)  # type: ignore[arg-type]
+    assert RomaMatcher(None, RomaOptions(), "cpu")._first_size(Size(864, 864)) == (560, 560)
     assert stretch(torch.Size([560, 560])) == 1.25
     assert stretch(torch.Size([864, 864])) == pytest.approx(1.25 * 1.542857, rel=1e-6)
 

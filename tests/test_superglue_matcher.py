@@ -1,7 +1,5 @@
 """SuperPoint + SuperGlue as a matcher, from checkpoints in the public files' own format, with random weights."""
 
-from pathlib import Path
-
 import pytest
 import torch
 from pictures import picture, write_store
@@ -25,7 +23,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> WeightStore:
     return write_store(tmp_path_factory.mktemp("weights"), states, slots)
 
 
-def test_the_other_way_round_the_same_keypoints_are_paired(store: WeightStore) -> None:
+def test_the_other_way_round_the_same_keypoints_are_paired(store):
     matcher = superglue.load(store, OPTIONS, Placement())
     first, second = matcher.encode([picture(120, 160, name, channels=1) for name in ("scene", "another")])
     (there,), (back,) = matcher.match([first], [second]), matcher.match([second], [first])
@@ -34,9 +32,7 @@ def test_the_other_way_round_the_same_keypoints_are_paired(store: WeightStore) -
     assert pairs == {(*a, *b) for a, b in zip(back.points1.tolist(), back.points0.tolist(), strict=True)}
 
 
-def test_indoor_weights_are_another_slot_and_another_networks_checkpoint_is_refused(
-    store: WeightStore, tmp_path: Path
-) -> None:
+def test_indoor_weights_are_another_slot_and_another_networks_checkpoint_is_refused(store, tmp_path):
     indoor = superglue.SuperGlueOptions(training=Training.INDOOR)
     assert superglue.SPEC.slots_for(indoor) == ("superpoint", "superglue-indoor")
     with pytest.raises(UserError, match="superglue-indoor"):

@@ -26,11 +26,8 @@ def test_every_tensor_comes_through_whatever_it_shares(tmp_path):
     line = convert(tmp_path / "x.ckpt", tmp_path / "new" / "x.safetensors")
     data = (tmp_path / "new" / "x.safetensors").read_bytes()
     assert (line.name, line.size, line.digest) == ("x.safetensors", len(data), digest_of(data))
-    assert (line.licence, line.slot, line.source) == (
-        "?",
-        "?",
-        f"x.ckpt ({digest_of((tmp_path / 'x.ckpt').read_bytes())}) with the same tensor names",
-    )
+    source = f"x.ckpt ({digest_of((tmp_path / 'x.ckpt').read_bytes())}) with the same tensor names"
+    assert (line.licence, line.slot, line.source) == ("?", "?", source)
     loaded = load_tensors(tmp_path / "new" / "x.safetensors")
     assert loaded.keys() == tensors.keys()
     assert all(torch.equal(loaded[name], tensor) for name, tensor in tensors.items())

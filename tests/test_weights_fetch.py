@@ -24,16 +24,10 @@ def site(monkeypatch: pytest.MonkeyPatch) -> Iterator[Site]:
         yield site
 
 
-class Pauses(list[float]):
-    """Takes the pauses between attempts and lets none pass."""
-
-    def __call__(self, seconds: float) -> None:
-        self.append(seconds)
-
-
-def get(site: Site, directory: Path, file: WeightFile | None = None, pauses: Pauses | None = None) -> Fetched:
+def get(site: Site, directory: Path, file: WeightFile | None = None, pauses: list[float] | None = None) -> Fetched:
+    """Download without a pause between attempts; ``pauses`` takes the seconds that there would have been."""
     wanted = replace(file or line(data=BIG), source=f"{site.url} (renamed)")
-    return fetch.fetch(wanted, directory, wait=Pauses() if pauses is None else pauses)
+    return fetch.fetch(wanted, directory, wait=([] if pauses is None else pauses).append)
 
 
 def names_in(directory: Path) -> list[str]:
@@ -42,7 +36,7 @@ def names_in(directory: Path) -> list[str]:
 
 def test_a_broken_connection_is_taken_up_where_it_broke(site, tmp_path):
     site.breaks = [CUT, 5]
-    pauses = Pauses()
+    pauses: list[float] = []
     fetched = get(site, tmp_path / "new" / "weights", pauses=pauses)
     assert (fetched.outcome, fetched.note) == (FetchOutcome.FETCHED, "")
     assert fetched.path.read_bytes() == BIG
@@ -54,7 +48,7 @@ def test_a_broken_connection_is_taken_up_where_it_broke(site, tmp_path):
 
 def test_another_call_goes_on_where_the_last_one_gave_up(site, tmp_path):
     site.breaks = [CUT] + [0] * (ATTEMPTS - 1)
-    pauses = Pauses()
+    pauses: list[float] = []
     failed = get(site, tmp_path, pauses=pauses)
     assert failed.outcome is FetchOutcome.FAILED
     assert f"{ATTEMPTS} attempts failed" in failed.note
@@ -107,8 +101,8 @@ def test_errors_that_pass_are_waited_for_and_others_are_told(site, tmp_path, sta
 
 
 def test_what_cannot_be_reached_or_written_is_told(site, tmp_path):
-    pauses = Pauses()
-    gone = fetch.fetch(replace(line(), source="http://127.0.0.1:9/a.bin"), tmp_path, wait=pauses)
+    pauses: list[float] = []
+    gone = fetch.fetch(replace(line(), source="http://127.0.0.1:9/a.bin"), tmp_path, wait=pauses.append)
     assert (gone.outcome, len(pauses)) == (FetchOutcome.FAILED, ATTEMPTS - 1)
     assert "127.0.0.1:9" in gone.note
     site.redirect = "file:///etc/hostname"

@@ -16,17 +16,14 @@ from mkpc_kaggle.weights.manifest import digest_of as file_digest
 pytestmark = pytest.mark.usefixtures("nowhere_else")
 
 
-def found_by(weights: WeightStore, slot: str = "slot") -> Path:
-    found = weights.find(slot)
-    assert found is not None
-    return found.path
+def found_by(weights: WeightStore) -> Path:
+    return weights.find("slot").path
 
 
 def test_a_file_is_found_in_the_directory_and_below_it(tmp_path):
     assert found_by(WeightStore([put(tmp_path / "a")], [line()])) == tmp_path / "a" / "a.bin"
     put(tmp_path / "b" / "deep" / "deeper")
     found = WeightStore([tmp_path / "b"], [line()]).find("slot")
-    assert found is not None
     assert (found.path, found.digest) == (tmp_path / "b" / "deep" / "deeper" / "a.bin", digest_of(DATA))
     put(tmp_path / "c" / "a.bin")  # Kaggle makes such directories of data sets of one file
     assert found_by(WeightStore([tmp_path / "c"], [line()])) == tmp_path / "c" / "a.bin" / "a.bin"
@@ -69,7 +66,6 @@ def test_a_renamed_file_is_found_by_its_size_and_digest(tmp_path, monkeypatch):
     put(tmp_path, "same size.dat", OTHER)
     put(tmp_path, "long.pth", DATA + b"!")
     found = WeightStore([tmp_path], [line()]).find("slot")
-    assert found is not None
     assert (found.path.name, found.state, found.note) == ("model", State.GOOD, "it is a.bin")
     assert "long.pth" not in {path.name for path in read}
 
@@ -104,7 +100,6 @@ def test_an_unpacked_checkpoint_is_found_and_read(tmp_path, outer):
     os.utime(tmp_path / "input" / "someones" / outer / "x" / "data.pkl", (0, 0))
     weights = WeightStore([tmp_path / "input"], [file])
     found = weights.find("slot")
-    assert found is not None
     assert (found.state, found.path) == (State.UNVERIFIED, tmp_path / "input" / "someones" / outer / "x")
     loaded = weights.load("slot")
     assert loaded.keys() == tensors.keys()

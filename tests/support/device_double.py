@@ -89,13 +89,13 @@ class Tagged(torch.Tensor):
 
 
 class DeviceDouble(TorchDispatchMode):
-    """``count`` GPUs of that compute ``capability``, with ``memory`` bytes each, all free."""
+    """``count`` GPUs with ``memory`` bytes each, all free."""
 
     current: DeviceDouble | None = None
 
-    def __init__(self, count=1, capability=(7, 5), memory=15 << 30):
+    def __init__(self, count=1, memory=15 << 30):
         super().__init__()
-        self.count, self.capability, self.memory = count, capability, memory
+        self.count, self.memory = count, memory
         self.operators = 0  # run on tagged tensors so far
         self.dtypes = set()  # of the tagged tensors that operators have met
         self._generators = {}
@@ -141,12 +141,9 @@ class DeviceDouble(TorchDispatchMode):
             "is_available": lambda: True,
             "device_count": lambda: self.count,
             "current_device": lambda: 0,
-            "get_device_capability": lambda device=None: self.capability,
-            "get_device_name": lambda device=None: "device double",
             "is_bf16_supported": lambda including_emulation=True: True,
             "mem_get_info": lambda device=None: (self.memory, self.memory),
             "empty_cache": lambda: None,
-            "synchronize": lambda device=None: None,
         }
         yield from ((torch.cuda, name, value) for name, value in values.items())
         yield torch, "Generator", Generator
@@ -186,7 +183,7 @@ class DeviceDouble(TorchDispatchMode):
         held = {id(each.held): each for each in tagged}
         if wanted is not None:
             kwargs = {**kwargs, "device": torch.device("cpu")}
-        inner_args, inner_kwargs = tree_map(untagged, (args, kwargs))
+        inner_args, inner_kwargs = tree_map(lambda x: x.held if isinstance(x, Tagged) else x, (args, kwargs))
         out = func(*inner_args, **inner_kwargs)
         for each in tagged:
             assert each.held.shape == each.shape, f"{name} changed a shape in place: the double cannot follow"
@@ -227,10 +224,6 @@ class DeviceDouble(TorchDispatchMode):
         made_for = self._generators.get(generator._cdata) if generator is not None else where
         if made_for != where:
             raise MixedDevicesError(f"{name}: a generator of {made_for} for a tensor on {where}")
-
-
-def untagged(value):
-    return value.held if isinstance(value, Tagged) else value
 
 
 class Autocast(TorchFunctionMode):

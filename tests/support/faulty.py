@@ -33,8 +33,6 @@ from mkpc_kaggle.scene.view_graph import BatchImage
 
 BROKEN = "CUDA error: an illegal memory access was encountered"
 
-# Faults
-
 Fault = Callable[[], None]
 
 
@@ -71,9 +69,6 @@ def breaks_after(pairs: int) -> Callable[[int], int]:
     """Answers of a matcher whose device fails after so many pairs, and then at everything in this process."""
     calls = count()
     return lambda _: 150 if next(calls) < pairs else break_device()
-
-
-# Matchers
 
 
 @dataclass
@@ -115,8 +110,6 @@ class NarrowMatcher(RectifiedMatcher):
             raise RuntimeError("cuDNN error: CUDNN_STATUS_ALLOC_FAILED")
         return super().match(encodings0, encodings1)
 
-
-# Scenes
 
 # The scenes of these tests give it to all pairs.
 SCENE_F = np.array([[0.0, 0, 0.2], [0, 0, -0.5], [-0.3, 0.6, 0.5]])
@@ -177,9 +170,6 @@ def scene_in_a_gigabyte(job: SceneJob) -> SceneResult:
     """All that it may have; libraries that are only mapped are not counted."""
     resource.setrlimit(resource.RLIMIT_DATA, (1 << 30, 1 << 30))
     return reconstruct(job)
-
-
-# Places
 
 
 def thread_place(

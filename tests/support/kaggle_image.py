@@ -9,7 +9,7 @@ import shutil
 import subprocess
 import sys
 import venv
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.metadata import Distribution, PackageNotFoundError, distribution
 from pathlib import Path
@@ -39,19 +39,7 @@ IMAGES = (
 )
 BESIDE = ("matplotlib", "tqdm", "ipykernel", "nbclient", "nbformat")
 UNPACKED = (".zip", ".tar", ".gz", ".pt", ".pth", ".ckpt")  # Kaggle unpacks archives, as torch's checkpoints are
-PACKAGES = (
-    "numpy",
-    "pandas",
-    "scipy",
-    "scikit-learn",
-    "opencv-python-headless",
-    "torch",
-    "matplotlib",
-    "tqdm",
-    "pip",
-    "ipykernel",
-    "nbclient",
-)
+PACKAGES = ("numpy", "pandas", "scipy", "scikit-learn", "opencv-python-headless", "torch", "pip", *BESIDE)
 
 
 def interpreter(python: str) -> Path | None:
@@ -133,18 +121,12 @@ def pack_wheel(name: str, directory: Path) -> Path:
     pythons, abis, platforms = (".".join(dict.fromkeys(column)) for column in columns)
     stem = f"{installed.name.replace('-', '_')}-{installed.version}"
     path = directory / f"{stem}-{pythons}-{abis}-{platforms}.whl"
-    with ZipFile(path, "w") as archive:
-        for file in _packed(installed):
-            archive.write(Path(str(installed.locate_file(file))), file)
-    return path
-
-
-def _packed(installed: Distribution) -> Iterator[str]:
-    """The files that were in the wheel: not what pip wrote, and not what Python compiled."""
     written_by_pip = ("INSTALLER", "REQUESTED", "direct_url.json")
-    for file in installed.files or ():
-        if file.parts[0] != ".." and "__pycache__" not in file.parts and file.name not in written_by_pip:
-            yield str(file)
+    with ZipFile(path, "w") as archive:
+        for file in installed.files or ():
+            if file.parts[0] != ".." and "__pycache__" not in file.parts and file.name not in written_by_pip:
+                archive.write(Path(str(installed.locate_file(file))), str(file))
+    return path
 
 
 def environment(**more: str) -> dict[str, str]:

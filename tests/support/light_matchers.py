@@ -39,54 +39,48 @@ from tests.support.standin import filled, narrow_roma, scene
 
 SIZE = Size(96, 64)
 SHIFT = 8  # pixels between the two pictures of a pair
-Make = Callable[[], nn.Module]
 
 
 @cache
-def standin(name: str, make: Make) -> nn.Module:
-    return filled(make(), name)
+def standin(name: str, make: Callable[..., nn.Module], *settings: Any, **named: Any) -> nn.Module:
+    """The network of these settings, filled once."""
+    return filled(make(*settings, **named), name)
 
 
-def ours(name: str, make: Make, placement: Placement) -> Any:
+def ours(placement: Placement, *network: Any, **named: Any) -> Any:
     """A network of ours, ready to run there."""
-    return placed(copy.deepcopy(standin(name, make)), placement)
+    return placed(copy.deepcopy(standin(*network, **named)), placement)
 
 
-def kornias(name: str, make: Make) -> Any:
+def kornias(*network: Any, **named: Any) -> Any:
     """A network of kornia's, which its matcher will move."""
-    return copy.deepcopy(standin(name, make))
-
-
-@cache
-def making(make: Callable[..., nn.Module], *settings: Any, **named: Any) -> Make:
-    """The same function for the same settings, so that a stand-in is filled once."""
-    return partial(make, *settings, **named)
+    return copy.deepcopy(standin(*network, **named))
 
 
 def superglue_matcher(placement: Placement, keypoints: int = 200) -> SuperGlueMatcher:
-    superpoint = ours("superpoint", making(SuperPoint, max_keypoints=keypoints), placement)
-    return SuperGlueMatcher(superpoint, ours("superglue", making(SuperGlue, 20), placement), placement.device)
+    superpoint = ours(placement, "superpoint", SuperPoint, max_keypoints=keypoints)
+    return SuperGlueMatcher(superpoint, ours(placement, "superglue", SuperGlue, 20), placement.device)
 
 
-def semi_dense_matcher(spec: MatcherSpec, make: Make, placement: Placement) -> SemiDenseMatcher:
-    return SemiDenseMatcher(ours(spec.name, make, placement), spec, placement.device)
+def semi_dense_matcher(spec: MatcherSpec, make: type[nn.Module], placement: Placement) -> SemiDenseMatcher:
+    return SemiDenseMatcher(ours(placement, spec.name, make), spec, placement.device)
 
 
 def dkm_matcher(placement: Placement, passes: int = 1, matches: int = 300) -> DkmMatcher:
-    return DkmMatcher(ours("dkm", DKM, placement), DenseOptions(passes, matches=matches), placement.device)
+    return DkmMatcher(ours(placement, "dkm", DKM), DenseOptions(passes, matches=matches), placement.device)
 
 
 def roma_matcher(placement: Placement) -> RomaMatcher:
-    return RomaMatcher(ours("roma", narrow_roma, placement), RomaOptions(matches=300), placement.device)
+    return RomaMatcher(ours(placement, "roma", narrow_roma), RomaOptions(matches=300), placement.device)
 
 
 def loma_matcher(placement: Placement) -> LomaAdapter:
     options = LomaOptions(Variant.B128, max_keypoints=200, match_threshold=0.0)
-    return LomaAdapter(ours("loma", making(Loma, Variant.B128), placement), options, placement.device)
+    return LomaAdapter(ours(placement, "loma", Loma, Variant.B128), options, placement.device)
 
 
 def aliked_encoder(placement: Placement, keypoints: int = 200) -> KeypointEncoder:
-    return KeypointEncoder(ours("aliked", making(Aliked, keypoints), placement), placement.device)
+    return KeypointEncoder(ours(placement, "aliked", Aliked, keypoints), placement.device)
 
 
 def aliked_matcher(placement: Placement, keypoints: int = 200) -> AlikedMatcher:
@@ -96,7 +90,7 @@ def aliked_matcher(placement: Placement, keypoints: int = 200) -> AlikedMatcher:
 def with_lightglue(
     spec: MatcherSpec, encoder: KeypointEncoder, placement: Placement, layers: int, threshold: float, **shape: int
 ) -> LightGlueMatcher:
-    glue = kornias("lightglue", making(light_glue, layers, threshold, **shape))
+    glue = kornias("lightglue", light_glue, layers, threshold, **shape)
     return LightGlueMatcher(spec, encoder, glue, placement)
 
 

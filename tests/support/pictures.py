@@ -35,6 +35,11 @@ def as_picture(pixels: np.ndarray, multiple: int = 1, padding: tuple[int, int] =
     return Picture(view.render(np.ascontiguousarray(pixels)), view)
 
 
+def image_of(pixels: np.ndarray) -> torch.Tensor:
+    """(H, W, 3) uint8 -> (1, 3, H, W) in 0..1."""
+    return torch.from_numpy(pixels.copy()).permute(2, 0, 1)[None].float() / 255
+
+
 def match_one(matcher: Any, first: Picture, second: Picture) -> Matches:
     (matches,) = matcher.match(matcher.encode([first]), matcher.encode([second]))
     return matches
@@ -43,6 +48,14 @@ def match_one(matcher: Any, first: Picture, second: Picture) -> Matches:
 def same(first: Matches, second: Matches) -> bool:
     parts = ("points0", "points1", "scores")
     return all(getattr(first, part).tobytes() == getattr(second, part).tobytes() for part in parts)
+
+
+def agreement(first: torch.Tensor, second: torch.Tensor, within: float, p: float = 2.0) -> float:
+    """The share of the rows of either that lie within that distance of a row of the other."""
+    if not len(first) and not len(second):
+        return 1.0
+    near = torch.cdist(first, second, p=p) <= within
+    return ((near.any(1).sum() + near.any(0).sum()) / (len(first) + len(second))).item()
 
 
 def write_store(directory: Path, states: Mapping[str, Any], slots: Iterable[tuple[str, str]]) -> WeightStore:

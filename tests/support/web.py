@@ -16,7 +16,6 @@ class Site:
     breaks: list[int] = field(default_factory=list)  # bytes after which the first connections break
     statuses: list[int] = field(default_factory=list)  # errors that the first requests get
     length: int | None = None  # a Content-Length that is not true; 0: none is sent
-    shift: int = 0  # the part that was asked for begins so many bytes later
     redirect: str = ""
     asked: list[str] = field(default_factory=list)
     sent: int = 0  # bytes of bodies
@@ -34,11 +33,8 @@ class _Handler(BaseHTTPRequestHandler):
         elif site.statuses:
             self.send_error(site.statuses.pop(0))
         else:
-            self._send(site, self._start(site))
-
-    def _start(self, site: Site) -> int:
-        wanted = re.fullmatch(r"bytes=(\d+)-", self.headers.get("Range", ""))
-        return int(wanted[1]) + site.shift if wanted else 0
+            wanted = re.fullmatch(r"bytes=(\d+)-", site.asked[-1])
+            self._send(site, int(wanted[1]) if wanted else 0)
 
     def _send(self, site: Site, start: int) -> None:
         if start and start >= len(site.data):
