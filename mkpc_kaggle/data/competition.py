@@ -253,7 +253,7 @@ class ImageFiles(dict[str, str]):
             self.update((path.stem, str(path)) for path in reversed(images))
 
     def __missing__(self, image_id: str) -> str:
-        return str(self.directory / f"{image_id}.png")
+        return f"{self.directory}{os.sep}{image_id}.png"  # a Path would keep the name of each missing image
 
 
 def _numbers(cell: str, where: str, count: int) -> NDArray[np.float64]:
