@@ -227,6 +227,16 @@ def test_units_that_do_not_fit_for_all_go_to_the_weakest_pairs_in_the_time_left(
     assert not plan.is_complete
 
 
+def test_a_unit_is_not_left_out_for_a_single_slow_pair():
+    plan = learnt(plan_of(60, limit=1000.0), SWEEP)
+    plan.costs.observe(SECOND.name, 60.0)
+    deepened = {
+        i for job in jobs_of(plan) if job.phase is Phase.DEEPEN and SECOND in job.units for i in job.indices
+    }
+    assert deepened == set(range(60))
+    assert not explained(plan, "of 3 units fit"), plan.explanations
+
+
 def test_pairs_that_are_at_work_when_the_filling_begins_are_filled_too():
     ran = simulate(Scenario(300, (0.5, 1.0, 1.0), 2, 500, drift=0.05, turn=0.6))
     assert explained_in(ran.report.explanations, "pairs that lack units, the weakest first")

@@ -7,7 +7,7 @@ from math import sqrt
 from mkpc_kaggle.recipe import Unit
 
 WINDOW = 64  # how many of the latest measurements count
-MIN_MEASUREMENTS = 4  # for a forecast: on a single pair a unit may take many times what it takes on others
+MIN_MEASUREMENTS = 4  # of a unit that is left out: on a single pair it may take many times what it takes on others
 MARGIN, MIN_MARGIN = 0.4, 0.01  # of a forecast from one measurement; from n, sqrt(n) times smaller
 STALL_FACTOR = 10.0  # a measurement this many times the upper quartile is a stall, and counts as no more
 
@@ -85,11 +85,13 @@ class Costs:
         return self._warm_up.get(unit, UNKNOWN).p90 + factor * (self._steady(unit) or UNKNOWN).p90
 
     def forecast(self, unit: str) -> float:
-        """Expected seconds with a margin that shrinks as more is known; 0 as long as too little is."""
+        """Expected seconds with a margin that shrinks as more is known; 0 as long as nothing is."""
         known = self._steady(unit)
-        if known is None or (known.count < MIN_MEASUREMENTS and unit in self._measured):
-            return 0.0
-        return known.mean * (1 + max(MIN_MARGIN, MARGIN / sqrt(known.count)))
+        return known.mean * (1 + max(MIN_MARGIN, MARGIN / sqrt(known.count))) if known else 0.0
+
+    def is_sure(self, unit: str) -> bool:
+        """Whether enough is known of a unit to leave it out."""
+        return unit in self._assumed or self._measured.get(unit, UNKNOWN).count >= MIN_MEASUREMENTS
 
     @property
     def overhead(self) -> float:

@@ -241,6 +241,8 @@ class Plan:
         left = (self.stop - now) * self.workers
         needed = list(self.costs.cumulative(units, self._lacking))
         count = next((number for number, seconds in enumerate(needed) if seconds > left), len(units))
+        if count < len(units) and not self.costs.is_sure(units[count].name):
+            return count + 1
         if count != self._fitting and count < len(units):
             self.explain(
                 now,
