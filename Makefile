@@ -42,7 +42,7 @@ tests:
 
 ray: install
 	$(BIN)/python -m pip install --quiet "ray>=2.9"
-	$(BIN)/python -m pytest tests/test_ray.py tests/test_cluster.py
+	$(BIN)/python -m pytest tests/engine/test_ray.py tests/engine/test_cluster.py
 
 hostile: install
 	$(BIN)/python -m pytest --slow tests/hostile --quiet --numprocesses $(TEST_PROCESSES) --dist load
@@ -50,8 +50,8 @@ hostile: install
 # Old versions of libraries warn of what newer ones of Python and torch deprecate; the tests that are left out pack
 # the wheels of the pinned versions, which are not installed there.
 oldest: $(OLDEST)/installed
-	$(OLDEST)/bin/python -m pytest -W ignore::DeprecationWarning --ignore=tests/test_package.py \
-	    --ignore=tests/test_submission_notebook.py \
+	$(OLDEST)/bin/python -m pytest -W ignore::DeprecationWarning --ignore=tests/package \
+	    --ignore=tests/notebooks/test_submission_notebook.py \
 	    --numprocesses $(TEST_PROCESSES) --dist loadfile
 
 $(OLDEST)/installed: pyproject.toml tests/support/oldest.py

@@ -32,7 +32,7 @@ def pairs_with(path: str, value: str) -> str:
     return f"UPDATE pair SET value = json_replace(value, '$[{path}]', json('{value}'))"
 
 
-# Other values that no reading takes, and pipes in the files' places, are in tests/test_journal.py.
+# Other values that no reading takes, and pipes in the files' places, are in tests/engine/test_journal.py.
 FINE = {
     "a pair of 2^62": pairs_with("0", str(2**62)),
     "no pairs": "DELETE FROM pair",

@@ -23,7 +23,7 @@ from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.recipe import SceneConfig
 from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 IMAGES = (BatchImage("a", "a", Size(80, 72)), BatchImage("b", "b", Size(80, 72)))
 POINTS = np.random.default_rng(1).uniform(0, 70, (50_000, 2)).astype(np.float32)
 MATCHES = Matches(POINTS, POINTS, POINTS[:, 0])
@@ -121,7 +121,7 @@ if __name__ == "__main__":
 
 def test_a_worker_at_work_ends_with_its_parent_and_prints_nothing(tmp_path):
     script = tmp_path / "orphan.py"  # a file, since its children import it
-    script.write_text(ORPHAN.format(path=[str(ROOT), str(ROOT / "tests"), str(ROOT / "tests" / "support")]))
+    script.write_text(ORPHAN.format(path=[str(ROOT), str(Path(__file__).parent), str(ROOT / "tests" / "support")]))
     mark, home = tmp_path / "hangs", {**os.environ, "MKPC_TEST_HOME": str(tmp_path)}
     parent = subprocess.Popen([sys.executable, str(script)], env=home, stderr=subprocess.PIPE)
     while not (mark.exists() and mark.read_text()):

@@ -16,7 +16,7 @@ from mkpc_kaggle.package import Request, make_package
 from mkpc_kaggle.package.metadata import COMPETITION
 from mkpc_kaggle.package.wheels import PYTHONS
 
-NOTEBOOKS = sorted((Path(__file__).resolve().parents[1] / "notebooks").glob("*.ipynb"))
+NOTEBOOKS = sorted((Path(__file__).resolve().parents[2] / "notebooks").glob("*.ipynb"))
 
 
 @pytest.fixture(scope="module")

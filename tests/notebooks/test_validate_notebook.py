@@ -7,7 +7,7 @@ import nbformat
 from kaggle_image import environment
 from offline_notebook import execute, needs_namespaces, pictures, printed
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 SETTINGS = {'"classical:whole-images", "classical"': '"small.toml:stage-1", "small.toml"'}
 SMALL = """
 units = [{ stage = 1, matcher = "sift", long_side = 320 }, { stage = 2, matcher = "sift", long_side = 400 }]

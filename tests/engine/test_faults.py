@@ -28,7 +28,7 @@ from mkpc_kaggle.engine.plan import Plan
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.reporting.run_log import read_log
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 PATHS = [str(ROOT), str(ROOT / "tests" / "support")]
 
 

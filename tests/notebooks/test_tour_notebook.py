@@ -8,7 +8,7 @@ import nbformat
 from kaggle_image import environment
 from offline_notebook import execute, needs_namespaces, outputs, pictures, printed, with_pictures_alone
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 TOUR = ROOT / "notebooks" / "mkpc_tour.ipynb"
 PATHS = os.pathsep.join([str(ROOT), str(TOUR.parent)])  # Jupyter starts a kernel beside its notebook
 MIN_BYTES, MAX_BYTES = 500_000, 1_500_000

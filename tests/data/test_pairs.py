@@ -220,7 +220,7 @@ def test_the_papers_tables_are_made_with_one_command(demo, scenes, tmp_path, cap
 
 
 def test_every_row_of_the_papers_tables_is_a_part_of_its_recipe():
-    text = (Path(__file__).resolve().parents[1] / "docs" / "benchmarks.md").read_text()
+    text = (Path(__file__).resolve().parents[2] / "docs" / "benchmarks.md").read_text()
     for dataset, rows in paper_tables.TABLES.items():
         assert {unit.name for unit in rows[-1].of(dataset, "superglue").units} == {
             unit.name for unit in load_recipe(dataset).units

@@ -1,8 +1,8 @@
 """Matches of whole matchers against vectors of our own, which need no golden files; mistakes must show in them.
 
 Weights and pictures come from ``standin.py`` alone, so nothing but the code decides the numbers.
-``PYTHONPATH=.:tests/support python tests/test_regression_vectors.py`` writes ``tests/data/matches.npz`` anew. That
-is right only when a change is wanted, and only while the parity tests pass: they say what the numbers should be.
+``PYTHONPATH=.:tests/support python tests/matchers/test_regression_vectors.py`` writes ``matches.npz`` beside it anew.
+That is right only when a change is wanted, and only while the parity tests pass: they say what the numbers should be.
 """
 
 from pathlib import Path
@@ -18,7 +18,7 @@ from mkpc_kaggle.matchers.contract import Placement
 from mkpc_kaggle.matchers.networks import dedode, warp_refiner
 from mkpc_kaggle.matchers.networks.grids import as_grid
 
-DATA = Path(__file__).parent / "data" / "matches.npz"
+DATA = Path(__file__).parent / "matches.npz"
 SAME = 0.95  # of the matches: a threshold or a tie within rounding may fall the other way on another processor
 TOLERANCES = np.array([0.5, *4 * [0.05], 2e-3])  # pair, pixels, score; a row is within all of them
 

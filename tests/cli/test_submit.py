@@ -19,7 +19,7 @@ from mkpc_kaggle.cli import main
 from mkpc_kaggle.data.competition import read_submission, read_test_side, submission_problems
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def command(test_dir: Path, output: Path, recipe: Path | str, *more: str) -> list[str]:
