@@ -1,8 +1,9 @@
 """Matches of whole matchers against vectors of our own, which need no golden files; mistakes must show in them.
 
 Weights and pictures come from ``standin.py`` alone, so nothing but the code decides the numbers.
-``PYTHONPATH=.:tests/support python tests/matchers/test_regression_vectors.py`` writes ``matches.npz`` beside it anew.
-That is right only when a change is wanted, and only while the parity tests pass: they say what the numbers should be.
+``PYTHONPATH=.:tests/support python tests/matchers/test_regression_vectors.py`` writes ``matches.npz`` anew.
+That is right only when a change is wanted, and only while the parity tests pass: they say what the numbers
+should be.
 """
 
 from pathlib import Path
