@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from contextlib import ExitStack, nullcontext
 from importlib import import_module
 from io import TextIOWrapper
+from pathlib import Path
 from typing import NoReturn
 
 from mkpc_kaggle import __version__
@@ -59,6 +60,7 @@ def main(arguments: Sequence[str] | None = None, *, started: float | None = None
         try:
             given = sys.argv[1:] if arguments is None else list(arguments)
             parsed = make_parser(given).parse_args(given)
+            require_directory()
             parsed.started = time.monotonic() if started is None else started
             printing.enter_context(parsed.printing())
             return int(parsed.run(parsed))
@@ -75,6 +77,16 @@ def main(arguments: Sequence[str] | None = None, *, started: float | None = None
                 raise
             complain(f"{error.strerror}: {str(error.filename)[:80]}...")
             return EXIT_BAD_INPUT
+
+
+def require_directory() -> None:
+    """Raise :class:`UserError` where the current directory has been removed: no path means anything there."""
+    from mkpc_kaggle.errors import UserError
+
+    try:
+        Path.cwd()
+    except OSError as error:
+        raise UserError(f"the current directory is gone ({error.strerror}); change to another") from error
 
 
 def make_parser(arguments: Sequence[str] = tuple(COMMANDS)) -> argparse.ArgumentParser:

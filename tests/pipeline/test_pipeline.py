@@ -1,5 +1,7 @@
 """The two stages on pictures whose correspondence is known, with real and with misbehaving matchers."""
 
+import multiprocessing
+import warnings
 from collections import Counter
 from dataclasses import dataclass, replace
 from functools import cache
@@ -307,3 +309,19 @@ def test_the_wait_for_the_device_counts_as_encoding_not_as_matching(monkeypatch)
     monkeypatch.setattr(stages.time, "perf_counter", lambda: now[0])
     (result,) = TwoStageMatcher(SIFT)(*pair()).results
     assert (result.encode_seconds, result.seconds) == (2, 2)  # two images, one at a time
+
+
+def test_a_matcher_in_a_forked_child_says_that_it_was_forked():
+    match = TwoStageMatcher(SIFT)
+    match(*pair())
+    child = multiprocessing.get_context("fork").Process(target=in_child, args=(match,))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # of Python 3.12: forks of processes with threads
+        child.start()
+    child.join()
+    assert child.exitcode == 0
+
+
+def in_child(match):
+    with pytest.raises(UserError, match="before the process forked"):
+        match(*pair())
