@@ -30,14 +30,14 @@ from torch import nn
 from tqdm import tqdm
 
 from mkpc_kaggle.geometry.coordinates import Box, Size, View
+from mkpc_kaggle.matchers.adapters.loma import LomaAdapter, LomaOptions
+from mkpc_kaggle.matchers.adapters.roma import RomaMatcher, RomaOptions
+from mkpc_kaggle.matchers.adapters.sift import SiftMatcher, SiftOptions
 from mkpc_kaggle.matchers.contract import Colour, Matcher, Picture, Placement, Precision
-from mkpc_kaggle.matchers.loma import LomaAdapter, LomaOptions
 from mkpc_kaggle.matchers.networks.loftr import Loftr
 from mkpc_kaggle.matchers.networks.loma import Loma, Variant
 from mkpc_kaggle.matchers.networks.placement import placed
 from mkpc_kaggle.matchers.networks.roma import RoMa
-from mkpc_kaggle.matchers.roma import RomaMatcher, RomaOptions
-from mkpc_kaggle.matchers.sift import SiftMatcher, SiftOptions
 from mkpc_kaggle.matchers.sparse import image_batch
 from tests.support import light_matchers
 from tests.support.light_matchers import MATCHERS

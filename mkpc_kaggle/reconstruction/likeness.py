@@ -16,7 +16,7 @@ from scipy.cluster.vq import kmeans2, vq
 
 from mkpc_kaggle.data.images import Image, read_image
 from mkpc_kaggle.geometry.robust import estimate
-from mkpc_kaggle.matchers.sift import root_sift
+from mkpc_kaggle.matchers.adapters.sift import root_sift
 from mkpc_kaggle.pipeline.assembly import Assembly
 from mkpc_kaggle.pipeline.pair import PairMatch
 
