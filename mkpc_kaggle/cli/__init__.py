@@ -11,7 +11,7 @@ from importlib import import_module
 from io import TextIOWrapper
 from typing import NoReturn
 
-from mkpc_kaggle import __version__
+from mkpc_kaggle.version import __version__
 
 COMMANDS = {
     "submit": "a test directory -> submission.csv",
