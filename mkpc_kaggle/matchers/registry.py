@@ -42,5 +42,5 @@ def _imported(name: str, where: str) -> Any:
     try:
         return import_module(f"{adapters.__name__}.{name}")
     except Exception as error:  # any error at import affects this matcher only
-        told = f"matcher {name} cannot be used here ({type(error).__name__}: {error})"
-        raise UnusableError(f"{where}: {told}. `--recipe auto` does without it.") from error
+        message = f"matcher {name} cannot be used here ({type(error).__name__}: {error})"
+        raise UnusableError(f"{where}: {message}. `--recipe auto` does without it.") from error

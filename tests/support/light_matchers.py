@@ -36,7 +36,7 @@ from mkpc_kaggle.matchers.networks.aspanformer import AspanFormer
 from mkpc_kaggle.matchers.networks.dkm import DKM
 from mkpc_kaggle.matchers.networks.loftr import Loftr
 from mkpc_kaggle.matchers.networks.loma import Loma, Variant
-from mkpc_kaggle.matchers.networks.placement import placed
+from mkpc_kaggle.matchers.networks.placement import prepared
 from mkpc_kaggle.matchers.networks.quadtree import Quadtree
 from mkpc_kaggle.matchers.networks.superglue import SuperGlue
 from mkpc_kaggle.matchers.networks.superpoint import SuperPoint
@@ -56,7 +56,7 @@ def standin(name: str, make: Callable[..., nn.Module], *settings: Any, **named: 
 
 def ours(placement: Placement, *network: Any, **named: Any) -> Any:
     """A network of ours, ready to run there."""
-    return placed(copy.deepcopy(standin(*network, **named)), placement)
+    return prepared(copy.deepcopy(standin(*network, **named)), placement)
 
 
 def kornias(*network: Any, **named: Any) -> Any:
