@@ -13,7 +13,7 @@ from io import TextIOWrapper
 from pathlib import Path
 from typing import NoReturn
 
-from mkpc_kaggle import __version__
+from mkpc_kaggle.version import __version__
 
 COMMANDS = {
     "submit": "a test directory -> submission.csv",
@@ -91,8 +91,8 @@ def require_directory() -> None:
 
 def make_parser(arguments: Sequence[str] = tuple(COMMANDS)) -> argparse.ArgumentParser:
     """The parser of these arguments; only the commands among them are imported, since imports take time."""
-    told = "Two-stage image matching with Matching Key-Points Crop, offline, inside a time budget."
-    parser = argparse.ArgumentParser("mkpc_kaggle", description=told, epilog="COMMAND --help tells more.")
+    text = "Two-stage image matching with Matching Key-Points Crop, offline, inside a time budget."
+    parser = argparse.ArgumentParser("mkpc_kaggle", description=text, epilog="COMMAND --help tells more.")
     parser.add_argument("--version", action="version", version=__version__)
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name, summary in COMMANDS.items():

@@ -19,7 +19,6 @@ from typing import Self
 import cv2
 import numpy as np
 
-from mkpc_kaggle import __version__
 from mkpc_kaggle.data.competition import Pair, write_submission
 from mkpc_kaggle.engine import console
 from mkpc_kaggle.engine.budget import Budget
@@ -32,6 +31,7 @@ from mkpc_kaggle.errors import UserError, writing
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
 from mkpc_kaggle.pipeline.assembly import Assembly
 from mkpc_kaggle.scene.export import Export
+from mkpc_kaggle.version import __version__
 
 EXIT_S = 0.2  # that the system takes to end a process
 REPORT_S = 2.0  # that an interrupted program may take for its report: enough for the tables

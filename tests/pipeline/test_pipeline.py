@@ -20,8 +20,8 @@ from mkpc_kaggle.geometry.coordinates import Box, Size
 from mkpc_kaggle.geometry.focal_prior import FocalConfig, FocalPrior, estimate_with_prior
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import ModelKind
+from mkpc_kaggle.matchers.adapters.sift import SiftMatcher, SiftOptions
 from mkpc_kaggle.matchers.contract import MatcherSpec
-from mkpc_kaggle.matchers.sift import SiftMatcher, SiftOptions
 from mkpc_kaggle.pipeline import stages
 from mkpc_kaggle.pipeline.pair import PairMatch, with_estimate
 from mkpc_kaggle.pipeline.stages import Pipeline
