@@ -52,7 +52,10 @@ class ThreadWorker:
         self._thread = threading.Thread(target=self._live, name=name, daemon=True)
 
     def start(self) -> None:
-        self._thread.start()
+        try:
+            self._thread.start()
+        except RuntimeError as error:  # no thread more
+            self._answers.put(Failure(Cause.NOT_STARTED, str(error)))
 
     def submit(self, job: Job, seconds: float) -> None:
         """Hand over a job; units may begin within ``seconds``."""

@@ -8,7 +8,7 @@ from mkpc_kaggle.engine.budget import format_duration
 from mkpc_kaggle.engine.engine import Ending, RunReport
 from mkpc_kaggle.engine.records import PairRecord, SceneRecord
 from mkpc_kaggle.reporting.run_log import RunLog
-from mkpc_kaggle.reporting.tables import RunTables, run_tables, seconds_by_part, unit_failures, unit_means
+from mkpc_kaggle.reporting.tables import RunTables, run_tables, seconds_by_part, unit_means, unit_reasons
 
 MAX_LINES = 8  # of each list
 
@@ -74,7 +74,8 @@ def _lines(tables: RunTables, run: RunReport | RunLog) -> list[str]:
         *_found(tables),
         *_scenes(tables, run.scenes),
         *_list("pairs with the fallback row", reasons, len(failed)),
-        *_list("units that failed", unit_failures(tables)),
+        *_list("units that failed", unit_reasons(tables)),
+        *_list("units that ran otherwise than written", unit_reasons(tables, "note")),
         *_list("faults", run.faults),
     ]
 

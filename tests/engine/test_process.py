@@ -16,11 +16,12 @@ import numpy as np
 import pytest
 from faulty import ScenesBy, choose_scene_for_all_but_the_first, on_fork
 
-from mkpc_kaggle.engine.jobs import Cause, Failure, Loaded, SceneJob, SceneResult
+from mkpc_kaggle.engine.jobs import Cause, Failure, Loaded, SceneJob
 from mkpc_kaggle.engine.process import WORKER_ENVIRONMENT, ProcessWorker
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.recipe import SceneConfig
+from mkpc_kaggle.scene.reconstruct import Solution
 from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -33,7 +34,7 @@ LARGE = SceneJob("one", (0,), (BatchPair(*IMAGES, MATCHES, None, {"m": MATCHES})
 class Worker(ProcessWorker):
     """A worker process with the scenes of ``make``, whose answers the test waits for."""
 
-    def __init__(self, make: Callable[[SceneJob], SceneResult]) -> None:
+    def __init__(self, make: Callable[[SceneJob], Solution]) -> None:
         self._bell = threading.Semaphore(0)
         super().__init__("scene", partial(ScenesBy, make), self._bell.release)
 
@@ -47,7 +48,7 @@ def start() -> Iterator[Callable[..., Worker]]:
     """Starts a worker. In the end it is killed, and neither its thread nor its process is left."""
     workers = []
 
-    def start(make: Callable[[SceneJob], SceneResult] = choose_scene_for_all_but_the_first) -> Worker:
+    def start(make: Callable[[SceneJob], Solution] = choose_scene_for_all_but_the_first) -> Worker:
         workers.append(Worker(make))
         workers[-1].start()
         return workers[-1]

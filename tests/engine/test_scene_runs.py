@@ -25,12 +25,13 @@ from synthetic import SyntheticMatcher, synthetic_pairs
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.engine import Ending
-from mkpc_kaggle.engine.jobs import SceneJob, SceneResult
+from mkpc_kaggle.engine.jobs import SceneJob
 from mkpc_kaggle.recipe import SceneConfig
 from mkpc_kaggle.reporting.report import report_page
 from mkpc_kaggle.reporting.run_log import read_log
 from mkpc_kaggle.reporting.summary import overview
 from mkpc_kaggle.scene.choose import Reason
+from mkpc_kaggle.scene.reconstruct import Solution
 from mkpc_kaggle.scene.view_graph import BatchPair
 
 RECIPE = replace(THREE_UNITS, scene=SceneConfig())
@@ -112,7 +113,7 @@ def test_a_death_within_pycolmap_costs_the_scene_alone_and_leaves_no_files(tmp_p
 def test_the_scene_of_a_run_is_made_of_tracks_and_judged_by_all_matches(tmp_path, monkeypatch):
     given: list[BatchPair] = []
 
-    def note(job: SceneJob) -> SceneResult:
+    def note(job: SceneJob) -> Solution:
         given.extend(job.pairs)
         return choose_scene_for_all_but_the_first(job)
 
