@@ -73,6 +73,9 @@ class EstimateStats:
     focals: tuple[float, float] | None = None  # in pixels, of both images; None where the winner has none
 
 
+NO_STATS = EstimateStats()
+
+
 @dataclass(frozen=True, eq=False)
 class Estimate:
     """A two-view model of a pair."""
@@ -82,7 +85,7 @@ class Estimate:
     inliers: NDArray[np.bool_]  # (N,) mask over the matches that were given: those nearer than the threshold
     failure: str = ""  # why ``matrix`` is only the fallback
     magsac: Matrix3 | None = None  # under a prior on focal lengths, the F of MAGSAC alone, if it finds any
-    stats: EstimateStats = EstimateStats()
+    stats: EstimateStats = NO_STATS
 
     @property
     def ok(self) -> bool:

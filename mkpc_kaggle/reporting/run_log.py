@@ -82,7 +82,7 @@ def read_log(directory: Path) -> RunLog:
     """
     with JournalReader(directory) as journal, undamaged(journal.path):
         about, belongs_to, pairs = journal.about(), journal.belongs_to(), journal.pairs()
-        recipe = recipe_of(belongs_to.get("recipe", {}), about.recipe)
+        recipe = recipe_of(belongs_to.get("recipe", {}) | json.loads(about.estimation), about.recipe)
         known = journal.records()
         records = tuple(known.get(index) or PairRecord.untouched(index) for index in range(len(pairs)))
         touched = sorted((record for record in records if record.units), key=lambda r: (r.inliers, r.index))
@@ -107,7 +107,7 @@ def write_csv(log: RunLog, directory: Path) -> list[Path]:
 def write_json(log: RunLog, path: Path) -> None:
     """Write everything as one JSON value, each pair with its units and regions; :class:`UserError` as above."""
     values = {
-        "recipe": {"name": log.about.recipe, **log.recipe.fingerprint()},
+        "recipe": {"name": log.about.recipe, **log.recipe.matching(), **log.recipe.estimation()},
         "device": log.about.device,
         "limit_seconds": log.about.limit,
         "ending": log.ending,

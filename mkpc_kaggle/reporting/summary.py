@@ -17,8 +17,10 @@ def summary(pairs: Sequence[Pair], report: RunReport) -> str:
     """The screen that ends a run."""
     tables = run_tables(pairs, report.records)
     resumed = f", {report.resumed} of them from earlier runs" if report.resumed else ""
+    anew = f"; {report.units_run} units run, {report.estimated_anew} F estimated anew"
     failed = filter(None, [trouble(report)])
-    return "\n".join([headline(tables, report) + resumed, *_lines(tables, report), *failed])
+    head = headline(tables, report) + resumed + anew * bool(report.estimated_anew)
+    return "\n".join([head, *_lines(tables, report), *failed])
 
 
 def overview(log: RunLog) -> str:
