@@ -105,11 +105,20 @@ def _scenes(tables: RunTables, scenes: Sequence[SceneRecord]) -> list[str]:
     made = sum(scene.placed > 0 for scene in scenes)
     images = f"{sum(scene.placed for scene in scenes)} of {sum(scene.images for scene in scenes)} images"
     pairs = f"F of {sum(tables.pairs['source'] == 'scene')} of {len(tables.pairs)} pairs is from them"
-    reasons = Counter(scene.failure for scene in scenes if scene.failure).most_common(MAX_LINES)
+    batches: dict[str, list[str]] = {}
+    for scene in scenes:
+        if scene.failure:
+            batches.setdefault(scene.failure, []).append(scene.batch)
     return [
         f"scenes: {made} of {len(scenes)} batches reconstructed with {images}; {pairs}",
-        *(f"  {count} batches without a scene: {reason}" for reason, count in reasons),
+        *(f"  no scene of {_names(names)}: {reason}" for reason, names in list(batches.items())[:MAX_LINES]),
     ]
+
+
+def _names(names: Sequence[str]) -> str:
+    """The first of the batches, and how many more there are."""
+    more = f" and {len(names) - MAX_LINES} more batches" if len(names) > MAX_LINES else ""
+    return ", ".join(names[:MAX_LINES]) + more
 
 
 def _list(title: str, items: Sequence[str], count: int | None = None) -> list[str]:

@@ -9,7 +9,7 @@ from statistics import median
 import numpy as np
 import pytest
 from rectified import SECOND, SWEEP, THIRD, THREE_UNITS
-from simulator import MemoryJournal, Scenario, random_scenario, simulate, without_records
+from simulator import MemoryJournal, Scenario, SimulatedScene, random_scenario, simulate, without_records
 
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.engine import Ending
@@ -382,3 +382,25 @@ def test_a_run_killed_at_any_moment_leaves_no_scene_out_of_date_when_it_goes_on(
     ran = simulate(scenario, journal)
     assert ran.report.ending is Ending.COMPLETE
     assert {scene.batch: scene.unit_results for scene in ran.report.scenes} == ran.scene_units
+
+
+def test_time_kept_for_scenes_is_used_for_units_when_they_need_less():
+    ran = simulate(Scenario(600, (0.1, 0.2, 0.3), 1, 280.0, warm_up=1, batches=1))
+    assert ran.work_left
+    assert ran.report.seconds > 279.0
+
+
+def test_a_scene_that_never_begins_is_named_and_the_others_have_their_turn(monkeypatch):
+    start = SimulatedScene.start
+
+    def stopped(scene: SimulatedScene) -> None:
+        if len(scene._site.scenes) > 2:  # both tries of the first
+            start(scene)
+
+    monkeypatch.setattr(SimulatedScene, "start", stopped)
+    ran = simulate(Scenario(300, (0.5, 1.0), 1, 600.0, batches=3, misses=0))
+    assert ran.late == 0
+    failures = {scene.batch: scene.failure for scene in ran.report.scenes}
+    assert failures.pop("000").startswith("the worker hung: no answer for ")
+    assert len(failures) == 2
+    assert not any("hung" in failure for failure in failures.values())

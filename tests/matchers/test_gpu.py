@@ -171,9 +171,8 @@ def test_features_that_are_not_finite_load_the_matcher_in_float32() -> None:
     with pytest.warns(RuntimeWarning, match="own runs in float32"):
         done = runner.match(works(), RECIPE.units)
     assert (half.encoded, exact.encoded) == (1, 3)
-    assert {work.results[0].failure for work in done} == {
-        "own runs in float32, for in half precision features of own are not finite"
-    }
+    note = "own runs in float32, for in half precision features of own are not finite"
+    assert {(work.results[0].failure, work.results[0].note) for work in done} == {("", note)}
 
 
 def test_features_that_are_not_finite_in_float32_are_an_error_of_the_unit() -> None:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from pictures import same
+from rectified import SWEEP, RectifiedMatcher
 from sklearn.datasets import load_sample_image
 
 from mkpc_kaggle.data.images import Image
@@ -270,6 +271,20 @@ def test_a_matcher_that_raises_costs_its_unit_and_the_run_goes_on(error):
     assert match.results[0].failure == f"{type(error).__name__}: {error}"
     assert len(match.results[0].matches) == 0
     assert match.estimate.ok
+
+
+def test_a_pair_at_which_a_matcher_raises_costs_the_others_of_its_minibatch_nothing():
+    def moody(brightness):
+        if brightness == 12:
+            raise RuntimeError("no mood")
+        return 150
+
+    matcher = RectifiedMatcher(matches=moody)
+    images = [Image(str(n), np.full((72, 80, 3), 10 + n, np.uint8)) for n in range(8)]
+    runner = Pipeline(Recipe((SWEEP,)), {"rectified": matcher}.__getitem__, minibatch=8)
+    done = runner.match([PairMatch(images=(each, each)) for each in images], [SWEEP])
+    assert [work.results[0].failure for work in done] == ["", "", "RuntimeError: no mood", *[""] * 5]
+    assert [len(work.results[0].matches) > 0 for work in done] == [True, True, False, *[True] * 5]
 
 
 @pytest.mark.parametrize(
