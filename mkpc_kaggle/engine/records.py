@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Matrix3, Size
+from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL, NO_STATS, EstimateStats
 from mkpc_kaggle.pipeline.pair import PairMatch, Regions, UnitResult
 from mkpc_kaggle.recipe import Unit
@@ -123,6 +124,11 @@ class PairRecord:
         if self.scene is None or self.scene.F is None:
             return "fallback" if self.failure else "pair"
         return "scene" if self.scene.from_scene else "pair"
+
+    @property
+    def overlaps(self) -> bool:
+        """Whether the two images most likely show the same thing."""
+        return self.stats.support >= MIN_SUPPORT
 
     @property
     def reached(self) -> bool:

@@ -69,6 +69,7 @@ class EstimateStats:
     cost: float | None = None  # the winner's
     magsac_cost: float | None = None  # that of the F of MAGSAC alone
     focals: tuple[float, float] | None = None  # in pixels, of both images; None where the winner has none
+    support: float = 0.0  # see :mod:`mkpc_kaggle.geometry.overlap`
 
 
 NO_STATS = EstimateStats()
