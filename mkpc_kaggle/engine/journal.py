@@ -8,6 +8,7 @@ reached), ``points`` (of a unit on a pair: later jobs, scenes and the report nee
 
 import json
 import os
+import shutil
 import sqlite3
 import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -327,6 +328,16 @@ class Journal(JournalReader):
             header = {"format": FORMAT, **belongs_to, "about": about}
             rows = ((key, encode(value)) for key, value in header.items())
             self._db.executemany("REPLACE INTO run VALUES (?, ?)", rows)
+
+
+def share_journal(source: Path, target: Path) -> None:
+    """Let the run of a work directory begin with the journal of another that has ended, if it has none yet."""
+    path = target / FILE_NAME
+    if not path.exists():
+        with writing(f"the work directory {target}"):
+            target.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(source / FILE_NAME, path.with_suffix(".part"))
+            path.with_suffix(".part").replace(path)
 
 
 def connect(path: Path) -> sqlite3.Connection:

@@ -150,8 +150,8 @@ def versions() -> dict[str, str]:
 
 
 def digest_of_pairs(pairs: Sequence[Pair]) -> str:
-    """Tells test sets apart: the keys of its pairs with the ids of their images, in order."""
-    ids = ((pair.key, pair.group, *(name.rpartition(".")[0] for name in pair.names)) for pair in pairs)
+    """Tells test sets apart: the ids of its pairs with the ids of their images, in order."""
+    ids = ((pair.id, pair.group, *(name.rpartition(".")[0] for name in pair.names)) for pair in pairs)
     rows = map("\t".join, ids)
     return hashlib.sha256("\n".join(rows).encode()).hexdigest()
 
