@@ -70,9 +70,12 @@ class Assembly:
         )
 
     def fingerprint(self) -> dict[str, Any]:
-        """What decides the numbers that come out: the recipe, the precision and the digests of the weights."""
+        """What decides which points are found: units and matchers, the precision and the digests of the weights.
+
+        What F and cameras are made of the points is in :meth:`Recipe.estimation`.
+        """
         return {
-            "recipe": self.recipe.fingerprint(),
+            "recipe": self.recipe.matching(),
             "precision": self.placement.precision,
             "weights": {slot: file.digest for slot, file in self.weight_files.items()},
         }

@@ -10,6 +10,7 @@ from mkpc_kaggle.geometry.coordinates import Matrix3, Size
 from mkpc_kaggle.geometry.critical_region import CriticalRegion
 from mkpc_kaggle.geometry.focal_prior import FocalPrior, estimate_with_prior
 from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.geometry.overlap import support
 from mkpc_kaggle.geometry.robust import Estimate, ModelKind, estimate
 from mkpc_kaggle.recipe import Recipe, Unit
 
@@ -86,4 +87,8 @@ def with_estimate(
         known = [FocalPrior(K, 0.0) for K in intrinsics or ()]
         first, second = known or [FocalPrior.of_image(size, recipe.focal) for size in sizes]
         found = estimate_with_prior(matches, (first, second), recipe.magsac, recipe.focal, model)
+    if found.ok and model is not ModelKind.H:
+        K0, K1 = intrinsics if intrinsics and model is ModelKind.E else (np.eye(3), np.eye(3))
+        F = np.linalg.inv(K1).T @ found.matrix @ np.linalg.inv(K0)
+        found = replace(found, stats=replace(found.stats, support=support(F, matches)))
     return replace(pair, results=results, estimate=found)
