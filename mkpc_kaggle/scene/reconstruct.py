@@ -46,7 +46,7 @@ def reconstruct_batch(
     """
     directory = None
     if export is not None:
-        pairs, directory = [export.original(pair) for pair in pairs], export.directory
+        pairs, directory = export.stored(pairs), export.directory
     together, shared = reconstruct_sharing(ViewGraph.of_pairs(pairs), config, directory)
     matchers = sorted({name for pair in pairs for name in pair.tracks or ()})
     single = matchers if config.each_matcher and len(matchers) > 1 else []
