@@ -48,7 +48,8 @@ class PairRecord:
     ``pair_fundamental`` is from the pair's own matches, and the fallback where ``failure`` says why there is none;
     ``magsac_fundamental`` is MAGSAC's alone, where the former comes from more than that. The seconds are those of
     all jobs on the pair. ``scene`` is what its batch's reconstruction says of it, ``None`` if there was none.
-    ``sizes`` and ``versions`` are of the two images that were matched; a version tells the content of a file.
+    ``sizes``, ``versions`` and ``focals`` are of the two images that were matched: a version tells the content of
+    a file, a focal length is in pixels by its EXIF, 0 if unknown.
     """
 
     index: int
@@ -63,6 +64,7 @@ class PairRecord:
     sizes: tuple[Size, ...] = ()
     versions: tuple[str, ...] = ()
     magsac_fundamental: Matrix3 | None = None
+    focals: tuple[float, ...] = ()
 
     @classmethod
     def untouched(cls, index: int, reason: str = NOT_REACHED) -> "PairRecord":
@@ -86,6 +88,7 @@ class PairRecord:
             sizes=match.sizes,
             versions=match.versions,
             magsac_fundamental=match.estimate.magsac,
+            focals=match.focals,
         )
 
     def after(self, former: "PairRecord") -> "PairRecord":

@@ -14,7 +14,7 @@ from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.matchers.contract import Matcher
 from mkpc_kaggle.pipeline.assembly import Assembly
 from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher, to_image
-from mkpc_kaggle.recipe import Recipe, SceneConfig, load_recipe
+from mkpc_kaggle.recipe import CameraSharing, Recipe, SceneConfig, load_recipe
 from mkpc_kaggle.reconstruction.folder import Datasets, Ends, pairs_of
 from mkpc_kaggle.reconstruction.likeness import find_turns
 from mkpc_kaggle.reconstruction.outputs import Cameras
@@ -33,10 +33,13 @@ class FolderResult:
     cameras: Cameras
 
 
-def for_cameras(recipe: Recipe) -> Recipe:
-    """The recipe without steps that only improve the F of single pairs, and without extra pairs."""
+def for_cameras(recipe: Recipe, sharing: str | None = None) -> Recipe:
+    """The recipe without steps that only improve the F of single pairs, and without extra pairs.
+
+    ``sharing`` is a :class:`CameraSharing`; ``None``: as the recipe has it.
+    """
     scene = replace(recipe.scene or SceneConfig(), each_matcher=False, pairs_per_image=0.0)
-    return replace(recipe, focal=None, scene=scene)
+    return replace(recipe, focal=None, scene=replace(scene, cameras=CameraSharing(sharing or scene.cameras)))
 
 
 def reconstruct_folder(
