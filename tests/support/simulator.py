@@ -297,7 +297,7 @@ def _outcome(
         UnitRecord(result.unit.name, result.unit.stage, len(MATCHES), 20 + index % 60, 0.0, result.seconds, "")
         for result in (*known, *found)
     )
-    record = PairRecord(index, FALLBACK_FUNDAMENTAL, "", units, sizes=SIZES, versions=("first", "second"))
+    record = PairRecord(index, FALLBACK_FUNDAMENTAL, "", units, sizes=SIZES, versions=("first", "second"), focals=(0.0, 0.0))
     record = replace(record, estimation=estimation)
     return Outcome(record, tuple(found))
 
