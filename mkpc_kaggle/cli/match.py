@@ -34,7 +34,7 @@ def run(arguments: argparse.Namespace) -> int:
         lines.append(f"this is the fallback: {match.estimate.failure}")
     lines.append(f"{len(match.matches)} matches, {match.estimate.inlier_count} inliers")
     for result in match.results:
-        counts = f"{len(result.matches):>6} matches  {result.seconds:.2f} s  {result.failure}"
+        counts = f"{len(result.matches):>6} matches  {result.seconds:.2f} s  {result.failure or result.note}"
         lines.append(f"  {result.unit.name:<30}{counts}")
     for number, region in enumerate(match.regions or ()):
         box = region.box

@@ -7,7 +7,7 @@ from mkpc_kaggle.cli import options
 from mkpc_kaggle.data.competition import read_test_side, test_side
 from mkpc_kaggle.data.outputs import require_apart
 from mkpc_kaggle.engine.console import say
-from mkpc_kaggle.engine.session import submit
+from mkpc_kaggle.engine.session import first_version, submit
 from mkpc_kaggle.reporting.report import report_run
 from mkpc_kaggle.reporting.summary import summary, trouble
 
@@ -49,9 +49,10 @@ def run(arguments: argparse.Namespace) -> int:
     require_apart(files, [*test_side(arguments.test_dir), Path(arguments.recipe)], work_dir, arguments.weights)
     with options.watched_session(arguments, work_dir) as (session, watchdog):
         pairs = read_test_side(arguments.test_dir)
-        assembly = options.assembly_of(arguments, arguments.recipe, arguments.mode)
-        options.say_start(f"{len(pairs)} pairs", assembly, work_dir)
-        report = submit(pairs, assembly, session, output)
+        with first_version(pairs, output):
+            assembly = options.assembly_of(arguments, arguments.recipe, arguments.mode)
+            options.say_start(f"{len(pairs)} pairs", assembly, work_dir)
+            report = submit(pairs, assembly, session, output)
         watchdog.status = int(bool(report.unwritten or trouble(report)))
         unwritten = f" is not the last version: {report.unwritten}" if report.unwritten else ""
         lines = [

@@ -20,9 +20,12 @@ MAX_POINT_BYTES = 1 << 26  # of a unit on a pair: three million matches; a damag
 
 
 def encode(value: Any) -> str:
-    """The JSON text of a value: the fields of a dataclass in their order, matrices row by row."""
+    """The JSON text of a value: the fields of a dataclass in their order, matrices row by row.
+
+    Raises ``ValueError`` for numbers that are not finite: a journal that has them could not be read again.
+    """
     values = astuple(value) if is_dataclass(value) and not isinstance(value, type) else value
-    return json.dumps(values, default=lambda array: array.tolist())
+    return json.dumps(values, default=lambda array: array.tolist(), allow_nan=False)
 
 
 @cache

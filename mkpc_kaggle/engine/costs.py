@@ -80,7 +80,7 @@ class Costs:
         """Seconds within which the unit ends on nine of ten pairs."""
         return (self._steady(unit) or self._warm_up.get(unit, UNKNOWN)).p90
 
-    def longest(self, unit: str, factor: float) -> float:
+    def hang_after(self, unit: str, factor: float) -> float:
         """Seconds after which the unit hangs: its warm-up, as on a new worker, and ``factor`` times its cost."""
         return self._warm_up.get(unit, UNKNOWN).p90 + factor * (self._steady(unit) or UNKNOWN).p90
 

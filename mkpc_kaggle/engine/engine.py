@@ -19,7 +19,6 @@ from mkpc_kaggle.engine.jobs import (
     MatchResult,
     Outcome,
     SceneJob,
-    SceneResult,
     visiting_order,
 )
 from mkpc_kaggle.engine.journal import EventKind, Journal
@@ -31,6 +30,7 @@ from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.pipeline.pair import UnitResult
 from mkpc_kaggle.recipe import Recipe
 from mkpc_kaggle.scene.export import Export
+from mkpc_kaggle.scene.reconstruct import Solution
 
 PUBLISH_INTERVAL_S, PUBLISH_SHARE = 30.0, 0.05  # how often the submission is written, and its share of the time
 
@@ -85,7 +85,7 @@ class Engine:
         minibatch: int = 1,
         exports: Mapping[str, Export] = MappingProxyType({}),
     ) -> None:
-        self.asked = len(pairs)
+        self.row_count = len(pairs)
         self.pairs = [*pairs, *extra_pairs_of(pairs, recipe.scene)]
         self.recipe, self.site, self.journal, self.budget = recipe, site, journal, budget
         self.publish, self.interrupt = publish, interrupt
@@ -98,7 +98,7 @@ class Engine:
         self._publishing = threading.Lock()
         self._has_ended = self._has_loaded = False
         order, records = visiting_order(self.pairs), self._read_records()
-        self.plan = Plan(order, self.asked, recipe, records, budget, minibatch)
+        self.plan = Plan(order, self.row_count, recipe, records, budget, minibatch)
         self.scenes = Scenes(self.pairs, recipe, self.plan.records, journal.scenes(), exports)
         self._scene_places: list[Place] = []
 
@@ -128,13 +128,13 @@ class Engine:
             tuple(self.faults),
             tuple(self.plan.explanations),
             self.unwritten,
-            tuple(self.scenes.made.values()),
+            self.scenes.report(),
         )
 
     @property
     def records(self) -> list[PairRecord]:
-        """Of the pairs that were asked for, in their order."""
-        return self.plan.records[: self.asked]
+        """Of the pairs that have a row, in their order."""
+        return self.plan.records[: self.row_count]
 
     @property
     def _places(self) -> list[Place]:
@@ -159,7 +159,8 @@ class Engine:
     # The loop
 
     def _loop(self) -> None:
-        if self.plan.has_work(self.budget.clock()) or self.scenes.due(range(len(self.pairs))) is not None:
+        self.plan.advance(now := self.budget.clock())
+        if self.plan.has_work(now) or self.scenes.due(range(len(self.pairs))) is not None:
             self.site.open()
         while not self.interrupt.is_set() and (now := self.budget.clock()) < self.budget.stop_waiting:
             for place in self._places:
@@ -177,6 +178,8 @@ class Engine:
 
     def _hand_out(self, now: float) -> None:
         """A worker for each place that has none, and a job for each worker that is idle."""
+        self.plan.reserve = self.scenes.reserve(self.site.scenes_at_once)
+        self.plan.advance(now)
         self.plan.workers = max(1, sum(not place.closed for place in self.site.places))
         for place in self.site.places:
             if place.may_start(now) and self.plan.has_work(now):
@@ -196,7 +199,8 @@ class Engine:
         if isinstance(answer, Loaded):
             self._has_loaded = True
             if isinstance(job, SceneJob):
-                place.submit(job, inf, self.scenes.time_limit(job.batch, self.budget.silence), now)
+                self.scenes.on_start(seconds)
+                place.submit(job, inf, self.scenes.time_limit(job.batch, self.budget.left()), now)
         elif answer is not None:
             place.job = None
             if isinstance(job, SceneJob):
@@ -241,24 +245,22 @@ class Engine:
             place = Place(f"scene of batch {batch}", self.site.scene_worker)
             place.job = self.scenes.job(batch, self._results)
             self._scene_places.append(place)
-            place.start(now)
-        plan.reserve = self.scenes.reserve(at_once)
+            place.start(now, self.scenes.start_timeout(self.budget.left()))
 
     def _take_scene(self, job: SceneJob, answer: Answer, seconds: float) -> None:
         """Record what came of a batch."""
-        records, record = self.plan.records, None
-        if isinstance(answer, SceneResult):
-            record = SceneRecord.of(job.batch, answer.reconstructions, job.made_from, seconds)
-            self.scenes.on_result(job, record)
-            for index, choice in answer.choices.items():
-                records[index] = replace(records[index], scene=choice)
-            self._note(EventKind.SCENE, f"{record.batch}: {record.placed} of {record.images} images")
-        else:
+        if not isinstance(answer, Solution):
             self._fault(f"batch {job.batch} was not reconstructed: {answer}")
-            record = self.scenes.on_failure(job, str(answer), seconds)
-        if record is not None:
-            members = [records[index] for index in self.scenes.batches[job.batch]]
-            self._save(partial(self.journal.save_scene, record, members))
+            self.scenes.on_failure(job, str(answer))
+            return
+        records = self.plan.records
+        record = SceneRecord.of(job.batch, answer.reconstructions, job.unit_results, seconds)
+        self.scenes.on_result(job, record)
+        for index, choice in zip(job.indices, answer.choices, strict=True):
+            records[index] = replace(records[index], scene=choice)
+        self._note(EventKind.SCENE, f"{record.batch}: {record.placed} of {record.images} images")
+        members = [records[index] for index in self.scenes.batches[job.batch]]
+        self._save(partial(self.journal.save_scene, record, members))
 
     # The journal and the submission
 
@@ -281,14 +283,15 @@ class Engine:
     def _keep(self, outcomes: Sequence[Outcome]) -> None:
         """Put outcomes into the journal; the scenes of their batches are out of date."""
         for outcome in outcomes:
-            self.scenes.note_change(outcome.record.index)
+            gained = sum(len(result.matches) for result in outcome.results)
+            self.scenes.note_change(outcome.record.index, gained)
         self._save(partial(self.journal.save, outcomes))
 
     def _save(self, write: Callable[[], None]) -> None:
         """Write to the journal: a full disk costs what a later run would have had of it."""
         try:
             write()
-        except sqlite3.Error as error:
+        except (sqlite3.Error, ValueError) as error:
             self._fault(f"the journal cannot be written ({error}): an interrupted run would have to do this again")
 
     def _note_explanations(self) -> None:
@@ -316,6 +319,6 @@ class Engine:
             return Ending.INTERRUPTED
         if self.plan.nothing_runs:
             return Ending.NOTHING_RUNS
-        if self.plan.is_complete:
+        if self.plan.is_complete and self.scenes.is_complete:
             return Ending.COMPLETE
         return Ending.NO_WORKER if self._is_closed else Ending.TIME_IS_UP

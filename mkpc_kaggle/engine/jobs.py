@@ -1,6 +1,6 @@
 """What crosses between the engine and a worker: two kinds of job, and their answers. Plain values."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -10,9 +10,8 @@ from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.geometry.robust import RobustConfig
 from mkpc_kaggle.pipeline.pair import UnitResult
 from mkpc_kaggle.recipe import SceneConfig, Unit
-from mkpc_kaggle.scene.choose import Choice
 from mkpc_kaggle.scene.export import Export
-from mkpc_kaggle.scene.reconstruction import Reconstruction
+from mkpc_kaggle.scene.reconstruct import Solution
 from mkpc_kaggle.scene.view_graph import BatchPair
 
 
@@ -47,10 +46,10 @@ class MatchJob:
 
 @dataclass(frozen=True, eq=False)
 class SceneJob:
-    """Reconstruct a batch: ``indices`` are the places of its ``pairs`` in the run; images go by their digests.
+    """Reconstruct a batch: ``indices`` are those of its ``pairs`` in the run; images go by their digests.
 
-    ``made_from`` counts the unit results that its matches are of; see :class:`SceneRecord`. ``export``: write
-    COLMAP's files, too.
+    ``unit_results``: how many its matches are of; see :class:`SceneRecord`. ``export``: write COLMAP's files, too.
+    The answer is a :class:`Solution`, whose choices are in the order of the pairs.
     """
 
     batch: str
@@ -59,7 +58,7 @@ class SceneJob:
     config: SceneConfig
     focal: FocalConfig | None = None
     magsac: RobustConfig | None = None
-    made_from: int = 0
+    unit_results: int = 0
     export: Export | None = None
 
 
@@ -95,14 +94,6 @@ class MatchResult:
         return sum(result.seconds for result in self.results)
 
 
-@dataclass(frozen=True, eq=False)
-class SceneResult:
-    """The reconstructions of a batch, and which F each pair gets, by its place in the run."""
-
-    reconstructions: tuple[Reconstruction, ...]
-    choices: Mapping[int, Choice]
-
-
 class Cause(StrEnum):
     """Why a worker has no result."""
 
@@ -131,7 +122,7 @@ class Failure:
         return f"{self.cause}: {self.message}" if self.message else str(self.cause)
 
 
-Answer = Loaded | MatchResult | SceneResult | Failure
+Answer = Loaded | MatchResult | Solution | Failure
 
 
 def visiting_order(pairs: Sequence[Pair]) -> list[int]:

@@ -27,7 +27,7 @@ from mkpc_kaggle.errors import UserError, writing
 from mkpc_kaggle.pipeline.pair import UnitResult
 from mkpc_kaggle.recipe import Unit
 
-FORMAT = 8
+FORMAT = 9
 FILE_NAME = "journal.sqlite"
 LOCK_NAME = "journal.lock"
 

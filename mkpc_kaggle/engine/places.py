@@ -47,14 +47,11 @@ class Place:
     def may_start(self, now: float) -> bool:
         return self.worker is None and not self.closed and (now >= self.limit or not self.losses)
 
-    def start(self, now: float) -> None:
+    def start(self, now: float, timeout: float = START_TIMEOUT_S) -> None:
         """Start a worker; it is loaded when it says so."""
-        self.is_loaded, self.since, self.limit = False, now, now + START_TIMEOUT_S
-        try:
-            self.worker = self.make()
-            self.worker.start()
-        except (RuntimeError, OSError) as error:  # no thread more
-            self.closed = f"{self.name}: {error}"
+        self.is_loaded, self.since, self.limit = False, now, now + timeout
+        self.worker = self.make()
+        self.worker.start()
 
     def submit(self, job: Job, seconds: float, time_limit: float, now: float) -> None:
         """Hand a job to the idle worker; its units may begin within ``seconds``."""
@@ -74,9 +71,10 @@ class Place:
         self.limit = inf
         if isinstance(answer, Loaded):
             self.is_loaded = True
-        elif not isinstance(answer, Failure):
+            return answer
+        if self.is_loaded and not (isinstance(answer, Failure) and answer.cause.is_of_place):
             self.losses = 0
-        elif answer.cause is not Cause.RAISED or not self.is_loaded:
+        if isinstance(answer, Failure) and (answer.cause is not Cause.RAISED or not self.is_loaded):
             self._lose(answer, now)
         return answer
 

@@ -7,6 +7,7 @@ from collections import Counter, deque
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
+from math import inf
 
 from mkpc_kaggle.engine.budget import Budget, format_duration
 from mkpc_kaggle.engine.costs import Costs
@@ -100,18 +101,33 @@ class ChunkQueue:
         return any(index in chunk.indices for chunk in self.again)
 
 
-class Plan:
-    """The phases of a run over the pairs of ``order``; indices from ``asked`` on are those that no row names.
+def job_size(pairs: int, prices: Sequence[float | None], overhead: float, seconds: float) -> tuple[int, int]:
+    """How many of so many pairs, and of the units with these ``prices``, are in a job of some ``seconds``.
 
-    ``records``, of all pairs by index, change through it. Of the pairs for the scenes alone, those of lower index
-    are wanted more. ``workers`` work at a time; ``reserve`` seconds of the end are left to scenes.
-    ``done`` are the pairs that have what fits for all; ``unusable`` names the units that no worker can run.
+    A price is what a unit costs on a pair, ``None`` while that is unknown: then the job is one pair, and the units
+    up to it. Late in the run: fewer pairs, then one unit, because a job's results arrive, or are lost, together.
+    """
+    if None in prices:
+        pairs, prices = 1, prices[: prices.index(None) + 1]
+    price = overhead + sum(filter(None, prices))
+    if pairs * price <= seconds:
+        return pairs, len(prices)
+    return max(1, int(seconds / price)), len(prices) if price <= seconds else 1
+
+
+class Plan:
+    """The phases of a run over the pairs of ``order``.
+
+    ``records``, of all pairs by index, change through it. Pairs from the index ``row_count`` on are extra pairs
+    for scenes, the most useful first. ``workers`` work at a time; ``reserve`` seconds of the end are left to
+    scenes. ``done`` are the pairs that have what fits for all; ``unusable`` names the units that no worker can
+    run.
     """
 
     def __init__(
         self,
         order: Sequence[int],
-        asked: int,
+        row_count: int,
         recipe: Recipe,
         records: list[PairRecord],
         budget: Budget,
@@ -121,7 +137,7 @@ class Plan:
         self.workers = 1
         self.reserve = 0.0
         self.explanations: list[Explanation] = []
-        self._order, self._asked, self._minibatch = order, asked, minibatch
+        self._order, self._row_count, self._minibatch = order, row_count, minibatch
         self._stuck: set[int] = set()  # an image cannot be read, or what was found before
         self._lacking = Counter(unit for record in records for unit in self._lacks(record))
         self._begin()
@@ -130,10 +146,11 @@ class Plan:
         """Everything is to come, and nothing is known of the devices."""
         self.costs = Costs()
         self.unusable: set[str] = set()
-        self.done = set(range(self._asked, len(self.records)))
+        self.done = set(range(self._row_count, len(self.records)))
         self.phase = Phase.SWEEP
         self._coming = list(Phase)
         self._queue = ChunkQueue()
+        self._late, self._late_at = list[Chunk](), inf  # what does not end before this moment, unless it moves
         self._total, self._left = 0, set[int]()  # pairs of the present phase, and those whose turn is not over
         self._fitting = -1
         self._tries: Counter[tuple[int, str]] = Counter()
@@ -146,18 +163,26 @@ class Plan:
 
         ``cautious``: the place has just lost a worker, and tries one pair and one unit.
         """
-        queue = self._queue
-        while self.has_work(now) and (chunk := queue.pop(place, alone=self.workers < 2, cautious=cautious)):
+        queue, job = self._queue, None
+        if self.stop > self._late_at:
+            queue.put_back(*self._late)
+            self._late.clear()
+        self.advance(now)
+        while job is None and self.has_work(now):
+            chunk = queue.pop(place, alone=self.workers < 2, cautious=cautious)
+            if chunk is None:
+                break
             units = self._units(chunk, now)
             todo = [index for index in chunk.indices if self.can_gain(index, units)]
             self._mark_done(chunk.phase, set(chunk.indices) - set(todo))
             in_time = tuple(unit for unit in units if self.costs.p90(unit.name) < self.stop - now)
-            if todo and not in_time:  # unless scenes need less time than is kept for them
-                queue.put_back(replace(chunk, indices=tuple(todo)))
-                return None
-            if todo := [index for index in todo if self.can_gain(index, in_time)]:
-                return self._job(chunk, todo, in_time, now, cautious=cautious)
-        return None
+            if chosen := [index for index in todo if self.can_gain(index, in_time)]:
+                job = self._job(chunk, chosen, in_time, now, cautious=cautious)
+            if late := tuple(index for index in todo if index not in chosen):
+                self._late.append(replace(chunk, indices=late))
+                self._late_at = self.stop
+            self.advance(now)
+        return job
 
     @property
     def stop(self) -> float:
@@ -165,7 +190,11 @@ class Plan:
         return self.budget.stop_units - min(self.reserve, RESERVE_SHARE * self.budget.time_limit)
 
     def has_work(self, now: float) -> bool:
-        """Whether a pair waits that can gain something; phases in which none does are passed over."""
+        """Whether a pair waits that can gain something, as far as the plan has advanced."""
+        return now < self.stop and bool(self._queue.fresh or self._queue.again)
+
+    def advance(self, now: float) -> None:
+        """Go on to the first pairs that can gain something: other chunks and phases are passed over."""
         while now < self.stop and (self._queue.fresh or self._coming):
             if not self._queue.fresh:
                 self._open(self._coming.pop(0), now)
@@ -173,9 +202,8 @@ class Plan:
             chunk = self._queue.fresh[0]
             units = self._units(chunk, now)
             if any(self.can_gain(index, units) for index in chunk.indices):
-                return True
+                return
             self._mark_done(chunk.phase, self._queue.fresh.popleft().indices)
-        return now < self.stop and bool(self._queue.again)
 
     def can_gain(self, index: int, units: Iterable[Unit]) -> bool:
         """Whether a pair may get any of the units that it has not had."""
@@ -184,39 +212,41 @@ class Plan:
     def _job(
         self, chunk: Chunk, todo: list[int], units: tuple[Unit, ...], now: float, *, cautious: bool
     ) -> MatchJob:
-        """A job for the first of the pairs and units; the others go back to the front of the queue.
-
-        It is one pair and one unit more where a unit's cost is unknown and cannot be planned, few pairs where it
-        gets late, and in the end one unit, since what one job does comes back, or is lost, at once.
-        """
+        """A job for the first of the pairs and units; the others go back to the front of the queue."""
         left, costs = self.stop - now, self.costs
-        lacking = dict.fromkeys(unit for index in todo for unit in self.records[index].lacking(units))
-        chosen = sorted(lacking, key=lambda unit: unit.stage)
-        unknown = [number for number, unit in enumerate(chosen) if not costs.is_known(unit.name)]
-        seconds = costs.overhead + sum(costs.mean(unit.name) for unit in chosen)
-        pair_count = (
-            len(todo) if len(todo) * seconds <= JOB_SHARE * left else max(1, int(JOB_SHARE * left / seconds))
-        )
-        unit_count = len(chosen) if seconds <= JOB_SHARE * left else 1
-        if unknown:
-            pair_count, unit_count = 1, min(unit_count, unknown[0] + 1)
-        if cautious:
-            pair_count = unit_count = 1
+        pair_count = unit_count = 1
+        if not cautious:
+            lacking = self._lacking_units(todo, units)
+            prices = [costs.mean(unit.name) if costs.is_known(unit.name) else None for unit in lacking]
+            pair_count, unit_count = job_size(len(todo), prices, costs.overhead, JOB_SHARE * left)
         indices, later = tuple(todo[:pair_count]), tuple(todo[pair_count:])
-        chosen, further = chosen[:unit_count], chosen[unit_count:]
+        lacking = self._lacking_units(indices, units)
+        chosen, further = lacking[:unit_count], tuple(lacking[unit_count:])
         if later:
             self._queue.put_back(replace(chunk, indices=later))
         if further:
-            self._queue.put_back(replace(chunk, indices=indices, units=tuple(further)))
+            self._queue.put_back(replace(chunk, indices=indices, units=further))
         self._queue.under_way.update(indices)
         p90 = tuple(costs.p90(unit.name) for unit in chosen)
-        allowance = SLOW_FACTOR * len(indices) * (costs.overhead + sum(p90)) + self.budget.silence
-        minibatch = min(len(indices), self._minibatch)
-        longest = max(costs.longest(unit.name, HANG_FACTOR * minibatch) for unit in chosen)
-        if not all(costs.is_known(unit.name) for unit in chosen):
-            longest += min(MAX_EXPLORE_S, EXPLORE_SHARE * left)
-        limits = min(left, allowance), allowance + longest
-        return MatchJob(chunk.phase, indices, tuple(chosen), p90, *limits, is_retry=bool(chunk.lost_at))
+        seconds, time_limit = self._limits(len(indices), chosen, left)
+        return MatchJob(
+            chunk.phase, indices, tuple(chosen), p90, seconds, time_limit, is_retry=bool(chunk.lost_at)
+        )
+
+    def _lacking_units(self, indices: Iterable[int], units: tuple[Unit, ...]) -> list[Unit]:
+        """Those of ``units`` that any of the pairs lacks, in the order in which they run."""
+        lacking = dict.fromkeys(unit for index in indices for unit in self.records[index].lacking(units))
+        return sorted(lacking, key=lambda unit: unit.stage)
+
+    def _limits(self, pair_count: int, units: Sequence[Unit], left: float) -> tuple[float, float]:
+        """The seconds within which units of a job may begin, and after which its worker hangs."""
+        costs, minibatch = self.costs, min(pair_count, self._minibatch)
+        expected = pair_count * (costs.overhead + sum(costs.p90(unit.name) for unit in units))
+        allowance = SLOW_FACTOR * expected + self.budget.silence
+        hangs = max(costs.hang_after(unit.name, HANG_FACTOR * minibatch) for unit in units)
+        if not all(costs.is_known(unit.name) for unit in units):
+            hangs += min(MAX_EXPLORE_S, EXPLORE_SHARE * left)
+        return min(left, allowance), allowance + hangs
 
     def _units(self, chunk: Chunk, now: float) -> tuple[Unit, ...]:
         """The units for a chunk whose turn has come."""
@@ -256,17 +286,17 @@ class Plan:
 
     def _open(self, phase: Phase, now: float) -> None:
         """Begin a phase."""
-        self.phase, indices = phase, [index for index in self._order if index < self._asked]
+        self.phase, indices = phase, [index for index in self._order if index < self._row_count]
         if phase is Phase.CONNECT:
-            extra = len(self.records) - self._asked
+            extra = len(self.records) - self._row_count
             count = self._pairs_that_fit(CONNECT_SHARE, extra, now)
-            indices = [index for index in self._order if self._asked <= index < self._asked + count]
+            indices = [index for index in self._order if self._row_count <= index < self._row_count + count]
             if extra:
                 self.explain(now, f"{count} of {extra} pairs are matched for the scenes alone")
         elif phase is Phase.DEEPEN:
             self.explain(now, "the sweep is over; deepening begins")
         elif phase is Phase.FILL:
-            lacking = filter(self.may_gain, self.records[: self._asked])
+            lacking = filter(self.may_gain, self.records[: self._row_count])
             busy = self._queue.under_way | {index for chunk in self._queue.again for index in chunk.indices}
             weakest = sorted(lacking, key=lambda record: (record.index in busy, record.inliers, record.index))
             indices = [record.index for record in weakest]
@@ -291,12 +321,12 @@ class Plan:
             self.costs.observe(found.unit.name, found.seconds, warm_up=found.warm_up)
         if result.results:
             self.costs.observe_overhead((seconds - result.unit_seconds) / len(result.outcomes))
-        kept = [outcome for outcome in result.outcomes if self._merge(outcome, now)]
+        kept = [merged for outcome in result.outcomes if (merged := self._merge(outcome, now)) is not None]
         rest = tuple(index for index in job.indices if self.can_gain(index, job.units))
         if rest:  # the job's own deadline cut it off
             self._queue.put_back(Chunk(job.phase, rest, job.units))
         self._mark_done(job.phase, set(job.indices) - set(rest))
-        return [replace(outcome, record=self.records[outcome.record.index]) for outcome in kept]
+        return kept
 
     def on_failure(self, job: MatchJob, failure: Failure, place: str, now: float) -> list[Outcome]:
         """Record a job that came to nothing, and plan it anew: halved, then unit by unit; what to keep.
@@ -334,8 +364,8 @@ class Plan:
         self._begin()
         return list(map(Outcome, changed))
 
-    def _merge(self, outcome: Outcome, now: float) -> bool:
-        """Whether a job has brought a pair something: a unit more, or the reason why there can be none."""
+    def _merge(self, outcome: Outcome, now: float) -> Outcome | None:
+        """What a job has brought a pair, if anything: a unit more, or the reason why there can be none."""
         record, former = outcome.record, self.records[outcome.record.index]
         if not outcome.results and record.failure and record.reached:
             self._stuck.add(record.index)  # an image cannot be read
@@ -344,9 +374,9 @@ class Plan:
         if len(record.units) <= len(former.units) and (former.reached or not record.reached):
             if outcome.results:  # what was found before cannot be read, and a worse F gains nothing
                 self._stuck.add(record.index)
-            return False
+            return None
         self._put(record.after(former))
-        return True
+        return replace(outcome, record=self.records[record.index])
 
     def _give_up(self, index: int, unit: Unit, failure: Failure, now: float) -> Outcome:
         """The pair keeps the F that it has; the unit is marked as had, with the reason."""
@@ -383,7 +413,7 @@ class Plan:
     @property
     def is_complete(self) -> bool:
         """Whether every pair has been reached, and none can gain what it wants."""
-        return all(record.reached and not self.may_gain(record) for record in self.records[: self._asked])
+        return all(record.reached and not self.may_gain(record) for record in self.records[: self._row_count])
 
     @property
     def nothing_runs(self) -> bool:
@@ -406,5 +436,5 @@ class Plan:
 
     def _lacks(self, record: PairRecord) -> list[str]:
         """The units that a pair is to get yet, if it has an F and a row."""
-        has_row = record.index < self._asked
+        has_row = record.index < self._row_count
         return [unit.name for unit in record.lacking(self.recipe.units)] if record.units and has_row else []

@@ -31,12 +31,14 @@ class UnitRecord:
     encode_seconds: float
     match_seconds: float
     failure: str
+    note: str = ""  # why the unit ran otherwise than it is written
 
     @classmethod
     def of(cls, found: UnitResult, inliers: NDArray[np.bool_]) -> "UnitRecord":
         """``inliers`` is a mask over the matches that were found."""
         unit, counts = found.unit, (len(found.matches), int(inliers.sum()))
-        return cls(unit.name, unit.stage, *counts, found.encode_seconds, found.match_seconds, found.failure)
+        seconds = found.encode_seconds, found.match_seconds
+        return cls(unit.name, unit.stage, *counts, *seconds, found.failure, found.note)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -176,7 +178,7 @@ class CameraRecord:
 class SceneRecord:
     """What came of a batch: how many of its images have a camera, in how many models, with how many points.
 
-    It was made from so many unit results on its pairs: if these have more now, the scene is out of date.
+    ``unit_results``: how many unit results the scene is made of; if its pairs have more, it is out of date.
     ``clouds`` are some points of each model, evenly chosen, in its units.
     """
 
@@ -185,7 +187,7 @@ class SceneRecord:
     placed: int
     models: int
     points: int
-    made_from: int
+    unit_results: int
     seconds: float
     failure: str
     cameras: tuple[CameraRecord, ...] = ()
@@ -193,7 +195,7 @@ class SceneRecord:
 
     @classmethod
     def of(
-        cls, batch: str, found: Sequence[Reconstruction], made_from: int, seconds: float, failure: str = ""
+        cls, batch: str, found: Sequence[Reconstruction], unit_results: int, seconds: float, failure: str = ""
     ) -> "SceneRecord":
         models = sorted((model for each in found for model in each.models), key=lambda model: -len(model.images))
         cameras = tuple(CameraRecord.of(image, n) for n, model in enumerate(models) for image in model.images)
@@ -204,7 +206,7 @@ class SceneRecord:
             sum(each.registered for each in found),
             len(models),
             sum(len(model.points) for model in models),
-            made_from,
+            unit_results,
             seconds,
             failure or "; ".join(reasons) or ("" if models else "no matches connect its images"),
             cameras,

@@ -6,12 +6,12 @@ since. Pairs have the F of their own matches all the while.
 
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.jobs import SceneJob
+from mkpc_kaggle.engine.places import START_TIMEOUT_S
 from mkpc_kaggle.engine.records import PairRecord, SceneRecord
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.pipeline.pair import UnitResult
@@ -23,9 +23,12 @@ from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair, tracks_of
 MIN_PAIRS = 2  # they can connect three images
 MAX_TRIES = 2  # of a reconstruction that is lost
 START_S = 3.0  # that a process takes to begin
-PAIR_S = 0.2  # that a pair adds to a reconstruction, as long as nothing is known
-FORECAST_MARGIN = 1.5  # a reconstruction may take this many times what its pairs took in earlier scenes
-HANG_FACTOR = 10.0  # a reconstruction that takes this many times its forecast hangs
+START_SHARE = 0.25  # of the time left, after which a process that has not begun hangs
+MATCH_S = 5e-4  # that a match adds to a reconstruction, as long as nothing is known
+FORECAST_MARGIN = 1.5  # a reconstruction may take this many times what its matches took in earlier scenes
+HANG_FACTOR = 10.0  # a reconstruction, or a start, that takes this many times its forecast hangs
+HANG_SHARE, MAX_HANG_S = 0.1, 3600.0  # of the time left that a reconstruction may take whatever was forecast
+NOT_RECONSTRUCTED = "not reconstructed in time"
 
 
 def batches_of(pairs: Iterable[Pair]) -> dict[str, list[int]]:
@@ -79,12 +82,27 @@ class Scenes:
         self._outdated = {name for name in self.batches if self._is_outdated(name)}
         self._running: set[str] = set()
         self._losses: Counter[tuple[str, int]] = Counter()
-        self._spent_s = self._spent_pairs = 0.0
+        self._failures: dict[str, str] = {}
+        self._spent_s = self._spent_matches = self._longest_start = 0.0
+        self._matches = {name: sum(map(self._match_count, indices)) for name, indices in self.batches.items()}
 
-    def note_change(self, index: int) -> None:
-        """Record that a pair has got units, or lost them."""
+    def note_change(self, index: int, gained: int) -> None:
+        """Record that a pair has got units, or lost them, and how many matches it ``gained``."""
         if (batch := self._batch_of.get(index)) is not None:
             self._outdated.add(batch)
+            self._matches[batch] += gained
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether no batch that has matches waits for its turn."""
+        return not any(self._has_units(name) for name in self._outdated)
+
+    def report(self) -> tuple[SceneRecord, ...]:
+        """What came of each batch, in their order: where there is no scene, ``failure`` says why."""
+        return tuple(
+            self.made.get(name) or SceneRecord.of(name, (), 0, 0.0, self._failures.get(name, NOT_RECONSTRUCTED))
+            for name in self.batches
+        )
 
     def due(self, done: Collection[int], filling: Collection[int] = ()) -> str | None:
         """A batch to reconstruct now: its matches have changed since it was, and all of its pairs are ``done``.
@@ -96,7 +114,7 @@ class Scenes:
         for name in sorted(waiting, key=self.made.__contains__):
             indices, waits_for = self.batches[name], filling if name in self.made else ()
             is_ready = all(index in done and index not in waits_for for index in indices)
-            if is_ready and any(self._records[index].units for index in indices):
+            if is_ready and self._has_units(name):
                 return name
         return None
 
@@ -107,32 +125,41 @@ class Scenes:
         found = tuple(index for index in self.batches[batch] if self._records[index].sizes)
         pairs = tuple(self._batch_pair(index, results_of(index)) for index in found)
         self._running.add(batch)
-        made_from, export = self._unit_count(batch), self._exports.get(batch)
-        return SceneJob(batch, found, pairs, config, recipe.focal, recipe.magsac, made_from, export)
+        unit_results, export = self._unit_count(batch), self._exports.get(batch)
+        return SceneJob(batch, found, pairs, config, recipe.focal, recipe.magsac, unit_results, export)
+
+    def on_start(self, seconds: float) -> None:
+        """Record how long a process took to begin."""
+        self._longest_start = max(self._longest_start, seconds)
 
     def on_result(self, job: SceneJob, record: SceneRecord) -> None:
+        """Record a reconstruction; it may be out of date already."""
         self._spent_s += max(0.0, record.seconds - START_S)
-        self._spent_pairs += len(self.batches[job.batch])
-        self._settle(record)
+        self._spent_matches += sum(len(pair.matches) for pair in job.pairs)
+        self._running.discard(job.batch)
+        self.made[job.batch] = record
+        if not self._is_outdated(job.batch):
+            self._outdated.discard(job.batch)
 
-    def on_failure(self, job: SceneJob, failure: str, seconds: float) -> SceneRecord | None:
-        """Record a reconstruction that was lost; what to keep if it is not tried again.
+    def on_failure(self, job: SceneJob, failure: str) -> None:
+        """Record a reconstruction that was lost: this run tries it again once, the next run anyway.
 
         What was found before its pairs got further matches still stands.
         """
         self._running.discard(job.batch)
-        self._losses[job.batch, job.made_from] += 1
-        if self._losses[job.batch, job.made_from] < MAX_TRIES:
-            return None
-        record = self.made.get(job.batch)
-        if record is None or record.failure:
-            record = SceneRecord.of(job.batch, (), job.made_from, seconds, failure)
-        self._settle(replace(record, made_from=job.made_from))
-        return self.made[job.batch]
+        self._failures[job.batch] = failure
+        self._losses[job.batch, job.unit_results] += 1
+        if self._losses[job.batch, job.unit_results] >= MAX_TRIES:
+            self._outdated.discard(job.batch)
 
-    def time_limit(self, batch: str, silence: float) -> float:
-        """Seconds after which a reconstruction hangs, with what :attr:`Budget.silence` allows."""
-        return silence + HANG_FACTOR * self._forecast(batch)
+    def start_timeout(self, left: float) -> float:
+        """Seconds after which a process that has not begun hangs; ``left`` are those of the run."""
+        usual = HANG_FACTOR * max(START_S, self._longest_start) if self._longest_start else START_TIMEOUT_S
+        return max(START_S, min(usual, START_SHARE * left))
+
+    def time_limit(self, batch: str, left: float) -> float:
+        """Seconds after which a reconstruction hangs: nothing is given up while time is plentiful."""
+        return max(HANG_FACTOR * self._forecast(batch), min(MAX_HANG_S, HANG_SHARE * left))
 
     def reserve(self, at_once: int) -> float:
         """The seconds that what is left to reconstruct will most likely take, ``at_once`` at a time."""
@@ -140,17 +167,17 @@ class Scenes:
         return max([*left, sum(left) / at_once], default=0.0)
 
     def _forecast(self, batch: str) -> float:
-        rate = FORECAST_MARGIN * self._spent_s / self._spent_pairs if self._spent_pairs else PAIR_S
-        return START_S + rate * len(self.batches[batch])
+        rate = FORECAST_MARGIN * self._spent_s / self._spent_matches if self._spent_matches else MATCH_S
+        return START_S + rate * self._matches[batch]
 
-    def _settle(self, record: SceneRecord) -> None:
-        self._running.discard(record.batch)
-        self.made[record.batch] = record
-        if not self._is_outdated(record.batch):
-            self._outdated.discard(record.batch)
+    def _match_count(self, index: int) -> int:
+        return self._records[index].matches
+
+    def _has_units(self, batch: str) -> bool:
+        return any(self._records[index].units for index in self.batches[batch])
 
     def _is_outdated(self, batch: str) -> bool:
-        return batch not in self.made or self.made[batch].made_from != self._unit_count(batch)
+        return batch not in self.made or self.made[batch].unit_results != self._unit_count(batch)
 
     def _unit_count(self, batch: str) -> int:
         return sum(len(self._records[index].units) for index in self.batches[batch])

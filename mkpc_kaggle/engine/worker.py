@@ -18,7 +18,6 @@ from mkpc_kaggle.engine.jobs import (
     MatchResult,
     Outcome,
     SceneJob,
-    SceneResult,
 )
 from mkpc_kaggle.engine.records import NOT_REACHED, PairRecord
 from mkpc_kaggle.errors import UserError
@@ -26,6 +25,7 @@ from mkpc_kaggle.pipeline import failures
 from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult, with_estimate
 from mkpc_kaggle.pipeline.stages import Pipeline
 from mkpc_kaggle.recipe import Unit
+from mkpc_kaggle.scene.reconstruct import Solution, reconstruct_batch
 
 ESTIMATE_THREADS = 2  # OpenCV releases the interpreter's lock: F of pairs is estimated while the next are matched
 
@@ -102,15 +102,12 @@ class MatchRunner:
         self._images.prefetch(path for pair in job.pairs for path in pair.images)
         pairs = [self._open(pair, known) for pair, known in zip(job.pairs, job.known, strict=True)]
         readable = [number for number, pair in enumerate(pairs) if not pair.failure]
-        units = sorted(job.units, key=lambda unit: unit.stage)
-        matched = self._pipeline.match([pairs[number] for number in readable], units[:-1], may_start)
         estimates: list[Future[Outcome]] = []
-        for start in range(0, len(matched), self._pipeline.minibatch):
-            part = slice(start, start + self._pipeline.minibatch)
-            found = self._pipeline.match(matched[part], units[-1:], may_start)
+        for start in range(0, len(readable), self._pipeline.minibatch):
+            part = readable[start : start + self._pipeline.minibatch]
+            found = self._pipeline.match([pairs[number] for number in part], job.units, may_start)
             estimates += [
-                self._estimators.submit(self._estimate, job, number, pair)
-                for number, pair in zip(readable[part], found, strict=True)
+                self._estimators.submit(self._estimate, job, *pair) for pair in zip(part, found, strict=True)
             ]
         outcomes = [Outcome(PairRecord.untouched(i, p.failure)) for i, p in zip(job.indices, pairs, strict=True)]
         for number, estimate in zip(readable, estimates, strict=True):
@@ -144,10 +141,7 @@ class MatchRunner:
 class SceneRunner:
     """Reconstructs batches. pycolmap may end the process: see :mod:`mkpc_kaggle.scene.colmap`."""
 
-    def run(self, job: Job, seconds: float) -> SceneResult:
+    def run(self, job: Job, seconds: float) -> Solution:
         """The cameras of a batch, and which F each of its pairs gets; ``seconds`` are not looked at."""
-        from mkpc_kaggle.scene.reconstruct import reconstruct_batch
-
         assert isinstance(job, SceneJob)
-        solution = reconstruct_batch(job.pairs, job.config, job.focal, job.magsac, job.export)
-        return SceneResult(solution.reconstructions, dict(zip(job.indices, solution.choices, strict=True)))
+        return reconstruct_batch(job.pairs, job.config, job.focal, job.magsac, job.export)

@@ -25,8 +25,9 @@ class UnitResult:
     matches: Matches
     encode_seconds: float = 0.0
     match_seconds: float = 0.0
-    failure: str = ""  # why there are no matches, or why the unit ran otherwise than it is written
+    failure: str = ""  # why there are no matches
     warm_up: bool = False  # this process ran the unit for the first time, which may take much longer
+    note: str = ""  # why the unit ran otherwise than it is written
 
     @property
     def seconds(self) -> float:

@@ -3,6 +3,7 @@
 Stage 1 matches whole images, MKPC finds the critical region of each, stage 2 matches the crops.
 """
 
+import os
 import sys
 import time
 import warnings
@@ -12,6 +13,7 @@ from itertools import chain
 from typing import Any
 
 from mkpc_kaggle.data.images import ByteCache, Image
+from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Box, View
 from mkpc_kaggle.geometry.critical_region import critical_region
 from mkpc_kaggle.geometry.matches import Matches
@@ -51,6 +53,7 @@ class Pipeline:
         self._matchers: dict[str, Matcher[Any]] = {}
         self._notes: dict[str, str] = {}  # on matchers that run in float32 though they should not
         self._encodings: ByteCache[ViewKey, Any] = ByteCache(cache_bytes)
+        self._process = os.getpid()
 
     def load(self) -> None:
         """Load all matchers of the recipe now; raises :class:`UserError` if one cannot be loaded."""
@@ -62,10 +65,15 @@ class Pipeline:
     ) -> list[PairMatch]:
         """Run ``units`` on every pair that has not had them: stage 1, the critical regions, stage 2.
 
-        ``may_start(unit)`` is asked before each unit on each minibatch of pairs. An error of a matcher is the
-        failure of this unit's results on the minibatch. Errors of the device, and of memory that does not suffice
-        for a single pair, are raised: see :mod:`mkpc_kaggle.pipeline.failures`.
+        ``may_start(unit)`` is asked before each unit on each minibatch of pairs. After an error of a matcher the
+        minibatch's pairs are run singly; a pair's error is the failure of its result. Errors of the device, and of
+        memory that does not suffice for a single pair, are raised: see :mod:`mkpc_kaggle.pipeline.failures`. In a
+        forked child, :class:`UserError`.
         """
+        if os.getpid() != self._process:  # the threads of PyTorch and OpenCV are gone, and would be waited for
+            raise UserError(
+                "this matcher was made before the process forked: make it anew here, or spawn processes"
+            )
         pairs, units = list(pairs), list(units)
         for unit in (unit for unit in units if unit.stage == 1):
             self._run(unit, pairs, may_start)
@@ -93,8 +101,10 @@ class Pipeline:
             failure = failure_of(error)
             if isinstance(error, NonFiniteError) and self._fall_back_to_float32(unit.matcher, error):
                 return []
+            if failure is FailureKind.ORDINARY and len(pairs) == 1:
+                return [UnitResult(unit, Matches.empty(), failure=reason_of(error))]
             if failure is FailureKind.ORDINARY:
-                return [UnitResult(unit, Matches.empty(), failure=reason_of(error))] * len(pairs)
+                return self._run_singly(unit, pairs)
             if failure is FailureKind.DEVICE or len(pairs) == 1:
                 error.add_note(f"in {unit.name}")
                 raise
@@ -105,6 +115,16 @@ class Pipeline:
             torch.cuda.empty_cache()  # cuBLAS and cuDNN cannot use what PyTorch keeps for later
         self._minibatches[unit] = len(pairs) // 2
         return []
+
+    def _run_singly(self, unit: Unit, pairs: list[PairMatch]) -> list[UnitResult]:
+        """The unit's results on the first of the pairs, up to a change in how the unit runs, or on all of them."""
+        results: list[UnitResult] = []
+        for pair in pairs:
+            found = self._run_minibatch(unit, [pair])
+            if not found:
+                break
+            results += found
+        return results
 
     def _fall_back_to_float32(self, name: str, error: NonFiniteError) -> bool:
         """Whether the matcher runs in float32 from now on, and did not before."""
@@ -134,8 +154,8 @@ class Pipeline:
                 matches.to_image(*both).best(unit.max_matches),
                 (encoded - start) / len(pairs),
                 (matched - encoded) / len(pairs),
-                self._notes.get(unit.matcher, ""),
-                warm_up,
+                warm_up=warm_up,
+                note=self._notes.get(unit.matcher, ""),
             )
             for matches, both in zip(found, views, strict=True)
         ]

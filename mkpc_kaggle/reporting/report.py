@@ -27,7 +27,7 @@ from mkpc_kaggle.reporting.figures.run import draw_budget, draw_cameras
 from mkpc_kaggle.reporting.figures.style import encode
 from mkpc_kaggle.reporting.run_log import RunLog, WeakPair, read_log
 from mkpc_kaggle.reporting.summary import headline, left_out_line, trouble
-from mkpc_kaggle.reporting.tables import seconds_by_part, unit_failures, unit_means
+from mkpc_kaggle.reporting.tables import seconds_by_part, unit_means, unit_reasons
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -89,7 +89,7 @@ def report_page(log: RunLog, pairs: Sequence[Pair] = (), *, undrawn: str = "") -
         left_out=left_out_line(log.about.left_out),
         faults=_events(log, EventKind.FAULT),
         failures=_failures(log),
-        unit_failures=pd.DataFrame({"units that failed": unit_failures(log.tables)}),
+        unit_failures=pd.DataFrame({"units that failed": unit_reasons(log.tables)}),
         weakest=[_weak(log, weak, sources) for weak in log.weakest],
         scenes=_scenes(log),
         cameras=[

@@ -8,7 +8,7 @@ from mkpc_kaggle.engine.budget import format_duration
 from mkpc_kaggle.engine.engine import Ending, RunReport
 from mkpc_kaggle.engine.records import PairRecord, SceneRecord
 from mkpc_kaggle.reporting.run_log import RunLog
-from mkpc_kaggle.reporting.tables import RunTables, run_tables, seconds_by_part, unit_failures, unit_means
+from mkpc_kaggle.reporting.tables import RunTables, run_tables, seconds_by_part, unit_means, unit_reasons
 
 MAX_LINES = 8  # of each list
 
@@ -74,7 +74,8 @@ def _lines(tables: RunTables, run: RunReport | RunLog) -> list[str]:
         *_found(tables),
         *_scenes(tables, run.scenes),
         *_list("pairs with the fallback row", reasons, len(failed)),
-        *_list("units that failed", unit_failures(tables)),
+        *_list("units that failed", unit_reasons(tables)),
+        *_list("units that ran otherwise than written", unit_reasons(tables, "note")),
         *_list("faults", run.faults),
     ]
 
@@ -102,11 +103,20 @@ def _scenes(tables: RunTables, scenes: Sequence[SceneRecord]) -> list[str]:
     made = sum(scene.placed > 0 for scene in scenes)
     images = f"{sum(scene.placed for scene in scenes)} of {sum(scene.images for scene in scenes)} images"
     pairs = f"F of {sum(tables.pairs['source'] == 'scene')} of {len(tables.pairs)} pairs is from them"
-    reasons = Counter(scene.failure for scene in scenes if scene.failure).most_common(MAX_LINES)
+    batches: dict[str, list[str]] = {}
+    for scene in scenes:
+        if scene.failure:
+            batches.setdefault(scene.failure, []).append(scene.batch)
     return [
         f"scenes: {made} of {len(scenes)} batches reconstructed with {images}; {pairs}",
-        *(f"  {count} batches without a scene: {reason}" for reason, count in reasons),
+        *(f"  no scene of {_names(names)}: {reason}" for reason, names in list(batches.items())[:MAX_LINES]),
     ]
+
+
+def _names(names: Sequence[str]) -> str:
+    """The first of the batches, and how many more there are."""
+    more = f" and {len(names) - MAX_LINES} more batches" if len(names) > MAX_LINES else ""
+    return ", ".join(names[:MAX_LINES]) + more
 
 
 def _list(title: str, items: Sequence[str], count: int | None = None) -> list[str]:

@@ -76,10 +76,10 @@ def unit_means(tables: RunTables) -> pd.DataFrame:
     return means.reset_index()
 
 
-def unit_failures(tables: RunTables) -> list[str]:
-    """Why units failed, and on how many pairs; the most frequent reason first."""
-    failed = tables.units[tables.units["failure"] != ""]
-    counts = (failed["unit"] + ": " + failed["failure"]).value_counts()
+def unit_reasons(tables: RunTables, column: str = "failure") -> list[str]:
+    """Why units failed (``failure``) or ran otherwise (``note``), on how many pairs; the most frequent first."""
+    told = tables.units[tables.units[column] != ""]
+    counts = (told["unit"] + ": " + told[column]).value_counts()
     return [f"{reason} ({count} pairs)" for reason, count in counts.items()]
 
 

@@ -176,6 +176,7 @@ def _sfm_model(found: Any, graph: ViewGraph) -> SfmModel:
         K[:2, 2] -= CENTRE_PX
         camera = Camera(K, pose[:, :3].copy(), pose[:, 3].copy())
         images.append(RegisteredImage(graph.images[number - 1], camera, int(image.num_points3D)))
-    points = [found.points3D[number].xyz for number in sorted(found.point3D_ids())]
-    error = float(found.compute_mean_reprojection_error()) if points else 0.0
-    return SfmModel(tuple(images), np.array(points, np.float64).reshape(-1, 3), error, found)
+    points = np.array([found.points3D[number].xyz for number in sorted(found.point3D_ids())], np.float64)
+    points = points.reshape(-1, 3)
+    error = float(found.compute_mean_reprojection_error()) if len(points) else 0.0
+    return SfmModel(tuple(images), points[np.isfinite(points).all(axis=1)], error, found)

@@ -102,7 +102,7 @@ def test_it_is_known_of_how_many_results_a_scene_was_made(tmp_path: Path) -> Non
     damaged_journal(tmp_path, "SELECT 1")
     with Journal(tmp_path, OURS) as journal:
         (scene,) = journal.scenes()
-        assert scene.made_from == 3
+        assert scene.unit_results == 3
         assert journal.records()[3].source == "scene"
 
 

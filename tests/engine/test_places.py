@@ -1,5 +1,6 @@
 """A place: when it is given up, on workers that answer as they are told."""
 
+import threading
 from types import SimpleNamespace
 
 import pytest
@@ -7,8 +8,11 @@ import pytest
 from mkpc_kaggle.engine import places
 from mkpc_kaggle.engine.jobs import Cause, Failure, Loaded, MatchJob, MatchResult, Phase
 from mkpc_kaggle.engine.places import LocalSite, Place
+from mkpc_kaggle.engine.process import ThreadWorker
+from mkpc_kaggle.engine.worker import SceneRunner
 
 LOST, DONE = Failure(Cause.DIED), MatchResult(())
+RAISED, NO_MEMORY = Failure(Cause.RAISED), Failure(Cause.OUT_OF_MEMORY)
 
 
 def job(*, is_retry=False):
@@ -29,6 +33,8 @@ def place_of(waiting):
         ([LOST] * 2, False, False),
         ([LOST] * 3, False, True),
         ([LOST, LOST, DONE, LOST, LOST], False, False),
+        ([LOST, LOST, RAISED, LOST, LOST], False, False),  # what a worker reports is an answer
+        ([LOST, LOST, NO_MEMORY, LOST, LOST], False, False),
         ([DONE] + [LOST] * 3, False, True),
         ([LOST] * 3, True, False),  # it is the job that other workers were lost at
     ],
@@ -45,6 +51,16 @@ def test_three_workers_lost_in_a_row_with_no_answer_between_close_a_place(answer
         place.submit(job(is_retry=is_retry), 1.0, 1.0, now=0.0)
         place.poll(0.0)
     assert bool(place.closed) == is_closed
+
+
+def test_a_thread_that_cannot_start_is_an_answer(monkeypatch):
+    def no_thread(_):
+        raise RuntimeError("can't start new thread")
+
+    monkeypatch.setattr(threading.Thread, "start", no_thread)
+    place = Place("scene", lambda: ThreadWorker("scene", SceneRunner, lambda: None))
+    place.start(0.0)
+    assert place.poll(0.0) == Failure(Cause.NOT_STARTED, "can't start new thread")
 
 
 def test_an_answer_that_is_there_counts_though_its_time_is_over():

@@ -2,19 +2,19 @@
 
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from statistics import median
 
 import numpy as np
 import pytest
 from rectified import SECOND, SWEEP, THIRD, THREE_UNITS
-from simulator import MemoryJournal, Scenario, random_scenario, simulate, without_records
+from simulator import MemoryJournal, Scenario, SimulatedScene, random_scenario, simulate, without_records
 
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.engine import Ending
 from mkpc_kaggle.engine.jobs import Cause, Failure, MatchJob, MatchResult, Outcome, Phase
-from mkpc_kaggle.engine.plan import HANG_FACTOR, JOB_PAIRS, Explanation, Plan
+from mkpc_kaggle.engine.plan import HANG_FACTOR, JOB_PAIRS, Explanation, Plan, job_size
 from mkpc_kaggle.engine.records import PairRecord, UnitRecord
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
@@ -24,8 +24,12 @@ from mkpc_kaggle.recipe import Unit
 DIED = Failure(Cause.DIED, "signal SIGKILL")
 
 
-def plan_of(count: int = 40, limit: float = math.inf, extra: int = 0) -> Plan:
+def plan_of(count: int = 40, limit: float = math.inf, extra: int = 0, had: Sequence[Sequence[Unit]] = ()) -> Plan:
+    """``had``: the units that the first pairs have had."""
     records = [PairRecord.untouched(index) for index in range(count + extra)]
+    for index, units in enumerate(had):
+        found = tuple(UnitRecord(unit.name, unit.stage, 100, 50, 0.0, 1.0, "") for unit in units)
+        records[index] = PairRecord(index, FALLBACK_FUNDAMENTAL, "", found)
     return Plan(range(count + extra), count, THREE_UNITS, records, Budget(0.0, limit, lambda: 0.0))
 
 
@@ -206,13 +210,48 @@ def test_a_worker_hangs_after_many_times_what_its_units_take_and_sooner_in_a_sho
 
 
 def test_where_no_unit_ends_in_time_there_is_no_job_until_scenes_need_less():
-    plan = learnt(plan_of(3, limit=100.0), SWEEP)
+    plan = plan_of(3, limit=100.0)
+    for unit in THREE_UNITS.units:
+        learnt(plan, unit)
     plan.reserve = 10.0
     now = plan.stop - 0.5
     assert plan.next(now) is None
-    assert plan.has_work(now)
     plan.reserve = 0.0
-    assert plan.next(now) is not None
+    assert plan.next(now).units == (SWEEP,)
+
+
+def test_a_unit_that_does_not_end_in_time_is_kept_for_later_where_others_still_fit():
+    plan = plan_of(1, limit=100.0, had=[(SWEEP, SECOND)])
+    learnt(plan, SECOND)
+    plan.costs.observe(THIRD.name, 20.0)
+    plan.reserve = 15.0
+    now = plan.stop - 10.0
+    assert plan.next(now) is None
+    plan.reserve = 0.0
+    assert plan.next(now).units == (THIRD,)
+
+
+@pytest.mark.parametrize(
+    ("pairs", "prices", "seconds", "size"),
+    [
+        (8, [1.0, 1.0], 100.0, (8, 2)),
+        (8, [1.0, 1.0], 6.0, (3, 2)),
+        (8, [1.0, 1.0], 1.5, (1, 1)),
+        (8, [1.0, None, 1.0], 100.0, (1, 2)),
+        (8, [None, 1.0], 100.0, (1, 1)),
+        (8, [5.0, None], 1.0, (1, 1)),
+        (8, [], 100.0, (8, 0)),
+    ],
+)
+def test_a_job_takes_a_share_of_the_time_left_and_explores_one_unit_on_one_pair(pairs, prices, seconds, size):
+    assert job_size(pairs, prices, 0.0, seconds) == size
+
+
+def test_a_job_has_only_units_that_its_own_pairs_lack():
+    plan = plan_of(3, had=[(SWEEP,), (SWEEP, THIRD), (SWEEP,)])
+    jobs = [plan.next(0.0, cautious=True) for _ in range(3)]
+    assert [job.units for job in jobs] == [(THIRD,), (SECOND,), (THIRD,)]
+    assert plan.on_failure(jobs[1], DIED, "here", 0.0) == []
 
 
 def test_units_that_do_not_fit_for_all_go_to_the_weakest_pairs_in_the_time_left():
@@ -292,7 +331,8 @@ def test_random_runs_are_never_late_never_lose_a_row_and_use_their_time():
     runs = [without_records(simulate(random_scenario(seed, pairs=300))) for seed in range(60)]
     assert max(run.late for run in runs) == 0
     assert sum(run.lost for run in runs) == 0
-    assert sum(run.missed for run in runs if run.scenes_fit) == 0
+    fit = [run for run in runs if run.scenes_fit]
+    assert sum(run.missed for run in fit) <= 0.02 * sum(run.scenario.batches for run in fit)
     used = [run.utilisation for run in runs if run.work_left]
     assert median(used) > 0.98
     assert np.percentile(used, 5) > 0.8
@@ -341,4 +381,26 @@ def test_a_run_killed_at_any_moment_leaves_no_scene_out_of_date_when_it_goes_on(
     simulate(scenario, journal, until=moment)
     ran = simulate(scenario, journal)
     assert ran.report.ending is Ending.COMPLETE
-    assert {scene.batch: scene.made_from for scene in ran.report.scenes} == ran.scene_units
+    assert {scene.batch: scene.unit_results for scene in ran.report.scenes} == ran.scene_units
+
+
+def test_time_kept_for_scenes_is_used_for_units_when_they_need_less():
+    ran = simulate(Scenario(600, (0.1, 0.2, 0.3), 1, 280.0, warm_up=1, batches=1))
+    assert ran.work_left
+    assert ran.report.seconds > 279.0
+
+
+def test_a_scene_that_never_begins_is_named_and_the_others_have_their_turn(monkeypatch):
+    start = SimulatedScene.start
+
+    def stopped(scene: SimulatedScene) -> None:
+        if len(scene._site.scenes) > 2:  # both tries of the first
+            start(scene)
+
+    monkeypatch.setattr(SimulatedScene, "start", stopped)
+    ran = simulate(Scenario(300, (0.5, 1.0), 1, 600.0, batches=3, misses=0))
+    assert ran.late == 0
+    failures = {scene.batch: scene.failure for scene in ran.report.scenes}
+    assert failures.pop("000").startswith("the worker hung: no answer for ")
+    assert len(failures) == 2
+    assert not any("hung" in failure for failure in failures.values())

@@ -16,11 +16,12 @@ import numpy as np
 import pytest
 from faulty import ScenesBy, choose_scene_for_all_but_the_first, on_fork
 
-from mkpc_kaggle.engine.jobs import Cause, Failure, Loaded, SceneJob, SceneResult
+from mkpc_kaggle.engine.jobs import Cause, Failure, Loaded, SceneJob
 from mkpc_kaggle.engine.process import WORKER_ENVIRONMENT, ProcessWorker
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.recipe import SceneConfig
+from mkpc_kaggle.scene.reconstruct import Solution
 from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -33,7 +34,7 @@ LARGE = SceneJob("one", (0,), (BatchPair(*IMAGES, MATCHES, None, {"m": MATCHES})
 class Worker(ProcessWorker):
     """A worker process with the scenes of ``make``, whose answers the test waits for."""
 
-    def __init__(self, make: Callable[[SceneJob], SceneResult]) -> None:
+    def __init__(self, make: Callable[[SceneJob], Solution]) -> None:
         self._bell = threading.Semaphore(0)
         super().__init__("scene", partial(ScenesBy, make), self._bell.release)
 
@@ -47,7 +48,7 @@ def start() -> Iterator[Callable[..., Worker]]:
     """Starts a worker. In the end it is killed, and neither its thread nor its process is left."""
     workers = []
 
-    def start(make: Callable[[SceneJob], SceneResult] = choose_scene_for_all_but_the_first) -> Worker:
+    def start(make: Callable[[SceneJob], Solution] = choose_scene_for_all_but_the_first) -> Worker:
         workers.append(Worker(make))
         workers[-1].start()
         return workers[-1]
@@ -119,7 +120,8 @@ if __name__ == "__main__":
 """
 
 
-def test_a_worker_at_work_ends_with_its_parent_and_prints_nothing(tmp_path):
+@pytest.mark.parametrize("is_stopped", [False, True])
+def test_a_worker_at_work_ends_with_its_parent_and_prints_nothing(tmp_path, is_stopped):
     script = tmp_path / "orphan.py"  # a file, since its children import it
     script.write_text(ORPHAN.format(path=[str(ROOT), str(Path(__file__).parent), str(ROOT / "tests" / "support")]))
     mark, home = tmp_path / "hangs", {**os.environ, "MKPC_TEST_HOME": str(tmp_path)}
@@ -128,6 +130,8 @@ def test_a_worker_at_work_ends_with_its_parent_and_prints_nothing(tmp_path):
         assert parent.poll() is None, parent.stderr
         threading.Event().wait(0.05)
     child = os.pidfd_open(int(mark.read_text()))
+    if is_stopped:
+        signal.pidfd_send_signal(child, signal.SIGSTOP)
     parent.kill()
     assert select.select([child], [], [], 120)[0], "it has ended"
     os.close(child)

@@ -1,5 +1,6 @@
 """Scenes in whole runs: whose F a pair gets, and what a reconstruction that goes wrong costs."""
 
+import math
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -25,12 +26,16 @@ from synthetic import SyntheticMatcher, synthetic_pairs
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.engine import Ending
-from mkpc_kaggle.engine.jobs import SceneJob, SceneResult
+from mkpc_kaggle.engine.jobs import SceneJob
+from mkpc_kaggle.engine.places import START_TIMEOUT_S
+from mkpc_kaggle.engine.records import PairRecord, UnitRecord
+from mkpc_kaggle.engine.scenes import MATCH_S, START_S, Scenes
 from mkpc_kaggle.recipe import SceneConfig
 from mkpc_kaggle.reporting.report import report_page
 from mkpc_kaggle.reporting.run_log import read_log
-from mkpc_kaggle.reporting.summary import overview
+from mkpc_kaggle.reporting.summary import overview, summary
 from mkpc_kaggle.scene.choose import Reason
+from mkpc_kaggle.scene.reconstruct import Solution
 from mkpc_kaggle.scene.view_graph import BatchPair
 
 RECIPE = replace(THREE_UNITS, scene=SceneConfig())
@@ -112,7 +117,7 @@ def test_a_death_within_pycolmap_costs_the_scene_alone_and_leaves_no_files(tmp_p
 def test_the_scene_of_a_run_is_made_of_tracks_and_judged_by_all_matches(tmp_path, monkeypatch):
     given: list[BatchPair] = []
 
-    def note(job: SceneJob) -> SceneResult:
+    def note(job: SceneJob) -> Solution:
         given.extend(job.pairs)
         return choose_scene_for_all_but_the_first(job)
 
@@ -135,3 +140,69 @@ def test_a_run_that_goes_on_reconstructs_only_the_batch_whose_image_was_replaced
     assert [record.source for record in again.records] == ["pair"] * 6 + ["pair", "scene", "scene"]
     assert {scene.batch: bool(scene.failure) for scene in again.scenes} == {"one": True, "two": False}
     assert matrices(again) == own_matrices(pairs, tmp_path / "alone")
+
+
+def test_a_scene_that_was_lost_is_tried_again_by_the_next_run(tmp_path, monkeypatch):
+    scenes_by(monkeypatch, partial(befall, lack_an_image))
+    pairs = batch_pairs(tmp_path / "images")
+    run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
+    scenes_by(monkeypatch, choose_scene_for_all_but_the_first)
+    matcher = RectifiedMatcher()
+    again = run(pairs, RECIPE, matcher, tmp_path / "work")
+    assert [record.source for record in again.records] == ["pair"] + ["scene"] * 5
+    assert matcher.calls == []
+
+
+def test_a_scene_with_a_point_at_infinity_costs_the_journal_its_record_alone(tmp_path, monkeypatch):
+    def infinite(job: SceneJob) -> Solution:
+        found = choose_scene_for_all_but_the_first(job)
+        (model,) = found.reconstructions[0].models
+        model.points[0] = np.inf
+        return found
+
+    scenes_by(monkeypatch, infinite)
+    pairs = batch_pairs(tmp_path / "images")
+    report = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
+    assert "the journal cannot be written" in report.faults[0]
+    assert [record.source for record in report.records] == ["pair"] + ["scene"] * 5
+    scenes_by(monkeypatch, choose_scene_for_all_but_the_first)
+    assert run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work").faults == ()
+
+
+def test_the_summary_names_a_batch_without_a_scene(tmp_path, monkeypatch):
+    scenes_by(monkeypatch, partial(befall, lack_an_image))
+    pairs = batch_pairs(tmp_path / "images")
+    report = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
+    assert "  no scene of one: the worker failed: KeyError: 'image 7'" in summary(pairs, report).splitlines()
+
+
+def batch_of(count: int, matches: int) -> Scenes:
+    """A batch of so many pairs with so many matches each."""
+    unit = UnitRecord("1:sift", 1, matches, matches, 0.0, 0.0, "")
+    records = [PairRecord(index, np.eye(3), "", (unit,)) for index in range(count)]
+    pairs = [Pair(str(index), "one", f"{index}.png", "b.png") for index in range(count)]
+    return Scenes(pairs, RECIPE, records, ())
+
+
+@pytest.mark.parametrize(
+    ("matches", "left", "seconds"),
+    [
+        (100, 60.0, 10 * (START_S + 66 * 100 * MATCH_S)),  # ten forecasts
+        (10_000, 60.0, 10 * (START_S + 66 * 10_000 * MATCH_S)),
+        (100, 8 * 3600.0, 2880.0),  # a tenth of the time left
+        (100, math.inf, 3600.0),
+    ],
+)
+def test_a_reconstruction_hangs_after_ten_forecasts_by_its_matches_and_not_while_time_is_plentiful(
+    matches, left, seconds
+):
+    scenes = batch_of(66, matches)
+    assert scenes.time_limit("one", left) == pytest.approx(seconds)
+
+
+def test_the_start_of_a_scene_is_timed_by_earlier_starts_and_by_the_time_left():
+    scenes = batch_of(3, 100)
+    assert scenes.start_timeout(math.inf) == START_TIMEOUT_S
+    assert scenes.start_timeout(40.0) == 10.0
+    scenes.on_start(5.0)
+    assert scenes.start_timeout(math.inf) == 50.0

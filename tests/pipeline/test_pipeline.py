@@ -1,5 +1,7 @@
 """The two stages on pictures whose correspondence is known, with real and with misbehaving matchers."""
 
+import multiprocessing
+import warnings
 from collections import Counter
 from dataclasses import dataclass, replace
 from functools import cache
@@ -9,6 +11,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from pictures import same
+from rectified import SWEEP, RectifiedMatcher
 from sklearn.datasets import load_sample_image
 
 from mkpc_kaggle.data.images import Image
@@ -272,6 +275,20 @@ def test_a_matcher_that_raises_costs_its_unit_and_the_run_goes_on(error):
     assert match.estimate.ok
 
 
+def test_a_pair_at_which_a_matcher_raises_costs_the_others_of_its_minibatch_nothing():
+    def moody(brightness):
+        if brightness == 12:
+            raise RuntimeError("no mood")
+        return 150
+
+    matcher = RectifiedMatcher(matches=moody)
+    images = [Image(str(n), np.full((72, 80, 3), 10 + n, np.uint8)) for n in range(8)]
+    runner = Pipeline(Recipe((SWEEP,)), {"rectified": matcher}.__getitem__, minibatch=8)
+    done = runner.match([PairMatch(images=(each, each)) for each in images], [SWEEP])
+    assert [work.results[0].failure for work in done] == ["", "", "RuntimeError: no mood", *[""] * 5]
+    assert [len(work.results[0].matches) > 0 for work in done] == [True, True, False, *[True] * 5]
+
+
 @pytest.mark.parametrize(
     "error", [MemoryError("full"), RuntimeError("CUDA error: unspecified launch failure"), KeyboardInterrupt("x")]
 )
@@ -292,3 +309,19 @@ def test_the_wait_for_the_device_counts_as_encoding_not_as_matching(monkeypatch)
     monkeypatch.setattr(stages.time, "perf_counter", lambda: now[0])
     (result,) = TwoStageMatcher(SIFT)(*pair()).results
     assert (result.encode_seconds, result.seconds) == (2, 2)  # two images, one at a time
+
+
+def test_a_matcher_in_a_forked_child_says_that_it_was_forked():
+    match = TwoStageMatcher(SIFT)
+    match(*pair())
+    child = multiprocessing.get_context("fork").Process(target=in_child, args=(match,))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # of Python 3.12: forks of processes with threads
+        child.start()
+    child.join()
+    assert child.exitcode == 0
+
+
+def in_child(match):
+    with pytest.raises(UserError, match="before the process forked"):
+        match(*pair())

@@ -18,7 +18,7 @@ import pytest
 from rectified import THREE_UNITS, RectifiedMatcher, Seen
 
 from mkpc_kaggle.engine import places, session
-from mkpc_kaggle.engine.jobs import SceneJob, SceneResult
+from mkpc_kaggle.engine.jobs import SceneJob
 from mkpc_kaggle.engine.places import LocalSite, Place
 from mkpc_kaggle.engine.process import ThreadWorker
 from mkpc_kaggle.engine.worker import MatchRunner, SceneRunner
@@ -28,6 +28,7 @@ from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.pipeline.assembly import Assembly
 from mkpc_kaggle.pipeline.stages import Pipeline
 from mkpc_kaggle.scene.choose import Choice, Reason
+from mkpc_kaggle.scene.reconstruct import Solution
 from mkpc_kaggle.scene.reconstruction import Reconstruction, RegisteredImage, SfmModel
 from mkpc_kaggle.scene.view_graph import BatchImage
 
@@ -118,15 +119,15 @@ SCENE_F = np.array([[0.0, 0, 0.2], [0, 0, -0.5], [-0.3, 0.6, 0.5]])
 class ScenesBy(SceneRunner):
     """What a function makes of a job, in place of a reconstruction."""
 
-    def __init__(self, make: Callable[[SceneJob], SceneResult]) -> None:
+    def __init__(self, make: Callable[[SceneJob], Solution]) -> None:
         self._make = make
 
-    def run(self, job: Any, seconds: float) -> SceneResult:
+    def run(self, job: Any, seconds: float) -> Solution:
         return self._make(job)
 
 
 def scenes_by(
-    monkeypatch: pytest.MonkeyPatch, make: Callable[[SceneJob], SceneResult], *, process: bool = False
+    monkeypatch: pytest.MonkeyPatch, make: Callable[[SceneJob], Solution], *, process: bool = False
 ) -> None:
     """Let ``make`` reconstruct batches, in a thread of this process or, as real runs do, in a process."""
     if process:
@@ -136,29 +137,29 @@ def scenes_by(
         monkeypatch.setattr(LocalSite, "scene_worker", lambda site: worker(site.ring))
 
 
-def choose_scene_for_all_but_the_first(job: SceneJob) -> SceneResult:
+def choose_scene_for_all_but_the_first(job: SceneJob) -> Solution:
     """As a reconstruction would, without cameras; it makes as many points as there are matches."""
-    choices = {index: Choice(SCENE_F, Reason.SCENE) for index in job.indices[1:]}
-    choices[job.indices[0]] = Choice(None, Reason.CONTRADICTION)
+    by_scene = (Choice(SCENE_F, Reason.SCENE),) * (len(job.pairs) - 1)
+    choices = (Choice(None, Reason.CONTRADICTION), *by_scene)
     names = tuple(sorted({image.name for pair in job.pairs for image in (pair.image0, pair.image1)}))
     camera = Camera(np.eye(3), np.eye(3), np.zeros(3))
     images = (BatchImage(name, name, Size(80, 72)) for name in names)
     registered = tuple(RegisteredImage(image, camera, 99) for image in images)
     points = np.zeros((sum(len(pair.matches) for pair in job.pairs), 3))
-    return SceneResult((Reconstruction(names, (SfmModel(registered, points, 0.5),)),), choices)
+    return Solution((Reconstruction(names, (SfmModel(registered, points, 0.5),)),), choices)
 
 
-def befall(fault: Fault, job: SceneJob) -> SceneResult:
+def befall(fault: Fault, job: SceneJob) -> Solution:
     """A fault in the place of a reconstruction."""
     fault()
     raise AssertionError
 
 
-def reconstruct(job: SceneJob) -> SceneResult:
+def reconstruct(job: SceneJob) -> Solution:
     return SceneRunner().run(job, inf)
 
 
-def die_within_pycolmap(job: SceneJob) -> SceneResult:
+def die_within_pycolmap(job: SceneJob) -> Solution:
     """When its database is written, and cameras are to be found."""
     import pycolmap
 
@@ -166,7 +167,7 @@ def die_within_pycolmap(job: SceneJob) -> SceneResult:
     return reconstruct(job)
 
 
-def scene_in_a_gigabyte(job: SceneJob) -> SceneResult:
+def scene_in_a_gigabyte(job: SceneJob) -> Solution:
     """All that it may have; libraries that are only mapped are not counted."""
     resource.setrlimit(resource.RLIMIT_DATA, (1 << 30, 1 << 30))
     return reconstruct(job)

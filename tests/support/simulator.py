@@ -26,7 +26,6 @@ from mkpc_kaggle.engine.jobs import (
     MatchResult,
     Outcome,
     SceneJob,
-    SceneResult,
 )
 from mkpc_kaggle.engine.places import Place, Site
 from mkpc_kaggle.engine.plan import RESERVE_SHARE
@@ -38,17 +37,19 @@ from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
 from mkpc_kaggle.pipeline.pair import UnitResult
 from mkpc_kaggle.recipe import Recipe, SceneConfig, Unit
 from mkpc_kaggle.scene.choose import Choice, Reason
+from mkpc_kaggle.scene.reconstruct import Solution
 
 RESTART_S = 8.0
 STALL = 20.0  # a unit that stalls takes so many times as long
 SIZES = (Size(640, 480), Size(640, 480))
-NO_MATCHES = Matches.empty()
+MATCHES = Matches(np.zeros((200, 2)), np.zeros((200, 2)), np.zeros(200))  # that a unit finds
 SWEEP_SHARE = 0.7  # of the limit, within which the sweep is said to fit
 
 
 @dataclass(frozen=True)
 class Scenario:
-    """A run's circumstances. Costs are seconds of a unit on a pair; faults are probabilities a unit on a pair.
+    """A run's circumstances. Costs are seconds of a unit on a pair; faults are probabilities a unit on a pair, and
+    ``job_faults`` a job: its worker dies as it begins, hangs, or answers late, whatever the job is.
 
     ``spread`` is the sigma of lognormal costs, ``misses`` the share of pairs whose views are not cached and cost
     ``miss_factor`` times as much, ``warm_up`` what a unit takes the first time on a worker. From ``turn``, a share
@@ -72,6 +73,7 @@ class Scenario:
     stalls: float = 0.0
     crashes: float = 0.0
     hangs: float = 0.0
+    job_faults: float = 0.0
     batches: int = 0
     pairs_per_image: float = 0.0
     scene_seconds: float = 0.06
@@ -124,6 +126,7 @@ def random_scenario(seed: int, pairs: int) -> Scenario:
     seconds = sum(costs) / len(costs) * scenario.cached
     runs = min(scenario.pairs * len(costs), limit * scenario.workers / seconds)
     rates = [float(rng.uniform(0, most)) / runs if troubled else 0.0 for most in (30, 3, 1)]
+    jobs = runs / 2  # at least: many are of one pair or of one unit
     return replace(
         scenario,
         limit=limit,
@@ -134,6 +137,7 @@ def random_scenario(seed: int, pairs: int) -> Scenario:
         pairs_per_image=float(rng.choice([0, 1.5])),
         scene_seconds=float(np.exp(rng.normal(np.log(0.06), 0.8))),
         scene_faults=float(rng.uniform(0, 0.3)) if troubled else 0.0,
+        job_faults=float(rng.uniform(0, 3)) / jobs if troubled else 0.0,
     )
 
 
@@ -250,6 +254,14 @@ class SimulatedWorker(Simulated):
         scenario, expected = site.scenario, dict(zip(job.units, job.expected, strict=True))
         results: list[list[UnitResult]] = [[] for _ in job.indices]
         hung = Failure(Cause.TIMED_OUT)
+        if site.rng.random() < scenario.job_faults:
+            usual = len(job.indices) * sum(self._site.costs[unit.name] for unit in job.units)
+            fate = site.rng.integers(3)
+            if fate == 0:
+                return now, Failure(Cause.DIED), 1e-9
+            if fate == 1:
+                return end, hung, min(end - now, STALL * usual)
+            now += usual
         for unit in sorted(job.units, key=lambda unit: unit.stage):
             for known, found in zip(job.known, results, strict=True):
                 if any(result.unit == unit for result in known) or now + expected[unit] >= deadline:
@@ -267,7 +279,7 @@ class SimulatedWorker(Simulated):
                 if now + seconds > end:
                     return end, hung, end - now if stalled else 0.0
                 now += seconds
-                found.append(UnitResult(unit, NO_MATCHES, 0.0, seconds, warm_up=warm_up))
+                found.append(UnitResult(unit, MATCHES, 0.0, seconds, warm_up=warm_up))
         pairs = zip(job.indices, job.known, results, strict=True)
         return now, MatchResult(tuple(starmap(_outcome, pairs))), 0.0
 
@@ -276,7 +288,7 @@ def _outcome(index: int, known: tuple[UnitResult, ...], found: list[UnitResult])
     if not found:
         return Outcome(PairRecord.untouched(index, NOT_REACHED))
     units = tuple(
-        UnitRecord(result.unit.name, result.unit.stage, 200, 20 + index % 60, 0.0, result.seconds, "")
+        UnitRecord(result.unit.name, result.unit.stage, len(MATCHES), 20 + index % 60, 0.0, result.seconds, "")
         for result in (*known, *found)
     )
     record = PairRecord(index, FALLBACK_FUNDAMENTAL, "", units, sizes=SIZES, versions=("first", "second"))
@@ -303,9 +315,7 @@ class SimulatedScene(Simulated):
         self.batch, self.seconds = job.batch, START_S + spread * scenario.scene_seconds * len(job.pairs)
         if self.begun > scenario.turn * scenario.limit:
             self.seconds *= scenario.drift
-        self._answer = SceneResult(
-            (), {index: Choice(FALLBACK_FUNDAMENTAL, Reason.SCENE) for index in job.indices}
-        )
+        self._answer = Solution((), (Choice(FALLBACK_FUNDAMENTAL, Reason.SCENE),) * len(job.indices))
         if rng.random() < scenario.scene_faults:
             self.is_faulty = True
             self._answer = Failure(Cause.DIED, "signal SIGSEGV")
@@ -354,8 +364,9 @@ class MemoryJournal:
 class Ran:
     """What became of a scenario; ``late`` and ``lost`` must be 0.
 
-    ``utilisation`` is what was used of what was given. Given are the workers' seconds from their start to the
-    budget's stop, without those that injected faults take from any planner (see :class:`SimulatedSite`). Used are
+    ``utilisation`` is what was used of what was given, of a run that did not get all done. Given are the workers'
+    seconds from their start to the budget's ``stop_units``, whenever the run ended, without those that injected
+    faults take from any planner (see :class:`SimulatedSite`). Used are
     the seconds of jobs whose results came back in time, warm-ups and stalls included. So idle workers, the end of
     a phase, what a lost job had done before, silence longer than a stall's, a slow unit taken to hang, and what
     is still under way at the end all count against the engine. Workers' time while nothing but scenes is under way
@@ -412,7 +423,7 @@ def simulate(scenario: Scenario, journal: MemoryJournal | None = None, until: fl
     report = engine.run()
     swept = sum(record.matches > 0 for record in report.records)
     sweep_fits = sweep_seconds(scenario) < SWEEP_SHARE * scenario.limit
-    given = len(site.places) * (min(budget.stop_units, clock.now) - RESTART_S) - site.faults
+    given = len(site.places) * (site.stop - RESTART_S) - site.faults
     faulty = {scene.batch for scene in site.scenes if scene.is_faulty}
     made = {pairs[record.index].group for record in report.records if record.scene is not None}
     return Ran(
@@ -443,6 +454,7 @@ def sweep_seconds(scenario: Scenario) -> float:
     start = RESTART_S + scenario.warm_up
     stalls = scenario.stalls * (STALL - 1) * unit
     faults = (scenario.crashes + scenario.hangs) * start + scenario.hangs * STALL * unit
+    faults += scenario.job_faults * (start + STALL * unit)
     return start + scenario.pairs * (unit + stalls + faults) / scenario.workers
 
 
