@@ -45,7 +45,7 @@ class Unit:
     area: str = ""  # height x width, such as "540x720": a view gets as many pixels, at its own aspect
     stretch: bool = False  # a view gets just that height and width
     fallback: str = ""  # the matcher that runs where this matcher is unavailable
-    tracks: bool = True  # False: a scene is made of its matches only where a pair has few others
+    tracks: bool = True  # False: its matches enter a scene only where the pair's other units found fewer than 50
 
     def __post_init__(self) -> None:
         check_ranges(self, stage=Range(1, 2), long_side=Range(0, MAX_SIDE_PX), max_matches=AT_LEAST_1)

@@ -18,13 +18,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from mkpc_kaggle import __version__
 from mkpc_kaggle.engine.jobs import Answer, Cause, Failure, Job
 from mkpc_kaggle.engine.places import Place, Site
 from mkpc_kaggle.engine.process import EXIT_TIMEOUT_S, ThreadWorker
 from mkpc_kaggle.engine.worker import Executor, Runner, SceneRunner, use_threads
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.pipeline.assembly import Assembly
+from mkpc_kaggle.version import __version__
 
 FORMS = "a number of processes, ray (this machine's cluster, or a new one for this run), ray://HOST:PORT"
 REACH_TIMEOUT_S = 5.0

@@ -151,11 +151,10 @@ class LocalSite(Site):
         # sweep over after 22 s instead of 31), but need twice the memory, and a network's last bits change.
         devices = assembly.devices
         used = [devices[number % len(devices)] for number in range(workers or len(devices))]
-        share = len(used) if devices == ("cpu",) else 1
         for number, device in enumerate(used):
             count = used.count(device)
             name = device if count == 1 else f"{device} {number}"
-            self.places.append(self._place(name, assembly.on(device, count), share))
+            self.places.append(self._place(name, assembly.on(device, count), len(used)))
         if devices != ("cpu",):
             self.fallback = [self._place("cpu", assembly.on_cpu())]
 

@@ -167,21 +167,21 @@ class DistinctMatches:
 
     points0: Vectors  # (M, 2)
     points1: Vectors
-    place: NDArray[np.intp]  # (N,) the row of each match in them, -1 for a match that is not finite
+    index: NDArray[np.intp]  # (N,) the row of each match in them, -1 for a match that is not finite
 
     @classmethod
     def of(cls, matches: Matches) -> "DistinctMatches":
         pairs = np.hstack([matches.points0, matches.points1]).astype(np.float64)
         finite = np.isfinite(pairs).all(axis=1)
         _, first, inverse = np.unique(pairs[finite], axis=0, return_index=True, return_inverse=True)
-        place = np.full(len(pairs), -1)
-        place[finite] = np.argsort(np.argsort(first))[inverse.ravel()]
+        index = np.full(len(pairs), -1)
+        index[finite] = np.argsort(np.argsort(first))[inverse.ravel()]
         pairs = pairs[finite][np.sort(first)]
-        return cls(pairs[:, :2], pairs[:, 2:], place)
+        return cls(pairs[:, :2], pairs[:, 2:], index)
 
     def mask_of_all(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """An (M,) mask of the distinct matches as an (N,) mask of all: duplicates are like the first."""
-        return np.append(mask, False)[self.place]
+        return np.append(mask, False)[self.index]
 
 
 def unit_norm(matrix: Matrix3) -> Matrix3:

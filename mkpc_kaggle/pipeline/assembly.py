@@ -42,7 +42,7 @@ class Assembly:
         return CUDA_MINIBATCH if self.placement.device.startswith("cuda") else 1
 
     def on(self, device: str, sharing: int = 1) -> "Assembly":
-        """The same on one device, which so many workers share."""
+        """A copy for one device that ``sharing`` workers use."""
         return replace(self, placement=replace(self.placement, device=device), sharing=sharing)
 
     def on_cpu(self) -> "Assembly":

@@ -147,17 +147,17 @@ def _weak(log: RunLog, weak: WeakPair, sources: dict[str, Pair]) -> tuple[str, s
     """What the page says of a weak pair: its picture, empty if it is not drawn; counts and remarks; id."""
     record, pair, picture = weak.record, log.pairs[weak.record.index], ""
     match = weak.match(log.recipe.magsac.threshold)
-    told = [f"{record.inliers} inliers of {record.matches} matches", record.failure]
-    told.append("" if record.overlaps else f"may show different things: support {record.stats.support:.1f}")
+    parts = [f"{record.inliers} inliers of {record.matches} matches", record.failure]
+    parts.append("" if record.overlaps else f"may show different things: support {record.stats.support:.1f}")
     if record.source == "scene":
-        told.append("F is the scene's")
+        parts.append("F is the scene's")
     if pair.id in sources:
         image0, image1 = map(read_image, sources[pair.id].images)
         if isinstance(image0, Unreadable) or isinstance(image1, Unreadable):
-            told.append("an image cannot be read any more")
+            parts.append("an image cannot be read any more")
         else:
             picture = _data_uri(draw_strip((image0, image1), match), "jpeg")
-    return picture, "; ".join(filter(None, told)), pair.id
+    return picture, "; ".join(filter(None, parts)), pair.id
 
 
 def weak_figure(log: RunLog, weak: WeakPair, source: Pair) -> "Figure":

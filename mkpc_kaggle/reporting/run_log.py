@@ -57,7 +57,7 @@ class RunLog:
     @property
     def session(self) -> tuple[Event, ...]:
         """The events since the run was last started."""
-        starts = [place for place, event in enumerate(self.events) if event.kind == EventKind.START]
+        starts = [index for index, event in enumerate(self.events) if event.kind == EventKind.START]
         return self.events[starts[-1] :] if starts else self.events
 
     @property
