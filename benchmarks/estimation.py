@@ -4,10 +4,10 @@ python -m benchmarks.estimation --train-dir DIR --journals DIR [DIR ...] [--scen
     [--shares 1 0.3 0.12] [--estimates NAME ...] [--pairs-per-image 0 5 10] [--thresholds PIXELS ...]
 
 The matches are those of journals, work directories of `validate`; pairs that a journal lacks are left out. For
-each journal and share of a scene's pairs, drawn by seed, a row for each estimate: mAA by scene and the mean, its
-gain over the first with the 95 % interval of resampled pairs, and seconds of this process, a pair or a batch. With
-a number of pairs for each image, the scene also has what the first unit found on extra pairs. With thresholds of
-MAGSAC, there are two rows for each instead: MAGSAC alone, and the prior.
+each journal and share of a scene's pairs, drawn by seed, a row for each estimate: mAA by scene and in the mean,
+its gain over the first estimate with the 95 % interval of resampled pairs, and seconds of this process, a pair or
+a batch. With a number of pairs for each image, the scene also has what the first unit found on extra pairs. With
+thresholds of MAGSAC, there are two rows for each instead: MAGSAC alone, and the prior.
 """
 
 import argparse

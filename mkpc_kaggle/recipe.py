@@ -83,6 +83,22 @@ class CameraModel(StrEnum):
     RADIAL = "SIMPLE_RADIAL"
 
 
+class CameraSharing(StrEnum):
+    """Which images of a scene, of those of one size, share a camera.
+
+    A scene's images are in one folder, so that a camera for each folder and one for all are the same.
+    """
+
+    AUTO = "auto"  # those whose focal lengths agree, see ``shared_intrinsics``
+    IMAGE = "image"  # none
+    FOLDER = "folder"
+    ONE = "one"
+
+    @property
+    def is_given(self) -> bool:
+        return self in (CameraSharing.FOLDER, CameraSharing.ONE)
+
+
 @dataclass(frozen=True)
 class SceneConfig:
     """Settings of :mod:`mkpc_kaggle.scene`, table ``[scene]`` of a recipe."""
@@ -91,6 +107,8 @@ class SceneConfig:
     each_matcher: bool = True  # also reconstruct each matcher's matches alone; a pair gets the mean of its cameras
     shared_intrinsics: float = 0.02  # images of one size share a camera if most focals are this close; 0: never
     pairs_per_image: float = 10.0  # a batch with fewer pairs gets extra pairs, for its scene alone; 0: none
+    cameras: CameraSharing = CameraSharing.AUTO
+    exif: bool = True  # a camera starts with the focal length of its image's EXIF, if that has one
     threads: int = 1  # more than one: the last digits differ from run to run
 
     def __post_init__(self) -> None:

@@ -193,8 +193,9 @@ class Engine:
             elif place.is_idle and (job := self.plan.next(now, place.name, cautious=place.losses > 0)):
                 pairs = tuple(self.pairs[index] for index in job.indices)
                 known = tuple(map(self._results, job.indices))
-                sizes = tuple(self.plan.records[index].sizes for index in job.indices)
-                job = replace(job, pairs=pairs, known=known, sizes=sizes)
+                records = [self.plan.records[index] for index in job.indices]
+                sizes, focals = (tuple(r.sizes for r in records), tuple(r.focals for r in records))
+                job = replace(job, pairs=pairs, known=known, sizes=sizes, focals=focals)
                 place.submit(job, job.seconds, job.time_limit, now)
 
     def _is_matching(self, now: float) -> bool:

@@ -30,7 +30,7 @@ class Phase(StrEnum):
 class MatchJob:
     """Run ``units`` on the pairs of ``indices``; what a pair has had, ``known``, is left out.
 
-    A job without units makes F of what is known alone: of its images only the ``sizes`` are needed.
+    A job without units makes F of what is known alone: of its images only ``sizes`` and ``focals`` are needed.
 
     ``expected`` are the seconds within which each unit most likely ends on a pair. Units may begin in the first
     ``seconds`` of the job if they are expected to end in them. After ``time_limit`` seconds without an answer the
@@ -47,6 +47,7 @@ class MatchJob:
     pairs: tuple[Pair, ...] = ()
     known: tuple[tuple[UnitResult, ...], ...] = ()
     sizes: tuple[tuple[Size, ...], ...] = ()
+    focals: tuple[tuple[float, ...], ...] = ()
 
 
 @dataclass(frozen=True, eq=False)

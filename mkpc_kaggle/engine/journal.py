@@ -28,7 +28,7 @@ from mkpc_kaggle.errors import UserError, writing
 from mkpc_kaggle.pipeline.pair import UnitResult
 from mkpc_kaggle.recipe import Unit
 
-FORMAT = 9
+FORMAT = 10
 FILE_NAME = "journal.sqlite"
 LOCK_NAME = "journal.lock"
 

@@ -51,7 +51,8 @@ class PairRecord:
     ``pair_fundamental`` is from the pair's own matches, and the fallback where ``failure`` says why there is none;
     ``magsac_fundamental`` is MAGSAC's alone, where the former comes from more than that. The seconds are those of
     all jobs on the pair. ``scene`` is what its batch's reconstruction says of it, ``None`` if there was none.
-    ``sizes`` and ``versions`` are of the two images that were matched; a version tells the content of a file.
+    ``sizes``, ``versions`` and ``focals`` are of the two images that were matched: a version tells the content of
+    a file, a focal length is in pixels by its EXIF, 0 if unknown.
     """
 
     index: int
@@ -68,6 +69,7 @@ class PairRecord:
     magsac_fundamental: Matrix3 | None = None
     estimation: str = ""
     stats: EstimateStats = NO_STATS
+    focals: tuple[float, ...] = ()
 
     @classmethod
     def untouched(cls, index: int, reason: str = NOT_REACHED) -> "PairRecord":
@@ -93,6 +95,7 @@ class PairRecord:
             magsac_fundamental=match.estimate.magsac,
             estimation=estimation,
             stats=match.estimate.stats,
+            focals=match.focals,
         )
 
     def after(self, former: "PairRecord") -> "PairRecord":
@@ -103,7 +106,7 @@ class PairRecord:
 
     def estimated_anew(self, later: "PairRecord") -> "PairRecord":
         """The record with the F of a job without units; its images and its units' seconds stay."""
-        kept = ("regions", "decode_seconds", "cluster_seconds", "scene", "sizes", "versions")
+        kept = ("regions", "decode_seconds", "cluster_seconds", "scene", "sizes", "versions", "focals")
         return replace(later, **{name: getattr(self, name) for name in kept})
 
     def without_given_up(self) -> "PairRecord":

@@ -187,10 +187,8 @@ class Scenes:
 
     def _batch_pair(self, index: int, results: Sequence[UnitResult]) -> BatchPair:
         record = self._records[index]
-        image0, image1 = (
-            BatchImage(path.stem, version, size)
-            for path, version, size in zip(self._pairs[index].images, record.versions, record.sizes, strict=True)
-        )
+        images = zip(self._pairs[index].images, record.versions, record.sizes, record.focals, strict=True)
+        image0, image1 = (BatchImage(path.stem, version, size, focal) for path, version, size, focal in images)
         matches = Matches.concatenate(result.matches for result in results)
         own = None if record.failure else record.pair_fundamental
         return BatchPair(image0, image1, matches, own, tracks_of(results))

@@ -120,7 +120,8 @@ class MatchRunner:
 
     def _estimate_anew(self, job: MatchJob) -> MatchResult:
         """F of the pairs of a job from what is known of them; their images are not looked at."""
-        pairs = [PairMatch(known, sizes=sizes) for known, sizes in zip(job.known, job.sizes, strict=True)]
+        known = zip(job.known, job.sizes, job.focals, strict=True)
+        pairs = [PairMatch(results, sizes=sizes, focals=focals) for results, sizes, focals in known]
         estimates = [self._estimators.submit(self._record, job, *pair) for pair in enumerate(pairs)]
         return MatchResult(tuple(Outcome(estimate.result()) for estimate in estimates))
 
@@ -140,7 +141,8 @@ class MatchRunner:
             return Outcome(PairRecord.untouched(job.indices[number], NOT_REACHED))
         sizes = tuple(image.size for image in pair.images)
         versions = tuple(image.version for image in pair.images)
-        pair = replace(pair, images=(), sizes=sizes, versions=versions)
+        focals = tuple(image.focal for image in pair.images)
+        pair = replace(pair, images=(), sizes=sizes, versions=versions, focals=focals)
         return Outcome(self._record(job, number, pair), found)
 
     def _record(self, job: MatchJob, number: int, pair: PairMatch) -> PairRecord:

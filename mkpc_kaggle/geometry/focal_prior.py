@@ -50,6 +50,7 @@ ROUGH_SCALES, FINE_SCALES = (4.0,), (2.0, 1.0)  # times the scale, in turn: a wi
 ROUGH_MATCHES, FINE_MATCHES = 300, 1000  # at most, evenly spread; the results are scored on all
 FINE_STARTS = 2  # how many of the rough results are refined
 FREE_COST = 10.0  # what MAGSAC's own F pays for being free of plausible focal lengths
+EXIF_SIGMA = 0.05  # standard deviation of the logarithm of a focal length that EXIF tells
 LOG_FOCAL_GRID = (-0.7, -0.35, 0.0, 0.35, 0.7)  # log f / g to read MAGSAC's F with; the best is a start
 
 
@@ -60,6 +61,7 @@ class FocalConfig:
     ratio: float = 1.1  # of an unknown focal length to the image's long side
     sigma: float = 0.4  # standard deviation of the focal length's logarithm
     scale: float = 0.35  # of the loss, in pixels
+    exif: bool = True  # where an image's EXIF has a focal length, expect that one, within 5 %
 
     def __post_init__(self) -> None:
         check_ranges(self, ratio=POSITIVE, sigma=POSITIVE, scale=POSITIVE)
@@ -73,8 +75,10 @@ class FocalPrior:
     sigma: float  # standard deviation of the log focal length; 0: it is known
 
     @classmethod
-    def of_image(cls, size: Size, config: FocalConfig) -> "FocalPrior":
-        """The weak prior for an image of which only the size is known."""
+    def of_image(cls, size: Size, config: FocalConfig, exif_focal: float = 0.0) -> "FocalPrior":
+        """The prior for an image of that size: weak, unless EXIF tells its focal length in pixels."""
+        if config.exif and exif_focal:
+            return cls.of_focal(exif_focal, EXIF_SIGMA, size)
         return cls.of_focal(config.ratio * max(size), config.sigma, size)
 
     @classmethod
