@@ -12,7 +12,18 @@ from mkpc_kaggle.weights import WeightStore
 
 # What matchers share.
 NOT_MATCHERS = frozenset(
-    {"contract", "dense", "dtypes", "lightglue", "neighbours", "registry", "semi_dense", "sparse", "vismatch"}
+    {
+        "contract",
+        "dense",
+        "dtypes",
+        "lightglue",
+        "neighbours",
+        "registry",
+        "semi_dense",
+        "sparse",
+        "subpixel",
+        "vismatch",
+    }
 )
 
 
