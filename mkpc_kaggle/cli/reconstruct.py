@@ -75,14 +75,14 @@ def run(arguments: argparse.Namespace) -> int:
         write_tables(out, result.cameras, root, arguments.format)
         failed = trouble(result.report)
         watchdog.status = int(bool(failed) or not any(any(found.values()) for found in result.cameras.values()))
-        told = [*options.plan_lines(arguments, result.report), *_told(result), failed, f"results: {out}"]
-        say("\n".join(filter(None, told)))
+        lines = [*options.plan_lines(arguments, result.report), *_lines(result), failed, f"results: {out}"]
+        say("\n".join(filter(None, lines)))
         say(report_run(work_dir, out / "report.html", session.must_end(), result.pairs))
         signal = session.interrupt.signal
         return 128 + signal if signal else watchdog.status
 
 
-def _told(result: FolderResult) -> Iterator[str]:
+def _lines(result: FolderResult) -> Iterator[str]:
     """A line for each dataset, and what went wrong."""
     report = result.report
     yield f"{len(result.pairs)} pairs: {report.ending} after {format_duration(report.seconds)}"

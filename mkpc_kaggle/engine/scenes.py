@@ -126,7 +126,8 @@ class Scenes:
         pairs = tuple(self._batch_pair(index, results_of(index)) for index in found)
         self._running.add(batch)
         unit_results, export = self._unit_count(batch), self._exports.get(batch)
-        return SceneJob(batch, found, pairs, config, recipe.focal, recipe.magsac, unit_results, export)
+        settings = config, recipe.focal, recipe.magsac
+        return SceneJob(batch, found, pairs, *settings, unit_results, recipe.scene_estimation, export)
 
     def on_start(self, seconds: float) -> None:
         """Record how long a process took to begin."""
@@ -177,7 +178,9 @@ class Scenes:
         return any(self._records[index].units for index in self.batches[batch])
 
     def _is_outdated(self, batch: str) -> bool:
-        return batch not in self.made or self.made[batch].unit_results != self._unit_count(batch)
+        made = self.made.get(batch)
+        wanted = self._unit_count(batch), self._recipe.scene_estimation
+        return made is None or (made.unit_results, made.estimation) != wanted
 
     def _unit_count(self, batch: str) -> int:
         return sum(len(self._records[index].units) for index in self.batches[batch])

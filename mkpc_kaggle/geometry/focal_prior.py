@@ -33,6 +33,7 @@ from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import (
     DistinctMatches,
     Estimate,
+    EstimateStats,
     ModelKind,
     RobustConfig,
     consensus,
@@ -87,9 +88,14 @@ class FocalPrior:
         return cls(np.array([[focal, 0, centre[0]], [0, focal, centre[1]], [0, 0, 1]]), sigma)
 
     @property
+    def focal(self) -> float:
+        """The mean focal length of both axes in pixels."""
+        return float(self.K[0, 0] + self.K[1, 1]) / 2
+
+    @property
     def to_ray(self) -> Matrix3:
-        """Homogeneous pixels -> rays (u, v, g), g being the mean focal length of both axes in pixels."""
-        return np.asarray(float(self.K[0, 0] + self.K[1, 1]) / 2 * np.linalg.inv(self.K))
+        """Homogeneous pixels -> rays (u, v, g), g being the focal length."""
+        return np.asarray(self.focal * np.linalg.inv(self.K))
 
     def scaled(self, factor: float) -> Matrix3:
         """The camera matrix of a focal length that is ``factor`` times as long."""
@@ -127,14 +133,16 @@ def estimate_with_prior(
         finite = [found for found in free if np.isfinite(found.cost)]
         plain = min(finite, key=lambda found: found.cost, default=None)
     magsac_fundamental = unit_norm(search.for_pixels(plain.fundamental)) if plain else None
-    return Estimate(model, unit_norm(matrix), distinct.mask_of_all(inliers), magsac=magsac_fundamental)
+    told = EstimateStats(len(candidates), best.cost, plain and plain.cost, search.focals(best))
+    return Estimate(model, unit_norm(matrix), distinct.mask_of_all(inliers), "", magsac_fundamental, told)
 
 
 class _Candidate(NamedTuple):
-    """An F (3, 3) for rays, and its cost."""
+    """An F (3, 3) for rays, and its cost: MAGSAC's own pays FREE_COST, the others the prior's."""
 
     fundamental: Matrix3
     cost: float
+    logs: Vectors | None = None  # log f / g of both cameras, where it has focal lengths
 
 
 class _Search:
@@ -183,7 +191,14 @@ class _Search:
         rough.sort(key=lambda view: self._many.cost(view, self._scale))
         fine = [self._searched(self._many, view, FINE_SCALES) for view in rough[:FINE_STARTS]]
         costs = [self._cost(view.fundamental, view) + self._all.prior_cost(view) for view in fine]
-        return [_Candidate(view.fundamental, cost) for view, cost in zip(fine, costs, strict=True)]
+        return [_Candidate(view.fundamental, cost, view.logs) for view, cost in zip(fine, costs, strict=True)]
+
+    def focals(self, found: _Candidate) -> tuple[float, float] | None:
+        """In pixels; ``None`` for MAGSAC's own F, which has none."""
+        if found.logs is None:
+            return None
+        ratio0, ratio1 = np.exp(found.logs).tolist()
+        return self._priors[0].focal * ratio0, self._priors[1].focal * ratio1
 
     def for_pixels(self, F: Matrix3) -> Matrix3:
         """The F for homogeneous pixels, from an F for rays."""

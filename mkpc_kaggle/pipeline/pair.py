@@ -6,11 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mkpc_kaggle.data.images import Image
-from mkpc_kaggle.geometry.coordinates import Size
+from mkpc_kaggle.geometry.coordinates import Matrix3, Size
 from mkpc_kaggle.geometry.critical_region import CriticalRegion
 from mkpc_kaggle.geometry.focal_prior import FocalPrior, estimate_with_prior
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.geometry.robust import Estimate, Matrix3, ModelKind, estimate
+from mkpc_kaggle.geometry.overlap import support
+from mkpc_kaggle.geometry.robust import Estimate, ModelKind, estimate
 from mkpc_kaggle.recipe import Recipe, Unit
 
 Regions = tuple[CriticalRegion, CriticalRegion]
@@ -92,4 +93,8 @@ def with_estimate(
         known = [FocalPrior(K, 0.0) for K in intrinsics or ()]
         first, second = known or [FocalPrior.of_image(size, recipe.focal, focal) for size, focal in told]
         found = estimate_with_prior(matches, (first, second), recipe.magsac, recipe.focal, model)
+    if found.ok and model is not ModelKind.H:
+        K0, K1 = intrinsics if intrinsics and model is ModelKind.E else (np.eye(3), np.eye(3))
+        F = np.linalg.inv(K1).T @ found.matrix @ np.linalg.inv(K0)
+        found = replace(found, stats=replace(found.stats, support=support(F, matches)))
     return replace(pair, results=results, estimate=found)

@@ -13,7 +13,7 @@ from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import Estimate, ModelKind, sampson_distances
 from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult
 from mkpc_kaggle.recipe import Recipe, recipe_of
-from mkpc_kaggle.reporting.tables import RunTables, run_tables, to_json
+from mkpc_kaggle.reporting.tables import RunTables, run_tables
 
 MAX_DRAWN_PAIRS = 20  # the weakest, which the report draws
 NOT_ENDED = "not ended (at work, or killed)"
@@ -57,7 +57,7 @@ class RunLog:
     @property
     def session(self) -> tuple[Event, ...]:
         """The events since the run was last started."""
-        starts = [place for place, event in enumerate(self.events) if event.kind == EventKind.START]
+        starts = [index for index, event in enumerate(self.events) if event.kind == EventKind.START]
         return self.events[starts[-1] :] if starts else self.events
 
     @property
@@ -82,7 +82,7 @@ def read_log(directory: Path) -> RunLog:
     """
     with JournalReader(directory) as journal, undamaged(journal.path):
         about, belongs_to, pairs = journal.about(), journal.belongs_to(), journal.pairs()
-        recipe = recipe_of(belongs_to.get("recipe", {}), about.recipe)
+        recipe = recipe_of(belongs_to.get("recipe", {}) | json.loads(about.estimation), about.recipe)
         known = journal.records()
         records = tuple(known.get(index) or PairRecord.untouched(index) for index in range(len(pairs)))
         touched = sorted((record for record in records if record.units), key=lambda r: (r.inliers, r.index))
@@ -102,20 +102,3 @@ def write_csv(log: RunLog, directory: Path) -> list[Path]:
             paths.append(directory / f"{name}.csv")
             table.to_csv(paths[-1], index=False)
     return paths
-
-
-def write_json(log: RunLog, path: Path) -> None:
-    """Write everything as one JSON value, each pair with its units and regions; :class:`UserError` as above."""
-    values = {
-        "recipe": {"name": log.about.recipe, **log.recipe.fingerprint()},
-        "device": log.about.device,
-        "limit_seconds": log.about.limit,
-        "ending": log.ending,
-        "seconds": log.seconds,
-        "versions": dict(log.about.versions),
-        "digests": log.digests,
-        **to_json(log.tables),
-    }
-    with writing(f"--json {path}"):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(values, allow_nan=False) + "\n", encoding="utf-8")

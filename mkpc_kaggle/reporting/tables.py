@@ -19,7 +19,11 @@ SECONDS = {  # what the parts of a pair's work are called; MAGSAC runs beside th
     "cluster_seconds": "cluster",
     "estimate_seconds": "MAGSAC (beside matching)",
 }
-_COLUMNS = {"failure": object, "source": object, "matches": int, "inliers": int} | dict.fromkeys(SECONDS, float)
+_COLUMNS = {
+    **{"failure": object, "source": object, "matches": int, "inliers": int, "overlaps": bool},
+    **dict.fromkeys(SECONDS, float),
+}
+_STATS_COLUMNS = {"support": float, "candidates": int, "cost": float, "magsac_cost": float}
 _UNIT_COLUMNS = {"pair": int, **UnitRecord.__annotations__}
 _BOX_COLUMNS = dict.fromkeys(("pair", "image", "left", "top", "right", "bottom"), int)
 _REGION_COLUMNS = {**_BOX_COLUMNS, "reason": str, "clusters": int, "kept": int}
@@ -88,23 +92,6 @@ def seconds_by_part(tables: RunTables) -> dict[str, float]:
     return {name: float(tables.pairs[column].sum()) for column, name in SECONDS.items()}
 
 
-def to_json(tables: RunTables) -> dict[str, list[dict[str, Any]]]:
-    """``pairs``, each with its F and the rows of its ``units`` and ``regions``, and ``events``."""
-    named = tables.named()
-    pairs = _rows(named["pairs"].drop(columns=list(F_COLUMNS)))
-    for pair, F in zip(pairs, tables.pairs[list(F_COLUMNS)].to_numpy(), strict=True):
-        pair |= {"F": F.reshape(3, 3).tolist(), "units": [], "regions": []}
-    for name in ("units", "regions"):
-        for row in _rows(named[name]):
-            pairs[row.pop("pair")][name].append(row)
-    return {"pairs": pairs, "events": _rows(tables.events)}
-
-
-def _rows(table: pd.DataFrame) -> list[dict[str, Any]]:
-    rows: list[dict[str, Any]] = table.to_dict("records")  # type: ignore[assignment]  # keys are column names
-    return rows
-
-
 def _table(rows: Iterator[tuple[object, ...]], columns: Mapping[str, type]) -> pd.DataFrame:
     # Without a row pandas would not know the columns' types.
     return pd.DataFrame(list(rows), columns=list(columns)).astype(dict(columns))
@@ -120,6 +107,10 @@ def _pair_table(pairs: Sequence[Pair], records: Sequence[PairRecord]) -> pd.Data
     }
     for name, kind in _COLUMNS.items():
         columns[name] = np.fromiter((getattr(record, name) for record in records), kind, size)
+    for name, kind in _STATS_COLUMNS.items():
+        columns[name] = np.array([getattr(record.stats, name) for record in records], kind)
+    focals = np.array([record.stats.focals or (np.nan, np.nan) for record in records]).reshape(size, 2)
+    columns |= {"focal0": focals[:, 0], "focal1": focals[:, 1]}
     F = np.array([record.chosen_fundamental for record in records]).reshape(size, 9)
     columns |= dict(zip(F_COLUMNS, F.T, strict=True))
     return pd.DataFrame(columns, copy=False)

@@ -93,7 +93,7 @@ def _write_images(
 ) -> list[Any]:
     """Write images, frames, cameras and rigs; returns each image's camera.
 
-    Images and frames are numbered by the image's place plus one, cameras and rigs by their first image.
+    Images and frames are numbered by the image's index plus one, cameras and rigs by their first image.
     """
     cameras: dict[object, Any] = {}
     used = []
