@@ -10,6 +10,7 @@ from mkpc_kaggle.cli import options
 from mkpc_kaggle.data.outputs import lies_in
 from mkpc_kaggle.engine.budget import format_duration
 from mkpc_kaggle.engine.console import say
+from mkpc_kaggle.engine.session import interruptible
 from mkpc_kaggle.errors import UserError, writing
 from mkpc_kaggle.recipe import CameraSharing
 from mkpc_kaggle.reconstruction.folder import read_folder, read_pair_list
@@ -67,7 +68,11 @@ def run(arguments: argparse.Namespace) -> int:
     if lies_in(out, root) or lies_in(root, out):
         raise UserError(f"--out {out} and the images in {root} are in each other's way; name another place")
     listed = None if arguments.pairs is None else read_pair_list(arguments.pairs, root, datasets)
-    with options.watched_session(arguments, work_dir) as (session, watchdog), writing(f"--out {out}"):
+    with (
+        interruptible() as interrupt,
+        options.watched_session(arguments, work_dir, interrupt) as (session, watchdog),
+        writing(f"--out {out}"),
+    ):
         assembly = options.assembly_of(arguments, arguments.recipe, arguments.mode)
         assembly = replace(assembly, recipe=for_cameras(assembly.recipe, arguments.camera))
         options.say_start(f"{sum(map(len, datasets.values()))} images", assembly, work_dir)

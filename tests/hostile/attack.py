@@ -26,7 +26,6 @@ REFUSED = (2,)
 EITHER = (0, 1, 2)  # a valid result, a result that says what it lacks, or a clear refusal
 CRASHES = ("Traceback (most recent call last)", "Fatal Python error", "Segmentation fault", "core dumped")
 LEFT_BY_ITSELF = (0, 1, 128 + signal.SIGINT, 128 + signal.SIGTERM)
-TOO_LATE = "the time was up before a first version"
 MARK = "MKPC_HOSTILE_CASE"
 
 Make = Callable[[Path], None]
@@ -75,9 +74,9 @@ def attack(case: Case, room: Path) -> None:
         status, output = _wait(process, room)
         faults += _faults(case, status, output, room)
         faults += [f"left running: {line}" for line in _orphans(mark)]
+        # Before the table was read.
         interrupted = status not in (0, 1) and output.strip() in ("", "error: interrupted")
-        nothing = interrupted or (status == 1 and TOO_LATE in output)  # before it began
-        if case.submission and not nothing and "submit" in command and status in LEFT_BY_ITSELF:
+        if case.submission and not interrupted and "submit" in command and status in LEFT_BY_ITSELF:
             faults += _submission_faults(room)
     faults += [f"changed: {name}" for name in _changed(before, _snapshot(room))]
     if faults:
