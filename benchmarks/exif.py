@@ -2,9 +2,9 @@
 
 python -m benchmarks.exif --train-dir DIR --journal DIR [--recipe classical] [--scenes NAME ...]
 
-The matches are those of a journal, a work directory of `validate`; pairs that it lacks are left out. The recipe says
-what is made of them. An image's error is drawn once, evenly within the bounds. A table for pairs and one for scenes,
-as of `benchmarks.estimation`.
+The matches are those of a journal, a work directory of `validate`; pairs that it lacks are left out. The recipe
+says what is made of them. An image's error is drawn once, evenly within the bounds. A table for pairs and one
+for scenes, as of `benchmarks.estimation`.
 """
 
 import argparse
