@@ -223,8 +223,7 @@ def parse_recipe(text: str, name: str) -> Recipe:
 def recipe_of(table: Mapping[str, Any], name: str) -> Recipe:
     """A recipe from a TOML file's table, or from a journal's; raises :class:`UserError`."""
     where = f"recipe {name!r}"
-    known = ("description", "units", "mkpc", "magsac", "focal", "matchers", "scene")
-    check_keys(table, known, where)
+    check_keys(table, ("description", "units", "mkpc", "magsac", "focal", "matchers", "scene"), where)
     units, matchers = table.get("units", []), table.get("matchers", {})
     if not isinstance(units, list) or not isinstance(matchers, dict):
         raise UserError(f"{where}: units must be a list of tables, and matchers a table")

@@ -297,8 +297,8 @@ def _outcome(
         UnitRecord(result.unit.name, result.unit.stage, len(MATCHES), 20 + index % 60, 0.0, result.seconds, "")
         for result in (*known, *found)
     )
-    record = PairRecord(index, FALLBACK_FUNDAMENTAL, "", units, sizes=SIZES, versions=("first", "second"))
-    record = replace(record, estimation=estimation)
+    images = {"sizes": SIZES, "versions": ("first", "second"), "focals": (0.0, 0.0)}
+    record = PairRecord(index, FALLBACK_FUNDAMENTAL, "", units, estimation=estimation, **images)
     return Outcome(record, tuple(found))
 
 
