@@ -7,11 +7,13 @@ import sys
 import time
 import warnings
 from collections.abc import Sequence
+from contextlib import ExitStack, nullcontext
 from importlib import import_module
 from io import TextIOWrapper
+from pathlib import Path
 from typing import NoReturn
 
-from mkpc_kaggle import __version__
+from mkpc_kaggle.version import __version__
 
 COMMANDS = {
     "submit": "a test directory -> submission.csv",
@@ -53,12 +55,14 @@ def main(arguments: Sequence[str] | None = None, *, started: float | None = None
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):  # paths and ids may have letters that the terminal lacks
             stream.reconfigure(errors="backslashreplace")
-    with warnings.catch_warnings():
+    with ExitStack() as printing, warnings.catch_warnings():
         warnings.showwarning = lambda message, *_, **__: warn(str(message))
         try:
             given = sys.argv[1:] if arguments is None else list(arguments)
             parsed = make_parser(given).parse_args(given)
+            require_directory()
             parsed.started = time.monotonic() if started is None else started
+            printing.enter_context(parsed.printing())
             return int(parsed.run(parsed))
         except UserError as error:
             complain(str(error))
@@ -75,10 +79,20 @@ def main(arguments: Sequence[str] | None = None, *, started: float | None = None
             return EXIT_BAD_INPUT
 
 
+def require_directory() -> None:
+    """Raise :class:`UserError` where the current directory has been removed: no path means anything there."""
+    from mkpc_kaggle.errors import UserError
+
+    try:
+        Path.cwd()
+    except OSError as error:
+        raise UserError(f"the current directory is gone ({error.strerror}); change to another") from error
+
+
 def make_parser(arguments: Sequence[str] = tuple(COMMANDS)) -> argparse.ArgumentParser:
     """The parser of these arguments; only the commands among them are imported, since imports take time."""
-    told = "Two-stage image matching with Matching Key-Points Crop, offline, inside a time budget."
-    parser = argparse.ArgumentParser("mkpc_kaggle", description=told, epilog="COMMAND --help tells more.")
+    text = "Two-stage image matching with Matching Key-Points Crop, offline, inside a time budget."
+    parser = argparse.ArgumentParser("mkpc_kaggle", description=text, epilog="COMMAND --help tells more.")
     parser.add_argument("--version", action="version", version=__version__)
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name, summary in COMMANDS.items():
@@ -86,6 +100,6 @@ def make_parser(arguments: Sequence[str] = tuple(COMMANDS)) -> argparse.Argument
         if name in arguments:
             command = import_module(f"mkpc_kaggle.cli.{name}")
             sub.description = command.HELP
-            sub.set_defaults(run=command.run)
+            sub.set_defaults(run=command.run, printing=nullcontext)
             command.add_arguments(sub)
     return parser

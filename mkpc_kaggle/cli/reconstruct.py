@@ -3,6 +3,7 @@
 import argparse
 from collections import Counter
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 from mkpc_kaggle.cli import options
@@ -10,9 +11,10 @@ from mkpc_kaggle.data.outputs import lies_in
 from mkpc_kaggle.engine.budget import format_duration
 from mkpc_kaggle.engine.console import say
 from mkpc_kaggle.errors import UserError, writing
+from mkpc_kaggle.recipe import CameraSharing
 from mkpc_kaggle.reconstruction.folder import read_folder, read_pair_list
 from mkpc_kaggle.reconstruction.outputs import FORMS, write_tables
-from mkpc_kaggle.reconstruction.run import FolderResult, reconstruct_folder
+from mkpc_kaggle.reconstruction.run import FolderResult, for_cameras, reconstruct_folder
 from mkpc_kaggle.reporting.report import report_run
 from mkpc_kaggle.reporting.summary import trouble
 
@@ -48,6 +50,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add(
         "--rotations", action="store_true", help="try to turn images that match nothing by 90, 180 and 270 degrees"
     )
+    told = """which images of one size in a folder one camera took: those whose focal lengths agree (auto), none
+        (image), or all (folder, one: they are the same, as each folder is reconstructed on its own)"""
+    add("--camera", choices=list(map(str, CameraSharing)), help=told)
     add("--fresh", action="store_true", help="forget what an earlier run left in OUT/work")
     parser.set_defaults(reconstruct=True)
 
@@ -60,19 +65,20 @@ def run(arguments: argparse.Namespace) -> int:
     listed = None if arguments.pairs is None else read_pair_list(arguments.pairs, root, datasets)
     with options.watched_session(arguments, work_dir) as (session, watchdog), writing(f"--out {out}"):
         assembly = options.assembly_of(arguments, arguments.recipe, arguments.mode)
+        assembly = replace(assembly, recipe=for_cameras(assembly.recipe, arguments.camera))
         options.say_start(f"{sum(map(len, datasets.values()))} images", assembly, work_dir)
         result = reconstruct_folder(datasets, assembly, session, out, listed=listed, rotations=arguments.rotations)
         write_tables(out, result.cameras, root, arguments.format)
         failed = trouble(result.report)
         watchdog.status = int(bool(failed) or not any(any(found.values()) for found in result.cameras.values()))
-        told = [*options.plan_lines(arguments, result.report), *_told(result), failed, f"results: {out}"]
-        say("\n".join(filter(None, told)))
+        lines = [*options.plan_lines(arguments, result.report), *_lines(result), failed, f"results: {out}"]
+        say("\n".join(filter(None, lines)))
         say(report_run(work_dir, out / "report.html", session.must_end(), result.pairs))
         signal = session.interrupt.signal
         return 128 + signal if signal else watchdog.status
 
 
-def _told(result: FolderResult) -> Iterator[str]:
+def _lines(result: FolderResult) -> Iterator[str]:
     """A line for each dataset, and what went wrong."""
     report = result.report
     yield f"{len(result.pairs)} pairs: {report.ending} after {format_duration(report.seconds)}"

@@ -51,7 +51,7 @@ class Assembly:
         return CUDA_MINIBATCH if self.placement.device.startswith("cuda") else 1
 
     def on(self, device: str, sharing: int = 1) -> "Assembly":
-        """The same on one device, which so many workers share."""
+        """A copy for one device that ``sharing`` workers use."""
         return replace(self, placement=replace(self.placement, device=device), sharing=sharing)
 
     def on_cpu(self) -> "Assembly":
@@ -79,9 +79,12 @@ class Assembly:
         )
 
     def fingerprint(self) -> dict[str, Any]:
-        """What decides the numbers that come out: the recipe, the precision and the digests of the weights."""
+        """What decides which points are found: units and matchers, the precision and the digests of the weights.
+
+        What F and cameras are made of the points is in :meth:`Recipe.estimation`.
+        """
         return {
-            "recipe": self.recipe.fingerprint(),
+            "recipe": self.recipe.matching(),
             "precision": self.placement.precision,
             "weights": {slot: file.digest for slot, file in self.weight_files.items()},
         }

@@ -16,7 +16,7 @@ from scipy.cluster.vq import kmeans2, vq
 
 from mkpc_kaggle.data.images import Image, read_image
 from mkpc_kaggle.geometry.robust import estimate
-from mkpc_kaggle.matchers.sift import root_sift
+from mkpc_kaggle.matchers.adapters.sift import root_sift
 from mkpc_kaggle.pipeline.assembly import Assembly
 from mkpc_kaggle.pipeline.pair import PairMatch
 
@@ -34,13 +34,13 @@ MIN_GAIN = 2.0  # times the inliers that it has as it is
 
 
 def shortlist(files: Sequence[Path], partners: int = PARTNERS) -> list[tuple[int, int]]:
-    """Pairs of places in ``files``, the smaller first, in order: each image with the ``partners`` most like it."""
+    """Pairs of indices of ``files``, smaller first, in order: each image with the ``partners`` most like it."""
     near = enumerate(most_alike(files, partners))
     return sorted({(min(i, j), max(i, j)) for i, others in near for j in others})
 
 
 def most_alike(files: Sequence[Path], count: int) -> list[list[int]]:
-    """For each image the places of the others that are most like it; unreadable images are like no other."""
+    """For each image the indices of the others that are most like it; unreadable images are like no other."""
     with ThreadPoolExecutor(THREADS) as pool:
         descriptors = list(pool.map(local_features, files))
     every = np.concatenate(descriptors)
@@ -93,7 +93,7 @@ def find_turns(files: Sequence[Path], assembly: Assembly) -> dict[Path, int]:
         return max((estimate(pair.matches, assembly.recipe.magsac).inlier_count for pair in matched), default=0)
 
     for path, near in zip(files, most_alike(files, TURN_PARTNERS), strict=True):
-        partners = [files[place] for place in near]
+        partners = [files[index] for index in near]
         if (upright := inliers(path, 0, partners)) < MANY_INLIERS:
             counts = {times: inliers(path, times, partners) for times in (1, 2, 3)}
             best = max(counts, key=counts.__getitem__)

@@ -83,6 +83,14 @@ def test_few_noisy_matches_have_a_better_pose_the_more_is_known_of_the_focal_len
     assert np.median(surely) < 0.7 * np.median(weakly)
 
 
+def test_exif_tells_a_focal_length_within_five_per_cent_unless_it_is_switched_off():
+    told, weak = (FocalPrior.of_image(SIZE, FocalConfig(exif=on), 700.0) for on in (True, False))
+    assert (told.K[0, 0], told.K[1, 1], told.sigma) == (700, 700, 0.05)
+    unknown = FocalPrior.of_image(SIZE, FocalConfig())
+    assert (weak.K.tolist(), weak.sigma) == (unknown.K.tolist(), unknown.sigma)
+    assert unknown.sigma == 0.4
+
+
 def test_known_cameras_of_two_focal_lengths_and_any_centre_give_their_essential_matrix():
     K0 = np.array([[820.0, 0, 400], [0, 860, 390], [0, 0, 1]])
     first = Camera(K0, np.eye(3), np.zeros(3))

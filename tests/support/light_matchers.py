@@ -13,30 +13,37 @@ from kornia.feature import DISK, XFeat
 from torch import nn
 
 from mkpc_kaggle.geometry.coordinates import Box, Size, View
-from mkpc_kaggle.matchers import aliked_lightglue, aspanformer, disk_lightglue, loftr, quadtree, xfeat_lighterglue
-from mkpc_kaggle.matchers.aliked import AlikedMatcher, AlikedOptions
+from mkpc_kaggle.matchers.adapters import (
+    aliked_lightglue,
+    aspanformer,
+    disk_lightglue,
+    loftr,
+    quadtree,
+    xfeat_lighterglue,
+)
+from mkpc_kaggle.matchers.adapters.aliked import AlikedMatcher, AlikedOptions
+from mkpc_kaggle.matchers.adapters.disk_lightglue import disk_encoder
+from mkpc_kaggle.matchers.adapters.dkm import DkmMatcher
+from mkpc_kaggle.matchers.adapters.loma import LomaAdapter, LomaOptions
+from mkpc_kaggle.matchers.adapters.roma import RomaMatcher, RomaOptions
+from mkpc_kaggle.matchers.adapters.superglue import SuperGlueMatcher
+from mkpc_kaggle.matchers.adapters.xfeat_lighterglue import xfeat_encoder
 from mkpc_kaggle.matchers.contract import Colour, MatcherSpec, Picture, Placement
 from mkpc_kaggle.matchers.dense import DenseOptions
-from mkpc_kaggle.matchers.disk_lightglue import disk_encoder
-from mkpc_kaggle.matchers.dkm import DkmMatcher
 from mkpc_kaggle.matchers.lightglue import LightGlueMatcher, light_glue
-from mkpc_kaggle.matchers.loma import LomaAdapter, LomaOptions
 from mkpc_kaggle.matchers.networks.aliked import Aliked
 from mkpc_kaggle.matchers.networks.aspanformer import AspanFormer
 from mkpc_kaggle.matchers.networks.dkm import DKM
 from mkpc_kaggle.matchers.networks.keypt2subpx import Keypt2Subpx
 from mkpc_kaggle.matchers.networks.loftr import Loftr
 from mkpc_kaggle.matchers.networks.loma import Loma, Variant
-from mkpc_kaggle.matchers.networks.placement import placed
+from mkpc_kaggle.matchers.networks.placement import prepared
 from mkpc_kaggle.matchers.networks.quadtree import Quadtree
 from mkpc_kaggle.matchers.networks.superglue import SuperGlue
 from mkpc_kaggle.matchers.networks.superpoint import SuperPoint
-from mkpc_kaggle.matchers.roma import RomaMatcher, RomaOptions
 from mkpc_kaggle.matchers.semi_dense import SemiDenseMatcher
 from mkpc_kaggle.matchers.sparse import KeypointEncoder
 from mkpc_kaggle.matchers.subpixel import Refiner
-from mkpc_kaggle.matchers.superglue import SuperGlueMatcher
-from mkpc_kaggle.matchers.xfeat_lighterglue import xfeat_encoder
 from tests.support.standin import filled, narrow_roma, scene
 
 SIZE = Size(96, 64)
@@ -51,7 +58,7 @@ def standin(name: str, make: Callable[..., nn.Module], *settings: Any, **named: 
 
 def ours(placement: Placement, *network: Any, **named: Any) -> Any:
     """A network of ours, ready to run there."""
-    return placed(copy.deepcopy(standin(*network, **named)), placement)
+    return prepared(copy.deepcopy(standin(*network, **named)), placement)
 
 
 def kornias(*network: Any, **named: Any) -> Any:

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from mkpc_kaggle.matchers import roma as adapter
+from mkpc_kaggle.matchers.adapters import roma as adapter
 from mkpc_kaggle.matchers.networks.dinov2 import DinoV2Config
 from mkpc_kaggle.matchers.networks.roma import RoMa, RomaConfig
 from mkpc_kaggle.matchers.networks.warp_refiner import WarpRefinerShape
