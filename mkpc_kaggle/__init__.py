@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from mkpc_kaggle.recipe import Recipe
     from mkpc_kaggle.reconstruction.run import reconstruct
 
-
 __all__ = ["PairMatch", "Recipe", "TwoStageMatcher", "__version__", "reconstruct"]
 
 _MODULES = {

@@ -19,7 +19,7 @@ from mkpc_kaggle.errors import UserError, read_text
 from mkpc_kaggle.geometry.coordinates import Box, Matrix3, Size, View
 from mkpc_kaggle.geometry.critical_region import MkpcConfig
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
-from mkpc_kaggle.geometry.robust import ModelKind, RobustConfig
+from mkpc_kaggle.geometry.robust import RobustConfig
 
 DIRECTORY = Path(__file__).resolve().parent / "recipes"
 MAX_SIDE_PX = 99_999
@@ -188,13 +188,12 @@ class Recipe:
         """The digest of all that decides what a scene is made of given points."""
         return _digest(self.estimation())
 
-    def pair_estimation(self, model: ModelKind, intrinsics: tuple[Matrix3, Matrix3] | None = None) -> str:
-        """The digest of all that decides which model a pair gets of given points."""
-        known = _digest([K.tolist() for K in intrinsics]) if intrinsics else ""
-        return f"{self._pair_estimation}{model}{known}"
+    def pair_estimation(self, intrinsics: tuple[Matrix3, Matrix3] | None = None) -> str:
+        """The digest of all that decides which F, or with intrinsics which E, a pair gets of given points."""
+        return self._of_pairs + (_digest([K.tolist() for K in intrinsics]) if intrinsics else "")
 
     @cached_property
-    def _pair_estimation(self) -> str:
+    def _of_pairs(self) -> str:
         return _digest(_values(self, "magsac", "focal"))
 
 
@@ -224,8 +223,7 @@ def parse_recipe(text: str, name: str) -> Recipe:
 def recipe_of(table: Mapping[str, Any], name: str) -> Recipe:
     """A recipe from a TOML file's table, or from a journal's; raises :class:`UserError`."""
     where = f"recipe {name!r}"
-    known = ("description", "units", "mkpc", "magsac", "focal", "matchers", "scene")
-    check_keys(table, known, where)
+    check_keys(table, ("description", "units", "mkpc", "magsac", "focal", "matchers", "scene"), where)
     units, matchers = table.get("units", []), table.get("matchers", {})
     if not isinstance(units, list) or not isinstance(matchers, dict):
         raise UserError(f"{where}: units must be a list of tables, and matchers a table")

@@ -12,7 +12,7 @@ from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Box, Size, View
 from mkpc_kaggle.geometry.critical_region import MkpcConfig
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
-from mkpc_kaggle.geometry.robust import Method, ModelKind, RobustConfig
+from mkpc_kaggle.geometry.robust import Method, RobustConfig
 from mkpc_kaggle.matchers.registry import matcher_names, spec_of
 from mkpc_kaggle.pipeline.availability import options_of
 from mkpc_kaggle.recipe import Mode, Recipe, SceneConfig, Unit, load_recipe, parse_recipe, recipe_names, split_mode
@@ -248,10 +248,9 @@ def test_what_is_matched_and_how_it_is_estimated_have_a_fingerprint_each(other, 
 
 def test_a_pair_is_estimated_otherwise_by_another_model_and_not_with_other_scenes():
     K = np.diag([800.0, 800, 1])
-    ways = {ALL.pair_estimation(ModelKind.F), ALL.pair_estimation(ModelKind.E, (K, K))}
-    ways |= {ALL.pair_estimation(ModelKind.E, (K, 2 * K)), replace(ALL, focal=FocalConfig()).pair_estimation("F")}
-    assert len(ways) == 4
-    assert ALL.with_scenes(ALL.scene is None).pair_estimation(ModelKind.F) in ways
+    ways = {ALL.pair_estimation(), ALL.pair_estimation((K, K)), ALL.pair_estimation((K, 2 * K))}
+    assert len(ways | {replace(ALL, focal=FocalConfig()).pair_estimation()}) == 4
+    assert ALL.with_scenes(ALL.scene is None).pair_estimation() in ways
 
 
 @pytest.mark.parametrize(

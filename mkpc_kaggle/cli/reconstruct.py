@@ -32,6 +32,10 @@ and for all together:
   report.html     the run, with the cameras and points of each model
   work/           the journal: killed at any point, the same command goes on, and ends with the same files
 
+Pixels are those that a file stores, as COLMAP reads it, whatever EXIF says of its orientation. Mirrored files (2,
+4, 5, 7) make models of their own. Cameras start with the focal lengths that EXIF has, unless the recipe's table
+[scene] has `exif = false`.
+
 All pairs of up to 100 images are matched, and in larger datasets each image with the 20 most like it.
 
 Exit status: 0 done; 1 there is no model, or the run failed; 2 bad input; 130 or 143 ended by a signal.

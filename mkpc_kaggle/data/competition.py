@@ -185,10 +185,8 @@ def submission_problems(path: Path, sample_ids: Sequence[str]) -> list[str]:
         except UserError as error:
             problems.append(str(error))
         else:
-            if not F.any():
-                problems.append(f"{sample}: the matrix is zero")
-            elif not np.isfinite(F).all():
-                problems.append(f"{sample}: a number is not finite")
+            if not F.any() or not np.isfinite(F).all():
+                problems.append(f"{sample}: the matrix is zero, or a number in it is not finite")
     return problems
 
 

@@ -4,6 +4,7 @@ import hashlib
 from collections import OrderedDict
 from collections.abc import Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -77,8 +78,9 @@ def read_image(path: Path) -> Image | Unreadable:
     except (OSError, ValueError, MemoryError, cv2.error) as error:
         return Unreadable(name, f"cannot be read: {error}")
     if bgr is None:
-        reason = "not a picture, or cut off: it cannot be decoded" if data.size else "the file is empty"
-        return Unreadable(name, reason)
+        return Unreadable(
+            name, "not a picture, or cut off: it cannot be decoded" if data.size else "the file is empty"
+        )
     height, width = bgr.shape[:2]
     if max(height, width) > MAX_ASPECT * min(height, width):
         return Unreadable(name, f"{width} x {height} pixels: one side is more than {MAX_ASPECT} times the other")
@@ -89,10 +91,9 @@ def read_image(path: Path) -> Image | Unreadable:
 
 def is_unchanged(path: Path, version: str) -> bool:
     """Whether a file is still of that ``version``; a file that cannot be read counts as unchanged."""
-    try:
+    with suppress(OSError, ValueError):
         return not path.is_file() or _content_digest(np.fromfile(path, np.uint8)) == version
-    except (OSError, ValueError):
-        return True
+    return True
 
 
 def _content_digest(data: Pixels) -> str:

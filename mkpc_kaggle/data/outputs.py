@@ -34,10 +34,9 @@ def require_apart(
         if not path.name or os.path.isdir(path):  # noqa: PTH112  Path raises for a name that is too long
             raise UserError(f"{option} {str(path)!r} is a directory; name a file")
         lost = [f"{other} {there}" for other, there in files.items() if other != option and same_file(path, there)]
-        if work_dir is not None and lies_in(work_dir, path):
+        is_journal = path.name.startswith("journal.") and work_dir is not None and same_file(path.parent, work_dir)
+        if is_journal or (work_dir is not None and lies_in(work_dir, path)):
             lost.append(f"the work directory {work_dir}")
-        if work_dir is not None and same_file(path.parent, work_dir) and path.name.startswith("journal."):
-            lost.append(f"the journal in {work_dir}")
         for source in precious if os.path.lexists(path) else ():
             if same_file(path, source) or (lies_in(path, source) and not is_result):
                 lost.append(f"the input {source}")

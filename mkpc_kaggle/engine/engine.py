@@ -264,8 +264,8 @@ class Engine:
             self.scenes.on_failure(job, str(answer))
             return
         records = self.plan.records
-        found, of = answer.reconstructions, job.estimation
-        record = SceneRecord.of(job.batch, found, job.unit_results, seconds, estimation=of)
+        record = SceneRecord.of(job.batch, answer.reconstructions, job.unit_results, seconds)
+        record = replace(record, estimation=job.estimation)
         self.scenes.on_result(job, record)
         for index, choice in zip(job.indices, answer.choices, strict=True):
             records[index] = replace(records[index], scene=choice)
@@ -285,8 +285,8 @@ class Engine:
 
     def _is_outdated(self, record: PairRecord) -> bool:
         """Whether a pair has the F of another estimation."""
-        pair = self.pairs[record.index]
-        return record.matches > 0 and record.estimation != self.recipe.pair_estimation(pair.model, pair.intrinsics)
+        wanted = self.recipe.pair_estimation(self.pairs[record.index].intrinsics)
+        return record.matches > 0 and record.estimation != wanted
 
     def _results(self, index: int) -> tuple[UnitResult, ...]:
         """What earlier jobs found on a pair."""

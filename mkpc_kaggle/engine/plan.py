@@ -96,11 +96,6 @@ class ChunkQueue:
             self.fresh.popleft()
         return chosen
 
-    @property
-    def is_busy(self) -> bool:
-        """Whether a job is under way, or has to be tried again."""
-        return bool(self.under_way or self.again)
-
     def waits(self, index: int) -> bool:
         """Whether something has to be tried again on a pair."""
         return any(index in chunk.indices for chunk in self.again)
@@ -209,7 +204,7 @@ class Plan:
         """Go on to the first pairs that can gain something: other chunks and phases are passed over."""
         while now < self.stop and (self._queue.fresh or self._coming):
             if not self._queue.fresh:
-                if self.phase is Phase.ESTIMATE and self._queue.is_busy:
+                if self.phase is Phase.ESTIMATE and (self._queue.under_way or self._queue.again):
                     return  # scenes, which come later, need F of all pairs
                 self._open(self._coming.pop(0), now)
                 continue
@@ -367,26 +362,23 @@ class Plan:
             self._queue.put_back(*(replace(chunk, indices=part) for part in halves))
             return []
         (index,) = job.indices
-        if not job.units:
-            self._tries[index, Phase.ESTIMATE] += 1
-            if self._tries[index, Phase.ESTIMATE] < MAX_TRIES:
-                self._queue.put_back(chunk)
-            else:
-                self.explain(now, f"pair {index} keeps the F it has: {failure}")
-                self.outdated.discard(index)
+        units = self.records[index].lacking(job.units)
+        if len(units) > 1:
+            self._queue.put_back(*(replace(chunk, units=(unit,)) for unit in units))
             return []
-        unit, *others = self.records[index].lacking(job.units)
-        if others:
-            self._queue.put_back(*(replace(chunk, units=(each,)) for each in (unit, *others)))
-            return []
+        (name,) = _priced(units)
         if failure.cause is Cause.TIMED_OUT:
-            self.costs.assume(unit.name, job.time_limit)
-        self._tries[index, unit.name] += 1
-        if self._tries[index, unit.name] < MAX_TRIES:
+            self.costs.assume(name, job.time_limit)
+        self._tries[index, name] += 1
+        if self._tries[index, name] < MAX_TRIES:
             self._queue.put_back(chunk)
             return []
         self._mark_done(job.phase, [index])
-        return [self._give_up(index, unit, failure, now)]
+        if units:
+            return [self._give_up(index, units[0], failure, now)]
+        self.explain(now, f"pair {index} keeps the F it has: {failure}")
+        self.outdated.discard(index)
+        return []
 
     def restart(self, now: float, reason: str) -> list[Outcome]:
         """Begin anew on other devices: no unit is given up, and pairs keep what they have; what has changed."""

@@ -147,11 +147,10 @@ class MatchRunner:
 
     def _record(self, job: MatchJob, number: int, pair: PairMatch) -> PairRecord:
         """The record of a pair with F from all of its matches."""
-        start, recipe = time.perf_counter(), self._pipeline.recipe
-        kind = job.pairs[number].model, job.pairs[number].intrinsics
-        pair = with_estimate(pair, recipe, *kind)
+        start, recipe, asked = time.perf_counter(), self._pipeline.recipe, job.pairs[number]
+        pair = with_estimate(pair, recipe, asked.model, asked.intrinsics)
         pair = replace(pair, estimate_seconds=time.perf_counter() - start)
-        return PairRecord.of(job.indices[number], pair, recipe.pair_estimation(*kind))
+        return PairRecord.of(job.indices[number], pair, recipe.pair_estimation(asked.intrinsics))
 
 
 class SceneRunner:

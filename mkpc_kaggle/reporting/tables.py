@@ -82,8 +82,8 @@ def unit_means(tables: RunTables) -> pd.DataFrame:
 
 def unit_reasons(tables: RunTables, column: str = "failure") -> list[str]:
     """Why units failed (``failure``) or ran otherwise (``note``), on how many pairs; the most frequent first."""
-    told = tables.units[tables.units[column] != ""]
-    counts = (told["unit"] + ": " + told[column]).value_counts()
+    noted = tables.units[tables.units[column] != ""]
+    counts = (noted["unit"] + ": " + noted[column]).value_counts()
     return [f"{reason} ({count} pairs)" for reason, count in counts.items()]
 
 

@@ -178,7 +178,7 @@ def test_bad_input_is_told_in_one_line_before_any_work(demo, tmp_path, capsys, a
         (["--recipe", "r.toml", "--output", "r.toml"], "would be written over the input r.toml"),
         (["--output", "s.html"], "would be written over --report"),
         (["--output", "q.work"], "would be written over the work directory"),
-        (["--output", "w/journal.sqlite", "--work-dir", "w"], "would be written over the journal"),
+        (["--output", "w/journal.sqlite", "--work-dir", "w"], "would be written over the work directory"),
     ],
 )
 def test_what_would_be_written_over_an_input_or_a_result_is_refused_before_any_work(

@@ -1,8 +1,12 @@
 """A journal outlives a change of the estimation: F and cameras are made anew of its points."""
 
-from collections.abc import Sequence
+import os
+import signal
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from multiprocessing import get_context
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +15,7 @@ from synthetic import RECIPE, SyntheticMatcher, synthetic_pairs
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.engine import Ending
+from mkpc_kaggle.engine.journal import Journal
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.geometry.robust import Method, RobustConfig
@@ -58,6 +63,40 @@ def test_a_run_that_goes_on_from_another_estimation_ends_with_the_bytes_of_a_fre
         assert (report.units_run, report.estimated_anew) == (0, 0 if name == "no scene" else 6)
         assert read_log(journal).recipe == replace(recipe, name=read_log(journal).recipe.name)
     assert "6 of them from earlier runs; 0 units run, 6 F estimated anew" in summary(pairs, report)
+
+
+def die_at_a_write(pairs: Sequence[Pair], recipe: Recipe, work_dir: Path, *, after: bool) -> None:
+    """Go on, until this process kills itself at the first write to the journal: before it, or after it."""
+
+    def save(name: str) -> Callable[..., None]:
+        whole = getattr(Journal, name)
+
+        def save_and_die(*arguments: Any) -> None:
+            if after:
+                whole(*arguments)
+            os.kill(os.getpid(), signal.SIGKILL)
+
+        return save_and_die
+
+    for name in ("save", "save_scene"):
+        setattr(Journal, name, save(name))
+    submission(pairs, recipe, work_dir, NoMatcher(name="synthetic"))
+
+
+@pytest.mark.parametrize("kills", [2, pytest.param(10, marks=pytest.mark.slow)])
+def test_a_run_that_is_killed_while_it_estimates_anew_ends_with_the_same_bytes(tmp_path, kills):
+    images = 7 if kills > 2 else 4  # 21 pairs are four jobs and a scene
+    pairs, other = synthetic_pairs(tmp_path / "images", images), ESTIMATIONS["another scene"]
+    undisturbed = submission(pairs, other, tmp_path / "fresh", SyntheticMatcher(images=images))[0]
+    submission(pairs, RECIPE, tmp_path / "work", SyntheticMatcher(images=images))
+    for number in range(kills):
+        settings = {"after": bool(number % 2)}
+        arguments = pairs, other, tmp_path / "work"
+        process = get_context("spawn").Process(target=die_at_a_write, args=arguments, kwargs=settings)
+        process.start()
+        process.join()
+        assert process.exitcode == -signal.SIGKILL
+    assert submission(pairs, other, tmp_path / "work", NoMatcher(name="synthetic"))[0] == undisturbed
 
 
 def test_the_file_has_the_former_f_until_another_is_there(tmp_path):

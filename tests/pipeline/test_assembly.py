@@ -13,8 +13,9 @@ from mkpc_kaggle.pipeline.assembly import assemble
 from mkpc_kaggle.pipeline.availability import Licence
 from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher
 from mkpc_kaggle.recipe import Mode, Recipe, Unit, load_recipe
-from mkpc_kaggle.weights import WeightFile, manifest
+from mkpc_kaggle.weights import WeightFile
 from mkpc_kaggle.weights import store as weight_store
+from mkpc_kaggle.weights.manifest import manifest
 
 pytestmark = pytest.mark.usefixtures("nowhere_else")
 

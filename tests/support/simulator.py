@@ -32,7 +32,7 @@ from mkpc_kaggle.engine.records import NOT_REACHED, PairRecord, SceneRecord, Uni
 from mkpc_kaggle.engine.scenes import FORECAST_MARGIN, START_S
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL, ModelKind, RobustConfig
+from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL, RobustConfig
 from mkpc_kaggle.pipeline.pair import UnitResult
 from mkpc_kaggle.recipe import Recipe, SceneConfig, Unit
 from mkpc_kaggle.scene.choose import Choice, Reason
@@ -169,7 +169,7 @@ class SimulatedSite(Site):
         self.scenes: list[SimulatedScene] = []
         self.rng = np.random.default_rng(scenario.seed)
         self.costs = {unit.name: cost for unit, cost in zip(scenario.recipe.units, scenario.costs, strict=True)}
-        self.estimation = scenario.recipe.pair_estimation(ModelKind.F)
+        self.estimation = scenario.recipe.pair_estimation()
         self.workers: set[SimulatedWorker] = set()
         self.places = [
             Place(f"place {number}", lambda: SimulatedWorker(self)) for number in range(scenario.workers)
@@ -297,8 +297,8 @@ def _outcome(
         UnitRecord(result.unit.name, result.unit.stage, len(MATCHES), 20 + index % 60, 0.0, result.seconds, "")
         for result in (*known, *found)
     )
-    record = PairRecord(index, FALLBACK_FUNDAMENTAL, "", units, sizes=SIZES, versions=("first", "second"))
-    record = replace(record, estimation=estimation)
+    images = {"sizes": SIZES, "versions": ("first", "second"), "focals": (0.0, 0.0)}
+    record = PairRecord(index, FALLBACK_FUNDAMENTAL, "", units, estimation=estimation, **images)
     return Outcome(record, tuple(found))
 
 
