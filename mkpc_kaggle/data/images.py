@@ -47,6 +47,14 @@ class Image:
         return np.asarray(cv2.cvtColor(self.pixels, cv2.COLOR_RGB2GRAY), np.uint8)
 
 
+def turned(image: "Image | Unreadable", times: int) -> "Image | Unreadable":
+    """An image turned by ``times`` quarters, counter-clockwise; its version is still that of its file."""
+    if isinstance(image, Unreadable) or not times:
+        return image
+    pixels = np.ascontiguousarray(np.rot90(image.pixels, times))
+    return Image(f"{image.name} turned {times}", pixels, image.version)
+
+
 @dataclass(frozen=True)
 class Unreadable:
     """An image that could not be decoded, and why."""

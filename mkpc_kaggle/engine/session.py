@@ -6,7 +6,7 @@ import signal
 import sqlite3
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib import metadata
@@ -26,7 +26,7 @@ from mkpc_kaggle.engine.cluster import RayCluster, RaySite
 from mkpc_kaggle.engine.engine import Engine, RunReport
 from mkpc_kaggle.engine.journal import About, EventKind, Journal
 from mkpc_kaggle.engine.places import LISTEN_S, LocalSite, Site
-from mkpc_kaggle.engine.records import PairRecord
+from mkpc_kaggle.engine.records import PairRecord, SceneRecord
 from mkpc_kaggle.errors import UserError, writing
 from mkpc_kaggle.pipeline.assembly import Assembly
 from mkpc_kaggle.scene.export import Export
@@ -70,7 +70,7 @@ def submit(pairs: Sequence[Pair], assembly: Assembly, session: Session, output: 
     Raises :class:`mkpc_kaggle.errors.UserError` where ``output`` cannot be written, before any work.
     """
 
-    def publish(records: Sequence[PairRecord]) -> None:
+    def publish(records: Sequence[PairRecord], _: Iterable[SceneRecord]) -> None:
         rows = zip(pairs, records, strict=True)
         write_submission(output, {pair.id: record.chosen_fundamental for pair, record in rows})
 
@@ -93,7 +93,7 @@ def run_pairs(
     pairs: Sequence[Pair],
     assembly: Assembly,
     session: Session,
-    publish: Callable[[Sequence[PairRecord]], None] = lambda _: None,
+    publish: Callable[[Sequence[PairRecord], Iterable[SceneRecord]], None] = lambda *_: None,
 ) -> RunReport:
     """Run the recipe on all pairs.
 
@@ -163,7 +163,7 @@ class Watchdog:
     """
 
     def __init__(self, budget: Budget, interrupt: Interrupt) -> None:
-        too_late = "the time was up before a first version of the submission was written"
+        too_late = "the time limit passed before the first results were written"
         self.save: Callable[[], str] = lambda: too_late
         self.status = 0
         self._budget = budget
@@ -182,7 +182,7 @@ class Watchdog:
         while (left := self._budget.final_write - self._budget.clock()) > 0:  # it moves while the run learns
             if self._over.wait(min(left, LISTEN_S)):
                 return
-        trouble = ["the time was up before the last version of the submission was written"]
+        trouble = ["the time limit passed before the last results were written"]
         writer = threading.Thread(target=lambda: trouble.append(self.save()), name="final write", daemon=True)
         writer.start()  # the disk may hang
         writer.join(max(EXIT_S, self._budget.limit - self._budget.clock() - EXIT_S))

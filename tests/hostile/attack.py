@@ -26,7 +26,7 @@ REFUSED = (2,)
 EITHER = (0, 1, 2)  # a valid result, a result that says what it lacks, or a clear refusal
 CRASHES = ("Traceback (most recent call last)", "Fatal Python error", "Segmentation fault", "core dumped")
 LEFT_BY_ITSELF = (0, 1, 128 + signal.SIGINT, 128 + signal.SIGTERM)
-TOO_LATE = "the time was up before a first version"
+TOO_LATE = "the time limit passed before the first results"
 MARK = "MKPC_HOSTILE_CASE"
 
 Make = Callable[[Path], None]
