@@ -33,8 +33,8 @@ from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.pipeline.assembly import assemble
 from mkpc_kaggle.recipe import Recipe, Unit
-from mkpc_kaggle.reconstruction.folder import MAX_IMAGES, pairs_of, read_folder, read_pair_list
-from mkpc_kaggle.reconstruction.likeness import find_turns, shortlist
+from mkpc_kaggle.reconstruction.folder import read_folder, read_pair_list
+from mkpc_kaggle.reconstruction.likeness import local_features, most_alike, shortlist
 from mkpc_kaggle.reconstruction.outputs import camera_rows, submission_rows
 from mkpc_kaggle.reconstruction.run import FolderResult, for_cameras, reconstruct_folder
 from mkpc_kaggle.reporting.report import report_page
@@ -166,12 +166,16 @@ def test_a_run_that_was_cut_off_ends_with_the_same_files(mixed, tmp_path):
     assert contents(tmp_path / "out") == contents(out)
 
 
-def test_models_that_were_removed_are_not_passed_over(tmp_path):
-    root = write_flat(tmp_path / "images", 4)
-    run(root, tmp_path / "out")
-    subprocess.run(["rm", "-r", str(tmp_path / "out" / "models")], check=True)
-    with pytest.raises(UserError, match="was removed after it was made; start anew with --fresh"):
-        run(root, tmp_path / "out")
+@pytest.mark.parametrize("removed", ["models", "models/0/points3D.bin", "database.db"])
+def test_what_was_removed_of_the_results_is_made_again(tmp_path, removed):
+    root, out = write_flat(tmp_path / "images", 4), tmp_path / "out"
+    run(root, out)
+    before = contents(out)
+    subprocess.run(["rm", "-r", str(out / removed)], check=True)
+    matcher = MixedMatcher()
+    run(root, out, matcher)
+    assert contents(out) == before
+    assert matcher.calls == []
 
 
 def test_each_model_is_drawn(mixed):
@@ -303,22 +307,20 @@ def photographs(folder: Path, count: int) -> list[Path]:
 
 def test_a_shortlist_has_images_that_are_alike(tmp_path):
     paths = photographs(tmp_path / "images", 6)
-    pairs = shortlist(paths, partners=3)
-    assert pairs == sorted(set(pairs)) == shortlist(paths, partners=3)
+    pairs = shortlist(partners(paths, 3))
+    assert pairs == sorted(set(pairs)) == shortlist(partners(paths, 3))
     assert all((i < 6) == (j < 6) and i < j for i, j in pairs)
     assert {place for pair in pairs for place in pair} == set(range(12))
 
 
-def test_large_folders_get_a_shortlist_and_others_all_pairs(tmp_path, monkeypatch):
-    monkeypatch.setattr("mkpc_kaggle.reconstruction.folder.shortlist", lambda files: [(0, 1)])
-    files = [tmp_path / f"{number:03}.png" for number in range(MAX_IMAGES + 1)]
-    assert len(pairs_of(files[:-1])) == MAX_IMAGES * (MAX_IMAGES - 1) // 2
-    assert pairs_of(files) == [(files[0], files[1])]
+def partners(paths: list[Path], count: int) -> list[list[int]]:
+    features = list(map(local_features, paths))
+    return most_alike(lambda: features, count)
 
 
 def test_unreadable_images_have_no_part_in_a_shortlist(tmp_path):
     paths = [tmp_path / f"{number}.png" for number in range(3)]
-    assert shortlist(paths, partners=1) == [(0, 1), (0, 2)]
+    assert shortlist(partners(paths, 1)) == [(0, 1), (0, 2)]
 
 
 @dataclass
@@ -353,15 +355,16 @@ def test_images_that_lie_on_a_side_are_found(tmp_path):
     for path, times in turned.items():
         cv2.imwrite(str(path), np.rot90(cv2.imread(str(path)), -times))
     (tmp_path / "images" / "broken.png").write_bytes(b"no picture")
-    assembly = assemble(RECIPE, matchers={"synthetic": UprightSift()}, device="cpu")
-    assert find_turns([*paths, tmp_path / "images" / "broken.png"], assembly) == turned
+    result = run(tmp_path / "images", tmp_path / "out", UprightSift(), rotations=True)
+    found = {path: t for pair in result.pairs for path, t in zip(pair.images, pair.turns, strict=True) if t}
+    assert found == turned
 
 
 def test_what_was_turned_comes_back_in_the_pixels_of_its_file(tmp_path, monkeypatch):
     root = write_flat(tmp_path / "images", FIRST)
     lying = root / "02.png"
     cv2.imwrite(str(lying), np.rot90(cv2.imread(str(lying)), -1))
-    monkeypatch.setattr("mkpc_kaggle.reconstruction.run.find_turns", lambda *_: {lying: 1})
+    monkeypatch.setattr("mkpc_kaggle.reconstruction.choice.find_turns", lambda *_: {lying: 1})
     result = run(root, tmp_path / "out", rotations=True)
     found = {name: record.camera for name, record in cameras(result).items()}
     downs = np.array([found[f"{number:02}.png"].R[1] for number in range(FIRST)])
