@@ -25,9 +25,10 @@ from benchmarks.saved_matches import SavedMatches
 from mkpc_kaggle.data.competition import TrainScene, TruePair, read_train_side
 from mkpc_kaggle.evaluation.compare import paired_difference
 from mkpc_kaggle.evaluation.validate import error_of
+from mkpc_kaggle.geometry.coordinates import Matrix3
 from mkpc_kaggle.geometry.focal_prior import FocalConfig, FocalPrior, estimate_with_prior
 from mkpc_kaggle.geometry.metrics import PoseError, pair_accuracy
-from mkpc_kaggle.geometry.robust import Estimate, Matrix3, RobustConfig, estimate
+from mkpc_kaggle.geometry.robust import Estimate, RobustConfig, estimate
 from mkpc_kaggle.recipe import SceneConfig
 from mkpc_kaggle.scene.densify import extra_pairs
 from mkpc_kaggle.scene.reconstruct import reconstruct_batch

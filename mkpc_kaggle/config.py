@@ -18,11 +18,9 @@ def from_table(cls: type[Config], table: Mapping[str, Any], where: str) -> Confi
 
     ``where`` names the table in messages. Raises :class:`UserError` for an unknown key (listing the known
     keys), a missing key, a value of another type, or a value that the dataclass refuses with a ``ValueError``.
-
-    A dataclass names its former keys in a class variable ``FORMER``, see :func:`check_keys`.
     """
     known: dict[str, Field[Any]] = {field.name: field for field in fields(cls)}  # type: ignore[arg-type]
-    check_keys(table, known, where, getattr(cls, "FORMER", {}))
+    check_keys(table, known, where)
     required = [name for name, field in known.items() if field.default is field.default_factory is MISSING]
     if missing := [name for name in required if name not in table]:
         raise UserError(f"{where} lacks {', '.join(map(repr, missing))}")
@@ -34,16 +32,11 @@ def from_table(cls: type[Config], table: Mapping[str, Any], where: str) -> Confi
         raise UserError(f"{where}: {error}") from error
 
 
-def check_keys(table: Mapping[str, Any], known: Iterable[str], where: str, former: Mapping[str, str]) -> None:
-    """Raise :class:`UserError` if ``table`` is not a table, or for its first key that is not among ``known``.
-
-    ``former`` has the keys of earlier versions with their present names.
-    """
+def check_keys(table: Mapping[str, Any], known: Iterable[str], where: str) -> None:
+    """Raise :class:`UserError` if ``table`` is not a table, or for its first key that is not among ``known``."""
     if not isinstance(table, Mapping):
         raise UserError(f"{where} must be a table, not {table!r}")
     for key in table:
-        if key in former:
-            raise UserError(f"{where}: the key {key!r} is now called {former[key]!r}")
         if key not in known:
             raise UserError(f"{where} has the unknown key {key!r}; known keys: {', '.join(known)}")
 

@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass, field, replace
 from enum import StrEnum
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 from mkpc_kaggle.config import AT_LEAST_0, AT_LEAST_1, Config, Range, check_keys, check_ranges, from_table
 from mkpc_kaggle.errors import UserError, read_text
@@ -90,8 +90,6 @@ class SceneConfig:
     shared_intrinsics: float = 0.02  # images of one size share a camera if most focals are this close; 0: never
     pairs_per_image: float = 10.0  # a batch with fewer pairs gets extra pairs, for its scene alone; 0: none
     threads: int = 1  # more than one: the last digits differ from run to run
-
-    FORMER: ClassVar = {"one_camera": "shared_intrinsics"}
 
     def __post_init__(self) -> None:
         check_ranges(self, shared_intrinsics=AT_LEAST_0, pairs_per_image=AT_LEAST_0, threads=AT_LEAST_1)
@@ -182,7 +180,7 @@ def recipe_of(table: Mapping[str, Any], name: str) -> Recipe:
     """A recipe from a TOML file's table, or from a fingerprint; raises :class:`UserError`."""
     where = f"recipe {name!r}"
     known = ("description", "units", "mkpc", "magsac", "focal", "matchers", "scene")
-    check_keys(table, known, where, {})
+    check_keys(table, known, where)
     units, matchers = table.get("units", []), table.get("matchers", {})
     if not isinstance(units, list) or not isinstance(matchers, dict):
         raise UserError(f"{where}: units must be a list of tables, and matchers a table")

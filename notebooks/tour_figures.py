@@ -11,11 +11,11 @@ from mkpc_kaggle.data.competition import TrainScene, TruePair, read_train_side
 from mkpc_kaggle.data.images import Image
 from mkpc_kaggle.engine.records import SceneRecord
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.geometry.coordinates import Box, Points
+from mkpc_kaggle.geometry.coordinates import Box, Matrix3, Points
 from mkpc_kaggle.geometry.critical_region import Clusters, CriticalRegion, MkpcConfig, expand_box
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.metrics import PoseError
-from mkpc_kaggle.geometry.robust import Estimate, Matrix3
+from mkpc_kaggle.geometry.robust import Estimate
 from mkpc_kaggle.pipeline.pair import PairMatch
 from mkpc_kaggle.recipe import Unit
 from mkpc_kaggle.reporting.figures.run import draw_cameras

@@ -7,6 +7,7 @@ import sys
 import time
 import warnings
 from collections.abc import Sequence
+from contextlib import ExitStack, nullcontext
 from importlib import import_module
 from io import TextIOWrapper
 from typing import NoReturn
@@ -53,12 +54,13 @@ def main(arguments: Sequence[str] | None = None, *, started: float | None = None
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):  # paths and ids may have letters that the terminal lacks
             stream.reconfigure(errors="backslashreplace")
-    with warnings.catch_warnings():
+    with ExitStack() as printing, warnings.catch_warnings():
         warnings.showwarning = lambda message, *_, **__: warn(str(message))
         try:
             given = sys.argv[1:] if arguments is None else list(arguments)
             parsed = make_parser(given).parse_args(given)
             parsed.started = time.monotonic() if started is None else started
+            printing.enter_context(parsed.printing())
             return int(parsed.run(parsed))
         except UserError as error:
             complain(str(error))
@@ -86,6 +88,6 @@ def make_parser(arguments: Sequence[str] = tuple(COMMANDS)) -> argparse.Argument
         if name in arguments:
             command = import_module(f"mkpc_kaggle.cli.{name}")
             sub.description = command.HELP
-            sub.set_defaults(run=command.run)
+            sub.set_defaults(run=command.run, printing=nullcontext)
             command.add_arguments(sub)
     return parser

@@ -6,7 +6,7 @@ from pathlib import Path
 from mkpc_kaggle.data.competition import read_test_side, test_side
 from mkpc_kaggle.data.outputs import require_apart
 from mkpc_kaggle.reporting.report import write_report
-from mkpc_kaggle.reporting.run_log import read_log, write_csv, write_json
+from mkpc_kaggle.reporting.run_log import read_log, write_csv
 from mkpc_kaggle.reporting.summary import overview
 
 HELP = """\
@@ -27,19 +27,18 @@ Exit status: 0 done, 2 there is no such journal, or a file cannot be written.
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("work_dir", type=Path, metavar="DIR")
     parser.add_argument("--csv", type=Path, metavar="OUT", help="the directory for the tables")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="all in one file, each pair with its units")
     parser.add_argument("--report", type=Path, metavar="FILE.html", help="a page to look at, pictures inside")
     parser.add_argument("--test-dir", type=Path, metavar="DIR", help="where the images are that the report draws")
 
 
 def run(arguments: argparse.Namespace) -> int:
-    files = {"--json": arguments.json, "--report": arguments.report}
-    require_apart(files, test_side(arguments.test_dir) if arguments.test_dir else [], arguments.work_dir)
+    require_apart(
+        {"--report": arguments.report},
+        test_side(arguments.test_dir) if arguments.test_dir else [],
+        arguments.work_dir,
+    )
     log = read_log(arguments.work_dir)
     written = write_csv(log, arguments.csv) if arguments.csv else []
-    if arguments.json:
-        write_json(log, arguments.json)
-        written.append(arguments.json)
     if arguments.report:
         pairs = read_test_side(arguments.test_dir) if arguments.test_dir else ()
         write_report(log, arguments.report, pairs)

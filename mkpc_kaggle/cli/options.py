@@ -11,6 +11,7 @@ from mkpc_kaggle.engine.cluster import parse_workers
 from mkpc_kaggle.engine.console import say
 from mkpc_kaggle.engine.engine import RunReport
 from mkpc_kaggle.engine.session import Session, Watchdog, interruptible
+from mkpc_kaggle.engine.streams import drain, unblocked
 from mkpc_kaggle.pipeline.assembly import Assembly, assemble
 from mkpc_kaggle.pipeline.availability import Licence
 from mkpc_kaggle.recipe import Mode
@@ -37,6 +38,7 @@ def add_weights(parser: argparse.ArgumentParser) -> None:
 
 def add_run(parser: argparse.ArgumentParser, time_limit: str | None) -> None:
     """How the engine runs a recipe."""
+    parser.set_defaults(printing=unblocked)
     add = parser.add_argument
     told = """two-stage (the default): the recipe as written; stage-1: its units of stage 1 alone; whole-images:
         all its units on whole images, the naive ensemble of equal inference count"""
@@ -71,6 +73,7 @@ def watched_session(arguments: argparse.Namespace, work_dir: Path) -> Iterator[t
     budget, fresh, workers = budget_of(arguments), arguments.fresh, arguments.workers
     with interruptible() as interrupt, Watchdog(budget, interrupt) as watchdog:
         yield Session(work_dir, budget, interrupt, fresh, workers=workers, watchdog=watchdog), watchdog
+        drain()  # under the watchdog's eyes: who reads it may hang
 
 
 def say_start(what: str, assembly: Assembly, work_dir: Path) -> None:

@@ -98,6 +98,10 @@ def _require_a_whole(given: argparse.Namespace) -> None:
             not given.imc2025 and (not given.submission) != (not given.truth),
             "--submission and --truth go together",
         ),
+        (
+            given.submission and (given.json or given.work_dir or given.compare),
+            "--submission only prints the score: it goes without --json, --work-dir and --compare",
+        ),
         ((given.pairs is None) != (given.image_root is None), "--pairs and --image-root go together"),
         (given.pairs and given.submission, "--submission needs a --train-dir: it scores in metres"),
         (given.pairs and given.compare, "--compare needs a --train-dir: it scores in metres"),

@@ -1,7 +1,6 @@
 """The command ``weights``."""
 
 import argparse
-import sys
 from pathlib import Path
 
 from mkpc_kaggle.cli import options
@@ -19,7 +18,6 @@ The files that the matchers load their weights from; none comes with the package
 
   list      what each matcher needs, and where it lies
   verify    compare every file found with the manifest
-  locate    where is the file that a matcher would get?
   fetch     download files, on a machine with internet
   convert   a checkpoint -> safetensors, and its line for the manifest
 
@@ -40,16 +38,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     for name, act, description in (
         ("list", _list, "Each slot, which is what a matcher asks for: its licence, its matchers and its files."),
         ("verify", _verify, _VERIFY),
-        ("locate", _locate, "Print the path of the file that would be taken; exit status 1 if there is none."),
         ("fetch", _fetch, _FETCH),
         ("convert", _convert, "Write a checkpoint's tensors as safetensors; print the manifest's line for it."),
     ):
         parsers[name] = actions.add_parser(name, description=description)
         parsers[name].set_defaults(act=act)
-    for name in ("list", "verify", "locate"):
+    for name in ("list", "verify"):
         options.add_weights(parsers[name])
     parsers["verify"].add_argument("--manifest", type=Path, metavar="FILE", help="is every file of it there?")
-    parsers["locate"].add_argument("name", metavar="NAME|SLOT", help="a file or a slot that `list` names")
     told = "default: what recipe auto can use"
     parsers["fetch"].add_argument("names", nargs="*", default=["auto"], metavar="NAME|SLOT|RECIPE", help=told)
     parsers["fetch"].add_argument("--out", type=Path, required=True, metavar="DIR", help="where the files go")
@@ -104,20 +100,6 @@ def _verify(arguments: argparse.Namespace) -> int:
     refused = sum(not found.usable for found in files)
     print(f"{len(rows) - 1} files, {refused} refused, {len(missing)} missing")
     return int(bool(refused or missing))
-
-
-def _locate(arguments: argparse.Namespace) -> int:
-    store = WeightStore(arguments.weights)
-    status = 0
-    for search in map(store.search, files_of(arguments.name, store)):
-        for refused in search.refused:
-            print(f"refused: {refused.path}: {refused.note}", file=sys.stderr)
-        if search.found:
-            print(search.found.path)
-        else:
-            print(f"{arguments.name}: not found (searched {store.searched})", file=sys.stderr)
-            status = 1
-    return status
 
 
 def _fetch(arguments: argparse.Namespace) -> int:

@@ -11,12 +11,8 @@ from typing import TextIO
 from mkpc_kaggle.errors import UserError
 
 # By option, the suffixes of what it writes: such a file in an input directory is the result of an earlier run.
-RESULTS = {
-    "--output": (".csv",),
-    "--json": (".json",),
-    "--report": (".html", ".htm"),
-    "--out": (".png", ".jpg", ".pdf", ".svg"),
-}
+RESULTS = {"--output": (".csv",), "--json": (".json",), "--report": (".html", ".htm")}
+RESULTS["--out"] = (".png", ".jpg", ".pdf", ".svg")
 
 
 def require_apart(
@@ -34,19 +30,19 @@ def require_apart(
     inputs = list(inputs)
     precious = [*inputs, *weights, *_weights_of_environment()]
     for option, path in files.items():
+        is_result = path.suffix.lower() in RESULTS.get(option, ())
         if not path.name or os.path.isdir(path):  # noqa: PTH112  Path raises for a name that is too long
             raise UserError(f"{option} {str(path)!r} is a directory; name a file")
-        for other, there in files.items():
-            if other != option and same_file(path, there):
-                raise UserError(f"{option} {path} and {other} {there} are one file; name another for one of them")
-        if work_dir is not None and (
-            lies_in(work_dir, path) or (same_file(path.parent, work_dir) and path.name.startswith("journal."))
-        ):
-            raise UserError(f"{option} {path} and the work directory {work_dir} are in each other's way")
-        is_result = path.suffix.lower() in RESULTS.get(option, ())
+        lost = [f"{other} {there}" for other, there in files.items() if other != option and same_file(path, there)]
+        if work_dir is not None and lies_in(work_dir, path):
+            lost.append(f"the work directory {work_dir}")
+        if work_dir is not None and same_file(path.parent, work_dir) and path.name.startswith("journal."):
+            lost.append(f"the journal in {work_dir}")
         for place in precious if os.path.lexists(path) else ():
             if same_file(path, place) or (lies_in(path, place) and not is_result):
-                raise UserError(f"{option} {path} would be written over the input {place}; name another file")
+                lost.append(f"the input {place}")
+        if lost:
+            raise UserError(f"{option} {path} would be written over {lost[0]}; name another file")
         if option in ("--json", "--report") and not is_result and os.path.isfile(path):  # noqa: PTH113
             raise UserError(f"{option} {path} exists and is not a {RESULTS[option][0]} file; name another file")
     for place in inputs:

@@ -15,6 +15,7 @@ SUMMARY_FACTOR = 5  # telling what a run did takes at most this many times what 
 WRITE_MARGIN = 1.5  # the next write may take this many times what the latest took
 MAX_WRITE_SHARE = 0.05  # of the limit, which writing is expected to take at most
 MAX_SILENCE_S, MIN_SILENCE_S, SILENCE_SHARE = 60.0, 5.0, 0.02  # of a worker, by the share of the limit
+MAX_STEP_BACK_S = 60.0  # of the wall clock, between the moment that --started-at names and the start
 MAX_PROCESS_AGE_S = 60.0  # a process that claims to be older when it begins to work does not tell its age
 
 
@@ -103,10 +104,13 @@ class Budget:
 def monotonic_of(epoch: float) -> float:
     """The monotonic clock's time at a moment of the wall clock, in seconds since 1970.
 
-    Called once, when a run starts: however the wall clock jumps later, the run's limit does not move. Raises
-    :class:`UserError` for a moment in the future.
+    Called once, when a run starts: however the wall clock jumps later, the run's limit does not move. A moment
+    less than a minute ahead counts as now, because the clock was set back meanwhile. Raises :class:`UserError` for
+    a moment in the future.
     """
     ago = time.time() - epoch
+    if -MAX_STEP_BACK_S < ago < 0:
+        ago = 0.0
     if not 0 <= ago < inf:
         raise UserError(
             f"--started-at {epoch:g} is not a moment of the past; it is in seconds since 1970 (date +%s)"

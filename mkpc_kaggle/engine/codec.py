@@ -13,8 +13,8 @@ from typing import Any, get_args, get_origin, get_type_hints
 import numpy as np
 
 from mkpc_kaggle.data.images import printable
+from mkpc_kaggle.geometry.coordinates import Matrix3
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.geometry.robust import Matrix3
 
 MAX_POINT_BYTES = 1 << 26  # of a unit on a pair: three million matches; a damaged journal may promise more
 

@@ -1,7 +1,8 @@
 """The only place that prints during a run: lines, warnings, progress. It never raises.
 
 A terminal may go away (EIO), a pipe lose its reader, a disk be full, or a stream be closed from the start: the run
-goes on, and its files tell what happened.
+goes on, and its files tell what happened. In a command that runs, it never waits either: see
+:mod:`mkpc_kaggle.engine.streams`.
 """
 
 import multiprocessing
@@ -14,6 +15,7 @@ from typing import Any, NoReturn, TextIO
 from tqdm import tqdm
 
 from mkpc_kaggle.engine.budget import Budget, format_duration
+from mkpc_kaggle.engine.streams import DRAIN_S, drain
 
 LINE_INTERVAL_S = 30.0  # between lines of progress where a bar cannot be drawn again
 
@@ -39,14 +41,11 @@ def _print(text: str, stream: TextIO | None) -> None:
             print(text, file=stream, flush=True)
 
 
-def leave(status: int) -> NoReturn:
-    """End the process at once, and its children, even if stopped (SIGSTOP)."""
-    for stream in (sys.stdout, sys.stderr):
-        with suppress(OSError, ValueError):
-            if stream is not None:
-                stream.flush()
+def leave(status: int, seconds: float = DRAIN_S) -> NoReturn:
+    """End the process and its children, even if stopped (SIGSTOP); printing the rest may take so many seconds."""
     for child in multiprocessing.active_children():
         child.kill()
+    drain(seconds)
     os._exit(status)
 
 

@@ -8,6 +8,7 @@ pebble, which keeps pools of processes, was tried and not taken: it times jobs b
 and its workers share one pipe and its lock, so that a worker killed in the middle of an answer blocks all of them.
 """
 
+import ctypes
 import multiprocessing
 import os
 import queue
@@ -21,12 +22,14 @@ from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
 
 from mkpc_kaggle.engine.jobs import Answer, Cause, Failure, Job, Loaded
+from mkpc_kaggle.engine.streams import unblocked
 from mkpc_kaggle.engine.worker import Executor, Runner, failure_of, use_threads
 
 # For PyTorch, which reads them once. Threads of OpenMP that wait for each other sleep; by default they spin, and
 # keep the cores from decoding, MAGSAC and other processes (python -m benchmarks.threads). Tensors of 2 MiB and
 # more come in huge pages, on Linux: in small ones a fresh map costs as much time as many convolutions.
 WORKER_ENVIRONMENT = {"OMP_WAIT_POLICY": "PASSIVE", "GOMP_SPINCOUNT": "0", "THP_MEM_ALLOC_ENABLE": "1"}
+PR_SET_PDEATHSIG = 1  # of Linux's prctl
 EXIT_TIMEOUT_S = 5.0  # a process's pipe closes before the process has ended
 
 
@@ -183,13 +186,20 @@ def serve(pipe: Connection, share: int) -> None:
             use_threads(max(1, torch.get_num_threads() // share))
         return maker()
 
+    end_when_parent_is_killed()
     threading.Thread(target=_end_with_parent, daemon=True).start()
     executor = Executor()
-    with suppress(EOFError, OSError):  # the parent is gone
+    with unblocked(), suppress(EOFError, OSError):  # the parent is gone
         answer = executor.load(make)
         pipe.send(answer)
         while isinstance(answer, Loaded):
             pipe.send(executor.run(*pipe.recv()))
+
+
+def end_when_parent_is_killed() -> None:
+    """Let Linux kill this process with the thread that started it: that ends a process that is stopped, too."""
+    with suppress(OSError, AttributeError):  # elsewhere
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
 def _end_with_parent() -> None:

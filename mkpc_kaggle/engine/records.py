@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mkpc_kaggle.geometry.cameras import Camera
-from mkpc_kaggle.geometry.coordinates import Size
-from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL, Matrix3
+from mkpc_kaggle.geometry.coordinates import Matrix3, Size
+from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
 from mkpc_kaggle.pipeline.pair import PairMatch, Regions, UnitResult
 from mkpc_kaggle.recipe import Unit
 from mkpc_kaggle.scene.choose import Choice

@@ -187,10 +187,9 @@ class Watchdog:
         writer.start()  # the disk may hang
         writer.join(max(EXIT_S, self._budget.limit - self._budget.clock() - EXIT_S))
         if trouble[-1]:
-            threading.Thread(target=console.complain, args=(trouble[-1],), daemon=True).start()
-            time.sleep(EXIT_S / 4)  # who reads it may hang
+            console.complain(trouble[-1])
         status = self.status or int(bool(trouble[-1]))
-        console.leave(128 + self._interrupt.signal if self._interrupt.signal else status)
+        console.leave(128 + self._interrupt.signal if self._interrupt.signal else status, EXIT_S / 4)
 
 
 @contextmanager

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from mkpc_kaggle.config import POSITIVE
 from mkpc_kaggle.data.competition import read_rows
 from mkpc_kaggle.errors import UserError
 
@@ -23,6 +24,7 @@ FREE = 3  # images that any similarity can be made to fit
 MAX_TRIPLETS = 20_000  # tried for a scene and a cluster; of more, so many are drawn
 REFINEMENTS = 10
 MIN_SPREAD = 1e-12  # sum of squares; centres with less stand at one point
+MAX_NUMBER = 1e12  # of a pose: squares of what is made of such numbers are finite
 
 Points = NDArray[np.float64]  # (N, 3)
 Centres = Mapping[str, Points]  # of the cameras of a scene or cluster by image, (3,); NaN without a camera
@@ -47,22 +49,25 @@ class DatasetScore:
 def score_imc2025(directory: Path, submission: Path) -> list[DatasetScore]:
     """The score of each dataset of a train side.
 
-    Raises :class:`UserError` for files that cannot be read, and if an image is missing, unknown or there twice.
+    Raises :class:`UserError` for files that cannot be read, for numbers that cannot be scored, and if an image or
+    a dataset is missing, unknown or there twice.
     """
-    truth, found = _centres(directory / "train_labels.csv"), _centres(submission)
-    path = directory / "train_thresholds.csv"
-    thresholds: dict[str, dict[str, Points]] = {name: {} for name in truth}
-    for where, (name, scene, cell) in read_rows(path, ("dataset", "scene", "thresholds")):
-        thresholds.setdefault(name, {})[scene] = _numbers(cell, where)
+    labels, path = directory / "train_labels.csv", directory / "train_thresholds.csv"
+    truth, found, thresholds = _centres(labels), _centres(submission), _thresholds(path)
     for name, scenes in truth.items():
+        if unplaced := [image for scene in scenes if scene != OUTLIERS for image in _without_pose(scenes[scene])]:
+            raise UserError(f"{labels}: {name}/{unplaced[0]} has no pose, and is not of the scene {OUTLIERS}")
         images, given = (
             {image for part in parts.values() for image in part} for parts in (scenes, found.get(name, {}))
         )
         if wrong := images ^ given:
             told = f"{len(wrong)} images of {name} are missing or unknown, such as {min(wrong)}"
             raise UserError(f"{submission}: {told}")
-        if lacking := [scene for scene in scenes if scene not in (OUTLIERS, *thresholds[name])]:
+        if lacking := [scene for scene in scenes if scene not in (OUTLIERS, *thresholds.get(name, ()))]:
             raise UserError(f"{path} has no thresholds of {name}/{lacking[0]}")
+    for file, named in ((submission, found), (path, thresholds)):
+        if unknown := named.keys() - truth.keys():
+            raise UserError(f"{file}: {labels} lacks the dataset {min(unknown)!r}")
     return [score_dataset(name, scenes, found[name], thresholds[name]) for name, scenes in truth.items()]
 
 
@@ -136,6 +141,25 @@ def _triplets(count: int) -> NDArray[np.intp]:
     return np.argpartition(drawn, 3, axis=1)[:, :3]
 
 
+def _without_pose(centres: Centres) -> list[str]:
+    return [image for image, centre in centres.items() if not np.isfinite(centre).all()]
+
+
+def _thresholds(path: Path) -> dict[str, dict[str, Points]]:
+    """By dataset and scene."""
+    found: dict[str, dict[str, Points]] = {}
+    for where, (dataset, scene, cell) in read_rows(path, ("dataset", "scene", "thresholds")):
+        limits = _numbers(cell, where)
+        if len(limits) <= SKIPPED_THRESHOLDS or not all(limit in POSITIVE for limit in limits):
+            raise UserError(
+                f"{where}: expected {SKIPPED_THRESHOLDS + 1} positive thresholds or more, found {cell!r}"
+            )
+        if scene in found.setdefault(dataset, {}):
+            raise UserError(f"{where}: the scene {dataset}/{scene} is there twice")
+        found[dataset][scene] = limits
+    return found
+
+
 def _centres(path: Path) -> dict[str, dict[str, dict[str, Points]]]:
     """The camera centres of a table of poses: by dataset, scene or cluster, and image."""
     found: dict[str, dict[str, dict[str, Points]]] = {}
@@ -148,14 +172,20 @@ def _centres(path: Path) -> dict[str, dict[str, dict[str, Points]]]:
         if (len(R), len(t)) != (9, 3):
             raise UserError(f"{where}: expected 9 and 3 numbers joined by ';', found {len(R)} and {len(t)}")
         found.setdefault(dataset, {}).setdefault(scene, {})[image] = -R.reshape(3, 3).T @ t
+    if not found:
+        raise UserError(f"{path} has no rows: there is nothing to score")
     return found
 
 
 def _numbers(cell: str, where: str) -> Points:
+    """NaN stands for what is unknown; raises :class:`UserError` for an infinite number."""
     try:
-        return np.array([float(part) for part in cell.split(";")])
+        found = np.array([float(part) for part in cell.split(";")])
     except ValueError as error:
         raise UserError(f"{where}: {cell!r} is not a list of numbers joined by ';'") from error
+    if (np.abs(found) > MAX_NUMBER).any():
+        raise UserError(f"{where}: {cell!r} has a number beyond {MAX_NUMBER:g}")
+    return found
 
 
 def score_lines(scores: Sequence[DatasetScore]) -> Iterator[str]:

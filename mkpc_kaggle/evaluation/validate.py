@@ -15,8 +15,9 @@ from mkpc_kaggle.engine.records import PairRecord
 from mkpc_kaggle.engine.session import Session, run_pairs
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry import metrics
+from mkpc_kaggle.geometry.coordinates import Matrix3
 from mkpc_kaggle.geometry.metrics import AUC_THRESHOLDS, PoseError, mean_average_accuracy
-from mkpc_kaggle.geometry.robust import Matrix3, ModelKind
+from mkpc_kaggle.geometry.robust import ModelKind
 from mkpc_kaggle.pipeline.assembly import Assembly
 
 

@@ -12,8 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mkpc_kaggle.config import AT_LEAST_1, POSITIVE, SHARE, Range, check_ranges
-from mkpc_kaggle.geometry.clustering import dbscan
 from mkpc_kaggle.geometry.coordinates import Box, Points, Size
+
+MERGE_ABOVE = (
+    2000  # points; DBSCAN lists the neighbours of each, which takes quadratic memory where points are clumped
+)
+CELLS_PER_EPS = 10
 
 
 @dataclass(frozen=True)
@@ -97,6 +101,25 @@ def find_clusters(points: Points, size: Size, config: MkpcConfig) -> Clusters:
     labels = dbscan(normalised, eps=config.eps, min_samples=config.min_samples)
     sizes = np.bincount(labels[labels >= 0])
     return Clusters(labels, sizes, keep_clusters(sizes, config.share))
+
+
+def dbscan(points: NDArray[np.float64], *, eps: float, min_samples: int) -> NDArray[np.intp]:
+    """Labels (N,) of scikit-learn's DBSCAN of ``points`` (N, 2), -1 for noise.
+
+    More than ``MERGE_ABOVE`` points are merged in cells of a tenth of eps, where each counts.
+    """
+    from sklearn.cluster import DBSCAN  # takes a second
+
+    if not len(points):
+        return np.zeros(0, np.intp)
+    cell, counts = np.arange(len(points)), np.ones(len(points), np.intp)
+    if len(points) > MERGE_ABOVE:
+        corners = np.floor(points * (CELLS_PER_EPS / eps))
+        _, cell, counts = np.unique(corners, axis=0, return_inverse=True, return_counts=True)
+        cell = cell.ravel()  # numpy 2.0.0 has it as a column
+        points = np.column_stack([np.bincount(cell, along) / counts for along in points.T])
+    found = DBSCAN(eps=eps, min_samples=min_samples, algorithm="kd_tree").fit(points, sample_weight=counts)
+    return np.asarray(found.labels_[cell], np.intp)
 
 
 def keep_clusters(sizes: NDArray[np.intp], share: float) -> NDArray[np.intp]:

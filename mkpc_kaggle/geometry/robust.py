@@ -7,14 +7,14 @@ finite and of the right rank, so that a submission is always complete.
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from mkpc_kaggle.config import POSITIVE, Range, check_ranges
-from mkpc_kaggle.geometry.coordinates import Matrix3 as Matrix3  # noqa: PLC0414  importers find it here
+from mkpc_kaggle.geometry.coordinates import Matrix3
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.two_view import Vectors, robust_costs, sampson
 
@@ -45,8 +45,6 @@ class RobustConfig:
     The estimator stops by chance before it has found the best model; where depends on the order of the matches. So
     it runs on several permutations, and the model of the lowest robust cost at twice the threshold is kept.
     """
-
-    FORMER: ClassVar = {"orders": "permutations"}
 
     method: Method = Method.MAGSAC
     threshold: float = 0.2  # image pixels

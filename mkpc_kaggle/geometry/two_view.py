@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from mkpc_kaggle.geometry.coordinates import Matrix3
 
@@ -82,7 +83,9 @@ class TwoView:
     def moved(self, step: Vectors) -> "TwoView":
         """After a step (7,) along the columns of :meth:`tangent`."""
         t = self.t + self._tangent_basis() @ step[3:5]
-        return TwoView(_rotation(step[:3]) @ self.R, t / np.linalg.norm(t), self.logs + step[5:])
+        return TwoView(
+            Rotation.from_rotvec(step[:3]).as_matrix() @ self.R, t / np.linalg.norm(t), self.logs + step[5:]
+        )
 
     def _tangent_basis(self) -> NDArray[np.float64]:
         """(3, 2) unit vectors at right angles to t and to each other."""
@@ -199,10 +202,3 @@ def _focal_factors(logs: Vectors) -> Matrix3:
 
 def cross_matrix(t: Vectors) -> Matrix3:
     return np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
-
-
-def _rotation(turn: Vectors) -> Matrix3:
-    """The rotation about ``turn`` by its length in radians: Rodrigues' formula."""
-    angle = float(np.linalg.norm(turn))
-    K = cross_matrix(turn)
-    return np.asarray(np.eye(3) + np.sinc(angle / np.pi) * K + 0.5 * np.sinc(angle / (2 * np.pi)) ** 2 * K @ K)

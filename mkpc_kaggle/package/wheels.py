@@ -87,9 +87,7 @@ def collect_wheels(
 def licence_of(wheel: Path) -> str:
     """The licence that a wheel's metadata names."""
     headers = _metadata(wheel)
-    classifiers = [text.rpartition(" :: ")[2] for text in headers.get_all("Classifier", []) if "License" in text]
-    named = [headers["License-Expression"], headers["License"], *classifiers]
-    return next(filter(None, named), "see its dist-info/licenses")
+    return str(headers["License-Expression"] or headers["License"] or "see its dist-info/licenses")
 
 
 def _metadata(wheel: Path) -> Message:

@@ -6,11 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mkpc_kaggle.data.images import Image
-from mkpc_kaggle.geometry.coordinates import Size
+from mkpc_kaggle.geometry.coordinates import Matrix3, Size
 from mkpc_kaggle.geometry.critical_region import CriticalRegion
 from mkpc_kaggle.geometry.focal_prior import FocalPrior, estimate_with_prior
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.geometry.robust import Estimate, Matrix3, ModelKind, estimate
+from mkpc_kaggle.geometry.robust import Estimate, ModelKind, estimate
 from mkpc_kaggle.recipe import Recipe, Unit
 
 Regions = tuple[CriticalRegion, CriticalRegion]

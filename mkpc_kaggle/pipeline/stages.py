@@ -3,6 +3,7 @@
 Stage 1 matches whole images, MKPC finds the critical region of each, stage 2 matches the crops.
 """
 
+import os
 import sys
 import time
 import warnings
@@ -12,6 +13,7 @@ from itertools import chain
 from typing import Any
 
 from mkpc_kaggle.data.images import ByteCache, Image
+from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Box, View
 from mkpc_kaggle.geometry.critical_region import critical_region
 from mkpc_kaggle.geometry.matches import Matches
@@ -51,6 +53,7 @@ class Pipeline:
         self._matchers: dict[str, Matcher[Any]] = {}
         self._notes: dict[str, str] = {}  # on matchers that run in float32 though they should not
         self._encodings: ByteCache[ViewKey, Any] = ByteCache(cache_bytes)
+        self._process = os.getpid()
 
     def load(self) -> None:
         """Load all matchers of the recipe now; raises :class:`UserError` if one cannot be loaded."""
@@ -64,8 +67,13 @@ class Pipeline:
 
         ``may_start(unit)`` is asked before each unit on each minibatch of pairs. After an error of a matcher the
         minibatch's pairs are run singly; a pair's error is the failure of its result. Errors of the device, and of
-        memory that does not suffice for a single pair, are raised: see :mod:`mkpc_kaggle.pipeline.failures`.
+        memory that does not suffice for a single pair, are raised: see :mod:`mkpc_kaggle.pipeline.failures`. In a
+        forked child, :class:`UserError`.
         """
+        if os.getpid() != self._process:  # the threads of PyTorch and OpenCV are gone, and would be waited for
+            raise UserError(
+                "this matcher was made before the process forked: make it anew here, or spawn processes"
+            )
         pairs, units = list(pairs), list(units)
         for unit in (unit for unit in units if unit.stage == 1):
             self._run(unit, pairs, may_start)

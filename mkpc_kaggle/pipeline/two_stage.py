@@ -8,8 +8,8 @@ import numpy as np
 
 from mkpc_kaggle.data.images import Image, Unreadable, read_image
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.geometry.coordinates import Pixels
-from mkpc_kaggle.geometry.robust import Matrix3, ModelKind
+from mkpc_kaggle.geometry.coordinates import Matrix3, Pixels
+from mkpc_kaggle.geometry.robust import ModelKind
 from mkpc_kaggle.matchers.contract import Matcher
 from mkpc_kaggle.pipeline.assembly import assemble
 from mkpc_kaggle.pipeline.availability import Licence

@@ -1,6 +1,5 @@
 """What a journal says of a run: read at one moment, kept as a value, exported to files."""
 
-import json
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -13,7 +12,7 @@ from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import Estimate, ModelKind, sampson_distances
 from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult
 from mkpc_kaggle.recipe import Recipe, recipe_of
-from mkpc_kaggle.reporting.tables import RunTables, run_tables, to_json
+from mkpc_kaggle.reporting.tables import RunTables, run_tables
 
 MAX_DRAWN_PAIRS = 20  # the weakest, which the report draws
 NOT_ENDED = "not ended (at work, or killed)"
@@ -102,20 +101,3 @@ def write_csv(log: RunLog, directory: Path) -> list[Path]:
             paths.append(directory / f"{name}.csv")
             table.to_csv(paths[-1], index=False)
     return paths
-
-
-def write_json(log: RunLog, path: Path) -> None:
-    """Write everything as one JSON value, each pair with its units and regions; :class:`UserError` as above."""
-    values = {
-        "recipe": {"name": log.about.recipe, **log.recipe.fingerprint()},
-        "device": log.about.device,
-        "limit_seconds": log.about.limit,
-        "ending": log.ending,
-        "seconds": log.seconds,
-        "versions": dict(log.about.versions),
-        "digests": log.digests,
-        **to_json(log.tables),
-    }
-    with writing(f"--json {path}"):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(values, allow_nan=False) + "\n", encoding="utf-8")

@@ -88,23 +88,6 @@ def seconds_by_part(tables: RunTables) -> dict[str, float]:
     return {name: float(tables.pairs[column].sum()) for column, name in SECONDS.items()}
 
 
-def to_json(tables: RunTables) -> dict[str, list[dict[str, Any]]]:
-    """``pairs``, each with its F and the rows of its ``units`` and ``regions``, and ``events``."""
-    named = tables.named()
-    pairs = _rows(named["pairs"].drop(columns=list(F_COLUMNS)))
-    for pair, F in zip(pairs, tables.pairs[list(F_COLUMNS)].to_numpy(), strict=True):
-        pair |= {"F": F.reshape(3, 3).tolist(), "units": [], "regions": []}
-    for name in ("units", "regions"):
-        for row in _rows(named[name]):
-            pairs[row.pop("pair")][name].append(row)
-    return {"pairs": pairs, "events": _rows(tables.events)}
-
-
-def _rows(table: pd.DataFrame) -> list[dict[str, Any]]:
-    rows: list[dict[str, Any]] = table.to_dict("records")  # type: ignore[assignment]  # keys are column names
-    return rows
-
-
 def _table(rows: Iterator[tuple[object, ...]], columns: Mapping[str, type]) -> pd.DataFrame:
     # Without a row pandas would not know the columns' types.
     return pd.DataFrame(list(rows), columns=list(columns)).astype(dict(columns))

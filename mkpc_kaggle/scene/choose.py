@@ -8,8 +8,9 @@ from typing import TypeAlias
 import numpy as np
 
 from mkpc_kaggle.geometry.cameras import fundamental_of_cameras, mean_cameras
+from mkpc_kaggle.geometry.coordinates import Matrix3
 from mkpc_kaggle.geometry.focal_prior import FocalConfig, FocalPrior, estimate_with_prior
-from mkpc_kaggle.geometry.robust import Matrix3, RobustConfig, sampson_distances
+from mkpc_kaggle.geometry.robust import RobustConfig, sampson_distances
 from mkpc_kaggle.scene.reconstruction import RegisteredImage
 from mkpc_kaggle.scene.view_graph import BatchPair
 

@@ -7,9 +7,8 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from mkpc_kaggle.geometry.coordinates import Size
+from mkpc_kaggle.geometry.coordinates import Matrix3, Size
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.geometry.robust import Matrix3
 from mkpc_kaggle.pipeline.pair import UnitResult
 
 MIN_MATCHES = 15  # an edge with fewer connects nothing; also the inliers that a verified edge needs

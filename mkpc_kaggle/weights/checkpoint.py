@@ -65,24 +65,11 @@ def _require_plain(table: Mapping[Any, Any], path: Path) -> None:
     """Raise ``ValueError`` unless all entries have a name and are tensors whose elements lie in memory."""
     import torch
 
-    odd = [
-        str(name)
-        for name, value in table.items()
-        if not isinstance(name, str)
-        or not isinstance(value, torch.Tensor)
-        or value.layout is not torch.strided
-        or value.device.type != "cpu"
-        or value.is_quantized
-        or value.is_nested
-        or value.nbytes > value.untyped_storage().nbytes()
-    ]
-    if odd:
-        raise ValueError(
-            f"not all of its entries are plain tensors with a name: {', '.join(odd[:5])}. Save the network's "
-            "state_dict alone."
-        )
-    files = [path] if path.is_file() else list(path.rglob("*"))
-    file_bytes = sum(file.stat().st_size for file in files if file.is_file())
+    for name, value in table.items():
+        plain = isinstance(value, torch.Tensor) and (value.layout, value.device.type) == (torch.strided, "cpu")
+        if not plain or not isinstance(name, str) or value.is_quantized or value.is_nested:
+            raise ValueError(f"entry {name!r} is no plain tensor with a name; save the network's state_dict alone")
+    file_bytes = sum(file.stat().st_size for file in (path, *path.rglob("*")) if file.is_file())
     if sum(tensor.nbytes for tensor in table.values()) > MAX_EXPANSION * file_bytes:
         raise ValueError("its tensors are larger than the file")
 

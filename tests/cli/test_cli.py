@@ -55,12 +55,12 @@ def test_results_are_not_written_over_inputs_nor_an_export_over_the_journal(demo
     table = demo.train_dir / "scaling_factors.csv"
     assert main(["validate", "--train-dir", str(demo.train_dir), "--json", str(table)]) == 2
     assert main(["match", first, second, "--out", first]) == 2
-    assert main(["journal", str(tmp_path), "--json", str(tmp_path / "journal.sqlite")]) == 2
-    assert main(["journal", str(tmp_path), "--json", first]) == 2
+    assert main(["journal", str(tmp_path), "--report", str(tmp_path / "journal.sqlite")]) == 2
+    assert main(["journal", str(tmp_path), "--report", first]) == 2
     told = capsys.readouterr().err.splitlines()
     assert "would be written over the input" in told[0]
     assert "would be written over the input" in told[1]
-    assert "are in each other's way" in told[2]
+    assert "would be written over the journal" in told[2]
 
 
 def test_check_tells_good_from_bad(demo, tmp_path, capsys):

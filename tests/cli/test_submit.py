@@ -175,9 +175,9 @@ def test_bad_input_is_told_in_one_line_before_any_work(demo, tmp_path, capsys, a
         (["--report", "r.toml"], "exists and is not a .html file"),
         (["--work-dir", "test/test_images"], "would be written over the input test/test_images"),
         (["--recipe", "r.toml", "--output", "r.toml"], "would be written over the input r.toml"),
-        (["--output", "s.html"], "are one file"),
-        (["--output", "q.work"], "are in each other's way"),
-        (["--output", "w/journal.sqlite", "--work-dir", "w"], "are in each other's way"),
+        (["--output", "s.html"], "would be written over --report"),
+        (["--output", "q.work"], "would be written over the work directory"),
+        (["--output", "w/journal.sqlite", "--work-dir", "w"], "would be written over the journal"),
     ],
 )
 def test_what_would_be_written_over_an_input_or_a_result_is_refused_before_any_work(

@@ -54,20 +54,6 @@ def test_verify_finds_truncated_and_swapped_files(weights, capsys):
     assert rows["a.pt"].endswith("its bytes are those of sift.pt")
 
 
-def test_locate_prints_the_path_alone(weights, capsys):
-    put(weights, "a.pt", DATA)
-    for name in ("aliked-n16", "a.pt"):
-        assert main(["weights", "locate", name, "--weights", str(weights)]) == 0
-        captured = capsys.readouterr()
-        assert captured.out == f"{weights / 'renamed.pt'}\n"
-        assert "its bytes are those of sift.pt" in captured.err
-    assert main(["weights", "locate", "superpoint", "--weights", str(weights)]) == 1
-    captured = capsys.readouterr()
-    assert (captured.out, captured.err) == ("", f"superpoint: not found (searched {weights})\n")
-    assert main(["weights", "locate", "x", "--weights", str(weights)]) == 2
-    assert "slot (sift, aliked-n16, superpoint)" in capsys.readouterr().err
-
-
 def test_fetch_takes_files_slots_and_recipes(tmp_path, monkeypatch, capsys):
     recipe = tmp_path / "own.toml"
     recipe.write_text('units = [{stage = 1, matcher = "aliked", long_side = 320}]')

@@ -7,8 +7,11 @@ import shutil
 import signal
 import subprocess
 import sys
+import termios
 import time
+from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -154,6 +157,41 @@ def without_a_reader(command: list[str]) -> int:
         return subprocess.run(command, stdout=gone, stderr=gone, check=False).returncode
 
 
+def into_a_full_pipe(command: list[str], **streams: int) -> int:
+    """Nobody reads what it prints to both streams, or to those that are not among ``streams``."""
+    reader, writer = os.pipe()
+    os.set_blocking(writer, False)
+    with suppress(BlockingIOError):
+        while True:
+            os.write(writer, b"x" * 4096)
+    os.set_blocking(writer, True)
+    status = subprocess.run(command, **{"stdout": writer, "stderr": writer, **streams}, check=False).returncode
+    os.close(reader)
+    os.close(writer)
+    return status
+
+
+def on_a_stopped_terminal(command: list[str]) -> int:
+    """As after Ctrl-S."""
+    ours, its = pty.openpty()
+    termios.tcflow(its, termios.TCOOFF)
+    running = subprocess.Popen(command, stdin=its, stdout=its, stderr=its, start_new_session=True)
+    status = running.wait()
+    os.close(ours)
+    os.close(its)
+    return status
+
+
+def on_a_terminal_that_goes_away(command: list[str]) -> int:
+    """As soon as something is printed there: the processes of workers and scenes are started later."""
+    ours, its = pty.openpty()
+    running = subprocess.Popen(command, stdin=its, stdout=its, stderr=its, start_new_session=True)
+    os.close(its)
+    os.read(ours, 1)
+    os.close(ours)
+    return running.wait()
+
+
 def with_stderr_closed(command: list[str]) -> int:
     return subprocess.run(["sh", "-c", 'exec "$@" 2>&-', "sh", *command], check=False).returncode
 
@@ -163,9 +201,19 @@ def on_a_disk_that_takes_nothing(command: list[str]) -> int:
         return subprocess.run(command, stdout=refusing, stderr=refusing, check=False).returncode
 
 
-@pytest.mark.parametrize(
-    "run_without", [on_a_closed_terminal, with_stderr_closed, without_a_reader, on_a_disk_that_takes_nothing]
-)
+CANNOT_PRINT = {
+    "closed terminal": on_a_closed_terminal,
+    "stopped terminal": on_a_stopped_terminal,
+    "full pipe": into_a_full_pipe,
+    "full stdout": partial(into_a_full_pipe, stderr=subprocess.DEVNULL),
+    "full stderr": partial(into_a_full_pipe, stdout=subprocess.DEVNULL),
+    "stderr closed": with_stderr_closed,
+    "no reader": without_a_reader,
+    "disk that takes nothing": on_a_disk_that_takes_nothing,
+}
+
+
+@pytest.mark.parametrize("run_without", CANNOT_PRINT.values(), ids=CANNOT_PRINT)
 def test_a_run_that_cannot_print_makes_the_whole_submission(
     demo, small_recipe, tmp_path, monkeypatch, run_without
 ):
@@ -175,6 +223,15 @@ def test_a_run_that_cannot_print_makes_the_whole_submission(
     script = [sys.executable, str(ROOT / "make_submission.py")]
     assert run_without([*script, *arguments_of(demo, small_recipe, alone)]) == 0
     assert alone.read_bytes() == told.read_bytes()
+
+
+def test_scenes_are_made_after_the_terminal_went_away(demo, small_recipe, tmp_path):
+    output = tmp_path / "submission.csv"
+    script = [sys.executable, str(ROOT / "make_submission.py"), "--scenes"]
+    assert on_a_terminal_that_goes_away([*script, *arguments_of(demo, small_recipe, output)]) == 0
+    log = read_log(tmp_path / "submission.work")
+    assert log.faults == []
+    assert len(log.scenes) == 1
 
 
 def python(code: str, *arguments: str) -> subprocess.CompletedProcess[str]:

@@ -1,5 +1,6 @@
 """The score of 2025 against answers by hand."""
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -147,6 +148,53 @@ def test_a_file_that_is_no_submission_is_refused(tmp_path, before, after, told):
     other.write_text((home / "train_labels.csv").read_text().replace(before, after, 1))
     with pytest.raises(UserError, match=told):
         score_imc2025(home, other)
+
+
+HUGE = POSE.replace("1", "1e308", 1)
+ROW = f"set,a,a0.png,{POSE}"
+
+
+@pytest.mark.parametrize(
+    ("table", "before", "after", "told"),
+    [
+        ("train_labels", POSE, HUGE, "line 2: '1e308;.*' has a number beyond 1e\\+12"),
+        (
+            "train_labels",
+            POSE,
+            POSE.replace("1", "nan", 1),
+            "train_labels.csv: set/a0.png has no pose, and is not",
+        ),
+        ("train_labels", POSE, POSE.replace("1", "-inf", 1), "line 2: '-inf;.*' has a number beyond"),
+        ("train_labels", None, LABELS, "train_labels.csv has no rows"),
+        ("train_thresholds", "0.5;", "nan;", "line 2: expected 3 positive thresholds or more, found '0.025;.*nan"),
+        ("train_thresholds", "0.5;", "-0.5;", "expected 3 positive thresholds"),
+        ("train_thresholds", "0.5;", "inf;", "has a number beyond"),
+        ("train_thresholds", ";0.1;0.2;0.5;1", "", "expected 3 positive thresholds or more, found '0.025;0.05'"),
+        ("train_thresholds", "set,a", "set,a,1;2;3\nset,a", "line 3: the scene set/a is there twice"),
+        ("train_thresholds", "set,a", "other,a,1;2;3\nset,a", "train_labels.csv lacks the dataset 'other'"),
+        ("submission", ROW, f"other,a,a0.png,{POSE},0;0;0\n{ROW}", "submission.csv: .* lacks the dataset 'other'"),
+        ("submission", POSE, HUGE, "submission.csv, line 2: '1e308;.*' has a number beyond"),
+        ("submission", None, LABELS, "submission.csv has no rows"),
+    ],
+)
+def test_a_table_that_cannot_be_scored_is_refused_in_one_line(tmp_path, capsys, table, before, after, told):
+    home = write_truth(tmp_path)
+    submission = home / "submission.csv"
+    submission.write_text((home / "train_labels.csv").read_text())
+    path = home / f"{table}.csv"
+    path.write_text(after if before is None else path.read_text().replace(before, after, 1))
+    assert main(["validate", "--imc2025", str(home), "--submission", str(submission)]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert re.search(told, line)
+
+
+@pytest.mark.parametrize("option", ["--json", "--work-dir"])
+def test_an_option_that_scoring_has_no_use_for_is_refused(tmp_path, capsys, option):
+    home = write_truth(tmp_path)
+    arguments = ["validate", "--imc2025", str(home), "--submission", str(home / "train_labels.csv")]
+    assert main([*arguments, option, str(tmp_path / "x")]) == 2
+    assert "it goes without --json, --work-dir" in capsys.readouterr().err
+    assert not (tmp_path / "x").exists()
 
 
 def test_a_scene_without_thresholds_is_refused(tmp_path):

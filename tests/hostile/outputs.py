@@ -65,7 +65,7 @@ WEIGHTS = (b"\x08\x00\x00\x00\x00\x00\x00\x00{}      ", "W/w.safetensors")  # a 
 OVER = {
     "a weight file": "submit --test-dir D --recipe quick.toml --weights W --output W/w.safetensors",
     "a drawing in an image's place": "match D/test_images/b1/x.png quick.toml --out D/test_images/b1/x.png",
-    "an export in the table's place": "journal out/s.work --json D/test.csv",
+    "an export in the table's place": "journal out/s.work --report D/test.csv",
     "a page in an image's place": "journal out/s.work --report D/test_images/b1/x.png",
     "a conversion in its source's place": "weights convert W/w.safetensors --out W/w.safetensors",
 }

@@ -154,7 +154,7 @@ CASES = [
     ),
     *(
         Case("weights", f"{file}, {name}: {command}", f"weights {command} {SEARCH}", listed(file, make), (0, 1))
-        for command in ("list", "verify", "locate superpoint")
+        for command in ("list", "verify")
         for file in LISTED
         for name, make in SEARCHED.items()
     ),

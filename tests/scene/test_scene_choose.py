@@ -124,5 +124,3 @@ def test_settings_come_from_a_table():
         from_table(SceneConfig, {"cells": 1.0}, "[scene]")
     with pytest.raises(UserError, match=r"\[scene\]: shared_intrinsics must be in"):
         from_table(SceneConfig, {"shared_intrinsics": -1}, "[scene]")
-    with pytest.raises(UserError, match=r"'one_camera' is now called 'shared_intrinsics'"):
-        from_table(SceneConfig, {"one_camera": 0}, "[scene]")

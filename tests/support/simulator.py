@@ -126,7 +126,7 @@ def random_scenario(seed: int, pairs: int) -> Scenario:
     seconds = sum(costs) / len(costs) * scenario.cached
     runs = min(scenario.pairs * len(costs), limit * scenario.workers / seconds)
     rates = [float(rng.uniform(0, most)) / runs if troubled else 0.0 for most in (30, 3, 1)]
-    jobs = runs / 8
+    jobs = runs / 2  # at least: many are of one pair or of one unit
     return replace(
         scenario,
         limit=limit,
@@ -454,6 +454,7 @@ def sweep_seconds(scenario: Scenario) -> float:
     start = RESTART_S + scenario.warm_up
     stalls = scenario.stalls * (STALL - 1) * unit
     faults = (scenario.crashes + scenario.hangs) * start + scenario.hangs * STALL * unit
+    faults += scenario.job_faults * (start + STALL * unit)
     return start + scenario.pairs * (unit + stalls + faults) / scenario.workers
 
 

@@ -1,10 +1,8 @@
 """Downloads against a local server: whole, broken off, resumed, wrong, impossible."""
 
 from collections.abc import Iterator
-from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 from web import Site, serve
@@ -113,14 +111,6 @@ def test_what_cannot_be_reached_or_written_is_told(site, tmp_path):
     (tmp_path / "a.bin").mkdir()
     failed = get(site, tmp_path, line(size=-1, digest=UNVERIFIED))
     assert failed.note == f"{tmp_path / 'a.bin'} cannot be written: Is a directory"
-
-
-def test_no_download_leaves_https(tmp_path, monkeypatch):
-    answer = closing(SimpleNamespace(url="http://x.org/a.bin", close=lambda: None))
-    monkeypatch.setattr(fetch, "urlopen", lambda *_, **__: answer)
-    failed = fetch.fetch(line(source="https://x.org/a.bin"), tmp_path)
-    assert (failed.outcome, names_in(tmp_path)) == (FetchOutcome.FAILED, [])
-    assert failed.note == "https://x.org/a.bin redirects to http://x.org/a.bin, which is not followed"
 
 
 def test_a_good_file_is_not_asked_for_and_a_bad_one_is_replaced(site, tmp_path):
