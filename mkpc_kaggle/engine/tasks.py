@@ -19,7 +19,7 @@ from mkpc_kaggle.errors import UserError
 
 MAX_WORKERS = 4
 MAX_TRIES = 2  # of a task whose worker is lost
-MAX_TASK_S, HANG_SHARE = 600.0, 0.1  # after which a task hangs, and that as a share of the time left
+MAX_TASK_S, HANG_SHARE = 600.0, 0.25  # after which a task hangs, and that as a share of the time left
 
 Tasks = Mapping[str, Callable[[], bytes]]
 

@@ -4,14 +4,14 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from mkpc_kaggle.data.outputs import replacing
 from mkpc_kaggle.errors import UserError, writing
-from mkpc_kaggle.scene.export import DATABASE, MODEL_FILES, MODELS, PART
+from mkpc_kaggle.scene.export import DATABASE, FORMER, MODEL_FILES, MODELS, PART
 
 WORK, TABLES = "work", ("cameras.csv", "submission.csv", "report.html")
 RESERVED = {DATABASE, MODELS, WORK, *TABLES}  # names that no dataset may have
@@ -52,9 +52,15 @@ def claim(out: Path, datasets: Iterable[str]) -> list[str]:
     return sorted((former or set()) - wanted)
 
 
-def settle(out: Path, datasets: Iterable[str], gone: Iterable[str]) -> None:
-    """Remove the results of the datasets that are ``gone``, for the run that holds the directory."""
+def settle(out: Path, datasets: Collection[str], gone: Iterable[str]) -> None:
+    """Remove the results of the datasets that are ``gone``, for the run that holds the directory.
+
+    Models that a killed run was replacing come back.
+    """
     with writing(f"--out {out}"):
+        for former in (found for name in datasets for found in (out / name).glob(f"{PART}*/{FORMER}")):
+            if not (former.parent.parent / MODELS).exists():
+                former.rename(former.parent.parent / MODELS)
         for name in gone:
             (out / name / DATABASE).unlink(missing_ok=True)
             shutil.rmtree(out / name / MODELS, ignore_errors=True)
