@@ -79,6 +79,8 @@ def attack(case: Case, room: Path) -> None:
         nothing = interrupted or (status == 1 and TOO_LATE in output)  # before it began
         if case.submission and not nothing and "submit" in command and status in LEFT_BY_ITSELF:
             faults += _submission_faults(room)
+        if status in (0, 1) and not nothing and "reconstruct" in command:
+            faults += _result_faults(room / "out" / "o", status)
     faults += [f"changed: {name}" for name in _changed(before, _snapshot(room))]
     if faults:
         pytest.fail("\n".join([case.id, case.command, *faults, f"output:\n{output[-3000:]}"]), pytrace=False)
@@ -143,6 +145,19 @@ def _faults(case: Case, status: int | None, output: str, room: Path) -> list[str
 def _submission_faults(room: Path) -> list[str]:
     ids = [pair.id for pair in read_test_side(room / "D")]
     return [f"submission: {problem}" for problem in submission_problems(room / "out" / "s.csv", ids)]
+
+
+def _result_faults(out: Path, status: int) -> list[str]:
+    """What is wrong with the results of a folder of images."""
+    table = out / "cameras.csv"
+    with suppress(OSError):
+        lines = table.read_text().splitlines()
+        faults = [] if lines[0] == "image,model,K,R,t" else [f"{table} begins with {lines[0]!r}"]
+        faults += (
+            [] if (len(lines) > 1) == (status == 0) else [f"exit status {status} with {len(lines) - 1} cameras"]
+        )
+        return faults + [f"left: {path}" for path in out.rglob(".*") if path.name != ".png"]
+    return [f"there is no {table}"]
 
 
 def _orphans(mark: str) -> list[str]:

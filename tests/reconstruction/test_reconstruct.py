@@ -24,6 +24,8 @@ from synthetic import SyntheticMatcher
 from benchmarks.synthetic_scene import SIZE, SyntheticScene, synthetic_scene
 from mkpc_kaggle import reconstruct
 from mkpc_kaggle.cli import main
+from mkpc_kaggle.data import images
+from mkpc_kaggle.data.images import Image, Unreadable, read_image
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.engine import Ending
 from mkpc_kaggle.engine.records import CameraRecord
@@ -31,11 +33,12 @@ from mkpc_kaggle.engine.session import Interrupt, Session
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.pipeline import pair
 from mkpc_kaggle.pipeline.assembly import assemble
 from mkpc_kaggle.recipe import Recipe, Unit
 from mkpc_kaggle.reconstruction.folder import read_folder, read_pair_list
 from mkpc_kaggle.reconstruction.likeness import local_features, most_alike, shortlist
-from mkpc_kaggle.reconstruction.outputs import camera_rows, submission_rows
+from mkpc_kaggle.reconstruction.outputs import Cameras, camera_rows, submission_rows
 from mkpc_kaggle.reconstruction.run import FolderResult, for_cameras, reconstruct_folder
 from mkpc_kaggle.reporting.report import report_page
 from mkpc_kaggle.reporting.run_log import read_log
@@ -79,11 +82,13 @@ def write_flat(folder: Path, count: int = FIRST + SECOND + OTHERS) -> Path:
     return folder
 
 
-def run(root: Path, out: Path, matcher: SyntheticMatcher | None = None, **options: object) -> FolderResult:
+def run(
+    root: Path, out: Path, matcher: SyntheticMatcher | None = None, *, fresh: bool = False, **options: object
+) -> FolderResult:
     matcher = matcher or MixedMatcher()
     interrupt = getattr(matcher, "interrupt", None) or Interrupt()
     budget = Budget(time.monotonic(), float("inf"))
-    session = Session(out / "work", budget, interrupt, progress=False, workers=0)
+    session = Session(out / "work", budget, interrupt, fresh, progress=False, workers=0)
     assembly = assemble(RECIPE, matchers={"synthetic": matcher}, device="cpu")
     return reconstruct_folder(read_folder(root), assembly, session, out, **options)  # type: ignore[arg-type]
 
@@ -391,3 +396,83 @@ def test_a_recipe_for_cameras_matches_no_pair_that_was_not_asked_for():
     assert recipe.scene is not None
     assert recipe.scene.pairs_per_image == 0
     assert recipe.focal is None
+
+
+def test_the_tables_are_there_at_first_and_again_after_each_scene(tmp_path):
+    for name in ("a", "b"):
+        write_flat(tmp_path / "images" / name, 5)
+    published: list[dict[str, int]] = []
+
+    def publish(found: Cameras) -> None:
+        (tmp_path / "out" / "cameras.csv").touch()
+        published.append({name: sum(map(bool, each.values())) for name, each in found.items()})
+
+    run(tmp_path / "images", tmp_path / "out", publish=publish)
+    steps = list(dict.fromkeys(tuple(each.values()) for each in published))
+    assert steps in ([(0, 0), (5, 0), (5, 5)], [(0, 0), (0, 5), (5, 5)])
+
+
+def test_a_dataset_that_is_gone_takes_its_results_with_it(tmp_path, capsys):
+    root, out = tmp_path / "images", tmp_path / "out"
+    for name in ("a", "b"):
+        write_flat(root / name, 4)
+    run(root, out)
+    (root / "b").rename(tmp_path / "elsewhere")
+    with pytest.raises(UserError, match="belongs to another run: its images differ"):
+        run(root, out)
+    assert (out / "b" / "models" / "0").is_dir()
+    run(root, out, fresh=True)
+    assert f"the images of b are gone, and so are its results in {out / 'b'}" in capsys.readouterr().err
+    assert not (out / "b").exists()
+    assert (out / "a" / "models" / "0").is_dir()
+
+
+def test_orientations_go_on_where_a_run_was_cut_off(tmp_path):
+    """Interrupted while images are matched to see how they lie: what is known is not matched again."""
+    paths, out = photographs(tmp_path / "images", 4), tmp_path / "out"
+    cv2.imwrite(str(paths[1]), np.rot90(cv2.imread(str(paths[1])), -1))
+
+    class Counted(UprightSift):
+        interrupt: Interrupt | None = None
+        after = -1
+        count = 0
+
+        def match(self, encodings0, encodings1):  # type: ignore[no-untyped-def]
+            self.count += len(encodings0)
+            if self.count == self.after and self.interrupt is not None:
+                self.interrupt.set()
+            return super().match(encodings0, encodings1)
+
+    whole = Counted()
+    expected = run(tmp_path / "images", tmp_path / "whole", whole, rotations=True)
+    assert {
+        path.name for pair in expected.pairs for path, t in zip(pair.images, pair.turns, strict=True) if t
+    } == {paths[1].name}
+    total, ending = 0, Ending.INTERRUPTED
+    for _ in range(100):
+        matcher = Counted()
+        matcher.interrupt, matcher.after = Interrupt(), 9
+        result = run(tmp_path / "images", out, matcher, rotations=True)
+        total, ending = total + matcher.count, result.report.ending
+        if ending is Ending.COMPLETE:
+            break
+        assert ending is Ending.INTERRUPTED
+    assert ending is Ending.COMPLETE
+    assert whole.count <= total <= 2 * whole.count
+    assert contents(out) == contents(tmp_path / "whole")
+
+
+def test_python_reads_each_image_once_and_estimates_nothing_that_nobody_reads(tmp_path, monkeypatch):
+    folder, read = write_flat(tmp_path / "images", 5), list[Path]()
+
+    def read_counted(path: Path) -> Image | Unreadable:
+        read.append(path)
+        return read_image(path)
+
+    def estimate_nothing(*_: object, **__: object) -> None:
+        raise AssertionError("nobody reads this")
+
+    monkeypatch.setattr(images, "read_image", read_counted)
+    monkeypatch.setattr(pair, "estimate", estimate_nothing)
+    reconstruct(folder.iterdir(), RECIPE, device="cpu", matchers={"synthetic": MixedMatcher()})
+    assert sorted(read) == sorted(folder.iterdir())
