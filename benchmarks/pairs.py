@@ -30,14 +30,14 @@ from torch import nn
 from tqdm import tqdm
 
 from mkpc_kaggle.geometry.coordinates import Box, Size, View
+from mkpc_kaggle.matchers.adapters.loma import LomaAdapter, LomaOptions
+from mkpc_kaggle.matchers.adapters.roma import RomaMatcher, RomaOptions
+from mkpc_kaggle.matchers.adapters.sift import SiftMatcher, SiftOptions
 from mkpc_kaggle.matchers.contract import Colour, Matcher, Picture, Placement, Precision
-from mkpc_kaggle.matchers.loma import LomaAdapter, LomaOptions
 from mkpc_kaggle.matchers.networks.loftr import Loftr
 from mkpc_kaggle.matchers.networks.loma import Loma, Variant
-from mkpc_kaggle.matchers.networks.placement import placed
+from mkpc_kaggle.matchers.networks.placement import prepared
 from mkpc_kaggle.matchers.networks.roma import RoMa
-from mkpc_kaggle.matchers.roma import RomaMatcher, RomaOptions
-from mkpc_kaggle.matchers.sift import SiftMatcher, SiftOptions
 from mkpc_kaggle.matchers.sparse import image_batch
 from tests.support import light_matchers
 from tests.support.light_matchers import MATCHERS
@@ -66,7 +66,7 @@ def random_network(make: Callable[[], nn.Module], placement: Placement) -> Any:
             tensor.normal_(std=tensor[0].numel() ** -0.5, generator=generator)
         else:
             tensor.fill_(1 if name.endswith(("weight", "running_var", "gamma")) else 0)
-    return placed(network, placement)
+    return prepared(network, placement)
 
 
 def loma(variant: Variant, placement: Placement) -> LomaAdapter:
@@ -112,7 +112,7 @@ def pictures_of(size: Size, colour: Colour, multiple: int) -> list[Picture]:
     return [Picture(view.render(pixels), view) for pixels in shown]
 
 
-def prepared(case: Case, placement: Placement) -> Run:
+def run_of(case: Case, placement: Placement) -> Run:
     matcher = case.make(placement)
     pictures = pictures_of(case.size, matcher.spec.colour, matcher.spec.multiple)
     return lambda: len(
@@ -135,7 +135,7 @@ def kornias_aliked(placement: Placement) -> Run:
     return lambda: sum(int(network(image)[0].n) for image in images)
 
 
-RUNS: dict[str, Callable[[Placement], Run]] = {name: partial(prepared, case) for name, case in CASES.items()}
+RUNS: dict[str, Callable[[Placement], Run]] = {name: partial(run_of, case) for name, case in CASES.items()}
 RUNS |= {"kornia's loftr": kornias_loftr, "kornia's aliked, keypoints": kornias_aliked}
 SIZES = {name: case.size for name, case in CASES.items()}
 SIZES |= {"kornia's loftr": SEMI_DENSE, "kornia's aliked, keypoints": SPARSE}

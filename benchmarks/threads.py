@@ -89,7 +89,7 @@ def match(threads: int, keypoints: int, connection: Connection) -> None:
     import torch
 
     from mkpc_kaggle.matchers.contract import Placement
-    from mkpc_kaggle.matchers.networks.placement import placed
+    from mkpc_kaggle.matchers.networks.placement import prepared
     from mkpc_kaggle.matchers.networks.superglue import SuperGlue
     from mkpc_kaggle.matchers.networks.superpoint import SuperPointKeypoints
     from tests.support.standin import filled
@@ -97,7 +97,7 @@ def match(threads: int, keypoints: int, connection: Connection) -> None:
     torch.set_num_threads(threads)
     size = Size(640, 480)
     with torch.inference_mode():
-        network = placed(filled(SuperGlue(20), "superglue"), Placement())
+        network = prepared(filled(SuperGlue(20), "superglue"), Placement())
         descriptors = torch.nn.functional.normalize(torch.randn(keypoints, 256), dim=1)
         points, scores = torch.rand(keypoints, 2) * torch.tensor(size), torch.rand(keypoints)
         image = SuperPointKeypoints(points, scores, descriptors, size)

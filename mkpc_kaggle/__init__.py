@@ -7,13 +7,14 @@ below are imported when they are first used.
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from mkpc_kaggle.version import __version__
+
 if TYPE_CHECKING:
     from mkpc_kaggle.pipeline.pair import PairMatch
     from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher
     from mkpc_kaggle.recipe import Recipe
     from mkpc_kaggle.reconstruction.run import reconstruct
 
-__version__ = "0.1.0"
 __all__ = ["PairMatch", "Recipe", "TwoStageMatcher", "__version__", "reconstruct"]
 
 _MODULES = {

@@ -1,4 +1,4 @@
-"""Errors and warnings for the user, told so that the user can mend the cause."""
+"""Errors and warnings that say what the user can do about the cause."""
 
 import warnings
 from collections.abc import Iterator

@@ -70,8 +70,8 @@ def subcommands() -> dict[str, argparse.ArgumentParser]:
 def commands(page: Path) -> Iterator[tuple[str, list[str]]]:
     """Each command of ours on a page, and the options that it is given there."""
     text = page.read_text(encoding="utf-8").replace("\\\n", " ")
-    for line in re.findall(r"(?:python -m mkpc_kaggle [a-z]|make_submission\.py )[^`\n#;]*", text):
-        name = "submit" if line.startswith("make") else line.split()[3]
+    for line in re.findall(r"(?:(?:python -m mkpc_kaggle|mkpc) [a-z]|make_submission\.py )[^`\n#;]*", text):
+        name = "submit" if line.startswith("make") else line.removeprefix("python -m ").split()[1]
         yield name, re.findall(r"(?<= )--[a-z0-9-]+", line)
 
 
@@ -95,6 +95,7 @@ def test_the_python_of_the_readme_runs(block, tmp_path, monkeypatch):
     photograph = load_sample_image("china.jpg")
     for name, shift in (("a.jpg", 0), ("b.jpg", 40)):
         assert cv2.imwrite(str(tmp_path / name), photograph[:, shift : shift + 560, ::-1])
+    (tmp_path / "docs").symlink_to(ROOT / "docs")
     monkeypatch.chdir(tmp_path)
     names = {}
     exec(compile(block, "README.md", "exec"), names)

@@ -10,9 +10,10 @@ from collections.abc import Sequence
 from contextlib import ExitStack, nullcontext
 from importlib import import_module
 from io import TextIOWrapper
+from pathlib import Path
 from typing import NoReturn
 
-from mkpc_kaggle import __version__
+from mkpc_kaggle.version import __version__
 
 COMMANDS = {
     "submit": "a test directory -> submission.csv",
@@ -59,6 +60,7 @@ def main(arguments: Sequence[str] | None = None, *, started: float | None = None
         try:
             given = sys.argv[1:] if arguments is None else list(arguments)
             parsed = make_parser(given).parse_args(given)
+            require_directory()
             parsed.started = time.monotonic() if started is None else started
             printing.enter_context(parsed.printing())
             return int(parsed.run(parsed))
@@ -77,10 +79,20 @@ def main(arguments: Sequence[str] | None = None, *, started: float | None = None
             return EXIT_BAD_INPUT
 
 
+def require_directory() -> None:
+    """Raise :class:`UserError` where the current directory has been removed: no path means anything there."""
+    from mkpc_kaggle.errors import UserError
+
+    try:
+        Path.cwd()
+    except OSError as error:
+        raise UserError(f"the current directory is gone ({error.strerror}); change to another") from error
+
+
 def make_parser(arguments: Sequence[str] = tuple(COMMANDS)) -> argparse.ArgumentParser:
     """The parser of these arguments; only the commands among them are imported, since imports take time."""
-    told = "Two-stage image matching with Matching Key-Points Crop, offline, inside a time budget."
-    parser = argparse.ArgumentParser("mkpc_kaggle", description=told, epilog="COMMAND --help tells more.")
+    text = "Two-stage image matching with Matching Key-Points Crop, offline, inside a time budget."
+    parser = argparse.ArgumentParser("mkpc_kaggle", description=text, epilog="COMMAND --help tells more.")
     parser.add_argument("--version", action="version", version=__version__)
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name, summary in COMMANDS.items():

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from mkpc_kaggle.cli import options
 from mkpc_kaggle.data.outputs import require_apart
+from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
 from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher, to_image
 from mkpc_kaggle.reporting.figures.pair import draw_pair
 from mkpc_kaggle.reporting.figures.style import save
@@ -29,18 +30,21 @@ def run(arguments: argparse.Namespace) -> int:
     given = {name: getattr(arguments, name) for name in ("weights", "device", "precision", "licence")}
     matcher = TwoStageMatcher(arguments.recipe, **given)
     match = matcher(*images)
-    told = [" ".join(f"{value: .9e}" for value in row) for row in match.estimate.matrix]
+    lines = [" ".join(f"{value: .9e}" for value in row) for row in match.estimate.matrix]
     if match.estimate.failure:
-        told.append(f"this is the fallback: {match.estimate.failure}")
-    told.append(f"{len(match.matches)} matches, {match.estimate.inlier_count} inliers")
+        lines.append(f"this is the fallback: {match.estimate.failure}")
+    lines.append(f"{len(match.matches)} matches, {match.estimate.inlier_count} inliers")
+    found = match.estimate.stats.support
+    verdict = "the images show the same thing" if found >= MIN_SUPPORT else "the images may show different things"
+    lines.append(f"{found:.1f} times as many as by chance: {verdict}")
     for result in match.results:
         counts = f"{len(result.matches):>6} matches  {result.seconds:.2f} s  {result.failure or result.note}"
-        told.append(f"  {result.unit.name:<30}{counts}")
+        lines.append(f"  {result.unit.name:<30}{counts}")
     for number, region in enumerate(match.regions or ()):
         box = region.box
         where = f"x {box.left}..{box.right - 1}, y {box.top}..{box.bottom - 1}"
-        told.append(f"image {number}: {region.reason}, {where}")
-    print("\n".join(told))
+        lines.append(f"image {number}: {region.reason}, {where}")
+    print("\n".join(lines))
     if arguments.out is not None:
         save(draw_pair(*images, match, matcher.recipe.mkpc), arguments.out)
         print(f"figure: {arguments.out}")

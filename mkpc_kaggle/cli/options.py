@@ -20,38 +20,38 @@ from mkpc_kaggle.recipe import Mode
 def add_matching(parser: argparse.ArgumentParser) -> None:
     """What decides how pairs are matched."""
     add = parser.add_argument
-    told = "default: auto, the best that the weights allow"
-    add("--recipe", default="auto", metavar="NAME|FILE.toml", help=told)
+    text = "default: auto, the best that the weights allow"
+    add("--recipe", default="auto", metavar="NAME|FILE.toml", help=text)
     add_weights(parser)
-    told = """permissive: only weights under Apache-2.0, BSD-3-Clause or MIT. Recipe auto leaves the others out,
+    text = """permissive: only weights under Apache-2.0, BSD-3-Clause or MIT. Recipe auto leaves the others out,
         units with a fallback take it, any other recipe that has them is refused (default: any)"""
-    add("--licence", choices=list(map(str, Licence)), default="any", help=told)
+    add("--licence", choices=list(map(str, Licence)), default="any", help=text)
     add("--device", default="auto", help="cpu, cuda, cuda:N, or auto (the default): the GPUs if there are any")
-    told = "of the networks; auto: half precision where the device is faster in it (default: float32)"
-    add("--precision", default="float32", choices=["float32", "auto", "bfloat16", "float16"], help=told)
+    text = "of the networks; auto: half precision where the device is faster in it (default: float32)"
+    add("--precision", default="float32", choices=["float32", "auto", "bfloat16", "float16"], help=text)
 
 
 def add_weights(parser: argparse.ArgumentParser) -> None:
-    told = "where weight files lie; may be repeated. Also searched: $MKPC_WEIGHTS and /kaggle/input"
-    parser.add_argument("--weights", action="append", default=[], type=Path, metavar="DIR", help=told)
+    text = "where weight files lie; may be repeated. Also searched: $MKPC_WEIGHTS and /kaggle/input"
+    parser.add_argument("--weights", action="append", default=[], type=Path, metavar="DIR", help=text)
 
 
 def add_run(parser: argparse.ArgumentParser, time_limit: str | None) -> None:
     """How the engine runs a recipe."""
     parser.set_defaults(printing=unblocked)
     add = parser.add_argument
-    told = """two-stage (the default): the recipe as written; stage-1: its units of stage 1 alone; whole-images:
+    text = """two-stage (the default): the recipe as written; stage-1: its units of stage 1 alone; whole-images:
         all its units on whole images, the naive ensemble of equal inference count"""
-    add("--mode", choices=list(map(str, Mode)), default="two-stage", help=told)
-    told = f"""such as 8h45m, 90m or 60s, from the start of the program; the run ends before it is over, with as
+    add("--mode", choices=list(map(str, Mode)), default="two-stage", help=text)
+    text = f"""such as 8h45m, 90m or 60s, from the start of the program; the run ends before it is over, with as
         many units as fit (default: {time_limit or "none"})"""
-    add("--time-limit", default=time_limit, metavar="TIME", help=told)
-    told = "count the limit from this moment instead, in seconds since 1970: time.time(), or $(date +%%s)"
-    add("--started-at", type=float, metavar="SECONDS", help=told)
-    told = """worker processes (default: one for each GPU, or one for the CPU); 0: none, this process does all.
+    add("--time-limit", default=time_limit, metavar="TIME", help=text)
+    text = "count the limit from this moment instead, in seconds since 1970: time.time(), or $(date +%%s)"
+    add("--started-at", type=float, metavar="SECONDS", help=text)
+    text = """worker processes (default: one for each GPU, or one for the CPU); 0: none, this process does all.
         ray: on the Ray cluster that this machine belongs to, one worker for each GPU, or for each machine if it
         has none; HOST:PORT as `ray start --head` tells it"""
-    add("--workers", type=parse_workers, metavar="N|ray[://HOST:PORT]", help=told)
+    add("--workers", type=parse_workers, metavar="N|ray[://HOST:PORT]", help=text)
     add("--explain", action="store_true", help="say at the end what was planned when, and why")
 
 

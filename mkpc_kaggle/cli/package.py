@@ -23,14 +23,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--out", type=Path, required=True, metavar="DIR", help="where the two folders go")
     add("--owner", required=True, metavar="NAME", help="your user name on Kaggle")
     options.add_weights(parser)
-    told = "the Python versions that Kaggle's image may have (default: %(default)s)"
-    add("--python", default=",".join(PYTHONS), metavar="VERSIONS", help=told)
+    text = "the Python versions that Kaggle's image may have (default: %(default)s)"
+    add("--python", default=",".join(PYTHONS), metavar="VERSIONS", help=text)
     add("--wheels", type=Path, metavar="DIR", help="take wheels from there and use no network")
-    told = "include weights that must not be redistributed: the dataset must stay private then"
-    add("--private", action="store_true", help=told)
-    told = """Kaggle's latest image (the default), for good that of the kernel's first version, or just this one
+    text = "include weights that must not be redistributed: the dataset must stay private then"
+    add("--private", action="store_true", help=text)
+    text = """Kaggle's latest image (the default), for good that of the kernel's first version, or just this one
         (`kaggle kernels pull NAME/mkpc-submission -m` tells which a version had, as docker_image)"""
-    add("--image", default=LATEST, metavar="latest|original|NAME@sha256:DIGEST", help=told)
+    add("--image", default=LATEST, metavar="latest|original|NAME@sha256:DIGEST", help=text)
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -3,15 +3,17 @@
 import argparse
 from collections import Counter
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 from mkpc_kaggle.cli import options
 from mkpc_kaggle.data.outputs import require_directory_apart
 from mkpc_kaggle.engine.budget import format_duration
 from mkpc_kaggle.engine.console import say
+from mkpc_kaggle.recipe import CameraSharing
 from mkpc_kaggle.reconstruction.folder import read_folder, read_pair_list
 from mkpc_kaggle.reconstruction.outputs import FORMS, Cameras, write_tables
-from mkpc_kaggle.reconstruction.run import FolderResult, reconstruct_folder
+from mkpc_kaggle.reconstruction.run import FolderResult, for_cameras, reconstruct_folder
 from mkpc_kaggle.reporting.report import report_run
 from mkpc_kaggle.reporting.summary import trouble
 
@@ -28,6 +30,10 @@ and for all together:
   submission.csv  with --format
   report.html     the run, with the cameras and points of each model
   work/           the journal: killed at any point, the same command goes on, and ends with the same files
+
+Pixels are those that a file stores, as COLMAP reads it, whatever EXIF says of its orientation. Mirrored files (2,
+4, 5, 7) make models of their own. Cameras start with the focal lengths that EXIF has, unless the recipe's table
+[scene] has `exif = false`.
 
 All pairs of up to 100 images are matched, and in larger datasets each image with the 20 most like it.
 
@@ -47,6 +53,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add(
         "--rotations", action="store_true", help="try to turn images that match nothing by 90, 180 and 270 degrees"
     )
+    told = """which images of one size in a folder one camera took: those whose focal lengths agree (auto), none
+        (image), or all (folder, one: they are the same, as each folder is reconstructed on its own)"""
+    add("--camera", choices=list(map(str, CameraSharing)), help=told)
     add("--fresh", action="store_true", help="forget what an earlier run left in OUT/work")
     parser.set_defaults(reconstruct=True)
 
@@ -66,19 +75,14 @@ def run(arguments: argparse.Namespace) -> int:
             watchdog.status = int(not has_camera(cameras))
 
         assembly = options.assembly_of(arguments, arguments.recipe, arguments.mode)
+        assembly = replace(assembly, recipe=for_cameras(assembly.recipe, arguments.camera))
         options.say_start(f"{sum(map(len, datasets.values()))} images", assembly, work_dir)
         given = {"listed": listed, "rotations": arguments.rotations, "publish": publish}
         result = reconstruct_folder(datasets, assembly, session, out, **given)
         unwritten, failed = result.report.unwritten, trouble(result.report)
         watchdog.status = int(bool(failed or unwritten) or not has_camera(result.cameras))
-        told = [
-            *options.plan_lines(arguments, result.report),
-            *_told(result),
-            failed,
-            unwritten,
-            f"results: {out}",
-        ]
-        say("\n".join(filter(None, told)))
+        lines = [*options.plan_lines(arguments, result.report), *_lines(result), failed, unwritten]
+        say("\n".join(filter(None, [*lines, f"results: {out}"])))
         if result.pairs:
             say(report_run(work_dir, out / "report.html", session.must_end(), result.pairs))
         signal = session.interrupt.signal
@@ -89,7 +93,7 @@ def has_camera(cameras: Cameras) -> bool:
     return any(any(found.values()) for found in cameras.values())
 
 
-def _told(result: FolderResult) -> Iterator[str]:
+def _lines(result: FolderResult) -> Iterator[str]:
     """A line for each dataset, and what went wrong."""
     report = result.report
     yield f"{len(result.pairs)} pairs: {report.ending} after {format_duration(report.seconds)}"

@@ -7,7 +7,7 @@ from mkpc_kaggle.cli import options
 from mkpc_kaggle.data.competition import read_test_side, test_side
 from mkpc_kaggle.data.outputs import require_apart
 from mkpc_kaggle.engine.console import say
-from mkpc_kaggle.engine.session import submit
+from mkpc_kaggle.engine.session import first_version, submit
 from mkpc_kaggle.reporting.report import report_run
 from mkpc_kaggle.reporting.summary import summary, trouble
 
@@ -29,15 +29,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--test-dir", type=Path, required=True, metavar="DIR", help="holds test.csv and test_images/")
     add("--output", type=Path, default=Path("submission.csv"), help="default: submission.csv")
     options.add_matching(parser)
-    told = """reconstruct the pairs of a batch together and take F from the cameras, or not (default: as the recipe
+    text = """reconstruct the pairs of a batch together and take F from the cameras, or not (default: as the recipe
         has it; the paper's recipes have not). A pair's F then comes from other pairs, too: read your competition's
         rules on that, and compare published stereo scores with --no-scenes"""
-    add("--scenes", dest="reconstruct", action=argparse.BooleanOptionalAction, help=told)
+    add("--scenes", dest="reconstruct", action=argparse.BooleanOptionalAction, help=text)
     options.add_run(parser, time_limit="8h45m")
     add("--work-dir", type=Path, metavar="DIR", help="for the journal; default: beside the output, NAME.work")
     add("--fresh", action="store_true", help="forget what an earlier run left in the work directory")
-    told = "a page on the run; default: beside the output, NAME.html"
-    add("--report", type=Path, metavar="FILE.html", help=told)
+    text = "a page on the run; default: beside the output, NAME.html"
+    add("--report", type=Path, metavar="FILE.html", help=text)
     add("--no-report", action="store_true", help="write none")
 
 
@@ -49,13 +49,18 @@ def run(arguments: argparse.Namespace) -> int:
     require_apart(files, [*test_side(arguments.test_dir), Path(arguments.recipe)], work_dir, arguments.weights)
     with options.watched_session(arguments, work_dir) as (session, watchdog):
         pairs = read_test_side(arguments.test_dir)
-        assembly = options.assembly_of(arguments, arguments.recipe, arguments.mode)
-        options.say_start(f"{len(pairs)} pairs", assembly, work_dir)
-        report = submit(pairs, assembly, session, output)
+        with first_version(pairs, output):
+            assembly = options.assembly_of(arguments, arguments.recipe, arguments.mode)
+            options.say_start(f"{len(pairs)} pairs", assembly, work_dir)
+            report = submit(pairs, assembly, session, output)
         watchdog.status = int(bool(report.unwritten or trouble(report)))
         unwritten = f" is not the last version: {report.unwritten}" if report.unwritten else ""
-        told = [*options.plan_lines(arguments, report), summary(pairs, report), f"submission: {output}{unwritten}"]
-        say("\n".join(told))  # the watchdog may end the program while it draws
+        lines = [
+            *options.plan_lines(arguments, report),
+            summary(pairs, report),
+            f"submission: {output}{unwritten}",
+        ]
+        say("\n".join(lines))  # the watchdog may end the program while it draws
         if not arguments.no_report:
             say(report_run(work_dir, page, session.must_end(), pairs))
         signal = session.interrupt.signal

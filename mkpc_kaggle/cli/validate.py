@@ -14,6 +14,7 @@ from mkpc_kaggle.data.outputs import require_apart
 from mkpc_kaggle.data.pairs import read_pairs
 from mkpc_kaggle.engine.console import say
 from mkpc_kaggle.engine.engine import Ending
+from mkpc_kaggle.engine.journal import share_journal
 from mkpc_kaggle.engine.session import Session, interruptible
 from mkpc_kaggle.errors import UserError, writing
 from mkpc_kaggle.evaluation.compare import Comparison, comparison_json, comparison_table, step_gains
@@ -47,26 +48,26 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     source = parser.add_mutually_exclusive_group(required=True)
     source.add_argument("--train-dir", type=Path, metavar="DIR")
     source.add_argument("--pairs", type=Path, metavar="FILE", help="a list of pairs with K and poses")
-    told = "score files of `reconstruct --format imc2025`; DIR has train_labels.csv and train_thresholds.csv"
-    source.add_argument("--imc2025", type=Path, metavar="DIR", help=told)
+    text = "score files of `reconstruct --format imc2025`; DIR has train_labels.csv and train_thresholds.csv"
+    source.add_argument("--imc2025", type=Path, metavar="DIR", help=text)
     add("--image-root", type=Path, metavar="DIR", help="where the images of --pairs lie")
     add("--scenes", default="", metavar="A,B", help="of --train-dir; default: all")
     add("--pairs-per-scene", type=int, metavar="N", help="evenly spread; default: all")
     add("--min-covisibility", type=float, default=0.1, help="of --train-dir; default: 0.1, as in the competition")
     options.add_matching(parser)
-    told = "F from each pair's own matches alone, whatever the recipe has"
-    add("--no-scenes", dest="reconstruct", action="store_const", const=False, help=told)
+    text = "F from each pair's own matches alone, whatever the recipe has"
+    add("--no-scenes", dest="reconstruct", action="store_const", const=False, help=text)
     add("--units", metavar="A,B", help="only these, in this order, such as 1:sift@1536; default: the recipe's")
-    told = """run these instead of --recipe and --mode, and give the gain of each over the first with its 95 %%
+    text = """run these instead of --recipe and --mode, and give the gain of each over the first with its 95 %%
         interval; such as classical:whole-images classical"""
-    add("--compare", nargs="+", metavar="RECIPE[:MODE]", help=told)
+    add("--compare", nargs="+", metavar="RECIPE[:MODE]", help=text)
     add("--method", choices=list(map(str, Method)), help="default: the recipe's")
     add("--threshold", type=float, metavar="PIXELS", help="of the method; for E divided by the mean focal length")
     options.add_run(parser, time_limit=None)
     add("--json", type=Path, metavar="FILE", help="write all figures, per pair too")
-    told = """keep the journal there (with --compare, a journal for each recipe) and go on from it; report.html
+    text = """keep the journal there (with --compare, a journal for each recipe) and go on from it; report.html
         beside it shows the run (not with --pairs); default: a temporary directory"""
-    add("--work-dir", type=Path, metavar="DIR", help=told)
+    add("--work-dir", type=Path, metavar="DIR", help=text)
     add("--submission", action="append", type=Path, metavar="CSV", help="score it, match nothing; may be repeated")
     add("--truth", type=Path, metavar="CSV", help="which pairs its samples are (`demo` writes such a table)")
 
@@ -92,7 +93,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _require_a_whole(given: argparse.Namespace) -> None:
     """Raise :class:`UserError` for options that do not go together."""
-    for is_wrong, told in (
+    for is_wrong, message in (
         (given.imc2025 and (given.truth or not given.submission), "--imc2025 needs --submission, and no --truth"),
         (
             not given.imc2025 and (not given.submission) != (not given.truth),
@@ -110,7 +111,7 @@ def _require_a_whole(given: argparse.Namespace) -> None:
         (given.pairs_per_scene is not None and given.pairs_per_scene < 1, "--pairs-per-scene: give 1 or more"),
     ):
         if is_wrong:
-            raise UserError(told)
+            raise UserError(message)
 
 
 def _read_scenes(arguments: argparse.Namespace, work_dir: Path) -> tuple[TrainScene, ...]:
@@ -129,19 +130,22 @@ def _match_and_score(arguments: argparse.Namespace, scenes: tuple[TrainScene, ..
     validations, status = [], 0
     with interruptible() as interrupt:
         assemblies = [_assemble(arguments, *choice) for choice in choices]
-        for text, assembly in zip(compared or [""], assemblies, strict=True):
-            place = work_dir / re.sub(r"[^\w.-]+", "_", text)
-            session = Session(place, options.budget_of(arguments), interrupt, workers=arguments.workers)
+        directories = [work_dir / re.sub(r"[^\w.-]+", "_", text) for text in compared or [""]]
+        for number, (assembly, directory) in enumerate(zip(assemblies, directories, strict=True)):
+            for former, done in zip(assemblies[:number], directories, strict=False):
+                if former.fingerprint() == assembly.fingerprint():
+                    share_journal(done, directory)  # what both match is matched once
+            session = Session(directory, options.budget_of(arguments), interrupt, workers=arguments.workers)
             validation = validate(scenes, assembly, session)
             validations.append(validation)
             report = validation.report
             assert report is not None
-            told = [*filter(None, [left_out_line(assembly.left_out)]), *options.plan_lines(arguments, report)]
-            told += [summary(pairs, report), "", f"recipe {validation.recipe}"]
-            say("\n".join([*told, *score_table(validation), *step_gains(validation)]))
+            lines = [*filter(None, [left_out_line(assembly.left_out)]), *options.plan_lines(arguments, report)]
+            lines += [summary(pairs, report), "", f"recipe {validation.recipe}"]
+            say("\n".join([*lines, *score_table(validation), *step_gains(validation)]))
             # The report's inliers are of F: there is none for a list of pairs, whose E is estimated.
             if arguments.work_dir is not None and arguments.pairs is None:
-                say(report_run(place, place / "report.html", session.must_end(), pairs))
+                say(report_run(directory, directory / "report.html", session.must_end(), pairs))
             status = 128 + interrupt.signal if interrupt.signal else int(bool(trouble(report)))
             if compared and report.ending != Ending.COMPLETE:
                 say("nothing is compared before all is done; with a --work-dir, the same command goes on")

@@ -46,8 +46,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     for name in ("list", "verify"):
         options.add_weights(parsers[name])
     parsers["verify"].add_argument("--manifest", type=Path, metavar="FILE", help="is every file of it there?")
-    told = "default: what recipe auto can use"
-    parsers["fetch"].add_argument("names", nargs="*", default=["auto"], metavar="NAME|SLOT|RECIPE", help=told)
+    text = "default: what recipe auto can use"
+    parsers["fetch"].add_argument("names", nargs="*", default=["auto"], metavar="NAME|SLOT|RECIPE", help=text)
     parsers["fetch"].add_argument("--out", type=Path, required=True, metavar="DIR", help="where the files go")
     parsers["convert"].add_argument("file", type=Path, metavar="FILE")
     parsers["convert"].add_argument("--out", type=Path, required=True, metavar="X.safetensors")
@@ -75,7 +75,7 @@ def _list(arguments: argparse.Namespace) -> int:
         users = [spec.name for spec in specs if spec.uses(slot)]
         rows.append((slot, files[0].licence, ", ".join(users) or "-", "; ".join(where)))
     options.print_table(rows)
-    print("".join(f"{told}\n" for told in unusable), end="")
+    print("".join(f"{text}\n" for text in unusable), end="")
     return 0
 
 

@@ -58,11 +58,6 @@ class Pair:
     def names(self) -> tuple[str, str]:
         return self.file0.rpartition(os.sep)[2], self.file1.rpartition(os.sep)[2]
 
-    @property
-    def key(self) -> str:
-        """What identifies the pair in a journal: E depends on the intrinsics."""
-        return self.id if self.intrinsics is None else f"{self.id} {[K.tolist() for K in self.intrinsics]}"
-
 
 @dataclass(frozen=True, eq=False)
 class TruePair:
@@ -191,10 +186,8 @@ def submission_problems(path: Path, sample_ids: Sequence[str]) -> list[str]:
         except UserError as error:
             problems.append(str(error))
         else:
-            if not F.any():
-                problems.append(f"{sample}: the matrix is zero")
-            elif not np.isfinite(F).all():
-                problems.append(f"{sample}: a number is not finite")
+            if not F.any() or not np.isfinite(F).all():
+                problems.append(f"{sample}: the matrix is zero, or a number in it is not finite")
     return problems
 
 
@@ -209,17 +202,17 @@ def read_rows(path: Path, columns: Sequence[str], *, only: bool = False) -> Iter
         with path.open(encoding="utf-8-sig", newline="") as stream:
             table = csv.reader(stream)
             header = next(filter(None, table), [])
-            told = ", ".join(header)[:200] or "nothing"
+            found = ", ".join(header)[:200] or "nothing"
             if missing := [column for column in columns if column not in header]:
-                raise UserError(f"{path} lacks the columns {', '.join(missing)}; it has {told}")
+                raise UserError(f"{path} lacks the columns {', '.join(missing)}; it has {found}")
             if only and header != list(columns):
-                raise UserError(f"{path}: the header is {told}, not {', '.join(columns)}")
-            places = [header.index(column) for column in columns]
+                raise UserError(f"{path}: the header is {found}, not {', '.join(columns)}")
+            indices = [header.index(column) for column in columns]
             for row in filter(None, table):
                 where = f"{path}, line {table.line_num}"
                 if len(row) != len(header):
                     raise UserError(f"{where}: {len(row)} cells, the header has {len(header)}")
-                yield where, [row[place] for place in places]
+                yield where, [row[index] for index in indices]
     except FileNotFoundError as error:
         raise UserError(f"{path}: no such file") from error
     except (OSError, ValueError, csv.Error) as error:

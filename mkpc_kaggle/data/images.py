@@ -4,7 +4,8 @@ import hashlib
 from collections import OrderedDict
 from collections.abc import Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Generic, TypeVar
@@ -12,6 +13,7 @@ from typing import Generic, TypeVar
 import cv2
 import numpy as np
 
+from mkpc_kaggle.data.exif import read_exif
 from mkpc_kaggle.geometry.coordinates import Pixels, Size
 
 Key = TypeVar("Key")
@@ -27,6 +29,7 @@ class Image:
     name: str  # unique in a run
     pixels: Pixels  # (H, W, 3) uint8 RGB
     version: str = ""  # the digest of its file, for :func:`is_unchanged`
+    focal: float = 0.0  # in pixels, by its EXIF; 0: unknown
 
     @classmethod
     def of_array(cls, array: Pixels) -> "Image":
@@ -52,7 +55,7 @@ def turned(image: "Image | Unreadable", times: int) -> "Image | Unreadable":
     if isinstance(image, Unreadable) or not times:
         return image
     pixels = np.ascontiguousarray(np.rot90(image.pixels, times))
-    return Image(f"{image.name} turned {times}", pixels, image.version)
+    return replace(image, name=f"{image.name} turned {times}", pixels=pixels)
 
 
 @dataclass(frozen=True)
@@ -69,34 +72,36 @@ class Unreadable:
 def read_image(path: Path) -> Image | Unreadable:
     """Decode a file to RGB; never raises. 16-bit values are divided by 256, EXIF's orientation is applied.
 
-    OpenCV decides whether a damaged file is readable: version 5 refuses a truncated file.
+    OpenCV decides whether a damaged file is readable: version 5 refuses a truncated file. Its versions differ in
+    whose orientation they apply, so they apply none.
     """
     name = str(path)
     try:
         if path.exists() and not path.is_file():  # a pipe or a device may never end
             return Unreadable(name, "cannot be read: not a regular file")
         data = np.fromfile(path, np.uint8)
-        bgr = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
+        bgr = cv2.imdecode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION) if data.size else None
     except FileNotFoundError:
         return Unreadable(name, "no such file")
     except (OSError, ValueError, MemoryError, cv2.error) as error:
         return Unreadable(name, f"cannot be read: {error}")
     if bgr is None:
-        reason = "not a picture, or cut off: it cannot be decoded" if data.size else "the file is empty"
-        return Unreadable(name, reason)
+        return Unreadable(
+            name, "not a picture, or cut off: it cannot be decoded" if data.size else "the file is empty"
+        )
     height, width = bgr.shape[:2]
     if max(height, width) > MAX_ASPECT * min(height, width):
         return Unreadable(name, f"{width} x {height} pixels: one side is more than {MAX_ASPECT} times the other")
-    pixels = np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)
-    return Image(name, pixels, _content_digest(data))
+    exif = read_exif(data.data, Size(width, height))
+    pixels = exif.upright(np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8))
+    return Image(name, pixels, _content_digest(data), exif.focal)
 
 
 def is_unchanged(path: Path, version: str) -> bool:
     """Whether a file is still of that ``version``; a file that cannot be read counts as unchanged."""
-    try:
+    with suppress(OSError, ValueError):
         return not path.is_file() or _content_digest(np.fromfile(path, np.uint8)) == version
-    except (OSError, ValueError):
-        return True
+    return True
 
 
 def _content_digest(data: Pixels) -> str:

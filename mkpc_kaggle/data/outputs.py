@@ -34,20 +34,19 @@ def require_apart(
         if not path.name or os.path.isdir(path):  # noqa: PTH112  Path raises for a name that is too long
             raise UserError(f"{option} {str(path)!r} is a directory; name a file")
         lost = [f"{other} {there}" for other, there in files.items() if other != option and same_file(path, there)]
-        if work_dir is not None and lies_in(work_dir, path):
+        is_journal = path.name.startswith("journal.") and work_dir is not None and same_file(path.parent, work_dir)
+        if is_journal or (work_dir is not None and lies_in(work_dir, path)):
             lost.append(f"the work directory {work_dir}")
-        if work_dir is not None and same_file(path.parent, work_dir) and path.name.startswith("journal."):
-            lost.append(f"the journal in {work_dir}")
-        for place in precious if os.path.lexists(path) else ():
-            if same_file(path, place) or (lies_in(path, place) and not is_result):
-                lost.append(f"the input {place}")
+        for source in precious if os.path.lexists(path) else ():
+            if same_file(path, source) or (lies_in(path, source) and not is_result):
+                lost.append(f"the input {source}")
         if lost:
             raise UserError(f"{option} {path} would be written over {lost[0]}; name another file")
         if option in ("--json", "--report") and not is_result and os.path.isfile(path):  # noqa: PTH113
             raise UserError(f"{option} {path} exists and is not a {RESULTS[option][0]} file; name another file")
-    for place in inputs:
-        if work_dir is not None and lies_in(work_dir, place):
-            raise UserError(f"--work-dir {work_dir} would be written over the input {place}; name another place")
+    for source in inputs:
+        if work_dir is not None and lies_in(work_dir, source):
+            raise UserError(f"--work-dir {work_dir} would be written over the input {source}; name another place")
 
 
 def require_directory_apart(out: Path, inputs: Iterable[Path], weights: Iterable[Path]) -> None:

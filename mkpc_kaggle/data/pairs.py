@@ -17,7 +17,7 @@ import numpy as np
 
 from mkpc_kaggle.data.competition import Pair, TrainScene, TruePair, evenly_spread
 from mkpc_kaggle.data.images import Unreadable, read_image
-from mkpc_kaggle.errors import UserError, read_text
+from mkpc_kaggle.errors import UserError, read_text, writing
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Size
 
@@ -50,9 +50,7 @@ def read_pairs(file: Path, image_root: Path, *, copies: Path, most: int | None =
     if not listed:
         raise UserError(f"{file} has no pairs; expected lines {EXPECTED}")
 
-    @cache
-    def copy_of(name: str, turns: int) -> tuple[Path, Size | None]:
-        return turned_copy(image_root / name, turns, copies)
+    copy_of = cache(lambda name, turns: turned_copy(image_root / name, turns, copies))
 
     def upright(image: ListedImage) -> tuple[str, Camera]:
         path, size = copy_of(image.name, image.turns)
@@ -74,9 +72,7 @@ def parse_line(line: str, where: str) -> tuple[ListedImage, ListedImage]:
     for name in cells[:2]:
         path = PureWindowsPath(name)  # the strictest rules: drives and backslashes count, too
         if path.anchor or ".." in path.parts or "\0" in name:
-            raise UserError(
-                f"{where}: {name!r} points outside the image root; expected a relative path without .."
-            )
+            raise UserError(f"{where}: {name!r} points outside the image root; expected a path without ..")
     try:
         turns, numbers = [int(cell) for cell in cells[2:4]], np.array([float(cell) for cell in cells[4:]])
     except ValueError as error:
@@ -108,9 +104,7 @@ def turned_copy(path: Path, turns: int, copies: Path) -> tuple[Path, Size | None
         return path, None
     copy = copies / f"{path.stem}-{hashlib.sha256(os.fsencode(path)).hexdigest()[:16]}-{turns}.png"
     bgr = cv2.cvtColor(np.ascontiguousarray(np.rot90(image.pixels, turns)), cv2.COLOR_RGB2BGR)
-    try:
+    with writing(f"the turned copy {copy}"):
         copies.mkdir(parents=True, exist_ok=True)
         copy.write_bytes(cv2.imencode(".png", bgr)[1].tobytes())
-    except OSError as error:
-        raise UserError(f"the turned copy {copy} cannot be written: {error.strerror}") from error
     return copy, image.size

@@ -57,8 +57,8 @@ def build_world(name: str, *, seed: int = 0, image_scale: float = 1.0) -> World:
     )
     cameras = []
     for position, target, focal, size, roll in SHOTS:
-        place, towards = np.add(position, rng.uniform(-0.15, 0.15, 3)), np.add(target, rng.uniform(-0.3, 0.3, 3))
-        camera = look_at(place * unit, towards * unit, focal * max(size), size, roll + rng.uniform(-2, 2))
+        eye, towards = np.add(position, rng.uniform(-0.15, 0.15, 3)), np.add(target, rng.uniform(-0.3, 0.3, 3))
+        camera = look_at(eye * unit, towards * unit, focal * max(size), size, roll + rng.uniform(-2, 2))
         cameras.append(resized(camera, image_scale))
     return World(name, SCENES[name], surfaces, tuple(cameras))
 

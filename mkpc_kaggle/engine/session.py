@@ -1,6 +1,8 @@
 """A run from its parts: journal, site and engine opened, used and let go of; signals, and the end at the limit."""
 
 import hashlib
+import json
+import os
 import platform
 import signal
 import sqlite3
@@ -18,7 +20,6 @@ from typing import Self
 import cv2
 import numpy as np
 
-from mkpc_kaggle import __version__
 from mkpc_kaggle.data.competition import Pair, write_submission
 from mkpc_kaggle.engine import console
 from mkpc_kaggle.engine.budget import Budget
@@ -28,8 +29,10 @@ from mkpc_kaggle.engine.journal import About, EventKind, Journal
 from mkpc_kaggle.engine.places import LISTEN_S, LocalSite, Site
 from mkpc_kaggle.engine.records import PairRecord, SceneRecord
 from mkpc_kaggle.errors import UserError, writing
+from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
 from mkpc_kaggle.pipeline.assembly import Assembly
 from mkpc_kaggle.scene.export import Export
+from mkpc_kaggle.version import __version__
 
 EXIT_S = 0.2  # that the system takes to end a process
 REPORT_S = 2.0  # that an interrupted program may take for its report: enough for the tables
@@ -65,17 +68,34 @@ class Session:
 
 
 def submit(pairs: Sequence[Pair], assembly: Assembly, session: Session, output: Path) -> RunReport:
-    """Match all pairs and keep ``output`` whole from the start: each pair has a row, of the fallback if need be.
-
-    Raises :class:`mkpc_kaggle.errors.UserError` where ``output`` cannot be written, before any work.
-    """
+    """Match all pairs and keep ``output`` whole: each pair has a row, of the fallback if need be."""
 
     def publish(records: Sequence[PairRecord], _: Iterable[SceneRecord]) -> None:
         rows = zip(pairs, records, strict=True)
         write_submission(output, {pair.id: record.chosen_fundamental for pair, record in rows})
 
-    require_writable(output)
     return run_pairs(pairs, assembly, session, publish)
+
+
+@contextmanager
+def first_version(pairs: Sequence[Pair], output: Path) -> Iterator[None]:
+    """Write fallback rows where there is no file yet, before weights, devices and images, any of which may hang.
+
+    A run that is refused before it has written a version of its own leaves no file. Raises
+    :class:`mkpc_kaggle.errors.UserError` where ``output`` cannot be written.
+    """
+    require_writable(output)
+    ours = None
+    if not output.exists():
+        with writing(f"--output {output}"):
+            write_submission(output, {pair.id: FALLBACK_FUNDAMENTAL for pair in pairs})
+            ours = output.stat()
+    try:
+        yield
+    except UserError:
+        if ours is not None and os.path.samestat(ours, output.stat()):
+            output.unlink()
+        raise
 
 
 def require_writable(output: Path) -> None:
@@ -103,8 +123,11 @@ def run_pairs(
     belongs_to = {"test set": digest_of_pairs(pairs), **assembly.fingerprint()}
     budget, recipe = session.budget, assembly.recipe
     limit = budget.time_limit if isfinite(budget.time_limit) else None
-    about = About(recipe.name, str(assembly.placement), limit, assembly.left_out, versions())
+    estimation = json.dumps(recipe.estimation())
+    about = About(recipe.name, str(assembly.placement), limit, assembly.left_out, versions(), estimation)
     with Journal(session.work_dir, belongs_to, pairs=pairs, about=about, fresh=session.fresh) as journal:
+        if recipe.scene is None:
+            journal.forget_scenes()
         journal.note(EventKind.START, budget.spent(), "")
         engine = Engine(
             pairs,
@@ -146,8 +169,8 @@ def versions() -> dict[str, str]:
 
 
 def digest_of_pairs(pairs: Sequence[Pair]) -> str:
-    """Tells test sets apart: the keys of its pairs with the ids of their images, in order."""
-    ids = ((pair.key, pair.group, *(name.rpartition(".")[0] for name in pair.names)) for pair in pairs)
+    """Tells test sets apart: the ids of its pairs with the ids of their images, in order."""
+    ids = ((pair.id, pair.group, *(name.rpartition(".")[0] for name in pair.names)) for pair in pairs)
     rows = map("\t".join, ids)
     return hashlib.sha256("\n".join(rows).encode()).hexdigest()
 

@@ -61,8 +61,8 @@ def score_imc2025(directory: Path, submission: Path) -> list[DatasetScore]:
             {image for part in parts.values() for image in part} for parts in (scenes, found.get(name, {}))
         )
         if wrong := images ^ given:
-            told = f"{len(wrong)} images of {name} are missing or unknown, such as {min(wrong)}"
-            raise UserError(f"{submission}: {told}")
+            message = f"{len(wrong)} images of {name} are missing or unknown, such as {min(wrong)}"
+            raise UserError(f"{submission}: {message}")
         if lacking := [scene for scene in scenes if scene not in (OUTLIERS, *thresholds.get(name, ()))]:
             raise UserError(f"{path} has no thresholds of {name}/{lacking[0]}")
     for file, named in ((submission, found), (path, thresholds)):

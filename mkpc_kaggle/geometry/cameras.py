@@ -72,8 +72,8 @@ def mean_cameras(pairs: Sequence[tuple[Camera, Camera]], max_degrees: float) -> 
     rotations = Rotation.from_matrix(np.stack([R for R, _ in poses]))
     near = np.degrees((rotations * rotations[0].inv()).magnitude()) <= max_degrees
     kept = np.flatnonzero(near).tolist()
-    direction = np.sum([_unit(poses[place][1]) for place in kept], axis=0)
-    K0, K1 = (_mean_intrinsics([pairs[place][side].K for place in kept]) for side in (0, 1))
+    direction = np.sum([_unit(poses[index][1]) for index in kept], axis=0)
+    K0, K1 = (_mean_intrinsics([pairs[index][side].K for index in kept]) for side in (0, 1))
     return Camera(K0, np.eye(3), np.zeros(3)), Camera(K1, rotations[near].mean().as_matrix(), _unit(direction))
 
 

@@ -1,1 +1,1 @@
-"""The matchers: one interface, one registry, one file each."""
+"""The matchers: one contract, one registry, and what adapters share."""

@@ -1,19 +1,14 @@
-"""Finds matchers by name: a file of this folder is a matcher, with a ``SPEC`` of its name and a ``load``."""
+"""Finds matchers by name: a file of ``adapters/`` is a matcher, with a ``SPEC`` of its name and a ``load``."""
 
 import pkgutil
 from functools import cache
 from importlib import import_module
 from typing import Any
 
-from mkpc_kaggle import matchers
 from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.matchers import adapters
 from mkpc_kaggle.matchers.contract import Matcher, MatcherSpec, Placement
 from mkpc_kaggle.weights import WeightStore
-
-# What matchers share.
-NOT_MATCHERS = frozenset(
-    {"contract", "dense", "dtypes", "lightglue", "neighbours", "registry", "semi_dense", "sparse", "vismatch"}
-)
 
 
 class UnusableError(UserError):
@@ -23,8 +18,7 @@ class UnusableError(UserError):
 @cache
 def matcher_names() -> tuple[str, ...]:
     """The names of all matchers; imports none of them. A new matcher is a new file."""
-    modules = pkgutil.iter_modules(matchers.__path__)
-    return tuple(info.name for info in modules if not info.ispkg and info.name not in NOT_MATCHERS)
+    return tuple(info.name for info in pkgutil.iter_modules(adapters.__path__))
 
 
 def spec_of(name: str, where: str) -> MatcherSpec:
@@ -46,7 +40,7 @@ def _imported(name: str, where: str) -> Any:
     if name not in matcher_names():
         raise UserError(f"{where}: unknown matcher {name!r}; known: {', '.join(matcher_names())}")
     try:
-        return import_module(f"{matchers.__name__}.{name}")
+        return import_module(f"{adapters.__name__}.{name}")
     except Exception as error:  # any error at import affects this matcher only
-        told = f"matcher {name} cannot be used here ({type(error).__name__}: {error})"
-        raise UnusableError(f"{where}: {told}. `--recipe auto` does without it.") from error
+        message = f"matcher {name} cannot be used here ({type(error).__name__}: {error})"
+        raise UnusableError(f"{where}: {message}. `--recipe auto` does without it.") from error

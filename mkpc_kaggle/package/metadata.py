@@ -5,6 +5,7 @@ import re
 from collections.abc import Iterable
 
 from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.version import __version__
 
 COMPETITION = "image-matching-challenge-2022"
 DATASET_SLUG = "mkpc-kaggle"
@@ -27,7 +28,7 @@ def dataset_metadata(owner: str, licences: Iterable[str]) -> str:
     return _json(
         {
             "id": f"{owner}/{DATASET_SLUG}",
-            "title": "MKPC Kaggle",
+            "title": f"MKPC Kaggle {__version__}",
             "subtitle": "Offline two-stage image matching: wheels and weights",
             "description": "mkpc_kaggle (Apache-2.0), the wheels that it needs (each has its licence inside), and "
             "weights of image matchers. weights_manifest.txt names the licence and the source of each file of "

@@ -49,8 +49,8 @@ def choose_weights(store: WeightStore, checkout: Path, staging: Path, *, private
 
 def licence_text(checkout: Path, tag: str) -> Path | None:
     """The text of a licence that the manifest names, if the checkout has it."""
-    path = checkout / ("LICENSE" if tag == "Apache-2.0" else f"licences/{tag}.txt")
-    return path if path.is_file() else None
+    texts = {path.stem: path for path in (checkout / "licences").glob("*.txt")}
+    return (texts | {"Apache-2.0": checkout / "LICENSE"}).get(tag)
 
 
 def _good_file(store: WeightStore, slot: str) -> FoundFile | None:

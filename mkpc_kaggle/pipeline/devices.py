@@ -12,6 +12,7 @@ from mkpc_kaggle.pipeline.failures import DeviceError, FailureKind, failure_of, 
 
 AUTO = "auto"
 ADVICE = "on Kaggle choose the accelerator GPU T4 x2, elsewhere try --device cpu"
+PROBE_TIMEOUT_S = 120.0  # for a process to compute something on each GPU
 TENSOR_CORES = (7, 0)  # the first compute capability that is faster in half precision
 # In a process of its own: a CUDA context takes some hundred MB of a GPU, and the parent of workers needs none.
 ASK_CAPABILITIES = """
@@ -81,9 +82,16 @@ def gpus_of(device: str) -> list[int]:
 @cache
 def gpu_capabilities() -> list[tuple[int, int]]:
     """The compute capability of each GPU, such as (7, 5); raises :class:`UserError` if none of them computes."""
-    asked = subprocess.run([sys.executable, "-c", ASK_CAPABILITIES], capture_output=True, text=True, check=False)
-    if asked.returncode:
-        reason = asked.stderr.strip()[-300:]
+    command = [sys.executable, "-c", ASK_CAPABILITIES]
+    try:
+        asked = subprocess.run(
+            command, capture_output=True, text=True, check=False, timeout=PROBE_TIMEOUT_S, stdin=subprocess.DEVNULL
+        )
+        failed = asked.stderr.strip()[-300:] or f"exit status {asked.returncode}"
+        reason = failed if asked.returncode else ""
+    except subprocess.TimeoutExpired:
+        reason = f"no answer for {PROBE_TIMEOUT_S:.0f} s"
+    if reason:
         raise UserError(f"PyTorch cannot compute on this machine's GPUs ({reason}); {ADVICE}")
     return [(major, minor) for major, minor in json.loads(asked.stdout.splitlines()[-1])]
 

@@ -17,7 +17,7 @@ from mkpc_kaggle.errors import UserError, writing
 from mkpc_kaggle.matchers.contract import Matcher
 from mkpc_kaggle.pipeline.assembly import Assembly, assemble
 from mkpc_kaggle.pipeline.pair import PairMatch
-from mkpc_kaggle.recipe import Recipe, SceneConfig, load_recipe
+from mkpc_kaggle.recipe import CameraSharing, Recipe, SceneConfig, load_recipe
 from mkpc_kaggle.reconstruction.choice import MAX_IMAGES, RunEndedError, choose_pairs, digest_of_names
 from mkpc_kaggle.reconstruction.directory import claim, settle
 from mkpc_kaggle.reconstruction.folder import Datasets, Ends
@@ -38,10 +38,13 @@ class FolderResult:
     cameras: Cameras
 
 
-def for_cameras(recipe: Recipe) -> Recipe:
-    """The recipe without steps that only improve the F of single pairs, and without extra pairs."""
+def for_cameras(recipe: Recipe, sharing: str | None = None) -> Recipe:
+    """The recipe without steps that only improve the F of single pairs, and without extra pairs.
+
+    ``sharing`` is a :class:`CameraSharing`; ``None``: as the recipe has it.
+    """
     scene = replace(recipe.scene or SceneConfig(), each_matcher=False, pairs_per_image=0.0)
-    return replace(recipe, focal=None, scene=scene)
+    return replace(recipe, focal=None, scene=replace(scene, cameras=CameraSharing(sharing or scene.cameras)))
 
 
 def reconstruct_folder(
@@ -78,7 +81,9 @@ def reconstruct_folder(
             return FolderResult(ended.report, (), none)
         turns = {path: times for pair in pairs for path, times in zip(pair.images, pair.turns, strict=True)}
         exports = {
-            name: Export(out / name, {file.stem: (file.name, turns.get(file, 0)) for file in files})
+            name: Export(
+                out / name, files[0].parent, {file.stem: (file.name, turns.get(file, 0)) for file in files}
+            )
             for name, files in datasets.items()
         }
 
@@ -116,8 +121,9 @@ def reconstruct(
 ) -> tuple[SfmModel, ...]:
     """The models of images, given by their paths: the largest first, none where too little matches.
 
-    What the command ``reconstruct`` does, in this process and without its budget and journal. Raises
-    :class:`UserError` for a recipe that cannot run here, and for an image that cannot be read.
+    What the command ``reconstruct`` does, in this process and without its budget and journal. Cameras are in
+    pixels of what the files store, as COLMAP reads them. Raises :class:`UserError` for a recipe that cannot run
+    here, and for an image that cannot be read.
     """
     files = sorted(map(Path, images))
     chosen = for_cameras(load_recipe(recipe) if isinstance(recipe, str) else recipe)
@@ -140,5 +146,6 @@ def reconstruct(
     for path0, path1 in ((files[i], files[j]) for i, j in ends):
         (match,) = pipeline.match([PairMatch(images=(opened(path0), opened(path1)))], assembly.recipe.units)
         pairs.append(BatchPair(known[path0], known[path1], match.matches, None, tracks_of(match.results)))
+    pairs = Export(Path(), Path(), {str(file): (str(file), 0) for file in files}).stored(pairs)
     found, _ = reconstruct_sharing(ViewGraph.of_pairs(pairs), chosen.scene or SceneConfig())
     return tuple(sorted(models_of(found), key=lambda model: -len(model.images)))

@@ -21,6 +21,7 @@ from mkpc_kaggle.engine.budget import format_duration
 from mkpc_kaggle.engine.journal import EventKind
 from mkpc_kaggle.engine.records import SceneRecord
 from mkpc_kaggle.errors import writing
+from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
 from mkpc_kaggle.pipeline.two_stage import to_image
 from mkpc_kaggle.reporting.figures.pair import draw_pair, draw_strip
 from mkpc_kaggle.reporting.figures.run import draw_budget, draw_cameras
@@ -114,6 +115,8 @@ def _facts(log: RunLog) -> Iterator[tuple[str, str, str]]:
     if len(solved):
         least = f"median of a pair, at least {solved['inliers'].min()}"
         yield "inliers", f"{solved['inliers'].median():.0f}", least
+        told = f"supported {MIN_SUPPORT:g} times as well as by chance"
+        yield "pairs that show the same", f"{solved['overlaps'].sum()} of {len(solved)}", told
     limit = f"of {format_duration(log.about.limit)}" if log.about.limit is not None else "no time limit"
     sessions = sum(event.kind == EventKind.START for event in log.events)
     yield "time", format_duration(log.seconds), limit + (f", session {sessions}" if sessions > 1 else "")
@@ -144,16 +147,17 @@ def _weak(log: RunLog, weak: WeakPair, sources: dict[str, Pair]) -> tuple[str, s
     """What the page says of a weak pair: its picture, empty if it is not drawn; counts and remarks; id."""
     record, pair, picture = weak.record, log.pairs[weak.record.index], ""
     match = weak.match(log.recipe.magsac.threshold)
-    told = [f"{record.inliers} inliers of {record.matches} matches", record.failure]
+    parts = [f"{record.inliers} inliers of {record.matches} matches", record.failure]
+    parts.append("" if record.overlaps else f"may show different things: support {record.stats.support:.1f}")
     if record.source == "scene":
-        told.append("F is the scene's")
+        parts.append("F is the scene's")
     if pair.id in sources:
         image0, image1 = map(turned, map(read_image, sources[pair.id].images), sources[pair.id].turns)
         if isinstance(image0, Unreadable) or isinstance(image1, Unreadable):
-            told.append("an image cannot be read any more")
+            parts.append("an image cannot be read any more")
         else:
             picture = _data_uri(draw_strip((image0, image1), match), "jpeg")
-    return picture, "; ".join(filter(None, told)), pair.id
+    return picture, "; ".join(filter(None, parts)), pair.id
 
 
 def weak_figure(log: RunLog, weak: WeakPair, source: Pair) -> "Figure":

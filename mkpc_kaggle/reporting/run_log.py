@@ -1,5 +1,6 @@
 """What a journal says of a run: read at one moment, kept as a value, exported to files."""
 
+import json
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -56,7 +57,7 @@ class RunLog:
     @property
     def session(self) -> tuple[Event, ...]:
         """The events since the run was last started."""
-        starts = [place for place, event in enumerate(self.events) if event.kind == EventKind.START]
+        starts = [index for index, event in enumerate(self.events) if event.kind == EventKind.START]
         return self.events[starts[-1] :] if starts else self.events
 
     @property
@@ -81,7 +82,7 @@ def read_log(directory: Path) -> RunLog:
     """
     with JournalReader(directory) as journal, undamaged(journal.path):
         about, belongs_to, pairs = journal.about(), journal.belongs_to(), journal.pairs()
-        recipe = recipe_of(belongs_to.get("recipe", {}), about.recipe)
+        recipe = recipe_of(belongs_to.get("recipe", {}) | json.loads(about.estimation), about.recipe)
         known = journal.records()
         records = tuple(known.get(index) or PairRecord.untouched(index) for index in range(len(pairs)))
         touched = sorted((record for record in records if record.units), key=lambda r: (r.inliers, r.index))

@@ -8,7 +8,7 @@ import numpy as np
 
 MAX_IMAGES = 2000  # the search takes the square of their number
 
-Ends: TypeAlias = tuple[int, int]  # the two images of a pair by their places, the smaller first
+Ends: TypeAlias = tuple[int, int]  # the two images of a pair by their indices, the smaller first
 
 
 def extra_pairs(image_count: int, pairs: Sequence[Ends], per_image: float) -> list[Ends]:

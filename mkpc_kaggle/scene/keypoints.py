@@ -14,7 +14,7 @@ from mkpc_kaggle.scene.view_graph import ViewGraph
 CELL_PX = 0.75  # points of an image in one cell of this size are one keypoint
 
 
-Index = NDArray[np.uint32]  # (M, 2): the places of the matched keypoints in the two images of an edge
+Index = NDArray[np.uint32]  # (M, 2): the indices of the matched keypoints in the two images of an edge
 
 
 def scene_keypoints(graph: ViewGraph) -> tuple[list[Points], list[Index]]:
@@ -24,31 +24,31 @@ def scene_keypoints(graph: ViewGraph) -> tuple[list[Points], list[Index]]:
         parts[edge.first].append(edge.matches.points0)
         parts[edge.second].append(edge.matches.points1)
     merged = [merge_points(np.concatenate([np.zeros((0, 2), np.float32), *part]), CELL_PX) for part in parts]
-    places = [
-        iter(np.split(place, np.cumsum([len(points) for points in part])[:-1]))
-        for (_, place), part in zip(merged, parts, strict=True)
+    indices = [
+        iter(np.split(index, np.cumsum([len(points) for points in part])[:-1]))
+        for (_, index), part in zip(merged, parts, strict=True)
     ]
-    matches = [np.stack([next(places[edge.first]), next(places[edge.second])], axis=1) for edge in graph.edges]
+    matches = [np.stack([next(indices[edge.first]), next(indices[edge.second])], axis=1) for edge in graph.edges]
     return [points for points, _ in merged], list(map(one_to_one, matches))
 
 
 def merge_points(points: Points, cell: float) -> tuple[Points, NDArray[np.intp]]:
-    """(N, 2) points -> (K, 2) float32 means of those that share a cell, and for each point its place there, (N,).
+    """(N, 2) points -> (K, 2) float32 means of those that share a cell, and for each point its index there, (N,).
 
     A grid has borders, and points on both sides of a border would stay apart. So the means of a first grid are
     merged once more in a second grid, shifted by half a cell.
     """
     total: NDArray[np.float64] = points.astype(np.float64)
     weight: NDArray[np.float64] = np.ones(len(points))
-    place: NDArray[np.intp] = np.arange(len(points))
+    index: NDArray[np.intp] = np.arange(len(points))
     for shift in (0.0, 0.5):
         cells = np.floor(total / weight[:, None] / cell + shift).astype(np.int64)
         distinct, inverse = np.unique(cells, axis=0, return_inverse=True)
         inverse = inverse.ravel()
         total = np.column_stack([np.bincount(inverse, column, len(distinct)) for column in total.T])
         weight = np.bincount(inverse, weight, len(distinct)).astype(np.float64)
-        place = inverse[place]
-    return (total / weight[:, None]).astype(np.float32), place
+        index = inverse[index]
+    return (total / weight[:, None]).astype(np.float32), index
 
 
 def one_to_one(index: NDArray[np.intp]) -> Index:

@@ -19,12 +19,13 @@ MIN_TRACK_MATCHES = 50  # a pair with fewer matches from units that make tracks 
 class BatchImage:
     """An image of a batch: its ``name``, the ``digest`` of its content, its ``size`` in pixels.
 
-    Two names with one digest are one image.
+    Two names with one digest are one image. ``focal`` is the focal length in pixels by its EXIF, 0 if unknown.
     """
 
     name: str
     digest: str
     size: Size
+    focal: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +51,7 @@ class BatchPair:
 
 @dataclass(frozen=True, eq=False)
 class Edge:
-    """All matches between two distinct images, given by their places in a list of images, ``first < second``."""
+    """All matches between two distinct images, given by their indices in a list of images, ``first < second``."""
 
     first: int
     second: int
@@ -83,10 +84,10 @@ class ViewGraph:
         images: dict[str, BatchImage] = {}
         for image in (image for pair in pairs for image in (pair.image0, pair.image1)):
             images.setdefault(image.digest, image)
-        place = {digest: number for number, digest in enumerate(images)}
+        index = {digest: number for number, digest in enumerate(images)}
         parts: dict[tuple[int, int], list[Matches]] = {}
         for pair in pairs:
-            first, second = place[pair.image0.digest], place[pair.image1.digest]
+            first, second = index[pair.image0.digest], index[pair.image1.digest]
             tracks = pair.tracks_of(matcher)
             if first > second:
                 first, second = second, first
@@ -106,9 +107,9 @@ class ViewGraph:
         found = []
         for label in dict.fromkeys(labels[np.sort(ends[:, 0])].tolist()):
             members = np.flatnonzero(labels == label).tolist()
-            place = {image: number for number, image in enumerate(members)}
+            index = {image: number for number, image in enumerate(members)}
             inside = [edge for edge in strong if labels[edge.first] == label]
-            edges = tuple(Edge(place[edge.first], place[edge.second], edge.matches) for edge in inside)
+            edges = tuple(Edge(index[edge.first], index[edge.second], edge.matches) for edge in inside)
             found.append(ViewGraph(tuple(self.images[image] for image in members), edges))
         return tuple(found)
 

@@ -1,6 +1,5 @@
 """Downloads files of the manifest: resumed after interruptions, renamed once their digest is verified."""
 
-import stat
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -14,7 +13,7 @@ from urllib.request import Request, urlopen
 
 from tqdm import tqdm
 
-from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.errors import UserError, writing
 from mkpc_kaggle.weights.manifest import UNVERIFIED, WeightFile, digest_of
 from mkpc_kaggle.weights.store import judge
 
@@ -23,8 +22,7 @@ BLOCK_BYTES = 1 << 20
 TIMEOUT_S = 30.0  # without a byte
 MAX_BYTES = 1 << 33  # of a file whose size the manifest does not know
 WEB_PAGE_HOSTS = ("drive.google.com",)  # they answer with a web page instead of the file
-TRANSIENT_STATUSES = (408, 425, 429, 500, 502, 503, 504)  # HTTP status codes after which a retry may succeed
-RANGE_NOT_SATISFIABLE = 416
+TRANSIENT_STATUSES = (408, 416, 425, 429, 500, 502, 503, 504)  # HTTP status codes after which a retry may succeed
 
 
 class FetchOutcome(StrEnum):
@@ -73,28 +71,17 @@ def fetch(file: WeightFile, directory: Path, *, wait: Callable[[float], None] = 
         return Fetched(file, path, FetchOutcome.BY_HAND, f"get it from {file.source} and save it as {path}")
     part = path.with_name(f"{path.name}.part")
     try:
-        directory.mkdir(parents=True, exist_ok=True)
-        if not (_size_of(part) and digest_of(part) == file.digest):
-            _download(url, part, file, wait)
-        note = _verify(part, file)
-        part.replace(path)
+        with writing(str(path)):
+            directory.mkdir(parents=True, exist_ok=True)
+            if part.is_symlink() or not part.is_file():
+                part.unlink(missing_ok=True)  # a link or a pipe is no part
+            if not (part.exists() and digest_of(part) == file.digest):
+                _download(url, part, file, wait)
+            note = _verify(part, file)
+            part.replace(path)
     except UserError as error:
         return Fetched(file, path, FetchOutcome.FAILED, str(error))
-    except OSError as error:
-        return Fetched(file, path, FetchOutcome.FAILED, f"{path} cannot be written: {error.strerror}")
     return Fetched(file, path, FetchOutcome.FETCHED, note)
-
-
-def _size_of(part: Path) -> int:
-    """Bytes of the partial download; what is not a regular file, such as a link, is removed."""
-    try:
-        status = part.lstat()
-    except FileNotFoundError:
-        return 0
-    if stat.S_ISREG(status.st_mode):
-        return status.st_size
-    part.unlink()
-    return 0
 
 
 def _verify(part: Path, file: WeightFile) -> str:
@@ -122,10 +109,10 @@ def _download(url: str, part: Path, file: WeightFile, wait: Callable[[float], No
         except HTTPError as error:
             reason = f"{error.code} {error.reason}"
             error.close()
-            if error.code == RANGE_NOT_SATISFIABLE:
-                part.unlink(missing_ok=True)  # these bytes belong to another version
-            elif error.code not in TRANSIENT_STATUSES:
+            if error.code not in TRANSIENT_STATUSES:
                 raise UserError(f"{url}: the server says {reason}") from error
+            if error.code == 416:  # no such range: the part belongs to another version
+                part.unlink(missing_ok=True)
         except (OSError, HTTPException, ValueError, OverflowError) as error:  # the last two: a malformed answer
             reason = str(error)
     raise UserError(
@@ -137,7 +124,7 @@ def _download(url: str, part: Path, file: WeightFile, wait: Callable[[float], No
 def _receive(url: str, part: Path, file: WeightFile) -> None:
     """Request what is missing, once; raises ``OSError`` and other errors if the connection breaks."""
     most = file.size if file.size >= 0 else MAX_BYTES
-    have = _size_of(part)
+    have = part.stat().st_size if part.exists() else 0
     wanted = {"Range": f"bytes={have}-"} if 0 < have < most and file.digest != UNVERIFIED else {}
     request = Request(url, headers={"User-Agent": "mkpc_kaggle", **wanted})
     with urlopen(request, timeout=TIMEOUT_S) as response:
@@ -145,13 +132,14 @@ def _receive(url: str, part: Path, file: WeightFile) -> None:
             have = 0  # the server sends the complete file
         total = None if response.length is None else have + response.length
         every = 0.1 if sys.stderr.isatty() else 30  # seconds; a log file gets a line for each update
-        progress = tqdm(desc=file.name, initial=have, total=total, unit="B", unit_scale=True, mininterval=every)
-        with progress, part.open("ab" if have else "wb") as out:
+        with (
+            part.open("ab" if have else "wb") as stream,
+            tqdm.wrapattr(stream, "write", total, desc=file.name, initial=have, mininterval=every) as out,
+        ):
             while block := response.read1(BLOCK_BYTES):
                 have += len(block)
                 if have > most:
                     raise UserError(f"more than {most} bytes came, the most that {file.name} may have")
                 out.write(block)
-                progress.update(len(block))
     if total is not None and have < total:
         raise ConnectionError(f"it broke off after {have} of {total} bytes")

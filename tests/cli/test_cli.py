@@ -60,7 +60,7 @@ def test_results_are_not_written_over_inputs_nor_an_export_over_the_journal(demo
     told = capsys.readouterr().err.splitlines()
     assert "would be written over the input" in told[0]
     assert "would be written over the input" in told[1]
-    assert "would be written over the journal" in told[2]
+    assert "would be written over the work directory" in told[2]
 
 
 def test_check_tells_good_from_bad(demo, tmp_path, capsys):

@@ -17,6 +17,7 @@ from shared import contents
 
 from mkpc_kaggle.cli import main
 from mkpc_kaggle.data.competition import read_submission, read_test_side, submission_problems
+from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -177,7 +178,7 @@ def test_bad_input_is_told_in_one_line_before_any_work(demo, tmp_path, capsys, a
         (["--recipe", "r.toml", "--output", "r.toml"], "would be written over the input r.toml"),
         (["--output", "s.html"], "would be written over --report"),
         (["--output", "q.work"], "would be written over the work directory"),
-        (["--output", "w/journal.sqlite", "--work-dir", "w"], "would be written over the journal"),
+        (["--output", "w/journal.sqlite", "--work-dir", "w"], "would be written over the work directory"),
     ],
 )
 def test_what_would_be_written_over_an_input_or_a_result_is_refused_before_any_work(
@@ -249,3 +250,27 @@ def test_a_million_rows_are_written_in_little_memory(demo, tmp_path):
     with output.open() as rows:
         assert sum(1 for _ in rows) == count + 1
     assert not list(tmp_path.glob(".*.part"))
+
+
+def test_a_whole_submission_is_there_before_weights_and_devices_are_looked_at(demo, tmp_path, monkeypatch):
+    def look(*_, **__):
+        assert submission_problems(output, [pair.id for pair in read_test_side(demo.test_dir)]) == []
+        raise UserError("the disk with the weights cannot be read")
+
+    monkeypatch.setattr("mkpc_kaggle.cli.options.assemble", look)
+    output = tmp_path / "submission.csv"
+    assert main(["submit", "--test-dir", str(demo.test_dir), "--output", str(output)]) == 2
+    assert not output.exists(), "a run that is refused leaves nothing"
+
+
+def test_a_current_directory_that_is_gone_is_a_line(tmp_path):
+    script = f"cd {tmp_path} && rmdir {tmp_path} && exec {sys.executable} -m mkpc_kaggle submit --test-dir x"
+    done = subprocess.run(
+        ["sh", "-c", script],
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    assert "error: the current directory is gone" in done.stderr

@@ -10,7 +10,8 @@ from web import Site, serve
 from weight_files import DATA, OTHER, digest_of, line, put
 
 from mkpc_kaggle.cli import main
-from mkpc_kaggle.weights import UNVERIFIED, WeightFile, manifest, store
+from mkpc_kaggle.weights import UNVERIFIED, WeightFile, store
+from mkpc_kaggle.weights.manifest import manifest
 
 FILES = (
     line("sift.pt", slot="sift"),

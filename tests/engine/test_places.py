@@ -5,8 +5,9 @@ from types import SimpleNamespace
 
 import pytest
 
+from mkpc_kaggle.engine import places
 from mkpc_kaggle.engine.jobs import Cause, Failure, Loaded, MatchJob, MatchResult, Phase
-from mkpc_kaggle.engine.places import Place
+from mkpc_kaggle.engine.places import LocalSite, Place
 from mkpc_kaggle.engine.process import ThreadWorker
 from mkpc_kaggle.engine.worker import SceneRunner
 
@@ -69,3 +70,22 @@ def test_an_answer_that_is_there_counts_though_its_time_is_over():
     place.submit(job(), 1.0, 10.0, now=0.0)
     assert place.poll(now=99.0) is DONE
     assert place.worker is not None, "it is not killed"
+
+
+@pytest.mark.parametrize(
+    ("devices", "workers", "shares"),
+    [
+        (("cpu",), None, [1]),
+        (("cpu",), 2, [2, 2]),
+        (("cuda:0",), None, [1]),
+        (("cuda:0", "cuda:1"), None, [2, 2]),
+        (("cuda:0", "cuda:1"), 4, [4] * 4),
+    ],
+)
+def test_the_workers_of_a_machine_share_its_cores_on_gpus_too(monkeypatch, devices, workers, shares):
+    made = SimpleNamespace(pipeline=None)
+    assembly = SimpleNamespace(devices=devices, on=lambda *_: made, on_cpu=lambda: made)
+    monkeypatch.setattr(places, "ProcessWorker", lambda name, make, ring, share: share)
+    site = LocalSite(assembly, workers, lambda: 0.0)
+    assert [place.make() for place in site.places] == shares
+    assert [place.make() for place in site.fallback] == [1] * (devices != ("cpu",))

@@ -120,7 +120,8 @@ if __name__ == "__main__":
 """
 
 
-def test_a_worker_at_work_ends_with_its_parent_and_prints_nothing(tmp_path):
+@pytest.mark.parametrize("is_stopped", [False, True])
+def test_a_worker_at_work_ends_with_its_parent_and_prints_nothing(tmp_path, is_stopped):
     script = tmp_path / "orphan.py"  # a file, since its children import it
     script.write_text(ORPHAN.format(path=[str(ROOT), str(Path(__file__).parent), str(ROOT / "tests" / "support")]))
     mark, home = tmp_path / "hangs", {**os.environ, "MKPC_TEST_HOME": str(tmp_path)}
@@ -129,6 +130,8 @@ def test_a_worker_at_work_ends_with_its_parent_and_prints_nothing(tmp_path):
         assert parent.poll() is None, parent.stderr
         threading.Event().wait(0.05)
     child = os.pidfd_open(int(mark.read_text()))
+    if is_stopped:
+        signal.pidfd_send_signal(child, signal.SIGSTOP)
     parent.kill()
     assert select.select([child], [], [], 120)[0], "it has ended"
     os.close(child)

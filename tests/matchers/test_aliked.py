@@ -10,7 +10,7 @@ from standin import STAND_INS, scene, standin_state
 
 from mkpc_kaggle.matchers.contract import Placement, Precision
 from mkpc_kaggle.matchers.networks.aliked import Aliked, own_name, refined_maxima, strict_maxima
-from mkpc_kaggle.matchers.networks.placement import placed
+from mkpc_kaggle.matchers.networks.placement import prepared
 from mkpc_kaggle.weights import load_tensors
 
 
@@ -21,7 +21,7 @@ def both(state, features=300):
     theirs.load_state_dict(state | grid)
     ours = Aliked(features)
     ours.load_state_dict({own_name(name): tensor for name, tensor in state.items()})
-    return placed(ours, Placement()), theirs
+    return prepared(ours, Placement()), theirs
 
 
 def standin():
@@ -65,7 +65,7 @@ def test_it_finds_what_kornias_finds_with_the_published_weights():
 def test_half_precision_moves_little(precision):
     image = image_of(scene(96, 128, 3))
     (points, descriptors), (half_points, half_descriptors) = (
-        placed(filled_network(), Placement(precision=each))(image)[0] for each in (Precision.FLOAT32, precision)
+        prepared(filled_network(), Placement(precision=each))(image)[0] for each in (Precision.FLOAT32, precision)
     )
     distances = torch.cdist(points, half_points)
     nearest = distances.argmin(dim=1)

@@ -5,10 +5,10 @@ import pytest
 import torch
 from pictures import match_one, picture, same, write_store
 
-from mkpc_kaggle.matchers import dkm
+from mkpc_kaggle.matchers.adapters import dkm
+from mkpc_kaggle.matchers.adapters.dkm import DkmMatcher
 from mkpc_kaggle.matchers.contract import Placement
 from mkpc_kaggle.matchers.dense import DenseEncoding, DenseOptions
-from mkpc_kaggle.matchers.dkm import DkmMatcher
 from mkpc_kaggle.matchers.networks.dense_warp import DenseFeatures, DenseWarp
 from mkpc_kaggle.matchers.networks.dkm import DKM
 from mkpc_kaggle.matchers.networks.grids import as_grid

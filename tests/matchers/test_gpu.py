@@ -98,6 +98,14 @@ def test_gpus_on_which_nothing_can_be_computed_leave_the_work_to_the_cpu(monkeyp
         assert str(assemble("classical").placement) == "device cpu in float32"
 
 
+def test_a_probe_of_the_gpus_that_hangs_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(devices, "ASK_CAPABILITIES", "import time; time.sleep(600)")
+    monkeypatch.setattr(devices, "PROBE_TIMEOUT_S", 0.1)
+    gpu_capabilities.cache_clear()
+    with pytest.raises(UserError, match="no answer for 0 s"):
+        gpu_capabilities()
+
+
 def test_a_device_that_multiplies_and_cannot_convolve_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     def convolve(*_: object) -> None:
         raise RuntimeError("cuDNN error: CUDNN_STATUS_EXECUTION_FAILED_CUDART")

@@ -10,9 +10,9 @@ from standin import scene
 
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Size
-from mkpc_kaggle.matchers import loma
+from mkpc_kaggle.matchers.adapters import loma
+from mkpc_kaggle.matchers.adapters.loma import LomaAdapter, LomaOptions
 from mkpc_kaggle.matchers.contract import Placement, encoding_bytes
-from mkpc_kaggle.matchers.loma import LomaAdapter, LomaOptions
 from mkpc_kaggle.matchers.networks import layers
 from mkpc_kaggle.matchers.networks.loma import Loma, Variant, detector_size
 from mkpc_kaggle.matchers.networks.loma_matcher import LomaKeypoints

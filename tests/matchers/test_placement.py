@@ -6,7 +6,7 @@ from torch import nn
 
 from mkpc_kaggle.matchers.contract import Placement, Precision
 from mkpc_kaggle.matchers.networks.layers import Linear
-from mkpc_kaggle.matchers.networks.placement import fold_norms, placed
+from mkpc_kaggle.matchers.networks.placement import fold_norms, prepared
 from mkpc_kaggle.matchers.networks.resnet_fpn import ResNetFpn
 
 
@@ -38,7 +38,7 @@ def test_a_placed_backbone_gives_the_same_maps_channels_last():
     network = with_random_norms(ResNetFpn())
     image = torch.rand(1, 1, 32, 48)
     expected = network(image)
-    found = placed(network, Placement())(image)
+    found = prepared(network, Placement())(image)
     for got, map_ in ((found.coarse, expected.coarse), (found.fine, expected.fine)):
         torch.testing.assert_close(got, map_, rtol=1e-4, atol=1e-4 * map_.abs().max().item())
     assert found.fine.is_contiguous(memory_format=torch.channels_last)
@@ -50,7 +50,7 @@ def test_half_precision_is_that_of_the_weights():
     network = nn.Sequential(Linear(8, 8), nn.LayerNorm(8))
     x = torch.randn(5, 8)
     expected = network(x)
-    found = placed(network, Placement(precision=Precision.BFLOAT16))(x)
+    found = prepared(network, Placement(precision=Precision.BFLOAT16))(x)
     assert network[0].weight.dtype == torch.bfloat16 and network[1].weight.dtype == torch.float32
     assert found.dtype == torch.float32
     assert 0 < (found - expected).abs().max() < 0.1

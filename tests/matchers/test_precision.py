@@ -15,7 +15,7 @@ from mkpc_kaggle.matchers.networks.aspanformer import AspanFormer
 from mkpc_kaggle.matchers.networks.dkm import DKM
 from mkpc_kaggle.matchers.networks.loftr import Loftr
 from mkpc_kaggle.matchers.networks.pixels import network_input
-from mkpc_kaggle.matchers.networks.placement import placed
+from mkpc_kaggle.matchers.networks.placement import prepared
 from mkpc_kaggle.matchers.networks.quadtree import Quadtree
 from mkpc_kaggle.pipeline.devices import fastest_precision, resolve_placement
 
@@ -25,7 +25,7 @@ half_precisions = pytest.mark.parametrize("precision", [Precision.BFLOAT16, Prec
 
 
 def network(name, precision=Precision.FLOAT32):
-    return placed(filled(MAKERS[name](), name), Placement(precision=precision))
+    return prepared(filled(MAKERS[name](), name), Placement(precision=precision))
 
 
 def pictures(size, channels):

@@ -5,11 +5,15 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
+from sklearn.datasets import load_sample_image
 
-from mkpc_kaggle import matchers
+from mkpc_kaggle import Recipe, TwoStageMatcher, matchers
 from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.matchers import adapters
 from mkpc_kaggle.matchers.registry import matcher_names, spec_of
+from mkpc_kaggle.recipe import Unit
 
 WITHOUT_KORNIA = """
 import sys
@@ -28,12 +32,12 @@ assemble("light")
 @pytest.fixture
 def more_matchers(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Path]:
     """A folder whose files are matchers too."""
-    monkeypatch.setattr(matchers, "__path__", [*matchers.__path__, str(tmp_path)])
+    monkeypatch.setattr(adapters, "__path__", [*adapters.__path__, str(tmp_path)])
     matcher_names.cache_clear()
     yield tmp_path
     matcher_names.cache_clear()
-    for name in ("new", "broken"):
-        sys.modules.pop(f"{matchers.__name__}.{name}", None)
+    for name in ("new", "broken", "orb"):
+        sys.modules.pop(f"{adapters.__name__}.{name}", None)
 
 
 def run(code: str) -> subprocess.CompletedProcess[str]:
@@ -50,6 +54,16 @@ def test_a_new_matcher_is_a_new_file(more_matchers: Path) -> None:
     assert spec_of("new", "test").summary == "one more"
 
 
+def test_the_template_of_a_matcher_is_a_matcher(more_matchers: Path) -> None:
+    page = (Path(__file__).parents[2] / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    (more_matchers / "orb.py").write_text(page.split("```python\n")[1].split("```")[0])
+    image = load_sample_image("china.jpg")
+    match = TwoStageMatcher(Recipe((Unit(1, "orb", 640), Unit(2, "orb", 640))))(image, image)
+    assert match.estimate.inlier_count > 500
+    flat = np.zeros_like(image)
+    assert not TwoStageMatcher(Recipe((Unit(1, "orb", 640),)))(image, flat).estimate.ok
+
+
 def test_a_broken_matcher_is_told_with_its_reason_and_costs_no_other(more_matchers: Path) -> None:
     (more_matchers / "broken.py").write_text("from json import no_such_thing\nSPEC = None\n")
     with pytest.raises(UserError, match=r"my recipe: matcher broken cannot be used here \(ImportError: .*no_such"):
@@ -57,8 +71,10 @@ def test_a_broken_matcher_is_told_with_its_reason_and_costs_no_other(more_matche
     assert spec_of("sift", "test").name == "sift"
 
 
-def test_files_without_a_spec_are_not_matchers() -> None:
-    assert not {"contract", "registry", "sparse", "neighbours"} & set(matcher_names())
+def test_what_matchers_share_is_no_matcher() -> None:
+    shared = {path.stem for path in Path(matchers.__file__).parent.glob("*.py")}
+    assert {"contract", "registry", "sparse"} <= shared
+    assert not shared & set(matcher_names())
     with pytest.raises(UserError, match="unknown matcher 'sparse'; known: aliked, "):
         spec_of("sparse", "test")
 

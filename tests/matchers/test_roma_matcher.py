@@ -7,10 +7,10 @@ from pictures import as_picture, picture, write_store
 from standin import filled, narrow_roma, scene, use_narrow
 
 from mkpc_kaggle.geometry.coordinates import Size
-from mkpc_kaggle.matchers import roma
+from mkpc_kaggle.matchers.adapters import roma
+from mkpc_kaggle.matchers.adapters.roma import RomaMatcher, RomaOptions
 from mkpc_kaggle.matchers.contract import Placement, Precision
 from mkpc_kaggle.matchers.networks.roma import stretch
-from mkpc_kaggle.matchers.roma import RomaMatcher, RomaOptions
 from mkpc_kaggle.weights import WeightStore
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*is not verified")

@@ -11,7 +11,7 @@ from pictures import picture, write_store
 from torch import nn
 
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.matchers import aspanformer, loftr, quadtree
+from mkpc_kaggle.matchers.adapters import aspanformer, loftr, quadtree
 from mkpc_kaggle.matchers.contract import Picture, Placement, Training
 from mkpc_kaggle.matchers.networks.aspanformer import AspanFormer
 from mkpc_kaggle.matchers.networks.loftr import Loftr

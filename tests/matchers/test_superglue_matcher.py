@@ -5,7 +5,7 @@ import torch
 from pictures import picture, write_store
 
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.matchers import superglue
+from mkpc_kaggle.matchers.adapters import superglue
 from mkpc_kaggle.matchers.contract import Placement, Training
 from mkpc_kaggle.matchers.networks.superglue import SuperGlue
 from mkpc_kaggle.matchers.networks.superpoint import SuperPoint

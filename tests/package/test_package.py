@@ -16,10 +16,12 @@ from kaggle_image import UNPACKED, environment, python_version, upload
 from shared import contents
 from weight_files import digest_of, line, put
 
+from mkpc_kaggle import __version__
 from mkpc_kaggle.cli import main
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.package import Package, Request, find_checkout, make_package
 from mkpc_kaggle.package import package as module
+from mkpc_kaggle.package.weights import licence_text
 from mkpc_kaggle.package.wheels import BUNDLED, PYTHONS, build_wheel, install_lines, pins
 from mkpc_kaggle.weights import WeightStore, load_tensors, store
 from mkpc_kaggle.weights.manifest import read_manifest
@@ -77,6 +79,14 @@ def metadata_of(out: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     return json.loads(dataset), json.loads(kernel)
 
 
+def test_a_licence_tag_leads_to_no_text_but_those_of_licences() -> None:
+    checkout = find_checkout()
+    assert licence_text(checkout, "MIT") == checkout / "licences" / "MIT.txt"
+    assert licence_text(checkout, "Apache-2.0") == checkout / "LICENSE"
+    for tag in ("../requirements-dev", "../licences/MIT", str(checkout / "licences" / "MIT"), "", "no-such"):
+        assert licence_text(checkout, tag) is None
+
+
 def test_the_dataset_holds_wheels_weights_and_their_licences(made):
     (out, package), dataset = made, made[0] / "dataset"
     names = {path.name for path in dataset.iterdir()}
@@ -87,6 +97,7 @@ def test_the_dataset_holds_wheels_weights_and_their_licences(made):
     assert not [name for name in names if name.startswith("kept.pt")]
     assert [item.name for item in package.restricted] == ["kept.pt"]
     assert "MIT" in metadata_of(out)[0]["description"]
+    assert metadata_of(out)[0]["title"] == f"MKPC Kaggle {__version__}"  # two datasets can be told apart
     assert {item.name: item.licence for item in package.dataset}["free.pt.safetensors"] == "MIT"
 
 

@@ -20,7 +20,7 @@ from mkpc_kaggle.matchers.networks.dinov2 import DinoV2, DinoV2Config
 from mkpc_kaggle.matchers.networks.loma import UNUSED, Loma, Variant, detector_size, parameter_name
 from mkpc_kaggle.matchers.networks.loma_matcher import LomaKeypoints, LomaMatcher
 from mkpc_kaggle.matchers.networks.pixels import resized
-from mkpc_kaggle.matchers.networks.placement import placed
+from mkpc_kaggle.matchers.networks.placement import prepared
 from mkpc_kaggle.weights import load_into
 
 TOLERANCES = {"score_map": 1e-4, "keypoints": 1e-6, "dense_descriptors": 2e-4, "descriptors": 2e-4}
@@ -49,7 +49,7 @@ def filled(network, tensors, part):
     ours = {parameter_name(name): tensor for name, tensor in tensors.items()}
     fitting = {name.removeprefix(part): tensor for name, tensor in ours.items() if not re.match(UNUSED, name)}
     load_into(network, fitting, what="golden")
-    return placed(network, Placement())
+    return prepared(network, Placement())
 
 
 def image_of(pixels):
@@ -194,7 +194,7 @@ def whole(variant):
     network = Loma(variant)
     tensors = {parameter_name(n): t for n, t in standin_state("loma", variant.upper()).items()}
     load_into(network, tensors, what="golden", unused=UNUSED)
-    return placed(network, Placement())
+    return prepared(network, Placement())
 
 
 CASES = {f"detector_{case}": partial(detector_stages, case) for case in ("160x208", "157x203", "batch2_72x96")}

@@ -1,5 +1,7 @@
 """The two stages on pictures whose correspondence is known, with real and with misbehaving matchers."""
 
+import multiprocessing
+import warnings
 from collections import Counter
 from dataclasses import dataclass, replace
 from functools import cache
@@ -18,8 +20,8 @@ from mkpc_kaggle.geometry.coordinates import Box, Size
 from mkpc_kaggle.geometry.focal_prior import FocalConfig, FocalPrior, estimate_with_prior
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import ModelKind
+from mkpc_kaggle.matchers.adapters.sift import SiftMatcher, SiftOptions
 from mkpc_kaggle.matchers.contract import MatcherSpec
-from mkpc_kaggle.matchers.sift import SiftMatcher, SiftOptions
 from mkpc_kaggle.pipeline import stages
 from mkpc_kaggle.pipeline.pair import PairMatch, with_estimate
 from mkpc_kaggle.pipeline.stages import Pipeline
@@ -307,3 +309,19 @@ def test_the_wait_for_the_device_counts_as_encoding_not_as_matching(monkeypatch)
     monkeypatch.setattr(stages.time, "perf_counter", lambda: now[0])
     (result,) = TwoStageMatcher(SIFT)(*pair()).results
     assert (result.encode_seconds, result.seconds) == (2, 2)  # two images, one at a time
+
+
+def test_a_matcher_in_a_forked_child_says_that_it_was_forked():
+    match = TwoStageMatcher(SIFT)
+    match(*pair())
+    child = multiprocessing.get_context("fork").Process(target=in_child, args=(match,))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # of Python 3.12: forks of processes with threads
+        child.start()
+    child.join()
+    assert child.exitcode == 0
+
+
+def in_child(match):
+    with pytest.raises(UserError, match="before the process forked"):
+        match(*pair())

@@ -12,7 +12,7 @@ import torch
 from shared import SHARED
 
 from mkpc_kaggle.matchers.contract import Placement
-from mkpc_kaggle.matchers.networks.placement import placed
+from mkpc_kaggle.matchers.networks.placement import prepared
 
 GOLDEN = SHARED / "golden"
 
@@ -62,7 +62,7 @@ def recorded(network, names):
 def ready(network, state):
     """The network with these weights as it runs, its batch norms folded."""
     network.load_state_dict(state, strict=True)
-    return placed(network.eval(), Placement())
+    return prepared(network.eval(), Placement())
 
 
 def _module(path):

@@ -13,28 +13,37 @@ from kornia.feature import DISK, XFeat
 from torch import nn
 
 from mkpc_kaggle.geometry.coordinates import Box, Size, View
-from mkpc_kaggle.matchers import aliked_lightglue, aspanformer, disk_lightglue, loftr, quadtree, xfeat_lighterglue
-from mkpc_kaggle.matchers.aliked import AlikedMatcher, AlikedOptions
+from mkpc_kaggle.matchers.adapters import (
+    aliked_lightglue,
+    aspanformer,
+    disk_lightglue,
+    loftr,
+    quadtree,
+    xfeat_lighterglue,
+)
+from mkpc_kaggle.matchers.adapters.aliked import AlikedMatcher, AlikedOptions
+from mkpc_kaggle.matchers.adapters.disk_lightglue import disk_encoder
+from mkpc_kaggle.matchers.adapters.dkm import DkmMatcher
+from mkpc_kaggle.matchers.adapters.loma import LomaAdapter, LomaOptions
+from mkpc_kaggle.matchers.adapters.roma import RomaMatcher, RomaOptions
+from mkpc_kaggle.matchers.adapters.superglue import SuperGlueMatcher
+from mkpc_kaggle.matchers.adapters.xfeat_lighterglue import xfeat_encoder
 from mkpc_kaggle.matchers.contract import Colour, MatcherSpec, Picture, Placement
 from mkpc_kaggle.matchers.dense import DenseOptions
-from mkpc_kaggle.matchers.disk_lightglue import disk_encoder
-from mkpc_kaggle.matchers.dkm import DkmMatcher
 from mkpc_kaggle.matchers.lightglue import LightGlueMatcher, light_glue
-from mkpc_kaggle.matchers.loma import LomaAdapter, LomaOptions
 from mkpc_kaggle.matchers.networks.aliked import Aliked
 from mkpc_kaggle.matchers.networks.aspanformer import AspanFormer
 from mkpc_kaggle.matchers.networks.dkm import DKM
+from mkpc_kaggle.matchers.networks.keypt2subpx import Keypt2Subpx
 from mkpc_kaggle.matchers.networks.loftr import Loftr
 from mkpc_kaggle.matchers.networks.loma import Loma, Variant
-from mkpc_kaggle.matchers.networks.placement import placed
+from mkpc_kaggle.matchers.networks.placement import prepared
 from mkpc_kaggle.matchers.networks.quadtree import Quadtree
 from mkpc_kaggle.matchers.networks.superglue import SuperGlue
 from mkpc_kaggle.matchers.networks.superpoint import SuperPoint
-from mkpc_kaggle.matchers.roma import RomaMatcher, RomaOptions
 from mkpc_kaggle.matchers.semi_dense import SemiDenseMatcher
 from mkpc_kaggle.matchers.sparse import KeypointEncoder
-from mkpc_kaggle.matchers.superglue import SuperGlueMatcher
-from mkpc_kaggle.matchers.xfeat_lighterglue import xfeat_encoder
+from mkpc_kaggle.matchers.subpixel import Refiner
 from tests.support.standin import filled, narrow_roma, scene
 
 SIZE = Size(96, 64)
@@ -49,7 +58,7 @@ def standin(name: str, make: Callable[..., nn.Module], *settings: Any, **named: 
 
 def ours(placement: Placement, *network: Any, **named: Any) -> Any:
     """A network of ours, ready to run there."""
-    return placed(copy.deepcopy(standin(*network, **named)), placement)
+    return prepared(copy.deepcopy(standin(*network, **named)), placement)
 
 
 def kornias(*network: Any, **named: Any) -> Any:
@@ -88,10 +97,16 @@ def aliked_matcher(placement: Placement, keypoints: int = 200) -> AlikedMatcher:
 
 
 def with_lightglue(
-    spec: MatcherSpec, encoder: KeypointEncoder, placement: Placement, layers: int, threshold: float, **shape: int
+    spec: MatcherSpec,
+    encoder: KeypointEncoder,
+    placement: Placement,
+    layers: int,
+    threshold: float,
+    refiner: Refiner | None = None,
+    **shape: int,
 ) -> LightGlueMatcher:
     glue = kornias("lightglue", light_glue, layers, threshold, **shape)
-    return LightGlueMatcher(spec, encoder, glue, placement)
+    return LightGlueMatcher(spec, encoder, glue, placement, refiner)
 
 
 def aliked_lightglue_matcher(
@@ -113,12 +128,17 @@ def make_xfeat() -> nn.Module:
 
 
 def xfeat_lighterglue_matcher(
-    placement: Placement, keypoints: int = 200, layers: int = 2, threshold: float = 0.0
+    placement: Placement, keypoints: int = 200, layers: int = 2, threshold: float = 0.0, refine: bool = False
 ) -> LightGlueMatcher:
     network = XFeat(top_k=keypoints, detection_threshold=0.0)
     network.net = kornias("xfeat", make_xfeat)
-    encoder, shape = xfeat_encoder(network, keypoints, placement), xfeat_lighterglue.SHAPE
-    return with_lightglue(xfeat_lighterglue.SPEC, encoder, placement, layers, threshold, **shape)
+    refiner = None
+    if refine:
+        refiner = Refiner(
+            kornias("keypt2subpx", Keypt2Subpx, xfeat_lighterglue.DESCRIPTOR_DIM).to(placement.device)
+        )
+    encoder, shape = xfeat_encoder(network, keypoints, placement, refiner), xfeat_lighterglue.SHAPE
+    return with_lightglue(xfeat_lighterglue.SPEC, encoder, placement, layers, threshold, refiner, **shape)
 
 
 MATCHERS: dict[str, Callable[[Placement], Any]] = {
@@ -134,6 +154,7 @@ MATCHERS: dict[str, Callable[[Placement], Any]] = {
     "aliked_lightglue": aliked_lightglue_matcher,
     "disk_lightglue": disk_lightglue_matcher,
     "xfeat_lighterglue": xfeat_lighterglue_matcher,
+    "xfeat_lighterglue, refined": partial(xfeat_lighterglue_matcher, refine=True),
 }
 
 

@@ -51,9 +51,9 @@ class _Handler(BaseHTTPRequestHandler):
             self.send_header("Content-Length", str(site.length or len(body)))
         self.end_headers()
         body = body[: site.breaks.pop(0)] if site.breaks else body
+        site.sent += len(body)  # before the client has them and looks
         with suppress(ConnectionError):
             self.wfile.write(body)
-        site.sent += len(body)
 
     def log_message(self, *_: object) -> None:
         pass

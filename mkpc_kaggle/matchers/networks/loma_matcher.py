@@ -27,7 +27,7 @@ class LomaKeypoints:
 
 
 class RotaryEmbedding(nn.Module):
-    """The rotations of pairs of channels, by angles that are linear in the place of a keypoint."""
+    """The rotations of pairs of channels, by angles that are linear in the position of a keypoint."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -16,7 +16,7 @@ Norm = nn.BatchNorm1d | nn.BatchNorm2d
 Layer = nn.Linear | nn.Conv1d | nn.Conv2d
 
 
-def placed(network: Network, placement: Placement) -> Network:
+def prepared(network: Network, placement: Placement) -> Network:
     """The network, changed in place; checkpoints cannot be loaded afterwards.
 
     The weights of convolutions and linear layers, :class:`Exact` ones apart, get the placement's precision, and

@@ -148,7 +148,7 @@ class AnchorDecoder(nn.Module):
 
 
 def anchor_mean(logits: Tensor) -> Tensor:
-    """The mean place (..., 2) of the most likely anchor of (..., 4096) and its four neighbours, by probability.
+    """The mean position (..., 2) of the most likely anchor of (..., 4096) and its four neighbours, by probability.
 
     As in training, neighbours are next in a row or 64 away, also across the ends of rows; those before the first
     anchor or after the last count as that one.

@@ -42,14 +42,14 @@ def pointwise_network(*channels: int) -> nn.Sequential:
 
 
 class PositionEncoder(nn.Module):
-    """(1, N, 256) from the places of keypoints, (1, N, 3): normalised x and y, score."""
+    """(1, N, 256) from the positions of keypoints, (1, N, 3): normalised x and y, score."""
 
     def __init__(self) -> None:
         super().__init__()
         self.encoder = pointwise_network(3, 32, 64, 128, 256, CHANNELS)
 
-    def forward(self, placed: Tensor) -> Tensor:
-        return _on_rows(self.encoder, placed)
+    def forward(self, positions: Tensor) -> Tensor:
+        return _on_rows(self.encoder, positions)
 
 
 class SuperGlueAttention(nn.Module):

@@ -59,6 +59,6 @@ def short(name: str, most: int = 18) -> str:
 def sample(mask: NDArray[np.bool_], most: int) -> NDArray[np.intp]:
     """At most ``most`` indices of a mask, evenly spread."""
     indices: NDArray[np.intp] = np.flatnonzero(mask)
-    places = np.linspace(0, len(indices) - 1, min(most, len(indices))).round().astype(int)
-    chosen: NDArray[np.intp] = indices[places]
+    evenly = np.linspace(0, len(indices) - 1, min(most, len(indices))).round().astype(int)
+    chosen: NDArray[np.intp] = indices[evenly]
     return chosen

@@ -8,7 +8,7 @@ import torch
 from mkpc_kaggle.config import AT_LEAST_0, AT_LEAST_1, SHARE, check_ranges
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import Colour, MatcherSpec, PairwiseMatcher, Picture, Placement, Training
-from mkpc_kaggle.matchers.networks.placement import placed
+from mkpc_kaggle.matchers.networks.placement import prepared
 from mkpc_kaggle.matchers.networks.superglue import SuperGlue
 from mkpc_kaggle.matchers.networks.superpoint import SuperPoint, SuperPointKeypoints
 from mkpc_kaggle.matchers.sparse import image_batch, matches_of
@@ -69,4 +69,4 @@ def load(weights: WeightStore, options: SuperGlueOptions, placement: Placement) 
     superglue = SuperGlue(options.sinkhorn_iterations, options.match_threshold)
     for network, slot in zip((superpoint, superglue), SPEC.slots_for(options), strict=True):
         load_into(network, weights.load(slot), what=slot)
-    return SuperGlueMatcher(placed(superpoint, placement), placed(superglue, placement), placement.device)
+    return SuperGlueMatcher(prepared(superpoint, placement), prepared(superglue, placement), placement.device)

@@ -3,7 +3,7 @@
 from mkpc_kaggle.matchers.contract import MatcherSpec, Placement
 from mkpc_kaggle.matchers.dense import DenseMatcher, DenseOptions
 from mkpc_kaggle.matchers.networks.dkm import DKM
-from mkpc_kaggle.matchers.networks.placement import placed
+from mkpc_kaggle.matchers.networks.placement import prepared
 from mkpc_kaggle.weights import WeightStore, load_into
 
 # Published are one pass of 540 x 720 or 480 x 640 (indoors), and two of 864 x 1152. The licence is that of the
@@ -19,4 +19,4 @@ def load(weights: WeightStore, options: DenseOptions, placement: Placement) -> D
     network = DKM()
     (slot,) = SPEC.slots_for(options)
     load_into(network, weights.load(slot), what=slot)
-    return DkmMatcher(placed(network, placement), options, placement.device)
+    return DkmMatcher(prepared(network, placement), options, placement.device)

@@ -6,7 +6,7 @@ from mkpc_kaggle.config import AT_LEAST_1, SHARE, check_ranges
 from mkpc_kaggle.matchers.contract import MatcherSpec, Placement
 from mkpc_kaggle.matchers.neighbours import NeighbourMatcher
 from mkpc_kaggle.matchers.networks.aliked import Aliked, own_name
-from mkpc_kaggle.matchers.networks.placement import placed
+from mkpc_kaggle.matchers.networks.placement import prepared
 from mkpc_kaggle.matchers.sparse import KeypointEncoder
 from mkpc_kaggle.weights import WeightStore, load_into
 
@@ -46,7 +46,7 @@ def load_encoder(weights: WeightStore, features: int, placement: Placement) -> K
     """ALIKED's, for every matcher of its keypoints."""
     network = Aliked(features)
     load_into(network, {own_name(name): tensor for name, tensor in weights.load(SLOT).items()}, what=SLOT)
-    return KeypointEncoder(placed(network, placement), placement.device)
+    return KeypointEncoder(prepared(network, placement), placement.device)
 
 
 def load(weights: WeightStore, options: AlikedOptions, placement: Placement) -> AlikedMatcher:

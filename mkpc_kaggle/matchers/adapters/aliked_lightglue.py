@@ -1,6 +1,6 @@
 """ALIKED keypoints (Zhao et al. 2023) matched by LightGlue (Lindenberger et al. 2023)."""
 
-from mkpc_kaggle.matchers.aliked import SLOT, load_encoder
+from mkpc_kaggle.matchers.adapters.aliked import SLOT, load_encoder
 from mkpc_kaggle.matchers.contract import MatcherSpec, Placement
 from mkpc_kaggle.matchers.lightglue import LightGlueMatcher, LightGlueOptions, load_glue
 from mkpc_kaggle.weights import WeightStore

@@ -27,10 +27,10 @@ PANELS = (  # what draw_errors draws: kind, unit, thresholds of the mAA, limits 
 def draw_scores(validations: Sequence["Validation"]) -> "Figure":
     """A row for each scene and for their mean, a mark for each recipe: its mAA."""
     figure, axes = _rows([scene.scene for scene in validations[0].scenes], "mAA of each scene, by recipe")
-    for place, validation in enumerate(validations):
+    for index, validation in enumerate(validations):
         values = [*(scene.maa for scene in validation.scenes), validation.maa]
-        y = _beside(len(values), place, len(validations))
-        axes.plot(values, y, **_style(place), linestyle="", label=validation.recipe)
+        y = _beside(len(values), index, len(validations))
+        axes.plot(values, y, **_style(index), linestyle="", label=validation.recipe)
     axes.set(xlim=(-0.02, 1.02), xlabel="mAA")
     _legend_below(figure)
     return figure
@@ -40,10 +40,10 @@ def draw_gains(comparison: "Comparison") -> "Figure":
     """A row for each scene and for their mean: what each recipe gains over the first, with its interval."""
     first, *others = comparison.validations
     figure, axes = _rows(comparison.scenes, f"gain of mAA over {first.recipe}, with 95 % intervals")
-    for place, other in enumerate(others):
-        found = [comparison.difference(place + 1, name) for name in (*comparison.scenes, None)]
+    for index, other in enumerate(others):
+        found = [comparison.difference(index + 1, name) for name in (*comparison.scenes, None)]
         gains, low, high = np.array([(gain.gain, gain.low, gain.high) for gain in found]).T
-        y, style = _beside(len(found), place, len(others)), _style(place + 1)
+        y, style = _beside(len(found), index, len(others)), _style(index + 1)
         axes.errorbar(
             gains, y, xerr=(gains - low, high - gains), **style, linestyle="", capsize=4, label=other.recipe
         )
@@ -61,10 +61,10 @@ def draw_errors(validations: Sequence["Validation"]) -> "Figure":
         axes.axvspan(
             thresholds[0], thresholds[-1], color=DROPPED, alpha=0.2, linewidth=0, label="mAA's thresholds"
         )
-        for place, validation in enumerate(validations):
+        for index, validation in enumerate(validations):
             # Failures are infinite: they go beyond the right edge, so that their curve ends below 1.
             errors = np.clip([getattr(error, kind) for error in validation.errors], limits[0], 2 * limits[1])
-            style = {"color": _style(place)["color"], "linestyle": DASHES[place % len(DASHES)]}
+            style = {"color": _style(index)["color"], "linestyle": DASHES[index % len(DASHES)]}
             axes.ecdf(errors, **style, linewidth=2, label=validation.recipe)
         axes.set(xscale="log", xlim=limits, ylim=(0, 1.01), xlabel=f"{kind} error in {unit}")
         axes.xaxis.set_major_formatter("{x:g}")
@@ -85,14 +85,14 @@ def _rows(scenes: Sequence[str], title: str) -> "tuple[Figure, Axes]":
     return figure, axes
 
 
-def _beside(rows: int, place: int, places: int) -> NDArray[np.float64]:
-    """(rows,) heights of the marks of a recipe, at ``place`` of the ``places`` that share each row."""
-    return np.arange(rows, dtype=np.float64) + 0.5 * ((place + 0.5) / places - 0.5)
+def _beside(rows: int, index: int, count: int) -> NDArray[np.float64]:
+    """(rows,) heights of the marks of a recipe, number ``index`` of the ``count`` that share each row."""
+    return np.arange(rows, dtype=np.float64) + 0.5 * ((index + 0.5) / count - 0.5)
 
 
-def _style(place: int) -> dict[str, Any]:
-    """The style of a recipe, by its place, the same in all figures; told apart by shape, too; 42 in all."""
-    return {"color": COLOURS[place % len(COLOURS)], "marker": MARKERS[place % len(MARKERS)], "markersize": 7}
+def _style(index: int) -> dict[str, Any]:
+    """The style of a recipe, by its index, the same in all figures; told apart by shape, too; 42 in all."""
+    return {"color": COLOURS[index % len(COLOURS)], "marker": MARKERS[index % len(MARKERS)], "markersize": 7}
 
 
 def _legend_below(figure: "Figure") -> None:

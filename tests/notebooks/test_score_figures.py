@@ -4,11 +4,11 @@ from math import inf
 
 import numpy as np
 import pytest
+import score_figures as figures
 
 from mkpc_kaggle.evaluation.compare import Comparison
 from mkpc_kaggle.evaluation.validate import PairScore, SceneScore, Validation
 from mkpc_kaggle.geometry.metrics import PoseError
-from mkpc_kaggle.reporting.figures import scores as figures
 
 
 def scene(name: str, *rotations: float) -> SceneScore:

@@ -2,7 +2,7 @@
 
 from mkpc_kaggle.matchers.contract import Colour, MatcherSpec, Placement, Training
 from mkpc_kaggle.matchers.networks.loftr import Loftr
-from mkpc_kaggle.matchers.networks.placement import placed
+from mkpc_kaggle.matchers.networks.placement import prepared
 from mkpc_kaggle.matchers.semi_dense import SemiDenseMatcher, SemiDenseOptions, load_network
 from mkpc_kaggle.weights import WeightStore
 
@@ -26,4 +26,4 @@ def load(weights: WeightStore, options: SemiDenseOptions, placement: Placement) 
     is_indoor = options.training is Training.INDOOR
     network = Loftr(options.threshold, BORDERS[options.training], fixed_positions=is_indoor)
     load_network(network, weights, *SPEC.slots_for(options))
-    return SemiDenseMatcher(placed(network, placement), SPEC, placement.device)
+    return SemiDenseMatcher(prepared(network, placement), SPEC, placement.device)

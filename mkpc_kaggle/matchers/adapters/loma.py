@@ -12,7 +12,7 @@ from mkpc_kaggle.matchers.contract import MatcherSpec, PairwiseMatcher, Picture,
 from mkpc_kaggle.matchers.networks.loma import UNUSED, WIDTHS, Loma, Variant, detector_size, parameter_name
 from mkpc_kaggle.matchers.networks.loma_matcher import LomaKeypoints
 from mkpc_kaggle.matchers.networks.pixels import resized
-from mkpc_kaggle.matchers.networks.placement import placed
+from mkpc_kaggle.matchers.networks.placement import prepared
 from mkpc_kaggle.weights import WeightStore, load_into
 
 PATCH = 14  # pixels: the side of the descriptor's input is a multiple of this
@@ -87,4 +87,4 @@ def load(weights: WeightStore, options: LomaOptions, placement: Placement) -> Lo
         network = Loma(options.variant)
     tensors = {parameter_name(name): tensor for name, tensor in weights.load(slot).items()}
     load_into(network, tensors, what=slot, unused=UNUSED)
-    return LomaAdapter(placed(network, placement), options, placement.device)
+    return LomaAdapter(prepared(network, placement), options, placement.device)

@@ -7,7 +7,7 @@ import torch
 from mkpc_kaggle.matchers.contract import MatcherSpec, Placement
 from mkpc_kaggle.matchers.dense import DenseMatcher, DenseOptions
 from mkpc_kaggle.matchers.networks.dinov2 import PATCH
-from mkpc_kaggle.matchers.networks.placement import placed
+from mkpc_kaggle.matchers.networks.placement import prepared
 from mkpc_kaggle.matchers.networks.roma import RoMa
 from mkpc_kaggle.weights import WeightStore, load_into
 
@@ -36,4 +36,4 @@ def load(weights: WeightStore, options: RomaOptions, placement: Placement) -> Ro
         network = RoMa()
     tensors = {f"dinov2.{name}": tensor for name, tensor in weights.load(backbone).items()}
     load_into(network, tensors | weights.load(own), what=f"{own} with {backbone}")
-    return RomaMatcher(placed(network, placement), options, placement.device)
+    return RomaMatcher(prepared(network, placement), options, placement.device)

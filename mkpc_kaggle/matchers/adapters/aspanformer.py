@@ -2,7 +2,7 @@
 
 from mkpc_kaggle.matchers.contract import Colour, MatcherSpec, Placement, Training
 from mkpc_kaggle.matchers.networks.aspanformer import AspanFormer
-from mkpc_kaggle.matchers.networks.placement import placed
+from mkpc_kaggle.matchers.networks.placement import prepared
 from mkpc_kaggle.matchers.semi_dense import SemiDenseMatcher, SemiDenseOptions, load_network
 from mkpc_kaggle.weights import WeightStore
 
@@ -24,4 +24,4 @@ def load(weights: WeightStore, options: SemiDenseOptions, placement: Placement) 
     network = AspanFormer(options.threshold, *GRIDS[options.training])
     # Checkpoints also have offsets that the published network never reads.
     load_network(network, weights, *SPEC.slots_for(options), unused=r".*\.sample_offset$")
-    return SemiDenseMatcher(placed(network, placement), SPEC, placement.device)
+    return SemiDenseMatcher(prepared(network, placement), SPEC, placement.device)

@@ -1,0 +1,3 @@
+"""The version: a leaf, so that any layer may say it."""
+
+__version__ = "0.2.0"
