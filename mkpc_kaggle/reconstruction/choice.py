@@ -1,6 +1,5 @@
 """Which images of a folder are matched with each other, and which of them are turned for it."""
 
-import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -26,12 +25,6 @@ class RunEndedError(Exception):
 
     def __init__(self, ending: Ending, session: Session, faults: tuple[str, ...] = ()) -> None:
         self.report = RunReport((), ending, session.budget.spent(), 0, faults)
-
-
-def digest_of_names(datasets: Datasets) -> str:
-    """Tells folders of images apart."""
-    names = json.dumps([[name, [file.name for file in files]] for name, files in datasets.items()])
-    return hashlib.sha256(names.encode()).hexdigest()
 
 
 def choose_pairs(
@@ -79,9 +72,8 @@ def find_partners(
     if not journal.tasks().issuperset(comparisons):
         for phase, tasks in (("look", looks), ("compare", comparisons)):
             if not run_tasks(phase, tasks, journal, session):
-                raise RunEndedError(
-                    Ending.INTERRUPTED if session.interrupt.is_set() else Ending.TIME_IS_UP, session
-                )
+                ending = Ending.INTERRUPTED if session.interrupt.is_set() else Ending.TIME_IS_UP
+                raise RunEndedError(ending, session)
     answers = {name: journal.task(key) for name, key in zip(counts, comparisons, strict=True)}
     if lost := [f"the images of {name} were not compared" for name, answer in answers.items() if not answer]:
         raise RunEndedError(Ending.NO_WORKER, session, tuple(lost))

@@ -18,7 +18,7 @@ from mkpc_kaggle.matchers.contract import Matcher
 from mkpc_kaggle.pipeline.assembly import Assembly, assemble
 from mkpc_kaggle.pipeline.pair import PairMatch
 from mkpc_kaggle.recipe import CameraSharing, Recipe, SceneConfig, load_recipe
-from mkpc_kaggle.reconstruction.choice import MAX_IMAGES, RunEndedError, choose_pairs, digest_of_names
+from mkpc_kaggle.reconstruction.choice import MAX_IMAGES, RunEndedError, choose_pairs
 from mkpc_kaggle.reconstruction.directory import claim, settle
 from mkpc_kaggle.reconstruction.folder import Datasets, Ends
 from mkpc_kaggle.reconstruction.likeness import PARTNERS, local_features, most_alike, shortlist
@@ -67,7 +67,7 @@ def reconstruct_folder(
     assembly = replace(assembly, recipe=for_cameras(assembly.recipe))
     gone = claim(out, datasets)
     none: Cameras = {name: dict.fromkeys(files) for name, files in datasets.items()}
-    belongs_to = {"images": digest_of_names(datasets)}
+    belongs_to = {"images": {name: [file.name for file in files] for name, files in datasets.items()}}
     with Journal(session.work_dir / "images", belongs_to, fresh=session.fresh) as journal:
         settle(out, datasets, gone)
         for name in gone:
@@ -107,7 +107,7 @@ def cameras_of(
     for name, files in datasets.items():
         by_name = {file.name: versions.get(file) for file in files}
         known = {by_name[camera.image]: camera for camera in reversed(placed.get(name, ()))}
-        cameras[name] = {file: known.get(by_name[file.name]) if by_name[file.name] else None for file in files}
+        cameras[name] = {file: known.get(by_name[file.name] or "") for file in files}
     return cameras
 
 

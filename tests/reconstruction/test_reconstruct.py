@@ -489,7 +489,7 @@ def test_orientations_go_on_where_a_run_was_cut_off(tmp_path):
     total, ending = 0, Ending.INTERRUPTED
     for _ in range(100):
         matcher = Counted()
-        matcher.interrupt, matcher.after = Interrupt(), 9
+        matcher.interrupt, matcher.after = Interrupt(), 20
         result = run(tmp_path / "images", out, matcher, rotations=True)
         total, ending = total + matcher.count, result.report.ending
         if ending is Ending.COMPLETE:
