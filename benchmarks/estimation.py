@@ -1,50 +1,53 @@
 """F by MAGSAC, under a prior on focal lengths, and from the cameras of the batch, on the same matches.
 
-python -m benchmarks.estimation --train-dir DIR --matches DIR [--recipes classical light] [--scenes NAME ...]
-    [--shares 1 0.3 0.12] [--seeds 1] [--estimates NAME ...] [--pairs-per-image 0 5 10]
+python -m benchmarks.estimation --train-dir DIR --journals DIR [DIR ...] [--scenes NAME ...] [--seeds 1]
+    [--shares 1 0.3 0.12] [--estimates NAME ...] [--pairs-per-image 0 5 10] [--thresholds PIXELS ...]
 
-MATCHES is what `benchmarks.saved_matches` wrote; pairs without a file are left out. For each recipe and share
-of a scene's pairs, drawn by seed, a row for each estimate: mAA by scene and in the mean, its gain over the first
-estimate with the 95 % interval of resampled pairs, and seconds of this process, a pair or a batch. With a number
-of pairs for each image, the scene also has what the first unit found on extra pairs.
+The matches are those of journals, work directories of `validate`; pairs that a journal lacks are left out. For
+each journal and share of a scene's pairs, drawn by seed, a row for each estimate: mAA by scene and in the mean,
+its gain over the first estimate with the 95 % interval of resampled pairs, and seconds of this process, a pair or
+a batch. With a number of pairs for each image, the scene also has what the first unit found on extra pairs. With
+thresholds of MAGSAC, there are two rows for each instead: MAGSAC alone, and the prior.
 """
 
 import argparse
 import time
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import mean
 
 import numpy as np
 from tqdm import tqdm
 
-from benchmarks import saved_matches
-from benchmarks.saved_matches import SavedMatches
 from mkpc_kaggle.data.competition import TrainScene, TruePair, read_train_side
+from mkpc_kaggle.engine.journal import JournalReader
 from mkpc_kaggle.evaluation.compare import paired_difference
 from mkpc_kaggle.evaluation.validate import error_of
 from mkpc_kaggle.geometry.coordinates import Matrix3
 from mkpc_kaggle.geometry.focal_prior import FocalConfig, FocalPrior, estimate_with_prior
 from mkpc_kaggle.geometry.metrics import PoseError, pair_accuracy
 from mkpc_kaggle.geometry.robust import Estimate, RobustConfig, estimate
-from mkpc_kaggle.recipe import SceneConfig
+from mkpc_kaggle.pipeline.pair import PairMatch
+from mkpc_kaggle.recipe import SceneConfig, recipe_of
 from mkpc_kaggle.scene.densify import extra_pairs
 from mkpc_kaggle.scene.reconstruct import reconstruct_batch
-from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair
+from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair, tracks_of
 
 MAGSAC = RobustConfig(permutations=1)
 FOCAL = FocalConfig()
 
 
-def with_prior(found: SavedMatches) -> Estimate:
+def with_prior(found: PairMatch, magsac: RobustConfig = MAGSAC) -> Estimate:
     size0, size1 = found.sizes
     priors = FocalPrior.of_image(size0, FOCAL), FocalPrior.of_image(size1, FOCAL)
-    return estimate_with_prior(found.matches, priors, MAGSAC, FOCAL)
+    return estimate_with_prior(found.matches, priors, magsac, FOCAL)
 
 
-PAIR_ESTIMATES: dict[str, Callable[[SavedMatches], Estimate]] = {
+PairEstimates = dict[str, Callable[[PairMatch], Estimate]]
+
+PAIR_ESTIMATES: PairEstimates = {
     "MAGSAC, 8 permutations": lambda found: estimate(found.matches, RobustConfig(permutations=8)),
     "MAGSAC": lambda found: estimate(found.matches, MAGSAC),
     "prior": with_prior,
@@ -52,12 +55,30 @@ PAIR_ESTIMATES: dict[str, Callable[[SavedMatches], Estimate]] = {
 SCENE = "scene"  # the F of the batch's cameras, or that of the prior where the pair keeps its own
 
 
+def by_threshold(pixels: float) -> PairEstimates:
+    magsac = replace(MAGSAC, threshold=pixels)
+    return {
+        f"MAGSAC, {pixels:g} px": lambda found: estimate(found.matches, magsac),
+        f"prior, {pixels:g} px": lambda found: with_prior(found, magsac),
+    }
+
+
+def read_journal(directory: Path) -> tuple[str, dict[str, PairMatch]]:
+    """The recipe's name, and by the ids of pairs what was found on them."""
+    with JournalReader(directory) as journal:
+        recipe = recipe_of(journal.belongs_to()["recipe"], journal.about().recipe)
+        units, pairs = {unit.name: unit for unit in recipe.units}, journal.pairs()
+        records = [record for index, record in journal.records().items() if index < len(pairs) and record.sizes]
+        found = {pairs[r.index].id: PairMatch(journal.results(r, units), sizes=r.sizes) for r in records}
+    return recipe.name, found
+
+
 @dataclass(frozen=True, eq=False)
 class Estimated:
     """A pair with its matches, and by estimate its F (``None`` where it failed), its accuracy and seconds."""
 
     true: TruePair
-    found: SavedMatches
+    found: PairMatch
     matrices: Mapping[str, Matrix3 | None]
     accuracies: Mapping[str, float]
     seconds: Mapping[str, float]
@@ -75,30 +96,30 @@ def accuracy(F: Matrix3 | None, true: TruePair, scene: TrainScene) -> float:
     return pair_accuracy(PoseError.failed() if F is None else error_of(F, true, scene))
 
 
-def estimated(true: TruePair, found: SavedMatches, scene: TrainScene, names: Sequence[str]) -> Estimated:
+def estimated(true: TruePair, found: PairMatch, scene: TrainScene, estimates: PairEstimates) -> Estimated:
     """A pair by every estimate of pairs that is wanted; the prior's is what a scene is compared with."""
     matrices: dict[str, Matrix3 | None] = {}
     seconds = {}
-    for name in names:
+    for name, make in estimates.items():
         start = time.process_time()
-        result = PAIR_ESTIMATES[name](found)
+        result = make(found)
         seconds[name] = time.process_time() - start
         matrices[name] = result.matrix if result.ok else None
     accuracies = {name: accuracy(F, true, scene) for name, F in matrices.items()}
     return Estimated(true, found, matrices, accuracies, seconds)
 
 
-def batch_pair(true: TruePair, found: SavedMatches, F: Matrix3 | None) -> BatchPair:
+def batch_pair(true: TruePair, found: PairMatch, F: Matrix3 | None) -> BatchPair:
     """A pair as a reconstruction is given it."""
     ends = zip(true.pair.images, found.sizes, strict=True)
     image0, image1 = (BatchImage(path.stem, path.stem, size) for path, size in ends)
-    return BatchPair(image0, image1, found.matches, F, found.tracks)
+    return BatchPair(image0, image1, found.matches, F, tracks_of(found.results))
 
 
 def by_scene(pairs: Sequence[Estimated], scene: TrainScene, extra: Sequence[Estimated] = ()) -> Score:
     """The accuracy of the pairs as one batch; of the ``extra`` pairs the first unit's matches join it."""
     batch = [batch_pair(pair.true, pair.found, pair.matrices["prior"]) for pair in pairs]
-    swept = [(pair.true, SavedMatches(pair.found.results[:1], pair.found.sizes)) for pair in extra]
+    swept = [(pair.true, replace(pair.found, results=pair.found.results[:1])) for pair in extra]
     batch += [batch_pair(true, found, None) for true, found in swept]
     start = time.process_time()
     choices = reconstruct_batch(batch, SceneConfig()).choices[: len(pairs)]
@@ -167,8 +188,8 @@ def table(title: str, done: Mapping[str, Sequence[Mapping[str, Score]]], names: 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--train-dir", type=Path, required=True)
-    parser.add_argument("--matches", type=Path, required=True)
-    parser.add_argument("--recipes", nargs="+", default=["classical"])
+    parser.add_argument("--journals", type=Path, nargs="+", required=True)
+    parser.add_argument("--thresholds", type=float, nargs="+")
     parser.add_argument("--scenes", nargs="*", default=())
     parser.add_argument("--shares", nargs="+", type=float, default=[1.0])
     parser.add_argument("--seeds", type=int, default=1, help="samples of each share below 1")
@@ -176,18 +197,22 @@ def main() -> None:
     parser.add_argument("--estimates", nargs="+", choices=names, default=names)
     parser.add_argument("--pairs-per-image", nargs="+", type=float, default=[0.0])
     arguments = parser.parse_args()
+    wanted = {name: make for name, make in PAIR_ESTIMATES.items() if name in (*arguments.estimates, "prior")}
     chosen_names = {name: 0.0 for name in arguments.estimates if name != SCENE}
-    if SCENE in arguments.estimates:
+    if arguments.thresholds:
+        wanted = {name: make for pixels in arguments.thresholds for name, make in by_threshold(pixels).items()}
+        chosen_names = dict.fromkeys(wanted, 0.0)
+    elif SCENE in arguments.estimates:
         counts = arguments.pairs_per_image
         chosen_names |= {f"{SCENE}, {count:g} pairs an image" if count else SCENE: count for count in counts}
-    for recipe in arguments.recipes:
+    for directory in arguments.journals:
+        recipe, known = read_journal(directory)
         done: dict[float, dict[str, list[dict[str, Score]]]] = defaultdict(lambda: defaultdict(list))
-        wanted = [name for name in PAIR_ESTIMATES if name in arguments.estimates or name == "prior"]
         for scene in read_train_side(arguments.train_dir, scenes=arguments.scenes):
             pairs = [
-                estimated(true, saved_matches.read(file), scene, wanted)
+                estimated(true, known[true.pair.id], scene, wanted)
                 for true in tqdm(scene.pairs, desc=f"{recipe}, {scene.name}", smoothing=0.05)
-                if (file := saved_matches.file_of(arguments.matches / recipe, true)).exists()
+                if true.pair.id in known
             ]
             for share in arguments.shares:
                 for seed in range(arguments.seeds if share < 1 else 1):

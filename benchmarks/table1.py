@@ -305,6 +305,7 @@ def main() -> None:
     assembly = assemble(union(ways), weights=arguments.weights, device=arguments.device)
     settings = {
         **assembly.fingerprint(),
+        "estimation": assembly.recipe.estimation(),
         "ways": [way.name for way in ways],
     }
     results = ResultsFile(arguments.out / "pairs.jsonl", settings)

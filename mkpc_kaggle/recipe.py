@@ -3,6 +3,8 @@
 A recipe is a TOML file: ``mkpc_kaggle/recipes/NAME.toml`` or a file of the user's own.
 """
 
+import hashlib
+import json
 import re
 import tomllib
 from collections.abc import Callable, Container, Mapping
@@ -14,7 +16,7 @@ from typing import Any
 
 from mkpc_kaggle.config import AT_LEAST_0, AT_LEAST_1, Config, Range, check_keys, check_ranges, from_table
 from mkpc_kaggle.errors import UserError, read_text
-from mkpc_kaggle.geometry.coordinates import Box, Size, View
+from mkpc_kaggle.geometry.coordinates import Box, Matrix3, Size, View
 from mkpc_kaggle.geometry.critical_region import MkpcConfig
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.geometry.robust import RobustConfig
@@ -81,6 +83,22 @@ class CameraModel(StrEnum):
     RADIAL = "SIMPLE_RADIAL"
 
 
+class CameraSharing(StrEnum):
+    """Which images of a scene, of those of one size, share a camera.
+
+    A scene's images are in one folder, so that a camera for each folder and one for all are the same.
+    """
+
+    AUTO = "auto"  # those whose focal lengths agree, see ``shared_intrinsics``
+    IMAGE = "image"  # none
+    FOLDER = "folder"
+    ONE = "one"
+
+    @property
+    def is_given(self) -> bool:
+        return self in (CameraSharing.FOLDER, CameraSharing.ONE)
+
+
 @dataclass(frozen=True)
 class SceneConfig:
     """Settings of :mod:`mkpc_kaggle.scene`, table ``[scene]`` of a recipe."""
@@ -89,6 +107,8 @@ class SceneConfig:
     each_matcher: bool = True  # also reconstruct each matcher's matches alone; a pair gets the mean of its cameras
     shared_intrinsics: float = 0.02  # images of one size share a camera if most focals are this close; 0: never
     pairs_per_image: float = 10.0  # a batch with fewer pairs gets extra pairs, for its scene alone; 0: none
+    cameras: CameraSharing = CameraSharing.AUTO
+    exif: bool = True  # a camera starts with the focal length of its image's EXIF, if that has one
     threads: int = 1  # more than one: the last digits differ from run to run
 
     def __post_init__(self) -> None:
@@ -155,11 +175,35 @@ class Recipe:
             return self
         return replace(self, scene=SceneConfig() if on else None)
 
-    def fingerprint(self) -> dict[str, Any]:
-        """All that decides what a run computes, as JSON-able values: not the name and the description."""
-        values = asdict(self)
-        del values["name"], values["description"]
-        return values
+    def matching(self) -> dict[str, Any]:
+        """All that decides which points a run finds, as JSON-able values."""
+        return _values(self, "units", "mkpc", "matchers")
+
+    def estimation(self) -> dict[str, Any]:
+        """All that decides what F and cameras a run makes of the points, as JSON-able values."""
+        return _values(self, "magsac", "focal", "scene")
+
+    @cached_property
+    def scene_estimation(self) -> str:
+        """The digest of all that decides what a scene is made of given points."""
+        return _digest(self.estimation())
+
+    def pair_estimation(self, intrinsics: tuple[Matrix3, Matrix3] | None = None) -> str:
+        """The digest of all that decides which F, or with intrinsics which E, a pair gets of given points."""
+        return self._of_pairs + (_digest([K.tolist() for K in intrinsics]) if intrinsics else "")
+
+    @cached_property
+    def _of_pairs(self) -> str:
+        return _digest(_values(self, "magsac", "focal"))
+
+
+def _values(recipe: Recipe, *names: str) -> dict[str, Any]:
+    values = asdict(recipe)
+    return {name: values[name] for name in names}
+
+
+def _digest(value: Any) -> str:
+    return hashlib.sha256(json.dumps(value).encode()).hexdigest()[:12]
 
 
 def split_mode(text: str) -> tuple[str, Mode]:
@@ -177,7 +221,7 @@ def parse_recipe(text: str, name: str) -> Recipe:
 
 
 def recipe_of(table: Mapping[str, Any], name: str) -> Recipe:
-    """A recipe from a TOML file's table, or from a fingerprint; raises :class:`UserError`."""
+    """A recipe from a TOML file's table, or from a journal's; raises :class:`UserError`."""
     where = f"recipe {name!r}"
     check_keys(table, ("description", "units", "mkpc", "magsac", "focal", "matchers", "scene"), where)
     units, matchers = table.get("units", []), table.get("matchers", {})
@@ -185,7 +229,7 @@ def recipe_of(table: Mapping[str, Any], name: str) -> Recipe:
         raise UserError(f"{where}: units must be a list of tables, and matchers a table")
 
     def settings(cls: type[Config], key: str) -> Config | None:
-        value = table.get(key)  # a fingerprint has None for a table that the recipe lacks
+        value = table.get(key)  # a journal has None for a table that the recipe lacks
         return None if value is None else from_table(cls, value, f"{where}, table [{key}]")
 
     return Recipe(

@@ -14,8 +14,10 @@ Read the journal of a run, running or ended, and show what it did. DIR is the ru
 beside the submission. Without options: one screen.
 
 --csv writes long tables that pandas.read_csv takes as they are, with `pair`, the row of the test set, in common:
-  pairs.csv    ids, image names, failure, source of F (pair, scene, fallback), matches, inliers, seconds by part,
-               F (f11 ... f33)
+  pairs.csv    ids, image names, failure, source of F (pair, scene, fallback), matches, inliers, seconds by part;
+               of the F of the pair's own matches: support (how many times as many matches agree with it as by
+               chance), overlaps (whether the images show the same thing), candidates, cost of the winner and of
+               MAGSAC's own F, the focal lengths found; F (f11 ... f33)
   units.csv    for each unit on each pair: matches, inliers, seconds, failure
   regions.csv  for each image (0 or 1) of each pair: the critical region's box and the reason for it
   events.csv   what happened when: starts, plans, jobs that ended, faults, ends

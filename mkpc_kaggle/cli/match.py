@@ -5,6 +5,7 @@ from pathlib import Path
 
 from mkpc_kaggle.cli import options
 from mkpc_kaggle.data.outputs import require_apart
+from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
 from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher, to_image
 from mkpc_kaggle.reporting.figures.pair import draw_pair
 from mkpc_kaggle.reporting.figures.style import save
@@ -33,6 +34,9 @@ def run(arguments: argparse.Namespace) -> int:
     if match.estimate.failure:
         lines.append(f"this is the fallback: {match.estimate.failure}")
     lines.append(f"{len(match.matches)} matches, {match.estimate.inlier_count} inliers")
+    found = match.estimate.stats.support
+    verdict = "the images show the same thing" if found >= MIN_SUPPORT else "the images may show different things"
+    lines.append(f"{found:.1f} times as many as by chance: {verdict}")
     for result in match.results:
         counts = f"{len(result.matches):>6} matches  {result.seconds:.2f} s  {result.failure or result.note}"
         lines.append(f"  {result.unit.name:<30}{counts}")

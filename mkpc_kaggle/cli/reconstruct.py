@@ -3,6 +3,7 @@
 import argparse
 from collections import Counter
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 from mkpc_kaggle.cli import options
@@ -10,9 +11,10 @@ from mkpc_kaggle.data.outputs import lies_in
 from mkpc_kaggle.engine.budget import format_duration
 from mkpc_kaggle.engine.console import say
 from mkpc_kaggle.errors import UserError, writing
+from mkpc_kaggle.recipe import CameraSharing
 from mkpc_kaggle.reconstruction.folder import read_folder, read_pair_list
 from mkpc_kaggle.reconstruction.outputs import FORMS, write_tables
-from mkpc_kaggle.reconstruction.run import FolderResult, reconstruct_folder
+from mkpc_kaggle.reconstruction.run import FolderResult, for_cameras, reconstruct_folder
 from mkpc_kaggle.reporting.report import report_run
 from mkpc_kaggle.reporting.summary import trouble
 
@@ -29,6 +31,10 @@ and for all together:
   submission.csv  with --format
   report.html     the run, with the cameras and points of each model
   work/           the journal: killed at any point, the same command goes on, and ends with the same files
+
+Pixels are those that a file stores, as COLMAP reads it, whatever EXIF says of its orientation. Mirrored files (2,
+4, 5, 7) make models of their own. Cameras start with the focal lengths that EXIF has, unless the recipe's table
+[scene] has `exif = false`.
 
 All pairs of up to 100 images are matched, and in larger datasets each image with the 20 most like it.
 
@@ -48,6 +54,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add(
         "--rotations", action="store_true", help="try to turn images that match nothing by 90, 180 and 270 degrees"
     )
+    told = """which images of one size in a folder one camera took: those whose focal lengths agree (auto), none
+        (image), or all (folder, one: they are the same, as each folder is reconstructed on its own)"""
+    add("--camera", choices=list(map(str, CameraSharing)), help=told)
     add("--fresh", action="store_true", help="forget what an earlier run left in OUT/work")
     parser.set_defaults(reconstruct=True)
 
@@ -60,6 +69,7 @@ def run(arguments: argparse.Namespace) -> int:
     listed = None if arguments.pairs is None else read_pair_list(arguments.pairs, root, datasets)
     with options.watched_session(arguments, work_dir) as (session, watchdog), writing(f"--out {out}"):
         assembly = options.assembly_of(arguments, arguments.recipe, arguments.mode)
+        assembly = replace(assembly, recipe=for_cameras(assembly.recipe, arguments.camera))
         options.say_start(f"{sum(map(len, datasets.values()))} images", assembly, work_dir)
         result = reconstruct_folder(datasets, assembly, session, out, listed=listed, rotations=arguments.rotations)
         write_tables(out, result.cameras, root, arguments.format)

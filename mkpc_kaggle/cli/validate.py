@@ -14,6 +14,7 @@ from mkpc_kaggle.data.outputs import require_apart
 from mkpc_kaggle.data.pairs import read_pairs
 from mkpc_kaggle.engine.console import say
 from mkpc_kaggle.engine.engine import Ending
+from mkpc_kaggle.engine.journal import share_journal
 from mkpc_kaggle.engine.session import Session, interruptible
 from mkpc_kaggle.errors import UserError, writing
 from mkpc_kaggle.evaluation.compare import Comparison, comparison_json, comparison_table, step_gains
@@ -129,8 +130,11 @@ def _match_and_score(arguments: argparse.Namespace, scenes: tuple[TrainScene, ..
     validations, status = [], 0
     with interruptible() as interrupt:
         assemblies = [_assemble(arguments, *choice) for choice in choices]
-        for text, assembly in zip(compared or [""], assemblies, strict=True):
-            directory = work_dir / re.sub(r"[^\w.-]+", "_", text)
+        directories = [work_dir / re.sub(r"[^\w.-]+", "_", text) for text in compared or [""]]
+        for number, (assembly, directory) in enumerate(zip(assemblies, directories, strict=True)):
+            for former, done in zip(assemblies[:number], directories, strict=False):
+                if former.fingerprint() == assembly.fingerprint():
+                    share_journal(done, directory)  # what both match is matched once
             session = Session(directory, options.budget_of(arguments), interrupt, workers=arguments.workers)
             validation = validate(scenes, assembly, session)
             validations.append(validation)

@@ -57,11 +57,6 @@ class Pair:
     def names(self) -> tuple[str, str]:
         return self.file0.rpartition(os.sep)[2], self.file1.rpartition(os.sep)[2]
 
-    @property
-    def key(self) -> str:
-        """What identifies the pair in a journal: E depends on the intrinsics."""
-        return self.id if self.intrinsics is None else f"{self.id} {[K.tolist() for K in self.intrinsics]}"
-
 
 @dataclass(frozen=True, eq=False)
 class TruePair:

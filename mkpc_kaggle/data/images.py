@@ -13,6 +13,7 @@ from typing import Generic, TypeVar
 import cv2
 import numpy as np
 
+from mkpc_kaggle.data.exif import read_exif
 from mkpc_kaggle.geometry.coordinates import Pixels, Size
 
 Key = TypeVar("Key")
@@ -28,6 +29,7 @@ class Image:
     name: str  # unique in a run
     pixels: Pixels  # (H, W, 3) uint8 RGB
     version: str = ""  # the digest of its file, for :func:`is_unchanged`
+    focal: float = 0.0  # in pixels, by its EXIF; 0: unknown
 
     @classmethod
     def of_array(cls, array: Pixels) -> "Image":
@@ -62,14 +64,15 @@ class Unreadable:
 def read_image(path: Path) -> Image | Unreadable:
     """Decode a file to RGB; never raises. 16-bit values are divided by 256, EXIF's orientation is applied.
 
-    OpenCV decides whether a damaged file is readable: version 5 refuses a truncated file.
+    OpenCV decides whether a damaged file is readable: version 5 refuses a truncated file. Its versions differ in
+    whose orientation they apply, so they apply none.
     """
     name = str(path)
     try:
         if path.exists() and not path.is_file():  # a pipe or a device may never end
             return Unreadable(name, "cannot be read: not a regular file")
         data = np.fromfile(path, np.uint8)
-        bgr = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
+        bgr = cv2.imdecode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION) if data.size else None
     except FileNotFoundError:
         return Unreadable(name, "no such file")
     except (OSError, ValueError, MemoryError, cv2.error) as error:
@@ -81,8 +84,9 @@ def read_image(path: Path) -> Image | Unreadable:
     height, width = bgr.shape[:2]
     if max(height, width) > MAX_ASPECT * min(height, width):
         return Unreadable(name, f"{width} x {height} pixels: one side is more than {MAX_ASPECT} times the other")
-    pixels = np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)
-    return Image(name, pixels, _content_digest(data))
+    exif = read_exif(data.data, Size(width, height))
+    pixels = exif.upright(np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8))
+    return Image(name, pixels, _content_digest(data), exif.focal)
 
 
 def is_unchanged(path: Path, version: str) -> bool:

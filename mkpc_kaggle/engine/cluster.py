@@ -21,7 +21,7 @@ from typing import Any
 from mkpc_kaggle.engine.jobs import Answer, Cause, Failure, Job
 from mkpc_kaggle.engine.places import Place, Site
 from mkpc_kaggle.engine.process import EXIT_TIMEOUT_S, ThreadWorker
-from mkpc_kaggle.engine.worker import Executor, MatchRunner, Runner, SceneRunner, use_threads
+from mkpc_kaggle.engine.worker import Executor, Runner, SceneRunner, use_threads
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.pipeline.assembly import Assembly
 from mkpc_kaggle.version import __version__
@@ -97,11 +97,11 @@ class RaySite(Site):
         self.scenes_at_once = max(1, len(machines))
         gpus = sum(int(node["Resources"].get("GPU", 0)) for node in machines)
         if gpus and self._assembly.device != "cpu":
-            make = partial(MatchRunner, self._assembly.on("cuda:0").pipeline)
+            make = self.match_runner(self._assembly.on("cuda:0"))
             names = [f"gpu {number}" for number in range(gpus)]
             self.places = [Place(name, partial(self._worker, name, make, num_gpus=1)) for name in names]
         else:
-            make = partial(MatchRunner, self._assembly.pipeline)
+            make = self.match_runner(self._assembly)
             for number, node in enumerate(machines):  # several may have the same name
                 name, cores = f"machine {number} ({node['NodeManagerHostname']})", int(node["Resources"]["CPU"])
                 self.places.append(Place(name, partial(self._worker, name, make, cores, num_cpus=cores)))

@@ -62,6 +62,8 @@ class RunReport:
     explanations: tuple[Explanation, ...] = ()
     unwritten: str = ""
     scenes: tuple[SceneRecord, ...] = ()
+    units_run: int = 0
+    estimated_anew: int = 0  # pairs that got another F of the points that the journal had
 
 
 class Engine:
@@ -92,13 +94,15 @@ class Engine:
         self.faults: list[str] = []
         self.unwritten = ""
         self._units = {unit.name: unit for unit in recipe.units}
-        self._explained = 0
+        self._explained = self._units_run = 0
         self._published = budget.clock()
         self._progress = console.Progress(budget) if progress else None
         self._publishing = threading.Lock()
         self._has_ended = self._has_loaded = False
         order, records = visiting_order(self.pairs), self._read_records()
-        self.plan = Plan(order, self.row_count, recipe, records, budget, minibatch)
+        outdated = [record.index for record in records if self._is_outdated(record)]
+        self.plan = Plan(order, self.row_count, recipe, records, budget, minibatch, outdated)
+        site.loads_matchers = any(record.lacking(recipe.units) for record in records)
         self.scenes = Scenes(self.pairs, recipe, self.plan.records, journal.scenes(), exports)
         self._scene_places: list[Place] = []
 
@@ -129,6 +133,8 @@ class Engine:
             tuple(self.plan.explanations),
             self.unwritten,
             self.scenes.report(),
+            self._units_run,
+            self.plan.estimated_anew,
         )
 
     @property
@@ -187,7 +193,10 @@ class Engine:
             elif place.is_idle and (job := self.plan.next(now, place.name, cautious=place.losses > 0)):
                 pairs = tuple(self.pairs[index] for index in job.indices)
                 known = tuple(map(self._results, job.indices))
-                place.submit(replace(job, pairs=pairs, known=known), job.seconds, job.time_limit, now)
+                records = [self.plan.records[index] for index in job.indices]
+                sizes, focals = (tuple(r.sizes for r in records), tuple(r.focals for r in records))
+                job = replace(job, pairs=pairs, known=known, sizes=sizes, focals=focals)
+                place.submit(job, job.seconds, job.time_limit, now)
 
     def _is_matching(self, now: float) -> bool:
         """Whether a job is under way, or will be when a worker has started."""
@@ -214,6 +223,7 @@ class Engine:
                 if place.closed:
                     self.plan.explain(now, f"no worker is started any more on {place.closed}")
             elif job is not None and isinstance(answer, MatchResult):
+                self._units_run += len(answer.results)
                 self._keep(self.plan.on_result(job, answer, seconds, now))
                 self._note(EventKind.JOB, f"{job.phase} {len(job.indices)} pairs {answer.unit_seconds:.3f} s")
             self._note_explanations()
@@ -255,6 +265,7 @@ class Engine:
             return
         records = self.plan.records
         record = SceneRecord.of(job.batch, answer.reconstructions, job.unit_results, seconds)
+        record = replace(record, estimation=job.estimation)
         self.scenes.on_result(job, record)
         for index, choice in zip(job.indices, answer.choices, strict=True):
             records[index] = replace(records[index], scene=choice)
@@ -271,6 +282,11 @@ class Engine:
             self._fault(text)
         records = self.journal.records()
         return [records.get(index) or PairRecord.untouched(index) for index in range(len(self.pairs))]
+
+    def _is_outdated(self, record: PairRecord) -> bool:
+        """Whether a pair has the F of another estimation."""
+        wanted = self.recipe.pair_estimation(self.pairs[record.index].intrinsics)
+        return record.matches > 0 and record.estimation != wanted
 
     def _results(self, index: int) -> tuple[UnitResult, ...]:
         """What earlier jobs found on a pair."""

@@ -6,6 +6,7 @@ from enum import StrEnum
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.records import PairRecord
+from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.geometry.robust import RobustConfig
 from mkpc_kaggle.pipeline.pair import UnitResult
@@ -18,6 +19,7 @@ from mkpc_kaggle.scene.view_graph import BatchPair
 class Phase(StrEnum):
     """The phases of a run, in order."""
 
+    ESTIMATE = "estimate"  # F anew, of the points that the journal has, where another estimation made it
     SWEEP = "sweep"  # the first unit on all pairs
     CONNECT = "connect"  # the first unit on pairs that no row names, where a batch has few
     DEEPEN = "deepen"  # the other units, as many as fit
@@ -27,6 +29,8 @@ class Phase(StrEnum):
 @dataclass(frozen=True)
 class MatchJob:
     """Run ``units`` on the pairs of ``indices``; what a pair has had, ``known``, is left out.
+
+    A job without units makes F of what is known alone: of its images only ``sizes`` and ``focals`` are needed.
 
     ``expected`` are the seconds within which each unit most likely ends on a pair. Units may begin in the first
     ``seconds`` of the job if they are expected to end in them. After ``time_limit`` seconds without an answer the
@@ -42,13 +46,15 @@ class MatchJob:
     is_retry: bool = False
     pairs: tuple[Pair, ...] = ()
     known: tuple[tuple[UnitResult, ...], ...] = ()
+    sizes: tuple[tuple[Size, ...], ...] = ()
+    focals: tuple[tuple[float, ...], ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
 class SceneJob:
     """Reconstruct a batch: ``indices`` are those of its ``pairs`` in the run; images go by their digests.
 
-    ``unit_results``: how many its matches are of; see :class:`SceneRecord`. ``export``: write COLMAP's files, too.
+    ``unit_results`` and ``estimation`` are those of its :class:`SceneRecord`. ``export``: write COLMAP's files.
     The answer is a :class:`Solution`, whose choices are in the order of the pairs.
     """
 
@@ -59,6 +65,7 @@ class SceneJob:
     focal: FocalConfig | None = None
     magsac: RobustConfig | None = None
     unit_results: int = 0
+    estimation: str = ""
     export: Export | None = None
 
 

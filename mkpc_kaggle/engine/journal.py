@@ -8,6 +8,7 @@ reached), ``points`` (of a unit on a pair: later jobs, scenes and the report nee
 
 import json
 import os
+import shutil
 import sqlite3
 import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -27,7 +28,7 @@ from mkpc_kaggle.errors import UserError, writing
 from mkpc_kaggle.pipeline.pair import UnitResult
 from mkpc_kaggle.recipe import Unit
 
-FORMAT = 9
+FORMAT = 10
 FILE_NAME = "journal.sqlite"
 LOCK_NAME = "journal.lock"
 
@@ -84,6 +85,7 @@ class About:
     limit: float | None = None  # in seconds; None: there was none
     left_out: tuple[str, ...] = ()  # which matchers did not run, by cause
     versions: Mapping[str, str] = field(default_factory=dict)  # of the package and what it stands on
+    estimation: str = "{}"  # how F and cameras are made of the points: JSON of :meth:`Recipe.estimation`
 
 
 @contextmanager
@@ -151,7 +153,7 @@ class JournalReader:
             return about
 
     def belongs_to(self) -> dict[str, Any]:
-        """What the run computes, by name: the recipe's fingerprint, digests of the test set and the weights."""
+        """What the run matches, by name: the recipe's part in it, digests of the test set and the weights."""
         return {key: value for key, value in self._header().items() if key not in ("format", "about")}
 
     def results(self, record: PairRecord, units: Mapping[str, Unit]) -> tuple[UnitResult, ...]:
@@ -165,6 +167,7 @@ class JournalReader:
                     found.encode_seconds,
                     found.match_seconds,
                     found.failure,
+                    note=found.note,
                 )
                 for found in record.units
             )
@@ -193,7 +196,7 @@ class JournalReader:
 class Journal(JournalReader):
     """The journal of a work directory, made if it is not there; no other run can open it while this run has it.
 
-    ``belongs_to`` says by name what the run computes (recipe, test set, weights). Raises :class:`UserError`
+    ``belongs_to`` says by name what the run matches (recipe, test set, weights). Raises :class:`UserError`
     where the directory cannot be written, another run holds it, or it belongs to something else.
 
     What the file cannot take (a full disk) is kept in memory, and written with what comes next.
@@ -231,9 +234,11 @@ class Journal(JournalReader):
         same = cache(is_unchanged)
         with undamaged(self.path), self._db:
             self._db.execute("BEGIN")
-            records = self.records().values()
-            if any(not 0 <= record.index < len(pairs) for record in records):
-                raise LookupError("it has pairs that the test set has not")
+            known = self.records()
+            if known and min(known) < 0:
+                raise LookupError("it has pairs that no test set has")
+            # Another run may have had more extra pairs for its scenes: the first of them are always the same.
+            records = [record for index, record in known.items() if index < len(pairs)]
             changed = {r.index for r in records if not all(map(same, pairs[r.index].images, r.versions))}
             outdated = {pairs[index].group for index in changed}
             without = [replace(record, scene=None) for record in records if pairs[record.index].group in outdated]
@@ -245,6 +250,15 @@ class Journal(JournalReader):
             ):
                 self._db.executemany(statement, [(key,) for key in keys])
         return len(changed)
+
+    def forget_scenes(self) -> None:
+        """Forget all scenes: pairs have the F of their own matches again."""
+        if self.scenes():
+            with undamaged(self.path), self._db:
+                self._db.execute("BEGIN")
+                without = [replace(record, scene=None) for record in self.records().values()]
+                self._db.executemany(SAVE_PAIR, [(record.index, encode(record)) for record in without])
+                self._db.execute("DELETE FROM scene")
 
     def save(self, outcomes: Iterable[Outcome]) -> None:
         """Put down a job's outcomes, all or none.
@@ -314,6 +328,16 @@ class Journal(JournalReader):
             header = {"format": FORMAT, **belongs_to, "about": about}
             rows = ((key, encode(value)) for key, value in header.items())
             self._db.executemany("REPLACE INTO run VALUES (?, ?)", rows)
+
+
+def share_journal(source: Path, target: Path) -> None:
+    """Let the run of a work directory begin with the journal of another that has ended, if it has none yet."""
+    path = target / FILE_NAME
+    if not path.exists():
+        with writing(f"the work directory {target}"):
+            target.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(source / FILE_NAME, path.with_suffix(".part"))
+            path.with_suffix(".part").replace(path)
 
 
 def connect(path: Path) -> sqlite3.Connection:

@@ -107,6 +107,7 @@ class Site:
     """
 
     scenes_at_once = 1
+    loads_matchers = True  # False: jobs have no units
 
     def __init__(self, clock: Callable[[], float]) -> None:
         self.places: list[Place] = []
@@ -116,6 +117,10 @@ class Site:
 
     def open(self) -> None:
         """Make the places known; raises :class:`mkpc_kaggle.errors.UserError` where there can be none."""
+
+    def match_runner(self, assembly: Assembly) -> Callable[[], MatchRunner]:
+        """What a worker for pairs makes its runner with."""
+        return partial(MatchRunner, assembly.pipeline, load=self.loads_matchers)
 
     def scene_worker(self) -> ThreadWorker:
         """A worker for one batch."""
@@ -139,8 +144,8 @@ class LocalSite(Site):
     def __init__(self, assembly: Assembly, workers: int | None, clock: Callable[[], float]) -> None:
         super().__init__(clock)
         if workers == 0:
-            make = partial(ThreadWorker, "matching", partial(MatchRunner, assembly.pipeline), self.ring)
-            self.places = [Place("this process", make)]
+            runner = self.match_runner
+            self.places = [Place("this process", lambda: ThreadWorker("matching", runner(assembly), self.ring))]
             return
         # On a CPU one process with all threads: two with half of them each do more (recipe light, two cores: the
         # sweep over after 22 s instead of 31), but need twice the memory, and a network's last bits change.
@@ -154,5 +159,4 @@ class LocalSite(Site):
             self.fallback = [self._place("cpu", assembly.on_cpu())]
 
     def _place(self, name: str, assembly: Assembly, share: int = 1) -> Place:
-        make = partial(MatchRunner, assembly.pipeline)
-        return Place(name, partial(ProcessWorker, f"mkpc {name}", make, self.ring, share))
+        return Place(name, lambda: ProcessWorker(f"mkpc {name}", self.match_runner(assembly), self.ring, share))

@@ -24,7 +24,7 @@ EXPLORE_SHARE = 0.25  # of the time left that may be spent to learn what a unit 
 MAX_EXPLORE_S = 600.0
 CONNECT_SHARE = 0.1  # of the time left after the sweep, for pairs that no row names
 RESERVE_SHARE = 0.2  # of the limit that is left to reconstruction at most
-MAX_TRIES = 2  # of a unit on a single pair, before it is given up there
+MAX_TRIES = 2  # of a unit, or of an estimate, on a single pair, before it is given up there
 MAX_FAILED_PAIRS = 2  # a unit that was given up on so many pairs and never ran is given up on all
 SLOW_FACTOR = 3.0  # a job that takes this many times what was expected begins no further unit
 HANG_FACTOR = 10.0  # a unit that takes this many times what it takes on nine of ten pairs hangs
@@ -115,13 +115,18 @@ def job_size(pairs: int, prices: Sequence[float | None], overhead: float, second
     return max(1, int(seconds / price)), len(prices) if price <= seconds else 1
 
 
+def _priced(units: Iterable[Unit]) -> list[str]:
+    """The names by which the cost of a job on a pair is known."""
+    return [unit.name for unit in units] or [Phase.ESTIMATE]
+
+
 class Plan:
     """The phases of a run over the pairs of ``order``.
 
     ``records``, of all pairs by index, change through it. Pairs from the index ``row_count`` on are extra pairs
     for scenes, the most useful first. ``workers`` work at a time; ``reserve`` seconds of the end are left to
     scenes. ``done`` are the pairs that have what fits for all; ``unusable`` names the units that no worker can
-    run.
+    run. ``outdated`` are the pairs whose F another estimation made.
     """
 
     def __init__(
@@ -132,8 +137,10 @@ class Plan:
         records: list[PairRecord],
         budget: Budget,
         minibatch: int = 1,
+        outdated: Iterable[int] = (),
     ) -> None:
         self.recipe, self.records, self.budget = recipe, records, budget
+        self.outdated, self.estimated_anew = set(outdated), 0
         self.workers = 1
         self.reserve = 0.0
         self.explanations: list[Explanation] = []
@@ -147,7 +154,7 @@ class Plan:
         self.costs = Costs()
         self.unusable: set[str] = set()
         self.done = set(range(self._row_count, len(self.records)))
-        self.phase = Phase.SWEEP
+        self.phase = Phase.ESTIMATE
         self._coming = list(Phase)
         self._queue = ChunkQueue()
         self._late, self._late_at = list[Chunk](), inf  # what does not end before this moment, unless it moves
@@ -197,6 +204,8 @@ class Plan:
         """Go on to the first pairs that can gain something: other chunks and phases are passed over."""
         while now < self.stop and (self._queue.fresh or self._coming):
             if not self._queue.fresh:
+                if self.phase is Phase.ESTIMATE and (self._queue.under_way or self._queue.again):
+                    return  # scenes, which come later, need F of all pairs
                 self._open(self._coming.pop(0), now)
                 continue
             chunk = self._queue.fresh[0]
@@ -206,7 +215,9 @@ class Plan:
             self._mark_done(chunk.phase, self._queue.fresh.popleft().indices)
 
     def can_gain(self, index: int, units: Iterable[Unit]) -> bool:
-        """Whether a pair may get any of the units that it has not had."""
+        """Whether a pair may get any of the units that it has not had; where there are none, another F."""
+        if not units:
+            return index in self.outdated
         return index not in self._stuck and bool(self.records[index].lacking(units))
 
     def _job(
@@ -217,7 +228,7 @@ class Plan:
         pair_count = unit_count = 1
         if not cautious:
             lacking = self._lacking_units(todo, units)
-            prices = [costs.mean(unit.name) if costs.is_known(unit.name) else None for unit in lacking]
+            prices = [costs.mean(name) if costs.is_known(name) else None for name in _priced(lacking)]
             pair_count, unit_count = job_size(len(todo), prices, costs.overhead, JOB_SHARE * left)
         indices, later = tuple(todo[:pair_count]), tuple(todo[pair_count:])
         lacking = self._lacking_units(indices, units)
@@ -241,10 +252,11 @@ class Plan:
     def _limits(self, pair_count: int, units: Sequence[Unit], left: float) -> tuple[float, float]:
         """The seconds within which units of a job may begin, and after which its worker hangs."""
         costs, minibatch = self.costs, min(pair_count, self._minibatch)
-        expected = pair_count * (costs.overhead + sum(costs.p90(unit.name) for unit in units))
+        names = _priced(units)
+        expected = pair_count * (costs.overhead + sum(map(costs.p90, names)))
         allowance = SLOW_FACTOR * expected + self.budget.silence
-        hangs = max(costs.hang_after(unit.name, HANG_FACTOR * minibatch) for unit in units)
-        if not all(costs.is_known(unit.name) for unit in units):
+        hangs = max(costs.hang_after(name, HANG_FACTOR * minibatch) for name in names)
+        if not all(map(costs.is_known, names)):
             hangs += min(MAX_EXPLORE_S, EXPLORE_SHARE * left)
         return min(left, allowance), allowance + hangs
 
@@ -252,6 +264,8 @@ class Plan:
         """The units for a chunk whose turn has come."""
         if chunk.units is not None:
             return self.usable(chunk.units)
+        if chunk.phase is Phase.ESTIMATE:
+            return ()
         units = self.usable(self.recipe.units)
         if chunk.phase is Phase.DEEPEN:
             return units[: self._fit(units, now)]
@@ -287,7 +301,11 @@ class Plan:
     def _open(self, phase: Phase, now: float) -> None:
         """Begin a phase."""
         self.phase, indices = phase, [index for index in self._order if index < self._row_count]
-        if phase is Phase.CONNECT:
+        if phase is Phase.ESTIMATE:
+            indices = [index for index in self._order if index in self.outdated]
+            if indices:
+                self.explain(now, f"{len(indices)} pairs have the F of other settings, and get it anew")
+        elif phase is Phase.CONNECT:
             extra = len(self.records) - self._row_count
             count = self._pairs_that_fit(CONNECT_SHARE, extra, now)
             indices = [index for index in self._order if self._row_count <= index < self._row_count + count]
@@ -321,7 +339,10 @@ class Plan:
             self.costs.observe(found.unit.name, found.seconds, warm_up=found.warm_up)
         if result.results:
             self.costs.observe_overhead((seconds - result.unit_seconds) / len(result.outcomes))
-        kept = [merged for outcome in result.outcomes if (merged := self._merge(outcome, now)) is not None]
+        if not job.units:
+            self.costs.observe(Phase.ESTIMATE, seconds / len(job.indices))
+        merge = self._merge if job.units else self._merge_estimate
+        kept = [merged for outcome in result.outcomes if (merged := merge(outcome, now)) is not None]
         rest = tuple(index for index in job.indices if self.can_gain(index, job.units))
         if rest:  # the job's own deadline cut it off
             self._queue.put_back(Chunk(job.phase, rest, job.units))
@@ -341,18 +362,23 @@ class Plan:
             self._queue.put_back(*(replace(chunk, indices=part) for part in halves))
             return []
         (index,) = job.indices
-        unit, *others = self.records[index].lacking(job.units)
-        if others:
-            self._queue.put_back(*(replace(chunk, units=(each,)) for each in (unit, *others)))
+        units = self.records[index].lacking(job.units)
+        if len(units) > 1:
+            self._queue.put_back(*(replace(chunk, units=(unit,)) for unit in units))
             return []
+        (name,) = _priced(units)
         if failure.cause is Cause.TIMED_OUT:
-            self.costs.assume(unit.name, job.time_limit)
-        self._tries[index, unit.name] += 1
-        if self._tries[index, unit.name] < MAX_TRIES:
+            self.costs.assume(name, job.time_limit)
+        self._tries[index, name] += 1
+        if self._tries[index, name] < MAX_TRIES:
             self._queue.put_back(chunk)
             return []
         self._mark_done(job.phase, [index])
-        return [self._give_up(index, unit, failure, now)]
+        if units:
+            return [self._give_up(index, units[0], failure, now)]
+        self.explain(now, f"pair {index} keeps the F it has: {failure}")
+        self.outdated.discard(index)
+        return []
 
     def restart(self, now: float, reason: str) -> list[Outcome]:
         """Begin anew on other devices: no unit is given up, and pairs keep what they have; what has changed."""
@@ -378,6 +404,17 @@ class Plan:
         self._put(record.after(former))
         return replace(outcome, record=self.records[record.index])
 
+    def _merge_estimate(self, outcome: Outcome, now: float) -> Outcome | None:
+        """The F that a job without units has made of all that was found on a pair."""
+        record, former = outcome.record, self.records[outcome.record.index]
+        self.outdated.discard(record.index)
+        if len(record.units) < len(former.units):
+            self.explain(now, f"pair {record.index} keeps the F it has: its points cannot be read")
+            return None
+        self.estimated_anew += 1
+        self._put(former.estimated_anew(record))
+        return replace(outcome, record=self.records[record.index])
+
     def _give_up(self, index: int, unit: Unit, failure: Failure, now: float) -> Outcome:
         """The pair keeps the F that it has; the unit is marked as had, with the reason."""
         record, reason = self.records[index], f"{GIVEN_UP}{failure}"
@@ -396,7 +433,7 @@ class Plan:
         over = {index for index in indices if not self._queue.waits(index)}
         if phase is self.phase:
             self._left -= over
-        if phase not in (Phase.SWEEP, Phase.CONNECT):
+        if phase not in (Phase.ESTIMATE, Phase.SWEEP, Phase.CONNECT):
             self.done |= over
 
     # What is left
@@ -412,7 +449,9 @@ class Plan:
 
     @property
     def is_complete(self) -> bool:
-        """Whether every pair has been reached, and none can gain what it wants."""
+        """Whether every pair has been reached, and none can gain what it wants, nor another F."""
+        if self.outdated:
+            return False
         return all(record.reached and not self.may_gain(record) for record in self.records[: self._row_count])
 
     @property

@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Matrix3, Size
-from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
+from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
+from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL, NO_STATS, EstimateStats
 from mkpc_kaggle.pipeline.pair import PairMatch, Regions, UnitResult
 from mkpc_kaggle.recipe import Unit
 from mkpc_kaggle.scene.choose import Choice
@@ -45,10 +46,13 @@ class UnitRecord:
 class PairRecord:
     """What is known of a pair: its F (its E, where the pair has intrinsics) and how it came about.
 
+    ``estimation`` is the digest of the settings that made its F of the units' points: :class:`Recipe` has it.
+
     ``pair_fundamental`` is from the pair's own matches, and the fallback where ``failure`` says why there is none;
     ``magsac_fundamental`` is MAGSAC's alone, where the former comes from more than that. The seconds are those of
     all jobs on the pair. ``scene`` is what its batch's reconstruction says of it, ``None`` if there was none.
-    ``sizes`` and ``versions`` are of the two images that were matched; a version tells the content of a file.
+    ``sizes``, ``versions`` and ``focals`` are of the two images that were matched: a version tells the content of
+    a file, a focal length is in pixels by its EXIF, 0 if unknown.
     """
 
     index: int
@@ -63,13 +67,16 @@ class PairRecord:
     sizes: tuple[Size, ...] = ()
     versions: tuple[str, ...] = ()
     magsac_fundamental: Matrix3 | None = None
+    estimation: str = ""
+    stats: EstimateStats = NO_STATS
+    focals: tuple[float, ...] = ()
 
     @classmethod
     def untouched(cls, index: int, reason: str = NOT_REACHED) -> "PairRecord":
         return cls(index, FALLBACK_FUNDAMENTAL, reason)
 
     @classmethod
-    def of(cls, index: int, match: PairMatch) -> "PairRecord":
+    def of(cls, index: int, match: PairMatch, estimation: str = "") -> "PairRecord":
         """The record of an estimated pair."""
         ends = np.cumsum([len(result.matches) for result in match.results])
         masks = np.split(match.estimate.inliers, ends[:-1])
@@ -86,6 +93,9 @@ class PairRecord:
             sizes=match.sizes,
             versions=match.versions,
             magsac_fundamental=match.estimate.magsac,
+            estimation=estimation,
+            stats=match.estimate.stats,
+            focals=match.focals,
         )
 
     def after(self, former: "PairRecord") -> "PairRecord":
@@ -93,6 +103,11 @@ class PairRecord:
         parts = ("decode_seconds", "cluster_seconds", "estimate_seconds")
         seconds = {part: getattr(former, part) + getattr(self, part) for part in parts}
         return replace(self, regions=self.regions or former.regions, scene=former.scene, **seconds)
+
+    def estimated_anew(self, later: "PairRecord") -> "PairRecord":
+        """The record with the F of a job without units; its images and its units' seconds stay."""
+        kept = ("regions", "decode_seconds", "cluster_seconds", "scene", "sizes", "versions", "focals")
+        return replace(later, **{name: getattr(self, name) for name in kept})
 
     def without_given_up(self) -> "PairRecord":
         """The record without the units that were given up: they may be tried again."""
@@ -112,6 +127,11 @@ class PairRecord:
         if self.scene is None or self.scene.F is None:
             return "fallback" if self.failure else "pair"
         return "scene" if self.scene.from_scene else "pair"
+
+    @property
+    def overlaps(self) -> bool:
+        """Whether the two images most likely show the same thing."""
+        return self.stats.support >= MIN_SUPPORT
 
     @property
     def reached(self) -> bool:
@@ -179,7 +199,8 @@ class SceneRecord:
     """What came of a batch: how many of its images have a camera, in how many models, with how many points.
 
     ``unit_results``: how many unit results the scene is made of; if its pairs have more, it is out of date.
-    ``clouds`` are some points of each model, evenly chosen, in its units.
+    ``estimation`` is the digest of the settings that made it. ``clouds`` are some points of each model, evenly
+    chosen, in its units.
     """
 
     batch: str
@@ -192,6 +213,7 @@ class SceneRecord:
     failure: str
     cameras: tuple[CameraRecord, ...] = ()
     clouds: tuple[tuple[Point, ...], ...] = ()
+    estimation: str = ""
 
     @classmethod
     def of(

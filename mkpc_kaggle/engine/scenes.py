@@ -126,7 +126,8 @@ class Scenes:
         pairs = tuple(self._batch_pair(index, results_of(index)) for index in found)
         self._running.add(batch)
         unit_results, export = self._unit_count(batch), self._exports.get(batch)
-        return SceneJob(batch, found, pairs, config, recipe.focal, recipe.magsac, unit_results, export)
+        settings = config, recipe.focal, recipe.magsac
+        return SceneJob(batch, found, pairs, *settings, unit_results, recipe.scene_estimation, export)
 
     def on_start(self, seconds: float) -> None:
         """Record how long a process took to begin."""
@@ -177,17 +178,17 @@ class Scenes:
         return any(self._records[index].units for index in self.batches[batch])
 
     def _is_outdated(self, batch: str) -> bool:
-        return batch not in self.made or self.made[batch].unit_results != self._unit_count(batch)
+        made = self.made.get(batch)
+        wanted = self._unit_count(batch), self._recipe.scene_estimation
+        return made is None or (made.unit_results, made.estimation) != wanted
 
     def _unit_count(self, batch: str) -> int:
         return sum(len(self._records[index].units) for index in self.batches[batch])
 
     def _batch_pair(self, index: int, results: Sequence[UnitResult]) -> BatchPair:
         record = self._records[index]
-        image0, image1 = (
-            BatchImage(path.stem, version, size)
-            for path, version, size in zip(self._pairs[index].images, record.versions, record.sizes, strict=True)
-        )
+        images = zip(self._pairs[index].images, record.versions, record.sizes, record.focals, strict=True)
+        image0, image1 = (BatchImage(path.stem, version, size, focal) for path, version, size, focal in images)
         matches = Matches.concatenate(result.matches for result in results)
         own = None if record.failure else record.pair_fundamental
         return BatchPair(image0, image1, matches, own, tracks_of(results))

@@ -1,6 +1,7 @@
 """A run from its parts: journal, site and engine opened, used and let go of; signals, and the end at the limit."""
 
 import hashlib
+import json
 import os
 import platform
 import signal
@@ -122,8 +123,11 @@ def run_pairs(
     belongs_to = {"test set": digest_of_pairs(pairs), **assembly.fingerprint()}
     budget, recipe = session.budget, assembly.recipe
     limit = budget.time_limit if isfinite(budget.time_limit) else None
-    about = About(recipe.name, str(assembly.placement), limit, assembly.left_out, versions())
+    estimation = json.dumps(recipe.estimation())
+    about = About(recipe.name, str(assembly.placement), limit, assembly.left_out, versions(), estimation)
     with Journal(session.work_dir, belongs_to, pairs=pairs, about=about, fresh=session.fresh) as journal:
+        if recipe.scene is None:
+            journal.forget_scenes()
         journal.note(EventKind.START, budget.spent(), "")
         engine = Engine(
             pairs,
@@ -165,8 +169,8 @@ def versions() -> dict[str, str]:
 
 
 def digest_of_pairs(pairs: Sequence[Pair]) -> str:
-    """Tells test sets apart: the keys of its pairs with the ids of their images, in order."""
-    ids = ((pair.key, pair.group, *(name.rpartition(".")[0] for name in pair.names)) for pair in pairs)
+    """Tells test sets apart: the ids of its pairs with the ids of their images, in order."""
+    ids = ((pair.id, pair.group, *(name.rpartition(".")[0] for name in pair.names)) for pair in pairs)
     rows = map("\t".join, ids)
     return hashlib.sha256("\n".join(rows).encode()).hexdigest()
 

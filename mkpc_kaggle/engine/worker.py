@@ -81,18 +81,22 @@ def use_threads(count: int) -> None:
 class MatchRunner:
     """Matches the pairs of jobs and estimates their F, in threads, while the next minibatch is matched.
 
-    Loads all matchers; raises :class:`mkpc_kaggle.errors.UserError` where this fails.
+    Loads all matchers, unless it gets jobs without units alone; raises :class:`mkpc_kaggle.errors.UserError` where
+    this fails.
     """
 
-    def __init__(self, make_pipeline: Callable[[], Pipeline]) -> None:
+    def __init__(self, make_pipeline: Callable[[], Pipeline], *, load: bool = True) -> None:
         self._pipeline = make_pipeline()
-        self._pipeline.load()
+        if load:
+            self._pipeline.load()
         self._images = ImageStore()
         self._estimators = ThreadPoolExecutor(ESTIMATE_THREADS, thread_name_prefix="estimate")
 
     def run(self, job: Job, seconds: float) -> MatchResult:
         """Match the pairs of a job; no unit begins that is expected to end later than ``seconds`` from now."""
         assert isinstance(job, MatchJob)
+        if not job.units:
+            return self._estimate_anew(job)
         deadline = time.monotonic() + seconds
         expected = dict(zip(job.units, job.expected, strict=True))
 
@@ -114,6 +118,13 @@ class MatchRunner:
             outcomes[number] = estimate.result()
         return MatchResult(tuple(outcomes))
 
+    def _estimate_anew(self, job: MatchJob) -> MatchResult:
+        """F of the pairs of a job from what is known of them; their images are not looked at."""
+        known = zip(job.known, job.sizes, job.focals, strict=True)
+        pairs = [PairMatch(results, sizes=sizes, focals=focals) for results, sizes, focals in known]
+        estimates = [self._estimators.submit(self._record, job, *pair) for pair in enumerate(pairs)]
+        return MatchResult(tuple(Outcome(estimate.result()) for estimate in estimates))
+
     def _open(self, pair: Pair, known: tuple[UnitResult, ...]) -> PairMatch:
         """The pair with its images; ``failure`` says which of them cannot be read."""
         start = time.perf_counter()
@@ -125,17 +136,21 @@ class MatchRunner:
 
     def _estimate(self, job: MatchJob, number: int, pair: PairMatch) -> Outcome:
         """F from all matches of a pair; the outcome has the new results alone, since only these have to travel."""
-        index, known = job.indices[number], job.known[number]
-        found = pair.results[len(known) :]
+        found = pair.results[len(job.known[number]) :]
         if not found:
-            return Outcome(PairRecord.untouched(index, NOT_REACHED))
-        start = time.perf_counter()
+            return Outcome(PairRecord.untouched(job.indices[number], NOT_REACHED))
         sizes = tuple(image.size for image in pair.images)
         versions = tuple(image.version for image in pair.images)
-        pair = replace(pair, images=(), sizes=sizes, versions=versions)
-        pair = with_estimate(pair, self._pipeline.recipe, job.pairs[number].model, job.pairs[number].intrinsics)
-        record = PairRecord.of(index, replace(pair, estimate_seconds=time.perf_counter() - start))
-        return Outcome(record, found)
+        focals = tuple(image.focal for image in pair.images)
+        pair = replace(pair, images=(), sizes=sizes, versions=versions, focals=focals)
+        return Outcome(self._record(job, number, pair), found)
+
+    def _record(self, job: MatchJob, number: int, pair: PairMatch) -> PairRecord:
+        """The record of a pair with F from all of its matches."""
+        start, recipe, asked = time.perf_counter(), self._pipeline.recipe, job.pairs[number]
+        pair = with_estimate(pair, recipe, asked.model, asked.intrinsics)
+        pair = replace(pair, estimate_seconds=time.perf_counter() - start)
+        return PairRecord.of(job.indices[number], pair, recipe.pair_estimation(asked.intrinsics))
 
 
 class SceneRunner:

@@ -33,6 +33,7 @@ from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import (
     DistinctMatches,
     Estimate,
+    EstimateStats,
     ModelKind,
     RobustConfig,
     consensus,
@@ -49,6 +50,7 @@ ROUGH_SCALES, FINE_SCALES = (4.0,), (2.0, 1.0)  # times the scale, in turn: a wi
 ROUGH_MATCHES, FINE_MATCHES = 300, 1000  # at most, evenly spread; the results are scored on all
 FINE_STARTS = 2  # how many of the rough results are refined
 FREE_COST = 10.0  # what MAGSAC's own F pays for being free of plausible focal lengths
+EXIF_SIGMA = 0.05  # standard deviation of the logarithm of a focal length that EXIF tells
 LOG_FOCAL_GRID = (-0.7, -0.35, 0.0, 0.35, 0.7)  # log f / g to read MAGSAC's F with; the best is a start
 
 
@@ -59,6 +61,7 @@ class FocalConfig:
     ratio: float = 1.1  # of an unknown focal length to the image's long side
     sigma: float = 0.4  # standard deviation of the focal length's logarithm
     scale: float = 0.35  # of the loss, in pixels
+    exif: bool = True  # where an image's EXIF has a focal length, expect that one, within 5 %
 
     def __post_init__(self) -> None:
         check_ranges(self, ratio=POSITIVE, sigma=POSITIVE, scale=POSITIVE)
@@ -72,8 +75,10 @@ class FocalPrior:
     sigma: float  # standard deviation of the log focal length; 0: it is known
 
     @classmethod
-    def of_image(cls, size: Size, config: FocalConfig) -> "FocalPrior":
-        """The weak prior for an image of which only the size is known."""
+    def of_image(cls, size: Size, config: FocalConfig, exif_focal: float = 0.0) -> "FocalPrior":
+        """The prior for an image of that size: weak, unless EXIF tells its focal length in pixels."""
+        if config.exif and exif_focal:
+            return cls.of_focal(exif_focal, EXIF_SIGMA, size)
         return cls.of_focal(config.ratio * max(size), config.sigma, size)
 
     @classmethod
@@ -83,9 +88,14 @@ class FocalPrior:
         return cls(np.array([[focal, 0, centre[0]], [0, focal, centre[1]], [0, 0, 1]]), sigma)
 
     @property
+    def focal(self) -> float:
+        """The mean focal length of both axes in pixels."""
+        return float(self.K[0, 0] + self.K[1, 1]) / 2
+
+    @property
     def to_ray(self) -> Matrix3:
-        """Homogeneous pixels -> rays (u, v, g), g being the mean focal length of both axes in pixels."""
-        return np.asarray(float(self.K[0, 0] + self.K[1, 1]) / 2 * np.linalg.inv(self.K))
+        """Homogeneous pixels -> rays (u, v, g), g being the focal length."""
+        return np.asarray(self.focal * np.linalg.inv(self.K))
 
     def scaled(self, factor: float) -> Matrix3:
         """The camera matrix of a focal length that is ``factor`` times as long."""
@@ -123,14 +133,16 @@ def estimate_with_prior(
         finite = [found for found in free if np.isfinite(found.cost)]
         plain = min(finite, key=lambda found: found.cost, default=None)
     magsac_fundamental = unit_norm(search.for_pixels(plain.fundamental)) if plain else None
-    return Estimate(model, unit_norm(matrix), distinct.mask_of_all(inliers), magsac=magsac_fundamental)
+    told = EstimateStats(len(candidates), best.cost, plain and plain.cost, search.focals(best))
+    return Estimate(model, unit_norm(matrix), distinct.mask_of_all(inliers), "", magsac_fundamental, told)
 
 
 class _Candidate(NamedTuple):
-    """An F (3, 3) for rays, and its cost."""
+    """An F (3, 3) for rays, and its cost: MAGSAC's own pays FREE_COST, the others the prior's."""
 
     fundamental: Matrix3
     cost: float
+    logs: Vectors | None = None  # log f / g of both cameras, where it has focal lengths
 
 
 class _Search:
@@ -179,7 +191,14 @@ class _Search:
         rough.sort(key=lambda view: self._many.cost(view, self._scale))
         fine = [self._searched(self._many, view, FINE_SCALES) for view in rough[:FINE_STARTS]]
         costs = [self._cost(view.fundamental, view) + self._all.prior_cost(view) for view in fine]
-        return [_Candidate(view.fundamental, cost) for view, cost in zip(fine, costs, strict=True)]
+        return [_Candidate(view.fundamental, cost, view.logs) for view, cost in zip(fine, costs, strict=True)]
+
+    def focals(self, found: _Candidate) -> tuple[float, float] | None:
+        """In pixels; ``None`` for MAGSAC's own F, which has none."""
+        if found.logs is None:
+            return None
+        ratio0, ratio1 = np.exp(found.logs).tolist()
+        return self._priors[0].focal * ratio0, self._priors[1].focal * ratio1
 
     def for_pixels(self, F: Matrix3) -> Matrix3:
         """The F for homogeneous pixels, from an F for rays."""

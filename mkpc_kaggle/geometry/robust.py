@@ -57,6 +57,24 @@ class RobustConfig:
         check_ranges(self, permutations=Range(1, 100))
 
 
+@dataclass(frozen=True)
+class EstimateStats:
+    """How a two-view model was found: what is known anyway, for whoever asks why a pair went wrong.
+
+    A cost is a sum of robust costs of the distinct matches, a half each at most. Under a prior on focal lengths
+    these cost, too, or that there are none.
+    """
+
+    candidates: int = 0  # whose costs were compared
+    cost: float | None = None  # the winner's
+    magsac_cost: float | None = None  # that of the F of MAGSAC alone
+    focals: tuple[float, float] | None = None  # in pixels, of both images; None where the winner has none
+    support: float = 0.0  # see :mod:`mkpc_kaggle.geometry.overlap`
+
+
+NO_STATS = EstimateStats()
+
+
 @dataclass(frozen=True, eq=False)
 class Estimate:
     """A two-view model of a pair."""
@@ -66,6 +84,7 @@ class Estimate:
     inliers: NDArray[np.bool_]  # (N,) mask over the matches that were given: those nearer than the threshold
     failure: str = ""  # why ``matrix`` is only the fallback
     magsac: Matrix3 | None = None  # under a prior on focal lengths, the F of MAGSAC alone, if it finds any
+    stats: EstimateStats = NO_STATS
 
     @property
     def ok(self) -> bool:
@@ -117,7 +136,7 @@ def consensus(
         threshold /= float(np.mean([K[axis, axis] for K in intrinsics for axis in (0, 1)]))
     method = cv2.USAC_MAGSAC if config.method is Method.MAGSAC else cv2.RANSAC
     settings = {"method": method, "confidence": config.confidence, "maxIters": config.max_iterations}
-    best, inliers, lowest = None, np.zeros(count, bool), np.inf
+    best, inliers, lowest, candidates = None, np.zeros(count, bool), np.inf, 0
     failure = f"no {model} fits {count} distinct matches"
     for number in range(config.permutations):
         order = permutation(number, count)
@@ -133,11 +152,13 @@ def consensus(
         # Most inliers do not decide: MAGSAC's score depends on distances up to several times the threshold.
         if best is None or cost < lowest:
             best, inliers[order], lowest = matrix, mask.ravel().astype(bool), cost
+        candidates += 1
     if best is None:
         return Estimate.failed(model, count, failure)
     if not inliers.any():
         return Estimate.failed(model, count, f"no {model} has inliers among {count} distinct matches")
-    return Estimate(model, unit_norm(best), inliers)
+    known = lowest if np.isfinite(lowest) else None
+    return Estimate(model, unit_norm(best), inliers, stats=EstimateStats(candidates, known, known))
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,7 +9,16 @@ from typing import Any
 from mkpc_kaggle.errors import warn_once
 from mkpc_kaggle.matchers.contract import Matcher, Placement, Precision
 from mkpc_kaggle.matchers.registry import load_matcher
-from mkpc_kaggle.pipeline.availability import FAULTS, Licence, by_kind, options_of, refusal, slots_of, unavailable
+from mkpc_kaggle.pipeline.availability import (
+    FAULTS,
+    Licence,
+    by_kind,
+    options_of,
+    refusal,
+    slots_of,
+    unavailable,
+    unrefined,
+)
 from mkpc_kaggle.pipeline.devices import AUTO, gpus_of, require_device, resolve_placement
 from mkpc_kaggle.pipeline.stages import ENCODING_CACHE_BYTES, Pipeline
 from mkpc_kaggle.recipe import Mode, Recipe, load_recipe
@@ -70,9 +79,12 @@ class Assembly:
         )
 
     def fingerprint(self) -> dict[str, Any]:
-        """What decides the numbers that come out: the recipe, the precision and the digests of the weights."""
+        """What decides which points are found: units and matchers, the precision and the digests of the weights.
+
+        What F and cameras are made of the points is in :meth:`Recipe.estimation`.
+        """
         return {
-            "recipe": self.recipe.fingerprint(),
+            "recipe": self.recipe.matching(),
             "precision": self.placement.precision,
             "weights": {slot: file.digest for slot, file in self.weight_files.items()},
         }
@@ -123,6 +135,8 @@ def assemble(
         options_of(chosen, name)  # those of a matcher that no unit names are checked too
     left_out = by_kind({name: reasons[name] for name in written.matcher_names if name in reasons})
     chosen = chosen.only(lambda unit: unit.matcher not in lacking).with_scenes(scenes).in_mode(mode)
+    if names := unrefined(chosen, store, own):
+        left_out += (f"no weights to refine keypoints: {', '.join(names)}",)
     made = Assembly(chosen, store, resolve_placement(device, precision), left_out, own, device)
     files = made.weight_files.values()
     if unverified := sorted(file.path.name for file in files if file.state is State.UNVERIFIED):

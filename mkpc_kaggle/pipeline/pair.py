@@ -10,6 +10,7 @@ from mkpc_kaggle.geometry.coordinates import Matrix3, Size
 from mkpc_kaggle.geometry.critical_region import CriticalRegion
 from mkpc_kaggle.geometry.focal_prior import FocalPrior, estimate_with_prior
 from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.geometry.overlap import support
 from mkpc_kaggle.geometry.robust import Estimate, ModelKind, estimate
 from mkpc_kaggle.recipe import Recipe, Unit
 
@@ -42,8 +43,11 @@ class PairMatch:
     regions: Regions | None = None  # None until a unit of stage 2 needs them
     estimate: Estimate = NOT_ESTIMATED
     images: tuple[Image, ...] = ()  # both, while units run
-    sizes: tuple[Size, ...] = ()  # of the images, and their versions, when they are no longer at hand
+    sizes: tuple[
+        Size, ...
+    ] = ()  # of the images, their versions and focal lengths, when they are no longer at hand
     versions: tuple[str, ...] = ()
+    focals: tuple[float, ...] = ()
     failure: str = ""  # which image cannot be read
     decode_seconds: float = 0.0
     cluster_seconds: float = 0.0
@@ -75,7 +79,8 @@ def with_estimate(
 ) -> PairMatch:
     """The pair with its two-view model from all matches, in the recipe's order: MAGSAC's result depends on it.
 
-    The recipe's prior on focal lengths, if any, goes by the images' sizes unless ``intrinsics`` are given.
+    The recipe's prior on focal lengths, if any, goes by the images' sizes and EXIF, unless ``intrinsics`` are
+    given.
     """
     results = tuple(sorted(pair.results, key=lambda result: recipe.units.index(result.unit)))
     matches = Matches.concatenate(result.matches for result in results)
@@ -83,7 +88,13 @@ def with_estimate(
         found = estimate(matches, recipe.magsac, model, intrinsics)
     else:
         sizes = pair.sizes or tuple(image.size for image in pair.images)
+        focals = pair.focals or tuple(image.focal for image in pair.images)
+        told = zip(sizes, focals, strict=True)
         known = [FocalPrior(K, 0.0) for K in intrinsics or ()]
-        first, second = known or [FocalPrior.of_image(size, recipe.focal) for size in sizes]
+        first, second = known or [FocalPrior.of_image(size, recipe.focal, focal) for size, focal in told]
         found = estimate_with_prior(matches, (first, second), recipe.magsac, recipe.focal, model)
+    if found.ok and model is not ModelKind.H:
+        K0, K1 = intrinsics if intrinsics and model is ModelKind.E else (np.eye(3), np.eye(3))
+        F = np.linalg.inv(K1).T @ found.matrix @ np.linalg.inv(K0)
+        found = replace(found, stats=replace(found.stats, support=support(F, matches)))
     return replace(pair, results=results, estimate=found)

@@ -1,6 +1,7 @@
 """The Python API: two images in, their matches and two-view model out."""
 
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -74,4 +75,5 @@ def to_image(source: str | Path | Pixels | Image) -> Image:
     image = read_image(Path(source))
     if isinstance(image, Unreadable):
         raise UserError(str(image))
-    return Image.of_array(image.pixels)  # named by its content: a file may change between two calls
+    # Named by its content: a file may change between two calls.
+    return replace(Image.of_array(image.pixels), focal=image.focal)

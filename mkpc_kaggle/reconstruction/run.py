@@ -14,7 +14,7 @@ from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.matchers.contract import Matcher
 from mkpc_kaggle.pipeline.assembly import Assembly
 from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher, to_image
-from mkpc_kaggle.recipe import Recipe, SceneConfig, load_recipe
+from mkpc_kaggle.recipe import CameraSharing, Recipe, SceneConfig, load_recipe
 from mkpc_kaggle.reconstruction.folder import Datasets, Ends, pairs_of
 from mkpc_kaggle.reconstruction.likeness import find_turns
 from mkpc_kaggle.reconstruction.outputs import Cameras
@@ -33,10 +33,13 @@ class FolderResult:
     cameras: Cameras
 
 
-def for_cameras(recipe: Recipe) -> Recipe:
-    """The recipe without steps that only improve the F of single pairs, and without extra pairs."""
+def for_cameras(recipe: Recipe, sharing: str | None = None) -> Recipe:
+    """The recipe without steps that only improve the F of single pairs, and without extra pairs.
+
+    ``sharing`` is a :class:`CameraSharing`; ``None``: as the recipe has it.
+    """
     scene = replace(recipe.scene or SceneConfig(), each_matcher=False, pairs_per_image=0.0)
-    return replace(recipe, focal=None, scene=scene)
+    return replace(recipe, focal=None, scene=replace(scene, cameras=CameraSharing(sharing or scene.cameras)))
 
 
 def reconstruct_folder(
@@ -60,7 +63,8 @@ def reconstruct_folder(
         ends = pairs_of(files) if listed is None else [two for two in listed if two[0].parent == files[0].parent]
         turns = dict.fromkeys(files, 0) | (find_turns(files, assembly) if rotations and ends else {})
         shown = {file: turned_copy(file, turns[file], session.work_dir / "turned")[0] for file in files}
-        exports[name] = Export(out / name, {shown[file].stem: (file.name, turns[file]) for file in files})
+        stored = {shown[file].stem: (file.name, turns[file]) for file in files}
+        exports[name] = Export(out / name, files[0].parent, stored)
         pairs += [Pair(f"{name}/{a.stem}/{b.stem}", name, str(shown[a]), str(shown[b])) for a, b in ends]
     report = run_pairs(pairs, assembly, replace(session, exports=exports))
     versions: dict[str, dict[str, str]] = {name: {} for name in datasets}
@@ -90,8 +94,9 @@ def reconstruct(
 ) -> tuple[SfmModel, ...]:
     """The models of images, given by their paths: the largest first, none where too little matches.
 
-    What the command ``reconstruct`` does, in this process and without its budget and journal. Raises
-    :class:`UserError` for a recipe that cannot run here, and for an image that cannot be read.
+    What the command ``reconstruct`` does, in this process and without its budget and journal. Cameras are in
+    pixels of what the files store, as COLMAP reads them. Raises :class:`UserError` for a recipe that cannot run
+    here, and for an image that cannot be read.
     """
     files = sorted(map(Path, images))
     chosen = for_cameras(load_recipe(recipe) if isinstance(recipe, str) else recipe)
@@ -102,5 +107,6 @@ def reconstruct(
     for path0, path1 in pairs_of(files):
         match = matcher(path0, path1)
         pairs.append(BatchPair(known[path0], known[path1], match.matches, None, tracks_of(match.results)))
+    pairs = Export(Path(), Path(), {str(file): (str(file), 0) for file in files}).stored(pairs)
     found, _ = reconstruct_sharing(ViewGraph.of_pairs(pairs), chosen.scene or SceneConfig())
     return tuple(sorted(models_of(found), key=lambda model: -len(model.images)))

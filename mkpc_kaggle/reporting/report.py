@@ -21,6 +21,7 @@ from mkpc_kaggle.engine.budget import format_duration
 from mkpc_kaggle.engine.journal import EventKind
 from mkpc_kaggle.engine.records import SceneRecord
 from mkpc_kaggle.errors import writing
+from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
 from mkpc_kaggle.pipeline.two_stage import to_image
 from mkpc_kaggle.reporting.figures.pair import draw_pair, draw_strip
 from mkpc_kaggle.reporting.figures.run import draw_budget, draw_cameras
@@ -114,6 +115,8 @@ def _facts(log: RunLog) -> Iterator[tuple[str, str, str]]:
     if len(solved):
         least = f"median of a pair, at least {solved['inliers'].min()}"
         yield "inliers", f"{solved['inliers'].median():.0f}", least
+        told = f"supported {MIN_SUPPORT:g} times as well as by chance"
+        yield "pairs that show the same", f"{solved['overlaps'].sum()} of {len(solved)}", told
     limit = f"of {format_duration(log.about.limit)}" if log.about.limit is not None else "no time limit"
     sessions = sum(event.kind == EventKind.START for event in log.events)
     yield "time", format_duration(log.seconds), limit + (f", session {sessions}" if sessions > 1 else "")
@@ -145,6 +148,7 @@ def _weak(log: RunLog, weak: WeakPair, sources: dict[str, Pair]) -> tuple[str, s
     record, pair, picture = weak.record, log.pairs[weak.record.index], ""
     match = weak.match(log.recipe.magsac.threshold)
     parts = [f"{record.inliers} inliers of {record.matches} matches", record.failure]
+    parts.append("" if record.overlaps else f"may show different things: support {record.stats.support:.1f}")
     if record.source == "scene":
         parts.append("F is the scene's")
     if pair.id in sources:

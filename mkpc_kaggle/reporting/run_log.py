@@ -1,5 +1,6 @@
 """What a journal says of a run: read at one moment, kept as a value, exported to files."""
 
+import json
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -81,7 +82,7 @@ def read_log(directory: Path) -> RunLog:
     """
     with JournalReader(directory) as journal, undamaged(journal.path):
         about, belongs_to, pairs = journal.about(), journal.belongs_to(), journal.pairs()
-        recipe = recipe_of(belongs_to.get("recipe", {}), about.recipe)
+        recipe = recipe_of(belongs_to.get("recipe", {}) | json.loads(about.estimation), about.recipe)
         known = journal.records()
         records = tuple(known.get(index) or PairRecord.untouched(index) for index in range(len(pairs)))
         touched = sorted((record for record in records if record.units), key=lambda r: (r.inliers, r.index))

@@ -7,6 +7,7 @@ from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.budget import format_duration
 from mkpc_kaggle.engine.engine import Ending, RunReport
 from mkpc_kaggle.engine.records import PairRecord, SceneRecord
+from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
 from mkpc_kaggle.reporting.run_log import RunLog
 from mkpc_kaggle.reporting.tables import RunTables, run_tables, seconds_by_part, unit_means, unit_reasons
 
@@ -17,8 +18,10 @@ def summary(pairs: Sequence[Pair], report: RunReport) -> str:
     """The screen that ends a run."""
     tables = run_tables(pairs, report.records)
     resumed = f", {report.resumed} of them from earlier runs" if report.resumed else ""
+    anew = f"; {report.units_run} units run, {report.estimated_anew} F estimated anew"
     failed = filter(None, [trouble(report)])
-    return "\n".join([headline(tables, report) + resumed, *_lines(tables, report), *failed])
+    head = headline(tables, report) + resumed + anew * bool(report.estimated_anew)
+    return "\n".join([head, *_lines(tables, report), *failed])
 
 
 def overview(log: RunLog) -> str:
@@ -85,6 +88,8 @@ def _found(tables: RunTables) -> Iterator[str]:
     inliers, means = tables.solved["inliers"], unit_means(tables)
     if len(inliers):
         yield f"inliers: median {inliers.median():.0f}, mean {inliers.mean():.1f}, least {inliers.min()}"
+        if doubtful := (~tables.solved["overlaps"]).sum():
+            yield f"pairs that may show different things: {doubtful} (support below {MIN_SUPPORT:g})"
     if len(means):
         yield f"{'unit':<30}{'pairs':>7}{'matches':>9}{'inliers':>9}{'seconds':>9}"
     for unit in means.itertuples():

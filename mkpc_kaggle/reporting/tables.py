@@ -19,7 +19,11 @@ SECONDS = {  # what the parts of a pair's work are called; MAGSAC runs beside th
     "cluster_seconds": "cluster",
     "estimate_seconds": "MAGSAC (beside matching)",
 }
-_COLUMNS = {"failure": object, "source": object, "matches": int, "inliers": int} | dict.fromkeys(SECONDS, float)
+_COLUMNS = {
+    **{"failure": object, "source": object, "matches": int, "inliers": int, "overlaps": bool},
+    **dict.fromkeys(SECONDS, float),
+}
+_STATS_COLUMNS = {"support": float, "candidates": int, "cost": float, "magsac_cost": float}
 _UNIT_COLUMNS = {"pair": int, **UnitRecord.__annotations__}
 _BOX_COLUMNS = dict.fromkeys(("pair", "image", "left", "top", "right", "bottom"), int)
 _REGION_COLUMNS = {**_BOX_COLUMNS, "reason": str, "clusters": int, "kept": int}
@@ -103,6 +107,10 @@ def _pair_table(pairs: Sequence[Pair], records: Sequence[PairRecord]) -> pd.Data
     }
     for name, kind in _COLUMNS.items():
         columns[name] = np.fromiter((getattr(record, name) for record in records), kind, size)
+    for name, kind in _STATS_COLUMNS.items():
+        columns[name] = np.array([getattr(record.stats, name) for record in records], kind)
+    focals = np.array([record.stats.focals or (np.nan, np.nan) for record in records]).reshape(size, 2)
+    columns |= {"focal0": focals[:, 0], "focal1": focals[:, 1]}
     F = np.array([record.chosen_fundamental for record in records]).reshape(size, 9)
     columns |= dict(zip(F_COLUMNS, F.T, strict=True))
     return pd.DataFrame(columns, copy=False)

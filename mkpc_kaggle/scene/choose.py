@@ -98,7 +98,7 @@ def estimate_at_known_focals(
     first, second = (
         FocalPrior.of_focal(focals[image.digest], FOCAL_SIGMA, image.size)
         if image.digest in focals
-        else FocalPrior.of_image(image.size, config)
+        else FocalPrior.of_image(image.size, config, image.focal)
         for image in images
     )
     found = estimate_with_prior(pair.matches, (first, second), magsac, config)

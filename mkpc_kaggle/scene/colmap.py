@@ -17,16 +17,15 @@ import numpy as np
 import pycolmap
 
 from mkpc_kaggle.geometry.cameras import Camera
-from mkpc_kaggle.geometry.coordinates import Points
-from mkpc_kaggle.recipe import CameraModel, SceneConfig
+from mkpc_kaggle.geometry.coordinates import Points, Size
+from mkpc_kaggle.recipe import SceneConfig
 from mkpc_kaggle.scene.export import DATABASE, MODELS
 from mkpc_kaggle.scene.keypoints import Index, scene_keypoints
 from mkpc_kaggle.scene.reconstruction import MIN_IMAGES, Reconstruction, RegisteredImage, SfmModel, filter_models
-from mkpc_kaggle.scene.shared_intrinsics import SharedIntrinsics
-from mkpc_kaggle.scene.view_graph import MIN_MATCHES, BatchImage, Edge, ViewGraph
+from mkpc_kaggle.scene.shared_intrinsics import SharedIntrinsics, start_focal
+from mkpc_kaggle.scene.view_graph import MIN_MATCHES, Edge, ViewGraph
 
 CENTRE_PX = 0.5  # in COLMAP the top-left pixel's centre is (0.5, 0.5), here it is (0, 0)
-PRIOR_FOCAL = 1.1  # long sides of the image: the focal length that cameras start with
 MAX_ERROR_PX = 1.0  # of a verified match
 MAX_TRIALS = 300  # of RANSAC for an edge: more find the same inliers at five times the cost
 LARGE = 100  # images; a larger scene has the cost of all its tracks, a smaller scene their accuracy
@@ -38,9 +37,10 @@ SEED = 0
 def structure_from_motion(graph: ViewGraph, config: SceneConfig, shared: SharedIntrinsics) -> Reconstruction:
     """What pycolmap makes of a view graph; perhaps no model, perhaps several.
 
-    Each image has a camera of its own, except those with ``shared`` intrinsics, which start at the shared focal
-    length. The global mapper goes first. Where it leaves many images of a small scene without a camera, the
-    incremental mapper is asked too, and the reconstruction in which images see points more often stays.
+    Each image has a camera of its own, except those with ``shared`` intrinsics. Cameras start with the shared
+    focal length or that of EXIF, which is refined as any other is. The global mapper goes first. Where it leaves
+    many images of a small scene without a camera, the incremental mapper is asked too, and the reconstruction in
+    which images see points more often stays.
     """
     pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
     pycolmap.set_random_seed(SEED)
@@ -81,7 +81,7 @@ def _fill(database: Any, graph: ViewGraph, config: SceneConfig, shared: SharedIn
     """Write images with their cameras and keypoints, and the matches and verified geometry of each edge."""
     keypoints, found = scene_keypoints(graph)
     with pycolmap.DatabaseTransaction(database):
-        cameras = _write_images(database, graph, keypoints, config.camera_model, shared)
+        cameras = _write_images(database, graph, keypoints, config, shared)
         geometries = verify(graph.edges, keypoints, found, cameras, config.threads)
         for edge, matches, geometry in zip(graph.edges, found, geometries, strict=True):
             database.write_matches(edge.first + 1, edge.second + 1, matches)
@@ -89,7 +89,7 @@ def _fill(database: Any, graph: ViewGraph, config: SceneConfig, shared: SharedIn
 
 
 def _write_images(
-    database: Any, graph: ViewGraph, keypoints: Sequence[Points], model: CameraModel, shared: SharedIntrinsics
+    database: Any, graph: ViewGraph, keypoints: Sequence[Points], config: SceneConfig, shared: SharedIntrinsics
 ) -> list[Any]:
     """Write images, frames, cameras and rigs; returns each image's camera.
 
@@ -101,7 +101,8 @@ def _write_images(
         focal = shared.get(image.digest)
         key = number if focal is None else (image.size, focal)
         if key not in cameras:
-            cameras[key] = _write_camera(database, number, image, model, focal)
+            start = start_focal(image, config) if focal is None else focal
+            cameras[key] = _write_camera(database, number, image.size, start, config)
         camera = cameras[key]
         taken = pycolmap.Image(
             name=image.name, camera_id=camera.camera_id, image_id=number, keypoints=np.zeros((0, 2))
@@ -115,10 +116,9 @@ def _write_images(
     return used
 
 
-def _write_camera(database: Any, number: int, image: BatchImage, model: CameraModel, focal: float | None) -> Any:
-    """Write a camera, and a rig of it alone."""
-    start = PRIOR_FOCAL * max(image.size) if focal is None else focal
-    camera = pycolmap.Camera.create_from_model_name(number, model.value, start, *image.size)
+def _write_camera(database: Any, number: int, size: Size, focal: float, config: SceneConfig) -> Any:
+    """Write a camera that starts with this focal length, and a rig of it alone."""
+    camera = pycolmap.Camera.create_from_model_name(number, config.camera_model.value, focal, *size)
     camera.has_prior_focal_length = True  # a pair that E explains at the prior is used as calibrated
     database.write_camera(camera, use_camera_id=True)
     rig = pycolmap.Rig(rig_id=number)

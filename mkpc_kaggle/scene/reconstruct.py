@@ -6,11 +6,11 @@ from pathlib import Path
 
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.geometry.robust import RobustConfig
-from mkpc_kaggle.recipe import SceneConfig
+from mkpc_kaggle.recipe import CameraSharing, SceneConfig
 from mkpc_kaggle.scene.choose import Choice, Reason, choose, estimate_at_known_focals
 from mkpc_kaggle.scene.export import Export
 from mkpc_kaggle.scene.reconstruction import MIN_IMAGES, Reconstruction, SfmModel
-from mkpc_kaggle.scene.shared_intrinsics import SharedIntrinsics, shared_intrinsics
+from mkpc_kaggle.scene.shared_intrinsics import SharedIntrinsics, given_intrinsics, shared_intrinsics
 from mkpc_kaggle.scene.view_graph import BatchPair, ViewGraph
 
 MIN_PAIRS_PER_IMAGE = 1.35  # connected pairs: with fewer there is little that could contradict the cameras
@@ -46,7 +46,7 @@ def reconstruct_batch(
     """
     directory = None
     if export is not None:
-        pairs, directory = [export.original(pair) for pair in pairs], export.directory
+        pairs, directory = export.stored(pairs), export.directory
     together, shared = reconstruct_sharing(ViewGraph.of_pairs(pairs), config, directory)
     matchers = sorted({name for pair in pairs for name in pair.tracks or ()})
     single = matchers if config.each_matcher and len(matchers) > 1 else []
@@ -76,16 +76,18 @@ def reconstruct_sharing(
 ) -> tuple[list[Reconstruction], SharedIntrinsics]:
     """The reconstruction of each component, and the intrinsics that its images share.
 
-    Images that seem to share a camera are reconstructed anew with it, unless they see fewer points then. With a
+    Images that seem to share a camera are reconstructed anew with it, unless they see fewer points then. Images
+    that are known to share a camera do so at once; the answer has the focal length that was found for it. With a
     ``directory`` the graph is reconstructed as a whole, and COLMAP's files are written there.
     """
     if directory is None:
         parts, make = graph.components(), reconstruct_component
     else:
         parts, make = (graph.strong,), reconstruct_connected
-    shared: SharedIntrinsics = {}
+    given = shared = given_intrinsics(graph.images, config)
     found = [make(part, config, shared) for part in parts]
-    if alike := shared_intrinsics(graph.images, models_of(found), config.shared_intrinsics):
+    tolerance = config.shared_intrinsics if config.cameras is CameraSharing.AUTO else 0.0
+    if alike := shared_intrinsics(graph.images, models_of(found), tolerance):
         anew = [make(part, config, alike) for part in parts]
         before, after = (sum(each.observations for each in made) for made in (found, anew))
         if after >= MIN_OBSERVATIONS * before:
@@ -94,6 +96,9 @@ def reconstruct_sharing(
         from mkpc_kaggle.scene.colmap import write_files
 
         write_files(directory, graph.strong, config, shared, models_of(found))
+    if given:
+        focals = {each.image.size: each.focal for model in reversed(models_of(found)) for each in model.images}
+        shared = {image.digest: focals[image.size] for image in graph.images if image.size in focals}
     return found, shared
 
 

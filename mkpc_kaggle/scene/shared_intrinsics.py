@@ -2,7 +2,8 @@
 
 A reconstruction that gives each image its own focal length trades it for the distance to what the image sees, and
 an image with few points may get any. If most images of one size agree on theirs, one camera took them, and a
-second reconstruction can share its intrinsics from the start.
+second reconstruction can share its intrinsics from the start. Where that one camera took them is known, the first
+does.
 """
 
 from collections.abc import Mapping, Sequence
@@ -10,14 +11,32 @@ from typing import TypeAlias
 
 import numpy as np
 
+from mkpc_kaggle.recipe import SceneConfig
 from mkpc_kaggle.scene.reconstruction import SfmModel
 from mkpc_kaggle.scene.view_graph import BatchImage
 
+PRIOR_FOCAL = 1.1  # long sides of the image: the focal length that cameras start with where nothing is known
 MIN_ALIKE = 5  # registered images of one size
 ZOOM_POINTS = 0.5  # an image that disagrees but sees this share of the median image's points has another zoom
 
 # By the digest of an image, the focal length in pixels of the camera that it shares with others of its size.
 SharedIntrinsics: TypeAlias = Mapping[str, float]
+
+
+def start_focal(image: BatchImage, config: SceneConfig) -> float:
+    """The focal length in pixels that an image's camera starts with."""
+    return image.focal if config.exif and image.focal else PRIOR_FOCAL * max(image.size)
+
+
+def given_intrinsics(images: Sequence[BatchImage], config: SceneConfig) -> SharedIntrinsics:
+    """The focal length that all images of one size start with together; nothing unless the recipe says so."""
+    if not config.cameras.is_given:
+        return {}
+    starts = {}
+    for size in {image.size for image in images}:
+        told = [image.focal for image in images if image.size == size and image.focal and config.exif]
+        starts[size] = float(np.median(told)) if told else PRIOR_FOCAL * max(size)
+    return {image.digest: starts[image.size] for image in images}
 
 
 def shared_intrinsics(

@@ -19,12 +19,13 @@ MIN_TRACK_MATCHES = 50  # a pair with fewer matches from units that make tracks 
 class BatchImage:
     """An image of a batch: its ``name``, the ``digest`` of its content, its ``size`` in pixels.
 
-    Two names with one digest are one image.
+    Two names with one digest are one image. ``focal`` is the focal length in pixels by its EXIF, 0 if unknown.
     """
 
     name: str
     digest: str
     size: Size
+    focal: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)

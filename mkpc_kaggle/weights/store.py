@@ -1,7 +1,9 @@
 """The weight files of this machine, found by name or by digest and judged against the manifest."""
 
 import os
+from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import cached_property
@@ -146,19 +148,42 @@ class WeightStore:
         for file in lines:
             for path in self._named(file.name):
                 yield judge(path, file, self.files)
-        sizes, unpacked = self._walked
         for file in (line for line in lines if line.digest != UNVERIFIED):
-            for path, size in sizes.items():
-                small = 0 <= size <= MAX_UNKNOWN_SIZE_BYTES and path.suffix.lower() in CHECKPOINT_SUFFIXES
-                if size == file.size or (file.size < 0 and small):
-                    found = judge(path, file)
-                    if found.state is State.GOOD:
-                        yield found
+            alike = self._by_size.get(file.size) if file.size >= 0 else self._small_by_digest.get(file.digest)
+            found = (judge(path, file) for path in alike or ())
+            yield from (each for each in found if each.state is State.GOOD)
         for file in lines:
-            yield from (judge(directory, file) for directory in unpacked if is_unpacked_from(directory, file))
+            directories = (path for path in self._walked[1] if is_unpacked_from(path, file))
+            yield from (judge(directory, file) for directory in directories)
 
     def _named(self, name: str) -> list[Path]:
-        return [path for path in self._walked[0] if path.name == name]
+        return self._by_name.get(name, [])
+
+    # A directory may have a hundred thousand files, and the manifest has some dozens of lines.
+
+    @cached_property
+    def _by_name(self) -> dict[str, list[Path]]:
+        found = defaultdict(list)
+        for path in self._walked[0]:
+            found[path.name].append(path)
+        return found
+
+    @cached_property
+    def _by_size(self) -> dict[int, list[Path]]:
+        found = defaultdict(list)
+        for path, size in self._walked[0].items():
+            found[size].append(path)
+        return found
+
+    @cached_property
+    def _small_by_digest(self) -> dict[str, list[Path]]:
+        """The files that may be weights whose size the manifest does not have."""
+        found = defaultdict(list)
+        for path, size in self._walked[0].items():
+            if 0 <= size <= MAX_UNKNOWN_SIZE_BYTES and path.suffix.lower() in CHECKPOINT_SUFFIXES:
+                with suppress(OSError):  # it cannot be read
+                    found[digest_of(path)].append(path)
+        return found
 
     @cached_property
     def _walked(self) -> tuple[dict[Path, int], list[Path]]:

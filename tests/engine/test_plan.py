@@ -24,13 +24,20 @@ from mkpc_kaggle.recipe import Unit
 DIED = Failure(Cause.DIED, "signal SIGKILL")
 
 
-def plan_of(count: int = 40, limit: float = math.inf, extra: int = 0, had: Sequence[Sequence[Unit]] = ()) -> Plan:
+def plan_of(
+    count: int = 40,
+    limit: float = math.inf,
+    extra: int = 0,
+    had: Sequence[Sequence[Unit]] = (),
+    outdated: Iterable[int] = (),
+) -> Plan:
     """``had``: the units that the first pairs have had."""
     records = [PairRecord.untouched(index) for index in range(count + extra)]
     for index, units in enumerate(had):
         found = tuple(UnitRecord(unit.name, unit.stage, 100, 50, 0.0, 1.0, "") for unit in units)
         records[index] = PairRecord(index, FALLBACK_FUNDAMENTAL, "", found)
-    return Plan(range(count + extra), count, THREE_UNITS, records, Budget(0.0, limit, lambda: 0.0))
+    budget = Budget(0.0, limit, lambda: 0.0)
+    return Plan(range(count + extra), count, THREE_UNITS, records, budget, outdated=outdated)
 
 
 def finished(job: MatchJob, plan: Plan, inliers: Callable[[int], int] = lambda _: 50) -> MatchResult:
@@ -404,3 +411,56 @@ def test_a_scene_that_never_begins_is_named_and_the_others_have_their_turn(monke
     assert failures.pop("000").startswith("the worker hung: no answer for ")
     assert len(failures) == 2
     assert not any("hung" in failure for failure in failures.values())
+
+
+def done_scenario(**changes):
+    return Scenario(200, (0.5, 1.0), 2, 3600.0, batches=4, pairs_per_image=1.5, **changes)
+
+
+def units_of(ran):
+    return [record.units for record in ran.report.records]
+
+
+@pytest.mark.parametrize("faults", [0.0, 0.2])
+def test_where_the_estimation_alone_has_changed_no_unit_runs_and_every_f_and_scene_is_made_anew(faults):
+    journal = MemoryJournal()
+    first = simulate(done_scenario(), journal)
+    assert first.report.ending == Ending.COMPLETE and first.report.estimated_anew == 0
+    anew = simulate(done_scenario(threshold=1.0, job_faults=faults), journal)
+    assert anew.report.ending == Ending.COMPLETE and anew.late == 0
+    assert anew.report.units_run == 0 and units_of(anew) == units_of(first)
+    assert {record.estimation for record in anew.report.records} != {r.estimation for r in first.report.records}
+    assert len(anew.scenes) == len(first.scenes) == 4
+    assert simulate(done_scenario(threshold=1.0), journal).report.estimated_anew == 0
+
+
+def test_an_interrupted_estimation_goes_on_where_it_was_and_units_that_are_lacking_come_after_it():
+    journal = MemoryJournal()
+    first = simulate(done_scenario(), journal, until=250.0)
+    assert first.report.ending == Ending.INTERRUPTED
+    had = sum(len(units) for units in units_of(first))
+    stopped = simulate(done_scenario(threshold=1.0), journal, until=9.0)
+    assert stopped.report.units_run == 0 < stopped.report.estimated_anew < 200
+    last = simulate(done_scenario(threshold=1.0), journal)
+    assert last.report.ending == Ending.COMPLETE
+    assert sum(len(units) for units in units_of(last)) == 400 > had
+    swept = sum(bool(units) for units in units_of(first))
+    assert stopped.report.estimated_anew + last.report.estimated_anew >= swept
+
+
+def test_an_estimate_that_kills_its_worker_twice_is_given_up_and_the_pair_keeps_its_f():
+    plan = plan_of(9, had=[THREE_UNITS.units] * 9, outdated=range(9))
+    jobs = list(jobs_of(plan, lambda job: DIED if 4 in job.indices else None))
+    assert {job.phase for job in jobs} == {Phase.ESTIMATE} and {job.units for job in jobs} == {()}
+    assert len([job for job in jobs if job.indices == (4,)]) == 2
+    assert (plan.estimated_anew, plan.is_complete) == (8, True)
+    assert explained(plan, "pair 4 keeps the F it has: the worker died")
+
+
+def test_units_wait_until_all_estimates_are_there():
+    plan = plan_of(9, had=[[SWEEP]] * 5, outdated=range(5))
+    first = plan.next(0.0, "one")
+    assert first is not None and (first.phase, first.units, len(first.indices)) == (Phase.ESTIMATE, (), 1)
+    assert {job.phase for job in jobs_of(plan)} == {Phase.ESTIMATE}, "scenes need F of all pairs"
+    plan.on_result(first, finished(first, plan), 0.1, 1.0)
+    assert next(jobs_of(plan)).phase is Phase.SWEEP

@@ -9,6 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from exif_files import set_exif
 from faulty import (
     SCENE_F,
     befall,
@@ -20,16 +21,18 @@ from faulty import (
     scene_in_a_gigabyte,
     scenes_by,
 )
-from rectified import THREE_UNITS, RectifiedMatcher, batch_pairs, matrices, run
+from rectified import SIZE, THREE_UNITS, RectifiedMatcher, batch_pairs, matrices, run
 from synthetic import RECIPE as SYNTHETIC
 from synthetic import SyntheticMatcher, synthetic_pairs
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.engine import Ending
 from mkpc_kaggle.engine.jobs import SceneJob
+from mkpc_kaggle.engine.journal import JournalReader
 from mkpc_kaggle.engine.places import START_TIMEOUT_S
 from mkpc_kaggle.engine.records import PairRecord, UnitRecord
 from mkpc_kaggle.engine.scenes import MATCH_S, START_S, Scenes
+from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.recipe import SceneConfig
 from mkpc_kaggle.reporting.report import report_page
 from mkpc_kaggle.reporting.run_log import read_log
@@ -59,6 +62,27 @@ def test_pairs_get_the_f_of_their_scene_and_keep_their_own(tmp_path, monkeypatch
     assert told in overview(log)
     assert "both cameras are known" in report_page(log)
     assert all(len(weak.results[0].matches) for weak in log.weakest), "what is drawn keeps its points"
+
+
+def test_a_focal_length_of_exif_goes_to_the_pairs_the_journal_and_the_scene(tmp_path, monkeypatch):
+    pairs, jobs = batch_pairs(tmp_path / "images", 3), list[SceneJob]()
+
+    def note(job: SceneJob) -> Solution:
+        jobs.append(job)
+        return choose_scene_for_all_but_the_first(job)
+
+    scenes_by(monkeypatch, note)
+    set_exif(pairs[0].images[0], tA405=28)
+    told = pytest.approx(28 / 43.27 * np.hypot(*SIZE))
+    recipes = [replace(RECIPE, focal=FocalConfig(exif=exif)) for exif in (True, False)]
+    reports = [run(pairs, recipe, RectifiedMatcher(), tmp_path / f"work{n}") for n, recipe in enumerate(recipes)]
+    for number, report in enumerate(reports):
+        assert [record.focals for record in report.records] == [(told, 0), (told, 0), (0, 0)]
+        with JournalReader(tmp_path / f"work{number}") as journal:
+            assert [record.focals for record in journal.records().values()] == [(told, 0), (told, 0), (0, 0)]
+    assert not np.array_equal(*(report.records[0].pair_fundamental for report in reports))
+    assert np.array_equal(*(report.records[2].pair_fundamental for report in reports))
+    assert [pair.image0.focal for pair in jobs[0].pairs] == [told, told, 0]
 
 
 @pytest.mark.parametrize(

@@ -83,6 +83,14 @@ def test_few_noisy_matches_have_a_better_pose_the_more_is_known_of_the_focal_len
     assert np.median(surely) < 0.7 * np.median(weakly)
 
 
+def test_exif_tells_a_focal_length_within_five_per_cent_unless_it_is_switched_off():
+    told, weak = (FocalPrior.of_image(SIZE, FocalConfig(exif=on), 700.0) for on in (True, False))
+    assert (told.K[0, 0], told.K[1, 1], told.sigma) == (700, 700, 0.05)
+    unknown = FocalPrior.of_image(SIZE, FocalConfig())
+    assert (weak.K.tolist(), weak.sigma) == (unknown.K.tolist(), unknown.sigma)
+    assert unknown.sigma == 0.4
+
+
 def test_known_cameras_of_two_focal_lengths_and_any_centre_give_their_essential_matrix():
     K0 = np.array([[820.0, 0, 400], [0, 860, 390], [0, 0, 1]])
     first = Camera(K0, np.eye(3), np.zeros(3))
@@ -158,3 +166,25 @@ def test_whatever_the_points_are_the_answer_is_an_estimate(data, n):
     result = with_prior(Matches(rows[:, :2], rows[:, 2:], np.ones(n)), magsac=quick)
     assert_is_a_value(result, n)
     assert not result.inliers[~np.isfinite(rows).all(axis=1)].any()
+
+
+def test_an_estimate_tells_its_candidates_their_costs_and_the_focal_lengths_that_it_found():
+    matches = seen(CAMERAS, n=300, noise=0.2, outliers=60)
+    stats = with_prior(matches).stats
+    assert stats.candidates == 3, "MAGSAC's, and two that were refined"
+    assert stats.cost < stats.magsac_cost
+    assert_allclose(stats.focals, (900, 1300), rtol=0.3)
+    alone = estimate(matches, RobustConfig(permutations=3)).stats
+    assert alone.candidates == 3 and alone.cost == alone.magsac_cost and alone.focals is None
+    assert 30 <= alone.cost < 100, "a half for each outlier, and little for the others"
+
+
+def test_the_focal_lengths_are_unknown_where_magsac_alone_wins():
+    off = (
+        camera(900.0, centre=CENTRE + np.array([350, 0])),
+        camera(1300.0, 0.15, (-1.0, 0.1, 0.2), CENTRE - np.array([350, 200])),
+    )
+    config = FocalConfig(sigma=0.01)
+    found = with_prior(seen(off, n=400), config=config)
+    assert_allclose(found.matrix * np.sign(found.matrix[2, 2]), found.magsac * np.sign(found.magsac[2, 2]))
+    assert found.stats.focals is None and found.stats.cost == found.stats.magsac_cost

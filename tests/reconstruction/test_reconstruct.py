@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
+from exif_files import set_exif
 from rectified import Seen, flat, number_of
 from sklearn.datasets import load_sample_image
 from synthetic import SyntheticMatcher
@@ -24,6 +25,7 @@ from synthetic import SyntheticMatcher
 from benchmarks.synthetic_scene import SIZE, SyntheticScene, synthetic_scene
 from mkpc_kaggle import reconstruct
 from mkpc_kaggle.cli import main
+from mkpc_kaggle.data.exif import Exif
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.engine import Ending
 from mkpc_kaggle.engine.records import CameraRecord
@@ -148,6 +150,42 @@ def test_colmap_goes_on_from_the_database(mixed, tmp_path):
     options = pycolmap.IncrementalPipelineOptions(settings)
     models = pycolmap.incremental_mapping(out / "database.db", tmp_path, tmp_path, options)
     assert sorted(model.num_reg_images() for model in models.values()) == [4, 6]
+
+
+ORIENTATIONS = (1, 6, 8, 3, 6, 1)  # of the images of a phone, by EXIF
+
+
+def write_from_phone(folder: Path) -> Path:
+    """The images of the first scene, stored as a phone stores them."""
+    write_flat(folder, FIRST)
+    for number, orientation in enumerate(ORIENTATIONS):
+        path = folder / f"{number:02}.png"
+        cv2.imwrite(str(path), np.rot90(flat(number, SIZE), -Exif(orientation).quarters))
+        set_exif(path, orientation)
+    return folder
+
+
+def test_colmap_goes_on_with_photographs_that_exif_turns(tmp_path):
+    root, out = write_from_phone(tmp_path / "images"), tmp_path / "out"
+    result = run(root, out)
+    sizes = {f"{n:02}.png": SIZE if o in (1, 3) else SIZE[::-1] for n, o in enumerate(ORIENTATIONS)}
+    assert {name: record.size for name, record in cameras(result).items()} == sizes
+    settings = {"min_model_size": 3, "random_seed": 0, "extract_colors": True, "num_threads": 1}
+    options = pycolmap.IncrementalPipelineOptions(settings)
+    (model,) = pycolmap.incremental_mapping(out / "database.db", root, tmp_path, options).values()
+    assert model.num_reg_images() == FIRST
+    pycolmap.undistort_images(tmp_path / "flat", out / "models" / "0", root)
+    for name, size in sizes.items():
+        picture = cv2.imread(str(tmp_path / "flat" / "images" / name), cv2.IMREAD_IGNORE_ORIENTATION)
+        assert picture.shape[1::-1] == size
+    flattened = pycolmap.Reconstruction(tmp_path / "flat" / "sparse")
+    undistorted = {image.name: (image.camera.width, image.camera.height) for image in flattened.images.values()}
+    assert undistorted == sizes
+    truth = MixedMatcher().scenes[0].cameras
+    for number, record in enumerate(cameras(result).values()):
+        quarters = Exif(ORIENTATIONS[number]).quarters
+        expected = truth[f"{number:04}"].rotated_90(-quarters, SIZE).R @ truth["0000"].R.T
+        np.testing.assert_allclose(record.camera.R @ cameras(result)["00.png"].camera.R.T, expected, atol=0.01)
 
 
 def test_a_run_that_was_cut_off_ends_with_the_same_files(mixed, tmp_path):

@@ -19,7 +19,7 @@ from mkpc_kaggle.reporting.run_log import NOT_ENDED, read_log
 from mkpc_kaggle.reporting.summary import overview
 
 EVIL = '<script>alert("$x$")</script>'
-BELONGS_TO = {"recipe": THREE_UNITS.fingerprint(), "test set": "abc", "weights": {"xfeat": "123"}}
+BELONGS_TO = {"recipe": THREE_UNITS.matching(), "test set": "abc", "weights": {"xfeat": "123"}}
 
 
 class Tags(HTMLParser):

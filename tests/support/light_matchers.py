@@ -34,6 +34,7 @@ from mkpc_kaggle.matchers.lightglue import LightGlueMatcher, light_glue
 from mkpc_kaggle.matchers.networks.aliked import Aliked
 from mkpc_kaggle.matchers.networks.aspanformer import AspanFormer
 from mkpc_kaggle.matchers.networks.dkm import DKM
+from mkpc_kaggle.matchers.networks.keypt2subpx import Keypt2Subpx
 from mkpc_kaggle.matchers.networks.loftr import Loftr
 from mkpc_kaggle.matchers.networks.loma import Loma, Variant
 from mkpc_kaggle.matchers.networks.placement import prepared
@@ -42,6 +43,7 @@ from mkpc_kaggle.matchers.networks.superglue import SuperGlue
 from mkpc_kaggle.matchers.networks.superpoint import SuperPoint
 from mkpc_kaggle.matchers.semi_dense import SemiDenseMatcher
 from mkpc_kaggle.matchers.sparse import KeypointEncoder
+from mkpc_kaggle.matchers.subpixel import Refiner
 from tests.support.standin import filled, narrow_roma, scene
 
 SIZE = Size(96, 64)
@@ -95,10 +97,16 @@ def aliked_matcher(placement: Placement, keypoints: int = 200) -> AlikedMatcher:
 
 
 def with_lightglue(
-    spec: MatcherSpec, encoder: KeypointEncoder, placement: Placement, layers: int, threshold: float, **shape: int
+    spec: MatcherSpec,
+    encoder: KeypointEncoder,
+    placement: Placement,
+    layers: int,
+    threshold: float,
+    refiner: Refiner | None = None,
+    **shape: int,
 ) -> LightGlueMatcher:
     glue = kornias("lightglue", light_glue, layers, threshold, **shape)
-    return LightGlueMatcher(spec, encoder, glue, placement)
+    return LightGlueMatcher(spec, encoder, glue, placement, refiner)
 
 
 def aliked_lightglue_matcher(
@@ -120,12 +128,17 @@ def make_xfeat() -> nn.Module:
 
 
 def xfeat_lighterglue_matcher(
-    placement: Placement, keypoints: int = 200, layers: int = 2, threshold: float = 0.0
+    placement: Placement, keypoints: int = 200, layers: int = 2, threshold: float = 0.0, refine: bool = False
 ) -> LightGlueMatcher:
     network = XFeat(top_k=keypoints, detection_threshold=0.0)
     network.net = kornias("xfeat", make_xfeat)
-    encoder, shape = xfeat_encoder(network, keypoints, placement), xfeat_lighterglue.SHAPE
-    return with_lightglue(xfeat_lighterglue.SPEC, encoder, placement, layers, threshold, **shape)
+    refiner = None
+    if refine:
+        refiner = Refiner(
+            kornias("keypt2subpx", Keypt2Subpx, xfeat_lighterglue.DESCRIPTOR_DIM).to(placement.device)
+        )
+    encoder, shape = xfeat_encoder(network, keypoints, placement, refiner), xfeat_lighterglue.SHAPE
+    return with_lightglue(xfeat_lighterglue.SPEC, encoder, placement, layers, threshold, refiner, **shape)
 
 
 MATCHERS: dict[str, Callable[[Placement], Any]] = {
@@ -141,6 +154,7 @@ MATCHERS: dict[str, Callable[[Placement], Any]] = {
     "aliked_lightglue": aliked_lightglue_matcher,
     "disk_lightglue": disk_lightglue_matcher,
     "xfeat_lighterglue": xfeat_lighterglue_matcher,
+    "xfeat_lighterglue, refined": partial(xfeat_lighterglue_matcher, refine=True),
 }
 
 

@@ -9,7 +9,6 @@ import math
 import threading
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import starmap
 
 import numpy as np
 
@@ -33,13 +32,14 @@ from mkpc_kaggle.engine.records import NOT_REACHED, PairRecord, SceneRecord, Uni
 from mkpc_kaggle.engine.scenes import FORECAST_MARGIN, START_S
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
+from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL, RobustConfig
 from mkpc_kaggle.pipeline.pair import UnitResult
 from mkpc_kaggle.recipe import Recipe, SceneConfig, Unit
 from mkpc_kaggle.scene.choose import Choice, Reason
 from mkpc_kaggle.scene.reconstruct import Solution
 
 RESTART_S = 8.0
+ESTIMATE_S = 0.1  # of a pair, in a job without units
 STALL = 20.0  # a unit that stalls takes so many times as long
 SIZES = (Size(640, 480), Size(640, 480))
 MATCHES = Matches(np.zeros((200, 2)), np.zeros((200, 2)), np.zeros(200))  # that a unit finds
@@ -79,13 +79,14 @@ class Scenario:
     scene_seconds: float = 0.06
     scene_faults: float = 0.0
     seed: int = 0
+    threshold: float = 0.2  # of MAGSAC
 
     @property
     def recipe(self) -> Recipe:
         count = len(self.costs)
         units = [Unit(1 if number % 2 == 0 else 2, f"m{number}", 100) for number in range(count)]
         scene = SceneConfig(pairs_per_image=self.pairs_per_image) if self.batches else None
-        return Recipe(tuple(units), scene=scene)
+        return Recipe(tuple(units), scene=scene, magsac=RobustConfig(threshold=self.threshold))
 
     @property
     def work(self) -> float:
@@ -168,6 +169,7 @@ class SimulatedSite(Site):
         self.scenes: list[SimulatedScene] = []
         self.rng = np.random.default_rng(scenario.seed)
         self.costs = {unit.name: cost for unit, cost in zip(scenario.recipe.units, scenario.costs, strict=True)}
+        self.estimation = scenario.recipe.pair_estimation()
         self.workers: set[SimulatedWorker] = set()
         self.places = [
             Place(f"place {number}", lambda: SimulatedWorker(self)) for number in range(scenario.workers)
@@ -280,18 +282,23 @@ class SimulatedWorker(Simulated):
                     return end, hung, end - now if stalled else 0.0
                 now += seconds
                 found.append(UnitResult(unit, MATCHES, 0.0, seconds, warm_up=warm_up))
+        if not job.units:
+            now += ESTIMATE_S * len(job.indices)
         pairs = zip(job.indices, job.known, results, strict=True)
-        return now, MatchResult(tuple(starmap(_outcome, pairs))), 0.0
+        return now, MatchResult(tuple(_outcome(site.estimation, not job.units, *pair) for pair in pairs)), 0.0
 
 
-def _outcome(index: int, known: tuple[UnitResult, ...], found: list[UnitResult]) -> Outcome:
-    if not found:
+def _outcome(
+    estimation: str, is_anew: bool, index: int, known: tuple[UnitResult, ...], found: list[UnitResult]
+) -> Outcome:
+    if not found and not is_anew:
         return Outcome(PairRecord.untouched(index, NOT_REACHED))
     units = tuple(
         UnitRecord(result.unit.name, result.unit.stage, len(MATCHES), 20 + index % 60, 0.0, result.seconds, "")
         for result in (*known, *found)
     )
-    record = PairRecord(index, FALLBACK_FUNDAMENTAL, "", units, sizes=SIZES, versions=("first", "second"))
+    images = {"sizes": SIZES, "versions": ("first", "second"), "focals": (0.0, 0.0)}
+    record = PairRecord(index, FALLBACK_FUNDAMENTAL, "", units, estimation=estimation, **images)
     return Outcome(record, tuple(found))
 
 

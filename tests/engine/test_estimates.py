@@ -1,0 +1,128 @@
+"""A journal outlives a change of the estimation: F and cameras are made anew of its points."""
+
+import os
+import signal
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rectified import RectifiedMatcher, run
+from synthetic import RECIPE, SyntheticMatcher, synthetic_pairs
+
+from mkpc_kaggle.data.competition import Pair
+from mkpc_kaggle.engine.engine import Ending
+from mkpc_kaggle.engine.journal import Journal
+from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.geometry.focal_prior import FocalConfig
+from mkpc_kaggle.geometry.robust import Method, RobustConfig
+from mkpc_kaggle.pipeline.stages import Pipeline
+from mkpc_kaggle.recipe import Recipe, SceneConfig
+from mkpc_kaggle.reporting.run_log import read_log
+from mkpc_kaggle.reporting.summary import summary
+
+ALONE = replace(RECIPE, scene=None)
+ESTIMATIONS = {  # in their order each is made of the journal of the one before
+    "scene": RECIPE,
+    "no scene": ALONE,
+    "threshold": replace(ALONE, magsac=RobustConfig(threshold=1.0, permutations=1)),
+    "RANSAC": replace(ALONE, magsac=RobustConfig(Method.RANSAC, permutations=2)),
+    "prior": replace(ALONE, focal=FocalConfig()),
+    "another scene": replace(RECIPE, focal=FocalConfig(sigma=0.2), scene=SceneConfig(shared_intrinsics=0)),
+}
+
+
+class NoMatcher(RectifiedMatcher):
+    def encode(self, pictures):
+        raise AssertionError("nothing is matched")
+
+
+def submission(pairs: Sequence[Pair], recipe: Recipe, work_dir: Path, matcher: RectifiedMatcher | None = None):
+    """The bytes of the file, and the report."""
+    output = work_dir.with_suffix(".csv")
+    report = run(pairs, recipe, matcher or SyntheticMatcher(images=4), work_dir, output=output)
+    assert report.ending is Ending.COMPLETE
+    return output.read_bytes(), report
+
+
+def test_a_run_that_goes_on_from_another_estimation_ends_with_the_bytes_of_a_fresh_one(tmp_path, monkeypatch):
+    pairs = synthetic_pairs(tmp_path / "images", 4)
+    fresh = {name: submission(pairs, recipe, tmp_path / name)[0] for name, recipe in ESTIMATIONS.items()}
+    assert len(set(fresh.values())) >= 5
+    journal = tmp_path / "scene"
+    for path in (tmp_path / "images").iterdir():
+        path.unlink()  # no image is read
+    monkeypatch.setattr(Pipeline, "load", lambda _: pytest.fail("no matcher is loaded"))
+    for name, recipe in [*ESTIMATIONS.items()][1:]:
+        written, report = submission(pairs, recipe, journal, NoMatcher(name="synthetic"))
+        assert written == fresh[name], name
+        # Without the scene F is that of the pairs' own matches, which the journal has.
+        assert (report.units_run, report.estimated_anew) == (0, 0 if name == "no scene" else 6)
+        assert read_log(journal).recipe == replace(recipe, name=read_log(journal).recipe.name)
+    assert "6 of them from earlier runs; 0 units run, 6 F estimated anew" in summary(pairs, report)
+
+
+def die_at_a_write(pairs: Sequence[Pair], recipe: Recipe, work_dir: Path, *, after: bool) -> None:
+    """Go on, until this process kills itself at the first write to the journal: before it, or after it."""
+
+    def save(name: str) -> Callable[..., None]:
+        whole = getattr(Journal, name)
+
+        def save_and_die(*arguments: Any) -> None:
+            if after:
+                whole(*arguments)
+            os.kill(os.getpid(), signal.SIGKILL)
+
+        return save_and_die
+
+    for name in ("save", "save_scene"):
+        setattr(Journal, name, save(name))
+    submission(pairs, recipe, work_dir, NoMatcher(name="synthetic"))
+
+
+@pytest.mark.parametrize("kills", [2, pytest.param(10, marks=pytest.mark.slow)])
+def test_a_run_that_is_killed_while_it_estimates_anew_ends_with_the_same_bytes(tmp_path, kills):
+    images = 7 if kills > 2 else 4  # 21 pairs are four jobs and a scene
+    pairs, other = synthetic_pairs(tmp_path / "images", images), ESTIMATIONS["another scene"]
+    undisturbed = submission(pairs, other, tmp_path / "fresh", SyntheticMatcher(images=images))[0]
+    submission(pairs, RECIPE, tmp_path / "work", SyntheticMatcher(images=images))
+    for number in range(kills):
+        settings = {"after": bool(number % 2)}
+        arguments = pairs, other, tmp_path / "work"
+        process = get_context("spawn").Process(target=die_at_a_write, args=arguments, kwargs=settings)
+        process.start()
+        process.join()
+        assert process.exitcode == -signal.SIGKILL
+    assert submission(pairs, other, tmp_path / "work", NoMatcher(name="synthetic"))[0] == undisturbed
+
+
+def test_the_file_has_the_former_f_until_another_is_there(tmp_path):
+    pairs, versions = synthetic_pairs(tmp_path / "images", 4), []
+    first = run(pairs, RECIPE, SyntheticMatcher(images=4), tmp_path / "work")
+    other = replace(RECIPE, magsac=RobustConfig(threshold=1.0))
+    run(pairs, other, SyntheticMatcher(images=4), tmp_path / "work", publish=lambda r: versions.append(list(r)))
+    for former, record in zip(first.records, versions[0], strict=True):
+        assert np.array_equal(former.chosen_fundamental, record.chosen_fundamental)
+    assert all(record.source == "scene" for record in versions[-1])
+    assert {record.estimation for record in versions[0]}.isdisjoint(record.estimation for record in versions[-1])
+
+
+def test_what_was_matched_otherwise_is_still_refused(tmp_path):
+    pairs = synthetic_pairs(tmp_path / "images", 4)
+    submission(pairs, ALONE, tmp_path / "work")
+    other = replace(ALONE, units=(replace(ALONE.units[0], max_matches=9),))
+    with pytest.raises(UserError, match="belongs to another run: its recipe differ"):
+        submission(pairs, other, tmp_path / "work")
+
+
+def test_e_is_estimated_of_the_points_that_f_was_made_of(tmp_path):
+    pairs = synthetic_pairs(tmp_path / "images", 4)
+    submission(pairs, ALONE, tmp_path / "work")
+    K = np.array([[900.0, 0, 400], [0, 900, 300], [0, 0, 1]])
+    known = [replace(pair, intrinsics=(K, K)) for pair in pairs]
+    written, report = submission(known, ALONE, tmp_path / "work")
+    assert (report.units_run, report.estimated_anew) == (0, 6)
+    assert written == submission(known, ALONE, tmp_path / "fresh")[0]

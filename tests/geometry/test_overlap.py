@@ -1,0 +1,48 @@
+"""Whether two images show the same thing: real matches support F, wrong ones hardly, however many."""
+
+import numpy as np
+import pytest
+
+from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.geometry.overlap import MIN_SUPPORT, support
+from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL, RobustConfig, estimate
+
+QUICK = RobustConfig(permutations=1, max_iterations=2000)
+
+
+def rectified(right, wrong, seed=0, box=(800, 600)):
+    """Matches along rows, whose F is the fallback, and wild ones."""
+    rng = np.random.default_rng(seed)
+    points0 = rng.uniform(0, box, (right + wrong, 2))
+    points1 = points0 + np.column_stack([rng.uniform(0, 50, right + wrong), np.zeros(right + wrong)])
+    points1[right:] = rng.uniform(0, box, (wrong, 2))
+    return Matches(points0, points1, np.ones(right + wrong))
+
+
+def own_support(matches):
+    return support(estimate(matches, QUICK).matrix, matches)
+
+
+@pytest.mark.parametrize("wrong", [0, 60, 3000])
+def test_right_matches_support_their_f_among_any_number_of_wrong_ones(wrong):
+    assert support(FALLBACK_FUNDAMENTAL, rectified(200, wrong)) > MIN_SUPPORT
+
+
+@pytest.mark.parametrize("wrong", [8, 60, 500, 5000])
+def test_wrong_matches_alone_do_not_support_the_best_f_that_is_found(wrong):
+    assert own_support(rectified(0, wrong)) < MIN_SUPPORT
+
+
+def test_thousands_of_inliers_in_one_spot_say_nothing():
+    matches = rectified(2000, 0, box=(3, 3))
+    assert (np.abs(matches.points0[:, 1] - matches.points1[:, 1]) < 1).all()
+    assert support(FALLBACK_FUNDAMENTAL, matches) < MIN_SUPPORT
+
+
+def test_duplicates_count_once_and_few_matches_never_tell():
+    matches = rectified(200, 60)
+    assert support(FALLBACK_FUNDAMENTAL, Matches.concatenate([matches] * 3)) == support(
+        FALLBACK_FUNDAMENTAL, matches
+    )
+    for count in (0, 1, 7):
+        assert support(FALLBACK_FUNDAMENTAL, rectified(count, 0)) == 0
