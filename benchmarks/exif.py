@@ -14,11 +14,11 @@ from pathlib import Path
 from zlib import crc32
 
 import numpy as np
+from benchmarks.saved_matches import SavedMatches
 from tqdm import tqdm
 
 from benchmarks import saved_matches
 from benchmarks.estimation import SCENE, Score, accuracy, batch_pair, table
-from benchmarks.saved_matches import SavedMatches
 from mkpc_kaggle.data.competition import TrainScene, TruePair, read_train_side
 from mkpc_kaggle.geometry.focal_prior import FocalPrior, estimate_with_prior
 from mkpc_kaggle.recipe import Recipe, load_recipe
