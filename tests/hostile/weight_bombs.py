@@ -156,8 +156,8 @@ CASES = [
         for name, data in SAFETENSORS.items()
     ),
     *(
-        Case("weights", f"{file}, {name}: {command}", f"weights {command} {SEARCH}", listed(file, make), (0, 1))
-        for command in ("list", "verify")
+        Case("weights", f"{file}, {name}: {command}", f"weights {command} {SEARCH}", listed(file, make), (status,))
+        for command, status in (("list", 0), ("verify", 1))
         for file in LISTED
         for name, make in SEARCHED.items()
     ),
