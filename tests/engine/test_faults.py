@@ -71,7 +71,13 @@ def test_an_error_of_the_engine_itself_leaves_the_latest_version_behind(pairs, t
 
     monkeypatch.setattr(Plan, "on_result", fail_later)
     with pytest.raises(KeyError, match="a bug"):
-        run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work", publish=lambda r: published.append(list(r)))
+        run(
+            pairs,
+            THREE_UNITS,
+            RectifiedMatcher(),
+            tmp_path / "work",
+            publish=lambda r, _: published.append(list(r)),
+        )
     assert [bool(record.units) for record in published[-1]] == [True] + [False] * 11
 
 
@@ -263,7 +269,7 @@ def stuck(self, until):
 LocalSite.wait = stuck
 home = Path(sys.argv[1])
 pairs = write_pairs(home / "pairs", 40)
-def publish(records):
+def publish(records, scenes):
     (home / "out").write_text(str(sum(bool(record.units) for record in records)))
 run(pairs, THREE_UNITS, RectifiedMatcher(), home / "work", limit=4.0, publish=publish, is_watched=True)
 """
