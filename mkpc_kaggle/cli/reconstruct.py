@@ -10,6 +10,7 @@ from mkpc_kaggle.cli import options
 from mkpc_kaggle.data.outputs import require_directory_apart
 from mkpc_kaggle.engine.budget import format_duration
 from mkpc_kaggle.engine.console import say
+from mkpc_kaggle.engine.session import interruptible
 from mkpc_kaggle.recipe import CameraSharing
 from mkpc_kaggle.reconstruction.folder import read_folder, read_pair_list
 from mkpc_kaggle.reconstruction.outputs import FORMS, Cameras, write_tables
@@ -75,8 +76,10 @@ def run(arguments: argparse.Namespace) -> int:
     lists = [] if arguments.pairs is None else [arguments.pairs]
     require_directory_apart(out, [root, *lists, Path(arguments.recipe)], arguments.weights)
     listed = None if arguments.pairs is None else read_pair_list(arguments.pairs, root, datasets)
-
-    with options.watched_session(arguments, work_dir) as (session, watchdog):
+    with (
+        interruptible() as interrupt,
+        options.watched_session(arguments, work_dir, interrupt) as (session, watchdog),
+    ):
         watchdog.status = 1  # until there is a model
 
         def publish(cameras: Cameras) -> None:

@@ -2,14 +2,13 @@
 
 import hashlib
 import json
-import os
 import platform
 import signal
 import sqlite3
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from importlib import metadata
 from math import isfinite
@@ -89,13 +88,20 @@ def first_version(pairs: Sequence[Pair], output: Path) -> Iterator[None]:
     if not output.exists():
         with writing(f"--output {output}"):
             write_submission(output, {pair.id: FALLBACK_FUNDAMENTAL for pair in pairs})
-            ours = output.stat()
+            ours = _identity(output)
     try:
         yield
     except UserError:
-        if ours is not None and os.path.samestat(ours, output.stat()):
-            output.unlink()
+        with suppress(OSError):  # somebody else has removed it
+            if ours == _identity(output):
+                output.unlink()
         raise
+
+
+def _identity(path: Path) -> tuple[int, int]:
+    """Tells versions of a file apart: a later version may have the number of a file that is gone."""
+    status = path.stat()
+    return status.st_ino, status.st_mtime_ns
 
 
 def require_writable(output: Path) -> None:

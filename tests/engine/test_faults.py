@@ -336,7 +336,7 @@ def test_a_child_that_was_stopped_does_not_outlive_the_watchdog():
     stop = "os.kill(child.pid, signal.SIGSTOP); print(child.pid, flush=True)"
     done = guarded(f"child = {child}; child.start(); {stop}; time.sleep(600)")
     assert done.returncode == 1  # nothing was written
-    assert "before a first version of the submission was written" in done.stderr
+    assert "the time limit passed before the first results were written" in done.stderr
     status = Path(f"/proc/{done.stdout.strip()}/stat")
     while status.exists() and status.read_text().split()[2] != "Z":  # dead, though nobody has asked of it yet
         time.sleep(0.05)

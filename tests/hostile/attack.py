@@ -75,11 +75,12 @@ def attack(case: Case, room: Path) -> None:
         status, output = _wait(process, room)
         faults += _faults(case, status, output, room)
         faults += [f"left running: {line}" for line in _orphans(mark)]
+        # Before the table was read.
         interrupted = status not in (0, 1) and output.strip() in ("", "error: interrupted")
-        nothing = interrupted or (status == 1 and TOO_LATE in output)  # before it began
-        if case.submission and not nothing and "submit" in command and status in LEFT_BY_ITSELF:
+        if case.submission and not interrupted and "submit" in command and status in LEFT_BY_ITSELF:
             faults += _submission_faults(room)
-        if status in (0, 1) and not nothing and "reconstruct" in command:
+        too_late = status == 1 and TOO_LATE in output  # before its directory was looked at
+        if status in (0, 1) and not too_late and "reconstruct" in command:
             faults += _result_faults(room / "out" / "o", status)
     faults += [f"changed: {name}" for name in _changed(before, _snapshot(room))]
     if faults:
