@@ -36,6 +36,9 @@ Pixels are those that a file stores, as COLMAP reads it, whatever EXIF says of i
 4, 5, 7) make models of their own. Cameras start with the focal lengths that EXIF has, unless the recipe's table
 [scene] has `exif = false`.
 
+OUT must be empty, or have nothing in it but what an earlier run of this command made. What is made takes the place
+of former results when it is whole.
+
 All pairs of up to 100 images are matched, and in larger datasets each image with the 20 most like it.
 
 Exit status: 0 done; 1 there is no model, or the run failed; 2 bad input; 130 or 143 ended by a signal.
@@ -46,7 +49,13 @@ MAX_LINES = 20  # of each list
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("images", type=Path, metavar="DIR", help="png, jpg or jpeg files, or folders of them")
-    add("--out", type=Path, required=True, metavar="OUT", help="the directory for the results")
+    add(
+        "--out",
+        type=Path,
+        required=True,
+        metavar="OUT",
+        help="the directory for the results: empty, or with those of an earlier run",
+    )
     options.add_matching(parser)
     options.add_run(parser, time_limit=None)
     add("--pairs", type=Path, metavar="FILE", help="match these alone: two paths below DIR a line, as of hloc")
