@@ -103,3 +103,15 @@ def test_the_python_of_the_readme_runs(block, tmp_path, monkeypatch):
         assert names["models"] == (), "two images make no model"
     else:
         assert names["match"].estimate.inlier_count > 50
+
+
+def test_a_folder_uses_those_above_it_and_never_those_below():
+    page = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    folders = re.findall(r"^\| `(\w+)/` \|", page, re.M)
+    order = ["errors", "version", "config", folders[0], "recipe", *folders[1:]]
+    package = ROOT / "mkpc_kaggle"
+    assert {path.name for path in package.iterdir() if (path / "__init__.py").is_file()} == set(folders)
+    for path in package.glob("*/**/*.py"):
+        layer = order.index(path.relative_to(package).parts[0])
+        used = re.findall(r"^\s*(?:from|import) mkpc_kaggle\b\.?(\w*)", path.read_text(encoding="utf-8"), re.M)
+        assert [name for name in used if name not in order[: layer + 1]] == [], path

@@ -4,7 +4,7 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
-from attack import EITHER, REFUSED, Case, nothing
+from attack import REFUSED, Case, nothing
 from room import SUBMIT
 
 INPUTS = {
@@ -31,6 +31,11 @@ INPUTS = {
     "below /dev/null": "--output /dev/null/s.csv",
     "the submission in the journal's place": "--work-dir out --output out/journal.sqlite",
     "the submission in the lock's place": "--work-dir out --output out/journal.lock",
+    "the null device": "--output /dev/null",
+    "the full device": "--output /dev/full",
+    "the journal among the images": "--output out/s.csv --work-dir D/test_images",
+    "no name for the report": "--output out/s.csv --report ''",
+    "a directory for the report": "--output out/s.csv --report out",
 }
 ODD = {
     "a name with a line feed": "--output 'out/a\nb.csv'",
@@ -38,28 +43,25 @@ ODD = {
     "no suffix": "--output out/s",
     "two suffixes": "--output out/s.csv.gz",
     "directories that are not there": "--output out/a/b/c/d/s.csv",
-    "the null device": "--output /dev/null",
-    "the full device": "--output /dev/full",
-    "the journal among the images": "--output out/s.csv --work-dir D/test_images",
-    "no name for the report": "--output out/s.csv --report ''",
-    "a directory for the report": "--output out/s.csv --report out",
 }
-THERE: dict[str, Callable[[Path], object]] = {
+IN_THE_WAY: dict[str, Callable[[Path], object]] = {
     "a link to the table": lambda path: path.symlink_to("../D/test.csv"),
     "a hard link to the table": lambda path: os.link(path.parent.parent / "D" / "test.csv", path),
+    "a directory": Path.mkdir,
+    "a file for the journal's directory": lambda path: path.with_suffix(".work").write_text("old"),
+    "a pipe for the journal's directory": lambda path: os.mkfifo(path.with_suffix(".work")),
+    "a link for the report": lambda path: path.with_suffix(".html").symlink_to("../D/test.csv"),
+    "a directory for the report ": lambda path: path.with_suffix(".html").mkdir(),
+}
+THERE: dict[str, Callable[[Path], object]] = {
     "a link to itself": lambda path: path.symlink_to(path),
     "a link to nothing": lambda path: path.symlink_to("nothing.csv"),
     "a pipe": os.mkfifo,
-    "a directory": Path.mkdir,
     "an older file": lambda path: path.write_text("old"),
-    "a file for the journal's directory": lambda path: path.with_suffix(".work").write_text("old"),
-    "a pipe for the journal's directory": lambda path: os.mkfifo(path.with_suffix(".work")),
     "a directory for the partial file": lambda path: path.with_name(".s.csv.part").mkdir(),
     "a link for the partial file": lambda path: path.with_name(".s.csv.part").symlink_to("../D/test.csv"),
     "a pipe for the partial file": lambda path: os.mkfifo(path.with_name(".s.csv.part")),
-    "a link for the report": lambda path: path.with_suffix(".html").symlink_to("../D/test.csv"),
     "a pipe for the report": lambda path: os.mkfifo(path.with_suffix(".html")),
-    "a directory for the report ": lambda path: path.with_suffix(".html").mkdir(),
 }
 WEIGHTS = (b"\x08\x00\x00\x00\x00\x00\x00\x00{}      ", "W/w.safetensors")  # a file without tensors
 OVER = {
@@ -90,14 +92,15 @@ def placed(make: Callable[[Path], object]) -> Callable[[Path], None]:
 CASES = [
     *(Case("outputs", name, f"{PLAIN} {options}", statuses=REFUSED) for name, options in INPUTS.items()),
     *(
-        Case("outputs", name, f"{PLAIN} {options}", statuses=(0, 1, 2), submission="out/s.csv " in f"{options} ")
+        Case("outputs", name, f"{PLAIN} {options}", submission="out/s.csv " in f"{options} ")
         for name, options in ODD.items()
     ),
     *(
-        Case("outputs", f"there is {name}", f"{PLAIN} --output out/s.csv", placed(make), (0, 1, 2))
-        for name, make in THERE.items()
+        Case("outputs", f"there is {name}", f"{PLAIN} --output out/s.csv", placed(make), statuses)
+        for table, statuses in ((THERE, (0,)), (IN_THE_WAY, REFUSED))
+        for name, make in table.items()
     ),
     *(Case("outputs", name, command, weights, REFUSED, "name another") for name, command in OVER.items()),
     Case("outputs", "text that the terminal has not", f"{PLAIN} --output out/s.csv", env=ASCII),
-    Case("outputs", "the C locale", f"{PLAIN} --output out/\u00e9.csv", statuses=EITHER, env=C, submission=False),
+    Case("outputs", "the C locale", f"{PLAIN} --output out/\u00e9.csv", env=C, submission=False),
 ]

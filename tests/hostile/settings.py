@@ -34,8 +34,7 @@ RECIPES = {
     "a million comments": "# nothing\n" * 1_000_000 + RECIPE,
     "10,000 units": "units = [" + 10_000 * '{ stage = 1, matcher = "sift", long_side = 200 },' + "]",
 }
-VALID = ("lines of another system", "a description of a list", "a million comments")
-VALID += ("a size of 10^9", "a byte order mark")
+VALID = ("a byte order mark", "lines of another system", "a description of a list", "a million comments")
 
 PLACES: dict[str, Callable[[Path], object]] = {
     "a directory": Path.mkdir,
@@ -126,12 +125,12 @@ def train_side(name: str = "", text: str = "", submission: str = "") -> Callable
 
 CASES = [
     *(
-        Case("recipes", name, SUBMIT, recipe(text), EITHER if name in VALID else REFUSED)
+        Case("recipes", name, SUBMIT, recipe(text), (0,) if name in VALID else REFUSED)
         for name, text in RECIPES.items()
     ),
     *(Case("recipes", name, SUBMIT, replaced(make), REFUSED) for name, make in PLACES.items()),
     *(
-        Case("arguments", name, f"{VALIDATE} {options}", train_side(), (0, 1, 2))
+        Case("arguments", name, f"{VALIDATE} {options}", train_side(), REFUSED)
         for name, options in ARGUMENTS.items()
     ),
     *(

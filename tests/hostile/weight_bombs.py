@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from attack import EITHER, REFUSED, Case
+from attack import REFUSED, Case
 from room import SUBMIT
 
 CONVERT = "weights convert a.pt --out out/a.safetensors"
@@ -26,12 +26,13 @@ PICKLES = {
     "a tensor of 6 GB": b"\x80\x02ctorch\nFloatTensor\n\x8a\x08" + LENGTH + b"\x85R.",
     "a call of the system": b"\x80\x02cposix\nsystem\nX\x10\x00\x00\x00touch out/called\x85R.",
 }
+ZIPPED = {"a place for 400 million objects": (0,)}  # an empty table: the place is never filled
 TENSORS = {
-    "of half complex numbers": "t.to(torch.complex32)",
-    "of eight bits": "t.to(torch.float8_e4m3fn)",
-    "of no elements": "torch.zeros(0, 1 << 40)",
-    "of NaN": "t * float('nan')",
-    "conjugated": "torch.view_as_complex(torch.ones(3, 2)).conj()",
+    "of half complex numbers": ("t.to(torch.complex32)", REFUSED),  # safetensors has no such type
+    "of eight bits": ("t.to(torch.float8_e4m3fn)", (0,)),
+    "of no elements": ("torch.zeros(0, 1 << 40)", (0,)),
+    "of NaN": ("t * float('nan')", (0,)),
+    "conjugated": ("torch.view_as_complex(torch.ones(3, 2)).conj()", (0,)),
 }
 
 
@@ -133,28 +134,30 @@ AUTO = SUBMIT.replace("quick.toml", "auto") + f" {SEARCH} --mode stage-1"
 CONVERT_SAFETENSORS = CONVERT.replace("a.pt", "a.safetensors")
 CASES = [
     *(
-        Case("weights", name, CONVERT, at("a.pt", lambda d=data: with_pickle(d)), EITHER)
+        Case("weights", name, CONVERT, at("a.pt", lambda d=data: with_pickle(d)), ZIPPED.get(name, REFUSED))
         for name, data in PICKLES.items()
     ),
     *(
-        Case("weights", f"{name}, old format", CONVERT, at("a.pt", lambda d=data: legacy_with_pickle(d)), EITHER)
+        Case("weights", f"{name}, old format", CONVERT, at("a.pt", lambda d=data: legacy_with_pickle(d)), REFUSED)
         for name, data in PICKLES.items()
     ),
     *(
-        Case("weights", f"a tensor {name}", CONVERT, at("a.pt", lambda e=expression: tensor_of(e)), EITHER)
-        for name, expression in TENSORS.items()
+        Case("weights", f"a tensor {name}", CONVERT, at("a.pt", lambda e=expression: tensor_of(e)), statuses)
+        for name, (expression, statuses) in TENSORS.items()
     ),
     *(
         Case("weights", name, CONVERT, lambda room, m=make: m(room / "a.pt"), REFUSED)
         for name, make in FILES.items()
     ),
     *(
-        Case("weights", f"safetensors: {name}", CONVERT_SAFETENSORS, at("a.safetensors", lambda d=data: d), EITHER)
+        Case(
+            "weights", f"safetensors: {name}", CONVERT_SAFETENSORS, at("a.safetensors", lambda d=data: d), REFUSED
+        )
         for name, data in SAFETENSORS.items()
     ),
     *(
-        Case("weights", f"{file}, {name}: {command}", f"weights {command} {SEARCH}", listed(file, make), (0, 1))
-        for command in ("list", "verify")
+        Case("weights", f"{file}, {name}: {command}", f"weights {command} {SEARCH}", listed(file, make), (status,))
+        for command, status in (("list", 0), ("verify", 1))
         for file in LISTED
         for name, make in SEARCHED.items()
     ),

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from checkpoints import PublicFile, write_checkpoints
+from checkpoints import PublicFile, store_of
 from kornia.feature import DISK
 from pictures import picture
 from torch import Tensor, nn
@@ -55,8 +55,7 @@ FILES = (
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> WeightStore:
-    directory = tmp_path_factory.mktemp("weights")
-    return WeightStore([directory], write_checkpoints(directory, FILES))
+    return store_of(tmp_path_factory.mktemp("weights"), FILES)
 
 
 def load(name: str, store: WeightStore, precision: Precision = Precision.FLOAT32, **options: Any) -> Any:

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from checkpoints import FILES, write_checkpoints
+from checkpoints import FILES, store_of
 from pictures import as_picture, image_of
 from standin import scene
 
@@ -23,9 +23,7 @@ OPTIONS = LomaOptions(Variant.B128, max_keypoints=200, match_threshold=0.0)
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> WeightStore:
-    directory = tmp_path_factory.mktemp("weights")
-    lines = write_checkpoints(directory, [file for file in FILES if file.matcher == "loma"])
-    return WeightStore([directory], lines)
+    return store_of(tmp_path_factory.mktemp("weights"), [file for file in FILES if file.matcher == "loma"])
 
 
 @pytest.fixture(scope="module")

@@ -5,10 +5,20 @@ from functools import cache
 
 import pytest
 import torch
-from dense import MODES, batch_of, compared, computed, grey_levels, input_of, pixels_of, resized_by_pil, within
+from dense import (
+    batch_of,
+    compared,
+    computed,
+    grey_levels,
+    input_of,
+    mode_stages,
+    pixels_of,
+    resized_by_pil,
+    within,
+)
 from golden import GOLDEN, Stage, assert_stages, golden_arrays, needs_golden, ready, seeded_tensor
 
-from mkpc_kaggle.matchers.networks.dense_sampling import balancing_weights, density, draw, sample_matches
+from mkpc_kaggle.matchers.networks.dense_sampling import balancing_weights, density, draw
 from mkpc_kaggle.matchers.networks.dkm import DKM
 from mkpc_kaggle.matchers.networks.pixels import network_input
 
@@ -88,12 +98,7 @@ def sampling_stages():
     golden, dense = golden_arrays("dkm", "sampling"), golden_arrays("dkm", "main")
     number = int(golden["num"])
     warp, certainty = dense["warp"].reshape(-1, 4), dense["certainty"].flatten()
-    for mode, threshold in MODES.items():
-        generator = torch.Generator().manual_seed(int(golden["seed"]))
-        found = sample_matches(warp, certainty, number, threshold, generator=generator)
-        weights = certainty.masked_fill(certainty > threshold, 1)
-        yield Stage(f"{mode}__matches", found.matches, golden[f"{mode}__matches"])
-        yield within(f"{mode}__certainty", weights[found.index], golden[f"{mode}__certainty"])
+    yield from mode_stages(warp, certainty, golden, within, number=number, seed=int(golden["seed"]))
     weights = certainty.masked_fill(certainty > 0.05, 1)
     good = draw(weights, golden["noise1"], 4 * number)
     yield Stage("good_index", good, golden["good_index"])

@@ -7,11 +7,11 @@ from functools import cache
 import dense
 import pytest
 import torch
-from dense import MODES, compared, computed, input_of, pixels_of, resized_by_pil
+from dense import compared, computed, input_of, mode_stages, pixels_of, resized_by_pil
 from golden import GOLDEN, Stage, assert_stages, golden_arrays, needs_golden, ready, seeded_tensor
 
 from mkpc_kaggle.matchers.networks import roma
-from mkpc_kaggle.matchers.networks.dense_sampling import balancing_weights, density, draw, sample_matches
+from mkpc_kaggle.matchers.networks.dense_sampling import balancing_weights, density, draw
 from mkpc_kaggle.matchers.networks.grids import as_grid, as_map
 from mkpc_kaggle.matchers.networks.roma import RoMa, anchor_mean
 
@@ -108,13 +108,7 @@ def parts_stages():
 def sampling_stages():
     golden, main = golden_arrays("roma", "sampling"), golden_arrays("roma", "main")
     warp, certainty = main["warp"].reshape(-1, 4), main["certainty"].flatten()
-    for mode, threshold in MODES.items():
-        name = f"{mode}_float32"
-        generator = torch.Generator().manual_seed(1234)
-        found = sample_matches(warp, certainty, 1000, threshold, generator=generator)
-        weights = certainty.masked_fill(certainty > threshold, 1)
-        yield Stage(f"{name}__matches", found.matches, golden[f"{name}__matches"])
-        yield within(f"{name}__certainty", weights[found.index], golden[f"{name}__certainty"])
+    yield from mode_stages(warp, certainty, golden, within, number=1000, seed=1234, suffix="_float32")
     weights = certainty.masked_fill(certainty > 0.05, 1)
     good = draw(weights, golden["noise1"], 4000)
     yield Stage("good_index", good, golden["good_index"])

@@ -1,7 +1,6 @@
 """SuperGlue against its golden vectors; what must hold of any weights; the transport by hand."""
 
 import json
-from functools import cache
 
 import pytest
 import torch
@@ -20,13 +19,8 @@ THRESHOLDS = ["0.0", "0.5"]
 VGA = Size(640, 480)
 
 
-@cache
-def standin():
-    return standin_state("superglue")
-
-
 def golden_network(options):
-    return ready(SuperGlue(**options), standin())
+    return ready(SuperGlue(**options), standin_state("superglue"))
 
 
 def golden_pairs(golden):

@@ -1,7 +1,6 @@
 """SuperPoint stage by stage against its golden vectors; what must hold of any weights; by hand on small maps."""
 
 import json
-from functools import cache
 
 import pytest
 import torch
@@ -14,16 +13,11 @@ from mkpc_kaggle.matchers.networks.superpoint import SuperPoint, sample_descript
 CASES = ["default_160x216", "outdoor_160x216", "odd_171x229", "noborder_64x72"]
 
 
-@cache
-def standin():
-    return standin_state("superpoint")
-
-
 def golden_network(config):
     options = json.loads(config)
     assert options.pop("descriptor_dim") == 256
     options["border"] = options.pop("remove_borders")
-    return ready(SuperPoint(**options), standin())
+    return ready(SuperPoint(**options), standin_state("superpoint"))
 
 
 def image_of(pixels):

@@ -102,6 +102,11 @@ def write_checkpoints(directory: Path, files: Iterable[PublicFile] = FILES) -> t
     return tuple(lines)
 
 
+def store_of(directory: Path, files: Iterable[PublicFile]) -> WeightStore:
+    """A store that has these files."""
+    return WeightStore([directory], write_checkpoints(directory, files))
+
+
 def use_manifest(monkeypatch: pytest.MonkeyPatch, lines: tuple[WeightFile, ...]) -> None:
     """Runs that are begun from now on hold their weights against these lines instead of the package's own."""
     monkeypatch.setattr(assembly, "WeightStore", lambda directories: WeightStore(directories, lines))

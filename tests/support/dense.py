@@ -8,6 +8,7 @@ import torch
 from golden import Stage
 
 from mkpc_kaggle.geometry.coordinates import Size, from_normalised
+from mkpc_kaggle.matchers.networks.dense_sampling import sample_matches
 from mkpc_kaggle.matchers.networks.dense_warp import DenseWarp, dense_warp
 from mkpc_kaggle.matchers.networks.pixels import MEAN, STD, network_input
 
@@ -109,3 +110,14 @@ def pixels_of(golden):
     sizes = Size(width0, height0), Size(width1, height1)
     for name, points, size in zip(("pixel_A", "pixel_B"), sides, sizes, strict=True):
         yield name, torch.from_numpy(from_normalised(points, size)) + 0.5
+
+
+def mode_stages(warp, certainty, golden, within, *, number, seed, suffix=""):
+    """Matches sampled in both modes, by the names of the golden files, which end in ``suffix``."""
+    for mode, threshold in MODES.items():
+        name = f"{mode}{suffix}"
+        generator = torch.Generator().manual_seed(seed)
+        found = sample_matches(warp, certainty, number, threshold, generator=generator)
+        weights = certainty.masked_fill(certainty > threshold, 1)
+        yield Stage(f"{name}__matches", found.matches, golden[f"{name}__matches"])
+        yield within(f"{name}__certainty", weights[found.index], golden[f"{name}__certainty"])

@@ -4,6 +4,7 @@ import importlib.util
 import sys
 from collections.abc import Iterable
 from contextlib import contextmanager
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -28,6 +29,7 @@ def golden_arrays(network, case):
     }
 
 
+@lru_cache(maxsize=1)  # the largest have a gigabyte
 def standin_state(network, *which, **part):
     """The stand-in checkpoint that the folder's ``standin.py`` makes, or that part of it, as tensors."""
     recipe = _module(GOLDEN / network / "standin.py")
