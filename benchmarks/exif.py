@@ -1,9 +1,10 @@
 """What focal lengths from EXIF gain: F with none, with those within 3 % of the truth, and with the true ones.
 
-python -m benchmarks.exif --train-dir DIR --matches DIR [--recipe classical] [--scenes NAME ...]
+python -m benchmarks.exif --train-dir DIR --journal DIR [--recipe classical] [--scenes NAME ...]
 
-MATCHES is what `benchmarks.saved_matches` wrote; pairs without a file are left out. An image's error is drawn
-once, evenly within the bounds. A table for pairs and one for scenes, as of `benchmarks.estimation`.
+The matches are those of a journal, a work directory of `validate`; pairs that it lacks are left out. The recipe
+says what is made of them. An image's error is drawn once, evenly within the bounds. A table for pairs and one
+for scenes, as of `benchmarks.estimation`.
 """
 
 import argparse
@@ -14,13 +15,12 @@ from pathlib import Path
 from zlib import crc32
 
 import numpy as np
-from benchmarks.saved_matches import SavedMatches
 from tqdm import tqdm
 
-from benchmarks import saved_matches
-from benchmarks.estimation import SCENE, Score, accuracy, batch_pair, table
+from benchmarks.estimation import SCENE, Score, accuracy, batch_pair, read_journal, table
 from mkpc_kaggle.data.competition import TrainScene, TruePair, read_train_side
 from mkpc_kaggle.geometry.focal_prior import FocalPrior, estimate_with_prior
+from mkpc_kaggle.pipeline.pair import PairMatch
 from mkpc_kaggle.recipe import Recipe, load_recipe
 from mkpc_kaggle.scene.reconstruct import reconstruct_batch
 from mkpc_kaggle.scene.view_graph import BatchPair
@@ -39,7 +39,7 @@ def exif_focals(true: TruePair, error: float | None) -> tuple[float, float]:
 
 
 def score(
-    pairs: Sequence[tuple[TruePair, SavedMatches]], scene: TrainScene, recipe: Recipe, error: float | None
+    pairs: Sequence[tuple[TruePair, PairMatch]], scene: TrainScene, recipe: Recipe, error: float | None
 ) -> tuple[Score, Score]:
     """Of the pairs alone, and with the cameras of the scene."""
     assert recipe.focal is not None
@@ -68,16 +68,15 @@ def score(
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--train-dir", type=Path, required=True)
-    parser.add_argument("--matches", type=Path, required=True)
+    parser.add_argument("--journal", type=Path, required=True)
     parser.add_argument("--recipe", default="classical")
     parser.add_argument("--scenes", nargs="*", default=())
     arguments = parser.parse_args()
-    recipe = load_recipe(arguments.recipe)
+    recipe, (_, known) = load_recipe(arguments.recipe), read_journal(arguments.journal)
     alone: dict[str, list[dict[str, Score]]] = {}
     together: dict[str, list[dict[str, Score]]] = {}
     for scene in read_train_side(arguments.train_dir, scenes=arguments.scenes):
-        files = [(true, saved_matches.file_of(arguments.matches / recipe.name, true)) for true in scene.pairs]
-        if pairs := [(true, saved_matches.read(file)) for true, file in files if file.exists()]:
+        if pairs := [(true, known[true.pair.id]) for true in scene.pairs if true.pair.id in known]:
             scores = {name: score(pairs, scene, recipe, error) for name, error in ERRORS.items()}
             alone[scene.name] = [{name: of_pairs for name, (of_pairs, _) in scores.items()}]
             together[scene.name] = [{f"{SCENE}, {name}": of_scene for name, (_, of_scene) in scores.items()}]

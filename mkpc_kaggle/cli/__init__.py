@@ -7,7 +7,7 @@ import sys
 import time
 import warnings
 from collections.abc import Sequence
-from contextlib import ExitStack, nullcontext
+from contextlib import ExitStack, nullcontext, suppress
 from importlib import import_module
 from io import TextIOWrapper
 from pathlib import Path
@@ -63,7 +63,11 @@ def main(arguments: Sequence[str] | None = None, *, started: float | None = None
             require_directory()
             parsed.started = time.monotonic() if started is None else started
             printing.enter_context(parsed.printing())
-            return int(parsed.run(parsed))
+            status = int(parsed.run(parsed))
+            with suppress(OSError, ValueError):  # full, or closed
+                if sys.stdout is not None:
+                    sys.stdout.flush()  # a reader may take its time, except in a run: there this does not wait
+            return status
         except UserError as error:
             complain(str(error))
             return EXIT_BAD_INPUT

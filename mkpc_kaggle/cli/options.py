@@ -10,7 +10,7 @@ from mkpc_kaggle.engine.budget import Budget, monotonic_of, parse_duration
 from mkpc_kaggle.engine.cluster import parse_workers
 from mkpc_kaggle.engine.console import say
 from mkpc_kaggle.engine.engine import RunReport
-from mkpc_kaggle.engine.session import Session, Watchdog, interruptible
+from mkpc_kaggle.engine.session import Interrupt, Session, Watchdog
 from mkpc_kaggle.engine.streams import drain, unblocked
 from mkpc_kaggle.pipeline.assembly import Assembly, assemble
 from mkpc_kaggle.pipeline.availability import Licence
@@ -68,10 +68,12 @@ def budget_of(arguments: argparse.Namespace) -> Budget:
 
 
 @contextmanager
-def watched_session(arguments: argparse.Namespace, work_dir: Path) -> Iterator[tuple[Session, Watchdog]]:
+def watched_session(
+    arguments: argparse.Namespace, work_dir: Path, interrupt: Interrupt
+) -> Iterator[tuple[Session, Watchdog]]:
     """A session as the options say, and the watchdog that ends the program in time whatever happens."""
     budget, fresh, workers = budget_of(arguments), arguments.fresh, arguments.workers
-    with interruptible() as interrupt, Watchdog(budget, interrupt) as watchdog:
+    with Watchdog(budget, interrupt) as watchdog:
         yield Session(work_dir, budget, interrupt, fresh, workers=workers, watchdog=watchdog), watchdog
         drain()  # under the watchdog's eyes: who reads it may hang
 

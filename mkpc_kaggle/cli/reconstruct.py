@@ -7,13 +7,13 @@ from dataclasses import replace
 from pathlib import Path
 
 from mkpc_kaggle.cli import options
-from mkpc_kaggle.data.outputs import lies_in
+from mkpc_kaggle.data.outputs import require_directory_apart
 from mkpc_kaggle.engine.budget import format_duration
 from mkpc_kaggle.engine.console import say
-from mkpc_kaggle.errors import UserError, writing
+from mkpc_kaggle.engine.session import interruptible
 from mkpc_kaggle.recipe import CameraSharing
 from mkpc_kaggle.reconstruction.folder import read_folder, read_pair_list
-from mkpc_kaggle.reconstruction.outputs import FORMS, write_tables
+from mkpc_kaggle.reconstruction.outputs import FORMS, Cameras, write_tables
 from mkpc_kaggle.reconstruction.run import FolderResult, for_cameras, reconstruct_folder
 from mkpc_kaggle.reporting.report import report_run
 from mkpc_kaggle.reporting.summary import trouble
@@ -64,22 +64,36 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     root, out, work_dir = arguments.images, arguments.out, arguments.out / "work"
     datasets = read_folder(root)
-    if lies_in(out, root) or lies_in(root, out):
-        raise UserError(f"--out {out} and the images in {root} are in each other's way; name another place")
+    lists = [] if arguments.pairs is None else [arguments.pairs]
+    require_directory_apart(out, [root, *lists, Path(arguments.recipe)], arguments.weights)
     listed = None if arguments.pairs is None else read_pair_list(arguments.pairs, root, datasets)
-    with options.watched_session(arguments, work_dir) as (session, watchdog), writing(f"--out {out}"):
+    with (
+        interruptible() as interrupt,
+        options.watched_session(arguments, work_dir, interrupt) as (session, watchdog),
+    ):
+        watchdog.status = 1  # until there is a model
+
+        def publish(cameras: Cameras) -> None:
+            write_tables(out, cameras, root, arguments.format)
+            watchdog.status = int(not has_camera(cameras))
+
         assembly = options.assembly_of(arguments, arguments.recipe, arguments.mode)
         assembly = replace(assembly, recipe=for_cameras(assembly.recipe, arguments.camera))
         options.say_start(f"{sum(map(len, datasets.values()))} images", assembly, work_dir)
-        result = reconstruct_folder(datasets, assembly, session, out, listed=listed, rotations=arguments.rotations)
-        write_tables(out, result.cameras, root, arguments.format)
-        failed = trouble(result.report)
-        watchdog.status = int(bool(failed) or not any(any(found.values()) for found in result.cameras.values()))
-        lines = [*options.plan_lines(arguments, result.report), *_lines(result), failed, f"results: {out}"]
-        say("\n".join(filter(None, lines)))
-        say(report_run(work_dir, out / "report.html", session.must_end(), result.pairs))
+        given = {"listed": listed, "rotations": arguments.rotations, "publish": publish}
+        result = reconstruct_folder(datasets, assembly, session, out, **given)
+        unwritten, failed = result.report.unwritten, trouble(result.report)
+        watchdog.status = int(bool(failed or unwritten) or not has_camera(result.cameras))
+        lines = [*options.plan_lines(arguments, result.report), *_lines(result), failed, unwritten]
+        say("\n".join(filter(None, [*lines, f"results: {out}"])))
+        if result.pairs:
+            say(report_run(work_dir, out / "report.html", session.must_end(), result.pairs))
         signal = session.interrupt.signal
         return 128 + signal if signal else watchdog.status
+
+
+def has_camera(cameras: Cameras) -> bool:
+    return any(any(found.values()) for found in cameras.values())
 
 
 def _lines(result: FolderResult) -> Iterator[str]:

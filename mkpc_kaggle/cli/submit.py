@@ -7,7 +7,7 @@ from mkpc_kaggle.cli import options
 from mkpc_kaggle.data.competition import read_test_side, test_side
 from mkpc_kaggle.data.outputs import require_apart
 from mkpc_kaggle.engine.console import say
-from mkpc_kaggle.engine.session import first_version, submit
+from mkpc_kaggle.engine.session import first_version, interruptible, submit
 from mkpc_kaggle.reporting.report import report_run
 from mkpc_kaggle.reporting.summary import summary, trouble
 
@@ -47,21 +47,23 @@ def run(arguments: argparse.Namespace) -> int:
     page: Path = arguments.report or output.parent / f"{output.stem}.html"
     files = {"--output": output, "--report": None if arguments.no_report else page}
     require_apart(files, [*test_side(arguments.test_dir), Path(arguments.recipe)], work_dir, arguments.weights)
-    with options.watched_session(arguments, work_dir) as (session, watchdog):
+    with interruptible() as interrupt:
         pairs = read_test_side(arguments.test_dir)
-        with first_version(pairs, output):
+        # Not yet watched: a run whose limit is over when it starts leaves a whole file, too.
+        with first_version(pairs, output), options.watched_session(arguments, work_dir, interrupt) as watched:
+            session, watchdog = watched
             assembly = options.assembly_of(arguments, arguments.recipe, arguments.mode)
             options.say_start(f"{len(pairs)} pairs", assembly, work_dir)
             report = submit(pairs, assembly, session, output)
-        watchdog.status = int(bool(report.unwritten or trouble(report)))
-        unwritten = f" is not the last version: {report.unwritten}" if report.unwritten else ""
-        lines = [
-            *options.plan_lines(arguments, report),
-            summary(pairs, report),
-            f"submission: {output}{unwritten}",
-        ]
-        say("\n".join(lines))  # the watchdog may end the program while it draws
-        if not arguments.no_report:
-            say(report_run(work_dir, page, session.must_end(), pairs))
-        signal = session.interrupt.signal
-        return 128 + signal if signal else watchdog.status
+            watchdog.status = int(bool(report.unwritten or trouble(report)))
+            unwritten = f" is not the last version: {report.unwritten}" if report.unwritten else ""
+            lines = [
+                *options.plan_lines(arguments, report),
+                summary(pairs, report),
+                f"submission: {output}{unwritten}",
+            ]
+            say("\n".join(lines))  # the watchdog may end the program while it draws
+            if not arguments.no_report:
+                say(report_run(work_dir, page, session.must_end(), pairs))
+            signal = session.interrupt.signal
+            return 128 + signal if signal else watchdog.status

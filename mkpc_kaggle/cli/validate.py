@@ -6,6 +6,7 @@ import re
 import tempfile
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 from mkpc_kaggle.cli import options
 from mkpc_kaggle.config import from_table
@@ -19,7 +20,7 @@ from mkpc_kaggle.engine.session import Session, interruptible
 from mkpc_kaggle.errors import UserError, writing
 from mkpc_kaggle.evaluation.compare import Comparison, comparison_json, comparison_table, step_gains
 from mkpc_kaggle.evaluation.imc2025 import score_imc2025, score_lines
-from mkpc_kaggle.evaluation.validate import score_submission, score_table, to_json, validate
+from mkpc_kaggle.evaluation.validate import missing_rows, score_submission, score_table, to_json, validate
 from mkpc_kaggle.geometry.robust import Method, RobustConfig
 from mkpc_kaggle.pipeline.assembly import Assembly
 from mkpc_kaggle.recipe import Recipe, split_mode
@@ -86,8 +87,11 @@ def run(arguments: argparse.Namespace) -> int:
         scenes = _read_scenes(arguments, work_dir)
         if arguments.submission is None:
             return _match_and_score(arguments, scenes, work_dir)
-        for submission in arguments.submission:
-            say("\n".join([str(submission), *score_table(score_submission(submission, arguments.truth, scenes))]))
+        scored = [score_submission(submission, arguments.truth, scenes) for submission in arguments.submission]
+        for submission, validation in zip(arguments.submission, scored, strict=True):
+            say("\n".join([str(submission), *score_table(validation), *missing_rows(validation)]))
+        figures = [*map(to_json, scored)]
+        _write_json(arguments.json, {"submissions": figures} if len(scored) > 1 else figures[0])
         return 0
 
 
@@ -100,9 +104,10 @@ def _require_a_whole(given: argparse.Namespace) -> None:
             "--submission and --truth go together",
         ),
         (
-            given.submission and (given.json or given.work_dir or given.compare),
-            "--submission only prints the score: it goes without --json, --work-dir and --compare",
+            given.submission and (given.work_dir or given.compare),
+            "--submission matches nothing: it goes without --work-dir and --compare",
         ),
+        (given.imc2025 and given.json, "--imc2025 only prints the score: it goes without --json"),
         ((given.pairs is None) != (given.image_root is None), "--pairs and --image-root go together"),
         (given.pairs and given.submission, "--submission needs a --train-dir: it scores in metres"),
         (given.pairs and given.compare, "--compare needs a --train-dir: it scores in metres"),
@@ -146,19 +151,23 @@ def _match_and_score(arguments: argparse.Namespace, scenes: tuple[TrainScene, ..
             # The report's inliers are of F: there is none for a list of pairs, whose E is estimated.
             if arguments.work_dir is not None and arguments.pairs is None:
                 say(report_run(directory, directory / "report.html", session.must_end(), pairs))
-            status = 128 + interrupt.signal if interrupt.signal else int(bool(trouble(report)))
+            status = 128 + interrupt.signal if interrupt.signal else max(status, bool(trouble(report)))
             if compared and report.ending != Ending.COMPLETE:
                 say("nothing is compared before all is done; with a --work-dir, the same command goes on")
                 return status or 1
     figures = to_json(validations[0])
     if compared:
-        comparison, status = Comparison(tuple(validations)), 0
+        comparison = Comparison(tuple(validations))
         say("\n".join(["", *comparison_table(comparison)]))
         figures = comparison_json(comparison)
-    if arguments.json is not None:
-        with writing(f"--json {arguments.json}"):
-            arguments.json.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
+    _write_json(arguments.json, figures)
     return status
+
+
+def _write_json(path: Path | None, figures: dict[str, Any]) -> None:
+    if path is not None:
+        with writing(f"--json {path}"):
+            path.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
 
 
 def _assemble(arguments: argparse.Namespace, name: str, mode: str) -> Assembly:

@@ -44,6 +44,7 @@ class Pair:
     file0: str  # the images' paths; as text, since a table may have a million rows
     file1: str
     intrinsics: tuple[Matrix3, Matrix3] | None = field(default=None, compare=False)  # with them E is estimated
+    turns: tuple[int, int] = (0, 0)  # quarters, counter-clockwise, by which the images are turned to be matched
 
     @property
     def images(self) -> tuple[Path, Path]:

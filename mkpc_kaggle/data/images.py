@@ -5,7 +5,7 @@ from collections import OrderedDict
 from collections.abc import Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Generic, TypeVar
@@ -48,6 +48,14 @@ class Image:
     def gray(self) -> Pixels:
         """(H, W) uint8."""
         return np.asarray(cv2.cvtColor(self.pixels, cv2.COLOR_RGB2GRAY), np.uint8)
+
+
+def turned(image: "Image | Unreadable", times: int) -> "Image | Unreadable":
+    """An image turned by ``times`` quarters, counter-clockwise; its version is still that of its file."""
+    if isinstance(image, Unreadable) or not times:
+        return image
+    pixels = np.ascontiguousarray(np.rot90(image.pixels, times))
+    return replace(image, name=f"{image.name} turned {times}", pixels=pixels)
 
 
 @dataclass(frozen=True)

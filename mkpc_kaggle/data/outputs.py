@@ -27,8 +27,8 @@ def require_apart(
     ``--json`` and ``--report`` overwrite nothing but their own kind. Raises :class:`UserError`.
     """
     files = {option: path for option, path in outputs.items() if path is not None}
-    inputs, environment = list(inputs), os.environ.get("MKPC_WEIGHTS", "").split(os.pathsep)
-    precious = [*inputs, *weights, *map(Path, filter(None, environment))]
+    inputs = list(inputs)
+    precious = [*inputs, *weights, *_weights_of_environment()]
     for option, path in files.items():
         is_result = path.suffix.lower() in RESULTS.get(option, ())
         if not path.name or os.path.isdir(path):  # noqa: PTH112  Path raises for a name that is too long
@@ -47,6 +47,18 @@ def require_apart(
     for source in inputs:
         if work_dir is not None and lies_in(work_dir, source):
             raise UserError(f"--work-dir {work_dir} would be written over the input {source}; name another place")
+
+
+def require_directory_apart(out: Path, inputs: Iterable[Path], weights: Iterable[Path]) -> None:
+    """Refuse a directory of results, ``--out``, that holds something that is read, or lies in an input."""
+    inputs = list(inputs)
+    for place in (*inputs, *weights, *_weights_of_environment()):
+        if os.path.lexists(place) and (lies_in(place, out) or (place in inputs and lies_in(out, place))):
+            raise UserError(f"--out {out} and the input {place} are in each other's way; name another place")
+
+
+def _weights_of_environment() -> list[Path]:
+    return [Path(name) for name in os.environ.get("MKPC_WEIGHTS", "").split(os.pathsep) if name]
 
 
 def lies_in(path: Path, directory: Path) -> bool:

@@ -59,9 +59,10 @@ def redraws(stream: TextIO) -> bool:
 
 
 class Progress:
-    """How many pairs of a phase are done: a bar on a terminal, a line now and then anywhere else."""
+    """How many pairs (``unit``) of a phase are done: a bar on a terminal, a line now and then anywhere else."""
 
-    def __init__(self, budget: Budget, stream: TextIO | None = None) -> None:
+    def __init__(self, budget: Budget, stream: TextIO | None = None, unit: str = "pair") -> None:
+        self._unit = unit
         self._budget = budget
         self._stream = stream or sys.stderr
         self._bar: tqdm[Any] | None = None
@@ -78,7 +79,7 @@ class Progress:
             with suppress(OSError, ValueError):
                 self._draw(phase if began else "", done, total, left)
             return
-        count = f"{total} pairs" if began else f"{done} of {total} pairs"
+        count = f"{total} {self._unit}s" if began else f"{done} of {total} {self._unit}s"
         self._waiting = ", ".join(filter(None, [f"{phase}: {count}", left]))
         if began or self._budget.clock() - self._written >= LINE_INTERVAL_S:
             self.close()
@@ -97,7 +98,7 @@ class Progress:
         if began:
             self.close()
             # With a delay, nothing is drawn before the bar is whole: a dead terminal left half a bar.
-            self._bar = tqdm(total=total, desc=began, unit="pair", file=self._stream, delay=1e-9)
+            self._bar = tqdm(total=total, desc=began, unit=self._unit, file=self._stream, delay=1e-9)
         if self._bar is not None:
             self._bar.set_postfix_str(left, refresh=False)
             self._bar.update(done - self._bar.n)

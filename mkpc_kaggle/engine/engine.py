@@ -2,7 +2,7 @@
 
 import sqlite3
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import partial
@@ -16,6 +16,7 @@ from mkpc_kaggle.engine.jobs import (
     Answer,
     Failure,
     Loaded,
+    MatchJob,
     MatchResult,
     Outcome,
     SceneJob,
@@ -69,8 +70,9 @@ class RunReport:
 class Engine:
     """A run over ``pairs``.
 
-    ``publish`` is called with all records, in the order of ``pairs``, when the run starts, every half minute (less
-    often where it takes long), and when it ends, in whatever way. Setting ``interrupt`` ends the run early.
+    ``publish`` is called with all records, in the order of ``pairs``, and what there is of scenes, when the run
+    starts, every half minute (less often where it takes long), after each scene of which COLMAP's files are
+    written, and when it ends, in whatever way. Setting ``interrupt`` ends the run early.
     """
 
     def __init__(
@@ -81,7 +83,7 @@ class Engine:
         journal: Journal,
         budget: Budget,
         *,
-        publish: Callable[[Sequence[PairRecord]], None],
+        publish: Callable[[Sequence[PairRecord], Iterable[SceneRecord]], None],
         interrupt: threading.Event,
         progress: bool = True,
         minibatch: int = 1,
@@ -152,14 +154,14 @@ class Engine:
         return bool(self.site.places) and all(place.closed for place in self.site.places)
 
     def save_what_there_is(self) -> str:
-        """Write the submission, unless the run has ended; why it cannot be written. For any thread."""
+        """Write the results, unless the run has ended; why it cannot be written. For any thread."""
         with self._publishing:
             if not self._has_ended:
                 try:
-                    self.publish(self.records)
+                    self.publish(self.records, list(self.scenes.made.values()))
                     self.unwritten = ""
                 except OSError as error:
-                    self.unwritten = f"the submission cannot be written: {error}"
+                    self.unwritten = f"the results cannot be written: {error}"
         return self.unwritten
 
     # The loop
@@ -218,11 +220,11 @@ class Engine:
                 self._take_scene(job, answer, seconds)
             elif isinstance(answer, Failure):
                 self._fault(f"a job was lost on {place.name}: {answer}" if job else f"{place.name}: {answer}")
-                if job is not None:
+                if isinstance(job, MatchJob):
                     self._keep(self.plan.on_failure(job, answer, place.name, now))
                 if place.closed:
                     self.plan.explain(now, f"no worker is started any more on {place.closed}")
-            elif job is not None and isinstance(answer, MatchResult):
+            elif isinstance(job, MatchJob) and isinstance(answer, MatchResult):
                 self._units_run += len(answer.results)
                 self._keep(self.plan.on_result(job, answer, seconds, now))
                 self._note(EventKind.JOB, f"{job.phase} {len(job.indices)} pairs {answer.unit_seconds:.3f} s")
@@ -272,6 +274,8 @@ class Engine:
         self._note(EventKind.SCENE, f"{record.batch}: {record.placed} of {record.images} images")
         members = [records[index] for index in self.scenes.batches[job.batch]]
         self._save(partial(self.journal.save_scene, record, members))
+        if job.export is not None:
+            self._publish()
 
     # The journal and the submission
 

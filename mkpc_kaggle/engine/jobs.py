@@ -1,6 +1,6 @@
-"""What crosses between the engine and a worker: two kinds of job, and their answers. Plain values."""
+"""What crosses between the engine and a worker: three kinds of job, and their answers. Plain values."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -69,7 +69,15 @@ class SceneJob:
     export: Export | None = None
 
 
-Job = MatchJob | SceneJob
+@dataclass(frozen=True, eq=False)
+class TaskJob:
+    """Something to be known of images before there are pairs, under a ``key``: what ``do`` returns."""
+
+    key: str
+    do: Callable[[], bytes]
+
+
+Job = MatchJob | SceneJob | TaskJob
 
 
 @dataclass(frozen=True)
@@ -101,6 +109,11 @@ class MatchResult:
         return sum(result.seconds for result in self.results)
 
 
+@dataclass(frozen=True)
+class TaskResult:
+    value: bytes
+
+
 class Cause(StrEnum):
     """Why a worker has no result."""
 
@@ -129,7 +142,7 @@ class Failure:
         return f"{self.cause}: {self.message}" if self.message else str(self.cause)
 
 
-Answer = Loaded | MatchResult | Solution | Failure
+Answer = Loaded | MatchResult | Solution | TaskResult | Failure
 
 
 def visiting_order(pairs: Sequence[Pair]) -> list[int]:

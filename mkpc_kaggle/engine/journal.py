@@ -3,7 +3,8 @@
 A value is a JSON text (see :mod:`mkpc_kaggle.engine.codec`). Tables: ``run`` (what the journal belongs to and who
 wrote it), ``sample`` (ids and images of the pairs), ``pair`` (a :class:`PairRecord` for each pair that was
 reached), ``points`` (of a unit on a pair: later jobs, scenes and the report need them), ``scene`` (a
-:class:`SceneRecord` for each batch), ``event`` (what happened when).
+:class:`SceneRecord` for each batch), ``event`` (what happened when), ``task`` (what is known of images before
+there are pairs).
 """
 
 import json
@@ -39,10 +40,12 @@ CREATE TABLE pair (key INTEGER PRIMARY KEY, value TEXT NOT NULL);
 CREATE TABLE points (pair INTEGER, unit TEXT, points BLOB NOT NULL, PRIMARY KEY (pair, unit));
 CREATE TABLE scene (key TEXT PRIMARY KEY, value TEXT NOT NULL);
 CREATE TABLE event (key INTEGER PRIMARY KEY, value TEXT NOT NULL);
+CREATE TABLE task (key TEXT PRIMARY KEY, value BLOB NOT NULL);
 """
 SAVE_PAIR = "REPLACE INTO pair VALUES (?, ?)"
 SAVE_POINTS = "REPLACE INTO points VALUES (?, ?, ?)"
 SAVE_SCENE = "REPLACE INTO scene VALUES (?, ?)"
+SAVE_TASK = "REPLACE INTO task VALUES (?, ?)"
 
 Statement = tuple[str, tuple[Any, ...]]  # and its values
 
@@ -142,6 +145,17 @@ class JournalReader:
     def pairs(self) -> tuple[Pair, ...]:
         """All pairs of the run, in order; of the images the journal knows the names of the files alone."""
         return tuple(Pair(*names) for names in self._read("sample", tuple[str, str, str, str]))
+
+    def tasks(self) -> set[str]:
+        """The keys of the tasks that were done; see :mod:`mkpc_kaggle.engine.tasks`."""
+        with undamaged(self.path):
+            return {str(key) for (key,) in self._db.execute("SELECT key FROM task")}
+
+    def task(self, key: str) -> bytes:
+        """The answer of a task that was done, else nothing."""
+        with undamaged(self.path):
+            found = self._db.execute("SELECT value FROM task WHERE key = ?", [key]).fetchone()
+        return bytes(found[0]) if found else b""
 
     def events(self) -> tuple[Event, ...]:
         """All events of all sessions of the run, in order."""
@@ -277,6 +291,13 @@ class Journal(JournalReader):
         """Put down what came of a batch, and its pairs' records."""
         pairs = [(SAVE_PAIR, (record.index, encode(record))) for record in records]
         self._write([*pairs, (SAVE_SCENE, (scene.batch, encode(scene)))])
+
+    def save_task(self, key: str, value: bytes) -> None:
+        self._write([(SAVE_TASK, (key, value))])
+
+    def task(self, key: str) -> bytes:
+        unsaved = {values[0]: values[1] for statement, values in self._unsaved if statement == SAVE_TASK}
+        return unsaved[key] if key in unsaved else super().task(key)
 
     def note(self, kind: str, seconds: float, text: str) -> None:
         """Put down what happened, ``seconds`` after the start; ``kind`` is an :class:`EventKind`.

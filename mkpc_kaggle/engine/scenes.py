@@ -75,7 +75,12 @@ class Scenes:
         exports: Mapping[str, Export] = MappingProxyType({}),
     ) -> None:
         self._exports = exports
-        self.made = {scene.batch: scene for scene in made}
+        # Where files of a scene were removed, it is made again.
+        self.made = {
+            scene.batch: scene
+            for scene in made
+            if scene.batch not in exports or exports[scene.batch].has_files(scene.models)
+        }
         self.batches = batches_of(pairs) if recipe.scene is not None else {}
         self._pairs, self._recipe, self._records = pairs, recipe, records
         self._batch_of = {index: name for name, indices in self.batches.items() for index in indices}

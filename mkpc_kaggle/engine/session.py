@@ -2,14 +2,13 @@
 
 import hashlib
 import json
-import os
 import platform
 import signal
 import sqlite3
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from importlib import metadata
 from math import isfinite
@@ -27,7 +26,7 @@ from mkpc_kaggle.engine.cluster import RayCluster, RaySite
 from mkpc_kaggle.engine.engine import Engine, RunReport
 from mkpc_kaggle.engine.journal import About, EventKind, Journal
 from mkpc_kaggle.engine.places import LISTEN_S, LocalSite, Site
-from mkpc_kaggle.engine.records import PairRecord
+from mkpc_kaggle.engine.records import PairRecord, SceneRecord
 from mkpc_kaggle.errors import UserError, writing
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
 from mkpc_kaggle.pipeline.assembly import Assembly
@@ -70,7 +69,7 @@ class Session:
 def submit(pairs: Sequence[Pair], assembly: Assembly, session: Session, output: Path) -> RunReport:
     """Match all pairs and keep ``output`` whole: each pair has a row, of the fallback if need be."""
 
-    def publish(records: Sequence[PairRecord]) -> None:
+    def publish(records: Sequence[PairRecord], _: Iterable[SceneRecord]) -> None:
         rows = zip(pairs, records, strict=True)
         write_submission(output, {pair.id: record.chosen_fundamental for pair, record in rows})
 
@@ -89,13 +88,20 @@ def first_version(pairs: Sequence[Pair], output: Path) -> Iterator[None]:
     if not output.exists():
         with writing(f"--output {output}"):
             write_submission(output, {pair.id: FALLBACK_FUNDAMENTAL for pair in pairs})
-            ours = output.stat()
+            ours = _identity(output)
     try:
         yield
     except UserError:
-        if ours is not None and os.path.samestat(ours, output.stat()):
-            output.unlink()
+        with suppress(OSError):  # somebody else has removed it
+            if ours == _identity(output):
+                output.unlink()
         raise
+
+
+def _identity(path: Path) -> tuple[int, int]:
+    """Tells versions of a file apart: a later version may have the number of a file that is gone."""
+    status = path.stat()
+    return status.st_ino, status.st_mtime_ns
 
 
 def require_writable(output: Path) -> None:
@@ -113,7 +119,7 @@ def run_pairs(
     pairs: Sequence[Pair],
     assembly: Assembly,
     session: Session,
-    publish: Callable[[Sequence[PairRecord]], None] = lambda _: None,
+    publish: Callable[[Sequence[PairRecord], Iterable[SceneRecord]], None] = lambda *_: None,
 ) -> RunReport:
     """Run the recipe on all pairs.
 
@@ -186,7 +192,7 @@ class Watchdog:
     """
 
     def __init__(self, budget: Budget, interrupt: Interrupt) -> None:
-        too_late = "the time was up before a first version of the submission was written"
+        too_late = "the time limit passed before the first results were written"
         self.save: Callable[[], str] = lambda: too_late
         self.status = 0
         self._budget = budget
@@ -205,7 +211,7 @@ class Watchdog:
         while (left := self._budget.final_write - self._budget.clock()) > 0:  # it moves while the run learns
             if self._over.wait(min(left, LISTEN_S)):
                 return
-        trouble = ["the time was up before the last version of the submission was written"]
+        trouble = ["the time limit passed before the last results were written"]
         writer = threading.Thread(target=lambda: trouble.append(self.save()), name="final write", daemon=True)
         writer.start()  # the disk may hang
         writer.join(max(EXIT_S, self._budget.limit - self._budget.clock() - EXIT_S))

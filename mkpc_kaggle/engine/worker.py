@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import Protocol
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.data.images import Image, ImageStore
+from mkpc_kaggle.data.images import Image, ImageStore, turned
 from mkpc_kaggle.engine.jobs import (
     Answer,
     Cause,
@@ -18,6 +18,8 @@ from mkpc_kaggle.engine.jobs import (
     MatchResult,
     Outcome,
     SceneJob,
+    TaskJob,
+    TaskResult,
 )
 from mkpc_kaggle.engine.records import NOT_REACHED, PairRecord
 from mkpc_kaggle.errors import UserError
@@ -128,7 +130,8 @@ class MatchRunner:
     def _open(self, pair: Pair, known: tuple[UnitResult, ...]) -> PairMatch:
         """The pair with its images; ``failure`` says which of them cannot be read."""
         start = time.perf_counter()
-        images = [self._images.get(path) for path in pair.images]
+        files = zip(pair.images, pair.turns, strict=True)
+        images = [turned(self._images.get(path), turns) for path, turns in files]
         seconds = time.perf_counter() - start
         readable = tuple(image for image in images if isinstance(image, Image))
         failure = next((str(image) for image in images if not isinstance(image, Image)), "")
@@ -160,3 +163,11 @@ class SceneRunner:
         """The cameras of a batch, and which F each of its pairs gets; ``seconds`` are not looked at."""
         assert isinstance(job, SceneJob)
         return reconstruct_batch(job.pairs, job.config, job.focal, job.magsac, job.export)
+
+
+class TaskRunner:
+    """Looks at images before there are pairs."""
+
+    def run(self, job: Job, seconds: float) -> TaskResult:
+        assert isinstance(job, TaskJob)
+        return TaskResult(job.do())

@@ -20,6 +20,8 @@ from mkpc_kaggle.geometry.metrics import AUC_THRESHOLDS, PoseError, mean_average
 from mkpc_kaggle.geometry.robust import ModelKind
 from mkpc_kaggle.pipeline.assembly import Assembly
 
+MAX_NAMES = 5  # of samples, in a line
+
 
 class Step(StrEnum):
     """The estimates of a pair's F, in the order in which they are made."""
@@ -74,13 +76,15 @@ class SceneScore:
 class Validation:
     """The scores of all scenes under one recipe.
 
-    A submission that is scored from its file has no ``report`` and no ``steps``.
+    A submission that is scored from its file has no ``report`` and no ``steps``; ``missing`` are the samples that
+    it has no row for.
     """
 
     recipe: str
     scenes: tuple[SceneScore, ...]
     report: RunReport | None = None
     steps: tuple[Step, ...] = ()
+    missing: tuple[str, ...] = ()
 
     @property
     def maa(self) -> float:
@@ -143,23 +147,26 @@ def score_submission(submission: Path, truth: Path, scenes: Sequence[TrainScene]
     """Score a submission whose samples are known pairs of a train side.
 
     ``truth`` is a table ``sample_id,scene,image_1_id,image_2_id``, the images named as in the train side.
-    Samples that the table or the scenes lack are left out; :class:`UserError` for files that cannot be read.
+    Samples that the table or the scenes lack are left out; those that the submission lacks count as failed.
+    Raises :class:`UserError` for files that cannot be read.
     """
     found = read_submission(submission)
     columns = ("sample_id", "scene", "image_1_id", "image_2_id")
-    known: dict[str, Matrix3] = {}  # F by the id that the pair has in the train side, in either order
+    # The sample and its F by the id that the pair has in the train side, in either order.
+    known: dict[str, tuple[str, Matrix3 | None]] = {}
     for _, (sample, scene, first, second) in read_rows(truth, columns):
-        if sample in found:
-            known[pair_id(scene, first, second)] = found[sample]
-            known[pair_id(scene, second, first)] = found[sample].T
-    scored = []
+        F = found.get(sample)
+        known[pair_id(scene, first, second)] = sample, F
+        known[pair_id(scene, second, first)] = sample, None if F is None else F.T
+    scored, missing = [], []
     for there in scenes:
-        of_scene = [(true, known[true.pair.id]) for true in there.pairs if true.pair.id in known]
-        pairs = [PairScore(true.pair.id, true.covisibility, error_of(F, true, there)) for true, F in of_scene]
+        of_scene = [(true, *known[true.pair.id]) for true in there.pairs if true.pair.id in known]
+        missing += [sample for _, sample, F in of_scene if F is None]
+        pairs = [PairScore(true.pair.id, true.covisibility, error_of(F, true, there)) for true, _, F in of_scene]
         scored += [SceneScore(there.name, tuple(pairs))] if pairs else []
-    if not scored:
+    if len(missing) == sum(len(scene.pairs) for scene in scored):
         raise UserError(f"{truth} names no pair of the scenes that {submission} has a row for")
-    return Validation(submission.name, tuple(scored))
+    return Validation(submission.name, tuple(scored), missing=tuple(missing))
 
 
 def score_table(validation: Validation) -> list[str]:
@@ -179,6 +186,15 @@ def score_table(validation: Validation) -> list[str]:
     return ["mAA after each step, AUC after the last:", *lines] if several else lines
 
 
+def missing_rows(validation: Validation) -> list[str]:
+    """A line that names the samples without a row, if there are any."""
+    missing = validation.missing
+    if not missing:
+        return []
+    more = f" and {len(missing) - MAX_NAMES} more" if len(missing) > MAX_NAMES else ""
+    return [f"{len(missing)} samples have no row and count as failed: {', '.join(missing[:MAX_NAMES])}{more}"]
+
+
 def to_json(validation: Validation) -> dict[str, Any]:
     """All figures of a validation as JSON values: overall, per scene, per pair; what is not finite is null."""
     steps, report = validation.steps, validation.report
@@ -186,6 +202,7 @@ def to_json(validation: Validation) -> dict[str, Any]:
     reasons = Counter(str(region.reason) for record in records for region in record.regions or ())
     return {
         "recipe": validation.recipe,
+        "missing": validation.missing,
         **_scores_json(validation, steps),
         "seconds": report and report.seconds,
         "seconds_per_pair": report and report.seconds / len(records),

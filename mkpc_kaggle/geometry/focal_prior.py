@@ -133,7 +133,7 @@ def estimate_with_prior(
         finite = [found for found in free if np.isfinite(found.cost)]
         plain = min(finite, key=lambda found: found.cost, default=None)
     magsac_fundamental = unit_norm(search.for_pixels(plain.fundamental)) if plain else None
-    told = EstimateStats(len(candidates), best.cost, plain and plain.cost, search.focals(best))
+    told = EstimateStats(len(candidates), best.cost, plain.cost if plain else 0.0, search.focals(best))
     return Estimate(model, unit_norm(matrix), distinct.mask_of_all(inliers), "", magsac_fundamental, told)
 
 
@@ -193,10 +193,10 @@ class _Search:
         costs = [self._cost(view.fundamental, view) + self._all.prior_cost(view) for view in fine]
         return [_Candidate(view.fundamental, cost, view.logs) for view, cost in zip(fine, costs, strict=True)]
 
-    def focals(self, found: _Candidate) -> tuple[float, float] | None:
-        """In pixels; ``None`` for MAGSAC's own F, which has none."""
+    def focals(self, found: _Candidate) -> tuple[float, float]:
+        """In pixels; 0 for MAGSAC's own F, which has none."""
         if found.logs is None:
-            return None
+            return 0.0, 0.0
         ratio0, ratio1 = np.exp(found.logs).tolist()
         return self._priors[0].focal * ratio0, self._priors[1].focal * ratio1
 

@@ -66,9 +66,9 @@ class EstimateStats:
     """
 
     candidates: int = 0  # whose costs were compared
-    cost: float | None = None  # the winner's
-    magsac_cost: float | None = None  # that of the F of MAGSAC alone
-    focals: tuple[float, float] | None = None  # in pixels, of both images; None where the winner has none
+    cost: float = 0.0  # the winner's
+    magsac_cost: float = 0.0  # that of the F of MAGSAC alone, 0 where it finds none
+    focals: tuple[float, float] = (0.0, 0.0)  # in pixels, of both images; 0 where the winner has none
     support: float = 0.0  # see :mod:`mkpc_kaggle.geometry.overlap`
 
 
@@ -157,7 +157,7 @@ def consensus(
         return Estimate.failed(model, count, failure)
     if not inliers.any():
         return Estimate.failed(model, count, f"no {model} has inliers among {count} distinct matches")
-    known = lowest if np.isfinite(lowest) else None
+    known = lowest if np.isfinite(lowest) else 0.0
     return Estimate(model, unit_norm(best), inliers, stats=EstimateStats(candidates, known, known))
 
 

@@ -27,6 +27,8 @@ ENCODING_CACHE_BYTES = 2 << 30
 
 ViewKey = tuple[str, str, View]  # matcher, image and view: what an encoding is of
 
+matched_in: set[int] = set()  # this process, if pairs have been matched in it, and those that it was forked from
+
 
 class Pipeline:
     """A recipe's units, run on chunks of pairs with matchers that are loaded when first needed.
@@ -53,7 +55,6 @@ class Pipeline:
         self._matchers: dict[str, Matcher[Any]] = {}
         self._notes: dict[str, str] = {}  # on matchers that run in float32 though they should not
         self._encodings: ByteCache[ViewKey, Any] = ByteCache(cache_bytes)
-        self._process = os.getpid()
 
     def load(self) -> None:
         """Load all matchers of the recipe now; raises :class:`UserError` if one cannot be loaded."""
@@ -70,10 +71,7 @@ class Pipeline:
         memory that does not suffice for a single pair, are raised: see :mod:`mkpc_kaggle.pipeline.failures`. In a
         forked child, :class:`UserError`.
         """
-        if os.getpid() != self._process:  # the threads of PyTorch and OpenCV are gone, and would be waited for
-            raise UserError(
-                "this matcher was made before the process forked: make it anew here, or spawn processes"
-            )
+        require_unforked()
         pairs, units = list(pairs), list(units)
         for unit in (unit for unit in units if unit.stage == 1):
             self._run(unit, pairs, may_start)
@@ -186,6 +184,19 @@ class Pipeline:
         if name not in self._matchers:
             self._matchers[name] = self._load(name)
         return self._matchers[name]
+
+
+def require_unforked() -> None:
+    """Raise :class:`UserError` in a child that was forked after its parent had matched.
+
+    The threads of PyTorch and OpenCV are not there, and would be waited for: by a new matcher, too.
+    """
+    matched_in.add(os.getpid())
+    if len(matched_in) > 1:
+        raise UserError(
+            "this process was forked after its parent had matched, and would hang: use processes that are "
+            "spawned, such as multiprocessing.get_context('spawn') or DataLoader's multiprocessing_context='spawn'"
+        )
 
 
 def views_of(unit: Unit, multiple: int, pair: PairMatch) -> tuple[View, View]:

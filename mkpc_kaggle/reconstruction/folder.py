@@ -1,14 +1,15 @@
-"""A folder of images: its datasets, and the pairs of each that are to be matched."""
+"""A folder of images: its datasets, and a list of pairs of them."""
 
+import os
+import re
 from collections.abc import Mapping, Sequence
-from itertools import combinations
 from pathlib import Path
 
 from mkpc_kaggle.data.competition import CONTROL, IMAGE_SUFFIXES
+from mkpc_kaggle.data.images import printable
+from mkpc_kaggle.engine.console import warn
 from mkpc_kaggle.errors import UserError, read_text
-from mkpc_kaggle.reconstruction.likeness import shortlist
-
-MAX_IMAGES = 100  # of which all pairs are matched; above, each image has a shortlist
+from mkpc_kaggle.reconstruction.directory import RESERVED
 
 Datasets = Mapping[str, Sequence[Path]]  # images that belong together, by their folder's name below the root
 Ends = tuple[Path, Path]
@@ -17,34 +18,52 @@ Ends = tuple[Path, Path]
 def read_folder(root: Path) -> Datasets:
     """The datasets of a folder: each folder in it, and itself, ".", that has images; all in order of names.
 
-    Raises :class:`UserError` where there are no two images to match, and for two images of one stem.
+    What is hidden is passed over, with a line. Raises :class:`UserError` where there are no two images to match,
+    for two images of one stem, and for names that files of results cannot have.
     """
     if not root.is_dir():
         raise UserError(f"{root}: no such directory; name a folder of images, or of folders of images")
-    datasets = {}
-    for folder in (root, *sorted(path for path in root.rglob("*") if path.is_dir())):
-        files = sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES)
-        stems: dict[str, Path] = {}
-        for path in files:
-            if CONTROL.search(path.name):
-                raise UserError(f"{folder}: the name {path.name!r} has control characters; rename that file")
-            if (other := stems.setdefault(path.stem, path)) is not path:
-                raise UserError(f"{folder} has both {other.name} and {path.name}; rename one of them")
+    datasets, hidden, seen = {}, list[Path](), {root.resolve()}
+    for place, folders, names in os.walk(root, onerror=_refuse_unreadable, followlinks=True):
+        folder, images = Path(place), sorted(filter(_is_image, names))
+        hidden += [folder / name for name in (*folders, *images) if name.startswith(".")]
+        inner = [folder / name for name in sorted(folders) if not name.startswith(".")]
+        folders[:] = [each.name for each in inner if each.resolve() not in seen]  # links may go round
+        seen.update(each.resolve() for each in inner)
+        files = [folder / name for name in images if not name.startswith(".")]
         if files:
+            _require_usable(folder, root, files)
             datasets[folder.relative_to(root).as_posix()] = files
+    if hidden:
+        warn(f"{len(hidden)} hidden files or folders are passed over, the first is {hidden[0]}")
     if not datasets:
         raise UserError(f"{root} has no images: name a folder with {', '.join(IMAGE_SUFFIXES)} files")
     if all(len(files) < 2 for files in datasets.values()):
         name = next(iter(datasets.values()))[0].name
         raise UserError(f"{root} has a single image, {name}: there is nothing to match")
-    return datasets
+    return dict(sorted(datasets.items()))
 
 
-def pairs_of(files: Sequence[Path]) -> list[Ends]:
-    """All pairs of up to ``MAX_IMAGES`` images; of more, those of their shortlist."""
-    if len(files) <= MAX_IMAGES:
-        return list(combinations(files, 2))
-    return [(files[first], files[second]) for first, second in shortlist(files)]
+def _is_image(name: str) -> bool:
+    return name.lower().endswith(IMAGE_SUFFIXES)
+
+
+def _require_usable(folder: Path, root: Path, files: Sequence[Path]) -> None:
+    """Refuse a dataset whose names, or those of its images, cannot stand in tables and databases."""
+    parts = folder.relative_to(root).parts or (root.resolve().name,)
+    for name in (*parts, *(path.name for path in files)):
+        if CONTROL.search(name) or printable(name) != name:
+            raise UserError(f"{folder}: the name {name!r} has characters that are no text; rename it")
+    if reserved := RESERVED.intersection(map(str.lower, folder.relative_to(root).parts)):
+        raise UserError(f"{folder}: results are called {min(reserved)}; rename that folder")
+    stems: dict[str, Path] = {}
+    for path in files:
+        if (other := stems.setdefault(path.stem, path)) is not path:
+            raise UserError(f"{folder} has both {other.name} and {path.name}; rename one of them")
+
+
+def _refuse_unreadable(error: OSError) -> None:
+    raise UserError(f"{error.filename} cannot be read: {error.strerror}")
 
 
 def read_pair_list(path: Path, root: Path, datasets: Datasets) -> list[Ends]:
@@ -55,12 +74,14 @@ def read_pair_list(path: Path, root: Path, datasets: Datasets) -> list[Ends]:
     known = {file for files in datasets.values() for file in files}
     found = []
     for number, line in enumerate(read_text(path).splitlines(), start=1):
-        ends = sorted(root / name for name in line.split())
-        if not ends:
+        text = line.strip()
+        if not text:
             continue
-        if len(ends) != 2 or ends[0] == ends[1] or ends[0].parent != ends[1].parent or not known.issuperset(ends):
+        ways = ((root / text[: gap.start()], root / text[gap.end() :]) for gap in re.finditer(r"\s+", text))
+        ends = [sorted(two) for two in ways if known.issuperset(two)]  # names may have blanks
+        if len(ends) != 1 or ends[0][0] == ends[0][1] or ends[0][0].parent != ends[0][1].parent:
             raise UserError(f"{path}, line {number}: expected two images of one dataset of {root}, found {line!r}")
-        found.append((ends[0], ends[1]))
+        found.append((ends[0][0], ends[0][1]))
     if not found:
         raise UserError(f"{path} has no pairs")
     return list(dict.fromkeys(found))

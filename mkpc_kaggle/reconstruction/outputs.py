@@ -25,6 +25,8 @@ def write_tables(out: Path, cameras: Cameras, root: Path, form: str | None) -> N
     tables = {"cameras.csv": camera_rows(cameras, root)}
     if form is not None:
         tables["submission.csv"] = submission_rows(form, cameras, root)
+    else:
+        (out / "submission.csv").unlink(missing_ok=True)  # an earlier run's, of other cameras
     for name, rows in tables.items():
         with replacing(out / name) as stream:
             csv.writer(stream, lineterminator="\n").writerows(rows)
@@ -43,17 +45,19 @@ def camera_rows(cameras: Cameras, root: Path) -> Iterator[Sequence[str]]:
 
 
 def submission_rows(form: str, cameras: Cameras, root: Path) -> Iterator[Sequence[str]]:
-    """A row for each image, in the order of the folder."""
+    """A row for each image, in the order of the folder; ids and dataset names of 2025 are made unique by ``_``."""
     of_2025 = form == "imc2025"
     heads = ("image_id", "dataset", "scene", "image") if of_2025 else ("image_path", "dataset", "scene")
     yield *heads, "rotation_matrix", "translation_vector"
+    ids, names = set[str](), set(cameras) - {"."}
     for dataset, found in cameras.items():
-        folder = root.resolve().name if dataset == "." else dataset
+        folder = _unused(root.resolve().name, names) if dataset == "." else dataset
         parts = folder.split("/")  # of 2023 dataset/scene/images, of 2024 dataset/images
         for name, record in ((file.name, record) for file, record in found.items()):
             pose = (joined(record.camera.R), joined(record.camera.t)) if record else NO_POSE
             if of_2025:
-                yield f"{folder}_{name}", folder, f"cluster{record.model}" if record else "outliers", name, *pose
+                number = _unused(f"{folder}_{name}", ids)
+                yield number, folder, f"cluster{record.model}" if record else "outliers", name, *pose
             else:
                 place = f"{folder}/{name}", parts[0], parts[1 if len(parts) > 2 else 0]
                 yield *place, *(pose if record and record.model == 0 else ORIGIN)
@@ -61,3 +65,11 @@ def submission_rows(form: str, cameras: Cameras, root: Path) -> Iterator[Sequenc
 
 def joined(numbers: NDArray[np.float64]) -> str:
     return ";".join(f"{value:.12g}" for value in numbers.ravel())
+
+
+def _unused(name: str, used: set[str]) -> str:
+    """The name, with ``_`` after it until nothing else has it; then it is ``used``."""
+    while name in used:
+        name += "_"
+    used.add(name)
+    return name

@@ -1,24 +1,29 @@
 """Images in, cameras out: a folder by the engine, or a few images in this process."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.data.pairs import turned_copy
+from mkpc_kaggle.data.images import Image, ImageStore, Unreadable
+from mkpc_kaggle.engine.console import warn
 from mkpc_kaggle.engine.engine import RunReport
-from mkpc_kaggle.engine.records import CameraRecord
+from mkpc_kaggle.engine.journal import Journal
+from mkpc_kaggle.engine.records import CameraRecord, PairRecord, SceneRecord
 from mkpc_kaggle.engine.session import Session, run_pairs
-from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.errors import UserError, writing
 from mkpc_kaggle.matchers.contract import Matcher
-from mkpc_kaggle.pipeline.assembly import Assembly
-from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher, to_image
+from mkpc_kaggle.pipeline.assembly import Assembly, assemble
+from mkpc_kaggle.pipeline.pair import PairMatch
 from mkpc_kaggle.recipe import CameraSharing, Recipe, SceneConfig, load_recipe
-from mkpc_kaggle.reconstruction.folder import Datasets, Ends, pairs_of
-from mkpc_kaggle.reconstruction.likeness import find_turns
+from mkpc_kaggle.reconstruction.choice import MAX_IMAGES, RunEndedError, choose_pairs
+from mkpc_kaggle.reconstruction.directory import claim, settle
+from mkpc_kaggle.reconstruction.folder import Datasets, Ends
+from mkpc_kaggle.reconstruction.likeness import PARTNERS, local_features, most_alike, shortlist
 from mkpc_kaggle.reconstruction.outputs import Cameras
-from mkpc_kaggle.scene.export import MODELS, Export
+from mkpc_kaggle.scene.export import Export
 from mkpc_kaggle.scene.reconstruct import models_of, reconstruct_sharing
 from mkpc_kaggle.scene.reconstruction import SfmModel
 from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair, ViewGraph, tracks_of
@@ -50,38 +55,60 @@ def reconstruct_folder(
     *,
     listed: Sequence[Ends] | None = None,
     rotations: bool = False,
+    publish: Callable[[Cameras], None] = lambda _: None,
 ) -> FolderResult:
-    """Match the pairs of each dataset, those ``listed`` or by :func:`pairs_of`, and reconstruct it.
+    """Match the pairs of each dataset, those ``listed`` or of :func:`choose_pairs`, and reconstruct it.
 
     COLMAP's files of a dataset are in the folder of its name in ``out``. With ``rotations``, images that match
     nothing are turned. A scene's own process writes its files before the journal says that the scene is done, so
-    a run that was killed makes what is lacking.
+    a run that was killed makes what is lacking. ``publish`` is called with the cameras that there are, at first
+    with none, and after each scene. Raises :class:`UserError` for what is in the way in ``out``.
     """
     assembly = replace(assembly, recipe=for_cameras(assembly.recipe))
-    pairs, exports = [], {}
-    for name, files in datasets.items():
-        ends = pairs_of(files) if listed is None else [two for two in listed if two[0].parent == files[0].parent]
-        turns = dict.fromkeys(files, 0) | (find_turns(files, assembly) if rotations and ends else {})
-        shown = {file: turned_copy(file, turns[file], session.work_dir / "turned")[0] for file in files}
-        stored = {shown[file].stem: (file.name, turns[file]) for file in files}
-        exports[name] = Export(out / name, files[0].parent, stored)
-        pairs += [Pair(f"{name}/{a.stem}/{b.stem}", name, str(shown[a]), str(shown[b])) for a, b in ends]
-    report = run_pairs(pairs, assembly, replace(session, exports=exports))
-    versions: dict[str, dict[str, str]] = {name: {} for name in datasets}
-    for pair, record in zip(pairs, report.records, strict=True):
+    gone = claim(out, datasets)
+    none: Cameras = {name: dict.fromkeys(files) for name, files in datasets.items()}
+    belongs_to = {"images": {name: [file.name for file in files] for name, files in datasets.items()}}
+    with Journal(session.work_dir / "images", belongs_to, fresh=session.fresh) as journal:
+        settle(out, datasets, gone)
+        for name in gone:
+            warn(f"the images of {name} are gone, and so are its results in {out / name}")
+        if not (out / "cameras.csv").exists():
+            with writing(f"--out {out}"):
+                publish(none)
+        try:
+            pairs = choose_pairs(datasets, assembly, session, journal, listed=listed, rotations=rotations)
+        except RunEndedError as ended:
+            return FolderResult(ended.report, (), none)
+        turns = {path: times for pair in pairs for path, times in zip(pair.images, pair.turns, strict=True)}
+        exports = {
+            name: Export(
+                out / name, files[0].parent, {file.stem: (file.name, turns.get(file, 0)) for file in files}
+            )
+            for name, files in datasets.items()
+        }
+
+        def write(records: Sequence[PairRecord], scenes: Iterable[SceneRecord]) -> None:
+            publish(cameras_of(datasets, pairs, records, scenes))
+
+        report = run_pairs(pairs, assembly, replace(session, exports=exports), write)
+    return FolderResult(report, tuple(pairs), cameras_of(datasets, pairs, report.records, report.scenes))
+
+
+def cameras_of(
+    datasets: Datasets, pairs: Sequence[Pair], records: Sequence[PairRecord], scenes: Iterable[SceneRecord]
+) -> Cameras:
+    """The camera of each image. Files of one content have one camera, that of the largest model that has it."""
+    versions: dict[Path, str] = {}
+    for pair, record in zip(pairs, records, strict=True):
         # A pair that was not reached, or of which an image cannot be read, has no versions.
-        for path, version in zip(pair.images if record.versions else (), record.versions, strict=True):
-            versions[pair.group][exports[pair.group].files[path.stem][0]] = version
-    placed = {scene.batch: scene.cameras for scene in report.scenes}
+        versions |= zip(pair.images, record.versions, strict=True) if record.versions else ()
     cameras: dict[str, Mapping[Path, CameraRecord | None]] = {}
+    placed = {scene.batch: scene.cameras for scene in scenes}
     for name, files in datasets.items():
-        found = placed.get(name, ())
-        if found and not (models := out / name / MODELS).is_dir():
-            raise UserError(f"{models} was removed after it was made; start anew with --fresh")
-        # Files of one content have one camera, that of the largest model that has it.
-        known = {versions[name][camera.image]: camera for camera in reversed(found)}
-        cameras[name] = {file: known.get(versions[name].get(file.name, "")) for file in files}
-    return FolderResult(report, tuple(pairs), cameras)
+        by_name = {file.name: versions.get(file) for file in files}
+        known = {by_name[camera.image]: camera for camera in reversed(placed.get(name, ()))}
+        cameras[name] = {file: known.get(by_name[file.name] or "") for file in files}
+    return cameras
 
 
 def reconstruct(
@@ -100,12 +127,24 @@ def reconstruct(
     """
     files = sorted(map(Path, images))
     chosen = for_cameras(load_recipe(recipe) if isinstance(recipe, str) else recipe)
-    matcher = TwoStageMatcher(chosen, weights=weights, device=device, matchers=matchers)
-    decoded = ((path, to_image(path)) for path in files)
-    known = {path: BatchImage(str(path), image.name, image.size) for path, image in decoded}
+    assembly = assemble(chosen, weights=map(Path, weights), device=device, matchers=matchers)
+    pipeline, store, known = assembly.pipeline(), ImageStore(), dict[Path, BatchImage]()
+
+    def opened(path: Path) -> Image:
+        image = store.get(path)
+        if isinstance(image, Unreadable):
+            raise UserError(str(image))
+        known[path] = BatchImage(str(path), image.version, image.size)
+        return image
+
     pairs = []
-    for path0, path1 in pairs_of(files):
-        match = matcher(path0, path1)
+    if len(files) <= MAX_IMAGES:
+        ends = list(combinations(range(len(files)), 2))
+    else:
+        features = list(map(local_features, files))
+        ends = shortlist(most_alike(lambda: features, PARTNERS))
+    for path0, path1 in ((files[i], files[j]) for i, j in ends):
+        (match,) = pipeline.match([PairMatch(images=(opened(path0), opened(path1)))], assembly.recipe.units)
         pairs.append(BatchPair(known[path0], known[path1], match.matches, None, tracks_of(match.results)))
     pairs = Export(Path(), Path(), {str(file): (str(file), 0) for file in files}).stored(pairs)
     found, _ = reconstruct_sharing(ViewGraph.of_pairs(pairs), chosen.scene or SceneConfig())

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import pandas as pd
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.data.images import Unreadable, printable, read_image
+from mkpc_kaggle.data.images import Unreadable, printable, read_image, turned
 from mkpc_kaggle.data.outputs import replacing
 from mkpc_kaggle.engine.budget import format_duration
 from mkpc_kaggle.engine.journal import EventKind
@@ -152,7 +152,7 @@ def _weak(log: RunLog, weak: WeakPair, sources: dict[str, Pair]) -> tuple[str, s
     if record.source == "scene":
         parts.append("F is the scene's")
     if pair.id in sources:
-        image0, image1 = map(read_image, sources[pair.id].images)
+        image0, image1 = map(turned, map(read_image, sources[pair.id].images), sources[pair.id].turns)
         if isinstance(image0, Unreadable) or isinstance(image1, Unreadable):
             parts.append("an image cannot be read any more")
         else:

@@ -109,7 +109,7 @@ def _pair_table(pairs: Sequence[Pair], records: Sequence[PairRecord]) -> pd.Data
         columns[name] = np.fromiter((getattr(record, name) for record in records), kind, size)
     for name, kind in _STATS_COLUMNS.items():
         columns[name] = np.array([getattr(record.stats, name) for record in records], kind)
-    focals = np.array([record.stats.focals or (np.nan, np.nan) for record in records]).reshape(size, 2)
+    focals = np.array([record.stats.focals for record in records]).reshape(size, 2)
     columns |= {"focal0": focals[:, 0], "focal1": focals[:, 1]}
     F = np.array([record.chosen_fundamental for record in records]).reshape(size, 9)
     columns |= dict(zip(F_COLUMNS, F.T, strict=True))

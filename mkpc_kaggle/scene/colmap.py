@@ -11,6 +11,7 @@ import shutil
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,7 @@ import pycolmap
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Points, Size
 from mkpc_kaggle.recipe import SceneConfig
-from mkpc_kaggle.scene.export import DATABASE, MODELS
+from mkpc_kaggle.scene.export import DATABASE, FORMER, MODELS, PART
 from mkpc_kaggle.scene.keypoints import Index, scene_keypoints
 from mkpc_kaggle.scene.reconstruction import MIN_IMAGES, Reconstruction, RegisteredImage, SfmModel, filter_models
 from mkpc_kaggle.scene.shared_intrinsics import SharedIntrinsics, start_focal
@@ -58,23 +59,31 @@ def structure_from_motion(graph: ViewGraph, config: SceneConfig, shared: SharedI
 def write_files(
     directory: Path, graph: ViewGraph, config: SceneConfig, shared: SharedIntrinsics, models: Sequence[SfmModel]
 ) -> None:
-    """Write COLMAP's files in the place of earlier files: the database, and a folder of each of its models.
+    """Write COLMAP's files: the database, and a folder of each of its models.
 
-    The images that were left out of a model are not in its files.
+    They are made in a folder beside earlier files, and take their place when all are whole. The images that were
+    left out of a model are not in its files.
     """
-    shutil.rmtree(directory / MODELS, ignore_errors=True)
     directory.mkdir(parents=True, exist_ok=True)
-    (directory / DATABASE).unlink(missing_ok=True)
-    with pycolmap.Database.open(str(directory / DATABASE)) as database:
-        _fill(database, graph, config, shared)
-    for number, model in enumerate(models):
-        kept = {each.image.name for each in model.images}
-        for frame in [frame for frame in model.colmap.frames.values() if frame.has_pose()]:
-            if model.colmap.images[frame.frame_id].name not in kept:
-                model.colmap.deregister_frame(frame.frame_id)
-        folder = directory / MODELS / str(number)
-        folder.mkdir(parents=True)
-        model.colmap.write(folder)
+    for left in directory.glob(f"{PART}*"):  # by a process that was killed
+        shutil.rmtree(left, ignore_errors=True)
+    with TemporaryDirectory(prefix=PART, dir=directory) as name:
+        made = Path(name)
+        with pycolmap.Database.open(str(made / DATABASE)) as database:
+            _fill(database, graph, config, shared)
+        for number, model in enumerate(models):
+            kept = {each.image.name for each in model.images}
+            for frame in [frame for frame in model.colmap.frames.values() if frame.has_pose()]:
+                if model.colmap.images[frame.frame_id].name not in kept:
+                    model.colmap.deregister_frame(frame.frame_id)
+            folder = made / MODELS / str(number)
+            folder.mkdir(parents=True)
+            model.colmap.write(folder)
+        (made / DATABASE).replace(directory / DATABASE)
+        if (directory / MODELS).exists():
+            (directory / MODELS).rename(made / FORMER)
+        if models:
+            (made / MODELS).rename(directory / MODELS)
 
 
 def _fill(database: Any, graph: ViewGraph, config: SceneConfig, shared: SharedIntrinsics) -> None:

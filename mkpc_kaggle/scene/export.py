@@ -12,6 +12,9 @@ from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair
 
 DATABASE, MODELS = "database.db", "models"
+MODEL_FILES = ("cameras.bin", "frames.bin", "images.bin", "points3D.bin", "rigs.bin")
+FORMER = "former"  # models that are being replaced
+PART = ".new-"  # how the names of folders begin in which files are made that replace former files
 
 
 @dataclass(frozen=True)
@@ -25,6 +28,14 @@ class Export:
     directory: Path
     source: Path
     files: Mapping[str, tuple[str, int]]
+
+    def has_files(self, models: int) -> bool:
+        """Whether the files of a reconstruction with so many models are there."""
+        folders = [self.directory / MODELS / str(number) for number in range(models)]
+        return all(
+            path.is_file()
+            for path in (self.directory / DATABASE, *(each / name for each in folders for name in MODEL_FILES))
+        )
 
     def stored(self, pairs: Sequence[BatchPair]) -> list[BatchPair]:
         """The pairs with their images under their files' names, and with points in pixels of what the files store.

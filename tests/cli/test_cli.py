@@ -1,6 +1,8 @@
 import os
 import subprocess
 import sys
+import threading
+from io import StringIO
 
 import cv2
 import numpy as np
@@ -98,3 +100,14 @@ def test_match_says_what_it_lacks_and_draws_a_pair_that_has_nothing_in_common(cl
     assert "superglue (Magic-Leap-noncommercial)" in capsys.readouterr().err
     assert main(["match", str(tmp_path / "b.png"), match[1]]) == 2
     assert "b.png: no such file" in capsys.readouterr().err
+
+
+def test_what_a_command_printed_has_been_flushed_when_it_ends_however_long_a_reader_takes(monkeypatch):
+    class Flushed(StringIO):
+        def flush(self) -> None:
+            self.whole = self.getvalue(), threading.current_thread()
+
+    monkeypatch.setattr(sys, "stdout", stream := Flushed())
+    assert main(["recipes"]) == 0
+    assert stream.whole == (stream.getvalue(), threading.main_thread())  # a thread would not be waited for
+    assert "auto: " in stream.getvalue()

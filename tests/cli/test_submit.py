@@ -195,10 +195,11 @@ def test_what_would_be_written_over_an_input_or_a_result_is_refused_before_any_w
     assert contents(tmp_path) == before
 
 
-def test_a_limit_that_ends_before_the_first_version_is_told(demo, tmp_path):
+def test_a_limit_that_is_over_at_the_start_leaves_a_whole_file_and_is_told(demo, tmp_path):
     made = make(demo.test_dir, tmp_path / "submission.csv", "classical", "--time-limit", "0.1s")
     assert made.returncode == 1
-    assert "the time was up before a first version of the submission was written" in made.stderr
+    assert "the time limit passed before the first results were written" in made.stderr
+    assert_good(tmp_path / "submission.csv", demo.test_dir)
 
 
 def test_paths_that_the_terminal_cannot_spell_cost_no_result(demo, small_recipe, tmp_path, monkeypatch):

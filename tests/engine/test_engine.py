@@ -50,7 +50,7 @@ def test_a_run_without_a_limit_gives_every_pair_every_unit(tmp_path):
 def test_every_published_version_is_whole_and_the_first_comes_before_any_work(tmp_path):
     matcher, published = RectifiedMatcher(), []
 
-    def publish(records: list[PairRecord]) -> None:
+    def publish(records: list[PairRecord], _: object) -> None:
         published.append(([record.pair_fundamental.copy() for record in records], len(matcher.calls)))
 
     run(write_pairs(tmp_path, 5), THREE_UNITS, matcher, tmp_path / "work", publish=publish)

@@ -103,7 +103,7 @@ def test_the_file_has_the_former_f_until_another_is_there(tmp_path):
     pairs, versions = synthetic_pairs(tmp_path / "images", 4), []
     first = run(pairs, RECIPE, SyntheticMatcher(images=4), tmp_path / "work")
     other = replace(RECIPE, magsac=RobustConfig(threshold=1.0))
-    run(pairs, other, SyntheticMatcher(images=4), tmp_path / "work", publish=lambda r: versions.append(list(r)))
+    run(pairs, other, SyntheticMatcher(images=4), tmp_path / "work", publish=lambda r, _: versions.append(list(r)))
     for former, record in zip(first.records, versions[0], strict=True):
         assert np.array_equal(former.chosen_fundamental, record.chosen_fundamental)
     assert all(record.source == "scene" for record in versions[-1])

@@ -71,7 +71,13 @@ def test_an_error_of_the_engine_itself_leaves_the_latest_version_behind(pairs, t
 
     monkeypatch.setattr(Plan, "on_result", fail_later)
     with pytest.raises(KeyError, match="a bug"):
-        run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work", publish=lambda r: published.append(list(r)))
+        run(
+            pairs,
+            THREE_UNITS,
+            RectifiedMatcher(),
+            tmp_path / "work",
+            publish=lambda r, _: published.append(list(r)),
+        )
     assert [bool(record.units) for record in published[-1]] == [True] + [False] * 11
 
 
@@ -263,7 +269,7 @@ def stuck(self, until):
 LocalSite.wait = stuck
 home = Path(sys.argv[1])
 pairs = write_pairs(home / "pairs", 40)
-def publish(records):
+def publish(records, scenes):
     (home / "out").write_text(str(sum(bool(record.units) for record in records)))
 run(pairs, THREE_UNITS, RectifiedMatcher(), home / "work", limit=4.0, publish=publish, is_watched=True)
 """
@@ -330,7 +336,7 @@ def test_a_child_that_was_stopped_does_not_outlive_the_watchdog():
     stop = "os.kill(child.pid, signal.SIGSTOP); print(child.pid, flush=True)"
     done = guarded(f"child = {child}; child.start(); {stop}; time.sleep(600)")
     assert done.returncode == 1  # nothing was written
-    assert "before a first version of the submission was written" in done.stderr
+    assert "the time limit passed before the first results were written" in done.stderr
     status = Path(f"/proc/{done.stdout.strip()}/stat")
     while status.exists() and status.read_text().split()[2] != "Z":  # dead, though nobody has asked of it yet
         time.sleep(0.05)

@@ -191,8 +191,8 @@ def test_damage_anywhere_is_told_as_such(tmp_path: Path, damage: str) -> None:
         assert journal.records() == {}
 
 
-def test_pairs_that_the_test_set_has_not_are_damage(tmp_path: Path) -> None:
-    damaged_journal(tmp_path, pairs_with("0", "1000"))
+def test_pairs_that_no_test_set_has_are_damage(tmp_path: Path) -> None:
+    damaged_journal(tmp_path, pairs_with("0", "-1"))
     with Journal(tmp_path, OURS) as journal, pytest.raises(UserError, match="damaged"):
         journal.forget_changed(PAIRS)
 

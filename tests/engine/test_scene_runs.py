@@ -51,7 +51,9 @@ def own_matrices(pairs: list[Pair], directory: Path) -> list[bytes]:
 def test_pairs_get_the_f_of_their_scene_and_keep_their_own(tmp_path, monkeypatch):
     scenes_by(monkeypatch, choose_scene_for_all_but_the_first, process=True)
     pairs, published = batch_pairs(tmp_path / "images"), []
-    report = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work", publish=lambda r: published.append(list(r)))
+    report = run(
+        pairs, RECIPE, RectifiedMatcher(), tmp_path / "work", publish=lambda r, _: published.append(list(r))
+    )
     assert report.ending is Ending.COMPLETE
     assert [record.source for record in report.records] == ["pair"] + ["scene"] * 5
     assert all(np.array_equal(record.chosen_fundamental, SCENE_F) for record in report.records[1:])

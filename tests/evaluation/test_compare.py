@@ -1,4 +1,5 @@
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -85,6 +86,17 @@ def test_a_recipe_against_its_units_on_whole_images(demo, small_recipe, tmp_path
     again = capsys.readouterr().out
     assert again.count("4 of them from earlier runs") == 2
     assert again.split("seconds a pair\n")[-1] == table
+
+
+def test_a_comparison_of_runs_that_failed_has_their_exit_status(demo, small_recipe, tmp_path, capsys):
+    train = shutil.copytree(demo.train_dir, tmp_path / "train")
+    for image in train.rglob("*.jpg"):
+        image.write_bytes(b"no picture")
+    two = f"{small_recipe}:stage-1", f"{small_recipe}:whole-images"
+    assert main(["validate", "--train-dir", str(train), "--pairs-per-scene", "2", "--compare", *two]) == 1
+    printed = capsys.readouterr().out
+    assert printed.count("the run failed: errors left 2 of 2 pairs without an F") == 2
+    assert "gain of mAA" in printed
 
 
 def test_what_two_recipes_both_match_is_matched_once(demo, small_recipe, tmp_path, capsys):

@@ -52,6 +52,24 @@ def test_the_true_matrices_score_one_whatever_the_order_of_the_images(demo, tmp_
     assert scored.maa < 0.2
 
 
+def test_samples_that_a_submission_has_no_row_for_count_as_failed_and_are_named(demo, tmp_path, capsys):
+    truth = true_matrices(demo)
+    some, whole, out = tmp_path / "some.csv", tmp_path / "whole.csv", tmp_path / "scores.json"
+    write_submission(some, dict(list(truth.items())[:2]))
+    write_submission(whole, truth)
+    score = ["validate", "--train-dir", str(demo.train_dir), "--truth", str(demo.truth_csv), "--json", str(out)]
+    assert main([*score, "--submission", str(some)]) == 0
+    lacking = list(truth)[2:]
+    printed = capsys.readouterr().out
+    assert "6 samples have no row and count as failed: " in printed
+    assert sum(sample in printed for sample in lacking) == 5
+    figures = json.loads(out.read_text())
+    assert figures["mAA"] == 2 / 8
+    assert sorted(figures["missing"]) == sorted(lacking)
+    assert main([*score, "--submission", str(some), "--submission", str(whole)]) == 0
+    assert [each["mAA"] for each in json.loads(out.read_text())["submissions"]] == [2 / 8, 1]
+
+
 def test_a_failed_pair_counts_as_failed_even_where_the_fallback_happens_to_be_right():
     eye = np.eye(3)
     camera0, camera1 = Camera(eye, eye, np.zeros(3)), Camera(eye, eye, np.array([1.0, 0, 0]))

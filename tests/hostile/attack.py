@@ -26,7 +26,7 @@ REFUSED = (2,)
 EITHER = (0, 1, 2)  # a valid result, a result that says what it lacks, or a clear refusal
 CRASHES = ("Traceback (most recent call last)", "Fatal Python error", "Segmentation fault", "core dumped")
 LEFT_BY_ITSELF = (0, 1, 128 + signal.SIGINT, 128 + signal.SIGTERM)
-TOO_LATE = "the time was up before a first version"
+TOO_LATE = "the time limit passed before the first results"
 MARK = "MKPC_HOSTILE_CASE"
 
 Make = Callable[[Path], None]
@@ -75,10 +75,13 @@ def attack(case: Case, room: Path) -> None:
         status, output = _wait(process, room)
         faults += _faults(case, status, output, room)
         faults += [f"left running: {line}" for line in _orphans(mark)]
+        # Before the table was read.
         interrupted = status not in (0, 1) and output.strip() in ("", "error: interrupted")
-        nothing = interrupted or (status == 1 and TOO_LATE in output)  # before it began
-        if case.submission and not nothing and "submit" in command and status in LEFT_BY_ITSELF:
+        if case.submission and not interrupted and "submit" in command and status in LEFT_BY_ITSELF:
             faults += _submission_faults(room)
+        too_late = status == 1 and TOO_LATE in output  # before its directory was looked at
+        if status in (0, 1) and not too_late and "reconstruct" in command:
+            faults += _result_faults(room / "out" / "o", status)
     faults += [f"changed: {name}" for name in _changed(before, _snapshot(room))]
     if faults:
         pytest.fail("\n".join([case.id, case.command, *faults, f"output:\n{output[-3000:]}"]), pytrace=False)
@@ -143,6 +146,19 @@ def _faults(case: Case, status: int | None, output: str, room: Path) -> list[str
 def _submission_faults(room: Path) -> list[str]:
     ids = [pair.id for pair in read_test_side(room / "D")]
     return [f"submission: {problem}" for problem in submission_problems(room / "out" / "s.csv", ids)]
+
+
+def _result_faults(out: Path, status: int) -> list[str]:
+    """What is wrong with the results of a folder of images."""
+    table = out / "cameras.csv"
+    with suppress(OSError):
+        lines = table.read_text().splitlines()
+        faults = [] if lines[0] == "image,model,K,R,t" else [f"{table} begins with {lines[0]!r}"]
+        faults += (
+            [] if (len(lines) > 1) == (status == 0) else [f"exit status {status} with {len(lines) - 1} cameras"]
+        )
+        return faults + [f"left: {path}" for path in out.rglob(".*") if path.name != ".png"]
+    return [f"there is no {table}"]
 
 
 def _orphans(mark: str) -> list[str]:

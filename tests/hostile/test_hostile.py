@@ -5,6 +5,7 @@ from pathlib import Path
 
 import ends
 import fetches
+import folders
 import images
 import journals
 import outputs
@@ -17,7 +18,7 @@ from room import write_template
 
 ALL: list[Case] = [
     case
-    for group in (tables, images, outputs, ends, journals, weight_bombs, settings, fetches)
+    for group in (tables, images, outputs, ends, journals, weight_bombs, settings, fetches, folders)
     for case in group.CASES
 ]
 QUICK = (  # these run with the other tests
@@ -38,6 +39,9 @@ QUICK = (  # these run with the other tests
     "fetches: a link for the part",
     "arguments: check of a submission of NaN",
     "packages: an owner that is a path",
+    "folders: database.db of the user's",
+    "folders: a folder's name: Latin 1",
+    "folders: again: an ending that was changed",
 )
 
 

@@ -25,7 +25,9 @@ from synthetic import SyntheticMatcher
 from benchmarks.synthetic_scene import SIZE, SyntheticScene, synthetic_scene
 from mkpc_kaggle import reconstruct
 from mkpc_kaggle.cli import main
+from mkpc_kaggle.data import images
 from mkpc_kaggle.data.exif import Exif
+from mkpc_kaggle.data.images import Image, Unreadable, read_image
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.engine import Ending
 from mkpc_kaggle.engine.records import CameraRecord
@@ -33,11 +35,12 @@ from mkpc_kaggle.engine.session import Interrupt, Session
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.pipeline import pair
 from mkpc_kaggle.pipeline.assembly import assemble
 from mkpc_kaggle.recipe import Recipe, Unit
-from mkpc_kaggle.reconstruction.folder import MAX_IMAGES, pairs_of, read_folder, read_pair_list
-from mkpc_kaggle.reconstruction.likeness import find_turns, shortlist
-from mkpc_kaggle.reconstruction.outputs import camera_rows, submission_rows
+from mkpc_kaggle.reconstruction.folder import read_folder, read_pair_list
+from mkpc_kaggle.reconstruction.likeness import local_features, most_alike, shortlist
+from mkpc_kaggle.reconstruction.outputs import Cameras, camera_rows, submission_rows
 from mkpc_kaggle.reconstruction.run import FolderResult, for_cameras, reconstruct_folder
 from mkpc_kaggle.reporting.report import report_page
 from mkpc_kaggle.reporting.run_log import read_log
@@ -81,11 +84,13 @@ def write_flat(folder: Path, count: int = FIRST + SECOND + OTHERS) -> Path:
     return folder
 
 
-def run(root: Path, out: Path, matcher: SyntheticMatcher | None = None, **options: object) -> FolderResult:
+def run(
+    root: Path, out: Path, matcher: SyntheticMatcher | None = None, *, fresh: bool = False, **options: object
+) -> FolderResult:
     matcher = matcher or MixedMatcher()
     interrupt = getattr(matcher, "interrupt", None) or Interrupt()
     budget = Budget(time.monotonic(), float("inf"))
-    session = Session(out / "work", budget, interrupt, progress=False, workers=0)
+    session = Session(out / "work", budget, interrupt, fresh, progress=False, workers=0)
     assembly = assemble(RECIPE, matchers={"synthetic": matcher}, device="cpu")
     return reconstruct_folder(read_folder(root), assembly, session, out, **options)  # type: ignore[arg-type]
 
@@ -204,12 +209,16 @@ def test_a_run_that_was_cut_off_ends_with_the_same_files(mixed, tmp_path):
     assert contents(tmp_path / "out") == contents(out)
 
 
-def test_models_that_were_removed_are_not_passed_over(tmp_path):
-    root = write_flat(tmp_path / "images", 4)
-    run(root, tmp_path / "out")
-    subprocess.run(["rm", "-r", str(tmp_path / "out" / "models")], check=True)
-    with pytest.raises(UserError, match="was removed after it was made; start anew with --fresh"):
-        run(root, tmp_path / "out")
+@pytest.mark.parametrize("removed", ["models", "models/0/points3D.bin", "database.db"])
+def test_what_was_removed_of_the_results_is_made_again(tmp_path, removed):
+    root, out = write_flat(tmp_path / "images", 4), tmp_path / "out"
+    run(root, out)
+    before = contents(out)
+    subprocess.run(["rm", "-r", str(out / removed)], check=True)
+    matcher = MixedMatcher()
+    run(root, out, matcher)
+    assert contents(out) == before
+    assert matcher.calls == []
 
 
 def test_each_model_is_drawn(mixed):
@@ -341,22 +350,20 @@ def photographs(folder: Path, count: int) -> list[Path]:
 
 def test_a_shortlist_has_images_that_are_alike(tmp_path):
     paths = photographs(tmp_path / "images", 6)
-    pairs = shortlist(paths, partners=3)
-    assert pairs == sorted(set(pairs)) == shortlist(paths, partners=3)
+    pairs = shortlist(partners(paths, 3))
+    assert pairs == sorted(set(pairs)) == shortlist(partners(paths, 3))
     assert all((i < 6) == (j < 6) and i < j for i, j in pairs)
     assert {place for pair in pairs for place in pair} == set(range(12))
 
 
-def test_large_folders_get_a_shortlist_and_others_all_pairs(tmp_path, monkeypatch):
-    monkeypatch.setattr("mkpc_kaggle.reconstruction.folder.shortlist", lambda files: [(0, 1)])
-    files = [tmp_path / f"{number:03}.png" for number in range(MAX_IMAGES + 1)]
-    assert len(pairs_of(files[:-1])) == MAX_IMAGES * (MAX_IMAGES - 1) // 2
-    assert pairs_of(files) == [(files[0], files[1])]
+def partners(paths: list[Path], count: int) -> list[list[int]]:
+    features = list(map(local_features, paths))
+    return most_alike(lambda: features, count)
 
 
 def test_unreadable_images_have_no_part_in_a_shortlist(tmp_path):
     paths = [tmp_path / f"{number}.png" for number in range(3)]
-    assert shortlist(paths, partners=1) == [(0, 1), (0, 2)]
+    assert shortlist(partners(paths, 1)) == [(0, 1), (0, 2)]
 
 
 @dataclass
@@ -391,15 +398,16 @@ def test_images_that_lie_on_a_side_are_found(tmp_path):
     for path, times in turned.items():
         cv2.imwrite(str(path), np.rot90(cv2.imread(str(path)), -times))
     (tmp_path / "images" / "broken.png").write_bytes(b"no picture")
-    assembly = assemble(RECIPE, matchers={"synthetic": UprightSift()}, device="cpu")
-    assert find_turns([*paths, tmp_path / "images" / "broken.png"], assembly) == turned
+    result = run(tmp_path / "images", tmp_path / "out", UprightSift(), rotations=True)
+    found = {path: t for pair in result.pairs for path, t in zip(pair.images, pair.turns, strict=True) if t}
+    assert found == turned
 
 
 def test_what_was_turned_comes_back_in_the_pixels_of_its_file(tmp_path, monkeypatch):
     root = write_flat(tmp_path / "images", FIRST)
     lying = root / "02.png"
     cv2.imwrite(str(lying), np.rot90(cv2.imread(str(lying)), -1))
-    monkeypatch.setattr("mkpc_kaggle.reconstruction.run.find_turns", lambda *_: {lying: 1})
+    monkeypatch.setattr("mkpc_kaggle.reconstruction.choice.find_turns", lambda *_: {lying: 1})
     result = run(root, tmp_path / "out", rotations=True)
     found = {name: record.camera for name, record in cameras(result).items()}
     downs = np.array([found[f"{number:02}.png"].R[1] for number in range(FIRST)])
@@ -426,3 +434,83 @@ def test_a_recipe_for_cameras_matches_no_pair_that_was_not_asked_for():
     assert recipe.scene is not None
     assert recipe.scene.pairs_per_image == 0
     assert recipe.focal is None
+
+
+def test_the_tables_are_there_at_first_and_again_after_each_scene(tmp_path):
+    for name in ("a", "b"):
+        write_flat(tmp_path / "images" / name, 5)
+    published: list[dict[str, int]] = []
+
+    def publish(found: Cameras) -> None:
+        (tmp_path / "out" / "cameras.csv").touch()
+        published.append({name: sum(map(bool, each.values())) for name, each in found.items()})
+
+    run(tmp_path / "images", tmp_path / "out", publish=publish)
+    steps = list(dict.fromkeys(tuple(each.values()) for each in published))
+    assert steps in ([(0, 0), (5, 0), (5, 5)], [(0, 0), (0, 5), (5, 5)])
+
+
+def test_a_dataset_that_is_gone_takes_its_results_with_it(tmp_path, capsys):
+    root, out = tmp_path / "images", tmp_path / "out"
+    for name in ("a", "b"):
+        write_flat(root / name, 4)
+    run(root, out)
+    (root / "b").rename(tmp_path / "elsewhere")
+    with pytest.raises(UserError, match="belongs to another run: its images differ"):
+        run(root, out)
+    assert (out / "b" / "models" / "0").is_dir()
+    run(root, out, fresh=True)
+    assert f"the images of b are gone, and so are its results in {out / 'b'}" in capsys.readouterr().err
+    assert not (out / "b").exists()
+    assert (out / "a" / "models" / "0").is_dir()
+
+
+def test_orientations_go_on_where_a_run_was_cut_off(tmp_path):
+    """Interrupted while images are matched to see how they lie: what is known is not matched again."""
+    paths, out = photographs(tmp_path / "images", 4), tmp_path / "out"
+    cv2.imwrite(str(paths[1]), np.rot90(cv2.imread(str(paths[1])), -1))
+
+    class Counted(UprightSift):
+        interrupt: Interrupt | None = None
+        after = -1
+        count = 0
+
+        def match(self, encodings0, encodings1):  # type: ignore[no-untyped-def]
+            self.count += len(encodings0)
+            if self.count == self.after and self.interrupt is not None:
+                self.interrupt.set()
+            return super().match(encodings0, encodings1)
+
+    whole = Counted()
+    expected = run(tmp_path / "images", tmp_path / "whole", whole, rotations=True)
+    assert {
+        path.name for pair in expected.pairs for path, t in zip(pair.images, pair.turns, strict=True) if t
+    } == {paths[1].name}
+    total, ending = 0, Ending.INTERRUPTED
+    for _ in range(100):
+        matcher = Counted()
+        matcher.interrupt, matcher.after = Interrupt(), 20
+        result = run(tmp_path / "images", out, matcher, rotations=True)
+        total, ending = total + matcher.count, result.report.ending
+        if ending is Ending.COMPLETE:
+            break
+        assert ending is Ending.INTERRUPTED
+    assert ending is Ending.COMPLETE
+    assert whole.count <= total <= 2 * whole.count
+    assert contents(out) == contents(tmp_path / "whole")
+
+
+def test_python_reads_each_image_once_and_estimates_nothing_that_nobody_reads(tmp_path, monkeypatch):
+    folder, read = write_flat(tmp_path / "images", 5), list[Path]()
+
+    def read_counted(path: Path) -> Image | Unreadable:
+        read.append(path)
+        return read_image(path)
+
+    def estimate_nothing(*_: object, **__: object) -> None:
+        raise AssertionError("nobody reads this")
+
+    monkeypatch.setattr(images, "read_image", read_counted)
+    monkeypatch.setattr(pair, "estimate", estimate_nothing)
+    reconstruct(folder.iterdir(), RECIPE, device="cpu", matchers={"synthetic": MixedMatcher()})
+    assert sorted(read) == sorted(folder.iterdir())

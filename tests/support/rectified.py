@@ -18,7 +18,6 @@ from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.cluster import RayCluster
 from mkpc_kaggle.engine.engine import RunReport
-from mkpc_kaggle.engine.records import PairRecord
 from mkpc_kaggle.engine.session import Interrupt, Session, Watchdog, run_pairs, submit
 from mkpc_kaggle.geometry.coordinates import Size, View
 from mkpc_kaggle.geometry.matches import Matches
@@ -112,7 +111,7 @@ def run(
     limit: float = float("inf"),
     budget: Budget | None = None,
     interrupt: Interrupt | None = None,
-    publish: Callable[[Sequence[PairRecord]], None] = lambda _: None,
+    publish: Callable[..., None] = lambda *_: None,
     output: Path | None = None,
     workers: int | RayCluster | None = 0,
     is_watched: bool = False,

@@ -416,7 +416,7 @@ def simulate(scenario: Scenario, journal: MemoryJournal | None = None, until: fl
         site,
         journal or MemoryJournal(),
         budget,
-        publish=lambda records: published.append(len(records)),
+        publish=lambda records, _: published.append(len(records)),
         interrupt=interrupt,
         progress=False,
     )

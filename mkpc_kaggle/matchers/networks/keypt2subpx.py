@@ -29,8 +29,8 @@ class Keypt2Subpx(nn.Module):
     def forward(self, patches: Tensor, descriptors: Tensor) -> Tensor:
         """Offsets (N, 2), x and y, at most 5 pixels, of ``patches`` (N, C, 11, 11) with ``descriptors`` (N, D)."""
         x = torch.relu_(self.conv1b(torch.relu_(self.conv1a(patches))))
-        x = torch.relu_(self.conv2b(torch.relu_(self.conv2a(x))))
-        field = functional.normalize(self.conv3(x), dim=1)  # (N, D, 5, 5)
+        x = self.conv3(torch.relu_(self.conv2b(torch.relu_(self.conv2a(x)))))
+        field = functional.normalize(x, dim=1)  # (N, D, 5, 5)
         weights = torch.einsum("ndrc,nd->nrc", field, descriptors).exp()
         weights = weights / (weights.sum(dim=(1, 2), keepdim=True) + EPSILON)
         places = torch.arange(PLACES, dtype=weights.dtype, device=weights.device)

@@ -1,0 +1,96 @@
+"""Names of files and folders as they come: taken, passed over with a line, or refused; never a traceback."""
+
+import os
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mkpc_kaggle.engine.records import CameraRecord
+from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.geometry.coordinates import Size
+from mkpc_kaggle.reconstruction.folder import read_folder, read_pair_list
+from mkpc_kaggle.reconstruction.outputs import submission_rows
+
+
+def written(root: Path, *names: str) -> Path:
+    for name in names:
+        path = os.path.join(os.fsencode(root), os.fsencode(name))  # noqa: PTH118  a name may be no text
+        os.makedirs(os.path.dirname(path), exist_ok=True)  # noqa: PTH103, PTH120
+        with open(path, "wb"):  # noqa: PTH123
+            pass
+    return root
+
+
+def names_of(root: Path) -> dict[str, list[str]]:
+    return {name: [file.name for file in files] for name, files in read_folder(root).items()}
+
+
+NO_TEXT = os.fsdecode(b"caf\xe9")
+
+
+@pytest.mark.parametrize("name", ["a\n.jpg", "a\x1b[2J.jpg", f"{NO_TEXT}.jpg", f"{NO_TEXT}/a.jpg", "x\ty/a.jpg"])
+def test_names_that_are_no_text_are_refused_by_their_folder(tmp_path, name):
+    with pytest.raises(UserError, match="has characters that are no text; rename it"):
+        read_folder(written(tmp_path, "b.jpg", "c.jpg", name))
+
+
+@pytest.mark.parametrize(
+    "name", ["models", "work", "database.db", "a/models", "cameras.csv", "report.html", "Models"]
+)
+def test_folders_that_are_called_as_results_are_refused_at_once(tmp_path, name):
+    with pytest.raises(UserError, match=r"results are called .*; rename that folder"):
+        read_folder(written(tmp_path, f"{name}/0.png", f"{name}/1.png"))
+
+
+def test_what_is_hidden_is_passed_over_with_a_line(tmp_path, capsys):
+    root = written(tmp_path, "f0.jpg", "f1.jpg", "._f0.jpg", ".thumbnails/f0.jpg", "a/._x.jpg", ".DS_Store")
+    assert names_of(root) == {".": ["f0.jpg", "f1.jpg"]}
+    assert f"3 hidden files or folders are passed over, the first is {root}" in capsys.readouterr().err
+
+
+def test_a_folder_that_is_called_as_an_image_is_a_dataset(tmp_path):
+    root = written(tmp_path, "x.jpg/1.png", "x.jpg/2.png", "a.png")
+    assert names_of(root) == {".": ["a.png"], "x.jpg": ["1.png", "2.png"]}
+
+
+def test_a_link_to_a_folder_is_a_dataset_and_links_that_go_round_end(tmp_path):
+    root = written(tmp_path / "images", "a/1.png", "a/2.png")
+    written(tmp_path / "elsewhere", "1.png", "2.png")
+    (root / "b").symlink_to(tmp_path / "elsewhere")
+    (root / "a" / "round").symlink_to(root)
+    assert names_of(root) == {"a": ["1.png", "2.png"], "b": ["1.png", "2.png"]}
+
+
+def test_names_in_a_list_of_pairs_may_have_blanks(tmp_path):
+    root = written(tmp_path / "images", "a b.png", "c.png", "d e f.png")
+    (tmp_path / "pairs.txt").write_text("a b.png c.png\n  d e f.png\ta b.png \r\n")
+    found = read_pair_list(tmp_path / "pairs.txt", root, read_folder(root))
+    assert [(a.name, b.name) for a, b in found] == [("a b.png", "c.png"), ("a b.png", "d e f.png")]
+
+
+def test_a_line_that_can_be_read_in_two_ways_is_refused(tmp_path):
+    root = written(tmp_path / "images", "a", "a.png", "a.png b.png", "b.png c.png", "c.png")
+    (tmp_path / "pairs.txt").write_text("a.png b.png c.png\n")
+    with pytest.raises(UserError, match="expected two images of one dataset"):
+        read_pair_list(tmp_path / "pairs.txt", root, read_folder(root))
+
+
+def rows_of(root: Path, files: Iterable[str]) -> list[tuple[str, ...]]:
+    record = CameraRecord("x", 0, (0, 0, 0), (0, 0, 1), (0, 1, 0), 100.0, Size(10, 10), 5)
+    cameras: dict[str, dict[Path, CameraRecord | None]] = {}
+    for name in files:
+        path = root / name
+        cameras.setdefault(path.parent.relative_to(root).as_posix(), {})[path] = record
+    _, *rows = submission_rows("imc2025", cameras, root)
+    return [tuple(row) for row in rows]
+
+
+def test_ids_and_rows_of_2025_are_unique(tmp_path):
+    root = tmp_path / "a"
+    rows = rows_of(root, ["b.jpg", "a/b.jpg", "a_b/c.jpg", "a/b_c.jpg", "a/b/c.jpg"])
+    assert len({row[0] for row in rows}) == len(rows) == 5
+    assert len({(row[1], row[3]) for row in rows}) == 5
+    assert rows_of(root, ["x/1.png", "y/1.png"])[0][:2] == ("x_1.png", "x")
+    assert np.all([row[2] == "cluster0" for row in rows])
