@@ -108,7 +108,6 @@ REFUSED_WHEN = {  # what is not named here is survived with status 0
         "another format of files",
         "no page size",
         "a page of zeros",
-        "a pair of 2^62",
         "no run",
         "JSON of another kind",
         "another format",
