@@ -45,7 +45,8 @@ def test_a_run_that_is_killed_at_random_moments_ends_with_the_same_files(demo, t
         return found
 
     (tmp_path / "small.toml").write_text(
-        'units = [{ stage = 1, matcher = "sift", long_side = 320 }, { stage = 2, matcher = "sift", long_side = 400 }]'
+        'units = [{ stage = 1, matcher = "sift", long_side = 320 }, '
+        '{ stage = 2, matcher = "sift", long_side = 400 }]'
     )
     start = time.monotonic()
     assert begin("undisturbed").wait() == 0
