@@ -84,6 +84,12 @@ class Progress:
         if began or self._budget.clock() - self._written >= LINE_INTERVAL_S:
             self.close()
 
+    def note(self, text: str) -> None:
+        """A line of its own."""
+        with suppress(OSError, ValueError):
+            if self._stream is not None:
+                tqdm.write(text, file=self._stream)  # a bar goes on below it
+
     def close(self) -> None:
         """End the bar, or print the line that waits."""
         with suppress(OSError, ValueError):

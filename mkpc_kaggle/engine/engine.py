@@ -153,7 +153,7 @@ class Engine:
         """Whether no worker is started at any place any more."""
         return bool(self.site.places) and all(place.closed for place in self.site.places)
 
-    def save_what_there_is(self) -> str:
+    def save_results(self) -> str:
         """Write the results, unless the run has ended; why it cannot be written. For any thread."""
         with self._publishing:
             if not self._has_ended:
@@ -256,6 +256,7 @@ class Engine:
         while len(self._scene_places) < at_once and (batch := self.scenes.due(done, filling)) is not None:
             place = Place(f"scene of batch {batch}", self.site.scene_worker)
             place.job = self.scenes.job(batch, self._results)
+            self._tell(f"batch {batch}: its cameras are reconstructed from {len(place.job.pairs)} pairs")
             self._scene_places.append(place)
             place.start(now, self.scenes.start_timeout(self.budget.left()))
 
@@ -271,7 +272,9 @@ class Engine:
         self.scenes.on_result(job, record)
         for index, choice in zip(job.indices, answer.choices, strict=True):
             records[index] = replace(records[index], scene=choice)
-        self._note(EventKind.SCENE, f"{record.batch}: {record.placed} of {record.images} images")
+        text = f"{record.batch}: {record.registered} of {record.images} images"
+        self._note(EventKind.SCENE, text)
+        self._tell(f"batch {text} have a camera")
         members = [records[index] for index in self.scenes.batches[job.batch]]
         self._save(partial(self.journal.save_scene, record, members))
         if job.export is not None:
@@ -322,6 +325,11 @@ class Engine:
     def _note(self, kind: EventKind, text: str) -> None:
         self.journal.note(kind, self.budget.spent(), text)
 
+    def _tell(self, text: str) -> None:
+        """Show a step of the run that may take minutes."""
+        if self._progress is not None:
+            self._progress.note(text)
+
     def _fault(self, what: str) -> None:
         if what not in self.faults:
             self.faults.append(what)
@@ -329,7 +337,7 @@ class Engine:
 
     def _publish(self) -> None:
         start = self.budget.clock()
-        if trouble := self.save_what_there_is():
+        if trouble := self.save_results():
             self._fault(trouble)
         self._published = self.budget.clock()
         self.budget.note_write(self._published - start)

@@ -333,7 +333,7 @@ class Journal(JournalReader):
             stored, wanted = self._header(), json.loads(json.dumps(belongs_to))
             if other := [key for key in wanted if stored.get(key) != wanted[key]]:
                 raise UserError(
-                    f"{self.path} belongs to another run: its {' and '.join(other)} differ. "
+                    f"{self.path} belongs to another run (different {', '.join(other)}). "
                     "Start anew with --fresh, or name another --work-dir."
                 )
         # Readers do not hold up the writer then. Killed, no result is lost; with the power, the last results.

@@ -205,7 +205,7 @@ class SceneRecord:
 
     batch: str
     images: int
-    placed: int
+    registered: int
     models: int
     points: int
     unit_results: int

@@ -148,7 +148,7 @@ def run_pairs(
             exports=session.exports,
         )
         if session.watchdog is not None:
-            session.watchdog.save = engine.save_what_there_is
+            session.watchdog.save = engine.save_results
         report = engine.run()
         journal.note(EventKind.END, report.seconds, report.ending)
     return report

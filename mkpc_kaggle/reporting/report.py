@@ -79,7 +79,7 @@ def report_page(log: RunLog, pairs: Sequence[Pair] = (), *, undrawn: str = "") -
     if not undrawn and find_spec("matplotlib") is None:
         undrawn = "matplotlib is not installed: pip install 'mkpc-kaggle[plots]'"
     sources = {} if undrawn else {pair.id: pair for pair in pairs}
-    largest = sorted((s for s in log.scenes if s.placed), key=lambda scene: -scene.placed)[:MAX_SCENES]
+    largest = sorted((s for s in log.scenes if s.registered), key=lambda scene: -scene.registered)[:MAX_SCENES]
     has_jobs = any(event.kind == EventKind.JOB for event in log.session)
     pages = Environment(loader=PackageLoader("mkpc_kaggle.reporting"), autoescape=True, undefined=StrictUndefined)
     return pages.get_template("report.html").render(
@@ -125,7 +125,7 @@ def _facts(log: RunLog) -> Iterator[tuple[str, str, str]]:
         others = ", ".join(f"{count} {reason}" for reason, count in reasons.items())
         yield "critical regions", f"{reasons.get('cropped', 0)} of {reasons.sum()}", others
     if log.scenes:
-        placed, images = (sum(getattr(scene, name) for scene in log.scenes) for name in ("placed", "images"))
+        placed, images = (sum(getattr(scene, name) for scene in log.scenes) for name in ("registered", "images"))
         yield "images with a camera", f"{placed} of {images}", f"in {len(log.scenes)} batches"
 
 
@@ -175,7 +175,7 @@ def _scenes(log: RunLog) -> list[pd.DataFrame]:
     counts = pairs[pairs["source"] == "scene"].groupby("group").size()
     rows = [
         (
-            *(scene.batch, scene.images, scene.placed, scene.points, _focals(scene)),
+            *(scene.batch, scene.images, scene.registered, scene.points, _focals(scene)),
             *(scene.seconds, int(counts.get(scene.batch, 0)), scene.failure),
         )
         for scene in log.scenes

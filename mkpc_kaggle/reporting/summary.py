@@ -105,8 +105,8 @@ def _scenes(tables: RunTables, scenes: Sequence[SceneRecord]) -> list[str]:
     """How many batches and images were reconstructed, whose F is from there, and why the others were not."""
     if not scenes:
         return []
-    made = sum(scene.placed > 0 for scene in scenes)
-    images = f"{sum(scene.placed for scene in scenes)} of {sum(scene.images for scene in scenes)} images"
+    made = sum(scene.registered > 0 for scene in scenes)
+    images = f"{sum(scene.registered for scene in scenes)} of {sum(scene.images for scene in scenes)} images"
     pairs = f"F of {sum(tables.pairs['source'] == 'scene')} of {len(tables.pairs)} pairs is from them"
     batches: dict[str, list[str]] = {}
     for scene in scenes:

@@ -53,7 +53,7 @@ def test_a_submission_is_made_resumed_and_kept_from_another_recipe(demo, small_r
     small_recipe.write_text(small_recipe.read_text().replace("400", "401"))
     refused = make(demo.test_dir, output, small_recipe)
     assert refused.returncode == 2
-    assert "belongs to another run: its recipe differ" in refused.stderr
+    assert "belongs to another run (different recipe)" in refused.stderr
     assert output.read_bytes() == written
     assert make(demo.test_dir, output, small_recipe, "--fresh", "--no-report").returncode == 0
     assert output.read_bytes() != written
