@@ -33,6 +33,7 @@ from mkpc_kaggle.recipe import Recipe
 from mkpc_kaggle.scene.export import Export
 from mkpc_kaggle.scene.reconstruct import Solution
 
+MIN_TOLD_PAIRS = 20  # of a batch whose reconstruction is shown: that of a smaller batch takes seconds
 PUBLISH_INTERVAL_S, PUBLISH_SHARE = 30.0, 0.05  # how often the submission is written, and its share of the time
 
 
@@ -256,7 +257,7 @@ class Engine:
         while len(self._scene_places) < at_once and (batch := self.scenes.due(done, filling)) is not None:
             place = Place(f"scene of batch {batch}", self.site.scene_worker)
             place.job = self.scenes.job(batch, self._results)
-            self._tell(f"batch {batch}: its cameras are reconstructed from {len(place.job.pairs)} pairs")
+            self._tell(place.job, f"its cameras are reconstructed from {len(place.job.pairs)} pairs")
             self._scene_places.append(place)
             place.start(now, self.scenes.start_timeout(self.budget.left()))
 
@@ -272,9 +273,9 @@ class Engine:
         self.scenes.on_result(job, record)
         for index, choice in zip(job.indices, answer.choices, strict=True):
             records[index] = replace(records[index], scene=choice)
-        text = f"{record.batch}: {record.registered} of {record.images} images"
-        self._note(EventKind.SCENE, text)
-        self._tell(f"batch {text} have a camera")
+        text = f"{record.registered} of {record.images} images"
+        self._note(EventKind.SCENE, f"{record.batch}: {text}")
+        self._tell(job, f"{text} have a camera")
         members = [records[index] for index in self.scenes.batches[job.batch]]
         self._save(partial(self.journal.save_scene, record, members))
         if job.export is not None:
@@ -325,10 +326,10 @@ class Engine:
     def _note(self, kind: EventKind, text: str) -> None:
         self.journal.note(kind, self.budget.spent(), text)
 
-    def _tell(self, text: str) -> None:
-        """Show a step of the run that may take minutes."""
-        if self._progress is not None:
-            self._progress.note(text)
+    def _tell(self, job: SceneJob, text: str) -> None:
+        """Show a step of a reconstruction that may take minutes."""
+        if self._progress is not None and len(job.pairs) >= MIN_TOLD_PAIRS:
+            self._progress.note(f"batch {job.batch}: {text}")
 
     def _fault(self, what: str) -> None:
         if what not in self.faults:

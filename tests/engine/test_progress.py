@@ -52,6 +52,15 @@ def test_lines_come_when_a_phase_begins_now_and_then_and_in_the_end() -> None:
     assert stream.getvalue().splitlines() == [*sweep, "deepen: 2 pairs", "deepen: 2 of 2 pairs"]
 
 
+@pytest.mark.parametrize("stream", [StringIO(), Terminal()])
+def test_a_note_is_a_line_of_its_own(stream: StringIO) -> None:
+    progress = Progress(Budget(0.0, clock=VirtualClock()), stream)
+    progress.show(Phase.SWEEP, 1, 5)
+    progress.note("batch one: 4 of 4 images have a camera")
+    progress.close()
+    assert "batch one: 4 of 4 images have a camera\n" in stream.getvalue()
+
+
 @pytest.mark.parametrize("stream", [StringIO, Terminal])
 def test_a_log_whose_reader_has_left_does_not_end_the_run(stream: type[StringIO]) -> None:
     class Left(stream):
