@@ -44,9 +44,8 @@ def test_a_run_that_is_killed_at_random_moments_ends_with_the_same_files(demo, t
         del found["report.html"]  # it tells of times
         return found
 
-    (tmp_path / "small.toml").write_text(
-        'units = [{ stage = 1, matcher = "sift", long_side = 320 }, { stage = 2, matcher = "sift", long_side = 400 }]'
-    )
+    units = '{ stage = 1, matcher = "sift", long_side = 320 }', '{ stage = 2, matcher = "sift", long_side = 400 }'
+    (tmp_path / "small.toml").write_text(f"units = [{', '.join(units)}]")
     start = time.monotonic()
     assert begin("undisturbed").wait() == 0
     whole_s, expected, rng = time.monotonic() - start, files_of("undisturbed"), random.Random(0)
