@@ -23,7 +23,7 @@ def own_support(matches):
     return support(estimate(matches, QUICK).matrix, matches)
 
 
-@pytest.mark.parametrize("wrong", [0, 60, 3000])
+@pytest.mark.parametrize("wrong", [0, 60, 1000])
 def test_right_matches_support_their_f_among_any_number_of_wrong_ones(wrong):
     assert support(FALLBACK_FUNDAMENTAL, rectified(200, wrong)) > MIN_SUPPORT
 

@@ -4,7 +4,7 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
-from attack import EITHER, REFUSED, Case
+from attack import REFUSED, Case
 from room import RECIPE, SUBMIT, encoded, picture, write_sparse
 
 UNIT = 'units = [{ stage = 1, matcher = "sift", long_side = 200 }]\n'
@@ -64,17 +64,17 @@ ARGUMENTS = {
 }
 TRAIN = {
     "scaling_factors.csv": {
-        "of NaN": "scene,scaling_factor\ns,nan\n",
-        "with a path": "scene,scaling_factor\n../T,1\n",
+        "of NaN": ("scene,scaling_factor\ns,nan\n", (0,)),
+        "with a path": ("scene,scaling_factor\n../T,1\n", REFUSED),
     },
     "s/calibration.csv": {
-        "of NaN": CALIBRATION.replace("200 0 80", "nan nan nan"),
-        "of zeros": CALIBRATION.replace("200 0 80 0 200 80 0 0 1", "0 0 0 0 0 0 0 0 0"),
-        "with a rotation that is none": CALIBRATION.replace("1 0 0 0 1 0 0 0 1", "1 2 3 4 5 6 7 8 9"),
+        "of NaN": (CALIBRATION.replace("200 0 80", "nan nan nan"), (0,)),
+        "of zeros": (CALIBRATION.replace("200 0 80 0 200 80 0 0 1", "0 0 0 0 0 0 0 0 0"), (0,)),
+        "with a rotation that is none": (CALIBRATION.replace("1 0 0 0 1 0 0 0 1", "1 2 3 4 5 6 7 8 9"), (0,)),
     },
     "s/pair_covisibility.csv": {
-        "of NaN": "pair,covisibility\nx-y,nan\n",
-        "with an image twice": "pair,covisibility\nx-x,1\n",
+        "of NaN": ("pair,covisibility\nx-y,nan\n", REFUSED),
+        "with an image twice": ("pair,covisibility\nx-x,1\n", (0,)),
     },
 }
 ROW = "1," + " ".join("123456789")
@@ -134,12 +134,12 @@ CASES = [
         for name, options in ARGUMENTS.items()
     ),
     *(
-        Case("arguments", f"{file} {name}", f"{VALIDATE} --pairs-per-scene 1", train_side(file, text), (0, 1, 2))
+        Case("arguments", f"{file} {name}", f"{VALIDATE} --pairs-per-scene 1", train_side(file, text), statuses)
         for file, texts in TRAIN.items()
-        for name, text in texts.items()
+        for name, (text, statuses) in texts.items()
     ),
     *(
-        Case("arguments", f"a submission {name}", SCORE, train_side(submission=text), EITHER)
+        Case("arguments", f"a submission {name}", SCORE, train_side(submission=text))
         for name, text in SUBMISSIONS.items()
     ),
     *(
