@@ -80,7 +80,7 @@ def attack(case: Case, room: Path) -> None:
         if case.submission and not interrupted and "submit" in command and status in LEFT_BY_ITSELF:
             faults += _submission_faults(room)
         too_late = status == 1 and TOO_LATE in output  # before its directory was looked at
-        if status in (0, 1) and not too_late and "reconstruct" in command:
+        if status in (0, 1) and not too_late and "reconstruct" in command and (number or not case.then):
             faults += _result_faults(room / "out" / "o", status)
     faults += [f"changed: {name}" for name in _changed(before, _snapshot(room))]
     if faults:

@@ -44,10 +44,8 @@ def test_a_run_that_is_killed_at_random_moments_ends_with_the_same_files(demo, t
         del found["report.html"]  # it tells of times
         return found
 
-    (tmp_path / "small.toml").write_text(
-        'units = [{ stage = 1, matcher = "sift", long_side = 320 }, '
-        '{ stage = 2, matcher = "sift", long_side = 400 }]'
-    )
+    units = '{ stage = 1, matcher = "sift", long_side = 320 }', '{ stage = 2, matcher = "sift", long_side = 400 }'
+    (tmp_path / "small.toml").write_text(f"units = [{', '.join(units)}]")
     start = time.monotonic()
     assert begin("undisturbed").wait() == 0
     whole_s, expected, rng = time.monotonic() - start, files_of("undisturbed"), random.Random(0)
@@ -57,11 +55,14 @@ def test_a_run_that_is_killed_at_random_moments_ends_with_the_same_files(demo, t
         for _ in range(KILLS):
             process = begin(f"out{number}")
             try:
-                process.wait(rng.uniform(0.0, whole_s))
+                process.wait(rng.uniform(0.0, 0.6 * whole_s))
             except subprocess.TimeoutExpired:
                 process.kill()
                 kills += 1
             process.wait()
         assert begin(f"out{number}").wait() == 0
         assert files_of(f"out{number}") == expected
+        assert (
+            len(list((tmp_path / f"out{number}" / "work").glob("turns-*"))) == 2
+        )  # the same pairs in each process
     assert kills >= ROUNDS
