@@ -1,5 +1,6 @@
 """``validate.ipynb`` from a clean kernel without network, on the demo set."""
 
+import os
 import sys
 from pathlib import Path
 
@@ -8,6 +9,7 @@ from kaggle_image import environment
 from offline_notebook import execute, needs_namespaces, pictures, printed
 
 ROOT = Path(__file__).resolve().parents[2]
+PATHS = os.pathsep.join([str(ROOT), str(ROOT / "notebooks")])  # Jupyter starts a kernel beside its notebook
 SETTINGS = {'"classical:whole-images", "classical"': '"small.toml:stage-1", "small.toml"'}
 SMALL = """
 units = [{ stage = 1, matcher = "sift", long_side = 320 }, { stage = 2, matcher = "sift", long_side = 400 }]
@@ -24,7 +26,7 @@ def run(directory: Path, settings: dict[str, str], **variables: str) -> tuple[st
         cell.source = cell.source.replace(former, new)
     nbformat.write(notebook, directory / "validate.ipynb")
     known = {name: value for name, value in environment().items() if name != "MKPC_TRAIN_DIR"}
-    known |= {"PYTHONPATH": str(ROOT), "TMPDIR": str(directory), **variables}
+    known |= {"PYTHONPATH": PATHS, "TMPDIR": str(directory), **variables}
     executed = execute(
         directory / "validate.ipynb", directory / "executed.ipynb", sys.executable, directory, known
     )
