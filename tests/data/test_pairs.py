@@ -154,7 +154,7 @@ def test_a_journal_knows_with_which_cameras_a_pair_was_estimated(scenes, demo, t
 
     def estimation():
         pair = read_pairs(path, demo.train_dir, copies=tmp_path).pairs[0].pair
-        return load_recipe("classical").pair_estimation(pair.model, pair.intrinsics)
+        return load_recipe("classical").pair_estimation(pair.intrinsics)
 
     before = estimation()
     first, *rest = path.read_text().splitlines()
