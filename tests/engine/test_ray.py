@@ -28,7 +28,7 @@ from mkpc_kaggle.pipeline.assembly import Assembly
 ray = pytest.importorskip("ray", reason="Ray is not installed: pip install 'mkpc-kaggle[ray]'")
 
 TESTS = Path(__file__).parents[1]
-IMPORTED = [str(TESTS.parent), str(TESTS), str(TESTS / "support")]  # what machines can import
+IMPORTED = [str(TESTS.parent), str(TESTS / "engine"), str(TESTS / "support")]  # what machines can import
 STORE_BYTES = 80 << 20
 
 
