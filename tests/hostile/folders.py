@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from attack import EITHER, REFUSED, Act, Case, nothing
-from ends import ENDS, sends
+from ends import ENDS, STATUSES, sends
 from images import DAMAGES, ODD, PLACES
 from room import RECIPE, encoded, picture
 
@@ -274,7 +274,13 @@ def interrupted(name: str, after: float, options: str) -> Case:
     act = sends(name, after)
     made = then(nothing)[0]
     return Case(
-        "folders", f"{name} after {after} s{options}", command, made, (0, 1, ENDS[name]), act=act, then=PLAIN_AGAIN
+        "folders",
+        f"{name} after {after} s{options}",
+        command,
+        made,
+        (1, *STATUSES[name]),
+        act=act,
+        then=PLAIN_AGAIN,
     )
 
 
