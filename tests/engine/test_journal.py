@@ -86,7 +86,7 @@ def test_a_job_is_saved_whole_or_not_at_all(journal: Journal) -> None:
 
 def test_a_journal_of_another_run_is_refused_and_says_what_differs(tmp_path: Path) -> None:
     Journal(tmp_path, OURS).close()
-    with pytest.raises(UserError, match=r"another run: its recipe differ.*--fresh"):
+    with pytest.raises(UserError, match=r"another run .different recipe.*--fresh"):
         Journal(tmp_path, {**OURS, "recipe": {"a": 2}})
     Journal(tmp_path, OURS).close()
 
