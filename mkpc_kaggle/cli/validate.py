@@ -137,7 +137,7 @@ def _match_and_score(arguments: argparse.Namespace, scenes: tuple[TrainScene, ..
         assemblies = [_assemble(arguments, *choice) for choice in choices]
         directories = [work_dir / re.sub(r"[^\w.-]+", "_", text) for text in compared or [""]]
         for number, (assembly, directory) in enumerate(zip(assemblies, directories, strict=True)):
-            for former, done in zip(assemblies[:number], directories, strict=False):
+            for former, done in zip(assemblies[:number], directories[:number], strict=True):
                 if former.fingerprint() == assembly.fingerprint():
                     share_journal(done, directory)  # what both match is matched once
             session = Session(directory, options.budget_of(arguments), interrupt, workers=arguments.workers)

@@ -32,11 +32,11 @@ NOT_RECONSTRUCTED = "not reconstructed in time"
 
 
 def batches_of(pairs: Iterable[Pair]) -> dict[str, list[int]]:
-    """By batch, the places of the pairs that may be reconstructed: F is wanted, and no camera is known."""
+    """By batch, the indices of the pairs that may be reconstructed: F is wanted, and no camera is known."""
     batches: dict[str, list[int]] = {}
-    for place, pair in enumerate(pairs):
+    for index, pair in enumerate(pairs):
         if pair.intrinsics is None:
-            batches.setdefault(pair.group, []).append(place)
+            batches.setdefault(pair.group, []).append(index)
     return {name: members for name, members in batches.items() if len(members) >= MIN_PAIRS}
 
 
@@ -48,10 +48,10 @@ def extra_pairs_of(pairs: Sequence[Pair], config: SceneConfig | None) -> list[Pa
     if config is None or not config.pairs_per_image:
         return []
     extra: list[tuple[float, Pair]] = []
-    for batch, places in batches_of(pairs).items():
-        asked = [pairs[place] for place in places]
+    for batch, indices in batches_of(pairs).items():
+        asked = [pairs[index] for index in indices]
         files = list(dict.fromkeys(file for pair in asked for file in (pair.file0, pair.file1)))
-        number = {file: place for place, file in enumerate(files)}
+        number = {file: index for index, file in enumerate(files)}
         ends = [(number[pair.file0], number[pair.file1]) for pair in asked]
         distinct = len({tuple(sorted(pair)) for pair in ends})
         for count, (i, j) in enumerate(extra_pairs(len(files), ends, config.pairs_per_image), start=distinct):

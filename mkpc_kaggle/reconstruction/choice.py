@@ -59,8 +59,8 @@ def choose_pairs(
         places = shortlist(partners[name]) if name in large else combinations(range(len(files)), 2)
         for a, b in [(files[i], files[j]) for i, j in places] if listed is None else ends[name]:
             turned = (turns.get(a, 0), turns.get(b, 0))
-            told = f" turned {turned[0]} {turned[1]}" if any(turned) else ""
-            pairs.append(Pair(f"{name}/{a.stem}/{b.stem}{told}", name, str(a), str(b), turns=turned))
+            suffix = f" turned {turned[0]} {turned[1]}" if any(turned) else ""
+            pairs.append(Pair(f"{name}/{a.stem}/{b.stem}{suffix}", name, str(a), str(b), turns=turned))
     return pairs
 
 

@@ -115,8 +115,8 @@ def _facts(log: RunLog) -> Iterator[tuple[str, str, str]]:
     if len(solved):
         least = f"median of a pair, at least {solved['inliers'].min()}"
         yield "inliers", f"{solved['inliers'].median():.0f}", least
-        told = f"supported {MIN_SUPPORT:g} times as well as by chance"
-        yield "pairs that show the same", f"{solved['overlaps'].sum()} of {len(solved)}", told
+        threshold = f"supported {MIN_SUPPORT:g} times as well as by chance"
+        yield "pairs that show the same", f"{solved['overlaps'].sum()} of {len(solved)}", threshold
     limit = f"of {format_duration(log.about.limit)}" if log.about.limit is not None else "no time limit"
     sessions = sum(event.kind == EventKind.START for event in log.events)
     yield "time", format_duration(log.seconds), limit + (f", session {sessions}" if sessions > 1 else "")

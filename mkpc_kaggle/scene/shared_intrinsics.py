@@ -34,8 +34,8 @@ def given_intrinsics(images: Sequence[BatchImage], config: SceneConfig) -> Share
         return {}
     starts = {}
     for size in {image.size for image in images}:
-        told = [image.focal for image in images if image.size == size and image.focal and config.exif]
-        starts[size] = float(np.median(told)) if told else PRIOR_FOCAL * max(size)
+        known = [image.focal for image in images if image.size == size and image.focal and config.exif]
+        starts[size] = float(np.median(known)) if known else PRIOR_FOCAL * max(size)
     return {image.digest: starts[image.size] for image in images}
 
 

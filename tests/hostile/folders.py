@@ -14,6 +14,7 @@ from room import RECIPE, encoded, picture
 OPTIONS = "--recipe quick.toml --workers 0 --time-limit 5m"
 PLAIN = f"reconstruct out/i {OPTIONS} --out out/o".replace("quick.toml", "out/quick.toml")
 WATCHED = f"reconstruct I {OPTIONS} --out out/o"  # the images must stay as they are
+WORK = Path("o", "work")  # of the results, in the folder of outputs
 TAKEN = (0, 1)  # three small images need not give a model
 
 
@@ -246,16 +247,16 @@ CHANGES: dict[str, Callable[[Path], object]] = {
     "no database": lambda out: (out / "o/database.db").unlink(missing_ok=True),
     "no models": lambda out: shutil.rmtree(out / "o/models", ignore_errors=True),
     "no tables": lambda out: (out / "o/cameras.csv").unlink(),
-    "no journal": lambda out: (out / "o/work/journal.sqlite").unlink(),
-    "no mark": lambda out: (out / "o/work/datasets.json").unlink(),
-    "a mark of noise": lambda out: (out / "o/work/datasets.json").write_bytes(os.urandom(99)),
-    "a journal of noise": lambda out: (out / "o/work/journal.sqlite").write_bytes(os.urandom(9999)),
-    "no journal of the images": lambda out: shutil.rmtree(out / "o/work/images"),
-    "a journal of the images of noise": lambda out: (out / "o/work/images/journal.sqlite").write_bytes(
+    "no journal": lambda out: (out / WORK / "journal.sqlite").unlink(),
+    "no mark": lambda out: (out / WORK / "datasets.json").unlink(),
+    "a mark of noise": lambda out: (out / WORK / "datasets.json").write_bytes(os.urandom(99)),
+    "a journal of noise": lambda out: (out / WORK / "journal.sqlite").write_bytes(os.urandom(9999)),
+    "no journal of the images": lambda out: shutil.rmtree(out / WORK / "images"),
+    "a journal of the images of noise": lambda out: (out / WORK / "images/journal.sqlite").write_bytes(
         os.urandom(9999)
     ),
     "a database of noise": lambda out: (out / "o/database.db").write_bytes(os.urandom(9999)),
-    "a link for work": lambda out: replaced_by_link(out / "o/work"),
+    "a link for work": lambda out: replaced_by_link(out / WORK),
     "a link for the tables": lambda out: replaced_by_link(out / "o/cameras.csv"),
     "a folder for the tables": lambda out: [(out / "o/cameras.csv").unlink(), (out / "o/cameras.csv").mkdir()],
     "a file of the user's": lambda out: (out / "o/notes.txt").touch(),
