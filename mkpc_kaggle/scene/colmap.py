@@ -22,6 +22,7 @@ from mkpc_kaggle.geometry.coordinates import Points, Size
 from mkpc_kaggle.recipe import SceneConfig
 from mkpc_kaggle.scene.export import DATABASE, FORMER, MODELS, PART
 from mkpc_kaggle.scene.keypoints import Index, scene_keypoints
+from mkpc_kaggle.scene.noise import adjust_by_noise
 from mkpc_kaggle.scene.reconstruction import MIN_IMAGES, Reconstruction, RegisteredImage, SfmModel, filter_models
 from mkpc_kaggle.scene.shared_intrinsics import SharedIntrinsics, start_focal
 from mkpc_kaggle.scene.view_graph import MIN_MATCHES, Edge, ViewGraph
@@ -49,9 +50,9 @@ def structure_from_motion(graph: ViewGraph, config: SceneConfig, shared: SharedI
         _fill(database, graph, config, shared)
         images = len(graph.images)
         for_global, for_incremental = _mapper_options(images, config)
-        found = run_mapper(pycolmap.GlobalPipeline, for_global, database, graph)
+        found = run_mapper(pycolmap.GlobalPipeline, for_global, database, graph, config.threads)
         if images <= LARGE and found.registered < MIN_REGISTERED * images:
-            other = run_mapper(pycolmap.IncrementalPipeline, for_incremental, database, graph)
+            other = run_mapper(pycolmap.IncrementalPipeline, for_incremental, database, graph, config.threads)
             found = max(found, other, key=lambda each: each.observations)
         return found
 
@@ -155,11 +156,14 @@ def verify(
         return list(pool.map(of_edge, edges, matches))
 
 
-def run_mapper(pipeline: Any, options: Any, database: Any, graph: ViewGraph) -> Reconstruction:
+def run_mapper(pipeline: Any, options: Any, database: Any, graph: ViewGraph, threads: int) -> Reconstruction:
     """The plausible models that a mapper makes of what the database holds."""
     manager = pycolmap.ReconstructionManager()
     pipeline(options, database, manager).run()
-    models = filter_models([_sfm_model(manager.get(number), graph) for number in range(manager.size())])
+    made = [manager.get(number) for number in range(manager.size())]
+    for found in made:
+        adjust_by_noise(found, threads)
+    models = filter_models([_sfm_model(found, graph) for found in made])
     return Reconstruction(graph.names, models, "" if models else "no plausible model came of the matches")
 
 
