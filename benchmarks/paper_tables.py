@@ -110,7 +110,7 @@ def main(arguments: list[str] | None = None) -> None:
     given = parser.parse_args(arguments)
     for dataset in TABLES:
         if (paths := vars(given)[dataset]) is not None:
-            scene = read_pairs(*paths, copies=given.out / dataset / "turned", most=given.pairs)
+            scene = read_pairs(*paths, most=given.pairs)
             print("\n".join([*table(dataset, scene, given), ""]))
 
 

@@ -84,19 +84,11 @@ class CameraModel(StrEnum):
 
 
 class CameraSharing(StrEnum):
-    """Which images of a scene, of those of one size, share a camera.
-
-    A scene's images are in one folder, so that a camera for each folder and one for all are the same.
-    """
+    """Which images of a scene, of those of one size, share a camera."""
 
     AUTO = "auto"  # those whose focal lengths agree, see ``shared_intrinsics``
     IMAGE = "image"  # none
-    FOLDER = "folder"
-    ONE = "one"
-
-    @property
-    def is_given(self) -> bool:
-        return self in (CameraSharing.FOLDER, CameraSharing.ONE)
+    FOLDER = "folder"  # all: a scene's images are in one folder
 
 
 @dataclass(frozen=True)

@@ -63,9 +63,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add(
         "--rotations", action="store_true", help="try to turn images that match nothing by 90, 180 and 270 degrees"
     )
-    told = """which images of one size in a folder one camera took: those whose focal lengths agree (auto), none
-        (image), or all (folder, one: they are the same, as each folder is reconstructed on its own)"""
-    add("--camera", choices=list(map(str, CameraSharing)), help=told)
+    text = """which images of one size in a folder one camera took: those whose focal lengths agree (auto), none
+        (image), or all (folder)"""
+    add("--camera", choices=list(map(str, CameraSharing)), help=text)
     add("--fresh", action="store_true", help="forget what an earlier run left in OUT/work")
     parser.set_defaults(reconstruct=True)
 

@@ -84,7 +84,7 @@ def run(arguments: argparse.Namespace) -> int:
     require_apart({"--json": arguments.json}, filter(None, inputs), arguments.work_dir)
     with tempfile.TemporaryDirectory(prefix="mkpc-") as temporary:
         work_dir = arguments.work_dir or Path(temporary)
-        scenes = _read_scenes(arguments, work_dir)
+        scenes = _read_scenes(arguments)
         if arguments.submission is None:
             return _match_and_score(arguments, scenes, work_dir)
         scored = [score_submission(submission, arguments.truth, scenes) for submission in arguments.submission]
@@ -119,10 +119,10 @@ def _require_a_whole(given: argparse.Namespace) -> None:
             raise UserError(message)
 
 
-def _read_scenes(arguments: argparse.Namespace, work_dir: Path) -> tuple[TrainScene, ...]:
+def _read_scenes(arguments: argparse.Namespace) -> tuple[TrainScene, ...]:
     most: int | None = arguments.pairs_per_scene
     if arguments.pairs is not None:
-        return (read_pairs(arguments.pairs, arguments.image_root, copies=work_dir / "turned", most=most),)
+        return (read_pairs(arguments.pairs, arguments.image_root, most=most),)
     scenes, least = filter(None, arguments.scenes.split(",")), arguments.min_covisibility
     return read_train_side(arguments.train_dir, scenes=scenes, min_covisibility=least, pairs_per_scene=most)
 

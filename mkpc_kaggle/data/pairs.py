@@ -5,19 +5,16 @@ root. ``turns`` are the quarter turns, counter-clockwise, that set an image upri
 by row, are those of the images as they are stored: X_1 = R X_0 + t with T = [R t; 0 1].
 """
 
-import hashlib
-import os
 from dataclasses import dataclass
 from functools import cache
 from math import nan
 from pathlib import Path, PureWindowsPath
 
-import cv2
 import numpy as np
 
 from mkpc_kaggle.data.competition import Pair, TrainScene, TruePair, evenly_spread
 from mkpc_kaggle.data.images import Unreadable, read_image
-from mkpc_kaggle.errors import UserError, read_text, writing
+from mkpc_kaggle.errors import UserError, read_text
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Size
 
@@ -36,12 +33,12 @@ class ListedImage:
         return self.name + (f" turned {self.turns}" if self.turns else "")
 
 
-def read_pairs(file: Path, image_root: Path, *, copies: Path, most: int | None = None) -> TrainScene:
+def read_pairs(file: Path, image_root: Path, *, most: int | None = None) -> TrainScene:
     """The pairs of a list as a scene of unknown scale, to estimate E on.
 
-    ``most`` takes that many pairs, evenly spread. Images that have to be turned are copied to the directory
-    ``copies``, and the cameras are those of the copies. An image that cannot be read is no error here: the run
-    reports it. Raises :class:`UserError` for a list without pairs and for a malformed line.
+    ``most`` takes that many pairs, evenly spread. The cameras are those of the upright images. An image that
+    cannot be read is no error here: the run reports it. Raises :class:`UserError` for a list without pairs and
+    for a malformed line.
     """
     if not image_root.is_dir():
         raise UserError(f"--image-root {image_root}: no such directory")
@@ -50,16 +47,21 @@ def read_pairs(file: Path, image_root: Path, *, copies: Path, most: int | None =
     if not listed:
         raise UserError(f"{file} has no pairs; expected lines {EXPECTED}")
 
-    copy_of = cache(lambda name, turns: turned_copy(image_root / name, turns, copies))
+    @cache
+    def size_of(name: str) -> Size | None:
+        image = read_image(image_root / name)
+        return None if isinstance(image, Unreadable) else image.size
 
-    def upright(image: ListedImage) -> tuple[str, Camera]:
-        path, size = copy_of(image.name, image.turns)
-        return str(path), image.camera.rotated_90(image.turns, size) if size else image.camera
+    def upright(image: ListedImage) -> Camera:
+        size = size_of(image.name) if image.turns else None
+        return image.camera.rotated_90(image.turns, size) if size else image.camera
 
     pairs = []
     for number, images in evenly_spread(listed, most):
-        (file0, camera0), (file1, camera1) = map(upright, images)
-        pair = Pair(f"{number}: {images[0]} {images[1]}", file.stem, file0, file1, (camera0.K, camera1.K))
+        camera0, camera1 = map(upright, images)
+        file0, file1 = (str(image_root / image.name) for image in images)
+        name, turns = f"{number}: {images[0]} {images[1]}", (images[0].turns, images[1].turns)
+        pair = Pair(name, file.stem, file0, file1, (camera0.K, camera1.K), turns)
         pairs.append(TruePair(pair, camera0, camera1, nan))
     return TrainScene(file.stem, nan, tuple(pairs))
 
@@ -92,19 +94,3 @@ def parse_line(line: str, where: str) -> tuple[ListedImage, ListedImage]:
             raise UserError(f"{where}: expected {expected}")
     first, second = Camera(K0, np.eye(3), np.zeros(3)), Camera(K1, R, t)
     return ListedImage(cells[0], turns[0], first), ListedImage(cells[1], turns[1], second)
-
-
-def turned_copy(path: Path, turns: int, copies: Path) -> tuple[Path, Size | None]:
-    """A copy of an image turned by ``turns`` quarters, in ``copies``, and the image's size before.
-
-    An image that need not be turned or cannot be read is returned itself, without its size.
-    """
-    image = read_image(path) if turns else None
-    if image is None or isinstance(image, Unreadable):
-        return path, None
-    copy = copies / f"{path.stem}-{hashlib.sha256(os.fsencode(path)).hexdigest()[:16]}-{turns}.png"
-    bgr = cv2.cvtColor(np.ascontiguousarray(np.rot90(image.pixels, turns)), cv2.COLOR_RGB2BGR)
-    with writing(f"the turned copy {copy}"):
-        copies.mkdir(parents=True, exist_ok=True)
-        copy.write_bytes(cv2.imencode(".png", bgr)[1].tobytes())
-    return copy, image.size

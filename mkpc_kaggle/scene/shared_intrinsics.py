@@ -11,7 +11,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from mkpc_kaggle.recipe import SceneConfig
+from mkpc_kaggle.recipe import CameraSharing, SceneConfig
 from mkpc_kaggle.scene.reconstruction import SfmModel
 from mkpc_kaggle.scene.view_graph import BatchImage
 
@@ -30,7 +30,7 @@ def start_focal(image: BatchImage, config: SceneConfig) -> float:
 
 def given_intrinsics(images: Sequence[BatchImage], config: SceneConfig) -> SharedIntrinsics:
     """The focal length that all images of one size start with together; nothing unless the recipe says so."""
-    if not config.cameras.is_given:
+    if config.cameras is not CameraSharing.FOLDER:
         return {}
     starts = {}
     for size in {image.size for image in images}:

@@ -14,7 +14,7 @@ from mkpc_kaggle import TwoStageMatcher
 from mkpc_kaggle.cli import main
 from mkpc_kaggle.cli.validate import with_units
 from mkpc_kaggle.data.competition import read_train_side
-from mkpc_kaggle.data.images import read_image
+from mkpc_kaggle.data.images import read_image, turned
 from mkpc_kaggle.data.pairs import parse_line, read_pairs
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.evaluation.validate import error_of
@@ -102,7 +102,7 @@ def test_a_list_without_pairs_is_refused(tmp_path, content, root, told):
     if content is not None:
         (tmp_path / "list.txt").write_bytes(content)
     with pytest.raises(UserError, match=told):
-        read_pairs(tmp_path / "list.txt", tmp_path / root, copies=tmp_path)
+        read_pairs(tmp_path / "list.txt", tmp_path / root)
 
 
 @pytest.fixture
@@ -111,8 +111,8 @@ def scenes(demo):
 
 
 def test_the_true_matrix_has_no_error(demo, scenes, tmp_path):
-    read = read_pairs(write_list(tmp_path / "list.txt", scenes, demo.train_dir), demo.train_dir, copies=tmp_path)
-    some = read_pairs(tmp_path / "list.txt", demo.train_dir, copies=tmp_path, most=2)
+    read = read_pairs(write_list(tmp_path / "list.txt", scenes, demo.train_dir), demo.train_dir)
+    some = read_pairs(tmp_path / "list.txt", demo.train_dir, most=2)
     assert [true.pair.id for true in some.pairs] == [read.pairs[0].pair.id, read.pairs[2].pair.id]
     for true in read.pairs:
         assert true.pair.model is ModelKind.E
@@ -135,10 +135,10 @@ def test_images_are_set_upright_and_their_cameras_with_them(demo, scenes, tmp_pa
             cameras.append(camera.rotated_90(-quarters, image.size))
         lines.append(line_of((names[0], names[1]), (cameras[0], cameras[1]), turns))
     (tmp_path / "list.txt").write_text("\n".join(lines))
-    read = read_pairs(tmp_path / "list.txt", tmp_path, copies=tmp_path / "copies")
+    read = read_pairs(tmp_path / "list.txt", tmp_path)
     for true, original in zip(read.pairs, originals, strict=True):
-        for path, former in zip(true.pair.images, original.pair.images, strict=True):
-            image, upright = read_image(path), read_image(former)
+        for path, turns, former in zip(true.pair.images, true.pair.turns, original.pair.images, strict=True):
+            image, upright = turned(read_image(path), turns), read_image(former)
             np.testing.assert_array_equal(image.pixels, upright.pixels)
         for camera, former_camera in ((true.camera0, original.camera0), (true.camera1, original.camera1)):
             np.testing.assert_allclose(camera.K, former_camera.K, atol=1e-9)
@@ -153,7 +153,7 @@ def test_a_journal_knows_with_which_cameras_a_pair_was_estimated(scenes, demo, t
     path = write_list(tmp_path / "list.txt", scenes, demo.train_dir)
 
     def estimation():
-        pair = read_pairs(path, demo.train_dir, copies=tmp_path).pairs[0].pair
+        pair = read_pairs(path, demo.train_dir).pairs[0].pair
         return load_recipe("classical").pair_estimation(pair.intrinsics)
 
     before = estimation()
@@ -170,7 +170,7 @@ def test_a_list_scores_as_the_train_side_does(demo, small_recipe, tmp_path):
     listed = write_list(tmp_path / "list.txt", scenes, train_dir)
     pairs = ["validate", "--pairs", str(listed), "--image-root", str(train_dir), "--recipe", str(recipe)]
     assert main([*pairs, "--json", str(out)]) == 0
-    read = read_pairs(listed, train_dir, copies=tmp_path)
+    read = read_pairs(listed, train_dir)
     matcher = TwoStageMatcher(str(recipe))
     matches = [
         matcher(*true.pair.images, model=ModelKind.E, intrinsics=true.pair.intrinsics) for true in read.pairs

@@ -42,10 +42,9 @@ def test_a_camera_starts_with_the_focal_length_of_exif(tmp_path, cameras):
     assert focals_of(tmp_path, config(cameras, exif=False)) == pytest.approx([GUESS] * 5 + [5])
 
 
-@pytest.mark.parametrize("cameras", ["folder", "one"])
-def test_images_of_one_size_that_one_camera_took_start_with_their_median(tmp_path, cameras):
-    assert focals_of(tmp_path, config(cameras)) == pytest.approx([1000] * 4 + [GUESS, 2])
-    assert focals_of(tmp_path, config(cameras, exif=False)) == pytest.approx([GUESS] * 5 + [2])
+def test_images_of_one_size_that_one_camera_took_start_with_their_median(tmp_path):
+    assert focals_of(tmp_path, config("folder")) == pytest.approx([1000] * 4 + [GUESS, 2])
+    assert focals_of(tmp_path, config("folder", exif=False)) == pytest.approx([GUESS] * 5 + [2])
 
 
 def with_exif(scene: SyntheticScene, factor: float) -> Sequence[BatchPair]:

@@ -66,7 +66,7 @@ def test_keypoints_and_centres_are_given_back_to_the_bit(scene, monkeypatch):
 
 
 def test_images_that_share_a_camera_keep_what_the_mapper_found(scene, monkeypatch):
-    one = SceneConfig(cameras=CameraSharing.ONE)
+    one = SceneConfig(cameras=CameraSharing.FOLDER)
     cameras = [found.camera.K.tolist() for found in model_of(reconstruct_batch(scene.pairs, one)).images]
     as_the_mapper_left_it(monkeypatch)
     assert cameras == [found.camera.K.tolist() for found in model_of(reconstruct_batch(scene.pairs, one)).images]
