@@ -18,7 +18,7 @@ import pycolmap
 
 from mkpc_kaggle.data.competition import TrainScene, TruePair, read_train_side
 from mkpc_kaggle.geometry.cameras import Camera, fundamental_of_cameras
-from mkpc_kaggle.geometry.metrics import PoseError, mean_average_accuracy, pose_error
+from mkpc_kaggle.geometry.metrics import PoseError, pair_accuracy, pose_error
 
 CENTRE_PX = 0.5  # in COLMAP the top-left pixel's centre is (0.5, 0.5), in the tables it is (0, 0)
 
@@ -77,8 +77,9 @@ def run(scene: TrainScene, images: Path, mappers: list[str], one_camera: bool) -
             errors = [error_of(true, found, scene.metres_per_unit) for true in scene.pairs]
             lost = np.mean([not np.isfinite(error.rotation) for error in errors])
             sizes = ", ".join(str(len(cameras)) for cameras in found) or "none"
+            maa = np.mean([*map(pair_accuracy, errors)])
             print(
-                f"{scene.name:20}{mapper:13}{len(scene.pairs):6}{mean_average_accuracy(errors):9.4f}{lost:8.2f}"
+                f"{scene.name:20}{mapper:13}{len(scene.pairs):6}{maa:9.4f}{lost:8.2f}"
                 f"{matching:10.0f}{time.process_time() - begin:9.0f}  {sizes}",
                 flush=True,
             )

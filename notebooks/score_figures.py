@@ -28,7 +28,7 @@ def draw_scores(validations: Sequence["Validation"]) -> "Figure":
     """A row for each scene and for their mean, a mark for each recipe: its mAA."""
     figure, axes = _rows([scene.scene for scene in validations[0].scenes], "mAA of each scene, by recipe")
     for index, validation in enumerate(validations):
-        values = [*(scene.maa for scene in validation.scenes), validation.maa]
+        values = [*(scene.maa() for scene in validation.scenes), validation.maa()]
         y = _beside(len(values), index, len(validations))
         axes.plot(values, y, **_style(index), linestyle="", label=validation.recipe)
     axes.set(xlim=(-0.02, 1.02), xlabel="mAA")

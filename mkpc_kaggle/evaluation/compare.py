@@ -28,7 +28,7 @@ class Difference:
         return f"{self.gain:+z.4f} [{self.low:+z.4f}, {self.high:+z.4f}]"
 
 
-def paired_difference(scenes: Sequence[tuple[Sequence[float], Sequence[float]]], *, seed: int = 0) -> Difference:
+def paired_difference(scenes: Sequence[tuple[Sequence[float], Sequence[float]]]) -> Difference:
     """The mean over scenes of the mean gain on a pair, from the pairs' values under the first and second recipe.
 
     Both values of a pair have the same index. The interval is the percentile bootstrap's: the pairs of each
@@ -39,7 +39,7 @@ def paired_difference(scenes: Sequence[tuple[Sequence[float], Sequence[float]]],
     """
     if not scenes or any(len(first) != len(second) or not len(first) for first, second in scenes):
         raise ValueError("a comparison needs scenes, and each with the same pairs under both recipes")
-    generator = np.random.default_rng(seed)
+    generator = np.random.default_rng(0)
     gains = [np.asarray(second, np.float64) - np.asarray(first, np.float64) for first, second in scenes]
     means = np.mean([_means_of_resamples(gain, generator) for gain in gains], axis=0)
     low, high = np.quantile(means, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
@@ -67,8 +67,7 @@ class Comparison:
 
     @property
     def scenes(self) -> tuple[str, ...]:
-        """The scenes that have pairs."""
-        return tuple(scene.scene for scene in self.validations[0].scenes if scene.pairs)
+        return tuple(scene.scene for scene in self.validations[0].scenes)
 
     def difference(self, number: int, scene: str | None = None) -> Difference:
         """MAA of the validation of that number less the first's, in a scene or as the mean over scenes."""
@@ -89,7 +88,7 @@ def comparison_table(comparison: Comparison) -> list[str]:
     """Lines: mAA and seconds a pair of each recipe, then its gain over the first, in each scene and overall."""
     first, *others = comparison.validations
     lines = [f"{'recipe':<40}{'mAA':>9}{'seconds a pair':>16}"]
-    lines += [f"{run.recipe:<40}{run.maa:>9.4f}{seconds_per_pair(run):>16.3f}" for run in comparison.validations]
+    lines += [f"{run.recipe:<40}{run.maa():>9.4f}{seconds_per_pair(run):>16.3f}" for run in comparison.validations]
     counts = {scene.scene: len(scene.pairs) for scene in first.scenes}
     for number, other in enumerate(others, start=1):
         lines += ["", f"{other.recipe} against {first.recipe}: gain of mAA, {LEVEL:.0%} interval"]
@@ -101,7 +100,7 @@ def comparison_table(comparison: Comparison) -> list[str]:
 
 def step_gains(validation: Validation) -> list[str]:
     """Lines: the gain of mAA, as the mean over scenes, of each step over the step before; none without metres."""
-    scenes = [scene for scene in validation.scenes if scene.pairs and scene.in_metres]
+    scenes = [scene for scene in validation.scenes if scene.in_metres]
     lines = []
     for steps in pairwise(validation.steps if scenes else ()):
         before, after = ([scene.accuracies(step) for scene in scenes] for step in steps)

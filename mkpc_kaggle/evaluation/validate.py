@@ -16,7 +16,7 @@ from mkpc_kaggle.engine.session import Session, run_pairs
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry import metrics
 from mkpc_kaggle.geometry.coordinates import Matrix3
-from mkpc_kaggle.geometry.metrics import AUC_THRESHOLDS, PoseError, mean_average_accuracy
+from mkpc_kaggle.geometry.metrics import AUC_THRESHOLDS, PoseError
 from mkpc_kaggle.geometry.robust import ModelKind
 from mkpc_kaggle.pipeline.assembly import Assembly
 
@@ -61,12 +61,9 @@ class SceneScore:
         """The accuracy of each pair after a step, by default the last."""
         return [metrics.pair_accuracy(pair.steps[step] if step else pair.error) for pair in self.pairs]
 
-    @property
-    def maa(self) -> float:
-        return mean_average_accuracy(self.errors) if self.in_metres else nan
-
-    def maa_after(self, step: Step) -> float:
-        return mean_average_accuracy([pair.steps[step] for pair in self.pairs]) if self.in_metres else nan
+    def maa(self, step: Step | None = None) -> float:
+        """The mean of :meth:`accuracies`: the mAA of the Image Matching Challenge 2022."""
+        return mean(self.accuracies(step)) if self.in_metres else nan
 
     def auc(self, threshold: float) -> float:
         return metrics.pose_auc(self.errors, threshold)
@@ -86,13 +83,9 @@ class Validation:
     steps: tuple[Step, ...] = ()
     missing: tuple[str, ...] = ()
 
-    @property
-    def maa(self) -> float:
-        """The mean of the scenes' mAA: the competition's figure."""
-        return mean(scene.maa for scene in self.scenes)
-
-    def maa_after(self, step: Step) -> float:
-        return mean(scene.maa_after(step) for scene in self.scenes)
+    def maa(self, step: Step | None = None) -> float:
+        """The mean of the scenes' mAA after a step, by default the last: the competition's figure."""
+        return mean(scene.maa(step) for scene in self.scenes)
 
     def auc(self, threshold: float) -> float:
         return mean(scene.auc(threshold) for scene in self.scenes)
@@ -179,7 +172,7 @@ def score_table(validation: Validation) -> list[str]:
     lines = [f"{'scene':<20}{'pairs':>6}" + "".join(f"{head:>9}" for head in heads)]
     rows: list[tuple[str, SceneScore | Validation]] = [(scene.scene, scene) for scene in validation.scenes]
     for name, scores in [*rows, ("mean over scenes", validation)]:
-        accuracies = map(scores.maa_after, validation.steps) if several else [scores.maa]
+        accuracies = map(scores.maa, validation.steps or [None])
         values = (*accuracies, *map(scores.auc, AUC_THRESHOLDS))
         cells = (f"{value:>9.4f}" if isfinite(value) else f"{'-':>9}" for value in values)
         lines.append(f"{name:<20}{len(scores.errors):>6}" + "".join(cells))
@@ -218,8 +211,8 @@ def to_json(validation: Validation) -> dict[str, Any]:
 
 def _scores_json(scores: SceneScore | Validation, steps: Sequence[Step]) -> dict[str, Any]:
     return {
-        "mAA": _finite(scores.maa),
-        "mAA_by_step": {step: _finite(scores.maa_after(step)) for step in steps},
+        "mAA": _finite(scores.maa()),
+        "mAA_by_step": {step: _finite(scores.maa(step)) for step in steps},
         "AUC": {f"{threshold:g}": scores.auc(threshold) for threshold in AUC_THRESHOLDS},
     }
 

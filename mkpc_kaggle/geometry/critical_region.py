@@ -14,9 +14,7 @@ from numpy.typing import NDArray
 from mkpc_kaggle.config import AT_LEAST_1, POSITIVE, SHARE, Range, check_ranges
 from mkpc_kaggle.geometry.coordinates import Box, Points, Size
 
-MERGE_ABOVE = (
-    2000  # points; DBSCAN lists the neighbours of each, which takes quadratic memory where points are clumped
-)
+MERGE_ABOVE = 2000  # points: DBSCAN lists the neighbours of each, of clumped points in quadratic memory
 CELLS_PER_EPS = 10
 
 

@@ -69,18 +69,11 @@ def rotation_angle(R: Matrix3) -> float:
     return float(np.degrees(np.arctan2(np.linalg.norm(skew), np.trace(R) - 1)))
 
 
-def mean_average_accuracy(errors: Sequence[PoseError]) -> float:
-    """The mAA of a scene: the share of pairs within both thresholds, averaged over the ten threshold pairs.
-
-    NaN without pairs. Source: evaluation page of the Image Matching Challenge 2022.
-    """
-    if not errors:
-        return float("nan")
-    return float(np.mean([pair_accuracy(error) for error in errors]))
-
-
 def pair_accuracy(error: PoseError) -> float:
-    """The share of the ten threshold pairs that a pair's error meets: its part of the mAA."""
+    """The share of the ten threshold pairs that a pair's error meets; a scene's mAA is its mean over the pairs.
+
+    Source: evaluation page of the Image Matching Challenge 2022.
+    """
     meets = (error.rotation < ROTATION_THRESHOLDS) & (error.translation < TRANSLATION_THRESHOLDS)
     return float(np.mean(meets))
 

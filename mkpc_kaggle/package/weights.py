@@ -34,13 +34,9 @@ def choose_weights(store: WeightStore, checkout: Path, staging: Path, *, private
     shipped = [found for found in every if private or found not in restricted]
     texts = {text for found in shipped if (text := licence_text(checkout, found.file.licence))}
     files = [_as_safetensors(found, staging) for found in shipped]
+    notes = ("" if found.state is State.GOOD else "its original is not verified" for found in shipped)
     return ChosenWeights(
-        tuple(
-            Item(
-                file.name, path, file.licence, "" if found.state is State.GOOD else "its original is not verified"
-            )
-            for (file, path), found in zip(files, shipped, strict=True)
-        ),
+        tuple(Item(file.name, path, file.licence, note) for (file, path), note in zip(files, notes, strict=True)),
         HEADER + "".join(f"{file.line}\n" for file, _ in files),
         tuple(Item(path.name, path) for path in sorted(texts) if path.name != "LICENSE"),
         tuple(Item(found.file.name, found.path, found.file.licence) for found in restricted),

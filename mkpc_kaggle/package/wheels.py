@@ -62,18 +62,10 @@ def collect_wheels(
     local = ("--no-index", "--find-links", str(wheels or kept))
     sources = [local] if wheels else [local, ()]
     platforms = [option for platform in PLATFORMS for option in ("--platform", platform)]
+    options = ["--only-binary=:all:", "--no-deps", *platforms, "--dest", str(directory)]
     for python in pythons:
-        options = [
-            "--only-binary=:all:",
-            "--no-deps",
-            "--python-version",
-            python,
-            *platforms,
-            "--dest",
-            f"{directory}",
-        ]
         for source in sources:
-            if not (failure := _pip("download", *options, *source, *requirements)):
+            if not (failure := _pip("download", *options, "--python-version", python, *source, *requirements)):
                 break
         else:
             raise UserError(

@@ -42,10 +42,8 @@ class PairMatch:
     results: tuple[UnitResult, ...] = ()  # as the units ran; with the estimate in the recipe's order
     regions: Regions | None = None  # None until a unit of stage 2 needs them
     estimate: Estimate = NOT_ESTIMATED
-    images: tuple[Image, ...] = ()  # both, while units run
-    sizes: tuple[
-        Size, ...
-    ] = ()  # of the images, their versions and focal lengths, when they are no longer at hand
+    images: tuple[Image, ...] = ()  # both, while units run; later the following three are known of them
+    sizes: tuple[Size, ...] = ()
     versions: tuple[str, ...] = ()
     focals: tuple[float, ...] = ()
     failure: str = ""  # which image cannot be read

@@ -43,7 +43,6 @@ class RunLog:
     path: Path  # of the journal
     about: About
     recipe: Recipe
-    digests: dict[str, str]  # of the test set and of the weights, by name
     pairs: tuple[Pair, ...]
     records: tuple[PairRecord, ...]  # a record for each pair, in order, reached or not
     events: tuple[Event, ...]  # of all sessions
@@ -88,9 +87,8 @@ def read_log(directory: Path) -> RunLog:
         touched = sorted((record for record in records if record.units), key=lambda r: (r.inliers, r.index))
         units = {unit.name: unit for unit in recipe.units}
         weakest = tuple(WeakPair(record, journal.results(record, units)) for record in touched[:MAX_DRAWN_PAIRS])
-        digests = {"test set": str(belongs_to.get("test set", "")), **belongs_to.get("weights", {})}
         events, scenes = journal.events(), journal.scenes()
-        return RunLog(journal.path, about, recipe, digests, pairs, records, events, weakest, scenes)
+        return RunLog(journal.path, about, recipe, pairs, records, events, weakest, scenes)
 
 
 def write_csv(log: RunLog, directory: Path) -> list[Path]:

@@ -94,7 +94,7 @@ class WeightStore:
         if self._given_files is not None:
             return tuple(self._given_files)
         lines = {file.name: file for file in manifest()}
-        for path in self._named(MANIFEST):
+        for path in self._by_name.get(MANIFEST, ()):
             try:
                 here = read_manifest(path)
             except UserError as error:
@@ -146,18 +146,18 @@ class WeightStore:
     def _candidates(self, lines: Sequence[WeightFile]) -> Iterator[FoundFile]:
         """The files for these lines: those of the name, those of the digest, those that were unpacked."""
         for file in lines:
-            for path in self._named(file.name):
+            for path in self._by_name.get(file.name, ()):
                 yield judge(path, file, self.files)
         for file in (line for line in lines if line.digest != UNVERIFIED):
-            alike = self._by_size.get(file.size) if file.size >= 0 else self._small_by_digest.get(file.digest)
-            found = (judge(path, file) for path in alike or ())
+            if file.size < 0:
+                alike = self._small_by_digest.get(file.digest, [])
+            else:
+                alike = [path for path, size in self._walked[0].items() if size == file.size]
+            found = (judge(path, file) for path in alike)
             yield from (each for each in found if each.state is State.GOOD)
         for file in lines:
             directories = (path for path in self._walked[1] if is_unpacked_from(path, file))
             yield from (judge(directory, file) for directory in directories)
-
-    def _named(self, name: str) -> list[Path]:
-        return self._by_name.get(name, [])
 
     # A directory may have a hundred thousand files, and the manifest has some dozens of lines.
 
@@ -166,13 +166,6 @@ class WeightStore:
         found = defaultdict(list)
         for path in self._walked[0]:
             found[path.name].append(path)
-        return found
-
-    @cached_property
-    def _by_size(self) -> dict[int, list[Path]]:
-        found = defaultdict(list)
-        for path, size in self._walked[0].items():
-            found[size].append(path)
         return found
 
     @cached_property

@@ -17,9 +17,16 @@ from mkpc_kaggle.data.competition import (
 )
 from mkpc_kaggle.demo import DemoSet
 from mkpc_kaggle.engine.records import PairRecord
-from mkpc_kaggle.evaluation.validate import Step, score_record, score_submission, score_table
+from mkpc_kaggle.evaluation.validate import (
+    PairScore,
+    SceneScore,
+    Step,
+    score_record,
+    score_submission,
+    score_table,
+)
 from mkpc_kaggle.geometry.cameras import Camera, fundamental_of_cameras
-from mkpc_kaggle.geometry.metrics import AUC_THRESHOLDS
+from mkpc_kaggle.geometry.metrics import AUC_THRESHOLDS, PoseError
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
 from mkpc_kaggle.reporting.run_log import read_log
 
@@ -41,7 +48,7 @@ def test_the_true_matrices_score_one_whatever_the_order_of_the_images(demo, tmp_
     assert list(truth) == [pair.id for pair in read_test_side(demo.test_dir)]
     write_submission(tmp_path / "true.csv", truth)
     scored = score_submission(tmp_path / "true.csv", demo.truth_csv, read_train_side(demo.train_dir))
-    assert scored.maa == 1
+    assert scored.maa() == 1
     assert [scored.auc(threshold) for threshold in AUC_THRESHOLDS] == pytest.approx([1, 1, 1], abs=1e-3)
     assert sum(len(scene.pairs) for scene in scored.scenes) == 8
     lines = score_table(scored)
@@ -49,7 +56,7 @@ def test_the_true_matrices_score_one_whatever_the_order_of_the_images(demo, tmp_
     assert lines[1].split()[1:3] == ["8", "1.0000"]
     write_submission(tmp_path / "fallback.csv", dict.fromkeys(truth, FALLBACK_FUNDAMENTAL))
     scored = score_submission(tmp_path / "fallback.csv", demo.truth_csv, read_train_side(demo.train_dir))
-    assert scored.maa < 0.2
+    assert scored.maa() < 0.2
 
 
 def test_samples_that_a_submission_has_no_row_for_count_as_failed_and_are_named(demo, tmp_path, capsys):
@@ -80,6 +87,14 @@ def test_a_failed_pair_counts_as_failed_even_where_the_fallback_happens_to_be_ri
     right = score_record(true, PairRecord(0, FALLBACK_FUNDAMENTAL.copy(), ""), scene)
     assert failed.error.rotation == failed.steps[Step.MAGSAC].rotation == np.inf
     assert right.error.angle < 1e-6
+
+
+def test_the_mean_average_accuracy_is_the_mean_over_pairs_and_a_failed_pair_counts():
+    perfect = PoseError(0, 0, 0)
+    errors = [perfect, PoseError.failed(), perfect, PoseError(5.5, 90, 0)]
+    pairs = tuple(PairScore("p", 0.5, error) for error in errors)
+    assert [SceneScore("s", pairs[:1]).maa(), SceneScore("s", pairs[1:2]).maa()] == [1, 0]
+    assert SceneScore("s", pairs).maa() == pytest.approx(2.5 / 4)
 
 
 def scores_of(demo: DemoSet, recipe: Path, *options: str) -> dict[str, Any]:

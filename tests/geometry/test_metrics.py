@@ -15,7 +15,6 @@ from mkpc_kaggle.geometry.metrics import (
     ROTATION_THRESHOLDS,
     TRANSLATION_THRESHOLDS,
     PoseError,
-    mean_average_accuracy,
     pair_accuracy,
     pose_auc,
     pose_error,
@@ -77,15 +76,6 @@ def test_the_thresholds_are_those_of_the_competition():
 )
 def test_the_accuracy_of_a_pair_counts_the_threshold_pairs_that_it_meets(rotation, translation, accuracy):
     assert pair_accuracy(PoseError(rotation, 0.0, translation)) == pytest.approx(accuracy, abs=1e-12)
-
-
-def test_the_mean_average_accuracy_is_the_mean_over_pairs_and_a_failed_pair_counts():
-    assert mean_average_accuracy([PERFECT]) == 1
-    assert mean_average_accuracy([PoseError.failed()]) == 0
-    assert mean_average_accuracy([PERFECT, PoseError.failed(), PERFECT, PoseError(5.5, 90, 0)]) == pytest.approx(
-        2.5 / 4
-    )
-    assert isnan(mean_average_accuracy([]))
 
 
 @pytest.mark.parametrize("degrees", [0, 1e-6, 1e-3, 1, 45, 90, 135, 179, 179.999, 180 - 1e-6, 180])

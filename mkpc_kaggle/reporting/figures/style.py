@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from mkpc_kaggle.data.competition import evenly_spread
 from mkpc_kaggle.errors import UserError
 
 if TYPE_CHECKING:
@@ -58,7 +59,4 @@ def short(name: str, most: int = 18) -> str:
 
 def sample(mask: NDArray[np.bool_], most: int) -> NDArray[np.intp]:
     """At most ``most`` indices of a mask, evenly spread."""
-    indices: NDArray[np.intp] = np.flatnonzero(mask)
-    evenly = np.linspace(0, len(indices) - 1, min(most, len(indices))).round().astype(int)
-    chosen: NDArray[np.intp] = indices[evenly]
-    return chosen
+    return np.array(evenly_spread(np.flatnonzero(mask).tolist(), most), np.intp)
