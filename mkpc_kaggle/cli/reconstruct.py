@@ -49,20 +49,14 @@ MAX_LINES = 20  # of each list
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("images", type=Path, metavar="DIR", help="png, jpg or jpeg files, or folders of them")
-    add(
-        "--out",
-        type=Path,
-        required=True,
-        metavar="OUT",
-        help="the directory for the results: empty, or with those of an earlier run",
-    )
+    text = "the directory for the results: empty, or with those of an earlier run"
+    add("--out", type=Path, required=True, metavar="OUT", help=text)
     options.add_matching(parser)
     options.add_run(parser, time_limit=None)
     add("--pairs", type=Path, metavar="FILE", help="match these alone: two paths below DIR a line, as of hloc")
     add("--format", choices=FORMS, help="also write submission.csv; imc2023: of 2024, too")
-    add(
-        "--rotations", action="store_true", help="try to turn images that match nothing by 90, 180 and 270 degrees"
-    )
+    text = "try to turn images that match nothing by 90, 180 and 270 degrees"
+    add("--rotations", action="store_true", help=text)
     text = """which images of one size in a folder one camera took: those whose focal lengths agree (auto), none
         (image), or all (folder)"""
     add("--camera", choices=list(map(str, CameraSharing)), help=text)

@@ -19,6 +19,7 @@ from mkpc_kaggle.geometry.coordinates import Pixels, Size
 Key = TypeVar("Key")
 Value = TypeVar("Value")
 
+NOT_A_PICTURE = "not a picture, or cut off: it cannot be decoded"
 MAX_ASPECT = 32  # of the sides; beyond it views would be a few pixels high, or would not fit into memory
 
 
@@ -86,9 +87,7 @@ def read_image(path: Path) -> Image | Unreadable:
     except (OSError, ValueError, MemoryError, cv2.error) as error:
         return Unreadable(name, f"cannot be read: {error}")
     if bgr is None:
-        return Unreadable(
-            name, "not a picture, or cut off: it cannot be decoded" if data.size else "the file is empty"
-        )
+        return Unreadable(name, NOT_A_PICTURE if data.size else "the file is empty")
     height, width = bgr.shape[:2]
     if max(height, width) > MAX_ASPECT * min(height, width):
         return Unreadable(name, f"{width} x {height} pixels: one side is more than {MAX_ASPECT} times the other")

@@ -219,10 +219,7 @@ def _epipolar_distances(matrix: Matrix3, points0: Vectors, points1: Vectors) -> 
 
 def _transfer_distances(matrix: Matrix3, points0: Vectors, points1: Vectors) -> Vectors:
     """(N,) distances in the second image to where an H takes the points of the first."""
-    mapped = homogeneous(points0) @ matrix.T
-    tiny = np.finfo(np.float64).tiny
-    depth = np.where(np.abs(mapped[:, 2:]) > tiny, mapped[:, 2:], tiny)
-    return np.asarray(np.hypot(*(mapped[:, :2] / depth - points1).T))
+    return np.asarray(np.hypot(*(cv2.perspectiveTransform(points0[None], matrix)[0] - points1).T))
 
 
 class _Solver(NamedTuple):

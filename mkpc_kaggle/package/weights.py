@@ -66,6 +66,4 @@ def _as_safetensors(found: FoundFile, staging: Path) -> tuple[WeightFile, Path]:
         return replace(found.file, size=found.path.stat().st_size, digest=found.digest), found.path
     # The whole name, suffix included: the manifest may know another conversion under the shorter one.
     path = staging / f"{found.file.name}.safetensors"
-    made = convert(found.path, path)
-    source = f"{found.file.name} ({found.digest}) with the same tensor names"
-    return replace(made, licence=found.file.licence, slot=found.file.slot, source=source), path
+    return convert(found.path, path, found.file), path

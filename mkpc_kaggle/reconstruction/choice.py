@@ -48,11 +48,7 @@ def choose_pairs(
     lying = {name for name, files in datasets.items() if rotations and (ends[name] if listed else len(files) > 1)}
     compared = {name: PARTNERS if name in large else orientation.TURN_PARTNERS for name in sorted(large | lying)}
     partners = find_partners(datasets, compared, session, journal)
-    near = {
-        name: [others[: orientation.TURN_PARTNERS] for others in found]
-        for name, found in partners.items()
-        if name in lying
-    }
+    near = {name: [others[: orientation.TURN_PARTNERS] for others in partners[name]] for name in sorted(lying)}
     turns = find_turns(datasets, near, assembly, session)
     pairs = []
     for name, files in datasets.items():

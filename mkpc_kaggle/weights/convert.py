@@ -9,10 +9,11 @@ from mkpc_kaggle.weights.manifest import UNVERIFIED, WeightFile, digest_of, mani
 from mkpc_kaggle.weights.store import is_unpacked_from
 
 
-def convert(source: Path, target: Path) -> WeightFile:
+def convert(source: Path, target: Path, known: WeightFile | None = None) -> WeightFile:
     """Write the tensors of ``source`` into ``target``, each a contiguous copy; returns the manifest's line for it.
 
-    Raises :class:`UserError` if the source cannot be read, or if the target cannot be written or does not end in
+    ``known`` is the manifest's line of the source, by default found by its digest, or else by its name. Raises
+    :class:`UserError` if the source cannot be read, or if the target cannot be written or does not end in
     ``.safetensors``.
     """
     if target.suffix != ".safetensors":
@@ -33,15 +34,14 @@ def convert(source: Path, target: Path) -> WeightFile:
         raise UserError(f"{source}: safetensors has no type for tensors of {error}") from error
     except (OSError, SafetensorError) as error:
         raise UserError(f"{target} cannot be written: {error}") from error
-    return _line(source, target)
+    known = known or _line_of(source) or WeightFile(source.name, -1, UNVERIFIED, "?", "?", "")
+    origin = f"{known.name} ({digest_of(source)}) with the same tensor names"
+    return WeightFile(target.name, target.stat().st_size, digest_of(target), known.licence, known.slot, origin)
 
 
-def _line(source: Path, target: Path) -> WeightFile:
-    """The target's line, with what the manifest knows of the source: by its digest, or else by its name."""
+def _line_of(source: Path) -> WeightFile | None:
     digest, lines = digest_of(source), manifest()
     known = [file for file in lines if file.digest == digest]
     known += [file for file in lines if (file.name, file.digest) == (source.name, UNVERIFIED)]
     known += [file for file in lines if source.is_dir() and is_unpacked_from(source, file)]
-    licence, slot, name = (known[0].licence, known[0].slot, known[0].name) if known else ("?", "?", source.name)
-    origin = f"{name} ({digest}) with the same tensor names"
-    return WeightFile(target.name, target.stat().st_size, digest_of(target), licence, slot, origin)
+    return next(iter(known), None)

@@ -44,9 +44,8 @@ class WeightFile:
 
 def parse_manifest(text: str, where: str = "the weights manifest") -> tuple[WeightFile, ...]:
     """All lines of a manifest; raises :class:`UserError` that names the line that cannot be read."""
-    lines = (
-        (number, line.partition("#")[0].split(maxsplit=5)) for number, line in enumerate(text.splitlines(), 1)
-    )
+    numbered = enumerate(text.splitlines(), start=1)
+    lines = ((number, line.partition("#")[0].split(maxsplit=5)) for number, line in numbered)
     return tuple(_parse_line(columns, f"{where}, line {number}") for number, columns in lines if columns)
 
 
