@@ -18,7 +18,6 @@ from mkpc_kaggle.recipe import Mode
 
 
 def add_matching(parser: argparse.ArgumentParser) -> None:
-    """What decides how pairs are matched."""
     add = parser.add_argument
     text = "default: auto, the best that the weights allow"
     add("--recipe", default="auto", metavar="NAME|FILE.toml", help=text)
@@ -37,7 +36,6 @@ def add_weights(parser: argparse.ArgumentParser) -> None:
 
 
 def add_run(parser: argparse.ArgumentParser, time_limit: str | None) -> None:
-    """How the engine runs a recipe."""
     parser.set_defaults(printing=unblocked)
     add = parser.add_argument
     text = """two-stage (the default): the recipe as written; stage-1: its units of stage 1 alone; whole-images:
@@ -56,7 +54,6 @@ def add_run(parser: argparse.ArgumentParser, time_limit: str | None) -> None:
 
 
 def assembly_of(arguments: argparse.Namespace, recipe: str, mode: str) -> Assembly:
-    """The parts of a run of this recipe, as the other options say."""
     given = {name: getattr(arguments, name) for name in ("weights", "device", "precision")}
     licence, scenes = Licence(arguments.licence), arguments.reconstruct
     return assemble(recipe, **given, mode=Mode(mode), licence=licence, scenes=scenes)

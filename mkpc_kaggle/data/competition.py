@@ -37,8 +37,6 @@ Item = TypeVar("Item")
 
 @dataclass(frozen=True, slots=True)
 class Pair:
-    """Two images to match."""
-
     id: str  # unique in a run
     group: str  # the batch or scene that they belong to
     file0: str  # the images' paths; as text, since a table may have a million rows
@@ -61,8 +59,6 @@ class Pair:
 
 @dataclass(frozen=True, eq=False)
 class TruePair:
-    """A pair with its cameras."""
-
     pair: Pair
     camera0: Camera
     camera1: Camera
@@ -71,8 +67,6 @@ class TruePair:
 
 @dataclass(frozen=True, eq=False)
 class TrainScene:
-    """Pairs with cameras in one world."""
-
     name: str
     metres_per_unit: float  # NaN where that is unknown
     pairs: tuple[TruePair, ...]

@@ -25,8 +25,6 @@ MAX_ASPECT = 32  # of the sides; beyond it views would be a few pixels high, or 
 
 @dataclass(frozen=True, eq=False)
 class Image:
-    """A decoded image."""
-
     name: str  # unique in a run
     pixels: Pixels  # (H, W, 3) uint8 RGB
     version: str = ""  # the digest of its file, for :func:`is_unchanged`
@@ -61,8 +59,6 @@ def turned(image: "Image | Unreadable", times: int) -> "Image | Unreadable":
 
 @dataclass(frozen=True)
 class Unreadable:
-    """An image that could not be decoded, and why."""
-
     name: str
     reason: str
 

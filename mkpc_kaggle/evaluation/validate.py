@@ -92,12 +92,10 @@ class Validation:
 
     @property
     def errors(self) -> list[PoseError]:
-        """The errors of all pairs."""
         return [error for scene in self.scenes for error in scene.errors]
 
 
 def validate(scenes: Sequence[TrainScene], assembly: Assembly, session: Session) -> Validation:
-    """Match all pairs of the scenes and score them."""
     report = run_pairs([true.pair for scene in scenes for true in scene.pairs], assembly, session)
     prior = assembly.recipe.focal is not None
     made = {  # if E is sought at known focal lengths, there is no MAGSAC alone

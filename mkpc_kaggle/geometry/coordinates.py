@@ -22,9 +22,7 @@ Matrix3 = NDArray[np.float64]  # (3, 3)
 
 
 class Size(NamedTuple):
-    """Width and height in pixels."""
-
-    width: int
+    width: int  # in pixels
     height: int
 
 

@@ -69,8 +69,6 @@ class FocalConfig:
 
 @dataclass(frozen=True, eq=False)
 class FocalPrior:
-    """What is known of a camera."""
-
     K: Matrix3  # in pixels
     sigma: float  # standard deviation of the log focal length; 0: it is known
 

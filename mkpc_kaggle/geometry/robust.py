@@ -32,8 +32,6 @@ class ModelKind(StrEnum):
 
 
 class Method(StrEnum):
-    """The robust estimator of OpenCV."""
-
     MAGSAC = "magsac"
     RANSAC = "ransac"
 
@@ -77,8 +75,6 @@ NO_STATS = EstimateStats()
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """A two-view model of a pair."""
-
     model: ModelKind
     matrix: Matrix3  # finite, of unit Frobenius norm; for F, x1^T F x0 = 0 in homogeneous image pixels
     inliers: NDArray[np.bool_]  # (N,) mask over the matches that were given: those nearer than the threshold

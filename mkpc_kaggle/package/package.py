@@ -17,8 +17,6 @@ NOTEBOOK = Path("notebooks", "submission.ipynb")
 
 @dataclass(frozen=True)
 class Request:
-    """What to package, and where to."""
-
     out: Path
     owner: str  # a user of Kaggle
     weights: tuple[Path, ...] = ()  # directories

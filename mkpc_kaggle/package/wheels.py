@@ -77,7 +77,6 @@ def collect_wheels(
 
 
 def licence_of(wheel: Path) -> str:
-    """The licence that a wheel's metadata names."""
     headers = _metadata(wheel)
     return str(headers["License-Expression"] or headers["License"] or "see its dist-info/licenses")
 

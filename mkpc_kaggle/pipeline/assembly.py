@@ -42,7 +42,6 @@ class Assembly:
 
     @property
     def devices(self) -> tuple[str, ...]:
-        """The devices to work on."""
         device = self.placement.device
         return ("cpu",) if device == "cpu" else tuple(f"cuda:{number}" for number in gpus_of(device))
 

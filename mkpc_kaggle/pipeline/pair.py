@@ -37,8 +37,6 @@ class UnitResult:
 
 @dataclass(frozen=True, eq=False)
 class PairMatch:
-    """All that is known of a pair."""
-
     results: tuple[UnitResult, ...] = ()  # as the units ran; with the estimate in the recipe's order
     regions: Regions | None = None  # None until a unit of stage 2 needs them
     estimate: Estimate = NOT_ESTIMATED

@@ -31,8 +31,6 @@ from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair, ViewGraph, track
 
 @dataclass(frozen=True)
 class FolderResult:
-    """What came of a folder: how the run went, its pairs, and the cameras."""
-
     report: RunReport
     pairs: tuple[Pair, ...]
     cameras: Cameras

@@ -195,7 +195,6 @@ def _focals(scene: SceneRecord) -> str:
 
 
 def _costs(log: RunLog) -> list[pd.DataFrame]:
-    """Seconds by unit, and by part of the work."""
     units = unit_means(log.tables).rename(columns={"unit": "unit (means)"})
     units["seconds in all"] = units["pairs"] * units["seconds"]
     parts = pd.DataFrame(seconds_by_part(log.tables).items(), columns=["part of the work", "seconds in all"])

@@ -38,8 +38,6 @@ class WeakPair:
 
 @dataclass(frozen=True, eq=False)
 class RunLog:
-    """A run as its journal has it."""
-
     path: Path  # of the journal
     about: About
     recipe: Recipe

@@ -49,7 +49,6 @@ class RunTables:
 
     @property
     def failed(self) -> pd.DataFrame:
-        """The pairs that have the fallback row."""
         return self.pairs[self.pairs["source"] == "fallback"]
 
     def named(self) -> dict[str, pd.DataFrame]:

@@ -26,8 +26,6 @@ TRANSIENT_STATUSES = (408, 416, 425, 429, 500, 502, 503, 504)  # HTTP status cod
 
 
 class FetchOutcome(StrEnum):
-    """What became of a file that was to be fetched."""
-
     FETCHED = "fetched"
     ALREADY_THERE = "already there"
     BY_HAND = "by hand"

@@ -37,7 +37,6 @@ class WeightFile:
 
     @property
     def line(self) -> str:
-        """The line as the manifest has it."""
         size = "?" if self.size < 0 else str(self.size)
         return "  ".join((self.name, size, self.digest, self.licence, self.slot, self.source))
 
