@@ -39,9 +39,10 @@ def draw_scores(validations: Sequence["Validation"]) -> "Figure":
 def draw_gains(comparison: "Comparison") -> "Figure":
     """A row for each scene and for their mean: what each recipe gains over the first, with its interval."""
     first, *others = comparison.validations
-    figure, axes = _rows(comparison.scenes, f"gain of mAA over {first.recipe}, with 95 % intervals")
+    names = [scene.scene for scene in first.scenes]
+    figure, axes = _rows(names, f"gain of mAA over {first.recipe}, with 95 % intervals")
     for index, other in enumerate(others):
-        found = [comparison.difference(index + 1, name) for name in (*comparison.scenes, None)]
+        found = [comparison.difference(index + 1, name) for name in (*names, None)]
         gains, low, high = np.array([(gain.gain, gain.low, gain.high) for gain in found]).T
         y, style = _beside(len(found), index, len(others)), _style(index + 1)
         axes.errorbar(

@@ -28,7 +28,7 @@ def require_apart(
     """
     files = {option: path for option, path in outputs.items() if path is not None}
     inputs = list(inputs)
-    precious = [*inputs, *weights, *_weights_of_environment()]
+    precious = [*inputs, *weights, *weights_of_environment()]
     for option, path in files.items():
         is_result = path.suffix.lower() in RESULTS.get(option, ())
         if not path.name or os.path.isdir(path):  # noqa: PTH112  Path raises for a name that is too long
@@ -52,12 +52,13 @@ def require_apart(
 def require_directory_apart(out: Path, inputs: Iterable[Path], weights: Iterable[Path]) -> None:
     """Refuse a directory of results, ``--out``, that holds something that is read, or lies in an input."""
     inputs = list(inputs)
-    for place in (*inputs, *weights, *_weights_of_environment()):
+    for place in (*inputs, *weights, *weights_of_environment()):
         if os.path.lexists(place) and (lies_in(place, out) or (place in inputs and lies_in(out, place))):
             raise UserError(f"--out {out} and the input {place} are in each other's way; name another place")
 
 
-def _weights_of_environment() -> list[Path]:
+def weights_of_environment() -> list[Path]:
+    """The directories that ``$MKPC_WEIGHTS`` names."""
     return [Path(name) for name in os.environ.get("MKPC_WEIGHTS", "").split(os.pathsep) if name]
 
 

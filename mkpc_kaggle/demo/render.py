@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mkpc_kaggle.demo.camera import FloatImage, Floats, SizedCamera, resized
+from mkpc_kaggle.demo.camera import FloatImage, Floats, SizedCamera, project, resized
 
 Picture = NDArray[np.uint8]
 Window = tuple[slice, slice]  # rows and columns of an image
@@ -143,13 +143,12 @@ def _extent(surface: Surface, camera: SizedCamera) -> Window | None:
     if abs(normal @ (camera.centre - surface.origin)) < MIN_DISTANCE * np.linalg.norm(normal):
         return None
     corners = np.array([surface.origin + i * surface.edge_u + j * surface.edge_v for i in (0, 1) for j in (0, 1)])
-    image = (corners @ camera.R.T + camera.t) @ camera.K.T
-    if (image[:, 2] < MIN_DEPTH).all():
+    pixels, depth = project(camera, corners)
+    if (depth < MIN_DEPTH).all():
         return None
     size = (camera.width, camera.height)
     low, high = np.zeros(2, int), np.array(size)
-    if (image[:, 2] >= MIN_DEPTH).all():  # else it passes the camera: its outline is not that of its corners
-        pixels = image[:, :2] / image[:, 2:]
+    if (depth >= MIN_DEPTH).all():  # else it passes the camera: its outline is not that of its corners
         low = np.clip(np.floor(pixels.min(axis=0)), 0, size).astype(int)
         high = np.clip(np.ceil(pixels.max(axis=0)) + 1, 0, size).astype(int)
     if (low >= high).any():

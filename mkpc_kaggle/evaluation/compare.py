@@ -65,15 +65,10 @@ class Comparison:
         if any(ids != known[0] for ids in known):
             raise ValueError("the recipes ran on different pairs")
 
-    @property
-    def scenes(self) -> tuple[str, ...]:
-        return tuple(scene.scene for scene in self.validations[0].scenes)
-
     def difference(self, number: int, scene: str | None = None) -> Difference:
         """MAA of the validation of that number less the first's, in a scene or as the mean over scenes."""
-        wanted = self.scenes if scene is None else (scene,)
         runs = self.validations[0], self.validations[number]
-        values = [[part.accuracies() for part in run.scenes if part.scene in wanted] for run in runs]
+        values = [[part.accuracies() for part in run.scenes if scene in (None, part.scene)] for run in runs]
         return paired_difference([*zip(*values, strict=True)])
 
 
@@ -92,7 +87,7 @@ def comparison_table(comparison: Comparison) -> list[str]:
     counts = {scene.scene: len(scene.pairs) for scene in first.scenes}
     for number, other in enumerate(others, start=1):
         lines += ["", f"{other.recipe} against {first.recipe}: gain of mAA, {LEVEL:.0%} interval"]
-        for name in (*comparison.scenes, None):
+        for name in (*counts, None):
             count = counts[name] if name else sum(counts.values())
             lines.append(f"{name or 'mean over scenes':<20}{count:>6}  {comparison.difference(number, name)}")
     return lines
@@ -120,6 +115,6 @@ def comparison_json(comparison: Comparison) -> dict[str, Any]:
     runs = [{**to_json(run), "work_seconds_per_pair": seconds_per_pair(run)} for run in comparison.validations]
     gains = []
     for number, other in enumerate(others, start=1):
-        scenes = [{"scene": name, **gain(number, name)} for name in comparison.scenes]
+        scenes = [{"scene": scene.scene, **gain(number, scene.scene)} for scene in first.scenes]
         gains.append({"recipe": other.recipe, "against": first.recipe, **gain(number), "scenes": scenes})
     return {"recipes": runs, "level": LEVEL, "gains": gains}

@@ -126,13 +126,12 @@ def reconstruct(
     files = sorted(map(Path, images))
     chosen = for_cameras(load_recipe(recipe) if isinstance(recipe, str) else recipe)
     assembly = assemble(chosen, weights=map(Path, weights), device=device, matchers=matchers)
-    pipeline, store, known = assembly.pipeline(), ImageStore(), dict[Path, BatchImage]()
+    pipeline, store = assembly.pipeline(), ImageStore()
 
     def opened(path: Path) -> Image:
         image = store.get(path)
         if isinstance(image, Unreadable):
             raise UserError(str(image))
-        known[path] = BatchImage(str(path), image.version, image.size)
         return image
 
     pairs = []
@@ -143,7 +142,8 @@ def reconstruct(
         ends = shortlist(most_alike(lambda: features, PARTNERS))
     for path0, path1 in ((files[i], files[j]) for i, j in ends):
         (match,) = pipeline.match([PairMatch(images=(opened(path0), opened(path1)))], assembly.recipe.units)
-        pairs.append(BatchPair(known[path0], known[path1], match.matches, None, tracks_of(match.results)))
+        image0, image1 = (BatchImage(image.name, image.version, image.size) for image in match.images)
+        pairs.append(BatchPair(image0, image1, match.matches, None, tracks_of(match.results)))
     pairs = Export(Path(), Path(), {str(file): (str(file), 0) for file in files}).stored(pairs)
     found, _ = reconstruct_sharing(ViewGraph.of_pairs(pairs), chosen.scene or SceneConfig())
     return tuple(sorted(models_of(found), key=lambda model: -len(model.images)))

@@ -10,6 +10,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from mkpc_kaggle.data.outputs import weights_of_environment
 from mkpc_kaggle.errors import UserError, warn_once
 from mkpc_kaggle.weights.checkpoint import load_tensors
 from mkpc_kaggle.weights.manifest import MANIFEST, UNVERIFIED, WeightFile, digest_of, manifest, read_manifest
@@ -74,8 +75,7 @@ class WeightStore:
         for directory in given:
             if not directory.is_dir():
                 raise UserError(f"--weights {directory}: no such directory")
-        environment = [Path(part) for part in os.environ.get("MKPC_WEIGHTS", "").split(os.pathsep) if part]
-        self.directories = given + environment + ([KAGGLE_INPUT] if KAGGLE_INPUT.is_dir() else [])
+        self.directories = given + weights_of_environment() + ([KAGGLE_INPUT] if KAGGLE_INPUT.is_dir() else [])
         self._given_files = files
         self._searches: dict[tuple[WeightFile, ...], Search] = {}
 
