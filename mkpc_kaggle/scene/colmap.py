@@ -10,6 +10,7 @@ Sources: Schoenberger and Frahm 2016 (the incremental mapper), Pan et al. 2024 (
 import shutil
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -50,11 +51,18 @@ def structure_from_motion(graph: ViewGraph, config: SceneConfig, shared: SharedI
         _fill(database, graph, config, shared)
         images = len(graph.images)
         for_global, for_incremental = _mapper_options(images, config)
-        found = run_mapper(pycolmap.GlobalPipeline, for_global, database, graph, config.threads)
+        found = run_mapper(pycolmap.GlobalPipeline, for_global, database, graph)
         if images <= LARGE and found.registered < MIN_REGISTERED * images:
-            other = run_mapper(pycolmap.IncrementalPipeline, for_incremental, database, graph, config.threads)
+            other = run_mapper(pycolmap.IncrementalPipeline, for_incremental, database, graph)
             found = max(found, other, key=lambda each: each.observations)
         return found
+
+
+def adjusted(found: Reconstruction, graph: ViewGraph, config: SceneConfig) -> Reconstruction:
+    """The reconstruction of a graph, each of its models adjusted by the noise of its images, in its place."""
+    for model in found.models:
+        adjust_by_noise(model.colmap, config.threads)
+    return replace(found, models=filter_models([_sfm_model(model.colmap, graph) for model in found.models]))
 
 
 def write_files(
@@ -156,14 +164,11 @@ def verify(
         return list(pool.map(of_edge, edges, matches))
 
 
-def run_mapper(pipeline: Any, options: Any, database: Any, graph: ViewGraph, threads: int) -> Reconstruction:
+def run_mapper(pipeline: Any, options: Any, database: Any, graph: ViewGraph) -> Reconstruction:
     """The plausible models that a mapper makes of what the database holds."""
     manager = pycolmap.ReconstructionManager()
     pipeline(options, database, manager).run()
-    made = [manager.get(number) for number in range(manager.size())]
-    for found in made:
-        adjust_by_noise(found, threads)
-    models = filter_models([_sfm_model(found, graph) for found in made])
+    models = filter_models([_sfm_model(manager.get(number), graph) for number in range(manager.size())])
     return Reconstruction(graph.names, models, "" if models else "no plausible model came of the matches")
 
 
