@@ -101,6 +101,6 @@ def _entries(tiff: memoryview, order: str, start: int) -> Iterator[tuple[int, fl
             (number,) = struct.unpack_from(order + NUMBERS[kind], tiff, place + 8)
             yield tag, number
         elif tag in TAGS and kind == RATIONAL:
-            (start,) = struct.unpack_from(f"{order}I", tiff, place + 8)
-            above, below = struct.unpack_from(f"{order}II", tiff, start)
+            (offset,) = struct.unpack_from(f"{order}I", tiff, place + 8)
+            above, below = struct.unpack_from(f"{order}II", tiff, offset)
             yield tag, above / below if below else 0.0

@@ -34,9 +34,8 @@ class FetchOutcome(StrEnum):
 
 @dataclass(frozen=True)
 class Fetched:
-    """A file and its outcome; ``note``: why it failed, what to do by hand, or an unverified file's digest."""
+    """``note``: why it failed, what to do by hand, or an unverified file's digest."""
 
-    file: WeightFile
     path: Path
     outcome: FetchOutcome
     note: str = ""
@@ -63,10 +62,10 @@ def fetch(file: WeightFile, directory: Path, *, wait: Callable[[float], None] = 
     """
     path = directory / file.name
     if judge(path, file).usable:
-        return Fetched(file, path, FetchOutcome.ALREADY_THERE)
+        return Fetched(path, FetchOutcome.ALREADY_THERE)
     url = url_of(file)
     if url is None:
-        return Fetched(file, path, FetchOutcome.BY_HAND, f"get it from {file.source} and save it as {path}")
+        return Fetched(path, FetchOutcome.BY_HAND, f"get it from {file.source} and save it as {path}")
     part = path.with_name(f"{path.name}.part")
     try:
         with writing(str(path)):
@@ -78,8 +77,8 @@ def fetch(file: WeightFile, directory: Path, *, wait: Callable[[float], None] = 
             note = _verify(part, file)
             part.replace(path)
     except UserError as error:
-        return Fetched(file, path, FetchOutcome.FAILED, str(error))
-    return Fetched(file, path, FetchOutcome.FETCHED, note)
+        return Fetched(path, FetchOutcome.FAILED, str(error))
+    return Fetched(path, FetchOutcome.FETCHED, note)
 
 
 def _verify(part: Path, file: WeightFile) -> str:

@@ -186,20 +186,18 @@ class WeightStore:
         """
         sizes: dict[Path, int] = {}
         unpacked: list[Path] = []
-        entered: set[tuple[int, int]] = set()
+        entered: set[str] = set()
         for root in self.directories:
             files: list[Path] = []
             for folder, folders, names in os.walk(root, followlinks=True):
-                status = Path(folder).stat()
-                again = (status.st_dev, status.st_ino) in entered
-                checkpoint = "data" in folders and "data.pkl" in names  # an archive that Kaggle unpacked
-                entered.add((status.st_dev, status.st_ino))
-                if again or checkpoint:
+                place, is_checkpoint = os.path.realpath(folder), "data" in folders and "data.pkl" in names
+                if place in entered or is_checkpoint:
                     folders.clear()  # os.walk goes no deeper
-                if checkpoint and not again:
-                    unpacked.append(Path(folder))
-                elif not again:
+                if is_checkpoint and place not in entered:
+                    unpacked.append(Path(folder))  # an archive that Kaggle unpacked
+                elif place not in entered:
                     files += [Path(folder, name) for name in names]
+                entered.add(place)
             for path in sorted(files, key=lambda path: (len(path.parts), path)):
                 if path.suffix.lower() not in IMAGE_SUFFIXES:
                     sizes[path] = path.stat().st_size if os.path.isfile(path) else -1  # noqa: PTH113  never raises
