@@ -122,8 +122,16 @@ def test_the_true_matrix_has_no_error(demo, scenes, tmp_path):
         assert all(path.is_file() for path in true.pair.images)
 
 
-def test_images_are_set_upright_and_their_cameras_with_them(demo, scenes, tmp_path):
-    """Images that lie on their sides, with cameras to match, come back as what they were."""
+def errors_of(listed: Path, root: Path, recipe: Path) -> list[float]:
+    """Of the rotation of each pair, in degrees, as `validate` writes it."""
+    command = ["validate", "--pairs", str(listed), "--image-root", str(root), "--recipe", str(recipe)]
+    assert main([*command, "--json", str(listed.with_suffix(".json"))]) == 0
+    (scene,) = json.loads(listed.with_suffix(".json").read_text())["scenes"]
+    return [pair["rotation_error_degrees"] for pair in scene["pairs"]]
+
+
+def test_images_are_set_upright_and_their_cameras_with_them(demo, scenes, small_recipe, tmp_path):
+    """Images that lie on their sides, with cameras to match, come back as what they were, and score as that."""
     lines, originals = [], [true for scene in scenes for true in scene.pairs]
     for number, true in enumerate(originals):
         turns, names, cameras = (number + 1, 3 - number), [], []
@@ -147,6 +155,10 @@ def test_images_are_set_upright_and_their_cameras_with_them(demo, scenes, tmp_pa
             fundamental_of_cameras(original.camera0, original.camera1),
             atol=1e-9,
         )
+    listed = write_list(tmp_path / "upright.txt", scenes, demo.train_dir)
+    upright = errors_of(listed, demo.train_dir, small_recipe)
+    assert min(upright) < 5
+    assert errors_of(tmp_path / "list.txt", tmp_path, small_recipe) == pytest.approx(upright, abs=1e-6)
 
 
 def test_a_journal_knows_with_which_cameras_a_pair_was_estimated(scenes, demo, tmp_path):
