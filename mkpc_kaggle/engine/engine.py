@@ -28,7 +28,7 @@ from mkpc_kaggle.engine.plan import Explanation, Plan
 from mkpc_kaggle.engine.records import PairRecord, SceneRecord
 from mkpc_kaggle.engine.scenes import Scenes, extra_pairs_of
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.pipeline.pair import UnitResult
+from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult
 from mkpc_kaggle.recipe import Recipe
 from mkpc_kaggle.scene.export import Export
 from mkpc_kaggle.scene.reconstruct import Solution
@@ -195,10 +195,7 @@ class Engine:
                 place.start(now)
             elif place.is_idle and (job := self.plan.next(now, place.name, cautious=place.losses > 0)):
                 pairs = tuple(self.pairs[index] for index in job.indices)
-                known = tuple(map(self._results, job.indices))
-                records = [self.plan.records[index] for index in job.indices]
-                sizes, focals = (tuple(r.sizes for r in records), tuple(r.focals for r in records))
-                job = replace(job, pairs=pairs, known=known, sizes=sizes, focals=focals)
+                job = replace(job, pairs=pairs, known=tuple(map(self._known, job.indices)))
                 place.submit(job, job.seconds, job.time_limit, now)
 
     def _is_matching(self, now: float) -> bool:
@@ -303,6 +300,11 @@ class Engine:
         except UserError as error:  # without them a job gains nothing, and the F stays
             self._fault(str(error))
             return ()
+
+    def _known(self, index: int) -> PairMatch:
+        """What later jobs on a pair build on."""
+        record = self.plan.records[index]
+        return PairMatch(self._results(index), sizes=record.sizes, focals=record.focals)
 
     def _keep(self, outcomes: Sequence[Outcome]) -> None:
         """Put outcomes into the journal; the scenes of their batches are out of date."""

@@ -6,10 +6,9 @@ from enum import StrEnum
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.records import PairRecord
-from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.geometry.robust import RobustConfig
-from mkpc_kaggle.pipeline.pair import UnitResult
+from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult
 from mkpc_kaggle.recipe import SceneConfig, Unit
 from mkpc_kaggle.scene.export import Export
 from mkpc_kaggle.scene.reconstruct import Solution
@@ -30,7 +29,7 @@ class Phase(StrEnum):
 class MatchJob:
     """Run ``units`` on the pairs of ``indices``; what a pair has had, ``known``, is left out.
 
-    A job without units makes F of what is known alone: of its images only ``sizes`` and ``focals`` are needed.
+    A job without units makes F of what is known alone: no image is read for it.
 
     ``expected`` are the seconds within which each unit most likely ends on a pair. Units may begin in the first
     ``seconds`` of the job if they are expected to end in them. After ``time_limit`` seconds without an answer the
@@ -45,9 +44,7 @@ class MatchJob:
     time_limit: float
     is_retry: bool = False
     pairs: tuple[Pair, ...] = ()
-    known: tuple[tuple[UnitResult, ...], ...] = ()
-    sizes: tuple[tuple[Size, ...], ...] = ()
-    focals: tuple[tuple[float, ...], ...] = ()
+    known: tuple[PairMatch, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)

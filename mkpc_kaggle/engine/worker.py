@@ -24,7 +24,7 @@ from mkpc_kaggle.engine.jobs import (
 from mkpc_kaggle.engine.records import NOT_REACHED, PairRecord
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.pipeline import failures
-from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult, with_estimate
+from mkpc_kaggle.pipeline.pair import PairMatch, with_estimate
 from mkpc_kaggle.pipeline.stages import Pipeline
 from mkpc_kaggle.recipe import Unit
 from mkpc_kaggle.scene.reconstruct import Solution, reconstruct_batch
@@ -122,12 +122,10 @@ class MatchRunner:
 
     def _estimate_anew(self, job: MatchJob) -> MatchResult:
         """F of the pairs of a job from what is known of them; their images are not looked at."""
-        known = zip(job.known, job.sizes, job.focals, strict=True)
-        pairs = [PairMatch(results, sizes=sizes, focals=focals) for results, sizes, focals in known]
-        estimates = [self._estimators.submit(self._record, job, *pair) for pair in enumerate(pairs)]
+        estimates = [self._estimators.submit(self._record, job, *pair) for pair in enumerate(job.known)]
         return MatchResult(tuple(Outcome(estimate.result()) for estimate in estimates))
 
-    def _open(self, pair: Pair, known: tuple[UnitResult, ...]) -> PairMatch:
+    def _open(self, pair: Pair, known: PairMatch) -> PairMatch:
         """The pair with its images; ``failure`` says which of them cannot be read."""
         start = time.perf_counter()
         files = zip(pair.images, pair.turns, strict=True)
@@ -135,11 +133,11 @@ class MatchRunner:
         seconds = time.perf_counter() - start
         readable = tuple(image for image in images if isinstance(image, Image))
         failure = next((str(image) for image in images if not isinstance(image, Image)), "")
-        return PairMatch(known, images=readable, failure=failure, decode_seconds=seconds)
+        return replace(known, images=readable, failure=failure, decode_seconds=seconds)
 
     def _estimate(self, job: MatchJob, number: int, pair: PairMatch) -> Outcome:
         """F from all matches of a pair; the outcome has the new results alone, since only these have to travel."""
-        found = pair.results[len(job.known[number]) :]
+        found = pair.results[len(job.known[number].results) :]
         if not found:
             return Outcome(PairRecord.untouched(job.indices[number], NOT_REACHED))
         sizes = tuple(image.size for image in pair.images)

@@ -266,7 +266,7 @@ class SimulatedWorker(Simulated):
             now += usual
         for unit in sorted(job.units, key=lambda unit: unit.stage):
             for known, found in zip(job.known, results, strict=True):
-                if any(result.unit == unit for result in known) or now + expected[unit] >= deadline:
+                if known.has(unit) or now + expected[unit] >= deadline:
                     continue
                 stalled = site.rng.random() < scenario.stalls
                 usual = site.unit_seconds(unit, now)
@@ -284,7 +284,8 @@ class SimulatedWorker(Simulated):
                 found.append(UnitResult(unit, MATCHES, 0.0, seconds, warm_up=warm_up))
         if not job.units:
             now += ESTIMATE_S * len(job.indices)
-        pairs = zip(job.indices, job.known, results, strict=True)
+        known = (pair.results for pair in job.known)
+        pairs = zip(job.indices, known, results, strict=True)
         return now, MatchResult(tuple(_outcome(site.estimation, not job.units, *pair) for pair in pairs)), 0.0
 
 
