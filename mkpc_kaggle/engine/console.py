@@ -61,10 +61,8 @@ def redraws(stream: TextIO) -> bool:
 class Progress:
     """How many pairs (``unit``) of a phase are done: a bar on a terminal, a line now and then anywhere else."""
 
-    def __init__(self, budget: Budget, stream: TextIO | None = None, unit: str = "pair") -> None:
-        self._unit = unit
-        self._budget = budget
-        self._stream = stream or sys.stderr
+    def __init__(self, budget: Budget, stream: TextIO | None, unit: str = "pair") -> None:
+        self._budget, self._stream, self._unit = budget, stream, unit
         self._bar: tqdm[Any] | None = None
         self._phase = self._waiting = ""
         self._written = budget.clock()

@@ -1,6 +1,7 @@
 """The engine: one loop on one thread that hands out jobs, takes in answers, keeps the journal, and publishes."""
 
 import sqlite3
+import sys
 import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -22,9 +23,9 @@ from mkpc_kaggle.engine.jobs import (
     SceneJob,
     visiting_order,
 )
-from mkpc_kaggle.engine.journal import EventKind, Journal
+from mkpc_kaggle.engine.journal import Event, EventKind, Journal
 from mkpc_kaggle.engine.places import Place, Site
-from mkpc_kaggle.engine.plan import Explanation, Plan
+from mkpc_kaggle.engine.plan import Plan
 from mkpc_kaggle.engine.records import PairRecord, SceneRecord
 from mkpc_kaggle.engine.scenes import Scenes, extra_pairs_of
 from mkpc_kaggle.errors import UserError
@@ -61,7 +62,7 @@ class RunReport:
     seconds: float
     resumed: int
     faults: tuple[str, ...]
-    explanations: tuple[Explanation, ...] = ()
+    explanations: tuple[Event, ...] = ()  # decisions of the plan
     unwritten: str = ""
     scenes: tuple[SceneRecord, ...] = ()
     units_run: int = 0
@@ -97,14 +98,15 @@ class Engine:
         self.faults: list[str] = []
         self.unwritten = ""
         self._units = {unit.name: unit for unit in recipe.units}
-        self._explained = self._units_run = 0
+        self._explanations: list[Event] = []
+        self._units_run = 0
         self._published = budget.clock()
-        self._progress = console.Progress(budget) if progress else None
+        self._progress = console.Progress(budget, sys.stderr if progress else None)
         self._publishing = threading.Lock()
         self._has_ended = self._has_loaded = False
         order, records = visiting_order(self.pairs), self._read_records()
         outdated = [record.index for record in records if self._is_outdated(record)]
-        self.plan = Plan(order, self.row_count, recipe, records, budget, minibatch, outdated)
+        self.plan = Plan(order, self.row_count, recipe, records, budget, self._explain, minibatch, outdated)
         site.loads_matchers = any(record.lacking(recipe.units) for record in records)
         self.scenes = Scenes(self.pairs, recipe, self.plan.records, journal.scenes(), exports)
         self._scene_places: list[Place] = []
@@ -122,18 +124,16 @@ class Engine:
             for place in self._places:
                 place.kill()
             self.site.close()
-            if self._progress is not None:
-                self._progress.close()
+            self._progress.close()
             self._publish()
             self._has_ended = True
-            self._note_explanations()
         return RunReport(
             tuple(self.records),
             self._ending(),
             self.budget.spent(),
             resumed,
             tuple(self.faults),
-            tuple(self.plan.explanations),
+            tuple(self._explanations),
             self.unwritten,
             self.scenes.report(),
             self._units_run,
@@ -219,16 +219,14 @@ class Engine:
             elif isinstance(answer, Failure):
                 self._fault(f"a job was lost on {place.name}: {answer}" if job else f"{place.name}: {answer}")
                 if isinstance(job, MatchJob):
-                    self._keep(self.plan.on_failure(job, answer, place.name, now))
+                    self._keep(self.plan.on_failure(job, answer, place.name))
                 if place.closed:
-                    self.plan.explain(now, f"no worker is started any more on {place.closed}")
+                    self._explain(f"no worker is started any more on {place.closed}")
             elif isinstance(job, MatchJob) and isinstance(answer, MatchResult):
                 self._units_run += len(answer.results)
-                self._keep(self.plan.on_result(job, answer, seconds, now))
+                self._keep(self.plan.on_result(job, answer, seconds))
                 self._note(EventKind.JOB, f"{job.phase} {len(job.indices)} pairs {answer.unit_seconds:.3f} s")
-            self._note_explanations()
-            if self._progress is not None:
-                self._progress.show(*self.plan.progress)
+            self._progress.show(*self.plan.progress)
 
     def _fall_back(self, now: float) -> None:
         """Go on elsewhere when the last place is closed, or had to give up every unit."""
@@ -241,7 +239,8 @@ class Engine:
             for place in self.site.places:
                 place.kill()
             self.site.places, self.site.fallback = self.site.fallback, []
-            self._keep(self.plan.restart(now, text))
+            self._explain(text)
+            self._keep(self.plan.restart())
         elif self._is_closed and not self._has_loaded:
             raise UserError(f"no worker could be started: {reason}")
 
@@ -320,17 +319,18 @@ class Engine:
         except (sqlite3.Error, ValueError) as error:
             self._fault(f"the journal cannot be written ({error}): an interrupted run would have to do this again")
 
-    def _note_explanations(self) -> None:
-        for explanation in self.plan.explanations[self._explained :]:
-            self.journal.note(EventKind.PLAN, explanation.seconds, explanation.text)
-        self._explained = len(self.plan.explanations)
+    def _explain(self, text: str) -> None:
+        """Note a decision, and why."""
+        self._explanations.append(self._note(EventKind.PLAN, text))
 
-    def _note(self, kind: EventKind, text: str) -> None:
-        self.journal.note(kind, self.budget.spent(), text)
+    def _note(self, kind: EventKind, text: str) -> Event:
+        event = Event(kind, self.budget.spent(), text)
+        self.journal.note(event)
+        return event
 
     def _tell(self, job: SceneJob, text: str) -> None:
         """Show a step of a reconstruction that may take minutes."""
-        if self._progress is not None and len(job.pairs) >= MIN_TOLD_PAIRS:
+        if len(job.pairs) >= MIN_TOLD_PAIRS:
             self._progress.note(f"batch {job.batch}: {text}")
 
     def _fault(self, what: str) -> None:

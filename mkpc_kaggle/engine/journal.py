@@ -22,6 +22,7 @@ from typing import Any, Self
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.data.images import is_unchanged
+from mkpc_kaggle.engine.budget import format_duration
 from mkpc_kaggle.engine.codec import decoder, encode, from_blob, to_blob
 from mkpc_kaggle.engine.jobs import Outcome
 from mkpc_kaggle.engine.records import PairRecord, SceneRecord
@@ -77,6 +78,9 @@ class Event:
     kind: str
     seconds: float
     text: str
+
+    def __str__(self) -> str:
+        return f"{format_duration(self.seconds):>7}  {self.text}"
 
 
 @dataclass(frozen=True)
@@ -299,13 +303,10 @@ class Journal(JournalReader):
         unsaved = {values[0]: values[1] for statement, values in self._unsaved if statement == SAVE_TASK}
         return unsaved[key] if key in unsaved else super().task(key)
 
-    def note(self, kind: str, seconds: float, text: str) -> None:
-        """Put down what happened, ``seconds`` after the start; ``kind`` is an :class:`EventKind`.
-
-        Notes explain a run and must not end it: where the journal cannot be written, they are lost.
-        """
+    def note(self, event: Event) -> None:
+        """Put down what happened; it is lost where the journal cannot be written, and the run goes on."""
         with suppress(sqlite3.Error):
-            self._db.execute("INSERT INTO event (value) VALUES (?)", [encode(Event(kind, seconds, text))])
+            self._db.execute("INSERT INTO event (value) VALUES (?)", [encode(event)])
 
     def close(self) -> None:
         with suppress(sqlite3.Error):  # a reader may be at it: then it stays as it is

@@ -4,7 +4,7 @@ It looks at a job's worth of pairs at a time, so that a hundred thousand pairs c
 """
 
 from collections import Counter, deque
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 from math import inf
@@ -28,17 +28,6 @@ MAX_TRIES = 2  # of a unit, or of an estimate, on a single pair, before it is gi
 MAX_FAILED_PAIRS = 2  # a unit that was given up on so many pairs and never ran is given up on all
 SLOW_FACTOR = 3.0  # a job that takes this many times what was expected begins no further unit
 HANG_FACTOR = 10.0  # a unit that takes this many times what it takes on nine of ten pairs hangs
-
-
-@dataclass(frozen=True)
-class Explanation:
-    """A decision, and why; ``seconds`` since the run's start."""
-
-    seconds: float
-    text: str
-
-    def __str__(self) -> str:
-        return f"{format_duration(self.seconds):>7}  {self.text}"
 
 
 @dataclass(frozen=True)
@@ -136,14 +125,14 @@ class Plan:
         recipe: Recipe,
         records: list[PairRecord],
         budget: Budget,
+        explain: Callable[[str], None],
         minibatch: int = 1,
         outdated: Iterable[int] = (),
     ) -> None:
-        self.recipe, self.records, self.budget = recipe, records, budget
+        self.recipe, self.records, self.budget, self._explain = recipe, records, budget, explain
         self.outdated, self.estimated_anew = set(outdated), 0
         self.workers = 1
         self.reserve = 0.0
-        self.explanations: list[Explanation] = []
         self._order, self._row_count, self._minibatch = order, row_count, minibatch
         self._stuck: set[int] = set()  # an image cannot be read, or what was found before
         self._lacking = Counter(unit for record in records for unit in self._lacks(record))
@@ -288,13 +277,12 @@ class Plan:
         if count < len(units) and not self.costs.is_sure(units[count].name):
             return count + 1
         if count != self._fitting and count < len(units):
-            self.explain(
-                now,
+            self._explain(
                 f"{count} of {len(units)} units fit: up to {units[count].name} all pairs would need "
                 f"{format_duration(needed[count] / self.workers)} of {format_duration(left / self.workers)}",
             )
         elif count != self._fitting and self._fitting >= 0:
-            self.explain(now, f"all {count} units fit again")
+            self._explain(f"all {count} units fit again")
         self._fitting = count
         return count
 
@@ -304,22 +292,22 @@ class Plan:
         if phase is Phase.ESTIMATE:
             indices = [index for index in self._order if index in self.outdated]
             if indices:
-                self.explain(now, f"{len(indices)} pairs have the F of other settings, and get it anew")
+                self._explain(f"{len(indices)} pairs have the F of other settings, and get it anew")
         elif phase is Phase.CONNECT:
             extra = len(self.records) - self._row_count
             count = self._pairs_that_fit(CONNECT_SHARE, extra, now)
             indices = [index for index in self._order if self._row_count <= index < self._row_count + count]
             if extra:
-                self.explain(now, f"{count} of {extra} pairs are matched for the scenes alone")
+                self._explain(f"{count} of {extra} pairs are matched for the scenes alone")
         elif phase is Phase.DEEPEN:
-            self.explain(now, "the sweep is over; deepening begins")
+            self._explain("the sweep is over; deepening begins")
         elif phase is Phase.FILL:
             lacking = filter(self.may_gain, self.records[: self._row_count])
             busy = self._queue.under_way | {index for chunk in self._queue.again for index in chunk.indices}
             weakest = sorted(lacking, key=lambda record: (record.index in busy, record.inliers, record.index))
             indices = [record.index for record in weakest]
             if indices:
-                self.explain(now, f"in the time left: {len(indices)} pairs that lack units, the weakest first")
+                self._explain(f"in the time left: {len(indices)} pairs that lack units, the weakest first")
         self._total, self._left = len(indices), set(indices)
         size = max(JOB_PAIRS, JOB_MINIBATCHES * self._minibatch if self._minibatch > 1 else 0)
         self._queue.fresh.extend(chunks_of(phase, indices, size))
@@ -332,7 +320,7 @@ class Plan:
 
     # What came of it
 
-    def on_result(self, job: MatchJob, result: MatchResult, seconds: float, now: float) -> list[Outcome]:
+    def on_result(self, job: MatchJob, result: MatchResult, seconds: float) -> list[Outcome]:
         """Record a job that took so many seconds; what it brought, to be kept."""
         self._queue.under_way.difference_update(job.indices)
         for found in result.results:
@@ -342,14 +330,14 @@ class Plan:
         if not job.units:
             self.costs.observe(Phase.ESTIMATE, seconds / len(job.indices))
         merge = self._merge if job.units else self._merge_estimate
-        kept = [merged for outcome in result.outcomes if (merged := merge(outcome, now)) is not None]
+        kept = [merged for outcome in result.outcomes if (merged := merge(outcome)) is not None]
         rest = tuple(index for index in job.indices if self.can_gain(index, job.units))
         if rest:  # the job's own deadline cut it off
             self._queue.put_back(Chunk(job.phase, rest, job.units))
         self._mark_done(job.phase, set(job.indices) - set(rest))
         return kept
 
-    def on_failure(self, job: MatchJob, failure: Failure, place: str, now: float) -> list[Outcome]:
+    def on_failure(self, job: MatchJob, failure: Failure, place: str) -> list[Outcome]:
         """Record a job that came to nothing, and plan it anew: halved, then unit by unit; what to keep.
 
         A unit that a single pair cannot have after two tries, in two places where there are two, is given up for
@@ -375,14 +363,13 @@ class Plan:
             return []
         self._mark_done(job.phase, [index])
         if units:
-            return [self._give_up(index, units[0], failure, now)]
-        self.explain(now, f"pair {index} keeps the F it has: {failure}")
+            return [self._give_up(index, units[0], failure)]
+        self._explain(f"pair {index} keeps the F it has: {failure}")
         self.outdated.discard(index)
         return []
 
-    def restart(self, now: float, reason: str) -> list[Outcome]:
+    def restart(self) -> list[Outcome]:
         """Begin anew on other devices: no unit is given up, and pairs keep what they have; what has changed."""
-        self.explain(now, reason)
         whole = [record.without_given_up() for record in self.records]
         changed = [record for record in whole if record is not self.records[record.index]]
         for record in changed:
@@ -390,13 +377,13 @@ class Plan:
         self._begin()
         return list(map(Outcome, changed))
 
-    def _merge(self, outcome: Outcome, now: float) -> Outcome | None:
+    def _merge(self, outcome: Outcome) -> Outcome | None:
         """What a job has brought a pair, if anything: a unit more, or the reason why there can be none."""
         record, former = outcome.record, self.records[outcome.record.index]
         if not outcome.results and record.failure and record.reached:
             self._stuck.add(record.index)  # an image cannot be read
             if former.units:
-                self.explain(now, f"pair {record.index} keeps the F it has: {record.failure}")
+                self._explain(f"pair {record.index} keeps the F it has: {record.failure}")
         if len(record.units) <= len(former.units) and (former.reached or not record.reached):
             if outcome.results:  # what was found before cannot be read, and a worse F gains nothing
                 self._stuck.add(record.index)
@@ -404,28 +391,28 @@ class Plan:
         self._put(record.after(former))
         return replace(outcome, record=self.records[record.index])
 
-    def _merge_estimate(self, outcome: Outcome, now: float) -> Outcome | None:
+    def _merge_estimate(self, outcome: Outcome) -> Outcome | None:
         """The F that a job without units has made of all that was found on a pair."""
         record, former = outcome.record, self.records[outcome.record.index]
         self.outdated.discard(record.index)
         if len(record.units) < len(former.units):
-            self.explain(now, f"pair {record.index} keeps the F it has: its points cannot be read")
+            self._explain(f"pair {record.index} keeps the F it has: its points cannot be read")
             return None
         self.estimated_anew += 1
         self._put(former.estimated_anew(record))
         return replace(outcome, record=self.records[record.index])
 
-    def _give_up(self, index: int, unit: Unit, failure: Failure, now: float) -> Outcome:
+    def _give_up(self, index: int, unit: Unit, failure: Failure) -> Outcome:
         """The pair keeps the F that it has; the unit is marked as had, with the reason."""
         record, reason = self.records[index], f"{GIVEN_UP}{failure}"
-        self.explain(now, f"{unit.name} is given up on pair {index} ({failure})")
+        self._explain(f"{unit.name} is given up on pair {index} ({failure})")
         empty = UnitRecord(unit.name, unit.stage, 0, 0, 0.0, 0.0, reason)
         message = record.failure if record.reached else reason
         self._put(replace(record, units=(*record.units, empty), failure=message))
         self._failed_pairs[unit.name] += 1
         if self._failed_pairs[unit.name] >= MAX_FAILED_PAIRS and not self.costs.has_run(unit.name):
             self.unusable.add(unit.name)
-            self.explain(now, f"{unit.name} is given up on all pairs: it never ran ({failure})")
+            self._explain(f"{unit.name} is given up on all pairs: it never ran ({failure})")
         return Outcome(self.records[index], (UnitResult(unit, Matches.empty(), failure=reason),))
 
     def _mark_done(self, phase: Phase, indices: Iterable[int]) -> None:
@@ -463,10 +450,6 @@ class Plan:
     def progress(self) -> tuple[Phase, int, int]:
         """The present phase, how many of its pairs are done, and how many it has."""
         return self.phase, self._total - len(self._left), self._total
-
-    def explain(self, now: float, text: str) -> None:
-        """Note a decision, and why."""
-        self.explanations.append(Explanation(now - self.budget.started, text))
 
     def _put(self, record: PairRecord) -> None:
         self._lacking.subtract(self._lacks(self.records[record.index]))

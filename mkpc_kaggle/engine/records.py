@@ -153,9 +153,6 @@ class PairRecord:
     def match_seconds(self) -> float:
         return sum(unit.match_seconds for unit in self.units)
 
-    def has(self, unit: Unit) -> bool:
-        return any(record.unit == unit.name for record in self.units)
-
     def lacking(self, units: Iterable[Unit]) -> list[Unit]:
         """Those of ``units`` that the pair has not had."""
         had = {record.unit for record in self.units}

@@ -24,7 +24,7 @@ from mkpc_kaggle.engine import console
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.cluster import RayCluster, RaySite
 from mkpc_kaggle.engine.engine import Engine, RunReport
-from mkpc_kaggle.engine.journal import About, EventKind, Journal
+from mkpc_kaggle.engine.journal import About, Event, EventKind, Journal
 from mkpc_kaggle.engine.places import LISTEN_S, LocalSite, Site
 from mkpc_kaggle.engine.records import PairRecord, SceneRecord
 from mkpc_kaggle.errors import UserError, writing
@@ -134,7 +134,7 @@ def run_pairs(
     with Journal(session.work_dir, belongs_to, pairs=pairs, about=about, fresh=session.fresh) as journal:
         if recipe.scene is None:
             journal.forget_scenes()
-        journal.note(EventKind.START, budget.spent(), "")
+        journal.note(Event(EventKind.START, budget.spent(), ""))
         engine = Engine(
             pairs,
             recipe,
@@ -150,7 +150,7 @@ def run_pairs(
         if session.watchdog is not None:
             session.watchdog.save = engine.save_results
         report = engine.run()
-        journal.note(EventKind.END, report.seconds, report.ending)
+        journal.note(Event(EventKind.END, report.seconds, report.ending))
     return report
 
 

@@ -26,6 +26,7 @@ from mkpc_kaggle.engine.jobs import (
     Outcome,
     SceneJob,
 )
+from mkpc_kaggle.engine.journal import Event
 from mkpc_kaggle.engine.places import Place, Site
 from mkpc_kaggle.engine.plan import RESERVE_SHARE
 from mkpc_kaggle.engine.records import NOT_REACHED, PairRecord, SceneRecord, UnitRecord
@@ -364,7 +365,7 @@ class MemoryJournal:
         self._scenes[scene.batch] = scene
         self._records |= {record.index: record for record in records}
 
-    def note(self, kind: str, seconds: float, text: str) -> None:
+    def note(self, event: Event) -> None:
         pass
 
 
