@@ -168,8 +168,7 @@ class Engine:
     # The loop
 
     def _loop(self) -> None:
-        self.plan.advance(now := self.budget.clock())
-        if self.plan.has_work(now) or self.scenes.due(range(len(self.pairs))) is not None:
+        if self.plan.advance(self.budget.clock()) or self.scenes.due(range(len(self.pairs))) is not None:
             self.site.open()
         while not self.interrupt.is_set() and (now := self.budget.clock()) < self.budget.stop_waiting:
             for place in self._places:
@@ -188,10 +187,9 @@ class Engine:
     def _hand_out(self, now: float) -> None:
         """A worker for each place that has none, and a job for each worker that is idle."""
         self.plan.reserve = self.scenes.reserve(self.site.scenes_at_once)
-        self.plan.advance(now)
         self.plan.workers = max(1, sum(not place.closed for place in self.site.places))
         for place in self.site.places:
-            if place.may_start(now) and self.plan.has_work(now):
+            if place.may_start(now) and self.plan.advance(now):
                 place.start(now)
             elif place.is_idle and (job := self.plan.next(now, place.name, cautious=place.losses > 0)):
                 pairs = tuple(self.pairs[index] for index in job.indices)
@@ -200,7 +198,7 @@ class Engine:
 
     def _is_matching(self, now: float) -> bool:
         """Whether a job is under way, or will be when a worker has started."""
-        places, may_begin = self.site.places, self.plan.has_work(now)
+        places, may_begin = self.site.places, self.plan.advance(now)
         return any(place.job is not None or (place.is_starting and may_begin) for place in places)
 
     def _take_answer(self, place: Place, now: float) -> None:

@@ -1,6 +1,10 @@
 """The plan: which units to run on which pairs next, and why. Decisions on values, without threads or clocks.
 
 It looks at a job's worth of pairs at a time, so that a hundred thousand pairs cost no more to plan than ten.
+
+Three places decide that a unit no longer fits: :meth:`Plan._fit`, for all pairs, when a chunk is deepened;
+:meth:`Plan.next`, for a job that could not end in time; and :meth:`MatchRunner.run
+<mkpc_kaggle.engine.worker.MatchRunner.run>`, in the worker, for a minibatch of a job that is late.
 """
 
 from collections import Counter, deque
@@ -163,21 +167,19 @@ class Plan:
         if self.stop > self._late_at:
             queue.put_back(*self._late)
             self._late.clear()
-        self.advance(now)
-        while job is None and self.has_work(now):
+        while self.advance(now) and job is None:
             chunk = queue.pop(place, alone=self.workers < 2, cautious=cautious)
             if chunk is None:
                 break
             units = self._units(chunk, now)
-            todo = [index for index in chunk.indices if self.can_gain(index, units)]
+            todo = self._wanting(chunk.phase, chunk.indices, units)
             self._mark_done(chunk.phase, set(chunk.indices) - set(todo))
             in_time = tuple(unit for unit in units if self.costs.p90(unit.name) < self.stop - now)
-            if chosen := [index for index in todo if self.can_gain(index, in_time)]:
-                job = self._job(chunk, chosen, in_time, now, cautious=cautious)
+            if chosen := self._wanting(chunk.phase, todo, in_time):
+                job = self._job(replace(chunk, indices=chosen), in_time, now, cautious=cautious)
             if late := tuple(index for index in todo if index not in chosen):
                 self._late.append(replace(chunk, indices=late))
                 self._late_at = self.stop
-            self.advance(now)
         return job
 
     @property
@@ -185,58 +187,51 @@ class Plan:
         """When no unit may be running any more."""
         return self.budget.stop_units - min(self.reserve, RESERVE_SHARE * self.budget.time_limit)
 
-    def has_work(self, now: float) -> bool:
-        """Whether a pair waits that can gain something, as far as the plan has advanced."""
-        return now < self.stop and bool(self._queue.fresh or self._queue.again)
-
-    def advance(self, now: float) -> None:
-        """Go on to the first pairs that can gain something: other chunks and phases are passed over."""
-        while now < self.stop and (self._queue.fresh or self._coming):
-            if not self._queue.fresh:
-                if self.phase is Phase.ESTIMATE and (self._queue.under_way or self._queue.again):
-                    return  # scenes, which come later, need F of all pairs
+    def advance(self, now: float) -> bool:
+        """Go on to the first pairs that can gain something, past others and past phases; whether there are any."""
+        queue = self._queue
+        while now < self.stop and (queue.fresh or self._coming):
+            if queue.fresh:
+                chunk = queue.fresh[0]
+                if self._wanting(chunk.phase, chunk.indices, self._units(chunk, now)):
+                    break
+                self._mark_done(chunk.phase, queue.fresh.popleft().indices)
+            elif self.phase is Phase.ESTIMATE and (queue.under_way or queue.again):
+                break  # scenes, which come later, need F of all pairs
+            else:
                 self._open(self._coming.pop(0), now)
-                continue
-            chunk = self._queue.fresh[0]
-            units = self._units(chunk, now)
-            if any(self.can_gain(index, units) for index in chunk.indices):
-                return
-            self._mark_done(chunk.phase, self._queue.fresh.popleft().indices)
+        return now < self.stop and bool(queue.fresh or queue.again)
 
-    def can_gain(self, index: int, units: Iterable[Unit]) -> bool:
-        """Whether a pair may get any of the units that it has not had; where there are none, another F."""
-        if not units:
-            return index in self.outdated
-        return index not in self._stuck and bool(self.records[index].lacking(units))
+    def _wanting(self, phase: Phase, indices: Iterable[int], units: Sequence[Unit]) -> tuple[int, ...]:
+        """The pairs that may get what a phase gives: another F, or any of the units."""
+        if phase is Phase.ESTIMATE:
+            return tuple(index for index in indices if index in self.outdated)
+        return tuple(i for i in indices if i not in self._stuck and self.records[i].lacking(units))
 
-    def _job(
-        self, chunk: Chunk, todo: list[int], units: tuple[Unit, ...], now: float, *, cautious: bool
-    ) -> MatchJob:
+    def _job(self, chunk: Chunk, units: tuple[Unit, ...], now: float, *, cautious: bool) -> MatchJob:
         """A job for the first of the pairs and units; the others go back to the front of the queue."""
         left, costs = self.stop - now, self.costs
         pair_count = unit_count = 1
         if not cautious:
-            lacking = self._lacking_units(todo, units)
-            prices = [costs.mean(name) if costs.is_known(name) else None for name in _priced(lacking)]
-            pair_count, unit_count = job_size(len(todo), prices, costs.overhead, JOB_SHARE * left)
-        indices, later = tuple(todo[:pair_count]), tuple(todo[pair_count:])
+            names = _priced(self._lacking_units(chunk.indices, units))
+            prices = [costs.mean(name) if costs.is_known(name) else None for name in names]
+            pair_count, unit_count = job_size(len(chunk.indices), prices, costs.overhead, JOB_SHARE * left)
+        indices, later = chunk.indices[:pair_count], chunk.indices[pair_count:]
         lacking = self._lacking_units(indices, units)
-        chosen, further = lacking[:unit_count], tuple(lacking[unit_count:])
+        chosen, further = lacking[:unit_count], lacking[unit_count:]
         if later:
             self._queue.put_back(replace(chunk, indices=later))
         if further:
             self._queue.put_back(replace(chunk, indices=indices, units=further))
         self._queue.under_way.update(indices)
         p90 = tuple(costs.p90(unit.name) for unit in chosen)
-        seconds, time_limit = self._limits(len(indices), chosen, left)
-        return MatchJob(
-            chunk.phase, indices, tuple(chosen), p90, seconds, time_limit, is_retry=bool(chunk.lost_at)
-        )
+        limits = self._limits(len(indices), chosen, left)
+        return MatchJob(chunk.phase, indices, chosen, p90, *limits, is_retry=bool(chunk.lost_at))
 
-    def _lacking_units(self, indices: Iterable[int], units: tuple[Unit, ...]) -> list[Unit]:
+    def _lacking_units(self, indices: Iterable[int], units: Sequence[Unit]) -> tuple[Unit, ...]:
         """Those of ``units`` that any of the pairs lacks, in the order in which they run."""
         lacking = dict.fromkeys(unit for index in indices for unit in self.records[index].lacking(units))
-        return sorted(lacking, key=lambda unit: unit.stage)
+        return tuple(sorted(lacking, key=lambda unit: unit.stage))
 
     def _limits(self, pair_count: int, units: Sequence[Unit], left: float) -> tuple[float, float]:
         """The seconds within which units of a job may begin, and after which its worker hangs."""
@@ -294,29 +289,22 @@ class Plan:
             if indices:
                 self._explain(f"{len(indices)} pairs have the F of other settings, and get it anew")
         elif phase is Phase.CONNECT:
-            extra = len(self.records) - self._row_count
-            count = self._pairs_that_fit(CONNECT_SHARE, extra, now)
+            extra, left = len(self.records) - self._row_count, CONNECT_SHARE * (self.stop - now) * self.workers
+            seconds = self.costs.overhead + sum(self.costs.forecast(unit.name) for unit in self._first)
+            count = extra if seconds * extra <= left else int(left / seconds)
             indices = [index for index in self._order if self._row_count <= index < self._row_count + count]
             if extra:
                 self._explain(f"{count} of {extra} pairs are matched for the scenes alone")
         elif phase is Phase.DEEPEN:
             self._explain("the sweep is over; deepening begins")
         elif phase is Phase.FILL:
-            lacking = filter(self.may_gain, self.records[: self._row_count])
             busy = self._queue.under_way | {index for chunk in self._queue.again for index in chunk.indices}
-            weakest = sorted(lacking, key=lambda record: (record.index in busy, record.inliers, record.index))
-            indices = [record.index for record in weakest]
+            indices = sorted(self._unsaturated(), key=lambda i: (i in busy, self.records[i].inliers, i))
             if indices:
                 self._explain(f"in the time left: {len(indices)} pairs that lack units, the weakest first")
         self._total, self._left = len(indices), set(indices)
         size = max(JOB_PAIRS, JOB_MINIBATCHES * self._minibatch if self._minibatch > 1 else 0)
         self._queue.fresh.extend(chunks_of(phase, indices, size))
-
-    def _pairs_that_fit(self, share: float, count: int, now: float) -> int:
-        """How many of so many pairs can have the first unit in a share of the time left."""
-        seconds = self.costs.overhead + sum(self.costs.forecast(unit.name) for unit in self._first)
-        left = share * max(0.0, self.stop - now) * self.workers
-        return count if seconds * count <= left else int(left / seconds)
 
     # What came of it
 
@@ -331,8 +319,7 @@ class Plan:
             self.costs.observe(Phase.ESTIMATE, seconds / len(job.indices))
         merge = self._merge if job.units else self._merge_estimate
         kept = [merged for outcome in result.outcomes if (merged := merge(outcome)) is not None]
-        rest = tuple(index for index in job.indices if self.can_gain(index, job.units))
-        if rest:  # the job's own deadline cut it off
+        if rest := self._wanting(job.phase, job.indices, job.units):  # the job's own deadline cut it off
             self._queue.put_back(Chunk(job.phase, rest, job.units))
         self._mark_done(job.phase, set(job.indices) - set(rest))
         return kept
@@ -372,10 +359,8 @@ class Plan:
         """Begin anew on other devices: no unit is given up, and pairs keep what they have; what has changed."""
         whole = [record.without_given_up() for record in self.records]
         changed = [record for record in whole if record is not self.records[record.index]]
-        for record in changed:
-            self._put(record)
         self._begin()
-        return list(map(Outcome, changed))
+        return list(map(self._put, changed))
 
     def _merge(self, outcome: Outcome) -> Outcome | None:
         """What a job has brought a pair, if anything: a unit more, or the reason why there can be none."""
@@ -388,8 +373,7 @@ class Plan:
             if outcome.results:  # what was found before cannot be read, and a worse F gains nothing
                 self._stuck.add(record.index)
             return None
-        self._put(record.after(former))
-        return replace(outcome, record=self.records[record.index])
+        return self._put(record.after(former), outcome.results)
 
     def _merge_estimate(self, outcome: Outcome) -> Outcome | None:
         """The F that a job without units has made of all that was found on a pair."""
@@ -399,21 +383,19 @@ class Plan:
             self._explain(f"pair {record.index} keeps the F it has: its points cannot be read")
             return None
         self.estimated_anew += 1
-        self._put(former.estimated_anew(record))
-        return replace(outcome, record=self.records[record.index])
+        return self._put(former.estimated_anew(record))
 
     def _give_up(self, index: int, unit: Unit, failure: Failure) -> Outcome:
         """The pair keeps the F that it has; the unit is marked as had, with the reason."""
-        record, reason = self.records[index], f"{GIVEN_UP}{failure}"
+        record, nothing = self.records[index], UnitResult(unit, Matches.empty(), failure=f"{GIVEN_UP}{failure}")
         self._explain(f"{unit.name} is given up on pair {index} ({failure})")
-        empty = UnitRecord(unit.name, unit.stage, 0, 0, 0.0, 0.0, reason)
-        message = record.failure if record.reached else reason
-        self._put(replace(record, units=(*record.units, empty), failure=message))
         self._failed_pairs[unit.name] += 1
         if self._failed_pairs[unit.name] >= MAX_FAILED_PAIRS and not self.costs.has_run(unit.name):
             self.unusable.add(unit.name)
             self._explain(f"{unit.name} is given up on all pairs: it never ran ({failure})")
-        return Outcome(self.records[index], (UnitResult(unit, Matches.empty(), failure=reason),))
+        units = (*record.units, UnitRecord.of(nothing, 0))
+        message = record.failure if record.reached else nothing.failure
+        return self._put(replace(record, units=units, failure=message), (nothing,))
 
     def _mark_done(self, phase: Phase, indices: Iterable[int]) -> None:
         """The turn of these pairs is over in a phase, unless they are to be tried again."""
@@ -430,16 +412,16 @@ class Plan:
         """Pairs that get more than what fits for all, in the time left."""
         return self._left if self.phase is Phase.FILL else ()
 
-    def may_gain(self, record: PairRecord) -> bool:
-        """Whether a pair that has its first unit can get further units."""
-        return bool(record.units) and self.can_gain(record.index, self.usable(self.recipe.units))
+    def _unsaturated(self) -> tuple[int, ...]:
+        """The pairs of rows that have a unit and can get further units."""
+        matched = (index for index in range(self._row_count) if self.records[index].units)
+        return self._wanting(Phase.FILL, matched, self.usable(self.recipe.units))
 
     @property
     def is_complete(self) -> bool:
         """Whether every pair has been reached, and none can gain what it wants, nor another F."""
-        if self.outdated:
-            return False
-        return all(record.reached and not self.may_gain(record) for record in self.records[: self._row_count])
+        are_reached = all(record.reached for record in self.records[: self._row_count])
+        return are_reached and not self.outdated and not self._unsaturated()
 
     @property
     def nothing_runs(self) -> bool:
@@ -451,10 +433,12 @@ class Plan:
         """The present phase, how many of its pairs are done, and how many it has."""
         return self.phase, self._total - len(self._left), self._total
 
-    def _put(self, record: PairRecord) -> None:
+    def _put(self, record: PairRecord, results: tuple[UnitResult, ...] = ()) -> Outcome:
+        """Replace a pair's record; what is to be kept of that."""
         self._lacking.subtract(self._lacks(self.records[record.index]))
         self._lacking.update(self._lacks(record))
         self.records[record.index] = record
+        return Outcome(record, results)
 
     def _lacks(self, record: PairRecord) -> list[str]:
         """The units that a pair is to get yet, if it has an F and a row."""

@@ -35,11 +35,9 @@ class UnitRecord:
     note: str = ""  # why the unit ran otherwise than it is written
 
     @classmethod
-    def of(cls, found: UnitResult, inliers: NDArray[np.bool_]) -> "UnitRecord":
-        """``inliers`` is a mask over the matches that were found."""
-        unit, counts = found.unit, (len(found.matches), int(inliers.sum()))
-        seconds = found.encode_seconds, found.match_seconds
-        return cls(unit.name, unit.stage, *counts, *seconds, found.failure, found.note)
+    def of(cls, found: UnitResult, inliers: int) -> "UnitRecord":
+        unit, seconds = found.unit, (found.encode_seconds, found.match_seconds)
+        return cls(unit.name, unit.stage, len(found.matches), inliers, *seconds, found.failure, found.note)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -79,8 +77,8 @@ class PairRecord:
     def of(cls, index: int, match: PairMatch, estimation: str = "") -> "PairRecord":
         """The record of an estimated pair."""
         ends = np.cumsum([len(result.matches) for result in match.results])
-        masks = np.split(match.estimate.inliers, ends[:-1])
-        units = tuple(UnitRecord.of(*found) for found in zip(match.results, masks, strict=True))
+        inliers = [int(mask.sum()) for mask in np.split(match.estimate.inliers, ends[:-1])]
+        units = tuple(map(UnitRecord.of, match.results, inliers))
         return cls(
             index,
             match.estimate.matrix,
