@@ -257,13 +257,13 @@ class Engine:
 
     def _take_scene(self, job: SceneJob, answer: Answer, seconds: float) -> None:
         """Record what came of a batch."""
-        if not isinstance(answer, Solution):
+        if isinstance(answer, Failure):
             self._fault(f"batch {job.batch} was not reconstructed: {answer}")
             self.scenes.on_failure(job, str(answer))
             return
-        records = self.plan.records
-        record = SceneRecord.of(job.batch, answer.reconstructions, job.unit_results, seconds)
-        record = replace(record, estimation=job.estimation)
+        assert isinstance(answer, Solution)
+        records, estimation = self.plan.records, self.recipe.scene_estimation
+        record = SceneRecord.of(job.batch, answer.reconstructions, job.unit_results, seconds, estimation)
         self.scenes.on_result(job, record)
         for index, choice in zip(job.indices, answer.choices, strict=True):
             records[index] = replace(records[index], scene=choice)

@@ -6,10 +6,8 @@ from enum import StrEnum
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.records import PairRecord
-from mkpc_kaggle.geometry.focal_prior import FocalConfig
-from mkpc_kaggle.geometry.robust import RobustConfig
 from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult
-from mkpc_kaggle.recipe import SceneConfig, Unit
+from mkpc_kaggle.recipe import Recipe, Unit
 from mkpc_kaggle.scene.export import Export
 from mkpc_kaggle.scene.reconstruct import Solution
 from mkpc_kaggle.scene.view_graph import BatchPair
@@ -51,24 +49,21 @@ class MatchJob:
 class SceneJob:
     """Reconstruct a batch: ``indices`` are those of its ``pairs`` in the run; images go by their digests.
 
-    ``unit_results`` and ``estimation`` are those of its :class:`SceneRecord`. ``export``: write COLMAP's files.
-    The answer is a :class:`Solution`, whose choices are in the order of the pairs.
+    ``unit_results`` are those of its :class:`SceneRecord`. ``export``: write COLMAP's files. The answer is a
+    :class:`Solution`, whose choices are in the order of the pairs.
     """
 
     batch: str
     indices: tuple[int, ...]
     pairs: tuple[BatchPair, ...]
-    config: SceneConfig
-    focal: FocalConfig | None = None
-    magsac: RobustConfig | None = None
+    recipe: Recipe
     unit_results: int = 0
-    estimation: str = ""
     export: Export | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class TaskJob:
-    """Something to be known of images before there are pairs, under a ``key``: what ``do`` returns."""
+    """Something to be known of images before there are pairs, under a ``key``: the bytes that ``do`` returns."""
 
     key: str
     do: Callable[[], bytes]
@@ -106,11 +101,6 @@ class MatchResult:
         return sum(result.seconds for result in self.results)
 
 
-@dataclass(frozen=True)
-class TaskResult:
-    value: bytes
-
-
 class Cause(StrEnum):
     """Why a worker has no result."""
 
@@ -139,7 +129,7 @@ class Failure:
         return f"{self.cause}: {self.message}" if self.message else str(self.cause)
 
 
-Answer = Loaded | MatchResult | Solution | TaskResult | Failure
+Answer = Loaded | MatchResult | Solution | bytes | Failure
 
 
 def visiting_order(pairs: Sequence[Pair]) -> list[int]:

@@ -43,12 +43,8 @@ CREATE TABLE scene (key TEXT PRIMARY KEY, value TEXT NOT NULL);
 CREATE TABLE event (key INTEGER PRIMARY KEY, value TEXT NOT NULL);
 CREATE TABLE task (key TEXT PRIMARY KEY, value BLOB NOT NULL);
 """
-SAVE_PAIR = "REPLACE INTO pair VALUES (?, ?)"
-SAVE_POINTS = "REPLACE INTO points VALUES (?, ?, ?)"
-SAVE_SCENE = "REPLACE INTO scene VALUES (?, ?)"
-SAVE_TASK = "REPLACE INTO task VALUES (?, ?)"
 
-Statement = tuple[str, tuple[Any, ...]]  # and its values
+Row = tuple[str, tuple[Any, ...]]  # the table, and the values of its columns
 
 # SQLite's primary result codes that say nothing against a file: no permission, busy, locked, read only, input or
 # output failed, full, cannot be opened.
@@ -230,7 +226,7 @@ class Journal(JournalReader):
         fresh: bool = False,
     ) -> None:
         path, lock = directory / FILE_NAME, directory / LOCK_NAME
-        self._unsaved: list[Statement] = []
+        self._unsaved: list[Row] = []
         with ExitStack() as opened, writing(f"the work directory {directory}"):  # left open where all is well
             directory.mkdir(parents=True, exist_ok=True)
             self._lock = opened.enter_context(closing(connect(lock)))
@@ -259,8 +255,7 @@ class Journal(JournalReader):
             records = [record for index, record in known.items() if index < len(pairs)]
             changed = {r.index for r in records if not all(map(same, pairs[r.index].images, r.versions))}
             outdated = {pairs[index].group for index in changed}
-            without = [replace(record, scene=None) for record in records if pairs[record.index].group in outdated]
-            self._db.executemany(SAVE_PAIR, [(record.index, encode(record)) for record in without])
+            self._put(pair_row(replace(r, scene=None)) for r in records if pairs[r.index].group in outdated)
             for statement, keys in (
                 ("DELETE FROM pair WHERE key = ?", changed),
                 ("DELETE FROM points WHERE pair = ?", changed),
@@ -274,8 +269,7 @@ class Journal(JournalReader):
         if self.scenes():
             with undamaged(self.path), self._db:
                 self._db.execute("BEGIN")
-                without = [replace(record, scene=None) for record in self.records().values()]
-                self._db.executemany(SAVE_PAIR, [(record.index, encode(record)) for record in without])
+                self._put(pair_row(replace(record, scene=None)) for record in self.records().values())
                 self._db.execute("DELETE FROM scene")
 
     def save(self, outcomes: Iterable[Outcome]) -> None:
@@ -283,25 +277,22 @@ class Journal(JournalReader):
 
         An outcome may have the new results alone: what was put down of others stays.
         """
-        statements: list[Statement] = []
+        rows: list[Row] = []
         for outcome in outcomes:
-            index = outcome.record.index
-            statements.append((SAVE_PAIR, (index, encode(outcome.record))))
-            for result in outcome.results:
-                statements.append((SAVE_POINTS, (index, result.unit.name, to_blob(result.matches))))
-        self._write(statements)
+            rows.append(pair_row(outcome.record))
+            for found in outcome.results:
+                rows.append(("points", (outcome.record.index, found.unit.name, to_blob(found.matches))))
+        self._write(rows)
 
     def save_scene(self, scene: SceneRecord, records: Iterable[PairRecord]) -> None:
         """Put down what came of a batch, and its pairs' records."""
-        pairs = [(SAVE_PAIR, (record.index, encode(record))) for record in records]
-        self._write([*pairs, (SAVE_SCENE, (scene.batch, encode(scene)))])
+        self._write([*map(pair_row, records), ("scene", (scene.batch, encode(scene)))])
 
     def save_task(self, key: str, value: bytes) -> None:
-        self._write([(SAVE_TASK, (key, value))])
+        self._write([("task", (key, value))])
 
     def task(self, key: str) -> bytes:
-        unsaved = {values[0]: values[1] for statement, values in self._unsaved if statement == SAVE_TASK}
-        return unsaved[key] if key in unsaved else super().task(key)
+        return dict(self._unsaved_in("task")).get(key) or super().task(key)
 
     def note(self, event: Event) -> None:
         """Put down what happened; it is lost where the journal cannot be written, and the run goes on."""
@@ -315,17 +306,23 @@ class Journal(JournalReader):
         self._lock.close()
 
     def _points(self, index: int) -> dict[str, bytes]:
-        unsaved = (values for statement, values in self._unsaved if statement == SAVE_POINTS)
-        return super()._points(index) | {unit: blob for pair, unit, blob in unsaved if pair == index}
+        unsaved = {unit: blob for pair, unit, blob in self._unsaved_in("points") if pair == index}
+        return super()._points(index) | unsaved
 
-    def _write(self, statements: Sequence[Statement]) -> None:
-        """Execute what has not been yet, in one transaction."""
-        self._unsaved += statements
+    def _unsaved_in(self, table: str) -> list[tuple[Any, ...]]:
+        return [values for name, values in self._unsaved if name == table]
+
+    def _write(self, rows: Iterable[Row]) -> None:
+        """Write these rows and those that the file did not take before, in one transaction."""
+        self._unsaved += rows
         with self._db:
             self._db.execute("BEGIN")
-            for statement, values in self._unsaved:
-                self._db.execute(statement, values)
+            self._put(self._unsaved)
         self._unsaved.clear()
+
+    def _put(self, rows: Iterable[Row]) -> None:
+        for table, values in rows:
+            self._db.execute(f"REPLACE INTO {table} VALUES ({', '.join('?' * len(values))})", values)
 
     def _claim(self, belongs_to: Mapping[str, Any], pairs: Sequence[Pair], about: About) -> None:
         """Write down what the journal belongs to, or compare it with what stands there."""
@@ -345,11 +342,13 @@ class Journal(JournalReader):
             if is_new:
                 for statement in SCHEMA.split(";")[:-1]:
                     self._db.execute(statement)
-                names = ((index, encode((p.id, p.group, *p.names))) for index, p in enumerate(pairs))
-                self._db.executemany("INSERT INTO sample VALUES (?, ?)", names)
+                self._put(("sample", (i, encode((p.id, p.group, *p.names)))) for i, p in enumerate(pairs))
             header = {"format": FORMAT, **belongs_to, "about": about}
-            rows = ((key, encode(value)) for key, value in header.items())
-            self._db.executemany("REPLACE INTO run VALUES (?, ?)", rows)
+            self._put(("run", (key, encode(value))) for key, value in header.items())
+
+
+def pair_row(record: PairRecord) -> Row:
+    return "pair", (record.index, encode(record))
 
 
 def share_journal(source: Path, target: Path) -> None:

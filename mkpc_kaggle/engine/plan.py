@@ -299,7 +299,7 @@ class Plan:
             self._explain("the sweep is over; deepening begins")
         elif phase is Phase.FILL:
             busy = self._queue.under_way | {index for chunk in self._queue.again for index in chunk.indices}
-            indices = sorted(self._unsaturated(), key=lambda i: (i in busy, self.records[i].inliers, i))
+            indices = sorted(self._fillable(), key=lambda i: (i in busy, self.records[i].inliers, i))
             if indices:
                 self._explain(f"in the time left: {len(indices)} pairs that lack units, the weakest first")
         self._total, self._left = len(indices), set(indices)
@@ -412,7 +412,7 @@ class Plan:
         """Pairs that get more than what fits for all, in the time left."""
         return self._left if self.phase is Phase.FILL else ()
 
-    def _unsaturated(self) -> tuple[int, ...]:
+    def _fillable(self) -> tuple[int, ...]:
         """The pairs of rows that have a unit and can get further units."""
         matched = (index for index in range(self._row_count) if self.records[index].units)
         return self._wanting(Phase.FILL, matched, self.usable(self.recipe.units))
@@ -421,7 +421,7 @@ class Plan:
     def is_complete(self) -> bool:
         """Whether every pair has been reached, and none can gain what it wants, nor another F."""
         are_reached = all(record.reached for record in self.records[: self._row_count])
-        return are_reached and not self.outdated and not self._unsaturated()
+        return are_reached and not self.outdated and not self._fillable()
 
     @property
     def nothing_runs(self) -> bool:

@@ -212,7 +212,13 @@ class SceneRecord:
 
     @classmethod
     def of(
-        cls, batch: str, found: Sequence[Reconstruction], unit_results: int, seconds: float, failure: str = ""
+        cls,
+        batch: str,
+        found: Sequence[Reconstruction],
+        unit_results: int = 0,
+        seconds: float = 0.0,
+        estimation: str = "",
+        failure: str = "",
     ) -> "SceneRecord":
         models = sorted((model for each in found for model in each.models), key=lambda model: -len(model.images))
         cameras = tuple(CameraRecord.of(image, n) for n, model in enumerate(models) for image in model.images)
@@ -228,6 +234,7 @@ class SceneRecord:
             failure or "; ".join(reasons) or ("" if models else "no matches connect its images"),
             cameras,
             tuple(_evenly(model.points) for model in models),
+            estimation,
         )
 
 

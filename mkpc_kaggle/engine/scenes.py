@@ -105,7 +105,7 @@ class Scenes:
     def report(self) -> tuple[SceneRecord, ...]:
         """What came of each batch, in their order: where there is no scene, ``failure`` says why."""
         return tuple(
-            self.made.get(name) or SceneRecord.of(name, (), 0, 0.0, self._failures.get(name, NOT_RECONSTRUCTED))
+            self.made.get(name) or SceneRecord.of(name, (), failure=self._failures.get(name, NOT_RECONSTRUCTED))
             for name in self.batches
         )
 
@@ -125,14 +125,11 @@ class Scenes:
 
     def job(self, batch: str, results_of: Callable[[int], tuple[UnitResult, ...]]) -> SceneJob:
         """The job that reconstructs a batch; ``results_of`` gives what was found on a pair."""
-        recipe, config = self._recipe, self._recipe.scene
-        assert config is not None
         found = tuple(index for index in self.batches[batch] if self._records[index].sizes)
         pairs = tuple(self._batch_pair(index, results_of(index)) for index in found)
         self._running.add(batch)
         unit_results, export = self._unit_count(batch), self._exports.get(batch)
-        settings = config, recipe.focal, recipe.magsac
-        return SceneJob(batch, found, pairs, *settings, unit_results, recipe.scene_estimation, export)
+        return SceneJob(batch, found, pairs, self._recipe, unit_results, export)
 
     def on_start(self, seconds: float) -> None:
         """Record how long a process took to begin."""

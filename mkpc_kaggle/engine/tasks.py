@@ -10,7 +10,7 @@ from functools import partial
 from math import inf
 
 from mkpc_kaggle.engine.console import Progress, warn
-from mkpc_kaggle.engine.jobs import Answer, TaskJob, TaskResult
+from mkpc_kaggle.engine.jobs import Answer, TaskJob
 from mkpc_kaggle.engine.journal import Journal
 from mkpc_kaggle.engine.places import Place, Site
 from mkpc_kaggle.engine.process import ProcessWorker
@@ -71,9 +71,9 @@ class TaskQueue:
     def take(self, job: TaskJob, answer: Answer) -> None:
         """Keep an answer; a task that came to nothing is tried once more."""
         self._tries[job.key] += 1
-        if isinstance(answer, TaskResult):
+        if isinstance(answer, bytes):
             with suppress(sqlite3.Error):  # it stays in memory
-                self._journal.save_task(job.key, answer.value)
+                self._journal.save_task(job.key, answer)
         elif self._tries[job.key] < MAX_TRIES:
             self.waiting.append(job)
             return

@@ -19,7 +19,6 @@ from mkpc_kaggle.engine.jobs import (
     Outcome,
     SceneJob,
     TaskJob,
-    TaskResult,
 )
 from mkpc_kaggle.engine.records import NOT_REACHED, PairRecord
 from mkpc_kaggle.errors import UserError
@@ -159,13 +158,13 @@ class SceneRunner:
 
     def run(self, job: Job, seconds: float) -> Solution:
         """The cameras of a batch, and which F each of its pairs gets; ``seconds`` are not looked at."""
-        assert isinstance(job, SceneJob)
-        return reconstruct_batch(job.pairs, job.config, job.focal, job.magsac, job.export)
+        assert isinstance(job, SceneJob) and job.recipe.scene is not None
+        return reconstruct_batch(job.pairs, job.recipe.scene, job.recipe.focal, job.recipe.magsac, job.export)
 
 
 class TaskRunner:
     """Looks at images before there are pairs."""
 
-    def run(self, job: Job, seconds: float) -> TaskResult:
+    def run(self, job: Job, seconds: float) -> bytes:
         assert isinstance(job, TaskJob)
-        return TaskResult(job.do())
+        return job.do()
