@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from math import inf
 from pathlib import Path
+from statistics import median_low
 
 from mkpc_kaggle.errors import UserError
 
@@ -61,9 +62,7 @@ class Budget:
     @property
     def writing(self) -> float:
         """Seconds that the next write may take, by the median of the latest: a single slow write is forgotten."""
-        if not self._writes:
-            return 0.0
-        median = sorted(self._writes)[(len(self._writes) - 1) // 2]
+        median = median_low(self._writes) if self._writes else 0.0
         return min(WRITE_MARGIN * median, MAX_WRITE_SHARE * self.time_limit)
 
     @property

@@ -23,7 +23,7 @@ from multiprocessing.context import SpawnProcess
 
 from mkpc_kaggle.engine.jobs import Answer, Cause, Failure, Job, Loaded
 from mkpc_kaggle.engine.streams import unblocked
-from mkpc_kaggle.engine.worker import Executor, Runner, failure_of, use_threads
+from mkpc_kaggle.engine.worker import Executor, Runner, failure_of
 
 # For PyTorch, which reads them once. Threads of OpenMP that wait for each other sleep; by default they spin, and
 # keep the cores from decoding, MAGSAC and other processes (python -m benchmarks.threads). Tensors of 2 MiB and
@@ -97,17 +97,9 @@ class ThreadWorker:
 
 
 class ProcessWorker(ThreadWorker):
-    """A worker process, started with ``spawn``. ``make`` and jobs can be pickled.
+    """A worker process, started with ``spawn``. ``make`` and jobs can be pickled."""
 
-    ``share`` is the number of processes that share the machine's cores.
-    """
-
-    def __init__(
-        self, name: str, make: Callable[[], Runner], on_answer: Callable[[], None], share: int = 1
-    ) -> None:
-        super().__init__(name, make, on_answer)
-        self._share = share
-        self._process: SpawnProcess | None = None
+    _process: SpawnProcess | None = None
 
     def kill(self) -> None:
         super().kill()
@@ -117,7 +109,7 @@ class ProcessWorker(ThreadWorker):
     def _load(self) -> Answer:
         context = multiprocessing.get_context("spawn")
         self._pipe, its_pipe = context.Pipe()
-        process = context.Process(target=serve, args=(its_pipe, self._share), name=self.name, daemon=True)
+        process = context.Process(target=serve, args=(its_pipe,), name=self.name, daemon=True)
         try:
             with worker_environment():
                 process.start()
@@ -175,15 +167,11 @@ def worker_environment() -> Iterator[None]:
         yield
 
 
-def serve(pipe: Connection, share: int) -> None:
+def serve(pipe: Connection) -> None:
     """The life of a worker process: what to make, then job after job."""
 
     def make() -> Runner:
         maker: Callable[[], Runner] = pipe.recv()  # what cannot be unpickled is an answer, too
-        if share > 1:
-            import torch
-
-            use_threads(max(1, torch.get_num_threads() // share))
         return maker()
 
     end_when_parent_is_killed()

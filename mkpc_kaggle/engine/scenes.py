@@ -89,7 +89,9 @@ class Scenes:
         self._losses: Counter[tuple[str, int]] = Counter()
         self._failures: dict[str, str] = {}
         self._spent_s = self._spent_matches = self._longest_start = 0.0
-        self._matches = {name: sum(map(self._match_count, indices)) for name, indices in self.batches.items()}
+        self._matches = {
+            name: sum(records[index].matches for index in indices) for name, indices in self.batches.items()
+        }
 
     def note_change(self, index: int, gained: int) -> None:
         """Record that a pair has got units, or lost them, and how many matches it ``gained``."""
@@ -172,9 +174,6 @@ class Scenes:
     def _forecast(self, batch: str) -> float:
         rate = FORECAST_MARGIN * self._spent_s / self._spent_matches if self._spent_matches else MATCH_S
         return START_S + rate * self._matches[batch]
-
-    def _match_count(self, index: int) -> int:
-        return self._records[index].matches
 
     def _has_units(self, batch: str) -> bool:
         return any(self._records[index].units for index in self.batches[batch])

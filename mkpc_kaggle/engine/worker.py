@@ -79,6 +79,15 @@ def use_threads(count: int) -> None:
     cv2.setNumThreads(count)
 
 
+def share_cores(make: Callable[[], Runner], share: int) -> Runner:
+    """What ``make`` makes in one of so many processes that share the machine's cores."""
+    import torch
+
+    if share > 1:
+        use_threads(max(1, torch.get_num_threads() // share))
+    return make()
+
+
 class MatchRunner:
     """Matches the pairs of jobs and estimates their F, in threads, while the next minibatch is matched.
 
