@@ -56,7 +56,6 @@ class Budget:
     _writes: deque[float] = field(default_factory=lambda: deque(maxlen=5))
 
     def note_write(self, seconds: float) -> None:
-        """Record how long it took to write the submission."""
         self._writes.append(seconds)
 
     @property
@@ -96,7 +95,6 @@ class Budget:
         return max(0.0, self.stop_units - self.clock())
 
     def spent(self) -> float:
-        """Seconds since the start."""
         return self.clock() - self.started
 
 
@@ -108,13 +106,11 @@ def monotonic_of(epoch: float) -> float:
     a moment in the future.
     """
     ago = time.time() - epoch
-    if -MAX_STEP_BACK_S < ago < 0:
-        ago = 0.0
-    if not 0 <= ago < inf:
+    if not -MAX_STEP_BACK_S < ago < inf:
         raise UserError(
             f"--started-at {epoch:g} is not a moment of the past; it is in seconds since 1970 (date +%s)"
         )
-    return time.monotonic() - ago
+    return time.monotonic() - max(0.0, ago)
 
 
 def process_started() -> float:
@@ -124,9 +120,8 @@ def process_started() -> float:
     """
     now = time.monotonic()
     try:
-        fields = Path("/proc/self/stat").read_text().rpartition(")")[2].split()
-        began = int(fields[19]) / os.sysconf("SC_CLK_TCK")
-        age = time.clock_gettime(time.CLOCK_BOOTTIME) - began
+        ticks = Path("/proc/self/stat").read_text().rpartition(")")[2].split()[19]
+        age = time.clock_gettime(time.CLOCK_BOOTTIME) - int(ticks) / os.sysconf("SC_CLK_TCK")
     except (OSError, AttributeError, ValueError, IndexError):
         return now
     return now - age if 0 <= age < MAX_PROCESS_AGE_S else now
