@@ -256,7 +256,6 @@ class Engine:
             place.start(now, self.scenes.start_timeout(self.budget.left()))
 
     def _take_scene(self, job: SceneJob, answer: Answer, seconds: float) -> None:
-        """Record what came of a batch."""
         if isinstance(answer, Failure):
             self._fault(f"batch {job.batch} was not reconstructed: {answer}")
             self.scenes.on_failure(job, str(answer))
@@ -278,7 +277,8 @@ class Engine:
     # The journal and the submission
 
     def _read_records(self) -> list[PairRecord]:
-        if forgotten := self.journal.forget_changed(self.pairs):
+        has_scenes = self.recipe.scene is not None
+        if forgotten := self.journal.forget_outdated(self.pairs, has_scenes=has_scenes):
             text = f"images have changed since they were matched: {forgotten} pairs are matched anew"
             console.warn(text)
             self._fault(text)
@@ -318,7 +318,6 @@ class Engine:
             self._fault(f"the journal cannot be written ({error}): an interrupted run would have to do this again")
 
     def _explain(self, text: str) -> None:
-        """Note a decision, and why."""
         self._explanations.append(self._note(EventKind.PLAN, text))
 
     def _note(self, kind: EventKind, text: str) -> Event:

@@ -135,11 +135,9 @@ class JournalReader:
         self._db.close()
 
     def records(self) -> dict[int, PairRecord]:
-        """All records by pair index."""
         return {record.index: record for record in self._read("pair", PairRecord)}
 
     def scenes(self) -> tuple[SceneRecord, ...]:
-        """What came of each batch that was reconstructed, by name."""
         return tuple(self._read("scene", SceneRecord))
 
     def pairs(self) -> tuple[Pair, ...]:
@@ -240,10 +238,11 @@ class Journal(JournalReader):
                 self._claim(belongs_to, pairs, about or About())
             opened.pop_all()
 
-    def forget_changed(self, pairs: Sequence[Pair]) -> int:
+    def forget_outdated(self, pairs: Sequence[Pair], *, has_scenes: bool) -> int:
         """Forget the pairs of which an image has not the content any more that was matched; how many these are.
 
-        Where such an image was in a scene, the scene is forgotten, too.
+        The scenes of their batches are forgotten, too; all scenes if the run has none. Their pairs have the F of
+        their own matches again.
         """
         same = cache(is_unchanged)
         with undamaged(self.path), self._db:
@@ -254,8 +253,9 @@ class Journal(JournalReader):
             # Another run may have had more extra pairs for its scenes: the first of them are always the same.
             records = [record for index, record in known.items() if index < len(pairs)]
             changed = {r.index for r in records if not all(map(same, pairs[r.index].images, r.versions))}
-            outdated = {pairs[index].group for index in changed}
-            self._put(pair_row(replace(r, scene=None)) for r in records if pairs[r.index].group in outdated)
+            outdated = {pairs[index].group for index in (changed if has_scenes else range(len(pairs)))}
+            chosen = [record for record in records if record.scene and pairs[record.index].group in outdated]
+            self._put(pair_row(replace(record, scene=None)) for record in chosen)
             for statement, keys in (
                 ("DELETE FROM pair WHERE key = ?", changed),
                 ("DELETE FROM points WHERE pair = ?", changed),
@@ -263,14 +263,6 @@ class Journal(JournalReader):
             ):
                 self._db.executemany(statement, [(key,) for key in keys])
         return len(changed)
-
-    def forget_scenes(self) -> None:
-        """Forget all scenes: pairs have the F of their own matches again."""
-        if self.scenes():
-            with undamaged(self.path), self._db:
-                self._db.execute("BEGIN")
-                self._put(pair_row(replace(record, scene=None)) for record in self.records().values())
-                self._db.execute("DELETE FROM scene")
 
     def save(self, outcomes: Iterable[Outcome]) -> None:
         """Put down a job's outcomes, all or none.
@@ -285,7 +277,6 @@ class Journal(JournalReader):
         self._write(rows)
 
     def save_scene(self, scene: SceneRecord, records: Iterable[PairRecord]) -> None:
-        """Put down what came of a batch, and its pairs' records."""
         self._write([*map(pair_row, records), ("scene", (scene.batch, encode(scene)))])
 
     def save_task(self, key: str, value: bytes) -> None:

@@ -123,7 +123,6 @@ class Site:
         return partial(MatchRunner, assembly.pipeline, load=self.loads_matchers)
 
     def scene_worker(self) -> ThreadWorker:
-        """A worker for one batch."""
         return ProcessWorker("scene", SceneRunner, self.ring)
 
     def ring(self) -> None:

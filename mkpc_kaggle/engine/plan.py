@@ -245,7 +245,6 @@ class Plan:
         return min(left, allowance), allowance + hangs
 
     def _units(self, chunk: Chunk, now: float) -> tuple[Unit, ...]:
-        """The units for a chunk whose turn has come."""
         if chunk.units is not None:
             return self.usable(chunk.units)
         if chunk.phase is Phase.ESTIMATE:
@@ -256,7 +255,6 @@ class Plan:
         return units if chunk.phase is Phase.FILL else self._first
 
     def usable(self, units: Iterable[Unit]) -> tuple[Unit, ...]:
-        """The units that were not given up on all pairs."""
         return tuple(unit for unit in units if unit.name not in self.unusable)
 
     @property
@@ -282,7 +280,6 @@ class Plan:
         return count
 
     def _open(self, phase: Phase, now: float) -> None:
-        """Begin a phase."""
         self.phase, indices = phase, [index for index in self._order if index < self._row_count]
         if phase is Phase.ESTIMATE:
             indices = [index for index in self._order if index in self.outdated]
@@ -425,7 +422,6 @@ class Plan:
 
     @property
     def nothing_runs(self) -> bool:
-        """Whether every unit has been given up."""
         return not self.usable(self.recipe.units)
 
     @property

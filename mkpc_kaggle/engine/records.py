@@ -75,7 +75,6 @@ class PairRecord:
 
     @classmethod
     def of(cls, index: int, match: PairMatch, estimation: str = "") -> "PairRecord":
-        """The record of an estimated pair."""
         ends = np.cumsum([len(result.matches) for result in match.results])
         inliers = [int(mask.sum()) for mask in np.split(match.estimate.inliers, ends[:-1])]
         units = tuple(map(UnitRecord.of, match.results, inliers))
@@ -108,7 +107,6 @@ class PairRecord:
         return replace(later, **{name: getattr(self, name) for name in kept})
 
     def without_given_up(self) -> "PairRecord":
-        """The record without the units that were given up: they may be tried again."""
         units = tuple(unit for unit in self.units if not unit.failure.startswith(GIVEN_UP))
         if len(units) == len(self.units):
             return self

@@ -134,7 +134,6 @@ class Scenes:
         return SceneJob(batch, found, pairs, self._recipe, unit_results, export)
 
     def on_start(self, seconds: float) -> None:
-        """Record how long a process took to begin."""
         self._longest_start = max(self._longest_start, seconds)
 
     def on_result(self, job: SceneJob, record: SceneRecord) -> None:

@@ -132,8 +132,6 @@ def run_pairs(
     estimation = json.dumps(recipe.estimation())
     about = About(recipe.name, str(assembly.placement), limit, assembly.left_out, versions(), estimation)
     with Journal(session.work_dir, belongs_to, pairs=pairs, about=about, fresh=session.fresh) as journal:
-        if recipe.scene is None:
-            journal.forget_scenes()
         journal.note(Event(EventKind.START, budget.spent(), ""))
         engine = Engine(
             pairs,
@@ -155,7 +153,6 @@ def run_pairs(
 
 
 def site_of(pairs: Sequence[Pair], assembly: Assembly, session: Session) -> Site:
-    """Where the workers are that the session asks for."""
     if isinstance(session.workers, RayCluster):
         folders = dict.fromkeys(path.parent for pair in pairs for path in pair.images)
         return RaySite(assembly, session.workers, session.budget.clock, folders)
@@ -163,7 +160,7 @@ def site_of(pairs: Sequence[Pair], assembly: Assembly, session: Session) -> Site
 
 
 def versions() -> dict[str, str]:
-    """The versions of what the results may depend on, by name."""
+    """Of what the results may depend on, by name."""
     return {
         "mkpc_kaggle": __version__,
         "Python": platform.python_version(),

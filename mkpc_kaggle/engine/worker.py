@@ -66,7 +66,6 @@ class Executor:
 
 
 def failure_of(error: Exception) -> Failure:
-    """What an error makes of a job."""
     return Failure(CAUSES[failures.failure_of(error)], failures.reason_of(error))
 
 
@@ -155,7 +154,6 @@ class MatchRunner:
         return Outcome(self._record(job, number, pair), found)
 
     def _record(self, job: MatchJob, number: int, pair: PairMatch) -> PairRecord:
-        """The record of a pair with F from all of its matches."""
         start, recipe, asked = time.perf_counter(), self._pipeline.recipe, job.pairs[number]
         pair = with_estimate(pair, recipe, asked.model, asked.intrinsics)
         pair = replace(pair, estimate_seconds=time.perf_counter() - start)

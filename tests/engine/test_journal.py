@@ -194,7 +194,7 @@ def test_damage_anywhere_is_told_as_such(tmp_path: Path, damage: str) -> None:
 def test_pairs_that_no_test_set_has_are_damage(tmp_path: Path) -> None:
     damaged_journal(tmp_path, pairs_with("0", "-1"))
     with Journal(tmp_path, OURS) as journal, pytest.raises(UserError, match="damaged"):
-        journal.forget_changed(PAIRS)
+        journal.forget_outdated(PAIRS, has_scenes=True)
 
 
 def test_bytes_damaged_at_random_never_end_in_a_traceback(tmp_path: Path) -> None:

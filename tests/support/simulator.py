@@ -343,7 +343,7 @@ class MemoryJournal:
         self._results: dict[int, tuple[UnitResult, ...]] = {}
         self._scenes: dict[str, SceneRecord] = {}
 
-    def forget_changed(self, pairs: Sequence[Pair]) -> int:
+    def forget_outdated(self, pairs: Sequence[Pair], *, has_scenes: bool) -> int:
         return 0
 
     def records(self) -> dict[int, PairRecord]:
