@@ -250,7 +250,7 @@ class Engine:
         done, filling = (plan.done, plan.filling) if is_matching else (range(len(self.pairs)), ())
         while len(self._scene_places) < at_once and (batch := self.scenes.due(done, filling)) is not None:
             place = Place(f"scene of batch {batch}", self.site.scene_worker)
-            place.job = self.scenes.job(batch, self._results)
+            place.job = self.scenes.job(batch, self._known)
             self._tell(place.job, f"its cameras are reconstructed from {len(place.job.pairs)} pairs")
             self._scene_places.append(place)
             place.start(now, self.scenes.start_timeout(self.budget.left()))
@@ -290,18 +290,14 @@ class Engine:
         wanted = self.recipe.pair_estimation(self.pairs[record.index].intrinsics)
         return record.matches > 0 and record.estimation != wanted
 
-    def _results(self, index: int) -> tuple[UnitResult, ...]:
+    def _known(self, index: int) -> PairMatch:
         """What earlier jobs found on a pair."""
+        record, results = self.plan.records[index], tuple[UnitResult, ...]()
         try:
-            return self.journal.results(self.plan.records[index], self._units)
+            results = self.journal.results(record, self._units)
         except UserError as error:  # without them a job gains nothing, and the F stays
             self._fault(str(error))
-            return ()
-
-    def _known(self, index: int) -> PairMatch:
-        """What later jobs on a pair build on."""
-        record = self.plan.records[index]
-        return PairMatch(self._results(index), sizes=record.sizes, focals=record.focals)
+        return PairMatch(results, sizes=record.sizes, versions=record.versions, focals=record.focals)
 
     def _keep(self, outcomes: Sequence[Outcome]) -> None:
         """Put outcomes into the journal; the scenes of their batches are out of date."""

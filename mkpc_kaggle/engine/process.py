@@ -132,17 +132,15 @@ class ProcessWorker(ThreadWorker):
         except (EOFError, OSError):
             process.join(timeout=EXIT_TIMEOUT_S)
             self._pipe.close()
-            return Failure(Cause.DIED, how_it_ended(process))
+            return Failure(Cause.DIED, how_it_ended(process.exitcode))
         except Exception as error:  # what cannot be pickled
             process.kill()
             return failure_of(error)
         return answer
 
 
-def how_it_ended(process: SpawnProcess) -> str:
-    """The signal that ended a process, or its exit status; for messages."""
-    code = process.exitcode
-    return f"signal {signal.Signals(-code).name}" if code is not None and code < 0 else f"exit status {code}"
+def how_it_ended(code: int | None) -> str:
+    return f"exit status {code}" if code is None or code >= 0 else f"signal {signal.Signals(-code).name}"
 
 
 _environment = threading.Lock()
@@ -174,8 +172,7 @@ def serve(pipe: Connection) -> None:
         maker: Callable[[], Runner] = pipe.recv()  # what cannot be unpickled is an answer, too
         return maker()
 
-    end_when_parent_is_killed()
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    end_with_parent()
     executor = Executor()
     with unblocked(), suppress(EOFError, OSError):  # the parent is gone
         answer = executor.load(make)
@@ -184,15 +181,17 @@ def serve(pipe: Connection) -> None:
             pipe.send(executor.run(*pipe.recv()))
 
 
-def end_when_parent_is_killed() -> None:
-    """Let Linux kill this process with the thread that started it: that ends a process that is stopped, too."""
+def end_with_parent() -> None:
+    """From now on this process ends with its parent, however that ends and whatever is computed here.
+
+    On Linux it ends with the thread that started it, even if it is stopped.
+    """
     with suppress(OSError, AttributeError):  # elsewhere
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
 
+    def wait() -> None:
+        if parent := multiprocessing.parent_process():
+            parent.join()
+            os._exit(1)
 
-def _end_with_parent() -> None:
-    """End this process when its parent has ended, however that ended and whatever is computed here."""
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
+    threading.Thread(target=wait, daemon=True).start()

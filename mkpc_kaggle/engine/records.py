@@ -102,8 +102,8 @@ class PairRecord:
         return replace(self, regions=self.regions or former.regions, scene=former.scene, **seconds)
 
     def estimated_anew(self, later: "PairRecord") -> "PairRecord":
-        """The record with the F of a job without units; its images and its units' seconds stay."""
-        kept = ("regions", "decode_seconds", "cluster_seconds", "scene", "sizes", "versions", "focals")
+        """The record with the F of a job without units."""
+        kept = ("regions", "decode_seconds", "cluster_seconds", "scene")
         return replace(later, **{name: getattr(self, name) for name in kept})
 
     def without_given_up(self) -> "PairRecord":

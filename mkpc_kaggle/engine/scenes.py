@@ -13,8 +13,7 @@ from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.jobs import SceneJob
 from mkpc_kaggle.engine.places import START_TIMEOUT_S
 from mkpc_kaggle.engine.records import PairRecord, SceneRecord
-from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.pipeline.pair import UnitResult
+from mkpc_kaggle.pipeline.pair import PairMatch
 from mkpc_kaggle.recipe import Recipe, SceneConfig
 from mkpc_kaggle.scene.densify import extra_pairs
 from mkpc_kaggle.scene.export import Export
@@ -125,10 +124,10 @@ class Scenes:
                 return name
         return None
 
-    def job(self, batch: str, results_of: Callable[[int], tuple[UnitResult, ...]]) -> SceneJob:
-        """The job that reconstructs a batch; ``results_of`` gives what was found on a pair."""
+    def job(self, batch: str, known: Callable[[int], PairMatch]) -> SceneJob:
+        """The job that reconstructs a batch; ``known`` gives what was found on a pair."""
         found = tuple(index for index in self.batches[batch] if self._records[index].sizes)
-        pairs = tuple(self._batch_pair(index, results_of(index)) for index in found)
+        pairs = tuple(self._batch_pair(index, known(index)) for index in found)
         self._running.add(batch)
         unit_results, export = self._unit_count(batch), self._exports.get(batch)
         return SceneJob(batch, found, pairs, self._recipe, unit_results, export)
@@ -185,10 +184,9 @@ class Scenes:
     def _unit_count(self, batch: str) -> int:
         return sum(len(self._records[index].units) for index in self.batches[batch])
 
-    def _batch_pair(self, index: int, results: Sequence[UnitResult]) -> BatchPair:
-        record = self._records[index]
-        images = zip(self._pairs[index].images, record.versions, record.sizes, record.focals, strict=True)
+    def _batch_pair(self, index: int, found: PairMatch) -> BatchPair:
+        images = zip(self._pairs[index].images, found.versions, found.sizes, found.focals, strict=True)
         image0, image1 = (BatchImage(path.stem, version, size, focal) for path, version, size, focal in images)
-        matches = Matches.concatenate(result.matches for result in results)
+        record = self._records[index]
         own = None if record.failure else record.pair_fundamental
-        return BatchPair(image0, image1, matches, own, tracks_of(results))
+        return BatchPair(image0, image1, found.matches, own, tracks_of(found.results))
