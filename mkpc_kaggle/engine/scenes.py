@@ -73,7 +73,6 @@ class Scenes:
         made: Iterable[SceneRecord],
         exports: Mapping[str, Export] = MappingProxyType({}),
     ) -> None:
-        self._exports = exports
         # Where files of a scene were removed, it is made again.
         self.made = {
             scene.batch: scene
@@ -81,7 +80,7 @@ class Scenes:
             if scene.batch not in exports or exports[scene.batch].has_files(scene.models)
         }
         self.batches = batches_of(pairs) if recipe.scene is not None else {}
-        self._pairs, self._recipe, self._records = pairs, recipe, records
+        self._pairs, self._recipe, self._records, self._exports = pairs, recipe, records, exports
         self._batch_of = {index: name for name, indices in self.batches.items() for index in indices}
         self._outdated = {name for name in self.batches if self._is_outdated(name)}
         self._running: set[str] = set()

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from importlib import metadata
 from math import isfinite
 from pathlib import Path
+from tempfile import TemporaryFile
 from types import FrameType
 from typing import Self
 
@@ -108,11 +109,9 @@ def require_writable(output: Path) -> None:
     """Make the file's directory if need be; :class:`UserError` where the file cannot be written, or replaced."""
     if output.is_char_device() or output.is_block_device():
         raise UserError(f"--output {output} is a device; name a file")
-    probe = output.with_name(f".{output.name}.probe")
     with writing(f"--output {output}"):
         output.parent.mkdir(parents=True, exist_ok=True)
-        probe.touch()
-        probe.unlink()
+        TemporaryFile(dir=output.parent).close()
 
 
 def run_pairs(
@@ -189,11 +188,9 @@ class Watchdog:
     """
 
     def __init__(self, budget: Budget, interrupt: Interrupt) -> None:
-        too_late = "the time limit passed before the first results were written"
-        self.save: Callable[[], str] = lambda: too_late
+        self.save: Callable[[], str] = lambda: "the time limit passed before the first results were written"
         self.status = 0
-        self._budget = budget
-        self._interrupt = interrupt
+        self._budget, self._interrupt = budget, interrupt
         self._over = threading.Event()
 
     def __enter__(self) -> Self:
