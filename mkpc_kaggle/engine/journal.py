@@ -172,17 +172,8 @@ class JournalReader:
         """What the units of a record found, for a later job to build on; ``units`` by name."""
         with undamaged(self.path):
             points = self._points(record.index)
-            return tuple(
-                UnitResult(
-                    units[found.unit],
-                    from_blob(points.get(found.unit)),
-                    found.encode_seconds,
-                    found.match_seconds,
-                    found.failure,
-                    note=found.note,
-                )
-                for found in record.units
-            )
+            had = ((each, from_blob(points.get(each.unit))) for each in record.units)
+            return tuple(each.result(units[each.unit], matches) for each, matches in had)
 
     def _points(self, index: int) -> dict[str, bytes]:
         return dict(self._db.execute("SELECT unit, points FROM points WHERE pair = ?", [index]))

@@ -2,9 +2,11 @@
 
 It looks at a job's worth of pairs at a time, so that a hundred thousand pairs cost no more to plan than ten.
 
-Three places decide that a unit no longer fits: :meth:`Plan._fit`, for all pairs, when a chunk is deepened;
-:meth:`Plan.next`, for a job that could not end in time; and :meth:`MatchRunner.run
-<mkpc_kaggle.engine.worker.MatchRunner.run>`, in the worker, for a minibatch of a job that is late.
+Three places decide that a unit no longer fits:
+
+- :meth:`Plan._fit`, for all pairs: how many units they can have in the time left, each time a chunk is deepened;
+- :meth:`Plan.next`, for a job: units that would not end in time wait for a moment when scenes need less;
+- :meth:`mkpc_kaggle.engine.worker.MatchRunner.run`, in a worker: a job that is late begins no further unit.
 """
 
 from collections import Counter, deque

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Matrix3, Size
+from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL, NO_STATS, EstimateStats
 from mkpc_kaggle.pipeline.pair import PairMatch, Regions, UnitResult
@@ -38,6 +39,10 @@ class UnitRecord:
     def of(cls, found: UnitResult, inliers: int) -> "UnitRecord":
         unit, seconds = found.unit, (found.encode_seconds, found.match_seconds)
         return cls(unit.name, unit.stage, len(found.matches), inliers, *seconds, found.failure, found.note)
+
+    def result(self, unit: Unit, matches: Matches) -> UnitResult:
+        """What the record was made of."""
+        return UnitResult(unit, matches, self.encode_seconds, self.match_seconds, self.failure, note=self.note)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
