@@ -382,7 +382,7 @@ class Plan:
             self._explain(f"pair {record.index} keeps the F it has: its points cannot be read")
             return None
         self.estimated_anew += 1
-        return self._put(former.estimated_anew(record))
+        return self._put(record.after(former))
 
     def _give_up(self, index: int, unit: Unit, failure: Failure) -> Outcome:
         """The pair keeps the F that it has; the unit is marked as had, with the reason."""

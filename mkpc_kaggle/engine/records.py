@@ -106,11 +106,6 @@ class PairRecord:
         seconds = {part: getattr(former, part) + getattr(self, part) for part in parts}
         return replace(self, regions=self.regions or former.regions, scene=former.scene, **seconds)
 
-    def estimated_anew(self, later: "PairRecord") -> "PairRecord":
-        """The record with the F of a job without units."""
-        kept = ("regions", "decode_seconds", "cluster_seconds", "scene")
-        return replace(later, **{name: getattr(self, name) for name in kept})
-
     def without_given_up(self) -> "PairRecord":
         units = tuple(unit for unit in self.units if not unit.failure.startswith(GIVEN_UP))
         if len(units) == len(self.units):
