@@ -51,7 +51,7 @@ def synthetic_scene(
     pairs: int | None = None,
     *,
     points: int = 1500,
-    noise: float = 0.4,
+    noise: float | Sequence[float] = 0.4,
     outliers: float = 0.2,
     seed: int = 0,
     prefix: str = "",
@@ -59,9 +59,9 @@ def synthetic_scene(
 ) -> SyntheticScene:
     """Cameras on an arc before a front with depth; ``pairs`` of all pairs, chosen evenly, or all of them.
 
-    A point is where the image's detector finds it, ``noise`` pixels off in each coordinate, and the same in every
-    pair of the image but for a twentieth of a pixel. ``outliers`` is the share of matches between other points.
-    Without ``focals``, in pixels, each camera has a focal length of its own.
+    A point is where the image's detector finds it, ``noise`` pixels off in each coordinate (a number, or one for
+    each image), and the same in every pair of the image but for a twentieth of a pixel. ``outliers`` is the share
+    of matches between other points. Without ``focals``, in pixels, each camera has a focal length of its own.
     """
     rng = np.random.default_rng(seed)
     world = front(rng, points)
@@ -104,7 +104,7 @@ def batch_of(
     world: np.ndarray,
     cameras: Sequence[Camera],
     ends: Iterable[tuple[int, int]],
-    noise: float,
+    noise: float | Sequence[float],
     outliers: float,
     *,
     prefix: str = "",
@@ -112,7 +112,8 @@ def batch_of(
 ) -> SyntheticScene:
     """Images of these cameras, and the pairs at these places among them."""
     images = tuple(BatchImage(f"{prefix}{n:04}", f"digest of {prefix}{n:04}", SIZE) for n in range(len(cameras)))
-    seen = [see(rng, camera, world, noise) for camera in cameras]
+    noises = np.broadcast_to(noise, len(cameras)).tolist()
+    seen = [see(rng, camera, world, own) for camera, own in zip(cameras, noises, strict=True)]
     pairs = tuple(
         BatchPair(images[first], images[second], match(rng, seen[first], seen[second], outliers, most))
         for first, second in ends
