@@ -4,19 +4,20 @@ A pipe that nobody reads and a stopped terminal (Ctrl-S) block a write for ever,
 wants the stream's lock. A terminal that goes away makes it fail (EIO).
 """
 
+import io
 import queue
 import sys
 import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from typing import Any, TextIO
+from typing import TextIO
 
 MAX_WAITING = 1000  # texts: some minutes of a busy bar
 DRAIN_S = 2.0  # that the end waits for what is still to be printed
 
 
-class QueuedStream:
+class QueuedStream(io.TextIOBase):
     """Prints to ``stream`` in a daemon thread; texts that do not fit into its queue are dropped."""
 
     def __init__(self, stream: TextIO) -> None:
@@ -25,12 +26,18 @@ class QueuedStream:
         self.is_stuck = False
         threading.Thread(target=self._print, name="print", daemon=True).start()
 
-    def __getattr__(self, name: str) -> Any:
-        """All but writing is as with ``stream``."""
-        return getattr(self._stream, name)
+    @property
+    def encoding(self) -> str:  # type: ignore[override]
+        return self._stream.encoding
 
-    def flush(self) -> None:
-        """Nothing to do: each text is flushed when it is printed."""
+    def fileno(self) -> int:
+        return self._stream.fileno()
+
+    def isatty(self) -> bool:
+        return self._stream.isatty()
+
+    def writable(self) -> bool:
+        return True
 
     def write(self, text: str) -> int:
         with suppress(queue.Full):
