@@ -66,9 +66,9 @@ def run(pairs: Sequence[Pair], assembly: Assembly, directory: Path) -> TimeSpent
     results: list[tuple[float, MatchResult]] = []
     whole = Plan.on_result
 
-    def on_result(plan: Plan, job: MatchJob, result: MatchResult, seconds: float, now: float) -> list[Outcome]:
-        results.append((now, result))
-        return whole(plan, job, result, seconds, now)
+    def on_result(plan: Plan, job: MatchJob, result: MatchResult, seconds: float) -> list[Outcome]:
+        results.append((time.monotonic(), result))
+        return whole(plan, job, result, seconds)
 
     session = Session(directory, Budget(time.monotonic()), Interrupt(), progress=False)
     with patch.object(Plan, "on_result", on_result):

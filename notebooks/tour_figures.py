@@ -335,4 +335,4 @@ def _far_apart(points: Points, count: int) -> NDArray[np.intp]:
 
 def draw_scene(name: str, scenes: Sequence[Reconstruction]) -> "Figure":
     """The cameras and points of the largest model of a batch, from above and from the side."""
-    return draw_cameras(SceneRecord.of(name, scenes, unit_results=0, seconds=0.0))
+    return draw_cameras(SceneRecord.of(name, scenes))

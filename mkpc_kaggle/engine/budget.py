@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from math import inf
 from pathlib import Path
+from statistics import median_low
 
 from mkpc_kaggle.errors import UserError
 
@@ -55,15 +56,12 @@ class Budget:
     _writes: deque[float] = field(default_factory=lambda: deque(maxlen=5))
 
     def note_write(self, seconds: float) -> None:
-        """Record how long it took to write the submission."""
         self._writes.append(seconds)
 
     @property
     def writing(self) -> float:
         """Seconds that the next write may take, by the median of the latest: a single slow write is forgotten."""
-        if not self._writes:
-            return 0.0
-        median = sorted(self._writes)[(len(self._writes) - 1) // 2]
+        median = median_low(self._writes) if self._writes else 0.0
         return min(WRITE_MARGIN * median, MAX_WRITE_SHARE * self.time_limit)
 
     @property
@@ -97,7 +95,6 @@ class Budget:
         return max(0.0, self.stop_units - self.clock())
 
     def spent(self) -> float:
-        """Seconds since the start."""
         return self.clock() - self.started
 
 
@@ -109,13 +106,11 @@ def monotonic_of(epoch: float) -> float:
     a moment in the future.
     """
     ago = time.time() - epoch
-    if -MAX_STEP_BACK_S < ago < 0:
-        ago = 0.0
-    if not 0 <= ago < inf:
+    if not -MAX_STEP_BACK_S < ago < inf:
         raise UserError(
             f"--started-at {epoch:g} is not a moment of the past; it is in seconds since 1970 (date +%s)"
         )
-    return time.monotonic() - ago
+    return time.monotonic() - max(0.0, ago)
 
 
 def process_started() -> float:
@@ -125,9 +120,8 @@ def process_started() -> float:
     """
     now = time.monotonic()
     try:
-        fields = Path("/proc/self/stat").read_text().rpartition(")")[2].split()
-        began = int(fields[19]) / os.sysconf("SC_CLK_TCK")
-        age = time.clock_gettime(time.CLOCK_BOOTTIME) - began
+        ticks = Path("/proc/self/stat").read_text().rpartition(")")[2].split()[19]
+        age = time.clock_gettime(time.CLOCK_BOOTTIME) - int(ticks) / os.sysconf("SC_CLK_TCK")
     except (OSError, AttributeError, ValueError, IndexError):
         return now
     return now - age if 0 <= age < MAX_PROCESS_AGE_S else now

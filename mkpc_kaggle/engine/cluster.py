@@ -79,21 +79,20 @@ class RaySite(Site):
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
         os.environ.setdefault("RAY_ENABLE_AUTO_CONNECT", "0")
         try:
-            import ray  # noqa: F401
+            import ray
         except ModuleNotFoundError as error:
             told = '--workers ray needs Ray, which is not installed: pip install "mkpc-kaggle[ray]"'
             raise UserError(told) from error
+        self._ray = ray
         self._assembly, self._cluster, self._needed = assembly, cluster, (*assembly.weight_paths, *folders)
         self._has_joined = False
         self._workers: list[RayWorker] = []
 
     def open(self) -> None:
-        import ray
-
-        self._has_joined = not ray.is_initialized()
+        self._has_joined = not self._ray.is_initialized()
         if self._has_joined:
-            join(self._cluster)
-        machines = [node for node in ray.nodes() if node["Alive"] and node["Resources"].get("CPU", 0) >= 1]
+            join(self._ray, self._cluster)
+        machines = [node for node in self._ray.nodes() if node["Alive"] and node["Resources"].get("CPU", 0) >= 1]
         self.scenes_at_once = max(1, len(machines))
         gpus = sum(int(node["Resources"].get("GPU", 0)) for node in machines)
         if gpus and self._assembly.device != "cpu":
@@ -112,37 +111,34 @@ class RaySite(Site):
         return self._worker("scene", SceneRunner, scheduling_strategy="SPREAD")
 
     def close(self) -> None:
-        import ray
-
-        if self._has_joined and ray.is_initialized():
+        if self._has_joined and self._ray.is_initialized():
             until = time.monotonic() + EXIT_TIMEOUT_S
             for worker in self._workers:
                 worker.join(until)
-            ray.shutdown()
+            self._ray.shutdown()
 
     def _worker(self, name: str, make: Callable[[], Runner], threads: int = 0, **where: Any) -> "RayWorker":
         make = partial(make_alike, make, __version__, self._needed, threads)
-        self._workers.append(RayWorker(name, make, self.ring, {"num_cpus": 0, **where}))
+        self._workers.append(RayWorker(name, make, self.ring, self._ray, {"num_cpus": 0, **where}))
         return self._workers[-1]
 
 
 class RayWorker(ThreadWorker):
     """An actor that Ray places ``where`` there is room; the thread waits for its answers."""
 
+    _actor: Any = None
+
     def __init__(
-        self, name: str, make: Callable[[], Runner], on_answer: Callable[[], None], where: dict[str, Any]
+        self, name: str, make: Callable[[], Runner], on_answer: Callable[[], None], ray: Any, where: dict[str, Any]
     ) -> None:
         super().__init__(name, make, on_answer)
-        self._where = where
-        self._actor: Any = None
+        self._ray, self._where = ray, where
 
     def kill(self) -> None:
-        import ray
-
         super().kill()
-        with suppress(ray.exceptions.RayError, ValueError):  # the cluster may be gone, its actors with it
+        with suppress(self._ray.exceptions.RayError, ValueError):  # the cluster may be gone, its actors with it
             if self._actor is not None:
-                ray.kill(self._actor)
+                self._ray.kill(self._actor)
 
     def join(self, until: float) -> None:
         """Wait until the killed worker's thread asks Ray for nothing more, or a moment of the monotonic clock."""
@@ -150,9 +146,7 @@ class RayWorker(ThreadWorker):
             self._thread.join(max(0.0, until - time.monotonic()))
 
     def _load(self) -> Answer:
-        import ray
-
-        self._actor = ray.remote(Executor).options(**self._where).remote()
+        self._actor = self._ray.remote(Executor).options(**self._where).remote()
         if self._killed:
             self.kill()
         return self._get(self._actor.load.remote(self._make))
@@ -161,12 +155,10 @@ class RayWorker(ThreadWorker):
         return self._get(self._actor.run.remote(job, seconds))
 
     def _get(self, coming: Any) -> Answer:
-        import ray
-
         try:
-            answer: Answer = ray.get(coming)
-        except ray.exceptions.RayError as error:
-            is_memory = isinstance(error, ray.exceptions.OutOfMemoryError)
+            answer: Answer = self._ray.get(coming)
+        except self._ray.exceptions.RayError as error:
+            is_memory = isinstance(error, self._ray.exceptions.OutOfMemoryError)
             return Failure(Cause.OUT_OF_MEMORY if is_memory else Cause.DIED, message_of(error))
         return answer
 
@@ -184,10 +176,8 @@ def make_alike(make: Callable[[], Runner], version: str, paths: tuple[Path, ...]
     return make()
 
 
-def join(cluster: RayCluster) -> None:
+def join(ray: Any, cluster: RayCluster) -> None:
     """Connect to the cluster; raises :class:`UserError` where that fails."""
-    import ray
-
     options: dict[str, Any] = {"include_dashboard": False}
     if cluster.address:
         cluster.require_reachable()

@@ -21,17 +21,14 @@ LINE_INTERVAL_S = 30.0  # between lines of progress where a bar cannot be drawn 
 
 
 def say(text: str) -> None:
-    """Print lines for the user to standard output."""
     _print(text, sys.stdout)
 
 
 def warn(text: str) -> None:
-    """Print a warning to standard error."""
     _print(f"warning: {text}", sys.stderr)
 
 
 def complain(text: str) -> None:
-    """Print an error to standard error."""
     _print(f"error: {text}", sys.stderr)
 
 
@@ -61,10 +58,8 @@ def redraws(stream: TextIO) -> bool:
 class Progress:
     """How many pairs (``unit``) of a phase are done: a bar on a terminal, a line now and then anywhere else."""
 
-    def __init__(self, budget: Budget, stream: TextIO | None = None, unit: str = "pair") -> None:
-        self._unit = unit
-        self._budget = budget
-        self._stream = stream or sys.stderr
+    def __init__(self, budget: Budget, stream: TextIO | None, unit: str = "pair") -> None:
+        self._budget, self._stream, self._unit = budget, stream, unit
         self._bar: tqdm[Any] | None = None
         self._phase = self._waiting = ""
         self._written = budget.clock()
@@ -85,7 +80,6 @@ class Progress:
             self.close()
 
     def note(self, text: str) -> None:
-        """A line of its own."""
         with suppress(OSError, ValueError):
             if self._stream is not None:
                 tqdm.write(text, file=self._stream)  # a bar goes on below it

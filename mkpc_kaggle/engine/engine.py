@@ -1,6 +1,7 @@
 """The engine: one loop on one thread that hands out jobs, takes in answers, keeps the journal, and publishes."""
 
 import sqlite3
+import sys
 import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -22,13 +23,13 @@ from mkpc_kaggle.engine.jobs import (
     SceneJob,
     visiting_order,
 )
-from mkpc_kaggle.engine.journal import EventKind, Journal
+from mkpc_kaggle.engine.journal import Event, EventKind, Journal
 from mkpc_kaggle.engine.places import Place, Site
-from mkpc_kaggle.engine.plan import Explanation, Plan
+from mkpc_kaggle.engine.plan import Plan
 from mkpc_kaggle.engine.records import PairRecord, SceneRecord
 from mkpc_kaggle.engine.scenes import Scenes, extra_pairs_of
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.pipeline.pair import UnitResult
+from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult
 from mkpc_kaggle.recipe import Recipe
 from mkpc_kaggle.scene.export import Export
 from mkpc_kaggle.scene.reconstruct import Solution
@@ -61,7 +62,7 @@ class RunReport:
     seconds: float
     resumed: int
     faults: tuple[str, ...]
-    explanations: tuple[Explanation, ...] = ()
+    explanations: tuple[Event, ...] = ()  # decisions of the plan
     unwritten: str = ""
     scenes: tuple[SceneRecord, ...] = ()
     units_run: int = 0
@@ -97,14 +98,15 @@ class Engine:
         self.faults: list[str] = []
         self.unwritten = ""
         self._units = {unit.name: unit for unit in recipe.units}
-        self._explained = self._units_run = 0
+        self._explanations: list[Event] = []
+        self._units_run = 0
         self._published = budget.clock()
-        self._progress = console.Progress(budget) if progress else None
+        self._progress = console.Progress(budget, sys.stderr if progress else None)
         self._publishing = threading.Lock()
         self._has_ended = self._has_loaded = False
         order, records = visiting_order(self.pairs), self._read_records()
         outdated = [record.index for record in records if self._is_outdated(record)]
-        self.plan = Plan(order, self.row_count, recipe, records, budget, minibatch, outdated)
+        self.plan = Plan(order, self.row_count, recipe, records, budget, self._explain, minibatch, outdated)
         site.loads_matchers = any(record.lacking(recipe.units) for record in records)
         self.scenes = Scenes(self.pairs, recipe, self.plan.records, journal.scenes(), exports)
         self._scene_places: list[Place] = []
@@ -122,18 +124,16 @@ class Engine:
             for place in self._places:
                 place.kill()
             self.site.close()
-            if self._progress is not None:
-                self._progress.close()
+            self._progress.close()
             self._publish()
             self._has_ended = True
-            self._note_explanations()
         return RunReport(
             tuple(self.records),
             self._ending(),
             self.budget.spent(),
             resumed,
             tuple(self.faults),
-            tuple(self.plan.explanations),
+            tuple(self._explanations),
             self.unwritten,
             self.scenes.report(),
             self._units_run,
@@ -168,8 +168,7 @@ class Engine:
     # The loop
 
     def _loop(self) -> None:
-        self.plan.advance(now := self.budget.clock())
-        if self.plan.has_work(now) or self.scenes.due(range(len(self.pairs))) is not None:
+        if self.plan.advance(self.budget.clock()) or self.scenes.due(range(len(self.pairs))) is not None:
             self.site.open()
         while not self.interrupt.is_set() and (now := self.budget.clock()) < self.budget.stop_waiting:
             for place in self._places:
@@ -188,22 +187,18 @@ class Engine:
     def _hand_out(self, now: float) -> None:
         """A worker for each place that has none, and a job for each worker that is idle."""
         self.plan.reserve = self.scenes.reserve(self.site.scenes_at_once)
-        self.plan.advance(now)
         self.plan.workers = max(1, sum(not place.closed for place in self.site.places))
         for place in self.site.places:
-            if place.may_start(now) and self.plan.has_work(now):
+            if place.may_start(now) and self.plan.advance(now):
                 place.start(now)
             elif place.is_idle and (job := self.plan.next(now, place.name, cautious=place.losses > 0)):
                 pairs = tuple(self.pairs[index] for index in job.indices)
-                known = tuple(map(self._results, job.indices))
-                records = [self.plan.records[index] for index in job.indices]
-                sizes, focals = (tuple(r.sizes for r in records), tuple(r.focals for r in records))
-                job = replace(job, pairs=pairs, known=known, sizes=sizes, focals=focals)
+                job = replace(job, pairs=pairs, known=tuple(map(self._known, job.indices)))
                 place.submit(job, job.seconds, job.time_limit, now)
 
     def _is_matching(self, now: float) -> bool:
         """Whether a job is under way, or will be when a worker has started."""
-        places, may_begin = self.site.places, self.plan.has_work(now)
+        places, may_begin = self.site.places, self.plan.advance(now)
         return any(place.job is not None or (place.is_starting and may_begin) for place in places)
 
     def _take_answer(self, place: Place, now: float) -> None:
@@ -222,16 +217,14 @@ class Engine:
             elif isinstance(answer, Failure):
                 self._fault(f"a job was lost on {place.name}: {answer}" if job else f"{place.name}: {answer}")
                 if isinstance(job, MatchJob):
-                    self._keep(self.plan.on_failure(job, answer, place.name, now))
+                    self._keep(self.plan.on_failure(job, answer, place.name))
                 if place.closed:
-                    self.plan.explain(now, f"no worker is started any more on {place.closed}")
+                    self._explain(f"no worker is started any more on {place.closed}")
             elif isinstance(job, MatchJob) and isinstance(answer, MatchResult):
                 self._units_run += len(answer.results)
-                self._keep(self.plan.on_result(job, answer, seconds, now))
+                self._keep(self.plan.on_result(job, answer, seconds))
                 self._note(EventKind.JOB, f"{job.phase} {len(job.indices)} pairs {answer.unit_seconds:.3f} s")
-            self._note_explanations()
-            if self._progress is not None:
-                self._progress.show(*self.plan.progress)
+            self._progress.show(*self.plan.progress)
 
     def _fall_back(self, now: float) -> None:
         """Go on elsewhere when the last place is closed, or had to give up every unit."""
@@ -244,7 +237,8 @@ class Engine:
             for place in self.site.places:
                 place.kill()
             self.site.places, self.site.fallback = self.site.fallback, []
-            self._keep(self.plan.restart(now, text))
+            self._explain(text)
+            self._keep(self.plan.restart())
         elif self._is_closed and not self._has_loaded:
             raise UserError(f"no worker could be started: {reason}")
 
@@ -256,20 +250,19 @@ class Engine:
         done, filling = (plan.done, plan.filling) if is_matching else (range(len(self.pairs)), ())
         while len(self._scene_places) < at_once and (batch := self.scenes.due(done, filling)) is not None:
             place = Place(f"scene of batch {batch}", self.site.scene_worker)
-            place.job = self.scenes.job(batch, self._results)
+            place.job = self.scenes.job(batch, self._known)
             self._tell(place.job, f"its cameras are reconstructed from {len(place.job.pairs)} pairs")
             self._scene_places.append(place)
             place.start(now, self.scenes.start_timeout(self.budget.left()))
 
     def _take_scene(self, job: SceneJob, answer: Answer, seconds: float) -> None:
-        """Record what came of a batch."""
-        if not isinstance(answer, Solution):
+        if isinstance(answer, Failure):
             self._fault(f"batch {job.batch} was not reconstructed: {answer}")
             self.scenes.on_failure(job, str(answer))
             return
-        records = self.plan.records
-        record = SceneRecord.of(job.batch, answer.reconstructions, job.unit_results, seconds)
-        record = replace(record, estimation=job.estimation)
+        assert isinstance(answer, Solution)
+        records, estimation = self.plan.records, self.recipe.scene_estimation
+        record = SceneRecord.of(job.batch, answer.reconstructions, job.unit_results, seconds, estimation)
         self.scenes.on_result(job, record)
         for index, choice in zip(job.indices, answer.choices, strict=True):
             records[index] = replace(records[index], scene=choice)
@@ -284,7 +277,8 @@ class Engine:
     # The journal and the submission
 
     def _read_records(self) -> list[PairRecord]:
-        if forgotten := self.journal.forget_changed(self.pairs):
+        has_scenes = self.recipe.scene is not None
+        if forgotten := self.journal.forget_outdated(self.pairs, has_scenes=has_scenes):
             text = f"images have changed since they were matched: {forgotten} pairs are matched anew"
             console.warn(text)
             self._fault(text)
@@ -296,13 +290,14 @@ class Engine:
         wanted = self.recipe.pair_estimation(self.pairs[record.index].intrinsics)
         return record.matches > 0 and record.estimation != wanted
 
-    def _results(self, index: int) -> tuple[UnitResult, ...]:
+    def _known(self, index: int) -> PairMatch:
         """What earlier jobs found on a pair."""
+        record, results = self.plan.records[index], tuple[UnitResult, ...]()
         try:
-            return self.journal.results(self.plan.records[index], self._units)
+            results = self.journal.results(record, self._units)
         except UserError as error:  # without them a job gains nothing, and the F stays
             self._fault(str(error))
-            return ()
+        return PairMatch(results, sizes=record.sizes, versions=record.versions, focals=record.focals)
 
     def _keep(self, outcomes: Sequence[Outcome]) -> None:
         """Put outcomes into the journal; the scenes of their batches are out of date."""
@@ -318,17 +313,17 @@ class Engine:
         except (sqlite3.Error, ValueError) as error:
             self._fault(f"the journal cannot be written ({error}): an interrupted run would have to do this again")
 
-    def _note_explanations(self) -> None:
-        for explanation in self.plan.explanations[self._explained :]:
-            self.journal.note(EventKind.PLAN, explanation.seconds, explanation.text)
-        self._explained = len(self.plan.explanations)
+    def _explain(self, text: str) -> None:
+        self._explanations.append(self._note(EventKind.PLAN, text))
 
-    def _note(self, kind: EventKind, text: str) -> None:
-        self.journal.note(kind, self.budget.spent(), text)
+    def _note(self, kind: EventKind, text: str) -> Event:
+        event = Event(kind, self.budget.spent(), text)
+        self.journal.note(event)
+        return event
 
     def _tell(self, job: SceneJob, text: str) -> None:
         """Show a step of a reconstruction that may take minutes."""
-        if self._progress is not None and len(job.pairs) >= MIN_TOLD_PAIRS:
+        if len(job.pairs) >= MIN_TOLD_PAIRS:
             self._progress.note(f"batch {job.batch}: {text}")
 
     def _fault(self, what: str) -> None:

@@ -6,11 +6,8 @@ from enum import StrEnum
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.records import PairRecord
-from mkpc_kaggle.geometry.coordinates import Size
-from mkpc_kaggle.geometry.focal_prior import FocalConfig
-from mkpc_kaggle.geometry.robust import RobustConfig
-from mkpc_kaggle.pipeline.pair import UnitResult
-from mkpc_kaggle.recipe import SceneConfig, Unit
+from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult
+from mkpc_kaggle.recipe import Recipe, Unit
 from mkpc_kaggle.scene.export import Export
 from mkpc_kaggle.scene.reconstruct import Solution
 from mkpc_kaggle.scene.view_graph import BatchPair
@@ -30,7 +27,7 @@ class Phase(StrEnum):
 class MatchJob:
     """Run ``units`` on the pairs of ``indices``; what a pair has had, ``known``, is left out.
 
-    A job without units makes F of what is known alone: of its images only ``sizes`` and ``focals`` are needed.
+    A job without units makes F of what is known alone: no image is read for it.
 
     ``expected`` are the seconds within which each unit most likely ends on a pair. Units may begin in the first
     ``seconds`` of the job if they are expected to end in them. After ``time_limit`` seconds without an answer the
@@ -45,33 +42,28 @@ class MatchJob:
     time_limit: float
     is_retry: bool = False
     pairs: tuple[Pair, ...] = ()
-    known: tuple[tuple[UnitResult, ...], ...] = ()
-    sizes: tuple[tuple[Size, ...], ...] = ()
-    focals: tuple[tuple[float, ...], ...] = ()
+    known: tuple[PairMatch, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
 class SceneJob:
     """Reconstruct a batch: ``indices`` are those of its ``pairs`` in the run; images go by their digests.
 
-    ``unit_results`` and ``estimation`` are those of its :class:`SceneRecord`. ``export``: write COLMAP's files.
-    The answer is a :class:`Solution`, whose choices are in the order of the pairs.
+    ``unit_results`` are those of its :class:`SceneRecord`. ``export``: write COLMAP's files. The answer is a
+    :class:`Solution`, whose choices are in the order of the pairs.
     """
 
     batch: str
     indices: tuple[int, ...]
     pairs: tuple[BatchPair, ...]
-    config: SceneConfig
-    focal: FocalConfig | None = None
-    magsac: RobustConfig | None = None
+    recipe: Recipe
     unit_results: int = 0
-    estimation: str = ""
     export: Export | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class TaskJob:
-    """Something to be known of images before there are pairs, under a ``key``: what ``do`` returns."""
+    """Something to be known of images before there are pairs, under a ``key``: the bytes that ``do`` returns."""
 
     key: str
     do: Callable[[], bytes]
@@ -109,11 +101,6 @@ class MatchResult:
         return sum(result.seconds for result in self.results)
 
 
-@dataclass(frozen=True)
-class TaskResult:
-    value: bytes
-
-
 class Cause(StrEnum):
     """Why a worker has no result."""
 
@@ -142,7 +129,7 @@ class Failure:
         return f"{self.cause}: {self.message}" if self.message else str(self.cause)
 
 
-Answer = Loaded | MatchResult | Solution | TaskResult | Failure
+Answer = Loaded | MatchResult | Solution | bytes | Failure
 
 
 def visiting_order(pairs: Sequence[Pair]) -> list[int]:

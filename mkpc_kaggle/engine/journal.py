@@ -22,6 +22,7 @@ from typing import Any, Self
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.data.images import is_unchanged
+from mkpc_kaggle.engine.budget import format_duration
 from mkpc_kaggle.engine.codec import decoder, encode, from_blob, to_blob
 from mkpc_kaggle.engine.jobs import Outcome
 from mkpc_kaggle.engine.records import PairRecord, SceneRecord
@@ -42,12 +43,8 @@ CREATE TABLE scene (key TEXT PRIMARY KEY, value TEXT NOT NULL);
 CREATE TABLE event (key INTEGER PRIMARY KEY, value TEXT NOT NULL);
 CREATE TABLE task (key TEXT PRIMARY KEY, value BLOB NOT NULL);
 """
-SAVE_PAIR = "REPLACE INTO pair VALUES (?, ?)"
-SAVE_POINTS = "REPLACE INTO points VALUES (?, ?, ?)"
-SAVE_SCENE = "REPLACE INTO scene VALUES (?, ?)"
-SAVE_TASK = "REPLACE INTO task VALUES (?, ?)"
 
-Statement = tuple[str, tuple[Any, ...]]  # and its values
+Row = tuple[str, tuple[Any, ...]]  # the table, and the values of its columns
 
 # SQLite's primary result codes that say nothing against a file: no permission, busy, locked, read only, input or
 # output failed, full, cannot be opened.
@@ -77,6 +74,9 @@ class Event:
     kind: str
     seconds: float
     text: str
+
+    def __str__(self) -> str:
+        return f"{format_duration(self.seconds):>7}  {self.text}"
 
 
 @dataclass(frozen=True)
@@ -135,11 +135,9 @@ class JournalReader:
         self._db.close()
 
     def records(self) -> dict[int, PairRecord]:
-        """All records by pair index."""
         return {record.index: record for record in self._read("pair", PairRecord)}
 
     def scenes(self) -> tuple[SceneRecord, ...]:
-        """What came of each batch that was reconstructed, by name."""
         return tuple(self._read("scene", SceneRecord))
 
     def pairs(self) -> tuple[Pair, ...]:
@@ -174,17 +172,8 @@ class JournalReader:
         """What the units of a record found, for a later job to build on; ``units`` by name."""
         with undamaged(self.path):
             points = self._points(record.index)
-            return tuple(
-                UnitResult(
-                    units[found.unit],
-                    from_blob(points.get(found.unit)),
-                    found.encode_seconds,
-                    found.match_seconds,
-                    found.failure,
-                    note=found.note,
-                )
-                for found in record.units
-            )
+            had = ((each, from_blob(points.get(each.unit))) for each in record.units)
+            return tuple(each.result(units[each.unit], matches) for each, matches in had)
 
     def _points(self, index: int) -> dict[str, bytes]:
         return dict(self._db.execute("SELECT unit, points FROM points WHERE pair = ?", [index]))
@@ -226,7 +215,7 @@ class Journal(JournalReader):
         fresh: bool = False,
     ) -> None:
         path, lock = directory / FILE_NAME, directory / LOCK_NAME
-        self._unsaved: list[Statement] = []
+        self._unsaved: list[Row] = []
         with ExitStack() as opened, writing(f"the work directory {directory}"):  # left open where all is well
             directory.mkdir(parents=True, exist_ok=True)
             self._lock = opened.enter_context(closing(connect(lock)))
@@ -240,10 +229,11 @@ class Journal(JournalReader):
                 self._claim(belongs_to, pairs, about or About())
             opened.pop_all()
 
-    def forget_changed(self, pairs: Sequence[Pair]) -> int:
+    def forget_outdated(self, pairs: Sequence[Pair], *, has_scenes: bool) -> int:
         """Forget the pairs of which an image has not the content any more that was matched; how many these are.
 
-        Where such an image was in a scene, the scene is forgotten, too.
+        The scenes of their batches are forgotten, too; all scenes if the run has none. Their pairs have the F of
+        their own matches again.
         """
         same = cache(is_unchanged)
         with undamaged(self.path), self._db:
@@ -254,9 +244,9 @@ class Journal(JournalReader):
             # Another run may have had more extra pairs for its scenes: the first of them are always the same.
             records = [record for index, record in known.items() if index < len(pairs)]
             changed = {r.index for r in records if not all(map(same, pairs[r.index].images, r.versions))}
-            outdated = {pairs[index].group for index in changed}
-            without = [replace(record, scene=None) for record in records if pairs[record.index].group in outdated]
-            self._db.executemany(SAVE_PAIR, [(record.index, encode(record)) for record in without])
+            outdated = {pairs[index].group for index in (changed if has_scenes else range(len(pairs)))}
+            chosen = [record for record in records if record.scene and pairs[record.index].group in outdated]
+            self._put(pair_row(replace(record, scene=None)) for record in chosen)
             for statement, keys in (
                 ("DELETE FROM pair WHERE key = ?", changed),
                 ("DELETE FROM points WHERE pair = ?", changed),
@@ -265,47 +255,31 @@ class Journal(JournalReader):
                 self._db.executemany(statement, [(key,) for key in keys])
         return len(changed)
 
-    def forget_scenes(self) -> None:
-        """Forget all scenes: pairs have the F of their own matches again."""
-        if self.scenes():
-            with undamaged(self.path), self._db:
-                self._db.execute("BEGIN")
-                without = [replace(record, scene=None) for record in self.records().values()]
-                self._db.executemany(SAVE_PAIR, [(record.index, encode(record)) for record in without])
-                self._db.execute("DELETE FROM scene")
-
     def save(self, outcomes: Iterable[Outcome]) -> None:
         """Put down a job's outcomes, all or none.
 
         An outcome may have the new results alone: what was put down of others stays.
         """
-        statements: list[Statement] = []
+        rows: list[Row] = []
         for outcome in outcomes:
-            index = outcome.record.index
-            statements.append((SAVE_PAIR, (index, encode(outcome.record))))
-            for result in outcome.results:
-                statements.append((SAVE_POINTS, (index, result.unit.name, to_blob(result.matches))))
-        self._write(statements)
+            rows.append(pair_row(outcome.record))
+            for found in outcome.results:
+                rows.append(("points", (outcome.record.index, found.unit.name, to_blob(found.matches))))
+        self._write(rows)
 
     def save_scene(self, scene: SceneRecord, records: Iterable[PairRecord]) -> None:
-        """Put down what came of a batch, and its pairs' records."""
-        pairs = [(SAVE_PAIR, (record.index, encode(record))) for record in records]
-        self._write([*pairs, (SAVE_SCENE, (scene.batch, encode(scene)))])
+        self._write([*map(pair_row, records), ("scene", (scene.batch, encode(scene)))])
 
     def save_task(self, key: str, value: bytes) -> None:
-        self._write([(SAVE_TASK, (key, value))])
+        self._write([("task", (key, value))])
 
     def task(self, key: str) -> bytes:
-        unsaved = {values[0]: values[1] for statement, values in self._unsaved if statement == SAVE_TASK}
-        return unsaved[key] if key in unsaved else super().task(key)
+        return dict(self._unsaved_in("task")).get(key) or super().task(key)
 
-    def note(self, kind: str, seconds: float, text: str) -> None:
-        """Put down what happened, ``seconds`` after the start; ``kind`` is an :class:`EventKind`.
-
-        Notes explain a run and must not end it: where the journal cannot be written, they are lost.
-        """
+    def note(self, event: Event) -> None:
+        """Put down what happened; it is lost where the journal cannot be written, and the run goes on."""
         with suppress(sqlite3.Error):
-            self._db.execute("INSERT INTO event (value) VALUES (?)", [encode(Event(kind, seconds, text))])
+            self._db.execute("INSERT INTO event (value) VALUES (?)", [encode(event)])
 
     def close(self) -> None:
         with suppress(sqlite3.Error):  # a reader may be at it: then it stays as it is
@@ -314,17 +288,23 @@ class Journal(JournalReader):
         self._lock.close()
 
     def _points(self, index: int) -> dict[str, bytes]:
-        unsaved = (values for statement, values in self._unsaved if statement == SAVE_POINTS)
-        return super()._points(index) | {unit: blob for pair, unit, blob in unsaved if pair == index}
+        unsaved = {unit: blob for pair, unit, blob in self._unsaved_in("points") if pair == index}
+        return super()._points(index) | unsaved
 
-    def _write(self, statements: Sequence[Statement]) -> None:
-        """Execute what has not been yet, in one transaction."""
-        self._unsaved += statements
+    def _unsaved_in(self, table: str) -> list[tuple[Any, ...]]:
+        return [values for name, values in self._unsaved if name == table]
+
+    def _write(self, rows: Iterable[Row]) -> None:
+        """Write these rows and those that the file did not take before, in one transaction."""
+        self._unsaved += rows
         with self._db:
             self._db.execute("BEGIN")
-            for statement, values in self._unsaved:
-                self._db.execute(statement, values)
+            self._put(self._unsaved)
         self._unsaved.clear()
+
+    def _put(self, rows: Iterable[Row]) -> None:
+        for table, values in rows:
+            self._db.execute(f"REPLACE INTO {table} VALUES ({', '.join('?' * len(values))})", values)
 
     def _claim(self, belongs_to: Mapping[str, Any], pairs: Sequence[Pair], about: About) -> None:
         """Write down what the journal belongs to, or compare it with what stands there."""
@@ -344,11 +324,13 @@ class Journal(JournalReader):
             if is_new:
                 for statement in SCHEMA.split(";")[:-1]:
                     self._db.execute(statement)
-                names = ((index, encode((p.id, p.group, *p.names))) for index, p in enumerate(pairs))
-                self._db.executemany("INSERT INTO sample VALUES (?, ?)", names)
+                self._put(("sample", (i, encode((p.id, p.group, *p.names)))) for i, p in enumerate(pairs))
             header = {"format": FORMAT, **belongs_to, "about": about}
-            rows = ((key, encode(value)) for key, value in header.items())
-            self._db.executemany("REPLACE INTO run VALUES (?, ?)", rows)
+            self._put(("run", (key, encode(value))) for key, value in header.items())
+
+
+def pair_row(record: PairRecord) -> Row:
+    return "pair", (record.index, encode(record))
 
 
 def share_journal(source: Path, target: Path) -> None:

@@ -9,7 +9,7 @@ from math import inf
 
 from mkpc_kaggle.engine.jobs import Answer, Cause, Failure, Job, Loaded, MatchJob
 from mkpc_kaggle.engine.process import ProcessWorker, ThreadWorker
-from mkpc_kaggle.engine.worker import MatchRunner, SceneRunner
+from mkpc_kaggle.engine.worker import MatchRunner, SceneRunner, share_cores
 from mkpc_kaggle.pipeline.assembly import Assembly
 
 START_TIMEOUT_S = 300.0  # for a worker to load its matchers; over a network's disk that is not quick
@@ -123,7 +123,6 @@ class Site:
         return partial(MatchRunner, assembly.pipeline, load=self.loads_matchers)
 
     def scene_worker(self) -> ThreadWorker:
-        """A worker for one batch."""
         return ProcessWorker("scene", SceneRunner, self.ring)
 
     def ring(self) -> None:
@@ -159,4 +158,8 @@ class LocalSite(Site):
             self.fallback = [self._place("cpu", assembly.on_cpu())]
 
     def _place(self, name: str, assembly: Assembly, share: int = 1) -> Place:
-        return Place(name, lambda: ProcessWorker(f"mkpc {name}", self.match_runner(assembly), self.ring, share))
+        def worker() -> ProcessWorker:
+            make = partial(share_cores, self.match_runner(assembly), share)
+            return ProcessWorker(f"mkpc {name}", make, self.ring)
+
+        return Place(name, worker)

@@ -1,10 +1,16 @@
 """The plan: which units to run on which pairs next, and why. Decisions on values, without threads or clocks.
 
 It looks at a job's worth of pairs at a time, so that a hundred thousand pairs cost no more to plan than ten.
+
+Three places decide that a unit no longer fits:
+
+- :meth:`Plan._fit`, for all pairs: how many units they can have in the time left, each time a chunk is deepened;
+- :meth:`Plan.next`, for a job: units that would not end in time wait for a moment when scenes need less;
+- :meth:`mkpc_kaggle.engine.worker.MatchRunner.run`, in a worker: a job that is late begins no further unit.
 """
 
 from collections import Counter, deque
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 from math import inf
@@ -28,17 +34,6 @@ MAX_TRIES = 2  # of a unit, or of an estimate, on a single pair, before it is gi
 MAX_FAILED_PAIRS = 2  # a unit that was given up on so many pairs and never ran is given up on all
 SLOW_FACTOR = 3.0  # a job that takes this many times what was expected begins no further unit
 HANG_FACTOR = 10.0  # a unit that takes this many times what it takes on nine of ten pairs hangs
-
-
-@dataclass(frozen=True)
-class Explanation:
-    """A decision, and why; ``seconds`` since the run's start."""
-
-    seconds: float
-    text: str
-
-    def __str__(self) -> str:
-        return f"{format_duration(self.seconds):>7}  {self.text}"
 
 
 @dataclass(frozen=True)
@@ -136,14 +131,14 @@ class Plan:
         recipe: Recipe,
         records: list[PairRecord],
         budget: Budget,
+        explain: Callable[[str], None],
         minibatch: int = 1,
         outdated: Iterable[int] = (),
     ) -> None:
-        self.recipe, self.records, self.budget = recipe, records, budget
+        self.recipe, self.records, self.budget, self._explain = recipe, records, budget, explain
         self.outdated, self.estimated_anew = set(outdated), 0
         self.workers = 1
         self.reserve = 0.0
-        self.explanations: list[Explanation] = []
         self._order, self._row_count, self._minibatch = order, row_count, minibatch
         self._stuck: set[int] = set()  # an image cannot be read, or what was found before
         self._lacking = Counter(unit for record in records for unit in self._lacks(record))
@@ -174,21 +169,19 @@ class Plan:
         if self.stop > self._late_at:
             queue.put_back(*self._late)
             self._late.clear()
-        self.advance(now)
-        while job is None and self.has_work(now):
+        while self.advance(now) and job is None:
             chunk = queue.pop(place, alone=self.workers < 2, cautious=cautious)
             if chunk is None:
                 break
             units = self._units(chunk, now)
-            todo = [index for index in chunk.indices if self.can_gain(index, units)]
+            todo = self._wanting(chunk.phase, chunk.indices, units)
             self._mark_done(chunk.phase, set(chunk.indices) - set(todo))
             in_time = tuple(unit for unit in units if self.costs.p90(unit.name) < self.stop - now)
-            if chosen := [index for index in todo if self.can_gain(index, in_time)]:
-                job = self._job(chunk, chosen, in_time, now, cautious=cautious)
+            if chosen := self._wanting(chunk.phase, todo, in_time):
+                job = self._job(replace(chunk, indices=chosen), in_time, now, cautious=cautious)
             if late := tuple(index for index in todo if index not in chosen):
                 self._late.append(replace(chunk, indices=late))
                 self._late_at = self.stop
-            self.advance(now)
         return job
 
     @property
@@ -196,58 +189,51 @@ class Plan:
         """When no unit may be running any more."""
         return self.budget.stop_units - min(self.reserve, RESERVE_SHARE * self.budget.time_limit)
 
-    def has_work(self, now: float) -> bool:
-        """Whether a pair waits that can gain something, as far as the plan has advanced."""
-        return now < self.stop and bool(self._queue.fresh or self._queue.again)
-
-    def advance(self, now: float) -> None:
-        """Go on to the first pairs that can gain something: other chunks and phases are passed over."""
-        while now < self.stop and (self._queue.fresh or self._coming):
-            if not self._queue.fresh:
-                if self.phase is Phase.ESTIMATE and (self._queue.under_way or self._queue.again):
-                    return  # scenes, which come later, need F of all pairs
+    def advance(self, now: float) -> bool:
+        """Go on to the first pairs that can gain something, past others and past phases; whether there are any."""
+        queue = self._queue
+        while now < self.stop and (queue.fresh or self._coming):
+            if queue.fresh:
+                chunk = queue.fresh[0]
+                if self._wanting(chunk.phase, chunk.indices, self._units(chunk, now)):
+                    break
+                self._mark_done(chunk.phase, queue.fresh.popleft().indices)
+            elif self.phase is Phase.ESTIMATE and (queue.under_way or queue.again):
+                break  # scenes, which come later, need F of all pairs
+            else:
                 self._open(self._coming.pop(0), now)
-                continue
-            chunk = self._queue.fresh[0]
-            units = self._units(chunk, now)
-            if any(self.can_gain(index, units) for index in chunk.indices):
-                return
-            self._mark_done(chunk.phase, self._queue.fresh.popleft().indices)
+        return now < self.stop and bool(queue.fresh or queue.again)
 
-    def can_gain(self, index: int, units: Iterable[Unit]) -> bool:
-        """Whether a pair may get any of the units that it has not had; where there are none, another F."""
-        if not units:
-            return index in self.outdated
-        return index not in self._stuck and bool(self.records[index].lacking(units))
+    def _wanting(self, phase: Phase, indices: Iterable[int], units: Sequence[Unit]) -> tuple[int, ...]:
+        """The pairs that may get what a phase gives: another F, or any of the units."""
+        if phase is Phase.ESTIMATE:
+            return tuple(index for index in indices if index in self.outdated)
+        return tuple(i for i in indices if i not in self._stuck and self.records[i].lacking(units))
 
-    def _job(
-        self, chunk: Chunk, todo: list[int], units: tuple[Unit, ...], now: float, *, cautious: bool
-    ) -> MatchJob:
+    def _job(self, chunk: Chunk, units: tuple[Unit, ...], now: float, *, cautious: bool) -> MatchJob:
         """A job for the first of the pairs and units; the others go back to the front of the queue."""
         left, costs = self.stop - now, self.costs
         pair_count = unit_count = 1
         if not cautious:
-            lacking = self._lacking_units(todo, units)
-            prices = [costs.mean(name) if costs.is_known(name) else None for name in _priced(lacking)]
-            pair_count, unit_count = job_size(len(todo), prices, costs.overhead, JOB_SHARE * left)
-        indices, later = tuple(todo[:pair_count]), tuple(todo[pair_count:])
+            names = _priced(self._lacking_units(chunk.indices, units))
+            prices = [costs.mean(name) if costs.is_known(name) else None for name in names]
+            pair_count, unit_count = job_size(len(chunk.indices), prices, costs.overhead, JOB_SHARE * left)
+        indices, later = chunk.indices[:pair_count], chunk.indices[pair_count:]
         lacking = self._lacking_units(indices, units)
-        chosen, further = lacking[:unit_count], tuple(lacking[unit_count:])
+        chosen, further = lacking[:unit_count], lacking[unit_count:]
         if later:
             self._queue.put_back(replace(chunk, indices=later))
         if further:
             self._queue.put_back(replace(chunk, indices=indices, units=further))
         self._queue.under_way.update(indices)
         p90 = tuple(costs.p90(unit.name) for unit in chosen)
-        seconds, time_limit = self._limits(len(indices), chosen, left)
-        return MatchJob(
-            chunk.phase, indices, tuple(chosen), p90, seconds, time_limit, is_retry=bool(chunk.lost_at)
-        )
+        limits = self._limits(len(indices), chosen, left)
+        return MatchJob(chunk.phase, indices, chosen, p90, *limits, is_retry=bool(chunk.lost_at))
 
-    def _lacking_units(self, indices: Iterable[int], units: tuple[Unit, ...]) -> list[Unit]:
+    def _lacking_units(self, indices: Iterable[int], units: Sequence[Unit]) -> tuple[Unit, ...]:
         """Those of ``units`` that any of the pairs lacks, in the order in which they run."""
         lacking = dict.fromkeys(unit for index in indices for unit in self.records[index].lacking(units))
-        return sorted(lacking, key=lambda unit: unit.stage)
+        return tuple(sorted(lacking, key=lambda unit: unit.stage))
 
     def _limits(self, pair_count: int, units: Sequence[Unit], left: float) -> tuple[float, float]:
         """The seconds within which units of a job may begin, and after which its worker hangs."""
@@ -261,7 +247,6 @@ class Plan:
         return min(left, allowance), allowance + hangs
 
     def _units(self, chunk: Chunk, now: float) -> tuple[Unit, ...]:
-        """The units for a chunk whose turn has come."""
         if chunk.units is not None:
             return self.usable(chunk.units)
         if chunk.phase is Phase.ESTIMATE:
@@ -272,7 +257,6 @@ class Plan:
         return units if chunk.phase is Phase.FILL else self._first
 
     def usable(self, units: Iterable[Unit]) -> tuple[Unit, ...]:
-        """The units that were not given up on all pairs."""
         return tuple(unit for unit in units if unit.name not in self.unusable)
 
     @property
@@ -288,51 +272,42 @@ class Plan:
         if count < len(units) and not self.costs.is_sure(units[count].name):
             return count + 1
         if count != self._fitting and count < len(units):
-            self.explain(
-                now,
+            self._explain(
                 f"{count} of {len(units)} units fit: up to {units[count].name} all pairs would need "
                 f"{format_duration(needed[count] / self.workers)} of {format_duration(left / self.workers)}",
             )
         elif count != self._fitting and self._fitting >= 0:
-            self.explain(now, f"all {count} units fit again")
+            self._explain(f"all {count} units fit again")
         self._fitting = count
         return count
 
     def _open(self, phase: Phase, now: float) -> None:
-        """Begin a phase."""
         self.phase, indices = phase, [index for index in self._order if index < self._row_count]
         if phase is Phase.ESTIMATE:
             indices = [index for index in self._order if index in self.outdated]
             if indices:
-                self.explain(now, f"{len(indices)} pairs have the F of other settings, and get it anew")
+                self._explain(f"{len(indices)} pairs have the F of other settings, and get it anew")
         elif phase is Phase.CONNECT:
-            extra = len(self.records) - self._row_count
-            count = self._pairs_that_fit(CONNECT_SHARE, extra, now)
+            extra, left = len(self.records) - self._row_count, CONNECT_SHARE * (self.stop - now) * self.workers
+            seconds = self.costs.overhead + sum(self.costs.forecast(unit.name) for unit in self._first)
+            count = extra if seconds * extra <= left else int(left / seconds)
             indices = [index for index in self._order if self._row_count <= index < self._row_count + count]
             if extra:
-                self.explain(now, f"{count} of {extra} pairs are matched for the scenes alone")
+                self._explain(f"{count} of {extra} pairs are matched for the scenes alone")
         elif phase is Phase.DEEPEN:
-            self.explain(now, "the sweep is over; deepening begins")
+            self._explain("the sweep is over; deepening begins")
         elif phase is Phase.FILL:
-            lacking = filter(self.may_gain, self.records[: self._row_count])
             busy = self._queue.under_way | {index for chunk in self._queue.again for index in chunk.indices}
-            weakest = sorted(lacking, key=lambda record: (record.index in busy, record.inliers, record.index))
-            indices = [record.index for record in weakest]
+            indices = sorted(self._fillable(), key=lambda i: (i in busy, self.records[i].inliers, i))
             if indices:
-                self.explain(now, f"in the time left: {len(indices)} pairs that lack units, the weakest first")
+                self._explain(f"in the time left: {len(indices)} pairs that lack units, the weakest first")
         self._total, self._left = len(indices), set(indices)
         size = max(JOB_PAIRS, JOB_MINIBATCHES * self._minibatch if self._minibatch > 1 else 0)
         self._queue.fresh.extend(chunks_of(phase, indices, size))
 
-    def _pairs_that_fit(self, share: float, count: int, now: float) -> int:
-        """How many of so many pairs can have the first unit in a share of the time left."""
-        seconds = self.costs.overhead + sum(self.costs.forecast(unit.name) for unit in self._first)
-        left = share * max(0.0, self.stop - now) * self.workers
-        return count if seconds * count <= left else int(left / seconds)
-
     # What came of it
 
-    def on_result(self, job: MatchJob, result: MatchResult, seconds: float, now: float) -> list[Outcome]:
+    def on_result(self, job: MatchJob, result: MatchResult, seconds: float) -> list[Outcome]:
         """Record a job that took so many seconds; what it brought, to be kept."""
         self._queue.under_way.difference_update(job.indices)
         for found in result.results:
@@ -342,14 +317,13 @@ class Plan:
         if not job.units:
             self.costs.observe(Phase.ESTIMATE, seconds / len(job.indices))
         merge = self._merge if job.units else self._merge_estimate
-        kept = [merged for outcome in result.outcomes if (merged := merge(outcome, now)) is not None]
-        rest = tuple(index for index in job.indices if self.can_gain(index, job.units))
-        if rest:  # the job's own deadline cut it off
+        kept = [merged for outcome in result.outcomes if (merged := merge(outcome)) is not None]
+        if rest := self._wanting(job.phase, job.indices, job.units):  # the job's own deadline cut it off
             self._queue.put_back(Chunk(job.phase, rest, job.units))
         self._mark_done(job.phase, set(job.indices) - set(rest))
         return kept
 
-    def on_failure(self, job: MatchJob, failure: Failure, place: str, now: float) -> list[Outcome]:
+    def on_failure(self, job: MatchJob, failure: Failure, place: str) -> list[Outcome]:
         """Record a job that came to nothing, and plan it anew: halved, then unit by unit; what to keep.
 
         A unit that a single pair cannot have after two tries, in two places where there are two, is given up for
@@ -375,58 +349,52 @@ class Plan:
             return []
         self._mark_done(job.phase, [index])
         if units:
-            return [self._give_up(index, units[0], failure, now)]
-        self.explain(now, f"pair {index} keeps the F it has: {failure}")
+            return [self._give_up(index, units[0], failure)]
+        self._explain(f"pair {index} keeps the F it has: {failure}")
         self.outdated.discard(index)
         return []
 
-    def restart(self, now: float, reason: str) -> list[Outcome]:
+    def restart(self) -> list[Outcome]:
         """Begin anew on other devices: no unit is given up, and pairs keep what they have; what has changed."""
-        self.explain(now, reason)
         whole = [record.without_given_up() for record in self.records]
         changed = [record for record in whole if record is not self.records[record.index]]
-        for record in changed:
-            self._put(record)
         self._begin()
-        return list(map(Outcome, changed))
+        return list(map(self._put, changed))
 
-    def _merge(self, outcome: Outcome, now: float) -> Outcome | None:
+    def _merge(self, outcome: Outcome) -> Outcome | None:
         """What a job has brought a pair, if anything: a unit more, or the reason why there can be none."""
         record, former = outcome.record, self.records[outcome.record.index]
         if not outcome.results and record.failure and record.reached:
             self._stuck.add(record.index)  # an image cannot be read
             if former.units:
-                self.explain(now, f"pair {record.index} keeps the F it has: {record.failure}")
+                self._explain(f"pair {record.index} keeps the F it has: {record.failure}")
         if len(record.units) <= len(former.units) and (former.reached or not record.reached):
             if outcome.results:  # what was found before cannot be read, and a worse F gains nothing
                 self._stuck.add(record.index)
             return None
-        self._put(record.after(former))
-        return replace(outcome, record=self.records[record.index])
+        return self._put(record.after(former), outcome.results)
 
-    def _merge_estimate(self, outcome: Outcome, now: float) -> Outcome | None:
+    def _merge_estimate(self, outcome: Outcome) -> Outcome | None:
         """The F that a job without units has made of all that was found on a pair."""
         record, former = outcome.record, self.records[outcome.record.index]
         self.outdated.discard(record.index)
         if len(record.units) < len(former.units):
-            self.explain(now, f"pair {record.index} keeps the F it has: its points cannot be read")
+            self._explain(f"pair {record.index} keeps the F it has: its points cannot be read")
             return None
         self.estimated_anew += 1
-        self._put(former.estimated_anew(record))
-        return replace(outcome, record=self.records[record.index])
+        return self._put(record.after(former))
 
-    def _give_up(self, index: int, unit: Unit, failure: Failure, now: float) -> Outcome:
+    def _give_up(self, index: int, unit: Unit, failure: Failure) -> Outcome:
         """The pair keeps the F that it has; the unit is marked as had, with the reason."""
-        record, reason = self.records[index], f"{GIVEN_UP}{failure}"
-        self.explain(now, f"{unit.name} is given up on pair {index} ({failure})")
-        empty = UnitRecord(unit.name, unit.stage, 0, 0, 0.0, 0.0, reason)
-        message = record.failure if record.reached else reason
-        self._put(replace(record, units=(*record.units, empty), failure=message))
+        record, nothing = self.records[index], UnitResult(unit, Matches.empty(), failure=f"{GIVEN_UP}{failure}")
+        self._explain(f"{unit.name} is given up on pair {index} ({failure})")
         self._failed_pairs[unit.name] += 1
         if self._failed_pairs[unit.name] >= MAX_FAILED_PAIRS and not self.costs.has_run(unit.name):
             self.unusable.add(unit.name)
-            self.explain(now, f"{unit.name} is given up on all pairs: it never ran ({failure})")
-        return Outcome(self.records[index], (UnitResult(unit, Matches.empty(), failure=reason),))
+            self._explain(f"{unit.name} is given up on all pairs: it never ran ({failure})")
+        units = (*record.units, UnitRecord.of(nothing, 0))
+        message = record.failure if record.reached else nothing.failure
+        return self._put(replace(record, units=units, failure=message), (nothing,))
 
     def _mark_done(self, phase: Phase, indices: Iterable[int]) -> None:
         """The turn of these pairs is over in a phase, unless they are to be tried again."""
@@ -443,20 +411,19 @@ class Plan:
         """Pairs that get more than what fits for all, in the time left."""
         return self._left if self.phase is Phase.FILL else ()
 
-    def may_gain(self, record: PairRecord) -> bool:
-        """Whether a pair that has its first unit can get further units."""
-        return bool(record.units) and self.can_gain(record.index, self.usable(self.recipe.units))
+    def _fillable(self) -> tuple[int, ...]:
+        """The pairs of rows that have a unit and can get further units."""
+        matched = (index for index in range(self._row_count) if self.records[index].units)
+        return self._wanting(Phase.FILL, matched, self.usable(self.recipe.units))
 
     @property
     def is_complete(self) -> bool:
         """Whether every pair has been reached, and none can gain what it wants, nor another F."""
-        if self.outdated:
-            return False
-        return all(record.reached and not self.may_gain(record) for record in self.records[: self._row_count])
+        are_reached = all(record.reached for record in self.records[: self._row_count])
+        return are_reached and not self.outdated and not self._fillable()
 
     @property
     def nothing_runs(self) -> bool:
-        """Whether every unit has been given up."""
         return not self.usable(self.recipe.units)
 
     @property
@@ -464,14 +431,12 @@ class Plan:
         """The present phase, how many of its pairs are done, and how many it has."""
         return self.phase, self._total - len(self._left), self._total
 
-    def explain(self, now: float, text: str) -> None:
-        """Note a decision, and why."""
-        self.explanations.append(Explanation(now - self.budget.started, text))
-
-    def _put(self, record: PairRecord) -> None:
+    def _put(self, record: PairRecord, results: tuple[UnitResult, ...] = ()) -> Outcome:
+        """Replace a pair's record; what is to be kept of that."""
         self._lacking.subtract(self._lacks(self.records[record.index]))
         self._lacking.update(self._lacks(record))
         self.records[record.index] = record
+        return Outcome(record, results)
 
     def _lacks(self, record: PairRecord) -> list[str]:
         """The units that a pair is to get yet, if it has an F and a row."""

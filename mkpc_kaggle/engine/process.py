@@ -23,7 +23,7 @@ from multiprocessing.context import SpawnProcess
 
 from mkpc_kaggle.engine.jobs import Answer, Cause, Failure, Job, Loaded
 from mkpc_kaggle.engine.streams import unblocked
-from mkpc_kaggle.engine.worker import Executor, Runner, failure_of, use_threads
+from mkpc_kaggle.engine.worker import Executor, Runner, failure_of
 
 # For PyTorch, which reads them once. Threads of OpenMP that wait for each other sleep; by default they spin, and
 # keep the cores from decoding, MAGSAC and other processes (python -m benchmarks.threads). Tensors of 2 MiB and
@@ -97,17 +97,9 @@ class ThreadWorker:
 
 
 class ProcessWorker(ThreadWorker):
-    """A worker process, started with ``spawn``. ``make`` and jobs can be pickled.
+    """A worker process, started with ``spawn``. ``make`` and jobs can be pickled."""
 
-    ``share`` is the number of processes that share the machine's cores.
-    """
-
-    def __init__(
-        self, name: str, make: Callable[[], Runner], on_answer: Callable[[], None], share: int = 1
-    ) -> None:
-        super().__init__(name, make, on_answer)
-        self._share = share
-        self._process: SpawnProcess | None = None
+    _process: SpawnProcess | None = None
 
     def kill(self) -> None:
         super().kill()
@@ -117,7 +109,7 @@ class ProcessWorker(ThreadWorker):
     def _load(self) -> Answer:
         context = multiprocessing.get_context("spawn")
         self._pipe, its_pipe = context.Pipe()
-        process = context.Process(target=serve, args=(its_pipe, self._share), name=self.name, daemon=True)
+        process = context.Process(target=serve, args=(its_pipe,), name=self.name, daemon=True)
         try:
             with worker_environment():
                 process.start()
@@ -140,17 +132,15 @@ class ProcessWorker(ThreadWorker):
         except (EOFError, OSError):
             process.join(timeout=EXIT_TIMEOUT_S)
             self._pipe.close()
-            return Failure(Cause.DIED, how_it_ended(process))
+            return Failure(Cause.DIED, how_it_ended(process.exitcode))
         except Exception as error:  # what cannot be pickled
             process.kill()
             return failure_of(error)
         return answer
 
 
-def how_it_ended(process: SpawnProcess) -> str:
-    """The signal that ended a process, or its exit status; for messages."""
-    code = process.exitcode
-    return f"signal {signal.Signals(-code).name}" if code is not None and code < 0 else f"exit status {code}"
+def how_it_ended(code: int | None) -> str:
+    return f"exit status {code}" if code is None or code >= 0 else f"signal {signal.Signals(-code).name}"
 
 
 _environment = threading.Lock()
@@ -175,19 +165,14 @@ def worker_environment() -> Iterator[None]:
         yield
 
 
-def serve(pipe: Connection, share: int) -> None:
+def serve(pipe: Connection) -> None:
     """The life of a worker process: what to make, then job after job."""
 
     def make() -> Runner:
         maker: Callable[[], Runner] = pipe.recv()  # what cannot be unpickled is an answer, too
-        if share > 1:
-            import torch
-
-            use_threads(max(1, torch.get_num_threads() // share))
         return maker()
 
-    end_when_parent_is_killed()
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    end_with_parent()
     executor = Executor()
     with unblocked(), suppress(EOFError, OSError):  # the parent is gone
         answer = executor.load(make)
@@ -196,15 +181,17 @@ def serve(pipe: Connection, share: int) -> None:
             pipe.send(executor.run(*pipe.recv()))
 
 
-def end_when_parent_is_killed() -> None:
-    """Let Linux kill this process with the thread that started it: that ends a process that is stopped, too."""
+def end_with_parent() -> None:
+    """From now on this process ends with its parent, however that ends and whatever is computed here.
+
+    On Linux it ends with the thread that started it, even if it is stopped.
+    """
     with suppress(OSError, AttributeError):  # elsewhere
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
 
+    def wait() -> None:
+        if parent := multiprocessing.parent_process():
+            parent.join()
+            os._exit(1)
 
-def _end_with_parent() -> None:
-    """End this process when its parent has ended, however that ended and whatever is computed here."""
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
+    threading.Thread(target=wait, daemon=True).start()

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Matrix3, Size
+from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL, NO_STATS, EstimateStats
 from mkpc_kaggle.pipeline.pair import PairMatch, Regions, UnitResult
@@ -35,11 +36,13 @@ class UnitRecord:
     note: str = ""  # why the unit ran otherwise than it is written
 
     @classmethod
-    def of(cls, found: UnitResult, inliers: NDArray[np.bool_]) -> "UnitRecord":
-        """``inliers`` is a mask over the matches that were found."""
-        unit, counts = found.unit, (len(found.matches), int(inliers.sum()))
-        seconds = found.encode_seconds, found.match_seconds
-        return cls(unit.name, unit.stage, *counts, *seconds, found.failure, found.note)
+    def of(cls, found: UnitResult, inliers: int) -> "UnitRecord":
+        unit, seconds = found.unit, (found.encode_seconds, found.match_seconds)
+        return cls(unit.name, unit.stage, len(found.matches), inliers, *seconds, found.failure, found.note)
+
+    def result(self, unit: Unit, matches: Matches) -> UnitResult:
+        """What the record was made of."""
+        return UnitResult(unit, matches, self.encode_seconds, self.match_seconds, self.failure, note=self.note)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -77,10 +80,9 @@ class PairRecord:
 
     @classmethod
     def of(cls, index: int, match: PairMatch, estimation: str = "") -> "PairRecord":
-        """The record of an estimated pair."""
         ends = np.cumsum([len(result.matches) for result in match.results])
-        masks = np.split(match.estimate.inliers, ends[:-1])
-        units = tuple(UnitRecord.of(*found) for found in zip(match.results, masks, strict=True))
+        inliers = [int(mask.sum()) for mask in np.split(match.estimate.inliers, ends[:-1])]
+        units = tuple(map(UnitRecord.of, match.results, inliers))
         return cls(
             index,
             match.estimate.matrix,
@@ -104,13 +106,7 @@ class PairRecord:
         seconds = {part: getattr(former, part) + getattr(self, part) for part in parts}
         return replace(self, regions=self.regions or former.regions, scene=former.scene, **seconds)
 
-    def estimated_anew(self, later: "PairRecord") -> "PairRecord":
-        """The record with the F of a job without units; its images and its units' seconds stay."""
-        kept = ("regions", "decode_seconds", "cluster_seconds", "scene", "sizes", "versions", "focals")
-        return replace(later, **{name: getattr(self, name) for name in kept})
-
     def without_given_up(self) -> "PairRecord":
-        """The record without the units that were given up: they may be tried again."""
         units = tuple(unit for unit in self.units if not unit.failure.startswith(GIVEN_UP))
         if len(units) == len(self.units):
             return self
@@ -152,9 +148,6 @@ class PairRecord:
     @property
     def match_seconds(self) -> float:
         return sum(unit.match_seconds for unit in self.units)
-
-    def has(self, unit: Unit) -> bool:
-        return any(record.unit == unit.name for record in self.units)
 
     def lacking(self, units: Iterable[Unit]) -> list[Unit]:
         """Those of ``units`` that the pair has not had."""
@@ -217,7 +210,13 @@ class SceneRecord:
 
     @classmethod
     def of(
-        cls, batch: str, found: Sequence[Reconstruction], unit_results: int, seconds: float, failure: str = ""
+        cls,
+        batch: str,
+        found: Sequence[Reconstruction],
+        unit_results: int = 0,
+        seconds: float = 0.0,
+        estimation: str = "",
+        failure: str = "",
     ) -> "SceneRecord":
         models = sorted((model for each in found for model in each.models), key=lambda model: -len(model.images))
         cameras = tuple(CameraRecord.of(image, n) for n, model in enumerate(models) for image in model.images)
@@ -233,6 +232,7 @@ class SceneRecord:
             failure or "; ".join(reasons) or ("" if models else "no matches connect its images"),
             cameras,
             tuple(_evenly(model.points) for model in models),
+            estimation,
         )
 
 

@@ -13,8 +13,7 @@ from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.jobs import SceneJob
 from mkpc_kaggle.engine.places import START_TIMEOUT_S
 from mkpc_kaggle.engine.records import PairRecord, SceneRecord
-from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.pipeline.pair import UnitResult
+from mkpc_kaggle.pipeline.pair import PairMatch
 from mkpc_kaggle.recipe import Recipe, SceneConfig
 from mkpc_kaggle.scene.densify import extra_pairs
 from mkpc_kaggle.scene.export import Export
@@ -74,7 +73,6 @@ class Scenes:
         made: Iterable[SceneRecord],
         exports: Mapping[str, Export] = MappingProxyType({}),
     ) -> None:
-        self._exports = exports
         # Where files of a scene were removed, it is made again.
         self.made = {
             scene.batch: scene
@@ -82,14 +80,16 @@ class Scenes:
             if scene.batch not in exports or exports[scene.batch].has_files(scene.models)
         }
         self.batches = batches_of(pairs) if recipe.scene is not None else {}
-        self._pairs, self._recipe, self._records = pairs, recipe, records
+        self._pairs, self._recipe, self._records, self._exports = pairs, recipe, records, exports
         self._batch_of = {index: name for name, indices in self.batches.items() for index in indices}
         self._outdated = {name for name in self.batches if self._is_outdated(name)}
         self._running: set[str] = set()
         self._losses: Counter[tuple[str, int]] = Counter()
         self._failures: dict[str, str] = {}
         self._spent_s = self._spent_matches = self._longest_start = 0.0
-        self._matches = {name: sum(map(self._match_count, indices)) for name, indices in self.batches.items()}
+        self._matches = {
+            name: sum(records[index].matches for index in indices) for name, indices in self.batches.items()
+        }
 
     def note_change(self, index: int, gained: int) -> None:
         """Record that a pair has got units, or lost them, and how many matches it ``gained``."""
@@ -105,7 +105,7 @@ class Scenes:
     def report(self) -> tuple[SceneRecord, ...]:
         """What came of each batch, in their order: where there is no scene, ``failure`` says why."""
         return tuple(
-            self.made.get(name) or SceneRecord.of(name, (), 0, 0.0, self._failures.get(name, NOT_RECONSTRUCTED))
+            self.made.get(name) or SceneRecord.of(name, (), failure=self._failures.get(name, NOT_RECONSTRUCTED))
             for name in self.batches
         )
 
@@ -123,19 +123,15 @@ class Scenes:
                 return name
         return None
 
-    def job(self, batch: str, results_of: Callable[[int], tuple[UnitResult, ...]]) -> SceneJob:
-        """The job that reconstructs a batch; ``results_of`` gives what was found on a pair."""
-        recipe, config = self._recipe, self._recipe.scene
-        assert config is not None
+    def job(self, batch: str, known: Callable[[int], PairMatch]) -> SceneJob:
+        """The job that reconstructs a batch; ``known`` gives what was found on a pair."""
         found = tuple(index for index in self.batches[batch] if self._records[index].sizes)
-        pairs = tuple(self._batch_pair(index, results_of(index)) for index in found)
+        pairs = tuple(self._batch_pair(index, known(index)) for index in found)
         self._running.add(batch)
         unit_results, export = self._unit_count(batch), self._exports.get(batch)
-        settings = config, recipe.focal, recipe.magsac
-        return SceneJob(batch, found, pairs, *settings, unit_results, recipe.scene_estimation, export)
+        return SceneJob(batch, found, pairs, self._recipe, unit_results, export)
 
     def on_start(self, seconds: float) -> None:
-        """Record how long a process took to begin."""
         self._longest_start = max(self._longest_start, seconds)
 
     def on_result(self, job: SceneJob, record: SceneRecord) -> None:
@@ -176,9 +172,6 @@ class Scenes:
         rate = FORECAST_MARGIN * self._spent_s / self._spent_matches if self._spent_matches else MATCH_S
         return START_S + rate * self._matches[batch]
 
-    def _match_count(self, index: int) -> int:
-        return self._records[index].matches
-
     def _has_units(self, batch: str) -> bool:
         return any(self._records[index].units for index in self.batches[batch])
 
@@ -190,10 +183,9 @@ class Scenes:
     def _unit_count(self, batch: str) -> int:
         return sum(len(self._records[index].units) for index in self.batches[batch])
 
-    def _batch_pair(self, index: int, results: Sequence[UnitResult]) -> BatchPair:
-        record = self._records[index]
-        images = zip(self._pairs[index].images, record.versions, record.sizes, record.focals, strict=True)
+    def _batch_pair(self, index: int, found: PairMatch) -> BatchPair:
+        images = zip(self._pairs[index].images, found.versions, found.sizes, found.focals, strict=True)
         image0, image1 = (BatchImage(path.stem, version, size, focal) for path, version, size, focal in images)
-        matches = Matches.concatenate(result.matches for result in results)
+        record = self._records[index]
         own = None if record.failure else record.pair_fundamental
-        return BatchPair(image0, image1, matches, own, tracks_of(results))
+        return BatchPair(image0, image1, found.matches, own, tracks_of(found.results))

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from importlib import metadata
 from math import isfinite
 from pathlib import Path
+from tempfile import TemporaryFile
 from types import FrameType
 from typing import Self
 
@@ -24,7 +25,7 @@ from mkpc_kaggle.engine import console
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.cluster import RayCluster, RaySite
 from mkpc_kaggle.engine.engine import Engine, RunReport
-from mkpc_kaggle.engine.journal import About, EventKind, Journal
+from mkpc_kaggle.engine.journal import About, Event, EventKind, Journal
 from mkpc_kaggle.engine.places import LISTEN_S, LocalSite, Site
 from mkpc_kaggle.engine.records import PairRecord, SceneRecord
 from mkpc_kaggle.errors import UserError, writing
@@ -108,11 +109,9 @@ def require_writable(output: Path) -> None:
     """Make the file's directory if need be; :class:`UserError` where the file cannot be written, or replaced."""
     if output.is_char_device() or output.is_block_device():
         raise UserError(f"--output {output} is a device; name a file")
-    probe = output.with_name(f".{output.name}.probe")
     with writing(f"--output {output}"):
         output.parent.mkdir(parents=True, exist_ok=True)
-        probe.touch()
-        probe.unlink()
+        TemporaryFile(dir=output.parent).close()
 
 
 def run_pairs(
@@ -132,9 +131,7 @@ def run_pairs(
     estimation = json.dumps(recipe.estimation())
     about = About(recipe.name, str(assembly.placement), limit, assembly.left_out, versions(), estimation)
     with Journal(session.work_dir, belongs_to, pairs=pairs, about=about, fresh=session.fresh) as journal:
-        if recipe.scene is None:
-            journal.forget_scenes()
-        journal.note(EventKind.START, budget.spent(), "")
+        journal.note(Event(EventKind.START, budget.spent(), ""))
         engine = Engine(
             pairs,
             recipe,
@@ -150,12 +147,11 @@ def run_pairs(
         if session.watchdog is not None:
             session.watchdog.save = engine.save_results
         report = engine.run()
-        journal.note(EventKind.END, report.seconds, report.ending)
+        journal.note(Event(EventKind.END, report.seconds, report.ending))
     return report
 
 
 def site_of(pairs: Sequence[Pair], assembly: Assembly, session: Session) -> Site:
-    """Where the workers are that the session asks for."""
     if isinstance(session.workers, RayCluster):
         folders = dict.fromkeys(path.parent for pair in pairs for path in pair.images)
         return RaySite(assembly, session.workers, session.budget.clock, folders)
@@ -163,7 +159,7 @@ def site_of(pairs: Sequence[Pair], assembly: Assembly, session: Session) -> Site
 
 
 def versions() -> dict[str, str]:
-    """The versions of what the results may depend on, by name."""
+    """Of what the results may depend on, by name."""
     return {
         "mkpc_kaggle": __version__,
         "Python": platform.python_version(),
@@ -192,11 +188,9 @@ class Watchdog:
     """
 
     def __init__(self, budget: Budget, interrupt: Interrupt) -> None:
-        too_late = "the time limit passed before the first results were written"
-        self.save: Callable[[], str] = lambda: too_late
+        self.save: Callable[[], str] = lambda: "the time limit passed before the first results were written"
         self.status = 0
-        self._budget = budget
-        self._interrupt = interrupt
+        self._budget, self._interrupt = budget, interrupt
         self._over = threading.Event()
 
     def __enter__(self) -> Self:

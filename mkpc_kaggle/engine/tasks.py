@@ -2,6 +2,7 @@
 
 import os
 import sqlite3
+import sys
 from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -9,7 +10,7 @@ from functools import partial
 from math import inf
 
 from mkpc_kaggle.engine.console import Progress, warn
-from mkpc_kaggle.engine.jobs import Answer, TaskJob, TaskResult
+from mkpc_kaggle.engine.jobs import Answer, TaskJob
 from mkpc_kaggle.engine.journal import Journal
 from mkpc_kaggle.engine.places import Place, Site
 from mkpc_kaggle.engine.process import ProcessWorker
@@ -30,13 +31,12 @@ def run_tasks(phase: str, tasks: Tasks, journal: Journal, session: Session) -> b
     Returns whether all were tried before an interrupt and the limit. Raises :class:`UserError` where no worker can
     be started.
     """
-    budget, site, progress = session.budget, Site(session.budget.clock), None
+    budget, site = session.budget, Site(session.budget.clock)
     queue = TaskQueue(phase, tasks, journal)
     make = partial(ProcessWorker, "images", TaskRunner, site.ring)
     count = min(MAX_WORKERS, os.cpu_count() or 1, len(queue.waiting))
     places = [Place(f"process {number}", make) for number in range(count)]
-    if session.progress:
-        progress = Progress(budget, unit="image")
+    progress = Progress(budget, sys.stderr if session.progress else None, unit="image")
     try:
         while queue.left and not session.interrupt.is_set() and (now := budget.clock()) < budget.stop_waiting:
             for place in places:
@@ -51,14 +51,12 @@ def run_tasks(phase: str, tasks: Tasks, journal: Journal, session: Session) -> b
                 elif queue.waiting and place.is_idle:
                     hangs = max(budget.silence, min(MAX_TASK_S, HANG_SHARE * budget.left()))
                     place.submit(queue.waiting.popleft(), inf, hangs, now)
-            if progress is not None:
-                progress.show(phase, len(tasks) - len(queue.left), len(tasks))
+            progress.show(phase, len(tasks) - len(queue.left), len(tasks))
             site.wait(min(budget.stop_waiting, *(place.limit for place in places if place.limit > now), inf))
     finally:
         for place in places:
             place.kill()
-        if progress is not None:
-            progress.close()
+        progress.close()
     return not queue.left
 
 
@@ -73,9 +71,9 @@ class TaskQueue:
     def take(self, job: TaskJob, answer: Answer) -> None:
         """Keep an answer; a task that came to nothing is tried once more."""
         self._tries[job.key] += 1
-        if isinstance(answer, TaskResult):
+        if isinstance(answer, bytes):
             with suppress(sqlite3.Error):  # it stays in memory
-                self._journal.save_task(job.key, answer.value)
+                self._journal.save_task(job.key, answer)
         elif self._tries[job.key] < MAX_TRIES:
             self.waiting.append(job)
             return

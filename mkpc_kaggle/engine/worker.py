@@ -19,12 +19,11 @@ from mkpc_kaggle.engine.jobs import (
     Outcome,
     SceneJob,
     TaskJob,
-    TaskResult,
 )
 from mkpc_kaggle.engine.records import NOT_REACHED, PairRecord
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.pipeline import failures
-from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult, with_estimate
+from mkpc_kaggle.pipeline.pair import PairMatch, with_estimate
 from mkpc_kaggle.pipeline.stages import Pipeline
 from mkpc_kaggle.recipe import Unit
 from mkpc_kaggle.scene.reconstruct import Solution, reconstruct_batch
@@ -67,7 +66,6 @@ class Executor:
 
 
 def failure_of(error: Exception) -> Failure:
-    """What an error makes of a job."""
     return Failure(CAUSES[failures.failure_of(error)], failures.reason_of(error))
 
 
@@ -78,6 +76,15 @@ def use_threads(count: int) -> None:
 
     torch.set_num_threads(count)
     cv2.setNumThreads(count)
+
+
+def share_cores(make: Callable[[], Runner], share: int) -> Runner:
+    """What ``make`` makes in one of so many processes that share the machine's cores."""
+    import torch
+
+    if share > 1:
+        use_threads(max(1, torch.get_num_threads() // share))
+    return make()
 
 
 class MatchRunner:
@@ -122,12 +129,10 @@ class MatchRunner:
 
     def _estimate_anew(self, job: MatchJob) -> MatchResult:
         """F of the pairs of a job from what is known of them; their images are not looked at."""
-        known = zip(job.known, job.sizes, job.focals, strict=True)
-        pairs = [PairMatch(results, sizes=sizes, focals=focals) for results, sizes, focals in known]
-        estimates = [self._estimators.submit(self._record, job, *pair) for pair in enumerate(pairs)]
+        estimates = [self._estimators.submit(self._record, job, *pair) for pair in enumerate(job.known)]
         return MatchResult(tuple(Outcome(estimate.result()) for estimate in estimates))
 
-    def _open(self, pair: Pair, known: tuple[UnitResult, ...]) -> PairMatch:
+    def _open(self, pair: Pair, known: PairMatch) -> PairMatch:
         """The pair with its images; ``failure`` says which of them cannot be read."""
         start = time.perf_counter()
         files = zip(pair.images, pair.turns, strict=True)
@@ -135,11 +140,11 @@ class MatchRunner:
         seconds = time.perf_counter() - start
         readable = tuple(image for image in images if isinstance(image, Image))
         failure = next((str(image) for image in images if not isinstance(image, Image)), "")
-        return PairMatch(known, images=readable, failure=failure, decode_seconds=seconds)
+        return replace(known, images=readable, failure=failure, decode_seconds=seconds)
 
     def _estimate(self, job: MatchJob, number: int, pair: PairMatch) -> Outcome:
         """F from all matches of a pair; the outcome has the new results alone, since only these have to travel."""
-        found = pair.results[len(job.known[number]) :]
+        found = pair.results[len(job.known[number].results) :]
         if not found:
             return Outcome(PairRecord.untouched(job.indices[number], NOT_REACHED))
         sizes = tuple(image.size for image in pair.images)
@@ -149,7 +154,6 @@ class MatchRunner:
         return Outcome(self._record(job, number, pair), found)
 
     def _record(self, job: MatchJob, number: int, pair: PairMatch) -> PairRecord:
-        """The record of a pair with F from all of its matches."""
         start, recipe, asked = time.perf_counter(), self._pipeline.recipe, job.pairs[number]
         pair = with_estimate(pair, recipe, asked.model, asked.intrinsics)
         pair = replace(pair, estimate_seconds=time.perf_counter() - start)
@@ -161,13 +165,13 @@ class SceneRunner:
 
     def run(self, job: Job, seconds: float) -> Solution:
         """The cameras of a batch, and which F each of its pairs gets; ``seconds`` are not looked at."""
-        assert isinstance(job, SceneJob)
-        return reconstruct_batch(job.pairs, job.config, job.focal, job.magsac, job.export)
+        assert isinstance(job, SceneJob) and job.recipe.scene is not None
+        return reconstruct_batch(job.pairs, job.recipe.scene, job.recipe.focal, job.recipe.magsac, job.export)
 
 
 class TaskRunner:
     """Looks at images before there are pairs."""
 
-    def run(self, job: Job, seconds: float) -> TaskResult:
+    def run(self, job: Job, seconds: float) -> bytes:
         assert isinstance(job, TaskJob)
-        return TaskResult(job.do())
+        return job.do()

@@ -14,7 +14,7 @@ from rectified import SECOND, SWEEP, THREE_UNITS
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.codec import encode
 from mkpc_kaggle.engine.jobs import Outcome
-from mkpc_kaggle.engine.journal import Journal
+from mkpc_kaggle.engine.journal import Event, EventKind, Journal
 from mkpc_kaggle.engine.records import CameraRecord, PairRecord, SceneRecord
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Box, Size
@@ -123,7 +123,7 @@ def test_what_a_full_disk_refuses_is_known_and_written_when_there_is_room(journa
 def damaged_journal(directory: Path, damage: str) -> Path:
     """A journal of two pairs and a scene, after a statement that no run makes."""
     journal = Journal(directory, OURS, pairs=PAIRS)
-    journal.note("start", 0.0, "")
+    journal.note(Event(EventKind.START, 0.0, ""))
     journal.save([outcome(3, seed=1), outcome(7, seed=2)])
     camera = CameraRecord("a", 0, (0.0, 0.0, 1.0), (0.0, 0.0, 1.0), (0.0, 1.0, 0.0), 500.0, Size(640, 480), 9)
     scene = SceneRecord("batch", 2, 2, 1, 9, 3, 1.5, "", (camera,), (((0.0, 0.0, 5.0),),))
@@ -194,7 +194,7 @@ def test_damage_anywhere_is_told_as_such(tmp_path: Path, damage: str) -> None:
 def test_pairs_that_no_test_set_has_are_damage(tmp_path: Path) -> None:
     damaged_journal(tmp_path, pairs_with("0", "-1"))
     with Journal(tmp_path, OURS) as journal, pytest.raises(UserError, match="damaged"):
-        journal.forget_changed(PAIRS)
+        journal.forget_outdated(PAIRS, has_scenes=True)
 
 
 def test_bytes_damaged_at_random_never_end_in_a_traceback(tmp_path: Path) -> None:
@@ -248,5 +248,5 @@ def test_a_refused_journal_holds_no_lock_and_no_file(tmp_path: Path) -> None:
 def test_text_that_is_not_utf8_is_kept_in_letters(journal: Journal) -> None:
     record = PairRecord.untouched(3, os.fsdecode(b"\xff: no such file"))
     journal.save([Outcome(record)])
-    journal.note("fault", 0.0, os.fsdecode(b"\xff"))
+    journal.note(Event(EventKind.FAULT, 0.0, os.fsdecode(b"\xff")))
     assert journal.records()[3].failure == "\\udcff: no such file"

@@ -24,7 +24,7 @@ from mkpc_kaggle.engine.streams import unblocked
 from mkpc_kaggle.engine.worker import SceneRunner
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.recipe import SceneConfig
+from mkpc_kaggle.recipe import Recipe, SceneConfig, Unit
 from mkpc_kaggle.scene.reconstruct import Solution
 from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair
 
@@ -32,7 +32,8 @@ ROOT = Path(__file__).resolve().parents[2]
 IMAGES = (BatchImage("a", "a", Size(80, 72)), BatchImage("b", "b", Size(80, 72)))
 POINTS = np.random.default_rng(1).uniform(0, 70, (50_000, 2)).astype(np.float32)
 MATCHES = Matches(POINTS, POINTS, POINTS[:, 0])
-LARGE = SceneJob("one", (0,), (BatchPair(*IMAGES, MATCHES, None, {"m": MATCHES}),), SceneConfig())
+SCENES = Recipe((Unit(1, "m", 80),), scene=SceneConfig())
+LARGE = SceneJob("one", (0,), (BatchPair(*IMAGES, MATCHES, None, {"m": MATCHES}),), SCENES)
 
 
 class Worker(ProcessWorker):

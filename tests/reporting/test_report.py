@@ -13,7 +13,7 @@ from rectified import THREE_UNITS, RectifiedMatcher, run, write_pairs
 
 from mkpc_kaggle.cli import main
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine.journal import About, EventKind, Journal, JournalReader
+from mkpc_kaggle.engine.journal import About, Event, EventKind, Journal, JournalReader
 from mkpc_kaggle.reporting.report import DRAWING_S, report_page, report_run
 from mkpc_kaggle.reporting.run_log import NOT_ENDED, read_log
 from mkpc_kaggle.reporting.summary import overview
@@ -89,10 +89,10 @@ def test_an_export_that_cannot_be_written_is_told(tmp_path, option, capsys):
 
 def test_a_journal_can_be_read_while_its_run_writes_it(tmp_path):
     journal = empty_journal(tmp_path, write_pairs(tmp_path / "images", 2))
-    journal.note(EventKind.START, 0.5, "")
+    journal.note(Event(EventKind.START, 0.5, ""))
     with JournalReader(tmp_path) as reader:
         assert [event.kind for event in reader.events()] == ["start"]
-        journal.note(EventKind.PLAN, 1.5, "no more")
+        journal.note(Event(EventKind.PLAN, 1.5, "no more"))
         assert len(reader.events()) == 1, "what is read is one moment"
     assert [event.text for event in read_log(tmp_path).events] == ["", "no more"]
     assert read_log(tmp_path).ending == NOT_ENDED
@@ -134,7 +134,7 @@ def test_what_comes_from_files_is_escaped(tmp_path):
     pairs = [Pair(EVIL, EVIL, f"{EVIL.replace('/', '')}.png", "b.png")]
     with empty_journal(tmp_path, pairs, device=EVIL, left_out=(EVIL,), versions={EVIL: EVIL}) as journal:
         for kind in EventKind:
-            journal.note(kind, 1.0, EVIL)
+            journal.note(Event(kind, 1.0, EVIL))
     log = read_log(tmp_path)
     for known in ((), log.pairs):
         text = report_page(log, known)

@@ -26,6 +26,7 @@ from mkpc_kaggle.engine.jobs import (
     Outcome,
     SceneJob,
 )
+from mkpc_kaggle.engine.journal import Event
 from mkpc_kaggle.engine.places import Place, Site
 from mkpc_kaggle.engine.plan import RESERVE_SHARE
 from mkpc_kaggle.engine.records import NOT_REACHED, PairRecord, SceneRecord, UnitRecord
@@ -266,7 +267,7 @@ class SimulatedWorker(Simulated):
             now += usual
         for unit in sorted(job.units, key=lambda unit: unit.stage):
             for known, found in zip(job.known, results, strict=True):
-                if any(result.unit == unit for result in known) or now + expected[unit] >= deadline:
+                if known.has(unit) or now + expected[unit] >= deadline:
                     continue
                 stalled = site.rng.random() < scenario.stalls
                 usual = site.unit_seconds(unit, now)
@@ -284,7 +285,8 @@ class SimulatedWorker(Simulated):
                 found.append(UnitResult(unit, MATCHES, 0.0, seconds, warm_up=warm_up))
         if not job.units:
             now += ESTIMATE_S * len(job.indices)
-        pairs = zip(job.indices, job.known, results, strict=True)
+        known = (pair.results for pair in job.known)
+        pairs = zip(job.indices, known, results, strict=True)
         return now, MatchResult(tuple(_outcome(site.estimation, not job.units, *pair) for pair in pairs)), 0.0
 
 
@@ -341,7 +343,7 @@ class MemoryJournal:
         self._results: dict[int, tuple[UnitResult, ...]] = {}
         self._scenes: dict[str, SceneRecord] = {}
 
-    def forget_changed(self, pairs: Sequence[Pair]) -> int:
+    def forget_outdated(self, pairs: Sequence[Pair], *, has_scenes: bool) -> int:
         return 0
 
     def records(self) -> dict[int, PairRecord]:
@@ -363,7 +365,7 @@ class MemoryJournal:
         self._scenes[scene.batch] = scene
         self._records |= {record.index: record for record in records}
 
-    def note(self, kind: str, seconds: float, text: str) -> None:
+    def note(self, event: Event) -> None:
         pass
 
 
