@@ -72,6 +72,14 @@ def test_images_that_share_a_camera_keep_what_the_mapper_found(scene, monkeypatc
     assert cameras == [found.camera.K.tolist() for found in model_of(reconstruct_batch(scene.pairs, one)).images]
 
 
+def test_what_pycolmap_raises_leaves_what_the_mapper_found(scene, monkeypatch):
+    def broken(*_: object) -> None:
+        raise RuntimeError("no memory")
+
+    monkeypatch.setattr(colmap, "adjust_by_noise", broken)
+    assert all(choice.from_scene for choice in reconstruct_batch(scene.pairs, OWN_CAMERAS).choices)
+
+
 def test_an_image_that_sees_little_counts_as_much_as_the_median_image(scene, monkeypatch):
     monkeypatch.setattr(noise, "MIN_OBSERVATIONS", 10_000)
     solution = reconstruct_batch(scene.pairs, OWN_CAMERAS)
