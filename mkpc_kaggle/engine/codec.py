@@ -33,9 +33,9 @@ def decoder(kind: Any) -> Callable[[Any], Any]:
     """A function that makes a value of the type ``kind`` of its JSON, and raises where it is of another type."""
     if isinstance(kind, type) and issubclass(kind, (int, float, str)):
         return partial(scalar, kind)
-    origin, arguments = get_origin(kind), get_args(kind)
-    if origin is np.ndarray:
+    if kind == Matrix3:  # since NumPy 2.5 the origin of NDArray[float64] is an alias, not np.ndarray
         return matrix_of
+    origin, arguments = get_origin(kind), get_args(kind)
     hints = arguments or get_type_hints(kind).values()
     parts = [decoder(hint) for hint in hints if hint not in (NoneType, ...)]
     if origin is UnionType:  # with None
