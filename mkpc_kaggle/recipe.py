@@ -3,8 +3,6 @@
 A recipe is a TOML file: ``mkpc_kaggle/recipes/NAME.toml`` or a file of the user's own.
 """
 
-import hashlib
-import json
 import re
 import tomllib
 from collections.abc import Callable, Container, Mapping
@@ -16,7 +14,7 @@ from typing import Any
 
 from mkpc_kaggle.config import AT_LEAST_0, AT_LEAST_1, Config, Range, check_keys, check_ranges, from_table
 from mkpc_kaggle.errors import UserError, read_text
-from mkpc_kaggle.geometry.coordinates import Box, Matrix3, Size, View
+from mkpc_kaggle.geometry.coordinates import Box, Size, View
 from mkpc_kaggle.geometry.critical_region import MkpcConfig
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.geometry.robust import RobustConfig
@@ -167,35 +165,12 @@ class Recipe:
             return self
         return replace(self, scene=SceneConfig() if on else None)
 
-    def matching(self) -> dict[str, Any]:
-        """All that decides which points a run finds, as JSON-able values."""
-        return _values(self, "units", "mkpc", "matchers")
-
-    def estimation(self) -> dict[str, Any]:
-        """All that decides what F and cameras a run makes of the points, as JSON-able values."""
-        return _values(self, "magsac", "focal", "scene")
-
-    @cached_property
-    def scene_estimation(self) -> str:
-        """The digest of all that decides what a scene is made of given points."""
-        return _digest(self.estimation())
-
-    def pair_estimation(self, intrinsics: tuple[Matrix3, Matrix3] | None = None) -> str:
-        """The digest of all that decides which F, or with intrinsics which E, a pair gets of given points."""
-        return self._of_pairs + (_digest([K.tolist() for K in intrinsics]) if intrinsics else "")
-
-    @cached_property
-    def _of_pairs(self) -> str:
-        return _digest(_values(self, "magsac", "focal"))
-
-
-def _values(recipe: Recipe, *names: str) -> dict[str, Any]:
-    values = asdict(recipe)
-    return {name: values[name] for name in names}
-
-
-def _digest(value: Any) -> str:
-    return hashlib.sha256(json.dumps(value).encode()).hexdigest()[:12]
+    def table(self) -> dict[str, Any]:
+        """Return the recipe as :func:`recipe_of` takes it, as JSON values."""
+        values = asdict(self)
+        return {
+            name: values[name] for name in ("description", "units", "mkpc", "magsac", "focal", "matchers", "scene")
+        }
 
 
 def split_mode(text: str) -> tuple[str, Mode]:

@@ -109,6 +109,6 @@ def _lines(result: FolderResult) -> Iterator[str]:
         sizes = ", ".join(str(models[number]) for number in sorted(models))
         why = f"models of {sizes}" if models else reasons.get(name, "too few pairs, or too little time")
         yield f"{name}: {models.total()} of {len(found)} images have a camera: {why}"
-    unreadable = {record.failure for record in report.records if record.reached and not record.sizes}
+    unreadable = {record.failure for record in report.records if record.reached and not record.units}
     yield from (f"cannot be read: {failure}" for failure in sorted(unreadable)[:MAX_LINES])
     yield from (f"fault: {fault}" for fault in report.faults[:MAX_LINES])

@@ -54,7 +54,7 @@ def run(arguments: argparse.Namespace) -> int:
             session, watchdog = watched
             assembly = options.assembly_of(arguments, arguments.recipe, arguments.mode)
             options.say_start(f"{len(pairs)} pairs", assembly, work_dir)
-            report = submit(pairs, assembly, session, output)
+            report = submit(pairs, assembly, session, output, str(test_side(arguments.test_dir)[1]))
             watchdog.status = int(bool(report.unwritten or trouble(report)))
             unwritten = f" is not the last version: {report.unwritten}" if report.unwritten else ""
             lines = [

@@ -15,7 +15,6 @@ from mkpc_kaggle.data.outputs import require_apart
 from mkpc_kaggle.data.pairs import read_pairs
 from mkpc_kaggle.engine.console import say
 from mkpc_kaggle.engine.engine import Ending
-from mkpc_kaggle.engine.journal import share_journal
 from mkpc_kaggle.engine.session import Session, interruptible
 from mkpc_kaggle.errors import UserError, writing
 from mkpc_kaggle.evaluation.compare import Comparison, comparison_json, comparison_table, step_gains
@@ -66,8 +65,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--threshold", type=float, metavar="PIXELS", help="of the method; for E divided by the mean focal length")
     options.add_run(parser, time_limit=None)
     add("--json", type=Path, metavar="FILE", help="write all figures, per pair too")
-    text = """keep the journal there (with --compare, a journal for each recipe) and go on from it; report.html
-        beside it shows the run (not with --pairs); default: a temporary directory"""
+    text = """keep the journal there and resume from it; report.html (with --compare, a page for each recipe) shows
+        the run (not with --pairs); default: a temporary directory"""
     add("--work-dir", type=Path, metavar="DIR", help=text)
     add("--submission", action="append", type=Path, metavar="CSV", help="score it, match nothing; may be repeated")
     add("--truth", type=Path, metavar="CSV", help="which pairs its samples are (`demo` writes such a table)")
@@ -128,20 +127,18 @@ def _read_scenes(arguments: argparse.Namespace) -> tuple[TrainScene, ...]:
 
 
 def _match_and_score(arguments: argparse.Namespace, scenes: tuple[TrainScene, ...], work_dir: Path) -> int:
-    """Run a recipe, or several to compare, each then with a journal in a directory of its own."""
+    """Run a recipe, or several to compare; they share a journal, so that common units run once."""
     compared: list[str] = arguments.compare or []
     choices = [split_mode(text) for text in compared] or [(arguments.recipe, arguments.mode)]
     pairs = [true.pair for scene in scenes for true in scene.pairs]
+    root = str(arguments.train_dir or arguments.image_root)
     validations, status = [], 0
     with interruptible() as interrupt:
         assemblies = [_assemble(arguments, *choice) for choice in choices]
-        directories = [work_dir / re.sub(r"[^\w.-]+", "_", text) for text in compared or [""]]
-        for number, (assembly, directory) in enumerate(zip(assemblies, directories, strict=True)):
-            for former, done in zip(assemblies[:number], directories[:number], strict=True):
-                if former.fingerprint() == assembly.fingerprint():
-                    share_journal(done, directory)  # what both match is matched once
-            session = Session(directory, options.budget_of(arguments), interrupt, workers=arguments.workers)
-            validation = validate(scenes, assembly, session)
+        reports = [re.sub(r"[^\w.-]+", "_", text) for text in compared or ["report"]]
+        for assembly, name in zip(assemblies, reports, strict=True):
+            session = Session(work_dir, options.budget_of(arguments), interrupt, workers=arguments.workers)
+            validation = validate(scenes, assembly, session, root)
             validations.append(validation)
             report = validation.report
             assert report is not None
@@ -150,7 +147,7 @@ def _match_and_score(arguments: argparse.Namespace, scenes: tuple[TrainScene, ..
             say("\n".join([*lines, *score_table(validation), *step_gains(validation)]))
             # The report's inliers are of F: there is none for a list of pairs, whose E is estimated.
             if arguments.work_dir is not None and arguments.pairs is None:
-                say(report_run(directory, directory / "report.html", session.must_end(), pairs))
+                say(report_run(work_dir, work_dir / f"{name}.html", session.must_end(), pairs))
             status = 128 + interrupt.signal if interrupt.signal else max(status, bool(trouble(report)))
             if compared and report.ending != Ending.COMPLETE:
                 say("nothing is compared before all is done; with a --work-dir, the same command goes on")

@@ -4,7 +4,6 @@ import hashlib
 from collections import OrderedDict
 from collections.abc import Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -27,7 +26,7 @@ MAX_ASPECT = 32  # of the sides; beyond it views would be a few pixels high, or 
 class Image:
     name: str  # unique in a run
     pixels: Pixels  # (H, W, 3) uint8 RGB
-    version: str = ""  # the digest of its file, for :func:`is_unchanged`
+    version: str = ""  # :func:`content_digest` of its file
     focal: float = 0.0  # in pixels, by its EXIF; 0: unknown
 
     @classmethod
@@ -92,11 +91,11 @@ def read_image(path: Path) -> Image | Unreadable:
     return Image(name, pixels, _content_digest(data), exif.focal)
 
 
-def is_unchanged(path: Path, version: str) -> bool:
-    """Whether a file is still of that ``version``; a file that cannot be read counts as unchanged."""
-    with suppress(OSError, ValueError):
-        return not path.is_file() or _content_digest(np.fromfile(path, np.uint8)) == version
-    return True
+def content_digest(path: Path) -> str:
+    """Return the digest of a file. Raise ``OSError`` or ``ValueError`` if it cannot be read."""
+    if not path.is_file():
+        raise FileNotFoundError(path)
+    return _content_digest(np.fromfile(path, np.uint8))
 
 
 def _content_digest(data: Pixels) -> str:

@@ -19,9 +19,9 @@ from pathlib import Path
 from typing import Any
 
 from mkpc_kaggle.engine.jobs import Answer, Cause, Failure, Job
-from mkpc_kaggle.engine.places import Place, Site
+from mkpc_kaggle.engine.places import Place, Site, Work
 from mkpc_kaggle.engine.process import EXIT_TIMEOUT_S, ThreadWorker
-from mkpc_kaggle.engine.worker import Executor, Runner, SceneRunner, use_threads
+from mkpc_kaggle.engine.worker import Executor, MatchRunner, Runner, use_threads
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.pipeline.assembly import Assembly
 from mkpc_kaggle.version import __version__
@@ -93,22 +93,18 @@ class RaySite(Site):
         if self._has_joined:
             join(self._ray, self._cluster)
         machines = [node for node in self._ray.nodes() if node["Alive"] and node["Resources"].get("CPU", 0) >= 1]
-        self.scenes_at_once = max(1, len(machines))
         gpus = sum(int(node["Resources"].get("GPU", 0)) for node in machines)
         if gpus and self._assembly.device != "cpu":
-            make = self.match_runner(self._assembly.on("cuda:0"))
+            make = partial(MatchRunner, self._assembly.on("cuda:0").pipeline)
             names = [f"gpu {number}" for number in range(gpus)]
-            self.places = [Place(name, partial(self._worker, name, make, num_gpus=1)) for name in names]
+            self.places += [Place(name, partial(self._worker, name, make, num_gpus=1)) for name in names]
         else:
-            make = self.match_runner(self._assembly)
+            make = partial(MatchRunner, self._assembly.pipeline)
             for number, node in enumerate(machines):  # several may have the same name
                 name, cores = f"machine {number} ({node['NodeManagerHostname']})", int(node["Resources"]["CPU"])
                 self.places.append(Place(name, partial(self._worker, name, make, cores, num_cpus=cores)))
-        if not self.places:
+        if not self.of(Work.MATCH):
             raise UserError("the Ray cluster offers neither a CPU nor a GPU")
-
-    def scene_worker(self) -> "RayWorker":
-        return self._worker("scene", SceneRunner, scheduling_strategy="SPREAD")
 
     def close(self) -> None:
         if self._has_joined and self._ray.is_initialized():

@@ -1,41 +1,62 @@
-"""The engine: one loop on one thread that hands out jobs, takes in answers, keeps the journal, and publishes."""
+"""The engine: one loop on one thread. It gives jobs to workers, saves their answers, and publishes results."""
 
+import os
 import sqlite3
 import sys
 import threading
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
-from functools import partial
-from math import inf
-from types import MappingProxyType
+from math import inf, isfinite
+from pathlib import Path
+from statistics import fmean
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
 
 from mkpc_kaggle.data.competition import Pair
+from mkpc_kaggle.data.images import content_digest
 from mkpc_kaggle.engine import console
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.jobs import (
     Answer,
+    Cause,
+    EstimateJob,
+    Estimates,
     Failure,
+    Job,
     Loaded,
+    LookJob,
+    Matched,
     MatchJob,
-    MatchResult,
-    Outcome,
+    PairPoints,
+    PointSource,
     SceneJob,
+    WantedPair,
     visiting_order,
 )
-from mkpc_kaggle.engine.journal import Event, EventKind, Journal
-from mkpc_kaggle.engine.places import Place, Site
+from mkpc_kaggle.engine.journal import About, Event, EventKind, Journal
+from mkpc_kaggle.engine.losses import Losses
+from mkpc_kaggle.engine.places import LISTEN_S, START_TIMEOUT_S, Place, Site, Work
 from mkpc_kaggle.engine.plan import Plan
 from mkpc_kaggle.engine.records import PairRecord, SceneRecord
-from mkpc_kaggle.engine.scenes import Scenes, extra_pairs_of
+from mkpc_kaggle.engine.scenes import Scenes, batches_of, extra_pairs_of
+from mkpc_kaggle.engine.settings import Settings
+from mkpc_kaggle.engine.state import State
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult
-from mkpc_kaggle.recipe import Recipe
+from mkpc_kaggle.recipe import Recipe, Unit
 from mkpc_kaggle.scene.export import Export
 from mkpc_kaggle.scene.reconstruct import Solution
 
+ESTIMATE_PAIRS = 8  # in a job
+HANG_FACTOR = 10.0  # a job that takes this many times what was measured hangs
+UNKNOWN_SHARE, MAX_UNKNOWN_S = 0.25, 3600.0  # of the time left, after which a job of unknown cost hangs
 MIN_TOLD_PAIRS = 20  # of a batch whose reconstruction is shown: that of a smaller batch takes seconds
-PUBLISH_INTERVAL_S, PUBLISH_SHARE = 30.0, 0.05  # how often the submission is written, and its share of the time
+PUBLISH_INTERVAL_S, PUBLISH_SHARE = 30.0, 0.05  # how often the results are written, and their share of the time
+HASH_THREADS = 4
 
 
 class Ending(StrEnum):
@@ -45,304 +66,522 @@ class Ending(StrEnum):
     TIME_IS_UP = "time is up"
     INTERRUPTED = "interrupted"
     NO_WORKER = "no worker left"
-    NOTHING_RUNS = "every unit was given up"
+    NOTHING_RUNS = "every unit was skipped"
+
+
+@dataclass(frozen=True)
+class Request:
+    """What to compute: points and estimates of ``pairs``, whose images lie below ``root``, and their scenes.
+
+    ``exports`` are the batches whose COLMAP files are written. ``publish`` is called with the results first,
+    every half minute (less often if it takes long), after each scene with files, and at the end.
+    """
+
+    pairs: Sequence[Pair]
+    recipe: Recipe
+    settings: Settings
+    root: str = ""
+    exports: Mapping[str, Export] = field(default_factory=dict)
+    about: About | None = None
+    publish: "Callable[[Standing], None]" = lambda _: None
+
+
+@dataclass(frozen=True, eq=False)
+class Standing:
+    """The best results so far: F of each pair (R, 3, 3), the scenes, and the digest of each image by name."""
+
+    fundamentals: NDArray[np.float64]
+    scenes: Mapping[str, SceneRecord]
+    digests: Mapping[str, str]
 
 
 @dataclass(frozen=True)
 class RunReport:
-    """What a run leaves behind: a record for every pair, in their order, and how it went.
+    """What a run leaves: a record of each pair, in order, and how it went.
 
-    ``resumed`` pairs were done by earlier runs; ``faults`` are jobs that were lost and files that could not be
-    written, with their reasons; ``unwritten`` says why the last version of the submission could not be. ``scenes``
-    are the batches that were reconstructed, or could not be.
+    ``resumed`` pairs were complete before. ``faults`` are lost jobs and unwritten files, with reasons.
+    ``unwritten`` says why the last version of the results could not be written.
     """
 
     records: tuple[PairRecord, ...]
     ending: Ending
     seconds: float
-    resumed: int
-    faults: tuple[str, ...]
+    resumed: int = 0
+    faults: tuple[str, ...] = ()
     explanations: tuple[Event, ...] = ()  # decisions of the plan
     unwritten: str = ""
     scenes: tuple[SceneRecord, ...] = ()
     units_run: int = 0
-    estimated_anew: int = 0  # pairs that got another F of the points that the journal had
+    estimated: int = 0
 
 
 class Engine:
-    """A run over ``pairs``.
+    """A run. :meth:`look` and :meth:`ask` compute what the journal does not have.
 
-    ``publish`` is called with all records, in the order of ``pairs``, and what there is of scenes, when the run
-    starts, every half minute (less often where it takes long), after each scene of which COLMAP's files are
-    written, and when it ends, in whatever way. Setting ``interrupt`` ends the run early.
+    ``nothing`` is a request without pairs. Setting ``interrupt`` ends the run early.
     """
 
     def __init__(
         self,
-        pairs: Sequence[Pair],
-        recipe: Recipe,
+        nothing: Request,
         site: Site,
         journal: Journal,
         budget: Budget,
         *,
-        publish: Callable[[Sequence[PairRecord], Iterable[SceneRecord]], None],
         interrupt: threading.Event,
         progress: bool = True,
         minibatch: int = 1,
-        exports: Mapping[str, Export] = MappingProxyType({}),
     ) -> None:
-        self.row_count = len(pairs)
-        self.pairs = [*pairs, *extra_pairs_of(pairs, recipe.scene)]
-        self.recipe, self.site, self.journal, self.budget = recipe, site, journal, budget
-        self.publish, self.interrupt = publish, interrupt
+        self.site, self.journal, self.budget = site, journal, budget
+        self.interrupt, self.minibatch = interrupt, minibatch
         self.faults: list[str] = []
+        self.explanations: list[Event] = []
         self.unwritten = ""
-        self._units = {unit.name: unit for unit in recipe.units}
-        self._explanations: list[Event] = []
-        self._units_run = 0
+        self.units_run = self.estimated = 0
+        self.digests: dict[str, str] = {}
+        self._looks: dict[tuple[str, str], LookJob] = {}
+        self._features: dict[tuple[str, str], bytes] = {}
+        self._look_losses: Losses[tuple[str, str]] = Losses()
+        self._until = inf
         self._published = budget.clock()
         self._progress = console.Progress(budget, sys.stderr if progress else None)
         self._publishing = threading.Lock()
-        self._has_ended = self._has_loaded = False
-        order, records = visiting_order(self.pairs), self._read_records()
-        outdated = [record.index for record in records if self._is_outdated(record)]
-        self.plan = Plan(order, self.row_count, recipe, records, budget, self._explain, minibatch, outdated)
-        site.loads_matchers = any(record.lacking(recipe.units) for record in records)
-        self.scenes = Scenes(self.pairs, recipe, self.plan.records, journal.scenes(), exports)
-        self._scene_places: list[Place] = []
+        self._is_open = self._has_loaded = self._has_ended = False
+        self._begin(nothing)
 
-    def run(self) -> RunReport:
-        """Run until all is done, the time is up, or an interrupt.
+    def __enter__(self) -> Self:
+        return self
 
-        Raises :class:`UserError` where no worker can be started.
+    def __exit__(self, *_: object) -> None:
+        self._end()
+
+    def _end(self) -> None:
+        """End all workers, and publish for the last time."""
+        if self._has_ended:
+            return
+        for place in [*self.site.places, *self.site.fallback]:
+            place.kill()
+        self.site.close()
+        self._progress.close()
+        self._publish()
+        self._has_ended = True
+
+    # Requests
+
+    def look(
+        self, looks: Mapping[tuple[str, str], Callable[[], bytes]], *, compute: bool = True
+    ) -> dict[tuple[str, str], bytes]:
+        """Return the features of each key (digest of contents, digest of settings), except those that failed.
+
+        With ``compute = False``, only those that the journal has.
         """
-        resumed = sum(not record.lacking(self.recipe.units) for record in self.records if record.units)
-        try:
-            self._publish()
+        known = {key: self.journal.feature(*key) for key in looks}
+        self._features = {key: value for key, value in known.items() if value is not None}
+        if compute:
+            self._looks = {key: LookJob(key, do) for key, do in looks.items() if key not in self._features}
             self._loop()
-        finally:
-            for place in self._places:
-                place.kill()
-            self.site.close()
-            self._progress.close()
-            self._publish()
-            self._has_ended = True
+            self._looks.clear()
+        return self._features
+
+    def ask(self, request: Request, share: float = 1.0) -> None:
+        """Compute what a request asks for and the journal lacks, in a share of the time left at most."""
+        self._begin(request)
+        self._until = self.budget.clock() + share * self.budget.left() if share < 1 else inf
+        self._publish()
+        self._loop()
+
+    def report(self) -> RunReport:
+        """End the run. Return the results of the latest request."""
+        self._end()
         return RunReport(
-            tuple(self.records),
-            self._ending(),
+            tuple(self.journal.records()),
+            self.ending,
             self.budget.spent(),
-            resumed,
+            self._resumed,
             tuple(self.faults),
-            tuple(self._explanations),
+            tuple(self.explanations),
             self.unwritten,
             self.scenes.report(),
-            self._units_run,
-            self.plan.estimated_anew,
+            self.units_run,
+            self.estimated,
         )
 
-    @property
-    def records(self) -> list[PairRecord]:
-        """Of the pairs that have a row, in their order."""
-        return self.plan.records[: self.row_count]
+    def digest_files(self, files: Mapping[str, Path]) -> dict[str, str]:
+        """Return the digest of each file's content by name; files that cannot be read are left out."""
+        with ThreadPoolExecutor(HASH_THREADS) as pool:
+            futures = {name: pool.submit(content_digest, path) for name, path in files.items()}
+            pending = set(futures.values())
+            while pending and not self._is_over(self.budget.clock()):
+                _, pending = wait(pending, LISTEN_S)
+            for future in pending:
+                future.cancel()
+        done = {name: future for name, future in futures.items() if future.done() and not future.cancelled()}
+        return {name: future.result() for name, future in done.items() if not future.exception()}
 
-    @property
-    def _places(self) -> list[Place]:
-        return [*self.site.places, *self._scene_places]
+    def _begin(self, request: Request) -> None:
+        """Let the journal say what is missing or out of date."""
+        recipe, settings = request.recipe, request.settings
+        self.request, self.recipe = request, recipe
+        extra = extra_pairs_of(request.pairs, recipe.scene)
+        self.pairs = [
+            WantedPair(
+                pair,
+                (name_below(request.root, pair.file0), name_below(request.root, pair.file1)),
+                settings.of_estimate(pair),
+                number < len(request.pairs),
+            )
+            for number, pair in enumerate([*request.pairs, *extra])
+        ]
+        self._units = dict(zip((unit.name for unit in recipe.units), settings.units, strict=True))
+        batches = batches_of(each.pair for each in self.pairs) if recipe.scene is not None else {}
+        units = list(zip(recipe.units, settings.units, strict=True))
+        self.journal.want(self.pairs, units, dict.fromkeys(batches, settings.scene), request.about)
+        self._look_at_images()
+        for batch, scene in self.journal.scenes().items():
+            if batch in request.exports and not request.exports[batch].has_files(scene.models):
+                self.journal.forget_scene(batch)  # its files are a result, too
+        self.state = State(self.journal, len(self.pairs), len(request.pairs), len(recipe.units))
+        order = visiting_order([each.pair for each in self.pairs])
+        self.plan = Plan(recipe.units, self.state, order, self.budget, self._explain, self.minibatch)
+        self.scenes = Scenes(batches, self.journal.scenes(), self.journal.current_scenes())
+        self._order = np.array(order, int)
+        self._estimating = np.zeros(len(self.pairs), bool)
+        self._estimate_losses: Losses[int] = Losses()
+        self._estimate_s: list[float] = []
+        complete = self.state.had.all(1) & self.state.is_estimated
+        self._resumed = int(complete[: self.state.rows].sum())
 
-    @property
-    def _is_closed(self) -> bool:
-        """Whether no worker is started at any place any more."""
-        return bool(self.site.places) and all(place.closed for place in self.site.places)
+    def _look_at_images(self) -> None:
+        """Digest the images that have points again: points of other contents are out of date."""
+        files = {
+            name: path for each in self.pairs for name, path in zip(each.names, each.pair.images, strict=True)
+        }
+        known = self.journal.digests()
+        now = self.digest_files({name: path for name, path in files.items() if name in known})
+        changed = {name: digest for name, digest in now.items() if known[name] != digest}
+        for name, digest in changed.items():
+            self.journal.save_digest(name, digest)
+        self.digests = known | changed
+        if changed:
+            count = sum(not changed.keys().isdisjoint(each.names) for each in self.pairs)
+            text = f"{len(changed)} images have changed: their {count} pairs are matched again"
+            console.warn(text)
+            self._fault(text)
+
+    # The loop
+
+    def _loop(self) -> None:
+        while not self._is_over(now := self.budget.clock()):
+            for place in self.site.places:
+                self._take_answer(place, now)
+            self._fall_back(now)
+            self._hand_out(now)
+            if not any(place.job is not None or self._may_work(place, now) for place in self.site.places):
+                return
+            if now - self._published > max(PUBLISH_INTERVAL_S, self.budget.writing / PUBLISH_SHARE):
+                self._publish()
+            limits = (place.limit for place in self.site.places)
+            self.site.wait(min(self.budget.stop_waiting, *(limit for limit in limits if limit > now), inf))
+
+    def _is_over(self, now: float) -> bool:
+        return self.interrupt.is_set() or now >= min(self._until, self.budget.stop_waiting)
+
+    def _hand_out(self, now: float) -> None:
+        """Start a worker where there is work and none, and give a job to each idle worker."""
+        if not self._is_open and self.plan.has_work(now):
+            self.site.open()
+            self._is_open = True
+        self.plan.reserve = self._reserve()
+        self.plan.workers = max(1, sum(not place.closed for place in self.site.of(Work.MATCH)))
+        for place in self.site.places:
+            if place.may_start(now) and self._has_work(place.work, now):
+                place.start(now, min(START_TIMEOUT_S, max(self.budget.silence, UNKNOWN_SHARE * self._left(now))))
+            elif place.is_idle and (job := self._next_job(place.work, now)) is not None:
+                seconds = job.seconds if isinstance(job, MatchJob) else inf
+                place.submit(job, seconds, self._time_limit(job, now), now)
+
+    def _may_work(self, place: Place, now: float) -> bool:
+        """Whether a place without a job will have one when a worker has started."""
+        return place.is_starting and self._has_work(place.work, now)
+
+    def _has_work(self, work: Work, now: float) -> bool:
+        if work is Work.MATCH:
+            return self.plan.has_work(now)
+        if work is Work.LIGHT:
+            return bool(self._looks) or bool(len(self._due_estimates()))
+        return self._due_scene(now) is not None
+
+    def _next_job(self, work: Work, now: float) -> Job | None:
+        if work is Work.MATCH:
+            job = self.plan.next(now)
+            return job and self._with_pairs(job)
+        if work is Work.SCENE:
+            batch = self._due_scene(now)
+            return None if batch is None else self._scene_job(batch)
+        if self._looks:
+            return self._looks.pop(next(iter(self._looks)))
+        return self._estimate_job()
+
+    def _time_limit(self, job: Job, now: float) -> float:
+        """Return the seconds after which a worker hangs, from measured costs or from the time left."""
+        expected = inf
+        if isinstance(job, MatchJob):
+            expected = self.plan.seconds_of(job)
+        elif isinstance(job, EstimateJob) and self._estimate_s:
+            expected = len(job.pairs) * fmean(self._estimate_s)
+        unknown = min(MAX_UNKNOWN_S, UNKNOWN_SHARE * self._left(now))
+        return self.budget.silence + (HANG_FACTOR * expected if isfinite(expected) else unknown)
+
+    def _left(self, now: float) -> float:
+        return max(0.0, self.budget.stop_units - now)
+
+    def _reserve(self) -> float:
+        """Return the seconds at the end that estimates and scenes will probably take."""
+        estimates = fmean(self._estimate_s or [0.0]) * len(self._due_estimates()) / len(self.site.of(Work.LIGHT))
+        return estimates + self.scenes.reserve(self.state.matches)
+
+    # Matching
+
+    def _with_pairs(self, job: MatchJob) -> MatchJob:
+        """The job with its pairs, and with their points of stage 1 if critical regions are computed from them."""
+        known: list[tuple[tuple[Unit, bytes], ...]] = []
+        for index in job.indices:
+            inputs = self.journal.inputs(index) if any(unit.stage == 2 for unit in job.units) else {}
+            units = {unit.name: unit for unit in self.recipe.units if unit.stage == 1}
+            revisions = {name: revision for name, revision in inputs.items() if name in units}
+            blobs = self.journal.blobs(revisions.values())
+            known.append(tuple((units[name], blobs[revision]) for name, revision in revisions.items()))
+        upcoming = (path for index in self.plan.upcoming(job) for path in self.pairs[index].pair.images)
+        pairs = tuple(self.pairs[index] for index in job.indices)
+        return replace(job, pairs=pairs, known=tuple(known), upcoming=tuple(upcoming))
+
+    def _take_matched(self, job: MatchJob, answer: Matched) -> None:
+        self.journal.save_outcomes(answer.outcomes, self._units)
+        self.units_run += sum(len(outcome.found) for outcome in answer.outcomes)
+        for outcome in answer.outcomes:
+            self.digests |= {image.name: image.digest for image in outcome.images}
+        self.scenes.note_change(self.state.refresh(outcome.index for outcome in answer.outcomes))
+        self.plan.on_result(job, answer.outcomes)
+        seconds = sum(found.seconds for outcome in answer.outcomes for found in outcome.found)
+        self._note(EventKind.JOB, f"{job.phase} {len(job.indices)} pairs {seconds:.3f} s")
+        self._progress.show(*self.plan.progress(self.budget.clock()))
+
+    # Estimates
+
+    def _due_estimates(self) -> NDArray[np.int_]:
+        """Return the rows whose estimate is missing or out of date, those without any F first."""
+        state = self.state
+        due = state.has_row & state.had.any(1) & ~state.is_estimated & ~self._estimating
+        due &= ~self.plan.busy | ~state.has_own
+        due[list(self._estimate_losses.skipped)] = False
+        order = self._order[due[self._order]]
+        return np.asarray(order[np.argsort(state.has_own[order], kind="stable")])
+
+    def _estimate_job(self) -> EstimateJob | None:
+        due = self._due_estimates().tolist()
+        if not due:
+            return None
+        is_retry = due[0] in self._estimate_losses.alone
+        chosen = due[: 1 if is_retry else ESTIMATE_PAIRS]
+        if not is_retry:
+            chosen = [index for index in chosen if index not in self._estimate_losses.alone]
+        self._estimating[chosen] = True
+        pairs = tuple(self._pair_points(index) for index in chosen)
+        return EstimateJob(pairs, self.recipe, self._source(pairs), is_retry)
+
+    def _take_estimates(self, answer: Estimates) -> None:
+        self.journal.save_estimates(answer.estimates)
+        indices = [each.index for each in answer.estimates]
+        self._estimating[indices] = False
+        self.estimated += len(indices)
+        self._estimate_s = [*self._estimate_s, *(each.seconds for each in answer.estimates)][-64:]
+        self.scenes.note_change(self.state.refresh(indices))
+        if not self.plan.busy.any():
+            rows = slice(self.state.rows)
+            done, total = self.state.is_estimated[rows].sum(), self.state.had[rows].any(1).sum()
+            self._progress.show("estimate", int(done), int(total))
+
+    def _pair_points(self, index: int) -> PairPoints:
+        """The current points of a pair, for an estimate or a scene."""
+        inputs, units = self.journal.inputs(index), {unit.name: unit for unit in self.recipe.units}
+        images = self.journal.images(index)
+        own = self.state.own[index] if self.state.has_own[index] else None
+        points = tuple((units[name], revision) for name, revision in inputs.items())
+        return PairPoints(index, (images[0], images[1]), points, self.pairs[index].pair.intrinsics, own)
+
+    def _source(self, pairs: Sequence[PairPoints]) -> PointSource:
+        """Workers read points themselves, unless the journal is in memory."""
+        revisions = [revision for pair in pairs for revision in pair.revisions]
+        blobs = self.journal.blobs(revisions) if self.journal.is_in_memory else None
+        return PointSource(self.journal.path.parent, blobs)
+
+    # Scenes
+
+    def _due_scene(self, now: float) -> str | None:
+        """Return a batch to reconstruct now: its pairs have what fits; any batch if matching has ended."""
+        if not (waiting := self.scenes.waiting(self.state.matches)):
+            return None
+        pending = np.zeros(len(self.pairs), bool)
+        pending[self._due_estimates()] = True
+        pending |= self._estimating
+        if self._is_matching(now):
+            settled, filled = self.plan.settled(now) & ~pending, self.plan.filled(now) & ~pending
+            return self.scenes.due(self.state.matches, settled, filled)
+        return next((name for name in waiting if not pending[self.scenes.batches[name]].any()), None)
+
+    def _is_matching(self, now: float) -> bool:
+        places = self.site.of(Work.MATCH)
+        is_closed = self._is_open and all(place.closed for place in places)
+        return any(place.job is not None for place in places) or (self.plan.has_work(now) and not is_closed)
+
+    def _scene_job(self, batch: str) -> SceneJob:
+        self.scenes.running.add(batch)
+        members = [index for index in self.scenes.batches[batch] if self.state.had[index].any()]
+        pairs = tuple(self._pair_points(index) for index in members)
+        if len(pairs) >= MIN_TOLD_PAIRS:
+            self._progress.note(f"batch {batch}: reconstructing its cameras from {len(pairs)} pairs")
+        inputs, matches = self.journal.batch_inputs(batch), int(self.state.matches[members].sum())
+        return SceneJob(
+            batch, pairs, self.recipe, self._source(pairs), inputs, matches, self.request.exports.get(batch)
+        )
+
+    def _take_scene(self, job: SceneJob, answer: Solution, seconds: float) -> None:
+        record = SceneRecord.of(job.batch, answer.reconstructions, seconds)
+        chosen = zip((pair.index for pair in job.pairs), answer.choices, strict=True)
+        self.journal.save_scene(record, job.inputs, dict(chosen))
+        self.scenes.on_result(job, record, is_current=self.journal.batch_inputs(job.batch) == job.inputs)
+        self.state.read_choices()
+        text = f"{record.registered} of {record.images} images"
+        self._note(EventKind.SCENE, f"{record.batch}: {text}")
+        if len(job.pairs) >= MIN_TOLD_PAIRS:
+            self._progress.note(f"batch {job.batch}: {text} have a camera")
+        if job.export is not None:
+            self._publish()
+
+    # Answers
+
+    def _take_answer(self, place: Place, now: float) -> None:
+        time_limit, seconds = place.limit - place.since, now - place.since
+        answer, job = place.poll(now), place.job
+        if isinstance(answer, Loaded):
+            self._has_loaded = self._has_loaded or place.work is Work.MATCH
+        elif answer is not None:
+            place.job = None
+            if isinstance(answer, Failure):
+                self._fault(f"a job was lost on {place.name}: {answer}" if job else f"{place.name}: {answer}")
+                if place.closed:
+                    self._explain(f"no worker is started any more on {place.closed}")
+                self._lose(job, answer, time_limit)
+            else:
+                self._save(job, answer, seconds)
+            if place.work is Work.SCENE:
+                place.kill()
+
+    def _save(self, job: Job | None, answer: Answer, seconds: float) -> None:
+        """Take an answer. A result that no table can hold costs itself alone."""
+        try:
+            if isinstance(job, MatchJob) and isinstance(answer, Matched):
+                self._take_matched(job, answer)
+            elif isinstance(answer, Estimates):
+                self._take_estimates(answer)
+            elif isinstance(job, SceneJob) and isinstance(answer, Solution):
+                self._take_scene(job, answer, seconds)
+            elif isinstance(job, LookJob) and isinstance(answer, bytes):
+                self._features[job.key] = answer
+                self.journal.save_feature(*job.key, answer)
+        except sqlite3.Error as error:
+            self._fault(f"a result cannot be saved: {error}")
+            self._lose(job, Failure(Cause.RAISED, str(error)), inf)
+        if self.journal.trouble:
+            self._fault(f"the journal cannot be written ({self.journal.trouble}); it continues in memory")
+
+    def _lose(self, job: Job | None, failure: Failure, time_limit: float) -> None:
+        if isinstance(job, MatchJob):
+            self.plan.on_failure(job, failure, time_limit)
+        elif isinstance(job, EstimateJob):
+            indices = [pair.index for pair in job.pairs]
+            self._estimating[indices] = False
+            if self._estimate_losses.add(indices, failure):
+                self._explain(f"pair {indices[0]} keeps the F it has: {failure}")
+        elif isinstance(job, SceneJob):
+            self._fault(f"batch {job.batch} was not reconstructed: {failure}")
+            self.scenes.on_failure(job, failure)
+        elif isinstance(job, LookJob) and not self._look_losses.add([job.key], failure):
+            self._looks[job.key] = job
+
+    def _fall_back(self, now: float) -> None:
+        """Continue elsewhere when the last matching place is closed, or had to skip every unit."""
+        places = self.site.of(Work.MATCH)
+        is_closed = self._is_open and all(place.closed for place in places)
+        reason = "; ".join(place.closed for place in places if place.closed)
+        if self.site.fallback and (is_closed or self.plan.nothing_runs):
+            text = f"matching continues on the {self.site.fallback[0].name}: {reason or Ending.NOTHING_RUNS}"
+            self._fault(text)
+            console.warn(text)
+            for place in places:
+                place.kill()
+                self.site.places.remove(place)
+            self.site.places += self.site.fallback
+            self.site.fallback = []
+            self._explain(text)
+            self.plan.busy[:] = False
+            self.plan.restart()
+        elif is_closed and not self._has_loaded and places:
+            raise UserError(f"no worker could be started: {reason}")
+
+    # Results
 
     def save_results(self) -> str:
-        """Write the results, unless the run has ended; why it cannot be written. For any thread."""
+        """Write the results unless the run has ended. Return why they cannot be written. For any thread."""
         with self._publishing:
             if not self._has_ended:
                 try:
-                    self.publish(self.records, list(self.scenes.made.values()))
+                    made = dict(self.scenes.made)
+                    self.request.publish(Standing(self.state.fundamentals, made, dict(self.digests)))
                     self.unwritten = ""
                 except OSError as error:
                     self.unwritten = f"the results cannot be written: {error}"
         return self.unwritten
 
-    # The loop
-
-    def _loop(self) -> None:
-        if self.plan.advance(self.budget.clock()) or self.scenes.due(range(len(self.pairs))) is not None:
-            self.site.open()
-        while not self.interrupt.is_set() and (now := self.budget.clock()) < self.budget.stop_waiting:
-            for place in self._places:
-                self._take_answer(place, now)
-            self._fall_back(now)
-            self._hand_out(now)
-            is_matching = self._is_matching(now)
-            self._start_scenes(now, is_matching=is_matching and now < self.plan.stop)
-            if not is_matching and not self._scene_places:
-                return
-            if now - self._published > max(PUBLISH_INTERVAL_S, self.budget.writing / PUBLISH_SHARE):
-                self._publish()
-            limits = (place.limit for place in self._places)
-            self.site.wait(min(self.budget.stop_waiting, *(limit for limit in limits if limit > now), inf))
-
-    def _hand_out(self, now: float) -> None:
-        """A worker for each place that has none, and a job for each worker that is idle."""
-        self.plan.reserve = self.scenes.reserve(self.site.scenes_at_once)
-        self.plan.workers = max(1, sum(not place.closed for place in self.site.places))
-        for place in self.site.places:
-            if place.may_start(now) and self.plan.advance(now):
-                place.start(now)
-            elif place.is_idle and (job := self.plan.next(now, place.name, cautious=place.losses > 0)):
-                pairs = tuple(self.pairs[index] for index in job.indices)
-                job = replace(job, pairs=pairs, known=tuple(map(self._known, job.indices)))
-                place.submit(job, job.seconds, job.time_limit, now)
-
-    def _is_matching(self, now: float) -> bool:
-        """Whether a job is under way, or will be when a worker has started."""
-        places, may_begin = self.site.places, self.plan.advance(now)
-        return any(place.job is not None or (place.is_starting and may_begin) for place in places)
-
-    def _take_answer(self, place: Place, now: float) -> None:
-        answer, job, seconds = place.poll(now), place.job, now - place.since
-        if isinstance(answer, Loaded):
-            self._has_loaded = True
-            if isinstance(job, SceneJob):
-                self.scenes.on_start(seconds)
-                place.submit(job, inf, self.scenes.time_limit(job.batch, self.budget.left()), now)
-        elif answer is not None:
-            place.job = None
-            if isinstance(job, SceneJob):
-                self._scene_places.remove(place)
-                place.kill()
-                self._take_scene(job, answer, seconds)
-            elif isinstance(answer, Failure):
-                self._fault(f"a job was lost on {place.name}: {answer}" if job else f"{place.name}: {answer}")
-                if isinstance(job, MatchJob):
-                    self._keep(self.plan.on_failure(job, answer, place.name))
-                if place.closed:
-                    self._explain(f"no worker is started any more on {place.closed}")
-            elif isinstance(job, MatchJob) and isinstance(answer, MatchResult):
-                self._units_run += len(answer.results)
-                self._keep(self.plan.on_result(job, answer, seconds))
-                self._note(EventKind.JOB, f"{job.phase} {len(job.indices)} pairs {answer.unit_seconds:.3f} s")
-            self._progress.show(*self.plan.progress)
-
-    def _fall_back(self, now: float) -> None:
-        """Go on elsewhere when the last place is closed, or had to give up every unit."""
-        reason = "; ".join(place.closed for place in self.site.places if place.closed)
-        if self.site.fallback and (self._is_closed or self.plan.nothing_runs):
-            why = reason if self._is_closed else Ending.NOTHING_RUNS
-            text = f"the work goes on on the {self.site.fallback[0].name}: {why}"
-            self._fault(text)
-            console.warn(text)
-            for place in self.site.places:
-                place.kill()
-            self.site.places, self.site.fallback = self.site.fallback, []
-            self._explain(text)
-            self._keep(self.plan.restart())
-        elif self._is_closed and not self._has_loaded:
-            raise UserError(f"no worker could be started: {reason}")
-
-    # Scenes
-
-    def _start_scenes(self, now: float, *, is_matching: bool) -> None:
-        """Begin to reconstruct batches whose pairs have what fits; all when nothing is matched any more."""
-        at_once, plan = self.site.scenes_at_once, self.plan
-        done, filling = (plan.done, plan.filling) if is_matching else (range(len(self.pairs)), ())
-        while len(self._scene_places) < at_once and (batch := self.scenes.due(done, filling)) is not None:
-            place = Place(f"scene of batch {batch}", self.site.scene_worker)
-            place.job = self.scenes.job(batch, self._known)
-            self._tell(place.job, f"its cameras are reconstructed from {len(place.job.pairs)} pairs")
-            self._scene_places.append(place)
-            place.start(now, self.scenes.start_timeout(self.budget.left()))
-
-    def _take_scene(self, job: SceneJob, answer: Answer, seconds: float) -> None:
-        if isinstance(answer, Failure):
-            self._fault(f"batch {job.batch} was not reconstructed: {answer}")
-            self.scenes.on_failure(job, str(answer))
-            return
-        assert isinstance(answer, Solution)
-        records, estimation = self.plan.records, self.recipe.scene_estimation
-        record = SceneRecord.of(job.batch, answer.reconstructions, job.unit_results, seconds, estimation)
-        self.scenes.on_result(job, record)
-        for index, choice in zip(job.indices, answer.choices, strict=True):
-            records[index] = replace(records[index], scene=choice)
-        text = f"{record.registered} of {record.images} images"
-        self._note(EventKind.SCENE, f"{record.batch}: {text}")
-        self._tell(job, f"{text} have a camera")
-        members = [records[index] for index in self.scenes.batches[job.batch]]
-        self._save(partial(self.journal.save_scene, record, members))
-        if job.export is not None:
-            self._publish()
-
-    # The journal and the submission
-
-    def _read_records(self) -> list[PairRecord]:
-        has_scenes = self.recipe.scene is not None
-        if forgotten := self.journal.forget_outdated(self.pairs, has_scenes=has_scenes):
-            text = f"images have changed since they were matched: {forgotten} pairs are matched anew"
-            console.warn(text)
-            self._fault(text)
-        records = self.journal.records()
-        return [records.get(index) or PairRecord.untouched(index) for index in range(len(self.pairs))]
-
-    def _is_outdated(self, record: PairRecord) -> bool:
-        """Whether a pair has the F of another estimation."""
-        wanted = self.recipe.pair_estimation(self.pairs[record.index].intrinsics)
-        return record.matches > 0 and record.estimation != wanted
-
-    def _known(self, index: int) -> PairMatch:
-        """What earlier jobs found on a pair."""
-        record, results = self.plan.records[index], tuple[UnitResult, ...]()
-        try:
-            results = self.journal.results(record, self._units)
-        except UserError as error:  # without them a job gains nothing, and the F stays
-            self._fault(str(error))
-        return PairMatch(results, sizes=record.sizes, versions=record.versions, focals=record.focals)
-
-    def _keep(self, outcomes: Sequence[Outcome]) -> None:
-        """Put outcomes into the journal; the scenes of their batches are out of date."""
-        for outcome in outcomes:
-            gained = sum(len(result.matches) for result in outcome.results)
-            self.scenes.note_change(outcome.record.index, gained)
-        self._save(partial(self.journal.save, outcomes))
-
-    def _save(self, write: Callable[[], None]) -> None:
-        """Write to the journal: a full disk costs what a later run would have had of it."""
-        try:
-            write()
-        except (sqlite3.Error, ValueError) as error:
-            self._fault(f"the journal cannot be written ({error}): an interrupted run would have to do this again")
-
-    def _explain(self, text: str) -> None:
-        self._explanations.append(self._note(EventKind.PLAN, text))
-
-    def _note(self, kind: EventKind, text: str) -> Event:
-        event = Event(kind, self.budget.spent(), text)
-        self.journal.note(event)
-        return event
-
-    def _tell(self, job: SceneJob, text: str) -> None:
-        """Show a step of a reconstruction that may take minutes."""
-        if len(job.pairs) >= MIN_TOLD_PAIRS:
-            self._progress.note(f"batch {job.batch}: {text}")
-
-    def _fault(self, what: str) -> None:
-        if what not in self.faults:
-            self.faults.append(what)
-            self._note(EventKind.FAULT, what)
-
     def _publish(self) -> None:
+        if not self.request.pairs:
+            return
         start = self.budget.clock()
         if trouble := self.save_results():
             self._fault(trouble)
         self._published = self.budget.clock()
         self.budget.note_write(self._published - start)
 
-    def _ending(self) -> Ending:
+    def _explain(self, text: str) -> None:
+        self.explanations.append(self._note(EventKind.PLAN, text))
+
+    def _note(self, kind: EventKind, text: str) -> Event:
+        event = Event(kind, self.budget.spent(), text)
+        with suppress(sqlite3.Error):
+            self.journal.note(event)
+        return event
+
+    def _fault(self, what: str) -> None:
+        if what not in self.faults:
+            self.faults.append(what)
+            self._note(EventKind.FAULT, what)
+
+    @property
+    def ending(self) -> Ending:
         if self.interrupt.is_set():
             return Ending.INTERRUPTED
         if self.plan.nothing_runs:
             return Ending.NOTHING_RUNS
-        if self.plan.is_complete and self.scenes.is_complete:
+        if (
+            self.plan.is_complete
+            and not len(self._due_estimates())
+            and not self.scenes.waiting(self.state.matches)
+        ):
             return Ending.COMPLETE
-        return Ending.NO_WORKER if self._is_closed else Ending.TIME_IS_UP
+        places = self.site.of(Work.MATCH)
+        return Ending.NO_WORKER if places and all(place.closed for place in places) else Ending.TIME_IS_UP
+
+
+def name_below(root: str, file: str) -> str:
+    """Return the name of a file below ``root``; a file elsewhere goes by its path."""
+    return file.removeprefix(root.rstrip(os.sep) + os.sep) if root else file

@@ -1,37 +1,46 @@
-"""What crosses between the engine and a worker: three kinds of job, and their answers. Plain values."""
+"""What crosses between the engine and a worker: four kinds of job, and their answers. Plain values."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from pathlib import Path
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine.records import PairRecord
-from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult
+from mkpc_kaggle.geometry.coordinates import Matrix3
+from mkpc_kaggle.geometry.robust import NO_STATS, EstimateStats
+from mkpc_kaggle.pipeline.pair import Regions
 from mkpc_kaggle.recipe import Recipe, Unit
 from mkpc_kaggle.scene.export import Export
 from mkpc_kaggle.scene.reconstruct import Solution
-from mkpc_kaggle.scene.view_graph import BatchPair
+from mkpc_kaggle.scene.view_graph import BatchImage
 
 
 class Phase(StrEnum):
-    """The phases of a run, in order."""
+    """The priorities of matching, in order."""
 
-    ESTIMATE = "estimate"  # F anew, of the points that the journal has, where another estimation made it
     SWEEP = "sweep"  # the first unit on all pairs
-    CONNECT = "connect"  # the first unit on pairs that no row names, where a batch has few
-    DEEPEN = "deepen"  # the other units, as many as fit
-    FILL = "fill"  # units that did not fit for all, on the weakest pairs first, in the time that is left
+    CONNECT = "connect"  # the first unit on extra pairs, where a batch has few pairs
+    DEEPEN = "deepen"  # the longest prefix of the recipe that fits for all pairs
+    FILL = "fill"  # the other units, on the weakest pairs first
+
+
+@dataclass(frozen=True)
+class WantedPair:
+    """A pair that a run asks for: names of its images, digest of its estimate's settings."""
+
+    pair: Pair
+    names: tuple[str, str]
+    settings: str
+    has_row: bool = True
 
 
 @dataclass(frozen=True)
 class MatchJob:
-    """Run ``units`` on the pairs of ``indices``; what a pair has had, ``known``, is left out.
+    """Run ``units``, none of which they have had, on the pairs of ``indices``: one pair, or a minibatch on a GPU.
 
-    A job without units makes F of what is known alone: no image is read for it.
-
-    ``expected`` are the seconds within which each unit most likely ends on a pair. Units may begin in the first
-    ``seconds`` of the job if they are expected to end in them. After ``time_limit`` seconds without an answer the
-    worker hangs. ``is_retry``: a worker was lost at it before.
+    ``expected`` are the seconds that each unit takes on a pair. A unit begins only if it is expected to end within
+    ``seconds`` of the job's start. ``known`` are the points of stage 1 that critical regions are computed from.
+    ``upcoming`` are the images that will probably be matched next. ``is_retry``: a worker was lost at it before.
     """
 
     phase: Phase
@@ -39,37 +48,72 @@ class MatchJob:
     units: tuple[Unit, ...]
     expected: tuple[float, ...]
     seconds: float
-    time_limit: float
     is_retry: bool = False
-    pairs: tuple[Pair, ...] = ()
-    known: tuple[PairMatch, ...] = ()
+    pairs: tuple[WantedPair, ...] = ()
+    known: tuple[tuple[tuple[Unit, bytes], ...], ...] = ()
+    upcoming: tuple[Path, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class PairPoints:
+    """The current points of a pair: ``units`` with the revisions of their rows, in the recipe's order."""
+
+    index: int
+    images: tuple[BatchImage, BatchImage]
+    units: tuple[tuple[Unit, int], ...]
+    intrinsics: tuple[Matrix3, Matrix3] | None = None
+    own: Matrix3 | None = None  # for a scene: the F of the pair's own matches
+
+    @property
+    def revisions(self) -> tuple[int, ...]:
+        return tuple(revision for _, revision in self.units)
+
+
+@dataclass(frozen=True, eq=False)
+class PointSource:
+    """Where a worker finds points: in the journal of ``directory``, or in ``blobs`` by revision."""
+
+    directory: Path
+    blobs: dict[int, bytes] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class EstimateJob:
+    """Estimate F, or E with intrinsics, of some pairs."""
+
+    pairs: tuple[PairPoints, ...]
+    recipe: Recipe
+    source: PointSource
+    is_retry: bool = False
 
 
 @dataclass(frozen=True, eq=False)
 class SceneJob:
-    """Reconstruct a batch: ``indices`` are those of its ``pairs`` in the run; images go by their digests.
+    """Reconstruct a batch with ``matches`` from ``inputs``, revisions; ``export``: write COLMAP's files.
 
-    ``unit_results`` are those of its :class:`SceneRecord`. ``export``: write COLMAP's files. The answer is a
-    :class:`Solution`, whose choices are in the order of the pairs.
+    The answer is a :class:`Solution` whose choices are in the order of the pairs.
     """
 
     batch: str
-    indices: tuple[int, ...]
-    pairs: tuple[BatchPair, ...]
+    pairs: tuple[PairPoints, ...]
     recipe: Recipe
-    unit_results: int = 0
+    source: PointSource
+    inputs: str = ""
+    matches: int = 0
     export: Export | None = None
+    is_retry: bool = True  # a crash of pycolmap counts against the batch and not against its place
 
 
-@dataclass(frozen=True, eq=False)
-class TaskJob:
-    """Something to be known of images before there are pairs, under a ``key``: the bytes that ``do`` returns."""
+@dataclass(frozen=True)
+class LookJob:
+    """Compute the features of an image, or of a dataset: the bytes that ``do`` returns."""
 
-    key: str
+    key: tuple[str, str]  # digest of the contents, digest of the settings
     do: Callable[[], bytes]
+    is_retry: bool = True
 
 
-Job = MatchJob | SceneJob | TaskJob
+Job = MatchJob | EstimateJob | SceneJob | LookJob
 
 
 @dataclass(frozen=True)
@@ -77,28 +121,63 @@ class Loaded:
     """A worker's first answer: it is ready for a job."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
+class Found:
+    """What a unit found on a pair: a row of the table ``points``."""
+
+    unit: Unit
+    matches: int
+    points: bytes
+    encode_seconds: float
+    match_seconds: float
+    failure: str = ""
+    note: str = ""
+    warm_up: bool = False
+
+    @property
+    def seconds(self) -> float:
+        return self.encode_seconds + self.match_seconds
+
+
+@dataclass(frozen=True, eq=False)
 class Outcome:
-    """What a job made of a pair: its record, and the new results that later jobs may build on."""
+    """What a job found on a pair. ``failure`` says which image cannot be read."""
 
-    record: PairRecord
-    results: tuple[UnitResult, ...] = ()
+    index: int
+    images: tuple[BatchImage, ...] = ()
+    found: tuple[Found, ...] = ()
+    regions: Regions | None = None
+    failure: str = ""
+    decode_seconds: float = 0.0
+    cluster_seconds: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Estimated:
+    """The estimate of a pair from the points of ``inputs``; ``inliers`` are the numbers among each of these."""
+
+    index: int
+    inputs: tuple[int, ...]
+    inliers: tuple[int, ...]
+    F: Matrix3
+    failure: str = ""
+    magsac: Matrix3 | None = None
+    stats: EstimateStats = NO_STATS
+    seconds: float = 0.0
 
 
 @dataclass(frozen=True)
-class MatchResult:
-    """The outcomes of a match job, in the order of its pairs."""
+class Matched:
+    """The answer to a match job: an outcome for each of its pairs, in order."""
 
     outcomes: tuple[Outcome, ...]
 
-    @property
-    def results(self) -> list[UnitResult]:
-        """Of every unit that this job ran on a pair."""
-        return [result for outcome in self.outcomes for result in outcome.results]
 
-    @property
-    def unit_seconds(self) -> float:
-        return sum(result.seconds for result in self.results)
+@dataclass(frozen=True)
+class Estimates:
+    """The answer to an estimate job."""
+
+    estimates: tuple[Estimated, ...]
 
 
 class Cause(StrEnum):
@@ -114,13 +193,13 @@ class Cause(StrEnum):
 
     @property
     def is_of_place(self) -> bool:
-        """Whether it counts against the place where the worker was, rather than against the units alone."""
+        """Whether it counts against the worker's place rather than against the job alone."""
         return self not in (Cause.OUT_OF_MEMORY, Cause.RAISED)
 
 
 @dataclass(frozen=True)
 class Failure:
-    """The answer that a job came to nothing, or a worker to no job, and why."""
+    """The answer that a job failed, or that a worker cannot take a job, and why."""
 
     cause: Cause
     message: str = ""
@@ -129,10 +208,10 @@ class Failure:
         return f"{self.cause}: {self.message}" if self.message else str(self.cause)
 
 
-Answer = Loaded | MatchResult | Solution | bytes | Failure
+Answer = Loaded | Matched | Estimates | Solution | bytes | Failure
 
 
 def visiting_order(pairs: Sequence[Pair]) -> list[int]:
-    """Indices of pairs such that views of one image follow each other, and the encoding cache hits."""
+    """Return indices of pairs in which pairs that share an image are adjacent, so that the encoding cache hits."""
     keys = [(pair.group, pair.file0, pair.file1) for pair in pairs]
     return sorted(range(len(pairs)), key=keys.__getitem__)

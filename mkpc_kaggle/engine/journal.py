@@ -1,55 +1,49 @@
-"""The durable record of a run: an SQLite file that only the parent writes, a transaction for each job.
+"""The durable record of a run: an SQLite file that only the parent writes, a transaction for each answer.
 
-A value is a JSON text (see :mod:`mkpc_kaggle.engine.codec`). Tables: ``run`` (what the journal belongs to and who
-wrote it), ``sample`` (ids and images of the pairs), ``pair`` (a :class:`PairRecord` for each pair that was
-reached), ``points`` (of a unit on a pair: later jobs, scenes and the report need them), ``scene`` (a
-:class:`SceneRecord` for each batch), ``event`` (what happened when), ``task`` (what is known of images before
-there are pairs).
+``schema.sql`` has the tables, and in its views the rule that says which rows are current.
 """
 
 import json
 import os
-import shutil
 import sqlite3
 import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, astuple, dataclass, field, replace
 from enum import StrEnum
-from functools import cache
+from itertools import count, groupby
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, Self
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.data.images import is_unchanged
+from mkpc_kaggle.data.images import printable
 from mkpc_kaggle.engine.budget import format_duration
-from mkpc_kaggle.engine.codec import decoder, encode, from_blob, to_blob
-from mkpc_kaggle.engine.jobs import Outcome
-from mkpc_kaggle.engine.records import PairRecord, SceneRecord
+from mkpc_kaggle.engine.codec import from_blob, matrix_of, vector_of
+from mkpc_kaggle.engine.jobs import Estimated, Outcome, WantedPair
+from mkpc_kaggle.engine.records import NOT_REACHED, CameraRecord, PairRecord, SceneRecord, UnitRecord
 from mkpc_kaggle.errors import UserError, writing
-from mkpc_kaggle.pipeline.pair import UnitResult
+from mkpc_kaggle.geometry.coordinates import Box, Size
+from mkpc_kaggle.geometry.critical_region import CriticalRegion, RegionReason
+from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.geometry.robust import EstimateStats
 from mkpc_kaggle.recipe import Unit
+from mkpc_kaggle.scene.choose import Choice, Reason
+from mkpc_kaggle.scene.view_graph import BatchImage
 
-FORMAT = 10
+FORMAT = 11
 FILE_NAME = "journal.sqlite"
 LOCK_NAME = "journal.lock"
+SCHEMA = Path(__file__).with_name("schema.sql")
+MIN_SQLITE = (3, 37, 0)  # STRICT tables
 
-SCHEMA = """
-CREATE TABLE run (key TEXT PRIMARY KEY, value TEXT NOT NULL);
-CREATE TABLE sample (key INTEGER PRIMARY KEY, value TEXT NOT NULL);
-CREATE TABLE pair (key INTEGER PRIMARY KEY, value TEXT NOT NULL);
-CREATE TABLE points (pair INTEGER, unit TEXT, points BLOB NOT NULL, PRIMARY KEY (pair, unit));
-CREATE TABLE scene (key TEXT PRIMARY KEY, value TEXT NOT NULL);
-CREATE TABLE event (key INTEGER PRIMARY KEY, value TEXT NOT NULL);
-CREATE TABLE task (key TEXT PRIMARY KEY, value BLOB NOT NULL);
-"""
-
-Row = tuple[str, tuple[Any, ...]]  # the table, and the values of its columns
+UNITS = """SELECT position, revision, decode_seconds, cluster_seconds, unit, stage, matches, encode_seconds,
+    match_seconds, failure, note FROM current_points ORDER BY position, number"""
 
 # SQLite's primary result codes that say nothing against a file: no permission, busy, locked, read only, input or
 # output failed, full, cannot be opened.
 UNUSABLE = {3, 5, 6, 8, 10, 13, 14}
-# What reading raises where something stands that no run writes.
+# Errors of reading what no run writes.
 DAMAGE = (
     *(sqlite3.Error, zlib.error, ValueError, TypeError),
     *(LookupError, AttributeError, ArithmeticError, RecursionError),
@@ -59,7 +53,7 @@ DAMAGE = (
 class EventKind(StrEnum):
     """What is noted during a run."""
 
-    START = "start"  # the program began to work on the run, anew or once more
+    START = "start"  # the program began or resumed the run
     PLAN = "plan"  # a decision, and why
     JOB = "job"  # a job has ended; the text begins with its phase
     SCENE = "scene"  # a batch was reconstructed; the text says how much of it
@@ -81,37 +75,36 @@ class Event:
 
 @dataclass(frozen=True)
 class About:
-    """Who wrote a journal last: for reports, and compared with nothing."""
+    """The latest run that wrote a journal, for reports."""
 
-    recipe: str = "unnamed"
+    recipe: Mapping[str, Any] = field(default_factory=dict)  # a table as of a recipe's file, and its name
     device: str = ""
-    limit: float | None = None  # in seconds; None: there was none
-    left_out: tuple[str, ...] = ()  # which matchers did not run, by cause
-    versions: Mapping[str, str] = field(default_factory=dict)  # of the package and what it stands on
-    estimation: str = "{}"  # how F and cameras are made of the points: JSON of :meth:`Recipe.estimation`
+    limit: float | None = None  # in seconds; None: no limit
+    left_out: tuple[str, ...] = ()  # matchers that did not run, by cause
+    versions: Mapping[str, str] = field(default_factory=dict)  # of the package and its main dependencies
 
 
 @contextmanager
-def undamaged(path: Path, advice: str = "start anew with --fresh") -> Iterator[None]:
-    """Raises :class:`UserError` where what is read of a journal is not what was written, or cannot be read now."""
+def undamaged(path: Path, advice: str = "delete it with --fresh") -> Iterator[None]:
+    """Raise :class:`UserError` if a journal holds what no run writes, or cannot be used now."""
     try:
         yield
     except DAMAGE as error:
         if getattr(error, "sqlite_errorcode", sqlite3.SQLITE_ERROR) & 0xFF in UNUSABLE:
-            raise UserError(f"{path} cannot be used: {error}; is another run at work there?") from error
+            raise UserError(f"{path} cannot be used: {error}; is another run using it?") from error
         raise UserError(f"{path} is damaged ({error}); {advice}") from error
 
 
 class JournalReader:
-    """The journal of a work directory as it is now, unchanged while it is read; a run may be at work on it.
+    """The journal of a work directory at one moment; a run may be writing to it meanwhile.
 
-    Raises :class:`UserError` where there is none, none that this version can read, or something is damaged.
+    Raises :class:`UserError` if the file is missing, damaged, or of another format.
     """
 
     path: Path
     _db: sqlite3.Connection
 
-    def __init__(self, directory: Path) -> None:
+    def __init__(self, directory: Path, *, check: bool = True) -> None:
         path = directory / FILE_NAME
         if not path.is_file():
             raise UserError(f"{directory} has no {FILE_NAME}: name the work directory of a run (NAME.work)")
@@ -122,7 +115,8 @@ class JournalReader:
             db = opened.enter_context(closing(sqlite3.connect(uri, uri=True, timeout=5.0, isolation_level=None)))
             db.execute("BEGIN")
             self.path, self._db = path, db
-            self._header()
+            if check:
+                self._check()
             opened.pop_all()
 
     def __enter__(self) -> Self:
@@ -134,89 +128,140 @@ class JournalReader:
     def close(self) -> None:
         self._db.close()
 
-    def records(self) -> dict[int, PairRecord]:
-        return {record.index: record for record in self._read("pair", PairRecord)}
-
-    def scenes(self) -> tuple[SceneRecord, ...]:
-        return tuple(self._read("scene", SceneRecord))
-
-    def pairs(self) -> tuple[Pair, ...]:
-        """All pairs of the run, in order; of the images the journal knows the names of the files alone."""
-        return tuple(Pair(*names) for names in self._read("sample", tuple[str, str, str, str]))
-
-    def tasks(self) -> set[str]:
-        """The keys of the tasks that were done; see :mod:`mkpc_kaggle.engine.tasks`."""
-        with undamaged(self.path):
-            return {str(key) for (key,) in self._db.execute("SELECT key FROM task")}
-
-    def task(self, key: str) -> bytes:
-        """The answer of a task that was done, else nothing."""
-        with undamaged(self.path):
-            found = self._db.execute("SELECT value FROM task WHERE key = ?", [key]).fetchone()
-        return bytes(found[0]) if found else b""
-
-    def events(self) -> tuple[Event, ...]:
-        """All events of all sessions of the run, in order."""
-        return tuple(self._read("event", Event))
-
     def about(self) -> About:
         with undamaged(self.path):
-            about: About = decoder(About)(self._header()["about"])
-            return about
+            values = json.loads(*self._rows("SELECT value FROM about")[0])
+            return About(**{**values, "left_out": tuple(values["left_out"])})
 
-    def belongs_to(self) -> dict[str, Any]:
-        """What the run matches, by name: the recipe's part in it, digests of the test set and the weights."""
-        return {key: value for key, value in self._header().items() if key not in ("format", "about")}
-
-    def results(self, record: PairRecord, units: Mapping[str, Unit]) -> tuple[UnitResult, ...]:
-        """What the units of a record found, for a later job to build on; ``units`` by name."""
+    def events(self) -> tuple[Event, ...]:
+        """Return all events of all sessions, in order."""
         with undamaged(self.path):
-            points = self._points(record.index)
-            had = ((each, from_blob(points.get(each.unit))) for each in record.units)
-            return tuple(each.result(units[each.unit], matches) for each, matches in had)
-
-    def _points(self, index: int) -> dict[str, bytes]:
-        return dict(self._db.execute("SELECT unit, points FROM points WHERE pair = ?", [index]))
-
-    def _read(self, table: str, kind: Any) -> list[Any]:
-        with undamaged(self.path):
-            decode = decoder(kind)
-            rows = self._db.execute(f"SELECT value FROM {table} ORDER BY key")
-            return [decode(json.loads(value)) for (value,) in rows]
-
-    def _header(self) -> dict[str, Any]:
-        """The table ``run``; raises :class:`UserError` where another version wrote it."""
-        with undamaged(self.path):
-            header = {key: json.loads(value) for key, value in self._db.execute("SELECT key, value FROM run")}
-        if (written := header.get("format")) != FORMAT:
-            raise UserError(
-                f"{self.path} was written by another version of this program (journal format {written}, this "
-                f"version has {FORMAT}). Use that version, or start anew with --fresh or another --work-dir."
+            return tuple(
+                Event(*row) for row in self._rows("SELECT kind, seconds, text FROM event ORDER BY number")
             )
-        return header
+
+    def pairs(self) -> tuple[Pair, ...]:
+        """Return the pairs that have a row, in order, with the names of their images for files."""
+        query = """SELECT w.id, batch, image0, image1, turns0, turns1 FROM wanted_pair w
+            JOIN pair ON pair.id = w.pair WHERE has_row ORDER BY position"""
+        with undamaged(self.path):
+            rows = self._rows(query)
+            return tuple(Pair(i, batch, *ends, None, (t0, t1)) for i, batch, *ends, t0, t1 in rows)
+
+    def records(self) -> list[PairRecord]:
+        """Return a record of each pair that has a row, in order."""
+        with undamaged(self.path):
+            query = "SELECT position, failure FROM wanted_pair WHERE has_row ORDER BY position"
+            values: dict[int, dict[str, Any]] = {
+                n: {"failure": why or NOT_REACHED} for n, why in self._rows(query)
+            }
+            inliers: dict[int, int] = {}
+            for position, inputs, counts, F, magsac, failure, seconds, *stats, focal0, focal1 in self._rows(
+                """SELECT position, inputs, inliers, F, magsac, failure, seconds, candidates, cost, magsac_cost,
+                support, focal0, focal1 FROM standing_estimate"""
+            ):
+                if position in values:
+                    inliers |= zip(map(int, inputs.split()), map(int, counts.split()), strict=True)
+                    values[position] |= {
+                        "pair_fundamental": matrix_of(F),
+                        "magsac_fundamental": None if magsac is None else matrix_of(magsac),
+                        "failure": failure,
+                        "estimate_seconds": seconds,
+                        "stats": EstimateStats(stats[0], stats[1], stats[2], (focal0, focal1), stats[3]),
+                    }
+            for position, units in groupby(self._rows(UNITS), itemgetter(0)):
+                if position in values:
+                    values[position] |= _units(list(units), inliers)
+            regions, choices = self._regions(), self._choices()
+            return [
+                PairRecord(position, **fields, regions=regions.get(position), scene=choices.get(position))
+                for position, fields in values.items()
+            ]
+
+    def scenes(self) -> dict[str, SceneRecord]:
+        """Return the standing reconstruction of each batch that has one."""
+        with undamaged(self.path):
+            scenes = {}
+            for revision, *row in self._rows(
+                """SELECT revision, batch, images, registered, models, points, seconds, failure FROM standing_scene
+                ORDER BY batch"""
+            ):
+                cameras = self._rows("SELECT * FROM camera WHERE scene = ? ORDER BY rowid", revision)
+                clouds = self._rows("SELECT points FROM cloud WHERE scene = ? ORDER BY model", revision)
+                drawn = tuple(map(_camera, cameras)), tuple(map(_cloud, clouds))
+                scenes[row[0]] = replace(SceneRecord(*row), cameras=drawn[0], clouds=drawn[1])
+            return scenes
+
+    def points(self, revisions: Iterable[int]) -> dict[int, Matches]:
+        """Return the points of these rows, by revision."""
+        return {revision: from_blob(blob) for revision, blob in self.blobs(revisions).items()}
+
+    def blobs(self, revisions: Iterable[int]) -> dict[int, bytes]:
+        with undamaged(self.path):
+            query = "SELECT points FROM points WHERE revision = ?"
+            return {revision: self._rows(query, revision)[0][0] for revision in revisions}
+
+    def inputs(self, position: int) -> dict[str, int]:
+        """Return the revisions of a pair's current points by unit, in the recipe's order."""
+        query = "SELECT unit, revision FROM current_points WHERE position = ? ORDER BY number"
+        with undamaged(self.path):
+            return dict(self._rows(query, position))
+
+    def feature(self, digest: str, settings: str) -> bytes | None:
+        """Return the features saved under a key, or ``None``."""
+        with undamaged(self.path):
+            found = self._rows("SELECT value FROM feature WHERE digest = ? AND settings = ?", digest, settings)
+        return found[0][0] if found else None
+
+    def _regions(self) -> dict[int, Any]:
+        """The critical regions of each pair's first unit of stage 2."""
+        found: dict[int, dict[int, CriticalRegion]] = {}
+        for position, image, *box, reason, clusters, kept in self._rows(
+            """SELECT position, r.image, r."left", r.top, r."right", r.bottom, r.reason, r.clusters, r.kept
+            FROM current_points c JOIN region r ON r.points = c.revision ORDER BY position, c.number DESC"""
+        ):
+            region = CriticalRegion(Box(*box), RegionReason(reason), clusters, kept)
+            found.setdefault(position, {})[image] = region
+        return {position: (both[0], both[1]) for position, both in found.items()}
+
+    def _choices(self) -> dict[int, Choice]:
+        rows = self._rows(
+            """SELECT w.position, c.F, c.reason FROM standing_scene s JOIN choice c ON c.scene = s.revision
+            JOIN wanted_pair w ON w.pair = c.pair AND w.batch = s.batch"""
+        )
+        return {position: Choice(None if F is None else matrix_of(F), Reason(why)) for position, F, why in rows}
+
+    def _rows(self, query: str, *values: Any) -> list[Any]:
+        return self._db.execute(query, values).fetchall()
+
+    def _check(self) -> None:
+        """Raise :class:`UserError` for a journal of another format, ``sqlite3.Error`` for a damaged journal."""
+        (written,) = self._rows("PRAGMA user_version")[0]
+        if written != FORMAT:
+            raise UserError(
+                f"{self.path} was written by another version of this program (its format is not {FORMAT}). "
+                "Use that version, delete it with --fresh, or name another --work-dir."
+            )
+        if (trouble := self._rows("PRAGMA quick_check(1)")[0][0]) != "ok":
+            raise sqlite3.DatabaseError(trouble)
 
 
 class Journal(JournalReader):
-    """The journal of a work directory, made if it is not there; no other run can open it while this run has it.
+    """The journal of a work directory, created if missing. No other run can open it meanwhile.
 
-    ``belongs_to`` says by name what the run matches (recipe, test set, weights). Raises :class:`UserError`
-    where the directory cannot be written, another run holds it, or it belongs to something else.
-
-    What the file cannot take (a full disk) is kept in memory, and written with what comes next.
+    When the file takes no more (a full disk), the journal continues in memory, and is copied back when it is
+    closed. ``trouble`` then has the reason. Raises :class:`UserError` if the directory cannot be written, or another
+    run uses it.
     """
 
-    def __init__(
-        self,
-        directory: Path,
-        belongs_to: Mapping[str, Any],
-        *,
-        pairs: Sequence[Pair] = (),
-        about: About | None = None,
-        fresh: bool = False,
-    ) -> None:
+    def __init__(self, directory: Path, *, fresh: bool = False) -> None:
+        if sqlite3.sqlite_version_info < MIN_SQLITE:
+            raise UserError(
+                f"SQLite {sqlite3.sqlite_version} is too old: Python needs 3.37 or newer for the journal"
+            )
         path, lock = directory / FILE_NAME, directory / LOCK_NAME
-        self._unsaved: list[Row] = []
-        with ExitStack() as opened, writing(f"the work directory {directory}"):  # left open where all is well
+        self.trouble = ""
+        with ExitStack() as opened, writing(f"the work directory {directory}"):  # stays open if all is well
             directory.mkdir(parents=True, exist_ok=True)
             self._lock = opened.enter_context(closing(connect(lock)))
             with undamaged(lock, "remove it"):
@@ -224,127 +269,286 @@ class Journal(JournalReader):
             if fresh:
                 for ending in ("", "-journal", "-wal", "-shm"):
                     path.with_name(FILE_NAME + ending).unlink(missing_ok=True)
-            self.path, self._db = path, opened.enter_context(closing(connect(path)))
+            self.path = path
+            self._file = self._db = opened.enter_context(closing(connect(path)))
             with undamaged(path):
-                self._claim(belongs_to, pairs, about or About())
+                self._open()
             opened.pop_all()
 
-    def forget_outdated(self, pairs: Sequence[Pair], *, has_scenes: bool) -> int:
-        """Forget the pairs of which an image has not the content any more that was matched; how many these are.
-
-        The scenes of their batches are forgotten, too; all scenes if the run has none. Their pairs have the F of
-        their own matches again.
-        """
-        same = cache(is_unchanged)
-        with undamaged(self.path), self._db:
-            self._db.execute("BEGIN")
-            known = self.records()
-            if known and min(known) < 0:
-                raise LookupError("it has pairs that no test set has")
-            # Another run may have had more extra pairs for its scenes: the first of them are always the same.
-            records = [record for index, record in known.items() if index < len(pairs)]
-            changed = {r.index for r in records if not all(map(same, pairs[r.index].images, r.versions))}
-            outdated = {pairs[index].group for index in (changed if has_scenes else range(len(pairs)))}
-            chosen = [record for record in records if record.scene and pairs[record.index].group in outdated]
-            self._put(pair_row(replace(record, scene=None)) for record in chosen)
-            for statement, keys in (
-                ("DELETE FROM pair WHERE key = ?", changed),
-                ("DELETE FROM points WHERE pair = ?", changed),
-                ("DELETE FROM scene WHERE key = ?", outdated),
-            ):
-                self._db.executemany(statement, [(key,) for key in keys])
-        return len(changed)
-
-    def save(self, outcomes: Iterable[Outcome]) -> None:
-        """Put down a job's outcomes, all or none.
-
-        An outcome may have the new results alone: what was put down of others stays.
-        """
-        rows: list[Row] = []
-        for outcome in outcomes:
-            rows.append(pair_row(outcome.record))
-            for found in outcome.results:
-                rows.append(("points", (outcome.record.index, found.unit.name, to_blob(found.matches))))
-        self._write(rows)
-
-    def save_scene(self, scene: SceneRecord, records: Iterable[PairRecord]) -> None:
-        self._write([*map(pair_row, records), ("scene", (scene.batch, encode(scene)))])
-
-    def save_task(self, key: str, value: bytes) -> None:
-        self._write([("task", (key, value))])
-
-    def task(self, key: str) -> bytes:
-        return dict(self._unsaved_in("task")).get(key) or super().task(key)
-
-    def note(self, event: Event) -> None:
-        """Put down what happened; it is lost where the journal cannot be written, and the run goes on."""
-        with suppress(sqlite3.Error):
-            self._db.execute("INSERT INTO event (value) VALUES (?)", [encode(event)])
+    @property
+    def is_in_memory(self) -> bool:
+        return self._db is not self._file
 
     def close(self) -> None:
-        with suppress(sqlite3.Error):  # a reader may be at it: then it stays as it is
-            self._db.execute("PRAGMA journal_mode = DELETE")  # a single file again, which can be copied
+        with suppress(sqlite3.Error):  # the disk is still full: what the file has is whole
+            if self.is_in_memory:
+                self._db.backup(self._file)
+        with suppress(sqlite3.Error):  # a reader is using it
+            self._file.execute("PRAGMA journal_mode = DELETE")  # a single file again, which can be copied
+        self._file.close()
         super().close()
         self._lock.close()
 
-    def _points(self, index: int) -> dict[str, bytes]:
-        unsaved = {unit: blob for pair, unit, blob in self._unsaved_in("points") if pair == index}
-        return super()._points(index) | unsaved
+    # What the run asks for
 
-    def _unsaved_in(self, table: str) -> list[tuple[Any, ...]]:
-        return [values for name, values in self._unsaved if name == table]
+    def want(
+        self,
+        pairs: Sequence[WantedPair],
+        units: Sequence[tuple[Unit, str]],
+        batches: Mapping[str, str],
+        about: About | None = None,
+    ) -> None:
+        """Replace what the run asks for: pairs, units with their settings, settings of each batch's scene."""
 
-    def _write(self, rows: Iterable[Row]) -> None:
-        """Write these rows and those that the file did not take before, in one transaction."""
-        self._unsaved += rows
+        def write(db: sqlite3.Connection) -> None:
+            for table in ("wanted_unit", "wanted_pair", "wanted_batch", "about"):
+                db.execute(f"DELETE FROM {table}")
+            db.execute("INSERT INTO about VALUES (?)", [json.dumps(asdict(about or About()))])
+            rows = ((n, unit.name, unit.stage, settings) for n, (unit, settings) in enumerate(units))
+            db.executemany("INSERT INTO wanted_unit VALUES (?, ?, ?, ?)", rows)
+            db.executemany("INSERT INTO wanted_batch VALUES (?, ?)", batches.items())
+            ends = ((*map(printable, each.names), *each.pair.turns) for each in pairs)
+            db.executemany("INSERT OR IGNORE INTO pair (image0, image1, turns0, turns1) VALUES (?, ?, ?, ?)", ends)
+            db.executemany(
+                """INSERT INTO wanted_pair SELECT ?, ?, ?, id, ?, ?, '' FROM pair
+                WHERE image0 = ? AND image1 = ? AND turns0 = ? AND turns1 = ?""",
+                map(_wanted_row, count(), pairs),
+            )
+
+        self._write(write)
+
+    def digests(self) -> dict[str, str]:
+        """Return the digest of each image of a wanted pair that was looked at, by name."""
+        query = """SELECT DISTINCT image.name, digest FROM wanted_pair w JOIN pair ON pair.id = w.pair
+            JOIN image ON image.name IN (image0, image1)"""
+        with undamaged(self.path):
+            return dict(self._rows(query))
+
+    def images(self, position: int) -> tuple[BatchImage, ...]:
+        """Return both images of a pair as they were last looked at, or nothing."""
+        query = """SELECT name, digest, width, height, focal FROM wanted_pair w JOIN pair ON pair.id = w.pair
+            JOIN image ON image.name = {} WHERE position = ?"""
+        with undamaged(self.path):
+            rows = [row for end in ("image0", "image1") for row in self._rows(query.format(end), position)]
+            images = tuple(BatchImage(name, digest, Size(w, h), focal) for name, digest, w, h, focal in rows)
+            return images if len(images) == 2 else ()
+
+    # The state of the run
+
+    def twins(self) -> dict[int, tuple[int, ...]]:
+        """Return the positions of pairs that several rows name, by each of these positions."""
+        query = "SELECT group_concat(position) FROM wanted_pair GROUP BY pair HAVING count(*) > 1"
+        with undamaged(self.path):
+            groups = [tuple(map(int, row[0].split(","))) for row in self._rows(query)]
+        return {position: group for group in groups for position in group}
+
+    def had(self, positions: Iterable[int] | None = None) -> Iterator[tuple[int, int, int]]:
+        """Yield (position, number of the unit, matches) of the current points, of all pairs or of these."""
+        yield from self._of("SELECT position, number, matches FROM current_points", positions)
+
+    def estimated(self, positions: Iterable[int] | None = None) -> Iterator[tuple[int, bytes, int, str]]:
+        """Yield (position, F, inliers, failure) of the standing estimates."""
+        query = "SELECT position, F, inliers, failure FROM standing_estimate"
+        for position, F, inliers, failure in self._of(query, positions):
+            yield position, F, sum(map(int, inliers.split())), failure
+
+    def currently_estimated(self, positions: Iterable[int] | None = None) -> Iterator[int]:
+        """Yield the positions of the pairs whose estimate is current."""
+        yield from (position for (position,) in self._of("SELECT position FROM current_estimate", positions))
+
+    def chosen(self) -> Iterator[tuple[int, Choice]]:
+        """Yield (position, choice) of the standing scenes."""
+        with undamaged(self.path):
+            yield from self._choices().items()
+
+    def batch_inputs(self, batch: str) -> str:
+        """Return the revisions that a scene of a batch would be computed from now."""
+        with undamaged(self.path):
+            rows = self._rows("SELECT inputs FROM batch_inputs WHERE batch = ?", batch)
+            return str(rows[0][0] or "") if rows else ""
+
+    def current_scenes(self) -> set[str]:
+        with undamaged(self.path):
+            return {batch for (batch,) in self._rows("SELECT batch FROM current_scene")}
+
+    def _of(self, query: str, positions: Iterable[int] | None) -> Iterator[Any]:
+        with undamaged(self.path):
+            if positions is None:
+                yield from self._db.execute(query)
+            else:
+                for position in positions:
+                    yield from self._db.execute(f"{query} WHERE position = ?", [position])
+
+    # Results
+
+    def save_images(self, images: Iterable[BatchImage]) -> None:
+        """Save the contents of images: points of other contents are out of date from now on."""
+        rows = [(printable(image.name), image.digest, *image.size, image.focal) for image in images]
+        self._write(lambda db: db.executemany("REPLACE INTO image VALUES (?, ?, ?, ?, ?)", rows))
+
+    def save_digest(self, name: str, digest: str) -> None:
+        """Save that an image has another content than it had."""
+        self._write(lambda db: db.execute("UPDATE image SET digest = ? WHERE name = ?", [digest, printable(name)]))
+
+    def save_outcomes(self, outcomes: Iterable[Outcome], settings: Mapping[str, str]) -> None:
+        """Save what a job found on its pairs, all or nothing; ``settings`` by the names of units."""
+
+        def write(db: sqlite3.Connection) -> None:
+            for outcome in outcomes:
+                failure = [printable(outcome.failure), outcome.index]
+                db.execute("UPDATE wanted_pair SET failure = ? WHERE position = ?", failure)
+                for image in outcome.images:
+                    row = (printable(image.name), image.digest, *image.size, image.focal)
+                    db.execute("REPLACE INTO image VALUES (?, ?, ?, ?, ?)", row)
+                digests = [image.digest for image in outcome.images]
+                for found in outcome.found:
+                    values = (
+                        (outcome.decode_seconds, outcome.cluster_seconds) if found is outcome.found[0] else (0, 0)
+                    )
+                    (revision,) = db.execute(
+                        f"""REPLACE INTO points (pair, settings, digest0, digest1, matches, decode_seconds,
+                        cluster_seconds, encode_seconds, match_seconds, failure, note, points)
+                        SELECT pair, {", ".join("?" * 11)} FROM wanted_pair WHERE position = ?
+                        RETURNING revision""",
+                        (
+                            *(settings[found.unit.name], *digests, found.matches, *values),
+                            *(found.encode_seconds, found.match_seconds, printable(found.failure)),
+                            *(printable(found.note), found.points, outcome.index),
+                        ),
+                    ).fetchone()
+                    for number, region in enumerate((outcome.regions or ()) if found.unit.stage == 2 else ()):
+                        box = astuple(region.box)
+                        values = (revision, number, *box, region.reason, region.clusters, region.kept)
+                        db.execute(f"INSERT INTO region VALUES ({', '.join('?' * 9)})", values)
+
+        self._write(write)
+
+    def save_estimates(self, estimates: Iterable[Estimated]) -> None:
+        rows = [
+            (
+                *(" ".join(map(str, each.inputs)), " ".join(map(str, each.inliers))),
+                *(
+                    each.F.tobytes(),
+                    None if each.magsac is None else each.magsac.tobytes(),
+                    printable(each.failure),
+                ),
+                *(each.stats.support, each.stats.candidates, each.stats.cost, each.stats.magsac_cost),
+                *(*each.stats.focals, each.seconds, each.index),
+            )
+            for each in estimates
+        ]
+        self._write(
+            lambda db: db.executemany(
+                f"""REPLACE INTO estimate (pair, settings, inputs, inliers, F, magsac, failure, support,
+                candidates, cost, magsac_cost, focal0, focal1, seconds)
+                SELECT pair, settings, {", ".join("?" * 12)} FROM wanted_pair WHERE position = ?""",
+                rows,
+            )
+        )
+
+    def save_scene(self, scene: SceneRecord, inputs: str, choices: Mapping[int, Choice]) -> None:
+        """Save the reconstruction of a batch with the choices for its pairs, by position."""
+
+        def write(db: sqlite3.Connection) -> None:
+            head = (scene.images, scene.registered, scene.models, scene.points, scene.seconds)
+            (revision,) = db.execute(
+                f"""REPLACE INTO scene (batch, settings, inputs, images, registered, models, points, seconds,
+                failure) SELECT batch, settings, {", ".join("?" * 7)} FROM wanted_batch WHERE batch = ?
+                RETURNING revision""",
+                (inputs, *head, printable(scene.failure), scene.batch),
+            ).fetchone()
+            for camera in scene.cameras:
+                axes = map(np_bytes, (camera.centre, camera.forward, camera.down))
+                values = (camera.model, *axes, camera.focal, *camera.size, camera.seen)
+                row = (revision, printable(camera.image), camera.digest, *values)
+                db.execute(f"INSERT INTO camera VALUES ({', '.join('?' * 11)})", row)
+            for model, cloud in enumerate(scene.clouds):
+                db.execute("INSERT INTO cloud VALUES (?, ?, ?)", (revision, model, np_bytes(cloud)))
+            rows = ((revision, c.reason, c.F if c.F is None else c.F.tobytes(), n) for n, c in choices.items())
+            db.executemany("REPLACE INTO choice SELECT ?, pair, ?, ? FROM wanted_pair WHERE position = ?", rows)
+
+        self._write(write)
+
+    def forget_scene(self, batch: str) -> None:
+        """Delete the scenes of a batch: its files were removed."""
+        self._write(lambda db: db.execute("DELETE FROM scene WHERE batch = ?", [batch]))
+
+    def save_feature(self, digest: str, settings: str, value: bytes) -> None:
+        self._write(lambda db: db.execute("REPLACE INTO feature VALUES (?, ?, ?)", [digest, settings, value]))
+
+    def note(self, event: Event) -> None:
+        """Note an event; it is lost if the journal cannot be written."""
+        values = [event.kind, event.seconds, printable(event.text)]
+        with suppress(sqlite3.Error):
+            self._db.execute("INSERT INTO event (kind, seconds, text) VALUES (?, ?, ?)", values)
+
+    def _write(self, write: Any) -> None:
+        """Run a transaction. If the file takes no more, continue in memory."""
+        try:
+            self._transact(write)
+        except sqlite3.OperationalError as error:
+            if self.is_in_memory:
+                raise
+            self.trouble = str(error)
+            self.continue_in_memory()
+            self._transact(write)
+
+    def continue_in_memory(self) -> None:
+        """Copy everything into memory, and write there from now on."""
+        memory = sqlite3.connect(":memory:", isolation_level=None)
+        self._file.backup(memory)
+        memory.execute("PRAGMA foreign_keys = ON")
+        self._db = memory
+
+    def _transact(self, write: Any) -> None:
         with self._db:
             self._db.execute("BEGIN")
-            self._put(self._unsaved)
-        self._unsaved.clear()
+            write(self._db)
 
-    def _put(self, rows: Iterable[Row]) -> None:
-        for table, values in rows:
-            self._db.execute(f"REPLACE INTO {table} VALUES ({', '.join('?' * len(values))})", values)
-
-    def _claim(self, belongs_to: Mapping[str, Any], pairs: Sequence[Pair], about: About) -> None:
-        """Write down what the journal belongs to, or compare it with what stands there."""
-        is_new = self._db.execute("SELECT 1 FROM sqlite_master WHERE name = 'run'").fetchone() is None
-        if not is_new:
-            stored, wanted = self._header(), json.loads(json.dumps(belongs_to))
-            if other := [key for key in wanted if stored.get(key) != wanted[key]]:
-                raise UserError(
-                    f"{self.path} belongs to another run (different {', '.join(other)}). "
-                    "Start anew with --fresh, or name another --work-dir."
-                )
-        # Readers do not hold up the writer then. Killed, no result is lost; with the power, the last results.
-        self._db.execute("PRAGMA journal_mode = WAL")
+    def _open(self) -> None:
+        if self._db.execute("SELECT 1 FROM sqlite_master").fetchone() is None:
+            self._db.execute("PRAGMA journal_mode = WAL")
+            self._db.executescript(
+                f"BEGIN; {SCHEMA.read_text(encoding='utf-8')} PRAGMA user_version = {FORMAT}; COMMIT;"
+            )
+        else:
+            self._check()
+            self._db.execute("PRAGMA journal_mode = WAL")
+        # Readers do not hold up the writer. A kill loses no result, a power failure the latest results.
         self._db.execute("PRAGMA synchronous = NORMAL")
-        with self._db:
-            self._db.execute("BEGIN")
-            if is_new:
-                for statement in SCHEMA.split(";")[:-1]:
-                    self._db.execute(statement)
-                self._put(("sample", (i, encode((p.id, p.group, *p.names)))) for i, p in enumerate(pairs))
-            header = {"format": FORMAT, **belongs_to, "about": about}
-            self._put(("run", (key, encode(value))) for key, value in header.items())
+        self._db.execute("PRAGMA foreign_keys = ON")
 
 
-def pair_row(record: PairRecord) -> Row:
-    return "pair", (record.index, encode(record))
+def _units(rows: Sequence[Any], inliers: Mapping[int, int]) -> dict[str, Any]:
+    """The fields of a :class:`PairRecord` that come from rows of the query :data:`UNITS`."""
+    units = tuple(UnitRecord(row[4], row[5], row[6], inliers.get(row[1], 0), *row[7:]) for row in rows)
+    decode, cluster = (sum(row[column] for row in rows) for column in (2, 3))
+    return {"units": units, "decode_seconds": decode, "cluster_seconds": cluster}
 
 
-def share_journal(source: Path, target: Path) -> None:
-    """Let the run of a work directory begin with the journal of another that has ended, if it has none yet."""
-    path = target / FILE_NAME
-    if not path.exists():
-        with writing(f"the work directory {target}"):
-            target.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(source / FILE_NAME, path.with_suffix(".part"))
-            path.with_suffix(".part").replace(path)
+def _wanted_row(position: int, wanted: WantedPair) -> tuple[Any, ...]:
+    pair, ends = wanted.pair, (*map(printable, wanted.names), *wanted.pair.turns)
+    return position, printable(pair.id), printable(pair.group), wanted.settings, wanted.has_row, *ends
+
+
+def np_bytes(values: Any) -> bytes:
+    import numpy as np
+
+    return np.asarray(values, np.float64).tobytes()
+
+
+def _camera(row: Sequence[Any]) -> CameraRecord:
+    _, image, digest, model, *axes, focal, width, height, seen = row
+    centre, forward, down = (tuple(vector_of(blob).tolist()) for blob in axes)
+    return CameraRecord(image, digest, model, centre, forward, down, focal, Size(width, height), seen)
+
+
+def _cloud(row: Sequence[Any]) -> tuple[Any, ...]:
+    return tuple(map(tuple, vector_of(row[0]).reshape(-1, 3).tolist()))
 
 
 def connect(path: Path) -> sqlite3.Connection:
-    """Open a database to write; raises :class:`UserError` where that cannot be."""
+    """Open a database to write. Raise :class:`UserError` if that is impossible."""
     if path.exists() and not path.is_file():
         raise UserError(f"{path} is not a regular file; remove it, or name another --work-dir")
     with undamaged(path):

@@ -1,32 +1,44 @@
 """Where workers are: a place has one worker at a time, and is closed when it loses three in a row."""
 
+import os
 import queue
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
+from enum import StrEnum
 from functools import partial
 from math import inf
 
-from mkpc_kaggle.engine.jobs import Answer, Cause, Failure, Job, Loaded, MatchJob
+from mkpc_kaggle.engine.jobs import Answer, Cause, Failure, Job, Loaded
 from mkpc_kaggle.engine.process import ProcessWorker, ThreadWorker
-from mkpc_kaggle.engine.worker import MatchRunner, SceneRunner, share_cores
+from mkpc_kaggle.engine.worker import LightRunner, MatchRunner, SceneRunner, share_cores
 from mkpc_kaggle.pipeline.assembly import Assembly
 
 START_TIMEOUT_S = 300.0  # for a worker to load its matchers; over a network's disk that is not quick
 RESTART_PAUSE_S = 1.0  # times the workers lost in a row: memory that is short may be free again
 MAX_LOSSES = 3  # workers lost in a row, with no answer between, close a place
 LISTEN_S = 0.2  # how often an interrupt is looked for
+CORES_PER_ESTIMATOR = 4
+
+
+class Work(StrEnum):
+    """What the workers of a place do."""
+
+    MATCH = "matching"
+    LIGHT = "estimates"  # and looks at images
+    SCENE = "scenes"
 
 
 @dataclass(eq=False)
 class Place:
-    """A place such as "cuda:0": its worker, the job that this has, and until when its answer is waited for.
+    """A place such as "cuda:0": its worker, the worker's job, and the moment until which an answer is awaited.
 
     ``closed`` says why no worker is started here any more.
     """
 
     name: str
     make: Callable[[], ThreadWorker]
+    work: Work = Work.MATCH
     worker: ThreadWorker | None = None
     job: Job | None = None
     is_loaded: bool = False
@@ -48,7 +60,7 @@ class Place:
         return self.worker is None and not self.closed and (now >= self.limit or not self.losses)
 
     def start(self, now: float, timeout: float = START_TIMEOUT_S) -> None:
-        """Start a worker; it is loaded when it says so."""
+        """Start a worker, which answers when it is loaded."""
         self.is_loaded, self.since, self.limit = False, now, now + timeout
         self.worker = self.make()
         self.worker.start()
@@ -60,7 +72,7 @@ class Place:
         self.worker.submit(job, seconds)
 
     def poll(self, now: float) -> Answer | None:
-        """What the worker answers, or that it hangs; then it is idle, or killed. ``None`` while it is at work."""
+        """Return the worker's answer, or that it hangs; ``None`` while it computes."""
         if self.worker is None:
             return None
         answer = self.worker.answer()
@@ -84,14 +96,14 @@ class Place:
             worker.kill()
 
     def _lose(self, failure: Failure, now: float) -> None:
-        """End the worker: memory that ran out is fragmented, and a device that failed goes on failing.
+        """End the worker: memory that ran out is fragmented, and a failing device keeps failing.
 
-        A death or a hang at a job that another worker was lost at does not count against the place.
+        A death or a hang does not count against the place if another worker was lost at the same job.
         """
         job, was_loaded = self.job, self.is_loaded
         self.kill()
         self.job, self.limit = job, now
-        is_retry = isinstance(job, MatchJob) and job.is_retry and failure.cause in (Cause.DIED, Cause.TIMED_OUT)
+        is_retry = job is not None and job.is_retry and failure.cause in (Cause.DIED, Cause.TIMED_OUT)
         if not was_loaded or (failure.cause.is_of_place and not is_retry):
             self.losses += 1
             self.limit = now + RESTART_PAUSE_S * self.losses
@@ -100,51 +112,54 @@ class Place:
 
 
 class Site:
-    """A machine or a cluster: the places of its matching workers, and where batches are reconstructed.
+    """The places of a run. Matching may be elsewhere, estimates and scenes are next to the journal.
 
-    ``fallback`` are the places where the work goes on when ``places`` are closed. Workers call ``ring`` when an
-    answer is there.
+    ``fallback`` are the matching places that take over when the others are closed. Workers call ``ring`` when an
+    answer is ready.
     """
 
-    scenes_at_once = 1
-    loads_matchers = True  # False: jobs have no units
-
-    def __init__(self, clock: Callable[[], float]) -> None:
-        self.places: list[Place] = []
-        self.fallback: list[Place] = []
+    def __init__(self, clock: Callable[[], float], *, threads: bool = False) -> None:
         self._clock = clock
         self._bell: queue.SimpleQueue[None] = queue.SimpleQueue()
+        estimators = 1 if threads else max(1, (os.cpu_count() or 1) // CORES_PER_ESTIMATOR)
+        worker = ThreadWorker if threads else ProcessWorker
+        self.places = [
+            Place(f"estimates {n}", lambda: worker("estimates", LightRunner, self.ring), Work.LIGHT)
+            for n in range(estimators)
+        ]
+        self.places.append(Place("scenes", lambda: self.scene_worker(), Work.SCENE))
+        self.fallback: list[Place] = []
+
+    def of(self, work: Work) -> list[Place]:
+        return [place for place in self.places if place.work is work]
 
     def open(self) -> None:
-        """Make the places known; raises :class:`mkpc_kaggle.errors.UserError` where there can be none."""
-
-    def match_runner(self, assembly: Assembly) -> Callable[[], MatchRunner]:
-        """What a worker for pairs makes its runner with."""
-        return partial(MatchRunner, assembly.pipeline, load=self.loads_matchers)
+        """Add the matching places. Raise :class:`mkpc_kaggle.errors.UserError` if there can be none."""
 
     def scene_worker(self) -> ThreadWorker:
+        """Return a worker for a scene: always a process, since pycolmap may crash."""
         return ProcessWorker("scene", SceneRunner, self.ring)
 
     def ring(self) -> None:
         self._bell.put(None)
 
     def wait(self, until: float) -> None:
-        """Until an answer may be there, or an interrupt, or the time ``until`` of the engine's clock."""
+        """Wait until an answer may be ready, for an interrupt, or until a moment of the engine's clock."""
         with suppress(queue.Empty):
             self._bell.get(timeout=max(0.0, min(LISTEN_S, until - self._clock())))
 
     def close(self) -> None:
-        """Let go of the site; its workers have been killed."""
+        """Release the site; its workers have been killed."""
 
 
 class LocalSite(Site):
-    """A worker process for each device of the machine, or as many as asked for; 0: a thread of this process."""
+    """A worker process for each device of the machine, or ``workers`` processes; 0: a thread of this process."""
 
     def __init__(self, assembly: Assembly, workers: int | None, clock: Callable[[], float]) -> None:
-        super().__init__(clock)
+        super().__init__(clock, threads=workers == 0)
         if workers == 0:
-            runner = self.match_runner
-            self.places = [Place("this process", lambda: ThreadWorker("matching", runner(assembly), self.ring))]
+            make = partial(MatchRunner, assembly.pipeline)
+            self.places.append(Place("this process", lambda: ThreadWorker("matching", make, self.ring)))
             return
         # On a CPU one process with all threads: two with half of them each do more (recipe light, two cores: the
         # sweep over after 22 s instead of 31), but need twice the memory, and a network's last bits change.
@@ -158,8 +173,5 @@ class LocalSite(Site):
             self.fallback = [self._place("cpu", assembly.on_cpu())]
 
     def _place(self, name: str, assembly: Assembly, share: int = 1) -> Place:
-        def worker() -> ProcessWorker:
-            make = partial(share_cores, self.match_runner(assembly), share)
-            return ProcessWorker(f"mkpc {name}", make, self.ring)
-
-        return Place(name, worker)
+        make = partial(share_cores, partial(MatchRunner, assembly.pipeline), share)
+        return Place(name, lambda: ProcessWorker(f"mkpc {name}", make, self.ring))

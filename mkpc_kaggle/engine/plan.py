@@ -1,444 +1,237 @@
-"""The plan: which units to run on which pairs next, and why. Decisions on values, without threads or clocks.
+"""Which units to run on which pairs next: one priority order over the state of all pairs.
 
-It looks at a job's worth of pairs at a time, so that a hundred thousand pairs cost no more to plan than ten.
+A plan has no queue. It looks at the state, the costs and the time left whenever a worker is idle.
 
-Three places decide that a unit no longer fits:
-
-- :meth:`Plan._fit`, for all pairs: how many units they can have in the time left, each time a chunk is deepened;
-- :meth:`Plan.next`, for a job: units that would not end in time wait for a moment when scenes need less;
-- :meth:`mkpc_kaggle.engine.worker.MatchRunner.run`, in a worker: a job that is late begins no further unit.
+Two places decide that a unit no longer fits: :meth:`Plan.fit` for all pairs, and
+:meth:`mkpc_kaggle.engine.worker.MatchRunner.run` for a job whose time is over.
 """
 
-from collections import Counter, deque
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
-from itertools import islice
-from math import inf
+from collections import Counter
+from collections.abc import Callable, Sequence
+from math import isfinite
+
+import numpy as np
+from numpy.typing import NDArray
 
 from mkpc_kaggle.engine.budget import Budget, format_duration
 from mkpc_kaggle.engine.costs import Costs
-from mkpc_kaggle.engine.jobs import Cause, Failure, MatchJob, MatchResult, Outcome, Phase
-from mkpc_kaggle.engine.records import GIVEN_UP, PairRecord, UnitRecord
-from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.pipeline.pair import UnitResult
-from mkpc_kaggle.recipe import Recipe, Unit
+from mkpc_kaggle.engine.jobs import Cause, Failure, MatchJob, Outcome, Phase
+from mkpc_kaggle.engine.losses import Losses
+from mkpc_kaggle.engine.state import State
+from mkpc_kaggle.recipe import Unit
 
-JOB_PAIRS = 8  # in a job: few enough to plan anew every some seconds
-JOB_MINIBATCHES = 3  # on a GPU: F of the pairs of the first is estimated while the others are matched
-JOB_SHARE = 0.05  # of the time left that a job may be expected to take: what a job found late comes too late
-EXPLORE_SHARE = 0.25  # of the time left that may be spent to learn what a unit costs that never ran
-MAX_EXPLORE_S = 600.0
-CONNECT_SHARE = 0.1  # of the time left after the sweep, for pairs that no row names
-RESERVE_SHARE = 0.2  # of the limit that is left to reconstruction at most
-MAX_TRIES = 2  # of a unit, or of an estimate, on a single pair, before it is given up there
-MAX_FAILED_PAIRS = 2  # a unit that was given up on so many pairs and never ran is given up on all
-SLOW_FACTOR = 3.0  # a job that takes this many times what was expected begins no further unit
-HANG_FACTOR = 10.0  # a unit that takes this many times what it takes on nine of ten pairs hangs
+CONNECT_SHARE = 0.1  # of the time after the sweep, for extra pairs
+RESERVE_SHARE = 0.2  # of the limit, at most, that is reserved for scenes
+MAX_FAILED_PAIRS = 2  # a unit that was skipped on this many pairs and never ran is skipped on all pairs
 
-
-@dataclass(frozen=True)
-class Chunk:
-    """Pairs that wait for their turn; ``units`` ``None``: those of the phase. ``lost_at`` names places."""
-
-    phase: Phase
-    indices: tuple[int, ...]
-    units: tuple[Unit, ...] | None = None
-    lost_at: tuple[str, ...] = ()
-
-
-def chunks_of(phase: Phase, indices: Sequence[int], size: int) -> Iterator[Chunk]:
-    """The first pair alone, so that costs are known early, then ``size`` at a time.
-
-    The same for every run of the same pairs, whatever was done before: a minibatch's composition can move the last
-    bits of a network's output.
-    """
-    for start in (0, *range(1, len(indices), size)) if indices else ():
-        yield Chunk(phase, tuple(indices[start : start + size if start else 1]))
-
-
-class ChunkQueue:
-    """Chunks in the order of their turn: first what was tried before.
-
-    A pair's turn comes when no job is under way on it, and nothing earlier waits for it: what has to be tried
-    again may be for another place, and the order of units decides regions.
-    """
-
-    def __init__(self) -> None:
-        self.under_way: set[int] = set()
-        self.fresh: deque[Chunk] = deque()
-        self.again: list[Chunk] = []
-
-    def put_back(self, *chunks: Chunk) -> None:
-        """Put these first, but for what was lost: so a unit that kills its worker is given up on few pairs."""
-        self.again = sorted([*chunks, *self.again], key=lambda chunk: not chunk.lost_at)
-
-    def pop(self, place: str, *, alone: bool, cautious: bool) -> Chunk | None:
-        """The next chunk for a place, lost elsewhere if at all, unless the place is ``alone``.
-
-        ``cautious``: a chunk that was not lost, if there is any.
-        """
-        free, earlier = [], set(self.under_way)
-        for chunk in (*self.again, *islice(self.fresh, 1)):
-            if earlier.isdisjoint(chunk.indices) and (alone or place not in chunk.lost_at):
-                free.append(chunk)
-            earlier.update(chunk.indices)
-        if not free:
-            return None
-        chosen = min(free, key=lambda chunk: bool(chunk.lost_at)) if cautious else free[0]
-        if chosen in self.again:
-            self.again.remove(chosen)
-        else:
-            self.fresh.popleft()
-        return chosen
-
-    def waits(self, index: int) -> bool:
-        """Whether something has to be tried again on a pair."""
-        return any(index in chunk.indices for chunk in self.again)
-
-
-def job_size(pairs: int, prices: Sequence[float | None], overhead: float, seconds: float) -> tuple[int, int]:
-    """How many of so many pairs, and of the units with these ``prices``, are in a job of some ``seconds``.
-
-    A price is what a unit costs on a pair, ``None`` while that is unknown: then the job is one pair, and the units
-    up to it. Late in the run: fewer pairs, then one unit, because a job's results arrive, or are lost, together.
-    """
-    if None in prices:
-        pairs, prices = 1, prices[: prices.index(None) + 1]
-    price = overhead + sum(filter(None, prices))
-    if pairs * price <= seconds:
-        return pairs, len(prices)
-    return max(1, int(seconds / price)), len(prices) if price <= seconds else 1
-
-
-def _priced(units: Iterable[Unit]) -> list[str]:
-    """The names by which the cost of a job on a pair is known."""
-    return [unit.name for unit in units] or [Phase.ESTIMATE]
+Mask = NDArray[np.bool_]
 
 
 class Plan:
-    """The phases of a run over the pairs of ``order``.
+    """The priorities of a run: sweep, connect, deepen, fill.
 
-    ``records``, of all pairs by index, change through it. Pairs from the index ``row_count`` on are extra pairs
-    for scenes, the most useful first. ``workers`` work at a time; ``reserve`` seconds of the end are left to
-    scenes. ``done`` are the pairs that have what fits for all; ``unusable`` names the units that no worker can
-    run. ``outdated`` are the pairs whose F another estimation made.
+    ``order`` is the order in which encodings are cached best. ``workers`` match at the same time. ``reserve``
+    seconds at the end belong to estimates and scenes. ``busy`` (N,) are the pairs of jobs under way, ``unusable``
+    (U,) the units that no worker can run.
     """
 
     def __init__(
         self,
+        units: Sequence[Unit],
+        state: State,
         order: Sequence[int],
-        row_count: int,
-        recipe: Recipe,
-        records: list[PairRecord],
         budget: Budget,
         explain: Callable[[str], None],
         minibatch: int = 1,
-        outdated: Iterable[int] = (),
     ) -> None:
-        self.recipe, self.records, self.budget, self._explain = recipe, records, budget, explain
-        self.outdated, self.estimated_anew = set(outdated), 0
-        self.workers = 1
-        self.reserve = 0.0
-        self._order, self._row_count, self._minibatch = order, row_count, minibatch
-        self._stuck: set[int] = set()  # an image cannot be read, or what was found before
-        self._lacking = Counter(unit for record in records for unit in self._lacks(record))
-        self._begin()
+        self.units, self.state, self.budget, self.explain = tuple(units), state, budget, explain
+        self.workers, self.reserve, self.minibatch = 1, 0.0, minibatch
+        self.busy = np.zeros(len(state.had), bool)
+        self._order = np.asarray(order, int)
+        self.restart()
 
-    def _begin(self) -> None:
-        """Everything is to come, and nothing is known of the devices."""
+    def restart(self) -> None:
+        """Forget all that was learnt of the devices: costs, losses, units that cannot run."""
         self.costs = Costs()
-        self.unusable: set[str] = set()
-        self.done = set(range(self._row_count, len(self.records)))
-        self.phase = Phase.ESTIMATE
-        self._coming = list(Phase)
-        self._queue = ChunkQueue()
-        self._late, self._late_at = list[Chunk](), inf  # what does not end before this moment, unless it moves
-        self._total, self._left = 0, set[int]()  # pairs of the present phase, and those whose turn is not over
-        self._fitting = -1
-        self._tries: Counter[tuple[int, str]] = Counter()
-        self._failed_pairs: Counter[str] = Counter()
-
-    # What to do next
-
-    def next(self, now: float, place: str = "", *, cautious: bool = False) -> MatchJob | None:
-        """The next job for an idle place, without its pairs; ``None`` where there is nothing to do now.
-
-        ``cautious``: the place has just lost a worker, and tries one pair and one unit.
-        """
-        queue, job = self._queue, None
-        if self.stop > self._late_at:
-            queue.put_back(*self._late)
-            self._late.clear()
-        while self.advance(now) and job is None:
-            chunk = queue.pop(place, alone=self.workers < 2, cautious=cautious)
-            if chunk is None:
-                break
-            units = self._units(chunk, now)
-            todo = self._wanting(chunk.phase, chunk.indices, units)
-            self._mark_done(chunk.phase, set(chunk.indices) - set(todo))
-            in_time = tuple(unit for unit in units if self.costs.p90(unit.name) < self.stop - now)
-            if chosen := self._wanting(chunk.phase, todo, in_time):
-                job = self._job(replace(chunk, indices=chosen), in_time, now, cautious=cautious)
-            if late := tuple(index for index in todo if index not in chosen):
-                self._late.append(replace(chunk, indices=late))
-                self._late_at = self.stop
-        return job
+        self.losses: Losses[tuple[int, str]] = Losses()
+        self.unusable = np.zeros(len(self.units), bool)
+        self.phase = Phase.SWEEP
+        self._fitting = len(self.units)
+        self._look()
 
     @property
     def stop(self) -> float:
-        """When no unit may be running any more."""
+        """When no unit may run any more."""
         return self.budget.stop_units - min(self.reserve, RESERVE_SHARE * self.budget.time_limit)
 
-    def advance(self, now: float) -> bool:
-        """Go on to the first pairs that can gain something, past others and past phases; whether there are any."""
-        queue = self._queue
-        while now < self.stop and (queue.fresh or self._coming):
-            if queue.fresh:
-                chunk = queue.fresh[0]
-                if self._wanting(chunk.phase, chunk.indices, self._units(chunk, now)):
-                    break
-                self._mark_done(chunk.phase, queue.fresh.popleft().indices)
-            elif self.phase is Phase.ESTIMATE and (queue.under_way or queue.again):
-                break  # scenes, which come later, need F of all pairs
-            else:
-                self._open(self._coming.pop(0), now)
-        return now < self.stop and bool(queue.fresh or queue.again)
+    def next(self, now: float) -> MatchJob | None:
+        """Return the next job for an idle worker, without its pairs; ``None`` if nothing can be done now."""
+        for phase in Phase:
+            lacking = self._lacking(phase, now)
+            ready = lacking.any(1) & ~self.busy
+            if ready.any():
+                self._enter(phase, now)
+                return self._job(phase, lacking, ready, now)
+        return None
 
-    def _wanting(self, phase: Phase, indices: Iterable[int], units: Sequence[Unit]) -> tuple[int, ...]:
-        """The pairs that may get what a phase gives: another F, or any of the units."""
-        if phase is Phase.ESTIMATE:
-            return tuple(index for index in indices if index in self.outdated)
-        return tuple(i for i in indices if i not in self._stuck and self.records[i].lacking(units))
+    def has_work(self, now: float) -> bool:
+        return any((self._lacking(phase, now).any(1) & ~self.busy).any() for phase in Phase)
 
-    def _job(self, chunk: Chunk, units: tuple[Unit, ...], now: float, *, cautious: bool) -> MatchJob:
-        """A job for the first of the pairs and units; the others go back to the front of the queue."""
-        left, costs = self.stop - now, self.costs
-        pair_count = unit_count = 1
-        if not cautious:
-            names = _priced(self._lacking_units(chunk.indices, units))
-            prices = [costs.mean(name) if costs.is_known(name) else None for name in names]
-            pair_count, unit_count = job_size(len(chunk.indices), prices, costs.overhead, JOB_SHARE * left)
-        indices, later = chunk.indices[:pair_count], chunk.indices[pair_count:]
-        lacking = self._lacking_units(indices, units)
-        chosen, further = lacking[:unit_count], lacking[unit_count:]
-        if later:
-            self._queue.put_back(replace(chunk, indices=later))
-        if further:
-            self._queue.put_back(replace(chunk, indices=indices, units=further))
-        self._queue.under_way.update(indices)
-        p90 = tuple(costs.p90(unit.name) for unit in chosen)
-        limits = self._limits(len(indices), chosen, left)
-        return MatchJob(chunk.phase, indices, chosen, p90, *limits, is_retry=bool(chunk.lost_at))
+    def settled(self, now: float) -> Mask:
+        """(N,): the pairs that get no further unit before the filling."""
+        waiting = self.busy.copy()
+        for phase in (Phase.SWEEP, Phase.CONNECT, Phase.DEEPEN):
+            waiting |= self._lacking(phase, now).any(1)
+        return ~waiting
 
-    def _lacking_units(self, indices: Iterable[int], units: Sequence[Unit]) -> tuple[Unit, ...]:
-        """Those of ``units`` that any of the pairs lacks, in the order in which they run."""
-        lacking = dict.fromkeys(unit for index in indices for unit in self.records[index].lacking(units))
-        return tuple(sorted(lacking, key=lambda unit: unit.stage))
+    def filled(self, now: float) -> Mask:
+        """(N,): the pairs that get no further unit."""
+        return self.settled(now) & ~self._lacking(Phase.FILL, now).any(1)
 
-    def _limits(self, pair_count: int, units: Sequence[Unit], left: float) -> tuple[float, float]:
-        """The seconds within which units of a job may begin, and after which its worker hangs."""
-        costs, minibatch = self.costs, min(pair_count, self._minibatch)
-        names = _priced(units)
-        expected = pair_count * (costs.overhead + sum(map(costs.p90, names)))
-        allowance = SLOW_FACTOR * expected + self.budget.silence
-        hangs = max(costs.hang_after(name, HANG_FACTOR * minibatch) for name in names)
-        if not all(map(costs.is_known, names)):
-            hangs += min(MAX_EXPLORE_S, EXPLORE_SHARE * left)
-        return min(left, allowance), allowance + hangs
-
-    def _units(self, chunk: Chunk, now: float) -> tuple[Unit, ...]:
-        if chunk.units is not None:
-            return self.usable(chunk.units)
-        if chunk.phase is Phase.ESTIMATE:
-            return ()
-        units = self.usable(self.recipe.units)
-        if chunk.phase is Phase.DEEPEN:
-            return units[: self._fit(units, now)]
-        return units if chunk.phase is Phase.FILL else self._first
-
-    def usable(self, units: Iterable[Unit]) -> tuple[Unit, ...]:
-        return tuple(unit for unit in units if unit.name not in self.unusable)
-
-    @property
-    def _first(self) -> tuple[Unit, ...]:
-        """The unit that sweeps all pairs; none where none can run."""
-        return self.usable(unit for unit in self.recipe.units if unit.stage == 1)[:1]
-
-    def _fit(self, units: tuple[Unit, ...], now: float) -> int:
-        """How many units all pairs can have in the time left; a change is explained."""
+    def fit(self, now: float) -> int:
+        """Return the length of the longest prefix of the recipe that all rows can have in the time left."""
         left = (self.stop - now) * self.workers
-        needed = list(self.costs.cumulative(units, self._lacking))
-        count = next((number for number, seconds in enumerate(needed) if seconds > left), len(units))
-        if count < len(units) and not self.costs.is_sure(units[count].name):
-            return count + 1
-        if count != self._fitting and count < len(units):
-            self._explain(
-                f"{count} of {len(units)} units fit: up to {units[count].name} all pairs would need "
-                f"{format_duration(needed[count] / self.workers)} of {format_duration(left / self.workers)}",
-            )
-        elif count != self._fitting and self._fitting >= 0:
-            self._explain(f"all {count} units fit again")
-        self._fitting = count
-        return count
+        return int(np.searchsorted(self._needed, left, side="right")) if left > 0 else 0
 
-    def _open(self, phase: Phase, now: float) -> None:
-        self.phase, indices = phase, [index for index in self._order if index < self._row_count]
-        if phase is Phase.ESTIMATE:
-            indices = [index for index in self._order if index in self.outdated]
-            if indices:
-                self._explain(f"{len(indices)} pairs have the F of other settings, and get it anew")
-        elif phase is Phase.CONNECT:
-            extra, left = len(self.records) - self._row_count, CONNECT_SHARE * (self.stop - now) * self.workers
-            seconds = self.costs.overhead + sum(self.costs.forecast(unit.name) for unit in self._first)
-            count = extra if seconds * extra <= left else int(left / seconds)
-            indices = [index for index in self._order if self._row_count <= index < self._row_count + count]
-            if extra:
-                self._explain(f"{count} of {extra} pairs are matched for the scenes alone")
-        elif phase is Phase.DEEPEN:
-            self._explain("the sweep is over; deepening begins")
-        elif phase is Phase.FILL:
-            busy = self._queue.under_way | {index for chunk in self._queue.again for index in chunk.indices}
-            indices = sorted(self._fillable(), key=lambda i: (i in busy, self.records[i].inliers, i))
-            if indices:
-                self._explain(f"in the time left: {len(indices)} pairs that lack units, the weakest first")
-        self._total, self._left = len(indices), set(indices)
-        size = max(JOB_PAIRS, JOB_MINIBATCHES * self._minibatch if self._minibatch > 1 else 0)
-        self._queue.fresh.extend(chunks_of(phase, indices, size))
+    def outlook(self, now: float) -> str:
+        """Say how many of the units fit in the time left."""
+        usable, unknown = (~self.unusable).sum(), sum(not self.costs.is_known(unit.name) for unit in self.units)
+        text = f"all units on all pairs would take {format_duration(self._needed[-1] / self.workers)}"
+        text += f", and {unknown} units were not measured yet" if unknown else ""
+        if not isfinite(self.stop):
+            return f"{text}; there is no time limit"
+        left = format_duration(max(0.0, self.stop - now))
+        return f"{text}; {min(self.fit(now), usable)} of {usable} units fit in the remaining {left}"
 
-    # What came of it
+    def _look(self) -> None:
+        """Derive which units pairs can still get, and the seconds that prefixes of the recipe take."""
+        missing = ~self.state.had & ~self.unusable & ~self.state.unreadable[:, None]
+        for index, name in self.losses.skipped:
+            missing[index, self._number(name)] = False
+        self._missing = missing
+        counts = missing[: self.state.rows].sum(0)
+        forecasts = np.array([self.costs.forecast(unit.name) for unit in self.units])
+        self._needed = np.cumsum(counts * forecasts)
+        self._means = np.array([self.costs.mean(unit.name) for unit in self.units])
 
-    def on_result(self, job: MatchJob, result: MatchResult, seconds: float) -> list[Outcome]:
-        """Record a job that took so many seconds; what it brought, to be kept."""
-        self._queue.under_way.difference_update(job.indices)
-        for found in result.results:
-            self.costs.observe(found.unit.name, found.seconds, warm_up=found.warm_up)
-        if result.results:
-            self.costs.observe_overhead((seconds - result.unit_seconds) / len(result.outcomes))
-        if not job.units:
-            self.costs.observe(Phase.ESTIMATE, seconds / len(job.indices))
-        merge = self._merge if job.units else self._merge_estimate
-        kept = [merged for outcome in result.outcomes if (merged := merge(outcome)) is not None]
-        if rest := self._wanting(job.phase, job.indices, job.units):  # the job's own deadline cut it off
-            self._queue.put_back(Chunk(job.phase, rest, job.units))
-        self._mark_done(job.phase, set(job.indices) - set(rest))
-        return kept
-
-    def on_failure(self, job: MatchJob, failure: Failure, place: str) -> list[Outcome]:
-        """Record a job that came to nothing, and plan it anew: halved, then unit by unit; what to keep.
-
-        A unit that a single pair cannot have after two tries, in two places where there are two, is given up for
-        that pair.
-        """
-        self._queue.under_way.difference_update(job.indices)
-        chunk, half = Chunk(job.phase, job.indices, job.units, (place,)), len(job.indices) // 2
-        if half:
-            halves = job.indices[:half], job.indices[half:]
-            self._queue.put_back(*(replace(chunk, indices=part) for part in halves))
-            return []
-        (index,) = job.indices
-        units = self.records[index].lacking(job.units)
-        if len(units) > 1:
-            self._queue.put_back(*(replace(chunk, units=(unit,)) for unit in units))
-            return []
-        (name,) = _priced(units)
-        if failure.cause is Cause.TIMED_OUT:
-            self.costs.assume(name, job.time_limit)
-        self._tries[index, name] += 1
-        if self._tries[index, name] < MAX_TRIES:
-            self._queue.put_back(chunk)
-            return []
-        self._mark_done(job.phase, [index])
-        if units:
-            return [self._give_up(index, units[0], failure)]
-        self._explain(f"pair {index} keeps the F it has: {failure}")
-        self.outdated.discard(index)
-        return []
-
-    def restart(self) -> list[Outcome]:
-        """Begin anew on other devices: no unit is given up, and pairs keep what they have; what has changed."""
-        whole = [record.without_given_up() for record in self.records]
-        changed = [record for record in whole if record is not self.records[record.index]]
-        self._begin()
-        return list(map(self._put, changed))
-
-    def _merge(self, outcome: Outcome) -> Outcome | None:
-        """What a job has brought a pair, if anything: a unit more, or the reason why there can be none."""
-        record, former = outcome.record, self.records[outcome.record.index]
-        if not outcome.results and record.failure and record.reached:
-            self._stuck.add(record.index)  # an image cannot be read
-            if former.units:
-                self._explain(f"pair {record.index} keeps the F it has: {record.failure}")
-        if len(record.units) <= len(former.units) and (former.reached or not record.reached):
-            if outcome.results:  # what was found before cannot be read, and a worse F gains nothing
-                self._stuck.add(record.index)
-            return None
-        return self._put(record.after(former), outcome.results)
-
-    def _merge_estimate(self, outcome: Outcome) -> Outcome | None:
-        """The F that a job without units has made of all that was found on a pair."""
-        record, former = outcome.record, self.records[outcome.record.index]
-        self.outdated.discard(record.index)
-        if len(record.units) < len(former.units):
-            self._explain(f"pair {record.index} keeps the F it has: its points cannot be read")
-            return None
-        self.estimated_anew += 1
-        return self._put(record.after(former))
-
-    def _give_up(self, index: int, unit: Unit, failure: Failure) -> Outcome:
-        """The pair keeps the F that it has; the unit is marked as had, with the reason."""
-        record, nothing = self.records[index], UnitResult(unit, Matches.empty(), failure=f"{GIVEN_UP}{failure}")
-        self._explain(f"{unit.name} is given up on pair {index} ({failure})")
-        self._failed_pairs[unit.name] += 1
-        if self._failed_pairs[unit.name] >= MAX_FAILED_PAIRS and not self.costs.has_run(unit.name):
-            self.unusable.add(unit.name)
-            self._explain(f"{unit.name} is given up on all pairs: it never ran ({failure})")
-        units = (*record.units, UnitRecord.of(nothing, 0))
-        message = record.failure if record.reached else nothing.failure
-        return self._put(replace(record, units=units, failure=message), (nothing,))
-
-    def _mark_done(self, phase: Phase, indices: Iterable[int]) -> None:
-        """The turn of these pairs is over in a phase, unless they are to be tried again."""
-        over = {index for index in indices if not self._queue.waits(index)}
-        if phase is self.phase:
-            self._left -= over
-        if phase not in (Phase.ESTIMATE, Phase.SWEEP, Phase.CONNECT):
-            self.done |= over
-
-    # What is left
+    def _lacking(self, phase: Phase, now: float) -> Mask:
+        """(N, U): the units that a phase gives to pairs, and that end in time."""
+        lacking: Mask = self._missing & np.less(self._means, self.stop - now)
+        has_row = self.state.has_row[:, None]
+        if phase in (Phase.SWEEP, Phase.CONNECT):
+            lacking &= np.arange(len(self.units)) == self._first
+        if phase is Phase.CONNECT:
+            return np.asarray(lacking & self._connecting(now)[:, None])
+        if phase is Phase.DEEPEN:
+            lacking &= np.arange(len(self.units)) < self.fit(now)
+        if phase is Phase.FILL:
+            lacking &= self.state.had.any(1)[:, None]
+        return np.asarray(lacking & has_row)
 
     @property
-    def filling(self) -> Collection[int]:
-        """Pairs that get more than what fits for all, in the time left."""
-        return self._left if self.phase is Phase.FILL else ()
+    def _first(self) -> int:
+        """The unit of the sweep; -1 if none can run."""
+        usable = (n for n, unit in enumerate(self.units) if unit.stage == 1 and not self.unusable[n])
+        return next(usable, -1)
 
-    def _fillable(self) -> tuple[int, ...]:
-        """The pairs of rows that have a unit and can get further units."""
-        matched = (index for index in range(self._row_count) if self.records[index].units)
-        return self._wanting(Phase.FILL, matched, self.usable(self.recipe.units))
+    def _connecting(self, now: float) -> Mask:
+        """(N,): the extra pairs that a tenth of the time suffices for, the most useful first."""
+        extra: Mask = np.asarray(~self.state.has_row)
+        seconds = self.costs.forecast(self.units[self._first].name) / self.workers
+        if not seconds or not extra.any():
+            return extra
+        spent = self.state.had[extra].any(1).sum() * seconds
+        most = CONNECT_SHARE * (max(0.0, self.stop - now) + spent) / seconds
+        return np.asarray(extra & (np.cumsum(extra) <= most))
+
+    def _job(self, phase: Phase, lacking: Mask, ready: Mask, now: float) -> MatchJob:
+        """A job for the first pair, or on a GPU for a minibatch of pairs that lack the same units."""
+        order = self._order[ready[self._order]]
+        if phase is Phase.FILL:
+            order = order[np.argsort(self.state.inliers[order], kind="stable")]
+        first = int(order[0])
+        numbers = sorted(np.flatnonzero(lacking[first]).tolist(), key=lambda number: self.units[number].stage)
+        units = [self.units[number] for number in numbers]
+        alone = any((first, unit.name) in self.losses.alone for unit in units)
+        unknown = next((n for n, unit in enumerate(units) if not self.costs.is_known(unit.name)), len(units))
+        units = units[: 1 if alone else unknown + 1]
+        alike = order[(lacking[order] == lacking[first]).all(1)]
+        indices = tuple(alike[: 1 if alone else self.minibatch].tolist())
+        self.busy[list(indices)] = True
+        expected = tuple(self.costs.mean(unit.name) for unit in units)
+        return MatchJob(phase, indices, tuple(units), expected, self.stop - now, is_retry=alone)
+
+    def upcoming(self, job: MatchJob) -> list[int]:
+        """Return the pairs that will probably be matched after a job."""
+        rank = int(np.flatnonzero(self._order == job.indices[-1])[0]) + 1
+        return self._order[rank : rank + self.minibatch].tolist() if job.phase is not Phase.FILL else []
+
+    def seconds_of(self, job: MatchJob) -> float:
+        """Return the seconds that a job takes on a new worker; infinity if a unit was not measured yet."""
+        if not all(self.costs.is_known(unit.name) for unit in job.units):
+            return float("inf")
+        return len(job.indices) * sum(self.costs.longest(unit.name) for unit in job.units)
+
+    def _enter(self, phase: Phase, now: float) -> None:
+        """Explain a change of the phase, and of the units that fit."""
+        if phase != self.phase:
+            if self.phase is Phase.SWEEP:
+                self.explain(f"the sweep is over: {self.outlook(now)}")
+            elif phase is Phase.FILL:
+                self.explain("the remaining time goes to the weakest pairs")
+            self.phase = phase
+        if phase is Phase.DEEPEN and (count := self.fit(now)) != self._fitting:
+            self._fitting = count
+            self.explain(self.outlook(now))
+
+    # Results
+
+    def on_result(self, job: MatchJob, outcomes: Sequence[Outcome]) -> None:
+        self.busy[list(job.indices)] = False
+        for outcome in outcomes:
+            self.state.unreadable[outcome.index] |= bool(outcome.failure)
+            for found in outcome.found:
+                self.costs.observe(found.unit.name, found.seconds, warm_up=found.warm_up)
+        self._look()
+
+    def on_failure(self, job: MatchJob, failure: Failure, time_limit: float) -> None:
+        """Record a lost job: it comes back as single pairs and units. Skip a unit that is lost twice on a pair."""
+        self.busy[list(job.indices)] = False
+        if failure.cause is Cause.TIMED_OUT and len(job.units) == 1:
+            self.costs.assume(job.units[0].name, time_limit / len(job.indices))
+        lost = [(index, unit.name) for index in job.indices for unit in job.units]
+        if self.losses.add(lost, failure):
+            self._skip(*lost[0], failure)
+        self._look()
+
+    def _skip(self, index: int, name: str, failure: Failure) -> None:
+        self.explain(f"{name} is skipped on pair {index} ({failure})")
+        pairs = Counter(unit for _, unit in self.losses.skipped)[name]
+        if pairs >= MAX_FAILED_PAIRS and not self.costs.has_run(name):
+            self.unusable[self._number(name)] = True
+            self.explain(f"{name} is skipped on all pairs: it never ran ({failure})")
+
+    def _number(self, name: str) -> int:
+        return next(number for number, unit in enumerate(self.units) if unit.name == name)
+
+    # The remaining work
 
     @property
     def is_complete(self) -> bool:
-        """Whether every pair has been reached, and none can gain what it wants, nor another F."""
-        are_reached = all(record.reached for record in self.records[: self._row_count])
-        return are_reached and not self.outdated and not self._fillable()
+        """Whether no row lacks a unit that can run."""
+        return not self._missing[: self.state.rows].any()
 
     @property
     def nothing_runs(self) -> bool:
-        return not self.usable(self.recipe.units)
+        return bool(self.unusable.all())
 
-    @property
-    def progress(self) -> tuple[Phase, int, int]:
-        """The present phase, how many of its pairs are done, and how many it has."""
-        return self.phase, self._total - len(self._left), self._total
-
-    def _put(self, record: PairRecord, results: tuple[UnitResult, ...] = ()) -> Outcome:
-        """Replace a pair's record; what is to be kept of that."""
-        self._lacking.subtract(self._lacks(self.records[record.index]))
-        self._lacking.update(self._lacks(record))
-        self.records[record.index] = record
-        return Outcome(record, results)
-
-    def _lacks(self, record: PairRecord) -> list[str]:
-        """The units that a pair is to get yet, if it has an F and a row."""
-        has_row = record.index < self._row_count
-        return [unit.name for unit in record.lacking(self.recipe.units)] if record.units and has_row else []
+    def progress(self, now: float) -> tuple[Phase, int, int]:
+        """Return the phase, the number of its pairs that are done, and the number of its pairs."""
+        members = (
+            ~self.state.has_row & self._connecting(now) if self.phase is Phase.CONNECT else self.state.has_row
+        )
+        units = {Phase.DEEPEN: slice(self.fit(now)), Phase.FILL: slice(None)}.get(
+            self.phase, slice(self._first, self._first + 1)
+        )
+        lacking = self._missing[members][:, units].any(1)
+        return self.phase, int((~lacking).sum()), int(members.sum())

@@ -1,21 +1,19 @@
 """A run from its parts: journal, site and engine opened, used and let go of; signals, and the end at the limit."""
 
-import hashlib
-import json
 import platform
 import signal
 import sqlite3
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from importlib import metadata
 from math import isfinite
 from pathlib import Path
 from tempfile import TemporaryFile
 from types import FrameType
-from typing import Self
+from typing import Any, Self
 
 import cv2
 import numpy as np
@@ -24,14 +22,13 @@ from mkpc_kaggle.data.competition import Pair, write_submission
 from mkpc_kaggle.engine import console
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.cluster import RayCluster, RaySite
-from mkpc_kaggle.engine.engine import Engine, RunReport
+from mkpc_kaggle.engine.engine import Engine, Request, RunReport, Standing
 from mkpc_kaggle.engine.journal import About, Event, EventKind, Journal
 from mkpc_kaggle.engine.places import LISTEN_S, LocalSite, Site
-from mkpc_kaggle.engine.records import PairRecord, SceneRecord
+from mkpc_kaggle.engine.settings import Settings
 from mkpc_kaggle.errors import UserError, writing
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
 from mkpc_kaggle.pipeline.assembly import Assembly
-from mkpc_kaggle.scene.export import Export
 from mkpc_kaggle.version import __version__
 
 EXIT_S = 0.2  # that the system takes to end a process
@@ -50,7 +47,6 @@ class Session:
 
     ``workers`` is the number of worker processes, or the cluster to work on; 0: the work is done in this process;
     ``None``: a process for each device. ``watchdog`` is told how to write the submission in the end.
-    ``exports``: of which batches COLMAP's files are written.
     """
 
     work_dir: Path
@@ -60,21 +56,20 @@ class Session:
     progress: bool = True
     workers: int | RayCluster | None = 0
     watchdog: "Watchdog | None" = None
-    exports: Mapping[str, Export] = field(default_factory=dict)
 
     def must_end(self) -> float:
         """When the program must have ended, by the monotonic clock: with its budget, or soon after a signal."""
         return time.monotonic() + REPORT_S if self.interrupt.signal else self.budget.limit
 
 
-def submit(pairs: Sequence[Pair], assembly: Assembly, session: Session, output: Path) -> RunReport:
-    """Match all pairs and keep ``output`` whole: each pair has a row, of the fallback if need be."""
+def submit(pairs: Sequence[Pair], assembly: Assembly, session: Session, output: Path, root: str = "") -> RunReport:
+    """Match all pairs and keep ``output`` whole: a row for each pair, with the fallback if necessary."""
 
-    def publish(records: Sequence[PairRecord], _: Iterable[SceneRecord]) -> None:
-        rows = zip(pairs, records, strict=True)
-        write_submission(output, {pair.id: record.chosen_fundamental for pair, record in rows})
+    def publish(standing: Standing) -> None:
+        ids = (pair.id for pair in pairs)
+        write_submission(output, dict(zip(ids, standing.fundamentals, strict=True)))
 
-    return run_pairs(pairs, assembly, session, publish)
+    return run_pairs(pairs, assembly, session, publish, root)
 
 
 @contextmanager
@@ -118,42 +113,56 @@ def run_pairs(
     pairs: Sequence[Pair],
     assembly: Assembly,
     session: Session,
-    publish: Callable[[Sequence[PairRecord], Iterable[SceneRecord]], None] = lambda *_: None,
+    publish: Callable[[Standing], None] = lambda _: None,
+    root: str = "",
 ) -> RunReport:
-    """Run the recipe on all pairs.
+    """Run the recipe on all pairs. The journal knows their images by their names below ``root``.
 
-    Raises :class:`mkpc_kaggle.errors.UserError` before any work where the journal is another run's, or a
-    matcher cannot be loaded.
+    Raises :class:`mkpc_kaggle.errors.UserError` if the journal cannot be used or a matcher cannot be loaded.
     """
-    belongs_to = {"test set": digest_of_pairs(pairs), **assembly.fingerprint()}
+    folders = dict.fromkeys(path.parent for pair in pairs for path in pair.images)
+    with opened_engine(assembly, session, folders) as engine:
+        engine.ask(request_of(pairs, assembly, session, root, publish=publish))
+        return engine.report()
+
+
+def request_of(
+    pairs: Sequence[Pair], assembly: Assembly, session: Session, root: str = "", **more: Any
+) -> Request:
+    """Return a request for these pairs; ``more`` are its other fields."""
     budget, recipe = session.budget, assembly.recipe
     limit = budget.time_limit if isfinite(budget.time_limit) else None
-    estimation = json.dumps(recipe.estimation())
-    about = About(recipe.name, str(assembly.placement), limit, assembly.left_out, versions(), estimation)
-    with Journal(session.work_dir, belongs_to, pairs=pairs, about=about, fresh=session.fresh) as journal:
-        journal.note(Event(EventKind.START, budget.spent(), ""))
+    table = {**recipe.table(), "name": recipe.name}
+    about = About(table, str(assembly.placement), limit, assembly.left_out, versions())
+    return Request(pairs, recipe, Settings.of(assembly), root, about=about, **more)
+
+
+@contextmanager
+def opened_engine(assembly: Assembly, session: Session, folders: Iterable[Path] = ()) -> Iterator[Engine]:
+    """An engine with its journal. Its workers end, and the last results are published, when it is left.
+
+    ``folders`` hold the images, on every machine.
+    """
+    with Journal(session.work_dir, fresh=session.fresh) as journal:
+        journal.note(Event(EventKind.START, session.budget.spent(), ""))
         engine = Engine(
-            pairs,
-            recipe,
-            site_of(pairs, assembly, session),
+            request_of((), assembly, session),
+            site_of(folders, assembly, session),
             journal,
-            budget,
-            publish=publish,
+            session.budget,
             interrupt=session.interrupt,
             progress=session.progress,
             minibatch=assembly.minibatch,
-            exports=session.exports,
         )
         if session.watchdog is not None:
             session.watchdog.save = engine.save_results
-        report = engine.run()
-        journal.note(Event(EventKind.END, report.seconds, report.ending))
-    return report
+        with engine:
+            yield engine
+        journal.note(Event(EventKind.END, session.budget.spent(), engine.ending))
 
 
-def site_of(pairs: Sequence[Pair], assembly: Assembly, session: Session) -> Site:
+def site_of(folders: Iterable[Path], assembly: Assembly, session: Session) -> Site:
     if isinstance(session.workers, RayCluster):
-        folders = dict.fromkeys(path.parent for pair in pairs for path in pair.images)
         return RaySite(assembly, session.workers, session.budget.clock, folders)
     return LocalSite(assembly, session.workers, session.budget.clock)
 
@@ -168,13 +177,6 @@ def versions() -> dict[str, str]:
         "NumPy": np.__version__,
         "SQLite": sqlite3.sqlite_version,
     }
-
-
-def digest_of_pairs(pairs: Sequence[Pair]) -> str:
-    """Tells test sets apart: the ids of its pairs with the ids of their images, in order."""
-    ids = ((pair.id, pair.group, *(name.rpartition(".")[0] for name in pair.names)) for pair in pairs)
-    rows = map("\t".join, ids)
-    return hashlib.sha256("\n".join(rows).encode()).hexdigest()
 
 
 class Watchdog:

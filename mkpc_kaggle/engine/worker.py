@@ -1,34 +1,49 @@
-"""What a worker does with its jobs, in whatever process it is: matching and F of pairs, the cameras of a batch."""
+"""What a worker does with its jobs: matching, estimates, looks at images, reconstructions.
+
+Importing this module does not import torch: only matching needs it.
+"""
 
 import time
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
-from typing import Protocol
+from pathlib import Path
+from typing import TYPE_CHECKING, Protocol
 
-from mkpc_kaggle.data.competition import Pair
+import numpy as np
+
 from mkpc_kaggle.data.images import Image, ImageStore, turned
+from mkpc_kaggle.engine.codec import from_blob, to_blob
 from mkpc_kaggle.engine.jobs import (
     Answer,
     Cause,
+    Estimated,
+    EstimateJob,
+    Estimates,
     Failure,
+    Found,
     Job,
     Loaded,
+    LookJob,
+    Matched,
     MatchJob,
-    MatchResult,
     Outcome,
+    PairPoints,
+    PointSource,
     SceneJob,
-    TaskJob,
+    WantedPair,
 )
-from mkpc_kaggle.engine.records import NOT_REACHED, PairRecord
+from mkpc_kaggle.engine.journal import JournalReader
 from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.geometry.robust import ModelKind
 from mkpc_kaggle.pipeline import failures
-from mkpc_kaggle.pipeline.pair import PairMatch, with_estimate
-from mkpc_kaggle.pipeline.stages import Pipeline
-from mkpc_kaggle.recipe import Unit
+from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult, with_estimate
+from mkpc_kaggle.recipe import Recipe, Unit
 from mkpc_kaggle.scene.reconstruct import Solution, reconstruct_batch
+from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair, tracks_of
 
-ESTIMATE_THREADS = 2  # OpenCV releases the interpreter's lock: F of pairs is estimated while the next are matched
+if TYPE_CHECKING:
+    from mkpc_kaggle.pipeline.stages import Pipeline
 
 CAUSES = {
     failures.FailureKind.OUT_OF_MEMORY: Cause.OUT_OF_MEMORY,
@@ -38,13 +53,13 @@ CAUSES = {
 
 
 class Runner(Protocol):
-    """Does jobs of one kind. It may raise anything, never return, or end the process."""
+    """Does jobs of some kinds. It may raise anything, never return, or end the process."""
 
     def run(self, job: Job, seconds: float) -> Answer: ...
 
 
 class Executor:
-    """A worker's own side, in whatever process it is: it makes its runner, then does jobs. Neither raises."""
+    """The worker's side in any process: it makes its runner, then does jobs. Neither raises."""
 
     runner: Runner
 
@@ -70,7 +85,7 @@ def failure_of(error: Exception) -> Failure:
 
 
 def use_threads(count: int) -> None:
-    """Let this process compute in so many threads at a time."""
+    """Let this process compute in ``count`` threads."""
     import cv2
     import torch
 
@@ -79,7 +94,7 @@ def use_threads(count: int) -> None:
 
 
 def share_cores(make: Callable[[], Runner], share: int) -> Runner:
-    """What ``make`` makes in one of so many processes that share the machine's cores."""
+    """Call ``make`` in one of ``share`` processes that share the machine's cores."""
     import torch
 
     if share > 1:
@@ -88,90 +103,120 @@ def share_cores(make: Callable[[], Runner], share: int) -> Runner:
 
 
 class MatchRunner:
-    """Matches the pairs of jobs and estimates their F, in threads, while the next minibatch is matched.
+    """Matches the pairs of jobs. Raises :class:`mkpc_kaggle.errors.UserError` if the matchers cannot be loaded."""
 
-    Loads all matchers, unless it gets jobs without units alone; raises :class:`mkpc_kaggle.errors.UserError` where
-    this fails.
-    """
-
-    def __init__(self, make_pipeline: Callable[[], Pipeline], *, load: bool = True) -> None:
+    def __init__(self, make_pipeline: Callable[[], "Pipeline"]) -> None:
         self._pipeline = make_pipeline()
-        if load:
-            self._pipeline.load()
+        self._pipeline.load()
         self._images = ImageStore()
-        self._estimators = ThreadPoolExecutor(ESTIMATE_THREADS, thread_name_prefix="estimate")
 
-    def run(self, job: Job, seconds: float) -> MatchResult:
-        """Match the pairs of a job; no unit begins that is expected to end later than ``seconds`` from now."""
+    def run(self, job: Job, seconds: float) -> Matched:
+        """Match the pairs of a job. No unit begins that is expected to end later than ``seconds`` from now."""
         assert isinstance(job, MatchJob)
-        if not job.units:
-            return self._estimate_anew(job)
         deadline = time.monotonic() + seconds
         expected = dict(zip(job.units, job.expected, strict=True))
 
         def may_start(unit: Unit) -> bool:
             return time.monotonic() + expected[unit] < deadline
 
-        self._images.prefetch(path for pair in job.pairs for path in pair.images)
-        pairs = [self._open(pair, known) for pair, known in zip(job.pairs, job.known, strict=True)]
+        self._images.prefetch(path for each in job.pairs for path in each.pair.images)
+        known = (tuple(UnitResult(unit, from_blob(blob)) for unit, blob in pair) for pair in job.known)
+        pairs = [self._open(each, results) for each, results in zip(job.pairs, known, strict=True)]
+        self._images.prefetch(job.upcoming)
         readable = [number for number, pair in enumerate(pairs) if not pair.failure]
-        estimates: list[Future[Outcome]] = []
-        for start in range(0, len(readable), self._pipeline.minibatch):
-            part = readable[start : start + self._pipeline.minibatch]
-            found = self._pipeline.match([pairs[number] for number in part], job.units, may_start)
-            estimates += [
-                self._estimators.submit(self._estimate, job, *pair) for pair in zip(part, found, strict=True)
-            ]
-        outcomes = [Outcome(PairRecord.untouched(i, p.failure)) for i, p in zip(job.indices, pairs, strict=True)]
-        for number, estimate in zip(readable, estimates, strict=True):
-            outcomes[number] = estimate.result()
-        return MatchResult(tuple(outcomes))
+        matched = self._pipeline.match([pairs[number] for number in readable], job.units, may_start)
+        for number, pair in zip(readable, matched, strict=True):
+            pairs[number] = pair
+        return Matched(
+            tuple(_outcome(*each) for each in zip(job.indices, job.pairs, pairs, job.known, strict=True))
+        )
 
-    def _estimate_anew(self, job: MatchJob) -> MatchResult:
-        """F of the pairs of a job from what is known of them; their images are not looked at."""
-        estimates = [self._estimators.submit(self._record, job, *pair) for pair in enumerate(job.known)]
-        return MatchResult(tuple(Outcome(estimate.result()) for estimate in estimates))
-
-    def _open(self, pair: Pair, known: PairMatch) -> PairMatch:
-        """The pair with its images; ``failure`` says which of them cannot be read."""
-        start = time.perf_counter()
+    def _open(self, wanted: WantedPair, known: tuple[UnitResult, ...]) -> PairMatch:
+        """Return the pair with its images; ``failure`` says which of them cannot be read."""
+        start, pair = time.perf_counter(), wanted.pair
         files = zip(pair.images, pair.turns, strict=True)
         images = [turned(self._images.get(path), turns) for path, turns in files]
         seconds = time.perf_counter() - start
         readable = tuple(image for image in images if isinstance(image, Image))
         failure = next((str(image) for image in images if not isinstance(image, Image)), "")
-        return replace(known, images=readable, failure=failure, decode_seconds=seconds)
+        return PairMatch(known, images=readable, failure=failure, decode_seconds=seconds)
 
-    def _estimate(self, job: MatchJob, number: int, pair: PairMatch) -> Outcome:
-        """F from all matches of a pair; the outcome has the new results alone, since only these have to travel."""
-        found = pair.results[len(job.known[number].results) :]
-        if not found:
-            return Outcome(PairRecord.untouched(job.indices[number], NOT_REACHED))
-        sizes = tuple(image.size for image in pair.images)
-        versions = tuple(image.version for image in pair.images)
-        focals = tuple(image.focal for image in pair.images)
-        pair = replace(pair, images=(), sizes=sizes, versions=versions, focals=focals)
-        return Outcome(self._record(job, number, pair), found)
 
-    def _record(self, job: MatchJob, number: int, pair: PairMatch) -> PairRecord:
-        start, recipe, asked = time.perf_counter(), self._pipeline.recipe, job.pairs[number]
-        pair = with_estimate(pair, recipe, asked.model, asked.intrinsics)
-        pair = replace(pair, estimate_seconds=time.perf_counter() - start)
-        return PairRecord.of(job.indices[number], pair, recipe.pair_estimation(asked.intrinsics))
+def _outcome(index: int, wanted: WantedPair, pair: PairMatch, known: tuple[object, ...]) -> Outcome:
+    """The new results of a pair; its image contents are those that were matched."""
+    images = tuple(
+        BatchImage(name, image.version, image.size, image.focal)
+        for name, image in zip(wanted.names, pair.images, strict=False)
+    )
+    found = tuple(
+        Found(
+            *(result.unit, len(result.matches), to_blob(result.matches), result.encode_seconds),
+            *(result.match_seconds, result.failure, result.note, result.warm_up),
+        )
+        for result in pair.results[len(known) :]
+    )
+    seconds = pair.decode_seconds, pair.cluster_seconds
+    return Outcome(index, () if pair.failure else images, found, pair.regions, pair.failure, *seconds)
+
+
+class LightRunner:
+    """Estimates the models of pairs, and looks at images. It needs neither torch nor a device."""
+
+    def __init__(self) -> None:
+        import cv2
+        from threadpoolctl import threadpool_limits
+
+        cv2.setNumThreads(1)
+        threadpool_limits(1)
+
+    def run(self, job: Job, seconds: float) -> Estimates | bytes:
+        """Do a job; ``seconds`` are ignored."""
+        if isinstance(job, LookJob):
+            return job.do()
+        assert isinstance(job, EstimateJob)
+        points = read_points(job.source, job.pairs)
+        return Estimates(tuple(estimate_pair(pair, points, job.recipe) for pair in job.pairs))
+
+
+def estimate_pair(pair: PairPoints, points: dict[int, Matches], recipe: Recipe) -> Estimated:
+    """Return F of a pair, or E with intrinsics, from its points of all units."""
+    start = time.perf_counter()
+    results = tuple(UnitResult(unit, points[revision]) for unit, revision in pair.units)
+    sizes, focals = tuple(image.size for image in pair.images), tuple(image.focal for image in pair.images)
+    match = PairMatch(results, sizes=sizes, focals=focals)
+    model = ModelKind.F if pair.intrinsics is None else ModelKind.E
+    found = with_estimate(match, recipe, model, pair.intrinsics).estimate
+    ends = np.cumsum([len(result.matches) for result in results])[:-1]
+    inliers = tuple(int(mask.sum()) for mask in np.split(found.inliers, ends))
+    seconds = time.perf_counter() - start
+    return Estimated(
+        pair.index, pair.revisions, inliers, found.matrix, found.failure, found.magsac, found.stats, seconds
+    )
 
 
 class SceneRunner:
     """Reconstructs batches. pycolmap may end the process: see :mod:`mkpc_kaggle.scene.colmap`."""
 
     def run(self, job: Job, seconds: float) -> Solution:
-        """The cameras of a batch, and which F each of its pairs gets; ``seconds`` are not looked at."""
+        """Return the cameras of a batch, and a choice for each of its pairs; ``seconds`` are ignored."""
         assert isinstance(job, SceneJob) and job.recipe.scene is not None
-        return reconstruct_batch(job.pairs, job.recipe.scene, job.recipe.focal, job.recipe.magsac, job.export)
+        points = read_points(job.source, job.pairs)
+        pairs = [batch_pair(pair, points) for pair in job.pairs]
+        return reconstruct_batch(pairs, job.recipe.scene, job.recipe.focal, job.recipe.magsac, job.export)
 
 
-class TaskRunner:
-    """Looks at images before there are pairs."""
+def batch_pair(pair: PairPoints, points: dict[int, Matches]) -> BatchPair:
+    """Return a pair of a batch with its points; images go by the names of their files."""
+    results = [UnitResult(unit, points[revision]) for unit, revision in pair.units]
+    image0, image1 = (replace(image, name=Path(image.name).name) for image in pair.images)
+    matches = Matches.concatenate(result.matches for result in results)
+    return BatchPair(image0, image1, matches, pair.own, tracks_of(results))
 
-    def run(self, job: Job, seconds: float) -> bytes:
-        assert isinstance(job, TaskJob)
-        return job.do()
+
+def read_points(source: PointSource, pairs: tuple[PairPoints, ...]) -> dict[int, Matches]:
+    """Return the points of pairs by revision."""
+    revisions = [revision for pair in pairs for revision in pair.revisions]
+    if source.blobs is not None:
+        return {revision: from_blob(source.blobs[revision]) for revision in revisions}
+    with JournalReader(source.directory, check=False) as journal:
+        return journal.points(revisions)

@@ -95,8 +95,9 @@ class Validation:
         return [error for scene in self.scenes for error in scene.errors]
 
 
-def validate(scenes: Sequence[TrainScene], assembly: Assembly, session: Session) -> Validation:
-    report = run_pairs([true.pair for scene in scenes for true in scene.pairs], assembly, session)
+def validate(scenes: Sequence[TrainScene], assembly: Assembly, session: Session, root: str = "") -> Validation:
+    """Run the recipe on the pairs of all scenes, whose images lie below ``root``, and score it."""
+    report = run_pairs([true.pair for scene in scenes for true in scene.pairs], assembly, session, root=root)
     prior = assembly.recipe.focal is not None
     made = {  # if E is sought at known focal lengths, there is no MAGSAC alone
         Step.MAGSAC: not prior or any(record.magsac_fundamental is not None for record in report.records),

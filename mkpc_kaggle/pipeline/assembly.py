@@ -1,7 +1,7 @@
 """A run's parts put together: a recipe, the weights it finds, the device, the matchers."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ from mkpc_kaggle.pipeline.availability import (
 )
 from mkpc_kaggle.pipeline.devices import AUTO, gpus_of, require_device, resolve_placement
 from mkpc_kaggle.pipeline.stages import ENCODING_CACHE_BYTES, Pipeline
-from mkpc_kaggle.recipe import Mode, Recipe, load_recipe
+from mkpc_kaggle.recipe import Mode, Recipe, Unit, load_recipe
 from mkpc_kaggle.weights import FoundFile, State, WeightStore
 
 CACHE_SHARE = 0.25  # of a GPU's free memory, for the encodings that all workers on it keep
@@ -77,15 +77,15 @@ class Assembly:
             load_float32=None if exact == self.placement else lambda name: self._load(name, exact),
         )
 
-    def fingerprint(self) -> dict[str, Any]:
-        """What decides which points are found: units and matchers, the precision and the digests of the weights.
-
-        What F and cameras are made of the points is in :meth:`Recipe.estimation`.
-        """
+    def unit_settings(self, unit: Unit) -> dict[str, Any]:
+        """Return all that decides the points of a unit on given views, as JSON values."""
+        name = unit.matcher
+        slots = slots_of(self.recipe.only(lambda each: each.matcher == name), self.matchers)
         return {
-            "recipe": self.recipe.matching(),
+            "unit": {key: value for key, value in asdict(unit).items() if key not in ("fallback", "tracks")},
+            "options": None if name in self.matchers else asdict(options_of(self.recipe, name)),
             "precision": self.placement.precision,
-            "weights": {slot: file.digest for slot, file in self.weight_files.items()},
+            "weights": {slot: file.digest for slot, file in self.weight_files.items() if slot in slots},
         }
 
     @property

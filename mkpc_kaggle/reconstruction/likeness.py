@@ -25,6 +25,7 @@ WORDS = 64
 SIDE_PX = 640
 FEATURES = 1000  # descriptors of an image
 MAX_TRAINING = 50_000  # descriptors that the words are made of
+FEATURE_SETTINGS = f"rootsift {SIDE_PX} {FEATURES} 1"  # with the number of the algorithm
 SCALE = np.float32(255)  # of descriptors as bytes
 
 
@@ -64,10 +65,14 @@ def most_alike(features: Callable[[], Iterable[bytes]], count: int) -> list[list
     return near
 
 
-def compare(directory: Path, keys: Sequence[str], count: int) -> bytes:
-    """:func:`most_alike` of images whose features a journal has under ``keys``, as JSON."""
-    with JournalReader(directory) as journal:
-        return json.dumps(most_alike(lambda: map(journal.task, keys), count)).encode()
+def compare(directory: Path, digests: Sequence[str], count: int) -> bytes:
+    """Return :func:`most_alike` as JSON, from the features that a journal has of images with these digests."""
+    with JournalReader(directory, check=False) as journal:
+
+        def features() -> Iterable[bytes]:
+            return (journal.feature(digest, FEATURE_SETTINGS) or b"" for digest in digests)
+
+        return json.dumps(most_alike(features, count)).encode()
 
 
 def _unpacked(features: bytes) -> NDArray[np.float32]:

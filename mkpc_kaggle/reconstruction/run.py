@@ -9,18 +9,17 @@ from typing import Any
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.data.images import Image, ImageStore, Unreadable
 from mkpc_kaggle.engine.console import warn
-from mkpc_kaggle.engine.engine import RunReport
-from mkpc_kaggle.engine.journal import Journal
-from mkpc_kaggle.engine.records import CameraRecord, PairRecord, SceneRecord
-from mkpc_kaggle.engine.session import Session, run_pairs
+from mkpc_kaggle.engine.engine import RunReport, Standing, name_below
+from mkpc_kaggle.engine.records import CameraRecord
+from mkpc_kaggle.engine.session import Session, opened_engine, request_of
 from mkpc_kaggle.errors import UserError, writing
 from mkpc_kaggle.matchers.contract import Matcher
 from mkpc_kaggle.pipeline.assembly import Assembly, assemble
 from mkpc_kaggle.pipeline.pair import PairMatch
 from mkpc_kaggle.recipe import CameraSharing, Recipe, SceneConfig, load_recipe
-from mkpc_kaggle.reconstruction.choice import MAX_IMAGES, RunEndedError, choose_pairs
+from mkpc_kaggle.reconstruction.choice import MAX_IMAGES, choose_pairs
 from mkpc_kaggle.reconstruction.directory import claim, settle
-from mkpc_kaggle.reconstruction.folder import Datasets, Ends
+from mkpc_kaggle.reconstruction.folder import Datasets, Ends, root_of
 from mkpc_kaggle.reconstruction.likeness import PARTNERS, local_features, most_alike, shortlist
 from mkpc_kaggle.reconstruction.outputs import Cameras
 from mkpc_kaggle.scene.export import Export
@@ -64,48 +63,42 @@ def reconstruct_folder(
     """
     assembly = replace(assembly, recipe=for_cameras(assembly.recipe))
     gone = claim(out, datasets)
-    none: Cameras = {name: dict.fromkeys(files) for name, files in datasets.items()}
-    belongs_to = {"images": {name: [file.name for file in files] for name, files in datasets.items()}}
-    with Journal(session.work_dir / "images", belongs_to, fresh=session.fresh) as journal:
+    folders, root = [files[0].parent for files in datasets.values()], str(root_of(datasets))
+    with opened_engine(assembly, session, folders) as engine:
         settle(out, datasets, gone)
         for name in gone:
             warn(f"the images of {name} are gone, and so are its results in {out / name}")
         if not (out / "cameras.csv").exists():
             with writing(f"--out {out}"):
-                publish(none)
-        try:
-            pairs = choose_pairs(datasets, assembly, session, journal, listed=listed, rotations=rotations)
-        except RunEndedError as ended:
-            return FolderResult(ended.report, (), none)
+                publish({name: dict.fromkeys(files) for name, files in datasets.items()})
+        pairs = choose_pairs(engine, datasets, assembly, session, listed=listed, rotations=rotations)
         turns = {path: times for pair in pairs for path, times in zip(pair.images, pair.turns, strict=True)}
         exports = {
             name: Export(
-                out / name, files[0].parent, {file.stem: (file.name, turns.get(file, 0)) for file in files}
+                out / name, files[0].parent, {file.name: (file.name, turns.get(file, 0)) for file in files}
             )
             for name, files in datasets.items()
         }
 
-        def write(records: Sequence[PairRecord], scenes: Iterable[SceneRecord]) -> None:
-            publish(cameras_of(datasets, pairs, records, scenes))
+        standing: list[Cameras] = []
 
-        report = run_pairs(pairs, assembly, replace(session, exports=exports), write)
-    return FolderResult(report, tuple(pairs), cameras_of(datasets, pairs, report.records, report.scenes))
+        def write(results: Standing) -> None:
+            standing[:] = [cameras_of(datasets, root, results)]
+            publish(standing[0])
+
+        engine.ask(request_of(pairs, assembly, session, root, exports=exports, publish=write))
+        report = engine.report()
+    return FolderResult(report, tuple(pairs), *standing)
 
 
-def cameras_of(
-    datasets: Datasets, pairs: Sequence[Pair], records: Sequence[PairRecord], scenes: Iterable[SceneRecord]
-) -> Cameras:
-    """The camera of each image. Files of one content have one camera, that of the largest model that has it."""
-    versions: dict[Path, str] = {}
-    for pair, record in zip(pairs, records, strict=True):
-        # A pair that was not reached, or of which an image cannot be read, has no versions.
-        versions |= zip(pair.images, record.versions, strict=True) if record.versions else ()
+def cameras_of(datasets: Datasets, root: str, results: Standing) -> Cameras:
+    """Return the camera of each image. Files of one content have one camera, that of the largest model with it."""
     cameras: dict[str, Mapping[Path, CameraRecord | None]] = {}
-    placed = {scene.batch: scene.cameras for scene in scenes}
     for name, files in datasets.items():
-        by_name = {file.name: versions.get(file) for file in files}
-        known = {by_name[camera.image]: camera for camera in reversed(placed.get(name, ()))}
-        cameras[name] = {file: known.get(by_name[file.name] or "") for file in files}
+        placed = results.scenes[name].cameras if name in results.scenes else ()
+        known = {camera.digest: camera for camera in reversed(placed)}
+        digests = {file: results.digests.get(name_below(root, str(file)), "") for file in files}
+        cameras[name] = {file: known.get(digests[file]) for file in files}
     return cameras
 
 

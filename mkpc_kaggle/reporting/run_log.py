@@ -1,6 +1,5 @@
 """What a journal says of a run: read at one moment, kept as a value, exported to files."""
 
-import json
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -78,15 +77,19 @@ def read_log(directory: Path) -> RunLog:
     Raises :class:`UserError` if there is none, or none that this version can read.
     """
     with JournalReader(directory) as journal, undamaged(journal.path):
-        about, belongs_to, pairs = journal.about(), journal.belongs_to(), journal.pairs()
-        recipe = recipe_of(belongs_to.get("recipe", {}) | json.loads(about.estimation), about.recipe)
-        known = journal.records()
-        records = tuple(known.get(index) or PairRecord.untouched(index) for index in range(len(pairs)))
+        about, pairs, records = journal.about(), journal.pairs(), tuple(journal.records())
+        table = dict(about.recipe)
+        recipe = recipe_of(table, table.pop("name"))
         touched = sorted((record for record in records if record.units), key=lambda r: (r.inliers, r.index))
         units = {unit.name: unit for unit in recipe.units}
-        weakest = tuple(WeakPair(record, journal.results(record, units)) for record in touched[:MAX_DRAWN_PAIRS])
-        events, scenes = journal.events(), journal.scenes()
-        return RunLog(journal.path, about, recipe, pairs, records, events, weakest, scenes)
+
+        def weak(record: PairRecord) -> WeakPair:
+            inputs = journal.inputs(record.index)
+            points = journal.points(inputs.values())
+            return WeakPair(record, tuple(UnitResult(units[name], points[inputs[name]]) for name in inputs))
+
+        weakest, scenes = tuple(map(weak, touched[:MAX_DRAWN_PAIRS])), tuple(journal.scenes().values())
+        return RunLog(journal.path, about, recipe, pairs, records, journal.events(), weakest, scenes)
 
 
 def write_csv(log: RunLog, directory: Path) -> list[Path]:

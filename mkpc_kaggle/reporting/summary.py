@@ -18,15 +18,15 @@ def summary(pairs: Sequence[Pair], report: RunReport) -> str:
     """The screen that ends a run."""
     tables = run_tables(pairs, report.records)
     resumed = f", {report.resumed} of them from earlier runs" if report.resumed else ""
-    anew = f"; {report.units_run} units run, {report.estimated_anew} F estimated anew"
+    done = f"; {report.units_run} units run, {report.estimated} F estimated"
     failed = filter(None, [trouble(report)])
-    head = headline(tables, report) + resumed + anew * bool(report.estimated_anew)
+    head = headline(tables, report) + resumed + done
     return "\n".join([head, *_lines(tables, report), *failed])
 
 
 def overview(log: RunLog) -> str:
     """The same screen from a journal."""
-    about = f"recipe {log.about.recipe}, {log.about.device}, {len(log.events)} events"
+    about = f"recipe {log.recipe.name}, {log.about.device}, {len(log.events)} events"
     left_out = filter(None, [left_out_line(log.about.left_out)])
     return "\n".join([headline(log.tables, log), about, *left_out, *_lines(log.tables, log)])
 

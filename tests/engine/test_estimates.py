@@ -16,7 +16,6 @@ from synthetic import RECIPE, SyntheticMatcher, synthetic_pairs
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.engine import Ending
 from mkpc_kaggle.engine.journal import Journal
-from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.geometry.robust import Method, RobustConfig
 from mkpc_kaggle.pipeline.stages import Pipeline
@@ -60,9 +59,9 @@ def test_a_run_that_goes_on_from_another_estimation_ends_with_the_bytes_of_a_fre
         written, report = submission(pairs, recipe, journal, NoMatcher(name="synthetic"))
         assert written == fresh[name], name
         # Without the scene F is that of the pairs' own matches, which the journal has.
-        assert (report.units_run, report.estimated_anew) == (0, 0 if name == "no scene" else 6)
+        assert (report.units_run, report.estimated) == (0, 0 if name == "no scene" else 6)
         assert read_log(journal).recipe == replace(recipe, name=read_log(journal).recipe.name)
-    assert "6 of them from earlier runs; 0 units run, 6 F estimated anew" in summary(pairs, report)
+    assert "0 units run, 6 F estimated" in summary(pairs, report)
 
 
 def die_at_a_write(pairs: Sequence[Pair], recipe: Recipe, work_dir: Path, *, after: bool) -> None:
@@ -78,7 +77,7 @@ def die_at_a_write(pairs: Sequence[Pair], recipe: Recipe, work_dir: Path, *, aft
 
         return save_and_die
 
-    for name in ("save", "save_scene"):
+    for name in ("save_estimates", "save_scene"):
         setattr(Journal, name, save(name))
     submission(pairs, recipe, work_dir, NoMatcher(name="synthetic"))
 
@@ -103,19 +102,20 @@ def test_the_file_has_the_former_f_until_another_is_there(tmp_path):
     pairs, versions = synthetic_pairs(tmp_path / "images", 4), []
     first = run(pairs, RECIPE, SyntheticMatcher(images=4), tmp_path / "work")
     other = replace(RECIPE, magsac=RobustConfig(threshold=1.0))
-    run(pairs, other, SyntheticMatcher(images=4), tmp_path / "work", publish=lambda r, _: versions.append(list(r)))
-    for former, record in zip(first.records, versions[0], strict=True):
-        assert np.array_equal(former.chosen_fundamental, record.chosen_fundamental)
-    assert all(record.source == "scene" for record in versions[-1])
-    assert {record.estimation for record in versions[0]}.isdisjoint(record.estimation for record in versions[-1])
+    publish = lambda standing: versions.append(standing.fundamentals)  # noqa: E731
+    last = run(pairs, other, SyntheticMatcher(images=4), tmp_path / "work", publish=publish)
+    assert np.array_equal(versions[0], [record.chosen_fundamental for record in first.records])
+    assert all(record.source == "scene" for record in last.records)
+    assert last.estimated == 6
 
 
-def test_what_was_matched_otherwise_is_still_refused(tmp_path):
+def test_another_number_of_matches_is_another_unit_and_the_former_points_stay(tmp_path):
     pairs = synthetic_pairs(tmp_path / "images", 4)
-    submission(pairs, ALONE, tmp_path / "work")
-    other = replace(ALONE, units=(replace(ALONE.units[0], max_matches=9),))
-    with pytest.raises(UserError, match=r"belongs to another run \(different recipe\)"):
-        submission(pairs, other, tmp_path / "work")
+    before, _ = submission(pairs, ALONE, tmp_path / "work")
+    fewer = replace(ALONE, units=(replace(ALONE.units[0], max_matches=9),))
+    assert submission(pairs, fewer, tmp_path / "work")[1].units_run == 6
+    again, report = submission(pairs, ALONE, tmp_path / "work")
+    assert (report.units_run, report.estimated, again) == (0, 0, before)
 
 
 def test_e_is_estimated_of_the_points_that_f_was_made_of(tmp_path):
@@ -124,5 +124,5 @@ def test_e_is_estimated_of_the_points_that_f_was_made_of(tmp_path):
     K = np.array([[900.0, 0, 400], [0, 900, 300], [0, 0, 1]])
     known = [replace(pair, intrinsics=(K, K)) for pair in pairs]
     written, report = submission(known, ALONE, tmp_path / "work")
-    assert (report.units_run, report.estimated_anew) == (0, 6)
+    assert (report.units_run, report.estimated) == (0, 6)
     assert written == submission(known, ALONE, tmp_path / "fresh")[0]

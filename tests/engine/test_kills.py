@@ -24,7 +24,6 @@ from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.engine import Ending, RunReport
 from mkpc_kaggle.engine.places import LocalSite
 from mkpc_kaggle.engine.process import ProcessWorker
-from mkpc_kaggle.engine.records import GIVEN_UP
 from mkpc_kaggle.geometry.robust import RobustConfig
 
 BATCHES = WORKERS = 3  # in a run so many scene workers and so many matching workers are disturbed
@@ -153,14 +152,11 @@ def test_a_run_whose_workers_are_killed_and_stopped_at_random_moments_ends_as_th
     compared = 0
     while len(DoomedWorker.sent) < moments:
         report = run_whole(f"disturbed {len(DoomedWorker.sent)}")
-        given_up = {
-            pair.group
-            for pair, record in zip(pairs, report.records, strict=True)
-            if any(unit.failure.startswith(GIVEN_UP) for unit in record.units)
-        }
+        skipped = {event.text.split()[4] for event in report.explanations if " is skipped on pair " in event.text}
+        given_up = {pairs[int(index)].group for index in skipped}
         intact = {pair.group for pair in pairs} - given_up
         assert matrices(report, intact, pairs) == matrices(undisturbed, intact, pairs), report.faults
         compared += len(intact)
     assert {number for _, number in DoomedWorker.sent} == {signal.SIGKILL, signal.SIGSTOP}
-    assert {kind for kind, _ in DoomedWorker.sent} == {"mkpc", "scene"}
+    assert {kind for kind, _ in DoomedWorker.sent} == {"mkpc", "estimates", "scene"}
     assert compared > 0

@@ -6,17 +6,17 @@ from types import SimpleNamespace
 import pytest
 
 from mkpc_kaggle.engine import places
-from mkpc_kaggle.engine.jobs import Cause, Failure, Loaded, MatchJob, MatchResult, Phase
-from mkpc_kaggle.engine.places import LocalSite, Place
+from mkpc_kaggle.engine.jobs import Cause, Failure, Loaded, Matched, MatchJob, Phase
+from mkpc_kaggle.engine.places import LocalSite, Place, Work
 from mkpc_kaggle.engine.process import ThreadWorker
 from mkpc_kaggle.engine.worker import SceneRunner
 
-LOST, DONE = Failure(Cause.DIED), MatchResult(())
+LOST, DONE = Failure(Cause.DIED), Matched(())
 RAISED, NO_MEMORY = Failure(Cause.RAISED), Failure(Cause.OUT_OF_MEMORY)
 
 
 def job(*, is_retry=False):
-    return MatchJob(Phase.DEEPEN, (0,), (), (), 1.0, 1.0, is_retry)
+    return MatchJob(Phase.DEEPEN, (0,), (), (), 1.0, is_retry)
 
 
 def place_of(waiting):
@@ -87,5 +87,5 @@ def test_the_workers_of_a_machine_share_its_cores_on_gpus_too(monkeypatch, devic
     assembly = SimpleNamespace(devices=devices, on=lambda *_: made, on_cpu=lambda: made)
     monkeypatch.setattr(places, "ProcessWorker", lambda name, make, ring: make.args[1])
     site = LocalSite(assembly, workers, lambda: 0.0)
-    assert [place.make() for place in site.places] == shares
+    assert [place.make() for place in site.of(Work.MATCH)] == shares
     assert [place.make() for place in site.fallback] == [1] * (devices != ("cpu",))

@@ -19,7 +19,7 @@ from rectified import THREE_UNITS, RectifiedMatcher, Seen
 
 from mkpc_kaggle.engine import places, session
 from mkpc_kaggle.engine.jobs import SceneJob
-from mkpc_kaggle.engine.places import LocalSite, Place
+from mkpc_kaggle.engine.places import LocalSite, Place, Work
 from mkpc_kaggle.engine.process import ThreadWorker
 from mkpc_kaggle.engine.worker import MatchRunner, SceneRunner
 from mkpc_kaggle.geometry.cameras import Camera
@@ -184,9 +184,10 @@ def thread_place(
 def use_places(monkeypatch: pytest.MonkeyPatch, *used: Place, fallback: Sequence[Place] = ()) -> None:
     """Let runs match at these places, and look every hundredth of a second for answers, without a pause."""
 
-    def site_of(pairs: Any, assembly: Assembly, plan: session.Session) -> LocalSite:
+    def site_of(folders: Any, assembly: Assembly, plan: session.Session) -> LocalSite:
         site = LocalSite(assembly, 0, plan.budget.clock)
-        site.places, site.fallback = list(used), list(fallback)
+        site.places = [*(place for place in site.places if place.work is not Work.MATCH), *used]
+        site.fallback = list(fallback)
         return site
 
     monkeypatch.setattr(session, "site_of", site_of)

@@ -7,43 +7,50 @@ crash, run out of memory and hang as well.
 
 import math
 import threading
-from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.budget import Budget
-from mkpc_kaggle.engine.engine import Ending, Engine, RunReport
+from mkpc_kaggle.engine.codec import to_blob
+from mkpc_kaggle.engine.engine import Ending, Engine, Request, RunReport
 from mkpc_kaggle.engine.jobs import (
     Answer,
     Cause,
+    Estimated,
+    EstimateJob,
+    Estimates,
     Failure,
+    Found,
     Job,
     Loaded,
+    Matched,
     MatchJob,
-    MatchResult,
     Outcome,
     SceneJob,
 )
-from mkpc_kaggle.engine.journal import Event
-from mkpc_kaggle.engine.places import Place, Site
+from mkpc_kaggle.engine.journal import Journal
+from mkpc_kaggle.engine.places import Place, Site, Work
 from mkpc_kaggle.engine.plan import RESERVE_SHARE
-from mkpc_kaggle.engine.records import NOT_REACHED, PairRecord, SceneRecord, UnitRecord
 from mkpc_kaggle.engine.scenes import FORECAST_MARGIN, START_S
+from mkpc_kaggle.engine.settings import Settings
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL, RobustConfig
-from mkpc_kaggle.pipeline.pair import UnitResult
+from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
 from mkpc_kaggle.recipe import Recipe, SceneConfig, Unit
 from mkpc_kaggle.scene.choose import Choice, Reason
 from mkpc_kaggle.scene.reconstruct import Solution
+from mkpc_kaggle.scene.view_graph import BatchImage
 
 RESTART_S = 8.0
-ESTIMATE_S = 0.1  # of a pair, in a job without units
+ESTIMATE_S = 0.1  # of a pair
 STALL = 20.0  # a unit that stalls takes so many times as long
-SIZES = (Size(640, 480), Size(640, 480))
-MATCHES = Matches(np.zeros((200, 2)), np.zeros((200, 2)), np.zeros(200))  # that a unit finds
+SIZE = Size(640, 480)
+MATCHES = 200  # that a unit finds
+POINTS = to_blob(Matches(np.zeros((MATCHES, 2)), np.zeros((MATCHES, 2)), np.zeros(MATCHES)))
 SWEEP_SHARE = 0.7  # of the limit, within which the sweep is said to fit
 
 
@@ -87,7 +94,12 @@ class Scenario:
         count = len(self.costs)
         units = [Unit(1 if number % 2 == 0 else 2, f"m{number}", 100) for number in range(count)]
         scene = SceneConfig(pairs_per_image=self.pairs_per_image) if self.batches else None
-        return Recipe(tuple(units), scene=scene, magsac=RobustConfig(threshold=self.threshold))
+        return Recipe(tuple(units), scene=scene)
+
+    @property
+    def settings(self) -> Settings:
+        names = tuple(unit.name for unit in self.recipe.units)
+        return Settings(names, f"estimate {self.threshold}", f"scene {self.threshold}")
 
     @property
     def work(self) -> float:
@@ -170,12 +182,13 @@ class SimulatedSite(Site):
         self.scenes: list[SimulatedScene] = []
         self.rng = np.random.default_rng(scenario.seed)
         self.costs = {unit.name: cost for unit, cost in zip(scenario.recipe.units, scenario.costs, strict=True)}
-        self.estimation = scenario.recipe.pair_estimation()
         self.workers: set[SimulatedWorker] = set()
-        self.places = [
-            Place(f"place {number}", lambda: SimulatedWorker(self)) for number in range(scenario.workers)
-        ]
+        self.others: set[Simulated] = set()
         self._scene_rng = np.random.default_rng([scenario.seed, 1])
+        makers = [(f"place {n}", lambda: SimulatedWorker(self), Work.MATCH) for n in range(scenario.workers)]
+        makers.append(("estimates", lambda: SimulatedEstimator(self), Work.LIGHT))
+        makers.append(("scenes", self.scene_worker, Work.SCENE))
+        self.places = [Place(*maker) for maker in makers]
 
     def scene_worker(self) -> "SimulatedScene":
         self.scenes.append(SimulatedScene(self, self._scene_rng))
@@ -183,11 +196,11 @@ class SimulatedSite(Site):
 
     def wait(self, until: float) -> None:
         scenes = [scene for scene in self.scenes if not scene.is_over]
-        moments = [worker.ready for worker in (*self.workers, *scenes)]
+        moments = [worker.ready for worker in (*self.workers, *self.others, *scenes)]
         moment = min([until, *moments])
         assert moment < math.inf, "the engine waits for ever"
         if scenes and not any(worker.job for worker in self.workers):
-            self.for_scenes += len(self.places) * max(0.0, min(moment, self.stop) - self.clock.now)
+            self.for_scenes += len(self.of(Work.MATCH)) * max(0.0, min(moment, self.stop) - self.clock.now)
         self.clock.now = max(self.clock.now, moment)
 
     def unit_seconds(self, unit: Unit, now: float) -> float:
@@ -232,30 +245,38 @@ class SimulatedWorker(Simulated):
         now = self._site.clock.now
         self.job = job
         self.ready, self._answer, fault = self._do(job, now, now + seconds)
+        self._kept = max(0.0, min(self.ready, self._site.stop) - now)
         if isinstance(self._answer, Failure):
-            lost = fault + RESTART_S * (fault > 0)
-            self._site.faults += max(0.0, min(lost, self._site.stop - now))
+            self._fault, self._begun = fault, now
             if self._answer.cause is Cause.TIMED_OUT:
                 self._answer, self.ready = None, math.inf  # the engine has to find out
-        else:
-            self._kept = max(0.0, min(self.ready, self._site.stop) - now)
+            else:
+                self._note_fault()
+
+    def _note_fault(self) -> None:
+        lost = self._fault + RESTART_S * (self._fault > 0)
+        self._site.faults += max(0.0, min(lost, self._site.stop - self._begun))
+        self._fault = 0.0
 
     def answer(self) -> Answer | None:
         if (answer := super().answer()) is not None:
             self.job = None
-        if isinstance(answer, MatchResult):
+        if isinstance(answer, Matched):
             self._site.kept += self._kept
             self._site.last_job = self._site.clock.now
         return answer
 
     def kill(self) -> None:
+        if self.job is not None and self._answer is None:  # it hangs
+            self._fault = min(self._fault, self._site.clock.now - self._begun)
+            self._note_fault()
         self._site.workers.discard(self)
 
     def _do(self, job: MatchJob, begun: float, deadline: float) -> tuple[float, Answer, float]:
-        """When the job ends, its answer, and the seconds of it that an injected fault took."""
-        site, now, end = self._site, begun, begun + job.time_limit
+        """When the job ends, its answer, and the seconds of it that an injected fault took at most."""
+        site, now = self._site, begun
         scenario, expected = site.scenario, dict(zip(job.units, job.expected, strict=True))
-        results: list[list[UnitResult]] = [[] for _ in job.indices]
+        found: list[list[Found]] = [[] for _ in job.indices]
         hung = Failure(Cause.TIMED_OUT)
         if site.rng.random() < scenario.job_faults:
             usual = len(job.indices) * sum(self._site.costs[unit.name] for unit in job.units)
@@ -263,11 +284,11 @@ class SimulatedWorker(Simulated):
             if fate == 0:
                 return now, Failure(Cause.DIED), 1e-9
             if fate == 1:
-                return end, hung, min(end - now, STALL * usual)
+                return now, hung, STALL * usual
             now += usual
         for unit in sorted(job.units, key=lambda unit: unit.stage):
-            for known, found in zip(job.known, results, strict=True):
-                if known.has(unit) or now + expected[unit] >= deadline:
+            for rows in found:
+                if now + expected[unit] >= deadline:
                     continue
                 stalled = site.rng.random() < scenario.stalls
                 usual = site.unit_seconds(unit, now)
@@ -278,30 +299,45 @@ class SimulatedWorker(Simulated):
                 if fate < scenario.crashes:
                     return now + seconds / 2, Failure(Cause.DIED), seconds / 2
                 if fate < scenario.crashes + scenario.hangs:
-                    return end, hung, min(end - now, STALL * usual)
-                if now + seconds > end:
-                    return end, hung, end - now if stalled else 0.0
+                    return now, hung, STALL * usual
                 now += seconds
-                found.append(UnitResult(unit, MATCHES, 0.0, seconds, warm_up=warm_up))
-        if not job.units:
-            now += ESTIMATE_S * len(job.indices)
-        known = (pair.results for pair in job.known)
-        pairs = zip(job.indices, known, results, strict=True)
-        return now, MatchResult(tuple(_outcome(site.estimation, not job.units, *pair) for pair in pairs)), 0.0
+                rows.append(Found(unit, MATCHES, POINTS, 0.0, seconds, warm_up=warm_up))
+        outcomes = []
+        for index, wanted, rows in zip(job.indices, job.pairs, found, strict=True):
+            images = tuple(BatchImage(name, name, SIZE) for name in wanted.names)
+            outcomes.append(Outcome(index, images, tuple(rows)))
+        return now, Matched(tuple(outcomes)), 0.0
 
 
-def _outcome(
-    estimation: str, is_anew: bool, index: int, known: tuple[UnitResult, ...], found: list[UnitResult]
-) -> Outcome:
-    if not found and not is_anew:
-        return Outcome(PairRecord.untouched(index, NOT_REACHED))
-    units = tuple(
-        UnitRecord(result.unit.name, result.unit.stage, len(MATCHES), 20 + index % 60, 0.0, result.seconds, "")
-        for result in (*known, *found)
-    )
-    images = {"sizes": SIZES, "versions": ("first", "second"), "focals": (0.0, 0.0)}
-    record = PairRecord(index, FALLBACK_FUNDAMENTAL, "", units, estimation=estimation, **images)
-    return Outcome(record, tuple(found))
+class SimulatedEstimator(Simulated):
+    """Estimates pairs: each has from 20 to 79 inliers by its number."""
+
+    def start(self) -> None:
+        self._site.others.add(self)
+        self._answer, self.ready = Loaded(), self._site.clock.now
+
+    def submit(self, job: Job, seconds: float) -> None:
+        assert isinstance(job, EstimateJob)
+        scenario, rng, now = self._site.scenario, self._site.rng, self._site.clock.now
+        self.ready = now + ESTIMATE_S * len(job.pairs)
+        self._answer = Estimates(
+            tuple(
+                Estimated(
+                    pair.index,
+                    pair.revisions,
+                    tuple(20 + pair.index % 60 for _ in pair.units),
+                    FALLBACK_FUNDAMENTAL,
+                    seconds=ESTIMATE_S,
+                )
+                for pair in job.pairs
+            )
+        )
+        if rng.random() < scenario.job_faults:
+            self._answer = Failure(Cause.DIED)
+            self.ready = now if rng.random() < 0.5 else math.inf
+
+    def kill(self) -> None:
+        self._site.others.discard(self)
 
 
 class SimulatedScene(Simulated):
@@ -324,7 +360,7 @@ class SimulatedScene(Simulated):
         self.batch, self.seconds = job.batch, START_S + spread * scenario.scene_seconds * len(job.pairs)
         if self.begun > scenario.turn * scenario.limit:
             self.seconds *= scenario.drift
-        self._answer = Solution((), (Choice(FALLBACK_FUNDAMENTAL, Reason.SCENE),) * len(job.indices))
+        self._answer = Solution((), (Choice(FALLBACK_FUNDAMENTAL, Reason.SCENE),) * len(job.pairs))
         if rng.random() < scenario.scene_faults:
             self.is_faulty = True
             self._answer = Failure(Cause.DIED, "signal SIGSEGV")
@@ -335,38 +371,12 @@ class SimulatedScene(Simulated):
         self.is_over = True
 
 
-class MemoryJournal:
-    """A journal that forgets with the process, not with the run."""
-
-    def __init__(self) -> None:
-        self._records: dict[int, PairRecord] = {}
-        self._results: dict[int, tuple[UnitResult, ...]] = {}
-        self._scenes: dict[str, SceneRecord] = {}
-
-    def forget_outdated(self, pairs: Sequence[Pair], *, has_scenes: bool) -> int:
-        return 0
-
-    def records(self) -> dict[int, PairRecord]:
-        return dict(self._records)
-
-    def results(self, record: PairRecord, units: Mapping[str, Unit]) -> tuple[UnitResult, ...]:
-        return self._results.get(record.index, ())
-
-    def save(self, outcomes: Iterable[Outcome]) -> None:
-        for outcome in outcomes:
-            index = outcome.record.index
-            self._records[index] = outcome.record
-            self._results[index] = self._results.get(index, ()) + outcome.results
-
-    def scenes(self) -> tuple[SceneRecord, ...]:
-        return tuple(self._scenes.values())
-
-    def save_scene(self, scene: SceneRecord, records: Iterable[PairRecord]) -> None:
-        self._scenes[scene.batch] = scene
-        self._records |= {record.index: record for record in records}
-
-    def note(self, event: Event) -> None:
-        pass
+def memory_journal() -> Journal:
+    """A journal that leaves no file."""
+    with TemporaryDirectory() as directory:
+        journal = Journal(Path(directory))
+        journal.continue_in_memory()
+        return journal
 
 
 @dataclass(frozen=True)
@@ -384,7 +394,7 @@ class Ran:
     ``lost`` counts pairs without the sweep's F where the sweep fits (see :func:`sweep_seconds`), and versions of
     the submission that lack a row. ``missed`` are batches without a scene that no fault befell; ``scenes_fit``
     says that what is left to scenes at most suffices for all, and that none hung while others waited. ``last_job``
-    is when the last job came back. ``scene_units`` counts the unit results of each batch.
+    is when the last job came back. ``stale`` are the batches whose scene is out of date.
     """
 
     scenario: Scenario
@@ -396,15 +406,15 @@ class Ran:
     scenes_fit: bool
     last_job: float
     scenes: tuple[SimulatedScene, ...]
-    scene_units: Mapping[str, int]
+    stale: set[str]
 
     @property
     def work_left(self) -> bool:
         return self.report.ending is not Ending.COMPLETE
 
 
-def simulate(scenario: Scenario, journal: MemoryJournal | None = None, until: float = math.inf) -> Ran:
-    """Run a scenario through the real engine, as long as nobody interrupts it."""
+def simulate(scenario: Scenario, journal: Journal | None = None, until: float = math.inf) -> Ran:
+    """Run a scenario through the real engine, until it ends or is interrupted."""
     clock = VirtualClock()
     budget = Budget(0.0, scenario.limit, clock)
     site = SimulatedSite(scenario, clock, budget.stop_units)
@@ -412,16 +422,9 @@ def simulate(scenario: Scenario, journal: MemoryJournal | None = None, until: fl
     pairs = [Pair(str(n), f"{int(n * share):03d}", f"{n:07d}", "b") for n in range(scenario.pairs)]
     published: list[int] = []
     interrupt = threading.Event()
-    engine = Engine(
-        pairs,
-        scenario.recipe,
-        site,
-        journal or MemoryJournal(),
-        budget,
-        publish=lambda records, _: published.append(len(records)),
-        interrupt=interrupt,
-        progress=False,
-    )
+    journal = memory_journal() if journal is None else journal
+    nothing = Request((), scenario.recipe, scenario.settings)
+    engine = Engine(nothing, site, journal, budget, interrupt=interrupt, progress=False)
 
     def wait(moment: float) -> None:
         whole_wait(min(moment, until))
@@ -429,10 +432,13 @@ def simulate(scenario: Scenario, journal: MemoryJournal | None = None, until: fl
             interrupt.set()
 
     whole_wait, site.wait = site.wait, wait
-    report = engine.run()
-    swept = sum(record.matches > 0 for record in report.records)
+    with engine:
+        publish = lambda standing: published.append(len(standing.fundamentals))  # noqa: E731
+        engine.ask(replace(nothing, pairs=pairs, publish=publish))
+        report = engine.report()
+    swept = int(engine.state.had[: scenario.pairs].any(1).sum())
     sweep_fits = sweep_seconds(scenario) < SWEEP_SHARE * scenario.limit
-    given = len(site.places) * (site.stop - RESTART_S) - site.faults
+    given = len(site.of(Work.MATCH)) * (site.stop - RESTART_S) - site.faults
     faulty = {scene.batch for scene in site.scenes if scene.is_faulty}
     made = {pairs[record.index].group for record in report.records if record.scene is not None}
     return Ran(
@@ -446,10 +452,7 @@ def simulate(scenario: Scenario, journal: MemoryJournal | None = None, until: fl
         and not any(math.isinf(scene.seconds) for scene in site.scenes),
         site.last_job,
         tuple(site.scenes),
-        {
-            name: sum(len(engine.plan.records[index].units) for index in indices)
-            for name, indices in engine.scenes.batches.items()
-        },
+        set(engine.scenes.batches) - journal.current_scenes(),
     )
 
 

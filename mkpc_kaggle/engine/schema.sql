@@ -1,0 +1,223 @@
+-- The journal of a work directory: what was computed, and from what.
+--
+-- points, estimate and scene are derived tables. A row records the revisions of its inputs and a digest of its settings.
+-- It is current if a computation today would use the same inputs and settings. The views below are that rule, and the only
+-- place that has it. Rows that nobody asks for stay: another recipe or test set may ask for them.
+-- A text named inputs lists revisions, separated by blanks. F is nine float64 numbers, row by row.
+
+-- What the latest run asked for.
+
+CREATE TABLE about (value TEXT NOT NULL) STRICT;  -- JSON, for reports
+
+CREATE TABLE wanted_unit (
+    number INTEGER PRIMARY KEY,  -- its place in the recipe
+    unit TEXT NOT NULL UNIQUE,
+    stage INTEGER NOT NULL CHECK (stage IN (1, 2)),
+    settings TEXT NOT NULL
+) STRICT;
+
+CREATE TABLE wanted_pair (
+    position INTEGER PRIMARY KEY,
+    id TEXT NOT NULL,
+    batch TEXT NOT NULL,
+    pair INTEGER NOT NULL REFERENCES pair,
+    settings TEXT NOT NULL,  -- of its estimate
+    has_row INTEGER NOT NULL CHECK (has_row IN (0, 1)),  -- 0: an extra pair, for the scene of its batch alone
+    failure TEXT NOT NULL DEFAULT ''  -- why it has no points
+) STRICT;
+CREATE INDEX wanted_by_batch ON wanted_pair (batch, position);
+CREATE INDEX wanted_by_pair ON wanted_pair (pair);
+
+CREATE TABLE wanted_batch (batch TEXT PRIMARY KEY, settings TEXT NOT NULL) STRICT;
+
+-- Images and pairs. Names are relative to the test side, the folder or the root of a list.
+
+CREATE TABLE image (
+    name TEXT PRIMARY KEY,
+    digest TEXT NOT NULL,  -- of the file's content when it was last looked at
+    width INTEGER NOT NULL CHECK (width > 0),
+    height INTEGER NOT NULL CHECK (height > 0),
+    focal REAL NOT NULL CHECK (focal >= 0)  -- in pixels, by EXIF; 0: unknown
+) STRICT;
+
+CREATE TABLE pair (
+    id INTEGER PRIMARY KEY,
+    image0 TEXT NOT NULL,
+    image1 TEXT NOT NULL,
+    turns0 INTEGER NOT NULL CHECK (turns0 BETWEEN 0 AND 3),
+    turns1 INTEGER NOT NULL CHECK (turns1 BETWEEN 0 AND 3),
+    UNIQUE (image0, image1, turns0, turns1)
+) STRICT;
+
+-- Derived tables.
+
+CREATE TABLE points (  -- of a unit on a pair, from the contents of two images
+    revision INTEGER PRIMARY KEY AUTOINCREMENT,
+    pair INTEGER NOT NULL REFERENCES pair,
+    settings TEXT NOT NULL,
+    digest0 TEXT NOT NULL,
+    digest1 TEXT NOT NULL,
+    matches INTEGER NOT NULL CHECK (matches >= 0),
+    decode_seconds REAL NOT NULL,
+    cluster_seconds REAL NOT NULL,
+    encode_seconds REAL NOT NULL,
+    match_seconds REAL NOT NULL,
+    failure TEXT NOT NULL,
+    note TEXT NOT NULL,
+    points BLOB NOT NULL,
+    UNIQUE (pair, settings)
+) STRICT;
+
+CREATE TABLE region (  -- the critical regions that a unit of stage 2 looked at
+    points INTEGER NOT NULL REFERENCES points ON DELETE CASCADE,
+    image INTEGER NOT NULL CHECK (image IN (0, 1)),
+    "left" INTEGER NOT NULL,
+    top INTEGER NOT NULL,
+    "right" INTEGER NOT NULL,
+    bottom INTEGER NOT NULL,
+    reason TEXT NOT NULL,
+    clusters INTEGER NOT NULL,
+    kept INTEGER NOT NULL,
+    PRIMARY KEY (points, image),
+    CHECK ("left" < "right" AND top < bottom)
+) STRICT;
+
+CREATE TABLE estimate (  -- of a pair, from its points
+    revision INTEGER PRIMARY KEY AUTOINCREMENT,
+    pair INTEGER NOT NULL REFERENCES pair,
+    settings TEXT NOT NULL,
+    inputs TEXT NOT NULL,
+    inliers TEXT NOT NULL,  -- the number among each of the inputs
+    F BLOB NOT NULL CHECK (length(F) = 72),
+    magsac BLOB CHECK (length(magsac) = 72),
+    failure TEXT NOT NULL,
+    support REAL NOT NULL,
+    candidates INTEGER NOT NULL,
+    cost REAL NOT NULL,
+    magsac_cost REAL NOT NULL,
+    focal0 REAL NOT NULL,
+    focal1 REAL NOT NULL,
+    seconds REAL NOT NULL,
+    UNIQUE (pair, settings, inputs)
+) STRICT;
+
+CREATE TABLE scene (  -- of a batch, from its points and estimates
+    revision INTEGER PRIMARY KEY AUTOINCREMENT,
+    batch TEXT NOT NULL,
+    settings TEXT NOT NULL,
+    inputs TEXT NOT NULL,
+    images INTEGER NOT NULL CHECK (images >= 0),
+    registered INTEGER NOT NULL CHECK (registered >= 0),
+    models INTEGER NOT NULL CHECK (models >= 0),
+    points INTEGER NOT NULL CHECK (points >= 0),
+    seconds REAL NOT NULL,
+    failure TEXT NOT NULL,
+    UNIQUE (batch, settings, inputs)
+) STRICT;
+
+CREATE TABLE camera (  -- centre, forward and down: three float64 numbers each
+    scene INTEGER NOT NULL REFERENCES scene ON DELETE CASCADE,
+    image TEXT NOT NULL,
+    digest TEXT NOT NULL,
+    model INTEGER NOT NULL CHECK (model >= 0),
+    centre BLOB NOT NULL CHECK (length(centre) = 24),
+    forward BLOB NOT NULL CHECK (length(forward) = 24),
+    down BLOB NOT NULL CHECK (length(down) = 24),
+    focal REAL NOT NULL CHECK (focal > 0),
+    width INTEGER NOT NULL CHECK (width > 0),
+    height INTEGER NOT NULL CHECK (height > 0),
+    seen INTEGER NOT NULL CHECK (seen >= 0)
+) STRICT;
+CREATE INDEX camera_of_scene ON camera (scene);
+
+CREATE TABLE cloud (  -- some points of a model to draw: float32 coordinates
+    scene INTEGER NOT NULL REFERENCES scene ON DELETE CASCADE,
+    model INTEGER NOT NULL CHECK (model >= 0),
+    points BLOB NOT NULL,
+    PRIMARY KEY (scene, model)
+) STRICT;
+
+CREATE TABLE choice (  -- F of a pair by its scene; NULL: the pair keeps its own
+    scene INTEGER NOT NULL REFERENCES scene ON DELETE CASCADE,
+    pair INTEGER NOT NULL REFERENCES pair,
+    reason TEXT NOT NULL,
+    F BLOB CHECK (length(F) = 72),
+    PRIMARY KEY (scene, pair)
+) STRICT;
+
+CREATE TABLE feature (  -- of an image, or of the images of a dataset, by the digest of the contents
+    digest TEXT NOT NULL,
+    settings TEXT NOT NULL,
+    value BLOB NOT NULL,
+    PRIMARY KEY (digest, settings)
+) STRICT;
+
+CREATE TABLE event (
+    number INTEGER PRIMARY KEY,
+    kind TEXT NOT NULL CHECK (kind IN ('start', 'plan', 'job', 'scene', 'fault', 'end')),
+    seconds REAL NOT NULL,
+    text TEXT NOT NULL
+) STRICT;
+
+-- The rule.
+
+CREATE VIEW current_points AS
+SELECT w.position, w.batch, u.number, u.unit, u.stage, p.*
+FROM wanted_pair w
+JOIN pair ON pair.id = w.pair
+JOIN image i0 ON i0.name = pair.image0
+JOIN image i1 ON i1.name = pair.image1
+JOIN points p ON p.pair = w.pair AND p.digest0 = i0.digest AND p.digest1 = i1.digest
+JOIN wanted_unit u ON u.settings = p.settings;
+
+CREATE VIEW pair_inputs AS  -- NULL: the pair has no points
+SELECT w.position, w.pair, w.batch, w.settings, (
+    SELECT group_concat(revision, ' ')
+    FROM (SELECT c.revision FROM current_points c WHERE c.position = w.position ORDER BY c.number)
+) AS inputs
+FROM wanted_pair w;
+
+CREATE VIEW current_estimate AS
+SELECT i.position, e.*
+FROM pair_inputs i
+JOIN estimate e ON e.pair = i.pair AND e.settings = i.settings AND e.inputs = i.inputs;
+
+CREATE VIEW batch_inputs AS
+SELECT b.batch, b.settings, (
+    SELECT group_concat(part, ' ')
+    FROM (
+        SELECT i.inputs || ':' || coalesce(e.revision, '') AS part
+        FROM pair_inputs i
+        LEFT JOIN estimate e ON e.pair = i.pair AND e.settings = i.settings AND e.inputs = i.inputs
+        WHERE i.batch = b.batch AND i.inputs IS NOT NULL
+        ORDER BY i.position
+    )
+) AS inputs
+FROM wanted_batch b;
+
+CREATE VIEW current_scene AS
+SELECT s.* FROM batch_inputs b JOIN scene s ON s.batch = b.batch AND s.settings = b.settings AND s.inputs = b.inputs;
+
+-- Until a current row exists, the latest row stands in for it, if its pairs have points of today's images.
+
+CREATE VIEW standing_estimate AS
+SELECT i.position, e.*
+FROM pair_inputs i
+JOIN estimate e ON e.revision = coalesce(
+    (SELECT c.revision FROM estimate c WHERE c.pair = i.pair AND c.settings = i.settings AND c.inputs = i.inputs),
+    (SELECT max(l.revision) FROM estimate l WHERE l.pair = i.pair)
+)
+WHERE i.inputs IS NOT NULL;
+
+CREATE VIEW standing_scene AS
+SELECT s.*
+FROM batch_inputs b
+JOIN scene s ON s.revision = coalesce(
+    (SELECT c.revision FROM scene c WHERE c.batch = b.batch AND c.settings = b.settings AND c.inputs = b.inputs),
+    (SELECT max(l.revision) FROM scene l WHERE l.batch = b.batch)
+)
+WHERE NOT EXISTS (
+    SELECT 1 FROM choice c
+    JOIN pair_inputs i ON i.pair = c.pair AND i.batch = s.batch
+    WHERE c.scene = s.revision AND i.inputs IS NULL
+);

@@ -1,0 +1,58 @@
+"""What decides the rows of a run: a digest of the settings of each derived table.
+
+A digest has the number of its algorithm. Raise the number when the same settings would give other results.
+"""
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import cv2
+
+from mkpc_kaggle.data.competition import Pair
+from mkpc_kaggle.pipeline.assembly import Assembly
+from mkpc_kaggle.recipe import Recipe
+
+POINTS, ESTIMATE, SCENE = 1, 1, 1  # numbers of the algorithms
+
+
+@dataclass(frozen=True)
+class Settings:
+    """The digests of a recipe's settings: of each unit, of estimates, and of scenes."""
+
+    units: tuple[str, ...]
+    estimate: str
+    scene: str
+
+    @classmethod
+    def of(cls, assembly: Assembly) -> "Settings":
+        recipe = assembly.recipe
+        alone = {unit: digest([POINTS, assembly.unit_settings(unit)]) for unit in recipe.units}
+        first = [alone[unit] for unit in recipe.units if unit.stage == 1]
+        units = tuple(
+            alone[unit] if unit.stage == 1 else digest([alone[unit], asdict(recipe.mkpc), first])
+            for unit in recipe.units
+        )
+        return cls(units, digest([ESTIMATE, *_of_estimates(recipe)]), digest([SCENE, *_of_scenes(recipe)]))
+
+    def of_estimate(self, pair: Pair) -> str:
+        """The digest of all that decides the F of a pair from its points, or its E with known intrinsics."""
+        known = pair.intrinsics
+        return digest([self.estimate, [K.tolist() for K in known]]) if known else self.estimate
+
+
+def _of_estimates(recipe: Recipe) -> Sequence[Any]:
+    return asdict(recipe.magsac), recipe.focal and asdict(recipe.focal), cv2.__version__
+
+
+def _of_scenes(recipe: Recipe) -> Sequence[Any]:
+    from importlib.metadata import version
+
+    tracks = [unit.name for unit in recipe.units if unit.tracks]
+    return recipe.scene and asdict(recipe.scene), tracks, *_of_estimates(recipe), version("pycolmap")
+
+
+def digest(value: Any) -> str:
+    return hashlib.sha256(json.dumps(value, sort_keys=True, default=str).encode()).hexdigest()[:16]
