@@ -50,6 +50,6 @@ class Costs:
         count = len(self._measured.get(unit, ())) or 1
         return self.mean(unit) * (1 + max(MIN_MARGIN, MARGIN / sqrt(count))) if self.is_known(unit) else 0.0
 
-    def longest(self, unit: str) -> float:
-        """Return the expected seconds on a new worker, its warm-up included."""
-        return self._warm_up.get(unit, 0.0) + (self.mean(unit) if self.is_known(unit) else 0.0)
+    def warm_up(self, unit: str) -> float:
+        """Return the seconds of the latest first run on a worker."""
+        return self._warm_up.get(unit, 0.0)

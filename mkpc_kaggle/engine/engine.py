@@ -41,7 +41,7 @@ from mkpc_kaggle.engine.jobs import (
 from mkpc_kaggle.engine.journal import About, Event, EventKind, Journal
 from mkpc_kaggle.engine.losses import Losses
 from mkpc_kaggle.engine.places import LISTEN_S, START_TIMEOUT_S, Place, Site, Work
-from mkpc_kaggle.engine.plan import Plan
+from mkpc_kaggle.engine.plan import HANG_FACTOR, Plan
 from mkpc_kaggle.engine.records import PairRecord, SceneRecord
 from mkpc_kaggle.engine.scenes import Scenes, batches_of, extra_pairs_of
 from mkpc_kaggle.engine.settings import Settings
@@ -52,7 +52,6 @@ from mkpc_kaggle.scene.export import Export
 from mkpc_kaggle.scene.reconstruct import Solution
 
 ESTIMATE_PAIRS = 8  # in a job
-HANG_FACTOR = 10.0  # a job that takes this many times what was measured hangs
 UNKNOWN_SHARE, MAX_UNKNOWN_S = 0.25, 3600.0  # of the time left, after which a job of unknown cost hangs
 MIN_TOLD_PAIRS = 20  # of a batch whose reconstruction is shown: that of a smaller batch takes seconds
 PUBLISH_INTERVAL_S, PUBLISH_SHARE = 30.0, 0.05  # how often the results are written, and their share of the time
@@ -324,13 +323,13 @@ class Engine:
 
     def _time_limit(self, job: Job, now: float) -> float:
         """Return the seconds after which a worker hangs, from measured costs or from the time left."""
-        expected = inf
+        patience = inf
         if isinstance(job, MatchJob):
-            expected = self.plan.seconds_of(job)
+            patience = self.plan.patience(job)
         elif isinstance(job, EstimateJob) and self._estimate_s:
-            expected = len(job.pairs) * fmean(self._estimate_s)
+            patience = HANG_FACTOR * len(job.pairs) * fmean(self._estimate_s)
         unknown = min(MAX_UNKNOWN_S, UNKNOWN_SHARE * self._left(now))
-        return self.budget.silence + (HANG_FACTOR * expected if isfinite(expected) else unknown)
+        return self.budget.silence + (patience if isfinite(patience) else unknown)
 
     def _left(self, now: float) -> float:
         return max(0.0, self.budget.stop_units - now)
@@ -447,8 +446,7 @@ class Engine:
 
     def _take_scene(self, job: SceneJob, answer: Solution, seconds: float) -> None:
         record = SceneRecord.of(job.batch, answer.reconstructions, seconds)
-        chosen = zip((pair.index for pair in job.pairs), answer.choices, strict=True)
-        self.journal.save_scene(record, job.inputs, dict(chosen))
+        self.journal.save_scene(record, job.inputs, job.pairs, answer.choices)
         self.scenes.on_result(job, record, is_current=self.journal.batch_inputs(job.batch) == job.inputs)
         self.state.read_choices()
         text = f"{record.registered} of {record.images} images"
@@ -472,6 +470,8 @@ class Engine:
                 if place.closed:
                     self._explain(f"no worker is started any more on {place.closed}")
                 self._lose(job, answer, time_limit)
+                if place.closed and place.work is Work.SCENE:
+                    self.scenes.skip_all(answer)
             else:
                 self._save(job, answer, seconds)
             if place.work is Work.SCENE:

@@ -20,10 +20,10 @@ from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.data.images import printable
 from mkpc_kaggle.engine.budget import format_duration
 from mkpc_kaggle.engine.codec import from_blob, matrix_of, vector_of
-from mkpc_kaggle.engine.jobs import Estimated, Outcome, WantedPair
+from mkpc_kaggle.engine.jobs import Estimated, Outcome, PairPoints, WantedPair
 from mkpc_kaggle.engine.records import NOT_REACHED, CameraRecord, PairRecord, SceneRecord, UnitRecord
 from mkpc_kaggle.errors import UserError, writing
-from mkpc_kaggle.geometry.coordinates import Box, Size
+from mkpc_kaggle.geometry.coordinates import Box, Matrix3, Size
 from mkpc_kaggle.geometry.critical_region import CriticalRegion, RegionReason
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import EstimateStats
@@ -146,7 +146,7 @@ class JournalReader:
             JOIN pair ON pair.id = w.pair WHERE has_row ORDER BY position"""
         with undamaged(self.path):
             rows = self._rows(query)
-            return tuple(Pair(i, batch, *ends, None, (t0, t1)) for i, batch, *ends, t0, t1 in rows)
+            return tuple(Pair(n, b, f0, f1, turns=(t0, t1)) for n, b, f0, f1, t0, t1 in rows)
 
     def records(self) -> list[PairRecord]:
         """Return a record of each pair that has a row, in order."""
@@ -194,7 +194,8 @@ class JournalReader:
 
     def points(self, revisions: Iterable[int]) -> dict[int, Matches]:
         """Return the points of these rows, by revision."""
-        return {revision: from_blob(blob) for revision, blob in self.blobs(revisions).items()}
+        with undamaged(self.path):
+            return {revision: from_blob(blob) for revision, blob in self.blobs(revisions).items()}
 
     def blobs(self, revisions: Iterable[int]) -> dict[int, bytes]:
         with undamaged(self.path):
@@ -250,8 +251,7 @@ class Journal(JournalReader):
     """The journal of a work directory, created if missing. No other run can open it meanwhile.
 
     When the file takes no more (a full disk), the journal continues in memory, and is copied back when it is
-    closed. ``trouble`` then has the reason. Raises :class:`UserError` if the directory cannot be written, or another
-    run uses it.
+    closed. ``trouble`` then has the reason. Raises :class:`UserError` if the directory cannot be written or is used.
     """
 
     def __init__(self, directory: Path, *, fresh: bool = False) -> None:
@@ -426,7 +426,7 @@ class Journal(JournalReader):
     def save_estimates(self, estimates: Iterable[Estimated]) -> None:
         rows = [
             (
-                *(" ".join(map(str, each.inputs)), " ".join(map(str, each.inliers))),
+                *(joined(each.inputs), joined(each.inliers)),
                 *(
                     each.F.tobytes(),
                     None if each.magsac is None else each.magsac.tobytes(),
@@ -446,8 +446,10 @@ class Journal(JournalReader):
             )
         )
 
-    def save_scene(self, scene: SceneRecord, inputs: str, choices: Mapping[int, Choice]) -> None:
-        """Save the reconstruction of a batch with the choices for its pairs, by position."""
+    def save_scene(
+        self, scene: SceneRecord, inputs: str, pairs: Sequence[PairPoints], choices: Sequence[Choice]
+    ) -> None:
+        """Save the reconstruction of a batch with the choices for its pairs."""
 
         def write(db: sqlite3.Connection) -> None:
             head = (scene.images, scene.registered, scene.models, scene.points, scene.seconds)
@@ -464,8 +466,11 @@ class Journal(JournalReader):
                 db.execute(f"INSERT INTO camera VALUES ({', '.join('?' * 11)})", row)
             for model, cloud in enumerate(scene.clouds):
                 db.execute("INSERT INTO cloud VALUES (?, ?, ?)", (revision, model, np_bytes(cloud)))
-            rows = ((revision, c.reason, c.F if c.F is None else c.F.tobytes(), n) for n, c in choices.items())
-            db.executemany("REPLACE INTO choice SELECT ?, pair, ?, ? FROM wanted_pair WHERE position = ?", rows)
+            rows = (
+                (revision, joined(pair.revisions), chosen.reason, blob_of(chosen.F), pair.index)
+                for pair, chosen in zip(pairs, choices, strict=True)
+            )
+            db.executemany("REPLACE INTO choice SELECT ?, pair, ?, ?, ? FROM wanted_pair WHERE position = ?", rows)
 
         self._write(write)
 
@@ -529,6 +534,14 @@ def _units(rows: Sequence[Any], inliers: Mapping[int, int]) -> dict[str, Any]:
 def _wanted_row(position: int, wanted: WantedPair) -> tuple[Any, ...]:
     pair, ends = wanted.pair, (*map(printable, wanted.names), *wanted.pair.turns)
     return position, printable(pair.id), printable(pair.group), wanted.settings, wanted.has_row, *ends
+
+
+def joined(numbers: Iterable[int]) -> str:
+    return " ".join(map(str, numbers))
+
+
+def blob_of(F: Matrix3 | None) -> bytes | None:
+    return None if F is None else F.tobytes()
 
 
 def np_bytes(values: Any) -> bytes:

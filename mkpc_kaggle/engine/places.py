@@ -127,7 +127,7 @@ class Site:
             Place(f"estimates {n}", lambda: worker("estimates", LightRunner, self.ring), Work.LIGHT)
             for n in range(estimators)
         ]
-        self.places.append(Place("scenes", lambda: self.scene_worker(), Work.SCENE))
+        self.places.append(Place("scenes", self.scene_worker, Work.SCENE))
         self.fallback: list[Place] = []
 
     def of(self, work: Work) -> list[Place]:

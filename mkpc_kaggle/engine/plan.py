@@ -8,7 +8,7 @@ Two places decide that a unit no longer fits: :meth:`Plan.fit` for all pairs, an
 
 from collections import Counter
 from collections.abc import Callable, Sequence
-from math import isfinite
+from math import inf, isfinite
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,7 @@ from mkpc_kaggle.engine.state import State
 from mkpc_kaggle.recipe import Unit
 
 CONNECT_SHARE = 0.1  # of the time after the sweep, for extra pairs
+HANG_FACTOR = 10.0  # a job that takes this many times what was measured hangs
 RESERVE_SHARE = 0.2  # of the limit, at most, that is reserved for scenes
 MAX_FAILED_PAIRS = 2  # a unit that was skipped on this many pairs and never ran is skipped on all pairs
 
@@ -125,7 +126,7 @@ class Plan:
         if phase is Phase.DEEPEN:
             lacking &= np.arange(len(self.units)) < self.fit(now)
         if phase is Phase.FILL:
-            lacking &= self.state.had.any(1)[:, None]
+            has_row = has_row & self.state.had.any(1, keepdims=True)
         return np.asarray(lacking & has_row)
 
     @property
@@ -166,11 +167,12 @@ class Plan:
         rank = int(np.flatnonzero(self._order == job.indices[-1])[0]) + 1
         return self._order[rank : rank + self.minibatch].tolist() if job.phase is not Phase.FILL else []
 
-    def seconds_of(self, job: MatchJob) -> float:
-        """Return the seconds that a job takes on a new worker; infinity if a unit was not measured yet."""
+    def patience(self, job: MatchJob) -> float:
+        """Return the seconds after which a job hangs, perhaps on a new worker; infinity if a unit is unknown."""
         if not all(self.costs.is_known(unit.name) for unit in job.units):
-            return float("inf")
-        return len(job.indices) * sum(self.costs.longest(unit.name) for unit in job.units)
+            return inf
+        expected = len(job.indices) * sum(self.costs.mean(unit.name) for unit in job.units)
+        return HANG_FACTOR * expected + sum(self.costs.warm_up(unit.name) for unit in job.units)
 
     def _enter(self, phase: Phase, now: float) -> None:
         """Explain a change of the phase, and of the units that fit."""
@@ -178,7 +180,7 @@ class Plan:
             if self.phase is Phase.SWEEP:
                 self.explain(f"the sweep is over: {self.outlook(now)}")
             elif phase is Phase.FILL:
-                self.explain("the remaining time goes to the weakest pairs")
+                self.explain(f"{self.outlook(now)}, which goes to the weakest pairs")
             self.phase = phase
         if phase is Phase.DEEPEN and (count := self.fit(now)) != self._fitting:
             self._fitting = count
@@ -200,7 +202,9 @@ class Plan:
         if failure.cause is Cause.TIMED_OUT and len(job.units) == 1:
             self.costs.assume(job.units[0].name, time_limit / len(job.indices))
         lost = [(index, unit.name) for index in job.indices for unit in job.units]
-        if self.losses.add(lost, failure):
+        if failure.cause is Cause.DEVICE:  # it counts against the place
+            self.losses.alone.update(lost)
+        elif self.losses.add(lost, failure):
             self._skip(*lost[0], failure)
         self._look()
 

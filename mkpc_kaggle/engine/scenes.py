@@ -104,6 +104,10 @@ class Scenes:
         self.running.discard(job.batch)
         self.losses.add([job.batch], failure)
 
+    def skip_all(self, failure: Failure) -> None:
+        """No worker reconstructs any further batch."""
+        self.losses.skipped |= dict.fromkeys(self.stale, failure)
+
     def reserve(self, matches: NDArray[np.int_], at_once: int = 1) -> float:
         """Return the seconds that the pending reconstructions will probably take."""
         seconds, done = self._rate

@@ -140,6 +140,7 @@ CREATE TABLE cloud (  -- some points of a model to draw: float32 coordinates
 CREATE TABLE choice (  -- F of a pair by its scene; NULL: the pair keeps its own
     scene INTEGER NOT NULL REFERENCES scene ON DELETE CASCADE,
     pair INTEGER NOT NULL REFERENCES pair,
+    inputs TEXT NOT NULL,  -- of the pair
     reason TEXT NOT NULL,
     F BLOB CHECK (length(F) = 72),
     PRIMARY KEY (scene, pair)
@@ -198,16 +199,20 @@ FROM wanted_batch b;
 CREATE VIEW current_scene AS
 SELECT s.* FROM batch_inputs b JOIN scene s ON s.batch = b.batch AND s.settings = b.settings AND s.inputs = b.inputs;
 
--- Until a current row exists, the latest row stands in for it, if its pairs have points of today's images.
+-- Until a current row exists, the latest row stands in for it, while the first points that it was computed from are current.
+-- A cast takes the first number of a list.
 
 CREATE VIEW standing_estimate AS
 SELECT i.position, e.*
 FROM pair_inputs i
 JOIN estimate e ON e.revision = coalesce(
     (SELECT c.revision FROM estimate c WHERE c.pair = i.pair AND c.settings = i.settings AND c.inputs = i.inputs),
-    (SELECT max(l.revision) FROM estimate l WHERE l.pair = i.pair)
-)
-WHERE i.inputs IS NOT NULL;
+    (
+        SELECT max(l.revision) FROM estimate l
+        JOIN current_points p ON p.position = i.position AND p.revision = CAST(l.inputs AS INTEGER)
+        WHERE l.pair = i.pair
+    )
+);
 
 CREATE VIEW standing_scene AS
 SELECT s.*
@@ -218,6 +223,7 @@ JOIN scene s ON s.revision = coalesce(
 )
 WHERE NOT EXISTS (
     SELECT 1 FROM choice c
-    JOIN pair_inputs i ON i.pair = c.pair AND i.batch = s.batch
-    WHERE c.scene = s.revision AND i.inputs IS NULL
+    JOIN wanted_pair w ON w.pair = c.pair AND w.batch = s.batch
+    LEFT JOIN current_points p ON p.position = w.position AND p.revision = CAST(c.inputs AS INTEGER)
+    WHERE c.scene = s.revision AND p.revision IS NULL
 );

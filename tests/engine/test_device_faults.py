@@ -22,7 +22,7 @@ from mkpc_kaggle.data.competition import read_test_side, submission_problems
 from mkpc_kaggle.engine.engine import Ending, RunReport
 from mkpc_kaggle.engine.places import Place
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.pipeline.assembly import assemble
+from mkpc_kaggle.pipeline.assembly import Assembly, assemble
 from mkpc_kaggle.pipeline.failures import DeviceError, FailureKind, failure_of, reason_of
 
 COUNT = 12
@@ -134,20 +134,26 @@ def test_a_worker_that_hangs_keeps_no_job_from_the_others(run_at, undisturbed):
     assert_as_if_nothing_had_failed(report, undisturbed)
 
 
-def test_a_unit_too_large_for_the_memory_is_given_up_on_that_pair_alone(run_at, undisturbed):
+def test_a_unit_too_large_for_the_memory_is_skipped_on_that_pair_alone_and_tried_by_the_next_run(
+    run_at, undisturbed
+):
     report = run_at(thread_place("cuda:0", FaultyMatcher(fault=exhaust_gpu, above=100)))
     assert report.ending is Ending.COMPLETE
-    given_up = "given up: out of memory: RuntimeError: CUDA out of memory. Tried to allocate 20.00 GiB, in {}"
-    failures = {unit.unit: unit.failure for unit in report.records[VICTIM].units}
-    assert failures == {SWEEP.name: "", **{unit.name: given_up.format(unit.name) for unit in (SECOND, THIRD)}}
+    memory = "out of memory: RuntimeError: CUDA out of memory. Tried to allocate 20.00 GiB, in {0}"
+    told = [f"{unit.name} is skipped on pair {VICTIM} ({memory.format(unit.name)})" for unit in (THIRD, SECOND)]
+    assert [event.text for event in report.explanations if "skipped" in event.text] == told
+    assert [unit.unit for unit in report.records[VICTIM].units] == [SWEEP.name]
     assert report.records[VICTIM].inliers > 100, "it keeps the F that it has"
     assert matrices(report)[:VICTIM] == matrices(undisturbed)[:VICTIM]
     assert matrices(report)[VICTIM + 1 :] == matrices(undisturbed)[VICTIM + 1 :]
     again = run_at(thread_place("cuda:0", RectifiedMatcher()))
-    assert matrices(again) == matrices(report), "what was given up is not tried again"
+    assert matrices(again) == matrices(undisturbed)
 
 
-def test_a_minibatch_that_memory_is_too_short_for_is_halved_once_and_no_worker_lost(run_at, undisturbed):
+def test_a_minibatch_that_memory_is_too_short_for_is_halved_once_and_no_worker_lost(
+    run_at, undisturbed, monkeypatch
+):
+    monkeypatch.setattr(Assembly, "minibatch", 8)
     matcher = NarrowMatcher(most=2)
     report = run_at(thread_place("cuda:0", matcher, minibatch=8))
     assert report.faults == ()
@@ -165,7 +171,7 @@ def refuse(_: int) -> int:
     [
         (refuse, "errors left 8 of 8 pairs without an F, 8 of them with this one: ValueError: no such layer"),
         (lambda _: break_device(), "no worker left, the faults say why; the same command goes on"),
-        (lambda _: exhaust_gpu(), "every unit was given up, the faults say why; the same command goes on"),
+        (lambda _: exhaust_gpu(), "every unit was skipped, the faults say why; the same command goes on"),
     ],
 )
 def test_a_run_that_failed_has_exit_status_one_and_a_line(demo, tmp_path, monkeypatch, capsys, fault, told):
@@ -208,5 +214,5 @@ def test_a_worker_that_cannot_be_started_again_ends_the_run_with_every_row_there
     report = run_at(thread_place("cpu", broken, pipeline=once))
     assert report.ending is Ending.NO_WORKER
     assert "cpu: the matchers cannot be loaded: the weights are gone" in report.faults
-    assert not report.records[0].lacking([SWEEP])
+    assert report.records[0].units
     assert len(report.records) == COUNT

@@ -1,6 +1,5 @@
 """Scenes in whole runs: whose F a pair gets, and what a reconstruction that goes wrong costs."""
 
-import math
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -102,7 +101,9 @@ def test_a_reconstruction_that_is_lost_costs_its_scene_alone_and_the_reason_is_t
     assert report.ending is Ending.COMPLETE
     assert matrices(report) == own_matrices(pairs, tmp_path / "alone")
     assert [record.source for record in report.records] == ["pair"] * 6
-    assert [fault.startswith(f"batch one was not reconstructed: {reason}") for fault in report.faults[1:]] == [True]
+    assert [fault.startswith(f"batch one was not reconstructed: {reason}") for fault in report.faults[1:]] == [
+        True
+    ]
     assert report.scenes[0].failure.startswith(reason)
     assert capfd.readouterr() == ("", "")
 
@@ -143,7 +144,7 @@ def test_the_scene_of_a_run_is_made_of_tracks_and_judged_by_all_matches(tmp_path
 
     def note(job: SceneJob) -> Solution:
         points = read_points(job.source, job.pairs)
-        given.extend(batch_pair(pair, points) for pair in job.pairs)
+        given[:] = [batch_pair(pair, points) for pair in job.pairs]
         return choose_scene_for_all_but_the_first(job)
 
     scenes_by(monkeypatch, note)

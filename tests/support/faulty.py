@@ -141,11 +141,11 @@ def choose_scene_for_all_but_the_first(job: SceneJob) -> Solution:
     """As a reconstruction would, without cameras; it makes as many points as there are matches."""
     by_scene = (Choice(SCENE_F, Reason.SCENE),) * (len(job.pairs) - 1)
     choices = (Choice(None, Reason.CONTRADICTION), *by_scene)
-    names = tuple(sorted({image.name for pair in job.pairs for image in (pair.image0, pair.image1)}))
+    names = tuple(sorted({image.name for pair in job.pairs for image in pair.images}))
     camera = Camera(np.eye(3), np.eye(3), np.zeros(3))
     images = (BatchImage(name, name, Size(80, 72)) for name in names)
     registered = tuple(RegisteredImage(image, camera, 99) for image in images)
-    points = np.zeros((sum(len(pair.matches) for pair in job.pairs), 3))
+    points = np.zeros((job.matches, 3))
     return Solution((Reconstruction(names, (SfmModel(registered, points, 0.5),)),), choices)
 
 

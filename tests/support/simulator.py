@@ -88,6 +88,7 @@ class Scenario:
     scene_faults: float = 0.0
     seed: int = 0
     threshold: float = 0.2  # of MAGSAC
+    never: str = ""  # the matcher whose worker dies whenever it runs
 
     @property
     def recipe(self) -> Recipe:
@@ -296,7 +297,7 @@ class SimulatedWorker(Simulated):
                 self._warm.add(unit.name)
                 seconds = usual * (STALL if stalled else 1.0) + scenario.warm_up * warm_up
                 fate = site.rng.random()
-                if fate < scenario.crashes:
+                if fate < scenario.crashes or unit.matcher == scenario.never:
                     return now + seconds / 2, Failure(Cause.DIED), seconds / 2
                 if fate < scenario.crashes + scenario.hangs:
                     return now, hung, STALL * usual
