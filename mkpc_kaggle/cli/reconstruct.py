@@ -32,9 +32,9 @@ and for all together:
   report.html     the run, with the cameras and points of each model
   work/           the journal: killed at any point, the same command goes on, and ends with the same files
 
-Pixels are those that a file stores, as COLMAP reads it, whatever EXIF says of its orientation. Mirrored files (2,
-4, 5, 7) make models of their own. Cameras start with the focal lengths that EXIF has, unless the recipe's table
-[scene] has `exif = false`.
+Pixels are those of the stored file, as COLMAP reads it, whatever EXIF says of its orientation. A file that EXIF
+calls mirrored (2, 4, 5, 7) is matched as it is stored: little but other mirrored files matches it. Cameras start
+with the focal lengths that EXIF has, unless the recipe's table [scene] has `exif = false`.
 
 OUT must be empty, or have nothing in it but what an earlier run of this command made. What is made takes the place
 of former results when it is whole.

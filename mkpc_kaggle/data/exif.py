@@ -1,4 +1,4 @@
-"""What a photograph's EXIF says: which way up its file is stored, and the focal length by COLMAP's rule.
+"""EXIF of a photograph: how its stored pixels lie, and the focal length by COLMAP's rule.
 
 Sources: CIPA DC-008 (Exif), TIFF 6.0, and ``Bitmap::ExifFocalLength`` of COLMAP 4.2, without its table of sensors.
 """
@@ -8,12 +8,9 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from math import hypot, inf
-from pathlib import Path
-
-import numpy as np
 
 from mkpc_kaggle.config import Range
-from mkpc_kaggle.geometry.coordinates import Pixels, Size
+from mkpc_kaggle.geometry.coordinates import Size
 
 ORIENTATION, DIRECTORY, FOCAL_MM = 0x0112, 0x8769, 0x920A  # tags
 PLANE_RESOLUTION, PLANE_UNIT, FOCAL_35MM = 0xA20E, 0xA210, 0xA405
@@ -24,36 +21,16 @@ FILM_MM = 43.27  # diagonal of 35 mm film
 UNITS_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 FOCALS = Range(0.2, 20.0)  # long sides of an image; a focal length beyond is taken for a mistake
 
-QUARTERS = {3: 2, 4: 2, 5: 1, 6: 3, 7: 3, 8: 1}  # counter-clockwise, that turn what is stored upright
-MIRRORED = {2, 4, 5, 7}  # before it is turned, left and right change places
+# By orientation, the quarter turns, counter-clockwise, that set stored pixels upright; mirrored pixels stay so.
+TURNS = {3: 2, 4: 2, 5: 3, 6: 3, 7: 1, 8: 1}
 
 
 @dataclass(frozen=True)
 class Exif:
     """The default is that of a file without EXIF."""
 
-    orientation: int = 1  # 1 to 8
-    focal: float = 0.0  # in pixels of the file; 0: unknown
-
-    @property
-    def quarters(self) -> int:
-        return QUARTERS.get(self.orientation, 0)
-
-    @property
-    def is_mirrored(self) -> bool:
-        return self.orientation in MIRRORED
-
-    def upright(self, stored: Pixels) -> Pixels:
-        """The picture, (H, W, 3), the right way up."""
-        return np.ascontiguousarray(np.rot90(stored[:, ::-1] if self.is_mirrored else stored, self.quarters))
-
-
-def exif_of_file(path: Path, size: Size) -> Exif:
-    """The EXIF of an image of that size; none of a file that cannot be read."""
-    try:
-        return read_exif(np.fromfile(path, np.uint8).data, size)
-    except (OSError, ValueError):
-        return Exif()
+    turns: int = 0  # quarters, counter-clockwise, that set the stored pixels upright
+    focal: float = 0.0  # in pixels; 0: unknown
 
 
 def read_exif(data: memoryview, size: Size) -> Exif:
@@ -65,12 +42,11 @@ def read_exif(data: memoryview, size: Size) -> Exif:
         if order is not None:
             tags.update(_entries(tiff, order, *struct.unpack_from(f"{order}I", tiff, 4)))
             tags.update(_entries(tiff, order, int(tags.get(DIRECTORY, len(tiff)))))
-    orientation = int(tags.get(ORIENTATION, 1))
     focal = tags.get(FOCAL_35MM, 0.0) / FILM_MM * hypot(*size)
     if not focal:
         unit = UNITS_MM.get(int(tags.get(PLANE_UNIT, 0)), inf)
         focal = tags.get(FOCAL_MM, 0.0) * tags.get(PLANE_RESOLUTION, 0.0) / unit
-    return Exif(orientation if 1 <= orientation <= 8 else 1, focal if focal / max(size) in FOCALS else 0.0)
+    return Exif(TURNS.get(int(tags.get(ORIENTATION, 1)), 0), focal if focal / max(size) in FOCALS else 0.0)
 
 
 def _tiff_part(data: memoryview) -> memoryview:

@@ -185,7 +185,7 @@ class Scenes:
 
     def _batch_pair(self, index: int, found: PairMatch) -> BatchPair:
         images = zip(self._pairs[index].images, found.versions, found.sizes, found.focals, strict=True)
-        image0, image1 = (BatchImage(path.stem, version, size, focal) for path, version, size, focal in images)
+        image0, image1 = (BatchImage(path.name, version, size, focal) for path, version, size, focal in images)
         record = self._records[index]
         own = None if record.failure else record.pair_fundamental
         return BatchPair(image0, image1, found.matches, own, tracks_of(found.results))

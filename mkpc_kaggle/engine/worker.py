@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import Protocol
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.data.images import Image, ImageStore, turned
+from mkpc_kaggle.data.images import Image, ImageStore
 from mkpc_kaggle.engine.jobs import (
     Answer,
     Cause,
@@ -136,7 +136,7 @@ class MatchRunner:
         """The pair with its images; ``failure`` says which of them cannot be read."""
         start = time.perf_counter()
         files = zip(pair.images, pair.turns, strict=True)
-        images = [turned(self._images.get(path), turns) for path, turns in files]
+        images = [self._images.get(path).turned(turns) for path, turns in files]
         seconds = time.perf_counter() - start
         readable = tuple(image for image in images if isinstance(image, Image))
         failure = next((str(image) for image in images if not isinstance(image, Image)), "")

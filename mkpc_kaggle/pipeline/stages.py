@@ -200,10 +200,11 @@ def require_unforked() -> None:
 
 
 def views_of(unit: Unit, multiple: int, pair: PairMatch) -> tuple[View, View]:
-    """What a unit looks at: whole images in stage 1, critical regions in stage 2."""
+    """Return the unit's views of both images: of all pixels in stage 1, of the critical regions in stage 2."""
     crops = [region.box for region in pair.regions or ()] if unit.stage == 2 else []
     boxes = crops or [Box.whole(image.size) for image in pair.images]
-    return unit.view(boxes[0], multiple), unit.view(boxes[1], multiple)
+    first, second = (unit.view(box, multiple, im.turns) for box, im in zip(boxes, pair.images, strict=True))
+    return first, second
 
 
 def with_regions(pair: PairMatch, recipe: Recipe) -> PairMatch:

@@ -77,13 +77,7 @@ def reconstruct_folder(
             pairs = choose_pairs(datasets, assembly, session, journal, listed=listed, rotations=rotations)
         except RunEndedError as ended:
             return FolderResult(ended.report, (), none)
-        turns = {path: times for pair in pairs for path, times in zip(pair.images, pair.turns, strict=True)}
-        exports = {
-            name: Export(
-                out / name, files[0].parent, {file.stem: (file.name, turns.get(file, 0)) for file in files}
-            )
-            for name, files in datasets.items()
-        }
+        exports = {name: Export(out / name) for name in datasets}
 
         def write(records: Sequence[PairRecord], scenes: Iterable[SceneRecord]) -> None:
             publish(cameras_of(datasets, pairs, records, scenes))
@@ -142,8 +136,7 @@ def reconstruct(
         ends = shortlist(most_alike(lambda: features, PARTNERS))
     for path0, path1 in ((files[i], files[j]) for i, j in ends):
         (match,) = pipeline.match([PairMatch(images=(opened(path0), opened(path1)))], assembly.recipe.units)
-        image0, image1 = (BatchImage(image.name, image.version, image.size) for image in match.images)
+        image0, image1 = (BatchImage(im.name, im.version, im.size, im.focal) for im in match.images)
         pairs.append(BatchPair(image0, image1, match.matches, None, tracks_of(match.results)))
-    pairs = Export(Path(), Path(), {str(file): (str(file), 0) for file in files}).stored(pairs)
     found, _ = reconstruct_sharing(ViewGraph.of_pairs(pairs), chosen.scene or SceneConfig())
     return tuple(sorted(models_of(found), key=lambda model: -len(model.images)))
