@@ -88,11 +88,9 @@ def read_image(path: Path) -> Image | Unreadable:
     height, width = bgr.shape[:2]
     if max(height, width) > MAX_ASPECT * min(height, width):
         return Unreadable(name, f"{width} x {height} pixels: one side is more than {MAX_ASPECT} times the other")
-    pixels, exif = (
-        np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8),
-        read_exif(data.data, Size(width, height)),
-    )
-    return Image(name, pixels, _content_digest(data), exif.focal, exif.turns)
+    turns, focal = read_exif(data.tobytes(), Size(width, height))
+    pixels = np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)
+    return Image(name, pixels, _content_digest(data), focal, turns)
 
 
 def is_unchanged(path: Path, version: str) -> bool:

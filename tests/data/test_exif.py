@@ -1,15 +1,14 @@
 """EXIF: COLMAP finds the same focal lengths, views are set upright, nothing hostile is believed."""
 
-import struct
-
 import cv2
 import numpy as np
+import PIL.Image
 import pycolmap
 import pytest
 from exif_files import set_exif, tiff, with_tiff
 from numpy.testing import assert_array_equal
 
-from mkpc_kaggle.data.exif import Exif, read_exif
+from mkpc_kaggle.data.exif import read_exif
 from mkpc_kaggle.data.images import Image, read_image
 from mkpc_kaggle.geometry.coordinates import Size
 
@@ -85,19 +84,44 @@ def test_an_orientation_that_does_not_exist_changes_nothing(tmp_path, orientatio
     assert image.turns == 0
 
 
-def test_exif_that_is_cut_off_or_damaged_is_missing_and_what_stands_before_it_counts():
-    whole = cv2.imencode(".jpg", PIXELS)[1].tobytes()
+def test_damaged_exif_is_missing():
+    whole, rng = cv2.imencode(".jpg", PIXELS)[1].tobytes(), np.random.default_rng(0)
     part = tiff({0x0112: 6}, {0xA405: 28, 0x920A: (4, 1)})
-    assert read_exif(memoryview(with_tiff(whole, part)), SIZE) == Exif(3, pytest.approx(46.663, abs=1e-3))
-    for length in range(len(part)):
-        found = read_exif(memoryview(with_tiff(whole, part[:length])), SIZE)
-        assert found.turns == (3 if length >= 20 else 0)
-    rng = np.random.default_rng(0)
+    assert read_exif(with_tiff(whole, part), SIZE) == (3, pytest.approx(46.663, abs=1e-3))
+    damaged = [part[:length] for length in range(len(part))]
     for _ in range(300):
-        data = bytearray(with_tiff(whole, part))
-        data[rng.integers(100)] = rng.integers(256)
-        found = read_exif(memoryview(data), SIZE)
-        assert 0 <= found.turns <= 3
-        assert found.focal == 0 or 12 <= found.focal <= 1200
-    far = struct.pack("<I", 0xFFFFFFF0)
-    assert read_exif(memoryview(with_tiff(whole, b"II*\0" + far)), SIZE) == Exif()
+        data = bytearray(part)
+        data[rng.integers(len(part))] = rng.integers(256)
+        damaged.append(bytes(data))
+    for data in damaged:
+        turns, focal = read_exif(with_tiff(whole, data), SIZE)
+        assert turns in range(4)
+        assert focal == 0 or 12 <= focal <= 1200
+
+
+def written_by_pillow(path, part):
+    PIL.Image.fromarray(PIXELS).save(path, exif=b"Exif\0\0" + part)
+
+
+def with_fill_bytes(path, part):
+    cv2.imwrite(str(path), PIXELS)
+    data = with_tiff(path.read_bytes(), part)
+    path.write_bytes(data[:2] + b"\xff\xff" + data[2:])
+
+
+def after_the_pixels(path, part):
+    cv2.imwrite(str(path), PIXELS)
+    plain = path.read_bytes()
+    chunk = with_tiff(plain, part)[33 : 33 - len(plain)]
+    path.write_bytes(plain[:-12] + chunk + plain[-12:])
+
+
+@pytest.mark.parametrize(
+    ("name", "write"),
+    [("a.webp", written_by_pillow), ("a.jpg", with_fill_bytes), ("a.png", after_the_pixels)],
+)
+def test_exif_is_found_wherever_a_format_has_it(tmp_path, name, write):
+    write(tmp_path / name, tiff({0x0112: 8}, {0xA405: 28}))
+    image = read_image(tmp_path / name)
+    assert isinstance(image, Image)
+    assert (image.size, image.turns, image.focal) == (SIZE, 1, pytest.approx(46.663, abs=1e-3))
