@@ -34,11 +34,9 @@ def read_exif(data: bytes, size: Size) -> tuple[int, float]:
     with suppress(Exception), warnings.catch_warnings():  # of a damaged file Pillow raises errors of any type
         warnings.filterwarnings("ignore", module="PIL")
         tags = _numbers(data)
+    unit = UNITS_MM.get(tags.get(PLANE_UNIT, 0), inf)
     focal = tags.get(FOCAL_35MM, 0.0) / FILM_MM * hypot(*size)
-    if not focal:
-        focal = (
-            tags.get(FOCAL_MM, 0.0) * tags.get(PLANE_RESOLUTION, 0.0) / UNITS_MM.get(tags.get(PLANE_UNIT, 0), inf)
-        )
+    focal = focal or tags.get(FOCAL_MM, 0.0) * tags.get(PLANE_RESOLUTION, 0.0) / unit
     return TURNS.get(tags.get(ORIENTATION, 1), 0), focal if focal / max(size) in FOCALS else 0.0
 
 

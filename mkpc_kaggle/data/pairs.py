@@ -42,14 +42,12 @@ def read_pairs(file: Path, image_root: Path, *, most: int | None = None) -> Trai
     listed = [(number, parse_line(line, f"{file}, line {number}")) for number, line in lines if line.split()]
     if not listed:
         raise UserError(f"{file} has no pairs; expected lines {EXPECTED}")
-
     pairs = []
-    for number, images in evenly_spread(listed, most):
-        camera0, camera1 = (image.camera for image in images)
-        file0, file1 = (str(image_root / image.name) for image in images)
-        name, turns = f"{number}: {images[0]} {images[1]}", (images[0].turns, images[1].turns)
-        pair = Pair(name, file.stem, file0, file1, (camera0.K, camera1.K), turns)
-        pairs.append(TruePair(pair, camera0, camera1, nan))
+    for number, (first, second) in evenly_spread(listed, most):
+        files = str(image_root / first.name), str(image_root / second.name)
+        known = (first.camera.K, second.camera.K), (first.turns, second.turns)
+        pair = Pair(f"{number}: {first} {second}", file.stem, *files, *known)
+        pairs.append(TruePair(pair, first.camera, second.camera, nan))
     return TrainScene(file.stem, nan, tuple(pairs))
 
 

@@ -8,7 +8,6 @@ from typing import Any
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.data.images import Image, ImageStore, Unreadable
-from mkpc_kaggle.engine.console import warn
 from mkpc_kaggle.engine.engine import RunReport
 from mkpc_kaggle.engine.journal import Journal
 from mkpc_kaggle.engine.records import CameraRecord, PairRecord, SceneRecord
@@ -19,7 +18,6 @@ from mkpc_kaggle.pipeline.assembly import Assembly, assemble
 from mkpc_kaggle.pipeline.pair import PairMatch
 from mkpc_kaggle.recipe import CameraSharing, Recipe, SceneConfig, load_recipe
 from mkpc_kaggle.reconstruction.choice import MAX_IMAGES, RunEndedError, choose_pairs
-from mkpc_kaggle.reconstruction.directory import claim, settle
 from mkpc_kaggle.reconstruction.folder import Datasets, Ends
 from mkpc_kaggle.reconstruction.likeness import PARTNERS, local_features, most_alike, shortlist
 from mkpc_kaggle.reconstruction.outputs import Cameras
@@ -60,16 +58,12 @@ def reconstruct_folder(
     COLMAP's files of a dataset are in the folder of its name in ``out``. With ``rotations``, images that match
     nothing are turned. A scene's own process writes its files before the journal says that the scene is done, so
     a run that was killed makes what is lacking. ``publish`` is called with the cameras that there are, at first
-    with none, and after each scene. Raises :class:`UserError` for what is in the way in ``out``.
+    with none, and after each scene.
     """
     assembly = replace(assembly, recipe=for_cameras(assembly.recipe))
-    gone = claim(out, datasets)
     none: Cameras = {name: dict.fromkeys(files) for name, files in datasets.items()}
     belongs_to = {"images": {name: [file.name for file in files] for name, files in datasets.items()}}
     with Journal(session.work_dir / "images", belongs_to, fresh=session.fresh) as journal:
-        settle(out, datasets, gone)
-        for name in gone:
-            warn(f"the images of {name} are gone, and so are its results in {out / name}")
         if not (out / "cameras.csv").exists():
             with writing(f"--out {out}"):
                 publish(none)

@@ -6,7 +6,7 @@ from pathlib import Path
 DATABASE, MODELS = "database.db", "models"
 MODEL_FILES = ("cameras.bin", "frames.bin", "images.bin", "points3D.bin", "rigs.bin")
 FORMER = "former"  # models that are being replaced
-PART = ".new-"  # how the names of folders begin in which files are made that replace former files
+PART = ".mkpc-new-"  # how the names of folders begin in which files are made that replace former files
 
 
 @dataclass(frozen=True)

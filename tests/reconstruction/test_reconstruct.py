@@ -438,21 +438,6 @@ def test_the_tables_are_there_at_first_and_again_after_each_scene(tmp_path):
     assert steps in ([(0, 0), (5, 0), (5, 5)], [(0, 0), (0, 5), (5, 5)])
 
 
-def test_a_dataset_that_is_gone_takes_its_results_with_it(tmp_path, capsys):
-    root, out = tmp_path / "images", tmp_path / "out"
-    for name in ("a", "b"):
-        write_flat(root / name, 4)
-    run(root, out)
-    (root / "b").rename(tmp_path / "elsewhere")
-    with pytest.raises(UserError, match=r"belongs to another run \(different images\)"):
-        run(root, out)
-    assert (out / "b" / "models" / "0").is_dir()
-    run(root, out, fresh=True)
-    assert f"the images of b are gone, and so are its results in {out / 'b'}" in capsys.readouterr().err
-    assert not (out / "b").exists()
-    assert (out / "a" / "models" / "0").is_dir()
-
-
 def test_orientations_go_on_where_a_run_was_cut_off(tmp_path):
     """Interrupted while images are matched to see how they lie: what is known is not matched again."""
     paths, out = photographs(tmp_path / "images", 4), tmp_path / "out"
