@@ -16,7 +16,6 @@ from mkpc_kaggle.geometry.coordinates import Size
 
 ORIENTATION, DIRECTORY, FOCAL_MM = 0x0112, 0x8769, 0x920A  # tags
 PLANE_RESOLUTION, PLANE_UNIT, FOCAL_35MM = 0xA20E, 0xA210, 0xA405
-FORMATS = ("JPEG", "PNG", "WEBP")  # OpenCV turns TIFF pictures itself
 FILM_MM = 43.27  # diagonal of 35 mm film
 UNITS_MM: dict[float, float] = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 FOCALS = Range(0.2, 20.0)  # long sides of an image; a focal length beyond is taken for a mistake
@@ -41,8 +40,7 @@ def read_exif(data: bytes, size: Size) -> tuple[int, float]:
 
 
 def _numbers(data: bytes) -> dict[int, float]:
-    """Return the tags of a file that are numbers."""
-    with PIL.Image.open(BytesIO(data), formats=FORMATS) as picture:
+    with PIL.Image.open(BytesIO(data), formats=("JPEG", "PNG", "WEBP")) as picture:  # OpenCV turns TIFF itself
         if picture.format == "PNG" and b"eXIf" not in data:
             return {}  # Pillow would decode all pixels, since EXIF may come after them
         exif = picture.getexif()
