@@ -101,8 +101,9 @@ class Pipeline:
                 return []
             if failure is FailureKind.ORDINARY and len(pairs) == 1:
                 return [UnitResult(unit, Matches.empty(), failure=reason_of(error))]
-            if failure is FailureKind.ORDINARY:
-                return self._run_singly(unit, pairs)
+            if failure is FailureKind.ORDINARY:  # a pair alone has no result once, if the matcher becomes exact
+                alone = (self._run_minibatch(unit, [pair]) or self._run_minibatch(unit, [pair]) for pair in pairs)
+                return list(chain.from_iterable(alone))
             if failure is FailureKind.DEVICE or len(pairs) == 1:
                 error.add_note(f"in {unit.name}")
                 raise
@@ -113,16 +114,6 @@ class Pipeline:
             torch.cuda.empty_cache()  # cuBLAS and cuDNN cannot use what PyTorch keeps for later
         self._minibatches[unit] = len(pairs) // 2
         return []
-
-    def _run_singly(self, unit: Unit, pairs: list[PairMatch]) -> list[UnitResult]:
-        """The unit's results on the first of the pairs, up to a change in how the unit runs, or on all of them."""
-        results: list[UnitResult] = []
-        for pair in pairs:
-            found = self._run_minibatch(unit, [pair])
-            if not found:
-                break
-            results += found
-        return results
 
     def _fall_back_to_float32(self, name: str, error: NonFiniteError) -> bool:
         """Whether the matcher runs in float32 from now on, and did not before."""
