@@ -61,7 +61,7 @@ class Box:
 class View:
     """The input of a matcher: a crop of an image, rotated by quarter turns, resized, padded right and bottom.
 
-    Image pixels are those of the stored file.
+    Image pixels are pixels of the stored file.
     """
 
     crop: Box  # in image pixels

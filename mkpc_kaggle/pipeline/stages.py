@@ -101,7 +101,7 @@ class Pipeline:
                 return []
             if failure is FailureKind.ORDINARY and len(pairs) == 1:
                 return [UnitResult(unit, Matches.empty(), failure=reason_of(error))]
-            if failure is FailureKind.ORDINARY:  # a pair alone has no result once, if the matcher becomes exact
+            if failure is FailureKind.ORDINARY:  # singly, and twice where the matcher falls back to float32
                 alone = (self._run_minibatch(unit, [pair]) or self._run_minibatch(unit, [pair]) for pair in pairs)
                 return list(chain.from_iterable(alone))
             if failure is FailureKind.DEVICE or len(pairs) == 1:

@@ -1,4 +1,4 @@
-"""The output directory of ``reconstruct``: what a run may write, replace and remove in it."""
+"""The output directory of ``reconstruct``: files that a run may write, replace and remove."""
 
 import json
 import os
@@ -23,10 +23,10 @@ MODEL_FILE = re.compile(rf"\d+(/({'|'.join(map(re.escape, MODEL_FILES))}))?")
 
 @contextmanager
 def output_directory(out: Path, datasets: Iterable[str], form: str | None = None) -> Iterator[None]:
-    """Reserve ``out`` for a run's results; when it has ended, remove those that only earlier runs made.
+    """Reserve ``out`` for a run's results; at its end, remove results that only earlier runs made.
 
     With a ``form``, ``submission.csv`` is a result. A result that was changed since a run made it is not removed.
-    Raises :class:`UserError` for a directory that is neither empty nor marked by a run, and for a link or another
+    Raise :class:`UserError` for a directory that is neither empty nor marked by a run, and for a link or another
     file in the place of a result.
     """
     results = [name for name in TABLES if form or name != "submission.csv"]
@@ -67,7 +67,7 @@ def _write_mark(out: Path, known: Mapping[str, str]) -> None:
 
 
 def _in_the_way(out: Path, results: Iterable[str], marked: Mapping[str, str] | None) -> Iterator[Path]:
-    """Yield what stands in the places of results and no run has made; all files where no run has been."""
+    """Yield links and files of the user's in the places of results; in an unmarked directory, all of them."""
     if marked is None:
         yield from (path for path in out.rglob("[!.]*") if path.is_symlink() or not path.is_dir())
     for name in results:
@@ -89,7 +89,7 @@ def _is_inside(out: Path, name: str) -> bool:
 
 
 def _digest(path: Path) -> str:
-    """Return the digest of a file, or of the names and contents of a folder; "" if there is none."""
+    """Return the digest of a file, or of the names and contents of a folder; "" if it does not exist."""
     whole = sha256()
     for file in sorted(path.rglob("*")) if path.is_dir() else [path]:
         whole.update(os.fsencode(file.relative_to(path)) + b"\0")
