@@ -64,14 +64,14 @@ class Unit:
         """The same unit, its fallback, if any, in its matcher's place."""
         return replace(self, matcher=self.fallback or self.matcher, fallback="")
 
-    def view(self, crop: Box, multiple: int) -> View:
-        """What this unit shows of a crop, padded to a multiple."""
+    def view(self, crop: Box, multiple: int, turns: int = 0) -> View:
+        """Return this unit's view of a crop, rotated by quarter turns and padded to a multiple."""
         if not self.area:
-            return View.fit(crop, long_side=self.long_side, multiple=multiple)
+            return View.fit(crop, long_side=self.long_side, multiple=multiple, turns=turns)
         height, width = map(int, self.area.split("x"))
         if self.stretch:
-            return View.stretched(crop, size=Size(width, height), multiple=multiple)
-        return View.of_area(crop, area=width * height, multiple=multiple)
+            return View.stretched(crop, size=Size(width, height), multiple=multiple, turns=turns)
+        return View.of_area(crop, area=width * height, multiple=multiple, turns=turns)
 
 
 class CameraModel(StrEnum):

@@ -11,8 +11,9 @@ from mkpc_kaggle.reporting.figures.pair import draw_pair
 from mkpc_kaggle.reporting.figures.style import save
 
 HELP = """\
-Match two images and print the fundamental matrix (x1^T F x0 = 0, pixel centres at integers), how many matches
-each unit found, and the critical regions. --out draws the matches, the clusters and the critical regions.
+Match two images and print the fundamental matrix (x1^T F x0 = 0, pixel centres at integers), the matches of each
+unit, and the critical regions. --out draws the matches, the clusters and the critical regions. Pixels are those of
+the stored files, whatever EXIF says of their orientation; figures are upright.
 """
 
 

@@ -12,6 +12,7 @@ from mkpc_kaggle.engine.budget import format_duration
 from mkpc_kaggle.engine.console import say
 from mkpc_kaggle.engine.session import interruptible
 from mkpc_kaggle.recipe import CameraSharing
+from mkpc_kaggle.reconstruction.directory import output_directory
 from mkpc_kaggle.reconstruction.folder import read_folder, read_pair_list
 from mkpc_kaggle.reconstruction.outputs import FORMS, Cameras, write_tables
 from mkpc_kaggle.reconstruction.run import FolderResult, for_cameras, reconstruct_folder
@@ -32,12 +33,13 @@ and for all together:
   report.html     the run, with the cameras and points of each model
   work/           the journal: killed at any point, the same command goes on, and ends with the same files
 
-Pixels are those that a file stores, as COLMAP reads it, whatever EXIF says of its orientation. Mirrored files (2,
-4, 5, 7) make models of their own. Cameras start with the focal lengths that EXIF has, unless the recipe's table
-[scene] has `exif = false`.
+Pixels are those of the stored file, as COLMAP reads it, whatever EXIF says of its orientation. A file that EXIF
+calls mirrored (2, 4, 5, 7) is matched as it is stored: little but other mirrored files matches it. Cameras start
+with the focal lengths that EXIF has, unless the recipe's table [scene] has `exif = false`.
 
-OUT must be empty, or have nothing in it but what an earlier run of this command made. What is made takes the place
-of former results when it is whole.
+OUT must be empty, or of an earlier run of this command. New results take the place of former results when they are
+whole; a link or a file of yours in the place of a result is refused. At the end, results that only an earlier run
+made are removed, unless they were changed. Other files are left alone.
 
 All pairs of up to 100 images are matched, and in larger datasets each image with the 20 most like it.
 
@@ -73,6 +75,7 @@ def run(arguments: argparse.Namespace) -> int:
     with (
         interruptible() as interrupt,
         options.watched_session(arguments, work_dir, interrupt) as (session, watchdog),
+        output_directory(out, datasets, arguments.format),
     ):
         watchdog.status = 1  # until there is a model
 

@@ -24,10 +24,13 @@ MAX_ASPECT = 32  # of the sides; beyond it views would be a few pixels high, or 
 
 @dataclass(frozen=True, eq=False)
 class Image:
+    """A picture as its file stores it; ``turns`` set its views upright."""
+
     name: str  # unique in a run
     pixels: Pixels  # (H, W, 3) uint8 RGB
     version: str = ""  # :func:`content_digest` of its file
     focal: float = 0.0  # in pixels, by its EXIF; 0: unknown
+    turns: int = 0  # quarters, counter-clockwise, by its EXIF
 
     @classmethod
     def of_array(cls, array: Pixels) -> "Image":
@@ -47,13 +50,9 @@ class Image:
         """(H, W) uint8."""
         return np.asarray(cv2.cvtColor(self.pixels, cv2.COLOR_RGB2GRAY), np.uint8)
 
-
-def turned(image: "Image | Unreadable", times: int) -> "Image | Unreadable":
-    """An image turned by ``times`` quarters, counter-clockwise; its version is still that of its file."""
-    if isinstance(image, Unreadable) or not times:
-        return image
-    pixels = np.ascontiguousarray(np.rot90(image.pixels, times))
-    return replace(image, name=f"{image.name} turned {times}", pixels=pixels)
+    def turned(self, turns: int) -> "Image":
+        """Return the image with views turned by more quarters, counter-clockwise."""
+        return replace(self, turns=(self.turns + turns) % 4) if turns else self
 
 
 @dataclass(frozen=True)
@@ -64,12 +63,14 @@ class Unreadable:
     def __str__(self) -> str:
         return f"{printable(self.name)}: {self.reason}"
 
+    def turned(self, _: int) -> "Unreadable":
+        return self
+
 
 def read_image(path: Path) -> Image | Unreadable:
-    """Decode a file to RGB; never raises. 16-bit values are divided by 256, EXIF's orientation is applied.
+    """Decode the stored pixels of a file to RGB; never raises. 16-bit values are divided by 256.
 
-    OpenCV decides whether a damaged file is readable: version 5 refuses a truncated file. Its versions differ in
-    whose orientation they apply, so they apply none.
+    OpenCV decides whether a damaged file is readable: version 5 refuses a truncated file.
     """
     name = str(path)
     try:
@@ -86,9 +87,9 @@ def read_image(path: Path) -> Image | Unreadable:
     height, width = bgr.shape[:2]
     if max(height, width) > MAX_ASPECT * min(height, width):
         return Unreadable(name, f"{width} x {height} pixels: one side is more than {MAX_ASPECT} times the other")
-    exif = read_exif(data.data, Size(width, height))
-    pixels = exif.upright(np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8))
-    return Image(name, pixels, _content_digest(data), exif.focal)
+    turns, focal = read_exif(data.tobytes(), Size(width, height))
+    pixels = np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)
+    return Image(name, pixels, _content_digest(data), focal, turns)
 
 
 def content_digest(path: Path) -> str:

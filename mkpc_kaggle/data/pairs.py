@@ -1,22 +1,19 @@
 """Lists of pairs with known poses, in the format that SuperGlue's evaluation made common.
 
 A line a pair: ``name0 name1 turns0 turns1 K0 K1 T_0to1``, separated by blanks. Names are paths under the image
-root. ``turns`` are the quarter turns, counter-clockwise, that set an image upright. K (9 numbers) and T (16), row
-by row, are those of the images as they are stored: X_1 = R X_0 + t with T = [R t; 0 1].
+root. ``turns`` are the quarter turns, counter-clockwise, that set an image upright, after those of its EXIF. K (9
+numbers) and T (16), row by row, are those of the stored pixels: X_1 = R X_0 + t with T = [R t; 0 1].
 """
 
 from dataclasses import dataclass
-from functools import cache
 from math import nan
 from pathlib import Path, PureWindowsPath
 
 import numpy as np
 
 from mkpc_kaggle.data.competition import Pair, TrainScene, TruePair, evenly_spread
-from mkpc_kaggle.data.images import Unreadable, read_image
 from mkpc_kaggle.errors import UserError, read_text
 from mkpc_kaggle.geometry.cameras import Camera
-from mkpc_kaggle.geometry.coordinates import Size
 
 FIELDS = 2 + 2 + 9 + 9 + 16
 EXPECTED = "name0 name1 turns0 turns1 K0 (9 numbers) K1 (9) T_0to1 (16)"
@@ -27,7 +24,7 @@ MAX_SKEWNESS = 1e-3  # of R R^T of a pose from the identity: files have few digi
 class ListedImage:
     name: str  # its path under the image root
     turns: int  # quarters
-    camera: Camera  # before turning
+    camera: Camera
 
     def __str__(self) -> str:
         return self.name + (f" turned {self.turns}" if self.turns else "")
@@ -36,9 +33,8 @@ class ListedImage:
 def read_pairs(file: Path, image_root: Path, *, most: int | None = None) -> TrainScene:
     """The pairs of a list as a scene of unknown scale, to estimate E on.
 
-    ``most`` takes that many pairs, evenly spread. The cameras are those of the upright images. An image that
-    cannot be read is no error here: the run reports it. Raises :class:`UserError` for a list without pairs and
-    for a malformed line.
+    ``most`` takes up to that number of pairs, evenly spread. An image that cannot be read is no error here: the
+    run reports it. Raises :class:`UserError` for a list without pairs and for a malformed line.
     """
     if not image_root.is_dir():
         raise UserError(f"--image-root {image_root}: no such directory")
@@ -46,23 +42,12 @@ def read_pairs(file: Path, image_root: Path, *, most: int | None = None) -> Trai
     listed = [(number, parse_line(line, f"{file}, line {number}")) for number, line in lines if line.split()]
     if not listed:
         raise UserError(f"{file} has no pairs; expected lines {EXPECTED}")
-
-    @cache
-    def size_of(name: str) -> Size | None:
-        image = read_image(image_root / name)
-        return None if isinstance(image, Unreadable) else image.size
-
-    def upright(image: ListedImage) -> Camera:
-        size = size_of(image.name) if image.turns else None
-        return image.camera.rotated_90(image.turns, size) if size else image.camera
-
     pairs = []
-    for number, images in evenly_spread(listed, most):
-        camera0, camera1 = map(upright, images)
-        file0, file1 = (str(image_root / image.name) for image in images)
-        name, turns = f"{number}: {images[0]} {images[1]}", (images[0].turns, images[1].turns)
-        pair = Pair(name, file.stem, file0, file1, (camera0.K, camera1.K), turns)
-        pairs.append(TruePair(pair, camera0, camera1, nan))
+    for number, (first, second) in evenly_spread(listed, most):
+        files = str(image_root / first.name), str(image_root / second.name)
+        known = (first.camera.K, second.camera.K), (first.turns, second.turns)
+        pair = Pair(f"{number}: {first} {second}", file.stem, *files, *known)
+        pairs.append(TruePair(pair, first.camera, second.camera, nan))
     return TrainScene(file.stem, nan, tuple(pairs))
 
 

@@ -251,7 +251,7 @@ class Journal(JournalReader):
     """The journal of a work directory, created if missing. No other run can open it meanwhile.
 
     When the file takes no more (a full disk), the journal continues in memory, and is copied back when it is
-    closed. ``trouble`` then has the reason. Raises :class:`UserError` if the directory cannot be written or is used.
+    closed. ``trouble`` has the reason. Raises :class:`UserError` if the directory cannot be written or is used.
     """
 
     def __init__(self, directory: Path, *, fresh: bool = False) -> None:

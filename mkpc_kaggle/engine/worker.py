@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from mkpc_kaggle.data.images import Image, ImageStore, turned
+from mkpc_kaggle.data.images import Image, ImageStore
 from mkpc_kaggle.engine.codec import from_blob, to_blob
 from mkpc_kaggle.engine.jobs import (
     Answer,
@@ -135,7 +135,7 @@ class MatchRunner:
         """Return the pair with its images; ``failure`` says which of them cannot be read."""
         start, pair = time.perf_counter(), wanted.pair
         files = zip(pair.images, pair.turns, strict=True)
-        images = [turned(self._images.get(path), turns) for path, turns in files]
+        images = [self._images.get(path).turned(turns) for path, turns in files]
         seconds = time.perf_counter() - start
         readable = tuple(image for image in images if isinstance(image, Image))
         failure = next((str(image) for image in images if not isinstance(image, Image)), "")

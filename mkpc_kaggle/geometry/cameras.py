@@ -7,12 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from mkpc_kaggle.geometry.coordinates import Matrix3, Size
+from mkpc_kaggle.geometry.coordinates import Matrix3
 from mkpc_kaggle.geometry.two_view import cross_matrix
 
-# A quarter turn of a picture, counter-clockwise: (x, y) goes to (y, -x), y being down.
-QUARTER: Matrix3 = np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])
-QUARTER.setflags(write=False)
 MIN_BASELINE = 1e-9  # below it, in units of the world, two cameras stand at the same point
 
 
@@ -28,19 +25,6 @@ class Camera:
     def calibrated(self) -> "Camera":
         """The same camera with K the identity: F of two such cameras is E of the two."""
         return replace(self, K=np.eye(3))
-
-    def rotated_90(self, times: int, size: Size) -> "Camera":
-        """The camera that takes ``np.rot90(picture, times)`` where this camera takes a picture of ``size``.
-
-        A quarter turn moves the pixel (x, y) to (y, width - 1 - x). The camera turns about its axis, so that in K
-        focal lengths and the centre's coordinates only change places.
-        """
-        camera, (width, height) = self, size
-        for _ in range(times % 4):
-            moved = np.array([[1.0, 0, 0], [0, 1, width - 1], [0, 0, 1]]) @ QUARTER
-            camera = Camera(moved @ camera.K @ QUARTER.T, QUARTER @ camera.R, QUARTER @ camera.t)
-            width, height = height, width
-        return camera
 
 
 def relative_pose(camera0: Camera, camera1: Camera) -> tuple[Matrix3, NDArray[np.float64]]:

@@ -2,8 +2,8 @@
 
 Pixel centres are at integers: the centre of the top-left pixel is (0, 0), x runs right, y runs down, and an
 image of width w covers [-0.5, w - 0.5). A resize by s maps ``x_view = (x + 0.5) * s - 0.5``, with an s for
-each axis from the *actual* sizes. A crop subtracts an integer offset. Padding goes to the right and the
-bottom, so it moves nothing.
+each axis from the *actual* sizes. A crop subtracts an integer offset, a quarter turn permutes the axes. Padding
+goes to the right and the bottom, so it moves nothing.
 
 Networks use other conventions: :func:`from_corner` and :func:`from_normalised` convert to this convention.
 """
@@ -59,50 +59,57 @@ class Box:
 
 @dataclass(frozen=True)
 class View:
-    """What a matcher is shown: a crop of an image, resized, padded right and bottom."""
+    """The input of a matcher: a crop of an image, rotated by quarter turns, resized, padded right and bottom.
+
+    Image pixels are pixels of the stored file.
+    """
 
     crop: Box  # in image pixels
-    content: Size  # of the resized crop
+    content: Size  # of the crop, turned and resized
     padded: Size  # of the picture with its padding
+    turns: int = 0  # quarters, counter-clockwise, 0 to 3
 
     @classmethod
-    def fit(cls, crop: Box, *, long_side: int, multiple: int = 1) -> "View":
-        """The view of ``crop`` whose longer side is ``long_side`` pixels, its aspect kept to the nearest pixel.
+    def fit(cls, crop: Box, *, long_side: int, multiple: int = 1, turns: int = 0) -> "View":
+        """Return the view of ``crop`` with this longer side in pixels, its aspect kept to the nearest pixel.
 
-        As for all views made here, both sides are then padded up to a multiple of ``multiple``.
+        Here, as in the other constructors, both sides are padded up to a multiple of ``multiple``.
         """
-        return cls._scaled(crop, long_side / max(crop.size), multiple)
+        return cls._scaled(crop, long_side / max(crop.size), multiple, turns)
 
     @classmethod
-    def of_area(cls, crop: Box, *, area: int, multiple: int = 1) -> "View":
-        """The view of ``crop`` that has about ``area`` pixels, its aspect kept to the nearest pixel."""
-        return cls._scaled(crop, sqrt(area / crop.area), multiple)
+    def of_area(cls, crop: Box, *, area: int, multiple: int = 1, turns: int = 0) -> "View":
+        """Return the view of ``crop`` with about ``area`` pixels, its aspect kept to the nearest pixel."""
+        return cls._scaled(crop, sqrt(area / crop.area), multiple, turns)
 
     @classmethod
-    def stretched(cls, crop: Box, *, size: Size, multiple: int = 1) -> "View":
-        """The view of ``crop`` resized to exactly ``size``, whatever its aspect."""
+    def stretched(cls, crop: Box, *, size: Size, multiple: int = 1, turns: int = 0) -> "View":
+        """Return the view of ``crop``, turned and then resized to exactly ``size``, regardless of its aspect."""
         padded = Size(*(ceil(side / multiple) * multiple for side in size))
-        return cls(crop, size, padded)
+        return cls(crop, size, padded, turns)
 
     @classmethod
-    def _scaled(cls, crop: Box, scale: float, multiple: int) -> "View":
-        width, height = (max(1, round(side * scale)) for side in crop.size)
-        return cls.stretched(crop, size=Size(width, height), multiple=multiple)
+    def _scaled(cls, crop: Box, scale: float, multiple: int, turns: int) -> "View":
+        width, height = (max(1, round(side * scale)) for side in _turned_size(crop.size, turns))
+        return cls.stretched(crop, size=Size(width, height), multiple=multiple, turns=turns)
 
     @property
     def scale(self) -> tuple[float, float]:
-        """View pixels per image pixel, (s_x, s_y)."""
-        return self.content.width / self.crop.size.width, self.content.height / self.crop.size.height
+        """View pixels per pixel of the turned crop, (s_x, s_y)."""
+        width, height = _turned_size(self.crop.size, self.turns)
+        return self.content.width / width, self.content.height / height
 
     def from_image(self, points: NDArray[np.floating]) -> NDArray[np.float64]:
         """(N, 2) image pixels -> (N, 2) view pixels."""
         offset = np.array([self.crop.left, self.crop.top])
-        return np.asarray((np.asarray(points, np.float64) - offset + 0.5) * self.scale - 0.5, np.float64)
+        turned = _turned(np.asarray(points, np.float64) - offset + 0.5, self.turns, self.crop.size)
+        return np.asarray(turned * self.scale - 0.5, np.float64)
 
     def to_image(self, points: NDArray[np.floating]) -> NDArray[np.float64]:
         """(N, 2) view pixels -> (N, 2) image pixels: the inverse of :meth:`from_image`."""
-        offset = np.array([self.crop.left, self.crop.top])
-        return np.asarray((np.asarray(points, np.float64) + 0.5) / self.scale - 0.5 + offset, np.float64)
+        offset, turned = np.array([self.crop.left, self.crop.top]), _turned_size(self.crop.size, self.turns)
+        stored = _turned((np.asarray(points, np.float64) + 0.5) / self.scale, -self.turns, turned)
+        return np.asarray(stored - 0.5 + offset, np.float64)
 
     def holds(self, points: NDArray[np.floating]) -> NDArray[np.bool_]:
         """Which (N, 2) view points lie on content rather than on padding or outside; never for NaN."""
@@ -118,14 +125,28 @@ class View:
         cut = image[crop.top : crop.bottom, crop.left : crop.right]
         if min(crop.left, crop.top) < 0 or cut.shape[1::-1] != crop.size:
             raise ValueError(f"{crop} leaves the image of {image.shape[1]} x {image.shape[0]} pixels")
+        # OpenCV counts quarters clockwise, and a single one is 0.
+        picture = cv2.rotate(cut, 3 - self.turns) if self.turns else cut
         # In two steps: INTER_AREA is itself only where neither axis grows.
-        shrunk = Size(*map(min, self.content, crop.size))
-        picture = cv2.resize(cut, shrunk, interpolation=cv2.INTER_AREA) if shrunk != crop.size else cut
+        turned = _turned_size(crop.size, self.turns)
+        shrunk = Size(*map(min, self.content, turned))
+        picture = cv2.resize(picture, shrunk, interpolation=cv2.INTER_AREA) if shrunk != turned else picture
         if shrunk != self.content:
             picture = cv2.resize(picture, self.content, interpolation=cv2.INTER_LINEAR)
         right = self.padded.width - self.content.width
         bottom = self.padded.height - self.content.height
         return np.pad(picture, ((0, bottom), (0, right)) + ((0, 0),) * (image.ndim - 2))
+
+
+def _turned_size(size: Size, turns: int) -> Size:
+    return Size(size.height, size.width) if turns % 2 else size
+
+
+def _turned(points: NDArray[np.float64], turns: int, size: Size) -> NDArray[np.float64]:
+    """(N, 2) points of a picture of ``size``, from its top-left corner -> of ``np.rot90(picture, turns)``."""
+    (x, y), (width, height) = points.T, size
+    quarters = (x, y), (y, width - x), (width - x, height - y), (height - y, x)
+    return np.stack(quarters[turns % 4], axis=1)
 
 
 def from_corner(points: NDArray[np.floating]) -> NDArray[np.floating]:

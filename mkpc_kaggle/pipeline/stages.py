@@ -101,8 +101,9 @@ class Pipeline:
                 return []
             if failure is FailureKind.ORDINARY and len(pairs) == 1:
                 return [UnitResult(unit, Matches.empty(), failure=reason_of(error))]
-            if failure is FailureKind.ORDINARY:
-                return self._run_singly(unit, pairs)
+            if failure is FailureKind.ORDINARY:  # singly, and twice where the matcher falls back to float32
+                alone = (self._run_minibatch(unit, [pair]) or self._run_minibatch(unit, [pair]) for pair in pairs)
+                return list(chain.from_iterable(alone))
             if failure is FailureKind.DEVICE or len(pairs) == 1:
                 error.add_note(f"in {unit.name}")
                 raise
@@ -113,16 +114,6 @@ class Pipeline:
             torch.cuda.empty_cache()  # cuBLAS and cuDNN cannot use what PyTorch keeps for later
         self._minibatches[unit] = len(pairs) // 2
         return []
-
-    def _run_singly(self, unit: Unit, pairs: list[PairMatch]) -> list[UnitResult]:
-        """The unit's results on the first of the pairs, up to a change in how the unit runs, or on all of them."""
-        results: list[UnitResult] = []
-        for pair in pairs:
-            found = self._run_minibatch(unit, [pair])
-            if not found:
-                break
-            results += found
-        return results
 
     def _fall_back_to_float32(self, name: str, error: NonFiniteError) -> bool:
         """Whether the matcher runs in float32 from now on, and did not before."""
@@ -200,10 +191,11 @@ def require_unforked() -> None:
 
 
 def views_of(unit: Unit, multiple: int, pair: PairMatch) -> tuple[View, View]:
-    """What a unit looks at: whole images in stage 1, critical regions in stage 2."""
+    """Return the unit's views of both images: of all pixels in stage 1, of the critical regions in stage 2."""
     crops = [region.box for region in pair.regions or ()] if unit.stage == 2 else []
     boxes = crops or [Box.whole(image.size) for image in pair.images]
-    return unit.view(boxes[0], multiple), unit.view(boxes[1], multiple)
+    first, second = (unit.view(box, multiple, im.turns) for box, im in zip(boxes, pair.images, strict=True))
+    return first, second
 
 
 def with_regions(pair: PairMatch, recipe: Recipe) -> PairMatch:

@@ -56,8 +56,9 @@ class TwoStageMatcher:
         """Match two images: paths, or arrays (H, W, 3) RGB or (H, W) gray, uint8.
 
         ``model`` E needs ``intrinsics``, the camera matrices in pixels; without them ``ValueError`` is raised.
-        Raises :class:`UserError` for an image that cannot be read. A pair that cannot be matched is a result with
-        ``estimate.failure``. Errors of memory and of the device are raised as they are.
+        Points and F are in pixels of the stored files: EXIF only sets the views upright. Raises :class:`UserError`
+        for an image that cannot be read. A pair that cannot be matched is a result with ``estimate.failure``.
+        Errors of memory and of the device are raised as they are.
         """
         if ModelKind(model) is ModelKind.E and intrinsics is None:
             raise ValueError("model E needs intrinsics=(K0, K1), the camera matrices of both images in pixels")
@@ -76,4 +77,4 @@ def to_image(source: str | Path | Pixels | Image) -> Image:
     if isinstance(image, Unreadable):
         raise UserError(str(image))
     # Named by its content: a file may change between two calls.
-    return replace(Image.of_array(image.pixels), focal=image.focal)
+    return replace(Image.of_array(image.pixels), focal=image.focal, turns=image.turns)

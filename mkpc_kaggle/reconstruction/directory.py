@@ -1,95 +1,107 @@
-"""The directory of results: what this command has made there, and what is in the way."""
+"""The output directory of ``reconstruct``: files that a run may write, replace and remove."""
 
 import json
 import os
 import re
 import shutil
-from collections.abc import Collection, Iterable
-from contextlib import suppress
-from pathlib import Path
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from hashlib import file_digest, sha256
+from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
 
 from mkpc_kaggle.data.outputs import replacing
+from mkpc_kaggle.engine.console import warn
 from mkpc_kaggle.errors import UserError, writing
-from mkpc_kaggle.scene.export import DATABASE, FORMER, MODEL_FILES, MODELS, PART
+from mkpc_kaggle.scene.export import DATABASE, MODEL_FILES, MODELS, PART
 
 WORK, TABLES = "work", ("cameras.csv", "submission.csv", "report.html")
 RESERVED = {DATABASE, MODELS, WORK, *TABLES}  # names that no dataset may have
-MARK = "datasets.json"  # in WORK: the datasets that may have results here; where it lies, the directory is ours
-RESULT = re.compile(
-    rf"(?:(.+)/)?(?:{re.escape(DATABASE)}|{MODELS}/\d+/(?:{'|'.join(map(re.escape, MODEL_FILES))}))"
-)
+MARK = f"{WORK}/results.json"  # the digest of each result by its path; "" if the run that made it did not end
+MODEL_FILE = re.compile(rf"\d+(/({'|'.join(map(re.escape, MODEL_FILES))}))?")
 
 
-def claim(out: Path, datasets: Iterable[str]) -> list[str]:
-    """Make the directory ours, and writable for all ``datasets``; the datasets of earlier runs that are gone.
+@contextmanager
+def output_directory(out: Path, datasets: Iterable[str], form: str | None = None) -> Iterator[None]:
+    """Reserve ``out`` for a run's results; at its end, remove results that only earlier runs made.
 
-    Raises :class:`UserError` with the name of what is in the way: a file that no run has made, a link anywhere.
+    With a ``form``, ``submission.csv`` is a result. A result that was changed since a run made it is not removed.
+    Raise :class:`UserError` for a directory that is neither empty nor marked by a run, and for a link or another
+    file in the place of a result.
     """
-    mark = out / WORK / MARK
-    former = _former(mark)
-    for folder, folders, files in os.walk(out, onerror=_refuse_unreadable):
-        place = Path(folder)
-        is_work = former is not None and place.relative_to(out).parts[:1] == (WORK,)
-        folders[:] = [name for name in folders if not name.startswith(".")]
-        strange = [name for name in folders if (place / name).is_symlink() or name in RESERVED - {MODELS, WORK}]
-        for name in (name for name in files if not name.startswith(".")):
-            path = place / name
-            is_ours = is_work or _is_ours(path.relative_to(out).as_posix(), former)
-            if path.is_symlink() or not path.is_file() or not is_ours:
-                strange.append(name)
-        if strange:
-            raise UserError(
-                f"--out {out}: {place / min(strange)} is in the way, it was not made by this command; move it, or "
-                "name an empty directory"
-            )
-    wanted = set(datasets)
+    results = [name for name in TABLES if form or name != "submission.csv"]
+    results += [str(PurePosixPath(name, each)) for name in datasets for each in (DATABASE, MODELS)]
     with writing(f"--out {out}"):
-        _write_mark(mark, wanted | (former or set()))
-        for name in wanted:
-            (out / name).mkdir(parents=True, exist_ok=True)
-            TemporaryDirectory(prefix=PART, dir=out / name).cleanup()
-    return sorted((former or set()) - wanted)
-
-
-def settle(out: Path, datasets: Collection[str], gone: Iterable[str]) -> None:
-    """Remove the results of the datasets that are ``gone``, for the run that holds the directory.
-
-    Models that a killed run was replacing come back.
-    """
+        marked = _read_mark(out)
+        if strange := next(_in_the_way(out, results, marked), None):
+            told = f"--out {out}: {strange} is in the way, it was not made by this command"
+            raise UserError(f"{told}; move it, or name an empty directory")
+        known = dict.fromkeys(results, "") | (marked or {})
+        _write_mark(out, known)
+        for folder in {(out / name).parent for name in results}:
+            folder.mkdir(parents=True, exist_ok=True)
+            TemporaryDirectory(prefix=PART, dir=folder).cleanup()
+        before = {name: _digest(out / name) for name in results}
+    yield
     with writing(f"--out {out}"):
-        for former in (found for name in datasets for found in (out / name).glob(f"{PART}*/{FORMER}")):
-            if not (former.parent.parent / MODELS).exists():
-                former.rename(former.parent.parent / MODELS)
-        for name in gone:
-            (out / name / DATABASE).unlink(missing_ok=True)
-            shutil.rmtree(out / name / MODELS, ignore_errors=True)
-            for folder in (out / name, *(out / name).parents):
-                with suppress(OSError):  # until it is not empty
-                    folder.rmdir()
-        _write_mark(out / WORK / MARK, datasets)
+        for name in known.keys() - results:
+            if known[name] and known[name] == _digest(out / name):
+                _remove(out / name)
+        after = {name: digest for name in results if (digest := _digest(out / name))}
+        _write_mark(out, {name: known[name] if after[name] == before[name] else after[name] for name in after})
 
 
-def _former(mark: Path) -> set[str] | None:
-    """The datasets that may have results; ``None`` in a directory that is not ours yet."""
-    if not mark.is_file() or mark.is_symlink():
-        return None
-    with suppress(OSError, ValueError, TypeError):
-        return {str(name) for name in json.loads(mark.read_text())}
+def _read_mark(out: Path) -> dict[str, str] | None:
+    """Return the digests of the results of earlier runs, ``None`` if no run has marked the directory."""
+    with suppress(OSError, ValueError, AttributeError, RecursionError):
+        if _is_inside(out, MARK):
+            known = json.loads((out / MARK).read_text()).items()
+            return {name: digest for name, digest in known if _is_inside(out, name)}
     return None
 
 
-def _is_ours(name: str, former: set[str] | None) -> bool:
-    found = RESULT.fullmatch(name)
-    return former is not None and (name in TABLES or (found is not None and (found[1] or ".") in former))
+def _write_mark(out: Path, known: Mapping[str, str]) -> None:
+    (out / WORK).mkdir(parents=True, exist_ok=True)
+    with replacing(out / MARK) as stream:
+        json.dump(known, stream, indent=1, sort_keys=True)
 
 
-def _write_mark(mark: Path, datasets: Iterable[str]) -> None:
-    mark.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(mark) as stream:
-        json.dump(sorted(datasets), stream)
+def _in_the_way(out: Path, results: Iterable[str], marked: Mapping[str, str] | None) -> Iterator[Path]:
+    """Yield links and files of the user's in the places of results; in an unmarked directory, all of them."""
+    if marked is None:
+        yield from (path for path in out.rglob("[!.]*") if path.is_symlink() or not path.is_dir())
+    for name in results:
+        path = out / name
+        is_result = name in (marked or ()) and (path.is_dir() if path.name == MODELS else path.is_file())
+        if not _is_inside(out, name) or (path.exists() and not is_result):
+            yield path
+        yield from path.parent.glob(f"{DATABASE}-*")  # another program has the database open
+        for each in path.rglob("*") if path.name == MODELS else ():
+            if not MODEL_FILE.fullmatch(each.relative_to(path).as_posix()):
+                yield each
 
 
-def _refuse_unreadable(error: OSError) -> None:
-    if not isinstance(error, FileNotFoundError):
-        raise UserError(f"--out {error.filename} cannot be read: {error.strerror}")
+def _is_inside(out: Path, name: str) -> bool:
+    """Return whether a path lies in ``out``, and no link on its way."""
+    root = Path(os.path.realpath(out))
+    path = root / name
+    return path.is_relative_to(root) and os.path.realpath(path) == str(path) and not path.is_symlink()
+
+
+def _digest(path: Path) -> str:
+    """Return the digest of a file, or of the names and contents of a folder; "" if it does not exist."""
+    whole = sha256()
+    for file in sorted(path.rglob("*")) if path.is_dir() else [path]:
+        whole.update(os.fsencode(file.relative_to(path)) + b"\0")
+        if file.is_file():
+            with file.open("rb") as stream:
+                whole.update(file_digest(stream, sha256).digest())
+    return whole.hexdigest() if path.exists() else ""
+
+
+def _remove(path: Path) -> None:
+    shutil.rmtree(path) if path.is_dir() else path.unlink()
+    for folder in path.parents:
+        with suppress(OSError):  # until it is not empty
+            folder.rmdir()
+    warn(f"{path} was removed: an earlier run made it, and this run does not")

@@ -25,8 +25,6 @@ def write_tables(out: Path, cameras: Cameras, root: Path, form: str | None) -> N
     tables = {"cameras.csv": camera_rows(cameras, root)}
     if form is not None:
         tables["submission.csv"] = submission_rows(form, cameras, root)
-    else:
-        (out / "submission.csv").unlink(missing_ok=True)  # an earlier run's, of other cameras
     for name, rows in tables.items():
         with replacing(out / name) as stream:
             csv.writer(stream, lineterminator="\n").writerows(rows)

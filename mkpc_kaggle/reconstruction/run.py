@@ -8,7 +8,6 @@ from typing import Any
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.data.images import Image, ImageStore, Unreadable
-from mkpc_kaggle.engine.console import warn
 from mkpc_kaggle.engine.engine import RunReport, Standing, name_below
 from mkpc_kaggle.engine.records import CameraRecord
 from mkpc_kaggle.engine.session import Session, opened_engine, request_of
@@ -18,7 +17,6 @@ from mkpc_kaggle.pipeline.assembly import Assembly, assemble
 from mkpc_kaggle.pipeline.pair import PairMatch
 from mkpc_kaggle.recipe import CameraSharing, Recipe, SceneConfig, load_recipe
 from mkpc_kaggle.reconstruction.choice import MAX_IMAGES, choose_pairs
-from mkpc_kaggle.reconstruction.directory import claim, settle
 from mkpc_kaggle.reconstruction.folder import Datasets, Ends, root_of
 from mkpc_kaggle.reconstruction.likeness import PARTNERS, local_features, most_alike, shortlist
 from mkpc_kaggle.reconstruction.outputs import Cameras
@@ -59,26 +57,16 @@ def reconstruct_folder(
     COLMAP's files of a dataset are in the folder of its name in ``out``. With ``rotations``, images that match
     nothing are turned. A scene's own process writes its files before the journal says that the scene is done, so
     a run that was killed makes what is lacking. ``publish`` is called with the cameras that there are, at first
-    with none, and after each scene. Raises :class:`UserError` for what is in the way in ``out``.
+    with none, and after each scene.
     """
     assembly = replace(assembly, recipe=for_cameras(assembly.recipe))
-    gone = claim(out, datasets)
     folders, root = [files[0].parent for files in datasets.values()], str(root_of(datasets))
     with opened_engine(assembly, session, folders) as engine:
-        settle(out, datasets, gone)
-        for name in gone:
-            warn(f"the images of {name} are gone, and so are its results in {out / name}")
         if not (out / "cameras.csv").exists():
             with writing(f"--out {out}"):
                 publish({name: dict.fromkeys(files) for name, files in datasets.items()})
         pairs = choose_pairs(engine, datasets, assembly, session, listed=listed, rotations=rotations)
-        turns = {path: times for pair in pairs for path, times in zip(pair.images, pair.turns, strict=True)}
-        exports = {
-            name: Export(
-                out / name, files[0].parent, {file.name: (file.name, turns.get(file, 0)) for file in files}
-            )
-            for name, files in datasets.items()
-        }
+        exports = {name: Export(out / name) for name in datasets}
 
         standing: list[Cameras] = []
 
@@ -135,8 +123,7 @@ def reconstruct(
         ends = shortlist(most_alike(lambda: features, PARTNERS))
     for path0, path1 in ((files[i], files[j]) for i, j in ends):
         (match,) = pipeline.match([PairMatch(images=(opened(path0), opened(path1)))], assembly.recipe.units)
-        image0, image1 = (BatchImage(image.name, image.version, image.size) for image in match.images)
+        image0, image1 = (BatchImage(im.name, im.version, im.size, im.focal) for im in match.images)
         pairs.append(BatchPair(image0, image1, match.matches, None, tracks_of(match.results)))
-    pairs = Export(Path(), Path(), {str(file): (str(file), 0) for file in files}).stored(pairs)
     found, _ = reconstruct_sharing(ViewGraph.of_pairs(pairs), chosen.scene or SceneConfig())
     return tuple(sorted(models_of(found), key=lambda model: -len(model.images)))

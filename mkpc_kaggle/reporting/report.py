@@ -15,12 +15,12 @@ from typing import TYPE_CHECKING
 import pandas as pd
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.data.images import Unreadable, printable, read_image, turned
+from mkpc_kaggle.data.images import Image, printable
 from mkpc_kaggle.data.outputs import replacing
 from mkpc_kaggle.engine.budget import format_duration
 from mkpc_kaggle.engine.journal import EventKind
 from mkpc_kaggle.engine.records import SceneRecord
-from mkpc_kaggle.errors import writing
+from mkpc_kaggle.errors import UserError, writing
 from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
 from mkpc_kaggle.pipeline.two_stage import to_image
 from mkpc_kaggle.reporting.figures.pair import draw_pair, draw_strip
@@ -152,11 +152,10 @@ def _weak(log: RunLog, weak: WeakPair, sources: dict[str, Pair]) -> tuple[str, s
     if record.source == "scene":
         parts.append("F is the scene's")
     if pair.id in sources:
-        image0, image1 = map(turned, map(read_image, sources[pair.id].images), sources[pair.id].turns)
-        if isinstance(image0, Unreadable) or isinstance(image1, Unreadable):
+        try:
+            picture = _data_uri(draw_strip(_images(sources[pair.id]), match), "jpeg")
+        except UserError:
             parts.append("an image cannot be read any more")
-        else:
-            picture = _data_uri(draw_strip((image0, image1), match), "jpeg")
     return picture, "; ".join(filter(None, parts)), pair.id
 
 
@@ -165,8 +164,12 @@ def weak_figure(log: RunLog, weak: WeakPair, source: Pair) -> "Figure":
 
     ``source`` is the pair with the paths of its images; raises :class:`UserError` if an image cannot be read.
     """
-    image0, image1 = map(to_image, source.images)
-    return draw_pair(image0, image1, weak.match(log.recipe.magsac.threshold), log.recipe.mkpc)
+    return draw_pair(*_images(source), weak.match(log.recipe.magsac.threshold), log.recipe.mkpc)
+
+
+def _images(pair: Pair) -> tuple[Image, Image]:
+    first, second = (to_image(path).turned(turns) for path, turns in zip(pair.images, pair.turns, strict=True))
+    return first, second
 
 
 def _scenes(log: RunLog) -> list[pd.DataFrame]:

@@ -40,14 +40,11 @@ def reconstruct_batch(
 
     With ``focal``, the recipe's prior, and ``magsac`` (default: its defaults), a pair that gets no F from cameras
     is estimated anew where the scene knows a focal length. With ``export``, the batch is reconstructed as a whole,
-    under the names of files, and COLMAP's files are written. Whatever the matches are, the answer is a
+    and COLMAP's files are written. Whatever the matches are, the answer is a
     :class:`Solution`: what is missing has a reason. It takes seconds to minutes and may end the process, see
     :mod:`mkpc_kaggle.scene.colmap`.
     """
-    directory = None
-    if export is not None:
-        pairs, directory = export.stored(pairs), export.directory
-    together, shared = reconstruct_sharing(ViewGraph.of_pairs(pairs), config, directory)
+    together, shared = reconstruct_sharing(ViewGraph.of_pairs(pairs), config, export.directory if export else None)
     matchers = sorted({name for pair in pairs for name in pair.tracks or ()})
     single = matchers if config.each_matcher and len(matchers) > 1 else []
     alone = [

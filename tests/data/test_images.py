@@ -65,20 +65,6 @@ def test_red_comes_first_and_the_suffix_does_not_decide_the_format(tmp_path):
     assert np.abs(read_image(path).pixels.astype(int) - RED).max() <= 3
 
 
-def test_an_exif_orientation_is_applied(tmp_path):
-    pixels = np.zeros((16, 32, 3), np.uint8)
-    pixels[:, :16] = RED  # turned clockwise by a quarter, the left half is on top
-    path = write(tmp_path / "a.jpg", pixels, cv2.IMWRITE_JPEG_QUALITY, 100)
-    tag = b"MM\0*\0\0\0\x08" + b"\0\x01" + b"\x01\x12\0\x03\0\0\0\x01\0\x06\0\0" + b"\0\0\0\0"
-    exif = b"Exif\0\0" + tag
-    data = path.read_bytes()
-    path.write_bytes(data[:2] + b"\xff\xe1" + (len(exif) + 2).to_bytes(2) + exif + data[2:])
-    image = read_image(path)
-    assert image.size == (16, 32)
-    assert image.pixels[:8, :, 0].mean() > 150
-    assert image.pixels[-8:, :, 0].mean() < 50
-
-
 def test_a_file_that_is_not_a_picture_has_its_reason(tmp_path):
     (tmp_path / "empty.png").touch()
     (tmp_path / "text.png").write_text("no picture at all\n" * 100)

@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from mkpc_kaggle.geometry.coordinates import Box, Size, View, from_corner, from_normalised
 
-SIDES = st.integers(1, 3000)
+SIDES, TURNS = st.integers(1, 3000), st.integers(0, 3)
 
 
 @st.composite
@@ -21,7 +21,7 @@ def boxes(draw):
 def views(draw):
     content = Size(draw(SIDES), draw(SIDES))
     padded = Size(content.width + draw(st.integers(0, 40)), content.height + draw(st.integers(0, 40)))
-    return View(draw(boxes()), content, padded)
+    return View(draw(boxes()), content, padded, draw(TURNS))
 
 
 def spot(size, centre, sigma):
@@ -52,6 +52,9 @@ RENDERED = {
     "with an axis that rounding changes": View(Box.whole(IMAGE), Size(80, 48), Size(80, 48)),
     "enlarged along x, shrunk along y": View(Box.whole(IMAGE), Size(240, 40), Size(240, 40)),
     "shrunk along x, enlarged along y": View(Box.whole(IMAGE), Size(60, 170), Size(64, 192)),
+    "turned by a quarter and enlarged": View.fit(Box.whole(IMAGE), long_side=250, turns=1),
+    "cropped, turned by a half and shrunk": View.fit(Box(13, 8, 90, 65), long_side=51, multiple=32, turns=2),
+    "cropped and turned by three quarters": View(Box(13, 8, 90, 65), Size(80, 48), Size(96, 48), turns=3),
 }
 
 
@@ -67,9 +70,25 @@ def test_there_and_back_is_the_identity(view, seed):
 @settings(max_examples=100, deadline=None)
 def test_the_edges_of_the_crop_are_the_edges_of_the_content(view):
     edges = np.array([[view.crop.left, view.crop.top], [view.crop.right, view.crop.bottom]]) - 0.5
-    (x0, y0), (x1, y1) = view.from_image(edges)
-    expected = [-0.5, -0.5, view.content.width - 0.5, view.content.height - 0.5]
-    assert_allclose([x0, y0, x1, y1], expected, rtol=0, atol=1e-9)
+    found = np.sort(view.from_image(edges), axis=0)
+    expected = [[-0.5, -0.5], [view.content.width - 0.5, view.content.height - 0.5]]
+    assert_allclose(found, expected, rtol=0, atol=1e-9)
+
+
+@given(turns=TURNS, scale=st.sampled_from([1, 2]), seed=st.integers(0, 2**32 - 1))
+@settings(max_examples=50, deadline=None)
+def test_a_turned_view_is_the_view_of_the_turned_picture(turns, scale, seed):
+    """One grey level a pixel: each pixel of the view has the level of the stored pixel that it comes from."""
+    stored = np.random.default_rng(seed).permutation(6 * 8).reshape(6, 8).astype(np.uint8)
+    view = View.fit(Box(1, 2, 8, 5), long_side=7 * scale, multiple=4, turns=turns)
+    upright = np.ascontiguousarray(np.rot90(stored[2:5, 1:8], turns))
+    expected = View.fit(Box.whole(Size(*upright.shape[::-1])), long_side=7 * scale, multiple=4)
+    assert (view.content, view.padded) == (expected.content, expected.padded)
+    assert_array_equal(view.render(stored), expected.render(upright))
+    if scale == 1:
+        y, x = np.indices(upright.shape).reshape(2, -1)
+        x0, y0 = view.to_image(np.column_stack([x, y])).astype(int).T
+        assert_array_equal(stored[y0, x0], upright.ravel())
 
 
 def test_known_points_map_to_known_points():

@@ -40,7 +40,7 @@ USERS = (
         "sparse/0/cameras.bin",
     ),
     *("database.db-wal", "work/journal.sqlite", "work/journal.lock", "images/0/1.png", "a/models/0/cameras.bin"),
-    *("notes.txt", "a/b/c/d.txt", "models", "work", "datasets.json", "dense/fused.ply", "0/database.db"),
+    *("notes.txt", "a/b/c/d.txt", "models", "work", "results.json", "dense/fused.ply", "0/database.db"),
 )
 MARKS = ("", "[]]", "null", '"a"', "\0" * 100)
 
@@ -57,7 +57,7 @@ def of_the_user(name: str, text: str = "mine") -> Callable[[Path], None]:
 
 def damaged_mark(text: str) -> Callable[[Path], None]:
     def make(room: Path) -> None:
-        of_the_user("work/datasets.json", text)(room)
+        of_the_user("work/results.json", text)(room)
         (room / "P" / "database.db").write_text("mine")
 
     return make
@@ -248,8 +248,8 @@ CHANGES: dict[str, Callable[[Path], object]] = {
     "no models": lambda out: shutil.rmtree(out / "o/models", ignore_errors=True),
     "no tables": lambda out: (out / "o/cameras.csv").unlink(),
     "no journal": lambda out: (out / WORK / "journal.sqlite").unlink(),
-    "no mark": lambda out: (out / WORK / "datasets.json").unlink(),
-    "a mark of noise": lambda out: (out / WORK / "datasets.json").write_bytes(os.urandom(99)),
+    "no mark": lambda out: (out / WORK / "results.json").unlink(),
+    "a mark of noise": lambda out: (out / WORK / "results.json").write_bytes(os.urandom(99)),
     "a journal of noise": lambda out: (out / WORK / "journal.sqlite").write_bytes(os.urandom(9999)),
     "no journal of the images": lambda out: shutil.rmtree(out / WORK / "images"),
     "a journal of the images of noise": lambda out: (out / WORK / "images/journal.sqlite").write_bytes(

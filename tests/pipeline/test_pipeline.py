@@ -9,14 +9,16 @@ from functools import cache
 import cv2
 import numpy as np
 import pytest
+from exif_files import set_exif
 from numpy.testing import assert_allclose, assert_array_equal
 from pictures import same
 from rectified import SWEEP, RectifiedMatcher
 from sklearn.datasets import load_sample_image
 
+from mkpc_kaggle.data.exif import TURNS
 from mkpc_kaggle.data.images import Image
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.geometry.coordinates import Box, Size
+from mkpc_kaggle.geometry.coordinates import Box, Size, View
 from mkpc_kaggle.geometry.focal_prior import FocalConfig, FocalPrior, estimate_with_prior
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import ModelKind
@@ -186,6 +188,28 @@ def test_paths_arrays_and_images_give_the_same(tmp_path):
         matcher(pair()[0] / 255, pair()[1])
     with pytest.raises(UserError, match=r"none\.png: no such file"):
         matcher(tmp_path / "none.png", pair()[1])
+
+
+@pytest.mark.parametrize("orientations", [(6, 1), (3, 8)])
+def test_a_photograph_on_its_side_gives_the_same_matches_in_its_stored_pixels(tmp_path, orientations):
+    paths, views = [], []
+    for number, (upright, orientation) in enumerate(zip(pair(), orientations, strict=True)):
+        paths.append(tmp_path / f"{number}.png")
+        stored = np.rot90(upright, -TURNS.get(orientation, 0))
+        cv2.imwrite(str(paths[-1]), stored[..., ::-1])
+        set_exif(paths[-1], orientation)
+        size = Size(*stored.shape[1::-1])
+        views.append(View.fit(Box.whole(size), long_side=max(SIZE), turns=TURNS.get(orientation, 0)))
+    found, expected = TwoStageMatcher(TWO_STAGES)(*paths), two_stage_match()
+    first, second = (
+        Matches(*(view.from_image(xy) for view, xy in zip(views, (m.points0, m.points1), strict=True)), m.scores)
+        for m in (result.matches for result in found.results)
+    )
+    assert_allclose(first.points0, expected.results[0].matches.points0, atol=1e-3)
+    assert_allclose(first.points1, expected.results[0].matches.points1, atol=1e-3)
+    assert len(second) > 100
+    assert np.mean(errors(second) < 2) > 0.9
+    assert found.estimate.inlier_count > 100
 
 
 def test_at_most_so_many_matches_are_kept_and_they_are_the_surest():

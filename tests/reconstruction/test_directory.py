@@ -1,5 +1,6 @@
-"""What lies in the directory of results: ours, in the way, or of datasets that are gone."""
+"""The output directory: what is refused, what is removed, and what is left alone."""
 
+import json
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -10,56 +11,34 @@ import pytest
 
 from mkpc_kaggle.data.outputs import require_directory_apart
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.reconstruction.directory import claim, settle
+from mkpc_kaggle.reconstruction.directory import MARK, output_directory
 from mkpc_kaggle.scene import colmap
 from mkpc_kaggle.scene.export import MODEL_FILES
 
 FILES = ["database.db", *(f"models/0/{name}" for name in MODEL_FILES)]
+TABLES = ["cameras.csv", "report.html", "submission.csv"]
 
 
-def results(folder: Path, text: str = "made") -> None:
-    for name in FILES:
+def write(folder: Path, names: list[str], text: str = "made") -> None:
+    for name in names:
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text(text)
 
 
-def files_of(folder: Path) -> list[str]:
-    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if not path.is_dir())
+def files_of(folder: Path) -> dict[str, str]:
+    paths = [path for path in folder.rglob("*") if path.is_file() and path.name != "results.json"]
+    return {path.relative_to(folder).as_posix(): path.read_text() for path in sorted(paths)}
 
 
-def test_a_project_of_the_user_is_refused_and_stays(tmp_path):
-    results(tmp_path / "out", "the user's")
-    (tmp_path / "out" / "submission.csv").write_text("the user's")
-    before = files_of(tmp_path)
-    with pytest.raises(UserError, match=r"out/database.db is in the way, it was not made by this command"):
-        claim(tmp_path / "out", ["."])
-    assert files_of(tmp_path) == before
-
-
-def test_a_directory_with_empty_folders_is_empty(tmp_path):
-    (tmp_path / "out" / "work").mkdir(parents=True)
-    assert claim(tmp_path / "out", ["."]) == []
-
-
-def owned(out: Path) -> None:
-    """A directory with results of two datasets and tables."""
-    settle(out, ["a", "b"], claim(out, ["a", "b"]))
-    for name in ("a", "b"):
-        results(out / name)
-    for name in ("cameras.csv", "submission.csv", "report.html", "work/journal.sqlite"):
-        (out / name).write_text("made")
-
-
-def test_results_of_an_earlier_run_are_ours_and_those_of_a_dataset_that_is_gone_are_removed(tmp_path):
-    out = tmp_path / "out"
-    owned(out)
-    assert claim(out, ["a", "b"]) == []
-    gone = claim(out, ["a", "c/d"])
-    assert gone == ["b"]
-    settle(out, ["a", "c/d"], gone)
-    assert not (out / "b").exists()
-    assert files_of(out / "a") == sorted(FILES)
-    assert claim(out, ["a", "c/d"]) == []
+@pytest.fixture
+def out(tmp_path: Path) -> Path:
+    """What a run has made of two datasets; and an image of the user's next to it."""
+    with output_directory(tmp_path / "out", "ab", "imc2025"):
+        for name in "ab":
+            write(tmp_path / "out" / name, FILES)
+        write(tmp_path / "out", [*TABLES, "work/journal.sqlite"])
+    write(tmp_path / "images", ["a.png"], "image")
+    return tmp_path / "out"
 
 
 def link(target: str) -> Callable[[Path], object]:
@@ -67,48 +46,90 @@ def link(target: str) -> Callable[[Path], object]:
 
 
 IN_THE_WAY: dict[str, tuple[str, Callable[[Path], object]]] = {
-    "a file of the user's": ("notes.txt", Path.touch),
-    "a backup of a dataset": ("a.old", results),
-    "a model that was exported": ("a/models/0/points.ply", Path.touch),
-    "a database that is open": ("a/database.db-wal", Path.touch),
-    "a link to the images for work": ("work", link("../images")),
-    "a link to the images for models": ("a/models", link("../../images")),
+    "an exported model": ("a/models/0/points.ply", Path.touch),
+    "an open database": ("a/database.db-wal", Path.touch),
+    "a dataset's file that no run has made": ("c/database.db", lambda path: write(path.parent, [path.name])),
+    "a link for work": ("work", link("../images")),
     "a link for a dataset": ("b", link("../images")),
-    "a link for the journal": ("work/journal.sqlite", link("../../images/a.png")),
-    "a link for a table": ("cameras.csv", link("../images/a.png")),
-    "a link for a database": ("a/database.db", link("../../images/a.png")),
-    "a directory for a table": ("cameras.csv", Path.mkdir),
-    "a directory for a database": ("a/database.db", Path.mkdir),
-    "a file for models": ("a/models", Path.touch),
     "a pipe for a table": ("report.html", os.mkfifo),
 }
 
 
 @pytest.mark.parametrize("name", IN_THE_WAY)
-def test_what_no_run_has_made_is_refused_by_its_name(tmp_path, name):
-    out, (place, make) = tmp_path / "out", IN_THE_WAY[name]
-    (tmp_path / "images").mkdir()
-    (tmp_path / "images" / "a.png").write_text("image")
-    owned(out)
+def test_a_link_or_a_file_of_the_users_in_the_place_of_a_result_is_refused(tmp_path, out, name):
+    place, make = IN_THE_WAY[name]
     if (out / place).exists():
         (out / place).rename(tmp_path / "former")
     make(out / place)
     before = files_of(tmp_path)
-    named = place.rstrip("/") if name != "a link to the images for work" else "work|cameras.csv|database.db"
-    with pytest.raises(UserError, match=f"({named}).* is in the way"):
-        claim(out, ["a", "b"])
+    told = "is in the way" if place == "work" else f"{place}.* is in the way"
+    with pytest.raises(UserError, match=told), output_directory(out, "abc", "imc2025"):
+        raise AssertionError
     assert files_of(tmp_path) == before
 
 
-def test_a_file_in_the_place_of_the_directory_is_refused(tmp_path):
-    (tmp_path / "out").write_text("a file")
-    with pytest.raises(UserError, match="Not a directory"):
-        claim(tmp_path / "out", ["."])
+@pytest.mark.parametrize("name", ["notes.txt", "work/journal.sqlite", "link"])
+def test_a_directory_that_is_neither_empty_nor_ours_is_refused(tmp_path, name):
+    write(tmp_path / "out", [name])
+    if name == "link":
+        (tmp_path / "out" / "link").unlink()
+        (tmp_path / "out" / "link").symlink_to(tmp_path)
+    told = rf"out/{name} is in the way, it was not made by this command"
+    with pytest.raises(UserError, match=told), output_directory(tmp_path / "out", ["."]):
+        raise AssertionError
 
 
-def test_a_place_that_cannot_be_written_is_found_before_any_work(tmp_path):
-    with pytest.raises(UserError, match="cannot be written"):
-        claim(tmp_path / "out", ["a" * 200 + "/" + "b" * 300])
+def test_results_that_only_earlier_runs_made_are_removed_when_the_run_has_ended(out, capsys):
+    write(out, ["notes.txt", "a/notes.txt", ".new-1/mine"], "the user's")
+    with output_directory(out, ["a"]):
+        assert (out / "b" / "database.db").exists()
+        write(out / "a", FILES, "made again")
+    found = files_of(out)
+    assert {name for name in found if name.startswith("b") or name == "submission.csv"} == set()
+    assert {found[name] for name in ("notes.txt", "a/notes.txt", ".new-1/mine")} == {"the user's"}
+    assert not (out / "b").exists()
+    assert f"{out / 'submission.csv'} was removed" in capsys.readouterr().err
+    with output_directory(out, "c"):
+        pass
+    assert sorted(path.name for path in (out / "a").iterdir()) == ["notes.txt"], "of both runs"
+
+
+def test_a_result_that_the_user_has_changed_is_not_removed(out):
+    changed = ["submission.csv", "b/models/0/images.bin"]
+    write(out, changed, "the user's")
+    for datasets, form in (("ab", "imc2025"), ("a", None), ("a", None)):
+        with output_directory(out, datasets, form):
+            pass
+    found = files_of(out)
+    assert {found[name] for name in changed} == {"the user's"}
+    assert "b/database.db" not in found
+
+
+def test_a_run_that_was_killed_is_resumed_and_what_it_made_is_not_in_the_way(tmp_path):
+    with pytest.raises(KeyboardInterrupt), output_directory(tmp_path / "out", ["."]):
+        write(tmp_path / "out", [*FILES, "cameras.csv"])
+        raise KeyboardInterrupt
+    with output_directory(tmp_path / "out", ["."]):
+        pass
+    assert "database.db" in files_of(tmp_path / "out")
+
+
+@pytest.mark.parametrize("name", ["../images/database.db", "{}/images/database.db", "a/../../images/database.db"])
+def test_a_name_in_a_mark_never_leads_out_of_the_directory(tmp_path, out, name):
+    write(tmp_path / "images", ["database.db"])
+    marked = json.loads((out / MARK).read_text())
+    (out / MARK).write_text(json.dumps(marked | {name.format(tmp_path): marked["a/database.db"]}))
+    before = files_of(tmp_path)
+    with output_directory(out, "ab", "imc2025"):
+        pass
+    assert files_of(tmp_path) == before
+
+
+@pytest.mark.parametrize(("out", "datasets"), [("file", ["."]), ("out", ["a" * 200 + "/" + "b" * 300])])
+def test_a_directory_that_cannot_be_written_is_found_before_any_work(tmp_path, out, datasets):
+    (tmp_path / "file").touch()
+    with pytest.raises(UserError, match="cannot be written"), output_directory(tmp_path / out, datasets):
+        raise AssertionError
 
 
 @pytest.mark.parametrize("place", ["out/cameras.csv", "out", "out/a/pairs.txt"])
@@ -126,7 +147,7 @@ def test_nothing_that_is_read_lies_in_the_directory_of_results(tmp_path, monkeyp
 
 def test_former_files_stay_until_the_new_ones_are_whole(tmp_path, monkeypatch):
     """A disk that is full while models are written costs neither the former models nor the former database."""
-    results(tmp_path, "former")
+    write(tmp_path, FILES, "former")
 
     def write_half(folder: Path) -> None:
         (folder / "cameras.bin").write_text("half")
@@ -143,20 +164,8 @@ def test_former_files_stay_until_the_new_ones_are_whole(tmp_path, monkeypatch):
     monkeypatch.setattr(colmap, "_fill", lambda *_: None)
     with pytest.raises(OSError, match="No space"):
         write_files(write_half)
-    assert files_of(tmp_path) == sorted(FILES)
-    assert {path.read_text() for path in tmp_path.rglob("*") if path.is_file()} == {"former"}
+    assert files_of(tmp_path) == dict.fromkeys(FILES, "former")
     write_files(write_whole)
-    assert files_of(tmp_path) == sorted(FILES)
     assert {(tmp_path / "models" / "0" / name).read_text() for name in MODEL_FILES} == {"new"}
     with pycolmap.Database.open(str(tmp_path / "database.db")) as database:
         assert database.num_images() == 0
-
-
-def test_models_that_were_being_replaced_come_back(tmp_path):
-    """A run that was killed between its two steps has the former models beside their place."""
-    out = tmp_path / "out"
-    owned(out)
-    (out / "a" / ".new-1234").mkdir()
-    (out / "a" / "models").rename(out / "a" / ".new-1234" / "former")
-    settle(out, ["a", "b"], claim(out, ["a", "b"]))
-    assert set(FILES) <= set(files_of(out / "a"))

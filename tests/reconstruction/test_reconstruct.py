@@ -18,6 +18,7 @@ import numpy as np
 import pycolmap
 import pytest
 from exif_files import set_exif
+from pair_lists import turned_camera
 from rectified import Seen, flat, number_of
 from sklearn.datasets import load_sample_image
 from synthetic import SyntheticMatcher
@@ -26,7 +27,7 @@ from benchmarks.synthetic_scene import SIZE, SyntheticScene, synthetic_scene
 from mkpc_kaggle import reconstruct
 from mkpc_kaggle.cli import main
 from mkpc_kaggle.data import images
-from mkpc_kaggle.data.exif import Exif
+from mkpc_kaggle.data.exif import TURNS
 from mkpc_kaggle.data.images import Image, Unreadable, read_image
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.engine import Ending
@@ -44,7 +45,6 @@ from mkpc_kaggle.reconstruction.outputs import Cameras, camera_rows, submission_
 from mkpc_kaggle.reconstruction.run import FolderResult, for_cameras, reconstruct_folder
 from mkpc_kaggle.reporting.report import report_page
 from mkpc_kaggle.reporting.run_log import read_log
-from mkpc_kaggle.scene.export import turned_back
 
 RECIPE = for_cameras(Recipe((Unit(1, "synthetic", SIZE.width),)))
 FIRST, SECOND, OTHERS = 6, 4, 1  # images of two scenes, and of none
@@ -70,9 +70,7 @@ class MixedMatcher(SyntheticMatcher):
             if start <= first < second < start + count:
                 names = [f"{first - start:04}", f"{second - start:04}"]
                 (found,) = (p.matches for p in scene.pairs if [p.image0.name, p.image1.name] == names)
-                return Matches(
-                    seen0.view.from_image(found.points0), seen1.view.from_image(found.points1), found.scores
-                )
+                return found  # views are upright and as large as the images
         rng = np.random.default_rng([first, second])
         return Matches(rng.uniform(10, 500, (25, 2)), rng.uniform(10, 500, (25, 2)), np.ones(25))
 
@@ -165,7 +163,7 @@ def write_from_phone(folder: Path) -> Path:
     write_flat(folder, FIRST)
     for number, orientation in enumerate(ORIENTATIONS):
         path = folder / f"{number:02}.png"
-        cv2.imwrite(str(path), np.rot90(flat(number, SIZE), -Exif(orientation).quarters))
+        cv2.imwrite(str(path), np.rot90(flat(number, SIZE), -TURNS.get(orientation, 0)))
         set_exif(path, orientation)
     return folder
 
@@ -188,8 +186,8 @@ def test_colmap_goes_on_with_photographs_that_exif_turns(tmp_path):
     assert undistorted == sizes
     truth = MixedMatcher().scenes[0].cameras
     for number, record in enumerate(cameras(result).values()):
-        quarters = Exif(ORIENTATIONS[number]).quarters
-        expected = truth[f"{number:04}"].rotated_90(-quarters, SIZE).R @ truth["0000"].R.T
+        stored = turned_camera(truth[f"{number:04}"], -TURNS.get(ORIENTATIONS[number], 0), SIZE)
+        expected = stored.R @ truth["0000"].R.T
         np.testing.assert_allclose(record.camera.R @ cameras(result)["00.png"].camera.R.T, expected, atol=0.01)
 
 
@@ -419,16 +417,6 @@ def test_what_was_turned_comes_back_in_the_pixels_of_its_file(tmp_path, monkeypa
     assert (image.camera.width, image.camera.height) == (SIZE.height, SIZE.width)
 
 
-@pytest.mark.parametrize("times", range(4))
-def test_points_of_a_turned_picture_go_back(times):
-    picture = np.arange(6 * 4, dtype=np.uint8).reshape(6, 4)
-    shown = np.rot90(picture, times)
-    y, x = np.indices(shown.shape).reshape(2, -1)
-    points = turned_back(np.column_stack([x, y]).astype(np.float32), times, shown.shape[::-1])  # type: ignore[arg-type]
-    x0, y0 = points.astype(int).T
-    np.testing.assert_array_equal(picture[y0, x0], shown.ravel())
-
-
 def test_a_recipe_for_cameras_matches_no_pair_that_was_not_asked_for():
     recipe = for_cameras(replace(RECIPE, scene=None))
     assert recipe.scene is not None
@@ -448,21 +436,6 @@ def test_the_tables_are_there_at_first_and_again_after_each_scene(tmp_path):
     run(tmp_path / "images", tmp_path / "out", publish=publish)
     steps = list(dict.fromkeys(tuple(each.values()) for each in published))
     assert steps in ([(0, 0), (5, 0), (5, 5)], [(0, 0), (0, 5), (5, 5)])
-
-
-def test_a_dataset_that_is_gone_takes_its_results_with_it(tmp_path, capsys):
-    root, out = tmp_path / "images", tmp_path / "out"
-    for name in ("a", "b"):
-        write_flat(root / name, 4)
-    run(root, out)
-    (root / "b").rename(tmp_path / "elsewhere")
-    with pytest.raises(UserError, match=r"belongs to another run \(different images\)"):
-        run(root, out)
-    assert (out / "b" / "models" / "0").is_dir()
-    run(root, out, fresh=True)
-    assert f"the images of b are gone, and so are its results in {out / 'b'}" in capsys.readouterr().err
-    assert not (out / "b").exists()
-    assert (out / "a" / "models" / "0").is_dir()
 
 
 def test_orientations_go_on_where_a_run_was_cut_off(tmp_path):

@@ -112,12 +112,12 @@ def test_cameras_are_seen_from_above_and_from_the_side_with_the_points_before_th
     assert seen.get_offsets()[:, 1].max() == 7, "up is up"
 
 
-def test_a_strip_shows_both_images_at_one_height_with_matches_where_they_are():
+def test_a_strip_shows_both_images_upright_at_one_height_with_matches_where_they_are():
     images = (
-        Image.of_array(np.full((100, 200, 3), 250, np.uint8)),
+        Image.of_array(np.full((200, 100, 3), 250, np.uint8)).turned(1),
         Image.of_array(np.full((300, 300, 3), 5, np.uint8)),
     )
-    matches = Matches(np.array([[9.5, 9.5]]), np.array([[149.5, 149.5]]), np.ones(1))
+    matches = Matches(np.array([[89.5, 9.5]]), np.array([[149.5, 149.5]]), np.ones(1))
     found = Estimate(ModelKind.F, np.eye(3), np.array([True]))
     figure = draw_strip(images, PairMatch((UnitResult(UNITS[0], matches),), None, found))
     drawn = cv2.imdecode(np.frombuffer(encode(figure, "jpeg"), np.uint8), cv2.IMREAD_COLOR)

@@ -7,6 +7,18 @@ import numpy as np
 
 from mkpc_kaggle.data.competition import TrainScene, TruePair
 from mkpc_kaggle.geometry.cameras import Camera, relative_pose
+from mkpc_kaggle.geometry.coordinates import Size
+
+
+def turned_camera(camera: Camera, turns: int, size: Size) -> Camera:
+    """The camera of ``np.rot90(picture, turns)``, where ``camera`` took a picture of ``size``."""
+    quarter = np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])
+    width, height = size
+    for _ in range(turns % 4):
+        moved = np.array([[1.0, 0, 0], [0, 1, width - 1], [0, 0, 1]]) @ quarter
+        camera = Camera(moved @ camera.K @ quarter.T, quarter @ camera.R, quarter @ camera.t)
+        width, height = height, width
+    return camera
 
 
 def line_of(names: tuple[str, str], cameras: tuple[Camera, Camera], turns: tuple[int, int] = (0, 0)) -> str:

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mkpc_kaggle.data.images import Image
+from mkpc_kaggle.geometry.coordinates import Box, View
 from mkpc_kaggle.geometry.critical_region import CriticalRegion, MkpcConfig, find_clusters
 from mkpc_kaggle.pipeline.pair import PairMatch
 from mkpc_kaggle.reporting.figures import style
@@ -35,7 +36,7 @@ def draw_pair(image0: Image, image1: Image, match: PairMatch, config: MkpcConfig
 
 def draw_strip(images: tuple[Image, Image], match: PairMatch) -> "Figure":
     """The matches and the critical regions without text, on at most :data:`MAX_STRIP_PX` pixels."""
-    aspect = sum(image.size.width / image.size.height for image in images)
+    aspect = sum(view.content.width / view.content.height for view in map(_upright, images))
     height = min(STRIP_HEIGHT_PX, sqrt(MAX_STRIP_PX / aspect)) / style.DPI
     figure = new_figure(aspect * height, height)
     figure.set_layout_engine("none")
@@ -53,9 +54,10 @@ def draw_matches(axes: "Axes", images: tuple[Image, Image], match: PairMatch) ->
     ends: list[NDArray[np.float64]] = []
     left = 0.0
     for side, points in enumerate((match.matches.points0, match.matches.points1)):
-        width, height = images[side].size
+        view = _upright(images[side])
+        width, height = view.content
         _show(axes, images[side], match.regions and match.regions[side], 1 / height, left)
-        ends.append((points + 0.5) / height + (left, 0))
+        ends.append((view.from_image(points) + 0.5) / height + (left, 0))
         left += width / height
         axes.axvline(left, color="white", linewidth=4, zorder=0.5)
     axes.set(xlim=(0, left), ylim=(1, 0))
@@ -79,11 +81,11 @@ def _draw_clusters(axes: "Axes", image: Image, match: PairMatch, config: MkpcCon
     stage1 = match.matches[match.in_stage(1)]
     points = stage1.points1 if side else stage1.points0
     clusters = find_clusters(points, image.size, config)
-    points = points + 0.5  # from the centres of pixels to their edges
-    x, y = points[~clusters.in_kept].T
+    shown = _upright(image).from_image(points) + 0.5  # from the centres of pixels to their edges
+    x, y = shown[~clusters.in_kept].T
     axes.scatter(x, y, s=8, color=DROPPED, marker="x", linewidths=0.7)
     for rank, label in enumerate(clusters.kept):
-        x, y = points[clusters.labels == label].T
+        x, y = shown[clusters.labels == label].T
         axes.scatter(x, y, s=8, color=COLOURS[rank % len(COLOURS)], linewidths=0)
     share = region.box.area / (image.size.width * image.size.height)
     axes.set_title(
@@ -96,12 +98,18 @@ def _draw_clusters(axes: "Axes", image: Image, match: PairMatch, config: MkpcCon
 def _show(
     axes: "Axes", image: Image, region: CriticalRegion | None, scale: float = 1.0, left: float = 0.0
 ) -> None:
-    """The image and its critical region; the image's corner is at (left, 0), a pixel's side is ``scale`` long."""
-    from matplotlib.patches import Rectangle
+    """Draw an image, upright, and its critical region, its corner at (left, 0) and its pixels ``scale`` wide."""
+    from matplotlib.patches import Polygon
 
-    width, height = image.size
-    axes.imshow(image.pixels, extent=(left, left + scale * width, scale * height, 0))
+    view = _upright(image)
+    width, height = view.content
+    axes.imshow(view.render(image.pixels), extent=(left, left + scale * width, scale * height, 0))
     if region is not None:
-        corner = left + scale * region.box.left, scale * region.box.top
-        sides = (scale * side for side in region.box.size)
-        axes.add_patch(Rectangle(corner, *sides, fill=False, edgecolor=style.REGION, linewidth=2.5))
+        (x0, y0), (x1, y1) = (region.box.left, region.box.top), (region.box.right, region.box.bottom)
+        corners = view.from_image(np.array([(x0, y0), (x0, y1), (x1, y1), (x1, y0)]) - 0.5) + 0.5
+        axes.add_patch(Polygon(scale * corners + (left, 0), fill=False, edgecolor=style.REGION, linewidth=2.5))
+
+
+def _upright(image: Image) -> View:
+    """Return the view of the whole image at its own size."""
+    return View.fit(Box.whole(image.size), long_side=max(image.size), turns=image.turns)
