@@ -56,14 +56,6 @@ class Training(StrEnum):
     INDOOR = "indoor"
 
 
-class Refine(StrEnum):
-    """Whether matched keypoints are moved by fractions of a pixel, see :mod:`mkpc_kaggle.matchers.subpixel`."""
-
-    IF_FOUND = "if-found"  # where the weights for it are found
-    ALWAYS = "always"  # without these weights the matcher is unavailable
-    NEVER = "never"
-
-
 @dataclass(frozen=True)
 class NoOptions:
     """For a matcher without settings."""
@@ -80,20 +72,14 @@ class MatcherSpec:
     multiple: int = 1  # both sides of a picture are padded to a multiple of it
     licences: tuple[str, ...] = ()  # tags of the weights
     slots: tuple[str, ...] = ()  # the manifest's slots that it needs; ``{name}`` stands for that option's value
-    refiner: str = ""  # the slot of the network that refines its keypoints, as its option ``refine`` says
 
     def slots_for(self, options: Any) -> tuple[str, ...]:
-        """The slots of the manifest that a matcher with these options cannot do without."""
-        needed = tuple(slot.format_map(vars(options)) for slot in self.slots)
-        return (*needed, self.refiner) if self.refiner and options.refine is Refine.ALWAYS else needed
-
-    def wanted_for(self, options: Any) -> tuple[str, ...]:
-        """The slots that a matcher with these options uses if they are found."""
-        return (self.refiner,) if self.refiner and options.refine is Refine.IF_FOUND else ()
+        """Return the slots of the manifest that a matcher with these options needs."""
+        return tuple(slot.format_map(vars(options)) for slot in self.slots)
 
     def uses(self, slot: str) -> bool:
-        """Whether some training or variant uses the slot."""
-        return slot == self.refiner or any(fnmatch(slot, re.sub(r"{\w+}", "*", own)) for own in self.slots)
+        """Return whether any training or variant uses the slot."""
+        return any(fnmatch(slot, re.sub(r"{\w+}", "*", own)) for own in self.slots)
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,8 +13,7 @@ from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import MatcherSpec, PairwiseMatcher, Placement
 from mkpc_kaggle.matchers.dtypes import check_finite
 from mkpc_kaggle.matchers.networks.placement import autocast
-from mkpc_kaggle.matchers.sparse import KeypointEncoder, Keypoints
-from mkpc_kaggle.matchers.subpixel import Refiner
+from mkpc_kaggle.matchers.sparse import KeypointEncoder, Keypoints, matches_of
 from mkpc_kaggle.weights import WeightStore, load_into
 
 
@@ -28,20 +27,12 @@ class LightGlueOptions:
 
 
 class LightGlueMatcher(PairwiseMatcher[Keypoints]):
-    """A match's score is LightGlue's. With a ``refiner`` its points are refined; the encoder adds patches then."""
+    """A match's score is LightGlue's."""
 
-    def __init__(
-        self,
-        spec: MatcherSpec,
-        encoder: KeypointEncoder,
-        glue: LightGlue,
-        placement: Placement,
-        refiner: Refiner | None = None,
-    ) -> None:
+    def __init__(self, spec: MatcherSpec, encoder: KeypointEncoder, glue: LightGlue, placement: Placement) -> None:
         self.spec = spec
         self.placement = placement
         self.encode = encoder.encode
-        self._refiner = refiner
         self._glue = glue.eval().to(placement.device)
         # Only its layers, into which float32 goes and of which, as a sum with it, float32 comes. Positions of
         # keypoints and scores stay float32: LightGlue itself turns off the autocast around it.
@@ -54,11 +45,7 @@ class LightGlueMatcher(PairwiseMatcher[Keypoints]):
         found = self._glue({"image0": _glue_input(keypoints0), "image1": _glue_input(keypoints1)})
         check_finite(f"scores of {self.spec.name}", found["log_assignment"])
         index0, index1 = found["matches"][0].T
-        if self._refiner is None:
-            points0, points1 = keypoints0.points[index0], keypoints1.points[index1]
-        else:
-            points0, points1 = self._refiner.refined(keypoints0, keypoints1, index0, index1)
-        return Matches(points0.cpu().numpy(), points1.cpu().numpy(), found["scores"][0].cpu().numpy())
+        return matches_of(keypoints0.points, keypoints1.points, index0, index1, found["scores"][0])
 
 
 def _glue_input(keypoints: Keypoints) -> dict[str, Tensor]:

@@ -115,25 +115,10 @@ def options_of(recipe: Recipe, name: str) -> Any:
 
 
 def slots_of(recipe: Recipe, own: Container[str] = ()) -> tuple[str, ...]:
-    """The slots, each once, of the recipe's matchers that can be imported here; the user's ``own`` need none.
-
-    Slots that a matcher uses only if they are found are among them.
-    """
+    """Return the slots, each once, of the recipe's matchers that can be imported here; ``own`` ones need none."""
     slots: list[str] = []
     for name in recipe.matcher_names:
         with suppress(UnusableError):
             if name not in own:
-                spec, options = spec_of(name, f"recipe {recipe.name!r}"), options_of(recipe, name)
-                slots += (*spec.slots_for(options), *spec.wanted_for(options))
+                slots += spec_of(name, f"recipe {recipe.name!r}").slots_for(options_of(recipe, name))
     return tuple(dict.fromkeys(slots))
-
-
-def unrefined(recipe: Recipe, store: WeightStore, own: Container[str] = ()) -> tuple[str, ...]:
-    """The matchers whose keypoints stay as detected since the weights that refine them are not found."""
-    return tuple(
-        name
-        for name in recipe.matcher_names
-        if name not in own
-        for slot in spec_of(name, f"recipe {recipe.name!r}").wanted_for(options_of(recipe, name))
-        if store.find(slot) is None
-    )

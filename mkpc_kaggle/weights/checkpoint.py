@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     import torch
     from torch import nn
 
-TENSORS_UNDER = ("state_dict", "extractor", "model")  # the first that a checkpoint has
+TENSORS_UNDER = ("state_dict", "extractor")  # the first that a checkpoint has
 MAX_EXPANSION = 4  # bytes of tensors for each byte of the file: some tensors share their bytes
 
 
@@ -32,8 +32,8 @@ def load_tensors(path: Path) -> "dict[str, torch.Tensor]":
     """Tensors by name, on the CPU, from a safetensors file or a torch checkpoint; nothing in the file is executed.
 
     ``path`` may be the directory into which a torch checkpoint was unpacked (``NAME/NAME`` on Kaggle).
-    A training checkpoint has its tensors under ``state_dict``, DISK's under ``extractor``, Keypt2Subpx's under
-    ``model``; its other entries are left out. Raises :class:`UserError` if the file cannot be read, if an entry is
+    A training checkpoint has its tensors under ``state_dict``, DISK's under ``extractor``; its other entries are
+    left out. Raises :class:`UserError` if the file cannot be read, if an entry is
     not a dense tensor with a name, or if the tensors have many more bytes than the file.
     """
     try:

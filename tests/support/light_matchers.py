@@ -34,7 +34,6 @@ from mkpc_kaggle.matchers.lightglue import LightGlueMatcher, light_glue
 from mkpc_kaggle.matchers.networks.aliked import Aliked
 from mkpc_kaggle.matchers.networks.aspanformer import AspanFormer
 from mkpc_kaggle.matchers.networks.dkm import DKM
-from mkpc_kaggle.matchers.networks.keypt2subpx import Keypt2Subpx
 from mkpc_kaggle.matchers.networks.loftr import Loftr
 from mkpc_kaggle.matchers.networks.loma import Loma, Variant
 from mkpc_kaggle.matchers.networks.placement import prepared
@@ -43,7 +42,6 @@ from mkpc_kaggle.matchers.networks.superglue import SuperGlue
 from mkpc_kaggle.matchers.networks.superpoint import SuperPoint
 from mkpc_kaggle.matchers.semi_dense import SemiDenseMatcher
 from mkpc_kaggle.matchers.sparse import KeypointEncoder
-from mkpc_kaggle.matchers.subpixel import Refiner
 from tests.support.standin import filled, narrow_roma, scene
 
 SIZE = Size(96, 64)
@@ -102,11 +100,10 @@ def with_lightglue(
     placement: Placement,
     layers: int,
     threshold: float,
-    refiner: Refiner | None = None,
     **shape: int,
 ) -> LightGlueMatcher:
     glue = kornias("lightglue", light_glue, layers, threshold, **shape)
-    return LightGlueMatcher(spec, encoder, glue, placement, refiner)
+    return LightGlueMatcher(spec, encoder, glue, placement)
 
 
 def aliked_lightglue_matcher(
@@ -128,17 +125,12 @@ def make_xfeat() -> nn.Module:
 
 
 def xfeat_lighterglue_matcher(
-    placement: Placement, keypoints: int = 200, layers: int = 2, threshold: float = 0.0, refine: bool = False
+    placement: Placement, keypoints: int = 200, layers: int = 2, threshold: float = 0.0
 ) -> LightGlueMatcher:
     network = XFeat(top_k=keypoints, detection_threshold=0.0)
     network.net = kornias("xfeat", make_xfeat)
-    refiner = None
-    if refine:
-        refiner = Refiner(
-            kornias("keypt2subpx", Keypt2Subpx, xfeat_lighterglue.DESCRIPTOR_DIM).to(placement.device)
-        )
-    encoder, shape = xfeat_encoder(network, keypoints, placement, refiner), xfeat_lighterglue.SHAPE
-    return with_lightglue(xfeat_lighterglue.SPEC, encoder, placement, layers, threshold, refiner, **shape)
+    encoder, shape = xfeat_encoder(network, keypoints, placement), xfeat_lighterglue.SHAPE
+    return with_lightglue(xfeat_lighterglue.SPEC, encoder, placement, layers, threshold, **shape)
 
 
 MATCHERS: dict[str, Callable[[Placement], Any]] = {
@@ -154,7 +146,6 @@ MATCHERS: dict[str, Callable[[Placement], Any]] = {
     "aliked_lightglue": aliked_lightglue_matcher,
     "disk_lightglue": disk_lightglue_matcher,
     "xfeat_lighterglue": xfeat_lighterglue_matcher,
-    "xfeat_lighterglue, refined": partial(xfeat_lighterglue_matcher, refine=True),
 }
 
 
