@@ -13,7 +13,7 @@ from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import MatcherSpec, PairwiseMatcher, Placement
 from mkpc_kaggle.matchers.dtypes import check_finite
 from mkpc_kaggle.matchers.networks.placement import autocast
-from mkpc_kaggle.matchers.sparse import KeypointEncoder, Keypoints, matches_of
+from mkpc_kaggle.matchers.sparse import Encoder, Keypoints, matches_of
 from mkpc_kaggle.weights import WeightStore, load_into
 
 
@@ -29,7 +29,7 @@ class LightGlueOptions:
 class LightGlueMatcher(PairwiseMatcher[Keypoints]):
     """A match's score is LightGlue's."""
 
-    def __init__(self, spec: MatcherSpec, encoder: KeypointEncoder, glue: LightGlue, placement: Placement) -> None:
+    def __init__(self, spec: MatcherSpec, encoder: Encoder, glue: LightGlue, placement: Placement) -> None:
         self.spec = spec
         self.placement = placement
         self.encode = encoder.encode
@@ -49,11 +49,14 @@ class LightGlueMatcher(PairwiseMatcher[Keypoints]):
 
 
 def _glue_input(keypoints: Keypoints) -> dict[str, Tensor]:
-    return {
+    given = {
         "keypoints": keypoints.points[None],
         "descriptors": keypoints.descriptors[None],
         "image_size": keypoints.points.new_tensor([keypoints.content]),
     }
+    if keypoints.scales is not None and keypoints.orientations is not None:
+        given |= {"scales": keypoints.scales[None], "oris": keypoints.orientations[None]}
+    return given
 
 
 def load_glue(weights: WeightStore, slot: str, threshold: float, **shape: int) -> LightGlue:

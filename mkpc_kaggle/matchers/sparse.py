@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -19,21 +20,30 @@ Detector = Callable[[Tensor], Iterable[tuple[Tensor, Tensor]]]
 
 @dataclass(frozen=True, eq=False)
 class Keypoints:
-    """K keypoints of one picture: ``points`` (K, 2) float32 in view pixels, unit ``descriptors`` (K, D)."""
+    """K keypoints of one picture: ``points`` (K, 2) float32 in view pixels, unit ``descriptors`` (K, D).
+
+    ``scales`` (K,), diameters in view pixels, and ``orientations`` (K,), radians, if the detector has them.
+    """
 
     points: Tensor
     descriptors: Tensor
     content: Size
+    scales: Tensor | None = None
+    orientations: Tensor | None = None
 
     @classmethod
-    def on_content(cls, points: Tensor, descriptors: Tensor, content: Size) -> "Keypoints":
-        """The keypoints on the picture's content, without those on its padding."""
+    def on_content(cls, points: Tensor, descriptors: Tensor, content: Size, *shapes: Tensor) -> "Keypoints":
+        """Return the keypoints on the picture's content, without its padding; ``shapes``: scales, orientations."""
         upper = points.new_tensor(content) - 0.5
         kept = ((points >= -0.5) & (points < upper)).all(dim=1)
-        return cls(points[kept], descriptors[kept], content)
+        return cls(points[kept], descriptors[kept], content, *(shape[kept] for shape in shapes))
 
     def __len__(self) -> int:
         return len(self.points)
+
+
+class Encoder(Protocol):
+    def encode(self, pictures: Sequence[Picture]) -> list[Keypoints]: ...
 
 
 class KeypointEncoder:

@@ -19,6 +19,7 @@ from mkpc_kaggle.matchers.adapters import (
     disk_lightglue,
     loftr,
     quadtree,
+    sift_lightglue,
     xfeat_lighterglue,
 )
 from mkpc_kaggle.matchers.adapters.aliked import AlikedMatcher, AlikedOptions
@@ -41,7 +42,7 @@ from mkpc_kaggle.matchers.networks.quadtree import Quadtree
 from mkpc_kaggle.matchers.networks.superglue import SuperGlue
 from mkpc_kaggle.matchers.networks.superpoint import SuperPoint
 from mkpc_kaggle.matchers.semi_dense import SemiDenseMatcher
-from mkpc_kaggle.matchers.sparse import KeypointEncoder
+from mkpc_kaggle.matchers.sparse import Encoder, KeypointEncoder
 from tests.support.standin import filled, narrow_roma, scene
 
 SIZE = Size(96, 64)
@@ -96,7 +97,7 @@ def aliked_matcher(placement: Placement, keypoints: int = 200) -> AlikedMatcher:
 
 def with_lightglue(
     spec: MatcherSpec,
-    encoder: KeypointEncoder,
+    encoder: Encoder,
     placement: Placement,
     layers: int,
     threshold: float,
@@ -118,6 +119,13 @@ def disk_lightglue_matcher(
 ) -> LightGlueMatcher:
     encoder = disk_encoder(kornias("disk", DISK), keypoints, placement)
     return with_lightglue(disk_lightglue.SPEC, encoder, placement, layers, threshold, input_dim=128)
+
+
+def sift_lightglue_matcher(
+    placement: Placement, keypoints: int = 200, layers: int = 2, threshold: float = 0.0
+) -> LightGlueMatcher:
+    encoder, shape = sift_lightglue.SiftEncoder(keypoints, placement.device), sift_lightglue.SHAPE
+    return with_lightglue(sift_lightglue.SPEC, encoder, placement, layers, threshold, **shape)
 
 
 def make_xfeat() -> nn.Module:
@@ -145,6 +153,7 @@ MATCHERS: dict[str, Callable[[Placement], Any]] = {
     "aliked": aliked_matcher,
     "aliked_lightglue": aliked_lightglue_matcher,
     "disk_lightglue": disk_lightglue_matcher,
+    "sift_lightglue": sift_lightglue_matcher,
     "xfeat_lighterglue": xfeat_lighterglue_matcher,
 }
 
