@@ -1,9 +1,10 @@
-"""DKM as a matcher, from a checkpoint in the public file's own format, with random weights."""
+"""DKM as a matcher, from a checkpoint in the public format, with stand-in weights."""
 
 import numpy as np
 import pytest
 import torch
-from pictures import match_one, picture, same, write_store
+from checkpoints import FILES, store_of
+from pictures import match_one, picture, same
 
 from mkpc_kaggle.matchers.adapters import dkm
 from mkpc_kaggle.matchers.adapters.dkm import DkmMatcher
@@ -13,25 +14,11 @@ from mkpc_kaggle.matchers.networks.dense_warp import DenseFeatures, DenseWarp
 from mkpc_kaggle.matchers.networks.dkm import DKM
 from mkpc_kaggle.matchers.networks.grids import as_grid
 from mkpc_kaggle.matchers.networks.warp_refiner import identity_map
-from mkpc_kaggle.weights import WeightStore
-
-pytestmark = pytest.mark.filterwarnings("ignore:.*is not verified")
 
 
 @pytest.fixture(scope="module")
-def store(tmp_path_factory: pytest.TempPathFactory) -> WeightStore:
-    """Random weights that keep activations, and so the flow, of order 1; for outdoors alone."""
-    torch.manual_seed(0)
-    network = DKM()
-    for parameter in network.parameters():
-        if parameter.ndim > 1:
-            parameter.normal_(std=parameter[0].numel() ** -0.5)
-    states = {"DKMv3_outdoor.pth": network.state_dict()}
-    return write_store(tmp_path_factory.mktemp("weights"), states, [("DKMv3_outdoor.pth", "dkm-outdoor")])
-
-
-@pytest.fixture(scope="module")
-def network(store: WeightStore) -> DKM:
+def network(tmp_path_factory: pytest.TempPathFactory) -> DKM:
+    store = store_of(tmp_path_factory.mktemp("weights"), [file for file in FILES if file.matcher == "dkm"])
     return dkm.load(store, DenseOptions(), Placement())._network
 
 

@@ -2,18 +2,14 @@
 
 import pytest
 import torch
-from checkpoints import dinov2_alone, roma_alone
-from pictures import as_picture, picture, write_store
-from standin import filled, narrow_roma, scene, use_narrow
+from checkpoints import FILES, store_of
+from pictures import as_picture, picture
+from standin import scene, use_narrow
 
-from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.matchers.adapters import roma
 from mkpc_kaggle.matchers.adapters.roma import RomaMatcher, RomaOptions
 from mkpc_kaggle.matchers.contract import Placement, Precision
-from mkpc_kaggle.matchers.networks.roma import stretch
 from mkpc_kaggle.weights import WeightStore
-
-pytestmark = pytest.mark.filterwarnings("ignore:.*is not verified")
 
 
 @pytest.fixture(autouse=True)
@@ -23,11 +19,7 @@ def narrow(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> WeightStore:
-    """Both files, RoMa's own for outdoors alone."""
-    state = filled(narrow_roma(), "roma").state_dict()
-    states = {"roma.pth": roma_alone(state), "dinov2.pth": dinov2_alone(state)}
-    slots = [("roma.pth", "roma-outdoor"), ("dinov2.pth", "dinov2-vitl14")]
-    return write_store(tmp_path_factory.mktemp("weights"), states, slots)
+    return store_of(tmp_path_factory.mktemp("weights"), [file for file in FILES if file.matcher == "roma"])
 
 
 def loaded(store: WeightStore, precision: Precision = Precision.FLOAT32, **options: object) -> RomaMatcher:
@@ -46,12 +38,6 @@ def test_sides_of_the_first_pass_are_multiples_of_14(store: WeightStore) -> None
     (encoded,) = loaded(store, passes=1).encode([picture(86, 130)])
     assert encoded.features.coarse.at(1).shape == (1, 9, 84, 126)
     assert encoded.features.fine is None
-
-
-def test_the_published_sizes_are_a_stretched_unit_of_864() -> None:
-    assert RomaMatcher(None, RomaOptions(), "cpu")._first_size(Size(864, 864)) == (560, 560)
-    assert stretch(torch.Size([560, 560])) == 1.25
-    assert stretch(torch.Size([864, 864])) == pytest.approx(1.25 * 1.542857, rel=1e-6)
 
 
 @pytest.mark.parametrize("precision", [Precision.BFLOAT16, Precision.FLOAT16])

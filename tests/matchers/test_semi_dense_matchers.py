@@ -1,5 +1,6 @@
-"""The semi-dense networks as matchers, from checkpoints wrapped as the public ones are, with random weights."""
+"""The semi-dense networks as matchers, from checkpoints wrapped as the public ones are, with stand-in weights."""
 
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -7,7 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from pictures import picture, write_store
+from checkpoints import PublicFile, store_of, wrapped
+from pictures import picture
 from torch import nn
 
 from mkpc_kaggle.errors import UserError
@@ -17,25 +19,22 @@ from mkpc_kaggle.matchers.networks.aspanformer import AspanFormer
 from mkpc_kaggle.matchers.networks.loftr import Loftr
 from mkpc_kaggle.matchers.networks.position import FIXED_DECAY
 from mkpc_kaggle.matchers.networks.quadtree import Quadtree
-from mkpc_kaggle.matchers.semi_dense import PREFIX, SemiDenseMatcher
+from mkpc_kaggle.matchers.semi_dense import SemiDenseMatcher
 
 MODULES: list[tuple[ModuleType, type[nn.Module]]] = [
     (loftr, Loftr),
     (quadtree, Quadtree),
     (aspanformer, AspanFormer),
 ]
-pytestmark = pytest.mark.filterwarnings("ignore:.*is not verified")
 
 
 def load_standin(
     module: ModuleType, network: type[nn.Module], directory: Path, training: Training, **options: Any
 ) -> Any:
-    """The matcher with random weights, which are there for this training alone."""
-    torch.manual_seed(0)
-    state = network().state_dict() | options.pop("surplus", {})
-    wrapped = {PREFIX + name: tensor for name, tensor in state.items()}
-    slots = [("network.ckpt", f"{module.SPEC.name}-{training}")]
-    store = write_store(directory, {"network.ckpt": {"state_dict": wrapped, "epoch": 3}}, slots)
+    """Return the matcher with stand-in weights for this training alone."""
+    name, surplus = module.SPEC.name, options.pop("surplus", {})
+    layout = partial(lambda more, state: wrapped(state | more), surplus)
+    store = store_of(directory, [PublicFile("x.ckpt", name, f"{name}-{training}", name, network, layout)])
     return module.load(store, module.SPEC.options(threshold=0.0, training=training, **options), Placement())
 
 

@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
@@ -247,12 +246,3 @@ def test_a_damaged_pickle_gives_tensors_or_a_refusal(tmp_path_factory, changes):
         assert "x.pt cannot be read as a checkpoint" in str(refusal)
     else:
         assert all(isinstance(tensor, torch.Tensor) for tensor in loaded.values())
-
-
-def test_a_checkpoint_with_a_numpy_scalar_beside_its_tensors_is_read(tmp_path):
-    optimizer = {"state": {0: {"step": torch.ones(1)}}, "param_groups": [{"lr": 1e-3}]}
-    contents = {"step": 7, "state_dict": TENSORS, "best_acc": np.float64(0.5), "optimizer": optimizer}
-    torch.save(contents, tmp_path / "x.pth")
-    found = load_tensors(tmp_path / "x.pth")
-    assert found.keys() == TENSORS.keys()
-    assert all(torch.equal(found[name], TENSORS[name]) for name in TENSORS)
