@@ -1,4 +1,4 @@
-"""Shared by keypoint matchers: the keypoints of a picture, an encoder, matches from pairs of indices."""
+"""Shared parts of keypoint matchers: keypoints of a picture, encoders, matches from pairs of indices."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -47,7 +47,7 @@ class Encoder(Protocol):
 
 
 class KeypointEncoder:
-    """The keypoints that a detector on this device finds in the content of pictures."""
+    """An encoder that runs a detector on a device."""
 
     def __init__(self, detect: Detector, device: str) -> None:
         self._detect = detect
@@ -65,7 +65,7 @@ class KeypointEncoder:
 def library_encoder(
     network: nn.Module, features: nn.Module, detect: Detector, placement: Placement
 ) -> KeypointEncoder:
-    """The encoder of a network that is not ours; what its part ``features`` returns must be finite."""
+    """Return the encoder of a library's network; the output of its part ``features`` must be finite."""
     network.eval().to(placement.device)
     what = f"features of {type(network).__name__.lower()}"
     features.register_forward_hook(lambda _, inputs, found: check_finite(what, found))
@@ -73,12 +73,12 @@ def library_encoder(
 
 
 def matches_of(points0: Tensor, points1: Tensor, index0: Tensor, index1: Tensor, scores: Tensor) -> Matches:
-    """The matches that pair point ``index0[i]`` of one picture with ``index1[i]`` of the other."""
+    """Return the matches that pair point ``index0[i]`` of one picture with ``index1[i]`` of the other."""
     return Matches(points0[index0].cpu().numpy(), points1[index1].cpu().numpy(), scores.cpu().numpy())
 
 
 def image_batch(pictures: Sequence[Picture], device: str) -> Tensor:
-    """Pictures of one shape as float32 in [0, 1]: (B, 3, H, W) from RGB, (B, 1, H, W) from gray."""
+    """Convert pictures of one shape to float32 in [0, 1]: (B, 3, H, W) for RGB, (B, 1, H, W) for gray."""
     stacked = np.stack([picture.pixels for picture in pictures])
     batch = torch.from_numpy(stacked).to(device)
     batch = batch[:, None] if stacked.ndim == 3 else batch.permute(0, 3, 1, 2)

@@ -8,7 +8,7 @@ from mkpc_kaggle.matchers.lightglue import LightGlueMatcher, LightGlueOptions, l
 from mkpc_kaggle.matchers.sparse import KeypointEncoder, library_encoder
 from mkpc_kaggle.weights import WeightStore, load_into
 
-SHAPE = {"input_dim": 64, "descriptor_dim": 96, "num_heads": 1}  # LighterGlue is a narrow LightGlue
+SHAPE = {"input_dim": 64, "descriptor_dim": 96, "num_heads": 1}  # a narrow LightGlue
 SPEC = MatcherSpec(
     "xfeat_lighterglue",
     "XFeat with LighterGlue: fast, learned",
@@ -29,7 +29,7 @@ def xfeat_encoder(network: XFeat, features: int, placement: Placement) -> Keypoi
 
 def load(weights: WeightStore, options: LightGlueOptions, placement: Placement) -> LightGlueMatcher:
     network = XFeat(top_k=options.features)
-    # Its fine matcher serves semi-dense matching only; some checkpoints are without it.
+    # The fine matcher is for semi-dense matching only; some checkpoints do not have it.
     load_into(network.net, weights.load("xfeat"), unused=r"fine_matcher\.", what="xfeat")
     encoder = xfeat_encoder(network, options.features, placement)
     glue = load_glue(weights, "xfeat-lighterglue", options.threshold, **SHAPE)
