@@ -152,7 +152,7 @@ def test_a_training_checkpoint_with_unknown_classes_gives_its_tensors(tmp_path, 
 def test_the_old_format_with_unknown_classes_is_refused(tmp_path, framework):
     save_legacy(training_checkpoint(framework, TENSORS), tmp_path / "x.ckpt")
     sys.modules.pop("training_framework")
-    with pytest.raises(UserError, match=r"x\.ckpt .* holds objects that are not read here"):
+    with pytest.raises(UserError, match=r"x\.ckpt .* contains unsupported objects"):
         load_tensors(tmp_path / "x.ckpt")
 
 
