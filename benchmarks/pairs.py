@@ -79,8 +79,7 @@ def roma(placement: Placement) -> RomaMatcher:
 
 
 def with_lightglue(name: str, layers: int, keypoints: int = KEYPOINTS) -> Callable[[Placement], Matcher[Any]]:
-    make = getattr(light_matchers, f"{name}_matcher")
-    return partial(make, keypoints=keypoints, layers=layers, threshold=0.1)
+    return partial(light_matchers.lightglue_matcher, name, keypoints=keypoints, layers=layers, threshold=0.1)
 
 
 SPARSE, SEMI_DENSE = Size(1024, 768), Size(840, 630)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 from golden import golden_arrays, needs_golden, seeded_tensor
-from light_matchers import sift_lightglue_matcher
+from light_matchers import lightglue_matcher
 from numpy.testing import assert_allclose
 from pictures import as_picture, match_one, picture, same
 
@@ -40,13 +40,14 @@ def test_keypoints_and_log_assignment_are_the_golden_ones():
         own = np.hstack([part.reshape(len(keypoints), -1) for part in parts.values()])
         assert_allclose(own[np.lexsort(own[:, :2].T)], expected[np.lexsort(expected[:, :2].T)], atol=1e-5)
     assert len(matcher.match(encodings[:1], encodings[1:])[0]) == len(golden["matches"]) == 0
+    # Down to -38. The golden values are up to 2e-4 from those in float64, so the tolerance is relative, too.
     assert_allclose(found[0], golden["log_assignment"], rtol=1e-4, atol=1e-4)
 
 
 @pytest.mark.parametrize("turns", [1, 2, 3])
 def test_a_picture_matches_itself_turned_by_quarter_turns(turns):
     turned = as_picture(np.ascontiguousarray(np.rot90(PICTURE.pixels, turns)))
-    matches = match_one(sift_lightglue_matcher(Placement()), PICTURE, turned)
+    matches = match_one(lightglue_matcher("sift_lightglue", Placement()), PICTURE, turned)
     points, (width, height) = matches.points0, PICTURE.content
     for _ in range(turns):
         points, width, height = np.stack([points[:, 1], width - 1 - points[:, 0]], 1), height, width
@@ -65,7 +66,10 @@ def test_a_pixel_has_one_keypoint_and_the_strongest_are_kept():
 
 
 def test_pictures_of_no_keypoints_and_of_one_are_legal():
-    matcher, empty = sift_lightglue_matcher(Placement(), keypoints=1), as_picture(np.zeros((64, 96), np.uint8))
+    matcher, empty = (
+        lightglue_matcher("sift_lightglue", Placement(), keypoints=1),
+        as_picture(np.zeros((64, 96), np.uint8)),
+    )
     assert len(match_one(matcher, empty, empty)) == len(match_one(matcher, PICTURE, empty)) == 0
     matches = match_one(matcher, PICTURE, PICTURE)
     assert len(matches) == 1
@@ -73,7 +77,9 @@ def test_pictures_of_no_keypoints_and_of_one_are_legal():
 
 
 def test_a_gray_picture_and_the_same_in_colour_have_the_same_matches():
-    match = TwoStageMatcher(Recipe((Unit(1, "own", 160),)), matchers={"own": sift_lightglue_matcher(Placement())})
+    match = TwoStageMatcher(
+        Recipe((Unit(1, "own", 160),)), matchers={"own": lightglue_matcher("sift_lightglue", Placement())}
+    )
     gray, other = PICTURE.pixels, picture(120, 160, "another").pixels
     alone, coloured = (match(shown, other).matches for shown in (gray, np.stack([gray] * 3, axis=2)))
     assert len(alone) > 0

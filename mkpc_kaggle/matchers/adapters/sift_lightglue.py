@@ -17,7 +17,7 @@ from mkpc_kaggle.weights import WeightStore
 
 @dataclass(frozen=True)
 class SiftLightGlueOptions(LightGlueOptions):
-    features: int = 4096  # of the published evaluation
+    features: int = 4096  # as in the published evaluation
 
 
 SHAPE = {"input_dim": 128, "add_scale_ori": True}
@@ -29,18 +29,16 @@ SPEC = MatcherSpec(
     licences=("Apache-2.0",),
     slots=("sift-lightglue",),
 )
-SHIFT_PX = 0.25  # of OpenCV's points without precise upscaling, which LightGlue's training did not use
-MIN_ROOT = 1e-3  # in a descriptor
+SHIFT_PX = 0.25  # OpenCV's offset without precise upscaling, which the published evaluation does not use
 
 
 class SiftEncoder:
-    """OpenCV's SIFT with one keypoint a pixel: the strongest one, of its first orientation."""
+    """OpenCV's SIFT with one keypoint per pixel: the highest response, then the smallest angle."""
 
     def __init__(self, features: int, device: str) -> None:
         self._features, self._device = features, device
-        self._sift = cv2.SIFT_create(  # type: ignore[attr-defined]  # missing in OpenCV's stubs
-            features, nOctaveLayers=4, contrastThreshold=0.0066667, edgeThreshold=10
-        )
+        # Octave layers, contrast threshold and edge threshold as in the published evaluation.
+        self._sift = cv2.SIFT_create(features, 4, 0.0066667, 10)  # type: ignore[attr-defined]  # missing in stubs
 
     def encode(self, pictures: Sequence[Picture]) -> list[Keypoints]:
         return [self._encode(picture) for picture in pictures]
@@ -48,12 +46,12 @@ class SiftEncoder:
     def _encode(self, picture: Picture) -> Keypoints:
         found, descriptors = self._sift.detectAndCompute(picture.pixels, None)
         found = np.array([(*k.pt, k.size, np.radians(k.angle), k.response) for k in found]).reshape(-1, 5)
-        order = np.lexsort((found[:, 3], -found[:, 4]))  # by response, then by angle
+        order = np.lexsort((found[:, 3], -found[:, 4]))  # by descending response, then by angle
         _, first = np.unique(np.rint(found[order, :2] - 0.5), axis=0, return_index=True)
         kept = np.sort(order[np.sort(first)[: self._features]])
         x, y, sizes, angles, _ = torch.from_numpy(found[kept].astype(np.float32)).to(self._device).T
         roots = np.zeros((0, 128), np.float32) if descriptors is None else root_sift(descriptors[kept])
-        unit = functional.normalize(torch.from_numpy(roots).to(self._device).clamp(min=MIN_ROOT), dim=1)
+        unit = functional.normalize(torch.from_numpy(roots).to(self._device).clamp(min=1e-3), dim=1)
         return Keypoints.on_content(torch.stack([x, y], 1) - SHIFT_PX, unit, picture.content, sizes, angles)
 
 
