@@ -182,11 +182,10 @@ def whole(variant):
 
 
 def pipeline_stages(case, variant):
-    """From picture to matched points; at the published settings keypoints are compared as sets, all but one."""
+    """Yield the stages from two images to matched points."""
     golden, network = golden_arrays("loma", case), whole(variant)
     images = golden if "image0" in golden else golden_arrays("loma", "pipeline_b128")
     side, number = int(golden["descriptor_side"]), int(golden["num_keypoints"])
-    as_sets = case.startswith("default")
     found = []
     for index in (0, 1):
         pixels = images[f"image{index}"]
@@ -197,32 +196,22 @@ def pipeline_stages(case, variant):
         (detected,) = network.detector(seen[0], number)
         found.append(keypoints)
         mine = {"keypoints": keypoints.points, "keypoint_probs": detected.scores}
-        mine["descriptors"] = keypoints.descriptors[:, ::32] if as_sets else keypoints.descriptors
+        mine["descriptors"] = keypoints.descriptors
         theirs = {name: golden[f"{name}{index}"] for name in mine}
-        if as_sets:
-            distance = torch.cdist(mine["keypoints"].double(), theirs["keypoints"].double())
-            nearest, partner = distance.min(dim=0)
-            assert (nearest > 1e-6).sum() <= 1
-            mine = {name: value[partner] for name, value in mine.items()}
-            kept = nearest <= 1e-6
-            mine, theirs = ({name: value[kept] for name, value in of.items()} for of in (mine, theirs))
         mine["keypoint_probs"] = mine["keypoint_probs"] / theirs["keypoint_probs"]
         theirs["keypoint_probs"] = torch.ones_like(theirs["keypoint_probs"])
         for name, tolerance in (("keypoints", 1e-6), ("keypoint_probs", 1e-4), ("descriptors", 2e-4)):
             yield Stage(f"{name}{index}", mine[name], theirs[name], tolerance)
     threshold = float(golden["threshold"])
-    if not as_sets:
-        for name, value in matcher_values(network.matcher, *found, threshold).items():
-            if name.startswith(("matches", "matching")):
-                yield Stage(name, value[0], golden[name], 4e-4 if "scores" in name else 0)
+    for name, value in matcher_values(network.matcher, *found, threshold).items():
+        if name.startswith(("matches", "matching")):
+            yield Stage(name, value[0], golden[name], 4e-4 if "scores" in name else 0)
     matches = network.matcher(*found, threshold)
     points = []
     for index, of in enumerate((matches.index0, matches.index1)):
         pixels = images[f"image{index}"]
         points.append((found[index].points[of] + 1) / 2 * torch.tensor([pixels.shape[1], pixels.shape[0]]))
     mine, theirs = torch.cat(points, dim=1), torch.cat([golden["points0"], golden["points1"]], dim=1)
-    if as_sets:
-        mine, theirs = (torch.tensor(sorted(of.tolist())) for of in (mine, theirs))
     yield Stage("points", mine, theirs, 1e-3)
 
 
@@ -239,5 +228,4 @@ CASES["loma pipeline_b128"] = partial(pipeline_stages, "pipeline_b128", Variant.
 SLOW = {
     "loma descriptor_g": partial(descriptor_stages, "B", "g_168x210"),
     "loma pipeline_b": partial(pipeline_stages, "pipeline_b", Variant.B),
-    "loma default_b128": partial(pipeline_stages, "default_b128", Variant.B128),
 }
