@@ -78,14 +78,15 @@ def roma(placement: Placement) -> RomaMatcher:
     return RomaMatcher(random_network(RoMa, placement), RomaOptions(), placement.device)
 
 
-def with_lightglue(name: str, layers: int) -> Callable[[Placement], Matcher[Any]]:
-    make = getattr(light_matchers, f"{name}_matcher")
-    return partial(make, keypoints=KEYPOINTS, layers=layers, threshold=0.1)
+def with_lightglue(name: str, layers: int, keypoints: int = KEYPOINTS) -> Callable[[Placement], Matcher[Any]]:
+    return partial(light_matchers.lightglue_matcher, name, keypoints=keypoints, layers=layers, threshold=0.1)
 
 
 SPARSE, SEMI_DENSE = Size(1024, 768), Size(840, 630)
 CASES = {
     "sift": Case(lambda placement: SiftMatcher(SiftOptions(), "cpu"), Size(1280, 960)),
+    "sift_lightglue": Case(with_lightglue("sift_lightglue", 9), SPARSE),
+    "sift_lightglue, 4096": Case(with_lightglue("sift_lightglue", 9, keypoints=4096), SPARSE),
     "xfeat_lighterglue": Case(with_lightglue("xfeat_lighterglue", 6), SPARSE),
     "aliked": Case(partial(light_matchers.aliked_matcher, keypoints=KEYPOINTS), SPARSE),
     "aliked_lightglue": Case(with_lightglue("aliked_lightglue", 9), SPARSE),

@@ -1,4 +1,4 @@
-"""Pinhole cameras with the size of their image, and projection between world points and pixels.
+"""Pinhole cameras with image sizes, and projection between world points and pixels.
 
 Pixel centres are at integer coordinates: (0, 0) is the centre of the top-left pixel, x to the right, y down.
 The world has z up; a camera looks along its +z. `X_cam = R X + t`.
@@ -17,7 +17,7 @@ FloatImage = NDArray[np.float32]
 
 @dataclass(frozen=True, eq=False)
 class SizedCamera(Camera):
-    """A camera and its image's width and height in pixels; t in world units."""
+    """A camera with its image's width and height in pixels; t in world units."""
 
     width: int
     height: int
@@ -31,10 +31,10 @@ class SizedCamera(Camera):
 def look_at(
     position: ArrayLike, target: ArrayLike, focal: float, size: tuple[int, int], roll: float = 0.0
 ) -> SizedCamera:
-    """A camera at `position` with `target` in the middle of its image of `size`, (width, height).
+    """Return a camera at `position` with `target` in the middle of its image of `size`, (width, height).
 
     `focal` is in pixels; `roll` turns the camera clockwise about its axis, in degrees. Position and target
-    are (3,) world points, not above one another.
+    are (3,) world points, one not above the other.
     """
     centre = np.asarray(position, dtype=np.float64)
     forward = _unit(np.asarray(target, dtype=np.float64) - centre)
@@ -47,9 +47,9 @@ def look_at(
 
 
 def resized(camera: SizedCamera, scale: float) -> SizedCamera:
-    """The camera of the image made `scale` times as large: `x' = (x + 0.5) * scale - 0.5`.
+    """Return the camera of the image resized by `scale`: `x' = (x + 0.5) * scale - 0.5`.
 
-    Sides are rounded to whole pixels while K keeps the exact scale, so at most half a pixel is cut or added
+    Sides are rounded to whole pixels and K keeps the exact scale. So the image loses or gains up to half a pixel
     on the right and at the bottom.
     """
     to_resized = np.array([[scale, 0, (scale - 1) / 2], [0, scale, (scale - 1) / 2], [0, 0, 1]])
@@ -58,14 +58,14 @@ def resized(camera: SizedCamera, scale: float) -> SizedCamera:
 
 
 def project(camera: SizedCamera, points: Floats) -> tuple[Floats, Floats]:
-    """World points (N, 3) to pixels (N, 2) and depths (N,); pixels mean nothing where depth <= 0."""
+    """Project world points (N, 3) to pixels (N, 2) and depths (N,); pixels are undefined where depth <= 0."""
     image = (points @ camera.R.T + camera.t) @ camera.K.T
     depth = image[:, 2]
     return image[:, :2] / np.where(depth == 0, np.finfo(np.float64).tiny, depth)[:, None], depth
 
 
 def unproject(camera: SizedCamera, pixels: Floats, depth: Floats) -> Floats:
-    """Pixels (N, 2) and their depths (N,), measured along the camera's axis, to world points (N, 3)."""
+    """Convert pixels (N, 2) and depths (N,) along the camera's axis to world points (N, 3)."""
     rays = np.column_stack([pixels, np.ones(len(pixels))]) @ np.linalg.inv(camera.K).T
     return np.asarray((rays * depth[:, None] - camera.t) @ camera.R, dtype=np.float64)
 

@@ -1,4 +1,4 @@
-"""How much of one view the other sees, from exact depth."""
+"""Covisibility of two views from exact depth."""
 
 import cv2
 import numpy as np
@@ -6,17 +6,17 @@ from numpy.typing import NDArray
 
 from mkpc_kaggle.demo.camera import FloatImage, SizedCamera, project, unproject
 
-DEPTH_TOLERANCE = 0.01  # relative; inverse depth interpolated between pixels is exact on a plane
-STEP_PX = 3  # every third pixel of every third row is enough for a share
+DEPTH_TOLERANCE = 0.01  # relative; interpolated inverse depth is exact on a plane
+STEP_PX = 3  # every third pixel of every third row suffices
 
 
 def visible_mask(
     first: SizedCamera, first_depth: FloatImage, second: SizedCamera, second_depth: FloatImage, step: int = 1
 ) -> NDArray[np.bool_]:
-    """Which pixels of `first`, every `step`-th of them, show a point that `second` sees too: bool.
+    """Return a bool mask of every `step`-th pixel of `first`: True if `second` shows the same point.
 
-    The depths are (H, W) float32 in world units, inf for the sky, which has no surface and is never shared. A
-    point outside the second image, behind its camera or hidden by something nearer there is not seen.
+    The depths are (H, W) float32 in world units, inf for the sky, which is never shared. A point is not visible
+    outside the second image, behind its camera, or behind a nearer surface.
     """
     y, x = np.mgrid[0 : first.height : step, 0 : first.width : step]
     depth = first_depth[::step, ::step].astype(np.float64)
@@ -34,6 +34,6 @@ def visible_mask(
 def covisibility(
     first: SizedCamera, first_depth: FloatImage, second: SizedCamera, second_depth: FloatImage
 ) -> float:
-    """The share of each view that the other sees, the smaller of the two: symmetric, in [0, 1]."""
+    """Return the smaller of the shares of either view visible in the other: symmetric, in [0, 1]."""
     ways = ((first, first_depth, second, second_depth), (second, second_depth, first, first_depth))
     return min(float(visible_mask(*way, STEP_PX).mean()) for way in ways)

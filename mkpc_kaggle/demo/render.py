@@ -1,4 +1,4 @@
-"""The renderer: rays against textured rectangles, the nearest wins, 2 x 2 samples a pixel."""
+"""A renderer of textured rectangles: the nearest one per ray, 2 x 2 samples per pixel."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ AMBIENT, DIFFUSE = 0.72, 0.38
 ZENITH, HORIZON = np.array([200, 140, 85], np.float32), np.array([235, 220, 205], np.float32)  # BGR
 NO_SURFACE = -1
 MIN_DEPTH = 1e-3  # world units
-MIN_DISTANCE = 1e-6  # of the camera from a plane, in world units: nearer, the plane is seen edge-on
+MIN_DISTANCE = 1e-6  # from camera to plane, in world units; a nearer plane is edge-on
 MIN_LEVEL_PX = 8  # the shorter side of a texture's smallest level
 
 
@@ -37,7 +37,7 @@ class Surface:
 
     @cached_property
     def levels(self) -> tuple[Picture, ...]:
-        """The texture, its half, its quarter and so on: from afar it is averaged and does not flicker."""
+        """The texture at full, half, quarter size and so on, against aliasing of distant surfaces."""
         levels = [self.texture]
         while min(levels[-1].shape[:2]) >= 2 * MIN_LEVEL_PX:
             height, width = levels[-1].shape[:2]
@@ -47,9 +47,9 @@ class Surface:
 
 
 def render(surfaces: Sequence[Surface], camera: SizedCamera) -> tuple[FloatImage, FloatImage]:
-    """One view: image (H, W, 3) float32 BGR in 0..255 and depth (H, W) float32 along the camera's axis.
+    """Render a view: image (H, W, 3) float32 BGR in 0..255 and depth (H, W) float32 along the camera's axis.
 
-    Depth is that of the pixel's centre, in world units, inf where the sky is seen.
+    Depth is measured at the pixel's centre, in world units; inf for the sky.
     """
     fine = resized(camera, SAMPLES)
     index, _ = nearest_surface(surfaces, fine)
@@ -65,7 +65,7 @@ def render(surfaces: Sequence[Surface], camera: SizedCamera) -> tuple[FloatImage
 
 
 def nearest_surface(surfaces: Sequence[Surface], camera: SizedCamera) -> tuple[NDArray[np.int16], FloatImage]:
-    """For each pixel the index of the surface seen, -1 for none, and the inverse depth, 0 for none."""
+    """Return each pixel's index of the visible surface, -1 for none, and inverse depth, 0 for none."""
     index = np.full((camera.height, camera.width), NO_SURFACE, dtype=np.int16)
     best = np.zeros((camera.height, camera.width), dtype=np.float32)
     for number, surface in enumerate(surfaces):
@@ -81,11 +81,11 @@ def nearest_surface(surfaces: Sequence[Surface], camera: SizedCamera) -> tuple[N
 
 
 def sample_texture(levels: Sequence[Picture], u: FloatImage, v: FloatImage, footprint: FloatImage) -> FloatImage:
-    """Trilinear look-up: colours (H, W, 3) float32 in 0..255 at u, v in [0, 1], each (H, W) float32.
+    """Sample colours (H, W, 3) float32 in 0..255, trilinearly, at u, v in [0, 1], each (H, W) float32.
 
     `footprint` (H, W) is the distance in texels of the full level from one sample to the next.
     """
-    # Half a level too sharp: every pixel averages several samples, which takes that much aliasing away.
+    # Half a level sharper: the average of several samples per pixel removes the aliasing.
     wanted = np.clip(np.log2(np.maximum(footprint, 1e-6)) - 0.5, 0, len(levels) - 1)
     colours = np.zeros((*u.shape, 3), np.float32)
     for number, level in enumerate(levels):
@@ -103,7 +103,7 @@ def _colour(surface: Surface, camera: SizedCamera, window: Window) -> FloatImage
     q2 = np.where(np.abs(q2) < 1e-9, np.float32(1e-9), q2)
     u, v = q0 / q2, q1 / q2
     height, width = surface.levels[0].shape[:2]
-    # How far a step in x, and a step in y, moves in the texture; squared.
+    # Squared distances in the texture of a step in x and of a step in y.
     steps = [
         np.square(width * (A[0, k] - u * A[2, k])) + np.square(height * (A[1, k] - v * A[2, k])) for k in range(2)
     ]
@@ -115,7 +115,7 @@ def _colour(surface: Surface, camera: SizedCamera, window: Window) -> FloatImage
 
 
 def _sky(camera: SizedCamera) -> FloatImage:
-    """The whole image as sky, paler towards the horizon."""
+    """Render the whole image as sky, paler towards the horizon."""
     y, x = np.mgrid[0 : camera.height, 0 : camera.width].astype(np.float32)
     east, north, up = (row[0] * x + row[1] * y + row[2] for row in camera.R.T @ np.linalg.inv(camera.K))
     height = np.clip(up / np.sqrt(east**2 + north**2 + up**2), 0, 1)[..., None]
@@ -123,14 +123,14 @@ def _sky(camera: SizedCamera) -> FloatImage:
 
 
 def _plane_matrix(surface: Surface, camera: SizedCamera) -> Floats:
-    """A (3, 3) with `A (x, y, 1) = (u, v, 1) / depth`: the inverse of `K [edge_u edge_v origin]`."""
+    """Return A (3, 3) with `A (x, y, 1) = (u, v, 1) / depth`: the inverse of `K [edge_u edge_v origin]`."""
     in_camera = camera.R @ np.column_stack([surface.edge_u, surface.edge_v, surface.origin])
     in_camera[:, 2] += camera.t
     return np.asarray(np.linalg.inv(camera.K @ in_camera), dtype=np.float64)
 
 
 def _plane_coordinates(A: Floats, window: Window) -> tuple[FloatImage, FloatImage, FloatImage]:
-    """The values u / depth, v / depth and 1 / depth on the surface's plane at each pixel of the window."""
+    """Return u / depth, v / depth and 1 / depth on the surface's plane at each pixel of the window."""
     x = np.arange(window[1].start, window[1].stop)[None, :]
     y = np.arange(window[0].start, window[0].stop)[:, None]
     a, b, c = ((row[0] * x).astype(np.float32) + (row[1] * y + row[2]).astype(np.float32) for row in A)
@@ -138,7 +138,7 @@ def _plane_coordinates(A: Floats, window: Window) -> tuple[FloatImage, FloatImag
 
 
 def _extent(surface: Surface, camera: SizedCamera) -> Window | None:
-    """The window of the image that the surface can touch; None if there is none or it is seen edge-on."""
+    """Return the image window that the surface can touch; None if it is outside or edge-on."""
     normal = np.cross(surface.edge_u, surface.edge_v)
     if abs(normal @ (camera.centre - surface.origin)) < MIN_DISTANCE * np.linalg.norm(normal):
         return None
@@ -148,7 +148,7 @@ def _extent(surface: Surface, camera: SizedCamera) -> Window | None:
         return None
     size = (camera.width, camera.height)
     low, high = np.zeros(2, int), np.array(size)
-    if (depth >= MIN_DEPTH).all():  # else it passes the camera: its outline is not that of its corners
+    if (depth >= MIN_DEPTH).all():  # else it passes the camera, and its corners do not bound it
         low = np.clip(np.floor(pixels.min(axis=0)), 0, size).astype(int)
         high = np.clip(np.ceil(pixels.max(axis=0)) + 1, 0, size).astype(int)
     if (low >= high).any():
@@ -157,6 +157,6 @@ def _extent(surface: Surface, camera: SizedCamera) -> Window | None:
 
 
 def _bounds(mask: NDArray[np.bool_]) -> Window:
-    """The smallest window with all of a mask that is not empty."""
+    """Return the smallest window that contains a mask that is not empty."""
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)

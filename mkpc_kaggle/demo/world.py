@@ -1,4 +1,4 @@
-"""The worlds: a ground, three walls and boxes that stand about, with drawn textures; and the views of them."""
+"""The worlds: a ground, three walls and boxes with drawn textures, and their views."""
 
 from dataclasses import dataclass, replace
 from itertools import product
@@ -13,14 +13,14 @@ from mkpc_kaggle.demo.render import Picture, Surface
 
 Colour = tuple[int, int, int]  # BGR
 
-SCENES = MappingProxyType({"courtyard": 2.5, "market": 1.0})  # metres in a unit of each world
+SCENES = MappingProxyType({"courtyard": 2.5, "market": 1.0})  # metres per unit of each world
 SCENE_NAMES = tuple(SCENES)
 
 TEXELS = 72  # a metre
 STONE, BRICK, PLASTER, PAVING = (150, 175, 190), (85, 105, 165), (150, 200, 215), (128, 136, 140)
 GLASS, FRAME = (75, 70, 60), (205, 215, 220)
 WINDOW_M, WINDOW_STEP_M = (1.3, 1.9), 3.1
-COLUMNS_X_M, ROWS_Y_M = (-9.0, -4.5, 0.0, 4.5, 9.0), (9.0, 12.5, 16.0)  # where boxes stand
+COLUMNS_X_M, ROWS_Y_M = (-9.0, -4.5, 0.0, 4.5, 9.0), (9.0, 12.5, 16.0)  # of the boxes
 MIN_BOX_M, MAX_BOX_M = (1.0, 1.0, 1.0), (3.0, 3.0, 5.5)  # width, depth, height
 
 # Position and target in metres, focal length over the long side, size in pixels, roll in degrees.
@@ -37,7 +37,7 @@ SHOTS = (
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """Surfaces and the cameras that look at them, in units of `metres_per_unit` metres."""
+    """Surfaces and cameras, in units of `metres_per_unit` metres."""
 
     name: str
     metres_per_unit: float
@@ -46,9 +46,9 @@ class World:
 
 
 def build_world(name: str, *, seed: int = 0, image_scale: float = 1.0) -> World:
-    """A world, which depends on its name and the seed alone. Raises ValueError for an unknown name."""
+    """Build a world from its name and the seed alone. Raises ValueError for an unknown name."""
     if name not in SCENES:
-        raise ValueError(f"unknown scene {name!r}; there are {', '.join(SCENE_NAMES)}")
+        raise ValueError(f"unknown scene {name!r}; known: {', '.join(SCENE_NAMES)}")
     rng = np.random.default_rng([seed, *name.encode()])
     unit = 1 / SCENES[name]
     surfaces = tuple(
@@ -64,7 +64,7 @@ def build_world(name: str, *, seed: int = 0, image_scale: float = 1.0) -> World:
 
 
 def _surfaces(rng: np.random.Generator) -> list[Surface]:
-    """In metres: x to the east, y to the north wall at 20, z up from the ground."""
+    """Return surfaces in metres: x to the east, y to the north wall at 20, z up from the ground."""
     surfaces = [
         quad((-20, 20, 0), (20, 20, 0), (-20, -14, 0), paint(rng, 40, 34, PAVING, is_stone=True)),
         quad((-14, 20, 10), (14, 20, 10), (-14, 20, 0), facade(rng, 28, 10, STONE)),
@@ -79,7 +79,7 @@ def _surfaces(rng: np.random.Generator) -> list[Surface]:
 
 
 def box(rng: np.random.Generator, centre: Floats, size: Floats, yaw: float) -> list[Surface]:
-    """Four sides and the top of a painted box on the ground.
+    """Return four sides and the top of a painted box on the ground.
 
     `centre` is (x, y), `size` is (width, depth, height), `yaw` in degrees.
     """
@@ -100,7 +100,7 @@ def box(rng: np.random.Generator, centre: Floats, size: Floats, yaw: float) -> l
 
 
 def quad(top_left: ArrayLike, top_right: ArrayLike, bottom_left: ArrayLike, picture: Picture) -> Surface:
-    """The rectangle with these corners, (3,), as its viewer sees them."""
+    """Return the rectangle with these corners, (3,), as seen from its front."""
     corner = np.asarray(top_left, dtype=np.float64)
     return Surface(corner, np.subtract(top_right, corner), np.subtract(bottom_left, corner), picture)
 
@@ -108,16 +108,16 @@ def quad(top_left: ArrayLike, top_right: ArrayLike, bottom_left: ArrayLike, pict
 def paint(
     rng: np.random.Generator, width_m: float, height_m: float, colour: Colour, *, is_stone: bool = False
 ) -> Picture:
-    """A dead-leaves texture (Lee, Mumford and Huang 2001): shapes of all sizes in tones of the colour.
+    """Draw a dead-leaves texture (Lee, Mumford and Huang 2001): shapes of all sizes in tones of the colour.
 
-    The shapes are upright rectangles for stone, ellipses of any direction and of stronger tones for paint.
+    The shapes are upright rectangles for stone, rotated ellipses with stronger tones for paint.
     """
     scale = min(TEXELS, 2000 / max(width_m, height_m))
     width, height = max(16, round(width_m * scale)), max(16, round(height_m * scale))
     picture = np.full((height, width, 3), colour, dtype=np.uint8)
     contrast, max_side_m = (0.06, 1.2) if is_stone else (0.4, 0.9)
     count = width * height // 60
-    # The density of their sizes falls with the third power, so that a nearer look shows as much.
+    # The density of sizes falls with the third power, so the texture looks alike at every scale.
     lengths = np.sort(3 / np.sqrt(rng.uniform((3 / (max_side_m * scale)) ** 2, 1, count)))[::-1]
     sides = lengths[:, None] * np.column_stack([np.ones(count), rng.uniform(0.3, 0.6 if is_stone else 1, count)])
     centres, angles = rng.uniform((0, 0), (width, height), (count, 2)), rng.uniform(0, 180, count)
@@ -134,7 +134,7 @@ def paint(
 
 
 def facade(rng: np.random.Generator, width_m: float, height_m: float, colour: Colour) -> Picture:
-    """A stone wall with a grid of windows that differ only in how bright they are."""
+    """Draw a stone wall with a grid of windows that differ only in brightness."""
     picture = paint(rng, width_m, height_m, colour, is_stone=True)
     scale = picture.shape[1] / width_m
     w, h = int(WINDOW_M[0] * scale), int(WINDOW_M[1] * scale)

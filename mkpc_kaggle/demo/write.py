@@ -1,4 +1,4 @@
-"""The data set on disk, in the layout of the competition's train and test sides."""
+"""The demo set on disk, in the layout of the competition's train and test sides."""
 
 import hashlib
 from collections.abc import Iterable, Sequence
@@ -15,13 +15,13 @@ from mkpc_kaggle.demo.render import Picture, render
 from mkpc_kaggle.demo.world import SCENE_NAMES, World, build_world
 from mkpc_kaggle.geometry.cameras import fundamental_of_cameras
 
-MIN_COVISIBILITY = 0.1  # what the competition scores
-TEST_PAIRS = 8  # a scene
+MIN_COVISIBILITY = 0.1  # the competition scores pairs from this value on
+TEST_PAIRS = 8  # per scene
 
 
 @dataclass(frozen=True)
 class DemoSet:
-    """Where a demo set lies; `truth_csv` says which train pictures a test pair shows."""
+    """The folders of a demo set; `truth_csv` lists the train pictures of each test pair."""
 
     root: Path
     train_dir: Path
@@ -53,7 +53,7 @@ def write_demo(
 ) -> DemoSet:
     """Render the scenes (all of them by default) and write both sides under `directory`.
 
-    The same arguments give the same bytes. `image_scale` makes all images and their K smaller (or larger).
+    The same arguments give the same bytes. `image_scale` scales all images and their K.
     Raises ValueError for an unknown scene, a scene given twice, or a scale that is not positive.
     """
     names = SCENE_NAMES if scenes is None else tuple(scenes)
@@ -77,7 +77,7 @@ def write_demo(
 
 
 def take_photographs(world: World, seed: int) -> list[Photograph]:
-    """What the world's cameras see, each with its own exposure, tint and noise."""
+    """Render the views of the world's cameras, each with its own exposure, tint and noise."""
     photographs = []
     for number, camera in enumerate(world.cameras):
         image, depth = render(world.surfaces, camera)
@@ -87,7 +87,7 @@ def take_photographs(world: World, seed: int) -> list[Photograph]:
 
 
 def _developed(image: FloatImage, rng: np.random.Generator) -> Picture:
-    """(H, W, 3) float32 in 0..255 to uint8; the geometry of the picture does not change."""
+    """Convert (H, W, 3) float32 in 0..255 to uint8 with exposure, tint and noise, without changing geometry."""
     gain, gamma, balance = rng.uniform(0.75, 1.25), rng.uniform(0.85, 1.2), rng.uniform(0.93, 1.07, 3)
     light = np.clip(image * (balance * gain / 255).astype(np.float32), 0, 1) ** np.float32(gamma)
     blurred = cv2.GaussianBlur(light, (5, 5), float(rng.uniform(0.3, 0.7)))
@@ -101,7 +101,7 @@ def _pair(a: Photograph, b: Photograph) -> DemoPair:
 
 
 def _selected(pairs: Sequence[DemoPair]) -> list[DemoPair]:
-    """The pairs of the test side: scored ones, spread evenly from the least covisible to the most."""
+    """Select the test side's pairs: scored ones, spread evenly over covisibility."""
     scored = sorted((p for p in pairs if p.covisibility >= MIN_COVISIBILITY), key=lambda p: p.covisibility)
     if len(scored) <= TEST_PAIRS:
         return scored
@@ -129,7 +129,7 @@ def _write_train(directory: Path, photographs: Sequence[Photograph], pairs: Sequ
 
 
 def _write_test(directory: Path, scene: str, pairs: Sequence[DemoPair], seed: int) -> list[tuple[str, str]]:
-    """Write the images of one batch; for each pair its rows of test.csv and of test_truth.csv."""
+    """Write the images of one batch; return each pair's rows of test.csv and test_truth.csv."""
     batch = _digest(f"{seed}/{scene}")[:8]
     photographs = {each.image_id: each for pair in pairs for each in (pair.first, pair.second)}
     hidden = {name: _digest(f"{seed}/{scene}/{name}")[:32] for name in photographs}
@@ -159,7 +159,7 @@ def _write_rows(path: Path, header: str, rows: Iterable[str]) -> None:
 
 
 def _numbers(values: Floats) -> str:
-    """Row by row, with all the digits that a float64 has."""
+    """Format values row by row, with all digits of a float64."""
     return " ".join(f"{value:.17g}" for value in values.ravel())
 
 

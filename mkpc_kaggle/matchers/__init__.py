@@ -1,1 +1,1 @@
-"""The matchers: one contract, one registry, and what adapters share."""
+"""The matchers: one contract, one registry, and shared parts of adapters."""

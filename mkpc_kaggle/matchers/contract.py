@@ -1,8 +1,8 @@
-"""The interface of matchers: each picture is encoded alone, then encodings are matched in pairs.
+"""The interface of matchers: pictures are encoded one by one, then encodings are matched in pairs.
 
-One contract serves sparse, semi-dense and dense networks. ``encode`` does what depends on one picture
-(keypoints and descriptors, or a backbone's feature maps). Its results are cached, because views of whole
-images are used in many pairs. ``match`` does the rest.
+One contract serves sparse, semi-dense and dense networks. ``encode`` computes all that depends on one picture
+(keypoints and descriptors, or a backbone's feature maps). Its results are cached, because many pairs use the view
+of a whole image. ``match`` computes the rest.
 """
 
 import re
@@ -17,7 +17,7 @@ from mkpc_kaggle.geometry.matches import Matches
 
 
 class NonFiniteError(ArithmeticError):
-    """A network's values are infinite or NaN, as may happen in half precision."""
+    """Infinite or NaN values in a network, which half precision can cause."""
 
 
 class Colour(StrEnum):
@@ -28,7 +28,7 @@ class Colour(StrEnum):
 
 
 class Precision(StrEnum):
-    """Of a network's convolutions and linear layers, by PyTorch's names."""
+    """The precision of a network's convolutions and linear layers, by PyTorch's names."""
 
     FLOAT32 = "float32"
     BFLOAT16 = "bfloat16"
@@ -39,7 +39,7 @@ class Precision(StrEnum):
 class Placement:
     """The device of a matcher, "cpu" or "cuda:0", and its precision.
 
-    Softmax, transport, least squares and coordinates are float32 in any precision.
+    Softmax, transport, least squares and coordinates are always float32.
     """
 
     device: str = "cpu"
@@ -50,23 +50,15 @@ class Placement:
 
 
 class Training(StrEnum):
-    """Which of a network's published weights: trained on MegaDepth's or on ScanNet's pictures."""
+    """The training set of published weights: MegaDepth (outdoor) or ScanNet (indoor)."""
 
     OUTDOOR = "outdoor"
     INDOOR = "indoor"
 
 
-class Refine(StrEnum):
-    """Whether matched keypoints are moved by fractions of a pixel, see :mod:`mkpc_kaggle.matchers.subpixel`."""
-
-    IF_FOUND = "if-found"  # where the weights for it are found
-    ALWAYS = "always"  # without these weights the matcher is unavailable
-    NEVER = "never"
-
-
 @dataclass(frozen=True)
 class NoOptions:
-    """For a matcher without settings."""
+    """The options of a matcher without settings."""
 
 
 @dataclass(frozen=True)
@@ -75,32 +67,26 @@ class MatcherSpec:
 
     name: str
     summary: str
-    options: type = NoOptions  # a frozen dataclass of settings, which a recipe's table [matchers.NAME] may change
+    options: type = NoOptions  # a frozen dataclass; a recipe's table [matchers.NAME] sets its fields
     colour: Colour = Colour.RGB
-    multiple: int = 1  # both sides of a picture are padded to a multiple of it
+    multiple: int = 1  # pictures are padded to multiples of it
     licences: tuple[str, ...] = ()  # tags of the weights
-    slots: tuple[str, ...] = ()  # the manifest's slots that it needs; ``{name}`` stands for that option's value
-    refiner: str = ""  # the slot of the network that refines its keypoints, as its option ``refine`` says
+    slots: tuple[str, ...] = ()  # of the manifest; ``{name}`` stands for that option's value
 
     def slots_for(self, options: Any) -> tuple[str, ...]:
-        """The slots of the manifest that a matcher with these options cannot do without."""
-        needed = tuple(slot.format_map(vars(options)) for slot in self.slots)
-        return (*needed, self.refiner) if self.refiner and options.refine is Refine.ALWAYS else needed
-
-    def wanted_for(self, options: Any) -> tuple[str, ...]:
-        """The slots that a matcher with these options uses if they are found."""
-        return (self.refiner,) if self.refiner and options.refine is Refine.IF_FOUND else ()
+        """Return the slots of the manifest that a matcher with these options needs."""
+        return tuple(slot.format_map(vars(options)) for slot in self.slots)
 
     def uses(self, slot: str) -> bool:
-        """Whether some training or variant uses the slot."""
-        return slot == self.refiner or any(fnmatch(slot, re.sub(r"{\w+}", "*", own)) for own in self.slots)
+        """Return whether any training or variant uses the slot."""
+        return any(fnmatch(slot, re.sub(r"{\w+}", "*", own)) for own in self.slots)
 
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """A matcher's input: ``pixels`` uint8, (H, W, 3) RGB or (H, W) gray, and the view that they show.
+    """A matcher's input: ``pixels`` uint8, (H, W, 3) RGB or (H, W) gray, of a ``view``.
 
-    Only the top-left ``content`` holds the image; the rest is padding, on which no point may lie.
+    Only the top-left ``content`` holds the image; the rest is padding, which must have no points.
     """
 
     pixels: Pixels
@@ -121,23 +107,23 @@ class Matcher(Protocol[Encoding]):
     def spec(self) -> MatcherSpec: ...
 
     def encode(self, pictures: Sequence[Picture]) -> Sequence[Encoding]:
-        """Encodings of pictures that have one shape.
+        """Encode pictures of one shape.
 
-        Their arrays are counted in dataclasses, tuples and lists. They should not be views of larger arrays: each
-        encoding may be cached alone.
+        Encodings are dataclasses, tuples or lists of arrays, by which their size is counted. Arrays must not be
+        views of larger arrays, since encodings are cached one by one.
         """
         ...
 
     def match(self, encodings0: Sequence[Encoding], encodings1: Sequence[Encoding]) -> Sequence[Matches]:
-        """The matches of each pair of encodings, in view pixels; empty is legal."""
+        """Return the matches of each pair of encodings, in view pixels; empty is legal."""
         ...
 
 
 class PairwiseMatcher(Generic[Encoding]):
-    """A matcher that matches its pairs one after the other, so that results do not depend on the minibatch."""
+    """A matcher that matches pairs one by one, so that results do not depend on the minibatch."""
 
     def match(self, encodings0: Sequence[Encoding], encodings1: Sequence[Encoding]) -> list[Matches]:
-        import torch  # here, since it takes seconds and those who read specs need none
+        import torch  # here: the import takes seconds, and specs need no torch
 
         with torch.inference_mode():
             return [self._match(*pair) for pair in zip(encodings0, encodings1, strict=True)]
@@ -147,7 +133,7 @@ class PairwiseMatcher(Generic[Encoding]):
 
 
 def arrays_of(value: Any) -> Iterator[Any]:
-    """The arrays and tensors in a value: in nested dataclasses, tuples and lists."""
+    """Yield the arrays and tensors in nested dataclasses, tuples and lists."""
     if hasattr(value, "nbytes"):
         yield value
     elif is_dataclass(value):

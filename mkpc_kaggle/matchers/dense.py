@@ -1,4 +1,4 @@
-"""The adapter of the dense networks: features for each picture, matches sampled from the warps of a pair."""
+"""The adapter of dense networks: features of each picture, matches sampled from the warps of a pair."""
 
 import zlib
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ from mkpc_kaggle.matchers.networks.pixels import network_input
 
 @dataclass(frozen=True)
 class DenseOptions:
-    passes: int = 1  # 2: first on pictures whose sides are scaled by ``first_pass``, then on the full ones
+    passes: int = 1  # 2: on pictures scaled by ``first_pass``, then on full ones
     first_pass: float = 0.625
     matches: int = 5000  # at most
     threshold: float = 0.05  # certainties above it count as 1
@@ -39,10 +39,10 @@ class DenseEncoding:
 
 
 class DenseMatcher(PairwiseMatcher[DenseEncoding]):
-    """A match's score is its certainty. The matches that are sampled depend on the two pictures alone.
+    """A dense matcher. A match's score is its certainty; sampling depends on the two pictures alone.
 
-    Pictures and pairs are processed separately, so that results do not depend on the batch. ``multiple``: sides of
-    the first pass's image are multiples of it; ``min_side_px``: the shortest side of any image.
+    Pictures and pairs are processed one by one, so that results do not depend on the batch. ``multiple``: sides in
+    the first pass are multiples of it; ``min_side_px``: the shortest side of any image.
     """
 
     spec: ClassVar[MatcherSpec]
@@ -60,7 +60,7 @@ class DenseMatcher(PairwiseMatcher[DenseEncoding]):
 
     def _encode(self, picture: Picture) -> DenseEncoding:
         width, height = picture.content
-        # The network takes any size, so that padding is cut off.
+        # The network accepts any size, so padding is cut off.
         content = picture.pixels[:height, :width].copy()
         pixels = torch.from_numpy(content).permute(2, 0, 1)[None]  # (1, 3, H, W)
         first = network_input(pixels, self._first_size(picture.content)).to(self.device)
@@ -71,7 +71,7 @@ class DenseMatcher(PairwiseMatcher[DenseEncoding]):
         return DenseEncoding(self._network.encode(first, second), picture.content, zlib.crc32(content.data))
 
     def _first_size(self, content: Size) -> tuple[int, int]:
-        """(H, W) of the image that the first pass sees."""
+        """Return (H, W) of the first pass's image."""
         share = self.options.first_pass if self.options.passes == 2 else 1
         width, height = (self.multiple * max(1, round(side * share / self.multiple)) for side in content)
         return height, width
@@ -82,7 +82,7 @@ class DenseMatcher(PairwiseMatcher[DenseEncoding]):
         warp = torch.cat([dense.warp.reshape(-1, 4) for dense in warps])
         certainty = torch.cat([dense.certainty.flatten() for dense in warps])
         check_finite(f"certainties of {self.spec.name}", certainty, warp)
-        # PyTorch's CPU generator uses 32 bits of a seed, so both checksums are combined into 32.
+        # PyTorch's CPU generator uses 32 bits of a seed, so both checksums become one of 32 bits.
         seed = zlib.crc32(second.checksum.to_bytes(4), first.checksum)
         generator = torch.Generator(warp.device).manual_seed(seed)
         found = sample_matches(warp, certainty, options.matches, options.threshold, generator=generator)

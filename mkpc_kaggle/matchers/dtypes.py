@@ -1,4 +1,4 @@
-"""Numerical safety of networks: float32 without TF32, and finite values."""
+"""Numerical safety of networks: float32 without TF32, finite values."""
 
 import sys
 from collections.abc import Iterator
@@ -10,10 +10,10 @@ from mkpc_kaggle.matchers.contract import NonFiniteError, arrays_of
 
 @contextmanager
 def exact_float32() -> Iterator[None]:
-    """A context in which NVIDIA GPUs multiply float32 as float32, not as TF32 with its 10 bits of mantissa.
+    """Make NVIDIA GPUs multiply float32 as float32, not as TF32 with its 10 bits of mantissa.
 
-    PyTorch's default for convolutions is TF32. The settings are those of the process, and are restored at the end.
-    Importing PyTorch takes seconds; where nothing has imported it, nothing computes with it.
+    PyTorch's default for convolutions is TF32. The settings apply to the process, and are restored at the end.
+    If PyTorch is not imported yet, nothing is changed: the import takes seconds.
     """
     if "torch" not in sys.modules:
         yield
@@ -22,7 +22,7 @@ def exact_float32() -> Iterator[None]:
 
     cudnn, product = torch.backends.cudnn, torch.backends.cuda.matmul
     settings: tuple[Any, ...] = (cudnn.conv, product) if hasattr(cudnn, "conv") else (cudnn, product)
-    # By the names that PyTorch has for it since 2.9, and before.
+    # PyTorch's names since 2.9, and before.
     name, exact = ("fp32_precision", "ieee") if hasattr(cudnn, "conv") else ("allow_tf32", False)
     former = [getattr(setting, name) for setting in settings]
     try:
@@ -37,8 +37,8 @@ def exact_float32() -> Iterator[None]:
 def check_finite(what: str, *values: Any) -> None:
     """Raise :class:`NonFiniteError` if a tensor in the values has NaN or infinity.
 
-    ``what`` names the values, which may be nested dataclasses and sequences. It costs one pass over the
-    tensors and one wait for the device.
+    ``what`` names the values, which may be nested dataclasses and sequences. The check costs one pass over the
+    tensors and one synchronisation with the device.
     """
     arrays = arrays_of(values)
     tensors = [array for array in arrays if hasattr(array, "is_floating_point") and array.is_floating_point()]
@@ -46,7 +46,7 @@ def check_finite(what: str, *values: Any) -> None:
         return
     import torch
 
-    # A sum is infinite or NaN if a value is; half precision is summed in float32, so that nothing overflows.
+    # A sum is infinite or NaN if a value is. Half precision is summed in float32 to prevent overflow.
     sums = [tensor.sum(dtype=torch.float32) for tensor in tensors]
     if not bool(torch.stack(sums).isfinite().all()):
         raise NonFiniteError(f"{what} are not finite")

@@ -13,38 +13,29 @@ from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import MatcherSpec, PairwiseMatcher, Placement
 from mkpc_kaggle.matchers.dtypes import check_finite
 from mkpc_kaggle.matchers.networks.placement import autocast
-from mkpc_kaggle.matchers.sparse import KeypointEncoder, Keypoints
-from mkpc_kaggle.matchers.subpixel import Refiner
+from mkpc_kaggle.matchers.sparse import Encoder, Keypoints, matches_of
 from mkpc_kaggle.weights import WeightStore, load_into
 
 
 @dataclass(frozen=True)
 class LightGlueOptions:
-    features: int = 2048  # the strongest kept in each picture
-    threshold: float = 0.1  # scores of matches are above it
+    features: int = 2048  # the number of strongest keypoints per picture
+    threshold: float = 0.1  # minimum score of a match (exclusive)
 
     def __post_init__(self) -> None:
         check_ranges(self, features=AT_LEAST_1, threshold=SHARE)
 
 
 class LightGlueMatcher(PairwiseMatcher[Keypoints]):
-    """A match's score is LightGlue's. With a ``refiner`` its points are refined; the encoder adds patches then."""
+    """LightGlue on the keypoints of an encoder; a match's score is LightGlue's."""
 
-    def __init__(
-        self,
-        spec: MatcherSpec,
-        encoder: KeypointEncoder,
-        glue: LightGlue,
-        placement: Placement,
-        refiner: Refiner | None = None,
-    ) -> None:
+    def __init__(self, spec: MatcherSpec, encoder: Encoder, glue: LightGlue, placement: Placement) -> None:
         self.spec = spec
         self.placement = placement
         self.encode = encoder.encode
-        self._refiner = refiner
         self._glue = glue.eval().to(placement.device)
-        # Only its layers, into which float32 goes and of which, as a sum with it, float32 comes. Positions of
-        # keypoints and scores stay float32: LightGlue itself turns off the autocast around it.
+        # Autocast the layers only; their inputs and outputs are float32. Positions of keypoints and scores stay
+        # float32. An autocast around LightGlue has no effect: LightGlue turns it off.
         for layer in glue.transformers:
             layer.forward = autocast(placement)(layer.forward)
 
@@ -54,39 +45,38 @@ class LightGlueMatcher(PairwiseMatcher[Keypoints]):
         found = self._glue({"image0": _glue_input(keypoints0), "image1": _glue_input(keypoints1)})
         check_finite(f"scores of {self.spec.name}", found["log_assignment"])
         index0, index1 = found["matches"][0].T
-        if self._refiner is None:
-            points0, points1 = keypoints0.points[index0], keypoints1.points[index1]
-        else:
-            points0, points1 = self._refiner.refined(keypoints0, keypoints1, index0, index1)
-        return Matches(points0.cpu().numpy(), points1.cpu().numpy(), found["scores"][0].cpu().numpy())
+        return matches_of(keypoints0.points, keypoints1.points, index0, index1, found["scores"][0])
 
 
 def _glue_input(keypoints: Keypoints) -> dict[str, Tensor]:
-    return {
+    given = {
         "keypoints": keypoints.points[None],
         "descriptors": keypoints.descriptors[None],
         "image_size": keypoints.points.new_tensor([keypoints.content]),
     }
+    if keypoints.scales is not None and keypoints.orientations is not None:
+        given |= {"scales": keypoints.scales[None], "oris": keypoints.orientations[None]}
+    return given
 
 
 def load_glue(weights: WeightStore, slot: str, threshold: float, **shape: int) -> LightGlue:
-    """With as many layers as the checkpoint has; ``shape``: kornia's ``input_dim`` and so on."""
+    """Load LightGlue with the checkpoint's number of layers; ``shape``: kornia's ``input_dim`` and so on."""
     tensors = {layer_name(name): tensor for name, tensor in weights.load(slot).items()}
     numbers = (int(name.split(".")[1]) for name in tensors if name.startswith("transformers."))
     layers = 1 + max(numbers, default=0)
     glue = light_glue(layers, threshold, **shape)
-    # Without early stopping and pruning only the last layer's assignment is used.
+    # Without early stopping and pruning, only the last layer's assignment is used.
     early = rf"token_confidence\.|confidence_thresholds|log_assignment\.(?!{layers - 1}\.)"
     load_into(glue, tensors, unused=early, what=slot)
     return glue
 
 
 def light_glue(layers: int, threshold: float, **shape: Any) -> LightGlue:
-    """The network without weights; ``threshold`` of a match's score."""
+    """Make the network without weights; ``threshold`` of a match's score."""
     flash = torch.backends.cuda.flash_sdp_enabled()  # type: ignore[no-untyped-call]  # torch's
     try:
         return LightGlue(
-            None,  # type: ignore[arg-type]  # no download; kornia's annotation leaves it out
+            None,  # type: ignore[arg-type]  # no download; missing in kornia's annotation
             n_layers=layers,
             flash=False,  # else kornia halves queries, keys and values on a GPU, float32 or not
             depth_confidence=-1,
@@ -95,9 +85,9 @@ def light_glue(layers: int, threshold: float, **shape: Any) -> LightGlue:
             **shape,
         )
     finally:
-        torch.backends.cuda.enable_flash_sdp(flash)  # kornia sets it for the whole process
+        torch.backends.cuda.enable_flash_sdp(flash)  # kornia changes it for the process
 
 
 def layer_name(name: str) -> str:
-    """LightGlue's current name of a parameter of an older checkpoint or of a training wrapper."""
+    """Return the current name of a parameter in an older checkpoint or in a training wrapper."""
     return re.sub(r"^(self|cross)_attn\.(\d+)\.", r"transformers.\2.\1_attn.", name.removeprefix("matcher."))

@@ -1,4 +1,4 @@
-"""Mutual nearest neighbours of descriptors, in blocks, so that the N x M matrix is never stored."""
+"""Mutual nearest neighbours of descriptors, in blocks: the N x M matrix is never stored."""
 
 from dataclasses import dataclass
 
@@ -14,8 +14,9 @@ BLOCK_ROWS = 2048
 
 @dataclass(frozen=True)
 class Neighbours:
-    """M mutual pairs: ``index0`` and ``index1`` (M,) int64, ``similarity`` (M,) cosine in -1..1, and
-    ``ratio`` (M,), the distance to the nearest over that to the second nearest, the larger of both ways.
+    """M mutual pairs: ``index0``, ``index1`` (M,) int64, ``similarity`` (M,) cosine in -1..1, ``ratio`` (M,).
+
+    The ratio is nearest over second nearest distance, the larger one of both directions.
     """
 
     index0: Tensor
@@ -40,10 +41,9 @@ class NeighbourMatcher(PairwiseMatcher[Keypoints]):
 
 
 def mutual_neighbours(descriptors0: Tensor, descriptors1: Tensor) -> Neighbours:
-    """Pairs of unit descriptors, (N, D) and (M, D), each other's nearest; in order of the first image.
+    """Pair unit descriptors, (N, D) and (M, D), that are each other's nearest; in order of the first image.
 
-    Among equal neighbours the one of lower index is taken. With fewer than two descriptors on a side there is no
-    second neighbour: the ratio is that of a second at the greatest distance.
+    Of equal neighbours the lower index counts. A missing second neighbour counts as one at the maximum distance.
     """
     if len(descriptors0) == 0 or len(descriptors1) == 0:
         nothing = descriptors0.new_zeros(0)
@@ -58,7 +58,7 @@ def mutual_neighbours(descriptors0: Tensor, descriptors1: Tensor) -> Neighbours:
 
 
 def _two_best(queries: Tensor, keys: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Highest and second highest similarity of each query (N,), and the index of the highest (N,)."""
+    """Return each query's highest and second highest similarity (N,), and the index of the highest (N,)."""
     best, second, nearest = [], [], []
     for start in range(0, len(queries), BLOCK_ROWS):
         similarity = queries[start : start + BLOCK_ROWS] @ keys.T  # (rows, M)
@@ -71,6 +71,6 @@ def _two_best(queries: Tensor, keys: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _distance_ratio(best: Tensor, second: Tensor) -> Tensor:
-    """Euclidean distances of unit vectors are sqrt(2 - 2 s); two neighbours at no distance are ambiguous: 1."""
+    """Return the ratio of distances sqrt(2 - 2 s) of unit vectors; 1 for two neighbours at distance 0."""
     nearest, next_nearest = (1 - best).clamp(min=1e-12), (1 - second).clamp(min=1e-12)
     return (nearest / next_nearest).sqrt()

@@ -1,4 +1,4 @@
-"""Finds matchers by name: a file of ``adapters/`` is a matcher, with a ``SPEC`` of its name and a ``load``."""
+"""The registry of matchers: each file of ``adapters/`` is a matcher, with a ``SPEC`` and a ``load``."""
 
 import pkgutil
 from functools import cache
@@ -17,21 +17,21 @@ class UnusableError(UserError):
 
 @cache
 def matcher_names() -> tuple[str, ...]:
-    """The names of all matchers; imports none of them. A new matcher is a new file."""
+    """Return the names of all matchers without importing them. A new matcher is a new file."""
     return tuple(info.name for info in pkgutil.iter_modules(adapters.__path__))
 
 
 def spec_of(name: str, where: str) -> MatcherSpec:
-    """The spec of a matcher, imported now; ``where`` it was asked for is said by the errors.
+    """Import a matcher and return its spec; errors name ``where`` the request came from.
 
-    Raises :class:`UserError` for an unknown name, :class:`UnusableError` where the import fails.
+    Raises :class:`UserError` for an unknown name, :class:`UnusableError` if the import fails.
     """
     spec: MatcherSpec = _imported(name, where).SPEC
     return spec
 
 
 def load_matcher(name: str, weights: WeightStore, options: Any, placement: Placement) -> Matcher[Any]:
-    """The matcher, ready to run; raises :class:`UserError` where its weights are missing or damaged."""
+    """Return the matcher, ready to run; raises :class:`UserError` if its weights are missing or damaged."""
     matcher: Matcher[Any] = _imported(name, "load").load(weights, options, placement)
     return matcher
 

@@ -1,4 +1,4 @@
-"""The adapter of the semi-dense networks: feature maps for each picture, matches of coarse cells for each pair."""
+"""The adapter of semi-dense networks: feature maps of each picture, matches of coarse cells of each pair."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ from mkpc_kaggle.matchers.sparse import image_batch
 from mkpc_kaggle.weights import WeightStore, load_into
 
 PREFIX = "matcher."  # of parameter names in the published training checkpoints
-TRANSPORT = "coarse_matching.bin_score"  # only in checkpoints of networks with optimal transport
+TRANSPORT = "coarse_matching.bin_score"  # only checkpoints of networks with optimal transport have it
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class SemiDenseEncoding:
 
 
 class SemiDenseMatcher(PairwiseMatcher[SemiDenseEncoding]):
-    """A match's score is the confidence of its coarse cells."""
+    """A semi-dense matcher; a match's score is the confidence of its coarse cells."""
 
     def __init__(self, network: SemiDenseNetwork[Any], spec: MatcherSpec, device: str) -> None:
         self.spec = spec
@@ -59,7 +59,7 @@ class SemiDenseMatcher(PairwiseMatcher[SemiDenseEncoding]):
     @torch.inference_mode()
     def encode(self, pictures: Sequence[Picture]) -> list[SemiDenseEncoding]:
         maps = self._network.encode(image_batch(pictures, self.device))
-        # Copies: a part of a map would keep all of it in memory.
+        # Copies: a view would keep the whole batch in memory.
         singles = zip(torch.split(maps.coarse, 1), torch.split(maps.fine, 1), strict=True)
         return [
             SemiDenseEncoding(FeatureMaps(coarse.clone(), fine.clone()), picture.content)
@@ -68,17 +68,17 @@ class SemiDenseMatcher(PairwiseMatcher[SemiDenseEncoding]):
 
     def _match(self, first: SemiDenseEncoding, second: SemiDenseEncoding) -> Matches:
         masks = first.mask, second.mask
-        # Even a mask that is all True can change rounding.
+        # Even a mask of True only can change rounding.
         found = self._network.match(first.maps, second.maps, None if all(mask.all() for mask in masks) else masks)
         points0, points1 = (from_corner(points.float().cpu().numpy()) for points in (found.points0, found.points1))
         return Matches(points0, points1, found.coarse.confidence.float().cpu().numpy())
 
 
 def load_network(network: SemiDenseNetwork[Any], weights: WeightStore, slot: str, *, unused: str = "$^") -> None:
-    """Fill a network from the published checkpoint, whose names have the training wrapper's prefix.
+    """Load the published checkpoint, whose names have the training wrapper's prefix, into a network.
 
-    Position tables, which are computed, and names that match ``unused`` are ignored. Raises :class:`UserError`
-    for weights that were trained with optimal transport.
+    Position tables are computed, so the checkpoint's are ignored, and so are names that match ``unused``. Raises
+    :class:`UserError` for weights that were trained with optimal transport.
     """
     tensors = {name.removeprefix(PREFIX): tensor for name, tensor in weights.load(slot).items()}
     if TRANSPORT in tensors:

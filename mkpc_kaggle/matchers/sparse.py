@@ -1,7 +1,8 @@
-"""Shared by keypoint matchers: the keypoints of a picture, an encoder, matches from pairs of indices."""
+"""Shared parts of keypoint matchers: keypoints of a picture, encoders, matches from pairs of indices."""
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -15,82 +16,69 @@ from mkpc_kaggle.matchers.networks.placement import autocast
 
 # Images (B, 3, H, W) -> the points (K, 2) in pixels and unit descriptors (K, D) of each.
 Detector = Callable[[Tensor], Iterable[tuple[Tensor, Tensor]]]
-# An image (3, H, W) and points (K, 2) -> patches (K, C, S, S).
-Patches = Callable[[Tensor, Tensor], Tensor]
 
 
 @dataclass(frozen=True, eq=False)
 class Keypoints:
     """K keypoints of one picture: ``points`` (K, 2) float32 in view pixels, unit ``descriptors`` (K, D).
 
-    ``patches`` (K, C, S, S) of the picture about the points, if they will be refined.
+    ``scales`` (K,), diameters in view pixels, and ``orientations`` (K,), radians, if the detector has them.
     """
 
     points: Tensor
     descriptors: Tensor
     content: Size
-    patches: Tensor | None = None
+    scales: Tensor | None = None
+    orientations: Tensor | None = None
 
     @classmethod
-    def on_content(cls, points: Tensor, descriptors: Tensor, content: Size) -> "Keypoints":
-        """The keypoints on the picture's content, without those on its padding."""
+    def on_content(cls, points: Tensor, descriptors: Tensor, content: Size, *shapes: Tensor) -> "Keypoints":
+        """Return the keypoints on the picture's content, without its padding; ``shapes``: scales, orientations."""
         upper = points.new_tensor(content) - 0.5
         kept = ((points >= -0.5) & (points < upper)).all(dim=1)
-        return cls(points[kept], descriptors[kept], content)
-
-    def with_patches(self, image: Tensor, patches: Patches) -> "Keypoints":
-        """The same keypoints with patches of the picture's content; ``image`` (3, H, W) has its padding too."""
-        width, height = self.content
-        return replace(self, patches=patches(image[:, :height, :width], self.points))
+        return cls(points[kept], descriptors[kept], content, *(shape[kept] for shape in shapes))
 
     def __len__(self) -> int:
         return len(self.points)
 
 
-class KeypointEncoder:
-    """The keypoints that a detector on this device finds in the content of pictures, with ``patches`` if given."""
+class Encoder(Protocol):
+    def encode(self, pictures: Sequence[Picture]) -> list[Keypoints]: ...
 
-    def __init__(self, detect: Detector, device: str, patches: Patches | None = None) -> None:
+
+class KeypointEncoder:
+    """An encoder that runs a detector on a device."""
+
+    def __init__(self, detect: Detector, device: str) -> None:
         self._detect = detect
         self._device = device
-        self._patches = patches
 
     @torch.inference_mode()
     def encode(self, pictures: Sequence[Picture]) -> list[Keypoints]:
-        images = image_batch(pictures, self._device)
-        encodings = [
-            Keypoints.on_content(points.float(), descriptors.float(), picture.content)
-            for (points, descriptors), picture in zip(self._detect(images), pictures, strict=True)
-        ]
-        if self._patches is None:
-            return encodings
+        found = self._detect(image_batch(pictures, self._device))
         return [
-            keypoints.with_patches(image, self._patches)
-            for keypoints, image in zip(encodings, images, strict=True)
+            Keypoints.on_content(points.float(), descriptors.float(), picture.content)
+            for (points, descriptors), picture in zip(found, pictures, strict=True)
         ]
 
 
 def library_encoder(
-    network: nn.Module,
-    features: nn.Module,
-    detect: Detector,
-    placement: Placement,
-    patches: Patches | None = None,
+    network: nn.Module, features: nn.Module, detect: Detector, placement: Placement
 ) -> KeypointEncoder:
-    """The encoder of a network that is not ours; what its part ``features`` returns must be finite."""
+    """Return the encoder of a library's network; the output of its part ``features`` must be finite."""
     network.eval().to(placement.device)
     what = f"features of {type(network).__name__.lower()}"
     features.register_forward_hook(lambda _, inputs, found: check_finite(what, found))
-    return KeypointEncoder(autocast(placement)(detect), placement.device, patches)
+    return KeypointEncoder(autocast(placement)(detect), placement.device)
 
 
 def matches_of(points0: Tensor, points1: Tensor, index0: Tensor, index1: Tensor, scores: Tensor) -> Matches:
-    """The matches that pair point ``index0[i]`` of one picture with ``index1[i]`` of the other."""
+    """Return the matches that pair point ``index0[i]`` of one picture with ``index1[i]`` of the other."""
     return Matches(points0[index0].cpu().numpy(), points1[index1].cpu().numpy(), scores.cpu().numpy())
 
 
 def image_batch(pictures: Sequence[Picture], device: str) -> Tensor:
-    """Pictures of one shape as float32 in [0, 1]: (B, 3, H, W) from RGB, (B, 1, H, W) from gray."""
+    """Convert pictures of one shape to float32 in [0, 1]: (B, 3, H, W) for RGB, (B, 1, H, W) for gray."""
     stacked = np.stack([picture.pixels for picture in pictures])
     batch = torch.from_numpy(stacked).to(device)
     batch = batch[:, None] if stacked.ndim == 3 else batch.permute(0, 3, 1, 2)

@@ -1,8 +1,8 @@
-"""Matchers of vismatch (https://github.com/gmberton/vismatch, version 1.4) as matchers of ours.
+"""Adapter of vismatch's matchers (https://github.com/gmberton/vismatch, version 1.4).
 
-Its ``get_matcher(NAME)`` returns an object that is called with two images and answers with a dict.
-Of that we read ``matched_kpts0`` and ``matched_kpts1``, (N, 2) pixels (x, y) before its own RANSAC, and
-``matched_confidences``, (N,) or ``None``. vismatch itself is not needed here.
+vismatch's ``get_matcher(NAME)`` returns a callable that maps two images to a dict. The adapter reads
+``matched_kpts0`` and ``matched_kpts1``, (N, 2) pixels (x, y) before vismatch's RANSAC, and
+``matched_confidences``, (N,) or ``None``. It does not import vismatch.
 """
 
 from collections.abc import Sequence
@@ -17,12 +17,12 @@ from mkpc_kaggle.matchers.contract import MatcherSpec, PairwiseMatcher, Picture
 
 
 class VismatchMatcher(PairwiseMatcher[Picture]):
-    """Give it to :class:`mkpc_kaggle.TwoStageMatcher` under the name that the recipe's units have.
+    """A vismatch matcher for :class:`mkpc_kaggle.TwoStageMatcher`, under the name in the recipe's units.
 
-    ``corner``: the matcher counts pixels from the image's top-left corner, as RoMa, DKM and LoMa do; else from the
-    centre of the top-left pixel. ``multiple``: what the sides of its images must be multiples of; where they are
-    not, many matchers resize, and their points lose a little. Every pair is matched from the pixels: no features
-    are kept. A match without a confidence has the score 1. The homography that vismatch fits is switched off.
+    ``corner``: the origin of points is the image's top-left corner, as in RoMa, DKM and LoMa; otherwise it is the
+    centre of the top-left pixel. ``multiple``: images are padded to multiples of it; many matchers resize other
+    images, which makes points less accurate. Every pair is matched from pixels; features are not cached. A match
+    without a confidence has the score 1. vismatch's homography is switched off.
     """
 
     def __init__(
@@ -43,7 +43,7 @@ class VismatchMatcher(PairwiseMatcher[Picture]):
         return list(pictures)
 
     def _match(self, picture0: Picture, picture1: Picture) -> Matches:
-        # (3, H, W) float32 in 0..1, padding included: it keeps the sides multiples of what they have to be.
+        # (3, H, W) float32 in 0..1, padding included, which makes the sides multiples.
         both = (torch.from_numpy(each.pixels).permute(2, 0, 1).float() / 255 for each in (picture0, picture1))
         found = self._matcher(*both)
         points = [np.asarray(found[f"matched_kpts{number}"], np.float32).reshape(-1, 2) for number in (0, 1)]

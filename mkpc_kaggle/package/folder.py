@@ -1,4 +1,4 @@
-"""Writing a folder that has exactly the given files."""
+"""Folders with exactly the given files."""
 
 import filecmp
 import shutil
@@ -11,7 +11,7 @@ from mkpc_kaggle.errors import UserError
 
 @dataclass(frozen=True)
 class Item:
-    """A file to write: its name in the folder, its source, and its licence if it has its own."""
+    """A file to write: name in the folder, source, and licence if it has its own."""
 
     name: str
     source: Path
@@ -20,20 +20,20 @@ class Item:
 
 
 def refuse_other_files(directory: Path, items: Sequence[Item]) -> None:
-    """Raise :class:`UserError` where the folder has other files: they would be uploaded too."""
+    """Raise :class:`UserError` if the folder has other files, which would be uploaded too."""
     names = {name for item in items for name in (item.name, f".{item.name}.part")}
     others = sorted({path.name for path in directory.glob("*")} - names)
     if others:
         raise UserError(
-            f"{directory} holds files that would be uploaded too: {', '.join(others)}. Remove them, or choose "
+            f"{directory} contains files that would be uploaded too: {', '.join(others)}. Remove them, or choose "
             "another --out."
         )
 
 
 def write_files(directory: Path, items: Sequence[Item]) -> tuple[Item, ...]:
-    """Write these files into the folder, except those that are there with the same bytes; the files as written.
+    """Write files into the folder, except existing ones with the same bytes, and return them as written.
 
-    Raises :class:`UserError` where a file cannot be written; the same call continues there.
+    Raises :class:`UserError` if a file cannot be written; the same call resumes.
     """
     try:
         directory.mkdir(parents=True, exist_ok=True)

@@ -10,12 +10,12 @@ from mkpc_kaggle.version import __version__
 COMPETITION = "image-matching-challenge-2022"
 DATASET_SLUG = "mkpc-kaggle"
 KERNEL_TITLE = "MKPC submission"
-KERNEL_SLUG = KERNEL_TITLE.lower().replace(" ", "-")  # Kaggle derives it like this, and requires that both agree
+KERNEL_SLUG = KERNEL_TITLE.lower().replace(" ", "-")  # Kaggle derives it from the title, and both must agree
 LATEST, ORIGINAL = "latest", "original"
 
 
 def check_owner(owner: str) -> None:
-    """Raise :class:`UserError` unless it can be the name of a Kaggle user."""
+    """Raise :class:`UserError` unless ``owner`` can be a Kaggle user name."""
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9-]*", owner):
         raise UserError(
             f"--owner {owner!r} cannot be a Kaggle user name: give the last part of your profile's address, "
@@ -24,7 +24,7 @@ def check_owner(owner: str) -> None:
 
 
 def dataset_metadata(owner: str, licences: Iterable[str]) -> str:
-    """``dataset-metadata.json``. Kaggle takes one licence for each dataset; the description lists the others."""
+    """Return ``dataset-metadata.json``. Kaggle allows one licence per dataset; the description lists all."""
     return _json(
         {
             "id": f"{owner}/{DATASET_SLUG}",
@@ -39,10 +39,10 @@ def dataset_metadata(owner: str, licences: Iterable[str]) -> str:
 
 
 def kernel_metadata(owner: str, notebook: str, image: str) -> str:
-    """``kernel-metadata.json``: two T4, internet off, the competition and our dataset attached.
+    """Return ``kernel-metadata.json``: two T4, internet off, the competition and our dataset attached.
 
-    ``image`` is ``latest``, ``original`` (the image of the kernel's first version, in later ones too), or an image
-    by its digest, as ``kaggle kernels pull -m`` tells it. Raises :class:`UserError` for anything else.
+    ``image`` is ``latest``, ``original`` (the image of the kernel's first version), or an image with the digest
+    that ``kaggle kernels pull -m`` reports. Raises :class:`UserError` for other values.
     """
     if image not in (LATEST, ORIGINAL) and not re.fullmatch(r"[\w./:-]+@sha256:[0-9a-f]{64}", image):
         raise UserError(f"--image {image}: give {LATEST}, {ORIGINAL}, or an image as NAME@sha256:DIGEST")

@@ -1,4 +1,4 @@
-"""The dataset folder and the kernel folder, from a checkout, weights and an index of wheels."""
+"""The dataset and kernel folders, made from a checkout, weights and an index of wheels."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,17 +18,17 @@ NOTEBOOK = Path("notebooks", "submission.ipynb")
 @dataclass(frozen=True)
 class Request:
     out: Path
-    owner: str  # a user of Kaggle
+    owner: str  # a Kaggle user name
     weights: tuple[Path, ...] = ()  # directories
     pythons: tuple[str, ...] = PYTHONS
-    wheels: Path | None = None  # a directory to take wheels from, instead of pip's index
-    private: bool = False  # include weights that must not be redistributed
-    image: str = LATEST  # of Kaggle's, see :func:`kernel_metadata`
+    wheels: Path | None = None  # a directory of wheels, used instead of pip's index
+    private: bool = False  # include weights whose licence forbids redistribution
+    image: str = LATEST  # a Kaggle image, see :func:`kernel_metadata`
 
 
 @dataclass(frozen=True)
 class Package:
-    """The files of both folders, and the weights whose licences do not allow redistribution."""
+    """The files of both folders, and the weights whose licences forbid redistribution."""
 
     dataset: tuple[Item, ...]
     kernel: tuple[Item, ...]
@@ -36,10 +36,10 @@ class Package:
 
 
 def make_package(request: Request) -> Package:
-    """Write both folders; the same request gives the same bytes, and files that are there already are kept.
+    """Write both folders and return them; the same request gives the same bytes.
 
-    Raises :class:`UserError`, before anything is written, without a checkout, for files in the folders that do not
-    belong there, for damaged weights, and where wheels cannot be built or found.
+    Raises :class:`UserError`, before anything is written: without a checkout, for other files in the folders, for
+    damaged weights, and if wheels cannot be built or found.
     """
     check_owner(request.owner)
     if request.wheels is not None and not request.wheels.is_dir():
@@ -78,11 +78,11 @@ def make_package(request: Request) -> Package:
 
 
 def find_checkout() -> Path:
-    """The source checkout that this package runs from; :class:`UserError` where it was installed from a wheel."""
+    """Return the checkout that this package runs from; raise :class:`UserError` if a wheel was installed."""
     root = Path(__file__).resolve().parents[2]
     if not (root / NOTEBOOK).is_file():
         raise UserError(
-            f"mkpc_kaggle was installed in {root} without its sources, which `package` builds the wheel from: "
+            f"mkpc_kaggle was installed in {root} without its sources, which `package` needs to build the wheel: "
             "clone the repository and run `python -m mkpc_kaggle package` in the clone"
         )
     return root

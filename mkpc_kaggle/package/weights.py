@@ -1,4 +1,4 @@
-"""Which weight files go into the dataset, and in what form."""
+"""The weight files of the dataset, as safetensors."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,20 +13,19 @@ HEADER = "# The weights of this dataset; the columns are name, bytes, digest, li
 
 @dataclass(frozen=True)
 class ChosenWeights:
-    """The files to include, with the texts of their licences, and those that must not be redistributed."""
+    """The files to include, the texts of their licences, and the files that must not be redistributed."""
 
     items: tuple[Item, ...]
-    manifest: str  # a line for each of the items
+    manifest: str  # a line per item
     licence_texts: tuple[Item, ...]
-    restricted: tuple[Item, ...]  # left out; in a private package they are among the items too
+    restricted: tuple[Item, ...]  # excluded, except from a private package
 
 
 def choose_weights(store: WeightStore, checkout: Path, staging: Path, *, private: bool) -> ChosenWeights:
-    """The file of each slot that the store has, as safetensors: Kaggle would unpack a torch checkpoint.
+    """Choose the file of each slot in the store, as safetensors: Kaggle would unpack a torch checkpoint.
 
-    Conversions go into ``staging``. Licences whose text the checkout has allow redistribution.
-    Raises :class:`mkpc_kaggle.errors.UserError` for a slot of which only damaged files were found, and for a
-    checkpoint that cannot be read.
+    Conversions are written to ``staging``. Licences with a text in the checkout allow redistribution.
+    Raises :class:`mkpc_kaggle.errors.UserError` if a slot has only damaged files or a checkpoint cannot be read.
     """
     slots = dict.fromkeys(file.slot for file in store.files)
     every = [found for found in (_good_file(store, slot) for slot in slots) if found is not None]
@@ -44,7 +43,7 @@ def choose_weights(store: WeightStore, checkout: Path, staging: Path, *, private
 
 
 def licence_text(checkout: Path, tag: str) -> Path | None:
-    """The text of a licence that the manifest names, if the checkout has it."""
+    """Return the path of a licence's text, if the checkout has it; ``tag`` is from the manifest."""
     texts = {path.stem: path for path in (checkout / "licences").glob("*.txt")}
     return (texts | {"Apache-2.0": checkout / "LICENSE"}).get(tag)
 
@@ -55,15 +54,15 @@ def _good_file(store: WeightStore, slot: str) -> FoundFile | None:
         refusals = "; ".join(f"{refused.path}: {refused.note}" for refused in search.refused)
         raise UserError(
             f"no good file for {slot!r}. Found {refusals}. Fetch it again "
-            f"(python -m mkpc_kaggle weights fetch {slot} --out DIR), or take it out of the directory."
+            f"(python -m mkpc_kaggle weights fetch {slot} --out DIR), or remove it from the directory."
         )
     return search.found
 
 
 def _as_safetensors(found: FoundFile, staging: Path) -> tuple[WeightFile, Path]:
-    """The manifest's line of the safetensors file, and its path."""
+    """Return the manifest's line and the path of the safetensors file."""
     if found.path.suffix == ".safetensors":
         return replace(found.file, size=found.path.stat().st_size, digest=found.digest), found.path
-    # The whole name, suffix included: the manifest may know another conversion under the shorter one.
+    # The full name, with its suffix: the manifest may list another conversion under the shorter name.
     path = staging / f"{found.file.name}.safetensors"
     return convert(found.path, path, found.file), path

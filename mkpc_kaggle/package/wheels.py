@@ -1,4 +1,4 @@
-"""Wheels: our own, built from the checkout, and those of the dependencies that Kaggle's image may lack."""
+"""Wheels: ours, built from the checkout, and wheels of dependencies that may be missing in Kaggle's image."""
 
 import subprocess
 import sys
@@ -14,23 +14,23 @@ from packaging.utils import canonicalize_name
 
 from mkpc_kaggle.errors import UserError
 
-# Dependencies, direct or not, that Kaggle's image may lack or have in a version that is too old.
+# Direct and indirect dependencies that may be missing or too old in Kaggle's image.
 BUNDLED = ("kornia", "kornia-rs", "pycolmap", "safetensors")
-PYTHONS = ("3.11", "3.12", "3.13", "3.14")  # of Kaggle's images, pinned older ones included, and likely next ones
+PYTHONS = ("3.11", "3.12", "3.13", "3.14")  # of Kaggle's current, pinned older and probable next images
 PLATFORMS = ("manylinux_2_28_x86_64", "manylinux_2_17_x86_64", "manylinux2014_x86_64")
 
 
 def pins(checkout: Path) -> tuple[str, ...]:
-    """``name==version`` of each bundled package, the version being the one that the tests run with."""
+    """Return ``name==version`` of each bundled package, with the version of the tests."""
     lines = (checkout / "requirements-dev.txt").read_text(encoding="utf-8").splitlines()
     pinned = {canonicalize_name(line.partition("==")[0]): line for line in lines}
     return tuple(pinned[canonicalize_name(name)] for name in BUNDLED)
 
 
 def install_lines(own: Path, wheels: Iterable[Path]) -> tuple[str, ...]:
-    """What the notebook installs: our wheel, and the ranges of bundled packages that the wheels require.
+    """Return the requirements of the notebook: our wheel, and the ranges of bundled packages of all wheels.
 
-    A version of the image within the range stays, whether there is a wheel for its Python or not.
+    A version of the image within the range is kept, with or without a wheel for its Python.
     """
     lines = (line for wheel in (own, *wheels) for line in _metadata(wheel).get_all("Requires-Dist", []))
     bundled = {
@@ -54,10 +54,10 @@ def build_wheel(checkout: Path, directory: Path) -> Path:
 def collect_wheels(
     requirements: Sequence[str], pythons: Iterable[str], directory: Path, *, kept: Path, wheels: Path | None
 ) -> list[Path]:
-    """The wheels of these requirements for these Python versions (``3.11``), in order of their names.
+    """Collect the wheels of these requirements for these Python versions (``3.11``), ordered by name.
 
-    They come from the directory ``wheels`` if given; else from ``kept``, the output of an earlier run, or, if one
-    is missing there, from pip's index. Raises :class:`UserError` where a wheel is not found.
+    The source is the directory ``wheels`` if given. Otherwise it is ``kept``, the output of an earlier run, and
+    pip's index for missing wheels. Raises :class:`UserError` if a wheel is not found.
     """
     local = ("--no-index", "--find-links", str(wheels or kept))
     sources = [local] if wheels else [local, ()]
@@ -71,7 +71,7 @@ def collect_wheels(
             raise UserError(
                 f"no wheels of {', '.join(requirements)} for Python {python} on Linux x86-64"
                 + (f" in {wheels}" if wheels else "")
-                + f": {failure}. On a machine without internet, name a directory that has them with --wheels."
+                + f": {failure}. On a machine without internet, give a directory of wheels with --wheels."
             )
     return sorted(directory.glob("*.whl"))
 
@@ -88,7 +88,7 @@ def _metadata(wheel: Path) -> Message:
 
 
 def _pip(*arguments: str | Path) -> str:
-    """Run this interpreter's pip; the reason if it failed, else empty."""
+    """Run this interpreter's pip; return the reason of a failure, or an empty text."""
     command = [sys.executable, "-m", "pip", "--disable-pip-version-check", *map(str, arguments)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode == 0:

@@ -17,7 +17,6 @@ from mkpc_kaggle.pipeline.availability import (
     refusal,
     slots_of,
     unavailable,
-    unrefined,
 )
 from mkpc_kaggle.pipeline.devices import AUTO, gpus_of, require_device, resolve_placement
 from mkpc_kaggle.pipeline.stages import ENCODING_CACHE_BYTES, Pipeline
@@ -134,8 +133,6 @@ def assemble(
         options_of(chosen, name)  # those of a matcher that no unit names are checked too
     left_out = by_kind({name: reasons[name] for name in written.matcher_names if name in reasons})
     chosen = chosen.only(lambda unit: unit.matcher not in lacking).with_scenes(scenes).in_mode(mode)
-    if names := unrefined(chosen, store, own):
-        left_out += (f"no weights to refine keypoints: {', '.join(names)}",)
     made = Assembly(chosen, store, resolve_placement(device, precision), left_out, own, device)
     files = made.weight_files.values()
     if unverified := sorted(file.path.name for file in files if file.state is State.UNVERIFIED):

@@ -1,16 +1,15 @@
 """Which matchers of a recipe cannot run here, and why: their code, their weights, the licence of these."""
 
-from collections.abc import Container, Iterable, Iterator, Mapping
+from collections.abc import Container, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from enum import StrEnum
-from itertools import chain
 from types import MappingProxyType
 from typing import Any
 
 from mkpc_kaggle.config import from_table
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.matchers.contract import Matcher, MatcherSpec, Placement
+from mkpc_kaggle.matchers.contract import Matcher, Placement
 from mkpc_kaggle.matchers.registry import UnusableError, load_matcher, spec_of
 from mkpc_kaggle.pipeline.failures import reason_of
 from mkpc_kaggle.recipe import Recipe
@@ -116,23 +115,10 @@ def options_of(recipe: Recipe, name: str) -> Any:
 
 
 def slots_of(recipe: Recipe, own: Container[str] = ()) -> tuple[str, ...]:
-    """The slots, each once, of the recipe's matchers that can be imported here; the user's ``own`` need none.
-
-    Slots that a matcher uses only if they are found are among them.
-    """
-    used = (spec.slots_for(options) + spec.wanted_for(options) for _, spec, options in _specs(recipe, own))
-    return tuple(dict.fromkeys(chain.from_iterable(used)))
-
-
-def unrefined(recipe: Recipe, store: WeightStore, own: Container[str] = ()) -> tuple[str, ...]:
-    """The matchers whose keypoints stay as detected since the weights that refine them are not found."""
-    wanted = {name: spec.wanted_for(options) for name, spec, options in _specs(recipe, own)}
-    return tuple(name for name, slots in wanted.items() for slot in slots if store.find(slot) is None)
-
-
-def _specs(recipe: Recipe, own: Container[str]) -> Iterator[tuple[str, MatcherSpec, Any]]:
-    """The recipe's matchers that can be imported here, with their options; not the user's ``own``."""
+    """Return the slots, each once, of the recipe's matchers that can be imported here; ``own`` ones need none."""
+    slots: list[str] = []
     for name in recipe.matcher_names:
         with suppress(UnusableError):
             if name not in own:
-                yield name, spec_of(name, f"recipe {recipe.name!r}"), options_of(recipe, name)
+                slots += spec_of(name, f"recipe {recipe.name!r}").slots_for(options_of(recipe, name))
+    return tuple(dict.fromkeys(slots))

@@ -1,4 +1,4 @@
-"""Weight files: the manifest that lists them, finding, checking, loading, downloading and converting them.
+"""Weight files: the manifest, and finding, verifying, loading, downloading and converting the files.
 
 Importing this package imports no torch.
 """

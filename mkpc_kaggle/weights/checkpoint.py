@@ -1,4 +1,4 @@
-"""Tensors from a checkpoint file, without running any code in it, and from there into a network."""
+"""Loading tensors from a checkpoint file, without running its code, and into a network."""
 
 import re
 import zipfile
@@ -14,12 +14,12 @@ if TYPE_CHECKING:
     import torch
     from torch import nn
 
-TENSORS_UNDER = ("state_dict", "extractor", "model")  # the first that a checkpoint has
-MAX_EXPANSION = 4  # bytes of tensors for each byte of the file: some tensors share their bytes
+TENSORS_UNDER = ("state_dict", "extractor")  # the first key in a checkpoint counts
+MAX_EXPANSION = 4  # bytes of tensors per byte of the file; some tensors share their bytes
 
 
 class Inert:
-    """Stands for every class and function in a pickle that torch does not know; it does nothing."""
+    """A stand-in without effect for classes and functions in a pickle that torch does not know."""
 
     def __new__(cls, *_: object, **__: object) -> "Inert":
         return object.__new__(cls)
@@ -29,12 +29,12 @@ class Inert:
 
 
 def load_tensors(path: Path) -> "dict[str, torch.Tensor]":
-    """Tensors by name, on the CPU, from a safetensors file or a torch checkpoint; nothing in the file is executed.
+    """Load tensors by name, on the CPU, from a safetensors file or a torch checkpoint without executing code.
 
-    ``path`` may be the directory into which a torch checkpoint was unpacked (``NAME/NAME`` on Kaggle).
-    A training checkpoint has its tensors under ``state_dict``, DISK's under ``extractor``, Keypt2Subpx's under
-    ``model``; its other entries are left out. Raises :class:`UserError` if the file cannot be read, if an entry is
-    not a dense tensor with a name, or if the tensors have many more bytes than the file.
+    ``path`` may be the directory of an unpacked torch checkpoint (``NAME/NAME`` on Kaggle). A training checkpoint
+    has its tensors under ``state_dict``, DISK's under ``extractor``; other entries are ignored.
+    Raises :class:`UserError` if the file cannot be read or an entry is not a dense tensor with a name. The same
+    error is raised if the tensors have many more bytes than the file.
     """
     try:
         table = _load_table(path)
@@ -49,9 +49,9 @@ def load_into(
 ) -> None:
     """Load a checkpoint into a network: all names and shapes must agree.
 
-    Only entries whose names match the pattern ``unused`` may be missing or surplus. A network made on the device
-    "meta" takes over the tensors themselves, so that a large network is not in memory twice. Raises
-    :class:`UserError` that names some of the entries that do not fit.
+    Only entries whose names match the pattern ``unused`` may be missing or surplus. A network on the device "meta"
+    takes the tensors themselves, so that a large network is not in memory twice. Raises :class:`UserError` that
+    names up to five entries that do not fit.
     """
     own = network.state_dict()
     odd = [name for name in own.keys() ^ tensors.keys() if not re.match(unused, name)]
@@ -69,7 +69,7 @@ def _require_plain(table: Mapping[Any, Any], path: Path) -> None:
     for name, value in table.items():
         plain = isinstance(value, torch.Tensor) and (value.layout, value.device.type) == (torch.strided, "cpu")
         if not plain or not isinstance(name, str) or value.is_quantized or value.is_nested:
-            raise ValueError(f"entry {name!r} is no plain tensor with a name; save the network's state_dict alone")
+            raise ValueError(f"entry {name!r} is not a plain named tensor; save the network's state_dict alone")
     file_bytes = sum(file.stat().st_size for file in (path, *path.rglob("*")) if file.is_file())
     if sum(tensor.nbytes for tensor in table.values()) > MAX_EXPANSION * file_bytes:
         raise ValueError("its tensors are larger than the file")
@@ -88,20 +88,20 @@ def _load_table(path: Path) -> Mapping[Any, Any]:
     try:
         contents = _unpickle(path)
     except (RuntimeError, EOFError, UnpicklingError, LookupError) as refusal:
-        # torch's message advises to load the file unsafely.
+        # torch's message recommends an unsafe way to load the file.
         raise ValueError(
-            "it is not a checkpoint, or holds objects that are not read here; save the network's state_dict alone"
+            "it is not a checkpoint, or contains unsupported objects; save the network's state_dict alone"
         ) from refusal
     if isinstance(contents, dict):
         contents = next((contents[key] for key in TENSORS_UNDER if key in contents), contents)
     if not isinstance(contents, dict):
-        raise ValueError("it holds no table of tensors by name")
+        raise ValueError("it contains no table of named tensors")
     return contents
 
 
 def _pack(directory: Path, file: Path) -> Path:
-    """Write an unpacked checkpoint as one archive again, ``file``; raises ``OSError``."""
-    # Mounted files may be dated 1970, which is before the format's first year.
+    """Pack an unpacked checkpoint into the archive ``file``; raises ``OSError``."""
+    # Mounted files may have dates in 1970, before the format's first year.
     with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED, strict_timestamps=False) as archive:
         for path in sorted(path for path in directory.rglob("*") if path.is_file()):
             archive.write(path, f"archive/{path.relative_to(directory).as_posix()}")
@@ -109,11 +109,11 @@ def _pack(directory: Path, file: Path) -> Path:
 
 
 def _unpickle(path: Path) -> object:
-    """The contents of a torch checkpoint, tensors on the CPU.
+    """Return the contents of a torch checkpoint, tensors on the CPU.
 
     Training frameworks pickle callbacks and settings of classes that are not installed here, which
-    ``weights_only=True`` refuses. In an archive such names are mapped to :class:`Inert`; torch still refuses names
-    of the operating system. The format before archives may hold no unknown names.
+    ``weights_only=True`` refuses. In archives these names are mapped to :class:`Inert`; torch still refuses names
+    of the operating system. The older format must not contain unknown names.
     """
     import torch
     from torch.serialization import get_unsafe_globals_in_checkpoint, safe_globals

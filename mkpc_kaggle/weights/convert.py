@@ -1,4 +1,4 @@
-"""Checkpoints as safetensors with the same names."""
+"""Conversion of checkpoints to safetensors with the same tensor names."""
 
 from pathlib import Path
 
@@ -10,10 +10,10 @@ from mkpc_kaggle.weights.store import is_unpacked_from
 
 
 def convert(source: Path, target: Path, known: WeightFile | None = None) -> WeightFile:
-    """Write the tensors of ``source`` into ``target``, each a contiguous copy; returns the manifest's line for it.
+    """Write contiguous copies of the tensors of ``source`` to ``target``; return its line of a manifest.
 
-    ``known`` is the manifest's line of the source, by default found by its digest, or else by its name. Raises
-    :class:`UserError` if the source cannot be read, or if the target cannot be written or does not end in
+    ``known`` is the manifest's line of the source; by default it is found by digest, then by name. Raises
+    :class:`UserError` if the source cannot be read, the target cannot be written, or its name does not end in
     ``.safetensors``.
     """
     if target.suffix != ".safetensors":
@@ -27,7 +27,7 @@ def convert(source: Path, target: Path, known: WeightFile | None = None) -> Weig
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         part.unlink(missing_ok=True)  # it may be a link
-        # safetensors takes no views and no two tensors that share their bytes.
+        # safetensors refuses views and tensors that share their bytes.
         save_file({name: tensor.contiguous().clone() for name, tensor in tensors.items()}, part)
         part.replace(target)
     except KeyError as error:

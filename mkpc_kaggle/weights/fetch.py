@@ -1,4 +1,4 @@
-"""Downloads files of the manifest: resumed after interruptions, renamed once their digest is verified."""
+"""Downloads of the manifest's files: resumed after interruptions, renamed after their digest is verified."""
 
 import sys
 import time
@@ -19,10 +19,10 @@ from mkpc_kaggle.weights.store import judge
 
 ATTEMPTS = 5
 BLOCK_BYTES = 1 << 20
-TIMEOUT_S = 30.0  # without a byte
-MAX_BYTES = 1 << 33  # of a file whose size the manifest does not know
-WEB_PAGE_HOSTS = ("drive.google.com",)  # they answer with a web page instead of the file
-TRANSIENT_STATUSES = (408, 416, 425, 429, 500, 502, 503, 504)  # HTTP status codes after which a retry may succeed
+TIMEOUT_S = 30.0  # without data
+MAX_BYTES = 1 << 33  # of a file of unknown size
+WEB_PAGE_HOSTS = ("drive.google.com",)  # they return a web page instead of the file
+TRANSIENT_STATUSES = (408, 416, 425, 429, 500, 502, 503, 504)  # HTTP statuses after which a retry can succeed
 
 
 class FetchOutcome(StrEnum):
@@ -34,7 +34,7 @@ class FetchOutcome(StrEnum):
 
 @dataclass(frozen=True)
 class Fetched:
-    """``note``: why it failed, what to do by hand, or an unverified file's digest."""
+    """The result of a download. ``note``: reason of a failure, manual step, or digest of an unverified file."""
 
     path: Path
     outcome: FetchOutcome
@@ -42,23 +42,23 @@ class Fetched:
 
 
 def url_of(file: WeightFile) -> str | None:
-    """Where the file can be downloaded as it is, or ``None``."""
+    """Return the URL of a direct download, or ``None``."""
     url = file.source.split()[0]
     parts = urlsplit(url)
     return url if parts.scheme in ("http", "https") and parts.hostname not in WEB_PAGE_HOSTS else None
 
 
 def choose(alternatives: Sequence[WeightFile], directory: Path) -> WeightFile:
-    """Of the lines of a slot: the first whose file is there, else that can be downloaded, else the first."""
+    """Choose a line of a slot: the first with a usable file, else the first with a URL, else the first."""
     there = [file for file in alternatives if judge(directory / file.name, file).usable]
     return next(iter(there + [file for file in alternatives if url_of(file)] + list(alternatives)))
 
 
 def fetch(file: WeightFile, directory: Path, *, wait: Callable[[float], None] = time.sleep) -> Fetched:
-    """Download the file into the directory, which is created.
+    """Download the file into the directory, which is created if necessary.
 
-    A partial download stays in ``NAME.part``. It is continued if the manifest has a digest, which shows in the end
-    whether both parts are of the same file. ``wait`` is called with the seconds to pause before another attempt.
+    A partial download stays in ``NAME.part``. It is resumed if the manifest has a digest, which finally verifies
+    both parts together. ``wait`` is called with the seconds to pause before the next attempt.
     """
     path = directory / file.name
     if judge(path, file).usable:
@@ -71,7 +71,7 @@ def fetch(file: WeightFile, directory: Path, *, wait: Callable[[float], None] = 
         with writing(str(path)):
             directory.mkdir(parents=True, exist_ok=True)
             if part.is_symlink() or not part.is_file():
-                part.unlink(missing_ok=True)  # a link or a pipe is no part
+                part.unlink(missing_ok=True)  # a link or a pipe is not a partial download
             if not (part.exists() and digest_of(part) == file.digest):
                 _download(url, part, file, wait)
             note = _verify(part, file)
@@ -82,7 +82,7 @@ def fetch(file: WeightFile, directory: Path, *, wait: Callable[[float], None] = 
 
 
 def _verify(part: Path, file: WeightFile) -> str:
-    """A note on the complete download; if it is another file, remove it and raise :class:`UserError`."""
+    """Return a note on the complete download; remove a wrong file and raise :class:`UserError`."""
     digest, size = digest_of(part), part.stat().st_size
     if file.digest == UNVERIFIED and file.size in (-1, size):
         return f"not verified: the manifest has no digest for it; this file's is {digest}"
@@ -96,7 +96,7 @@ def _verify(part: Path, file: WeightFile) -> str:
 
 
 def _download(url: str, part: Path, file: WeightFile, wait: Callable[[float], None]) -> None:
-    """Request until the file is complete; raises :class:`UserError` if a retry cannot help or all failed."""
+    """Request until the file is complete; raise :class:`UserError` on permanent errors or after all attempts."""
     reason = ""
     for attempt in range(ATTEMPTS):
         if attempt:
@@ -108,18 +108,18 @@ def _download(url: str, part: Path, file: WeightFile, wait: Callable[[float], No
             error.close()
             if error.code not in TRANSIENT_STATUSES:
                 raise UserError(f"{url}: the server says {reason}") from error
-            if error.code == 416:  # no such range: the part belongs to another version
+            if error.code == 416:  # range not satisfiable: the partial download is of another version
                 part.unlink(missing_ok=True)
-        except (OSError, HTTPException, ValueError, OverflowError) as error:  # the last two: a malformed answer
+        except (OSError, HTTPException, ValueError, OverflowError) as error:  # the last two: a malformed response
             reason = str(error)
     raise UserError(
-        f"{url}: {ATTEMPTS} attempts failed (the last time: {reason}). The same command tries again, and "
-        "continues a file that has a digest."
+        f"{url}: {ATTEMPTS} attempts failed (the last error: {reason}). Run the same command again: it resumes "
+        "a file that has a digest."
     )
 
 
 def _receive(url: str, part: Path, file: WeightFile) -> None:
-    """Request what is missing, once; raises ``OSError`` and other errors if the connection breaks."""
+    """Request the missing bytes once; raises ``OSError`` and other errors if the connection breaks."""
     most = file.size if file.size >= 0 else MAX_BYTES
     have = part.stat().st_size if part.exists() else 0
     wanted = {"Range": f"bytes={have}-"} if 0 < have < most and file.digest != UNVERIFIED else {}
@@ -128,7 +128,7 @@ def _receive(url: str, part: Path, file: WeightFile) -> None:
         if response.status != 206:
             have = 0  # the server sends the complete file
         total = None if response.length is None else have + response.length
-        every = 0.1 if sys.stderr.isatty() else 30  # seconds; a log file gets a line for each update
+        every = 0.1 if sys.stderr.isatty() else 30  # seconds; each update is a line of a log file
         with (
             part.open("ab" if have else "wb") as stream,
             tqdm.wrapattr(stream, "write", total, desc=file.name, initial=have, mininterval=every) as out,
@@ -136,7 +136,7 @@ def _receive(url: str, part: Path, file: WeightFile) -> None:
             while block := response.read1(BLOCK_BYTES):
                 have += len(block)
                 if have > most:
-                    raise UserError(f"more than {most} bytes came, the most that {file.name} may have")
+                    raise UserError(f"received more than {most} bytes, the maximum size of {file.name}")
                 out.write(block)
     if total is not None and have < total:
-        raise ConnectionError(f"it broke off after {have} of {total} bytes")
+        raise ConnectionError(f"the connection closed after {have} of {total} bytes")

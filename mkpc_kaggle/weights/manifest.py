@@ -1,11 +1,11 @@
-"""The weights manifest: every file that a matcher can use.
+"""The weights manifest: all files that matchers can use.
 
-``weights_manifest.txt`` has one line for each file, columns split by blanks; ``#`` starts a comment::
+``weights_manifest.txt`` has one line per file, with columns separated by blanks; ``#`` starts a comment::
 
     name  bytes  digest  licence  slot  source
 
-``bytes`` is a number or ``?``. ``digest`` is ``sha256:<64 hex>`` or ``unverified``. A *slot* is what a matcher
-asks for. Lines of one slot are alternatives: the first file that is found is taken.
+``bytes`` is a number or ``?``. ``digest`` is ``sha256:<64 hex>`` or ``unverified``. Matchers request files by
+*slot*. Lines of one slot are alternatives: the first file that is found is used.
 """
 
 import errno
@@ -26,7 +26,7 @@ DIGEST = re.compile(rf"sha256:[0-9a-f]{{64}}|{UNVERIFIED}")
 
 @dataclass(frozen=True)
 class WeightFile:
-    """A line of the manifest; ``size`` in bytes, -1 if it is not known."""
+    """A line of the manifest; ``size`` in bytes, -1 if unknown."""
 
     name: str
     size: int
@@ -42,20 +42,20 @@ class WeightFile:
 
 
 def parse_manifest(text: str, where: str = "the weights manifest") -> tuple[WeightFile, ...]:
-    """All lines of a manifest; raises :class:`UserError` that names the line that cannot be read."""
+    """Parse all lines of a manifest; raise :class:`UserError` with the number of an invalid line."""
     numbered = enumerate(text.splitlines(), start=1)
     lines = ((number, line.partition("#")[0].split(maxsplit=5)) for number, line in numbered)
     return tuple(_parse_line(columns, f"{where}, line {number}") for number, columns in lines if columns)
 
 
 def read_manifest(path: Path) -> tuple[WeightFile, ...]:
-    """The lines of a manifest's file; raises :class:`UserError` if it cannot be read."""
+    """Read a manifest file; raises :class:`UserError` if it cannot be read."""
     return parse_manifest(read_text(path), str(path))
 
 
 @cache
 def manifest() -> tuple[WeightFile, ...]:
-    """The manifest that came with the package (in a wheel: inside it; in a checkout: beside it)."""
+    """Return the package's manifest, which is inside a wheel and next to the package in a checkout."""
     package = Path(__file__).resolve().parents[1]
     for path in (package / MANIFEST, package.parent / MANIFEST):
         if path.is_file():
@@ -73,7 +73,7 @@ def pin(file: WeightFile, path: Path) -> None:
 
 
 def digest_of(path: Path) -> str:
-    """``sha256:<hex>`` of a file, cached for the process, or of all files in a directory and of their names.
+    """Return ``sha256:<hex>`` of a file, cached for the process, or of all names and files of a directory.
 
     Raises ``OSError`` if it cannot be read.
     """

@@ -1,4 +1,4 @@
-"""The weight files of this machine, found by name or by digest and judged against the manifest."""
+"""The weight files of this machine, found by name or digest and compared with the manifest."""
 
 import os
 from collections import defaultdict
@@ -19,9 +19,9 @@ if TYPE_CHECKING:
     import torch
 
 KAGGLE_INPUT = Path("/kaggle/input")
-IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png"})  # a competition's input has thousands of them
+IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png"})  # a competition's input has thousands
 CHECKPOINT_SUFFIXES = frozenset({".pth", ".pt", ".ckpt", ".safetensors", ".bin", ".pkl", ""})
-MAX_UNKNOWN_SIZE_BYTES = 1 << 28  # the files whose size is not known have some 50 MB; larger files are not read
+MAX_UNKNOWN_SIZE_BYTES = 1 << 28  # files of unknown size have about 50 MB; larger ones are not read
 UNPACKED = (
     "this checkpoint was unpacked into a directory, as Kaggle does; it is read from there, but cannot be held "
     "against the manifest's digest. Upload it as safetensors (python -m mkpc_kaggle weights convert)"
@@ -29,18 +29,18 @@ UNPACKED = (
 
 
 class State(StrEnum):
-    """What the comparison with the manifest says of a file."""
+    """The result of a file's comparison with the manifest."""
 
-    GOOD = "good"  # the bytes of a file of the manifest, whatever the name
-    UNVERIFIED = "unverified"  # the manifest has no digest, or the checkpoint was unpacked into a directory
-    REFUSED = "refused"  # cannot be read, or has other bytes than the manifest says
+    GOOD = "good"  # the bytes of a file of the manifest, under any name
+    UNVERIFIED = "unverified"  # no digest in the manifest, or an unpacked checkpoint
+    REFUSED = "refused"  # unreadable, or other bytes than in the manifest
 
 
 @dataclass(frozen=True)
 class FoundFile:
-    """A file that was compared with its line of the manifest.
+    """A file that was compared with a line of the manifest.
 
-    ``path`` is a directory if the checkpoint was unpacked into it. ``digest`` is ``sha256:<hex>`` of the bytes,
+    ``path`` is a directory if the checkpoint is unpacked. ``digest`` is ``sha256:<hex>`` of the bytes,
     empty for an unreadable file. ``note`` is the reason for the state.
     """
 
@@ -57,7 +57,7 @@ class FoundFile:
 
 @dataclass(frozen=True)
 class Search:
-    """The file that was found, if any, and the files of the right name that were refused."""
+    """The result of a search: the file, if found, and refused files of the right name."""
 
     found: FoundFile | None
     refused: tuple[FoundFile, ...] = ()
@@ -66,8 +66,8 @@ class Search:
 class WeightStore:
     """Weight files in search directories: ``--weights``, then ``$MKPC_WEIGHTS``, then ``/kaggle/input/**``.
 
-    They are compared with ``files``; by default these are the package's manifest and the manifests in the search
-    directories, which list weights that ``package`` converted.
+    Files are compared with ``files``, by default the package's manifest and the manifests in the search
+    directories, which list weights converted by ``package``.
     """
 
     def __init__(self, directories: Iterable[Path] = (), files: Sequence[WeightFile] | None = None) -> None:
@@ -81,15 +81,15 @@ class WeightStore:
 
     @property
     def searched(self) -> str:
-        """The search directories, for messages."""
+        """The search directories as text for messages."""
         return ", ".join(map(str, self.directories)) or "nowhere: name a directory with --weights"
 
     @cached_property
     def files(self) -> tuple[WeightFile, ...]:
-        """The lines to compare with, one for each name; the package's manifest comes first.
+        """The lines to compare with, one per name; the package's manifest comes first.
 
-        If it has no digest for a file, the digest of a manifest in the search directories counts: that of the
-        first download.
+        If it has no digest for a file, the digest of a manifest in the search directories counts, which is the
+        digest of the first download.
         """
         if self._given_files is not None:
             return tuple(self._given_files)
@@ -107,18 +107,18 @@ class WeightStore:
         return tuple(lines.values())
 
     def alternatives(self, slot: str) -> list[WeightFile]:
-        """The manifest's lines for a slot, in order of preference."""
+        """Return the manifest's lines for a slot, in order of preference."""
         return [file for file in self.files if file.slot == slot]
 
     def find(self, slot: str) -> FoundFile | None:
-        """The slot's file; ``None`` if there is none. Warns of files of the right name that are refused."""
+        """Return the slot's file or ``None``. Warn of refused files of the right name."""
         search = self.search(self.alternatives(slot))
         for refused in search.refused:
             warn_once(f"passed over: {refused.path}: {refused.note}")
         return search.found
 
     def load(self, slot: str) -> "dict[str, torch.Tensor]":
-        """The slot's tensors by name, on the CPU; raises :class:`UserError` if the file is missing."""
+        """Load the slot's tensors by name, on the CPU; raises :class:`UserError` if the file is missing."""
         found = self.find(slot)
         if found is None:
             names = " or ".join(file.name for file in self.alternatives(slot))
@@ -126,10 +126,10 @@ class WeightStore:
         return load_tensors(found.path)
 
     def search(self, lines: Sequence[WeightFile]) -> Search:
-        """The first usable file of these lines; cached, also for the processes that the store is sent to."""
+        """Return the first usable file of these lines; results are cached and sent to workers with the store."""
         key = tuple(lines)
         if key not in self._searches:
-            judged: dict[Path, FoundFile] = {}  # of two verdicts on a path the last counts: that of its digest
+            judged: dict[Path, FoundFile] = {}  # by path; a comparison by digest replaces one by name
             for file in self._candidates(lines):
                 judged[file.path] = file
                 if file.usable:
@@ -139,12 +139,12 @@ class WeightStore:
         return self._searches[key]
 
     def verify(self) -> list[FoundFile]:
-        """Every file found, by path: all with a name of the manifest, and others with one of its digests."""
-        found = {file.path: file for file in reversed([*self._candidates(self.files)])}  # the first of a path
+        """Return all files, by path, that have a name or a digest of the manifest."""
+        found = {file.path: file for file in reversed([*self._candidates(self.files)])}  # first per path
         return [found[path] for path in sorted(found)]
 
     def _candidates(self, lines: Sequence[WeightFile]) -> Iterator[FoundFile]:
-        """The files for these lines: those of the name, those of the digest, those that were unpacked."""
+        """Yield files for these lines: by name, then by digest, then unpacked checkpoints."""
         for file in lines:
             for path in self._by_name.get(file.name, ()):
                 yield judge(path, file, self.files)
@@ -159,7 +159,7 @@ class WeightStore:
             directories = (path for path in self._walked[1] if is_unpacked_from(path, file))
             yield from (judge(directory, file) for directory in directories)
 
-    # A directory may have a hundred thousand files, and the manifest has some dozens of lines.
+    # Indexes: a directory may have a hundred thousand files, the manifest has dozens of lines.
 
     @cached_property
     def _by_name(self) -> dict[str, list[Path]]:
@@ -170,19 +170,19 @@ class WeightStore:
 
     @cached_property
     def _small_by_digest(self) -> dict[str, list[Path]]:
-        """The files that may be weights whose size the manifest does not have."""
+        """Files, by digest, that could be weights of unknown size."""
         found = defaultdict(list)
         for path, size in self._walked[0].items():
             if 0 <= size <= MAX_UNKNOWN_SIZE_BYTES and path.suffix.lower() in CHECKPOINT_SUFFIXES:
-                with suppress(OSError):  # it cannot be read
+                with suppress(OSError):  # unreadable
                     found[digest_of(path)].append(path)
         return found
 
     @cached_property
     def _walked(self) -> tuple[dict[Path, int], list[Path]]:
-        """Bytes of all files but images (-1: not a regular file), by directory and depth; unpacked checkpoints.
+        """Sizes in bytes of all files except images (-1: not a regular file), by depth; unpacked checkpoints.
 
-        Links are followed, since Kaggle mounts inputs by links; no directory is entered twice, so that cycles end.
+        Links are followed, since Kaggle mounts inputs by links. No directory is visited twice, so cycles end.
         """
         sizes: dict[Path, int] = {}
         unpacked: list[Path] = []
@@ -192,7 +192,7 @@ class WeightStore:
             for folder, folders, names in os.walk(root, followlinks=True):
                 place, is_checkpoint = os.path.realpath(folder), "data" in folders and "data.pkl" in names
                 if place in entered or is_checkpoint:
-                    folders.clear()  # os.walk goes no deeper
+                    folders.clear()  # os.walk skips the subfolders
                 if is_checkpoint and place not in entered:
                     unpacked.append(Path(folder))  # an archive that Kaggle unpacked
                 elif place not in entered:
@@ -205,7 +205,7 @@ class WeightStore:
 
 
 def judge(path: Path, file: WeightFile, files: Iterable[WeightFile] = ()) -> FoundFile:
-    """The file at ``path``, or unpacked into it, by the name of ``file``; ``files`` is the whole manifest."""
+    """Compare the file, or unpacked checkpoint, at ``path`` with ``file``; ``files`` is the whole manifest."""
     try:
         unpacked = (path / "data.pkl").is_file()
         if path.is_dir() and not unpacked:
@@ -231,9 +231,9 @@ def judge(path: Path, file: WeightFile, files: Iterable[WeightFile] = ()) -> Fou
 
 
 def is_unpacked_from(directory: Path, file: WeightFile) -> bool:
-    """Whether ``directory`` has a name that Kaggle gives to the unpacked ``file``.
+    """Return whether ``directory`` has a name that Kaggle gives to the unpacked ``file``.
 
-    Kaggle unpacks uploaded archives, and torch's checkpoints are archives: ``NAME.pth`` becomes
+    Kaggle unpacks uploaded archives, and torch checkpoints are archives: ``NAME.pth`` becomes
     ``NAME/NAME/{data.pkl, data/, version, ...}``, with or without the suffix in the outer name.
     """
     return bool({directory.name, directory.parent.name} & {file.name, Path(file.name).stem})

@@ -1,6 +1,7 @@
-"""ALIKED and DISK with LightGlue, from checkpoints laid out as the public ones are, with stand-in weights."""
+"""ALIKED, DISK and SIFT with LightGlue, from checkpoints in the public format, with stand-in weights."""
 
 import re
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,17 +13,17 @@ from pictures import picture
 from torch import Tensor, nn
 
 from mkpc_kaggle.geometry.coordinates import Box
-from mkpc_kaggle.matchers.contract import Placement, Precision, encoding_bytes
+from mkpc_kaggle.matchers.contract import Colour, Placement, Precision, encoding_bytes
 from mkpc_kaggle.matchers.lightglue import LightGlueOptions, light_glue
 from mkpc_kaggle.matchers.networks.aliked import Aliked
 from mkpc_kaggle.matchers.registry import load_matcher
 from mkpc_kaggle.weights import WeightStore
 
-NAMES = ["aliked_lightglue", "disk_lightglue"]
+NAMES = ["aliked_lightglue", "disk_lightglue", "sift_lightglue"]
 
 
-def glue() -> nn.Module:
-    return light_glue(2, 0.1, input_dim=128)
+def glue(**shape: Any) -> nn.Module:
+    return light_glue(2, 0.1, input_dim=128, **shape)
 
 
 def old_names(state: dict[str, Tensor]) -> dict[str, Any]:
@@ -50,6 +51,14 @@ FILES = (
     PublicFile("aliked_lightglue.pth", "aliked_lightglue", "aliked-lightglue", "lightglue", glue, old_names),
     PublicFile("depth-save.pth", "disk_lightglue", "disk", "disk", DISK, beside_an_optimizer),
     PublicFile("disk_lightglue.pth", "disk_lightglue", "disk-lightglue", "lightglue", glue, old_names),
+    PublicFile(
+        "sift_lightglue.pth",
+        "sift_lightglue",
+        "sift-lightglue",
+        "lightglue",
+        partial(glue, add_scale_ori=True),
+        old_names,
+    ),
 )
 
 
@@ -66,15 +75,16 @@ def load(name: str, store: WeightStore, precision: Precision = Precision.FLOAT32
 @pytest.mark.parametrize("name", NAMES)
 def test_a_picture_matches_itself_point_by_point(name: str, precision: Precision, store: WeightStore) -> None:
     matcher = load(name, store, precision, features=300, threshold=0.0)
-    first = picture(97, 131, multiple=32)
-    encodings = matcher.encode([first, picture(97, 131, "another", multiple=32)])
+    channels = 1 if matcher.spec.colour is Colour.GRAY else 3
+    first, other = (picture(97, 131, of, channels=channels, multiple=32) for of in ("scene", "another"))
+    encodings = matcher.encode([first, other])
     (matches,) = matcher.match(encodings[:1], encodings[:1])
     assert 50 < len(encodings[0]) <= 300
     assert len(matches) > 0.9 * len(encodings[0])
     assert (matches.points0 == matches.points1).all(axis=1).mean() > 0.9
     assert Box.whole(first.content).contains(matches.points0).all()
     assert matches.scores.dtype == encodings[0].descriptors.numpy().dtype == np.float32
-    assert encoding_bytes(encodings[0]) == len(encodings[0]) * (2 + 128) * 4
+    assert encoding_bytes(encodings[0]) == len(encodings[0]) * (2 + 128 + 2 * (name == "sift_lightglue")) * 4
 
 
 @pytest.mark.parametrize("precision", Precision)

@@ -15,7 +15,6 @@ from mkpc_kaggle.matchers.adapters.loma import LomaAdapter, LomaOptions
 from mkpc_kaggle.matchers.contract import Placement, encoding_bytes
 from mkpc_kaggle.matchers.networks import layers
 from mkpc_kaggle.matchers.networks.loma import Loma, Variant, detector_size
-from mkpc_kaggle.matchers.networks.loma_matcher import LomaKeypoints
 from mkpc_kaggle.weights import WeightStore
 
 OPTIONS = LomaOptions(Variant.B128, max_keypoints=200, match_threshold=0.0)
@@ -78,20 +77,6 @@ def test_padding_changes_nothing_and_tiny_pictures_have_no_matches(matcher):
     assert encoding_bytes(plain) == 200 * (2 + 128) * 4
     tiny = [matcher.encode([as_picture(scene(*size, channels=3))])[0] for size in ((7, 90), (1, 1), (90, 5))]
     assert [len(matches) for matches in matcher.match([*tiny, plain, tiny[0]], [plain] * 3 + tiny[:2])] == [0] * 5
-
-
-def test_the_sizes_are_the_releases_on_views_of_1024_pixels(matcher, monkeypatch):
-    seen = []
-
-    def encode(to_detect, to_describe, number):
-        seen.append((to_detect.shape[2:], to_describe.shape[2:], number))
-        return LomaKeypoints(torch.zeros(0, 2), torch.zeros(0, 128))
-
-    monkeypatch.setattr(matcher._network, "encode", encode)
-    published = LomaAdapter(matcher._network, LomaOptions(Variant.B128), "cpu")
-    for size in ((683, 1024), (512, 384), (6, 3)):
-        published.encode([as_picture(np.zeros((*size, 3), np.uint8))])
-    assert seen == [((680, 1024), (784, 784), 2048), ((512, 384), (392, 392), 2048)]
 
 
 def test_checkpoints_that_lack_or_add_something_are_refused(store):

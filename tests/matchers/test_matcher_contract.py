@@ -36,7 +36,7 @@ def test_matches_lie_on_the_pictures_whatever_their_sizes(matcher, sizes):
     (matches,) = matcher.match(encodings[:1], encodings[1:])
     assert all(part.dtype == np.float32 for part in (matches.points0, matches.points1, matches.scores))
     assert ((matches.scores >= 0) & (matches.scores <= 1.0001)).all()
-    # A window or a keypoint's subpixel offset may reach over the edge by a few pixels.
+    # A window may reach over the edge by a few pixels.
     for points, size in zip((matches.points0, matches.points1), sizes, strict=True):
         assert (points > -5).all() and (points < np.array(size[::-1]) + 4).all()
     views = [each.view for each in shown]

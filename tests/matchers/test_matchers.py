@@ -14,8 +14,7 @@ from torch import nn
 
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Box, Size
-from mkpc_kaggle.matchers.adapters.xfeat_lighterglue import XFeatOptions
-from mkpc_kaggle.matchers.contract import Colour, Placement, Refine
+from mkpc_kaggle.matchers.contract import Colour, Placement
 from mkpc_kaggle.matchers.registry import load_matcher, spec_of
 from mkpc_kaggle.weights import WeightStore, load_into
 
@@ -135,17 +134,3 @@ def test_all_names_and_shapes_of_a_checkpoint_must_fit_but_those_that_are_not_us
     load_into(network, {**part, "2.x": torch.ones(9)}, unused=r"1\.bias|2\.", what="w")
     assert torch.equal(network[1].bias, before)
     assert (network[0].weight == 1).all()
-
-
-@needs_weights
-def test_refined_keypoints_are_more_exact_than_whole_pixels():
-    H = MAPS["rotated"]
-    turned = cv2.warpPerspective(photograph(), H, SIZE, flags=cv2.INTER_AREA)
-    errors = {}
-    for refine in ("always", "never"):
-        options = XFeatOptions(features=1000, refine=Refine(refine))
-        matcher = load_matcher("xfeat_lighterglue", WeightStore([WEIGHTS]), options, Placement())
-        first, second = (matcher.encode([picture(shown, matcher)]) for shown in (photograph(), turned))
-        (matches,) = matcher.match(first, second)
-        errors[refine] = np.median(np.hypot(*offsets(matches, H).T))
-    assert errors["always"] < 0.8 * errors["never"]

@@ -64,24 +64,6 @@ def test_blocks_change_nothing(rows, monkeypatch):
     assert_equal_to_brute_force(*related(6, 122, 61))
 
 
-def test_the_ratio_is_that_of_distances_and_the_larger_of_both_ways():
-    # Angles on a circle; a chord is 2 sin(angle / 2).
-    def circle(*degrees):
-        radians = np.radians(degrees)
-        return np.stack([np.cos(radians), np.sin(radians)], axis=1)
-
-    def chord(degrees):
-        return 2 * np.sin(np.radians(degrees) / 2)
-
-    index0, index1, similarity, ratio = found(circle(0, 25), circle(10, 100))
-    assert_array_equal(index0, [0])
-    assert_array_equal(index1, [0])
-    assert_allclose(similarity, [np.cos(np.radians(10))])
-    # One way the second is at 100 degrees, the other way at 15: the latter is the nearer rival.
-    assert_allclose(ratio, [chord(10) / chord(15)])
-    assert_allclose(found(circle(10, 100), circle(0, 25))[3], [chord(10) / chord(15)])
-
-
 @pytest.mark.parametrize(("n", "m"), [(0, 0), (0, 5), (5, 0)])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_no_descriptors_give_no_pairs(n, m, dtype):

@@ -18,7 +18,7 @@ def overflow(monkeypatch: pytest.MonkeyPatch) -> None:
         )
 
 
-@pytest.mark.parametrize("name", MATCHERS)
+@pytest.mark.parametrize("name", [name for name in MATCHERS if name != "sift_lightglue"])
 def test_overflow_in_a_picture_is_an_error(name, monkeypatch):
     matcher = MATCHERS[name](Placement())
     overflow(monkeypatch)

@@ -16,10 +16,11 @@ from pictures import agreement
 from torch.nn import functional
 
 from mkpc_kaggle.matchers.contract import Placement
-from mkpc_kaggle.matchers.networks import dedode, warp_refiner
+from mkpc_kaggle.matchers.networks import warp_refiner
 from mkpc_kaggle.matchers.networks.grids import as_grid
 
 DATA = Path(__file__).parent / "matches.npz"
+NAMES = [name for name in MATCHERS if name != "sift_lightglue"]  # SIFT differs between versions of OpenCV
 SAME = 0.95  # of the matches: a threshold or a tie within rounding may fall the other way on another processor
 TOLERANCES = np.array([0.5, *4 * [0.05], 2e-3])  # pair, pixels, score; a row is within all of them
 
@@ -45,7 +46,7 @@ def agreement_with_vectors(name):
     return agreement(*(torch.from_numpy(matches / TOLERANCES) for matches in (found(name), stored)), 1, torch.inf)
 
 
-@pytest.mark.parametrize("name", MATCHERS)
+@pytest.mark.parametrize("name", NAMES)
 def test_matches_are_those_of_the_vectors(name):
     assert agreement_with_vectors(name) >= SAME
 
@@ -55,40 +56,19 @@ def best_anchor(logits):
     return grid[logits.argmax(dim=-1)]
 
 
-def no_offsets(self, patches, reach):
-    return patches.new_zeros(len(patches), 16, 2)
-
-
 def nearest(x, size):
     return functional.interpolate(x, tuple(size))
 
 
-MISTAKES = [  # in a matcher: what is changed in its networks, and how
-    ("roma", "dinov2.OFFSET", 0.0),
-    ("roma", "roma.DISPLACEMENT", 1.0),
-    ("roma", "roma.TRAINED_SIDE", 600),
-    ("roma", "roma.refined", lambda *values: warp_refiner.refined(*values[:2], 14, values[3])),
+MISTAKES = [  # one in a matcher of each kind: what is changed in its networks, and how
     ("roma", "roma.anchor_mean", best_anchor),
-    ("roma", "vgg.halved", lambda x: functional.avg_pool2d(x, 2)),
-    ("roma", "dense_warp.resize", nearest),
     ("dkm", "dense_warp.resize", nearest),
-    ("loma", "dad.TEMPERATURE", 1.0),
-    ("loma", "dad.MEAN", (0.5, 0.5, 0.5)),
-    ("loma", "dad.resize", lambda x, size, mode: dedode.resize(x, size, "bilinear")),
-    ("loma", "dedode.DedodeRefiner._hidden", lambda self, mixed: self.hidden_blocks(mixed)),
     ("loma", "loma_matcher.apply_rotary", lambda x, rotation: x),
-    ("loma", "loma_matcher.log_scores", lambda similarity: similarity.log_softmax(dim=2)),
     ("aliked", "aliked.TEMPERATURE", 0.2),
-    ("aliked", "aliked.RADIUS", 3),
-    ("aliked", "aliked.enlarged", nearest),
-    ("aliked", "aliked.DescriptorHead.offsets", no_offsets),
-    ("superglue", "superpoint.SUPPRESSION_ROUNDS", 0),
     ("superglue", "superglue.normalise_points", lambda points, size: points / max(size)),
     ("loftr", "fine_matching.CENTRE", 11),
-    ("loftr", "linear_attention.functional.elu", lambda x, inplace: x.relu_()),
     ("quadtree", "coarse_matching.inner_cells", lambda mask, border: mask.flatten()),
     ("aspanformer", "aspanformer.RADIUS", 4.0),
-    ("dkm", "dense_warp.TEMPERATURE", 0.25),
 ]
 
 
@@ -101,4 +81,4 @@ def test_a_mistake_is_noticed(name, what, value, monkeypatch):
 if __name__ == "__main__":
     torch.set_num_threads(1)
     DATA.parent.mkdir(exist_ok=True)
-    np.savez_compressed(DATA, **{name: found(name) for name in MATCHERS})
+    np.savez_compressed(DATA, **{name: found(name) for name in NAMES})

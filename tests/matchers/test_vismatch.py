@@ -1,58 +1,56 @@
-"""vismatch's matchers as ours, by a stand-in of the same interface."""
+"""vismatch's matchers as ours, by a stand-in of the same interface with known answers."""
 
 import numpy as np
+import pytest
 import torch
 from numpy.testing import assert_allclose
-from pictures import as_picture
+from pictures import as_picture, match_one
 from standin import scene
-from vismatch_standin import OrbLikeVismatch
 
-from mkpc_kaggle.geometry.coordinates import Size
-from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.vismatch import VismatchMatcher
 from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher
 from mkpc_kaggle.recipe import Recipe, Unit
 
-SIZE, SHIFT = Size(200, 160), 24
-WHOLE = scene(SIZE.height, SIZE.width + SHIFT, 3)
-LEFT, RIGHT = (np.ascontiguousarray(WHOLE[:, shift:][:, : SIZE.width]) for shift in (0, SHIFT))
+PICTURE = scene(160, 200, 3)
+POINTS = np.stack(np.meshgrid(np.arange(8.0, 120, 8), np.arange(8.0, 88, 8)), axis=-1).reshape(-1, 2)
+SHIFTED = np.add(POINTS, (3, 2))
 
 
-def matched(matcher: VismatchMatcher) -> Matches:
-    multiple = matcher.spec.multiple
-    encoded = [matcher.encode([as_picture(pixels, multiple)]) for pixels in (LEFT, RIGHT)]
-    (matches,) = matcher.match(*encoded)
-    return matches
+class Vismatch:
+    """``corner``: points count from the image's corner; ``confidences`` of its matches."""
+
+    def __init__(self, corner: bool = False, confidences: np.ndarray | None = None) -> None:
+        self.offset, self.confidences = 0.5 * corner, confidences
+        self.skip_ransac, self.seen = False, []
+
+    def __call__(self, *images: torch.Tensor) -> dict:
+        assert self.skip_ransac, "a homography would be fitted to the matches"
+        self.seen += images
+        points = {f"matched_kpts{side}": of + self.offset for side, of in enumerate((POINTS, SHIFTED))}
+        return points | {"matched_confidences": self.confidences, "inlier_kpts0": np.empty((0, 2)), "H": None}
 
 
-def test_points_are_where_the_matcher_saw_them() -> None:
-    matches = matched(VismatchMatcher(OrbLikeVismatch()))
-    offsets = matches.points1 - matches.points0
-    good = np.abs(offsets - (-SHIFT, 0)).max(axis=1) < 1
-    assert good.sum() > 50
-    assert good.mean() > 0.5
-    assert len(set(matches.scores)) > 10
+@pytest.mark.parametrize("corner", [False, True])
+@pytest.mark.parametrize("confidences", [None, np.linspace(0, 1, len(POINTS))])
+def test_points_are_pixels_from_the_first_ones_centre_and_confidences_are_scores(corner, confidences):
+    matcher = VismatchMatcher(Vismatch(corner, confidences), corner=corner)
+    matches = match_one(matcher, as_picture(PICTURE), as_picture(PICTURE))
+    assert_allclose(matches.points0, POINTS, atol=1e-4)
+    assert_allclose(matches.points1, SHIFTED, atol=1e-4)
+    assert_allclose(matches.scores, 1 if confidences is None else confidences)
 
 
-def test_points_counted_from_the_corner_become_points_counted_from_the_first_pixels_centre() -> None:
-    plain = matched(VismatchMatcher(OrbLikeVismatch()))
-    corner = matched(VismatchMatcher(OrbLikeVismatch(offset=0.5), corner=True))
-    assert_allclose(corner.points0, plain.points0, atol=1e-4)
-    assert_allclose(corner.points1, plain.points1, atol=1e-4)
-
-
-def test_images_are_rgb_in_0_to_1_and_padded_to_the_multiple() -> None:
-    standin = OrbLikeVismatch()
-    matched(VismatchMatcher(standin, multiple=64))
+def test_images_are_rgb_in_0_to_1_and_padded_to_the_multiple():
+    standin = Vismatch()
+    match_one(VismatchMatcher(standin, multiple=64), as_picture(PICTURE, 64), as_picture(PICTURE, 64))
     assert [tuple(image.shape) for image in standin.seen] == [(3, 192, 256)] * 2
-    content = standin.seen[0][:, : SIZE.height, : SIZE.width]
-    assert torch.equal(content, torch.from_numpy(LEFT).permute(2, 0, 1) / 255)
+    assert torch.equal(standin.seen[0][:, :160, :200], torch.from_numpy(PICTURE).permute(2, 0, 1) / 255)
 
 
-def test_both_stages_run_with_it() -> None:
-    recipe = Recipe((Unit(1, "orb", 200), Unit(2, "orb", 160)))
-    match = TwoStageMatcher(recipe, matchers={"orb": VismatchMatcher(OrbLikeVismatch(), "orb", multiple=8)})(
-        LEFT, RIGHT
+def test_both_stages_run_with_it():
+    recipe = Recipe((Unit(1, "own", 200), Unit(2, "own", 160)))
+    match = TwoStageMatcher(recipe, matchers={"own": VismatchMatcher(Vismatch(), "own", multiple=8)})(
+        PICTURE, PICTURE
     )
     assert [result.failure for result in match.results] == ["", ""]
     assert all(len(result.matches) > 20 for result in match.results)

@@ -112,7 +112,7 @@ def test_a_commit_run_without_network_leaves_a_submission_and_shows_pairs(kaggle
 
 
 def assert_all_weights_are_used(printed: str) -> None:
-    assert "4 files, 0 refused, 0 missing" in printed
+    assert "3 files, 0 refused, 0 missing" in printed
     assert "1:xfeat_lighterglue@1024 " in printed
     assert "1:aliked@1024 " in printed
 

@@ -54,36 +54,13 @@ def test_recipes_take_what_is_there_and_fallbacks_stand_in_for_the_rest():
     auto, there = assemble("auto", weights=[WEIGHTS]), {"xfeat_lighterglue", "sift", "aliked"}
     assert auto.recipe == load_recipe("auto").only(lambda unit: unit.matcher in there)
     digests = auto.fingerprint()["weights"]
-    assert set(digests) == {"xfeat", "xfeat-lighterglue", "keypt2subpx-xfeat", "aliked-n16"}
+    assert set(digests) == {"xfeat", "xfeat-lighterglue", "aliked-n16"}
     assert all(digest.startswith("sha256:") for digest in digests.values())
     light = assemble("light", weights=[WEIGHTS])
     assert light.recipe.matcher_names == ("xfeat_lighterglue", "sift", "aliked")
-    assert light.left_out == ("no weights: aliked_lightglue",)
+    assert light.left_out == ("no weights: sift_lightglue, aliked_lightglue",)
     assert [unit.stage for unit in light.recipe.units] == [unit.stage for unit in load_recipe("light").units]
     assert light.recipe.matching() == light.recipe.with_fallbacks(()).matching()
-
-
-@needs_weights
-def test_keypoints_stay_as_detected_where_the_weights_that_refine_them_are_missing(tmp_path):
-    for name in ("xfeat_sparse_bnfolded", "xfeat_lighterglue_l3", "aliked-n16", "keypt2subpx-xfeat"):
-        (tmp_path / f"{name}.safetensors").symlink_to(WEIGHTS / f"{name}.safetensors")
-    light = load_recipe("light")
-
-    def assembled(**options):
-        return assemble(
-            replace(light, matchers={**light.matchers, "xfeat_lighterglue": options}), weights=[tmp_path]
-        )
-
-    assert assembled().fingerprint()["weights"] == assembled(refine="always").fingerprint()["weights"]
-    without = {slot for slot in assembled().weight_files if slot != "keypt2subpx-xfeat"}
-    assert set(assembled(refine="never").weight_files) == without
-    (tmp_path / "keypt2subpx-xfeat.safetensors").unlink()
-    assert assembled().left_out[1:] == ("no weights to refine keypoints: xfeat_lighterglue",)
-    assert set(assembled().weight_files) == without
-    assembled().pipeline().load()
-    assert assembled(refine="never").left_out == ("no weights: aliked_lightglue",)
-    with pytest.raises(UserError, match=r"needs weights.*keypt2subpx-xfeat: k2s_xfeat_pretrained\.pth or keypt2"):
-        assembled(refine="always")
 
 
 def standins(directory, *names):

@@ -100,3 +100,18 @@ def assert_stages(stages: Iterable[Stage]):
     """All stages within their tolerances; the message starts with the first stage that is off."""
     off = [stage for stage in stages if stage.difference > stage.tolerance]
     assert not off, "; ".join(f"{stage.name} is off by {stage.difference:.2g}" for stage in off)
+
+
+def tolerance_of(name, tolerances):
+    """Return the tolerance of the entry's prefix, 0 if it has none: then it must agree exactly."""
+    return next((tolerance for prefix, tolerance in tolerances.items() if name.startswith(prefix)), 0.0)
+
+
+def compared(values, golden, tolerances):
+    """Yield a stage for each value that the golden file has."""
+    names = [name for name in values if name in golden]
+    assert len(names) >= 2
+    yield from (
+        Stage(name, values[name].reshape(golden[name].shape), golden[name], tolerance_of(name, tolerances))
+        for name in names
+    )

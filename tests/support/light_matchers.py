@@ -19,22 +19,20 @@ from mkpc_kaggle.matchers.adapters import (
     disk_lightglue,
     loftr,
     quadtree,
+    sift_lightglue,
     xfeat_lighterglue,
 )
 from mkpc_kaggle.matchers.adapters.aliked import AlikedMatcher, AlikedOptions
-from mkpc_kaggle.matchers.adapters.disk_lightglue import disk_encoder
 from mkpc_kaggle.matchers.adapters.dkm import DkmMatcher
 from mkpc_kaggle.matchers.adapters.loma import LomaAdapter, LomaOptions
 from mkpc_kaggle.matchers.adapters.roma import RomaMatcher, RomaOptions
 from mkpc_kaggle.matchers.adapters.superglue import SuperGlueMatcher
-from mkpc_kaggle.matchers.adapters.xfeat_lighterglue import xfeat_encoder
 from mkpc_kaggle.matchers.contract import Colour, MatcherSpec, Picture, Placement
 from mkpc_kaggle.matchers.dense import DenseOptions
 from mkpc_kaggle.matchers.lightglue import LightGlueMatcher, light_glue
 from mkpc_kaggle.matchers.networks.aliked import Aliked
 from mkpc_kaggle.matchers.networks.aspanformer import AspanFormer
 from mkpc_kaggle.matchers.networks.dkm import DKM
-from mkpc_kaggle.matchers.networks.keypt2subpx import Keypt2Subpx
 from mkpc_kaggle.matchers.networks.loftr import Loftr
 from mkpc_kaggle.matchers.networks.loma import Loma, Variant
 from mkpc_kaggle.matchers.networks.placement import prepared
@@ -42,8 +40,7 @@ from mkpc_kaggle.matchers.networks.quadtree import Quadtree
 from mkpc_kaggle.matchers.networks.superglue import SuperGlue
 from mkpc_kaggle.matchers.networks.superpoint import SuperPoint
 from mkpc_kaggle.matchers.semi_dense import SemiDenseMatcher
-from mkpc_kaggle.matchers.sparse import KeypointEncoder
-from mkpc_kaggle.matchers.subpixel import Refiner
+from mkpc_kaggle.matchers.sparse import Encoder, KeypointEncoder
 from tests.support.standin import filled, narrow_roma, scene
 
 SIZE = Size(96, 64)
@@ -96,49 +93,43 @@ def aliked_matcher(placement: Placement, keypoints: int = 200) -> AlikedMatcher:
     return AlikedMatcher(aliked_encoder(placement, keypoints), AlikedOptions())
 
 
-def with_lightglue(
-    spec: MatcherSpec,
-    encoder: KeypointEncoder,
-    placement: Placement,
-    layers: int,
-    threshold: float,
-    refiner: Refiner | None = None,
-    **shape: int,
-) -> LightGlueMatcher:
-    glue = kornias("lightglue", light_glue, layers, threshold, **shape)
-    return LightGlueMatcher(spec, encoder, glue, placement, refiner)
+def aliked_keypoints(placement: Placement, keypoints: int) -> tuple[MatcherSpec, Encoder, dict[str, Any]]:
+    return aliked_lightglue.SPEC, aliked_encoder(placement, keypoints), {"input_dim": 128}
 
 
-def aliked_lightglue_matcher(
-    placement: Placement, keypoints: int = 200, layers: int = 2, threshold: float = 0.0
-) -> LightGlueMatcher:
-    encoder = aliked_encoder(placement, keypoints)
-    return with_lightglue(aliked_lightglue.SPEC, encoder, placement, layers, threshold, input_dim=128)
+def disk_keypoints(placement: Placement, keypoints: int) -> tuple[MatcherSpec, Encoder, dict[str, Any]]:
+    encoder = disk_lightglue.disk_encoder(kornias("disk", DISK), keypoints, placement)
+    return disk_lightglue.SPEC, encoder, {"input_dim": 128}
 
 
-def disk_lightglue_matcher(
-    placement: Placement, keypoints: int = 200, layers: int = 2, threshold: float = 0.0
-) -> LightGlueMatcher:
-    encoder = disk_encoder(kornias("disk", DISK), keypoints, placement)
-    return with_lightglue(disk_lightglue.SPEC, encoder, placement, layers, threshold, input_dim=128)
+def sift_keypoints(placement: Placement, keypoints: int) -> tuple[MatcherSpec, Encoder, dict[str, Any]]:
+    return sift_lightglue.SPEC, sift_lightglue.SiftEncoder(keypoints, placement.device), sift_lightglue.SHAPE
 
 
 def make_xfeat() -> nn.Module:
     return XFeat().net
 
 
-def xfeat_lighterglue_matcher(
-    placement: Placement, keypoints: int = 200, layers: int = 2, threshold: float = 0.0, refine: bool = False
-) -> LightGlueMatcher:
+def xfeat_keypoints(placement: Placement, keypoints: int) -> tuple[MatcherSpec, Encoder, dict[str, Any]]:
     network = XFeat(top_k=keypoints, detection_threshold=0.0)
     network.net = kornias("xfeat", make_xfeat)
-    refiner = None
-    if refine:
-        refiner = Refiner(
-            kornias("keypt2subpx", Keypt2Subpx, xfeat_lighterglue.DESCRIPTOR_DIM).to(placement.device)
-        )
-    encoder, shape = xfeat_encoder(network, keypoints, placement, refiner), xfeat_lighterglue.SHAPE
-    return with_lightglue(xfeat_lighterglue.SPEC, encoder, placement, layers, threshold, refiner, **shape)
+    encoder = xfeat_lighterglue.xfeat_encoder(network, keypoints, placement)
+    return xfeat_lighterglue.SPEC, encoder, xfeat_lighterglue.SHAPE
+
+
+KEYPOINTS = {
+    "aliked_lightglue": aliked_keypoints,
+    "disk_lightglue": disk_keypoints,
+    "sift_lightglue": sift_keypoints,
+    "xfeat_lighterglue": xfeat_keypoints,
+}
+
+
+def lightglue_matcher(
+    name: str, placement: Placement, keypoints: int = 200, layers: int = 2, threshold: float = 0.0
+) -> LightGlueMatcher:
+    spec, encoder, shape = KEYPOINTS[name](placement, keypoints)
+    return LightGlueMatcher(spec, encoder, kornias("lightglue", light_glue, layers, threshold, **shape), placement)
 
 
 MATCHERS: dict[str, Callable[[Placement], Any]] = {
@@ -151,10 +142,7 @@ MATCHERS: dict[str, Callable[[Placement], Any]] = {
     "roma": roma_matcher,
     "loma": loma_matcher,
     "aliked": aliked_matcher,
-    "aliked_lightglue": aliked_lightglue_matcher,
-    "disk_lightglue": disk_lightglue_matcher,
-    "xfeat_lighterglue": xfeat_lighterglue_matcher,
-    "xfeat_lighterglue, refined": partial(xfeat_lighterglue_matcher, refine=True),
+    **{name: partial(lightglue_matcher, name) for name in KEYPOINTS},
 }
 
 

@@ -1,7 +1,5 @@
-"""Pictures as a matcher is shown them, stores of stand-in weights, and how matches are compared."""
+"""Pictures for matchers, and comparisons of matches."""
 
-from collections.abc import Iterable, Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,7 +9,6 @@ from standin import scene
 from mkpc_kaggle.geometry.coordinates import Box, Size, View
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import Picture
-from mkpc_kaggle.weights import UNVERIFIED, WeightFile, WeightStore
 
 
 def picture(
@@ -56,11 +53,3 @@ def agreement(first: torch.Tensor, second: torch.Tensor, within: float, p: float
         return 1.0
     near = torch.cdist(first, second, p=p) <= within
     return ((near.any(1).sum() + near.any(0).sum()) / (len(first) + len(second))).item()
-
-
-def write_store(directory: Path, states: Mapping[str, Any], slots: Iterable[tuple[str, str]]) -> WeightStore:
-    """A store of checkpoints by file name; ``slots`` has (file, slot)."""
-    for name, state in states.items():
-        torch.save(state, directory / name)
-    files = [WeightFile(name, -1, UNVERIFIED, "none", slot, "made here") for name, slot in slots]
-    return WeightStore([directory], files)

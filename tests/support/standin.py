@@ -59,7 +59,6 @@ STAND_INS = {
     "aliked": StandIn(2.0, {"score_head.6.weight": 3.0, "desc_head.offset_conv.2.*": 3.0}),
     "disk": StandIn(2.0),
     "xfeat": StandIn(2.0),
-    "keypt2subpx": StandIn(2.0),
     "lightglue": StandIn(
         1.0, {"input_proj.weight": 16.0, "transformers.*.ffn.3.*": 0.1, "log_assignment.*.final_proj.weight": 4.0}
     ),

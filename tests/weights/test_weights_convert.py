@@ -48,21 +48,23 @@ def test_the_line_takes_over_what_the_manifest_knows(tmp_path, monkeypatch):
     assert told == [("MIT", "slot", "known.pt"), ("BSD", "other", "x.pt"), ("?", "?", "x.pt")]
 
 
+REFUSED = [  # file, result, message
+    ("x.pt", "x.bin", r"x\.bin: the name must end in \.safetensors"),
+    ("gone.pt", "x.safetensors", r"gone\.pt cannot be read"),
+    ("pipe.pt", "x.safetensors", r"pipe\.pt cannot be read as a checkpoint: not a regular file"),
+    ("odd.pt", "x.safetensors", r"odd\.pt: safetensors has no type for tensors of torch\.complex32"),
+    ("x.pt", "x.pt/x.safetensors", r"x\.safetensors cannot be written"),
+]
+
+
 @pytest.mark.filterwarnings("ignore:ComplexHalf")
 def test_what_cannot_be_converted_is_told(tmp_path):
     torch.save({"a": torch.zeros(1)}, tmp_path / "x.pt")
-    with pytest.raises(UserError, match=r"x\.bin: the name must end in \.safetensors"):
-        convert(tmp_path / "x.pt", tmp_path / "x.bin")
-    with pytest.raises(UserError, match=r"gone\.pt cannot be read"):
-        convert(tmp_path / "gone.pt", tmp_path / "x.safetensors")
-    os.mkfifo(tmp_path / "pipe.pt")
-    with pytest.raises(UserError, match=r"pipe\.pt cannot be read as a checkpoint: not a regular file"):
-        convert(tmp_path / "pipe.pt", tmp_path / "x.safetensors")
     torch.save({"a": torch.zeros(1).to(torch.complex32)}, tmp_path / "odd.pt")
-    with pytest.raises(UserError, match=r"odd\.pt: safetensors has no type for tensors of torch\.complex32"):
-        convert(tmp_path / "odd.pt", tmp_path / "x.safetensors")
-    with pytest.raises(UserError, match=r"x\.safetensors cannot be written"):
-        convert(tmp_path / "x.pt", tmp_path / "x.pt" / "x.safetensors")
+    os.mkfifo(tmp_path / "pipe.pt")
+    for file, result, message in REFUSED:
+        with pytest.raises(UserError, match=message):
+            convert(tmp_path / file, tmp_path / result)
 
 
 def test_a_link_in_the_place_of_the_partial_file_is_not_followed(tmp_path):

@@ -126,7 +126,7 @@ def test_no_more_bytes_are_taken_than_the_manifest_has(site, tmp_path):
     site.data, site.length = BIG + bytes(10 * BLOCK_BYTES), 0
     failed = get(site, tmp_path)
     assert failed.outcome is FetchOutcome.FAILED
-    assert f"more than {len(BIG)} bytes came" in failed.note
+    assert f"more than {len(BIG)} bytes" in failed.note
     assert sum(path.stat().st_size for path in tmp_path.iterdir()) <= len(BIG)
 
 

@@ -192,13 +192,3 @@ def test_verify_tells_good_truncated_swapped_renamed_and_unverified_files_apart(
     assert checked["swapped.pt"][1] == "its bytes are those of good.pt"
     assert checked["renamed.pt"][1] == "it is lost.pt"
     assert digest_of(contents["free"]) in checked["free.pt"][1]
-
-
-def test_many_files_are_looked_through_once_however_many_lines_the_manifest_has(tmp_path, monkeypatch):
-    for number in range(20):
-        put(tmp_path, f"{number}.bin", b"%d" % number)
-    read: list[Path] = []
-    monkeypatch.setattr(store, "digest_of", lambda path: read.append(path) or file_digest(path))
-    lines = [line(name=f"{letter}.pth", data=letter.encode(), size=-1) for letter in "abcde"]
-    assert WeightStore([tmp_path], lines).verify() == []
-    assert len(read) == 20

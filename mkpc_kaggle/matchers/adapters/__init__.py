@@ -1,1 +1,1 @@
-"""One file for each matcher; the registry finds it by its name."""
+"""One file per matcher; the registry finds it by name."""

@@ -15,8 +15,8 @@ SLOT = "aliked-n16"
 
 @dataclass(frozen=True)
 class AlikedOptions:
-    features: int = 2048  # the strongest kept in each picture
-    ratio: float = 1.0  # of the distances to the nearest and second nearest descriptor, at most; 1: no ratio test
+    features: int = 2048  # the number of strongest keypoints per picture
+    ratio: float = 1.0  # maximum ratio of the two smallest distances; 1: no ratio test
 
     def __post_init__(self) -> None:
         check_ranges(self, features=AT_LEAST_1, ratio=SHARE)
@@ -33,7 +33,7 @@ SPEC = MatcherSpec(
 
 
 class AlikedMatcher(NeighbourMatcher):
-    """A match's score is the cosine of its descriptors."""
+    """ALIKED; a match's score is the cosine of its descriptors."""
 
     spec = SPEC
 
@@ -43,7 +43,7 @@ class AlikedMatcher(NeighbourMatcher):
 
 
 def load_encoder(weights: WeightStore, features: int, placement: Placement) -> KeypointEncoder:
-    """ALIKED's, for every matcher of its keypoints."""
+    """Load ALIKED's encoder, for all matchers of its keypoints."""
     network = Aliked(features)
     load_into(network, {own_name(name): tensor for name, tensor in weights.load(SLOT).items()}, what=SLOT)
     return KeypointEncoder(prepared(network, placement), placement.device)

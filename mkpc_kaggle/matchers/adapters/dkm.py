@@ -1,4 +1,4 @@
-"""DKM v3 (Edstedt et al. 2023): dense warps between two views; matches are sampled from them."""
+"""DKM v3 (Edstedt et al. 2023): matches sampled from dense warps between two views."""
 
 from mkpc_kaggle.matchers.contract import MatcherSpec, Placement
 from mkpc_kaggle.matchers.dense import DenseMatcher, DenseOptions
@@ -6,8 +6,8 @@ from mkpc_kaggle.matchers.networks.dkm import DKM
 from mkpc_kaggle.matchers.networks.placement import prepared
 from mkpc_kaggle.weights import WeightStore, load_into
 
-# Published are one pass of 540 x 720 or 480 x 640 (indoors), and two of 864 x 1152. The licence is that of the
-# outdoor weights; the terms of the indoor ones are unclear, as the manifest says.
+# Published: one pass of 540 x 720 or 480 x 640 (indoors), and two passes up to 864 x 1152. The licence applies to
+# the outdoor weights; the terms of the indoor weights are unclear (see the manifest).
 SPEC = MatcherSpec("dkm", "DKM v3", DenseOptions, licences=("MIT",), slots=("dkm-{training}",))
 
 

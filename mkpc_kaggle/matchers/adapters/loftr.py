@@ -6,7 +6,7 @@ from mkpc_kaggle.matchers.networks.placement import prepared
 from mkpc_kaggle.matchers.semi_dense import SemiDenseMatcher, SemiDenseOptions, load_network
 from mkpc_kaggle.weights import WeightStore
 
-# Coarse cells along the border of a picture that get no match, as in the published evaluations.
+# Coarse cells along the border of a picture without matches, as in the published evaluations.
 BORDERS = {Training.OUTDOOR: 2, Training.INDOOR: 0}
 
 
@@ -22,7 +22,7 @@ SPEC = MatcherSpec(
 
 
 def load(weights: WeightStore, options: SemiDenseOptions, placement: Placement) -> SemiDenseMatcher:
-    # The indoor weights are the later ones, trained with the corrected position encoding.
+    # The indoor weights were trained later, with the corrected position encoding.
     is_indoor = options.training is Training.INDOOR
     network = Loftr(options.threshold, BORDERS[options.training], fixed_positions=is_indoor)
     load_network(network, weights, *SPEC.slots_for(options))

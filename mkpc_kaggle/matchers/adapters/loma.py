@@ -15,7 +15,7 @@ from mkpc_kaggle.matchers.networks.pixels import resized
 from mkpc_kaggle.matchers.networks.placement import prepared
 from mkpc_kaggle.weights import WeightStore, load_into
 
-PATCH = 14  # pixels: the side of the descriptor's input is a multiple of this
+PATCH = 14  # pixels; the side of the descriptor's input is a multiple of it
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class LomaOptions:
 
     variant: Variant = Variant.B
     max_keypoints: int = 2048
-    descriptor_scale: float = 784 / 1024  # side of the descriptor's square input by the view's longer side
+    descriptor_scale: float = 784 / 1024  # side of the descriptor's square input over the view's longer side
     match_threshold: float = 0.1
 
     def __post_init__(self) -> None:
@@ -43,9 +43,9 @@ class LomaEncoding:
 
 
 class LomaAdapter(PairwiseMatcher[LomaEncoding]):
-    """A match's score is the product of the softmax over either picture's keypoints.
+    """LoMa. A match's score is the product of the softmaxes over either picture's keypoints.
 
-    Pictures and pairs are processed separately, so that results do not depend on the batch.
+    Pictures and pairs are processed one by one, so that results do not depend on the batch.
     """
 
     spec = SPEC
@@ -66,7 +66,7 @@ class LomaAdapter(PairwiseMatcher[LomaEncoding]):
             descriptor, _ = WIDTHS[self.options.variant]
             return LomaKeypoints(*(torch.zeros(0, width, device=self.device) for width in (2, descriptor)))
         side = PATCH * max(1, round(self.options.descriptor_scale * long_side / PATCH))
-        # Without padding, which would affect the descriptors.
+        # Without padding, which would change the descriptors.
         pixels = torch.from_numpy(picture.pixels[: content.height, : content.width].copy()).permute(2, 0, 1)[None]
         to_detect = resized(pixels, (detected.height, detected.width)).to(self.device)
         to_describe = resized(pixels, (side, side)).to(self.device)

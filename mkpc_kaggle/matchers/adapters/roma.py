@@ -14,12 +14,12 @@ from mkpc_kaggle.weights import WeightStore, load_into
 
 @dataclass(frozen=True)
 class RomaOptions(DenseOptions):
-    # Published: two passes of 560 x 560 and 864 x 864, as a stretched unit of 864 x 864 has; indoors one of 560.
+    # Published: two passes of 560 x 560 and 864 x 864, as in a stretched unit of 864 x 864; indoors one of 560.
     passes: int = 2
     first_pass: float = 0.648
 
 
-# The licences are those of the outdoor weights and of DINOv2's; the terms of the indoor ones are unclear.
+# Licences of the outdoor weights and of DINOv2; the terms of the indoor weights are unclear.
 SPEC = MatcherSpec(
     "roma", "RoMa", RomaOptions, licences=("MIT", "Apache-2.0"), slots=("roma-{training}", "dinov2-vitl14")
 )

@@ -21,7 +21,7 @@ from mkpc_kaggle.weights import WeightStore
 
 @dataclass(frozen=True)
 class SiftOptions:
-    """``features``: the strongest kept in each picture. ``ratio``: at most, both ways."""
+    """``features``: the number of strongest keypoints per picture. ``ratio``: the maximum, in both directions."""
 
     features: int = 8000
     ratio: float = 0.8
@@ -35,14 +35,14 @@ SPEC = MatcherSpec("sift", "RootSIFT, mutual nearest neighbours, ratio test", Si
 
 
 class SiftMatcher(NeighbourMatcher):
-    """OpenCV's SIFT; a match's score is one minus its distance ratio."""
+    """OpenCV's SIFT. A match's score is one minus its distance ratio."""
 
     spec = SPEC
 
     def __init__(self, options: SiftOptions, device: str) -> None:
         self.ratio = options.ratio
         self.device = device
-        # Without precise upscaling OpenCV's first octave moves every point by a quarter of a pixel.
+        # Without precise upscaling, OpenCV shifts every point by a quarter of a pixel.
         self._sift = cv2.SIFT_create(  # type: ignore[attr-defined]  # missing in OpenCV's stubs
             options.features, contrastThreshold=options.contrast_threshold, enable_precise_upscale=True
         )
@@ -65,7 +65,7 @@ class SiftMatcher(NeighbourMatcher):
 
 
 def root_sift(descriptors: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(K, 128) SIFT -> (K, 128) float32 unit vectors whose dot product is the Hellinger kernel."""
+    """Map (K, 128) SIFT to (K, 128) float32 unit vectors; their dot product is the Hellinger kernel."""
     sums = np.maximum(descriptors.sum(axis=1, keepdims=True), np.finfo(np.float32).tiny)
     return np.asarray(np.sqrt(descriptors / sums), np.float32)
 

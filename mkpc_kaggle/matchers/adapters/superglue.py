@@ -1,4 +1,4 @@
-"""SuperPoint keypoints matched by SuperGlue: the paper's matcher. Its weights are for noncommercial research."""
+"""SuperPoint keypoints matched by SuperGlue, the paper's matcher. Its weights are for noncommercial research."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,9 +17,9 @@ from mkpc_kaggle.weights import WeightStore, load_into
 
 @dataclass(frozen=True)
 class SuperGlueOptions:
-    """SuperPoint's and SuperGlue's settings of the published outdoor evaluation.
+    """Settings of the published outdoor evaluation.
 
-    With SuperGlue's indoor weights the published ones are ``max_keypoints`` 1024 and ``nms_radius`` 4.
+    The published indoor evaluation uses ``max_keypoints`` 1024 and ``nms_radius`` 4.
     """
 
     max_keypoints: int = 2048
@@ -34,7 +34,7 @@ class SuperGlueOptions:
         check_ranges(self, sinkhorn_iterations=AT_LEAST_1, match_threshold=SHARE)
 
 
-# Sides need no multiple: SuperPoint itself leaves out the last rows and columns beyond one of 8.
+# No multiple: SuperPoint ignores the rows and columns beyond a multiple of 8.
 SPEC = MatcherSpec(
     "superglue",
     "SuperPoint with SuperGlue",
@@ -46,7 +46,7 @@ SPEC = MatcherSpec(
 
 
 class SuperGlueMatcher(PairwiseMatcher[SuperPointKeypoints]):
-    """A match's score is the keypoint's mass that the optimal transport assigns to it."""
+    """SuperGlue. A match's score is its mass in the optimal transport."""
 
     spec = SPEC
 

@@ -1,7 +1,7 @@
-"""Attention whose keys lie where a predicted flow points, as far apart as it is uncertain.
+"""Attention to keys around the target of a predicted flow, spaced by the uncertainty of the flow.
 
 Source: Chen et al., "ASpanFormer: Detector-Free Image Matching with Adaptive Span Transformer", 2022, section 3.
-Here "cells" are 2x2 blocks of queries that share their keys, 8 x 8 samples of the key map.
+"Cells" here are 2x2 blocks of queries; each block shares 8 x 8 samples of the key map.
 """
 
 from dataclasses import dataclass
@@ -15,13 +15,13 @@ from mkpc_kaggle.matchers.networks.grids import mask_valid, mean_pool, softmax_a
 
 SIDE = 8  # samples on each axis
 SAMPLES = SIDE * SIDE
-CELLS_AT_ONCE = {"cpu": 256, "cuda": 8192}  # a cell's samples take 128 KiB: on a CPU they must fit the cache
-MASKED = -1e8  # a logit; finite, so that where all are masked the attention is uniform
+CELLS_AT_ONCE = {"cpu": 256, "cuda": 8192}  # a cell's samples take 128 KiB and must fit a CPU's cache
+MASKED = -1e8  # a finite logit: attention is uniform if all keys are masked
 
 
 @dataclass(frozen=True, eq=False)
 class Span:
-    """Of P cells of queries: ``centre`` and ``step`` (N, P, 2), (x, y) in cells of the level's key map.
+    """Samples of P cells of queries: ``centre`` and ``step`` (N, P, 2), (x, y) in cells of the level's key map.
 
     A sample at (x, y) reads around index (x - 0.5, y - 0.5): the origin is the corner of the key map.
     """
@@ -30,14 +30,14 @@ class Span:
     step: Tensor
 
     def samples(self) -> Tensor:
-        """(N, P, 64, 2): x varies slowest."""
+        """Return (N, P, 64, 2): x varies slowest."""
         axis = torch.arange(SIDE, dtype=self.centre.dtype, device=self.centre.device) - (SIDE - 1) / 2
         offsets = torch.cartesian_prod(axis, axis)  # (64, 2)
         return self.centre[:, :, None] + offsets * self.step[:, :, None]
 
 
 def adaptive_span(flow: Tensor, radius: float, factor: int) -> Span:
-    """Flow (N, h, w, 4) -> the span of each cell at the level that pools by ``factor``.
+    """Map a flow (N, h, w, 4) to the span of each cell at the level that pools by ``factor``.
 
     The flow is the target (x, y) in coarse cells of the other image and its log-variances. The samples cover
     two ``radius`` deviations, with a step of at least one. As published, centres are in units of the level but
@@ -50,9 +50,9 @@ def adaptive_span(flow: Tensor, radius: float, factor: int) -> Span:
 
 
 def sample_usable(samples: Tensor, mask: Tensor, key_size: tuple[int, int], factor: int) -> Tensor:
-    """(N, P, 64) bool: where the mask of the *query* image reads valid at the samples.
+    """Return (N, P, 64) bool: whether the mask of the *query* image is valid at the samples.
 
-    The mask should be the key image's, but it is with this oversight that the networks were published.
+    The mask should be the key image's, but the networks were published with this oversight.
     Coordinates are relative to the key map (h, w); ``mask`` is (N, h, w) at the coarse level.
     """
     valid = mask_valid(mask, factor).float()[:, None]
@@ -64,9 +64,9 @@ def sample_usable(samples: Tensor, mask: Tensor, key_size: tuple[int, int], fact
 def span_attention(
     q: Tensor, k: Tensor, v: Tensor, samples: Tensor, heads: int, usable: Tensor | None = None
 ) -> Tensor:
-    """Queries (N, h, w, C), keys and values (N, h_key, w_key, C), samples (N, h w / 4, 64, 2) -> (N, h, w, C).
+    """Map queries (N, h, w, C), keys, values (N, h_key, w_key, C), samples (N, h w / 4, 64, 2) to (N, h, w, C).
 
-    Samples outside the key map have a zero key and value, yet take part unless ``usable`` excludes them. The
+    Samples outside the key map have a zero key and value, but still count unless ``usable`` excludes them. The
     messages are ordered by cell, four queries each, and read as rows of the map without reordering: the
     published networks were trained with this permutation within each two rows.
     """
@@ -86,7 +86,7 @@ def span_attention(
 
 
 def _attend_cells(queries: Tensor, read: Tensor, heads: int, excluded: Tensor | None) -> Tensor:
-    """Scaled queries (p, 4, C), samples (p, 64, 2 C) of keys and values, ``excluded`` (p, 64) -> (p, 4, C)."""
+    """Map scaled queries (p, 4, C), samples (p, 64, 2 C) of keys and values, ``excluded`` (p, 64) to (p, 4, C)."""
     keys, values = (half.chunk(heads, dim=-1) for half in read.chunk(2, dim=-1))
     found = []
     # Head by head: batched products of all heads would first copy the samples.

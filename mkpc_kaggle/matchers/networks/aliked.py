@@ -1,9 +1,9 @@
 """ALIKED: Zhao et al., "ALIKED: A Lighter Keypoint and Descriptor Extraction Network via Deformable
 Transformation", IEEE Transactions on Instrumentation and Measurement 2023.
 
-A map of four scales, joined at full size, gives a score at every pixel; descriptors are read where each keypoint's
-offsets point. The joined map is never stored: scores need 8 channels of it, and descriptors some thousand pixels.
-Parameter names are those of the public checkpoints, apart from ``regular_conv`` (see :func:`own_name`).
+Four scales are joined at full size. Every pixel has a score; descriptors are read at offsets around each keypoint.
+The joined map is never stored: scores need 8 channels of it, and descriptors a few thousand pixels.
+Parameter names match the public checkpoints, except for ``regular_conv`` (see :func:`own_name`).
 For inference only.
 """
 
@@ -18,17 +18,17 @@ from mkpc_kaggle.matchers.networks.bilinear import DeformableConv2d, corners, ta
 from mkpc_kaggle.matchers.networks.grids import as_grid, pointwise
 from mkpc_kaggle.matchers.networks.layers import ExactConv2d, linear
 
-# Of the published n16: channels of the four scales, the last also that of descriptors; positions read for each.
+# Published as n16: channels of the four scales (the last is also the descriptors'); positions per descriptor.
 CHANNELS = (16, 32, 64, 128)
 POSITIONS = 16
-RADIUS = 2  # of non-maximum suppression and of the window that refines a keypoint
-TEMPERATURE = 0.1  # of that refinement's softmax
-PATCH = 3  # pixels that a keypoint's offsets are computed from, each way
+RADIUS = 2  # of suppression and of refinement, in pixels
+TEMPERATURE = 0.1  # of the softmax in the refinement window
+PATCH = 3  # pixels per axis from which a keypoint's offsets are computed
 ROWS_AT_ONCE, POSITIONS_AT_ONCE = 16, 1024  # intermediate maps fit a CPU's cache
 
 
 class Aliked(nn.Module):
-    """``max_keypoints``: the strongest kept in each image."""
+    """ALIKED; ``max_keypoints``: the number of strongest keypoints kept in each image."""
 
     def __init__(self, max_keypoints: int) -> None:
         super().__init__()
@@ -55,7 +55,7 @@ class Aliked(nn.Module):
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # missing in torch's stubs
 
     def forward(self, images: Tensor) -> list[tuple[Tensor, Tensor]]:
-        """Of each image the K keypoints, best first: points (K, 2) float32, x and y in pixels with centres at
+        """Return each image's K keypoints, best first: points (K, 2) float32, x and y in pixels with centres at
         integers, and unit descriptors (K, 128) float32.
 
         Images (B, 3, H, W) float32 RGB in [0, 1], sides multiples of 32.
@@ -72,7 +72,7 @@ class Aliked(nn.Module):
         return list(zip(points, torch.split(descriptors, counts), strict=True))
 
     def maps(self, images: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """(B, c1, H, W) at stride 1, the input of its part; and the parts themselves at strides 2, 8 and 32."""
+        """Return maps (B, c1, H, W) at stride 1, as input of its part, and the parts at strides 2, 8 and 32."""
         # Channels first: with three channels the convolution is faster; its result is channels last.
         x1 = self.block1(images.contiguous().to(self.conv1.weight.dtype))
         x2 = self.block2(functional.avg_pool2d(x1, 2))
@@ -83,7 +83,7 @@ class Aliked(nn.Module):
         return x1, part2, part3, part4
 
     def score_map(self, maps: tuple[Tensor, ...]) -> Tensor:
-        """(B, H, W) float32 in (0, 1)."""
+        """Return scores (B, H, W) float32 in (0, 1)."""
         x1, *parts = maps
         # (8, C / 4, 1, 1) each: a 1x1 convolution may precede upsampling.
         weights = self.score_head.get_parameter("0.weight").chunk(4, dim=1)
@@ -101,7 +101,7 @@ class Aliked(nn.Module):
         return logits[:, 0].sigmoid_()
 
 
-Convolution = Callable[[int, int], nn.Conv2d]  # of that many channels to that many
+Convolution = Callable[[int, int], nn.Conv2d]  # (input channels, output channels)
 
 
 def conv3x3(channels: int, out_channels: int) -> nn.Conv2d:
@@ -133,7 +133,7 @@ class AlikedResidualBlock(AlikedBlock):
 
 
 class JoinedMap:
-    """The unit features of the full-size map, computed only at the pixels that are needed."""
+    """The unit features of the full-size map, computed only at the requested pixels."""
 
     def __init__(self, network: Aliked, maps: tuple[Tensor, ...]) -> None:
         self._conv1 = network.conv1
@@ -143,7 +143,7 @@ class JoinedMap:
         self._sizes = [part.shape[2:] for part in parts]
 
     def at(self, pixels: Tensor) -> Tensor:
-        """Pixels (P,) int64 of the table of the full-size map -> (P, C) float32."""
+        """Return (P, C) float32 at pixels (P,) int64 of the table of the full-size map."""
         height, width = self.size
         full, *tables = self._tables
         image = pixels // (height * width)
@@ -155,7 +155,7 @@ class JoinedMap:
         return functional.normalize(torch.cat(parts, dim=1), dim=1)
 
     def sampled(self, positions: Tensor, image: Tensor) -> Tensor:
-        """Positions (Q, 2) in the images ``image`` (Q,) -> (Q, C) float32, zero outside."""
+        """Sample at positions (Q, 2) of the images ``image`` (Q,): (Q, C) float32, zero outside."""
         pixels, weights = corners(positions, image, self.size)  # (Q, 4)
         order = torch.arange(pixels.numel(), device=pixels.device).view_as(pixels)
         blocks = (torch.split(values, POSITIONS_AT_ONCE) for values in (pixels, weights))
@@ -182,7 +182,7 @@ class DescriptorHead(nn.Module):
         self.agg_weights = nn.Parameter(torch.zeros(POSITIONS, channels, channels))
 
     def forward(self, joined: JoinedMap, points: Tensor, image: Tensor) -> Tensor:
-        """Descriptors (K, C) at points (K, 2) of the images ``image`` (K,)."""
+        """Return descriptors (K, C) at points (K, 2) of the images ``image`` (K,)."""
         if len(points) == 0:
             return points.new_zeros(0, self.agg_weights.shape[2])
         height, width = joined.size
@@ -199,7 +199,7 @@ class DescriptorHead(nn.Module):
         return functional.normalize(linear(read, self.agg_weights.flatten(0, 1).T), dim=1)
 
     def offsets(self, patches: Tensor, reach: float) -> Tensor:
-        """Patches (K, 9 C), row by row -> (x, y) offsets (K, M, 2) in pixels."""
+        """Map patches (K, 9 C), row by row, to (x, y) offsets (K, M, 2) in pixels."""
         whole, bias, last, last_bias = (
             self.offset_conv.get_parameter(name) for name in ("0.weight", "0.bias", "2.weight", "2.bias")
         )
@@ -209,17 +209,17 @@ class DescriptorHead(nn.Module):
 
 
 def enlarged(maps: Tensor, size: torch.Size) -> Tensor:
-    """Bilinear; the corner pixels' centres stay at the corners."""
+    """Enlarge bilinearly; the centres of the corner pixels stay at the corners."""
     return functional.interpolate(maps, tuple(size), mode="bilinear", align_corners=True)
 
 
 def _step(length: int, full: int) -> float:
-    """A pixel of the full length in pixels of a shorter map with the corners' centres in common."""
+    """Return one pixel of the full length in pixels of a shorter map; both share the centres of their corners."""
     return (length - 1) / max(full - 1, 1)
 
 
 def strict_maxima(scores: Tensor, count: int) -> Tensor:
-    """The best strict maxima of a map (H, W), best first: (K,) int64, row by row. Published code keeps more."""
+    """Return the best strict maxima of a map (H, W), best first: (K,) int64. Published code keeps more."""
     peaks = scores == functional.max_pool2d(scores[None], 2 * RADIUS + 1, 1, RADIUS)[0]
     inner = torch.zeros_like(peaks)
     inner[RADIUS:-RADIUS, RADIUS:-RADIUS] = True
@@ -230,7 +230,7 @@ def strict_maxima(scores: Tensor, count: int) -> Tensor:
 
 
 def refined_maxima(scores: Tensor, index: Tensor) -> Tensor:
-    """The maxima (K,) of a map (H, W) with a softmax's mean offset in the window around each: (K, 2), x and y."""
+    """Move the maxima (K,) of a map (H, W) by a softmax's mean offset in their windows: (K, 2), x and y."""
     shares = torch.softmax(windows(scores, index) / TEMPERATURE, dim=1)  # (K, 25)
     steps = torch.arange(-RADIUS, RADIUS + 1, device=scores.device).float()
     offsets = shares @ torch.cartesian_prod(steps, steps).flip(1)
@@ -239,12 +239,12 @@ def refined_maxima(scores: Tensor, index: Tensor) -> Tensor:
 
 
 def windows(scores: Tensor, index: Tensor) -> Tensor:
-    """The scores (K, 25) around inner pixels (K,) of a map (H, W), row by row."""
+    """Return the scores (K, 25) around inner pixels (K,) of a map (H, W), row by row."""
     steps = torch.arange(-RADIUS, RADIUS + 1, device=scores.device)
     around = (steps[:, None] * scores.shape[1] + steps).flatten()
     return scores.flatten()[index[:, None] + around]
 
 
 def own_name(name: str) -> str:
-    """Our name of a checkpoint's parameter: here the module is the convolution itself."""
+    """Return our name of a checkpoint's parameter: here the module is the convolution itself."""
     return name.replace(".regular_conv.", ".")

@@ -45,7 +45,7 @@ class Side:
     mask: Tensor | None
 
     def values(self, projection: nn.Conv1d) -> Tensor:
-        """(N, h, w, 256): the projection of the visual feature and the positions."""
+        """Return (N, h, w, 256): the projection of the visual feature and the positions."""
         positions = self.positions.expand(len(self.visual), -1, -1, -1)
         return pointwise(projection, torch.cat([self.visual, positions], dim=-1))
 
@@ -71,7 +71,7 @@ class ChannelNorm(nn.Module):
 def global_attention(
     q: Tensor, k: Tensor, v: Tensor, temperature: Tensor | float, masks: tuple[Tensor | None, Tensor | None]
 ) -> Tensor:
-    """Grids (N, h, w, C) of queries, (N, h_key, w_key, C) of keys and values -> (N, h, w, C).
+    """Map grids (N, h, w, C) of queries, (N, h_key, w_key, C) of keys and values to (N, h, w, C).
 
     A masked query gets the mean of all values, as published.
     """
@@ -86,7 +86,7 @@ def global_attention(
 
 
 class InitialLayer(nn.Module):
-    """Updates the pooled features of an image from those of the other one."""
+    """An update of the pooled features of one image from the other image."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -101,7 +101,7 @@ class InitialLayer(nn.Module):
         self.norm2 = ChannelNorm(TOP)
 
     def forward(self, own: Side, other: Side) -> Tensor:
-        """The new visual feature of ``own`` (N, rows, columns, 256); both sides are pooled to the global level."""
+        """Return the new visual feature of ``own`` (N, rows, columns, 256), pooled to the global level."""
         message = global_attention(
             pointwise(self.q_proj, own.visual),
             pointwise(self.k_proj, other.visual),
@@ -140,7 +140,7 @@ class InitialStage(nn.Module):
 
 
 def _pooled(side: Side) -> Side:
-    """At the global level; the mask stays, for it is pooled where it is used."""
+    """Pool to the global level. The mask stays, since its user pools it."""
     visual, positions = mean_pool(side.visual, side.factor), mean_pool(side.positions, side.factor)
     return replace(side, visual=visual, positions=positions)
 
@@ -154,7 +154,7 @@ class HierarchicalAttention(nn.Module):
         self.merge_head = Perceptron(nn.Conv1d(3 * TOP, TOP, 1, bias=False), nn.Conv1d(TOP, TOP, 1, bias=False))
 
     def forward(self, q: Tensor, k: Tensor, v: Tensor, flow: Tensor, own: Side, other: Side) -> Tensor:
-        """Queries of ``own``, keys and values of ``other``, and the flow of ``own`` -> message (N, h, w, 256)."""
+        """Map queries and flow of ``own``, keys and values of ``other`` to a message (N, h, w, 256)."""
         coarse, half, full = self.messages(q, k, v, flow, own, other)
         h, w = q.shape[1:3]
         stacked = torch.cat([_repeated(coarse, h, w), _repeated(half, h, w), full], dim=-1)
@@ -164,7 +164,7 @@ class HierarchicalAttention(nn.Module):
     def messages(
         self, q: Tensor, k: Tensor, v: Tensor, flow: Tensor, own: Side, other: Side
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Of the global level (N, h / rows, w / columns, 256), of half (N, h/2, w/2, 256) and of full size."""
+        """Return messages of the global level (N, h / rows, w / columns, 256), of half and of full size."""
         coarse = global_attention(
             mean_pool(q, own.factor),
             mean_pool(k, other.factor),
@@ -185,12 +185,12 @@ class HierarchicalAttention(nn.Module):
 
 
 def _repeated(grid: Tensor, height: int, width: int) -> Tensor:
-    """Nearest neighbours at a whole multiple of the size."""
+    """Upsample by nearest neighbours to a whole multiple of the size."""
     return as_grid(functional.interpolate(as_map(grid), size=(height, width), mode="nearest"))
 
 
 class AspanBlock(nn.Module):
-    """Decodes the flow, and updates both features of an image along it; the last block the visual one alone."""
+    """A block that decodes the flow and updates both features along it; the last block updates the visual one."""
 
     def __init__(self, last: bool) -> None:
         super().__init__()
@@ -211,13 +211,13 @@ class AspanBlock(nn.Module):
         self.norm2 = ChannelNorm(width)
 
     def decode_flow(self, own: Side, other: Side) -> Tensor:
-        """(N, h, w, 4): target (x, y) in coarse cells of ``other`` from its corner, log-variances (x, y)."""
+        """Return (N, h, w, 4): target (x, y) in coarse cells of ``other`` from its corner, log-variances."""
         raw = self.flow_decoder(own.flow)
         size = raw.new_tensor([other.visual.shape[2], other.visual.shape[1]])
         return torch.cat([raw[..., :2].sigmoid() * size, raw[..., 2:]], dim=-1)
 
     def forward(self, own: Side, other: Side) -> Side:
-        """``own``, updated."""
+        """Return ``own``, updated."""
         message = self.attention(
             pointwise(self.q_proj, own.visual),
             pointwise(self.k_proj, other.visual),
@@ -241,22 +241,22 @@ class AspanTransformer(nn.Module):
         self.pos_transform = nn.Conv2d(TOP, FLOW, 1, bias=False)
         self.ini_layer = InitialStage()
         self.layers = nn.ModuleList(AspanBlock(last=index == BLOCKS - 1) for index in range(BLOCKS))
-        # The 3x3 convolutions lie in memory as the grids they see.
+        # The weights of 3x3 convolutions have the memory layout of the grids.
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # missing in torch's stubs
 
     def project(self, positions: Tensor) -> Tensor:
-        """Encoded positions (1, h, w, 256) -> (1, h, w, 128), as values need them."""
+        """Map encoded positions (1, h, w, 256) to (1, h, w, 128), for the values."""
         return pointwise(self.pos_transform, positions)
 
     def forward(self, side0: Side, side1: Side) -> tuple[Tensor, Tensor]:
-        """-> the visual features of both, (N, h, w, 256)."""
+        """Return the visual features of both, (N, h, w, 256)."""
         side0, side1 = self.ini_layer(side0, side1)
         for block in self.layers:
             side0, side1 = block(side0, side1), block(side1, side0)
         return side0.visual, side1.visual
 
 
-POOLING = (4, 4)  # rows and columns of the coarse map that are a cell of the global level
+POOLING = (4, 4)  # rows and columns of the coarse map per cell of the global level
 
 
 class MatchingTemperature(nn.Module):
@@ -268,11 +268,11 @@ class MatchingTemperature(nn.Module):
 
 
 class AspanFormer(SemiDenseNetwork[AspanTransformer]):
-    """Sides are multiples of 32; the two images may differ in size.
+    """ASpanFormer. Sides are multiples of 32; the two images may differ in size.
 
-    ``train_size``: (height, width) whose extent the positions of every image are stretched to. The defaults are
-    those published for outdoor images of any size. Checkpoints also hold ``*.sample_offset``, which the published
-    network ignores: leave them out.
+    ``train_size``: (height, width) to whose extent the positions of every image are stretched. The defaults were
+    published for outdoor images of any size. Checkpoints also hold ``*.sample_offset``; leave them out, since the
+    published network ignores them.
     """
 
     multiple = 32
@@ -293,7 +293,7 @@ class AspanFormer(SemiDenseNetwork[AspanTransformer]):
         return grid0, grid1
 
     def side(self, coarse: Tensor, mask: Tensor | None) -> Side:
-        """What the transformer is given of an image: its coarse map (N, 256, h, w) with positions added."""
+        """Return the transformer's input for an image: its coarse map (N, 256, h, w) with positions added."""
         grid = as_grid(coarse)
         height, width = grid.shape[1:3]
         scale = self.position_scale(height, width)
@@ -302,6 +302,6 @@ class AspanFormer(SemiDenseNetwork[AspanTransformer]):
         return Side(visual, visual.new_empty(0), self.loftr_coarse.project(positions), POOLING, mask)
 
     def position_scale(self, height: int, width: int) -> tuple[float, float]:
-        """The factors (y, x) that stretch the positions in a coarse map."""
+        """Return the factors (y, x) that stretch the positions in a coarse map."""
         train_height, train_width = self.train_size
         return train_height / (COARSE_STRIDE * height), train_width / (COARSE_STRIDE * width)

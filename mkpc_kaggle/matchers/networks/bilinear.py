@@ -1,7 +1,7 @@
-"""Bilinear samples of tables of pixels, and the deformable convolution that is made of them (Dai et al. 2017).
+"""Bilinear samples of tables of pixels, and a deformable convolution on them (Dai et al. 2017).
 
-A table (P, C) holds the pixels of B maps of one size, row by row and one map after the other: a channels-last
-batch seen as rows. Positions are (x, y) in pixels of their map.
+A table (P, C) holds the pixels of B maps of one size, map by map and row by row: a channels-last batch as rows.
+Positions are (x, y) in pixels of their map.
 """
 
 import torch
@@ -15,14 +15,14 @@ KERNEL = 3
 
 
 def table_of(maps: Tensor) -> Tensor:
-    """(B, C, h, w) -> (B h w, C) float32; a view where the maps are float32 and channels last."""
+    """Map (B, C, h, w) to (B h w, C) float32; a view where the maps are float32 and channels last."""
     return as_grid(maps).flatten(0, 2).float()
 
 
 def corners(positions: Tensor, image: Tensor, size: torch.Size) -> tuple[Tensor, Tensor]:
-    """The pixels (Q, 4) int64 around positions (Q, 2) in maps ``image`` (Q,), and their weights (Q, 4).
+    """Return the pixels (Q, 4) int64 around positions (Q, 2) in maps ``image`` (Q,), and their weights (Q, 4).
 
-    Pixels outside the map, of ``size`` (h, w), have the weight 0 and the index of another.
+    Pixels outside the map, of ``size`` (h, w), have the weight 0 and the index of another pixel.
     """
     height, width = size
     x, y = positions.unbind(1)
@@ -34,9 +34,9 @@ def corners(positions: Tensor, image: Tensor, size: torch.Size) -> tuple[Tensor,
 
 
 def neighbours(positions: Tensor, length: int) -> list[tuple[Tensor, Tensor]]:
-    """On one axis the pixel before each position (Q,) and the one after it, int64, with their weights.
+    """Return the pixels before and after each position (Q,) on one axis, int64, with their weights.
 
-    A position that is NaN has some pixel, for a GPU is lost after an index out of range, and NaN for its weight.
+    A NaN position gets a valid pixel, since a GPU fails on an index out of range, and a NaN weight.
     """
     before = positions.floor()
     share = positions - before
@@ -47,24 +47,24 @@ def neighbours(positions: Tensor, length: int) -> list[tuple[Tensor, Tensor]]:
 
 
 def weighted_rows(table: Tensor, index: Tensor, weights: Tensor) -> Tensor:
-    """Sums (Q, C) over K of weights (Q, K) times the rows ``index`` (Q, K) of a table (P, C)."""
+    """Sum weights (Q, K) times the rows ``index`` (Q, K) of a table (P, C) over K: (Q, C)."""
     return functional.embedding_bag(index, table, mode="sum", per_sample_weights=weights)
 
 
 def sampled(maps: Tensor, positions: Tensor, image: Tensor) -> Tensor:
-    """Maps (B, C, h, w) at positions (Q, 2) of the maps ``image`` (Q,): (Q, C) float32, zero outside."""
+    """Sample maps (B, C, h, w) at positions (Q, 2) of the maps ``image`` (Q,): (Q, C) float32, zero outside."""
     return weighted_rows(table_of(maps), *corners(positions, image, maps.shape[2:]))
 
 
 class DeformableConv2d(nn.Conv2d):
-    """A 3x3 convolution whose nine taps ``offset_conv`` moves, at each pixel, away from its neighbours."""
+    """A 3x3 convolution whose nine taps are moved by ``offset_conv`` at each pixel."""
 
     def __init__(self, channels: int, out_channels: int) -> None:
         super().__init__(channels, out_channels, KERNEL, padding=1, bias=False)
         self.offset_conv = ExactConv2d(channels, 2 * KERNEL**2, KERNEL, padding=1)
 
     def forward(self, x: Tensor) -> Tensor:
-        """(B, C, h, w) -> (B, out_channels, h, w), like ``x``."""
+        """Map (B, C, h, w) to (B, out_channels, h, w), like ``x``."""
         batch, _, height, width = x.shape
         reach = max(height, width) / 4
         offsets = as_grid(self.offset_conv(x.float())).clamp(-reach, reach)  # (B, h, w, 18): y, x by tap

@@ -1,8 +1,8 @@
 """Matches of coarse cells: dual softmax, mutual nearest neighbours, threshold and border.
 
 Source: Sun et al. 2021, section 3.3. The matrix of all pairs of cells is stored only if it is small: at
-1600 x 1200 pixels it would take 3.6 GB. Otherwise blocks of rows are computed twice, once for the sums of the
-softmaxes and once for the maximum of each row and column.
+1600 x 1200 pixels it would take 3.6 GB. Otherwise blocks of rows are computed twice, first for the sums of the
+softmaxes, then for the maximum of each row and column.
 """
 
 from collections.abc import Iterable, Iterator
@@ -22,7 +22,7 @@ HELD_FLOATS = 2**25  # of the matrix: 128 MiB, at 640 x 480 it has 23 million
 class CoarseMatches:
     """M matches in order of (batch, cell0): int64 ``batch``, ``cell0``, ``cell1`` and float32 ``confidence``.
 
-    A cell is counted row by row over its own map.
+    Cells are counted row by row in their own map.
     """
 
     batch: Tensor
@@ -34,11 +34,10 @@ class CoarseMatches:
 def coarse_matches(
     grid0: Tensor, grid1: Tensor, scale: float | Tensor, threshold: float, border: int, masks: Masks | None
 ) -> CoarseMatches:
-    """Grids (N, h0, w0, C) and (N, h1, w1, C), whose similarity is ``scale`` times their dot product.
+    """Match grids (N, h0, w0, C) and (N, h1, w1, C); ``scale`` times their dot product is the similarity.
 
-    A match is above ``threshold`` and the best of its row and of its column, border cells included; then those
-    with a cell within ``border`` of the border of its content are dropped. ``masks``: (N, h, w) bool, True at
-    content.
+    A match is above ``threshold`` and the best of its row and of its column, border cells included. Then matches
+    with a cell within ``border`` of the content's border are dropped. ``masks``: (N, h, w) bool, True at content.
     """
     masks0, masks1 = masks or (grid0.new_ones(grid.shape[:3], dtype=torch.bool) for grid in (grid0, grid1))
     found = [
@@ -58,7 +57,7 @@ def _matches_of_pair(
     threshold: float,
     border: int,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """``cell0``, ``cell1`` and ``confidence`` of one pair; grids (h, w, C), masks (h, w)."""
+    """Return ``cell0``, ``cell1`` and ``confidence`` of one pair; grids (h, w, C), masks (h, w)."""
     cells = Cells(grid0.flatten(0, 1) * scale, grid1.flatten(0, 1), mask0.flatten(), mask1.flatten())
     best0, partner, best1 = row_and_column_maxima(cells)
     inner0, inner1 = inner_cells(mask0, border), inner_cells(mask1, border)
@@ -78,7 +77,7 @@ class Cells:
     content1: Tensor
 
     def similarity(self) -> Iterator[Tensor]:
-        """Blocks of rows (l, S) float32: dot products, minus infinity where either cell is padding."""
+        """Yield dot products in blocks of rows (l, S) float32, minus infinity where either cell is padding."""
         rows = ROWS_AT_ONCE.get(self.features0.device.type, 256)
         blocks = zip(torch.split(self.features0.float(), rows), torch.split(self.content0, rows), strict=True)
         keys = self.features1.float()
@@ -90,20 +89,20 @@ class Cells:
 
 
 def half_log_sums(blocks: Iterable[Tensor]) -> tuple[Tensor, Tensor]:
-    """Of blocks (l, S): half the logarithm of the sums of exp over each row (L,) and each column (S,)."""
+    """Return half the logarithm of the sums of exp over each row (L,) and each column (S,) of blocks (l, S)."""
     rows_and_columns = [(block.logsumexp(dim=1), block.logsumexp(dim=0)) for block in blocks]
     over_rows, of_blocks = (list(sums) for sums in zip(*rows_and_columns, strict=True))
     over_columns = torch.stack(of_blocks).logsumexp(dim=0)
-    # The sum of a row of padding is minus infinity; clamped, subtracting it gives no NaN.
+    # The sum of a row of padding is minus infinity. Clamping prevents NaN in the difference.
     finite = torch.finfo(torch.float32).min
     return torch.cat(over_rows).clamp_(min=finite).div_(2), over_columns.clamp_(min=finite).div_(2)
 
 
 def half_log_confidences(cells: Cells) -> Iterator[Tensor]:
-    """Blocks of rows (l, S): half the logarithm of the confidence.
+    """Yield half the logarithm of the confidence, in blocks of rows (l, S).
 
-    The confidence is the softmax over the rows times that over the columns, so its logarithm is
-    2 s_ij - log sum_j exp s_ij - log sum_i exp s_ij.
+    The confidence is the product of the softmaxes over rows and columns.
+    Its logarithm is 2 s_ij - log sum_j exp s_ij - log sum_i exp s_ij.
     """
     small = len(cells.features0) * len(cells.features1) <= HELD_FLOATS
     held = list(cells.similarity()) if small else None
@@ -115,7 +114,7 @@ def half_log_confidences(cells: Cells) -> Iterator[Tensor]:
 
 
 def row_and_column_maxima(cells: Cells) -> tuple[Tensor, Tensor, Tensor]:
-    """Half the log confidence: each row's maximum (L,) and its column (L,), and each column's maximum (S,)."""
+    """Return the maximum (L,) and its column (L,) of each row, and the maximum (S,) of each column."""
     of_rows = []
     of_columns = cells.features1.new_full(cells.content1.shape, -torch.inf, dtype=torch.float32)
     for block in half_log_confidences(cells):
@@ -126,7 +125,7 @@ def row_and_column_maxima(cells: Cells) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def inner_cells(mask: Tensor, border: int) -> Tensor:
-    """(h w,) bool: cells of the content (h, w) at least ``border`` away from its border."""
+    """Return (h w,) bool: cells of the content (h, w) at least ``border`` away from its border."""
     h, w = mask.shape
     bottom, right = mask.sum(dim=0).amax() - border, mask.sum(dim=1).amax() - border
     row, column = torch.arange(h, device=mask.device)[:, None], torch.arange(w, device=mask.device)

@@ -1,7 +1,7 @@
 """DaD, a keypoint detector (Edstedt et al. 2025, arXiv 2503.07347): a map of logits and its strongest maxima.
 
-Normalised coordinates: (x, y) in [-1, 1], where +-1 are the outer edges of an image. Parameter names are those of
-the public checkpoint. For inference only.
+Normalised coordinates: (x, y) in [-1, 1], where +-1 are the outer edges of an image. Parameter names match the
+public checkpoint. For inference only.
 """
 
 from collections.abc import Iterator
@@ -17,7 +17,7 @@ from mkpc_kaggle.matchers.networks.pixels import MEAN, STD
 from mkpc_kaggle.matchers.networks.superpoint import window_maximum
 from mkpc_kaggle.matchers.networks.vgg import VGG11, Vgg
 
-TEMPERATURE = 0.5  # of the softmax over the nine pixels that place a keypoint between pixels
+TEMPERATURE = 0.5  # of the softmax over nine pixels that locates a keypoint between pixels
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +38,7 @@ class Dad(nn.Module):
         self.eval().requires_grad_(False)
 
     def forward(self, image: Tensor, number: int) -> list[DadKeypoints]:
-        """At most ``number`` keypoints of each image of (B, 3, H, W), RGB in 0..1, sides of at least 8.
+        """Return up to ``number`` keypoints of each image of (B, 3, H, W), RGB in 0..1, sides of at least 8.
 
         Trained with sides that are multiples of 8, the longer one 1024.
         """
@@ -47,19 +47,19 @@ class Dad(nn.Module):
         return [select_keypoints(logits, number) for logits in maps]
 
     def logits(self, image: Tensor) -> Tensor:
-        """(B, H, W) float32."""
+        """Return logits (B, H, W) float32."""
         prediction, hidden = self.decoder(self.levels(image))
         part = self.decoder.last.outputs(hidden, slice(1))
         return resize(prediction, part.shape[2:], "bicubic").add_(part)[:, 0]
 
     def levels(self, image: Tensor) -> Iterator[Tensor]:
-        """The features at strides 1, 2, 4 and 8."""
+        """Return the features at strides 1, 2, 4 and 8."""
         mean, std = (image.new_tensor(values)[:, None, None] for values in (MEAN, STD))
         return self.encoder.levels((image - mean) / std)
 
 
 def select_keypoints(logits: Tensor, number: int) -> DadKeypoints:
-    """The largest maxima of 3 x 3 pixels of a map (H, W); equal ones in one window are all kept."""
+    """Return the largest maxima of 3 x 3 pixels of a map (H, W); equal ones in one window are all kept."""
     height, width = logits.shape
     probability = logits.flatten().softmax(dim=0).view(1, height, width)
     maxima = probability.where(probability == window_maximum(probability, 1), 0).flatten()
@@ -71,7 +71,7 @@ def select_keypoints(logits: Tensor, number: int) -> DadKeypoints:
 
 
 def subpixel_offsets(logits: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
-    """(K, 2) float32 in pixels, each within -1..1: the mean of a softmax around pixels (K,) of a map (H, W).
+    """Return (K, 2) float32 in pixels, within -1..1: the mean of a softmax around pixels (K,) of a map (H, W).
 
     Pixels beyond the map count as logits of 0, as they did in training.
     """

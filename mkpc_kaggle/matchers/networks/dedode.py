@@ -1,9 +1,9 @@
-"""DeDoDe descriptors (Edstedt et al. 2024, arXiv 2308.08479) as in LoMa: a dense map, read at keypoints.
+"""DeDoDe descriptors (Edstedt et al. 2024, arXiv 2308.08479) as in LoMa: a dense map, sampled at keypoints.
 
-The decoder, which the detector DaD has too, goes from coarse to fine: at each stride a refiner looks at the
-features there and at the context of the coarser strides, adds to the prediction and passes on a context.
-Predictions are float32 in any precision. B is of VGG-19 alone; G adds DINOv2 at stride 14. Coordinates are
-normalised as in dad. Parameter names are those of the public checkpoints. For inference only.
+The decoder, which DaD shares, runs from coarse to fine. At each stride a refiner reads the features and context of
+the coarser strides, adds to the prediction and passes on a context. Predictions are float32 in any precision.
+B uses VGG-19 alone; G adds DINOv2 at stride 14. Coordinates are normalised as in dad. Parameter names match the
+public checkpoints. For inference only.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -17,13 +17,13 @@ from mkpc_kaggle.matchers.networks.dinov2 import DinoV2, DinoV2Config
 from mkpc_kaggle.matchers.networks.layers import ExactConv2d, in_strips
 from mkpc_kaggle.matchers.networks.vgg import VGG19, Vgg
 
-KERNEL, BLOCKS = 5, 5  # the side of the depthwise convolutions; how many follow the first
-CHANNELS = 32  # of a prediction that are enlarged at a time
+KERNEL, BLOCKS = 5, 5  # side of the depthwise convolutions; number of blocks after the first
+CHANNELS = 32  # of a prediction, enlarged at a time
 
 
 @dataclass(frozen=True)
 class DedodeRefinerShape:
-    """Channels: of the ``features`` looked at, inside, and of the ``context`` passed on."""
+    """Channels of the input ``features``, inside, and of the output ``context``."""
 
     features: int
     hidden: int
@@ -53,27 +53,27 @@ class DedodeRefiner(nn.Module):
         self.out_conv = ExactConv2d(width, prediction + shape.context, 1)
 
     def entry(self, features: Tensor) -> Tensor:
-        """What the first convolution makes of features (B, C, h, w) alone: (B, hidden, h, w)."""
+        """Return the first convolution of features (B, C, h, w) alone: (B, hidden, h, w)."""
         weight, bias = (self.block1.get_parameter(f"0.{name}") for name in ("weight", "bias"))
         return functional.conv2d(features.to(weight.dtype), weight[:, : self.features], bias)
 
     def mixed(self, entry: Tensor, context: Tensor | None) -> Tensor:
-        """(B, hidden, h, w) from an :meth:`entry`, which is overwritten, and the coarser stride's context."""
+        """Return (B, hidden, h, w) from an :meth:`entry`, which is overwritten, and the coarser context."""
         first, norm, relu, mix = self.block1
         if context is not None:
-            # A 1x1 convolution of the enlarged context is the enlarged one of the context.
+            # A 1x1 convolution and enlargement commute; the small map is cheaper.
             weight = first.get_parameter("weight")[:, self.features :]
             entry += resize(functional.conv2d(context.to(weight.dtype), weight), entry.shape[2:], "bilinear")
         mixed: Tensor = mix(relu(norm(entry)))
         return mixed
 
     def hidden(self, mixed: Tensor) -> Tensor:
-        """What is in :meth:`mixed` and what the blocks make of it: (B, hidden, h, w) again."""
+        """Return the scaled sum of :meth:`mixed` and its blocks, (B, hidden, h, w)."""
         reach = KERNEL // 2 * len(self.hidden_blocks)
         return in_strips(self._hidden, mixed, reach=reach, channels=mixed.shape[1])
 
     def outputs(self, hidden: Tensor, which: slice = slice(None)) -> Tensor:
-        """(B, n, h, w) float32: ``which`` of the channels, the prediction's first and then the context's."""
+        """Return (B, n, h, w) float32: ``which`` of the channels, the prediction's before the context's."""
         weight, bias = (self.out_conv.get_parameter(name)[which] for name in ("weight", "bias"))
         return functional.conv2d(hidden.float(), weight, bias)
 
@@ -83,7 +83,7 @@ class DedodeRefiner(nn.Module):
 
 
 class DedodeDecoder(nn.Module):
-    """``prediction`` channels, ``blocks`` in each refiner; it is upsampled in interpolate's ``mode``."""
+    """A decoder of ``prediction`` channels, ``blocks`` in each refiner, upsampling in ``mode``."""
 
     def __init__(self, strides: Sequence[int], prediction: int, blocks: int, mode: str) -> None:
         super().__init__()
@@ -104,13 +104,12 @@ class DedodeDecoder(nn.Module):
         return refiner
 
     def forward(self, levels: Iterable[Tensor]) -> tuple[Tensor, Tensor]:
-        """The prediction (B, prediction, h, w) after stride 2, and the last refiner's hidden map, (B, 32, H, W).
+        """Return the prediction (B, prediction, h, w) after stride 2, and the last hidden map, (B, 32, H, W).
 
-        ``levels`` are the features from fine to coarse, computed one by one, so that none is kept in memory
-        once the next is requested.
+        ``levels`` yields the features from fine to coarse, so that only one level is in memory at a time.
         """
         strides = [int(stride) for stride in self.layers]
-        # A for loop would keep the features alive while the next ones are computed.
+        # A for loop would keep the features in memory while the next ones are computed.
         entries = list(map(self.entry, reversed(strides), levels))
         prediction: Tensor | None = None
         context: Tensor | None = None
@@ -126,14 +125,14 @@ class DedodeDecoder(nn.Module):
     def refined(
         self, stride: int, entry: Tensor, prediction: Tensor | None, context: Tensor | None
     ) -> tuple[Tensor, Tensor]:
-        """The prediction with what this stride adds, and its context."""
+        """Return the prediction with this stride's correction, and its context."""
         refiner = self.at(stride)
         hidden = refiner.hidden(refiner.mixed(entry, context))
-        del entry  # the maps that follow are the most that is in memory at a time
+        del entry  # the next maps are the peak of memory
         part = refiner.outputs(hidden, slice(self.prediction))
         context = refiner.outputs(hidden, slice(self.prediction, None))
         if prediction is not None:
-            # In parts, since at stride 2 the enlarged one is the largest map of all.
+            # In parts: at stride 2 the enlarged map is the largest of all.
             chunks = (torch.split(map_, CHANNELS, dim=1) for map_ in (part, prediction))
             for some, coarser in zip(*chunks, strict=True):
                 some.add_(resize(coarser, some.shape[2:], self.mode))
@@ -141,7 +140,7 @@ class DedodeDecoder(nn.Module):
 
 
 def resize(x: Tensor, size: torch.Size, mode: str) -> Tensor:
-    """(B, C, h, w) -> (B, C, *size), without antialiasing, half-pixel centres."""
+    """Resize (B, C, h, w) to (B, C, *size), without antialiasing, half-pixel centres."""
     return functional.interpolate(x, tuple(size), mode=mode, align_corners=False)
 
 
@@ -155,7 +154,7 @@ def normalised(width: int) -> tuple[nn.Module, nn.Module]:
 
 
 class Dedode(nn.Module):
-    """``encoder``: of features at the ``strides``."""
+    """A descriptor on an ``encoder`` of features at the ``strides``."""
 
     def __init__(self, encoder: "Vgg | VggAndVit", strides: tuple[int, ...], channels: int) -> None:
         super().__init__()
@@ -164,12 +163,12 @@ class Dedode(nn.Module):
         self.eval().requires_grad_(False)
 
     def forward(self, image: Tensor, points: Tensor) -> Tensor:
-        """Descriptors (B, K, D) float32, of any length, at points (B, K, 2) of images (B, 3, H, W), RGB in 0..1.
+        """Return descriptors (B, K, D) float32, of any length, at points (B, K, 2) of images (B, 3, H, W) in 0..1.
 
         The images are not normalised. Beyond the image, descriptors fade to 0 within a pixel.
         """
         prediction, hidden = self.decoder(self.encoder.levels(image))
-        # The map at full resolution is never computed, only its two parts at the points.
+        # The full-resolution map is never computed, only its two parts at the points.
         head = self.decoder.last.out_conv
         weight, bias = (
             parameter[: self.decoder.prediction] for parameter in (head.weight, head.get_parameter("bias"))
@@ -182,7 +181,7 @@ class Dedode(nn.Module):
 
 
 def nearest_pixels(points: Tensor, size: torch.Size) -> tuple[Tensor, Tensor]:
-    """The four pixels (B, K, 4, 2), column and row, around points (B, K, 2), and their bilinear shares (B, K, 4).
+    """Return the four pixels (B, K, 4, 2), column and row, around points (B, K, 2), and their shares (B, K, 4).
 
     Pixels outside an image of ``size`` (height, width) have weight 0.
     """
@@ -197,7 +196,7 @@ def nearest_pixels(points: Tensor, size: torch.Size) -> tuple[Tensor, Tensor]:
 
 
 def read_enlarged(x: Tensor, pixels: Tensor, shares: Tensor, size: torch.Size) -> Tensor:
-    """Weighted sums (B, K, C) of pixels (B, K, 4, 2) of a map (B, C, h, w) enlarged bilinearly to ``size``."""
+    """Sum weighted pixels (B, K, 4, 2) of a map (B, C, h, w) enlarged bilinearly to ``size``: (B, K, C)."""
     centres = (2 * pixels + 1) / pixels.new_tensor([size[1], size[0]]) - 1
     read = functional.grid_sample(x, centres, padding_mode="border", align_corners=False)  # (B, C, K, 4)
     return (read * shares[:, None]).sum(dim=3).mT
@@ -221,5 +220,5 @@ def dedode_b(channels: int) -> Dedode:
 
 
 def dedode_g(channels: int, vit: DinoV2Config | None = None) -> Dedode:
-    """``vit`` of ViT-L/14 unless given."""
+    """Make the network; ``vit`` defaults to ViT-L/14."""
     return Dedode(VggAndVit(vit), (14, 8, 4, 2, 1), channels)

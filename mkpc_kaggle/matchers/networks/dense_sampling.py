@@ -1,4 +1,4 @@
-"""Draws matches from a dense warp, spread evenly over the images: Edstedt et al. 2023, "DKM", section 3.5."""
+"""Matches drawn evenly from a dense warp: Edstedt et al. 2023, "DKM", section 3.5."""
 
 from dataclasses import dataclass
 
@@ -7,7 +7,7 @@ from torch import Generator, Tensor
 
 OVERSAMPLING = 4  # before matches are balanced
 BANDWIDTH = 0.1  # of the density's kernel, in normalised coordinates
-MIN_DENSITY, LAST_RESORT = 10, 1e-7  # isolated matches are drawn only when no others are left
+MIN_DENSITY, LAST_RESORT = 10, 1e-7  # isolated matches are drawn only if no others remain
 BLOCK_FLOATS = 2**20
 MIN_EXPONENT = -80  # exp of less is denormal: ten times slower, and adds nothing
 
@@ -28,11 +28,11 @@ def sample_matches(
     *,
     generator: Generator | None = None,
 ) -> SampledMatches:
-    """Draws at most ``number`` matches from a warp (N, 4) with its certainty (N,).
+    """Draw up to ``number`` matches from a warp (N, 4) with its certainty (N,).
 
-    Certainties above ``threshold`` count as 1. Fewer than ``number`` where fewer have any weight, or none.
-    ``generator`` (on the tensors' device; default: PyTorch's) fixes the result. ValueError unless certainties are
-    finite.
+    Certainties above ``threshold`` count as 1. Matches without weight are never drawn.
+    ``generator`` (on the tensors' device; default: PyTorch's) fixes the result. Raises ``ValueError`` unless
+    certainties are finite.
     """
     weights = certainty.masked_fill(certainty > threshold, 1)
     if not weights.isfinite().all():
@@ -48,9 +48,9 @@ def noise_like(weights: Tensor, generator: Generator | None) -> Tensor:
 
 
 def draw(weights: Tensor, noise: Tensor, number: int) -> Tensor:
-    """Indices (M,) int64 of at most ``number`` entries of weights (N,), none twice, none of weight 0.
+    """Return up to ``number`` indices (M,) int64 of weights (N,), none twice, none of weight 0.
 
-    With exponential noise (N,) the order of weight / noise is one of successive draws in proportion to weight.
+    Sorting by weight / noise, with exponential noise (N,), equals successive draws in proportion to weight.
     """
     drawn = (weights / noise).topk(min(number, len(weights))).indices
     return drawn[weights[drawn] > 0]
@@ -67,5 +67,5 @@ def density(points: Tensor) -> Tensor:
 
 
 def balancing_weights(density: Tensor) -> Tensor:
-    """(N,) -> (N,): lower where the density is higher, and almost 0 for isolated points."""
+    """Map densities (N,) to weights (N,): lower for higher densities, and almost 0 for isolated points."""
     return (1 / (density + 1)).masked_fill_(density < MIN_DENSITY, LAST_RESORT)

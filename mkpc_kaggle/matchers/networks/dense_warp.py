@@ -1,4 +1,4 @@
-"""Dense warps: for every pixel its position in the other image and a certainty; what DKM and RoMa share.
+"""Dense warps, shared by DKM and RoMa: for every pixel its position in the other image and a certainty.
 
 Normalised coordinates as in warp_refiner. Source: Edstedt et al. 2023, "DKM", section 3.4, and its published code.
 """
@@ -18,7 +18,7 @@ from mkpc_kaggle.matchers.networks.warp_refiner import WarpEstimate, identity_ma
 
 @dataclass(frozen=True, eq=False)
 class Pyramid:
-    """Of B images, (B, C, h, w) each, in the network's precision: at strides 1, 2, 4, 8 and maybe more."""
+    """Features of B images, (B, C, h, w), in the network's precision: at strides 1, 2, 4, 8 and maybe more."""
 
     levels: tuple[Tensor, ...]
 
@@ -40,23 +40,23 @@ class DenseFeatures:
 
 @dataclass(frozen=True, eq=False)
 class DenseWarp:
-    """Of B pairs, float32: ``warp`` (B, H, W, 4), (x, y) in the first image and (x, y) in the second, in [-1, 1];
-    ``certainty`` (B, H, W) in [0, 1], 0 where the target is outside. The grid is that of one of the images.
+    """Warps of B pairs, float32: ``warp`` (B, H, W, 4), (x, y) in the first and in the second image, in [-1, 1];
+    ``certainty`` (B, H, W) in [0, 1], 0 where the target is outside. The grid is one of the images'.
     """
 
     warp: Tensor
     certainty: Tensor
 
     def swapped(self) -> "DenseWarp":
-        """The same pairs of points, the other image's coordinates first."""
+        """Return the same pairs of points, the other image's coordinates first."""
         return DenseWarp(torch.cat([self.warp[..., 2:], self.warp[..., :2]], dim=3), self.certainty)
 
 
 class WarpDecoder(nn.Module, ABC):
-    """From the features of two images to the flow from the one to the other."""
+    """A decoder from the features of two images to the flow between them."""
 
     def forward(self, query: DenseFeatures, support: DenseFeatures) -> tuple[WarpEstimate, Tensor]:
-        """The flow from query to support at stride 1 of the last pass, and the first pass's logits at 16."""
+        """Return the flow from query to support at stride 1 (last pass) and the logits at 16 (first pass)."""
         estimate = self.coarse_estimate(query, support)
         logits = estimate.certainty
         estimate = self.refine(estimate, query.coarse, support.coarse)
@@ -65,18 +65,18 @@ class WarpDecoder(nn.Module, ABC):
         return estimate, logits
 
     def refine(self, estimate: WarpEstimate, query: Pyramid, support: Pyramid) -> WarpEstimate:
-        """Down to stride 1 from an estimate of any size."""
+        """Refine an estimate of any size down to stride 1."""
         for stride in (8, 4, 2, 1):
             estimate = self.correct(estimate.resized(query.at(stride).shape[2:]), query, support, stride)
         return estimate
 
     @abstractmethod
     def coarse_estimate(self, query: DenseFeatures, support: DenseFeatures) -> WarpEstimate:
-        """At stride 16, refined."""
+        """Return the refined estimate at stride 16."""
 
     @abstractmethod
     def correct(self, estimate: WarpEstimate, query: Pyramid, support: Pyramid, stride: int) -> WarpEstimate:
-        """The estimate, of the size of a stride's features, corrected by that stride's refiner."""
+        """Correct an estimate, of the size of a stride's features, by that stride's refiner."""
 
 
 class DenseNetwork(nn.Module, ABC):
@@ -86,19 +86,19 @@ class DenseNetwork(nn.Module, ABC):
 
     @abstractmethod
     def encode(self, image: Tensor, fine: Tensor | None = None) -> DenseFeatures:
-        """Images (B, 3, H, W) as :func:`pixels.network_input` makes them; larger ones for a second pass."""
+        """Encode images (B, 3, H, W) of :func:`pixels.network_input`; larger ones are for a second pass."""
 
     def match(self, first: DenseFeatures, second: DenseFeatures) -> tuple[DenseWarp, DenseWarp]:
-        """B pairs, whose images may differ in size: the warps on the first image's grid and on the second's."""
+        """Match B pairs, whose images may differ in size: warps on the first and on the second image's grid."""
         # Sequential: one batch of both directions would take twice the memory and as much time.
         forward, backward = (dense_warp(*self.decoder(*both)) for both in ((first, second), (second, first)))
         return forward, backward.swapped()
 
 
 def dense_warp(estimate: WarpEstimate, coarse_logits: Tensor) -> DenseWarp:
-    """One direction on the query's grid; ``coarse_logits`` (B, 1, h, w): those of stride 16, first pass."""
+    """Return one direction on the query's grid; ``coarse_logits`` (B, 1, h, w) are of stride 16, first pass."""
     flow, logits = estimate.flow, estimate.certainty
-    # Half of the coarse logits that speak against a match is subtracted again.
+    # Subtract half of the negative coarse logits.
     doubts = resize(coarse_logits, logits.shape[2:]).clamp(max=0)
     certainty = torch.sigmoid(logits - 0.5 * doubts)[:, 0]  # (B, H, W)
     outside = (flow.abs() > 1).any(dim=1)
@@ -111,7 +111,7 @@ TEMPERATURE, NOISE_VARIANCE = 0.2, 0.1
 
 
 class GaussianProcess(nn.Module):
-    """Regresses from the support's features to the coordinates of its pixels, embedded in ``width`` channels.
+    """A Gaussian process from the support's features to the embedded coordinates of its pixels, of ``width``.
 
     Source: Edstedt et al. 2023, section 3.2.
     """
@@ -121,39 +121,39 @@ class GaussianProcess(nn.Module):
         self.pos_conv = ExactConv2d(2, width, 1)
 
     def regress(self, support: Tensor) -> Tensor:
-        """Features (B, C, h', w') -> the coefficients (B, n', width) of their kernels, float32."""
+        """Map features (B, C, h', w') to the coefficients (B, n', width) of their kernels, float32."""
         return coefficients(tokens(support), tokens(self.embed_coordinates(support)))
 
     def forward(self, query: Tensor, support: Tensor, coefficients: Tensor) -> Tensor:
-        """Posterior mean (B, width, h, w) of features (B, C, h, w) and (B, C, h', w'), regressed before."""
+        """Return the posterior mean (B, width, h, w) of features (B, C, h, w) and the coefficients."""
         mean = kernel(tokens(query), tokens(support)) @ coefficients  # (B, n, width)
         return mean.mT.reshape(len(query), -1, *query.shape[2:])
 
     def embed_coordinates(self, like: Tensor) -> Tensor:
-        """(1, width, h, w) for a map (..., h, w)."""
+        """Return (1, width, h, w) for a map (..., h, w)."""
         return torch.cos(8 * math.pi * self.pos_conv(identity_map(like)))
 
 
 def tokens(feature_map: Tensor) -> Tensor:
-    """(B, C, h, w) -> (B, h w, C), float32."""
+    """Map (B, C, h, w) to (B, h w, C), float32."""
     return feature_map.float().flatten(2).mT
 
 
 def coefficients(y: Tensor, values: Tensor) -> Tensor:
-    """(K_yy + noise)^-1 values: (B, m, C) and (B or 1, m, D) -> (B, m, D)."""
+    """Return (K_yy + noise)^-1 values: (B, m, C) and (B or 1, m, D) give (B, m, D)."""
     check_finite("coarse features", y)
     covariance = kernel(y, y)
     covariance.diagonal(dim1=1, dim2=2).add_(NOISE_VARIANCE)
-    # Positive definite. LU would cost twice as much, and batched it is broken in PyTorch's MKL builds.
+    # Positive definite. LU costs twice as much; batched LU is broken in PyTorch's MKL builds.
     factor = torch.linalg.cholesky(covariance)
     return torch.cholesky_solve(values.expand(len(y), -1, -1), factor)
 
 
 def kernel(x: Tensor, y: Tensor) -> Tensor:
-    """exp((cosine - 1) / T) of all pairs: (B, n, C) and (B, m, C) -> (B, n, m), float32.
+    """Return exp((cosine - 1) / T) of all pairs: (B, n, C) and (B, m, C) give (B, n, m), float32.
 
-    Computed in float64: the inverse of a covariance amplifies rounding errors some fifteen times, and the
-    refiners do again. It takes a tenth of a second on a CPU, and 40 ms on a T4 for a pair of 540 x 720.
+    Computed in float64: the inverse of a covariance amplifies rounding errors about fifteen times, and so do the
+    refiners. For a pair of 540 x 720 it takes 0.1 s on a CPU and 40 ms on a T4.
     """
     x, y = x.double(), y.double()
     norms = (x.norm(dim=2)[:, :, None] * y.norm(dim=2)[:, None]).add_(1e-6)

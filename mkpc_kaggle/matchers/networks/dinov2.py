@@ -1,6 +1,6 @@
 """DINOv2's vision transformer: Oquab et al., "DINOv2: Learning Robust Visual Features without Supervision", 2023.
 
-Without register tokens. Parameter names are those of the public checkpoints. For inference only.
+Without register tokens. Parameter names match the public checkpoints. For inference only.
 """
 
 from dataclasses import dataclass
@@ -15,12 +15,12 @@ from mkpc_kaggle.matchers.networks.layers import Linear
 PATCH = 14  # pixels a side: the stride of the features
 EPSILON = 1e-6  # of the norms
 EXPANSION = 4  # of a perceptron's hidden layer
-OFFSET = 0.1  # added to a grid's sides where positions are resampled, as in training
+OFFSET = 0.1  # added to a grid's sides when positions are resampled, as in training
 
 
 @dataclass(frozen=True)
 class DinoV2Config:
-    """Of ViT-L/14. ``positions``: the side of the stored grid of positional embeddings, in patches."""
+    """Sizes of ViT-L/14. ``positions``: the side of the stored grid of positional embeddings, in patches."""
 
     width: int = 1024
     blocks: int = 24
@@ -36,7 +36,7 @@ class DinoV2(nn.Module):
         self.config = config = config or DinoV2Config()
         self.cls_token = nn.Parameter(torch.zeros(1, 1, config.width))
         self.pos_embed = nn.Parameter(torch.zeros(1, 1 + config.positions**2, config.width))
-        self.mask_token = nn.Parameter(torch.zeros(1, config.width))  # used in training; checkpoints have it
+        self.mask_token = nn.Parameter(torch.zeros(1, config.width))  # for training only; checkpoints have it
         self.patch_embed = PatchEmbedding(config.width)
         self.blocks = nn.ModuleList(
             VitBlock(config.width, config.heads, EPSILON, bias=True, scaled=True) for _ in range(config.blocks)
@@ -45,7 +45,7 @@ class DinoV2(nn.Module):
         self.eval().requires_grad_(False)
 
     def forward(self, image: Tensor) -> Tensor:
-        """(B, 3, 14 h, 14 w), normalised as the network wants it -> (B, C, h, w) float32, channels last."""
+        """Map normalised images (B, 3, 14 h, 14 w) to (B, C, h, w) float32, channels last."""
         patches = as_grid(self.patch_embed(image))  # (B, h, w, C)
         classes = self.cls_token.expand(len(image), -1, -1)
         tokens = torch.cat([classes, patches.flatten(1, 2)], dim=1).add_(self.positions(*patches.shape[1:3]))
@@ -55,10 +55,9 @@ class DinoV2(nn.Module):
         return as_map(normed[:, 1:].reshape(patches.shape))
 
     def positions(self, height: int, width: int) -> Tensor:
-        """What is added to the tokens (1, 1 + h w, C) of a grid of patches, the class token's first.
+        """Return the embedding of tokens (1, 1 + h w, C) of a grid of patches, the class token's first.
 
-        The stored grid is resampled by factors that are a little more than the ratios of the sides, and read where
-        the factors say.
+        The stored grid is resampled by factors slightly above the ratios of the sides, as in training.
         """
         side = self.config.positions
         if (height, width) == (side, side):
@@ -76,7 +75,7 @@ class PatchEmbedding(nn.Module):
         self.proj = nn.Conv2d(3, width, PATCH, PATCH)
 
     def forward(self, image: Tensor) -> Tensor:
-        """(B, 3, 14 h, 14 w) -> (B, C, h, w) float32."""
+        """Map (B, 3, 14 h, 14 w) to (B, C, h, w) float32."""
         patches: Tensor = self.proj(image.to(self.proj.weight.dtype))
         return patches.float()
 
@@ -84,8 +83,8 @@ class PatchEmbedding(nn.Module):
 class VitBlock(nn.Module):
     """Self-attention, then a perceptron, each on normed tokens and added to them (Dosovitskiy et al. 2021, 3.1).
 
-    Sums and norms are float32; what is added to the tokens is computed in the precision of the layers' weights.
-    ``epsilon`` of the norms; ``scaled``: each addition has a factor of its own per channel.
+    Sums and norms are float32; the added terms are computed in the precision of the layers' weights.
+    ``epsilon`` of the norms; ``scaled``: each added term has a learned factor per channel.
     """
 
     def __init__(self, width: int, heads: int, epsilon: float, *, bias: bool, scaled: bool) -> None:
@@ -98,13 +97,13 @@ class VitBlock(nn.Module):
         self.ls2 = Scale(width) if scaled else nn.Identity()
 
     def forward(self, tokens: Tensor) -> Tensor:
-        """(B, n, C) -> (B, n, C), float32."""
+        """Map (B, n, C) to (B, n, C), float32."""
         tokens = tokens + self.ls1(self.attn(self.norm1(tokens)))
         return tokens.add_(self.ls2(self.mlp(self.norm2(tokens))))
 
 
 class VitAttention(nn.Module):
-    """Every token looks at all of them; ``bias`` of queries, keys and values."""
+    """Self-attention of all tokens; ``bias`` of queries, keys and values."""
 
     def __init__(self, width: int, heads: int, bias: bool) -> None:
         super().__init__()
@@ -113,7 +112,7 @@ class VitAttention(nn.Module):
         self.proj = Linear(width, width)
 
     def forward(self, tokens: Tensor) -> Tensor:
-        """(B, n, C) -> (B, n, C) in the weights' precision."""
+        """Map (B, n, C) to (B, n, C) in the weights' precision."""
         projected = self.qkv(tokens.to(self.qkv.weight.dtype))  # (B, n, 3 C): all queries, keys, then values
         split = projected.view(*projected.shape[:2], 3, self.heads, -1).permute(
             2, 0, 3, 1, 4
@@ -130,7 +129,7 @@ class VitPerceptron(nn.Module):
         self.fc2 = Linear(EXPANSION * width, width)
 
     def forward(self, tokens: Tensor) -> Tensor:
-        """(B, n, C) -> (B, n, C) in the weights' precision."""
+        """Map (B, n, C) to (B, n, C) in the weights' precision."""
         out: Tensor = self.fc2(functional.gelu(self.fc1(tokens.to(self.fc1.weight.dtype))))
         return out
 

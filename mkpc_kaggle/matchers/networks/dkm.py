@@ -1,9 +1,9 @@
 """DKM v3: Edstedt et al., "DKM: Dense Kernelized Feature Matching for Geometry Estimation", CVPR 2023.
 
-Every pixel of each image gets a position in the other and a certainty. Images may have any sizes; the published
-code needs the same size for both. Pixels of windows and corrections are the query's.
+Every pixel of each image gets a position in the other image and a certainty. Image sizes may differ; the published
+code needs equal sizes. Windows and corrections are in pixels of the query.
 Coordinates are normalised: (x, y) in [-1, 1], where +-1 are the outer edges of an image (see warp_refiner).
-Parameter names are those of the public checkpoints. For inference only.
+Parameter names match the public checkpoints. For inference only.
 """
 
 import torch
@@ -23,22 +23,22 @@ from mkpc_kaggle.matchers.networks.warp_refiner import SHAPES, WarpEstimate, War
 STRIDES = (32, 16)  # of the coarse decoder
 FEATURES, POSTERIOR, WIDTH = 512, 256, 384  # its channels
 EXPANSION = 4  # of the channels in a bottleneck of ResNet-50
-FINE_COARSEST = 8  # the coarsest stride that the second pass looks at
+FINE_COARSEST = 8  # the coarsest stride of the second pass
 
 
 class DKM(DenseNetwork):
-    """Trained at 540 x 720 (outdoor; second pass 864 x 1152) and 480 x 640 (indoor); worse far from it."""
+    """DKM v3, trained at 540 x 720 (outdoor; second pass 864 x 1152) and 480 x 640 (indoor)."""
 
     def __init__(self) -> None:
         super().__init__()
         self.encoder = DkmEncoder()
         self.decoder: DkmDecoder = DkmDecoder()
-        # Weights that lie channels last make every map so; loading a checkpoint keeps it.
+        # Channels-last weights make all maps channels last; loading a checkpoint keeps that.
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # missing in torch's stubs
         self.eval().requires_grad_(False)
 
     def encode(self, image: Tensor, fine: Tensor | None = None) -> DenseFeatures:
-        """Images of any size."""
+        """Encode images of any size."""
         coarse = self.decoder.projected(self.encoder(image))
         second = None if fine is None else self.encoder(fine, FINE_COARSEST)
         return DenseFeatures(coarse, self.decoder.regress(coarse), second)
@@ -50,7 +50,7 @@ class DkmEncoder(nn.Module):
         self.net = ResNet50()
 
     def forward(self, image: Tensor, coarsest: int = 32) -> Pyramid:
-        """The image (B, 3, H, W) itself and its features at strides 2 to ``coarsest``."""
+        """Return the image (B, 3, H, W) itself and its features at strides 2 to ``coarsest``."""
         image = image.contiguous(memory_format=torch.channels_last)
         features = self.net(image.to(self.net.conv1.weight.dtype), coarsest)
         return Pyramid((image, *features))
@@ -65,17 +65,17 @@ class DkmDecoder(WarpDecoder):
         self.conv_refiner = nn.ModuleDict({str(s): WarpRefiner(shape) for s, shape in SHAPES.items()})
 
     def projected(self, pyramid: Pyramid) -> Pyramid:
-        """The pyramid of all six strides, with 512 channels at 16 and 32."""
+        """Return the pyramid of all six strides, with 512 channels at 16 and 32."""
         *finer, at16, at32 = pyramid.levels
         return Pyramid((*finer, self.proj["16"](at16), self.proj["32"](at32)))
 
     def regress(self, support: Pyramid) -> tuple[Tensor, ...]:
-        """The coefficients of the Gaussian processes, by :data:`STRIDES`."""
+        """Return the coefficients of the Gaussian processes, by :data:`STRIDES`."""
         processes = zip(self.gps.values(), STRIDES, strict=True)
         return tuple(process.regress(support.at(stride)) for process, stride in processes)  # type: ignore[operator]
 
     def coarse_estimate(self, query: DenseFeatures, support: DenseFeatures) -> WarpEstimate:
-        """Of what stride 32 found only the context is used."""
+        """Return the estimate at stride 16; of stride 32 only the context is used."""
         first, second = query.coarse, support.coarse
         batch, _, height, width = first.at(32).shape
         context = first.at(32).new_zeros(batch, WIDTH, height, width)
@@ -92,7 +92,7 @@ class DkmDecoder(WarpDecoder):
 
 
 class EmbeddingDecoder(nn.Module):
-    """Turns the posterior into a first estimate, scale by scale, with a context passed to the next."""
+    """A decoder of the posterior into a first estimate, with a context for the next scale."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -105,7 +105,7 @@ class EmbeddingDecoder(nn.Module):
     def forward(
         self, stride: int, posterior: Tensor, features: Tensor, context: Tensor
     ) -> tuple[WarpEstimate, Tensor]:
-        """Maps (B, 256, h, w), (B, 512, h, w) and (B, 384, h, w) -> the estimate and the next context."""
+        """Map (B, 256, h, w), (B, 512, h, w) and (B, 384, h, w) to the estimate and the next context."""
         at = str(stride)
         own = self.feat_input_modules[at](features)
         embedded = torch.cat([own, posterior.to(own.dtype)], dim=1)  # (B, 512, h, w)
@@ -115,7 +115,7 @@ class EmbeddingDecoder(nn.Module):
 
 
 class ResidualRefinement(nn.Module):
-    """Two 3x3 convolutions beside a shortcut, after a 1x1 one that sets the width."""
+    """Two 3x3 convolutions with a shortcut, after a 1x1 convolution that sets the width."""
 
     def __init__(self, inputs: int) -> None:
         super().__init__()
@@ -125,14 +125,14 @@ class ResidualRefinement(nn.Module):
         self.conv3 = nn.Conv2d(WIDTH, WIDTH, 3, padding=1)
 
     def forward(self, x: Tensor) -> Tensor:
-        """(B, inputs, h, w) -> (B, 384, h, w)."""
+        """Map (B, inputs, h, w) to (B, 384, h, w)."""
         x = self.conv1(x)
         y = self.conv3(torch.relu_(self.bn(self.conv2(x))))
         return torch.relu_(y.add_(x))
 
 
 class ChannelAttention(nn.Module):
-    """Adds the new embedding to the context, with a weight per channel from the means of both."""
+    """The sum of context and weighted embedding; the means of both give a weight per channel."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -140,14 +140,14 @@ class ChannelAttention(nn.Module):
         self.conv2 = nn.Conv2d(WIDTH, WIDTH, 1)
 
     def forward(self, context: Tensor, embedded: Tensor) -> Tensor:
-        """(B, 384, h, w) each -> (B, 384, h, w)."""
+        """Map two maps (B, 384, h, w) to (B, 384, h, w)."""
         means = torch.cat([context, embedded], dim=1).mean(dim=(2, 3), keepdim=True)  # (B, 768, 1, 1)
         weights = self.conv2(self.conv1(means).relu_()).sigmoid_()
         return torch.addcmul(context, weights, embedded)
 
 
 class Bottleneck(nn.Module):
-    """1x1, 3x3 and 1x1 convolutions beside a shortcut, which is a 1x1 convolution where the shape changes.
+    """1x1, 3x3 and 1x1 convolutions with a shortcut, a 1x1 convolution where the shape changes.
 
     Written here because offline installs have no torchvision. The stride sits in the 3x3 convolution.
     """
@@ -168,7 +168,7 @@ class Bottleneck(nn.Module):
             )
 
     def forward(self, x: Tensor) -> Tensor:
-        """(B, inputs, h, w) -> (B, 4 width, ceil(h / stride), ceil(w / stride))."""
+        """Map (B, inputs, h, w) to (B, 4 width, ceil(h / stride), ceil(w / stride))."""
         y = functional.relu_(self.bn1(self.conv1(x)))
         y = functional.relu_(self.bn2(self.conv2(y)))
         return functional.relu_(self.bn3(self.conv3(y)).add_(self.downsample(x)))
@@ -180,7 +180,7 @@ def stage(inputs: int, width: int, blocks: int, stride: int) -> nn.Sequential:
 
 
 class ResNet50(nn.Module):
-    """The classifier is there because checkpoints have it; it is not used."""
+    """ResNet-50. Its classifier is unused and exists for the checkpoints alone."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -193,7 +193,7 @@ class ResNet50(nn.Module):
         self.fc = nn.Linear(2048, 1000)
 
     def forward(self, image: Tensor, coarsest: int = 32) -> tuple[Tensor, ...]:
-        """Features at strides 2, 4, 8, 16 and 32, as far as ``coarsest``, of images (B, 3, H, W) of any size.
+        """Return features at strides 2, 4, 8, 16 and 32, up to ``coarsest``, of images (B, 3, H, W) of any size.
 
         (B, C, h, w) with C = 64, 256, 512, 1024, 2048; every halving of a side rounds up.
         """

@@ -20,7 +20,7 @@ class SemiDenseMatches:
 
     ``points0``, ``points1``: (M, 2) float32 (x, y) in pixels of the network's input, in a frame whose origin is
     the corner of the image: the centre of the top-left pixel is (0.5, 0.5). Points of image 0 lie on the
-    grid of coarse cells; those of image 1 are refined by up to 4 pixels. ``expectation``: (M, 3) offset
+    grid of coarse cells; points of image 1 are refined by up to 4 pixels. ``expectation``: (M, 3) offset
     (x, y) in -1..1 and its standard deviation.
     """
 
@@ -31,7 +31,7 @@ class SemiDenseMatches:
 
 
 class FinePreprocess(nn.Module):
-    """Adds the coarse features of a cell to each entry of its window."""
+    """Windows merged with the coarse features of their cells."""
 
     def __init__(self, coarse: int, fine: int) -> None:
         super().__init__()
@@ -39,19 +39,19 @@ class FinePreprocess(nn.Module):
         self.merge_feat = Linear(2 * fine, fine)
 
     def forward(self, windows: Tensor, context: Tensor) -> Tensor:
-        """Windows (M, 25, fine) and coarse features (M, coarse) -> (M, 25, fine)."""
+        """Map windows (M, 25, fine) and coarse features (M, coarse) to (M, 25, fine)."""
         of_window, of_context = self.merge_feat.weight.chunk(2, dim=1)
         added = linear(self.down_proj(context), of_context, self.merge_feat.bias)  # (M, fine)
         return linear(windows, of_window).add_(added[:, None])
 
 
 def cell_points(cells: Tensor, width: int) -> Tensor:
-    """(M,) cells of a coarse map of ``width`` columns -> (M, 2) float32 (x, y) in pixels."""
+    """Map (M,) cells of a coarse map of ``width`` columns to (M, 2) float32 (x, y) in pixels."""
     return torch.stack([cells % width, cells // width], dim=1).float() * COARSE_STRIDE
 
 
 def cut_windows(fine: Tensor, batch: Tensor, cells: Tensor) -> Tensor:
-    """Fine maps (N, C, Hf, Wf) and M coarse cells -> (M, 25, C) float32: what lies around each, row by row.
+    """Cut (M, 25, C) float32, row by row, around M coarse cells out of fine maps (N, C, Hf, Wf).
 
     A cell's window is centred on the fine cell at its top-left corner; zero outside the map.
     """
@@ -62,14 +62,14 @@ def cut_windows(fine: Tensor, batch: Tensor, cells: Tensor) -> Tensor:
     around = torch.arange(SIDE, device=fine.device) - SIDE // 2
     rows = (cells // coarse_width * step)[:, None, None] + around[:, None]  # (M, 5, 1)
     columns = (cells % coarse_width * step)[:, None, None] + around  # (M, 1, 5)
-    # Centres are at multiples of the step: windows reach beyond the top and the left only.
+    # Centres are at multiples of the step, so windows exceed the map at the top and left only.
     index = (batch[:, None, None] * height + rows.clamp(min=0)) * width + columns.clamp(min=0)  # (M, 5, 5)
     windows = grid.reshape(-1, channels).index_select(0, index.flatten()).float().view(-1, SIDE * SIDE, channels)
     return windows.masked_fill_(((rows < 0) | (columns < 0)).flatten(1)[..., None], 0.0)
 
 
 def expected_offset(windows0: Tensor, windows1: Tensor) -> Tensor:
-    """(M, 25, C) twice -> (M, 3) float32: mean offset (x, y) in -1..1, and its standard deviation.
+    """Map (M, 25, C) twice to (M, 3) float32: mean offset (x, y) in -1..1, and its standard deviation.
 
     The centre of window 0 is compared with all of window 1; the softmax is the distribution of the offset.
     """
@@ -83,5 +83,5 @@ def expected_offset(windows0: Tensor, windows1: Tensor) -> Tensor:
 
 
 def refined_points(coarse1: Tensor, expectation: Tensor) -> Tensor:
-    """Coarse points of image 1 (M, 2) -> refined (M, 2): an offset of one is half a window, two fine cells."""
+    """Move coarse points of image 1 (M, 2): an offset of one is half a window, two fine cells."""
     return coarse1 + expectation[:, :2] * (SIDE // 2 * FINE_STRIDE)

@@ -1,7 +1,7 @@
 """Linear maps, attention, convolutions in strips and mutual matches, fast on CPUs; for inference only.
 
-A weight may be kept in half precision (see ``placement``): the product is then taken in it, and a linear map's
-result has its input's precision again.
+A weight may have half precision (see ``placement``). The product is then computed in half precision, and a linear
+map's result has its input's precision again.
 """
 
 from collections.abc import Callable
@@ -11,17 +11,17 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-STRIP_FLOATS = 2**21  # of a strip of :func:`in_strips`, where it has most channels
-IMAGES = 16  # on one thread PyTorch takes oneDNN's convolution from this batch size on
+STRIP_FLOATS = 2**21  # of a strip of :func:`in_strips`, at its maximum number of channels
+IMAGES = 16  # on one thread PyTorch uses oneDNN's convolution from this batch size on
 
 
 def linear(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
-    """(..., C_in) times ``weight`` (C_out, C_in) plus ``bias`` (C_out,) -> (..., C_out)."""
+    """Multiply (..., C_in) by ``weight`` (C_out, C_in), and add ``bias`` (C_out,): (..., C_out)."""
     if weight.dtype != x.dtype:
         return functional.linear(x.to(weight.dtype), weight, bias).to(x.dtype)
     if x.device.type != "cpu" or weight.dtype != torch.float32 or x.numel() == 0:
         return functional.linear(x, weight, bias)
-    # In float32 a 1x1 convolution by oneDNN: as fast as MKL's matrix product on Intel, twice as fast on AMD.
+    # In float32 oneDNN's 1x1 convolution is as fast as MKL's matrix product on Intel, twice as fast on AMD.
     rows = x.numel() // x.shape[-1]
     images = IMAGES if rows % IMAGES == 0 else 1
     seen = x.reshape(images, 1, rows // images, -1).permute(0, 3, 1, 2)  # channels last
@@ -30,14 +30,14 @@ def linear(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
 
 
 class Linear(nn.Linear):
-    """(..., C_in) -> (..., C_out)."""
+    """A linear map (..., C_in) to (..., C_out)."""
 
     def forward(self, x: Tensor) -> Tensor:
         return linear(x, self.weight, self.bias)
 
 
 class Exact:
-    """Marks layers whose outputs are or select coordinates: they stay in float32 in any precision."""
+    """A mark of layers whose outputs are or select coordinates: they stay float32 in any precision."""
 
 
 class ExactLinear(Exact, Linear):
@@ -53,20 +53,20 @@ class ExactConv2d(Exact, nn.Conv2d):
 
 
 def attention(q: Tensor, k: Tensor, v: Tensor, precision: torch.dtype) -> Tensor:
-    """softmax(q k^T / sqrt(D)) v of (B, heads, L, D) and (B, heads, S, D) twice -> (B, heads, L, D), like ``q``.
+    """Return softmax(q k^T / sqrt(D)) v of (B, heads, L, D) and twice (B, heads, S, D), like ``q``.
 
-    The products are taken in ``precision``, the softmax in float32.
+    Products are computed in ``precision``, the softmax in float32.
     """
     queries, keys, values = (x.to(precision) for x in (q, k, v))
     return functional.scaled_dot_product_attention(queries, keys, values).to(q.dtype)
 
 
 def in_strips(function: Callable[[Tensor], Tensor], x: Tensor, *, reach: int, channels: int) -> Tensor:
-    """``function(x)``, a map (B, C', H, W) from (B, C, H, W), on a CPU by strips of rows that fit its cache.
+    """Return ``function(x)``, (B, C, H, W) to (B, C', H, W), on a CPU by strips of rows that fit its cache.
 
-    A row of the result depends on ``reach`` rows above and below it; ``channels`` are the most that maps inside
-    the function have. The function must not change its argument. Strips overlap by the reach, and the zeros that
-    convolutions add at a strip's edges do not get further.
+    A row of the result depends on ``reach`` rows above and below it. ``channels``: the maximum number of channels
+    inside the function, which must not change its argument. Strips overlap by the reach, so zero padding at their
+    edges has no effect.
     """
     batch, _, height, width = x.shape
     rows = max(4 * reach, STRIP_FLOATS // (batch * channels * width))
@@ -99,7 +99,7 @@ class Assignment:
 
 
 def mutual_matches(log_scores: Tensor, threshold: float) -> Assignment:
-    """Pairs of keypoints that are each other's best in (N0, N1) logarithms, scored above the threshold."""
+    """Return pairs of keypoints that are each other's best in (N0, N1) logarithms, scored above the threshold."""
     (best0, partner0), partner1 = log_scores.max(dim=1), log_scores.argmax(dim=0)  # (N0,) twice, (N1,)
     index0, scores = torch.arange(len(partner0), device=log_scores.device), best0.exp()
     kept = (partner1[partner0] == index0) & (scores > threshold)

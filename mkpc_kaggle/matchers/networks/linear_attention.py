@@ -1,4 +1,4 @@
-"""The transformer with linear attention of LoFTR: its coarse one, and the fine one of its descendants too.
+"""LoFTR's transformer with linear attention: its coarse one, and the fine one of its descendants.
 
 Sources: Sun et al. 2021, section 3.2; Katharopoulos et al. 2020 (linear attention).
 """
@@ -14,7 +14,7 @@ Masks = tuple[Tensor, Tensor]
 
 
 def linear_attention(q: Tensor, k: Tensor, v: Tensor, heads: int, masks: Masks | None = None) -> Tensor:
-    """Queries (N, L, C), keys and values (N, S, C) -> (N, L, C); head h owns channels h C/heads and on.
+    """Map queries (N, L, C), keys, values (N, S, C) to (N, L, C); head h owns channels from h C/heads.
 
     ``masks``: of the queries (N, L) and of the keys (N, S), True at content. A masked query's output is zero, a
     masked key has no effect. ``q`` and ``k`` are overwritten.
@@ -30,7 +30,7 @@ def linear_attention(q: Tensor, k: Tensor, v: Tensor, heads: int, masks: Masks |
 
 
 class EncoderLayer(nn.Module):
-    """Updates tokens from a source: attention, then a multi-layer perceptron on the tokens and the messages."""
+    """An update of tokens from a source: attention, then a perceptron on tokens and messages."""
 
     def __init__(self, width: int, heads: int) -> None:
         super().__init__()
@@ -44,8 +44,8 @@ class EncoderLayer(nn.Module):
         self.norm2 = nn.LayerNorm(width)
 
     def forward(self, x: Tensor, source: Tensor, masks: Masks | None = None) -> Tensor:
-        """Tokens (N, L, C) and source (N, S, C), with their masks (N, L) and (N, S) -> (N, L, C)."""
-        # Cast once, not in each projection.
+        """Map tokens (N, L, C) and source (N, S, C), with their masks (N, L) and (N, S), to (N, L, C)."""
+        # One cast instead of one per projection.
         seen = x.to(self.q_proj.weight.dtype)
         other = seen if source is x else source.to(seen.dtype)
         q, k, v = self.q_proj(seen).float(), self.k_proj(other).float(), self.v_proj(other).float()
@@ -56,9 +56,9 @@ class EncoderLayer(nn.Module):
 
 
 class LinearTransformer(nn.Module):
-    """``cycles`` times a layer of self and one of cross attention; each serves both images.
+    """``cycles`` of a self-attention and a cross-attention layer; each layer serves both images.
 
-    Cross attention runs in sequence: image 1 is updated from the image 0 that was updated just before.
+    Cross attention runs in sequence: image 1 is updated from the updated image 0.
     """
 
     def __init__(self, width: int, heads: int, cycles: int) -> None:
@@ -66,7 +66,7 @@ class LinearTransformer(nn.Module):
         self.layers = nn.ModuleList(EncoderLayer(width, heads) for _ in range(2 * cycles))
 
     def forward(self, x0: Tensor, x1: Tensor, masks: Masks | None = None) -> tuple[Tensor, Tensor]:
-        """(N, L, C) and (N, S, C), with masks (N, L) and (N, S), True at content -> the same shapes."""
+        """Map (N, L, C) and (N, S, C), with masks (N, L) and (N, S), True at content, to the same shapes."""
         own0 = own1 = cross0 = cross1 = None
         if masks is not None:
             mask0, mask1 = masks

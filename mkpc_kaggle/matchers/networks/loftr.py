@@ -9,9 +9,9 @@ from mkpc_kaggle.matchers.networks.semi_dense import HEADS, SemiDenseNetwork
 
 
 class Loftr(SemiDenseNetwork[LinearTransformer]):
-    """Sides are multiples of 8; the two images may differ in size.
+    """LoFTR. Sides are multiples of 8; the two images may differ in size.
 
-    The defaults are those published for ``outdoor_ds``. ``fixed_positions``: True for ``indoor_ds_new`` alone.
+    The defaults were published for ``outdoor_ds``. ``fixed_positions``: True for ``indoor_ds_new`` only.
     """
 
     multiple = 8

@@ -1,7 +1,7 @@
 """LoMa (Nordström et al. 2026, arXiv 2604.04931): DaD keypoints, DeDoDe descriptors, a LightGlue-like matcher.
 
-One public checkpoint has all three; its variants differ in the descriptor and in the matcher's width. For
-inference only.
+One public checkpoint has all three. Variants differ in the descriptor and in the matcher's width. For inference
+only.
 """
 
 from enum import StrEnum
@@ -29,7 +29,7 @@ class Variant(StrEnum):
 # Channels of descriptors and of the matcher.
 WIDTHS = {Variant.B128: (128, 256), Variant.B: (256, 256), Variant.R: (256, 256)}
 WIDTHS |= {Variant.L: (256, 512), Variant.G: (256, 1024)}
-# In checkpoints for training alone: assignments of other layers, matchability, further layers.
+# For training only: assignments of other layers, matchability, further layers.
 UNUSED = rf"matcher\.(log_assignment\.(?!{LAYERS - 1}\.final_proj\.)|transformers\.(?![0-{LAYERS - 1}]\.))"
 
 
@@ -43,23 +43,23 @@ class Loma(nn.Module):
         self.eval().requires_grad_(False)
 
     def encode(self, detected: Tensor, described: Tensor, number: int) -> LomaKeypoints:
-        """At most ``number`` keypoints of one image, strongest first.
+        """Return up to ``number`` keypoints of one image, strongest first.
 
-        It comes in two sizes, (1, 3, H, W) each, RGB in 0..1: as the detector and as the descriptor see it.
+        The image has two sizes, (1, 3, H, W) each, RGB in 0..1: for the detector and for the descriptor.
         """
         (found,) = self.detector(detected, number)
         return LomaKeypoints(found.points, self.descriptor(described, found.points[None])[0])
 
 
 def parameter_name(published: str) -> str:
-    """Our name of a checkpoint's parameter: ``_detector.*``, ``_descriptor.*``; all else is the matcher's."""
+    """Return our name of a checkpoint's parameter: ``_detector.*``, ``_descriptor.*``, or else the matcher's."""
     return published[1:] if published.startswith("_") else f"matcher.{published}"
 
 
 def detector_size(image: Size, long_side: int) -> Size:
-    """What the detector is shown of an image: its longer side ``long_side``, both rounded down to multiples of 8.
+    """Return the detector's input size: the longer side ``long_side``, both rounded down to multiples of 8.
 
-    Computed as when it was trained: where the product falls just below ``long_side``, that side gets 8 less.
+    As in training: if rounding puts the product just below ``long_side``, that side loses 8 pixels.
     """
     scale = long_side / max(image)
     return Size(*(8 * int(scale * side / 8) for side in image))

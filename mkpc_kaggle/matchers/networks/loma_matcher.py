@@ -1,7 +1,7 @@
 """LoMa's matcher (Nordström et al. 2026, arXiv 2604.04931): LightGlue (Lindenberger et al. 2023), all layers.
 
-Inside, the keypoints of both images are in one tensor (1, N, d), N = N0 + N1: only attention tells them apart.
-Parameter names are those of the public checkpoints. For inference only.
+The keypoints of both images share one tensor (1, N, d), N = N0 + N1; only attention separates the images.
+Parameter names match the public checkpoints. For inference only.
 """
 
 from dataclasses import dataclass
@@ -27,20 +27,20 @@ class LomaKeypoints:
 
 
 class RotaryEmbedding(nn.Module):
-    """The rotations of pairs of channels, by angles that are linear in the position of a keypoint."""
+    """Rotations of pairs of channels by angles that are linear in a keypoint's position."""
 
     def __init__(self) -> None:
         super().__init__()
         self.Wr = nn.Linear(2, HEAD // 2, bias=False)
 
     def forward(self, points: Tensor) -> Tensor:
-        """exp(i angle), (1, 1, N, 32) complex64, for points (1, N, 2)."""
+        """Return exp(i angle), (1, 1, N, 32) complex64, for points (1, N, 2)."""
         angles = points @ self.Wr.weight.float().T
         return torch.polar(torch.ones_like(angles), angles)[:, None]
 
 
 def apply_rotary(x: Tensor, rotation: Tensor) -> Tensor:
-    """Pairs of channels of (1, heads, N, 64) rotated by (1, 1, N, 32)."""
+    """Rotate pairs of channels of (1, heads, N, 64) by (1, 1, N, 32)."""
     pairs = torch.view_as_complex(x.view(*x.shape[:3], -1, 2))
     return torch.view_as_real(pairs * rotation).flatten(3)
 
@@ -64,7 +64,7 @@ class LomaSelfAttention(nn.Module):
         self.ffn = LomaUpdate(width)
 
     def forward(self, x: Tensor, n0: int, rotation: Tensor) -> Tensor:
-        """(1, N, d) -> (1, N, d); the first ``n0`` of the N keypoints are image 0's."""
+        """Map (1, N, d) to (1, N, d); the first ``n0`` of the N keypoints are image 0's."""
         projected = self.Wqkv(x).view(*x.shape[:2], -1, HEAD, 3).transpose(1, 2)  # (1, heads, N, 64, 3)
         q, k, v = (part.contiguous() for part in projected.unbind(4))
         q, k = apply_rotary(q, rotation), apply_rotary(k, rotation)
@@ -75,7 +75,7 @@ class LomaSelfAttention(nn.Module):
 
 
 class LomaCrossAttention(nn.Module):
-    """Messages from the keypoints of the other image, both ways from the features before it."""
+    """Messages between the keypoints of both images, computed from the same input features."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -85,7 +85,7 @@ class LomaCrossAttention(nn.Module):
         self.ffn = LomaUpdate(width)
 
     def forward(self, x: Tensor, n0: int) -> Tensor:
-        """As :class:`LomaSelfAttention`'s."""
+        """Map as :class:`LomaSelfAttention` does."""
         qk, v = (layer(x).view(*x.shape[:2], -1, HEAD).transpose(1, 2) for layer in (self.to_qk, self.to_v))
         (qk0, qk1), (v0, v1) = ((part[:, :, :n0], part[:, :, n0:]) for part in (qk, v))
         precision = self.to_out.weight.dtype
@@ -94,7 +94,7 @@ class LomaCrossAttention(nn.Module):
 
 
 def updated(x: Tensor, outputs: list[Tensor], out: Linear, ffn: LomaUpdate) -> Tensor:
-    """Features (1, N, d) updated by the attention outputs (1, heads, Ni, 64) of both images."""
+    """Update features (1, N, d) by the attention outputs (1, heads, Ni, 64) of both images."""
     output = torch.cat([each.transpose(1, 2) for each in outputs], dim=1).flatten(2)  # (1, N, d)
     change: Tensor = ffn(torch.cat([x, out(output)], dim=2))
     return x + change
@@ -112,8 +112,8 @@ class LomaLayer(nn.Module):
 
 
 class LomaMatcher(nn.Module):
-    """``descriptor`` channels come in, ``width`` are worked with. Of a checkpoint's assignments only the last
-    layer's is used.
+    """A matcher of ``descriptor`` input channels and ``width`` inner channels. Of a checkpoint's assignments only
+    the last layer's is used.
     """
 
     def __init__(self, descriptor: int, width: int) -> None:
@@ -125,7 +125,7 @@ class LomaMatcher(nn.Module):
         self.eval().requires_grad_(False)
 
     def forward(self, image0: LomaKeypoints, image1: LomaKeypoints, threshold: float) -> Assignment:
-        """Mutual matches scored above the threshold; no keypoints give no matches."""
+        """Return mutual matches scored above the threshold; no keypoints give no matches."""
         n0, n1 = len(image0.points), len(image1.points)
         if n0 == 0 or n1 == 0:
             return Assignment.empty(image0.points.device)
@@ -134,7 +134,7 @@ class LomaMatcher(nn.Module):
         return mutual_matches(log_scores(similarity)[0], threshold)
 
     def features(self, image0: LomaKeypoints, image1: LomaKeypoints) -> Tensor:
-        """(1, N0 + N1, d) after all layers."""
+        """Return (1, N0 + N1, d) after all layers."""
         rotation = self.posenc(torch.cat([image0.points, image1.points])[None])
         x: Tensor = self.input_proj(torch.cat([image0.descriptors, image1.descriptors])[None])
         for layer in self.transformers:
@@ -142,7 +142,7 @@ class LomaMatcher(nn.Module):
         return x
 
     def similarity(self, features: Tensor, n0: int) -> Tensor:
-        """(1, N0, N1)."""
+        """Return (1, N0, N1)."""
         projected = self.log_assignment.get_submodule(f"{LAYERS - 1}.final_proj")(features)
         scaled = projected / features.shape[2] ** 0.25
         similarity: Tensor = scaled[:, :n0] @ scaled[:, n0:].mT
@@ -150,5 +150,5 @@ class LomaMatcher(nn.Module):
 
 
 def log_scores(similarity: Tensor) -> Tensor:
-    """Logarithm of the product of the softmax over either image's keypoints, (1, N0, N1)."""
+    """Return the logarithm of the product of the softmax over either image's keypoints, (1, N0, N1)."""
     return similarity.log_softmax(dim=1).add_(similarity.log_softmax(dim=2))

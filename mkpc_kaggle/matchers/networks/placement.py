@@ -1,4 +1,4 @@
-"""Prepares a loaded network for inference: batch norms folded, on its device, in its precision."""
+"""Preparation of a loaded network for inference: batch norms, device and precision."""
 
 from itertools import pairwise
 from typing import TypeVar
@@ -17,10 +17,10 @@ Layer = nn.Linear | nn.Conv1d | nn.Conv2d
 
 
 def prepared(network: Network, placement: Placement) -> Network:
-    """The network, changed in place; checkpoints cannot be loaded afterwards.
+    """Prepare the network in place, and return it; checkpoints cannot be loaded afterwards.
 
-    The weights of convolutions and linear layers, :class:`Exact` ones apart, get the placement's precision, and
-    with them the maps between convolutions. All else stays float32: what transformers add up, softmax, transport,
+    The weights of convolutions and linear layers, except :class:`Exact` ones, get the placement's precision, and
+    so do the maps between convolutions. All else stays float32: sums of transformers, softmax, transport,
     coordinates.
     """
     fold_norms(network)
@@ -32,7 +32,7 @@ def prepared(network: Network, placement: Placement) -> Network:
 
 
 def fold_norms(network: nn.Module) -> None:
-    """Every batch norm goes into the convolution before it; computed in float64, rounded once."""
+    """Fold every batch norm into the convolution before it; computed in float64, rounded once."""
     for parent in list(network.modules()):
         for (conv_name, conv), (norm_name, norm) in pairwise(list(parent.named_children())):
             if isinstance(norm, Norm):
@@ -43,7 +43,7 @@ def fold_norms(network: nn.Module) -> None:
 
 
 def autocast(placement: Placement) -> torch.autocast:
-    """For networks that are not ours: PyTorch decides what runs in half precision."""
+    """Return an autocast for networks of libraries: PyTorch decides which operators run in half precision."""
     enabled = placement.precision is not Precision.FLOAT32
     return torch.autocast(torch.device(placement.device).type, dtype_of(placement), enabled)
 

@@ -9,8 +9,8 @@ from mkpc_kaggle.matchers.networks.grids import as_grid
 
 CHANNELS = 256
 
-# Decay of the frequencies. LoFTR's first checkpoints were trained with an encoding whose floor division makes
-# the exponent -1, so that all but the first frequencies vanish; later ones have the intended decay.
+# Decay of the frequencies. In the encoding of LoFTR's first checkpoints a floor division makes the exponent -1,
+# so that all but the first frequencies vanish. Later checkpoints have the intended decay.
 ORIGINAL_DECAY = 1.0
 FIXED_DECAY = math.log(10000.0) / (CHANNELS // 2)
 
@@ -22,7 +22,7 @@ def sine_positions(
     scale: tuple[float, float] = (1.0, 1.0),
     device: torch.device | None = None,
 ) -> Tensor:
-    """(height, width, 256) float32: for g = 0..63 the sine and cosine of x w_g, then of y w_g.
+    """Return (height, width, 256) float32: for g = 0..63 sine and cosine of x w_g, then of y w_g.
 
     w_g = exp(-2 g decay); x and y are the column and row counted from one, times ``scale`` (y, x).
     """
@@ -33,14 +33,14 @@ def sine_positions(
 
 
 def with_positions(coarse: Tensor, decay: float) -> Tensor:
-    """A coarse map (N, 256, h, w) -> the grid (N, h, w, 256), contiguous, with its positions added."""
+    """Map a coarse map (N, 256, h, w) to the grid (N, h, w, 256), contiguous, with its positions added."""
     grid = as_grid(coarse)
     _, height, width, _ = grid.shape
     return (grid + sine_positions(height, width, decay, device=grid.device)).contiguous()
 
 
 def _waves(length: int, scale: float, frequency: Tensor) -> Tensor:
-    """(length, 64, 2): sine and cosine at each position of one axis."""
+    """Return (length, 64, 2): sine and cosine at each position of one axis."""
     positions = torch.arange(1, length + 1, dtype=torch.float32, device=frequency.device) * scale
     angles = positions[:, None] * frequency
     return torch.stack([angles.sin(), angles.cos()], dim=-1)

@@ -31,7 +31,7 @@ HIDDEN = 4 * TOP
 
 @dataclass(frozen=True, eq=False)
 class Attended:
-    """One level's answer for P query cells of G queries each: ``message`` (B, P, G, D), and ``kept`` (B, P, G, K)
+    """One level's result for P query cells of G queries each: ``message`` (B, P, G, D), and ``kept`` (B, P, G, K)
     int64, the key cells (row by row over the level's map) with the highest attention; None at the last level.
     """
 
@@ -40,17 +40,17 @@ class Attended:
 
 
 def attend(q: Tensor, k: Tensor, v: Tensor, keep: int | None) -> Attended:
-    """Queries (B, P, G, D), each group's keys and values (B, P, S, D); ``kept`` are indices into S."""
+    """Attend from queries (B, P, G, D) to each group's keys and values (B, P, S, D); ``kept`` index S."""
     logits = (q * q.shape[-1] ** -0.5) @ k.transpose(-1, -2)  # (B, P, G, S)
     kept = None if keep is None else logits.topk(min(keep, logits.shape[-1]), dim=-1, sorted=False).indices
     return Attended(logits.softmax(dim=-1) @ v, kept)
 
 
 def attend_children(q: Tensor, k: Tensor, v: Tensor, parents: Tensor, keep: int | None) -> Attended:
-    """A finer level: maps (B, h, w, D) of queries, and (B, h_key, w_key, D) of keys and values.
+    """Attend at a finer level: maps (B, h, w, D) of queries, and (B, h_key, w_key, D) of keys and values.
 
-    ``parents``: (B, h w / 4, K) int64, for each 2x2 cell of queries the key cells of the level above whose
-    children it sees. Children of one parent lie together, so that they are gathered in one read.
+    ``parents``: (B, h w / 4, K) int64, the key cells of the level above whose children a 2x2 cell of queries
+    attends to. Children of one parent are adjacent in memory, for one read.
     """
     w_key = k.shape[2]
     candidates = partial(_children_of, parents=parents)
@@ -64,7 +64,7 @@ def attend_children(q: Tensor, k: Tensor, v: Tensor, parents: Tensor, keep: int 
 
 
 def _children_of(cells: Tensor, parents: Tensor) -> Tensor:
-    """Cells (B, S, 4, D) gathered by ``parents`` (B, P, K) -> (B, P, 4 K, D), parent by parent."""
+    """Gather cells (B, S, 4, D) by ``parents`` (B, P, K): (B, P, 4 K, D), parent by parent."""
     batch, count, four, width = cells.shape
     offset = torch.arange(batch, device=cells.device)[:, None, None] * count
     found = cells.reshape(-1, four * width).index_select(0, (parents + offset).flatten())
@@ -72,10 +72,10 @@ def _children_of(cells: Tensor, parents: Tensor) -> Tensor:
 
 
 def quadtree_attention(q: Tensor, k: Tensor, v: Tensor, shares: Tensor, topks: tuple[int, int]) -> Tensor:
-    """Queries (B, h, w, D), keys and values (B, h_key, w_key, D), one head each -> messages (B, h, w, D).
+    """Map queries (B, h, w, D), keys and values (B, h_key, w_key, D), one head each, to messages (B, h, w, D).
 
-    Sides are multiples of 4. The coarsest of three levels of mean pooling attends to all key cells; each next
-    one to the children of the ``topks`` best that its parent found. ``shares`` (3,): of the levels' messages.
+    Sides are multiples of 4. The coarsest of three levels of mean pooling attends to all key cells. A next level
+    attends to the children of its parent's ``topks`` best cells. ``shares`` (3,): weights of the levels' messages.
     """
     (q0, k0, v0), (q1, k1, v1) = ([mean_pool(x, factor) for x in (q, k, v)] for factor in (4, 2))
     batch, h0, w0, width = q0.shape
@@ -84,7 +84,7 @@ def quadtree_attention(q: Tensor, k: Tensor, v: Tensor, shares: Tensor, topks: t
     middle = attend_children(q1, k1, v1, dense.kept[:, 0], topks[1])
     assert middle.kept is not None
     fine = attend_children(q, k, v, from_2x2_blocks(middle.kept, 2 * h0, 2 * w0).flatten(1, 2), None)
-    # A cell's children inherit its message: in 2x2 blocks that is broadcasting.
+    # A cell's children inherit its message: broadcasting over 2x2 blocks.
     coarse = dense.message[:, 0, :, None] * shares[0]  # (B, h0 w0, 1, D)
     merged = from_2x2_blocks(coarse + middle.message * shares[1], 2 * h0, 2 * w0)  # (B, 2 h0, 2 w0, D)
     return from_2x2_blocks(fine.message * shares[2] + merged.flatten(1, 2)[:, :, None], 4 * h0, 4 * w0)
@@ -112,13 +112,13 @@ class QuadtreeAttention(nn.Module):
         self.proj = Linear(width, width)
 
     def forward(self, x: Tensor, source: Tensor) -> Tensor:
-        """Grids (N, h, w, C) and (N, h_source, w_source, C) -> (N, h, w, C)."""
+        """Map grids (N, h, w, C) and (N, h_source, w_source, C) to (N, h, w, C)."""
         q, k, v = (
             self._by_head(pointwise(layer, grid))
             for layer, grid in ((self.q_proj, x), (self.k_proj, source), (self.v_proj, source))
         )  # (N heads, h, w, D)
         shares = self.py_att.weight.softmax(dim=0)
-        # One head at a time keeps the gathered keys in a CPU's cache; a GPU is fastest with all at once.
+        # On a CPU head by head, so that gathered keys fit the cache; on a GPU all at once.
         at_once = 1 if x.device.type == "cpu" else len(q)
         parts = zip(*(torch.split(y, at_once) for y in (q, k, v)), strict=True)
         message = torch.cat([quadtree_attention(q, k, v, shares, self.topks) for q, k, v in parts])
@@ -127,7 +127,7 @@ class QuadtreeAttention(nn.Module):
         return out
 
     def _by_head(self, grid: Tensor) -> Tensor:
-        """(N, h, w, C) -> (N heads, h, w, D), contiguous."""
+        """Map (N, h, w, C) to (N heads, h, w, D), contiguous."""
         return grid.view(*grid.shape[:3], self.heads, -1).permute(0, 3, 1, 2, 4).flatten(0, 1)
 
 
@@ -143,7 +143,7 @@ class DepthwiseConvolution(nn.Module):
 
 
 class ConvolutionalMlp(nn.Module):
-    """A multi-layer perceptron that sees the neighbours of a cell."""
+    """A perceptron with a depthwise convolution over neighbouring cells."""
 
     def __init__(self, width: int, hidden: int) -> None:
         super().__init__()
@@ -152,14 +152,14 @@ class ConvolutionalMlp(nn.Module):
         self.fc2 = Linear(hidden, width)
 
     def forward(self, grid: Tensor) -> Tensor:
-        """(N, h, w, C) -> (N, h, w, C)."""
+        """Map (N, h, w, C) to (N, h, w, C)."""
         hidden = functional.relu_(self.fc1(grid.to(self.fc1.weight.dtype)))  # (N, h, w, hidden)
         out: Tensor = self.fc2(functional.gelu(self.dwconv(hidden)))
         return out.to(grid.dtype)
 
 
 class QuadtreeLayer(nn.Module):
-    """Updates a grid from a source, both normalised beforehand."""
+    """An update of a grid from a source, both normalised first."""
 
     def __init__(self, width: int, heads: int, topks: tuple[int, int]) -> None:
         super().__init__()
@@ -169,7 +169,7 @@ class QuadtreeLayer(nn.Module):
         self.mlp = ConvolutionalMlp(width, HIDDEN)
 
     def forward(self, x: Tensor, source: Tensor) -> Tensor:
-        """Grids (N, h, w, C) and (N, h_source, w_source, C) -> (N, h, w, C)."""
+        """Map grids (N, h, w, C) and (N, h_source, w_source, C) to (N, h, w, C)."""
         own = self.norm1(x)
         attended = x + self.attn(own, own if source is x else self.norm1(source))
         out: Tensor = attended + self.mlp(self.norm2(attended))
@@ -191,10 +191,10 @@ class QuadtreeTransformer(nn.Module):
 
 
 class Quadtree(SemiDenseNetwork[QuadtreeTransformer]):
-    """Sides are multiples of 32. The published code needs two images of one size; the weights do not.
+    """LoFTR with quadtree attention. Sides are multiples of 32. The published code needs two images of one size.
 
-    ``topks``: how many key cells each level keeps for the next, coarsest first. The defaults are those published
-    for outdoors. Masks act in the matching of coarse cells alone, as published: attention sees the padding.
+    ``topks``: the number of key cells that each level keeps for the next, coarsest first. The defaults were
+    published for outdoors. As published, masks apply to the matching of coarse cells only, not to attention.
     """
 
     multiple = 32

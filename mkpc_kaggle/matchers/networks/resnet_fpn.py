@@ -1,4 +1,4 @@
-"""The ResNet with a feature pyramid of LoFTR and its descendants: maps at 1/8 and at 1/2 of the image.
+"""ResNet with a feature pyramid, of LoFTR and its descendants: maps at 1/8 and 1/2 of the image size.
 
 Source: Sun et al. 2021 (LoFTR), section 3.1; layer names as in the public checkpoints.
 """
@@ -14,7 +14,7 @@ STEM, MIDDLE, TOP, FINE = 128, 196, 256, 128  # channels at 1/2, 1/4 and 1/8, an
 
 @dataclass(frozen=True, eq=False)
 class FeatureMaps:
-    """Of B images of H x W pixels: ``coarse`` (B, 256, H/8, W/8) and ``fine`` (B, 128, H/2, W/2).
+    """Maps of B images of H x W pixels: ``coarse`` (B, 256, H/8, W/8) and ``fine`` (B, 128, H/2, W/2).
 
     In the precision of the backbone's weights.
     """
@@ -24,7 +24,7 @@ class FeatureMaps:
 
 
 class ResidualBlock(nn.Module):
-    """Two 3x3 convolutions beside a shortcut, which is a strided 1x1 convolution where the size changes."""
+    """Two 3x3 convolutions with a shortcut, a strided 1x1 convolution where the size changes."""
 
     def __init__(self, inputs: int, outputs: int, stride: int = 1) -> None:
         super().__init__()
@@ -39,13 +39,13 @@ class ResidualBlock(nn.Module):
             )
 
     def forward(self, x: Tensor) -> Tensor:
-        """(B, inputs, h, w) -> (B, outputs, h / stride, w / stride)."""
+        """Map (B, inputs, h, w) to (B, outputs, h / stride, w / stride)."""
         y = functional.relu_(self.bn1(self.conv1(x)))
         return functional.relu_(self.bn2(self.conv2(y)).add_(self.downsample(x)))
 
 
 def smoothing(inputs: int, outputs: int) -> nn.Sequential:
-    """The convolutions after two levels of the pyramid are merged."""
+    """Return the convolutions after two levels of the pyramid are merged."""
     return nn.Sequential(
         nn.Conv2d(inputs, inputs, 3, padding=1, bias=False),
         nn.BatchNorm2d(inputs),

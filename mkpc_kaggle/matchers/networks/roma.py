@@ -1,9 +1,9 @@
 """RoMa: Edstedt et al., "RoMa: Robust Dense Feature Matching", CVPR 2024.
 
-Like DKM with other features: the coarse ones are DINOv2's, of patches of 14 x 14 pixels, though their stride is
-named 16 in the checkpoints and taken for 16 pixels where displacements are measured. Images may have any sizes.
+DKM with other features. The coarse ones are DINOv2's, of patches of 14 x 14 pixels. Checkpoints call their stride
+16, and displacements count them as 16 pixels. Image sizes may differ.
 Coordinates are normalised: (x, y) in [-1, 1], where +-1 are the outer edges of an image (see warp_refiner).
-Parameter names are those of the public checkpoints, DINOv2's under the prefix "dinov2.". For inference only.
+Parameter names match the public checkpoints, DINOv2's under the prefix "dinov2.". For inference only.
 """
 
 from collections.abc import Mapping, Sequence
@@ -39,7 +39,7 @@ COARSEST = 16
 REFINERS = SHAPES | {1: WarpRefinerShape(9, 6, None, 24)}
 DISPLACEMENT, TRAINED_SIDE = 1.25, 560  # the factor of displacements in a square of this side
 
-SIDE = 64  # of the grid of anchors, whatever the images' shape
+SIDE = 64  # of the grid of anchors, for any image shape
 EPSILON = 1e-5  # of the norms
 
 
@@ -54,7 +54,7 @@ class RomaConfig:
 
 
 class RoMa(DenseNetwork):
-    """Trained at 560 x 560, with a second pass at 864 x 864."""
+    """RoMa, trained at 560 x 560, with a second pass at 864 x 864."""
 
     def __init__(self, config: RomaConfig | None = None) -> None:
         super().__init__()
@@ -65,7 +65,7 @@ class RoMa(DenseNetwork):
         self.eval().requires_grad_(False)
 
     def encode(self, image: Tensor, fine: Tensor | None = None) -> DenseFeatures:
-        """Sides of images are multiples of 14, those of larger ones for a second pass at least 8."""
+        """Encode images with sides that are multiples of 14; sides for a second pass are at least 8."""
         vgg = self.encoder["cnn"]
         coarse = self.decoder.projected([*vgg(image), self.dinov2(image)])
         coefficients = self.decoder.process.regress(coarse.at(COARSEST))
@@ -85,7 +85,7 @@ class RomaDecoder(WarpDecoder):
         self.conv_refiner = nn.ModuleDict({str(s): WarpRefiner(shape) for s, shape in config.refiners.items()})
 
     def projected(self, levels: Sequence[Tensor]) -> Pyramid:
-        """Features at strides 1, 2, 4, ... as all that follows looks at them."""
+        """Return features at strides 1, 2, 4, ..., projected for all later steps."""
         return Pyramid(tuple(self.proj[str(2**i)](features) for i, features in enumerate(levels)))
 
     @property
@@ -103,18 +103,18 @@ class RomaDecoder(WarpDecoder):
         size = query.at(1).shape[2:]
         refiner = self.conv_refiner[str(stride)]
         corrections = refiner(query.at(stride), support.at(stride), estimate.flow, stretch(size))
-        # In this network the certainty's comes last.
+        # In this network the certainty's correction comes last.
         return refined(estimate, corrections.roll(1, dims=1), stride, size)
 
 
 class Projection(nn.Sequential):
-    """To the channels that the decoder compares."""
+    """A projection to the channels that the decoder compares."""
 
     def __init__(self, inputs: int, outputs: int) -> None:
         super().__init__(nn.Conv2d(inputs, outputs, 1), nn.BatchNorm2d(outputs))
 
     def forward(self, features: Tensor) -> Tensor:
-        """(B, C, h, w) -> (B, C', h, w), both channels last."""
+        """Map (B, C, h, w) to (B, C', h, w), both channels last."""
         mix, norm = self
         assert isinstance(mix, nn.Conv2d)
         projected: Tensor = norm(by_rows(mix, features.to(mix.weight.dtype)))
@@ -122,12 +122,12 @@ class Projection(nn.Sequential):
 
 
 def stretch(size: torch.Size) -> float:
-    """The factor of displacements in an image (H, W): their scale in pixels is about the same at any size."""
+    """Return the factor of displacements in an image (H, W), which keeps their scale in pixels at any size."""
     return DISPLACEMENT * sqrt(size.numel()) / TRAINED_SIDE
 
 
 class AnchorDecoder(nn.Module):
-    """A transformer without positions; those are in the posterior."""
+    """A transformer without position encoding; the posterior contains positions."""
 
     def __init__(self, width: int, blocks: int, heads: int) -> None:
         super().__init__()
@@ -137,7 +137,7 @@ class AnchorDecoder(nn.Module):
         self.to_out = ExactLinear(width, SIDE**2 + 1)
 
     def forward(self, posterior: Tensor, features: Tensor) -> WarpEstimate:
-        """Maps (B, C, h, w) and (B, C', h, w) of the query, C + C' the width -> the first estimate."""
+        """Map the query's maps (B, C, h, w) and (B, C', h, w), C + C' the width, to the first estimate."""
         x = torch.cat([tokens(posterior), tokens(features)], dim=2)  # (B, h w, C + C')
         for block in self.blocks:
             x = block(x)
@@ -148,10 +148,10 @@ class AnchorDecoder(nn.Module):
 
 
 def anchor_mean(logits: Tensor) -> Tensor:
-    """The mean position (..., 2) of the most likely anchor of (..., 4096) and its four neighbours, by probability.
+    """Return the mean position (..., 2) of the best anchor of (..., 4096) and its four neighbours.
 
-    As in training, neighbours are next in a row or 64 away, also across the ends of rows; those before the first
-    anchor or after the last count as that one.
+    As in training, neighbours are 1 or 64 indices away, also across the ends of rows, and clamped to the first and
+    last anchor. Weights are probabilities.
     """
     best = logits.argmax(dim=-1, keepdim=True)
     offsets = torch.tensor([-1, 0, 1, -SIDE, SIDE], device=logits.device)

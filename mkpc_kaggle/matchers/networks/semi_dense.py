@@ -1,4 +1,4 @@
-"""The network that LoFTR, QuadTree and ASpanFormer share: all but their coarse transformers.
+"""The shared parts of LoFTR, QuadTree and ASpanFormer: all except their coarse transformers.
 
 Backbone, coarse transformer, dual softmax of all pairs of coarse cells, refinement in fine windows.
 """
@@ -30,7 +30,7 @@ Transformer = TypeVar("Transformer", bound=nn.Module)
 
 
 class SemiDenseNetwork(nn.Module, ABC, Generic[Transformer]):
-    """For inference only: in evaluation mode, and no parameter asks for gradients.
+    """A semi-dense network for inference only: in evaluation mode, without gradients.
 
     ``multiple``: both sides of an image must be multiples of it. ``threshold``: a match's confidence is above it.
     ``border``: coarse cells along the border of an image that get no match.
@@ -50,15 +50,15 @@ class SemiDenseNetwork(nn.Module, ABC, Generic[Transformer]):
 
     @property
     def similarity_scale(self) -> float | Tensor:
-        """The factor of the dot product of two coarse features before the dual softmax."""
+        """Factor of the dot product of two coarse features before the dual softmax."""
         return 1 / (TOP * TEMPERATURE)
 
     @abstractmethod
     def transform(self, coarse0: Tensor, coarse1: Tensor, masks: Masks | None = None) -> tuple[Tensor, Tensor]:
-        """The coarse transformer: maps (N, 256, h, w) of both images -> grids (N, h, w, 256)."""
+        """Transform the coarse maps (N, 256, h, w) of both images to grids (N, h, w, 256)."""
 
     def encode(self, image: Tensor) -> FeatureMaps:
-        """Gray images (B, 1, H, W), float32 in [0, 1]; ValueError where a side is no multiple of the network's."""
+        """Encode gray images (B, 1, H, W), float32 in [0, 1]; ValueError unless ``multiple`` divides sides."""
         height, width = image.shape[2:]
         if height % self.multiple or width % self.multiple or height * width == 0:
             raise ValueError(f"sides of an image must be multiples of {self.multiple}, not {height} x {width}")
@@ -69,7 +69,7 @@ class SemiDenseNetwork(nn.Module, ABC, Generic[Transformer]):
     def match(
         self, features0: FeatureMaps, features1: FeatureMaps, masks: Masks | None = None
     ) -> SemiDenseMatches:
-        """Matches of B pairs; ``masks``: (B, H/8, W/8) bool of each image, True at its content at the top left."""
+        """Match B pairs; ``masks``: (B, H/8, W/8) bool of each image, True at its content at the top left."""
         grid0, grid1 = self.transform(features0.coarse, features1.coarse, masks)
         check_finite("coarse features", grid0, grid1)
         coarse = coarse_matches(grid0, grid1, self.similarity_scale, self.threshold, self.border, masks)
@@ -80,7 +80,7 @@ class SemiDenseNetwork(nn.Module, ABC, Generic[Transformer]):
         return SemiDenseMatches(coarse, points0, refined_points(points1, expectation), expectation)
 
     def refine(self, coarse: CoarseMatches, fine0: Tensor, fine1: Tensor, grid0: Tensor, grid1: Tensor) -> Tensor:
-        """(M, 3): the offset of each match from the corner of its coarse cell in image 1, see fine_matching."""
+        """Return (M, 3): the offset of each match from its coarse cell's corner in image 1, see fine_matching."""
         indices = (coarse.batch, coarse.cell0, coarse.cell1)
         found = []
         for batch, cell0, cell1 in zip(*(torch.split(x, WINDOWS_AT_ONCE) for x in indices), strict=True):

@@ -1,8 +1,8 @@
 """SuperGlue (Sarlin et al. 2020, arXiv 1911.11763): matches of two sets of keypoints with descriptors.
 
-Parameter names are those of ``superglue_outdoor.pth`` and ``superglue_indoor.pth``, which load strictly; their
-terms (noncommercial research) apply to every use. Inside, the keypoints of both images are in one tensor
-(1, N, 256), N = N0 + N1: all layers act on rows, and only attention separates the images.
+Parameter names match ``superglue_outdoor.pth`` and ``superglue_indoor.pth``; their terms (noncommercial research)
+apply to every use. The keypoints of both images share one tensor (1, N, 256), N = N0 + N1: all layers act on rows,
+and only attention separates the images.
 """
 
 import math
@@ -34,7 +34,7 @@ class Pointwise(nn.Conv1d):
 
 
 def pointwise_network(*channels: int) -> nn.Sequential:
-    """Linear maps between these numbers of channels, batch norm and ReLU between them; acts on (rows, C)."""
+    """Make linear maps between these numbers of channels, batch norm and ReLU between them, for (rows, C)."""
     steps: list[nn.Module] = []
     for width_in, width_out in pairwise(channels[:-1]):
         steps += [Pointwise(width_in, width_out), nn.BatchNorm1d(width_out), nn.ReLU(inplace=True)]
@@ -42,7 +42,7 @@ def pointwise_network(*channels: int) -> nn.Sequential:
 
 
 class PositionEncoder(nn.Module):
-    """(1, N, 256) from the positions of keypoints, (1, N, 3): normalised x and y, score."""
+    """An encoder of keypoints (1, N, 3), normalised x and y and score, as (1, N, 256)."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -53,7 +53,7 @@ class PositionEncoder(nn.Module):
 
 
 class SuperGlueAttention(nn.Module):
-    """Four heads of 64 channels. In the checkpoint channel c belongs to head ``c mod 4``."""
+    """Attention with four heads of 64 channels. In the checkpoint channel c belongs to head ``c mod 4``."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -61,11 +61,11 @@ class SuperGlueAttention(nn.Module):
         self.merge = Pointwise(CHANNELS, CHANNELS)
 
     def forward(self, x: Tensor, n0: int, *, cross: bool) -> Tensor:
-        """Messages (1, N, 256) to the keypoints ``x`` (1, N, 256), of which the first ``n0`` are image 0's.
+        """Return messages (1, N, 256) to the keypoints ``x`` (1, N, 256); the first ``n0`` are image 0's.
 
-        They come from the keypoints of the same image, or of the other one with ``cross``.
+        The sources are keypoints of the same image, or of the other one with ``cross``.
         """
-        # Reordering the weights' channels by head costs less than reordering those of all keypoints.
+        # Reordering channels by head costs less in the weights than in all keypoints.
         maps = cast("Iterable[nn.Conv1d]", self.proj)
         weight = torch.cat([_by_head(each.weight[:, :, 0]) for each in maps])  # (768, 256)
         bias = torch.cat([_by_head(each.get_parameter("bias")) for each in maps])
@@ -82,7 +82,7 @@ class SuperGlueAttention(nn.Module):
 
 
 class SuperGlueLayer(nn.Module):
-    """One layer of the graph network: messages from other keypoints update a keypoint's features."""
+    """A layer of the graph network, which updates keypoints by messages from other keypoints."""
 
     def __init__(self, *, cross: bool) -> None:
         super().__init__()
@@ -91,7 +91,7 @@ class SuperGlueLayer(nn.Module):
         self.mlp = pointwise_network(2 * CHANNELS, 2 * CHANNELS, CHANNELS)
 
     def message(self, x: Tensor, n0: int) -> Tensor:
-        """The messages (1, N, 256) to the keypoints ``x`` (1, N, 256), the first ``n0`` of them image 0's."""
+        """Return messages (1, N, 256) to the keypoints ``x`` (1, N, 256); the first ``n0`` are image 0's."""
         message: Tensor = self.attn(x, n0, cross=self.cross)
         return message
 
@@ -105,7 +105,7 @@ class SuperGlueLayer(nn.Module):
 class SuperGlue(nn.Module):
     """Keypoint encoder, graph network, optimal transport; for inference only.
 
-    The published numbers have 20 ``sinkhorn_iterations``. Scores of matches are above ``match_threshold``.
+    Published results use 20 ``sinkhorn_iterations``. Scores of matches are above ``match_threshold``.
     """
 
     def __init__(self, sinkhorn_iterations: int = 100, match_threshold: float = 0.2) -> None:
@@ -120,7 +120,7 @@ class SuperGlue(nn.Module):
         self.eval().requires_grad_(False)
 
     def forward(self, image0: SuperPointKeypoints, image1: SuperPointKeypoints) -> Assignment:
-        """The matches of the keypoints of both images; no keypoints give no matches."""
+        """Match the keypoints of both images; no keypoints give no matches."""
         n0, n1 = len(image0.points), len(image1.points)
         if n0 == 0 or n1 == 0:
             return Assignment.empty(image0.points.device)
@@ -133,47 +133,47 @@ class SuperGlue(nn.Module):
         return mutual_matches(log_plan[0, :-1, :-1], self.match_threshold)
 
     def encoded(self, image: SuperPointKeypoints) -> Tensor:
-        """The input features (1, N, 256) of the graph network: descriptor and encoded position."""
+        """Return the input features (1, N, 256) of the graph network: descriptor and encoded position."""
         return image.descriptors[None].float() + self.position(image)
 
     def position(self, image: SuperPointKeypoints) -> Tensor:
-        """The position encoder's output for an image, (1, N, 256)."""
+        """Return the position encoder's output for an image, (1, N, 256)."""
         points = normalise_points(image.points, image.size)
         encoded: Tensor = self.kenc(torch.cat([points, image.scores.float()[:, None]], dim=1)[None])
         return encoded
 
     @staticmethod
     def score_matrix(projected: Tensor, n0: int) -> Tensor:
-        """Scaled inner products (1, N0, N1) float32 of projected features (1, N0 + N1, 256)."""
+        """Return scaled inner products (1, N0, N1) float32 of projected features (1, N0 + N1, 256)."""
         first, second = projected[:, :n0].float(), projected[:, n0:].float()
         return (first @ second.mT) / math.sqrt(CHANNELS)
 
 
 def _by_head(rows: Tensor) -> Tensor:
-    """256 rows, those of one head together, from the checkpoint's order; a vector or a matrix."""
+    """Order the 256 rows of a vector or matrix by head; checkpoints interleave the heads."""
     return rows.reshape(CHANNELS // HEADS, HEADS, -1).transpose(0, 1).reshape(rows.shape)
 
 
 def _on_rows(network: nn.Module, x: Tensor) -> Tensor:
-    """A network of (rows, C) on (1, N, C): there batch norm takes the last axis for the channels."""
+    """Apply a network of (rows, C) to (1, N, C): there batch norm takes the last axis for the channels."""
     precision = next(network.parameters()).dtype
     rows: Tensor = network(x.flatten(0, 1).to(precision))
     return rows.to(x.dtype).view(*x.shape[:2], -1)
 
 
 def normalise_points(points: Tensor, size: Size) -> Tensor:
-    """Points in pixels relative to the image's middle, in units of 0.7 times its longer side; float32."""
+    """Move the origin of points to the image's middle, in units of 0.7 times its longer side; float32."""
     middle = torch.tensor([size.width / 2, size.height / 2], device=points.device)
     return (points.float() - middle) / (0.7 * max(size))
 
 
 def log_optimal_transport(scores: Tensor, bin_score: Tensor, iterations: int) -> Tensor:
-    """Sinkhorn's plan (B, m + 1, n + 1) float32 as logarithms, from scores (B, m, n); dustbins come last.
+    """Return the logarithms of Sinkhorn's plan (B, m + 1, n + 1) float32 for scores (B, m, n); dustbins are last.
 
-    Each keypoint has mass 1 and may give it to the other image's dustbin, which can take all of them. An
-    iteration scales the rows, then the columns to their masses.
+    Each keypoint has mass 1. The other image's dustbin can take the mass of all keypoints. An iteration scales the
+    rows, then the columns to their masses.
 
-    Potentials u and v are added to the scores, so that nothing leaves float32's range.
+    The potentials u and v are added to the scores, so that nothing leaves float32's range.
     """
     batch, m, n = scores.shape
     couplings = bin_score.float().expand(batch, m + 1, n + 1).clone()

@@ -1,8 +1,8 @@
 """SuperPoint (DeTone et al. 2018, arXiv 1712.07629): keypoints of a gray image and their descriptors.
 
-Parameter names are those of ``superpoint_v1.pth``, which loads strictly; its terms (noncommercial research)
-apply to every use. The computation is the one that SuperGlue's weights were published with, including an error
-in the sampling of descriptors. Pixel centres are at integers, as everywhere in the package.
+Parameter names match ``superpoint_v1.pth``; its terms (noncommercial research) apply to every use. The computation
+is the one published with SuperGlue's weights, including an error in the sampling of descriptors. Pixel centres are
+at integers, as everywhere in the package.
 """
 
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.matchers.dtypes import check_finite
 
 CELL = 8  # pixels: the stride of the features
-SUPPRESSION_ROUNDS = 2  # that recover points which only a suppressed point exceeded
+SUPPRESSION_ROUNDS = 2  # each recovers points that only suppressed points exceed
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,7 +23,7 @@ class SuperPointKeypoints:
     """K keypoints of one image, all float32: ``points`` (K, 2), whole pixels (x, y); ``scores`` (K,) in 0..1;
     ``descriptors`` (K, 256), unit vectors, one a row; ``size`` of the image.
 
-    By descending score if ``max_keypoints`` cut some off, else by row and column.
+    Ordered by descending score if ``max_keypoints`` was reached, else by row and column.
     """
 
     points: Tensor
@@ -36,8 +36,8 @@ class SuperPoint(nn.Module):
     """A shared trunk of eight convolutions, a detector head (Pa, Pb) and a descriptor head (Da, Db).
 
     ``nms_radius``: half the suppression window, in pixels. Scores are above ``keypoint_threshold``.
-    ``max_keypoints``: the strongest to keep, -1 for all. ``border``: the width in pixels of the strip along the
-    border without keypoints. SuperGlue's published numbers have 3, 0.005, 2048, 4 outdoors and 4, 0.005, 1024, 4
+    ``max_keypoints``: the number to keep, -1 for all. ``border``: the width in pixels of the strip along the
+    border without keypoints. SuperGlue's published results use 3, 0.005, 2048, 4 outdoors and 4, 0.005, 1024, 4
     indoors. For inference only.
     """
 
@@ -62,13 +62,13 @@ class SuperPoint(nn.Module):
         self.convDa = nn.Conv2d(128, 256, 3, padding=1)
         self.convDb = nn.Conv2d(256, 256, 1)
         self.eval().requires_grad_(False)
-        # The weights' layout decides that of the activations, since a one-channel image's is ambiguous.
+        # A one-channel image has no definite layout, so the weights' layout decides.
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # missing in torch's stubs
 
     def forward(self, image: Tensor) -> list[SuperPointKeypoints]:
-        """The keypoints of each ``image`` of a batch (B, 1, H, W), gray in 0..1; none where a side is below 8.
+        """Return the keypoints of each ``image`` of (B, 1, H, W), gray in 0..1; none where a side is below 8.
 
-        Sides need not be multiples of 8; the at most 7 last rows and columns beyond carry no keypoint.
+        Sides beyond a multiple of 8 have no keypoints in their last rows and columns.
         """
         batch, _, height, width = image.shape
         size = Size(width, height)
@@ -86,25 +86,25 @@ class SuperPoint(nn.Module):
         return found
 
     def features(self, image: Tensor) -> Tensor:
-        """The trunk: (B, 128, h, w) from (B, 1, H, W), with h = floor(H / 8) and w = floor(W / 8)."""
+        """Return the trunk's (B, 128, h, w) of (B, 1, H, W), with h = floor(H / 8) and w = floor(W / 8)."""
         x = image.to(self.conv1a.weight.dtype)
         for first, second in ((self.conv1a, self.conv1b), (self.conv2a, self.conv2b), (self.conv3a, self.conv3b)):
-            # Pooling first leaves the ReLU a quarter of the values.
+            # Pooling first: the ReLU has a quarter of the values.
             x = torch.relu_(functional.max_pool2d(second(torch.relu_(first(x))), 2))
         return torch.relu_(self.conv4b(torch.relu_(self.conv4a(x))))
 
     def logits(self, features: Tensor) -> Tensor:
-        """The detector head: (B, 65, h, w), the 64 pixels of a cell row by row and "no keypoint"."""
+        """Return the detector head's (B, 65, h, w): the 64 pixels of a cell row by row and "no keypoint"."""
         logits: Tensor = self.convPb(torch.relu_(self.convPa(features)))
         return logits
 
     def descriptor_field(self, features: Tensor) -> Tensor:
-        """The descriptor head: (B, 256, h, w), one vector a cell, of any length."""
+        """Return the descriptor head's (B, 256, h, w): one vector a cell, of any length."""
         field: Tensor = self.convDb(torch.relu_(self.convDa(features)))
         return field
 
     def select_keypoints(self, scores: Tensor) -> tuple[Tensor, Tensor]:
-        """Points (K, 2) float32, (x, y) in pixels, and scores (K,) of one suppressed score map (8h, 8w)."""
+        """Select points (K, 2) float32, (x, y) in pixels, and scores (K,) of one suppressed score map (8h, 8w)."""
         border, (height, width) = self.border, scores.shape
         inner = scores[border : max(height - border, 0), border : max(width - border, 0)]
         rows, columns = torch.nonzero(inner > self.keypoint_threshold, as_tuple=True)
@@ -117,7 +117,7 @@ class SuperPoint(nn.Module):
 
 
 def score_map(logits: Tensor) -> Tensor:
-    """The score of each pixel, (B, 8h, 8w) float32, from logits (B, 65, h, w)."""
+    """Return the score of each pixel, (B, 8h, 8w) float32, from logits (B, 65, h, w)."""
     batch, _, h, w = logits.shape
     cells = logits.permute(0, 2, 3, 1).float().softmax(dim=3)[..., :-1]  # (B, h, w, 64)
     rows = cells.reshape(batch, h, w, CELL, CELL).transpose(2, 3)  # (B, h, 8, w, 8)
@@ -125,10 +125,10 @@ def score_map(logits: Tensor) -> Tensor:
 
 
 def suppress_non_maxima(scores: Tensor, radius: int) -> Tensor:
-    """``scores`` (B, H, W), at least 0, with those set to 0 that are no maximum of their square window.
+    """Set ``scores`` (B, H, W), at least 0, to 0 unless they are the maximum of their square window.
 
-    Equal maxima in one window are all kept. A point that only suppressed points exceed is recovered, in
-    two rounds: neither greedy suppression nor its fixed point.
+    All equal maxima in one window are kept. Two rounds recover points that only suppressed points exceed. This is
+    neither greedy suppression nor its fixed point.
     """
     kept = scores == window_maximum(scores, radius)
     for _ in range(SUPPRESSION_ROUNDS):
@@ -139,15 +139,15 @@ def suppress_non_maxima(scores: Tensor, radius: int) -> Tensor:
 
 
 def window_maximum(values: Tensor, radius: int) -> Tensor:
-    """The maximum over (2 radius + 1)^2 pixels about each pixel of ``values`` (B, H, W), at least 0 or bool.
+    """Return the maximum over (2 radius + 1)^2 pixels about each of ``values`` (B, H, W), at least 0 or bool.
 
-    Axis by axis and by doubling, in a few vectorised passes where a pooling layer makes (2 radius + 1)^2
-    comparisons a pixel. The padding of zeros is never the maximum.
+    Computed by axis and by doubling in a few vectorised passes; a pooling layer needs (2 radius + 1)^2 comparisons
+    per pixel. The zero padding is never the maximum.
     """
     window = 2 * radius + 1
     padded = functional.pad(values, (radius,) * 4)
     for axis in (1, 2):
-        width = 1  # of the window whose maxima ``padded`` holds
+        width = 1  # of the window of the maxima in ``padded``
         while width < window:
             step = min(width, window - width)
             length = padded.shape[axis] - step
@@ -157,10 +157,10 @@ def window_maximum(values: Tensor, radius: int) -> Tensor:
 
 
 def sample_descriptors(field: Tensor, points: Tensor) -> Tensor:
-    """Unit descriptors (K, D) float32 at ``points`` (K, 2), from the vectors of the cells, ``field`` (D, h, w).
+    """Return unit descriptors (K, D) float32 at ``points`` (K, 2), from the cells' vectors ``field`` (D, h, w).
 
-    The centre of cell j lies at pixel 8 j + 3.5, yet the divisor below puts a point off by up to half a cell
-    (at the far border): so it was when SuperGlue was trained and published. Cells beyond the field are zero.
+    The centre of cell j is at pixel 8 j + 3.5. The divisor below shifts a point by up to half a cell, as in
+    SuperGlue's training. Cells beyond the field are zero.
     """
     h, w = field.shape[1:]
     extent = points.new_tensor([CELL * w - 4.5, CELL * h - 4.5])

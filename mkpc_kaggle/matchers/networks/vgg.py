@@ -1,7 +1,7 @@
 """VGG with batch norms as a pyramid of features: Simonyan and Zisserman, "Very Deep Convolutional Networks", 2015.
 
-Written here because offline installs have no torchvision. Layers are numbered as in the usual classifiers, so that
-``layers.N`` are the usual parameter names. For inference in evaluation mode only.
+Written here because offline installs have no torchvision. Layers are numbered as in the usual classifiers, so the
+parameter names are ``layers.N``. For inference in evaluation mode only.
 """
 
 from collections.abc import Iterator, Sequence
@@ -17,7 +17,7 @@ VGG11, VGG19 = (1, 1, 2, 2), (2, 2, 4, 4)  # convolutions at each of these strid
 
 
 class Vgg(nn.Module):
-    """Up to stride 8; the classifiers' last level is left out."""
+    """VGG up to stride 8, without the last level of the classifiers."""
 
     def __init__(self, convolutions: Sequence[int]) -> None:
         super().__init__()
@@ -32,14 +32,14 @@ class Vgg(nn.Module):
         self.convolutions = tuple(convolutions)
 
     def forward(self, image: Tensor) -> list[Tensor]:
-        """Features (B, C, h, w) at strides 1, 2, 4 and 8 of images (B, 3, H, W), before the pooling that follows.
+        """Return features (B, C, h, w) at strides 1, 2, 4 and 8 of images (B, 3, H, W), before the next pooling.
 
         Sides of at least 8; every halving rounds down.
         """
         return list(self.levels(image))
 
     def levels(self, image: Tensor) -> Iterator[Tensor]:
-        """The same one by one, so that not all of them are in memory."""
+        """Yield the same one by one, so that not all of them are in memory."""
         first = next(self.parameters())
         x = image.to(first.dtype).contiguous(memory_format=torch.channels_last)
         for number, level in enumerate(self._levels()):
@@ -49,14 +49,14 @@ class Vgg(nn.Module):
             yield x
 
     def _levels(self) -> list[nn.Sequential]:
-        """The layers between poolings."""
+        """Return the layers between poolings."""
         layers = list(self.layers)
         pools = [i for i, layer in enumerate(layers) if isinstance(layer, nn.MaxPool2d)]
         return [nn.Sequential(*layers[start + 1 : end]) for start, end in pairwise([-1, *pools, len(layers)])]
 
 
 def halved(x: Tensor) -> Tensor:
-    """Maxima of 2 x 2 pixels. PyTorch's pooling also stores indices, twice as large as the maxima."""
+    """Return maxima of 2 x 2 pixels. PyTorch's pooling also stores indices, twice as large as the maxima."""
     height, width = (side // 2 * 2 for side in x.shape[2:])
     first, *others = (x[:, :, row:height:2, column:width:2] for row in (0, 1) for column in (0, 1))
     maxima = first.clone(memory_format=torch.channels_last)

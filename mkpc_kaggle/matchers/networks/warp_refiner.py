@@ -1,7 +1,7 @@
 """Warp refiners, DKM's and RoMa's, and their local correlation (Edstedt et al. 2023, section 3.3).
 
-Normalised coordinates: (x, y) in [-1, 1], where +-1 are the outer edges of an image; the centre of pixel
-(column j, row i) of w x h is ((2 j + 1) / w - 1, (2 i + 1) / h - 1). Resizing a map of them leaves its values.
+Normalised coordinates are (x, y) in [-1, 1]; +-1 are the outer edges of an image. In an image of w x h the centre
+of pixel (column j, row i) is ((2 j + 1) / w - 1, (2 i + 1) / h - 1).
 """
 
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ HIDDEN_BLOCKS = 8
 
 @dataclass(frozen=True)
 class WarpRefinerShape:
-    """``features`` of either image, ``embedding`` of the displacement, correlation ``radius`` (None: none)."""
+    """Channels: ``features`` of either image, ``embedding`` of the displacement; ``radius`` of the correlation."""
 
     features: int
     embedding: int
@@ -43,8 +43,8 @@ SHAPES = {  # by stride
 
 @dataclass(frozen=True, eq=False)
 class WarpEstimate:
-    """``flow`` (B, 2, h, w): where each pixel lies in the other image, absolute and normalised, unclamped;
-    ``certainty`` (B, 1, h, w): logits. Both float32.
+    """An estimate, float32: ``flow`` (B, 2, h, w), each pixel's position in the other image, normalised and
+    unclamped; ``certainty`` (B, 1, h, w), logits.
     """
 
     flow: Tensor
@@ -66,14 +66,14 @@ class WarpRefiner(nn.Module):
         self.disp_emb = ExactConv2d(2, shape.embedding, 1)
 
     def forward(self, query: Tensor, support: Tensor, flow: Tensor, stretch: float = 1) -> Tensor:
-        """Corrections (B, 3, h, w) of features (B, C, h, w) and (B, C, h', w') and a flow (B, 2, h, w).
+        """Return corrections (B, 3, h, w) of features (B, C, h, w), (B, C, h', w') and a flow (B, 2, h, w).
 
-        Displacements are shown to the network multiplied by ``stretch``. Channel 0 is added to the certainty's
-        logit; 1 and 2 are x and y in eighths of the query's pixel at this scale, as shares of the image's sides.
+        The network's displacements are multiplied by ``stretch``. Channel 0 is added to the certainty's logit;
+        1 and 2 are x and y in eighths of the query's pixel at this scale, as shares of the image's sides.
         """
         x = self._look(query, support, flow, stretch)  # (B, inputs, h, w)
         for depthwise, norm, _, mix in (self.block1, *self.hidden_blocks):
-            # One variable for all: no more than two maps are alive at a time.
+            # One variable: at most two maps are in memory at a time.
             x = by_rows(mix, torch.relu_(norm(depthwise(x))))
         corrections: Tensor = self.out_conv(x.float())
         return corrections
@@ -100,10 +100,10 @@ def block(inputs: int, outputs: int) -> nn.Sequential:
 
 
 def by_rows(pointwise: nn.Conv2d, x: Tensor) -> Tensor:
-    """A 1x1 convolution of (B, C, h, w), channels last: most of the network's work.
+    """Apply a 1x1 convolution to (B, C, h, w), channels last: most of the network's work.
 
-    Rows go in as a batch, without a copy. A batch of one on one thread PyTorch leaves to MKL's matrix product
-    instead of oneDNN's convolution, which is twice as fast on AMD.
+    Rows are a batch, without a copy. For a batch of one on one thread PyTorch uses MKL's matrix product. oneDNN's
+    convolution is twice as fast on AMD.
     """
     rows = as_grid(x).reshape(-1, 1, x.shape[3], x.shape[1])  # (B h, 1, w, C)
     mixed: Tensor = pointwise(as_map(rows))  # (B h, C', 1, w)
@@ -111,7 +111,7 @@ def by_rows(pointwise: nn.Conv2d, x: Tensor) -> Tensor:
 
 
 def refined(estimate: WarpEstimate, corrections: Tensor, stride: int, full: torch.Size) -> WarpEstimate:
-    """The estimate after a refiner's corrections; ``full`` (H, W): the query's size in the same pass."""
+    """Apply a refiner's corrections to the estimate; ``full`` (H, W): the query's size in the same pass."""
     height, width = full
     unit = corrections.new_tensor([stride / (4 * width), stride / (4 * height)])  # an eighth of a pixel
     flow = estimate.flow + corrections[:, 1:] * unit[:, None, None]
@@ -119,13 +119,13 @@ def refined(estimate: WarpEstimate, corrections: Tensor, stride: int, full: torc
 
 
 def local_correlation(query: Tensor, support: Tensor, flow: Tensor, radius: int) -> Tensor:
-    """Dot products of each pixel's features with the support's around its target, over sqrt(C).
+    """Return dot products of each pixel's features with the support's around its target, over sqrt(C).
 
-    (B, C, h, w), (B, C, h', w') and (B, 2, h, w) -> (B, (2 radius + 1)^2, h, w), float32. The window moves row by
-    row in steps of 2 / w and 2 / h, one pixel of the query; the support is zero outside, bilinear between pixels.
+    (B, C, h, w), (B, C, h', w') and (B, 2, h, w) give (B, (2 radius + 1)^2, h, w), float32. The window's steps are
+    2 / w and 2 / h, one pixel of the query, row by row. The support is zero outside, bilinear between pixels.
 
-    A product with a bilinear sample is the bilinear sample of products: each pixel meets the whole pixels that its
-    window covers, and both axes are interpolated afterwards.
+    The product with a bilinear sample is the bilinear sample of products. So products are computed with the whole
+    pixels that a window covers, and then interpolated.
     """
     size, size1 = query.shape[2:], support.shape[2:]
     targets = ((as_grid(flow).reshape(-1, 2) + 1) * flow.new_tensor(size1[::-1]) - 1) / 2  # (P, 2) pixels
@@ -145,8 +145,8 @@ def local_correlation(query: Tensor, support: Tensor, flow: Tensor, radius: int)
 
 @dataclass(frozen=True, eq=False)
 class Taps:
-    """Of P targets on one axis the K whole ``pixels`` (P, K) int64 that their windows cover, and their ``weights``
-    (P, 2 radius + 1, K) in each step of the window: linear, zero outside the axis.
+    """Whole ``pixels`` (P, K) int64 covered by the windows of P targets on one axis, and their ``weights``
+    (P, 2 radius + 1, K) at each step of the window: linear, zero outside the axis.
     """
 
     pixels: Tensor
@@ -165,27 +165,27 @@ class Taps:
 
 
 def _products(queries: Tensor, keys: Tensor, index: Tensor) -> Tensor:
-    """(P, K) dot products of queries (P, C) with their own keys each, (N, C) at ``index`` (P, K)."""
+    """Return (P, K) dot products of queries (P, C) with their own keys, (N, C) at ``index`` (P, K)."""
     neighbours, channels = index.shape[1], keys.shape[1]
-    # The gathered keys of a block stay within a processor's cache; a GPU wants few large blocks.
+    # The gathered keys of a block fit a processor's cache; a GPU needs few large blocks.
     floats = 2**26 if keys.is_cuda else 2**20
     at_once = max(1, floats // (neighbours * channels))
     products = queries.new_empty(index.shape)
     blocks = zip(*(torch.split(x, at_once) for x in (queries, index, products)), strict=True)
     for some, positions, out in blocks:
         gathered = keys.index_select(0, positions.flatten()).view(-1, neighbours, channels)
-        # A row times a matrix: the other way round MKL takes ten times as long.
+        # A row times a matrix; MKL takes ten times as long for the reverse.
         torch.bmm(some[:, None], gathered.transpose(1, 2), out=out[:, None])
     return products
 
 
 def resize(x: Tensor, size: torch.Size) -> Tensor:
-    """(B, C, h, w) -> (B, C, *size), bilinear without antialiasing, larger or smaller."""
+    """Resize (B, C, h, w) to (B, C, *size), bilinear without antialiasing, larger or smaller."""
     return functional.interpolate(x, tuple(size), mode="bilinear", align_corners=False)
 
 
 def identity_map(like: Tensor) -> Tensor:
-    """(1, 2, h, w): the normalised pixel centres of a map (..., h, w), channel 0 x and 1 y."""
+    """Return (1, 2, h, w): the normalised pixel centres of a map (..., h, w), channel 0 x and 1 y."""
     height, width = like.shape[-2:]
     x, y = (torch.linspace(1 / n - 1, 1 - 1 / n, n, device=like.device) for n in (width, height))
     return torch.stack([x.expand(height, width), y[:, None].expand(height, width)])[None]

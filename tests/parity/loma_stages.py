@@ -1,16 +1,13 @@
-"""LoMa against golden vectors of the reference, with its stand-in weights, network by network, norms folded."""
+"""LoMa against golden files, network by network, norms folded."""
 
-import json
 import re
 from functools import cache, partial
 
 import numpy as np
-import pytest
 import torch
-from dense import batch_of, resized_by_pil
-from golden import GOLDEN, Stage, assert_stages, golden_arrays, needs_golden, standin_state
-from loma_values import assignment_values, descriptor_values, detector_values, matcher_values
-from semi_dense import tolerance_of
+from dense_stages import batch_of, resized_by_pil
+from golden import Stage, golden_arrays, recorded, standin_state, tolerance_of
+from sparse_stages import assignment_values
 
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.matchers.contract import Placement
@@ -18,7 +15,7 @@ from mkpc_kaggle.matchers.networks.dad import Dad, select_keypoints
 from mkpc_kaggle.matchers.networks.dedode import dedode_b, dedode_g
 from mkpc_kaggle.matchers.networks.dinov2 import DinoV2, DinoV2Config
 from mkpc_kaggle.matchers.networks.loma import UNUSED, Loma, Variant, detector_size, parameter_name
-from mkpc_kaggle.matchers.networks.loma_matcher import LomaKeypoints, LomaMatcher
+from mkpc_kaggle.matchers.networks.loma_matcher import LAYERS, LomaKeypoints, LomaMatcher, log_scores
 from mkpc_kaggle.matchers.networks.pixels import resized
 from mkpc_kaggle.matchers.networks.placement import prepared
 from mkpc_kaggle.weights import load_into
@@ -72,6 +69,38 @@ def compared(values, golden):
             yield Stage(name, got / expected, torch.ones_like(expected), 1e-4)
         else:
             yield Stage(name, got.reshape(expected.shape), expected, tolerance_of(name, TOLERANCES))
+
+
+def detector_values(detector, images, number):
+    logits, found = detector.logits(images), detector(images, number)
+    return {
+        "score_map": logits,
+        "dense_probs": logits.flatten(1).softmax(dim=1).view_as(logits),
+        "keypoints": torch.stack([each.points for each in found]),
+        "keypoint_probs": torch.stack([each.scores for each in found]),
+    }
+
+
+def descriptor_values(descriptor, images, points):
+    """At the points, and at every third pixel of the images."""
+    height, width = images.shape[2:]
+    rows, columns = ((2 * torch.arange(side) + 1) / side - 1 for side in (height, width))
+    pixels = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), dim=2)[::3, ::3]
+    dense = descriptor(images, pixels.reshape(1, -1, 2).expand(len(images), -1, -1))
+    return {
+        "dense_descriptors": dense.mT.unflatten(2, pixels.shape[:2])[:, ::32],
+        "descriptors": descriptor(images, points),
+    }
+
+
+def matcher_values(matcher, image0, image1, threshold):
+    """Of a single pair, as a batch of one."""
+    last = f"transformers.{LAYERS - 1}"
+    with recorded(matcher, [last]) as calls:
+        matcher(image0, image1, threshold)
+    similarity = matcher.similarity(calls[last][0][1], len(image0.points))
+    scores = log_scores(similarity)
+    return {"similarity": similarity, "scores": scores.exp()} | assignment_values(scores[0], threshold)
 
 
 def detector_stages(case):
@@ -144,12 +173,19 @@ def matcher_stages(case):
         yield from compared(values, arrays)
 
 
-def pipeline_stages(case, network):
-    """From picture to matched points; at the published settings keypoints are compared as sets, all but one."""
-    golden = golden_arrays("loma", case)
+@cache
+def whole(variant):
+    network = Loma(variant)
+    tensors = {parameter_name(n): t for n, t in standin_state("loma", variant.upper()).items()}
+    load_into(network, tensors, what="golden", unused=UNUSED)
+    return prepared(network, Placement())
+
+
+def pipeline_stages(case, variant):
+    """Yield the stages from two images to matched points."""
+    golden, network = golden_arrays("loma", case), whole(variant)
     images = golden if "image0" in golden else golden_arrays("loma", "pipeline_b128")
     side, number = int(golden["descriptor_side"]), int(golden["num_keypoints"])
-    as_sets = case.startswith("default")
     found = []
     for index in (0, 1):
         pixels = images[f"image{index}"]
@@ -160,81 +196,36 @@ def pipeline_stages(case, network):
         (detected,) = network.detector(seen[0], number)
         found.append(keypoints)
         mine = {"keypoints": keypoints.points, "keypoint_probs": detected.scores}
-        mine["descriptors"] = keypoints.descriptors[:, ::32] if as_sets else keypoints.descriptors
+        mine["descriptors"] = keypoints.descriptors
         theirs = {name: golden[f"{name}{index}"] for name in mine}
-        if as_sets:
-            distance = torch.cdist(mine["keypoints"].double(), theirs["keypoints"].double())
-            nearest, partner = distance.min(dim=0)
-            assert (nearest > 1e-6).sum() <= 1
-            mine = {name: value[partner] for name, value in mine.items()}
-            kept = nearest <= 1e-6
-            mine, theirs = ({name: value[kept] for name, value in of.items()} for of in (mine, theirs))
         mine["keypoint_probs"] = mine["keypoint_probs"] / theirs["keypoint_probs"]
         theirs["keypoint_probs"] = torch.ones_like(theirs["keypoint_probs"])
         for name, tolerance in (("keypoints", 1e-6), ("keypoint_probs", 1e-4), ("descriptors", 2e-4)):
             yield Stage(f"{name}{index}", mine[name], theirs[name], tolerance)
     threshold = float(golden["threshold"])
-    if not as_sets:
-        for name, value in matcher_values(network.matcher, *found, threshold).items():
-            if name.startswith(("matches", "matching")):
-                yield Stage(name, value[0], golden[name], 4e-4 if "scores" in name else 0)
+    for name, value in matcher_values(network.matcher, *found, threshold).items():
+        if name.startswith(("matches", "matching")):
+            yield Stage(name, value[0], golden[name], 4e-4 if "scores" in name else 0)
     matches = network.matcher(*found, threshold)
     points = []
     for index, of in enumerate((matches.index0, matches.index1)):
         pixels = images[f"image{index}"]
         points.append((found[index].points[of] + 1) / 2 * torch.tensor([pixels.shape[1], pixels.shape[0]]))
     mine, theirs = torch.cat(points, dim=1), torch.cat([golden["points0"], golden["points1"]], dim=1)
-    if as_sets:
-        mine, theirs = (torch.tensor(sorted(of.tolist())) for of in (mine, theirs))
     yield Stage("points", mine, theirs, 1e-3)
 
 
-@cache
-def whole(variant):
-    network = Loma(variant)
-    tensors = {parameter_name(n): t for n, t in standin_state("loma", variant.upper()).items()}
-    load_into(network, tensors, what="golden", unused=UNUSED)
-    return prepared(network, Placement())
-
-
-CASES = {f"detector_{case}": partial(detector_stages, case) for case in ("160x208", "157x203", "batch2_72x96")}
-CASES |= {"sampling": sampling_stages, "resize": resize_stages, "vit_positions": position_stages}
-CASES["descriptor_b128"] = partial(descriptor_stages, "B128", "b128_157x203")
+CASES = {
+    f"loma detector_{case}": partial(detector_stages, case) for case in ("160x208", "157x203", "batch2_72x96")
+}
+CASES |= {"loma sampling": sampling_stages, "loma resize": resize_stages, "loma vit_positions": position_stages}
+CASES["loma descriptor_b128"] = partial(descriptor_stages, "B128", "b128_157x203")
 CASES |= {
-    f"matcher_{case}": partial(matcher_stages, case)
+    f"loma matcher_{case}": partial(matcher_stages, case)
     for case in ("b_60x47", "b128_33x71", "l_24x18", "g_14x11", "b_batch2_20x26", "b_1x3", "b_1x1")
 }
-CASES["pipeline_b128"] = lambda: pipeline_stages("pipeline_b128", whole(Variant.B128))
+CASES["loma pipeline_b128"] = partial(pipeline_stages, "pipeline_b128", Variant.B128)
 SLOW = {
-    "descriptor_g": partial(descriptor_stages, "B", "g_168x210"),
-    "pipeline_b": lambda: pipeline_stages("pipeline_b", whole(Variant.B)),
-    "default_b128": lambda: pipeline_stages("default_b128", whole(Variant.B128)),
+    "loma descriptor_g": partial(descriptor_stages, "B", "g_168x210"),
+    "loma pipeline_b": partial(pipeline_stages, "pipeline_b", Variant.B),
 }
-
-
-@needs_golden
-@pytest.mark.parametrize("case", CASES)
-@torch.inference_mode()
-def test_every_stage_is_the_golden_one(case):
-    assert_stages(CASES[case]())
-
-
-@needs_golden
-@pytest.mark.slow
-@pytest.mark.parametrize("case", SLOW)
-@torch.inference_mode()
-def test_every_stage_is_the_golden_one_at_the_published_settings(case):
-    assert_stages(SLOW[case]())
-
-
-@needs_golden
-@pytest.mark.parametrize("variant", Variant)
-def test_the_published_files_have_the_networks_parameters_and_what_training_alone_used(variant):
-    shapes = json.loads((GOLDEN / "loma" / "shapes.json").read_text())
-    name = variant.upper()
-    published = shapes["B128"] if name == "B128" else shapes["B"] | shapes.get(name, {})
-    used = {parameter_name(name): shape for name, shape in published.items()}
-    used = {name: shape for name, shape in used.items() if not re.match(UNUSED, name)}
-    with torch.device("meta"):
-        network = Loma(variant)
-    assert {name: list(tensor.shape) for name, tensor in network.state_dict().items()} == used

@@ -1,0 +1,249 @@
+"""DKM and RoMa against golden files: the estimates at every stride, the warp, and the matches drawn from it."""
+
+import json
+import re
+from contextlib import contextmanager
+from functools import cache, partial
+
+import numpy as np
+import pytest
+import torch
+from golden import GOLDEN, Stage, golden_arrays, ready, seeded_tensor
+
+from mkpc_kaggle.geometry.coordinates import Size, from_normalised
+from mkpc_kaggle.matchers.networks import roma
+from mkpc_kaggle.matchers.networks.dense_sampling import balancing_weights, density, draw, sample_matches
+from mkpc_kaggle.matchers.networks.dense_warp import dense_warp
+from mkpc_kaggle.matchers.networks.dkm import DKM
+from mkpc_kaggle.matchers.networks.grids import as_grid, as_map
+from mkpc_kaggle.matchers.networks.pixels import MEAN, STD, network_input
+from mkpc_kaggle.matchers.networks.roma import RoMa, anchor_mean
+
+MODES = {"threshold_balanced": 0.05, "balanced": 1.0}  # of sampling, by the golden files' names: the threshold
+CERTAINTY = {"dkm": 1e-4, "roma": 3e-4}  # shares of an array's largest value; of all else 1e-4
+
+
+def state_of(shapes, gains, default, prefix=""):
+    def gain(name):
+        fitting = [start for start in gains if name.startswith(start)]
+        return gains[max(fitting, key=len)] if fitting else default
+
+    return {prefix + name: seeded_tensor(name, shape, gain(name)) for name, shape in shapes.items()}
+
+
+@cache
+def network_of(name):
+    shapes, gains = (json.loads((GOLDEN / name / f"{file}.json").read_text()) for file in ("shapes", "gains"))
+    default = gains["default"]
+    if name == "dkm":
+        return ready(DKM(), state_of(shapes, gains["prefixes"], default))
+    dinov2 = state_of(shapes["dinov2"], gains["dinov2"]["prefixes"], default, "dinov2.")
+    return ready(RoMa(), dinov2 | state_of(shapes["roma"], gains["roma"]["prefixes"], default))
+
+
+def within(network, name, got, expected):
+    is_certainty = re.fullmatch("(.*_)?certainty", name) and "__" not in name
+    share = CERTAINTY[network] if is_certainty else 1e-4
+    return Stage(name, got.reshape(expected.shape), expected, share * expected.abs().max().item())
+
+
+def compared(network, values, golden):
+    """Yield stages for all values that the golden file has; of some batches it has the first item only."""
+    names = [name for name in values if name in golden]
+    assert any(name.endswith("warp") for name in names) and any(name.endswith("certainty") for name in names)
+    yield from (within(network, name, values[name][: len(golden[name])], golden[name]) for name in names)
+
+
+@contextmanager
+def one_thread():
+    """As the golden files were made.
+
+    Their own rounding takes up to 0.7 of the tolerance at stride 1. The split of work among threads changes the
+    network's rounding by as much again.
+    """
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+@contextmanager
+def recorded_estimates(decoder):
+    """Record the estimates after each refiner, by stride, in the order of the calls."""
+    correct, estimates = decoder.correct, {stride: [] for stride in decoder.conv_refiner}
+
+    def recording(estimate, query, support, stride):
+        estimates[str(stride)].append(correct(estimate, query, support, stride))
+        return estimates[str(stride)][-1]
+
+    decoder.correct = recording
+    try:
+        yield estimates
+    finally:
+        del decoder.correct
+
+
+@one_thread()
+def computed(name, images, fine_images=(None, None), *, symmetric=True):
+    """Return estimates at all strides and the final warp, by the golden files' names; "up_" in the second pass.
+
+    The network runs the directions one after the other; here they are one batch, side by side.
+    """
+    network = network_of(name)
+    features = [network.encode(*versions) for versions in zip(images, fine_images, strict=True)]
+    with recorded_estimates(network.decoder) as estimates:
+        warps = network.match(*features) if symmetric else [dense_warp(*network.decoder(*features))]
+    passes = ("",) if fine_images[0] is None else ("", "up_")
+    values = {}
+    for number, prefix in enumerate(passes):
+        for stride, found in estimates.items():
+            if stride == "16" and prefix:
+                continue  # the second pass begins at stride 8
+            of_pass = found if stride == "16" else found[number :: len(passes)]
+            values[f"{prefix}flow{stride}"] = torch.cat([estimate.flow for estimate in of_pass])
+            values[f"{prefix}cert{stride}"] = torch.cat([estimate.certainty for estimate in of_pass])
+    for part in ("warp", "certainty"):
+        values[f"{passes[-1]}{part}"] = torch.cat([getattr(warp, part) for warp in warps], 2)
+    return values
+
+
+def second_pass(values, *plain):
+    """Return the second pass's values alone; ``plain`` are named without "up_" in the file."""
+    values = {name: value for name, value in values.items() if name.startswith("up_")}
+    return {name.removeprefix("up_") if name[3:] in plain else name: value for name, value in values.items()}
+
+
+def batch_of(pixels):
+    return pixels.permute(2, 0, 1)[None].contiguous()
+
+
+def resized_by_pil(pixels, size):
+    image = pytest.importorskip("PIL.Image", reason="the golden images were resized by PIL")
+    resized = image.fromarray(pixels.numpy()).resize(size[::-1], image.Resampling.BICUBIC)
+    return torch.from_numpy(np.array(resized))
+
+
+def images_of(name, *keys, size=None):
+    """Return pictures of the file "main" as the network's input, resized if a size (H, W) is given."""
+    golden = golden_arrays(name, "main")
+    pictures = [resized_by_pil(golden[key], size) if size else golden[key] for key in keys]
+    return [network_input(batch_of(pixels), tuple(pixels.shape[:2])) for pixels in pictures]
+
+
+def main_stages(name, *keys):
+    yield from compared(name, computed(name, images_of(name, *keys)), golden_arrays(name, "main"))
+
+
+def dkm_input_stages():
+    golden, (mean, std) = golden_arrays("dkm", "main"), (torch.tensor(of)[:, None, None] for of in (MEAN, STD))
+    for name in ("imA", "imB"):
+        for size in ((96, 128), (144, 192)):
+            key = f"{name}_{size[0]}x{size[1]}"
+            got = ((network_input(batch_of(golden[name]), size) * std + mean) * 255).round()
+            expected = batch_of(golden[key]).float()
+            yield Stage(key, got, expected, 1)
+            yield Stage(f"{key}, share", (got != expected).float().mean(), torch.tensor(0.0), 0.01)
+
+
+def dkm_upsample_stages():
+    pairs = ([f"{name}_{size}" for name in ("imA", "imB")] for size in ("96x128", "144x192"))
+    values = computed("dkm", *(images_of("dkm", *keys) for keys in pairs))
+    yield from compared("dkm", values, golden_arrays("dkm", "upsample"))
+
+
+def dkm_one_way_stages():
+    coarse, fine = (images_of("dkm", "imA", "imB", size=size) for size in ((90, 118), (130, 170)))
+    values = computed("dkm", coarse, symmetric=False) | computed("dkm", coarse, fine, symmetric=False)
+    yield from compared("dkm", values, golden_arrays("dkm", "odd_one_way"))
+
+
+def dkm_batched_stages():
+    golden = golden_arrays("dkm", "batched")
+    pair = golden["query"], golden["support"]
+    one_way = computed("dkm", pair, symmetric=False)
+    values = computed("dkm", pair) | {f"one_way_{part}": one_way[part] for part in ("warp", "certainty")}
+    yield from compared("dkm", values, golden)
+
+
+def roma_upsample_stages():
+    values = computed("roma", images_of("roma", "rsA", "rsB"), images_of("roma", "imA", "imB", size=(168, 168)))
+    yield from compared("roma", second_pass(values, "warp", "certainty"), golden_arrays("roma", "upsample"))
+
+
+def roma_one_way_stages():
+    images, high = (images_of("roma", "imA", "imB", size=size) for size in ((112, 140), (150, 202)))
+    values = computed("roma", images, symmetric=False)
+    values |= second_pass(computed("roma", images, high, symmetric=False))
+    yield from compared("roma", values, golden_arrays("roma", "unequal_one_way"))
+
+
+def roma_batched_stages():
+    golden = golden_arrays("roma", "batched")
+    pair, high = ([golden[f"{side}{name}"] for side in ("query", "support")] for name in ("", "_high"))
+    values = computed("roma", pair) | second_pass(computed("roma", pair, high))
+    forward = computed("roma", pair, symmetric=False)
+    with pytest.MonkeyPatch.context() as patch:  # the release's displacements follow its settings' size
+        patch.setattr(roma, "stretch", lambda size: 1.25 * 112 / 560)
+        other = computed("roma", pair)
+    for part in ("warp", "certainty"):
+        values |= {f"one_way_{part}": forward[part], f"other_setting_{part}": other[part]}
+    yield from compared("roma", values, golden)
+
+
+def roma_parts_stages():
+    """Yield positions of DINOv2 at other sizes, and the mean of the best anchor and its neighbours."""
+    golden, dinov2 = golden_arrays("roma", "parts"), network_of("roma").dinov2
+    for name in (name for name in golden if name.startswith("pos_")):
+        _, size, channels = name.split("_")
+        got = dinov2.positions(*map(int, size.split("x")))
+        yield within("roma", name, got[..., :: int(channels.removeprefix("ch"))], golden[name])
+    logits = seeded_tensor("golden.cls_logits", (2, 4096, 5, 6), 4096 * 30 * 0.25)
+    for position, anchor in enumerate(golden["cls_boost_index"].tolist()):
+        logits[:, anchor, position // 6, position % 6] += 3
+    yield within("roma", "cls_flow", as_map(anchor_mean(as_grid(logits))), golden["cls_flow"])
+
+
+def sampling_stages(name, suffix=""):
+    golden, main = golden_arrays(name, "sampling"), golden_arrays(name, "main")
+    number, seed = (int(golden.get(key, value)) for key, value in (("num", 1000), ("seed", 1234)))
+    warp, certainty = main["warp"].reshape(-1, 4), main["certainty"].flatten()
+    for mode, threshold in MODES.items():
+        found = sample_matches(warp, certainty, number, threshold, generator=torch.Generator().manual_seed(seed))
+        weights, key = certainty.masked_fill(certainty > threshold, 1), f"{mode}{suffix}"
+        yield Stage(f"{key}__matches", found.matches, golden[f"{key}__matches"])
+        yield within(name, f"{key}__certainty", weights[found.index], golden[f"{key}__certainty"])
+    weights = certainty.masked_fill(certainty > MODES["threshold_balanced"], 1)
+    yield Stage("good_index", draw(weights, golden["noise1"], 4 * number), golden["good_index"])
+    good, evenness = warp[golden["good_index"]], balancing_weights(golden["density"])
+    values = {"good_matches": good, "good_certainty": weights[golden["good_index"]], "balance_p": evenness}
+    values |= dict.fromkeys(("density", "density_exact"), density(good))
+    if "kde_points" in golden:
+        values |= dict.fromkeys(("kde_density", "kde_density_exact"), density(golden["kde_points"]))
+    yield from (within(name, key, values[key], golden[key]) for key in values if key in golden)
+    yield Stage("balanced_index", draw(evenness, golden["noise2"], number), golden["balanced_index"])
+    if "density_half" in golden:  # half precision draws by it what no other device would
+        half = golden["density_half"]
+        yield Stage("density_half", values["density"], half, 0.1 * half.max().item())
+    height0, width0, height1, width1 = golden["pixel_sizes_HA_WA_HB_WB"].tolist()
+    sides = golden["pixel_in"].numpy().reshape(-1, 2, 2).swapaxes(0, 1)
+    for side, points, size in zip("AB", sides, (Size(width0, height0), Size(width1, height1)), strict=True):
+        got = torch.from_numpy(from_normalised(points, size)) + 0.5  # their centres are at halves
+        yield within(name, f"pixel_{side}", got, golden[f"pixel_{side}"])
+
+
+CASES = {
+    "dkm input": dkm_input_stages,
+    "dkm main": partial(main_stages, "dkm", "imA_96x128", "imB_96x128"),
+    "dkm upsample": dkm_upsample_stages,
+    "dkm odd_one_way": dkm_one_way_stages,
+    "dkm batched": dkm_batched_stages,
+    "dkm sampling": partial(sampling_stages, "dkm"),
+    "roma main": partial(main_stages, "roma", "rsA", "rsB"),
+    "roma upsample": roma_upsample_stages,
+    "roma unequal_one_way": roma_one_way_stages,
+    "roma batched": roma_batched_stages,
+    "roma parts": roma_parts_stages,
+    "roma sampling": partial(sampling_stages, "roma", "_float32"),
+}

@@ -1,0 +1,154 @@
+"""SuperPoint and SuperGlue against golden files, stage by stage."""
+
+import json
+from functools import partial
+
+import torch
+from golden import Stage, compared, golden_arrays, ready, recorded, standin_state
+from torch.nn import functional
+
+from mkpc_kaggle.geometry.coordinates import Size
+from mkpc_kaggle.matchers.networks.layers import mutual_matches
+from mkpc_kaggle.matchers.networks.superglue import SuperGlue, log_optimal_transport
+from mkpc_kaggle.matchers.networks.superpoint import (
+    SuperPoint,
+    SuperPointKeypoints,
+    sample_descriptors,
+    score_map,
+    suppress_non_maxima,
+)
+
+SUPERPOINT = {"conv4b_relu": 1e-4, "logits": 1e-4, "descriptor_raw": 1e-4, "score": 2e-5}
+SUPERPOINT |= {"dense_descriptors": 1e-5, "descriptors": 1e-5}
+SUPERGLUE = {"score_matrix": 1e-3, "log_assignment": 1e-3, "matching_scores": 1e-4}
+
+
+def superpoint(options):
+    unchanged = {
+        name: value for name, value in options.items() if name not in ("descriptor_dim", "remove_borders")
+    }
+    return ready(SuperPoint(**unchanged, border=options["remove_borders"]), standin_state("superpoint"))
+
+
+def image_of(pixels):
+    return pixels[None, None].float() / 255
+
+
+def superpoint_stages(case):
+    golden = golden_arrays("superpoint", case)
+    network, image = superpoint(json.loads(golden["config"])), image_of(golden["image"])
+    features = network.features(image)
+    logits, field = network.logits(features), network.descriptor_field(features)
+    scores = score_map(logits)
+    suppressed = suppress_non_maxima(scores, network.nms_radius)
+    (found,) = network(image)
+    got = {"conv4b_relu": features[0], "logits": logits[0], "descriptor_raw": field[0], "score_map": scores[0]}
+    got |= {"dense_descriptors": functional.normalize(field[0], dim=0), "score_map_nms": suppressed[0]}
+    got |= {"keypoints": found.points, "scores": found.scores, "descriptors": found.descriptors.T}
+    yield from compared(got, golden, SUPERPOINT)
+    if "score_map_nms" in golden:
+        survivors, expected = (values > 0 for values in (suppressed[0], golden["score_map_nms"]))
+        yield Stage("surviving pixels", survivors.long(), expected.long())
+
+
+def suppression_stages():
+    golden = golden_arrays("superpoint", "nms_cases")
+    for name in ("ties", "ramp", "random"):
+        for radius in range(5):
+            got = suppress_non_maxima(golden[name][None], radius)[0]
+            yield Stage(f"{name}, radius {radius}", got, golden[f"{name}_nms{radius}"])
+
+
+def sampling_stages():
+    golden = golden_arrays("superpoint", "descriptor_sampling")
+    got = sample_descriptors(golden["field"], golden["keypoints"])
+    yield Stage("descriptors", got.T, golden["descriptors"], 1e-5)
+
+
+def superglue(options):
+    return ready(SuperGlue(**options), standin_state("superglue"))
+
+
+def golden_pairs(golden):
+    """Yield the keypoints of both images of each pair of a file, with the file's arrays of that pair."""
+    arrays = {n: x for n, x in golden.items() if isinstance(x, torch.Tensor) and not n.startswith("image_size")}
+    if arrays["keypoints0"].ndim == 2:
+        arrays = {name: value[None] for name, value in arrays.items()}
+    for pair in range(len(arrays["keypoints0"])):
+        of_pair = {name: value[pair] for name, value in arrays.items()}
+        images = [
+            SuperPointKeypoints(
+                of_pair[f"keypoints{index}"],
+                of_pair[f"scores{index}"],
+                of_pair[f"descriptors{index}"].mT,
+                Size(*golden[f"image_size{index}"].tolist()),
+            )
+            for index in (0, 1)
+        ]
+        yield *images, of_pair
+
+
+def assignment_values(log_scores, threshold, suffix=""):
+    """Return, by keypoint of either image, its match and the score of any mutual pair; as a batch of one."""
+    found, every, values = mutual_matches(log_scores, threshold), mutual_matches(log_scores, 0), {}
+    for side, count in enumerate(log_scores.shape):
+        matches, scores = torch.full((1, count), -1), torch.zeros(1, count)
+        matches[0, (found.index0, found.index1)[side]] = (found.index1, found.index0)[side]
+        scores[0, (every.index0, every.index1)[side]] = every.scores
+        values |= {f"matches{side}{suffix}": matches, f"matching_scores{side}": scores}
+    return values
+
+
+def plan_of(network, image0, image1):
+    """Return the score matrix of a pair, and the logarithm of its transport plan with the dustbins."""
+    n0 = len(image0.points)
+    with recorded(network, ["final_proj"]) as calls:
+        network(image0, image1)
+    scores = network.score_matrix(calls["final_proj"][0][1], n0)
+    return scores, log_optimal_transport(scores, network.bin_score, network.sinkhorn_iterations)[0]
+
+
+def superglue_stages(case):
+    golden = golden_arrays("superglue", case)
+    network = superglue(json.loads(golden["config"]))
+    for image0, image1, arrays in golden_pairs(golden):
+        scores, log_plan = plan_of(network, image0, image1)
+        found, plan = network(image0, image1), log_plan[:-1, :-1]
+        again = mutual_matches(plan, network.match_threshold)
+        yield Stage("pairs", torch.stack([found.index0, found.index1]), torch.stack([again.index0, again.index1]))
+        values = {"score_matrix": scores, "log_assignment": log_plan}
+        for threshold in ("0.0", "0.5"):
+            values |= assignment_values(plan, float(threshold), f"_threshold{threshold}")
+        yield from compared(values | assignment_values(plan, network.match_threshold), arrays, SUPERGLUE)
+
+
+def sinkhorn_stages():
+    golden = golden_arrays("superglue", "sinkhorn")
+    for iterations in (1, 2, 5, 20, 100):
+        got = log_optimal_transport(golden["score_matrix"], golden["bin_score"], iterations)
+        yield Stage(f"log_assignment_{iterations}", got, golden[f"log_assignment_{iterations}"], 1e-5)
+
+
+def pipeline_stages():
+    """Yield the stages of SuperPoint, then of SuperGlue, from two images."""
+    golden = golden_arrays("superglue", "pipeline_pair")
+    config = json.loads(golden["config"])
+    detector, network = superpoint(config["superpoint"]), superglue(config["superglue"])
+    images = [detector(image_of(golden[f"image{index}"]))[0] for index in (0, 1)]
+    for index, found in enumerate(images):
+        values = {f"keypoints{index}": found.points, f"scores{index}": found.scores}
+        yield from compared(values, golden, SUPERPOINT)
+    _, log_plan = plan_of(network, *images)
+    yield from compared(assignment_values(log_plan[:-1, :-1], network.match_threshold), golden, SUPERGLUE)
+
+
+CASES = {
+    f"superpoint {case}": partial(superpoint_stages, case)
+    for case in ("default_160x216", "outdoor_160x216", "odd_171x229", "noborder_64x72")
+}
+CASES |= {"superpoint nms_cases": suppression_stages, "superpoint descriptor_sampling": sampling_stages}
+CASES |= {
+    f"superglue {case}": partial(superglue_stages, case)
+    for case in ("full_60x47", "eval20_33x71", "batch2_20x26", "tiny_1x3")
+}
+CASES |= {"superglue sinkhorn": sinkhorn_stages, "superglue pipeline_pair": pipeline_stages}
