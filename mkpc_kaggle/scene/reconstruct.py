@@ -14,6 +14,7 @@ from mkpc_kaggle.scene.shared_intrinsics import SharedIntrinsics, given_intrinsi
 from mkpc_kaggle.scene.view_graph import BatchPair, ViewGraph
 
 MIN_PAIRS_PER_IMAGE = 1.35  # connected pairs: with fewer there is little that could contradict the cameras
+KEEPS_ITS_F = Reason.SCENE, Reason.SAME_IMAGE, Reason.CONTRADICTION  # no other F, at the scene's focal lengths
 MIN_OBSERVATIONS = 0.99  # shared intrinsics stay if images see points at least this many times as often as without
 
 
@@ -39,10 +40,11 @@ def reconstruct_batch(
     """Reconstruct every connected component of a batch, and choose an F for each of its pairs.
 
     With ``focal``, the recipe's prior, and ``magsac`` (default: its defaults), a pair that gets no F from cameras
-    is estimated anew where the scene knows a focal length. With ``export``, the batch is reconstructed as a whole,
-    under the names of files, and COLMAP's files are written. Whatever the matches are, the answer is a
-    :class:`Solution`: what is missing has a reason. It takes seconds to minutes and may end the process, see
-    :mod:`mkpc_kaggle.scene.colmap`.
+    is re-estimated where the scene knows a focal length, unless it contradicts the scene. With ``export``, the
+    batch is reconstructed as a whole, under the names of files, and COLMAP's files are written.
+
+    A missing result has a reason, and no matches raise an error. It takes seconds to minutes and may end the
+    process, see :mod:`mkpc_kaggle.scene.colmap`.
     """
     directory = None
     if export is not None:
@@ -67,7 +69,7 @@ def reconstruct_batch(
     choices = []
     for pair in pairs:
         choice = choose(pair, by_digest)
-        if focal is not None and choice.reason not in (Reason.SCENE, Reason.SAME_IMAGE):
+        if focal is not None and choice.reason not in KEEPS_ITS_F:
             F = estimate_at_known_focals(pair, focals, focal, magsac or RobustConfig())
             choice = replace(choice, F=F)
         choices.append(choice)

@@ -117,8 +117,8 @@ def test_a_pair_whose_matches_agree_on_something_else_keeps_its_own(scene):
     shifted = replace(pair.matches, points1=pair.matches.points0 + np.array([0, 90], np.float32))
     columns = np.array([[0, 0, 1], [0, 0, 0], [-1, 0, 0]]) / np.sqrt(2)
     pairs = (*scene.pairs[:-1], replace(pair, matches=shifted, pair_fundamental=columns))
-    solution = reconstruct_batch(pairs, SceneConfig())
-    assert solution.choices[-1].reason is Reason.CONTRADICTION
+    solution = reconstruct_batch(pairs, SceneConfig(), FocalConfig())
+    assert (solution.choices[-1].reason, solution.choices[-1].F) == (Reason.CONTRADICTION, None)
     assert all(choice.from_scene for choice in solution.choices[:-1])
 
 
