@@ -10,7 +10,6 @@ Sources: Schoenberger and Frahm 2016 (the incremental mapper), Pan et al. 2024 (
 import shutil
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -23,7 +22,6 @@ from mkpc_kaggle.geometry.coordinates import Points, Size
 from mkpc_kaggle.recipe import SceneConfig
 from mkpc_kaggle.scene.export import DATABASE, FORMER, MODELS, PART
 from mkpc_kaggle.scene.keypoints import Index, scene_keypoints
-from mkpc_kaggle.scene.noise import adjust_by_noise
 from mkpc_kaggle.scene.reconstruction import MIN_IMAGES, Reconstruction, RegisteredImage, SfmModel, filter_models
 from mkpc_kaggle.scene.shared_intrinsics import SharedIntrinsics, start_focal
 from mkpc_kaggle.scene.view_graph import MIN_MATCHES, Edge, ViewGraph
@@ -56,13 +54,6 @@ def structure_from_motion(graph: ViewGraph, config: SceneConfig, shared: SharedI
             other = run_mapper(pycolmap.IncrementalPipeline, for_incremental, database, graph)
             found = max(found, other, key=lambda each: each.observations)
         return found
-
-
-def adjusted(found: Reconstruction, graph: ViewGraph, config: SceneConfig) -> Reconstruction:
-    """The reconstruction of a graph, each of its models adjusted by the noise of its images, in its place."""
-    for model in found.models:
-        adjust_by_noise(model.colmap, config.threads)
-    return replace(found, models=filter_models([_sfm_model(model.colmap, graph) for model in found.models]))
 
 
 def write_files(

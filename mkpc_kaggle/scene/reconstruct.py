@@ -53,10 +53,7 @@ def reconstruct_batch(
     matchers = sorted({name for pair in pairs for name in pair.tracks or ()})
     single = matchers if config.each_matcher and len(matchers) > 1 else []
     alone = [
-        [
-            adjusted(reconstruct_component(part, config, shared), part, config)
-            for part in ViewGraph.of_pairs(pairs, name).components()
-        ]
+        [reconstruct_component(part, config, shared) for part in ViewGraph.of_pairs(pairs, name).components()]
         for name in single
     ]
     by_digest = [
@@ -97,7 +94,6 @@ def reconstruct_sharing(
         before, after = (sum(each.observations for each in made) for made in (found, anew))
         if after >= MIN_OBSERVATIONS * before:
             found, shared = anew, alike
-    found = [adjusted(each, part, config) for each, part in zip(found, parts, strict=True)]
     if directory is not None:
         from mkpc_kaggle.scene.colmap import write_files
 
@@ -129,18 +125,6 @@ def reconstruct_connected(graph: ViewGraph, config: SceneConfig, shared: SharedI
         return Reconstruction(graph.names, failure=f"pycolmap cannot be imported: {error}")
     except (RuntimeError, ValueError) as error:
         return Reconstruction(graph.names, failure=f"pycolmap failed: {error}")
-
-
-def adjusted(found: Reconstruction, graph: ViewGraph, config: SceneConfig) -> Reconstruction:
-    """The reconstruction of a graph, adjusted by the noise of its images if pycolmap can."""
-    if not found.models:
-        return found
-    from mkpc_kaggle.scene import colmap
-
-    try:
-        return colmap.adjusted(found, graph, config)
-    except (RuntimeError, ValueError):
-        return found
 
 
 def models_of(reconstructions: Sequence[Reconstruction]) -> list[SfmModel]:

@@ -176,7 +176,6 @@ def test_the_incremental_mapper_is_asked_where_the_global_one_leaves_images_out(
         return found[-1]
 
     monkeypatch.setattr(colmap, "run_mapper", run)
-    monkeypatch.setattr(colmap, "adjusted", lambda reconstruction, *_: reconstruction)
     solution = reconstruct_batch(scene.pairs, SceneConfig(shared_intrinsics=0))
     assert len(found) == asked
     assert solution.reconstructions[0].models[0].images is found[0 if fewer else -1].models[0].images
