@@ -160,7 +160,8 @@ class CameraRecord:
     """A camera of a scene: where it is and looks, in its model's units, and its focal length in pixels.
 
     ``down`` is where the image's lower border is; ``size`` are its width and height in pixels. ``model`` numbers
-    the models of the batch, the largest is 0; ``seen`` are the points that the image sees.
+    the models of the batch, the largest is 0; ``seen`` are the points that the image sees. ``sigmas`` are as in
+    :class:`RegisteredImage`.
     """
 
     image: str
@@ -171,6 +172,7 @@ class CameraRecord:
     focal: float
     size: Size
     seen: int
+    sigmas: tuple[float, ...] = ()
 
     @property
     def camera(self) -> Camera:
@@ -184,7 +186,17 @@ class CameraRecord:
     def of(cls, found: RegisteredImage, model: int) -> "CameraRecord":
         R, t = found.camera.R, found.camera.t
         centre, forward, down = (tuple(vector.tolist()) for vector in (-R.T @ t, R[2], R[1]))
-        return cls(found.image.name, model, centre, forward, down, found.focal, found.image.size, found.points)
+        return cls(
+            found.image.name,
+            model,
+            centre,
+            forward,
+            down,
+            found.focal,
+            found.image.size,
+            found.points,
+            found.sigmas,
+        )
 
 
 @dataclass(frozen=True)

@@ -24,6 +24,7 @@ from mkpc_kaggle.scene.export import DATABASE, FORMER, MODELS, PART
 from mkpc_kaggle.scene.keypoints import Index, scene_keypoints
 from mkpc_kaggle.scene.reconstruction import MIN_IMAGES, Reconstruction, RegisteredImage, SfmModel, filter_models
 from mkpc_kaggle.scene.shared_intrinsics import SharedIntrinsics, start_focal
+from mkpc_kaggle.scene.uncertainty import camera_sigmas
 from mkpc_kaggle.scene.view_graph import MIN_MATCHES, Edge, ViewGraph
 
 CENTRE_PX = 0.5  # in COLMAP the top-left pixel's centre is (0.5, 0.5), here it is (0, 0)
@@ -178,13 +179,14 @@ def _mapper_options(images: int, config: SceneConfig) -> tuple[Any, Any]:
 
 
 def _sfm_model(found: Any, graph: ViewGraph) -> SfmModel:
-    images = []
+    images, sigmas = [], camera_sigmas(found)
     for number in sorted(found.reg_image_ids()):
         image = found.images[number]
         pose, K = np.asarray(image.cam_from_world().matrix()), np.array(image.camera.calibration_matrix())
         K[:2, 2] -= CENTRE_PX
         camera = Camera(K, pose[:, :3].copy(), pose[:, 3].copy())
-        images.append(RegisteredImage(graph.images[number - 1], camera, int(image.num_points3D)))
+        known = graph.images[number - 1], camera, int(image.num_points3D), sigmas.get(image.name, ())
+        images.append(RegisteredImage(*known))
     points = np.array([found.points3D[number].xyz for number in sorted(found.point3D_ids())], np.float64)
     points = points.reshape(-1, 3)
     error = float(found.compute_mean_reprojection_error()) if len(points) else 0.0
