@@ -4,7 +4,7 @@ pycolmap can end the process on its own (a failed assertion, memory), and the gl
 pycolmap is imported, a SIGTERM ends the process with a stack trace on stderr. So a caller that cannot afford this
 runs it in a process of its own. Nothing is written to disk, unless COLMAP's files are asked for.
 
-Sources: Schoenberger and Frahm 2016 (the incremental mapper), Pan et al. 2024 (the global mapper).
+Source: Pan et al. 2024 (the global mapper).
 """
 
 import shutil
@@ -32,7 +32,6 @@ MAX_ERROR_PX = 1.0  # of a verified match
 MAX_TRIALS = 300  # of RANSAC for an edge: more find the same inliers at five times the cost
 LARGE = 100  # images; a larger scene has the cost of all its tracks, a smaller scene their accuracy
 TRACKS_PER_IMAGE = 200  # that the global mapper keeps at first in a large scene, the longest
-MIN_REGISTERED = 0.85  # share of a small scene's images below which the other mapper is asked
 SEED = 0
 
 
@@ -40,21 +39,13 @@ def structure_from_motion(graph: ViewGraph, config: SceneConfig, shared: SharedI
     """What pycolmap makes of a view graph; perhaps no model, perhaps several.
 
     Each image has a camera of its own, except those with ``shared`` intrinsics. Cameras start with the shared
-    focal length or that of EXIF, which is refined as any other is. The global mapper goes first. Where it leaves
-    many images of a small scene without a camera, the incremental mapper is asked too, and the reconstruction in
-    which images see points more often stays.
+    focal length or that of EXIF, which is refined as any other is.
     """
     pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
     pycolmap.set_random_seed(SEED)
     with pycolmap.Database.open(":memory:") as database:
         _fill(database, graph, config, shared)
-        images = len(graph.images)
-        for_global, for_incremental = _mapper_options(images, config)
-        found = run_mapper(pycolmap.GlobalPipeline, for_global, database, graph)
-        if images <= LARGE and found.registered < MIN_REGISTERED * images:
-            other = run_mapper(pycolmap.IncrementalPipeline, for_incremental, database, graph)
-            found = max(found, other, key=lambda each: each.observations)
-        return found
+        return run_mapper(database, graph, config.threads)
 
 
 def write_files(
@@ -156,26 +147,18 @@ def verify(
         return list(pool.map(of_edge, edges, matches))
 
 
-def run_mapper(pipeline: Any, options: Any, database: Any, graph: ViewGraph) -> Reconstruction:
-    """The plausible models that a mapper makes of what the database holds."""
-    manager = pycolmap.ReconstructionManager()
-    pipeline(options, database, manager).run()
-    models = filter_models([_sfm_model(manager.get(number), graph) for number in range(manager.size())])
-    return Reconstruction(graph.names, models, "" if models else "no plausible model came of the matches")
-
-
-def _mapper_options(images: int, config: SceneConfig) -> tuple[Any, Any]:
-    """Those of the global and of the incremental mapper for a scene of so many images."""
-    seed, threads = {"random_seed": SEED}, {"num_threads": config.threads}
-    common = {**seed, **threads, "min_model_size": MIN_IMAGES, "min_num_matches": MIN_MATCHES}
+def run_mapper(database: Any, graph: ViewGraph, threads: int) -> Reconstruction:
+    """Return the plausible models that the global mapper makes of a filled database."""
+    seed, common = {"random_seed": SEED}, {"random_seed": SEED, "num_threads": threads}
     parts = dict.fromkeys(("rotation_averaging", "global_positioning", "retriangulation"), seed)
-    required = {"track_required_tracks_per_view": TRACKS_PER_IMAGE} if images > LARGE else {}
-    return (
-        pycolmap.GlobalPipelineOptions({**common, "mapper": {**seed, **threads, **parts, **required}}),
-        pycolmap.IncrementalPipelineOptions(
-            {**common, "extract_colors": False, "mapper": seed, "triangulation": seed}
-        ),
-    )
+    required = {"track_required_tracks_per_view": TRACKS_PER_IMAGE} if len(graph.images) > LARGE else {}
+    mapper = {**common, **parts, **required}
+    limits = {"min_model_size": MIN_IMAGES, "min_num_matches": MIN_MATCHES}
+    manager = pycolmap.ReconstructionManager()
+    options = pycolmap.GlobalPipelineOptions({**common, **limits, "mapper": mapper})
+    pycolmap.GlobalPipeline(options, database, manager).run()
+    models = filter_models([_sfm_model(manager.get(number), graph) for number in range(manager.size())])
+    return Reconstruction(graph.names, models, "" if models else "the matches gave no plausible model")
 
 
 def _sfm_model(found: Any, graph: ViewGraph) -> SfmModel:

@@ -160,27 +160,6 @@ def test_degenerate_matches_give_a_reason(kind):
         assert choice.F is None or np.isfinite(choice.F).all()
 
 
-@pytest.mark.parametrize(("share", "fewer", "asked"), [(1.0, 0, 1), (0.5, 0, 2), (0.5, 9, 2)])
-def test_the_incremental_mapper_is_asked_where_the_global_one_leaves_images_out(
-    scene, monkeypatch, share, fewer, asked
-):
-    """The global mapper is made to find a share of the images, the incremental mapper to see points less often."""
-    made, found = colmap.run_mapper, []
-
-    def run(pipeline: type, *rest: Any) -> Reconstruction:
-        whole = made(pipeline, *rest)
-        (model,) = whole.models
-        kept = model.images[: round(share * 6)] if not found else model.images
-        seen = tuple(replace(image, points=image.points // (10 if found and fewer else 1)) for image in kept)
-        found.append(replace(whole, models=(replace(model, images=seen),)))
-        return found[-1]
-
-    monkeypatch.setattr(colmap, "run_mapper", run)
-    solution = reconstruct_batch(scene.pairs, SceneConfig(shared_intrinsics=0))
-    assert len(found) == asked
-    assert solution.reconstructions[0].models[0].images is found[0 if fewer else -1].models[0].images
-
-
 def test_without_pycolmap_every_scene_says_so(scene, monkeypatch):
     monkeypatch.delitem(sys.modules, "mkpc_kaggle.scene.colmap", raising=False)
     monkeypatch.setitem(sys.modules, "pycolmap", None)
