@@ -1,29 +1,38 @@
 """F by MAGSAC, under a prior on focal lengths, and from the cameras of the batch, on the same matches.
 
-python -m benchmarks.estimation --train-dir DIR --journals DIR [DIR ...] [--scenes NAME ...] [--seeds 1]
-    [--shares 1 0.3 0.12] [--estimates NAME ...] [--pairs-per-image 0 5 10] [--thresholds PIXELS ...]
+python -m benchmarks.estimation --train-dir DIR --journals DIR [DIR ...] [--scenes NAME ...]
+    [--estimates NAME ...] [--thresholds PIXELS ...] [--settings TOML ...]
+    [--images 18 24] [--shares 1 0.3 0.12] [--seeds 8]
 
-The matches are those of journals, work directories of `validate`; pairs that a journal lacks are left out. For
-each journal and share of a scene's pairs, drawn by seed, a row for each estimate: mAA by scene and in the mean,
-its gain over the first estimate with the 95 % interval of resampled pairs, and seconds of this process, a pair or
-a batch. With a number of pairs for each image, the scene also has what the first unit found on extra pairs. With
-thresholds of MAGSAC, there are two rows for each instead: MAGSAC alone, and the prior.
+The matches and each pair's own F are those of journals, work directories of `validate`. A journal made with
+``--min-covisibility 0`` also has the pairs that a scene may add to few pairs; they are not scored.
+
+The unit of evidence is a draw: all images of a scene, or a number of them, and a share of the pairs of these.
+Each journal and share has a table with a row for each estimate: mAA by scene, its gain over the first estimate,
+and seconds of this process, a pair or a batch. Intervals are of resampled images where a scene has one draw, else
+of resampled draws, and in the mean of resampled scenes too. ``--settings`` has a row for each of these lines of a
+recipe's table [scene], such as "cameras = 'image'"; with ``--thresholds`` of MAGSAC there are two rows for each.
 """
 
 import argparse
 import time
+import tomllib
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache, partial
+from itertools import product
 from pathlib import Path
 from statistics import mean
+from typing import TypeAlias
 
 import numpy as np
 from tqdm import tqdm
 
+from mkpc_kaggle.config import from_table
 from mkpc_kaggle.data.competition import TrainScene, TruePair, read_train_side
 from mkpc_kaggle.engine.journal import JournalReader
-from mkpc_kaggle.evaluation.compare import paired_difference
+from mkpc_kaggle.evaluation.compare import Difference, paired_difference
 from mkpc_kaggle.evaluation.validate import error_of
 from mkpc_kaggle.geometry.coordinates import Matrix3
 from mkpc_kaggle.geometry.focal_prior import FocalConfig, FocalPrior, estimate_with_prior
@@ -35,8 +44,27 @@ from mkpc_kaggle.scene.densify import extra_pairs
 from mkpc_kaggle.scene.reconstruct import reconstruct_batch
 from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair, tracks_of
 
+MIN_COVISIBILITY = 0.1  # of a pair that is scored
 MAGSAC = RobustConfig(permutations=1)
 FOCAL = FocalConfig()
+OWN, SCENE = "own F", "scene"
+
+
+@dataclass(frozen=True, eq=False)
+class Known:
+    """A pair, the matches that a journal has of it, and its own F by that journal, ``None`` where that failed."""
+
+    true: TruePair
+    found: PairMatch
+    F: Matrix3 | None
+
+    @property
+    def names(self) -> tuple[str, str]:
+        return self.true.pair.names
+
+
+# The F of each pair; the second list has all pairs of the same images that the journal knows.
+Estimator: TypeAlias = Callable[[Sequence[Known], Sequence[Known]], Sequence[Matrix3 | None]]
 
 
 def with_prior(found: PairMatch, magsac: RobustConfig = MAGSAC) -> Estimate:
@@ -45,182 +73,182 @@ def with_prior(found: PairMatch, magsac: RobustConfig = MAGSAC) -> Estimate:
     return estimate_with_prior(found.matches, priors, magsac, FOCAL)
 
 
-PairEstimates = dict[str, Callable[[PairMatch], Estimate]]
+def by_pair(make: Callable[[PairMatch], Estimate]) -> Estimator:
+    @cache
+    def of_pair(known: Known) -> Matrix3 | None:
+        found = make(known.found)
+        return found.matrix if found.ok else None
 
-PAIR_ESTIMATES: PairEstimates = {
-    "MAGSAC, 8 permutations": lambda found: estimate(found.matches, RobustConfig(permutations=8)),
-    "MAGSAC": lambda found: estimate(found.matches, MAGSAC),
-    "prior": with_prior,
-}
-SCENE = "scene"  # the F of the batch's cameras, or that of the prior where the pair keeps its own
+    return lambda pairs, _: [of_pair(pair) for pair in pairs]
 
 
-def by_threshold(pixels: float) -> PairEstimates:
+def by_threshold(pixels: float) -> dict[str, Estimator]:
     magsac = replace(MAGSAC, threshold=pixels)
     return {
-        f"MAGSAC, {pixels:g} px": lambda found: estimate(found.matches, magsac),
-        f"prior, {pixels:g} px": lambda found: with_prior(found, magsac),
+        f"MAGSAC, {pixels:g} px": by_pair(lambda found: estimate(found.matches, magsac)),
+        f"prior, {pixels:g} px": by_pair(lambda found: with_prior(found, magsac)),
     }
 
 
-def read_journal(directory: Path) -> tuple[str, dict[str, PairMatch]]:
-    """The recipe's name, and by the ids of pairs what was found on them."""
+PAIR_ESTIMATORS: dict[str, Estimator] = {
+    "MAGSAC, 8 permutations": by_pair(lambda found: estimate(found.matches, RobustConfig())),
+    "MAGSAC": by_pair(lambda found: estimate(found.matches, MAGSAC)),
+    "prior": by_pair(with_prior),
+    OWN: lambda pairs, _: [pair.F for pair in pairs],
+}
+
+
+def by_scene(settings: str, pairs: Sequence[Known], every: Sequence[Known]) -> list[Matrix3 | None]:
+    """The F of the pairs as one batch, with the first unit's matches of extra pairs."""
+    config = from_table(SceneConfig, tomllib.loads(settings), settings)
+    batch = [batch_pair(pair.true, pair.found, pair.F) for pair in pairs]
+    for extra in extra_of(pairs, every, config):
+        batch.append(batch_pair(extra.true, replace(extra.found, results=extra.found.results[:1])))
+    choices = reconstruct_batch(batch, config).choices[: len(pairs)]
+    return [pair.F if choice.F is None else choice.F for pair, choice in zip(pairs, choices, strict=True)]
+
+
+def batch_pair(true: TruePair, found: PairMatch, F: Matrix3 | None = None) -> BatchPair:
+    """A pair as a reconstruction is given it."""
+    image0, image1 = (
+        BatchImage(name, name, size) for name, size in zip(true.pair.names, found.sizes, strict=True)
+    )
+    return BatchPair(image0, image1, found.matches, F, tracks_of(found.results))
+
+
+def extra_of(pairs: Sequence[Known], every: Sequence[Known], config: SceneConfig) -> list[Known]:
+    """The pairs that the engine would add to these."""
+    names = list(dict.fromkeys(name for pair in pairs for name in pair.names))
+    ends = [(names.index(first), names.index(second)) for first, second in (pair.names for pair in pairs)]
+    chosen = extra_pairs(len(names), ends, config.pairs_per_image)
+    wanted = {frozenset((names[first], names[second])) for first, second in chosen}
+    return [pair for pair in every if frozenset(pair.names) in wanted]
+
+
+def read_journal(directory: Path) -> tuple[str, dict[str, tuple[PairMatch, Matrix3 | None]]]:
+    """The recipe's name, and by the ids of pairs what was found on them and their own F."""
     with JournalReader(directory) as journal:
         recipe = recipe_of(journal.belongs_to()["recipe"], journal.about().recipe)
         units, pairs = {unit.name: unit for unit in recipe.units}, journal.pairs()
         records = [record for index, record in journal.records().items() if index < len(pairs) and record.sizes]
-        found = {pairs[r.index].id: PairMatch(journal.results(r, units), sizes=r.sizes) for r in records}
+        found = {
+            pairs[r.index].id: (
+                PairMatch(journal.results(r, units), sizes=r.sizes),
+                None if r.failure else r.pair_fundamental,
+            )
+            for r in records
+        }
     return recipe.name, found
 
 
 @dataclass(frozen=True, eq=False)
-class Estimated:
-    """A pair with its matches, and by estimate its F (``None`` where it failed), its accuracy and seconds."""
-
-    true: TruePair
-    found: PairMatch
-    matrices: Mapping[str, Matrix3 | None]
-    accuracies: Mapping[str, float]
-    seconds: Mapping[str, float]
-
-
-@dataclass(frozen=True)
 class Score:
-    """What one estimate made of the chosen pairs of one scene: their accuracies, and seconds in all."""
+    """What an estimate made of a draw of a scene: its pairs' accuracies, their images, and seconds in all."""
 
-    accuracies: tuple[float, ...]
+    accuracies: list[float]
+    images: list[tuple[str, str]]
     seconds: float
 
 
-def accuracy(F: Matrix3 | None, true: TruePair, scene: TrainScene) -> float:
-    return pair_accuracy(PoseError.failed() if F is None else error_of(F, true, scene))
-
-
-def estimated(true: TruePair, found: PairMatch, scene: TrainScene, estimates: PairEstimates) -> Estimated:
-    """A pair by every estimate of pairs that is wanted; the prior's is what a scene is compared with."""
-    matrices: dict[str, Matrix3 | None] = {}
-    seconds = {}
-    for name, make in estimates.items():
-        start = time.process_time()
-        result = make(found)
-        seconds[name] = time.process_time() - start
-        matrices[name] = result.matrix if result.ok else None
-    accuracies = {name: accuracy(F, true, scene) for name, F in matrices.items()}
-    return Estimated(true, found, matrices, accuracies, seconds)
-
-
-def batch_pair(true: TruePair, found: PairMatch, F: Matrix3 | None) -> BatchPair:
-    """A pair as a reconstruction is given it."""
-    ends = zip(true.pair.images, found.sizes, strict=True)
-    image0, image1 = (BatchImage(path.stem, path.stem, size) for path, size in ends)
-    return BatchPair(image0, image1, found.matches, F, tracks_of(found.results))
-
-
-def by_scene(pairs: Sequence[Estimated], scene: TrainScene, extra: Sequence[Estimated] = ()) -> Score:
-    """The accuracy of the pairs as one batch; of the ``extra`` pairs the first unit's matches join it."""
-    batch = [batch_pair(pair.true, pair.found, pair.matrices["prior"]) for pair in pairs]
-    swept = [(pair.true, replace(pair.found, results=pair.found.results[:1])) for pair in extra]
-    batch += [batch_pair(true, found, None) for true, found in swept]
+def score(make: Estimator, pairs: Sequence[Known], every: Sequence[Known], scene: TrainScene) -> Score:
     start = time.process_time()
-    choices = reconstruct_batch(batch, SceneConfig()).choices[: len(pairs)]
+    matrices = make(pairs, every)
     seconds = time.process_time() - start
-    matrices = [
-        pair.matrices["prior"] if choice.F is None else choice.F
-        for pair, choice in zip(pairs, choices, strict=True)
+    errors = [
+        PoseError.failed() if F is None else error_of(F, pair.true, scene)
+        for F, pair in zip(matrices, pairs, strict=True)
     ]
-    return Score(tuple(accuracy(F, pair.true, scene) for F, pair in zip(matrices, pairs, strict=True)), seconds)
+    return Score([*map(pair_accuracy, errors)], [pair.names for pair in pairs], seconds)
 
 
-def extra_of(pairs: Sequence[Estimated], every: Sequence[Estimated], per_image: float) -> list[Estimated]:
-    """The pairs that these lack to have ``per_image`` for each of their images, as the engine chooses them."""
-    ends = [[path.stem for path in pair.true.pair.images] for pair in pairs]
-    names = list(dict.fromkeys(name for pair in ends for name in pair))
-    chosen = extra_pairs(len(names), [(names.index(a), names.index(b)) for a, b in ends], per_image)
-    wanted = {frozenset((names[first], names[second])) for first, second in chosen}
-    return [pair for pair in every if {path.stem for path in pair.true.pair.images} in wanted]
+def drawn(every: Sequence[Known], images: int, share: float, seed: int) -> tuple[list[Known], list[Known]]:
+    """The pairs to score of so many images, 0 for all, and all pairs of these images; in their order."""
+    generator = np.random.default_rng(seed)
+    names = sorted({name for pair in every for name in pair.names})
+    chosen = set(generator.permutation(names)[: images or None].tolist())
+    inside = [pair for pair in every if chosen >= set(pair.names)]
+    scored = [pair for pair in inside if pair.true.covisibility >= MIN_COVISIBILITY]
+    kept = np.sort(generator.permutation(len(scored))[: round(share * len(scored))])
+    return [scored[index] for index in kept], inside
 
 
-def drawn(pairs: Sequence[Estimated], share: float, seed: int) -> list[Estimated]:
-    """That share of the pairs, in their order."""
-    count = round(share * len(pairs))
-    places = np.sort(np.random.default_rng(seed).choice(len(pairs), count, replace=False))
-    return [pairs[place] for place in places]
+# By scene, for each of its draws the score of each estimate.
+Draws: TypeAlias = Mapping[str, Sequence[Mapping[str, Score]]]
 
 
-def score_all(
-    pairs: Sequence[Estimated], every: Sequence[Estimated], scene: TrainScene, names: Mapping[str, float]
-) -> dict[str, Score]:
-    """By estimate; ``names`` has the pairs for each image that a scene gets."""
-    return {
-        name: by_scene(pairs, scene, extra_of(pairs, every, per_image))
-        if name.startswith(SCENE)
-        else Score(tuple(pair.accuracies[name] for pair in pairs), sum(pair.seconds[name] for pair in pairs))
-        for name, per_image in names.items()
-    }
+def difference(draws: Draws, first: str, second: str) -> Difference:
+    """The gain of an estimate with its interval: over images where each scene is one draw, else over draws."""
+    both = [(scene, each[first], each[second]) for scene, scores in draws.items() for each in scores]
+    if len(both) == len(draws):
+        return paired_difference([(a.accuracies, b.accuracies, a.images) for _, a, b in both])
+    firsts, seconds = [mean(a.accuracies) for _, a, _ in both], [mean(b.accuracies) for *_, b in both]
+    return paired_difference([(firsts, seconds, [(scene, f"draw {n}") for n, (scene, *_) in enumerate(both)])])
 
 
-def table(title: str, done: Mapping[str, Sequence[Mapping[str, Score]]], names: Sequence[str]) -> list[str]:
-    """Markdown; ``done``: by scene, for each seed the scores by estimate, whose pairs count together."""
-    joined = {
-        name: {
-            scene: [value for scores in seeds for value in scores[name].accuracies]
-            for scene, seeds in done.items()
-        }
-        for name in names
-    }
-    counts = [f"{scene} ({len(values)})" for scene, values in joined[names[0]].items()]
+def table(title: str, draws: Draws, names: Sequence[str]) -> list[str]:
+    """Markdown; the second row of an estimate has its gain by scene, then lines with its gain by draw."""
+    counts = [f"{name} ({len(scores)})" for name, scores in draws.items()]
     lines = [f"| {title} | {' | '.join(counts)} | mean | gain over the first | seconds |"]
     lines.append("|" + " --- |" * (len(counts) + 4))
+    by_draw = []
     for name in names:
-        means = [mean(values) for values in joined[name].values()]
-        cells = " | ".join(f"{value:.3f}" for value in (*means, mean(means)))
-        spent = [scores[name] for seeds in done.values() for scores in seeds]
-        runs = len(spent) if name.startswith(SCENE) else sum(len(score.accuracies) for score in spent)
-        seconds = sum(score.seconds for score in spent) / runs
-        gain = str(paired_difference(list(zip(joined[names[0]].values(), joined[name].values(), strict=True))))
-        lines.append(f"| {name} | {cells} | {'' if name == names[0] else gain} | {seconds:.2f} |")
-        if name != names[0]:
-            gains = [str(paired_difference([(joined[names[0]][scene], joined[name][scene])])) for scene in done]
+        maas = {scene: [mean(each[name].accuracies) for each in scores] for scene, scores in draws.items()}
+        means = [mean(values) for values in maas.values()]
+        spent = [each[name] for scores in draws.values() for each in scores]
+        runs = len(spent) if name.startswith(SCENE) else sum(len(each.accuracies) for each in spent)
+        cells = [f"{value:.3f}" for value in (*means, mean(means))]
+        gain = "" if name == names[0] else str(difference(draws, names[0], name))
+        lines.append(
+            f"| {name} | {' | '.join(cells)} | {gain} | {sum(each.seconds for each in spent) / runs:.2f} |"
+        )
+        if gain:
+            gains = [str(difference({scene: scores}, names[0], name)) for scene, scores in draws.items()]
             lines.append(f"| its gain | {' | '.join(gains)} | | | |")
-    return lines
+        for scene, values in maas.items():
+            first = [mean(each[names[0]].accuracies) for each in draws[scene]]
+            shown = [
+                f"{value - other:+.3f}" if gain else f"{value:.3f}"
+                for value, other in zip(values, first, strict=True)
+            ]
+            by_draw.append(f"{name}, {scene}: {', '.join(shown)}")
+    return lines + (["", *by_draw] if any(len(scores) > 1 for scores in draws.values()) else [])
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--train-dir", type=Path, required=True)
     parser.add_argument("--journals", type=Path, nargs="+", required=True)
-    parser.add_argument("--thresholds", type=float, nargs="+")
+    parser.add_argument("--thresholds", type=float, nargs="+", default=())
     parser.add_argument("--scenes", nargs="*", default=())
+    parser.add_argument("--images", nargs="+", type=int, default=[0], help="of a draw; 0, the default: all")
     parser.add_argument("--shares", nargs="+", type=float, default=[1.0])
-    parser.add_argument("--seeds", type=int, default=1, help="samples of each share below 1")
-    names = [*PAIR_ESTIMATES, SCENE]
+    parser.add_argument("--seeds", type=int, default=1, help="draws of each number of images and share")
+    names = [*PAIR_ESTIMATORS, SCENE]
     parser.add_argument("--estimates", nargs="+", choices=names, default=names)
-    parser.add_argument("--pairs-per-image", nargs="+", type=float, default=[0.0])
+    parser.add_argument("--settings", nargs="+", default=[""], metavar="TOML")
     arguments = parser.parse_args()
-    wanted = {name: make for name, make in PAIR_ESTIMATES.items() if name in (*arguments.estimates, "prior")}
-    chosen_names = {name: 0.0 for name in arguments.estimates if name != SCENE}
+    estimators = {name: PAIR_ESTIMATORS[name] for name in arguments.estimates if name != SCENE}
     if arguments.thresholds:
-        wanted = {name: make for pixels in arguments.thresholds for name, make in by_threshold(pixels).items()}
-        chosen_names = dict.fromkeys(wanted, 0.0)
+        estimators = {name: make for pixels in arguments.thresholds for name, make in by_threshold(pixels).items()}
     elif SCENE in arguments.estimates:
-        counts = arguments.pairs_per_image
-        chosen_names |= {f"{SCENE}, {count:g} pairs an image" if count else SCENE: count for count in counts}
+        settings = arguments.settings
+        estimators |= {f"{SCENE}, {line}" if line else SCENE: partial(by_scene, line) for line in settings}
     for directory in arguments.journals:
-        recipe, known = read_journal(directory)
+        recipe, journal = read_journal(directory)
         done: dict[float, dict[str, list[dict[str, Score]]]] = defaultdict(lambda: defaultdict(list))
-        for scene in read_train_side(arguments.train_dir, scenes=arguments.scenes):
-            pairs = [
-                estimated(true, known[true.pair.id], scene, wanted)
-                for true in tqdm(scene.pairs, desc=f"{recipe}, {scene.name}", smoothing=0.05)
-                if true.pair.id in known
-            ]
-            for share in arguments.shares:
-                for seed in range(arguments.seeds if share < 1 else 1):
-                    if chosen := drawn(pairs, share, seed):
-                        done[share][scene.name].append(score_all(chosen, pairs, scene, chosen_names))
-        for share, by_name in done.items():
-            lines = table(f"{recipe}, {share:.0%} of the pairs", by_name, list(chosen_names))
-            print("\n".join(lines), "\n", flush=True)
+        for scene in read_train_side(arguments.train_dir, scenes=arguments.scenes, min_covisibility=0):
+            every = [Known(true, *journal[true.pair.id]) for true in scene.pairs if true.pair.id in journal]
+            plan = [*product(arguments.shares, arguments.images, range(arguments.seeds))] if every else []
+            for share, images, seed in tqdm(plan, desc=f"{recipe}, {scene.name}"):
+                if seed and not images and share == 1:
+                    continue  # all of a scene: there is but one draw
+                pairs, inside = drawn(every, images, share, seed)
+                scores = {name: score(make, pairs, inside, scene) for name, make in estimators.items()}
+                done[share][scene.name].append(scores)
+        for share, draws in done.items():
+            print(
+                "\n".join(table(f"{recipe}, {share:.0%} of the pairs", draws, list(estimators))), "\n", flush=True
+            )
 
 
 if __name__ == "__main__":

@@ -24,7 +24,7 @@ from tqdm import tqdm
 from mkpc_kaggle.data.competition import TrainScene, TruePair, read_train_side
 from mkpc_kaggle.data.images import ImageStore, Unreadable
 from mkpc_kaggle.engine.jobs import visiting_order
-from mkpc_kaggle.evaluation.compare import Difference, paired_difference
+from mkpc_kaggle.evaluation.compare import Difference, Paired, paired_difference
 from mkpc_kaggle.evaluation.validate import error_of
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.metrics import PoseError, pair_accuracy, pose_auc
@@ -199,7 +199,7 @@ class Tables:
     """What was found, by scene, on the pairs that are done."""
 
     scenes: Mapping[str, Sequence[Mapping[str, Found]]]
-    covisibility: Mapping[str, Sequence[float]]
+    pairs: Mapping[str, Sequence[TruePair]]
 
     @classmethod
     def of(cls, scenes: Sequence[TrainScene], results: ResultsFile) -> "Tables":
@@ -207,7 +207,7 @@ class Tables:
         done = {name: pairs for name, pairs in done.items() if pairs}
         return cls(
             {name: [results.found[true.pair.id] for true in pairs] for name, pairs in done.items()},
-            {name: [true.covisibility for true in pairs] for name, pairs in done.items()},
+            done,
         )
 
     def markdown(self, ways: Sequence[Way]) -> Iterator[str]:
@@ -249,30 +249,32 @@ class Tables:
 
     def gains_by_covisibility(self, contrasts: Iterable[tuple[Way, Way]]) -> Iterator[str]:
         """A row a contrast, a column a range of covisibility: gains in mAA with intervals."""
-        pairs = [
-            (pair, covisibility)
-            for name, found in self.scenes.items()
-            for pair, covisibility in zip(found, self.covisibility[name], strict=True)
-        ]
+        every = [item for name, found in self.scenes.items() for item in zip(found, self.pairs[name], strict=True)]
         ranges = [
-            (f"{low} to {high}", [pair for pair, covisibility in pairs if low <= covisibility < high])
+            (f"{low} to {high}", [item for item in every if low <= item[1].covisibility < high])
             for low, high in pairwise(COVISIBILITIES)
         ]
         ranges = [(name, some) for name, some in ranges if some]
         yield from _head(["way", "against", *(f"{name} ({len(some)} pairs)" for name, some in ranges)])
         for first, second in contrasts:
-            cells = [str(paired_difference([_accuracies(some, first, second)])) for _, some in ranges]
+            cells = [
+                str(paired_difference([_accuracies(*zip(*some, strict=True), first, second)]))
+                for _, some in ranges
+            ]
             yield _row([second.name, first.name, *cells])
 
     def difference(self, first: Way, second: Way, scenes: Sequence[str]) -> Difference:
-        values = [_accuracies(self.scenes[name], first, second) for name in scenes]
-        return paired_difference(values)
+        return paired_difference(
+            [_accuracies(self.scenes[name], self.pairs[name], first, second) for name in scenes]
+        )
 
 
-def _accuracies(pairs: Sequence[Mapping[str, Found]], first: Way, second: Way) -> tuple[list[float], list[float]]:
-    """The accuracies of the same pairs in two ways."""
-    accuracies, others = ([pair_accuracy(pair[way.name].error) for pair in pairs] for way in (first, second))
-    return accuracies, others
+def _accuracies(
+    found: Sequence[Mapping[str, Found]], pairs: Sequence[TruePair], first: Way, second: Way
+) -> Paired:
+    """Return the accuracies of the same pairs in two ways, and the pairs' images."""
+    accuracies, others = ([pair_accuracy(each[way.name].error) for each in found] for way in (first, second))
+    return accuracies, others, [(true.pair.file0, true.pair.file1) for true in pairs]
 
 
 def _head(cells: Sequence[str]) -> list[str]:

@@ -29,6 +29,8 @@ OUT gets, for a folder in DIR in a folder of its name:
   models/0, 1...  COLMAP's binary models, the largest first
 and for all together:
   cameras.csv     image, model, K, R, t: X_cam = R X + t, (0, 0) is the first pixel's centre; numbers joined by ;
+                  and how sure each camera is: rotation_sigma (degrees), centre_sigma (of the model's size),
+                  focal_sigma (percent); see docs/running.md
   submission.csv  with --format
   report.html     the run, with the cameras and points of each model
   work/           the journal: killed at any point, the same command goes on, and ends with the same files

@@ -461,9 +461,10 @@ class Journal(JournalReader):
             ).fetchone()
             for camera in scene.cameras:
                 axes = map(np_bytes, (camera.centre, camera.forward, camera.down))
-                values = (camera.model, *axes, camera.focal, *camera.size, camera.seen)
+                sigmas = camera.sigmas or (None, None, None)
+                values = (camera.model, *axes, camera.focal, *camera.size, camera.seen, *sigmas)
                 row = (revision, printable(camera.image), camera.digest, *values)
-                db.execute(f"INSERT INTO camera VALUES ({', '.join('?' * 11)})", row)
+                db.execute(f"INSERT INTO camera VALUES ({', '.join('?' * 14)})", row)
             for model, cloud in enumerate(scene.clouds):
                 db.execute("INSERT INTO cloud VALUES (?, ?, ?)", (revision, model, np_bytes(cloud)))
             rows = (
@@ -551,9 +552,10 @@ def np_bytes(values: Any) -> bytes:
 
 
 def _camera(row: Sequence[Any]) -> CameraRecord:
-    _, image, digest, model, *axes, focal, width, height, seen = row
+    _, image, digest, model, *axes, focal, width, height, seen, rotation, centre_sigma, focal_sigma = row
     centre, forward, down = (tuple(vector_of(blob).tolist()) for blob in axes)
-    return CameraRecord(image, digest, model, centre, forward, down, focal, Size(width, height), seen)
+    sigmas = () if rotation is None else (rotation, centre_sigma, focal_sigma)
+    return CameraRecord(image, digest, model, centre, forward, down, focal, Size(width, height), seen, sigmas)
 
 
 def _cloud(row: Sequence[Any]) -> tuple[Any, ...]:

@@ -98,7 +98,8 @@ class CameraRecord:
     """A camera of a scene: centre and axes in its model's units, focal length and size in pixels.
 
     ``down`` points to the image's lower border. ``digest`` identifies the image's content. ``model`` numbers the
-    models of the batch, 0 is the largest. ``seen`` is the number of points that the image sees.
+    models of the batch, 0 is the largest. ``seen`` is the number of points that the image sees. ``sigmas`` are as in
+    :class:`RegisteredImage`.
     """
 
     image: str
@@ -110,6 +111,7 @@ class CameraRecord:
     focal: float
     size: Size
     seen: int
+    sigmas: tuple[float, ...] = ()
 
     @property
     def camera(self) -> Camera:
@@ -123,7 +125,8 @@ class CameraRecord:
     def of(cls, found: RegisteredImage, model: int) -> "CameraRecord":
         R, t, image = found.camera.R, found.camera.t, found.image
         centre, forward, down = (tuple(vector.tolist()) for vector in (-R.T @ t, R[2], R[1]))
-        return cls(image.name, image.digest, model, centre, forward, down, found.focal, image.size, found.points)
+        size, points, sigmas = image.size, found.points, found.sigmas
+        return cls(image.name, image.digest, model, centre, forward, down, found.focal, size, points, sigmas)
 
 
 @dataclass(frozen=True)

@@ -126,7 +126,10 @@ CREATE TABLE camera (  -- centre, forward and down: three float64 numbers each
     focal REAL NOT NULL CHECK (focal > 0),
     width INTEGER NOT NULL CHECK (width > 0),
     height INTEGER NOT NULL CHECK (height > 0),
-    seen INTEGER NOT NULL CHECK (seen >= 0)
+    seen INTEGER NOT NULL CHECK (seen >= 0),
+    rotation_sigma REAL,  -- degrees; NULL where the standard deviations are unknown
+    centre_sigma REAL,  -- a share of the model's size
+    focal_sigma REAL  -- percent
 ) STRICT;
 CREATE INDEX camera_of_scene ON camera (scene);
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from math import nan
 from statistics import mean
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,9 @@ from mkpc_kaggle.evaluation.validate import Validation, to_json
 
 LEVEL = 0.95
 RESAMPLES = 10_000
+
+# The values of the same pairs under a first and under a second recipe, and the two images of each pair.
+Paired: TypeAlias = tuple[Sequence[float], Sequence[float], Sequence[tuple[str, str]]]
 
 
 @dataclass(frozen=True)
@@ -28,30 +31,37 @@ class Difference:
         return f"{self.gain:+z.4f} [{self.low:+z.4f}, {self.high:+z.4f}]"
 
 
-def paired_difference(scenes: Sequence[tuple[Sequence[float], Sequence[float]]]) -> Difference:
-    """The mean over scenes of the mean gain on a pair, from the pairs' values under the first and second recipe.
+def paired_difference(scenes: Sequence[Paired]) -> Difference:
+    """Return the mean over scenes of the mean gain of a pair, with its interval.
 
-    Both values of a pair have the same index. The interval is the percentile bootstrap's: the pairs of each
-    scene are resampled with replacement, :data:`RESAMPLES` times; the scenes stay. It assumes independent pairs,
-    which pairs that share an image are not quite. The same input gives the same interval. ``ValueError`` without
-    scenes, for a scene without pairs, and if the two have different numbers of pairs.
-    Source: Efron and Tibshirani, An Introduction to the Bootstrap, 13.3.
+    Pairs that share an image are not independent. So images are resampled, not pairs: each image of a scene gets
+    a random weight, and a pair counts by the product of its images' weights. Scenes are not resampled. The same
+    input gives the same interval. Where pairs share no image, the interval is up to 1.7 times too wide.
+
+    Raises ``ValueError`` without scenes, for a scene without pairs, and if values and images differ in number.
+    Sources: Rubin 1981 (exponential weights); Owen 2007 (products of weights).
     """
-    if not scenes or any(len(first) != len(second) or not len(first) for first, second in scenes):
+    if not scenes or any(not len(first) == len(second) == len(images) > 0 for first, second, images in scenes):
         raise ValueError("a comparison needs scenes, and each with the same pairs under both recipes")
     generator = np.random.default_rng(0)
-    gains = [np.asarray(second, np.float64) - np.asarray(first, np.float64) for first, second in scenes]
-    means = np.mean([_means_of_resamples(gain, generator) for gain in gains], axis=0)
-    low, high = np.quantile(means, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
+    gains = [np.asarray(second, np.float64) - np.asarray(first, np.float64) for first, second, _ in scenes]
+    means = [_resampled_means(gain, scene[2], generator) for gain, scene in zip(gains, scenes, strict=True)]
+    low, high = np.quantile(np.mean(means, axis=0), [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
     return Difference(mean(float(gain.mean()) for gain in gains), float(low), float(high))
 
 
-def _means_of_resamples(gains: NDArray[np.float64], generator: np.random.Generator) -> NDArray[np.float64]:
-    """(RESAMPLES,) means of as many pairs as there are, drawn with replacement."""
-    # Accuracies are multiples of 0.1: drawing the count of each value is equivalent to drawing pairs, and faster.
-    values, counts = np.unique(gains.round(12), return_counts=True)
-    drawn = generator.multinomial(len(gains), counts / len(gains), size=RESAMPLES)
-    return np.asarray(drawn @ values / len(gains))
+def _resampled_means(
+    gains: NDArray[np.float64], images: Sequence[tuple[str, str]], generator: np.random.Generator
+) -> NDArray[np.float64]:
+    """Return (RESAMPLES,) means of the gains, (P,), each under other weights of the images."""
+    _, ends = np.unique(np.array(images), return_inverse=True)
+    ends = ends.reshape(-1, 2)
+    table = np.zeros((2, ends.max() + 1, ends.max() + 1))  # sums of gains, and numbers of pairs, by their images
+    np.add.at(table[0], (ends[:, 0], ends[:, 1]), gains)
+    np.add.at(table[1], (ends[:, 0], ends[:, 1]), 1.0)
+    weights = generator.exponential(size=(RESAMPLES, table.shape[1]))
+    total, count = ((weights @ each * weights).sum(axis=1) for each in table)
+    return np.asarray(total / count)
 
 
 @dataclass(frozen=True)
@@ -68,8 +78,8 @@ class Comparison:
     def difference(self, number: int, scene: str | None = None) -> Difference:
         """MAA of the validation of that number less the first's, in a scene or as the mean over scenes."""
         runs = self.validations[0], self.validations[number]
-        values = [[part.accuracies() for part in run.scenes if scene in (None, part.scene)] for run in runs]
-        return paired_difference([*zip(*values, strict=True)])
+        parts = [[part for part in run.scenes if scene in (None, part.scene)] for run in runs]
+        return paired_difference([(a.accuracies(), b.accuracies(), a.images) for a, b in zip(*parts, strict=True)])
 
 
 def seconds_per_pair(validation: Validation) -> float:
@@ -98,9 +108,9 @@ def step_gains(validation: Validation) -> list[str]:
     scenes = [scene for scene in validation.scenes if scene.in_metres]
     lines = []
     for steps in pairwise(validation.steps if scenes else ()):
-        before, after = ([scene.accuracies(step) for scene in scenes] for step in steps)
-        difference = paired_difference([*zip(before, after, strict=True)])
-        lines.append(f"gain of {steps[1]} over the step before, {LEVEL:.0%} interval: {difference}")
+        first, second = steps
+        difference = paired_difference([(s.accuracies(first), s.accuracies(second), s.images) for s in scenes])
+        lines.append(f"gain of {second} over the step before, {LEVEL:.0%} interval: {difference}")
     return lines
 
 

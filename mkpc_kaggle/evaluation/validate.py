@@ -39,6 +39,7 @@ class PairScore:
     """
 
     id: str
+    images: tuple[str, str]
     covisibility: float
     error: PoseError
     record: PairRecord | None = None
@@ -56,6 +57,10 @@ class SceneScore:
     @property
     def errors(self) -> list[PoseError]:
         return [pair.error for pair in self.pairs]
+
+    @property
+    def images(self) -> list[tuple[str, str]]:
+        return [pair.images for pair in self.pairs]
 
     def accuracies(self, step: Step | None = None) -> list[float]:
         """The accuracy of each pair after a step, by default the last."""
@@ -122,7 +127,7 @@ def score_record(true: TruePair, record: PairRecord, scene: TrainScene, steps: S
     }
     errors = {step: error_of(matrix, true, scene) for step, matrix in matrices.items()}
     made = {step: errors[step] for step in steps}
-    return PairScore(true.pair.id, true.covisibility, errors[Step.SCENE], record, made)
+    return PairScore(true.pair.id, true.pair.names, true.covisibility, errors[Step.SCENE], record, made)
 
 
 def error_of(matrix: Matrix3 | None, true: TruePair, scene: TrainScene) -> PoseError:
@@ -154,8 +159,11 @@ def score_submission(submission: Path, truth: Path, scenes: Sequence[TrainScene]
     for there in scenes:
         of_scene = [(true, *known[true.pair.id]) for true in there.pairs if true.pair.id in known]
         missing += [sample for _, sample, F in of_scene if F is None]
-        pairs = [PairScore(true.pair.id, true.covisibility, error_of(F, true, there)) for true, _, F in of_scene]
-        scored += [SceneScore(there.name, tuple(pairs))] if pairs else []
+        pairs = tuple(
+            PairScore(true.pair.id, true.pair.names, true.covisibility, error_of(F, true, there))
+            for true, _, F in of_scene
+        )
+        scored += [SceneScore(there.name, pairs)] if pairs else []
     if len(missing) == sum(len(scene.pairs) for scene in scored):
         raise UserError(f"{truth} names no pair of the scenes that {submission} has a row for")
     return Validation(submission.name, tuple(scored), missing=tuple(missing))

@@ -31,15 +31,16 @@ def write_tables(out: Path, cameras: Cameras, root: Path, form: str | None) -> N
 
 
 def camera_rows(cameras: Cameras, root: Path) -> Iterator[Sequence[str]]:
-    """A row for each image with a camera: its path below the folder, its model, K, R and t.
+    """A row for each image with a camera: its path below the folder, its model, K, R, t, and its ``Sigmas``.
 
-    The centre of an image's first pixel is (0, 0); X_cam = R X + t.
+    The centre of an image's first pixel is (0, 0); X_cam = R X + t. Unknown sigmas are empty cells.
     """
-    yield "image", "model", "K", "R", "t"
+    yield "image", "model", "K", "R", "t", "rotation_sigma", "centre_sigma", "focal_sigma"
     for file, record in (item for found in cameras.values() for item in found.items()):
         if record is not None:
             parts = record.camera.K, record.camera.R, record.camera.t
-            yield file.relative_to(root).as_posix(), str(record.model), *map(joined, parts)
+            sigmas = [f"{value:g}" for value in record.sigmas] or [""] * 3
+            yield file.relative_to(root).as_posix(), str(record.model), *map(joined, parts), *sigmas
 
 
 def submission_rows(form: str, cameras: Cameras, root: Path) -> Iterator[Sequence[str]]:

@@ -4,13 +4,12 @@ pycolmap can end the process on its own (a failed assertion, memory), and the gl
 pycolmap is imported, a SIGTERM ends the process with a stack trace on stderr. So a caller that cannot afford this
 runs it in a process of its own. Nothing is written to disk, unless COLMAP's files are asked for.
 
-Sources: Schoenberger and Frahm 2016 (the incremental mapper), Pan et al. 2024 (the global mapper).
+Source: Pan et al. 2024 (the global mapper).
 """
 
 import shutil
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -23,9 +22,9 @@ from mkpc_kaggle.geometry.coordinates import Points, Size
 from mkpc_kaggle.recipe import SceneConfig
 from mkpc_kaggle.scene.export import DATABASE, FORMER, MODELS, PART
 from mkpc_kaggle.scene.keypoints import Index, scene_keypoints
-from mkpc_kaggle.scene.noise import adjust_by_noise
 from mkpc_kaggle.scene.reconstruction import MIN_IMAGES, Reconstruction, RegisteredImage, SfmModel, filter_models
 from mkpc_kaggle.scene.shared_intrinsics import SharedIntrinsics, start_focal
+from mkpc_kaggle.scene.uncertainty import camera_sigmas
 from mkpc_kaggle.scene.view_graph import MIN_MATCHES, Edge, ViewGraph
 
 CENTRE_PX = 0.5  # in COLMAP the top-left pixel's centre is (0.5, 0.5), here it is (0, 0)
@@ -33,7 +32,6 @@ MAX_ERROR_PX = 1.0  # of a verified match
 MAX_TRIALS = 300  # of RANSAC for an edge: more find the same inliers at five times the cost
 LARGE = 100  # images; a larger scene has the cost of all its tracks, a smaller scene their accuracy
 TRACKS_PER_IMAGE = 200  # that the global mapper keeps at first in a large scene, the longest
-MIN_REGISTERED = 0.85  # share of a small scene's images below which the other mapper is asked
 SEED = 0
 
 
@@ -41,28 +39,13 @@ def structure_from_motion(graph: ViewGraph, config: SceneConfig, shared: SharedI
     """What pycolmap makes of a view graph; perhaps no model, perhaps several.
 
     Each image has a camera of its own, except those with ``shared`` intrinsics. Cameras start with the shared
-    focal length or that of EXIF, which is refined as any other is. The global mapper goes first. Where it leaves
-    many images of a small scene without a camera, the incremental mapper is asked too, and the reconstruction in
-    which images see points more often stays.
+    focal length or that of EXIF, which is refined as any other is.
     """
     pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
     pycolmap.set_random_seed(SEED)
     with pycolmap.Database.open(":memory:") as database:
         _fill(database, graph, config, shared)
-        images = len(graph.images)
-        for_global, for_incremental = _mapper_options(images, config)
-        found = run_mapper(pycolmap.GlobalPipeline, for_global, database, graph)
-        if images <= LARGE and found.registered < MIN_REGISTERED * images:
-            other = run_mapper(pycolmap.IncrementalPipeline, for_incremental, database, graph)
-            found = max(found, other, key=lambda each: each.observations)
-        return found
-
-
-def adjusted(found: Reconstruction, graph: ViewGraph, config: SceneConfig) -> Reconstruction:
-    """The reconstruction of a graph, each of its models adjusted by the noise of its images, in its place."""
-    for model in found.models:
-        adjust_by_noise(model.colmap, config.threads)
-    return replace(found, models=filter_models([_sfm_model(model.colmap, graph) for model in found.models]))
+        return run_mapper(database, graph, config.threads)
 
 
 def write_files(
@@ -164,36 +147,29 @@ def verify(
         return list(pool.map(of_edge, edges, matches))
 
 
-def run_mapper(pipeline: Any, options: Any, database: Any, graph: ViewGraph) -> Reconstruction:
-    """The plausible models that a mapper makes of what the database holds."""
-    manager = pycolmap.ReconstructionManager()
-    pipeline(options, database, manager).run()
-    models = filter_models([_sfm_model(manager.get(number), graph) for number in range(manager.size())])
-    return Reconstruction(graph.names, models, "" if models else "no plausible model came of the matches")
-
-
-def _mapper_options(images: int, config: SceneConfig) -> tuple[Any, Any]:
-    """Those of the global and of the incremental mapper for a scene of so many images."""
-    seed, threads = {"random_seed": SEED}, {"num_threads": config.threads}
-    common = {**seed, **threads, "min_model_size": MIN_IMAGES, "min_num_matches": MIN_MATCHES}
+def run_mapper(database: Any, graph: ViewGraph, threads: int) -> Reconstruction:
+    """Return the plausible models that the global mapper makes of a filled database."""
+    seed, common = {"random_seed": SEED}, {"random_seed": SEED, "num_threads": threads}
     parts = dict.fromkeys(("rotation_averaging", "global_positioning", "retriangulation"), seed)
-    required = {"track_required_tracks_per_view": TRACKS_PER_IMAGE} if images > LARGE else {}
-    return (
-        pycolmap.GlobalPipelineOptions({**common, "mapper": {**seed, **threads, **parts, **required}}),
-        pycolmap.IncrementalPipelineOptions(
-            {**common, "extract_colors": False, "mapper": seed, "triangulation": seed}
-        ),
-    )
+    required = {"track_required_tracks_per_view": TRACKS_PER_IMAGE} if len(graph.images) > LARGE else {}
+    mapper = {**common, **parts, **required}
+    limits = {"min_model_size": MIN_IMAGES, "min_num_matches": MIN_MATCHES}
+    manager = pycolmap.ReconstructionManager()
+    options = pycolmap.GlobalPipelineOptions({**common, **limits, "mapper": mapper})
+    pycolmap.GlobalPipeline(options, database, manager).run()
+    models = filter_models([_sfm_model(manager.get(number), graph) for number in range(manager.size())])
+    return Reconstruction(graph.names, models, "" if models else "the matches gave no plausible model")
 
 
 def _sfm_model(found: Any, graph: ViewGraph) -> SfmModel:
-    images = []
+    images, sigmas = [], camera_sigmas(found)
     for number in sorted(found.reg_image_ids()):
         image = found.images[number]
         pose, K = np.asarray(image.cam_from_world().matrix()), np.array(image.camera.calibration_matrix())
         K[:2, 2] -= CENTRE_PX
         camera = Camera(K, pose[:, :3].copy(), pose[:, 3].copy())
-        images.append(RegisteredImage(graph.images[number - 1], camera, int(image.num_points3D)))
+        known = graph.images[number - 1], camera, int(image.num_points3D), sigmas.get(image.name, ())
+        images.append(RegisteredImage(*known))
     points = np.array([found.points3D[number].xyz for number in sorted(found.point3D_ids())], np.float64)
     points = points.reshape(-1, 3)
     error = float(found.compute_mean_reprojection_error()) if len(points) else 0.0

@@ -14,6 +14,7 @@ from mkpc_kaggle.scene.shared_intrinsics import SharedIntrinsics, given_intrinsi
 from mkpc_kaggle.scene.view_graph import BatchPair, ViewGraph
 
 MIN_PAIRS_PER_IMAGE = 1.35  # connected pairs: with fewer there is little that could contradict the cameras
+KEEPS_ITS_F = Reason.SCENE, Reason.SAME_IMAGE, Reason.CONTRADICTION  # no other F, at the scene's focal lengths
 MIN_OBSERVATIONS = 0.99  # shared intrinsics stay if images see points at least this many times as often as without
 
 
@@ -39,19 +40,17 @@ def reconstruct_batch(
     """Reconstruct every connected component of a batch, and choose an F for each of its pairs.
 
     With ``focal``, the recipe's prior, and ``magsac`` (default: its defaults), a pair that gets no F from cameras
-    is estimated anew where the scene knows a focal length. With ``export``, the batch is reconstructed as a whole,
-    and COLMAP's files are written. Whatever the matches are, the answer is a
-    :class:`Solution`: what is missing has a reason. It takes seconds to minutes and may end the process, see
-    :mod:`mkpc_kaggle.scene.colmap`.
+    is re-estimated where the scene knows a focal length, unless it contradicts the scene. With ``export``, the
+    batch is reconstructed as a whole, and COLMAP's files are written.
+
+    A missing result has a reason, and no matches raise an error. It takes seconds to minutes and may end the
+    process, see :mod:`mkpc_kaggle.scene.colmap`.
     """
     together, shared = reconstruct_sharing(ViewGraph.of_pairs(pairs), config, export.directory if export else None)
     matchers = sorted({name for pair in pairs for name in pair.tracks or ()})
     single = matchers if config.each_matcher and len(matchers) > 1 else []
     alone = [
-        [
-            adjusted(reconstruct_component(part, config, shared), part, config)
-            for part in ViewGraph.of_pairs(pairs, name).components()
-        ]
+        [reconstruct_component(part, config, shared) for part in ViewGraph.of_pairs(pairs, name).components()]
         for name in single
     ]
     by_digest = [
@@ -64,7 +63,7 @@ def reconstruct_batch(
     choices = []
     for pair in pairs:
         choice = choose(pair, by_digest)
-        if focal is not None and choice.reason not in (Reason.SCENE, Reason.SAME_IMAGE):
+        if focal is not None and choice.reason not in KEEPS_ITS_F:
             F = estimate_at_known_focals(pair, focals, focal, magsac or RobustConfig())
             choice = replace(choice, F=F)
         choices.append(choice)
@@ -92,7 +91,6 @@ def reconstruct_sharing(
         before, after = (sum(each.observations for each in made) for made in (found, anew))
         if after >= MIN_OBSERVATIONS * before:
             found, shared = anew, alike
-    found = [adjusted(each, part, config) for each, part in zip(found, parts, strict=True)]
     if directory is not None:
         from mkpc_kaggle.scene.colmap import write_files
 
@@ -124,18 +122,6 @@ def reconstruct_connected(graph: ViewGraph, config: SceneConfig, shared: SharedI
         return Reconstruction(graph.names, failure=f"pycolmap cannot be imported: {error}")
     except (RuntimeError, ValueError) as error:
         return Reconstruction(graph.names, failure=f"pycolmap failed: {error}")
-
-
-def adjusted(found: Reconstruction, graph: ViewGraph, config: SceneConfig) -> Reconstruction:
-    """The reconstruction of a graph, adjusted by the noise of its images if pycolmap can."""
-    if not found.models:
-        return found
-    from mkpc_kaggle.scene import colmap
-
-    try:
-        return colmap.adjusted(found, graph, config)
-    except (RuntimeError, ValueError):
-        return found
 
 
 def models_of(reconstructions: Sequence[Reconstruction]) -> list[SfmModel]:

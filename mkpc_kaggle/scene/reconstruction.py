@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,13 +16,25 @@ MIN_POINTS = 30  # seen by a registered image
 FOCALS = Range(0.3, 5.0)  # plausible focal lengths, in long sides of the image
 
 
+class Sigmas(NamedTuple):
+    """Root mean square errors to expect of a camera, see :mod:`mkpc_kaggle.scene.uncertainty`."""
+
+    rotation: float  # degrees
+    centre: float  # in units of the model's size, the root mean square distance of its cameras from their mean
+    focal: float  # percent
+
+
 @dataclass(frozen=True, eq=False)
 class RegisteredImage:
-    """An image with its camera in its model's world units; ``points`` is the number of points that it sees."""
+    """An image with its camera in its model's world units; ``points`` is the number of points that it sees.
+
+    ``sigmas`` are its :class:`Sigmas`, or empty where they are unknown.
+    """
 
     image: BatchImage
     camera: Camera
     points: int
+    sigmas: Sigmas | tuple[()] = ()
 
     @property
     def focal(self) -> float:

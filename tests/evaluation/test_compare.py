@@ -1,5 +1,6 @@
 import json
 import shutil
+from itertools import combinations
 
 import numpy as np
 import pytest
@@ -12,49 +13,55 @@ from mkpc_kaggle.evaluation.compare import Comparison, paired_difference
 from mkpc_kaggle.evaluation.validate import PairScore, SceneScore, Validation
 from mkpc_kaggle.geometry.metrics import PoseError
 
-tenths = st.lists(st.integers(0, 10).map(lambda count: count / 10), min_size=1, max_size=30)
+PAIRS = [*combinations("abcdef", 2)]
+tenths = st.lists(st.integers(0, 10).map(lambda count: count / 10), min_size=1, max_size=len(PAIRS))
 
 
 def test_scenes_count_alike_however_many_pairs_they_have():
-    difference = paired_difference([([0.0] * 9, [0.2] * 9), ([0.0], [0.4])])
+    difference = paired_difference([([0.0] * 9, [0.2] * 9, PAIRS[:9]), ([0.0], [0.4], PAIRS[:1])])
     assert (difference.gain, difference.low, difference.high) == pytest.approx((0.3, 0.3, 0.3))
-
-
-def test_one_pair_in_two_gives_the_interval_of_the_coin():
-    """Of 8 pairs 4 gain 1: the mean of a resample is binomial(8, 1/2) / 8, at most 1/8 with 3.5 %."""
-    difference = paired_difference([([0] * 8, [1, 0] * 4)])
-    assert (difference.gain, difference.low, difference.high) == (0.5, 0.125, 0.875)
 
 
 @settings(max_examples=30, deadline=None)
 @given(st.lists(tenths, min_size=1, max_size=3), st.randoms(use_true_random=False))
 def test_the_interval_holds_the_gain_and_turns_with_it(firsts, random):
-    seconds = [random.sample(first, len(first)) for first in firsts]
-    scenes = list(zip(firsts, seconds, strict=True))
+    scenes = [(first, random.sample(first, len(first)), PAIRS[: len(first)]) for first in firsts]
     difference = paired_difference(scenes)
     assert difference == paired_difference(scenes)
     assert difference.low - 1e-9 <= difference.gain <= difference.high + 1e-9
-    other = paired_difference([(second, first) for first, second in scenes])
-    assert other.gain == pytest.approx(-difference.gain)
-    assert (other.low, other.high) == pytest.approx((-difference.high, -difference.low), abs=0.07)
+    other = paired_difference([(second, first, images) for first, second, images in scenes])
+    assert (other.gain, other.low, other.high) == pytest.approx(
+        (-difference.gain, -difference.high, -difference.low)
+    )
 
 
-def test_nineteen_intervals_of_twenty_hold_the_truth():
-    """Two scenes; the second way is better by 0.08 and by 0 on average, with the pairs' own scatter on top."""
-    generator, held, trials = np.random.default_rng(7), 0, 200
+def test_a_gain_of_the_pairs_of_one_image_is_less_sure_than_as_many_gains_of_others():
+    same, apart = ([1.0 if kept(*pair) else 0.0 for pair in PAIRS] for kept in (
+        lambda a, b: a == "a",
+        lambda a, b: ord(b) - ord(a) == 1,
+    ))  # fmt: skip
+    of_one, of_all = (paired_difference([([0.0] * 15, gains, PAIRS)]) for gains in (same, apart))
+    assert of_one.gain == of_all.gain
+    assert of_one.high - of_one.low > 1.2 * (of_all.high - of_all.low)
+
+
+def test_the_interval_holds_the_truth_where_a_gain_is_of_images():
+    """Two scenes of 16 images, all pairs. A pair gains the sum of its images' gains, and noise."""
+    generator, held, trials = np.random.default_rng(7), 0, 100
+    ends = [*combinations(range(16), 2)]
+    names = [(str(a), str(b)) for a, b in ends]
     for _ in range(trials):
         scenes = []
-        for pairs, gain in ((80, 0.08), (40, 0.0)):
-            level = generator.integers(0, 8, pairs) / 10
-            moved = generator.choice([-0.2, 0.0, 0.2], size=pairs, p=[0.3 - gain / 0.4, 0.4, 0.3 + gain / 0.4])
-            scenes.append((level, level + moved))
+        for gain in (0.08, 0.0):
+            image = generator.normal(gain / 2, 0.1, 16)
+            scenes.append((np.zeros(120), image[ends].sum(axis=1) + generator.normal(0, 0.2, 120), names))
         difference = paired_difference(scenes)
         held += difference.low <= 0.04 <= difference.high
-    assert 0.90 <= held / trials <= 0.985
+    assert 0.88 <= held / trials <= 0.99
 
 
 def validation(name: str, *ids: str) -> Validation:
-    scores = tuple(PairScore(pair, 0.5, PoseError(0, 0, 0)) for pair in ids)
+    scores = tuple(PairScore(pair, ("a", "b"), 0.5, PoseError(0, 0, 0)) for pair in ids)
     return Validation(name, (SceneScore("s", scores),))
 
 

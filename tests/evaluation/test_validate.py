@@ -92,7 +92,7 @@ def test_a_failed_pair_counts_as_failed_even_where_the_fallback_happens_to_be_ri
 def test_the_mean_average_accuracy_is_the_mean_over_pairs_and_a_failed_pair_counts():
     perfect = PoseError(0, 0, 0)
     errors = [perfect, PoseError.failed(), perfect, PoseError(5.5, 90, 0)]
-    pairs = tuple(PairScore("p", 0.5, error) for error in errors)
+    pairs = tuple(PairScore("p", ("a", "b"), 0.5, error) for error in errors)
     assert [SceneScore("s", pairs[:1]).maa(), SceneScore("s", pairs[1:2]).maa()] == [1, 0]
     assert SceneScore("s", pairs).maa() == pytest.approx(2.5 / 4)
 

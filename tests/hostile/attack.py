@@ -153,7 +153,7 @@ def _result_faults(out: Path, status: int) -> list[str]:
     table = out / "cameras.csv"
     with suppress(OSError):
         lines = table.read_text().splitlines()
-        faults = [] if lines[0] == "image,model,K,R,t" else [f"{table} begins with {lines[0]!r}"]
+        faults = [] if lines[0].startswith("image,model,K,R,t,") else [f"{table} begins with {lines[0]!r}"]
         faults += (
             [] if (len(lines) > 1) == (status == 0) else [f"exit status {status} with {len(lines) - 1} cameras"]
         )

@@ -13,7 +13,7 @@ from mkpc_kaggle.geometry.metrics import PoseError
 
 def scene(name: str, *rotations: float) -> SceneScore:
     """Pairs with these rotation errors, a tenth as many metres off; infinite: failed."""
-    scores = [PairScore(f"{name} {i}", 0.5, PoseError(r, r, r / 10)) for i, r in enumerate(rotations)]
+    scores = [PairScore(f"{name} {i}", ("a", "b"), 0.5, PoseError(r, r, r / 10)) for i, r in enumerate(rotations)]
     return SceneScore(name, tuple(scores))
 
 

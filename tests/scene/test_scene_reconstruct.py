@@ -117,8 +117,8 @@ def test_a_pair_whose_matches_agree_on_something_else_keeps_its_own(scene):
     shifted = replace(pair.matches, points1=pair.matches.points0 + np.array([0, 90], np.float32))
     columns = np.array([[0, 0, 1], [0, 0, 0], [-1, 0, 0]]) / np.sqrt(2)
     pairs = (*scene.pairs[:-1], replace(pair, matches=shifted, pair_fundamental=columns))
-    solution = reconstruct_batch(pairs, SceneConfig())
-    assert solution.choices[-1].reason is Reason.CONTRADICTION
+    solution = reconstruct_batch(pairs, SceneConfig(), FocalConfig())
+    assert (solution.choices[-1].reason, solution.choices[-1].F) == (Reason.CONTRADICTION, None)
     assert all(choice.from_scene for choice in solution.choices[:-1])
 
 
@@ -158,28 +158,6 @@ def test_degenerate_matches_give_a_reason(kind):
     for choice in solution.choices:
         assert choice.from_scene or choice.reason is not Reason.SCENE
         assert choice.F is None or np.isfinite(choice.F).all()
-
-
-@pytest.mark.parametrize(("share", "fewer", "asked"), [(1.0, 0, 1), (0.5, 0, 2), (0.5, 9, 2)])
-def test_the_incremental_mapper_is_asked_where_the_global_one_leaves_images_out(
-    scene, monkeypatch, share, fewer, asked
-):
-    """The global mapper is made to find a share of the images, the incremental mapper to see points less often."""
-    made, found = colmap.run_mapper, []
-
-    def run(pipeline: type, *rest: Any) -> Reconstruction:
-        whole = made(pipeline, *rest)
-        (model,) = whole.models
-        kept = model.images[: round(share * 6)] if not found else model.images
-        seen = tuple(replace(image, points=image.points // (10 if found and fewer else 1)) for image in kept)
-        found.append(replace(whole, models=(replace(model, images=seen),)))
-        return found[-1]
-
-    monkeypatch.setattr(colmap, "run_mapper", run)
-    monkeypatch.setattr(colmap, "adjusted", lambda reconstruction, *_: reconstruction)
-    solution = reconstruct_batch(scene.pairs, SceneConfig(shared_intrinsics=0))
-    assert len(found) == asked
-    assert solution.reconstructions[0].models[0].images is found[0 if fewer else -1].models[0].images
 
 
 def test_without_pycolmap_every_scene_says_so(scene, monkeypatch):

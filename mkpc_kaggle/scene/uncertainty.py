@@ -1,0 +1,67 @@
+"""How sure each camera of a reconstruction is, by the covariance of its bundle adjustment.
+
+All cameras together fix the origin, orientation and scale: errors that a similarity of the world explains do not
+count (the S-transformation of Baarda 1981). The noise of keypoints is that of the residuals.
+"""
+
+from typing import Any, cast
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+from scipy.linalg import block_diag
+
+from mkpc_kaggle.geometry.two_view import cross_matrix
+from mkpc_kaggle.scene.reconstruction import Sigmas
+
+MAX_IMAGES = 200  # of a model: memory grows with the square of their number, and time with its cube
+DAMPING = 1e-3  # the world is free, so the normal equations are singular
+
+
+def camera_sigmas(found: Any) -> dict[str, Sigmas]:
+    """Return those of the registered images of pycolmap's reconstruction, by name; empty if they are unknown."""
+    images = [image for _, image in sorted(found.images.items()) if image.has_pose and image.num_points3D]
+    if not 1 < len(images) <= MAX_IMAGES:
+        return {}
+    config = pycolmap.BundleAdjustmentConfig()
+    for image in images:
+        config.add_image(image.image_id)
+    ceres = {"use_gpu": False, "solver_options": {"max_num_iterations": 0, "num_threads": 1}}
+    options = pycolmap.BundleAdjustmentOptions({"print_summary": False, "ceres": ceres})
+    adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, found)
+    fit = cast(Any, adjuster.solve()).ceres_summary
+    redundancy = fit.num_residuals - fit.num_effective_parameters + 7
+    damped = pycolmap.BACovarianceOptions({"damping": DAMPING})
+    solved: Any = pycolmap.estimate_ba_covariance(damped, found, adjuster)
+    if redundancy <= 0 or solved is None:
+        return {}
+    ids, cameras = [image.image_id for image in images], [image.camera for image in images]
+    poses = np.block([[solved.get_cam_cross_cov_from_world(i, j) for j in ids] for i in ids])
+    focals = [solved.get_other_params_cov(each.params)[0, 0] / each.mean_focal_length() ** 2 for each in cameras]
+    variances = _pose_variances([image.cam_from_world().matrix() for image in images], poses)
+    noise = 2 * fit.initial_cost / redundancy  # variance of a keypoint's coordinate, square pixels
+    sigmas = np.sqrt(noise * np.column_stack([variances, focals])) * [np.degrees(1), 1, 100]
+    # Rounded: the last digits differ from call to call.
+    rows = [Sigmas(*(float(f"{value:.4g}") for value in row)) for row in sigmas]
+    return {image.name: row for image, row in zip(images, rows, strict=True)}
+
+
+def _pose_variances(poses: list[NDArray[np.float64]], covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the variances of rotations, radians, and of centres, in model sizes: (N, 2).
+
+    ``poses`` are [R | t]; the covariance is that of COLMAP's parameters, half angles and t.
+    """
+    centres = np.array([-pose[:, :3].T @ pose[:, 3] for pose in poses])
+    centres -= centres.mean(axis=0)
+    size = np.sqrt((centres**2).sum(axis=1).mean())
+    moves, similarities = [], []  # what angles and centres change by parameters of the pose, and of the world
+    for pose, centre in zip(poses, centres / size, strict=True):
+        R, t = pose[:, :3], pose[:, 3]
+        moves.append(np.vstack([2 * np.eye(3, 6), -R.T @ np.hstack([2 * cross_matrix(t), np.eye(3)]) / size]))
+        similarities.append(
+            np.block([[-R, np.zeros((3, 4))], [-cross_matrix(centre), np.eye(3), centre[:, None]]])
+        )
+    basis, _ = np.linalg.qr(np.vstack(similarities))
+    change = block_diag(*moves)
+    change -= basis @ (basis.T @ change)
+    return np.asarray(((change @ covariance) * change).sum(axis=1).reshape(-1, 2, 3).sum(axis=2))
