@@ -57,6 +57,6 @@ _PRIVATE = """\
 In this dataset, though their licences do not clearly allow redistribution. Keep the dataset private on Kaggle,
 do not share it, and check what the licences say of competitions. These are"""
 _NEXT = """\
-Next, with the `kaggle` command (README, On Kaggle):
+Next, with the `kaggle` command (README.md; details in docs/kaggle.md):
   kaggle datasets create -p {out}/dataset
   kaggle kernels push -p {out}/kernel"""
