@@ -31,7 +31,7 @@ QUICK = (  # these run with the other tests
     "signals: SIGINT after 0.3 s",  # while modules are imported
     "signals: SIGTERM after 1.0 s",
     "signals: SIGINT to all after 3.0 s",
-    "journals: no points, resumed",
+    "journals: its first half, resumed",
     "journals: noise after its head, read",
     "recipes: deep tables",
     "weights: a bytearray of 6 GB",

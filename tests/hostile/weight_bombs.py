@@ -17,21 +17,15 @@ CONVERT = "weights convert a.pt --out out/a.safetensors"
 LENGTH = (6 * 10**9).to_bytes(8, "little")
 PICKLES = {
     "lists of lists": b"\x80\x02" + b"]" * 500_000 + b"a" * 499_999 + b".",
-    "a place for 400 million objects": b"\x80\x02}r\x00\x84\xd7\x17.",
     "a bytearray of 6 GB": b"\x80\x02cbuiltins\nbytearray\n\x8a\x08" + LENGTH + b"\x85R.",
     "a string of 4 GB": b"\x80\x02}X\xff\xff\xff\xffa.",
-    "a bytes object of 6 GB": b"\x80\x04\x8e" + LENGTH + b"a.",
-    "a frame of 6 GB": b"\x80\x04\x95" + LENGTH + b"}.",
     "a million sets": b"\x80\x04(" + b"\x8f" * 1_000_000 + b"t.",
     "a tensor of 6 GB": b"\x80\x02ctorch\nFloatTensor\n\x8a\x08" + LENGTH + b"\x85R.",
     "a call of the system": b"\x80\x02cposix\nsystem\nX\x10\x00\x00\x00touch out/called\x85R.",
 }
-ZIPPED = {"a place for 400 million objects": (0,)}  # an empty table: the place is never filled
 TENSORS = {
     "of half complex numbers": ("t.to(torch.complex32)", REFUSED),  # safetensors has no such type
     "of eight bits": ("t.to(torch.float8_e4m3fn)", (0,)),
-    "of no elements": ("torch.zeros(0, 1 << 40)", (0,)),
-    "of NaN": ("t * float('nan')", (0,)),
     "conjugated": ("torch.view_as_complex(torch.ones(3, 2)).conj()", (0,)),
 }
 
@@ -45,14 +39,12 @@ def unpacked(path: Path) -> None:
 FILES: dict[str, Callable[[Path], object]] = {
     "a pipe": os.mkfifo,
     "a link to /dev/zero": lambda path: path.symlink_to("/dev/zero"),
-    "an empty archive": lambda path: path.write_bytes(b"PK\x05\x06" + bytes(18)),
     "an archive cut off": lambda path: path.write_bytes(b"PK\x03\x04" + bytes(100)),
     "a compressed gigabyte": lambda path: archive(path, zipfile.ZIP_DEFLATED, bytes(1_000_000_000)),
     "an unpacked directory of a pipe": unpacked,
 }
 SAFETENSORS = {
     "a head of 2^63 bytes": (2**63).to_bytes(8, "little") + b"{}",
-    "a head that is longer than the file": (10**6).to_bytes(8, "little") + b"{}",
     "deep JSON": (200_000).to_bytes(8, "little") + b"[" * 200_000,
     "a tensor beyond the end": (80).to_bytes(8, "little")
     + b'{"a":{"dtype":"F32","shape":[99],"data_offsets":[0,396]}}'.ljust(80),
@@ -134,7 +126,7 @@ AUTO = SUBMIT.replace("quick.toml", "auto") + f" {SEARCH} --mode stage-1"
 CONVERT_SAFETENSORS = CONVERT.replace("a.pt", "a.safetensors")
 CASES = [
     *(
-        Case("weights", name, CONVERT, at("a.pt", lambda d=data: with_pickle(d)), ZIPPED.get(name, REFUSED))
+        Case("weights", name, CONVERT, at("a.pt", lambda d=data: with_pickle(d)), REFUSED)
         for name, data in PICKLES.items()
     ),
     *(
