@@ -15,15 +15,17 @@ from mkpc_kaggle.geometry.metrics import PoseError
 tenths = st.lists(st.integers(0, 10).map(lambda count: count / 10), min_size=1, max_size=30)
 
 
-def test_scenes_count_alike_however_many_pairs_they_have():
-    difference = paired_difference([([0.0] * 9, [0.2] * 9), ([0.0], [0.4])])
-    assert (difference.gain, difference.low, difference.high) == pytest.approx((0.3, 0.3, 0.3))
-
-
-def test_one_pair_in_two_gives_the_interval_of_the_coin():
-    """Of 8 pairs 4 gain 1: the mean of a resample is binomial(8, 1/2) / 8, at most 1/8 with 3.5 %."""
-    difference = paired_difference([([0] * 8, [1, 0] * 4)])
-    assert (difference.gain, difference.low, difference.high) == (0.5, 0.125, 0.875)
+@pytest.mark.parametrize(
+    ("scenes", "expected"),
+    [
+        ([([0.0] * 9, [0.2] * 9), ([0.0], [0.4])], (0.3, 0.3, 0.3)),  # scenes count alike, whatever their pairs
+        # Of 8 pairs 4 gain 1: the mean of a resample is binomial(8, 1/2) / 8, at most 1/8 with 3.5 %.
+        ([([0] * 8, [1, 0] * 4)], (0.5, 0.125, 0.875)),
+    ],
+)
+def test_the_interval_is_that_by_hand(scenes, expected):
+    difference = paired_difference(scenes)
+    assert (difference.gain, difference.low, difference.high) == pytest.approx(expected)
 
 
 @settings(max_examples=30, deadline=None)
@@ -53,14 +55,10 @@ def test_nineteen_intervals_of_twenty_hold_the_truth():
     assert 0.90 <= held / trials <= 0.985
 
 
-def validation(name: str, *ids: str) -> Validation:
-    scores = tuple(PairScore(pair, 0.5, PoseError(0, 0, 0)) for pair in ids)
-    return Validation(name, (SceneScore("s", scores),))
-
-
 def test_different_pairs_are_not_compared():
+    p, q = (PairScore(pair, 0.5, PoseError(0, 0, 0)) for pair in "pq")
     with pytest.raises(ValueError, match="different pairs"):
-        Comparison((validation("a", "p", "q"), validation("b", "q", "p")))
+        Comparison(tuple(Validation("a", (SceneScore("s", pairs),)) for pairs in ((p, q), (q, p))))
 
 
 def compare(demo: DemoSet, *more: str) -> int:

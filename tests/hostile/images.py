@@ -1,7 +1,6 @@
 """Images that cannot be read, or are too much: the other pair must still have its F."""
 
 import os
-import socket
 import struct
 import zlib
 from collections.abc import Callable
@@ -70,24 +69,12 @@ ODD: dict[str, tuple[str, Callable[[], bytes]]] = {
 }
 
 
-def bound(path: Path) -> None:
-    here = Path.cwd()
-    os.chdir(path.parent)  # the path of a socket must be short
-    try:
-        with socket.socket(socket.AF_UNIX) as listener:
-            listener.bind(path.name)
-    finally:
-        os.chdir(here)
-
-
 PLACES: dict[str, Callable[[Path], object]] = {
     "a pipe": os.mkfifo,
-    "a socket": bound,
     "a link to /dev/zero": lambda path: path.symlink_to("/dev/zero"),
     "a link to nothing": lambda path: path.symlink_to("nothing"),
     "a link to another image": lambda path: path.symlink_to(path.with_name("z.png")),
     "a name in another case": lambda path: path.with_name("X.PNG").write_bytes(encoded(".png")),
-    "two files of the id": lambda path: [path.with_suffix(end).write_bytes(encoded(".png")) for end in KINDS],
 }
 
 

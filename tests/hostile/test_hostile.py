@@ -38,7 +38,7 @@ QUICK = (  # these run with the other tests
     "fetches: a redirection to a file",
     "fetches: a link for the part",
     "arguments: check of a submission of NaN",
-    "packages: an owner that is a path",
+    "arguments: an owner that is a path",
     "folders: database.db of the user's",
     "folders: a folder's name: Latin 1",
     "folders: again: an ending that was changed",
