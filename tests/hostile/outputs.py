@@ -10,11 +10,9 @@ from room import SUBMIT
 INPUTS = {
     "the table": "--output D/test.csv",
     "an image": "--output D/test_images/b1/x.png",
-    "no name": "--output ''",
     "the report's place": "--output out/s.html --report out/s.html",
     "a name that ends as work directories do": "--output out/q.work",
     "a name of 300 characters": f"--output out/{'s' * 300}.csv",
-    "below a file": "--output D/test.csv/s.csv",
     "below /proc": "--output /proc/s.csv",
     "the submission in the lock's place": "--work-dir out --output out/journal.lock",
     "the full device": "--output /dev/full",
@@ -22,7 +20,6 @@ INPUTS = {
 }
 ODD = {
     "a name with a line feed": "--output 'out/a\nb.csv'",
-    "a name of other scripts": "--output out/\u202e\U0001f600.csv",
     "directories that are not there": "--output out/a/b/c/d/s.csv",
 }
 IN_THE_WAY: dict[str, tuple[Callable[[Path], object], tuple[int, ...]]] = {
@@ -37,8 +34,6 @@ IN_THE_WAY: dict[str, tuple[Callable[[Path], object], tuple[int, ...]]] = {
 }
 OVER = {
     "a weight file": "submit --test-dir D --recipe quick.toml --weights W --output W/w.safetensors",
-    "a drawing in an image's place": "match D/test_images/b1/x.png quick.toml --out D/test_images/b1/x.png",
-    "an export in the table's place": "journal out/s.work --report D/test.csv",
     "a conversion in its source's place": "weights convert W/w.safetensors --out W/w.safetensors",
 }
 

@@ -1,6 +1,5 @@
 """``test.csv`` as nobody should write it."""
 
-import gzip
 import os
 from pathlib import Path
 
@@ -29,10 +28,7 @@ REFUSALS = {
     "an empty file": b"",
     "a batch further above": (HEADER + "1,../../etc,x,y\n").encode(),
     "UTF-16": TABLE.encode("utf-16"),
-    "compressed": gzip.compress(TABLE.encode()),
     "bytes that are not UTF-8": TABLE.encode().replace(b"x-y", b"\xff\xfe"),
-    "NUL bytes": TABLE.encode().replace(b"x-y", b"x\0y"),
-    "an open quote": (HEADER + '"b1,b1,x,y\n').encode(),
     "a hundred thousand columns": (HEADER.strip() + ",c" * 100_000 + "\n" + ROW).encode(),
     "a cell of 10 MB": (HEADER + "1,b1,x,y\n2,b1,x," + "y" * 10_000_000 + "\n").encode(),
 }
@@ -41,11 +37,9 @@ TAKEN = {
     "lines of another system": TABLE.replace("\n", "\r\n").encode(),
     "quotes and commas in an id": (HEADER + '"a,""b""",b1,x,y\n').encode(),
     "ids like missing values": (HEADER + "nan,b1,x,y\nNA,b1,NA,null\n,b1,x,y\n").encode(),
-    "ids of other scripts": (HEADER + "\u202eab\U0001f600\u0301,b1,x,y\n").encode(),
     "a very long sample id": (HEADER + "s" * 100_000 + ",b1,x,y\n").encode(),
     "a batch id of 5,000 characters": (HEADER + "1," + "b" * 5000 + ",x,y\n2,b1,x,y\n").encode(),
     "an image id of 300 characters": (HEADER + "1,b1," + "x" * 300 + ",y\n2,b1,x,y\n").encode(),
-    "the same image twice": (HEADER + "1,b1,x,x\n").encode(),
 }
 NO_IMAGES = (HEADER + "".join(f"{n},b1,p{n},q{n}\n" for n in range(5000))).encode()
 PLACES = {
