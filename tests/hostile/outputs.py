@@ -32,15 +32,6 @@ IN_THE_WAY: dict[str, tuple[Callable[[Path], object], tuple[int, ...]]] = {
     "a pipe for the partial file": (lambda path: os.mkfifo(path.with_name(".s.csv.part")), (0,)),
     "a pipe for the report": (lambda path: os.mkfifo(path.with_suffix(".html")), (0,)),
 }
-OVER = {
-    "a weight file": "submit --test-dir D --recipe quick.toml --weights W --output W/w.safetensors",
-    "a conversion in its source's place": "weights convert W/w.safetensors --out W/w.safetensors",
-}
-
-
-def weights(room: Path) -> None:
-    (room / "W").mkdir()
-    (room / "W" / "w.safetensors").write_bytes(b"\x08\x00\x00\x00\x00\x00\x00\x00{}      ")  # without tensors
 
 
 def placed(make: Callable[[Path], object]) -> Callable[[Path], None]:
@@ -56,7 +47,6 @@ CASES = [
         Case("outputs", f"there is {name}", f"{PLAIN} --output out/s.csv", placed(make), statuses)
         for name, (make, statuses) in IN_THE_WAY.items()
     ),
-    *(Case("outputs", name, command, weights, REFUSED, "name another") for name, command in OVER.items()),
     Case("outputs", "text that the terminal has not", f"{PLAIN} --output out/s.csv", env=ASCII),
     Case("outputs", "the C locale", f"{PLAIN} --output out/\u00e9.csv", env=C, submission=False),
 ]
