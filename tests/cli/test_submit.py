@@ -5,7 +5,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import cv2
@@ -74,22 +73,6 @@ def test_a_killed_run_goes_on_and_ends_with_the_bytes_of_an_undisturbed_one(demo
     resumed = make(demo.test_dir, output, small_recipe, "--no-report")
     assert resumed.returncode == 0, resumed.stderr
     assert output.read_bytes() == undisturbed.read_bytes()
-
-
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_a_signal_ends_the_run_with_a_valid_file(demo, small_recipe, tmp_path, number):
-    output = tmp_path / "submission.csv"
-    running = subprocess.Popen(
-        command(demo.test_dir, output, small_recipe), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
-    while not output.exists():
-        time.sleep(0.02)
-        assert running.poll() is None
-    running.send_signal(number)
-    out, _ = running.communicate(timeout=600)
-    assert running.returncode == 128 + number
-    assert "interrupted after" in out
-    assert_good(output, demo.test_dir)
 
 
 def write_test_side(
