@@ -176,3 +176,16 @@ def test_an_estimate_tells_its_candidates_their_costs_and_the_focal_lengths_that
     alone = estimate(matches, RobustConfig(permutations=3)).stats
     assert alone.candidates == 3 and alone.cost == alone.magsac_cost and alone.focals == (0, 0)
     assert 30 <= alone.cost < 100, "a half for each outlier, and little for the others"
+
+
+def test_magsac_wins_over_focal_lengths_that_are_too_implausible():
+    for sigma, has_focals in ((0.4, True), (0.03, False)):
+        priors = (FocalPrior.of_image(SIZE, FocalConfig(sigma=sigma)),) * 2
+        assert any(with_prior(seen(CAMERAS, 400, 0.05), priors).stats.focals) == has_focals
+
+
+def test_matches_of_points_behind_the_cameras_cost_as_outliers():
+    X = np.random.default_rng(1).uniform((-1.5, -1.2, -9), (1.5, 1.2, -4), (60, 3))
+    before, behind = seen(CAMERAS, 200, 0.05), Matches(*project(CAMERAS, X), np.ones(60))
+    costs = [with_prior(matches).stats.cost for matches in (before, Matches.concatenate([before, behind]))]
+    assert costs[1] - costs[0] == pytest.approx(60 / 2, rel=0.1)
