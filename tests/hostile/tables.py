@@ -43,10 +43,6 @@ PLACES = {
     "a pipe": os.mkfifo,
     "a link to /dev/zero": lambda path: path.symlink_to("/dev/zero"),
 }
-DIRECTORIES = {
-    "a very long name for the directory": "d" * 5000,
-}
-
 CASES = [
     Case(
         "tables",
@@ -60,8 +56,7 @@ CASES = [
     *(Case("tables", name, SUBMIT, written(data)) for name, data in TAKEN.items()),
     Case("tables", "5,000 pairs of no images", SUBMIT, written(NO_IMAGES), statuses=(1,)),
     *(Case("tables", name, SUBMIT, in_place(make), REFUSED) for name, make in PLACES.items()),
-    *(
-        Case("tables", name, SUBMIT.replace("--test-dir D", f"--test-dir {place}"), statuses=REFUSED)
-        for name, place in DIRECTORIES.items()
+    Case(
+        "tables", "a very long name", SUBMIT.replace("--test-dir D", f"--test-dir {'d' * 5000}"), statuses=REFUSED
     ),
 ]
