@@ -135,6 +135,7 @@ def test_odd_pictures_get_an_f_or_the_fallback_row_and_a_line_in_the_summary(dem
         (["--device", "abacus"], "unknown device 'abacus'"),
         (["--output", "/dev/null/submission.csv"], "cannot be written"),
         (["--output", "/dev/null"], "--output /dev/null is a device; name a file"),
+        (["--work-dir", "/dev/null/work"], "cannot be written"),
     ],
 )
 def test_bad_input_is_told_in_one_line_before_any_work(demo, tmp_path, capsys, arguments, told):
@@ -154,6 +155,7 @@ def test_bad_input_is_told_in_one_line_before_any_work(demo, tmp_path, capsys, a
         (["--output", ""], "is a directory; name a file"),
         (["--output", "test/test.csv"], "would be written over the input test/test.csv"),
         (["--output", "w/m.pth", "--weights", "w"], "would be written over the input w"),
+        (["--work-dir", "test/test_images"], "would be written over the input test/test_images"),
         (["--recipe", "r.toml", "--output", "r.toml"], "would be written over the input r.toml"),
         (["--output", "s.html"], "would be written over --report"),
         (["--output", "w/journal.sqlite", "--work-dir", "w"], "would be written over the work directory"),
