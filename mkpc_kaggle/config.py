@@ -1,4 +1,4 @@
-"""Settings: frozen dataclasses from TOML tables, with every key known and every value in its range."""
+"""Settings: frozen dataclasses from TOML tables, with checked keys and values."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import MISSING, Field, dataclass, fields
@@ -16,14 +16,14 @@ MAX_INTEGER = 2**63 - 1  # as in TOML
 def from_table(cls: type[Config], table: Mapping[str, Any], where: str) -> Config:
     """Build the dataclass ``cls`` from a TOML table.
 
-    ``where`` names the table in messages. Raises :class:`UserError` for an unknown key (listing the known
-    keys), a missing key, a value of another type, or a value that the dataclass refuses with a ``ValueError``.
+    ``where`` names the table in messages. Raises :class:`UserError` for an unknown key (with a list of the known
+    ones), a missing key, a wrong type, or a value that the dataclass refuses with a ``ValueError``.
     """
     known: dict[str, Field[Any]] = {field.name: field for field in fields(cls)}  # type: ignore[arg-type]
     check_keys(table, known, where)
     required = [name for name, field in known.items() if field.default is field.default_factory is MISSING]
     if missing := [name for name in required if name not in table]:
-        raise UserError(f"{where} lacks {', '.join(map(repr, missing))}")
+        raise UserError(f"{where}: missing keys {', '.join(map(repr, missing))}")
     hints = get_type_hints(cls)
     values = {key: convert(value, hints[key], f"{where}, key {key!r}") for key, value in table.items()}
     try:
@@ -33,7 +33,7 @@ def from_table(cls: type[Config], table: Mapping[str, Any], where: str) -> Confi
 
 
 def check_keys(table: Mapping[str, Any], known: Iterable[str], where: str) -> None:
-    """Raise :class:`UserError` if ``table`` is not a table, or for its first key that is not among ``known``."""
+    """Raise :class:`UserError` if ``table`` is not a table, or for its first unknown key."""
     if not isinstance(table, Mapping):
         raise UserError(f"{where} must be a table, not {table!r}")
     for key in table:
@@ -42,7 +42,7 @@ def check_keys(table: Mapping[str, Any], known: Iterable[str], where: str) -> No
 
 
 def convert(value: Any, kind: type, where: str) -> Any:
-    """``value`` as ``kind`` (int, float, bool, str or an enum of strings), or :class:`UserError`."""
+    """Return ``value`` as ``kind`` (int, float, bool, str or an enum of strings), or raise :class:`UserError`."""
     if issubclass(kind, StrEnum):
         if value not in list(kind):
             raise UserError(f"{where}: {value!r} is none of {', '.join(repr(str(member)) for member in kind)}")
@@ -58,7 +58,7 @@ def convert(value: Any, kind: type, where: str) -> Any:
 
 @dataclass(frozen=True)
 class Range:
-    """Finite numbers from ``low`` to ``high``; ``bounds`` "[]", "(]", "[)" or "()" say which ends belong to it."""
+    """Finite numbers from ``low`` to ``high``; ``bounds`` is "[]", "(]", "[)" or "()", in interval notation."""
 
     low: float
     high: float = inf
@@ -76,11 +76,11 @@ class Range:
 
 AT_LEAST_0, AT_LEAST_1 = Range(0), Range(1)
 POSITIVE = Range(0, bounds="(]")
-SHARE = Range(0, 1)  # of a whole; also a score's range
+SHARE = Range(0, 1)  # a fraction; also the range of scores
 
 
 def check_ranges(config: Any, **ranges: Range) -> None:
-    """Raise ``ValueError`` for the first of these attributes of ``config`` that is out of its range."""
+    """Raise ``ValueError`` for the first attribute of ``config`` out of its range."""
     for name, allowed in ranges.items():
         number = getattr(config, name)
         if number not in allowed:

@@ -1,4 +1,4 @@
-"""Errors and warnings that say what the user can do about the cause."""
+"""Errors and warnings for users."""
 
 import warnings
 from collections.abc import Iterator
@@ -10,17 +10,17 @@ MAX_TEXT_BYTES = 1 << 24
 
 
 class UserError(Exception):
-    """The run cannot start: the message says what happened, where, and what to do next."""
+    """A problem that the user can correct. The message states the problem, the place and the next step."""
 
 
 @cache
 def warn_once(message: str) -> None:
-    """Warn, unless this process has given the same warning before."""
+    """Warn once per process and message."""
     warnings.warn(message, stacklevel=3)
 
 
 def read_text(path: Path) -> str:
-    """The text of a UTF-8 file of at most 16 MiB; :class:`UserError` if it cannot be read."""
+    """Return the text of a UTF-8 file of at most 16 MiB, or raise :class:`UserError`."""
     try:
         if path.exists() and (not path.is_file() or path.stat().st_size > MAX_TEXT_BYTES):
             raise UserError(f"{path} cannot be read: not a regular file of at most {MAX_TEXT_BYTES} bytes")
@@ -33,7 +33,7 @@ def read_text(path: Path) -> str:
 
 @contextmanager
 def writing(what: str) -> Iterator[None]:
-    """Write the file that ``what`` names; an ``OSError`` becomes a :class:`UserError` that says so."""
+    """Convert an ``OSError`` in the block to a :class:`UserError`: ``what`` cannot be written."""
     try:
         yield
     except OSError as error:

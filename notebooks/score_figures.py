@@ -1,4 +1,4 @@
-"""How well recipes do: scores, gains, errors."""
+"""Figures that compare recipes: scores, gains, errors."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
@@ -18,14 +18,14 @@ if TYPE_CHECKING:
 
 MARKERS = "osD^vPX"
 DASHES = ("-", "--", "-.", ":")
-PANELS = (  # what draw_errors draws: kind, unit, thresholds of the mAA, limits of x
+PANELS = (  # of draw_errors: kind, unit, thresholds of the mAA, limits of x
     ("rotation", "degrees", ROTATION_THRESHOLDS, (0.05, 180)),
     ("translation", "metres", TRANSLATION_THRESHOLDS, (0.01, 100)),
 )
 
 
 def draw_scores(validations: Sequence["Validation"]) -> "Figure":
-    """A row for each scene and for their mean, a mark for each recipe: its mAA."""
+    """Draw the mAA of each recipe, one row per scene and one for their mean."""
     figure, axes = _rows([scene.scene for scene in validations[0].scenes], "mAA of each scene, by recipe")
     for index, validation in enumerate(validations):
         values = [*(scene.maa() for scene in validation.scenes), validation.maa()]
@@ -37,7 +37,7 @@ def draw_scores(validations: Sequence["Validation"]) -> "Figure":
 
 
 def draw_gains(comparison: "Comparison") -> "Figure":
-    """A row for each scene and for their mean: what each recipe gains over the first, with its interval."""
+    """Draw the gain of each recipe over the first, with its interval, one row per scene and one for their mean."""
     first, *others = comparison.validations
     names = [scene.scene for scene in first.scenes]
     figure, axes = _rows(names, f"gain of mAA over {first.recipe}, with 95 % intervals")
@@ -49,21 +49,21 @@ def draw_gains(comparison: "Comparison") -> "Figure":
             gains, y, xerr=(gains - low, high - gains), **style, linestyle="", capsize=4, label=other.recipe
         )
     axes.axvline(0, color="black", linewidth=1)
-    axes.set_xlabel("mAA gained; an interval that holds 0 proves nothing")
+    axes.set_xlabel("mAA gained; an interval that includes 0 proves nothing")
     _legend_below(figure)
     return figure
 
 
 def draw_errors(validations: Sequence["Validation"]) -> "Figure":
-    """Two panels: the share of pairs whose rotation, and whose translation, is less than x off."""
+    """Draw the share of pairs with an error below x, for rotation and for translation."""
     figure = new_figure(9, 4.2)
     for axes, (kind, unit, thresholds, limits) in zip(figure.subplots(1, 2, sharey=True), PANELS, strict=True):
-        plain(axes, f"pairs whose {kind} is less than x off")
+        plain(axes, f"pairs with a {kind} error below x")
         axes.axvspan(
             thresholds[0], thresholds[-1], color=DROPPED, alpha=0.2, linewidth=0, label="mAA's thresholds"
         )
         for index, validation in enumerate(validations):
-            # Failures are infinite: they go beyond the right edge, so that their curve ends below 1.
+            # Failures are infinite: clipped beyond the right edge, so that the curve ends below 1.
             errors = np.clip([getattr(error, kind) for error in validation.errors], limits[0], 2 * limits[1])
             style = {"color": _style(index)["color"], "linestyle": DASHES[index % len(DASHES)]}
             axes.ecdf(errors, **style, linewidth=2, label=validation.recipe)
@@ -75,7 +75,7 @@ def draw_errors(validations: Sequence["Validation"]) -> "Figure":
 
 
 def _rows(scenes: Sequence[str], title: str) -> "tuple[Figure, Axes]":
-    """Axes with a row for each scene, the first on top, and, set apart, a row for their mean."""
+    """Return axes with one row per scene, the first on top, and a separate row for their mean."""
     names = [*map(short, scenes), "mean over scenes"]
     figure = new_figure(8, 1.5 + 0.45 * len(names))
     axes = plain(figure.subplots(), title)
@@ -87,12 +87,12 @@ def _rows(scenes: Sequence[str], title: str) -> "tuple[Figure, Axes]":
 
 
 def _beside(rows: int, index: int, count: int) -> NDArray[np.float64]:
-    """(rows,) heights of the marks of a recipe, number ``index`` of the ``count`` that share each row."""
+    """Return the (rows,) y coordinates of the marks of recipe ``index`` of the ``count`` in each row."""
     return np.arange(rows, dtype=np.float64) + 0.5 * ((index + 0.5) / count - 0.5)
 
 
 def _style(index: int) -> dict[str, Any]:
-    """The style of a recipe, by its index, the same in all figures; told apart by shape, too; 42 in all."""
+    """Return the style of a recipe by its index, the same in all figures. There are 42, distinct in shape, too."""
     return {"color": COLOURS[index % len(COLOURS)], "marker": MARKERS[index % len(MARKERS)], "markersize": 7}
 
 

@@ -1,4 +1,4 @@
-"""The method step by step, each step a figure: what one pair looks like on its way through the two stages."""
+"""One figure for each step of the method, for a single pair."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -38,14 +38,14 @@ if TYPE_CHECKING:
 
 Images = tuple[Image, Image]
 WIDTH = 10.0  # inches, across a notebook
-MAX_INLIERS, MAX_OUTLIERS = 150, 30  # lines that an eye can follow
+MAX_INLIERS, MAX_OUTLIERS = 150, 30  # number of lines drawn
 _PAPER = {"boxstyle": "round,pad=0.15", "facecolor": "white", "alpha": 0.8, "linewidth": 0}
 
 
 def read_true_pair(directory: Path, pair: str) -> tuple[TrainScene, TruePair]:
-    """The pair ``SCENE;IMAGE-IMAGE`` of a train side, whatever its covisibility, and its scene.
+    """Return the pair ``SCENE;IMAGE-IMAGE`` of a train side, with any covisibility, and its scene.
 
-    Raises :class:`UserError` for an unknown pair, besides what :func:`read_train_side` raises.
+    Raises :class:`UserError` for an unknown pair, and the errors of :func:`read_train_side`.
     """
     (scene,) = read_train_side(directory, scenes=[pair.partition(";")[0]], min_covisibility=0.0)
     known = {true.pair.id: true for true in scene.pairs}
@@ -55,7 +55,7 @@ def read_true_pair(directory: Path, pair: str) -> tuple[TrainScene, TruePair]:
 
 
 def draw_images(images: Images) -> "Figure":
-    """The two photographs."""
+    """Draw the two photographs."""
     figure, row = side_by_side(images)
     for number, (axes, image) in enumerate(zip(row, images, strict=True)):
         _title(axes, f"image {number}: {image.size.width} x {image.size.height} pixels")
@@ -63,13 +63,13 @@ def draw_images(images: Images) -> "Figure":
 
 
 def draw_stage(images: Images, match: PairMatch, stage: int) -> "Figure":
-    """The matches that one stage found, coloured by inlier; those of stage 2 on the crops."""
+    """Draw the matches of one stage, coloured by inlier; stage 2 on the crops."""
     mask = match.in_stage(stage)
     inliers = match.estimate.inliers[mask]
     regions = match.regions if stage == 2 else None
     boxes = [region.box for region in regions] if regions else [Box.whole(image.size) for image in images]
     figure, row = side_by_side([_cut(image, box) for image, box in zip(images, boxes, strict=True)])
-    # The cut is shown as it is; points are moved with it.
+    # The figure shows the crop alone, so the points move by its offset.
     shift0, shift1 = (np.array([box.left, box.top], np.float32) for box in boxes)
     found = match.matches[mask]
     drawn = connect(row, Matches(found.points0 - shift0, found.points1 - shift1, found.scores), inliers)
@@ -80,7 +80,7 @@ def draw_stage(images: Images, match: PairMatch, stage: int) -> "Figure":
 
 
 def draw_clusters(images: Images, points: tuple[Points, Points], clusters: tuple[Clusters, Clusters]) -> "Figure":
-    """All clusters of each image, one colour each with its size beside it; noise as grey crosses."""
+    """Draw all clusters of each image, one colour each, with their sizes; noise as grey crosses."""
     figure, row = side_by_side(images, title_lines=2)
     for number, (axes, xy, found) in enumerate(zip(row, points, clusters, strict=True)):
         noise = xy[found.labels < 0]
@@ -95,7 +95,7 @@ def draw_clusters(images: Images, points: tuple[Points, Points], clusters: tuple
 
 
 def draw_sizes(clusters: tuple[Clusters, Clusters], config: MkpcConfig) -> "Figure":
-    """Bars: the clusters of each image by size, and the size below which they are dropped."""
+    """Draw bars of the cluster sizes of each image, and the size below which clusters are dropped."""
     figure = new_figure(WIDTH, 3.6)
     for number, (axes, found) in enumerate(zip(figure.subplots(1, 2), clusters, strict=True)):
         _size_bars(axes, found, config)
@@ -130,7 +130,7 @@ def _limit(clusters: Clusters, config: MkpcConfig) -> str:
 def draw_boxes(
     images: Images, points: tuple[Points, Points], clusters: tuple[Clusters, Clusters], config: MkpcConfig
 ) -> "Figure":
-    """The bounding box of the kept clusters as it is, and with Crop Area Expansion; dropped points as crosses."""
+    """Draw the bounding box of the kept clusters, without and with expansion; dropped points as crosses."""
     figure, row = side_by_side(images, title_lines=2)
     for number, (axes, image, xy, found) in enumerate(zip(row, images, points, clusters, strict=True)):
         kept = xy[found.in_kept]
@@ -149,20 +149,20 @@ def draw_boxes(
 
 
 def draw_views(images: Images, regions: tuple[CriticalRegion, CriticalRegion], unit: Unit) -> "Figure":
-    """A unit's view of each whole image and of its critical region, and how much each enlarges."""
+    """Draw a unit's view of each whole image and of its critical region, with their scales."""
     pairs = [(Box.whole(image.size), region.box) for image, region in zip(images, regions, strict=True)]
     boxes = [*pairs[0], *pairs[1]]
     views = [unit.view(box, 1) for box in boxes]
-    pictures = [Image("", view.render(images[place // 2].pixels)) for place, view in enumerate(views)]
+    pictures = [Image("", view.render(images[index // 2].pixels)) for index, view in enumerate(views)]
     figure, row = side_by_side(pictures, title_lines=2)
     names = [("whole", f"crop ({region.reason})" if region.reason != "cropped" else "crop") for region in regions]
-    for place, (axes, view, what) in enumerate(zip(row, views, [*names[0], *names[1]], strict=True)):
-        _title(axes, f"image {place // 2}, {what}\n{view.scale[0]:.2f} times enlarged")
+    for index, (axes, view, what) in enumerate(zip(row, views, [*names[0], *names[1]], strict=True)):
+        _title(axes, f"image {index // 2}, {what}\n{view.scale[0]:.2f} times enlarged")
     return figure
 
 
 def draw_both(images: Images, match: PairMatch) -> "Figure":
-    """The points of both stages on the whole images: inliers in the colour of their stage, outliers grey."""
+    """Draw the points of both stages on the whole images: inliers in the colour of their stage, outliers grey."""
     figure, row = side_by_side(images, title_lines=2)
     inliers = match.estimate.inliers
     for axes, points in zip(row, (match.matches.points0, match.matches.points1), strict=True):
@@ -170,12 +170,12 @@ def draw_both(images: Images, match: PairMatch) -> "Figure":
         for stage, marker in ((1, "o"), (2, "^")):
             xy = points[match.in_stage(stage) & inliers]
             axes.scatter(xy[:, 0], xy[:, 1], s=9, c=COLOURS[stage - 1], marker=marker, linewidths=0)
-    told = [
+    counts = [
         f"{what}: stage {stage}, {np.count_nonzero(match.in_stage(stage))} points, "
         f"{np.count_nonzero(match.in_stage(stage) & inliers)} inliers"
         for stage, what in ((1, "blue dots"), (2, "orange triangles"))
     ]
-    _title(row[0], "\n".join(told))
+    _title(row[0], "\n".join(counts))
     total = f"together: {len(match.matches)} points, {match.estimate.inlier_count} inliers"
     _title(row[1], f"{total}\ngrey crosses: outliers")
     return figure
@@ -188,17 +188,17 @@ def draw_epipolar(
     truth: Matrix3 | None = None,
     count: int = 6,
 ) -> "Figure":
-    """``count`` points of image 0, and their epipolar lines in image 1 by each F; the true lines are dashed.
+    """Draw ``count`` points of image 0 and their epipolar lines in image 1 by each F; the true lines are dashed.
 
-    The points are matches, far from each other; in image 1 the point that each was matched with is marked.
+    The points are matches, far from each other. Image 1 also shows their matched points.
     """
     figure, row = side_by_side([images[0], *[images[1]] * len(fundamentals)], title_lines=2)
     chosen = matches[_far_apart(matches.points0, count)]
     _numbered(row[0], chosen.points0)
     _title(row[0], f"image 0: {len(chosen)} matched points")
     for axes, (name, F) in zip(row[1:], fundamentals.items(), strict=True):
-        for place, point in enumerate(chosen.points0):
-            _line(axes, F, point, color=COLOURS[place % len(COLOURS)], linewidth=2)
+        for index, point in enumerate(chosen.points0):
+            _line(axes, F, point, color=COLOURS[index % len(COLOURS)], linewidth=2)
             if truth is not None:
                 _line(axes, truth, point, color="white", linewidth=1.2, linestyle=(0, (4, 4)))
         _numbered(axes, chosen.points1)
@@ -210,19 +210,19 @@ def draw_epipolar(
 
 
 def draw_plane(images: Images, matches: Matches, homography: Estimate, threshold: float) -> "Figure":
-    """Inliers of an F: those that one homography explains, too, and those that lie off its plane."""
+    """Draw the inliers of an F: on the plane of a homography, and off it."""
     figure, row = side_by_side(images, title_lines=2)
     for axes, points in zip(row, (matches.points0, matches.points1), strict=True):
         _dots(axes, points[homography.inliers], COLOURS[0])
         _crosses(axes, points[~homography.inliers], OUTLIER)
     explained = f"{homography.inlier_count} of {len(matches)} inliers of F"
     _title(row[0], f"blue: {explained}\nfit one plane to {threshold:g} pixels")
-    _title(row[1], "orange crosses: those off the plane")
+    _title(row[1], "orange crosses: off the plane")
     return figure
 
 
 def draw_pose_errors(errors: Mapping[str, PoseError]) -> "Figure":
-    """Bars: the errors of the pose that each F stands for, in degrees; those of a failure are infinite."""
+    """Draw bars of the pose errors of each F, in degrees; the errors of a failure are infinite."""
     figure = new_figure(WIDTH, 1.0 + 0.4 * len(errors))
     panels = figure.subplots(1, 2, sharey=True)
     for axes, kind, title in zip(
@@ -241,7 +241,7 @@ def draw_pose_errors(errors: Mapping[str, PoseError]) -> "Figure":
 
 
 def side_by_side(images: Sequence[Image], title_lines: int = 1) -> "tuple[Figure, Sequence[Axes]]":
-    """Pictures in a row at one height, with room for titles of that many lines above."""
+    """Show pictures in a row at one height, with room for titles of ``title_lines`` lines."""
     aspects = [image.size.width / image.size.height for image in images]
     height = min((WIDTH - 0.1 * (len(images) + 1)) / sum(aspects), 5.0)
     figure = new_figure(WIDTH, height + 0.3 + 0.17 * title_lines)
@@ -254,7 +254,7 @@ def side_by_side(images: Sequence[Image], title_lines: int = 1) -> "tuple[Figure
 
 
 def connect(axes: "Sequence[Axes]", matches: Matches, inliers: NDArray[np.bool_]) -> str:
-    """Draw matches from one picture to the other, a sample of them where there are many; what was drawn."""
+    """Draw a sample of the matches from one picture to the other. Return a description of the sample."""
     from matplotlib.patches import ConnectionPatch
 
     drawn = sample(~inliers, MAX_OUTLIERS), sample(inliers, MAX_INLIERS)
@@ -270,7 +270,7 @@ def connect(axes: "Sequence[Axes]", matches: Matches, inliers: NDArray[np.bool_]
 
 
 def add_box(axes: "Axes", box: Box, **style: Any) -> None:
-    """Frame a box of image pixels; ``style`` is matplotlib's."""
+    """Draw the outline of a box of image pixels; ``style`` is matplotlib's."""
     from matplotlib.patches import Rectangle
 
     style = {"edgecolor": REGION, "linewidth": 2.5, **style}
@@ -287,7 +287,7 @@ def _cut(image: Image, box: Box) -> Image:
 
 
 def _by_size(clusters: Clusters) -> NDArray[np.intp]:
-    """Labels, the largest cluster first: the order in which they are kept."""
+    """Return the labels, largest cluster first: the order in which MKPC keeps them."""
     return np.argsort(-clusters.sizes, kind="stable")
 
 
@@ -300,20 +300,20 @@ def _crosses(axes: "Axes", points: Points, colour: str) -> None:
 
 
 def _tag(axes: "Axes", points: Points, text: str) -> None:
-    """A number above a group of points."""
+    """Write a number above a group of points."""
     x, y = points[:, 0].mean(), points[:, 1].min()
     axes.text(x, y, text, fontsize=8, ha="center", va="bottom", bbox=_PAPER)
 
 
 def _numbered(axes: "Axes", points: Points) -> None:
-    for place, (x, y) in enumerate(points):
-        colour = COLOURS[place % len(COLOURS)]
+    for index, (x, y) in enumerate(points):
+        colour = COLOURS[index % len(COLOURS)]
         axes.scatter(x, y, s=130, c=colour, edgecolors="white", linewidths=1, zorder=3)
-        axes.text(x, y, str(place + 1), color="white", fontsize=8, ha="center", va="center_baseline", zorder=4)
+        axes.text(x, y, str(index + 1), color="white", fontsize=8, ha="center", va="center_baseline", zorder=4)
 
 
 def _line(axes: "Axes", F: Matrix3, point: Points, **style: Any) -> None:
-    """The epipolar line of a point of image 0, where axes show image 1: a x + b y + c = 0 with (a, b, c) = F x."""
+    """Draw the epipolar line of a point of image 0 on image 1: a x + b y + c = 0 with (a, b, c) = F x."""
     a, b, c = F @ np.append(point.astype(np.float64), 1)
     normal = a * a + b * b
     if normal > 0:
@@ -322,7 +322,7 @@ def _line(axes: "Axes", F: Matrix3, point: Points, **style: Any) -> None:
 
 
 def _far_apart(points: Points, count: int) -> NDArray[np.intp]:
-    """Indices of points that lie far from each other: each next one is the farthest from those before it."""
+    """Return indices of distant points: each next point is the farthest from the points before it."""
     if not len(points):
         return np.zeros(0, np.intp)
     chosen = [int(np.argmin(points.sum(axis=1)))]
@@ -334,5 +334,5 @@ def _far_apart(points: Points, count: int) -> NDArray[np.intp]:
 
 
 def draw_scene(name: str, scenes: Sequence[Reconstruction]) -> "Figure":
-    """The cameras and points of the largest model of a batch, from above and from the side."""
+    """Draw the cameras and points of the largest model of a batch, from above and from the side."""
     return draw_cameras(SceneRecord.of(name, scenes))

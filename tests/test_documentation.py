@@ -86,11 +86,13 @@ def test_pages_name_commands_and_options_that_there_are(page):
         assert set(options) <= have, (name, set(options) - have)
 
 
-BLOCKS = re.findall(r"^```python\n(.*?)^```", PAGES[0].read_text(encoding="utf-8"), re.M | re.S)
+BLOCKS = [
+    block for page in PAGES for block in re.findall(r"^```python\n(.*?)^```", page.read_text("utf-8"), re.M | re.S)
+]
 
 
 @pytest.mark.parametrize("block", BLOCKS, ids=range(len(BLOCKS)))
-def test_the_python_of_the_readme_runs(block, tmp_path, monkeypatch):
+def test_the_python_of_the_pages_runs(block, tmp_path, monkeypatch):
     """On two parts of a photograph."""
     photograph = load_sample_image("china.jpg")
     for name, shift in (("a.jpg", 0), ("b.jpg", 40)):
@@ -98,7 +100,7 @@ def test_the_python_of_the_readme_runs(block, tmp_path, monkeypatch):
     (tmp_path / "docs").symlink_to(ROOT / "docs")
     monkeypatch.chdir(tmp_path)
     names = {}
-    exec(compile(block, "README.md", "exec"), names)
+    exec(compile(block, "page", "exec"), names)
     if "models" in names:
         assert names["models"] == (), "two images make no model"
     else:

@@ -140,7 +140,7 @@ def unit(**changes):
         (SIFT + "[mkpc]\nepsilon = 1\n", r"\[mkpc\].*'epsilon'.*eps, min_samples, share, expand_x"),
         (SIFT + "[upgrade]\nbelow_inliers = 1\n", "has the unknown key 'upgrade'"),
         (units(unit(flip="true")), "unit 1 has the unknown key 'flip'"),
-        (units(unit(stage=None)), r"unit 1 lacks 'stage'"),
+        (units(unit(stage=None)), r"unit 1: missing keys 'stage'"),
         ("", "no units"),
         ("units = [", "not valid TOML"),
         # types

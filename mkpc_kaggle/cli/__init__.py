@@ -20,21 +20,21 @@ COMMANDS = {
     "match": "two images -> F, counts, a figure",
     "reconstruct": "a folder of images -> cameras, a COLMAP database, models",
     "validate": "a directory with known poses -> mAA and pose AUC of a recipe",
-    "recipes": "the recipes, their units, and the weights that each lacks",
-    "weights": "the weight files: which are there, are they whole, fetch them",
-    "check": "is this submission.csv what the competition takes?",
-    "journal": "what a run did: overview, tables for pandas, report.html",
-    "package": "the folders that you upload to Kaggle: a dataset and a notebook",
+    "recipes": "list recipes, their units and missing weights",
+    "weights": "list, verify, fetch and convert weight files",
+    "check": "compare a submission.csv with the competition's format",
+    "journal": "a run's journal -> overview, tables for pandas, report.html",
+    "package": "write the folders to upload to Kaggle: a dataset and a notebook",
     "demo": "render a small test set with known poses",
 }
 EXIT_BAD_INPUT = 2
-EXIT_BROKEN_PIPE = 128 + 13  # a shell's status for SIGPIPE, which Windows lacks
-EXIT_INTERRUPTED = 128 + 2  # and for SIGINT
+EXIT_BROKEN_PIPE = 128 + 13  # a shell's status for SIGPIPE, which Windows does not define
+EXIT_INTERRUPTED = 128 + 2  # a shell's status for SIGINT
 
 
 def program(arguments: Sequence[str] | None = None) -> NoReturn:
-    """Run a command and end the process, without what an interpreter would still do for a second or longer."""
-    try:  # imports take a while, and Ctrl-C is no error
+    """Run a command and end the process at once: an orderly exit of the interpreter takes a second or longer."""
+    try:  # Ctrl-C during slow imports is not an error
         from mkpc_kaggle.engine.budget import process_started
         from mkpc_kaggle.engine.console import leave
 
@@ -45,15 +45,16 @@ def program(arguments: Sequence[str] | None = None) -> NoReturn:
 
 
 def main(arguments: Sequence[str] | None = None, *, started: float | None = None) -> int:
-    """Run a command; the exit status: 0 done, 1 a check failed, 2 bad input, 130 / 143 ended by a signal.
+    """Run a command. Return the exit status.
 
-    141: the reader of the output closed the pipe. The time limit counts from ``started``; default: now.
+    0: done; 1: a check failed; 2: bad input; 130, 143: ended by a signal; 141: the reader of the output closed the
+    pipe. The time limit counts from ``started``; default: now.
     """
     from mkpc_kaggle.engine.console import complain, warn
     from mkpc_kaggle.errors import UserError
 
     for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, TextIOWrapper):  # paths and ids may have letters that the terminal lacks
+        if isinstance(stream, TextIOWrapper):  # paths and ids may have characters that the terminal cannot encode
             stream.reconfigure(errors="backslashreplace")
     with ExitStack() as printing, warnings.catch_warnings():
         warnings.showwarning = lambda message, *_, **__: warn(str(message))
@@ -64,9 +65,9 @@ def main(arguments: Sequence[str] | None = None, *, started: float | None = None
             parsed.started = time.monotonic() if started is None else started
             printing.enter_context(parsed.printing())
             status = int(parsed.run(parsed))
-            with suppress(OSError, ValueError):  # full, or closed
+            with suppress(OSError, ValueError):  # the disk is full, or the stream closed
                 if sys.stdout is not None:
-                    sys.stdout.flush()  # a reader may take its time, except in a run: there this does not wait
+                    sys.stdout.flush()  # waits for a slow reader, except in a run
             return status
         except UserError as error:
             complain(str(error))
@@ -74,7 +75,7 @@ def main(arguments: Sequence[str] | None = None, *, started: float | None = None
         except KeyboardInterrupt:
             complain("interrupted")
             return EXIT_INTERRUPTED
-        except BrokenPipeError:  # the reader closed the pipe, as head does
+        except BrokenPipeError:  # the reader closed the pipe, as `head` does
             return EXIT_BROKEN_PIPE
         except OSError as error:
             if error.errno != errno.ENAMETOOLONG:
@@ -84,7 +85,7 @@ def main(arguments: Sequence[str] | None = None, *, started: float | None = None
 
 
 def require_directory() -> None:
-    """Raise :class:`UserError` where the current directory has been removed: no path means anything there."""
+    """Raise :class:`UserError` if the current directory was removed: relative paths are then undefined."""
     from mkpc_kaggle.errors import UserError
 
     try:
@@ -94,9 +95,9 @@ def require_directory() -> None:
 
 
 def make_parser(arguments: Sequence[str] = tuple(COMMANDS)) -> argparse.ArgumentParser:
-    """The parser of these arguments; only the commands among them are imported, since imports take time."""
+    """Return the parser for these arguments. Imports only the commands among them, since imports take time."""
     text = "Two-stage image matching with Matching Key-Points Crop, offline, inside a time budget."
-    parser = argparse.ArgumentParser("mkpc_kaggle", description=text, epilog="COMMAND --help tells more.")
+    parser = argparse.ArgumentParser("mkpc_kaggle", description=text, epilog="COMMAND --help has the options.")
     parser.add_argument("--version", action="version", version=__version__)
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name, summary in COMMANDS.items():

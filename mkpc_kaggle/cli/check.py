@@ -6,8 +6,8 @@ from pathlib import Path
 from mkpc_kaggle.data.competition import read_test_side, submission_problems
 
 HELP = """\
-Compare a submission with test.csv: header, ids and their order, nine finite numbers a row.
-Exit status: 0 it is good, 1 it is not (each problem on a line), 2 the test side cannot be read.
+Compare a submission with test.csv: header, ids and their order, nine finite numbers per row.
+Exit status: 0 good, 1 not good (one problem per line), 2 the test side cannot be read.
 """
 MAX_LINES = 20
 

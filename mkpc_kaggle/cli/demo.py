@@ -6,8 +6,8 @@ from pathlib import Path
 from mkpc_kaggle.demo import write_demo
 
 HELP = """\
-Render scenes of stone walls and painted boxes with known cameras, in the competition's layout:
-DIR/train with poses, DIR/test without, DIR/test_truth.csv to score a submission for the test side:
+Render scenes of stone walls and painted boxes with known cameras, in the competition's layout: DIR/train with
+poses, DIR/test without poses, and DIR/test_truth.csv to score a submission:
 
   python -m mkpc_kaggle demo --out demo
   python make_submission.py --test-dir demo/test
@@ -17,7 +17,7 @@ DIR/train with poses, DIR/test without, DIR/test_truth.csv to score a submission
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, default=Path("demo"), metavar="DIR", help="default: demo")
-    parser.add_argument("--seed", type=int, default=0, help="another seed gives other pictures")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the rendered scenes")
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -10,27 +10,27 @@ from mkpc_kaggle.reporting.run_log import read_log, write_csv
 from mkpc_kaggle.reporting.summary import overview
 
 HELP = """\
-Read the journal of a run, running or ended, and show what it did. DIR is the run's work directory, NAME.work
-beside the submission. Without options: one screen.
+Show the journal of a run, also while it is running. DIR is the run's work directory, NAME.work next to the
+submission. Without options, print an overview of one screen.
 
---csv writes long tables that pandas.read_csv takes as they are, with `pair`, the row of the test set, in common:
+--csv writes long tables for pandas.read_csv. All have the column `pair`, the row of the test set:
   pairs.csv    ids, image names, failure, source of F (pair, scene, fallback), matches, inliers, seconds by part;
-               of the F of the pair's own matches: support (how many times as many matches agree with it as by
-               chance), overlaps (whether the images show the same thing), candidates, cost of the winner and of
-               MAGSAC's own F, the focal lengths found; F (f11 ... f33)
-  units.csv    for each unit on each pair: matches, inliers, seconds, failure
-  regions.csv  for each image (0 or 1) of each pair: the critical region's box and the reason for it
-  events.csv   what happened when: starts, plans, jobs that ended, faults, ends
+               F (f11 ... f33). For the F of the pair's own matches: support (ratio of inliers to inliers by
+               chance), overlaps (whether the images overlap), number of candidates, costs of the result and of
+               MAGSAC's own F, focal lengths
+  units.csv    per unit and pair: matches, inliers, seconds, failure
+  regions.csv  per image (0 or 1) and pair: the critical region's box and the reason for it
+  events.csv   times of starts, plans, jobs that ended, faults, ends
 
-Exit status: 0 done, 2 there is no such journal, or a file cannot be written.
+Exit status: 0 done, 2 the journal does not exist, or a file cannot be written.
 """
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("work_dir", type=Path, metavar="DIR")
-    parser.add_argument("--csv", type=Path, metavar="OUT", help="the directory for the tables")
-    parser.add_argument("--report", type=Path, metavar="FILE.html", help="a page to look at, pictures inside")
-    parser.add_argument("--test-dir", type=Path, metavar="DIR", help="where the images are that the report draws")
+    parser.add_argument("--csv", type=Path, metavar="OUT", help="write tables to this directory")
+    parser.add_argument("--report", type=Path, metavar="FILE.html", help="write a page with pictures")
+    parser.add_argument("--test-dir", type=Path, metavar="DIR", help="the images that the report draws")
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -11,16 +11,16 @@ from mkpc_kaggle.reporting.figures.pair import draw_pair
 from mkpc_kaggle.reporting.figures.style import save
 
 HELP = """\
-Match two images and print the fundamental matrix (x1^T F x0 = 0, pixel centres at integers), the matches of each
-unit, and the critical regions. --out draws the matches, the clusters and the critical regions. Pixels are those of
-the stored files, whatever EXIF says of their orientation; figures are upright.
+Match two images. Print the fundamental matrix (x1^T F x0 = 0, pixel centres at integers), the number of matches of
+each unit, and the critical regions. --out draws the matches, the clusters and the critical regions. Pixels are those
+of the stored files, whatever EXIF says of their orientation; figures are upright.
 """
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("image0", type=Path)
     parser.add_argument("image1", type=Path)
-    parser.add_argument("--out", type=Path, metavar="FIG.png", help="draw the pair; the suffix says the format")
+    parser.add_argument("--out", type=Path, metavar="FIG.png", help="draw the pair; the suffix sets the format")
     options.add_matching(parser)
 
 
@@ -36,8 +36,8 @@ def run(arguments: argparse.Namespace) -> int:
         lines.append(f"this is the fallback: {match.estimate.failure}")
     lines.append(f"{len(match.matches)} matches, {match.estimate.inlier_count} inliers")
     found = match.estimate.stats.support
-    verdict = "the images show the same thing" if found >= MIN_SUPPORT else "the images may show different things"
-    lines.append(f"{found:.1f} times as many as by chance: {verdict}")
+    verdict = "the images overlap" if found >= MIN_SUPPORT else "the images may not overlap"
+    lines.append(f"{found:.1f} times the inliers expected by chance: {verdict}")
     for result in match.results:
         counts = f"{len(result.matches):>6} matches  {result.seconds:.2f} s  {result.failure or result.note}"
         lines.append(f"  {result.unit.name:<30}{counts}")

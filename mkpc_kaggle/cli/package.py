@@ -9,27 +9,28 @@ from mkpc_kaggle.package.metadata import LATEST
 from mkpc_kaggle.package.wheels import PYTHONS
 
 HELP = """\
-Write DIR/dataset (our wheel, the wheels that Kaggle's image may lack, weights with their licences) and DIR/kernel
-(the submission notebook), each with the metadata that the `kaggle` command reads. It runs in a checkout, on a
-machine with internet or with the wheels in a directory (--wheels). Run again, it keeps what is there already.
+Write two folders, each with the metadata for the `kaggle` command:
+  DIR/dataset  our wheel, wheels of packages that may be missing on Kaggle, weights with their licences
+  DIR/kernel   the submission notebook
 
-Torch checkpoints are converted to safetensors, since Kaggle unpacks uploaded archives, which these are.
+Run it in a checkout, with internet or with the wheels in a directory (--wheels). A second run keeps valid files.
+Torch checkpoints are converted to safetensors, since Kaggle unpacks uploaded archives.
 Weights whose licences do not allow redistribution are left out, unless --private is given.
 """
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add("--out", type=Path, required=True, metavar="DIR", help="where the two folders go")
+    add("--out", type=Path, required=True, metavar="DIR", help="the directory for the two folders")
     add("--owner", required=True, metavar="NAME", help="your user name on Kaggle")
     options.add_weights(parser)
-    text = "the Python versions that Kaggle's image may have (default: %(default)s)"
+    text = "Python versions to bundle wheels for (default: %(default)s)"
     add("--python", default=",".join(PYTHONS), metavar="VERSIONS", help=text)
-    add("--wheels", type=Path, metavar="DIR", help="take wheels from there and use no network")
-    text = "include weights that must not be redistributed: the dataset must stay private then"
+    add("--wheels", type=Path, metavar="DIR", help="take wheels from DIR, without a network")
+    text = "include weights that must not be redistributed; the dataset must then stay private"
     add("--private", action="store_true", help=text)
-    text = """Kaggle's latest image (the default), for good that of the kernel's first version, or just this one
-        (`kaggle kernels pull NAME/mkpc-submission -m` tells which a version had, as docker_image)"""
+    text = """Kaggle's latest image (the default), the image of the kernel's first version, or this image
+        (`kaggle kernels pull NAME/mkpc-submission -m` prints the image of a version as docker_image)"""
     add("--image", default=LATEST, metavar="latest|original|NAME@sha256:DIGEST", help=text)
 
 
@@ -54,9 +55,9 @@ def run(arguments: argparse.Namespace) -> int:
 
 _LEFT_OUT = "Left out, because their licences do not clearly allow redistribution (--private includes them)"
 _PRIVATE = """\
-In this dataset, though their licences do not clearly allow redistribution. Keep the dataset private on Kaggle,
-do not share it, and check what the licences say of competitions. These are"""
+Included, although their licences do not clearly allow redistribution. Keep the dataset private on Kaggle, do not
+share it, and check what the licences say about competitions"""
 _NEXT = """\
-Next, with the `kaggle` command (README, On Kaggle):
+Next, with the `kaggle` command (README.md; details in docs/kaggle.md):
   kaggle datasets create -p {out}/dataset
   kaggle kernels push -p {out}/kernel"""

@@ -8,10 +8,10 @@ from mkpc_kaggle.recipe import load_recipe, recipe_names
 from mkpc_kaggle.weights import WeightStore
 
 HELP = """\
-List the recipes: their units in order of importance, and which weight files are missing. A unit reads
-stage:matcher@size, where the size is the view's long side, or the height x width whose area the view gets at
-its own aspect ("!": that height and width themselves), and the most matches that are kept.
-A recipe of your own is a TOML file of the form of those in the package: --recipe FILE.toml.
+List the recipes: their units in order of importance, and missing weight files. A unit is printed as
+stage:matcher@size, with its maximum number of matches. The size is the view's long side, or a height x width: the
+view gets this area at its own aspect ratio, or exactly this height and width ("!").
+A custom recipe is a TOML file in the format of the package's recipes: --recipe FILE.toml.
 """
 
 
@@ -25,8 +25,8 @@ def run(arguments: argparse.Namespace) -> int:
         recipe = load_recipe(name)
         print(f"{name}: {recipe.description}")
         for unit in recipe.units:
-            fallback = f"  (or {unit.fallback}, where its weights are missing)" if unit.fallback else ""
+            fallback = f"  (or {unit.fallback}, if its weights are missing)" if unit.fallback else ""
             print(f"    {unit.name}  at most {unit.max_matches}{fallback}")
         reasons = [f"    {matcher}: {reason}" for matcher, reason in unavailable(recipe, store).items()]
-        print("\n".join(reasons or ["    all weights are there"]))
+        print("\n".join(reasons or ["    all weights are available"]))
     return 0

@@ -12,15 +12,15 @@ from mkpc_kaggle.reporting.report import report_run
 from mkpc_kaggle.reporting.summary import summary, trouble
 
 HELP = """\
-Match every pair of test.csv and write its fundamental matrix, a row for each pair.
+Match every pair of test.csv and write one row per pair, its fundamental matrix.
 
-submission.csv is complete from the start: pairs that were not reached hold a fallback matrix, and every later
-version is better. Killed at any point, the same command goes on where it was (its journal lies in the work
-directory). Ctrl-C and SIGTERM end the run early with a valid file.
+submission.csv is complete from the start: pending pairs have a fallback matrix, and every later version is better.
+If the run is killed, the same command resumes it from its journal in the work directory. Ctrl-C and SIGTERM end
+the run early with a valid file.
 
-Exit status: 0 done, or the time was up; 1 the run failed (no worker was left, or errors left most pairs without
-an F), or the last version of the file could not be written: an earlier version is whole; 2 bad input; 130 or 143
-ended by a signal (the file is whole).
+Exit status: 0 done, or the time limit was reached; 1 the run failed (no worker remained, or errors left most pairs
+without an F), or the last version of the file could not be written, and an earlier one is complete; 2 bad input;
+130 or 143 ended by a signal, and the file is complete.
 """
 
 
@@ -29,16 +29,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--test-dir", type=Path, required=True, metavar="DIR", help="holds test.csv and test_images/")
     add("--output", type=Path, default=Path("submission.csv"), help="default: submission.csv")
     options.add_matching(parser)
-    text = """reconstruct the pairs of a batch together and take F from the cameras, or not (default: as the recipe
-        has it; the paper's recipes have not). A pair's F then comes from other pairs, too: read your competition's
-        rules on that, and compare published stereo scores with --no-scenes"""
+    text = """reconstruct the pairs of a batch together and take F from the cameras (default: the recipe's choice;
+        the paper's recipes do not). A pair's F then also depends on other pairs: read your competition's rules,
+        and compare published stereo scores with --no-scenes only"""
     add("--scenes", dest="reconstruct", action=argparse.BooleanOptionalAction, help=text)
     options.add_run(parser, time_limit="8h45m")
-    add("--work-dir", type=Path, metavar="DIR", help="for the journal; default: beside the output, NAME.work")
-    add("--fresh", action="store_true", help="forget what an earlier run left in the work directory")
-    text = "a page on the run; default: beside the output, NAME.html"
+    add("--work-dir", type=Path, metavar="DIR", help="for the journal; default: NAME.work next to the output")
+    add("--fresh", action="store_true", help="delete the journal of an earlier run")
+    text = "a page about the run; default: NAME.html next to the output"
     add("--report", type=Path, metavar="FILE.html", help=text)
-    add("--no-report", action="store_true", help="write none")
+    add("--no-report", action="store_true", help="write no page")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -49,7 +49,7 @@ def run(arguments: argparse.Namespace) -> int:
     require_apart(files, [*test_side(arguments.test_dir), Path(arguments.recipe)], work_dir, arguments.weights)
     with interruptible() as interrupt:
         pairs = read_test_side(arguments.test_dir)
-        # Not yet watched: a run whose limit is over when it starts leaves a whole file, too.
+        # Before the watchdog starts: a run that begins after its limit must still leave a complete file.
         with first_version(pairs, output), options.watched_session(arguments, work_dir, interrupt) as watched:
             session, watchdog = watched
             assembly = options.assembly_of(arguments, arguments.recipe, arguments.mode)

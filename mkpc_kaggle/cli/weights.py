@@ -14,29 +14,29 @@ from mkpc_kaggle.weights.fetch import FetchOutcome, choose, fetch
 from mkpc_kaggle.weights.manifest import UNVERIFIED, pin, read_manifest
 
 HELP = """\
-The files that the matchers load their weights from; none comes with the package.
+Manage the weight files of the matchers. The package contains none.
 
-  list      what each matcher needs, and where it lies
+  list      print the files of each matcher and their paths
   verify    compare every file found with the manifest
-  fetch     download files, on a machine with internet
-  convert   a checkpoint -> safetensors, and its line for the manifest
+  fetch     download files; needs internet
+  convert   write a checkpoint as safetensors, and print its line for the manifest
 
-Exit status: 0 done, 1 a file is not there, is wrong or could not be fetched, 2 bad input.
-ACTION --help tells more.
+Exit status: 0 done, 1 a file is missing, is wrong or could not be fetched, 2 bad input.
+ACTION --help has the options.
 """
 _FETCH = """\
-Download files; an interrupted download is resumed. If no digest is published, that of the first download is kept
-in DIR/weights_manifest.txt and must be met from then on. Each licence is printed first; check it."""
+Download files; resume an interrupted download. If no digest is published, the digest of the first download is
+saved in DIR/weights_manifest.txt, and later downloads must match it. Each licence is printed first; check it."""
 _VERIFY = """\
-Compare every file found with the manifest: it is good (also under another name), unverified (no digest is known,
-or Kaggle unpacked it into a directory) or refused, with the reason."""
+Compare every file found with the manifest. A file is good (also under another name), unverified (no digest is
+known, or Kaggle unpacked it into a directory) or refused, with the reason."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     actions = parser.add_subparsers(required=True, metavar="ACTION")
     parsers = {}
     for name, act, description in (
-        ("list", _list, "Each slot, which is what a matcher asks for: its licence, its matchers and its files."),
+        ("list", _list, "List the slots, the weights that matchers ask for, with licence, matchers and files."),
         ("verify", _verify, _VERIFY),
         ("fetch", _fetch, _FETCH),
         ("convert", _convert, "Write a checkpoint's tensors as safetensors; print the manifest's line for it."),
@@ -45,10 +45,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         parsers[name].set_defaults(act=act)
     for name in ("list", "verify"):
         options.add_weights(parsers[name])
-    parsers["verify"].add_argument("--manifest", type=Path, metavar="FILE", help="is every file of it there?")
-    text = "default: what recipe auto can use"
+    parsers["verify"].add_argument("--manifest", type=Path, metavar="FILE", help="check every file of this one")
+    text = "default: all weights of recipe auto"
     parsers["fetch"].add_argument("names", nargs="*", default=["auto"], metavar="NAME|SLOT|RECIPE", help=text)
-    parsers["fetch"].add_argument("--out", type=Path, required=True, metavar="DIR", help="where the files go")
+    parsers["fetch"].add_argument("--out", type=Path, required=True, metavar="DIR", help="directory for the files")
     parsers["convert"].add_argument("file", type=Path, metavar="FILE")
     parsers["convert"].add_argument("--out", type=Path, required=True, metavar="X.safetensors")
 
@@ -87,7 +87,7 @@ def _verify(arguments: argparse.Namespace) -> int:
     files = store.verify() if wanted is None else looked_for
     there = {found.file for found in files}
     missing = [file.name for file in wanted or () if file not in there]
-    beside = arguments.manifest and arguments.manifest.parent  # where a file needs no path
+    beside = arguments.manifest and arguments.manifest.parent  # files in this folder are printed without a path
     rows = [("file", "state", "path", "note")]
     for found in files:
         path = "" if found.path.parent == beside else str(found.path)
@@ -122,7 +122,7 @@ def _convert(arguments: argparse.Namespace) -> int:
 
 
 def files_of(name: str, store: WeightStore) -> list[list[WeightFile]]:
-    """The files that the name of a file, a slot or a recipe stands for: a list of alternatives for each slot.
+    """Return the files of a file name, a slot or a recipe: a list of alternatives per slot.
 
     Raises :class:`UserError` with the known names for an unknown name.
     """

@@ -1,1 +1,1 @@
-"""Points, boxes, clusters, two-view geometry and scores: numpy, OpenCV and SciPy only, no torch."""
+"""Points, boxes, clusters, two-view geometry and scores. Uses NumPy, OpenCV, SciPy and scikit-learn, not torch."""

@@ -1,4 +1,4 @@
-"""Calibrated cameras and the exact geometry of two of them."""
+"""Calibrated cameras, and the exact two-view geometry of two cameras."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -10,12 +10,12 @@ from scipy.spatial.transform import Rotation
 from mkpc_kaggle.geometry.coordinates import Matrix3
 from mkpc_kaggle.geometry.two_view import cross_matrix
 
-MIN_BASELINE = 1e-9  # below it, in units of the world, two cameras stand at the same point
+MIN_BASELINE = 1e-9  # world units; two closer cameras count as one point
 
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A calibrated camera: K (3, 3) in pixels; R (3, 3) and t (3,) take world to camera, X_cam = R X + t."""
+    """A calibrated camera: K (3, 3) in pixels; R (3, 3) and t (3,) map world to camera, X_cam = R X + t."""
 
     K: Matrix3
     R: Matrix3
@@ -23,20 +23,20 @@ class Camera:
 
     @property
     def calibrated(self) -> "Camera":
-        """The same camera with K the identity: F of two such cameras is E of the two."""
+        """The same camera with K the identity. F of two calibrated cameras is their E."""
         return replace(self, K=np.eye(3))
 
 
 def relative_pose(camera0: Camera, camera1: Camera) -> tuple[Matrix3, NDArray[np.float64]]:
-    """R (3, 3) and t (3,) with X_1 = R X_0 + t, in the cameras' world units."""
+    """Return R (3, 3) and t (3,) with X_1 = R X_0 + t, in world units."""
     R = camera1.R @ camera0.R.T
     return R, camera1.t - R @ camera0.t
 
 
 def fundamental_of_cameras(camera0: Camera, camera1: Camera) -> Matrix3:
-    """The true F, x1^T F x0 = 0, of unit Frobenius norm: K1^-T [t]_x R K0^-1.
+    """Return F with x1^T F x0 = 0 and unit Frobenius norm: K1^-T [t]_x R K0^-1.
 
-    Raises ``ValueError`` when the two cameras stand at the same point: then F is not defined.
+    Raises ``ValueError`` if the two cameras have the same centre: F is not defined.
     """
     R, t = relative_pose(camera0, camera1)
     if np.linalg.norm(t) < MIN_BASELINE * max(1.0, float(np.linalg.norm(camera0.t))):
@@ -46,11 +46,11 @@ def fundamental_of_cameras(camera0: Camera, camera1: Camera) -> Matrix3:
 
 
 def mean_cameras(pairs: Sequence[tuple[Camera, Camera]], max_degrees: float) -> tuple[Camera, Camera]:
-    """Two cameras whose relative pose and focal lengths are the mean of several answers for the same two cameras.
+    """Return two cameras with the mean relative pose and focal lengths of several estimates.
 
-    Each answer has a world of its own. An answer whose relative rotation is more than ``max_degrees`` from that of
-    the first is left out. The directions of translation are averaged as unit vectors, focal lengths geometrically;
-    principal points are those of the first. Raises ``ValueError`` if the cameras of an answer have one centre.
+    Each estimate has its own world. Estimates with a relative rotation more than ``max_degrees`` from the first
+    are ignored. Translation directions are averaged as unit vectors, focal lengths geometrically. The principal
+    points are the first estimate's. Raises ``ValueError`` if the two cameras of an estimate have the same centre.
     """
     poses = [relative_pose(*pair) for pair in pairs]
     rotations = Rotation.from_matrix(np.stack([R for R, _ in poses]))

@@ -1,8 +1,8 @@
 """The critical region of an image: Matching Key-Points Crop (the paper's Algorithm 1) and Crop Area Expansion.
 
-Each image is treated on its own: its matched points of stage 1, normalised by its width and height, are
-clustered; the big clusters are kept; their bounding box, scaled about its centre, is the critical region.
-Where that cannot be trusted, the region is the whole image, with the reason.
+For each image separately: normalise the matched points of stage 1 by width and height, cluster them, and keep the
+large clusters. Their bounding box, scaled about its centre, is the critical region. If the box cannot be trusted,
+the region is the whole image, with the reason.
 """
 
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from mkpc_kaggle.config import AT_LEAST_1, POSITIVE, SHARE, Range, check_ranges
 from mkpc_kaggle.geometry.coordinates import Box, Points, Size
 
-MERGE_ABOVE = 2000  # points: DBSCAN lists the neighbours of each, of clumped points in quadratic memory
+MERGE_ABOVE = 2000  # points; DBSCAN stores the neighbours of each, so clumped points take quadratic memory
 CELLS_PER_EPS = 10
 
 
@@ -22,12 +22,12 @@ CELLS_PER_EPS = 10
 class MkpcConfig:
     """Settings of :func:`critical_region`, table ``[mkpc]`` of a recipe."""
 
-    eps: float = 0.05  # of DBSCAN, in units of the image's width and height
+    eps: float = 0.05  # radius of DBSCAN, relative to the image's width and height
     min_samples: int = 5  # of DBSCAN
-    share: float = 0.05  # Algorithm 1's T: a cluster that is kept has that share of the largest cluster's points
+    share: float = 0.05  # Algorithm 1's T: minimum size of a kept cluster, relative to the largest
     expand_x: float = 1.05  # the paper's e_h
     expand_y: float = 1.0  # the paper's e_v
-    min_clustered: float = 0.2  # share of the points that must be in clusters
+    min_clustered: float = 0.2  # minimum share of points in clusters
     min_side: int = 32  # of a crop, in pixels
 
     def __post_init__(self) -> None:
@@ -47,12 +47,12 @@ class RegionReason(StrEnum):
 
 @dataclass(frozen=True)
 class CriticalRegion:
-    """The box of an image that stage 2 looks at, in image pixels, and the reason for it."""
+    """The box of an image for stage 2, in image pixels, and the reason for it."""
 
     box: Box
     reason: RegionReason
-    clusters: int = 0  # found
-    kept: int = 0  # those whose points span the box
+    clusters: int = 0  # number found
+    kept: int = 0  # number inside the box
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +61,7 @@ class Clusters:
 
     labels: NDArray[np.intp]  # (N,) the cluster of each point, -1 for noise
     sizes: NDArray[np.intp]  # (K,) the points of each cluster
-    kept: NDArray[np.intp]  # labels of those that span the critical region, largest first
+    kept: NDArray[np.intp]  # labels of the clusters in the critical region, largest first
 
     @property
     def in_kept(self) -> NDArray[np.bool_]:
@@ -70,9 +70,9 @@ class Clusters:
 
 
 def critical_region(points: Points, size: Size, config: MkpcConfig) -> CriticalRegion:
-    """The critical region of an image of ``size`` with matched ``points``, (N, 2) float32 in image pixels.
+    """Return the critical region of an image of ``size`` with matched ``points``, (N, 2) float32 in image pixels.
 
-    Points that are not finite or not on the image are ignored. Never raises, whatever the points are.
+    Ignores points that are not finite or not on the image. Never raises.
     """
     whole = Box.whole(size)
     points = points[whole.contains(points)]
@@ -91,9 +91,9 @@ def critical_region(points: Points, size: Size, config: MkpcConfig) -> CriticalR
 
 
 def find_clusters(points: Points, size: Size, config: MkpcConfig) -> Clusters:
-    """The clusters of an image's matched points, (N, 2) float32 in image pixels, and those that MKPC keeps.
+    """Cluster matched points, (N, 2) float32 in image pixels, by DBSCAN, and select the clusters to keep.
 
-    DBSCAN sees x over the image's width and y over its height.
+    Coordinates are normalised by the image's width and height.
     """
     normalised = np.asarray(points, np.float64) / (size.width, size.height)
     labels = dbscan(normalised, eps=config.eps, min_samples=config.min_samples)
@@ -102,11 +102,11 @@ def find_clusters(points: Points, size: Size, config: MkpcConfig) -> Clusters:
 
 
 def dbscan(points: NDArray[np.float64], *, eps: float, min_samples: int) -> NDArray[np.intp]:
-    """Labels (N,) of scikit-learn's DBSCAN of ``points`` (N, 2), -1 for noise.
+    """Return the labels (N,) of scikit-learn's DBSCAN for ``points`` (N, 2), -1 for noise.
 
-    More than ``MERGE_ABOVE`` points are merged in cells of a tenth of eps, where each counts.
+    More than ``MERGE_ABOVE`` points are merged in cells of a tenth of eps, weighted by their number.
     """
-    from sklearn.cluster import DBSCAN  # takes a second
+    from sklearn.cluster import DBSCAN  # the import takes a second
 
     if not len(points):
         return np.zeros(0, np.intp)
@@ -114,16 +114,17 @@ def dbscan(points: NDArray[np.float64], *, eps: float, min_samples: int) -> NDAr
     if len(points) > MERGE_ABOVE:
         corners = np.floor(points * (CELLS_PER_EPS / eps))
         _, cell, counts = np.unique(corners, axis=0, return_inverse=True, return_counts=True)
-        cell = cell.ravel()  # numpy 2.0.0 has it as a column
+        cell = cell.ravel()  # NumPy 2.0.0 returns a column
         points = np.column_stack([np.bincount(cell, along) / counts for along in points.T])
     found = DBSCAN(eps=eps, min_samples=min_samples, algorithm="kd_tree").fit(points, sample_weight=counts)
     return np.asarray(found.labels_[cell], np.intp)
 
 
 def keep_clusters(sizes: NDArray[np.intp], share: float) -> NDArray[np.intp]:
-    """Labels of the clusters to keep, largest first; ``sizes`` is (K,), the number of points by label.
+    """Return the labels of the clusters to keep, largest first; ``sizes`` (K,) is the number of points per label.
 
-    These have at least ``share`` of the largest cluster's points. Clusters of equal size keep their label order.
+    Keeps clusters with at least ``share`` of the largest cluster's points. Clusters of equal size keep their
+    order.
     """
     by_size = np.argsort(-sizes, kind="stable")
     kept: NDArray[np.intp] = by_size[sizes[by_size] / sizes.max(initial=1) >= share]
@@ -131,10 +132,10 @@ def keep_clusters(sizes: NDArray[np.intp], share: float) -> NDArray[np.intp]:
 
 
 def expand_box(points: Points, size: Size, expand_x: float, expand_y: float) -> Box:
-    """Crop Area Expansion: the bounding box of ``points`` scaled about its centre, cut at the image's border.
+    """Scale the bounding box of ``points`` about its centre and clip it to the image: Crop Area Expansion.
 
-    The box is that of the points' pixels, [min, max + 1) in whole pixels, so nothing on the last row or
-    column is lost; scaled edges are rounded outwards.
+    The box spans the points' pixels, [min, max + 1) in whole pixels, so it includes the last row and column.
+    Scaled edges are rounded outwards.
     """
     low = np.floor(points.min(axis=0).astype(np.float64) + 0.5)
     high = np.floor(points.max(axis=0).astype(np.float64) + 0.5) + 1

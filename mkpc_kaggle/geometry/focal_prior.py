@@ -1,22 +1,21 @@
 """F of a pair under a prior on the focal lengths of its two cameras.
 
-The seven degrees of freedom of F are a relative pose and two focal lengths, once the principal points are known,
-and cameras have plausible focal lengths. What is minimised over the pose and log f0, log f1 is the negative
-logarithm of a posterior density,
+With known principal points, the seven degrees of freedom of F are a relative pose and two focal lengths, and most
+cameras have plausible focal lengths. The search minimises the negative logarithm of a posterior density over the
+pose and log f0, log f1:
 
     sum_n rho(r_n / scale) + sum_i (log f_i - log g_i)^2 / (2 sigma_i^2),     rho(x) = x^2 / (2 (1 + x^2)),
 
-r being the Sampson distance in pixels (:mod:`mkpc_kaggle.geometry.two_view`), g the focal lengths that are
-expected, and rho the loss of Geman and McClure (1985): an outlier costs a half, as much as a focal length that is
-sigma off. Where the matches determine the focal lengths they decide, elsewhere the prior does.
+r is the Sampson distance in pixels (:mod:`mkpc_kaggle.geometry.two_view`), g the expected focal length, and rho
+the loss of Geman and McClure (1985). An outlier costs 0.5, as much as a focal length that is sigma off. The prior
+matters only if the matches do not determine the focal lengths. A match with its point behind a camera is an
+outlier, too.
 
-A match whose point would lie behind a camera is an outlier, too.
-
-The search is local, so it has several starts: the F of MAGSAC, and E by MAGSAC at several focal lengths, each
-on another part of the matches. What a short search on few matches makes of each is compared, and the best are
-refined. MAGSAC's own F is kept where it costs much less: then no plausible focal lengths explain the matches, and
-the principal points may be elsewhere. The two rotations that an E stands for are not two starts: both give the
-same F and the same derivatives of it.
+The search is local and has several starts: MAGSAC's F, and MAGSAC's E at several focal lengths, each on a
+different subset of the matches. A short search on few matches ranks the starts, and the best are refined. MAGSAC's
+own F wins if it costs much less: then no plausible focal lengths explain the matches, for example because the
+principal points are not at the centres. Both rotations of an E have the same F and the same derivatives, so they
+share a start.
 """
 
 from collections.abc import Sequence
@@ -43,25 +42,25 @@ from mkpc_kaggle.geometry.robust import (
 )
 from mkpc_kaggle.geometry.two_view import Problem, TwoView, Vectors, robust_costs, sampson
 
-ESSENTIAL_STARTS = 5  # how often E is sought, at focal lengths spread evenly over the prior's distribution
-ESSENTIAL_SHARE, MIN_ESSENTIAL = 0.25, 50  # of the matches, and at least so many, that E is sought on
+ESSENTIAL_STARTS = 5  # estimates of E, at evenly spaced quantiles of the prior on focal lengths
+ESSENTIAL_SHARE, MIN_ESSENTIAL = 0.25, 50  # share and minimum number of the matches for an estimate of E
 ESSENTIAL_THRESHOLD_PX, ESSENTIAL_ITERATIONS = 0.4, 300
-ROUGH_SCALES, FINE_SCALES = (4.0,), (2.0, 1.0)  # times the scale, in turn: a wide loss has fewer local minima
-ROUGH_MATCHES, FINE_MATCHES = 300, 1000  # at most, evenly spread; the results are scored on all
-FINE_STARTS = 2  # how many of the rough results are refined
-FREE_COST = 10.0  # what MAGSAC's own F pays for being free of plausible focal lengths
-EXIF_SIGMA = 0.05  # standard deviation of the logarithm of a focal length that EXIF tells
-LOG_FOCAL_GRID = (-0.7, -0.35, 0.0, 0.35, 0.7)  # log f / g to read MAGSAC's F with; the best is a start
+ROUGH_SCALES, FINE_SCALES = (4.0,), (2.0, 1.0)  # multiples of the scale, in order; a wide loss has few minima
+ROUGH_MATCHES, FINE_MATCHES = 300, 1000  # maximum numbers, evenly spaced; all matches score the results
+FINE_STARTS = 2  # number of rough results to refine
+FREE_COST = 10.0  # penalty of MAGSAC's own F, which need not have plausible focal lengths
+EXIF_SIGMA = 0.05  # standard deviation of the logarithm of a focal length from EXIF
+LOG_FOCAL_GRID = (-0.7, -0.35, 0.0, 0.35, 0.7)  # log f / g to decompose MAGSAC's F with; the best is a start
 
 
 @dataclass(frozen=True)
 class FocalConfig:
-    """Settings of :func:`estimate_with_prior`, table ``[focal]`` of a recipe; without it MAGSAC is alone."""
+    """Settings of :func:`estimate_with_prior`, table ``[focal]`` of a recipe; without it F is MAGSAC's."""
 
-    ratio: float = 1.1  # of an unknown focal length to the image's long side
-    sigma: float = 0.4  # standard deviation of the focal length's logarithm
-    scale: float = 0.35  # of the loss, in pixels
-    exif: bool = True  # where an image's EXIF has a focal length, expect that one, within 5 %
+    ratio: float = 1.1  # expected focal length over the image's long side
+    sigma: float = 0.4  # standard deviation of the log focal length
+    scale: float = 0.35  # scale of the loss, in pixels
+    exif: bool = True  # expect the focal length of an image's EXIF, within 5 %
 
     def __post_init__(self) -> None:
         check_ranges(self, ratio=POSITIVE, sigma=POSITIVE, scale=POSITIVE)
@@ -70,18 +69,18 @@ class FocalConfig:
 @dataclass(frozen=True, eq=False)
 class FocalPrior:
     K: Matrix3  # in pixels
-    sigma: float  # standard deviation of the log focal length; 0: it is known
+    sigma: float  # standard deviation of the log focal length; 0: known
 
     @classmethod
     def of_image(cls, size: Size, config: FocalConfig, exif_focal: float = 0.0) -> "FocalPrior":
-        """The prior for an image of that size: weak, unless EXIF tells its focal length in pixels."""
+        """Return the prior for an image of ``size``: weak without a focal length from EXIF, in pixels."""
         if config.exif and exif_focal:
             return cls.of_focal(exif_focal, EXIF_SIGMA, size)
         return cls.of_focal(config.ratio * max(size), config.sigma, size)
 
     @classmethod
     def of_focal(cls, focal: float, sigma: float, size: Size) -> "FocalPrior":
-        """A focal length in pixels, and the image's centre as principal point."""
+        """Return the prior for a focal length in pixels, with the principal point at the image's centre."""
         centre = (size.width - 1) / 2, (size.height - 1) / 2
         return cls(np.array([[focal, 0, centre[0]], [0, focal, centre[1]], [0, 0, 1]]), sigma)
 
@@ -92,15 +91,15 @@ class FocalPrior:
 
     @property
     def to_ray(self) -> Matrix3:
-        """Homogeneous pixels -> rays (u, v, g), g being the focal length."""
+        """The matrix from homogeneous pixels to rays (u, v, g), with g the focal length."""
         return np.asarray(self.focal * np.linalg.inv(self.K))
 
     def scaled(self, factor: float) -> Matrix3:
-        """The camera matrix of a focal length that is ``factor`` times as long."""
+        """Return K with the focal length times ``factor``."""
         return np.asarray(self.K * np.array([[factor, factor, 1], [1, factor, 1], [1, 1, 1]]))
 
     def rays(self, points: Vectors) -> Vectors:
-        """(N, 2) pixels -> (N, 3)."""
+        """Convert (N, 2) pixels to (N, 3) rays."""
         return homogeneous(points) @ self.to_ray.T
 
 
@@ -110,13 +109,13 @@ Priors = tuple[FocalPrior, FocalPrior]
 def estimate_with_prior(
     matches: Matches, priors: Priors, magsac: RobustConfig, config: FocalConfig, model: ModelKind = ModelKind.F
 ) -> Estimate:
-    """F of ``matches`` (image pixels), or E where both K are known: of all candidates that of lowest cost.
+    """Estimate F of ``matches`` (image pixels), or E with known K: the candidate of the lowest cost.
 
-    Inliers are nearer than MAGSAC's threshold by their Sampson distance. MAGSAC's own F is a candidate, so the
-    winner never costs more. Six distinct matches are enough. The same input gives the same bytes.
+    Inliers have a Sampson distance below MAGSAC's threshold. MAGSAC's own F is a candidate, so the result never
+    costs more. Six distinct matches are enough. The same input gives the same bytes.
     """
     distinct = DistinctMatches.of(matches)
-    with np.errstate(all="ignore"):  # points need not be pixels; a candidate that overflows loses
+    with np.errstate(all="ignore"):  # points may be any numbers; a candidate that overflows loses
         search = _Search(distinct, priors, config.scale)
         free, starts, failures = search.starts(magsac)
         if model is ModelKind.E:
@@ -136,15 +135,15 @@ def estimate_with_prior(
 
 
 class _Candidate(NamedTuple):
-    """An F (3, 3) for rays, and its cost: MAGSAC's own pays FREE_COST, the others the prior's."""
+    """An F (3, 3) for rays, and its cost, which includes FREE_COST for MAGSAC's own and the prior for others."""
 
     fundamental: Matrix3
     cost: float
-    logs: Vectors | None = None  # log f / g of both cameras, where it has focal lengths
+    logs: Vectors | None = None  # log f / g of both cameras; None for MAGSAC's own F
 
 
 class _Search:
-    """The candidates from the distinct matches of a pair, as ``rays``."""
+    """Search for candidates on the distinct matches of a pair, as ``rays``."""
 
     def __init__(self, distinct: DistinctMatches, priors: Priors, scale: float) -> None:
         self._distinct, self._priors, self._scale = distinct, priors, scale
@@ -154,13 +153,13 @@ class _Search:
         self._many, self._few = self._sample(FINE_MATCHES), self._sample(ROUGH_MATCHES)
 
     def _sample(self, most: int) -> Problem:
-        """At most so many matches, evenly spread, that stand for all."""
+        """Return up to ``most`` evenly spaced matches, weighted to represent all."""
         count = len(self.rays[0])
         few = np.linspace(0, count - 1, min(count, most)).astype(int)
         return Problem(self.rays[0][few], self.rays[1][few], self._sigmas, count / max(len(few), 1))
 
     def starts(self, magsac: RobustConfig) -> tuple[list[_Candidate], list[TwoView], list[str]]:
-        """MAGSAC's F as they are, the starts from them and from E, and the reasons why starts are missing."""
+        """Return the F of MAGSAC, the starts from these and from E, and the reasons for missing starts."""
         free, starts, failures, count = [], [], [], len(self.rays[0])
         for number in range(magsac.permutations):
             plain = self._consensus(permutation(number, count), magsac)
@@ -184,7 +183,7 @@ class _Search:
         return free, starts, failures
 
     def refined(self, starts: Sequence[TwoView]) -> list[_Candidate]:
-        """The best of what a search from each start finds."""
+        """Return the best results of the searches from all starts."""
         rough = [self._searched(self._few, start, ROUGH_SCALES) for start in starts]
         rough.sort(key=lambda view: self._many.cost(view, self._scale))
         fine = [self._searched(self._many, view, FINE_SCALES) for view in rough[:FINE_STARTS]]
@@ -192,38 +191,38 @@ class _Search:
         return [_Candidate(view.fundamental, cost, view.logs) for view, cost in zip(fine, costs, strict=True)]
 
     def focals(self, found: _Candidate) -> tuple[float, float]:
-        """In pixels; 0 for MAGSAC's own F, which has none."""
+        """Return both focal lengths in pixels; 0 for MAGSAC's own F."""
         if found.logs is None:
             return 0.0, 0.0
         ratio0, ratio1 = np.exp(found.logs).tolist()
         return self._priors[0].focal * ratio0, self._priors[1].focal * ratio1
 
     def for_pixels(self, F: Matrix3) -> Matrix3:
-        """The F for homogeneous pixels, from an F for rays."""
+        """Convert an F for rays to an F for homogeneous pixels."""
         return self._priors[1].to_ray.T @ F @ self._priors[0].to_ray
 
     def _consensus(
         self, chosen: NDArray[np.intp], config: RobustConfig, intrinsics: tuple[Matrix3, Matrix3] | None = None
     ) -> Estimate:
-        """MAGSAC's F of the matches in that order, or E with ``intrinsics``."""
+        """Estimate F, or E with ``intrinsics``, by MAGSAC on the chosen matches in order."""
         points0, points1 = self._distinct.points0[chosen], self._distinct.points1[chosen]
         model = ModelKind.E if intrinsics else ModelKind.F
         return consensus(points0, points1, replace(config, permutations=1), model, intrinsics)
 
     def _decomposed(self, F: Matrix3) -> TwoView:
-        """An F for rays as two views, with the focal lengths of a grid that fit the matches best."""
+        """Decompose an F for rays into two views, with the focal lengths of a grid that fit the matches best."""
         grid0, grid1 = (LOG_FOCAL_GRID if prior.sigma else (0.0,) for prior in self._priors)
         views = [TwoView.nearest(F, log0, log1) for log0 in grid0 for log1 in grid1]
         return min(views, key=lambda view: self._few.cost(view, ROUGH_SCALES[0] * self._scale))
 
     def _searched(self, problem: Problem, view: TwoView, factors: Sequence[float]) -> TwoView:
-        """The local minimum near a view, with a loss that narrows."""
+        """Return the local minimum near ``view``, with an increasingly narrow loss."""
         for factor in factors:
             view = problem.fit(view, factor * self._scale)
         return view
 
     def _cost(self, F: Matrix3, view: TwoView) -> float:
-        """What an F for rays costs by all matches; matches behind a camera of ``view`` are outliers."""
+        """Return the cost of an F for rays on all matches; matches behind a camera of ``view`` are outliers."""
         saved = 0.5 - robust_costs(sampson(F, *self.rays), self._scale)
         signs = (views.depth_signs(*self.rays, 3 * self._scale) for views in (view, view.twisted))
         behind = min(saved[both * sign <= 0].sum() for both in signs for sign in (1, -1))

@@ -1,4 +1,4 @@
-"""Corresponding points of a pair: always in full-image pixels outside a matcher; empty is a legal value."""
+"""Corresponding points of a pair, in full-image pixels outside a matcher. Empty is a legal value."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -11,11 +11,11 @@ from mkpc_kaggle.geometry.coordinates import Points, View
 
 @dataclass(frozen=True, eq=False)
 class Matches:
-    """N corresponding points with scores; pixel centres at integers, (x, y).
+    """N corresponding points (x, y) with scores; pixel centres are at integers.
 
-    ``points0`` and ``points1`` are (N, 2) float32, ``scores`` is (N,) float32, higher is more certain. The
-    matcher's order is kept everywhere, because MAGSAC's result depends on it. Input of another dtype is cast;
-    shapes that disagree raise ``ValueError``.
+    ``points0`` and ``points1`` are (N, 2) float32, ``scores`` is (N,) float32, higher is more certain. All methods
+    keep the matcher's order, since MAGSAC's result depends on it. Other dtypes are cast. Raises ``ValueError`` for
+    inconsistent shapes.
     """
 
     points0: Points
@@ -37,7 +37,7 @@ class Matches:
 
     @classmethod
     def concatenate(cls, parts: Iterable["Matches"]) -> "Matches":
-        """All parts, one after the other; nothing is merged or sorted."""
+        """Return all parts in order, without merging or sorting."""
         parts = list(parts)
         if not parts:
             return cls.empty()
@@ -48,20 +48,20 @@ class Matches:
         return len(self.scores)
 
     def __getitem__(self, index: NDArray[np.bool_] | NDArray[np.integer] | slice) -> "Matches":
-        """The matches that a mask, indices or a slice choose."""
+        """Return the matches selected by a mask, indices or a slice."""
         return Matches(self.points0[index], self.points1[index], self.scores[index])
 
     def best(self, most: int) -> "Matches":
-        """At most ``most`` matches, those of highest score, in their present order (ties: the earlier)."""
+        """Return up to ``most`` matches of the highest scores, in their present order (ties: the earlier)."""
         if len(self) <= most:
             return self
         chosen = np.argsort(-self.scores, kind="stable")[:most]
         return self[np.sort(chosen)]
 
     def to_image(self, view0: View, view1: View) -> "Matches":
-        """Matches in view pixels -> image pixels.
+        """Convert matches in view pixels to image pixels.
 
-        Dropped here: points that are not finite, points on padding or outside their view, non-finite scores.
+        Drops points that are not finite, lie on padding or outside their view, and matches with non-finite scores.
         """
         kept = self[view0.holds(self.points0) & view1.holds(self.points1) & np.isfinite(self.scores)]
         return Matches(

@@ -11,7 +11,7 @@ from scipy.integrate import trapezoid
 from mkpc_kaggle.geometry.cameras import Camera, relative_pose
 from mkpc_kaggle.geometry.coordinates import Matrix3
 
-# The competition's rules: the i-th threshold in degrees goes with the i-th in metres.
+# The competition's rules. The i-th threshold in degrees belongs to the i-th in metres.
 ROTATION_THRESHOLDS = np.linspace(1, 10, 10)
 TRANSLATION_THRESHOLDS = np.geomspace(0.2, 5, 10)
 AUC_THRESHOLDS = (5.0, 10.0, 20.0)  # degrees
@@ -19,11 +19,11 @@ AUC_THRESHOLDS = (5.0, 10.0, 20.0)  # degrees
 
 @dataclass(frozen=True)
 class PoseError:
-    """How far an F's pose is from the truth; infinite where F is missing."""
+    """The error of the pose of an F; infinite without an F."""
 
     rotation: float  # degrees
-    translation_angle: float  # degrees, at most 90: the sign is unknown
-    translation: float  # metres, after scaling to the true length; NaN where the scale of the world is unknown
+    translation_angle: float  # degrees, at most 90, since F leaves the sign open
+    translation: float  # metres, after scaling to the true length; NaN if the scale of the world is unknown
 
     @classmethod
     def failed(cls) -> "PoseError":
@@ -38,18 +38,18 @@ class PoseError:
 
     @property
     def angle(self) -> float:
-        """The larger of the two angular errors, in degrees: what the pose AUC counts."""
+        """The larger of the two angular errors, in degrees, as in the pose AUC."""
         return max(self.rotation, self.translation_angle)
 
 
 def pose_error(F: Matrix3, camera0: Camera, camera1: Camera, metres_per_unit: float) -> PoseError:
-    """The error of the pose that F stands for.
+    """Return the error of the pose of F.
 
-    The competition gets F alone, without points to tell its two rotations apart: the rotation nearer to the truth
-    counts, and the translation's sign is free.
+    A submission has no points that would select one of F's two rotations. So the rotation nearer to the truth
+    counts, and the sign of the translation is free.
     """
     R, t = relative_pose(camera0, camera1)
-    # Hartley and Zisserman, Multiple View Geometry, 9.6.2: two rotations, a direction (3, 1) of unknown sign.
+    # Two rotations, and a direction (3, 1) of unknown sign (Hartley and Zisserman, Multiple View Geometry, 9.6.2).
     *rotations, column = cv2.decomposeEssentialMat(camera1.K.T @ F @ camera0.K)
     direction = np.ravel(column).astype(np.float64)
     length = float(np.linalg.norm(t))
@@ -63,14 +63,14 @@ def pose_error(F: Matrix3, camera0: Camera, camera1: Camera, metres_per_unit: fl
 
 
 def rotation_angle(R: Matrix3) -> float:
-    """The angle of a rotation matrix in degrees, 0 to 180; precise at both ends."""
-    # Not SciPy's Rotation, which raises for cameras of a file that are no rotations.
+    """Return the angle of a rotation matrix in degrees, 0 to 180, precise at both ends."""
+    # SciPy's Rotation would raise for a matrix of a file that is not a rotation.
     skew = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
     return float(np.degrees(np.arctan2(np.linalg.norm(skew), np.trace(R) - 1)))
 
 
 def pair_accuracy(error: PoseError) -> float:
-    """The share of the ten threshold pairs that a pair's error meets; a scene's mAA is its mean over the pairs.
+    """Return the share of the ten threshold pairs that a pair's error meets; a scene's mAA is its mean.
 
     Source: evaluation page of the Image Matching Challenge 2022.
     """
@@ -79,9 +79,10 @@ def pair_accuracy(error: PoseError) -> float:
 
 
 def pose_auc(errors: Sequence[PoseError], threshold: float) -> float:
-    """Area under the recall curve of the angular error up to ``threshold`` degrees, 0 to 1; NaN without pairs.
+    """Return the area under the recall curve of the angular error up to ``threshold`` degrees, 0 to 1.
 
-    The curve is piecewise linear through (error_i, i / n), sorted, as is usual since SuperGlue.
+    The curve is piecewise linear through (error_i, i / n), sorted, as in SuperGlue's evaluation. NaN without
+    pairs.
     """
     if not errors:
         return float("nan")

@@ -1,7 +1,8 @@
-"""Do two images show the same thing? The matches that agree with their F, against those that chance makes agree.
+"""Test whether two images overlap: compare the inliers of their F with the inliers of shuffled matches.
 
-The number of inliers does not tell: among thousands of wrong matches hundreds agree with some F. What chance makes
-agree is counted on the same points, at the same density: each point of image 0 is given the partner of another.
+The number of inliers alone does not decide: among thousands of wrong matches, hundreds agree with some F. Shuffled
+matches give the number expected by chance for the same points and density: each point of image 0 gets the partner
+of another point.
 """
 
 import numpy as np
@@ -12,15 +13,15 @@ from mkpc_kaggle.geometry.robust import DistinctMatches, homogeneous
 from mkpc_kaggle.geometry.two_view import sampson
 
 AGREEMENT_PX = 1.0  # Sampson distance within which a match agrees with F
-FREE_MATCHES = 7  # which agree with an F that is made of them, whatever they are
-MAX_SHUFFLES, SHUFFLED_MATCHES = 20, 20_000  # how often partners are exchanged: fewer times where matches are many
-MIN_SUPPORT = 20.0  # fewer than 1 in 100 pairs without overlap have it; docs/results.md has the table of errors
+FREE_MATCHES = 7  # F has seven degrees of freedom, so it can fit any seven matches
+MAX_SHUFFLES, SHUFFLED_MATCHES = 20, 20_000  # number of shuffles, and of shuffled matches in total
+MIN_SUPPORT = 20.0  # fewer than 1 in 100 pairs without overlap reach it; docs/results.md has the error rates
 
 
 def support(F: Matrix3, matches: Matches) -> float:
-    """How many times as many matches (image pixels) agree with F as chance makes agree; below 0 never.
+    """Return the ratio, at least 0, of matches (image pixels) that agree with F to the number expected by chance.
 
-    Duplicates count once. From ``MIN_SUPPORT`` on, the two images most likely show the same thing.
+    Duplicates count once. With ``MIN_SUPPORT`` or more, the two images probably overlap.
     """
     distinct = DistinctMatches.of(matches)
     rays0, rays1 = homogeneous(distinct.points0), homogeneous(distinct.points1)

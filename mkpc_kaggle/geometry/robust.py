@@ -1,7 +1,7 @@
 """Two-view models from matches: F, E or H by MAGSAC++.
 
-An estimate is always a value: where no model is found, it has the reason and the fallback matrix, which is
-finite and of the right rank, so that a submission is always complete.
+An estimate is always a value. Without a model it holds the reason and the fallback matrix, which is finite and of
+the right rank, so a submission is always complete.
 """
 
 from collections.abc import Callable
@@ -18,7 +18,7 @@ from mkpc_kaggle.geometry.coordinates import Matrix3
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.two_view import Vectors, robust_costs, sampson
 
-# The F of a pure sideways motion, [e_x]_x: finite, rank 2; epipolar lines are the image rows.
+# F of a pure sideways motion, [e_x]_x: finite, rank 2; the epipolar lines are the image rows.
 FALLBACK_FUNDAMENTAL: Matrix3 = np.array([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 FALLBACK_FUNDAMENTAL.setflags(write=False)
 
@@ -40,15 +40,15 @@ class Method(StrEnum):
 class RobustConfig:
     """Settings of :func:`estimate`, table ``[magsac]`` of a recipe.
 
-    The estimator stops by chance before it has found the best model; where depends on the order of the matches. So
-    it runs on several permutations, and the model of the lowest robust cost at twice the threshold is kept.
+    The estimator may stop before it finds the best model, depending on the order of the matches. So it runs on
+    several permutations, and the model with the lowest robust cost at twice the threshold wins.
     """
 
     method: Method = Method.MAGSAC
     threshold: float = 0.2  # image pixels
     confidence: float = 0.99999
     max_iterations: int = 50_000
-    permutations: int = 8  # fixed; the first is the matches' own order
+    permutations: int = 8  # number of fixed permutations; the first is the matches' own order
 
     def __post_init__(self) -> None:
         check_ranges(self, threshold=POSITIVE, confidence=Range(0, 1, "()"), max_iterations=Range(1, 10**6))
@@ -57,16 +57,16 @@ class RobustConfig:
 
 @dataclass(frozen=True)
 class EstimateStats:
-    """How a two-view model was found: what is known anyway, for whoever asks why a pair went wrong.
+    """Statistics of an estimate, to find out why a pair went wrong.
 
-    A cost is a sum of robust costs of the distinct matches, a half each at most. Under a prior on focal lengths
-    these cost, too, or that there are none.
+    A cost is the sum of the robust costs of the distinct matches, at most 0.5 each. Under a prior on focal lengths
+    it includes the prior, or the penalty of an F without focal lengths.
     """
 
-    candidates: int = 0  # whose costs were compared
-    cost: float = 0.0  # the winner's
-    magsac_cost: float = 0.0  # that of the F of MAGSAC alone, 0 where it finds none
-    focals: tuple[float, float] = (0.0, 0.0)  # in pixels, of both images; 0 where the winner has none
+    candidates: int = 0  # number of compared models
+    cost: float = 0.0  # of the result
+    magsac_cost: float = 0.0  # of MAGSAC's own F; 0 without one
+    focals: tuple[float, float] = (0.0, 0.0)  # in pixels, of both images; 0 if unknown
     support: float = 0.0  # see :mod:`mkpc_kaggle.geometry.overlap`
 
 
@@ -77,9 +77,9 @@ NO_STATS = EstimateStats()
 class Estimate:
     model: ModelKind
     matrix: Matrix3  # finite, of unit Frobenius norm; for F, x1^T F x0 = 0 in homogeneous image pixels
-    inliers: NDArray[np.bool_]  # (N,) mask over the matches that were given: those nearer than the threshold
-    failure: str = ""  # why ``matrix`` is only the fallback
-    magsac: Matrix3 | None = None  # under a prior on focal lengths, the F of MAGSAC alone, if it finds any
+    inliers: NDArray[np.bool_]  # (N,) mask of the given matches within the threshold
+    failure: str = ""  # the reason if ``matrix`` is the fallback
+    magsac: Matrix3 | None = None  # under a prior on focal lengths, MAGSAC's own F, if any
     stats: EstimateStats = NO_STATS
 
     @property
@@ -92,7 +92,7 @@ class Estimate:
 
     @classmethod
     def failed(cls, model: ModelKind, count: int, reason: str) -> "Estimate":
-        """The fallback for ``count`` matches, with the reason."""
+        """Return the fallback for ``count`` matches, with the reason."""
         return cls(model, unit_norm(_SOLVERS[model].fallback), np.zeros(count, bool), reason)
 
 
@@ -102,12 +102,11 @@ def estimate(
     model: ModelKind = ModelKind.F,
     intrinsics: tuple[Matrix3, Matrix3] | None = None,
 ) -> Estimate:
-    """The model of that kind that ``matches`` (image pixels) agree on.
+    """Estimate a two-view model from ``matches`` (image pixels).
 
-    Non-finite points and exact duplicates are left out first; an inlier's duplicates are inliers too. E
-    needs the two camera matrices, (3, 3) each: the points are then calibrated and the threshold is divided
-    by the mean focal length. Raises ``ValueError`` for E without intrinsics, and never on account of the
-    points. The same input gives the same bytes.
+    Ignores non-finite points and exact duplicates; duplicates of an inlier are inliers. E needs the two camera
+    matrices, (3, 3) each: the points are calibrated, and the threshold is divided by the mean focal length. Raises
+    ``ValueError`` for E without intrinsics, and never because of the points. The same input gives the same bytes.
     """
     if model is ModelKind.E and intrinsics is None:
         raise ValueError("an essential matrix needs the intrinsics, the camera matrix K of both images")
@@ -138,14 +137,14 @@ def consensus(
         order = permutation(number, count)
         try:
             matrix, mask = solver.find(points0[order], points1[order], ransacReprojThreshold=threshold, **settings)
-        except cv2.error as error:  # it sometimes rejects points in one order and not in another
+        except cv2.error as error:  # it may reject points in one order and accept them in another
             failure = f"OpenCV refused the points: {error.err}"
             continue
         if matrix is None or matrix.shape != (3, 3) or not np.isfinite(matrix).all() or not matrix.any():
             continue
-        with np.errstate(over="ignore", invalid="ignore"):  # points may be anything
+        with np.errstate(over="ignore", invalid="ignore"):  # points may be any numbers
             cost = float(np.sum(robust_costs(solver.distances(matrix, points0, points1), 2 * threshold)))
-        # Most inliers do not decide: MAGSAC's score depends on distances up to several times the threshold.
+        # The number of inliers does not decide: MAGSAC scores distances up to several times the threshold.
         if best is None or cost < lowest:
             best, inliers[order], lowest = matrix, mask.ravel().astype(bool), cost
         candidates += 1
@@ -159,11 +158,11 @@ def consensus(
 
 @dataclass(frozen=True, eq=False)
 class DistinctMatches:
-    """The finite distinct matches among N, in order of first appearance."""
+    """The finite distinct matches of N matches, in order of first appearance."""
 
     points0: Vectors  # (M, 2)
     points1: Vectors
-    index: NDArray[np.intp]  # (N,) the row of each match in them, -1 for a match that is not finite
+    index: NDArray[np.intp]  # (N,) the row of each match, -1 for a match that is not finite
 
     @classmethod
     def of(cls, matches: Matches) -> "DistinctMatches":
@@ -176,7 +175,7 @@ class DistinctMatches:
         return cls(pairs[:, :2], pairs[:, 2:], index)
 
     def mask_of_all(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """An (M,) mask of the distinct matches as an (N,) mask of all: duplicates are like the first."""
+        """Expand an (M,) mask of the distinct matches to an (N,) mask of all, duplicates included."""
         return np.append(mask, False)[self.index]
 
 
@@ -185,13 +184,13 @@ def unit_norm(matrix: Matrix3) -> Matrix3:
 
 
 def calibrate(points: Vectors, K: Matrix3) -> Vectors:
-    """(N, 2) pixels -> (N, 2) coordinates in the plane z = 1 of the camera with matrix K."""
+    """Convert (N, 2) pixels to (N, 2) coordinates in the plane z = 1 of the camera with matrix K."""
     mapped = homogeneous(points) @ np.linalg.inv(K).T
     return np.asarray(mapped[:, :2] / mapped[:, 2:])
 
 
 def sampson_distances(F: Matrix3, matches: Matches) -> Vectors:
-    """(N,) Sampson distance in pixels; OpenCV's inliers of an F have it below the threshold.
+    """Return (N,) Sampson distances in pixels; OpenCV compares these with the threshold of F.
 
     Source: Hartley and Zisserman, Multiple View Geometry, 11.4.3.
     """
@@ -199,29 +198,29 @@ def sampson_distances(F: Matrix3, matches: Matches) -> Vectors:
 
 
 def permutation(number: int, count: int) -> NDArray[np.intp]:
-    """A fixed permutation of ``count`` matches; number 0 is their own order."""
+    """Return a fixed permutation of ``count`` matches; number 0 is their own order."""
     return np.random.default_rng(number).permutation(count) if number else np.arange(count)
 
 
 def homogeneous(points: Vectors) -> Vectors:
-    """(N, 2) -> (N, 3), the third 1."""
+    """Append a 1 to each point: (N, 2) -> (N, 3)."""
     return np.column_stack([points, np.ones(len(points))])
 
 
 def _epipolar_distances(matrix: Matrix3, points0: Vectors, points1: Vectors) -> Vectors:
-    """(N,) Sampson distances to an F or E."""
+    """Return (N,) Sampson distances to an F or E."""
     return np.abs(sampson(matrix, homogeneous(points0), homogeneous(points1)))
 
 
 def _transfer_distances(matrix: Matrix3, points0: Vectors, points1: Vectors) -> Vectors:
-    """(N,) distances in the second image to where an H takes the points of the first."""
+    """Return (N,) distances in the second image between its points and the points of the first, mapped by H."""
     return np.asarray(np.hypot(*(cv2.perspectiveTransform(points0[None], matrix)[0] - points1).T))
 
 
 class _Solver(NamedTuple):
-    min_matches: int  # more than the minimal solver takes, so that they tell a model
+    min_matches: int  # more than a minimal sample, so that matches can contradict the model
     fallback: Matrix3
-    find: Callable[..., Any]  # OpenCV's matrix and mask, ``None`` where no model is found
+    find: Callable[..., Any]  # returns OpenCV's matrix, ``None`` without a model, and mask
     distances: Callable[[Matrix3, Vectors, Vectors], Vectors]
 
 

@@ -35,7 +35,7 @@ def test_a_reader_that_leaves_ends_the_command_quietly():
     assert (done.returncode, done.stderr) == (141, b"")
 
 
-@pytest.mark.parametrize("option", ["--test-dir", "--weights", "--output", "--work-dir"])
+@pytest.mark.parametrize("option", ["--test-dir", "--output"])
 def test_a_name_that_is_too_long_is_told(option, demo, capsys):
     assert main(["submit", "--test-dir", str(demo.test_dir), option, "d" * 5000]) == 2
     assert "File name too long" in capsys.readouterr().err
@@ -47,9 +47,9 @@ def test_recipes_are_listed_with_what_they_lack(clean_environment, capsys):
     light = out[out.index("light: ") :]
     assert "xfeat_lighterglue: no weights (xfeat: xfeat.pt or xfeat_sparse_bnfolded.safetensors" in light
     classical = out[out.index("classical: ") : out.index("light: ")]
-    assert "all weights are there" in classical
+    assert "all weights are available" in classical
     assert "    2:dkm@630x840  at most 4096\n" in out
-    assert "    1:aliked_lightglue@1024  at most 4096  (or aliked, where its weights are missing)\n" in light
+    assert "    1:aliked_lightglue@1024  at most 4096  (or aliked, if its weights are missing)\n" in light
 
 
 def test_results_are_not_written_over_inputs_nor_an_export_over_the_journal(demo, tmp_path, capsys):

@@ -48,9 +48,8 @@ def test_verify_finds_truncated_and_swapped_files(weights, capsys):
     put(weights, "lost.pt", b"los")
     put(weights, "a.pt", DATA)
     assert main(["weights", "verify", "--weights", str(weights)]) == 1
-    rows = {
-        row.split()[0]: row for row in capsys.readouterr().out.splitlines() if str(weights / row.split()[0]) in row
-    }
+    lines = capsys.readouterr().out.splitlines()
+    rows = {line.split()[0]: line for line in lines if str(weights / line.split()[0]) in line}
     assert "truncated" in rows["lost.pt"]
     assert rows["a.pt"].endswith("its bytes are those of sift.pt")
 

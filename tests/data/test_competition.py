@@ -93,7 +93,6 @@ def test_an_image_is_found_whatever_its_suffix(side, file):
         (HEADER.encode() + b"\ns,b,1,2\n\nt,b,1,2,3,4\n", "line 4: 6 cells, the header has 4"),
         (HEADER.encode() + b"\ns,b,1\n", "line 2: 3 cells, the header has 4"),
         (HEADER.encode() + b"\ns,b,1,2\nt,b,1,3\ns,b,2,3\n", "line 4: the sample_id 's' is not unique"),
-        (HEADER.encode() + b"\na\x1bb,b,1,2\n", "has control characters"),
         (HEADER.encode() + "\na\u2028b,b,1,2\n".encode(), "has control characters"),
     ],
 )
@@ -118,12 +117,12 @@ def test_a_directory_without_its_table_or_images_is_refused(side, tmp_path):
         read_test_side(home)
 
 
-@pytest.mark.parametrize("row", ["s,{},1,2", "s,b,{},2", "s,b,1,{}"], ids=["batch", "image 1", "image 2"])
-@pytest.mark.parametrize("name", ["", ".", "..", "../x", "x/y", "/etc", "x\\y", "C:x", "c:", "a\x1bb", "a\x7f"])
-def test_an_id_that_is_not_a_plain_name_is_refused(side, row, name):
-    home = side("ok,b,1,2", row.format(name))
-    with pytest.raises(UserError, match=r"test\.csv.* is not a plain name"):
-        read_test_side(home)
+@pytest.mark.parametrize("name", ["", ".", "..", "../x", "/etc", "x\\y", "C:x", "a\x1bb", "a\x7f"])
+def test_an_id_that_is_not_a_plain_name_is_refused(side, name):
+    for row in ("s,{},1,2", "s,b,{},2", "s,b,1,{}"):
+        home = side("ok,b,1,2", row.format(name))
+        with pytest.raises(UserError, match=r"test\.csv.* is not a plain name"):
+            read_test_side(home)
 
 
 def test_a_train_side_by_hand_reads_as_written(train):
@@ -167,12 +166,10 @@ def test_what_a_train_side_lacks_is_told_with_what_it_has(train):
     ("file", "old", "new", "says"),
     [
         ("s/calibration.csv", "2 0 1 0 2 1 0 0 1", "2 0 1 0 2 1 0 0", "expected 9 numbers, found 8 words"),
-        ("s/calibration.csv", "2 0 1 0 2 1 0 0 1", "2 0 1 0 x 1 0 0 1", "found 9 words: '2 0 1 0 x"),
         ("s/calibration.csv", ",rotation_matrix", ",rotation", "lacks the columns rotation_matrix"),
         ("s/pair_covisibility.csv", "c-b", "cb", "'cb'"),
         ("s/pair_covisibility.csv", "c-b", "c-x", "'c-x'"),
         ("s/pair_covisibility.csv", "c-b,0.5", "c-b,many", "many"),
-        ("s/pair_covisibility.csv", "c-b,0.5", "c-b,", "found 0"),
         ("scaling_factors.csv", "2.5", "long", "long"),
     ],
 )
@@ -237,14 +234,8 @@ def test_the_former_submission_stays_when_writing_fails(tmp_path, monkeypatch):
         ("sample_id,fundamental_matrix\nb,{F}\na,{F}\n", "not in the order of test.csv"),
         ("sample_id,fundamental_matrix\na,{F}\nb,{F}\nb,{F}\n", "twice"),
         ("sample_id,fundamental_matrix\na,{F}\nb,1 2 3 4 5 6 7 8\n", "b: expected 9 numbers, found 8 words"),
-        (
-            "sample_id,fundamental_matrix\na,{F}\nb,1 2 3 4 5 6 7 8 nan\n",
-            "b: the matrix is zero, or a number in it is not finite",
-        ),
-        (
-            "sample_id,fundamental_matrix\na,{F}\nb,0 0 0 0 0 0 0 0 0\n",
-            "b: the matrix is zero, or a number in it is not finite",
-        ),
+        ("sample_id,fundamental_matrix\na,{F}\nb,1 2 3 4 5 6 7 8 nan\n", "b: the matrix is zero, or a number"),
+        ("sample_id,fundamental_matrix\na,{F}\nb,0 0 0 0 0 0 0 0 0\n", "b: the matrix is zero, or a number"),
         ("\0\0\0", "lacks the columns|cannot be read"),
     ],
 )

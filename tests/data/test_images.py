@@ -37,27 +37,15 @@ def reason(path):
     return answer.reason
 
 
-def test_a_colour_png_is_read_as_it_is(tmp_path):
-    pixels = noise(5, 7, 3)
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16])
+@pytest.mark.parametrize("shape", [(1, 1), (5, 7), (5, 7, 3), (5, 7, 4)])
+def test_a_png_has_three_channels_of_eight_bits(tmp_path, shape, kind):
+    pixels = noise(*shape, kind=kind)
     image = read_image(write(tmp_path / "a.png", pixels))
-    assert_array_equal(image.pixels, pixels)
-    assert (image.name, image.size, image.pixels.dtype) == (str(tmp_path / "a.png"), (7, 5), np.uint8)
-
-
-@pytest.mark.parametrize("shape", [(1, 1), (5, 7), (5, 7, 4)])
-def test_gray_has_three_equal_channels_and_alpha_is_dropped(tmp_path, shape):
-    pixels = noise(*shape)
-    image = read_image(write(tmp_path / "a.png", pixels, cv2.IMWRITE_PNG_COMPRESSION, 1))
-    expected = pixels[..., :3] if len(shape) == 3 else np.stack([pixels] * 3, axis=2)
-    assert_array_equal(image.pixels, expected)
-    assert len(shape) == 3 or (image.gray == pixels).all()
-
-
-@pytest.mark.parametrize("shape", [(16, 16), (16, 16, 3)])
-def test_sixteen_bits_are_divided_by_256(tmp_path, shape):
-    pixels = noise(*shape, kind=np.uint16)
-    image = read_image(write(tmp_path / "a.png", pixels))
-    assert_array_equal(image.pixels, np.broadcast_to((pixels // 256).reshape(16, 16, -1), (16, 16, 3)))
+    bytes_ = (pixels // (256 if kind is np.uint16 else 1)).reshape(*shape[:2], -1)[..., :3]
+    assert_array_equal(image.pixels, np.broadcast_to(bytes_, (*shape[:2], 3)))
+    assert (image.name, image.size, image.pixels.dtype) == (str(tmp_path / "a.png"), shape[1::-1], np.uint8)
+    assert len(shape) == 3 or (image.gray == bytes_[..., 0]).all()
 
 
 def test_red_comes_first_and_the_suffix_does_not_decide_the_format(tmp_path):
@@ -106,20 +94,11 @@ def test_an_array_is_named_by_its_content_and_its_shape():
     assert Image.of_array(pixels).name != Image.of_array(255 - pixels).name
 
 
-@pytest.mark.parametrize(
-    "array",
-    [
-        np.zeros((4, 4, 3), np.float32),
-        np.zeros((4, 4, 4), np.uint8),
-        np.zeros((4, 4, 1), np.uint8),
-        np.zeros((2, 4, 4, 3), np.uint8),
-        np.zeros((0, 4, 3), np.uint8),
-    ],
-    ids=lambda array: f"{array.dtype} {array.shape}",
-)
-def test_an_array_that_is_not_an_image_is_refused_by_type_and_shape(array):
-    with pytest.raises(ValueError, match=rf"not {array.dtype} \({array.shape[0]},"):
-        Image.of_array(array)
+@pytest.mark.parametrize("shape", [(4, 4, 4), (4, 4, 1), (2, 4, 4, 3), (0, 4, 3), (4, 4, 3)])
+def test_an_array_that_is_not_an_image_is_refused_by_type_and_shape(shape):
+    kind = np.float32 if shape == (4, 4, 3) else np.uint8
+    with pytest.raises(ValueError, match=rf"not {np.dtype(kind)} \({shape[0]},"):
+        Image.of_array(np.zeros(shape, kind))
 
 
 @pytest.fixture

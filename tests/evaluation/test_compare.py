@@ -60,14 +60,10 @@ def test_the_interval_holds_the_truth_where_a_gain_is_of_images():
     assert 0.88 <= held / trials <= 0.99
 
 
-def validation(name: str, *ids: str) -> Validation:
-    scores = tuple(PairScore(pair, ("a", "b"), 0.5, PoseError(0, 0, 0)) for pair in ids)
-    return Validation(name, (SceneScore("s", scores),))
-
-
 def test_different_pairs_are_not_compared():
+    p, q = (PairScore(pair, ("a", "b"), 0.5, PoseError(0, 0, 0)) for pair in "pq")
     with pytest.raises(ValueError, match="different pairs"):
-        Comparison((validation("a", "p", "q"), validation("b", "q", "p")))
+        Comparison(tuple(Validation("a", (SceneScore("s", pairs),)) for pairs in ((p, q), (q, p))))
 
 
 def compare(demo: DemoSet, *more: str) -> int:

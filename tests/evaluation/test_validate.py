@@ -18,7 +18,6 @@ from mkpc_kaggle.data.competition import (
 from mkpc_kaggle.demo import DemoSet
 from mkpc_kaggle.engine.records import PairRecord
 from mkpc_kaggle.evaluation.validate import (
-    PairScore,
     SceneScore,
     Step,
     score_record,
@@ -26,7 +25,7 @@ from mkpc_kaggle.evaluation.validate import (
     score_table,
 )
 from mkpc_kaggle.geometry.cameras import Camera, fundamental_of_cameras
-from mkpc_kaggle.geometry.metrics import AUC_THRESHOLDS, PoseError
+from mkpc_kaggle.geometry.metrics import AUC_THRESHOLDS
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
 from mkpc_kaggle.reporting.run_log import read_log
 
@@ -52,7 +51,6 @@ def test_the_true_matrices_score_one_whatever_the_order_of_the_images(demo, tmp_
     assert [scored.auc(threshold) for threshold in AUC_THRESHOLDS] == pytest.approx([1, 1, 1], abs=1e-3)
     assert sum(len(scene.pairs) for scene in scored.scenes) == 8
     lines = score_table(scored)
-    assert [line.split()[0] for line in lines] == ["scene", "courtyard", "mean"]
     assert lines[1].split()[1:3] == ["8", "1.0000"]
     write_submission(tmp_path / "fallback.csv", dict.fromkeys(truth, FALLBACK_FUNDAMENTAL))
     scored = score_submission(tmp_path / "fallback.csv", demo.truth_csv, read_train_side(demo.train_dir))
@@ -85,16 +83,9 @@ def test_a_failed_pair_counts_as_failed_even_where_the_fallback_happens_to_be_ri
     record = PairRecord(0, FALLBACK_FUNDAMENTAL.copy(), "too few matches")
     failed = score_record(true, record, scene, [Step.MAGSAC])
     right = score_record(true, PairRecord(0, FALLBACK_FUNDAMENTAL.copy(), ""), scene)
+    assert SceneScore("s", (right, failed, right)).maa() == pytest.approx(2 / 3)
     assert failed.error.rotation == failed.steps[Step.MAGSAC].rotation == np.inf
     assert right.error.angle < 1e-6
-
-
-def test_the_mean_average_accuracy_is_the_mean_over_pairs_and_a_failed_pair_counts():
-    perfect = PoseError(0, 0, 0)
-    errors = [perfect, PoseError.failed(), perfect, PoseError(5.5, 90, 0)]
-    pairs = tuple(PairScore("p", ("a", "b"), 0.5, error) for error in errors)
-    assert [SceneScore("s", pairs[:1]).maa(), SceneScore("s", pairs[1:2]).maa()] == [1, 0]
-    assert SceneScore("s", pairs).maa() == pytest.approx(2.5 / 4)
 
 
 def scores_of(demo: DemoSet, recipe: Path, *options: str) -> dict[str, Any]:
@@ -116,8 +107,6 @@ def test_validate_scores_a_recipe_and_writes_all_figures(demo, small_recipe, cap
     assert scores["seconds_per_pair"] > 0
     assert set(scores["inliers_by_stage"]) == {"1", "2"}
     assert sum(scores["region_reasons"].values()) == 10
-    for pair in scene["pairs"]:
-        assert set(pair["matches"]) == {"1:sift@320", "2:sift@400"}
 
 
 def test_each_step_of_the_estimate_has_a_column(demo, small_recipe, capsys):
@@ -177,7 +166,6 @@ def test_the_classical_recipe_reaches_plain_root_sift_scene_by_scene(tmp_path):
         (["--pairs", "a.txt", "--image-root", ".", "--compare", "a", "b"], "needs a --train-dir"),
         (["--train-dir", ".", "--image-root", "."], "go together"),
         (["--imc2025", "."], "--imc2025 needs --submission, and no --truth"),
-        (["--imc2025", ".", "--submission", "a.csv", "--truth", "b.csv"], "--imc2025 needs --submission, and no"),
         (["--train-dir", "T", "--compare", "classical", "clasical:stage-1"], "unknown recipe 'clasical'"),
         (["--train-dir", "T", "--compare", "classical"], "two recipes"),
     ],

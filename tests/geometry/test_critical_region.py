@@ -62,13 +62,6 @@ def test_every_outcome_has_its_reason_and_only_one_is_a_crop(points, reason, clu
     assert (reason is RegionReason.CROPPED) == (got.box != Box.whole(SQUARE))
 
 
-@pytest.mark.parametrize(("percent", "clustered"), [(7, 7), (14, 7), (28, 7), (55, 11), (56, 14)])
-def test_the_least_share_clustered_is_compared_to_the_letter(percent, clustered):
-    cluster, noise = block(100, 100, 130, 130, clustered), lone(clustered * 100 // percent - clustered)
-    got = region(cluster, noise, config=replace(BARE, min_clustered=percent / 100))
-    assert got.reason is RegionReason.CROPPED
-
-
 def test_the_share_is_compared_to_the_letter():
     for percent, hundreds in product(range(1, 100), (1, 7, 11)):
         share, largest, least = percent / 100, 100 * hundreds, percent * hundreds

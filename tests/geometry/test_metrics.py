@@ -1,19 +1,15 @@
 """The scores, against answers known by construction or by hand."""
 
-from math import inf, isnan, nan
+from math import inf, isnan
 
 import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.testing import assert_allclose
 
 from mkpc_kaggle.geometry.cameras import Camera, fundamental_of_cameras, relative_pose
 from mkpc_kaggle.geometry.metrics import (
-    AUC_THRESHOLDS,
-    ROTATION_THRESHOLDS,
-    TRANSLATION_THRESHOLDS,
     PoseError,
     pair_accuracy,
     pose_auc,
@@ -22,7 +18,6 @@ from mkpc_kaggle.geometry.metrics import (
 )
 
 SEEDS = st.integers(0, 2**32 - 1)
-PERFECT = PoseError(0.0, 0.0, 0.0)
 
 
 def rotation(axis, degrees):
@@ -47,13 +42,6 @@ def errors(*angles):
     return [PoseError(angle, 0.0, 0.0) for angle in angles]
 
 
-def test_the_thresholds_are_those_of_the_competition():
-    assert_allclose(ROTATION_THRESHOLDS, [1, 2, 3, 4, 5, 6, 7, 8, 9, 10])
-    ratio = 25 ** (1 / 9)
-    assert_allclose(TRANSLATION_THRESHOLDS, [0.2 * ratio**i for i in range(10)])
-    assert AUC_THRESHOLDS == (5, 10, 20)
-
-
 @pytest.mark.parametrize(
     ("rotation", "translation", "accuracy"),
     [
@@ -61,8 +49,6 @@ def test_the_thresholds_are_those_of_the_competition():
         (0.999, 0.1999, 1.0),
         (1.0, 0, 0.9),  # on a threshold is not within it
         (0, 0.2, 0.9),
-        (1.001, 0, 0.9),
-        (0, 0.2001, 0.9),
         (9.999, 0, 0.1),
         (10.001, 0, 0.0),
         (0, 4.999, 0.1),
@@ -70,8 +56,6 @@ def test_the_thresholds_are_those_of_the_competition():
         (4.5, 0.2 * 25 ** (6.5 / 9), 0.3),  # both of one threshold pair have to be met: the translation decides
         (7.5, 0.5, 0.3),  # here the rotation
         (inf, inf, 0.0),
-        (0, inf, 0.0),
-        (nan, nan, 0.0),
     ],
 )
 def test_the_accuracy_of_a_pair_counts_the_threshold_pairs_that_it_meets(rotation, translation, accuracy):

@@ -14,9 +14,7 @@ NONE = {
     "--started-at": ["nan", "-inf", "1e400", "abc", "99999999999", "''"],
     "--workers": ["-1", "''", "1.5", "99999999999999999999", "ray://", "\u0663x"],
     "--device": ["foo", "cuda:99", "''", "cpu:0", "cuda:-1", "meta"],
-    "--precision": ["foo", "''", "int8"],
     "--mode": ["foo", "''"],
-    "--licence": ["foo"],
     "--recipe": ["foo", "''", "../quick", "D/test.csv", "/dev/null", "quick.toml/x.toml", "D", "x" * 5000],
     "--weights": ["foo", "D/test.csv", "/dev/null"],
 }
@@ -43,41 +41,11 @@ def sends(name: str, *after: float, group: bool = False) -> Act:
     return act
 
 
-def to_workers(name: str, after: float) -> Act:
-    """Send the signal to the workers that the program has then."""
-
-    def act(process: "subprocess.Popen[bytes]") -> None:
-        time.sleep(after)
-        children = ["ps", "-o", "pid=,args=", "--ppid", str(process.pid)]
-        for line in subprocess.run(children, capture_output=True, check=False, text=True).stdout.splitlines():
-            if "spawn_main" in line:  # not Python's own tracker of semaphores
-                os.kill(int(line.split()[0]), signal.Signals[name])
-
-    return act
-
-
-def stopped_for(seconds: float) -> Act:
-    """The whole program stands still for a while."""
-
-    def act(process: "subprocess.Popen[bytes]") -> None:
-        time.sleep(2.0)
-        os.killpg(process.pid, signal.SIGSTOP)
-        time.sleep(seconds)
-        os.killpg(process.pid, signal.SIGCONT)
-
-    return act
-
-
 LONG = PLAIN.replace("quick.toml", "classical")
 STATUSES: dict[str, tuple[int, ...]] = {name: (0, status, -status + 128) for name, status in ENDS.items()}
 
-WORKING, SHORT = f"{LONG} --workers 1", f"{PLAIN} --workers 1 --time-limit 60s"
+WORKING = f"{LONG} --workers 1"
 AGAIN = SUBMIT.replace("quick.toml", "classical")
-
-
-def to_program(name: str, when: str, act: Act) -> Case:
-    """A signal from a terminal or a supervisor: the run ends, or had ended before."""
-    return Case("signals", f"{name} {when}", WORKING, statuses=STATUSES[name], act=act)
 
 
 CASES = [
@@ -91,30 +59,20 @@ CASES = [
         for value, statuses in LIMITS.items()
     ),
     *(
-        Case(
-            "limits",
-            f"{limit} with {count} workers",
-            f"{LONG} --workers {count} --time-limit {limit}",
-            statuses=(0, 1),
-        )
-        for limit in ("5s", "15s")
-        for count in (0, 1, 2)
+        Case("limits", f"5s with {n} workers", f"{LONG} --workers {n} --time-limit 5s", statuses=(0, 1))
+        for n in (0, 2)
     ),
-    *(to_program(name, f"after {after} s", sends(name, after)) for name in ENDS for after in SOON),
     *(
-        to_program(name, f"to all after {after} s", sends(name, after, group=True))
+        Case("signals", f"{name} {when}", WORKING, statuses=STATUSES[name], act=act)
         for name in ENDS
-        for after in SOON[::2]
+        for when, act in (
+            *((f"after {after} s", sends(name, after)) for after in SOON),
+            *((f"to all after {after} s", sends(name, after, group=True)) for after in SOON[::2]),
+            ("twice", sends(name, 3.0, 0.2)),
+        )
     ),
-    *(to_program(name, "twice", sends(name, 3.0, 0.2)) for name in ENDS),
     *(
         Case("signals", f"{name} and once more", WORKING, statuses=(status, 0), act=sends(name, 4.0), then=AGAIN)
         for name, status in CRUEL.items()
     ),
-    *(
-        Case("signals", f"{name} to the worker after {after} s", SHORT, act=to_workers(name, after))
-        for name in ("SIGKILL", "SIGSTOP", "SIGTERM", "SIGSEGV")
-        for after in (3.0, 6.0)
-    ),
-    Case("signals", "stopped for a while", f"{WORKING} --time-limit 60s", act=stopped_for(5.0)),
 ]

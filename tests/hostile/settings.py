@@ -8,33 +8,17 @@ from attack import REFUSED, Case
 from room import RECIPE, SUBMIT, encoded, picture, write_sparse
 
 UNIT = 'units = [{ stage = 1, matcher = "sift", long_side = 200 }]\n'
-RECIPES = {
-    "an empty file": "",
-    "a size of 400 digits": UNIT.replace("200", "9" * 400),
+RECIPES = {  # tests/test_recipe.py has the values that are out of range
     "a size of 5,000 digits": UNIT.replace("200", "9" * 5000),
-    "a size of NaN": UNIT.replace("200", "nan"),
-    "an area of 10^40": UNIT.replace("long_side = 200", f'area = "{10**20}x{10**20}"'),
-    "a size of 10^9": UNIT.replace("200", "1000000000"),
-    "a matcher nobody knows": UNIT.replace("sift", "foo"),
-    "a matcher that is a path": UNIT.replace("sift", "../sift"),
     "a module that is not a matcher": UNIT.replace("sift", "registry"),
-    "a key twice": UNIT + UNIT,
-    "no features": UNIT + "[matchers.sift]\nfeatures = 0",
-    "a ratio of NaN": UNIT + "[matchers.sift]\nratio = nan",
-    "10^12 iterations": UNIT + "[magsac]\nmax_iterations = 1000000000000",
-    "10^9 points for a cluster": UNIT + "[mkpc]\nmin_samples = 1000000000",
-    "a cluster radius of 10^-300": UNIT + "[mkpc]\neps = 1e-300",
-    "10^9 permutations": UNIT + "[magsac]\npermutations = 1000000000",
     "deep lists": "units = " + "[" * 100_000,
     "deep tables": "units = " + "{a=" * 20_000,
     "a byte order mark": "\ufeff" + RECIPE,
-    "NUL bytes": RECIPE.replace("sift", "si\0ft"),
     "lines of another system": RECIPE.replace("\n", "\r\n"),
-    "a description of a list": "description = [1]\n" + RECIPE,
     "a million comments": "# nothing\n" * 1_000_000 + RECIPE,
     "10,000 units": "units = [" + 10_000 * '{ stage = 1, matcher = "sift", long_side = 200 },' + "]",
 }
-VALID = ("a byte order mark", "lines of another system", "a description of a list", "a million comments")
+VALID = ("a byte order mark", "lines of another system", "a million comments")
 
 PLACES: dict[str, Callable[[Path], object]] = {
     "a directory": Path.mkdir,
@@ -47,49 +31,20 @@ PLACES: dict[str, Callable[[Path], object]] = {
 CALIBRATION = "image_id,camera_intrinsics,rotation_matrix,translation_vector\n" + "".join(
     f"{name},200 0 80 0 200 80 0 0 1,1 0 0 0 1 0 0 0 1,{shift} 0 0\n" for shift, name in enumerate("xyz")
 )
-COVISIBILITY = "pair,covisibility\nx-y,0.9\ny-z,0.8\nx-z,0.05\n"
-FACTORS = "scene,scaling_factor\ns,1.5\n"
 VALIDATE = "validate --train-dir T --recipe quick.toml --workers 0 --no-scenes"
 CHECK = "check out/sub.csv --test-dir D"
 SCORE = "validate --train-dir T --submission out/sub.csv --truth truth.csv"
 ARGUMENTS = {
     "covisibility of NaN": "--min-covisibility nan",
     "a scene above": "--scenes ../T",
-    "a threshold of NaN": "--threshold nan",
-    "a comparison with nothing": "--compare quick.toml foo",
-    "a submission without truth": "--submission out/sub.csv",
     "figures in a directory": "--json out --pairs-per-scene 1",
     "figures in the table": "--json T/scaling_factors.csv --pairs-per-scene 1",
-    "a file for the work directory": "--work-dir truth.csv",
-}
-TRAIN = {
-    "scaling_factors.csv": {
-        "of NaN": ("scene,scaling_factor\ns,nan\n", (0,)),
-        "with a path": ("scene,scaling_factor\n../T,1\n", REFUSED),
-    },
-    "s/calibration.csv": {
-        "of NaN": (CALIBRATION.replace("200 0 80", "nan nan nan"), (0,)),
-        "of zeros": (CALIBRATION.replace("200 0 80 0 200 80 0 0 1", "0 0 0 0 0 0 0 0 0"), (0,)),
-        "with a rotation that is none": (CALIBRATION.replace("1 0 0 0 1 0 0 0 1", "1 2 3 4 5 6 7 8 9"), (0,)),
-    },
-    "s/pair_covisibility.csv": {
-        "of NaN": ("pair,covisibility\nx-y,nan\n", REFUSED),
-        "with an image twice": ("pair,covisibility\nx-x,1\n", (0,)),
-    },
 }
 ROW = "1," + " ".join("123456789")
 SUBMISSIONS = {
     "empty": "",
     "of NaN": "sample_id,fundamental_matrix\n1,nan nan nan nan nan nan nan nan nan\n",
     "of huge numbers": "sample_id,fundamental_matrix\n1,1e308 1e308 1 1 1 1 1 1 1\n",
-}
-PACKAGES = {
-    "an owner that is a path": "--owner ../x",
-    "an owner with a line feed": "--owner 'a\nb'",
-    "wheels that are not there": "--owner me --wheels foo",
-    "wheels that are a file": "--owner me --wheels quick.toml",
-    "an empty directory of wheels": "--owner me --wheels home",
-    "no Python": "--owner me --wheels home --python ''",
 }
 
 
@@ -105,18 +60,19 @@ def replaced(make: Callable[[Path], object]) -> Callable[[Path], None]:
     return replace
 
 
-def train_side(name: str = "", text: str = "", submission: str = "") -> Callable[[Path], None]:
-    """A train side of one scene, one of its files changed, and a submission with what its sample is."""
+def train_side(former: str = "", new: str = "", submission: str = "") -> Callable[[Path], None]:
+    """A train side of one scene, with a change to its cameras, and a submission with the sample's truth."""
 
     def make(room: Path) -> None:
         images = room / "T" / "s" / "images"
         images.mkdir(parents=True)
         for number, image in enumerate("xyz"):
             (images / f"{image}.jpg").write_bytes(encoded(".jpg", picture(12 * number)))
-        files = {"scaling_factors.csv": FACTORS, "s/calibration.csv": CALIBRATION}
-        files["s/pair_covisibility.csv"] = COVISIBILITY
-        for file, contents in {**files, **({name: text} if name else {})}.items():
-            (room / "T" / file).write_text(contents)
+        (room / "T" / "scaling_factors.csv").write_text("scene,scaling_factor\ns,1.5\n")
+        (room / "T" / "s" / "calibration.csv").write_text(
+            CALIBRATION.replace(former, new) if former else CALIBRATION
+        )
+        (room / "T" / "s" / "pair_covisibility.csv").write_text("pair,covisibility\nx-y,0.9\ny-z,0.8\nx-z,0.05\n")
         (room / "truth.csv").write_text("sample_id,scene,image_1_id,image_2_id\n1,s,x,y\n")
         (room / "out" / "sub.csv").write_text(submission or f"sample_id,fundamental_matrix\n{ROW}\n")
 
@@ -133,21 +89,12 @@ CASES = [
         Case("arguments", name, f"{VALIDATE} {options}", train_side(), REFUSED)
         for name, options in ARGUMENTS.items()
     ),
-    *(
-        Case("arguments", f"{file} {name}", f"{VALIDATE} --pairs-per-scene 1", train_side(file, text), statuses)
-        for file, texts in TRAIN.items()
-        for name, (text, statuses) in texts.items()
-    ),
+    Case("arguments", "cameras of NaN", f"{VALIDATE} --pairs-per-scene 1", train_side("200 0 80", "nan nan nan")),
+    Case("arguments", "a rotation that is none", f"{VALIDATE} --pairs-per-scene 1", train_side("1 0 0", "1 2 3")),
     *(
         Case("arguments", f"a submission {name}", SCORE, train_side(submission=text))
         for name, text in SUBMISSIONS.items()
     ),
-    *(
-        Case("arguments", f"check of a submission {name}", CHECK, train_side(submission=text), (1,))
-        for name, text in SUBMISSIONS.items()
-    ),
-    *(
-        Case("packages", name, f"package --out out/p {options}", statuses=REFUSED)
-        for name, options in PACKAGES.items()
-    ),
+    Case("arguments", "check of a submission of NaN", CHECK, train_side(submission=SUBMISSIONS["of NaN"]), (1,)),
+    Case("arguments", "an owner that is a path", "package --out out/p --owner ../x", statuses=REFUSED),
 ]

@@ -1,6 +1,5 @@
 """``test.csv`` as nobody should write it."""
 
-import gzip
 import os
 from pathlib import Path
 
@@ -26,49 +25,24 @@ def in_place(make):
 
 
 REFUSALS = {
-    "an empty file": b"",
     "a batch further above": (HEADER + "1,../../etc,x,y\n").encode(),
     "UTF-16": TABLE.encode("utf-16"),
-    "compressed": gzip.compress(TABLE.encode()),
     "bytes that are not UTF-8": TABLE.encode().replace(b"x-y", b"\xff\xfe"),
-    "NUL bytes": TABLE.encode().replace(b"x-y", b"x\0y"),
-    "semicolons": TABLE.replace(";", "-").replace(",", ";").encode(),
-    "blanks around cells": TABLE.replace(",", " , ").encode(),
-    "an open quote": (HEADER + '"b1,b1,x,y\n').encode(),
-    "an image id with a NUL": (HEADER + "1,b1,a\0,y\n2,b1,x,y\n").encode(),
-    "rows with fewer cells": (HEADER + "1,b1\n2,b1,x,y\n").encode(),
     "a hundred thousand columns": (HEADER.strip() + ",c" * 100_000 + "\n" + ROW).encode(),
     "a cell of 10 MB": (HEADER + "1,b1,x,y\n2,b1,x," + "y" * 10_000_000 + "\n").encode(),
 }
 TAKEN = {
     "a byte order mark": b"\xef\xbb\xbf" + TABLE.encode(),
     "lines of another system": TABLE.replace("\n", "\r\n").encode(),
-    "lines of an old system": TABLE.replace("\n", "\r").encode(),
-    "a column twice": TABLE.replace("\n", ",x\n").replace("id,x", "id,sample_id", 1).encode(),
-    "quotes and commas in an id": (HEADER + '"a,""b""",b1,x,y\n').encode(),
-    "ids like missing values": (HEADER + "nan,b1,x,y\nNA,b1,NA,null\n,b1,x,y\n").encode(),
-    "ids like numbers": (HEADER + "001,b1,x,y\n1e3,b1,x,y\n1,b1,x,y\n").encode(),
-    "ids of other scripts": (HEADER + "\u202eab\U0001f600\u0301,b1,x,y\n").encode(),
     "a very long sample id": (HEADER + "s" * 100_000 + ",b1,x,y\n").encode(),
     "a batch id of 5,000 characters": (HEADER + "1," + "b" * 5000 + ",x,y\n2,b1,x,y\n").encode(),
-    "an image id of 300 characters": (HEADER + "1,b1," + "x" * 300 + ",y\n2,b1,x,y\n").encode(),
-    "the same image twice": (HEADER + "1,b1,x,x\n").encode(),
 }
 NO_IMAGES = (HEADER + "".join(f"{n},b1,p{n},q{n}\n" for n in range(5000))).encode()
 PLACES = {
     "a directory": Path.mkdir,
     "a pipe": os.mkfifo,
     "a link to /dev/zero": lambda path: path.symlink_to("/dev/zero"),
-    "a link to /dev/null": lambda path: path.symlink_to("/dev/null"),
-    "a link to nothing": lambda path: path.symlink_to("nothing"),
 }
-DIRECTORIES = {
-    "a directory that is not there": "E",
-    "a file for the directory": "D/test.csv",
-    "a very long name for the directory": "d" * 5000,
-    "another directory": "out",
-}
-
 CASES = [
     Case(
         "tables",
@@ -82,8 +56,7 @@ CASES = [
     *(Case("tables", name, SUBMIT, written(data)) for name, data in TAKEN.items()),
     Case("tables", "5,000 pairs of no images", SUBMIT, written(NO_IMAGES), statuses=(1,)),
     *(Case("tables", name, SUBMIT, in_place(make), REFUSED) for name, make in PLACES.items()),
-    *(
-        Case("tables", name, SUBMIT.replace("--test-dir D", f"--test-dir {place}"), statuses=REFUSED)
-        for name, place in DIRECTORIES.items()
+    Case(
+        "tables", "a very long name", SUBMIT.replace("--test-dir D", f"--test-dir {'d' * 5000}"), statuses=REFUSED
     ),
 ]

@@ -31,14 +31,14 @@ QUICK = (  # these run with the other tests
     "signals: SIGINT after 0.3 s",  # while modules are imported
     "signals: SIGTERM after 1.0 s",
     "signals: SIGINT to all after 3.0 s",
-    "journals: no points, resumed",
+    "journals: its first half, resumed",
     "journals: noise after its head, read",
     "recipes: deep tables",
     "weights: a bytearray of 6 GB",
     "fetches: a redirection to a file",
     "fetches: a link for the part",
     "arguments: check of a submission of NaN",
-    "packages: an owner that is a path",
+    "arguments: an owner that is a path",
     "folders: database.db of the user's",
     "folders: a folder's name: Latin 1",
     "folders: again: an ending that was changed",
@@ -59,5 +59,5 @@ def test_a_hostile_input_is_survived(case, template, tmp_path):
 
 def test_the_names_of_cases_are_unique_and_the_quick_ones_are_among_them():
     names = {case.id for case in ALL}
-    assert len(names) == len(ALL) >= 300
+    assert len(names) == len(ALL)
     assert set(QUICK) <= names
