@@ -81,7 +81,7 @@ def _stored(pair: BatchPair, first: StoredImage, second: StoredImage) -> BatchPa
             return Matches.empty()
         return Matches(first.points(found.points0), second.points(found.points1), found.scores)
 
-    tracks = pair.tracks and {name: moved(found) for name, found in pair.tracks.items()}
+    tracks = None if pair.tracks is None else moved(pair.tracks)
     return BatchPair(first.image, second.image, moved(pair.matches), None, tracks)
 
 

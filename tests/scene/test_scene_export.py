@@ -47,7 +47,7 @@ def test_nothing_connects_a_mirrored_file_with_others(tmp_path):
         ends[name] = BatchImage(name, name, image.size)
     points = every_pixel(4, 4)
     found = Matches(points, points, np.ones(16))
-    pairs = [BatchPair(ends[i], ends[j], found, None, {"sift": found}) for i, j in ("ab", "ac", "bd", "cd")]
+    pairs = [BatchPair(ends[i], ends[j], found, None, found) for i, j in ("ab", "ac", "bd", "cd")]
     moved = Export(tmp_path, tmp_path, {name: (f"{name}.png", 0) for name in ends}).stored(pairs)
     assert [len(pair.matches) for pair in moved] == [16, 0, 0, 16]
-    assert [len(pair.tracks_of("sift")) for pair in moved] == [16, 0, 0, 16]
+    assert [len(pair.tracks) for pair in moved] == [16, 0, 0, 16]
