@@ -8,7 +8,7 @@ from mkpc_kaggle.data.outputs import require_apart
 from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
 from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher, to_image
 from mkpc_kaggle.reporting.figures.pair import draw_pair
-from mkpc_kaggle.reporting.figures.style import save
+from mkpc_kaggle.reporting.figures.style import require_format, save
 
 HELP = """\
 Match two images and print the fundamental matrix (x1^T F x0 = 0, pixel centres at integers), how many matches
@@ -26,6 +26,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     inputs = [arguments.image0, arguments.image1, Path(arguments.recipe)]
     require_apart({"--out": arguments.out}, inputs, weights=arguments.weights)
+    if arguments.out is not None:
+        require_format(arguments.out)
     images = to_image(arguments.image0), to_image(arguments.image1)
     given = {name: getattr(arguments, name) for name in ("weights", "device", "precision", "licence")}
     matcher = TwoStageMatcher(arguments.recipe, **given)
