@@ -1,10 +1,12 @@
 """The command ``match``."""
 
 import argparse
+from functools import partial
 from pathlib import Path
 
 from mkpc_kaggle.cli import options
 from mkpc_kaggle.data.outputs import require_apart
+from mkpc_kaggle.engine.streams import unblocked
 from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
 from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher, to_image
 from mkpc_kaggle.reporting.figures.pair import draw_pair
@@ -17,6 +19,7 @@ each unit found, and the critical regions. --out draws the matches, the clusters
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.set_defaults(printing=partial(unblocked, "stderr"))  # on which decoders complain
     parser.add_argument("image0", type=Path)
     parser.add_argument("image1", type=Path)
     parser.add_argument("--out", type=Path, metavar="FIG.png", help="draw the pair; the suffix says the format")
