@@ -3,12 +3,13 @@
 import hashlib
 import json
 import platform
+import shutil
 import signal
 import sqlite3
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from importlib import metadata
 from math import isfinite
@@ -20,7 +21,8 @@ from typing import Self
 import cv2
 import numpy as np
 
-from mkpc_kaggle.data.competition import Pair, write_submission
+from mkpc_kaggle.data.competition import Pair, has_samples, write_submission
+from mkpc_kaggle.data.outputs import replacing
 from mkpc_kaggle.engine import console
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.cluster import RayCluster, RaySite
@@ -79,24 +81,31 @@ def submit(pairs: Sequence[Pair], assembly: Assembly, session: Session, output: 
 
 @contextmanager
 def first_version(pairs: Sequence[Pair], output: Path) -> Iterator[None]:
-    """Write fallback rows where there is no file yet, before weights, devices and images, any of which may hang.
+    """Write fallback rows, unless the file has them, before weights, devices and images: any of those may hang.
 
-    A run that is refused before it has written a version of its own leaves no file. Raises
+    A run that is refused before it has written its own version leaves the former file, or none. Raises
     :class:`mkpc_kaggle.errors.UserError` where ``output`` cannot be written.
     """
     require_writable(output)
-    ours = None
-    if not output.exists():
-        with writing(f"--output {output}"):
-            write_submission(output, {pair.id: FALLBACK_FUNDAMENTAL for pair in pairs})
-            ours = _identity(output)
-    try:
-        yield
-    except UserError:
-        with suppress(OSError):  # somebody else has removed it
-            if ours == _identity(output):
-                output.unlink()
-        raise
+    ours, ids = None, [pair.id for pair in pairs]
+    with ExitStack() as closed:
+        former = None
+        if not output.exists() or (output.is_file() and not has_samples(output, ids)):
+            with writing(f"--output {output}"):
+                if output.is_file():
+                    former = closed.enter_context(output.open("rb"))  # it outlives its name
+                write_submission(output, dict.fromkeys(ids, FALLBACK_FUNDAMENTAL))
+                ours = _identity(output)
+        try:
+            yield
+        except UserError:
+            with suppress(OSError):  # somebody else has removed it
+                if ours == _identity(output):
+                    output.unlink()
+                    if former is not None:
+                        with replacing(output) as stream:
+                            shutil.copyfileobj(former, stream.buffer)
+            raise
 
 
 def _identity(path: Path) -> tuple[int, int]:

@@ -253,15 +253,21 @@ def test_a_million_rows_are_written_in_little_memory(demo, tmp_path):
     assert not list(tmp_path.glob(".*.part"))
 
 
-def test_a_whole_submission_is_there_before_weights_and_devices_are_looked_at(demo, tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    "former", [None, "", "sample_id,fundamental_matrix\nof another test set,0 0 0 0 0 0 0 0 0\n"]
+)
+def test_a_whole_submission_is_there_before_weights_and_devices_are_looked_at(demo, tmp_path, monkeypatch, former):
     def look(*_, **__):
         assert submission_problems(output, [pair.id for pair in read_test_side(demo.test_dir)]) == []
         raise UserError("the disk with the weights cannot be read")
 
     monkeypatch.setattr("mkpc_kaggle.cli.options.assemble", look)
     output = tmp_path / "submission.csv"
+    if former is not None:
+        output.write_text(former)
     assert main(["submit", "--test-dir", str(demo.test_dir), "--output", str(output)]) == 2
-    assert not output.exists(), "a run that is refused leaves nothing"
+    left = output.read_text() if output.exists() else None
+    assert left == former, "a run that is refused leaves what there was"
 
 
 def test_a_current_directory_that_is_gone_is_a_line(tmp_path):
