@@ -71,9 +71,9 @@ def main(arguments: Sequence[str] | None = None, *, started: float | None = None
         except UserError as error:
             complain(str(error))
             return EXIT_BAD_INPUT
-        except KeyboardInterrupt:
+        except KeyboardInterrupt as error:
             complain("interrupted")
-            return EXIT_INTERRUPTED
+            return 128 + int(*error.args) if error.args else EXIT_INTERRUPTED
         except BrokenPipeError:  # the reader closed the pipe, as head does
             return EXIT_BROKEN_PIPE
         except OSError as error:

@@ -52,7 +52,7 @@ def run(arguments: argparse.Namespace) -> int:
         # Not yet watched: a run whose limit is over when it starts leaves a whole file, too.
         with first_version(pairs, output), options.watched_session(arguments, work_dir, interrupt) as watched:
             session, watchdog = watched
-            assembly = options.assembly_of(arguments, arguments.recipe, arguments.mode)
+            assembly = options.assembly_of(arguments, arguments.recipe, arguments.mode, interrupt)
             options.say_start(f"{len(pairs)} pairs", assembly, work_dir)
             report = submit(pairs, assembly, session, output)
             watchdog.status = int(bool(report.unwritten or trouble(report)))

@@ -16,7 +16,7 @@ from mkpc_kaggle.data.pairs import read_pairs
 from mkpc_kaggle.engine.console import say
 from mkpc_kaggle.engine.engine import Ending
 from mkpc_kaggle.engine.journal import share_journal
-from mkpc_kaggle.engine.session import Session, interruptible
+from mkpc_kaggle.engine.session import Interrupt, Session, interruptible
 from mkpc_kaggle.errors import UserError, writing
 from mkpc_kaggle.evaluation.compare import Comparison, comparison_json, comparison_table, step_gains
 from mkpc_kaggle.evaluation.imc2025 import score_imc2025, score_lines
@@ -134,7 +134,7 @@ def _match_and_score(arguments: argparse.Namespace, scenes: tuple[TrainScene, ..
     pairs = [true.pair for scene in scenes for true in scene.pairs]
     validations, status = [], 0
     with interruptible() as interrupt:
-        assemblies = [_assemble(arguments, *choice) for choice in choices]
+        assemblies = [_assemble(arguments, interrupt, *choice) for choice in choices]
         directories = [work_dir / re.sub(r"[^\w.-]+", "_", text) for text in compared or [""]]
         for number, (assembly, directory) in enumerate(zip(assemblies, directories, strict=True)):
             for former, done in zip(assemblies[:number], directories[:number], strict=True):
@@ -170,9 +170,9 @@ def _write_json(path: Path | None, figures: dict[str, Any]) -> None:
             path.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
 
 
-def _assemble(arguments: argparse.Namespace, name: str, mode: str) -> Assembly:
+def _assemble(arguments: argparse.Namespace, interrupt: Interrupt, name: str, mode: str) -> Assembly:
     """The parts of a run of a recipe, with the units and the robust method that the command names."""
-    assembly = options.assembly_of(arguments, name, mode)
+    assembly = options.assembly_of(arguments, name, mode, interrupt)
     recipe = with_units(assembly.recipe, arguments.units)
     given = {"method": arguments.method, "threshold": arguments.threshold}
     changes = {key: value for key, value in given.items() if value is not None}

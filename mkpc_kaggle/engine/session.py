@@ -41,9 +41,25 @@ REPORT_S = 2.0  # that an interrupted program may take for its report: enough fo
 
 
 class Interrupt(threading.Event):
-    """Set when the run has to end early; ``signal`` is what asked for it, 0 if nothing did."""
+    """Set when the run must end early; ``signal`` is what asked for it, 0 if nothing did."""
 
     signal = 0
+    _raises = False
+
+    @contextmanager
+    def raising(self) -> Iterator[None]:
+        """Answer a signal with ``KeyboardInterrupt`` of its number, during work that does not look at the event."""
+        self._raises = True
+        try:
+            yield
+        finally:
+            self._raises = False
+
+    def note(self, number: int) -> None:
+        self.signal = number
+        self.set()
+        if self._raises:
+            raise KeyboardInterrupt(number)
 
 
 @dataclass(frozen=True)
@@ -231,9 +247,8 @@ def interruptible() -> Iterator[Interrupt]:
     former = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
 
     def note(number: int, _: FrameType | None) -> None:
-        interrupt.signal = number
-        interrupt.set()
         restore()
+        interrupt.note(number)
 
     def restore() -> None:
         for number, handler in former.items():

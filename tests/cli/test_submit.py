@@ -270,6 +270,27 @@ def test_a_whole_submission_is_there_before_weights_and_devices_are_looked_at(de
     assert left == former, "a run that is refused leaves what there was"
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("command", ["submit --test-dir {test}", "reconstruct {test}/test_images --out out"])
+def test_a_signal_is_answered_while_weights_are_read(
+    demo, tmp_path, clean_environment, monkeypatch, number, command, capsys
+):
+    def read_for_long(path):
+        os.kill(os.getpid(), number)
+        for _ in range(100):
+            time.sleep(0.01)
+        pytest.fail("it is read on for a second")
+
+    monkeypatch.setattr("mkpc_kaggle.weights.store.digest_of", read_for_long)
+    (tmp_path / "weights").mkdir()
+    (tmp_path / "weights" / "superglue_outdoor.pth").touch()  # whose size the manifest does not have
+    status = main([*command.format(test=demo.test_dir).split(), "--recipe", "auto", "--weights", "weights"])
+    assert status == 128 + number
+    assert capsys.readouterr().err == "error: interrupted\n"
+    if command.startswith("submit"):
+        assert_good(tmp_path / "submission.csv", demo.test_dir)
+
+
 def test_a_current_directory_that_is_gone_is_a_line(tmp_path):
     script = f"cd {tmp_path} && rmdir {tmp_path} && exec {sys.executable} -m mkpc_kaggle submit --test-dir x"
     done = subprocess.run(
