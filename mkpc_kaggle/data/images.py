@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 
 from mkpc_kaggle.data.exif import read_exif
+from mkpc_kaggle.errors import shown
 from mkpc_kaggle.geometry.coordinates import Pixels, Size
 
 Key = TypeVar("Key")
@@ -63,7 +64,7 @@ class Unreadable:
     reason: str
 
     def __str__(self) -> str:
-        return f"{printable(self.name)}: {self.reason}"
+        return f"{shown(self.name)}: {self.reason}"
 
 
 def read_image(path: Path) -> Image | Unreadable:

@@ -48,7 +48,7 @@ class Interrupt(threading.Event):
 
     @contextmanager
     def raising(self) -> Iterator[None]:
-        """Answer a signal with ``KeyboardInterrupt`` of its number, during work that does not look at the event."""
+        """Answer a signal with ``KeyboardInterrupt`` of its number: for work that does not look at the event."""
         self._raises = True
         try:
             yield

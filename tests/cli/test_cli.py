@@ -120,6 +120,29 @@ def test_match_prints_f_and_draws_the_pair(demo, small_recipe, tmp_path, capsys)
     assert cv2.imread(str(figure)).shape[1] > 1000
 
 
+def test_a_missing_image_is_shown_in_letters(clean_environment, capsys):
+    assert main(["match", "a\x1b[2J\n.png", "b.png"]) == 2
+    assert capsys.readouterr().err == r"error: a\x1b[2J\n.png: no such file" + "\n"
+
+
+def test_a_long_text_is_called_long(clean_environment, tmp_path, capsys):
+    (tmp_path / "long.toml").write_bytes(b"#" * (17 << 20))
+    assert main(["match", "a.png", "b.png", "--recipe", "long.toml"]) == 2
+    (tmp_path / "a.png").write_bytes(cv2.imencode(".png", np.zeros((9, 9), np.uint8))[1])
+    assert main(["match", "a.png", "a.png", "--recipe", "long.toml"]) == 2
+    assert "17825792 bytes, at most 16777216 are" in capsys.readouterr().err
+
+
+def test_matplotlib_leaves_nothing_where_home_cannot_be_written(demo, small_recipe, tmp_path):
+    images = sorted((demo.train_dir / "courtyard" / "images").iterdir())[:2]
+    (tmp_path / "tmp").mkdir()
+    home = {"HOME": "/proc/home", "XDG_CONFIG_HOME": "/proc/home", "TMPDIR": str(tmp_path / "tmp")}
+    command = [*map(str, images), "--recipe", str(small_recipe), "--out", str(tmp_path / "pair.png")]
+    environment = {name: value for name, value in os.environ.items() if name != "MPLCONFIGDIR"} | home
+    subprocess.run([sys.executable, "-m", "mkpc_kaggle", "match", *command], env=environment, check=True)
+    assert list((tmp_path / "tmp").iterdir()) == []
+
+
 def test_match_says_what_it_lacks_and_draws_a_pair_that_has_nothing_in_common(clean_environment, tmp_path, capsys):
     cv2.imwrite(str(tmp_path / "a.png"), np.full((60, 90, 3), 127, np.uint8))
     match, figure = ["match", *[str(tmp_path / "a.png")] * 2], tmp_path / "pair.png"

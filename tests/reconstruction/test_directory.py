@@ -145,7 +145,10 @@ def test_former_files_stay_until_the_new_ones_are_whole(tmp_path, monkeypatch):
         write_files(write_half)
     assert files_of(tmp_path) == sorted(FILES)
     assert {path.read_text() for path in tmp_path.rglob("*") if path.is_file()} == {"former"}
+    synced = set()
+    monkeypatch.setattr(os, "fsync", lambda number: synced.add(Path(f"/proc/self/fd/{number}").readlink().name))
     write_files(write_whole)
+    assert synced == {"database.db", *MODEL_FILES}, "a power failure leaves no empty file under its name"
     assert files_of(tmp_path) == sorted(FILES)
     assert {(tmp_path / "models" / "0" / name).read_text() for name in MODEL_FILES} == {"new"}
     with pycolmap.Database.open(str(tmp_path / "database.db")) as database:

@@ -40,6 +40,8 @@ def test_a_manifest_reads_as_written():
         ("../a.pt 12 unverified MIT one x", "'../a.pt' is not a plain file name"),
         ("a.pt 12kB unverified MIT one x", "bytes must be a number or '?', not '12kB'"),
         ("a.pt -1 unverified MIT one x", "bytes must be a number or '?', not '-1'"),
+        (f"a.pt {'9' * 5000} unverified MIT one x", "bytes must be a number or '?', not '999"),
+        ("a\x1b[2J.pt 12 unverified MIT one x", r"'a\x1b[2J.pt' is not a plain file name"),
         ("a.pt 12 md5:00 MIT one x", "digest must be"),
         (f"a.pt 12 {SHA256[:-1]} MIT one x", "digest must be"),
         (f"a.pt 12 {SHA256[:-1]}g MIT one x", "digest must be"),
