@@ -44,7 +44,7 @@ def own(*licences):
     ],
 )
 def test_what_is_of_a_wrong_type_is_named(wrong):
-    with pytest.raises(TypeError, match="(recipe|device|matcher).* not |has no `spec`"):
+    with pytest.raises(TypeError, match=r"(recipe|device|matcher).* not |has no `spec`"):
         TwoStageMatcher(**({"recipe": "classical"} | wrong))
 
 
