@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 
 from mkpc_kaggle.demo import write_demo
-from mkpc_kaggle.errors import writing
+from mkpc_kaggle.errors import UserError, writing
 
 HELP = """\
 Render scenes of stone walls and painted boxes with known cameras, in the competition's layout:
@@ -18,20 +18,13 @@ DIR/train with poses, DIR/test without, DIR/test_truth.csv to score a submission
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, default=Path("demo"), metavar="DIR", help="default: demo")
-    parser.add_argument("--seed", type=_seed, default=0, help="another seed gives other pictures")
+    parser.add_argument("--seed", type=int, default=0, help="another seed gives other pictures")
 
 
 def run(arguments: argparse.Namespace) -> int:
+    if arguments.seed < 0:
+        raise UserError("--seed: give 0 or more")
     with writing(f"--out {arguments.out}"):
         demo = write_demo(arguments.out, seed=arguments.seed)
     print(f"train side: {demo.train_dir}\ntest side: {demo.test_dir}\ntruth of the test side: {demo.truth_csv}")
     return 0
-
-
-def _seed(text: str) -> int:
-    if (seed := int(text)) < 0:
-        raise ValueError
-    return seed
-
-
-_seed.__name__ = "seed"  # in argparse's message

@@ -65,7 +65,7 @@ def require_table(path: Path, columns: Iterable[str]) -> None:
                 with path.open(encoding="utf-8", errors="replace") as stream:
                     if stream.readline(1 << 16).rstrip("\n") == ",".join(columns):
                         return
-        raise UserError(f"{path} exists and is not such a table; name another directory")
+        raise UserError(f"{path} exists and is no such table; name another directory")
 
 
 def weights_of_environment() -> list[Path]:

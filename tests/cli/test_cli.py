@@ -79,7 +79,7 @@ def test_results_are_not_written_over_inputs_nor_an_export_over_the_journal(demo
         ("demo --out x.png", "cannot be written"),
         ("demo --out x.png/d", "cannot be written"),
         ("demo --out /proc/d", "cannot be written"),
-        ("demo --seed -1 --out d", "invalid seed value"),
+        ("demo --seed -1 --out d", "--seed: give 0 or more"),
     ],
 )
 def test_what_would_replace_files_of_the_user_is_refused_before_any_work(

@@ -4,7 +4,7 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
-from attack import REFUSED, Case, nothing
+from attack import REFUSED, Case, nothing, prepared
 from room import SUBMIT
 
 INPUTS = {
@@ -73,12 +73,79 @@ OVER = {
 }
 
 
+FIGURES = {
+    "a photograph's name without its suffix": "D/test_images/b1/x",
+    "another photograph's": "D/test_images/b1/z",
+    "the recipe's name without its suffix": "quick",
+    "no suffix": "out/notes",
+    "a suffix that is no picture's": "out/a.xyz",
+    "a suffix that needs LaTeX": "out/a.pgf",
+    "a dot after the suffix": "out/a.png.",
+    "a suffix alone": "out/.png",
+    "the full device": "/dev/full",
+    "the null device": "/dev/null",
+    "the screen": "/dev/stdout",
+}
+USERS: dict[str, Callable[[Path], object]] = {  # in the folder U of the user
+    "a train side of the user's": lambda folder: mine(folder / "train" / "scaling_factors.csv"),
+    "a test side of the user's": lambda folder: mine(folder / "test" / "test.csv"),
+    "a truth of the user's": lambda folder: mine(folder / "test_truth.csv"),
+    "a link to a train side": lambda folder: (folder / "train").symlink_to("../D"),
+    "a link to nothing for the mark": lambda folder: (folder / "demo.txt").symlink_to("../nothing"),
+    "a pipe for the mark": lambda folder: os.mkfifo(folder / "demo.txt"),
+    "another mark": lambda folder: [mine(folder / "demo.txt"), mine(folder / "test_truth.csv")],
+}
+DEMOS = {
+    "a file": "--out D/test.csv",
+    "below a file": "--out D/test.csv/d",
+    "below /proc": "--out /proc/d",
+    "the null device": "--out /dev/null",
+    "a name of 300 characters": f"--out out/{'d' * 300}",
+    "a seed below none": "--out out/d --seed -1",
+    "a seed of text": "--out out/d --seed x",
+    "a seed of 5,000 digits": f"--out out/d --seed {'9' * 5000}",
+}
+EXPORTS: dict[str, Callable[[Path], object]] = {
+    "a table of the user's": lambda folder: mine(folder / "pairs.csv"),
+    "another table of the user's": lambda folder: mine(folder / "events.csv"),
+    "a link to the test set": lambda folder: (folder / "pairs.csv").symlink_to("../D/test.csv"),
+    "a link to an image": lambda folder: (folder / "units.csv").symlink_to("../D/test_images/b1/x.png"),
+    "a link to the journal": lambda folder: (folder / "regions.csv").symlink_to("../out/s.work/journal.sqlite"),
+    "a link to nothing": lambda folder: (folder / "units.csv").symlink_to("nothing"),
+    "a pipe": lambda folder: os.mkfifo(folder / "units.csv"),
+    "a directory": lambda folder: (folder / "units.csv").mkdir(),
+    "/dev/zero": lambda folder: (folder / "units.csv").symlink_to("/dev/zero"),
+}
+
+
+def mine(path: Path) -> None:
+    path.parent.mkdir(exist_ok=True)
+    path.write_text("mine")
+
+
+def in_folder(make: Callable[[Path], object]) -> Callable[[Path], None]:
+    def write(room: Path) -> None:
+        (room / "U").mkdir()
+        make(room / "U")
+
+    return write
+
+
+def exported(make: Callable[[Path], object]) -> Callable[[Path], None]:
+    def write(room: Path) -> None:
+        prepared(SUBMIT, room)
+        in_folder(make)(room)
+
+    return write
+
+
 def weights(room: Path) -> None:
     data, name = WEIGHTS
     (room / "W").mkdir()
     (room / name).write_bytes(data)
 
 
+B1 = "D/test_images/b1"
 PLAIN = SUBMIT.replace("--output out/s.csv --no-report ", "")
 
 
@@ -101,6 +168,25 @@ CASES = [
         for name, make in table.items()
     ),
     *(Case("outputs", name, command, weights, REFUSED, "name another") for name, command in OVER.items()),
+    *(
+        Case("figures", name, f"match {B1}/x.png {B1}/y.png --recipe quick.toml --out {out}", statuses=REFUSED)
+        for name, out in FIGURES.items()
+    ),
+    Case("figures", "capitals", f"match {B1}/x.png {B1}/y.png --recipe quick.toml --out out/a.PNG"),
+    *(Case("demos", name, "demo --out U", in_folder(make), REFUSED, "in the way") for name, make in USERS.items()),
+    *(Case("demos", name, f"demo {options}", statuses=REFUSED) for name, options in DEMOS.items()),
+    Case("demos", "given again", "demo --out out/d", then="demo --out out/d --seed 1"),
+    *(
+        Case("exports", name, "journal out/s.work --csv U", exported(make), REFUSED, "is no such table")
+        for name, make in EXPORTS.items()
+    ),
+    Case(
+        "exports",
+        "given again",
+        "journal out/s.work --csv out/t",
+        exported(nothing),
+        then="journal out/s.work --csv out/t",
+    ),
     Case("outputs", "text that the terminal has not", f"{PLAIN} --output out/s.csv", env=ASCII),
     Case("outputs", "the C locale", f"{PLAIN} --output out/\u00e9.csv", env=C, submission=False),
 ]

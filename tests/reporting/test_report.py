@@ -98,7 +98,7 @@ def test_an_export_replaces_nothing_but_its_own_tables(tmp_path, make, capsys):
     (tmp_path / "csv").mkdir()
     make(tmp_path / "csv" / "units.csv")
     assert main(["journal", str(tmp_path), "--csv", str(tmp_path / "csv")]) == 2
-    assert "units.csv exists and is not such a table" in capsys.readouterr().err
+    assert "units.csv exists and is no such table" in capsys.readouterr().err
     assert [path.name for path in (tmp_path / "csv").iterdir()] == ["units.csv"]
     assert read_log(tmp_path).pairs == ()
 
