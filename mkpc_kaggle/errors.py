@@ -34,7 +34,7 @@ def read_text(path: Path) -> str:
 
 
 def shown(name: object) -> str:
-    """A name of a file or dataset for messages: with escapes for what ends a line or drives a terminal."""
+    """Return a name for messages, its control characters escaped: they end lines and drive terminals."""
     return "".join(letter if letter.isprintable() else repr(letter)[1:-1] for letter in str(name))
 
 

@@ -26,7 +26,7 @@ from mkpc_kaggle.recipe import Recipe, split_mode
 from mkpc_kaggle.reporting.report import report_run
 from mkpc_kaggle.reporting.summary import left_out_line, summary, trouble
 
-# Defaults of the options that say what is matched, and how.
+# Defaults of the options of matching.
 MATCHING = dict.fromkeys(("work_dir", "compare", "units", "method", "threshold")) | {
     "recipe": "auto",
     "mode": "two-stage",

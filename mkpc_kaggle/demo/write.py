@@ -58,8 +58,8 @@ def write_demo(
     """Render the scenes (all of them by default) and write both sides under `directory`.
 
     The same arguments give the same bytes. `image_scale` scales all images and their K.
-    Raises ValueError for an unknown scene, a scene given twice, or a scale that is not positive, and
-    :class:`UserError` if the directory has such files that no demo wrote.
+    Raises ValueError for an unknown scene, a scene given twice, or a scale that is not positive. Raises
+    :class:`UserError` if the directory has a train or test side that no demo wrote.
     """
     names = SCENE_NAMES if scenes is None else tuple(scenes)
     if len(set(names)) != len(names):

@@ -102,7 +102,7 @@ class QueuedStream(io.TextIOBase):
     def _print(self) -> None:
         while True:
             write = self._waiting.get()
-            with suppress(Exception):  # gone, full, closed; an encoding that lacks a letter
+            with suppress(Exception):  # gone, full, closed; a letter that the encoding cannot write
                 write()
                 self._stream.flush()
 
@@ -141,7 +141,7 @@ def _duplicate(stream: TextIO) -> TextIO:
 def unblocked(*names: str) -> Iterator[None]:
     """``sys.stdout`` and ``sys.stderr``, or the named one, never wait; the end prints the rest, if it is read.
 
-    A stream that is stuck then stays as it is: what is printed later must not wait for it either.
+    A stream that is stuck stays queued, so that later text does not wait for it either.
     """
     with ExitStack() as ended:
         for number, name in enumerate(("stdout", "stderr"), start=1):
@@ -161,7 +161,7 @@ def _restore(name: str, queued: QueuedStream, former: TextIO) -> None:
 
 
 def _may_block(stream: TextIO, descriptor: int) -> bool:
-    """Whether the stream's descriptor is this one, and not one that never blocks, as those of a worker."""
+    """Return whether the stream has this descriptor, and this blocks; those that a worker inherits do not."""
     with suppress(OSError, ValueError, AttributeError):
         return sys.platform != "win32" and stream.fileno() == descriptor and os.get_blocking(descriptor)
     return False
