@@ -38,7 +38,7 @@ from mkpc_kaggle.geometry.coordinates import Matrix3
 from mkpc_kaggle.geometry.focal_prior import FocalConfig, FocalPrior, estimate_with_prior
 from mkpc_kaggle.geometry.metrics import PoseError, pair_accuracy
 from mkpc_kaggle.geometry.robust import Estimate, RobustConfig, estimate
-from mkpc_kaggle.pipeline.pair import PairMatch
+from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult
 from mkpc_kaggle.recipe import SceneConfig, recipe_of
 from mkpc_kaggle.scene.densify import extra_pairs
 from mkpc_kaggle.scene.reconstruct import reconstruct_batch
@@ -128,16 +128,15 @@ def extra_of(pairs: Sequence[Known], every: Sequence[Known], config: SceneConfig
 def read_journal(directory: Path) -> tuple[str, dict[str, tuple[PairMatch, Matrix3 | None]]]:
     """The recipe's name, and by the ids of pairs what was found on them and their own F."""
     with JournalReader(directory) as journal:
-        recipe = recipe_of(journal.belongs_to()["recipe"], journal.about().recipe)
-        units, pairs = {unit.name: unit for unit in recipe.units}, journal.pairs()
-        records = [record for index, record in journal.records().items() if index < len(pairs) and record.sizes]
-        found = {
-            pairs[r.index].id: (
-                PairMatch(journal.results(r, units), sizes=r.sizes),
-                None if r.failure else r.pair_fundamental,
-            )
-            for r in records
-        }
+        table = dict(journal.about().recipe)
+        recipe = recipe_of(table, table.pop("name"))
+        units, pairs, found = {unit.name: unit for unit in recipe.units}, journal.pairs(), {}
+        for record in (record for record in journal.records() if record.units):
+            inputs, images = journal.inputs(record.index), journal.images(record.index)
+            points = journal.points(inputs.values())
+            results = tuple(UnitResult(units[name], points[revision]) for name, revision in inputs.items())
+            match = PairMatch(results, sizes=tuple(image.size for image in images))
+            found[pairs[record.index].id] = match, None if record.failure else record.pair_fundamental
     return recipe.name, found
 
 

@@ -208,6 +208,15 @@ class JournalReader:
         with undamaged(self.path):
             return dict(self._rows(query, position))
 
+    def images(self, position: int) -> tuple[BatchImage, ...]:
+        """Return both images of a pair as they were last looked at, or nothing."""
+        query = """SELECT name, digest, width, height, focal FROM wanted_pair w JOIN pair ON pair.id = w.pair
+            JOIN image ON image.name = {} WHERE position = ?"""
+        with undamaged(self.path):
+            rows = [row for end in ("image0", "image1") for row in self._rows(query.format(end), position)]
+            images = tuple(BatchImage(name, digest, Size(w, h), focal) for name, digest, w, h, focal in rows)
+            return images if len(images) == 2 else ()
+
     def feature(self, digest: str, settings: str) -> bytes | None:
         """Return the features saved under a key, or ``None``."""
         with undamaged(self.path):
@@ -323,15 +332,6 @@ class Journal(JournalReader):
             JOIN image ON image.name IN (image0, image1)"""
         with undamaged(self.path):
             return dict(self._rows(query))
-
-    def images(self, position: int) -> tuple[BatchImage, ...]:
-        """Return both images of a pair as they were last looked at, or nothing."""
-        query = """SELECT name, digest, width, height, focal FROM wanted_pair w JOIN pair ON pair.id = w.pair
-            JOIN image ON image.name = {} WHERE position = ?"""
-        with undamaged(self.path):
-            rows = [row for end in ("image0", "image1") for row in self._rows(query.format(end), position)]
-            images = tuple(BatchImage(name, digest, Size(w, h), focal) for name, digest, w, h, focal in rows)
-            return images if len(images) == 2 else ()
 
     # The state of the run
 

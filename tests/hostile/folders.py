@@ -63,7 +63,7 @@ def folder_named(name: bytes) -> Callable[[Path], None]:
 OUTS: dict[str, tuple[str, Callable[[Path], None]]] = {  # directories of results that are refused
     "database.db of the user's": ("P", of_the_user("database.db")),
     "a journal of the user's": ("P", of_the_user("work/journal.sqlite")),
-    "a mark that is none": ("P --fresh", of_the_user("work/datasets.json", "[]]")),
+    "a mark that is none": ("P --fresh", of_the_user("work/results.json", "[]]")),
     "work links to the images": (
         "P",
         with_images(lambda room: [(room / "P").mkdir(), (room / "P" / "work").symlink_to("../I")]),

@@ -72,7 +72,7 @@ def write_recipe(directory: Path, matcher: str) -> Path:
 def matches_found(work_dir: Path) -> dict[tuple[int, int], int]:
     """The matches of each pair's unit by (pair, stage); none of the units may have failed."""
     with JournalReader(work_dir) as journal:
-        found = [(index, unit) for index, record in journal.records().items() for unit in record.units]
+        found = [(record.index, unit) for record in journal.records() for unit in record.units]
     assert [unit.failure for _, unit in found] == [""] * len(found)
     return {(index, unit.stage): unit.matches for index, unit in found}
 

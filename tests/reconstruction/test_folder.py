@@ -78,7 +78,7 @@ def test_a_line_that_can_be_read_in_two_ways_is_refused(tmp_path):
 
 
 def rows_of(root: Path, files: Iterable[str]) -> list[tuple[str, ...]]:
-    record = CameraRecord("x", 0, (0, 0, 0), (0, 0, 1), (0, 1, 0), 100.0, Size(10, 10), 5)
+    record = CameraRecord("x", "x", 0, (0, 0, 0), (0, 0, 1), (0, 1, 0), 100.0, Size(10, 10), 5)
     cameras: dict[str, dict[Path, CameraRecord | None]] = {}
     for name in files:
         path = root / name

@@ -99,10 +99,10 @@ def test_an_epipolar_line_is_that_of_the_point():
 def test_cameras_are_seen_from_above_and_from_the_side_with_the_points_before_them():
     """Two cameras two units apart look along the world's x axis, its z axis is up; a wall is ten units ahead."""
     cameras = tuple(
-        CameraRecord(f"{n}.png", 0, [0, 2 * n, 1], [1, 0, 0], [0, 0, -1], 900, [80, 60], 9) for n in (0, 1)
+        CameraRecord(f"{n}.png", str(n), 0, [0, 2 * n, 1], [1, 0, 0], [0, 0, -1], 900, [80, 60], 9) for n in (0, 1)
     )
     wall = tuple([10, y, z] for y in range(5) for z in range(8))
-    above, side = draw_cameras(SceneRecord("batch", 2, 2, 1, 40, 9, 1.0, "", cameras, (wall,))).axes
+    above, side = draw_cameras(SceneRecord("batch", 2, 2, 1, 40, 1.0, "", cameras, (wall,))).axes
     (cloud, _, centres), (seen, _, points) = ([*panel.collections] for panel in (above, side))
     assert np.ptp(centres.get_offsets(), axis=0).tolist() == [2, 0]
     assert np.ptp(cloud.get_offsets(), axis=0).tolist() == [4, 0], "from above a wall is a line"

@@ -14,13 +14,13 @@ from rectified import THREE_UNITS, RectifiedMatcher, run, write_pairs
 
 from mkpc_kaggle.cli import main
 from mkpc_kaggle.data.competition import Pair
+from mkpc_kaggle.engine.jobs import WantedPair
 from mkpc_kaggle.engine.journal import About, Event, EventKind, Journal, JournalReader
 from mkpc_kaggle.reporting.report import DRAWING_S, report_page, report_run
 from mkpc_kaggle.reporting.run_log import NOT_ENDED, read_log
 from mkpc_kaggle.reporting.summary import overview
 
 EVIL = '<script>alert("$x$")</script>'
-BELONGS_TO = {"recipe": THREE_UNITS.matching(), "test set": "abc", "weights": {"xfeat": "123"}}
 
 
 class Tags(HTMLParser):
@@ -46,7 +46,10 @@ def a_run(directory: Path, count: int = 12) -> list[Pair]:
 
 
 def empty_journal(work_dir: Path, pairs: list[Pair], **about: object) -> Journal:
-    return Journal(work_dir, BELONGS_TO, pairs=pairs, about=About("three", **about))  # type: ignore[arg-type]
+    journal = Journal(work_dir)
+    wanted = [WantedPair(pair, pair.names, "F") for pair in pairs]
+    journal.want(wanted, [], {}, About({**THREE_UNITS.table(), "name": "three"}, **about))  # type: ignore[arg-type]
+    return journal
 
 
 def test_a_run_exports_tables_that_pandas_reads_as_they_are(tmp_path, capsys):
