@@ -125,7 +125,7 @@ def test_the_page_begins_with_the_verdict_has_pictures_inside_and_asks_for_nothi
     text = page.read_text(encoding="utf-8")
     assert re.search("<h1>Complete after .*: 11 of 12 pairs have an F</h1>", text)
     assert re.findall("<h2>(.*?)</h2>", text) == [
-        "What is missing, and why",
+        "Missing results",
         "The weakest pairs",
         "Where the time went",
         "What made this",
