@@ -94,7 +94,6 @@ class SceneConfig:
     """Settings of :mod:`mkpc_kaggle.scene`, table ``[scene]`` of a recipe."""
 
     camera_model: CameraModel = CameraModel.PINHOLE
-    each_matcher: bool = True  # also reconstruct each matcher's matches alone; a pair gets the mean of its cameras
     shared_intrinsics: float = 0.02  # images of one size share a camera if most focals are this close; 0: never
     pairs_per_image: float = 10.0  # a batch with fewer pairs gets extra pairs, for its scene alone; 0: none
     cameras: CameraSharing = CameraSharing.AUTO

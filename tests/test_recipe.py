@@ -235,7 +235,7 @@ def test_the_whole_images_mode_shows_every_unit_the_whole_image_and_none_twice()
         (replace(ALL, matchers={"sift": {"features": 9}}), False),
         (replace(ALL, magsac=RobustConfig(threshold=0.21)), True),
         (replace(ALL, focal=FocalConfig()), True),
-        (replace(ALL, scene=SceneConfig(each_matcher=False)), True),
+        (replace(ALL, scene=SceneConfig(exif=False)), True),
     ],
 )
 def test_what_is_matched_and_how_it_is_estimated_have_a_fingerprint_each(other, matches_alike):

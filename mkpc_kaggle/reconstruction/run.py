@@ -38,7 +38,7 @@ def for_cameras(recipe: Recipe, sharing: str | None = None) -> Recipe:
 
     ``sharing`` is a :class:`CameraSharing`; ``None``: as the recipe has it.
     """
-    scene = replace(recipe.scene or SceneConfig(), each_matcher=False, pairs_per_image=0.0)
+    scene = replace(recipe.scene or SceneConfig(), pairs_per_image=0.0)
     return replace(recipe, focal=None, scene=replace(scene, cameras=CameraSharing(sharing or scene.cameras)))
 
 

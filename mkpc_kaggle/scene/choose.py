@@ -7,14 +7,13 @@ from typing import TypeAlias
 
 import numpy as np
 
-from mkpc_kaggle.geometry.cameras import fundamental_of_cameras, mean_cameras
+from mkpc_kaggle.geometry.cameras import fundamental_of_cameras
 from mkpc_kaggle.geometry.coordinates import Matrix3
 from mkpc_kaggle.geometry.focal_prior import FocalConfig, FocalPrior, estimate_with_prior
 from mkpc_kaggle.geometry.robust import RobustConfig, sampson_distances
 from mkpc_kaggle.scene.reconstruction import RegisteredImage
 from mkpc_kaggle.scene.view_graph import BatchPair
 
-MAX_DISAGREEMENT_DEG = 5.0  # between the rotations that are averaged over reconstructions
 CONTRADICTION_ERROR_PX = 2.0  # Sampson's distance within which a match agrees with an F
 CONTRADICTION_MATCHES = 30  # that agree with the pair's own F
 CONTRADICTION_SHARE = 0.05  # as many of them have to agree with the scene's F
@@ -48,23 +47,17 @@ class Choice:
         return self.reason is Reason.SCENE
 
 
-def choose(pair: BatchPair, reconstructions: Sequence[Sequence[ModelImages]]) -> Choice:
-    """The F of a pair, from the mean of its cameras in all reconstructions of the batch that have both.
-
-    A reconstruction is several models; the first that has both images counts. A rotation that is more than
-    ``MAX_DISAGREEMENT_DEG`` from the first reconstruction's is left out.
-    """
+def choose(pair: BatchPair, models: Sequence[ModelImages]) -> Choice:
+    """Return the F of a pair from its cameras in the first model that has both, or why it gets none."""
     digests = pair.image0.digest, pair.image1.digest
     if digests[0] == digests[1]:
         return Choice(None, Reason.SAME_IMAGE)
-    holding = [[model for model in models if model.keys() >= set(digests)] for models in reconstructions]
-    cameras = [(models[0][digests[0]].camera, models[0][digests[1]].camera) for models in holding if models]
-    if not cameras:
-        registered = {digest for models in reconstructions for model in models for digest in model}
+    model = next((model for model in models if model.keys() >= set(digests)), None)
+    if model is None:
+        registered = {digest for model in models for digest in model}
         return Choice(None, Reason.APART if registered >= set(digests) else Reason.UNREGISTERED)
     try:
-        both = cameras[0] if len(cameras) == 1 else mean_cameras(cameras, MAX_DISAGREEMENT_DEG)
-        F = fundamental_of_cameras(*both)
+        F = fundamental_of_cameras(*(model[digest].camera for digest in digests))
     except ValueError:
         return Choice(None, Reason.SAME_CENTRE)
     return Choice(None, Reason.CONTRADICTION) if contradicts(F, pair) else Choice(F, Reason.SCENE)

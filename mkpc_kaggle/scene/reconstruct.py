@@ -20,10 +20,9 @@ MIN_OBSERVATIONS = 0.99  # shared intrinsics stay if images see points at least 
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """What is known of a batch: for each pair, in order, its choice, and the reconstructions of its components.
+    """The reconstructions of a batch's components, and the choice of each pair, in order.
 
-    They are of all matches together; those of single matchers are in the choices alone. An image goes by the name
-    under which it came first.
+    An image has the name under which it came first.
     """
 
     reconstructions: tuple[Reconstruction, ...]
@@ -46,28 +45,19 @@ def reconstruct_batch(
     A missing result has a reason, and no matches raise an error. It takes seconds to minutes and may end the
     process, see :mod:`mkpc_kaggle.scene.colmap`.
     """
-    together, shared = reconstruct_sharing(ViewGraph.of_pairs(pairs), config, export.directory if export else None)
-    matchers = sorted({name for pair in pairs for name in pair.tracks or ()})
-    single = matchers if config.each_matcher and len(matchers) > 1 else []
-    alone = [
-        [reconstruct_component(part, config, shared) for part in ViewGraph.of_pairs(pairs, name).components()]
-        for name in single
-    ]
-    by_digest = [
-        [{found.image.digest: found for found in model.images} for model in models_of(found)]
-        for found in (together, *alone)
-    ]
+    found, shared = reconstruct_sharing(ViewGraph.of_pairs(pairs), config, export.directory if export else None)
+    models = [{image.image.digest: image for image in model.images} for model in models_of(found)]
     focals = dict(shared)  # an image's is that of the first model that has it, else of the camera that it shares
-    for model in reversed([model for found in by_digest for model in found]):
-        focals |= {digest: found.focal for digest, found in model.items()}
+    for model in reversed(models):
+        focals |= {digest: image.focal for digest, image in model.items()}
     choices = []
     for pair in pairs:
-        choice = choose(pair, by_digest)
+        choice = choose(pair, models)
         if focal is not None and choice.reason not in KEEPS_ITS_F:
             F = estimate_at_known_focals(pair, focals, focal, magsac or RobustConfig())
             choice = replace(choice, F=F)
         choices.append(choice)
-    return Solution(tuple(together), tuple(choices))
+    return Solution(tuple(found), tuple(choices))
 
 
 def reconstruct_sharing(

@@ -1,6 +1,6 @@
 """The view graph of a batch: its distinct images, and the matches between each two of them."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,20 +33,14 @@ class BatchPair:
     """Two images of a batch and their matches in full-image pixels, which may be empty.
 
     ``pair_fundamental`` is the F, (3, 3), that the pair's matches alone gave, or ``None``. ``tracks`` are the
-    matches that the scene is made of, by the names of their matchers; ``None``: all matches, as of one matcher.
+    matches that the scene is made of; ``None``: all matches.
     """
 
     image0: BatchImage
     image1: BatchImage
     matches: Matches
     pair_fundamental: Matrix3 | None = None
-    tracks: Mapping[str, Matches] | None = None
-
-    def tracks_of(self, matcher: str = "") -> Matches:
-        """The matches that the scene is made of; with ``matcher`` only those that it found."""
-        if self.tracks is None:
-            return self.matches
-        return Matches.concatenate(found for name, found in self.tracks.items() if matcher in ("", name))
+    tracks: Matches | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,8 +69,8 @@ class ViewGraph:
         return ViewGraph(self.images, tuple(edge for edge in self.edges if len(edge.matches) >= MIN_MATCHES))
 
     @classmethod
-    def of_pairs(cls, pairs: Sequence[BatchPair], matcher: str = "") -> "ViewGraph":
-        """The graph of a batch's pairs, from the matches of all matchers or of one.
+    def of_pairs(cls, pairs: Sequence[BatchPair]) -> "ViewGraph":
+        """The graph of a batch's pairs.
 
         Pairs of the same two images become one edge, whatever their order. A pair of an image with itself and a
         pair without matches make no edge.
@@ -88,7 +82,7 @@ class ViewGraph:
         parts: dict[tuple[int, int], list[Matches]] = {}
         for pair in pairs:
             first, second = index[pair.image0.digest], index[pair.image1.digest]
-            tracks = pair.tracks_of(matcher)
+            tracks = pair.matches if pair.tracks is None else pair.tracks
             if first > second:
                 first, second = second, first
                 tracks = Matches(tracks.points1, tracks.points0, tracks.scores)
@@ -114,12 +108,7 @@ class ViewGraph:
         return tuple(found)
 
 
-def tracks_of(results: Sequence[UnitResult]) -> dict[str, Matches]:
-    """The matches that a scene is made of, by their matchers: of units that make tracks, or all if few are."""
-    chosen = [result for result in results if result.unit.tracks]
-    if sum(len(result.matches) for result in chosen) < MIN_TRACK_MATCHES:
-        chosen = list(results)
-    parts: dict[str, list[Matches]] = {}
-    for result in chosen:
-        parts.setdefault(result.unit.matcher, []).append(result.matches)
-    return {name: Matches.concatenate(found) for name, found in parts.items()}
+def tracks_of(results: Sequence[UnitResult]) -> Matches:
+    """Return the matches that a scene is made of: of units that make tracks, or all if those are few."""
+    tracks = Matches.concatenate(result.matches for result in results if result.unit.tracks)
+    return tracks if len(tracks) >= MIN_TRACK_MATCHES else Matches.concatenate(each.matches for each in results)

@@ -152,7 +152,7 @@ def test_the_scene_of_a_run_is_made_of_tracks_and_judged_by_all_matches(tmp_path
     recipe = replace(RECIPE, units=(replace(first, tracks=False), *others))
     run(batch_pairs(tmp_path / "images"), recipe, RectifiedMatcher(), tmp_path / "work")
     assert len(given) == 6
-    assert all(0 < sum(map(len, pair.tracks.values())) < len(pair.matches) for pair in given)
+    assert all(0 < len(pair.tracks) < len(pair.matches) for pair in given)
 
 
 def test_a_run_that_goes_on_reconstructs_only_the_batch_whose_image_was_replaced(tmp_path, monkeypatch, capsys):

@@ -11,7 +11,7 @@ from mkpc_kaggle.config import from_table
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.recipe import CameraModel, SceneConfig
-from mkpc_kaggle.scene.choose import MAX_DISAGREEMENT_DEG, Choice, Reason, choose
+from mkpc_kaggle.scene.choose import Choice, Reason, choose
 from mkpc_kaggle.scene.reconstruction import RegisteredImage, SfmModel, filter_models
 from mkpc_kaggle.scene.view_graph import BatchImage
 
@@ -29,14 +29,10 @@ def model(cameras: dict[str, Camera], points: int = 100) -> SfmModel:
     return SfmModel(tuple(registered), np.zeros((points, 3)), 0.5)
 
 
-def choice_of(scene: SyntheticScene, *reconstructions: list[SfmModel], **changes: object) -> Choice:
+def choice(models: list[SfmModel], scene: SyntheticScene, **changes: object) -> Choice:
     """What the first pair gets."""
-    found = [[{image.image.digest: image for image in model.images} for model in each] for each in reconstructions]
+    found = [{image.image.digest: image for image in model.images} for model in models]
     return choose(replace(scene.pairs[0], **changes), found)
-
-
-def choice(models: list[SfmModel], scene: SyntheticScene, own: np.ndarray | None = None) -> Choice:
-    return choice_of(scene, models, pair_fundamental=own)
 
 
 def test_the_scenes_fundamental_is_that_of_the_cameras(scene):
@@ -57,34 +53,8 @@ def test_cameras_of_two_models_make_no_fundamental(scene):
     assert choice(apart, scene).reason is Reason.APART
 
 
-def moved(scene: SyntheticScene, degrees: float, zoom: float = 1.0) -> SfmModel:
-    """A model in a world of its own in which the second image's camera is turned and has another focal length."""
-    turn, _ = cv2.Rodrigues(np.radians([0, degrees, 0]))
-    world, _ = cv2.Rodrigues(np.array([0.3, -0.2, 0.1]))
-    cameras = {name: replace(camera, R=camera.R @ world, t=3 * camera.t) for name, camera in scene.cameras.items()}
-    second = cameras["0001"]
-    K = second.K * [[zoom, 1, 1], [1, zoom, 1], [1, 1, 1]]
-    return model({**cameras, "0001": Camera(K, turn @ second.R, turn @ second.t)})
-
-
-def test_what_several_reconstructions_say_is_averaged(scene):
-    pair = scene.pairs[0]
-    left, right = moved(scene, 1.0, 1.25), moved(scene, -1.0, 0.8)
-    both = choice_of(scene, [left], [right])
-    assert both.F is not None
-    assert scene.median_distance(both.F, pair) < 0.01
-    assert scene.median_distance(choice([left], scene).F, pair) > 2
-
-
-def test_a_reconstruction_that_says_something_else_is_not_averaged(scene):
-    pair = scene.pairs[0]
-    first, other = moved(scene, 0.0), moved(scene, MAX_DISAGREEMENT_DEG + 1)
-    both = choice_of(scene, [first], [], [other])
-    np.testing.assert_allclose(both.F, scene.true_fundamental(pair), atol=1e-9)
-
-
 def test_a_picture_and_itself_have_no_fundamental(scene):
-    assert choice_of(scene, [model(scene.cameras)], image1=scene.images[0]).reason is Reason.SAME_IMAGE
+    assert choice([model(scene.cameras)], scene, image1=scene.images[0]).reason is Reason.SAME_IMAGE
 
 
 def test_two_cameras_at_one_point_have_no_fundamental(scene):
@@ -96,8 +66,8 @@ def test_a_wrong_camera_is_contradicted_by_the_pairs_matches(scene):
     camera, tilt = scene.cameras["0001"], cv2.Rodrigues(np.array([np.radians(15), 0, 0]))[0]
     wrong = scene.cameras | {"0001": Camera(camera.K, tilt @ camera.R, tilt @ camera.t)}
     own = scene.true_fundamental(scene.pairs[0])
-    assert choice([model(wrong)], scene, own).reason is Reason.CONTRADICTION
-    assert choice([model(wrong)], scene, None).from_scene  # without an F of its own, nothing contradicts
+    assert choice([model(wrong)], scene, pair_fundamental=own).reason is Reason.CONTRADICTION
+    assert choice([model(wrong)], scene).from_scene  # without an F of its own, nothing contradicts
 
 
 def with_camera(scene: SyntheticScene, **changes: object) -> SfmModel:

@@ -4,7 +4,6 @@ import pickle
 import sys
 import tempfile
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -17,8 +16,7 @@ from mkpc_kaggle.recipe import CameraModel, SceneConfig
 from mkpc_kaggle.scene import colmap
 from mkpc_kaggle.scene.choose import Reason
 from mkpc_kaggle.scene.reconstruct import Solution, reconstruct_batch
-from mkpc_kaggle.scene.reconstruction import Reconstruction
-from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair, ViewGraph
+from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair
 
 
 @pytest.fixture(scope="module")
@@ -59,23 +57,6 @@ def test_the_same_batch_gives_the_same_bytes_through_a_pipe_too(scene):
     first, again = (pickle.dumps(reconstruct_batch(pairs, SceneConfig())) for pairs in (scene.pairs, piped))
     assert first == again
     assert pickle.loads(first).choices[0].from_scene
-
-
-@pytest.mark.parametrize(("each_matcher", "times"), [(True, 3), (False, 1)])
-def test_what_each_matcher_found_is_reconstructed_alone_too(scene, monkeypatch, each_matcher, times):
-    called: list[int] = []
-
-    def note(graph: ViewGraph, *rest: Any) -> Reconstruction:
-        called.append(len(graph.images))
-        return made(graph, *rest)
-
-    made = colmap.structure_from_motion
-    monkeypatch.setattr(colmap, "structure_from_motion", note)
-    halves = [replace(pair, tracks={"even": pair.matches[::2], "odd": pair.matches[1::2]}) for pair in scene.pairs]
-    solution = reconstruct_batch(halves, SceneConfig(each_matcher=each_matcher))
-    assert called == [6] * times
-    assert len(solution.reconstructions) == 1
-    assert max(distances(solution, scene)) < 0.5
 
 
 @pytest.mark.parametrize("count", [3, 0])
