@@ -53,9 +53,7 @@ def main() -> None:
             state = State(journal, len(pairs), len(pairs), len(units))
         resuming = time.perf_counter() - started
     print(f"{int(state.is_estimated.sum())} pairs, {arguments.units} units of {arguments.matches} matches")
-    print(
-        f"journal: {size / 1e6:.0f} MB; saving: {1e3 * saving / len(pairs):.1f} ms a pair; resuming: {resuming:.1f} s"
-    )
+    print(f"journal: {size / 1e6:.0f} MB; saving: {1e3 * saving / len(pairs):.1f} ms; resuming: {resuming:.1f} s")
     print(f"memory: {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3:.0f} MB")
 
 
