@@ -107,7 +107,8 @@ def has_camera(cameras: Cameras) -> bool:
 def _lines(result: FolderResult) -> Iterator[str]:
     """A line for each dataset, and what went wrong."""
     report = result.report
-    yield f"{len(result.pairs)} pairs: {report.ending} after {format_duration(report.seconds)}"
+    ended = f"{report.ending} after {format_duration(report.seconds)}"
+    yield f"{len(result.pairs)} pairs: {ended}; {report.units_run} units run, {report.estimated} F estimated"
     reasons = {scene.batch: scene.failure for scene in report.scenes}
     for name, found in result.cameras.items():
         models = Counter(camera.model for camera in found.values() if camera)

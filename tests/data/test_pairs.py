@@ -11,8 +11,9 @@ from benchmarks import paper_tables
 from mkpc_kaggle import TwoStageMatcher
 from mkpc_kaggle.cli import main
 from mkpc_kaggle.cli.validate import with_units
-from mkpc_kaggle.data.competition import read_train_side
+from mkpc_kaggle.data.competition import Pair, read_train_side
 from mkpc_kaggle.data.pairs import parse_line, read_pairs
+from mkpc_kaggle.engine.settings import Settings
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.evaluation.validate import error_of
 from mkpc_kaggle.geometry.cameras import Camera, fundamental_of_cameras
@@ -126,9 +127,10 @@ def test_a_listed_image_is_set_upright_and_scored_by_the_camera_of_its_stored_pi
     assert max(errors_of(tmp_path / "list.txt", tmp_path, small_recipe)) < 5
 
 
-def test_a_journal_knows_with_which_cameras_a_pair_was_estimated():
-    estimations = [load_recipe("classical").pair_estimation((K, second)) for second in (K, K + 1)]
-    assert estimations[0] != estimations[1]
+def test_the_estimate_of_a_pair_depends_on_its_cameras():
+    settings, pair = Settings((), "estimate", ""), Pair("p", "b", "0", "1")
+    digests = [settings.of_estimate(replace(pair, intrinsics=both)) for both in (None, (K, K), (K, K + 1))]
+    assert len(set(digests)) == 3
 
 
 def test_a_list_scores_as_the_train_side_does(demo, small_recipe, tmp_path):

@@ -203,7 +203,7 @@ def test_what_a_full_disk_refuses_is_in_memory_and_written_when_there_is_room(tm
 
 DAMAGES: Sequence[tuple[str, str]] = [
     ("UPDATE estimate SET F = zeroblob(72)", "zero or not finite"),
-    ("UPDATE points SET points = zeroblob(1000)", "incorrect header check"),
+    ("UPDATE points SET points = zeroblob(1000)", "while decompressing data"),
     ("UPDATE region SET reason = 'x'", "RegionReason"),
     ("UPDATE choice SET reason = 'x'", "Reason"),
     ("UPDATE about SET value = '{'", "Expecting property name"),

@@ -7,12 +7,13 @@ import torch
 from shared import WEIGHTS, needs_weights
 from weight_files import digest_of
 
+from mkpc_kaggle.engine.settings import Settings
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.matchers.contract import MatcherSpec, Placement
 from mkpc_kaggle.pipeline.assembly import assemble
 from mkpc_kaggle.pipeline.availability import Licence
 from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher
-from mkpc_kaggle.recipe import Mode, Recipe, Unit, load_recipe
+from mkpc_kaggle.recipe import Recipe, Unit, load_recipe
 from mkpc_kaggle.weights import WeightFile
 from mkpc_kaggle.weights import store as weight_store
 from mkpc_kaggle.weights.manifest import manifest
@@ -53,7 +54,7 @@ def test_recipe_auto_leaves_out_the_units_whose_weights_are_missing():
     others = [name for name in load_recipe("auto").matcher_names if name != "sift"]
     assert assembly.recipe.matcher_names == ("sift",)
     assert assembly.left_out == (f"no weights: {', '.join(others)}",)
-    assert assembly.fingerprint()["weights"] == {}
+    assert assembly.weight_files == {}
 
 
 def test_a_named_recipe_without_its_weights_is_refused_with_the_file_names():
@@ -70,14 +71,14 @@ def test_a_named_recipe_without_its_weights_is_refused_with_the_file_names():
 def test_recipes_take_what_is_there_and_fallbacks_stand_in_for_the_rest():
     auto, there = assemble("auto", weights=[WEIGHTS]), {"xfeat_lighterglue", "sift", "aliked"}
     assert auto.recipe == load_recipe("auto").only(lambda unit: unit.matcher in there)
-    digests = auto.fingerprint()["weights"]
-    assert set(digests) == {"xfeat", "xfeat-lighterglue", "aliked-n16"}
-    assert all(digest.startswith("sha256:") for digest in digests.values())
+    assert set(auto.weight_files) == {"xfeat", "xfeat-lighterglue", "aliked-n16"}
+    first, sift = (auto.unit_settings(unit)["weights"] for unit in auto.recipe.units[:2])
+    assert set(first) == {"xfeat", "xfeat-lighterglue"} or set(sift) == {"xfeat", "xfeat-lighterglue"}
     light = assemble("light", weights=[WEIGHTS])
     assert light.recipe.matcher_names == ("xfeat_lighterglue", "sift", "aliked")
     assert light.left_out == ("no weights: sift_lightglue, aliked_lightglue",)
     assert [unit.stage for unit in light.recipe.units] == [unit.stage for unit in load_recipe("light").units]
-    assert light.recipe.matching() == light.recipe.with_fallbacks(()).matching()
+    assert light.recipe == light.recipe.with_fallbacks(())
 
 
 def standins(directory, *names):
@@ -109,7 +110,7 @@ def test_a_permissive_run_leaves_out_of_recipe_auto_what_is_licensed_otherwise(k
     some = assemble("auto", weights=[known_files], licence=Licence.PERMISSIVE)
     assert some.recipe.matcher_names == ("loftr", "sift", "dkm")
     assert some.left_out[1].startswith("weights not permitted: superglue, aspanformer")
-    assert set(some.fingerprint()["weights"]) == {"loftr-outdoor", "dkm-outdoor"}
+    assert set(some.weight_files) == {"loftr-outdoor", "dkm-outdoor"}
 
 
 @pytest.mark.filterwarnings("ignore:weights not verified")
@@ -134,7 +135,7 @@ def test_the_licence_of_the_file_counts_too(known_files):
     recipe = Recipe((Unit(1, "dkm", area="90x120"),), matchers={"dkm": {"training": "outdoor"}})
     assert assemble(recipe, weights=[known_files], licence=Licence.PERMISSIVE).left_out == ()
     indoors = replace(recipe, matchers={"dkm": {"training": "indoor"}})
-    assert set(assemble(indoors, weights=[known_files]).fingerprint()["weights"]) == {"dkm-indoor"}
+    assert set(assemble(indoors, weights=[known_files]).weight_files) == {"dkm-indoor"}
     with pytest.raises(UserError, match=r"dkm \(unclear\)"):
         assemble(indoors, weights=[known_files], licence=Licence.PERMISSIVE)
 
@@ -164,9 +165,19 @@ def test_a_gpu_that_is_not_there_is_refused_and_auto_takes_the_cpu():
     assert assemble("classical").placement == Placement()
 
 
-def test_another_mode_or_precision_is_another_run():
-    plain = assemble("classical", precision="float32").fingerprint()
-    stage1 = assemble("classical", mode=Mode.STAGE_1, precision="float32")
-    assert {unit.stage for unit in stage1.recipe.units} == {1}
-    for other in (stage1, assemble("classical", precision="bfloat16")):
-        assert other.fingerprint() != plain
+def test_a_units_digest_has_all_that_decides_its_points():
+    plain = load_recipe("classical")
+    first, second, third = plain.units
+    units = [Settings.of(assemble(plain)).units]
+    for other in (
+        replace(plain, units=(replace(first, tracks=False), second, third)),  # no point depends on it
+        replace(plain, magsac=replace(plain.magsac, threshold=1.0)),
+        replace(plain, units=(first, second)),  # the regions of stage 2 depend on all units of stage 1
+        replace(plain, mkpc=replace(plain.mkpc, eps=0.1)),
+        replace(plain, matchers={"sift": {"ratio": 0.7}}),
+    ):
+        units.append(Settings.of(assemble(other)).units)
+    assert units[0] == units[1] == units[2]
+    changed = [[one != two for one, two in zip(units[0], other, strict=False)] for other in units[3:]]
+    assert changed == [[False, True], [False, True, False], [True] * 3]
+    assert not set(units[0]) & set(Settings.of(assemble(plain, precision="bfloat16")).units)

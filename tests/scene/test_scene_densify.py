@@ -41,7 +41,8 @@ def test_a_sparse_batch_has_a_scene_by_pairs_that_no_row_names(tmp_path):
     asked = [every[list(combinations(range(6), 2)).index(ends)] for ends in CHAIN]
     published: list[int] = []
     recipe = replace(RECIPE, scene=SceneConfig(pairs_per_image=2))
-    report = run(asked, recipe, matcher, tmp_path / "work", publish=lambda rows, _: published.append(len(rows)))
+    publish = lambda standing: published.append(len(standing.fundamentals))  # noqa: E731
+    report = run(asked, recipe, matcher, tmp_path / "work", publish=publish)
     assert report.ending is Ending.COMPLETE
     assert [record.source for record in report.records] == ["scene"] * 5
     true = [matcher.scene.pairs[list(combinations(range(6), 2)).index(ends)] for ends in CHAIN]

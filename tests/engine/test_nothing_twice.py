@@ -1,0 +1,156 @@
+"""Nothing is computed twice: what runs after a change, and that the result has the bytes of a fresh run."""
+
+import os
+import random
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from mkpc_kaggle.cli import main
+from mkpc_kaggle.demo import DemoSet
+
+ROOT = Path(__file__).resolve().parents[2]
+FIRST, SECOND, THIRD = (
+    '{ stage = 1, matcher = "sift", long_side = 320 }',
+    '{ stage = 2, matcher = "sift", long_side = 400 }',
+    '{ stage = 1, matcher = "sift", long_side = 256 }',
+)
+BEFORE = 6  # rows of the test side before the change, of 8
+
+
+@dataclass
+class Room:
+    """A test side, a recipe, and a run of them."""
+
+    home: Path
+
+    @property
+    def table(self) -> Path:
+        return self.home / "test" / "test.csv"
+
+    @property
+    def recipe(self) -> Path:
+        return self.home / "small.toml"
+
+    def units(self, *units: str, more: str = "") -> None:
+        self.recipe.write_text(f"units = [{', '.join(units)}]\n{more}\n[focal]\n[scene]\npairs_per_image = 0\n")
+
+    def rows(self, count: int) -> None:
+        lines = (self.home / "rows.csv").read_text().splitlines()
+        self.table.write_text("\n".join(lines[: count + 1]) + "\n")
+
+    def command(self, output: str) -> list[str]:
+        files = ["--test-dir", str(self.home / "test"), "--output", str(self.home / output)]
+        return ["submit", *files, "--recipe", str(self.recipe), "--no-report", "--workers", "0"]
+
+    def run(self, output: str = "a.csv") -> bytes:
+        assert main(self.command(output)) == 0
+        return (self.home / output).read_bytes()
+
+
+@pytest.fixture
+def room(demo: DemoSet, tmp_path: Path) -> Room:
+    """Six of eight rows, two units."""
+    shutil.copytree(demo.test_dir, tmp_path / "test")
+    shutil.copy(tmp_path / "test" / "test.csv", tmp_path / "rows.csv")
+    room = Room(tmp_path)
+    room.units(FIRST, SECOND)
+    room.rows(BEFORE)
+    return room
+
+
+def rows_of(room: Room, name: str) -> int:
+    return sum(name in row.split(",")[2:] for row in room.table.read_text().splitlines())
+
+
+def rarest_image(room: Room) -> tuple[str, str]:
+    """The batch and the name of the image of the first row that fewest rows have."""
+    _, batch, first, second = room.table.read_text().splitlines()[1].split(",")
+    return batch, min((first, second), key=lambda name: rows_of(room, name))
+
+
+def replace_an_image(room: Room) -> None:
+    """Turn an image upside down."""
+    batch, name = rarest_image(room)
+    (path,) = (room.home / "test" / "test_images" / batch).glob(f"{name}.*")
+    cv2.imwrite(str(path), np.ascontiguousarray(cv2.imread(str(path))[::-1]))
+
+
+CHANGES: dict[str, tuple[Callable[[Room], None], Callable[[Room], int]]] = {
+    "nothing": (lambda room: None, lambda room: 0),
+    "a unit added": (lambda room: room.units(FIRST, SECOND, SECOND.replace("400", "360")), lambda room: BEFORE),
+    "a unit removed": (lambda room: room.units(FIRST), lambda room: 0),
+    "a unit of stage 1 added": (lambda room: room.units(FIRST, SECOND, THIRD), lambda room: 2 * BEFORE),
+    "another threshold": (lambda room: room.units(FIRST, SECOND, more="[magsac]\nthreshold = 1.0"), lambda room: 0),
+    "another option of the matcher": (
+        lambda room: room.units(FIRST, SECOND, more="[matchers.sift]\nratio = 0.75"),
+        lambda room: 2 * BEFORE,
+    ),
+    "rows added": (lambda room: room.rows(8), lambda room: 4),
+    "rows removed": (lambda room: room.rows(4), lambda room: 0),
+    "an image replaced": (replace_an_image, lambda room: 2 * rows_of(room, rarest_image(room)[1])),
+}
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_what_runs_after_a_change_and_the_bytes_are_those_of_a_fresh_run(room: Room, change: str, capsys) -> None:
+    make, units = CHANGES[change]
+    room.run()
+    capsys.readouterr()
+    make(room)
+    again = room.run()
+    (run,) = re.findall(r"(\d+) units run", capsys.readouterr().out)
+    assert int(run) == units(room)
+    assert again == room.run("fresh.csv")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("change", CHANGES)
+def test_ten_kills_after_a_change_leave_the_same_bytes(room: Room, change: str) -> None:
+    rng = random.Random(change)
+    command = [sys.executable, "-m", "mkpc_kaggle"]
+    room.run()
+    CHANGES[change][0](room)
+    for _ in range(10):
+        running = subprocess.Popen([*command, *room.command("a.csv")], cwd=ROOT, stdout=-3, stderr=-3)
+        time.sleep(rng.uniform(0.5, 6.0))
+        os.kill(running.pid, signal.SIGKILL)
+        running.wait()
+    assert room.run() == room.run("fresh.csv")
+
+
+def test_images_added_to_a_folder_are_matched_with_each_other_and_with_the_former(demo, tmp_path, capsys) -> None:
+    images = sorted((demo.train_dir / "courtyard" / "images").iterdir())
+    (tmp_path / "in").mkdir()
+    recipe, folder = tmp_path / "small.toml", tmp_path / "in"
+    recipe.write_text(f"units = [{FIRST}]\n")
+
+    def reconstruct(out: str) -> tuple[int, list[str]]:
+        options = ["--recipe", str(recipe), "--workers", "0", "--out", str(tmp_path / out)]
+        assert main(["reconstruct", str(folder), *options]) in (0, 1)
+        printed = capsys.readouterr()
+        (run,) = re.findall(r"(\d+) units run", printed.out)
+        return int(run), (tmp_path / out / "cameras.csv").read_text().splitlines()
+
+    for path in images[:4]:
+        shutil.copy(path, folder)
+    assert reconstruct("out")[0] == 6
+    for path in images[4:6]:
+        shutil.copy(path, folder)
+    run, cameras = reconstruct("out")
+    assert run == 9
+    assert cameras == reconstruct("fresh")[1]
+    assert reconstruct("out") == (0, cameras)
+    (tmp_path / "out" / "database.db").unlink()
+    assert reconstruct("out") == (0, cameras)
+    assert (tmp_path / "out" / "database.db").exists(), "the scene is made again"
