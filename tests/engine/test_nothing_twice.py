@@ -91,7 +91,10 @@ CHANGES: dict[str, tuple[Callable[[Room], None], Callable[[Room], int]]] = {
     "a unit added": (lambda room: room.units(FIRST, SECOND, SECOND.replace("400", "360")), lambda room: BEFORE),
     "a unit removed": (lambda room: room.units(FIRST), lambda room: 0),
     "a unit of stage 1 added": (lambda room: room.units(FIRST, SECOND, THIRD), lambda room: 2 * BEFORE),
-    "another threshold": (lambda room: room.units(FIRST, SECOND, more="[magsac]\nthreshold = 1.0"), lambda room: 0),
+    "another threshold": (
+        lambda room: room.units(FIRST, SECOND, more="[magsac]\nthreshold = 1.0"),
+        lambda room: 0,
+    ),
     "another option of the matcher": (
         lambda room: room.units(FIRST, SECOND, more="[matchers.sift]\nratio = 0.75"),
         lambda room: 2 * BEFORE,
