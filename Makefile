@@ -1,8 +1,10 @@
 # make demo: install, render a demo set, make its submission, score it, draw a pair.
 # make test: install, lint, types, tests.
 # make ray: the tests of worker machines, with Ray installed beside the rest.
-# make hostile: about 280 hostile inputs (tests/hostile), each in a process with 4 GB.
+# make hostile: about 320 hostile inputs (tests/hostile), each in a process with 4 GB.
 # make oldest: the tests with the lowest versions that pyproject.toml declares, on Python 3.11, in .venv-oldest.
+# make newest: the tests with the newest versions that it allows, on Python 3.13 or 3.12, in .venv-newest; PYTHON= names
+#   another Python, TESTS= some of the tests.
 
 PYTHON ?= python3
 VENV := .venv
@@ -10,12 +12,17 @@ BIN := $(VENV)/bin
 DEMO := demo
 OLDEST := .venv-oldest
 PYTHON311 ?= python3.11
+IS_CHOSEN := $(filter-out file,$(origin PYTHON))
+NEWEST ?= .venv-newest$(if $(IS_CHOSEN),-$(notdir $(PYTHON)))
+PYENV := $$HOME/.pyenv/versions
+NEWEST_PYTHON = $(if $(IS_CHOSEN),$(PYTHON),$(shell for python in python3.13 $(PYENV)/3.13*/bin/python python3.12 \
+    $(PYENV)/3.12*/bin/python; do $$python -c 0 2> /dev/null && echo $$python && break; done))
 # Each test runs on one thread.
 TEST_PROCESSES ?= 2
 # Not the declared floor: on most indexes old versions of torch have no build for the CPU, and bring CUDA along.
 TORCH ?= $(shell grep '^torch==' requirements-dev.txt)
 
-.PHONY: demo test ray hostile oldest install lint tests clean
+.PHONY: demo test ray hostile oldest newest install lint tests clean
 
 demo: install
 	$(BIN)/python -m mkpc_kaggle demo --out $(DEMO)
@@ -61,6 +68,17 @@ $(OLDEST)/installed: pyproject.toml tests/support/oldest.py
 	$(OLDEST)/bin/python -m pip install --quiet --no-deps --no-build-isolation --editable .
 	touch $@
 
+# Deprecations of other packages are listed. Nothing is pinned: on Linux torch brings CUDA along (6 GB).
+newest: $(NEWEST)/installed
+	$(NEWEST)/bin/python -m pip install --quiet --no-deps --editable .
+	$(NEWEST)/bin/python -m pytest -W default::DeprecationWarning -W default::PendingDeprecationWarning \
+	    -W default::FutureWarning --numprocesses $(TEST_PROCESSES) --dist loadfile $(TESTS)
+
+$(NEWEST)/installed: pyproject.toml
+	$(or $(NEWEST_PYTHON),$(error no Python 3.13 or 3.12 runs here; PYTHON= names one)) -m venv --clear $(NEWEST)
+	$(NEWEST)/bin/python -m pip install --quiet --editable ".[dev]"
+	touch $@
+
 install: $(VENV)/installed
 
 $(VENV)/installed: requirements-dev.txt pyproject.toml
@@ -71,4 +89,4 @@ $(VENV)/installed: requirements-dev.txt pyproject.toml
 	touch $@
 
 clean:
-	rm -rf $(VENV) $(OLDEST) $(DEMO)
+	rm -rf $(VENV) $(OLDEST) .venv-newest* $(DEMO)

@@ -22,13 +22,20 @@ def warn_once(message: str) -> None:
 def read_text(path: Path) -> str:
     """Return the text of a UTF-8 file of at most 16 MiB, or raise :class:`UserError`."""
     try:
-        if path.exists() and (not path.is_file() or path.stat().st_size > MAX_TEXT_BYTES):
-            raise UserError(f"{path} cannot be read: not a regular file of at most {MAX_TEXT_BYTES} bytes")
+        if path.exists() and not path.is_file():
+            raise UserError(f"{path} cannot be read: not a regular file")
+        if path.exists() and (size := path.stat().st_size) > MAX_TEXT_BYTES:
+            raise UserError(f"{path} cannot be read: {size} bytes, at most {MAX_TEXT_BYTES} are; split it")
         return path.read_text(encoding="utf-8-sig")
     except OSError as error:
         raise UserError(f"{path} cannot be read: {error.strerror}") from error
     except UnicodeDecodeError as error:
         raise UserError(f"{path} is not UTF-8 text") from error
+
+
+def shown(name: object) -> str:
+    """Return a name for messages, its control characters escaped: they end lines and drive terminals."""
+    return "".join(letter if letter.isprintable() else repr(letter)[1:-1] for letter in str(name))
 
 
 @contextmanager

@@ -3,6 +3,7 @@
 import argparse
 import errno
 import os
+import shutil
 import sys
 import time
 import warnings
@@ -38,7 +39,10 @@ def program(arguments: Sequence[str] | None = None) -> NoReturn:
         from mkpc_kaggle.engine.budget import process_started
         from mkpc_kaggle.engine.console import leave
 
+        former = os.environ.get("MPLCONFIGDIR")
         status = main(arguments, started=process_started())
+        if (made := os.environ.get("MPLCONFIGDIR")) != former:  # by matplotlib, where it cannot write below HOME
+            shutil.rmtree(str(made), ignore_errors=True)  # which it would do after this program has left
     except KeyboardInterrupt:
         os._exit(EXIT_INTERRUPTED)
     leave(status)
@@ -72,9 +76,9 @@ def main(arguments: Sequence[str] | None = None, *, started: float | None = None
         except UserError as error:
             complain(str(error))
             return EXIT_BAD_INPUT
-        except KeyboardInterrupt:
+        except KeyboardInterrupt as error:
             complain("interrupted")
-            return EXIT_INTERRUPTED
+            return 128 + int(*error.args) if error.args else EXIT_INTERRUPTED
         except BrokenPipeError:  # the reader closed the pipe, as `head` does
             return EXIT_BROKEN_PIPE
         except OSError as error:

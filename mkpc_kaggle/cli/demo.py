@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 
 from mkpc_kaggle.demo import write_demo
+from mkpc_kaggle.errors import UserError, writing
 
 HELP = """\
 Render scenes of stone walls and painted boxes with known cameras, in the competition's layout: DIR/train with
@@ -21,6 +22,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    demo = write_demo(arguments.out, seed=arguments.seed)
+    if arguments.seed < 0:
+        raise UserError("--seed: give 0 or more")
+    with writing(f"--out {arguments.out}"):
+        demo = write_demo(arguments.out, seed=arguments.seed)
     print(f"train side: {demo.train_dir}\ntest side: {demo.test_dir}\ntruth of the test side: {demo.truth_csv}")
     return 0

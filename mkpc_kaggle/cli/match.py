@@ -1,14 +1,16 @@
 """The command ``match``."""
 
 import argparse
+from functools import partial
 from pathlib import Path
 
 from mkpc_kaggle.cli import options
 from mkpc_kaggle.data.outputs import require_apart
+from mkpc_kaggle.engine.streams import unblocked
 from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
 from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher, to_image
 from mkpc_kaggle.reporting.figures.pair import draw_pair
-from mkpc_kaggle.reporting.figures.style import save
+from mkpc_kaggle.reporting.figures.style import require_format, save
 
 HELP = """\
 Match two images. Print the fundamental matrix (x1^T F x0 = 0, pixel centres at integers), the number of matches
@@ -18,6 +20,7 @@ those of the stored files, whatever EXIF says of their orientation; figures are 
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.set_defaults(printing=partial(unblocked, "stderr"))  # on which decoders complain
     parser.add_argument("image0", type=Path)
     parser.add_argument("image1", type=Path)
     parser.add_argument("--out", type=Path, metavar="FIG.png", help="draw the pair; the suffix sets the format")
@@ -27,6 +30,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     inputs = [arguments.image0, arguments.image1, Path(arguments.recipe)]
     require_apart({"--out": arguments.out}, inputs, weights=arguments.weights)
+    if arguments.out is not None:
+        require_format(arguments.out)
     images = to_image(arguments.image0), to_image(arguments.image1)
     given = {name: getattr(arguments, name) for name in ("weights", "device", "precision", "licence")}
     matcher = TwoStageMatcher(arguments.recipe, **given)

@@ -53,10 +53,11 @@ def add_run(parser: argparse.ArgumentParser, time_limit: str | None) -> None:
     add("--explain", action="store_true", help="print the plan at the end: what, when and why")
 
 
-def assembly_of(arguments: argparse.Namespace, recipe: str, mode: str) -> Assembly:
+def assembly_of(arguments: argparse.Namespace, recipe: str, mode: str, interrupt: Interrupt) -> Assembly:
     given = {name: getattr(arguments, name) for name in ("weights", "device", "precision")}
     licence, scenes = Licence(arguments.licence), arguments.reconstruct
-    return assemble(recipe, **given, mode=Mode(mode), licence=licence, scenes=scenes)
+    with interrupt.raising():  # digests of large files
+        return assemble(recipe, **given, mode=Mode(mode), licence=licence, scenes=scenes)
 
 
 def budget_of(arguments: argparse.Namespace) -> Budget:

@@ -85,7 +85,7 @@ def run(arguments: argparse.Namespace) -> int:
             write_tables(out, cameras, root, arguments.format)
             watchdog.status = int(not has_camera(cameras))
 
-        assembly = options.assembly_of(arguments, arguments.recipe, arguments.mode)
+        assembly = options.assembly_of(arguments, arguments.recipe, arguments.mode, interrupt)
         assembly = replace(assembly, recipe=for_cameras(assembly.recipe, arguments.camera))
         options.say_start(f"{sum(map(len, datasets.values()))} images", assembly, work_dir)
         given = {"listed": listed, "rotations": arguments.rotations, "publish": publish}

@@ -52,7 +52,7 @@ def run(arguments: argparse.Namespace) -> int:
         # Before the watchdog starts: a run that begins after its limit must still leave a complete file.
         with first_version(pairs, output), options.watched_session(arguments, work_dir, interrupt) as watched:
             session, watchdog = watched
-            assembly = options.assembly_of(arguments, arguments.recipe, arguments.mode)
+            assembly = options.assembly_of(arguments, arguments.recipe, arguments.mode, interrupt)
             options.say_start(f"{len(pairs)} pairs", assembly, work_dir)
             report = submit(pairs, assembly, session, output, str(test_side(arguments.test_dir)[1]))
             watchdog.status = int(bool(report.unwritten or trouble(report)))

@@ -15,7 +15,7 @@ from mkpc_kaggle.data.outputs import require_apart
 from mkpc_kaggle.data.pairs import read_pairs
 from mkpc_kaggle.engine.console import say
 from mkpc_kaggle.engine.engine import Ending
-from mkpc_kaggle.engine.session import Session, interruptible
+from mkpc_kaggle.engine.session import Interrupt, Session, Watchdog, interruptible
 from mkpc_kaggle.errors import UserError, writing
 from mkpc_kaggle.evaluation.compare import Comparison, comparison_json, comparison_table, step_gains
 from mkpc_kaggle.evaluation.imc2025 import score_imc2025, score_lines
@@ -26,6 +26,11 @@ from mkpc_kaggle.recipe import Recipe, split_mode
 from mkpc_kaggle.reporting.report import report_run
 from mkpc_kaggle.reporting.summary import left_out_line, summary, trouble
 
+# Defaults of the options of matching.
+MATCHING = dict.fromkeys(("work_dir", "compare", "units", "method", "threshold")) | {
+    "recipe": "auto",
+    "mode": "two-stage",
+}
 HELP = """\
 Run a recipe, with the engine that makes submissions, on a train side (calibration.csv, pair_covisibility.csv
 and images/ in each scene, scaling_factors.csv beside the scenes), and score it as the competition does: mAA
@@ -103,8 +108,9 @@ def _require_a_whole(given: argparse.Namespace) -> None:
             "--submission and --truth go together",
         ),
         (
-            given.submission and (given.work_dir or given.compare),
-            "--submission matches nothing: it goes without --work-dir and --compare",
+            given.submission and any(getattr(given, name) != default for name, default in MATCHING.items()),
+            "--submission matches nothing: it goes without "
+            + ", ".join(f"--{name.replace('_', '-')}" for name in MATCHING),
         ),
         (given.imc2025 and given.json, "--imc2025 only prints the score: it goes without --json"),
         ((given.pairs is None) != (given.image_root is None), "--pairs and --image-root go together"),
@@ -133,8 +139,9 @@ def _match_and_score(arguments: argparse.Namespace, scenes: tuple[TrainScene, ..
     pairs = [true.pair for scene in scenes for true in scene.pairs]
     root = str(arguments.train_dir or arguments.image_root)
     validations, status = [], 0
-    with interruptible() as interrupt:
-        assemblies = [_assemble(arguments, *choice) for choice in choices]
+    with interruptible() as interrupt, Watchdog(options.budget_of(arguments), interrupt) as watchdog:
+        watchdog.save = lambda: "the time limit passed before the scores were printed"
+        assemblies = [_assemble(arguments, interrupt, *choice) for choice in choices]
         reports = [re.sub(r"[^\w.-]+", "_", text) for text in compared or ["report"]]
         for assembly, name in zip(assemblies, reports, strict=True):
             session = Session(work_dir, options.budget_of(arguments), interrupt, workers=arguments.workers)
@@ -167,9 +174,9 @@ def _write_json(path: Path | None, figures: dict[str, Any]) -> None:
             path.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
 
 
-def _assemble(arguments: argparse.Namespace, name: str, mode: str) -> Assembly:
+def _assemble(arguments: argparse.Namespace, interrupt: Interrupt, name: str, mode: str) -> Assembly:
     """The parts of a run of a recipe, with the units and the robust method that the command names."""
-    assembly = options.assembly_of(arguments, name, mode)
+    assembly = options.assembly_of(arguments, name, mode, interrupt)
     recipe = with_units(assembly.recipe, arguments.units)
     given = {"method": arguments.method, "threshold": arguments.threshold}
     changes = {key: value for key, value in given.items() if value is not None}

@@ -13,6 +13,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache
+from itertools import zip_longest
 from pathlib import Path
 from typing import TypeVar
 
@@ -158,6 +159,14 @@ def read_submission(path: Path) -> dict[str, Matrix3]:
     """F by sample id; raises :class:`UserError` for a file that is not a submission."""
     rows = read_rows(path, SUBMISSION_COLUMNS)
     return {sample: _numbers(cell, where, 9).reshape(3, 3) for where, (sample, cell) in rows}
+
+
+def has_samples(path: Path, sample_ids: Iterable[str]) -> bool:
+    """Return whether a file is a submission with these samples, in their order; its matrices may be anything."""
+    with suppress(UserError):
+        rows = (sample for _, (sample, _) in read_rows(path, SUBMISSION_COLUMNS, only=True))
+        return all(found == wanted for found, wanted in zip_longest(rows, sample_ids))
+    return False
 
 
 def submission_problems(path: Path, sample_ids: Sequence[str]) -> list[str]:

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 
 from mkpc_kaggle.data.exif import read_exif
+from mkpc_kaggle.errors import shown
 from mkpc_kaggle.geometry.coordinates import Pixels, Size
 
 Key = TypeVar("Key")
@@ -61,7 +62,7 @@ class Unreadable:
     reason: str
 
     def __str__(self) -> str:
-        return f"{printable(self.name)}: {self.reason}"
+        return f"{shown(self.name)}: {self.reason}"
 
     def turned(self, _: int) -> "Unreadable":
         return self

@@ -57,6 +57,17 @@ def require_directory_apart(out: Path, inputs: Iterable[Path], weights: Iterable
             raise UserError(f"--out {out} and the input {place} are in each other's way; name another place")
 
 
+def require_table(path: Path, columns: Iterable[str]) -> None:
+    """Refuse to replace anything but a table with these columns. Raises :class:`UserError`."""
+    if os.path.lexists(path):
+        with suppress(OSError):
+            if path.is_file() and not path.is_symlink():  # a pipe would block
+                with path.open(encoding="utf-8", errors="replace") as stream:
+                    if stream.readline(1 << 16).rstrip("\n") == ",".join(columns):
+                        return
+        raise UserError(f"{path} exists and is no such table; name another directory")
+
+
 def weights_of_environment() -> list[Path]:
     """The directories that ``$MKPC_WEIGHTS`` names."""
     return [Path(name) for name in os.environ.get("MKPC_WEIGHTS", "").split(os.pathsep) if name]

@@ -1,6 +1,7 @@
 """The demo set on disk, in the layout of the competition's train and test sides."""
 
 import hashlib
+import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
@@ -13,10 +14,13 @@ from mkpc_kaggle.demo.camera import FloatImage, Floats, SizedCamera
 from mkpc_kaggle.demo.covisibility import covisibility
 from mkpc_kaggle.demo.render import Picture, render
 from mkpc_kaggle.demo.world import SCENE_NAMES, World, build_world
+from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.cameras import fundamental_of_cameras
 
 MIN_COVISIBILITY = 0.1  # the competition scores pairs from this value on
 TEST_PAIRS = 8  # per scene
+MARK = "demo.txt"
+MARK_TEXT = "Rendered by mkpc_kaggle. The command `demo` replaces train/, test/ and test_truth.csv.\n"
 
 
 @dataclass(frozen=True)
@@ -54,15 +58,17 @@ def write_demo(
     """Render the scenes (all of them by default) and write both sides under `directory`.
 
     The same arguments give the same bytes. `image_scale` scales all images and their K.
-    Raises ValueError for an unknown scene, a scene given twice, or a scale that is not positive.
+    Raises ValueError for an unknown scene, a scene given twice, or a scale that is not positive. Raises
+    :class:`UserError` if the directory has a train or test side that no demo wrote.
     """
     names = SCENE_NAMES if scenes is None else tuple(scenes)
     if len(set(names)) != len(names):
         raise ValueError(f"a scene is given twice: {', '.join(names)}")
     if not image_scale > 0:
         raise ValueError(f"image_scale must be positive, not {image_scale}")
-    worlds = [build_world(name, seed=seed, image_scale=image_scale) for name in names]
     demo = DemoSet(directory, directory / "train", directory / "test", directory / "test_truth.csv")
+    _claim(demo)
+    worlds = [build_world(name, seed=seed, image_scale=image_scale) for name in names]
     rows: list[tuple[str, str]] = []
     for world in worlds:
         photographs = take_photographs(world, seed)
@@ -74,6 +80,17 @@ def write_demo(
     _write_rows(demo.test_dir / "test.csv", "sample_id,batch_id,image_1_id,image_2_id", (row[0] for row in rows))
     _write_rows(demo.truth_csv, "sample_id,scene,image_1_id,image_2_id", (row[1] for row in rows))
     return demo
+
+
+def _claim(demo: DemoSet) -> None:
+    """Mark the directory as a demo set's; raise :class:`UserError` if it has another's files."""
+    mark = demo.root / MARK
+    is_ours = mark.is_file() and mark.read_text(errors="replace") == MARK_TEXT
+    for path in () if is_ours else (mark, demo.train_dir, demo.test_dir, demo.truth_csv):
+        if os.path.lexists(path):
+            raise UserError(f"{path} is in the way: `demo` did not write it; name an empty directory")
+    demo.root.mkdir(parents=True, exist_ok=True)
+    mark.write_text(MARK_TEXT)
 
 
 def take_photographs(world: World, seed: int) -> list[Photograph]:

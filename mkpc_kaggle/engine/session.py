@@ -1,12 +1,13 @@
 """A run from its parts: journal, site and engine opened, used and let go of; signals, and the end at the limit."""
 
 import platform
+import shutil
 import signal
 import sqlite3
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from importlib import metadata
 from math import isfinite
@@ -18,7 +19,8 @@ from typing import Any, Self
 import cv2
 import numpy as np
 
-from mkpc_kaggle.data.competition import Pair, write_submission
+from mkpc_kaggle.data.competition import Pair, has_samples, write_submission
+from mkpc_kaggle.data.outputs import replacing
 from mkpc_kaggle.engine import console
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.cluster import RayCluster, RaySite
@@ -36,9 +38,25 @@ REPORT_S = 2.0  # that an interrupted program may take for its report: enough fo
 
 
 class Interrupt(threading.Event):
-    """Set when the run has to end early; ``signal`` is what asked for it, 0 if nothing did."""
+    """Set when the run must end early; ``signal`` is what asked for it, 0 if nothing did."""
 
     signal = 0
+    _raises = False
+
+    @contextmanager
+    def raising(self) -> Iterator[None]:
+        """Answer a signal with ``KeyboardInterrupt`` of its number: for work that does not look at the event."""
+        self._raises = True
+        try:
+            yield
+        finally:
+            self._raises = False
+
+    def note(self, number: int) -> None:
+        self.signal = number
+        self.set()
+        if self._raises:
+            raise KeyboardInterrupt(number)
 
 
 @dataclass(frozen=True)
@@ -74,24 +92,31 @@ def submit(pairs: Sequence[Pair], assembly: Assembly, session: Session, output: 
 
 @contextmanager
 def first_version(pairs: Sequence[Pair], output: Path) -> Iterator[None]:
-    """Write fallback rows where there is no file yet, before weights, devices and images, any of which may hang.
+    """Write fallback rows, unless the file has them, before weights, devices and images: any of those may hang.
 
-    A run that is refused before it has written a version of its own leaves no file. Raises
+    A run that is refused before it has written its own version leaves the former file, or none. Raises
     :class:`mkpc_kaggle.errors.UserError` where ``output`` cannot be written.
     """
     require_writable(output)
-    ours = None
-    if not output.exists():
-        with writing(f"--output {output}"):
-            write_submission(output, {pair.id: FALLBACK_FUNDAMENTAL for pair in pairs})
-            ours = _identity(output)
-    try:
-        yield
-    except UserError:
-        with suppress(OSError):  # somebody else has removed it
-            if ours == _identity(output):
-                output.unlink()
-        raise
+    ours, ids = None, [pair.id for pair in pairs]
+    with ExitStack() as closed:
+        former = None
+        if not output.exists() or (output.is_file() and not has_samples(output, ids)):
+            with writing(f"--output {output}"):
+                if output.is_file():
+                    former = closed.enter_context(output.open("rb"))  # it outlives its name
+                write_submission(output, dict.fromkeys(ids, FALLBACK_FUNDAMENTAL))
+                ours = _identity(output)
+        try:
+            yield
+        except UserError:
+            with suppress(OSError):  # somebody else has removed it
+                if ours == _identity(output):
+                    output.unlink()
+                    if former is not None:
+                        with replacing(output) as stream:
+                            shutil.copyfileobj(former, stream.buffer)
+            raise
 
 
 def _identity(path: Path) -> tuple[int, int]:
@@ -224,9 +249,8 @@ def interruptible() -> Iterator[Interrupt]:
     former = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
 
     def note(number: int, _: FrameType | None) -> None:
-        interrupt.signal = number
-        interrupt.set()
         restore()
+        interrupt.note(number)
 
     def restore() -> None:
         for number, handler in former.items():

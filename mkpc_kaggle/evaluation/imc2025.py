@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from mkpc_kaggle.config import POSITIVE
 from mkpc_kaggle.data.competition import read_rows
-from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.errors import UserError, shown
 
 OUTLIERS = "outliers"
 POSE_COLUMNS = ("dataset", "scene", "image", "rotation_matrix", "translation_vector")
@@ -56,19 +56,20 @@ def score_imc2025(directory: Path, submission: Path) -> list[DatasetScore]:
     truth, found, thresholds = _centres(labels), _centres(submission), _thresholds(path)
     for name, scenes in truth.items():
         if unplaced := [image for scene in scenes if scene != OUTLIERS for image in _without_pose(scenes[scene])]:
-            raise UserError(f"{labels}: {name}/{unplaced[0]} has no pose, and is not of the scene {OUTLIERS}")
+            image = shown(f"{name}/{unplaced[0]}")
+            raise UserError(f"{labels}: {image} has no pose, and is not of the scene {OUTLIERS}")
         images, given = (
             {image for part in parts.values() for image in part} for parts in (scenes, found.get(name, {}))
         )
         if wrong := images ^ given:
             message = f"{len(wrong)} images of {name} are missing or unknown, such as {min(wrong)}"
-            raise UserError(f"{submission}: {message}")
+            raise UserError(f"{submission}: {shown(message)}")
         if lacking := [scene for scene in scenes if scene not in (OUTLIERS, *thresholds.get(name, ()))]:
-            raise UserError(f"{path} has no thresholds of {name}/{lacking[0]}")
+            raise UserError(f"{path} has no thresholds of {shown(f'{name}/{lacking[0]}')}")
     for file, named in ((submission, found), (path, thresholds)):
         if unknown := named.keys() - truth.keys():
             raise UserError(f"{file}: {labels} lacks the dataset {min(unknown)!r}")
-    return [score_dataset(name, scenes, found[name], thresholds[name]) for name, scenes in truth.items()]
+    return [score_dataset(name, scenes, found[name], thresholds.get(name, {})) for name, scenes in truth.items()]
 
 
 def score_dataset(
@@ -155,7 +156,7 @@ def _thresholds(path: Path) -> dict[str, dict[str, Points]]:
                 f"{where}: expected {SKIPPED_THRESHOLDS + 1} positive thresholds or more, found {cell!r}"
             )
         if scene in found.setdefault(dataset, {}):
-            raise UserError(f"{where}: the scene {dataset}/{scene} is there twice")
+            raise UserError(f"{where}: the scene {shown(f'{dataset}/{scene}')} is there twice")
         found[dataset][scene] = limits
     return found
 
@@ -166,7 +167,7 @@ def _centres(path: Path) -> dict[str, dict[str, dict[str, Points]]]:
     seen: set[tuple[str, str]] = set()
     for where, (dataset, scene, image, *cells) in read_rows(path, POSE_COLUMNS):
         if (dataset, image) in seen:
-            raise UserError(f"{where}: the image {dataset}/{image} is there twice")
+            raise UserError(f"{where}: the image {shown(f'{dataset}/{image}')} is there twice")
         seen.add((dataset, image))
         R, t = (_numbers(cell, where) for cell in cells)
         if (len(R), len(t)) != (9, 3):
@@ -192,5 +193,5 @@ def score_lines(scores: Sequence[DatasetScore]) -> Iterator[str]:
     """Lines: a row for each dataset, and their mean."""
     yield f"{'dataset':<24}{'mAA':>9}{'clusters':>10}{'score':>9}"
     for each in scores:
-        yield f"{each.dataset:<24}{each.maa:>9.4f}{each.clusterness:>10.4f}{each.score:>9.4f}"
+        yield f"{shown(each.dataset):<24}{each.maa:>9.4f}{each.clusterness:>10.4f}{each.score:>9.4f}"
     yield f"{'mean':<43}{np.mean([each.score for each in scores]):>9.4f}"

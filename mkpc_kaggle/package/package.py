@@ -1,5 +1,6 @@
 """The dataset and kernel folders, made from a checkout, weights and an index of wheels."""
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -42,6 +43,8 @@ def make_package(request: Request) -> Package:
     damaged weights, and if wheels cannot be built or found.
     """
     check_owner(request.owner)
+    if wrong := [python for python in request.pythons if not re.fullmatch(r"3\.[0-9]{1,2}", python)]:
+        raise UserError(f"--python {wrong[0][:20]!r}: expected versions of Python 3 such as {','.join(PYTHONS)}")
     if request.wheels is not None and not request.wheels.is_dir():
         raise UserError(f"--wheels {request.wheels}: no such directory")
     checkout = find_checkout()

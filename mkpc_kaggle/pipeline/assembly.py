@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from mkpc_kaggle.errors import warn_once
-from mkpc_kaggle.matchers.contract import Matcher, Placement, Precision
+from mkpc_kaggle.matchers.contract import Matcher, MatcherSpec, Placement, Precision
 from mkpc_kaggle.matchers.registry import load_matcher
 from mkpc_kaggle.pipeline.availability import (
     FAULTS,
@@ -118,6 +118,7 @@ def assemble(
     An unavailable matcher's fallback takes its place, or else recipe ``auto`` drops its units. ``scenes`` switches
     the reconstruction of batches on or off; ``None``: as the recipe has it. Raises :class:`UserError`.
     """
+    require_types(recipe, device, matchers)
     own = matchers or {}
     store = WeightStore(weights)
     written = load_recipe(recipe) if isinstance(recipe, str) else recipe
@@ -139,3 +140,16 @@ def assemble(
         listed = ", ".join(unverified)
         warn_once(f"weights not verified: {listed}; `python -m mkpc_kaggle weights verify` says why")
     return made
+
+
+def require_types(recipe: object, device: object, matchers: object) -> None:
+    """Raise ``TypeError`` for what :func:`assemble` cannot take."""
+    if not isinstance(recipe, Recipe | str):
+        raise TypeError(f"a recipe is a Recipe, a name, or a path as text, not {recipe!r}")
+    if not isinstance(device, str):
+        raise TypeError(f"a device is text such as 'cuda:0', not {device!r}")
+    if not isinstance(matchers, Mapping | None):
+        raise TypeError(f"matchers are a mapping from names to matchers, not {matchers!r}")
+    for name, matcher in (matchers or {}).items():
+        if not isinstance(getattr(matcher, "spec", None), MatcherSpec):
+            raise TypeError(f"matcher {name!r} has no `spec` that is a MatcherSpec: {matcher!r}")

@@ -5,6 +5,7 @@ from functools import cached_property
 from pathlib import Path
 
 from mkpc_kaggle.data.competition import Pair
+from mkpc_kaggle.data.outputs import replacing, require_table
 from mkpc_kaggle.engine.journal import About, Event, EventKind, JournalReader, undamaged
 from mkpc_kaggle.engine.records import PairRecord, SceneRecord
 from mkpc_kaggle.errors import writing
@@ -93,11 +94,16 @@ def read_log(directory: Path) -> RunLog:
 
 
 def write_csv(log: RunLog, directory: Path) -> list[Path]:
-    """Write each table to a file of its name; :class:`UserError` if they cannot be written."""
-    paths = []
+    """Write each table to a file of its name; :class:`UserError` if they cannot be written.
+
+    Such tables are replaced, other files are not.
+    """
+    tables = {directory / f"{name}.csv": table for name, table in log.tables.named().items()}
     with writing(f"--csv {directory}"):
         directory.mkdir(parents=True, exist_ok=True)
-        for name, table in log.tables.named().items():
-            paths.append(directory / f"{name}.csv")
-            table.to_csv(paths[-1], index=False)
-    return paths
+        for path, table in tables.items():
+            require_table(path, table.columns)
+        for path, table in tables.items():
+            with replacing(path) as stream:
+                table.to_csv(stream, index=False)
+    return list(tables)

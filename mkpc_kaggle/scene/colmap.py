@@ -7,6 +7,7 @@ runs it in a process of its own. Nothing is written to disk, unless COLMAP's fil
 Source: Pan et al. 2024 (the global mapper).
 """
 
+import os
 import shutil
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -71,6 +72,9 @@ def write_files(
             folder = made / MODELS / str(number)
             folder.mkdir(parents=True)
             model.colmap.write(folder)
+        for path in filter(Path.is_file, made.rglob("*")):
+            with path.open("rb") as stream:  # a power failure must not leave empty files under their names
+                os.fsync(stream.fileno())
         (made / DATABASE).replace(directory / DATABASE)
         if (directory / MODELS).exists():
             (directory / MODELS).rename(made / FORMER)

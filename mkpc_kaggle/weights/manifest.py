@@ -97,10 +97,10 @@ def _parse_line(columns: list[str], where: str) -> WeightFile:
     if len(columns) != 6:
         raise UserError(f"{where}: expected 6 columns, found {len(columns)}")
     name, size, digest, licence, slot, source = columns
-    if Path(name).name != name or name.startswith("."):
+    if Path(name).name != name or name.startswith(".") or not "".join(columns).isprintable():
         raise UserError(f"{where}: {name!r} is not a plain file name")
-    if size != "?" and not (size.isascii() and size.isdigit()):
-        raise UserError(f"{where}: bytes must be a number or '?', not {size!r}")
+    if size != "?" and not re.fullmatch("[0-9]{1,18}", size):
+        raise UserError(f"{where}: bytes must be a number or '?', not {size[:20]!r}")
     if not DIGEST.fullmatch(digest):
         raise UserError(f"{where}: digest must be 'sha256:' with 64 hex digits or '{UNVERIFIED}', not {digest!r}")
     return WeightFile(name, -1 if size == "?" else int(size), digest, licence, slot, source.strip())

@@ -41,7 +41,7 @@ class FoundFile:
     """A file that was compared with a line of the manifest.
 
     ``path`` is a directory if the checkpoint is unpacked. ``digest`` is ``sha256:<hex>`` of the bytes,
-    empty for an unreadable file. ``note`` is the reason for the state.
+    empty for a file that is unreadable or has no size of the manifest. ``note`` is the reason for the state.
     """
 
     file: WeightFile
@@ -210,7 +210,11 @@ def judge(path: Path, file: WeightFile, files: Iterable[WeightFile] = ()) -> Fou
         unpacked = (path / "data.pkl").is_file()
         if path.is_dir() and not unpacked:
             return FoundFile(file, path, State.REFUSED, "", "it is a directory")
-        digest, size = digest_of(path), path.stat().st_size
+        size = path.stat().st_size
+        wrong_size = f"{size} bytes, the manifest says {file.size}: truncated, or another file"
+        if path.is_file() and not _may_be(size, file, files):
+            return FoundFile(file, path, State.REFUSED, "", wrong_size)
+        digest = digest_of(path)
     except OSError as error:
         return FoundFile(file, path, State.REFUSED, "", f"cannot be read: {error.strerror}")
     other = next((line.name for line in files if line.digest == digest), "")
@@ -222,12 +226,18 @@ def judge(path: Path, file: WeightFile, files: Iterable[WeightFile] = ()) -> Fou
     elif other:
         note = f"its bytes are those of {other}"
     elif 0 <= file.size != size:
-        note = f"{size} bytes, the manifest says {file.size}: truncated, or another file"
+        note = wrong_size
     elif file.digest == UNVERIFIED:
         state, note = State.UNVERIFIED, f"the manifest has no digest for it; this file's is {digest}"
     else:
         note = f"its digest is {digest}, the manifest says {file.digest}: damaged, or another file"
     return FoundFile(file, path, state, digest, note)
+
+
+def _may_be(size: int, file: WeightFile, files: Iterable[WeightFile]) -> bool:
+    """Return whether a file of ``size`` bytes may have the content of ``file``, or of another of ``files``."""
+    may_be_any = size <= MAX_UNKNOWN_SIZE_BYTES and any(line.size < 0 for line in files)
+    return file.size < 0 or may_be_any or size in (file.size, *(line.size for line in files))
 
 
 def is_unpacked_from(directory: Path, file: WeightFile) -> bool:

@@ -2,14 +2,17 @@ import os
 import subprocess
 import sys
 import threading
+from contextlib import suppress
 from io import StringIO
 
 import cv2
 import numpy as np
 import pytest
+from shared import contents
 
 from mkpc_kaggle.cli import main
 from mkpc_kaggle.data.competition import read_test_side, write_submission
+from mkpc_kaggle.demo import write
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
 
 
@@ -65,6 +68,35 @@ def test_results_are_not_written_over_inputs_nor_an_export_over_the_journal(demo
     assert "would be written over the work directory" in told[2]
 
 
+@pytest.mark.parametrize(
+    ("command", "message"),
+    [
+        ("match x.png y.png --recipe classical --out x", "needs a suffix"),
+        ("match x.png y.png --recipe classical --out notes.xyz", "needs a suffix"),
+        ("match x.png y.png --recipe classical --out /dev/full", "needs a suffix"),
+        ("demo --out users", "users/train is in the way"),
+        ("demo --out truth", "truth/test_truth.csv is in the way"),
+        ("demo --out x.png", "cannot be written"),
+        ("demo --out x.png/d", "cannot be written"),
+        ("demo --out /proc/d", "cannot be written"),
+        ("demo --seed -1 --out d", "--seed: give 0 or more"),
+    ],
+)
+def test_what_would_replace_files_of_the_user_is_refused_before_any_work(
+    command, message, clean_environment, tmp_path, monkeypatch, capsys
+):
+    files = ("x.png", "notes.png", "users/train/scaling_factors.csv", "truth/test_truth.csv")
+    for name in files:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text("precious")
+    monkeypatch.setattr(write, "build_world", lambda *_, **__: pytest.fail("rendered before it was refused"))
+    before = contents(tmp_path)
+    with suppress(SystemExit):  # of argparse
+        assert main(command.split()) == 2
+    assert message in capsys.readouterr().err
+    assert contents(tmp_path) == before
+
+
 def test_check_tells_good_from_bad(demo, tmp_path, capsys):
     ids = [pair.id for pair in read_test_side(demo.test_dir)]
     path = tmp_path / "submission.csv"
@@ -86,6 +118,29 @@ def test_match_prints_f_and_draws_the_pair(demo, small_recipe, tmp_path, capsys)
     assert np.linalg.norm(F) == pytest.approx(1)
     assert "1:sift@320" in "\n".join(out)
     assert cv2.imread(str(figure)).shape[1] > 1000
+
+
+def test_a_missing_image_is_shown_in_letters(clean_environment, capsys):
+    assert main(["match", "a\x1b[2J\n.png", "b.png"]) == 2
+    assert capsys.readouterr().err == r"error: a\x1b[2J\n.png: no such file" + "\n"
+
+
+def test_a_long_text_is_called_long(clean_environment, tmp_path, capsys):
+    (tmp_path / "long.toml").write_bytes(b"#" * (17 << 20))
+    assert main(["match", "a.png", "b.png", "--recipe", "long.toml"]) == 2
+    (tmp_path / "a.png").write_bytes(cv2.imencode(".png", np.zeros((9, 9), np.uint8))[1])
+    assert main(["match", "a.png", "a.png", "--recipe", "long.toml"]) == 2
+    assert "17825792 bytes, at most 16777216 are" in capsys.readouterr().err
+
+
+def test_matplotlib_leaves_nothing_where_home_cannot_be_written(demo, small_recipe, tmp_path):
+    images = sorted((demo.train_dir / "courtyard" / "images").iterdir())[:2]
+    (tmp_path / "tmp").mkdir()
+    home = {"HOME": "/proc/home", "XDG_CONFIG_HOME": "/proc/home", "TMPDIR": str(tmp_path / "tmp")}
+    command = [*map(str, images), "--recipe", str(small_recipe), "--out", str(tmp_path / "pair.png")]
+    environment = {name: value for name, value in os.environ.items() if name != "MPLCONFIGDIR"} | home
+    subprocess.run([sys.executable, "-m", "mkpc_kaggle", "match", *command], env=environment, check=True)
+    assert list((tmp_path / "tmp").iterdir()) == []
 
 
 def test_match_says_what_it_lacks_and_draws_a_pair_that_has_nothing_in_common(clean_environment, tmp_path, capsys):

@@ -5,6 +5,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import cv2
@@ -193,15 +194,42 @@ def test_paths_that_the_terminal_cannot_spell_cost_no_result(demo, small_recipe,
     assert_good(tmp_path / "submission.csv", test_dir)
 
 
-def test_a_whole_submission_is_there_before_weights_and_devices_are_looked_at(demo, tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    "former", [None, "", "sample_id,fundamental_matrix\nof another test set,0 0 0 0 0 0 0 0 0\n"]
+)
+def test_a_whole_submission_is_there_before_weights_and_devices_are_looked_at(demo, tmp_path, monkeypatch, former):
     def look(*_, **__):
         assert submission_problems(output, [pair.id for pair in read_test_side(demo.test_dir)]) == []
         raise UserError("the disk with the weights cannot be read")
 
     monkeypatch.setattr("mkpc_kaggle.cli.options.assemble", look)
     output = tmp_path / "submission.csv"
+    if former is not None:
+        output.write_text(former)
     assert main(["submit", "--test-dir", str(demo.test_dir), "--output", str(output)]) == 2
-    assert not output.exists(), "a run that is refused leaves nothing"
+    left = output.read_text() if output.exists() else None
+    assert left == former, "a run that is refused leaves what there was"
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("command", ["submit --test-dir {test}", "reconstruct {test}/test_images --out out"])
+def test_a_signal_is_answered_while_weights_are_read(
+    demo, tmp_path, clean_environment, monkeypatch, number, command, capsys
+):
+    def read_for_long(path):
+        os.kill(os.getpid(), number)
+        for _ in range(100):
+            time.sleep(0.01)
+        pytest.fail("it is read on for a second")
+
+    monkeypatch.setattr("mkpc_kaggle.weights.store.digest_of", read_for_long)
+    (tmp_path / "weights").mkdir()
+    (tmp_path / "weights" / "superglue_outdoor.pth").touch()  # whose size the manifest does not have
+    status = main([*command.format(test=demo.test_dir).split(), "--recipe", "auto", "--weights", "weights"])
+    assert status == 128 + number
+    assert capsys.readouterr().err == "error: interrupted\n"
+    if command.startswith("submit"):
+        assert_good(tmp_path / "submission.csv", demo.test_dir)
 
 
 def test_a_current_directory_that_is_gone_is_a_line(tmp_path):

@@ -148,5 +148,18 @@ def test_an_option_that_scoring_has_no_use_for_is_refused(tmp_path, capsys, opti
     home = write_truth(tmp_path)
     arguments = ["validate", "--imc2025", str(home), "--submission", str(home / "train_labels.csv")]
     assert main([*arguments, option, str(tmp_path / "x")]) == 2
-    assert re.search(r"it goes without (--json|--work-dir and)", capsys.readouterr().err)
+    assert re.search(r"it goes without (--json|--work-dir, )", capsys.readouterr().err)
     assert not (tmp_path / "x").exists()
+
+
+def test_a_dataset_of_outliers_alone_needs_no_thresholds_and_its_name_is_shown_in_letters(tmp_path, capsys):
+    home = write_truth(tmp_path)
+    with (home / "train_labels.csv").open("a") as stream:
+        stream.write(f"a\x1b[2Jb,outliers,x.png,{';'.join(['nan'] * 9)},nan;nan;nan\n")
+    assert main(["validate", "--imc2025", str(home), "--submission", str(home / "train_labels.csv")]) == 0
+    rows = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert rows[2:] == [
+        ["set", "1.0000", "1.0000", "1.0000"],
+        [r"a\x1b[2Jb", "0.0000", "0.0000", "0.0000"],
+        ["mean", "0.5000"],
+    ]

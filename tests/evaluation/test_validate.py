@@ -1,4 +1,6 @@
 import json
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -156,6 +158,20 @@ def test_the_classical_recipe_reaches_plain_root_sift_scene_by_scene(tmp_path):
         assert scores[scene] >= baseline - 0.01, scene
 
 
+HANGS = """
+import time
+from mkpc_kaggle.cli import program, validate
+validate.validate = lambda *_: time.sleep(600)
+program(["validate", "--train-dir", {train!r}, "--recipe", "classical", "--time-limit", "8s"])
+"""
+
+
+def test_a_validation_that_hangs_ends_at_its_limit(demo):
+    code = HANGS.format(train=str(demo.train_dir))
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=300)
+    assert (done.returncode, done.stderr) == (1, "error: the time limit passed before the scores were printed\n")
+
+
 @pytest.mark.parametrize(
     ("options", "told"),
     [
@@ -168,6 +184,8 @@ def test_the_classical_recipe_reaches_plain_root_sift_scene_by_scene(tmp_path):
         (["--imc2025", "."], "--imc2025 needs --submission, and no --truth"),
         (["--train-dir", "T", "--compare", "classical", "clasical:stage-1"], "unknown recipe 'clasical'"),
         (["--train-dir", "T", "--compare", "classical"], "two recipes"),
+        (["--train-dir", "T", "--submission", "a", "--truth", "b", "--recipe", "nonsense"], "it goes without"),
+        (["--train-dir", "T", "--submission", "a", "--truth", "b", "--units", "1:sift@320"], "it goes without"),
     ],
 )
 def test_options_that_make_no_validation_are_refused(demo, small_recipe, options, told, capsys):

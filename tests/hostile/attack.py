@@ -56,6 +56,7 @@ class Case:
     then: str = ""
     env: dict[str, str] = field(default_factory=dict)
     submission: bool = True
+    stderr: Callable[[], int] | None = None  # opens the descriptor that the command writes to; else the log
 
     @property
     def id(self) -> str:
@@ -69,7 +70,7 @@ def attack(case: Case, room: Path) -> None:
     mark = uuid.uuid4().hex
     faults = []
     for number, command in enumerate(filter(None, (case.command, case.then))):
-        process = _start(command, room, {**case.env, MARK: mark})
+        process = _start(command, room, {**case.env, MARK: mark}, case.stderr)
         if number == 0 and case.act is not None:
             case.act(process)
         status, output = _wait(process, room)
@@ -92,7 +93,9 @@ def prepared(command: str, room: Path) -> int:
     return _start(command, room, {}).wait()
 
 
-def _start(command: str, room: Path, env: dict[str, str]) -> "subprocess.Popen[bytes]":
+def _start(
+    command: str, room: Path, env: dict[str, str], stderr: Callable[[], int] | None = None
+) -> "subprocess.Popen[bytes]":
     words = [word.format(room=room) for word in shlex.split(command)]
     limited = ["sh", "-c", f'ulimit -d {MEMORY_KIB}; ulimit -c 0; exec "$@"', "sh"]
     own = {
@@ -112,7 +115,7 @@ def _start(command: str, room: Path, env: dict[str, str]) -> "subprocess.Popen[b
             env=own | env,
             stdin=subprocess.DEVNULL,
             stdout=log,
-            stderr=subprocess.STDOUT,
+            stderr=stderr() if stderr else subprocess.STDOUT,
             start_new_session=True,
         )
 

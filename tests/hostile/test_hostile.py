@@ -12,13 +12,14 @@ import outputs
 import pytest
 import settings
 import tables
+import unread
 import weight_bombs
 from attack import Case, attack
 from room import write_template
 
 ALL: list[Case] = [
     case
-    for group in (tables, images, outputs, ends, journals, weight_bombs, settings, fetches, folders)
+    for group in (tables, images, outputs, ends, journals, weight_bombs, settings, fetches, folders, unread)
     for case in group.CASES
 ]
 QUICK = (  # these run with the other tests
@@ -39,6 +40,10 @@ QUICK = (  # these run with the other tests
     "fetches: a link for the part",
     "arguments: check of a submission of NaN",
     "arguments: an owner that is a path",
+    "figures: a photograph's name without its suffix",
+    "exports: a link to an image",
+    "demos: a train side of the user's",
+    "unread: submit in a worker: a colour profile that is too short",
     "folders: database.db of the user's",
     "folders: a folder's name: Latin 1",
     "folders: again: an ending that was changed",

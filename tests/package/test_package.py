@@ -208,7 +208,8 @@ def test_bad_requests_are_refused_before_anything_is_written(wanted, tmp_path):
         "give latest, original, or an image as NAME@sha256:DIGEST": replace(wanted, image="python@sha256:12"),
         "no such directory": replace(wanted, wheels=tmp_path / "nowhere"),
         f"for Python {python_version()}": replace(wanted, wheels=empty),
-        "for Python 2.7": replace(wanted, pythons=("2.7",)),
+        "--python '2.7': expected versions of Python 3": replace(wanted, pythons=("2.7",)),
+        f"--python '3.{'9' * 18}': expected": replace(wanted, pythons=(f"3.{'9' * 100}",)),
         "truncated": replace(wanted, weights=(put(tmp_path / "damaged", "free.pt", DATA[:-1]),)),
     }
     for told, request in bad.items():

@@ -32,6 +32,23 @@ def own(*licences):
     return {"own": Own(MatcherSpec("own", "for tests", licences=licences))}
 
 
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"recipe": None},
+        {"recipe": 5},
+        {"recipe": {}},
+        {"device": 0},
+        {"matchers": [1]},
+        {"matchers": {"own": object()}},
+        {"matchers": {"own": None}},
+    ],
+)
+def test_what_is_of_a_wrong_type_is_named(wrong):
+    with pytest.raises(TypeError, match=r"(recipe|device|matcher).* not |has no `spec`"):
+        TwoStageMatcher(**({"recipe": "classical"} | wrong))
+
+
 def test_recipe_auto_leaves_out_the_units_whose_weights_are_missing():
     assembly = assemble("auto")
     others = [name for name in load_recipe("auto").matcher_names if name != "sift"]

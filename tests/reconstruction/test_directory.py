@@ -165,7 +165,10 @@ def test_former_files_stay_until_the_new_ones_are_whole(tmp_path, monkeypatch):
     with pytest.raises(OSError, match="No space"):
         write_files(write_half)
     assert files_of(tmp_path) == dict.fromkeys(FILES, "former")
+    synced = set()
+    monkeypatch.setattr(os, "fsync", lambda number: synced.add(Path(f"/proc/self/fd/{number}").readlink().name))
     write_files(write_whole)
+    assert synced == {"database.db", *MODEL_FILES}, "a power failure leaves no empty file under its name"
     assert {(tmp_path / "models" / "0" / name).read_text() for name in MODEL_FILES} == {"new"}
     with pycolmap.Database.open(str(tmp_path / "database.db")) as database:
         assert database.num_images() == 0

@@ -1,5 +1,6 @@
 """The journal command and report.html, on journals with known contents."""
 
+import os
 import re
 import sys
 from html.parser import HTMLParser
@@ -69,6 +70,8 @@ def test_a_run_exports_tables_that_pandas_reads_as_they_are(tmp_path, capsys):
     assert len(table["regions"]) == 2 * 11
     assert set(table["events"]["kind"]) >= {"start", "end"}
     capsys.readouterr()
+    assert main(["journal", str(tmp_path / "work"), "--csv", str(tmp_path / "csv")]) == 0, "its own are replaced"
+    capsys.readouterr()
     assert main(["journal", str(tmp_path / "work")]) == 0
     out = capsys.readouterr().out
     assert re.search("complete after .*: 11 of 12 pairs have an F", out)
@@ -90,6 +93,19 @@ def test_an_export_that_cannot_be_written_is_told(tmp_path, option, capsys):
     assert "has no journal.sqlite" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    "make", [lambda path: path.write_text("mine"), lambda path: path.symlink_to("../journal.sqlite"), os.mkfifo]
+)
+def test_an_export_replaces_nothing_but_its_own_tables(tmp_path, make, capsys):
+    empty_journal(tmp_path, []).close()
+    (tmp_path / "csv").mkdir()
+    make(tmp_path / "csv" / "units.csv")
+    assert main(["journal", str(tmp_path), "--csv", str(tmp_path / "csv")]) == 2
+    assert "units.csv exists and is no such table" in capsys.readouterr().err
+    assert [path.name for path in (tmp_path / "csv").iterdir()] == ["units.csv"]
+    assert read_log(tmp_path).pairs == ()
+
+
 def test_a_journal_can_be_read_while_its_run_writes_it(tmp_path):
     journal = empty_journal(tmp_path, write_pairs(tmp_path / "images", 2))
     journal.note(Event(EventKind.START, 0.5, ""))
@@ -109,7 +125,7 @@ def test_the_page_begins_with_the_verdict_has_pictures_inside_and_asks_for_nothi
     text = page.read_text(encoding="utf-8")
     assert re.search("<h1>Complete after .*: 11 of 12 pairs have an F</h1>", text)
     assert re.findall("<h2>(.*?)</h2>", text) == [
-        "Faults",
+        "Missing results",
         "The weakest pairs",
         "Where the time went",
         "What made this",

@@ -39,6 +39,8 @@ def test_a_manifest_reads_as_written():
         ("a.pt 12 unverified MIT one", "expected 6 columns, found 5"),
         ("../a.pt 12 unverified MIT one x", "'../a.pt' is not a plain file name"),
         ("a.pt 12kB unverified MIT one x", "bytes must be a number or '?', not '12kB'"),
+        (f"a.pt {'9' * 5000} unverified MIT one x", "bytes must be a number or '?', not '999"),
+        ("a\x1b[2J.pt 12 unverified MIT one x", r"'a\x1b[2J.pt' is not a plain file name"),
         (f"a.pt 12 {SHA256[:-1]}g MIT one x", "digest must be"),
         (f"a.pt 12 git-blob:{'a1' * 20} MIT one x", "digest must be 'sha256:'"),
     ],

@@ -139,6 +139,15 @@ def test_other_bytes_of_the_same_size_are_refused_with_both_digests(tmp_path):
         WeightStore([tmp_path], [line()]).load("slot")
 
 
+def test_a_file_whose_size_is_no_files_is_refused_unread(tmp_path, monkeypatch):
+    monkeypatch.setattr(store, "digest_of", lambda path: pytest.fail(f"{path.name} is read"))
+    with (tmp_path / "a.bin").open("wb") as stream:
+        stream.truncate(20_000_000_000)
+    (judged,) = WeightStore([tmp_path], [line("a.bin"), line("b.bin", OTHER * 2)]).verify()
+    assert (judged.state, judged.digest) == (State.REFUSED, "")
+    assert judged.note.startswith("20000000000 bytes, the manifest says")
+
+
 def test_after_a_bad_file_the_search_goes_on(tmp_path):
     put(tmp_path / "one", "a.bin", DATA[:-1])
     path = put(tmp_path / "two", "renamed.bin", DATA) / "renamed.bin"

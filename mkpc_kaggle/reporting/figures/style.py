@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mkpc_kaggle.data.competition import evenly_spread
+from mkpc_kaggle.data.outputs import replacing
 from mkpc_kaggle.errors import UserError
 
 if TYPE_CHECKING:
@@ -29,11 +30,19 @@ def new_figure(width: float, height: float) -> "Figure":
     return Figure(figsize=(width, height), layout="constrained")
 
 
+def require_format(path: Path) -> None:
+    """Raise :class:`UserError` for a suffix that names no format of matplotlib, or without matplotlib."""
+    formats = new_figure(1, 1).canvas.get_supported_filetypes().keys() - {"pgf"}  # which needs LaTeX
+    if path.suffix[1:].lower() not in formats:
+        raise UserError(f"the figure {path} needs a suffix: one of {', '.join(sorted(formats))}")
+
+
 def save(figure: "Figure", path: Path) -> None:
-    """Write a figure; the suffix says the format. Raises :class:`UserError` if it cannot be written."""
+    """Write a figure in the format of its suffix. Raises :class:`UserError` if it cannot be written."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path, dpi=DPI)
+        with replacing(path) as stream:
+            figure.savefig(stream.buffer, format=path.suffix[1:].lower(), dpi=DPI)
     except (OSError, ValueError) as error:
         raise UserError(f"the figure {path} cannot be written: {error}") from error
 

@@ -1,0 +1,110 @@
+"""Standard streams that are not read, or that a library uses in its own way, cost neither time nor a job."""
+
+import os
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from mkpc_kaggle.engine.jobs import Loaded
+from mkpc_kaggle.engine.process import ProcessWorker
+from mkpc_kaggle.engine.streams import QueuedStream
+
+ROOT = Path(__file__).resolve().parents[2]
+COMPLAINS = """
+import os, threading
+from contextlib import suppress
+from mkpc_kaggle.engine.jobs import Loaded
+from mkpc_kaggle.engine.process import ProcessWorker
+from mkpc_kaggle.engine.streams import unblocked
+
+def complain():
+    for number in range(3000):
+        with suppress(BlockingIOError):  # native code does not look
+            os.write({descriptor}, b"libpng warning: iCCP: known incorrect sRGB profile, number %d" % number)
+
+if __name__ == "__main__":
+    with unblocked():
+        if {in_worker}:
+            answers = threading.Semaphore(0)
+            worker = ProcessWorker("decoder", complain, answers.release)
+            worker.start()
+            answers.acquire()
+            assert worker.answer() == Loaded()
+            worker.kill()
+        else:
+            complain()
+    os.write({done}, b"done")
+    os._exit(0)
+"""
+
+
+@pytest.mark.parametrize("in_worker", [False, True])
+@pytest.mark.parametrize("descriptor", [1, 2])
+def test_native_code_that_complains_to_a_pipe_without_a_reader_does_not_wait(descriptor, in_worker, tmp_path):
+    script, (reader, pipe), (told, done) = tmp_path / "complains.py", os.pipe(), os.pipe()
+    script.write_text(COMPLAINS.format(descriptor=descriptor, in_worker=in_worker, done=done))
+    given = {"stdout": pipe} if descriptor == 1 else {"stderr": pipe}
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    with subprocess.Popen([sys.executable, script], env=environment, pass_fds=[done], **given) as process:
+        os.close(done)
+        os.close(pipe)
+        timer = threading.Timer(60, process.kill)
+        timer.start()
+        assert os.read(told, 10) == b"done"
+        timer.cancel()
+    os.close(told)
+    os.close(reader)
+
+
+def test_what_native_code_writes_is_printed(tmp_path):
+    script = "import os\nfrom mkpc_kaggle.engine.streams import unblocked\nwith unblocked():\n"
+    script += "    os.write(2, b'libjpeg: premature end')\nprint('later', flush=True)\nos.write(2, b', again')"
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, check=True, env=os.environ | {"PYTHONPATH": str(ROOT)}
+    )
+    assert done.stderr == b"libjpeg: premature end, again"
+
+
+def use(stream):
+    """What libraries do with a standard stream."""
+    assert stream.name == "<stderr>"
+    assert stream.writable() and stream.errors and not stream.closed
+    stream.reconfigure(line_buffering=True)
+    assert stream.buffer.write(b"by") + stream.buffer.write(memoryview(b"tes")) == 5
+    for write, wrong in ((stream.write, b"bytes"), (stream.buffer.write, "text"), (stream.write, None)):
+        try:
+            write(wrong)
+        except TypeError:
+            continue
+        raise AssertionError(f"{wrong!r} was taken")
+    stream.write(" and text")
+
+
+def use_stderr():
+    use(sys.stderr)
+
+
+def test_a_library_finds_in_a_worker_what_streams_have():
+    answers = threading.Semaphore(0)
+    worker = ProcessWorker("library", use_stderr, answers.release)
+    worker.start()
+    answers.acquire()
+    answer = worker.answer()
+    worker.kill()
+    assert answer == Loaded()
+
+
+def test_the_printing_thread_survives_whatever_is_written(tmp_path):
+    with (tmp_path / "log").open("w") as log:
+        log.reconfigure(encoding="ascii")
+        stream = QueuedStream(log)
+        stream.write("\u00e9")  # which ASCII lacks
+        stream.buffer.write(b"bytes, ")
+        stream.writelines(["line ", "line"])
+        stream.drain(time.monotonic() + 60)
+    assert not stream.is_stuck
+    assert (tmp_path / "log").read_text() == "bytes, line line"
