@@ -45,6 +45,7 @@ class Unit:
     area: str = ""  # height x width, such as "540x720": a view gets as many pixels, at its own aspect
     stretch: bool = False  # a view gets just that height and width
     fallback: str = ""  # the matcher that runs where this matcher is unavailable
+    antialias: bool = True  # False: shrink views bilinearly, without averaging areas
     tracks: bool = True  # False: its matches enter a scene only where the pair's other units found fewer than 50
 
     def __post_init__(self) -> None:

@@ -3,20 +3,25 @@
 A line a pair: ``name0 name1 turns0 turns1 K0 K1 T_0to1``, separated by blanks. Names are paths under the image
 root. ``turns`` are the quarter turns, counter-clockwise, that set an image upright. K (9 numbers) and T (16), row
 by row, are those of the images as they are stored: X_1 = R X_0 + t with T = [R t; 0 1].
+
+A file ``.npz``, or a directory of such files, is LoFTR's list of MegaDepth-1500.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache
+from itertools import chain
 from math import nan
 from pathlib import Path, PureWindowsPath
 
 import numpy as np
 
-from mkpc_kaggle.data.competition import Pair, TrainScene, TruePair, evenly_spread
+from mkpc_kaggle.data.competition import Pair, TrainScene, TruePair, evenly_spread, read_rows
 from mkpc_kaggle.data.images import Unreadable, read_image
+from mkpc_kaggle.data.megadepth import lines_of_scene_info
 from mkpc_kaggle.errors import UserError, read_text
 from mkpc_kaggle.geometry.cameras import Camera
-from mkpc_kaggle.geometry.coordinates import Size
+from mkpc_kaggle.geometry.coordinates import Box, Size
 
 FIELDS = 2 + 2 + 9 + 9 + 16
 EXPECTED = "name0 name1 turns0 turns1 K0 (9 numbers) K1 (9) T_0to1 (16)"
@@ -42,18 +47,17 @@ def read_pairs(file: Path, image_root: Path, *, most: int | None = None) -> Trai
     """
     if not image_root.is_dir():
         raise UserError(f"--image-root {image_root}: no such directory")
-    lines = enumerate(read_text(file).splitlines(), start=1)
-    listed = [(number, parse_line(line, f"{file}, line {number}")) for number, line in lines if line.split()]
+    files = sorted(file.glob("*.npz")) if file.is_dir() else [file] if file.suffix == ".npz" else []
+    lines = [*chain.from_iterable(map(lines_of_scene_info, files))] if files else read_text(file).splitlines()
+    numbered = enumerate(lines, start=1)
+    listed = [(number, parse_line(line, f"{file}, line {number}")) for number, line in numbered if line.split()]
     if not listed:
         raise UserError(f"{file} has no pairs; expected lines {EXPECTED}")
 
-    @cache
-    def size_of(name: str) -> Size | None:
-        image = read_image(image_root / name)
-        return None if isinstance(image, Unreadable) else image.size
+    size_in_root = cache(lambda name: size_of(str(image_root / name)))
 
     def upright(image: ListedImage) -> Camera:
-        size = size_of(image.name) if image.turns else None
+        size = size_in_root(image.name) if image.turns else None
         return image.camera.rotated_90(image.turns, size) if size else image.camera
 
     pairs = []
@@ -64,6 +68,38 @@ def read_pairs(file: Path, image_root: Path, *, most: int | None = None) -> Trai
         pair = Pair(name, file.stem, file0, file1, (camera0.K, camera1.K), turns)
         pairs.append(TruePair(pair, camera0, camera1, nan))
     return TrainScene(file.stem, nan, tuple(pairs))
+
+
+def read_regions(file: Path, image_root: Path, pairs: Iterable[Pair]) -> dict[tuple[str, ...], tuple[Box, Box]]:
+    """Return the boxes for stage 2 of these pairs by the files of their images.
+
+    ``file`` is a table ``image_0,image_1,box_0,box_1``: paths under the root; left, top, right and bottom in whole
+    pixels, the latter two exclusive. Raises :class:`UserError` for a malformed table, for a box that leaves its
+    image, and where a pair is missing.
+    """
+    rows, found = {}, dict[tuple[str, ...], tuple[Box, Box]]()
+    for where, (*names, cell0, cell1) in read_rows(file, ("image_0", "image_1", "box_0", "box_1")):
+        rows[tuple(str(image_root / name) for name in names)] = where, cell0, cell1
+    size = cache(size_of)
+    for pair in pairs:
+        files = pair.file0, pair.file1
+        if files not in rows:
+            raise UserError(f"{file} has no regions of the pair {pair.id}")
+        where, *cells = rows[files]
+        try:
+            box0, box1 = (Box(*map(int, cell.split())) for cell in cells)
+        except (ValueError, TypeError) as error:
+            raise UserError(f"{where}: expected boxes of 4 integers, left top right bottom: {error}") from error
+        for name, box in zip(files, (box0, box1), strict=True):
+            if (known := size(name)) and not box.is_within(known):
+                raise UserError(f"{where}: {box} leaves {name}, {known.width} x {known.height} pixels")
+        found[files] = box0, box1
+    return found
+
+
+def size_of(path: str) -> Size | None:
+    image = read_image(Path(path))
+    return None if isinstance(image, Unreadable) else image.size
 
 
 def parse_line(line: str, where: str) -> tuple[ListedImage, ListedImage]:

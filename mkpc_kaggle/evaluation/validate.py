@@ -2,25 +2,38 @@
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from math import isfinite, nan
 from pathlib import Path
 from statistics import mean
 from typing import Any
 
+from scipy.spatial.transform import Rotation
+
 from mkpc_kaggle.data.competition import TrainScene, TruePair, pair_id, read_rows, read_submission
 from mkpc_kaggle.engine.engine import RunReport
+from mkpc_kaggle.engine.journal import JournalReader, share_journal
 from mkpc_kaggle.engine.records import PairRecord
 from mkpc_kaggle.engine.session import Session, run_pairs
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry import metrics
 from mkpc_kaggle.geometry.coordinates import Matrix3
+from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.metrics import AUC_THRESHOLDS, PoseError
-from mkpc_kaggle.geometry.robust import ModelKind
+from mkpc_kaggle.geometry.robust import Method, ModelKind, Pixel, RobustConfig
 from mkpc_kaggle.pipeline.assembly import Assembly
+from mkpc_kaggle.pipeline.pair import UnitResult
+from mkpc_kaggle.recipe import Recipe
 
 MAX_NAMES = 5  # of samples, in a line
+
+
+# Of SuperGlue's evaluation of YFCC100M and ScanNet, and of LoFTR's of MegaDepth.
+PROTOCOLS = {
+    "superglue": RobustConfig(Method.RANSAC, 1.0, 0.99999, 1000, 1, Pixel.LARGEST, every_match=True),
+    "loftr": RobustConfig(Method.RANSAC, 0.5, 0.99999, 1000, 1, Pixel.STORED, every_match=True),
+}
 
 
 class Step(StrEnum):
@@ -35,7 +48,9 @@ class Step(StrEnum):
 class PairScore:
     """One pair's error, infinite for a failed pair, and its record if the engine made it.
 
-    ``steps`` are the errors after each :class:`Step` that was made; the last is ``error``.
+    ``steps`` are the errors after each :class:`Step` that was made; the last is ``error``. For a pair of a list,
+    ``precision`` is the share of correct matches, and ``matching_score`` their number over the number of keypoints
+    in the first image, NaN where the latter is unknown.
     """
 
     id: str
@@ -43,6 +58,8 @@ class PairScore:
     error: PoseError
     record: PairRecord | None = None
     steps: Mapping[Step, PoseError] = field(default_factory=dict)
+    precision: float = nan
+    matching_score: float = nan
 
 
 @dataclass(frozen=True)
@@ -68,6 +85,10 @@ class SceneScore:
     def auc(self, threshold: float) -> float:
         return metrics.pose_auc(self.errors, threshold)
 
+    def matching(self) -> tuple[float, float]:
+        """Return the mean precision and the mean matching score."""
+        return mean(pair.precision for pair in self.pairs), mean(pair.matching_score for pair in self.pairs)
+
 
 @dataclass(frozen=True)
 class Validation:
@@ -90,12 +111,37 @@ class Validation:
     def auc(self, threshold: float) -> float:
         return mean(scene.auc(threshold) for scene in self.scenes)
 
+    def matching(self) -> tuple[float, float]:
+        precisions, scores = zip(*(scene.matching() for scene in self.scenes), strict=True)
+        return mean(precisions), mean(scores)
+
     @property
     def errors(self) -> list[PoseError]:
         return [error for scene in self.scenes for error in scene.errors]
 
 
-def validate(scenes: Sequence[TrainScene], assembly: Assembly, session: Session) -> Validation:
+def by_protocol(recipe: Recipe, protocol: str) -> Recipe:
+    """Return the recipe with the settings of one of :data:`PROTOCOLS`. These also score rotations ``in_front``."""
+    units = tuple(replace(unit, antialias=False) for unit in recipe.units)
+    return replace(recipe, units=units, magsac=PROTOCOLS[protocol], focal=None, scene=None)
+
+
+def shared_directory(directory: Path, assembly: Assembly, done: dict[Path, Assembly]) -> Path:
+    """Return the work directory of a run; a new one starts with the points of an equal run that is ``done``."""
+    for former, other in done.items():
+        if other.fingerprint() == assembly.fingerprint():
+            share_journal(former, directory)
+    done[directory] = assembly
+    return directory
+
+
+def validate(
+    scenes: Sequence[TrainScene], assembly: Assembly, session: Session, *, in_front: bool = False
+) -> Validation:
+    """Run the recipe on all pairs of the scenes and score it.
+
+    With ``in_front``, the inliers choose between the two rotations of an E, instead of the truth.
+    """
     report = run_pairs([true.pair for scene in scenes for true in scene.pairs], assembly, session)
     prior = assembly.recipe.focal is not None
     made = {  # if E is sought at known focal lengths, there is no MAGSAC alone
@@ -106,32 +152,52 @@ def validate(scenes: Sequence[TrainScene], assembly: Assembly, session: Session)
     steps = tuple(step for step in Step if made[step])
     records, scored = iter(report.records), []
     for scene in scenes:
-        pairs = tuple(score_record(true, next(records), scene, steps) for true in scene.pairs)
-        scored.append(SceneScore(scene.name, pairs, isfinite(scene.metres_per_unit)))
+        pairs = [score_record(true, next(records), scene, steps, in_front) for true in scene.pairs]
+        if not (in_metres := isfinite(scene.metres_per_unit)):
+            units = {unit.name: unit for unit in assembly.recipe.units}
+            with JournalReader(session.work_dir) as journal:
+                found = [journal.results(pair.record, units) for pair in pairs if pair.record]
+            pairs = [*map(with_matches, pairs, scene.pairs, found)]
+        scored.append(SceneScore(scene.name, tuple(pairs), in_metres))
     return Validation(assembly.recipe.name, tuple(scored), report, steps)
 
 
-def score_record(true: TruePair, record: PairRecord, scene: TrainScene, steps: Sequence[Step] = ()) -> PairScore:
-    """The score of a pair's record; the fallback row counts as a failure."""
+def with_matches(pair: PairScore, true: TruePair, results: Sequence[UnitResult]) -> PairScore:
+    """Return the pair's score with the precision and the matching score of what its units found."""
+    matches = Matches.concatenate(result.matches for result in results)
+    correct = metrics.correct_matches(matches, true.camera0, true.camera1)
+    keypoints = sum(result.keypoints for result in results)
+    is_known = all(result.keypoints or not len(result.matches) for result in results)
+    score = correct.sum() / max(keypoints, 1) if is_known else nan
+    return replace(pair, precision=correct.sum() / max(len(matches), 1), matching_score=score)
+
+
+def score_record(
+    true: TruePair, record: PairRecord, scene: TrainScene, steps: Sequence[Step] = (), in_front: bool = False
+) -> PairScore:
+    """Return the score of a pair's record; the fallback row counts as a failure."""
+    rotation = Rotation.from_rotvec(record.stats.rotation).as_matrix() if in_front else None
     own = None if record.failure else record.pair_fundamental
     matrices = {
         Step.MAGSAC: record.magsac_fundamental if Step.PRIOR in steps else own,
         Step.PRIOR: own,
         Step.SCENE: None if record.source == "fallback" else record.chosen_fundamental,
     }
-    errors = {step: error_of(matrix, true, scene) for step, matrix in matrices.items()}
+    errors = {step: error_of(matrix, true, scene, rotation) for step, matrix in matrices.items()}
     made = {step: errors[step] for step in steps}
     return PairScore(true.pair.id, true.covisibility, errors[Step.SCENE], record, made)
 
 
-def error_of(matrix: Matrix3 | None, true: TruePair, scene: TrainScene) -> PoseError:
-    """The error of a pair's F, or of its E if that is what was estimated; infinite if there is none."""
+def error_of(
+    matrix: Matrix3 | None, true: TruePair, scene: TrainScene, rotation: Matrix3 | None = None
+) -> PoseError:
+    """Return the error of a pair's F, or of its E, whose rotation may be given; infinite if there is none."""
     if matrix is None:
         return PoseError.failed()
-    camera0, camera1 = true.camera0, true.camera1
-    if true.pair.model is ModelKind.E:
-        camera0, camera1 = camera0.calibrated, camera1.calibrated
-    return metrics.pose_error(matrix, camera0, camera1, scene.metres_per_unit)
+    if true.pair.model is ModelKind.F:
+        return metrics.pose_error(matrix, true.camera0, true.camera1, scene.metres_per_unit)
+    camera0, camera1 = true.camera0.calibrated, true.camera1.calibrated
+    return metrics.pose_error(matrix, camera0, camera1, scene.metres_per_unit, rotation)
 
 
 def score_submission(submission: Path, truth: Path, scenes: Sequence[TrainScene]) -> Validation:
@@ -161,17 +227,19 @@ def score_submission(submission: Path, truth: Path, scenes: Sequence[TrainScene]
 
 
 def score_table(validation: Validation) -> list[str]:
-    """Lines: a row for each scene and their mean; a dash for the mAA of unknown metres.
+    """Lines: a row for each scene and their mean; a dash for unknown figures.
 
-    The columns are the mAA, after each step if there are several, and the pose AUC after the last.
+    The columns are the mAA, after each step if there are several, and the pose AUC after the last. Lists of pairs
+    also have precision and matching score.
     """
-    several = len(validation.steps) > 1
+    several, is_list = len(validation.steps) > 1, not all(scene.in_metres for scene in validation.scenes)
     heads = [*(validation.steps if several else ["mAA"]), *(f"AUC {angle:.0f}" for angle in AUC_THRESHOLDS)]
+    heads += ["precis.", "m.score"] if is_list else []
     lines = [f"{'scene':<20}{'pairs':>6}" + "".join(f"{head:>9}" for head in heads)]
     rows: list[tuple[str, SceneScore | Validation]] = [(scene.scene, scene) for scene in validation.scenes]
     for name, scores in [*rows, ("mean over scenes", validation)]:
         accuracies = map(scores.maa, validation.steps or [None])
-        values = (*accuracies, *map(scores.auc, AUC_THRESHOLDS))
+        values = (*accuracies, *map(scores.auc, AUC_THRESHOLDS), *(scores.matching() if is_list else ()))
         cells = (f"{value:>9.4f}" if isfinite(value) else f"{'-':>9}" for value in values)
         lines.append(f"{name:<20}{len(scores.errors):>6}" + "".join(cells))
     return ["mAA after each step, AUC after the last:", *lines] if several else lines
@@ -212,6 +280,7 @@ def _scores_json(scores: SceneScore | Validation, steps: Sequence[Step]) -> dict
         "mAA": _finite(scores.maa()),
         "mAA_by_step": {step: _finite(scores.maa(step)) for step in steps},
         "AUC": {f"{threshold:g}": scores.auc(threshold) for threshold in AUC_THRESHOLDS},
+        **dict(zip(("precision", "matching_score"), map(_finite, scores.matching()), strict=True)),
     }
 
 
@@ -230,6 +299,8 @@ def _pair_json(pair: PairScore) -> dict[str, Any]:
         "rotation_error_degrees": _finite(pair.error.rotation),
         "translation_error_metres": _finite(pair.error.translation),
         "translation_error_degrees": _finite(pair.error.translation_angle),
+        "precision": _finite(pair.precision),
+        "matching_score": _finite(pair.matching_score),
         "accuracy_by_step": {step: metrics.pair_accuracy(error) for step, error in pair.steps.items()},
     }
     if (record := pair.record) is not None:

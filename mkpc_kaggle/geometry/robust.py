@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from mkpc_kaggle.config import POSITIVE, Range, check_ranges
 from mkpc_kaggle.geometry.coordinates import Matrix3
@@ -21,6 +22,7 @@ from mkpc_kaggle.geometry.two_view import Vectors, robust_costs, sampson
 # The F of a pure sideways motion, [e_x]_x: finite, rank 2; epipolar lines are the image rows.
 FALLBACK_FUNDAMENTAL: Matrix3 = np.array([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 FALLBACK_FUNDAMENTAL.setflags(write=False)
+FARTHEST = 1e9  # baselines; matches that are farther do not count as in front of a camera
 
 
 class ModelKind(StrEnum):
@@ -36,6 +38,14 @@ class Method(StrEnum):
     RANSAC = "ransac"
 
 
+class Pixel(StrEnum):
+    """The unit of a threshold: a pixel of the stored image, or of its largest or smallest view in stage 1."""
+
+    STORED = "stored"
+    LARGEST = "largest"
+    SMALLEST = "smallest"
+
+
 @dataclass(frozen=True)
 class RobustConfig:
     """Settings of :func:`estimate`, table ``[magsac]`` of a recipe.
@@ -45,10 +55,12 @@ class RobustConfig:
     """
 
     method: Method = Method.MAGSAC
-    threshold: float = 0.2  # image pixels
+    threshold: float = 0.2  # in units of ``pixel``
     confidence: float = 0.99999
     max_iterations: int = 50_000
     permutations: int = 8  # fixed; the first is the matches' own order
+    pixel: Pixel = Pixel.STORED
+    every_match: bool = False  # keep exact duplicates, and estimate from as few matches as the solver accepts
 
     def __post_init__(self) -> None:
         check_ranges(self, threshold=POSITIVE, confidence=Range(0, 1, "()"), max_iterations=Range(1, 10**6))
@@ -68,6 +80,7 @@ class EstimateStats:
     magsac_cost: float = 0.0  # that of the F of MAGSAC alone, 0 where it finds none
     focals: tuple[float, float] = (0.0, 0.0)  # in pixels, of both images; 0 where the winner has none
     support: float = 0.0  # see :mod:`mkpc_kaggle.geometry.overlap`
+    rotation: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of an E, see :func:`rotation_in_front`
 
 
 NO_STATS = EstimateStats()
@@ -102,16 +115,16 @@ def estimate(
     model: ModelKind = ModelKind.F,
     intrinsics: tuple[Matrix3, Matrix3] | None = None,
 ) -> Estimate:
-    """The model of that kind that ``matches`` (image pixels) agree on.
+    """Estimate the model of that kind from ``matches``, in image pixels, as the threshold is.
 
-    Non-finite points and exact duplicates are left out first; an inlier's duplicates are inliers too. E
-    needs the two camera matrices, (3, 3) each: the points are then calibrated and the threshold is divided
-    by the mean focal length. Raises ``ValueError`` for E without intrinsics, and never on account of the
-    points. The same input gives the same bytes.
+    Non-finite points and, unless the settings keep them, exact duplicates are left out first; an inlier's
+    duplicates are inliers too. E needs the two camera matrices, (3, 3) each: the points are then calibrated and
+    the threshold is divided by the mean focal length. Raises ``ValueError`` for E without intrinsics, and never on
+    account of the points. The same input gives the same bytes.
     """
     if model is ModelKind.E and intrinsics is None:
         raise ValueError("an essential matrix needs the intrinsics, the camera matrix K of both images")
-    distinct = DistinctMatches.of(matches)
+    distinct = DistinctMatches.of(matches, merge=not config.every_match)
     found = consensus(distinct.points0, distinct.points1, config, model, intrinsics)
     return replace(found, inliers=distinct.mask_of_all(found.inliers))
 
@@ -125,7 +138,7 @@ def consensus(
 ) -> Estimate:
     """:func:`estimate` for (N, 2) finite points without duplicates."""
     count, threshold, solver = len(points0), config.threshold, _SOLVERS[model]
-    if count < solver.min_matches:
+    if count < (solver.minimal if config.every_match else solver.min_matches):
         return Estimate.failed(model, count, f"too few distinct matches for {model}: {count}")
     if intrinsics is not None and model is ModelKind.E:
         points0, points1 = calibrate(points0, intrinsics[0]), calibrate(points1, intrinsics[1])
@@ -159,21 +172,23 @@ def consensus(
 
 @dataclass(frozen=True, eq=False)
 class DistinctMatches:
-    """The finite distinct matches among N, in order of first appearance."""
+    """The finite distinct matches among N, in order of first appearance; without ``merge`` all finite matches."""
 
     points0: Vectors  # (M, 2)
     points1: Vectors
     index: NDArray[np.intp]  # (N,) the row of each match in them, -1 for a match that is not finite
 
     @classmethod
-    def of(cls, matches: Matches) -> "DistinctMatches":
+    def of(cls, matches: Matches, *, merge: bool = True) -> "DistinctMatches":
         pairs = np.hstack([matches.points0, matches.points1]).astype(np.float64)
+        if not merge:
+            pairs = np.column_stack([pairs, np.arange(len(pairs))])
         finite = np.isfinite(pairs).all(axis=1)
         _, first, inverse = np.unique(pairs[finite], axis=0, return_index=True, return_inverse=True)
         index = np.full(len(pairs), -1)
         index[finite] = np.argsort(np.argsort(first))[inverse.ravel()]
         pairs = pairs[finite][np.sort(first)]
-        return cls(pairs[:, :2], pairs[:, 2:], index)
+        return cls(pairs[:, :2], pairs[:, 2:4], index)
 
     def mask_of_all(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """An (M,) mask of the distinct matches as an (N,) mask of all: duplicates are like the first."""
@@ -184,10 +199,21 @@ def unit_norm(matrix: Matrix3) -> Matrix3:
     return np.asarray(matrix / np.linalg.norm(matrix))
 
 
-def calibrate(points: Vectors, K: Matrix3) -> Vectors:
+def calibrate(points: NDArray[np.floating], K: Matrix3) -> Vectors:
     """(N, 2) pixels -> (N, 2) coordinates in the plane z = 1 of the camera with matrix K."""
     mapped = homogeneous(points) @ np.linalg.inv(K).T
     return np.asarray(mapped[:, :2] / mapped[:, 2:])
+
+
+def rotation_in_front(
+    E: Matrix3, matches: Matches, intrinsics: tuple[Matrix3, Matrix3]
+) -> tuple[float, float, float]:
+    """Return the rotation of E that puts most matches in front of both cameras: its axis times radians."""
+    x0, x1 = (
+        calibrate(points, K) for points, K in zip((matches.points0, matches.points1), intrinsics, strict=True)
+    )
+    x, y, z = Rotation.from_matrix(cv2.recoverPose(E, x0, x1, np.eye(3), FARTHEST)[1]).as_rotvec().tolist()
+    return x, y, z
 
 
 def sampson_distances(F: Matrix3, matches: Matches) -> Vectors:
@@ -203,7 +229,7 @@ def permutation(number: int, count: int) -> NDArray[np.intp]:
     return np.random.default_rng(number).permutation(count) if number else np.arange(count)
 
 
-def homogeneous(points: Vectors) -> Vectors:
+def homogeneous(points: NDArray[np.floating]) -> Vectors:
     """(N, 2) -> (N, 3), the third 1."""
     return np.column_stack([points, np.ones(len(points))])
 
@@ -219,6 +245,7 @@ def _transfer_distances(matrix: Matrix3, points0: Vectors, points1: Vectors) -> 
 
 
 class _Solver(NamedTuple):
+    minimal: int  # the fewest matches that OpenCV accepts
     min_matches: int  # more than the minimal solver takes, so that they tell a model
     fallback: Matrix3
     find: Callable[..., Any]  # OpenCV's matrix and mask, ``None`` where no model is found
@@ -227,11 +254,18 @@ class _Solver(NamedTuple):
 
 def _find_essential(points0: Vectors, points1: Vectors, confidence: float, **settings: Any) -> Any:
     settings["threshold"] = settings.pop("ransacReprojThreshold")
-    return cv2.findEssentialMat(points0, points1, np.eye(3), prob=confidence, **settings)
+    stacked, mask = cv2.findEssentialMat(points0, points1, np.eye(3), prob=confidence, **settings)
+    if stacked is None or len(stacked) <= 3:
+        return stacked, mask
+
+    def in_front(E: Any) -> int:
+        return int(cv2.recoverPose(E, points0, points1, np.eye(3), FARTHEST)[0])
+
+    return max(np.split(stacked, len(stacked) // 3), key=in_front), mask  # of five points up to ten
 
 
 _SOLVERS = {
-    ModelKind.F: _Solver(8, FALLBACK_FUNDAMENTAL, cv2.findFundamentalMat, _epipolar_distances),
-    ModelKind.E: _Solver(6, FALLBACK_FUNDAMENTAL, _find_essential, _epipolar_distances),
-    ModelKind.H: _Solver(5, np.eye(3), cv2.findHomography, _transfer_distances),
+    ModelKind.F: _Solver(8, 8, FALLBACK_FUNDAMENTAL, cv2.findFundamentalMat, _epipolar_distances),
+    ModelKind.E: _Solver(5, 6, FALLBACK_FUNDAMENTAL, _find_essential, _epipolar_distances),
+    ModelKind.H: _Solver(4, 5, np.eye(3), cv2.findHomography, _transfer_distances),
 }

@@ -1,5 +1,6 @@
 """A run's parts put together: a recipe, the weights it finds, the device, the matchers."""
 
+import hashlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -7,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from mkpc_kaggle.errors import warn_once
+from mkpc_kaggle.geometry.coordinates import Box
 from mkpc_kaggle.matchers.contract import Matcher, Placement, Precision
 from mkpc_kaggle.matchers.registry import load_matcher
 from mkpc_kaggle.pipeline.availability import (
@@ -39,6 +41,7 @@ class Assembly:
     matchers: Mapping[str, Matcher[Any]] = field(default_factory=dict)  # ready matchers of the user's own
     device: str = AUTO  # as the user asked for it
     sharing: int = 1  # workers on the placement's device
+    regions: Mapping[tuple[str, ...], tuple[Box, Box]] = field(default_factory=dict)  # in MKPC's place, by images
 
     @property
     def devices(self) -> tuple[str, ...]:
@@ -75,6 +78,7 @@ class Assembly:
             minibatch=self.minibatch,
             cache_bytes=cache_bytes,
             load_float32=None if exact == self.placement else lambda name: self._load(name, exact),
+            regions=self.regions,
         )
 
     def fingerprint(self) -> dict[str, Any]:
@@ -86,6 +90,9 @@ class Assembly:
             "recipe": self.recipe.matching(),
             "precision": self.placement.precision,
             "weights": {slot: file.digest for slot, file in self.weight_files.items()},
+            "regions": hashlib.sha256(repr(sorted(self.regions.items())).encode()).hexdigest()
+            if self.regions
+            else "",
         }
 
     @property
