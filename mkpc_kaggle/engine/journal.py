@@ -30,7 +30,7 @@ from mkpc_kaggle.errors import UserError, writing
 from mkpc_kaggle.pipeline.pair import UnitResult
 from mkpc_kaggle.recipe import Unit
 
-FORMAT = 10
+FORMAT = 11
 FILE_NAME = "journal.sqlite"
 LOCK_NAME = "journal.lock"
 

@@ -34,15 +34,18 @@ class UnitRecord:
     match_seconds: float
     failure: str
     note: str = ""  # why the unit ran otherwise than it is written
+    keypoints: int = 0  # detected in the first view; 0 for a matcher without a detector
 
     @classmethod
     def of(cls, found: UnitResult, inliers: int) -> "UnitRecord":
         unit, seconds = found.unit, (found.encode_seconds, found.match_seconds)
-        return cls(unit.name, unit.stage, len(found.matches), inliers, *seconds, found.failure, found.note)
+        counts = len(found.matches), inliers
+        return cls(unit.name, unit.stage, *counts, *seconds, found.failure, found.note, found.keypoints)
 
     def result(self, unit: Unit, matches: Matches) -> UnitResult:
         """What the record was made of."""
-        return UnitResult(unit, matches, self.encode_seconds, self.match_seconds, self.failure, note=self.note)
+        seconds = self.encode_seconds, self.match_seconds
+        return UnitResult(unit, matches, *seconds, self.failure, note=self.note, keypoints=self.keypoints)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
