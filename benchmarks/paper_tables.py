@@ -23,7 +23,8 @@ from mkpc_kaggle.data.pairs import read_pairs
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.session import Session, interruptible
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.evaluation.validate import PROTOCOLS, Validation, by_protocol, shared_directory, validate
+from mkpc_kaggle.evaluation.protocols import PROTOCOLS, by_protocol
+from mkpc_kaggle.evaluation.validate import Validation, shared_directory, validate
 from mkpc_kaggle.geometry.metrics import AUC_THRESHOLDS
 from mkpc_kaggle.geometry.robust import Method
 from mkpc_kaggle.pipeline.assembly import Assembly, assemble
@@ -69,7 +70,7 @@ def table(name: str, given: argparse.Namespace) -> Iterator[str]:
             scores = run(assembly, shared_directory(directory, assembly, done), scenes, given)
             own = [scores.maa()] * 2 if is_imc else [100 * scores.auc(limit) for limit in AUC_THRESHOLDS]
             differences.append([mine - other for mine, other in zip(own, published, strict=True)])
-            cells = own[:1] if is_imc else [*own, *(100 * share for share in scores.matching())]
+            cells = own[:1] if is_imc else [*own, *(100 * share for share in scores.matching)]
             cells = [f"{cell:.{4 if is_imc else 2}f}" for cell in cells]
             yield f"| {' | '.join([row, method, *cells, *map(str, published)])} |"
     means = [f"{mean(column):+.4f}" for column in zip(*differences, strict=True)]

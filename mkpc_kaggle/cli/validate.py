@@ -20,16 +20,9 @@ from mkpc_kaggle.engine.session import Session, interruptible
 from mkpc_kaggle.errors import UserError, writing
 from mkpc_kaggle.evaluation.compare import Comparison, comparison_json, comparison_table, step_gains
 from mkpc_kaggle.evaluation.imc2025 import score_imc2025, score_lines
-from mkpc_kaggle.evaluation.validate import (
-    PROTOCOLS,
-    by_protocol,
-    missing_rows,
-    score_submission,
-    score_table,
-    shared_directory,
-    to_json,
-    validate,
-)
+from mkpc_kaggle.evaluation.protocols import PROTOCOLS, by_protocol
+from mkpc_kaggle.evaluation.validate import missing_rows, score_submission, score_table, shared_directory, to_json
+from mkpc_kaggle.evaluation.validate import validate as validation_of
 from mkpc_kaggle.geometry.robust import Method, RobustConfig
 from mkpc_kaggle.pipeline.assembly import Assembly
 from mkpc_kaggle.recipe import Recipe, split_mode
@@ -163,7 +156,7 @@ def _match_and_score(arguments: argparse.Namespace, scenes: tuple[TrainScene, ..
             directory = shared_directory(work_dir / re.sub(r"[^\w.-]+", "_", text), assembly, done)
             session = Session(directory, options.budget_of(arguments), interrupt, workers=arguments.workers)
             in_front = arguments.in_front or arguments.protocol is not None
-            validation = validate(scenes, assembly, session, in_front=in_front)
+            validation = validation_of(scenes, assembly, session, in_front=in_front)
             validations.append(validation)
             report = validation.report
             assert report is not None

@@ -8,6 +8,7 @@ A file ``.npz``, or a directory of such files, is LoFTR's list of MegaDepth-1500
 """
 
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from itertools import chain
@@ -54,11 +55,11 @@ def read_pairs(file: Path, image_root: Path, *, most: int | None = None) -> Trai
     if not listed:
         raise UserError(f"{file} has no pairs; expected lines {EXPECTED}")
 
-    size_in_root = cache(lambda name: size_of(str(image_root / name)))
+    size = cache(size_of)
 
     def upright(image: ListedImage) -> Camera:
-        size = size_in_root(image.name) if image.turns else None
-        return image.camera.rotated_90(image.turns, size) if size else image.camera
+        known = size(image_root / image.name) if image.turns else None
+        return image.camera.rotated_90(image.turns, known) if known else image.camera
 
     pairs = []
     for number, images in evenly_spread(listed, most):
@@ -74,30 +75,29 @@ def read_regions(file: Path, image_root: Path, pairs: Iterable[Pair]) -> dict[tu
     """Return the boxes for stage 2 of these pairs by the files of their images.
 
     ``file`` is a table ``image_0,image_1,box_0,box_1``: paths under the root; left, top, right and bottom in whole
-    pixels, the latter two exclusive. Raises :class:`UserError` for a malformed table, for a box that leaves its
-    image, and where a pair is missing.
+    pixels, the latter two exclusive. Raises :class:`UserError` for a malformed table or box and a missing pair.
     """
-    rows, found = {}, dict[tuple[str, ...], tuple[Box, Box]]()
-    for where, (*names, cell0, cell1) in read_rows(file, ("image_0", "image_1", "box_0", "box_1")):
-        rows[tuple(str(image_root / name) for name in names)] = where, cell0, cell1
-    size = cache(size_of)
+    rows, found, size = {}, dict[tuple[str, ...], tuple[Box, Box]](), cache(size_of)
+    for where, (name0, name1, *cells) in read_rows(file, ("image_0", "image_1", "box_0", "box_1")):
+        rows[str(image_root / name0), str(image_root / name1)] = where, *cells
     for pair in pairs:
         files = pair.file0, pair.file1
         if files not in rows:
             raise UserError(f"{file} has no regions of the pair {pair.id}")
-        where, *cells = rows[files]
-        try:
-            box0, box1 = (Box(*map(int, cell.split())) for cell in cells)
-        except (ValueError, TypeError) as error:
-            raise UserError(f"{where}: expected boxes of 4 integers, left top right bottom: {error}") from error
-        for name, box in zip(files, (box0, box1), strict=True):
-            if (known := size(name)) and not box.is_within(known):
-                raise UserError(f"{where}: {box} leaves {name}, {known.width} x {known.height} pixels")
-        found[files] = box0, box1
+        where, cell0, cell1 = rows[files]
+        found[files] = parse_box(cell0, size(files[0]), where), parse_box(cell1, size(files[1]), where)
     return found
 
 
-def size_of(path: str) -> Size | None:
+def parse_box(cell: str, size: Size | None, where: str) -> Box:
+    with suppress(ValueError, TypeError):
+        box = Box(*map(int, cell.split()))
+        if size is None or box.is_within(size):
+            return box
+    raise UserError(f"{where}: expected left, top, right and bottom of a box on its image, found {cell!r}")
+
+
+def size_of(path: str | Path) -> Size | None:
     image = read_image(Path(path))
     return None if isinstance(image, Unreadable) else image.size
 

@@ -1,6 +1,5 @@
 """Runs the engine on a train side and scores it as the competition does."""
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
@@ -21,19 +20,11 @@ from mkpc_kaggle.geometry import metrics
 from mkpc_kaggle.geometry.coordinates import Matrix3
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.metrics import AUC_THRESHOLDS, PoseError
-from mkpc_kaggle.geometry.robust import Method, ModelKind, Pixel, RobustConfig
+from mkpc_kaggle.geometry.robust import ModelKind
 from mkpc_kaggle.pipeline.assembly import Assembly
 from mkpc_kaggle.pipeline.pair import UnitResult
-from mkpc_kaggle.recipe import Recipe
 
 MAX_NAMES = 5  # of samples, in a line
-
-
-# Of SuperGlue's evaluation of YFCC100M and ScanNet, and of LoFTR's of MegaDepth.
-PROTOCOLS = {
-    "superglue": RobustConfig(Method.RANSAC, 1.0, 0.99999, 1000, 1, Pixel.LARGEST, every_match=True),
-    "loftr": RobustConfig(Method.RANSAC, 0.5, 0.99999, 1000, 1, Pixel.STORED, every_match=True),
-}
 
 
 class Step(StrEnum):
@@ -48,9 +39,8 @@ class Step(StrEnum):
 class PairScore:
     """One pair's error, infinite for a failed pair, and its record if the engine made it.
 
-    ``steps`` are the errors after each :class:`Step` that was made; the last is ``error``. For a pair of a list,
-    ``precision`` is the share of correct matches, and ``matching_score`` their number over the number of keypoints
-    in the first image, NaN where the latter is unknown.
+    ``steps`` are the errors after each :class:`Step` that was made; the last is ``error``. For pairs of a list,
+    ``matching`` is the precision and the matching score: correct matches over all, and over keypoints of image 0.
     """
 
     id: str
@@ -58,8 +48,7 @@ class PairScore:
     error: PoseError
     record: PairRecord | None = None
     steps: Mapping[Step, PoseError] = field(default_factory=dict)
-    precision: float = nan
-    matching_score: float = nan
+    matching: tuple[float, float] = (nan, nan)
 
 
 @dataclass(frozen=True)
@@ -85,9 +74,9 @@ class SceneScore:
     def auc(self, threshold: float) -> float:
         return metrics.pose_auc(self.errors, threshold)
 
-    def matching(self) -> tuple[float, float]:
-        """Return the mean precision and the mean matching score."""
-        return mean(pair.precision for pair in self.pairs), mean(pair.matching_score for pair in self.pairs)
+    @property
+    def matching(self) -> list[float]:
+        return [mean(column) for column in zip(*(pair.matching for pair in self.pairs), strict=True)]
 
 
 @dataclass(frozen=True)
@@ -111,19 +100,13 @@ class Validation:
     def auc(self, threshold: float) -> float:
         return mean(scene.auc(threshold) for scene in self.scenes)
 
-    def matching(self) -> tuple[float, float]:
-        precisions, scores = zip(*(scene.matching() for scene in self.scenes), strict=True)
-        return mean(precisions), mean(scores)
+    @property
+    def matching(self) -> list[float]:
+        return [mean(column) for column in zip(*(scene.matching for scene in self.scenes), strict=True)]
 
     @property
     def errors(self) -> list[PoseError]:
         return [error for scene in self.scenes for error in scene.errors]
-
-
-def by_protocol(recipe: Recipe, protocol: str) -> Recipe:
-    """Return the recipe with the settings of one of :data:`PROTOCOLS`. These also score rotations ``in_front``."""
-    units = tuple(replace(unit, antialias=False) for unit in recipe.units)
-    return replace(recipe, units=units, magsac=PROTOCOLS[protocol], focal=None, scene=None)
 
 
 def shared_directory(directory: Path, assembly: Assembly, done: dict[Path, Assembly]) -> Path:
@@ -138,10 +121,7 @@ def shared_directory(directory: Path, assembly: Assembly, done: dict[Path, Assem
 def validate(
     scenes: Sequence[TrainScene], assembly: Assembly, session: Session, *, in_front: bool = False
 ) -> Validation:
-    """Run the recipe on all pairs of the scenes and score it.
-
-    With ``in_front``, the inliers choose between the two rotations of an E, instead of the truth.
-    """
+    """Run the recipe on all pairs and score it; with ``in_front`` the inliers choose the rotation of an E."""
     report = run_pairs([true.pair for scene in scenes for true in scene.pairs], assembly, session)
     prior = assembly.recipe.focal is not None
     made = {  # if E is sought at known focal lengths, there is no MAGSAC alone
@@ -163,13 +143,13 @@ def validate(
 
 
 def with_matches(pair: PairScore, true: TruePair, results: Sequence[UnitResult]) -> PairScore:
-    """Return the pair's score with the precision and the matching score of what its units found."""
+    """Return the pair's score with the quality of its units' matches; its matching score may be unknown, NaN."""
     matches = Matches.concatenate(result.matches for result in results)
     correct = metrics.correct_matches(matches, true.camera0, true.camera1)
     keypoints = sum(result.keypoints for result in results)
     is_known = all(result.keypoints or not len(result.matches) for result in results)
     score = correct.sum() / max(keypoints, 1) if is_known else nan
-    return replace(pair, precision=correct.sum() / max(len(matches), 1), matching_score=score)
+    return replace(pair, matching=(correct.sum() / max(len(matches), 1), score))
 
 
 def score_record(
@@ -194,9 +174,9 @@ def error_of(
     """Return the error of a pair's F, or of its E, whose rotation may be given; infinite if there is none."""
     if matrix is None:
         return PoseError.failed()
-    if true.pair.model is ModelKind.F:
-        return metrics.pose_error(matrix, true.camera0, true.camera1, scene.metres_per_unit)
-    camera0, camera1 = true.camera0.calibrated, true.camera1.calibrated
+    camera0, camera1 = true.camera0, true.camera1
+    if true.pair.model is ModelKind.E:
+        camera0, camera1 = camera0.calibrated, camera1.calibrated
     return metrics.pose_error(matrix, camera0, camera1, scene.metres_per_unit, rotation)
 
 
@@ -239,7 +219,7 @@ def score_table(validation: Validation) -> list[str]:
     rows: list[tuple[str, SceneScore | Validation]] = [(scene.scene, scene) for scene in validation.scenes]
     for name, scores in [*rows, ("mean over scenes", validation)]:
         accuracies = map(scores.maa, validation.steps or [None])
-        values = (*accuracies, *map(scores.auc, AUC_THRESHOLDS), *(scores.matching() if is_list else ()))
+        values = (*accuracies, *map(scores.auc, AUC_THRESHOLDS), *(scores.matching if is_list else ()))
         cells = (f"{value:>9.4f}" if isfinite(value) else f"{'-':>9}" for value in values)
         lines.append(f"{name:<20}{len(scores.errors):>6}" + "".join(cells))
     return ["mAA after each step, AUC after the last:", *lines] if several else lines
@@ -257,17 +237,11 @@ def missing_rows(validation: Validation) -> list[str]:
 def to_json(validation: Validation) -> dict[str, Any]:
     """All figures of a validation as JSON values: overall, per scene, per pair; what is not finite is null."""
     steps, report = validation.steps, validation.report
-    records = report.records if report else ()
-    reasons = Counter(str(region.reason) for record in records for region in record.regions or ())
     return {
         "recipe": validation.recipe,
         "missing": validation.missing,
         **_scores_json(validation, steps),
         "seconds": report and report.seconds,
-        "seconds_per_pair": report and report.seconds / len(records),
-        "matches_by_stage": _stage_means(records, "matches"),
-        "inliers_by_stage": _stage_means(records, "inliers"),
-        "region_reasons": dict(reasons),
         "scenes": [
             {"scene": scene.scene, **_scores_json(scene, steps), "pairs": [*map(_pair_json, scene.pairs)]}
             for scene in validation.scenes
@@ -280,16 +254,8 @@ def _scores_json(scores: SceneScore | Validation, steps: Sequence[Step]) -> dict
         "mAA": _finite(scores.maa()),
         "mAA_by_step": {step: _finite(scores.maa(step)) for step in steps},
         "AUC": {f"{threshold:g}": scores.auc(threshold) for threshold in AUC_THRESHOLDS},
-        **dict(zip(("precision", "matching_score"), map(_finite, scores.matching()), strict=True)),
+        **_matching_json(scores),
     }
-
-
-def _stage_means(records: Sequence[PairRecord], what: str) -> dict[str, float]:
-    """Mean number of matches or inliers on a pair, by stage."""
-    sums = Counter[int]()
-    for unit in (unit for record in records for unit in record.units):
-        sums[unit.stage] += getattr(unit, what)
-    return {str(stage): sums[stage] / len(records) for stage in sorted(sums)}
 
 
 def _pair_json(pair: PairScore) -> dict[str, Any]:
@@ -299,8 +265,7 @@ def _pair_json(pair: PairScore) -> dict[str, Any]:
         "rotation_error_degrees": _finite(pair.error.rotation),
         "translation_error_metres": _finite(pair.error.translation),
         "translation_error_degrees": _finite(pair.error.translation_angle),
-        "precision": _finite(pair.precision),
-        "matching_score": _finite(pair.matching_score),
+        **_matching_json(pair),
         "accuracy_by_step": {step: metrics.pair_accuracy(error) for step, error in pair.steps.items()},
     }
     if (record := pair.record) is not None:
@@ -308,6 +273,11 @@ def _pair_json(pair: PairScore) -> dict[str, Any]:
         values["matches"] = {unit.unit: unit.matches for unit in record.units}
         values["regions"] = [str(region.reason) for region in record.regions or ()]
     return values
+
+
+def _matching_json(scores: PairScore | SceneScore | Validation) -> dict[str, Any]:
+    precision, matching_score = map(_finite, scores.matching)
+    return {"precision": precision, "matching_score": matching_score}
 
 
 def _finite(value: float) -> float | None:

@@ -52,7 +52,6 @@ class Box:
         return self.size.width * self.size.height
 
     def is_within(self, size: Size) -> bool:
-        """Whether it lies on an image of that size."""
         return min(self.left, self.top) >= 0 and self.right <= size.width and self.bottom <= size.height
 
     def contains(self, points: NDArray[np.floating]) -> NDArray[np.bool_]:

@@ -90,9 +90,7 @@ def correct_matches(matches: Matches, camera0: Camera, camera1: Camera) -> NDArr
     """Return an (N,) mask of the matches that the true cameras confirm, by :data:`CORRECT`."""
     R, t = relative_pose(camera0, camera1)
     E = cross_matrix(t) @ R
-    x0, x1 = (
-        homogeneous(calibrate(*each)) for each in ((matches.points0, camera0.K), (matches.points1, camera1.K))
-    )
+    x0, x1 = homogeneous(calibrate(matches.points0, camera0.K)), homogeneous(calibrate(matches.points1, camera1.K))
     lines0, lines1 = x1 @ E, x0 @ E.T
     with np.errstate(divide="ignore", invalid="ignore"):  # cameras with one centre confirm nothing
         inverse = 1 / (lines0[:, :2] ** 2).sum(axis=1) + 1 / (lines1[:, :2] ** 2).sum(axis=1)

@@ -38,14 +38,6 @@ class Method(StrEnum):
     RANSAC = "ransac"
 
 
-class Pixel(StrEnum):
-    """The unit of a threshold: a pixel of the stored image, or of its largest or smallest view in stage 1."""
-
-    STORED = "stored"
-    LARGEST = "largest"
-    SMALLEST = "smallest"
-
-
 @dataclass(frozen=True)
 class RobustConfig:
     """Settings of :func:`estimate`, table ``[magsac]`` of a recipe.
@@ -55,16 +47,16 @@ class RobustConfig:
     """
 
     method: Method = Method.MAGSAC
-    threshold: float = 0.2  # in units of ``pixel``
+    threshold: float = 0.2  # pixels of the stored image
     confidence: float = 0.99999
     max_iterations: int = 50_000
     permutations: int = 8  # fixed; the first is the matches' own order
-    pixel: Pixel = Pixel.STORED
+    threshold_side: int = 0  # if given, the threshold's pixels are those of the image resized to this long side
     every_match: bool = False  # keep exact duplicates, and estimate from as few matches as the solver accepts
 
     def __post_init__(self) -> None:
         check_ranges(self, threshold=POSITIVE, confidence=Range(0, 1, "()"), max_iterations=Range(1, 10**6))
-        check_ranges(self, permutations=Range(1, 100))
+        check_ranges(self, permutations=Range(1, 100), threshold_side=Range(0, 99_999))
 
 
 @dataclass(frozen=True)
@@ -80,7 +72,7 @@ class EstimateStats:
     magsac_cost: float = 0.0  # that of the F of MAGSAC alone, 0 where it finds none
     focals: tuple[float, float] = (0.0, 0.0)  # in pixels, of both images; 0 where the winner has none
     support: float = 0.0  # see :mod:`mkpc_kaggle.geometry.overlap`
-    rotation: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of an E, see :func:`rotation_in_front`
+    rotation: tuple[float, ...] = (0.0, 0.0, 0.0)  # of an E, see :func:`rotation_in_front`
 
 
 NO_STATS = EstimateStats()
@@ -205,15 +197,12 @@ def calibrate(points: NDArray[np.floating], K: Matrix3) -> Vectors:
     return np.asarray(mapped[:, :2] / mapped[:, 2:])
 
 
-def rotation_in_front(
-    E: Matrix3, matches: Matches, intrinsics: tuple[Matrix3, Matrix3]
-) -> tuple[float, float, float]:
-    """Return the rotation of E that puts most matches in front of both cameras: its axis times radians."""
-    x0, x1 = (
-        calibrate(points, K) for points, K in zip((matches.points0, matches.points1), intrinsics, strict=True)
-    )
-    x, y, z = Rotation.from_matrix(cv2.recoverPose(E, x0, x1, np.eye(3), FARTHEST)[1]).as_rotvec().tolist()
-    return x, y, z
+def rotation_in_front(E: Matrix3, matches: Matches, intrinsics: tuple[Matrix3, Matrix3]) -> list[float]:
+    """Return the rotation of E that puts most matches in front of both cameras: (3,) its axis times radians."""
+    x0, x1 = calibrate(matches.points0, intrinsics[0]), calibrate(matches.points1, intrinsics[1])
+    _, R, *_ = cv2.recoverPose(E, x0, x1, np.eye(3), FARTHEST)
+    rotation: list[float] = Rotation.from_matrix(R).as_rotvec().tolist()
+    return rotation
 
 
 def sampson_distances(F: Matrix3, matches: Matches) -> Vectors:
@@ -257,11 +246,8 @@ def _find_essential(points0: Vectors, points1: Vectors, confidence: float, **set
     stacked, mask = cv2.findEssentialMat(points0, points1, np.eye(3), prob=confidence, **settings)
     if stacked is None or len(stacked) <= 3:
         return stacked, mask
-
-    def in_front(E: Any) -> int:
-        return int(cv2.recoverPose(E, points0, points1, np.eye(3), FARTHEST)[0])
-
-    return max(np.split(stacked, len(stacked) // 3), key=in_front), mask  # of five points up to ten
+    solutions = np.split(stacked, len(stacked) // 3)  # of five points, up to ten
+    return max(solutions, key=lambda E: cv2.recoverPose(E, points0, points1, np.eye(3), FARTHEST)[0]), mask
 
 
 _SOLVERS = {

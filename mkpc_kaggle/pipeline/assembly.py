@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from mkpc_kaggle.errors import warn_once
-from mkpc_kaggle.geometry.coordinates import Box
 from mkpc_kaggle.matchers.contract import Matcher, Placement, Precision
 from mkpc_kaggle.matchers.registry import load_matcher
 from mkpc_kaggle.pipeline.availability import (
@@ -22,7 +21,7 @@ from mkpc_kaggle.pipeline.availability import (
     unrefined,
 )
 from mkpc_kaggle.pipeline.devices import AUTO, gpus_of, require_device, resolve_placement
-from mkpc_kaggle.pipeline.stages import ENCODING_CACHE_BYTES, Pipeline
+from mkpc_kaggle.pipeline.stages import ENCODING_CACHE_BYTES, GivenRegions, Pipeline
 from mkpc_kaggle.recipe import Mode, Recipe, load_recipe
 from mkpc_kaggle.weights import FoundFile, State, WeightStore
 
@@ -41,7 +40,7 @@ class Assembly:
     matchers: Mapping[str, Matcher[Any]] = field(default_factory=dict)  # ready matchers of the user's own
     device: str = AUTO  # as the user asked for it
     sharing: int = 1  # workers on the placement's device
-    regions: Mapping[tuple[str, ...], tuple[Box, Box]] = field(default_factory=dict)  # in MKPC's place, by images
+    regions: GivenRegions = field(default_factory=dict)
 
     @property
     def devices(self) -> tuple[str, ...]:
@@ -90,9 +89,7 @@ class Assembly:
             "recipe": self.recipe.matching(),
             "precision": self.placement.precision,
             "weights": {slot: file.digest for slot, file in self.weight_files.items()},
-            "regions": hashlib.sha256(repr(sorted(self.regions.items())).encode()).hexdigest()
-            if self.regions
-            else "",
+            "regions": hashlib.sha256(repr(sorted(self.regions.items())).encode()).hexdigest(),
         }
 
     @property

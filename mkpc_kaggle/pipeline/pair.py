@@ -1,6 +1,5 @@
 """A pair on its way through the stages: results of units, critical regions, the two-view model."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -8,12 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mkpc_kaggle.data.images import Image
-from mkpc_kaggle.geometry.coordinates import Box, Matrix3, Size
+from mkpc_kaggle.geometry.coordinates import Box, Matrix3, Size, View
 from mkpc_kaggle.geometry.critical_region import CriticalRegion
 from mkpc_kaggle.geometry.focal_prior import FocalPrior, estimate_with_prior
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.overlap import support
-from mkpc_kaggle.geometry.robust import Estimate, ModelKind, Pixel, RobustConfig, estimate, rotation_in_front
+from mkpc_kaggle.geometry.robust import Estimate, ModelKind, RobustConfig, estimate, rotation_in_front
 from mkpc_kaggle.recipe import Recipe, Unit
 
 Regions = tuple[CriticalRegion, CriticalRegion]
@@ -85,7 +84,7 @@ def with_estimate(
     results = tuple(sorted(pair.results, key=lambda result: recipe.units.index(result.unit)))
     matches = Matches.concatenate(result.matches for result in results)
     sizes = pair.sizes or tuple(image.size for image in pair.images)
-    magsac = in_stored_pixels(recipe, sizes, intrinsics)
+    magsac = in_stored_pixels(recipe.magsac, sizes, intrinsics)
     if recipe.focal is None or model is ModelKind.H:
         found = estimate(matches, magsac, model, intrinsics)
     else:
@@ -99,23 +98,17 @@ def with_estimate(
         F = np.linalg.inv(K1).T @ found.matrix @ np.linalg.inv(K0)
         found = replace(found, stats=replace(found.stats, support=support(F, matches)))
         if model is ModelKind.E and intrinsics and found.inliers.any():
-            rotation = rotation_in_front(found.matrix, matches[found.inliers], intrinsics)
+            rotation = tuple(rotation_in_front(found.matrix, matches[found.inliers], intrinsics))
             found = replace(found, stats=replace(found.stats, rotation=rotation))
     return replace(pair, results=results, estimate=found)
 
 
 def in_stored_pixels(
-    recipe: Recipe, sizes: Sequence[Size], intrinsics: tuple[Matrix3, Matrix3] | None
+    magsac: RobustConfig, sizes: Sequence[Size], intrinsics: tuple[Matrix3, Matrix3] | None
 ) -> RobustConfig:
-    """Return the recipe's robust settings with their threshold in pixels of the stored images, of these sizes.
-
-    With intrinsics, the threshold over the mean focal length stays what it is in pixels of the views.
-    """
-    magsac = recipe.magsac
-    if magsac.pixel is Pixel.STORED:
+    """Return settings for stored images of these sizes, with the same threshold over the mean focal length."""
+    if not magsac.threshold_side:
         return magsac
-    units, chosen = recipe.only(lambda unit: unit.stage == 1).units, max if magsac.pixel is Pixel.LARGEST else min
-    views = ([unit.view(Box.whole(size), 1) for unit in units] for size in sizes)
-    scales = np.array([chosen((view.scale for view in those), key=math.prod) for those in views])
-    focals = np.array([[K[0, 0], K[1, 1]] for K in intrinsics or 2 * [np.eye(3)]])
-    return replace(magsac, threshold=magsac.threshold * focals.sum() / (focals * scales).sum())
+    scales = np.array([View.fit(Box.whole(size), long_side=magsac.threshold_side).scale for size in sizes])
+    focals = np.array([K.diagonal()[:2] for K in intrinsics or 2 * [np.eye(3)]])
+    return replace(magsac, threshold=magsac.threshold * focals.sum() / (focals * scales).sum(), threshold_side=0)

@@ -26,6 +26,7 @@ from mkpc_kaggle.recipe import Recipe, Unit
 
 ENCODING_CACHE_BYTES = 2 << 30
 
+GivenRegions = Mapping[tuple[str, ...], tuple[Box, Box]]  # by the names of both images
 ViewKey = tuple[str, str, View]  # matcher, image and view: what an encoding is of
 
 matched_in: set[int] = set()  # this process, if pairs have been matched in it, and those that it was forked from
@@ -37,7 +38,7 @@ class Pipeline:
     ``load(name)`` gives a matcher, ``load_float32(name)`` the same in float32: it takes over for good if half
     precision does not hold a matcher's numbers. Pairs are matched, and views of one shape encoded, ``minibatch``
     at a time; fewer by a unit for which memory was short, from then on. Encodings of whole images, which come back
-    in many pairs, are kept in ``cache_bytes``. ``regions`` replace MKPC's, by the names of the two images.
+    in many pairs, are kept in ``cache_bytes``. ``regions`` replace MKPC's.
     """
 
     def __init__(
@@ -48,7 +49,7 @@ class Pipeline:
         minibatch: int = 1,
         cache_bytes: int = ENCODING_CACHE_BYTES,
         load_float32: Callable[[str], Matcher[Any]] | None = None,
-        regions: Mapping[tuple[str, ...], tuple[Box, Box]] = MappingProxyType({}),
+        regions: GivenRegions = MappingProxyType({}),
     ) -> None:
         self.recipe, self.minibatch, self.regions = recipe, minibatch, regions
         self._load, self._load_float32 = load, load_float32
@@ -210,9 +211,7 @@ def views_of(unit: Unit, multiple: int, pair: PairMatch) -> tuple[View, View]:
     return first, second
 
 
-def with_regions(
-    pair: PairMatch, recipe: Recipe, given: Mapping[tuple[str, ...], tuple[Box, Box]] = MappingProxyType({})
-) -> PairMatch:
+def with_regions(pair: PairMatch, recipe: Recipe, given: GivenRegions = MappingProxyType({})) -> PairMatch:
     """Return the pair with the critical region of each image: given, or from the matched points of stage 1."""
     if (boxes := given.get(tuple(image.name for image in pair.images))) is not None:
         first, second = (CriticalRegion(box, RegionReason.GIVEN) for box in boxes)

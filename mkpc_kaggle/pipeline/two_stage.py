@@ -57,17 +57,13 @@ class TwoStageMatcher:
         """Match two images: paths, or arrays (H, W, 3) RGB or (H, W) gray, uint8.
 
         ``model`` E needs ``intrinsics``, the camera matrices in pixels; without them ``ValueError`` is raised.
-        ``regions`` replace MKPC's; boxes that leave the images raise ``ValueError``.
+        ``regions`` are boxes for stage 2 in MKPC's place; its units fail where a box leaves its image.
         Raises :class:`UserError` for an image that cannot be read. A pair that cannot be matched is a result with
         ``estimate.failure``. Errors of memory and of the device are raised as they are.
         """
         if ModelKind(model) is ModelKind.E and intrinsics is None:
             raise ValueError("model E needs intrinsics=(K0, K1), the camera matrices of both images in pixels")
         images = to_image(image0), to_image(image1)
-        if regions and not all(box.is_within(image.size) for box, image in zip(regions, images, strict=True)):
-            raise ValueError(
-                f"{regions} are not boxes on the two images, of {images[0].size} and {images[1].size}"
-            )
         self._pipeline.regions = {tuple(image.name for image in images): regions} if regions else {}
         (pair,) = self._pipeline.match([PairMatch(images=images)], self.recipe.units)
         return with_estimate(pair, self.recipe, ModelKind(model), intrinsics)
