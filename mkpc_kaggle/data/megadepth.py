@@ -20,7 +20,7 @@ NAMES |= {"_reconstruct": np.empty(0).__reduce__()[0], "scalar": np.float64(0)._
 def lines_of_scene_info(file: Path) -> Iterator[str]:
     """Yield a line for each pair, as :mod:`mkpc_kaggle.data.pairs` reads it; nothing in the file is executed.
 
-    A pair begins with two indices into ``image_paths``, ``intrinsics`` (3, 3) and ``poses`` (4, 4), world to camera.
+    Pairs begin with two indices into ``image_paths``, ``intrinsics`` (3, 3) and ``poses`` (4, 4), world to camera.
     Raises :class:`UserError` for any other file.
     """
     try:
