@@ -11,9 +11,9 @@ from mkpc_kaggle.reporting.figures.pair import draw_pair
 from mkpc_kaggle.reporting.figures.style import save
 
 HELP = """\
-Match two images. Print the fundamental matrix (x1^T F x0 = 0, pixel centres at integers), the number of matches of
-each unit, and the critical regions. --out draws the matches, the clusters and the critical regions. Pixels are those
-of the stored files, whatever EXIF says of their orientation; figures are upright.
+Match two images. Print the fundamental matrix (x1^T F x0 = 0, pixel centres at integers), the number of matches
+of each unit, and the critical regions. --out draws the matches, the clusters and the critical regions. Pixels are
+those of the stored files, whatever EXIF says of their orientation; figures are upright.
 """
 
 

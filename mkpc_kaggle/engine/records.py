@@ -32,6 +32,7 @@ class UnitRecord:
     match_seconds: float
     failure: str
     note: str = ""  # how the unit differed from its settings, such as the precision
+    keypoints: int = 0  # detected in the first view; 0 for a matcher without a detector
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -98,7 +99,7 @@ class CameraRecord:
     """A camera of a scene: centre and axes in its model's units, focal length and size in pixels.
 
     ``down`` points to the image's lower border. ``digest`` identifies the image's content. ``model`` numbers the
-    models of the batch, 0 is the largest. ``seen`` is the number of points that the image sees. ``sigmas`` are as in
+    models of the batch, 0 is the largest. ``seen`` is the number of points that the image sees. ``sigmas``: see
     :class:`RegisteredImage`.
     """
 

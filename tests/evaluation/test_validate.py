@@ -78,7 +78,7 @@ def test_samples_that_a_submission_has_no_row_for_count_as_failed_and_are_named(
 def test_a_failed_pair_counts_as_failed_even_where_the_fallback_happens_to_be_right():
     eye = np.eye(3)
     camera0, camera1 = Camera(eye, eye, np.zeros(3)), Camera(eye, eye, np.array([1.0, 0, 0]))
-    true = TruePair(Pair("p", "s", Path("a"), Path("b")), camera0, camera1, 0.5)
+    true = TruePair(Pair("p", "s", "a", "b"), camera0, camera1, 0.5)
     scene = TrainScene("s", 1.0, (true,))
     record = PairRecord(0, FALLBACK_FUNDAMENTAL.copy(), "too few matches")
     failed = score_record(true, record, scene, [Step.MAGSAC])
@@ -104,9 +104,8 @@ def test_validate_scores_a_recipe_and_writes_all_figures(demo, small_recipe, cap
     assert scene["scene"] == "courtyard"
     assert len(scene["pairs"]) == 5
     assert 0.1 < scores["mAA"] == scene["mAA"] <= 1
-    assert scores["seconds_per_pair"] > 0
-    assert set(scores["inliers_by_stage"]) == {"1", "2"}
-    assert sum(scores["region_reasons"].values()) == 10
+    for pair in scene["pairs"]:
+        assert set(pair["matches"]) == {"1:sift@320", "2:sift@400"}
 
 
 def test_each_step_of_the_estimate_has_a_column(demo, small_recipe, capsys):
