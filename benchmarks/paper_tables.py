@@ -1,4 +1,4 @@
-"""The paper's tables, row by row, beside their published figures, with one command.
+"""The paper's tables, row by row, next to their published figures, with one command.
 
 python -m benchmarks.paper_tables --out DIR --weights DIR [--yfcc LIST IMAGES] [--scannet LIST IMAGES]
     [--imc TRAIN_DIR] [--rows "1200,1600 + 1400" ...] [--pairs N] [--protocol superglue] [--matcher NAME]

@@ -1,11 +1,8 @@
 """Recipes: the package's work, and a wrong recipe is refused in words that help."""
 
-import json
 import os
-from dataclasses import replace
 from itertools import combinations
 
-import numpy as np
 import pytest
 
 from mkpc_kaggle.errors import UserError
@@ -15,7 +12,7 @@ from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.geometry.robust import Method, RobustConfig
 from mkpc_kaggle.matchers.registry import matcher_names, spec_of
 from mkpc_kaggle.pipeline.availability import options_of
-from mkpc_kaggle.recipe import Mode, Recipe, SceneConfig, Unit, load_recipe, parse_recipe, recipe_names, split_mode
+from mkpc_kaggle.recipe import Mode, Recipe, Unit, load_recipe, parse_recipe, recipe_names, split_mode
 
 SIFT = 'units = [{ stage = 1, matcher = "sift", long_side = 640 }]\n'
 
@@ -208,33 +205,6 @@ def test_the_stage_1_mode_keeps_the_units_of_stage_1():
 def test_the_whole_images_mode_shows_every_unit_the_whole_image_and_none_twice():
     recipe = ALL.in_mode(Mode.WHOLE_IMAGES)
     assert [unit.name for unit in recipe.units] == ["1:sift@640", "1:aliked@800", "1:aliked@640", "1:sift@320"]
-
-
-@pytest.mark.parametrize(
-    ("other", "matches_alike"),
-    [
-        (replace(ALL, units=(ALL.units[0], *reversed(ALL.units[1:]))), False),
-        (replace(ALL, units=(replace(ALL.units[0], max_matches=7), *ALL.units[1:])), False),
-        (replace(ALL, mkpc=replace(ALL.mkpc, share=0.06)), False),
-        (replace(ALL, matchers={"sift": {"features": 9}}), False),
-        (replace(ALL, magsac=RobustConfig(threshold=0.21)), True),
-        (replace(ALL, focal=FocalConfig()), True),
-        (replace(ALL, scene=SceneConfig(each_matcher=False)), True),
-    ],
-)
-def test_what_is_matched_and_how_it_is_estimated_have_a_fingerprint_each(other, matches_alike):
-    assert (json.dumps(other.matching()) == json.dumps(ALL.matching())) == matches_alike
-    assert (json.dumps(other.estimation()) != json.dumps(ALL.estimation())) == matches_alike
-    assert (other.scene_estimation != ALL.scene_estimation) == matches_alike
-    named = replace(other, name="other", description="something")
-    assert (named.matching(), named.estimation()) == (other.matching(), other.estimation())
-
-
-def test_a_pair_is_estimated_otherwise_by_another_model_and_not_with_other_scenes():
-    K = np.diag([800.0, 800, 1])
-    ways = {ALL.pair_estimation(), ALL.pair_estimation((K, K)), ALL.pair_estimation((K, 2 * K))}
-    assert len(ways | {replace(ALL, focal=FocalConfig()).pair_estimation()}) == 4
-    assert ALL.with_scenes(ALL.scene is None).pair_estimation() in ways
 
 
 @pytest.mark.parametrize(

@@ -168,7 +168,7 @@ def score_record(
 def error_of(
     matrix: Matrix3 | None, true: TruePair, scene: TrainScene, rotation: Matrix3 | None = None
 ) -> PoseError:
-    """Return the error of a pair's F, or of its E, whose rotation may be given; infinite if there is none."""
+    """Return the error of a pair's F, or of its E and a given rotation; infinite without a matrix."""
     if matrix is None:
         return PoseError.failed()
     camera0, camera1 = true.camera0, true.camera1
