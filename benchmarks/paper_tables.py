@@ -1,94 +1,98 @@
-"""The paper's tables of YFCC100M and ScanNet, row by row, with one command.
+"""The paper's tables, row by row, next to their published figures, with one command.
 
 python -m benchmarks.paper_tables --out DIR --weights DIR [--yfcc LIST IMAGES] [--scannet LIST IMAGES]
-    [--rows "one + two" ...] [--pairs N] [--method ransac] [--threshold 1] [--matcher superglue]
+    [--imc TRAIN_DIR] [--rows "1200,1600 + 1400" ...] [--pairs N] [--protocol superglue] [--matcher NAME]
 
 LIST is a list of pairs in the format of SuperGlue's evaluation, IMAGES the directory that its names start from
-(docs/benchmarks.md). Each row is journalled in a directory of its own under DIR: killed or stopped, the same
-command goes on there, and the tables with the AUC of each row are printed at the end. `--pairs N` takes a sample
-of each list, `--matcher` another matcher in SuperGlue's place.
+(docs/benchmarks.md), TRAIN_DIR any train side of the Image Matching Challenge 2022. The rows are in
+`paper_tables.toml`. The rows of a table share a work directory, so that common units run once; the last column
+counts the units that a row ran. Killed or stopped, the same command resumes. `--pairs N` takes a sample of each
+list or scene, `--matcher` replaces all matchers.
 """
 
 import argparse
 import time
+import tomllib
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from itertools import chain
 from pathlib import Path
+from statistics import mean
 
-from mkpc_kaggle.data.competition import TrainScene
+from mkpc_kaggle.data.competition import TrainScene, read_train_side
 from mkpc_kaggle.data.pairs import read_pairs
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.session import Session, interruptible
+from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.evaluation.protocols import PROTOCOLS, by_protocol
 from mkpc_kaggle.evaluation.validate import Validation, validate
 from mkpc_kaggle.geometry.metrics import AUC_THRESHOLDS
 from mkpc_kaggle.geometry.robust import Method
-from mkpc_kaggle.pipeline.assembly import assemble
-from mkpc_kaggle.recipe import Recipe, load_recipe
+from mkpc_kaggle.pipeline.assembly import Assembly, assemble
+from mkpc_kaggle.recipe import Recipe, Unit, load_recipe
+
+TABLES = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
 
 
-@dataclass(frozen=True)
-class Row:
-    """A row of a table: long sides on whole images and on critical regions; ``recipe`` has its settings."""
-
-    name: str
-    stage1: tuple[int, ...]
-    stage2: tuple[int, ...] = ()
-    recipe: str = ""
-
-    def of(self, dataset: str, matcher: str) -> Recipe:
-        """The recipe of this row, with another matcher in SuperGlue's place if that is wanted."""
-        whole = load_recipe(self.recipe or dataset)
-        wanted = {*((1, side) for side in self.stage1), *((2, side) for side in self.stage2)}
-        chosen = [unit for unit in whole.units if (unit.stage, unit.long_side) in wanted]
-        assert len(chosen) == len(wanted), f"{self} asks for sizes that {whole.name} lacks"
-        units = tuple(replace(unit, matcher=matcher) for unit in sorted(chosen, key=lambda unit: unit.stage))
-        return replace(whole, units=units, matchers=whole.matchers if matcher == "superglue" else {})
+def recipe_of(table: str, row: str, method: str, given: argparse.Namespace) -> Recipe:
+    """Return the recipe of a row, by the protocol that the command names, with its matcher if it names one."""
+    whole = load_recipe("imc2022" if table == "imc" else table)
+    if table == "imc":
+        own = next((unit for unit in whole.units if unit.matcher == row), None)
+        units = [replace(own, stage=1)] if own else [*whole.units]
+    else:
+        parts = enumerate(row.split(" + "), start=1)
+        units = [sized(whole.units[0], stage, side) for stage, sides in parts for side in sides.split(",")]
+    known = {unit.name: unit for unit in (replace(each, matcher=given.matcher or each.matcher) for each in units)}
+    recipe = replace(whole, units=tuple(known.values()), matchers={} if given.matcher else whole.matchers)
+    if table != "imc" and given.protocol in PROTOCOLS:
+        recipe = by_protocol(recipe, given.protocol)
+    return replace(recipe, name=f"{row} {method}", magsac=replace(recipe.magsac, method=Method(method)))
 
 
-TABLES = {
-    "yfcc": (
-        Row("one", (1600,)),
-        Row("two", (1200, 1600)),
-        Row("three", (840, 1200, 1600)),
-        Row("all sizes", (840, 1200, 1400, 1600), recipe="yfcc_naive"),
-        Row("one + two", (1600,), (1200, 1400)),
-        Row("two + one", (1200, 1600), (1400,)),
-        Row("three + three", (840, 1200, 1600), (1200, 1400, 1600)),
-    ),
-    "scannet": (
-        Row("one", (1280,)),
-        Row("two", (1024, 1280)),
-        Row("three", (840, 1024, 1280)),
-        Row("all sizes", (640, 840, 1024, 1280, 1536), recipe="scannet_naive"),
-        Row("one + two", (1280,), (840, 1280)),
-        Row("two + one", (1024, 1280), (1280,)),
-        Row("three + two", (840, 1024, 1280), (840, 1280)),
-    ),
-}
-"""The sizes of the last row and of "all sizes" are the paper's; the others are a choice among the last's."""
+def sized(unit: Unit, stage: int, side: str) -> Unit:
+    """Return the unit with another long side, or stretched to a width x height."""
+    width, _, height = side.partition("x")
+    area = f"{height}x{width}" if height else ""
+    return replace(unit, stage=stage, long_side=0 if area else int(side), area=area, stretch=bool(area))
 
 
-def table(dataset: str, scene: TrainScene, arguments: argparse.Namespace) -> Iterator[str]:
-    """The table in Markdown."""
-    heads = " | ".join(f"AUC {threshold:g}" for threshold in AUC_THRESHOLDS)
-    yield f"| {dataset}: {len(scene.pairs)} pairs | whole images | critical regions | {heads} |"
-    yield "| --- " * (3 + len(AUC_THRESHOLDS)) + "|"
-    for row in TABLES[dataset]:
-        if row.name in (arguments.rows or [row.name]):
-            validation = run(row, dataset, scene, arguments)
-            sizes = [", ".join(map(str, sides)) or "-" for sides in (row.stage1, row.stage2)]
-            areas = [f"{100 * validation.auc(threshold):.2f}" for threshold in AUC_THRESHOLDS]
-            yield "| " + " | ".join([row.name, *sizes, *areas]) + " |"
+def table(name: str, given: argparse.Namespace) -> Iterator[str]:
+    """Yield the lines of the table in Markdown, each row when it has run."""
+    scenes, is_imc, differences = scenes_of(name, given), name == "imc", []
+    ours = ["mAA"] if is_imc else [*(f"AUC {limit:g}" for limit in AUC_THRESHOLDS), "precision", "matching score"]
+    heads = [
+        *ours,
+        *(f"published {head}" for head in (["public", "private"] if is_imc else ours[:3])),
+        "units run",
+    ]
+    yield f"| {' | '.join([f'{name}: {sum(len(scene.pairs) for scene in scenes)} pairs', 'estimator', *heads])} |"
+    yield "| --- " * (2 + len(heads)) + "|"
+    for row, method, *published in TABLES[name]:
+        if row in (given.rows or [row]):
+            assembly = assemble(recipe_of(name, row, method, given), weights=given.weights)
+            scores = run(name, assembly, scenes, given)
+            assert scores.report is not None
+            own = [scores.maa()] * 2 if is_imc else [100 * scores.auc(limit) for limit in AUC_THRESHOLDS]
+            differences.append([mine - other for mine, other in zip(own, published, strict=True)])
+            cells = own[:1] if is_imc else [*own, *(100 * share for share in scores.matching)]
+            cells = [f"{cell:.{4 if is_imc else 2}f}" for cell in cells]
+            yield f"| {' | '.join([row, method, *cells, *map(str, [*published, scores.report.units_run])])} |"
+    means = [f"{mean(column):+.4f}" for column in zip(*differences, strict=True)]
+    yield f"| {' | '.join(['mean difference', *[''] * (len(heads) - len(means)), *means, ''])} |"
 
 
-def run(row: Row, dataset: str, scene: TrainScene, arguments: argparse.Namespace) -> Validation:
-    recipe = row.of(dataset, arguments.matcher)
-    magsac = replace(recipe.magsac, method=arguments.method, threshold=arguments.threshold)
-    assembly = assemble(replace(recipe, magsac=magsac), weights=arguments.weights)
-    work_dir = arguments.out / dataset / row.name.replace(" ", "")
+def scenes_of(name: str, given: argparse.Namespace) -> tuple[TrainScene, ...]:
+    if name == "imc":
+        return read_train_side(*given.imc, pairs_per_scene=given.pairs)
+    return (read_pairs(*vars(given)[name], most=given.pairs),)
+
+
+def run(name: str, assembly: Assembly, scenes: tuple[TrainScene, ...], given: argparse.Namespace) -> Validation:
+    root, in_front = str(vars(given)[name][-1]), given.protocol in PROTOCOLS
     with interruptible() as interrupt:
-        session = Session(work_dir, Budget(time.monotonic()), interrupt, workers=None)
-        validation = validate([scene], assembly, session)
+        session = Session(given.out / name, Budget(time.monotonic()), interrupt, workers=None)
+        validation = validate(scenes, assembly, session, root, in_front=in_front)
     if interrupt.is_set():
         raise KeyboardInterrupt
     return validation
@@ -98,20 +102,22 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--weights", type=Path, action="append", default=[])
-    for dataset in TABLES:
-        parser.add_argument(f"--{dataset}", type=Path, nargs=2, metavar=("LIST", "IMAGES"))
+    parser.add_argument("--yfcc", type=Path, nargs=2, metavar=("LIST", "IMAGES"))
+    parser.add_argument("--scannet", type=Path, nargs=2, metavar=("LIST", "IMAGES"))
+    parser.add_argument("--imc", type=Path, nargs=1, metavar="TRAIN_DIR")
+    rows = sorted({row for rows in TABLES.values() for row, *_ in rows})
+    parser.add_argument("--rows", nargs="+", choices=rows, help="default: all")
+    parser.add_argument("--pairs", type=int, help="of each list or scene, evenly spread; default: all")
     parser.add_argument(
-        "--rows", nargs="+", choices=sorted({row.name for rows in TABLES.values() for row in rows})
+        "--protocol", choices=[*PROTOCOLS, "none"], default="superglue", help="none: as the recipe"
     )
-    parser.add_argument("--pairs", type=int, help="of each list, evenly spread; default: all")
-    parser.add_argument("--method", type=Method, choices=list(Method), default=Method.RANSAC)
-    parser.add_argument("--threshold", type=float, default=1.0, help="pixels, divided by the mean focal length")
-    parser.add_argument("--matcher", default="superglue")
+    parser.add_argument("--matcher")
     given = parser.parse_args(arguments)
-    for dataset in TABLES:
-        if (paths := vars(given)[dataset]) is not None:
-            scene = read_pairs(*paths, most=given.pairs)
-            print("\n".join([*table(dataset, scene, given), ""]))
+    try:
+        for line in chain.from_iterable(table(name, given) for name in TABLES if vars(given)[name]):
+            print(line, flush=True)
+    except UserError as error:
+        parser.exit(2, f"{error}\n")
 
 
 if __name__ == "__main__":

@@ -43,6 +43,7 @@ class Unit:
     area: str = ""  # height x width, such as "540x720": a view gets as many pixels, at its own aspect
     stretch: bool = False  # a view gets just that height and width
     fallback: str = ""  # the matcher that runs where this matcher is unavailable
+    antialias: bool = True  # False: shrink views bilinearly, without averaging areas
     tracks: bool = True  # False: its matches enter a scene only where the pair's other units found fewer than 50
 
     def __post_init__(self) -> None:
@@ -66,12 +67,14 @@ class Unit:
 
     def view(self, crop: Box, multiple: int, turns: int = 0) -> View:
         """Return this unit's view of a crop, rotated by quarter turns and padded to a multiple."""
-        if not self.area:
-            return View.fit(crop, long_side=self.long_side, multiple=multiple, turns=turns)
-        height, width = map(int, self.area.split("x"))
+        height, width = map(int, (self.area or "1x1").split("x"))
         if self.stretch:
-            return View.stretched(crop, size=Size(width, height), multiple=multiple, turns=turns)
-        return View.of_area(crop, area=width * height, multiple=multiple, turns=turns)
+            view = View.stretched(crop, size=Size(width, height), multiple=multiple, turns=turns)
+        elif self.area:
+            view = View.of_area(crop, area=width * height, multiple=multiple, turns=turns)
+        else:
+            view = View.fit(crop, long_side=self.long_side, multiple=multiple, turns=turns)
+        return replace(view, antialias=self.antialias)
 
 
 class CameraModel(StrEnum):

@@ -51,22 +51,6 @@ def test_whatever_matchers_are_left_of_recipe_auto_the_first_unit_can_sweep():
             assert remaining.units[0].stage == 1
 
 
-@pytest.mark.parametrize(
-    ("name", "stage1", "stage2", "naive"),
-    [
-        ("yfcc", {840, 1200, 1600}, {1200, 1400, 1600}, {840, 1200, 1400, 1600}),
-        ("scannet", {840, 1024, 1280}, {840, 1280}, {640, 840, 1024, 1280, 1536}),
-    ],
-)
-def test_the_papers_recipes_have_the_resolutions_of_its_tables(name, stage1, stage2, naive):
-    recipe, whole = load_recipe(name), load_recipe(f"{name}_naive")
-    for stage, sides in ((1, stage1), (2, stage2)):
-        assert {unit.long_side for unit in recipe.units if unit.stage == stage} == sides
-    assert {(unit.stage, unit.long_side) for unit in whole.units} == {(1, side) for side in naive}
-    assert whole.matchers == recipe.matchers
-    assert {unit.max_matches for unit in (*recipe.units, *whole.units)} == {2048}
-
-
 @pytest.mark.parametrize("name", recipe_names())
 def test_recipes_for_every_user_name_no_weights_for_noncommercial_use_but_with_a_fallback(name):
     """Those with such weights say so in the README: the paper's."""

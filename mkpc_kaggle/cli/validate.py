@@ -4,21 +4,23 @@ import argparse
 import json
 import re
 import tempfile
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 from mkpc_kaggle.cli import options
 from mkpc_kaggle.config import from_table
-from mkpc_kaggle.data.competition import TrainScene, read_train_side
+from mkpc_kaggle.data.competition import Pair, TrainScene, read_train_side
 from mkpc_kaggle.data.outputs import require_apart
-from mkpc_kaggle.data.pairs import read_pairs
+from mkpc_kaggle.data.pairs import read_pairs, read_regions
 from mkpc_kaggle.engine.console import say
 from mkpc_kaggle.engine.engine import Ending
 from mkpc_kaggle.engine.session import Interrupt, Session, Watchdog, interruptible
 from mkpc_kaggle.errors import UserError, writing
 from mkpc_kaggle.evaluation.compare import Comparison, comparison_json, comparison_table, step_gains
 from mkpc_kaggle.evaluation.imc2025 import score_imc2025, score_lines
+from mkpc_kaggle.evaluation.protocols import PROTOCOLS, by_protocol
 from mkpc_kaggle.evaluation.validate import missing_rows, score_submission, score_table, to_json, validate
 from mkpc_kaggle.geometry.robust import Method, RobustConfig
 from mkpc_kaggle.pipeline.assembly import Assembly
@@ -52,7 +54,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     source = parser.add_mutually_exclusive_group(required=True)
     source.add_argument("--train-dir", type=Path, metavar="DIR")
-    source.add_argument("--pairs", type=Path, metavar="FILE", help="a list of pairs with K and poses")
+    text = "a list of pairs with K and poses, or a directory of .npz of MegaDepth-1500"
+    source.add_argument("--pairs", type=Path, metavar="FILE", help=text)
     text = "score files of `reconstruct --format imc2025`; DIR has train_labels.csv and train_thresholds.csv"
     source.add_argument("--imc2025", type=Path, metavar="DIR", help=text)
     add("--image-root", type=Path, metavar="DIR", help="where the images of --pairs lie")
@@ -68,6 +71,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--compare", nargs="+", metavar="RECIPE[:MODE]", help=text)
     add("--method", choices=list(map(str, Method)), help="default: the recipe's")
     add("--threshold", type=float, metavar="PIXELS", help="of the method; for E divided by the mean focal length")
+    text = (
+        "settings of a published evaluation of --pairs, see docs/benchmarks.md; --method and --threshold change it"
+    )
+    add("--protocol", choices=list(PROTOCOLS), help=text)
+    text = "the matches choose between E's two rotations, as with --protocol; default: the one nearer to the truth"
+    add("--in-front", action="store_true", help=text)
+    text = "boxes for stage 2 instead of MKPC's: a table image_0,image_1,box_0,box_1"
+    add("--regions", type=Path, metavar="CSV", help=text)
     options.add_run(parser, time_limit=None)
     add("--json", type=Path, metavar="FILE", help="write all figures, per pair too")
     text = """keep the journal there and resume from it; report.html (with --compare, a page for each recipe) shows
@@ -84,7 +95,7 @@ def run(arguments: argparse.Namespace) -> int:
             say("\n".join([str(submission), *score_lines(score_imc2025(arguments.imc2025, submission))]))
         return 0
     sides = [arguments.train_dir, arguments.image_root]
-    inputs = [*sides, arguments.pairs, arguments.truth, *(arguments.submission or ())]
+    inputs = [*sides, arguments.pairs, arguments.truth, arguments.regions, *(arguments.submission or ())]
     require_apart({"--json": arguments.json}, filter(None, inputs), arguments.work_dir)
     with tempfile.TemporaryDirectory(prefix="mkpc-") as temporary:
         work_dir = arguments.work_dir or Path(temporary)
@@ -115,6 +126,11 @@ def _require_a_whole(given: argparse.Namespace) -> None:
         (given.imc2025 and given.json, "--imc2025 only prints the score: it goes without --json"),
         ((given.pairs is None) != (given.image_root is None), "--pairs and --image-root go together"),
         (given.pairs and given.submission, "--submission needs a --train-dir: it scores in metres"),
+        (
+            not given.pairs and (given.protocol or given.in_front),
+            "--protocol and --in-front need --pairs: they are of E",
+        ),
+        (given.regions and given.submission, "--submission matches nothing: it goes without --regions"),
         (given.pairs and given.compare, "--compare needs a --train-dir: it scores in metres"),
         (given.compare and given.units, "--units chooses from one recipe; --compare takes recipes as they are"),
         (given.compare and len(given.compare) < 2, "--compare needs two recipes or more"),
@@ -141,11 +157,12 @@ def _match_and_score(arguments: argparse.Namespace, scenes: tuple[TrainScene, ..
     validations, status = [], 0
     with interruptible() as interrupt, Watchdog(options.budget_of(arguments), interrupt) as watchdog:
         watchdog.save = lambda: "the time limit passed before the scores were printed"
-        assemblies = [_assemble(arguments, interrupt, *choice) for choice in choices]
+        assemblies = [_assemble(arguments, interrupt, *choice, pairs) for choice in choices]
         reports = [re.sub(r"[^\w.-]+", "_", text) for text in compared or ["report"]]
         for assembly, name in zip(assemblies, reports, strict=True):
             session = Session(work_dir, options.budget_of(arguments), interrupt, workers=arguments.workers)
-            validation = validate(scenes, assembly, session, root)
+            in_front = arguments.in_front or arguments.protocol is not None
+            validation = validate(scenes, assembly, session, root, in_front=in_front)
             validations.append(validation)
             report = validation.report
             assert report is not None
@@ -174,10 +191,17 @@ def _write_json(path: Path | None, figures: dict[str, Any]) -> None:
             path.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
 
 
-def _assemble(arguments: argparse.Namespace, interrupt: Interrupt, name: str, mode: str) -> Assembly:
-    """The parts of a run of a recipe, with the units and the robust method that the command names."""
+def _assemble(
+    arguments: argparse.Namespace, interrupt: Interrupt, name: str, mode: str, pairs: Sequence[Pair]
+) -> Assembly:
+    """Return the parts of a run of a recipe, with what the command changes of it."""
     assembly = options.assembly_of(arguments, name, mode, interrupt)
     recipe = with_units(assembly.recipe, arguments.units)
+    if arguments.protocol is not None:
+        recipe = by_protocol(recipe, arguments.protocol)
+    if arguments.regions is not None:
+        root = arguments.train_dir or arguments.image_root
+        assembly = replace(assembly, regions=read_regions(arguments.regions, root, pairs))
     given = {"method": arguments.method, "threshold": arguments.threshold}
     changes = {key: value for key, value in given.items() if value is not None}
     magsac = from_table(RobustConfig, asdict(recipe.magsac) | changes, "--method and --threshold")

@@ -3,17 +3,26 @@
 A line a pair: ``name0 name1 turns0 turns1 K0 K1 T_0to1``, separated by blanks. Names are paths under the image
 root. ``turns`` are the quarter turns, counter-clockwise, that set an image upright, after those of its EXIF. K (9
 numbers) and T (16), row by row, are those of the stored pixels: X_1 = R X_0 + t with T = [R t; 0 1].
+
+A file ``.npz``, or a directory of such files, is LoFTR's list of MegaDepth-1500.
 """
 
+from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import cache
+from itertools import chain
 from math import nan
 from pathlib import Path, PureWindowsPath
 
 import numpy as np
 
-from mkpc_kaggle.data.competition import Pair, TrainScene, TruePair, evenly_spread
+from mkpc_kaggle.data.competition import Pair, TrainScene, TruePair, evenly_spread, read_rows
+from mkpc_kaggle.data.images import Unreadable, read_image
+from mkpc_kaggle.data.megadepth import lines_of_scene_info
 from mkpc_kaggle.errors import UserError, read_text
 from mkpc_kaggle.geometry.cameras import Camera
+from mkpc_kaggle.geometry.coordinates import Box, Size
 
 FIELDS = 2 + 2 + 9 + 9 + 16
 EXPECTED = "name0 name1 turns0 turns1 K0 (9 numbers) K1 (9) T_0to1 (16)"
@@ -38,8 +47,10 @@ def read_pairs(file: Path, image_root: Path, *, most: int | None = None) -> Trai
     """
     if not image_root.is_dir():
         raise UserError(f"--image-root {image_root}: no such directory")
-    lines = enumerate(read_text(file).splitlines(), start=1)
-    listed = [(number, parse_line(line, f"{file}, line {number}")) for number, line in lines if line.split()]
+    infos = sorted(file.glob("*.npz")) if file.is_dir() else [file] if file.suffix == ".npz" else []
+    lines = [*chain.from_iterable(map(lines_of_scene_info, infos))] if infos else read_text(file).splitlines()
+    numbered = enumerate(lines, start=1)
+    listed = [(number, parse_line(line, f"{file}, line {number}")) for number, line in numbered if line.split()]
     if not listed:
         raise UserError(f"{file} has no pairs; expected lines {EXPECTED}")
     pairs = []
@@ -49,6 +60,38 @@ def read_pairs(file: Path, image_root: Path, *, most: int | None = None) -> Trai
         pair = Pair(f"{number}: {first} {second}", file.stem, *files, *known)
         pairs.append(TruePair(pair, first.camera, second.camera, nan))
     return TrainScene(file.stem, nan, tuple(pairs))
+
+
+def read_regions(file: Path, image_root: Path, pairs: Iterable[Pair]) -> dict[tuple[str, ...], tuple[Box, Box]]:
+    """Return the boxes for stage 2 of these pairs by the files of their images.
+
+    ``file`` is a table ``image_0,image_1,box_0,box_1``: paths under the root; left, top, right and bottom in whole
+    pixels of the stored file, the latter two exclusive. Raises :class:`UserError` for a malformed table or box and
+    for a missing pair.
+    """
+    rows, found, size = {}, dict[tuple[str, ...], tuple[Box, Box]](), cache(size_of)
+    for where, (name0, name1, *cells) in read_rows(file, ("image_0", "image_1", "box_0", "box_1")):
+        rows[str(image_root / name0), str(image_root / name1)] = where, *cells
+    for pair in pairs:
+        files = pair.file0, pair.file1
+        if files not in rows:
+            raise UserError(f"{file} has no regions of the pair {pair.id}")
+        where, cell0, cell1 = rows[files]
+        found[files] = parse_box(cell0, size(files[0]), where), parse_box(cell1, size(files[1]), where)
+    return found
+
+
+def parse_box(cell: str, size: Size | None, where: str) -> Box:
+    with suppress(ValueError, TypeError):
+        box = Box(*map(int, cell.split()))
+        if size is None or box.is_within(size):
+            return box
+    raise UserError(f"{where}: expected left, top, right and bottom of a box on its image, found {cell!r}")
+
+
+def size_of(path: str | Path) -> Size | None:
+    image = read_image(Path(path))
+    return None if isinstance(image, Unreadable) else image.size
 
 
 def parse_line(line: str, where: str) -> tuple[ListedImage, ListedImage]:

@@ -133,6 +133,7 @@ class Found:
     failure: str = ""
     note: str = ""
     warm_up: bool = False
+    keypoints: int = 0
 
     @property
     def seconds(self) -> float:

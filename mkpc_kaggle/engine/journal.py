@@ -38,7 +38,7 @@ SCHEMA = Path(__file__).with_name("schema.sql")
 MIN_SQLITE = (3, 37, 0)  # STRICT tables
 
 UNITS = """SELECT position, revision, decode_seconds, cluster_seconds, unit, stage, matches, encode_seconds,
-    match_seconds, failure, note FROM current_points ORDER BY position, number"""
+    match_seconds, failure, note, keypoints FROM current_points ORDER BY position, number"""
 
 # SQLite's primary result codes that say nothing against a file: no permission, busy, locked, read only, input or
 # output failed, full, cannot be opened.
@@ -156,9 +156,9 @@ class JournalReader:
                 n: {"failure": why or NOT_REACHED} for n, why in self._rows(query)
             }
             inliers: dict[int, int] = {}
-            for position, inputs, counts, F, magsac, failure, seconds, *stats, focal0, focal1 in self._rows(
+            for position, inputs, counts, F, magsac, failure, seconds, *stats, rotation in self._rows(
                 """SELECT position, inputs, inliers, F, magsac, failure, seconds, candidates, cost, magsac_cost,
-                support, focal0, focal1 FROM standing_estimate"""
+                focal0, focal1, support, rotation FROM standing_estimate"""
             ):
                 if position in values:
                     inliers |= zip(map(int, inputs.split()), map(int, counts.split()), strict=True)
@@ -167,7 +167,10 @@ class JournalReader:
                         "magsac_fundamental": None if magsac is None else matrix_of(magsac),
                         "failure": failure,
                         "estimate_seconds": seconds,
-                        "stats": EstimateStats(stats[0], stats[1], stats[2], (focal0, focal1), stats[3]),
+                        "stats": EstimateStats(
+                            *(stats[0], stats[1], stats[2], (stats[3], stats[4]), stats[5]),
+                            rotation=tuple(vector_of(rotation).tolist()),
+                        ),
                     }
             for position, units in groupby(self._rows(UNITS), itemgetter(0)):
                 if position in values:
@@ -406,12 +409,12 @@ class Journal(JournalReader):
                         (outcome.decode_seconds, outcome.cluster_seconds) if found is outcome.found[0] else (0, 0)
                     )
                     (revision,) = db.execute(
-                        f"""REPLACE INTO points (pair, settings, digest0, digest1, matches, decode_seconds,
-                        cluster_seconds, encode_seconds, match_seconds, failure, note, points)
-                        SELECT pair, {", ".join("?" * 11)} FROM wanted_pair WHERE position = ?
+                        f"""REPLACE INTO points (pair, settings, digest0, digest1, matches, keypoints,
+                        decode_seconds, cluster_seconds, encode_seconds, match_seconds, failure, note, points)
+                        SELECT pair, {", ".join("?" * 12)} FROM wanted_pair WHERE position = ?
                         RETURNING revision""",
                         (
-                            *(settings[found.unit.name], *digests, found.matches, *values),
+                            *(settings[found.unit.name], *digests, found.matches, found.keypoints, *values),
                             *(found.encode_seconds, found.match_seconds, printable(found.failure)),
                             *(printable(found.note), found.points, outcome.index),
                         ),
@@ -433,15 +436,15 @@ class Journal(JournalReader):
                     printable(each.failure),
                 ),
                 *(each.stats.support, each.stats.candidates, each.stats.cost, each.stats.magsac_cost),
-                *(*each.stats.focals, each.seconds, each.index),
+                *(*each.stats.focals, np_bytes(each.stats.rotation), each.seconds, each.index),
             )
             for each in estimates
         ]
         self._write(
             lambda db: db.executemany(
                 f"""REPLACE INTO estimate (pair, settings, inputs, inliers, F, magsac, failure, support,
-                candidates, cost, magsac_cost, focal0, focal1, seconds)
-                SELECT pair, settings, {", ".join("?" * 12)} FROM wanted_pair WHERE position = ?""",
+                candidates, cost, magsac_cost, focal0, focal1, rotation, seconds)
+                SELECT pair, settings, {", ".join("?" * 13)} FROM wanted_pair WHERE position = ?""",
                 rows,
             )
         )

@@ -32,6 +32,7 @@ class UnitRecord:
     match_seconds: float
     failure: str
     note: str = ""  # how the unit differed from its settings, such as the precision
+    keypoints: int = 0  # detected in the first view; 0 for a matcher without a detector
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -58,6 +58,7 @@ CREATE TABLE points (  -- of a unit on a pair, from the contents of two images
     digest0 TEXT NOT NULL,
     digest1 TEXT NOT NULL,
     matches INTEGER NOT NULL CHECK (matches >= 0),
+    keypoints INTEGER NOT NULL DEFAULT 0 CHECK (keypoints >= 0),  -- detected in the first view
     decode_seconds REAL NOT NULL,
     cluster_seconds REAL NOT NULL,
     encode_seconds REAL NOT NULL,
@@ -97,6 +98,7 @@ CREATE TABLE estimate (  -- of a pair, from its points
     magsac_cost REAL NOT NULL,
     focal0 REAL NOT NULL,
     focal1 REAL NOT NULL,
+    rotation BLOB NOT NULL CHECK (length(rotation) = 24),  -- of an E by its inliers: the axis times radians
     seconds REAL NOT NULL,
     UNIQUE (pair, settings, inputs)
 ) STRICT;

@@ -31,10 +31,8 @@ class Settings:
         recipe = assembly.recipe
         alone = {unit: digest([POINTS, assembly.unit_settings(unit)]) for unit in recipe.units}
         first = [alone[unit] for unit in recipe.units if unit.stage == 1]
-        units = tuple(
-            alone[unit] if unit.stage == 1 else digest([alone[unit], asdict(recipe.mkpc), first])
-            for unit in recipe.units
-        )
+        crops = digest([asdict(recipe.mkpc), first, sorted(assembly.regions.items())])
+        units = tuple(alone[unit] if unit.stage == 1 else digest([alone[unit], crops]) for unit in recipe.units)
         return cls(units, digest([ESTIMATE, *_of_estimates(recipe)]), digest([SCENE, *_of_scenes(recipe)]))
 
     def of_estimate(self, pair: Pair) -> str:

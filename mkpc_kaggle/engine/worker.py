@@ -152,6 +152,7 @@ def _outcome(index: int, wanted: WantedPair, pair: PairMatch, known: tuple[objec
         Found(
             *(result.unit, len(result.matches), to_blob(result.matches), result.encode_seconds),
             *(result.match_seconds, result.failure, result.note, result.warm_up),
+            keypoints=result.keypoints,
         )
         for result in pair.results[len(known) :]
     )

@@ -1,21 +1,24 @@
 """Runs the engine on a train side and scores it as the competition does."""
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from math import isfinite, nan
 from pathlib import Path
 from statistics import mean
 from typing import Any
 
+from scipy.spatial.transform import Rotation
+
 from mkpc_kaggle.data.competition import TrainScene, TruePair, pair_id, read_rows, read_submission
 from mkpc_kaggle.engine.engine import RunReport
+from mkpc_kaggle.engine.journal import JournalReader
 from mkpc_kaggle.engine.records import PairRecord
 from mkpc_kaggle.engine.session import Session, run_pairs
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry import metrics
 from mkpc_kaggle.geometry.coordinates import Matrix3
+from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.metrics import AUC_THRESHOLDS, PoseError
 from mkpc_kaggle.geometry.robust import ModelKind
 from mkpc_kaggle.pipeline.assembly import Assembly
@@ -35,7 +38,8 @@ class Step(StrEnum):
 class PairScore:
     """One pair's error, infinite for a failed pair, and its record if the engine made it.
 
-    ``steps`` are the errors after each :class:`Step` that was made; the last is ``error``.
+    ``steps`` are the errors after each :class:`Step` that was made; the last is ``error``. For pairs of a list,
+    ``matching`` is the precision and the matching score: correct matches over all, and over keypoints of image 0.
     """
 
     id: str
@@ -44,6 +48,7 @@ class PairScore:
     error: PoseError
     record: PairRecord | None = None
     steps: Mapping[Step, PoseError] = field(default_factory=dict)
+    matching: tuple[float, float] = (nan, nan)
 
 
 @dataclass(frozen=True)
@@ -73,6 +78,10 @@ class SceneScore:
     def auc(self, threshold: float) -> float:
         return metrics.pose_auc(self.errors, threshold)
 
+    @property
+    def matching(self) -> list[float]:
+        return [mean(column) for column in zip(*(pair.matching for pair in self.pairs), strict=True)]
+
 
 @dataclass(frozen=True)
 class Validation:
@@ -96,12 +105,21 @@ class Validation:
         return mean(scene.auc(threshold) for scene in self.scenes)
 
     @property
+    def matching(self) -> list[float]:
+        return [mean(column) for column in zip(*(scene.matching for scene in self.scenes), strict=True)]
+
+    @property
     def errors(self) -> list[PoseError]:
         return [error for scene in self.scenes for error in scene.errors]
 
 
-def validate(scenes: Sequence[TrainScene], assembly: Assembly, session: Session, root: str = "") -> Validation:
-    """Run the recipe on the pairs of all scenes, whose images lie below ``root``, and score it."""
+def validate(
+    scenes: Sequence[TrainScene], assembly: Assembly, session: Session, root: str = "", *, in_front: bool = False
+) -> Validation:
+    """Run the recipe on the pairs of all scenes, whose images lie below ``root``, and score it.
+
+    With ``in_front``, the inliers of an E choose between its two rotations.
+    """
     report = run_pairs([true.pair for scene in scenes for true in scene.pairs], assembly, session, root=root)
     prior = assembly.recipe.focal is not None
     made = {  # if E is sought at known focal lengths, there is no MAGSAC alone
@@ -112,32 +130,51 @@ def validate(scenes: Sequence[TrainScene], assembly: Assembly, session: Session,
     steps = tuple(step for step in Step if made[step])
     records, scored = iter(report.records), []
     for scene in scenes:
-        pairs = tuple(score_record(true, next(records), scene, steps) for true in scene.pairs)
-        scored.append(SceneScore(scene.name, pairs, isfinite(scene.metres_per_unit)))
+        pairs = [score_record(true, next(records), scene, steps, in_front) for true in scene.pairs]
+        if not (in_metres := isfinite(scene.metres_per_unit)):
+            with JournalReader(session.work_dir) as journal:
+                pairs = [with_matching(*each, journal) for each in zip(pairs, scene.pairs, strict=True)]
+        scored.append(SceneScore(scene.name, tuple(pairs), in_metres))
     return Validation(assembly.recipe.name, tuple(scored), report, steps)
 
 
-def score_record(true: TruePair, record: PairRecord, scene: TrainScene, steps: Sequence[Step] = ()) -> PairScore:
-    """The score of a pair's record; the fallback row counts as a failure."""
+def with_matching(pair: PairScore, true: TruePair, journal: JournalReader) -> PairScore:
+    """Return the score with the quality of the pair's matches; NaN for a matching score without keypoints."""
+    assert pair.record is not None
+    points = journal.points(journal.inputs(pair.record.index).values())
+    matches, units = Matches.concatenate(points.values()), pair.record.units
+    correct = metrics.correct_matches(matches, true.camera0, true.camera1).sum()
+    is_known = all(unit.keypoints or not unit.matches for unit in units)
+    score = correct / max(sum(unit.keypoints for unit in units), 1) if is_known else nan
+    return replace(pair, matching=(correct / max(len(matches), 1), score))
+
+
+def score_record(
+    true: TruePair, record: PairRecord, scene: TrainScene, steps: Sequence[Step] = (), in_front: bool = False
+) -> PairScore:
+    """Return the score of a pair's record; the fallback row counts as a failure."""
+    rotation = Rotation.from_rotvec(record.stats.rotation).as_matrix() if in_front else None
     own = None if record.failure else record.pair_fundamental
     matrices = {
         Step.MAGSAC: record.magsac_fundamental if Step.PRIOR in steps else own,
         Step.PRIOR: own,
         Step.SCENE: None if record.source == "fallback" else record.chosen_fundamental,
     }
-    errors = {step: error_of(matrix, true, scene) for step, matrix in matrices.items()}
+    errors = {step: error_of(matrix, true, scene, rotation) for step, matrix in matrices.items()}
     made = {step: errors[step] for step in steps}
     return PairScore(true.pair.id, true.pair.names, true.covisibility, errors[Step.SCENE], record, made)
 
 
-def error_of(matrix: Matrix3 | None, true: TruePair, scene: TrainScene) -> PoseError:
-    """The error of a pair's F, or of its E if that is what was estimated; infinite if there is none."""
+def error_of(
+    matrix: Matrix3 | None, true: TruePair, scene: TrainScene, rotation: Matrix3 | None = None
+) -> PoseError:
+    """Return the error of a pair's F, or of its E and a given rotation; infinite without a matrix."""
     if matrix is None:
         return PoseError.failed()
     camera0, camera1 = true.camera0, true.camera1
     if true.pair.model is ModelKind.E:
         camera0, camera1 = camera0.calibrated, camera1.calibrated
-    return metrics.pose_error(matrix, camera0, camera1, scene.metres_per_unit)
+    return metrics.pose_error(matrix, camera0, camera1, scene.metres_per_unit, rotation)
 
 
 def score_submission(submission: Path, truth: Path, scenes: Sequence[TrainScene]) -> Validation:
@@ -170,17 +207,19 @@ def score_submission(submission: Path, truth: Path, scenes: Sequence[TrainScene]
 
 
 def score_table(validation: Validation) -> list[str]:
-    """Lines: a row for each scene and their mean; a dash for the mAA of unknown metres.
+    """Lines: a row for each scene and their mean; a dash for unknown figures.
 
-    The columns are the mAA, after each step if there are several, and the pose AUC after the last.
+    The columns are the mAA, after each step if there are several, and the pose AUC after the last. Lists of pairs
+    also have precision and matching score.
     """
-    several = len(validation.steps) > 1
+    several, is_list = len(validation.steps) > 1, not all(scene.in_metres for scene in validation.scenes)
     heads = [*(validation.steps if several else ["mAA"]), *(f"AUC {angle:.0f}" for angle in AUC_THRESHOLDS)]
+    heads += ["precis.", "m.score"] if is_list else []
     lines = [f"{'scene':<20}{'pairs':>6}" + "".join(f"{head:>9}" for head in heads)]
     rows: list[tuple[str, SceneScore | Validation]] = [(scene.scene, scene) for scene in validation.scenes]
     for name, scores in [*rows, ("mean over scenes", validation)]:
         accuracies = map(scores.maa, validation.steps or [None])
-        values = (*accuracies, *map(scores.auc, AUC_THRESHOLDS))
+        values = (*accuracies, *map(scores.auc, AUC_THRESHOLDS), *(scores.matching if is_list else ()))
         cells = (f"{value:>9.4f}" if isfinite(value) else f"{'-':>9}" for value in values)
         lines.append(f"{name:<20}{len(scores.errors):>6}" + "".join(cells))
     return ["mAA after each step, AUC after the last:", *lines] if several else lines
@@ -198,17 +237,11 @@ def missing_rows(validation: Validation) -> list[str]:
 def to_json(validation: Validation) -> dict[str, Any]:
     """All figures of a validation as JSON values: overall, per scene, per pair; what is not finite is null."""
     steps, report = validation.steps, validation.report
-    records = report.records if report else ()
-    reasons = Counter(str(region.reason) for record in records for region in record.regions or ())
     return {
         "recipe": validation.recipe,
         "missing": validation.missing,
         **_scores_json(validation, steps),
         "seconds": report and report.seconds,
-        "seconds_per_pair": report and report.seconds / len(records),
-        "matches_by_stage": _stage_means(records, "matches"),
-        "inliers_by_stage": _stage_means(records, "inliers"),
-        "region_reasons": dict(reasons),
         "scenes": [
             {"scene": scene.scene, **_scores_json(scene, steps), "pairs": [*map(_pair_json, scene.pairs)]}
             for scene in validation.scenes
@@ -221,15 +254,8 @@ def _scores_json(scores: SceneScore | Validation, steps: Sequence[Step]) -> dict
         "mAA": _finite(scores.maa()),
         "mAA_by_step": {step: _finite(scores.maa(step)) for step in steps},
         "AUC": {f"{threshold:g}": scores.auc(threshold) for threshold in AUC_THRESHOLDS},
+        **_matching_json(scores),
     }
-
-
-def _stage_means(records: Sequence[PairRecord], what: str) -> dict[str, float]:
-    """Mean number of matches or inliers on a pair, by stage."""
-    sums = Counter[int]()
-    for unit in (unit for record in records for unit in record.units):
-        sums[unit.stage] += getattr(unit, what)
-    return {str(stage): sums[stage] / len(records) for stage in sorted(sums)}
 
 
 def _pair_json(pair: PairScore) -> dict[str, Any]:
@@ -239,6 +265,7 @@ def _pair_json(pair: PairScore) -> dict[str, Any]:
         "rotation_error_degrees": _finite(pair.error.rotation),
         "translation_error_metres": _finite(pair.error.translation),
         "translation_error_degrees": _finite(pair.error.translation_angle),
+        **_matching_json(pair),
         "accuracy_by_step": {step: metrics.pair_accuracy(error) for step, error in pair.steps.items()},
     }
     if (record := pair.record) is not None:
@@ -246,6 +273,11 @@ def _pair_json(pair: PairScore) -> dict[str, Any]:
         values["matches"] = {unit.unit: unit.matches for unit in record.units}
         values["regions"] = [str(region.reason) for region in record.regions or ()]
     return values
+
+
+def _matching_json(scores: PairScore | SceneScore | Validation) -> dict[str, Any]:
+    precision, matching_score = map(_finite, scores.matching)
+    return {"precision": precision, "matching_score": matching_score}
 
 
 def _finite(value: float) -> float | None:

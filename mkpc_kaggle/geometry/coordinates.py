@@ -51,6 +51,9 @@ class Box:
     def area(self) -> int:
         return self.size.width * self.size.height
 
+    def is_within(self, size: Size) -> bool:
+        return min(self.left, self.top) >= 0 and self.right <= size.width and self.bottom <= size.height
+
     def contains(self, points: NDArray[np.floating]) -> NDArray[np.bool_]:
         """Which points, (N, 2) in image pixels, lie on the box's pixels; never for NaN."""
         x, y = points[:, 0], points[:, 1]
@@ -68,6 +71,7 @@ class View:
     content: Size  # of the crop, turned and resized
     padded: Size  # of the picture with its padding
     turns: int = 0  # quarters, counter-clockwise, 0 to 3
+    antialias: bool = True  # average areas where the crop shrinks
 
     @classmethod
     def fit(cls, crop: Box, *, long_side: int, multiple: int = 1, turns: int = 0) -> "View":
@@ -118,18 +122,18 @@ class View:
     def render(self, image: Pixels) -> Pixels:
         """The picture: (H, W) or (H, W, 3) uint8 image -> the same with ``padded`` height and width.
 
-        Padding is black. Shrinking averages areas, so that nothing aliases; enlarging is bilinear. Both use
-        the half-pixel convention of this module.
+        Padding is black. Shrinking averages areas, so that nothing aliases, unless ``antialias`` is off. All other
+        resizing is bilinear. Both use the half-pixel convention of this module.
         """
         crop = self.crop
         cut = image[crop.top : crop.bottom, crop.left : crop.right]
-        if min(crop.left, crop.top) < 0 or cut.shape[1::-1] != crop.size:
+        if not crop.is_within(Size(image.shape[1], image.shape[0])):
             raise ValueError(f"{crop} leaves the image of {image.shape[1]} x {image.shape[0]} pixels")
         # OpenCV counts quarters clockwise, and a single one is 0.
         picture = cv2.rotate(cut, 3 - self.turns) if self.turns else cut
         # In two steps: INTER_AREA is itself only where neither axis grows.
         turned = _turned_size(crop.size, self.turns)
-        shrunk = Size(*map(min, self.content, turned))
+        shrunk = Size(*map(min, self.content, turned)) if self.antialias else turned
         picture = cv2.resize(picture, shrunk, interpolation=cv2.INTER_AREA) if shrunk != turned else picture
         if shrunk != self.content:
             picture = cv2.resize(picture, self.content, interpolation=cv2.INTER_LINEAR)

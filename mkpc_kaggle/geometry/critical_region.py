@@ -36,9 +36,10 @@ class MkpcConfig:
 
 
 class RegionReason(StrEnum):
-    """``CROPPED``, or why the region is the whole image."""
+    """``CROPPED``, ``GIVEN`` by the user, or why the region is the whole image."""
 
     CROPPED = "cropped"
+    GIVEN = "given"
     TOO_FEW_POINTS = "too few points"
     NO_CLUSTER = "no cluster"
     TOO_SCATTERED = "too few points in clusters"

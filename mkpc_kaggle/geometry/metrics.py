@@ -6,15 +6,20 @@ from math import inf, isfinite
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 from scipy.integrate import trapezoid
 
 from mkpc_kaggle.geometry.cameras import Camera, relative_pose
 from mkpc_kaggle.geometry.coordinates import Matrix3
+from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.geometry.robust import calibrate, homogeneous
+from mkpc_kaggle.geometry.two_view import cross_matrix
 
 # The competition's rules. The i-th threshold in degrees belongs to the i-th in metres.
 ROTATION_THRESHOLDS = np.linspace(1, 10, 10)
 TRANSLATION_THRESHOLDS = np.geomspace(0.2, 5, 10)
 AUC_THRESHOLDS = (5.0, 10.0, 20.0)  # degrees
+CORRECT = 5e-4  # a correct match's squared distance to its epipolar lines on the planes z = 1, summed over both
 
 
 @dataclass(frozen=True)
@@ -42,15 +47,18 @@ class PoseError:
         return max(self.rotation, self.translation_angle)
 
 
-def pose_error(F: Matrix3, camera0: Camera, camera1: Camera, metres_per_unit: float) -> PoseError:
-    """Return the error of the pose of F.
+def pose_error(
+    F: Matrix3, camera0: Camera, camera1: Camera, metres_per_unit: float, rotation: Matrix3 | None = None
+) -> PoseError:
+    """Return the error of the pose of F, or of its translation and a given ``rotation``.
 
-    A submission has no points that would select one of F's two rotations. So the rotation nearer to the truth
-    counts, and the sign of the translation is free.
+    A submission has no points that would select one of F's two rotations. So by default the rotation nearer to
+    the truth counts. The sign of the translation is free.
     """
     R, t = relative_pose(camera0, camera1)
     # Two rotations, and a direction (3, 1) of unknown sign (Hartley and Zisserman, Multiple View Geometry, 9.6.2).
-    *rotations, column = cv2.decomposeEssentialMat(camera1.K.T @ F @ camera0.K)
+    *both, column = cv2.decomposeEssentialMat(camera1.K.T @ F @ camera0.K)
+    rotations = both if rotation is None else [rotation]
     direction = np.ravel(column).astype(np.float64)
     length = float(np.linalg.norm(t))
     cosine = abs(float(direction @ t)) / max(length, np.finfo(float).tiny)
@@ -76,6 +84,17 @@ def pair_accuracy(error: PoseError) -> float:
     """
     meets = (error.rotation < ROTATION_THRESHOLDS) & (error.translation < TRANSLATION_THRESHOLDS)
     return float(np.mean(meets))
+
+
+def correct_matches(matches: Matches, camera0: Camera, camera1: Camera) -> NDArray[np.bool_]:
+    """Return an (N,) mask of the matches that the true cameras confirm, by :data:`CORRECT`."""
+    R, t = relative_pose(camera0, camera1)
+    E = cross_matrix(t) @ R
+    x0, x1 = homogeneous(calibrate(matches.points0, camera0.K)), homogeneous(calibrate(matches.points1, camera1.K))
+    lines0, lines1 = x1 @ E, x0 @ E.T
+    with np.errstate(divide="ignore", invalid="ignore"):  # cameras with one centre confirm nothing
+        inverse = 1 / (lines0[:, :2] ** 2).sum(axis=1) + 1 / (lines1[:, :2] ** 2).sum(axis=1)
+        return np.asarray((x1 * lines1).sum(axis=1) ** 2 * inverse < CORRECT)
 
 
 def pose_auc(errors: Sequence[PoseError], threshold: float) -> float:

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from mkpc_kaggle.config import POSITIVE, Range, check_ranges
 from mkpc_kaggle.geometry.coordinates import Matrix3
@@ -21,6 +22,7 @@ from mkpc_kaggle.geometry.two_view import Vectors, robust_costs, sampson
 # F of a pure sideways motion, [e_x]_x: finite, rank 2; the epipolar lines are the image rows.
 FALLBACK_FUNDAMENTAL: Matrix3 = np.array([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 FALLBACK_FUNDAMENTAL.setflags(write=False)
+FARTHEST = 1e9  # baselines; matches that are farther do not count as in front of a camera
 
 
 class ModelKind(StrEnum):
@@ -45,14 +47,16 @@ class RobustConfig:
     """
 
     method: Method = Method.MAGSAC
-    threshold: float = 0.2  # image pixels
+    threshold: float = 0.2  # pixels of the stored image
     confidence: float = 0.99999
     max_iterations: int = 50_000
     permutations: int = 8  # number of fixed permutations; the first is the matches' own order
+    threshold_side: int = 0  # if not 0, the threshold is in pixels of the image resized to this long side
+    every_match: bool = False  # keep exact duplicates, and estimate from the fewest matches that OpenCV accepts
 
     def __post_init__(self) -> None:
         check_ranges(self, threshold=POSITIVE, confidence=Range(0, 1, "()"), max_iterations=Range(1, 10**6))
-        check_ranges(self, permutations=Range(1, 100))
+        check_ranges(self, permutations=Range(1, 100), threshold_side=Range(0, 99_999))
 
 
 @dataclass(frozen=True)
@@ -68,6 +72,7 @@ class EstimateStats:
     magsac_cost: float = 0.0  # of MAGSAC's own F; 0 without one
     focals: tuple[float, float] = (0.0, 0.0)  # in pixels, of both images; 0 if unknown
     support: float = 0.0  # see :mod:`mkpc_kaggle.geometry.overlap`
+    rotation: tuple[float, ...] = (0.0, 0.0, 0.0)  # of an E by its inliers, see :func:`rotation_in_front`
 
 
 NO_STATS = EstimateStats()
@@ -104,13 +109,14 @@ def estimate(
 ) -> Estimate:
     """Estimate a two-view model from ``matches`` (image pixels).
 
-    Ignores non-finite points and exact duplicates; duplicates of an inlier are inliers. E needs the two camera
-    matrices, (3, 3) each: the points are calibrated, and the threshold is divided by the mean focal length. Raises
-    ``ValueError`` for E without intrinsics, and never because of the points. The same input gives the same bytes.
+    Ignores non-finite points and, by default, exact duplicates; duplicates of an inlier are inliers. E needs the
+    two camera matrices, (3, 3) each: the points are calibrated, and the threshold is divided by the mean focal
+    length. Raises ``ValueError`` for E without intrinsics, and never because of the points. The same input gives
+    the same bytes.
     """
     if model is ModelKind.E and intrinsics is None:
         raise ValueError("an essential matrix needs the intrinsics, the camera matrix K of both images")
-    distinct = DistinctMatches.of(matches)
+    distinct = DistinctMatches.of(matches, merge=not config.every_match)
     found = consensus(distinct.points0, distinct.points1, config, model, intrinsics)
     return replace(found, inliers=distinct.mask_of_all(found.inliers))
 
@@ -124,7 +130,7 @@ def consensus(
 ) -> Estimate:
     """:func:`estimate` for (N, 2) finite points without duplicates."""
     count, threshold, solver = len(points0), config.threshold, _SOLVERS[model]
-    if count < solver.min_matches:
+    if count < (solver.minimal if config.every_match else solver.min_matches):
         return Estimate.failed(model, count, f"too few distinct matches for {model}: {count}")
     if intrinsics is not None and model is ModelKind.E:
         points0, points1 = calibrate(points0, intrinsics[0]), calibrate(points1, intrinsics[1])
@@ -158,21 +164,23 @@ def consensus(
 
 @dataclass(frozen=True, eq=False)
 class DistinctMatches:
-    """The finite distinct matches of N matches, in order of first appearance."""
+    """The finite distinct matches of N matches, in order of first appearance; without ``merge``, all finite."""
 
     points0: Vectors  # (M, 2)
     points1: Vectors
     index: NDArray[np.intp]  # (N,) the row of each match, -1 for a match that is not finite
 
     @classmethod
-    def of(cls, matches: Matches) -> "DistinctMatches":
+    def of(cls, matches: Matches, *, merge: bool = True) -> "DistinctMatches":
         pairs = np.hstack([matches.points0, matches.points1]).astype(np.float64)
+        if not merge:
+            pairs = np.column_stack([pairs, np.arange(len(pairs))])
         finite = np.isfinite(pairs).all(axis=1)
         _, first, inverse = np.unique(pairs[finite], axis=0, return_index=True, return_inverse=True)
         index = np.full(len(pairs), -1)
         index[finite] = np.argsort(np.argsort(first))[inverse.ravel()]
         pairs = pairs[finite][np.sort(first)]
-        return cls(pairs[:, :2], pairs[:, 2:], index)
+        return cls(pairs[:, :2], pairs[:, 2:4], index)
 
     def mask_of_all(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Expand an (M,) mask of the distinct matches to an (N,) mask of all, duplicates included."""
@@ -183,10 +191,18 @@ def unit_norm(matrix: Matrix3) -> Matrix3:
     return np.asarray(matrix / np.linalg.norm(matrix))
 
 
-def calibrate(points: Vectors, K: Matrix3) -> Vectors:
+def calibrate(points: NDArray[np.floating], K: Matrix3) -> Vectors:
     """Convert (N, 2) pixels to (N, 2) coordinates in the plane z = 1 of the camera with matrix K."""
     mapped = homogeneous(points) @ np.linalg.inv(K).T
     return np.asarray(mapped[:, :2] / mapped[:, 2:])
+
+
+def rotation_in_front(E: Matrix3, matches: Matches, intrinsics: tuple[Matrix3, Matrix3]) -> list[float]:
+    """Return the rotation of E that puts most matches in front of both cameras: (3,) its axis times radians."""
+    x0, x1 = calibrate(matches.points0, intrinsics[0]), calibrate(matches.points1, intrinsics[1])
+    _, R, *_ = cv2.recoverPose(E, x0, x1, np.eye(3), FARTHEST)
+    rotation: list[float] = Rotation.from_matrix(R).as_rotvec().tolist()
+    return rotation
 
 
 def sampson_distances(F: Matrix3, matches: Matches) -> Vectors:
@@ -202,7 +218,7 @@ def permutation(number: int, count: int) -> NDArray[np.intp]:
     return np.random.default_rng(number).permutation(count) if number else np.arange(count)
 
 
-def homogeneous(points: Vectors) -> Vectors:
+def homogeneous(points: NDArray[np.floating]) -> Vectors:
     """Append a 1 to each point: (N, 2) -> (N, 3)."""
     return np.column_stack([points, np.ones(len(points))])
 
@@ -218,6 +234,7 @@ def _transfer_distances(matrix: Matrix3, points0: Vectors, points1: Vectors) -> 
 
 
 class _Solver(NamedTuple):
+    minimal: int  # the fewest matches that OpenCV accepts
     min_matches: int  # more than a minimal sample, so that matches can contradict the model
     fallback: Matrix3
     find: Callable[..., Any]  # returns OpenCV's matrix, ``None`` without a model, and mask
@@ -226,11 +243,15 @@ class _Solver(NamedTuple):
 
 def _find_essential(points0: Vectors, points1: Vectors, confidence: float, **settings: Any) -> Any:
     settings["threshold"] = settings.pop("ransacReprojThreshold")
-    return cv2.findEssentialMat(points0, points1, np.eye(3), prob=confidence, **settings)
+    stacked, mask = cv2.findEssentialMat(points0, points1, np.eye(3), prob=confidence, **settings)
+    if stacked is None or len(stacked) <= 3:
+        return stacked, mask
+    solutions = np.split(stacked, len(stacked) // 3)  # of five points, up to ten
+    return max(solutions, key=lambda E: cv2.recoverPose(E, points0, points1, np.eye(3), FARTHEST)[0]), mask
 
 
 _SOLVERS = {
-    ModelKind.F: _Solver(8, FALLBACK_FUNDAMENTAL, cv2.findFundamentalMat, _epipolar_distances),
-    ModelKind.E: _Solver(6, FALLBACK_FUNDAMENTAL, _find_essential, _epipolar_distances),
-    ModelKind.H: _Solver(5, np.eye(3), cv2.findHomography, _transfer_distances),
+    ModelKind.F: _Solver(8, 8, FALLBACK_FUNDAMENTAL, cv2.findFundamentalMat, _epipolar_distances),
+    ModelKind.E: _Solver(5, 6, FALLBACK_FUNDAMENTAL, _find_essential, _epipolar_distances),
+    ModelKind.H: _Solver(4, 5, np.eye(3), cv2.findHomography, _transfer_distances),
 }

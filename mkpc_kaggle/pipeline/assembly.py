@@ -19,7 +19,7 @@ from mkpc_kaggle.pipeline.availability import (
     unavailable,
 )
 from mkpc_kaggle.pipeline.devices import AUTO, gpus_of, require_device, resolve_placement
-from mkpc_kaggle.pipeline.stages import ENCODING_CACHE_BYTES, Pipeline
+from mkpc_kaggle.pipeline.stages import ENCODING_CACHE_BYTES, GivenRegions, Pipeline
 from mkpc_kaggle.recipe import Mode, Recipe, Unit, load_recipe
 from mkpc_kaggle.weights import FoundFile, State, WeightStore
 
@@ -38,6 +38,7 @@ class Assembly:
     matchers: Mapping[str, Matcher[Any]] = field(default_factory=dict)  # ready matchers of the user's own
     device: str = AUTO  # as the user asked for it
     sharing: int = 1  # workers on the placement's device
+    regions: GivenRegions = field(default_factory=dict)  # in MKPC's place
 
     @property
     def devices(self) -> tuple[str, ...]:
@@ -74,6 +75,7 @@ class Assembly:
             minibatch=self.minibatch,
             cache_bytes=cache_bytes,
             load_float32=None if exact == self.placement else lambda name: self._load(name, exact),
+            regions=self.regions,
         )
 
     def unit_settings(self, unit: Unit) -> dict[str, Any]:

@@ -1,17 +1,18 @@
 """A pair on its way through the stages: results of units, critical regions, the two-view model."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mkpc_kaggle.data.images import Image
-from mkpc_kaggle.geometry.coordinates import Matrix3, Size
+from mkpc_kaggle.geometry.coordinates import Box, Matrix3, Size, View
 from mkpc_kaggle.geometry.critical_region import CriticalRegion
 from mkpc_kaggle.geometry.focal_prior import FocalPrior, estimate_with_prior
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.overlap import support
-from mkpc_kaggle.geometry.robust import Estimate, ModelKind, estimate
+from mkpc_kaggle.geometry.robust import Estimate, ModelKind, RobustConfig, estimate, rotation_in_front
 from mkpc_kaggle.recipe import Recipe, Unit
 
 Regions = tuple[CriticalRegion, CriticalRegion]
@@ -29,6 +30,7 @@ class UnitResult:
     failure: str = ""  # why there are no matches
     warm_up: bool = False  # this process ran the unit for the first time, which may take much longer
     note: str = ""  # why the unit ran otherwise than it is written
+    keypoints: int = 0  # that its matcher detected in the first view; 0 for a matcher without a detector
 
     @property
     def seconds(self) -> float:
@@ -73,24 +75,40 @@ def with_estimate(
     model: ModelKind = ModelKind.F,
     intrinsics: tuple[Matrix3, Matrix3] | None = None,
 ) -> PairMatch:
-    """The pair with its two-view model from all matches, in the recipe's order: MAGSAC's result depends on it.
+    """Return the pair with its two-view model from all matches.
 
+    They are in the recipe's order, on which MAGSAC's result depends.
     The recipe's prior on focal lengths, if any, goes by the images' sizes and EXIF, unless ``intrinsics`` are
     given.
     """
     results = tuple(sorted(pair.results, key=lambda result: recipe.units.index(result.unit)))
     matches = Matches.concatenate(result.matches for result in results)
+    sizes = pair.sizes or tuple(image.size for image in pair.images)
+    magsac = in_stored_pixels(recipe.magsac, sizes, intrinsics)
     if recipe.focal is None or model is ModelKind.H:
-        found = estimate(matches, recipe.magsac, model, intrinsics)
+        found = estimate(matches, magsac, model, intrinsics)
     else:
-        sizes = pair.sizes or tuple(image.size for image in pair.images)
         focals = pair.focals or tuple(image.focal for image in pair.images)
         told = zip(sizes, focals, strict=True)
         known = [FocalPrior(K, 0.0) for K in intrinsics or ()]
         first, second = known or [FocalPrior.of_image(size, recipe.focal, focal) for size, focal in told]
-        found = estimate_with_prior(matches, (first, second), recipe.magsac, recipe.focal, model)
+        found = estimate_with_prior(matches, (first, second), magsac, recipe.focal, model)
     if found.ok and model is not ModelKind.H:
         K0, K1 = intrinsics if intrinsics and model is ModelKind.E else (np.eye(3), np.eye(3))
         F = np.linalg.inv(K1).T @ found.matrix @ np.linalg.inv(K0)
         found = replace(found, stats=replace(found.stats, support=support(F, matches)))
+        if model is ModelKind.E and intrinsics and found.inliers.any():
+            rotation = tuple(rotation_in_front(found.matrix, matches[found.inliers], intrinsics))
+            found = replace(found, stats=replace(found.stats, rotation=rotation))
     return replace(pair, results=results, estimate=found)
+
+
+def in_stored_pixels(
+    magsac: RobustConfig, sizes: Sequence[Size], intrinsics: tuple[Matrix3, Matrix3] | None
+) -> RobustConfig:
+    """Return settings for stored images of these sizes, with the same threshold over the mean focal length."""
+    if not magsac.threshold_side:
+        return magsac
+    scales = np.array([View.fit(Box.whole(size), long_side=magsac.threshold_side).scale for size in sizes])
+    focals = np.array([K.diagonal()[:2] for K in intrinsics or 2 * [np.eye(3)]])
+    return replace(magsac, threshold=magsac.threshold * focals.sum() / (focals * scales).sum(), threshold_side=0)

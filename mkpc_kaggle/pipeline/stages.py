@@ -7,15 +7,16 @@ import os
 import sys
 import time
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import chain
+from types import MappingProxyType
 from typing import Any
 
 from mkpc_kaggle.data.images import ByteCache, Image
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Box, View
-from mkpc_kaggle.geometry.critical_region import critical_region
+from mkpc_kaggle.geometry.critical_region import CriticalRegion, RegionReason, critical_region
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import Colour, Matcher, NonFiniteError, Picture, encoding_bytes
 from mkpc_kaggle.matchers.dtypes import check_finite, exact_float32
@@ -25,6 +26,7 @@ from mkpc_kaggle.recipe import Recipe, Unit
 
 ENCODING_CACHE_BYTES = 2 << 30
 
+GivenRegions = Mapping[tuple[str, ...], tuple[Box, Box]]  # by the names of both images
 ViewKey = tuple[str, str, View]  # matcher, image and view: what an encoding is of
 
 matched_in: set[int] = set()  # this process, if pairs have been matched in it, and those that it was forked from
@@ -36,7 +38,7 @@ class Pipeline:
     ``load(name)`` gives a matcher, ``load_float32(name)`` the same in float32: it takes over for good if half
     precision does not hold a matcher's numbers. Pairs are matched, and views of one shape encoded, ``minibatch``
     at a time; fewer by a unit for which memory was short, from then on. Encodings of whole images, which come back
-    in many pairs, are kept in ``cache_bytes``.
+    in many pairs, are kept in ``cache_bytes``. ``regions`` replace MKPC's.
     """
 
     def __init__(
@@ -47,8 +49,9 @@ class Pipeline:
         minibatch: int = 1,
         cache_bytes: int = ENCODING_CACHE_BYTES,
         load_float32: Callable[[str], Matcher[Any]] | None = None,
+        regions: GivenRegions = MappingProxyType({}),
     ) -> None:
-        self.recipe, self.minibatch = recipe, minibatch
+        self.recipe, self.minibatch, self.regions = recipe, minibatch, regions
         self._load, self._load_float32 = load, load_float32
         self._minibatches: dict[Unit, int] = {}
         self._ran: set[Unit] = set()
@@ -76,7 +79,7 @@ class Pipeline:
         for unit in (unit for unit in units if unit.stage == 1):
             self._run(unit, pairs, may_start)
         if any(unit.stage == 2 for unit in units):
-            pairs = [with_regions(pair, self.recipe) for pair in pairs]
+            pairs = [with_regions(pair, self.recipe, self.regions) for pair in pairs]
         for unit in (unit for unit in units if unit.stage == 2):
             self._run(unit, pairs, may_start)
         return pairs
@@ -145,8 +148,9 @@ class Pipeline:
                 (matched - encoded) / len(pairs),
                 warm_up=warm_up,
                 note=self._notes.get(unit.matcher, ""),
+                keypoints=len(getattr(encoding, "points", ())),
             )
-            for matches, both in zip(found, views, strict=True)
+            for matches, both, encoding in zip(found, views, encodings[::2], strict=True)
         ]
 
     def _encode(self, unit: Unit, wanted: Sequence[tuple[Image, View]]) -> list[Any]:
@@ -198,8 +202,11 @@ def views_of(unit: Unit, multiple: int, pair: PairMatch) -> tuple[View, View]:
     return first, second
 
 
-def with_regions(pair: PairMatch, recipe: Recipe) -> PairMatch:
-    """The pair with the critical region of each image, from the matched points of stage 1."""
+def with_regions(pair: PairMatch, recipe: Recipe, given: GivenRegions = MappingProxyType({})) -> PairMatch:
+    """Return the pair with the critical region of each image: given, or from the matches of stage 1."""
+    if (boxes := given.get(tuple(image.name for image in pair.images))) is not None:
+        first, second = (CriticalRegion(box, RegionReason.GIVEN) for box in boxes)
+        return replace(pair, regions=(first, second))
     start = time.perf_counter()
     matches = pair.matches[pair.in_stage(1)]
     region0, region1 = (

@@ -9,7 +9,7 @@ import numpy as np
 
 from mkpc_kaggle.data.images import Image, Unreadable, read_image
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.geometry.coordinates import Matrix3, Pixels
+from mkpc_kaggle.geometry.coordinates import Box, Matrix3, Pixels
 from mkpc_kaggle.geometry.robust import ModelKind
 from mkpc_kaggle.matchers.contract import Matcher
 from mkpc_kaggle.pipeline.assembly import assemble
@@ -52,18 +52,21 @@ class TwoStageMatcher:
         *,
         model: ModelKind | str = ModelKind.F,
         intrinsics: tuple[Matrix3, Matrix3] | None = None,
+        regions: tuple[Box, Box] | None = None,
     ) -> PairMatch:
         """Match two images: paths, or arrays (H, W, 3) RGB or (H, W) gray, uint8.
 
         ``model`` E needs ``intrinsics``, the camera matrices in pixels; without them ``ValueError`` is raised.
-        Points and F are in pixels of the stored files: EXIF only sets the views upright. Raises :class:`UserError`
-        for an image that cannot be read. A pair that cannot be matched is a result with ``estimate.failure``.
-        Errors of memory and of the device are raised as they are.
+        ``regions`` replace MKPC's boxes; units of stage 2 fail if a box leaves its image. Points, boxes and F are
+        in pixels of the stored files: EXIF only sets the views upright. Raises :class:`UserError` for an image
+        that cannot be read. A pair that cannot be matched is a result with ``estimate.failure``. Errors of memory
+        and of the device are raised as they are.
         """
         if ModelKind(model) is ModelKind.E and intrinsics is None:
             raise ValueError("model E needs intrinsics=(K0, K1), the camera matrices of both images in pixels")
-        pair = PairMatch(images=(to_image(image0), to_image(image1)))
-        (pair,) = self._pipeline.match([pair], self.recipe.units)
+        images = to_image(image0), to_image(image1)
+        self._pipeline.regions = {tuple(image.name for image in images): regions} if regions else {}
+        (pair,) = self._pipeline.match([PairMatch(images=images)], self.recipe.units)
         return with_estimate(pair, self.recipe, ModelKind(model), intrinsics)
 
 

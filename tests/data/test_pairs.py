@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from pair_lists import line_of, line_of_pair, turned_camera, write_list
 
-from benchmarks import paper_tables
 from mkpc_kaggle import TwoStageMatcher
 from mkpc_kaggle.cli import main
 from mkpc_kaggle.cli.validate import with_units
@@ -174,28 +173,6 @@ def test_failures_count_as_such(demo, scenes, tmp_path, capsys):
     assert scores["AUC"]["20"] == pytest.approx(curve)
     row = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("mean over scenes"))
     assert row.split()[3:5] == ["2", "-"]
-
-
-def test_the_papers_tables_are_made_with_one_command(demo, scenes, tmp_path, capsys):
-    listed = write_list(tmp_path / "list.txt", [replace(scenes[0], pairs=scenes[0].pairs[:1])], demo.train_dir)
-    where = ["--scannet", str(listed), str(demo.train_dir), "--out", str(tmp_path / "out"), "--matcher", "sift"]
-    paper_tables.main([*where, "--rows", "one", "two + one"])
-    heads, _, first, second, empty = capsys.readouterr().out.splitlines()
-    assert heads.startswith("| scannet: 1 pairs | whole images | critical regions | AUC 5 |")
-    assert first.startswith("| one | 1280 | - | ")
-    assert second.startswith("| two + one | 1024, 1280 | 1280 | ")
-    assert all(0 <= float(area) <= 100 for row in (first, second) for area in row.split("|")[4:7])
-    assert float(first.split("|")[6]) > 10
-    assert empty == ""
-
-
-def test_every_row_of_the_papers_tables_is_a_part_of_its_recipe():
-    text = (Path(__file__).resolve().parents[2] / "docs" / "benchmarks.md").read_text()
-    for dataset, rows in paper_tables.TABLES.items():
-        assert set(rows[-1].of(dataset, "superglue").units) == set(load_recipe(dataset).units)
-        for row in rows:
-            sizes = [", ".join(map(str, sides)) for sides in (row.stage1, row.stage2) if sides]
-            assert f"| {' + '.join(sizes)} |" in text
 
 
 def test_units_are_taken_in_the_order_in_which_they_are_named():

@@ -106,9 +106,8 @@ def test_validate_scores_a_recipe_and_writes_all_figures(demo, small_recipe, cap
     assert scene["scene"] == "courtyard"
     assert len(scene["pairs"]) == 5
     assert 0.1 < scores["mAA"] == scene["mAA"] <= 1
-    assert scores["seconds_per_pair"] > 0
-    assert set(scores["inliers_by_stage"]) == {"1", "2"}
-    assert sum(scores["region_reasons"].values()) == 10
+    for pair in scene["pairs"]:
+        assert set(pair["matches"]) == {"1:sift@320", "2:sift@400"}
 
 
 def test_each_step_of_the_estimate_has_a_column(demo, small_recipe, capsys):

@@ -1,0 +1,318 @@
+import argparse
+import json
+import pickle
+import re
+import sqlite3
+import zipfile
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from pair_lists import line_of, line_of_pair, write_list
+from protocol_by_hand import auc, evaluate
+from rectified import RectifiedMatcher
+from scipy.spatial.transform import Rotation
+from shared import DATA, needs_data
+
+from benchmarks import paper_tables
+from mkpc_kaggle import TwoStageMatcher
+from mkpc_kaggle.cli import main
+from mkpc_kaggle.data.competition import read_train_side
+from mkpc_kaggle.data.images import read_image
+from mkpc_kaggle.data.pairs import read_pairs
+from mkpc_kaggle.engine.journal import JournalReader
+from mkpc_kaggle.evaluation.protocols import by_protocol
+from mkpc_kaggle.geometry.cameras import Camera
+from mkpc_kaggle.geometry.coordinates import Box, Size
+from mkpc_kaggle.geometry.critical_region import RegionReason
+from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.geometry.metrics import pose_error
+from mkpc_kaggle.geometry.robust import Method, ModelKind, RobustConfig, estimate
+from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult, with_estimate
+from mkpc_kaggle.recipe import Recipe, Unit, load_recipe
+
+K = np.array([[800.0, 0, 320], [0, 800, 240], [0, 0, 1]])
+CAMERAS = Camera(K, np.eye(3), np.zeros(3)), Camera(K, np.eye(3), np.array([1.0, 0, 0.1]))
+
+
+def validate(listed: Path, root: Path, recipe: Path) -> list[str]:
+    return ["validate", "--pairs", str(listed), "--image-root", str(root), "--recipe", str(recipe)]
+
+
+def matches_of(journal: JournalReader, position: int) -> Matches:
+    return Matches.concatenate(journal.points(journal.inputs(position).values()).values())
+
+
+OUTDOORS = ["castle_p19", "fountain_p11", "herz_jesus_p8", "reichstag_26"]
+
+
+def sharp(camera: Camera) -> Camera:
+    """The camera with a rotation of all digits: with six, the angle from a trace is wrong by up to 0.1 degrees."""
+    return replace(camera, R=Rotation.from_matrix(camera.R).as_matrix())
+
+
+@needs_data
+@pytest.mark.parametrize(
+    ("scenes", "pairs", "units"),
+    [
+        (["scannet_samples"], 15, [(1, 640)]),
+        (OUTDOORS, 3, [(1, 480), (1, 640), (2, 480)]),
+        pytest.param(OUTDOORS, None, [(1, 1200)], marks=pytest.mark.slow),
+    ],
+)
+def test_an_independent_evaluation_of_the_same_matches_agrees(scenes, pairs, units, tmp_path):
+    train = DATA / "train"
+    truths = [
+        true for scene in read_train_side(train, scenes=scenes, pairs_per_scene=pairs) for true in scene.pairs
+    ]
+    lines = [
+        line_of_pair(replace(true, camera0=sharp(true.camera0), camera1=sharp(true.camera1)), train)
+        for true in truths
+    ]
+    listed = tmp_path / "list.txt"
+    listed.write_text("\n".join(lines))
+    recipe, out = tmp_path / "recipe.toml", tmp_path / "scores.json"
+    text = ", ".join(f'{{ stage = {stage}, matcher = "sift", long_side = {side} }}' for stage, side in units)
+    recipe.write_text(f"units = [{text}]")
+    command = [*validate(listed, train, recipe), "--protocol", "superglue", "--work-dir", str(tmp_path)]
+    assert main([*command, "--json", str(out)]) == 0
+    scores = json.loads(out.read_text())
+    side = max(side for stage, side in units if stage == 1)
+    expected = []
+    with JournalReader(tmp_path) as journal:
+        for line, true, record in zip(lines, truths, journal.records(), strict=True):
+            matches = matches_of(journal, record.index)
+            keypoints = sum(unit.keypoints for unit in record.units)
+            points = matches.points0.astype(float), matches.points1.astype(float)
+            sizes = [read_image(path).size for path in true.pair.images]
+            expected.append(evaluate(line, points, keypoints, sizes, side))
+            if (R := expected[-1]["R"]) is not None:
+                np.testing.assert_allclose(Rotation.from_rotvec(record.stats.rotation).as_matrix(), R, atol=1e-6)
+                residual = expected[-1]["t"] @ record.pair_fundamental  # t is E's left null vector
+                np.testing.assert_allclose(residual, 0, atol=1e-6)
+    (scene,) = scores["scenes"]
+    for key, own in (
+        ("rotation", "rotation_error_degrees"),
+        ("translation", "translation_error_degrees"),
+        ("precision", "precision"),
+        ("matching_score", "matching_score"),
+    ):
+        found = [np.inf if pair[own] is None else pair[own] for pair in scene["pairs"]]
+        np.testing.assert_allclose(found, [pair[key] for pair in expected], atol=1e-6, err_msg=key)
+        if "error" not in own:
+            assert scores[own] == pytest.approx(np.mean(found), abs=1e-9)
+    errors = [max(pair["rotation"], pair["translation"]) for pair in expected]
+    for limit in (5, 10, 20):
+        assert scores["AUC"][str(limit)] == pytest.approx(auc(errors, limit), abs=1e-6)
+    assert any(np.isfinite(errors))
+
+
+@pytest.mark.parametrize(("side", "width"), [(None, 1600), (1200, 1200), (0, 640)])
+def test_the_threshold_that_reaches_opencv_is_a_pixel_of_the_resized_picture(side, width, monkeypatch, tmp_path):
+    """The stored images are 640 and 500 pixels wide, and resized to the same long side."""
+    small = Camera(np.diag([500 / 640, 500 / 640, 1]) @ K, CAMERAS[1].R, CAMERAS[1].t)
+    for name, shape in (("a.png", (480, 640)), ("b.png", (375, 500))):
+        cv2.imwrite(str(tmp_path / name), np.full(shape, 90, np.uint8))
+    (tmp_path / "list.txt").write_text(line_of(("a.png", "b.png"), (CAMERAS[0], small)))
+    (true,) = read_pairs(tmp_path / "list.txt", tmp_path).pairs
+    thresholds = []
+    find = cv2.findEssentialMat
+
+    def noted(*points, **settings):
+        thresholds.append(settings["threshold"])
+        return find(*points, **settings)
+
+    monkeypatch.setattr(cv2, "findEssentialMat", noted)
+    units = (Unit(1, "rectified", 1200), Unit(1, "rectified", 1600), Unit(2, "rectified", 2000))
+    recipe = by_protocol(Recipe(units), "superglue")
+    if side is not None:
+        recipe = replace(recipe, magsac=replace(recipe.magsac, threshold_side=side))
+    matcher = TwoStageMatcher(recipe, matchers={"rectified": RectifiedMatcher()})
+    matcher(*true.pair.images, model=ModelKind.E, intrinsics=true.pair.intrinsics)
+    focals = [800, 500 / 640 * 800] if side == 0 else [800 * width / 640]
+    assert thresholds == pytest.approx([1 / np.mean(focals)])
+
+
+def test_five_matches_are_enough_for_an_essential_matrix_and_duplicates_count():
+    generator = np.random.default_rng(1)
+    points = generator.uniform((-1, -1, 3), (1, 1, 6), (5, 3))
+    projected = [(points + camera.t) @ K.T for camera in CAMERAS]
+    x0, x1 = ((each[:, :2] / each[:, 2:]).astype(np.float32) for each in projected)
+    five, config = Matches(x0, x1, np.ones(5)), RobustConfig(Method.RANSAC, 1.0, permutations=1)
+    every = replace(config, every_match=True)
+    assert estimate(five, config, ModelKind.E, (K, K)).failure == "too few distinct matches for E: 5"
+    found = estimate(five, every, ModelKind.E, (K, K))
+    assert found.matrix.shape == (3, 3)
+    assert found.inlier_count == 5
+    twice = Matches.concatenate([five[:4], five[:4]])
+    assert "too few distinct matches for E: 4" in estimate(twice, config, ModelKind.E, (K, K)).failure
+    assert "too few" not in estimate(twice, every, ModelKind.E, (K, K)).failure
+
+
+def test_the_points_in_front_of_both_cameras_choose_between_the_two_rotations_of_e():
+    """Matches of the twisted pair have the same E as the truth, whose rotation they do not have."""
+    t = CAMERAS[1].t
+    twisted = 2 * np.outer(t, t) / (t @ t) - np.eye(3)
+    points = np.random.default_rng(0).uniform((6, -1, 1), (8, 1, 2), (40, 3))
+    points[:, 0] *= points[:, 2]  # far to the side, in front of both
+    projected = points @ K.T, (points @ twisted.T + t) @ K.T
+    assert min(each[:, 2].min() for each in projected) > 0
+    x0, x1 = (each[:, :2] / each[:, 2:] for each in projected)
+    recipe = by_protocol(Recipe((Unit(1, "sift", 640),)), "superglue")
+    found = UnitResult(recipe.units[0], Matches(x0.astype(np.float32), x1.astype(np.float32), np.ones(40)))
+    pair = PairMatch((found,), sizes=(Size(640, 480), Size(640, 480)))
+    result = with_estimate(pair, recipe, ModelKind.E, (K, K)).estimate
+    rotation = Rotation.from_rotvec(result.stats.rotation).as_matrix()
+    calibrated = [camera.calibrated for camera in CAMERAS]
+    assert pose_error(result.matrix, *calibrated, 1.0).rotation < 0.1
+    assert pose_error(result.matrix, *calibrated, 1.0, rotation).rotation > 179
+
+
+@pytest.fixture(scope="module")
+def scenes(demo):
+    return read_train_side(demo.train_dir, pairs_per_scene=3)
+
+
+def write_scene_info(path: Path, scenes, root: Path) -> Path:
+    """As numpy writes arrays of objects; images without a camera, and more than the two indices in a pair."""
+    truths = [true for scene in scenes for true in scene.pairs]
+    images = [each for true in truths for each in zip(true.pair.images, (true.camera0, true.camera1), strict=True)]
+    poses = np.array([None] * (len(images) + 1), object)
+    paths, Ks = poses.copy(), poses.copy()
+    infos = np.array([None] * (len(images) // 2), object)
+    for number, (file, camera) in enumerate(images):
+        paths[number + 1], Ks[number + 1] = str(file.relative_to(root)), camera.K
+        poses[number + 1] = np.vstack([np.column_stack([camera.R, camera.t]), [0, 0, 0, 1]])
+        infos[number // 2] = (number - number % 2 + 1, number - number % 2 + 2), 0.5, np.zeros((1, 4))
+    np.savez(path, pair_infos=infos, image_paths=paths, intrinsics=Ks, poses=poses)
+    return path
+
+
+def test_megadepths_files_are_read_as_the_list_that_they_stand_for(demo, scenes, tmp_path):
+    (tmp_path / "infos").mkdir()
+    for number, scene in enumerate(scenes):
+        write_scene_info(tmp_path / "infos" / f"{number}.npz", [scene], demo.train_dir)
+    listed = read_pairs(write_list(tmp_path / "list.txt", scenes, demo.train_dir), demo.train_dir)
+    found = read_pairs(tmp_path / "infos", demo.train_dir)
+    for one, other in zip(found.pairs, listed.pairs, strict=True):
+        assert one.pair == replace(other.pair, group="infos")
+        for camera, truth in ((one.camera0, other.camera0), (one.camera1, other.camera1)):
+            np.testing.assert_allclose(camera.K, truth.K)
+            np.testing.assert_allclose(camera.R, truth.R, atol=1e-12)
+            np.testing.assert_allclose(camera.t, truth.t, atol=1e-9)
+
+
+class Run:
+    def __reduce__(self):
+        return print, ("executed",)
+
+
+def pickled(data: bytes):
+    """Write a scene_info whose arrays of objects are this pickle."""
+    header = b"{'descr': '|O', 'fortran_order': False, 'shape': (1,), }".ljust(117) + b"\n"
+
+    def write(path: Path) -> None:
+        with zipfile.ZipFile(path, "w") as archive:
+            for name in ("pair_infos", "image_paths", "intrinsics", "poses"):
+                archive.writestr(f"{name}.npy", b"\x93NUMPY\x01\x00\x76\x00" + header + data)
+
+    return write
+
+
+def table(row: str, header: str = "image_0,image_1,box_0,box_1"):
+    return lambda path: path.write_text(f"{header}\n{row}\n")
+
+
+BAD = {
+    "no archive": ("pairs.npz", lambda path: path.write_bytes(b"PK\x03\x04"), "is not a scene_info"),
+    "other arrays": ("pairs.npz", lambda path: np.savez(path, a=[1]), "pair_infos.npy"),
+    "code": ("pairs.npz", pickled(pickle.dumps(Run())), "it names builtins.print"),
+    "cut off": ("pairs.npz", pickled(pickle.dumps([1, 2])[:-3]), "is not a scene_info"),
+    "no pairs": ("pairs.txt", lambda path: path.write_text("a b\n"), "expected 38 fields"),
+    "an empty directory": ("pairs", Path.mkdir, "cannot be read"),
+    "no columns": ("regions.csv", table("1,2", "a,b"), "lacks the columns image_0"),
+    "no row of a pair": ("regions.csv", table("A,C,0 0 9 9,0 0 9 9"), "has no regions of the pair 1: "),
+    "three numbers": ("regions.csv", table("A,B,1 2 3,0 0 9 9"), "line 2: expected left, .* '1 2 3'"),
+    "words": ("regions.csv", table("A,B,0 0 x 9,0 0 9 9"), "line 2: expected left, .* '0 0 x 9'"),
+    "an empty box": ("regions.csv", table("A,B,9 0 9 9,0 0 9 9"), "line 2: expected left, .* '9 0 9 9'"),
+    "a box outside": ("regions.csv", table("A,B,0 0 9 9,0 0 9 9999"), "line 2: expected left, .* '0 0 9 9999'"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_lists_and_regions_get_one_line_and_exit_2(name, demo, scenes, small_recipe, tmp_path, capsys):
+    file, write, told = BAD[name]
+    listed = write_list(tmp_path / "list.txt", [replace(scenes[0], pairs=scenes[0].pairs[:1])], demo.train_dir)
+    write(tmp_path / file)
+    source, regions = tmp_path / file, []
+    if file == "regions.csv":
+        source.write_text(source.read_text().replace("A,B", ",".join(listed.read_text().split()[:2])))
+        source, regions = listed, ["--regions", str(source)]
+    assert main([*validate(source, demo.train_dir, small_recipe), *regions]) == 2
+    out, err = capsys.readouterr()
+    assert "executed" not in out
+    (line,) = err.splitlines()
+    assert re.search(told, line)
+
+
+def test_regions_of_ones_own_take_the_place_of_mkpcs(demo, scenes, small_recipe, tmp_path):
+    true = max(scenes[0].pairs, key=lambda true: true.covisibility)
+    sizes = [read_image(path).size for path in true.pair.images]
+    boxes = Box(0, 0, sizes[0].width // 2, sizes[0].height), Box(7, 0, sizes[1].width, sizes[1].height - 3)
+    matcher = TwoStageMatcher(str(small_recipe))
+    match = matcher(*true.pair.images, regions=boxes)
+    assert tuple(region.box for region in match.regions) == boxes
+    assert {region.reason for region in match.regions} == {RegionReason.GIVEN}
+    second = match.matches[match.in_stage(2)]
+    assert len(second)
+    assert boxes[0].contains(second.points0).all()
+    assert RegionReason.GIVEN not in {region.reason for region in matcher(*true.pair.images).regions}
+    outside = matcher(*true.pair.images, regions=(boxes[0], Box(0, 0, sizes[1].width + 1, 9)))
+    assert "leaves the image" in outside.results[1].failure
+    listed = write_list(tmp_path / "list.txt", [replace(scenes[0], pairs=(true,))], demo.train_dir)
+    cells = ",".join(f"{box.left} {box.top} {box.right} {box.bottom}" for box in boxes)
+    table(f"{','.join(listed.read_text().split()[:2])},{cells}")(tmp_path / "regions.csv")
+    command = [*validate(listed, demo.train_dir, small_recipe), "--work-dir", str(tmp_path / "run")]
+    given = ["--regions", str(tmp_path / "regions.csv")]
+    for options, rows in ((given, 2), ([], 3), (given, 3)):
+        assert main([*command, *options]) == 0
+        with JournalReader(tmp_path / "run") as journal:
+            (record,), found = journal.records(), matches_of(journal, 0)
+        assert ([region.box for region in record.regions] == [*boxes]) == bool(options)
+        assert ({region.reason for region in record.regions} == {RegionReason.GIVEN}) == bool(options)
+        with closing(
+            sqlite3.connect(tmp_path / "run" / "journal.sqlite")
+        ) as database:  # other regions, other points
+            assert database.execute("SELECT count(*) FROM points").fetchone() == (rows,)
+    np.testing.assert_array_equal(found.points0, match.matches.points0)
+
+
+def test_the_papers_tables_are_made_with_one_command(demo, scenes, tmp_path, capsys):
+    listed = write_list(tmp_path / "list.txt", [replace(scenes[0], pairs=scenes[0].pairs[:1])], demo.train_dir)
+    tables = ["--yfcc", str(listed), str(demo.train_dir), "--imc", str(demo.train_dir), "--pairs", "1"]
+    tables += ["--out", str(tmp_path / "out"), "--matcher", "sift"]
+    paper_tables.main([*tables, "--rows", "1600", "1200 + 1600", "loftr"])
+    lines = [[cell.strip() for cell in line.split("|")[1:-1]] for line in capsys.readouterr().out.splitlines()]
+    yfcc, imc = lines[:6], lines[6:]
+    names = ["1600 ransac", "1600 magsac", "1200 + 1600 magsac", "mean difference"]
+    assert [" ".join(row[:2]).strip() for row in yfcc[2:]] == names
+    assert yfcc[2][7:] == ["37.73", "58.03", "74.57", "1"]
+    assert [row[10] for row in yfcc[2:5]] == ["1", "0", "2"]  # the unit that two rows have ran once
+    own, published = (np.array([row[part] for row in yfcc[2:5]], float) for part in (slice(2, 5), slice(7, 10)))
+    np.testing.assert_allclose(np.array(yfcc[5][7:10], float), (own - published).mean(axis=0), atol=0.006)
+    assert imc[2][0] == "loftr"
+    assert imc[2][3:] == ["0.75478", "0.75606", "1"]
+
+
+def test_the_rows_of_the_papers_tables_have_their_sizes_and_the_best_is_the_recipe():
+    given = argparse.Namespace(matcher=None, protocol="none")
+    for table, count in (("yfcc", 16), ("scannet", 8)):
+        rows = paper_tables.TABLES[table]
+        assert len(rows) == count
+        best = paper_tables.recipe_of(table, *rows[-1][:2], given)
+        assert {unit.name for unit in best.units} == {unit.name for unit in load_recipe(table).units}
+    (stretched,) = paper_tables.recipe_of("scannet", "640x480", "ransac", given).units
+    assert stretched.name == "1:superglue@480x640!"
