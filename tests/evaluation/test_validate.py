@@ -80,7 +80,7 @@ def test_samples_that_a_submission_has_no_row_for_count_as_failed_and_are_named(
 def test_a_failed_pair_counts_as_failed_even_where_the_fallback_happens_to_be_right():
     eye = np.eye(3)
     camera0, camera1 = Camera(eye, eye, np.zeros(3)), Camera(eye, eye, np.array([1.0, 0, 0]))
-    true = TruePair(Pair("p", "s", Path("a"), Path("b")), camera0, camera1, 0.5)
+    true = TruePair(Pair("p", "s", "a", "b"), camera0, camera1, 0.5)
     scene = TrainScene("s", 1.0, (true,))
     record = PairRecord(0, FALLBACK_FUNDAMENTAL.copy(), "too few matches")
     failed = score_record(true, record, scene, [Step.MAGSAC])
