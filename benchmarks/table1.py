@@ -257,10 +257,8 @@ class Tables:
         ranges = [(name, some) for name, some in ranges if some]
         yield from _head(["way", "against", *(f"{name} ({len(some)} pairs)" for name, some in ranges)])
         for first, second in contrasts:
-            cells = [
-                str(paired_difference([_accuracies(*zip(*some, strict=True), first, second)]))
-                for _, some in ranges
-            ]
+            parts = [([found for found, _ in some], [true for _, true in some]) for _, some in ranges]
+            cells = [str(paired_difference([_accuracies(*part, first, second)])) for part in parts]
             yield _row([second.name, first.name, *cells])
 
     def difference(self, first: Way, second: Way, scenes: Sequence[str]) -> Difference:

@@ -371,7 +371,7 @@ class Engine:
         """Return the rows whose estimate is missing or out of date, those without any F first."""
         state = self.state
         due = state.has_row & state.had.any(1) & ~state.is_estimated & ~self._estimating
-        due &= ~self.plan.busy | ~state.has_own
+        due &= self.plan.settled(self.budget.clock()) | ~state.has_own
         due[list(self._estimate_losses.skipped)] = False
         order = self._order[due[self._order]]
         return np.asarray(order[np.argsort(state.has_own[order], kind="stable")])

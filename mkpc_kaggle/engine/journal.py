@@ -284,7 +284,12 @@ class Journal(JournalReader):
             self.path = path
             self._file = self._db = opened.enter_context(closing(connect(path)))
             with undamaged(path):
-                self._open()
+                try:
+                    self._open()
+                except sqlite3.OperationalError as error:  # a full disk
+                    self.trouble = str(error)
+                    self._db = sqlite3.connect(":memory:", isolation_level=None)
+                    self._open()
             opened.pop_all()
 
     @property

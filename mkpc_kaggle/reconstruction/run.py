@@ -13,7 +13,7 @@ from mkpc_kaggle.engine.records import CameraRecord
 from mkpc_kaggle.engine.session import Session, opened_engine, request_of
 from mkpc_kaggle.errors import UserError, writing
 from mkpc_kaggle.matchers.contract import Matcher
-from mkpc_kaggle.pipeline.assembly import Assembly, assemble
+from mkpc_kaggle.pipeline.assembly import Assembly, assemble, require_types
 from mkpc_kaggle.pipeline.pair import PairMatch
 from mkpc_kaggle.recipe import CameraSharing, Recipe, SceneConfig, load_recipe
 from mkpc_kaggle.reconstruction.choice import MAX_IMAGES, choose_pairs
@@ -104,6 +104,7 @@ def reconstruct(
     pixels of what the files store, as COLMAP reads them. Raises :class:`UserError` for a recipe that cannot run
     here, and for an image that cannot be read.
     """
+    require_types(recipe, device, matchers)
     files = sorted(map(Path, images))
     chosen = for_cameras(load_recipe(recipe) if isinstance(recipe, str) else recipe)
     assembly = assemble(chosen, weights=map(Path, weights), device=device, matchers=matchers)
