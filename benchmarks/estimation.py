@@ -31,7 +31,7 @@ from tqdm import tqdm
 
 from mkpc_kaggle.config import from_table
 from mkpc_kaggle.data.competition import TrainScene, TruePair, read_train_side
-from mkpc_kaggle.engine.journal import JournalReader
+from mkpc_kaggle.engine.journal_reader import JournalReader
 from mkpc_kaggle.evaluation.compare import Difference, paired_difference
 from mkpc_kaggle.evaluation.validate import error_of
 from mkpc_kaggle.geometry.coordinates import Matrix3

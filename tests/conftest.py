@@ -14,7 +14,7 @@ from mkpc_kaggle.weights import store as weight_store
 
 if TYPE_CHECKING:
     from mkpc_kaggle.data.competition import Pair
-    from mkpc_kaggle.engine.engine import RunReport
+    from mkpc_kaggle.engine.request import RunReport
 
 # Before torch is imported, here and in the processes of the tests: their tensors are small, and on a busy machine
 # threads wait for each other more than they work.

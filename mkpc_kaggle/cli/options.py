@@ -9,7 +9,7 @@ from pathlib import Path
 from mkpc_kaggle.engine.budget import Budget, monotonic_of, parse_duration
 from mkpc_kaggle.engine.cluster import parse_workers
 from mkpc_kaggle.engine.console import say
-from mkpc_kaggle.engine.engine import RunReport
+from mkpc_kaggle.engine.request import RunReport
 from mkpc_kaggle.engine.session import Interrupt, Session, Watchdog
 from mkpc_kaggle.engine.streams import drain, unblocked
 from mkpc_kaggle.pipeline.assembly import Assembly, assemble

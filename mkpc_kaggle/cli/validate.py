@@ -15,7 +15,7 @@ from mkpc_kaggle.data.competition import Pair, TrainScene, read_train_side
 from mkpc_kaggle.data.outputs import require_apart
 from mkpc_kaggle.data.pairs import read_pairs, read_regions
 from mkpc_kaggle.engine.console import say
-from mkpc_kaggle.engine.engine import Ending
+from mkpc_kaggle.engine.request import Ending
 from mkpc_kaggle.engine.session import Interrupt, Session, Watchdog, interruptible
 from mkpc_kaggle.errors import UserError, writing
 from mkpc_kaggle.evaluation.compare import Comparison, comparison_json, comparison_table, step_gains

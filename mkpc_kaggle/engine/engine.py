@@ -7,20 +7,15 @@ import threading
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
-from enum import StrEnum
+from dataclasses import replace
 from math import inf, isfinite
 from pathlib import Path
-from statistics import fmean
 from typing import Self
 
-import numpy as np
-from numpy.typing import NDArray
-
-from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.data.images import content_digest
 from mkpc_kaggle.engine import console
 from mkpc_kaggle.engine.budget import Budget
+from mkpc_kaggle.engine.estimates import EstimatePlan
 from mkpc_kaggle.engine.jobs import (
     Answer,
     Cause,
@@ -38,80 +33,23 @@ from mkpc_kaggle.engine.jobs import (
     WantedPair,
     visiting_order,
 )
-from mkpc_kaggle.engine.journal import About, Event, EventKind, Journal
+from mkpc_kaggle.engine.journal import Journal
+from mkpc_kaggle.engine.journal_reader import Event, EventKind
 from mkpc_kaggle.engine.losses import Losses
 from mkpc_kaggle.engine.places import LISTEN_S, START_TIMEOUT_S, Place, Site, Work
-from mkpc_kaggle.engine.plan import HANG_FACTOR, Plan
-from mkpc_kaggle.engine.records import PairRecord, SceneRecord
+from mkpc_kaggle.engine.plan import Plan
+from mkpc_kaggle.engine.records import SceneRecord
+from mkpc_kaggle.engine.request import Ending, Request, RunReport, Standing
 from mkpc_kaggle.engine.scenes import Scenes, batches_of, extra_pairs_of
-from mkpc_kaggle.engine.settings import Settings
 from mkpc_kaggle.engine.state import State
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.recipe import Recipe, Unit
-from mkpc_kaggle.scene.export import Export
+from mkpc_kaggle.recipe import Unit
 from mkpc_kaggle.scene.reconstruct import Solution
 
-ESTIMATE_PAIRS = 8  # in a job
 UNKNOWN_SHARE, MAX_UNKNOWN_S = 0.25, 3600.0  # of the time left, after which a job of unknown cost hangs
 MIN_TOLD_PAIRS = 20  # of a batch whose reconstruction is shown: that of a smaller batch takes seconds
 PUBLISH_INTERVAL_S, PUBLISH_SHARE = 30.0, 0.05  # how often the results are written, and their share of the time
 HASH_THREADS = 4
-
-
-class Ending(StrEnum):
-    """Why a run ended."""
-
-    COMPLETE = "complete"
-    TIME_IS_UP = "time is up"
-    INTERRUPTED = "interrupted"
-    NO_WORKER = "no worker left"
-    NOTHING_RUNS = "every unit was skipped"
-
-
-@dataclass(frozen=True)
-class Request:
-    """What to compute: points and estimates of ``pairs``, whose images lie below ``root``, and their scenes.
-
-    ``exports`` are the batches whose COLMAP files are written. ``publish`` is called with the results first,
-    every half minute (less often if it takes long), after each scene with files, and at the end.
-    """
-
-    pairs: Sequence[Pair]
-    recipe: Recipe
-    settings: Settings
-    root: str = ""
-    exports: Mapping[str, Export] = field(default_factory=dict)
-    about: About | None = None
-    publish: "Callable[[Standing], None]" = lambda _: None
-
-
-@dataclass(frozen=True, eq=False)
-class Standing:
-    """The best results so far: F of each pair (R, 3, 3), the scenes, and the digest of each image by name."""
-
-    fundamentals: NDArray[np.float64]
-    scenes: Mapping[str, SceneRecord]
-    digests: Mapping[str, str]
-
-
-@dataclass(frozen=True)
-class RunReport:
-    """What a run leaves: a record of each pair, in order, and how it went.
-
-    ``resumed`` pairs were complete before. ``faults`` are lost jobs and unwritten files, with reasons.
-    ``unwritten`` says why the last version of the results could not be written.
-    """
-
-    records: tuple[PairRecord, ...]
-    ending: Ending
-    seconds: float
-    resumed: int = 0
-    faults: tuple[str, ...] = ()
-    explanations: tuple[Event, ...] = ()  # decisions of the plan
-    unwritten: str = ""
-    scenes: tuple[SceneRecord, ...] = ()
-    units_run: int = 0
-    estimated: int = 0
 
 
 class Engine:
@@ -243,10 +181,7 @@ class Engine:
         order = visiting_order([each.pair for each in self.pairs])
         self.plan = Plan(recipe.units, self.state, order, self.budget, self._explain, self.minibatch)
         self.scenes = Scenes(batches, self.journal.scenes(), self.journal.current_scenes())
-        self._order = np.array(order, int)
-        self._estimating = np.zeros(len(self.pairs), bool)
-        self._estimate_losses: Losses[int] = Losses()
-        self._estimate_s: list[float] = []
+        self.estimates = EstimatePlan(self.plan, order)
         complete = self.state.had.all(1) & self.state.is_estimated
         self._resumed = int(complete[: self.state.rows].sum())
 
@@ -290,11 +225,13 @@ class Engine:
         if not self._is_open and self.plan.has_work(now):
             self.site.open()
             self._is_open = True
-        self.plan.reserve = self._reserve()
+        estimates = self.estimates.reserve(now, len(self.site.of(Work.LIGHT)))
+        self.plan.reserve = estimates + self.scenes.reserve(self.state.matches)
         self.plan.workers = max(1, sum(not place.closed for place in self.site.of(Work.MATCH)))
         for place in self.site.places:
             if place.may_start(now) and self._has_work(place.work, now):
-                place.start(now, min(START_TIMEOUT_S, max(self.budget.silence, UNKNOWN_SHARE * self._left(now))))
+                share = max(self.budget.silence, UNKNOWN_SHARE * self._left(now))
+                place.start(now, START_TIMEOUT_S if place.work is Work.MATCH else min(START_TIMEOUT_S, share))
             elif place.is_idle and (job := self._next_job(place.work, now)) is not None:
                 seconds = job.seconds if isinstance(job, MatchJob) else inf
                 place.submit(job, seconds, self._time_limit(job, now), now)
@@ -307,7 +244,7 @@ class Engine:
         if work is Work.MATCH:
             return self.plan.has_work(now)
         if work is Work.LIGHT:
-            return bool(self._looks) or bool(len(self._due_estimates()))
+            return bool(self._looks) or bool(len(self.estimates.due(now)))
         return self._due_scene(now) is not None
 
     def _next_job(self, work: Work, now: float) -> Job | None:
@@ -319,25 +256,20 @@ class Engine:
             return None if batch is None else self._scene_job(batch)
         if self._looks:
             return self._looks.pop(next(iter(self._looks)))
-        return self._estimate_job()
+        return self._estimate_job(now)
 
     def _time_limit(self, job: Job, now: float) -> float:
         """Return the seconds after which a worker hangs, from measured costs or from the time left."""
         patience = inf
         if isinstance(job, MatchJob):
             patience = self.plan.patience(job)
-        elif isinstance(job, EstimateJob) and self._estimate_s:
-            patience = HANG_FACTOR * len(job.pairs) * fmean(self._estimate_s)
+        elif isinstance(job, EstimateJob):
+            patience = self.estimates.patience(job)
         unknown = min(MAX_UNKNOWN_S, UNKNOWN_SHARE * self._left(now))
         return self.budget.silence + (patience if isfinite(patience) else unknown)
 
     def _left(self, now: float) -> float:
         return max(0.0, self.budget.stop_units - now)
-
-    def _reserve(self) -> float:
-        """Return the seconds at the end that estimates and scenes will probably take."""
-        estimates = fmean(self._estimate_s or [0.0]) * len(self._due_estimates()) / len(self.site.of(Work.LIGHT))
-        return estimates + self.scenes.reserve(self.state.matches)
 
     # Matching
 
@@ -367,34 +299,15 @@ class Engine:
 
     # Estimates
 
-    def _due_estimates(self) -> NDArray[np.int_]:
-        """Return the rows whose estimate is missing or out of date, those without any F first."""
-        state = self.state
-        due = state.has_row & state.had.any(1) & ~state.is_estimated & ~self._estimating
-        due &= self.plan.settled(self.budget.clock()) | ~state.has_own
-        due[list(self._estimate_losses.skipped)] = False
-        order = self._order[due[self._order]]
-        return np.asarray(order[np.argsort(state.has_own[order], kind="stable")])
-
-    def _estimate_job(self) -> EstimateJob | None:
-        due = self._due_estimates().tolist()
-        if not due:
-            return None
-        is_retry = due[0] in self._estimate_losses.alone
-        chosen = due[: 1 if is_retry else ESTIMATE_PAIRS]
-        if not is_retry:
-            chosen = [index for index in chosen if index not in self._estimate_losses.alone]
-        self._estimating[chosen] = True
+    def _estimate_job(self, now: float) -> EstimateJob | None:
+        chosen, is_retry = self.estimates.next(now)
         pairs = tuple(self._pair_points(index) for index in chosen)
-        return EstimateJob(pairs, self.recipe, self._source(pairs), is_retry)
+        return EstimateJob(pairs, self.recipe, self._source(pairs), is_retry) if pairs else None
 
     def _take_estimates(self, answer: Estimates) -> None:
         self.journal.save_estimates(answer.estimates)
-        indices = [each.index for each in answer.estimates]
-        self._estimating[indices] = False
-        self.estimated += len(indices)
-        self._estimate_s = [*self._estimate_s, *(each.seconds for each in answer.estimates)][-64:]
-        self.scenes.note_change(self.state.refresh(indices))
+        self.estimated += len(answer.estimates)
+        self.scenes.note_change(self.state.refresh(self.estimates.on_result(answer)))
         if not self.plan.busy.any():
             rows = slice(self.state.rows)
             done, total = self.state.is_estimated[rows].sum(), self.state.had[rows].any(1).sum()
@@ -420,9 +333,8 @@ class Engine:
         """Return a batch to reconstruct now: its pairs have what fits; any batch if matching has ended."""
         if not (waiting := self.scenes.waiting(self.state.matches)):
             return None
-        pending = np.zeros(len(self.pairs), bool)
-        pending[self._due_estimates()] = True
-        pending |= self._estimating
+        pending = self.estimates.busy.copy()
+        pending[self.estimates.due(now)] = True
         if self._is_matching(now):
             settled, filled = self.plan.settled(now) & ~pending, self.plan.filled(now) & ~pending
             return self.scenes.due(self.state.matches, settled, filled)
@@ -499,10 +411,8 @@ class Engine:
         if isinstance(job, MatchJob):
             self.plan.on_failure(job, failure, time_limit)
         elif isinstance(job, EstimateJob):
-            indices = [pair.index for pair in job.pairs]
-            self._estimating[indices] = False
-            if self._estimate_losses.add(indices, failure):
-                self._explain(f"pair {indices[0]} keeps the F it has: {failure}")
+            if self.estimates.on_failure(job, failure):
+                self._explain(f"pair {job.pairs[0].index} keeps the F it has: {failure}")
         elif isinstance(job, SceneJob):
             self._fault(f"batch {job.batch} was not reconstructed: {failure}")
             self.scenes.on_failure(job, failure)
@@ -574,7 +484,7 @@ class Engine:
             return Ending.NOTHING_RUNS
         if (
             self.plan.is_complete
-            and not len(self._due_estimates())
+            and not len(self.estimates.due(self.budget.clock()))
             and not self.scenes.waiting(self.state.matches)
         ):
             return Ending.COMPLETE

@@ -24,9 +24,11 @@ from mkpc_kaggle.data.outputs import replacing
 from mkpc_kaggle.engine import console
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.cluster import RayCluster, RaySite
-from mkpc_kaggle.engine.engine import Engine, Request, RunReport, Standing
-from mkpc_kaggle.engine.journal import About, Event, EventKind, Journal
+from mkpc_kaggle.engine.engine import Engine
+from mkpc_kaggle.engine.journal import Journal
+from mkpc_kaggle.engine.journal_reader import About, Event, EventKind
 from mkpc_kaggle.engine.places import LISTEN_S, LocalSite, Site
+from mkpc_kaggle.engine.request import Request, RunReport, Standing
 from mkpc_kaggle.engine.settings import Settings
 from mkpc_kaggle.errors import UserError, writing
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL

@@ -32,7 +32,7 @@ from mkpc_kaggle.engine.jobs import (
     SceneJob,
     WantedPair,
 )
-from mkpc_kaggle.engine.journal import JournalReader
+from mkpc_kaggle.engine.journal_reader import JournalReader
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import ModelKind

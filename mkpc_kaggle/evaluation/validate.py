@@ -11,9 +11,9 @@ from typing import Any
 from scipy.spatial.transform import Rotation
 
 from mkpc_kaggle.data.competition import TrainScene, TruePair, pair_id, read_rows, read_submission
-from mkpc_kaggle.engine.engine import RunReport
-from mkpc_kaggle.engine.journal import JournalReader
+from mkpc_kaggle.engine.journal_reader import JournalReader
 from mkpc_kaggle.engine.records import PairRecord
+from mkpc_kaggle.engine.request import RunReport
 from mkpc_kaggle.engine.session import Session, run_pairs
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry import metrics

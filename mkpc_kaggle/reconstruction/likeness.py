@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2, vq
 
 from mkpc_kaggle.data.images import Image, read_image
-from mkpc_kaggle.engine.journal import JournalReader
+from mkpc_kaggle.engine.journal_reader import JournalReader
 from mkpc_kaggle.matchers.adapters.sift import root_sift
 
 Partners = list[list[int]]  # of each image, by the places of the images

@@ -8,8 +8,9 @@ from typing import Any
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.data.images import Image, ImageStore, Unreadable
-from mkpc_kaggle.engine.engine import RunReport, Standing, name_below
+from mkpc_kaggle.engine.engine import name_below
 from mkpc_kaggle.engine.records import CameraRecord
+from mkpc_kaggle.engine.request import RunReport, Standing
 from mkpc_kaggle.engine.session import Session, opened_engine, request_of
 from mkpc_kaggle.errors import UserError, writing
 from mkpc_kaggle.matchers.contract import Matcher

@@ -18,7 +18,7 @@ from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.data.images import Image, printable
 from mkpc_kaggle.data.outputs import replacing
 from mkpc_kaggle.engine.budget import format_duration
-from mkpc_kaggle.engine.journal import EventKind
+from mkpc_kaggle.engine.journal_reader import EventKind
 from mkpc_kaggle.engine.records import SceneRecord
 from mkpc_kaggle.errors import UserError, writing
 from mkpc_kaggle.geometry.overlap import MIN_SUPPORT

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.data.outputs import replacing, require_table
-from mkpc_kaggle.engine.journal import About, Event, EventKind, JournalReader, undamaged
+from mkpc_kaggle.engine.journal_reader import About, Event, EventKind, JournalReader, undamaged
 from mkpc_kaggle.engine.records import PairRecord, SceneRecord
 from mkpc_kaggle.errors import writing
 from mkpc_kaggle.geometry.matches import Matches

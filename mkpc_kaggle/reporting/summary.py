@@ -5,8 +5,8 @@ from collections.abc import Iterator, Sequence
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.budget import format_duration
-from mkpc_kaggle.engine.engine import Ending, RunReport
 from mkpc_kaggle.engine.records import PairRecord, SceneRecord
+from mkpc_kaggle.engine.request import Ending, RunReport
 from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
 from mkpc_kaggle.reporting.run_log import RunLog
 from mkpc_kaggle.reporting.tables import RunTables, run_tables, seconds_by_part, unit_means, unit_reasons

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine.journal import Event
+from mkpc_kaggle.engine.journal_reader import Event
 from mkpc_kaggle.engine.records import PairRecord, UnitRecord
 
 F_COLUMNS = tuple(f"f{row}{column}" for row in (1, 2, 3) for column in (1, 2, 3))

@@ -19,8 +19,8 @@ from rectified import SECOND, SWEEP, THIRD, THREE_UNITS, RectifiedMatcher, matri
 
 from mkpc_kaggle.cli import main, options
 from mkpc_kaggle.data.competition import read_test_side, submission_problems
-from mkpc_kaggle.engine.engine import Ending, RunReport
 from mkpc_kaggle.engine.places import Place
+from mkpc_kaggle.engine.request import Ending, RunReport
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.pipeline.assembly import Assembly, assemble
 from mkpc_kaggle.pipeline.failures import DeviceError, FailureKind, failure_of, reason_of

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from rectified import SECOND, SWEEP, THIRD, THREE_UNITS, RectifiedMatcher, matrices, run, write_pairs
 
-from mkpc_kaggle.engine.engine import Ending, Standing
 from mkpc_kaggle.engine.records import PairRecord
+from mkpc_kaggle.engine.request import Ending, Standing
 from mkpc_kaggle.engine.session import Interrupt
 from mkpc_kaggle.pipeline.stages import Pipeline
 

@@ -14,8 +14,8 @@ from rectified import RectifiedMatcher, run
 from synthetic import RECIPE, SyntheticMatcher, synthetic_pairs
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine.engine import Ending
 from mkpc_kaggle.engine.journal import Journal
+from mkpc_kaggle.engine.request import Ending
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.geometry.robust import Method, RobustConfig
 from mkpc_kaggle.pipeline.stages import Pipeline

@@ -24,9 +24,10 @@ from mkpc_kaggle.cli import main
 from mkpc_kaggle.data.competition import read_test_side, submission_problems
 from mkpc_kaggle.demo import DemoSet
 from mkpc_kaggle.engine import session, worker
-from mkpc_kaggle.engine.engine import Ending
-from mkpc_kaggle.engine.journal import Journal, JournalReader
+from mkpc_kaggle.engine.journal import Journal
+from mkpc_kaggle.engine.journal_reader import JournalReader
 from mkpc_kaggle.engine.plan import Plan
+from mkpc_kaggle.engine.request import Ending
 from mkpc_kaggle.reporting.run_log import read_log
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -13,9 +13,9 @@ from simulator import Scenario, SimulatedScene, memory_journal, random_scenario,
 
 from mkpc_kaggle.engine import plan as plan_module
 from mkpc_kaggle.engine.budget import Budget
-from mkpc_kaggle.engine.engine import Ending
 from mkpc_kaggle.engine.jobs import Cause, Failure, Found, MatchJob, Outcome, Phase
 from mkpc_kaggle.engine.plan import Plan
+from mkpc_kaggle.engine.request import Ending
 from mkpc_kaggle.recipe import Unit
 
 DIED = Failure(Cause.DIED, "signal SIGKILL")

@@ -20,7 +20,7 @@ from synthetic import SyntheticMatcher, synthetic_pairs
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.cluster import RayCluster
-from mkpc_kaggle.engine.engine import Ending
+from mkpc_kaggle.engine.request import Ending
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.pipeline.assembly import Assembly

@@ -25,9 +25,9 @@ from synthetic import RECIPE as SYNTHETIC
 from synthetic import SyntheticMatcher, synthetic_pairs
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine.engine import Ending
 from mkpc_kaggle.engine.jobs import SceneJob
 from mkpc_kaggle.engine.journal import Journal
+from mkpc_kaggle.engine.request import Ending
 from mkpc_kaggle.engine.worker import batch_pair, read_points
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.recipe import SceneConfig

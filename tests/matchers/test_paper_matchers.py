@@ -15,7 +15,7 @@ from standin import scene, use_narrow
 
 from mkpc_kaggle.cli import main
 from mkpc_kaggle.data.competition import read_submission, read_test_side, submission_problems
-from mkpc_kaggle.engine.journal import JournalReader
+from mkpc_kaggle.engine.journal_reader import JournalReader
 from mkpc_kaggle.weights import WeightFile
 
 # What the units of stages 1 and 2 look at, which fits no network's multiple, and the matcher's options.

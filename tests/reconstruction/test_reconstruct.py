@@ -30,8 +30,8 @@ from mkpc_kaggle.data import images
 from mkpc_kaggle.data.exif import TURNS
 from mkpc_kaggle.data.images import Image, Unreadable, read_image
 from mkpc_kaggle.engine.budget import Budget
-from mkpc_kaggle.engine.engine import Ending
 from mkpc_kaggle.engine.records import CameraRecord
+from mkpc_kaggle.engine.request import Ending
 from mkpc_kaggle.engine.session import Interrupt, Session
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.cameras import Camera

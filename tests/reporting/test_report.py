@@ -15,7 +15,8 @@ from rectified import THREE_UNITS, RectifiedMatcher, run, write_pairs
 from mkpc_kaggle.cli import main
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.jobs import WantedPair
-from mkpc_kaggle.engine.journal import About, Event, EventKind, Journal, JournalReader
+from mkpc_kaggle.engine.journal import Journal
+from mkpc_kaggle.engine.journal_reader import About, Event, EventKind, JournalReader
 from mkpc_kaggle.reporting.report import DRAWING_S, report_page, report_run
 from mkpc_kaggle.reporting.run_log import NOT_ENDED, read_log
 from mkpc_kaggle.reporting.summary import overview

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from rectified import run
 from synthetic import RECIPE, SyntheticMatcher, synthetic_pairs
 
-from mkpc_kaggle.engine.engine import Ending
+from mkpc_kaggle.engine.request import Ending
 from mkpc_kaggle.recipe import SceneConfig
 from mkpc_kaggle.reporting.run_log import read_log
 from mkpc_kaggle.scene.densify import extra_pairs

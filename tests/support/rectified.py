@@ -17,7 +17,7 @@ import numpy as np
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.cluster import RayCluster
-from mkpc_kaggle.engine.engine import RunReport
+from mkpc_kaggle.engine.request import RunReport
 from mkpc_kaggle.engine.session import Interrupt, Session, Watchdog, run_pairs, submit
 from mkpc_kaggle.geometry.coordinates import Size, View
 from mkpc_kaggle.geometry.matches import Matches

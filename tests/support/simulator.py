@@ -16,7 +16,7 @@ import numpy as np
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.codec import to_blob
-from mkpc_kaggle.engine.engine import Ending, Engine, Request, RunReport
+from mkpc_kaggle.engine.engine import Engine
 from mkpc_kaggle.engine.jobs import (
     Answer,
     Cause,
@@ -35,6 +35,7 @@ from mkpc_kaggle.engine.jobs import (
 from mkpc_kaggle.engine.journal import Journal
 from mkpc_kaggle.engine.places import Place, Site, Work
 from mkpc_kaggle.engine.plan import RESERVE_SHARE
+from mkpc_kaggle.engine.request import Ending, Request, RunReport
 from mkpc_kaggle.engine.scenes import FORECAST_MARGIN, START_S
 from mkpc_kaggle.engine.settings import Settings
 from mkpc_kaggle.geometry.coordinates import Size

@@ -1,0 +1,71 @@
+"""What a run is asked for, and what it returns."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mkpc_kaggle.data.competition import Pair
+from mkpc_kaggle.engine.journal_reader import About, Event
+from mkpc_kaggle.engine.records import PairRecord, SceneRecord
+from mkpc_kaggle.engine.settings import Settings
+from mkpc_kaggle.recipe import Recipe
+from mkpc_kaggle.scene.export import Export
+
+
+class Ending(StrEnum):
+    """Why a run ended."""
+
+    COMPLETE = "complete"
+    TIME_IS_UP = "time is up"
+    INTERRUPTED = "interrupted"
+    NO_WORKER = "no worker left"
+    NOTHING_RUNS = "every unit was skipped"
+
+
+@dataclass(frozen=True)
+class Request:
+    """What to compute: points and estimates of ``pairs``, whose images lie below ``root``, and their scenes.
+
+    ``exports`` are the batches whose COLMAP files are written. ``publish`` is called with the results first,
+    every half minute (less often if it takes long), after each scene with files, and at the end.
+    """
+
+    pairs: Sequence[Pair]
+    recipe: Recipe
+    settings: Settings
+    root: str = ""
+    exports: Mapping[str, Export] = field(default_factory=dict)
+    about: About | None = None
+    publish: "Callable[[Standing], None]" = lambda _: None
+
+
+@dataclass(frozen=True, eq=False)
+class Standing:
+    """The best results so far: F of each pair (R, 3, 3), the scenes, and the digest of each image by name."""
+
+    fundamentals: NDArray[np.float64]
+    scenes: Mapping[str, SceneRecord]
+    digests: Mapping[str, str]
+
+
+@dataclass(frozen=True)
+class RunReport:
+    """What a run leaves: a record of each pair, in order, and how it went.
+
+    ``resumed`` pairs were complete before. ``faults`` are lost jobs and unwritten files, with reasons.
+    ``unwritten`` says why the last version of the results could not be written.
+    """
+
+    records: tuple[PairRecord, ...]
+    ending: Ending
+    seconds: float
+    resumed: int = 0
+    faults: tuple[str, ...] = ()
+    explanations: tuple[Event, ...] = ()  # decisions of the plan
+    unwritten: str = ""
+    scenes: tuple[SceneRecord, ...] = ()
+    units_run: int = 0
+    estimated: int = 0
