@@ -78,8 +78,8 @@ class Session:
     watchdog: "Watchdog | None" = None
 
     def must_end(self) -> float:
-        """When the program must have ended, by the monotonic clock: with its budget, or soon after a signal."""
-        return time.monotonic() + REPORT_S if self.interrupt.signal else self.budget.limit
+        """Return when the program must have ended, by the monotonic clock: the watchdog ends it at ``final_write``."""
+        return time.monotonic() + REPORT_S if self.interrupt.signal else self.budget.final_write
 
 
 def submit(pairs: Sequence[Pair], assembly: Assembly, session: Session, output: Path, root: str = "") -> RunReport:
