@@ -1,8 +1,11 @@
 """What units cost on a pair, as measured during the run."""
 
 from collections import deque
+from collections.abc import Iterable
 from math import sqrt
 from statistics import fmean
+
+from mkpc_kaggle.recipe import Unit
 
 WINDOW = 64  # the number of the latest measurements that count
 MARGIN, MIN_MARGIN = 0.4, 0.01  # of a forecast from one measurement; from n, sqrt(n) times smaller
@@ -50,6 +53,6 @@ class Costs:
         count = len(self._measured.get(unit, ())) or 1
         return self.mean(unit) * (1 + max(MIN_MARGIN, MARGIN / sqrt(count))) if self.is_known(unit) else 0.0
 
-    def warm_up(self, unit: str) -> float:
-        """Return the seconds of the latest first run on a worker."""
-        return self._warm_up.get(unit, 0.0)
+    def warm_up(self, units: Iterable[Unit]) -> float:
+        """Return the seconds of the longest of these units' latest first runs on a worker."""
+        return max((self._warm_up.get(unit.name, 0.0) for unit in units), default=0.0)

@@ -37,7 +37,7 @@ from mkpc_kaggle.engine.journal import Journal
 from mkpc_kaggle.engine.journal_reader import Event, EventKind
 from mkpc_kaggle.engine.losses import Losses
 from mkpc_kaggle.engine.places import LISTEN_S, START_TIMEOUT_S, Place, Site, Work
-from mkpc_kaggle.engine.plan import Plan
+from mkpc_kaggle.engine.plan import HANG_FACTOR, Plan
 from mkpc_kaggle.engine.records import SceneRecord
 from mkpc_kaggle.engine.request import Ending, Request, RunReport, Standing
 from mkpc_kaggle.engine.scenes import Scenes, batches_of, extra_pairs_of
@@ -266,6 +266,8 @@ class Engine:
         elif isinstance(job, EstimateJob):
             patience = self.estimates.patience(job)
         unknown = min(MAX_UNKNOWN_S, UNKNOWN_SHARE * self._left(now))
+        if isinstance(job, SceneJob):
+            patience = max(unknown, HANG_FACTOR * self.scenes.forecast(job.matches))
         return self.budget.silence + (patience if isfinite(patience) else unknown)
 
     def _left(self, now: float) -> float:
@@ -338,7 +340,8 @@ class Engine:
         if self._is_matching(now):
             settled, filled = self.plan.settled(now) & ~pending, self.plan.filled(now) & ~pending
             return self.scenes.due(self.state.matches, settled, filled)
-        return next((name for name in waiting if not pending[self.scenes.batches[name]].any()), None)
+        is_late = now >= self.plan.stop  # too late to wait for estimates
+        return next((name for name in waiting if is_late or not pending[self.scenes.batches[name]].any()), None)
 
     def _is_matching(self, now: float) -> bool:
         places = self.site.of(Work.MATCH)

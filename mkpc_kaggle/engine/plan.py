@@ -21,7 +21,8 @@ from mkpc_kaggle.engine.state import State
 from mkpc_kaggle.recipe import Unit
 
 CONNECT_SHARE = 0.1  # of the time after the sweep, for extra pairs
-HANG_FACTOR = 10.0  # a job that takes this many times what was measured hangs
+SLOW_FACTOR = 2.0  # all units of a job may take this many times what was measured
+HANG_FACTOR = 10.0  # one unit, or another job, may take this many times more before it hangs
 RESERVE_SHARE = 0.2  # of the limit, at most, that is reserved for scenes
 MAX_FAILED_PAIRS = 2  # a unit that was skipped on this many pairs and never ran is skipped on all pairs
 
@@ -171,8 +172,8 @@ class Plan:
         """Return the seconds after which a job hangs, perhaps on a new worker; infinity if a unit is unknown."""
         if not all(self.costs.is_known(unit.name) for unit in job.units):
             return inf
-        expected = len(job.indices) * sum(self.costs.mean(unit.name) for unit in job.units)
-        return HANG_FACTOR * expected + sum(self.costs.warm_up(unit.name) for unit in job.units)
+        seconds = [len(job.indices) * self.costs.mean(unit.name) for unit in job.units]
+        return SLOW_FACTOR * sum(seconds) + HANG_FACTOR * max(seconds) + self.costs.warm_up(job.units)
 
     def _enter(self, phase: Phase, now: float) -> None:
         """Explain a change of the phase, and of the units that fit."""

@@ -108,12 +108,15 @@ class Scenes:
         """No worker reconstructs any further batch."""
         self.losses.skipped |= dict.fromkeys(self.stale, failure)
 
-    def reserve(self, matches: NDArray[np.int_], at_once: int = 1) -> float:
+    def reserve(self, matches: NDArray[np.int_]) -> float:
         """Return the seconds that the pending reconstructions will probably take."""
-        seconds, done = self._rate
-        rate = FORECAST_MARGIN * seconds / done if done else MATCH_S
         pending = [name for name in self.stale if name not in self.losses.skipped]
-        return sum(START_S + rate * float(matches[self.batches[name]].sum()) for name in pending) / at_once
+        return sum(self.forecast(float(matches[self.batches[name]].sum())) for name in pending)
+
+    def forecast(self, matches: float) -> float:
+        """Return the seconds that a reconstruction will probably take."""
+        seconds, done = self._rate
+        return START_S + matches * (FORECAST_MARGIN * seconds / done if done else MATCH_S)
 
     def report(self) -> tuple[SceneRecord, ...]:
         """Return the scene of each batch, in order; ``failure`` says why there is none."""
