@@ -78,7 +78,7 @@ class Session:
     watchdog: "Watchdog | None" = None
 
     def must_end(self) -> float:
-        """Return when the program must have ended, by the monotonic clock: the watchdog ends it at ``final_write``."""
+        """Return when the report must be written, by the monotonic clock: then the watchdog ends the process."""
         return time.monotonic() + REPORT_S if self.interrupt.signal else self.budget.final_write
 
 

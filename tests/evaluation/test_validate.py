@@ -160,7 +160,7 @@ def test_the_classical_recipe_reaches_plain_root_sift_scene_by_scene(tmp_path):
 HANGS = """
 import time
 from mkpc_kaggle.cli import program, validate
-validate.validate = lambda *_: time.sleep(600)
+validate.validate = lambda *_, **__: time.sleep(600)
 program(["validate", "--train-dir", {train!r}, "--recipe", "classical", "--time-limit", "8s"])
 """
 

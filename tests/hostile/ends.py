@@ -23,7 +23,7 @@ LIMITS: dict[str, tuple[int, ...]] = {  # how a run under them ends; too short: 
     **dict.fromkeys(("99999999999h", "' 60s '"), (0,)),
     **dict.fromkeys(("8h45", "5m5m", "1e3", "+60", "60S", "1e9"), REFUSED),
 }
-SOON = (0.3, 1.0, 3.0, 6.0)  # Python itself takes 0.1 s to start
+SOON = (0.6, 1.5, 3.0, 6.0)  # Python itself takes 0.1 s to start, more on a busy machine
 ENDS = {"SIGINT": 130, "SIGTERM": 143}
 CRUEL = {"SIGKILL": -9, "SIGHUP": -1, "SIGQUIT": -3, "SIGUSR1": -10, "SIGXCPU": -24, "SIGSEGV": -11}
 

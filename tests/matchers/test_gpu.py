@@ -10,7 +10,7 @@ import torch
 from device_double import DeviceDouble
 
 from mkpc_kaggle.data.images import Image
-from mkpc_kaggle.engine.places import LocalSite
+from mkpc_kaggle.engine.places import LocalSite, Work
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import MatcherSpec, NonFiniteError, Precision
@@ -58,7 +58,7 @@ def test_the_parent_of_workers_never_initialises_cuda(monkeypatch: pytest.Monkey
     assert str(made.placement) == "device cuda in float16"
     site = LocalSite(made, None, time.monotonic)
     site.open()
-    assert [place.name for place in site.places] == ["cuda:0", "cuda:1"]
+    assert [place.name for place in site.of(Work.MATCH)] == ["cuda:0", "cuda:1"]
 
 
 def test_gpus_on_which_nothing_can_be_computed_leave_the_work_to_the_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
