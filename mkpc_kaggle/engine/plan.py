@@ -21,7 +21,7 @@ from mkpc_kaggle.engine.state import State
 from mkpc_kaggle.recipe import Unit
 
 CONNECT_SHARE = 0.1  # of the time after the sweep, for extra pairs
-HANG_FACTOR = 10.0  # a unit, or a job of another kind, that takes this many times what was measured hangs
+HANG_FACTOR = 10.0  # a job that takes this many times what was measured hangs
 RESERVE_SHARE = 0.2  # of the limit, at most, that is reserved for scenes
 MAX_FAILED_PAIRS = 2  # a unit that was skipped on this many pairs and never ran is skipped on all pairs
 
@@ -171,8 +171,8 @@ class Plan:
         """Return the seconds after which a job hangs, perhaps on a new worker; infinity if a unit is unknown."""
         if not all(self.costs.is_known(unit.name) for unit in job.units):
             return inf
-        seconds = [len(job.indices) * self.costs.mean(unit.name) for unit in job.units]
-        return sum(seconds) + (HANG_FACTOR - 1) * max(seconds) + self.costs.warm_up(job.units)
+        expected = len(job.indices) * sum(self.costs.mean(unit.name) for unit in job.units)
+        return HANG_FACTOR * expected + self.costs.warm_up(job.units)
 
     def _enter(self, phase: Phase, now: float) -> None:
         """Explain a change of the phase, and of the units that fit."""
