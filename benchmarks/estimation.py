@@ -4,14 +4,14 @@ python -m benchmarks.estimation --train-dir DIR --journals DIR [DIR ...] [--scen
     [--estimates NAME ...] [--thresholds PIXELS ...] [--settings TOML ...]
     [--images 18 24] [--shares 1 0.3 0.12] [--seeds 8]
 
-The matches and each pair's own F are those of journals, work directories of `validate`. A journal made with
-``--min-covisibility 0`` also has the pairs that a scene may add to few pairs; they are not scored.
+Journals, the work directories of `validate`, provide the matches and each pair's own F. A journal made with
+``--min-covisibility 0`` also has the extra pairs that a scene may add; they are not scored.
 
-The unit of evidence is a draw: all images of a scene, or a number of them, and a share of the pairs of these.
-Each journal and share has a table with a row for each estimate: mAA by scene, its gain over the first estimate,
-and seconds of this process, a pair or a batch. Intervals are of resampled images where a scene has one draw, else
-of resampled draws, and in the mean of resampled scenes too. ``--settings`` has a row for each of these lines of a
-recipe's table [scene], such as "cameras = 'image'"; with ``--thresholds`` of MAGSAC there are two rows for each.
+The unit of evidence is a draw: all images of a scene, or a number of them, and a share of their pairs. The output
+has a table for each journal and share, with a row for each estimate: mAA by scene, its gain over the first
+estimate, and seconds of this process, per pair or batch. Intervals resample images if a scene has one draw, and
+draws otherwise; the mean's also resample scenes. ``--settings`` adds a row for each line of a recipe's table
+[scene], such as "cameras = 'image'". ``--thresholds`` adds two rows for each threshold of MAGSAC.
 """
 
 import argparse
@@ -44,7 +44,7 @@ from mkpc_kaggle.scene.densify import extra_pairs
 from mkpc_kaggle.scene.reconstruct import reconstruct_batch
 from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair, tracks_of
 
-MIN_COVISIBILITY = 0.1  # of a pair that is scored
+MIN_COVISIBILITY = 0.1  # of a scored pair
 MAGSAC = RobustConfig(permutations=1)
 FOCAL = FocalConfig()
 OWN, SCENE = "own F", "scene"
@@ -52,7 +52,7 @@ OWN, SCENE = "own F", "scene"
 
 @dataclass(frozen=True, eq=False)
 class Known:
-    """A pair, the matches that a journal has of it, and its own F by that journal, ``None`` where that failed."""
+    """A pair with its matches and its own F from a journal; F is ``None`` if its estimate failed."""
 
     true: TruePair
     found: PairMatch
@@ -63,7 +63,7 @@ class Known:
         return self.true.pair.names
 
 
-# The F of each pair; the second list has all pairs of the same images that the journal knows.
+# The F of each pair; the second list has all pairs of the same images in the journal.
 Estimator: TypeAlias = Callable[[Sequence[Known], Sequence[Known]], Sequence[Matrix3 | None]]
 
 
@@ -99,7 +99,7 @@ PAIR_ESTIMATORS: dict[str, Estimator] = {
 
 
 def by_scene(settings: str, pairs: Sequence[Known], every: Sequence[Known]) -> list[Matrix3 | None]:
-    """The F of the pairs as one batch, with the first unit's matches of extra pairs."""
+    """Return the F of the pairs as one batch, with the first unit's matches of extra pairs."""
     config = from_table(SceneConfig, tomllib.loads(settings), settings)
     batch = [batch_pair(pair.true, pair.found, pair.F) for pair in pairs]
     for extra in extra_of(pairs, every, config):
@@ -109,7 +109,7 @@ def by_scene(settings: str, pairs: Sequence[Known], every: Sequence[Known]) -> l
 
 
 def batch_pair(true: TruePair, found: PairMatch, F: Matrix3 | None = None) -> BatchPair:
-    """A pair as a reconstruction is given it."""
+    """Return a pair as the input of a reconstruction."""
     image0, image1 = (
         BatchImage(name, name, size) for name, size in zip(true.pair.names, found.sizes, strict=True)
     )
@@ -117,7 +117,7 @@ def batch_pair(true: TruePair, found: PairMatch, F: Matrix3 | None = None) -> Ba
 
 
 def extra_of(pairs: Sequence[Known], every: Sequence[Known], config: SceneConfig) -> list[Known]:
-    """The pairs that the engine would add to these."""
+    """Return the extra pairs that the engine would add."""
     names = list(dict.fromkeys(name for pair in pairs for name in pair.names))
     ends = [(names.index(first), names.index(second)) for first, second in (pair.names for pair in pairs)]
     chosen = extra_pairs(len(names), ends, config.pairs_per_image)
@@ -126,7 +126,7 @@ def extra_of(pairs: Sequence[Known], every: Sequence[Known], config: SceneConfig
 
 
 def read_journal(directory: Path) -> tuple[str, dict[str, tuple[PairMatch, Matrix3 | None]]]:
-    """The recipe's name, and by the ids of pairs what was found on them and their own F."""
+    """Return the recipe's name, and by pair id the matches and the pair's own F."""
     with JournalReader(directory) as journal:
         table = dict(journal.about().recipe)
         recipe = recipe_of(table, table.pop("name"))
@@ -142,7 +142,7 @@ def read_journal(directory: Path) -> tuple[str, dict[str, tuple[PairMatch, Matri
 
 @dataclass(frozen=True, eq=False)
 class Score:
-    """What an estimate made of a draw of a scene: its pairs' accuracies, their images, and seconds in all."""
+    """Result of an estimate on a draw of a scene: accuracies of its pairs, their images, total seconds."""
 
     accuracies: list[float]
     images: list[tuple[str, str]]
@@ -161,7 +161,7 @@ def score(make: Estimator, pairs: Sequence[Known], every: Sequence[Known], scene
 
 
 def drawn(every: Sequence[Known], images: int, share: float, seed: int) -> tuple[list[Known], list[Known]]:
-    """The pairs to score of so many images, 0 for all, and all pairs of these images; in their order."""
+    """Return a share of the scored pairs of random images, 0 for all images, and all pairs of these images."""
     generator = np.random.default_rng(seed)
     names = sorted({name for pair in every for name in pair.names})
     chosen = set(generator.permutation(names)[: images or None].tolist())
@@ -171,12 +171,12 @@ def drawn(every: Sequence[Known], images: int, share: float, seed: int) -> tuple
     return [scored[index] for index in kept], inside
 
 
-# By scene, for each of its draws the score of each estimate.
+# The score of each estimate, by scene and draw.
 Draws: TypeAlias = Mapping[str, Sequence[Mapping[str, Score]]]
 
 
 def difference(draws: Draws, first: str, second: str) -> Difference:
-    """The gain of an estimate with its interval: over images where each scene is one draw, else over draws."""
+    """Return an estimate's gain and interval, by images if each scene has one draw, and by draws otherwise."""
     both = [(scene, each[first], each[second]) for scene, scores in draws.items() for each in scores]
     if len(both) == len(draws):
         return paired_difference([(a.accuracies, b.accuracies, a.images) for _, a, b in both])
@@ -185,7 +185,7 @@ def difference(draws: Draws, first: str, second: str) -> Difference:
 
 
 def table(title: str, draws: Draws, names: Sequence[str]) -> list[str]:
-    """Markdown; the second row of an estimate has its gain by scene, then lines with its gain by draw."""
+    """Return Markdown; an estimate's second row has its gain by scene, and further lines its gain by draw."""
     counts = [f"{name} ({len(scores)})" for name, scores in draws.items()]
     lines = [f"| {title} | {' | '.join(counts)} | mean | gain over the first | seconds |"]
     lines.append("|" + " --- |" * (len(counts) + 4))
@@ -240,7 +240,7 @@ def main() -> None:
             plan = [*product(arguments.shares, arguments.images, range(arguments.seeds))] if every else []
             for share, images, seed in tqdm(plan, desc=f"{recipe}, {scene.name}"):
                 if seed and not images and share == 1:
-                    continue  # all of a scene: there is but one draw
+                    continue  # all images of a scene make a single draw
                 pairs, inside = drawn(every, images, share, seed)
                 scores = {name: score(make, pairs, inside, scene) for name, make in estimators.items()}
                 done[share][scene.name].append(scores)

@@ -30,7 +30,7 @@ def main() -> None:
     parser.add_argument("--matches", type=int, default=2000)
     arguments = parser.parse_args()
     units, rng = [Unit(1, f"m{number}", 1024) for number in range(arguments.units)], np.random.default_rng(0)
-    # Sub-pixel points on images of 1600 x 1200 in no order: a compressor gains little.
+    # Sub-pixel points on images of 1600 x 1200 in random order hardly compress.
     points = (rng.random((arguments.matches, 2)) * (1600, 1200) for _ in range(2))
     blob = to_blob(Matches(*points, rng.random(arguments.matches)))
     names = [(f"{number}.jpg", f"{number % 100}.jpg") for number in range(arguments.pairs)]

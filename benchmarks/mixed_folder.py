@@ -1,8 +1,8 @@
-"""A folder of mixed photographs with the truth that the score of 2025 asks for.
+"""A folder of mixed photographs with the ground truth for the score of 2025.
 
     python -m benchmarks.mixed_folder --train-dir DIR --unrelated IMAGE... --out DIR
 
-OUT/images/mixed has the images of all scenes, and others that belong to none; OUT has ``train_labels.csv`` and
+OUT/images/mixed has the images of all scenes, and unrelated images; OUT has ``train_labels.csv`` and
 ``train_thresholds.csv``, 0.025 to 1 m.
 """
 

@@ -1,11 +1,11 @@
-"""Seconds that each matcher takes for a pair of new images: the column of the README's table.
+"""Seconds of each matcher for a pair of new images: the column of the README's table.
 
 python -m benchmarks.pairs [--rounds 3] [--only loftr,roma] [--precision bfloat16]
 
-Both images are encoded and matched, a matcher after the other in each round; medians. kornia's LoFTR and ALIKED
-are measured beside them. The memory is the largest of a process that does nothing else, Python and PyTorch
-included. Weights are stand-ins, or random ones, and keypoints as many as the options allow. Views are as
-large as in the recipes. To have what a worker has, run it with ``THP_MEM_ALLOC_ENABLE=1``.
+Each round encodes and matches both images with one matcher after the other; figures are medians. kornia's LoFTR
+and ALIKED are measured too. The memory is the maximum of a separate process, including Python and PyTorch. Weights
+are stand-ins or random, and matchers detect the maximum number of keypoints. Views have the sizes of the recipes.
+Set ``THP_MEM_ALLOC_ENABLE=1``, as workers do.
 """
 
 import argparse
@@ -44,7 +44,7 @@ from tests.support.light_matchers import MATCHERS
 from tests.support.standin import filled
 
 KEYPOINTS = 2048
-Run = Callable[[], int]  # does the work once; the number of matches or keypoints that it found
+Run = Callable[[], int]  # runs once and returns the number of matches or keypoints
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class Case:
 
 
 def random_network(make: Callable[[], nn.Module], placement: Placement) -> Any:
-    """With weights that keep activations of order 1: stand-ins of such large networks take minutes."""
+    """Load the matcher with weights that keep activations of order 1: stand-ins of large networks take minutes."""
     with torch.device("meta"):
         network = make()
     network.to_empty(device="cpu")
@@ -101,7 +101,7 @@ CASES = {
 
 
 def photographs(size: Size) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """Two views (H, W, 3) RGB, the second 16 pixels further right and 8 further down."""
+    """Return two views, (H, W, 3) RGB, the second 16 pixels further right and 8 further down."""
     resized = cv2.resize(load_sample_images().images[0], size, interpolation=cv2.INTER_AREA)
     return resized, np.roll(resized, (8, 16), axis=(0, 1))
 
@@ -122,7 +122,7 @@ def run_of(case: Case, placement: Placement) -> Run:
 
 
 def kornias_loftr(placement: Placement) -> Run:
-    """Always in float32, with the weights of ours."""
+    """Return a run of kornia's LoFTR in float32, with our weights."""
     network = LoFTR(pretrained=None).eval()
     network.load_state_dict({**network.state_dict(), **filled(Loftr(), "loftr").state_dict()})
     image0, image1 = (image_batch([each], "cpu") for each in pictures_of(SEMI_DENSE, Colour.GRAY, 8))
@@ -130,7 +130,7 @@ def kornias_loftr(placement: Placement) -> Run:
 
 
 def kornias_aliked(placement: Placement) -> Run:
-    """Always in float32; the keypoints of both images."""
+    """Return a run of kornia's ALIKED in float32, which counts the keypoints of both images."""
     network = filled(ALIKED("aliked-n16", max_num_keypoints=KEYPOINTS, detection_threshold=0.0).eval(), "aliked")
     images = [image_batch([each], "cpu") for each in pictures_of(SPARSE, Colour.RGB, 32)]
     return lambda: sum(int(network(image)[0].n) for image in images)
@@ -149,14 +149,14 @@ def seconds_of(run: Run) -> float:
 
 
 def high_water() -> int:
-    """The most kilobytes that this process has held; what ``getrusage`` gives may be its parent's."""
+    """Return the peak memory of this process in kilobytes; ``getrusage`` may report its parent's."""
     kilobytes = re.search(r"VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text())
     assert kilobytes is not None
     return int(kilobytes[1])
 
 
 def peak_memory(name: str, precision: str) -> float:
-    """GB of a process of its own."""
+    """Return the peak memory of a separate process, in GB."""
     arguments = [sys.executable, "-m", "benchmarks.pairs", "--memory-of", name, "--precision", precision]
     return int(subprocess.run(arguments, check=True, capture_output=True, text=True).stdout) * 1024 / 1e9
 

@@ -6,8 +6,8 @@ python -m benchmarks.paper_tables --out DIR --weights DIR [--yfcc LIST IMAGES] [
 LIST is a list of pairs in the format of SuperGlue's evaluation, IMAGES the directory that its names start from
 (docs/benchmarks.md), TRAIN_DIR any train side of the Image Matching Challenge 2022. The rows are in
 `paper_tables.toml`. The rows of a table share a work directory, so that common units run once; the last column
-counts the units that a row ran. Killed or stopped, the same command resumes. `--pairs N` takes a sample of each
-list or scene, `--matcher` replaces all matchers.
+counts the units that a row ran. After a kill, the same command resumes. `--pairs N` takes a sample of each list or
+scene, and `--matcher` replaces all matchers.
 """
 
 import argparse
@@ -35,7 +35,7 @@ TABLES = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="u
 
 
 def recipe_of(table: str, row: str, method: str, given: argparse.Namespace) -> Recipe:
-    """Return the recipe of a row, by the protocol that the command names, with its matcher if it names one."""
+    """Return the recipe of a row, with the command's protocol and its matcher, if any."""
     whole = load_recipe("imc2022" if table == "imc" else table)
     if table == "imc":
         own = next((unit for unit in whole.units if unit.matcher == row), None)
@@ -58,7 +58,7 @@ def sized(unit: Unit, stage: int, side: str) -> Unit:
 
 
 def table(name: str, given: argparse.Namespace) -> Iterator[str]:
-    """Yield the lines of the table in Markdown, each row when it has run."""
+    """Yield the lines of the table in Markdown, each row after its run."""
     scenes, is_imc, differences = scenes_of(name, given), name == "imc", []
     ours = ["mAA"] if is_imc else [*(f"AUC {limit:g}" for limit in AUC_THRESHOLDS), "precision", "matching score"]
     heads = [

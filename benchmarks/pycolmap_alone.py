@@ -3,9 +3,9 @@
 python -m benchmarks.pycolmap_alone --train-dir DIR [--scenes NAME ...] [--mappers incremental global]
     [--one-camera]
 
-DIR is a train side in the layout of the Image Matching Challenge 2022. All settings are pycolmap's defaults, but
-for one SIMPLE_RADIAL camera for each image, or for all of a scene with ``--one-camera``. A pair whose images are
-not in one model fails. It prints the mAA over all pairs with a covisibility of at least 0.1, and CPU seconds.
+DIR is a train side in the layout of the Image Matching Challenge 2022. All settings are pycolmap's defaults,
+except one SIMPLE_RADIAL camera for each image, or for all of a scene with ``--one-camera``. A pair fails if no
+model has both images. The output is the mAA over all pairs with a covisibility of at least 0.1, and CPU seconds.
 """
 
 import argparse
@@ -26,7 +26,7 @@ Cameras = dict[str, Camera]
 
 
 def matched(database: Path, images: Path, one_camera: bool) -> None:
-    """Write SIFT features of all images, and verified matches of every two, to the database."""
+    """Write SIFT features of all images, and verified matches of all pairs, to the database."""
     reader = pycolmap.ImageReaderOptions()
     reader.camera_model = "SIMPLE_RADIAL"
     pycolmap.extract_features(
@@ -40,7 +40,7 @@ def matched(database: Path, images: Path, one_camera: bool) -> None:
 
 
 def models(mapper: str, database: Path, images: Path, folder: Path) -> list[Cameras]:
-    """The cameras of every model by image id, the largest model first."""
+    """Return the cameras of every model by image id, the largest model first."""
     mapping = pycolmap.incremental_mapping if mapper == "incremental" else pycolmap.global_mapping
     found = mapping(database, images, folder)
     return sorted((cameras_of(model) for model in found.values()), key=len, reverse=True)

@@ -1,10 +1,10 @@
-"""Cost and accuracy of a batch's reconstruction, from matches of known cameras with noise and wrong ones.
+"""Cost and accuracy of a batch's reconstruction, from noisy and wrong matches of known cameras.
 
 python -m benchmarks.scenes [26:304 100:2000] [--world front|street] [--threads 1]
 
-Each size is images:pairs, and runs in a process of its own, as in the engine. The front is seen by all images;
-along the street each image sees what is near. `verify` and `map` are CPU seconds; the errors are medians over
-pairs, in degrees, of the relative rotation and of the direction of translation.
+Each size is images:pairs and runs in a separate process, as in the engine. All images see the front; images along
+the street see only nearby facades. `verify` and `map` are CPU seconds. Errors are medians over pairs, in degrees,
+of the relative rotation and of the direction of translation.
 """
 
 import argparse
@@ -46,7 +46,7 @@ def row(size: str, world: str, config: SceneConfig) -> str:
 
 
 def timed(function: Callable[..., Any], name: str, seconds: Counter[str]) -> Callable[..., Any]:
-    """The function, with its CPU seconds added up under its name."""
+    """Wrap the function to sum its CPU seconds under its name."""
 
     def call(*arguments: Any) -> Any:
         begin = time.process_time()
@@ -59,7 +59,7 @@ def timed(function: Callable[..., Any], name: str, seconds: Counter[str]) -> Cal
 
 
 def errors(solution: Solution, scene: SyntheticScene) -> list[tuple[float, float]]:
-    """Of each pair that has its F from cameras: of its relative rotation and of its direction, in degrees."""
+    """Return errors in degrees of each pair with an F from cameras: relative rotation and direction."""
     angles = []
     registered = registered_images(solution)
     for pair, choice in zip(scene.pairs, solution.choices, strict=True):

@@ -1,10 +1,10 @@
-"""How well the engine uses its time, on random simulated runs.
+"""Use of time by the engine, on random simulated runs.
 
 python -m benchmarks.simulation [--scenarios 1000] [--seed 0] [--pairs 10000]
 python -m benchmarks.simulation --costs 0.6 0.4 0.35 [--batches 15] [--pairs 10000] [--scene-seconds 0.15]
     [--limit 8h45m] [--workers 1]
 
-With `--costs`, the seconds of each unit on a pair, one run is simulated and told: when what happened.
+With `--costs`, the seconds of each unit on a pair, the output is the timeline of one simulated run.
 """
 
 import argparse
@@ -18,7 +18,7 @@ from tests.support.simulator import Scenario, random_scenario, simulate, without
 
 
 def tell(scenario: Scenario) -> None:
-    """When the phases of a run began, and the scenes of its batches."""
+    """Start times of the phases of a run, and the scenes of its batches."""
     ran = simulate(scenario)
     for explanation in ran.report.explanations:
         print(explanation)

@@ -15,12 +15,12 @@ from mkpc_kaggle.scene.reconstruction import RegisteredImage
 from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair
 
 SIZE = Size(800, 600)
-# The numbers of the points that an image sees, ascending (N,), and where its detector finds them (N, 2).
+# Ascending numbers of the points in an image, (N,), and their detected positions, (N, 2).
 Seen = tuple[np.ndarray, np.ndarray]
 
 
 def registered_images(solution: Solution) -> dict[str, RegisteredImage]:
-    """The images that have a camera, by digest, each of the first model that has it."""
+    """Return the registered images by digest, each from the first model with it."""
     models = [model for found in solution.reconstructions for model in found.models]
     return {found.image.digest: found for model in reversed(models) for found in model.images}
 
@@ -41,7 +41,7 @@ class SyntheticScene:
         return fundamental_of_cameras(*self.true_cameras(pair))
 
     def median_distance(self, F: Matrix3, pair: BatchPair) -> float:
-        """How far true correspondences of a pair are from an F: the median of Sampson's distance, in pixels."""
+        """Return the median Sampson distance of a pair's true correspondences from an F, in pixels."""
         points = [project(camera, self.world[:400]) for camera in self.true_cameras(pair)]
         return float(np.median(sampson_distances(F, Matches(*points, np.ones(len(points[0]))))))
 
@@ -57,11 +57,11 @@ def synthetic_scene(
     prefix: str = "",
     focals: Sequence[float] = (),
 ) -> SyntheticScene:
-    """Cameras on an arc before a front with depth; ``pairs`` of all pairs, chosen evenly, or all of them.
+    """Return cameras on an arc before a front with depth, and ``pairs`` evenly chosen pairs, or all pairs.
 
-    A point is where the image's detector finds it, ``noise`` pixels off in each coordinate (a number, or one for
-    each image), and the same in every pair of the image but for a twentieth of a pixel. ``outliers`` is the share
-    of matches between other points. Without ``focals``, in pixels, each camera has a focal length of its own.
+    ``noise`` is the error of an image's detector in pixels in each coordinate: a number, or one for each image. A
+    point has the same error in all pairs of the image, except for a twentieth of a pixel. ``outliers`` is the
+    share of wrong matches. Without ``focals``, in pixels, each camera has its own random focal length.
     """
     rng = np.random.default_rng(seed)
     world = front(rng, points)
@@ -77,7 +77,7 @@ def synthetic_scene(
 def street(
     images: int, pairs: int, *, noise: float = 0.4, outliers: float = 0.25, seed: int = 0
 ) -> SyntheticScene:
-    """An image a metre along a loop of facades, each matched with its neighbours; at most 290 matches a pair."""
+    """Return an image per metre along a loop of facades, matched with its neighbours, up to 290 matches a pair."""
     rng = np.random.default_rng(seed)
     radius = images / (2 * np.pi)
     angles = 2 * np.pi * np.arange(images) / images
@@ -110,7 +110,7 @@ def batch_of(
     prefix: str = "",
     most: int | None = None,
 ) -> SyntheticScene:
-    """Images of these cameras, and the pairs at these places among them."""
+    """Return images of these cameras, and the pairs with these indices."""
     images = tuple(BatchImage(f"{prefix}{n:04}", f"digest of {prefix}{n:04}", SIZE) for n in range(len(cameras)))
     noises = np.broadcast_to(noise, len(cameras)).tolist()
     seen = [see(rng, camera, world, own) for camera, own in zip(cameras, noises, strict=True)]
@@ -122,14 +122,14 @@ def batch_of(
 
 
 def front(rng: np.random.Generator, count: int) -> np.ndarray:
-    """(count, 3) world points of a facade with bays: x to the right, y down, z away from the cameras."""
+    """Return (count, 3) world points of a facade with bays: x to the right, y down, z away from the cameras."""
     x, y = rng.uniform(-8, 8, count), rng.uniform(-4, 4, count)
     bays = np.where(np.floor(x / 2) % 2 == 0, 0.0, 2.0)
     return np.column_stack([x, y, bays + rng.uniform(0, 1.0, count)])
 
 
 def arc_camera(rng: np.random.Generator, where: float) -> Camera:
-    """A camera at ``where`` (0 to 1) of an arc of 80 degrees about the front, with a focal length of its own."""
+    """Return a camera at ``where``, 0 to 1, of an arc of 80 degrees about the front, with a random focal."""
     angle = np.radians(80) * (where - 0.5) + rng.normal(0, 0.02)
     distance = rng.uniform(11, 15)
     centre = np.array([distance * np.sin(angle), rng.normal(0, 0.5), 1.5 - distance * np.cos(angle)])
@@ -139,12 +139,12 @@ def arc_camera(rng: np.random.Generator, where: float) -> Camera:
 
 
 def looking(centre: np.ndarray, angle: float, focal: float) -> Camera:
-    """A level camera that looks along an angle about the vertical axis."""
+    """Return a level camera that looks along an angle about the vertical axis."""
     return pointed(centre, np.array([np.sin(angle), 0.0, np.cos(angle)]), focal)
 
 
 def pointed(centre: np.ndarray, ahead: np.ndarray, focal: float) -> Camera:
-    """An upright camera at ``centre`` that looks along the unit vector ``ahead``."""
+    """Return an upright camera at ``centre`` that looks along the unit vector ``ahead``."""
     right = np.cross([0.0, 1, 0], ahead)
     right /= np.linalg.norm(right)
     R = np.stack([right, np.cross(ahead, right), ahead])
@@ -152,19 +152,19 @@ def pointed(centre: np.ndarray, ahead: np.ndarray, focal: float) -> Camera:
 
 
 def zoomed(camera: Camera, focal: float) -> Camera:
-    """The camera with another focal length, in pixels."""
+    """Return the camera with another focal length, in pixels."""
     K = np.array([[focal, 0, SIZE.width / 2 - 0.5], [0, focal, SIZE.height / 2 - 0.5], [0, 0, 1]])
     return replace(camera, K=K)
 
 
 def project(camera: Camera, world: np.ndarray) -> np.ndarray:
-    """(N, 3) world points -> (N, 2) pixels."""
+    """Project (N, 3) world points to (N, 2) pixels."""
     seen = (world @ camera.R.T + camera.t) @ camera.K.T
     return np.asarray(seen[:, :2] / seen[:, 2:])
 
 
 def see(rng: np.random.Generator, camera: Camera, world: np.ndarray, noise: float) -> Seen:
-    """The points within the image, less what is behind the camera."""
+    """Return the points in front of the camera and within the image."""
     found = project(camera, world) + rng.normal(0, noise, (len(world), 2))
     ahead = world @ camera.R[2] + camera.t[2] > 0
     numbers = np.flatnonzero(Box.whole(SIZE).contains(found) & ahead)
@@ -172,7 +172,7 @@ def see(rng: np.random.Generator, camera: Camera, world: np.ndarray, noise: floa
 
 
 def match(rng: np.random.Generator, first: Seen, second: Seen, outliers: float, most: int | None) -> Matches:
-    """The points that both images see, some of them lost and some mixed up."""
+    """Return matches of the common points of both images, some dropped and some wrong."""
     common, places0, places1 = np.intersect1d(first[0], second[0], assume_unique=True, return_indices=True)
     kept = np.flatnonzero(rng.random(len(common)) < 0.5)[:most]
     points0 = first[1][places0[kept]] + rng.normal(0, 0.05, (len(kept), 2))

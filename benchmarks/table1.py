@@ -2,9 +2,9 @@
 
 python -m benchmarks.table1 --train-dir DIR --weights DIR --out DIR [--pairs-per-scene 6] [--matchers sift,aliked]
 
-All recipes see a pair together, so that a unit they share runs once. Each pair that is done is a line of
-OUT/pairs.jsonl: killed or stopped, the same command goes on there, with more pairs too. The tables in Markdown are
-printed at the end; ``--tables`` prints those of the pairs done so far.
+All recipes run on a pair together, so that common units run once. Each finished pair is a line of OUT/pairs.jsonl:
+after a kill, the same command resumes, also with more pairs. The tables are printed in Markdown at the end;
+``--tables`` prints the tables of the finished pairs.
 """
 
 import argparse
@@ -39,7 +39,7 @@ LONG_SIDES = {
     "aliked": (1024, 832, 640, 928, 736, 1120),
     "xfeat_lighterglue": (1024, 1280, 800, 1152, 896, 1408),
 }
-"""In the order in which recipes use them; all differ, since the same size would give the same matches."""
+"""Long sides in the order of use; all differ, since equal sizes would give equal matches."""
 MAX_MATCHES = {"sift": 8000}
 OPTIONS: Mapping[str, Mapping[str, float]] = {"sift": {"features": 8000, "ratio": 0.8}}
 
@@ -52,12 +52,12 @@ LAYOUTS = {
     "six": (6, 0),
     "three + three": (3, 3),
 }
-"""How many of a matcher's units look at whole images, and how many at the critical regions."""
+"""Numbers of a matcher's units on whole images and on critical regions."""
 CONTRASTS = (("three", "one + two"), ("three", "two + one"), ("six", "three + three"))
 """The same units, all on whole images and split over the stages."""
 ENSEMBLE_LAYOUTS = ("three", "two + one")
 COVISIBILITIES = (0.0, 0.3, 0.6, 1.01)
-"""Borders of the ranges of covisibility for which gains are printed."""
+"""Bounds of the ranges of covisibility in the table of gains."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class Way:
 
     @property
     def units(self) -> tuple[Unit, ...]:
-        """Those of stage 1 first; a size of every matcher, then the next."""
+        """The units, stage 1 first; one size of every matcher, then the next size."""
         whole, crops = LAYOUTS[self.layout]
         return tuple(
             Unit(1 if place < whole else 2, matcher, LONG_SIDES[matcher][place], MAX_MATCHES.get(matcher, 4096))
@@ -83,7 +83,7 @@ class Way:
 
 
 def ways_of(matchers: Sequence[str]) -> tuple[Way, ...]:
-    """Every layout of each matcher alone, and some of every two and more together."""
+    """Return every layout of single matchers, and some layouts of two or more matchers."""
     alone = [Way((matcher,), layout) for matcher in matchers for layout in LAYOUTS]
     together = [
         Way(some, layout)
@@ -95,7 +95,7 @@ def ways_of(matchers: Sequence[str]) -> tuple[Way, ...]:
 
 
 def union(ways: Iterable[Way]) -> Recipe:
-    """A recipe with the units of all ways, each once, those of stage 1 first."""
+    """Return a recipe with the distinct units of all ways, stage 1 first."""
     units = sorted({unit: None for way in ways for unit in way.units}, key=lambda unit: unit.stage)
     names = {unit.matcher for unit in units}
     return Recipe(tuple(units), "table1", matchers={name: OPTIONS[name] for name in OPTIONS if name in names})
@@ -103,7 +103,7 @@ def union(ways: Iterable[Way]) -> Recipe:
 
 @dataclass(frozen=True)
 class Found:
-    """What one way made of one pair; ``matches`` were given to MAGSAC, ``seconds`` are of work."""
+    """Result of one way on one pair; ``matches`` are MAGSAC's input, ``seconds`` are of work."""
 
     error: PoseError
     matches: int
@@ -113,7 +113,7 @@ class Found:
 def try_all(
     ways: Sequence[Way], work: PairMatch, true: TruePair, scene: TrainScene, pipeline: Pipeline
 ) -> dict[str, Found]:
-    """Every way on one pair: units of stage 1 once, units of stage 2 once for each plain way."""
+    """Run every way on one pair: units of stage 1 once, units of stage 2 once for each plain way."""
     (whole,) = pipeline.match([work], [unit for unit in pipeline.recipe.units if unit.stage == 1])
     known = {result.unit: result for result in whole.results}
     done: dict[tuple[Unit, ...], PairMatch] = {}
@@ -130,7 +130,7 @@ def try_all(
 
 
 def _conclude(way: Way, work: PairMatch, *, true: TruePair, scene: TrainScene, config: RobustConfig) -> Found:
-    start = time.thread_time()  # several work at once
+    start = time.thread_time()  # several threads work in parallel
     matches = Matches.concatenate(result.matches for result in work.results)
     result = estimate(matches, config)
     seconds = time.thread_time() - start + work.cluster_seconds + _seconds(work.results)
@@ -143,14 +143,14 @@ def _seconds(results: Iterable[UnitResult]) -> float:
 
 
 class ResultsFile:
-    """The results of pairs in a file of JSON lines, of which the first has the settings."""
+    """Results of pairs in a file of JSON lines. The first line has the settings."""
 
     def __init__(self, path: Path, settings: Mapping[str, object]) -> None:
         self.path = path
         self.found: dict[str, dict[str, Found]] = {}
         header = json.dumps(settings, sort_keys=True)
         text = path.read_text(encoding="utf-8") if path.exists() else ""
-        whole = text[: text.rfind("\n") + 1]  # a line that was cut off is done again
+        whole = text[: text.rfind("\n") + 1]  # the pair of a truncated line runs again
         head, *lines = whole.splitlines() or [header]
         if head != header:
             raise SystemExit(f"{path} was made with other settings; name another --out")
@@ -175,7 +175,7 @@ class ResultsFile:
 
 
 def run_all(scenes: Sequence[TrainScene], ways: Sequence[Way], pipeline: Pipeline, results: ResultsFile) -> None:
-    """Every way on every pair that is not in the file; unreadable images are failures of every way."""
+    """Run every way on every pair that is not in the file. Every way fails on unreadable images."""
     todo = [(scene, true) for scene in scenes for true in _in_order(scene) if true.pair.id not in results.found]
     images = ImageStore()
     try:
@@ -196,7 +196,7 @@ def _in_order(scene: TrainScene) -> list[TruePair]:
 
 @dataclass(frozen=True)
 class Tables:
-    """What was found, by scene, on the pairs that are done."""
+    """Results on the finished pairs, by scene."""
 
     scenes: Mapping[str, Sequence[Mapping[str, Found]]]
     pairs: Mapping[str, Sequence[TruePair]]
@@ -227,7 +227,7 @@ class Tables:
         yield from self.gains_by_covisibility(contrasts)
 
     def accuracy(self, ways: Sequence[Way]) -> Iterator[str]:
-        """A row a way: mAA by scene and their mean, AUC at 5 and 10 degrees, matches, seconds a pair."""
+        """Yield a row per way: mAA by scene and their mean, AUC at 5 and 10 degrees, matches, seconds a pair."""
         yield from _head(["way", *self.scenes, "mAA", "AUC 5", "AUC 10", "matches", "seconds"])
         for way in ways:
             found = {name: [pair[way.name] for pair in pairs] for name, pairs in self.scenes.items()}
@@ -240,7 +240,7 @@ class Tables:
             yield _row([way.name, *cells])
 
     def gains(self, contrasts: Iterable[tuple[Way, Way]]) -> Iterator[str]:
-        """A row a contrast: what the second gains over the first in mAA, with intervals, by scene and overall."""
+        """Yield a row per contrast: gains in mAA of the second way over the first, with intervals."""
         yield from _head(["way", "against", *self.scenes, "mean over scenes"])
         for first, second in contrasts:
             overall = self.difference(first, second, tuple(self.scenes))
@@ -248,7 +248,7 @@ class Tables:
             yield _row([second.name, first.name, *by_scene, f"**{overall}**"])
 
     def gains_by_covisibility(self, contrasts: Iterable[tuple[Way, Way]]) -> Iterator[str]:
-        """A row a contrast, a column a range of covisibility: gains in mAA with intervals."""
+        """Yield a row per contrast and a column per range of covisibility: gains in mAA with intervals."""
         every = [item for name, found in self.scenes.items() for item in zip(found, self.pairs[name], strict=True)]
         ranges = [
             (f"{low} to {high}", [item for item in every if low <= item[1].covisibility < high])

@@ -1,6 +1,6 @@
-"""Recipes: which matchers run on which views, in order of importance, and the settings of all that follows.
+"""Recipes: matchers and their views in order of importance, and the settings of all later steps.
 
-A recipe is a TOML file: ``mkpc_kaggle/recipes/NAME.toml`` or a file of the user's own.
+A recipe is a TOML file: ``mkpc_kaggle/recipes/NAME.toml`` or a custom file.
 """
 
 import re
@@ -25,26 +25,26 @@ AREA = re.compile(r"[1-9]\d{0,4}x[1-9]\d{0,4}", re.ASCII)
 
 
 class Mode(StrEnum):
-    """How a recipe's two stages are run; the last two are what the method is compared with."""
+    """Ways to run a recipe's two stages; the last two are baselines."""
 
-    TWO_STAGE = "two-stage"  # as written: stage 2 looks at the critical regions
+    TWO_STAGE = "two-stage"  # as written: stage 2 on the critical regions
     STAGE_1 = "stage-1"  # the units of stage 1 alone
     WHOLE_IMAGES = "whole-images"  # every unit on whole images: the naive ensemble of equal inference count
 
 
 @dataclass(frozen=True)
 class Unit:
-    """One piece of work on one pair; raises ``ValueError`` for values that contradict each other."""
+    """One matcher on one kind of view of a pair. Raises ``ValueError`` for contradictory values."""
 
     stage: int  # 1: on whole images, 2: on the critical regions
     matcher: str
-    long_side: int = 0  # pixels of a view's longer side; or
-    max_matches: int = 4096  # so many of the highest scores are kept
-    area: str = ""  # height x width, such as "540x720": a view gets as many pixels, at its own aspect
-    stretch: bool = False  # a view gets just that height and width
-    fallback: str = ""  # the matcher that runs where this matcher is unavailable
+    long_side: int = 0  # pixels of a view's longer side, or 0 with ``area``
+    max_matches: int = 4096  # keeps the highest scores
+    area: str = ""  # height x width, such as "540x720": the area of a view, which keeps its aspect ratio
+    stretch: bool = False  # a view gets exactly this height and width
+    fallback: str = ""  # replaces the matcher if it is unavailable
     antialias: bool = True  # False: shrink views bilinearly, without averaging areas
-    tracks: bool = True  # False: its matches enter a scene only where the pair's other units found fewer than 50
+    tracks: bool = True  # False: scenes use its matches only if the pair's other units found fewer than 50
 
     def __post_init__(self) -> None:
         check_ranges(self, stage=Range(1, 2), long_side=Range(0, MAX_SIDE_PX), max_matches=AT_LEAST_1)
@@ -55,14 +55,14 @@ class Unit:
         if self.stretch and not self.area:
             raise ValueError("stretch needs an area, the height and width to stretch views to")
 
-    @cached_property  # plans ask for it often
+    @cached_property  # used often by plans
     def name(self) -> str:
-        """Such as ``2:sift@1280`` or ``1:dkm@540x720``; "!" means stretched. Unique in a recipe."""
+        """Name such as ``2:sift@1280`` or ``1:dkm@540x720``; "!" means stretched. Unique in a recipe."""
         return f"{self.stage}:{self.matcher}@{self.long_side or self.area}{'!' if self.stretch else ''}"
 
     @property
     def with_fallback(self) -> "Unit":
-        """The same unit, its fallback, if any, in its matcher's place."""
+        """The unit with its fallback, if any, as its matcher."""
         return replace(self, matcher=self.fallback or self.matcher, fallback="")
 
     def view(self, crop: Box, multiple: int, turns: int = 0) -> View:
@@ -78,16 +78,16 @@ class Unit:
 
 
 class CameraModel(StrEnum):
-    """COLMAP's models of one focal length, the principal point at the centre; RADIAL has a distortion too."""
+    """COLMAP's camera models with one focal length and a central principal point; RADIAL adds distortion."""
 
     PINHOLE = "SIMPLE_PINHOLE"
     RADIAL = "SIMPLE_RADIAL"
 
 
 class CameraSharing(StrEnum):
-    """Which images of a scene, of those of one size, share a camera."""
+    """Camera sharing among the images of one size in a scene."""
 
-    AUTO = "auto"  # those whose focal lengths agree, see ``shared_intrinsics``
+    AUTO = "auto"  # images whose focal lengths agree, see ``shared_intrinsics``
     IMAGE = "image"  # none
     FOLDER = "folder"  # all: a scene's images are in one folder
 
@@ -97,10 +97,10 @@ class SceneConfig:
     """Settings of :mod:`mkpc_kaggle.scene`, table ``[scene]`` of a recipe."""
 
     camera_model: CameraModel = CameraModel.PINHOLE
-    shared_intrinsics: float = 0.02  # images of one size share a camera if most focals are this close; 0: never
-    pairs_per_image: float = 10.0  # a batch with fewer pairs gets extra pairs, for its scene alone; 0: none
+    shared_intrinsics: float = 0.02  # maximum relative deviation of focal lengths from their median; 0: never
+    pairs_per_image: float = 10.0  # a batch with fewer gets extra pairs, used only for its scene; 0: none
     cameras: CameraSharing = CameraSharing.AUTO
-    exif: bool = True  # a camera starts with the focal length of its image's EXIF, if that has one
+    exif: bool = True  # cameras start with the focal length of EXIF, if known
     threads: int = 1  # more than one: the last digits differ from run to run
 
     def __post_init__(self) -> None:
@@ -111,7 +111,7 @@ class SceneConfig:
 class Recipe:
     """Units in order of importance, and the settings of MKPC, MAGSAC, the matchers and scenes.
 
-    Raises :class:`UserError` unless the first unit, which sweeps all pairs, has stage 1 and all units differ.
+    Raises :class:`UserError` unless the first unit, which sweeps all pairs, has stage 1 and no unit is repeated.
     """
 
     units: tuple[Unit, ...]
@@ -119,9 +119,9 @@ class Recipe:
     description: str = ""
     mkpc: MkpcConfig = field(default_factory=MkpcConfig)
     magsac: RobustConfig = field(default_factory=RobustConfig)
-    focal: FocalConfig | None = None  # without it F is MAGSAC's alone, and nothing is assumed of focal lengths
+    focal: FocalConfig | None = None  # ``None``: F is MAGSAC's, without a prior on focal lengths
     matchers: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)  # options by name
-    scene: SceneConfig | None = None  # with it the pairs of a batch are reconstructed together
+    scene: SceneConfig | None = None  # ``None``: batches are not reconstructed
 
     def __post_init__(self) -> None:
         where = f"recipe {self.name!r}"
@@ -137,38 +137,38 @@ class Recipe:
 
     @property
     def matcher_names(self) -> tuple[str, ...]:
-        """Each matcher once, in order of first use."""
+        """Distinct matchers, in order of first use."""
         return tuple(dict.fromkeys(unit.matcher for unit in self.units))
 
     def only(self, wanted: Callable[[Unit], bool]) -> "Recipe":
-        """The same recipe with the units that ``wanted`` lets through."""
+        """Return the recipe with only the units that ``wanted`` accepts."""
         return replace(self, units=tuple(filter(wanted, self.units)))
 
     def with_fallbacks(self, unavailable: Container[str]) -> "Recipe":
-        """The recipe that is run: fallbacks are in the places of ``unavailable`` matchers, or are forgotten."""
+        """Return the recipe with fallbacks instead of ``unavailable`` matchers, and no other fallbacks."""
         units = (u.with_fallback if u.matcher in unavailable else replace(u, fallback="") for u in self.units)
         return replace(self, units=tuple(units))
 
     def in_mode(self, mode: Mode) -> "Recipe":
-        """The recipe run another way, see :class:`Mode`."""
+        """Return the recipe for a :class:`Mode`."""
         if mode is Mode.TWO_STAGE:
             return self
         name = f"{self.name} ({mode})"
         if mode is Mode.STAGE_1:
             return replace(self.only(lambda unit: unit.stage == 1), name=name)
-        whole: dict[str, Unit] = {}  # a unit that both stages have runs once: twice would find the same
+        whole: dict[str, Unit] = {}  # a unit of both stages runs once: a second run would find the same
         for unit in (replace(unit, stage=1) for unit in self.units):
             whole.setdefault(unit.name, unit)
         return replace(self, name=name, units=tuple(whole.values()))
 
     def with_scenes(self, on: bool | None) -> "Recipe":
-        """The recipe with the reconstruction of batches switched on or off; ``None``: as it is."""
+        """Return the recipe with the reconstruction of batches switched on or off; ``None``: no change."""
         if on is None or on == (self.scene is not None):
             return self
         return replace(self, scene=SceneConfig() if on else None)
 
     def table(self) -> dict[str, Any]:
-        """Return the recipe as :func:`recipe_of` takes it, as JSON values."""
+        """Return the table of :func:`recipe_of`, as JSON values."""
         values = asdict(self)
         return {
             name: values[name] for name in ("description", "units", "mkpc", "magsac", "focal", "matchers", "scene")
@@ -176,21 +176,21 @@ class Recipe:
 
 
 def split_mode(text: str) -> tuple[str, Mode]:
-    """The recipe's name or file and the mode of ``RECIPE:MODE``; without a mode, as it is written."""
+    """Return the name or file and the mode of ``RECIPE:MODE``; the mode defaults to two-stage."""
     name, _, mode = text.rpartition(":")
     return (name, Mode(mode)) if name and mode in list(Mode) else (text, Mode.TWO_STAGE)
 
 
 def parse_recipe(text: str, name: str) -> Recipe:
-    """A recipe from TOML text; raises :class:`UserError` if it cannot be accepted."""
+    """Return the recipe of TOML text. Raise :class:`UserError` if it is invalid."""
     try:
         return recipe_of(tomllib.loads(text), name)
-    except (ValueError, RecursionError) as error:  # numbers of thousands of digits, tables in tables in tables
+    except (ValueError, RecursionError) as error:  # numbers of thousands of digits, deeply nested tables
         raise UserError(f"recipe {name!r} is not valid TOML: {error}") from error
 
 
 def recipe_of(table: Mapping[str, Any], name: str) -> Recipe:
-    """A recipe from a TOML file's table, or from a journal's; raises :class:`UserError`."""
+    """Return the recipe of a TOML file's or a journal's table. Raise :class:`UserError` if it is invalid."""
     where = f"recipe {name!r}"
     check_keys(table, ("description", "units", "mkpc", "magsac", "focal", "matchers", "scene"), where)
     units, matchers = table.get("units", []), table.get("matchers", {})
@@ -198,7 +198,7 @@ def recipe_of(table: Mapping[str, Any], name: str) -> Recipe:
         raise UserError(f"{where}: units must be a list of tables, and matchers a table")
 
     def settings(cls: type[Config], key: str) -> Config | None:
-        value = table.get(key)  # a journal has None for a table that the recipe lacks
+        value = table.get(key)  # a journal has None for a missing table
         return None if value is None else from_table(cls, value, f"{where}, table [{key}]")
 
     return Recipe(
@@ -214,12 +214,12 @@ def recipe_of(table: Mapping[str, Any], name: str) -> Recipe:
 
 
 def recipe_names() -> list[str]:
-    """The recipes that come with the package."""
+    """Return the names of the package's recipes."""
     return sorted(path.stem for path in DIRECTORY.glob("*.toml"))
 
 
 def load_recipe(name: str) -> Recipe:
-    """The recipe of that name, or in that ``.toml`` file; raises :class:`UserError` if there is none."""
+    """Return the recipe of this name or ``.toml`` file. Raise :class:`UserError` if it does not exist."""
     known = recipe_names()
     if name not in known and not name.endswith(".toml"):
         raise UserError(f"unknown recipe {name!r}; known: {', '.join(known)}, or a path that ends in .toml")

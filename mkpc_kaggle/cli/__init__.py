@@ -34,15 +34,15 @@ EXIT_INTERRUPTED = 128 + 2  # a shell's status for SIGINT
 
 
 def program(arguments: Sequence[str] | None = None) -> NoReturn:
-    """Run a command and end the process at once: an orderly exit of the interpreter takes a second or longer."""
+    """Run a command and end the process at once: an orderly interpreter exit takes a second or longer."""
     try:  # Ctrl-C during slow imports is not an error
         from mkpc_kaggle.engine.budget import process_started
         from mkpc_kaggle.engine.console import leave
 
         former = os.environ.get("MPLCONFIGDIR")
         status = main(arguments, started=process_started())
-        if (made := os.environ.get("MPLCONFIGDIR")) != former:  # by matplotlib, where it cannot write below HOME
-            shutil.rmtree(str(made), ignore_errors=True)  # which it would do after this program has left
+        if (made := os.environ.get("MPLCONFIGDIR")) != former:  # by matplotlib if it cannot write below HOME
+            shutil.rmtree(str(made), ignore_errors=True)  # matplotlib would remove it in an orderly exit
     except KeyboardInterrupt:
         os._exit(EXIT_INTERRUPTED)
     leave(status)
@@ -52,7 +52,7 @@ def main(arguments: Sequence[str] | None = None, *, started: float | None = None
     """Run a command. Return the exit status.
 
     0: done; 1: a check failed; 2: bad input; 130, 143: ended by a signal; 141: the reader of the output closed the
-    pipe. The time limit counts from ``started``; default: now.
+    pipe. The time limit starts at ``started``; default: now.
     """
     from mkpc_kaggle.engine.console import complain, warn
     from mkpc_kaggle.errors import UserError
@@ -99,7 +99,7 @@ def require_directory() -> None:
 
 
 def make_parser(arguments: Sequence[str] = tuple(COMMANDS)) -> argparse.ArgumentParser:
-    """Return the parser for these arguments. Imports only the commands among them, since imports take time."""
+    """Return the parser for these arguments. Import only the commands among them, since imports take time."""
     text = "Two-stage image matching with Matching Key-Points Crop, offline, inside a time budget."
     parser = argparse.ArgumentParser("mkpc_kaggle", description=text, epilog="COMMAND --help has the options.")
     parser.add_argument("--version", action="version", version=__version__)

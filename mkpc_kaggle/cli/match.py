@@ -14,8 +14,8 @@ from mkpc_kaggle.reporting.figures.style import require_format, save
 
 HELP = """\
 Match two images. Print the fundamental matrix (x1^T F x0 = 0, pixel centres at integers), the number of matches
-of each unit, and the critical regions. --out draws the matches, the clusters and the critical regions. Pixels are
-those of the stored files, whatever EXIF says of their orientation; figures are upright.
+of each unit, and the critical regions. --out draws the matches, the clusters and the critical regions. Points are
+in pixels of the stored files, without the EXIF orientation; figures are upright.
 """
 
 

@@ -21,31 +21,31 @@ from mkpc_kaggle.reporting.summary import trouble
 
 HELP = """\
 Match the images of a folder with the engine that makes submissions, and reconstruct their cameras. Each folder
-in DIR that has images is a dataset of its own, the images directly in DIR are another. Images of several places
-may be mixed: each place becomes a model, and an image that belongs to none has no camera.
+in DIR with images is a separate dataset, and the images directly in DIR are another. Images of several scenes
+may be mixed: each scene becomes a model, and unrelated images get no camera.
 
-OUT gets, for a folder in DIR in a folder of its name:
+OUT gets a folder for each folder in DIR, with:
   database.db     COLMAP's: cameras, images, keypoints, matches, verified two-view geometries
   models/0, 1...  COLMAP's binary models, the largest first
-and for all together:
+and for all datasets together:
   cameras.csv     image, model, K, R, t: X_cam = R X + t, (0, 0) is the first pixel's centre; numbers joined by ;
-                  and how sure each camera is: rotation_sigma (degrees), centre_sigma (of the model's size),
+                  and the uncertainty of each camera: rotation_sigma (degrees), centre_sigma (of the model's size),
                   focal_sigma (percent); see docs/running.md
   submission.csv  with --format
   report.html     the run, with the cameras and points of each model
-  work/           the journal: killed at any point, the same command goes on, and ends with the same files
+  work/           the journal: after a kill, the same command resumes the run and makes the same files
 
-Pixels are those of the stored file, as COLMAP reads it, whatever EXIF says of its orientation. A file that EXIF
-calls mirrored (2, 4, 5, 7) is matched as it is stored: little but other mirrored files matches it. Cameras start
-with the focal lengths that EXIF has, unless the recipe's table [scene] has `exif = false`.
+Points refer to the pixels of the stored file, as COLMAP reads it, without the EXIF orientation. A file that EXIF
+calls mirrored (2, 4, 5, 7) is matched as stored: hardly any but other mirrored files match it. Cameras start with
+the focal lengths of EXIF, unless the recipe's table [scene] has `exif = false`.
 
-OUT must be empty, or of an earlier run of this command. New results take the place of former results when they are
-whole; a link or a file of yours in the place of a result is refused. At the end, results that only an earlier run
-made are removed, unless they were changed. Other files are left alone.
+OUT must be empty or the result of an earlier run of this command. Complete new results replace former results; a
+link or a file of yours at the path of a result is refused. At the end, unchanged results that only an earlier run
+made are removed. Other files remain.
 
-All pairs of up to 100 images are matched, and in larger datasets each image with the 20 most like it.
+All pairs of up to 100 images are matched; in larger datasets, each image is matched with the 20 most similar.
 
-Exit status: 0 done; 1 there is no model, or the run failed; 2 bad input; 130 or 143 ended by a signal.
+Exit status: 0 done; 1 no image has a camera, or the run failed; 2 bad input; 130 or 143 ended by a signal.
 """
 MAX_LINES = 20  # of each list
 
@@ -53,18 +53,18 @@ MAX_LINES = 20  # of each list
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("images", type=Path, metavar="DIR", help="png, jpg or jpeg files, or folders of them")
-    text = "the directory for the results: empty, or with those of an earlier run"
+    text = "directory for the results: empty, or with the results of an earlier run"
     add("--out", type=Path, required=True, metavar="OUT", help=text)
     options.add_matching(parser)
     options.add_run(parser, time_limit=None)
-    add("--pairs", type=Path, metavar="FILE", help="match these alone: two paths below DIR a line, as of hloc")
-    add("--format", choices=FORMS, help="also write submission.csv; imc2023: of 2024, too")
-    text = "try to turn images that match nothing by 90, 180 and 270 degrees"
+    add("--pairs", type=Path, metavar="FILE", help="match only these: two paths below DIR per line, as in hloc")
+    add("--format", choices=FORMS, help="also write submission.csv; imc2023 is also for 2024")
+    text = "try images without matches turned by 90, 180 and 270 degrees"
     add("--rotations", action="store_true", help=text)
-    text = """which images of one size in a folder one camera took: those whose focal lengths agree (auto), none
+    text = """images of one size in a folder that share a camera: if their focal lengths agree (auto), none
         (image), or all (folder)"""
     add("--camera", choices=list(map(str, CameraSharing)), help=text)
-    add("--fresh", action="store_true", help="forget what an earlier run left in OUT/work")
+    add("--fresh", action="store_true", help="delete the journal of an earlier run in OUT/work")
     parser.set_defaults(reconstruct=True)
 
 
@@ -105,7 +105,7 @@ def has_camera(cameras: Cameras) -> bool:
 
 
 def _lines(result: FolderResult) -> Iterator[str]:
-    """A line for each dataset, and what went wrong."""
+    """Yield a line for each dataset, and the errors."""
     report = result.report
     ended = f"{report.ending} after {format_duration(report.seconds)}"
     yield f"{len(result.pairs)} pairs: {ended}; {report.units_run} units run, {report.estimated} F estimated"

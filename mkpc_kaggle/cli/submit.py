@@ -19,8 +19,8 @@ If the run is killed, the same command resumes it from its journal in the work d
 the run early with a valid file.
 
 Exit status: 0 done, or the time limit was reached; 1 the run failed (no worker remained, or errors left most pairs
-without an F), or the last version of the file could not be written, and an earlier one is complete; 2 bad input;
-130 or 143 ended by a signal, and the file is complete.
+without an F), or the last version of the file could not be written; an earlier version is complete; 2 bad input;
+130 or 143 ended by a signal; the file is complete.
 """
 
 
@@ -49,7 +49,7 @@ def run(arguments: argparse.Namespace) -> int:
     require_apart(files, [*test_side(arguments.test_dir), Path(arguments.recipe)], work_dir, arguments.weights)
     with interruptible() as interrupt:
         pairs = read_test_side(arguments.test_dir)
-        # Before the watchdog starts: a run that begins after its limit must still leave a complete file.
+        # Before the watchdog starts: a run that starts after its limit must still leave a complete file.
         with first_version(pairs, output), options.watched_session(arguments, work_dir, interrupt) as watched:
             session, watchdog = watched
             assembly = options.assembly_of(arguments, arguments.recipe, arguments.mode, interrupt)

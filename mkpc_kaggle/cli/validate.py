@@ -28,25 +28,28 @@ from mkpc_kaggle.recipe import Recipe, split_mode
 from mkpc_kaggle.reporting.report import report_run
 from mkpc_kaggle.reporting.summary import left_out_line, summary, trouble
 
-# Defaults of the options of matching.
+# Defaults of the matching options.
 MATCHING = dict.fromkeys(("work_dir", "compare", "units", "method", "threshold")) | {
     "recipe": "auto",
     "mode": "two-stage",
 }
 HELP = """\
-Run a recipe, with the engine that makes submissions, on a train side (calibration.csv, pair_covisibility.csv
-and images/ in each scene, scaling_factors.csv beside the scenes), and score it as the competition does: mAA
-over rotation errors of 1 to 10 degrees and translation errors of 0.2 to 5 metres, for each scene, then the
-mean of the scenes; beside it the AUC of the larger angular error up to 5, 10 and 20 degrees. The mAA has a column
-for each step of the estimate: MAGSAC alone, with the prior on focal lengths, with the cameras of the scene.
+Run a recipe on a train side with the engine that makes submissions, and score it as the competition does. A
+train side has calibration.csv, pair_covisibility.csv and images/ in each scene, and scaling_factors.csv next to
+the scenes.
 
-With --compare, several recipes run on the same pairs; each is compared with the first.
+The score is the mAA over rotation errors of 1 to 10 degrees and translation errors of 0.2 to 5 metres, for each
+scene and as the mean of the scenes. The next columns are the AUC of the larger angular error up to 5, 10 and 20
+degrees. The mAA has a column for each step of the estimate: MAGSAC alone, with the prior on focal lengths, with
+the cameras of the scene.
 
-With --pairs and --image-root the pairs come from a list in the format of SuperGlue's evaluation (a line a pair:
-name0 name1 turns0 turns1 K0 K1 T_0to1), E is estimated, and the AUC is what counts: see docs/benchmarks.md.
+With --compare, several recipes run on the same pairs and are compared with the first.
 
-With --submission and --truth nothing is matched: the files are scored. So they are with --submission and
---imc2025, by the rules of 2025: mAA of the camera centres, and the share of right images in the clusters.
+With --pairs and --image-root, the pairs come from a list in the format of SuperGlue's evaluation, one line per
+pair: name0 name1 turns0 turns1 K0 K1 T_0to1. E is estimated, and the AUC is the score: see docs/benchmarks.md.
+
+With --submission and --truth, files are scored without matching. With --submission and --imc2025, they are scored
+by the rules of 2025: mAA of the camera centres, and the share of right images in the clusters.
 """
 
 
@@ -63,7 +66,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--pairs-per-scene", type=int, metavar="N", help="evenly spread; default: all")
     add("--min-covisibility", type=float, default=0.1, help="of --train-dir; default: 0.1, as in the competition")
     options.add_matching(parser)
-    text = "F from each pair's own matches alone, whatever the recipe has"
+    text = "F from each pair's matches alone, even if the recipe reconstructs scenes"
     add("--no-scenes", dest="reconstruct", action="store_const", const=False, help=text)
     add("--units", metavar="A,B", help="only these, in this order, such as 1:sift@1536; default: the recipe's")
     text = """run these instead of --recipe and --mode, and give the gain of each over the first with its 95 %%
@@ -85,7 +88,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         the run (not with --pairs); default: a temporary directory"""
     add("--work-dir", type=Path, metavar="DIR", help=text)
     add("--submission", action="append", type=Path, metavar="CSV", help="score it, match nothing; may be repeated")
-    add("--truth", type=Path, metavar="CSV", help="which pairs its samples are (`demo` writes such a table)")
+    add("--truth", type=Path, metavar="CSV", help="the pairs of its samples; `demo` writes an example")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -111,7 +114,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _require_a_whole(given: argparse.Namespace) -> None:
-    """Raise :class:`UserError` for options that do not go together."""
+    """Raise :class:`UserError` for options that cannot be combined."""
     for is_wrong, message in (
         (given.imc2025 and (given.truth or not given.submission), "--imc2025 needs --submission, and no --truth"),
         (
@@ -169,12 +172,12 @@ def _match_and_score(arguments: argparse.Namespace, scenes: tuple[TrainScene, ..
             lines = [*filter(None, [left_out_line(assembly.left_out)]), *options.plan_lines(arguments, report)]
             lines += [summary(pairs, report), "", f"recipe {validation.recipe}"]
             say("\n".join([*lines, *score_table(validation), *step_gains(validation)]))
-            # The report's inliers are of F: there is none for a list of pairs, whose E is estimated.
+            # The report draws inliers of F, and a list of pairs has E instead.
             if arguments.work_dir is not None and arguments.pairs is None:
                 say(report_run(work_dir, work_dir / f"{name}.html", session.must_end(), pairs))
             status = 128 + interrupt.signal if interrupt.signal else max(status, bool(trouble(report)))
             if compared and report.ending != Ending.COMPLETE:
-                say("nothing is compared before all is done; with a --work-dir, the same command goes on")
+                say("nothing is compared until all is done; with a --work-dir, the same command resumes")
                 return status or 1
     figures = to_json(validations[0])
     if compared:
@@ -194,7 +197,7 @@ def _write_json(path: Path | None, figures: dict[str, Any]) -> None:
 def _assemble(
     arguments: argparse.Namespace, interrupt: Interrupt, name: str, mode: str, pairs: Sequence[Pair]
 ) -> Assembly:
-    """Return the parts of a run of a recipe, with what the command changes of it."""
+    """Return the assembly of a recipe, as changed by the command's options."""
     assembly = options.assembly_of(arguments, name, mode, interrupt)
     recipe = with_units(assembly.recipe, arguments.units)
     if arguments.protocol is not None:
@@ -209,7 +212,7 @@ def _assemble(
 
 
 def with_units(recipe: Recipe, wanted: str | None) -> Recipe:
-    """The recipe with the units of these names alone, in this order; all of them if none are named."""
+    """Return the recipe with only the named units, in this order; all units by default."""
     if wanted is None:
         return recipe
     known, names = {unit.name: unit for unit in recipe.units}, wanted.split(",")

@@ -1,1 +1,1 @@
-"""Files in and out: the competition directory, lists of pairs, images."""
+"""Input and output files: the competition directory, pair lists, images."""

@@ -1,6 +1,6 @@
 """Files of the Image Matching Challenge 2022: the test side, the train side, submissions.
 
-Matrices and vectors in cells are separated by blanks, row by row. A test image is
+Numbers of matrices and vectors in a cell are separated by blanks, row by row. A test image is
 ``test_images/<batch_id>/<image_id>.png``, a train image ``<scene>/images/<image_id>.jpg``; png, jpg and
 jpeg are accepted on both sides. F of a pair satisfies x2^T F x1 = 0, image 1 being the first.
 """
@@ -74,16 +74,16 @@ class TrainScene:
 
 
 def test_side(directory: Path) -> tuple[Path, Path]:
-    """The table, and the directory of the images."""
+    """Return the paths of the table and of the image directory."""
     home = directory.parent if directory.name == "test_images" else directory
     return home / "test.csv", home / "test_images"
 
 
 def read_test_side(directory: Path) -> tuple[Pair, ...]:
-    """The pairs of ``test.csv``, in its order; a missing image is no error here: its path does not exist.
+    """Return the pairs of ``test.csv``, in its order. A missing image is not an error here.
 
-    ``directory`` holds ``test.csv`` and ``test_images/``, or is the latter. Raises :class:`UserError` for a table
-    that cannot be read or has no rows, and for ids that are repeated or that no file can have.
+    ``directory`` holds ``test.csv`` and ``test_images/``, or is the latter. Raises :class:`UserError` for an
+    unreadable or empty table, and for ids that are repeated or cannot be file names.
     """
     path, images = test_side(directory)
     pairs: dict[str, Pair] = {}
@@ -94,7 +94,7 @@ def read_test_side(directory: Path) -> tuple[Pair, ...]:
         if CONTROL.search(sample):
             raise UserError(f"{where}: the sample_id {sample!r} has control characters: no submission can hold it")
         batch, first, second = (plain_name(name, where) for name in ids)
-        # A large table names a batch in thousands of rows: they share its string.
+        # A large table names a batch in thousands of rows: interning shares one string.
         pairs[sample] = Pair(sample, sys.intern(batch), files(batch)[first], files(batch)[second])
     if not images.is_dir():
         raise UserError(f"{images}: no such directory; --test-dir must hold test.csv and test_images/")
@@ -110,9 +110,10 @@ def read_train_side(
     min_covisibility: float = 0.1,
     pairs_per_scene: int | None = None,
 ) -> tuple[TrainScene, ...]:
-    """The scenes of a train side (all, or those named), with so many pairs each, evenly spread over its table.
+    """Return the named scenes of a train side, or all of them.
 
-    Raises :class:`UserError` for what is missing, and for cells that cannot be read.
+    ``pairs_per_scene`` limits each scene to that number of pairs, evenly spread over its table. Raises
+    :class:`UserError` for missing files and scenes, and for malformed cells.
     """
     path = directory / "scaling_factors.csv"
     rows = read_rows(path, ("scene", "scaling_factor"))
@@ -147,7 +148,7 @@ def _read_scene(directory: Path, metres: float, min_covisibility: float, most: i
 
 
 def write_submission(path: Path, rows: Mapping[str, Matrix3]) -> None:
-    """Write a row for each sample. If that raises ``OSError``, an earlier file is unchanged."""
+    """Write a row for each sample. Raise ``OSError`` and leave an existing file unchanged if that fails."""
     with replacing(path) as stream:
         table = csv.writer(stream, lineterminator="\n")
         table.writerow(SUBMISSION_COLUMNS)
@@ -156,13 +157,13 @@ def write_submission(path: Path, rows: Mapping[str, Matrix3]) -> None:
 
 
 def read_submission(path: Path) -> dict[str, Matrix3]:
-    """F by sample id; raises :class:`UserError` for a file that is not a submission."""
+    """Return F by sample id. Raise :class:`UserError` for a file that is not a submission."""
     rows = read_rows(path, SUBMISSION_COLUMNS)
     return {sample: _numbers(cell, where, 9).reshape(3, 3) for where, (sample, cell) in rows}
 
 
 def has_samples(path: Path, sample_ids: Iterable[str]) -> bool:
-    """Return whether a file is a submission with these samples, in their order; its matrices may be anything."""
+    """Return whether a file is a submission with these samples, in their order. Matrices are not checked."""
     with suppress(UserError):
         rows = (sample for _, (sample, _) in read_rows(path, SUBMISSION_COLUMNS, only=True))
         return all(found == wanted for found, wanted in zip_longest(rows, sample_ids))
@@ -170,7 +171,7 @@ def has_samples(path: Path, sample_ids: Iterable[str]) -> bool:
 
 
 def submission_problems(path: Path, sample_ids: Sequence[str]) -> list[str]:
-    """What is wrong with a submission, a sentence each; empty if the competition accepts it."""
+    """Return the problems of a submission, a sentence each; empty if the competition accepts it."""
     try:
         rows = [cells for _, cells in read_rows(path, SUBMISSION_COLUMNS, only=True)]
     except UserError as error:
@@ -195,9 +196,9 @@ def submission_problems(path: Path, sample_ids: Sequence[str]) -> list[str]:
 
 
 def read_rows(path: Path, columns: Sequence[str], *, only: bool = False) -> Iterator[tuple[str, list[str]]]:
-    """Where each row of a CSV file is, for messages, and its cells in these columns; ``only``: it has no others.
+    """Yield each row of a CSV file: its location, for messages, and its cells in these columns.
 
-    Raises :class:`UserError` for a file that cannot be used.
+    ``only`` requires that the file has no other columns. Raises :class:`UserError` for an unusable file.
     """
     try:
         if path.exists() and not path.is_file():
@@ -223,25 +224,25 @@ def read_rows(path: Path, columns: Sequence[str], *, only: bool = False) -> Iter
 
 
 def plain_name(name: str, where: object) -> str:
-    """``name`` if it is the name of a file or directory; an id must not point outside its directory."""
+    """Return ``name`` if it is a plain file name. Raise :class:`UserError` if it may leave its directory."""
     if NOT_PLAIN.search(name):
         raise UserError(f"{where}: the id {name!r} is not a plain name, so it cannot name a file here")
     return name
 
 
 def pair_id(scene: str, first: str, second: str) -> str:
-    """The id under which a pair of the train side runs."""
+    """Return the id of a pair of the train side in a run."""
     return f"{scene};{first}-{second}"
 
 
 def evenly_spread(items: Sequence[Item], most: int | None) -> list[Item]:
-    """At most that many of the items, the first and the last among them."""
+    """Return up to ``most`` of the items, including the first and the last."""
     count = len(items) if most is None else min(most, len(items))
     return [items[index] for index in np.linspace(0, len(items) - 1, count).round().astype(int)]
 
 
 class ImageFiles(dict[str, str]):
-    """Paths of the images of a directory, as it is now, by id; for any other id a png that does not exist."""
+    """Paths of the images of a directory by id, listed once; an unknown id gives a png that does not exist."""
 
     def __init__(self, directory: Path) -> None:
         self.directory = directory
@@ -250,7 +251,7 @@ class ImageFiles(dict[str, str]):
             self.update((path.stem, str(path)) for path in reversed(images))
 
     def __missing__(self, image_id: str) -> str:
-        return f"{self.directory}{os.sep}{image_id}.png"  # a Path would keep the name of each missing image
+        return f"{self.directory}{os.sep}{image_id}.png"  # a Path would cache the name of each missing image
 
 
 def _numbers(cell: str, where: str, count: int) -> NDArray[np.float64]:

@@ -1,4 +1,4 @@
-"""EXIF of a photograph: how its stored pixels lie, and the focal length by COLMAP's rule.
+"""EXIF of a photograph: the orientation of its stored pixels, and the focal length by COLMAP's rule.
 
 Source: ``Bitmap::ExifFocalLength`` of COLMAP 4.2, without its table of sensors.
 """
@@ -18,9 +18,9 @@ ORIENTATION, DIRECTORY, FOCAL_MM = 0x0112, 0x8769, 0x920A  # tags
 PLANE_RESOLUTION, PLANE_UNIT, FOCAL_35MM = 0xA20E, 0xA210, 0xA405
 FILM_MM = 43.27  # diagonal of 35 mm film
 UNITS_MM: dict[float, float] = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
-FOCALS = Range(0.2, 20.0)  # long sides of an image; a focal length beyond is taken for a mistake
+FOCALS = Range(0.2, 20.0)  # long sides of an image; a focal length outside this range counts as a mistake
 
-# By orientation, the quarter turns, counter-clockwise, that set stored pixels upright; mirrored pixels stay so.
+# Counter-clockwise quarter turns that set stored pixels upright, by orientation; mirrored pixels stay mirrored.
 TURNS: dict[float, int] = {3: 2, 4: 2, 5: 3, 6: 3, 7: 1, 8: 1}
 
 
@@ -30,7 +30,7 @@ def read_exif(data: bytes, size: Size) -> tuple[int, float]:
     ``data`` is the file of an image of ``size``. Both numbers are 0 if unknown; damaged EXIF counts as missing.
     """
     tags: dict[int, float] = {}
-    with suppress(Exception), warnings.catch_warnings():  # of a damaged file Pillow raises errors of any type
+    with suppress(Exception), warnings.catch_warnings():  # Pillow raises errors of any type for a damaged file
         warnings.filterwarnings("ignore", module="PIL")
         tags = _numbers(data)
     unit = UNITS_MM.get(tags.get(PLANE_UNIT, 0), inf)

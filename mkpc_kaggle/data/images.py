@@ -1,4 +1,4 @@
-"""Images: decoded in the background and once. An unreadable file is a value with a reason, not an exception."""
+"""Images: decoded once, in the background. An unreadable file is a value with a reason, not an exception."""
 
 import hashlib
 from collections import OrderedDict
@@ -20,7 +20,7 @@ Key = TypeVar("Key")
 Value = TypeVar("Value")
 
 NOT_A_PICTURE = "not a picture, or cut off: it cannot be decoded"
-MAX_ASPECT = 32  # of the sides; beyond it views would be a few pixels high, or would not fit into memory
+MAX_ASPECT = 32  # of the sides; longer views would be a few pixels high, or would not fit into memory
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +35,7 @@ class Image:
 
     @classmethod
     def of_array(cls, array: Pixels) -> "Image":
-        """From (H, W, 3) RGB or (H, W) gray uint8, named by its content; ``ValueError`` for anything else."""
+        """Wrap (H, W, 3) RGB or (H, W) gray uint8, named by its content. Raise ``ValueError`` otherwise."""
         if array.dtype != np.uint8 or array.ndim < 2 or array.shape[2:] not in ((), (3,)) or not array.size:
             raise ValueError(f"an image is uint8 (H, W) or (H, W, 3), not {array.dtype} {array.shape}")
         pixels = np.ascontiguousarray(np.stack([array] * 3, axis=2) if array.ndim == 2 else array)
@@ -48,7 +48,7 @@ class Image:
 
     @cached_property
     def gray(self) -> Pixels:
-        """(H, W) uint8."""
+        """Gray values, (H, W) uint8."""
         return np.asarray(cv2.cvtColor(self.pixels, cv2.COLOR_RGB2GRAY), np.uint8)
 
     def turned(self, turns: int) -> "Image":
@@ -69,7 +69,7 @@ class Unreadable:
 
 
 def read_image(path: Path) -> Image | Unreadable:
-    """Decode the stored pixels of a file to RGB; never raises. 16-bit values are divided by 256.
+    """Decode the stored pixels of a file to RGB, without raising. Divide 16-bit values by 256.
 
     OpenCV decides whether a damaged file is readable: version 5 refuses a truncated file.
     """
@@ -105,12 +105,12 @@ def _content_digest(data: Pixels) -> str:
 
 
 def printable(text: str) -> str:
-    """``text`` with escapes for characters that UTF-8 cannot encode, which paths may have."""
+    """Return ``text`` with escapes for characters that UTF-8 cannot encode. Paths may have them."""
     return text.encode("utf-8", "backslashreplace").decode()
 
 
 class ByteCache(Generic[Key, Value]):
-    """The most recently used values, ``limit`` bytes at most; a larger value is not kept. For one thread."""
+    """Cache of the most recently used values, up to ``limit`` bytes. Not thread-safe."""
 
     def __init__(self, limit: int) -> None:
         self.limit, self.bytes = limit, 0
@@ -132,7 +132,7 @@ class ByteCache(Generic[Key, Value]):
 
 
 class ImageStore:
-    """Images by path, decoded in the background; the most recently used are kept. For one thread."""
+    """Images by path, decoded in the background; caches the most recently used. Not thread-safe."""
 
     def __init__(self, limit_bytes: int = 512 << 20) -> None:
         self._images: ByteCache[Path, Image] = ByteCache(limit_bytes)
@@ -146,7 +146,7 @@ class ImageStore:
                 self._pending[path] = self._decoder.submit(read_image, path)
 
     def get(self, path: Path) -> Image | Unreadable:
-        """The image; waits until it is decoded."""
+        """Return the image. Wait until it is decoded."""
         if (known := self._images.get(path)) is not None:
             return known
         self.prefetch([path])

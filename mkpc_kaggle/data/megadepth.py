@@ -1,4 +1,4 @@
-"""MegaDepth-1500 in the files of LoFTR's evaluation, ``scene_info`` as .npz, as lines of a list of pairs."""
+"""MegaDepth-1500 from the LoFTR's ``scene_info`` files, as lines of a pair list."""
 
 import pickle
 import zipfile
@@ -11,17 +11,17 @@ import numpy as np
 
 from mkpc_kaggle.errors import UserError
 
-MAX_ARRAY_BYTES = 1 << 28  # of a file's array, unpacked
+MAX_ARRAY_BYTES = 1 << 28  # limit for an unpacked array of a file
 # The only names that pickled arrays need. Any other name might run code.
 NAMES = {"ndarray": np.ndarray, "dtype": np.dtype, "encode": lambda text, _: text.encode("latin-1")}
 NAMES |= {"_reconstruct": np.empty(0).__reduce__()[0], "scalar": np.float64(0).__reduce__()[0]}
 
 
 def lines_of_scene_info(file: Path) -> Iterator[str]:
-    """Yield a line for each pair, as :mod:`mkpc_kaggle.data.pairs` reads it; nothing in the file is executed.
+    """Yield a line of :mod:`mkpc_kaggle.data.pairs` for each pair.
 
-    Pairs begin with two indices into ``image_paths``, ``intrinsics`` (3, 3) and ``poses`` (4, 4), world to camera.
-    Raises :class:`UserError` for any other file.
+    A pair has two indices into ``image_paths``, ``intrinsics``, (3, 3), and ``poses``, (4, 4) world to camera.
+    Raises :class:`UserError` for any other file. Executes no code of the file.
     """
     try:
         with zipfile.ZipFile(file) as archive:

@@ -1,4 +1,4 @@
-"""Files that a command writes: an input is never overwritten, and a file is replaced only by a whole file."""
+"""Output files of a command: no input is overwritten, and only a complete file replaces another."""
 
 import os
 import secrets
@@ -10,7 +10,7 @@ from typing import TextIO
 
 from mkpc_kaggle.errors import UserError
 
-# By option, the suffixes of what it writes: such a file in an input directory is the result of an earlier run.
+# Suffixes of each option's results. A file with this suffix in an input directory is an earlier run's result.
 RESULTS = {"--output": (".csv",), "--json": (".json",), "--report": (".html", ".htm")}
 RESULTS["--out"] = (".png", ".jpg", ".pdf", ".svg")
 
@@ -21,10 +21,10 @@ def require_apart(
     work_dir: Path | None = None,
     weights: Iterable[Path] = (),
 ) -> None:
-    """Refuse outputs that would overwrite an input, or that are in each other's or the journal's way.
+    """Raise :class:`UserError` for outputs that would overwrite an input, another output or the journal.
 
-    ``outputs`` are files, by option; ``inputs`` and ``weights`` files and directories. A new file is fine.
-    ``--json`` and ``--report`` overwrite nothing but their own kind. Raises :class:`UserError`.
+    ``outputs`` are files, by option; ``inputs`` and ``weights`` are files and directories. A new file is allowed.
+    ``--json`` and ``--report`` overwrite only files of their own kind.
     """
     files = {option: path for option, path in outputs.items() if path is not None}
     inputs = list(inputs)
@@ -50,7 +50,7 @@ def require_apart(
 
 
 def require_directory_apart(out: Path, inputs: Iterable[Path], weights: Iterable[Path]) -> None:
-    """Refuse a directory of results, ``--out``, that holds something that is read, or lies in an input."""
+    """Raise :class:`UserError` for a result directory, ``--out``, that contains an input or lies in one."""
     inputs = list(inputs)
     for place in (*inputs, *weights, *weights_of_environment()):
         if os.path.lexists(place) and (lies_in(place, out) or (place in inputs and lies_in(out, place))):
@@ -58,7 +58,7 @@ def require_directory_apart(out: Path, inputs: Iterable[Path], weights: Iterable
 
 
 def require_table(path: Path, columns: Iterable[str]) -> None:
-    """Refuse to replace anything but a table with these columns. Raises :class:`UserError`."""
+    """Raise :class:`UserError` if ``path`` exists and is not a table with these columns."""
     if os.path.lexists(path):
         with suppress(OSError):
             if path.is_file() and not path.is_symlink():  # a pipe would block
@@ -69,17 +69,17 @@ def require_table(path: Path, columns: Iterable[str]) -> None:
 
 
 def weights_of_environment() -> list[Path]:
-    """The directories that ``$MKPC_WEIGHTS`` names."""
+    """Return the directories in ``$MKPC_WEIGHTS``."""
     return [Path(name) for name in os.environ.get("MKPC_WEIGHTS", "").split(os.pathsep) if name]
 
 
 def lies_in(path: Path, directory: Path) -> bool:
-    """Whether ``path`` is ``directory`` or in it, links resolved."""
+    """Return whether ``path`` is ``directory`` or lies in it, with links resolved."""
     return any(same_file(place, directory) for place in (path, *Path(os.path.realpath(path)).parents))
 
 
 def same_file(path: Path, other: Path) -> bool:
-    try:  # links, and file systems that do not tell A from a
+    try:  # links, and case-insensitive file systems
         return os.path.realpath(path) == os.path.realpath(other) or path.samefile(other)
     except OSError:
         return False
@@ -87,10 +87,10 @@ def same_file(path: Path, other: Path) -> bool:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[TextIO]:
-    """A file to write that takes the place of ``path`` when all of it is on the disk.
+    """Open a temporary file that replaces ``path`` when it is complete and on the disk.
 
-    Until then it lies beside ``path``; what a killed process has left there is removed. A device such as
-    ``/dev/stdout`` is written to and not replaced. Raises ``OSError`` where it cannot be written; nothing is left.
+    The temporary file lies next to ``path``; files that a killed process left there are removed. A device such as
+    ``/dev/stdout`` is written directly. Raises ``OSError`` and removes the temporary file if writing fails.
     """
     if path.is_char_device():
         with path.open("w", encoding="utf-8", newline="") as stream:

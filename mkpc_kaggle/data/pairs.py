@@ -1,10 +1,10 @@
-"""Lists of pairs with known poses, in the format that SuperGlue's evaluation made common.
+"""Lists of pairs with known poses, in the format of SuperGlue's evaluation.
 
-A line a pair: ``name0 name1 turns0 turns1 K0 K1 T_0to1``, separated by blanks. Names are paths under the image
-root. ``turns`` are the quarter turns, counter-clockwise, that set an image upright, after those of its EXIF. K (9
-numbers) and T (16), row by row, are those of the stored pixels: X_1 = R X_0 + t with T = [R t; 0 1].
+One line per pair: ``name0 name1 turns0 turns1 K0 K1 T_0to1``, separated by blanks. Names are paths under the image
+root. ``turns`` are the counter-clockwise quarter turns that set an image upright, in addition to its EXIF's. K (9
+numbers) and T (16) are stored row by row and refer to the stored pixels: X_1 = R X_0 + t with T = [R t; 0 1].
 
-A file ``.npz``, or a directory of such files, is LoFTR's list of MegaDepth-1500.
+A file ``.npz``, or a directory of ``.npz`` files, is LoFTR's list of MegaDepth-1500.
 """
 
 from collections.abc import Iterable
@@ -26,12 +26,12 @@ from mkpc_kaggle.geometry.coordinates import Box, Size
 
 FIELDS = 2 + 2 + 9 + 9 + 16
 EXPECTED = "name0 name1 turns0 turns1 K0 (9 numbers) K1 (9) T_0to1 (16)"
-MAX_SKEWNESS = 1e-3  # of R R^T of a pose from the identity: files have few digits
+MAX_SKEWNESS = 1e-3  # of R R^T from the identity; files round poses to few digits
 
 
 @dataclass(frozen=True, eq=False)
 class ListedImage:
-    name: str  # its path under the image root
+    name: str  # path under the image root
     turns: int  # quarters
     camera: Camera
 
@@ -40,10 +40,10 @@ class ListedImage:
 
 
 def read_pairs(file: Path, image_root: Path, *, most: int | None = None) -> TrainScene:
-    """The pairs of a list as a scene of unknown scale, to estimate E on.
+    """Return the pairs of a list as a scene of unknown scale, with intrinsics to estimate E.
 
-    ``most`` takes up to that number of pairs, evenly spread. An image that cannot be read is no error here: the
-    run reports it. Raises :class:`UserError` for a list without pairs and for a malformed line.
+    ``most`` limits the number of pairs, evenly spread. An unreadable image is not an error here: the run reports
+    it. Raises :class:`UserError` for a list without pairs and for a malformed line.
     """
     if not image_root.is_dir():
         raise UserError(f"--image-root {image_root}: no such directory")
@@ -63,7 +63,7 @@ def read_pairs(file: Path, image_root: Path, *, most: int | None = None) -> Trai
 
 
 def read_regions(file: Path, image_root: Path, pairs: Iterable[Pair]) -> dict[tuple[str, ...], tuple[Box, Box]]:
-    """Return the boxes for stage 2 of these pairs by the files of their images.
+    """Return the stage-2 boxes of these pairs, by the files of their images.
 
     ``file`` is a table ``image_0,image_1,box_0,box_1``: paths under the root; left, top, right and bottom in whole
     pixels of the stored file, the latter two exclusive. Raises :class:`UserError` for a malformed table or box and
@@ -95,12 +95,12 @@ def size_of(path: str | Path) -> Size | None:
 
 
 def parse_line(line: str, where: str) -> tuple[ListedImage, ListedImage]:
-    """Both images of a line; raises :class:`UserError` that says where it is and what was expected."""
+    """Return both images of a line. Raise :class:`UserError` with its location and the expected format."""
     cells = line.split()
     if len(cells) != FIELDS:
         raise UserError(f"{where}: expected {FIELDS} fields, {EXPECTED}, found {len(cells)}")
     for name in cells[:2]:
-        path = PureWindowsPath(name)  # the strictest rules: drives and backslashes count, too
+        path = PureWindowsPath(name)  # the strictest rules: drives and backslashes count too
         if path.anchor or ".." in path.parts or "\0" in name:
             raise UserError(f"{where}: {name!r} points outside the image root; expected a path without ..")
     try:
@@ -110,7 +110,7 @@ def parse_line(line: str, where: str) -> tuple[ListedImage, ListedImage]:
     K0, K1, T = numbers[:9].reshape(3, 3), numbers[9:18].reshape(3, 3), numbers[18:].reshape(4, 4)
     R, t = T[:3, :3], T[:3, 3]
     has_focals = all(min(K[0, 0], K[1, 1]) > 0 and (K[1, 0], *K[2]) == (0, 0, 0, 1) for K in (K0, K1))
-    with np.errstate(over="ignore", invalid="ignore"):  # whether they are finite is asked below
+    with np.errstate(over="ignore", invalid="ignore"):  # the loop below checks that they are finite
         is_rotation = np.abs(R @ R.T - np.eye(3)).max() < MAX_SKEWNESS and np.linalg.det(R) > 0
     for holds, expected in (
         (set(turns) <= {0, 1, 2, 3}, f"0, 1, 2 or 3 quarter turns, found {cells[2]} and {cells[3]}"),

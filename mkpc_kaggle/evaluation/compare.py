@@ -1,4 +1,4 @@
-"""Recipes compared on the same pairs: differences of mAA with bootstrap intervals."""
+"""Comparison of recipes on the same pairs: differences of mAA with bootstrap intervals."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from mkpc_kaggle.evaluation.validate import Validation, to_json
 LEVEL = 0.95
 RESAMPLES = 10_000
 
-# The values of the same pairs under a first and under a second recipe, and the two images of each pair.
+# Values of the same pairs under two recipes, and the two images of each pair.
 Paired: TypeAlias = tuple[Sequence[float], Sequence[float], Sequence[tuple[str, str]]]
 
 
@@ -34,9 +34,9 @@ class Difference:
 def paired_difference(scenes: Sequence[Paired]) -> Difference:
     """Return the mean over scenes of the mean gain of a pair, with its interval.
 
-    Pairs that share an image are not independent. So images are resampled, not pairs: each image of a scene gets
-    a random weight, and a pair counts by the product of its images' weights. Scenes are not resampled. The same
-    input gives the same interval. Where pairs share no image, the interval is up to 1.7 times too wide.
+    Pairs that share an image are not independent. So the bootstrap resamples images, not pairs: each image of a
+    scene gets a random weight, and a pair has the product of its images' weights. Scenes are not resampled. The
+    same input gives the same interval. If pairs share no image, the interval is up to 1.7 times too wide.
 
     Raises ``ValueError`` without scenes, for a scene without pairs, and if values and images differ in number.
     Sources: Rubin 1981 (exponential weights); Owen 2007 (products of weights).
@@ -53,7 +53,7 @@ def paired_difference(scenes: Sequence[Paired]) -> Difference:
 def _resampled_means(
     gains: NDArray[np.float64], images: Sequence[tuple[str, str]], generator: np.random.Generator
 ) -> NDArray[np.float64]:
-    """Return (RESAMPLES,) means of the gains, (P,), each under other weights of the images."""
+    """Return (RESAMPLES,) means of the gains, (P,), each under new random weights of the images."""
     _, ends = np.unique(np.array(images), return_inverse=True)
     ends = ends.reshape(-1, 2)
     table = np.zeros((2, ends.max() + 1, ends.max() + 1))  # sums of gains, and numbers of pairs, by their images
@@ -66,7 +66,7 @@ def _resampled_means(
 
 @dataclass(frozen=True)
 class Comparison:
-    """Validations of the same pairs; each is compared with the first."""
+    """Validations of the same pairs, compared with the first."""
 
     validations: tuple[Validation, ...]
 
@@ -76,21 +76,21 @@ class Comparison:
             raise ValueError("the recipes ran on different pairs")
 
     def difference(self, number: int, scene: str | None = None) -> Difference:
-        """MAA of the validation of that number less the first's, in a scene or as the mean over scenes."""
+        """Return the mAA of a validation less the first's, in a scene or as the mean over scenes."""
         runs = self.validations[0], self.validations[number]
         parts = [[part for part in run.scenes if scene in (None, part.scene)] for run in runs]
         return paired_difference([(a.accuracies(), b.accuracies(), a.images) for a, b in zip(*parts, strict=True)])
 
 
 def seconds_per_pair(validation: Validation) -> float:
-    """Mean seconds of units, clustering and last estimate, over all runs of the journal; NaN if unknown."""
+    """Return the mean seconds of units, clustering and last estimate over all runs of the journal, or NaN."""
     records = validation.report.records if validation.report else ()
     seconds = (r.encode_seconds + r.match_seconds + r.cluster_seconds + r.estimate_seconds for r in records)
     return mean(seconds) if records else nan
 
 
 def comparison_table(comparison: Comparison) -> list[str]:
-    """Lines: mAA and seconds a pair of each recipe, then its gain over the first, in each scene and overall."""
+    """Return lines: mAA and seconds per pair of each recipe, then its gain over the first by scene and overall."""
     first, *others = comparison.validations
     lines = [f"{'recipe':<40}{'mAA':>9}{'seconds a pair':>16}"]
     lines += [f"{run.recipe:<40}{run.maa():>9.4f}{seconds_per_pair(run):>16.3f}" for run in comparison.validations]
@@ -104,7 +104,7 @@ def comparison_table(comparison: Comparison) -> list[str]:
 
 
 def step_gains(validation: Validation) -> list[str]:
-    """Lines: the gain of mAA, as the mean over scenes, of each step over the step before; none without metres."""
+    """Return lines: the mean gain of mAA of each step over the previous step; none without metres."""
     scenes = [scene for scene in validation.scenes if scene.in_metres]
     lines = []
     for steps in pairwise(validation.steps if scenes else ()):
@@ -115,7 +115,7 @@ def step_gains(validation: Validation) -> list[str]:
 
 
 def comparison_json(comparison: Comparison) -> dict[str, Any]:
-    """All figures as JSON values: each validation, and the gain of each later validation over the first."""
+    """Return all figures as JSON values: each validation, and its gain over the first."""
 
     def gain(number: int, name: str | None = None) -> dict[str, float]:
         difference = comparison.difference(number, name)

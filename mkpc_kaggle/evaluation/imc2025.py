@@ -1,4 +1,4 @@
-"""The score of the Image Matching Challenge 2025: are mixed images in the right clusters, with the right cameras?
+"""The score of the Image Matching Challenge 2025: clusters of mixed images, and their cameras.
 
 ``train_labels.csv`` has ``dataset,scene,image,rotation_matrix,translation_vector``, ``train_thresholds.csv`` has
 ``dataset,scene,thresholds``; numbers in a cell are joined by ``;``, and poses are world to camera. An image of the
@@ -19,15 +19,15 @@ from mkpc_kaggle.errors import UserError, shown
 
 OUTLIERS = "outliers"
 POSE_COLUMNS = ("dataset", "scene", "image", "rotation_matrix", "translation_vector")
-SKIPPED_THRESHOLDS = 2  # the finest, which the ground truth cannot tell apart
-FREE = 3  # images that any similarity can be made to fit
-MAX_TRIPLETS = 20_000  # tried for a scene and a cluster; of more, so many are drawn
+SKIPPED_THRESHOLDS = 2  # the finest, below the accuracy of the ground truth
+FREE = 3  # images that some similarity always fits
+MAX_TRIPLETS = 20_000  # per scene and cluster; a random sample of this size if there are more
 REFINEMENTS = 10
-MIN_SPREAD = 1e-12  # sum of squares; centres with less stand at one point
-MAX_NUMBER = 1e12  # of a pose: squares of what is made of such numbers are finite
+MIN_SPREAD = 1e-12  # sum of squares; centres with a smaller sum coincide
+MAX_NUMBER = 1e12  # of a pose; keeps squares of derived numbers finite
 
 Points = NDArray[np.float64]  # (N, 3)
-Centres = Mapping[str, Points]  # of the cameras of a scene or cluster by image, (3,); NaN without a camera
+Centres = Mapping[str, Points]  # camera centres, (3,), of a scene or cluster by image; NaN without a camera
 Parts = Mapping[str, Centres]  # the scenes of a dataset, or its clusters
 
 
@@ -41,16 +41,16 @@ class DatasetScore:
 
     @property
     def score(self) -> float:
-        """The harmonic mean of the two."""
+        """Harmonic mean of both figures."""
         total = self.maa + self.clusterness
         return 2 * self.maa * self.clusterness / total if total else 0.0
 
 
 def score_imc2025(directory: Path, submission: Path) -> list[DatasetScore]:
-    """The score of each dataset of a train side.
+    """Return the score of each dataset of a train side.
 
-    Raises :class:`UserError` for files that cannot be read, for numbers that cannot be scored, and if an image or
-    a dataset is missing, unknown or there twice.
+    Raises :class:`UserError` for unreadable files, for numbers that cannot be scored, and for a missing, unknown
+    or repeated image or dataset.
     """
     labels, path = directory / "train_labels.csv", directory / "train_thresholds.csv"
     truth, found, thresholds = _centres(labels), _centres(submission), _thresholds(path)
@@ -75,9 +75,9 @@ def score_imc2025(directory: Path, submission: Path) -> list[DatasetScore]:
 def score_dataset(
     name: str, scenes: Parts, clusters: Parts, thresholds: Mapping[str, Sequence[float] | Points]
 ) -> DatasetScore:
-    """Each scene takes the cluster that has most of its images, of several the cluster with the best mAA.
+    """Return the score of a dataset. Each scene takes the cluster with most of its images, then the best mAA.
 
-    The mAA's numerators and denominators are summed over the scenes before they are divided.
+    The mAA's numerators and denominators are summed over the scenes before the division.
     """
     accurate = possible = common = taken = 0
     for scene in scenes.keys() - {OUTLIERS}:
@@ -94,10 +94,10 @@ def score_dataset(
 
 
 def accurate_images(truth: Centres, cluster: Centres, thresholds: Sequence[float] | Points) -> int:
-    """How many images more than ``FREE`` have a centre less than a threshold off, summed over thresholds.
+    """Return the number of images above ``FREE`` with a centre within a threshold, summed over thresholds.
 
-    For each threshold on its own, the similarity of three images that takes most of the cluster's centres to the
-    scene's is fitted anew to these.
+    For each threshold, the best similarity of three images is refined on its inliers: the cluster's centres that
+    it maps to the scene's.
     """
     common = sorted(name for name in truth.keys() & cluster.keys() if np.isfinite(cluster[name]).all())
     if len(common) < FREE:
@@ -117,9 +117,9 @@ def accurate_images(truth: Centres, cluster: Centres, thresholds: Sequence[float
 
 
 def residuals(source: Points, target: Points, fitted: NDArray[np.intp]) -> NDArray[np.float64]:
-    """(B, N): how far from its target each point is, moved by the similarity of the points ``fitted``, (B, K).
+    """Return each point's distance from its target, (B, N), under the similarity of ``fitted`` points, (B, K).
 
-    It is NaN where the fitted sources are one point.
+    It is NaN if the fitted sources coincide.
 
     Source: Umeyama 1991, the solution of Horn's problem by a singular value decomposition.
     """
@@ -147,7 +147,7 @@ def _without_pose(centres: Centres) -> list[str]:
 
 
 def _thresholds(path: Path) -> dict[str, dict[str, Points]]:
-    """By dataset and scene."""
+    """Return the thresholds by dataset and scene."""
     found: dict[str, dict[str, Points]] = {}
     for where, (dataset, scene, cell) in read_rows(path, ("dataset", "scene", "thresholds")):
         limits = _numbers(cell, where)
@@ -162,7 +162,7 @@ def _thresholds(path: Path) -> dict[str, dict[str, Points]]:
 
 
 def _centres(path: Path) -> dict[str, dict[str, dict[str, Points]]]:
-    """The camera centres of a table of poses: by dataset, scene or cluster, and image."""
+    """Return the camera centres of a table of poses, by dataset, scene or cluster, and image."""
     found: dict[str, dict[str, dict[str, Points]]] = {}
     seen: set[tuple[str, str]] = set()
     for where, (dataset, scene, image, *cells) in read_rows(path, POSE_COLUMNS):
@@ -179,7 +179,7 @@ def _centres(path: Path) -> dict[str, dict[str, dict[str, Points]]]:
 
 
 def _numbers(cell: str, where: str) -> Points:
-    """NaN stands for what is unknown; raises :class:`UserError` for an infinite number."""
+    """Return the numbers of a cell, NaN for unknown ones. Raise :class:`UserError` for an infinite number."""
     try:
         found = np.array([float(part) for part in cell.split(";")])
     except ValueError as error:
@@ -190,7 +190,7 @@ def _numbers(cell: str, where: str) -> Points:
 
 
 def score_lines(scores: Sequence[DatasetScore]) -> Iterator[str]:
-    """Lines: a row for each dataset, and their mean."""
+    """Yield a row for each dataset, and a row of their mean."""
     yield f"{'dataset':<24}{'mAA':>9}{'clusters':>10}{'score':>9}"
     for each in scores:
         yield f"{shown(each.dataset):<24}{each.maa:>9.4f}{each.clusterness:>10.4f}{each.score:>9.4f}"

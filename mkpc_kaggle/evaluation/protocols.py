@@ -1,4 +1,4 @@
-"""Settings of published evaluations: SuperGlue's of YFCC100M and ScanNet, and LoFTR's of MegaDepth."""
+"""Settings of published evaluations: SuperGlue's on YFCC100M and ScanNet, and LoFTR's on MegaDepth."""
 
 from dataclasses import replace
 
@@ -10,9 +10,9 @@ PROTOCOLS = {"superglue": RUN, "loftr": replace(RUN, threshold=0.5)}
 
 
 def by_protocol(recipe: Recipe, protocol: str) -> Recipe:
-    """Return the recipe with the settings of a protocol, which also scores rotations ``in_front``.
+    """Return the recipe with the settings of a protocol. A protocol also scores rotations ``in_front``.
 
-    SuperGlue's threshold is in pixels of the resized picture: of the recipe's largest in stage 1.
+    SuperGlue's threshold is in pixels of the resized picture, here the recipe's largest in stage 1.
     """
     units = tuple(replace(unit, antialias=False) for unit in recipe.units)
     sides = [unit.long_side or max(map(int, unit.area.split("x"))) for unit in units if unit.stage == 1]

@@ -1,4 +1,4 @@
-"""Runs the engine on a train side and scores it as the competition does."""
+"""Run of the engine on a train side, and its scores by the rules of the competition."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -23,22 +23,22 @@ from mkpc_kaggle.geometry.metrics import AUC_THRESHOLDS, PoseError
 from mkpc_kaggle.geometry.robust import ModelKind
 from mkpc_kaggle.pipeline.assembly import Assembly
 
-MAX_NAMES = 5  # of samples, in a line
+MAX_NAMES = 5  # sample names in a line
 
 
 class Step(StrEnum):
-    """The estimates of a pair's F, in the order in which they are made."""
+    """Successive estimates of a pair's F."""
 
     MAGSAC = "MAGSAC"
     PRIOR = "+ prior"  # on the focal lengths
-    SCENE = "+ scene"  # with the cameras of the pair's batch, if these give an F
+    SCENE = "+ scene"  # from the cameras of the pair's batch, if these give an F
 
 
 @dataclass(frozen=True)
 class PairScore:
     """One pair's error, infinite for a failed pair, and its record if the engine made it.
 
-    ``steps`` are the errors after each :class:`Step` that was made; the last is ``error``. For pairs of a list,
+    ``steps`` are the errors after each :class:`Step` of the run; the last is ``error``. For pairs of a list,
     ``matching`` is the precision and the matching score: correct matches over all, and over keypoints of image 0.
     """
 
@@ -53,7 +53,7 @@ class PairScore:
 
 @dataclass(frozen=True)
 class SceneScore:
-    """The scores of one scene's pairs; without metres there is no mAA."""
+    """The scores of one scene's pairs; without metres the mAA is NaN."""
 
     scene: str
     pairs: tuple[PairScore, ...]
@@ -68,11 +68,11 @@ class SceneScore:
         return [pair.images for pair in self.pairs]
 
     def accuracies(self, step: Step | None = None) -> list[float]:
-        """The accuracy of each pair after a step, by default the last."""
+        """Return the accuracy of each pair after a step, by default the last."""
         return [metrics.pair_accuracy(pair.steps[step] if step else pair.error) for pair in self.pairs]
 
     def maa(self, step: Step | None = None) -> float:
-        """The mean of :meth:`accuracies`: the mAA of the Image Matching Challenge 2022."""
+        """Return the mean of :meth:`accuracies`: the mAA of the Image Matching Challenge 2022."""
         return mean(self.accuracies(step)) if self.in_metres else nan
 
     def auc(self, threshold: float) -> float:
@@ -87,8 +87,7 @@ class SceneScore:
 class Validation:
     """The scores of all scenes under one recipe.
 
-    A submission that is scored from its file has no ``report`` and no ``steps``; ``missing`` are the samples that
-    it has no row for.
+    A submission scored from its file has no ``report`` and no ``steps``; ``missing`` are samples without a row.
     """
 
     recipe: str
@@ -98,7 +97,7 @@ class Validation:
     missing: tuple[str, ...] = ()
 
     def maa(self, step: Step | None = None) -> float:
-        """The mean of the scenes' mAA after a step, by default the last: the competition's figure."""
+        """Return the competition's figure: the mean of the scenes' mAA after a step, by default the last."""
         return mean(scene.maa(step) for scene in self.scenes)
 
     def auc(self, threshold: float) -> float:
@@ -118,11 +117,11 @@ def validate(
 ) -> Validation:
     """Run the recipe on the pairs of all scenes, whose images lie below ``root``, and score it.
 
-    With ``in_front``, the inliers of an E choose between its two rotations.
+    With ``in_front``, the inliers of an E select one of its two rotations.
     """
     report = run_pairs([true.pair for scene in scenes for true in scene.pairs], assembly, session, root=root)
     prior = assembly.recipe.focal is not None
-    made = {  # if E is sought at known focal lengths, there is no MAGSAC alone
+    made = {  # E at known focal lengths has no step of MAGSAC alone
         Step.MAGSAC: not prior or any(record.magsac_fundamental is not None for record in report.records),
         Step.PRIOR: prior,
         Step.SCENE: any(record.scene is not None for record in report.records),
@@ -180,13 +179,13 @@ def error_of(
 def score_submission(submission: Path, truth: Path, scenes: Sequence[TrainScene]) -> Validation:
     """Score a submission whose samples are known pairs of a train side.
 
-    ``truth`` is a table ``sample_id,scene,image_1_id,image_2_id``, the images named as in the train side.
-    Samples that the table or the scenes lack are left out; those that the submission lacks count as failed.
-    Raises :class:`UserError` for files that cannot be read.
+    ``truth`` is a table ``sample_id,scene,image_1_id,image_2_id``, with the image names of the train side.
+    Samples missing from the table or the scenes are left out; samples missing from the submission count as failed.
+    Raises :class:`UserError` for unreadable files.
     """
     found = read_submission(submission)
     columns = ("sample_id", "scene", "image_1_id", "image_2_id")
-    # The sample and its F by the id that the pair has in the train side, in either order.
+    # The sample and its F by the pair's id in the train side, in either order.
     known: dict[str, tuple[str, Matrix3 | None]] = {}
     for _, (sample, scene, first, second) in read_rows(truth, columns):
         F = found.get(sample)
@@ -207,10 +206,10 @@ def score_submission(submission: Path, truth: Path, scenes: Sequence[TrainScene]
 
 
 def score_table(validation: Validation) -> list[str]:
-    """Lines: a row for each scene and their mean; a dash for unknown figures.
+    """Return a row for each scene and a row of their mean, with a dash for unknown figures.
 
-    The columns are the mAA, after each step if there are several, and the pose AUC after the last. Lists of pairs
-    also have precision and matching score.
+    The columns are the mAA, after each of several steps, and the pose AUC after the last. Lists of pairs also have
+    precision and matching score.
     """
     several, is_list = len(validation.steps) > 1, not all(scene.in_metres for scene in validation.scenes)
     heads = [*(validation.steps if several else ["mAA"]), *(f"AUC {angle:.0f}" for angle in AUC_THRESHOLDS)]
@@ -226,7 +225,7 @@ def score_table(validation: Validation) -> list[str]:
 
 
 def missing_rows(validation: Validation) -> list[str]:
-    """A line that names the samples without a row, if there are any."""
+    """Return a line with the names of samples without a row, if any."""
     missing = validation.missing
     if not missing:
         return []
@@ -235,7 +234,7 @@ def missing_rows(validation: Validation) -> list[str]:
 
 
 def to_json(validation: Validation) -> dict[str, Any]:
-    """All figures of a validation as JSON values: overall, per scene, per pair; what is not finite is null."""
+    """Return all figures as JSON values: overall, per scene and per pair; null for non-finite numbers."""
     steps, report = validation.steps, validation.report
     return {
         "recipe": validation.recipe,

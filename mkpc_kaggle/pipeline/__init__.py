@@ -1,1 +1,1 @@
-"""The two stages on a batch of pairs, and one pair at a time."""
+"""The two matching stages, on a minibatch of pairs or on one pair."""

@@ -1,4 +1,4 @@
-"""A run's parts put together: a recipe, the weights it finds, the device, the matchers."""
+"""Assembly of a run's parts: recipe, weights, device, matchers."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
@@ -23,22 +23,22 @@ from mkpc_kaggle.pipeline.stages import ENCODING_CACHE_BYTES, GivenRegions, Pipe
 from mkpc_kaggle.recipe import Mode, Recipe, Unit, load_recipe
 from mkpc_kaggle.weights import FoundFile, State, WeightStore
 
-CACHE_SHARE = 0.25  # of a GPU's free memory, for the encodings that all workers on it keep
-CUDA_MINIBATCH = 8  # pairs at a time; on a CPU more than one only costs memory
+CACHE_SHARE = 0.25  # of a GPU's free memory, for the cached encodings of all workers on it
+CUDA_MINIBATCH = 8  # pairs at a time; on a CPU more than one only takes memory
 
 
 @dataclass(frozen=True)
 class Assembly:
-    """All that a worker needs to build its pipeline."""
+    """The values from which a worker builds its pipeline."""
 
     recipe: Recipe
     weights: WeightStore
     placement: Placement
-    left_out: tuple[str, ...] = ()  # matchers that the recipe names and that do not run, by cause, for the user
-    matchers: Mapping[str, Matcher[Any]] = field(default_factory=dict)  # ready matchers of the user's own
-    device: str = AUTO  # as the user asked for it
+    left_out: tuple[str, ...] = ()  # the recipe's matchers that do not run, by cause, for messages
+    matchers: Mapping[str, Matcher[Any]] = field(default_factory=dict)  # the user's ready matchers
+    device: str = AUTO  # as the user named it
     sharing: int = 1  # workers on the placement's device
-    regions: GivenRegions = field(default_factory=dict)  # in MKPC's place
+    regions: GivenRegions = field(default_factory=dict)  # instead of MKPC's
 
     @property
     def devices(self) -> tuple[str, ...]:
@@ -50,14 +50,14 @@ class Assembly:
         return CUDA_MINIBATCH if self.placement.device.startswith("cuda") else 1
 
     def on(self, device: str, sharing: int = 1) -> "Assembly":
-        """A copy for one device that ``sharing`` workers use."""
+        """Return a copy for one device that ``sharing`` workers use."""
         return replace(self, placement=replace(self.placement, device=device), sharing=sharing)
 
     def on_cpu(self) -> "Assembly":
         return replace(self, placement=Placement(), sharing=1)
 
     def pipeline(self) -> Pipeline:
-        """A pipeline whose matchers are loaded when they are first needed.
+        """Return a pipeline that loads each matcher on first use.
 
         Raises :class:`mkpc_kaggle.pipeline.failures.DeviceError` if the device cannot compute.
         """
@@ -79,7 +79,7 @@ class Assembly:
         )
 
     def unit_settings(self, unit: Unit) -> dict[str, Any]:
-        """Return all that decides the points of a unit on given views, as JSON values."""
+        """Return all settings that determine a unit's points on given views, as JSON values."""
         name = unit.matcher
         slots = slots_of(self.recipe.only(lambda each: each.matcher == name), self.matchers)
         return {
@@ -95,7 +95,7 @@ class Assembly:
 
     @cached_property
     def weight_files(self) -> dict[str, FoundFile]:
-        """The files that the matchers load, by slot."""
+        """Weight files of the matchers, by slot."""
         slots = slots_of(self.recipe, self.matchers)
         return {slot: file for slot in slots if (file := self.weights.find(slot))}
 
@@ -115,10 +115,10 @@ def assemble(
     licence: Licence = Licence.ANY,
     matchers: Mapping[str, Matcher[Any]] | None = None,
 ) -> Assembly:
-    """Everything checked before any work: recipe, options, licences, weights and their digests, device, precision.
+    """Check recipe, options, licences, weights, device and precision before any work, and return the assembly.
 
-    An unavailable matcher's fallback takes its place, or else recipe ``auto`` drops its units. ``scenes`` switches
-    the reconstruction of batches on or off; ``None``: as the recipe has it. Raises :class:`UserError`.
+    A fallback replaces an unavailable matcher; without one, recipe ``auto`` drops its units. ``scenes`` switches
+    the reconstruction of batches on or off; ``None`` follows the recipe. Raises :class:`UserError`.
     """
     require_types(recipe, device, matchers)
     own = matchers or {}
@@ -133,7 +133,7 @@ def assemble(
         if reason.kind in FAULTS:
             warn_once(f"recipe auto does without {name}: {reason}")
     for name in sorted(chosen.matchers.keys() - own.keys() - reasons.keys()):
-        options_of(chosen, name)  # those of a matcher that no unit names are checked too
+        options_of(chosen, name)  # check the options of unused matchers too
     left_out = by_kind({name: reasons[name] for name in written.matcher_names if name in reasons})
     chosen = chosen.only(lambda unit: unit.matcher not in lacking).with_scenes(scenes).in_mode(mode)
     made = Assembly(chosen, store, resolve_placement(device, precision), left_out, own, device)
@@ -145,7 +145,7 @@ def assemble(
 
 
 def require_types(recipe: object, device: object, matchers: object) -> None:
-    """Raise ``TypeError`` for what :func:`assemble` cannot take."""
+    """Raise ``TypeError`` for arguments that :func:`assemble` does not accept."""
     if not isinstance(recipe, Recipe | str):
         raise TypeError(f"a recipe is a Recipe, a name, or a path as text, not {recipe!r}")
     if not isinstance(device, str):

@@ -1,4 +1,4 @@
-"""Which matchers of a recipe cannot run here, and why: their code, their weights, the licence of these."""
+"""Availability of a recipe's matchers: their code, their weights, and the licences of the weights."""
 
 from collections.abc import Container, Iterable, Mapping
 from contextlib import suppress
@@ -20,11 +20,11 @@ PERMISSIVE_TAGS = frozenset({"Apache-2.0", "BSD-3-Clause", "MIT"})
 
 class Licence(StrEnum):
     ANY = "any"
-    PERMISSIVE = "permissive"  # those that may be used for any purpose: Apache-2.0, BSD-3-Clause, MIT
+    PERMISSIVE = "permissive"  # usable for any purpose: Apache-2.0, BSD-3-Clause, MIT
 
 
 class UnavailableKind(StrEnum):
-    """The kinds of reasons, as a summary tells them."""
+    """Kinds of reasons, as a summary states them."""
 
     NOT_IMPORTABLE = "cannot be used here"
     NOT_PERMITTED = "weights not permitted"
@@ -32,12 +32,12 @@ class UnavailableKind(StrEnum):
     UNREADABLE = "weights cannot be loaded"
 
 
-FAULTS = (UnavailableKind.NOT_IMPORTABLE, UnavailableKind.UNREADABLE)  # the others are a user's choices
+FAULTS = (UnavailableKind.NOT_IMPORTABLE, UnavailableKind.UNREADABLE)  # the other kinds are the user's choices
 
 
 @dataclass(frozen=True)
 class UnavailableReason:
-    """Why a matcher is unavailable; ``detail`` are the error, the licences, or the files that would do."""
+    """Reason why a matcher is unavailable; ``detail`` is the error, the licences, or the missing files."""
 
     kind: UnavailableKind
     detail: str
@@ -54,10 +54,10 @@ def unavailable(
     *,
     load: bool = False,
 ) -> dict[str, UnavailableReason]:
-    """Why matchers of the recipe, fallbacks included, cannot run here, by their names.
+    """Return the reasons why matchers of the recipe, fallbacks included, cannot run here, by name.
 
-    ``own`` are the user's ready matchers. With ``load``, weights whose digest is unknown are loaded, which shows
-    whether they are damaged. Raises :class:`UserError` for an unknown matcher or option.
+    ``own`` are the user's ready matchers. ``load`` loads weights of unknown digest to check that they are not
+    damaged. Raises :class:`UserError` for an unknown matcher or option.
     """
 
     def not_permitted(tags: Iterable[str]) -> UnavailableReason | None:
@@ -90,7 +90,7 @@ def unavailable(
 
 
 def refusal(recipe: Recipe, reasons: Mapping[str, UnavailableReason]) -> UserError:
-    """The error of a recipe that cannot do without these matchers: the first kind, and what to do about it."""
+    """Return the error for a recipe that needs these matchers: the first kind of reason, and the remedy."""
     first, kind = next((name, reason.kind) for name, reason in reasons.items())
     those = "; ".join(f"{name} ({reason.detail})" for name, reason in reasons.items() if reason.kind is kind)
     if kind is UnavailableKind.NOT_PERMITTED:
@@ -103,19 +103,19 @@ def refusal(recipe: Recipe, reasons: Mapping[str, UnavailableReason]) -> UserErr
 
 
 def by_kind(reasons: Mapping[str, UnavailableReason]) -> tuple[str, ...]:
-    """The matchers of each kind, for a summary, such as "no weights: loma, superglue"."""
+    """Return the matchers of each kind, for a summary, such as "no weights: loma, superglue"."""
     kinds = dict.fromkeys(reason.kind for reason in reasons.values())
     return tuple(f"{kind}: {', '.join(name for name in reasons if reasons[name].kind is kind)}" for kind in kinds)
 
 
 def options_of(recipe: Recipe, name: str) -> Any:
-    """The matcher's options with what the recipe's ``[matchers.NAME]`` changes."""
+    """Return the matcher's options, as changed by the recipe's ``[matchers.NAME]``."""
     where, table = f"recipe {recipe.name!r}", recipe.matchers.get(name, {})
     return from_table(spec_of(name, where).options, table, f"{where}, table [matchers.{name}]")
 
 
 def slots_of(recipe: Recipe, own: Container[str] = ()) -> tuple[str, ...]:
-    """Return the slots, each once, of the recipe's matchers that can be imported here; ``own`` ones need none."""
+    """Return the distinct slots of the recipe's importable matchers; matchers in ``own`` need none."""
     slots: list[str] = []
     for name in recipe.matcher_names:
         with suppress(UnusableError):

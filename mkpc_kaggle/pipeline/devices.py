@@ -1,4 +1,4 @@
-"""Devices: what a user's words for them mean, which GPUs there are, and whether a device computes."""
+"""Devices: parsing of their names, the available GPUs, and a test that a device computes."""
 
 import json
 import subprocess
@@ -12,9 +12,9 @@ from mkpc_kaggle.pipeline.failures import DeviceError, FailureKind, failure_of, 
 
 AUTO = "auto"
 ADVICE = "on Kaggle choose the accelerator GPU T4 x2, elsewhere try --device cpu"
-PROBE_TIMEOUT_S = 120.0  # for a process to compute something on each GPU
+PROBE_TIMEOUT_S = 120.0  # for a process that computes on each GPU
 TENSOR_CORES = (7, 0)  # the first compute capability that is faster in half precision
-# In a process of its own: a CUDA context takes some hundred MB of a GPU, and the parent of workers needs none.
+# Runs in a separate process: a CUDA context takes hundreds of MB of a GPU, and the workers' parent needs none.
 ASK_CAPABILITIES = """
 import json, torch
 gpus, errors = range(torch.cuda.device_count()), []
@@ -31,9 +31,9 @@ print(json.dumps([torch.cuda.get_device_capability(gpu) for gpu in gpus]))
 
 
 def resolve_placement(device: str, precision: str) -> Placement:
-    """The placement that the user's words mean: ``auto`` are the GPUs, "cuda", or the CPU if none computes.
+    """Return the placement for the user's words. ``auto`` means "cuda", all GPUs, or the CPU if no GPU computes.
 
-    Raises :class:`UserError` for an unknown word, and for a GPU that is not there.
+    Raises :class:`UserError` for an unknown word and for a missing GPU.
     """
     import torch
 
@@ -51,20 +51,20 @@ def resolve_placement(device: str, precision: str) -> Placement:
 
 
 def fastest_precision(device: str) -> Precision:
-    """Half precision if the device has units for it; of several GPUs, if each of them has."""
+    """Return half precision if the device, or each of several GPUs, has units for it; float32 otherwise."""
     import torch
 
     if device.startswith("cuda"):
         capabilities = gpu_capabilities()
         able = all(capabilities[gpu] >= TENSOR_CORES for gpu in gpus_of(device))
         return Precision.FLOAT16 if able else Precision.FLOAT32
-    # Older versions of PyTorch do not tell; then float32 is safe.
+    # Older versions of PyTorch do not report capabilities; then float32 is safe.
     flags: dict[str, Any] = getattr(torch.cpu, "get_capabilities", dict)()
     return Precision.BFLOAT16 if flags.get("avx512_bf16") or flags.get("amx_bf16") else Precision.FLOAT32
 
 
 def gpus_of(device: str) -> list[int]:
-    """The numbers of the GPUs that ``cuda`` or ``cuda:N`` stands for; counting them makes no context."""
+    """Return the numbers of the GPUs that ``cuda`` or ``cuda:N`` names. Counting them creates no CUDA context."""
     import torch
 
     kind, _, number = device.partition(":")
@@ -81,7 +81,7 @@ def gpus_of(device: str) -> list[int]:
 
 @cache
 def gpu_capabilities() -> list[tuple[int, int]]:
-    """The compute capability of each GPU, such as (7, 5); raises :class:`UserError` if none of them computes."""
+    """Return the compute capability of each GPU, such as (7, 5). Raise :class:`UserError` if none computes."""
     command = [sys.executable, "-c", ASK_CAPABILITIES]
     try:
         asked = subprocess.run(
@@ -97,9 +97,9 @@ def gpu_capabilities() -> list[tuple[int, int]]:
 
 
 def require_device(device: str) -> None:
-    """Multiply and convolve on a device; raises :class:`DeviceError` if that fails.
+    """Multiply and convolve on a device. Raise :class:`DeviceError` if that fails.
 
-    A GPU for which PyTorch's build or cuDNN has no kernels counts as available: only kernels that run are proof.
+    PyTorch also lists a GPU for which its build or cuDNN has no kernels. Only a kernel that runs is proof.
     """
     if device == "cpu":
         return

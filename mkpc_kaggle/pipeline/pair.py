@@ -21,16 +21,16 @@ NOT_ESTIMATED = Estimate.failed(ModelKind.F, 0, "not estimated yet")
 
 @dataclass(frozen=True, eq=False)
 class UnitResult:
-    """What a unit found on a pair, in image pixels, and what it cost."""
+    """Result of a unit on a pair: matches in image pixels, times in seconds."""
 
     unit: Unit
     matches: Matches
     encode_seconds: float = 0.0
     match_seconds: float = 0.0
     failure: str = ""  # why there are no matches
-    warm_up: bool = False  # this process ran the unit for the first time, which may take much longer
-    note: str = ""  # why the unit ran otherwise than it is written
-    keypoints: int = 0  # that its matcher detected in the first view; 0 for a matcher without a detector
+    warm_up: bool = False  # the first run of the unit in this process, which may take much longer
+    note: str = ""  # why the unit did not run as written
+    keypoints: int = 0  # detected in the first view; 0 for a matcher without a detector
 
     @property
     def seconds(self) -> float:
@@ -39,10 +39,10 @@ class UnitResult:
 
 @dataclass(frozen=True, eq=False)
 class PairMatch:
-    results: tuple[UnitResult, ...] = ()  # as the units ran; with the estimate in the recipe's order
+    results: tuple[UnitResult, ...] = ()  # in the order of the runs; with an estimate, in the recipe's order
     regions: Regions | None = None  # None until a unit of stage 2 needs them
     estimate: Estimate = NOT_ESTIMATED
-    images: tuple[Image, ...] = ()  # both, while units run; later the following three are known of them
+    images: tuple[Image, ...] = ()  # both, while units run; afterwards the next three fields describe them
     sizes: tuple[Size, ...] = ()
     versions: tuple[str, ...] = ()
     focals: tuple[float, ...] = ()
@@ -53,7 +53,7 @@ class PairMatch:
 
     @property
     def matches(self) -> Matches:
-        """Those of all units; ``estimate.inliers`` is a mask over them."""
+        """The matches of all units; ``estimate.inliers`` is a mask over them."""
         return Matches.concatenate(result.matches for result in self.results)
 
     @property
@@ -64,7 +64,7 @@ class PairMatch:
         return any(result.unit == unit for result in self.results)
 
     def in_stage(self, stage: int) -> NDArray[np.bool_]:
-        """(N,) mask: which of ``matches`` the units of that stage found."""
+        """Return the (N,) mask of the ``matches`` that units of this stage found."""
         chosen = [result.unit.stage == stage for result in self.results]
         return np.repeat(np.array(chosen, bool), [len(result.matches) for result in self.results])
 
@@ -77,9 +77,8 @@ def with_estimate(
 ) -> PairMatch:
     """Return the pair with its two-view model from all matches.
 
-    They are in the recipe's order, on which MAGSAC's result depends.
-    The recipe's prior on focal lengths, if any, goes by the images' sizes and EXIF, unless ``intrinsics`` are
-    given.
+    The matches are in the recipe's order, because MAGSAC's result depends on the order. The recipe's focal prior,
+    if any, uses the images' sizes and EXIF, or ``intrinsics`` if given.
     """
     results = tuple(sorted(pair.results, key=lambda result: recipe.units.index(result.unit)))
     matches = Matches.concatenate(result.matches for result in results)

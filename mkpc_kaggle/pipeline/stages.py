@@ -1,6 +1,6 @@
 """The two-stage pipeline on a chunk of pairs.
 
-Stage 1 matches whole images, MKPC finds the critical region of each, stage 2 matches the crops.
+Stage 1 matches whole images, MKPC finds the critical region of each image, and stage 2 matches the crops.
 """
 
 import os
@@ -27,18 +27,18 @@ from mkpc_kaggle.recipe import Recipe, Unit
 ENCODING_CACHE_BYTES = 2 << 30
 
 GivenRegions = Mapping[tuple[str, ...], tuple[Box, Box]]  # by the names of both images
-ViewKey = tuple[str, str, View]  # matcher, image and view: what an encoding is of
+ViewKey = tuple[str, str, View]  # matcher, image and view of an encoding
 
-matched_in: set[int] = set()  # this process, if pairs have been matched in it, and those that it was forked from
+matched_in: set[int] = set()  # ids of this process and of its forked ancestors, if they matched pairs
 
 
 class Pipeline:
-    """A recipe's units, run on chunks of pairs with matchers that are loaded when first needed.
+    """Pipeline that runs a recipe's units on chunks of pairs and loads each matcher on first use.
 
-    ``load(name)`` gives a matcher, ``load_float32(name)`` the same in float32: it takes over for good if half
-    precision does not hold a matcher's numbers. Pairs are matched, and views of one shape encoded, ``minibatch``
-    at a time; fewer by a unit for which memory was short, from then on. Encodings of whole images, which come back
-    in many pairs, are kept in ``cache_bytes``. ``regions`` replace MKPC's.
+    ``load(name)`` returns a matcher, ``load_float32(name)`` its float32 version, which replaces it permanently if
+    half precision overflows. ``minibatch`` is the number of pairs to match, and of views of one shape to encode,
+    at a time; a unit that runs out of memory uses fewer from then on. Encodings of whole images are reused by many
+    pairs and cached, up to ``cache_bytes``. ``regions`` replace MKPC's.
     """
 
     def __init__(
@@ -56,23 +56,23 @@ class Pipeline:
         self._minibatches: dict[Unit, int] = {}
         self._ran: set[Unit] = set()
         self._matchers: dict[str, Matcher[Any]] = {}
-        self._notes: dict[str, str] = {}  # on matchers that run in float32 though they should not
+        self._notes: dict[str, str] = {}  # on matchers that fell back to float32
         self._encodings: ByteCache[ViewKey, Any] = ByteCache(cache_bytes)
 
     def load(self) -> None:
-        """Load all matchers of the recipe now; raises :class:`UserError` if one cannot be loaded."""
+        """Load all matchers of the recipe now. Raise :class:`UserError` if one cannot be loaded."""
         for name in self.recipe.matcher_names:
             self._matcher(name)
 
     def match(
         self, pairs: Sequence[PairMatch], units: Iterable[Unit], may_start: Callable[[Unit], bool] = lambda _: True
     ) -> list[PairMatch]:
-        """Run ``units`` on every pair that has not had them: stage 1, the critical regions, stage 2.
+        """Run ``units`` on every pair without their results: stage 1, the critical regions, stage 2.
 
-        ``may_start(unit)`` is asked before each unit on each minibatch of pairs. After an error of a matcher the
-        minibatch's pairs are run singly; a pair's error is the failure of its result. Errors of the device, and of
-        memory that does not suffice for a single pair, are raised: see :mod:`mkpc_kaggle.pipeline.failures`. In a
-        forked child, :class:`UserError`.
+        ``may_start(unit)`` is called before each unit on each minibatch; False stops the unit. After a matcher's
+        error the minibatch's pairs run singly, and the error of a pair becomes the failure of its result. Raises
+        device errors and memory errors of a single pair, see :mod:`mkpc_kaggle.pipeline.failures`, and
+        :class:`UserError` in a forked child.
         """
         require_unforked()
         pairs, units = list(pairs), list(units)
@@ -85,7 +85,7 @@ class Pipeline:
         return pairs
 
     def _run(self, unit: Unit, pairs: list[PairMatch], may_start: Callable[[Unit], bool]) -> None:
-        """Put the unit's results into the pairs."""
+        """Add the unit's results to the pairs, in place."""
         waiting = [number for number, pair in enumerate(pairs) if not pair.has(unit)]
         while waiting and may_start(unit):
             numbers = waiting[: self._minibatches.get(unit, self.minibatch)]
@@ -95,7 +95,7 @@ class Pipeline:
             waiting = waiting[len(results) :]
 
     def _run_minibatch(self, unit: Unit, pairs: list[PairMatch]) -> list[UnitResult]:
-        """The unit's result on each of the pairs; none if memory was short and fewer pairs may fit."""
+        """Return the unit's result on each pair, or an empty list to try again: in float32, or on fewer pairs."""
         try:
             return self._match(unit, pairs)
         except Exception as error:
@@ -104,22 +104,22 @@ class Pipeline:
                 return []
             if failure is FailureKind.ORDINARY and len(pairs) == 1:
                 return [UnitResult(unit, Matches.empty(), failure=reason_of(error))]
-            if failure is FailureKind.ORDINARY:  # singly, and twice where the matcher falls back to float32
+            if failure is FailureKind.ORDINARY:  # singly, and again if the matcher falls back to float32
                 alone = (self._run_minibatch(unit, [pair]) or self._run_minibatch(unit, [pair]) for pair in pairs)
                 return list(chain.from_iterable(alone))
             if failure is FailureKind.DEVICE or len(pairs) == 1:
                 error.add_note(f"in {unit.name}")
                 raise
-        # Not in the handler: until it is left, the error's traceback holds the tensors of the minibatch.
+        # Outside the handler: inside it, the error's traceback holds the tensors of the minibatch.
         if "torch" in sys.modules:
             import torch
 
-            torch.cuda.empty_cache()  # cuBLAS and cuDNN cannot use what PyTorch keeps for later
+            torch.cuda.empty_cache()  # cuBLAS and cuDNN cannot use PyTorch's cached memory
         self._minibatches[unit] = len(pairs) // 2
         return []
 
     def _fall_back_to_float32(self, name: str, error: NonFiniteError) -> bool:
-        """Whether the matcher runs in float32 from now on, and did not before."""
+        """Switch the matcher to float32. Return False if it cannot switch or has switched before."""
         if self._load_float32 is None or name in self._notes:
             return False
         self._notes[name] = f"{name} runs in float32, for in half precision {error}"
@@ -154,7 +154,7 @@ class Pipeline:
         ]
 
     def _encode(self, unit: Unit, wanted: Sequence[tuple[Image, View]]) -> list[Any]:
-        """The encodings of views by the unit's matcher, from the cache or made now, one shape at a time."""
+        """Return the encodings of views by the unit's matcher, cached or computed, one shape at a time."""
         matcher = self._matcher(unit.matcher)
         is_gray = matcher.spec.colour is Colour.GRAY
         keys = [(unit.matcher, image.name, view) for image, view in wanted]
@@ -171,7 +171,7 @@ class Pipeline:
                 check_finite(f"features of {unit.matcher}", list(encodings))
                 known |= zip(part, encodings, strict=True)
         for key, image in missing.items():
-            if key[2].crop == Box.whole(image.size):  # a crop is one pair's own: no other will ask for it
+            if key[2].crop == Box.whole(image.size):  # only one pair uses a crop
                 self._encodings.put(key, known[key], encoding_bytes(known[key]))
         return [known[key] for key in keys]
 
@@ -184,7 +184,7 @@ class Pipeline:
 def require_unforked() -> None:
     """Raise :class:`UserError` in a child that was forked after its parent had matched.
 
-    The threads of PyTorch and OpenCV are not there, and would be waited for: by a new matcher, too.
+    A forked child has no threads of PyTorch and OpenCV, but waits for them, even with a new matcher.
     """
     matched_in.add(os.getpid())
     if len(matched_in) > 1:
@@ -195,7 +195,7 @@ def require_unforked() -> None:
 
 
 def views_of(unit: Unit, multiple: int, pair: PairMatch) -> tuple[View, View]:
-    """Return the unit's views of both images: of all pixels in stage 1, of the critical regions in stage 2."""
+    """Return the unit's views of both images: whole images in stage 1, critical regions in stage 2."""
     crops = [region.box for region in pair.regions or ()] if unit.stage == 2 else []
     boxes = crops or [Box.whole(image.size) for image in pair.images]
     first, second = (unit.view(box, multiple, im.turns) for box, im in zip(boxes, pair.images, strict=True))

@@ -1,4 +1,4 @@
-"""The Python API: two images in, their matches and two-view model out."""
+"""The Python API: two images in, matches and two-view model out."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
@@ -19,14 +19,14 @@ from mkpc_kaggle.recipe import Recipe
 
 
 class TwoStageMatcher:
-    """Matches one pair at a time::
+    """Matcher of one pair at a time::
 
         match = TwoStageMatcher("classical")("a.jpg", "b.jpg")
         F, points0 = match.estimate.matrix, match.inliers.points0
 
-    ``recipe`` is a :class:`Recipe`, a recipe's name, or a path to a TOML file; ``weights`` are directories to
-    search; with ``licence`` "permissive" weights that forbid some uses are refused; ``matchers`` are your own, by
-    the names that the recipe's units have. Raises :class:`UserError` for what is unknown or missing.
+    ``recipe`` is a :class:`Recipe`, a recipe's name, or a path to a TOML file. ``weights`` are directories to
+    search. The ``licence`` "permissive" refuses weights that forbid some uses. ``matchers`` are your own, by their
+    names in the recipe's units. Raises :class:`UserError` for an unknown name and for missing weights.
     """
 
     def __init__(
@@ -56,11 +56,12 @@ class TwoStageMatcher:
     ) -> PairMatch:
         """Match two images: paths, or arrays (H, W, 3) RGB or (H, W) gray, uint8.
 
-        ``model`` E needs ``intrinsics``, the camera matrices in pixels; without them ``ValueError`` is raised.
-        ``regions`` replace MKPC's boxes; units of stage 2 fail if a box leaves its image. Points, boxes and F are
-        in pixels of the stored files: EXIF only sets the views upright. Raises :class:`UserError` for an image
-        that cannot be read. A pair that cannot be matched is a result with ``estimate.failure``. Errors of memory
-        and of the device are raised as they are.
+        ``model`` E needs ``intrinsics``, the camera matrices in pixels. ``regions`` replace MKPC's boxes; units of
+        stage 2 fail if a box leaves its image. Points, boxes and F are in pixels of the stored files: EXIF only
+        sets the views upright. A pair without an estimate has ``estimate.failure``.
+
+        Raises ``ValueError`` for model E without intrinsics and :class:`UserError` for an unreadable image. Memory
+        and device errors are not caught.
         """
         if ModelKind(model) is ModelKind.E and intrinsics is None:
             raise ValueError("model E needs intrinsics=(K0, K1), the camera matrices of both images in pixels")
@@ -71,7 +72,7 @@ class TwoStageMatcher:
 
 
 def to_image(source: str | Path | Pixels | Image) -> Image:
-    """An image from a path or an array; raises :class:`UserError` if it cannot be read."""
+    """Return the image of a path or an array. Raise :class:`UserError` for an unreadable file."""
     if isinstance(source, Image):
         return source
     if isinstance(source, np.ndarray):
@@ -79,5 +80,5 @@ def to_image(source: str | Path | Pixels | Image) -> Image:
     image = read_image(Path(source))
     if isinstance(image, Unreadable):
         raise UserError(str(image))
-    # Named by its content: a file may change between two calls.
+    # Named by content, since a file may change between two calls.
     return replace(Image.of_array(image.pixels), focal=image.focal, turns=image.turns)

@@ -1,1 +1,1 @@
-"""Folders of images in, cameras out: which pairs are matched, and the files that come of them."""
+"""Reconstruction of a folder of images: choice of pairs, cameras, output files."""

@@ -24,7 +24,7 @@ from mkpc_kaggle.reconstruction.likeness import (
     shortlist,
 )
 
-MAX_IMAGES = 100  # of which all pairs are matched; above, each image has a shortlist
+MAX_IMAGES = 100  # with more, each image has a shortlist instead of all pairs
 TRIAL_SHARE = 0.25  # of the time left, for trials of each kind of orientation
 
 

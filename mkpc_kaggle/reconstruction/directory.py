@@ -1,4 +1,4 @@
-"""The output directory of ``reconstruct``: files that a run may write, replace and remove."""
+"""The output directory of ``reconstruct``: rules for writing, replacing and removing its files."""
 
 import json
 import os
@@ -17,17 +17,17 @@ from mkpc_kaggle.scene.export import DATABASE, MODEL_FILES, MODELS, PART
 
 WORK, TABLES = "work", ("cameras.csv", "submission.csv", "report.html")
 RESERVED = {DATABASE, MODELS, WORK, *TABLES}  # names that no dataset may have
-MARK = f"{WORK}/results.json"  # the digest of each result by its path; "" if the run that made it did not end
+MARK = f"{WORK}/results.json"  # digests of results by path; "" if their run did not end
 MODEL_FILE = re.compile(rf"\d+(/({'|'.join(map(re.escape, MODEL_FILES))}))?")
 
 
 @contextmanager
 def output_directory(out: Path, datasets: Iterable[str], form: str | None = None) -> Iterator[None]:
-    """Reserve ``out`` for a run's results; at its end, remove results that only earlier runs made.
+    """Reserve ``out`` for a run's results. At the end, remove results that only earlier runs made.
 
-    With a ``form``, ``submission.csv`` is a result. A result that was changed since a run made it is not removed.
-    Raise :class:`UserError` for a directory that is neither empty nor marked by a run, and for a link or another
-    file in the place of a result.
+    With a ``form``, ``submission.csv`` is a result. A result that was changed after its run is not removed. Raise
+    :class:`UserError` for a directory that is neither empty nor marked by a run, and for a link or another file at
+    the path of a result.
     """
     results = [name for name in TABLES if form or name != "submission.csv"]
     results += [str(PurePosixPath(name, each)) for name in datasets for each in (DATABASE, MODELS)]
@@ -52,7 +52,7 @@ def output_directory(out: Path, datasets: Iterable[str], form: str | None = None
 
 
 def _read_mark(out: Path) -> dict[str, str] | None:
-    """Return the digests of the results of earlier runs, ``None`` if no run has marked the directory."""
+    """Return the digests of earlier results, or ``None`` if no run has marked the directory."""
     with suppress(OSError, ValueError, AttributeError, RecursionError):
         if _is_inside(out, MARK):
             known = json.loads((out / MARK).read_text()).items()
@@ -67,7 +67,7 @@ def _write_mark(out: Path, known: Mapping[str, str]) -> None:
 
 
 def _in_the_way(out: Path, results: Iterable[str], marked: Mapping[str, str] | None) -> Iterator[Path]:
-    """Yield links and files of the user's in the places of results; in an unmarked directory, all of them."""
+    """Yield the user's links and files at the paths of results, or all of them in an unmarked directory."""
     if marked is None:
         yield from (path for path in out.rglob("[!.]*") if path.is_symlink() or not path.is_dir())
     for name in results:
@@ -82,7 +82,7 @@ def _in_the_way(out: Path, results: Iterable[str], marked: Mapping[str, str] | N
 
 
 def _is_inside(out: Path, name: str) -> bool:
-    """Return whether a path lies in ``out``, and no link on its way."""
+    """Return whether a path lies in ``out`` and no part of it is a link."""
     root = Path(os.path.realpath(out))
     path = root / name
     return path.is_relative_to(root) and os.path.realpath(path) == str(path) and not path.is_symlink()
@@ -102,6 +102,6 @@ def _digest(path: Path) -> str:
 def _remove(path: Path) -> None:
     shutil.rmtree(path) if path.is_dir() else path.unlink()
     for folder in path.parents:
-        with suppress(OSError):  # until it is not empty
+        with suppress(OSError):  # stop at a non-empty folder
             folder.rmdir()
     warn(f"{path} was removed: an earlier run made it, and this run does not")

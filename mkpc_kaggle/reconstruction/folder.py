@@ -1,4 +1,4 @@
-"""A folder of images: its datasets, and a list of pairs of them."""
+"""A folder of images: its datasets, and lists of their pairs."""
 
 import os
 import re
@@ -11,15 +11,15 @@ from mkpc_kaggle.engine.console import warn
 from mkpc_kaggle.errors import UserError, read_text
 from mkpc_kaggle.reconstruction.directory import RESERVED
 
-Datasets = Mapping[str, Sequence[Path]]  # images that belong together, by their folder's name below the root
+Datasets = Mapping[str, Sequence[Path]]  # images of one folder, by its path below the root
 Ends = tuple[Path, Path]
 
 
 def read_folder(root: Path) -> Datasets:
-    """The datasets of a folder: each folder in it, and itself, ".", that has images; all in order of names.
+    """Return the datasets of a folder, sorted by name: itself, ".", and each folder below it, if it has images.
 
-    What is hidden is passed over, with a line. Raises :class:`UserError` where there are no two images to match,
-    for two images of one stem, and for names that files of results cannot have.
+    Hidden files and folders are skipped with a warning. Raises :class:`UserError` if no dataset has two images,
+    for two images of one stem, and for names that cannot be used in result files.
     """
     if not root.is_dir():
         raise UserError(f"{root}: no such directory; name a folder of images, or of folders of images")
@@ -28,7 +28,7 @@ def read_folder(root: Path) -> Datasets:
         folder, images = Path(place), sorted(filter(_is_image, names))
         hidden += [folder / name for name in (*folders, *images) if name.startswith(".")]
         inner = [folder / name for name in sorted(folders) if not name.startswith(".")]
-        folders[:] = [each.name for each in inner if each.resolve() not in seen]  # links may go round
+        folders[:] = [each.name for each in inner if each.resolve() not in seen]  # links may form a cycle
         seen.update(each.resolve() for each in inner)
         files = [folder / name for name in images if not name.startswith(".")]
         if files:
@@ -45,7 +45,7 @@ def read_folder(root: Path) -> Datasets:
 
 
 def root_of(datasets: Datasets) -> Path:
-    """Return the folder that :func:`read_folder` has read."""
+    """Return the root folder of datasets of :func:`read_folder`."""
     name, files = next(iter(datasets.items()))
     folder = files[0].parent
     return folder if name == "." else folder.parents[len(Path(name).parts) - 1]
@@ -56,7 +56,7 @@ def _is_image(name: str) -> bool:
 
 
 def _require_usable(folder: Path, root: Path, files: Sequence[Path]) -> None:
-    """Refuse a dataset whose names, or those of its images, cannot stand in tables and databases."""
+    """Raise :class:`UserError` if a name of the dataset or its images does not fit into tables and databases."""
     parts = folder.relative_to(root).parts or (root.resolve().name,)
     for name in (*parts, *(path.name for path in files)):
         if CONTROL.search(name) or printable(name) != name:
@@ -74,7 +74,7 @@ def _refuse_unreadable(error: OSError) -> None:
 
 
 def read_pair_list(path: Path, root: Path, datasets: Datasets) -> list[Ends]:
-    """The pairs of a list: a line each, two images by their paths below ``root``, as of hloc.
+    """Return the pairs of a list in hloc's format: one line per pair, two image paths below ``root``.
 
     Raises :class:`UserError` for a line that does not name two images of one dataset.
     """

@@ -1,7 +1,7 @@
-"""Which images look alike, by a VLAD of RootSIFT: the pairs of a large folder, and the partners of each image.
+"""Similarity of images by a VLAD of RootSIFT: the pairs of a large folder, and the partners of each image.
 
-RootSIFT whatever the recipe is: it needs no weights, is there for dense matchers, too, and does not care how an
-image is turned. Source: Jegou et al. 2010; normalisation by Arandjelovic and Zisserman 2013.
+All recipes use RootSIFT: it needs no weights, works with dense matchers, and does not depend on the orientation of
+an image. Source: Jegou et al. 2010; normalisation by Arandjelovic and Zisserman 2013.
 """
 
 import json
@@ -18,24 +18,24 @@ from mkpc_kaggle.data.images import Image, read_image
 from mkpc_kaggle.engine.journal_reader import JournalReader
 from mkpc_kaggle.matchers.adapters.sift import root_sift
 
-Partners = list[list[int]]  # of each image, by the places of the images
+Partners = list[list[int]]  # of each image, by the indices of the images
 
 PARTNERS = 20  # of an image
 WORDS = 64
 SIDE_PX = 640
 FEATURES = 1000  # descriptors of an image
-MAX_TRAINING = 50_000  # descriptors that the words are made of
-FEATURE_SETTINGS = f"rootsift {SIDE_PX} {FEATURES} 1"  # with the number of the algorithm
+MAX_TRAINING = 50_000  # descriptors for the words
+FEATURE_SETTINGS = f"rootsift {SIDE_PX} {FEATURES} 1"  # ends with the version of the algorithm
 SCALE = np.float32(255)  # of descriptors as bytes
 
 
 def shortlist(partners: Partners) -> list[tuple[int, int]]:
-    """The pairs of each image with its partners, the smaller place first, in order."""
+    """Return the sorted pairs of each image with its partners, the smaller index first."""
     return sorted({(min(i, j), max(i, j)) for i, others in enumerate(partners) for j in others})
 
 
 def local_features(path: Path) -> bytes:
-    """RootSIFT descriptors of an image, 128 bytes each; none if it cannot be read."""
+    """Return the RootSIFT descriptors of an image, 128 bytes each; empty if it cannot be read."""
     image, found = read_image(path), None
     if isinstance(image, Image):
         scale = SIDE_PX / max(image.size)
@@ -45,9 +45,9 @@ def local_features(path: Path) -> bytes:
 
 
 def most_alike(features: Callable[[], Iterable[bytes]], count: int) -> list[list[int]]:
-    """For each image the places of the ``count`` others most like it, by their :func:`local_features`.
+    """Return for each image the indices of the ``count`` most similar images, by their :func:`local_features`.
 
-    These are asked for twice, so that they need not be in memory. An image without any is like no other.
+    ``features`` is called several times, so that it can stream. An image without features is similar to none.
     """
     share = MAX_TRAINING // max(1, sum(1 for _ in features()))
     training = np.concatenate(
@@ -56,7 +56,7 @@ def most_alike(features: Callable[[], Iterable[bytes]], count: int) -> list[list
     words = training[:: max(1, len(training) // WORDS)][:WORDS]
     if len(words):
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # a word that nothing is near to any more
+            warnings.simplefilter("ignore")  # a word without descriptors
             words, _ = kmeans2(training, words, iter=10, minit="matrix")
     table = np.stack([vlad(found, words) for found in map(_unpacked, features())])
     similarity = table @ table.T
@@ -66,7 +66,7 @@ def most_alike(features: Callable[[], Iterable[bytes]], count: int) -> list[list
 
 
 def compare(directory: Path, digests: Sequence[str], count: int) -> bytes:
-    """Return :func:`most_alike` as JSON, from the features that a journal has of images with these digests."""
+    """Return :func:`most_alike` as JSON, from a journal's features of images with these digests."""
     with JournalReader(directory, check=False) as journal:
 
         def features() -> Iterable[bytes]:
@@ -76,12 +76,12 @@ def compare(directory: Path, digests: Sequence[str], count: int) -> bytes:
 
 
 def _unpacked(features: bytes) -> NDArray[np.float32]:
-    """(K, 128) descriptors."""
+    """Return the (K, 128) descriptors."""
     return np.frombuffer(features, np.uint8).reshape(-1, 128).astype(np.float32) / SCALE
 
 
 def vlad(descriptors: NDArray[np.float32], words: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(K, D) descriptors and (W, D) words -> (W * D,) of unit length, or zero without descriptors."""
+    """Return the VLAD, (W * D,) of unit length, of descriptors, (K, D), by words, (W, D); zero without any."""
     sums = np.zeros_like(words)
     if len(descriptors):
         nearest, _ = vq(descriptors, words)

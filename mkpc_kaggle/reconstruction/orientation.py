@@ -1,4 +1,4 @@
-"""Images that lie on a side: each is matched, turned, with the few that are most like it."""
+"""Orientation of images, found by matching each image in four rotations with its most similar images."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -6,36 +6,36 @@ from pathlib import Path
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.reconstruction.likeness import Partners
 
-TURN_PARTNERS = 4  # with which an image is matched to see how it lies
-MANY_INLIERS = 100  # with one of them: the image is the right way up
-MIN_INLIERS = 30  # of an image that is turned
-MIN_GAIN = 2.0  # times the inliers that it has as it is
+TURN_PARTNERS = 4  # per image, to find its orientation
+MANY_INLIERS = 100  # with one partner: the image is upright
+MIN_INLIERS = 30  # of a turned image
+MIN_GAIN = 2.0  # of inliers, relative to the unturned image
 
-Key = tuple[int, int, int]  # image i turned by so many quarters, and image j > i as it is
+Key = tuple[int, int, int]  # image i, its quarter turns, and the unturned image j > i
 Inliers = Mapping[Key, int]
 
 
 def relative(i: int, times: int, j: int) -> Key:
-    """The key of image i turned by ``times`` quarters and image j as it is."""
+    """Return the key of image i turned by ``times`` quarters and the unturned image j."""
     return (i, times % 4, j) if i < j else (j, -times % 4, i)
 
 
 def upright_keys(partners: Partners, _: Inliers) -> list[Key]:
-    """Every image with its partners, as they are."""
+    """Return the keys of every unturned image with its partners."""
     return sorted({relative(i, 0, j) for i, others in enumerate(partners) for j in others})
 
 
 def turned_keys(partners: Partners, found: Inliers) -> list[Key]:
-    """The other three orientations of images that have few inliers with all of their partners."""
+    """Return the keys of the other three orientations, for images with few inliers with all partners."""
     few = [i for i, others in enumerate(partners) if _best(i, 0, others, found) < MANY_INLIERS]
     return sorted({relative(i, times, j) for i in few for times in (1, 2, 3) for j in partners[i]})
 
 
 def turns_of(partners: Partners, found: Inliers) -> list[int]:
-    """By how many quarters, counter-clockwise, each image has to be turned.
+    """Return the counter-clockwise quarter turns that set each image upright.
 
-    An image that has few inliers as it is takes the best of the other three orientations if it gains enough; the
-    turns of images before it count.
+    An image with few inliers takes the best of the other three orientations if it gains enough, relative to the
+    turns of earlier images.
     """
     turns = [0] * len(partners)
     for i, others in enumerate(partners):

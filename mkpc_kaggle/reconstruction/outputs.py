@@ -1,4 +1,4 @@
-"""Tables of cameras: ours, and those that the Image Matching Challenges of 2023 to 2025 ask for."""
+"""Tables of cameras: ``cameras.csv``, and submissions to the Image Matching Challenges of 2023 to 2025."""
 
 import csv
 from collections.abc import Iterator, Mapping, Sequence
@@ -10,18 +10,18 @@ from numpy.typing import NDArray
 from mkpc_kaggle.data.outputs import replacing
 from mkpc_kaggle.engine.records import CameraRecord
 
-Cameras = Mapping[str, Mapping[Path, CameraRecord | None]]  # of each file of a dataset, None without a camera
+Cameras = Mapping[str, Mapping[Path, CameraRecord | None]]  # of each file of a dataset; None without a camera
 
 NO_POSE = ";".join(["nan"] * 9), "nan;nan;nan"
 ORIGIN = "1;0;0;0;1;0;0;0;1", "0;0;0"
 FORMS = (  # of a submission
     "imc2025",  # a cluster for each model; an image without a camera is an outlier, its pose nan
-    "imc2023",  # also of 2024: the cameras of the largest model, the other images at the origin
+    "imc2023",  # also for 2024: the cameras of the largest model; other images are at the origin
 )
 
 
 def write_tables(out: Path, cameras: Cameras, root: Path, form: str | None) -> None:
-    """Write ``cameras.csv`` and, in one of ``FORMS``, ``submission.csv``; raises ``OSError`` if that cannot be."""
+    """Write ``cameras.csv`` and, in one of ``FORMS``, ``submission.csv``. Raise ``OSError`` if that fails."""
     tables = {"cameras.csv": camera_rows(cameras, root)}
     if form is not None:
         tables["submission.csv"] = submission_rows(form, cameras, root)
@@ -31,7 +31,7 @@ def write_tables(out: Path, cameras: Cameras, root: Path, form: str | None) -> N
 
 
 def camera_rows(cameras: Cameras, root: Path) -> Iterator[Sequence[str]]:
-    """A row for each image with a camera: its path below the folder, its model, K, R, t, and its ``Sigmas``.
+    """Yield a row for each image with a camera: its path below the folder, its model, K, R, t, and ``Sigmas``.
 
     The centre of an image's first pixel is (0, 0); X_cam = R X + t. Unknown sigmas are empty cells.
     """
@@ -44,14 +44,14 @@ def camera_rows(cameras: Cameras, root: Path) -> Iterator[Sequence[str]]:
 
 
 def submission_rows(form: str, cameras: Cameras, root: Path) -> Iterator[Sequence[str]]:
-    """A row for each image, in the order of the folder; ids and dataset names of 2025 are made unique by ``_``."""
+    """Yield a row for each image, in the order of the folder. Make ids and names of 2025 unique by ``_``."""
     of_2025 = form == "imc2025"
     heads = ("image_id", "dataset", "scene", "image") if of_2025 else ("image_path", "dataset", "scene")
     yield *heads, "rotation_matrix", "translation_vector"
     ids, names = set[str](), set(cameras) - {"."}
     for dataset, found in cameras.items():
         folder = _unused(root.resolve().name, names) if dataset == "." else dataset
-        parts = folder.split("/")  # of 2023 dataset/scene/images, of 2024 dataset/images
+        parts = folder.split("/")  # dataset/scene/images in 2023, dataset/images in 2024
         for name, record in ((file.name, record) for file, record in found.items()):
             pose = (joined(record.camera.R), joined(record.camera.t)) if record else NO_POSE
             if of_2025:
@@ -67,7 +67,7 @@ def joined(numbers: NDArray[np.float64]) -> str:
 
 
 def _unused(name: str, used: set[str]) -> str:
-    """The name, with ``_`` after it until nothing else has it; then it is ``used``."""
+    """Append ``_`` to the name until it is unused, add it to ``used``, and return it."""
     while name in used:
         name += "_"
     used.add(name)

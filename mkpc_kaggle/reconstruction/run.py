@@ -55,10 +55,10 @@ def reconstruct_folder(
 ) -> FolderResult:
     """Match the pairs of each dataset, those ``listed`` or of :func:`choose_pairs`, and reconstruct it.
 
-    COLMAP's files of a dataset are in the folder of its name in ``out``. With ``rotations``, images that match
-    nothing are turned. A scene's own process writes its files before the journal says that the scene is done, so
-    a run that was killed makes what is lacking. ``publish`` is called with the cameras that there are, at first
-    with none, and after each scene.
+    COLMAP's files of a dataset are in the folder of its name in ``out``. With ``rotations``, images without
+    matches are turned. The process of a scene writes its files before the journal records the scene, so a resumed
+    run makes the missing files. ``publish`` is called with the cameras so far: initially none, then after each
+    scene.
     """
     assembly = replace(assembly, recipe=for_cameras(assembly.recipe))
     folders, root = [files[0].parent for files in datasets.values()], str(root_of(datasets))
@@ -99,11 +99,11 @@ def reconstruct(
     device: str = "auto",
     matchers: Mapping[str, Matcher[Any]] | None = None,
 ) -> tuple[SfmModel, ...]:
-    """The models of images, given by their paths: the largest first, none where too little matches.
+    """Return the models of images, given by their paths, the largest first; none if too few match.
 
-    What the command ``reconstruct`` does, in this process and without its budget and journal. Cameras are in
-    pixels of what the files store, as COLMAP reads them. Raises :class:`UserError` for a recipe that cannot run
-    here, and for an image that cannot be read.
+    This is the command ``reconstruct`` in this process, without budget and journal. Cameras refer to the stored
+    pixels of the files, as COLMAP reads them. Raises :class:`UserError` for a recipe that cannot run here, and for
+    an unreadable image.
     """
     require_types(recipe, device, matchers)
     files = sorted(map(Path, images))

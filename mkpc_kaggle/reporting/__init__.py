@@ -1,1 +1,1 @@
-"""What a run did: summary, tables, pages, figures."""
+"""Reports of a run: summary, tables, pages, figures."""

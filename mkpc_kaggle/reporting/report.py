@@ -1,6 +1,6 @@
-"""``report.html``: one page about a run, made from its journal; it needs no other file.
+"""``report.html``: one self-contained page about a run, from its journal.
 
-Drawings need matplotlib, pictures of pairs the images; if something is lacking, the page says so.
+Drawings need matplotlib, and pictures of pairs need the images. The page states why drawings are missing.
 """
 
 import base64
@@ -33,18 +33,18 @@ from mkpc_kaggle.reporting.tables import seconds_by_part, unit_means, unit_reaso
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-WRITING_S, WRITING_S_PER_PAIR = 0.6, 0.0002  # what a page without drawings takes
-DRAWING_S = 5.0  # drawings are not begun with less time left
-MAX_ROWS = 100  # of a table; the exports of the journal command have all
-MAX_SCENES, MAX_MODELS = 12, 8  # drawn, and of a scene
+WRITING_S, WRITING_S_PER_PAIR = 0.6, 0.0002  # time for a page without drawings
+DRAWING_S = 5.0  # drawings start only with more time left
+MAX_ROWS = 100  # of a table; the journal command exports all rows
+MAX_SCENES, MAX_MODELS = 12, 8  # drawn scenes, and drawn models of a scene
 
 
 def report_run(work_dir: Path, path: Path, ends: float, pairs: Sequence[Pair] = ()) -> str:
-    """Write the report of a run that has just ended; the line that says so, or why there is none.
+    """Write the report of a run that has just ended. Return a line with its path, or the reason for no report.
 
-    The page is written without drawings first, so that a page is there if the program is ended while it draws.
-    ``ends`` is when the program must have ended, in seconds of the monotonic clock; ``pairs`` are the run's, to
-    be drawn. Never raises: a report must not cost a run that went well its exit status.
+    The page is first written without drawings, so that it exists even if the program ends while drawing. ``ends``
+    is the end of the program's time, in seconds of the monotonic clock; ``pairs`` are the run's, to be drawn.
+    Never raises: a failed report must not change the exit status of a successful run.
     """
     later = f"python -m mkpc_kaggle journal {work_dir} --report {path}"
     left = ends - time.monotonic()
@@ -61,7 +61,7 @@ def report_run(work_dir: Path, path: Path, ends: float, pairs: Sequence[Pair] = 
 
 
 def write_report(log: RunLog, path: Path, pairs: Sequence[Pair] = (), *, undrawn: str = "") -> None:
-    """Write the page of :func:`report_page`; raises :class:`UserError` if ``path`` cannot be written."""
+    """Write the page of :func:`report_page`. Raise :class:`UserError` if ``path`` cannot be written."""
     text = report_page(log, pairs, undrawn=undrawn)
     with writing(f"the report {path}"):
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -70,9 +70,9 @@ def write_report(log: RunLog, path: Path, pairs: Sequence[Pair] = (), *, undrawn
 
 
 def report_page(log: RunLog, pairs: Sequence[Pair] = (), *, undrawn: str = "") -> str:
-    """The whole document; the template escapes all text that comes from files.
+    """Return the HTML document. The template escapes all text from files.
 
-    ``pairs`` have the paths of the images of the pairs to be drawn; ``undrawn`` says why nothing is drawn.
+    ``pairs`` have the image paths of the pairs to be drawn; ``undrawn`` is the reason for a page without drawings.
     """
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
@@ -107,7 +107,7 @@ def report_page(log: RunLog, pairs: Sequence[Pair] = (), *, undrawn: str = "") -
 
 
 def _facts(log: RunLog) -> Iterator[tuple[str, str, str]]:
-    """What a reader wants to know first: name, value, remark."""
+    """Yield the most important facts: name, value, remark."""
     solved, sources = log.tables.solved, log.tables.pairs["source"].value_counts()
     parts = (("scene", "from scenes"), ("pair", "from their own matches"), ("fallback", "fallback"))
     from_where = ", ".join(f"{sources[source]} {what}" for source, what in parts if source in sources)
@@ -135,7 +135,7 @@ def _events(log: RunLog, kind: EventKind) -> pd.DataFrame:
 
 
 def _failures(log: RunLog) -> list[pd.DataFrame]:
-    """How often which reason left a pair without an F, where pairs share a reason; and the pairs."""
+    """Return a table of reasons for pairs without an F, if pairs share reasons, and a table of these pairs."""
     failed = log.tables.failed[["id", "group", "failure"]]
     counts = failed["failure"].value_counts()
     reasons = pd.DataFrame({"pairs with the fallback row": counts, "reason": counts.index})
@@ -144,7 +144,7 @@ def _failures(log: RunLog) -> list[pd.DataFrame]:
 
 
 def _weak(log: RunLog, weak: WeakPair, sources: dict[str, Pair]) -> tuple[str, str, str]:
-    """What the page says of a weak pair: its picture, empty if it is not drawn; counts and remarks; id."""
+    """Return a weak pair's picture, empty if it is not drawn, its counts and remarks, and its id."""
     record, pair, picture = weak.record, log.pairs[weak.record.index], ""
     match = weak.match(log.recipe.magsac.threshold)
     parts = [f"{record.inliers} inliers of {record.matches} matches", record.failure]
@@ -160,9 +160,9 @@ def _weak(log: RunLog, weak: WeakPair, sources: dict[str, Pair]) -> tuple[str, s
 
 
 def weak_figure(log: RunLog, weak: WeakPair, source: Pair) -> "Figure":
-    """Matches, clusters and critical regions of a weak pair, as the journal has them.
+    """Draw the matches, clusters and critical regions of a weak pair, from the journal.
 
-    ``source`` is the pair with the paths of its images; raises :class:`UserError` if an image cannot be read.
+    ``source`` is the pair with its image paths. Raises :class:`UserError` for an unreadable image.
     """
     return draw_pair(*_images(source), weak.match(log.recipe.magsac.threshold), log.recipe.mkpc)
 
@@ -173,7 +173,7 @@ def _images(pair: Pair) -> tuple[Image, Image]:
 
 
 def _scenes(log: RunLog) -> list[pd.DataFrame]:
-    """The batches that were reconstructed; which F the pairs have, and why."""
+    """Return a table of reconstructed batches, and a table of the reasons for the pairs' F."""
     pairs = log.tables.pairs
     counts = pairs[pairs["source"] == "scene"].groupby("group").size()
     rows = [
@@ -206,7 +206,7 @@ def _costs(log: RunLog) -> list[pd.DataFrame]:
 
 
 def budget_figure(log: RunLog) -> "Figure":
-    """The jobs that ended over the time of the last session; see :func:`draw_budget`."""
+    """Draw the ended jobs over the time of the last session, see :func:`draw_budget`."""
     ended: dict[str, list[float]] = {}
     for event in log.session:
         if event.kind == EventKind.JOB:

@@ -1,4 +1,4 @@
-"""What a journal says of a run: read at one moment, kept as a value, exported to files."""
+"""Snapshot of a run from its journal, and its export to files."""
 
 from dataclasses import dataclass
 from functools import cached_property

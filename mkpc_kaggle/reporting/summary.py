@@ -1,4 +1,4 @@
-"""One screen of summary: what a run did, what it cost, and which pairs it could not help."""
+"""Summary of a run on one screen: results, costs, failed pairs."""
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -15,7 +15,7 @@ MAX_LINES = 8  # of each list
 
 
 def summary(pairs: Sequence[Pair], report: RunReport) -> str:
-    """The screen that ends a run."""
+    """Return the summary at the end of a run."""
     tables = run_tables(pairs, report.records)
     resumed = f", {report.resumed} of them from earlier runs" if report.resumed else ""
     done = f"; {report.units_run} units run, {report.estimated} F estimated"
@@ -25,22 +25,22 @@ def summary(pairs: Sequence[Pair], report: RunReport) -> str:
 
 
 def overview(log: RunLog) -> str:
-    """The same screen from a journal."""
+    """Return the summary of a journal."""
     about = f"recipe {log.recipe.name}, {log.about.device}, {len(log.events)} events"
     left_out = filter(None, [left_out_line(log.about.left_out)])
     return "\n".join([headline(log.tables, log), about, *left_out, *_lines(log.tables, log)])
 
 
 def headline(tables: RunTables, run: RunReport | RunLog) -> str:
-    """How the run ended, and how many pairs have an F."""
+    """Return the run's ending and the number of pairs with an F."""
     count = f"{len(tables.solved)} of {len(tables.pairs)} pairs have an F"
     return f"{run.ending} after {format_duration(run.seconds)}: {count}"
 
 
 def trouble(run: RunReport | RunLog) -> str:
-    """Why a run failed, though its file is whole; empty if it did not fail.
+    """Return why a run failed although its file is complete, or an empty string.
 
-    Pairs without an F count if an error is the reason, and not if the matches or the time did not suffice.
+    A pair without an F counts if an error is the reason, but not for too few matches or too little time.
     """
     if run.ending in (Ending.NO_WORKER, Ending.NOTHING_RUNS):
         return f"the run failed: {run.ending}, the faults say why; the same command goes on"
@@ -54,7 +54,7 @@ def trouble(run: RunReport | RunLog) -> str:
 
 
 def _error(record: PairRecord) -> str:
-    """The error that left a pair without an F, if there was an error."""
+    """Return the error that left a pair without an F, if any."""
     if record.source != "fallback":
         return ""
     if not record.units:
@@ -63,7 +63,7 @@ def _error(record: PairRecord) -> str:
 
 
 def left_out_line(left_out: Sequence[str]) -> str:
-    """Which matchers did not run, by cause, and how to get weights; empty if all ran."""
+    """Return the matchers that did not run, by cause, with advice on weights; empty if all ran."""
     if not left_out:
         return ""
     advice = " (`python -m mkpc_kaggle weights fetch --out DIR` gets weights)"
@@ -84,7 +84,7 @@ def _lines(tables: RunTables, run: RunReport | RunLog) -> list[str]:
 
 
 def _found(tables: RunTables) -> Iterator[str]:
-    """What was found on a pair, by which unit, and what it cost."""
+    """Yield inliers, critical regions and seconds per pair, and the means of each unit."""
     inliers, means = tables.solved["inliers"], unit_means(tables)
     if len(inliers):
         yield f"inliers: median {inliers.median():.0f}, mean {inliers.mean():.1f}, least {inliers.min()}"
@@ -102,7 +102,7 @@ def _found(tables: RunTables) -> Iterator[str]:
 
 
 def _scenes(tables: RunTables, scenes: Sequence[SceneRecord]) -> list[str]:
-    """How many batches and images were reconstructed, whose F is from there, and why the others were not."""
+    """Return the numbers of reconstructed batches and images and of pairs with a scene's F, and failures."""
     if not scenes:
         return []
     made = sum(scene.registered > 0 for scene in scenes)
@@ -119,13 +119,13 @@ def _scenes(tables: RunTables, scenes: Sequence[SceneRecord]) -> list[str]:
 
 
 def _names(names: Sequence[str]) -> str:
-    """The first of the batches, and how many more there are."""
+    """Return the first batches, and the number of the others."""
     more = f" and {len(names) - MAX_LINES} more batches" if len(names) > MAX_LINES else ""
     return ", ".join(names[:MAX_LINES]) + more
 
 
 def _list(title: str, items: Sequence[str], count: int | None = None) -> list[str]:
-    """The first of the items, and how many there are: ``count``, if not all of them are given."""
+    """Return the first items and their number: ``count``, if ``items`` is only a part."""
     count = len(items) if count is None else count
     if not count:
         return []

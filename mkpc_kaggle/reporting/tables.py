@@ -12,7 +12,7 @@ from mkpc_kaggle.engine.journal_reader import Event
 from mkpc_kaggle.engine.records import PairRecord, UnitRecord
 
 F_COLUMNS = tuple(f"f{row}{column}" for row in (1, 2, 3) for column in (1, 2, 3))
-SECONDS = {  # what the parts of a pair's work are called; MAGSAC runs beside the others
+SECONDS = {  # names of the parts of a pair's work; MAGSAC runs in parallel with the others
     "decode_seconds": "wait for decoding",
     "encode_seconds": "encode",
     "match_seconds": "match",
@@ -44,7 +44,7 @@ class RunTables:
 
     @property
     def solved(self) -> pd.DataFrame:
-        """The pairs that have an F, of their own or of their scene."""
+        """The pairs with an F, from their matches or their scene."""
         return self.pairs[self.pairs["source"] != "fallback"]
 
     @property
@@ -97,7 +97,7 @@ def _table(rows: Iterator[tuple[object, ...]], columns: Mapping[str, type]) -> p
 
 
 def _pair_table(pairs: Sequence[Pair], records: Sequence[PairRecord]) -> pd.DataFrame:
-    """Column by column: a row as a tuple of its own takes a kilobyte, and there may be a million."""
+    """Build the table by columns: a tuple per row takes a kilobyte, and a run may have a million rows."""
     size = len(pairs)
     columns: dict[str, Any] = {
         "pair": np.fromiter((record.index for record in records), int, size),

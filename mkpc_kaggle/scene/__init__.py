@@ -1,1 +1,1 @@
-"""A batch together: keypoints from all matches, reconstruction by pycolmap, and which F a pair gets."""
+"""Reconstruction of a batch: keypoints from all matches, pycolmap's models, and the F of each pair."""

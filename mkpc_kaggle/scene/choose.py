@@ -1,4 +1,4 @@
-"""Which fundamental matrix a pair gets: the scene's, or that of its own matches, at known focal lengths or not."""
+"""Choice of a pair's fundamental matrix: from the scene, or from the pair's matches."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -14,16 +14,16 @@ from mkpc_kaggle.geometry.robust import RobustConfig, sampson_distances
 from mkpc_kaggle.scene.reconstruction import RegisteredImage
 from mkpc_kaggle.scene.view_graph import BatchPair
 
-CONTRADICTION_ERROR_PX = 2.0  # Sampson's distance within which a match agrees with an F
-CONTRADICTION_MATCHES = 30  # that agree with the pair's own F
-CONTRADICTION_SHARE = 0.05  # as many of them have to agree with the scene's F
-FOCAL_SIGMA = 0.1  # standard deviation of the logarithm of a focal length that the scene found
+CONTRADICTION_ERROR_PX = 2.0  # maximum Sampson distance of a match that agrees with an F
+CONTRADICTION_MATCHES = 30  # minimum number that agrees with the pair's F
+CONTRADICTION_SHARE = 0.05  # of these, the minimum share that must agree with the scene's F
+FOCAL_SIGMA = 0.1  # standard deviation of the logarithm of the scene's focal lengths
 
 ModelImages: TypeAlias = Mapping[str, RegisteredImage]  # the registered images of a model, by digest
 
 
 class Reason(StrEnum):
-    """Why a pair has the F that it has; the first alone means the scene's."""
+    """Reason of a pair's :class:`Choice`; only ``SCENE`` means the scene's F."""
 
     SCENE = "both cameras are known"
     UNREGISTERED = "an image has no camera"
@@ -35,8 +35,9 @@ class Reason(StrEnum):
 
 @dataclass(frozen=True, eq=False)
 class Choice:
-    """``F`` is the scene's, (3, 3) of unit norm with x1^T F x0 = 0, or that of the pair's own matches at the focal
-    lengths that the scene found; ``None`` where the pair keeps the F that it had.
+    """The F chosen for a pair, (3, 3) of unit norm with x1^T F x0 = 0.
+
+    It is the scene's, or the pair's at the scene's focal lengths; ``None`` if the pair keeps its F.
     """
 
     F: Matrix3 | None
@@ -48,7 +49,7 @@ class Choice:
 
 
 def choose(pair: BatchPair, models: Sequence[ModelImages]) -> Choice:
-    """Return the F of a pair from its cameras in the first model that has both, or why it gets none."""
+    """Return the F of a pair from its cameras in the first model with both, or the reason for none."""
     digests = pair.image0.digest, pair.image1.digest
     if digests[0] == digests[1]:
         return Choice(None, Reason.SAME_IMAGE)
@@ -64,10 +65,10 @@ def choose(pair: BatchPair, models: Sequence[ModelImages]) -> Choice:
 
 
 def contradicts(F: Matrix3, pair: BatchPair) -> bool:
-    """Whether far fewer of the pair's matches agree with the scene's F than with its own.
+    """Return whether far fewer of the pair's matches agree with the scene's F than with the pair's.
 
-    A pair's own F always has more of its matches. On a facade that repeats itself it may have many times as many
-    and be wrong: only a share of next to nothing counts against the scene.
+    The pair's F always agrees with more of its matches. On a repetitive facade it may agree with many times more
+    and be wrong, so only a tiny share counts against the scene.
     """
     if pair.pair_fundamental is None:
         return False
@@ -81,9 +82,9 @@ def contradicts(F: Matrix3, pair: BatchPair) -> bool:
 def estimate_at_known_focals(
     pair: BatchPair, focals: Mapping[str, float], config: FocalConfig, magsac: RobustConfig
 ) -> Matrix3 | None:
-    """F, (3, 3), of a pair's own matches where the scene knows focal lengths, ``focals`` in pixels by digest.
+    """Return the F, (3, 3), of a pair's matches at the scene's focal lengths, ``focals`` in pixels by digest.
 
-    ``None`` where neither image's is known or the matches give no F.
+    Return ``None`` if neither image has a known focal length or the matches give no F.
     """
     images = pair.image0, pair.image1
     if not any(image.digest in focals for image in images):

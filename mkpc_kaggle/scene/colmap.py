@@ -1,8 +1,8 @@
 """Structure from motion by pycolmap: a connected view graph in, cameras and points out.
 
-pycolmap can end the process on its own (a failed assertion, memory), and the global mapper has no time limit. Once
-pycolmap is imported, a SIGTERM ends the process with a stack trace on stderr. So a caller that cannot afford this
-runs it in a process of its own. Nothing is written to disk, unless COLMAP's files are asked for.
+pycolmap can abort the process (failed assertion, out of memory), and the global mapper has no time limit. Once
+pycolmap is imported, a SIGTERM ends the process with a stack trace on stderr. A caller that cannot afford this
+must run it in a separate process. Nothing is written to disk, except by :func:`write_files`.
 
 Source: Pan et al. 2024 (the global mapper).
 """
@@ -30,17 +30,17 @@ from mkpc_kaggle.scene.view_graph import MIN_MATCHES, Edge, ViewGraph
 
 CENTRE_PX = 0.5  # in COLMAP the top-left pixel's centre is (0.5, 0.5), here it is (0, 0)
 MAX_ERROR_PX = 1.0  # of a verified match
-MAX_TRIALS = 300  # of RANSAC for an edge: more find the same inliers at five times the cost
-LARGE = 100  # images; a larger scene has the cost of all its tracks, a smaller scene their accuracy
-TRACKS_PER_IMAGE = 200  # that the global mapper keeps at first in a large scene, the longest
+MAX_TRIALS = 300  # RANSAC trials per edge: more find the same inliers at five times the cost
+LARGE = 100  # images; in a larger scene all tracks cost too much, a smaller scene gains accuracy from them
+TRACKS_PER_IMAGE = 200  # the longest, with which the global mapper starts in a large scene
 SEED = 0
 
 
 def structure_from_motion(graph: ViewGraph, config: SceneConfig, shared: SharedIntrinsics) -> Reconstruction:
-    """What pycolmap makes of a view graph; perhaps no model, perhaps several.
+    """Return pycolmap's reconstruction of a view graph, with any number of models.
 
-    Each image has a camera of its own, except those with ``shared`` intrinsics. Cameras start with the shared
-    focal length or that of EXIF, which is refined as any other is.
+    Each image has its own camera, except images with ``shared`` intrinsics. Cameras start with the shared focal
+    length or EXIF's, and all focal lengths are refined.
     """
     pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
     pycolmap.set_random_seed(SEED)
@@ -52,13 +52,13 @@ def structure_from_motion(graph: ViewGraph, config: SceneConfig, shared: SharedI
 def write_files(
     directory: Path, graph: ViewGraph, config: SceneConfig, shared: SharedIntrinsics, models: Sequence[SfmModel]
 ) -> None:
-    """Write COLMAP's files: the database, and a folder of each of its models.
+    """Write COLMAP's files: the database and one folder per model.
 
-    They are made in a folder beside earlier files, and take their place when all are whole. The images that were
-    left out of a model are not in its files.
+    Files are written to a temporary folder in ``directory`` and replace earlier files when all are complete. Files
+    of a model contain only its plausible images.
     """
     directory.mkdir(parents=True, exist_ok=True)
-    for left in directory.glob(f"{PART}*"):  # by a process that was killed
+    for left in directory.glob(f"{PART}*"):  # of a killed process
         shutil.rmtree(left, ignore_errors=True)
     with TemporaryDirectory(prefix=PART, dir=directory) as name:
         made = Path(name)
@@ -83,7 +83,7 @@ def write_files(
 
 
 def _fill(database: Any, graph: ViewGraph, config: SceneConfig, shared: SharedIntrinsics) -> None:
-    """Write images with their cameras and keypoints, and the matches and verified geometry of each edge."""
+    """Write images, their cameras and keypoints, and the matches and verified geometry of each edge."""
     keypoints, found = scene_keypoints(graph)
     with pycolmap.DatabaseTransaction(database):
         cameras = _write_images(database, graph, keypoints, config, shared)
@@ -96,7 +96,7 @@ def _fill(database: Any, graph: ViewGraph, config: SceneConfig, shared: SharedIn
 def _write_images(
     database: Any, graph: ViewGraph, keypoints: Sequence[Points], config: SceneConfig, shared: SharedIntrinsics
 ) -> list[Any]:
-    """Write images, frames, cameras and rigs; returns each image's camera.
+    """Write images, frames, cameras and rigs. Return each image's camera.
 
     Images and frames are numbered by the image's index plus one, cameras and rigs by their first image.
     """
@@ -122,9 +122,9 @@ def _write_images(
 
 
 def _write_camera(database: Any, number: int, size: Size, focal: float, config: SceneConfig) -> Any:
-    """Write a camera that starts with this focal length, and a rig of it alone."""
+    """Write a camera with this initial focal length, and a rig of this camera alone."""
     camera = pycolmap.Camera.create_from_model_name(number, config.camera_model.value, focal, *size)
-    camera.has_prior_focal_length = True  # a pair that E explains at the prior is used as calibrated
+    camera.has_prior_focal_length = True  # a pair that E explains at this focal length counts as calibrated
     database.write_camera(camera, use_camera_id=True)
     rig = pycolmap.Rig(rig_id=number)
     rig.add_ref_sensor(camera.sensor_id)
@@ -135,9 +135,9 @@ def _write_camera(database: Any, number: int, size: Size, focal: float, config: 
 def verify(
     edges: Sequence[Edge], keypoints: Sequence[Points], matches: Sequence[Index], cameras: list[Any], threads: int
 ) -> list[Any]:
-    """The epipolar geometry of each edge, with the matches that agree on it."""
+    """Return the epipolar geometry of each edge, with its inliers."""
     ransac = {"max_error": MAX_ERROR_PX, "max_num_trials": MAX_TRIALS, "random_seed": SEED}
-    # A watermark is seen in matches that stand still, of which near views have many.
+    # COLMAP takes unmoved matches for a watermark, but views from nearby have many of them.
     settings = {"ransac": ransac, "min_num_inliers": MIN_MATCHES, "detect_watermark": False}
     options = pycolmap.TwoViewGeometryOptions(settings)
     points = [found.astype(np.float64) + CENTRE_PX for found in keypoints]
@@ -152,7 +152,7 @@ def verify(
 
 
 def run_mapper(database: Any, graph: ViewGraph, threads: int) -> Reconstruction:
-    """Return the plausible models that the global mapper makes of a filled database."""
+    """Return the plausible models of the global mapper from a filled database."""
     seed, common = {"random_seed": SEED}, {"random_seed": SEED, "num_threads": threads}
     parts = dict.fromkeys(("rotation_averaging", "global_positioning", "retriangulation"), seed)
     required = {"track_required_tracks_per_view": TRACKS_PER_IMAGE} if len(graph.images) > LARGE else {}

@@ -1,4 +1,4 @@
-"""Extra image pairs that densify the view graph of a batch whose images are in few pairs."""
+"""Extra image pairs that densify the view graph of a batch with few pairs per image."""
 
 from collections.abc import Sequence
 from math import ceil
@@ -6,21 +6,21 @@ from typing import TypeAlias
 
 import numpy as np
 
-MAX_IMAGES = 2000  # the search takes the square of their number
+MAX_IMAGES = 2000  # the search is quadratic in their number
 
 Ends: TypeAlias = tuple[int, int]  # the two images of a pair by their indices, the smaller first
 
 
 def extra_pairs(image_count: int, pairs: Sequence[Ends], per_image: float) -> list[Ends]:
-    """The pairs that a batch lacks to have ``per_image`` pairs for each of its images, the most wanted first.
+    """Return extra pairs that give a batch ``per_image`` pairs per image, the most useful first.
 
-    ``pairs`` are those that it has, in any order. In each step the image in the fewest pairs gets a partner: the
-    image that has most partners in common with it, since they are likely to show the same, and among these the
-    image in the fewest pairs. Nothing for a batch of more than ``MAX_IMAGES``.
+    ``pairs`` are the existing pairs, in any order. Each step adds a partner to the image in the fewest pairs: the
+    image with the most partners in common, which probably shows the same part of the scene. Among several, the
+    image in the fewest pairs wins. A batch of more than ``MAX_IMAGES`` images gets none.
     """
     if image_count > MAX_IMAGES:
         return []
-    linked = np.eye(image_count, dtype=bool)  # (N, N): an image is linked with its partners and with itself
+    linked = np.eye(image_count, dtype=bool)  # (N, N); each image is linked to its partners and itself
     for first, second in pairs:
         linked[first, second] = linked[second, first] = True
     common = linked.astype(np.float32) @ linked.astype(np.float32)  # (N, N): partners in common; exact below 2**24

@@ -5,8 +5,8 @@ from pathlib import Path
 
 DATABASE, MODELS = "database.db", "models"
 MODEL_FILES = ("cameras.bin", "frames.bin", "images.bin", "points3D.bin", "rigs.bin")
-FORMER = "former"  # models that are being replaced
-PART = ".mkpc-new-"  # how the names of folders begin in which files are made that replace former files
+FORMER = "former"  # folder of the models being replaced
+PART = ".mkpc-new-"  # prefix of temporary folders, whose files replace former files
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,7 @@
 """Keypoints of images from the matches of their pairs: a point that two pairs share becomes one keypoint.
 
-Matchers find a point again to within a fraction of a pixel only, when they see it in another pair, at another
-resolution, or when another matcher finds it. Structure from motion follows points through images, so points of an
-image that are less than a pixel apart have to become a single keypoint.
+The position of a point varies by a fraction of a pixel between pairs, resolutions and matchers. Structure from
+motion tracks points through images, so points of an image less than a pixel apart must become one keypoint.
 """
 
 import numpy as np
@@ -14,11 +13,11 @@ from mkpc_kaggle.scene.view_graph import ViewGraph
 CELL_PX = 0.75  # points of an image in one cell of this size are one keypoint
 
 
-Index = NDArray[np.uint32]  # (M, 2): the indices of the matched keypoints in the two images of an edge
+Index = NDArray[np.uint32]  # (M, 2): indices of the matched keypoints in both images of an edge
 
 
 def scene_keypoints(graph: ViewGraph) -> tuple[list[Points], list[Index]]:
-    """The keypoints of each image, (K, 2) float32 in image pixels, and the matches of each edge."""
+    """Return the keypoints of each image, (K, 2) float32 in image pixels, and the matches of each edge."""
     parts: list[list[Points]] = [[] for _ in graph.images]
     for edge in graph.edges:
         parts[edge.first].append(edge.matches.points0)
@@ -33,10 +32,10 @@ def scene_keypoints(graph: ViewGraph) -> tuple[list[Points], list[Index]]:
 
 
 def merge_points(points: Points, cell: float) -> tuple[Points, NDArray[np.intp]]:
-    """(N, 2) points -> (K, 2) float32 means of those that share a cell, and for each point its index there, (N,).
+    """Return the float32 means, (K, 2), of points, (N, 2), in each cell, and the index of each point's mean, (N,).
 
-    A grid has borders, and points on both sides of a border would stay apart. So the means of a first grid are
-    merged once more in a second grid, shifted by half a cell.
+    A grid separates close points on both sides of a cell border. A second grid, shifted by half a cell, merges the
+    means of the first.
     """
     total: NDArray[np.float64] = points.astype(np.float64)
     weight: NDArray[np.float64] = np.ones(len(points))
@@ -52,10 +51,9 @@ def merge_points(points: Points, cell: float) -> tuple[Points, NDArray[np.intp]]
 
 
 def one_to_one(index: NDArray[np.intp]) -> Index:
-    """(N, 2) pairs of keypoints -> (M, 2) in which no keypoint is twice.
+    """Return the matches, (M, 2) of (N, 2), that use each keypoint at most once.
 
-    Pairs that were found more often go first, then earlier pairs: matchers that disagree about a keypoint cannot
-    both be right.
+    Of conflicting matches at most one is right: the more frequent match wins, then the earlier.
     """
     distinct, first, count = np.unique(index, axis=0, return_index=True, return_counts=True)
     order = np.lexsort((first, -count))

@@ -1,4 +1,4 @@
-"""A batch is reconstructed: pairs in, cameras and the pairs' choices out; plain values that go through a pipe."""
+"""Reconstruction of a batch: pairs in, cameras and the pairs' choices out, all of them picklable."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -13,16 +13,16 @@ from mkpc_kaggle.scene.reconstruction import MIN_IMAGES, Reconstruction, SfmMode
 from mkpc_kaggle.scene.shared_intrinsics import SharedIntrinsics, given_intrinsics, shared_intrinsics
 from mkpc_kaggle.scene.view_graph import BatchPair, ViewGraph
 
-MIN_PAIRS_PER_IMAGE = 1.35  # connected pairs: with fewer there is little that could contradict the cameras
-KEEPS_ITS_F = Reason.SCENE, Reason.SAME_IMAGE, Reason.CONTRADICTION  # no other F, at the scene's focal lengths
-MIN_OBSERVATIONS = 0.99  # shared intrinsics stay if images see points at least this many times as often as without
+MIN_PAIRS_PER_IMAGE = 1.35  # connected pairs; fewer hardly constrain the cameras
+KEEPS_ITS_F = Reason.SCENE, Reason.SAME_IMAGE, Reason.CONTRADICTION  # not re-estimated at other focal lengths
+MIN_OBSERVATIONS = 0.99  # of the observations without them; with fewer, shared intrinsics are dropped
 
 
 @dataclass(frozen=True, eq=False)
 class Solution:
     """The reconstructions of a batch's components, and the choice of each pair, in order.
 
-    An image has the name under which it came first.
+    Duplicate images have the name of the first.
     """
 
     reconstructions: tuple[Reconstruction, ...]
@@ -38,17 +38,17 @@ def reconstruct_batch(
 ) -> Solution:
     """Reconstruct every connected component of a batch, and choose an F for each of its pairs.
 
-    With ``focal``, the recipe's prior, and ``magsac`` (default: its defaults), a pair that gets no F from cameras
-    is re-estimated where the scene knows a focal length, unless it contradicts the scene. With ``export``, the
-    batch is reconstructed as a whole, and COLMAP's files are written.
+    With ``focal``, the recipe's prior, a pair without an F from cameras is re-estimated if the scene has a
+    focal length, unless the pair contradicts the scene. ``magsac`` defaults to its default settings. With
+    ``export``, the batch is reconstructed as a whole, and COLMAP's files are written.
 
-    A missing result has a reason, and no matches raise an error. It takes seconds to minutes and may end the
-    process, see :mod:`mkpc_kaggle.scene.colmap`.
+    A missing result has a reason; no matches raise an error. Reconstruction takes seconds to minutes and may end
+    the process, see :mod:`mkpc_kaggle.scene.colmap`.
     """
     directory = export.directory if export else None
     found, shared = reconstruct_sharing(ViewGraph.of_pairs(pairs), config, directory)
     models = [{image.image.digest: image for image in model.images} for model in models_of(found)]
-    focals = dict(shared)  # an image's is that of the first model that has it, else of the camera that it shares
+    focals = dict(shared)  # of the first model with the image, or else of its shared camera
     for model in reversed(models):
         focals |= {digest: image.focal for digest, image in model.items()}
     choices = []
@@ -64,11 +64,11 @@ def reconstruct_batch(
 def reconstruct_sharing(
     graph: ViewGraph, config: SceneConfig, directory: Path | None = None
 ) -> tuple[list[Reconstruction], SharedIntrinsics]:
-    """The reconstruction of each component, and the intrinsics that its images share.
+    """Return the reconstruction of each component, and the intrinsics that its images share.
 
-    Images that seem to share a camera are reconstructed anew with it, unless they see fewer points then. Images
-    that are known to share a camera do so at once; the answer has the focal length that was found for it. With a
-    ``directory`` the graph is reconstructed as a whole, and COLMAP's files are written there.
+    Images that seem to share a camera are reconstructed again with shared intrinsics, unless they see fewer points
+    then. Images that are known to share a camera do so from the start; their focal length in the result is the
+    refined one. With a ``directory`` the graph is reconstructed as a whole, and COLMAP's files are written there.
     """
     if directory is None:
         parts, make = graph.components(), reconstruct_component
@@ -93,7 +93,7 @@ def reconstruct_sharing(
 
 
 def reconstruct_component(graph: ViewGraph, config: SceneConfig, shared: SharedIntrinsics) -> Reconstruction:
-    """The reconstruction of a connected graph, or why there is none."""
+    """Return the reconstruction of a connected graph, or the reason for its failure."""
     images, pairs = len(graph.images), len(graph.edges)
     if images < MIN_IMAGES:
         return Reconstruction(graph.names, failure=f"{images} images are connected; a scene needs {MIN_IMAGES}")
@@ -104,7 +104,7 @@ def reconstruct_component(graph: ViewGraph, config: SceneConfig, shared: SharedI
 
 
 def reconstruct_connected(graph: ViewGraph, config: SceneConfig, shared: SharedIntrinsics) -> Reconstruction:
-    """What pycolmap makes of a graph, or why there is nothing."""
+    """Return pycolmap's reconstruction of a graph, or the reason for its failure."""
     try:
         from mkpc_kaggle.scene.colmap import structure_from_motion
 

@@ -1,4 +1,4 @@
-"""What a reconstruction gives: cameras of images and points, without the cameras that cannot be right."""
+"""Results of a reconstruction: cameras and points, without implausible cameras."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -17,10 +17,10 @@ FOCALS = Range(0.3, 5.0)  # plausible focal lengths, in long sides of the image
 
 
 class Sigmas(NamedTuple):
-    """Root mean square errors to expect of a camera, see :mod:`mkpc_kaggle.scene.uncertainty`."""
+    """Expected root mean square errors of a camera, see :mod:`mkpc_kaggle.scene.uncertainty`."""
 
     rotation: float  # degrees
-    centre: float  # in units of the model's size, the root mean square distance of its cameras from their mean
+    centre: float  # in model sizes: root mean square distances of its cameras from their mean
     focal: float  # percent
 
 
@@ -28,7 +28,7 @@ class Sigmas(NamedTuple):
 class RegisteredImage:
     """An image with its camera in its model's world units; ``points`` is the number of points that it sees.
 
-    ``sigmas`` are its :class:`Sigmas`, or empty where they are unknown.
+    ``sigmas`` is empty if unknown.
     """
 
     image: BatchImage
@@ -38,15 +38,15 @@ class RegisteredImage:
 
     @property
     def focal(self) -> float:
-        """In pixels."""
+        """Focal length in pixels."""
         return float(self.camera.K[0, 0])
 
 
 @dataclass(frozen=True, eq=False)
 class SfmModel:
-    """Cameras in one world, and points in it, (P, 3) float64; ``reprojection_error`` is the mean in pixels.
+    """Cameras and points, (P, 3) float64, of one world; ``reprojection_error`` is the mean in pixels.
 
-    ``colmap`` is pycolmap's own value of it, which cannot leave its process.
+    ``colmap`` is pycolmap's model, which cannot leave its process.
     """
 
     images: tuple[RegisteredImage, ...]
@@ -60,10 +60,9 @@ class SfmModel:
 
 @dataclass(frozen=True, eq=False)
 class Reconstruction:
-    """A connected component of a batch: the names of its images, and the models that were made of them.
+    """A connected component of a batch: the names of its images, and its models, the largest first.
 
-    Models are in order of size, the largest first, and an image may be in several. ``failure`` is empty, or says
-    why there is no model.
+    An image may be in several models. ``failure`` is the reason why the component has no model, or empty.
     """
 
     names: tuple[str, ...]
@@ -72,17 +71,17 @@ class Reconstruction:
 
     @property
     def registered(self) -> int:
-        """How many of its images have a camera."""
+        """Number of images with a camera."""
         return len({found.image.name for model in self.models for found in model.images})
 
     @property
     def observations(self) -> int:
-        """How often its images see points."""
+        """Number of observations of points in images."""
         return sum(found.points for model in self.models for found in model.images)
 
 
 def filter_models(models: Sequence[SfmModel]) -> tuple[SfmModel, ...]:
-    """The models without the images whose cameras cannot be right, if enough are left; the largest first."""
+    """Return the models without implausible cameras, the largest first. Drop models with too few images left."""
     cleaned = [replace(model, images=tuple(filter(is_plausible, model.images))) for model in models]
     kept = [model for model in cleaned if len(model.images) >= MIN_IMAGES]
     return tuple(sorted(kept, key=lambda model: (-len(model.images), -len(model.points))))

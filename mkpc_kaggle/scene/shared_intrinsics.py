@@ -1,9 +1,8 @@
-"""Images that one camera took at one zoom, recognised by the focal lengths that were found for each.
+"""Shared intrinsics of images that one camera took at one zoom, recognised by their focal lengths.
 
-A reconstruction that gives each image its own focal length trades it for the distance to what the image sees, and
-an image with few points may get any. If most images of one size agree on theirs, one camera took them, and a
-second reconstruction can share its intrinsics from the start. Where that one camera took them is known, the first
-does.
+A separate focal length of an image is ambiguous with the distance to the scene, and few points hardly constrain
+it. If most images of one size agree on their focal length, one camera took them. A second reconstruction then
+shares its intrinsics from the start. If the user states that one camera took them, the first reconstruction does.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,21 +14,21 @@ from mkpc_kaggle.recipe import CameraSharing, SceneConfig
 from mkpc_kaggle.scene.reconstruction import SfmModel
 from mkpc_kaggle.scene.view_graph import BatchImage
 
-PRIOR_FOCAL = 1.1  # long sides of the image: the focal length that cameras start with where nothing is known
+PRIOR_FOCAL = 1.1  # initial focal length without EXIF, in long sides of the image
 MIN_ALIKE = 5  # registered images of one size
-ZOOM_POINTS = 0.5  # an image that disagrees but sees this share of the median image's points has another zoom
+ZOOM_POINTS = 0.5  # of the median image's points; an image that sees more but disagrees has another zoom
 
-# By the digest of an image, the focal length in pixels of the camera that it shares with others of its size.
+# Focal length in pixels of the camera that an image shares with others of its size, by the image's digest.
 SharedIntrinsics: TypeAlias = Mapping[str, float]
 
 
 def start_focal(image: BatchImage, config: SceneConfig) -> float:
-    """The focal length in pixels that an image's camera starts with."""
+    """Return the initial focal length, in pixels, of an image's camera."""
     return image.focal if config.exif and image.focal else PRIOR_FOCAL * max(image.size)
 
 
 def given_intrinsics(images: Sequence[BatchImage], config: SceneConfig) -> SharedIntrinsics:
-    """The focal length that all images of one size start with together; nothing unless the recipe says so."""
+    """Return the common initial focal length of the images of each size, if the recipe shares cameras."""
     if config.cameras is not CameraSharing.FOLDER:
         return {}
     starts = {}
@@ -42,10 +41,10 @@ def given_intrinsics(images: Sequence[BatchImage], config: SceneConfig) -> Share
 def shared_intrinsics(
     images: Sequence[BatchImage], models: Sequence[SfmModel], tolerance: float
 ) -> SharedIntrinsics:
-    """The focal lengths that images of one size share, because more than half of the registered images agree.
+    """Return the focal lengths of images of one size on which more than half of the registered images agree.
 
-    To agree is to be within a share of ``tolerance`` of their median. All images of the size share it, registered
-    or not, except those that see many points at another focal length: they were taken at another zoom.
+    Focal lengths agree within a share of ``tolerance`` of their median. All images of the size share the median,
+    also unregistered ones, except images that see many points at another focal length: they have another zoom.
     """
     registered = {found.image.digest: found for model in reversed(models) for found in model.images}
     shared: dict[str, float] = {}

@@ -1,7 +1,7 @@
-"""How sure each camera of a reconstruction is, by the covariance of its bundle adjustment.
+"""Uncertainty of each camera of a reconstruction, from the covariance of its bundle adjustment.
 
 All cameras together fix the origin, orientation and scale: errors that a similarity of the world explains do not
-count (the S-transformation of Baarda 1981). The noise of keypoints is that of the residuals.
+count (the S-transformation of Baarda 1981). The residuals give the noise of keypoints.
 """
 
 from typing import Any, cast
@@ -19,7 +19,7 @@ DAMPING = 1e-3  # the world is free, so the normal equations are singular
 
 
 def camera_sigmas(found: Any) -> dict[str, Sigmas]:
-    """Return those of the registered images of pycolmap's reconstruction, by name; empty if they are unknown."""
+    """Return the sigmas of the registered images of pycolmap's reconstruction, by name; empty if unknown."""
     images = [image for _, image in sorted(found.images.items()) if image.has_pose and image.num_points3D]
     if not 1 < len(images) <= MAX_IMAGES:
         return {}
@@ -41,7 +41,7 @@ def camera_sigmas(found: Any) -> dict[str, Sigmas]:
     variances = _pose_variances([image.cam_from_world().matrix() for image in images], poses)
     noise = 2 * fit.initial_cost / redundancy  # variance of a keypoint's coordinate, square pixels
     sigmas = np.sqrt(noise * np.column_stack([variances, focals])) * [np.degrees(1), 1, 100]
-    # Rounded: the last digits differ from call to call.
+    # Rounded, since the last digits differ between calls.
     rows = [Sigmas(*(float(f"{value:.4g}") for value in row)) for row in sigmas]
     return {image.name: row for image, row in zip(images, rows, strict=True)}
 
@@ -49,12 +49,12 @@ def camera_sigmas(found: Any) -> dict[str, Sigmas]:
 def _pose_variances(poses: list[NDArray[np.float64]], covariance: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the variances of rotations, radians, and of centres, in model sizes: (N, 2).
 
-    ``poses`` are [R | t]; the covariance is that of COLMAP's parameters, half angles and t.
+    ``poses`` are [R | t]; ``covariance`` refers to COLMAP's parameters, half angles and t.
     """
     centres = np.array([-pose[:, :3].T @ pose[:, 3] for pose in poses])
     centres -= centres.mean(axis=0)
     size = np.sqrt((centres**2).sum(axis=1).mean())
-    moves, similarities = [], []  # what angles and centres change by parameters of the pose, and of the world
+    moves, similarities = [], []  # Jacobians of angles and centres: by the pose, and by a similarity of the world
     for pose, centre in zip(poses, centres / size, strict=True):
         R, t = pose[:, :3], pose[:, 3]
         moves.append(np.vstack([2 * np.eye(3, 6), -R.T @ np.hstack([2 * cross_matrix(t), np.eye(3)]) / size]))

@@ -1,4 +1,4 @@
-"""The view graph of a batch: its distinct images, and the matches between each two of them."""
+"""The view graph of a batch: its distinct images, and the matches between them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,15 +11,15 @@ from mkpc_kaggle.geometry.coordinates import Matrix3, Size
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.pipeline.pair import UnitResult
 
-MIN_MATCHES = 15  # an edge with fewer connects nothing; also the inliers that a verified edge needs
-MIN_TRACK_MATCHES = 50  # a pair with fewer matches from units that make tracks uses those of all its units
+MIN_MATCHES = 15  # of an edge that connects images; also the minimum inliers of a verified edge
+MIN_TRACK_MATCHES = 50  # from units that make tracks; a pair with fewer uses the matches of all units
 
 
 @dataclass(frozen=True)
 class BatchImage:
     """An image of a batch: its ``name``, the ``digest`` of its content, its ``size`` in pixels.
 
-    Two names with one digest are one image. ``focal`` is the focal length in pixels by its EXIF, 0 if unknown.
+    Names with equal digests are one image. ``focal`` is EXIF's focal length in pixels, 0 if unknown.
     """
 
     name: str
@@ -32,8 +32,8 @@ class BatchImage:
 class BatchPair:
     """Two images of a batch and their matches in full-image pixels, which may be empty.
 
-    ``pair_fundamental`` is the F, (3, 3), that the pair's matches alone gave, or ``None``. ``tracks`` are the
-    matches that the scene is made of; ``None``: all matches.
+    ``pair_fundamental`` is the F, (3, 3), from the pair's matches alone, or ``None``. ``tracks`` are the matches
+    for the reconstruction; ``None`` means all matches.
     """
 
     image0: BatchImage
@@ -45,7 +45,7 @@ class BatchPair:
 
 @dataclass(frozen=True, eq=False)
 class Edge:
-    """All matches between two distinct images, given by their indices in a list of images, ``first < second``."""
+    """All matches between two distinct images, given by their indices in the graph, ``first < second``."""
 
     first: int
     second: int
@@ -54,7 +54,7 @@ class Edge:
 
 @dataclass(frozen=True, eq=False)
 class ViewGraph:
-    """Distinct images, and the edges between them in order of their two ends."""
+    """Distinct images, and the edges between them, sorted by their two ends."""
 
     images: tuple[BatchImage, ...]
     edges: tuple[Edge, ...]
@@ -65,15 +65,15 @@ class ViewGraph:
 
     @property
     def strong(self) -> "ViewGraph":
-        """The same images, and the edges with at least ``MIN_MATCHES`` matches: fewer connect nothing."""
+        """The graph with only the edges of at least ``MIN_MATCHES`` matches."""
         return ViewGraph(self.images, tuple(edge for edge in self.edges if len(edge.matches) >= MIN_MATCHES))
 
     @classmethod
     def of_pairs(cls, pairs: Sequence[BatchPair]) -> "ViewGraph":
-        """The graph of a batch's pairs.
+        """Return the graph of a batch's pairs.
 
-        Pairs of the same two images become one edge, whatever their order. A pair of an image with itself and a
-        pair without matches make no edge.
+        Pairs of the same two images, in either order, become one edge. A pair of an image with itself and a pair
+        without matches make no edge.
         """
         images: dict[str, BatchImage] = {}
         for image in (image for pair in pairs for image in (pair.image0, pair.image1)):
@@ -92,7 +92,7 @@ class ViewGraph:
         return cls(tuple(images.values()), edges)
 
     def components(self) -> tuple["ViewGraph", ...]:
-        """The connected components that have a strong edge, by their first images; weak edges are in none."""
+        """Return the connected components of the strong edges, ordered by their first images."""
         strong = self.strong.edges
         ends = np.array([(edge.first, edge.second) for edge in strong], np.intp).reshape(-1, 2)
         shape = (len(self.images), len(self.images))
@@ -109,6 +109,6 @@ class ViewGraph:
 
 
 def tracks_of(results: Sequence[UnitResult]) -> Matches:
-    """Return the matches that a scene is made of: of units that make tracks, or all if those are few."""
+    """Return the matches for reconstruction: from units that make tracks, or all if these are few."""
     tracks = Matches.concatenate(result.matches for result in results if result.unit.tracks)
     return tracks if len(tracks) >= MIN_TRACK_MATCHES else Matches.concatenate(each.matches for each in results)

@@ -18,11 +18,11 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 STRIP_HEIGHT_PX, MAX_STRIP_PX = 480, 2_000_000
-MAX_INLIERS, MAX_OUTLIERS = 150, 50  # lines that an eye can follow
+MAX_INLIERS, MAX_OUTLIERS = 150, 50  # number of lines that stay legible
 
 
 def draw_pair(image0: Image, image1: Image, match: PairMatch, config: MkpcConfig) -> "Figure":
-    """Above, the matches of all units and the critical regions; below, the clusters of stage 1."""
+    """Draw the matches of all units and the critical regions at the top, the clusters of stage 1 below."""
     figure = new_figure(12, 9)
     panels = figure.subplot_mosaic([["matches", "matches"], ["0", "1"]])
     counts = f"{len(match.matches)} matches, {match.estimate.inlier_count} inliers"
@@ -35,7 +35,7 @@ def draw_pair(image0: Image, image1: Image, match: PairMatch, config: MkpcConfig
 
 
 def draw_strip(images: tuple[Image, Image], match: PairMatch) -> "Figure":
-    """The matches and the critical regions without text, on at most :data:`MAX_STRIP_PX` pixels."""
+    """Draw the matches and the critical regions without text, on up to :data:`MAX_STRIP_PX` pixels."""
     aspect = sum(view.content.width / view.content.height for view in map(_upright, images))
     height = min(STRIP_HEIGHT_PX, sqrt(MAX_STRIP_PX / aspect)) / style.DPI
     figure = new_figure(aspect * height, height)
@@ -45,7 +45,7 @@ def draw_strip(images: tuple[Image, Image], match: PairMatch) -> "Figure":
 
 
 def draw_matches(axes: "Axes", images: tuple[Image, Image], match: PairMatch) -> str:
-    """Show the images side by side, matches as lines, critical regions as boxes; returns what was drawn.
+    """Show the images side by side, matches as lines, critical regions as boxes. Return the drawn objects.
 
     Where there are many matches, an even sample is drawn. The axes' unit is the height of both images.
     """

@@ -1,4 +1,4 @@
-"""What a run did: jobs over time, and the cameras of a scene."""
+"""Figures of a run: jobs over time, and the cameras of a scene."""
 
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
@@ -13,11 +13,11 @@ if TYPE_CHECKING:
 
     from mkpc_kaggle.engine.records import CameraRecord, SceneRecord
 
-MAX_EMPTY = 4  # a time limit that is more times as long as the run is not drawn: the jobs would have no room
+MAX_EMPTY = 4  # a time limit of more run lengths is not drawn: it would leave no room for the jobs
 
 
 def draw_budget(ended: Mapping[str, Sequence[float]], limit: float | None) -> "Figure":
-    """Jobs ended over time, a colour for each phase; a flat piece is time without a result.
+    """Draw the number of ended jobs over time, a colour for each phase. A flat segment is time without a result.
 
     ``ended`` has seconds since the start by phase, ``limit`` is the time limit in seconds.
     """
@@ -79,7 +79,7 @@ def _axes_of(cameras: "Sequence[CameraRecord]") -> NDArray[np.float64]:
 
 
 def _near(values: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Which values are not much farther out than nearly all of them."""
+    """Return the mask of values that are not far outside the range of nearly all values."""
     low, high = np.percentile(values, (3, 97)) if len(values) else (0.0, 0.0)
     near: NDArray[np.bool_] = np.abs(values - (low + high) / 2) <= 0.7 * (high - low)
     return near

@@ -1,4 +1,4 @@
-"""What all figures share: colours, an empty figure, plain axes, and the ways to write a figure."""
+"""Common parts of all figures: colours, an empty figure, plain axes, and output formats."""
 
 from io import BytesIO
 from pathlib import Path
@@ -15,14 +15,14 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# The Okabe-Ito palette, which colour-blind readers can tell apart.
+# The Okabe-Ito palette, suitable for colour-blind readers.
 INLIER, OUTLIER, REGION, DROPPED = "#009E73", "#D55E00", "#F0E442", "#999999"
 COLOURS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#56B4E9", "#CC79A7")
 DPI = 110
 
 
 def new_figure(width: float, height: float) -> "Figure":
-    """An empty figure of that size in inches; :class:`UserError` without matplotlib."""
+    """Return an empty figure of this size in inches. Raise :class:`UserError` without matplotlib."""
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
@@ -31,7 +31,7 @@ def new_figure(width: float, height: float) -> "Figure":
 
 
 def require_format(path: Path) -> None:
-    """Raise :class:`UserError` for a suffix that names no format of matplotlib, or without matplotlib."""
+    """Raise :class:`UserError` for a suffix that is not a format of matplotlib, or without matplotlib."""
     formats = new_figure(1, 1).canvas.get_supported_filetypes().keys() - {"pgf"}  # which needs LaTeX
     if path.suffix[1:].lower() not in formats:
         raise UserError(f"the figure {path} needs a suffix: one of {', '.join(sorted(formats))}")
@@ -48,14 +48,14 @@ def save(figure: "Figure", path: Path) -> None:
 
 
 def encode(figure: "Figure", kind: str, dpi: int = DPI) -> bytes:
-    """The figure as "png", for lines and text, or "jpeg", for photographs."""
+    """Return the figure as "png", for lines and text, or "jpeg", for photographs."""
     stream = BytesIO()
     figure.savefig(stream, format=kind, dpi=dpi, pil_kwargs={"quality": 82} if kind == "jpeg" else None)
     return stream.getvalue()
 
 
 def plain(axes: "Axes", title: str) -> "Axes":
-    """Axes with a title on the left, and without a frame on top and to the right."""
+    """Return axes with a title on the left, and without a frame at the top and on the right."""
     axes.set_title(title, loc="left", fontsize=10)
     axes.tick_params(labelsize=9)
     axes.spines[["top", "right"]].set_visible(False)
@@ -67,5 +67,5 @@ def short(name: str, most: int = 18) -> str:
 
 
 def sample(mask: NDArray[np.bool_], most: int) -> NDArray[np.intp]:
-    """At most ``most`` indices of a mask, evenly spread."""
+    """Return up to ``most`` indices of a mask, evenly spread."""
     return np.array(evenly_spread(np.flatnonzero(mask).tolist(), most), np.intp)
