@@ -146,7 +146,7 @@ def _outcome(index: int, wanted: WantedPair, pair: PairMatch, known: tuple[objec
     """The new results of a pair; its image contents are those that were matched."""
     images = tuple(
         BatchImage(name, image.version, image.size, image.focal)
-        for name, image in zip(wanted.names, pair.images, strict=False)
+        for name, image in zip(wanted.names, pair.images, strict=False)  # fewer if one is unreadable
     )
     found = tuple(
         Found(

@@ -62,7 +62,4 @@ def test_a_run_that_is_killed_at_random_moments_ends_with_the_same_files(demo, t
             process.wait()
         assert begin(f"out{number}").wait() == 0
         assert files_of(f"out{number}") == expected
-        assert (
-            len(list((tmp_path / f"out{number}" / "work").glob("turns-*"))) == 2
-        )  # the same pairs in each process
     assert kills >= ROUNDS
