@@ -165,7 +165,7 @@ class LightRunner:
 
     def __init__(self) -> None:
         import cv2
-        from threadpoolctl import threadpool_limits
+        from threadpoolctl import threadpool_limits  # comes with scikit-learn
 
         cv2.setNumThreads(1)
         threadpool_limits(1)
