@@ -29,8 +29,8 @@ QUICK = (  # these run with the other tests
     "tables: bytes that are not UTF-8",
     "limits: --time-limit nan",
     "outputs: the table",
-    "signals: SIGINT after 0.3 s",  # while modules are imported
-    "signals: SIGTERM after 1.0 s",
+    "signals: SIGINT after 0.6 s",  # while modules are imported
+    "signals: SIGTERM after 1.5 s",
     "signals: SIGINT to all after 3.0 s",
     "journals: its first half, resumed",
     "journals: noise after its head, read",
