@@ -9,6 +9,8 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from mkpc_kaggle.data.images import printable
 from mkpc_kaggle.engine.jobs import Estimated, Outcome, PairPoints, WantedPair
 from mkpc_kaggle.engine.journal_reader import FILE_NAME, FORMAT, About, Event, JournalReader, undamaged
@@ -17,7 +19,6 @@ from mkpc_kaggle.errors import UserError, writing
 from mkpc_kaggle.geometry.coordinates import Matrix3
 from mkpc_kaggle.recipe import Unit
 from mkpc_kaggle.scene.choose import Choice
-from mkpc_kaggle.scene.view_graph import BatchImage
 
 LOCK_NAME = "journal.lock"
 SCHEMA = Path(__file__).with_name("schema.sql")
@@ -154,11 +155,6 @@ class Journal(JournalReader):
 
     # Results
 
-    def save_images(self, images: Iterable[BatchImage]) -> None:
-        """Save the contents of images: points of other contents are out of date from now on."""
-        rows = [(printable(image.name), image.digest, *image.size, image.focal) for image in images]
-        self._write(lambda db: db.executemany("REPLACE INTO image VALUES (?, ?, ?, ?, ?)", rows))
-
     def save_digest(self, name: str, digest: str) -> None:
         """Save that an image has another content than it had."""
         self._write(lambda db: db.execute("UPDATE image SET digest = ? WHERE name = ?", [digest, printable(name)]))
@@ -206,7 +202,7 @@ class Journal(JournalReader):
                     printable(each.failure),
                 ),
                 *(each.stats.support, each.stats.candidates, each.stats.cost, each.stats.magsac_cost),
-                *(*each.stats.focals, np_bytes(each.stats.rotation), each.seconds, each.index),
+                *(*each.stats.focals, float_bytes(each.stats.rotation), each.seconds, each.index),
             )
             for each in estimates
         ]
@@ -233,13 +229,13 @@ class Journal(JournalReader):
                 (inputs, *head, printable(scene.failure), scene.batch),
             ).fetchone()
             for camera in scene.cameras:
-                axes = map(np_bytes, (camera.centre, camera.forward, camera.down))
+                axes = map(float_bytes, (camera.centre, camera.forward, camera.down))
                 sigmas = camera.sigmas or (None, None, None)
                 values = (camera.model, *axes, camera.focal, *camera.size, camera.seen, *sigmas)
                 row = (revision, printable(camera.image), camera.digest, *values)
                 db.execute(f"INSERT INTO camera VALUES ({', '.join('?' * 14)})", row)
             for model, cloud in enumerate(scene.clouds):
-                db.execute("INSERT INTO cloud VALUES (?, ?, ?)", (revision, model, np_bytes(cloud)))
+                db.execute("INSERT INTO cloud VALUES (?, ?, ?)", (revision, model, float_bytes(cloud)))
             rows = (
                 (revision, joined(pair.revisions), chosen.reason, blob_of(chosen.F), pair.index)
                 for pair, chosen in zip(pairs, choices, strict=True)
@@ -311,9 +307,7 @@ def blob_of(F: Matrix3 | None) -> bytes | None:
     return None if F is None else F.tobytes()
 
 
-def np_bytes(values: Any) -> bytes:
-    import numpy as np
-
+def float_bytes(values: Any) -> bytes:
     return np.asarray(values, np.float64).tobytes()
 
 
