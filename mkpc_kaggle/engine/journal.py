@@ -2,10 +2,9 @@
 
 import json
 import sqlite3
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack, closing, suppress
-from dataclasses import asdict, astuple
-from itertools import count
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +12,18 @@ import numpy as np
 
 from mkpc_kaggle.data.images import printable
 from mkpc_kaggle.engine.jobs import Estimated, Outcome, PairPoints, WantedPair
-from mkpc_kaggle.engine.journal_reader import FILE_NAME, FORMAT, About, Event, JournalReader, undamaged
+from mkpc_kaggle.engine.journal_reader import (
+    FILE_NAME,
+    FORMAT,
+    About,
+    Event,
+    JournalReader,
+    connected,
+    reading,
+    undamaged,
+)
 from mkpc_kaggle.engine.records import SceneRecord
 from mkpc_kaggle.errors import UserError, writing
-from mkpc_kaggle.geometry.coordinates import Matrix3
 from mkpc_kaggle.recipe import Unit
 from mkpc_kaggle.scene.choose import Choice
 
@@ -37,24 +44,23 @@ class Journal(JournalReader):
             raise UserError(
                 f"SQLite {sqlite3.sqlite_version} is too old: Python needs 3.37 or newer for the journal"
             )
-        path, lock = directory / FILE_NAME, directory / LOCK_NAME
+        self.path, lock = directory / FILE_NAME, directory / LOCK_NAME
         self.trouble = ""
         with ExitStack() as opened, writing(f"the work directory {directory}"):  # stays open if all is well
             directory.mkdir(parents=True, exist_ok=True)
-            self._lock = opened.enter_context(closing(connect(lock)))
+            self._lock = opened.enter_context(closing(opened_file(lock)))
             with undamaged(lock, "remove it"):
                 self._lock.execute("BEGIN EXCLUSIVE")  # another file: a journal can be read while its run works
             if fresh:
                 for ending in ("", "-journal", "-wal", "-shm"):
-                    path.with_name(FILE_NAME + ending).unlink(missing_ok=True)
-            self.path = path
-            self._file = self._db = opened.enter_context(closing(connect(path)))
-            with undamaged(path):
+                    directory.joinpath(FILE_NAME + ending).unlink(missing_ok=True)
+            self._file = self._db = opened.enter_context(closing(opened_file(self.path)))
+            with undamaged(self.path):
                 try:
                     self._open()
                 except sqlite3.OperationalError as error:  # a full disk
                     self.trouble = str(error)
-                    self._db = sqlite3.connect(":memory:", isolation_level=None)
+                    self._db = connected(":memory:")
                     self._open()
             opened.pop_all()
 
@@ -86,72 +92,60 @@ class Journal(JournalReader):
         def write(db: sqlite3.Connection) -> None:
             for table in ("wanted_unit", "wanted_pair", "wanted_batch", "about"):
                 db.execute(f"DELETE FROM {table}")
-            db.execute("INSERT INTO about VALUES (?)", [json.dumps(asdict(about or About()))])
-            rows = ((n, unit.name, unit.stage, settings) for n, (unit, settings) in enumerate(units))
-            db.executemany("INSERT INTO wanted_unit VALUES (?, ?, ?, ?)", rows)
-            db.executemany("INSERT INTO wanted_batch VALUES (?, ?)", batches.items())
-            ends = ((*map(printable, each.names), *each.pair.turns) for each in pairs)
+            insert(db, "about", value=json.dumps(asdict(about or About())))
+            for number, (unit, settings) in enumerate(units):
+                insert(db, "wanted_unit", number=number, unit=unit.name, stage=unit.stage, settings=settings)
+            for batch, settings in batches.items():
+                insert(db, "wanted_batch", batch=batch, settings=settings)
+            ends = [(*map(printable, each.names), *each.pair.turns) for each in pairs]
             db.executemany("INSERT OR IGNORE INTO pair (image0, image1, turns0, turns1) VALUES (?, ?, ?, ?)", ends)
-            db.executemany(
-                """INSERT INTO wanted_pair SELECT ?, ?, ?, id, ?, ?, '' FROM pair
-                WHERE image0 = ? AND image1 = ? AND turns0 = ? AND turns1 = ?""",
-                map(_wanted_row, count(), pairs),
-            )
+            ids = {tuple(row)[1:]: row["id"] for row in db.execute("SELECT * FROM pair")}
+            for position, (each, end) in enumerate(zip(pairs, ends, strict=True)):
+                asked = {"id": each.pair.id, "batch": each.pair.group, "settings": each.settings}
+                insert(db, "wanted_pair", position=position, pair=ids[end], has_row=each.has_row, **asked)
 
         self._write(write)
 
+    @reading
     def digests(self) -> dict[str, str]:
         """Return the digest of each image of a wanted pair that was looked at, by name."""
         query = """SELECT DISTINCT image.name, digest FROM wanted_pair w JOIN pair ON pair.id = w.pair
             JOIN image ON image.name IN (image0, image1)"""
-        with undamaged(self.path):
-            return dict(self._rows(query))
+        return dict(map(tuple, self._rows(query)))
 
     # The state of the run
 
+    @reading
     def twins(self) -> dict[int, tuple[int, ...]]:
         """Return the positions of pairs that several rows name, by each of these positions."""
         query = "SELECT group_concat(position) FROM wanted_pair GROUP BY pair HAVING count(*) > 1"
-        with undamaged(self.path):
-            groups = [tuple(map(int, row[0].split(","))) for row in self._rows(query)]
+        groups = [tuple(map(int, row[0].split(","))) for row in self._rows(query)]
         return {position: group for group in groups for position in group}
 
-    def had(self, positions: Iterable[int] | None = None) -> Iterator[tuple[int, int, int]]:
-        """Yield (position, number of the unit, matches) of the current points, of all pairs or of these."""
-        yield from self._of("SELECT position, number, matches FROM current_points", positions)
+    @reading
+    def had(self, positions: Iterable[int] | None = None) -> list[sqlite3.Row]:
+        """Return position, number of the unit and matches of the current points, of all pairs or of these."""
+        return self._of("SELECT position, number, matches FROM current_points", positions)
 
-    def estimated(self, positions: Iterable[int] | None = None) -> Iterator[tuple[int, bytes, int, str]]:
-        """Yield (position, F, inliers, failure) of the standing estimates."""
-        query = "SELECT position, F, inliers, failure FROM standing_estimate"
-        for position, F, inliers, failure in self._of(query, positions):
-            yield position, F, sum(map(int, inliers.split())), failure
+    @reading
+    def estimated(self, positions: Iterable[int] | None = None) -> list[sqlite3.Row]:
+        """Return position, F, inliers, failure and whether it is current, of the standing estimates."""
+        return self._of("SELECT position, F, inliers, failure, is_current FROM standing_estimate", positions)
 
-    def currently_estimated(self, positions: Iterable[int] | None = None) -> Iterator[int]:
-        """Yield the positions of the pairs whose estimate is current."""
-        yield from (position for (position,) in self._of("SELECT position FROM current_estimate", positions))
-
-    def chosen(self) -> Iterator[tuple[int, Choice]]:
-        """Yield (position, choice) of the standing scenes."""
-        with undamaged(self.path):
-            yield from self._choices().items()
-
+    @reading
     def batch_inputs(self, batch: str) -> str:
         """Return the revisions that a scene of a batch would be computed from now."""
-        with undamaged(self.path):
-            rows = self._rows("SELECT inputs FROM batch_inputs WHERE batch = ?", batch)
-            return str(rows[0][0] or "") if rows else ""
+        rows = self._rows("SELECT inputs FROM batch_inputs WHERE batch = ?", batch)
+        return str(rows[0]["inputs"] or "") if rows else ""
 
+    @reading
     def current_scenes(self) -> set[str]:
-        with undamaged(self.path):
-            return {batch for (batch,) in self._rows("SELECT batch FROM current_scene")}
+        return {row["batch"] for row in self._rows("SELECT batch FROM standing_scene WHERE is_current")}
 
-    def _of(self, query: str, positions: Iterable[int] | None) -> Iterator[Any]:
-        with undamaged(self.path):
-            if positions is None:
-                yield from self._db.execute(query)
-            else:
-                for position in positions:
-                    yield from self._db.execute(f"{query} WHERE position = ?", [position])
+    def _of(self, query: str, positions: Iterable[int] | None) -> list[sqlite3.Row]:
+        if positions is None:
+            return self._rows(query)
+        return [row for position in positions for row in self._rows(f"{query} WHERE position = ?", position)]
 
     # Results
 
@@ -164,56 +158,36 @@ class Journal(JournalReader):
 
         def write(db: sqlite3.Connection) -> None:
             for outcome in outcomes:
+                pair = wanted(db, outcome.index)["pair"]
                 failure = [printable(outcome.failure), outcome.index]
                 db.execute("UPDATE wanted_pair SET failure = ? WHERE position = ?", failure)
                 for image in outcome.images:
-                    row = (printable(image.name), image.digest, *image.size, image.focal)
-                    db.execute("REPLACE INTO image VALUES (?, ?, ?, ?, ?)", row)
-                digests = [image.digest for image in outcome.images]
+                    width, height = image.size
+                    names = {"name": image.name, "digest": image.digest, "focal": image.focal}
+                    insert(db, "image", width=width, height=height, **names)
+                seconds = {"decode_seconds": outcome.decode_seconds, "cluster_seconds": outcome.cluster_seconds}
                 for found in outcome.found:
-                    values = (
-                        (outcome.decode_seconds, outcome.cluster_seconds) if found is outcome.found[0] else (0, 0)
-                    )
-                    (revision,) = db.execute(
-                        f"""REPLACE INTO points (pair, settings, digest0, digest1, matches, keypoints,
-                        decode_seconds, cluster_seconds, encode_seconds, match_seconds, failure, note, points)
-                        SELECT pair, {", ".join("?" * 12)} FROM wanted_pair WHERE position = ?
-                        RETURNING revision""",
-                        (
-                            *(settings[found.unit.name], *digests, found.matches, found.keypoints, *values),
-                            *(found.encode_seconds, found.match_seconds, printable(found.failure)),
-                            *(printable(found.note), found.points, outcome.index),
-                        ),
-                    ).fetchone()
-                    for number, region in enumerate((outcome.regions or ()) if found.unit.stage == 2 else ()):
-                        box = astuple(region.box)
-                        values = (revision, number, *box, region.reason, region.clusters, region.kept)
-                        db.execute(f"INSERT INTO region VALUES ({', '.join('?' * 9)})", values)
+                    row = columns(found, "unit", "warm_up")
+                    digests = {f"digest{side}": image.digest for side, image in enumerate(outcome.images)}
+                    row |= {"pair": pair, "settings": settings[found.unit.name], **digests, **seconds}
+                    revision = insert(db, "points", **row)
+                    seconds = dict.fromkeys(seconds, 0.0)  # the pair's, in its first row
+                    for side, region in enumerate((outcome.regions or ()) if found.unit.stage == 2 else ()):
+                        row = columns(region, "box") | columns(region.box)
+                        insert(db, "region", points=revision, image=side, **row)
 
         self._write(write)
 
     def save_estimates(self, estimates: Iterable[Estimated]) -> None:
-        rows = [
-            (
-                *(joined(each.inputs), joined(each.inliers)),
-                *(
-                    each.F.tobytes(),
-                    None if each.magsac is None else each.magsac.tobytes(),
-                    printable(each.failure),
-                ),
-                *(each.stats.support, each.stats.candidates, each.stats.cost, each.stats.magsac_cost),
-                *(*each.stats.focals, float_bytes(each.stats.rotation), each.seconds, each.index),
-            )
-            for each in estimates
-        ]
-        self._write(
-            lambda db: db.executemany(
-                f"""REPLACE INTO estimate (pair, settings, inputs, inliers, F, magsac, failure, support,
-                candidates, cost, magsac_cost, focal0, focal1, rotation, seconds)
-                SELECT pair, settings, {", ".join("?" * 13)} FROM wanted_pair WHERE position = ?""",
-                rows,
-            )
-        )
+        def write(db: sqlite3.Connection) -> None:
+            for each in estimates:
+                pair, stats = wanted(db, each.index), each.stats
+                row = columns(each, "index", "stats") | columns(stats, "focals", "rotation")
+                row |= {"focal0": stats.focals[0], "focal1": stats.focals[1], "rotation": floats(stats.rotation)}
+                row |= {"pair": pair["pair"], "settings": pair["settings"]}
+                insert(db, "estimate", **row)
+
+        self._write(write)
 
     def save_scene(
         self, scene: SceneRecord, inputs: str, pairs: Sequence[PairPoints], choices: Sequence[Choice]
@@ -221,26 +195,19 @@ class Journal(JournalReader):
         """Save the reconstruction of a batch with the choices for its pairs."""
 
         def write(db: sqlite3.Connection) -> None:
-            head = (scene.images, scene.registered, scene.models, scene.points, scene.seconds)
-            (revision,) = db.execute(
-                f"""REPLACE INTO scene (batch, settings, inputs, images, registered, models, points, seconds,
-                failure) SELECT batch, settings, {", ".join("?" * 7)} FROM wanted_batch WHERE batch = ?
-                RETURNING revision""",
-                (inputs, *head, printable(scene.failure), scene.batch),
-            ).fetchone()
+            (asked,) = db.execute("SELECT settings FROM wanted_batch WHERE batch = ?", [printable(scene.batch)])
+            row = columns(scene, "cameras", "clouds")
+            revision = insert(db, "scene", settings=asked["settings"], inputs=inputs, **row)
             for camera in scene.cameras:
-                axes = map(float_bytes, (camera.centre, camera.forward, camera.down))
-                sigmas = camera.sigmas or (None, None, None)
-                values = (camera.model, *axes, camera.focal, *camera.size, camera.seen, *sigmas)
-                row = (revision, printable(camera.image), camera.digest, *values)
-                db.execute(f"INSERT INTO camera VALUES ({', '.join('?' * 14)})", row)
+                row = columns(camera, "size", "sigmas")
+                row |= {name: floats(row[name]) for name in ("centre", "forward", "down")}
+                row |= dict(zip(SIGMAS, camera.sigmas, strict=False))  # all or none
+                insert(db, "camera", scene=revision, width=camera.size.width, height=camera.size.height, **row)
             for model, cloud in enumerate(scene.clouds):
-                db.execute("INSERT INTO cloud VALUES (?, ?, ?)", (revision, model, float_bytes(cloud)))
-            rows = (
-                (revision, joined(pair.revisions), chosen.reason, blob_of(chosen.F), pair.index)
-                for pair, chosen in zip(pairs, choices, strict=True)
-            )
-            db.executemany("REPLACE INTO choice SELECT ?, pair, ?, ?, ? FROM wanted_pair WHERE position = ?", rows)
+                insert(db, "cloud", scene=revision, model=model, points=floats(cloud))
+            for pair, chosen in zip(pairs, choices, strict=True):
+                row = {"pair": wanted(db, pair.index)["pair"], "inputs": pair.revisions} | columns(chosen)
+                insert(db, "choice", scene=revision, **row)
 
         self._write(write)
 
@@ -249,15 +216,14 @@ class Journal(JournalReader):
         self._write(lambda db: db.execute("DELETE FROM scene WHERE batch = ?", [batch]))
 
     def save_feature(self, digest: str, settings: str, value: bytes) -> None:
-        self._write(lambda db: db.execute("REPLACE INTO feature VALUES (?, ?, ?)", [digest, settings, value]))
+        self._write(lambda db: insert(db, "feature", digest=digest, settings=settings, value=value))
 
     def note(self, event: Event) -> None:
         """Note an event; it is lost if the journal cannot be written."""
-        values = [event.kind, event.seconds, printable(event.text)]
         with suppress(sqlite3.Error):
-            self._db.execute("INSERT INTO event (kind, seconds, text) VALUES (?, ?, ?)", values)
+            insert(self._db, "event", **columns(event))
 
-    def _write(self, write: Any) -> None:
+    def _write(self, write: Callable[[sqlite3.Connection], object]) -> None:
         """Run a transaction. If the file takes no more, continue in memory."""
         try:
             self._transact(write)
@@ -270,12 +236,12 @@ class Journal(JournalReader):
 
     def continue_in_memory(self) -> None:
         """Copy everything into memory, and write there from now on."""
-        memory = sqlite3.connect(":memory:", isolation_level=None)
+        memory = connected(":memory:")
         self._file.backup(memory)
         memory.execute("PRAGMA foreign_keys = ON")
         self._db = memory
 
-    def _transact(self, write: Any) -> None:
+    def _transact(self, write: Callable[[sqlite3.Connection], object]) -> None:
         with self._db:
             self._db.execute("BEGIN")
             write(self._db)
@@ -294,26 +260,43 @@ class Journal(JournalReader):
         self._db.execute("PRAGMA foreign_keys = ON")
 
 
-def _wanted_row(position: int, wanted: WantedPair) -> tuple[Any, ...]:
-    pair, ends = wanted.pair, (*map(printable, wanted.names), *wanted.pair.turns)
-    return position, printable(pair.id), printable(pair.group), wanted.settings, wanted.has_row, *ends
+SIGMAS = ("rotation_sigma", "centre_sigma", "focal_sigma")
 
 
-def joined(numbers: Iterable[int]) -> str:
-    return " ".join(map(str, numbers))
+def insert(db: sqlite3.Connection, table: str, **row: Any) -> int:
+    """Insert or replace a row, values by the names of columns. Return its number."""
+    names, marks = ", ".join(f'"{name}"' for name in row), ", ".join("?" * len(row))
+    query = f"REPLACE INTO {table} ({names}) VALUES ({marks}) RETURNING rowid"
+    return int(db.execute(query, list(map(stored, row.values()))).fetchone()[0])
 
 
-def blob_of(F: Matrix3 | None) -> bytes | None:
-    return None if F is None else F.tobytes()
+def columns(value: Any, *without: str) -> dict[str, Any]:
+    """Return the fields of a dataclass, which have the names of columns, except some."""
+    return {name: item for name, item in vars(value).items() if name not in without}
 
 
-def float_bytes(values: Any) -> bytes:
+def stored(value: Any) -> Any:
+    """Return a value as its column stores it: a matrix as bytes, numbers of rows as a text."""
+    if isinstance(value, str):
+        return printable(value)
+    if isinstance(value, np.ndarray):
+        return value.tobytes()
+    return " ".join(map(str, value)) if isinstance(value, tuple) else value
+
+
+def floats(values: Any) -> bytes:
     return np.asarray(values, np.float64).tobytes()
 
 
-def connect(path: Path) -> sqlite3.Connection:
+def wanted(db: sqlite3.Connection, position: int) -> sqlite3.Row:
+    """Return the row of a pair that the run asks for."""
+    row: sqlite3.Row = db.execute("SELECT * FROM wanted_pair WHERE position = ?", [position]).fetchone()
+    return row
+
+
+def opened_file(path: Path) -> sqlite3.Connection:
     """Open a database to write. Raise :class:`UserError` if that is impossible."""
     if path.exists() and not path.is_file():
         raise UserError(f"{path} is not a regular file; remove it, or name another --work-dir")
     with undamaged(path):
-        return sqlite3.connect(path, timeout=1.0, isolation_level=None)
+        return connected(str(path))

@@ -6,15 +6,13 @@
 import json
 import os
 import sqlite3
-import zlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, closing, contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields
 from enum import StrEnum
-from itertools import groupby
-from operator import itemgetter
+from functools import wraps
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Self, TypeVar, cast
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.budget import format_duration
@@ -28,23 +26,23 @@ from mkpc_kaggle.geometry.robust import EstimateStats
 from mkpc_kaggle.scene.choose import Choice, Reason
 from mkpc_kaggle.scene.view_graph import BatchImage
 
-FORMAT = 11
+FORMAT = 12
 FILE_NAME = "journal.sqlite"
-LOCK_NAME = "journal.lock"
-SCHEMA = Path(__file__).with_name("schema.sql")
-MIN_SQLITE = (3, 37, 0)  # STRICT tables
-
-UNITS = """SELECT position, revision, decode_seconds, cluster_seconds, unit, stage, matches, encode_seconds,
-    match_seconds, failure, note, keypoints FROM current_points ORDER BY position, number"""
 
 # SQLite's primary result codes that say nothing against a file: no permission, busy, locked, read only, input or
 # output failed, full, cannot be opened.
 UNUSABLE = {3, 5, 6, 8, 10, 13, 14}
 # Errors of reading what no run writes.
-DAMAGE = (
-    *(sqlite3.Error, zlib.error, ValueError, TypeError),
-    *(LookupError, AttributeError, ArithmeticError, RecursionError),
-)
+DAMAGE = (sqlite3.Error, ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RecursionError)
+
+UNIT_COLUMNS = tuple(each.name for each in fields(UnitRecord) if each.name != "inliers")
+UNITS = f"""SELECT position, revision, decode_seconds, cluster_seconds, {", ".join(UNIT_COLUMNS)}
+    FROM current_points ORDER BY position, number"""
+SCENE_COLUMNS = tuple(each.name for each in fields(SceneRecord) if each.name not in ("cameras", "clouds"))
+REGIONS = """SELECT position, r.* FROM current_points c JOIN region r ON r.points = c.revision
+    ORDER BY position, c.number DESC, r.image"""  # the first unit of stage 2 comes last
+
+Method = TypeVar("Method", bound=Callable[..., Any])
 
 
 class EventKind(StrEnum):
@@ -92,26 +90,36 @@ def undamaged(path: Path, advice: str = "delete it with --fresh") -> Iterator[No
         raise UserError(f"{path} is damaged ({error}); {advice}") from error
 
 
+def reading(read: Method) -> Method:
+    """Decorate a method that reads a journal, which may be damaged."""
+
+    @wraps(read)
+    def checked(self: Any, *args: Any) -> Any:
+        with undamaged(self.path):
+            return read(self, *args)
+
+    return cast(Method, checked)
+
+
 class JournalReader:
     """The journal of a work directory at one moment; a run may be writing to it meanwhile.
 
-    Raises :class:`UserError` if the file is missing, damaged, or of another format.
+    All methods raise :class:`UserError` if the file is missing, damaged, or of another format. A position is the
+    index of a pair among all pairs that the run asked for.
     """
 
     path: Path
     _db: sqlite3.Connection
 
     def __init__(self, directory: Path, *, check: bool = True) -> None:
-        path = directory / FILE_NAME
+        self.path = path = directory / FILE_NAME
         if not path.is_file():
             raise UserError(f"{directory} has no {FILE_NAME}: name the work directory of a run (NAME.work)")
         # A directory that cannot be written has no room for SQLite's locks, and needs none.
         mode = "mode=ro" if os.access(directory, os.W_OK) else "mode=ro&immutable=1"
         with ExitStack() as opened, undamaged(path):
-            uri = f"{path.resolve().as_uri()}?{mode}"
-            db = opened.enter_context(closing(sqlite3.connect(uri, uri=True, timeout=5.0, isolation_level=None)))
-            db.execute("BEGIN")
-            self.path, self._db = path, db
+            self._db = opened.enter_context(closing(connected(f"{path.resolve().as_uri()}?{mode}", timeout=5.0)))
+            self._db.execute("BEGIN")
             if check:
                 self._check()
             opened.pop_all()
@@ -125,129 +133,114 @@ class JournalReader:
     def close(self) -> None:
         self._db.close()
 
+    @reading
     def about(self) -> About:
-        with undamaged(self.path):
-            values = json.loads(*self._rows("SELECT value FROM about")[0])
-            return About(**{**values, "left_out": tuple(values["left_out"])})
+        values = json.loads(self._rows("SELECT value FROM about")[0]["value"])
+        return About(**{**values, "left_out": tuple(values["left_out"])})
 
+    @reading
     def events(self) -> tuple[Event, ...]:
         """Return all events of all sessions, in order."""
-        with undamaged(self.path):
-            return tuple(
-                Event(*row) for row in self._rows("SELECT kind, seconds, text FROM event ORDER BY number")
-            )
+        return tuple(Event(*row) for row in self._rows("SELECT kind, seconds, text FROM event ORDER BY number"))
 
+    @reading
     def pairs(self) -> tuple[Pair, ...]:
         """Return the pairs that have a row, in order, with the names of their images for files."""
         query = """SELECT w.id, batch, image0, image1, turns0, turns1 FROM wanted_pair w
             JOIN pair ON pair.id = w.pair WHERE has_row ORDER BY position"""
-        with undamaged(self.path):
-            rows = self._rows(query)
-            return tuple(Pair(n, b, f0, f1, turns=(t0, t1)) for n, b, f0, f1, t0, t1 in rows)
+        return tuple(Pair(n, b, f0, f1, turns=(t0, t1)) for n, b, f0, f1, t0, t1 in self._rows(query))
 
+    @reading
     def records(self) -> list[PairRecord]:
         """Return a record of each pair that has a row, in order."""
-        with undamaged(self.path):
-            query = "SELECT position, failure FROM wanted_pair WHERE has_row ORDER BY position"
-            values: dict[int, dict[str, Any]] = {
-                n: {"failure": why or NOT_REACHED} for n, why in self._rows(query)
+        pairs = self._rows("SELECT failure, has_row FROM wanted_pair ORDER BY position")
+        values: list[dict[str, Any]] = [{"failure": pair["failure"] or NOT_REACHED} for pair in pairs]
+        inliers: dict[int, int] = {}
+        for row in self._rows("SELECT * FROM standing_estimate"):
+            inliers |= zip(map(int, row["inputs"].split()), map(int, row["inliers"].split()), strict=True)
+            values[row["position"]] |= {
+                "pair_fundamental": matrix_of(row["F"]),
+                "magsac_fundamental": None if row["magsac"] is None else matrix_of(row["magsac"]),
+                "failure": row["failure"],
+                "estimate_seconds": row["seconds"],
+                "stats": _stats(row),
             }
-            inliers: dict[int, int] = {}
-            for position, inputs, counts, F, magsac, failure, seconds, *stats, rotation in self._rows(
-                """SELECT position, inputs, inliers, F, magsac, failure, seconds, candidates, cost, magsac_cost,
-                focal0, focal1, support, rotation FROM standing_estimate"""
-            ):
-                if position in values:
-                    inliers |= zip(map(int, inputs.split()), map(int, counts.split()), strict=True)
-                    values[position] |= {
-                        "pair_fundamental": matrix_of(F),
-                        "magsac_fundamental": None if magsac is None else matrix_of(magsac),
-                        "failure": failure,
-                        "estimate_seconds": seconds,
-                        "stats": EstimateStats(
-                            *(stats[0], stats[1], stats[2], (stats[3], stats[4]), stats[5]),
-                            rotation=tuple(vector_of(rotation).tolist()),
-                        ),
-                    }
-            for position, units in groupby(self._rows(UNITS), itemgetter(0)):
-                if position in values:
-                    values[position] |= _units(list(units), inliers)
-            regions, choices = self._regions(), self._choices()
-            return [
-                PairRecord(position, **fields, regions=regions.get(position), scene=choices.get(position))
-                for position, fields in values.items()
-            ]
+        for row in self._rows(UNITS):
+            found = values[row["position"]]
+            unit = {name: row[name] for name in UNIT_COLUMNS}
+            found.setdefault("units", []).append(UnitRecord(inliers=inliers.get(row["revision"], 0), **unit))
+            for name in ("decode_seconds", "cluster_seconds"):
+                found[name] = found.get(name, 0.0) + row[name]
+        for row in self._rows(REGIONS):
+            box = Box(row["left"], row["top"], row["right"], row["bottom"])
+            region = CriticalRegion(box, RegionReason(row["reason"]), row["clusters"], row["kept"])
+            found = values[row["position"]]
+            found["regions"] = (region,) if row["image"] == 0 else (*found["regions"], region)
+        choices = self.choices()
+        rows = range(sum(pair["has_row"] for pair in pairs))
+        return [PairRecord(position, scene=choices.get(position), **values[position]) for position in rows]
 
+    @reading
+    def choices(self) -> dict[int, Choice]:
+        """Return the choices of the standing scenes by the positions of their pairs."""
+        query = """SELECT w.position, c.F, c.reason FROM standing_scene s JOIN choice c ON c.scene = s.revision
+            JOIN wanted_pair w ON w.pair = c.pair AND w.batch = s.batch"""
+        return {
+            position: Choice(None if F is None else matrix_of(F), Reason(why))
+            for position, F, why in self._rows(query)
+        }
+
+    @reading
     def scenes(self) -> dict[str, SceneRecord]:
         """Return the standing reconstruction of each batch that has one."""
-        with undamaged(self.path):
-            scenes = {}
-            for revision, *row in self._rows(
-                """SELECT revision, batch, images, registered, models, points, seconds, failure FROM standing_scene
-                ORDER BY batch"""
-            ):
-                cameras = self._rows("SELECT * FROM camera WHERE scene = ? ORDER BY rowid", revision)
-                clouds = self._rows("SELECT points FROM cloud WHERE scene = ? ORDER BY model", revision)
-                drawn = tuple(map(_camera, cameras)), tuple(map(_cloud, clouds))
-                scenes[row[0]] = replace(SceneRecord(*row), cameras=drawn[0], clouds=drawn[1])
-            return scenes
+        scenes = {}
+        for scene in self._rows("SELECT * FROM standing_scene ORDER BY batch"):
+            cameras = self._rows("SELECT * FROM camera WHERE scene = ? ORDER BY rowid", scene["revision"])
+            clouds = self._rows("SELECT points FROM cloud WHERE scene = ? ORDER BY model", scene["revision"])
+            scenes[scene["batch"]] = SceneRecord(
+                **{name: scene[name] for name in SCENE_COLUMNS},
+                cameras=tuple(map(_camera, cameras)),
+                clouds=tuple(_points(row["points"]) for row in clouds),
+            )
+        return scenes
 
+    @reading
     def points(self, revisions: Iterable[int]) -> dict[int, Matches]:
         """Return the points of these rows, by revision."""
-        with undamaged(self.path):
-            return {revision: from_blob(blob) for revision, blob in self.blobs(revisions).items()}
+        return {revision: from_blob(blob) for revision, blob in self.blobs(revisions).items()}
 
+    @reading
     def blobs(self, revisions: Iterable[int]) -> dict[int, bytes]:
-        with undamaged(self.path):
-            query = "SELECT points FROM points WHERE revision = ?"
-            return {revision: self._rows(query, revision)[0][0] for revision in revisions}
+        query = "SELECT points FROM points WHERE revision = ?"
+        return {revision: self._rows(query, revision)[0]["points"] for revision in revisions}
 
+    @reading
     def inputs(self, position: int) -> dict[str, int]:
         """Return the revisions of a pair's current points by unit, in the recipe's order."""
         query = "SELECT unit, revision FROM current_points WHERE position = ? ORDER BY number"
-        with undamaged(self.path):
-            return dict(self._rows(query, position))
+        return dict(map(tuple, self._rows(query, position)))
 
+    @reading
     def images(self, position: int) -> tuple[BatchImage, ...]:
         """Return both images of a pair as they were last looked at, or nothing."""
-        query = """SELECT name, digest, width, height, focal FROM wanted_pair w JOIN pair ON pair.id = w.pair
-            JOIN image ON image.name = {} WHERE position = ?"""
-        with undamaged(self.path):
-            rows = [row for end in ("image0", "image1") for row in self._rows(query.format(end), position)]
-            images = tuple(BatchImage(name, digest, Size(w, h), focal) for name, digest, w, h, focal in rows)
-            return images if len(images) == 2 else ()
+        query = """SELECT i.* FROM wanted_pair w JOIN pair ON pair.id = w.pair
+            JOIN image i ON i.name = {} WHERE position = ?"""
+        rows = [row for end in ("image0", "image1") for row in self._rows(query.format(end), position)]
+        images = tuple(BatchImage(name, digest, Size(w, h), focal) for name, digest, w, h, focal in rows)
+        return images if len(images) == 2 else ()
 
+    @reading
     def feature(self, digest: str, settings: str) -> bytes | None:
         """Return the features saved under a key, or ``None``."""
-        with undamaged(self.path):
-            found = self._rows("SELECT value FROM feature WHERE digest = ? AND settings = ?", digest, settings)
-        return found[0][0] if found else None
+        found = self._rows("SELECT value FROM feature WHERE digest = ? AND settings = ?", digest, settings)
+        return found[0]["value"] if found else None
 
-    def _regions(self) -> dict[int, Any]:
-        """The critical regions of each pair's first unit of stage 2."""
-        found: dict[int, dict[int, CriticalRegion]] = {}
-        for position, image, *box, reason, clusters, kept in self._rows(
-            """SELECT position, r.image, r."left", r.top, r."right", r.bottom, r.reason, r.clusters, r.kept
-            FROM current_points c JOIN region r ON r.points = c.revision ORDER BY position, c.number DESC"""
-        ):
-            region = CriticalRegion(Box(*box), RegionReason(reason), clusters, kept)
-            found.setdefault(position, {})[image] = region
-        return {position: (both[0], both[1]) for position, both in found.items()}
-
-    def _choices(self) -> dict[int, Choice]:
-        rows = self._rows(
-            """SELECT w.position, c.F, c.reason FROM standing_scene s JOIN choice c ON c.scene = s.revision
-            JOIN wanted_pair w ON w.pair = c.pair AND w.batch = s.batch"""
-        )
-        return {position: Choice(None if F is None else matrix_of(F), Reason(why)) for position, F, why in rows}
-
-    def _rows(self, query: str, *values: Any) -> list[Any]:
+    def _rows(self, query: str, *values: Any) -> list[sqlite3.Row]:
         return self._db.execute(query, values).fetchall()
 
     def _check(self) -> None:
         """Raise :class:`UserError` for a journal of another format, ``sqlite3.Error`` for a damaged journal."""
-        (written,) = self._rows("PRAGMA user_version")[0]
-        if written != FORMAT:
+        if self._rows("PRAGMA user_version")[0][0] != FORMAT:
             raise UserError(
                 f"{self.path} was written by another version of this program (its format is not {FORMAT}). "
                 "Use that version, delete it with --fresh, or name another --work-dir."
@@ -256,19 +249,26 @@ class JournalReader:
             raise sqlite3.DatabaseError(trouble)
 
 
-def _units(rows: Sequence[Any], inliers: Mapping[int, int]) -> dict[str, Any]:
-    """The fields of a :class:`PairRecord` that come from rows of the query :data:`UNITS`."""
-    units = tuple(UnitRecord(row[4], row[5], row[6], inliers.get(row[1], 0), *row[7:]) for row in rows)
-    decode, cluster = (sum(row[column] for row in rows) for column in (2, 3))
-    return {"units": units, "decode_seconds": decode, "cluster_seconds": cluster}
+def connected(uri: str, timeout: float = 1.0) -> sqlite3.Connection:
+    """Return a connection whose rows have names, without transactions of Python's own."""
+    db = sqlite3.connect(uri, uri=uri.startswith("file:"), timeout=timeout, isolation_level=None)
+    db.row_factory = sqlite3.Row
+    return db
 
 
-def _camera(row: Sequence[Any]) -> CameraRecord:
-    _, image, digest, model, *axes, focal, width, height, seen, rotation, centre_sigma, focal_sigma = row
-    centre, forward, down = (tuple(vector_of(blob).tolist()) for blob in axes)
-    sigmas = () if rotation is None else (rotation, centre_sigma, focal_sigma)
-    return CameraRecord(image, digest, model, centre, forward, down, focal, Size(width, height), seen, sigmas)
+def _stats(row: sqlite3.Row) -> EstimateStats:
+    focals, rotation = (row["focal0"], row["focal1"]), tuple(vector_of(row["rotation"]).tolist())
+    return EstimateStats(row["candidates"], row["cost"], row["magsac_cost"], focals, row["support"], rotation)
 
 
-def _cloud(row: Sequence[Any]) -> tuple[Any, ...]:
-    return tuple(map(tuple, vector_of(row[0]).reshape(-1, 3).tolist()))
+def _camera(row: sqlite3.Row) -> CameraRecord:
+    centre, forward, down = (_points(row[name])[0] for name in ("centre", "forward", "down"))
+    sigmas = (row["rotation_sigma"], row["centre_sigma"], row["focal_sigma"])
+    size = Size(row["width"], row["height"])
+    pose = row["model"], centre, forward, down
+    known = () if None in sigmas else sigmas
+    return CameraRecord(row["image"], row["digest"], *pose, row["focal"], size, row["seen"], known)
+
+
+def _points(blob: bytes) -> tuple[Any, ...]:
+    return tuple(map(tuple, vector_of(blob).reshape(-1, 3).tolist()))

@@ -47,7 +47,7 @@ class PairRecord:
     index: int
     pair_fundamental: Matrix3 = field(default_factory=FALLBACK_FUNDAMENTAL.copy)
     failure: str = NOT_REACHED
-    units: tuple[UnitRecord, ...] = ()
+    units: Sequence[UnitRecord] = ()
     regions: Regions | None = None
     decode_seconds: float = 0.0
     cluster_seconds: float = 0.0

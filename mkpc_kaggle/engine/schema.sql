@@ -65,7 +65,7 @@ CREATE TABLE points (  -- of a unit on a pair, from the contents of two images
     match_seconds REAL NOT NULL,
     failure TEXT NOT NULL,
     note TEXT NOT NULL,
-    points BLOB NOT NULL,
+    points BLOB NOT NULL CHECK (length(points) = 20 * matches),  -- x0, y0, x1, y1, score: float32, match by match
     UNIQUE (pair, settings)
 ) STRICT;
 
@@ -183,11 +183,6 @@ SELECT w.position, w.pair, w.batch, w.settings, (
 ) AS inputs
 FROM wanted_pair w;
 
-CREATE VIEW current_estimate AS
-SELECT i.position, e.*
-FROM pair_inputs i
-JOIN estimate e ON e.pair = i.pair AND e.settings = i.settings AND e.inputs = i.inputs;
-
 CREATE VIEW batch_inputs AS
 SELECT b.batch, b.settings, (
     SELECT group_concat(part, ' ')
@@ -201,14 +196,11 @@ SELECT b.batch, b.settings, (
 ) AS inputs
 FROM wanted_batch b;
 
-CREATE VIEW current_scene AS
-SELECT s.* FROM batch_inputs b JOIN scene s ON s.batch = b.batch AND s.settings = b.settings AND s.inputs = b.inputs;
-
 -- Until a current row exists, the latest row stands in for it, while the first points that it was computed from are current.
 -- A cast takes the first number of a list.
 
 CREATE VIEW standing_estimate AS
-SELECT i.position, e.*
+SELECT i.position, e.settings = i.settings AND e.inputs = i.inputs AS is_current, e.*
 FROM pair_inputs i
 JOIN estimate e ON e.revision = coalesce(
     (SELECT c.revision FROM estimate c WHERE c.pair = i.pair AND c.settings = i.settings AND c.inputs = i.inputs),
@@ -220,7 +212,7 @@ JOIN estimate e ON e.revision = coalesce(
 );
 
 CREATE VIEW standing_scene AS
-SELECT s.*
+SELECT s.settings = b.settings AND s.inputs = b.inputs AS is_current, s.*
 FROM batch_inputs b
 JOIN scene s ON s.revision = coalesce(
     (SELECT c.revision FROM scene c WHERE c.batch = b.batch AND c.settings = b.settings AND c.inputs = b.inputs),

@@ -53,13 +53,13 @@ class State:
 
     def read_choices(self) -> None:
         """Read which pairs have the F of their scene."""
-        self.by_scene = {n: choice.F for n, choice in self._journal.chosen() if choice.F is not None}
+        self.by_scene = {n: choice.F for n, choice in self._journal.choices().items() if choice.F is not None}
 
     def _read(self, positions: list[int] | None) -> None:
         for position, unit, matches in self._journal.had(positions):
             self.had[position, unit] = True
             self.matches[position] += matches
-        for position, F, inliers, failure in self._journal.estimated(positions):
-            self.own[position], self.inliers[position], self.has_own[position] = matrix_of(F), inliers, not failure
-        for position in self._journal.currently_estimated(positions):
-            self.is_estimated[position] = True
+        for position, F, inliers, failure, is_current in self._journal.estimated(positions):
+            self.own[position], self.has_own[position] = matrix_of(F), not failure
+            self.inliers[position] = sum(map(int, inliers.split()))
+            self.is_estimated[position] = is_current
