@@ -15,7 +15,7 @@ from typing import Any, NoReturn, TextIO
 from tqdm import tqdm
 
 from mkpc_kaggle.engine.budget import Budget, format_duration
-from mkpc_kaggle.engine.streams import DRAIN_S, drain
+from mkpc_kaggle.engine.streams import DRAIN_S, columns, drain
 
 LINE_INTERVAL_S = 30.0  # between lines of progress where a bar cannot be drawn again
 
@@ -46,20 +46,16 @@ def leave(status: int, seconds: float = DRAIN_S) -> NoReturn:
     os._exit(status)
 
 
-def redraws(stream: TextIO) -> bool:
-    """Whether a bar on the stream can be drawn again.
-
-    The children of a notebook's kernel (``!command``) are given a terminal, but what they write is kept: every
-    state of a bar would be stored and, in Kaggle's log, printed. Jupyter marks them with JPY_PARENT_PID.
-    """
-    return stream.isatty() and "JPY_PARENT_PID" not in os.environ
-
-
 class Progress:
-    """How many pairs (``unit``) of a phase are done: a bar on a terminal, a line now and then anywhere else."""
+    """How many pairs (``unit``) of a phase are done: a bar on a terminal, a line now and then anywhere else.
+
+    The children of a notebook's kernel (``!command``) have a terminal whose text is stored, each state of a bar
+    with it. Jupyter marks them with JPY_PARENT_PID.
+    """
 
     def __init__(self, budget: Budget, stream: TextIO | None, unit: str = "pair") -> None:
         self._budget, self._stream, self._unit = budget, stream, unit
+        self._columns = columns(stream) if stream is not None and "JPY_PARENT_PID" not in os.environ else 0
         self._bar: tqdm[Any] | None = None
         self._phase = self._waiting = ""
         self._written = budget.clock()
@@ -70,7 +66,7 @@ class Progress:
             return
         began, self._phase = phase != self._phase, phase
         left = f"budget left {format_duration(self._budget.left())}" if isfinite(self._budget.time_limit) else ""
-        if redraws(self._stream):
+        if self._columns:
             with suppress(OSError, ValueError):
                 self._draw(phase if began else "", done, total, left)
             return
@@ -98,7 +94,8 @@ class Progress:
         if began:
             self.close()
             # With a delay, nothing is drawn before the bar is whole: a dead terminal left half a bar.
-            self._bar = tqdm(total=total, desc=began, unit=self._unit, file=self._stream, delay=1e-9)
+            width = self._columns
+            self._bar = tqdm(total=total, desc=began, unit=self._unit, file=self._stream, ncols=width, delay=1e-9)
         if self._bar is not None:
             self._bar.set_postfix_str(left, refresh=False)
             self._bar.update(done - self._bar.n)
