@@ -1,6 +1,5 @@
 """Whatever becomes of a worker's process, and however large its job is, no call blocks and the reason is told."""
 
-import errno
 import multiprocessing
 import os
 import select
@@ -10,7 +9,6 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from functools import partial
-from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +18,6 @@ from faulty import ScenesBy, choose_scene_for_all_but_the_first, on_fork
 
 from mkpc_kaggle.engine.jobs import Cause, Failure, Loaded, SceneJob
 from mkpc_kaggle.engine.process import WORKER_ENVIRONMENT, ProcessWorker
-from mkpc_kaggle.engine.streams import unblocked
-from mkpc_kaggle.engine.worker import SceneRunner
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.recipe import Recipe, SceneConfig, Unit
@@ -174,21 +170,3 @@ def test_the_first_worker_of_a_program_hears_no_ctrl_c_and_is_told_not_to_spin_a
     environment = {name: value for name, value in os.environ.items() if name not in WORKER_ENVIRONMENT}
     environment |= {"GOMP_SPINCOUNT": "7", "PYTHONPATH": str(ROOT)}
     subprocess.run([sys.executable, script], env=environment, check=True)
-
-
-class GoneTerminal(StringIO):
-    def flush(self) -> None:
-        raise OSError(errno.EIO, os.strerror(errno.EIO))
-
-
-def test_a_process_starts_though_the_terminal_has_gone_away(monkeypatch):
-    """multiprocessing flushes both streams first."""
-    monkeypatch.setattr(sys, "stderr", GoneTerminal())
-    answered = threading.Event()
-    with unblocked():
-        worker = ProcessWorker("scene", SceneRunner, answered.set)
-        worker.start()
-        answered.wait()
-        answer = worker.answer()
-        worker.kill()
-    assert answer == Loaded()

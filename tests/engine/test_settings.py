@@ -1,12 +1,13 @@
 """Which settings decide which derived table."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 
 from mkpc_kaggle.engine.settings import Settings
-from mkpc_kaggle.pipeline.assembly import assemble
-from mkpc_kaggle.recipe import SceneConfig, load_recipe
+from mkpc_kaggle.pipeline.assembly import Assembly, assemble
+from mkpc_kaggle.recipe import SceneConfig, Unit, load_recipe
 
 CLASSICAL = load_recipe("classical")
 
@@ -26,3 +27,18 @@ def test_estimates_and_scenes_have_a_digest_of_their_settings(changes, estimates
     former, new = (Settings.of(assemble(recipe)) for recipe in (CLASSICAL, replace(CLASSICAL, **changes)))
     assert (former.estimate != new.estimate) == estimates_differ
     assert (former.scene != new.scene) == scenes_differ
+
+
+@pytest.mark.parametrize(("slot", "changed"), [("xfeat", [True, False, True]), ("disk", [False, True, True])])
+def test_other_weights_of_a_matcher_change_its_units_and_stage_2(monkeypatch, slot, changed):
+    units = Unit(1, "xfeat_lighterglue", 640), Unit(1, "disk_lightglue", 640), Unit(2, "sift", 640)
+    recipe = replace(CLASSICAL, units=units)
+
+    def digests(**other: str) -> tuple[str, ...]:
+        slots = {"xfeat": "same", "xfeat-lighterglue": "same", "disk": "same", "disk-lightglue": "same"} | other
+        files = {name: SimpleNamespace(digest=digest) for name, digest in slots.items()}
+        monkeypatch.setattr(Assembly, "weight_files", files)
+        return Settings.of(replace(assemble(CLASSICAL), recipe=recipe)).units
+
+    pairs = zip(digests(), digests(**{slot: "other"}), strict=True)
+    assert [former != new for former, new in pairs] == changed

@@ -103,13 +103,14 @@ def test_a_comparison_of_runs_that_failed_has_their_exit_status(demo, small_reci
     assert "gain of mAA" in printed
 
 
-def test_what_two_recipes_both_match_is_matched_once(demo, small_recipe, tmp_path, capsys):
-    other, text = tmp_path / "other.toml", small_recipe.read_text()
+def test_what_recipes_have_in_common_is_matched_once(demo, small_recipe, tmp_path, capsys):
+    other, third, text = tmp_path / "other.toml", tmp_path / "third.toml", small_recipe.read_text()
+    third.write_text(text + "\n[magsac]\nthreshold = 1.0\n")
     other.write_text(text.replace("400", "440") + "\n[focal]\nsigma = 0.3\n")
-    work_dir = tmp_path / "work"
-    assert compare(demo, "--compare", str(small_recipe), str(other), "--work-dir", str(work_dir)) == 0
+    recipes = map(str, (small_recipe, third, other))
+    assert compare(demo, "--compare", *recipes, "--work-dir", str(tmp_path / "work")) == 0
     printed = capsys.readouterr().out
-    assert re.findall(r"(\d+) units run", printed) == ["8", "4"], "the common unit runs once"
+    assert re.findall(r"(\d+) units run", printed) == ["8", "0", "4"], "each common unit runs once"
     shared = printed.split("recipe other")[-1]
     assert compare(demo, "--recipe", str(other), "--work-dir", str(tmp_path / "alone")) == 0
     scores = shared.splitlines()[1:5]
