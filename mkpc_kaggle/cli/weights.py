@@ -132,7 +132,8 @@ def files_of(name: str, store: WeightStore) -> list[list[WeightFile]]:
     if name in slots:
         return [store.alternatives(name)]
     if name in recipe_names() or name.endswith(".toml"):
-        return [store.alternatives(slot) for slot in slots_of(load_recipe(name))]
+        recipe = load_recipe(name)
+        return [store.alternatives(slot) for slot in slots_of(recipe, recipe.matcher_names)]
     raise UserError(
         f"{name!r} is neither a file of the manifest (python -m mkpc_kaggle weights list names them), nor a slot "
         f"({', '.join(slots)}), nor a recipe ({', '.join(recipe_names())})"

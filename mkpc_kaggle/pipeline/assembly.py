@@ -81,7 +81,7 @@ class Assembly:
     def unit_settings(self, unit: Unit) -> dict[str, Any]:
         """Return all settings that determine a unit's points on given views, as JSON values."""
         name = unit.matcher
-        slots = slots_of(self.recipe.only(lambda each: each.matcher == name), self.matchers)
+        slots = slots_of(self.recipe, {name} - self.matchers.keys())
         return {
             "unit": {key: value for key, value in asdict(unit).items() if key not in ("fallback", "tracks")},
             "options": None if name in self.matchers else asdict(options_of(self.recipe, name)),
@@ -96,7 +96,7 @@ class Assembly:
     @cached_property
     def weight_files(self) -> dict[str, FoundFile]:
         """Weight files of the matchers, by slot."""
-        slots = slots_of(self.recipe, self.matchers)
+        slots = slots_of(self.recipe, [name for name in self.recipe.matcher_names if name not in self.matchers])
         return {slot: file for slot in slots if (file := self.weights.find(slot))}
 
     def _load(self, name: str, placement: Placement) -> Matcher[Any]:

@@ -1,6 +1,6 @@
 """Availability of a recipe's matchers: their code, their weights, and the licences of the weights."""
 
-from collections.abc import Container, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from enum import StrEnum
@@ -114,11 +114,10 @@ def options_of(recipe: Recipe, name: str) -> Any:
     return from_table(spec_of(name, where).options, table, f"{where}, table [matchers.{name}]")
 
 
-def slots_of(recipe: Recipe, own: Container[str] = ()) -> tuple[str, ...]:
-    """Return the distinct slots of the recipe's importable matchers; matchers in ``own`` need none."""
+def slots_of(recipe: Recipe, names: Iterable[str]) -> tuple[str, ...]:
+    """Return the distinct slots of these matchers of a recipe, except those that cannot be imported."""
     slots: list[str] = []
-    for name in recipe.matcher_names:
+    for name in names:
         with suppress(UnusableError):
-            if name not in own:
-                slots += spec_of(name, f"recipe {recipe.name!r}").slots_for(options_of(recipe, name))
+            slots += spec_of(name, f"recipe {recipe.name!r}").slots_for(options_of(recipe, name))
     return tuple(dict.fromkeys(slots))

@@ -32,13 +32,13 @@ def test_estimates_and_scenes_have_a_digest_of_their_settings(changes, estimates
 @pytest.mark.parametrize(("slot", "changed"), [("xfeat", [True, False, True]), ("disk", [False, True, True])])
 def test_other_weights_of_a_matcher_change_its_units_and_stage_2(monkeypatch, slot, changed):
     units = Unit(1, "xfeat_lighterglue", 640), Unit(1, "disk_lightglue", 640), Unit(2, "sift", 640)
-    recipe = replace(CLASSICAL, units=units)
+    assembly = replace(assemble(CLASSICAL), recipe=replace(CLASSICAL, units=units))
 
     def digests(**other: str) -> tuple[str, ...]:
         slots = {"xfeat": "same", "xfeat-lighterglue": "same", "disk": "same", "disk-lightglue": "same"} | other
         files = {name: SimpleNamespace(digest=digest) for name, digest in slots.items()}
         monkeypatch.setattr(Assembly, "weight_files", files)
-        return Settings.of(replace(assemble(CLASSICAL), recipe=recipe)).units
+        return Settings.of(assembly).units
 
     pairs = zip(digests(), digests(**{slot: "other"}), strict=True)
     assert [former != new for former, new in pairs] == changed
