@@ -10,7 +10,7 @@ from contextlib import suppress
 from dataclasses import replace
 from math import inf, isfinite
 from pathlib import Path
-from typing import Self
+from typing import Self, cast
 
 from mkpc_kaggle.data.images import content_digest
 from mkpc_kaggle.engine import console
@@ -19,14 +19,14 @@ from mkpc_kaggle.engine.estimates import EstimatePlan
 from mkpc_kaggle.engine.jobs import (
     Answer,
     Cause,
+    Estimated,
     EstimateJob,
-    Estimates,
     Failure,
     Job,
     Loaded,
     LookJob,
-    Matched,
     MatchJob,
+    Outcome,
     PairPoints,
     PointSource,
     SceneJob,
@@ -288,14 +288,14 @@ class Engine:
         pairs = tuple(self.pairs[index] for index in job.indices)
         return replace(job, pairs=pairs, known=tuple(known), upcoming=tuple(upcoming))
 
-    def _take_matched(self, job: MatchJob, answer: Matched) -> None:
-        self.journal.save_outcomes(answer.outcomes, self._units)
-        self.units_run += sum(len(outcome.found) for outcome in answer.outcomes)
-        for outcome in answer.outcomes:
+    def _take_matched(self, job: MatchJob, outcomes: Sequence[Outcome]) -> None:
+        self.journal.save_outcomes(outcomes, self._units)
+        self.units_run += sum(len(outcome.found) for outcome in outcomes)
+        for outcome in outcomes:
             self.digests |= {image.name: image.digest for image in outcome.images}
-        self.scenes.note_change(self.state.refresh(outcome.index for outcome in answer.outcomes))
-        self.plan.on_result(job, answer.outcomes)
-        seconds = sum(found.seconds for outcome in answer.outcomes for found in outcome.found)
+        self.scenes.note_change(self.state.refresh(outcome.index for outcome in outcomes))
+        self.plan.on_result(job, outcomes)
+        seconds = sum(found.seconds for outcome in outcomes for found in outcome.found)
         self._note(EventKind.JOB, f"{job.phase} {len(job.indices)} pairs {seconds:.3f} s")
         self._progress.show(*self.plan.progress(self.budget.clock()))
 
@@ -306,10 +306,10 @@ class Engine:
         pairs = tuple(self._pair_points(index) for index in chosen)
         return EstimateJob(pairs, self.recipe, self._source(pairs), is_retry) if pairs else None
 
-    def _take_estimates(self, answer: Estimates) -> None:
-        self.journal.save_estimates(answer.estimates)
-        self.estimated += len(answer.estimates)
-        self.scenes.note_change(self.state.refresh(self.estimates.on_result(answer)))
+    def _take_estimates(self, estimates: Sequence[Estimated]) -> None:
+        self.journal.save_estimates(estimates)
+        self.estimated += len(estimates)
+        self.scenes.note_change(self.state.refresh(self.estimates.on_result(estimates)))
         if not self.plan.busy.any():
             rows = slice(self.state.rows)
             done, total = self.state.is_estimated[rows].sum(), self.state.had[rows].any(1).sum()
@@ -395,10 +395,10 @@ class Engine:
     def _save(self, job: Job | None, answer: Answer, seconds: float) -> None:
         """Take an answer. A result that no table can hold costs itself alone."""
         try:
-            if isinstance(job, MatchJob) and isinstance(answer, Matched):
-                self._take_matched(job, answer)
-            elif isinstance(answer, Estimates):
-                self._take_estimates(answer)
+            if isinstance(job, MatchJob):
+                self._take_matched(job, cast(Sequence[Outcome], answer))
+            elif isinstance(job, EstimateJob):
+                self._take_estimates(cast(Sequence[Estimated], answer))
             elif isinstance(job, SceneJob) and isinstance(answer, Solution):
                 self._take_scene(job, answer, seconds)
             elif isinstance(job, LookJob) and isinstance(answer, bytes):

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mkpc_kaggle.engine.costs import WINDOW
-from mkpc_kaggle.engine.jobs import EstimateJob, Estimates, Failure
+from mkpc_kaggle.engine.jobs import Estimated, EstimateJob, Failure
 from mkpc_kaggle.engine.losses import Losses
 from mkpc_kaggle.engine.plan import HANG_FACTOR, Plan
 
@@ -48,11 +48,11 @@ class EstimatePlan:
         """Return the seconds after which a job hangs; infinity before any was measured."""
         return HANG_FACTOR * len(job.pairs) * fmean(self._seconds) if self._seconds else float("inf")
 
-    def on_result(self, answer: Estimates) -> list[int]:
+    def on_result(self, answer: Sequence[Estimated]) -> list[int]:
         """Record an answer. Return its pairs."""
-        indices = [each.index for each in answer.estimates]
+        indices = [each.index for each in answer]
         self.busy[indices] = False
-        self._seconds = [*self._seconds, *(each.seconds for each in answer.estimates)][-WINDOW:]
+        self._seconds = [*self._seconds, *(each.seconds for each in answer)][-WINDOW:]
         return indices
 
     def on_failure(self, job: EstimateJob, failure: Failure) -> bool:

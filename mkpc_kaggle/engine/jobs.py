@@ -167,20 +167,6 @@ class Estimated:
     seconds: float = 0.0
 
 
-@dataclass(frozen=True)
-class Matched:
-    """The answer to a match job: an outcome for each of its pairs, in order."""
-
-    outcomes: tuple[Outcome, ...]
-
-
-@dataclass(frozen=True)
-class Estimates:
-    """The answer to an estimate job."""
-
-    estimates: tuple[Estimated, ...]
-
-
 class Cause(StrEnum):
     """Why a worker has no result."""
 
@@ -209,7 +195,8 @@ class Failure:
         return f"{self.cause}: {self.message}" if self.message else str(self.cause)
 
 
-Answer = Loaded | Matched | Estimates | Solution | bytes | Failure
+# A match job or an estimate job is answered by a value for each of its pairs, in order.
+Answer = Loaded | tuple[Outcome, ...] | tuple[Estimated, ...] | Solution | bytes | Failure
 
 
 def visiting_order(pairs: Sequence[Pair]) -> list[int]:

@@ -18,13 +18,11 @@ from mkpc_kaggle.engine.jobs import (
     Cause,
     Estimated,
     EstimateJob,
-    Estimates,
     Failure,
     Found,
     Job,
     Loaded,
     LookJob,
-    Matched,
     MatchJob,
     Outcome,
     PairPoints,
@@ -110,7 +108,7 @@ class MatchRunner:
         self._pipeline.load()
         self._images = ImageStore()
 
-    def run(self, job: Job, seconds: float) -> Matched:
+    def run(self, job: Job, seconds: float) -> tuple[Outcome, ...]:
         """Match the pairs of a job. No unit begins that is expected to end later than ``seconds`` from now."""
         assert isinstance(job, MatchJob)
         deadline = time.monotonic() + seconds
@@ -127,9 +125,7 @@ class MatchRunner:
         matched = self._pipeline.match([pairs[number] for number in readable], job.units, may_start)
         for number, pair in zip(readable, matched, strict=True):
             pairs[number] = pair
-        return Matched(
-            tuple(_outcome(*each) for each in zip(job.indices, job.pairs, pairs, job.known, strict=True))
-        )
+        return tuple(_outcome(*each) for each in zip(job.indices, job.pairs, pairs, job.known, strict=True))
 
     def _open(self, wanted: WantedPair, known: tuple[UnitResult, ...]) -> PairMatch:
         """Return the pair with its images; ``failure`` says which of them cannot be read."""
@@ -170,13 +166,13 @@ class LightRunner:
         cv2.setNumThreads(1)
         threadpool_limits(1)
 
-    def run(self, job: Job, seconds: float) -> Estimates | bytes:
+    def run(self, job: Job, seconds: float) -> tuple[Estimated, ...] | bytes:
         """Do a job; ``seconds`` are ignored."""
         if isinstance(job, LookJob):
             return job.do()
         assert isinstance(job, EstimateJob)
         points = read_points(job.source, job.pairs)
-        return Estimates(tuple(estimate_pair(pair, points, job.recipe) for pair in job.pairs))
+        return tuple(estimate_pair(pair, points, job.recipe) for pair in job.pairs)
 
 
 def estimate_pair(pair: PairPoints, points: dict[int, Matches], recipe: Recipe) -> Estimated:

@@ -6,12 +6,12 @@ from types import SimpleNamespace
 import pytest
 
 from mkpc_kaggle.engine import places
-from mkpc_kaggle.engine.jobs import Cause, Failure, Loaded, Matched, MatchJob, Phase
+from mkpc_kaggle.engine.jobs import Cause, Failure, Loaded, MatchJob, Phase
 from mkpc_kaggle.engine.places import LocalSite, Place, Work
 from mkpc_kaggle.engine.process import ThreadWorker
 from mkpc_kaggle.engine.worker import SceneRunner
 
-LOST, DONE = Failure(Cause.DIED), Matched(())
+LOST, DONE = Failure(Cause.DIED), ()
 RAISED, NO_MEMORY = Failure(Cause.RAISED), Failure(Cause.OUT_OF_MEMORY)
 
 

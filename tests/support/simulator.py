@@ -22,12 +22,10 @@ from mkpc_kaggle.engine.jobs import (
     Cause,
     Estimated,
     EstimateJob,
-    Estimates,
     Failure,
     Found,
     Job,
     Loaded,
-    Matched,
     MatchJob,
     Outcome,
     SceneJob,
@@ -263,7 +261,7 @@ class SimulatedWorker(Simulated):
     def answer(self) -> Answer | None:
         if (answer := super().answer()) is not None:
             self.job = None
-        if isinstance(answer, Matched):
+        if isinstance(answer, tuple):
             self._site.kept += self._kept
             self._site.last_job = self._site.clock.now
         return answer
@@ -308,7 +306,7 @@ class SimulatedWorker(Simulated):
         for index, wanted, rows in zip(job.indices, job.pairs, found, strict=True):
             images = tuple(BatchImage(name, name, SIZE) for name in wanted.names)
             outcomes.append(Outcome(index, images, tuple(rows)))
-        return now, Matched(tuple(outcomes)), 0.0
+        return now, tuple(outcomes), 0.0
 
 
 class SimulatedEstimator(Simulated):
@@ -322,17 +320,12 @@ class SimulatedEstimator(Simulated):
         assert isinstance(job, EstimateJob)
         scenario, rng, now = self._site.scenario, self._site.rng, self._site.clock.now
         self.ready = now + ESTIMATE_S * len(job.pairs)
-        self._answer = Estimates(
-            tuple(
-                Estimated(
-                    pair.index,
-                    pair.revisions,
-                    tuple(20 + pair.index % 60 for _ in pair.units),
-                    FALLBACK_FUNDAMENTAL,
-                    seconds=ESTIMATE_S,
-                )
-                for pair in job.pairs
+        inliers = [20 + pair.index % 60 for pair in job.pairs]
+        self._answer = tuple(
+            Estimated(
+                *(pair.index, pair.revisions, (count,) * len(pair.units), FALLBACK_FUNDAMENTAL), seconds=ESTIMATE_S
             )
+            for pair, count in zip(job.pairs, inliers, strict=True)
         )
         if rng.random() < scenario.job_faults:
             self._answer = Failure(Cause.DIED)
