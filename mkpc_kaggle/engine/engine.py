@@ -55,7 +55,7 @@ HASH_THREADS = 4
 class Engine:
     """A run. :meth:`look` and :meth:`ask` compute what the journal does not have.
 
-    ``nothing`` is a request without pairs. Setting ``interrupt`` ends the run early.
+    ``nothing`` is a request without pairs, until the first is asked. Setting ``interrupt`` ends the run early.
     """
 
     def __init__(
@@ -122,7 +122,7 @@ class Engine:
 
     def ask(self, request: Request, share: float = 1.0) -> None:
         """Compute what a request asks for and the journal lacks, in a share of the time left at most."""
-        self._begin(request)
+        self._begin(request, is_asked=True)
         self._until = self.budget.clock() + share * self.budget.left() if share < 1 else inf
         self._publish()
         self._loop()
@@ -155,8 +155,8 @@ class Engine:
         done = {name: future for name, future in futures.items() if future.done() and not future.cancelled()}
         return {name: future.result() for name, future in done.items() if not future.exception()}
 
-    def _begin(self, request: Request) -> None:
-        """Let the journal say what is missing or out of date."""
+    def _begin(self, request: Request, *, is_asked: bool = False) -> None:
+        """Let the journal say what is missing or out of date. It records what is asked."""
         recipe, settings = request.recipe, request.settings
         self.request, self.recipe = request, recipe
         extra = extra_pairs_of(request.pairs, recipe.scene)
@@ -172,7 +172,8 @@ class Engine:
         self._units = dict(zip((unit.name for unit in recipe.units), settings.units, strict=True))
         batches = batches_of(each.pair for each in self.pairs) if recipe.scene is not None else {}
         units = list(zip(recipe.units, settings.units, strict=True))
-        self.journal.want(self.pairs, units, dict.fromkeys(batches, settings.scene), request.about)
+        if is_asked:
+            self.journal.want(self.pairs, units, dict.fromkeys(batches, settings.scene), request.about)
         self._look_at_images()
         for batch, scene in self.journal.scenes().items():
             if batch in request.exports and not request.exports[batch].has_files(scene.models):

@@ -1,6 +1,6 @@
 """The state of all pairs of a run in arrays: the answers of the journal's views, kept up to date."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +26,7 @@ class State:
         self.own = np.tile(FALLBACK_FUNDAMENTAL, (pairs, 1, 1))
         self.by_scene: dict[int, NDArray[np.float64]] = {}
         self._twins = journal.twins()
-        self._read(None)
+        self._read(None if pairs else ())
         self.read_choices()
 
     @property
@@ -55,7 +55,7 @@ class State:
         """Read which pairs have the F of their scene."""
         self.by_scene = {n: choice.F for n, choice in self._journal.choices().items() if choice.F is not None}
 
-    def _read(self, positions: list[int] | None) -> None:
+    def _read(self, positions: Sequence[int] | None) -> None:
         for position, unit, matches in self._journal.had(positions):
             self.had[position, unit] = True
             self.matches[position] += matches

@@ -9,9 +9,12 @@ import numpy as np
 import pytest
 from rectified import SECOND, SWEEP, THIRD, THREE_UNITS, RectifiedMatcher, matrices, run, write_pairs
 
+from mkpc_kaggle.engine.budget import Budget
+from mkpc_kaggle.engine.journal_reader import JournalReader
 from mkpc_kaggle.engine.records import PairRecord
 from mkpc_kaggle.engine.request import Ending, Standing
-from mkpc_kaggle.engine.session import Interrupt
+from mkpc_kaggle.engine.session import Interrupt, Session, opened_engine
+from mkpc_kaggle.pipeline.assembly import assemble
 from mkpc_kaggle.pipeline.stages import Pipeline
 
 
@@ -85,6 +88,16 @@ def test_a_finished_run_loads_no_matcher_again(tmp_path, monkeypatch):
     assert not loaded
     assert matrices(once) == matrices(twice)
     assert twice.resumed == 3
+
+
+def test_a_run_that_ends_before_it_asks_leaves_the_journal_as_it_was(tmp_path):
+    run(write_pairs(tmp_path, 3), THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
+    assembly = assemble(THREE_UNITS, matchers={"rectified": RectifiedMatcher()}, device="cpu")
+    session = Session(tmp_path / "work", Budget(0.0), Interrupt(), progress=False)
+    with opened_engine(assembly, session) as engine:
+        assert engine.look({}) == {}
+    with JournalReader(tmp_path / "work") as journal:
+        assert [len(record.units) for record in journal.records()] == [3, 3, 3]
 
 
 def test_an_unreadable_image_costs_its_pair_only(tmp_path):
