@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine.codec import to_blob
 from mkpc_kaggle.engine.jobs import Estimated, Found, Outcome, WantedPair
 from mkpc_kaggle.engine.journal import Journal
+from mkpc_kaggle.engine.journal_reader import to_blob
 from mkpc_kaggle.engine.state import State
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.matches import Matches

@@ -14,12 +14,13 @@ from functools import wraps
 from pathlib import Path
 from typing import Any, Self, TypeVar, cast
 
+import numpy as np
+
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.budget import format_duration
-from mkpc_kaggle.engine.codec import from_blob, matrix_of, vector_of
 from mkpc_kaggle.engine.records import NOT_REACHED, CameraRecord, PairRecord, SceneRecord, UnitRecord
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.geometry.coordinates import Box, Size
+from mkpc_kaggle.geometry.coordinates import Box, Matrix3, Size
 from mkpc_kaggle.geometry.critical_region import CriticalRegion, RegionReason
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import EstimateStats
@@ -256,8 +257,27 @@ def connected(uri: str, timeout: float = 1.0) -> sqlite3.Connection:
     return db
 
 
+def to_blob(matches: Matches) -> bytes:
+    """Return x0, y0, x1, y1 and the score of each match, as little-endian float32."""
+    return np.column_stack([matches.points0, matches.points1, matches.scores]).astype("<f4").tobytes()
+
+
+def from_blob(blob: bytes) -> Matches:
+    """Invert :func:`to_blob`. Raise ``ValueError`` for damaged bytes."""
+    table = np.frombuffer(blob, "<f4").reshape(-1, 5)
+    return Matches(table[:, :2], table[:, 2:4], table[:, 4])
+
+
+def matrix_of(blob: bytes) -> Matrix3:
+    """Return F from its 72 bytes. Raise ``ValueError`` unless a submission may hold it."""
+    matrix = np.frombuffer(blob).reshape(3, 3).copy()
+    if not np.isfinite(matrix).all() or not matrix.any():
+        raise ValueError("a matrix is zero or not finite")
+    return matrix
+
+
 def _stats(row: sqlite3.Row) -> EstimateStats:
-    focals, rotation = (row["focal0"], row["focal1"]), tuple(vector_of(row["rotation"]).tolist())
+    focals, rotation = (row["focal0"], row["focal1"]), _points(row["rotation"])[0]
     return EstimateStats(row["candidates"], row["cost"], row["magsac_cost"], focals, row["support"], rotation)
 
 
@@ -271,4 +291,4 @@ def _camera(row: sqlite3.Row) -> CameraRecord:
 
 
 def _points(blob: bytes) -> tuple[Any, ...]:
-    return tuple(map(tuple, vector_of(blob).reshape(-1, 3).tolist()))
+    return tuple(map(tuple, np.frombuffer(blob).reshape(-1, 3).tolist()))

@@ -5,8 +5,8 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from mkpc_kaggle.engine.codec import matrix_of
 from mkpc_kaggle.engine.journal import Journal
+from mkpc_kaggle.engine.journal_reader import matrix_of
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
 
 

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 
 from mkpc_kaggle.data.images import Image, ImageStore
-from mkpc_kaggle.engine.codec import from_blob, to_blob
 from mkpc_kaggle.engine.jobs import (
     Answer,
     Cause,
@@ -30,7 +29,7 @@ from mkpc_kaggle.engine.jobs import (
     SceneJob,
     WantedPair,
 )
-from mkpc_kaggle.engine.journal_reader import JournalReader
+from mkpc_kaggle.engine.journal_reader import JournalReader, from_blob, to_blob
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import ModelKind

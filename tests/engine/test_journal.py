@@ -12,10 +12,9 @@ import pytest
 from rectified import SECOND, SWEEP, THIRD
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine.codec import to_blob
 from mkpc_kaggle.engine.jobs import Estimated, Found, Outcome, PairPoints, WantedPair
 from mkpc_kaggle.engine.journal import Journal
-from mkpc_kaggle.engine.journal_reader import About, Event, EventKind
+from mkpc_kaggle.engine.journal_reader import About, Event, EventKind, to_blob
 from mkpc_kaggle.engine.records import CameraRecord, SceneRecord
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Box, Size

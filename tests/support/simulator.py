@@ -15,7 +15,6 @@ import numpy as np
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.budget import Budget
-from mkpc_kaggle.engine.codec import to_blob
 from mkpc_kaggle.engine.engine import Engine
 from mkpc_kaggle.engine.jobs import (
     Answer,
@@ -31,6 +30,7 @@ from mkpc_kaggle.engine.jobs import (
     SceneJob,
 )
 from mkpc_kaggle.engine.journal import Journal
+from mkpc_kaggle.engine.journal_reader import to_blob
 from mkpc_kaggle.engine.places import Place, Site, Work
 from mkpc_kaggle.engine.plan import RESERVE_SHARE
 from mkpc_kaggle.engine.request import Ending, Request, RunReport
