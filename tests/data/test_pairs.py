@@ -102,7 +102,17 @@ def test_the_true_matrix_has_no_error(demo, scenes, tmp_path):
 
 def errors_of(listed: Path, root: Path, recipe: Path) -> list[float]:
     """Of the rotation of each pair, in degrees, as `validate` writes it."""
-    command = ["validate", "--pairs", str(listed), "--image-root", str(root), "--recipe", str(recipe)]
+    command = [
+        "validate",
+        "--pairs",
+        str(listed),
+        "--image-root",
+        str(root),
+        "--recipe",
+        str(recipe),
+        "--workers",
+        "0",
+    ]
     assert main([*command, "--json", str(listed.with_suffix(".json"))]) == 0
     (scene,) = json.loads(listed.with_suffix(".json").read_text())["scenes"]
     return [pair["rotation_error_degrees"] for pair in scene["pairs"]]
@@ -139,7 +149,18 @@ def test_failures_count_as_such(demo, scenes, tmp_path, capsys):
     bad = line_of(("missing.jpg", "none.jpg"), (true.camera0, true.camera1), (1, 0))
     (tmp_path / "list.txt").write_text(f"{good}\n\n{bad}\n")
     arguments = ["validate", "--pairs", str(tmp_path / "list.txt"), "--image-root", str(demo.train_dir)]
-    arguments += ["--recipe", "classical", "--method", "ransac", "--threshold", "1", "--json", str(out)]
+    arguments += [
+        "--recipe",
+        "classical",
+        "--method",
+        "ransac",
+        "--threshold",
+        "1",
+        "--workers",
+        "0",
+        "--json",
+        str(out),
+    ]
     assert main(arguments) == 0
     scores = json.loads(out.read_text())
     assert scores["mAA"] is None
