@@ -70,11 +70,12 @@ def wheels(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def small_recipe(tmp_path: Path) -> Path:
-    """A quick recipe of two stages, in a file of its own."""
+    """The file of a quick recipe of two stages."""
     path = tmp_path / "small.toml"
-    stages = ((1, 320), (2, 400))
-    units = [f'{{ stage = {stage}, matcher = "sift", long_side = {side} }}' for stage, side in stages]
-    path.write_text(f"units = [{', '.join(units)}]\n")
+    units = [
+        f'{{ stage = {stage}, matcher = "sift", long_side = {side} }}' for stage, side in ((1, 320), (2, 400))
+    ]
+    path.write_text(f"units = [{', '.join(units)}]\n[magsac]\npermutations = 1\nmax_iterations = 5000\n")
     return path
 
 

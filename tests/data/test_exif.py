@@ -9,7 +9,7 @@ from exif_files import set_exif, tiff, with_tiff
 from numpy.testing import assert_array_equal
 
 from mkpc_kaggle.data.exif import read_exif
-from mkpc_kaggle.data.images import Image, read_image
+from mkpc_kaggle.data.images import read_image
 from mkpc_kaggle.geometry.coordinates import Size
 
 PIXELS = np.random.default_rng(0).integers(0, 255, (40, 60, 3), np.uint8)
@@ -27,7 +27,6 @@ def write(path, *tags, **more):
 def test_stored_pixels_are_read_and_views_set_upright_as_by_opencv(tmp_path, orientation, suffix, order):
     path = write(tmp_path / f"a{suffix}", orientation, order=order)
     image = read_image(path)
-    assert isinstance(image, Image)
     assert_array_equal(
         image.pixels, cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)[..., ::-1]
     )
@@ -45,9 +44,7 @@ def test_stored_pixels_are_read_and_views_set_upright_as_by_opencv(tmp_path, ori
         {"t920A": (42, 10), "tA20E": (100, 1), "tA210": 3},
         {"t920A": (42, 10), "tA20E": (101, 10), "tA210": 4},
         {"t920A": (42, 10), "tA20E": (10, 1001), "tA210": 5},
-        {"t920A": (42, 10), "tA20E": (250, 1)},
         {"t920A": (42, 10), "tA20E": (250, 1), "tA210": 1},
-        {"t920A": (42, 10)},
         {},
     ],
 )
@@ -56,32 +53,22 @@ def test_the_focal_length_is_that_of_colmap(tmp_path, tags, order):
     path = write(tmp_path / "a.jpg", 6, order=order, **tags)
     camera = pycolmap.infer_camera_from_image(path)
     image = read_image(path)
-    assert isinstance(image, Image)
     assert image.focal == pytest.approx(camera.focal_length if camera.has_prior_focal_length else 0, rel=1e-6)
 
 
-@pytest.mark.parametrize(
-    "tags",
-    [
-        {"tA405": 65535},
-        {"tA405": 1},
-        {"t920A": (0, 0), "tA20E": (250, 1), "tA210": 2},
-        {"t920A": (4, 1), "tA20E": (250, 0), "tA210": 2},
-        {"t920A": (4_000_000_000, 1), "tA20E": (4_000_000_000, 1), "tA210": 5},
-        {"tA405": "28 mm"},
-    ],
-)
-def test_a_focal_length_that_no_camera_has_is_unknown(tmp_path, tags):
-    image = read_image(write(tmp_path / "a.jpg", **tags))
-    assert isinstance(image, Image)
-    assert image.focal == 0
+IMPOSSIBLE = [
+    {"tA405": 65535},
+    {"tA405": 1},
+    {"t920A": (0, 0), "tA20E": (250, 1), "tA210": 2},
+    {"t920A": (4, 1), "tA20E": (250, 0), "tA210": 2},
+    {"tA405": "28 mm"},
+]
 
 
-@pytest.mark.parametrize("orientation", [0, 9, 65535])
-def test_an_orientation_that_does_not_exist_changes_nothing(tmp_path, orientation):
-    image = read_image(write(tmp_path / "a.png", orientation))
-    assert isinstance(image, Image)
-    assert image.turns == 0
+@pytest.mark.parametrize("tags", IMPOSSIBLE)
+def test_a_focal_length_or_an_orientation_that_cannot_be_is_unknown(tmp_path, tags):
+    image = read_image(write(tmp_path / "a.jpg", 9, **tags))
+    assert (image.focal, image.turns) == (0, 0)
 
 
 def test_damaged_exif_is_missing():
@@ -123,5 +110,4 @@ def after_the_pixels(path, part):
 def test_exif_is_found_wherever_a_format_has_it(tmp_path, name, write):
     write(tmp_path / name, tiff({0x0112: 8}, {0xA405: 28}))
     image = read_image(tmp_path / name)
-    assert isinstance(image, Image)
     assert (image.size, image.turns, image.focal) == (SIZE, 1, pytest.approx(46.663, abs=1e-3))

@@ -13,7 +13,7 @@ from mkpc_kaggle.errors import UserError
 @pytest.fixture
 def place(tmp_path):
     """Inputs: a table, a directory with an image, a directory with a weight file and an earlier submission."""
-    for name in ("test.csv", "images/x.png", "weights/m.pth", "weights/s.csv", "images/scores.json"):
+    for name in ("test.csv", "images/x.png", "weights/m.pth", "weights/s.csv"):
         path = tmp_path / name
         path.parent.mkdir(exist_ok=True)
         path.write_text("precious")
@@ -31,9 +31,7 @@ def place(tmp_path):
         ("--json", "images/x.png", "would be written over the input"),
         ("--json", "submission.csv", "exists and is not a .json file"),
         ("--report", "submission.csv", "exists and is not a .html file"),
-        ("--output", "new.csv", ""),
         ("--output", "weights/s.csv", ""),
-        ("--json", "images/scores.json", ""),
         ("--output", "n" * 300, ""),
     ],
 )

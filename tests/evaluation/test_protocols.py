@@ -39,7 +39,17 @@ CAMERAS = Camera(K, np.eye(3), np.zeros(3)), Camera(K, np.eye(3), np.array([1.0,
 
 
 def validate(listed: Path, root: Path, recipe: Path) -> list[str]:
-    return ["validate", "--pairs", str(listed), "--image-root", str(root), "--recipe", str(recipe)]
+    return [
+        "validate",
+        "--pairs",
+        str(listed),
+        "--image-root",
+        str(root),
+        "--recipe",
+        str(recipe),
+        "--workers",
+        "0",
+    ]
 
 
 def matches_of(journal: JournalReader, position: int) -> Matches:
@@ -58,9 +68,8 @@ def sharp(camera: Camera) -> Camera:
 @pytest.mark.parametrize(
     ("scenes", "pairs", "units"),
     [
-        (["scannet_samples"], 15, [(1, 640)]),
-        (OUTDOORS, 3, [(1, 480), (1, 640), (2, 480)]),
-        pytest.param(OUTDOORS, None, [(1, 1200)], marks=pytest.mark.slow),
+        (["scannet_samples"], 8, [(1, 640)]),
+        (OUTDOORS, 1, [(1, 480), (1, 640), (2, 480)]),
     ],
 )
 def test_an_independent_evaluation_of_the_same_matches_agrees(scenes, pairs, units, tmp_path):
@@ -288,23 +297,6 @@ def test_regions_of_ones_own_take_the_place_of_mkpcs(demo, scenes, small_recipe,
         ) as database:  # other regions, other points
             assert database.execute("SELECT count(*) FROM points").fetchone() == (rows,)
     np.testing.assert_array_equal(found.points0, match.matches.points0)
-
-
-def test_the_papers_tables_are_made_with_one_command(demo, scenes, tmp_path, capsys):
-    listed = write_list(tmp_path / "list.txt", [replace(scenes[0], pairs=scenes[0].pairs[:1])], demo.train_dir)
-    tables = ["--yfcc", str(listed), str(demo.train_dir), "--imc", str(demo.train_dir), "--pairs", "1"]
-    tables += ["--out", str(tmp_path / "out"), "--matcher", "sift"]
-    paper_tables.main([*tables, "--rows", "1600", "1200 + 1600", "loftr"])
-    lines = [[cell.strip() for cell in line.split("|")[1:-1]] for line in capsys.readouterr().out.splitlines()]
-    yfcc, imc = lines[:6], lines[6:]
-    names = ["1600 ransac", "1600 magsac", "1200 + 1600 magsac", "mean difference"]
-    assert [" ".join(row[:2]).strip() for row in yfcc[2:]] == names
-    assert yfcc[2][7:] == ["37.73", "58.03", "74.57", "1"]
-    assert [row[10] for row in yfcc[2:5]] == ["1", "0", "2"]  # the unit that two rows have ran once
-    own, published = (np.array([row[part] for row in yfcc[2:5]], float) for part in (slice(2, 5), slice(7, 10)))
-    np.testing.assert_allclose(np.array(yfcc[5][7:10], float), (own - published).mean(axis=0), atol=0.006)
-    assert imc[2][0] == "loftr"
-    assert imc[2][3:] == ["0.75478", "0.75606", "1"]
 
 
 def test_the_rows_of_the_papers_tables_have_their_sizes_and_the_best_is_the_recipe():

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from shared import DATA, needs_data
 
 from mkpc_kaggle.cli import main
 from mkpc_kaggle.data.competition import (
@@ -94,24 +93,12 @@ def scores_of(demo: DemoSet, recipe: Path, *options: str) -> dict[str, Any]:
     """What `validate --json` writes."""
     out = recipe.with_suffix(".json")
     arguments = ["validate", "--train-dir", str(demo.train_dir), "--recipe", str(recipe), "--json", str(out)]
-    assert main([*arguments, *options]) == 0
+    assert main([*arguments, "--workers", "0", *options]) == 0
     scores: dict[str, Any] = json.loads(out.read_text())
     return scores
 
 
-def test_validate_scores_a_recipe_and_writes_all_figures(demo, small_recipe, capsys):
-    scores = scores_of(demo, small_recipe, "--pairs-per-scene", "5")
-    assert f"{'mean over scenes':<20}{5:>6}{scores['mAA']:>9.4f}" in capsys.readouterr().out
-    (scene,) = scores["scenes"]
-    assert scene["scene"] == "courtyard"
-    assert len(scene["pairs"]) == 5
-    assert 0.1 < scores["mAA"] == scene["mAA"] <= 1
-    for pair in scene["pairs"]:
-        assert set(pair["matches"]) == {"1:sift@320", "2:sift@400"}
-
-
 def test_each_step_of_the_estimate_has_a_column(demo, small_recipe, capsys):
-    small_recipe.write_text(small_recipe.read_text() + "[magsac]\npermutations = 1\n")
     plain = scores_of(demo, small_recipe)
     assert plain["mAA_by_step"] == {"MAGSAC": plain["mAA"]}
     capsys.readouterr()
@@ -142,21 +129,6 @@ def test_a_work_directory_keeps_the_journal_and_a_report_that_shows_the_pairs(
     assert len(read_log(tmp_path / "work").pairs) == 2
 
 
-BASELINE = {"castle_p19": 0.4319, "fountain_p11": 0.9018, "herz_jesus_p8": 0.8857, "reichstag_26": 0.2313}
-
-
-@needs_data
-@pytest.mark.slow
-@pytest.mark.timeout(7200)
-def test_the_classical_recipe_reaches_plain_root_sift_scene_by_scene(tmp_path):
-    out = tmp_path / "scores.json"
-    train = str(DATA / "train")
-    assert main(["validate", "--train-dir", train, "--recipe", "classical", "--json", str(out)]) == 0
-    scores = {scene["scene"]: scene["mAA"] for scene in json.loads(out.read_text())["scenes"]}
-    for scene, baseline in {**BASELINE, "scannet_samples": 0.04}.items():
-        assert scores[scene] >= baseline - 0.01, scene
-
-
 HANGS = """
 import time
 from mkpc_kaggle.cli import program, validate
@@ -168,7 +140,8 @@ program(["validate", "--train-dir", {train!r}, "--recipe", "classical", "--time-
 def test_a_validation_that_hangs_ends_at_its_limit(demo):
     code = HANGS.format(train=str(demo.train_dir))
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=300)
-    assert (done.returncode, done.stderr) == (1, "error: the time limit passed before the scores were printed\n")
+    assert done.returncode == 1
+    assert done.stderr.endswith("error: the time limit passed before the scores were printed\n")
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from numpy.testing import assert_array_equal
 from scipy.spatial import KDTree
 from sklearn.cluster import DBSCAN
 
@@ -35,7 +34,7 @@ def test_merged_points_have_scikit_learns_clusters(sample, count):
     assert np.mean((merged >= 0) != (expected >= 0)) < 0.002
 
 
-def test_no_point_of_many_has_more_neighbours_than_a_circle_has_cells(monkeypatch):
+def test_many_points_are_merged_so_that_memory_stays_linear(monkeypatch):
     seen = []
     fit = DBSCAN.fit
 
@@ -45,15 +44,7 @@ def test_no_point_of_many_has_more_neighbours_than_a_circle_has_cells(monkeypatc
 
     monkeypatch.setattr(DBSCAN, "fit", spy)
     dbscan(clumps(np.random.default_rng(2), 20_000), eps=EPS, min_samples=MIN_SAMPLES)
-    [(places, counts)] = seen
+    [(cells, counts)] = seen
     assert counts.sum() == 20_000
-    # pi 10^2 cells, and those that the circle only touches: what is listed is linear in the number of points.
-    assert KDTree(places).query_ball_point(places, EPS, return_length=True).max() < 450
-
-
-def test_no_and_one_point_are_legal():
-    empty = dbscan(np.empty((0, 2)), eps=EPS, min_samples=MIN_SAMPLES)
-    assert (empty.shape, empty.dtype) == ((0,), np.intp)
-    point = np.array([[0.2, 0.7]])
-    assert_array_equal(dbscan(point, eps=EPS, min_samples=1), [0])
-    assert_array_equal(dbscan(point, eps=EPS, min_samples=2), [-1])
+    # pi 10^2 cells, and those that the circle only touches
+    assert KDTree(cells).query_ball_point(cells, EPS, return_length=True).max() < 450

@@ -40,10 +40,8 @@ IMAGE = Size(107, 71)
 RENDERED = {
     "enlarged": View.fit(Box.whole(IMAGE), long_side=250),
     "shrunk": View.fit(Box.whole(IMAGE), long_side=46),
-    "of the same size": View.fit(Box.whole(IMAGE), long_side=107),
     "cropped and enlarged": View.fit(Box(13, 8, 90, 65), long_side=200, multiple=32),
     "cropped and shrunk": View.fit(Box(13, 8, 90, 65), long_side=51, multiple=32),
-    "with an axis that rounding changes": View(Box.whole(IMAGE), Size(80, 48), Size(80, 48)),
     "enlarged along x, shrunk along y": View(Box.whole(IMAGE), Size(240, 40), Size(240, 40)),
     "shrunk along x, enlarged along y": View(Box.whole(IMAGE), Size(60, 170), Size(64, 192)),
     "turned by a quarter and enlarged": View.fit(Box.whole(IMAGE), long_side=250, turns=1),
@@ -85,28 +83,18 @@ def test_a_turned_view_is_the_view_of_the_turned_picture(turns, scale, seed):
         assert_array_equal(stored[y0, x0], upright.ravel())
 
 
-@given(crop=boxes(), long_side=SIDES, multiple=st.sampled_from([1, 8, 14, 16, 32]))
+@given(crop=boxes(), long_side=SIDES, area=st.integers(1, 2_000_000), multiple=st.sampled_from([1, 8, 14, 32]))
 @settings(max_examples=150, deadline=None)
-def test_a_fitted_view_keeps_the_aspect_to_the_nearest_pixel_and_pads_to_the_multiple(crop, long_side, multiple):
-    view = View.fit(crop, long_side=long_side, multiple=multiple)
-    assert max(view.content) == long_side
-    exact = min(crop.size) * long_side / max(crop.size)
-    assert abs(min(view.content) - max(1, exact)) <= 0.5
-    assert view.crop == crop
-    for side, padded in zip(view.content, view.padded, strict=True):
-        assert padded % multiple == 0
-        assert 0 <= padded - side < multiple
-
-
-@given(crop=boxes(), area=st.integers(1, 2_000_000))
-@settings(max_examples=150, deadline=None)
-def test_a_view_of_an_area_keeps_the_aspect_and_has_that_many_pixels(crop, area):
-    view = View.of_area(crop, area=area)
-    width, height = (side * (area / crop.area) ** 0.5 for side in crop.size)
-    assert width * height == pytest.approx(area)
-    for side, exact in zip(view.content, (width, height), strict=True):
-        assert abs(side - max(1, exact)) <= 0.5 + 1e-9 * exact
-    assert view.crop == crop
+def test_a_view_keeps_the_aspect_to_the_nearest_pixel_and_pads_to_the_multiple(crop, long_side, area, multiple):
+    fitted = View.fit(crop, long_side=long_side, multiple=multiple)
+    assert max(fitted.content) == long_side
+    of_area = View.of_area(crop, area=area, multiple=multiple)
+    for view, scale in ((fitted, long_side / max(crop.size)), (of_area, (area / crop.area) ** 0.5)):
+        assert view.crop == crop
+        for side, content, padded in zip(crop.size, view.content, view.padded, strict=True):
+            assert abs(content - max(1, side * scale)) <= 0.5 + 1e-9 * side * scale
+            assert padded % multiple == 0
+            assert 0 <= padded - content < multiple
 
 
 def test_a_stretched_view_has_the_size_whatever_the_crop_and_is_padded():
@@ -125,7 +113,7 @@ def test_what_networks_count_otherwise_is_led_to_centres_at_integers():
 
 
 @pytest.mark.parametrize("name", RENDERED)
-@pytest.mark.parametrize("centre", [(41.3, 30.8), (60.0, 40.5), (55.75, 44.25)])
+@pytest.mark.parametrize("centre", [(41.3, 30.8), (55.75, 44.25)])
 def test_a_spot_is_rendered_where_the_map_says(name, centre):
     view = RENDERED[name]
     picture = view.render(spot(IMAGE, centre, 4.0))
@@ -159,10 +147,8 @@ def test_a_box_holds_the_points_on_its_pixels_half_open_and_never_nan():
 
 def test_a_view_holds_points_on_content_but_not_on_padding():
     view = View(Box(100, 100, 140, 120), Size(20, 10), Size(32, 16))
-    inside = [(-0.5, -0.5), (0, 0), (19, 9), (19.4, 9.4)]
-    outside = [(19.5, 5), (5, 9.5), (25, 5), (5, 14), (-0.6, 5), (5, -0.6), (np.nan, 5), (5, np.inf)]
-    assert view.holds(np.array(inside)).all()
-    assert not view.holds(np.array(outside)).any()
+    points = np.array([(-0.5, -0.5), (19.4, 9.4), (19.5, 5), (5, 9.5), (-0.6, 5), (5, np.inf)])
+    assert view.holds(points).tolist() == [True] * 2 + [False] * 4
 
 
 @pytest.mark.parametrize("content", [Size(64, 16), Size(64, 19), Size(32, 16), Size(90, 16)])
@@ -179,19 +165,10 @@ def test_images_one_pixel_wide_or_high_are_rendered(size, shape):
     assert (picture == 200).all()
 
 
-BLACK = np.zeros((30, 40), np.uint8)
-
-
-@pytest.mark.parametrize(
-    ("make", "says"),
-    [
-        (lambda: Box(0, 0, 0, 5), "empty box"),
-        (lambda: Box(0, 3, 5, 2), "empty box"),
-        (lambda: View.fit(Box(0, 0, 41, 30), long_side=9).render(BLACK), "leaves the image of 40 x 30"),
-        (lambda: View.fit(Box(0, 0, 40, 31), long_side=9).render(BLACK), "leaves the image"),
-        (lambda: View.fit(Box(-9, -9, -1, -1), long_side=9).render(BLACK), "leaves the image"),
-    ],
-)
-def test_an_empty_box_or_a_crop_that_leaves_its_image_is_an_error(make, says):
-    with pytest.raises(ValueError, match=says):
-        make()
+def test_an_empty_box_or_a_crop_that_leaves_its_image_is_an_error():
+    for corners in ((0, 0, 0, 5), (0, 3, 5, 2)):
+        with pytest.raises(ValueError, match="empty box"):
+            Box(*corners)
+    for corners in ((0, 0, 41, 30), (0, 0, 40, 31), (-9, -9, -1, -1)):
+        with pytest.raises(ValueError, match="leaves the image of 40 x 30"):
+            View.fit(Box(*corners), long_side=9).render(np.zeros((30, 40), np.uint8))

@@ -116,15 +116,12 @@ def test_a_principal_point_far_off_leaves_magsac_its_matrix():
 
 
 def degenerate():
-    rng = np.random.default_rng(0)
-    turned = seen((camera(1100), camera(1100, 0.1)), 80, 0.1)
-    along = np.linspace(0, 700, 40)
+    rng, along = np.random.default_rng(0), np.linspace(0, 700, 40)
     X = np.column_stack([rng.uniform(-1, 1, (80, 2)), np.full(80, 5.0)])
     return {
-        "a pure rotation": turned,
+        "a pure rotation": seen((camera(1100), camera(1100, 0.1)), 80, 0.1),
         "one plane": Matches(*project(CAMERAS, X), np.ones(80)),
         "a line": Matches(np.column_stack([along, along]), np.column_stack([along, 2 * along]), np.ones(40)),
-        "eight": seen(CAMERAS, 8),
         "six": seen(CAMERAS, 6),
         "five": seen(CAMERAS, 5),
         "none": Matches.empty(),
@@ -138,11 +135,8 @@ def test_degenerate_matches_end_in_a_value(name):
     matches = degenerate()[name]
     result = with_prior(matches)
     assert_is_a_value(result, len(matches))
-    assert result.ok != bool(result.failure)
-    if name in ("five", "none"):
-        assert "too few distinct matches" in result.failure
-    if name == "six":
-        assert result.ok and result.magsac is None
+    assert ("too few distinct matches" in result.failure) == (name in ("five", "none"))
+    assert name != "six" or (result.ok and result.magsac is None)
 
 
 def test_repetitions_and_what_is_not_finite_change_nothing():
@@ -168,14 +162,10 @@ def test_whatever_the_points_are_the_answer_is_an_estimate(data, n):
     assert not result.inliers[~np.isfinite(rows).all(axis=1)].any()
 
 
-def test_an_estimate_tells_its_candidates_their_costs_and_the_focal_lengths_that_it_found():
-    matches = seen(CAMERAS, n=300, noise=0.2, outliers=60)
-    stats = with_prior(matches).stats
-    assert stats.cost < stats.magsac_cost
+def test_the_focal_lengths_are_stated_and_the_cost_is_below_magsacs():
+    stats = with_prior(seen(CAMERAS, n=300, noise=0.2, outliers=60)).stats
+    assert 30 <= stats.cost < stats.magsac_cost, "a half for each outlier"
     assert_allclose(stats.focals, (900, 1300), rtol=0.3)
-    alone = estimate(matches, RobustConfig(permutations=3)).stats
-    assert alone.candidates == 3 and alone.cost == alone.magsac_cost and alone.focals == (0, 0)
-    assert 30 <= alone.cost < 100, "a half for each outlier, and little for the others"
 
 
 def test_magsac_wins_over_focal_lengths_that_are_too_implausible():

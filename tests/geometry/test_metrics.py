@@ -62,8 +62,8 @@ def test_the_accuracy_of_a_pair_counts_the_threshold_pairs_that_it_meets(rotatio
     assert pair_accuracy(PoseError(rotation, 0.0, translation)) == pytest.approx(accuracy, abs=1e-12)
 
 
-@pytest.mark.parametrize("degrees", [0, 1e-6, 1e-3, 1, 45, 90, 135, 179, 179.999, 180 - 1e-6, 180])
-@pytest.mark.parametrize("axis", [(1, 0, 0), (0, -1, 0), (1, 2, 3), (-1, 1, 0.1)])
+@pytest.mark.parametrize("degrees", [0, 1e-6, 1, 90, 179, 180 - 1e-6, 180])
+@pytest.mark.parametrize("axis", [(1, 0, 0), (-1, 1, 0.1)])
 def test_the_rotation_angle_is_precise_at_both_ends(axis, degrees):
     assert rotation_angle(rotation(axis, degrees)) == pytest.approx(degrees, rel=1e-6, abs=1e-13)
 

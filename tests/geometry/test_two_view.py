@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from scipy.spatial.transform import Rotation
 
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import sampson_distances
@@ -51,7 +52,7 @@ def test_the_gradient_of_the_cost_is_that_of_finite_differences(k):
     assert_allclose(curvature, curvature.T)
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(2))
 def test_the_views_nearest_to_an_essential_matrix_have_it(seed):
     E = random_view(seed, (0, 0)).fundamental
     for times in (1, -7):
@@ -88,10 +89,8 @@ def rays_of(points, view):
 
 
 def test_points_are_in_front_of_both_cameras_behind_both_or_between():
-    turn = np.array([[0.98, 0, 0.199], [0, 1, 0], [-0.199, 0, 0.98]])
-    view = TwoView(
-        np.linalg.qr(turn)[0] * np.sign(np.diag(np.linalg.qr(turn)[1])), unit([1, 0.1, 1]), np.array([0.2, -0.3])
-    )
+    turn = Rotation.from_rotvec([0, 0.2, 0]).as_matrix()
+    view = TwoView(turn, unit([1, 0.1, 1]), np.array([0.2, -0.3]))
     points = np.random.default_rng(0).uniform((-1, -1, 3), (1, 1, 6), (50, 3))
     assert_allclose(sampson(view.fundamental, *rays_of(points, view)), 0, atol=1e-6)
     assert (view.depth_signs(*rays_of(points, view), 1.0) == 1).all()

@@ -1,6 +1,5 @@
 """ALIKED against kornia's on stand-in weights and on the real ones, and its parts by hand."""
 
-import pytest
 import torch
 from kornia.feature import ALIKED
 from pictures import image_of
@@ -8,8 +7,8 @@ from shared import WEIGHTS, needs_weights
 from sklearn.datasets import load_sample_image
 from standin import STAND_INS, scene, standin_state
 
-from mkpc_kaggle.matchers.contract import Placement, Precision
-from mkpc_kaggle.matchers.networks.aliked import Aliked, own_name, refined_maxima, strict_maxima
+from mkpc_kaggle.matchers.contract import Placement
+from mkpc_kaggle.matchers.networks.aliked import Aliked, own_name, strict_maxima
 from mkpc_kaggle.matchers.networks.placement import prepared
 from mkpc_kaggle.weights import load_tensors
 
@@ -60,28 +59,6 @@ def test_it_finds_what_kornias_finds_with_the_published_weights():
     assert_alike(ours(photograph)[0], theirs(photograph)[0])
 
 
-@torch.inference_mode()
-@pytest.mark.parametrize("precision", [Precision.BFLOAT16, Precision.FLOAT16])
-def test_half_precision_moves_little(precision):
-    image = image_of(scene(96, 128, 3))
-    (points, descriptors), (half_points, half_descriptors) = (
-        prepared(filled_network(), Placement(precision=each))(image)[0] for each in (Precision.FLOAT32, precision)
-    )
-    distances = torch.cdist(points, half_points)
-    nearest = distances.argmin(dim=1)
-    common = distances.amin(dim=1) < 0.25
-    assert common.float().mean() > 0.9
-    assert (descriptors * half_descriptors[nearest]).sum(dim=1)[common].median() > 0.999
-    assert half_points.dtype == half_descriptors.dtype == torch.float32
-    assert not torch.equal(descriptors, half_descriptors)
-
-
-def filled_network():
-    network = Aliked(max_keypoints=200)
-    network.load_state_dict({own_name(name): tensor for name, tensor in standin().items()})
-    return network
-
-
 def test_maxima_are_strict_inner_and_the_best_come_first():
     scores = torch.zeros(12, 15)
     scores[3, 4], scores[8, 9], scores[1, 12] = 0.5, 0.9, 0.95  # the last lies in the border
@@ -89,8 +66,3 @@ def test_maxima_are_strict_inner_and_the_best_come_first():
     scores[5, 4] = 0.4  # beside a stronger maximum
     assert strict_maxima(scores, 10).tolist() == [8 * 15 + 9, 3 * 15 + 4]
     assert strict_maxima(scores, 1).tolist() == [8 * 15 + 9]
-    scores[8, 10] = 0.9 - 0.1 * torch.log(torch.tensor(2.0))  # half its weight
-    x, y = refined_maxima(scores, torch.tensor([8 * 15 + 9]))[0]
-    weights = torch.exp((scores[6:11, 7:12] - 0.9) / 0.1)
-    torch.testing.assert_close(x, 9 + (weights.sum(0) * torch.arange(-2.0, 3)).sum() / weights.sum())
-    torch.testing.assert_close(y, torch.tensor(8.0), rtol=0, atol=1e-5)

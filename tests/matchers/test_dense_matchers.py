@@ -1,23 +1,21 @@
-"""DKM and RoMa: their parts by hand, and the matchers from checkpoints in the public format."""
+"""DKM and RoMa: their parts by hand, and the matchers' points and draws."""
 
 import numpy as np
 import pytest
 import torch
-from checkpoints import FILES, store_of
-from pictures import as_picture, match_one, picture, same
-from standin import scene, use_narrow
+from light_matchers import dkm_matcher, ours
+from pictures import match_one, picture, same
+from standin import narrow_roma
 
-from mkpc_kaggle.matchers.adapters import dkm, roma
 from mkpc_kaggle.matchers.adapters.dkm import DkmMatcher
 from mkpc_kaggle.matchers.adapters.roma import RomaMatcher, RomaOptions
-from mkpc_kaggle.matchers.contract import Placement, Precision
+from mkpc_kaggle.matchers.contract import Placement
 from mkpc_kaggle.matchers.dense import DenseEncoding, DenseOptions
 from mkpc_kaggle.matchers.networks.dense_sampling import sample_matches
 from mkpc_kaggle.matchers.networks.dense_warp import DenseFeatures, DenseWarp, dense_warp
 from mkpc_kaggle.matchers.networks.dkm import DKM
 from mkpc_kaggle.matchers.networks.grids import as_grid
 from mkpc_kaggle.matchers.networks.warp_refiner import WarpEstimate, identity_map
-from mkpc_kaggle.weights import WeightStore
 
 
 @torch.inference_mode()
@@ -44,11 +42,6 @@ def test_targets_outside_have_no_certainty_and_coarse_doubts_count_half():
     assert torch.equal(sure.swapped().warp[0, 0, 1], torch.tensor([1, 0, 0.5, -0.5]))
 
 
-def warp_and_certainty(count=3000, seed=5):
-    generator = torch.Generator().manual_seed(seed)
-    return torch.rand(count, 4, generator=generator) * 2 - 1, torch.rand(count, generator=generator) ** 4
-
-
 def test_balancing_spreads_the_matches():
     generator = torch.Generator().manual_seed(7)
     crowd = torch.rand(9000, 4, generator=generator) * 0.1
@@ -59,7 +52,7 @@ def test_balancing_spreads_the_matches():
 
 
 def test_what_has_no_weight_is_not_drawn():
-    warp, certainty = warp_and_certainty(100)
+    warp, certainty = torch.rand(100, 4), torch.ones(100)
     certainty[10:] = 0
     found = sample_matches(warp, certainty, 50)
     assert sorted(found.matches.tolist()) == sorted(warp[:10].tolist())
@@ -70,14 +63,8 @@ def test_what_has_no_weight_is_not_drawn():
 
 
 @pytest.fixture(scope="module")
-def network(tmp_path_factory: pytest.TempPathFactory) -> DKM:
-    store = store_of(tmp_path_factory.mktemp("weights"), [file for file in FILES if file.matcher == "dkm"])
-    return dkm.load(store, DenseOptions(), Placement())._network
-
-
-@pytest.fixture
-def matcher(network: DKM) -> DkmMatcher:
-    return DkmMatcher(network, DenseOptions(matches=300), "cpu")
+def matcher() -> DkmMatcher:
+    return dkm_matcher(Placement())
 
 
 def test_which_matches_are_drawn_depends_on_both_pictures(matcher: DkmMatcher) -> None:
@@ -104,9 +91,6 @@ class Given:
     def __init__(self, *warps: DenseWarp) -> None:
         self.warps = warps
 
-    def to(self, device: str) -> "Given":
-        return self
-
     def encode(self, image: torch.Tensor, fine: torch.Tensor | None = None) -> DenseFeatures:
         return None
 
@@ -132,46 +116,11 @@ def test_points_of_either_picture_are_in_its_own_pixels() -> None:
     assert (whole0 | whole1).all()
     np.testing.assert_array_equal(matches.scores == np.float32(0.3), whole0)
     assert set(matches.scores.tolist()) == {float(np.float32(0.3)), float(np.float32(0.9))}
-    unsure = identity_warp(9, 9, 0.0), identity_warp(9, 9, 0.0)
-    matcher = DkmMatcher(Given(*unsure), DenseOptions(), "cpu")
-    assert len(match_one(matcher, picture(9, 9), picture(9, 9))) == 0
-
-
-@pytest.fixture(autouse=True)
-def narrow(monkeypatch: pytest.MonkeyPatch) -> None:
-    use_narrow(monkeypatch)
-
-
-@pytest.fixture(scope="module")
-def store(tmp_path_factory: pytest.TempPathFactory) -> WeightStore:
-    return store_of(tmp_path_factory.mktemp("weights"), [file for file in FILES if file.matcher == "roma"])
-
-
-def loaded(store: WeightStore, precision: Precision = Precision.FLOAT32, **options: object) -> RomaMatcher:
-    return roma.load(store, RomaOptions(**options), Placement(precision=precision))
 
 
 @pytest.mark.parametrize(("passes", "sides"), [(2, (56, 84)), (1, (84, 126))])
-def test_sides_of_the_first_pass_are_multiples_of_14(
-    store: WeightStore, passes: int, sides: tuple[int, int]
-) -> None:
-    (encoded,) = loaded(store, passes=passes, first_pass=0.648).encode([picture(86, 130)])
+def test_sides_of_the_first_pass_are_multiples_of_14(passes: int, sides: tuple[int, int]) -> None:
+    options = RomaOptions(passes=passes, first_pass=0.648)
+    (encoded,) = RomaMatcher(ours(Placement(), "roma", narrow_roma), options, "cpu").encode([picture(86, 130)])
     assert encoded.features.coarse.at(1).shape[2:] == sides
     assert [each.at(1).shape[2:] for each in [encoded.features.fine] if each] == [(86, 130)] * (passes - 1)
-
-
-@pytest.mark.parametrize("precision", [Precision.BFLOAT16, Precision.FLOAT16])
-def test_half_precision_moves_most_targets_little(store: WeightStore, precision: Precision) -> None:
-    """Where the best anchor changes they move by much: few, as these weights have no sure ones."""
-    whole = scene(56, 78, 3)
-    pictures = as_picture(whole[:, :70]), as_picture(whole[:, 8:])
-    warps = []
-    for each in (Precision.FLOAT32, precision):
-        matcher = loaded(store, each, passes=1)
-        first, second = (encoded.features for encoded in matcher.encode(pictures))
-        dense, _ = matcher._network.match(first, second)
-        assert dense.warp.dtype == dense.certainty.dtype == torch.float32
-        warps.append(dense.warp[..., 2:])
-    moved = (warps[0] - warps[1]).norm(dim=-1)
-    assert 0 < moved.median() < 0.02
-    assert (moved > 0.1).float().mean() < 0.2

@@ -4,7 +4,6 @@ import re
 from functools import partial
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from checkpoints import PublicFile, store_of
@@ -12,14 +11,11 @@ from kornia.feature import DISK
 from pictures import picture
 from torch import Tensor, nn
 
-from mkpc_kaggle.geometry.coordinates import Box
-from mkpc_kaggle.matchers.contract import Colour, Placement, Precision, encoding_bytes
+from mkpc_kaggle.matchers.contract import Colour, Placement, Precision
 from mkpc_kaggle.matchers.lightglue import LightGlueOptions, light_glue
 from mkpc_kaggle.matchers.networks.aliked import Aliked
 from mkpc_kaggle.matchers.registry import load_matcher
 from mkpc_kaggle.weights import WeightStore
-
-NAMES = ["aliked_lightglue", "disk_lightglue", "sift_lightglue"]
 
 
 def glue(**shape: Any) -> nn.Module:
@@ -44,21 +40,13 @@ def beside_an_optimizer(state: dict[str, Tensor]) -> dict[str, Any]:
     return {"extractor": state, "optim": {"lr": 0.1}}
 
 
+SIFT = partial(glue, add_scale_ori=True)
 FILES = (
-    PublicFile(
-        "aliked-n16.pth", "aliked_lightglue", "aliked-n16", "aliked", lambda: Aliked(2048), published_aliked
-    ),
-    PublicFile("aliked_lightglue.pth", "aliked_lightglue", "aliked-lightglue", "lightglue", glue, old_names),
-    PublicFile("depth-save.pth", "disk_lightglue", "disk", "disk", DISK, beside_an_optimizer),
-    PublicFile("disk_lightglue.pth", "disk_lightglue", "disk-lightglue", "lightglue", glue, old_names),
-    PublicFile(
-        "sift_lightglue.pth",
-        "sift_lightglue",
-        "sift-lightglue",
-        "lightglue",
-        partial(glue, add_scale_ori=True),
-        old_names,
-    ),
+    PublicFile("a.pth", "aliked_lightglue", "aliked-n16", "aliked", lambda: Aliked(2048), published_aliked),
+    PublicFile("b.pth", "aliked_lightglue", "aliked-lightglue", "lightglue", glue, old_names),
+    PublicFile("c.pth", "disk_lightglue", "disk", "disk", DISK, beside_an_optimizer),
+    PublicFile("d.pth", "disk_lightglue", "disk-lightglue", "lightglue", glue, old_names),
+    PublicFile("e.pth", "sift_lightglue", "sift-lightglue", "lightglue", SIFT, old_names),
 )
 
 
@@ -71,20 +59,15 @@ def load(name: str, store: WeightStore, precision: Precision = Precision.FLOAT32
     return load_matcher(name, store, LightGlueOptions(**options), Placement(precision=precision))
 
 
-@pytest.mark.parametrize("precision", [Precision.FLOAT32, Precision.BFLOAT16])
-@pytest.mark.parametrize("name", NAMES)
-def test_a_picture_matches_itself_point_by_point(name: str, precision: Precision, store: WeightStore) -> None:
-    matcher = load(name, store, precision, features=300, threshold=0.0)
+@pytest.mark.parametrize("name", ["aliked_lightglue", "disk_lightglue", "sift_lightglue"])
+def test_a_picture_matches_itself_point_by_point(name: str, store: WeightStore) -> None:
+    matcher = load(name, store, features=300, threshold=0.0)
     channels = 1 if matcher.spec.colour is Colour.GRAY else 3
-    first, other = (picture(97, 131, of, channels=channels, multiple=32) for of in ("scene", "another"))
-    encodings = matcher.encode([first, other])
-    (matches,) = matcher.match(encodings[:1], encodings[:1])
+    encodings = matcher.encode([picture(97, 131, channels=channels, multiple=32)])
+    (matches,) = matcher.match(encodings, encodings)
     assert 50 < len(encodings[0]) <= 300
     assert len(matches) > 0.9 * len(encodings[0])
     assert (matches.points0 == matches.points1).all(axis=1).mean() > 0.9
-    assert Box.whole(first.content).contains(matches.points0).all()
-    assert matches.scores.dtype == encodings[0].descriptors.numpy().dtype == np.float32
-    assert encoding_bytes(encodings[0]) == len(encodings[0]) * (2 + 128 + 2 * (name == "sift_lightglue")) * 4
 
 
 @pytest.mark.parametrize("precision", Precision)

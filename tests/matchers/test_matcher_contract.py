@@ -7,8 +7,10 @@ import torch
 from light_matchers import MATCHERS
 from pictures import same
 from standin import scene
+from torch.nn import functional
 
-from mkpc_kaggle.matchers.contract import Colour, Placement, arrays_of, encoding_bytes
+from mkpc_kaggle.matchers.contract import Colour, NonFiniteError, Placement, arrays_of, encoding_bytes
+from mkpc_kaggle.matchers.dtypes import check_finite
 from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher
 from mkpc_kaggle.recipe import Recipe, Unit
 
@@ -18,10 +20,7 @@ SIZES = [((33, 47), (64, 48)), ((9, 120), (40, 40)), ((20, 1), (40, 50))]
 
 @pytest.fixture(params=[name for name in MATCHERS if name != "dkm, two passes"], scope="module")
 def matcher(request):
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield MATCHERS[request.param](Placement())
-    torch.set_num_threads(before)
+    return MATCHERS[request.param](Placement())
 
 
 def picture(matcher, height, width, name="scene"):
@@ -68,3 +67,21 @@ def test_both_stages_run_with_an_odd_flat_picture(matcher):
     found = run(np.full((33, 47, 3), 128, np.uint8), scene(90, 70, 3))
     assert [result.failure for result in found.results] == ["", ""]
     assert np.isfinite(found.estimate.matrix).all()
+
+
+def overflow(monkeypatch):
+    """Let all linear maps and convolutions overflow from now on, as in half precision they may."""
+    for name in ("linear", "conv1d", "conv2d"):
+        exact = getattr(functional, name)
+        monkeypatch.setattr(functional, name, lambda *args, exact=exact, **more: exact(*args, **more) * torch.inf)
+
+
+def test_overflow_is_an_error_and_never_a_lack_of_keypoints_or_matches(matcher, monkeypatch):
+    encodings = [matcher.encode([picture(matcher, 64, 96, name)]) for name in ("scene", "another")]
+    overflow(monkeypatch)
+    if matcher.spec.name != "sift_lightglue":
+        with pytest.raises(NonFiniteError):
+            check_finite("features", list(matcher.encode([picture(matcher, 64, 96)])))
+    if matcher.spec.name != "aliked":  # nearest neighbours need no network
+        with pytest.raises(NonFiniteError):
+            matcher.match(*encodings)

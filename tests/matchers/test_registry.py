@@ -36,22 +36,8 @@ def more_matchers(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[P
     matcher_names.cache_clear()
     yield tmp_path
     matcher_names.cache_clear()
-    for name in ("new", "broken", "orb"):
+    for name in ("broken", "orb"):
         sys.modules.pop(f"{adapters.__name__}.{name}", None)
-
-
-def run(code: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-
-
-def test_a_new_matcher_is_a_new_file(more_matchers: Path) -> None:
-    (more_matchers / "new.py").write_text(
-        "from mkpc_kaggle.matchers.contract import MatcherSpec\n"
-        "SPEC = MatcherSpec('new', 'one more')\n"
-        "def load(weights, options, placement): ...\n"
-    )
-    assert "new" in matcher_names()
-    assert spec_of("new", "test").summary == "one more"
 
 
 def test_the_template_of_a_matcher_is_a_matcher(more_matchers: Path) -> None:
@@ -80,7 +66,7 @@ def test_what_matchers_share_is_no_matcher() -> None:
 
 
 def test_without_kornia_its_matchers_alone_are_lost(clean_environment: None) -> None:
-    done = run(WITHOUT_KORNIA)
+    done = subprocess.run([sys.executable, "-c", WITHOUT_KORNIA], capture_output=True, text=True, check=False)
     assert "superglue_outdoor.pth" in done.stdout, done.stderr
     assert "\nweights: matcher xfeat_lighterglue cannot be used here (ModuleNotFoundError" in done.stdout
     assert "    xfeat_lighterglue: cannot be used here (ModuleNotFoundError" in done.stdout

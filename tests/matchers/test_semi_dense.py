@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 import torch
 from checkpoints import PublicFile, store_of, wrapped
+from light_matchers import MATCHERS
 from pictures import picture
-from semi_dense import check_empty, random_network, textured
 from torch import nn
 
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.matchers.adapters import aspanformer, loftr, quadtree
-from mkpc_kaggle.matchers.contract import Picture, Placement, Training
+from mkpc_kaggle.matchers.contract import Placement, Training
 from mkpc_kaggle.matchers.networks.adaptive_span import CELLS_AT_ONCE, span_attention
 from mkpc_kaggle.matchers.networks.aspanformer import AspanFormer
 from mkpc_kaggle.matchers.networks.coarse_matching import coarse_matches
@@ -23,51 +23,6 @@ from mkpc_kaggle.matchers.networks.grids import as_map, to_2x2_blocks
 from mkpc_kaggle.matchers.networks.loftr import Loftr
 from mkpc_kaggle.matchers.networks.position import FIXED_DECAY
 from mkpc_kaggle.matchers.networks.quadtree import Quadtree
-from mkpc_kaggle.matchers.semi_dense import SemiDenseMatcher
-
-
-class SharpLoftr(Loftr):
-    similarity_scale = 1 / (256 * 0.03)
-
-
-class SharpQuadtree(Quadtree):
-    similarity_scale = 1 / (256 * 0.03)
-
-
-MAKERS = {
-    "loftr": lambda border: SharpLoftr(0.0, border),
-    "quadtree": lambda border: SharpQuadtree(0.0, border, (3, 2)),
-    "aspanformer": lambda border: AspanFormer(0.0, border),
-}
-
-
-@pytest.fixture(params=MAKERS)
-def network(request):
-    """A function that makes the network, with a border of so many cells."""
-    return lambda border: random_network(lambda: MAKERS[request.param](border))
-
-
-@torch.inference_mode()
-def test_no_point_lies_on_padding_nor_within_the_border_of_the_content(network):
-    network, (h, w) = network(1), (12, 8)
-    maps = [network.encode(textured(1, 1, 8 * h, 8 * w))] * 2
-    masks = [torch.zeros(1, h, w, dtype=torch.bool) for _ in maps]
-    masks[0][:, : h - 3, : w - 2], masks[1][:, : h - 1, : w - 4] = True, True
-    matches = network.match(*maps, tuple(masks))
-    assert len(matches.points0) > 0
-    for cells, mask in zip((matches.coarse.cell0, matches.coarse.cell1), masks, strict=True):
-        extent = mask[0].any(1).sum(), mask[0].any(0).sum()
-        for position, length in zip((cells // w, cells % w), extent, strict=True):
-            assert network.border <= position.min() and position.max() < length - network.border
-    check_empty(network.match(*maps, (masks[0], torch.zeros_like(masks[1]))))
-
-
-@torch.inference_mode()
-def test_tiny_pictures_match_nothing_and_sides_must_fit(network):
-    network = network(2)
-    check_empty(network.match(*(network.encode(textured(1, 1, 32, width)) for width in (32, 64))))
-    with pytest.raises(ValueError, match=f"multiples of {network.multiple}"):
-        network.encode(torch.zeros(1, 1, 32, 36))
 
 
 @pytest.mark.parametrize("held", [0, 2**20])
@@ -124,17 +79,6 @@ def load_standin(
     return module.load(store, module.SPEC.options(threshold=0.0, training=training, **options), Placement())
 
 
-@pytest.fixture(scope="module", params=MODULES, ids=["loftr", "quadtree", "aspanformer"])
-def matcher(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> SemiDenseMatcher:
-    matcher = load_standin(*request.param, tmp_path_factory.mktemp("weights"), Training.OUTDOOR)
-    assert isinstance(matcher, SemiDenseMatcher)
-    return matcher
-
-
-def shown(height: int, width: int, matcher: SemiDenseMatcher) -> Picture:
-    return picture(height, width, channels=1, multiple=matcher.spec.multiple)
-
-
 def test_indoor_weights_come_with_their_settings(tmp_path: Path) -> None:
     of_loftr, of_quadtree, of_aspanformer = (
         load_standin(*kind, tmp_path, Training.INDOOR)._network for kind in MODULES
@@ -151,11 +95,16 @@ def test_weights_with_optimal_transport_are_refused_with_what_to_take_instead(tm
         load_standin(loftr, Loftr, tmp_path, Training.OUTDOOR, surplus=surplus)
 
 
-def test_cells_on_padding_are_masked_and_points_of_image_0_are_corners_of_cells(matcher: SemiDenseMatcher) -> None:
-    (encoded,) = matcher.encode([shown(97, 131, matcher)])
-    mask = encoded.mask
-    assert mask.shape[1:] == encoded.maps.coarse.shape[2:]
-    assert mask.sum() == 13 * 17
-    (matches,) = matcher.match([encoded], [encoded])
+@pytest.mark.parametrize("name", ["loftr", "quadtree", "aspanformer"])
+def test_points_of_image_0_are_centres_of_cells_within_the_border_of_the_content(name: str) -> None:
+    matcher = MATCHERS[name](Placement())
+    padded = picture(97, 131, channels=1, multiple=matcher.spec.multiple, padding=(20, 40))
+    whole = picture(97, 131, channels=1, multiple=matcher.spec.multiple)
+    first, second = matcher.encode([padded]) + matcher.encode([whole])
+    assert first.mask.sum() == 13 * 17
+    (matches,) = matcher.match([first], [second])
     assert len(matches) > 0
-    np.testing.assert_array_equal((matches.points0 + 0.5) % 8, 0)
+    cells = (matches.points0 + 0.5) / 8
+    np.testing.assert_array_equal(cells % 1, 0)
+    border = matcher._network.border
+    assert (cells >= border).all() and (cells < np.array([17, 13]) - border).all()

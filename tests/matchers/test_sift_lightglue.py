@@ -6,13 +6,11 @@ import torch
 from golden import golden_arrays, needs_golden, seeded_tensor
 from light_matchers import lightglue_matcher
 from numpy.testing import assert_allclose
-from pictures import as_picture, match_one, picture, same
+from pictures import as_picture, match_one, picture
 
 from mkpc_kaggle.matchers.adapters.sift_lightglue import SHAPE, SPEC, SiftEncoder
 from mkpc_kaggle.matchers.contract import Placement
 from mkpc_kaggle.matchers.lightglue import LightGlueMatcher, light_glue
-from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher
-from mkpc_kaggle.recipe import Recipe, Unit
 
 PICTURE = picture(130, 171, channels=1)
 
@@ -66,21 +64,9 @@ def test_a_pixel_has_one_keypoint_and_the_strongest_are_kept():
 
 
 def test_pictures_of_no_keypoints_and_of_one_are_legal():
-    matcher, empty = (
-        lightglue_matcher("sift_lightglue", Placement(), keypoints=1),
-        as_picture(np.zeros((64, 96), np.uint8)),
-    )
+    matcher = lightglue_matcher("sift_lightglue", Placement(), keypoints=1)
+    empty = as_picture(np.zeros((64, 96), np.uint8))
     assert len(match_one(matcher, empty, empty)) == len(match_one(matcher, PICTURE, empty)) == 0
     matches = match_one(matcher, PICTURE, PICTURE)
     assert len(matches) == 1
     assert (matches.points0 == matches.points1).all()
-
-
-def test_a_gray_picture_and_the_same_in_colour_have_the_same_matches():
-    match = TwoStageMatcher(
-        Recipe((Unit(1, "own", 160),)), matchers={"own": lightglue_matcher("sift_lightglue", Placement())}
-    )
-    gray, other = PICTURE.pixels, picture(120, 160, "another").pixels
-    alone, coloured = (match(shown, other).matches for shown in (gray, np.stack([gray] * 3, axis=2)))
-    assert len(alone) > 0
-    assert same(alone, coloured)

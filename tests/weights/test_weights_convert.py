@@ -1,7 +1,5 @@
 """Checkpoints as safetensors."""
 
-import os
-
 import pytest
 import torch
 from weight_files import digest_of
@@ -48,21 +46,16 @@ def test_the_line_takes_over_what_the_manifest_knows(tmp_path, monkeypatch):
     assert told == [("MIT", "slot", "known.pt"), ("BSD", "other", "x.pt"), ("?", "?", "x.pt")]
 
 
-REFUSED = [  # file, result, message
-    ("x.pt", "x.bin", r"x\.bin: the name must end in \.safetensors"),
-    ("gone.pt", "x.safetensors", r"gone\.pt cannot be read"),
-    ("pipe.pt", "x.safetensors", r"pipe\.pt cannot be read as a checkpoint: not a regular file"),
-    ("odd.pt", "x.safetensors", r"odd\.pt: safetensors has no type for tensors of torch\.complex32"),
-    ("x.pt", "x.pt/x.safetensors", r"x\.safetensors cannot be written"),
-]
-
-
 @pytest.mark.filterwarnings("ignore:ComplexHalf")
-def test_what_cannot_be_converted_is_told(tmp_path):
+def test_what_cannot_be_converted_is_stated(tmp_path):
     torch.save({"a": torch.zeros(1)}, tmp_path / "x.pt")
     torch.save({"a": torch.zeros(1).to(torch.complex32)}, tmp_path / "odd.pt")
-    os.mkfifo(tmp_path / "pipe.pt")
-    for file, result, message in REFUSED:
+    for file, result, message in (
+        ("x.pt", "x.bin", r"x\.bin: the name must end in \.safetensors"),
+        ("gone.pt", "x.safetensors", r"gone\.pt cannot be read"),
+        ("odd.pt", "x.safetensors", r"odd\.pt: safetensors has no type for tensors of torch\.complex32"),
+        ("x.pt", "x.pt/x.safetensors", r"x\.safetensors cannot be written"),
+    ):
         with pytest.raises(UserError, match=message):
             convert(tmp_path / file, tmp_path / result)
 

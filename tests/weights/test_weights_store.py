@@ -101,23 +101,14 @@ def test_an_unpacked_checkpoint_is_found_and_read(tmp_path, outer):
     weights = WeightStore([tmp_path / "input"], [file])
     found = weights.find("slot")
     assert (found.state, found.path) == (State.UNVERIFIED, tmp_path / "input" / "someones" / outer / "x")
-    loaded = weights.load("slot")
-    assert loaded.keys() == tensors.keys()
+    assert weights.load("slot").keys() == tensors.keys()
+    assert found.digest in convert(found.path, tmp_path / "x.safetensors").source
+    loaded = load_tensors(tmp_path / "x.safetensors")
     assert all(torch.equal(loaded[name], tensor) for name, tensor in tensors.items())
-    assert [file.state for file in weights.verify()] == [State.UNVERIFIED]
-    line_made = convert(found.path, tmp_path / "x.safetensors")
-    assert found.digest in line_made.source
-    assert load_tensors(tmp_path / "x.safetensors").keys() == tensors.keys()
-
-
-def test_an_unpacked_checkpoint_whose_record_is_cut_off_is_refused_when_it_is_read(tmp_path):
-    torch.save({"a": torch.arange(6.0)}, tmp_path / "x.pth")
-    with ZipFile(tmp_path / "x.pth") as archive:
-        archive.extractall(tmp_path / "input" / "x.pth")
-    record = tmp_path / "input" / "x.pth" / "x" / "data" / "0"
+    record = found.path / "data" / "0"
     record.write_bytes(record.read_bytes()[:-4])
     with pytest.raises(UserError, match="cannot be read as a checkpoint"):
-        load_tensors(record.parents[1])
+        load_tensors(found.path)
 
 
 def test_a_manifest_beside_weights_adds_lines_and_overrides_none(tmp_path, monkeypatch):
@@ -167,37 +158,31 @@ def test_what_cannot_be_read_is_passed_over(tmp_path, kind):
     assert [file.state for file in weights.verify()] == [State.REFUSED]
 
 
-@pytest.mark.parametrize("kind", ["pipe", "garbage", "too large"])
-def test_a_manifest_that_cannot_be_read_is_passed_over(tmp_path, kind):
+@pytest.mark.parametrize("text", [None, b"no manifest", b"#" * (1 << 25)], ids=["pipe", "garbage", "too large"])
+def test_a_manifest_that_cannot_be_read_is_passed_over(tmp_path, text):
     path = put(tmp_path) / "weights_manifest.txt"
-    if kind == "pipe":
-        os.mkfifo(path)
-    else:
-        path.write_bytes(b"no manifest" if kind == "garbage" else b"#" * (1 << 25))
+    os.mkfifo(path) if text is None else path.write_bytes(text)
     with pytest.warns(UserWarning, match=r"passed over: .*weights_manifest\.txt"):
         assert WeightStore([tmp_path]).files
 
 
 def test_verify_tells_good_truncated_swapped_renamed_and_unverified_files_apart(tmp_path):
-    contents = {name: name.encode() * 9 for name in ("good", "cut", "swapped", "lost", "damaged", "free")}
-    files = [line(f"{name}.pt", data) for name, data in contents.items() if name != "free"]
+    contents = {name: name.encode() * 9 for name in ("good", "cut", "swapped", "lost")}
+    files = [line(f"{name}.pt", data) for name, data in contents.items()]
     files.append(line("free.pt", size=-1, digest=UNVERIFIED))
-    put(tmp_path, "good.pt", contents["good"])
-    put(tmp_path, "cut.pt", contents["cut"][:-1])
-    put(tmp_path, "swapped.pt", contents["good"])
-    put(tmp_path, "damaged.pt", contents["damaged"][:-1] + b"!")
-    put(tmp_path / "deep", "renamed.pt", contents["lost"])
-    put(tmp_path, "free.pt", contents["free"])
-    put(tmp_path, "none of ours.pt", b"?")
+    written = {"good.pt": contents["good"], "cut.pt": contents["cut"][:-1], "swapped.pt": contents["good"]}
+    for name, data in (
+        written | {"renamed.pt": contents["lost"], "free.pt": b"free", "none of ours.pt": b"?"}
+    ).items():
+        put(tmp_path, name, data)
     checked = {file.path.name: (file.state, file.note) for file in WeightStore([tmp_path], files).verify()}
     assert {name: state for name, (state, _) in checked.items()} == {
         "good.pt": State.GOOD,
         "cut.pt": State.REFUSED,
         "swapped.pt": State.REFUSED,
-        "damaged.pt": State.REFUSED,
         "renamed.pt": State.GOOD,
         "free.pt": State.UNVERIFIED,
     }
     assert checked["swapped.pt"][1] == "its bytes are those of good.pt"
     assert checked["renamed.pt"][1] == "it is lost.pt"
-    assert digest_of(contents["free"]) in checked["free.pt"][1]
+    assert digest_of(b"free") in checked["free.pt"][1]
