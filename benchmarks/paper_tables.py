@@ -24,8 +24,7 @@ from mkpc_kaggle.data.pairs import read_pairs
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.session import Session, interruptible
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.evaluation.protocols import PROTOCOLS, by_protocol
-from mkpc_kaggle.evaluation.validate import Validation, validate
+from mkpc_kaggle.evaluation.validate import PROTOCOLS, Validation, by_protocol, validate
 from mkpc_kaggle.geometry.metrics import AUC_THRESHOLDS
 from mkpc_kaggle.geometry.robust import Method
 from mkpc_kaggle.pipeline.assembly import Assembly, assemble

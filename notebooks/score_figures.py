@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mkpc_kaggle.geometry.metrics import ROTATION_THRESHOLDS, TRANSLATION_THRESHOLDS
-from mkpc_kaggle.reporting.figures.style import COLOURS, DROPPED, new_figure, plain, short
+from mkpc_kaggle.reporting.figures import COLOURS, DROPPED, new_figure, plain
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -100,3 +100,8 @@ def _legend_below(figure: "Figure") -> None:
     handles, names = figure.axes[0].get_legend_handles_labels()
     if names:
         figure.legend(handles, names, loc="outside lower center", ncols=3, frameon=False)
+
+
+def short(name: str, most: int = 18) -> str:
+    """Return a name of up to ``most`` letters."""
+    return name if len(name) <= most else name[: most - 1] + "…"

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from score_figures import short
 
 from mkpc_kaggle.data.competition import TrainScene, TruePair, read_train_side
 from mkpc_kaggle.data.images import Image
@@ -18,17 +19,16 @@ from mkpc_kaggle.geometry.metrics import PoseError
 from mkpc_kaggle.geometry.robust import Estimate
 from mkpc_kaggle.pipeline.pair import PairMatch
 from mkpc_kaggle.recipe import Unit
-from mkpc_kaggle.reporting.figures.run import draw_cameras
-from mkpc_kaggle.reporting.figures.style import (
+from mkpc_kaggle.reporting.figures import (
     COLOURS,
     DROPPED,
     INLIER,
     OUTLIER,
     REGION,
+    draw_cameras,
     new_figure,
     plain,
     sample,
-    short,
 )
 from mkpc_kaggle.scene.reconstruction import Reconstruction
 

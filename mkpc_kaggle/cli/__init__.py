@@ -65,7 +65,10 @@ def main(arguments: Sequence[str] | None = None, *, started: float | None = None
         try:
             given = sys.argv[1:] if arguments is None else list(arguments)
             parsed = make_parser(given).parse_args(given)
-            require_directory()
+            try:
+                Path.cwd()  # relative paths are undefined without it
+            except OSError as error:
+                raise UserError(f"the current directory is gone ({error.strerror}); change to another") from error
             parsed.started = time.monotonic() if started is None else started
             printing.enter_context(parsed.printing())
             status = int(parsed.run(parsed))
@@ -86,16 +89,6 @@ def main(arguments: Sequence[str] | None = None, *, started: float | None = None
                 raise
             complain(f"{error.strerror}: {str(error.filename)[:80]}...")
             return EXIT_BAD_INPUT
-
-
-def require_directory() -> None:
-    """Raise :class:`UserError` if the current directory was removed: relative paths are then undefined."""
-    from mkpc_kaggle.errors import UserError
-
-    try:
-        Path.cwd()
-    except OSError as error:
-        raise UserError(f"the current directory is gone ({error.strerror}); change to another") from error
 
 
 def make_parser(arguments: Sequence[str] = tuple(COMMANDS)) -> argparse.ArgumentParser:

@@ -9,8 +9,7 @@ from mkpc_kaggle.data.outputs import require_apart
 from mkpc_kaggle.engine.streams import unblocked
 from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
 from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher, to_image
-from mkpc_kaggle.reporting.figures.pair import draw_pair
-from mkpc_kaggle.reporting.figures.style import require_format, save
+from mkpc_kaggle.reporting.figures import draw_pair, require_format, save
 
 HELP = """\
 Match two images. Print the fundamental matrix (x1^T F x0 = 0, pixel centres at integers), the number of matches

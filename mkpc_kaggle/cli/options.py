@@ -6,6 +6,7 @@ from contextlib import contextmanager
 from math import inf
 from pathlib import Path
 
+from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.budget import Budget, monotonic_of, parse_duration
 from mkpc_kaggle.engine.cluster import parse_workers
 from mkpc_kaggle.engine.console import say
@@ -82,6 +83,15 @@ def say_start(what: str, assembly: Assembly, work_dir: Path) -> None:
 
     header = f"{what}, recipe {assembly.recipe.name}, {assembly.placement}, journal in {work_dir}"
     say("\n".join(filter(None, [header, left_out_line(assembly.left_out)])))
+
+
+def finish(session: Session, status: int, page: Path | None, pairs: Sequence[Pair]) -> int:
+    """Write the page about a run, if any. Return the exit status: that of a signal, or ``status``."""
+    from mkpc_kaggle.reporting.report import report_run
+
+    if page is not None:
+        say(report_run(session.work_dir, page, session.must_end(), pairs))
+    return 128 + session.interrupt.signal if session.interrupt.signal else status
 
 
 def plan_lines(arguments: argparse.Namespace, report: RunReport) -> list[str]:

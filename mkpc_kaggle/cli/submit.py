@@ -8,7 +8,6 @@ from mkpc_kaggle.data.competition import read_test_side, test_side
 from mkpc_kaggle.data.outputs import require_apart
 from mkpc_kaggle.engine.console import say
 from mkpc_kaggle.engine.session import first_version, interruptible, submit
-from mkpc_kaggle.reporting.report import report_run
 from mkpc_kaggle.reporting.summary import summary, trouble
 
 HELP = """\
@@ -44,8 +43,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     output: Path = arguments.output
     work_dir: Path = arguments.work_dir or output.parent / f"{output.stem}.work"
-    page: Path = arguments.report or output.parent / f"{output.stem}.html"
-    files = {"--output": output, "--report": None if arguments.no_report else page}
+    page = None if arguments.no_report else arguments.report or output.parent / f"{output.stem}.html"
+    files = {"--output": output, "--report": page}
     require_apart(files, [*test_side(arguments.test_dir), Path(arguments.recipe)], work_dir, arguments.weights)
     with interruptible() as interrupt:
         pairs = read_test_side(arguments.test_dir)
@@ -57,13 +56,6 @@ def run(arguments: argparse.Namespace) -> int:
             report = submit(pairs, assembly, session, output, str(test_side(arguments.test_dir)[1]))
             watchdog.status = int(bool(report.unwritten or trouble(report)))
             unwritten = f" is not the last version: {report.unwritten}" if report.unwritten else ""
-            lines = [
-                *options.plan_lines(arguments, report),
-                summary(pairs, report),
-                f"submission: {output}{unwritten}",
-            ]
-            say("\n".join(lines))  # the watchdog may end the program while it draws
-            if not arguments.no_report:
-                say(report_run(work_dir, page, session.must_end(), pairs))
-            signal = session.interrupt.signal
-            return 128 + signal if signal else watchdog.status
+            lines = [*options.plan_lines(arguments, report), summary(pairs, report)]
+            say("\n".join([*lines, f"submission: {output}{unwritten}"]))  # drawing may exceed the time limit
+            return options.finish(session, watchdog.status, page, pairs)

@@ -20,19 +20,22 @@ from mkpc_kaggle.engine.session import Interrupt, Session, Watchdog, interruptib
 from mkpc_kaggle.errors import UserError, writing
 from mkpc_kaggle.evaluation.compare import Comparison, comparison_json, comparison_table, step_gains
 from mkpc_kaggle.evaluation.imc2025 import score_imc2025, score_lines
-from mkpc_kaggle.evaluation.protocols import PROTOCOLS, by_protocol
-from mkpc_kaggle.evaluation.validate import missing_rows, score_submission, score_table, to_json, validate
+from mkpc_kaggle.evaluation.validate import (
+    PROTOCOLS,
+    by_protocol,
+    score_submission,
+    score_table,
+    to_json,
+    validate,
+)
 from mkpc_kaggle.geometry.robust import Method, RobustConfig
 from mkpc_kaggle.pipeline.assembly import Assembly
 from mkpc_kaggle.recipe import Recipe, split_mode
-from mkpc_kaggle.reporting.report import report_run
 from mkpc_kaggle.reporting.summary import left_out_line, summary, trouble
 
 # Defaults of the matching options.
-MATCHING = dict.fromkeys(("work_dir", "compare", "units", "method", "threshold")) | {
-    "recipe": "auto",
-    "mode": "two-stage",
-}
+MATCHING = dict.fromkeys(("work_dir", "compare", "units", "method", "threshold", "regions"))
+MATCHING |= {"recipe": "auto", "mode": "two-stage"}
 HELP = """\
 Run a recipe on a train side with the engine that makes submissions, and score it as the competition does. A
 train side has calibration.csv, pair_covisibility.csv and images/ in each scene, and scaling_factors.csv next to
@@ -74,9 +77,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--compare", nargs="+", metavar="RECIPE[:MODE]", help=text)
     add("--method", choices=list(map(str, Method)), help="default: the recipe's")
     add("--threshold", type=float, metavar="PIXELS", help="of the method; for E divided by the mean focal length")
-    text = (
-        "settings of a published evaluation of --pairs, see docs/benchmarks.md; --method and --threshold change it"
-    )
+    text = "settings of a published evaluation, see docs/benchmarks.md; --method and --threshold change them"
     add("--protocol", choices=list(PROTOCOLS), help=text)
     text = "the matches choose between E's two rotations, as with --protocol; default: the one nearer to the truth"
     add("--in-front", action="store_true", help=text)
@@ -107,7 +108,7 @@ def run(arguments: argparse.Namespace) -> int:
             return _match_and_score(arguments, scenes, work_dir)
         scored = [score_submission(submission, arguments.truth, scenes) for submission in arguments.submission]
         for submission, validation in zip(arguments.submission, scored, strict=True):
-            say("\n".join([str(submission), *score_table(validation), *missing_rows(validation)]))
+            say("\n".join([str(submission), *score_table(validation)]))
         figures = [*map(to_json, scored)]
         _write_json(arguments.json, {"submissions": figures} if len(scored) > 1 else figures[0])
         return 0
@@ -115,25 +116,22 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _require_a_whole(given: argparse.Namespace) -> None:
     """Raise :class:`UserError` for options that cannot be combined."""
+    matches = any(getattr(given, name) != default for name, default in MATCHING.items())
+    matching = ", ".join(f"--{name.replace('_', '-')}" for name in MATCHING)
     for is_wrong, message in (
         (given.imc2025 and (given.truth or not given.submission), "--imc2025 needs --submission, and no --truth"),
         (
-            not given.imc2025 and (not given.submission) != (not given.truth),
+            not given.imc2025 and bool(given.submission) != bool(given.truth),
             "--submission and --truth go together",
         ),
-        (
-            given.submission and any(getattr(given, name) != default for name, default in MATCHING.items()),
-            "--submission matches nothing: it goes without "
-            + ", ".join(f"--{name.replace('_', '-')}" for name in MATCHING),
-        ),
+        (given.submission and matches, f"--submission matches nothing: it goes without {matching}"),
         (given.imc2025 and given.json, "--imc2025 only prints the score: it goes without --json"),
         ((given.pairs is None) != (given.image_root is None), "--pairs and --image-root go together"),
         (given.pairs and given.submission, "--submission needs a --train-dir: it scores in metres"),
         (
             not given.pairs and (given.protocol or given.in_front),
-            "--protocol and --in-front need --pairs: they are of E",
+            "--protocol and --in-front are of E: give --pairs",
         ),
-        (given.regions and given.submission, "--submission matches nothing: it goes without --regions"),
         (given.pairs and given.compare, "--compare needs a --train-dir: it scores in metres"),
         (given.compare and given.units, "--units chooses from one recipe; --compare takes recipes as they are"),
         (given.compare and len(given.compare) < 2, "--compare needs two recipes or more"),
@@ -172,10 +170,10 @@ def _match_and_score(arguments: argparse.Namespace, scenes: tuple[TrainScene, ..
             lines = [*filter(None, [left_out_line(assembly.left_out)]), *options.plan_lines(arguments, report)]
             lines += [summary(pairs, report), "", f"recipe {validation.recipe}"]
             say("\n".join([*lines, *score_table(validation), *step_gains(validation)]))
-            # The report draws inliers of F, and a list of pairs has E instead.
-            if arguments.work_dir is not None and arguments.pairs is None:
-                say(report_run(work_dir, work_dir / f"{name}.html", session.must_end(), pairs))
-            status = 128 + interrupt.signal if interrupt.signal else max(status, bool(trouble(report)))
+            # The page draws inliers of F, and a list of pairs has E instead.
+            has_page = arguments.work_dir is not None and arguments.pairs is None
+            page = work_dir / f"{name}.html" if has_page else None
+            status = options.finish(session, max(status, bool(trouble(report))), page, pairs)
             if compared and report.ending != Ending.COMPLETE:
                 say("nothing is compared until all is done; with a --work-dir, the same command resumes")
                 return status or 1

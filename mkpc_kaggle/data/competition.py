@@ -13,7 +13,6 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache
-from itertools import zip_longest
 from pathlib import Path
 from typing import TypeVar
 
@@ -99,7 +98,7 @@ def read_test_side(directory: Path) -> tuple[Pair, ...]:
     if not images.is_dir():
         raise UserError(f"{images}: no such directory; --test-dir must hold test.csv and test_images/")
     if not pairs:
-        raise UserError(f"{path} has no rows: there is nothing to match")
+        raise UserError(f"{path} has no rows, so there is nothing to match")
     return tuple(pairs.values())
 
 
@@ -162,14 +161,6 @@ def read_submission(path: Path) -> dict[str, Matrix3]:
     return {sample: _numbers(cell, where, 9).reshape(3, 3) for where, (sample, cell) in rows}
 
 
-def has_samples(path: Path, sample_ids: Iterable[str]) -> bool:
-    """Return whether a file is a submission with these samples, in their order. Matrices are not checked."""
-    with suppress(UserError):
-        rows = (sample for _, (sample, _) in read_rows(path, SUBMISSION_COLUMNS, only=True))
-        return all(found == wanted for found, wanted in zip_longest(rows, sample_ids))
-    return False
-
-
 def submission_problems(path: Path, sample_ids: Sequence[str]) -> list[str]:
     """Return the problems of a submission, a sentence each; empty if the competition accepts it."""
     try:
@@ -183,7 +174,7 @@ def submission_problems(path: Path, sample_ids: Sequence[str]) -> list[str]:
     elif surplus := [sample for sample in found if sample not in wanted]:
         problems.append(f"{len(surplus)} samples are not in test.csv, the first is {surplus[0]}")
     elif found != list(sample_ids):
-        problems.append("the samples are not in the order of test.csv, or a sample is there twice")
+        problems.append("the samples are not in the order of test.csv, or a sample appears twice")
     for sample, cell in rows:
         try:
             F = _numbers(cell, sample, 9)

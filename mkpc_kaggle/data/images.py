@@ -1,18 +1,28 @@
-"""Images: decoded once, in the background. An unreadable file is a value with a reason, not an exception."""
+"""Images: decoded once, in the background. An unreadable file is a value with a reason, not an exception.
+
+EXIF gives the orientation of the stored pixels, and the focal length by COLMAP's rule. Source:
+``Bitmap::ExifFocalLength`` of COLMAP 4.2, without its table of sensors.
+"""
 
 import hashlib
+import warnings
 from collections import OrderedDict
 from collections.abc import Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
+from io import BytesIO
+from math import hypot, inf
+from numbers import Real
 from pathlib import Path
 from typing import Generic, TypeVar
 
 import cv2
 import numpy as np
+import PIL.Image
 
-from mkpc_kaggle.data.exif import read_exif
+from mkpc_kaggle.config import Range
 from mkpc_kaggle.errors import shown
 from mkpc_kaggle.geometry.coordinates import Pixels, Size
 
@@ -21,6 +31,14 @@ Value = TypeVar("Value")
 
 NOT_A_PICTURE = "not a picture, or cut off: it cannot be decoded"
 MAX_ASPECT = 32  # of the sides; longer views would be a few pixels high, or would not fit into memory
+
+ORIENTATION, DIRECTORY, FOCAL_MM = 0x0112, 0x8769, 0x920A  # tags of EXIF
+PLANE_RESOLUTION, PLANE_UNIT, FOCAL_35MM = 0xA20E, 0xA210, 0xA405
+FILM_MM = 43.27  # diagonal of 35 mm film
+UNITS_MM: dict[float, float] = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
+FOCALS = Range(0.2, 20.0)  # long sides of an image; a focal length outside this range counts as a mistake
+# Counter-clockwise quarter turns that set stored pixels upright, by orientation; mirrored pixels stay mirrored.
+TURNS: dict[float, int] = {3: 2, 4: 2, 5: 3, 6: 3, 7: 1, 8: 1}
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,6 +111,26 @@ def read_image(path: Path) -> Image | Unreadable:
     return Image(name, pixels, _content_digest(data), focal, turns)
 
 
+def read_exif(data: bytes, size: Size) -> tuple[int, float]:
+    """Return the quarter turns, counter-clockwise, that set an image upright, and its focal length in pixels.
+
+    ``data`` is the file of an image of ``size``. Both numbers are 0 if unknown; damaged EXIF counts as missing.
+    """
+    tags: dict[int, float] = {}
+    with suppress(Exception), warnings.catch_warnings():  # Pillow raises errors of any type for a damaged file
+        warnings.filterwarnings("ignore", module="PIL")
+        # OpenCV turns TIFF itself. Pillow would decode all pixels of a PNG, since EXIF may come after them.
+        with PIL.Image.open(BytesIO(data), formats=("JPEG", "PNG", "WEBP")) as picture:
+            if picture.format != "PNG" or b"eXIf" in data:
+                exif = picture.getexif()
+                found = {**exif, **exif.get_ifd(DIRECTORY)}
+                tags = {tag: float(value) for tag, value in found.items() if isinstance(value, Real)}
+    unit = UNITS_MM.get(tags.get(PLANE_UNIT, 0), inf)
+    focal = tags.get(FOCAL_35MM, 0.0) / FILM_MM * hypot(*size)
+    focal = focal or tags.get(FOCAL_MM, 0.0) * tags.get(PLANE_RESOLUTION, 0.0) / unit
+    return TURNS.get(tags.get(ORIENTATION, 1), 0), focal if focal / max(size) in FOCALS else 0.0
+
+
 def content_digest(path: Path) -> str:
     """Return the digest of a file. Raise ``OSError`` or ``ValueError`` if it cannot be read."""
     if not path.is_file():
@@ -123,10 +161,10 @@ class ByteCache(Generic[Key, Value]):
         return self._entries[key][0]
 
     def put(self, key: Key, value: Value, size: int) -> None:
-        self.bytes += size - self._entries.pop(key, (value, 0))[1]
-        self._entries[key] = value, size
-        if size > self.limit:
-            self.bytes -= self._entries.pop(key)[1]
+        self.bytes -= self._entries.pop(key, (value, 0))[1]
+        if size <= self.limit:
+            self._entries[key] = value, size
+            self.bytes += size
         while self.bytes > self.limit:
             self.bytes -= self._entries.popitem(last=False)[1][1]
 
@@ -147,10 +185,8 @@ class ImageStore:
 
     def get(self, path: Path) -> Image | Unreadable:
         """Return the image. Wait until it is decoded."""
-        if (known := self._images.get(path)) is not None:
-            return known
         self.prefetch([path])
-        image = self._pending.pop(path).result()
+        image = self._images.get(path) or self._pending.pop(path).result()
         if isinstance(image, Image):
             self._images.put(path, image, image.pixels.nbytes)
         return image

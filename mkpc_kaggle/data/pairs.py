@@ -4,22 +4,25 @@ One line per pair: ``name0 name1 turns0 turns1 K0 K1 T_0to1``, separated by blan
 root. ``turns`` are the counter-clockwise quarter turns that set an image upright, in addition to its EXIF's. K (9
 numbers) and T (16) are stored row by row and refer to the stored pixels: X_1 = R X_0 + t with T = [R t; 0 1].
 
-A file ``.npz``, or a directory of ``.npz`` files, is LoFTR's list of MegaDepth-1500.
+A file ``.npz``, or a directory of ``.npz`` files, is LoFTR's list of MegaDepth-1500, ``scene_info``.
 """
 
-from collections.abc import Iterable
+import pickle
+import zipfile
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
+from io import BytesIO
 from itertools import chain
 from math import nan
 from pathlib import Path, PureWindowsPath
+from typing import Any
 
 import numpy as np
 
 from mkpc_kaggle.data.competition import Pair, TrainScene, TruePair, evenly_spread, read_rows
-from mkpc_kaggle.data.images import Unreadable, read_image
-from mkpc_kaggle.data.megadepth import lines_of_scene_info
+from mkpc_kaggle.data.images import Image, read_image
 from mkpc_kaggle.errors import UserError, read_text
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Box, Size
@@ -27,6 +30,10 @@ from mkpc_kaggle.geometry.coordinates import Box, Size
 FIELDS = 2 + 2 + 9 + 9 + 16
 EXPECTED = "name0 name1 turns0 turns1 K0 (9 numbers) K1 (9) T_0to1 (16)"
 MAX_SKEWNESS = 1e-3  # of R R^T from the identity; files round poses to few digits
+MAX_ARRAY_BYTES = 1 << 28  # limit for an unpacked array of a .npz
+# The only names that pickled arrays need. Any other name might run code.
+NAMES = {"ndarray": np.ndarray, "dtype": np.dtype, "encode": lambda text, _: text.encode("latin-1")}
+NAMES |= {"_reconstruct": np.empty(0).__reduce__()[0], "scalar": np.float64(0).__reduce__()[0]}
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +76,13 @@ def read_regions(file: Path, image_root: Path, pairs: Iterable[Pair]) -> dict[tu
     pixels of the stored file, the latter two exclusive. Raises :class:`UserError` for a malformed table or box and
     for a missing pair.
     """
-    rows, found, size = {}, dict[tuple[str, ...], tuple[Box, Box]](), cache(size_of)
+    rows, found = {}, dict[tuple[str, ...], tuple[Box, Box]]()
+
+    @cache
+    def size(file: str) -> Size | None:
+        image = read_image(Path(file))
+        return image.size if isinstance(image, Image) else None
+
     for where, (name0, name1, *cells) in read_rows(file, ("image_0", "image_1", "box_0", "box_1")):
         rows[str(image_root / name0), str(image_root / name1)] = where, *cells
     for pair in pairs:
@@ -89,11 +102,6 @@ def parse_box(cell: str, size: Size | None, where: str) -> Box:
     raise UserError(f"{where}: expected left, top, right and bottom of a box on its image, found {cell!r}")
 
 
-def size_of(path: str | Path) -> Size | None:
-    image = read_image(Path(path))
-    return None if isinstance(image, Unreadable) else image.size
-
-
 def parse_line(line: str, where: str) -> tuple[ListedImage, ListedImage]:
     """Return both images of a line. Raise :class:`UserError` with its location and the expected format."""
     cells = line.split()
@@ -104,7 +112,7 @@ def parse_line(line: str, where: str) -> tuple[ListedImage, ListedImage]:
         if path.anchor or ".." in path.parts or "\0" in name:
             raise UserError(f"{where}: {name!r} points outside the image root; expected a path without ..")
     try:
-        turns, numbers = [int(cell) for cell in cells[2:4]], np.array([float(cell) for cell in cells[4:]])
+        turns, numbers = list(map(int, cells[2:4])), np.array(list(map(float, cells[4:])))
     except ValueError as error:
         raise UserError(f"{where}: expected numbers for turns, K0, K1 and T_0to1: {error}") from error
     K0, K1, T = numbers[:9].reshape(3, 3), numbers[9:18].reshape(3, 3), numbers[18:].reshape(4, 4)
@@ -122,3 +130,38 @@ def parse_line(line: str, where: str) -> tuple[ListedImage, ListedImage]:
             raise UserError(f"{where}: expected {expected}")
     first, second = Camera(K0, np.eye(3), np.zeros(3)), Camera(K1, R, t)
     return ListedImage(cells[0], turns[0], first), ListedImage(cells[1], turns[1], second)
+
+
+def lines_of_scene_info(file: Path) -> Iterator[str]:
+    """Yield a line of the list for each pair of a ``scene_info`` file.
+
+    A pair has two indices into ``image_paths``, ``intrinsics``, (3, 3), and ``poses``, (4, 4) world to camera.
+    Raises :class:`UserError` for any other file. Executes no code of the file.
+    """
+    try:
+        with zipfile.ZipFile(file) as archive:
+            names = ("pair_infos", "image_paths", "intrinsics", "poses")
+            infos, paths, Ks, poses = (_array(archive, f"{name}.npy") for name in names)
+        for (i, j), *_ in infos:
+            T = np.asarray(poses[j], float) @ np.linalg.inv(np.asarray(poses[i], float))
+            numbers = np.concatenate([np.ravel(matrix) for matrix in (Ks[i], Ks[j], T)])
+            yield " ".join([str(paths[i]), str(paths[j]), "0 0", *(f"{number:.17g}" for number in numbers)])
+    except Exception as error:  # a pickle may raise anything
+        raise UserError(f"{file} is not a scene_info of MegaDepth: {error}") from error
+
+
+class _Arrays(pickle.Unpickler):
+    def find_class(self, module: str, name: str) -> Any:
+        if module.partition(".")[0] not in ("numpy", "_codecs") or name not in NAMES:
+            raise pickle.UnpicklingError(f"it names {module}.{name}, which no array needs")
+        return NAMES[name]
+
+
+def _array(archive: zipfile.ZipFile, name: str) -> Any:
+    if archive.getinfo(name).file_size > MAX_ARRAY_BYTES:
+        raise ValueError(f"{name} has more than {MAX_ARRAY_BYTES} bytes")
+    stream = BytesIO(archive.read(name))
+    try:
+        return np.lib.format.read_array(stream, allow_pickle=False)
+    except ValueError:  # an array of objects: its header has been read, and its pickle follows
+        return _Arrays(stream).load()

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass, replace
 from itertools import product
-from types import MappingProxyType
 
 import cv2
 import numpy as np
@@ -13,7 +12,7 @@ from mkpc_kaggle.demo.render import Picture, Surface
 
 Colour = tuple[int, int, int]  # BGR
 
-SCENES = MappingProxyType({"courtyard": 2.5, "market": 1.0})  # metres per unit of each world
+SCENES = {"courtyard": 2.5, "market": 1.0}  # metres per unit of each world
 SCENE_NAMES = tuple(SCENES)
 
 TEXELS = 72  # a metre

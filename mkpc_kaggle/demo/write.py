@@ -10,8 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from mkpc_kaggle.demo.camera import FloatImage, Floats, SizedCamera
-from mkpc_kaggle.demo.covisibility import covisibility
+from mkpc_kaggle.demo.camera import FloatImage, Floats, SizedCamera, covisibility
 from mkpc_kaggle.demo.render import Picture, render
 from mkpc_kaggle.demo.world import SCENE_NAMES, World, build_world
 from mkpc_kaggle.errors import UserError
@@ -58,17 +57,12 @@ def write_demo(
     """Render the scenes (all of them by default) and write both sides under `directory`.
 
     The same arguments give the same bytes. `image_scale` scales all images and their K.
-    Raises ValueError for an unknown scene, a scene given twice, or a scale that is not positive. Raises
-    :class:`UserError` if the directory has a train or test side that no demo wrote.
+    Raises ValueError for an unknown scene, and :class:`UserError` if the directory has a train or test side that
+    no demo wrote.
     """
-    names = SCENE_NAMES if scenes is None else tuple(scenes)
-    if len(set(names)) != len(names):
-        raise ValueError(f"a scene is given twice: {', '.join(names)}")
-    if not image_scale > 0:
-        raise ValueError(f"image_scale must be positive, not {image_scale}")
     demo = DemoSet(directory, directory / "train", directory / "test", directory / "test_truth.csv")
     _claim(demo)
-    worlds = [build_world(name, seed=seed, image_scale=image_scale) for name in names]
+    worlds = [build_world(name, seed=seed, image_scale=image_scale) for name in scenes or SCENE_NAMES]
     rows: list[tuple[str, str]] = []
     for world in worlds:
         photographs = take_photographs(world, seed)
@@ -120,9 +114,8 @@ def _pair(a: Photograph, b: Photograph) -> DemoPair:
 def _selected(pairs: Sequence[DemoPair]) -> list[DemoPair]:
     """Select the test side's pairs: scored ones, spread evenly over covisibility."""
     scored = sorted((p for p in pairs if p.covisibility >= MIN_COVISIBILITY), key=lambda p: p.covisibility)
-    if len(scored) <= TEST_PAIRS:
-        return scored
-    return [scored[i] for i in np.linspace(0, len(scored) - 1, TEST_PAIRS).round().astype(int)]
+    chosen = np.linspace(0, len(scored) - 1, min(TEST_PAIRS, len(scored))).round().astype(int)
+    return [scored[index] for index in chosen]
 
 
 def _write_train(directory: Path, photographs: Sequence[Photograph], pairs: Sequence[DemoPair]) -> None:

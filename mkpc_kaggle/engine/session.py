@@ -19,7 +19,7 @@ from typing import Any, Self
 import cv2
 import numpy as np
 
-from mkpc_kaggle.data.competition import Pair, has_samples, write_submission
+from mkpc_kaggle.data.competition import Pair, submission_problems, write_submission
 from mkpc_kaggle.data.outputs import replacing
 from mkpc_kaggle.engine import console
 from mkpc_kaggle.engine.budget import Budget
@@ -103,7 +103,7 @@ def first_version(pairs: Sequence[Pair], output: Path) -> Iterator[None]:
     ours, ids = None, [pair.id for pair in pairs]
     with ExitStack() as closed:
         former = None
-        if not output.exists() or (output.is_file() and not has_samples(output, ids)):
+        if not output.exists() or (output.is_file() and submission_problems(output, ids)):
             with writing(f"--output {output}"):
                 if output.is_file():
                     former = closed.enter_context(output.open("rb"))  # it outlives its name

@@ -55,7 +55,8 @@ def score_imc2025(directory: Path, submission: Path) -> list[DatasetScore]:
     labels, path = directory / "train_labels.csv", directory / "train_thresholds.csv"
     truth, found, thresholds = _centres(labels), _centres(submission), _thresholds(path)
     for name, scenes in truth.items():
-        if unplaced := [image for scene in scenes if scene != OUTLIERS for image in _without_pose(scenes[scene])]:
+        placed = {image: centre for scene in scenes.keys() - {OUTLIERS} for image, centre in scenes[scene].items()}
+        if unplaced := [image for image, centre in placed.items() if not np.isfinite(centre).all()]:
             image = shown(f"{name}/{unplaced[0]}")
             raise UserError(f"{labels}: {image} has no pose, and is not of the scene {OUTLIERS}")
         images, given = (
@@ -140,10 +141,6 @@ def _triplets(count: int) -> NDArray[np.intp]:
         return np.array(list(combinations(range(count), 3)), np.intp)
     drawn = np.random.default_rng(0).random((MAX_TRIPLETS, count))
     return np.argpartition(drawn, 3, axis=1)[:, :3]
-
-
-def _without_pose(centres: Centres) -> list[str]:
-    return [image for image, centre in centres.items() if not np.isfinite(centre).all()]
 
 
 def _thresholds(path: Path) -> dict[str, dict[str, Points]]:

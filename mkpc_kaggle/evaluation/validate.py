@@ -1,5 +1,9 @@
-"""Run of the engine on a train side, and its scores by the rules of the competition."""
+"""Run of the engine on pairs with known cameras, and its scores.
 
+A train side is scored by the rules of the competition, a list of pairs by those of SuperGlue and LoFTR.
+"""
+
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
@@ -20,10 +24,15 @@ from mkpc_kaggle.geometry import metrics
 from mkpc_kaggle.geometry.coordinates import Matrix3
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.metrics import AUC_THRESHOLDS, PoseError
-from mkpc_kaggle.geometry.robust import ModelKind
+from mkpc_kaggle.geometry.robust import Method, ModelKind, RobustConfig
 from mkpc_kaggle.pipeline.assembly import Assembly
+from mkpc_kaggle.recipe import Recipe
 
 MAX_NAMES = 5  # sample names in a line
+MATCHING = ("precision", "matching_score")
+
+SUPERGLUE = RobustConfig(Method.RANSAC, 1.0, 0.99999, max_iterations=1000, permutations=1, every_match=True)
+PROTOCOLS = {"superglue": SUPERGLUE, "loftr": replace(SUPERGLUE, threshold=0.5)}
 
 
 class Step(StrEnum):
@@ -110,6 +119,17 @@ class Validation:
     @property
     def errors(self) -> list[PoseError]:
         return [error for scene in self.scenes for error in scene.errors]
+
+
+def by_protocol(recipe: Recipe, protocol: str) -> Recipe:
+    """Return the recipe with the settings of a protocol. A protocol also scores rotations ``in_front``.
+
+    SuperGlue's threshold is in pixels of the resized picture, here the recipe's largest in stage 1.
+    """
+    units = tuple(replace(unit, antialias=False) for unit in recipe.units)
+    sides = [unit.long_side or max(map(int, unit.area.split("x"))) for unit in units if unit.stage == 1]
+    magsac = replace(PROTOCOLS[protocol], threshold_side=max(sides) if protocol == "superglue" else 0)
+    return replace(recipe, units=units, magsac=magsac, focal=None, scene=None)
 
 
 def validate(
@@ -209,7 +229,7 @@ def score_table(validation: Validation) -> list[str]:
     """Return a row for each scene and a row of their mean, with a dash for unknown figures.
 
     The columns are the mAA, after each of several steps, and the pose AUC after the last. Lists of pairs also have
-    precision and matching score.
+    precision and matching score. The last line has the names of samples without a row, if any.
     """
     several, is_list = len(validation.steps) > 1, not all(scene.in_metres for scene in validation.scenes)
     heads = [*(validation.steps if several else ["mAA"]), *(f"AUC {angle:.0f}" for angle in AUC_THRESHOLDS)]
@@ -221,22 +241,17 @@ def score_table(validation: Validation) -> list[str]:
         values = (*accuracies, *map(scores.auc, AUC_THRESHOLDS), *(scores.matching if is_list else ()))
         cells = (f"{value:>9.4f}" if isfinite(value) else f"{'-':>9}" for value in values)
         lines.append(f"{name:<20}{len(scores.errors):>6}" + "".join(cells))
+    if missing := validation.missing:
+        more = f" and {len(missing) - MAX_NAMES} more" if len(missing) > MAX_NAMES else ""
+        names = ", ".join(missing[:MAX_NAMES]) + more
+        lines.append(f"{len(missing)} samples have no row and count as failed: {names}")
     return ["mAA after each step, AUC after the last:", *lines] if several else lines
-
-
-def missing_rows(validation: Validation) -> list[str]:
-    """Return a line with the names of samples without a row, if any."""
-    missing = validation.missing
-    if not missing:
-        return []
-    more = f" and {len(missing) - MAX_NAMES} more" if len(missing) > MAX_NAMES else ""
-    return [f"{len(missing)} samples have no row and count as failed: {', '.join(missing[:MAX_NAMES])}{more}"]
 
 
 def to_json(validation: Validation) -> dict[str, Any]:
     """Return all figures as JSON values: overall, per scene and per pair; null for non-finite numbers."""
     steps, report = validation.steps, validation.report
-    return {
+    figures = {
         "recipe": validation.recipe,
         "missing": validation.missing,
         **_scores_json(validation, steps),
@@ -246,25 +261,27 @@ def to_json(validation: Validation) -> dict[str, Any]:
             for scene in validation.scenes
         ],
     }
+    values: dict[str, Any] = json.loads(json.dumps(figures), parse_constant=lambda _: None)  # NaN and infinity
+    return values
 
 
 def _scores_json(scores: SceneScore | Validation, steps: Sequence[Step]) -> dict[str, Any]:
     return {
-        "mAA": _finite(scores.maa()),
-        "mAA_by_step": {step: _finite(scores.maa(step)) for step in steps},
+        "mAA": scores.maa(),
+        "mAA_by_step": {step: scores.maa(step) for step in steps},
         "AUC": {f"{threshold:g}": scores.auc(threshold) for threshold in AUC_THRESHOLDS},
-        **_matching_json(scores),
+        **dict(zip(MATCHING, scores.matching, strict=True)),
     }
 
 
 def _pair_json(pair: PairScore) -> dict[str, Any]:
     values: dict[str, Any] = {
         "pair": pair.id,
-        "covisibility": _finite(pair.covisibility),
-        "rotation_error_degrees": _finite(pair.error.rotation),
-        "translation_error_metres": _finite(pair.error.translation),
-        "translation_error_degrees": _finite(pair.error.translation_angle),
-        **_matching_json(pair),
+        "covisibility": pair.covisibility,
+        "rotation_error_degrees": pair.error.rotation,
+        "translation_error_metres": pair.error.translation,
+        "translation_error_degrees": pair.error.translation_angle,
+        **dict(zip(MATCHING, pair.matching, strict=True)),
         "accuracy_by_step": {step: metrics.pair_accuracy(error) for step, error in pair.steps.items()},
     }
     if (record := pair.record) is not None:
@@ -272,12 +289,3 @@ def _pair_json(pair: PairScore) -> dict[str, Any]:
         values["matches"] = {unit.unit: unit.matches for unit in record.units}
         values["regions"] = [str(region.reason) for region in record.regions or ()]
     return values
-
-
-def _matching_json(scores: PairScore | SceneScore | Validation) -> dict[str, Any]:
-    precision, matching_score = map(_finite, scores.matching)
-    return {"precision": precision, "matching_score": matching_score}
-
-
-def _finite(value: float) -> float | None:
-    return value if isfinite(value) else None

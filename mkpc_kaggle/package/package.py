@@ -6,9 +6,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.package.folder import Item, refuse_other_files, write_files
+from mkpc_kaggle.package.files import Item, choose_weights, refuse_other_files, write_files
 from mkpc_kaggle.package.metadata import LATEST, check_owner, dataset_metadata, kernel_metadata
-from mkpc_kaggle.package.weights import choose_weights
 from mkpc_kaggle.package.wheels import PYTHONS, build_wheel, collect_wheels, install_lines, licence_of, pins
 from mkpc_kaggle.weights import WeightStore
 from mkpc_kaggle.weights.manifest import MANIFEST

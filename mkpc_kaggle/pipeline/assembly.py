@@ -9,15 +9,7 @@ from typing import Any
 from mkpc_kaggle.errors import warn_once
 from mkpc_kaggle.matchers.contract import Matcher, MatcherSpec, Placement, Precision
 from mkpc_kaggle.matchers.registry import load_matcher
-from mkpc_kaggle.pipeline.availability import (
-    FAULTS,
-    Licence,
-    by_kind,
-    options_of,
-    refusal,
-    slots_of,
-    unavailable,
-)
+from mkpc_kaggle.pipeline.availability import FAULTS, Licence, by_kind, options_of, refusal, slots_of, unavailable
 from mkpc_kaggle.pipeline.devices import AUTO, gpus_of, require_device, resolve_placement
 from mkpc_kaggle.pipeline.stages import ENCODING_CACHE_BYTES, GivenRegions, Pipeline
 from mkpc_kaggle.recipe import Mode, Recipe, Unit, load_recipe

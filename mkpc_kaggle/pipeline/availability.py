@@ -60,21 +60,17 @@ def unavailable(
     damaged. Raises :class:`UserError` for an unknown matcher or option.
     """
 
-    def not_permitted(tags: Iterable[str]) -> UnavailableReason | None:
-        others = sorted(set(tags) - PERMISSIVE_TAGS) if licence is Licence.PERMISSIVE else []
-        return UnavailableReason(UnavailableKind.NOT_PERMITTED, ", ".join(others)) if others else None
-
     def reason_for(name: str) -> UnavailableReason | None:
-        if name in own:
-            return not_permitted(own[name].spec.licences)
         try:
-            spec, options = spec_of(name, f"recipe {recipe.name!r}"), options_of(recipe, name)
+            spec = own[name].spec if name in own else spec_of(name, f"recipe {recipe.name!r}")
+            options = None if name in own else options_of(recipe, name)
         except UnusableError as error:
             return UnavailableReason(UnavailableKind.NOT_IMPORTABLE, reason_of(error.__cause__ or error))
-        found = {slot: store.find(slot) for slot in spec.slots_for(options)}
+        found = {slot: store.find(slot) for slot in (() if name in own else spec.slots_for(options))}
         files = [file for file in found.values() if file is not None]
-        if reason := not_permitted([*spec.licences, *(file.file.licence for file in files)]):
-            return reason
+        others = {*spec.licences, *(file.file.licence for file in files)} - PERMISSIVE_TAGS
+        if others and licence is Licence.PERMISSIVE:
+            return UnavailableReason(UnavailableKind.NOT_PERMITTED, ", ".join(sorted(others)))
         if missing := [slot for slot, file in found.items() if file is None]:
             names = (f"{slot}: {' or '.join(file.name for file in store.alternatives(slot))}" for slot in missing)
             return UnavailableReason(UnavailableKind.NO_WEIGHTS, "; ".join(names))
@@ -98,7 +94,7 @@ def refusal(recipe: Recipe, reasons: Mapping[str, UnavailableReason]) -> UserErr
         return UserError(f"{what}. Take a recipe without them, such as permissive, or --recipe auto.")
     if kind is UnavailableKind.NO_WEIGHTS:
         what = f"recipe {recipe.name!r} needs weights that were not found: {those}"
-        return UserError(f"{what}. Name their directory with --weights, or take what is there with --recipe auto.")
+        return UserError(f"{what}. Name their directory with --weights, or use --recipe auto, which needs none.")
     return UserError(f"recipe {recipe.name!r}: matcher {first} {reasons[first]}. `--recipe auto` does without it.")
 
 

@@ -82,18 +82,15 @@ def gpus_of(device: str) -> list[int]:
 @cache
 def gpu_capabilities() -> list[tuple[int, int]]:
     """Return the compute capability of each GPU, such as (7, 5). Raise :class:`UserError` if none computes."""
-    command = [sys.executable, "-c", ASK_CAPABILITIES]
+    command, timeout = [sys.executable, "-c", ASK_CAPABILITIES], PROBE_TIMEOUT_S
     try:
-        asked = subprocess.run(
-            command, capture_output=True, text=True, check=False, timeout=PROBE_TIMEOUT_S, stdin=subprocess.DEVNULL
-        )
-        failed = asked.stderr.strip()[-300:] or f"exit status {asked.returncode}"
-        reason = failed if asked.returncode else ""
+        asked = subprocess.run(command, input="", capture_output=True, text=True, check=True, timeout=timeout)
+        return [(major, minor) for major, minor in json.loads(asked.stdout.splitlines()[-1])]
+    except subprocess.CalledProcessError as error:
+        reason = error.stderr.strip()[-300:] or f"exit status {error.returncode}"
     except subprocess.TimeoutExpired:
         reason = f"no answer for {PROBE_TIMEOUT_S:.0f} s"
-    if reason:
-        raise UserError(f"PyTorch cannot compute on this machine's GPUs ({reason}); {ADVICE}")
-    return [(major, minor) for major, minor in json.loads(asked.stdout.splitlines()[-1])]
+    raise UserError(f"PyTorch cannot compute on this machine's GPUs ({reason}); {ADVICE}")
 
 
 def require_device(device: str) -> None:

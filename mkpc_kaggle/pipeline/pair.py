@@ -27,7 +27,7 @@ class UnitResult:
     matches: Matches
     encode_seconds: float = 0.0
     match_seconds: float = 0.0
-    failure: str = ""  # why there are no matches
+    failure: str = ""  # the reason for a result without matches
     warm_up: bool = False  # the first run of the unit in this process, which may take much longer
     note: str = ""  # why the unit did not run as written
     keypoints: int = 0  # detected in the first view; 0 for a matcher without a detector
@@ -42,14 +42,12 @@ class PairMatch:
     results: tuple[UnitResult, ...] = ()  # in the order of the runs; with an estimate, in the recipe's order
     regions: Regions | None = None  # None until a unit of stage 2 needs them
     estimate: Estimate = NOT_ESTIMATED
-    images: tuple[Image, ...] = ()  # both, while units run; afterwards the next three fields describe them
+    images: tuple[Image, ...] = ()  # both, while units run; afterwards the next two fields describe them
     sizes: tuple[Size, ...] = ()
-    versions: tuple[str, ...] = ()
     focals: tuple[float, ...] = ()
     failure: str = ""  # which image cannot be read
     decode_seconds: float = 0.0
     cluster_seconds: float = 0.0
-    estimate_seconds: float = 0.0
 
     @property
     def matches(self) -> Matches:

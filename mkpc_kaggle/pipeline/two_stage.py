@@ -80,5 +80,4 @@ def to_image(source: str | Path | Pixels | Image) -> Image:
     image = read_image(Path(source))
     if isinstance(image, Unreadable):
         raise UserError(str(image))
-    # Named by content, since a file may change between two calls.
-    return replace(Image.of_array(image.pixels), focal=image.focal, turns=image.turns)
+    return replace(image, name=image.version)  # its content: a file may change between two calls

@@ -23,12 +23,9 @@ from mkpc_kaggle.engine.records import SceneRecord
 from mkpc_kaggle.errors import UserError, writing
 from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
 from mkpc_kaggle.pipeline.two_stage import to_image
-from mkpc_kaggle.reporting.figures.pair import draw_pair, draw_strip
-from mkpc_kaggle.reporting.figures.run import draw_budget, draw_cameras
-from mkpc_kaggle.reporting.figures.style import encode
+from mkpc_kaggle.reporting.figures import draw_budget, draw_cameras, draw_pair, draw_strip, encode
 from mkpc_kaggle.reporting.run_log import RunLog, WeakPair, read_log
 from mkpc_kaggle.reporting.summary import headline, left_out_line, trouble
-from mkpc_kaggle.reporting.tables import seconds_by_part, unit_means, unit_reasons
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -90,7 +87,7 @@ def report_page(log: RunLog, pairs: Sequence[Pair] = (), *, undrawn: str = "") -
         left_out=left_out_line(log.about.left_out),
         faults=_events(log, EventKind.FAULT),
         failures=_failures(log),
-        unit_failures=pd.DataFrame({"units that failed": unit_reasons(log.tables)}),
+        unit_failures=pd.DataFrame({"units that failed": log.tables.unit_reasons()}),
         weakest=[_weak(log, weak, sources) for weak in log.weakest],
         scenes=_scenes(log),
         cameras=[
@@ -98,7 +95,7 @@ def report_page(log: RunLog, pairs: Sequence[Pair] = (), *, undrawn: str = "") -
             for scene in ([] if undrawn else largest)
             for number in range(min(scene.models, MAX_MODELS))
         ],
-        jobs=_data_uri(budget_figure(log), "png") if has_jobs and not undrawn else "",
+        jobs=_data_uri(draw_budget(log.session, log.about.limit), "png") if has_jobs and not undrawn else "",
         costs=_costs(log),
         plans=_events(log, EventKind.PLAN),
         undrawn=undrawn,
@@ -146,14 +143,13 @@ def _failures(log: RunLog) -> list[pd.DataFrame]:
 def _weak(log: RunLog, weak: WeakPair, sources: dict[str, Pair]) -> tuple[str, str, str]:
     """Return a weak pair's picture, empty if it is not drawn, its counts and remarks, and its id."""
     record, pair, picture = weak.record, log.pairs[weak.record.index], ""
-    match = weak.match(log.recipe.magsac.threshold)
     parts = [f"{record.inliers} inliers of {record.matches} matches", record.failure]
     parts.append("" if record.overlaps else f"may show different things: support {record.stats.support:.1f}")
     if record.source == "scene":
         parts.append("F is the scene's")
     if pair.id in sources:
         try:
-            picture = _data_uri(draw_strip(_images(sources[pair.id]), match), "jpeg")
+            picture = _data_uri(draw_strip(_images(sources[pair.id]), weak.match), "jpeg")
         except UserError:
             parts.append("an image cannot be read any more")
     return picture, "; ".join(filter(None, parts)), pair.id
@@ -164,7 +160,7 @@ def weak_figure(log: RunLog, weak: WeakPair, source: Pair) -> "Figure":
 
     ``source`` is the pair with its image paths. Raises :class:`UserError` for an unreadable image.
     """
-    return draw_pair(*_images(source), weak.match(log.recipe.magsac.threshold), log.recipe.mkpc)
+    return draw_pair(*_images(source), weak.match, log.recipe.mkpc)
 
 
 def _images(pair: Pair) -> tuple[Image, Image]:
@@ -198,20 +194,11 @@ def _focals(scene: SceneRecord) -> str:
 
 
 def _costs(log: RunLog) -> list[pd.DataFrame]:
-    units = unit_means(log.tables).rename(columns={"unit": "unit (means)"})
+    units = log.tables.unit_means.rename(columns={"unit": "unit (means)"})
     units["seconds in all"] = units["pairs"] * units["seconds"]
-    parts = pd.DataFrame(seconds_by_part(log.tables).items(), columns=["part of the work", "seconds in all"])
+    parts = pd.DataFrame(log.tables.seconds_by_part.items(), columns=["part of the work", "seconds in all"])
     parts["seconds a pair"] = parts["seconds in all"] / max(1, len(log.pairs))
     return [units, parts] if len(units) else []
-
-
-def budget_figure(log: RunLog) -> "Figure":
-    """Draw the ended jobs over the time of the last session, see :func:`draw_budget`."""
-    ended: dict[str, list[float]] = {}
-    for event in log.session:
-        if event.kind == EventKind.JOB:
-            ended.setdefault(event.text.partition(" ")[0], []).append(event.seconds)
-    return draw_budget(ended, log.about.limit)
 
 
 def _data_uri(figure: "Figure", kind: str) -> str:

@@ -1,39 +1,95 @@
-"""Snapshot of a run from its journal, and its export to files."""
+"""A run for reports: a snapshot of its journal, and the tables of the summary, the page and the exports."""
 
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import astuple, dataclass
 from functools import cached_property
+from operator import attrgetter
 from pathlib import Path
+
+import numpy as np
+import pandas as pd
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.data.outputs import replacing, require_table
 from mkpc_kaggle.engine.journal_reader import About, Event, EventKind, JournalReader, undamaged
-from mkpc_kaggle.engine.records import PairRecord, SceneRecord
+from mkpc_kaggle.engine.records import PairRecord, SceneRecord, UnitRecord
 from mkpc_kaggle.errors import writing
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import Estimate, ModelKind, sampson_distances
 from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult
 from mkpc_kaggle.recipe import Recipe, recipe_of
-from mkpc_kaggle.reporting.tables import RunTables, run_tables
 
 MAX_DRAWN_PAIRS = 20  # the weakest, which the report draws
 NOT_ENDED = "not ended (at work, or killed)"
+SECONDS = {  # names of the parts of a pair's work
+    "decode_seconds": "wait for decoding",
+    "encode_seconds": "encode",
+    "match_seconds": "match",
+    "cluster_seconds": "cluster",
+    "estimate_seconds": "MAGSAC (in parallel with matching)",
+}
+VALUES: dict[str, type] = {  # of a pair, as attributes of its record
+    **{"failure": object, "source": object, "matches": int, "inliers": int, "overlaps": bool},
+    **dict.fromkeys(SECONDS, float),
+    **{"stats.support": float, "stats.candidates": int, "stats.cost": float, "stats.magsac_cost": float},
+}
+PAIR_COLUMNS: dict[str, type] = {
+    **{"pair": int, "id": object, "group": object},
+    **{name.removeprefix("stats."): kind for name, kind in VALUES.items()},
+    **dict.fromkeys(("focal0", "focal1", *(f"f{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3))), float),
+}
+UNIT_COLUMNS = {"pair": int, **UnitRecord.__annotations__}
+BOX = ("left", "top", "right", "bottom")
+REGION_COLUMNS = {**dict.fromkeys(("pair", "image", *BOX), int), "reason": str, "clusters": int, "kept": int}
+
+
+@dataclass(frozen=True, eq=False)
+class RunTables:
+    """Long tables: pairs; units on pairs; critical regions, two for a pair. ``pair`` is the row of the test set.
+
+    Seconds are of work, boxes are in image pixels.
+    """
+
+    pairs: pd.DataFrame
+    units: pd.DataFrame
+    regions: pd.DataFrame
+
+    @property
+    def solved(self) -> pd.DataFrame:
+        """The pairs with an F, from their matches or their scene."""
+        return self.pairs[self.pairs["source"] != "fallback"]
+
+    @property
+    def failed(self) -> pd.DataFrame:
+        return self.pairs[self.pairs["source"] == "fallback"]
+
+    @property
+    def unit_means(self) -> pd.DataFrame:
+        """Each ``unit``, the number of ``pairs`` it ran on, its mean ``matches``, ``inliers`` and ``seconds``."""
+        units = self.units.assign(seconds=self.units["encode_seconds"] + self.units["match_seconds"])
+        by_unit = units.groupby("unit", sort=False)
+        means = by_unit[["matches", "inliers", "seconds"]].mean()
+        means.insert(0, "pairs", by_unit.size())
+        return means.reset_index()
+
+    def unit_reasons(self, column: str = "failure") -> list[str]:
+        """Return why units failed or, by ``note``, ran otherwise, and on how many pairs; most frequent first."""
+        noted = self.units[self.units[column] != ""]
+        counts = (noted["unit"] + ": " + noted[column]).value_counts()
+        return [f"{reason} ({count} pairs)" for reason, count in counts.items()]
+
+    @property
+    def seconds_by_part(self) -> dict[str, float]:
+        """Seconds of each part of the work on all pairs."""
+        return {name: float(self.pairs[column].sum()) for column, name in SECONDS.items()}
 
 
 @dataclass(frozen=True, eq=False)
 class WeakPair:
-    """A pair with few inliers, with its matches by unit."""
+    """A pair with few inliers, with its matches and its F by MAGSAC."""
 
     record: PairRecord
-    results: tuple[UnitResult, ...]
-
-    def match(self, threshold: float) -> PairMatch:
-        """The pair as MAGSAC left it, without running it again; inliers are within ``threshold`` pixels."""
-        record = self.record
-        matches = Matches.concatenate(result.matches for result in self.results)
-        inliers = (sampson_distances(record.pair_fundamental, matches) < threshold) & (not record.failure)
-        return PairMatch(
-            self.results, record.regions, Estimate(ModelKind.F, record.pair_fundamental, inliers, record.failure)
-        )
+    match: PairMatch
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,14 +98,14 @@ class RunLog:
     about: About
     recipe: Recipe
     pairs: tuple[Pair, ...]
-    records: tuple[PairRecord, ...]  # a record for each pair, in order, reached or not
+    records: tuple[PairRecord, ...]  # of each pair, in order
     events: tuple[Event, ...]  # of all sessions
     weakest: tuple[WeakPair, ...]  # of the pairs that were matched, the fewest inliers first
-    scenes: tuple[SceneRecord, ...] = ()  # the batches that were reconstructed, or could not be
+    scenes: tuple[SceneRecord, ...] = ()
 
     @cached_property
     def tables(self) -> RunTables:
-        return run_tables(self.pairs, self.records, self.events)
+        return run_tables(self.pairs, self.records)
 
     @property
     def session(self) -> tuple[Event, ...]:
@@ -64,18 +120,48 @@ class RunLog:
 
     @property
     def seconds(self) -> float:
-        """How long the last session took, or had taken when it last noted something."""
+        """Duration of the last session until its last event."""
         return max((event.seconds for event in self.session), default=0.0)
 
     @property
     def faults(self) -> list[str]:
         return [event.text for event in self.events if event.kind == EventKind.FAULT]
 
+    def named_tables(self) -> dict[str, pd.DataFrame]:
+        """Return the tables by name, as they are exported."""
+        pairs = self.tables.pairs.copy(deep=False)
+        for side in (0, 1):  # only here: of a million pairs they take 300 MB
+            pairs.insert(3 + side, f"image{side}", [pair.names[side] for pair in self.pairs])
+        events = _table(map(astuple, self.events), Event.__annotations__)
+        return {"pairs": pairs, "units": self.tables.units, "regions": self.tables.regions, "events": events}
+
+
+def run_tables(pairs: Sequence[Pair], records: Sequence[PairRecord]) -> RunTables:
+    """Return the tables of a run: a record for each pair, in the same order."""
+    values = attrgetter(*VALUES)
+    of_pairs = (
+        (r.index, pair.id, pair.group, *values(r), *r.stats.focals, *r.chosen_fundamental.flat)
+        for pair, r in zip(pairs, records, strict=True)
+    )
+    units = ((r.index, *astuple(unit)) for r in records for unit in r.units)
+    regions = (
+        (r.index, image, *astuple(region.box), str(region.reason), region.clusters, region.kept)
+        for r in records
+        for image, region in enumerate(r.regions or ())
+    )
+    return RunTables(_table(of_pairs, PAIR_COLUMNS), _table(units, UNIT_COLUMNS), _table(regions, REGION_COLUMNS))
+
+
+def _table(rows: Iterable[tuple[object, ...]], columns: Mapping[str, type]) -> pd.DataFrame:
+    """Stream the rows, since a run may have a million."""
+    kinds = [(name, object if kind is str else kind) for name, kind in columns.items()]
+    return pd.DataFrame(np.fromiter(rows, np.dtype(kinds)))
+
 
 def read_log(directory: Path) -> RunLog:
-    """Read the journal of a work directory, of a run at work or ended.
+    """Read the journal of a work directory, during a run or after it.
 
-    Raises :class:`UserError` if there is none, or none that this version can read.
+    Raises :class:`UserError` for a missing journal, and for one that this version cannot read.
     """
     with JournalReader(directory) as journal, undamaged(journal.path):
         about, pairs, records = journal.about(), journal.pairs(), tuple(journal.records())
@@ -85,20 +171,25 @@ def read_log(directory: Path) -> RunLog:
         units = {unit.name: unit for unit in recipe.units}
 
         def weak(record: PairRecord) -> WeakPair:
-            inputs = journal.inputs(record.index)
+            inputs, F = journal.inputs(record.index), record.pair_fundamental
             points = journal.points(inputs.values())
-            return WeakPair(record, tuple(UnitResult(units[name], points[inputs[name]]) for name in inputs))
+            results = tuple(UnitResult(units[name], points[inputs[name]]) for name in inputs)
+            distances = sampson_distances(F, Matches.concatenate(points.values()))
+            inliers = (distances < recipe.magsac.threshold) & (not record.failure)
+            estimate = Estimate(ModelKind.F, F, inliers, record.failure)
+            return WeakPair(record, PairMatch(results, record.regions, estimate))
 
         weakest, scenes = tuple(map(weak, touched[:MAX_DRAWN_PAIRS])), tuple(journal.scenes().values())
         return RunLog(journal.path, about, recipe, pairs, records, journal.events(), weakest, scenes)
 
 
 def write_csv(log: RunLog, directory: Path) -> list[Path]:
-    """Write each table to a file of its name; :class:`UserError` if they cannot be written.
+    """Write each table to a file of its name. Return the files.
 
-    Such tables are replaced, other files are not.
+    Only tables with the same columns are replaced. Raises :class:`UserError` for other files of these names, and
+    if a table cannot be written.
     """
-    tables = {directory / f"{name}.csv": table for name, table in log.tables.named().items()}
+    tables = {directory / f"{name}.csv": table for name, table in log.named_tables().items()}
     with writing(f"--csv {directory}"):
         directory.mkdir(parents=True, exist_ok=True)
         for path, table in tables.items():

@@ -8,8 +8,7 @@ from mkpc_kaggle.engine.budget import format_duration
 from mkpc_kaggle.engine.records import PairRecord, SceneRecord
 from mkpc_kaggle.engine.request import Ending, RunReport
 from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
-from mkpc_kaggle.reporting.run_log import RunLog
-from mkpc_kaggle.reporting.tables import RunTables, run_tables, seconds_by_part, unit_means, unit_reasons
+from mkpc_kaggle.reporting.run_log import RunLog, RunTables, run_tables
 
 MAX_LINES = 8  # of each list
 
@@ -43,7 +42,7 @@ def trouble(run: RunReport | RunLog) -> str:
     A pair without an F counts if an error is the reason, but not for too few matches or too little time.
     """
     if run.ending in (Ending.NO_WORKER, Ending.NOTHING_RUNS):
-        return f"the run failed: {run.ending}, the faults say why; the same command goes on"
+        return f"the run failed: {run.ending}, the faults say why; the same command resumes"
     reached = [record for record in run.records if record.reached]
     reasons = Counter(filter(None, map(_error, reached)))
     if 2 * reasons.total() <= len(reached):
@@ -77,15 +76,15 @@ def _lines(tables: RunTables, run: RunReport | RunLog) -> list[str]:
         *_found(tables),
         *_scenes(tables, run.scenes),
         *_list("pairs with the fallback row", reasons, len(failed)),
-        *_list("units that failed", unit_reasons(tables)),
-        *_list("units that ran otherwise than written", unit_reasons(tables, "note")),
+        *_list("units that failed", tables.unit_reasons()),
+        *_list("units that ran otherwise than written", tables.unit_reasons("note")),
         *_list("faults", run.faults),
     ]
 
 
 def _found(tables: RunTables) -> Iterator[str]:
     """Yield inliers, critical regions and seconds per pair, and the means of each unit."""
-    inliers, means = tables.solved["inliers"], unit_means(tables)
+    inliers, means = tables.solved["inliers"], tables.unit_means
     if len(inliers):
         yield f"inliers: median {inliers.median():.0f}, mean {inliers.mean():.1f}, least {inliers.min()}"
         if doubtful := (~tables.solved["overlaps"]).sum():
@@ -97,7 +96,7 @@ def _found(tables: RunTables) -> Iterator[str]:
     if reasons := [f"{count} {reason}" for reason, count in tables.regions["reason"].value_counts().items()]:
         yield f"critical regions: {', '.join(reasons)}"
     pairs = max(1, len(tables.pairs))
-    parts = (f"{name} {seconds / pairs:.3f}" for name, seconds in seconds_by_part(tables).items())
+    parts = (f"{name} {seconds / pairs:.3f}" for name, seconds in tables.seconds_by_part.items())
     yield f"seconds a pair: {', '.join(parts)}"
 
 
@@ -108,20 +107,9 @@ def _scenes(tables: RunTables, scenes: Sequence[SceneRecord]) -> list[str]:
     made = sum(scene.registered > 0 for scene in scenes)
     images = f"{sum(scene.registered for scene in scenes)} of {sum(scene.images for scene in scenes)} images"
     pairs = f"F of {sum(tables.pairs['source'] == 'scene')} of {len(tables.pairs)} pairs is from them"
-    batches: dict[str, list[str]] = {}
-    for scene in scenes:
-        if scene.failure:
-            batches.setdefault(scene.failure, []).append(scene.batch)
-    return [
-        f"scenes: {made} of {len(scenes)} batches reconstructed with {images}; {pairs}",
-        *(f"  no scene of {_names(names)}: {reason}" for reason, names in list(batches.items())[:MAX_LINES]),
-    ]
-
-
-def _names(names: Sequence[str]) -> str:
-    """Return the first batches, and the number of the others."""
-    more = f" and {len(names) - MAX_LINES} more batches" if len(names) > MAX_LINES else ""
-    return ", ".join(names[:MAX_LINES]) + more
+    failed = [f"{scene.batch}: {scene.failure}" for scene in scenes if scene.failure]
+    head = f"scenes: {made} of {len(scenes)} batches reconstructed with {images}; {pairs}"
+    return [head, *_list("batches without a scene", failed)]
 
 
 def _list(title: str, items: Sequence[str], count: int | None = None) -> list[str]:

@@ -8,8 +8,7 @@ import pytest
 from exif_files import set_exif, tiff, with_tiff
 from numpy.testing import assert_array_equal
 
-from mkpc_kaggle.data.exif import read_exif
-from mkpc_kaggle.data.images import read_image
+from mkpc_kaggle.data.images import read_exif, read_image
 from mkpc_kaggle.geometry.coordinates import Size
 
 PIXELS = np.random.default_rng(0).integers(0, 255, (40, 60, 3), np.uint8)

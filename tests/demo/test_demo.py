@@ -9,8 +9,7 @@ import pytest
 from shared import contents
 
 from mkpc_kaggle.demo import SCENE_NAMES, DemoSet, write_demo
-from mkpc_kaggle.demo.camera import SizedCamera, look_at, project, unproject
-from mkpc_kaggle.demo.covisibility import covisibility, visible_mask
+from mkpc_kaggle.demo.camera import SizedCamera, covisibility, look_at, project, unproject, visible_mask
 from mkpc_kaggle.demo.render import render
 from mkpc_kaggle.demo.world import World, build_world, quad
 
@@ -171,6 +170,5 @@ def test_same_seed_same_bytes_whatever_the_other_scenes(tmp_path, small_demo):
 
 
 def test_bad_arguments_are_refused(tmp_path):
-    for arguments in ({"scenes": ["castle"]}, {"scenes": ["market", "market"]}, {"image_scale": 0.0}):
-        with pytest.raises(ValueError, match=r"known|twice|positive"):
-            write_demo(tmp_path, **arguments)
+    with pytest.raises(ValueError, match="known"):
+        write_demo(tmp_path, scenes=["castle"])

@@ -170,8 +170,8 @@ def refuse(_: int) -> int:
     ("fault", "told"),
     [
         (refuse, "errors left 8 of 8 pairs without an F, 8 of them with this one: ValueError: no such layer"),
-        (lambda _: break_device(), "no worker left, the faults say why; the same command goes on"),
-        (lambda _: exhaust_gpu(), "every unit was skipped, the faults say why; the same command goes on"),
+        (lambda _: break_device(), "no worker left, the faults say why; the same command resumes"),
+        (lambda _: exhaust_gpu(), "every unit was skipped, the faults say why; the same command resumes"),
     ],
 )
 def test_a_run_that_failed_has_exit_status_one_and_a_line(demo, tmp_path, monkeypatch, capsys, fault, told):

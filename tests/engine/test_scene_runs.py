@@ -60,7 +60,7 @@ def test_pairs_get_the_f_of_their_scene_and_keep_their_own(tmp_path, monkeypatch
     told = "scenes: 1 of 1 batches reconstructed with 4 of 4 images; F of 5 of 6 pairs is from them"
     assert told in overview(log)
     assert "both cameras are known" in report_page(log)
-    assert all(len(weak.results[0].matches) for weak in log.weakest), "what is drawn keeps its points"
+    assert all(len(weak.match.results[0].matches) for weak in log.weakest), "what is drawn keeps its points"
 
 
 def test_a_focal_length_of_exif_goes_to_the_pairs_the_journal_and_the_scene(tmp_path, monkeypatch):
@@ -199,4 +199,4 @@ def test_the_summary_names_a_batch_without_a_scene(tmp_path, monkeypatch):
     scenes_by(monkeypatch, partial(befall, lack_an_image))
     pairs = batch_pairs(tmp_path / "images")
     report = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
-    assert "  no scene of one: the worker failed: KeyError: 'image 7'" in summary(pairs, report).splitlines()
+    assert "  one: the worker failed: KeyError: 'image 7'" in summary(pairs, report).splitlines()

@@ -24,7 +24,7 @@ from mkpc_kaggle.data.competition import read_train_side
 from mkpc_kaggle.data.images import read_image
 from mkpc_kaggle.data.pairs import read_pairs
 from mkpc_kaggle.engine.journal_reader import JournalReader
-from mkpc_kaggle.evaluation.protocols import by_protocol
+from mkpc_kaggle.evaluation.validate import by_protocol
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Box, Size
 from mkpc_kaggle.geometry.critical_region import RegionReason

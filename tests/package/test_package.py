@@ -21,7 +21,7 @@ from mkpc_kaggle.cli import main
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.package import Package, Request, find_checkout, make_package
 from mkpc_kaggle.package import package as module
-from mkpc_kaggle.package.weights import licence_text
+from mkpc_kaggle.package.files import licence_text
 from mkpc_kaggle.package.wheels import BUNDLED, PYTHONS, build_wheel, install_lines, pins
 from mkpc_kaggle.weights import WeightStore, load_tensors, store
 from mkpc_kaggle.weights.manifest import read_manifest

@@ -15,8 +15,7 @@ from pictures import same
 from rectified import SWEEP, RectifiedMatcher
 from sklearn.datasets import load_sample_image
 
-from mkpc_kaggle.data.exif import TURNS
-from mkpc_kaggle.data.images import Image
+from mkpc_kaggle.data.images import TURNS, Image
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Box, Size, View
 from mkpc_kaggle.geometry.focal_prior import FocalConfig, FocalPrior, estimate_with_prior

@@ -27,8 +27,7 @@ from benchmarks.synthetic_scene import SIZE, SyntheticScene, synthetic_scene
 from mkpc_kaggle import reconstruct
 from mkpc_kaggle.cli import main
 from mkpc_kaggle.data import images
-from mkpc_kaggle.data.exif import TURNS
-from mkpc_kaggle.data.images import Image, Unreadable, read_image
+from mkpc_kaggle.data.images import TURNS, Image, Unreadable, read_image
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.records import CameraRecord
 from mkpc_kaggle.engine.request import Ending

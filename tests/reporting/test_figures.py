@@ -17,9 +17,7 @@ from mkpc_kaggle.geometry.metrics import PoseError
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL, Estimate, ModelKind
 from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult
 from mkpc_kaggle.recipe import Unit
-from mkpc_kaggle.reporting.figures.pair import draw_pair, draw_strip
-from mkpc_kaggle.reporting.figures.run import draw_cameras
-from mkpc_kaggle.reporting.figures.style import encode
+from mkpc_kaggle.reporting.figures import draw_cameras, draw_pair, draw_strip, encode
 
 SIZES = Size(120, 80), Size(60, 90)
 IMAGES = tuple(Image.of_array(np.full((size.height, size.width, 3), 90, np.uint8)) for size in SIZES)

@@ -58,10 +58,10 @@ def test_a_run_exports_tables_that_pandas_reads_as_they_are(tmp_path, capsys):
     assert main(["journal", str(tmp_path / "work"), "--csv", str(tmp_path / "csv")]) == 0
     assert len(capsys.readouterr().out.splitlines()) == 4
     log = read_log(tmp_path / "work")
-    for name, table in log.tables.named().items():
+    for name, table in log.named_tables().items():
         again = pd.read_csv(tmp_path / "csv" / f"{name}.csv", keep_default_na=False)
         pd.testing.assert_frame_equal(again, table, check_dtype=False)
-    table = log.tables.named()
+    table = log.named_tables()
     assert list(table["pairs"]["id"]) == [pair.id for pair in pairs]
     assert "the file is empty" in table["pairs"]["failure"][1]
     units = table["units"].merge(table["pairs"][["pair", "inliers"]], on="pair", suffixes=("", "_of_pair"))
@@ -145,7 +145,7 @@ def test_the_weakest_pairs_are_drawn_with_the_inliers_that_magsac_found(tmp_path
     log = read_log(tmp_path / "work")
     assert len(log.weakest) == 11
     for weak in log.weakest:
-        match = weak.match(THREE_UNITS.magsac.threshold)
+        match = weak.match
         assert len(match.matches) == weak.record.matches
         assert match.estimate.inlier_count == weak.record.inliers
 

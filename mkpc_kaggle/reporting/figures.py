@@ -1,0 +1,245 @@
+"""Figures: a pair with its matches, clusters and critical regions; a run's jobs over time; a scene's cameras."""
+
+from collections.abc import Sequence
+from io import BytesIO
+from math import sqrt
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mkpc_kaggle.data.competition import evenly_spread
+from mkpc_kaggle.data.images import Image
+from mkpc_kaggle.data.outputs import replacing
+from mkpc_kaggle.engine.journal_reader import Event, EventKind
+from mkpc_kaggle.engine.records import CameraRecord, SceneRecord
+from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.geometry.coordinates import Box, View
+from mkpc_kaggle.geometry.critical_region import CriticalRegion, MkpcConfig, find_clusters
+from mkpc_kaggle.pipeline.pair import PairMatch
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+# The Okabe-Ito palette, suitable for colour-blind readers.
+INLIER, OUTLIER, REGION, DROPPED = "#009E73", "#D55E00", "#F0E442", "#999999"
+COLOURS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#56B4E9", "#CC79A7")
+DPI = 110
+STRIP_HEIGHT_PX, MAX_STRIP_PX = 480, 2_000_000
+MAX_INLIERS, MAX_OUTLIERS = 150, 50  # number of lines that stay legible
+MAX_EMPTY = 4  # a time limit of more run lengths is not drawn: it would leave no room for the jobs
+
+
+def draw_pair(image0: Image, image1: Image, match: PairMatch, config: MkpcConfig) -> "Figure":
+    """Draw the matches of all units and the critical regions at the top, the clusters of stage 1 below."""
+    figure = new_figure(12, 9)
+    panels = figure.subplot_mosaic([["matches", "matches"], ["0", "1"]])
+    counts = f"{len(match.matches)} matches, {match.estimate.inlier_count} inliers"
+    drawn = draw_matches(panels["matches"], (image0, image1), match)
+    title = "; ".join(filter(None, [counts, match.estimate.failure, drawn]))
+    panels["matches"].set_title(title, loc="left")
+    for side, image in enumerate((image0, image1)):
+        _draw_clusters(panels[str(side)], image, match, config, side)
+    return figure
+
+
+def draw_strip(images: tuple[Image, Image], match: PairMatch) -> "Figure":
+    """Draw the matches and the critical regions without text, on up to :data:`MAX_STRIP_PX` pixels."""
+    aspect = sum(view.content.width / view.content.height for view in map(_upright, images))
+    height = min(STRIP_HEIGHT_PX, sqrt(MAX_STRIP_PX / aspect)) / DPI
+    figure = new_figure(aspect * height, height)
+    figure.set_layout_engine("none")
+    draw_matches(figure.add_axes((0, 0, 1, 1)), images, match)
+    return figure
+
+
+def draw_matches(axes: "Axes", images: tuple[Image, Image], match: PairMatch) -> str:
+    """Show the images side by side, matches as lines, critical regions as boxes. Return the drawn objects.
+
+    Where there are many matches, an even sample is drawn. The axes' unit is the height of both images.
+    """
+    from matplotlib.collections import LineCollection
+
+    ends: list[NDArray[np.float64]] = []
+    left = 0.0
+    for side, points in enumerate((match.matches.points0, match.matches.points1)):
+        view = _upright(images[side])
+        width, height = view.content
+        _show(axes, images[side], match.regions and match.regions[side], 1 / height, left)
+        ends.append((view.from_image(points) + 0.5) / height + (left, 0))
+        left += width / height
+        axes.axvline(left, color="white", linewidth=4, zorder=0.5)
+    axes.set(xlim=(0, left), ylim=(1, 0))
+    axes.axis("off")
+    lines, inliers = np.stack(ends, axis=1), match.estimate.inliers
+    chosen = sample(inliers, MAX_INLIERS), sample(~inliers, MAX_OUTLIERS)
+    for some, colour, thickness in ((chosen[1], OUTLIER, 0.6), (chosen[0], INLIER, 1.0)):
+        axes.add_collection(LineCollection([*lines[some]], colors=colour, linewidths=thickness, alpha=0.75))
+        x, y = lines[some].reshape(-1, 2).T
+        axes.scatter(x, y, s=5, color=colour, linewidths=0)
+    return f"{len(chosen[0])} inliers (green) and {len(chosen[1])} outliers (orange) drawn"
+
+
+def _draw_clusters(axes: "Axes", image: Image, match: PairMatch, config: MkpcConfig, side: int) -> None:
+    _show(axes, image, match.regions and match.regions[side])
+    axes.set(xticks=[], yticks=[])
+    if match.regions is None:
+        axes.set_title("no stage 2: no critical region", loc="left")
+        return
+    region = match.regions[side]
+    stage1 = match.matches[match.in_stage(1)]
+    points = stage1.points1 if side else stage1.points0
+    clusters = find_clusters(points, image.size, config)
+    shown = _upright(image).from_image(points) + 0.5  # from the centres of pixels to their edges
+    x, y = shown[~clusters.in_kept].T
+    axes.scatter(x, y, s=8, color=DROPPED, marker="x", linewidths=0.7)
+    for rank, label in enumerate(clusters.kept):
+        x, y = shown[clusters.labels == label].T
+        axes.scatter(x, y, s=8, color=COLOURS[rank % len(COLOURS)], linewidths=0)
+    share = region.box.area / (image.size.width * image.size.height)
+    axes.set_title(
+        f"critical region: {region.reason}, {100 * share:.0f} % of the image\n"
+        f"{region.kept} of {region.clusters} clusters kept, grey: the other points",
+        loc="left",
+    )
+
+
+def _show(
+    axes: "Axes", image: Image, region: CriticalRegion | None, scale: float = 1.0, left: float = 0.0
+) -> None:
+    """Draw an image, upright, and its critical region, its corner at (left, 0) and its pixels ``scale`` wide."""
+    from matplotlib.patches import Polygon
+
+    view = _upright(image)
+    width, height = view.content
+    axes.imshow(view.render(image.pixels), extent=(left, left + scale * width, scale * height, 0))
+    if region is not None:
+        (x0, y0), (x1, y1) = (region.box.left, region.box.top), (region.box.right, region.box.bottom)
+        corners = view.from_image(np.array([(x0, y0), (x0, y1), (x1, y1), (x1, y0)]) - 0.5) + 0.5
+        axes.add_patch(Polygon(scale * corners + (left, 0), fill=False, edgecolor=REGION, linewidth=2.5))
+
+
+def _upright(image: Image) -> View:
+    """Return the view of the whole image at its own size."""
+    return View.fit(Box.whole(image.size), long_side=max(image.size), turns=image.turns)
+
+
+def draw_budget(events: Sequence[Event], limit: float | None) -> "Figure":
+    """Draw the number of ended jobs over time, a colour for each phase. A flat segment is time without a result.
+
+    ``events`` are those of a session, ``limit`` is the time limit in seconds.
+    """
+    ended: dict[str, list[float]] = {}
+    for event in events:
+        if event.kind == EventKind.JOB:
+            ended.setdefault(event.text.partition(" ")[0], []).append(event.seconds)
+    figure = new_figure(6.5, 3.2)
+    axes = plain(figure.subplots(), f"{sum(map(len, ended.values()))} jobs ended, over minutes since the start")
+    below, latest = 0, 0.0
+    for phase, times in ended.items():
+        counts = below + 1 + np.arange(len(times))
+        axes.step(np.asarray(times) / 60, counts, "o-", where="post", markersize=2.5, label=phase)
+        below, latest = below + len(times), max(latest, *times)
+    if limit is not None and limit < MAX_EMPTY * latest:
+        axes.axvline(limit / 60, color="black", linewidth=1.2, label="time limit")
+    axes.set(xlim=(0, None), ylim=(0, None), xlabel="minutes")
+    if ended:
+        axes.legend(fontsize=8, frameon=False)
+    return figure
+
+
+def draw_cameras(scene: SceneRecord, number: int = 0) -> "Figure":
+    """The cameras and points of a model of a batch, 0 the largest, from above and the side, in its own units.
+
+    An arrow points the way a camera looks. Up is the mean direction of the images' upper borders, and the cameras
+    look ahead. Points far away from nearly all others are cut off. A batch without cameras has a line instead.
+    """
+    figure = new_figure(8.4, 4.0)
+    cameras = [camera for camera in scene.cameras if camera.model == number]
+    if not cameras:
+        figure.text(0.5, 0.5, f"no cameras: {scene.failure}", ha="center", wrap=True)
+        return figure
+    right, ahead, up = _axes_of(cameras)
+    centres = np.array([camera.centre for camera in cameras])
+    looks = np.array([camera.forward for camera in cameras])
+    cloud = np.array(scene.clouds[number] if scene.clouds else ()).reshape(-1, 3)
+    arrow = 0.12 * (np.ptp(centres, axis=0).max() or 1.0)
+    sides = (("above", right, ahead), ("the side", ahead, up))
+    for panel, (name, across, upward) in zip(figure.subplots(1, 2), sides, strict=True):
+        plain(panel, f"{len(cameras)} cameras from {name}")
+        x, y = centres @ across, centres @ upward
+        near = _near(cloud @ across) & _near(cloud @ upward)
+        panel.scatter(cloud[near] @ across, cloud[near] @ upward, s=2, color=DROPPED, linewidths=0)
+        panel.quiver(
+            *(x, y, arrow * looks @ across, arrow * looks @ upward),
+            **{"angles": "xy", "scale_units": "xy", "scale": 1, "width": 0.004, "color": COLOURS[0]},
+        )
+        panel.scatter(x, y, s=14, color=OUTLIER, linewidths=0, zorder=3)
+        panel.set_aspect("equal", adjustable="datalim")
+        panel.margins(0.1)
+    return figure
+
+
+def _axes_of(cameras: Sequence[CameraRecord]) -> NDArray[np.float64]:
+    """(3, 3), rows right, ahead and up of a scene as :func:`draw_cameras` shows it, in its own units."""
+    down = np.mean([camera.down for camera in cameras], axis=0)
+    forward = np.mean([camera.forward for camera in cameras], axis=0)
+    up = -down / np.linalg.norm(down)
+    ahead = forward - forward @ up * up
+    ahead /= np.linalg.norm(ahead)
+    return np.stack([np.cross(ahead, up), ahead, up])
+
+
+def _near(values: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return the mask of values that are not far outside the range of nearly all values."""
+    low, high = np.percentile(values, (3, 97)) if len(values) else (0.0, 0.0)
+    near: NDArray[np.bool_] = np.abs(values - (low + high) / 2) <= 0.7 * (high - low)
+    return near
+
+
+def new_figure(width: float, height: float) -> "Figure":
+    """Return an empty figure of this size in inches. Raise :class:`UserError` without matplotlib."""
+    try:
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise UserError("figures need matplotlib: pip install 'mkpc-kaggle[plots]'") from error
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+def require_format(path: Path) -> None:
+    """Raise :class:`UserError` for a suffix that is not a format of matplotlib, or without matplotlib."""
+    formats = new_figure(1, 1).canvas.get_supported_filetypes().keys() - {"pgf"}  # which needs LaTeX
+    if path.suffix[1:].lower() not in formats:
+        raise UserError(f"the figure {path} needs a suffix: one of {', '.join(sorted(formats))}")
+
+
+def save(figure: "Figure", path: Path) -> None:
+    """Write a figure in the format of its suffix. Raises :class:`UserError` if it cannot be written."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with replacing(path) as stream:
+            figure.savefig(stream.buffer, format=path.suffix[1:].lower(), dpi=DPI)
+    except (OSError, ValueError) as error:
+        raise UserError(f"the figure {path} cannot be written: {error}") from error
+
+
+def encode(figure: "Figure", kind: str, dpi: int = DPI) -> bytes:
+    """Return the figure as "png", for lines and text, or "jpeg", for photographs."""
+    stream = BytesIO()
+    figure.savefig(stream, format=kind, dpi=dpi, pil_kwargs={"quality": 82} if kind == "jpeg" else None)
+    return stream.getvalue()
+
+
+def plain(axes: "Axes", title: str) -> "Axes":
+    """Return axes with a title on the left, and without a frame at the top and on the right."""
+    axes.set_title(title, loc="left", fontsize=10)
+    axes.tick_params(labelsize=9)
+    axes.spines[["top", "right"]].set_visible(False)
+    return axes
+
+
+def sample(mask: NDArray[np.bool_], most: int) -> NDArray[np.intp]:
+    """Return up to ``most`` indices of a mask, evenly spread."""
+    return np.array(evenly_spread(np.flatnonzero(mask).tolist(), most), np.intp)
