@@ -2,10 +2,11 @@
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.budget import format_duration
-from mkpc_kaggle.engine.records import PairRecord, SceneRecord
+from mkpc_kaggle.engine.records import CameraRecord, PairRecord, SceneRecord
 from mkpc_kaggle.engine.request import Ending, RunReport
 from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
 from mkpc_kaggle.reporting.run_log import RunLog
@@ -114,8 +115,22 @@ def _scenes(tables: RunTables, scenes: Sequence[SceneRecord]) -> list[str]:
             batches.setdefault(scene.failure, []).append(scene.batch)
     return [
         f"scenes: {made} of {len(scenes)} batches reconstructed with {images}; {pairs}",
+        *weakest_line(scenes),
         *(f"  no scene of {_names(names)}: {reason}" for reason, names in list(batches.items())[:MAX_LINES]),
     ]
+
+
+def weakest_line(scenes: Sequence[SceneRecord]) -> list[str]:
+    """Return a line with the weakest cameras, if any is known."""
+    weakest = weakest_cameras(scenes)[:3]
+    named = [f"{Path(camera.image).name} ({100 * camera.sigmas[1]:.2g} %)" for camera in weakest]
+    return [f"weakest cameras, with the error of the centre: {', '.join(named)}"] if named else []
+
+
+def weakest_cameras(scenes: Sequence[SceneRecord]) -> list[CameraRecord]:
+    """Return the cameras of known uncertainty, the largest expected error of the centre first."""
+    known = [camera for scene in scenes for camera in scene.cameras if camera.sigmas]
+    return sorted(known, key=lambda camera: -camera.sigmas[1])
 
 
 def _names(names: Sequence[str]) -> str:
