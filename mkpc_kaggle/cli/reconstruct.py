@@ -17,7 +17,7 @@ from mkpc_kaggle.reconstruction.folder import read_folder, read_pair_list
 from mkpc_kaggle.reconstruction.outputs import FORMS, Cameras, write_tables
 from mkpc_kaggle.reconstruction.run import FolderResult, for_cameras, reconstruct_folder
 from mkpc_kaggle.reporting.report import report_run
-from mkpc_kaggle.reporting.summary import trouble
+from mkpc_kaggle.reporting.summary import trouble, weakest_line
 
 HELP = """\
 Match the images of a folder with the engine that makes submissions, and reconstruct their cameras. Each folder
@@ -115,6 +115,7 @@ def _lines(result: FolderResult) -> Iterator[str]:
         sizes = ", ".join(str(models[number]) for number in sorted(models))
         why = f"models of {sizes}" if models else reasons.get(name, "too few pairs, or too little time")
         yield f"{name}: {models.total()} of {len(found)} images have a camera: {why}"
+    yield from weakest_line(report.scenes)
     unreadable = {record.failure for record in report.records if record.reached and not record.units}
     yield from (f"cannot be read: {failure}" for failure in sorted(unreadable)[:MAX_LINES])
     yield from (f"fault: {fault}" for fault in report.faults[:MAX_LINES])

@@ -132,11 +132,12 @@ def consensus(
     count, threshold, solver = len(points0), config.threshold, _SOLVERS[model]
     if count < (solver.minimal if config.every_match else solver.min_matches):
         return Estimate.failed(model, count, f"too few distinct matches for {model}: {count}")
-    if intrinsics is not None and model is ModelKind.E:
-        points0, points1 = calibrate(points0, intrinsics[0]), calibrate(points1, intrinsics[1])
-        threshold /= float(np.mean([K[axis, axis] for K in intrinsics for axis in (0, 1)]))
     method = cv2.USAC_MAGSAC if config.method is Method.MAGSAC else cv2.RANSAC
     settings = {"method": method, "confidence": config.confidence, "maxIters": config.max_iterations}
+    if intrinsics is not None and model is ModelKind.E:
+        points0, points1 = calibrate(points0, intrinsics[0]), calibrate(points1, intrinsics[1])
+        settings["focal"] = float(np.mean([K[axis, axis] for K in intrinsics for axis in (0, 1)]))
+        threshold /= settings["focal"]
     best, inliers, lowest, candidates = None, np.zeros(count, bool), np.inf, 0
     failure = f"no {model} fits {count} distinct matches"
     for number in range(config.permutations):
@@ -241,9 +242,12 @@ class _Solver(NamedTuple):
     distances: Callable[[Matrix3, Vectors, Vectors], Vectors]
 
 
-def _find_essential(points0: Vectors, points1: Vectors, confidence: float, **settings: Any) -> Any:
-    settings["threshold"] = settings.pop("ransacReprojThreshold")
-    stacked, mask = cv2.findEssentialMat(points0, points1, np.eye(3), prob=confidence, **settings)
+def _find_essential(points0: Vectors, points1: Vectors, confidence: float, focal: float, **settings: Any) -> Any:
+    # MAGSAC integrates its score up to a fixed number of pixels, so it needs points in pixels.
+    scale = focal if settings["method"] == cv2.USAC_MAGSAC else 1.0
+    settings["threshold"] = scale * settings.pop("ransacReprojThreshold")
+    K = np.diag([scale, scale, 1.0])
+    stacked, mask = cv2.findEssentialMat(scale * points0, scale * points1, K, prob=confidence, **settings)
     if stacked is None or len(stacked) <= 3:
         return stacked, mask
     solutions = np.split(stacked, len(stacked) // 3)  # of five points, up to ten

@@ -25,7 +25,7 @@ from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
 from mkpc_kaggle.pipeline.two_stage import to_image
 from mkpc_kaggle.reporting.figures import draw_budget, draw_cameras, draw_pair, draw_strip, encode
 from mkpc_kaggle.reporting.run_log import RunLog, WeakPair, read_log
-from mkpc_kaggle.reporting.summary import headline, left_out_line, trouble
+from mkpc_kaggle.reporting.summary import headline, left_out_line, trouble, weakest_cameras
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -169,7 +169,7 @@ def _images(pair: Pair) -> tuple[Image, Image]:
 
 
 def _scenes(log: RunLog) -> list[pd.DataFrame]:
-    """Return a table of reconstructed batches, and a table of the reasons for the pairs' F."""
+    """Return tables of reconstructed batches, of reasons for the pairs' F, and of cameras, the weakest first."""
     pairs = log.tables.pairs
     counts = pairs[pairs["source"] == "scene"].groupby("group").size()
     rows = [
@@ -182,9 +182,14 @@ def _scenes(log: RunLog) -> list[pd.DataFrame]:
     heads = ["batch", "images", "cameras", "points", "focals (px)", "seconds", "pairs with its F", "failure"]
     reasons = Counter(str(record.scene.reason) for record in log.records if record.scene is not None)
     batches = pd.DataFrame(rows, columns=heads)
+    cameras = [
+        (each.image, 100 * each.sigmas[1], each.sigmas[0], each.sigmas[2]) for each in weakest_cameras(log.scenes)
+    ]
+    sigmas = ["camera, weakest first", "error of its centre (%)", "rotation (deg)", "focal length (%)"]
     return [
         batches if batches["failure"].any() else batches.drop(columns="failure"),
         pd.DataFrame(reasons.most_common(), columns=["which F a pair has", "pairs"]),
+        pd.DataFrame(cameras, columns=sigmas),
     ]
 
 

@@ -2,10 +2,11 @@
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.budget import format_duration
-from mkpc_kaggle.engine.records import PairRecord, SceneRecord
+from mkpc_kaggle.engine.records import CameraRecord, PairRecord, SceneRecord
 from mkpc_kaggle.engine.request import Ending, RunReport
 from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
 from mkpc_kaggle.reporting.run_log import RunLog, RunTables, run_tables
@@ -109,7 +110,20 @@ def _scenes(tables: RunTables, scenes: Sequence[SceneRecord]) -> list[str]:
     pairs = f"F of {sum(tables.pairs['source'] == 'scene')} of {len(tables.pairs)} pairs is from them"
     failed = [f"{scene.batch}: {scene.failure}" for scene in scenes if scene.failure]
     head = f"scenes: {made} of {len(scenes)} batches reconstructed with {images}; {pairs}"
-    return [head, *_list("batches without a scene", failed)]
+    return [head, *weakest_line(scenes), *_list("batches without a scene", failed)]
+
+
+def weakest_line(scenes: Sequence[SceneRecord]) -> list[str]:
+    """Return a line with the weakest cameras, if any is known."""
+    weakest = weakest_cameras(scenes)[:3]
+    named = [f"{Path(camera.image).name} ({100 * camera.sigmas[1]:.2g} %)" for camera in weakest]
+    return [f"weakest cameras, with the error of the centre: {', '.join(named)}"] if named else []
+
+
+def weakest_cameras(scenes: Sequence[SceneRecord]) -> list[CameraRecord]:
+    """Return the cameras of known uncertainty, the largest expected error of the centre first."""
+    known = [camera for scene in scenes for camera in scene.cameras if camera.sigmas]
+    return sorted(known, key=lambda camera: -camera.sigmas[1])
 
 
 def _list(title: str, items: Sequence[str], count: int | None = None) -> list[str]:

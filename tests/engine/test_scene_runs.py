@@ -59,6 +59,8 @@ def test_pairs_get_the_f_of_their_scene_and_keep_their_own(tmp_path, monkeypatch
     log = read_log(tmp_path / "work")
     told = "scenes: 1 of 1 batches reconstructed with 4 of 4 images; F of 5 of 6 pairs is from them"
     assert told in overview(log)
+    assert "weakest cameras, with the error of the centre: 3.png (3 %), 2.png (2 %), 1.png (1 %)" in overview(log)
+    assert report_page(log).index("3.png</td>") < report_page(log).index("2.png</td>")
     assert "both cameras are known" in report_page(log)
     assert all(len(weak.match.results[0].matches) for weak in log.weakest), "what is drawn keeps its points"
 

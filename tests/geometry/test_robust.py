@@ -14,6 +14,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from mkpc_kaggle.geometry import robust
 from mkpc_kaggle.geometry.cameras import Camera, fundamental_of_cameras
 from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.geometry.metrics import pose_error
 from mkpc_kaggle.geometry.robust import (
     FALLBACK_FUNDAMENTAL,
     Method,
@@ -119,6 +120,17 @@ def test_the_essential_matrix_and_the_homography_of_a_plane_are_found_among_outl
     fresh = seen(0, 500, plane=True)[180:]
     moved = cv2.perspectiveTransform(fresh.points0[:, None], result.matrix)[:, 0]
     assert np.hypot(*(moved - fresh.points1).T).max() < 0.05
+
+
+def test_magsac_finds_the_pose_of_noisy_matches_at_a_threshold_of_a_pixel():
+    errors = []
+    for seed in range(12):
+        matches, _ = scene(seed)
+        noise = np.random.default_rng(seed).normal(0, 0.5, (2, *matches.points0.shape))
+        noisy = Matches(matches.points0 + noise[0], matches.points1 + noise[1], matches.scores)
+        result = estimated(ModelKind.E, noisy, RobustConfig(threshold=1.0, permutations=1), seed)
+        errors.append(pose_error(result.matrix, *(camera.calibrated for camera in cameras(seed)), 1.0).angle)
+    assert np.median(errors) < 0.4  # degrees; 0.9 in units of the focal length, where the score has no scale
 
 
 def test_sampson_distance_is_in_pixels_and_the_same_in_either_order():

@@ -29,7 +29,7 @@ from mkpc_kaggle.pipeline.assembly import Assembly
 from mkpc_kaggle.pipeline.stages import Pipeline
 from mkpc_kaggle.scene.choose import Choice, Reason
 from mkpc_kaggle.scene.reconstruct import Solution
-from mkpc_kaggle.scene.reconstruction import Reconstruction, RegisteredImage, SfmModel
+from mkpc_kaggle.scene.reconstruction import Reconstruction, RegisteredImage, SfmModel, Sigmas
 from mkpc_kaggle.scene.view_graph import BatchImage
 
 BROKEN = "CUDA error: an illegal memory access was encountered"
@@ -144,7 +144,9 @@ def choose_scene_for_all_but_the_first(job: SceneJob) -> Solution:
     names = tuple(sorted({image.name for pair in job.pairs for image in pair.images}))
     camera = Camera(np.eye(3), np.eye(3), np.zeros(3))
     images = (BatchImage(name, name, Size(80, 72)) for name in names)
-    registered = tuple(RegisteredImage(image, camera, 99) for image in images)
+    registered = tuple(
+        RegisteredImage(each, camera, 99, Sigmas(0.1, 0.01 * n, 2.0)) for n, each in enumerate(images)
+    )
     points = np.zeros((job.matches, 3))
     return Solution((Reconstruction(names, (SfmModel(registered, points, 0.5),)),), choices)
 
