@@ -222,7 +222,7 @@ class Engine:
         return self.interrupt.is_set() or now >= min(self._until, self.budget.stop_waiting)
 
     def _hand_out(self, now: float) -> None:
-        """Start a worker where there is work and none, and give a job to each idle worker."""
+        """Start a worker in each place with work but no worker. Give a job to each idle worker."""
         if not self._is_open and self.plan.has_work(now):
             self.site.open()
             self._is_open = True

@@ -1,4 +1,8 @@
-"""Where workers are: a place has one worker at a time, and is closed when it loses three in a row."""
+"""Where workers are: a place has one worker at a time, and is closed when it loses three in a row.
+
+A worker that has not answered by :attr:`Place.limit`, which :meth:`Engine._time_limit` sets, is killed in
+:meth:`Place._lose`: its process gets SIGKILL.
+"""
 
 import os
 import queue
@@ -53,7 +57,7 @@ class Place:
 
     @property
     def is_starting(self) -> bool:
-        """Whether a worker is being loaded, or may be after a pause."""
+        """Whether a worker is loading, or may be started again after a pause."""
         return not self.is_loaded and not self.closed and (self.worker is not None or self.losses > 0)
 
     def may_start(self, now: float) -> bool:
@@ -66,7 +70,7 @@ class Place:
         self.worker.start()
 
     def submit(self, job: Job, seconds: float, time_limit: float, now: float) -> None:
-        """Hand a job to the idle worker; its units may begin within ``seconds``."""
+        """Hand a job to the idle worker. A unit begins only if it is expected to end within ``seconds``."""
         assert self.worker is not None
         self.job, self.since, self.limit = job, now, now + time_limit
         self.worker.submit(job, seconds)

@@ -98,9 +98,9 @@ class PairRecord:
 class CameraRecord:
     """A camera of a scene: centre and axes in its model's units, focal length and size in pixels.
 
-    ``down`` points to the image's lower border. ``digest`` identifies the image's content. ``model`` numbers the
-    models of the batch, 0 is the largest. ``seen`` is the number of points that the image sees. ``sigmas``: see
-    :class:`RegisteredImage`.
+    ``down`` points to the image's lower border. ``digest`` identifies the image's content. ``model`` is the index
+    of its model in the batch; 0 is the largest. ``seen`` is the number of points that the image sees. ``sigmas``:
+    see :class:`RegisteredImage`.
     """
 
     image: str

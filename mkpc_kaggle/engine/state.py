@@ -36,7 +36,7 @@ class State:
 
     @property
     def fundamentals(self) -> NDArray[np.float64]:
-        """(rows, 3, 3): the F to write now."""
+        """(rows, 3, 3): what is written now, by the scene, else by the pair, else the fallback."""
         written = self.own[: self.rows].copy()
         for position, F in self.by_scene.items():
             if position < self.rows:

@@ -1,6 +1,9 @@
 """What a worker does with its jobs: matching, estimates, looks at images, reconstructions.
 
 Importing this module does not import torch: only matching needs it.
+
+Threads: one matching process uses all cores, and N processes share them. A process for estimates has one thread, a
+scene has ``threads`` of ``[scene]``, and a machine of a Ray cluster has its number of CPUs.
 """
 
 import time
