@@ -30,7 +30,7 @@ from mkpc_kaggle.evaluation.validate import (
 )
 from mkpc_kaggle.geometry.robust import Method, RobustConfig
 from mkpc_kaggle.pipeline.assembly import Assembly
-from mkpc_kaggle.recipe import Recipe, split_mode
+from mkpc_kaggle.recipe import split_mode
 from mkpc_kaggle.reporting.summary import left_out_line, summary, trouble
 
 # Defaults of the matching options.
@@ -102,8 +102,10 @@ def run(arguments: argparse.Namespace) -> int:
     inputs = [root, arguments.pairs, arguments.truth, arguments.regions, *(arguments.submission or ())]
     require_apart({"--json": arguments.json}, filter(None, inputs), arguments.work_dir)
     scenes = _read_scenes(arguments)
+    status = 0
+    figures: dict[str, Any] | None = None
     if arguments.submission is not None:
-        status, figures = 0, _score(arguments, scenes)
+        figures = _score(arguments, scenes)
     else:
         with tempfile.TemporaryDirectory(prefix="mkpc-") as temporary:
             status, figures = _match_and_score(arguments, scenes, root, arguments.work_dir or Path(temporary))
@@ -115,18 +117,16 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _require_a_whole(given: argparse.Namespace) -> None:
     """Raise :class:`UserError` for options that cannot be combined."""
+    scored = bool(given.submission)
     matches = any(getattr(given, name) != default for name, default in MATCHING.items())
     matching = ", ".join(f"--{name.replace('_', '-')}" for name in MATCHING)
     for is_wrong, message in (
-        (given.imc2025 and (given.truth or not given.submission), "--imc2025 needs --submission, and no --truth"),
-        (
-            not given.imc2025 and (not given.submission) != (not given.truth),
-            "--submission and --truth go together",
-        ),
-        (given.submission and matches, f"--submission matches nothing: it goes without {matching}"),
+        (given.imc2025 and (given.truth or not scored), "--imc2025 needs --submission, and no --truth"),
+        (not given.imc2025 and scored != bool(given.truth), "--submission and --truth go together"),
+        (scored and matches, f"--submission matches nothing: it goes without {matching}"),
         (given.imc2025 and given.json, "--imc2025 only prints the score: it goes without --json"),
         ((given.pairs is None) != (given.image_root is None), "--pairs and --image-root go together"),
-        (given.pairs and given.submission, "--submission needs a --train-dir: it scores in metres"),
+        (scored and given.pairs, "--submission needs a --train-dir: it scores in metres"),
         (given.protocol and not given.pairs, "--protocol needs --pairs: it is of E"),
         (given.in_front and not given.pairs, "--in-front needs --pairs: it is of E"),
         (given.pairs and given.compare, "--compare needs a --train-dir: it scores in metres"),
@@ -201,21 +201,12 @@ def _match_and_score(
 def _assemble(arguments: argparse.Namespace, interrupt: Interrupt, name: str, mode: str) -> Assembly:
     """Return the assembly of a recipe, as changed by the command's options."""
     assembly = options.assembly_of(arguments, name, mode, interrupt)
-    recipe = with_units(assembly.recipe, arguments.units)
+    recipe = assembly.recipe
+    if arguments.units is not None:
+        recipe = recipe.with_units(arguments.units.split(","))
     if arguments.protocol is not None:
         recipe = by_protocol(recipe, arguments.protocol)
     given = {"method": arguments.method, "threshold": arguments.threshold}
     changes = {key: value for key, value in given.items() if value is not None}
     magsac = from_table(RobustConfig, asdict(recipe.magsac) | changes, "--method and --threshold")
     return replace(assembly, recipe=replace(recipe, magsac=magsac))
-
-
-def with_units(recipe: Recipe, wanted: str | None) -> Recipe:
-    """Return the recipe with only the named units, in this order; all units by default."""
-    if wanted is None:
-        return recipe
-    known, names = {unit.name: unit for unit in recipe.units}, wanted.split(",")
-    for name in names:
-        if name not in known:
-            raise UserError(f"--units: recipe {recipe.name!r} has no unit {name!r}; it has {', '.join(known)}")
-    return replace(recipe, units=tuple(known[name] for name in names))
