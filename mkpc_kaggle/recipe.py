@@ -5,7 +5,7 @@ A recipe is a TOML file: ``mkpc_kaggle/recipes/NAME.toml`` or a custom file.
 
 import re
 import tomllib
-from collections.abc import Callable, Container, Mapping
+from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from enum import StrEnum
 from functools import cached_property
@@ -143,6 +143,14 @@ class Recipe:
     def only(self, wanted: Callable[[Unit], bool]) -> "Recipe":
         """Return the recipe with only the units that ``wanted`` accepts."""
         return replace(self, units=tuple(filter(wanted, self.units)))
+
+    def with_units(self, names: Sequence[str]) -> "Recipe":
+        """Return the recipe with only these units, in this order. Raise :class:`UserError` for an unknown one."""
+        known = {unit.name: unit for unit in self.units}
+        for name in names:
+            if name not in known:
+                raise UserError(f"recipe {self.name!r} has no unit {name!r}; it has {', '.join(known)}")
+        return replace(self, units=tuple(known[name] for name in names))
 
     def with_fallbacks(self, unavailable: Container[str]) -> "Recipe":
         """Return the recipe with fallbacks instead of ``unavailable`` matchers, and no other fallbacks."""

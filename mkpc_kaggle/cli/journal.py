@@ -37,11 +37,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    require_apart(
-        {"--report": arguments.report},
-        test_side(arguments.test_dir) if arguments.test_dir else [],
-        arguments.work_dir,
-    )
+    inputs = test_side(arguments.test_dir) if arguments.test_dir else []
+    require_apart({"--report": arguments.report}, inputs, arguments.work_dir)
     log = read_log(arguments.work_dir)
     written = write_csv(log, arguments.csv) if arguments.csv else []
     if arguments.report:

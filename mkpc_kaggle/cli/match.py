@@ -35,13 +35,12 @@ def run(arguments: argparse.Namespace) -> int:
     given = {name: getattr(arguments, name) for name in ("weights", "device", "precision", "licence")}
     matcher = TwoStageMatcher(arguments.recipe, **given)
     match = matcher(*images)
-    lines = [" ".join(f"{value: .9e}" for value in row) for row in match.estimate.matrix]
-    if match.estimate.failure:
-        lines.append(f"this is the fallback: {match.estimate.failure}")
-    lines.append(f"{len(match.matches)} matches, {match.estimate.inlier_count} inliers")
-    found = match.estimate.stats.support
-    verdict = "the images overlap" if found >= MIN_SUPPORT else "the images may not overlap"
-    lines.append(f"{found:.1f} times the inliers expected by chance: {verdict}")
+    found = match.estimate
+    lines = [" ".join(f"{value: .9e}" for value in row) for row in found.matrix]
+    lines += [f"this is the fallback: {found.failure}"] if found.failure else []
+    lines.append(f"{len(match.matches)} matches, {found.inlier_count} inliers")
+    verdict = "the images overlap" if found.stats.support >= MIN_SUPPORT else "the images may not overlap"
+    lines.append(f"{found.stats.support:.1f} times the inliers expected by chance: {verdict}")
     for result in match.results:
         counts = f"{len(result.matches):>6} matches  {result.seconds:.2f} s  {result.failure or result.note}"
         lines.append(f"  {result.unit.name:<30}{counts}")

@@ -40,9 +40,8 @@ def run(arguments: argparse.Namespace) -> int:
     weights = tuple(arguments.weights)
     package = make_package(Request(out, arguments.owner, weights, pythons, arguments.wheels, private, image))
     for folder, items in (("dataset", package.dataset), ("kernel", package.kernel)):
-        sizes = [item.source.stat().st_size for item in items]
-        rows = [(i.name, str(size), i.licence or "-", i.note) for i, size in zip(items, sizes, strict=True)]
-        total = f"{len(rows)} files", str(sum(sizes)), "", ""
+        rows = [(item.name, str(item.source.stat().st_size), item.licence or "-", item.note) for item in items]
+        total = f"{len(rows)} files", str(sum(int(size) for _, size, *_ in rows)), "", ""
         print(out / folder)
         options.print_table([("file", "bytes", "licence", ""), *rows, total])
         print()

@@ -16,7 +16,6 @@ from mkpc_kaggle.reconstruction.directory import output_directory
 from mkpc_kaggle.reconstruction.folder import read_folder, read_pair_list
 from mkpc_kaggle.reconstruction.outputs import FORMS, Cameras, write_tables
 from mkpc_kaggle.reconstruction.run import FolderResult, for_cameras, reconstruct_folder
-from mkpc_kaggle.reporting.report import report_run
 from mkpc_kaggle.reporting.summary import trouble, weakest_line
 
 HELP = """\
@@ -71,8 +70,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     root, out, work_dir = arguments.images, arguments.out, arguments.out / "work"
     datasets = read_folder(root)
-    lists = [] if arguments.pairs is None else [arguments.pairs]
-    require_directory_apart(out, [root, *lists, Path(arguments.recipe)], arguments.weights)
+    require_directory_apart(out, filter(None, [root, arguments.pairs, Path(arguments.recipe)]), arguments.weights)
     listed = None if arguments.pairs is None else read_pair_list(arguments.pairs, root, datasets)
     with (
         interruptible() as interrupt,
@@ -89,15 +87,13 @@ def run(arguments: argparse.Namespace) -> int:
         assembly = replace(assembly, recipe=for_cameras(assembly.recipe, arguments.camera))
         options.say_start(f"{sum(map(len, datasets.values()))} images", assembly, work_dir)
         given = {"listed": listed, "rotations": arguments.rotations, "publish": publish}
-        result = reconstruct_folder(datasets, assembly, session, out, **given)
+        result = reconstruct_folder(root, datasets, assembly, session, out, **given)
         unwritten, failed = result.report.unwritten, trouble(result.report)
         watchdog.status = int(bool(failed or unwritten) or not has_camera(result.cameras))
         lines = [*options.plan_lines(arguments, result.report), *_lines(result), failed, unwritten]
         say("\n".join(filter(None, [*lines, f"results: {out}"])))
-        if result.pairs:
-            say(report_run(work_dir, out / "report.html", session.must_end(), result.pairs))
-        signal = session.interrupt.signal
-        return 128 + signal if signal else watchdog.status
+        page = out / "report.html" if result.pairs else None
+        return options.finish(session, watchdog.status, page, result.pairs)
 
 
 def has_camera(cameras: Cameras) -> bool:

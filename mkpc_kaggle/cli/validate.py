@@ -11,7 +11,7 @@ from typing import Any
 
 from mkpc_kaggle.cli import options
 from mkpc_kaggle.config import from_table
-from mkpc_kaggle.data.competition import Pair, TrainScene, read_train_side
+from mkpc_kaggle.data.competition import TrainScene, read_train_side
 from mkpc_kaggle.data.outputs import require_apart
 from mkpc_kaggle.data.pairs import read_pairs, read_regions
 from mkpc_kaggle.engine.console import say
@@ -30,7 +30,7 @@ from mkpc_kaggle.evaluation.validate import (
 )
 from mkpc_kaggle.geometry.robust import Method, RobustConfig
 from mkpc_kaggle.pipeline.assembly import Assembly
-from mkpc_kaggle.recipe import Recipe, split_mode
+from mkpc_kaggle.recipe import split_mode
 from mkpc_kaggle.reporting.summary import left_out_line, summary, trouble
 
 # Defaults of the matching options.
@@ -98,40 +98,37 @@ def run(arguments: argparse.Namespace) -> int:
         for submission in arguments.submission:
             say("\n".join([str(submission), *score_lines(score_imc2025(arguments.imc2025, submission))]))
         return 0
-    sides = [arguments.train_dir, arguments.image_root]
-    inputs = [*sides, arguments.pairs, arguments.truth, arguments.regions, *(arguments.submission or ())]
+    root = arguments.train_dir or arguments.image_root
+    inputs = [root, arguments.pairs, arguments.truth, arguments.regions, *(arguments.submission or ())]
     require_apart({"--json": arguments.json}, filter(None, inputs), arguments.work_dir)
-    with tempfile.TemporaryDirectory(prefix="mkpc-") as temporary:
-        work_dir = arguments.work_dir or Path(temporary)
-        scenes = _read_scenes(arguments)
-        if arguments.submission is None:
-            return _match_and_score(arguments, scenes, work_dir)
-        scored = [score_submission(submission, arguments.truth, scenes) for submission in arguments.submission]
-        for submission, validation in zip(arguments.submission, scored, strict=True):
-            say("\n".join([str(submission), *score_table(validation)]))
-        figures = [*map(to_json, scored)]
-        _write_json(arguments.json, {"submissions": figures} if len(scored) > 1 else figures[0])
-        return 0
+    scenes = _read_scenes(arguments)
+    status = 0
+    figures: dict[str, Any] | None = None
+    if arguments.submission is not None:
+        figures = _score(arguments, scenes)
+    else:
+        with tempfile.TemporaryDirectory(prefix="mkpc-") as temporary:
+            status, figures = _match_and_score(arguments, scenes, root, arguments.work_dir or Path(temporary))
+    if figures is not None and arguments.json is not None:
+        with writing(f"--json {arguments.json}"):
+            arguments.json.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
+    return status
 
 
 def _require_a_whole(given: argparse.Namespace) -> None:
     """Raise :class:`UserError` for options that cannot be combined."""
+    scored = bool(given.submission)
     matches = any(getattr(given, name) != default for name, default in MATCHING.items())
     matching = ", ".join(f"--{name.replace('_', '-')}" for name in MATCHING)
     for is_wrong, message in (
-        (given.imc2025 and (given.truth or not given.submission), "--imc2025 needs --submission, and no --truth"),
-        (
-            not given.imc2025 and bool(given.submission) != bool(given.truth),
-            "--submission and --truth go together",
-        ),
-        (given.submission and matches, f"--submission matches nothing: it goes without {matching}"),
+        (given.imc2025 and (given.truth or not scored), "--imc2025 needs --submission, and no --truth"),
+        (not given.imc2025 and scored != bool(given.truth), "--submission and --truth go together"),
+        (scored and matches, f"--submission matches nothing: it goes without {matching}"),
         (given.imc2025 and given.json, "--imc2025 only prints the score: it goes without --json"),
         ((given.pairs is None) != (given.image_root is None), "--pairs and --image-root go together"),
-        (given.pairs and given.submission, "--submission needs a --train-dir: it scores in metres"),
-        (
-            not given.pairs and (given.protocol or given.in_front),
-            "--protocol and --in-front are of E: give --pairs",
-        ),
+        (scored and given.pairs, "--submission needs a --train-dir: it scores in metres"),
+        (given.protocol and not given.pairs, "--protocol needs --pairs: it is of E"),
+        (given.in_front and not given.pairs, "--in-front needs --pairs: it is of E"),
         (given.pairs and given.compare, "--compare needs a --train-dir: it scores in metres"),
         (given.compare and given.units, "--units chooses from one recipe; --compare takes recipes as they are"),
         (given.compare and len(given.compare) < 2, "--compare needs two recipes or more"),
@@ -149,21 +146,37 @@ def _read_scenes(arguments: argparse.Namespace) -> tuple[TrainScene, ...]:
     return read_train_side(arguments.train_dir, scenes=scenes, min_covisibility=least, pairs_per_scene=most)
 
 
-def _match_and_score(arguments: argparse.Namespace, scenes: tuple[TrainScene, ...], work_dir: Path) -> int:
-    """Run a recipe, or several to compare; they share a journal, so that common units run once."""
+def _score(arguments: argparse.Namespace, scenes: Sequence[TrainScene]) -> dict[str, Any]:
+    """Print the scores of submissions. Return all figures."""
+    figures = []
+    for submission in arguments.submission:
+        validation = score_submission(submission, arguments.truth, scenes)
+        say("\n".join([str(submission), *score_table(validation)]))
+        figures.append(to_json(validation))
+    return {"submissions": figures} if len(figures) > 1 else figures[0]
+
+
+def _match_and_score(
+    arguments: argparse.Namespace, scenes: Sequence[TrainScene], root: Path, work_dir: Path
+) -> tuple[int, dict[str, Any] | None]:
+    """Run a recipe, or several to compare; they share a journal, so that common units run once.
+
+    Return the exit status and all figures; no figures of an incomplete comparison.
+    """
     compared: list[str] = arguments.compare or []
     choices = [split_mode(text) for text in compared] or [(arguments.recipe, arguments.mode)]
     pairs = [true.pair for scene in scenes for true in scene.pairs]
-    root = str(arguments.train_dir or arguments.image_root)
+    regions = None if arguments.regions is None else read_regions(arguments.regions, root, pairs)
     validations, status = [], 0
     with interruptible() as interrupt, Watchdog(options.budget_of(arguments), interrupt) as watchdog:
         watchdog.save = lambda: "the time limit passed before the scores were printed"
-        assemblies = [_assemble(arguments, interrupt, *choice, pairs) for choice in choices]
-        reports = [re.sub(r"[^\w.-]+", "_", text) for text in compared or ["report"]]
-        for assembly, name in zip(assemblies, reports, strict=True):
+        assemblies = [_assemble(arguments, interrupt, *choice) for choice in choices]
+        for number, assembly in enumerate(assemblies):
             session = Session(work_dir, options.budget_of(arguments), interrupt, workers=arguments.workers)
             in_front = arguments.in_front or arguments.protocol is not None
-            validation = validate(scenes, assembly, session, root, in_front=in_front)
+            validation = validate(
+                scenes, replace(assembly, regions=regions or {}), session, str(root), in_front=in_front
+            )
             validations.append(validation)
             report = validation.report
             assert report is not None
@@ -172,49 +185,28 @@ def _match_and_score(arguments: argparse.Namespace, scenes: tuple[TrainScene, ..
             say("\n".join([*lines, *score_table(validation), *step_gains(validation)]))
             # The page draws inliers of F, and a list of pairs has E instead.
             has_page = arguments.work_dir is not None and arguments.pairs is None
+            name = re.sub(r"[^\w.-]+", "_", compared[number]) if compared else "report"
             page = work_dir / f"{name}.html" if has_page else None
             status = options.finish(session, max(status, bool(trouble(report))), page, pairs)
             if compared and report.ending != Ending.COMPLETE:
                 say("nothing is compared until all is done; with a --work-dir, the same command resumes")
-                return status or 1
-    figures = to_json(validations[0])
-    if compared:
-        comparison = Comparison(tuple(validations))
-        say("\n".join(["", *comparison_table(comparison)]))
-        figures = comparison_json(comparison)
-    _write_json(arguments.json, figures)
-    return status
+                return status or 1, None
+    if not compared:
+        return status, to_json(validations[0])
+    comparison = Comparison(tuple(validations))
+    say("\n".join(["", *comparison_table(comparison)]))
+    return status, comparison_json(comparison)
 
 
-def _write_json(path: Path | None, figures: dict[str, Any]) -> None:
-    if path is not None:
-        with writing(f"--json {path}"):
-            path.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
-
-
-def _assemble(
-    arguments: argparse.Namespace, interrupt: Interrupt, name: str, mode: str, pairs: Sequence[Pair]
-) -> Assembly:
+def _assemble(arguments: argparse.Namespace, interrupt: Interrupt, name: str, mode: str) -> Assembly:
     """Return the assembly of a recipe, as changed by the command's options."""
     assembly = options.assembly_of(arguments, name, mode, interrupt)
-    recipe = with_units(assembly.recipe, arguments.units)
+    recipe = assembly.recipe
+    if arguments.units is not None:
+        recipe = recipe.with_units(arguments.units.split(","))
     if arguments.protocol is not None:
         recipe = by_protocol(recipe, arguments.protocol)
-    if arguments.regions is not None:
-        root = arguments.train_dir or arguments.image_root
-        assembly = replace(assembly, regions=read_regions(arguments.regions, root, pairs))
     given = {"method": arguments.method, "threshold": arguments.threshold}
     changes = {key: value for key, value in given.items() if value is not None}
     magsac = from_table(RobustConfig, asdict(recipe.magsac) | changes, "--method and --threshold")
     return replace(assembly, recipe=replace(recipe, magsac=magsac))
-
-
-def with_units(recipe: Recipe, wanted: str | None) -> Recipe:
-    """Return the recipe with only the named units, in this order; all units by default."""
-    if wanted is None:
-        return recipe
-    known, names = {unit.name: unit for unit in recipe.units}, wanted.split(",")
-    for name in names:
-        if name not in known:
-            raise UserError(f"--units: recipe {recipe.name!r} has no unit {name!r}; it has {', '.join(known)}")
-    return replace(recipe, units=tuple(known[name] for name in names))

@@ -16,17 +16,13 @@ from mkpc_kaggle.weights.manifest import UNVERIFIED, pin, read_manifest
 HELP = """\
 Manage the weight files of the matchers. The package contains none.
 
-  list      print the files of each matcher and their paths
-  verify    compare every file found with the manifest
-  fetch     download files; needs internet
-  convert   write a checkpoint as safetensors, and print its line for the manifest
-
 Exit status: 0 done, 1 a file is missing, is wrong or could not be fetched, 2 bad input.
 ACTION --help has the options.
 """
 _FETCH = """\
-Download files; resume an interrupted download. If no digest is published, the digest of the first download is
-saved in DIR/weights_manifest.txt, and later downloads must match it. Each licence is printed first; check it."""
+Download files, which needs internet; resume interrupted downloads. If no digest is published, the digest of the
+first download is saved in DIR/weights_manifest.txt, and later downloads must match it. Each licence is printed
+first; check it."""
 _VERIFY = """\
 Compare every file found with the manifest. A file is good (also under another name), unverified (no digest is
 known, or Kaggle unpacked it into a directory) or refused, with the reason."""
@@ -41,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         ("fetch", _fetch, _FETCH),
         ("convert", _convert, "Write a checkpoint's tensors as safetensors; print the manifest's line for it."),
     ):
-        parsers[name] = actions.add_parser(name, description=description)
+        parsers[name] = actions.add_parser(name, description=description, help=description.partition(".")[0])
         parsers[name].set_defaults(act=act)
     for name in ("list", "verify"):
         options.add_weights(parsers[name])
@@ -87,11 +83,8 @@ def _verify(arguments: argparse.Namespace) -> int:
     files = store.verify() if wanted is None else looked_for
     there = {found.file for found in files}
     missing = [file.name for file in wanted or () if file not in there]
-    beside = arguments.manifest and arguments.manifest.parent  # files in this folder are printed without a path
     rows = [("file", "state", "path", "note")]
-    for found in files:
-        path = "" if found.path.parent == beside else str(found.path)
-        rows.append((found.file.name, str(found.state), path, found.note))
+    rows += [(found.file.name, str(found.state), str(found.path), found.note) for found in files]
     rows += [(name, "missing", "", f"searched {store.searched}") for name in missing]
     if len(rows) == 1:
         print(f"no weight files found (searched {store.searched})")

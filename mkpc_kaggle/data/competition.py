@@ -23,7 +23,6 @@ from mkpc_kaggle.data.outputs import replacing
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Matrix3
-from mkpc_kaggle.geometry.robust import ModelKind
 
 SUBMISSION_COLUMNS = ("sample_id", "fundamental_matrix")
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
@@ -47,10 +46,6 @@ class Pair:
     @property
     def images(self) -> tuple[Path, Path]:
         return Path(self.file0), Path(self.file1)
-
-    @property
-    def model(self) -> ModelKind:
-        return ModelKind.F if self.intrinsics is None else ModelKind.E
 
     @property
     def names(self) -> tuple[str, str]:
@@ -98,7 +93,7 @@ def read_test_side(directory: Path) -> tuple[Pair, ...]:
     if not images.is_dir():
         raise UserError(f"{images}: no such directory; --test-dir must hold test.csv and test_images/")
     if not pairs:
-        raise UserError(f"{path} has no rows, so there is nothing to match")
+        raise UserError(f"{path} has no rows, so no pair can be matched")
     return tuple(pairs.values())
 
 

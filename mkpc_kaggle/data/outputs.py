@@ -24,22 +24,20 @@ def require_apart(
     """Raise :class:`UserError` for outputs that would overwrite an input, another output or the journal.
 
     ``outputs`` are files, by option; ``inputs`` and ``weights`` are files and directories. A new file is allowed.
-    ``--json`` and ``--report`` overwrite only files of their own kind.
+    ``--json`` and ``--report`` overwrite only files with their own suffix.
     """
     files = {option: path for option, path in outputs.items() if path is not None}
     inputs = list(inputs)
-    precious = [*inputs, *weights, *weights_of_environment()]
     for option, path in files.items():
         is_result = path.suffix.lower() in RESULTS.get(option, ())
         if not path.name or os.path.isdir(path):  # noqa: PTH112  Path raises for a name that is too long
             raise UserError(f"{option} {str(path)!r} is a directory; name a file")
         lost = [f"{other} {there}" for other, there in files.items() if other != option and same_file(path, there)]
-        is_journal = path.name.startswith("journal.") and work_dir is not None and same_file(path.parent, work_dir)
-        if is_journal or (work_dir is not None and lies_in(work_dir, path)):
-            lost.append(f"the work directory {work_dir}")
-        for source in precious if os.path.lexists(path) else ():
-            if same_file(path, source) or (lies_in(path, source) and not is_result):
-                lost.append(f"the input {source}")
+        if work_dir is not None:
+            is_journal = path.name.startswith("journal.") and same_file(path.parent, work_dir)
+            lost += [f"the work directory {work_dir}"] if is_journal or lies_in(work_dir, path) else []
+        precious = [*inputs, *weights, *weights_of_environment()] if os.path.lexists(path) else []
+        lost += [f"the input {p}" for p in precious if same_file(path, p) or (lies_in(path, p) and not is_result)]
         if lost:
             raise UserError(f"{option} {path} would be written over {lost[0]}; name another file")
         if option in ("--json", "--report") and not is_result and os.path.isfile(path):  # noqa: PTH113

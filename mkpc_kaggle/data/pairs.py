@@ -12,7 +12,6 @@ import zipfile
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import cache
 from io import BytesIO
 from itertools import chain
 from math import nan
@@ -22,10 +21,9 @@ from typing import Any
 import numpy as np
 
 from mkpc_kaggle.data.competition import Pair, TrainScene, TruePair, evenly_spread, read_rows
-from mkpc_kaggle.data.images import Image, read_image
 from mkpc_kaggle.errors import UserError, read_text
 from mkpc_kaggle.geometry.cameras import Camera
-from mkpc_kaggle.geometry.coordinates import Box, Size
+from mkpc_kaggle.geometry.coordinates import Box
 
 FIELDS = 2 + 2 + 9 + 9 + 16
 EXPECTED = "name0 name1 turns0 turns1 K0 (9 numbers) K1 (9) T_0to1 (16)"
@@ -74,32 +72,22 @@ def read_regions(file: Path, image_root: Path, pairs: Iterable[Pair]) -> dict[tu
 
     ``file`` is a table ``image_0,image_1,box_0,box_1``: paths under the root; left, top, right and bottom in whole
     pixels of the stored file, the latter two exclusive. Raises :class:`UserError` for a malformed table or box and
-    for a missing pair.
+    for a missing pair. A unit fails where a box leaves its image.
     """
-    rows, found = {}, dict[tuple[str, ...], tuple[Box, Box]]()
-
-    @cache
-    def size(file: str) -> Size | None:
-        image = read_image(Path(file))
-        return image.size if isinstance(image, Image) else None
-
+    boxes = {}
     for where, (name0, name1, *cells) in read_rows(file, ("image_0", "image_1", "box_0", "box_1")):
-        rows[str(image_root / name0), str(image_root / name1)] = where, *cells
-    for pair in pairs:
-        files = pair.file0, pair.file1
-        if files not in rows:
-            raise UserError(f"{file} has no regions of the pair {pair.id}")
-        where, cell0, cell1 = rows[files]
-        found[files] = parse_box(cell0, size(files[0]), where), parse_box(cell1, size(files[1]), where)
-    return found
+        box0, box1 = (parse_box(cell, where) for cell in cells)
+        boxes[str(image_root / name0), str(image_root / name1)] = box0, box1
+    wanted = {(pair.file0, pair.file1): pair.id for pair in pairs}
+    if missing := [name for files, name in wanted.items() if files not in boxes]:
+        raise UserError(f"{file} has no regions of the pair {missing[0]}")
+    return {files: boxes[files] for files in wanted}
 
 
-def parse_box(cell: str, size: Size | None, where: str) -> Box:
+def parse_box(cell: str, where: str) -> Box:
     with suppress(ValueError, TypeError):
-        box = Box(*map(int, cell.split()))
-        if size is None or box.is_within(size):
-            return box
-    raise UserError(f"{where}: expected left, top, right and bottom of a box on its image, found {cell!r}")
+        return Box(*map(int, cell.split()))
+    raise UserError(f"{where}: expected left, top, right and bottom of a box, found {cell!r}")
 
 
 def parse_line(line: str, where: str) -> tuple[ListedImage, ListedImage]:

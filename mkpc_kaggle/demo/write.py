@@ -66,7 +66,8 @@ def write_demo(
     rows: list[tuple[str, str]] = []
     for world in worlds:
         photographs = take_photographs(world, seed)
-        pairs = [_pair(a, b) for a, b in combinations(photographs, 2)]
+        ends = combinations(photographs, 2)  # the competition's pairs begin with the greater id
+        pairs = [DemoPair(b, a, covisibility(b.camera, b.depth, a.camera, a.depth)) for a, b in ends]
         _write_train(demo.train_dir / world.name, photographs, pairs)
         rows += _write_test(demo.test_dir, world.name, _selected(pairs), seed)
     factors = (f"{world.name},{world.metres_per_unit:.17g}" for world in worlds)
@@ -104,11 +105,6 @@ def _developed(image: FloatImage, rng: np.random.Generator) -> Picture:
     blurred = cv2.GaussianBlur(light, (5, 5), float(rng.uniform(0.3, 0.7)))
     noise = np.float32(rng.uniform(0.006, 0.016)) * rng.standard_normal(light.shape, dtype=np.float32)
     return np.asarray(np.clip((blurred + noise) * 255, 0, 255).round(), dtype=np.uint8)
-
-
-def _pair(a: Photograph, b: Photograph) -> DemoPair:
-    first, second = (a, b) if a.image_id > b.image_id else (b, a)
-    return DemoPair(first, second, covisibility(a.camera, a.depth, b.camera, b.depth))
 
 
 def _selected(pairs: Sequence[DemoPair]) -> list[DemoPair]:

@@ -171,7 +171,7 @@ def _centres(path: Path) -> dict[str, dict[str, dict[str, Points]]]:
             raise UserError(f"{where}: expected 9 and 3 numbers joined by ';', found {len(R)} and {len(t)}")
         found.setdefault(dataset, {}).setdefault(scene, {})[image] = -R.reshape(3, 3).T @ t
     if not found:
-        raise UserError(f"{path} has no rows: there is nothing to score")
+        raise UserError(f"{path} has no rows to score")
     return found
 
 

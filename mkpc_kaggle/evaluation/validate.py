@@ -1,6 +1,6 @@
 """Run of the engine on pairs with known cameras, and its scores.
 
-A train side is scored by the rules of the competition, a list of pairs by those of SuperGlue and LoFTR.
+A train side is scored by the rules of the competition, a list of pairs by the rules of SuperGlue and LoFTR.
 """
 
 import json
@@ -24,7 +24,7 @@ from mkpc_kaggle.geometry import metrics
 from mkpc_kaggle.geometry.coordinates import Matrix3
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.metrics import AUC_THRESHOLDS, PoseError
-from mkpc_kaggle.geometry.robust import Method, ModelKind, RobustConfig
+from mkpc_kaggle.geometry.robust import Method, RobustConfig
 from mkpc_kaggle.pipeline.assembly import Assembly
 from mkpc_kaggle.recipe import Recipe
 
@@ -191,7 +191,7 @@ def error_of(
     if matrix is None:
         return PoseError.failed()
     camera0, camera1 = true.camera0, true.camera1
-    if true.pair.model is ModelKind.E:
+    if true.pair.intrinsics is not None:
         camera0, camera1 = camera0.calibrated, camera1.calibrated
     return metrics.pose_error(matrix, camera0, camera1, scene.metres_per_unit, rotation)
 

@@ -4,7 +4,7 @@ An estimate is always a value. Without a model it holds the reason and the fallb
 the right rank, so a submission is always complete.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Any, NamedTuple
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from mkpc_kaggle.config import POSITIVE, Range, check_ranges
-from mkpc_kaggle.geometry.coordinates import Matrix3
+from mkpc_kaggle.geometry.coordinates import Box, Matrix3, Size, View
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.two_view import Vectors, robust_costs, sampson
 
@@ -57,6 +57,16 @@ class RobustConfig:
     def __post_init__(self) -> None:
         check_ranges(self, threshold=POSITIVE, confidence=Range(0, 1, "()"), max_iterations=Range(1, 10**6))
         check_ranges(self, permutations=Range(1, 100), threshold_side=Range(0, 99_999))
+
+    def in_stored_pixels(
+        self, sizes: Sequence[Size], intrinsics: tuple[Matrix3, Matrix3] | None = None
+    ) -> "RobustConfig":
+        """Return settings for stored images of these sizes, with the same threshold over the mean focal length."""
+        if not self.threshold_side:
+            return self
+        scales = np.array([View.fit(Box.whole(size), long_side=self.threshold_side).scale for size in sizes])
+        focals = np.array([K.diagonal()[:2] for K in intrinsics or 2 * [np.eye(3)]])
+        return replace(self, threshold=self.threshold * focals.sum() / (focals * scales).sum(), threshold_side=0)
 
 
 @dataclass(frozen=True)

@@ -1,18 +1,17 @@
 """A pair on its way through the stages: results of units, critical regions, the two-view model."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mkpc_kaggle.data.images import Image
-from mkpc_kaggle.geometry.coordinates import Box, Matrix3, Size, View
+from mkpc_kaggle.geometry.coordinates import Matrix3, Size
 from mkpc_kaggle.geometry.critical_region import CriticalRegion
 from mkpc_kaggle.geometry.focal_prior import FocalPrior, estimate_with_prior
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.overlap import support
-from mkpc_kaggle.geometry.robust import Estimate, ModelKind, RobustConfig, estimate, rotation_in_front
+from mkpc_kaggle.geometry.robust import Estimate, ModelKind, estimate, rotation_in_front
 from mkpc_kaggle.recipe import Recipe, Unit
 
 Regions = tuple[CriticalRegion, CriticalRegion]
@@ -81,7 +80,7 @@ def with_estimate(
     results = tuple(sorted(pair.results, key=lambda result: recipe.units.index(result.unit)))
     matches = Matches.concatenate(result.matches for result in results)
     sizes = pair.sizes or tuple(image.size for image in pair.images)
-    magsac = in_stored_pixels(recipe.magsac, sizes, intrinsics)
+    magsac = recipe.magsac.in_stored_pixels(sizes, intrinsics)
     if recipe.focal is None or model is ModelKind.H:
         found = estimate(matches, magsac, model, intrinsics)
     else:
@@ -98,14 +97,3 @@ def with_estimate(
             rotation = tuple(rotation_in_front(found.matrix, matches[found.inliers], intrinsics))
             found = replace(found, stats=replace(found.stats, rotation=rotation))
     return replace(pair, results=results, estimate=found)
-
-
-def in_stored_pixels(
-    magsac: RobustConfig, sizes: Sequence[Size], intrinsics: tuple[Matrix3, Matrix3] | None
-) -> RobustConfig:
-    """Return settings for stored images of these sizes, with the same threshold over the mean focal length."""
-    if not magsac.threshold_side:
-        return magsac
-    scales = np.array([View.fit(Box.whole(size), long_side=magsac.threshold_side).scale for size in sizes])
-    focals = np.array([K.diagonal()[:2] for K in intrinsics or 2 * [np.eye(3)]])
-    return replace(magsac, threshold=magsac.threshold * focals.sum() / (focals * scales).sum(), threshold_side=0)

@@ -1,7 +1,10 @@
-"""Which images of a folder are matched with each other, and which of them are turned for it."""
+"""Choice of the pairs of a folder: images to match with each other, and images to turn for it.
+
+The orientation of an image is found by matching it in four rotations with its most similar images.
+"""
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import combinations
@@ -10,26 +13,27 @@ from pathlib import Path
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.console import warn
 from mkpc_kaggle.engine.engine import Engine
+from mkpc_kaggle.engine.journal_reader import JournalReader
 from mkpc_kaggle.engine.session import Session, request_of
 from mkpc_kaggle.engine.settings import digest
 from mkpc_kaggle.pipeline.assembly import Assembly
-from mkpc_kaggle.reconstruction import orientation
-from mkpc_kaggle.reconstruction.folder import Datasets, Ends, root_of
-from mkpc_kaggle.reconstruction.likeness import (
-    FEATURE_SETTINGS,
-    PARTNERS,
-    Partners,
-    compare,
-    local_features,
-    shortlist,
-)
+from mkpc_kaggle.reconstruction.folder import Datasets, Ends
+from mkpc_kaggle.scene.likeness import FEATURE_SETTINGS, PARTNERS, Partners, local_features, most_alike, shortlist
 
 MAX_IMAGES = 100  # with more, each image has a shortlist instead of all pairs
 TRIAL_SHARE = 0.25  # of the time left, for trials of each kind of orientation
+TURN_PARTNERS = 4  # per image, to find its orientation
+MANY_INLIERS = 100  # with one partner: the image is upright
+MIN_INLIERS = 30  # of a turned image
+MIN_GAIN = 2.0  # of inliers, relative to the unturned image
+
+Key = tuple[Path, int, Path]  # an image, its quarter turns, and an unturned image of greater name
+Near = Mapping[Path, Sequence[Path]]  # the most similar images of each image
 
 
 def choose_pairs(
     engine: Engine,
+    root: Path,
     datasets: Datasets,
     assembly: Assembly,
     session: Session,
@@ -41,64 +45,91 @@ def choose_pairs(
 
     With ``rotations``, images are turned as the recipe's first unit matches them best.
     """
-    ends = {
-        name: [two for two in listed or () if two[0].parent == files[0].parent] for name, files in datasets.items()
-    }
-    large = {name for name, files in datasets.items() if listed is None and len(files) > MAX_IMAGES}
-    lying = {name for name, files in datasets.items() if rotations and (ends[name] if listed else len(files) > 1)}
-    counts = {name: PARTNERS if name in large else orientation.TURN_PARTNERS for name in sorted(large | lying)}
-    partners = find_partners(engine, datasets, counts)
-    near = {name: [others[: orientation.TURN_PARTNERS] for others in partners[name]] for name in sorted(lying)}
-    turns = find_turns(engine, datasets, near, assembly, session)
-    pairs = []
+    ends: dict[str, Sequence[Ends]] = {}
+    near: dict[Path, list[Path]] = {}
     for name, files in datasets.items():
-        indices = shortlist(partners[name]) if name in large else combinations(range(len(files)), 2)
-        for a, b in [(files[i], files[j]) for i, j in indices] if listed is None else ends[name]:
-            turned = (turns.get(a, 0), turns.get(b, 0))
-            suffix = f" turned {turned[0]} {turned[1]}" if any(turned) else ""
-            pairs.append(Pair(f"{name}/{a.stem}/{b.stem}{suffix}", name, str(a), str(b), turns=turned))
-    return pairs
+        ends[name] = [two for two in listed or () if two[0].parent == files[0].parent]
+        is_large = listed is None and len(files) > MAX_IMAGES
+        may_lie = rotations and (bool(ends[name]) if listed else len(files) > 1)
+        count = PARTNERS if is_large else TURN_PARTNERS
+        partners = find_partners(engine, name, files, count) if is_large or may_lie else []
+        if may_lie:
+            near |= {a: [files[j] for j in partners[i][:TURN_PARTNERS]] for i, a in enumerate(files)}
+        if listed is None:
+            indices = shortlist(partners) if is_large else combinations(range(len(files)), 2)
+            ends[name] = [(files[i], files[j]) for i, j in indices]
+    names = {file: name for name, files in datasets.items() for file in files}
+    turns = find_turns(engine, near, names, root, assembly, session)
+    return [pair_of(name, a, b, turns.get(a, 0), turns.get(b, 0)) for name in ends for a, b in ends[name]]
 
 
-def find_partners(engine: Engine, datasets: Datasets, counts: Mapping[str, int]) -> dict[str, Partners]:
-    """Return the most similar images of each image, by dataset; none where they could not be compared."""
-    digests: dict[str, list[str]] = {}
-    looks, comparisons = dict[tuple[str, str], Callable[[], bytes]](), {}
-    for name, count in counts.items():
-        files = {str(file): file for file in datasets[name]}
-        found = engine.digest_files(files)
-        looks |= {(found[key], FEATURE_SETTINGS): partial(local_features, files[key]) for key in found}
-        digests[name] = [found.get(key, "") for key in files]
-        key = digest(digests[name]), digest([FEATURE_SETTINGS, count])
-        comparisons[name] = key, partial(compare, engine.journal.path.parent, digests[name], count)
-    known = engine.look(dict(comparisons.values()), compute=False)
-    if any(key not in known for key, _ in comparisons.values()):
-        engine.look(looks)
-        known = engine.look(dict(comparisons.values()))
-    partners = {}
-    for name, (key, _) in comparisons.items():
-        if key not in known:
-            warn(f"the images of {name} were not compared")
-        partners[name] = json.loads(known[key]) if key in known else [[] for _ in datasets[name]]
+def pair_of(dataset: str, a: Path, b: Path, *turns: int) -> Pair:
+    """Return the pair of two images of a dataset, matched with these quarter turns, counter-clockwise."""
+    suffix = f" turned {turns[0]} {turns[1]}" if any(turns) else ""
+    return Pair(f"{dataset}/{a.stem}/{b.stem}{suffix}", dataset, str(a), str(b), turns=(turns[0], turns[1]))
+
+
+def find_partners(engine: Engine, dataset: str, files: Sequence[Path], count: int) -> Partners:
+    """Return the ``count`` most similar images of each image of a dataset; none if they could not be compared."""
+    found = engine.digest_files({str(file): file for file in files})
+    digests = [found.get(str(file), "") for file in files]
+    key = digest(digests), digest([FEATURE_SETTINGS, count])
+    comparison = {key: partial(compare, engine.journal.path.parent, digests, count)}
+    known = engine.look(comparison, compute=False)
+    if not known:
+        engine.look(
+            {(found[str(a)], FEATURE_SETTINGS): partial(local_features, a) for a in files if str(a) in found}
+        )
+        known = engine.look(comparison)
+    if key not in known:
+        warn(f"the images of {dataset} were not compared")
+    partners: Partners = json.loads(known[key]) if key in known else [[] for _ in files]
     return partners
 
 
+def compare(directory: Path, digests: Sequence[str], count: int) -> bytes:
+    """Return :func:`most_alike` as JSON, from a journal's features of images with these digests."""
+    with JournalReader(directory, check=False) as journal:
+
+        def features() -> Iterable[bytes]:
+            return (journal.feature(digest, FEATURE_SETTINGS) or b"" for digest in digests)
+
+        return json.dumps(most_alike(features, count)).encode()
+
+
 def find_turns(
-    engine: Engine, datasets: Datasets, partners: Mapping[str, Partners], assembly: Assembly, session: Session
+    engine: Engine, near: Near, names: Mapping[Path, str], root: Path, assembly: Assembly, session: Session
 ) -> dict[Path, int]:
-    """Return by how many quarters, counter-clockwise, images are turned."""
+    """Return the quarter turns, counter-clockwise, that set images upright; upright images are left out.
+
+    ``names`` are the datasets of images. First all images are matched unturned, then images with few inliers in
+    the other three orientations. An image takes its best orientation if it gains enough, relative to the turns of
+    earlier images.
+    """
     recipe = assembly.recipe
     trial = replace(assembly, recipe=replace(recipe, units=recipe.units[:1], scene=None))
-    found: dict[str, dict[orientation.Key, int]] = {name: {} for name in partners}
-    for keys_of in (orientation.upright_keys, orientation.turned_keys):
-        keys = [(name, key) for name, near in partners.items() for key in keys_of(near, found[name])]
-        pairs = [orientation.pair_of(key, name, datasets[name]) for name, key in keys]
-        if pairs:
-            engine.ask(request_of(pairs, trial, session, str(root_of(datasets))), TRIAL_SHARE)
-            for (name, key), inliers in zip(keys, engine.state.inliers.tolist(), strict=True):
-                found[name][key] = inliers
-    return {
-        datasets[name][i]: times
-        for name, near in partners.items()
-        for i, times in enumerate(orientation.turns_of(near, found[name]))
-    }
+    found: dict[Key, int] = {}
+    turns: dict[Path, int] = {}
+
+    def inliers(a: Path, times: int) -> int:
+        """Return the most inliers of an image with an image near it, as turned so far."""
+        return max((found.get(relative(a, times - turns.get(b, 0), b), 0) for b in near[a]), default=0)
+
+    for tried in ((0,), (1, 2, 3)):
+        few = [a for a in near if inliers(a, 0) < MANY_INLIERS]
+        keys = sorted({relative(a, times, b) for a in few for times in tried for b in near[a]})
+        if keys:
+            pairs = [pair_of(names[a], a, b, times, 0) for a, times, b in keys]
+            engine.ask(request_of(pairs, trial, session, str(root)), TRIAL_SHARE)
+            found |= zip(keys, engine.state.inliers.tolist(), strict=True)
+    for a in near:
+        counts = [inliers(a, times) for times in range(4)]
+        best = max(range(4), key=counts.__getitem__)
+        if counts[0] < MANY_INLIERS and counts[best] >= max(MIN_INLIERS, MIN_GAIN * counts[0]):
+            turns[a] = best
+    return turns
+
+
+def relative(a: Path, times: int, b: Path) -> Key:
+    """Return the key of image a turned by ``times`` quarters and the unturned image b."""
+    return (a, times % 4, b) if a < b else (b, -times % 4, a)

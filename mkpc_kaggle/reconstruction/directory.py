@@ -6,7 +6,6 @@ import re
 import shutil
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from hashlib import file_digest, sha256
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
 
@@ -14,6 +13,7 @@ from mkpc_kaggle.data.outputs import replacing
 from mkpc_kaggle.engine.console import warn
 from mkpc_kaggle.errors import UserError, writing
 from mkpc_kaggle.scene.export import DATABASE, MODEL_FILES, MODELS, PART
+from mkpc_kaggle.weights.manifest import digest_of
 
 WORK, TABLES = "work", ("cameras.csv", "submission.csv", "report.html")
 RESERVED = {DATABASE, MODELS, WORK, *TABLES}  # names that no dataset may have
@@ -34,8 +34,8 @@ def output_directory(out: Path, datasets: Iterable[str], form: str | None = None
     with writing(f"--out {out}"):
         marked = _read_mark(out)
         if strange := next(_in_the_way(out, results, marked), None):
-            told = f"--out {out}: {strange} is in the way, it was not made by this command"
-            raise UserError(f"{told}; move it, or name an empty directory")
+            message = f"--out {out}: {strange} is in the way, it was not made by this command"
+            raise UserError(f"{message}; move it, or name an empty directory")
         known = dict.fromkeys(results, "") | (marked or {})
         _write_mark(out, known)
         for folder in {(out / name).parent for name in results}:
@@ -89,14 +89,8 @@ def _is_inside(out: Path, name: str) -> bool:
 
 
 def _digest(path: Path) -> str:
-    """Return the digest of a file, or of the names and contents of a folder; "" if it does not exist."""
-    whole = sha256()
-    for file in sorted(path.rglob("*")) if path.is_dir() else [path]:
-        whole.update(os.fsencode(file.relative_to(path)) + b"\0")
-        if file.is_file():
-            with file.open("rb") as stream:
-                whole.update(file_digest(stream, sha256).digest())
-    return whole.hexdigest() if path.exists() else ""
+    """Return the digest of a file or a folder; "" if it does not exist."""
+    return digest_of(path) if path.exists() else ""
 
 
 def _remove(path: Path) -> None:

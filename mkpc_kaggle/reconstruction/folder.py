@@ -44,13 +44,6 @@ def read_folder(root: Path) -> Datasets:
     return dict(sorted(datasets.items()))
 
 
-def root_of(datasets: Datasets) -> Path:
-    """Return the root folder of datasets of :func:`read_folder`."""
-    name, files = next(iter(datasets.items()))
-    folder = files[0].parent
-    return folder if name == "." else folder.parents[len(Path(name).parts) - 1]
-
-
 def _is_image(name: str) -> bool:
     return name.lower().endswith(IMAGE_SUFFIXES)
 

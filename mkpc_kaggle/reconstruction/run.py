@@ -14,14 +14,14 @@ from mkpc_kaggle.engine.request import RunReport, Standing
 from mkpc_kaggle.engine.session import Session, opened_engine, request_of
 from mkpc_kaggle.errors import UserError, writing
 from mkpc_kaggle.matchers.contract import Matcher
-from mkpc_kaggle.pipeline.assembly import Assembly, assemble, require_types
+from mkpc_kaggle.pipeline.assembly import Assembly, assemble
 from mkpc_kaggle.pipeline.pair import PairMatch
-from mkpc_kaggle.recipe import CameraSharing, Recipe, SceneConfig, load_recipe
+from mkpc_kaggle.recipe import CameraSharing, Recipe, SceneConfig
 from mkpc_kaggle.reconstruction.choice import MAX_IMAGES, choose_pairs
-from mkpc_kaggle.reconstruction.folder import Datasets, Ends, root_of
-from mkpc_kaggle.reconstruction.likeness import PARTNERS, local_features, most_alike, shortlist
+from mkpc_kaggle.reconstruction.folder import Datasets, Ends
 from mkpc_kaggle.reconstruction.outputs import Cameras
 from mkpc_kaggle.scene.export import Export
+from mkpc_kaggle.scene.likeness import PARTNERS, local_features, most_alike, shortlist
 from mkpc_kaggle.scene.reconstruct import models_of, reconstruct_sharing
 from mkpc_kaggle.scene.reconstruction import SfmModel
 from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair, ViewGraph, tracks_of
@@ -44,6 +44,7 @@ def for_cameras(recipe: Recipe, sharing: str | None = None) -> Recipe:
 
 
 def reconstruct_folder(
+    root: Path,
     datasets: Datasets,
     assembly: Assembly,
     session: Session,
@@ -53,7 +54,7 @@ def reconstruct_folder(
     rotations: bool = False,
     publish: Callable[[Cameras], None] = lambda _: None,
 ) -> FolderResult:
-    """Match the pairs of each dataset, those ``listed`` or of :func:`choose_pairs`, and reconstruct it.
+    """Match the pairs of each dataset below ``root``, ``listed`` or of :func:`choose_pairs`, and reconstruct it.
 
     COLMAP's files of a dataset are in the folder of its name in ``out``. With ``rotations``, images without
     matches are turned. The process of a scene writes its files before the journal records the scene, so a resumed
@@ -61,21 +62,20 @@ def reconstruct_folder(
     scene.
     """
     assembly = replace(assembly, recipe=for_cameras(assembly.recipe))
-    folders, root = [files[0].parent for files in datasets.values()], str(root_of(datasets))
-    with opened_engine(assembly, session, folders) as engine:
+    with opened_engine(assembly, session, [files[0].parent for files in datasets.values()]) as engine:
         if not (out / "cameras.csv").exists():
             with writing(f"--out {out}"):
                 publish({name: dict.fromkeys(files) for name, files in datasets.items()})
-        pairs = choose_pairs(engine, datasets, assembly, session, listed=listed, rotations=rotations)
+        pairs = choose_pairs(engine, root, datasets, assembly, session, listed=listed, rotations=rotations)
         exports = {name: Export(out / name) for name in datasets}
 
         standing: list[Cameras] = []
 
         def write(results: Standing) -> None:
-            standing[:] = [cameras_of(datasets, root, results)]
+            standing[:] = [cameras_of(datasets, str(root), results)]
             publish(standing[0])
 
-        engine.ask(request_of(pairs, assembly, session, root, exports=exports, publish=write))
+        engine.ask(request_of(pairs, assembly, session, str(root), exports=exports, publish=write))
         report = engine.report()
     return FolderResult(report, tuple(pairs), *standing)
 
@@ -105,11 +105,9 @@ def reconstruct(
     pixels of the files, as COLMAP reads them. Raises :class:`UserError` for a recipe that cannot run here, and for
     an unreadable image.
     """
-    require_types(recipe, device, matchers)
-    files = sorted(map(Path, images))
-    chosen = for_cameras(load_recipe(recipe) if isinstance(recipe, str) else recipe)
-    assembly = assemble(chosen, weights=map(Path, weights), device=device, matchers=matchers)
-    pipeline, store = assembly.pipeline(), ImageStore()
+    assembly = assemble(recipe, weights=map(Path, weights), device=device, matchers=matchers)
+    assembly = replace(assembly, recipe=for_cameras(assembly.recipe))
+    pipeline, store, files = assembly.pipeline(), ImageStore(), sorted(map(Path, images))
 
     def opened(path: Path) -> Image:
         image = store.get(path)
@@ -117,15 +115,13 @@ def reconstruct(
             raise UserError(str(image))
         return image
 
-    pairs = []
-    if len(files) <= MAX_IMAGES:
-        ends = list(combinations(range(len(files)), 2))
-    else:
+    pairs, ends = [], list(combinations(range(len(files)), 2))
+    if len(files) > MAX_IMAGES:
         features = list(map(local_features, files))
         ends = shortlist(most_alike(lambda: features, PARTNERS))
     for path0, path1 in ((files[i], files[j]) for i, j in ends):
         (match,) = pipeline.match([PairMatch(images=(opened(path0), opened(path1)))], assembly.recipe.units)
         image0, image1 = (BatchImage(im.name, im.version, im.size, im.focal) for im in match.images)
         pairs.append(BatchPair(image0, image1, match.matches, None, tracks_of(match.results)))
-    found, _ = reconstruct_sharing(ViewGraph.of_pairs(pairs), chosen.scene or SceneConfig())
+    found, _ = reconstruct_sharing(ViewGraph.of_pairs(pairs), assembly.recipe.scene or SceneConfig())
     return tuple(sorted(models_of(found), key=lambda model: -len(model.images)))

@@ -129,7 +129,7 @@ def _upright(image: Image) -> View:
 def draw_budget(events: Sequence[Event], limit: float | None) -> "Figure":
     """Draw the number of ended jobs over time, a colour for each phase. A flat segment is time without a result.
 
-    ``events`` are those of a session, ``limit`` is the time limit in seconds.
+    ``events`` are the events of a session, ``limit`` is the time limit in seconds.
     """
     ended: dict[str, list[float]] = {}
     for event in events:

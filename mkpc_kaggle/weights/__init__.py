@@ -1,7 +1,4 @@
-"""Weight files: the manifest, and finding, verifying, loading, downloading and converting the files.
-
-Importing this package imports no torch.
-"""
+"""Weight files: the manifest; finding, verifying, loading, fetching, converting. The import brings no torch."""
 
 from mkpc_kaggle.weights.checkpoint import load_into, load_tensors
 from mkpc_kaggle.weights.manifest import UNVERIFIED, WeightFile

@@ -224,7 +224,7 @@ def judge(path: Path, file: WeightFile, files: Iterable[WeightFile] = ()) -> Fou
     elif unpacked:
         state, note = State.UNVERIFIED, UNPACKED
     elif other:
-        note = f"its bytes are those of {other}"
+        note = f"it has the bytes of {other}"
     elif 0 <= file.size != size:
         note = wrong_size
     elif file.digest == UNVERIFIED:

@@ -51,7 +51,7 @@ def test_verify_finds_truncated_and_swapped_files(weights, capsys):
     lines = capsys.readouterr().out.splitlines()
     rows = {line.split()[0]: line for line in lines if str(weights / line.split()[0]) in line}
     assert "truncated" in rows["lost.pt"]
-    assert rows["a.pt"].endswith("its bytes are those of sift.pt")
+    assert rows["a.pt"].endswith("it has the bytes of sift.pt")
 
 
 def test_fetch_takes_files_slots_and_recipes(tmp_path, monkeypatch, capsys):

@@ -10,7 +10,6 @@ import pytest
 from pair_lists import line_of, line_of_pair, turned_camera, write_list
 
 from mkpc_kaggle.cli import main
-from mkpc_kaggle.cli.validate import with_units
 from mkpc_kaggle.data.competition import Pair, read_train_side
 from mkpc_kaggle.data.pairs import parse_line, read_pairs
 from mkpc_kaggle.engine.settings import Settings
@@ -18,7 +17,6 @@ from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.evaluation.validate import error_of
 from mkpc_kaggle.geometry.cameras import Camera, fundamental_of_cameras
 from mkpc_kaggle.geometry.coordinates import Size
-from mkpc_kaggle.geometry.robust import ModelKind
 from mkpc_kaggle.recipe import load_recipe
 
 WHERE = "list.txt, line 7"
@@ -93,7 +91,7 @@ def test_the_true_matrix_has_no_error(demo, scenes, tmp_path):
     some = read_pairs(tmp_path / "list.txt", demo.train_dir, most=2)
     assert [true.pair.id for true in some.pairs] == [read.pairs[0].pair.id, read.pairs[2].pair.id]
     for true in read.pairs:
-        assert true.pair.model is ModelKind.E
+        assert true.pair.intrinsics is not None
         cameras = true.camera0.calibrated, true.camera1.calibrated
         # Near a cosine of 1 the angle of a rounding error is a millionth of a degree.
         assert error_of(fundamental_of_cameras(*cameras), true, read).angle < 1e-5
@@ -176,5 +174,5 @@ def test_failures_count_as_such(demo, scenes, tmp_path, capsys):
 
 
 def test_units_are_taken_in_the_order_in_which_they_are_named():
-    recipe = with_units(load_recipe("yfcc"), "1:superglue@1600,2:superglue@1400")
+    recipe = load_recipe("yfcc").with_units(["1:superglue@1600", "2:superglue@1400"])
     assert [unit.name for unit in recipe.units] == ["1:superglue@1600", "2:superglue@1400"]

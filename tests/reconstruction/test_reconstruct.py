@@ -38,10 +38,10 @@ from mkpc_kaggle.pipeline import pair
 from mkpc_kaggle.pipeline.assembly import assemble
 from mkpc_kaggle.recipe import Recipe, Unit
 from mkpc_kaggle.reconstruction.folder import read_folder, read_pair_list
-from mkpc_kaggle.reconstruction.likeness import local_features, most_alike, shortlist
 from mkpc_kaggle.reconstruction.outputs import Cameras, camera_rows, submission_rows
 from mkpc_kaggle.reconstruction.run import FolderResult, for_cameras, reconstruct_folder
 from mkpc_kaggle.reporting.run_log import read_log
+from mkpc_kaggle.scene.likeness import local_features, most_alike, shortlist
 
 RECIPE = for_cameras(Recipe((Unit(1, "synthetic", SIZE.width),)))
 FIRST, SECOND, OTHERS = 6, 4, 1  # images of two scenes, and of none
@@ -87,7 +87,7 @@ def run(
     budget = Budget(time.monotonic(), float("inf"))
     session = Session(out / "work", budget, interrupt, fresh, progress=False, workers=0)
     assembly = assemble(RECIPE, matchers={"synthetic": matcher}, device="cpu")
-    return reconstruct_folder(read_folder(root), assembly, session, out, **options)  # type: ignore[arg-type]
+    return reconstruct_folder(root, read_folder(root), assembly, session, out, **options)  # type: ignore[arg-type]
 
 
 @pytest.fixture(scope="module")

@@ -183,6 +183,6 @@ def test_verify_tells_good_truncated_swapped_renamed_and_unverified_files_apart(
         "renamed.pt": State.GOOD,
         "free.pt": State.UNVERIFIED,
     }
-    assert checked["swapped.pt"][1] == "its bytes are those of good.pt"
+    assert checked["swapped.pt"][1] == "it has the bytes of good.pt"
     assert checked["renamed.pt"][1] == "it is lost.pt"
     assert digest_of(b"free") in checked["free.pt"][1]

@@ -4,9 +4,8 @@ All recipes use RootSIFT: it needs no weights, works with dense matchers, and do
 an image. Source: Jegou et al. 2010; normalisation by Arandjelovic and Zisserman 2013.
 """
 
-import json
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import cv2
@@ -15,7 +14,6 @@ from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2, vq
 
 from mkpc_kaggle.data.images import Image, read_image
-from mkpc_kaggle.engine.journal_reader import JournalReader
 from mkpc_kaggle.matchers.adapters.sift import root_sift
 
 Partners = list[list[int]]  # of each image, by the indices of the images
@@ -63,16 +61,6 @@ def most_alike(features: Callable[[], Iterable[bytes]], count: int) -> list[list
     np.fill_diagonal(similarity, -np.inf)
     near: list[list[int]] = np.argsort(-similarity, axis=1, kind="stable")[:, :-1][:, :count].tolist()
     return near
-
-
-def compare(directory: Path, digests: Sequence[str], count: int) -> bytes:
-    """Return :func:`most_alike` as JSON, from a journal's features of images with these digests."""
-    with JournalReader(directory, check=False) as journal:
-
-        def features() -> Iterable[bytes]:
-            return (journal.feature(digest, FEATURE_SETTINGS) or b"" for digest in digests)
-
-        return json.dumps(most_alike(features, count)).encode()
 
 
 def _unpacked(features: bytes) -> NDArray[np.float32]:
