@@ -281,13 +281,12 @@ class SimulatedWorker(Simulated):
         found: list[list[Found]] = [[] for _ in job.indices]
         hung = Failure(Cause.TIMED_OUT)
         if site.rng.random() < scenario.job_faults:
-            usual = len(job.indices) * sum(self._site.costs[unit.name] for unit in job.units)
             fate = site.rng.integers(3)
             if fate == 0:
                 return now, Failure(Cause.DIED), 1e-9
             if fate == 1:
-                return now, hung, STALL * usual
-            now += usual
+                return now, hung, sum(self._stall(unit, now) for unit in job.units)
+            now += len(job.indices) * sum(site.costs[unit.name] for unit in job.units)
         for unit in sorted(job.units, key=lambda unit: unit.stage):
             for rows in found:
                 if now + expected[unit] >= deadline:
@@ -301,7 +300,7 @@ class SimulatedWorker(Simulated):
                 if fate < scenario.crashes or unit.matcher == scenario.never:
                     return now + seconds / 2, Failure(Cause.DIED), seconds / 2
                 if fate < scenario.crashes + scenario.hangs:
-                    return now, hung, STALL * usual
+                    return now, hung, self._stall(unit, now)
                 now += seconds
                 rows.append(Found(unit, MATCHES, POINTS, 0.0, seconds, warm_up=warm_up))
         outcomes = []
@@ -309,6 +308,12 @@ class SimulatedWorker(Simulated):
             images = tuple(BatchImage(name, name, SIZE) for name in wanted.names)
             outcomes.append(Outcome(index, images, tuple(rows)))
         return now, Matched(tuple(outcomes)), 0.0
+
+    def _stall(self, unit: Unit, now: float) -> float:
+        """Return the seconds that a stall of a unit takes on an uncached view, at the costs of this time."""
+        scenario = self._site.scenario
+        drift = scenario.drift if now > scenario.turn * scenario.limit else 1.0
+        return STALL * self._site.costs[unit.name] * max(1.0, scenario.miss_factor) * drift
 
 
 class SimulatedEstimator(Simulated):
