@@ -7,6 +7,7 @@ crash, run out of memory and hang as well.
 
 import math
 import threading
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -14,6 +15,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from mkpc_kaggle.data.competition import Pair
+from mkpc_kaggle.engine import costs, losses, plan, scenes
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.codec import to_blob
 from mkpc_kaggle.engine.engine import Engine
@@ -53,6 +55,25 @@ SIZE = Size(640, 480)
 MATCHES = 200  # that a unit finds
 POINTS = to_blob(Matches(np.zeros((MATCHES, 2)), np.zeros((MATCHES, 2)), np.zeros(MATCHES)))
 SWEEP_SHARE = 0.7  # of the limit, within which the sweep is said to fit
+
+MECHANISMS: dict[str, tuple[tuple[object, str, object], ...]] = {  # what to change to run without each
+    "reserve for scenes": ((plan, "RESERVE_SHARE", 0.0),),
+    "margin of scenes": ((scenes, "FORECAST_MARGIN", 1.0),),
+    "margin of units": ((costs, "MARGIN", 0.0), (costs, "MIN_MARGIN", 0.0)),
+    "latest costs": ((costs, "WINDOW", 10**9),),
+    "assumed costs": ((costs.Costs, "assume", lambda *_: None),),
+    "short jobs": ((plan, "JOB_SHARE", math.inf),),
+    "connect share": ((plan, "CONNECT_SHARE", 1.0),),
+    "end of patience": ((plan, "HANG_FACTOR", math.inf),),
+    "second try": ((losses, "MAX_TRIES", 1),),
+    "end of tries": ((plan, "MAX_FAILED_PAIRS", 10**9),),
+}
+
+
+def switch_off(mechanism: str, change: Callable[[object, str, object], None] = setattr) -> None:
+    """Run without a mechanism of the plan from now on."""
+    for owner, name, value in MECHANISMS[mechanism]:
+        change(owner, name, value)
 
 
 @dataclass(frozen=True)
@@ -171,8 +192,8 @@ class SimulatedSite(Site):
     Of their seconds until ``stop``, ``kept`` went into jobs that came back in time. ``faults`` are what injected
     faults take whatever is planned: the unit that a crash cut short, of a hang as long as a stall might have
     taken, which it cannot be told from sooner, a stall that was taken for a hang, and the new worker's start
-    after any of these. ``scenes`` are those begun; ``for_scenes`` are the workers' seconds in which nothing else
-    was under way.
+    after any of these. ``scenes`` are those begun; ``for_scenes`` are the seconds in which workers were idle and a
+    scene was under way.
     """
 
     def __init__(self, scenario: Scenario, clock: VirtualClock, stop: float) -> None:
@@ -197,12 +218,13 @@ class SimulatedSite(Site):
         return self.scenes[-1]
 
     def wait(self, until: float) -> None:
-        scenes = [scene for scene in self.scenes if not scene.is_over]
-        moments = [worker.ready for worker in (*self.workers, *self.others, *scenes)]
+        running = [scene for scene in self.scenes if not scene.is_over]
+        moments = [worker.ready for worker in (*self.workers, *self.others, *running)]
         moment = min([until, *moments])
         assert moment < math.inf, "the engine waits for ever"
-        if scenes and not any(worker.job for worker in self.workers):
-            self.for_scenes += len(self.of(Work.MATCH)) * max(0.0, min(moment, self.stop) - self.clock.now)
+        if running:
+            idle = sum(place.is_idle for place in self.of(Work.MATCH))
+            self.for_scenes += idle * max(0.0, min(moment, self.stop) - self.clock.now)
         self.clock.now = max(self.clock.now, moment)
 
     def unit_seconds(self, unit: Unit, now: float) -> float:
@@ -395,8 +417,8 @@ class Ran:
     faults take from any planner (see :class:`SimulatedSite`). Used are
     the seconds of jobs whose results came back in time, warm-ups and stalls included. So idle workers, the end of
     a phase, what a lost job had done before, silence longer than a stall's, a slow unit taken to hang, and what
-    is still under way at the end all count against the engine. Workers' time while nothing but scenes is under way
-    is used.
+    is still under way at the end all count against the engine. A worker that is idle while a scene is under way is
+    used.
 
     ``lost`` counts pairs without the sweep's F where the sweep fits (see :func:`sweep_seconds`), and versions of
     the submission that lack a row. ``missed`` are batches without a scene that no fault befell; ``scenes_fit``
