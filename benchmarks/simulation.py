@@ -1,6 +1,6 @@
 """Use of time by the engine, on random simulated runs.
 
-python -m benchmarks.simulation [--scenarios 1000] [--seed 0] [--pairs 10000]
+python -m benchmarks.simulation [--scenarios 1000] [--seed 0] [--pairs 10000] [--without MECHANISM]
 python -m benchmarks.simulation --costs 0.6 0.4 0.35 [--batches 15] [--pairs 10000] [--scene-seconds 0.15]
     [--limit 8h45m] [--workers 1]
 
@@ -14,11 +14,19 @@ from collections import Counter
 import numpy as np
 
 from mkpc_kaggle.engine.budget import format_duration, parse_duration
-from tests.support.simulator import Scenario, random_scenario, simulate, without_records
+from tests.support.simulator import (
+    MECHANISMS,
+    Ran,
+    Scenario,
+    random_scenario,
+    simulate,
+    switch_off,
+    without_records,
+)
 
 
-def tell(scenario: Scenario) -> None:
-    """Start times of the phases of a run, and the scenes of its batches."""
+def timeline(scenario: Scenario) -> None:
+    """Print the start times of the phases of a run, and the scenes of its batches."""
     ran = simulate(scenario)
     for explanation in ran.report.explanations:
         print(explanation)
@@ -31,19 +39,37 @@ def tell(scenario: Scenario) -> None:
     print(f"workers busy: {ran.utilisation:.4f} of their time; late: {ran.late:.0f} s; rows lost: {ran.lost}")
 
 
+def summary(runs: list[Ran]) -> None:
+    """Print what was late, lost, missed and used."""
+    busy = [run.utilisation for run in runs if run.work_left]
+    print(f"{len(runs)} scenarios, {len(busy)} with work left at the end")
+    print(f"late: {sum(run.late > 0 for run in runs)}, rows lost: {sum(run.lost for run in runs)}")
+    print(f"units run: {sum(run.report.units_run for run in runs)}")
+    fit = [run for run in runs if run.scenario.batches and run.scenes_fit]
+    batches, missed = sum(run.scenario.batches for run in fit), sum(run.missed for run in fit)
+    print(f"scenes: {len(fit)} scenarios in which they fit, {missed} of {batches} batches missed")
+    low, middle = np.percentile(busy or [math.nan], [5, 50])
+    print(f"utilisation: median {middle:.4f}, mean {np.mean(busy or [math.nan]):.4f}, 5th percentile {low:.4f}")
+    for run in sorted((run for run in runs if run.work_left), key=lambda run: run.utilisation)[:5]:
+        print(f"  {run.utilisation:.4f} {run.scenario}")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenarios", type=int, default=1000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--pairs", type=int, default=1000, help="on average; the scale of a run (default: 1000)")
+    parser.add_argument("--without", choices=MECHANISMS, action="append", default=[], help="may be repeated")
     parser.add_argument("--costs", type=float, nargs="+")
     parser.add_argument("--batches", type=int, default=15)
     parser.add_argument("--scene-seconds", type=float, default=Scenario.scene_seconds, help="for each pair")
     parser.add_argument("--limit", type=parse_duration, default=parse_duration("8h45m"))
     parser.add_argument("--workers", type=int, default=1)
     arguments = parser.parse_args()
+    for name in arguments.without:
+        switch_off(name)
     if arguments.costs is not None:
-        tell(
+        timeline(
             Scenario(
                 arguments.pairs,
                 tuple(arguments.costs),
@@ -55,20 +81,8 @@ def main() -> None:
             )
         )
         return
-    runs = [
-        without_records(simulate(random_scenario(seed, arguments.pairs)))
-        for seed in range(arguments.seed, arguments.seed + arguments.scenarios)
-    ]
-    busy = [run.utilisation for run in runs if run.work_left]
-    print(f"{len(runs)} scenarios, {len(busy)} with work left at the end")
-    print(f"late: {sum(run.late > 0 for run in runs)}, rows lost: {sum(run.lost for run in runs)}")
-    fit = [run for run in runs if run.scenario.batches and run.scenes_fit]
-    batches, missed = sum(run.scenario.batches for run in fit), sum(run.missed for run in fit)
-    print(f"scenes: {len(fit)} scenarios in which they fit, {missed} of {batches} batches missed")
-    low, middle = np.percentile(busy, [5, 50]) if busy else (math.nan, math.nan)
-    print(f"utilisation: median {middle:.4f}, 5th percentile {low:.4f}, least {min(busy, default=math.nan):.4f}")
-    for run in sorted((run for run in runs if run.work_left), key=lambda run: run.utilisation)[:5]:
-        print(f"  {run.utilisation:.4f} {run.scenario}")
+    seeds = range(arguments.seed, arguments.seed + arguments.scenarios)
+    summary([without_records(simulate(random_scenario(seed, arguments.pairs))) for seed in seeds])
 
 
 if __name__ == "__main__":

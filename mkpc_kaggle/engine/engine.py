@@ -180,7 +180,8 @@ class Engine:
                 self.journal.forget_scene(batch)  # its files are a result, too
         self.state = State(self.journal, len(self.pairs), len(request.pairs), len(recipe.units))
         order = visiting_order([each.pair for each in self.pairs])
-        self.plan = Plan(recipe.units, self.state, order, self.budget, self._explain, self.minibatch)
+        note = self._progress.note
+        self.plan = Plan(recipe.units, self.state, order, self.budget, self._explain, note, self.minibatch)
         self.scenes = Scenes(batches, self.journal.scenes(), self.journal.current_scenes())
         self.estimates = EstimatePlan(self.plan, order)
         complete = self.state.had.all(1) & self.state.is_estimated
@@ -375,6 +376,8 @@ class Engine:
     # Answers
 
     def _take_answer(self, place: Place, now: float) -> None:
+        if place.job is not None:
+            place.limit = place.since + self._time_limit(place.job, place.since)  # by the costs known now
         time_limit, seconds = place.limit - place.since, now - place.since
         answer, job = place.poll(now), place.job
         if isinstance(answer, Loaded):

@@ -21,9 +21,13 @@ from mkpc_kaggle.engine.state import State
 from mkpc_kaggle.recipe import Unit
 
 CONNECT_SHARE = 0.1  # of the time after the sweep, for extra pairs
-HANG_FACTOR = 10.0  # a job that takes this many times what was measured hangs
+JOB_SHARE = 0.01  # of the time left, which a job of several units takes at most
+HANG_FACTOR = 30.0  # a job that takes this many times what was measured hangs
 RESERVE_SHARE = 0.2  # of the limit, at most, that is reserved for scenes
 MAX_FAILED_PAIRS = 2  # a unit that was skipped on this many pairs and never ran is skipped on all pairs
+
+PHASES = tuple(Phase)
+SWEEP, CONNECT, DEEPEN, FILL, NEVER = range(5)
 
 Mask = NDArray[np.bool_]
 
@@ -33,7 +37,7 @@ class Plan:
 
     ``order`` is the order in which encodings are cached best. ``workers`` match at the same time. ``reserve``
     seconds at the end belong to estimates and scenes. ``busy`` (N,) are the pairs of jobs under way, ``unusable``
-    (U,) the units that no worker can run.
+    (U,) the units that no worker can run. ``announce`` gets one line for the user, ``explain`` each decision.
     """
 
     def __init__(
@@ -43,9 +47,11 @@ class Plan:
         order: Sequence[int],
         budget: Budget,
         explain: Callable[[str], None],
+        announce: Callable[[str], None],
         minibatch: int = 1,
     ) -> None:
-        self.units, self.state, self.budget, self.explain = tuple(units), state, budget, explain
+        self.units, self.state, self.budget = tuple(units), state, budget
+        self.explain, self.announce = explain, announce
         self.workers, self.reserve, self.minibatch = 1, 0.0, minibatch
         self.busy = np.zeros(len(state.had), bool)
         self._order = np.asarray(order, int)
@@ -57,7 +63,7 @@ class Plan:
         self.losses: Losses[tuple[int, str]] = Losses()
         self.unusable = np.zeros(len(self.units), bool)
         self.phase = Phase.SWEEP
-        self._fitting = len(self.units)
+        self._explained, self._is_announced = "", False
         self._look()
 
     @property
@@ -67,27 +73,24 @@ class Plan:
 
     def next(self, now: float) -> MatchJob | None:
         """Return the next job for an idle worker, without its pairs; ``None`` if nothing can be done now."""
-        for phase in Phase:
-            lacking = self._lacking(phase, now)
-            ready = lacking.any(1) & ~self.busy
-            if ready.any():
-                self._enter(phase, now)
-                return self._job(phase, lacking, ready, now)
-        return None
+        wanted = self._wanted(now)
+        best = np.where(self.busy, NEVER, wanted.min(1))
+        number = int(best.min(initial=NEVER))
+        if number == NEVER:
+            return None
+        self._enter(PHASES[number], now)
+        return self._job(PHASES[number], wanted <= number, best == number, now)
 
     def has_work(self, now: float) -> bool:
-        return any((self._lacking(phase, now).any(1) & ~self.busy).any() for phase in Phase)
+        return bool((self._wanted(now)[~self.busy] < NEVER).any())
 
     def settled(self, now: float) -> Mask:
         """(N,): the pairs that get no further unit before the filling."""
-        waiting = self.busy.copy()
-        for phase in (Phase.SWEEP, Phase.CONNECT, Phase.DEEPEN):
-            waiting |= self._lacking(phase, now).any(1)
-        return ~waiting
+        return np.asarray((self._wanted(now).min(1) >= FILL) & ~self.busy)
 
     def filled(self, now: float) -> Mask:
         """(N,): the pairs that get no further unit."""
-        return self.settled(now) & ~self._lacking(Phase.FILL, now).any(1)
+        return np.asarray((self._wanted(now).min(1) == NEVER) & ~self.busy)
 
     def fit(self, now: float) -> int:
         """Return the length of the longest prefix of the recipe that all rows can have in the time left."""
@@ -95,14 +98,20 @@ class Plan:
         return int(np.searchsorted(self._needed, left, side="right")) if left > 0 else 0
 
     def outlook(self, now: float) -> str:
-        """Say how many of the units fit in the time left."""
-        usable, unknown = (~self.unusable).sum(), sum(not self.costs.is_known(unit.name) for unit in self.units)
+        """Return how long all missing units would take, and how many units fit in the time left."""
+        unknown = sum(not self.costs.is_known(unit.name) for unit in self._usable)
         text = f"all units on all pairs would take {format_duration(self._needed[-1] / self.workers)}"
         text += f", and {unknown} units were not measured yet" if unknown else ""
         if not isfinite(self.stop):
             return f"{text}; there is no time limit"
-        left = format_duration(max(0.0, self.stop - now))
-        return f"{text}; {min(self.fit(now), usable)} of {usable} units fit in the remaining {left}"
+        usable, left = len(self._usable), max(0.0, self.stop - now)
+        return (
+            f"{text}; {min(self.fit(now), usable)} of {usable} units fit in the remaining {format_duration(left)}"
+        )
+
+    @property
+    def _usable(self) -> list[Unit]:
+        return [unit for unit, unusable in zip(self.units, self.unusable, strict=True) if not unusable]
 
     def _look(self) -> None:
         """Derive which units pairs can still get, and the seconds that prefixes of the recipe take."""
@@ -115,19 +124,18 @@ class Plan:
         self._needed = np.cumsum(counts * forecasts)
         self._means = np.array([self.costs.mean(unit.name) for unit in self.units])
 
-    def _lacking(self, phase: Phase, now: float) -> Mask:
-        """(N, U): the units that a phase gives to pairs, and that end in time."""
-        lacking: Mask = self._missing & np.less(self._means, self.stop - now)
-        has_row = self.state.has_row[:, None]
-        if phase in (Phase.SWEEP, Phase.CONNECT):
-            lacking &= np.arange(len(self.units)) == self._first
-        if phase is Phase.CONNECT:
-            return np.asarray(lacking & self._connecting(now)[:, None])
-        if phase is Phase.DEEPEN:
-            lacking &= np.arange(len(self.units)) < self.fit(now)
-        if phase is Phase.FILL:
-            has_row = has_row & self.state.had.any(1, keepdims=True)
-        return np.asarray(lacking & has_row)
+    def _wanted(self, now: float) -> NDArray[np.int_]:
+        """(N, U): the number of the phase in which a pair gets a unit; ``NEVER`` if it would not end in time."""
+        return np.where(self._means < self.stop - now, self._phases(now), NEVER)
+
+    def _phases(self, now: float) -> NDArray[np.int_]:
+        """(N, U): the number of the phase to which a missing unit belongs; ``NEVER`` elsewhere."""
+        phases = np.full(self._missing.shape, NEVER)
+        rows, extra = phases[: self.state.rows], phases[self.state.rows :]
+        rows[:] = np.where(np.arange(len(self.units)) < self.fit(now), DEEPEN, FILL)
+        rows[:, self._first] = SWEEP
+        extra[self._connecting(now), self._first] = CONNECT
+        return np.where(self._missing, phases, NEVER)
 
     @property
     def _first(self) -> int:
@@ -136,14 +144,11 @@ class Plan:
         return next(usable, -1)
 
     def _connecting(self, now: float) -> Mask:
-        """(N,): the extra pairs that a tenth of the time suffices for, the most useful first."""
-        extra: Mask = np.asarray(~self.state.has_row)
+        """(N - rows,): the extra pairs that a tenth of the time suffices for, the most useful first."""
+        had = self.state.had[self.state.rows :, self._first]
         seconds = self.costs.forecast(self.units[self._first].name) / self.workers
-        if not seconds or not extra.any():
-            return extra
-        spent = self.state.had[extra].any(1).sum() * seconds
-        most = CONNECT_SHARE * (max(0.0, self.stop - now) + spent) / seconds
-        return np.asarray(extra & (np.cumsum(extra) <= most))
+        most = CONNECT_SHARE * (max(0.0, self.stop - now) + had.sum() * seconds)
+        return np.asarray(np.arange(1, had.size + 1) * seconds <= most)
 
     def _job(self, phase: Phase, lacking: Mask, ready: Mask, now: float) -> MatchJob:
         """A job for the first pair, or on a GPU for a minibatch of pairs that lack the same units."""
@@ -154,10 +159,11 @@ class Plan:
         numbers = sorted(np.flatnonzero(lacking[first]).tolist(), key=lambda number: self.units[number].stage)
         units = [self.units[number] for number in numbers]
         alone = any((first, unit.name) in self.losses.alone for unit in units)
-        unknown = next((n for n, unit in enumerate(units) if not self.costs.is_known(unit.name)), len(units))
-        units = units[: 1 if alone else unknown + 1]
         alike = order[(lacking[order] == lacking[first]).all(1)]
         indices = tuple(alike[: 1 if alone else self.minibatch].tolist())
+        seconds = [self.costs.mean(unit.name) if self.costs.is_known(unit.name) else inf for unit in units]
+        fits = np.cumsum(seconds) * len(indices) < JOB_SHARE * (self.stop - now)
+        units = units[: 1 if alone else max(1, fits.sum())]
         self.busy[list(indices)] = True
         expected = tuple(self.costs.mean(unit.name) for unit in units)
         return MatchJob(phase, indices, tuple(units), expected, self.stop - now, is_retry=alone)
@@ -175,16 +181,18 @@ class Plan:
         return HANG_FACTOR * expected + self.costs.warm_up(job.units)
 
     def _enter(self, phase: Phase, now: float) -> None:
-        """Explain a change of the phase, and of the units that fit."""
-        if phase != self.phase:
-            if self.phase is Phase.SWEEP:
-                self.explain(f"the sweep is over: {self.outlook(now)}")
-            elif phase is Phase.FILL:
-                self.explain(f"{self.outlook(now)}, which goes to the weakest pairs")
-            self.phase = phase
-        if phase is Phase.DEEPEN and (count := self.fit(now)) != self._fitting:
-            self._fitting = count
-            self.explain(self.outlook(now))
+        """Explain a change of the phase or of the units that fit. Announce once how many fit by measured costs."""
+        self.phase = phase
+        if phase is Phase.SWEEP:
+            return
+        fitting = f"{phase} {self.fit(now) if phase is Phase.DEEPEN else ''}"
+        if fitting != self._explained:
+            self.explain(f"{phase}: {self.outlook(now)}")
+            self._explained = fitting
+        is_measured = all(self.costs.is_known(unit.name) for unit in self._usable)
+        if not self._is_announced and (phase is Phase.FILL or (phase is Phase.DEEPEN and is_measured)):
+            self.announce(self.outlook(now))
+            self._is_announced = True
 
     # Results
 
@@ -231,11 +239,8 @@ class Plan:
 
     def progress(self, now: float) -> tuple[Phase, int, int]:
         """Return the phase, the number of its pairs that are done, and the number of its pairs."""
-        members = (
-            ~self.state.has_row & self._connecting(now) if self.phase is Phase.CONNECT else self.state.has_row
-        )
-        units = {Phase.DEEPEN: slice(self.fit(now)), Phase.FILL: slice(None)}.get(
-            self.phase, slice(self._first, self._first + 1)
-        )
-        lacking = self._missing[members][:, units].any(1)
-        return self.phase, int((~lacking).sum()), int(members.sum())
+        pending = self._phases(now).min(1) <= PHASES.index(self.phase)
+        rows, total = pending[: self.state.rows], self.state.rows
+        if self.phase is Phase.CONNECT:
+            rows, total = pending[self.state.rows :], int(self._connecting(now).sum())
+        return self.phase, total - int(rows.sum()), total

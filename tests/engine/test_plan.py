@@ -52,8 +52,9 @@ def plan_of(
         pairs.had[index, [UNITS.index(unit) for unit in units]] = True
     explanations: list[str] = []
     budget = Budget(0.0, limit, lambda: 0.0)
-    plan = Plan(UNITS, pairs, range(count + extra), budget, explanations.append, minibatch)
-    plan.explanations = explanations
+    announced: list[str] = []
+    plan = Plan(UNITS, pairs, range(count + extra), budget, explanations.append, announced.append, minibatch)
+    plan.explanations, plan.announced = explanations, announced
     return plan
 
 
@@ -148,7 +149,7 @@ def test_a_unit_that_never_ran_is_skipped_on_all_pairs_after_two():
         return DIED
 
     list(jobs_of(plan, fails))
-    assert len(lost) == 5
+    assert len(lost) == 4, "two tries on each of two pairs"
     assert plan.unusable.tolist() == [False, True, False]
     assert plan.is_complete
     assert explained(plan.explanations, f"{SECOND.name} is skipped on all pairs: it never ran")
@@ -177,6 +178,17 @@ def test_a_pair_whose_image_cannot_be_read_gets_no_further_job():
     assert plan.is_complete
 
 
+@pytest.mark.parametrize(
+    ("limit", "fit"), [(math.inf, "there is no time limit"), (120.0, "2 of 3 units fit in the")]
+)
+def test_after_the_sweep_the_user_is_told_once_how_many_units_fit(limit, fit):
+    plan = plan_of(limit=limit)
+    for job in jobs_of(plan):
+        assert not plan.announced or job.phase is not Phase.SWEEP
+    assert [fit in line for line in plan.announced] == [True]
+    assert "not measured" not in plan.announced[0]
+
+
 @pytest.mark.parametrize("reserve", [0.0, 10.0])
 def test_a_unit_begins_only_if_it_ends_before_the_time_reserved_for_scenes(reserve):
     plan = plan_of(3, limit=100.0)
@@ -192,8 +204,8 @@ def test_units_that_do_not_fit_for_all_go_to_the_weakest_pairs_in_the_time_left(
     plan = plan_of(60, limit=100.0)
     jobs = list(jobs_of(plan, inliers=lambda index: index))
     filled = [index for job in jobs if job.phase is Phase.FILL for index in job.indices]
-    assert explained(plan.explanations, "1 of 3 units fit in the remaining")
-    assert explained(plan.explanations, "which goes to the weakest pairs")
+    assert explained(plan.explanations, "deepen: all units on all pairs would take")
+    assert explained(plan.explanations, "fill: all units on all pairs would take")
     assert filled == sorted(filled)
     assert filled[0] < 3
     assert not plan.is_complete

@@ -7,6 +7,7 @@ crash, run out of memory and hang as well.
 
 import math
 import threading
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -14,6 +15,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from mkpc_kaggle.data.competition import Pair
+from mkpc_kaggle.engine import costs, losses, plan, scenes
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.engine import Engine
 from mkpc_kaggle.engine.jobs import (
@@ -51,6 +53,25 @@ SIZE = Size(640, 480)
 MATCHES = 200  # that a unit finds
 POINTS = to_blob(Matches(np.zeros((MATCHES, 2)), np.zeros((MATCHES, 2)), np.zeros(MATCHES)))
 SWEEP_SHARE = 0.7  # of the limit, within which the sweep is said to fit
+
+MECHANISMS: dict[str, tuple[tuple[object, str, object], ...]] = {  # what to change to run without each
+    "reserve for scenes": ((plan, "RESERVE_SHARE", 0.0),),
+    "margin of scenes": ((scenes, "FORECAST_MARGIN", 1.0),),
+    "margin of units": ((costs, "MARGIN", 0.0), (costs, "MIN_MARGIN", 0.0)),
+    "latest costs": ((costs, "WINDOW", 10**9),),
+    "assumed costs": ((costs.Costs, "assume", lambda *_: None),),
+    "short jobs": ((plan, "JOB_SHARE", math.inf),),
+    "connect share": ((plan, "CONNECT_SHARE", 1.0),),
+    "end of patience": ((plan, "HANG_FACTOR", math.inf),),
+    "second try": ((losses, "MAX_TRIES", 1),),
+    "end of tries": ((plan, "MAX_FAILED_PAIRS", 10**9),),
+}
+
+
+def switch_off(mechanism: str, change: Callable[[object, str, object], None] = setattr) -> None:
+    """Run without a mechanism of the plan from now on."""
+    for owner, name, value in MECHANISMS[mechanism]:
+        change(owner, name, value)
 
 
 @dataclass(frozen=True)
@@ -169,8 +190,8 @@ class SimulatedSite(Site):
     Of their seconds until ``stop``, ``kept`` went into jobs that came back in time. ``faults`` are what injected
     faults take whatever is planned: the unit that a crash cut short, of a hang as long as a stall might have
     taken, which it cannot be told from sooner, a stall that was taken for a hang, and the new worker's start
-    after any of these. ``scenes`` are those begun; ``for_scenes`` are the workers' seconds in which nothing else
-    was under way.
+    after any of these. ``scenes`` are those begun; ``for_scenes`` are the seconds in which workers were idle and a
+    scene was under way.
     """
 
     def __init__(self, scenario: Scenario, clock: VirtualClock, stop: float) -> None:
@@ -195,12 +216,13 @@ class SimulatedSite(Site):
         return self.scenes[-1]
 
     def wait(self, until: float) -> None:
-        scenes = [scene for scene in self.scenes if not scene.is_over]
-        moments = [worker.ready for worker in (*self.workers, *self.others, *scenes)]
+        running = [scene for scene in self.scenes if not scene.is_over]
+        moments = [worker.ready for worker in (*self.workers, *self.others, *running)]
         moment = min([until, *moments])
         assert moment < math.inf, "the engine waits for ever"
-        if scenes and not any(worker.job for worker in self.workers):
-            self.for_scenes += len(self.of(Work.MATCH)) * max(0.0, min(moment, self.stop) - self.clock.now)
+        if running:
+            idle = sum(place.is_idle for place in self.of(Work.MATCH))
+            self.for_scenes += idle * max(0.0, min(moment, self.stop) - self.clock.now)
         self.clock.now = max(self.clock.now, moment)
 
     def unit_seconds(self, unit: Unit, now: float) -> float:
@@ -279,13 +301,12 @@ class SimulatedWorker(Simulated):
         found: list[list[Found]] = [[] for _ in job.indices]
         hung = Failure(Cause.TIMED_OUT)
         if site.rng.random() < scenario.job_faults:
-            usual = len(job.indices) * sum(self._site.costs[unit.name] for unit in job.units)
             fate = site.rng.integers(3)
             if fate == 0:
                 return now, Failure(Cause.DIED), 1e-9
             if fate == 1:
-                return now, hung, STALL * usual
-            now += usual
+                return now, hung, sum(self._stall(unit, now) for unit in job.units)
+            now += len(job.indices) * sum(site.costs[unit.name] for unit in job.units)
         for unit in sorted(job.units, key=lambda unit: unit.stage):
             for rows in found:
                 if now + expected[unit] >= deadline:
@@ -299,7 +320,7 @@ class SimulatedWorker(Simulated):
                 if fate < scenario.crashes or unit.matcher == scenario.never:
                     return now + seconds / 2, Failure(Cause.DIED), seconds / 2
                 if fate < scenario.crashes + scenario.hangs:
-                    return now, hung, STALL * usual
+                    return now, hung, self._stall(unit, now)
                 now += seconds
                 rows.append(Found(unit, MATCHES, POINTS, 0.0, seconds, warm_up=warm_up))
         outcomes = []
@@ -307,6 +328,12 @@ class SimulatedWorker(Simulated):
             images = tuple(BatchImage(name, name, SIZE) for name in wanted.names)
             outcomes.append(Outcome(index, images, tuple(rows)))
         return now, tuple(outcomes), 0.0
+
+    def _stall(self, unit: Unit, now: float) -> float:
+        """Return the seconds that a stall of a unit takes on an uncached view, at the costs of this time."""
+        scenario = self._site.scenario
+        drift = scenario.drift if now > scenario.turn * scenario.limit else 1.0
+        return STALL * self._site.costs[unit.name] * max(1.0, scenario.miss_factor) * drift
 
 
 class SimulatedEstimator(Simulated):
@@ -383,8 +410,8 @@ class Ran:
     faults take from any planner (see :class:`SimulatedSite`). Used are
     the seconds of jobs whose results came back in time, warm-ups and stalls included. So idle workers, the end of
     a phase, what a lost job had done before, silence longer than a stall's, a slow unit taken to hang, and what
-    is still under way at the end all count against the engine. Workers' time while nothing but scenes is under way
-    is used.
+    is still under way at the end all count against the engine. A worker that is idle while a scene is under way is
+    used.
 
     ``lost`` counts pairs without the sweep's F where the sweep fits (see :func:`sweep_seconds`), and versions of
     the submission that lack a row. ``missed`` are batches without a scene that no fault befell; ``scenes_fit``
