@@ -1,5 +1,4 @@
 import argparse
-import json
 import pickle
 import re
 import sqlite3
@@ -11,11 +10,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from pair_lists import line_of, line_of_pair, write_list
-from protocol_by_hand import auc, evaluate
+from pair_lists import line_of, write_list
 from rectified import RectifiedMatcher
 from scipy.spatial.transform import Rotation
-from shared import DATA, needs_data
 
 from benchmarks import paper_tables
 from mkpc_kaggle import TwoStageMatcher
@@ -54,69 +51,6 @@ def validate(listed: Path, root: Path, recipe: Path) -> list[str]:
 
 def matches_of(journal: JournalReader, position: int) -> Matches:
     return Matches.concatenate(journal.points(journal.inputs(position).values()).values())
-
-
-OUTDOORS = ["castle_p19", "fountain_p11", "herz_jesus_p8", "reichstag_26"]
-
-
-def sharp(camera: Camera) -> Camera:
-    """The camera with a rotation of all digits: with six, the angle from a trace is wrong by up to 0.1 degrees."""
-    return replace(camera, R=Rotation.from_matrix(camera.R).as_matrix())
-
-
-@needs_data
-@pytest.mark.parametrize(
-    ("scenes", "pairs", "units"),
-    [
-        (["scannet_samples"], 8, [(1, 640)]),
-        (OUTDOORS, 1, [(1, 480), (1, 640), (2, 480)]),
-    ],
-)
-def test_an_independent_evaluation_of_the_same_matches_agrees(scenes, pairs, units, tmp_path):
-    train = DATA / "train"
-    truths = [
-        true for scene in read_train_side(train, scenes=scenes, pairs_per_scene=pairs) for true in scene.pairs
-    ]
-    lines = [
-        line_of_pair(replace(true, camera0=sharp(true.camera0), camera1=sharp(true.camera1)), train)
-        for true in truths
-    ]
-    listed = tmp_path / "list.txt"
-    listed.write_text("\n".join(lines))
-    recipe, out = tmp_path / "recipe.toml", tmp_path / "scores.json"
-    text = ", ".join(f'{{ stage = {stage}, matcher = "sift", long_side = {side} }}' for stage, side in units)
-    recipe.write_text(f"units = [{text}]")
-    command = [*validate(listed, train, recipe), "--protocol", "superglue", "--work-dir", str(tmp_path)]
-    assert main([*command, "--json", str(out)]) == 0
-    scores = json.loads(out.read_text())
-    side = max(side for stage, side in units if stage == 1)
-    expected = []
-    with JournalReader(tmp_path) as journal:
-        for line, true, record in zip(lines, truths, journal.records(), strict=True):
-            matches = matches_of(journal, record.index)
-            keypoints = sum(unit.keypoints for unit in record.units)
-            points = matches.points0.astype(float), matches.points1.astype(float)
-            sizes = [read_image(path).size for path in true.pair.images]
-            expected.append(evaluate(line, points, keypoints, sizes, side))
-            if (R := expected[-1]["R"]) is not None:
-                np.testing.assert_allclose(Rotation.from_rotvec(record.stats.rotation).as_matrix(), R, atol=1e-6)
-                residual = expected[-1]["t"] @ record.pair_fundamental  # t is E's left null vector
-                np.testing.assert_allclose(residual, 0, atol=1e-6)
-    (scene,) = scores["scenes"]
-    for key, own in (
-        ("rotation", "rotation_error_degrees"),
-        ("translation", "translation_error_degrees"),
-        ("precision", "precision"),
-        ("matching_score", "matching_score"),
-    ):
-        found = [np.inf if pair[own] is None else pair[own] for pair in scene["pairs"]]
-        np.testing.assert_allclose(found, [pair[key] for pair in expected], atol=1e-6, err_msg=key)
-        if "error" not in own:
-            assert scores[own] == pytest.approx(np.mean(found), abs=1e-9)
-    errors = [max(pair["rotation"], pair["translation"]) for pair in expected]
-    for limit in (5, 10, 20):
-        assert scores["AUC"][str(limit)] == pytest.approx(auc(errors, limit), abs=1e-6)
-    assert any(np.isfinite(errors))
 
 
 @pytest.mark.parametrize(("side", "width"), [(None, 1600), (1200, 1200), (0, 640)])
