@@ -93,8 +93,6 @@ def test_a_recipe_reads_as_written():
 
 
 def test_unit_names_tell_units_apart():
-    names = {unit.name for unit in (Unit(1, "a", 640), Unit(2, "a", 640), Unit(1, "a", 800), Unit(1, "b", 640))}
-    assert len(names) == 4
     assert Unit(2, "sift", 1280).name == "2:sift@1280"
     assert Unit(2, "dkm", area="540x720").name == "2:dkm@540x720"
     assert Unit(2, "dkm", area="540x720", stretch=True).name == "2:dkm@540x720!"
@@ -119,8 +117,6 @@ def unit(**changes):
         ("colour = 1\n" + SIFT, r"'colour'; known keys: description, units, mkpc, magsac, focal, matchers, scene"),
         (units(unit(longside=640)), r"unit 1.*'longside'.*stage, matcher, long_side, max_matches, area"),
         (SIFT + "[mkpc]\nepsilon = 1\n", r"\[mkpc\].*'epsilon'.*eps, min_samples, share, expand_x"),
-        (SIFT + "[upgrade]\nbelow_inliers = 1\n", "has the unknown key 'upgrade'"),
-        (units(unit(flip="true")), "unit 1 has the unknown key 'flip'"),
         (units(unit(stage=None)), r"unit 1: missing keys 'stage'"),
         ("", "no units"),
         ("units = [", "not valid TOML"),
@@ -128,15 +124,11 @@ def unit(**changes):
         (SIFT + "[mkpc]\nmin_samples = 5.0\n", r"\[mkpc\], key 'min_samples': expected int, got 5.0"),
         (SIFT + '[magsac]\nmethod = "MAGSAC"\n', r"'MAGSAC' is none of 'magsac', 'ransac'"),
         (units(unit(stage="true")), r"key 'stage': expected int, got True"),
-        (units(unit(matcher=7)), r"key 'matcher': expected str, got 7"),
-        (units(unit(tracks=1)), r"expected bool, got 1"),
         ('units = "sift"\n', "units|unit 1"),
-        (SIFT + "mkpc = 3\n", "mkpc"),
         # units
         (units(unit(stage=2)), "so it must have stage 1"),
         (units(unit(), unit(max_matches=9)), "1:sift@640 twice"),
         (units(unit(), unit(matcher='"a"', fallback='"sift"')), "1:sift@640 twice"),
-        (units(unit(), unit(stage=3)), r"unit 2: stage must be in \[1, 2\], not 3"),
         (units(unit(long_side=-9)), r"unit 1: long_side must be in \[0, 99999\]"),
         (units(unit(long_side=None)), "either long_side or area must be given"),
         (units(unit(area='"9x9"')), "and not both"),
@@ -148,8 +140,6 @@ def unit(**changes):
         ],
         # ranges
         (SIFT + "[mkpc]\neps = nan\n", r"table \[mkpc\]: .*eps must be in \[1e-06, inf\), not nan"),
-        (SIFT + "[mkpc]\nshare = 1.1\n", r"share must be in \[0, 1\], not 1.1"),
-        (SIFT + "[mkpc]\nmin_samples = 0\n", r"min_samples must be in \[1, 100\], not 0"),
         (SIFT + "[magsac]\nthreshold = 0\n", r"threshold must be in \(0, inf\), not 0"),
     ],
 )
@@ -158,17 +148,13 @@ def test_a_recipe_that_makes_no_run_is_refused_in_words_that_help(text, says):
         parse(text)
 
 
-@pytest.mark.parametrize(
-    ("text", "says"),
-    [
+def test_options_that_a_matcher_does_not_have_are_refused():
+    for text, says in (
         ("[matchers.sift]\nkeypoints = 1\n", r"\[matchers.sift\].*'keypoints'.*features, ratio, contrast"),
-        ("matchers = 3\n", "matchers"),
         ("[matchers]\nsift = 3\n", "matchers"),
-    ],
-)
-def test_options_that_a_matcher_does_not_have_are_refused(text, says):
-    with pytest.raises(UserError, match=says):
-        options_of(parse(SIFT + text), "sift")
+    ):
+        with pytest.raises(UserError, match=says):
+            options_of(parse(SIFT + text), "sift")
     with pytest.raises(UserError, match=r"unknown matcher 'sitf'; known: .*aliked.*sift"):
         options_of(parse(SIFT), "sitf")
 
@@ -195,27 +181,19 @@ NAMES = ((1, "sift", 640), (2, "sift", 640), (2, "aliked", 800), (1, "aliked", 6
 ALL = Recipe(tuple(Unit(*name) for name in NAMES), name="all", mkpc=MkpcConfig(eps=0.1))
 
 
-def test_the_stage_1_mode_keeps_the_units_of_stage_1():
+def test_modes_keep_stage_1_or_show_every_unit_the_whole_image_and_none_twice():
     assert ALL.in_mode(Mode.TWO_STAGE) is ALL
-    recipe = ALL.in_mode(Mode.STAGE_1)
-    assert [unit.name for unit in recipe.units] == ["1:sift@640", "1:aliked@640"]
-    assert (recipe.name, recipe.mkpc) == ("all (stage-1)", ALL.mkpc)
+    stage_1, whole = ALL.in_mode(Mode.STAGE_1), ALL.in_mode(Mode.WHOLE_IMAGES)
+    assert [unit.name for unit in stage_1.units] == ["1:sift@640", "1:aliked@640"]
+    assert (stage_1.name, stage_1.mkpc) == ("all (stage-1)", ALL.mkpc)
+    assert [unit.name for unit in whole.units] == ["1:sift@640", "1:aliked@800", "1:aliked@640", "1:sift@320"]
 
 
-def test_the_whole_images_mode_shows_every_unit_the_whole_image_and_none_twice():
-    recipe = ALL.in_mode(Mode.WHOLE_IMAGES)
-    assert [unit.name for unit in recipe.units] == ["1:sift@640", "1:aliked@800", "1:aliked@640", "1:sift@320"]
-
-
-@pytest.mark.parametrize(
-    ("text", "recipe", "mode"),
-    [
+def test_a_choice_is_a_recipe_and_perhaps_a_mode():
+    for text, recipe, mode in (
         ("classical", "classical", Mode.TWO_STAGE),
-        ("classical:two-stage", "classical", Mode.TWO_STAGE),
         ("my/own.toml:stage-1", "my/own.toml", Mode.STAGE_1),
         ("C:own.toml", "C:own.toml", Mode.TWO_STAGE),
         (":stage-1", ":stage-1", Mode.TWO_STAGE),
-    ],
-)
-def test_a_choice_is_a_recipe_and_perhaps_a_mode(text, recipe, mode):
-    assert split_mode(text) == (recipe, mode)
+    ):
+        assert split_mode(text) == (recipe, mode)

@@ -4,6 +4,7 @@ import sys
 import threading
 from contextlib import suppress
 from io import StringIO
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -12,7 +13,7 @@ from shared import contents
 
 from mkpc_kaggle.cli import main
 from mkpc_kaggle.data.competition import read_test_side, write_submission
-from mkpc_kaggle.demo import write
+from mkpc_kaggle.demo import DemoSet, write
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
 
 
@@ -36,12 +37,6 @@ def test_a_reader_that_leaves_ends_the_command_quietly():
             [sys.executable, "-m", "mkpc_kaggle", "recipes"], stdout=out, stderr=subprocess.PIPE, check=False
         )
     assert (done.returncode, done.stderr) == (141, b"")
-
-
-@pytest.mark.parametrize("option", ["--test-dir", "--output"])
-def test_a_name_that_is_too_long_is_told(option, demo, capsys):
-    assert main(["submit", "--test-dir", str(demo.test_dir), option, "d" * 5000]) == 2
-    assert "File name too long" in capsys.readouterr().err
 
 
 def test_recipes_are_listed_with_what_they_lack(clean_environment, capsys):
@@ -71,14 +66,11 @@ def test_results_are_not_written_over_inputs_nor_an_export_over_the_journal(demo
 @pytest.mark.parametrize(
     ("command", "message"),
     [
-        ("match x.png y.png --recipe classical --out x", "needs a suffix"),
         ("match x.png y.png --recipe classical --out notes.xyz", "needs a suffix"),
         ("match x.png y.png --recipe classical --out /dev/full", "needs a suffix"),
         ("demo --out users", "users/train is in the way"),
         ("demo --out truth", "truth/test_truth.csv is in the way"),
         ("demo --out x.png", "cannot be written"),
-        ("demo --out x.png/d", "cannot be written"),
-        ("demo --out /proc/d", "cannot be written"),
         ("demo --seed -1 --out d", "--seed: give 0 or more"),
     ],
 )
@@ -109,10 +101,14 @@ def test_check_tells_good_from_bad(demo, tmp_path, capsys):
     assert main(["check", str(path), "--test-dir", str(tmp_path)]) == 2
 
 
-def test_match_prints_f_and_draws_the_pair(demo, small_recipe, tmp_path, capsys):
+def match_arguments(demo: DemoSet, recipe: Path, out: Path) -> list[str]:
     images = sorted((demo.train_dir / "courtyard" / "images").iterdir())[:2]
+    return ["match", *map(str, images), "--recipe", str(recipe), "--out", str(out)]
+
+
+def test_match_prints_f_and_draws_the_pair(demo, small_recipe, tmp_path, capsys):
     figure = tmp_path / "new" / "pair.png"
-    assert main(["match", *map(str, images), "--recipe", str(small_recipe), "--out", str(figure)]) == 0
+    assert main(match_arguments(demo, small_recipe, figure)) == 0
     out = capsys.readouterr().out.splitlines()
     F = np.array([[float(value) for value in line.split()] for line in out[:3]])
     assert np.linalg.norm(F) == pytest.approx(1)
@@ -120,41 +116,21 @@ def test_match_prints_f_and_draws_the_pair(demo, small_recipe, tmp_path, capsys)
     assert cv2.imread(str(figure)).shape[1] > 1000
 
 
-def test_a_missing_image_is_shown_in_letters(clean_environment, capsys):
-    assert main(["match", "a\x1b[2J\n.png", "b.png"]) == 2
-    assert capsys.readouterr().err == r"error: a\x1b[2J\n.png: no such file" + "\n"
-
-
-def test_a_long_text_is_called_long(clean_environment, tmp_path, capsys):
-    (tmp_path / "long.toml").write_bytes(b"#" * (17 << 20))
-    assert main(["match", "a.png", "b.png", "--recipe", "long.toml"]) == 2
-    (tmp_path / "a.png").write_bytes(cv2.imencode(".png", np.zeros((9, 9), np.uint8))[1])
-    assert main(["match", "a.png", "a.png", "--recipe", "long.toml"]) == 2
-    assert "17825792 bytes, at most 16777216 are" in capsys.readouterr().err
-
-
 def test_matplotlib_leaves_nothing_where_home_cannot_be_written(demo, small_recipe, tmp_path):
-    images = sorted((demo.train_dir / "courtyard" / "images").iterdir())[:2]
     (tmp_path / "tmp").mkdir()
     home = {"HOME": "/proc/home", "XDG_CONFIG_HOME": "/proc/home", "TMPDIR": str(tmp_path / "tmp")}
-    command = [*map(str, images), "--recipe", str(small_recipe), "--out", str(tmp_path / "pair.png")]
+    command = [sys.executable, "-m", "mkpc_kaggle", *match_arguments(demo, small_recipe, tmp_path / "pair.png")]
     environment = {name: value for name, value in os.environ.items() if name != "MPLCONFIGDIR"} | home
-    subprocess.run([sys.executable, "-m", "mkpc_kaggle", "match", *command], env=environment, check=True)
+    subprocess.run(command, env=environment, check=True)
     assert list((tmp_path / "tmp").iterdir()) == []
 
 
-def test_match_says_what_it_lacks_and_draws_a_pair_that_has_nothing_in_common(clean_environment, tmp_path, capsys):
+def test_match_draws_a_pair_that_has_nothing_in_common(clean_environment, tmp_path, capsys):
     cv2.imwrite(str(tmp_path / "a.png"), np.full((60, 90, 3), 127, np.uint8))
     match, figure = ["match", *[str(tmp_path / "a.png")] * 2], tmp_path / "pair.png"
     assert main([*match, "--licence", "permissive", "--out", str(figure)]) == 0
     assert "this is the fallback: too few distinct matches" in capsys.readouterr().out
     assert figure.exists()
-    assert main([*match, "--recipe", "classical", "--out", "/dev/null/pair.png"]) == 2
-    assert "cannot be written" in capsys.readouterr().err
-    assert main([*match, "--recipe", "yfcc", "--licence", "permissive"]) == 2
-    assert "superglue (Magic-Leap-noncommercial)" in capsys.readouterr().err
-    assert main(["match", str(tmp_path / "b.png"), match[1]]) == 2
-    assert "b.png: no such file" in capsys.readouterr().err
 
 
 def test_what_a_command_printed_has_been_flushed_when_it_ends_however_long_a_reader_takes(monkeypatch):

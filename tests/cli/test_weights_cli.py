@@ -4,14 +4,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-import torch
-from shared import WEIGHTS, needs_weights
 from web import Site, serve
 from weight_files import DATA, OTHER, digest_of, line, put
 
 from mkpc_kaggle.cli import main
 from mkpc_kaggle.weights import UNVERIFIED, WeightFile, store
-from mkpc_kaggle.weights.manifest import manifest
 
 FILES = (
     line("sift.pt", slot="sift"),
@@ -41,17 +38,12 @@ def test_list_says_what_is_there_and_what_the_missing_would_enable(weights, caps
     assert len(lines) == 4
 
 
-def test_verify_finds_truncated_and_swapped_files(weights, capsys):
+def test_verify_lists_refused_files_and_fails(weights, capsys):
     assert main(["weights", "verify", "--weights", str(put(weights, "b.pt", b"what may be it"))]) == 0
     assert "3 files, 0 refused" in capsys.readouterr().out
-    (weights / "b.pt").unlink()
-    put(weights, "lost.pt", b"los")
     put(weights, "a.pt", DATA)
     assert main(["weights", "verify", "--weights", str(weights)]) == 1
-    lines = capsys.readouterr().out.splitlines()
-    rows = {line.split()[0]: line for line in lines if str(weights / line.split()[0]) in line}
-    assert "truncated" in rows["lost.pt"]
-    assert rows["a.pt"].endswith("it has the bytes of sift.pt")
+    assert "it has the bytes of sift.pt" in capsys.readouterr().out
 
 
 def test_fetch_takes_files_slots_and_recipes(tmp_path, monkeypatch, capsys):
@@ -103,21 +95,3 @@ def test_the_first_download_of_a_file_without_a_digest_is_the_one_that_is_accept
     (out / "b.pt").write_bytes(OTHER)
     with pytest.warns(UserWarning, match="damaged, or another file"):
         assert store.WeightStore([out]).find("aliked-n16") is None
-
-
-def test_convert_prints_the_line_for_the_manifest(tmp_path, capsys):
-    torch.save({"a": torch.zeros(2)}, tmp_path / "x.pt")
-    source, made = str(tmp_path / "x.pt"), str(tmp_path / "x.safetensors")
-    assert main(["weights", "convert", source, "--out", made]) == 0
-    size = (tmp_path / "x.safetensors").stat().st_size
-    assert capsys.readouterr().out.startswith(f"x.safetensors  {size}  sha256:")
-    assert main(["weights", "convert", source, "--out", source]) == 2
-    assert main(["weights", "convert", made, "--out", made]) == 2
-    assert "would be written over the input" in capsys.readouterr().err
-
-
-@needs_weights
-def test_the_shared_checkpoints_are_good(monkeypatch, capsys):
-    monkeypatch.setattr(store, "manifest", manifest)
-    assert main(["weights", "verify", "--weights", str(WEIGHTS)]) == 0
-    assert "3 files, 0 refused" in capsys.readouterr().out

@@ -186,23 +186,6 @@ def test_a_submission_keeps_its_numbers_and_their_order(tmp_path):
     assert (tmp_path / "x.csv").read_bytes() == expected
 
 
-def test_the_former_submission_stays_when_writing_fails(tmp_path, monkeypatch):
-    def full(descriptor):
-        raise OSError(28, "No space left on device")
-
-    path = tmp_path / "submission.csv"
-    write_submission(path, {"a": EYE})
-    before = path.read_bytes()
-    monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(OSError, match="No space"):
-        write_submission(path, {"a": EYE, "b": EYE})
-    assert path.read_bytes() == before
-    monkeypatch.undo()
-    write_submission(path, {"b": EYE})
-    assert list(read_submission(path)) == ["b"]
-    assert list(tmp_path.iterdir()) == [path]
-
-
 @pytest.mark.parametrize(
     ("content", "says"),
     [

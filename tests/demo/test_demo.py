@@ -54,21 +54,6 @@ def upright(left: tuple[float, float], right: tuple[float, float], low: float, h
     return quad((*left, high), (*right, high), (*left, low), texture)
 
 
-def test_a_wall_seen_head_on_is_the_picture_itself():
-    """One texel a pixel, no rotation: any shift by half a pixel shows."""
-    picture = smooth_texture()
-    # Seen from the north, where the sun does not shine.
-    camera = look_at((0, 0, 0), (0, -10, 0), 1000, (256, 200))
-    image, depth = render([upright((2.56, -10), (-2.56, -10), -2.56, 2.56, picture)], camera)
-    expected = picture[156:356, 128:384].astype(np.float64)
-    gain = (image * expected).sum() / (expected**2).sum()
-    error = np.abs(image / gain - expected)
-    assert np.median(error) < 1.5
-    shifted = np.abs(image[:, 1:] / gain - (expected[:, 1:] + expected[:, :-1]) / 2)
-    assert np.median(shifted) > 3 * np.median(error), "the test must be able to see half a pixel"
-    assert np.allclose(depth, 10, atol=1e-4)
-
-
 def test_a_view_warped_by_depth_falls_on_the_other():
     """Image, depth and camera agree to a small part of a pixel; half a pixel would show."""
     texture = smooth_texture()
@@ -129,36 +114,26 @@ def test_fundamental_matrices_fit_points_of_the_rendered_depth(small_demo, world
         inside = (np.abs(second) < 4000).all(axis=1)
         assert inside.any()
         assert (np.abs(offsets) / np.hypot(lines[:, 0], lines[:, 1]))[inside].max() < 0.01
-        # and not with the roles of the two images swapped
-        swapped = first @ F[:2] + F[2]
-        wrong = np.abs((swapped * np.column_stack([second, np.ones(len(second))])).sum(axis=1))
-        assert np.median(wrong / np.hypot(swapped[:, 0], swapped[:, 1])) > 0.5
 
 
 def test_the_test_side_has_covisible_pairs_of_renamed_train_images(small_demo):
     samples, truths = rows(small_demo.test_dir / "test.csv"), rows(small_demo.truth_csv)
-    assert [row["sample_id"] for row in samples] == [row["sample_id"] for row in truths]
-    assert len({row["sample_id"] for row in samples}) == len(samples) == 8 * len(SCENE_NAMES)
-    covisible = {
-        (scene, frozenset(row["pair"].split("-"))): float(row["covisibility"])
-        for scene in SCENE_NAMES
-        for row in rows(small_demo.train_dir / scene / "pair_covisibility.csv")
-    }
-    used = set()
+    assert len({row["sample_id"] for row in samples}) == 8 * len(SCENE_NAMES)
     for row, truth in zip(samples, truths, strict=True):
         batch, *hidden = row["batch_id"], row["image_1_id"], row["image_2_id"]
         names = truth["image_1_id"], truth["image_2_id"]
-        assert row["sample_id"] == f"{truth['scene']};{batch};{'-'.join(hidden)}"
-        assert hidden[0] > hidden[1]
-        assert covisible[truth["scene"], frozenset(names)] >= 0.1
-        used |= {(batch, image) for image in hidden}
+        assert row["sample_id"] == truth["sample_id"] == f"{truth['scene']};{batch};{'-'.join(hidden)}"
+        train = small_demo.train_dir / truth["scene"]
+        pairs = {
+            frozenset(each["pair"].split("-")): each["covisibility"]
+            for each in rows(train / "pair_covisibility.csv")
+        }
+        assert float(pairs[frozenset(names)]) >= 0.1
         for image, name in zip(hidden, names, strict=True):
             png = cv2.imread(str(small_demo.test_dir / "test_images" / batch / f"{image}.png"))
-            jpg = cv2.imread(str(small_demo.train_dir / truth["scene"] / "images" / f"{name}.jpg"))
+            jpg = cv2.imread(str(train / "images" / f"{name}.jpg"))
             assert png.shape == jpg.shape
             assert np.abs(png.astype(int) - jpg).mean() < 6, "the same picture"
-    on_disk = {(path.parent.name, path.stem) for path in (small_demo.test_dir / "test_images").rglob("*.png")}
-    assert on_disk == used
 
 
 def test_same_seed_same_bytes_whatever_the_other_scenes(tmp_path, small_demo):
@@ -167,8 +142,3 @@ def test_same_seed_same_bytes_whatever_the_other_scenes(tmp_path, small_demo):
     assert contents(alone.train_dir / "market") == contents(small_demo.train_dir / "market")
     of_all = contents(small_demo.test_dir / "test_images")
     assert contents(alone.test_dir / "test_images").items() <= of_all.items()
-
-
-def test_bad_arguments_are_refused(tmp_path):
-    with pytest.raises(ValueError, match="known"):
-        write_demo(tmp_path, scenes=["castle"])

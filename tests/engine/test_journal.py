@@ -123,6 +123,7 @@ CHANGES = {
     "pair added": lambda j: want(j, count=4),
     "order": lambda j: want(j, SECOND, SWEEP),
     "content": lambda j: j.save_digest("0.png", "new"),
+    "content of second images": lambda j: j.save_digest("c.png", "new"),
     "more points": lambda j: match(j, 2, SWEEP),
 }
 CURRENT = {  # pairs with all points of before, with a current estimate, and whether the scene is current
@@ -134,6 +135,7 @@ CURRENT = {  # pairs with all points of before, with a current estimate, and whe
     "pair added": (2, 2, True),
     "order": (2, 0, False),
     "content": (1, 1, False),
+    "content of second images": (0, 0, False),
     "more points": (3, 2, False),
 }
 

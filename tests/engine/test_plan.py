@@ -234,6 +234,14 @@ def test_other_devices_try_what_was_skipped():
 # The engine on a virtual clock
 
 
+def test_two_workers_fit_more_units_than_one():
+    plan, fits = plan_of(40, limit=100.0), []
+    finish(plan, MatchJob(Phase.SWEEP, (0,), UNITS, (1.0,) * 3, math.inf))
+    for plan.workers in (1, 2):
+        fits.append(plan.fit(0.0))
+    assert fits[0] < fits[1] == 3
+
+
 def test_more_time_never_means_fewer_units():
     runs = [simulate(Scenario(40, (1.0, 1.0, 1.0), 1, limit, misses=0)) for limit in (40.0, 80.0, 120.0, 999.0)]
     units = [sum(len(record.units) for record in ran.report.records) for ran in runs]

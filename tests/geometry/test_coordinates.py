@@ -58,15 +58,6 @@ def test_there_and_back_is_the_identity(view, seed):
     assert_allclose(view.from_image(view.to_image(points)), points, rtol=0, atol=1e-7)
 
 
-@given(view=views())
-@settings(max_examples=100, deadline=None)
-def test_the_edges_of_the_crop_are_the_edges_of_the_content(view):
-    edges = np.array([[view.crop.left, view.crop.top], [view.crop.right, view.crop.bottom]]) - 0.5
-    found = np.sort(view.from_image(edges), axis=0)
-    expected = [[-0.5, -0.5], [view.content.width - 0.5, view.content.height - 0.5]]
-    assert_allclose(found, expected, rtol=0, atol=1e-9)
-
-
 @given(turns=TURNS, scale=st.sampled_from([1, 2]), seed=st.integers(0, 2**32 - 1))
 @settings(max_examples=50, deadline=None)
 def test_a_turned_view_is_the_view_of_the_turned_picture(turns, scale, seed):
@@ -95,12 +86,6 @@ def test_a_view_keeps_the_aspect_to_the_nearest_pixel_and_pads_to_the_multiple(c
             assert abs(content - max(1, side * scale)) <= 0.5 + 1e-9 * side * scale
             assert padded % multiple == 0
             assert 0 <= padded - content < multiple
-
-
-def test_a_stretched_view_has_the_size_whatever_the_crop_and_is_padded():
-    view = View.stretched(Box(3, 4, 103, 24), size=Size(72, 54), multiple=16)
-    assert (view.content, view.padded) == ((72, 54), (80, 64))
-    assert view.scale == (0.72, 2.7)
 
 
 def test_what_networks_count_otherwise_is_led_to_centres_at_integers():

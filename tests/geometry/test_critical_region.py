@@ -1,6 +1,5 @@
 """The critical region: the paper's Algorithm 1 and Crop Area Expansion, to the letter."""
 
-from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -101,17 +100,6 @@ def test_the_box_grows_about_its_centre_and_holds_the_pixels_that_the_points_lie
     assert expand_box(points[:, ::-1], SQUARE, 1.0, 1.05) == Box(300, 195, 332, 405)
     # 101 columns grow by 2.525 on either side: edges are rounded outwards
     assert expand_box(np.array([(200, 300), (300, 331)], np.float32), SQUARE, 1.05, 1.0) == Box(197, 300, 304, 332)
-
-
-def test_the_box_is_cut_at_the_border_and_loses_nothing_on_the_last_row_and_column():
-    size = Size(640, 480)
-    corners = np.array([(0, 0), (639, 479)], np.float32)
-    assert expand_box(corners, size, 1.05, 1.05) == Box(0, 0, 640, 480)
-    edge = np.nextafter(np.array([(639.5, 479.5)], np.float32), np.float32(0))
-    right = region(block(610, 450, 639, 479, 30), edge, size=size, config=replace(PAPER, min_side=1))
-    assert (right.box.right, right.box.bottom) == (640, 480)
-    assert right.box.left == 609  # 30 columns expanded by a twentieth about their centre, not about the cut box's
-    assert right.box.contains(edge).all()
 
 
 def test_points_that_are_not_finite_or_not_on_the_image_are_ignored():

@@ -1,7 +1,5 @@
 """F under a prior on focal lengths: nearer to the truth than MAGSAC alone, and always a value with its reason."""
 
-from concurrent.futures import ThreadPoolExecutor
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -137,17 +135,6 @@ def test_degenerate_matches_end_in_a_value(name):
     assert_is_a_value(result, len(matches))
     assert ("too few distinct matches" in result.failure) == (name in ("five", "none"))
     assert name != "six" or (result.ok and result.magsac is None)
-
-
-def test_repetitions_and_what_is_not_finite_change_nothing():
-    matches = seen(CAMERAS, 80, 0.1, 20)
-    bad = Matches(np.full((9, 2), np.nan), np.full((9, 2), 1.0), np.ones(9))
-    more = with_prior(Matches.concatenate([matches, matches, bad]))
-    with ThreadPoolExecutor(2) as threads:  # the same bytes in threads, too
-        once, again = threads.map(with_prior, [matches, matches])
-    assert_array_equal(again.matrix, once.matrix)
-    assert_array_equal(more.matrix, once.matrix)
-    assert_array_equal(more.inliers, np.concatenate([once.inliers, once.inliers, np.zeros(9, bool)]))
 
 
 @given(data=st.data(), n=st.integers(0, 24))

@@ -157,14 +157,6 @@ def test_fewer_matches_than_a_model_needs_give_the_fallback_and_so_many_give_the
 
 
 @pytest.mark.parametrize("model", ModelKind)
-def test_points_that_say_nothing_give_the_fallback(model):
-    same = Matches(np.full((30, 2), 5.5), np.full((30, 2), 9.25), np.ones(30))
-    nothing = Matches(np.full((30, 2), np.nan), seen(0, 30).points1, np.ones(30))
-    for matches in (same, nothing, seen(0, 4)[np.tile(np.arange(4), 25)]):
-        assert_fallback(estimated(model, matches), model, len(matches))
-
-
-@pytest.mark.parametrize("model", ModelKind)
 def test_repetitions_are_inliers_like_the_first_and_what_is_not_finite_is_set_aside(model):
     matches, truth = scene(1, plane=model is ModelKind.H)
     clean = estimated(model, matches, seed=1)

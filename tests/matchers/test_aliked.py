@@ -8,7 +8,7 @@ from sklearn.datasets import load_sample_image
 from standin import STAND_INS, scene, standin_state
 
 from mkpc_kaggle.matchers.contract import Placement
-from mkpc_kaggle.matchers.networks.aliked import Aliked, own_name, strict_maxima
+from mkpc_kaggle.matchers.networks.aliked import Aliked, own_name
 from mkpc_kaggle.matchers.networks.placement import prepared
 from mkpc_kaggle.weights import load_tensors
 
@@ -57,12 +57,3 @@ def test_it_finds_what_kornias_finds_with_the_published_weights():
     ours, theirs = both(load_tensors(WEIGHTS / "aliked-n16.safetensors"), 1000)
     photograph = image_of(load_sample_image("china.jpg")[:256, :320])
     assert_alike(ours(photograph)[0], theirs(photograph)[0])
-
-
-def test_maxima_are_strict_inner_and_the_best_come_first():
-    scores = torch.zeros(12, 15)
-    scores[3, 4], scores[8, 9], scores[1, 12] = 0.5, 0.9, 0.95  # the last lies in the border
-    scores[8, 2], scores[8, 3] = 0.7, 0.7  # a tie
-    scores[5, 4] = 0.4  # beside a stronger maximum
-    assert strict_maxima(scores, 10).tolist() == [8 * 15 + 9, 3 * 15 + 4]
-    assert strict_maxima(scores, 1).tolist() == [8 * 15 + 9]

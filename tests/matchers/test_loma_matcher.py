@@ -45,20 +45,6 @@ class Holding(WeightStore):
         return self.tensors
 
 
-def test_a_shifted_picture_is_matched_by_its_shift(store):
-    """A square, so that the descriptor sees the same shift: stand-in weights know only shifts of whole cells."""
-    options = LomaOptions(Variant.B128, max_keypoints=300, descriptor_scale=1.0)
-    matcher = loma.load(store, options, Placement())
-    whole = scene(176, 184, channels=3)
-    first, second = matcher.encode([as_picture(whole[:168, 16:]), as_picture(whole[8:, :168])])
-    (matches,) = matcher.match([first], [second])
-    offsets = matches.points1 - matches.points0
-    good = np.abs(offsets - (16, -8)).max(axis=1) < 1.5
-    assert good.sum() >= 20
-    assert good.mean() > 0.8
-    assert np.abs(np.median(offsets[good], axis=0) - (16, -8)).max() < 0.2
-
-
 def test_keypoints_are_where_the_detector_saw_them(matcher):
     """A dot stays in its place when the detector's picture has other sides than the view."""
     pixels = np.full((101, 135, 3), 90, np.uint8)

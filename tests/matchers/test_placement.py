@@ -4,8 +4,7 @@ import pytest
 import torch
 from torch import nn
 
-from mkpc_kaggle.matchers.contract import Placement, Precision
-from mkpc_kaggle.matchers.networks.layers import Linear
+from mkpc_kaggle.matchers.contract import Placement
 from mkpc_kaggle.matchers.networks.placement import prepared
 
 
@@ -22,15 +21,3 @@ def test_a_norm_goes_into_the_convolution_before_it(bias):
     found = prepared(network, Placement())(x)
     assert not any(isinstance(module, nn.BatchNorm2d) for module in network.modules())
     torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-5)
-
-
-@torch.inference_mode()
-def test_half_precision_is_that_of_the_weights():
-    torch.manual_seed(3)
-    network = nn.Sequential(Linear(8, 8), nn.LayerNorm(8))
-    x = torch.randn(5, 8)
-    expected = network(x)
-    found = prepared(network, Placement(precision=Precision.BFLOAT16))(x)
-    assert network[0].weight.dtype == torch.bfloat16 and network[1].weight.dtype == torch.float32
-    assert found.dtype == torch.float32
-    assert 0 < (found - expected).abs().max() < 0.1

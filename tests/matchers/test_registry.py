@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from sklearn.datasets import load_sample_image
 
-from mkpc_kaggle import Recipe, TwoStageMatcher, matchers
+from mkpc_kaggle import Recipe, TwoStageMatcher
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.matchers import adapters
 from mkpc_kaggle.matchers.registry import matcher_names, spec_of
@@ -55,14 +55,6 @@ def test_a_broken_matcher_is_told_with_its_reason_and_costs_no_other(more_matche
     with pytest.raises(UserError, match=r"my recipe: matcher broken cannot be used here \(ImportError: .*no_such"):
         spec_of("broken", "my recipe")
     assert spec_of("sift", "test").name == "sift"
-
-
-def test_what_matchers_share_is_no_matcher() -> None:
-    shared = {path.stem for path in Path(matchers.__file__).parent.glob("*.py")}
-    assert {"contract", "registry", "sparse"} <= shared
-    assert not shared & set(matcher_names())
-    with pytest.raises(UserError, match="unknown matcher 'sparse'; known: aliked, "):
-        spec_of("sparse", "test")
 
 
 def test_without_kornia_its_matchers_alone_are_lost(clean_environment: None) -> None:

@@ -1,8 +1,6 @@
 """LoFTR, QuadTree and ASpanFormer: properties of the networks, and the matchers from public checkpoints."""
 
-from functools import partial
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -11,18 +9,14 @@ import torch
 from checkpoints import PublicFile, store_of, wrapped
 from light_matchers import MATCHERS
 from pictures import picture
-from torch import nn
 
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.matchers.adapters import aspanformer, loftr, quadtree
-from mkpc_kaggle.matchers.contract import Placement, Training
+from mkpc_kaggle.matchers.adapters import loftr
+from mkpc_kaggle.matchers.contract import Placement
 from mkpc_kaggle.matchers.networks.adaptive_span import CELLS_AT_ONCE, span_attention
-from mkpc_kaggle.matchers.networks.aspanformer import AspanFormer
 from mkpc_kaggle.matchers.networks.coarse_matching import coarse_matches
 from mkpc_kaggle.matchers.networks.grids import as_map, to_2x2_blocks
 from mkpc_kaggle.matchers.networks.loftr import Loftr
-from mkpc_kaggle.matchers.networks.position import FIXED_DECAY
-from mkpc_kaggle.matchers.networks.quadtree import Quadtree
 
 
 @pytest.mark.parametrize("held", [0, 2**20])
@@ -62,37 +56,13 @@ def test_span_attention_is_that_of_sampled_keys(monkeypatch):
         torch.testing.assert_close(span_attention(q, k, v, samples, 2, mask), expected, rtol=1e-4, atol=1e-5)
 
 
-MODULES: list[tuple[ModuleType, type[nn.Module]]] = [
-    (loftr, Loftr),
-    (quadtree, Quadtree),
-    (aspanformer, AspanFormer),
-]
-
-
-def load_standin(
-    module: ModuleType, network: type[nn.Module], directory: Path, training: Training, **options: Any
-) -> Any:
-    """Return the matcher with stand-in weights for this training alone."""
-    name, surplus = module.SPEC.name, options.pop("surplus", {})
-    layout = partial(lambda more, state: wrapped(state | more), surplus)
-    store = store_of(directory, [PublicFile("x.ckpt", name, f"{name}-{training}", name, network, layout)])
-    return module.load(store, module.SPEC.options(threshold=0.0, training=training, **options), Placement())
-
-
-def test_indoor_weights_come_with_their_settings(tmp_path: Path) -> None:
-    of_loftr, of_quadtree, of_aspanformer = (
-        load_standin(*kind, tmp_path, Training.INDOOR)._network for kind in MODULES
-    )
-    assert (of_loftr.border, of_loftr.decay) == (0, FIXED_DECAY)
-    assert of_quadtree.loftr_coarse.layers[0].attn.topks == (32, 16)
-    # Of the published size, so that positions are neither stretched nor shrunk.
-    assert (of_aspanformer.border, of_aspanformer.position_scale(60, 80)) == (0, (1, 1))
-
-
 def test_weights_with_optimal_transport_are_refused_with_what_to_take_instead(tmp_path: Path) -> None:
-    surplus = {"coarse_matching.bin_score": torch.ones(())}
+    def with_bin_score(state: dict[str, torch.Tensor]) -> dict[str, Any]:
+        return wrapped(state | {"coarse_matching.bin_score": torch.ones(())})
+
+    store = store_of(tmp_path, [PublicFile("x.ckpt", "loftr", "loftr-outdoor", "loftr", Loftr, with_bin_score)])
     with pytest.raises(UserError, match=r"'loftr-outdoor' match by optimal transport.*outdoor_ds"):
-        load_standin(loftr, Loftr, tmp_path, Training.OUTDOOR, surplus=surplus)
+        loftr.load(store, loftr.SPEC.options(), Placement())
 
 
 @pytest.mark.parametrize("name", ["loftr", "quadtree", "aspanformer"])

@@ -6,10 +6,10 @@ from pathlib import Path
 import nbformat
 import pandas as pd
 import pytest
-from kaggle_image import IMAGES, environment, install_image, make_image, python_version, upload
+from kaggle_image import environment, make_image, python_version, upload
 from offline_notebook import execute, needs_namespaces, pictures, printed
 from packaging.requirements import Requirement
-from shared import DATA, WEIGHTS, needs_data, needs_weights
+from shared import DATA, WEIGHTS
 
 from mkpc_kaggle.data.competition import read_test_side, submission_problems
 from mkpc_kaggle.package import Request, make_package
@@ -27,7 +27,7 @@ def image(tmp_path_factory: pytest.TempPathFactory) -> Path:
 class Kaggle:
     """A copy of Kaggle's directories: ``input`` with the competition and our dataset, and ``working``."""
 
-    def __init__(self, root: Path, image: Path, wheels: Path | None) -> None:
+    def __init__(self, root: Path, image: Path, wheels: Path) -> None:
         self.root = root
         self.image = image
         self._wheels = wheels
@@ -43,8 +43,7 @@ class Kaggle:
         (self.test_dir / "test_images").symlink_to(test_dir / "test_images")
 
     def add_dataset(self, packaged: Path, weights: tuple[Path, ...] = ()) -> None:
-        pythons = (python_version(),) if self._wheels else PYTHONS
-        make_package(Request(packaged, "someone", weights, pythons, self._wheels))
+        make_package(Request(packaged, "someone", weights, (python_version(),), self._wheels))
         upload(packaged / "dataset", self.dataset)
         self.notebook = packaged / "kernel" / "submission.ipynb"
 
@@ -72,13 +71,21 @@ def kaggle(tmp_path: Path, image: Path, wheels: Path) -> Kaggle:
     return Kaggle(tmp_path / "kaggle", image, wheels)
 
 
-@pytest.mark.parametrize("image", IMAGES, ids=str)
-def test_every_image_has_what_the_package_takes_from_it(image):
+VERSIONS = "opencv-python-headless=={} scikit-learn==1.6.1 pandas==2.2.3 scipy==1.15.3 torch=={} numpy=={}"
+IMAGES = [  # of Kaggle's: Python, OpenCV, torch, NumPy
+    ("3.11", "4.11.0.86", "2.6.0", "1.26.4"),
+    ("3.12", "4.13.0.92", "2.11.0", "2.0.2"),
+    ("3.13", "5.0.0.93", "2.11.0", "2.1.3"),
+]
+
+
+@pytest.mark.parametrize(("python", "opencv", "torch", "numpy"), IMAGES)
+def test_every_image_has_what_the_package_takes_from_it(python, opencv, torch, numpy):
     project = tomllib.loads((NOTEBOOKS[0].parents[1] / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     taken = {need.name: need for need in map(Requirement, project["dependencies"])}
-    for name, _, version in (pin.partition("==") for pin in image.versions):
-        assert name not in taken or version in taken[name].specifier, name
-    assert image.python in PYTHONS
+    for name, _, version in (pin.partition("==") for pin in VERSIONS.format(opencv, torch, numpy).split()):
+        assert version in taken[name].specifier, name
+    assert python in PYTHONS
 
 
 @needs_namespaces
@@ -95,8 +102,6 @@ def test_a_commit_run_without_network_leaves_a_submission_and_shows_pairs(kaggle
     printed = kaggle.run()
     assert f"not taken    {other} (version 0.0.9)" in printed
     assert "left out, no weights: loma, superglue, loftr" in printed
-    before, _, _ = printed.partition("sweep: ")
-    assert len(before.splitlines()) <= 45 - 24, "one screen, were there all 27 weights"
     assert kaggle.problems() == []
     assert "good: 2 rows" in printed
     assert "recipe auto" in printed
@@ -108,24 +113,8 @@ def test_a_commit_run_without_network_leaves_a_submission_and_shows_pairs(kaggle
     assert not list(kaggle.working.rglob("journal*")), "what lies here is published"
     assert kaggle.figures() == 1 + 2, "the budget and the pairs"
     if WEIGHTS.is_dir():
-        assert_all_weights_are_used(printed)
-
-
-def assert_all_weights_are_used(printed: str) -> None:
-    assert "3 files, 0 refused, 0 missing" in printed
-    assert "1:xfeat_lighterglue@1024 " in printed
-    assert "1:aliked@1024 " in printed
-
-
-@needs_namespaces
-@needs_weights
-def test_the_notebook_stops_where_a_packaged_weight_did_not_arrive(kaggle, demo, tmp_path):
-    kaggle.add_test_side(demo.test_dir, pairs=1)
-    kaggle.add_dataset(tmp_path / "package", (WEIGHTS,))
-    (kaggle.dataset / "aliked-n16.safetensors").unlink()
-    with pytest.raises(AssertionError, match="weights of the dataset are missing or damaged"):
-        kaggle.run()
-    assert "missing" in printed(nbformat.read(kaggle.executed, as_version=4))
+        for told in ("3 files, 0 refused, 0 missing", "1:xfeat_lighterglue@1024 ", "1:aliked@1024 "):
+            assert told in printed
 
 
 @needs_namespaces
@@ -146,44 +135,18 @@ def test_a_failed_run_fails_the_notebook_after_its_figures_but_not_the_hidden_re
 
 
 @needs_namespaces
-@pytest.mark.parametrize("is_missing", [True, False])
-def test_what_pip_says_is_told_and_the_advice_only_where_no_wheel_fits(kaggle, demo, tmp_path, is_missing):
+def test_what_pip_says_is_stated_with_the_advice_where_no_wheel_fits(kaggle, demo, tmp_path):
     kaggle.add_test_side(demo.test_dir, pairs=1)
     kaggle.add_dataset(tmp_path / "package")
     kaggle.image = make_image(tmp_path / "image")  # other tests have installed into the shared image
     (wheel,) = kaggle.dataset.glob("pycolmap-*.whl")
-    if is_missing:
-        wheel.rename(wheel.with_name("pycolmap-4.2.1-cp27-cp27m-manylinux_2_28_x86_64.whl"))
-    else:
-        wheel.write_bytes(b"cut off")
-    with pytest.raises(AssertionError) as stopped:
+    wheel.rename(wheel.with_name("pycolmap-4.2.1-cp27-cp27m-manylinux_2_28_x86_64.whl"))
+    with pytest.raises(AssertionError, match="ERROR: ") as stopped:
         kaggle.run()
-    assert "ERROR: " in str(stopped.value)
-    advice = (
-        f"no wheel of pycolmap is for Python {python_version()}: package again with --python {python_version()}"
+    python = python_version()
+    assert f"no wheel of pycolmap is for Python {python}: package again with --python {python}" in str(
+        stopped.value
     )
-    assert (advice in str(stopped.value)) == is_missing
-
-
-@needs_namespaces
-@needs_data
-@needs_weights
-@pytest.mark.slow
-@pytest.mark.timeout(7200)
-@pytest.mark.parametrize("image", IMAGES, ids=str)
-def test_the_notebook_runs_on_an_image_of_kaggles_versions(image, tmp_path, request):
-    """As the README's commands make it, wheels from the index included."""
-    directory = request.config.cache.mkdir("kaggle_images") / str(image)
-    python = install_image(image, directory)
-    if python is None:
-        pytest.skip(f"no Python {image.python} on PATH, or pip reaches no index from here")
-    kaggle = Kaggle(tmp_path / "kaggle", python, wheels=None)
-    kaggle.add_test_side(DATA / "test", pairs=3)
-    kaggle.add_dataset(tmp_path / "package", (WEIGHTS,))
-    printed = kaggle.run()
-    assert kaggle.problems() == []
-    assert f"Python {image.python}" in printed
-    assert_all_weights_are_used(printed)
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)

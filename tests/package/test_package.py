@@ -20,10 +20,9 @@ from mkpc_kaggle import __version__
 from mkpc_kaggle.cli import main
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.package import Package, Request, find_checkout, make_package
-from mkpc_kaggle.package import package as module
 from mkpc_kaggle.package.files import licence_text
-from mkpc_kaggle.package.wheels import BUNDLED, PYTHONS, build_wheel, install_lines, pins
-from mkpc_kaggle.weights import WeightStore, load_tensors, store
+from mkpc_kaggle.package.wheels import BUNDLED, build_wheel, install_lines, pins
+from mkpc_kaggle.weights import load_tensors, store
 from mkpc_kaggle.weights.manifest import read_manifest
 
 
@@ -110,27 +109,13 @@ def test_weights_survive_the_upload_and_are_held_against_the_datasets_manifest(o
     data = (mount / "free.pt.safetensors").read_bytes()
     assert (told.name, told.size, told.digest) == ("free.pt.safetensors", len(data), digest_of(data))
     assert (told.licence, told.slot) == ("MIT", "free")
-    found = WeightStore([tmp_path / "input"]).find("free")
-    assert found is not None
-    assert (found.state, found.path) == ("good", mount / "free.pt.safetensors")
     verify = ["weights", "verify", "--weights", str(tmp_path / "input")]
     verify += ["--manifest", str(mount / "weights_manifest.txt")]
     assert main(verify) == 0
     assert "1 files, 0 refused, 0 missing" in capsys.readouterr().out
-    (mount / "free.pt.safetensors").write_bytes(data[:-1])
-    assert main(verify) == 1
-    assert "truncated" in capsys.readouterr().out
     (mount / "free.pt.safetensors").unlink()
     assert main(verify) == 1
     assert "missing" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize("image", ["original", f"gcr.io/kaggle/python@sha256:{'0a' * 32}"])
-def test_the_image_is_the_first_or_one_by_its_digest(wanted, image):
-    make_package(replace(wanted, image=image))
-    _, kernel = metadata_of(wanted.out)
-    assert kernel["docker_image_pinning_type"] == "original"
-    assert kernel.get("docker_image", "") == (image if "@" in image else "")
 
 
 def test_what_the_image_has_is_used_where_it_satisfies_even_without_a_wheel_for_its_python(out, tmp_path):
@@ -162,25 +147,13 @@ def test_the_kernel_runs_on_a_gpu_without_internet_on_the_competition_and_the_da
 
 def test_the_same_request_gives_the_same_bytes_and_leaves_files_alone(wanted, tmp_path):
     make_package(wanted)
-    former = {path: path.stat().st_mtime_ns for path in wanted.out.rglob("*")}
+    former = {path: path.stat().st_mtime_ns for path in wanted.out.rglob("*") if path.is_file()}
     (wanted.out / "dataset" / "free.pt.safetensors").write_bytes(b"broken off")
     make_package(wanted)
-    kept = [path for path, modified in former.items() if path.is_file() and path.stat().st_mtime_ns == modified]
-    assert {path.name for path in former if path.is_file()} - {path.name for path in kept} == {
-        "free.pt.safetensors"
-    }
+    written = [path.name for path, modified in former.items() if path.stat().st_mtime_ns != modified]
+    assert written == ["free.pt.safetensors"]
     make_package(replace(wanted, out=tmp_path / "again"))
     assert contents(tmp_path / "again") == contents(wanted.out)
-
-
-def test_a_link_planted_at_the_name_of_an_unfinished_file_is_not_followed(wanted, tmp_path):
-    outside = put(tmp_path / "outside", "precious", b"precious") / "precious"
-    (wanted.out / "dataset").mkdir(parents=True)
-    (wanted.out / "dataset" / ".LICENSE.part").symlink_to(outside)
-    make_package(wanted)
-    assert outside.read_bytes() == b"precious"
-    assert not (wanted.out / "dataset" / ".LICENSE.part").is_symlink()
-    assert not (wanted.out / "dataset" / "LICENSE").is_symlink()
 
 
 def test_a_private_package_has_all_weights_and_a_public_one_refuses_to_be_laid_over_it(wanted, capsys):
@@ -218,12 +191,6 @@ def test_bad_requests_are_refused_before_anything_is_written(wanted, tmp_path):
     assert not wanted.out.exists()
 
 
-def test_without_sources_it_says_that_a_checkout_is_needed(wanted, monkeypatch, tmp_path):
-    monkeypatch.setattr(module, "__file__", str(tmp_path / "site-packages/mkpc_kaggle/package/package.py"))
-    with pytest.raises(UserError, match="clone the repository"):
-        make_package(wanted)
-
-
 def test_the_wheel_holds_what_a_run_needs_and_asks_for_what_is_bundled(tmp_path, wheels):
     wheel = build_wheel(find_checkout(), tmp_path)
     asked = [line.replace("_", "-").partition(">=")[0] for line in install_lines(wheel, wheels.iterdir())]
@@ -236,17 +203,3 @@ def test_the_wheel_holds_what_a_run_needs_and_asks_for_what_is_bundled(tmp_path,
     names = ZipFile(wheel).namelist()
     assert {"mkpc_kaggle/weights_manifest.txt", "mkpc_kaggle/recipes/auto.toml"} <= set(names)
     assert not [name for name in names if name.startswith(("tests/", "notebooks/"))]
-
-
-@pytest.mark.slow
-def test_wheels_come_from_the_index_for_all_pythons(wanted, tmp_path):
-    probe = [sys.executable, "-m", "pip", "download", "--quiet", "--no-deps", "--dest", str(tmp_path / "probe")]
-    if subprocess.run([*probe, pins(find_checkout())[0]], check=False, capture_output=True).returncode != 0:
-        pytest.skip("pip reaches no index from here")
-    request = replace(wanted, wheels=None, pythons=PYTHONS)
-    make_package(request)
-    names = [path.name for path in (request.out / "dataset").glob("kornia_rs-*.whl")]
-    assert sorted(name.split("-")[2] for name in names) == ["cp311", "cp312", "cp313", "cp314"]
-    written = contents(request.out)
-    make_package(request)
-    assert contents(request.out) == written

@@ -3,13 +3,12 @@
 from dataclasses import dataclass, replace
 
 import pytest
-import torch
 from shared import WEIGHTS, needs_weights
 from weight_files import digest_of
 
 from mkpc_kaggle.engine.settings import Settings
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.matchers.contract import MatcherSpec, Placement
+from mkpc_kaggle.matchers.contract import MatcherSpec
 from mkpc_kaggle.pipeline.assembly import assemble
 from mkpc_kaggle.pipeline.availability import Licence
 from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher
@@ -33,16 +32,7 @@ def own(*licences):
 
 
 @pytest.mark.parametrize(
-    "wrong",
-    [
-        {"recipe": None},
-        {"recipe": 5},
-        {"recipe": {}},
-        {"device": 0},
-        {"matchers": [1]},
-        {"matchers": {"own": object()}},
-        {"matchers": {"own": None}},
-    ],
+    "wrong", [{"recipe": 5}, {"device": 0}, {"matchers": [1]}, {"matchers": {"own": object()}}]
 )
 def test_what_is_of_a_wrong_type_is_named(wrong):
     with pytest.raises(TypeError, match=r"(recipe|device|matcher).* not |has no `spec`"):
@@ -124,11 +114,10 @@ def test_a_fallback_stands_in_for_a_matcher_whose_weights_are_not_permitted_or_n
     assert assemble(recipe, weights=[known_files]).recipe == some.recipe
 
 
-@pytest.mark.parametrize("recipe", ["imc2022", load_recipe("scannet")])
-def test_a_permissive_run_refuses_a_recipe_by_matcher_and_licence_and_says_what_to_do(recipe):
+def test_a_permissive_run_refuses_a_recipe_by_matcher_and_licence_and_says_what_to_do():
     says = r"permissive refuses recipe '\w+' .*superglue \(Magic-Leap-noncommercial\).*recipe auto"
     with pytest.raises(UserError, match=says):
-        TwoStageMatcher(recipe, licence="permissive")
+        TwoStageMatcher("imc2022", licence="permissive")
 
 
 def test_the_licence_of_the_file_counts_too(known_files):
@@ -156,13 +145,6 @@ def test_recipe_auto_passes_damaged_weights_over(tmp_path, name):
     with pytest.warns(UserWarning, match=rf"(passed over|does without dkm): .*{name}"):
         assembly = assemble("auto", weights=[tmp_path])
     assert not {"dkm", "xfeat_lighterglue"} & set(assembly.recipe.matcher_names)
-
-
-@pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a GPU")
-def test_a_gpu_that_is_not_there_is_refused_and_auto_takes_the_cpu():
-    with pytest.raises(UserError, match=r"cuda:0.*no GPU.*--device cpu"):
-        assemble("classical", device="cuda:0")
-    assert assemble("classical").placement == Placement()
 
 
 def test_a_units_digest_has_all_that_decides_its_points():

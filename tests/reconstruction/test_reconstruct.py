@@ -30,7 +30,6 @@ from mkpc_kaggle.data import images
 from mkpc_kaggle.data.images import TURNS, Image, Unreadable, read_image
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.records import CameraRecord
-from mkpc_kaggle.engine.request import Ending
 from mkpc_kaggle.engine.session import Interrupt, Session
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.matches import Matches
@@ -51,9 +50,6 @@ FIRST, SECOND, OTHERS = 6, 4, 1  # images of two scenes, and of none
 class MixedMatcher(SyntheticMatcher):
     """Two scenes, and images of neither; between what has nothing in common it finds a few wrong matches."""
 
-    interrupt: Interrupt | None = None
-    after: int = 0
-
     @cached_property
     def scenes(self) -> tuple[SyntheticScene, SyntheticScene]:
         return synthetic_scene(FIRST, points=500), synthetic_scene(SECOND, points=500, seed=7)
@@ -61,8 +57,6 @@ class MixedMatcher(SyntheticMatcher):
     def _match(self, seen0: Seen, seen1: Seen) -> Matches:
         first, second = number_of(seen0), number_of(seen1)
         self.calls.append((first, second))
-        if self.interrupt is not None and len(self.calls) == self.after:
-            self.interrupt.set()
         for scene, start, count in ((self.scenes[0], 0, FIRST), (self.scenes[1], FIRST, SECOND)):
             if start <= first < second < start + count:
                 names = [f"{first - start:04}", f"{second - start:04}"]
@@ -79,13 +73,10 @@ def write_flat(folder: Path, count: int = FIRST + SECOND + OTHERS) -> Path:
     return folder
 
 
-def run(
-    root: Path, out: Path, matcher: SyntheticMatcher | None = None, *, fresh: bool = False, **options: object
-) -> FolderResult:
+def run(root: Path, out: Path, matcher: SyntheticMatcher | None = None, **options: object) -> FolderResult:
     matcher = matcher or MixedMatcher()
-    interrupt = getattr(matcher, "interrupt", None) or Interrupt()
     budget = Budget(time.monotonic(), float("inf"))
-    session = Session(out / "work", budget, interrupt, fresh, progress=False, workers=0)
+    session = Session(out / "work", budget, Interrupt(), progress=False, workers=0)
     assembly = assemble(RECIPE, matchers={"synthetic": matcher}, device="cpu")
     return reconstruct_folder(root, read_folder(root), assembly, session, out, **options)  # type: ignore[arg-type]
 
@@ -139,20 +130,6 @@ def test_the_cameras_are_those_of_the_models_and_right(mixed):
         assert [0 < sigma < most for (sigma,), most in zip(sigmas, (0.3, 0.03, 2), strict=True)] == [True] * 3
 
 
-def test_colmap_goes_on_from_the_database(mixed, tmp_path):
-    out, _ = mixed
-    with pycolmap.Database.open(str(out / "database.db")) as database:
-        assert [image.name for image in database.read_all_images()] == [f"{n:02}.png" for n in range(11)]
-        assert database.num_keypoints() > 1000
-        assert database.num_matched_image_pairs() == 11 * 10 / 2
-        verified = database.read_two_view_geometries()[1]
-        assert sum(len(geometry.inlier_matches) > 0 for geometry in verified) == 15 + 6
-    settings = {"min_model_size": 3, "random_seed": 0, "extract_colors": False, "num_threads": 1}
-    options = pycolmap.IncrementalPipelineOptions(settings)
-    models = pycolmap.incremental_mapping(out / "database.db", tmp_path, tmp_path, options)
-    assert sorted(model.num_reg_images() for model in models.values()) == [4, 6]
-
-
 ORIENTATIONS = (1, 6, 8, 3, 6, 1)  # of the images of a phone, by EXIF
 
 
@@ -187,22 +164,6 @@ def test_colmap_goes_on_with_photographs_that_exif_turns(tmp_path):
         stored = turned_camera(truth[f"{number:04}"], -TURNS.get(ORIENTATIONS[number], 0), SIZE)
         expected = stored.R @ truth["0000"].R.T
         np.testing.assert_allclose(record.camera.R @ cameras(result)["00.png"].camera.R.T, expected, atol=0.01)
-
-
-def test_a_run_that_was_cut_off_ends_with_the_same_files(mixed, tmp_path):
-    out, _ = mixed
-    root = write_flat(tmp_path / "images")
-    cut = run(root, tmp_path / "out", MixedMatcher(interrupt=Interrupt(), after=30))
-    assert cut.report.ending is Ending.INTERRUPTED
-    assert contents(tmp_path / "out") == {}
-    again = MixedMatcher()
-    run(root, tmp_path / "out", again)
-    assert 0 < len(again.calls) < 55
-    assert contents(tmp_path / "out") == contents(out)
-    third = MixedMatcher()
-    assert cameras(run(root, tmp_path / "out", third)).keys() == cameras(mixed[1]).keys()
-    assert third.calls == []
-    assert contents(tmp_path / "out") == contents(out)
 
 
 def test_what_was_removed_of_the_results_is_made_again(tmp_path):

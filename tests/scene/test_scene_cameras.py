@@ -36,15 +36,17 @@ def focals_of(directory: Path, settings: SceneConfig) -> list[float]:
         return [*(known[image.camera_id] for image in database.read_all_images()), len(known)]
 
 
-@pytest.mark.parametrize("cameras", ["auto", "image"])
-def test_a_camera_starts_with_the_focal_length_of_exif(tmp_path, cameras):
-    assert focals_of(tmp_path, config(cameras)) == pytest.approx([GUESS, 900, 1000, 1040, GUESS, 5])
-    assert focals_of(tmp_path, config(cameras, exif=False)) == pytest.approx([GUESS] * 5 + [5])
-
-
-def test_images_of_one_size_that_one_camera_took_start_with_their_median(tmp_path):
-    assert focals_of(tmp_path, config("folder")) == pytest.approx([1000] * 4 + [GUESS, 2])
-    assert focals_of(tmp_path, config("folder", exif=False)) == pytest.approx([GUESS] * 5 + [2])
+@pytest.mark.parametrize(
+    ("cameras", "exif", "focals"),
+    [
+        ("auto", True, [GUESS, 900, 1000, 1040, GUESS, 5]),
+        ("image", False, [GUESS] * 5 + [5]),
+        ("folder", True, [1000] * 4 + [GUESS, 2]),  # the median of each size
+        ("folder", False, [GUESS] * 5 + [2]),
+    ],
+)
+def test_cameras_start_with_the_focal_length_of_exif(tmp_path, cameras, exif, focals):
+    assert focals_of(tmp_path, config(cameras, exif=exif)) == pytest.approx(focals)
 
 
 def with_exif(scene: SyntheticScene, factor: float) -> Sequence[BatchPair]:

@@ -7,10 +7,7 @@ import numpy as np
 import pytest
 
 from benchmarks.synthetic_scene import SIZE, SyntheticScene, synthetic_scene
-from mkpc_kaggle.config import from_table
-from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.cameras import Camera
-from mkpc_kaggle.recipe import CameraModel, SceneConfig
 from mkpc_kaggle.scene.choose import Choice, Reason, choose
 from mkpc_kaggle.scene.reconstruction import RegisteredImage, SfmModel, filter_models
 from mkpc_kaggle.scene.view_graph import BatchImage
@@ -42,24 +39,14 @@ def test_the_scenes_fundamental_is_that_of_the_cameras(scene):
     np.testing.assert_allclose(chosen.F, scene.true_fundamental(scene.pairs[0]))
 
 
-def test_an_image_without_a_camera_leaves_the_pair_its_own(scene):
+def test_a_pair_whose_cameras_make_no_fundamental_keeps_its_own(scene):
     rest = {name: camera for name, camera in scene.cameras.items() if name != "0000"}
-    assert choice([model(rest)], scene).reason is Reason.UNREGISTERED
-    assert choice([], scene).reason is Reason.UNREGISTERED
-
-
-def test_cameras_of_two_models_make_no_fundamental(scene):
     apart = [model({name: scene.cameras[name]}) for name in ("0000", "0001")]
+    together = [model(scene.cameras | {"0001": scene.cameras["0000"]})]
+    assert choice([], scene).reason is choice([model(rest)], scene).reason is Reason.UNREGISTERED
     assert choice(apart, scene).reason is Reason.APART
-
-
-def test_a_picture_and_itself_have_no_fundamental(scene):
     assert choice([model(scene.cameras)], scene, image1=scene.images[0]).reason is Reason.SAME_IMAGE
-
-
-def test_two_cameras_at_one_point_have_no_fundamental(scene):
-    cameras = scene.cameras | {"0001": scene.cameras["0000"]}
-    assert choice([model(cameras)], scene).reason is Reason.SAME_CENTRE
+    assert choice(together, scene).reason is Reason.SAME_CENTRE
 
 
 def test_a_wrong_camera_is_contradicted_by_the_pairs_matches(scene):
@@ -70,27 +57,13 @@ def test_a_wrong_camera_is_contradicted_by_the_pairs_matches(scene):
     assert choice([model(wrong)], scene).from_scene  # without an F of its own, nothing contradicts
 
 
-def with_camera(scene: SyntheticScene, **changes: object) -> SfmModel:
-    cameras = model(scene.cameras)
-    return replace(cameras, images=(replace(cameras.images[0], **changes), *cameras.images[1:]))
-
-
 @pytest.mark.parametrize("focal", [-900.0, 0.0, 1e5, np.nan])
 def test_an_absurd_focal_length_is_left_out(scene, focal):
     bad = replace(scene.cameras["0000"], K=np.diag([focal, focal, 1.0]))
-    (kept,) = filter_models((with_camera(scene, camera=bad),))
+    (kept,) = filter_models((model(scene.cameras | {"0000": bad}),))
     assert [found.image.name for found in kept.images] == ["0001", "0002", "0003"]
 
 
 def test_a_model_that_is_too_small_is_left_out(scene):
     small = model({name: scene.cameras[name] for name in ("0000", "0001")})
     assert [len(each.images) for each in filter_models((small, model(scene.cameras)))] == [4]
-
-
-def test_settings_come_from_a_table():
-    config = from_table(SceneConfig, {"camera_model": "SIMPLE_RADIAL", "pairs_per_image": 2}, "[scene]")
-    assert (config.camera_model, config.pairs_per_image) == (CameraModel.RADIAL, 2.0)
-    with pytest.raises(UserError, match=r"unknown key 'cells'.*camera_model"):
-        from_table(SceneConfig, {"cells": 1.0}, "[scene]")
-    with pytest.raises(UserError, match=r"\[scene\]: shared_intrinsics must be in"):
-        from_table(SceneConfig, {"shared_intrinsics": -1}, "[scene]")

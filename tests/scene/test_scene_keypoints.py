@@ -52,12 +52,6 @@ def test_points_on_both_sides_of_a_cells_border_are_one_keypoint():
     np.testing.assert_allclose(keypoints[place[0]], [0.75, 1.5], atol=1e-6)
 
 
-def test_a_match_that_two_matchers_found_is_one_and_outvotes_another():
-    edge = Edge(0, 1, matches((10, 10, 60, 60), (10, 10, 20, 20), (10.1, 10, 20, 20.1)))
-    keypoints, (index,) = keypoints_of(2, edge)
-    np.testing.assert_allclose(keypoints[1][index[0, 1]], [20, 20.05], atol=1e-5)
-
-
 def test_a_keypoint_is_matched_once_and_to_what_was_found_most_often():
     index = np.array([[0, 5], [0, 6], [0, 6], [1, 6], [2, 7], [2, 8]])
     assert one_to_one(index).tolist() == [[0, 6], [2, 7]]

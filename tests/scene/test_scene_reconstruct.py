@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.synthetic_scene import SIZE, SyntheticScene, registered_images, synthetic_scene
+from benchmarks.synthetic_scene import SIZE, SyntheticScene, front, match, registered_images, see, synthetic_scene
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import RobustConfig
@@ -56,7 +56,19 @@ def test_the_same_batch_gives_the_same_bytes_through_a_pipe_too(scene):
     piped = pickle.loads(pickle.dumps(scene.pairs))
     first, again = (pickle.dumps(reconstruct_batch(pairs, SceneConfig())) for pairs in (scene.pairs, piped))
     assert first == again
-    assert pickle.loads(first).choices[0].from_scene
+
+
+def test_points_of_a_dense_matcher_make_tracks(scene):
+    """Each pair has other points of the surface: a keypoint of two pairs is a coincidence within a cell."""
+    rng, pairs = np.random.default_rng(3), []
+    for pair in scene.pairs:
+        world = front(rng, 8000)
+        seen = [see(rng, camera, world, 0.3) for camera in scene.true_cameras(pair)]
+        pairs.append(replace(pair, matches=match(rng, *seen, 0.1, None)))
+    solution = reconstruct_batch(pairs, SceneConfig())
+    (found,) = solution.reconstructions
+    assert (found.registered, found.failure) == (6, "")
+    assert max(distances(solution, scene)) < 1
 
 
 @pytest.mark.parametrize("count", [3, 0])
@@ -115,20 +127,16 @@ def test_a_batch_without_matches_has_no_scene():
 
 
 def junk(kind: str, count: int = 60) -> Matches:
-    rng = np.random.default_rng(0)
-    points = rng.uniform(10, 500, (count, 2))
-    match kind:
-        case "random":
-            return Matches(points, rng.uniform(10, 500, (count, 2)), np.ones(count))
-        case "one point":
-            return Matches(np.full((count, 2), 50.0), np.full((count, 2), 60.0), np.ones(count))
-        case "a line":
-            line = np.column_stack([points[:, 0], points[:, 0]])
-            return Matches(line, line + 5, np.ones(count))
-        case "the same places":
-            return Matches(points, points, np.ones(count))
-        case _:  # a plane, or a camera that only turned
-            return Matches(points, points[:, ::-1] * 0.9 + 20, np.ones(count))
+    points, other = np.random.default_rng(0).uniform(10, 500, (2, count, 2))
+    line = np.column_stack([points[:, 0], points[:, 0]])
+    both = {
+        "random": (points, other),
+        "one point": (np.full((count, 2), 50.0), np.full((count, 2), 60.0)),
+        "a line": (line, line + 5),
+        "the same places": (points, points),
+        "a homography": (points, points[:, ::-1] * 0.9 + 20),  # of a plane, or a camera that only turned
+    }
+    return Matches(*both[kind], np.ones(count))
 
 
 @pytest.mark.parametrize("kind", ["random", "one point", "a line", "the same places", "a homography"])
@@ -141,21 +149,20 @@ def test_degenerate_matches_give_a_reason(kind):
         assert choice.F is None or np.isfinite(choice.F).all()
 
 
-def test_without_pycolmap_every_scene_says_so(scene, monkeypatch):
-    monkeypatch.delitem(sys.modules, "mkpc_kaggle.scene.colmap", raising=False)
-    monkeypatch.setitem(sys.modules, "pycolmap", None)
-    solution = reconstruct_batch(scene.pairs, SceneConfig())
-    assert "pycolmap cannot be imported" in solution.reconstructions[0].failure
-    assert {choice.reason for choice in solution.choices} == {Reason.UNREGISTERED}
-
-
-def test_what_pycolmap_raises_is_a_reason(scene, monkeypatch):
+@pytest.mark.parametrize("is_missing", [True, False])
+def test_a_missing_or_broken_pycolmap_is_a_reason(scene, monkeypatch, is_missing):
     def broken(*_: object) -> None:
         raise RuntimeError("disk I/O error")
 
-    monkeypatch.setattr(colmap, "structure_from_motion", broken)
-    (found,) = reconstruct_batch(scene.pairs, SceneConfig()).reconstructions
-    assert found.failure == "pycolmap failed: disk I/O error"
+    if is_missing:
+        monkeypatch.delitem(sys.modules, "mkpc_kaggle.scene.colmap", raising=False)
+        monkeypatch.setitem(sys.modules, "pycolmap", None)
+    else:
+        monkeypatch.setattr(colmap, "structure_from_motion", broken)
+    solution = reconstruct_batch(scene.pairs, SceneConfig())
+    told = "pycolmap cannot be imported" if is_missing else "pycolmap failed: disk I/O error"
+    assert told in solution.reconstructions[0].failure
+    assert {choice.reason for choice in solution.choices} == {Reason.UNREGISTERED}
 
 
 def test_nothing_is_written_to_disk(scene, tmp_path, monkeypatch):

@@ -36,37 +36,34 @@ def model(registered: Sequence[BatchImage], focals: Sequence[float], points: Seq
     return SfmModel(tuple(found), np.zeros((0, 3)), 0.5)
 
 
-def shared(*focals: float, points: Sequence[int] = (), tolerance: float = 0.02) -> dict[str, float]:
-    """By digest, the shared focal length of as many wide images, each found to have its own."""
+def shared(*focals: float, points: Sequence[int] = ()) -> dict[str, float]:
+    """By digest, the shared focal length of wide images, each found to have its own."""
     every = images(len(focals))
-    return dict(shared_intrinsics(every, [model(every, focals, points)], tolerance))
+    return dict(shared_intrinsics(every, [model(every, focals, points)], 0.02))
 
 
-def test_most_images_of_a_size_tell_its_focal_length():
-    assert shared(838, 839, 840, 841, 842) == dict.fromkeys("01234", 840)
-
-
-def test_an_image_with_few_points_shares_the_camera_whatever_its_focal_length():
-    assert shared(838, 840, 841, 2900, 880, points=(100, 100, 100, 4, 49)) == dict.fromkeys("01234", 841)
-
-
-def test_an_image_with_many_points_and_another_focal_length_was_taken_at_another_zoom():
-    assert shared(838, 840, 841, 420, 842, points=(100, 100, 100, 90, 100)) == dict.fromkeys("0124", 840)
+@pytest.mark.parametrize(
+    ("focals", "points", "expected"),
+    [
+        ((838, 839, 840, 841, 842), (), dict.fromkeys("01234", 840)),
+        # With few points, an image shares the camera whatever its focal length; with many, it had another zoom.
+        ((838, 840, 841, 2900, 880), (100, 100, 100, 4, 49), dict.fromkeys("01234", 841)),
+        ((838, 840, 841, 420, 842), (100, 100, 100, 90, 100), dict.fromkeys("0124", 840)),
+        ((), (), {}),
+        ((FOCAL,) * 4, (), {}),
+        ((840, 840, 840, 900, 900, 900), (), {}),
+        ((600, 700, 840, 950, 1100), (), {}),
+        ((-840,) * 3 + (np.nan,) * 3, (), {}),
+    ],
+)
+def test_most_images_of_a_size_tell_its_focal_length(focals, points, expected):
+    assert shared(*focals, points=points) == expected
 
 
 def test_an_image_without_a_camera_shares_that_of_its_size():
     every = [*images(6), *images(1, TALL, "tall")]
     found = shared_intrinsics(every, [model(every[:5], [FOCAL] * 5)], 0.02)
     assert found == dict.fromkeys("012345", FOCAL)
-
-
-@pytest.mark.parametrize(
-    "focals",
-    [(), (FOCAL,) * 4, (840, 840, 840, 900, 900, 900), (600, 700, 840, 950, 1100), (-840,) * 3 + (np.nan,) * 3],
-    ids=["none", "few", "half", "strangers", "absurd"],
-)
-def test_where_fewer_agree_nothing_is_shared(focals):
-    assert shared(*focals) == {}
 
 
 def focals_of(solution: Solution) -> list[float]:

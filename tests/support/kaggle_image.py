@@ -1,73 +1,18 @@
-"""Stand-ins for Kaggle's images, environments with the packages that they have and none of ours; and its uploads.
-
-The quick environment links this interpreter's packages; the table's are installed from pip's index.
-"""
+"""A stand-in for Kaggle's image, an environment with its packages and none of ours; and Kaggle's uploads."""
 
 import os
 import re
 import shutil
-import subprocess
 import sys
 import venv
 from collections.abc import Sequence
-from dataclasses import dataclass
 from importlib.metadata import Distribution, PackageNotFoundError, distribution
 from pathlib import Path
 from zipfile import ZipFile, is_zipfile
 
-
-@dataclass(frozen=True)
-class Image:
-    """What an image of Kaggle's has: Python's version, and those of the packages that we take from it."""
-
-    python: str
-    versions: tuple[str, ...]
-
-    def __str__(self) -> str:
-        return "-".join([self.python, *self.versions[:1], *self.versions[2:3]])
-
-
-NEWER = ("opencv-python-headless==4.13.0.92", "scikit-learn==1.6.1", "pandas==2.2.3", "scipy==1.15.3")
-OLDER = ("opencv-python-headless==4.11.0.86", "scikit-learn==1.6.1", "pandas==2.2.3", "scipy==1.15.3")
-OPENCV_5 = ("opencv-python-headless==5.0.0.93", *NEWER[1:])
-IMAGES = (
-    Image("3.11", ("torch==2.6.0", "numpy==1.26.4", *OLDER)),
-    Image("3.12", ("torch==2.10.0", "numpy==2.0.2", *NEWER)),
-    Image("3.12", ("torch==2.11.0", "numpy==2.0.2", *NEWER)),
-    Image("3.13", ("torch==2.11.0", "numpy==2.1.3", *NEWER)),
-    Image("3.13", ("torch==2.11.0", "numpy==2.1.3", *OPENCV_5)),
-)
 BESIDE = ("matplotlib", "tqdm", "ipykernel", "nbclient", "nbformat")
 UNPACKED = (".zip", ".tar", ".gz", ".pt", ".pth", ".ckpt")  # Kaggle unpacks archives, as torch's checkpoints are
 PACKAGES = ("numpy", "pandas", "scipy", "scikit-learn", "opencv-python-headless", "torch", "pip", *BESIDE)
-
-
-def interpreter(python: str) -> Path | None:
-    """The first command of that version, ``3.13``, on ``PATH`` that runs; version managers have some that fail."""
-    for folder in os.environ["PATH"].split(os.pathsep):
-        found = shutil.which(f"python{python}", path=folder)
-        if found and subprocess.run([found, "-c", ""], capture_output=True, check=False).returncode == 0:
-            return Path(found)
-    return None
-
-
-def install_image(image: Image, directory: Path) -> Path | None:
-    """The interpreter of an environment with just that image's versions; ``None`` where it cannot be had here.
-
-    An environment that is there already is taken as it is: it has gigabytes, with CUDA's libraries.
-    """
-    python = directory / "bin" / "python"
-    done = directory / "installed"
-    base = interpreter(image.python)
-    if base is None:
-        return None
-    if not done.is_file():
-        subprocess.run([base, "-m", "venv", "--clear", directory], check=True, env=environment())
-        pip = [python, "-m", "pip", "install", "--quiet", *image.versions, *BESIDE]
-        if subprocess.run(pip, check=False, env=environment()).returncode != 0:
-            return None
-        done.touch()
-    return python
 
 
 def upload(folder: Path, mount: Path) -> None:

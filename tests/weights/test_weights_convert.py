@@ -58,12 +58,3 @@ def test_what_cannot_be_converted_is_stated(tmp_path):
     ):
         with pytest.raises(UserError, match=message):
             convert(tmp_path / file, tmp_path / result)
-
-
-def test_a_link_in_the_place_of_the_partial_file_is_not_followed(tmp_path):
-    torch.save({"a": torch.zeros(1)}, tmp_path / "x.pt")
-    (tmp_path / "other").write_bytes(b"mine")
-    (tmp_path / "x.safetensors.part").symlink_to(tmp_path / "other")
-    convert(tmp_path / "x.pt", tmp_path / "x.safetensors")
-    assert (tmp_path / "other").read_bytes() == b"mine"
-    assert not (tmp_path / "x.safetensors").is_symlink()

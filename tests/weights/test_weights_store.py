@@ -70,16 +70,6 @@ def test_a_renamed_file_is_found_by_its_size_and_digest(tmp_path, monkeypatch):
     assert "long.pth" not in {path.name for path in read}
 
 
-def test_without_a_size_only_small_checkpoints_are_read_for_their_digest(tmp_path, monkeypatch):
-    monkeypatch.setattr(store, "MAX_UNKNOWN_SIZE_BYTES", len(DATA))
-    put(tmp_path, "table.csv")
-    put(tmp_path, "picture.png")
-    put(tmp_path, "big.pth", DATA * 2)
-    assert WeightStore([tmp_path], [line(size=-1), line(data=DATA * 2, size=-1)]).find("slot") is None
-    put(tmp_path, "renamed.ckpt")
-    assert found_by(WeightStore([tmp_path], [line(size=-1)])).name == "renamed.ckpt"
-
-
 def test_links_to_directories_are_followed_once(tmp_path):
     put(tmp_path / "outside", "b.pth")
     inside = put(tmp_path / "inside" / "deep", "a.pth")
@@ -128,15 +118,6 @@ def test_other_bytes_of_the_same_size_are_refused_with_both_digests(tmp_path):
         pytest.raises(UserError, match="no weights for 'slot'"),
     ):
         WeightStore([tmp_path], [line()]).load("slot")
-
-
-def test_a_file_whose_size_is_no_files_is_refused_unread(tmp_path, monkeypatch):
-    monkeypatch.setattr(store, "digest_of", lambda path: pytest.fail(f"{path.name} is read"))
-    with (tmp_path / "a.bin").open("wb") as stream:
-        stream.truncate(20_000_000_000)
-    (judged,) = WeightStore([tmp_path], [line("a.bin"), line("b.bin", OTHER * 2)]).verify()
-    assert (judged.state, judged.digest) == (State.REFUSED, "")
-    assert judged.note.startswith("20000000000 bytes, the manifest says")
 
 
 def test_after_a_bad_file_the_search_goes_on(tmp_path):

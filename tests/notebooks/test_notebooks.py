@@ -1,0 +1,68 @@
+"""``mkpc_tour.ipynb`` and ``validate.ipynb`` from a clean kernel without a network, on the demo set."""
+
+import os
+import sys
+from pathlib import Path
+
+import nbformat
+from kaggle_image import environment
+from offline_notebook import execute, needs_namespaces, outputs, pictures, printed, with_pictures_alone
+
+ROOT = Path(__file__).resolve().parents[2]
+TOUR = ROOT / "notebooks" / "mkpc_tour.ipynb"
+PATHS = os.pathsep.join([str(ROOT), str(TOUR.parent)])  # Jupyter starts a kernel in the folder of its notebook
+SMALL = """
+units = [{ stage = 1, matcher = "sift", long_side = 320 }, { stage = 2, matcher = "sift", long_side = 400 }]
+magsac = { permutations = 1, max_iterations = 5000 }
+"""
+SETTINGS = {  # as a user would edit them
+    '"classical:whole-images", "classical"': '"small.toml:stage-1", "small.toml"',
+    "SCENES = []": 'SCENES = ["courtyard"]',
+    "PAIRS_PER_SCENE = 12": "PAIRS_PER_SCENE = 4",
+}
+
+
+def figures_of(notebook: nbformat.NotebookNode) -> int:
+    """Return the number of figures that its cells ask for."""
+    return sum(cell.source.count("show(figures.") for cell in notebook.cells if cell.cell_type == "code")
+
+
+@needs_namespaces
+def test_the_tour_runs_on_a_train_side_without_a_network(demo, tmp_path):
+    variables = environment(
+        PYTHONPATH=PATHS,
+        MKPC_TRAIN_DIR=str(demo.train_dir),
+        MKPC_PAIR="courtyard;courtyard_0006-courtyard_0001",
+        MKPC_OTHER_PAIR="courtyard;courtyard_0003-courtyard_0000",
+    )
+    executed = execute(TOUR, tmp_path / "executed.ipynb", sys.executable, tmp_path, variables)
+    assert pictures(executed) == figures_of(executed) == 16
+    assert printed(executed) == ""
+
+
+def test_the_tour_is_committed_with_all_its_pictures_and_nothing_else():
+    tour = nbformat.read(TOUR, as_version=4)
+    assert with_pictures_alone(tour) == tour
+    assert pictures(tour) == figures_of(tour) == len(outputs(tour))
+    assert 500_000 < TOUR.stat().st_size < 1_500_000
+
+
+@needs_namespaces
+def test_without_a_train_side_recipes_are_compared_on_the_demo_set(tmp_path):
+    (tmp_path / "small.toml").write_text(SMALL, encoding="utf-8")
+    notebook = nbformat.read(ROOT / "notebooks" / "validate.ipynb", as_version=4)
+    (cell,) = (cell for cell in notebook.cells if cell.id == "settings")
+    for former, new in SETTINGS.items():
+        assert cell.source.count(former) == 1, former
+        cell.source = cell.source.replace(former, new)
+    path = tmp_path / "validate.ipynb"
+    nbformat.write(notebook, path)
+    known = {name: value for name, value in environment().items() if name != "MKPC_TRAIN_DIR"}
+    known |= {"PYTHONPATH": PATHS, "TMPDIR": str(tmp_path)}
+    executed = execute(path, tmp_path / "executed.ipynb", sys.executable, tmp_path, known)
+    text = printed(executed)
+    assert "courtyard              4 pairs" in text
+    assert "small against small (stage-1): gain of mAA, 95% interval" in text
+    assert text.count("mean over scenes         4") == 3
+    assert text.count(": covisibility 0.") == 3
+    assert pictures(executed) == 3 + 3, "scores, gains, errors; the hardest pairs"
