@@ -7,12 +7,11 @@ from dataclasses import replace
 from pathlib import Path
 
 from mkpc_kaggle.cli import options
-from mkpc_kaggle.data.outputs import require_directory_apart
 from mkpc_kaggle.engine.budget import format_duration
 from mkpc_kaggle.engine.console import say
 from mkpc_kaggle.engine.session import interruptible
 from mkpc_kaggle.recipe import CameraSharing
-from mkpc_kaggle.reconstruction.directory import output_directory
+from mkpc_kaggle.reconstruction.directory import output_directory, require_directory_apart
 from mkpc_kaggle.reconstruction.folder import read_folder, read_pair_list
 from mkpc_kaggle.reconstruction.outputs import FORMS, Cameras, write_tables
 from mkpc_kaggle.reconstruction.run import FolderResult, for_cameras, reconstruct_folder

@@ -47,14 +47,6 @@ def require_apart(
             raise UserError(f"--work-dir {work_dir} would be written over the input {source}; name another place")
 
 
-def require_directory_apart(out: Path, inputs: Iterable[Path], weights: Iterable[Path]) -> None:
-    """Raise :class:`UserError` for a result directory, ``--out``, that contains an input or lies in one."""
-    inputs = list(inputs)
-    for place in (*inputs, *weights, *weights_of_environment()):
-        if os.path.lexists(place) and (lies_in(place, out) or (place in inputs and lies_in(out, place))):
-            raise UserError(f"--out {out} and the input {place} are in each other's way; name another place")
-
-
 def require_table(path: Path, columns: Iterable[str]) -> None:
     """Raise :class:`UserError` if ``path`` exists and is not a table with these columns."""
     if os.path.lexists(path):

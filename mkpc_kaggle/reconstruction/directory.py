@@ -9,7 +9,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
 
-from mkpc_kaggle.data.outputs import replacing
+from mkpc_kaggle.data.outputs import lies_in, replacing, weights_of_environment
 from mkpc_kaggle.engine.console import warn
 from mkpc_kaggle.errors import UserError, writing
 from mkpc_kaggle.scene.export import DATABASE, MODEL_FILES, MODELS, PART
@@ -49,6 +49,14 @@ def output_directory(out: Path, datasets: Iterable[str], form: str | None = None
                 _remove(out / name)
         after = {name: digest for name in results if (digest := _digest(out / name))}
         _write_mark(out, {name: known[name] if after[name] == before[name] else after[name] for name in after})
+
+
+def require_directory_apart(out: Path, inputs: Iterable[Path], weights: Iterable[Path]) -> None:
+    """Raise :class:`UserError` for a result directory, ``--out``, that contains an input or lies in one."""
+    inputs = list(inputs)
+    for place in (*inputs, *weights, *weights_of_environment()):
+        if os.path.lexists(place) and (lies_in(place, out) or (place in inputs and lies_in(out, place))):
+            raise UserError(f"--out {out} and the input {place} are in each other's way; name another place")
 
 
 def _read_mark(out: Path) -> dict[str, str] | None:

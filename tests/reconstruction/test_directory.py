@@ -9,9 +9,8 @@ from types import SimpleNamespace
 import pycolmap
 import pytest
 
-from mkpc_kaggle.data.outputs import require_directory_apart
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.reconstruction.directory import MARK, output_directory
+from mkpc_kaggle.reconstruction.directory import MARK, output_directory, require_directory_apart
 from mkpc_kaggle.scene import colmap
 from mkpc_kaggle.scene.export import MODEL_FILES
 
