@@ -27,6 +27,7 @@ from mkpc_kaggle.geometry.coordinates import Matrix3
 SUBMISSION_COLUMNS = ("sample_id", "fundamental_matrix")
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 
+MAX_LINE = 1 << 24  # characters of a row: another file may be one line of gigabytes
 CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]")  # characters that end lines, or drive a terminal
 # Names of directories, of drives (Windows), and names that no file can have.
 NOT_PLAIN = re.compile(rf"^\.{{0,2}}$|^[A-Za-z]:|[/\\]|{CONTROL.pattern}")
@@ -190,7 +191,7 @@ def read_rows(path: Path, columns: Sequence[str], *, only: bool = False) -> Iter
         if path.exists() and not path.is_file():
             raise UserError(f"{path} is not a regular file")
         with path.open(encoding="utf-8-sig", newline="") as stream:
-            table = csv.reader(stream)
+            table = csv.reader(iter(lambda: stream.readline(MAX_LINE), ""))
             header = next(filter(None, table), [])
             found = ", ".join(header)[:200] or "nothing"
             if missing := [column for column in columns if column not in header]:

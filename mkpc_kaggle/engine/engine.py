@@ -175,14 +175,16 @@ class Engine:
         if is_asked:
             self.journal.want(self.pairs, units, dict.fromkeys(batches, settings.scene), request.about)
         self._look_at_images()
-        for batch, scene in self.journal.scenes().items():
-            if batch in request.exports and not request.exports[batch].has_files(scene.models):
+        made = self.journal.scenes("scene") if request.exports else self.journal.scenes()
+        for batch in request.exports.keys() & made.keys():
+            if not request.exports[batch].has_files(made[batch].models):
                 self.journal.forget_scene(batch)  # its files are a result, too
+                del made[batch]
         self.state = State(self.journal, len(self.pairs), len(request.pairs), len(recipe.units))
         order = visiting_order([each.pair for each in self.pairs])
         note = self._progress.note
         self.plan = Plan(recipe.units, self.state, order, self.budget, self._explain, note, self.minibatch)
-        self.scenes = Scenes(batches, self.journal.scenes(), self.journal.current_scenes())
+        self.scenes = Scenes(batches, made, self.journal.current_scenes())
         self.estimates = EstimatePlan(self.plan, order)
         complete = self.state.had.all(1) & self.state.is_estimated
         self._resumed = int(complete[: self.state.rows].sum())
@@ -363,6 +365,8 @@ class Engine:
 
     def _take_scene(self, job: SceneJob, answer: Solution, seconds: float) -> None:
         record = SceneRecord.of(job.batch, answer.reconstructions, seconds)
+        if job.export is not None:
+            self.journal.forget_scene(job.batch)  # its files are replaced
         self.journal.save_scene(record, job.inputs, job.pairs, answer.choices)
         self.scenes.on_result(job, record, is_current=self.journal.batch_inputs(job.batch) == job.inputs)
         self.state.read_choices()

@@ -60,7 +60,7 @@ class Journal(JournalReader):
                     self._open()
                 except sqlite3.OperationalError as error:  # a full disk
                     self.trouble = str(error)
-                    self._db = connected(":memory:")
+                    self.continue_in_memory()
                     self._open()
             opened.pop_all()
 
@@ -237,7 +237,11 @@ class Journal(JournalReader):
     def continue_in_memory(self) -> None:
         """Copy everything into memory, and write there from now on."""
         memory = connected(":memory:")
-        self._file.backup(memory)
+        try:
+            self._file.backup(memory)
+        except sqlite3.OperationalError:  # a full disk has no room for SQLite's locks either
+            with closing(connected(f"{self.path.resolve().as_uri()}?immutable=1")) as file:
+                file.backup(memory)
         memory.execute("PRAGMA foreign_keys = ON")
         self._db = memory
 

@@ -192,10 +192,10 @@ class JournalReader:
         }
 
     @reading
-    def scenes(self) -> dict[str, SceneRecord]:
-        """Return the standing reconstruction of each batch that has one."""
+    def scenes(self, table: str = "standing_scene") -> dict[str, SceneRecord]:
+        """Return the standing reconstruction of each batch that has one, or those of another table."""
         scenes = {}
-        for scene in self._rows("SELECT * FROM standing_scene ORDER BY batch"):
+        for scene in self._rows(f"SELECT * FROM {table} ORDER BY batch, revision"):
             cameras = self._rows("SELECT * FROM camera WHERE scene = ? ORDER BY rowid", scene["revision"])
             clouds = self._rows("SELECT points FROM cloud WHERE scene = ? ORDER BY model", scene["revision"])
             scenes[scene["batch"]] = SceneRecord(

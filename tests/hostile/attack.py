@@ -1,4 +1,4 @@
-"""One hostile case: a room with an input, the real command in it as a process of its own, what must come of it."""
+"""One hostile case: a room with an input, the command in it as a separate process, and the allowed results."""
 
 import os
 import shlex
@@ -8,7 +8,7 @@ import sys
 import tempfile
 import time
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -23,13 +23,13 @@ ROOT = Path(__file__).resolve().parents[2]
 MEMORY_KIB = 4 << 20
 HANGS_S = 600
 REFUSED = (2,)
-EITHER = (0, 1, 2)  # a valid result, a result that says what it lacks, or a clear refusal
+EITHER = (0, 1, 2)  # a valid result, a result that states what is missing, or a clear refusal
 CRASHES = ("Traceback (most recent call last)", "Fatal Python error", "Segmentation fault", "core dumped")
-LEFT_BY_ITSELF = (0, 1, 128 + signal.SIGINT, 128 + signal.SIGTERM)
+ENDED_BY_ITSELF = (0, 1, 128 + signal.SIGINT, 128 + signal.SIGTERM)
 TOO_LATE = "the time limit passed before the first results"
 MARK = "MKPC_HOSTILE_CASE"
 
-Make = Callable[[Path], None]
+Make = Callable[[Path], object]
 Act = Callable[["subprocess.Popen[bytes]"], None]
 
 
@@ -39,11 +39,11 @@ def nothing(_: object) -> None:
 
 @dataclass(frozen=True)
 class Case:
-    """``make`` changes the room; ``command`` runs in it, ``act`` disturbs it.
+    """``make`` changes the room; ``command`` runs in it under ``limits`` (options of ulimit); ``act`` disturbs it.
 
-    It must end with one of ``statuses``, and its output have ``says``. It may write to the room's folder ``out``
-    alone. Where it makes a submission, ``out/s.csv`` must be valid and complete unless the command was refused or
-    ``submission`` says no. ``then`` is a second command, judged as the first.
+    It must end with one of ``statuses``, and its output must contain ``says``. It may write only to the room's
+    folder ``out``. A submission, ``out/s.csv``, must be valid and complete unless the command was refused or
+    ``submission`` is false. ``then`` is a second command with the same rules.
     """
 
     group: str
@@ -55,6 +55,7 @@ class Case:
     act: Act | None = None
     then: str = ""
     env: dict[str, str] = field(default_factory=dict)
+    limits: str = "-c 0"
     submission: bool = True
     stderr: Callable[[], int] | None = None  # opens the descriptor that the command writes to; else the log
 
@@ -64,40 +65,42 @@ class Case:
 
 
 def attack(case: Case, room: Path) -> None:
-    """Run the case in the room; the test fails with all that was wrong."""
+    """Run the case in the room. The test fails with all faults."""
     case.make(room)
     before = _snapshot(room)
-    mark = uuid.uuid4().hex
     faults = []
-    for number, command in enumerate(filter(None, (case.command, case.then))):
-        process = _start(command, room, {**case.env, MARK: mark}, case.stderr)
-        if number == 0 and case.act is not None:
+    for command in filter(None, (case.command, case.then)):
+        mark = uuid.uuid4().hex
+        process = _start(command, room, {**case.env, MARK: mark}, case.limits, case.stderr)
+        if command == case.command and case.act is not None:
             case.act(process)
         status, output = _wait(process, room)
         faults += _faults(case, status, output, room)
         faults += [f"left running: {line}" for line in _orphans(mark)]
-        # Before the table was read.
-        interrupted = status not in (0, 1) and output.strip() in ("", "error: interrupted")
-        if case.submission and not interrupted and "submit" in command and status in LEFT_BY_ITSELF:
+        was_interrupted = status not in (0, 1) and output.strip() in ("", "error: interrupted")  # at its start
+        if case.submission and not was_interrupted and "submit" in command and status in ENDED_BY_ITSELF:
             faults += _submission_faults(room)
-        too_late = status == 1 and TOO_LATE in output  # before its directory was looked at
-        if status in (0, 1) and not too_late and "reconstruct" in command and (number or not case.then):
+        if status in (0, 1) and "reconstruct" in command and TOO_LATE not in output:
             faults += _result_faults(room / "out" / "o", status)
-    faults += [f"changed: {name}" for name in _changed(before, _snapshot(room))]
+    after = _snapshot(room)
+    faults += [f"changed: {name}" for name in sorted(before | after) if before.get(name) != after.get(name)]
     if faults:
         pytest.fail("\n".join([case.id, case.command, *faults, f"output:\n{output[-3000:]}"]), pytrace=False)
 
 
 def prepared(command: str, room: Path) -> int:
-    """The exit status of a command that nobody disturbs."""
+    """Return the exit status of an undisturbed command."""
     return _start(command, room, {}).wait()
 
 
 def _start(
-    command: str, room: Path, env: dict[str, str], stderr: Callable[[], int] | None = None
+    command: str,
+    room: Path,
+    env: dict[str, str],
+    limits: str = "-c 0",
+    stderr: Callable[[], int] | None = None,
 ) -> "subprocess.Popen[bytes]":
-    words = [word.format(room=room) for word in shlex.split(command)]
-    limited = ["sh", "-c", f'ulimit -d {MEMORY_KIB}; ulimit -c 0; exec "$@"', "sh"]
+    limited = ["sh", "-c", f'ulimit -d {MEMORY_KIB}; ulimit {limits}; exec "$@"', "sh"]
     own = {
         "PATH": os.defpath,
         "PYTHONPATH": str(ROOT),
@@ -110,7 +113,7 @@ def _start(
     }
     with (room / "out" / "log").open("ab") as log:
         return subprocess.Popen(
-            [*limited, sys.executable, "-m", "mkpc_kaggle", *words],
+            [*limited, sys.executable, "-m", "mkpc_kaggle", *shlex.split(command)],
             cwd=room,
             env=own | env,
             stdin=subprocess.DEVNULL,
@@ -121,29 +124,28 @@ def _start(
 
 
 def _wait(process: "subprocess.Popen[bytes]", room: Path) -> tuple[int | None, str]:
-    """The status, ``None`` where it had to be killed, and the output."""
-    try:
-        status: int | None = process.wait(HANGS_S)
-    except subprocess.TimeoutExpired:
-        status = None
+    """Return the status, ``None`` if the process had to be killed, and the output."""
+    status = None
+    with suppress(subprocess.TimeoutExpired):
+        status = process.wait(HANGS_S)
+    if status is None:
         os.killpg(process.pid, signal.SIGKILL)
         process.wait()
     return status, (room / "out" / "log").read_text(errors="replace")
 
 
-def _faults(case: Case, status: int | None, output: str, room: Path) -> list[str]:
-    faults = [f"the output has {crash!r}" for crash in CRASHES if crash in output]
+def _faults(case: Case, status: int | None, output: str, room: Path) -> Iterator[str]:
+    yield from (f"the output has {crash!r}" for crash in CRASHES if crash in output)
     if status is None:
-        faults.append(f"it hangs: not over after {HANGS_S} s")
+        yield f"it hangs: not over after {HANGS_S} s"
     elif status not in case.statuses:
-        faults.append(f"exit status {status}, not one of {case.statuses}")
+        yield f"exit status {status}, not one of {case.statuses}"
     if status in REFUSED and "error:" not in output:
-        faults.append("refused without a word")
+        yield "refused without a word"
     if case.says not in output:
-        faults.append(f"the output lacks {case.says!r}")
+        yield f"the output has no {case.says!r}"
     if status in (0, 1, 2) and (left := sorted(path.name for path in (room / "tmp").iterdir())):
-        faults.append(f"left in the folder for temporary files: {left}")
-    return faults
+        yield f"left in the folder for temporary files: {left}"
 
 
 def _submission_faults(room: Path) -> list[str]:
@@ -151,21 +153,21 @@ def _submission_faults(room: Path) -> list[str]:
     return [f"submission: {problem}" for problem in submission_problems(room / "out" / "s.csv", ids)]
 
 
-def _result_faults(out: Path, status: int) -> list[str]:
-    """What is wrong with the results of a folder of images."""
+def _result_faults(out: Path, status: int) -> Iterator[str]:
+    """Yield the faults of the results of a folder of images."""
     table = out / "cameras.csv"
-    with suppress(OSError):
-        lines = table.read_text().splitlines()
-        faults = [] if lines[0].startswith("image,model,K,R,t,") else [f"{table} begins with {lines[0]!r}"]
-        faults += (
-            [] if (len(lines) > 1) == (status == 0) else [f"exit status {status} with {len(lines) - 1} cameras"]
-        )
-        return faults + [f"left: {path}" for path in out.rglob(".*") if path.name != ".png"]
-    return [f"there is no {table}"]
+    lines = table.read_text().splitlines() if table.is_file() else [""]
+    if not lines[0].startswith("image,model,K,R,t,"):
+        yield f"{table} begins with {lines[0]!r}"
+    if status == 0 and len(lines) == 1:
+        yield "exit status 0 without a camera"
+    if len(lines) == 1 and any(out.rglob("images.bin")):
+        yield "no camera in the table, and a model"
+    yield from (f"left: {path}" for path in out.rglob(".*") if path.name != ".png")
 
 
 def _orphans(mark: str) -> list[str]:
-    """Command lines of processes of the case that are still there; they are killed."""
+    """Kill the processes of the case that still run, and return their command lines."""
     for _ in range(600):
         if not (left := started_with(mark)):
             break
@@ -177,7 +179,7 @@ def _orphans(mark: str) -> list[str]:
 
 
 def _snapshot(room: Path) -> dict[str, tuple[object, ...]]:
-    """What identifies the state of each file of the room, except what a command may write."""
+    """Return the state of each file and folder of the room, except what a command may write."""
     states: dict[str, tuple[object, ...]] = {}
     for folder, folders, names in os.walk(os.fsencode(room)):
         if folder == os.fsencode(room):
@@ -188,7 +190,3 @@ def _snapshot(room: Path) -> dict[str, tuple[object, ...]]:
             contents = (status.st_size, status.st_mtime_ns, status.st_ino) if name in names else ()
             states[repr(path)] = (status.st_mode, *contents)
     return states
-
-
-def _changed(before: dict[str, tuple[object, ...]], after: dict[str, tuple[object, ...]]) -> list[str]:
-    return [name for name in sorted(before.keys() | after.keys()) if before.get(name) != after.get(name)]

@@ -1,35 +1,64 @@
-"""Time limits without sense, and runs that are ended in every way."""
+"""Arguments without sense, and runs that are ended in every way."""
 
 import os
 import signal
 import subprocess
 import time
+from collections.abc import Iterator
 
 from attack import REFUSED, Act, Case
-from room import SUBMIT
+from room import CALIBRATION, SUBMIT, makes, options, written
 
-PLAIN = SUBMIT.replace(" --time-limit 5m", "").replace(" --workers 0", "")
-NONE = {
-    "--time-limit": ["0", "-1", "nan", "inf", "''", "1d", "0x10", "1h1h", "\uff11s s", "1e400"],
+WITHOUT_LIMIT = SUBMIT.replace(" --time-limit 5m", "").replace(" --workers 0", "")
+NONSENSE = {
+    "--time-limit": [
+        "0",
+        "-1",
+        "nan",
+        "inf",
+        "''",
+        "1d",
+        "0x10",
+        "1h1h",
+        "\uff11s s",
+        "1e400",
+        "8h45",
+        "60S",
+        "+60",
+    ],
     "--started-at": ["nan", "-inf", "1e400", "abc", "99999999999", "''"],
     "--workers": ["-1", "''", "1.5", "99999999999999999999", "ray://", "\u0663x"],
     "--device": ["foo", "cuda:99", "''", "cpu:0", "cuda:-1", "meta"],
     "--mode": ["foo", "''"],
     "--recipe": ["foo", "''", "../quick", "D/test.csv", "/dev/null", "quick.toml/x.toml", "D", "x" * 5000],
     "--weights": ["foo", "D/test.csv", "/dev/null"],
+    "--test-dir": ["d" * 5000],
 }
-LIMITS: dict[str, tuple[int, ...]] = {  # how a run under them ends; too short: as quick as the machine is
-    **dict.fromkeys(("1s", "0.001s", "3s"), (0, 1)),
-    **dict.fromkeys(("99999999999h", "' 60s '"), (0,)),
-    **dict.fromkeys(("8h45", "5m5m", "1e3", "+60", "60S", "1e9"), REFUSED),
+VALIDATE = "validate --train-dir T --recipe quick.toml --workers 0 --no-scenes --pairs-per-scene 1"
+SCENES = {
+    "covisibility of NaN": "--min-covisibility nan",
+    "a scene above": "--scenes ../T",
+    "figures in a directory": "--json out",
+    "figures in the table": "--json T/scaling_factors.csv",
 }
+OF_NAN = "sample_id,fundamental_matrix\n1,nan nan nan nan nan nan nan nan nan\n"
+SUBMISSIONS = {
+    "empty": "",
+    "of NaN": OF_NAN,
+    "of huge numbers": "sample_id,fundamental_matrix\n1,1e308 1e308 1 1 1 1 1 1 1\n",
+}
+SCORE = "validate --train-dir T --submission sub.csv --truth truth.csv"
+SHORT, LONG = ("1s", "0.001s", "3s"), ("99999999999h", "' 60s '")  # limits
 SOON = (0.6, 1.5, 3.0, 6.0)  # Python itself takes 0.1 s to start, more on a busy machine
 ENDS = {"SIGINT": 130, "SIGTERM": 143}
+STATUSES = {name: (0, status, -status + 128) for name, status in ENDS.items()}
 CRUEL = {"SIGKILL": -9, "SIGHUP": -1, "SIGQUIT": -3, "SIGUSR1": -10, "SIGXCPU": -24, "SIGSEGV": -11}
+AGAIN = SUBMIT.replace("quick.toml", "classical")
+WORKING = f"{WITHOUT_LIMIT.replace('quick.toml', 'classical')} --workers"
 
 
 def sends(name: str, *after: float, group: bool = False) -> Act:
-    """Send the signal after so many seconds, and once more after each further time."""
+    """Send the signal after so many seconds, and again after each further time."""
 
     def act(process: "subprocess.Popen[bytes]") -> None:
         for seconds in after:
@@ -41,38 +70,50 @@ def sends(name: str, *after: float, group: bool = False) -> Act:
     return act
 
 
-LONG = PLAIN.replace("quick.toml", "classical")
-STATUSES: dict[str, tuple[int, ...]] = {name: (0, status, -status + 128) for name, status in ENDS.items()}
+def signals() -> Iterator[Case]:
+    for name in ENDS:
+        acts = {f"after {after} s": sends(name, after) for after in SOON}
+        acts |= {f"to all after {after} s": sends(name, after, group=True) for after in SOON[::2]}
+        acts["twice"] = sends(name, 3.0, 0.2)
+        for when, act in acts.items():
+            yield Case("signals", f"{name} {when}", f"{WORKING} 1", statuses=STATUSES[name], act=act)
+    for name, status in CRUEL.items():
+        act = sends(name, 4.0)
+        yield Case("signals", f"{name} and once more", f"{WORKING} 1", statuses=(status, 0), act=act, then=AGAIN)
 
-WORKING = f"{LONG} --workers 1"
-AGAIN = SUBMIT.replace("quick.toml", "classical")
+
+def each(*values: str) -> dict[str, str]:
+    return {f"--time-limit {value}": value for value in values}
 
 
+LIMITED = f"{WITHOUT_LIMIT} --workers 1 --time-limit"
+CAMERAS = {
+    f"cameras of {new}": written("T/s/calibration.csv", CALIBRATION.replace(former, new))
+    for former, new in (("200 0 80", "nan nan nan"), ("1 0 0", "1 2 3"))
+}
 CASES = [
     *(
-        Case("limits", f"{option} {value[:20]}", f"{SUBMIT} {option}={value}", statuses=REFUSED)
-        for option, values in NONE.items()
-        for value in values
+        case
+        for option, values in NONSENSE.items()
+        for case in options("limits", SUBMIT, {f"{option} {value[:20]}": f"{option}={value}" for value in values})
     ),
-    *(
-        Case("limits", f"--time-limit {value}", f"{PLAIN} --workers 1 --time-limit={value}", statuses=statuses)
-        for value, statuses in LIMITS.items()
+    *options("limits", LIMITED, each(*SHORT), (0, 1)),
+    *options("limits", LIMITED, each(*LONG), (0,)),
+    *options("limits", WORKING, {f"5s with {n} workers": f"{n} --time-limit 5s" for n in (0, 2)}, (0, 1)),
+    *options("arguments", VALIDATE, SCENES),
+    *makes("arguments", VALIDATE, CAMERAS, (0,)),
+    *makes(
+        "arguments",
+        SCORE,
+        {f"a submission {what}": written("sub.csv", text) for what, text in SUBMISSIONS.items()},
+        (0,),
     ),
-    *(
-        Case("limits", f"5s with {n} workers", f"{LONG} --workers {n} --time-limit 5s", statuses=(0, 1))
-        for n in (0, 2)
+    *makes(
+        "arguments",
+        "check sub.csv --test-dir D",
+        {"a checked submission of NaN": written("sub.csv", OF_NAN)},
+        (1,),
     ),
-    *(
-        Case("signals", f"{name} {when}", WORKING, statuses=STATUSES[name], act=act)
-        for name in ENDS
-        for when, act in (
-            *((f"after {after} s", sends(name, after)) for after in SOON),
-            *((f"to all after {after} s", sends(name, after, group=True)) for after in SOON[::2]),
-            ("twice", sends(name, 3.0, 0.2)),
-        )
-    ),
-    *(
-        Case("signals", f"{name} and once more", WORKING, statuses=(status, 0), act=sends(name, 4.0), then=AGAIN)
-        for name, status in CRUEL.items()
-    ),
+    Case("arguments", "an owner that is a path", "package --out out/p --owner ../x", statuses=REFUSED),
+    *signals(),
 ]

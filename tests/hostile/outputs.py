@@ -4,34 +4,31 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
-from attack import REFUSED, Case, nothing
-from journals import damaged
-from room import SUBMIT
+from attack import Case, Make, nothing
+from room import SUBMIT, makes, options, resumed
 
-INPUTS = {
-    "the table": "--output D/test.csv",
-    "an image": "--output D/test_images/b1/x.png",
-    "the report's place": "--output out/s.html --report out/s.html",
-    "a name that ends as work directories do": "--output out/q.work",
-    "a name of 300 characters": f"--output out/{'s' * 300}.csv",
-    "below /proc": "--output /proc/s.csv",
+REFUSALS = {
+    "the table": "D/test.csv",
+    "an image": "D/test_images/b1/x.png",
+    "the report's place": "out/s.html --report out/s.html",
+    "a name that ends as work directories do": "out/q.work",
+    "a name of 300 characters": f"out/{'s' * 300}.csv",
+    "below /proc": "/proc/s.csv",
     "the submission in the lock's place": "--work-dir out --output out/journal.lock",
-    "the full device": "--output /dev/full",
-    "the journal among the images": "--output out/s.csv --work-dir D/test_images",
+    "the full device": "/dev/full",
+    "the journal among the images": "out/s.csv --work-dir D/test_images",
 }
-ODD = {
-    "a name with a line feed": "--output 'out/a\nb.csv'",
-    "directories that are not there": "--output out/a/b/c/d/s.csv",
+IN_THE_WAY: dict[str, Make] = {
+    "a link to the table": lambda room: (room / "out/s.csv").symlink_to("../D/test.csv"),
+    "a hard link to the table": lambda room: os.link(room / "D/test.csv", room / "out/s.csv"),
+    "a pipe for the journal's directory": lambda room: os.mkfifo(room / "out/s.work"),
+    "a directory for the report": lambda room: (room / "out/s.html").mkdir(),
 }
-IN_THE_WAY: dict[str, tuple[Callable[[Path], object], tuple[int, ...]]] = {
-    "a link to the table": (lambda path: path.symlink_to("../D/test.csv"), REFUSED),
-    "a hard link to the table": (lambda path: os.link(path.parent.parent / "D" / "test.csv", path), REFUSED),
-    "a pipe for the journal's directory": (lambda path: os.mkfifo(path.with_suffix(".work")), REFUSED),
-    "a directory for the report": (lambda path: path.with_suffix(".html").mkdir(), REFUSED),
-    "a link to itself": (lambda path: path.symlink_to(path), (0,)),
-    "a pipe": (os.mkfifo, (0,)),
-    "a pipe for the partial file": (lambda path: os.mkfifo(path.with_name(".s.csv.part")), (0,)),
-    "a pipe for the report": (lambda path: os.mkfifo(path.with_suffix(".html")), (0,)),
+REPLACED: dict[str, Make] = {
+    "a link to itself": lambda room: (room / "out/s.csv").symlink_to("s.csv"),
+    "a pipe": lambda room: os.mkfifo(room / "out/s.csv"),
+    "a pipe for the partial file": lambda room: os.mkfifo(room / "out/.s.csv.part"),
+    "a pipe for the report": lambda room: os.mkfifo(room / "out/s.html"),
 }
 FIGURES = {
     "a photograph's name without its suffix": "D/test_images/b1/x",
@@ -43,7 +40,22 @@ FIGURES = {
     "the full device": "/dev/full",
     "the screen": "/dev/stdout",
 }
-DEMOS: dict[str, Callable[[Path], object]] = {  # in the folder U of the user
+DEMOS = {
+    "a name of 300 characters": f"--out out/{'d' * 300}",
+    "a file": "--out quick.toml",
+    "below a file": "--out quick.toml/d",
+    "below /proc": "--out /proc/d",
+    "a seed below none": "--out out/d --seed -1",
+    "a seed of 5,000 digits": f"--out out/d --seed {'9' * 5000}",
+}
+
+
+def mine(path: Path) -> None:
+    path.parent.mkdir(exist_ok=True)
+    path.write_text("mine")
+
+
+DEMOS_OVER: dict[str, Callable[[Path], object]] = {  # in the folder U of the user
     "a train side of the user's": lambda folder: mine(folder / "train" / "scaling_factors.csv"),
     "a truth of the user's": lambda folder: mine(folder / "test_truth.csv"),
     "a link to a train side": lambda folder: (folder / "train").symlink_to("../D"),
@@ -51,7 +63,7 @@ DEMOS: dict[str, Callable[[Path], object]] = {  # in the folder U of the user
     "a pipe for the mark": lambda folder: os.mkfifo(folder / "demo.txt"),
     "another mark": lambda folder: [mine(folder / "demo.txt"), mine(folder / "test_truth.csv")],
 }
-EXPORTS: dict[str, Callable[[Path], object]] = {
+EXPORTS_OVER: dict[str, Callable[[Path], object]] = {
     "a table of the user's": lambda folder: mine(folder / "pairs.csv"),
     "a link to an image": lambda folder: (folder / "units.csv").symlink_to("../D/test_images/b1/x.png"),
     "a link to the journal": lambda folder: (folder / "regions.csv").symlink_to("../out/s.work/journal.sqlite"),
@@ -62,48 +74,31 @@ EXPORTS: dict[str, Callable[[Path], object]] = {
 }
 
 
-def mine(path: Path) -> None:
-    path.parent.mkdir(exist_ok=True)
-    path.write_text("mine")
+def in_folder(table: dict[str, Callable[[Path], object]]) -> dict[str, Make]:
+    """Return how to put the results of a finished run, and a folder U of the user, into the room."""
+
+    def making(make: Callable[[Path], object]) -> Make:
+        return resumed(lambda room: [(room / "U").mkdir(), make(room / "U")])
+
+    return {name: making(make) for name, make in table.items()}
 
 
-def in_folder(make: Callable[[Path], object]) -> Callable[[Path], None]:
-    """The results of a finished run, and a folder U of the user."""
-
-    def write(room: Path) -> None:
-        damaged(nothing)(room)
-        (room / "U").mkdir()
-        make(room / "U")
-
-    return write
-
-
-def placed(make: Callable[[Path], object]) -> Callable[[Path], None]:
-    return lambda room: nothing(make(room / "out" / "s.csv"))
-
-
-MATCH = "match D/test_images/b1/x.png D/test_images/b1/y.png --recipe quick.toml"
+MATCH = "match D/test_images/b1/x.png D/test_images/b1/y.png --recipe quick.toml --out"
 EXPORT = "journal out/s.work --csv"
-PLAIN = SUBMIT.replace("--output out/s.csv --no-report ", "")
-ASCII, C = {"PYTHONIOENCODING": "ascii"}, {"LC_ALL": "C"}
+TO = SUBMIT.replace("out/s.csv --no-report ", "") + " --output"
+ODD = {"a line feed": "'out/a\nb.csv'", "new directories": "out/a/b/c/d/s.csv"}
 CASES = [
-    *(Case("outputs", name, f"{PLAIN} {options}", statuses=REFUSED) for name, options in INPUTS.items()),
-    *(Case("outputs", name, f"{PLAIN} {options}", submission=False) for name, options in ODD.items()),
-    *(
-        Case("outputs", f"there is {name}", f"{PLAIN} --output out/s.csv", placed(make), statuses)
-        for name, (make, statuses) in IN_THE_WAY.items()
-    ),
-    *(Case("figures", name, f"{MATCH} --out {out}", statuses=REFUSED) for name, out in FIGURES.items()),
-    Case("figures", "capitals", f"{MATCH} --out out/a.PNG"),
-    *(Case("demos", name, "demo --out U", in_folder(make), REFUSED, "in the way") for name, make in DEMOS.items()),
-    Case("demos", "a name of 300 characters", f"demo --out out/{'d' * 300}", statuses=REFUSED),
-    Case("demos", "a seed of 5,000 digits", f"demo --out out/d --seed {'9' * 5000}", statuses=REFUSED),
+    *options("outputs", TO, REFUSALS),
+    *options("outputs", TO, ODD, (0,), submission=False),
+    *makes("outputs", f"{TO} out/s.csv", IN_THE_WAY),
+    *makes("outputs", f"{TO} out/s.csv", REPLACED, (0,)),
+    Case("outputs", "text that the terminal has not", f"{TO} out/s.csv", env={"PYTHONIOENCODING": "ascii"}),
+    Case("outputs", "the C locale", f"{TO} out/\u00e9.csv", env={"LC_ALL": "C"}, submission=False),
+    *options("figures", MATCH, FIGURES),
+    Case("figures", "capitals", f"{MATCH} out/a.PNG"),
+    *options("demos", "demo", DEMOS),
+    *makes("demos", "demo --out U", in_folder(DEMOS_OVER), says="in the way"),
     Case("demos", "given again", "demo --out out/d", then="demo --out out/d --seed 1"),
-    *(
-        Case("exports", name, f"{EXPORT} U", in_folder(make), REFUSED, "is no such table")
-        for name, make in EXPORTS.items()
-    ),
-    Case("exports", "given again", f"{EXPORT} out/t", damaged(nothing), then=f"{EXPORT} out/t"),
-    Case("outputs", "text that the terminal has not", f"{PLAIN} --output out/s.csv", env=ASCII),
-    Case("outputs", "the C locale", f"{PLAIN} --output out/\u00e9.csv", env=C, submission=False),
+    *makes("exports", f"{EXPORT} U", in_folder(EXPORTS_OVER), says="is no such table"),
+    Case("exports", "given again", f"{EXPORT} out/t", resumed(nothing), then=f"{EXPORT} out/t"),
 ]

@@ -6,37 +6,34 @@ import zlib
 from collections.abc import Callable
 from pathlib import Path
 
-from attack import Case, prepared
+from attack import Case, Make, prepared
 from images import chunk
-from room import SUBMIT, encoded, picture
+from room import IMAGES_TO, REPORTED, SUBMIT, encoded, picture
 
 HEAD = 33  # bytes of a PNG's signature and first chunk
-COMPLAINTS: dict[str, Callable[[int], bytes]] = {
-    "a colour profile that is too short": lambda n: with_chunk(b"iCCP", b"x\0\0" + zlib.compress(b"bad"), n),
-    "bytes between a photograph's restarts": lambda n: jpeg_with(b"\xff\xd0", n),
-}
-JOURNAL, FOLDER = "journal out/s.work --report out/r.html --test-dir D", "D/test_images/b1"
+FOLDER = "D/test_images/b1"
+JOURNAL = "journal out/s.work --report out/r.html --test-dir D"
 COMMANDS = {
     "submit in its own process": SUBMIT,
     "submit in a worker": SUBMIT.replace("--workers 0", "--workers 1"),
-    "submit with a report": SUBMIT.replace(" --no-report", ""),
-    "reconstruct": f"reconstruct {FOLDER} --recipe quick.toml --workers 1 --time-limit 5m --out out/o",
+    "submit with a report": REPORTED,
+    "reconstruct": IMAGES_TO.replace("I", FOLDER, 1).replace("--workers 0", "--workers 1") + " out/o",
     "match": f"match {FOLDER}/x.png {FOLDER}/y.png --recipe quick.toml --out out/p.png",
     "a page from a journal": JOURNAL,
 }
 
 
-def with_chunk(kind: bytes, data: bytes, number: int) -> bytes:
+def short_profile(number: int) -> bytes:
     whole = encoded(".png", picture(12 * number))
-    return whole[:HEAD] + chunk(kind, data) + whole[HEAD:]
+    return whole[:HEAD] + chunk(b"iCCP", b"x\0\0" + zlib.compress(b"bad")) + whole[HEAD:]
 
 
-def jpeg_with(data: bytes, number: int) -> bytes:
+def extra_restart(number: int) -> bytes:
     whole = encoded(".jpg", picture(12 * number))
-    return whole[: len(whole) // 2] + data + whole[len(whole) // 2 :]
+    return whole[: len(whole) // 2] + b"\xff\xd0" + whole[len(whole) // 2 :]
 
 
-def complained_of(make: Callable[[int], bytes], command: str) -> Callable[[Path], None]:
+def complained_of(make: Callable[[int], bytes], command: str) -> Make:
     def write(room: Path) -> None:
         for number, name in enumerate("xyz"):
             (room / FOLDER / f"{name}.png").write_bytes(make(number))
@@ -54,6 +51,10 @@ def full_pipe() -> int:
     return pipe
 
 
+COMPLAINTS = {
+    "a colour profile that is too short": short_profile,
+    "bytes between a photograph's restarts": extra_restart,
+}
 CASES = [
     Case("unread", f"{name}: {complaint}", command, complained_of(make, command), (0, 1), stderr=full_pipe)
     for complaint, make in COMPLAINTS.items()

@@ -6,7 +6,7 @@ from functools import cache, partial
 import numpy as np
 import torch
 from dense_stages import batch_of, resized_by_pil
-from golden import Stage, golden_arrays, recorded, standin_state, tolerance_of
+from golden import Stage, Within, compared, golden_arrays, in_order, recorded, standin_state
 from sparse_stages import assignment_values
 
 from mkpc_kaggle.geometry.coordinates import Size
@@ -21,7 +21,7 @@ from mkpc_kaggle.matchers.networks.placement import prepared
 from mkpc_kaggle.weights import load_into
 
 TOLERANCES = {"score_map": 1e-4, "keypoints": 1e-6, "dense_descriptors": 2e-4, "descriptors": 2e-4}
-TOLERANCES |= {"similarity": 1e-3, "scores": 1e-4, "matching_scores": 1e-4}
+TOLERANCES |= {"similarity": 1e-3, "scores": 1e-4, "matching_scores": 1e-4, ".*_probs": Within(relative=1e-4)}
 
 
 @cache
@@ -51,24 +51,8 @@ def filled(network, tensors, part):
 
 def image_of(pixels):
     """(..., H, W, 3) uint8 -> (B, 3, H, W) in 0..1."""
-    return (
-        torch.from_numpy((pixels.numpy() / 255).astype(np.float32))
-        .reshape(-1, *pixels.shape[-3:])
-        .permute(0, 3, 1, 2)
-    )
-
-
-def compared(values, golden):
-    """Stages for all values that the golden file has; not all have dense probabilities."""
-    batched = golden.get("image", torch.zeros(0)).ndim == 4
-    for name, value in values.items():
-        if name == "dense_probs" and name not in golden:
-            continue
-        got, expected = value if batched else value[0], golden[name]
-        if name.endswith("probs"):
-            yield Stage(name, got / expected, torch.ones_like(expected), 1e-4)
-        else:
-            yield Stage(name, got.reshape(expected.shape), expected, tolerance_of(name, TOLERANCES))
+    image = torch.from_numpy((pixels.numpy() / 255).astype(np.float32))
+    return image.reshape(-1, *pixels.shape[-3:]).permute(0, 3, 1, 2)
 
 
 def detector_values(detector, images, number):
@@ -105,9 +89,8 @@ def matcher_values(matcher, image0, image1, threshold):
 
 def detector_stages(case):
     golden = golden_arrays("loma", f"detector_{case}")
-    number = golden["keypoints"].shape[-2]
-    values = detector_values(detector(), image_of(golden["image"]), number)
-    yield from compared(values, golden)
+    values = detector_values(detector(), image_of(golden["image"]), golden["keypoints"].shape[-2])
+    yield from compared(values, golden, TOLERANCES)
 
 
 def sampling_stages():
@@ -117,9 +100,9 @@ def sampling_stages():
         rows = torch.cat([found.points, found.scores[:, None]], dim=1)
         expected = torch.cat([golden[f"{name}_keypoints"], golden[f"{name}_probs"][:, None]], dim=1)
         if name == "ties":
-            rows, expected = (torch.tensor(sorted(of.tolist())) for of in (rows, expected))
+            rows, expected = in_order(rows), in_order(expected)
         yield Stage(f"{name} points", rows[:, :2], expected[:, :2], 1e-6)
-        yield Stage(f"{name} scores", rows[:, 2] / expected[:, 2], torch.ones(len(expected)), 1e-4)
+        yield Stage(f"{name} scores", rows[:, 2], expected[:, 2], Within(relative=1e-4))
 
 
 def resize_stages():
@@ -146,7 +129,7 @@ def resize_stages():
 def descriptor_stages(variant, case):
     golden = golden_arrays("loma", f"descriptor_{case}")
     values = descriptor_values(descriptor(variant), image_of(golden["image"]), golden["keypoints"][None])
-    yield from compared(values, golden)
+    yield from compared(values, golden, TOLERANCES)
 
 
 def position_stages():
@@ -170,7 +153,7 @@ def matcher_stages(case):
         for threshold in others:
             values |= assignment_values(log_plan, threshold, f"_threshold{threshold}")
         assert {name for name in golden if name.startswith("matches")} <= values.keys()
-        yield from compared(values, arrays)
+        yield from compared(values, arrays, TOLERANCES)
 
 
 @cache
@@ -195,17 +178,13 @@ def pipeline_stages(case, variant):
         keypoints = network.encode(*seen, number)
         (detected,) = network.detector(seen[0], number)
         found.append(keypoints)
-        mine = {"keypoints": keypoints.points, "keypoint_probs": detected.scores}
-        mine["descriptors"] = keypoints.descriptors
-        theirs = {name: golden[f"{name}{index}"] for name in mine}
-        mine["keypoint_probs"] = mine["keypoint_probs"] / theirs["keypoint_probs"]
-        theirs["keypoint_probs"] = torch.ones_like(theirs["keypoint_probs"])
-        for name, tolerance in (("keypoints", 1e-6), ("keypoint_probs", 1e-4), ("descriptors", 2e-4)):
-            yield Stage(f"{name}{index}", mine[name], theirs[name], tolerance)
+        values = {"keypoints": keypoints.points, "keypoint_probs": detected.scores}
+        values |= {"descriptors": keypoints.descriptors}
+        yield from compared(values, golden, TOLERANCES, suffix=index)
     threshold = float(golden["threshold"])
-    for name, value in matcher_values(network.matcher, *found, threshold).items():
-        if name.startswith(("matches", "matching")):
-            yield Stage(name, value[0], golden[name], 4e-4 if "scores" in name else 0)
+    values = matcher_values(network.matcher, *found, threshold)
+    assigned = {name: value for name, value in values.items() if name.startswith("match")}
+    yield from compared(assigned, golden, {"matching_scores": 4e-4})
     matches = network.matcher(*found, threshold)
     points = []
     for index, of in enumerate((matches.index0, matches.index1)):

@@ -178,6 +178,17 @@ def test_what_was_removed_of_the_results_is_made_again(tmp_path):
         assert matcher.calls == []
 
 
+def test_an_image_that_was_absent_for_a_run_comes_back_with_the_former_files(tmp_path):
+    root, out = write_flat(tmp_path / "images", 4), tmp_path / "out"
+    run(root, out)
+    before = contents(out)
+    (root / "03.png").rename(tmp_path / "away.png")
+    run(root, out)
+    (tmp_path / "away.png").rename(root / "03.png")
+    run(root, out)
+    assert contents(out) == before
+
+
 def test_a_folder_in_the_folder_is_a_dataset_and_files_of_one_content_share_a_camera(tmp_path):
     write_flat(tmp_path / "images" / "a", 5)
     (tmp_path / "images" / "a" / "copy.png").write_bytes((tmp_path / "images" / "a" / "00.png").read_bytes())

@@ -1,9 +1,11 @@
 """Golden vectors beside the repository, ``../shared/golden``; tests that need them are skipped without them."""
 
 import importlib.util
+import re
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -78,40 +80,58 @@ def _module(path):
     return module
 
 
+@dataclass(frozen=True)
+class Within:
+    """The allowed difference: a number, plus a part of each value, plus a part of the largest value."""
+
+    absolute: float = 0.0
+    relative: float = 0.0
+    share: float = 0.0
+
+    def of(self, expected):
+        sizes = expected.double().abs()
+        return self.absolute + self.relative * sizes + self.share * (sizes.max() if sizes.numel() else 0)
+
+
+Tolerances = Mapping[str, float | Within]  # by patterns of names; of others the difference must be 0
+
+
 class Stage(NamedTuple):
-    """What a network computed at one stage, what it should be, and by how much they may differ at most."""
+    """The value that a network computed at one stage, the expected value, and their allowed difference."""
 
     name: str
     got: torch.Tensor
     expected: torch.Tensor
-    tolerance: float = 0
+    within: float | Within = 0.0
 
     @property
-    def difference(self):
-        """Infinite if shapes or kinds differ or a value is not finite."""
+    def excess(self):
+        """Return by how much the difference exceeds the allowed one: infinite for other shapes, kinds, or NaN."""
         got, expected = self.got, self.expected
         alike = got.shape == expected.shape and got.is_floating_point() == expected.is_floating_point()
         if not alike or not got.isfinite().all():
             return float("inf")
-        return (got.double() - expected.double()).abs().max().item() if got.numel() else 0.0
+        within = self.within if isinstance(self.within, Within) else Within(self.within)
+        excess = (got.double() - expected.double()).abs() - within.of(expected)
+        return excess.max().item() if got.numel() else 0.0
+
+
+def compared(values, golden, tolerances: Tolerances, suffix=""):
+    """Yield a stage for each value that the golden file has; batches of one may have no axis there."""
+    names = [name for name in values if f"{name}{suffix}" in golden]
+    assert len(names) >= 2
+    for name in names:
+        expected = golden[f"{name}{suffix}"]
+        within = next((value for pattern, value in tolerances.items() if re.match(pattern, name)), 0.0)
+        yield Stage(f"{name}{suffix}", values[name].reshape(expected.shape), expected, within)
+
+
+def in_order(rows):
+    """Return the rows (N, D) in lexicographic order, for choices whose order does not count."""
+    return torch.tensor(sorted(rows.tolist()))
 
 
 def assert_stages(stages: Iterable[Stage]):
     """All stages within their tolerances; the message starts with the first stage that is off."""
-    off = [stage for stage in stages if stage.difference > stage.tolerance]
-    assert not off, "; ".join(f"{stage.name} is off by {stage.difference:.2g}" for stage in off)
-
-
-def tolerance_of(name, tolerances):
-    """Return the tolerance of the entry's prefix, 0 if it has none: then it must agree exactly."""
-    return next((tolerance for prefix, tolerance in tolerances.items() if name.startswith(prefix)), 0.0)
-
-
-def compared(values, golden, tolerances):
-    """Yield a stage for each value that the golden file has."""
-    names = [name for name in values if name in golden]
-    assert len(names) >= 2
-    yield from (
-        Stage(name, values[name].reshape(golden[name].shape), golden[name], tolerance_of(name, tolerances))
-        for name in names
-    )
+    off = [stage for stage in stages if stage.excess > 0]
+    assert not off, "; ".join(f"{stage.name} exceeds its tolerance by {stage.excess:.2g}" for stage in off)

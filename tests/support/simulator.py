@@ -7,6 +7,7 @@ crash, run out of memory and hang as well.
 
 import math
 import threading
+import weakref
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -398,6 +399,8 @@ def memory_journal() -> Journal:
     with TemporaryDirectory() as directory:
         journal = Journal(Path(directory))
         journal.continue_in_memory()
+        for connection in (journal._file, journal._lock, journal._db):
+            weakref.finalize(journal, connection.close)  # since 3.13, Python warns of open connections
         return journal
 
 

@@ -1,0 +1,109 @@
+"""Something else in the place of each file that a command reads."""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+from attack import EITHER, REFUSED, Case
+from room import (
+    HEADER,
+    INSTEAD,
+    RECIPE,
+    RECONSTRUCT,
+    REPORTED,
+    SUBMIT,
+    TABLE,
+    UNIT,
+    makes,
+    replaced,
+    resumed,
+    written,
+)
+from weight_bombs import AUTO, CONVERT, NAME, SEARCH
+
+READ: dict[str, tuple[str, tuple[int, ...]]] = {  # by its path: what reads it, and how that may end
+    "D/test.csv": (SUBMIT, REFUSED),
+    "D/test_images/b1/x.png": (REPORTED, (0,)),
+    "quick.toml": (SUBMIT, REFUSED),
+    "I/0.png": (f"{RECONSTRUCT} --rotations", EITHER),
+    "pairs.txt": (f"{RECONSTRUCT} --pairs pairs.txt", REFUSED),
+    "a.pt": (CONVERT, REFUSED),
+    f"weights/deep/{NAME}": (AUTO, (0,)),
+    "weights/deep/weights_manifest.txt": (f"weights verify {SEARCH}", (0,)),
+    "truth.csv": ("validate --train-dir T --submission D/test.csv --truth truth.csv", REFUSED),
+    "T/scaling_factors.csv": ("validate --train-dir T --recipe quick.toml --workers 0", REFUSED),
+    "out/s.work/journal.sqlite": (SUBMIT, REFUSED),
+    "out/s.work/journal.lock": (SUBMIT, REFUSED),
+}
+ROW = "b1;x-y,b1,x,y\n"
+TABLES = {
+    "a batch further above": HEADER + "1,../../etc,x,y\n",
+    "UTF-16": TABLE.encode("utf-16"),
+    "bytes that are not UTF-8": TABLE.encode().replace(b"x-y", b"\xff\xfe"),
+    "a hundred thousand columns": HEADER.strip() + ",c" * 100_000 + "\n" + ROW,
+    "a cell of 10 MB": HEADER + "1,b1,x,y\n2,b1,x," + "y" * 10_000_000 + "\n",
+}
+GOOD_TABLES = {
+    "a byte order mark": b"\xef\xbb\xbf" + TABLE.encode(),
+    "lines of another system": TABLE.replace("\n", "\r\n"),
+    "a very long sample id": HEADER + "s" * 100_000 + ",b1,x,y\n",
+    "a batch id of 5,000 characters": HEADER + "1," + "b" * 5000 + ",x,y\n2,b1,x,y\n",
+}
+NO_IMAGES = HEADER + "".join(f"{n},b1,p{n},q{n}\n" for n in range(5000))
+ACCENTED = written("D/test.csv", HEADER + "1,\u00e9,x,y\n2,b1,x,y\n")
+C = {"LC_ALL": "C", "PYTHONUTF8": "0"}
+RECIPES = {  # tests/test_recipe.py has the values that are out of range
+    "a size of 5,000 digits": RECIPE.replace("200", "9" * 5000),
+    "a module that is not a matcher": RECIPE.replace("sift", "registry"),
+    "deep lists": "units = " + "[" * 100_000,
+    "deep tables": "units = " + "{a=" * 20_000,
+    "10,000 units": f"units = [{10_000 * (UNIT.format(1) + ',')}]",
+}
+GOOD_RECIPES = {
+    "a byte order mark": "\ufeff" + RECIPE,
+    "lines of another system": RECIPE.replace("\n", "\r\n"),
+    "a million comments": "# nothing\n" * 1_000_000 + RECIPE,
+}
+IMAGES: dict[str, Callable[[Path], object]] = {
+    "a link to another image": lambda path: path.symlink_to(path.with_name("z.png")),
+    "a name in another case": lambda path: path.with_name("X.PNG").write_bytes(
+        path.with_name("z.png").read_bytes()
+    ),
+}
+
+
+def tables_of(name: str, texts: dict[str, bytes | str]) -> dict[str, Callable[[Path], None]]:
+    return {what: written(name, text) for what, text in texts.items()}
+
+
+def unpacked(path: Path) -> None:
+    (path / "data").mkdir(parents=True)
+    (path / "data.pkl").write_bytes(b"\x80\x02}.")
+    os.mkfifo(path / "data" / "0")
+
+
+def halve(room: Path) -> None:
+    path = room / "out/s.work/journal.sqlite"
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+CASES = [
+    *(
+        Case("files", f"{name} is {what}", command, resumed(replaced(name, make)), statuses)
+        for name, (command, statuses) in READ.items()
+        for what, make in INSTEAD.items()
+    ),
+    *makes("journals", SUBMIT, {"its first half, resumed": resumed(halve)}),
+    *makes("journals", f"{SUBMIT} --fresh", {"its first half, forgotten": resumed(halve)}, (0,)),
+    *makes("journals", "journal out/s.work --csv out/t", {"its first half, read": resumed(halve)}),
+    *makes("files", CONVERT, {"a.pt is a directory of a pipe": replaced("a.pt", unpacked)}),
+    *makes(
+        "files", SUBMIT, {name: replaced("D/test_images/b1/x.png", make) for name, make in IMAGES.items()}, (0,)
+    ),
+    *makes("tables", SUBMIT, tables_of("D/test.csv", TABLES)),
+    *makes("tables", SUBMIT, tables_of("D/test.csv", GOOD_TABLES), (0,)),
+    Case("tables", "5,000 pairs of no images", SUBMIT, written("D/test.csv", NO_IMAGES), (1,)),
+    Case("tables", "a batch that the locale lacks", SUBMIT, ACCENTED, says="1 of 2 pairs", env=C),
+    *makes("recipes", SUBMIT, tables_of("quick.toml", RECIPES)),
+    *makes("recipes", SUBMIT, tables_of("quick.toml", GOOD_RECIPES), (0,)),
+]
