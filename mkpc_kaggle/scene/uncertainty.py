@@ -15,7 +15,7 @@ from mkpc_kaggle.geometry.two_view import cross_matrix
 from mkpc_kaggle.scene.reconstruction import Sigmas
 
 MAX_IMAGES = 200  # of a model: memory grows with the square of their number, and time with its cube
-DAMPING = 1e-3  # the world is free, so the normal equations are singular
+DAMPED = pycolmap.BACovarianceOptions({"damping": 1e-3})  # the world is free: the normal equations are singular
 
 
 def camera_sigmas(found: Any) -> dict[str, Sigmas]:
@@ -31,8 +31,7 @@ def camera_sigmas(found: Any) -> dict[str, Sigmas]:
     adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, found)
     fit = cast(Any, adjuster.solve()).ceres_summary
     redundancy = fit.num_residuals - fit.num_effective_parameters + 7
-    damped = pycolmap.BACovarianceOptions({"damping": DAMPING})
-    solved: Any = pycolmap.estimate_ba_covariance(damped, found, adjuster)
+    solved: Any = pycolmap.estimate_ba_covariance(DAMPED, found, adjuster)
     if redundancy <= 0 or solved is None:
         return {}
     ids, cameras = [image.image_id for image in images], [image.camera for image in images]
@@ -41,26 +40,20 @@ def camera_sigmas(found: Any) -> dict[str, Sigmas]:
     variances = _pose_variances([image.cam_from_world().matrix() for image in images], poses)
     noise = 2 * fit.initial_cost / redundancy  # variance of a keypoint's coordinate, square pixels
     sigmas = np.sqrt(noise * np.column_stack([variances, focals])) * [np.degrees(1), 1, 100]
-    # Rounded, since the last digits differ between calls.
-    rows = [Sigmas(*(float(f"{value:.4g}") for value in row)) for row in sigmas]
+    rows = [Sigmas(*(float(f"{value:.4g}") for value in row)) for row in sigmas]  # later digits vary between calls
     return {image.name: row for image, row in zip(images, rows, strict=True)}
 
 
 def _pose_variances(poses: list[NDArray[np.float64]], covariance: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the variances of rotations, radians, and of centres, in model sizes: (N, 2).
-
-    ``poses`` are [R | t]; ``covariance`` refers to COLMAP's parameters, half angles and t.
-    """
+    """Return variances of rotations, radians, and of centres, in model sizes: (N, 2); ``poses`` are [R | t]."""
     centres = np.array([-pose[:, :3].T @ pose[:, 3] for pose in poses])
     centres -= centres.mean(axis=0)
     size = np.sqrt((centres**2).sum(axis=1).mean())
     moves, similarities = [], []  # Jacobians of angles and centres: by the pose, and by a similarity of the world
     for pose, centre in zip(poses, centres / size, strict=True):
-        R, t = pose[:, :3], pose[:, 3]
+        R, t, zero = pose[:, :3], pose[:, 3], np.zeros((3, 4))  # COLMAP's parameters are half angles and t
         moves.append(np.vstack([2 * np.eye(3, 6), -R.T @ np.hstack([2 * cross_matrix(t), np.eye(3)]) / size]))
-        similarities.append(
-            np.block([[-R, np.zeros((3, 4))], [-cross_matrix(centre), np.eye(3), centre[:, None]]])
-        )
+        similarities.append(np.block([[-R, zero], [-cross_matrix(centre), np.eye(3), centre[:, None]]]))
     basis, _ = np.linalg.qr(np.vstack(similarities))
     change = block_diag(*moves)
     change -= basis @ (basis.T @ change)
