@@ -33,7 +33,7 @@ def from_table(cls: type[Config], table: Mapping[str, Any], where: str) -> Confi
 
 
 def check_keys(table: Mapping[str, Any], known: Iterable[str], where: str) -> None:
-    """Raise :class:`UserError` if ``table`` is not a table, or for its first unknown key."""
+    """Raise :class:`UserError` if ``table`` is not a TOML table or has an unknown key."""
     if not isinstance(table, Mapping):
         raise UserError(f"{where} must be a table, not {table!r}")
     for key in table:

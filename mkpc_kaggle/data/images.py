@@ -184,7 +184,7 @@ class ImageStore:
                 self._pending[path] = self._decoder.submit(read_image, path)
 
     def get(self, path: Path) -> Image | Unreadable:
-        """Return the image. Wait until it is decoded."""
+        """Wait until the image is decoded, then return it."""
         self.prefetch([path])
         image = self._images.get(path) or self._pending.pop(path).result()
         if isinstance(image, Image):

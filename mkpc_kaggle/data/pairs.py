@@ -68,11 +68,11 @@ def read_pairs(file: Path, image_root: Path, *, most: int | None = None) -> Trai
 
 
 def read_regions(file: Path, image_root: Path, pairs: Iterable[Pair]) -> dict[tuple[str, ...], tuple[Box, Box]]:
-    """Return the stage-2 boxes of these pairs, by the files of their images.
+    """Return the stage-2 boxes of these pairs, keyed by their image files.
 
     ``file`` is a table ``image_0,image_1,box_0,box_1``: paths under the root; left, top, right and bottom in whole
     pixels of the stored file, the latter two exclusive. Raises :class:`UserError` for a malformed table or box and
-    for a missing pair. A unit fails where a box leaves its image.
+    for a missing pair. A unit fails on a pair if a box extends beyond its image.
     """
     boxes = {}
     for where, (name0, name1, *cells) in read_rows(file, ("image_0", "image_1", "box_0", "box_1")):

@@ -98,7 +98,7 @@ def visible_mask(
 def covisibility(
     first: SizedCamera, first_depth: FloatImage, second: SizedCamera, second_depth: FloatImage
 ) -> float:
-    """Return the smaller of the shares of either view visible in the other: symmetric, in [0, 1]."""
+    """Return the smaller of two fractions, each of a view that is visible in the other: symmetric, in [0, 1]."""
     ways = ((first, first_depth, second, second_depth), (second, second_depth, first, first_depth))
     return min(float(visible_mask(*way, STEP_PX).mean()) for way in ways)
 

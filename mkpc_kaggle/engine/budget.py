@@ -71,7 +71,7 @@ class Budget:
 
     @property
     def silence(self) -> float:
-        """Seconds more than expected that an answer may take before its worker is thought to hang."""
+        """Seconds beyond the expected ones after which a worker without an answer hangs."""
         return min(MAX_SILENCE_S, max(MIN_SILENCE_S, SILENCE_SHARE * self.time_limit))
 
     @property
@@ -99,7 +99,7 @@ class Budget:
 
 
 def monotonic_of(epoch: float) -> float:
-    """The monotonic clock's time at a moment of the wall clock, in seconds since 1970.
+    """Return the monotonic clock's time at wall-clock time ``epoch``, in seconds since 1970.
 
     Called once, when a run starts: however the wall clock jumps later, the run's limit does not move. A moment
     less than a minute ahead counts as now, because the clock was set back meanwhile. Raises :class:`UserError` for

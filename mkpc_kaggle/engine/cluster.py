@@ -53,7 +53,7 @@ class RayCluster:
 
 
 def parse_workers(text: str) -> int | RayCluster:
-    """What the user wrote; raises :class:`UserError` that lists the forms for anything else."""
+    """Parse the value of ``--workers``. Raise :class:`UserError` with the accepted forms for any other text."""
     if re.fullmatch(r"\d{1,3}", text):
         return int(text)
     if text == "ray":
@@ -173,7 +173,7 @@ def make_alike(make: Callable[[], Runner], version: str, paths: tuple[Path, ...]
 
 
 def join(ray: Any, cluster: RayCluster) -> None:
-    """Connect to the cluster; raises :class:`UserError` where that fails."""
+    """Connect to the cluster. Raise :class:`UserError` if that fails."""
     options: dict[str, Any] = {"include_dashboard": False}
     if cluster.address:
         cluster.require_reachable()

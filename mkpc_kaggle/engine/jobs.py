@@ -56,7 +56,7 @@ class MatchJob:
 
 @dataclass(frozen=True, eq=False)
 class PairPoints:
-    """The current points of a pair: ``units`` with the revisions of their rows, in the recipe's order."""
+    """References to a pair's current points: ``units`` with the revisions of their rows, in the recipe's order."""
 
     index: int
     images: tuple[BatchImage, BatchImage]
@@ -142,7 +142,7 @@ class Found:
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """What a job found on a pair. ``failure`` says which image cannot be read."""
+    """What a job found for a pair. ``failure`` says which image cannot be read."""
 
     index: int
     images: tuple[BatchImage, ...] = ()

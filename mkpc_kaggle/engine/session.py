@@ -47,7 +47,7 @@ class Interrupt(threading.Event):
 
     @contextmanager
     def raising(self) -> Iterator[None]:
-        """Answer a signal with ``KeyboardInterrupt`` of its number: for work that does not look at the event."""
+        """Answer a signal with ``KeyboardInterrupt`` of its number, for work that does not check the event."""
         self._raises = True
         try:
             yield
@@ -207,13 +207,13 @@ def versions() -> dict[str, str]:
 
 
 class Watchdog:
-    """Leaves the process before the limit, the submission written, if the program has not ended by itself.
+    """Writes the submission and ends the process before the limit, if the program has not ended by itself.
 
-    A thread does it, so that it helps wherever the others are stuck, short of holding the interpreter's lock:
-    that only a matcher in the program's own process can do. Worker processes are ended with it.
+    It is a thread, so it works wherever other threads hang, unless one holds the GIL. Only a matcher in the
+    program's own process can do that. Worker processes end with the program.
 
-    ``save`` writes the submission, or says why it is not the last version; ``status`` is the exit status of a
-    program that is left while it tells what it has done.
+    ``save`` writes the submission, or returns why the file is not the last version. ``status`` is the exit status
+    if the watchdog ends the program during its final report.
     """
 
     def __init__(self, budget: Budget, interrupt: Interrupt) -> None:

@@ -53,7 +53,7 @@ def paired_difference(scenes: Sequence[Paired]) -> Difference:
 def _resampled_means(
     gains: NDArray[np.float64], images: Sequence[tuple[str, str]], generator: np.random.Generator
 ) -> NDArray[np.float64]:
-    """Return (RESAMPLES,) means of the gains, (P,), each under new random weights of the images."""
+    """Return the weighted means of the (P,) gains: (RESAMPLES,), one for each random draw of image weights."""
     _, ends = np.unique(np.array(images), return_inverse=True)
     ends = ends.reshape(-1, 2)
     table = np.zeros((2, ends.max() + 1, ends.max() + 1))  # sums of gains, and numbers of pairs, by their images

@@ -33,7 +33,7 @@ Parts = Mapping[str, Centres]  # the scenes of a dataset, or its clusters
 
 @dataclass(frozen=True)
 class DatasetScore:
-    """``maa`` is pooled over the dataset's scenes; ``clusterness`` is the share of right images in clusters."""
+    """``maa`` is pooled over the dataset's scenes; ``clusterness`` is the share of correct images in clusters."""
 
     dataset: str
     maa: float
@@ -118,7 +118,7 @@ def accurate_images(truth: Centres, cluster: Centres, thresholds: Sequence[float
 
 
 def residuals(source: Points, target: Points, fitted: NDArray[np.intp]) -> NDArray[np.float64]:
-    """Return each point's distance from its target, (B, N), under the similarity of ``fitted`` points, (B, K).
+    """Return (B, N) distances of points from targets, after the similarity transform of the ``fitted`` points.
 
     It is NaN if the fitted sources coincide.
 

@@ -1,6 +1,6 @@
-"""Run of the engine on pairs with known cameras, and its scores.
+"""Run the engine on pairs with known cameras, and score the results.
 
-A train side is scored by the rules of the competition, a list of pairs by the rules of SuperGlue and LoFTR.
+A train side is scored by the competition's rules, and a list of pairs by those of SuperGlue and LoFTR.
 """
 
 import json
@@ -122,9 +122,11 @@ class Validation:
 
 
 def by_protocol(recipe: Recipe, protocol: str) -> Recipe:
-    """Return the recipe with the settings of a protocol. A protocol also scores rotations ``in_front``.
+    """Return the recipe with the settings of a protocol. Scoring by a protocol also sets ``in_front``: the inliers
+    of an E select its rotation.
 
-    SuperGlue's threshold is in pixels of the resized picture, here the recipe's largest in stage 1.
+    SuperGlue's threshold is in pixels of the resized image, whose long side is the largest of
+    stage 1.
     """
     units = tuple(replace(unit, antialias=False) for unit in recipe.units)
     sides = [unit.long_side or max(map(int, unit.area.split("x"))) for unit in units if unit.stage == 1]

@@ -54,9 +54,9 @@ def unavailable(
     *,
     load: bool = False,
 ) -> dict[str, UnavailableReason]:
-    """Return the reasons why matchers of the recipe, fallbacks included, cannot run here, by name.
+    """Return, by name, why matchers of the recipe (fallbacks included) cannot run here.
 
-    ``own`` are the user's ready matchers. ``load`` loads weights of unknown digest to check that they are not
+    ``own`` has the user's matchers by name. ``load`` loads weights of unknown digest to check that they are not
     damaged. Raises :class:`UserError` for an unknown matcher or option.
     """
 
@@ -86,7 +86,7 @@ def unavailable(
 
 
 def refusal(recipe: Recipe, reasons: Mapping[str, UnavailableReason]) -> UserError:
-    """Return the error for a recipe that needs these matchers: the first kind of reason, and the remedy."""
+    """Return the error for a recipe with unavailable matchers: the first kind of reason, and the remedy."""
     first, kind = next((name, reason.kind) for name, reason in reasons.items())
     those = "; ".join(f"{name} ({reason.detail})" for name, reason in reasons.items() if reason.kind is kind)
     if kind is UnavailableKind.NOT_PERMITTED:

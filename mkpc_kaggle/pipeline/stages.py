@@ -203,7 +203,7 @@ def views_of(unit: Unit, multiple: int, pair: PairMatch) -> tuple[View, View]:
 
 
 def with_regions(pair: PairMatch, recipe: Recipe, given: GivenRegions = MappingProxyType({})) -> PairMatch:
-    """Return the pair with the critical region of each image: given, or from the matches of stage 1."""
+    """Return the pair with each image's critical region: the user's, or that of the matches of stage 1."""
     if (boxes := given.get(tuple(image.name for image in pair.images))) is not None:
         first, second = (CriticalRegion(box, RegionReason.GIVEN) for box in boxes)
         return replace(pair, regions=(first, second))

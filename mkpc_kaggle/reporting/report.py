@@ -1,4 +1,4 @@
-"""``report.html``: one self-contained page about a run, from its journal.
+"""``report.html``: a self-contained page about a run, built from its journal.
 
 Drawings need matplotlib, and pictures of pairs need the images. The page states why drawings are missing.
 """
@@ -169,7 +169,7 @@ def _images(pair: Pair) -> tuple[Image, Image]:
 
 
 def _scenes(log: RunLog) -> list[pd.DataFrame]:
-    """Return tables of reconstructed batches, of reasons for the pairs' F, and of cameras, the weakest first."""
+    """Return three tables: reconstructed batches, why pairs have their F, and cameras, weakest first."""
     pairs = log.tables.pairs
     counts = pairs[pairs["source"] == "scene"].groupby("group").size()
     rows = [

@@ -29,7 +29,7 @@ UNPACKED = (
 
 
 class State(StrEnum):
-    """The result of a file's comparison with the manifest."""
+    """The result of comparing a file with the manifest."""
 
     GOOD = "good"  # the bytes of a file of the manifest, under any name
     UNVERIFIED = "unverified"  # no digest in the manifest, or an unpacked checkpoint

@@ -33,7 +33,7 @@ SHIFT_PX = 0.25  # OpenCV's offset without precise upscaling, which the publishe
 
 
 class SiftEncoder:
-    """OpenCV's SIFT with one keypoint per pixel: the highest response, then the smallest angle."""
+    """OpenCV's SIFT. Of several keypoints at one pixel, it keeps the highest response, then the smallest angle."""
 
     def __init__(self, features: int, device: str) -> None:
         self._features, self._device = features, device

@@ -36,7 +36,7 @@ def corners(positions: Tensor, image: Tensor, size: torch.Size) -> tuple[Tensor,
 def neighbours(positions: Tensor, length: int) -> list[tuple[Tensor, Tensor]]:
     """Return the pixels before and after each position (Q,) on one axis, int64, with their weights.
 
-    A NaN position gets a valid pixel, since a GPU fails on an index out of range, and a NaN weight.
+    A NaN position gets a NaN weight and a valid pixel, since a GPU fails on an index out of range.
     """
     before = positions.floor()
     share = positions - before

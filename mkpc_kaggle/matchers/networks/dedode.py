@@ -58,7 +58,7 @@ class DedodeRefiner(nn.Module):
         return functional.conv2d(features.to(weight.dtype), weight[:, : self.features], bias)
 
     def mixed(self, entry: Tensor, context: Tensor | None) -> Tensor:
-        """Return (B, hidden, h, w) from an :meth:`entry`, which is overwritten, and the coarser context."""
+        """Mix an :meth:`entry`, which is overwritten, with the coarser context: (B, hidden, h, w)."""
         first, norm, relu, mix = self.block1
         if context is not None:
             # A 1x1 convolution and enlargement commute; the small map is cheaper.

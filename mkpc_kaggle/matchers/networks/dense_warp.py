@@ -28,9 +28,9 @@ class Pyramid:
 
 @dataclass(frozen=True, eq=False)
 class DenseFeatures:
-    """Features of B images for the first pass and, of larger versions of them, for the second.
+    """Features of B images: of the images for the first pass, and of larger versions for the second.
 
-    ``coefficients`` (B, n, C): of each of the network's Gaussian processes, with the images as supports.
+    ``coefficients`` has (B, n, width) for each Gaussian process of the network, with the images as its support.
     """
 
     coarse: Pyramid
@@ -125,7 +125,7 @@ class GaussianProcess(nn.Module):
         return coefficients(tokens(support), tokens(self.embed_coordinates(support)))
 
     def forward(self, query: Tensor, support: Tensor, coefficients: Tensor) -> Tensor:
-        """Return the posterior mean (B, width, h, w) of features (B, C, h, w) and the coefficients."""
+        """Return the posterior mean (B, width, h, w), given features (B, C, h, w) and coefficients."""
         mean = kernel(tokens(query), tokens(support)) @ coefficients  # (B, n, width)
         return mean.mT.reshape(len(query), -1, *query.shape[2:])
 

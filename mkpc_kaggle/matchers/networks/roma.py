@@ -127,7 +127,7 @@ def stretch(size: torch.Size) -> float:
 
 
 class AnchorDecoder(nn.Module):
-    """A transformer without position encoding; the posterior contains positions."""
+    """A transformer without positional encoding, because the posterior contains positions."""
 
     def __init__(self, width: int, blocks: int, heads: int) -> None:
         super().__init__()

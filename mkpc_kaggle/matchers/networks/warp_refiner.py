@@ -100,7 +100,7 @@ def block(inputs: int, outputs: int) -> nn.Sequential:
 
 
 def by_rows(pointwise: nn.Conv2d, x: Tensor) -> Tensor:
-    """Apply a 1x1 convolution to (B, C, h, w), channels last: most of the network's work.
+    """Apply a 1x1 convolution to (B, C, h, w), channels last. This is most of the network's work.
 
     Rows are a batch, without a copy. For a batch of one on one thread PyTorch uses MKL's matrix product. oneDNN's
     convolution is twice as fast on AMD.
