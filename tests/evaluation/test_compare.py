@@ -103,7 +103,7 @@ def test_a_comparison_of_runs_that_failed_or_ran_out_of_time_has_their_exit_stat
 
 def test_what_recipes_have_in_common_is_matched_once(demo, small_recipe, tmp_path, capsys):
     other, third, text = tmp_path / "other.toml", tmp_path / "third.toml", small_recipe.read_text()
-    third.write_text(text + "\n[magsac]\nthreshold = 1.0\n")
+    third.write_text(f"{text}threshold = 1.0\n")
     other.write_text(text.replace("400", "440") + "\n[focal]\nsigma = 0.3\n")
     recipes = map(str, (small_recipe, third, other))
     assert compare(demo, "--compare", *recipes, "--work-dir", str(tmp_path / "work")) == 0
