@@ -36,12 +36,6 @@ def everything_said() -> str:
     return "\n".join(text for source in [*sources, *python] for text in texts_of(source))
 
 
-def messages() -> list[str]:
-    """What stands in backticks in the first column of the table of messages."""
-    rows = re.findall(r"^\| (.*?) \|", (ROOT / "docs" / "troubleshooting.md").read_text(encoding="utf-8"), re.M)
-    return [message for row in rows for message in re.findall(r"`([^`]+)`", row) if not message.startswith("--")]
-
-
 def pattern_of(message: str) -> str:
     """Three dots stand for anything, F for the name of a model."""
     literal = re.escape(message).replace(r"\ ", " ").replace(r"\.\.\.", ".*")
@@ -49,11 +43,12 @@ def pattern_of(message: str) -> str:
 
 
 def test_every_message_of_the_troubleshooting_page_is_one_of_the_programs():
+    """They are in backticks in the first column of its table."""
+    rows = re.findall(r"^\| (.*?) \|", (ROOT / "docs" / "troubleshooting.md").read_text(encoding="utf-8"), re.M)
+    known = [text for row in rows for text in re.findall(r"`([^`]+)`", row) if not text.startswith("--")]
     said = everything_said()
-    known = messages()
     assert len(known) > 25
-    unknown = [message for message in known if not re.search(pattern_of(message), said)]
-    assert unknown == []
+    assert [message for message in known if not re.search(pattern_of(message), said)] == []
 
 
 def options_of(parser: argparse.ArgumentParser) -> set[str]:

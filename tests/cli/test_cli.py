@@ -2,18 +2,16 @@ import os
 import subprocess
 import sys
 import threading
-from contextlib import suppress
 from io import StringIO
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from shared import contents
 
 from mkpc_kaggle.cli import main
 from mkpc_kaggle.data.competition import read_test_side, write_submission
-from mkpc_kaggle.demo import DemoSet, write
+from mkpc_kaggle.demo import DemoSet
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
 
 
@@ -48,45 +46,6 @@ def test_recipes_are_listed_with_what_they_lack(clean_environment, capsys):
     assert "all weights are available" in classical
     assert "    2:dkm@630x840  at most 4096\n" in out
     assert "    1:aliked_lightglue@1024  at most 4096  (or aliked, if its weights are missing)\n" in light
-
-
-def test_results_are_not_written_over_inputs_nor_an_export_over_the_journal(demo, tmp_path, capsys):
-    first, second, *_ = sorted(map(str, demo.train_dir.rglob("*.jpg")))
-    table = demo.train_dir / "scaling_factors.csv"
-    assert main(["validate", "--train-dir", str(demo.train_dir), "--json", str(table)]) == 2
-    assert main(["match", first, second, "--out", first]) == 2
-    assert main(["journal", str(tmp_path), "--report", str(tmp_path / "journal.sqlite")]) == 2
-    assert main(["journal", str(tmp_path), "--report", first]) == 2
-    told = capsys.readouterr().err.splitlines()
-    assert "would be written over the input" in told[0]
-    assert "would be written over the input" in told[1]
-    assert "would be written over the work directory" in told[2]
-
-
-@pytest.mark.parametrize(
-    ("command", "message"),
-    [
-        ("match x.png y.png --recipe classical --out notes.xyz", "needs a suffix"),
-        ("match x.png y.png --recipe classical --out /dev/full", "needs a suffix"),
-        ("demo --out users", "users/train is in the way"),
-        ("demo --out truth", "truth/test_truth.csv is in the way"),
-        ("demo --out x.png", "cannot be written"),
-        ("demo --seed -1 --out d", "--seed: give 0 or more"),
-    ],
-)
-def test_what_would_replace_files_of_the_user_is_refused_before_any_work(
-    command, message, clean_environment, tmp_path, monkeypatch, capsys
-):
-    files = ("x.png", "notes.png", "users/train/scaling_factors.csv", "truth/test_truth.csv")
-    for name in files:
-        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / name).write_text("precious")
-    monkeypatch.setattr(write, "build_world", lambda *_, **__: pytest.fail("rendered before it was refused"))
-    before = contents(tmp_path)
-    with suppress(SystemExit):  # of argparse
-        assert main(command.split()) == 2
-    assert message in capsys.readouterr().err
-    assert contents(tmp_path) == before
 
 
 def test_check_tells_good_from_bad(demo, tmp_path, capsys):

@@ -1,7 +1,6 @@
 """``make_submission.py`` as a person runs it: a process, real pictures, files on disk."""
 
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -11,7 +10,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from shared import contents
 
 from mkpc_kaggle.cli import main
 from mkpc_kaggle.data.competition import read_submission, read_test_side, submission_problems
@@ -104,57 +102,6 @@ def test_odd_pictures_get_an_f_or_the_fallback_row_and_a_line_in_the_summary(dem
         assert is_fallback == (f"good-{name}: " in made.stdout) == (name in ("line", "flat", "pipe", "missing")), (
             name
         )
-
-
-@pytest.mark.parametrize(
-    ("arguments", "told"),
-    [
-        (["--test-dir", "nowhere"], "test.csv: no such file"),
-        (["--recipe", "imaginary"], "unknown recipe 'imaginary'; known: "),
-        (["--recipe", "light"], "needs weights that were not found"),
-        (["--weights", "nowhere"], "--weights nowhere: no such directory"),
-        (["--time-limit", "soon"], "'soon' is not a duration"),
-        (["--device", "abacus"], "unknown device 'abacus'"),
-        (["--output", "/dev/null/submission.csv"], "cannot be written"),
-        (["--output", "/dev/null"], "--output /dev/null is a device; name a file"),
-        (["--work-dir", "/dev/null/work"], "cannot be written"),
-    ],
-)
-def test_bad_input_is_told_in_one_line_before_any_work(demo, tmp_path, capsys, arguments, told):
-    output = tmp_path / "submission.csv"
-    status = main(["submit", "--test-dir", str(demo.test_dir), "--output", str(output), *arguments])
-    captured = capsys.readouterr()
-    assert status == 2
-    assert captured.err.startswith("error: ")
-    assert told in captured.err
-    assert len(captured.err.splitlines()) == 1
-    assert not output.exists()
-
-
-@pytest.mark.parametrize(
-    ("arguments", "told"),
-    [
-        (["--output", ""], "is a directory; name a file"),
-        (["--output", "test/test.csv"], "would be written over the input test/test.csv"),
-        (["--output", "w/m.pth", "--weights", "w"], "would be written over the input w"),
-        (["--work-dir", "test/test_images"], "would be written over the input test/test_images"),
-        (["--recipe", "r.toml", "--output", "r.toml"], "would be written over the input r.toml"),
-        (["--output", "s.html"], "would be written over --report"),
-        (["--output", "w/journal.sqlite", "--work-dir", "w"], "would be written over the work directory"),
-    ],
-)
-def test_what_would_be_written_over_an_input_or_a_result_is_refused_before_any_work(
-    demo, small_recipe, tmp_path, monkeypatch, capsys, arguments, told
-):
-    monkeypatch.chdir(tmp_path)
-    shutil.copytree(demo.test_dir, "test")
-    shutil.copyfile(small_recipe, "r.toml")
-    Path("w").mkdir()
-    Path("w/m.pth").touch()
-    before = contents(tmp_path)
-    assert main(["submit", "--test-dir", "test", *arguments]) == 2
-    assert told in capsys.readouterr().err
-    assert contents(tmp_path) == before
 
 
 def test_a_limit_that_is_over_at_the_start_leaves_a_whole_file_and_is_told(demo, tmp_path):

@@ -66,18 +66,19 @@ def test_a_file_that_is_not_a_picture_has_its_reason(tmp_path):
         assert reason(tmp_path / name) == "cannot be read: not a regular file"
 
 
-def test_an_array_is_named_by_its_content_and_its_shape():
+def test_an_array_is_named_by_its_content_and_shape_or_refused():
     pixels = noise(6, 4, 3)
-    assert Image.of_array(pixels).name == Image.of_array(pixels.copy()).name
-    assert Image.of_array(pixels).name != Image.of_array(pixels.reshape(4, 6, 3)).name
-    assert Image.of_array(pixels).name != Image.of_array(255 - pixels).name
-
-
-@pytest.mark.parametrize("shape", [(4, 4, 4), (4, 4, 1), (2, 4, 4, 3), (0, 4, 3), (4, 4, 3)])
-def test_an_array_that_is_not_an_image_is_refused_by_type_and_shape(shape):
-    kind = np.float32 if shape == (4, 4, 3) else np.uint8
-    with pytest.raises(ValueError, match=rf"not {np.dtype(kind)} \({shape[0]},"):
-        Image.of_array(np.zeros(shape, kind))
+    name = Image.of_array(pixels).name
+    assert name == Image.of_array(pixels.copy()).name
+    assert name not in (Image.of_array(pixels.reshape(4, 6, 3)).name, Image.of_array(255 - pixels).name)
+    for shape, kind in (
+        ((4, 4, 4), np.uint8),
+        ((2, 4, 4, 3), np.uint8),
+        ((0, 4, 3), np.uint8),
+        ((4, 4, 3), np.float32),
+    ):
+        with pytest.raises(ValueError, match=rf"not {np.dtype(kind)} \({shape[0]},"):
+            Image.of_array(np.zeros(shape, kind))
 
 
 @pytest.fixture

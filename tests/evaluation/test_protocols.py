@@ -1,4 +1,3 @@
-import argparse
 import json
 import pickle
 import re
@@ -17,7 +16,6 @@ from rectified import RectifiedMatcher
 from scipy.spatial.transform import Rotation
 from shared import DATA, needs_data
 
-from benchmarks import paper_tables
 from mkpc_kaggle import TwoStageMatcher
 from mkpc_kaggle.cli import main
 from mkpc_kaggle.data.competition import read_train_side
@@ -32,7 +30,7 @@ from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.metrics import pose_error
 from mkpc_kaggle.geometry.robust import Method, ModelKind, RobustConfig, estimate
 from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult, with_estimate
-from mkpc_kaggle.recipe import Recipe, Unit, load_recipe
+from mkpc_kaggle.recipe import Recipe, Unit
 
 K = np.array([[800.0, 0, 320], [0, 800, 240], [0, 0, 1]])
 CAMERAS = Camera(K, np.eye(3), np.zeros(3)), Camera(K, np.eye(3), np.array([1.0, 0, 0.1]))
@@ -296,14 +294,3 @@ def test_regions_of_ones_own_take_the_place_of_mkpcs(demo, scenes, small_recipe,
         ) as database:  # other regions, other points
             assert database.execute("SELECT count(*) FROM points").fetchone() == (rows,)
     np.testing.assert_array_equal(found.points0, match.matches.points0)
-
-
-def test_the_rows_of_the_papers_tables_have_their_sizes_and_the_best_is_the_recipe():
-    given = argparse.Namespace(matcher=None, protocol="none")
-    for table, count in (("yfcc", 16), ("scannet", 8)):
-        rows = paper_tables.TABLES[table]
-        assert len(rows) == count
-        best = paper_tables.recipe_of(table, *rows[-1][:2], given)
-        assert {unit.name for unit in best.units} == {unit.name for unit in load_recipe(table).units}
-    (stretched,) = paper_tables.recipe_of("scannet", "640x480", "ransac", given).units
-    assert stretched.name == "1:superglue@480x640!"

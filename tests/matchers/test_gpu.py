@@ -33,19 +33,15 @@ def gpus_here(monkeypatch: pytest.MonkeyPatch, *capabilities: tuple[int, int]) -
     monkeypatch.setattr(devices, "gpu_capabilities", lambda: list(capabilities))
 
 
-@pytest.mark.parametrize("device", ["cuda:2", "cuda:9"])
-def test_a_gpu_that_is_not_there_is_refused(monkeypatch: pytest.MonkeyPatch, device: str) -> None:
-    gpus_here(monkeypatch, (7, 5), (7, 5))
-    assert resolve_placement("cuda:1", "float32").device == "cuda:1"
-    with pytest.raises(UserError, match=f"--device {device}: this machine has only cuda:0, cuda:1"):
-        resolve_placement(device, "float32")
-
-
-def test_half_precision_asks_every_gpu_that_the_run_uses(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_gpu_is_refused_and_half_precision_asks_every_gpu_that_the_run_uses(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     gpus_here(monkeypatch, (7, 5), (6, 0))
-    assert fastest_precision("cuda") is Precision.FLOAT32
-    assert fastest_precision("cuda:0") is Precision.FLOAT16
-    assert fastest_precision("cuda:1") is Precision.FLOAT32
+    assert resolve_placement("cuda:1", "float32").device == "cuda:1"
+    with pytest.raises(UserError, match="--device cuda:2: this machine has only cuda:0, cuda:1"):
+        resolve_placement("cuda:2", "float32")
+    fastest = [fastest_precision(device) for device in ("cuda", "cuda:0", "cuda:1")]
+    assert fastest == [Precision.FLOAT32, Precision.FLOAT16, Precision.FLOAT32]
 
 
 def test_the_parent_of_workers_never_initialises_cuda(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -145,7 +141,7 @@ def test_matchers_run_without_tf32_and_the_process_keeps_its_settings() -> None:
     assert settings() == before
 
 
-def test_features_that_are_not_finite_load_the_matcher_in_float32() -> None:
+def test_features_that_are_not_finite_load_the_matcher_in_float32_and_are_an_error_there() -> None:
     half, exact = Own(float("inf")), Own(1.0)
     runner = Pipeline(RECIPE, lambda name: half, load_float32=lambda name: exact)
     with pytest.warns(RuntimeWarning, match="own runs in float32"):
@@ -153,12 +149,8 @@ def test_features_that_are_not_finite_load_the_matcher_in_float32() -> None:
     assert (half.encoded, exact.encoded) == (1, 3)
     note = "own runs in float32, for in half precision features of own are not finite"
     assert {(work.results[0].failure, work.results[0].note) for work in done} == {("", note)}
-
-
-def test_features_that_are_not_finite_in_float32_are_an_error_of_the_unit() -> None:
-    runner = Pipeline(RECIPE, lambda name: Own(float("nan")))
-    failures = {work.results[0].failure for work in runner.match(works(), RECIPE.units)}
-    assert failures == {"NonFiniteError: features of own are not finite"}
+    failed = Pipeline(RECIPE, lambda name: Own(float("nan"))).match(works(), RECIPE.units)
+    assert {work.results[0].failure for work in failed} == {"NonFiniteError: features of own are not finite"}
 
 
 def test_finite_numbers_pass_however_large_their_sum_and_whatever_holds_them() -> None:

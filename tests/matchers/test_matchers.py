@@ -106,30 +106,13 @@ def test_sift_puts_its_points_where_they_are_at_every_scale():
         assert_allclose(np.median(off[np.hypot(*off.T) < 3], axis=0), 0, atol=0.06)
 
 
-@every_matcher
-def test_no_match_lies_on_the_padding_and_padding_costs_no_good_match(name):
-    matcher = matcher_of(name)
-    cut = np.ascontiguousarray(photograph()[:140, :180])
-    padded = picture(cut, matcher, padding=(60, 50))
-    assert padded.pixels.shape[:2] >= (190, 240)
-    matches = matcher.match(matcher.encode([padded]), [photograph_encoding(name)])[0]
-    assert Box.whole(padded.content).contains(matches.points0).all()
-    errors = np.hypot(*(matches.points1 - matches.points0).T)  # the cut's corner is the photograph's
-    assert np.sum(errors < 2) >= 60
-
-
 def test_all_names_and_shapes_of_a_checkpoint_must_fit_but_those_that_are_not_used():
     network = nn.Sequential(nn.Linear(2, 2), nn.Linear(2, 2))
-    before = network[1].bias.detach().clone()
     whole = {name: torch.ones_like(tensor) for name, tensor in network.state_dict().items()}
     part = {name: tensor for name, tensor in whole.items() if name != "1.bias"}
-    for wrong, says in (
-        ({**whole, "2.bias": torch.ones(2)}, r"2\.bias"),
-        (part, r"1\.bias"),
-        ({**whole, "0.weight": torch.ones(3, 2)}, r"0\.weight"),
-    ):
+    surplus, misshapen = {"2.bias": torch.ones(2)}, {"0.weight": torch.ones(3, 2)}
+    for wrong, says in ((whole | surplus, r"2\.bias"), (part, r"1\.bias"), (whole | misshapen, r"0\.weight")):
         with pytest.raises(UserError, match=f"'w' do not fit the network: {says}"):
             load_into(network, wrong, unused="nothing", what="w")
-    load_into(network, {**part, "2.x": torch.ones(9)}, unused=r"1\.bias|2\.", what="w")
-    assert torch.equal(network[1].bias, before)
-    assert (network[0].weight == 1).all()
+    load_into(network, part | surplus, unused=r"1\.bias|2\.", what="w")
+    assert (network[0].weight == 1).all() and not (network[1].bias == 1).any()

@@ -187,13 +187,11 @@ def test_a_report_that_fails_is_a_line_and_leaves_the_page_without_drawings(tmp_
 
 
 def test_the_command_draws_a_page_with_the_images_of_a_test_side(tmp_path):
-    pairs = write_pairs(tmp_path / "test" / "test_images" / "set", 2)
+    pairs = write_pairs(tmp_path / "test_images" / "set", 2)
     rows = [f"{pair.id},set,{pair.images[0].stem},{pair.images[1].stem}" for pair in pairs]
-    (tmp_path / "test" / "test.csv").write_text("\n".join(["sample_id,batch_id,image_1_id,image_2_id", *rows]))
+    (tmp_path / "test.csv").write_text("\n".join(["sample_id,batch_id,image_1_id,image_2_id", *rows]))
     run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
     page = tmp_path / "report.html"
-    options = ["--report", str(page), "--test-dir", str(tmp_path / "test")]
-    assert main(["journal", str(tmp_path / "work"), *options]) == 0
-    assert Tags(page.read_text()).names.count("img") == 2 + 1
-    assert main(["journal", str(tmp_path / "work"), "--report", str(page)]) == 0
-    assert "where the images are is not known" in page.read_text()
+    for more, told in (["--test-dir", str(tmp_path)], "<img"), ([], "where the images are is not known"):
+        assert main(["journal", str(tmp_path / "work"), "--report", str(page), *more]) == 0
+        assert told in page.read_text()

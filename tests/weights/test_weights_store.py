@@ -41,22 +41,15 @@ def test_directories_are_searched_in_order_then_the_environment_then_kaggle(tmp_
     assert WeightStore(homes[:2], [line()]).find("slot") is None
 
 
-def test_the_first_alternative_that_is_there_is_taken(tmp_path):
+def test_the_first_alternative_that_is_there_is_taken_and_missing_ones_are_all_named(tmp_path):
     files = [line("a.bin"), line("b.bin", OTHER), line("c.bin", slot="other")]
+    with pytest.raises(UserError, match=rf"'slot': a\.bin or b\.bin not found \(searched {tmp_path}\)"):
+        WeightStore([tmp_path], files).load("slot")
     put(tmp_path, "renamed.bin", DATA)
     put(tmp_path, "b.bin", OTHER)
     assert found_by(WeightStore([tmp_path], files)).name == "b.bin", "a name goes before a digest"
     put(tmp_path, "a.bin")
     assert found_by(WeightStore([tmp_path], files)).name == "a.bin"
-
-
-def test_missing_weights_are_named_with_all_alternatives_and_where_they_were_searched(tmp_path):
-    weights = WeightStore([tmp_path], [line("a.bin"), line("b.bin")])
-    assert weights.find("slot") is None
-    with pytest.raises(UserError, match=rf"'slot': a\.bin or b\.bin not found \(searched {tmp_path}\)"):
-        weights.load("slot")
-    with pytest.raises(UserError, match=r"--weights"):
-        WeightStore([], [line()]).load("slot")
 
 
 def test_a_renamed_file_is_found_by_its_size_and_digest(tmp_path, monkeypatch):

@@ -1,0 +1,64 @@
+"""What each command refuses: in one line, with status 2, before any work, and without a change to a file."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+from shared import contents
+
+from mkpc_kaggle.cli import main
+from mkpc_kaggle.demo import write
+
+SUBMIT = "submit --test-dir demo/test"
+MATCH = "match x.png y.png --recipe classical --out"
+REFUSALS = [
+    ("submit --test-dir nowhere", "test.csv: no such file"),
+    (f"{SUBMIT} --recipe imaginary", "unknown recipe 'imaginary'; known: "),
+    (f"{SUBMIT} --recipe light", "needs weights that were not found"),
+    (f"{SUBMIT} --weights nowhere", "--weights nowhere: no such directory"),
+    (f"{SUBMIT} --time-limit soon", "'soon' is not a duration"),
+    (f"{SUBMIT} --device abacus", "unknown device 'abacus'"),
+    (f"{SUBMIT} --output /dev/null/submission.csv", "cannot be written"),
+    (f"{SUBMIT} --output /dev/null", "--output /dev/null is a device; name a file"),
+    (f"{SUBMIT} --work-dir /dev/null/work", "cannot be written"),
+    (f"{SUBMIT} --output .", "is a directory; name a file"),
+    (f"{SUBMIT} --output demo/test/test.csv", "would be written over the input demo/test/test.csv"),
+    (f"{SUBMIT} --output w/m.pth --weights w", "would be written over the input w"),
+    (f"{SUBMIT} --work-dir demo/test/test_images", "would be written over the input demo/test/test_images"),
+    (f"{SUBMIT} --recipe small.toml --output small.toml", "would be written over the input small.toml"),
+    (f"{SUBMIT} --output s.html", "would be written over --report"),
+    (f"{SUBMIT} --output w/journal.sqlite --work-dir w", "would be written over the work directory"),
+    ("validate --train-dir demo/train --json demo/train/scaling_factors.csv", "would be written over the input"),
+    ("journal w --report w/journal.sqlite", "would be written over the work directory"),
+    ("journal w --report x.png", "exists and is not a .html file"),
+    (f"{MATCH} x.png", "would be written over the input"),
+    (f"{MATCH} notes.xyz", "needs a suffix"),
+    ("demo --out users", "users/train is in the way"),
+    ("demo --out truth", "truth/test_truth.csv is in the way"),
+    ("demo --out x.png", "cannot be written"),
+]
+
+
+@pytest.mark.parametrize(("command", "told"), REFUSALS)
+def test_what_cannot_be_done_is_refused_in_one_line_before_any_work(
+    command, told, demo, small_recipe, clean_environment, tmp_path, monkeypatch, capsys
+):
+    shutil.copytree(demo.test_dir, "demo/test")
+    Path("demo/train").mkdir()
+    for name in (
+        "demo/train/scaling_factors.csv",
+        "x.png",
+        "w/m.pth",
+        "users/train/a.csv",
+        "truth/test_truth.csv",
+    ):
+        Path(name).parent.mkdir(parents=True, exist_ok=True)
+        Path(name).write_text("precious")
+    monkeypatch.setattr(write, "build_world", lambda *_, **__: pytest.fail("rendered before it was refused"))
+    before = contents(tmp_path)
+    assert main(command.split()) == 2
+    captured = capsys.readouterr()
+    (line,) = captured.err.splitlines()
+    assert line.startswith("error: ")
+    assert told in line
+    assert contents(tmp_path) == before
