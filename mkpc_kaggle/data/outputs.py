@@ -13,6 +13,7 @@ from mkpc_kaggle.errors import UserError
 # Suffixes of each option's results. A file with this suffix in an input directory is an earlier run's result.
 RESULTS = {"--output": (".csv",), "--json": (".json",), "--report": (".html", ".htm")}
 RESULTS["--out"] = (".png", ".jpg", ".pdf", ".svg")
+UNFINISHED: set[Path] = set()  # temporary files of this process
 
 
 def require_apart(
@@ -90,6 +91,7 @@ def replacing(path: Path) -> Iterator[TextIO]:
         with suppress(OSError):
             left.unlink()
     part = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
+    UNFINISHED.add(part)
     try:
         with part.open("x", encoding="utf-8", newline="") as stream:  # "x" follows no link
             yield stream
@@ -97,4 +99,11 @@ def replacing(path: Path) -> Iterator[TextIO]:
             os.fsync(stream.fileno())
         part.replace(path)
     finally:
+        part.unlink(missing_ok=True)
+        UNFINISHED.discard(part)
+
+
+def remove_unfinished() -> None:
+    """Remove the temporary files of :func:`replacing`, for a process that ends before they are complete."""
+    for part in tuple(UNFINISHED):
         part.unlink(missing_ok=True)

@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 
 from mkpc_kaggle.data.competition import Pair, submission_problems, write_submission
-from mkpc_kaggle.data.outputs import replacing
+from mkpc_kaggle.data.outputs import remove_unfinished, replacing
 from mkpc_kaggle.engine import console
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.cluster import RayCluster, RaySite
@@ -235,7 +235,13 @@ class Watchdog:
             if self._over.wait(min(left, LISTEN_S)):
                 return
         trouble = ["the time limit passed before the last results were written"]
-        writer = threading.Thread(target=lambda: trouble.append(self.save()), name="final write", daemon=True)
+
+        def write() -> None:
+            trouble.append(self.save())
+            with suppress(OSError):
+                remove_unfinished()  # a report, say
+
+        writer = threading.Thread(target=write, name="final write", daemon=True)
         writer.start()  # the disk may hang
         writer.join(max(EXIT_S, self._budget.limit - self._budget.clock() - EXIT_S))
         if trouble[-1]:

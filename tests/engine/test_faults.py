@@ -322,6 +322,15 @@ def test_the_watchdog_leaves_though_writing_hangs_and_keeps_the_status_of_the_ru
     assert guarded(f"{body}; time.sleep(600)").returncode == status
 
 
+def test_the_watchdog_leaves_no_unfinished_file(tmp_path):
+    report = f"replacing(Path({str(tmp_path / 'report.html')!r}))"
+    body = (
+        f"from mkpc_kaggle.data.outputs import replacing, Path; open = {report}; open.__enter__(); time.sleep(600)"
+    )
+    assert guarded(f"watchdog.save = lambda: ''; {body}").returncode == 0
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_limit_of_ten_million_years_is_none():
     done = guarded("time.sleep(0.5); print('ended by itself')", "359999999996400")
     assert (done.returncode, done.stdout, done.stderr) == (0, "ended by itself\n", "")

@@ -37,6 +37,7 @@ def with_matcher(fault: str) -> Make:
     return lambda room: [written(name, text)(room) for name, text in texts.items()]
 
 
+SAYS = "2 of 2 pairs have an F"
 CHANGED = resumed(written("I/0.png", encoded(".png", picture(2))))
 CASES = [
     *makes(
@@ -45,8 +46,9 @@ CASES = [
         {f"the first matcher {name}": with_matcher(fault) for name, fault in FAULTS.items()},
         (0,),
         env=ENV,
+        says=SAYS,
     ),
-    Case("faults", "no file above 20 kB", SUBMIT, limits="-f 40"),  # of 512 bytes
+    Case("faults", "no file above 20 kB", SUBMIT, says=SAYS, limits="-f 40"),  # of 512 bytes
     *(
         Case(
             "faults", f"given again, no file above {kib} kB", RECONSTRUCT, CHANGED, EITHER, limits=f"-f {2 * kib}"

@@ -30,10 +30,10 @@ READ: dict[str, tuple[str, tuple[int, ...]]] = {  # by its path: what reads it, 
     "a.pt": (CONVERT, REFUSED),
     f"weights/deep/{NAME}": (AUTO, (0,)),
     "weights/deep/weights_manifest.txt": (f"weights verify {SEARCH}", (0,)),
-    "truth.csv": ("validate --train-dir T --submission D/test.csv --truth truth.csv", REFUSED),
+    "truth.csv": ("validate --train-dir T --submission sub.csv --truth truth.csv", REFUSED),
     "T/scaling_factors.csv": ("validate --train-dir T --recipe quick.toml --workers 0", REFUSED),
-    "out/s.work/journal.sqlite": (SUBMIT, REFUSED),
-    "out/s.work/journal.lock": (SUBMIT, REFUSED),
+    "out/s.work/journal.sqlite": (SUBMIT, (0, 2)),  # a link to nothing is followed
+    "out/s.work/journal.lock": (SUBMIT, (0, 2)),
 }
 ROW = "b1;x-y,b1,x,y\n"
 TABLES = {

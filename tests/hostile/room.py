@@ -25,6 +25,7 @@ TEXTS = {
     "T/scaling_factors.csv": "scene,scaling_factor\ns,1.5\n",
     "T/s/calibration.csv": CALIBRATION,
     "T/s/pair_covisibility.csv": "pair,covisibility\nx-y,0.9\ny-z,0.8\nx-z,0.05\n",
+    "sub.csv": "sample_id,fundamental_matrix\n1,1 2 3 4 5 6 7 8 9\n",
     "truth.csv": "sample_id,scene,image_1_id,image_2_id\n1,s,x,y\n",
     "pairs.txt": "0.png 1.png\n",
     "quick.toml": RECIPE,

@@ -13,7 +13,6 @@ from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.matchers.contract import Placement
 from mkpc_kaggle.matchers.networks.dad import Dad, select_keypoints
 from mkpc_kaggle.matchers.networks.dedode import dedode_b, dedode_g
-from mkpc_kaggle.matchers.networks.dinov2 import DinoV2, DinoV2Config
 from mkpc_kaggle.matchers.networks.loma import UNUSED, Loma, Variant, detector_size, parameter_name
 from mkpc_kaggle.matchers.networks.loma_matcher import LAYERS, LomaKeypoints, LomaMatcher, log_scores
 from mkpc_kaggle.matchers.networks.pixels import resized
@@ -132,15 +131,6 @@ def descriptor_stages(variant, case):
     yield from compared(values, golden, TOLERANCES)
 
 
-def position_stages():
-    prefix = "_descriptor.encoder.frozen_dinov2.dinov2_vitl14."
-    network = DinoV2(DinoV2Config(blocks=0))
-    network.pos_embed.copy_(standin_state("loma", "B", f"{prefix}pos_embed")[f"{prefix}pos_embed"])
-    for name, expected in golden_arrays("loma", "vit_positions").items():
-        height, width = map(int, name.removeprefix("pos_").split("x"))
-        yield Stage(name, network.positions(height, width)[0, :, ::128], expected, 3e-5)
-
-
 def matcher_stages(case):
     golden = golden_arrays("loma", f"matcher_{case}")
     batched = golden["keypoints0"].ndim == 3
@@ -197,7 +187,7 @@ def pipeline_stages(case, variant):
 CASES = {
     f"loma detector_{case}": partial(detector_stages, case) for case in ("160x208", "157x203", "batch2_72x96")
 }
-CASES |= {"loma sampling": sampling_stages, "loma resize": resize_stages, "loma vit_positions": position_stages}
+CASES |= {"loma sampling": sampling_stages, "loma resize": resize_stages}
 CASES["loma descriptor_b128"] = partial(descriptor_stages, "B128", "b128_157x203")
 CASES |= {
     f"loma matcher_{case}": partial(matcher_stages, case)

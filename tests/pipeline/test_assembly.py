@@ -1,11 +1,13 @@
 """Putting a run together: which units a recipe keeps here, and why others go or are refused."""
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import pytest
 from shared import WEIGHTS, needs_weights
 from weight_files import digest_of
 
+from mkpc_kaggle import reconstruct
 from mkpc_kaggle.engine.settings import Settings
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.matchers.contract import MatcherSpec
@@ -35,8 +37,9 @@ def own(*licences):
     "wrong", [{"recipe": 5}, {"device": 0}, {"matchers": [1]}, {"matchers": {"own": object()}}]
 )
 def test_what_is_of_a_wrong_type_is_named(wrong):
-    with pytest.raises(TypeError, match=r"(recipe|device|matcher).* not |has no `spec`"):
-        TwoStageMatcher(**({"recipe": "classical"} | wrong))
+    for call in (TwoStageMatcher, partial(reconstruct, [])):
+        with pytest.raises(TypeError, match=r"(recipe|device|matcher).* not |has no `spec`"):
+            call(**({"recipe": "classical"} | wrong))
 
 
 def test_recipe_auto_leaves_out_the_units_whose_weights_are_missing():
