@@ -1,5 +1,4 @@
 import json
-import re
 import shutil
 from itertools import combinations
 
@@ -99,16 +98,3 @@ def test_a_comparison_of_runs_that_failed_or_ran_out_of_time_has_their_exit_stat
     printed = capsys.readouterr().out
     assert "nothing is compared" in printed
     assert "gain of mAA" not in printed
-
-
-def test_what_two_recipes_both_match_is_matched_once(demo, small_recipe, tmp_path, capsys):
-    other, text = tmp_path / "other.toml", small_recipe.read_text()
-    other.write_text(text.replace("400", "440") + "\n[focal]\nsigma = 0.3\n")
-    work_dir = tmp_path / "work"
-    assert compare(demo, "--compare", str(small_recipe), str(other), "--work-dir", str(work_dir)) == 0
-    printed = capsys.readouterr().out
-    assert re.findall(r"(\d+) units run", printed) == ["8", "4"], "the common unit runs once"
-    shared = printed.split("recipe other")[-1]
-    assert compare(demo, "--recipe", str(other), "--work-dir", str(tmp_path / "alone")) == 0
-    scores = shared.splitlines()[1:5]
-    assert "\n".join(scores) in capsys.readouterr().out, "as if it had been matched"
