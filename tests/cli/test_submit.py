@@ -7,14 +7,11 @@ import sys
 import time
 from pathlib import Path
 
-import cv2
-import numpy as np
 import pytest
 
 from mkpc_kaggle.cli import main
-from mkpc_kaggle.data.competition import read_submission, read_test_side, submission_problems
+from mkpc_kaggle.data.competition import read_test_side, submission_problems
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -71,37 +68,6 @@ def test_a_killed_run_goes_on_and_ends_with_the_bytes_of_an_undisturbed_one(demo
     resumed = make(demo.test_dir, output, small_recipe, "--no-report")
     assert resumed.returncode == 0, resumed.stderr
     assert output.read_bytes() == undisturbed.read_bytes()
-
-
-def test_odd_pictures_get_an_f_or_the_fallback_row_and_a_line_in_the_summary(demo, small_recipe, tmp_path):
-    good, other, *_ = map(cv2.imread, map(str, sorted((demo.train_dir / "courtyard" / "images").iterdir())))
-    usable = {
-        "good.jpg": good,
-        "gray.png": cv2.cvtColor(other, cv2.COLOR_BGR2GRAY),
-        "rgba.png": cv2.cvtColor(other, cv2.COLOR_BGR2BGRA),
-        "deep.png": other.astype(np.uint16) * 256,
-        "huge.jpeg": cv2.resize(other, (3200, 2350)),
-    }
-    useless = {"line.png": np.full((3, 3000, 3), 90, np.uint8), "flat.png": np.full((200, 300, 3), 128, np.uint8)}
-    folder = tmp_path / "test_images" / "batch"
-    folder.mkdir(parents=True)
-    for name, pixels in (usable | useless).items():
-        cv2.imwrite(str(folder / name), pixels)
-    os.mkfifo(folder / "pipe.png")
-    names = [name.partition(".")[0] for name in (*usable, *useless, "pipe", "missing")]
-    rows = [f"good-{name},batch,good,{name}" for name in names]
-    (tmp_path / "test.csv").write_text("\n".join(["sample_id,batch_id,image_1_id,image_2_id", *rows]))
-    made = make(tmp_path, tmp_path / "submission.csv", small_recipe, "--workers", "1")
-    assert made.returncode == 0, made.stderr
-    assert "Traceback" not in made.stderr
-    for told in ("cannot be read: not a regular file", "one side is more than 32 times the other", "report: "):
-        assert told in made.stdout
-    assert_good(tmp_path / "submission.csv", tmp_path)
-    for name, F in zip(names, read_submission(tmp_path / "submission.csv").values(), strict=True):
-        is_fallback = np.allclose(F / np.linalg.norm(F), FALLBACK_FUNDAMENTAL / np.sqrt(2), atol=1e-3)
-        assert is_fallback == (f"good-{name}: " in made.stdout) == (name in ("line", "flat", "pipe", "missing")), (
-            name
-        )
 
 
 def test_a_limit_that_is_over_at_the_start_leaves_a_whole_file_and_is_told(demo, tmp_path):

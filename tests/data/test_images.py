@@ -59,6 +59,9 @@ def test_a_file_that_is_not_a_picture_has_its_reason(tmp_path):
     png = write(tmp_path / "cut.png", noise(64, 64, 3))
     png.write_bytes(png.read_bytes()[: png.stat().st_size // 2])
     assert "cut off" in reason(png)
+    for shape, told in (((3, 300), "300 x 3 pixels"), ((300, 3), "3 x 300 pixels")):
+        assert told in reason(write(tmp_path / "line.png", noise(*shape)))
+    assert isinstance(read_image(write(tmp_path / "strip.png", noise(10, 300))), Image)
     assert "cannot be read" in reason(tmp_path / "directory.png")
     assert reason(tmp_path / "none.png") == "no such file"
     assert str(read_image(tmp_path / os.fsdecode(b"\xff.png"))) == f"{tmp_path}/\\udcff.png: no such file"

@@ -117,14 +117,11 @@ def test_each_step_of_the_estimate_has_a_column(demo, small_recipe, capsys):
         assert pair["accuracy_by_step"]["MAGSAC"] == former["accuracy_by_step"]["MAGSAC"]
 
 
-def test_a_work_directory_keeps_the_journal_and_a_report_that_shows_the_pairs(
-    demo, small_recipe, tmp_path, capsys
-):
+def test_a_work_directory_keeps_the_journal_and_a_report_that_shows_the_pairs(demo, small_recipe, tmp_path):
     options = ["--pairs-per-scene", "2", "--mode", "whole-images", "--units", "1:sift@400"]
     scores = scores_of(demo, small_recipe, *options, "--work-dir", str(tmp_path / "work"))
     assert [set(pair["matches"]) for pair in scores["scenes"][0]["pairs"]] == [{"1:sift@400"}] * 2
     page = tmp_path / "work" / "report.html"
-    assert f"report: {page}" in capsys.readouterr().out
     assert page.read_text(encoding="utf-8").count("<img ") == 2 + 1
     assert len(read_log(tmp_path / "work").pairs) == 2
 

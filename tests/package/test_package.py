@@ -118,6 +118,14 @@ def test_weights_survive_the_upload_and_are_held_against_the_datasets_manifest(o
     assert "missing" in capsys.readouterr().out
 
 
+def test_the_image_is_the_latest_or_one_by_its_digest(out, wanted):
+    image = f"gcr.io/kaggle/python@sha256:{'0a' * 32}"
+    make_package(replace(wanted, image=image))
+    latest, pinned = (metadata_of(folder)[1] for folder in (out, wanted.out))
+    assert (latest["docker_image_pinning_type"], latest.get("docker_image", "")) == ("latest", "")
+    assert (pinned["docker_image_pinning_type"], pinned["docker_image"]) == ("original", image)
+
+
 def test_what_the_image_has_is_used_where_it_satisfies_even_without_a_wheel_for_its_python(out, tmp_path):
     dataset = out / "dataset"
     lines = (dataset / "requirements.txt").read_text().splitlines()

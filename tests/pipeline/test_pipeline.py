@@ -135,21 +135,6 @@ def test_the_critical_regions_are_where_the_photograph_is():
         assert (abs(box - true) < 8 + 0.05 * 230 * scale).all()
 
 
-def test_a_homography_and_an_essential_matrix_come_out_as_they_are():
-    K = np.array([[400.0, 0, 240], [0, 400, 180], [0, 0, 1]])
-    matcher = TwoStageMatcher(SIFT)
-    found = matcher(*pair(), model="H").estimate
-    assert found.model is ModelKind.H
-    corners = np.array([[[60.0, 130], [290, 130], [290, 310], [60, 310]]])
-    moved, true = (cv2.perspectiveTransform(corners, matrix) for matrix in (found.matrix, H))
-    assert_allclose(moved, true, atol=0.7)
-    with pytest.raises(ValueError, match="intrinsics"):
-        matcher(*pair(), model="E")
-    E = matcher(*pair(), model=ModelKind.E, intrinsics=(K, K)).estimate.matrix
-    values = np.linalg.svd(E, compute_uv=False)
-    assert_allclose(values / values[0], [1, 1, 0], atol=1e-6)
-
-
 def test_a_prior_on_focal_lengths_goes_by_the_sizes_of_the_images_unless_the_cameras_are_known():
     focal = FocalConfig(sigma=1e-3)
     matcher = TwoStageMatcher(replace(SIFT, focal=focal))

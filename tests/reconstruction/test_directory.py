@@ -6,7 +6,6 @@ from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
-import pycolmap
 import pytest
 
 from mkpc_kaggle.errors import UserError
@@ -138,26 +137,21 @@ def test_former_files_stay_until_the_new_ones_are_whole(tmp_path, monkeypatch):
     """A disk that is full while models are written costs neither the former models nor the former database."""
     write(tmp_path, FILES, "former")
 
-    def write_half(folder: Path) -> None:
-        (folder / "cameras.bin").write_text("half")
-        raise OSError(28, "No space left on device")
+    def write_files(is_full: bool) -> None:
+        def fill(folder: Path) -> None:
+            write(folder, [*MODEL_FILES[:1]] if is_full else [*MODEL_FILES], "new")
+            if is_full:
+                raise OSError(28, "No space left on device")
 
-    def write_whole(folder: Path) -> None:
-        for name in MODEL_FILES:
-            (folder / name).write_text("new")
-
-    def write_files(write: Callable[[Path], None]) -> None:
-        model = SimpleNamespace(images=(), colmap=SimpleNamespace(frames={}, write=write))
+        model = SimpleNamespace(images=(), colmap=SimpleNamespace(frames={}, write=fill))
         colmap.write_files(tmp_path, None, None, {}, [model])  # type: ignore[arg-type,list-item]
 
     monkeypatch.setattr(colmap, "_fill", lambda *_: None)
     with pytest.raises(OSError, match="No space"):
-        write_files(write_half)
+        write_files(is_full=True)
     assert files_of(tmp_path) == dict.fromkeys(FILES, "former")
     synced = set()
     monkeypatch.setattr(os, "fsync", lambda number: synced.add(Path(f"/proc/self/fd/{number}").readlink().name))
-    write_files(write_whole)
+    write_files(is_full=False)
     assert synced == {"database.db", *MODEL_FILES}, "a power failure leaves no empty file under its name"
     assert {(tmp_path / "models" / "0" / name).read_text() for name in MODEL_FILES} == {"new"}
-    with pycolmap.Database.open(str(tmp_path / "database.db")) as database:
-        assert database.num_images() == 0

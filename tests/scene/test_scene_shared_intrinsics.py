@@ -91,15 +91,6 @@ def test_a_scene_with_shared_intrinsics_is_nearer_to_the_truth():
     assert mean_angle(sharing, scene) < 0.6 * mean_angle(own, scene)
 
 
-def test_images_at_another_zoom_keep_a_camera_of_their_own():
-    scene = synthetic_scene(8, points=400, focals=[FOCAL] * 6 + [0.6 * FOCAL, 1.5 * FOCAL])
-    found = reconstruct_batch(scene.pairs, CONFIG)
-    assert len(set(focals_of(found))) == 3
-    registered = registered_images(found)
-    for image in scene.images:
-        assert registered[image.digest].focal == pytest.approx(scene.cameras[image.name].K[0, 0], rel=0.02)
-
-
 @pytest.mark.parametrize(("least", "cameras"), [(0.99, 6), (0.0, 1)])
 def test_shared_intrinsics_stay_unless_they_explain_fewer_points_and_the_files_are_of_what_stays(
     tmp_path, monkeypatch, least, cameras

@@ -97,7 +97,6 @@ class DeviceDouble(TorchDispatchMode):
         super().__init__()
         self.count, self.memory = count, memory
         self.operators = 0  # run on tagged tensors so far
-        self.dtypes = set()  # of the tagged tensors that operators have met
         self._generators = {}
         self._autocast = Autocast()
         self._undo = []
@@ -173,7 +172,6 @@ class DeviceDouble(TorchDispatchMode):
             return func(*args, **kwargs)
         name = func._schema.name.removeprefix("aten::")
         self.operators += 1
-        self.dtypes |= {each.dtype for each in tagged}
         if name == "_has_compatible_shallow_copy_type":
             return False
         if name == "_fused_sdp_choice":
