@@ -80,7 +80,7 @@ def run(arguments: argparse.Namespace) -> int:
 
         def publish(cameras: Cameras) -> None:
             write_tables(out, cameras, root, arguments.format)
-            watchdog.status = int(not has_camera(cameras))
+            watchdog.status = int(not any(any(found.values()) for found in cameras.values()))
 
         assembly = options.assembly_of(arguments, arguments.recipe, arguments.mode, interrupt)
         assembly = replace(assembly, recipe=for_cameras(assembly.recipe, arguments.camera))
@@ -88,15 +88,11 @@ def run(arguments: argparse.Namespace) -> int:
         given = {"listed": listed, "rotations": arguments.rotations, "publish": publish}
         result = reconstruct_folder(root, datasets, assembly, session, out, **given)
         unwritten, failed = result.report.unwritten, trouble(result.report)
-        watchdog.status = int(bool(failed or unwritten) or not has_camera(result.cameras))
+        watchdog.status = int(bool(failed or unwritten)) or watchdog.status
         lines = [*options.plan_lines(arguments, result.report), *_lines(result), failed, unwritten]
         say("\n".join(filter(None, [*lines, f"results: {out}"])))
         page = out / "report.html" if result.pairs else None
         return options.finish(session, watchdog.status, page, result.pairs)
-
-
-def has_camera(cameras: Cameras) -> bool:
-    return any(any(found.values()) for found in cameras.values())
 
 
 def _lines(result: FolderResult) -> Iterator[str]:
