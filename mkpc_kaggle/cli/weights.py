@@ -9,7 +9,7 @@ from mkpc_kaggle.matchers.registry import UnusableError, matcher_names, spec_of
 from mkpc_kaggle.pipeline.availability import slots_of
 from mkpc_kaggle.recipe import load_recipe, recipe_names
 from mkpc_kaggle.weights import WeightFile, WeightStore
-from mkpc_kaggle.weights.convert import convert
+from mkpc_kaggle.weights.checkpoint import convert
 from mkpc_kaggle.weights.fetch import FetchOutcome, choose, fetch
 from mkpc_kaggle.weights.manifest import UNVERIFIED, pin, read_manifest
 
