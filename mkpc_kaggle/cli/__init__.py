@@ -71,7 +71,7 @@ def main(arguments: Sequence[str] | None = None, *, started: float | None = None
                 raise UserError(f"the current directory is gone ({error.strerror}); change to another") from error
             parsed.started = time.monotonic() if started is None else started
             printing.enter_context(parsed.printing())
-            status = int(parsed.run(parsed))
+            status = int(parsed.run(parsed) or 0)
             with suppress(OSError, ValueError):  # the disk is full, or the stream closed
                 if sys.stdout is not None:
                     sys.stdout.flush()  # waits for a slow reader, except in a run

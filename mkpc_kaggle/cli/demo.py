@@ -21,10 +21,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=int, default=0, help="seed of the rendered scenes")
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run(arguments: argparse.Namespace) -> None:
     if arguments.seed < 0:
         raise UserError("--seed: give 0 or more")
     with writing(f"--out {arguments.out}"):
         demo = write_demo(arguments.out, seed=arguments.seed)
     print(f"train side: {demo.train_dir}\ntest side: {demo.test_dir}\ntruth of the test side: {demo.truth_csv}")
-    return 0

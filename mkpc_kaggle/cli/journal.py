@@ -36,7 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--test-dir", type=Path, metavar="DIR", help="the images that the report draws")
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run(arguments: argparse.Namespace) -> None:
     inputs = test_side(arguments.test_dir) if arguments.test_dir else []
     require_apart({"--report": arguments.report}, inputs, arguments.work_dir)
     log = read_log(arguments.work_dir)
@@ -46,4 +46,3 @@ def run(arguments: argparse.Namespace) -> int:
         write_report(log, arguments.report, pairs)
         written.append(arguments.report)
     print("\n".join(map(str, written)) or overview(log))
-    return 0

@@ -26,7 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     options.add_matching(parser)
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run(arguments: argparse.Namespace) -> None:
     inputs = [arguments.image0, arguments.image1, Path(arguments.recipe)]
     require_apart({"--out": arguments.out}, inputs, weights=arguments.weights)
     if arguments.out is not None:
@@ -52,4 +52,3 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.out is not None:
         save(draw_pair(*images, match, matcher.recipe.mkpc), arguments.out)
         print(f"figure: {arguments.out}")
-    return 0

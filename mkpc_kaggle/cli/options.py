@@ -20,8 +20,7 @@ from mkpc_kaggle.recipe import Mode
 
 def add_matching(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    text = "default: auto, every matcher whose weights are found"
-    add("--recipe", default="auto", metavar="NAME|FILE.toml", help=text)
+    add("--recipe", default="auto", metavar="NAME|FILE.toml", help="default: auto, every matcher with its weights")
     add_weights(parser)
     text = """permissive: only weights under Apache-2.0, BSD-3-Clause or MIT. Recipe auto omits other weights, and
         units run their fallback; any other recipe that needs them is refused (default: any)"""

@@ -24,8 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--out", type=Path, required=True, metavar="DIR", help="the directory for the two folders")
     add("--owner", required=True, metavar="NAME", help="your user name on Kaggle")
     options.add_weights(parser)
-    text = "Python versions to bundle wheels for (default: %(default)s)"
-    add("--python", default=",".join(PYTHONS), metavar="VERSIONS", help=text)
+    add("--python", default=",".join(PYTHONS), metavar="VERSIONS", help="of the wheels (default: %(default)s)")
     add("--wheels", type=Path, metavar="DIR", help="take wheels from DIR, without a network")
     text = "include weights that must not be redistributed; the dataset must then stay private"
     add("--private", action="store_true", help=text)
@@ -34,7 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--image", default=LATEST, metavar="latest|original|NAME@sha256:DIGEST", help=text)
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run(arguments: argparse.Namespace) -> None:
     out, private, image = arguments.out, arguments.private, arguments.image
     pythons = tuple(version.strip() for version in arguments.python.split(","))
     weights = tuple(arguments.weights)
@@ -49,7 +48,6 @@ def run(arguments: argparse.Namespace) -> int:
         names = ", ".join(f"{item.name} ({item.licence})" for item in package.restricted)
         print(f"{_PRIVATE if private else _LEFT_OUT}: {names}\n")
     print(_NEXT.format(out=out))
-    return 0
 
 
 _LEFT_OUT = "Left out, because their licences do not clearly allow redistribution (--private includes them)"

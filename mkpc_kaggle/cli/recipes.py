@@ -19,7 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     options.add_weights(parser)
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run(arguments: argparse.Namespace) -> None:
     store = WeightStore(arguments.weights)
     for name in recipe_names():
         recipe = load_recipe(name)
@@ -29,4 +29,3 @@ def run(arguments: argparse.Namespace) -> int:
             print(f"    {unit.name}  at most {unit.max_matches}{fallback}")
         reasons = [f"    {matcher}: {reason}" for matcher, reason in unavailable(recipe, store).items()]
         print("\n".join(reasons or ["    all weights are available"]))
-    return 0

@@ -51,14 +51,12 @@ MAX_LINES = 20  # of each list
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("images", type=Path, metavar="DIR", help="png, jpg or jpeg files, or folders of them")
-    text = "directory for the results: empty, or with the results of an earlier run"
-    add("--out", type=Path, required=True, metavar="OUT", help=text)
+    add("--out", type=Path, required=True, metavar="OUT", help="empty, or with the results of an earlier run")
     options.add_matching(parser)
     options.add_run(parser, time_limit=None)
     add("--pairs", type=Path, metavar="FILE", help="match only these: two paths below DIR per line, as in hloc")
     add("--format", choices=FORMS, help="also write submission.csv; imc2023 is also for 2024")
-    text = "try images without matches turned by 90, 180 and 270 degrees"
-    add("--rotations", action="store_true", help=text)
+    add("--rotations", action="store_true", help="try images without matches turned by 90, 180 and 270 degrees")
     text = """images of one size in a folder that share a camera: if their focal lengths agree (auto), none
         (image), or all (folder)"""
     add("--camera", choices=list(map(str, CameraSharing)), help=text)
@@ -80,7 +78,7 @@ def run(arguments: argparse.Namespace) -> int:
 
         def publish(cameras: Cameras) -> None:
             write_tables(out, cameras, root, arguments.format)
-            watchdog.status = int(not has_camera(cameras))
+            watchdog.status = int(not any(any(found.values()) for found in cameras.values()))
 
         assembly = options.assembly_of(arguments, arguments.recipe, arguments.mode, interrupt)
         assembly = replace(assembly, recipe=for_cameras(assembly.recipe, arguments.camera))
@@ -88,15 +86,11 @@ def run(arguments: argparse.Namespace) -> int:
         given = {"listed": listed, "rotations": arguments.rotations, "publish": publish}
         result = reconstruct_folder(root, datasets, assembly, session, out, **given)
         unwritten, failed = result.report.unwritten, trouble(result.report)
-        watchdog.status = int(bool(failed or unwritten) or not has_camera(result.cameras))
+        watchdog.status = int(bool(failed or unwritten)) or watchdog.status
         lines = [*options.plan_lines(arguments, result.report), *_lines(result), failed, unwritten]
         say("\n".join(filter(None, [*lines, f"results: {out}"])))
         page = out / "report.html" if result.pairs else None
         return options.finish(session, watchdog.status, page, result.pairs)
-
-
-def has_camera(cameras: Cameras) -> bool:
-    return any(any(found.values()) for found in cameras.values())
 
 
 def _lines(result: FolderResult) -> Iterator[str]:

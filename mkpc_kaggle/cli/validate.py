@@ -101,7 +101,13 @@ def run(arguments: argparse.Namespace) -> int:
     root = arguments.train_dir or arguments.image_root
     inputs = [root, arguments.pairs, arguments.truth, arguments.regions, *(arguments.submission or ())]
     require_apart({"--json": arguments.json}, filter(None, inputs), arguments.work_dir)
-    scenes = _read_scenes(arguments)
+    scenes: Sequence[TrainScene]
+    most, least = arguments.pairs_per_scene, arguments.min_covisibility
+    if arguments.pairs is not None:
+        scenes = [read_pairs(arguments.pairs, root, most=most)]
+    else:
+        names = filter(None, arguments.scenes.split(","))
+        scenes = read_train_side(root, scenes=names, min_covisibility=least, pairs_per_scene=most)
     status = 0
     figures: dict[str, Any] | None = None
     if arguments.submission is not None:
@@ -136,14 +142,6 @@ def _require_a_whole(given: argparse.Namespace) -> None:
     ):
         if is_wrong:
             raise UserError(message)
-
-
-def _read_scenes(arguments: argparse.Namespace) -> tuple[TrainScene, ...]:
-    most: int | None = arguments.pairs_per_scene
-    if arguments.pairs is not None:
-        return (read_pairs(arguments.pairs, arguments.image_root, most=most),)
-    scenes, least = filter(None, arguments.scenes.split(",")), arguments.min_covisibility
-    return read_train_side(arguments.train_dir, scenes=scenes, min_covisibility=least, pairs_per_scene=most)
 
 
 def _score(arguments: argparse.Namespace, scenes: Sequence[TrainScene]) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from mkpc_kaggle.matchers.registry import UnusableError, matcher_names, spec_of
 from mkpc_kaggle.pipeline.availability import slots_of
 from mkpc_kaggle.recipe import load_recipe, recipe_names
 from mkpc_kaggle.weights import WeightFile, WeightStore
-from mkpc_kaggle.weights.convert import convert
+from mkpc_kaggle.weights.checkpoint import convert
 from mkpc_kaggle.weights.fetch import FetchOutcome, choose, fetch
 from mkpc_kaggle.weights.manifest import UNVERIFIED, pin, read_manifest
 
@@ -50,10 +50,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    return int(arguments.act(arguments))
+    return int(arguments.act(arguments) or 0)
 
 
-def _list(arguments: argparse.Namespace) -> int:
+def _list(arguments: argparse.Namespace) -> None:
     store = WeightStore(arguments.weights)
     specs, unusable = [], []
     for name in matcher_names():
@@ -72,7 +72,6 @@ def _list(arguments: argparse.Namespace) -> int:
         rows.append((slot, files[0].licence, ", ".join(users) or "-", "; ".join(where)))
     options.print_table(rows)
     print("".join(f"{text}\n" for text in unusable), end="")
-    return 0
 
 
 def _verify(arguments: argparse.Namespace) -> int:
@@ -109,9 +108,8 @@ def _fetch(arguments: argparse.Namespace) -> int:
     return 1 if {FetchOutcome.FAILED, FetchOutcome.BY_HAND} & set(outcomes) else 0
 
 
-def _convert(arguments: argparse.Namespace) -> int:
+def _convert(arguments: argparse.Namespace) -> None:
     print(convert(arguments.file, arguments.out).line)
-    return 0
 
 
 def files_of(name: str, store: WeightStore) -> list[list[WeightFile]]:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.weights import FoundFile, State, WeightFile, WeightStore
-from mkpc_kaggle.weights.convert import convert
+from mkpc_kaggle.weights.checkpoint import convert
 
 HEADER = "# The weights of this dataset; the columns are name, bytes, digest, licence, slot, source.\n"
 

@@ -63,13 +63,12 @@ def reconstruct_folder(
     """
     assembly = replace(assembly, recipe=for_cameras(assembly.recipe))
     with opened_engine(assembly, session, [files[0].parent for files in datasets.values()]) as engine:
+        standing: list[Cameras] = [{name: dict.fromkeys(files) for name, files in datasets.items()}]
         if not (out / "cameras.csv").exists():
             with writing(f"--out {out}"):
-                publish({name: dict.fromkeys(files) for name, files in datasets.items()})
+                publish(standing[0])
         pairs = choose_pairs(engine, root, datasets, assembly, session, listed=listed, rotations=rotations)
         exports = {name: Export(out / name) for name in datasets}
-
-        standing: list[Cameras] = []
 
         def write(results: Standing) -> None:
             standing[:] = [cameras_of(datasets, str(root), results)]

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from mkpc_kaggle.data.outputs import weights_of_environment
 from mkpc_kaggle.errors import UserError, warn_once
-from mkpc_kaggle.weights.checkpoint import load_tensors
+from mkpc_kaggle.weights.checkpoint import is_unpacked_from, load_tensors
 from mkpc_kaggle.weights.manifest import MANIFEST, UNVERIFIED, WeightFile, digest_of, manifest, read_manifest
 
 if TYPE_CHECKING:
@@ -238,12 +238,3 @@ def _may_be(size: int, file: WeightFile, files: Iterable[WeightFile]) -> bool:
     """Return whether a file of ``size`` bytes may have the content of ``file``, or of another of ``files``."""
     may_be_any = size <= MAX_UNKNOWN_SIZE_BYTES and any(line.size < 0 for line in files)
     return file.size < 0 or may_be_any or size in (file.size, *(line.size for line in files))
-
-
-def is_unpacked_from(directory: Path, file: WeightFile) -> bool:
-    """Return whether ``directory`` has a name that Kaggle gives to the unpacked ``file``.
-
-    Kaggle unpacks uploaded archives, and torch checkpoints are archives: ``NAME.pth`` becomes
-    ``NAME/NAME/{data.pkl, data/, version, ...}``, with or without the suffix in the outer name.
-    """
-    return bool({directory.name, directory.parent.name} & {file.name, Path(file.name).stem})

@@ -5,9 +5,9 @@ import torch
 from weight_files import digest_of
 
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.weights import convert as module
+from mkpc_kaggle.weights import checkpoint as module
 from mkpc_kaggle.weights import load_tensors
-from mkpc_kaggle.weights.convert import convert
+from mkpc_kaggle.weights.checkpoint import convert
 from mkpc_kaggle.weights.manifest import UNVERIFIED, WeightFile
 
 

@@ -10,7 +10,7 @@ from weight_files import DATA, OTHER, digest_of, line, put
 
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.weights import UNVERIFIED, State, WeightStore, load_tensors, store
-from mkpc_kaggle.weights.convert import convert
+from mkpc_kaggle.weights.checkpoint import convert
 from mkpc_kaggle.weights.manifest import digest_of as file_digest
 
 pytestmark = pytest.mark.usefixtures("nowhere_else")
