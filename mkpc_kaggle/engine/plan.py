@@ -204,11 +204,9 @@ class Plan:
                 self.costs.observe(found.unit.name, found.seconds, warm_up=found.warm_up)
         self._look()
 
-    def on_failure(self, job: MatchJob, failure: Failure, time_limit: float) -> None:
+    def on_failure(self, job: MatchJob, failure: Failure) -> None:
         """Record a lost job: it comes back as single pairs and units. Skip a unit that is lost twice on a pair."""
         self.busy[list(job.indices)] = False
-        if failure.cause is Cause.TIMED_OUT and len(job.units) == 1:
-            self.costs.assume(job.units[0].name, time_limit / len(job.indices))
         lost = [(index, unit.name) for index in job.indices for unit in job.units]
         if failure.cause is Cause.DEVICE:  # it counts against the place
             self.losses.alone.update(lost)

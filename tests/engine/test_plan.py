@@ -9,9 +9,17 @@ from statistics import mean, median
 import numpy as np
 import pytest
 from rectified import SECOND, SWEEP, THIRD, THREE_UNITS
-from simulator import Scenario, SimulatedScene, memory_journal, random_scenario, simulate, without_records
+from simulator import (
+    Scenario,
+    SimulatedSite,
+    SimulatedWorker,
+    memory_journal,
+    random_scenario,
+    simulate,
+    switch_off,
+    without_records,
+)
 
-from mkpc_kaggle.engine import plan as plan_module
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.jobs import Cause, Failure, Found, MatchJob, Outcome, Phase
 from mkpc_kaggle.engine.plan import Plan
@@ -82,7 +90,7 @@ def jobs_of(
             now += finish(plan, job, inliers)
         else:
             now += 1.0
-            plan.on_failure(job, failure, 10.0)
+            plan.on_failure(job, failure)
 
 
 def learnt(plan: Plan, unit: Unit, seconds: float = 1.0) -> Plan:
@@ -253,18 +261,27 @@ def test_random_runs_are_never_late_never_lose_a_row_and_use_their_time():
     assert mean(used) > 0.9
 
 
-def test_without_the_reserve_scenes_are_missed(monkeypatch):
-    scenario = Scenario(600, (1.0,), 1, 500.0, warm_up=1, batches=2, scene_seconds=0.05)
-    assert simulate(scenario).missed == 0
-    monkeypatch.setattr(plan_module, "RESERVE_SHARE", 0.0)
-    assert simulate(scenario).missed > 0
+ABLATIONS = {  # a scenario that each mechanism of the plan serves
+    "reserve for scenes": Scenario(600, (1.0,), 1, 500.0, warm_up=1, batches=2, scene_seconds=0.05),
+    "margin of scenes": Scenario(400, (1.0,), 1, 500.0, warm_up=1, batches=8, scene_seconds=0.18),
+    "margin of units": Scenario(150, (1.0,) * 4, 1, 500.0, warm_up=1, spread=1.0),
+    "connect share": Scenario(100, (1.0,) * 3, 1, 300.0, warm_up=1, batches=2, pairs_per_image=6.0),
+    "short jobs": Scenario(100, (1.0,) * 8, 2, 300.0, warm_up=1, spread=0.5, crashes=0.01),
+    "patience": Scenario(150, (1.0, 1.0), 1, 400.0, warm_up=1, hangs=0.01, misses=0, seed=1),
+    "second try": Scenario(100, (1.0,), 1, 600.0, warm_up=1, crashes=0.05),
+    "end of tries": Scenario(100, (0.5, 1.0, 1.0), 1, 300.0, warm_up=1, never="m1"),
+}
 
 
-def test_a_unit_that_never_runs_costs_time_on_every_pair_unless_it_is_skipped_on_all(monkeypatch):
-    scenario = Scenario(100, (0.5, 1.0, 1.0), 1, 300.0, warm_up=1, never="m1")
-    skipped = simulate(scenario).report.units_run
-    monkeypatch.setattr(plan_module, "MAX_FAILED_PAIRS", 10**9)
-    assert simulate(scenario).report.units_run < skipped
+@pytest.mark.parametrize("mechanism", ABLATIONS)
+def test_a_mechanism_that_is_off_costs_units_or_scenes(monkeypatch, mechanism):
+    def gained() -> tuple[int, int]:
+        ran = simulate(ABLATIONS[mechanism])
+        return -ran.missed, sum(len(record.units) for record in ran.report.records)
+
+    whole = gained()
+    switch_off(mechanism, monkeypatch.setattr)
+    assert gained() < whole
 
 
 def test_undisturbed_runs_use_all_their_time():
@@ -321,7 +338,9 @@ def test_time_reserved_for_scenes_is_used_for_units_when_they_need_less():
 
 
 def test_scenes_that_never_begin_are_named_and_the_run_ends(monkeypatch):
-    monkeypatch.setattr(SimulatedScene, "start", lambda _: None)
+    monkeypatch.setattr(
+        SimulatedSite, "scene_worker", lambda site: SimulatedWorker(site, site.reconstruct, math.inf)
+    )
     ran = simulate(Scenario(300, (0.5, 1.0), 1, 900.0, batches=3, misses=0))
     assert ran.late == 0
     assert explained(ran.report.faults, "scenes: the worker hung: no answer for ")
