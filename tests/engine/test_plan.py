@@ -3,7 +3,7 @@
 import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from statistics import mean, median
 
 import numpy as np
@@ -251,14 +251,14 @@ def test_more_time_never_means_fewer_units():
 
 
 def test_random_runs_are_never_late_never_lose_a_row_and_use_their_time():
-    runs = [without_records(simulate(random_scenario(seed, pairs=150))) for seed in range(40)]
+    runs = [without_records(simulate(random_scenario(seed, pairs=150))) for seed in range(20)]
     assert max(run.late for run in runs) == 0
     assert sum(run.lost for run in runs) == 0
     fit = [run for run in runs if run.scenes_fit]
     assert sum(run.missed for run in fit) <= 0.03 * sum(run.scenario.batches for run in fit)
     used = [run.utilisation for run in runs if run.work_left]
-    assert median(used) > 0.97
-    assert mean(used) > 0.9
+    assert median(used) > 0.99
+    assert mean(used) > 0.95
 
 
 ABLATIONS = {  # a scenario that each mechanism of the plan serves
@@ -282,16 +282,6 @@ def test_a_mechanism_that_is_off_costs_units_or_scenes(monkeypatch, mechanism):
     whole = gained()
     switch_off(mechanism, monkeypatch.setattr)
     assert gained() < whole
-
-
-def test_undisturbed_runs_use_all_their_time():
-    for seed in range(3):
-        rng = np.random.default_rng(seed)
-        workers = int(rng.integers(1, 5))
-        scenario = Scenario(400 * workers, tuple(rng.uniform(0.2, 2, 5).tolist()), workers, 2400.0, seed=seed)
-        ran = simulate(replace(scenario, limit=0.8 * scenario.work + 60))
-        assert ran.work_left
-        assert ran.utilisation > 0.97, scenario
 
 
 def test_planning_a_job_does_not_take_much_longer_for_many_pairs():
@@ -363,14 +353,3 @@ def test_another_estimation_runs_no_unit_and_makes_every_f_and_scene_again(fault
     assert other.report.estimated == 200 or faults
     back = simulate(done_scenario(), journal)
     assert (back.report.units_run, back.report.estimated, len(back.scenes)) == (0, 0, 0), "both are in the journal"
-
-
-def test_an_interrupted_run_of_another_estimation_resumes():
-    journal = memory_journal()
-    first = simulate(done_scenario(), journal, until=150.0)
-    assert first.report.ending is Ending.INTERRUPTED
-    last = simulate(done_scenario(threshold=1.0), journal)
-    assert last.report.ending is Ending.COMPLETE
-    extra = last.report.units_run + first.report.units_run - 400
-    assert 0 <= extra <= last.scenario.pairs, "extra pairs of scenes"
-    assert all(len(record.units) == 2 for record in last.report.records)

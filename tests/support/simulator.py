@@ -52,6 +52,7 @@ from mkpc_kaggle.scene.view_graph import BatchImage
 
 RESTART_S = 8.0
 ESTIMATE_S = 0.1  # of a pair
+WAKE_S = 5.0  # the longest wait; the real loop wakes every 0.2 s, and may give out other work then
 STALL = 20.0  # a unit that stalls takes so many times as long
 SIZE = Size(640, 480)
 MATCHES = 200  # that a unit finds
@@ -232,6 +233,7 @@ class SimulatedSite(Site):
     def wait(self, until: float) -> None:
         moment = min([until, *(worker.ready for worker in self.workers)])
         assert moment < math.inf, "the engine waits for ever"
+        moment = min(moment, self.clock.now + WAKE_S)
         if any(place.job for place in self.of(Work.SCENE)):
             idle = sum(place.is_idle for place in self.of(Work.MATCH))
             self.for_scenes += idle * max(0.0, min(moment, self.stop) - self.clock.now)
