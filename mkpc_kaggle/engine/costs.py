@@ -1,4 +1,4 @@
-"""What units cost on a pair, as measured during the run."""
+"""Costs of units on a pair, as measured during the run."""
 
 from collections import deque
 from collections.abc import Iterable
@@ -14,8 +14,7 @@ MARGIN, MIN_MARGIN = 0.4, 0.01  # of a forecast from one measurement; from n, sq
 class Costs:
     """Seconds of a unit on a pair, by name.
 
-    A worker's first run of a unit is its warm-up. It counts only while nothing else was measured, and in no
-    forecast.
+    A worker's first run of a unit is its warm-up. It counts until another run is measured, and in no forecast.
     """
 
     def __init__(self) -> None:

@@ -85,6 +85,6 @@ class Scenes:
         return START_S + matches * (FORECAST_MARGIN * seconds / done if done else MATCH_S)
 
     def report(self) -> tuple[SceneRecord, ...]:
-        """Return the scene of each batch, in order; ``failure`` says why there is none."""
+        """Return the scene of each batch, in order; ``failure`` is the reason for a missing scene."""
         missing = {name: str(self.losses.skipped.get(name, NOT_RECONSTRUCTED)) for name in self.batches}
         return tuple(self.made.get(name) or SceneRecord(name, failure=missing[name]) for name in self.batches)

@@ -28,7 +28,7 @@ def batches_of(pairs: Iterable[Pair]) -> dict[str, list[int]]:
 def extra_pairs_of(pairs: Sequence[Pair], config: SceneConfig | None) -> list[Pair]:
     """Return pairs of a batch's images that no row names, for its scene alone; the most useful first.
 
-    Each batch gets what it lacks to have ``pairs_per_image``, a batch with the fewest an image first.
+    Each batch gets up to ``pairs_per_image``, the batch with the fewest pairs per image first.
     """
     if config is None or not config.pairs_per_image:
         return []

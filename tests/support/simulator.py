@@ -1,8 +1,7 @@
 """The engine on a virtual clock: random runs without images, and how well each used its time.
 
-The plan and the engine are the real ones. Workers are simulated: what a unit costs is drawn at random, and
-drifts, stalls, crashes, hangs and wrong first estimates are thrown in. So are reconstructions of batches, which
-crash, run out of memory and hang as well.
+The plan and the engine are the real ones. Workers are simulated: costs of units are random, with drifts, stalls,
+crashes, hangs and wrong first estimates. Reconstructions of batches crash, run out of memory and hang as well.
 """
 
 import math
@@ -53,13 +52,13 @@ from mkpc_kaggle.scene.view_graph import BatchImage
 RESTART_S = 8.0
 ESTIMATE_S = 0.1  # of a pair
 WAKE_S = 5.0  # the longest wait; the real loop wakes every 0.2 s, and may give out other work then
-STALL = 20.0  # a unit that stalls takes so many times as long
+STALL = 20.0  # how many times as long a unit takes that stalls
 SIZE = Size(640, 480)
 MATCHES = 200  # that a unit finds
 POINTS = to_blob(Matches(np.zeros((MATCHES, 2)), np.zeros((MATCHES, 2)), np.zeros(MATCHES)))
 SWEEP_SHARE = 0.7  # of the limit, within which the sweep is said to fit
 
-MECHANISMS: dict[str, tuple[tuple[object, str, object], ...]] = {  # what to change to run without each
+MECHANISMS: dict[str, tuple[tuple[object, str, object], ...]] = {  # changes that switch each of them off
     "reserve for scenes": ((plan, "RESERVE_SHARE", 0.0),),
     "margin of scenes": ((scenes, "FORECAST_MARGIN", 1.0),),
     "margin of units": ((costs, "MARGIN", 0.0), (costs, "MIN_MARGIN", 0.0)),
@@ -80,16 +79,16 @@ def switch_off(mechanism: str, change: Callable[[object, str, object], None] = s
 
 @dataclass(frozen=True)
 class Scenario:
-    """A run's circumstances. Costs are seconds of a unit on a pair; faults are probabilities a unit on a pair, and
-    ``job_faults`` a job: its worker dies as it begins, hangs, or answers late, whatever the job is.
+    """The circumstances of a run: costs in seconds of a unit on a pair, faults in probabilities per unit and pair.
 
-    ``spread`` is the sigma of lognormal costs, ``misses`` the share of pairs whose views are not cached and cost
-    ``miss_factor`` times as much, ``warm_up`` what a unit takes the first time on a worker. From ``turn``, a share
-    of the limit, on costs are ``drift`` times as high.
+    A worker dies at the start of any job, hangs, or answers late with probability ``job_faults``. ``spread`` is
+    the sigma of lognormal costs. Views of a share ``misses`` of the pairs are not cached and cost ``miss_factor``
+    times as much. ``warm_up`` are the extra seconds of a unit's first run on a worker. After the share ``turn`` of
+    the limit, costs are ``drift`` times as high.
 
-    The pairs are in so many ``batches``; 0: there are no scenes. Each image but one is in a single pair, and where
-    ``pairs_per_image`` is above 1 others are matched for the scene's sake. A scene takes ``scene_seconds`` a pair
-    of its batch, and with the probability ``scene_faults`` it crashes, runs out of memory or hangs.
+    With 0 ``batches``, there are no scenes. Each image but one is in a single pair; if ``pairs_per_image`` is
+    above 1, the run adds pairs. A scene takes ``scene_seconds`` per pair. It crashes, runs out of memory or hangs
+    with probability ``scene_faults``.
     """
 
     pairs: int
@@ -133,7 +132,7 @@ class Scenario:
 
     @property
     def cached(self) -> float:
-        """What a unit costs on average, times its cost on a cached view."""
+        """Mean cost of a unit, in multiples of its cost on a cached view."""
         return 1 + self.misses * (self.miss_factor - 1)
 
     @property
@@ -353,14 +352,14 @@ def memory_journal() -> Journal:
 
 @dataclass(frozen=True)
 class Ran:
-    """What became of a scenario; ``late`` and ``lost`` must be 0.
+    """The outcome of a scenario; ``late`` and ``lost`` must be 0.
 
     ``utilisation`` is the used share of the workers' time from their start to ``stop_units``, without injected
     faults. Used are the seconds of jobs that came back in time, and of idle workers while a scene is under way
     (see :class:`SimulatedSite`).
 
     ``lost`` counts pairs without the sweep's F where the sweep fits (see :func:`sweep_seconds`), and versions of
-    the submission that lack a row. ``missed`` are batches without a scene that no fault befell; ``scenes_fit``
+    the submission with a missing row. ``missed`` are batches without a scene and without a fault; ``scenes_fit``
     states that the largest reserve suffices for all, and that none hung while others waited. ``stale`` are the
     batches whose scene is out of date.
     """
@@ -425,10 +424,10 @@ def simulate(scenario: Scenario, journal: Journal | None = None, until: float = 
 
 
 def sweep_seconds(scenario: Scenario) -> float:
-    """What the sweep takes: with the drift from its first moment on, its stalls, warm-ups, crashes and hangs.
+    """Return the expected seconds of the sweep, with its drift, stalls, warm-ups, crashes and hangs.
 
-    The faults are those to expect; that there may be more of them is what the rest of the limit is for. Each
-    takes a worker's start and warm-up, a hang also as long as a stall would.
+    The rest of the limit is for more faults than expected. A fault takes a worker's start and warm-up, and a hang
+    also takes as long as a stall.
     """
     unit = scenario.costs[0] * scenario.cached * max(1.0, scenario.drift)
     start = RESTART_S + scenario.warm_up
@@ -439,5 +438,5 @@ def sweep_seconds(scenario: Scenario) -> float:
 
 
 def without_records(ran: Ran) -> Ran:
-    """The run without what it found: kept of a thousand runs, that would slow down all that come after."""
+    """Return the run without its records: a thousand runs with theirs would fill the memory."""
     return replace(ran, report=replace(ran.report, records=()), scenes=())
