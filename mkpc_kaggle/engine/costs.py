@@ -1,4 +1,4 @@
-"""What units cost on a pair, as measured during the run."""
+"""Costs of units on a pair, as measured during the run."""
 
 from collections import deque
 from collections.abc import Iterable
@@ -14,44 +14,37 @@ MARGIN, MIN_MARGIN = 0.4, 0.01  # of a forecast from one measurement; from n, sq
 class Costs:
     """Seconds of a unit on a pair, by name.
 
-    A worker's first run of a unit is its warm-up. It counts only while nothing else was measured, and in no
-    forecast.
+    A worker's first run of a unit is its warm-up. It counts until another run is measured, and in no forecast.
     """
 
     def __init__(self) -> None:
         self._measured: dict[str, deque[float]] = {}
         self._warm_up: dict[str, float] = {}
-        self._assumed: dict[str, float] = {}
 
     def observe(self, unit: str, seconds: float, *, warm_up: bool = False) -> None:
-        self._assumed.pop(unit, None)
         if warm_up:
             self._warm_up[unit] = seconds
         else:
             self._measured.setdefault(unit, deque(maxlen=WINDOW)).append(seconds)
-
-    def assume(self, unit: str, seconds: float) -> None:
-        """Assume that a unit costs at least the seconds in which it did not end, until it is measured."""
-        if not self.has_run(unit):
-            self._assumed.setdefault(unit, seconds)
 
     def has_run(self, unit: str) -> bool:
         return unit in self._measured or unit in self._warm_up
 
     def is_known(self, unit: str) -> bool:
         """Whether more than the warm-up is known."""
-        return unit in self._measured or unit in self._assumed
+        return unit in self._measured
 
     def mean(self, unit: str) -> float:
         """Return the expected seconds on a pair; 0 if nothing is known."""
         if unit in self._measured:
             return fmean(self._measured[unit])
-        return self._assumed.get(unit, self._warm_up.get(unit, 0.0))
+        return self._warm_up.get(unit, 0.0)
 
     def forecast(self, unit: str) -> float:
         """Return the expected seconds with a margin that shrinks as more is known; 0 while nothing is."""
-        count = len(self._measured.get(unit, ())) or 1
-        return self.mean(unit) * (1 + max(MIN_MARGIN, MARGIN / sqrt(count))) if self.is_known(unit) else 0.0
+        if not self.is_known(unit):
+            return 0.0
+        return self.mean(unit) * (1 + max(MIN_MARGIN, MARGIN / sqrt(len(self._measured[unit]))))
 
     def warm_up(self, units: Iterable[Unit]) -> float:
         """Return the seconds of the longest of these units' latest first runs on a worker."""

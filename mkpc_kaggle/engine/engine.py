@@ -40,10 +40,11 @@ from mkpc_kaggle.engine.places import LISTEN_S, START_TIMEOUT_S, Place, Site, Wo
 from mkpc_kaggle.engine.plan import HANG_FACTOR, Plan
 from mkpc_kaggle.engine.records import SceneRecord
 from mkpc_kaggle.engine.request import Ending, Request, RunReport, Standing
-from mkpc_kaggle.engine.scenes import Scenes, batches_of, extra_pairs_of
+from mkpc_kaggle.engine.scenes import Scenes
 from mkpc_kaggle.engine.state import State
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.recipe import Unit
+from mkpc_kaggle.scene.densify import batches_of, extra_pairs_of
 from mkpc_kaggle.scene.reconstruct import Solution
 
 UNKNOWN_SHARE, MAX_UNKNOWN_S = 0.25, 3600.0  # of the time left, after which a job of unknown cost hangs
@@ -382,7 +383,7 @@ class Engine:
     def _take_answer(self, place: Place, now: float) -> None:
         if place.job is not None:
             place.limit = place.since + self._time_limit(place.job, place.since)  # by the costs known now
-        time_limit, seconds = place.limit - place.since, now - place.since
+        seconds = now - place.since
         answer, job = place.poll(now), place.job
         if isinstance(answer, Loaded):
             self._has_loaded = self._has_loaded or place.work is Work.MATCH
@@ -392,7 +393,7 @@ class Engine:
                 self._fault(f"a job was lost on {place.name}: {answer}" if job else f"{place.name}: {answer}")
                 if place.closed:
                     self._explain(f"no worker is started any more on {place.closed}")
-                self._lose(job, answer, time_limit)
+                self._lose(job, answer)
                 if place.closed and place.work is Work.SCENE:
                     self.scenes.skip_all(answer)
             else:
@@ -414,13 +415,13 @@ class Engine:
                 self.journal.save_feature(*job.key, answer)
         except sqlite3.Error as error:
             self._fault(f"a result cannot be saved: {error}")
-            self._lose(job, Failure(Cause.RAISED, str(error)), inf)
+            self._lose(job, Failure(Cause.RAISED, str(error)))
         if self.journal.trouble:
             self._fault(f"the journal cannot be written ({self.journal.trouble}); it continues in memory")
 
-    def _lose(self, job: Job | None, failure: Failure, time_limit: float) -> None:
+    def _lose(self, job: Job | None, failure: Failure) -> None:
         if isinstance(job, MatchJob):
-            self.plan.on_failure(job, failure, time_limit)
+            self.plan.on_failure(job, failure)
         elif isinstance(job, EstimateJob):
             if self.estimates.on_failure(job, failure):
                 self._explain(f"pair {job.pairs[0].index} keeps the F it has: {failure}")

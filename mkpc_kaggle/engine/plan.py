@@ -55,6 +55,7 @@ class Plan:
         self.workers, self.reserve, self.minibatch = 1, 0.0, minibatch
         self.busy = np.zeros(len(state.had), bool)
         self._order = np.asarray(order, int)
+        self._numbers = {unit.name: number for number, unit in enumerate(self.units)}
         self.restart()
 
     def restart(self) -> None:
@@ -117,7 +118,7 @@ class Plan:
         """Derive which units pairs can still get, and the seconds that prefixes of the recipe take."""
         missing = ~self.state.had & ~self.unusable & ~self.state.unreadable[:, None]
         for index, name in self.losses.skipped:
-            missing[index, self._number(name)] = False
+            missing[index, self._numbers[name]] = False
         self._missing = missing
         counts = missing[: self.state.rows].sum(0)
         forecasts = np.array([self.costs.forecast(unit.name) for unit in self.units])
@@ -151,7 +152,7 @@ class Plan:
         return np.asarray(np.arange(1, had.size + 1) * seconds <= most)
 
     def _job(self, phase: Phase, lacking: Mask, ready: Mask, now: float) -> MatchJob:
-        """A job for the first pair, or on a GPU for a minibatch of pairs that lack the same units."""
+        """A job for the first pair, or on a GPU for a minibatch of pairs with the same missing units."""
         order = self._order[ready[self._order]]
         if phase is Phase.FILL:
             order = order[np.argsort(self.state.inliers[order], kind="stable")]
@@ -204,11 +205,9 @@ class Plan:
                 self.costs.observe(found.unit.name, found.seconds, warm_up=found.warm_up)
         self._look()
 
-    def on_failure(self, job: MatchJob, failure: Failure, time_limit: float) -> None:
+    def on_failure(self, job: MatchJob, failure: Failure) -> None:
         """Record a lost job: it comes back as single pairs and units. Skip a unit that is lost twice on a pair."""
         self.busy[list(job.indices)] = False
-        if failure.cause is Cause.TIMED_OUT and len(job.units) == 1:
-            self.costs.assume(job.units[0].name, time_limit / len(job.indices))
         lost = [(index, unit.name) for index in job.indices for unit in job.units]
         if failure.cause is Cause.DEVICE:  # it counts against the place
             self.losses.alone.update(lost)
@@ -220,17 +219,14 @@ class Plan:
         self.explain(f"{name} is skipped on pair {index} ({failure})")
         pairs = Counter(unit for _, unit in self.losses.skipped)[name]
         if pairs >= MAX_FAILED_PAIRS and not self.costs.has_run(name):
-            self.unusable[self._number(name)] = True
+            self.unusable[self._numbers[name]] = True
             self.explain(f"{name} is skipped on all pairs: it never ran ({failure})")
-
-    def _number(self, name: str) -> int:
-        return next(number for number, unit in enumerate(self.units) if unit.name == name)
 
     # The remaining work
 
     @property
     def is_complete(self) -> bool:
-        """Whether no row lacks a unit that can run."""
+        """Whether all rows have all units that can run."""
         return not self._missing[: self.state.rows].any()
 
     @property

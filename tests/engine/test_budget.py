@@ -81,15 +81,6 @@ def test_costs_follow_a_machine_that_slows_down() -> None:
     assert costs.mean("a") == 10.0
 
 
-def test_an_assumed_cost_holds_only_for_a_unit_that_was_never_measured() -> None:
-    costs = Costs()
-    costs.observe("a", 1.0)
-    costs.assume("a", 99.0)
-    costs.assume("b", 99.0)
-    assert costs.mean("a") == 1.0
-    assert costs.mean("b") == 99.0
-
-
 def test_forecasts_grow_surer_with_every_measurement() -> None:
     costs, margins = Costs(), []
     for _ in range(1000):

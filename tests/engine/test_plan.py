@@ -3,15 +3,23 @@
 import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from statistics import mean, median
 
 import numpy as np
 import pytest
 from rectified import SECOND, SWEEP, THIRD, THREE_UNITS
-from simulator import Scenario, SimulatedScene, memory_journal, random_scenario, simulate, without_records
+from simulator import (
+    Scenario,
+    SimulatedSite,
+    SimulatedWorker,
+    memory_journal,
+    random_scenario,
+    simulate,
+    switch_off,
+    without_records,
+)
 
-from mkpc_kaggle.engine import plan as plan_module
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.jobs import Cause, Failure, Found, MatchJob, Outcome, Phase
 from mkpc_kaggle.engine.plan import Plan
@@ -82,7 +90,7 @@ def jobs_of(
             now += finish(plan, job, inliers)
         else:
             now += 1.0
-            plan.on_failure(job, failure, 10.0)
+            plan.on_failure(job, failure)
 
 
 def learnt(plan: Plan, unit: Unit, seconds: float = 1.0) -> Plan:
@@ -251,38 +259,37 @@ def test_more_time_never_means_fewer_units():
 
 
 def test_random_runs_are_never_late_never_lose_a_row_and_use_their_time():
-    runs = [without_records(simulate(random_scenario(seed, pairs=150))) for seed in range(40)]
+    runs = [without_records(simulate(random_scenario(seed, pairs=150))) for seed in range(20)]
     assert max(run.late for run in runs) == 0
     assert sum(run.lost for run in runs) == 0
     fit = [run for run in runs if run.scenes_fit]
     assert sum(run.missed for run in fit) <= 0.03 * sum(run.scenario.batches for run in fit)
     used = [run.utilisation for run in runs if run.work_left]
-    assert median(used) > 0.97
-    assert mean(used) > 0.9
+    assert median(used) > 0.99
+    assert mean(used) > 0.95
 
 
-def test_without_the_reserve_scenes_are_missed(monkeypatch):
-    scenario = Scenario(600, (1.0,), 1, 500.0, warm_up=1, batches=2, scene_seconds=0.05)
-    assert simulate(scenario).missed == 0
-    monkeypatch.setattr(plan_module, "RESERVE_SHARE", 0.0)
-    assert simulate(scenario).missed > 0
+ABLATIONS = {  # a scenario that each mechanism of the plan serves
+    "reserve for scenes": Scenario(600, (1.0,), 1, 500.0, warm_up=1, batches=2, scene_seconds=0.05),
+    "margin of scenes": Scenario(400, (1.0,), 1, 500.0, warm_up=1, batches=8, scene_seconds=0.18),
+    "margin of units": Scenario(150, (1.0,) * 4, 1, 500.0, warm_up=1, spread=1.0),
+    "connect share": Scenario(100, (1.0,) * 3, 1, 300.0, warm_up=1, batches=2, pairs_per_image=6.0),
+    "short jobs": Scenario(100, (1.0,) * 8, 2, 300.0, warm_up=1, spread=0.5, crashes=0.01),
+    "patience": Scenario(150, (1.0, 1.0), 1, 400.0, warm_up=1, hangs=0.01, misses=0, seed=1),
+    "second try": Scenario(100, (1.0,), 1, 600.0, warm_up=1, crashes=0.05),
+    "end of tries": Scenario(100, (0.5, 1.0, 1.0), 1, 300.0, warm_up=1, never="m1"),
+}
 
 
-def test_a_unit_that_never_runs_costs_time_on_every_pair_unless_it_is_skipped_on_all(monkeypatch):
-    scenario = Scenario(100, (0.5, 1.0, 1.0), 1, 300.0, warm_up=1, never="m1")
-    skipped = simulate(scenario).report.units_run
-    monkeypatch.setattr(plan_module, "MAX_FAILED_PAIRS", 10**9)
-    assert simulate(scenario).report.units_run < skipped
+@pytest.mark.parametrize("mechanism", ABLATIONS)
+def test_a_mechanism_that_is_off_costs_units_or_scenes(monkeypatch, mechanism):
+    def gained() -> tuple[int, int]:
+        ran = simulate(ABLATIONS[mechanism])
+        return -ran.missed, sum(len(record.units) for record in ran.report.records)
 
-
-def test_undisturbed_runs_use_all_their_time():
-    for seed in range(3):
-        rng = np.random.default_rng(seed)
-        workers = int(rng.integers(1, 5))
-        scenario = Scenario(400 * workers, tuple(rng.uniform(0.2, 2, 5).tolist()), workers, 2400.0, seed=seed)
-        ran = simulate(replace(scenario, limit=0.8 * scenario.work + 60))
-        assert ran.work_left
-        assert ran.utilisation > 0.97, scenario
+    whole = gained()
+    switch_off(mechanism, monkeypatch.setattr)
+    assert gained() < whole
 
 
 def test_planning_a_job_does_not_take_much_longer_for_many_pairs():
@@ -329,7 +336,9 @@ def test_time_reserved_for_scenes_is_used_for_units_when_they_need_less():
 
 
 def test_scenes_that_never_begin_are_named_and_the_run_ends(monkeypatch):
-    monkeypatch.setattr(SimulatedScene, "start", lambda _: None)
+    monkeypatch.setattr(
+        SimulatedSite, "scene_worker", lambda site: SimulatedWorker(site, site.reconstruct, math.inf)
+    )
     ran = simulate(Scenario(300, (0.5, 1.0), 1, 900.0, batches=3, misses=0))
     assert ran.late == 0
     assert explained(ran.report.faults, "scenes: the worker hung: no answer for ")
@@ -352,14 +361,3 @@ def test_another_estimation_runs_no_unit_and_makes_every_f_and_scene_again(fault
     assert other.report.estimated == 200 or faults
     back = simulate(done_scenario(), journal)
     assert (back.report.units_run, back.report.estimated, len(back.scenes)) == (0, 0, 0), "both are in the journal"
-
-
-def test_an_interrupted_run_of_another_estimation_resumes():
-    journal = memory_journal()
-    first = simulate(done_scenario(), journal, until=150.0)
-    assert first.report.ending is Ending.INTERRUPTED
-    last = simulate(done_scenario(threshold=1.0), journal)
-    assert last.report.ending is Ending.COMPLETE
-    extra = last.report.units_run + first.report.units_run - 400
-    assert 0 <= extra <= last.scenario.pairs, "extra pairs of scenes"
-    assert all(len(record.units) == 2 for record in last.report.records)

@@ -1,8 +1,7 @@
 """The engine on a virtual clock: random runs without images, and how well each used its time.
 
-The plan and the engine are the real ones. Workers are simulated: what a unit costs is drawn at random, and
-drifts, stalls, crashes, hangs and wrong first estimates are thrown in. So are reconstructions of batches, which
-crash, run out of memory and hang as well.
+The plan and the engine are the real ones. Workers are simulated: costs of units are random, with drifts, stalls,
+crashes, hangs and wrong first estimates. Reconstructions of batches crash, run out of memory and hang as well.
 """
 
 import math
@@ -10,8 +9,10 @@ import threading
 import weakref
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 
@@ -49,21 +50,21 @@ from mkpc_kaggle.scene.view_graph import BatchImage
 
 RESTART_S = 8.0
 ESTIMATE_S = 0.1  # of a pair
-STALL = 20.0  # a unit that stalls takes so many times as long
+WAKE_S = 5.0  # the longest wait; the real loop wakes every 0.2 s, and may give out other work then
+STALL = 20.0  # how many times as long a unit takes that stalls
 SIZE = Size(640, 480)
 MATCHES = 200  # that a unit finds
 POINTS = to_blob(Matches(np.zeros((MATCHES, 2)), np.zeros((MATCHES, 2)), np.zeros(MATCHES)))
 SWEEP_SHARE = 0.7  # of the limit, within which the sweep is said to fit
 
-MECHANISMS: dict[str, tuple[tuple[object, str, object], ...]] = {  # what to change to run without each
+MECHANISMS: dict[str, tuple[tuple[object, str, object], ...]] = {  # changes that switch each of them off
     "reserve for scenes": ((plan, "RESERVE_SHARE", 0.0),),
     "margin of scenes": ((scenes, "FORECAST_MARGIN", 1.0),),
     "margin of units": ((costs, "MARGIN", 0.0), (costs, "MIN_MARGIN", 0.0)),
     "latest costs": ((costs, "WINDOW", 10**9),),
-    "assumed costs": ((costs.Costs, "assume", lambda *_: None),),
     "short jobs": ((plan, "JOB_SHARE", math.inf),),
     "connect share": ((plan, "CONNECT_SHARE", 1.0),),
-    "end of patience": ((plan, "HANG_FACTOR", math.inf),),
+    "patience": ((plan, "HANG_FACTOR", math.inf),),
     "second try": ((losses, "MAX_TRIES", 1),),
     "end of tries": ((plan, "MAX_FAILED_PAIRS", 10**9),),
 }
@@ -77,16 +78,16 @@ def switch_off(mechanism: str, change: Callable[[object, str, object], None] = s
 
 @dataclass(frozen=True)
 class Scenario:
-    """A run's circumstances. Costs are seconds of a unit on a pair; faults are probabilities a unit on a pair, and
-    ``job_faults`` a job: its worker dies as it begins, hangs, or answers late, whatever the job is.
+    """The circumstances of a run: costs in seconds of a unit on a pair, faults in probabilities per unit and pair.
 
-    ``spread`` is the sigma of lognormal costs, ``misses`` the share of pairs whose views are not cached and cost
-    ``miss_factor`` times as much, ``warm_up`` what a unit takes the first time on a worker. From ``turn``, a share
-    of the limit, on costs are ``drift`` times as high.
+    A worker dies at the start of any job, hangs, or answers late with probability ``job_faults``. ``spread`` is
+    the sigma of lognormal costs. Views of a share ``misses`` of the pairs are not cached and cost ``miss_factor``
+    times as much. ``warm_up`` are the extra seconds of a unit's first run on a worker. After the share ``turn`` of
+    the limit, costs are ``drift`` times as high.
 
-    The pairs are in so many ``batches``; 0: there are no scenes. Each image but one is in a single pair, and where
-    ``pairs_per_image`` is above 1 others are matched for the scene's sake. A scene takes ``scene_seconds`` a pair
-    of its batch, and with the probability ``scene_faults`` it crashes, runs out of memory or hangs.
+    With 0 ``batches``, there are no scenes. Each image but one is in a single pair; if ``pairs_per_image`` is
+    above 1, the run adds pairs. A scene takes ``scene_seconds`` per pair. It crashes, runs out of memory or hangs
+    with probability ``scene_faults``.
     """
 
     pairs: int
@@ -130,7 +131,7 @@ class Scenario:
 
     @property
     def cached(self) -> float:
-        """What a unit costs on average, times its cost on a cached view."""
+        """Mean cost of a unit, in multiples of its cost on a cached view."""
         return 1 + self.misses * (self.miss_factor - 1)
 
     @property
@@ -185,213 +186,159 @@ class VirtualClock:
         return self.now
 
 
+@dataclass(frozen=True)
+class SceneRun:
+    """A reconstruction that began; ``seconds`` are infinite if it hangs."""
+
+    batch: str
+    begun: float
+    seconds: float
+    is_faulty: bool
+
+
+Drawn = tuple[
+    float, Answer, float
+]  # the seconds until the answer, the answer, what an injected fault takes of them
+
+
 class SimulatedSite(Site):
     """Workers that take their time on the virtual clock alone.
 
     Of their seconds until ``stop``, ``kept`` went into jobs that came back in time. ``faults`` are what injected
-    faults take whatever is planned: the unit that a crash cut short, of a hang as long as a stall might have
-    taken, which it cannot be told from sooner, a stall that was taken for a hang, and the new worker's start
-    after any of these. ``scenes`` are those begun; ``for_scenes`` are the seconds in which workers were idle and a
-    scene was under way.
+    faults take from any plan: the unit that a crash cut short, a hang for as long as a stall takes, the start of
+    a new worker. ``for_scenes`` are the seconds in which workers were idle and a scene was under way.
     """
 
     def __init__(self, scenario: Scenario, clock: VirtualClock, stop: float) -> None:
         super().__init__(clock)
-        self.scenario = scenario
-        self.clock = clock
-        self.stop = stop
+        self.scenario, self.clock, self.stop = scenario, clock, stop
         self.kept = self.faults = self.last_job = self.for_scenes = 0.0
-        self.scenes: list[SimulatedScene] = []
-        self.rng = np.random.default_rng(scenario.seed)
-        self.costs = {unit.name: cost for unit, cost in zip(scenario.recipe.units, scenario.costs, strict=True)}
+        self.scenes: list[SceneRun] = []
         self.workers: set[SimulatedWorker] = set()
-        self.others: set[Simulated] = set()
-        self._scene_rng = np.random.default_rng([scenario.seed, 1])
-        makers = [(f"place {n}", lambda: SimulatedWorker(self), Work.MATCH) for n in range(scenario.workers)]
-        makers.append(("estimates", lambda: SimulatedEstimator(self), Work.LIGHT))
+        self.costs = {unit.name: cost for unit, cost in zip(scenario.recipe.units, scenario.costs, strict=True)}
+        self.rng, self._scene_rng = (np.random.default_rng(seed) for seed in (scenario.seed, [scenario.seed, 1]))
+        makers = [(f"place {n}", self.match_worker, Work.MATCH) for n in range(scenario.workers)]
+        makers.append(("estimates", lambda: SimulatedWorker(self, self.estimate), Work.LIGHT))
         makers.append(("scenes", self.scene_worker, Work.SCENE))
         self.places = [Place(*maker) for maker in makers]
 
-    def scene_worker(self) -> "SimulatedScene":
-        self.scenes.append(SimulatedScene(self, self._scene_rng))
-        return self.scenes[-1]
+    def match_worker(self) -> "SimulatedWorker":
+        return SimulatedWorker(self, partial(self.match, set()), RESTART_S)
+
+    def scene_worker(self) -> "SimulatedWorker":
+        return SimulatedWorker(self, self.reconstruct)
 
     def wait(self, until: float) -> None:
-        running = [scene for scene in self.scenes if not scene.is_over]
-        moments = [worker.ready for worker in (*self.workers, *self.others, *running)]
-        moment = min([until, *moments])
+        moment = min([until, *(worker.ready for worker in self.workers)])
         assert moment < math.inf, "the engine waits for ever"
-        if running:
+        moment = min(moment, self.clock.now + WAKE_S)
+        if any(place.job for place in self.of(Work.SCENE)):
             idle = sum(place.is_idle for place in self.of(Work.MATCH))
             self.for_scenes += idle * max(0.0, min(moment, self.stop) - self.clock.now)
         self.clock.now = max(self.clock.now, moment)
 
+    def drift(self, now: float) -> float:
+        return self.scenario.drift if now > self.scenario.turn * self.scenario.limit else 1.0
+
     def unit_seconds(self, unit: Unit, now: float) -> float:
         scenario, rng = self.scenario, self.rng
         seconds = self.costs[unit.name] * math.exp(scenario.spread * rng.normal() - scenario.spread**2 / 2)
-        if rng.random() < scenario.misses:
-            seconds *= scenario.miss_factor
-        if now > scenario.turn * scenario.limit:
-            seconds *= scenario.drift
-        return seconds
+        missed = rng.random() < scenario.misses
+        return seconds * (scenario.miss_factor if missed else 1.0) * self.drift(now)
+
+    def stall_seconds(self, unit: Unit, now: float) -> float:
+        """Return the seconds that a stall of a unit takes on an uncached view, at the costs of this time."""
+        return STALL * self.costs[unit.name] * max(1.0, self.scenario.miss_factor) * self.drift(now)
+
+    def match(self, warm: set[str], job: MatchJob, seconds: float) -> Drawn:
+        """Draw the answer of a worker that ran the units of ``warm`` before; no unit begins after ``seconds``."""
+        scenario, rng, begun, spent = self.scenario, self.rng, self.clock.now, 0.0
+        expected = dict(zip(job.units, job.expected, strict=True))
+        if rng.random() < scenario.job_faults:
+            fate = rng.integers(3)
+            if fate == 0:
+                return 0.0, Failure(Cause.DIED), 0.0
+            if fate == 1:
+                stall = sum(self.stall_seconds(unit, begun) for unit in job.units)
+                return math.inf, Failure(Cause.TIMED_OUT), stall
+            spent = len(job.indices) * sum(self.costs[unit.name] for unit in job.units)
+        found: list[list[Found]] = [[] for _ in job.indices]
+        for unit in sorted(job.units, key=lambda unit: unit.stage):
+            for rows in found:
+                if spent + expected[unit] >= seconds:
+                    continue
+                slow = STALL if rng.random() < scenario.stalls else 1.0
+                took = slow * self.unit_seconds(unit, begun + spent)
+                took += scenario.warm_up * (unit.name not in warm)
+                fate = rng.random()
+                if fate < scenario.crashes or unit.matcher == scenario.never:
+                    return spent + took / 2, Failure(Cause.DIED), took / 2
+                if fate < scenario.crashes + scenario.hangs:
+                    return math.inf, Failure(Cause.TIMED_OUT), self.stall_seconds(unit, begun + spent)
+                spent += took
+                rows.append(Found(unit, MATCHES, POINTS, 0.0, took, warm_up=unit.name not in warm))
+                warm.add(unit.name)
+        images = [tuple(BatchImage(name, name, SIZE) for name in wanted.names) for wanted in job.pairs]
+        return spent, tuple(map(Outcome, job.indices, images, map(tuple, found))), 0.0
+
+    def estimate(self, job: EstimateJob, seconds: float) -> Drawn:
+        """Draw an answer: each pair has from 20 to 79 inliers by its number."""
+        if self.rng.random() < self.scenario.job_faults:
+            return 0.0 if self.rng.random() < 0.5 else math.inf, Failure(Cause.DIED), 0.0
+        estimates = []
+        for pair in job.pairs:
+            inliers = (20 + pair.index % 60,) * len(pair.units)
+            values = pair.index, pair.revisions, inliers, FALLBACK_FUNDAMENTAL
+            estimates.append(Estimated(*values, seconds=ESTIMATE_S))
+        return ESTIMATE_S * len(estimates), tuple(estimates), 0.0
+
+    def reconstruct(self, job: SceneJob, seconds: float) -> Drawn:
+        scenario, rng, begun = self.scenario, self._scene_rng, self.clock.now
+        spread = math.exp(0.3 * rng.normal() - 0.3**2 / 2)
+        spent = (START_S + spread * scenario.scene_seconds * len(job.pairs)) * self.drift(begun)
+        answer: Answer = Solution((), (Choice(FALLBACK_FUNDAMENTAL, Reason.SCENE),) * len(job.pairs))
+        if is_faulty := rng.random() < scenario.scene_faults:
+            answer = Failure(Cause.DIED, "signal SIGSEGV")
+            spent *= (0.5, 0.3, math.inf)[rng.integers(3)]
+        self.scenes.append(SceneRun(job.batch, begun, spent, is_faulty))
+        return spent, answer, 0.0
 
 
-class Simulated:
+class SimulatedWorker:
     """A worker whose answer is drawn when a job is submitted, and given when its time has come."""
 
-    def __init__(self, site: SimulatedSite) -> None:
+    def __init__(self, site: SimulatedSite, draw: Callable[[Any, float], Drawn], start_s: float = 0.0) -> None:
         self.ready = math.inf
-        self._site = site
-        self._answer: Answer | None = None
-
-    def answer(self) -> Answer | None:
-        if self._answer is None or self._site.clock.now < self.ready:
-            return None
-        answer, self._answer, self.ready = self._answer, None, math.inf
-        return answer
-
-
-class SimulatedWorker(Simulated):
-    """A matching worker."""
-
-    def __init__(self, site: SimulatedSite) -> None:
-        super().__init__(site)
-        self.job: Job | None = None
-        self._warm: set[str] = set()
+        self._site, self._draw, self._start_s = site, draw, start_s
+        self._answer: Answer = Loaded()
+        self._begun = self._fault = 0.0
 
     def start(self) -> None:
         self._site.workers.add(self)
-        self._answer, self.ready = Loaded(), self._site.clock.now + RESTART_S
+        self.ready = self._site.clock.now + self._start_s
 
     def submit(self, job: Job, seconds: float) -> None:
-        assert isinstance(job, MatchJob) and self._answer is None
-        now = self._site.clock.now
-        self.job = job
-        self.ready, self._answer, fault = self._do(job, now, now + seconds)
-        self._kept = max(0.0, min(self.ready, self._site.stop) - now)
-        if isinstance(self._answer, Failure):
-            self._fault, self._begun = fault, now
-            if self._answer.cause is Cause.TIMED_OUT:
-                self._answer, self.ready = None, math.inf  # the engine has to find out
-            else:
-                self._note_fault()
-
-    def _note_fault(self) -> None:
-        lost = self._fault + RESTART_S * (self._fault > 0)
-        self._site.faults += max(0.0, min(lost, self._site.stop - self._begun))
-        self._fault = 0.0
+        self._begun = self._site.clock.now
+        taken, self._answer, self._fault = self._draw(job, seconds)
+        self.ready = self._begun + taken
 
     def answer(self) -> Answer | None:
-        if (answer := super().answer()) is not None:
-            self.job = None
-        if isinstance(answer, tuple):
-            self._site.kept += self._kept
-            self._site.last_job = self._site.clock.now
-        return answer
+        site = self._site
+        if site.clock.now < self.ready:
+            return None
+        if self._start_s and isinstance(self._answer, tuple):
+            site.kept += max(0.0, min(self.ready, site.stop) - self._begun)
+            site.last_job = self.ready
+        self.ready = math.inf
+        return self._answer
 
     def kill(self) -> None:
-        if self.job is not None and self._answer is None:  # it hangs
-            self._fault = min(self._fault, self._site.clock.now - self._begun)
-            self._note_fault()
-        self._site.workers.discard(self)
-
-    def _do(self, job: MatchJob, begun: float, deadline: float) -> tuple[float, Answer, float]:
-        """When the job ends, its answer, and the seconds of it that an injected fault took at most."""
-        site, now = self._site, begun
-        scenario, expected = site.scenario, dict(zip(job.units, job.expected, strict=True))
-        found: list[list[Found]] = [[] for _ in job.indices]
-        hung = Failure(Cause.TIMED_OUT)
-        if site.rng.random() < scenario.job_faults:
-            fate = site.rng.integers(3)
-            if fate == 0:
-                return now, Failure(Cause.DIED), 1e-9
-            if fate == 1:
-                return now, hung, sum(self._stall(unit, now) for unit in job.units)
-            now += len(job.indices) * sum(site.costs[unit.name] for unit in job.units)
-        for unit in sorted(job.units, key=lambda unit: unit.stage):
-            for rows in found:
-                if now + expected[unit] >= deadline:
-                    continue
-                stalled = site.rng.random() < scenario.stalls
-                usual = site.unit_seconds(unit, now)
-                warm_up = unit.name not in self._warm
-                self._warm.add(unit.name)
-                seconds = usual * (STALL if stalled else 1.0) + scenario.warm_up * warm_up
-                fate = site.rng.random()
-                if fate < scenario.crashes or unit.matcher == scenario.never:
-                    return now + seconds / 2, Failure(Cause.DIED), seconds / 2
-                if fate < scenario.crashes + scenario.hangs:
-                    return now, hung, self._stall(unit, now)
-                now += seconds
-                rows.append(Found(unit, MATCHES, POINTS, 0.0, seconds, warm_up=warm_up))
-        outcomes = []
-        for index, wanted, rows in zip(job.indices, job.pairs, found, strict=True):
-            images = tuple(BatchImage(name, name, SIZE) for name in wanted.names)
-            outcomes.append(Outcome(index, images, tuple(rows)))
-        return now, tuple(outcomes), 0.0
-
-    def _stall(self, unit: Unit, now: float) -> float:
-        """Return the seconds that a stall of a unit takes on an uncached view, at the costs of this time."""
-        scenario = self._site.scenario
-        drift = scenario.drift if now > scenario.turn * scenario.limit else 1.0
-        return STALL * self._site.costs[unit.name] * max(1.0, scenario.miss_factor) * drift
-
-
-class SimulatedEstimator(Simulated):
-    """Estimates pairs: each has from 20 to 79 inliers by its number."""
-
-    def start(self) -> None:
-        self._site.others.add(self)
-        self._answer, self.ready = Loaded(), self._site.clock.now
-
-    def submit(self, job: Job, seconds: float) -> None:
-        assert isinstance(job, EstimateJob)
-        scenario, rng, now = self._site.scenario, self._site.rng, self._site.clock.now
-        self.ready = now + ESTIMATE_S * len(job.pairs)
-        inliers = [20 + pair.index % 60 for pair in job.pairs]
-        self._answer = tuple(
-            Estimated(
-                *(pair.index, pair.revisions, (count,) * len(pair.units), FALLBACK_FUNDAMENTAL), seconds=ESTIMATE_S
-            )
-            for pair, count in zip(job.pairs, inliers, strict=True)
-        )
-        if rng.random() < scenario.job_faults:
-            self._answer = Failure(Cause.DIED)
-            self.ready = now if rng.random() < 0.5 else math.inf
-
-    def kill(self) -> None:
-        self._site.others.discard(self)
-
-
-class SimulatedScene(Simulated):
-    """A worker for a batch; ``is_over`` when it was killed."""
-
-    def __init__(self, site: SimulatedSite, rng: np.random.Generator) -> None:
-        super().__init__(site)
-        self.batch = ""
-        self.begun = self.seconds = 0.0
-        self.is_over = self.is_faulty = False
-        self._rng = rng
-
-    def start(self) -> None:
-        self._answer, self.ready = Loaded(), self._site.clock.now
-
-    def submit(self, job: Job, seconds: float) -> None:
-        assert isinstance(job, SceneJob)
-        scenario, rng, self.begun = self._site.scenario, self._rng, self._site.clock.now
-        spread = math.exp(0.3 * rng.normal() - 0.3**2 / 2)
-        self.batch, self.seconds = job.batch, START_S + spread * scenario.scene_seconds * len(job.pairs)
-        if self.begun > scenario.turn * scenario.limit:
-            self.seconds *= scenario.drift
-        self._answer = Solution((), (Choice(FALLBACK_FUNDAMENTAL, Reason.SCENE),) * len(job.pairs))
-        if rng.random() < scenario.scene_faults:
-            self.is_faulty = True
-            self._answer = Failure(Cause.DIED, "signal SIGSEGV")
-            self.seconds *= (0.5, 0.3, math.inf)[rng.integers(3)]
-        self.ready = self.begun + self.seconds
-
-    def kill(self) -> None:
-        self.is_over = True
+        """End the worker, which died, hangs, or computes."""
+        site = self._site
+        site.workers.discard(self)
+        if self._start_s and isinstance(self._answer, Failure):
+            lost = min(self._fault, site.clock.now - self._begun) + RESTART_S
+            site.faults += max(0.0, min(lost, site.stop - self._begun))
 
 
 def memory_journal() -> Journal:
@@ -406,20 +353,16 @@ def memory_journal() -> Journal:
 
 @dataclass(frozen=True)
 class Ran:
-    """What became of a scenario; ``late`` and ``lost`` must be 0.
+    """The outcome of a scenario; ``late`` and ``lost`` must be 0.
 
-    ``utilisation`` is what was used of what was given, of a run that did not get all done. Given are the workers'
-    seconds from their start to the budget's ``stop_units``, whenever the run ended, without those that injected
-    faults take from any planner (see :class:`SimulatedSite`). Used are
-    the seconds of jobs whose results came back in time, warm-ups and stalls included. So idle workers, the end of
-    a phase, what a lost job had done before, silence longer than a stall's, a slow unit taken to hang, and what
-    is still under way at the end all count against the engine. A worker that is idle while a scene is under way is
-    used.
+    ``utilisation`` is the used share of the workers' time from their start to ``stop_units``, without injected
+    faults. Used are the seconds of jobs that came back in time, and of idle workers while a scene is under way
+    (see :class:`SimulatedSite`).
 
     ``lost`` counts pairs without the sweep's F where the sweep fits (see :func:`sweep_seconds`), and versions of
-    the submission that lack a row. ``missed`` are batches without a scene that no fault befell; ``scenes_fit``
-    says that what is left to scenes at most suffices for all, and that none hung while others waited. ``last_job``
-    is when the last job came back. ``stale`` are the batches whose scene is out of date.
+    the submission with a missing row. ``missed`` are batches without a scene and without a fault; ``scenes_fit``
+    states that the largest reserve suffices for all, and that none hung while others waited. ``stale`` are the
+    batches whose scene is out of date.
     """
 
     scenario: Scenario
@@ -430,7 +373,7 @@ class Ran:
     missed: int
     scenes_fit: bool
     last_job: float
-    scenes: tuple[SimulatedScene, ...]
+    scenes: tuple[SceneRun, ...]
     stale: set[str]
 
     @property
@@ -482,10 +425,10 @@ def simulate(scenario: Scenario, journal: Journal | None = None, until: float = 
 
 
 def sweep_seconds(scenario: Scenario) -> float:
-    """What the sweep takes: with the drift from its first moment on, its stalls, warm-ups, crashes and hangs.
+    """Return the expected seconds of the sweep, with its drift, stalls, warm-ups, crashes and hangs.
 
-    The faults are those to expect; that there may be more of them is what the rest of the limit is for. Each
-    takes a worker's start and warm-up, a hang also as long as a stall would.
+    The rest of the limit is for more faults than expected. A fault takes a worker's start and warm-up, and a hang
+    also takes as long as a stall.
     """
     unit = scenario.costs[0] * scenario.cached * max(1.0, scenario.drift)
     start = RESTART_S + scenario.warm_up
@@ -496,5 +439,5 @@ def sweep_seconds(scenario: Scenario) -> float:
 
 
 def without_records(ran: Ran) -> Ran:
-    """The run without what it found: kept of a thousand runs, that would slow down all that come after."""
+    """Return the run without its records: a thousand runs with theirs would fill the memory."""
     return replace(ran, report=replace(ran.report, records=()), scenes=())

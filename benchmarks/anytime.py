@@ -1,0 +1,62 @@
+"""Accuracy by time limit: mAA of scenes at limits of 1, 2, 4, 8 and 16 times the sweep, on the real clock.
+
+python -m benchmarks.anytime --train-dir DIR --out FIGURE.png [--recipes classical light] [--runs 2] [-- OPTION...]
+
+OPTIONs are of `validate`, such as `--scenes A,B`. The sweep is a run of the recipe's first unit alone, from the
+start of its process to its end. *Early* is how long before the limit a process ended, at least; negative is late.
+"""
+
+import argparse
+import json
+import subprocess
+import sys
+import time
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from mkpc_kaggle.recipe import load_recipe
+from mkpc_kaggle.reporting.figures import new_figure, plain, save
+
+FACTORS = (1, 2, 4, 8, 16)
+
+
+def timed(arguments: list[str]) -> tuple[float, float]:
+    """Run `validate`. Return its mAA and the seconds of its process."""
+    with TemporaryDirectory() as directory:
+        result = Path(directory) / "scores.json"
+        start = time.monotonic()
+        command = [sys.executable, "-m", "mkpc_kaggle", "validate", "--json", str(result), *arguments]
+        subprocess.run(command, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        return json.loads(result.read_text())["mAA"], time.monotonic() - start
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--train-dir", required=True)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--recipes", nargs="+", default=["classical", "light"])
+    parser.add_argument("--runs", type=int, default=2)
+    parser.add_argument("options", nargs="*")
+    given = parser.parse_args()
+    figure = new_figure(6.5, 3.2)
+    axes = plain(figure.subplots(), "mAA by time limit, over multiples of the sweep")
+    print(f"{'recipe':12}{'limit':>10}{'early':>8}  mAA")
+    for recipe in given.recipes:
+        side = ["--train-dir", given.train_dir, "--recipe", recipe, *given.options]
+        _, sweep = timed([*side, "--no-scenes", "--units", load_recipe(recipe).units[0].name])
+        means = []
+        for factor in FACTORS:
+            runs = [timed([*side, "--time-limit", f"{factor * sweep:.1f}"]) for _ in range(given.runs)]
+            early = min(factor * sweep - seconds for _, seconds in runs)
+            means.append(sum(maa for maa, _ in runs) / len(runs))
+            scores = ", ".join(f"{maa:.3f}" for maa, _ in runs)
+            print(f"{recipe:12}{factor * sweep:9.1f}s{early:7.1f}s  {scores}", flush=True)
+        axes.plot(FACTORS, means, "o-", label=f"{recipe}: the sweep takes {sweep:.0f} s")
+    axes.set_xscale("log", base=2)
+    axes.set(ylim=(0, 1), xlabel="time limit / sweep", xticks=FACTORS, xticklabels=FACTORS)
+    axes.legend(fontsize=8, frameon=False)
+    save(figure, given.out)
+
+
+if __name__ == "__main__":
+    main()
