@@ -214,14 +214,8 @@ def table(title: str, draws: Draws, names: Sequence[str]) -> list[str]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--train-dir", type=Path, required=True)
-    parser.add_argument("--journals", type=Path, nargs="+", required=True)
+    parser = draws_parser(__doc__ or "")
     parser.add_argument("--thresholds", type=float, nargs="+", default=())
-    parser.add_argument("--scenes", nargs="*", default=())
-    parser.add_argument("--images", nargs="+", type=int, default=[0], help="of a draw; 0, the default: all")
-    parser.add_argument("--shares", nargs="+", type=float, default=[1.0])
-    parser.add_argument("--seeds", type=int, default=1, help="draws of each number of images and share")
     names = [*PAIR_ESTIMATORS, SCENE]
     parser.add_argument("--estimates", nargs="+", choices=names, default=names)
     parser.add_argument("--settings", nargs="+", default=[""], metavar="TOML")
@@ -232,6 +226,23 @@ def main() -> None:
     elif SCENE in arguments.estimates:
         settings = arguments.settings
         estimators |= {f"{SCENE}, {line}" if line else SCENE: partial(by_scene, line) for line in settings}
+    compare(estimators, arguments)
+
+
+def draws_parser(description: str) -> argparse.ArgumentParser:
+    """Return a parser of the options that choose journals, scenes and draws."""
+    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--train-dir", type=Path, required=True)
+    parser.add_argument("--journals", type=Path, nargs="+", required=True)
+    parser.add_argument("--scenes", nargs="*", default=())
+    parser.add_argument("--images", nargs="+", type=int, default=[0], help="of a draw; 0, the default: all")
+    parser.add_argument("--shares", nargs="+", type=float, default=[1.0])
+    parser.add_argument("--seeds", type=int, default=1, help="draws of each number of images and share")
+    return parser
+
+
+def compare(estimators: Mapping[str, Estimator], arguments: argparse.Namespace) -> None:
+    """Print a table of the estimators' scores for each journal and share."""
     for directory in arguments.journals:
         recipe, journal = read_journal(directory)
         done: dict[float, dict[str, list[dict[str, Score]]]] = defaultdict(lambda: defaultdict(list))
@@ -245,9 +256,8 @@ def main() -> None:
                 scores = {name: score(make, pairs, inside, scene) for name, make in estimators.items()}
                 done[share][scene.name].append(scores)
         for share, draws in done.items():
-            print(
-                "\n".join(table(f"{recipe}, {share:.0%} of the pairs", draws, list(estimators))), "\n", flush=True
-            )
+            title = f"{recipe}, {share:.0%} of the pairs"
+            print("\n".join(table(title, draws, list(estimators))), "\n", flush=True)
 
 
 if __name__ == "__main__":

@@ -1,0 +1,113 @@
+"""Scenes from COLMAP's pipeline and ours, with one stage exchanged at a time.
+
+python -m benchmarks.stages --train-dir DIR --journals DIR --databases DIR [--scenes NAME ...]
+    [--images 18] [--seeds 4] [--cells MATCHES/CELL/ERROR/CAMERA/MAPPER ...]
+
+A row of the table is a scene of these stages. The first row, ``all/0.75/1/pinhole/global``, is ours.
+
+- MATCHES: ``all`` of the journal, those of some units such as ``1:sift@1536+1:aliked@1024``, or ``COLMAP``
+- CELL: size in pixels of the cells in which keypoints are merged; ``0``: none are
+- ERROR: of a verified match in pixels, ``1`` with our number of trials, any other with COLMAP's
+- CAMERA: ``pinhole`` or ``radial``
+- MAPPER: ``global`` or ``incremental``
+
+COLMAP's SIFT and exhaustive matching of a scene are stored in DATABASES/SCENE.db. The other options and the table
+are those of `benchmarks.estimation`. Each image has its own camera.
+"""
+
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+from functools import cache, partial
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from benchmarks.estimation import Known, batch_pair, compare, draws_parser, extra_of
+from benchmarks.pycolmap_alone import matched
+from mkpc_kaggle.geometry.coordinates import Matrix3
+from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.recipe import CameraModel, CameraSharing, SceneConfig
+from mkpc_kaggle.scene import colmap, keypoints
+from mkpc_kaggle.scene.reconstruct import reconstruct_batch
+from mkpc_kaggle.scene.reconstruction import MIN_IMAGES
+
+OURS, COLMAP = "all/0.75/1/pinhole/global", "COLMAP/0/4/radial/incremental"
+UNMERGED_PX = 1e-3
+COLMAP_TRIALS = 10_000
+
+
+@cache
+def of_colmap(database: Path, images: Path) -> tuple[dict[str, Any], dict[tuple[str, str], NDArray[np.uint32]]]:
+    """Return COLMAP's keypoints (K, 2) of the images of a folder, and the matches (M, 2) of its pairs."""
+    if not database.exists():
+        part = database.with_suffix(".part")
+        part.unlink(missing_ok=True)
+        matched(part, images, one_camera=False)
+        part.rename(database)
+    with pycolmap.Database.open(str(database)) as found:
+        names = {image.image_id: image.name for image in found.read_all_images()}
+        points = {name: found.read_keypoints(number)[:, :2] - colmap.CENTRE_PX for number, name in names.items()}
+        ends = [(i, j) for i in names for j in names if i < j and found.exists_matches(i, j)]
+        return points, {(names[i], names[j]): found.read_matches(i, j) for i, j in ends}
+
+
+def matches_of(known: Known, source: str, databases: Path) -> Matches:
+    if source != "COLMAP":
+        chosen = [each for each in known.found.results if source == "all" or each.unit.name in source.split("+")]
+        return Matches.concatenate(each.matches for each in chosen)
+    first, second = known.true.pair.images
+    points, found = of_colmap(databases / f"{first.parent.parent.name}.db", first.parent)
+    if (second.name, first.name) in found:
+        index = found[second.name, first.name][:, ::-1]
+    else:
+        index = found.get((first.name, second.name), np.zeros((0, 2), np.uint32))
+    return Matches(points[first.name][index[:, 0]], points[second.name][index[:, 1]], np.ones(len(index)))
+
+
+@contextmanager
+def stages(cell: float, error: float, mapper: str) -> Iterator[None]:
+    """Exchange the stages of :mod:`mkpc_kaggle.scene` within the context."""
+    with ExitStack() as stack:
+        stack.enter_context(patch.object(keypoints, "CELL_PX", cell or UNMERGED_PX))
+        if error != colmap.MAX_ERROR_PX:
+            stack.enter_context(patch.multiple(colmap, MAX_ERROR_PX=error, MAX_TRIALS=COLMAP_TRIALS))
+        if mapper == "incremental":
+            stack.enter_context(patch.object(pycolmap, "GlobalPipeline", incremental))
+        yield
+
+
+def incremental(_: Any, database: Any, manager: Any) -> Any:
+    settings = {"random_seed": 0, "num_threads": 1, "extract_colors": False, "min_model_size": MIN_IMAGES}
+    return pycolmap.IncrementalPipeline(pycolmap.IncrementalPipelineOptions(settings), database, manager)
+
+
+def by_stages(row: str, databases: Path, pairs: Sequence[Known], every: Sequence[Known]) -> list[Matrix3 | None]:
+    """Return the F of the pairs from a row's scene, or their own: an estimator of `benchmarks.estimation`."""
+    source, cell, error, camera, mapper = row.split("/")
+    model = CameraModel.PINHOLE if camera == "pinhole" else CameraModel.RADIAL
+    config = SceneConfig(camera_model=model, cameras=CameraSharing.IMAGE)
+    batch = [
+        replace(batch_pair(known.true, known.found, known.F), tracks=matches_of(known, source, databases))
+        for known in (*pairs, *extra_of(pairs, every, config))
+    ]
+    with stages(float(cell), float(error), mapper):
+        choices = reconstruct_batch(batch, config).choices
+    return [known.F if choice.F is None else choice.F for known, choice in zip(pairs, choices, strict=False)]
+
+
+def main() -> None:
+    parser = draws_parser(__doc__ or "")
+    parser.add_argument("--databases", type=Path, required=True)
+    parser.add_argument("--cells", nargs="+", default=[OURS, COLMAP])
+    arguments = parser.parse_args()
+    arguments.databases.mkdir(parents=True, exist_ok=True)
+    compare({f"scene, {row}": partial(by_stages, row, arguments.databases) for row in arguments.cells}, arguments)
+
+
+if __name__ == "__main__":
+    main()
