@@ -19,6 +19,7 @@ from pathlib import Path, PureWindowsPath
 from typing import Any
 
 import numpy as np
+import PIL.Image
 
 from mkpc_kaggle.data.competition import Pair, TrainScene, TruePair, evenly_spread, read_rows
 from mkpc_kaggle.errors import UserError, read_text
@@ -71,8 +72,8 @@ def read_regions(file: Path, image_root: Path, pairs: Iterable[Pair]) -> dict[tu
     """Return the stage-2 boxes of these pairs, keyed by their image files.
 
     ``file`` is a table ``image_0,image_1,box_0,box_1``: paths under the root; left, top, right and bottom in whole
-    pixels of the stored file, the latter two exclusive. Raises :class:`UserError` for a malformed table or box and
-    for a missing pair. A unit fails on a pair if a box extends beyond its image.
+    pixels of the stored file, the latter two exclusive. Raises :class:`UserError` for a malformed table, for a box
+    that is malformed or extends beyond its image, and for a missing pair.
     """
     boxes = {}
     for where, (name0, name1, *cells) in read_rows(file, ("image_0", "image_1", "box_0", "box_1")):
@@ -81,7 +82,20 @@ def read_regions(file: Path, image_root: Path, pairs: Iterable[Pair]) -> dict[tu
     wanted = {(pair.file0, pair.file1): pair.id for pair in pairs}
     if missing := [name for files, name in wanted.items() if files not in boxes]:
         raise UserError(f"{file} has no regions of the pair {missing[0]}")
+    for files in wanted:
+        for path, box in zip(files, boxes[files], strict=True):
+            require_inside(box, path, file)
     return {files: boxes[files] for files in wanted}
+
+
+def require_inside(box: Box, path: str, file: Path) -> None:
+    with (
+        suppress(OSError, PIL.Image.DecompressionBombError),
+        PIL.Image.open(path) as picture,
+    ):  # reads its head alone
+        if box.right > picture.width or box.bottom > picture.height:
+            size = f"{picture.width} x {picture.height}"
+            raise UserError(f"{file}: a box ends at {box.right}, {box.bottom}, beyond {path} of {size} pixels")
 
 
 def parse_box(cell: str, where: str) -> Box:
