@@ -14,6 +14,7 @@ from mkpc_kaggle.data.competition import read_test_side, submission_problems
 from mkpc_kaggle.errors import UserError
 
 ROOT = Path(__file__).resolve().parents[2]
+HERE = ("--no-report", "--workers", "0")  # in one process
 
 
 def command(test_dir: Path, output: Path, recipe: Path | str, *more: str) -> list[str]:
@@ -40,20 +41,20 @@ def test_a_submission_is_made_resumed_and_computed_again_where_a_unit_changed(de
     assert "complete after" in first.stdout
     assert_good(output, demo.test_dir)
     written = output.read_bytes()
-    second = make(demo.test_dir, output, small_recipe, "--no-report")
+    second = make(demo.test_dir, output, small_recipe, *HERE)
     assert "8 of them from earlier runs" in second.stdout
     assert output.read_bytes() == written
     small_recipe.write_text(small_recipe.read_text().replace("400", "401"))
-    assert "8 units run" in make(demo.test_dir, output, small_recipe, "--no-report").stdout
+    assert "8 units run" in make(demo.test_dir, output, small_recipe, *HERE).stdout
     changed = output.read_bytes()
     assert changed != written
-    assert "16 units run" in make(demo.test_dir, output, small_recipe, "--fresh", "--no-report").stdout
+    assert "16 units run" in make(demo.test_dir, output, small_recipe, "--fresh", *HERE).stdout
     assert output.read_bytes() == changed
 
 
 def test_a_killed_run_goes_on_and_ends_with_the_bytes_of_an_undisturbed_one(demo, small_recipe, tmp_path):
     undisturbed, output = tmp_path / "undisturbed.csv", tmp_path / "submission.csv"
-    make(demo.test_dir, undisturbed, small_recipe, "--no-report", "--workers", "0")
+    make(demo.test_dir, undisturbed, small_recipe, *HERE)
     running = subprocess.Popen(
         command(demo.test_dir, output, small_recipe, "--no-report"), stderr=subprocess.PIPE, text=True
     )
@@ -65,7 +66,7 @@ def test_a_killed_run_goes_on_and_ends_with_the_bytes_of_an_undisturbed_one(demo
     running.wait()
     running.stderr.close()
     assert_good(output, demo.test_dir)
-    resumed = make(demo.test_dir, output, small_recipe, "--no-report")
+    resumed = make(demo.test_dir, output, small_recipe, *HERE)
     assert resumed.returncode == 0, resumed.stderr
     assert output.read_bytes() == undisturbed.read_bytes()
 

@@ -174,7 +174,10 @@ def test_a_submission_keeps_its_numbers_and_their_order(tmp_path):
     assert submission_problems(tmp_path / "submission.csv", list(rows)) == []
     write_submission(tmp_path / "x.csv", {"b": EYE, "a": -EYE / 2})
     expected = b"sample_id,fundamental_matrix\nb,1 0 0 0 1 0 0 0 1\na,-0.5 -0 -0 -0 -0.5 -0 -0 -0 -0.5\n"
-    assert (tmp_path / "x.csv").read_bytes() == expected
+    with (tmp_path / "x.csv").open("rb") as former:
+        write_submission(tmp_path / "x.csv", {"b": EYE})
+        assert former.read() == expected, "a file is replaced, not overwritten"
+    assert list(read_submission(tmp_path / "x.csv")) == ["b"]
 
 
 @pytest.mark.parametrize(

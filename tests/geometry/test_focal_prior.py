@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from benchmarks.synthetic_scene import project
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.focal_prior import FocalConfig, FocalPrior, estimate_with_prior
@@ -27,16 +28,11 @@ def camera(focal, turn=0.0, t=(0, 0, 0), centre=CENTRE):
 CAMERAS = camera(900.0), camera(1300.0, 0.15, (-1.0, 0.1, 0.2))
 
 
-def project(cameras, X):
-    """The points (N, 3) in the pixels of each camera."""
-    return [x[:, :2] / x[:, 2:] for x in ((X @ view.R.T + view.t) @ view.K.T for view in cameras)]
-
-
 def seen(cameras, n=200, noise=0.0, outliers=0, seed=0, depth=(4, 9)):
     """n matches of random points, then wild ones."""
     rng = np.random.default_rng(seed)
     X = rng.uniform((-1.5, -1.2, depth[0]), (1.5, 1.2, depth[1]), (n, 3))
-    points = [x + rng.normal(scale=noise, size=(n, 2)) for x in project(cameras, X)]
+    points = [project(view, X) + rng.normal(scale=noise, size=(n, 2)) for view in cameras]
     wild = [rng.uniform(0, SIZE, (outliers, 2)) for _ in range(2)]
     return Matches(*(np.vstack(both) for both in zip(points, wild, strict=True)), np.ones(n + outliers))
 
@@ -101,7 +97,7 @@ def test_a_principal_point_far_off_leaves_magsac_its_matrix():
     cropped = camera(700.0, centre=(-900, 1500)), camera(800.0, 0.3, (-2.0, 0.3, 0.5), centre=(2500, -800))
     rng = np.random.default_rng(0)
     X = rng.uniform((-4, -4, 4), (4, 4, 9), (400, 3))
-    matches = Matches(*project(cropped, X), np.ones(400))
+    matches = Matches(*(project(view, X) for view in cropped), np.ones(400))
     result = with_prior(matches)
     assert result.ok
     assert_array_equal(result.matrix, result.magsac)
@@ -115,7 +111,7 @@ def degenerate():
     X = np.column_stack([rng.uniform(-1, 1, (80, 2)), np.full(80, 5.0)])
     return {
         "a pure rotation": seen((camera(1100), camera(1100, 0.1)), 80, 0.1),
-        "one plane": Matches(*project(CAMERAS, X), np.ones(80)),
+        "one plane": Matches(*(project(view, X) for view in CAMERAS), np.ones(80)),
         "a line": Matches(np.column_stack([along, along]), np.column_stack([along, 2 * along]), np.ones(40)),
         "six": seen(CAMERAS, 6),
         "five": seen(CAMERAS, 5),
@@ -148,6 +144,6 @@ def test_magsac_wins_over_focal_lengths_that_are_too_implausible():
 
 def test_matches_of_points_behind_the_cameras_cost_as_outliers():
     X = np.random.default_rng(1).uniform((-1.5, -1.2, -9), (1.5, 1.2, -4), (60, 3))
-    before, behind = seen(CAMERAS, 200, 0.05), Matches(*project(CAMERAS, X), np.ones(60))
+    before, behind = seen(CAMERAS, 200, 0.05), Matches(*(project(view, X) for view in CAMERAS), np.ones(60))
     costs = [with_prior(matches).stats.cost for matches in (before, Matches.concatenate([before, behind]))]
     assert costs[1] - costs[0] == pytest.approx(60 / 2, rel=0.1)

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.testing import assert_allclose, assert_array_equal
 
+from benchmarks.synthetic_scene import project
 from mkpc_kaggle.geometry import robust
 from mkpc_kaggle.geometry.cameras import Camera, fundamental_of_cameras
 from mkpc_kaggle.geometry.matches import Matches
@@ -38,11 +39,6 @@ def cameras(seed):
     R0, R1 = (cv2.Rodrigues(rng.uniform(-0.15, 0.15, 3))[0] for _ in range(2))
     t = np.array([1.0, rng.uniform(-0.5, 0.5), rng.uniform(-0.5, 0.5)])
     return Camera(K0, R0, np.zeros(3)), Camera(K1, R1, t)
-
-
-def project(camera, X):
-    x = (X @ camera.R.T + camera.t) @ camera.K.T
-    return x[:, :2] / x[:, 2:]
 
 
 def seen(seed, n, *, plane=False):

@@ -15,6 +15,8 @@ from typing import Any
 
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from safetensors.torch import save_file
 from torch import nn
 from weight_files import put
@@ -216,3 +218,19 @@ def test_records_that_unpack_to_more_than_the_file_or_overlap_are_refused(tmp_pa
         same.file_size = same.compress_size = 20_000
     with pytest.raises(UserError, match="compressed or overlap"):
         load_tensors(path)
+
+
+@settings(max_examples=100)
+@given(st.lists(st.tuples(st.integers(0, 10_000), st.integers(0, 255)), min_size=1, max_size=3))
+def test_a_damaged_pickle_gives_tensors_or_a_refusal(tmp_path_factory, changes):
+    def damaged(data: bytes) -> bytes:
+        changed = bytearray(data)
+        for place, byte in changes:
+            changed[place % len(data)] = byte
+        return bytes(changed)
+
+    path = with_pickle(tmp_path_factory.mktemp("fuzz") / "x.pt", damaged)
+    try:
+        assert all(isinstance(tensor, torch.Tensor) for tensor in load_tensors(path).values())
+    except UserError as refusal:
+        assert "x.pt cannot be read as a checkpoint" in str(refusal)
