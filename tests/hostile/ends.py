@@ -114,6 +114,13 @@ CASES = [
         {"a checked submission of NaN": written("sub.csv", OF_NAN)},
         (1,),
     ),
+    Case(
+        "arguments",
+        "a name that clears the screen",
+        "match 'a\x1b[2J\n' b",
+        statuses=REFUSED,
+        says=r"a\x1b[2J\n: no",
+    ),
     Case("arguments", "an owner that is a path", "package --out out/p --owner ../x", statuses=REFUSED),
     *signals(),
 ]

@@ -105,5 +105,6 @@ CASES = [
     Case("tables", "5,000 pairs of no images", SUBMIT, written("D/test.csv", NO_IMAGES), (1,)),
     Case("tables", "a batch that the locale lacks", SUBMIT, ACCENTED, says="1 of 2 pairs", env=C),
     *makes("recipes", SUBMIT, tables_of("quick.toml", RECIPES)),
+    Case("recipes", "17 MiB", SUBMIT, written("quick.toml", "#" * (17 << 20)), REFUSED, "at most 16777216 are"),
     *makes("recipes", SUBMIT, tables_of("quick.toml", GOOD_RECIPES), (0,)),
 ]

@@ -13,13 +13,16 @@ from room import IMAGES_TO, REPORTED, SUBMIT, encoded, picture
 HEAD = 33  # bytes of a PNG's signature and first chunk
 FOLDER = "D/test_images/b1"
 JOURNAL = "journal out/s.work --report out/r.html --test-dir D"
-COMMANDS = {
-    "submit in its own process": SUBMIT,
-    "submit in a worker": SUBMIT.replace("--workers 0", "--workers 1"),
-    "submit with a report": REPORTED,
-    "reconstruct": IMAGES_TO.replace("I", FOLDER, 1).replace("--workers 0", "--workers 1") + " out/o",
-    "match": f"match {FOLDER}/x.png {FOLDER}/y.png --recipe quick.toml --out out/p.png",
-    "a page from a journal": JOURNAL,
+COMMANDS = {  # and the end of its work
+    "submit in its own process": (SUBMIT, "complete after"),
+    "submit in a worker": (SUBMIT.replace("--workers 0", "--workers 1"), "complete after"),
+    "submit with a report": (REPORTED, "complete after"),
+    "reconstruct": (
+        IMAGES_TO.replace("I", FOLDER, 1).replace("--workers 0", "--workers 1") + " out/o",
+        "complete after",
+    ),
+    "match": (f"match {FOLDER}/x.png {FOLDER}/y.png --recipe quick.toml --out out/p.png", "figure: out/p.png"),
+    "a page from a journal": (JOURNAL, "out/r.html"),
 }
 
 
@@ -56,7 +59,7 @@ COMPLAINTS = {
     "bytes between a photograph's restarts": extra_restart,
 }
 CASES = [
-    Case("unread", f"{name}: {complaint}", command, complained_of(make, command), (0, 1), stderr=full_pipe)
+    Case("unread", f"{name}: {complaint}", command, complained_of(make, command), (0, 1), says, stderr=full_pipe)
     for complaint, make in COMPLAINTS.items()
-    for name, command in COMMANDS.items()
+    for name, (command, says) in COMMANDS.items()
 ]
