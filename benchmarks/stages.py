@@ -3,11 +3,11 @@
 python -m benchmarks.stages --train-dir DIR --journals DIR --databases DIR [--scenes NAME ...]
     [--images 18] [--seeds 4] [--cells MATCHES/CELL/ERROR/CAMERA/MAPPER ...]
 
-A row of the table is a scene of these stages. The first row, ``all/0.75/1/pinhole/global``, is ours.
+A row of the table is a scene of these stages. The first row, ``all/0.75/2/pinhole/global``, is ours.
 
 - MATCHES: ``all`` of the journal, those of some units such as ``1:sift@1536+1:aliked@1024``, or ``COLMAP``
 - CELL: size in pixels of the cells in which keypoints are merged; ``0``: none are
-- ERROR: of a verified match in pixels, ``1`` with our number of trials, any other with COLMAP's
+- ERROR: of a verified match in pixels, with our number of trials; from ``4`` with COLMAP's
 - CAMERA: ``pinhole`` or ``radial``
 - MAPPER: ``global`` or ``incremental``
 
@@ -36,9 +36,9 @@ from mkpc_kaggle.scene import colmap, keypoints
 from mkpc_kaggle.scene.reconstruct import reconstruct_batch
 from mkpc_kaggle.scene.reconstruction import MIN_IMAGES
 
-OURS, COLMAP = "all/0.75/1/pinhole/global", "COLMAP/0/4/radial/incremental"
+OURS, COLMAP = "all/0.75/2/pinhole/global", "COLMAP/0/4/radial/incremental"
 UNMERGED_PX = 1e-3
-COLMAP_TRIALS = 10_000
+COLMAP_ERROR_PX, COLMAP_TRIALS = 4.0, 10_000
 
 
 @cache
@@ -74,8 +74,8 @@ def stages(cell: float, error: float, mapper: str) -> Iterator[None]:
     """Exchange the stages of :mod:`mkpc_kaggle.scene` within the context."""
     with ExitStack() as stack:
         stack.enter_context(patch.object(keypoints, "CELL_PX", cell or UNMERGED_PX))
-        if error != colmap.MAX_ERROR_PX:
-            stack.enter_context(patch.multiple(colmap, MAX_ERROR_PX=error, MAX_TRIALS=COLMAP_TRIALS))
+        trials = colmap.MAX_TRIALS if error < COLMAP_ERROR_PX else COLMAP_TRIALS
+        stack.enter_context(patch.multiple(colmap, MAX_ERROR_PX=error, MAX_TRIALS=trials))
         if mapper == "incremental":
             stack.enter_context(patch.object(pycolmap, "GlobalPipeline", incremental))
         yield
