@@ -40,11 +40,10 @@ from mkpc_kaggle.engine.places import LISTEN_S, START_TIMEOUT_S, Place, Site, Wo
 from mkpc_kaggle.engine.plan import HANG_FACTOR, Plan
 from mkpc_kaggle.engine.records import SceneRecord
 from mkpc_kaggle.engine.request import Ending, Request, RunReport, Standing
-from mkpc_kaggle.engine.scenes import Scenes
+from mkpc_kaggle.engine.scenes import Scenes, batches_of, extra_pairs_of
 from mkpc_kaggle.engine.state import State
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.recipe import Unit
-from mkpc_kaggle.scene.densify import batches_of, extra_pairs_of
 from mkpc_kaggle.scene.reconstruct import Solution
 
 UNKNOWN_SHARE, MAX_UNKNOWN_S = 0.25, 3600.0  # of the time left, after which a job of unknown cost hangs

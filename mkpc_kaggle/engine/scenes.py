@@ -1,20 +1,54 @@
 """Batches reconstructed in parallel with matching: which of them, when, and how long they take."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.jobs import Failure, SceneJob
 from mkpc_kaggle.engine.losses import Losses
 from mkpc_kaggle.engine.records import SceneRecord
+from mkpc_kaggle.recipe import SceneConfig
+from mkpc_kaggle.scene.densify import extra_pairs
 
+MIN_PAIRS = 2  # they can connect three images
 START_S = 3.0  # that a process takes to begin
 MATCH_S = 5e-4  # that a match adds to a reconstruction, before any was measured
 FORECAST_MARGIN = 1.5  # of a forecast from the matches of earlier scenes
 NOT_RECONSTRUCTED = "not reconstructed in time"
 
 Mask = NDArray[np.bool_]
+
+
+def batches_of(pairs: Iterable[Pair]) -> dict[str, list[int]]:
+    """Return the indices of the pairs of each batch that may be reconstructed: F is wanted, no camera is known."""
+    batches: dict[str, list[int]] = {}
+    for index, pair in enumerate(pairs):
+        if pair.intrinsics is None:
+            batches.setdefault(pair.group, []).append(index)
+    return {name: members for name, members in batches.items() if len(members) >= MIN_PAIRS}
+
+
+def extra_pairs_of(pairs: Sequence[Pair], config: SceneConfig | None) -> list[Pair]:
+    """Return pairs of a batch's images that no row names, for its scene alone; the most useful first.
+
+    Each batch gets up to ``pairs_per_image``, the batch with the fewest pairs per image first.
+    """
+    if config is None or not config.pairs_per_image:
+        return []
+    extra: list[tuple[float, Pair]] = []
+    for batch, indices in batches_of(pairs).items():
+        asked = [pairs[index] for index in indices]
+        files = list(dict.fromkeys(file for pair in asked for file in (pair.file0, pair.file1)))
+        number = {file: index for index, file in enumerate(files)}
+        ends = [(number[pair.file0], number[pair.file1]) for pair in asked]
+        distinct = len({tuple(sorted(pair)) for pair in ends})
+        for count, (i, j) in enumerate(extra_pairs(len(files), ends, config.pairs_per_image), start=distinct):
+            key = f"{batch};{Path(files[i]).stem}-{Path(files[j]).stem}"
+            extra.append((count / len(files), Pair(key, batch, files[i], files[j])))
+    return [pair for _, pair in sorted(extra, key=lambda each: each[0])]
 
 
 class Scenes:
