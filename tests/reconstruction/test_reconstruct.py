@@ -327,9 +327,10 @@ class UprightSift(SyntheticMatcher):
     def match(self, encodings0, encodings1):  # type: ignore[no-untyped-def,override]
         matches = []
         for (points0, found0), (points1, found1) in zip(encodings0, encodings1, strict=True):
-            pairs = [pair for pair in cv2.BFMatcher(crossCheck=True).match(found0, found1) if pair.distance < 150]
-            ends = [points0[m.queryIdx].pt for m in pairs], [points1[m.trainIdx].pt for m in pairs]
-            matches.append(Matches(*ends, np.ones(len(pairs))) if pairs else Matches.empty())
+            near = cv2.BFMatcher().knnMatch(found0, found1, k=2)
+            good = [first for first, second in near if first.distance < 0.75 * second.distance]
+            ends = [points0[m.queryIdx].pt for m in good], [points1[m.trainIdx].pt for m in good]
+            matches.append(Matches(*ends, np.ones(len(good))))
         return matches
 
 
