@@ -1,4 +1,4 @@
-"""The clock of a run: durations, the time left, and the four moments at which a run must let go of something."""
+"""The clock of a run: durations, the time left, and the four deadlines of a run."""
 
 import os
 import re
@@ -12,16 +12,16 @@ from statistics import median_low
 
 from mkpc_kaggle.errors import UserError
 
-SUMMARY_FACTOR = 5  # telling what a run did takes at most this many times what writing its submission takes
-WRITE_MARGIN = 1.5  # the next write may take this many times what the latest took
+SUMMARY_FACTOR = 5  # a report may take this many times as long as writing the submission
+WRITE_MARGIN = 1.5  # the next write may take this many times as long as the latest
 MAX_WRITE_SHARE = 0.05  # of the limit, which writing is expected to take at most
 MAX_SILENCE_S, MIN_SILENCE_S, SILENCE_SHARE = 60.0, 5.0, 0.02  # of a worker, by the share of the limit
 MAX_STEP_BACK_S = 60.0  # of the wall clock, between the moment that --started-at names and the start
-MAX_PROCESS_AGE_S = 60.0  # a process that claims to be older when it begins to work does not tell its age
+MAX_PROCESS_AGE_S = 60.0  # the reported age of an older process is wrong
 
 
 def parse_duration(text: str) -> float:
-    """Seconds from ``8h45m``, ``90m``, ``60s`` or plain seconds; raises :class:`UserError` for anything else."""
+    """Return the seconds of ``8h45m``, ``90m``, ``60s`` or a number. Raise :class:`UserError` for other text."""
     parts = re.fullmatch(r"(?:(\d+)h)?(?:(\d+)m)?(?:(\d+(?:\.\d+)?)(s?))?", text.strip())
     if parts is None or not any(parts.groups()):
         raise UserError(f"{text!r} is not a duration; write it as 8h45m, 90m, 60s or a number of seconds")
@@ -35,7 +35,7 @@ def parse_duration(text: str) -> float:
 
 
 def format_duration(seconds: float) -> str:
-    """Such as ``8h45m``, ``12m03s`` or ``4.2s``."""
+    """Return text such as ``8h45m``, ``12m03s`` or ``4.2s``."""
     if seconds < 60:
         return f"{seconds:.1f}s"
     minutes, rest = divmod(round(seconds), 60)
@@ -44,10 +44,10 @@ def format_duration(seconds: float) -> str:
 
 @dataclass
 class Budget:
-    """The time that a run has, in seconds of ``clock``, which never jumps, since ``started``.
+    """The time of a run since ``started``, in seconds of ``clock``, which never jumps.
 
-    No unit runs after ``stop_units``; no answer is waited for after ``stop_waiting``; the last version of the
-    submission is written at ``final_write``; the process is gone at ``limit``.
+    No unit runs after ``stop_units``, and the run waits for no worker after ``stop_waiting``. The last version of
+    the submission is written at ``final_write``. The process has ended at ``limit``.
     """
 
     started: float
@@ -60,7 +60,7 @@ class Budget:
 
     @property
     def writing(self) -> float:
-        """Seconds that the next write may take, by the median of the latest: a single slow write is forgotten."""
+        """Seconds that the next write may take, by the median of the latest: one slow write has no effect."""
         median = median_low(self._writes) if self._writes else 0.0
         return min(WRITE_MARGIN * median, MAX_WRITE_SHARE * self.time_limit)
 
@@ -101,9 +101,9 @@ class Budget:
 def monotonic_of(epoch: float) -> float:
     """Return the monotonic clock's time at wall-clock time ``epoch``, in seconds since 1970.
 
-    Called once, when a run starts: however the wall clock jumps later, the run's limit does not move. A moment
-    less than a minute ahead counts as now, because the clock was set back meanwhile. Raises :class:`UserError` for
-    a moment in the future.
+    It is called once, when a run starts, so later jumps of the wall clock do not move the limit. A time less than
+    a minute ahead counts as now, because the clock was probably set back. Raises :class:`UserError` for a later
+    time.
     """
     ago = time.time() - epoch
     if not -MAX_STEP_BACK_S < ago < inf:
@@ -114,7 +114,7 @@ def monotonic_of(epoch: float) -> float:
 
 
 def process_started() -> float:
-    """The monotonic clock's time at which this process began: imports count, too.
+    """Return the monotonic clock's time at which this process began, before its imports.
 
     From Linux's /proc/self/stat (field 22, clock ticks since boot); elsewhere the time of the call.
     """

@@ -1,7 +1,7 @@
-"""Workers on a Ray cluster: an actor for each GPU, or for each machine if there is none; Ray places them.
+"""Workers on a Ray cluster: an actor for each GPU, or for each machine without GPUs; Ray places them.
 
-The test set and the weights have the same paths on every machine, as on clusters with a shared file system. The
-parent's machine has to last, and Ray's head: without them another run goes on from the journal.
+The test set and the weights have the same paths on every machine, as on clusters with a shared file system. If the
+parent's machine or Ray's head fails, the same command resumes from the journal.
 """
 
 import os
@@ -41,7 +41,7 @@ class RayCluster:
     address: str = ""
 
     def require_reachable(self) -> None:
-        """Raise :class:`UserError` where nothing listens at the address: Ray itself tries for minutes."""
+        """Raise :class:`UserError` if nothing listens at the address: Ray itself tries for minutes."""
         host, _, port = self.address.rpartition(":")
         try:
             socket.create_connection((host, int(port)), timeout=REACH_TIMEOUT_S).close()
@@ -65,7 +65,7 @@ def parse_workers(text: str) -> int | RayCluster:
 
 
 class RaySite(Site):
-    """The machines of a cluster, which is joined when the site is opened.
+    """Machines of a cluster, which is joined when the site is opened.
 
     Each must have the weights and the ``folders``, which hold the images. Raises :class:`UserError` where Ray is
     not installed.
@@ -120,7 +120,7 @@ class RaySite(Site):
 
 
 class RayWorker(ThreadWorker):
-    """An actor that Ray places ``where`` there is room; the thread waits for its answers."""
+    """An actor that Ray places by the resources in ``where``. The thread waits for its answers."""
 
     _actor: Any = None
 
@@ -137,7 +137,7 @@ class RayWorker(ThreadWorker):
                 self._ray.kill(self._actor)
 
     def join(self, until: float) -> None:
-        """Wait until the killed worker's thread asks Ray for nothing more, or a moment of the monotonic clock."""
+        """Wait until the killed worker's thread has ended, or until a time of the monotonic clock."""
         if self._thread.is_alive():
             self._thread.join(max(0.0, until - time.monotonic()))
 
@@ -160,7 +160,7 @@ class RayWorker(ThreadWorker):
 
 
 def make_alike(make: Callable[[], Runner], version: str, paths: tuple[Path, ...], threads: int) -> Runner:
-    """What ``make`` makes on a machine of the cluster; :class:`UserError` if that is not like the parent's."""
+    """Return ``make()`` on a machine of the cluster. Raise :class:`UserError` if it differs from the parent's."""
     host = socket.gethostname()
     if version != __version__:
         raise UserError(f"mkpc-kaggle is {__version__} on {host} and {version} here: install the same on both")
@@ -183,13 +183,13 @@ def join(ray: Any, cluster: RayCluster) -> None:
         ray.init(**options, log_to_driver=False, logging_level="ERROR")
     except (RuntimeError, ConnectionError, ValueError, OSError) as error:
         raise UserError(f"the Ray cluster cannot be joined: {error}") from error
-    finally:  # Ray puts its own answers to signals in the place of this process's
+    finally:  # Ray replaces this process's signal handlers
         if threading.current_thread() is threading.main_thread():
             for number, handler in former.items():
                 signal.signal(number, handler)
 
 
 def message_of(error: Exception) -> str:
-    """What Ray says of an error, shortened: Ray is lengthy, and begins with its own ids."""
+    """Return Ray's text of an error, shortened and without Ray's own ids."""
     lines = [line for line in str(error).splitlines() if not re.match(r"\t\w+: ", line)]
     return textwrap.shorten(" ".join(lines[1:] or lines), 240)

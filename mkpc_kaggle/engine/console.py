@@ -1,7 +1,7 @@
 """The only place that prints during a run: lines, warnings, progress. It never raises.
 
-A terminal may go away (EIO), a pipe lose its reader, a disk be full, or a stream be closed from the start: the run
-goes on, and its files tell what happened. In a command that runs, it never waits either: see
+A terminal may disappear (EIO), a pipe lose its reader, a disk fill up, or a stream be closed from the start. The
+run continues, and its files record its events. During a run, printing never waits either: see
 :mod:`mkpc_kaggle.engine.streams`.
 """
 
@@ -39,7 +39,7 @@ def _print(text: str, stream: TextIO | None) -> None:
 
 
 def leave(status: int, seconds: float = DRAIN_S) -> NoReturn:
-    """End the process and its children, even if stopped (SIGSTOP); printing the rest may take so many seconds."""
+    """End the process and its children, even stopped ones (SIGSTOP). Printing the rest may take ``seconds``."""
     for child in multiprocessing.active_children():
         child.kill()
     drain(seconds)
@@ -47,7 +47,7 @@ def leave(status: int, seconds: float = DRAIN_S) -> NoReturn:
 
 
 class Progress:
-    """How many pairs (``unit``) of a phase are done: a bar on a terminal, a line now and then anywhere else.
+    """Progress of a phase in pairs (``unit``): a bar on a terminal, occasional lines elsewhere.
 
     The children of a notebook's kernel (``!command``) have a terminal whose text is stored, each state of a bar
     with it. Jupyter marks them with JPY_PARENT_PID.
@@ -61,7 +61,7 @@ class Progress:
         self._written = budget.clock()
 
     def show(self, phase: str, done: int, total: int) -> None:
-        """Called after every job; a phase without pairs is not told."""
+        """Show progress after a job. A phase without pairs is not shown."""
         if self._stream is None or not total:
             return
         began, self._phase = phase != self._phase, phase
@@ -78,10 +78,10 @@ class Progress:
     def note(self, text: str) -> None:
         with suppress(OSError, ValueError):
             if self._stream is not None:
-                tqdm.write(text, file=self._stream)  # a bar goes on below it
+                tqdm.write(text, file=self._stream)  # a bar continues below it
 
     def close(self) -> None:
-        """End the bar, or print the line that waits."""
+        """End the bar, or print the pending line."""
         with suppress(OSError, ValueError):
             if self._bar is not None:
                 self._bar.close()

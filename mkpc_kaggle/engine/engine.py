@@ -108,9 +108,9 @@ class Engine:
     def look(
         self, looks: Mapping[tuple[str, str], Callable[[], bytes]], *, compute: bool = True
     ) -> dict[tuple[str, str], bytes]:
-        """Return the features of each key (digest of contents, digest of settings), except those that failed.
+        """Return the features of each key (digest of contents, digest of settings), except failed ones.
 
-        With ``compute = False``, only those that the journal has.
+        With ``compute = False``, return only features in the journal.
         """
         known = {key: self.journal.feature(*key) for key in looks}
         self._features = {key: value for key, value in known.items() if value is not None}
@@ -121,7 +121,7 @@ class Engine:
         return self._features
 
     def ask(self, request: Request, share: float = 1.0) -> None:
-        """Compute what a request asks for and the journal lacks, in a share of the time left at most."""
+        """Compute the missing results of a request, in at most a share of the remaining time."""
         self._begin(request, is_asked=True)
         self._until = self.budget.clock() + share * self.budget.left() if share < 1 else inf
         self._publish()
@@ -156,7 +156,7 @@ class Engine:
         return {name: future.result() for name, future in done.items() if not future.exception()}
 
     def _begin(self, request: Request, *, is_asked: bool = False) -> None:
-        """Let the journal say what is missing or out of date. It records what is asked."""
+        """Find missing and outdated results. If ``is_asked``, record the request in the journal."""
         recipe, settings = request.recipe, request.settings
         self.request, self.recipe = request, recipe
         extra = extra_pairs_of(request.pairs, recipe.scene)

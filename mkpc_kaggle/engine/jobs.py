@@ -1,4 +1,4 @@
-"""What crosses between the engine and a worker: four kinds of job, and their answers. Plain values."""
+"""Messages between the engine and its workers: four kinds of job, and their answers. Plain values."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -36,7 +36,7 @@ class WantedPair:
 
 @dataclass(frozen=True)
 class MatchJob:
-    """Run ``units``, none of which they have had, on the pairs of ``indices``: one pair, or a minibatch on a GPU.
+    """Run missing ``units`` on the pairs of ``indices``: one pair, or a minibatch on a GPU.
 
     ``expected`` are the seconds that each unit takes on a pair. A unit begins only if it is expected to end within
     ``seconds`` of the job's start. ``known`` are the points of stage 1 that critical regions are computed from.
@@ -123,7 +123,7 @@ class Loaded:
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """What a unit found on a pair: a row of the table ``points``."""
+    """Result of a unit on a pair: a row of the table ``points``."""
 
     unit: Unit
     matches: int
@@ -142,7 +142,7 @@ class Found:
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """What a job found for a pair. ``failure`` says which image cannot be read."""
+    """Result of a job for a pair. ``failure`` says which image cannot be read."""
 
     index: int
     images: tuple[BatchImage, ...] = ()

@@ -69,7 +69,7 @@ class Journal(JournalReader):
         return self._db is not self._file
 
     def close(self) -> None:
-        with suppress(sqlite3.Error):  # the disk is still full: what the file has is whole
+        with suppress(sqlite3.Error):  # the disk is still full; the file stays valid
             if self.is_in_memory:
                 self._db.backup(self._file)
         with suppress(sqlite3.Error):  # a reader is using it
@@ -78,7 +78,7 @@ class Journal(JournalReader):
         super().close()
         self._lock.close()
 
-    # What the run asks for
+    # The request
 
     def want(
         self,
@@ -87,7 +87,7 @@ class Journal(JournalReader):
         batches: Mapping[str, str],
         about: About | None = None,
     ) -> None:
-        """Replace what the run asks for: pairs, units with their settings, settings of each batch's scene."""
+        """Replace the request: pairs, units with their settings, settings of each batch's scene."""
 
         def write(db: sqlite3.Connection) -> None:
             for table in ("wanted_unit", "wanted_pair", "wanted_batch", "about"):
@@ -293,7 +293,7 @@ def floats(values: Any) -> bytes:
 
 
 def wanted(db: sqlite3.Connection, position: int) -> sqlite3.Row:
-    """Return the row of a pair that the run asks for."""
+    """Return the row of a requested pair."""
     row: sqlite3.Row = db.execute("SELECT * FROM wanted_pair WHERE position = ?", [position]).fetchone()
     return row
 

@@ -47,7 +47,7 @@ Method = TypeVar("Method", bound=Callable[..., Any])
 
 
 class EventKind(StrEnum):
-    """What is noted during a run."""
+    """Kinds of events."""
 
     START = "start"  # the program began or resumed the run
     PLAN = "plan"  # a decision, and why
@@ -82,7 +82,7 @@ class About:
 
 @contextmanager
 def undamaged(path: Path, advice: str = "delete it with --fresh") -> Iterator[None]:
-    """Raise :class:`UserError` if a journal holds what no run writes, or cannot be used now."""
+    """Raise :class:`UserError` if a journal is damaged or cannot be used now."""
     try:
         yield
     except DAMAGE as error:
@@ -193,7 +193,7 @@ class JournalReader:
 
     @reading
     def scenes(self, table: str = "standing_scene") -> dict[str, SceneRecord]:
-        """Return the standing reconstruction of each batch that has one, or those of another table."""
+        """Return the standing reconstruction of each batch, or its latest row in another table."""
         scenes = {}
         for scene in self._rows(f"SELECT * FROM {table} ORDER BY batch, revision"):
             cameras = self._rows("SELECT * FROM camera WHERE scene = ? ORDER BY rowid", scene["revision"])

@@ -1,4 +1,4 @@
-"""Work at which workers were lost: it comes back singly, and what is lost twice alone is skipped."""
+"""Work that lost workers: its items are retried singly, and an item that is lost twice alone is skipped."""
 
 from collections import Counter
 from collections.abc import Hashable, Sequence
@@ -12,7 +12,7 @@ Key = TypeVar("Key", bound=Hashable)
 
 
 class Losses(Generic[Key]):
-    """``alone`` are the items to try singly, ``skipped`` the failures of those that are not tried any more."""
+    """``alone`` are the items to try singly, ``skipped`` the failures of the items that are no longer tried."""
 
     def __init__(self) -> None:
         self.alone: set[Key] = set()

@@ -26,7 +26,7 @@ CORES_PER_ESTIMATOR = 4
 
 
 class Work(StrEnum):
-    """What the workers of a place do."""
+    """The work of a place's workers."""
 
     MATCH = "matching"
     LIGHT = "estimates"  # and looks at images
@@ -37,7 +37,7 @@ class Work(StrEnum):
 class Place:
     """A place such as "cuda:0": its worker, the worker's job, and the moment until which an answer is awaited.
 
-    ``closed`` says why no worker is started here any more.
+    ``closed`` is the reason if no more workers start here.
     """
 
     name: str

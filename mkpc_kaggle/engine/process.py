@@ -1,11 +1,11 @@
-"""Workers on this machine: in a thread of the engine's own process, or in processes of their own.
+"""Workers on this machine: in a thread of the engine's process, or in separate processes.
 
 No call of the engine blocks: a thread for each worker does the blocking calls. No lock is shared with a process,
 nothing large goes through its start-up pipe, and its end of the other pipe is closed here. So it may die, be
 stopped or be killed at any moment: a write to it, or a read, ends with it.
 
-pebble, which keeps pools of processes, was tried and not taken: it times jobs by the wall clock, which may jump,
-and its workers share one pipe and its lock, so that a worker killed in the middle of an answer blocks all of them.
+pebble, which keeps pools of processes, was rejected. It times jobs by the wall clock, which may jump. Its workers
+share a pipe and its lock, so a worker that is killed during an answer blocks all others.
 """
 
 import ctypes
@@ -27,21 +27,21 @@ from mkpc_kaggle.engine.worker import Executor, Runner, failure_of
 
 # For PyTorch, which reads them once. Threads of OpenMP that wait for each other sleep; by default they spin, and
 # keep the cores from decoding, MAGSAC and other processes (python -m benchmarks.threads). Tensors of 2 MiB and
-# more come in huge pages, on Linux: in small ones a fresh map costs as much time as many convolutions.
+# more come in huge pages, on Linux: in small ones allocating a feature map takes as long as some convolutions.
 WORKER_ENVIRONMENT = {"OMP_WAIT_POLICY": "PASSIVE", "GOMP_SPINCOUNT": "0", "THP_MEM_ALLOC_ENABLE": "1"}
 PR_SET_PDEATHSIG = 1  # of Linux's prctl
 EXIT_TIMEOUT_S = 5.0  # a process's pipe closes before the process has ended
 
 
 class ThreadWorker:
-    """Does jobs, one at a time, in a thread of this process. No call blocks, whatever became of it.
+    """Does jobs, one at a time, in a thread of this process. No call blocks, even if the worker hangs.
 
     After ``start`` it answers once, :class:`Loaded` or :class:`Failure`; after each ``submit`` once more.
-    ``on_answer`` is called in its thread when an answer is there. It is not used again after a failure of its
+    ``on_answer`` is called in its thread for each answer. It is not used again after a failure of its
     place, nor after ``kill``.
 
-    A matcher that never returns cannot be stopped here, nor one that brings the process down, and a device that
-    failed does not come back: that takes processes.
+    A matcher that hangs or crashes cannot be contained here, and a failed device does not recover. Both need
+    processes.
     """
 
     def __init__(self, name: str, make: Callable[[], Runner], on_answer: Callable[[], None]) -> None:
@@ -61,11 +61,11 @@ class ThreadWorker:
             self._answers.put(Failure(Cause.NOT_STARTED, str(error)))
 
     def submit(self, job: Job, seconds: float) -> None:
-        """Hand over a job; units may begin within ``seconds``."""
+        """Hand over a job. A unit begins only if it is expected to end within ``seconds``."""
         self._orders.put((job, time.monotonic() + seconds))
 
     def answer(self) -> Answer | None:
-        """Its answer, once; ``None`` as long as there is none."""
+        """Return an answer once; ``None`` while it computes."""
         with suppress(queue.Empty):
             return self._answers.get_nowait()
         return None
@@ -125,7 +125,7 @@ class ProcessWorker(ThreadWorker):
         return self._exchange(self._process, (job, seconds))
 
     def _exchange(self, process: SpawnProcess, message: Callable[[], Runner] | tuple[Job, float]) -> Answer:
-        """The answer to a message, or what became of the process."""
+        """Return the answer to a message, or how the process ended."""
         try:
             self._pipe.send(message)
             answer: Answer = self._pipe.recv()
@@ -133,7 +133,7 @@ class ProcessWorker(ThreadWorker):
             process.join(timeout=EXIT_TIMEOUT_S)
             self._pipe.close()
             return Failure(Cause.DIED, how_it_ended(process.exitcode))
-        except Exception as error:  # what cannot be pickled
+        except Exception as error:  # an object that cannot be pickled
             process.kill()
             return failure_of(error)
         return answer
@@ -148,7 +148,7 @@ _environment = threading.Lock()
 
 @contextmanager
 def worker_environment() -> Iterator[None]:
-    """Processes started meanwhile have :data:`WORKER_ENVIRONMENT`, except what the user has set.
+    """Start processes with :data:`WORKER_ENVIRONMENT`, except variables that the user has set.
 
     It is removed again here, where the OpenMP library is loaded already. These processes ignore Ctrl-C, which a
     terminal sends to all, and SIGTERM: their parent handles both, and ends them.
@@ -166,10 +166,10 @@ def worker_environment() -> Iterator[None]:
 
 
 def serve(pipe: Connection) -> None:
-    """The life of a worker process: what to make, then job after job."""
+    """Serve as a worker process: receive a maker, then one job after another."""
 
     def make() -> Runner:
-        maker: Callable[[], Runner] = pipe.recv()  # what cannot be unpickled is an answer, too
+        maker: Callable[[], Runner] = pipe.recv()  # an object that cannot be unpickled is an answer, too
         return maker()
 
     end_with_parent()
@@ -182,7 +182,7 @@ def serve(pipe: Connection) -> None:
 
 
 def end_with_parent() -> None:
-    """From now on this process ends with its parent, however that ends and whatever is computed here.
+    """End this process with its parent, even during a computation.
 
     On Linux it ends with the thread that started it, even if it is stopped.
     """

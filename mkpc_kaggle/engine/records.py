@@ -1,4 +1,4 @@
-"""What a run knows of its pairs and batches, as values for reports and scores."""
+"""Results of a run by pair and batch, as values for reports and scores."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -22,7 +22,7 @@ MAX_DRAWN_POINTS = 300  # of a model, evenly chosen
 
 @dataclass(frozen=True)
 class UnitRecord:
-    """What a unit found on a pair: numbers of matches and of inliers among them, and seconds."""
+    """Result of a unit on a pair: numbers of matches and of inliers among them, and seconds."""
 
     unit: str
     stage: int
@@ -41,7 +41,7 @@ class PairRecord:
 
     ``pair_fundamental`` comes from the pair's own matches. It is the fallback if ``failure`` says why there is no
     F. ``magsac_fundamental`` is MAGSAC's alone if ``pair_fundamental`` was refined. ``scene`` is the choice by the
-    scene of its batch, ``None`` without a scene. Seconds are those of the current points and estimate.
+    scene of its batch, ``None`` without a scene. Seconds belong to the current points and estimate.
     """
 
     index: int
@@ -70,7 +70,7 @@ class PairRecord:
 
     @property
     def overlaps(self) -> bool:
-        """Whether the two images probably show the same thing."""
+        """Whether the two images probably overlap."""
         return self.stats.support >= MIN_SUPPORT
 
     @property

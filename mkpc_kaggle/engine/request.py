@@ -1,4 +1,4 @@
-"""What a run is asked for, and what it returns."""
+"""The request to a run, and its report."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -27,7 +27,7 @@ class Ending(StrEnum):
 
 @dataclass(frozen=True)
 class Request:
-    """What to compute: points and estimates of ``pairs``, whose images lie below ``root``, and their scenes.
+    """A request: points and estimates of ``pairs``, whose images lie below ``root``, and their scenes.
 
     ``exports`` are the batches whose COLMAP files are written. ``publish`` is called with the results first,
     every half minute (less often if it takes long), after each scene with files, and at the end.
@@ -53,7 +53,7 @@ class Standing:
 
 @dataclass(frozen=True)
 class RunReport:
-    """What a run leaves: a record of each pair, in order, and how it went.
+    """The outcome of a run: a record of each pair, in order, and how the run ended.
 
     ``resumed`` pairs were complete before. ``faults`` are lost jobs and unwritten files, with reasons.
     ``unwritten`` says why the last version of the results could not be written.

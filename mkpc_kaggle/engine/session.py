@@ -1,4 +1,4 @@
-"""A run from its parts: journal, site and engine opened, used and let go of; signals, and the end at the limit."""
+"""A run from its parts: journal, site, engine, signals, and the end at the limit."""
 
 import platform
 import shutil
@@ -63,10 +63,10 @@ class Interrupt(threading.Event):
 
 @dataclass(frozen=True)
 class Session:
-    """What a run needs besides its pairs and its recipe.
+    """The environment of a run: everything besides its pairs and its recipe.
 
     ``workers`` is the number of worker processes, or the cluster to work on; 0: the work is done in this process;
-    ``None``: a process for each device. ``watchdog`` is told how to write the submission in the end.
+    ``None``: a process for each device. ``watchdog`` gets the function that writes the submission.
     """
 
     work_dir: Path
@@ -83,7 +83,7 @@ class Session:
 
 
 def submit(pairs: Sequence[Pair], assembly: Assembly, session: Session, output: Path, root: str = "") -> RunReport:
-    """Match all pairs and keep ``output`` whole: a row for each pair, with the fallback if necessary."""
+    """Match all pairs. ``output`` always has a row for each pair, the fallback if necessary."""
 
     def publish(standing: Standing) -> None:
         ids = (pair.id for pair in pairs)
@@ -122,13 +122,13 @@ def first_version(pairs: Sequence[Pair], output: Path) -> Iterator[None]:
 
 
 def _identity(path: Path) -> tuple[int, int]:
-    """Tells versions of a file apart: a later version may have the number of a file that is gone."""
+    """Return an identity of a file's version: a later file may reuse the inode number of a deleted one."""
     status = path.stat()
     return status.st_ino, status.st_mtime_ns
 
 
 def require_writable(output: Path) -> None:
-    """Make the file's directory if need be; :class:`UserError` where the file cannot be written, or replaced."""
+    """Make the file's directory if necessary. Raise :class:`UserError` if the file cannot be written."""
     if output.is_char_device() or output.is_block_device():
         raise UserError(f"--output {output} is a device; name a file")
     with writing(f"--output {output}"):
@@ -252,7 +252,7 @@ class Watchdog:
 
 @contextmanager
 def interruptible() -> Iterator[Interrupt]:
-    """SIGTERM and Ctrl-C set the interrupt; a second signal acts as if nobody listened."""
+    """Let SIGTERM and Ctrl-C set the interrupt. A second signal has its default effect."""
     interrupt = Interrupt()
     former = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
 

@@ -1,4 +1,4 @@
-"""What decides the rows of a run: a digest of the settings of each derived table.
+"""Digests of the settings of each derived table: they decide which rows are up to date.
 
 A digest has the number of its algorithm. Raise the number when the same settings would give other results.
 """

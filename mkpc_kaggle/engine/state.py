@@ -11,7 +11,7 @@ from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
 
 
 class State:
-    """What is known of N pairs and U units, by their positions in the run and in the recipe.
+    """Arrays for N pairs and U units, by their positions in the run and in the recipe.
 
     ``had`` (N, U): the current points. ``matches`` (N,): their number. ``is_estimated`` (N,): whether the estimate
     is current. ``inliers`` (N,), ``own`` (N, 3, 3), ``has_own`` (N,): of the standing estimate. ``unreadable``
@@ -36,7 +36,7 @@ class State:
 
     @property
     def fundamentals(self) -> NDArray[np.float64]:
-        """(rows, 3, 3): what is written now, by the scene, else by the pair, else the fallback."""
+        """(rows, 3, 3): the F to write: the scene's, else the pair's, else the fallback."""
         written = self.own[: self.rows].copy()
         for position, F in self.by_scene.items():
             if position < self.rows:

@@ -22,7 +22,7 @@ COLUMNS = 80  # of a terminal that does not state its width
 
 
 class Relay:
-    """What is written to a descriptor goes to its file, ``sink``, by two threads: one reads, one prints.
+    """Relays text from a descriptor to its file, ``sink``, with two threads: one reads, one prints.
 
     Text that does not fit into the queue between them is dropped, and text that the file refuses.
     """

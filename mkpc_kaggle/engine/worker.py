@@ -1,4 +1,4 @@
-"""What a worker does with its jobs: matching, estimates, looks at images, reconstructions.
+"""The work of workers: matching, estimates, looks at images, reconstructions.
 
 Importing this module does not import torch: only matching needs it.
 
@@ -141,7 +141,7 @@ class MatchRunner:
 
 
 def _outcome(index: int, wanted: WantedPair, pair: PairMatch, known: tuple[object, ...]) -> Outcome:
-    """The new results of a pair; its image contents are those that were matched."""
+    """The new results of a pair; its images have the contents that were matched."""
     images = tuple(
         BatchImage(name, image.version, image.size, image.focal)
         for name, image in zip(wanted.names, pair.images, strict=False)  # fewer if one is unreadable
