@@ -118,10 +118,11 @@ def process_started() -> float:
 
     From Linux's /proc/self/stat (field 22, clock ticks since boot); elsewhere the time of the call.
     """
-    now = time.monotonic()
     try:
         ticks = Path("/proc/self/stat").read_text().rpartition(")")[2].split()[19]
-        age = time.clock_gettime(time.CLOCK_BOOTTIME) - int(ticks) / os.sysconf("SC_CLK_TCK")
+        began = int(ticks) / os.sysconf("SC_CLK_TCK")
+        age = time.clock_gettime(time.CLOCK_BOOTTIME) - began
     except (OSError, AttributeError, ValueError, IndexError):
-        return now
+        return time.monotonic()
+    now = time.monotonic()  # just after the other clock was read
     return now - age if 0 <= age < MAX_PROCESS_AGE_S else now

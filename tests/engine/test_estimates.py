@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 import pytest
 from rectified import RectifiedMatcher, run
-from synthetic import RECIPE, SyntheticMatcher, synthetic_pairs
+from synthetic import QUICK, RECIPE, SyntheticMatcher, synthetic_pairs
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.journal import Journal
 from mkpc_kaggle.engine.request import Ending
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
-from mkpc_kaggle.geometry.robust import Method, RobustConfig
+from mkpc_kaggle.geometry.robust import Method
 from mkpc_kaggle.pipeline.stages import Pipeline
 from mkpc_kaggle.recipe import Recipe, SceneConfig
 from mkpc_kaggle.reporting.run_log import read_log
@@ -27,8 +27,8 @@ ALONE = replace(RECIPE, scene=None)
 ESTIMATIONS = {  # in their order each is made of the journal of the one before
     "scene": RECIPE,
     "no scene": ALONE,
-    "threshold": replace(ALONE, magsac=RobustConfig(threshold=1.0, permutations=1)),
-    "RANSAC": replace(ALONE, magsac=RobustConfig(Method.RANSAC, permutations=2)),
+    "threshold": replace(ALONE, magsac=replace(QUICK, threshold=1.0)),
+    "RANSAC": replace(ALONE, magsac=replace(QUICK, method=Method.RANSAC)),
     "prior": replace(ALONE, focal=FocalConfig()),
     "another scene": replace(RECIPE, focal=FocalConfig(sigma=0.2), scene=SceneConfig(shared_intrinsics=0)),
 }
@@ -101,7 +101,7 @@ def test_a_run_that_is_killed_while_it_estimates_anew_ends_with_the_same_bytes(t
 def test_the_file_has_the_former_f_until_another_is_there(tmp_path):
     pairs, versions = synthetic_pairs(tmp_path / "images", 4), []
     first = run(pairs, RECIPE, SyntheticMatcher(images=4), tmp_path / "work")
-    other = replace(RECIPE, magsac=RobustConfig(threshold=1.0))
+    other = replace(RECIPE, magsac=replace(QUICK, threshold=1.0))
     publish = lambda standing: versions.append(standing.fundamentals)  # noqa: E731
     last = run(pairs, other, SyntheticMatcher(images=4), tmp_path / "work", publish=publish)
     assert np.array_equal(versions[0], [record.chosen_fundamental for record in first.records])

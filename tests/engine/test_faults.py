@@ -212,7 +212,7 @@ def test_the_limit_counts_from_the_start_of_the_process():
     code += "import numpy, pandas; print(process_started(), began)"
     before = time.monotonic()
     started, began = map(float, python(code).stdout.split())
-    assert before - 0.02 < started < began, "the kernel counts hundredths of a second"
+    assert before - 1 < started < began, "the kernel counts hundredths of a second"
 
 
 def test_a_program_leaves_without_what_an_interpreter_does_at_its_end():

@@ -9,9 +9,11 @@ from rectified import RectifiedMatcher, Seen, batch_pairs, number_of
 from benchmarks.synthetic_scene import SIZE, SyntheticScene, synthetic_scene
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.geometry.robust import RobustConfig
 from mkpc_kaggle.recipe import Recipe, SceneConfig, Unit
 
-RECIPE = Recipe((Unit(1, "synthetic", SIZE.width),), scene=SceneConfig())
+QUICK = RobustConfig(permutations=1, max_iterations=2000)
+RECIPE = Recipe((Unit(1, "synthetic", SIZE.width),), magsac=QUICK, scene=SceneConfig())
 
 
 @dataclass
