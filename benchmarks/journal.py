@@ -15,11 +15,13 @@ from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.jobs import Estimated, Found, Outcome, WantedPair
 from mkpc_kaggle.engine.journal import Journal
 from mkpc_kaggle.engine.journal_reader import to_blob
+from mkpc_kaggle.engine.request import Request
+from mkpc_kaggle.engine.settings import Settings
 from mkpc_kaggle.engine.state import State
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
-from mkpc_kaggle.recipe import Unit
+from mkpc_kaggle.recipe import Recipe, Unit
 from mkpc_kaggle.scene.view_graph import BatchImage
 
 
@@ -36,6 +38,8 @@ def main() -> None:
     names = [(f"{number}.jpg", f"{number % 100}.jpg") for number in range(arguments.pairs)]
     pairs = [WantedPair(Pair(str(n), "one", *both), both, "F") for n, both in enumerate(names)]
     settings = {unit.name: unit.name for unit in units}
+    recipe = Recipe(tuple(units))
+    request = Request([each.pair for each in pairs], recipe, Settings(tuple(settings), "F", "scene"))
     with tempfile.TemporaryDirectory() as directory:
         with Journal(Path(directory)) as journal:
             journal.want(pairs, [(unit, unit.name) for unit in units], {"one": "scene"})
@@ -50,7 +54,7 @@ def main() -> None:
         size = journal.path.stat().st_size
         started = time.perf_counter()
         with Journal(Path(directory)) as journal:
-            state = State(journal, len(pairs), len(pairs), len(units))
+            state = State(journal, request, pairs, journal.digests())
         resuming = time.perf_counter() - started
     print(f"{int(state.is_estimated.sum())} pairs, {arguments.units} units of {arguments.matches} matches")
     print(f"journal: {size / 1e6:.0f} MB; saving: {1e3 * saving / len(pairs):.1f} ms; resuming: {resuming:.1f} s")

@@ -1,21 +1,24 @@
-"""The clock of a run: durations, the time left, and the four deadlines of a run."""
+"""The time of a run: durations, its four deadlines, and the measured costs of units."""
 
 import os
 import re
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from math import inf
+from math import inf, sqrt
 from pathlib import Path
-from statistics import median_low
+from statistics import fmean, median_low
 
 from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.recipe import Unit
 
 SUMMARY_FACTOR = 5  # a report may take this many times as long as writing the submission
 WRITE_MARGIN = 1.5  # the next write may take this many times as long as the latest
 MAX_WRITE_SHARE = 0.05  # of the limit, which writing is expected to take at most
 MAX_SILENCE_S, MIN_SILENCE_S, SILENCE_SHARE = 60.0, 5.0, 0.02  # of a worker, by the share of the limit
+WINDOW = 64  # the number of the latest measurements that count
+MARGIN, MIN_MARGIN = 0.4, 0.01  # of a forecast from one measurement; from n, sqrt(n) times smaller
 MAX_STEP_BACK_S = 60.0  # of the wall clock, between the moment that --started-at names and the start
 MAX_PROCESS_AGE_S = 60.0  # the reported age of an older process is wrong
 
@@ -96,6 +99,46 @@ class Budget:
 
     def spent(self) -> float:
         return self.clock() - self.started
+
+
+class Costs:
+    """Seconds of a unit on a pair, by name.
+
+    A worker's first run of a unit is its warm-up. It counts until another run is measured, and in no forecast.
+    """
+
+    def __init__(self) -> None:
+        self._measured: dict[str, deque[float]] = {}
+        self._warm_up: dict[str, float] = {}
+
+    def observe(self, unit: str, seconds: float, *, warm_up: bool = False) -> None:
+        if warm_up:
+            self._warm_up[unit] = seconds
+        else:
+            self._measured.setdefault(unit, deque(maxlen=WINDOW)).append(seconds)
+
+    def has_run(self, unit: str) -> bool:
+        return unit in self._measured or unit in self._warm_up
+
+    def is_known(self, unit: str) -> bool:
+        """Whether more than the warm-up is known."""
+        return unit in self._measured
+
+    def mean(self, unit: str) -> float:
+        """Return the expected seconds on a pair; 0 if nothing is known."""
+        if unit in self._measured:
+            return fmean(self._measured[unit])
+        return self._warm_up.get(unit, 0.0)
+
+    def forecast(self, unit: str) -> float:
+        """Return the expected seconds with a margin that shrinks as more is known; 0 while nothing is."""
+        if not self.is_known(unit):
+            return 0.0
+        return self.mean(unit) * (1 + max(MIN_MARGIN, MARGIN / sqrt(len(self._measured[unit]))))
+
+    def warm_up(self, units: Iterable[Unit]) -> float:
+        """Return the seconds of the longest of these units' latest first runs on a worker."""
+        return max((self._warm_up.get(unit.name, 0.0) for unit in units), default=0.0)
 
 
 def monotonic_of(epoch: float) -> float:

@@ -147,8 +147,8 @@ class RayWorker(ThreadWorker):
             self.kill()
         return self._get(self._actor.load.remote(self._make))
 
-    def _run(self, job: Job, seconds: float) -> Answer:
-        return self._get(self._actor.run.remote(job, seconds))
+    def _run(self, job: Job) -> Answer:
+        return self._get(self._actor.run.remote(job))
 
     def _get(self, coming: Any) -> Answer:
         try:

@@ -6,50 +6,64 @@ import sys
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
-from contextlib import suppress
-from dataclasses import replace
-from math import inf, isfinite
+from math import inf
 from pathlib import Path
-from typing import Self, cast
+from typing import Any, Protocol, Self
 
 from mkpc_kaggle.data.images import content_digest
 from mkpc_kaggle.engine import console
 from mkpc_kaggle.engine.budget import Budget
-from mkpc_kaggle.engine.estimates import EstimatePlan
+from mkpc_kaggle.engine.chronicle import Chronicle
+from mkpc_kaggle.engine.estimates import Estimates
+from mkpc_kaggle.engine.features import Features, Key
 from mkpc_kaggle.engine.jobs import (
-    Answer,
     Cause,
-    Estimated,
     EstimateJob,
     Failure,
     Job,
     Loaded,
     LookJob,
     MatchJob,
-    Outcome,
-    PairPoints,
-    PointSource,
     SceneJob,
     WantedPair,
     visiting_order,
 )
 from mkpc_kaggle.engine.journal import Journal
-from mkpc_kaggle.engine.journal_reader import Event, EventKind
-from mkpc_kaggle.engine.losses import Losses
+from mkpc_kaggle.engine.matching import Matching
 from mkpc_kaggle.engine.places import LISTEN_S, START_TIMEOUT_S, Place, Site, Work
-from mkpc_kaggle.engine.plan import HANG_FACTOR, Plan
-from mkpc_kaggle.engine.records import SceneRecord
+from mkpc_kaggle.engine.plan import Plan
 from mkpc_kaggle.engine.request import Ending, Request, RunReport, Standing
-from mkpc_kaggle.engine.scenes import Scenes, batches_of, extra_pairs_of
+from mkpc_kaggle.engine.scenes import Scenes, batches_of, extra_pairs_of, standing_scenes
 from mkpc_kaggle.engine.state import State
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.recipe import Unit
-from mkpc_kaggle.scene.reconstruct import Solution
 
 UNKNOWN_SHARE, MAX_UNKNOWN_S = 0.25, 3600.0  # of the time left, after which a job of unknown cost hangs
-MIN_TOLD_PAIRS = 20  # of a batch whose reconstruction is shown: that of a smaller batch takes seconds
 PUBLISH_INTERVAL_S, PUBLISH_SHARE = 30.0, 0.05  # how often the results are written, and their share of the time
 HASH_THREADS = 4
+
+JOBS: dict[Work, tuple[type[Job], ...]] = {  # of a place by its work, the most urgent first
+    Work.MATCH: (MatchJob,),
+    Work.LIGHT: (LookJob, EstimateJob),
+    Work.SCENE: (SceneJob,),
+}
+
+
+class Table(Protocol):
+    """A derived table of the journal: the jobs that compute its missing and outdated rows."""
+
+    def has_work(self, now: float) -> bool: ...
+
+    def next(self, now: float) -> Job | None:
+        """Return a job for an idle worker, if there is any."""
+
+    def patience(self, job: Any, unknown: float) -> float:
+        """Return the seconds after which a job hangs; ``unknown`` before any was measured."""
+
+    def save(self, job: Any, answer: Any, seconds: float) -> None:
+        """Save the answer to a job that took ``seconds``. Raise ``sqlite3.Error`` if no row can hold it."""
+
+    def lose(self, job: Any, failure: Failure) -> None:
+        """Record that a job failed, or that its worker was lost."""
 
 
 class Engine:
@@ -71,17 +85,12 @@ class Engine:
     ) -> None:
         self.site, self.journal, self.budget = site, journal, budget
         self.interrupt, self.minibatch = interrupt, minibatch
-        self.faults: list[str] = []
-        self.explanations: list[Event] = []
         self.unwritten = ""
-        self.units_run = self.estimated = 0
-        self.digests: dict[str, str] = {}
-        self._looks: dict[tuple[str, str], LookJob] = {}
-        self._features: dict[tuple[str, str], bytes] = {}
-        self._look_losses: Losses[tuple[str, str]] = Losses()
+        self._progress = console.Progress(budget, sys.stderr if progress else None)
+        self._chronicle = Chronicle(journal, budget, self._progress)
+        self._features = Features(journal)
         self._until = inf
         self._published = budget.clock()
-        self._progress = console.Progress(budget, sys.stderr if progress else None)
         self._publishing = threading.Lock()
         self._is_open = self._has_loaded = self._has_ended = False
         self._begin(nothing)
@@ -105,23 +114,16 @@ class Engine:
 
     # Requests
 
-    def look(
-        self, looks: Mapping[tuple[str, str], Callable[[], bytes]], *, compute: bool = True
-    ) -> dict[tuple[str, str], bytes]:
-        """Return the features of each key (digest of contents, digest of settings), except failed ones.
-
-        With ``compute = False``, return only features in the journal.
-        """
-        known = {key: self.journal.feature(*key) for key in looks}
-        self._features = {key: value for key, value in known.items() if value is not None}
-        if compute:
-            self._looks = {key: LookJob(key, do) for key, do in looks.items() if key not in self._features}
-            self._loop()
-            self._looks.clear()
-        return self._features
+    def look(self, looks: Mapping[Key, Callable[[], bytes]]) -> dict[Key, bytes]:
+        """Return the features of each key (digest of contents, digest of settings), except failed ones."""
+        self._features.want(looks)
+        self._loop()
+        found = self._features.found
+        self._features.want({})
+        return found
 
     def ask(self, request: Request, share: float = 1.0) -> None:
-        """Compute the missing results of a request, in at most a share of the remaining time."""
+        """Compute the missing results of a request. No job begins after a share of the remaining time."""
         self._begin(request, is_asked=True)
         self._until = self.budget.clock() + share * self.budget.left() if share < 1 else inf
         self._publish()
@@ -135,12 +137,12 @@ class Engine:
             self.ending,
             self.budget.spent(),
             self._resumed,
-            tuple(self.faults),
-            tuple(self.explanations),
+            tuple(self._chronicle.faults),
+            tuple(self._chronicle.explanations),
             self.unwritten,
             self.scenes.report(),
-            self.units_run,
-            self.estimated,
+            self._chronicle.units_run,
+            self._chronicle.estimated,
         )
 
     def digest_files(self, files: Mapping[str, Path]) -> dict[str, str]:
@@ -158,9 +160,8 @@ class Engine:
     def _begin(self, request: Request, *, is_asked: bool = False) -> None:
         """Find missing and outdated results. If ``is_asked``, record the request in the journal."""
         recipe, settings = request.recipe, request.settings
-        self.request, self.recipe = request, recipe
         extra = extra_pairs_of(request.pairs, recipe.scene)
-        self.pairs = [
+        pairs = [
             WantedPair(
                 pair,
                 (name_below(request.root, pair.file0), name_below(request.root, pair.file1)),
@@ -169,42 +170,41 @@ class Engine:
             )
             for number, pair in enumerate([*request.pairs, *extra])
         ]
-        self._units = dict(zip((unit.name for unit in recipe.units), settings.units, strict=True))
-        batches = batches_of(each.pair for each in self.pairs) if recipe.scene is not None else {}
-        units = list(zip(recipe.units, settings.units, strict=True))
+        batches = batches_of(each.pair for each in pairs) if recipe.scene is not None else {}
         if is_asked:
-            self.journal.want(self.pairs, units, dict.fromkeys(batches, settings.scene), request.about)
-        self._look_at_images()
-        made = self.journal.scenes("scene") if request.exports else self.journal.scenes()
-        for batch in request.exports.keys() & made.keys():
-            if not request.exports[batch].has_files(made[batch].models):
-                self.journal.forget_scene(batch)  # its files are a result, too
-                del made[batch]
-        self.state = State(self.journal, len(self.pairs), len(request.pairs), len(recipe.units))
-        order = visiting_order([each.pair for each in self.pairs])
-        note = self._progress.note
-        self.plan = Plan(recipe.units, self.state, order, self.budget, self._explain, note, self.minibatch)
-        self.scenes = Scenes(batches, made, self.journal.current_scenes())
-        self.estimates = EstimatePlan(self.plan, order)
+            units = list(zip(recipe.units, settings.units, strict=True))
+            self.journal.want(pairs, units, dict.fromkeys(batches, settings.scene), request.about)
+        digests = self._digests(pairs)
+        made = standing_scenes(self.journal, request)
+        self.state = State(self.journal, request, pairs, digests)
+        order, note = visiting_order([each.pair for each in pairs]), self._progress.note
+        explain = self._chronicle.explain
+        self.plan = Plan(recipe.units, self.state, order, self.budget, explain, note, self.minibatch)
+        self.estimates = Estimates(self.state, self.plan, order, self._chronicle)
+        self.scenes = Scenes(batches, made, self.state, self.plan, self.estimates, self._chronicle)
+        self._tables: dict[type[Job], Table] = {
+            MatchJob: Matching(self.state, self.plan, self._chronicle),
+            EstimateJob: self.estimates,
+            SceneJob: self.scenes,
+            LookJob: self._features,
+        }
         complete = self.state.had.all(1) & self.state.is_estimated
         self._resumed = int(complete[: self.state.rows].sum())
 
-    def _look_at_images(self) -> None:
-        """Digest the images that have points again: points of other contents are out of date."""
-        files = {
-            name: path for each in self.pairs for name, path in zip(each.names, each.pair.images, strict=True)
-        }
+    def _digests(self, pairs: Sequence[WantedPair]) -> dict[str, str]:
+        """Return the digests of the images that have points, digested again: other contents have other points."""
+        files = {name: path for each in pairs for name, path in zip(each.names, each.pair.images, strict=True)}
         known = self.journal.digests()
         now = self.digest_files({name: path for name, path in files.items() if name in known})
         changed = {name: digest for name, digest in now.items() if known[name] != digest}
         for name, digest in changed.items():
             self.journal.save_digest(name, digest)
-        self.digests = known | changed
         if changed:
-            count = sum(not changed.keys().isdisjoint(each.names) for each in self.pairs)
+            count = sum(not changed.keys().isdisjoint(each.names) for each in pairs)
             text = f"{len(changed)} images have changed: their {count} pairs are matched again"
             console.warn(text)
-            self._fault(text)
+            self._chronicle.fault(text)
+        return known | changed
 
     # The loop
 
@@ -212,7 +212,7 @@ class Engine:
         while not self._is_over(now := self.budget.clock()):
             for place in self.site.places:
                 self._take_answer(place, now)
-            self._fall_back(now)
+            self._fall_back()
             self._hand_out(now)
             if not any(place.job is not None or self._may_work(place, now) for place in self.site.places):
                 return
@@ -222,7 +222,7 @@ class Engine:
             self.site.wait(min(self.budget.stop_waiting, *(limit for limit in limits if limit > now), inf))
 
     def _is_over(self, now: float) -> bool:
-        return self.interrupt.is_set() or now >= min(self._until, self.budget.stop_waiting)
+        return self.interrupt.is_set() or now >= self.budget.stop_waiting
 
     def _hand_out(self, now: float) -> None:
         """Start a worker in each place with work but no worker. Give a job to each idle worker."""
@@ -230,154 +230,32 @@ class Engine:
             self.site.open()
             self._is_open = True
         estimates = self.estimates.reserve(now, len(self.site.of(Work.LIGHT)))
-        self.plan.reserve = estimates + self.scenes.reserve(self.state.matches)
+        self.plan.reserve = estimates + self.scenes.reserve()
         self.plan.workers = max(1, sum(not place.closed for place in self.site.of(Work.MATCH)))
         for place in self.site.places:
-            if place.may_start(now) and self._has_work(place.work, now):
-                share = max(self.budget.silence, UNKNOWN_SHARE * self._left(now))
+            if place.may_start(now) and self._has_work(place, now):
+                share = max(self.budget.silence, self._unknown(now))
                 place.start(now, START_TIMEOUT_S if place.work is Work.MATCH else min(START_TIMEOUT_S, share))
-            elif place.is_idle and (job := self._next_job(place.work, now)) is not None:
-                seconds = job.seconds if isinstance(job, MatchJob) else inf
-                place.submit(job, seconds, self._time_limit(job, now), now)
+            elif place.is_idle and (job := self._next_job(place, now)) is not None:
+                place.submit(job, self._time_limit(job, now), now)
 
     def _may_work(self, place: Place, now: float) -> bool:
         """Whether a place without a job will have one when a worker has started."""
-        return place.is_starting and self._has_work(place.work, now)
+        return place.is_starting and self._has_work(place, now)
 
-    def _has_work(self, work: Work, now: float) -> bool:
-        if work is Work.MATCH:
-            return self.plan.has_work(now)
-        if work is Work.LIGHT:
-            return bool(self._looks) or bool(len(self.estimates.due(now)))
-        return self._due_scene(now) is not None
+    def _has_work(self, place: Place, now: float) -> bool:
+        return now < self._until and any(self._tables[kind].has_work(now) for kind in JOBS[place.work])
 
-    def _next_job(self, work: Work, now: float) -> Job | None:
-        if work is Work.MATCH:
-            job = self.plan.next(now)
-            return job and self._with_pairs(job)
-        if work is Work.SCENE:
-            batch = self._due_scene(now)
-            return None if batch is None else self._scene_job(batch)
-        if self._looks:
-            return self._looks.pop(next(iter(self._looks)))
-        return self._estimate_job(now)
+    def _next_job(self, place: Place, now: float) -> Job | None:
+        jobs = (self._tables[kind].next(now) for kind in JOBS[place.work] if now < self._until)
+        return next((job for job in jobs if job is not None), None)
 
     def _time_limit(self, job: Job, now: float) -> float:
         """Return the seconds after which a worker hangs, from measured costs or from the time left."""
-        patience = inf
-        if isinstance(job, MatchJob):
-            patience = self.plan.patience(job)
-        elif isinstance(job, EstimateJob):
-            patience = self.estimates.patience(job)
-        unknown = min(MAX_UNKNOWN_S, UNKNOWN_SHARE * self._left(now))
-        if isinstance(job, SceneJob):
-            patience = max(unknown, HANG_FACTOR * self.scenes.forecast(job.matches))
-        return self.budget.silence + (patience if isfinite(patience) else unknown)
+        return self.budget.silence + self._tables[type(job)].patience(job, min(MAX_UNKNOWN_S, self._unknown(now)))
 
-    def _left(self, now: float) -> float:
-        return max(0.0, self.budget.stop_units - now)
-
-    # Matching
-
-    def _with_pairs(self, job: MatchJob) -> MatchJob:
-        """The job with its pairs, and with their points of stage 1 if critical regions are computed from them."""
-        known: list[tuple[tuple[Unit, bytes], ...]] = []
-        for index in job.indices:
-            inputs = self.journal.inputs(index) if any(unit.stage == 2 for unit in job.units) else {}
-            units = {unit.name: unit for unit in self.recipe.units if unit.stage == 1}
-            revisions = {name: revision for name, revision in inputs.items() if name in units}
-            blobs = self.journal.blobs(revisions.values())
-            known.append(tuple((units[name], blobs[revision]) for name, revision in revisions.items()))
-        upcoming = (path for index in self.plan.upcoming(job) for path in self.pairs[index].pair.images)
-        pairs = tuple(self.pairs[index] for index in job.indices)
-        return replace(job, pairs=pairs, known=tuple(known), upcoming=tuple(upcoming))
-
-    def _take_matched(self, job: MatchJob, outcomes: Sequence[Outcome]) -> None:
-        self.journal.save_outcomes(outcomes, self._units)
-        self.units_run += sum(len(outcome.found) for outcome in outcomes)
-        for outcome in outcomes:
-            self.digests |= {image.name: image.digest for image in outcome.images}
-        self.scenes.note_change(self.state.refresh(outcome.index for outcome in outcomes))
-        self.plan.on_result(job, outcomes)
-        seconds = sum(found.seconds for outcome in outcomes for found in outcome.found)
-        self._note(EventKind.JOB, f"{job.phase} {len(job.indices)} pairs {seconds:.3f} s")
-        self._progress.show(*self.plan.progress(self.budget.clock()))
-
-    # Estimates
-
-    def _estimate_job(self, now: float) -> EstimateJob | None:
-        chosen, is_retry = self.estimates.next(now)
-        pairs = tuple(self._pair_points(index) for index in chosen)
-        return EstimateJob(pairs, self.recipe, self._source(pairs), is_retry) if pairs else None
-
-    def _take_estimates(self, estimates: Sequence[Estimated]) -> None:
-        self.journal.save_estimates(estimates)
-        self.estimated += len(estimates)
-        self.scenes.note_change(self.state.refresh(self.estimates.on_result(estimates)))
-        if not self.plan.busy.any():
-            rows = slice(self.state.rows)
-            done, total = self.state.is_estimated[rows].sum(), self.state.had[rows].any(1).sum()
-            self._progress.show("estimate", int(done), int(total))
-
-    def _pair_points(self, index: int) -> PairPoints:
-        """The current points of a pair, for an estimate or a scene."""
-        inputs, units = self.journal.inputs(index), {unit.name: unit for unit in self.recipe.units}
-        images = self.journal.images(index)
-        own = self.state.own[index] if self.state.has_own[index] else None
-        points = tuple((units[name], revision) for name, revision in inputs.items())
-        return PairPoints(index, (images[0], images[1]), points, self.pairs[index].pair.intrinsics, own)
-
-    def _source(self, pairs: Sequence[PairPoints]) -> PointSource:
-        """Workers read points themselves, unless the journal is in memory."""
-        revisions = [revision for pair in pairs for revision in pair.revisions]
-        blobs = self.journal.blobs(revisions) if self.journal.is_in_memory else None
-        return PointSource(self.journal.path.parent, blobs)
-
-    # Scenes
-
-    def _due_scene(self, now: float) -> str | None:
-        """Return a batch to reconstruct now: its pairs have what fits; any batch if matching has ended."""
-        if not (waiting := self.scenes.waiting(self.state.matches)):
-            return None
-        pending = self.estimates.busy.copy()
-        pending[self.estimates.due(now)] = True
-        if self._is_matching(now):
-            settled, filled = self.plan.settled(now) & ~pending, self.plan.filled(now) & ~pending
-            return self.scenes.due(self.state.matches, settled, filled)
-        is_late = now >= self.plan.stop  # too late to wait for estimates
-        return next((name for name in waiting if is_late or not pending[self.scenes.batches[name]].any()), None)
-
-    def _is_matching(self, now: float) -> bool:
-        places = self.site.of(Work.MATCH)
-        is_closed = self._is_open and all(place.closed for place in places)
-        return any(place.job is not None for place in places) or (self.plan.has_work(now) and not is_closed)
-
-    def _scene_job(self, batch: str) -> SceneJob:
-        self.scenes.running.add(batch)
-        members = [index for index in self.scenes.batches[batch] if self.state.had[index].any()]
-        pairs = tuple(self._pair_points(index) for index in members)
-        if len(pairs) >= MIN_TOLD_PAIRS:
-            self._progress.note(f"batch {batch}: reconstructing its cameras from {len(pairs)} pairs")
-        inputs, matches = self.journal.batch_inputs(batch), int(self.state.matches[members].sum())
-        return SceneJob(
-            batch, pairs, self.recipe, self._source(pairs), inputs, matches, self.request.exports.get(batch)
-        )
-
-    def _take_scene(self, job: SceneJob, answer: Solution, seconds: float) -> None:
-        record = SceneRecord.of(job.batch, answer.reconstructions, seconds)
-        if job.export is not None:
-            self.journal.forget_scene(job.batch)  # its files are replaced
-        self.journal.save_scene(record, job.inputs, job.pairs, answer.choices)
-        self.scenes.on_result(job, record, is_current=self.journal.batch_inputs(job.batch) == job.inputs)
-        self.state.read_choices()
-        text = f"{record.registered} of {record.images} images"
-        self._note(EventKind.SCENE, f"{record.batch}: {text}")
-        if len(job.pairs) >= MIN_TOLD_PAIRS:
-            self._progress.note(f"batch {job.batch}: {text} have a camera")
-        if job.export is not None:
-            self._publish()
-
-    # Answers
+    def _unknown(self, now: float) -> float:
+        return UNKNOWN_SHARE * max(0.0, self.budget.stop_units - now)
 
     def _take_answer(self, place: Place, now: float) -> None:
         if place.job is not None:
@@ -388,66 +266,50 @@ class Engine:
             self._has_loaded = self._has_loaded or place.work is Work.MATCH
         elif answer is not None:
             place.job = None
-            if isinstance(answer, Failure):
-                self._fault(f"a job was lost on {place.name}: {answer}" if job else f"{place.name}: {answer}")
+            if job is not None and not isinstance(answer, Failure):
+                self._save(job, answer, seconds)
+            elif isinstance(answer, Failure):
+                text = f"a job was lost on {place.name}: {answer}" if job else f"{place.name}: {answer}"
+                self._chronicle.fault(text)
                 if place.closed:
-                    self._explain(f"no worker is started any more on {place.closed}")
-                self._lose(job, answer)
+                    self._chronicle.explain(f"no worker is started any more on {place.closed}")
+                if job is not None:
+                    self._tables[type(job)].lose(job, answer)
                 if place.closed and place.work is Work.SCENE:
                     self.scenes.skip_all(answer)
-            else:
-                self._save(job, answer, seconds)
             if place.work is Work.SCENE:
                 place.kill()
 
-    def _save(self, job: Job | None, answer: Answer, seconds: float) -> None:
-        """Take an answer. A result that no table can hold costs itself alone."""
+    def _save(self, job: Job, answer: Any, seconds: float) -> None:
+        """Save an answer. A result that no table can hold costs itself alone."""
+        table = self._tables[type(job)]
         try:
-            if isinstance(job, MatchJob):
-                self._take_matched(job, cast(Sequence[Outcome], answer))
-            elif isinstance(job, EstimateJob):
-                self._take_estimates(cast(Sequence[Estimated], answer))
-            elif isinstance(job, SceneJob) and isinstance(answer, Solution):
-                self._take_scene(job, answer, seconds)
-            elif isinstance(job, LookJob) and isinstance(answer, bytes):
-                self._features[job.key] = answer
-                self.journal.save_feature(*job.key, answer)
+            table.save(job, answer, seconds)
         except sqlite3.Error as error:
-            self._fault(f"a result cannot be saved: {error}")
-            self._lose(job, Failure(Cause.RAISED, str(error)))
-        if self.journal.trouble:
-            self._fault(f"the journal cannot be written ({self.journal.trouble}); it continues in memory")
+            self._chronicle.fault(f"a result cannot be saved: {error}")
+            table.lose(job, Failure(Cause.RAISED, str(error)))
+        if trouble := self.journal.trouble:
+            self._chronicle.fault(f"the journal cannot be written ({trouble}); it continues in memory")
+        if isinstance(job, SceneJob) and job.export is not None:
+            self._publish()
 
-    def _lose(self, job: Job | None, failure: Failure) -> None:
-        if isinstance(job, MatchJob):
-            self.plan.on_failure(job, failure)
-        elif isinstance(job, EstimateJob):
-            if self.estimates.on_failure(job, failure):
-                self._explain(f"pair {job.pairs[0].index} keeps the F it has: {failure}")
-        elif isinstance(job, SceneJob):
-            self._fault(f"batch {job.batch} was not reconstructed: {failure}")
-            self.scenes.on_failure(job, failure)
-        elif isinstance(job, LookJob) and not self._look_losses.add([job.key], failure):
-            self._looks[job.key] = job
-
-    def _fall_back(self, now: float) -> None:
+    def _fall_back(self) -> None:
         """Continue elsewhere when the last matching place is closed, or had to skip every unit."""
         places = self.site.of(Work.MATCH)
-        is_closed = self._is_open and all(place.closed for place in places)
+        self.plan.is_closed = self._is_open and all(place.closed for place in places)
         reason = "; ".join(place.closed for place in places if place.closed)
-        if self.site.fallback and (is_closed or self.plan.nothing_runs):
+        if self.site.fallback and (self.plan.is_closed or self.plan.nothing_runs):
             text = f"matching continues on the {self.site.fallback[0].name}: {reason or Ending.NOTHING_RUNS}"
-            self._fault(text)
+            self._chronicle.fault(text)
             console.warn(text)
             for place in places:
                 place.kill()
                 self.site.places.remove(place)
             self.site.places += self.site.fallback
             self.site.fallback = []
-            self._explain(text)
-            self.plan.busy[:] = False
+            self._chronicle.explain(text)
             self.plan.restart()
-        elif is_closed and not self._has_loaded and places:
+        elif self.plan.is_closed and not self._has_loaded and places:
             raise UserError(f"no worker could be started: {reason}")
 
     # Results
@@ -457,35 +319,21 @@ class Engine:
         with self._publishing:
             if not self._has_ended:
                 try:
-                    made = dict(self.scenes.made)
-                    self.request.publish(Standing(self.state.fundamentals, made, dict(self.digests)))
+                    made, digests = dict(self.scenes.made), dict(self.state.digests)
+                    self.state.request.publish(Standing(self.state.fundamentals, made, digests))
                     self.unwritten = ""
                 except OSError as error:
                     self.unwritten = f"the results cannot be written: {error}"
         return self.unwritten
 
     def _publish(self) -> None:
-        if not self.request.pairs:
+        if not self.state.rows:
             return
         start = self.budget.clock()
         if trouble := self.save_results():
-            self._fault(trouble)
+            self._chronicle.fault(trouble)
         self._published = self.budget.clock()
         self.budget.note_write(self._published - start)
-
-    def _explain(self, text: str) -> None:
-        self.explanations.append(self._note(EventKind.PLAN, text))
-
-    def _note(self, kind: EventKind, text: str) -> Event:
-        event = Event(kind, self.budget.spent(), text)
-        with suppress(sqlite3.Error):
-            self.journal.note(event)
-        return event
-
-    def _fault(self, what: str) -> None:
-        if what not in self.faults:
-            self.faults.append(what)
-            self._note(EventKind.FAULT, what)
 
     @property
     def ending(self) -> Ending:
@@ -493,14 +341,10 @@ class Engine:
             return Ending.INTERRUPTED
         if self.plan.nothing_runs:
             return Ending.NOTHING_RUNS
-        if (
-            self.plan.is_complete
-            and not len(self.estimates.due(self.budget.clock()))
-            and not self.scenes.waiting(self.state.matches)
-        ):
+        now = self.budget.clock()
+        if self.plan.is_complete and not self.estimates.has_work(now) and not self.scenes.waiting():
             return Ending.COMPLETE
-        places = self.site.of(Work.MATCH)
-        return Ending.NO_WORKER if places and all(place.closed for place in places) else Ending.TIME_IS_UP
+        return Ending.NO_WORKER if self.plan.is_closed else Ending.TIME_IS_UP
 
 
 def name_below(root: str, file: str) -> str:

@@ -69,11 +69,11 @@ class Place:
         self.worker = self.make()
         self.worker.start()
 
-    def submit(self, job: Job, seconds: float, time_limit: float, now: float) -> None:
-        """Hand a job to the idle worker. A unit begins only if it is expected to end within ``seconds``."""
+    def submit(self, job: Job, time_limit: float, now: float) -> None:
+        """Hand a job to the idle worker."""
         assert self.worker is not None
         self.job, self.since, self.limit = job, now, now + time_limit
-        self.worker.submit(job, seconds)
+        self.worker.submit(job)
 
     def poll(self, now: float) -> Answer | None:
         """Return the worker's answer, or that it hangs; ``None`` while it computes."""

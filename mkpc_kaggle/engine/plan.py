@@ -13,8 +13,7 @@ from math import inf, isfinite
 import numpy as np
 from numpy.typing import NDArray
 
-from mkpc_kaggle.engine.budget import Budget, format_duration
-from mkpc_kaggle.engine.costs import Costs
+from mkpc_kaggle.engine.budget import Budget, Costs, format_duration
 from mkpc_kaggle.engine.jobs import Cause, Failure, MatchJob, Outcome, Phase
 from mkpc_kaggle.engine.losses import Losses
 from mkpc_kaggle.engine.state import State
@@ -35,9 +34,10 @@ Mask = NDArray[np.bool_]
 class Plan:
     """The priorities of a run: sweep, connect, deepen, fill.
 
-    ``order`` is the order in which encodings are cached best. ``workers`` match at the same time. ``reserve``
-    seconds at the end belong to estimates and scenes. ``busy`` (N,) are the pairs of jobs under way, ``unusable``
-    (U,) the units that no worker can run. ``announce`` gets one line for the user, ``explain`` each decision.
+    ``order`` is the order in which encodings are cached best. ``workers`` match at the same time; ``is_closed``:
+    none can any more. ``reserve`` seconds at the end belong to estimates and scenes. ``busy`` (N,) are the pairs
+    of jobs under way, ``unusable`` (U,) the units that no worker can run. ``announce`` gets one line for the user,
+    ``explain`` each decision.
     """
 
     def __init__(
@@ -64,6 +64,8 @@ class Plan:
         self.losses: Losses[tuple[int, str]] = Losses()
         self.unusable = np.zeros(len(self.units), bool)
         self.phase = Phase.SWEEP
+        self.is_closed = False
+        self.busy[:] = False
         self._explained, self._is_announced = "", False
         self._look()
 
@@ -83,7 +85,7 @@ class Plan:
         return self._job(PHASES[number], wanted <= number, best == number, now)
 
     def has_work(self, now: float) -> bool:
-        return bool((self._wanted(now)[~self.busy] < NEVER).any())
+        return not self.is_closed and bool((self._wanted(now)[~self.busy] < NEVER).any())
 
     def settled(self, now: float) -> Mask:
         """(N,): the pairs that get no further unit before the filling."""

@@ -14,7 +14,6 @@ import os
 import queue
 import signal
 import threading
-import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from multiprocessing import resource_tracker
@@ -49,7 +48,7 @@ class ThreadWorker:
         self._make = make
         self._on_answer = on_answer
         self._executor = Executor()
-        self._orders: queue.SimpleQueue[tuple[Job, float] | None] = queue.SimpleQueue()
+        self._orders: queue.SimpleQueue[Job | None] = queue.SimpleQueue()
         self._answers: queue.SimpleQueue[Answer] = queue.SimpleQueue()
         self._killed = False
         self._thread = threading.Thread(target=self._live, name=name, daemon=True)
@@ -60,9 +59,8 @@ class ThreadWorker:
         except RuntimeError as error:  # no thread more
             self._answers.put(Failure(Cause.NOT_STARTED, str(error)))
 
-    def submit(self, job: Job, seconds: float) -> None:
-        """Hand over a job. A unit begins only if it is expected to end within ``seconds``."""
-        self._orders.put((job, time.monotonic() + seconds))
+    def submit(self, job: Job) -> None:
+        self._orders.put(job)
 
     def answer(self) -> Answer | None:
         """Return an answer once; ``None`` while it computes."""
@@ -84,16 +82,16 @@ class ThreadWorker:
             self._on_answer()
             if isinstance(answer, Failure) and answer.cause.is_of_place:
                 return
-            order = self._orders.get()
-            if order is None or self._killed:
+            job = self._orders.get()
+            if job is None or self._killed:
                 return
-            answer = self._run(order[0], order[1] - time.monotonic())
+            answer = self._run(job)
 
     def _load(self) -> Answer:
         return self._executor.load(self._make)
 
-    def _run(self, job: Job, seconds: float) -> Answer:
-        return self._executor.run(job, seconds)
+    def _run(self, job: Job) -> Answer:
+        return self._executor.run(job)
 
 
 class ProcessWorker(ThreadWorker):
@@ -120,11 +118,11 @@ class ProcessWorker(ThreadWorker):
             process.kill()
         return self._exchange(process, self._make)
 
-    def _run(self, job: Job, seconds: float) -> Answer:
+    def _run(self, job: Job) -> Answer:
         assert self._process is not None, "only a worker that has loaded gets jobs"
-        return self._exchange(self._process, (job, seconds))
+        return self._exchange(self._process, job)
 
-    def _exchange(self, process: SpawnProcess, message: Callable[[], Runner] | tuple[Job, float]) -> Answer:
+    def _exchange(self, process: SpawnProcess, message: Callable[[], Runner] | Job) -> Answer:
         """Return the answer to a message, or how the process ended."""
         try:
             self._pipe.send(message)
@@ -178,7 +176,7 @@ def serve(pipe: Connection) -> None:
         answer = executor.load(make)
         pipe.send(answer)
         while isinstance(answer, Loaded):
-            pipe.send(executor.run(*pipe.recv()))
+            pipe.send(executor.run(pipe.recv()))
 
 
 def end_with_parent() -> None:

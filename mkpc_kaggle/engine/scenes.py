@@ -1,25 +1,29 @@
-"""Batches reconstructed in parallel with matching: which of them, when, and how long they take."""
+"""The table of scenes: which batches to reconstruct, when, and how long that takes, in parallel with matching."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from mkpc_kaggle.data.competition import Pair
+from mkpc_kaggle.engine.chronicle import Chronicle
+from mkpc_kaggle.engine.estimates import Estimates
 from mkpc_kaggle.engine.jobs import Failure, SceneJob
+from mkpc_kaggle.engine.journal import Journal
+from mkpc_kaggle.engine.journal_reader import EventKind
 from mkpc_kaggle.engine.losses import Losses
+from mkpc_kaggle.engine.plan import HANG_FACTOR, Plan
 from mkpc_kaggle.engine.records import SceneRecord
+from mkpc_kaggle.engine.request import Request
+from mkpc_kaggle.engine.state import State
 from mkpc_kaggle.recipe import SceneConfig
 from mkpc_kaggle.scene.densify import extra_pairs
+from mkpc_kaggle.scene.reconstruct import Solution
 
 MIN_PAIRS = 2  # they can connect three images
 START_S = 3.0  # that a process takes to begin
 MATCH_S = 5e-4  # that a match adds to a reconstruction, before any was measured
 FORECAST_MARGIN = 1.5  # of a forecast from the matches of earlier scenes
+MIN_TOLD_PAIRS = 20  # of a batch whose reconstruction is shown: that of a smaller batch takes seconds
 NOT_RECONSTRUCTED = "not reconstructed in time"
-
-Mask = NDArray[np.bool_]
 
 
 def batches_of(pairs: Iterable[Pair]) -> dict[str, list[int]]:
@@ -51,74 +55,119 @@ def extra_pairs_of(pairs: Sequence[Pair], config: SceneConfig | None) -> list[Pa
     return [pair for _, pair in sorted(extra, key=lambda each: each[0])]
 
 
+def standing_scenes(journal: Journal, request: Request) -> dict[str, SceneRecord]:
+    """Return the standing scene of each batch. Forget a scene whose files were removed: they are a result, too."""
+    made = journal.scenes("scene") if request.exports else journal.scenes()
+    for batch in request.exports.keys() & made.keys():
+        if not request.exports[batch].has_files(made[batch].models):
+            journal.forget_scene(batch)
+            del made[batch]
+    return made
+
+
 class Scenes:
-    """The batches of a run, by name with the positions of their pairs, and which scenes are out of date.
+    """The ``batches`` of a request, by name with the positions of their pairs, and their scenes, current or not.
 
     ``made`` are the standing reconstructions. ``losses`` has why a reconstruction failed.
     """
 
-    def __init__(self, batches: Mapping[str, list[int]], made: dict[str, SceneRecord], current: set[str]) -> None:
+    def __init__(
+        self,
+        batches: Mapping[str, list[int]],
+        made: dict[str, SceneRecord],
+        state: State,
+        plan: Plan,
+        estimates: Estimates,
+        chronicle: Chronicle,
+    ) -> None:
         self.batches, self.made = batches, made
-        self.stale = set(batches) - current
-        self.running: set[str] = set()
         self.losses: Losses[str] = Losses()
+        self._state, self._plan, self._estimates, self._chronicle = state, plan, estimates, chronicle
+        self._stale = set(batches) - state.journal.current_scenes()
+        self._running: set[str] = set()
         self._batch_of = {index: name for name, indices in batches.items() for index in indices}
         self._rate = 0.0, 0  # seconds and matches of the scenes of this run
 
-    def note_change(self, positions: Iterable[int]) -> None:
-        """Record that pairs have other points or another estimate."""
-        changed = {self._batch_of[index] for index in positions if index in self._batch_of}
-        self.stale |= changed
+    def waiting(self) -> list[str]:
+        """Return the batches to reconstruct, never reconstructed batches first."""
+        changed = {self._batch_of[index] for index in self._state.changed if index in self._batch_of}
+        self._state.changed.clear()
+        self._stale |= changed
         for name in changed:
             self.losses.skipped.pop(name, None)
+        names = (name for name in self.batches if name in self._stale - self._running)
+        tried = (name for name in names if name not in self.losses.skipped and self._matches(name))
+        return sorted(tried, key=self.made.__contains__)
 
-    def waiting(self, matches: NDArray[np.int_]) -> list[str]:
-        """Return the batches to reconstruct, never reconstructed batches first. ``matches`` (N,) of each pair."""
-        names = [
-            name
-            for name in self.batches
-            if name in self.stale - self.running
-            and name not in self.losses.skipped
-            and matches[self.batches[name]].any()
-        ]
-        return sorted(names, key=self.made.__contains__)
+    def reserve(self) -> float:
+        """Return the seconds that the pending reconstructions will probably take."""
+        return sum(self._forecast(self._matches(name)) for name in self._stale - self.losses.skipped.keys())
 
-    def due(self, matches: NDArray[np.int_], settled: Mask, filled: Mask) -> str | None:
-        """Return a batch whose pairs are all ``settled``, and all ``filled`` if it has a scene already."""
-        for name in self.waiting(matches):
-            if (filled if name in self.made else settled)[self.batches[name]].all():
-                return name
-        return None
+    def has_work(self, now: float) -> bool:
+        return self._due(now) is not None
 
-    def on_result(self, job: SceneJob, record: SceneRecord, *, is_current: bool) -> None:
-        """Record a reconstruction, which may be out of date already."""
-        seconds, matches = self._rate
-        self._rate = seconds + max(0.0, record.seconds - START_S), matches + job.matches
-        self.running.discard(job.batch)
+    def next(self, now: float) -> SceneJob | None:
+        if (batch := self._due(now)) is None:
+            return None
+        self._running.add(batch)
+        state, request = self._state, self._state.request
+        pairs, source = state.points_of(index for index in self.batches[batch] if state.had[index].any())
+        if len(pairs) >= MIN_TOLD_PAIRS:
+            self._chronicle.progress.note(f"batch {batch}: reconstructing its cameras from {len(pairs)} pairs")
+        inputs, export = state.journal.batch_inputs(batch), request.exports.get(batch)
+        return SceneJob(batch, pairs, request.recipe, source, inputs, self._matches(batch), export)
+
+    def patience(self, job: SceneJob, unknown: float) -> float:
+        return max(unknown, HANG_FACTOR * self._forecast(job.matches))
+
+    def save(self, job: SceneJob, answer: Solution, seconds: float) -> None:
+        """Save a reconstruction, which may be out of date already."""
+        journal, record = self._state.journal, SceneRecord.of(job.batch, answer.reconstructions, seconds)
+        if job.export is not None:
+            journal.forget_scene(job.batch)  # its files are replaced
+        journal.save_scene(record, job.inputs, job.pairs, answer.choices)
+        total, matches = self._rate
+        self._rate = total + max(0.0, seconds - START_S), matches + job.matches
+        self._running.discard(job.batch)
         self.made[job.batch] = record
-        if is_current:
-            self.stale.discard(job.batch)
+        if journal.batch_inputs(job.batch) == job.inputs:
+            self._stale.discard(job.batch)
+        self._state.read_choices()
+        text = f"{record.registered} of {record.images} images"
+        self._chronicle.note(EventKind.SCENE, f"{job.batch}: {text}")
+        if len(job.pairs) >= MIN_TOLD_PAIRS:
+            self._chronicle.progress.note(f"batch {job.batch}: {text} have a camera")
 
-    def on_failure(self, job: SceneJob, failure: Failure) -> None:
-        """Record a lost reconstruction: this run tries it again once, the next run again."""
-        self.running.discard(job.batch)
+    def lose(self, job: SceneJob, failure: Failure) -> None:
+        """Try a lost reconstruction once more in this run, and again in the next run."""
+        self._chronicle.fault(f"batch {job.batch} was not reconstructed: {failure}")
+        self._running.discard(job.batch)
         self.losses.add([job.batch], failure)
 
     def skip_all(self, failure: Failure) -> None:
         """No worker reconstructs any further batch."""
-        self.losses.skipped |= dict.fromkeys(self.stale, failure)
-
-    def reserve(self, matches: NDArray[np.int_]) -> float:
-        """Return the seconds that the pending reconstructions will probably take."""
-        pending = [name for name in self.stale if name not in self.losses.skipped]
-        return sum(self.forecast(float(matches[self.batches[name]].sum())) for name in pending)
-
-    def forecast(self, matches: float) -> float:
-        """Return the seconds that a reconstruction will probably take."""
-        seconds, done = self._rate
-        return START_S + matches * (FORECAST_MARGIN * seconds / done if done else MATCH_S)
+        self.losses.skipped |= dict.fromkeys(self._stale, failure)
 
     def report(self) -> tuple[SceneRecord, ...]:
         """Return the scene of each batch, in order; ``failure`` is the reason for a missing scene."""
         missing = {name: str(self.losses.skipped.get(name, NOT_RECONSTRUCTED)) for name in self.batches}
         return tuple(self.made.get(name) or SceneRecord(name, failure=missing[name]) for name in self.batches)
+
+    def _due(self, now: float) -> str | None:
+        """Return a batch whose pairs have what fits, all units if it has a scene already, or whatever they get."""
+        if not (waiting := self.waiting()):
+            return None
+        pending, plan = self._estimates.pending(now), self._plan
+        if plan.busy.any() or plan.has_work(now):
+            ready = {False: plan.settled(now) & ~pending, True: plan.filled(now) & ~pending}
+        else:
+            ready = dict.fromkeys((False, True), ~pending | (now >= plan.stop))  # too late to wait for estimates
+        return next((name for name in waiting if ready[name in self.made][self.batches[name]].all()), None)
+
+    def _matches(self, batch: str) -> int:
+        return int(self._state.matches[self.batches[batch]].sum())
+
+    def _forecast(self, matches: int) -> float:
+        """Return the seconds that a reconstruction will probably take."""
+        seconds, done = self._rate
+        return START_S + matches * (FORECAST_MARGIN * seconds / done if done else MATCH_S)

@@ -3,7 +3,7 @@
 -- points, estimate and scene are derived tables. A row records the revisions of its inputs and a digest of its settings.
 -- It is current if a computation today would use the same inputs and settings. The views below are that rule, and the only
 -- place that has it. Rows that nobody asks for stay: another recipe or test set may ask for them.
--- A run digests the images that have points before it matches (Engine._look_at_images): points of other contents are not current.
+-- A run digests the images that have points before it matches (Engine._digests): points of other contents are not current.
 -- A text named inputs lists revisions, separated by blanks. F is nine float64 numbers, row by row.
 
 -- What the latest run asked for.

@@ -1,32 +1,41 @@
-"""The state of all pairs of a run in arrays: the answers of the journal's views, kept up to date."""
+"""The state of all pairs of a request in arrays: the answers of the journal's views, kept up to date."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mkpc_kaggle.engine.jobs import PairPoints, PointSource, WantedPair
 from mkpc_kaggle.engine.journal import Journal
 from mkpc_kaggle.engine.journal_reader import matrix_of
+from mkpc_kaggle.engine.request import Request
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
 
 
 class State:
-    """Arrays for N pairs and U units, by their positions in the run and in the recipe.
+    """Arrays for N pairs and U units, by their positions in the request and in its recipe.
 
     ``had`` (N, U): the current points. ``matches`` (N,): their number. ``is_estimated`` (N,): whether the estimate
     is current. ``inliers`` (N,), ``own`` (N, 3, 3), ``has_own`` (N,): of the standing estimate. ``unreadable``
-    (N,): an image cannot be read. The first ``rows`` pairs have a row.
+    (N,): an image cannot be read. The first ``rows`` pairs have a row. ``changed`` are the pairs with other points
+    or another estimate since their scenes were looked at. ``digests`` are those of the images by name.
     """
 
-    def __init__(self, journal: Journal, pairs: int, rows: int, units: int) -> None:
-        self.rows, self._journal = rows, journal
-        self.had = np.zeros((pairs, units), bool)
-        self.matches, self.inliers = np.zeros(pairs, int), np.zeros(pairs, int)
-        self.is_estimated, self.has_own, self.unreadable = (np.zeros(pairs, bool) for _ in range(3))
-        self.own = np.tile(FALLBACK_FUNDAMENTAL, (pairs, 1, 1))
+    def __init__(
+        self, journal: Journal, request: Request, pairs: Sequence[WantedPair], digests: Mapping[str, str]
+    ) -> None:
+        self.journal, self.request, self.pairs, self.digests = journal, request, pairs, dict(digests)
+        self.rows = len(request.pairs)
+        self.units = {unit.name: unit for unit in request.recipe.units}
+        count = len(pairs)
+        self.had = np.zeros((count, len(self.units)), bool)
+        self.matches, self.inliers = np.zeros(count, int), np.zeros(count, int)
+        self.is_estimated, self.has_own, self.unreadable = (np.zeros(count, bool) for _ in range(3))
+        self.own = np.tile(FALLBACK_FUNDAMENTAL, (count, 1, 1))
         self.by_scene: dict[int, NDArray[np.float64]] = {}
+        self.changed: set[int] = set()
         self._twins = journal.twins()
-        self._read(None if pairs else ())
+        self._read(None if count else ())
         self.read_choices()
 
     @property
@@ -43,23 +52,36 @@ class State:
                 written[position] = F
         return written
 
-    def refresh(self, positions: Iterable[int]) -> set[int]:
-        """Read these pairs again, and all rows of the same images. Return their positions."""
+    def refresh(self, positions: Iterable[int]) -> None:
+        """Read these pairs again, and all rows of the same images."""
         changed = {twin for position in positions for twin in self._twins.get(position, (position,))}
         index = sorted(changed)
         self.had[index], self.matches[index], self.is_estimated[index] = False, 0, False
         self._read(index)
-        return changed
+        self.changed |= changed
 
     def read_choices(self) -> None:
         """Read which pairs have the F of their scene."""
-        self.by_scene = {n: choice.F for n, choice in self._journal.choices().items() if choice.F is not None}
+        self.by_scene = {n: choice.F for n, choice in self.journal.choices().items() if choice.F is not None}
+
+    def points_of(self, positions: Iterable[int]) -> tuple[tuple[PairPoints, ...], PointSource]:
+        """Return references to the current points of pairs, and where a worker reads them."""
+        pairs = tuple(map(self._points_of, positions))
+        revisions = [revision for pair in pairs for revision in pair.revisions]
+        blobs = self.journal.blobs(revisions) if self.journal.is_in_memory else None
+        return pairs, PointSource(self.journal.path.parent, blobs)
+
+    def _points_of(self, position: int) -> PairPoints:
+        image0, image1 = self.journal.images(position)
+        points = tuple((self.units[name], row) for name, row in self.journal.inputs(position).items())
+        own = self.own[position] if self.has_own[position] else None
+        return PairPoints(position, (image0, image1), points, self.pairs[position].pair.intrinsics, own)
 
     def _read(self, positions: Sequence[int] | None) -> None:
-        for position, unit, matches in self._journal.had(positions):
+        for position, unit, matches in self.journal.had(positions):
             self.had[position, unit] = True
             self.matches[position] += matches
-        for position, F, inliers, failure, is_current in self._journal.estimated(positions):
+        for position, F, inliers, failure, is_current in self.journal.estimated(positions):
             self.own[position], self.has_own[position] = matrix_of(F), not failure
             self.inliers[position] = sum(map(int, inliers.split()))
             self.is_estimated[position] = is_current

@@ -55,7 +55,7 @@ CAUSES = {
 class Runner(Protocol):
     """Does jobs of some kinds. It may raise anything, never return, or end the process."""
 
-    def run(self, job: Job, seconds: float) -> Answer: ...
+    def run(self, job: Job) -> Answer: ...
 
 
 class Executor:
@@ -73,9 +73,9 @@ class Executor:
             return failure_of(error)
         return Loaded()
 
-    def run(self, job: Job, seconds: float) -> Answer:
+    def run(self, job: Job) -> Answer:
         try:
-            return self.runner.run(job, seconds)
+            return self.runner.run(job)
         except Exception as error:
             return failure_of(error)
 
@@ -110,10 +110,10 @@ class MatchRunner:
         self._pipeline.load()
         self._images = ImageStore()
 
-    def run(self, job: Job, seconds: float) -> tuple[Outcome, ...]:
-        """Match the pairs of a job. No unit begins that is expected to end later than ``seconds`` from now."""
+    def run(self, job: Job) -> tuple[Outcome, ...]:
+        """Match the pairs of a job, with the units that are expected to end in time."""
         assert isinstance(job, MatchJob)
-        deadline = time.monotonic() + seconds
+        deadline = time.monotonic() + job.seconds
         expected = dict(zip(job.units, job.expected, strict=True))
 
         def may_start(unit: Unit) -> bool:
@@ -168,8 +168,7 @@ class LightRunner:
         cv2.setNumThreads(1)
         threadpool_limits(1)
 
-    def run(self, job: Job, seconds: float) -> tuple[Estimated, ...] | bytes:
-        """Do a job; ``seconds`` are ignored."""
+    def run(self, job: Job) -> tuple[Estimated, ...] | bytes:
         if isinstance(job, LookJob):
             return job.do()
         assert isinstance(job, EstimateJob)
@@ -196,8 +195,8 @@ def estimate_pair(pair: PairPoints, points: dict[int, Matches], recipe: Recipe) 
 class SceneRunner:
     """Reconstructs batches. pycolmap may end the process: see :mod:`mkpc_kaggle.scene.colmap`."""
 
-    def run(self, job: Job, seconds: float) -> Solution:
-        """Return the cameras of a batch, and a choice for each of its pairs; ``seconds`` are ignored."""
+    def run(self, job: Job) -> Solution:
+        """Return the cameras of a batch, and a choice for each of its pairs."""
         assert isinstance(job, SceneJob) and job.recipe.scene is not None
         points = read_points(job.source, job.pairs)
         pairs = [batch_pair(pair, points) for pair in job.pairs]

@@ -75,15 +75,14 @@ def find_partners(engine: Engine, dataset: str, files: Sequence[Path], count: in
     digests = [found.get(str(file), "") for file in files]
     key = digest(digests), digest([FEATURE_SETTINGS, count])
     comparison = {key: partial(compare, engine.journal.path.parent, digests, count)}
-    known = engine.look(comparison, compute=False)
-    if not known:
+    if (known := engine.journal.feature(*key)) is None:
         engine.look(
             {(found[str(a)], FEATURE_SETTINGS): partial(local_features, a) for a in files if str(a) in found}
         )
-        known = engine.look(comparison)
-    if key not in known:
+        known = engine.look(comparison).get(key)
+    if known is None:
         warn(f"the images of {dataset} were not compared")
-    partners: Partners = json.loads(known[key]) if key in known else [[] for _ in files]
+    partners: Partners = [[] for _ in files] if known is None else json.loads(known)
     return partners
 
 

@@ -4,8 +4,7 @@ import time
 import numpy as np
 import pytest
 
-from mkpc_kaggle.engine.budget import Budget, format_duration, monotonic_of, parse_duration
-from mkpc_kaggle.engine.costs import WINDOW, Costs
+from mkpc_kaggle.engine.budget import WINDOW, Budget, Costs, format_duration, monotonic_of, parse_duration
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.recipe import Unit
 

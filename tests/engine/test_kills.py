@@ -56,9 +56,9 @@ class DoomedWorker(ProcessWorker):
         self.is_busy = True
         super().start()
 
-    def submit(self, job: Any, seconds: float) -> None:
+    def submit(self, job: Any) -> None:
         self.is_busy = True
-        super().submit(job, seconds)
+        super().submit(job)
 
     def answer(self) -> Any:
         answer = super().answer()

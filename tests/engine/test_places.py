@@ -48,7 +48,7 @@ def test_three_workers_lost_in_a_row_with_no_answer_between_close_a_place(answer
             waiting.append(Loaded())
             place.poll(0.0)
         waiting.append(answer)
-        place.submit(job(is_retry=is_retry), 1.0, 1.0, now=0.0)
+        place.submit(job(is_retry=is_retry), 1.0, now=0.0)
         place.poll(0.0)
     assert bool(place.closed) == is_closed
 
@@ -67,7 +67,7 @@ def test_an_answer_that_is_there_counts_though_its_time_is_over():
     place = place_of([Loaded(), DONE])
     place.start(0.0)
     place.poll(0.0)
-    place.submit(job(), 1.0, 10.0, now=0.0)
+    place.submit(job(), 10.0, now=0.0)
     assert place.poll(now=99.0) is DONE
     assert place.worker is not None, "it is not killed"
 

@@ -1,9 +1,10 @@
 """The plan's decisions, and the engine on a virtual clock."""
 
 import math
+import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from statistics import mean, median
 
 import numpy as np
@@ -13,6 +14,7 @@ from simulator import (
     Scenario,
     SimulatedSite,
     SimulatedWorker,
+    VirtualClock,
     memory_journal,
     random_scenario,
     simulate,
@@ -20,10 +22,12 @@ from simulator import (
     without_records,
 )
 
+from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.budget import Budget
+from mkpc_kaggle.engine.engine import Engine
 from mkpc_kaggle.engine.jobs import Cause, Failure, Found, MatchJob, Outcome, Phase
 from mkpc_kaggle.engine.plan import Plan
-from mkpc_kaggle.engine.request import Ending
+from mkpc_kaggle.engine.request import Ending, Request
 from mkpc_kaggle.recipe import Unit
 
 DIED = Failure(Cause.DIED, "signal SIGKILL")
@@ -333,6 +337,22 @@ def test_time_reserved_for_scenes_is_used_for_units_when_they_need_less():
     ran = simulate(Scenario(600, (0.1, 0.2, 0.3), 1, 280.0, warm_up=1, batches=1))
     assert ran.work_left
     assert ran.report.seconds > 275.0
+
+
+def test_a_job_of_an_earlier_request_is_saved_before_the_next_request_begins():
+    scenario = Scenario(10, (10.0,), 1, 1000.0, spread=0, misses=0, warm_up=0)
+    clock, nothing = VirtualClock(), Request((), scenario.recipe, scenario.settings)
+    time = Budget(0.0, scenario.limit, clock)
+    site, pairs = (
+        SimulatedSite(scenario, clock, time.stop_units),
+        [Pair(str(n), "", str(n), "b") for n in range(10)],
+    )
+    with Engine(nothing, site, memory_journal(), time, interrupt=threading.Event(), progress=False) as engine:
+        engine.ask(replace(nothing, pairs=pairs), share=0.05)  # it ends amid the fifth pair
+        assert engine.state.had.sum() == 5
+        engine.ask(replace(nothing, pairs=pairs[4:6]))
+        report = engine.report()
+    assert (report.ending, report.units_run) == (Ending.COMPLETE, 6), "five, and the sixth"
 
 
 def test_scenes_that_never_begin_are_named_and_the_run_ends(monkeypatch):

@@ -98,7 +98,7 @@ def test_a_large_job_goes_to_a_stopped_process_without_blocking(at_birth, start)
     worker = start()
     assert worker.next_answer() == Loaded()
     os.kill(born[0], signal.SIGSTOP)
-    worker.submit(LARGE, 1.0)
+    worker.submit(LARGE)
     assert worker.answer() is None
 
 
@@ -116,7 +116,7 @@ if __name__ == "__main__":
     worker.start()
     os.read(answers, 1)
     worker.answer()
-    worker.submit(LARGE, 1.0)
+    worker.submit(LARGE)
     os.read(answers, 1)
 """
 

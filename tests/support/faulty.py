@@ -8,7 +8,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import count
-from math import inf
 from multiprocessing import resource_tracker, util
 from pathlib import Path
 from typing import Any, NoReturn
@@ -122,7 +121,7 @@ class ScenesBy(SceneRunner):
     def __init__(self, make: Callable[[SceneJob], Solution]) -> None:
         self._make = make
 
-    def run(self, job: Any, seconds: float) -> Solution:
+    def run(self, job: Any) -> Solution:
         return self._make(job)
 
 
@@ -158,7 +157,7 @@ def befall(fault: Fault, job: SceneJob) -> Solution:
 
 
 def reconstruct(job: SceneJob) -> Solution:
-    return SceneRunner().run(job, inf)
+    return SceneRunner().run(job)
 
 
 def die_within_pycolmap(job: SceneJob) -> Solution:

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine import costs, losses, plan, scenes
+from mkpc_kaggle.engine import budget, losses, plan, scenes
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.engine import Engine
 from mkpc_kaggle.engine.jobs import (
@@ -60,8 +60,8 @@ SWEEP_SHARE = 0.7  # of the limit, within which the sweep is said to fit
 MECHANISMS: dict[str, tuple[tuple[object, str, object], ...]] = {  # changes that switch each of them off
     "reserve for scenes": ((plan, "RESERVE_SHARE", 0.0),),
     "margin of scenes": ((scenes, "FORECAST_MARGIN", 1.0),),
-    "margin of units": ((costs, "MARGIN", 0.0), (costs, "MIN_MARGIN", 0.0)),
-    "latest costs": ((costs, "WINDOW", 10**9),),
+    "margin of units": ((budget, "MARGIN", 0.0), (budget, "MIN_MARGIN", 0.0)),
+    "latest costs": ((budget, "WINDOW", 10**9),),
     "short jobs": ((plan, "JOB_SHARE", math.inf),),
     "connect share": ((plan, "CONNECT_SHARE", 1.0),),
     "patience": ((plan, "HANG_FACTOR", math.inf),),
@@ -250,8 +250,8 @@ class SimulatedSite(Site):
         """Return the seconds that a stall of a unit takes on an uncached view, at the costs of this time."""
         return STALL * self.costs[unit.name] * max(1.0, self.scenario.miss_factor) * self.drift(now)
 
-    def match(self, warm: set[str], job: MatchJob, seconds: float) -> Drawn:
-        """Draw the answer of a worker that ran the units of ``warm`` before; no unit begins after ``seconds``."""
+    def match(self, warm: set[str], job: MatchJob) -> Drawn:
+        """Draw the answer of a worker that ran the units of ``warm`` before; none begins after ``job.seconds``."""
         scenario, rng, begun, spent = self.scenario, self.rng, self.clock.now, 0.0
         expected = dict(zip(job.units, job.expected, strict=True))
         if rng.random() < scenario.job_faults:
@@ -265,7 +265,7 @@ class SimulatedSite(Site):
         found: list[list[Found]] = [[] for _ in job.indices]
         for unit in sorted(job.units, key=lambda unit: unit.stage):
             for rows in found:
-                if spent + expected[unit] >= seconds:
+                if spent + expected[unit] >= job.seconds:
                     continue
                 slow = STALL if rng.random() < scenario.stalls else 1.0
                 took = slow * self.unit_seconds(unit, begun + spent)
@@ -281,7 +281,7 @@ class SimulatedSite(Site):
         images = [tuple(BatchImage(name, name, SIZE) for name in wanted.names) for wanted in job.pairs]
         return spent, tuple(map(Outcome, job.indices, images, map(tuple, found))), 0.0
 
-    def estimate(self, job: EstimateJob, seconds: float) -> Drawn:
+    def estimate(self, job: EstimateJob) -> Drawn:
         """Draw an answer: each pair has from 20 to 79 inliers by its number."""
         if self.rng.random() < self.scenario.job_faults:
             return 0.0 if self.rng.random() < 0.5 else math.inf, Failure(Cause.DIED), 0.0
@@ -292,7 +292,7 @@ class SimulatedSite(Site):
             estimates.append(Estimated(*values, seconds=ESTIMATE_S))
         return ESTIMATE_S * len(estimates), tuple(estimates), 0.0
 
-    def reconstruct(self, job: SceneJob, seconds: float) -> Drawn:
+    def reconstruct(self, job: SceneJob) -> Drawn:
         scenario, rng, begun = self.scenario, self._scene_rng, self.clock.now
         spread = math.exp(0.3 * rng.normal() - 0.3**2 / 2)
         spent = (START_S + spread * scenario.scene_seconds * len(job.pairs)) * self.drift(begun)
@@ -307,7 +307,7 @@ class SimulatedSite(Site):
 class SimulatedWorker:
     """A worker whose answer is drawn when a job is submitted, and given when its time has come."""
 
-    def __init__(self, site: SimulatedSite, draw: Callable[[Any, float], Drawn], start_s: float = 0.0) -> None:
+    def __init__(self, site: SimulatedSite, draw: Callable[[Any], Drawn], start_s: float = 0.0) -> None:
         self.ready = math.inf
         self._site, self._draw, self._start_s = site, draw, start_s
         self._answer: Answer = Loaded()
@@ -317,9 +317,9 @@ class SimulatedWorker:
         self._site.workers.add(self)
         self.ready = self._site.clock.now + self._start_s
 
-    def submit(self, job: Job, seconds: float) -> None:
+    def submit(self, job: Job) -> None:
         self._begun = self._site.clock.now
-        taken, self._answer, self._fault = self._draw(job, seconds)
+        taken, self._answer, self._fault = self._draw(job)
         self.ready = self._begun + taken
 
     def answer(self) -> Answer | None:
@@ -384,15 +384,15 @@ class Ran:
 def simulate(scenario: Scenario, journal: Journal | None = None, until: float = math.inf) -> Ran:
     """Run a scenario through the real engine, until it ends or is interrupted."""
     clock = VirtualClock()
-    budget = Budget(0.0, scenario.limit, clock)
-    site = SimulatedSite(scenario, clock, budget.stop_units)
+    time = Budget(0.0, scenario.limit, clock)
+    site = SimulatedSite(scenario, clock, time.stop_units)
     share = max(1, scenario.batches) / scenario.pairs
     pairs = [Pair(str(n), f"{int(n * share):03d}", f"{n:07d}", "b") for n in range(scenario.pairs)]
     published: list[int] = []
     interrupt = threading.Event()
     journal = memory_journal() if journal is None else journal
     nothing = Request((), scenario.recipe, scenario.settings)
-    engine = Engine(nothing, site, journal, budget, interrupt=interrupt, progress=False)
+    engine = Engine(nothing, site, journal, time, interrupt=interrupt, progress=False)
 
     def wait(moment: float) -> None:
         whole_wait(min(moment, until))
