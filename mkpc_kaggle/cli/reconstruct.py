@@ -100,7 +100,7 @@ def _lines(result: FolderResult) -> Iterator[str]:
     yield f"{len(result.pairs)} pairs: {ended}; {report.units_run} units run, {report.estimated} F estimated"
     reasons = {scene.batch: scene.failure for scene in report.scenes}
     for name, found in result.cameras.items():
-        models = Counter(camera.model for camera in found.values() if camera)
+        models = Counter(placed[0] for placed in found.values() if placed)
         sizes = ", ".join(str(models[number]) for number in sorted(models))
         why = f"models of {sizes}" if models else reasons.get(name, "too few pairs, or too little time")
         yield f"{name}: {models.total()} of {len(found)} images have a camera: {why}"

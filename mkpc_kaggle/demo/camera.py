@@ -26,11 +26,6 @@ class SizedCamera(Camera):
     width: int
     height: int
 
-    @property
-    def centre(self) -> Floats:
-        """The position in the world, (3,)."""
-        return np.asarray(-self.R.T @ self.t, dtype=np.float64)
-
 
 def look_at(
     position: ArrayLike, target: ArrayLike, focal: float, size: tuple[int, int], roll: float = 0.0

@@ -183,7 +183,7 @@ class Journal(JournalReader):
             for each in estimates:
                 pair, stats = wanted(db, each.index), each.stats
                 row = columns(each, "index", "stats") | columns(stats, "focals", "rotation")
-                row |= {"focal0": stats.focals[0], "focal1": stats.focals[1], "rotation": floats(stats.rotation)}
+                row |= {"focal0": stats.focals[0], "focal1": stats.focals[1], "rotation": np.array(stats.rotation)}
                 row |= {"pair": pair["pair"], "settings": pair["settings"]}
                 insert(db, "estimate", **row)
 
@@ -196,15 +196,15 @@ class Journal(JournalReader):
 
         def write(db: sqlite3.Connection) -> None:
             (asked,) = db.execute("SELECT settings FROM wanted_batch WHERE batch = ?", [printable(scene.batch)])
-            row = columns(scene, "cameras", "clouds")
+            row = columns(scene, "models")
             revision = insert(db, "scene", settings=asked["settings"], inputs=inputs, **row)
-            for camera in scene.cameras:
-                row = columns(camera, "size", "sigmas")
-                row |= {name: floats(row[name]) for name in ("centre", "forward", "down")}
-                row |= dict(zip(SIGMAS, camera.sigmas, strict=False))  # all or none
-                insert(db, "camera", scene=revision, width=camera.size.width, height=camera.size.height, **row)
-            for model, cloud in enumerate(scene.clouds):
-                insert(db, "cloud", scene=revision, model=model, points=floats(cloud))
+            for number, model in enumerate(scene.models):
+                row = columns(model, "images", "colmap")
+                insert(db, "model", scene=revision, number=number, **row)
+                for found in model.images:
+                    row = columns(found.camera) | columns(found.image, "size", "focal")
+                    row |= found.image.size._asdict() | (found.sigmas._asdict() if found.sigmas else {})
+                    insert(db, "camera", scene=revision, model=number, points=found.points, **row)
             for pair, chosen in zip(pairs, choices, strict=True):
                 row = {"pair": wanted(db, pair.index)["pair"], "inputs": pair.revisions} | columns(chosen)
                 insert(db, "choice", scene=revision, **row)
@@ -264,9 +264,6 @@ class Journal(JournalReader):
         self._db.execute("PRAGMA foreign_keys = ON")
 
 
-SIGMAS = ("rotation_sigma", "centre_sigma", "focal_sigma")
-
-
 def insert(db: sqlite3.Connection, table: str, **row: Any) -> int:
     """Insert or replace a row, values by the names of columns. Return its number."""
     names, marks = ", ".join(f'"{name}"' for name in row), ", ".join("?" * len(row))
@@ -284,12 +281,8 @@ def stored(value: Any) -> Any:
     if isinstance(value, str):
         return printable(value)
     if isinstance(value, np.ndarray):
-        return value.tobytes()
+        return value.astype(np.float64).tobytes()
     return " ".join(map(str, value)) if isinstance(value, tuple) else value
-
-
-def floats(values: Any) -> bytes:
-    return np.asarray(values, np.float64).tobytes()
 
 
 def wanted(db: sqlite3.Connection, position: int) -> sqlite3.Row:

@@ -15,19 +15,22 @@ from pathlib import Path
 from typing import Any, Self, TypeVar, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.budget import format_duration
-from mkpc_kaggle.engine.records import NOT_REACHED, CameraRecord, PairRecord, SceneRecord, UnitRecord
+from mkpc_kaggle.engine.records import NOT_REACHED, PairRecord, SceneRecord, UnitRecord
 from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Box, Matrix3, Size
 from mkpc_kaggle.geometry.critical_region import CriticalRegion, RegionReason
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import EstimateStats
 from mkpc_kaggle.scene.choose import Choice, Reason
+from mkpc_kaggle.scene.reconstruction import RegisteredImage, SfmModel, Sigmas
 from mkpc_kaggle.scene.view_graph import BatchImage
 
-FORMAT = 12
+FORMAT = 13
 FILE_NAME = "journal.sqlite"
 
 # SQLite's primary result codes that say nothing against a file: no permission, busy, locked, read only, input or
@@ -39,7 +42,7 @@ DAMAGE = (sqlite3.Error, ValueError, TypeError, LookupError, AttributeError, Ari
 UNIT_COLUMNS = tuple(each.name for each in fields(UnitRecord) if each.name != "inliers")
 UNITS = f"""SELECT position, revision, decode_seconds, cluster_seconds, {", ".join(UNIT_COLUMNS)}
     FROM current_points ORDER BY position, number"""
-SCENE_COLUMNS = tuple(each.name for each in fields(SceneRecord) if each.name not in ("cameras", "clouds"))
+SCENE_COLUMNS = tuple(each.name for each in fields(SceneRecord) if each.name != "models")
 REGIONS = """SELECT position, r.* FROM current_points c JOIN region r ON r.points = c.revision
     ORDER BY position, c.number DESC, r.image"""  # the first unit of stage 2 comes last
 
@@ -196,13 +199,9 @@ class JournalReader:
         """Return the standing reconstruction of each batch, or its latest row in another table."""
         scenes = {}
         for scene in self._rows(f"SELECT * FROM {table} ORDER BY batch, revision"):
-            cameras = self._rows("SELECT * FROM camera WHERE scene = ? ORDER BY rowid", scene["revision"])
-            clouds = self._rows("SELECT points FROM cloud WHERE scene = ? ORDER BY model", scene["revision"])
-            scenes[scene["batch"]] = SceneRecord(
-                **{name: scene[name] for name in SCENE_COLUMNS},
-                cameras=tuple(map(_camera, cameras)),
-                clouds=tuple(_points(row["points"]) for row in clouds),
-            )
+            values = {name: scene[name] for name in SCENE_COLUMNS}
+            models = self._rows("SELECT * FROM model WHERE scene = ? ORDER BY number", scene["revision"])
+            scenes[scene["batch"]] = SceneRecord(**values, models=tuple(map(self._model, models)))
         return scenes
 
     @reading
@@ -235,6 +234,11 @@ class JournalReader:
         """Return the features saved under a key, or ``None``."""
         found = self._rows("SELECT value FROM feature WHERE digest = ? AND settings = ?", digest, settings)
         return found[0]["value"] if found else None
+
+    def _model(self, row: sqlite3.Row) -> SfmModel:
+        query = "SELECT * FROM camera WHERE scene = ? AND model = ? ORDER BY rowid"
+        cameras = tuple(map(_registered, self._rows(query, row["scene"], row["number"])))
+        return SfmModel(cameras, floats(row["points"], -1, 3), row["reprojection_error"])
 
     def _rows(self, query: str, *values: Any) -> list[sqlite3.Row]:
         return self._db.execute(query, values).fetchall()
@@ -270,25 +274,24 @@ def from_blob(blob: bytes) -> Matches:
 
 def matrix_of(blob: bytes) -> Matrix3:
     """Return F from its 72 bytes. Raise ``ValueError`` unless a submission may hold it."""
-    matrix = np.frombuffer(blob).reshape(3, 3).copy()
+    matrix = floats(blob, 3, 3)
     if not np.isfinite(matrix).all() or not matrix.any():
         raise ValueError("a matrix is zero or not finite")
     return matrix
 
 
 def _stats(row: sqlite3.Row) -> EstimateStats:
-    focals, rotation = (row["focal0"], row["focal1"]), _points(row["rotation"])[0]
+    x, y, z = floats(row["rotation"], 3).tolist()
+    focals, rotation = (row["focal0"], row["focal1"]), (x, y, z)
     return EstimateStats(row["candidates"], row["cost"], row["magsac_cost"], focals, row["support"], rotation)
 
 
-def _camera(row: sqlite3.Row) -> CameraRecord:
-    centre, forward, down = (_points(row[name])[0] for name in ("centre", "forward", "down"))
-    sigmas = (row["rotation_sigma"], row["centre_sigma"], row["focal_sigma"])
-    size = Size(row["width"], row["height"])
-    pose = row["model"], centre, forward, down
-    known = () if None in sigmas else sigmas
-    return CameraRecord(row["image"], row["digest"], *pose, row["focal"], size, row["seen"], known)
+def _registered(row: sqlite3.Row) -> RegisteredImage:
+    image = BatchImage(row["name"], row["digest"], Size(row["width"], row["height"]))
+    camera = Camera(floats(row["K"], 3, 3), floats(row["R"], 3, 3), floats(row["t"], 3))
+    sigmas = Sigmas(row["rotation"], row["centre"], row["focal"])
+    return RegisteredImage(image, camera, row["points"], () if None in sigmas else sigmas)
 
 
-def _points(blob: bytes) -> tuple[Any, ...]:
-    return tuple(map(tuple, np.frombuffer(blob).reshape(-1, 3).tolist()))
+def floats(blob: bytes, *shape: int) -> NDArray[np.float64]:
+    return np.frombuffer(blob).reshape(shape).copy()

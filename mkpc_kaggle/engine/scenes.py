@@ -59,7 +59,7 @@ def standing_scenes(journal: Journal, request: Request) -> dict[str, SceneRecord
     """Return the standing scene of each batch. Forget a scene whose files were removed: they are a result, too."""
     made = journal.scenes("scene") if request.exports else journal.scenes()
     for batch in request.exports.keys() & made.keys():
-        if not request.exports[batch].has_files(made[batch].models):
+        if not request.exports[batch].has_files(len(made[batch].models)):
             journal.forget_scene(batch)
             del made[batch]
     return made

@@ -111,37 +111,37 @@ CREATE TABLE scene (  -- of a batch, from its points and estimates
     inputs TEXT NOT NULL,
     images INTEGER NOT NULL CHECK (images >= 0),
     registered INTEGER NOT NULL CHECK (registered >= 0),
-    models INTEGER NOT NULL CHECK (models >= 0),
     points INTEGER NOT NULL CHECK (points >= 0),
     seconds REAL NOT NULL,
     failure TEXT NOT NULL,
     UNIQUE (batch, settings, inputs)
 ) STRICT;
 
-CREATE TABLE camera (  -- centre, forward and down: three float64 numbers each
+CREATE TABLE model (  -- of a scene, the largest first
     scene INTEGER NOT NULL REFERENCES scene ON DELETE CASCADE,
-    image TEXT NOT NULL,
+    number INTEGER NOT NULL CHECK (number >= 0),
+    reprojection_error REAL NOT NULL,  -- pixels
+    points BLOB NOT NULL CHECK (length(points) % 24 = 0),  -- some of them, to draw: three float64 numbers each
+    PRIMARY KEY (scene, number)
+) STRICT;
+
+CREATE TABLE camera (  -- float64 numbers: K and R row by row, t
+    scene INTEGER NOT NULL REFERENCES scene ON DELETE CASCADE,
+    model INTEGER NOT NULL,
+    name TEXT NOT NULL,
     digest TEXT NOT NULL,
-    model INTEGER NOT NULL CHECK (model >= 0),
-    centre BLOB NOT NULL CHECK (length(centre) = 24),
-    forward BLOB NOT NULL CHECK (length(forward) = 24),
-    down BLOB NOT NULL CHECK (length(down) = 24),
-    focal REAL NOT NULL CHECK (focal > 0),
     width INTEGER NOT NULL CHECK (width > 0),
     height INTEGER NOT NULL CHECK (height > 0),
-    seen INTEGER NOT NULL CHECK (seen >= 0),
-    rotation_sigma REAL,  -- degrees; NULL where the standard deviations are unknown
-    centre_sigma REAL,  -- a share of the model's size
-    focal_sigma REAL  -- percent
+    K BLOB NOT NULL CHECK (length(K) = 72),
+    R BLOB NOT NULL CHECK (length(R) = 72),
+    t BLOB NOT NULL CHECK (length(t) = 24),
+    points INTEGER NOT NULL CHECK (points >= 0),  -- that the image sees
+    rotation REAL,  -- degrees; NULL where the expected errors are unknown
+    centre REAL,  -- a share of the model's size
+    focal REAL,  -- percent
+    FOREIGN KEY (scene, model) REFERENCES model
 ) STRICT;
-CREATE INDEX camera_of_scene ON camera (scene);
-
-CREATE TABLE cloud (  -- some points of a model to draw: float32 coordinates
-    scene INTEGER NOT NULL REFERENCES scene ON DELETE CASCADE,
-    model INTEGER NOT NULL CHECK (model >= 0),
-    points BLOB NOT NULL,
-    PRIMARY KEY (scene, model)
-) STRICT;
+CREATE INDEX camera_of_model ON camera (scene, model);
 
 CREATE TABLE choice (  -- F of a pair by its scene; NULL: the pair keeps its own
     scene INTEGER NOT NULL REFERENCES scene ON DELETE CASCADE,

@@ -20,6 +20,11 @@ class Camera:
     t: NDArray[np.float64]
 
     @property
+    def centre(self) -> NDArray[np.float64]:
+        """The camera's position (3,) in the world."""
+        return -self.R.T @ self.t
+
+    @property
     def calibrated(self) -> "Camera":
         """The same camera with K the identity. F of two calibrated cameras is their E."""
         return replace(self, K=np.eye(3))

@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mkpc_kaggle.data.outputs import replacing
-from mkpc_kaggle.engine.records import CameraRecord
+from mkpc_kaggle.scene.reconstruction import RegisteredImage
 
-Cameras = Mapping[str, Mapping[Path, CameraRecord | None]]  # of each file of a dataset; None without a camera
+# Of each file of a dataset: the number of its model and its camera; None without a camera.
+Cameras = Mapping[str, Mapping[Path, tuple[int, RegisteredImage] | None]]
 
 NO_POSE = ";".join(["nan"] * 9), "nan;nan;nan"
 ORIGIN = "1;0;0;0;1;0;0;0;1", "0;0;0"
@@ -36,11 +37,12 @@ def camera_rows(cameras: Cameras, root: Path) -> Iterator[Sequence[str]]:
     The centre of an image's first pixel is (0, 0); X_cam = R X + t. Unknown sigmas are empty cells.
     """
     yield "image", "model", "K", "R", "t", "rotation_sigma", "centre_sigma", "focal_sigma"
-    for file, record in (item for found in cameras.values() for item in found.items()):
-        if record is not None:
-            parts = record.camera.K, record.camera.R, record.camera.t
-            sigmas = [f"{value:g}" for value in record.sigmas] or [""] * 3
-            yield file.relative_to(root).as_posix(), str(record.model), *map(joined, parts), *sigmas
+    for file, placed in (item for found in cameras.values() for item in found.items()):
+        if placed is not None:
+            model, found = placed
+            parts = found.camera.K, found.camera.R, found.camera.t
+            sigmas = [f"{value:g}" for value in found.sigmas] or [""] * 3
+            yield file.relative_to(root).as_posix(), str(model), *map(joined, parts), *sigmas
 
 
 def submission_rows(form: str, cameras: Cameras, root: Path) -> Iterator[Sequence[str]]:
@@ -52,14 +54,14 @@ def submission_rows(form: str, cameras: Cameras, root: Path) -> Iterator[Sequenc
     for dataset, found in cameras.items():
         folder = _unused(root.resolve().name, names) if dataset == "." else dataset
         parts = folder.split("/")  # dataset/scene/images in 2023, dataset/images in 2024
-        for name, record in ((file.name, record) for file, record in found.items()):
-            pose = (joined(record.camera.R), joined(record.camera.t)) if record else NO_POSE
+        for name, placed in ((file.name, placed) for file, placed in found.items()):
+            pose = (joined(placed[1].camera.R), joined(placed[1].camera.t)) if placed else NO_POSE
             if of_2025:
                 number = _unused(f"{folder}_{name}", ids)
-                yield number, folder, f"cluster{record.model}" if record else "outliers", name, *pose
+                yield number, folder, f"cluster{placed[0]}" if placed else "outliers", name, *pose
             else:
                 place = f"{folder}/{name}", parts[0], parts[1 if len(parts) > 2 else 0]
-                yield *place, *(pose if record and record.model == 0 else ORIGIN)
+                yield *place, *(pose if placed and placed[0] == 0 else ORIGIN)
 
 
 def joined(numbers: NDArray[np.float64]) -> str:

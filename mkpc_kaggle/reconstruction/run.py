@@ -9,7 +9,6 @@ from typing import Any
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.data.images import Image, ImageStore, Unreadable
 from mkpc_kaggle.engine.engine import name_below
-from mkpc_kaggle.engine.records import CameraRecord
 from mkpc_kaggle.engine.request import RunReport, Standing
 from mkpc_kaggle.engine.session import Session, opened_engine, request_of
 from mkpc_kaggle.errors import UserError, writing
@@ -23,7 +22,7 @@ from mkpc_kaggle.reconstruction.outputs import Cameras
 from mkpc_kaggle.scene.export import Export
 from mkpc_kaggle.scene.likeness import PARTNERS, local_features, most_alike, shortlist
 from mkpc_kaggle.scene.reconstruct import models_of, reconstruct_sharing
-from mkpc_kaggle.scene.reconstruction import SfmModel
+from mkpc_kaggle.scene.reconstruction import RegisteredImage, SfmModel
 from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair, ViewGraph, tracks_of
 
 
@@ -81,10 +80,11 @@ def reconstruct_folder(
 
 def cameras_of(datasets: Datasets, root: str, results: Standing) -> Cameras:
     """Return the camera of each image. Files of one content have one camera, that of the largest model with it."""
-    cameras: dict[str, Mapping[Path, CameraRecord | None]] = {}
+    cameras: dict[str, Mapping[Path, tuple[int, RegisteredImage] | None]] = {}
     for name, files in datasets.items():
-        placed = results.scenes[name].cameras if name in results.scenes else ()
-        known = {camera.digest: camera for camera in reversed(placed)}
+        models = results.scenes[name].models if name in results.scenes else ()
+        placed = [(number, found) for number, model in enumerate(models) for found in model.images]
+        known = {found.image.digest: (number, found) for number, found in reversed(placed)}
         digests = {file: results.digests.get(name_below(root, str(file)), "") for file in files}
         cameras[name] = {file: known.get(digests[file]) for file in files}
     return cameras
@@ -123,4 +123,4 @@ def reconstruct(
         image0, image1 = (BatchImage(im.name, im.version, im.size, im.focal) for im in match.images)
         pairs.append(BatchPair(image0, image1, match.matches, None, tracks_of(match.results)))
     found, _ = reconstruct_sharing(ViewGraph.of_pairs(pairs), assembly.recipe.scene or SceneConfig())
-    return tuple(sorted(models_of(found), key=lambda model: -len(model.images)))
+    return models_of(found)

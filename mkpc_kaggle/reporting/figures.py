@@ -13,8 +13,9 @@ from mkpc_kaggle.data.competition import evenly_spread
 from mkpc_kaggle.data.images import Image
 from mkpc_kaggle.data.outputs import replacing
 from mkpc_kaggle.engine.journal_reader import Event, EventKind
-from mkpc_kaggle.engine.records import CameraRecord, SceneRecord
+from mkpc_kaggle.engine.records import SceneRecord
 from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Box, View
 from mkpc_kaggle.geometry.critical_region import CriticalRegion, MkpcConfig, find_clusters
 from mkpc_kaggle.pipeline.pair import PairMatch
@@ -157,14 +158,12 @@ def draw_cameras(scene: SceneRecord, number: int = 0) -> "Figure":
     look ahead. Points far away from nearly all others are cut off. A batch without cameras has a line instead.
     """
     figure = new_figure(8.4, 4.0)
-    cameras = [camera for camera in scene.cameras if camera.model == number]
-    if not cameras:
+    if not scene.models:
         figure.text(0.5, 0.5, f"no cameras: {scene.failure}", ha="center", wrap=True)
         return figure
+    cloud, cameras = scene.models[number].points, [found.camera for found in scene.models[number].images]
+    centres, looks = np.array([(camera.centre, camera.R[2]) for camera in cameras]).swapaxes(0, 1)
     right, ahead, up = _axes_of(cameras)
-    centres = np.array([camera.centre for camera in cameras])
-    looks = np.array([camera.forward for camera in cameras])
-    cloud = np.array(scene.clouds[number] if scene.clouds else ()).reshape(-1, 3)
     arrow = 0.12 * (np.ptp(centres, axis=0).max() or 1.0)
     sides = (("above", right, ahead), ("the side", ahead, up))
     for panel, (name, across, upward) in zip(figure.subplots(1, 2), sides, strict=True):
@@ -182,10 +181,9 @@ def draw_cameras(scene: SceneRecord, number: int = 0) -> "Figure":
     return figure
 
 
-def _axes_of(cameras: Sequence[CameraRecord]) -> NDArray[np.float64]:
+def _axes_of(cameras: Sequence[Camera]) -> NDArray[np.float64]:
     """(3, 3), rows right, ahead and up of a scene as :func:`draw_cameras` shows it, in its own units."""
-    down = np.mean([camera.down for camera in cameras], axis=0)
-    forward = np.mean([camera.forward for camera in cameras], axis=0)
+    _, down, forward = np.mean([camera.R for camera in cameras], axis=0)
     up = -down / np.linalg.norm(down)
     ahead = forward - forward @ up * up
     ahead /= np.linalg.norm(ahead)

@@ -93,7 +93,7 @@ def report_page(log: RunLog, pairs: Sequence[Pair] = (), *, undrawn: str = "") -
         cameras=[
             (f"{scene.batch}, model {number}", _data_uri(draw_cameras(scene, number), "png"))
             for scene in ([] if undrawn else largest)
-            for number in range(min(scene.models, MAX_MODELS))
+            for number in range(min(len(scene.models), MAX_MODELS))
         ],
         jobs=_data_uri(draw_budget(log.session, log.about.limit), "png") if has_jobs and not undrawn else "",
         costs=_costs(log),
@@ -183,7 +183,7 @@ def _scenes(log: RunLog) -> list[pd.DataFrame]:
     reasons = Counter(str(record.scene.reason) for record in log.records if record.scene is not None)
     batches = pd.DataFrame(rows, columns=heads)
     cameras = [
-        (each.image, 100 * each.sigmas[1], each.sigmas[0], each.sigmas[2]) for each in weakest_cameras(log.scenes)
+        (name, 100 * sigmas.centre, sigmas.rotation, sigmas.focal) for name, sigmas in weakest_cameras(log.scenes)
     ]
     sigmas = ["camera, weakest first", "error of its centre (%)", "rotation (deg)", "focal length (%)"]
     return [
@@ -194,7 +194,7 @@ def _scenes(log: RunLog) -> list[pd.DataFrame]:
 
 
 def _focals(scene: SceneRecord) -> str:
-    focals = [camera.focal for camera in scene.cameras]
+    focals = [found.focal for model in scene.models for found in model.images]
     return f"{median(focals):.0f} ({min(focals):.0f} to {max(focals):.0f})" if focals else ""
 
 

@@ -6,10 +6,11 @@ from pathlib import Path
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.budget import format_duration
-from mkpc_kaggle.engine.records import CameraRecord, PairRecord, SceneRecord
+from mkpc_kaggle.engine.records import PairRecord, SceneRecord
 from mkpc_kaggle.engine.request import Ending, RunReport
 from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
 from mkpc_kaggle.reporting.run_log import RunLog, RunTables, run_tables
+from mkpc_kaggle.scene.reconstruction import Sigmas
 
 MAX_LINES = 8  # of each list
 
@@ -116,14 +117,15 @@ def _scenes(tables: RunTables, scenes: Sequence[SceneRecord]) -> list[str]:
 def weakest_line(scenes: Sequence[SceneRecord]) -> list[str]:
     """Return a line with the weakest cameras, if any is known."""
     weakest = weakest_cameras(scenes)[:3]
-    named = [f"{Path(camera.image).name} ({100 * camera.sigmas[1]:.2g} %)" for camera in weakest]
+    named = [f"{Path(name).name} ({100 * sigmas.centre:.2g} %)" for name, sigmas in weakest]
     return [f"weakest cameras, with the error of the centre: {', '.join(named)}"] if named else []
 
 
-def weakest_cameras(scenes: Sequence[SceneRecord]) -> list[CameraRecord]:
-    """Return the cameras of known uncertainty, the largest expected error of the centre first."""
-    known = [camera for scene in scenes for camera in scene.cameras if camera.sigmas]
-    return sorted(known, key=lambda camera: -camera.sigmas[1])
+def weakest_cameras(scenes: Sequence[SceneRecord]) -> list[tuple[str, Sigmas]]:
+    """Return images and expected errors of their cameras, the largest expected error of the centre first."""
+    placed = (found for scene in scenes for model in scene.models for found in model.images)
+    known = [(found.image.name, found.sigmas) for found in placed if found.sigmas]
+    return sorted(known, key=lambda each: -each[1].centre)
 
 
 def _list(title: str, items: Sequence[str], count: int | None = None) -> list[str]:

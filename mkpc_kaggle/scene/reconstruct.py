@@ -115,5 +115,7 @@ def reconstruct_connected(graph: ViewGraph, config: SceneConfig, shared: SharedI
         return Reconstruction(graph.names, failure=f"pycolmap failed: {error}")
 
 
-def models_of(reconstructions: Sequence[Reconstruction]) -> list[SfmModel]:
-    return [model for found in reconstructions for model in found.models]
+def models_of(reconstructions: Sequence[Reconstruction]) -> tuple[SfmModel, ...]:
+    """Return all models, the largest first."""
+    models = (model for found in reconstructions for model in found.models)
+    return tuple(sorted(models, key=lambda model: -len(model.images)))

@@ -15,13 +15,15 @@ from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.jobs import Estimated, Found, Outcome, PairPoints, WantedPair
 from mkpc_kaggle.engine.journal import Journal
 from mkpc_kaggle.engine.journal_reader import About, Event, EventKind, to_blob
-from mkpc_kaggle.engine.records import CameraRecord, SceneRecord
+from mkpc_kaggle.engine.records import SceneRecord
 from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Box, Size
 from mkpc_kaggle.geometry.critical_region import CriticalRegion, RegionReason
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.recipe import Unit
 from mkpc_kaggle.scene.choose import Choice, Reason
+from mkpc_kaggle.scene.reconstruction import RegisteredImage, SfmModel, Sigmas
 from mkpc_kaggle.scene.view_graph import BatchImage
 
 UNITS = {SWEEP.name: "s1", SECOND.name: "s2", THIRD.name: "s3"}
@@ -60,10 +62,11 @@ def estimate(journal: Journal, position: int) -> None:
 
 
 def reconstruct(journal: Journal, *positions: int) -> None:
-    camera = CameraRecord(
-        "0.png", "d", 0, (0.0, 0.0, 1.0), (0.0, 0.0, 1.0), (0.0, 1.0, 0.0), 500.0, Size(640, 480), 9
-    )
-    scene = SceneRecord("one", 2, 2, 1, 9, 1.5, "", (camera,), (((0.0, 0.0, 5.0),),))
+    camera = Camera(np.diag([500.0, 500, 1]), np.eye(3)[[1, 0, 2]], np.array([0.0, 0.0, 1.0]))
+    sigmas = {"0.png": Sigmas(0.1, 0.02, 3.0), "1.png": ()}
+    placed = [RegisteredImage(BatchImage(name, "d", Size(80, 60)), camera, 9, sigmas[name]) for name in sigmas]
+    model = SfmModel(tuple(placed), np.array([[0.0, 0.0, 5.0]]), 0.7)
+    scene = SceneRecord("one", 2, 2, 9, 1.5, "", (model,))
     pairs, unit = [], Unit(1, "x", 9)
     for position in positions:
         images, revisions = journal.images(position), journal.inputs(position).values()
@@ -107,7 +110,13 @@ def test_what_is_saved_is_read_after_opening_again(whole: Journal, tmp_path: Pat
         assert records[0].regions == REGIONS
         assert np.array_equal(records[0].chosen_fundamental, 3 * F)
         assert np.array_equal(records[0].magsac_fundamental, 2 * F)
-        assert scenes == before[1]
+        assert replace(scenes["one"], models=()) == replace(before[1]["one"], models=())
+        (model,), (known,) = scenes["one"].models, before[1]["one"].models
+        assert (model.points.tolist(), model.reprojection_error) == ([[0.0, 0.0, 5.0]], 0.7)
+        for image, other in zip(model.images, known.images, strict=True):
+            assert (image.image, image.points, image.sigmas) == (other.image, other.points, other.sigmas)
+            for part in ("K", "R", "t"):
+                assert np.array_equal(getattr(image.camera, part), getattr(other.camera, part))
         assert [record.units for record in records] == [record.units for record in before[0]]
         (points,) = again.points([again.inputs(0)[SWEEP.name]]).values()
         assert points.points0.tobytes() == np.random.default_rng(0).random((30, 2)).astype(np.float32).tobytes()
@@ -238,7 +247,7 @@ def read_all(directory: Path) -> None:
 def test_a_journal_of_another_format_is_refused_in_one_line(tmp_path: Path) -> None:
     with closing(sqlite3.connect(tmp_path / "journal.sqlite")) as db:
         db.execute("CREATE TABLE run (key TEXT PRIMARY KEY, value TEXT NOT NULL)")  # as format 10
-    with pytest.raises(UserError, match=r"another version of this program \(its format is not 12\).*--fresh"):
+    with pytest.raises(UserError, match=r"another version of this program \(its format is not 13\).*--fresh"):
         Journal(tmp_path)
     Journal(tmp_path, fresh=True).close()
 

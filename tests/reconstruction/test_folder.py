@@ -7,11 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mkpc_kaggle.engine.records import CameraRecord
 from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.reconstruction.folder import read_folder, read_pair_list
 from mkpc_kaggle.reconstruction.outputs import submission_rows
+from mkpc_kaggle.scene.reconstruction import RegisteredImage
+from mkpc_kaggle.scene.view_graph import BatchImage
 
 
 def written(root: Path, *names: str) -> Path:
@@ -70,11 +72,12 @@ def test_names_in_a_list_of_pairs_may_have_blanks(tmp_path):
 
 
 def rows_of(root: Path, files: Iterable[str]) -> list[tuple[str, ...]]:
-    record = CameraRecord("x", "x", 0, (0, 0, 0), (0, 0, 1), (0, 1, 0), 100.0, Size(10, 10), 5)
-    cameras: dict[str, dict[Path, CameraRecord | None]] = {}
+    camera = Camera(np.eye(3), np.eye(3), np.zeros(3))
+    placed = 0, RegisteredImage(BatchImage("x", "x", Size(10, 10)), camera, 5)
+    cameras: dict[str, dict[Path, tuple[int, RegisteredImage] | None]] = {}
     for name in files:
         path = root / name
-        cameras.setdefault(path.parent.relative_to(root).as_posix(), {})[path] = record
+        cameras.setdefault(path.parent.relative_to(root).as_posix(), {})[path] = placed
     _, *rows = submission_rows("imc2025", cameras, root)
     return [tuple(row) for row in rows]
 

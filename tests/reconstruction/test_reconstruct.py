@@ -29,7 +29,6 @@ from mkpc_kaggle.cli import main
 from mkpc_kaggle.data import images
 from mkpc_kaggle.data.images import TURNS, Image, Unreadable, read_image
 from mkpc_kaggle.engine.budget import Budget
-from mkpc_kaggle.engine.records import CameraRecord
 from mkpc_kaggle.engine.session import Interrupt, Session
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.matches import Matches
@@ -41,6 +40,7 @@ from mkpc_kaggle.reconstruction.outputs import Cameras, camera_rows, submission_
 from mkpc_kaggle.reconstruction.run import FolderResult, for_cameras, reconstruct_folder
 from mkpc_kaggle.reporting.run_log import read_log
 from mkpc_kaggle.scene.likeness import local_features, most_alike, shortlist
+from mkpc_kaggle.scene.reconstruction import RegisteredImage
 
 RECIPE = for_cameras(Recipe((Unit(1, "synthetic", SIZE.width),)))
 FIRST, SECOND, OTHERS = 6, 4, 1  # images of two scenes, and of none
@@ -88,9 +88,9 @@ def mixed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, FolderResult]
     return home / "out", run(write_flat(home / "images"), home / "out")
 
 
-def cameras(result: FolderResult) -> Mapping[str, CameraRecord]:
+def cameras(result: FolderResult) -> Mapping[str, RegisteredImage]:
     (found,) = result.cameras.values()
-    return {file.name: record for file, record in found.items() if record}
+    return {file.name: placed[1] for file, placed in found.items() if placed}
 
 
 def contents(out: Path) -> dict[str, str]:

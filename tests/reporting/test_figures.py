@@ -6,7 +6,8 @@ import pytest
 import tour_figures as figures
 
 from mkpc_kaggle.data.images import Image
-from mkpc_kaggle.engine.records import CameraRecord, SceneRecord
+from mkpc_kaggle.engine.records import SceneRecord
+from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Box, Size
 from mkpc_kaggle.geometry.critical_region import CriticalRegion, RegionReason
 from mkpc_kaggle.geometry.matches import Matches
@@ -14,6 +15,8 @@ from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL, Estimate, ModelKin
 from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult
 from mkpc_kaggle.recipe import Unit
 from mkpc_kaggle.reporting.figures import draw_cameras, draw_strip, encode
+from mkpc_kaggle.scene.reconstruction import RegisteredImage, SfmModel
+from mkpc_kaggle.scene.view_graph import BatchImage
 
 SIZES = Size(120, 80), Size(60, 90)
 IMAGES = tuple(Image.of_array(np.full((size.height, size.width, 3), 90, np.uint8)) for size in SIZES)
@@ -56,11 +59,11 @@ def test_an_epipolar_line_is_that_of_the_point():
 
 def test_cameras_are_seen_from_above_and_from_the_side_with_the_points_before_them():
     """Two cameras two units apart look along the world's x axis, its z axis is up; a wall is ten units ahead."""
-    cameras = tuple(
-        CameraRecord(f"{n}.png", str(n), 0, [0, 2 * n, 1], [1, 0, 0], [0, 0, -1], 900, [80, 60], 9) for n in (0, 1)
-    )
-    wall = tuple([10, y, z] for y in range(5) for z in range(8))
-    above, side = draw_cameras(SceneRecord("batch", 2, 2, 1, 40, 1.0, "", cameras, (wall,))).axes
+    R = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
+    cameras = [Camera(np.eye(3), R, -R @ (0.0, 2.0 * n, 1.0)) for n in (0, 1)]
+    wall = np.array([(10.0, y, z) for y in range(5) for z in range(8)])
+    images = tuple(RegisteredImage(BatchImage("a.png", "a", Size(80, 60)), camera, 9) for camera in cameras)
+    above, side = draw_cameras(SceneRecord("batch", models=(SfmModel(images, wall, 0.5),))).axes
     (cloud, _, centres), (seen, _, points) = ([*panel.collections] for panel in (above, side))
     assert np.ptp(centres.get_offsets(), axis=0).tolist() == [2, 0]
     assert np.ptp(cloud.get_offsets(), axis=0).tolist() == [4, 0], "from above a wall is a line"
