@@ -12,15 +12,15 @@ from pathlib import Path
 import numpy as np
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine.jobs import Estimated, Found, Outcome, WantedPair
+from mkpc_kaggle.engine.jobs import Estimated, Outcome, WantedPair
 from mkpc_kaggle.engine.journal import Journal
-from mkpc_kaggle.engine.journal_reader import to_blob
 from mkpc_kaggle.engine.request import Request
 from mkpc_kaggle.engine.settings import Settings
 from mkpc_kaggle.engine.state import State
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
+from mkpc_kaggle.pipeline.pair import UnitResult
 from mkpc_kaggle.recipe import Recipe, Unit
 from mkpc_kaggle.scene.view_graph import BatchImage
 
@@ -34,7 +34,7 @@ def main() -> None:
     units, rng = [Unit(1, f"m{number}", 1024) for number in range(arguments.units)], np.random.default_rng(0)
     # Sub-pixel points on images of 1600 x 1200 in random order hardly compress.
     points = (rng.random((arguments.matches, 2)) * (1600, 1200) for _ in range(2))
-    blob = to_blob(Matches(*points, rng.random(arguments.matches)))
+    matches = Matches(*points, rng.random(arguments.matches))
     names = [(f"{number}.jpg", f"{number % 100}.jpg") for number in range(arguments.pairs)]
     pairs = [WantedPair(Pair(str(n), "one", *both), both, "F") for n, both in enumerate(names)]
     settings = {unit.name: unit.name for unit in units}
@@ -46,7 +46,7 @@ def main() -> None:
             started = time.perf_counter()
             for index, both in enumerate(names):
                 images = tuple(BatchImage(name, name, Size(1600, 1200)) for name in both)
-                found = tuple(Found(unit, arguments.matches, blob, 0.1, 0.1) for unit in units)
+                found = tuple(UnitResult(unit, matches, 0.1, 0.1) for unit in units)
                 journal.save_outcomes([Outcome(index, images, found)], settings)
                 inputs = tuple(journal.inputs(index).values())
                 journal.save_estimates([Estimated(index, inputs, inputs, FALLBACK_FUNDAMENTAL)])

@@ -7,8 +7,9 @@ from pathlib import Path
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.geometry.coordinates import Matrix3
+from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import NO_STATS, EstimateStats
-from mkpc_kaggle.pipeline.pair import Regions
+from mkpc_kaggle.pipeline.pair import Regions, UnitResult
 from mkpc_kaggle.recipe import Recipe, Unit
 from mkpc_kaggle.scene.export import Export
 from mkpc_kaggle.scene.reconstruct import Solution
@@ -50,7 +51,7 @@ class MatchJob:
     seconds: float
     is_retry: bool = False
     pairs: tuple[WantedPair, ...] = ()
-    known: tuple[tuple[tuple[Unit, bytes], ...], ...] = ()
+    known: tuple[tuple[UnitResult, ...], ...] = ()
     upcoming: tuple[Path, ...] = ()
 
 
@@ -71,10 +72,10 @@ class PairPoints:
 
 @dataclass(frozen=True, eq=False)
 class PointSource:
-    """Where a worker finds points: in the journal of ``directory``, or in ``blobs`` by revision."""
+    """Where a worker finds points: in the journal of ``directory``, or in ``points`` by revision."""
 
     directory: Path
-    blobs: dict[int, bytes] | None = None
+    points: dict[int, Matches] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,31 +123,12 @@ class Loaded:
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
-    """Result of a unit on a pair: a row of the table ``points``."""
-
-    unit: Unit
-    matches: int
-    points: bytes
-    encode_seconds: float
-    match_seconds: float
-    failure: str = ""
-    note: str = ""
-    warm_up: bool = False
-    keypoints: int = 0
-
-    @property
-    def seconds(self) -> float:
-        return self.encode_seconds + self.match_seconds
-
-
-@dataclass(frozen=True, eq=False)
 class Outcome:
-    """Result of a job for a pair. ``failure`` says which image cannot be read."""
+    """Result of a job for a pair: rows of the table ``points``. ``failure`` says which image cannot be read."""
 
     index: int
     images: tuple[BatchImage, ...] = ()
-    found: tuple[Found, ...] = ()
+    found: tuple[UnitResult, ...] = ()
     regions: Regions | None = None
     failure: str = ""
     decode_seconds: float = 0.0

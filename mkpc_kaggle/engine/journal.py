@@ -20,6 +20,7 @@ from mkpc_kaggle.engine.journal_reader import (
     JournalReader,
     connected,
     reading,
+    to_blob,
     undamaged,
 )
 from mkpc_kaggle.engine.records import SceneRecord
@@ -167,7 +168,8 @@ class Journal(JournalReader):
                     insert(db, "image", width=width, height=height, **names)
                 seconds = {"decode_seconds": outcome.decode_seconds, "cluster_seconds": outcome.cluster_seconds}
                 for found in outcome.found:
-                    row = columns(found, "unit", "warm_up")
+                    row = columns(found, "unit", "warm_up", "matches")
+                    row |= {"matches": len(found.matches), "points": to_blob(found.matches)}
                     digests = {f"digest{side}": image.digest for side, image in enumerate(outcome.images)}
                     row |= {"pair": pair, "settings": settings[found.unit.name], **digests, **seconds}
                     revision = insert(db, "points", **row)

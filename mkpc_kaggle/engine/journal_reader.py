@@ -207,12 +207,8 @@ class JournalReader:
     @reading
     def points(self, revisions: Iterable[int]) -> dict[int, Matches]:
         """Return the points of these rows, by revision."""
-        return {revision: from_blob(blob) for revision, blob in self.blobs(revisions).items()}
-
-    @reading
-    def blobs(self, revisions: Iterable[int]) -> dict[int, bytes]:
         query = "SELECT points FROM points WHERE revision = ?"
-        return {revision: self._rows(query, revision)[0]["points"] for revision in revisions}
+        return {revision: from_blob(self._rows(query, revision)[0]["points"]) for revision in revisions}
 
     @reading
     def inputs(self, position: int) -> dict[str, int]:

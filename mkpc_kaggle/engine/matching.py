@@ -9,7 +9,7 @@ from mkpc_kaggle.engine.jobs import Failure, MatchJob, Outcome
 from mkpc_kaggle.engine.journal_reader import EventKind
 from mkpc_kaggle.engine.plan import Plan
 from mkpc_kaggle.engine.state import State
-from mkpc_kaggle.recipe import Unit
+from mkpc_kaggle.pipeline.pair import UnitResult
 
 
 class Matching:
@@ -50,10 +50,9 @@ class Matching:
     def lose(self, job: MatchJob, failure: Failure) -> None:
         self._plan.on_failure(job, failure)
 
-    def _first_stage(self, index: int) -> tuple[tuple[Unit, bytes], ...]:
+    def _first_stage(self, index: int) -> tuple[UnitResult, ...]:
         """Return the current points of stage 1, from which a pair's critical regions are computed."""
-        inputs = self._state.journal.inputs(index)
-        rows = {self._state.units[name]: row for name, row in inputs.items()}
-        first = {unit: row for unit, row in rows.items() if unit.stage == 1}
-        blobs = self._state.journal.blobs(first.values())
-        return tuple((unit, blobs[row]) for unit, row in first.items())
+        journal, units = self._state.journal, self._state.units
+        rows = {units[name]: row for name, row in journal.inputs(index).items() if units[name].stage == 1}
+        points = journal.points(rows.values())
+        return tuple(UnitResult(unit, points[row]) for unit, row in rows.items())

@@ -68,8 +68,8 @@ class State:
         """Return references to the current points of pairs, and where a worker reads them."""
         pairs = tuple(map(self._points_of, positions))
         revisions = [revision for pair in pairs for revision in pair.revisions]
-        blobs = self.journal.blobs(revisions) if self.journal.is_in_memory else None
-        return pairs, PointSource(self.journal.path.parent, blobs)
+        points = self.journal.points(revisions) if self.journal.is_in_memory else None
+        return pairs, PointSource(self.journal.path.parent, points)
 
     def _points_of(self, position: int) -> PairPoints:
         image0, image1 = self.journal.images(position)

@@ -21,7 +21,6 @@ from mkpc_kaggle.engine.jobs import (
     Estimated,
     EstimateJob,
     Failure,
-    Found,
     Job,
     Loaded,
     LookJob,
@@ -32,7 +31,7 @@ from mkpc_kaggle.engine.jobs import (
     SceneJob,
     WantedPair,
 )
-from mkpc_kaggle.engine.journal_reader import JournalReader, from_blob, to_blob
+from mkpc_kaggle.engine.journal_reader import JournalReader
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import ModelKind
@@ -120,8 +119,7 @@ class MatchRunner:
             return time.monotonic() + expected[unit] < deadline
 
         self._images.prefetch(path for each in job.pairs for path in each.pair.images)
-        known = (tuple(UnitResult(unit, from_blob(blob)) for unit, blob in pair) for pair in job.known)
-        pairs = [self._open(each, results) for each, results in zip(job.pairs, known, strict=True)]
+        pairs = [self._open(each, known) for each, known in zip(job.pairs, job.known, strict=True)]
         self._images.prefetch(job.upcoming)
         readable = [number for number, pair in enumerate(pairs) if not pair.failure]
         matched = self._pipeline.match([pairs[number] for number in readable], job.units, may_start)
@@ -146,15 +144,7 @@ def _outcome(index: int, wanted: WantedPair, pair: PairMatch, known: tuple[objec
         BatchImage(name, image.version, image.size, image.focal)
         for name, image in zip(wanted.names, pair.images, strict=False)  # fewer if one is unreadable
     )
-    found = tuple(
-        Found(
-            *(result.unit, len(result.matches), to_blob(result.matches), result.encode_seconds),
-            *(result.match_seconds, result.failure, result.note, result.warm_up),
-            keypoints=result.keypoints,
-        )
-        for result in pair.results[len(known) :]
-    )
-    seconds = pair.decode_seconds, pair.cluster_seconds
+    found, seconds = pair.results[len(known) :], (pair.decode_seconds, pair.cluster_seconds)
     return Outcome(index, () if pair.failure else images, found, pair.regions, pair.failure, *seconds)
 
 
@@ -214,7 +204,7 @@ def batch_pair(pair: PairPoints, points: dict[int, Matches]) -> BatchPair:
 def read_points(source: PointSource, pairs: tuple[PairPoints, ...]) -> dict[int, Matches]:
     """Return the points of pairs by revision."""
     revisions = [revision for pair in pairs for revision in pair.revisions]
-    if source.blobs is not None:
-        return {revision: from_blob(source.blobs[revision]) for revision in revisions}
+    if source.points is not None:
+        return source.points
     with JournalReader(source.directory, check=False) as journal:
         return journal.points(revisions)

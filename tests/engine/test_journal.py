@@ -12,15 +12,16 @@ import pytest
 from rectified import SECOND, SWEEP, THIRD
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine.jobs import Estimated, Found, Outcome, PairPoints, WantedPair
+from mkpc_kaggle.engine.jobs import Estimated, Outcome, PairPoints, WantedPair
 from mkpc_kaggle.engine.journal import Journal
-from mkpc_kaggle.engine.journal_reader import About, Event, EventKind, to_blob
+from mkpc_kaggle.engine.journal_reader import About, Event, EventKind
 from mkpc_kaggle.engine.records import SceneRecord
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Box, Size
 from mkpc_kaggle.geometry.critical_region import CriticalRegion, RegionReason
 from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.pipeline.pair import UnitResult
 from mkpc_kaggle.recipe import Unit
 from mkpc_kaggle.scene.choose import Choice, Reason
 from mkpc_kaggle.scene.reconstruction import RegisteredImage, SfmModel, Sigmas
@@ -52,7 +53,7 @@ def match(journal: Journal, position: int, *units: Unit, digest: str = "d") -> N
     rng = np.random.default_rng(position)
     matches = Matches(rng.random((30, 2)), rng.random((30, 2)), rng.random(30))
     images = BatchImage(f"{position}.png", digest, Size(80, 60)), BatchImage("c.png", "common", Size(80, 60), 99.0)
-    found = tuple(Found(unit, 30, to_blob(matches), 0.5, 0.25) for unit in units)
+    found = tuple(UnitResult(unit, matches, 0.5, 0.25) for unit in units)
     journal.save_outcomes([Outcome(position, images, found, REGIONS, "", 0.1, 0.2)], UNITS)
 
 

@@ -25,9 +25,11 @@ from simulator import (
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.engine import Engine
-from mkpc_kaggle.engine.jobs import Cause, Failure, Found, MatchJob, Outcome, Phase
+from mkpc_kaggle.engine.jobs import Cause, Failure, MatchJob, Outcome, Phase
 from mkpc_kaggle.engine.plan import Plan
 from mkpc_kaggle.engine.request import Ending, Request
+from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.pipeline.pair import UnitResult
 from mkpc_kaggle.recipe import Unit
 
 DIED = Failure(Cause.DIED, "signal SIGKILL")
@@ -72,7 +74,7 @@ def plan_of(
 
 def finish(plan: Plan, job: MatchJob, inliers: Callable[[int], int] = lambda _: 50) -> float:
     """Every unit of a job took a second. Return the seconds of the job."""
-    found = tuple(Found(unit, 100, b"", 0.0, 1.0) for unit in job.units)
+    found = tuple(UnitResult(unit, Matches.empty(), 0.0, 1.0) for unit in job.units)
     for index in job.indices:
         plan.state.had[index, [UNITS.index(unit) for unit in job.units]] = True
         plan.state.inliers[index] = inliers(index)
@@ -179,7 +181,7 @@ def test_what_a_jobs_own_deadline_cut_off_is_planned_again():
     job = plan.next(0.0)
     assert job.units == (THIRD, SECOND)
     plan.state.had[0, 2] = True
-    plan.on_result(job, [Outcome(0, found=(Found(THIRD, 100, b"", 0.0, 1.0),))])
+    plan.on_result(job, [Outcome(0, found=(UnitResult(THIRD, Matches.empty(), 0.0, 1.0),))])
     assert plan.next(7.0).units == (SECOND,)
 
 

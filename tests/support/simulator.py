@@ -26,7 +26,6 @@ from mkpc_kaggle.engine.jobs import (
     Estimated,
     EstimateJob,
     Failure,
-    Found,
     Job,
     Loaded,
     MatchJob,
@@ -34,7 +33,6 @@ from mkpc_kaggle.engine.jobs import (
     SceneJob,
 )
 from mkpc_kaggle.engine.journal import Journal
-from mkpc_kaggle.engine.journal_reader import to_blob
 from mkpc_kaggle.engine.places import Place, Site, Work
 from mkpc_kaggle.engine.plan import RESERVE_SHARE
 from mkpc_kaggle.engine.request import Ending, Request, RunReport
@@ -43,6 +41,7 @@ from mkpc_kaggle.engine.settings import Settings
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
+from mkpc_kaggle.pipeline.pair import UnitResult
 from mkpc_kaggle.recipe import Recipe, SceneConfig, Unit
 from mkpc_kaggle.scene.choose import Choice, Reason
 from mkpc_kaggle.scene.reconstruct import Solution
@@ -54,7 +53,7 @@ WAKE_S = 5.0  # the longest wait; the real loop wakes every 0.2 s, and may give 
 STALL = 20.0  # how many times as long a unit takes that stalls
 SIZE = Size(640, 480)
 MATCHES = 200  # that a unit finds
-POINTS = to_blob(Matches(np.zeros((MATCHES, 2)), np.zeros((MATCHES, 2)), np.zeros(MATCHES)))
+POINTS = Matches(np.zeros((MATCHES, 2)), np.zeros((MATCHES, 2)), np.zeros(MATCHES))
 SWEEP_SHARE = 0.7  # of the limit, within which the sweep is said to fit
 
 MECHANISMS: dict[str, tuple[tuple[object, str, object], ...]] = {  # changes that switch each of them off
@@ -262,7 +261,7 @@ class SimulatedSite(Site):
                 stall = sum(self.stall_seconds(unit, begun) for unit in job.units)
                 return math.inf, Failure(Cause.TIMED_OUT), stall
             spent = len(job.indices) * sum(self.costs[unit.name] for unit in job.units)
-        found: list[list[Found]] = [[] for _ in job.indices]
+        found: list[list[UnitResult]] = [[] for _ in job.indices]
         for unit in sorted(job.units, key=lambda unit: unit.stage):
             for rows in found:
                 if spent + expected[unit] >= job.seconds:
@@ -276,7 +275,7 @@ class SimulatedSite(Site):
                 if fate < scenario.crashes + scenario.hangs:
                     return math.inf, Failure(Cause.TIMED_OUT), self.stall_seconds(unit, begun + spent)
                 spent += took
-                rows.append(Found(unit, MATCHES, POINTS, 0.0, took, warm_up=unit.name not in warm))
+                rows.append(UnitResult(unit, POINTS, 0.0, took, warm_up=unit.name not in warm))
                 warm.add(unit.name)
         images = [tuple(BatchImage(name, name, SIZE) for name in wanted.names) for wanted in job.pairs]
         return spent, tuple(map(Outcome, job.indices, images, map(tuple, found))), 0.0
