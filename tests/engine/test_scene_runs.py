@@ -181,17 +181,19 @@ def test_a_scene_that_was_lost_is_tried_again_by_the_next_run(tmp_path, monkeypa
     assert matcher.calls == []
 
 
-def test_a_camera_that_no_table_can_hold_costs_its_scene_alone(tmp_path, monkeypatch):
-    def without_focal(job: SceneJob) -> Solution:
+def test_a_model_that_no_table_can_hold_costs_its_scene_alone(tmp_path, monkeypatch):
+    def with_a_wrong_error(job: SceneJob) -> Solution:
         found = choose_scene_for_all_but_the_first(job)
-        found.reconstructions[0].models[0].images[0].camera.K[0, 0] = np.nan
-        return found
+        (reconstruction,) = found.reconstructions
+        (model,) = reconstruction.models
+        wrong = replace(model, reprojection_error=np.nan)
+        return replace(found, reconstructions=(replace(reconstruction, models=(wrong,)),))
 
-    scenes_by(monkeypatch, without_focal)
+    scenes_by(monkeypatch, with_a_wrong_error)
     pairs = batch_pairs(tmp_path / "images")
     report = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
     assert report.ending is Ending.COMPLETE
-    assert "a result cannot be saved: NOT NULL constraint failed: camera.focal" in report.faults
+    assert "a result cannot be saved: NOT NULL constraint failed: model.reprojection_error" in report.faults
     assert [record.source for record in report.records] == ["pair"] * 6
     scenes_by(monkeypatch, choose_scene_for_all_but_the_first)
     assert run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work").faults == ()
