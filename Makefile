@@ -13,7 +13,7 @@ DEMO := demo
 OLDEST := .venv-oldest
 PYTHON311 ?= python3.11
 IS_CHOSEN := $(filter-out file,$(origin PYTHON))
-NEWEST ?= .venv-newest$(if $(IS_CHOSEN),-$(notdir $(PYTHON)))
+NEWEST ?= .venv-newest$(if $(IS_CHOSEN),-$(lastword $(shell $(PYTHON) --version)))
 PYENV := $$HOME/.pyenv/versions
 NEWEST_PYTHON = $(if $(IS_CHOSEN),$(PYTHON),$(shell for python in python3.13 $(PYENV)/3.13*/bin/python python3.12 \
     $(PYENV)/3.12*/bin/python; do $$python -c 0 2> /dev/null && echo $$python && break; done))

@@ -147,13 +147,12 @@ class Engine:
 
     def digest_files(self, files: Mapping[str, Path]) -> dict[str, str]:
         """Return the digest of each file's content by name; files that cannot be read are left out."""
-        with ThreadPoolExecutor(HASH_THREADS) as pool:
-            futures = {name: pool.submit(content_digest, path) for name, path in files.items()}
-            pending = set(futures.values())
-            while pending and not self._is_over(self.budget.clock()):
-                _, pending = wait(pending, LISTEN_S)
-            for future in pending:
-                future.cancel()
+        pool = ThreadPoolExecutor(HASH_THREADS)
+        futures = {name: pool.submit(content_digest, path) for name, path in files.items()}
+        pending = set(futures.values())
+        while pending and not self._is_over(self.budget.clock()):
+            _, pending = wait(pending, LISTEN_S)
+        pool.shutdown(wait=False, cancel_futures=True)  # a file of many GB takes long
         done = {name: future for name, future in futures.items() if future.done() and not future.cancelled()}
         return {name: future.result() for name, future in done.items() if not future.exception()}
 

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import termios
+import threading
 import time
 from contextlib import suppress
 from pathlib import Path
@@ -20,7 +21,7 @@ from rectified import THREE_UNITS, RectifiedMatcher, matrices, run
 from mkpc_kaggle.cli import main
 from mkpc_kaggle.data.competition import read_test_side, submission_problems
 from mkpc_kaggle.demo import DemoSet
-from mkpc_kaggle.engine import session, worker
+from mkpc_kaggle.engine import engine, session, worker
 from mkpc_kaggle.engine.journal import Journal
 from mkpc_kaggle.engine.journal_reader import JournalReader
 from mkpc_kaggle.engine.plan import Plan
@@ -54,6 +55,26 @@ def test_a_worker_lost_once_costs_time_alone(pairs, undisturbed, tmp_path, fault
     assert report.ending is Ending.COMPLETE
     assert [reason in fault for fault in report.faults] == [True]
     assert matrices(report) == matrices(undisturbed)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_a_resumed_run_while_an_image_is_digested(pairs, tmp_path, monkeypatch, number):
+    run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
+    first, released, digested = iter([number]), threading.Event(), []
+
+    def digest(path: Path) -> str:
+        for signal_number in first:
+            os.kill(os.getpid(), signal_number)
+            released.wait(60)  # an image of many GB
+            digested.append(path)
+        return "changed"
+
+    monkeypatch.setattr(engine, "content_digest", digest)
+    with session.interruptible() as interrupt:
+        report = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work", interrupt=interrupt)
+    assert digested == [], "the run ends before that digest"
+    released.set()
+    assert (report.ending, interrupt.signal) == (Ending.INTERRUPTED, number)
 
 
 def test_an_error_of_the_engine_itself_leaves_the_latest_version_behind(pairs, tmp_path, monkeypatch):
