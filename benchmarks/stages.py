@@ -96,8 +96,8 @@ def by_stages(row: str, databases: Path, pairs: Sequence[Known], every: Sequence
         for known in (*pairs, *extra_of(pairs, every, config))
     ]
     with stages(float(cell), float(error), mapper):
-        choices = reconstruct_batch(batch, config).choices
-    return [known.F if choice.F is None else choice.F for known, choice in zip(pairs, choices, strict=False)]
+        choices = reconstruct_batch(batch, config).choices[: len(pairs)]
+    return [known.F if choice.F is None else choice.F for known, choice in zip(pairs, choices, strict=True)]
 
 
 def main() -> None:

@@ -31,46 +31,40 @@ class NeighbourMatcher(PairwiseMatcher[Keypoints]):
     ratio: float
 
     def _match(self, first: Keypoints, second: Keypoints) -> Matches:
-        pairs = mutual_neighbours(first.descriptors, second.descriptors)
-        passed = pairs.ratio <= self.ratio
-        index0, index1, scores = pairs.index0[passed], pairs.index1[passed], self._scores(pairs)[passed]
-        return matches_of(first.points, second.points, index0, index1, scores)
+        pairs = mutual_neighbours(first.descriptors, second.descriptors, self.ratio)
+        return matches_of(first.points, second.points, pairs.index0, pairs.index1, self._scores(pairs))
 
     def _scores(self, pairs: Neighbours) -> Tensor:
         return pairs.similarity
 
 
-def mutual_neighbours(descriptors0: Tensor, descriptors1: Tensor) -> Neighbours:
+def mutual_neighbours(descriptors0: Tensor, descriptors1: Tensor, max_ratio: float = 1.0) -> Neighbours:
     """Pair unit descriptors, (N, D) and (M, D), that are each other's nearest; in order of the first image.
 
     Of equal neighbours the lower index counts. A missing second neighbour counts as one at the maximum distance.
+    Pairs with a ratio above ``max_ratio`` are dropped.
     """
     if len(descriptors0) == 0 or len(descriptors1) == 0:
         nothing = descriptors0.new_zeros(0)
         return Neighbours(nothing.long(), nothing.long(), nothing, nothing)
-    best0, second0, nearest0 = _two_best(descriptors0, descriptors1)
-    best1, second1, nearest1 = _two_best(descriptors1, descriptors0)
-    index0 = torch.arange(len(descriptors0), device=descriptors0.device)
-    index0 = index0[nearest1[nearest0] == index0]
+    similarity, ratio0, nearest0 = _nearest(descriptors0, descriptors1)
+    index0 = (ratio0 <= max_ratio).nonzero()[:, 0]  # few at a low ratio: only these need the other direction
     index1 = nearest0[index0]
-    ratio0, ratio1 = _distance_ratio(best0, second0)[index0], _distance_ratio(best1, second1)[index1]
-    return Neighbours(index0, index1, best0[index0], torch.maximum(ratio0, ratio1))
+    _, ratio1, nearest1 = _nearest(descriptors1[index1], descriptors0)
+    ratio = torch.maximum(ratio0[index0], ratio1)
+    kept = (nearest1 == index0) & (ratio <= max_ratio)
+    return Neighbours(index0[kept], index1[kept], similarity[index0[kept]], ratio[kept])
 
 
-def _two_best(queries: Tensor, keys: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return each query's highest and second highest similarity (N,), and the index of the highest (N,)."""
-    best, second, nearest = [], [], []
-    for start in range(0, len(queries), BLOCK_ROWS):
-        similarity = queries[start : start + BLOCK_ROWS] @ keys.T  # (rows, M)
-        top, index = similarity.max(dim=1)
-        best.append(top)
-        nearest.append(index)
+def _nearest(queries: Tensor, keys: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return each query's highest similarity, its distance ratio, and the index of that neighbour, all (N,)."""
+    parts = []
+    for block in torch.split(queries, BLOCK_ROWS):
+        similarity = block @ keys.T  # (rows, M)
+        best, index = similarity.max(dim=1)
         similarity.scatter_(1, index[:, None], -1.0)
-        second.append(similarity.amax(dim=1))
-    return torch.cat(best), torch.cat(second), torch.cat(nearest)
-
-
-def _distance_ratio(best: Tensor, second: Tensor) -> Tensor:
-    """Return the ratio of distances sqrt(2 - 2 s) of unit vectors; 1 for two neighbours at distance 0."""
-    nearest, next_nearest = (1 - best).clamp(min=1e-12), (1 - second).clamp(min=1e-12)
-    return (nearest / next_nearest).sqrt()
+        second = similarity.amax(dim=1)
+        # Distances of unit vectors are sqrt(2 - 2 s); the ratio of two neighbours at distance 0 is 1.
+        parts.append((best, ((1 - best).clamp(min=1e-12) / (1 - second).clamp(min=1e-12)).sqrt(), index))
+    best, ratio, index = map(torch.cat, zip(*parts, strict=True))
+    return best, ratio, index

@@ -54,6 +54,17 @@ def test_they_are_those_of_brute_force_in_blocks_of_any_size(n, m, dtype, tolera
         assert_allclose(value, truth, rtol=0, atol=tolerance)
 
 
+@pytest.mark.parametrize("max_ratio", [0.0, 0.3, 0.8])
+def test_a_maximum_ratio_drops_pairs_and_changes_no_others(max_ratio):
+    descriptors = [torch.tensor(each) for each in related(3, 150, 61)]
+    every, kept = mutual_neighbours(*descriptors), mutual_neighbours(*descriptors, max_ratio)
+    passed = every.ratio <= max_ratio
+    assert_array_equal(kept.index0, every.index0[passed])
+    assert_array_equal(kept.index1, every.index1[passed])
+    assert_allclose(kept.similarity, every.similarity[passed], atol=1e-9)
+    assert_allclose(kept.ratio, every.ratio[passed], atol=1e-9)
+
+
 @pytest.mark.parametrize(("n", "m"), [(0, 0), (0, 5), (5, 0)])
 def test_no_descriptors_give_no_pairs(n, m):
     assert [part.shape for part in found(np.zeros((n, 8)), np.zeros((m, 8)))] == [(0,)] * 4
