@@ -38,8 +38,7 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=2)
     parser.add_argument("options", nargs="*")
     given = parser.parse_args()
-    figure = new_figure(6.5, 3.2)
-    axes = plain(figure.subplots(), "mAA by time limit")
+    axes = plain(new_figure(6.5, 3.2).subplots(), "mAA by time limit")
     print(f"{'recipe':12}{'limit':>10}{'early':>8}  mAA")
     for recipe in given.recipes:
         side = ["--train-dir", given.train_dir, "--recipe", recipe, *given.options]
@@ -49,13 +48,12 @@ def main() -> None:
             runs = [timed([*side, "--time-limit", f"{factor * sweep:.1f}"]) for _ in range(given.runs)]
             early = min(factor * sweep - seconds for _, seconds in runs)
             means.append(sum(maa for maa, _ in runs) / len(runs))
-            print(
-                f"{recipe:12}{factor * sweep:9.1f}s{early:7.1f}s ", *(f"{maa:.3f}" for maa, _ in runs), flush=True
-            )
+            scores = " ".join(f"{maa:.3f}" for maa, _ in runs)
+            print(f"{recipe:12}{factor * sweep:9.1f}s{early:7.1f}s  {scores}", flush=True)
         axes.plot([*map(str, FACTORS)], means, "o-", label=f"{recipe}: the sweep takes {sweep:.0f} s")
     axes.set(ylim=(0, 1), xlabel="time limit / sweep")
     axes.legend(fontsize=8, frameon=False)
-    save(figure, given.out)
+    save(axes.figure, given.out)
 
 
 if __name__ == "__main__":

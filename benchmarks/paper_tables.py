@@ -1,13 +1,13 @@
 """The paper's tables, row by row, next to their published figures, with one command.
 
-python -m benchmarks.paper_tables --out DIR --weights DIR [--yfcc LIST IMAGES] [--scannet LIST IMAGES]
-    [--imc TRAIN_DIR] [--rows "1200,1600 + 1400" ...] [--pairs N] [--protocol superglue] [--matcher NAME]
-
-LIST is a list of pairs in the format of SuperGlue's evaluation, IMAGES the directory that its names start from
-(docs/benchmarks.md), TRAIN_DIR any train side of the Image Matching Challenge 2022. The rows are in
+LIST is a list of pairs in the format of SuperGlue's evaluation (docs/benchmarks.md). IMAGES is the directory that
+its names start from. TRAIN_DIR is any train side of the Image Matching Challenge 2022. The rows are in
 `paper_tables.toml`. The rows of a table share a work directory, so that common units run once; the last column
 counts the units that a row ran. After a kill, the same command resumes. `--pairs N` takes a sample of each list or
-scene, and `--matcher` replaces all matchers.
+scene, and `--matcher` replaces all matchers. Usage:
+
+python -m benchmarks.paper_tables --out DIR --weights DIR [--yfcc LIST IMAGES] [--scannet LIST IMAGES]
+    [--imc TRAIN_DIR] [--rows "1200,1600 + 1400" ...] [--pairs N] [--protocol superglue] [--matcher NAME]
 """
 
 import argparse

@@ -1,10 +1,13 @@
 """Use of time by the engine, on random simulated runs.
 
-python -m benchmarks.simulation [--scenarios 1000] [--seed 0] [--pairs 10000] [--without MECHANISM]
-python -m benchmarks.simulation --costs 0.6 0.4 0.35 [--batches 15] [--pairs 10000] [--scene-seconds 0.15]
-    [--limit 8h45m] [--workers 1]
+Statistics of many runs:
 
-With `--costs`, the seconds of each unit on a pair, the output is the timeline of one simulated run.
+    python -m benchmarks.simulation [--scenarios 1000] [--seed 0] [--pairs 10000] [--without MECHANISM]
+
+The timeline of one run; the costs are the seconds of each unit on a pair:
+
+    python -m benchmarks.simulation --costs 0.6 0.4 0.35 [--batches 15] [--pairs 10000] [--scene-seconds 0.15]
+        [--limit 8h45m] [--workers 1]
 """
 
 import argparse

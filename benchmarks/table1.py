@@ -33,7 +33,7 @@ def recipe(matcher: str, layout: str) -> str:
     stages = (1,) * whole + (2,) * crops
     units = (
         f'{{ stage = {stage}, matcher = "{matcher}", long_side = {side}{MORE.get(matcher, "")} }}'
-        for stage, side in zip(stages, LONG_SIDES[matcher], strict=False)
+        for stage, side in zip(stages, LONG_SIDES[matcher][: len(stages)], strict=True)
     )
     return f"units = [{', '.join(units)}]\n"
 

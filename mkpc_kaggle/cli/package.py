@@ -10,8 +10,8 @@ from mkpc_kaggle.package.wheels import PYTHONS
 
 HELP = """\
 Write two folders, each with the metadata for the `kaggle` command:
-  DIR/dataset  our wheel, wheels of packages that may be missing on Kaggle, weights with their licences
-  DIR/kernel   the submission notebook
+  DIR/dataset  our wheel, wheels of packages that may be missing on Kaggle, weights with their licences;
+  DIR/kernel   the submission notebook.
 
 Run it in a checkout, with internet or with the wheels in a directory (--wheels). A second run keeps valid files.
 Torch checkpoints are converted to safetensors, since Kaggle unpacks uploaded archives.

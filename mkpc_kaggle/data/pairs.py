@@ -11,7 +11,6 @@ import pickle
 import zipfile
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass
 from io import BytesIO
 from itertools import chain
 from math import nan
@@ -35,16 +34,6 @@ NAMES = {"ndarray": np.ndarray, "dtype": np.dtype, "encode": lambda text, _: tex
 NAMES |= {"_reconstruct": np.empty(0).__reduce__()[0], "scalar": np.float64(0).__reduce__()[0]}
 
 
-@dataclass(frozen=True, eq=False)
-class ListedImage:
-    name: str  # path under the image root
-    turns: int  # quarters
-    camera: Camera
-
-    def __str__(self) -> str:
-        return self.name + (f" turned {self.turns}" if self.turns else "")
-
-
 def read_pairs(file: Path, image_root: Path, *, most: int | None = None) -> TrainScene:
     """Return the pairs of a list as a scene of unknown scale, with intrinsics to estimate E.
 
@@ -54,18 +43,12 @@ def read_pairs(file: Path, image_root: Path, *, most: int | None = None) -> Trai
     if not image_root.is_dir():
         raise UserError(f"--image-root {image_root}: no such directory")
     infos = sorted(file.glob("*.npz")) if file.is_dir() else [file] if file.suffix == ".npz" else []
-    lines = [*chain.from_iterable(map(lines_of_scene_info, infos))] if infos else read_text(file).splitlines()
-    numbered = enumerate(lines, start=1)
-    listed = [(number, parse_line(line, f"{file}, line {number}")) for number, line in numbered if line.split()]
-    if not listed:
+    lines = chain.from_iterable(map(lines_of_scene_info, infos)) if infos else read_text(file).splitlines()
+    numbered = ((number, line) for number, line in enumerate(lines, start=1) if line.split())
+    pairs = [parse_line(line, file, number, image_root) for number, line in numbered]
+    if not pairs:
         raise UserError(f"{file} has no pairs; expected lines {EXPECTED}")
-    pairs = []
-    for number, (first, second) in evenly_spread(listed, most):
-        files = str(image_root / first.name), str(image_root / second.name)
-        known = (first.camera.K, second.camera.K), (first.turns, second.turns)
-        pair = Pair(f"{number}: {first} {second}", file.stem, *files, *known)
-        pairs.append(TruePair(pair, first.camera, second.camera, nan))
-    return TrainScene(file.stem, nan, tuple(pairs))
+    return TrainScene(file.stem, nan, tuple(evenly_spread(pairs, most)))
 
 
 def read_regions(file: Path, image_root: Path, pairs: Iterable[Pair]) -> dict[tuple[str, ...], tuple[Box, Box]]:
@@ -75,46 +58,43 @@ def read_regions(file: Path, image_root: Path, pairs: Iterable[Pair]) -> dict[tu
     pixels of the stored file, the latter two exclusive. Raises :class:`UserError` for a malformed table, for a box
     that is malformed or extends beyond its image, and for a missing pair.
     """
-    boxes = {}
+    boxes: dict[tuple[str, ...], tuple[Box, Box]] = {}
+    found: dict[tuple[str, ...], tuple[Box, Box]] = {}
     for where, (name0, name1, *cells) in read_rows(file, ("image_0", "image_1", "box_0", "box_1")):
-        box0, box1 = (parse_box(cell, where) for cell in cells)
+        try:
+            box0, box1 = (Box(*map(int, cell.split())) for cell in cells)
+        except (ValueError, TypeError) as error:
+            message = f"expected left, top, right and bottom of a box, found {cells[0]!r} and {cells[1]!r}"
+            raise UserError(f"{where}: {message}") from error
         boxes[str(image_root / name0), str(image_root / name1)] = box0, box1
-    wanted = {(pair.file0, pair.file1): pair.id for pair in pairs}
-    if missing := [name for files, name in wanted.items() if files not in boxes]:
-        raise UserError(f"{file} has no regions of the pair {missing[0]}")
-    for files in wanted:
+    for pair in pairs:
+        files = pair.file0, pair.file1
+        if files not in boxes:
+            raise UserError(f"{file} has no regions of the pair {pair.id}")
+        found[files] = boxes[files]
         for path, box in zip(files, boxes[files], strict=True):
-            require_inside(box, path, file)
-    return {files: boxes[files] for files in wanted}
+            with suppress(OSError, PIL.Image.DecompressionBombError), PIL.Image.open(path) as picture:
+                if box.right > picture.width or box.bottom > picture.height:
+                    size = f"{picture.width} x {picture.height}"
+                    raise UserError(
+                        f"{file}: a box ends at {box.right}, {box.bottom}, beyond {path} of {size} pixels"
+                    )
+    return found
 
 
-def require_inside(box: Box, path: str, file: Path) -> None:
-    with (
-        suppress(OSError, PIL.Image.DecompressionBombError),
-        PIL.Image.open(path) as picture,
-    ):  # reads its head alone
-        if box.right > picture.width or box.bottom > picture.height:
-            size = f"{picture.width} x {picture.height}"
-            raise UserError(f"{file}: a box ends at {box.right}, {box.bottom}, beyond {path} of {size} pixels")
-
-
-def parse_box(cell: str, where: str) -> Box:
-    with suppress(ValueError, TypeError):
-        return Box(*map(int, cell.split()))
-    raise UserError(f"{where}: expected left, top, right and bottom of a box, found {cell!r}")
-
-
-def parse_line(line: str, where: str) -> tuple[ListedImage, ListedImage]:
-    """Return both images of a line. Raise :class:`UserError` with its location and the expected format."""
-    cells = line.split()
+def parse_line(line: str, file: Path, number: int, image_root: Path) -> TruePair:
+    """Return the pair of a line. Raise :class:`UserError` with its location and the expected format."""
+    cells, where = line.split(), f"{file}, line {number}"
     if len(cells) != FIELDS:
         raise UserError(f"{where}: expected {FIELDS} fields, {EXPECTED}, found {len(cells)}")
-    for name in cells[:2]:
+    names = cells[:2]
+    for name in names:
         path = PureWindowsPath(name)  # the strictest rules: drives and backslashes count too
         if path.anchor or ".." in path.parts or "\0" in name:
             raise UserError(f"{where}: {name!r} points outside the image root; expected a path without ..")
     try:
-        turns, numbers = list(map(int, cells[2:4])), np.array(list(map(float, cells[4:])))
+        turns0, turns1 = turns = int(cells[2]), int(cells[3])
+        numbers = np.array(list(map(float, cells[4:])))
     except ValueError as error:
         raise UserError(f"{where}: expected numbers for turns, K0, K1 and T_0to1: {error}") from error
     K0, K1, T = numbers[:9].reshape(3, 3), numbers[9:18].reshape(3, 3), numbers[18:].reshape(4, 4)
@@ -123,15 +103,17 @@ def parse_line(line: str, where: str) -> tuple[ListedImage, ListedImage]:
     with np.errstate(over="ignore", invalid="ignore"):  # the loop below checks that they are finite
         is_rotation = np.abs(R @ R.T - np.eye(3)).max() < MAX_SKEWNESS and np.linalg.det(R) > 0
     for holds, expected in (
-        (set(turns) <= {0, 1, 2, 3}, f"0, 1, 2 or 3 quarter turns, found {cells[2]} and {cells[3]}"),
+        ({turns0, turns1} <= {0, 1, 2, 3}, f"0, 1, 2 or 3 quarter turns, found {cells[2]} and {cells[3]}"),
         (np.isfinite(numbers).all(), "finite numbers for K0, K1 and T_0to1"),
         (has_focals, "K0 and K1 = fx s cx 0 fy cy 0 0 1 with positive fx and fy"),
         (is_rotation and tuple(T[3]) == (0, 0, 0, 1), "T_0to1 = [R t; 0 0 0 1] with R a rotation"),
     ):
         if not holds:
             raise UserError(f"{where}: expected {expected}")
-    first, second = Camera(K0, np.eye(3), np.zeros(3)), Camera(K1, R, t)
-    return ListedImage(cells[0], turns[0], first), ListedImage(cells[1], turns[1], second)
+    labels = (f"{name} turned {times}" if times else name for name, times in zip(names, turns, strict=True))
+    file0, file1 = (str(image_root / name) for name in names)
+    pair = Pair(f"{number}: {' '.join(labels)}", file.stem, file0, file1, (K0, K1), turns)
+    return TruePair(pair, Camera(K0, np.eye(3), np.zeros(3)), Camera(K1, R, t), nan)
 
 
 def lines_of_scene_info(file: Path) -> Iterator[str]:

@@ -19,7 +19,7 @@ from mkpc_kaggle.geometry.cameras import Camera, fundamental_of_cameras
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.recipe import load_recipe
 
-WHERE = "list.txt, line 7"
+WHERE = Path("list.txt"), 7, Path("images")
 EYE = " ".join(["1 0 0 0 1 0 0 0 1"] * 2 + ["1 0 0 1 0 1 0 0 0 0 1 0 0 0 0 1"])
 K = np.array([[500.0, 0, 31.5], [0, 450, 20.25], [0, 0, 1]])
 R = cv2.Rodrigues(np.array([0.1, -0.3, 0.2]))[0]
@@ -28,15 +28,12 @@ CAMERA = Camera(K, R, np.array([0.2, -0.1, 0.5]))
 
 def test_a_line_is_what_was_written():
     first = Camera(K, R, np.array([1.0, 2, 3]))
-    images = parse_line(line_of(("a/b.jpg", "c.png"), (first, CAMERA), (3, 1)), WHERE)
-    assert [(image.name, image.turns) for image in images] == [("a/b.jpg", 3), ("c.png", 1)]
-    assert list(map(str, images)) == ["a/b.jpg turned 3", "c.png turned 1"]
-    np.testing.assert_array_equal(images[0].camera.K, K)
-    np.testing.assert_allclose(
-        fundamental_of_cameras(*(image.camera for image in images)),
-        fundamental_of_cameras(first, CAMERA),
-        atol=1e-15,
-    )
+    true = parse_line(line_of(("a/b.jpg", "c.png"), (first, CAMERA), (3, 1)), *WHERE)
+    assert (true.pair.images, true.pair.turns) == ((Path("images/a/b.jpg"), Path("images/c.png")), (3, 1))
+    assert true.pair.id == "7: a/b.jpg turned 3 c.png turned 1"
+    np.testing.assert_array_equal(true.camera0.K, K)
+    found = fundamental_of_cameras(true.camera0, true.camera1)
+    np.testing.assert_allclose(found, fundamental_of_cameras(first, CAMERA), atol=1e-15)
 
 
 @pytest.mark.parametrize(
@@ -53,7 +50,7 @@ def test_a_line_is_what_was_written():
 )
 def test_a_malformed_line_is_named_with_what_was_expected(line, expected):
     with pytest.raises(UserError, match=rf"^list.txt, line 7: .*({expected})"):
-        parse_line(line, WHERE)
+        parse_line(line, *WHERE)
 
 
 @pytest.mark.parametrize(
@@ -62,9 +59,9 @@ def test_a_malformed_line_is_named_with_what_was_expected(line, expected):
 def test_no_name_leads_out_of_the_image_root(name):
     for names in (f"{name} ok.jpg", f"ok.jpg {name}"):
         with pytest.raises(UserError, match=r"list.txt, line 7: .* points outside the image root"):
-            parse_line(f"{names} 0 0 {EYE}", WHERE)
-    images = parse_line(f"a/b..c.jpg ./d.jpg 0 0 {EYE}", WHERE)
-    assert [image.name for image in images] == ["a/b..c.jpg", "./d.jpg"]
+            parse_line(f"{names} 0 0 {EYE}", *WHERE)
+    pair = parse_line(f"a/b..c.jpg ./d.jpg 0 0 {EYE}", *WHERE).pair
+    assert pair.images == (Path("images/a/b..c.jpg"), Path("images/d.jpg"))
 
 
 def test_a_list_without_pairs_is_refused(tmp_path):
