@@ -40,9 +40,7 @@ ODD: dict[str, Callable[[], bytes]] = {
     "20,000 black pixels a side": lambda: png(20_000, 20_000, rows(20_000, 20_000, 1), depth=1),
     "1 x 60,000 pixels": lambda: encoded(".jpg", cv2.resize(picture(0), (1, 60_000))),
     "a tag of no end": lambda: encoded(".jpg")[:2] + b"\xff\xe1\xff\xffExif\0\0II*\0\x08\0\0\0" + b"\xff" * 50_000,
-    "a text of 200 MB": lambda: png(
-        64, 64, chunk(b"zTXt", b"a\0\0" + zlib.compress(bytes(2 * 10**8))), rows(64, 64)
-    ),
+    "a text of 200 MB": lambda: png(9, 9, chunk(b"zTXt", b"a\0\0" + zlib.compress(bytes(2 * 10**8))), rows(9, 9)),
     "an HDR image by another name": lambda: encoded(".hdr", picture(0).astype(np.float32) * 1e30),
 }
 
