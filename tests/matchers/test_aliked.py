@@ -24,11 +24,11 @@ def both():
 def test_it_finds_what_kornias_finds():
     ours, theirs = both()
     images = torch.cat([image_of(scene(96, 160, 3)), image_of(scene(96, 160, 3, "another"))])
-    for (points, descriptors), expected in zip(ours(images), theirs(images), strict=True):
-        assert len(points) == expected.n > 100
-        points, wanted = points.double(), expected.keypoints.double()
-        assert agreement(points, wanted, 0.01) > 0.99
-        distances, nearest = torch.cdist(points, wanted).min(dim=1)
+    for (keypoints, descriptors), expected in zip(ours(images), theirs(images), strict=True):
+        assert len(keypoints) == expected.n > 100
+        both_points = keypoints.double(), expected.keypoints.double()
+        assert agreement(*both_points, 0.01) > 0.99
+        distances, nearest = torch.cdist(*both_points).min(dim=1)
         cosines = (descriptors * expected.descriptors[nearest]).sum(dim=1)[distances < 0.01]
         # A coordinate within rounding of a whole pixel may take its offsets from the next pixel.
         assert (cosines > 0.9999).double().mean() > 0.99

@@ -143,10 +143,8 @@ def test_what_pip_says_is_stated_with_the_advice_where_no_wheel_fits(kaggle, dem
     wheel.rename(wheel.with_name("pycolmap-4.2.1-cp27-cp27m-manylinux_2_28_x86_64.whl"))
     with pytest.raises(AssertionError, match="ERROR: ") as stopped:
         kaggle.run()
-    python = python_version()
-    assert f"no wheel of pycolmap is for Python {python}: package again with --python {python}" in str(
-        stopped.value
-    )
+    told = "no wheel of pycolmap is for Python {0}: package again with --python {0}".format(python_version())
+    assert told in str(stopped.value)
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)

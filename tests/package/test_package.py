@@ -140,9 +140,7 @@ def test_what_the_image_has_is_used_where_it_satisfies_even_without_a_wheel_for_
 
 def test_the_kernel_runs_on_a_gpu_without_internet_on_the_competition_and_the_dataset(out):
     dataset, kernel = metadata_of(out)
-    assert (
-        6 <= len(dataset["title"]) <= 50 and 20 <= len(dataset["subtitle"]) <= 80
-    )  # limits of the kaggle command
+    assert 6 <= len(dataset["title"]) <= 50 and 20 <= len(dataset["subtitle"]) <= 80  # Kaggle's limits
     assert (kernel["enable_gpu"], kernel["enable_internet"]) == (True, False)
     assert kernel["dataset_sources"] == [dataset["id"]] == ["someone/mkpc-kaggle"]
     assert kernel["id"] == "someone/" + kernel["title"].lower().replace(" ", "-")
