@@ -71,7 +71,6 @@ def wheels(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def small_recipe(tmp_path: Path) -> Path:
-    """The file of a quick recipe of two stages."""
     magsac = "[magsac]\npermutations = 1\nmax_iterations = 5000\n"
     return write_recipe(tmp_path / "small.toml", (1, 320), (2, 400), more=magsac)
 

@@ -8,16 +8,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from numpy.testing import assert_array_equal
 
 from mkpc_kaggle.data import images
-from mkpc_kaggle.data.images import ByteCache, Image, ImageStore, Unreadable, content_digest, read_image
+from mkpc_kaggle.data.images import Image, ImageStore, Unreadable, content_digest, read_image
 
 
 def write(path, pixels, *options):
-    """RGB, gray or RGBA -> the file."""
     order = {4: cv2.COLOR_RGBA2BGRA, 3: cv2.COLOR_RGB2BGR}.get(pixels.shape[2] if pixels.ndim == 3 else 1)
     done, data = cv2.imencode(path.suffix, pixels if order is None else cv2.cvtColor(pixels, order), options)
     assert done
@@ -112,27 +109,6 @@ def test_a_file_is_decoded_once_unless_it_made_room_or_is_unreadable(decoded):
     with closing(ImageStore(limit_bytes=299)) as small:  # an image above the limit is handed out all the same
         assert [small.get(Path("a")).name for _ in range(2)] == ["a", "a"]
     assert len(decoded) == 9
-
-
-@given(
-    st.integers(0, 20),
-    st.lists(st.tuples(st.sampled_from("abcde"), st.one_of(st.none(), st.integers(0, 25))), max_size=40),
-)
-def test_the_cache_agrees_with_a_plain_list_in_order_of_use(limit, steps):
-    """A step puts a value of that size, or with no size asks for the key."""
-    cache: ByteCache[str, int] = ByteCache(limit)
-    used: list[tuple[str, int]] = []
-    for key, size in steps:
-        entry = next((entry for entry in used if entry[0] == key), None)
-        if size is None:
-            assert cache.get(key) == (entry[1] if entry else None)
-        else:
-            cache.put(key, size, size)
-            entry = (key, size) if size <= limit else None
-        used = [other for other in used if other[0] != key] + ([entry] if entry else [])
-        while sum(size for _, size in used) > limit:
-            used.pop(0)
-        assert cache.bytes == sum(size for _, size in used)
 
 
 def test_the_digest_of_a_file_is_that_of_its_bytes(tmp_path):

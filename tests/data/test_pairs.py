@@ -98,7 +98,6 @@ def test_the_true_matrix_has_no_error(demo, scenes, tmp_path):
 
 
 def listed(home: Path, root: Path) -> tuple[object, ...]:
-    """Return options for the list in ``home`` of images below ``root``."""
     return "--pairs", home / "list.txt", "--image-root", root
 
 

@@ -20,7 +20,6 @@ from mkpc_kaggle.reporting.run_log import read_log
 
 
 def true_matrices(demo: DemoSet) -> dict[str, np.ndarray]:
-    """The true F of the test side's samples, in the test side's order of images."""
     cameras: dict[str, tuple[Camera, Camera]] = {}
     for scene in read_train_side(demo.train_dir, min_covisibility=0):
         for true in scene.pairs:

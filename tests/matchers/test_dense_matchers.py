@@ -53,8 +53,6 @@ def test_padding_changes_nothing(matcher):
 
 
 class Given:
-    """A network that answers with these warps."""
-
     def __init__(self, *warps):
         self.warps = warps
 

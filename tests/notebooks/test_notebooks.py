@@ -19,7 +19,6 @@ SETTINGS = {  # as a user would edit them
 
 
 def figures_of(notebook: nbformat.NotebookNode) -> int:
-    """Return the number of figures that its cells ask for."""
     return sum(cell.source.count("show(figures.") for cell in notebook.cells if cell.cell_type == "code")
 
 

@@ -48,13 +48,11 @@ class Kaggle:
         self.notebook = packaged / "kernel" / "submission.ipynb"
 
     def set(self, former: str, new: str) -> None:
-        """Edit the notebook as a user would."""
         text = self.notebook.read_text(encoding="utf-8")
         assert former in text
         self.notebook.write_text(text.replace(former, new), encoding="utf-8")
 
     def run(self, **more: str) -> str:
-        """Execute the notebook; what it printed."""
         variables = environment(KAGGLE_ROOT=str(self.root), **more)
         return printed(execute(self.notebook, self.executed, self.image, self.working, variables))
 

@@ -26,7 +26,6 @@ from mkpc_kaggle.weights.manifest import read_manifest
 
 
 def checkpoint(number: float) -> bytes:
-    """A torch checkpoint, which is a zip file."""
     stream = io.BytesIO()
     torch.save({"a": torch.full((3,), number)}, stream)
     return stream.getvalue()
@@ -72,7 +71,6 @@ def out(made: tuple[Path, Package]) -> Path:
 
 
 def metadata_of(out: Path) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The dataset's and the kernel's."""
     dataset, kernel = ((out / name / f"{name}-metadata.json").read_text() for name in ("dataset", "kernel"))
     return json.loads(dataset), json.loads(kernel)
 

@@ -122,7 +122,6 @@ def sinkhorn_stages():
 
 
 def pipeline_stages():
-    """Yield the stages of SuperPoint, then of SuperGlue, from two images."""
     golden = golden_arrays("superglue", "pipeline_pair")
     config = json.loads(golden["config"])
     detector, network = superpoint(config["superpoint"]), superglue(config["superglue"])

@@ -63,8 +63,6 @@ def errors(matches):
 
 
 class Scripted:
-    """Finds nothing, or raises an error."""
-
     spec = MatcherSpec("own", "a test's")
 
     def __init__(self, error=None):
@@ -80,8 +78,6 @@ class Scripted:
 
 
 class CountingSift(SiftMatcher):
-    """Sift that counts how often each crop was encoded."""
-
     def __init__(self):
         super().__init__(SiftOptions(), "cpu")
         self.seen = Counter()

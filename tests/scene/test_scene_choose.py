@@ -25,7 +25,6 @@ def model(cameras: dict[str, Camera], points: int = 100) -> SfmModel:
 
 
 def choice(models: list[SfmModel], scene: SyntheticScene, **changes: object) -> Choice:
-    """What the first pair gets."""
     found = [{image.image.digest: image for image in model.images} for model in models]
     return choose(replace(scene.pairs[0], **changes), found)
 

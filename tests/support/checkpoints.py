@@ -82,7 +82,6 @@ FILES = (
 
 
 def write_checkpoints(directory: Path, files: Iterable[PublicFile] = FILES) -> tuple[WeightFile, ...]:
-    """The files' lines of a manifest, sizes and digests included."""
     lines = []
     for file in files:
         path = directory / file.name
@@ -93,7 +92,6 @@ def write_checkpoints(directory: Path, files: Iterable[PublicFile] = FILES) -> t
 
 
 def store_of(directory: Path, files: Iterable[PublicFile]) -> WeightStore:
-    """A store that has these files."""
     return WeightStore([directory], write_checkpoints(directory, files))
 
 

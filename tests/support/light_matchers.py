@@ -42,12 +42,10 @@ SHIFT = 8  # pixels between the two pictures of a pair
 
 @cache
 def standin(name: str, make: Callable[..., nn.Module], *settings: Any, **named: Any) -> nn.Module:
-    """The network of these settings, filled once."""
     return filled(make(*settings, **named), name)
 
 
 def ours(placement: Placement, *network: Any, **named: Any) -> Any:
-    """A network of ours, ready to run there."""
     return prepared(kornias(*network, **named), placement)
 
 

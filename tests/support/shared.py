@@ -17,7 +17,6 @@ needs_weights = pytest.mark.skipif(not WEIGHTS.is_dir(), reason=f"no checkpoints
 
 
 def contents(directory: Path) -> dict[str, bytes]:
-    """The files below a directory."""
     return {str(path.relative_to(directory)): path.read_bytes() for path in directory.rglob("*") if path.is_file()}
 
 

@@ -116,7 +116,6 @@ def standin_state(network: nn.Module, standin: StandIn) -> dict[str, Tensor]:
 
 
 def filled(network: nn.Module, name: str) -> nn.Module:
-    """The network with the stand-in weights of that name."""
     network.load_state_dict(standin_state(network, STAND_INS[name]))
     return network
 
